@@ -1,0 +1,97 @@
+"""What a result was made with: device, driver, package versions and commit."""
+
+import subprocess
+from importlib import metadata
+from pathlib import Path
+from platform import python_version
+from typing import NamedTuple
+
+import warp as wp
+from rich.console import Console
+
+PACKAGES = ("jumper-warp", "warp-lang", "newton", "mujoco", "mujoco-warp", "torch", "numpy", "rsl-rl-lib")
+"""Distributions whose version can change a figure."""
+
+
+class Commit(NamedTuple):
+    """State of the source tree."""
+
+    hash: str
+    """Full hash of the checked-out commit."""
+    dirty: bool
+    """Whether tracked files differ from that commit or untracked files lie beside them."""
+
+
+class DeviceInfo(NamedTuple):
+    """What Warp computes on."""
+
+    alias: str
+    """Warp's name of the device, for example `cpu` or `cuda:0`."""
+    name: str
+    """The maker's name of the processor."""
+    driver: str | None
+    """CUDA version that the driver supports; None on a CPU."""
+    mempool: bool
+    """Whether device memory comes from a stream-ordered pool, which captured graphs need to allocate."""
+    graphs: bool
+    """Whether a step that allocates memory can be captured as a graph."""
+
+
+def device_info(device: wp.DeviceLike = None) -> DeviceInfo:
+    """Return the facts about a Warp device; None is the current one."""
+    found = wp.get_device(device)
+    if not found.is_cuda:
+        return DeviceInfo(found.alias, found.name, driver=None, mempool=False, graphs=True)
+    major, minor = wp.get_cuda_driver_version()
+    pooled = wp.is_mempool_enabled(found)
+    return DeviceInfo(found.alias, found.name, driver=f"{major}.{minor}", mempool=pooled, graphs=pooled)
+
+
+def report_device(device: wp.DeviceLike = None, console: Console | None = None) -> DeviceInfo:
+    """Print one line on the device to standard error, and return the same facts."""
+    info = device_info(device)
+    parts = [f"device {info.alias} ({info.name})"]
+    if info.driver is None:
+        parts.append("no CUDA device in use: large batches will be slow")
+    else:
+        parts += [f"driver for CUDA {info.driver}", f"mempool {'on' if info.mempool else 'OFF'}"]
+    parts.append(f"graph capture {'on' if info.graphs else 'OFF: each kernel is launched on its own'}")
+    good = info.driver is not None and info.graphs
+    console = console or Console(stderr=True)
+    console.print(", ".join(parts), style="green" if good else "yellow", markup=False, highlight=False, soft_wrap=True)
+    return info
+
+
+def git_commit(folder: Path | None = None) -> Commit | None:
+    """Return the commit of the source tree in `folder` (default: this package's).
+
+    None without git, outside a git tree, in a tree without commits, and where the enclosing tree does not track
+    the folder, as for a package installed inside another project.
+    """
+    folder = Path(__file__).parent if folder is None else folder
+    if not _git(folder, "ls-files"):
+        return None
+    commit = _git(folder, "rev-parse", "--verify", "HEAD")
+    if not commit:
+        return None
+    return Commit(commit.strip(), dirty=bool(_git(folder, "status", "--porcelain", "--", ":/")))
+
+
+def _git(folder: Path, *arguments: str) -> str | None:
+    """Return what git prints for the tree in `folder`, or None if it fails or is not installed."""
+    try:
+        answer = subprocess.run(["git", "-C", str(folder), *arguments], capture_output=True, text=True, timeout=30)
+    except (OSError, subprocess.TimeoutExpired):
+        return None
+    return answer.stdout if answer.returncode == 0 else None
+
+
+def versions() -> dict[str, str | None]:
+    """Return the version of Python and of each of `PACKAGES`; None for one that is not installed."""
+    found: dict[str, str | None] = {"python": python_version()}
+    for package in PACKAGES:
+        try:
+            found[package] = metadata.version(package)
+        except metadata.PackageNotFoundError:
+            found[package] = None
+    return found

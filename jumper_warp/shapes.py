@@ -1,0 +1,126 @@
+"""Triangle meshes of what a Newton model shows: one mesh per visible shape."""
+
+from dataclasses import dataclass
+
+import newton
+import numpy as np
+import trimesh
+from newton import GeoType
+
+PLANE_EXTENT = 10.0
+"""Half the side of the patch drawn for an infinite plane [m]."""
+CHECKER_CELL = 0.5
+"""Side of one field of that patch [m]."""
+CHECKER_COLORS = ((0.80, 0.81, 0.83), (0.70, 0.71, 0.74))
+"""RGB of its light and dark fields."""
+
+
+@dataclass(frozen=True)
+class ShapeMesh:
+    """The surface of one shape."""
+
+    name: str
+    body: int
+    """Index of the body in the model; -1: fixed to the world."""
+    color: tuple[float, float, float]
+    """RGB, each in [0, 1]."""
+    vertices: np.ndarray
+    """(num_vertices, 3) float32 [m], in the body's frame; in the world frame if fixed to the world."""
+    normals: np.ndarray
+    """(num_vertices, 3) float32, outward unit normals in the same frame."""
+    triangles: np.ndarray
+    """(num_triangles, 3) int32, indices of vertices."""
+
+
+def shape_meshes(model: newton.Model, worlds: tuple[int, ...]) -> list[ShapeMesh]:
+    """Return the meshes of the visible shapes of some worlds, and of those that all worlds share.
+
+    Raises:
+        ValueError: A visible shape is of a kind that has no mesh here (a cone or a splat).
+    """
+    kinds = model.shape_type.numpy()
+    scales = model.shape_scale.numpy().astype(float)
+    placements = model.shape_transform.numpy().astype(float)
+    bodies = model.shape_body.numpy()
+    colors = model.shape_color.numpy().astype(float)
+    shown = (model.shape_flags.numpy() & int(newton.ShapeFlags.VISIBLE)) != 0
+    meshes = []
+    for shape in np.flatnonzero(shown & np.isin(model.shape_world.numpy(), [-1, *worlds])):
+        label = model.shape_label[shape].split("/")[-1]
+        kind = GeoType(int(kinds[shape]))
+        if kind == GeoType.PLANE:
+            surfaces = _checker(label, scales[shape])
+        else:
+            mesh = _surface(kind, scales[shape], model.shape_source[shape], label)
+            surfaces = [(label, tuple(colors[shape]), mesh)]
+        for name, color, mesh in surfaces:
+            meshes.append(_placed(name, int(bodies[shape]), color, mesh, placements[shape]))
+    return meshes
+
+
+def _surface(kind: GeoType, scale: np.ndarray, source: object, label: str) -> trimesh.Trimesh:
+    """Return the mesh of one shape in its own frame. scale: Newton's three size parameters [m]."""
+    if kind == GeoType.SPHERE:
+        return trimesh.creation.icosphere(subdivisions=3, radius=scale[0])
+    if kind == GeoType.CAPSULE:
+        return trimesh.creation.capsule(radius=scale[0], height=2.0 * scale[1], count=[16, 16])
+    if kind == GeoType.CYLINDER:
+        return trimesh.creation.cylinder(radius=scale[0], height=2.0 * scale[1], sections=24)
+    if kind == GeoType.ELLIPSOID:
+        return trimesh.creation.icosphere(subdivisions=3).apply_scale(scale)
+    if kind == GeoType.BOX:
+        return trimesh.creation.box(extents=2.0 * scale)
+    if kind in (GeoType.MESH, GeoType.CONVEX_MESH):
+        return trimesh.Trimesh(np.asarray(source.vertices) * scale, np.asarray(source.indices).reshape(-1, 3))
+    if kind == GeoType.HFIELD:
+        return _heightfield(source, scale)
+    raise ValueError(f"shape {label!r} is a {kind.name}, which cannot be drawn")
+
+
+def _heightfield(field: newton.Heightfield, scale: np.ndarray) -> trimesh.Trimesh:
+    """Return the upper surface of a heightfield; rows follow y, columns x."""
+    x = np.linspace(-field.hx, field.hx, field.ncol)
+    y = np.linspace(-field.hy, field.hy, field.nrow)
+    heights = field.min_z + np.asarray(field.data) * (field.max_z - field.min_z)
+    vertices = np.stack([*np.meshgrid(x, y), heights], axis=-1).reshape(-1, 3) * scale
+    node = np.arange(field.nrow * field.ncol).reshape(field.nrow, field.ncol)
+    here, right = node[:-1, :-1].ravel(), node[:-1, 1:].ravel()
+    ahead, across = node[1:, :-1].ravel(), node[1:, 1:].ravel()
+    triangles = [np.stack([here, right, across], axis=1), np.stack([here, across, ahead], axis=1)]
+    return trimesh.Trimesh(vertices, np.concatenate(triangles))
+
+
+def _checker(label: str, size: np.ndarray) -> list[tuple[str, tuple[float, float, float], trimesh.Trimesh]]:
+    """Return the light and the dark fields of a plane. size: width along x and length along y [m], 0 if infinite."""
+    half = np.where(size[:2] > 0.0, 0.5 * size[:2], PLANE_EXTENT)
+    cells = np.maximum(1, np.round(2.0 * half / CHECKER_CELL)).astype(int)
+    step = 2.0 * half / cells
+    column, row = (index.ravel() for index in np.meshgrid(np.arange(cells[0]), np.arange(cells[1])))
+    corner = np.stack([column * step[0] - half[0], row * step[1] - half[1], 0.0 * row], axis=1)
+    outline = np.array([[0.0, 0.0, 0.0], [step[0], 0.0, 0.0], [step[0], step[1], 0.0], [0.0, step[1], 0.0]])
+    surfaces = []
+    for shade, color in enumerate(CHECKER_COLORS):
+        chosen = corner[(column + row) % 2 == shade]
+        vertices = (chosen[:, None] + outline).reshape(-1, 3)
+        triangles = (4 * np.arange(len(chosen))[:, None, None] + np.array([[0, 1, 2], [0, 2, 3]])).reshape(-1, 3)
+        name = f"{label}_{('light', 'dark')[shade]}"
+        surfaces.append((name, color, trimesh.Trimesh(vertices, triangles, process=False)))
+    return surfaces
+
+
+def _placed(
+    name: str, body: int, color: tuple[float, float, float], mesh: trimesh.Trimesh, placement: np.ndarray
+) -> ShapeMesh:
+    """Move a mesh from the shape's frame to the body's. placement: pos [m] and quat xyzw, (7,)."""
+    x, y, z, w = placement[3:]
+    matrix = trimesh.transformations.quaternion_matrix([w, x, y, z])
+    matrix[:3, 3] = placement[:3]
+    smooth = mesh.copy().apply_transform(matrix).smooth_shaded
+    return ShapeMesh(
+        name,
+        body,
+        tuple(float(channel) for channel in color),
+        np.asarray(smooth.vertices, dtype=np.float32),
+        np.asarray(smooth.vertex_normals, dtype=np.float32),
+        np.asarray(smooth.faces, dtype=np.int32),
+    )

@@ -1,0 +1,255 @@
+"""`SolverJumper`: the robot's dedicated solver behind Newton's solver interface."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import newton
+import warp as wp
+from newton import ModelFlags, StateFlags
+from newton.solvers import SolverBase
+
+from jumper_warp.description import RobotDescription
+from jumper_warp.dynamics import JumperDynamics
+
+MAX_SWEEPS = 50
+"""Most sweeps of the contact iteration in a step."""
+TOLERANCE = 1.0e-5
+"""[m/s] The contact iteration ends when a sweep changes no contact velocity by more."""
+
+
+@wp.kernel(enable_backward=False)
+def _clear_kernel(
+    # in
+    mask: wp.array(dtype=wp.bool),
+    # out
+    impulse: wp.array2d(dtype=wp.vec3),
+    contact_force: wp.array2d(dtype=wp.vec3),
+    invalid: wp.array(dtype=int),
+):
+    world = wp.tid()
+    if mask[world]:
+        invalid[world] = 0
+        for k in range(4):
+            impulse[k, world] = wp.vec3(0.0)
+            contact_force[k, world] = wp.vec3(0.0)
+
+
+@wp.kernel(enable_backward=False)
+def _restore_kernel(
+    # in
+    mask: wp.array(dtype=wp.bool),
+    reference: wp.array2d(dtype=float),
+    # out
+    values: wp.array2d(dtype=float),
+):
+    world, i = wp.tid()
+    if mask[world]:
+        values[world, i] = reference[world, i]
+
+
+@wp.kernel(enable_backward=False)
+def _acceleration_kernel(
+    # in
+    before: wp.array(dtype=wp.spatial_vector),
+    after: wp.array(dtype=wp.spatial_vector),
+    dt: float,
+    # out
+    body_qdd: wp.array(dtype=wp.spatial_vector),
+):
+    body = wp.tid()
+    body_qdd[body] = (after[body] - before[body]) / dt
+
+
+class SolverJumper(SolverBase):
+    """Exact 18-coordinate dynamics of the Jumper with rigid paw contact.
+
+    The five-bar loops hold by construction. Semi-implicit Euler; contact by block Gauss-Seidel on the four paws to
+    `tolerance`. Per-world masses, inertias, armature, motor friction, damping, joint stops, paw friction and gravity
+    are read from the model: write the model's arrays, then call `notify_model_changed`.
+
+    Reads base and motor coordinates of `joint_q`/`joint_qd`, `control.joint_f` of base and motors (world wrench [N],
+    [N m] at the base's com; motor torques [N m]) and `state.body_f` of the base. Writes every joint, loop joint and
+    body. Forces on other bodies and passive joints are not read. One thread owns one world and nothing is
+    accumulated across threads, so results repeat bit for bit on a device.
+
+    A world that becomes non-finite is flagged in `invalid`, parked at rest in the model's reference pose and left
+    there until `reset` clears it.
+    """
+
+    SUPPORTED_OBSERVABLES = frozenset({SolverBase.ObservableKind.BODY_QDD})
+
+    def __init__(
+        self,
+        model: newton.Model,
+        *,
+        description: RobotDescription | None = None,
+        max_sweeps: int = MAX_SWEEPS,
+        tolerance: float = TOLERANCE,
+    ):
+        """Prepare for a model of `jumper_warp.robot.build_model`.
+
+        Raises:
+            NotThisRobotError: the model is another robot's.
+            ValueError: `max_sweeps` below 1 or `tolerance` [m/s] not positive.
+        """
+        super().__init__(model)
+        if max_sweeps < 1 or not tolerance > 0.0:
+            raise ValueError(f"max_sweeps must be >= 1 and tolerance > 0, got {max_sweeps}, {tolerance}")
+        self.dynamics = JumperDynamics(model, description=description)
+        self.max_sweeps = max_sweeps
+        self.tolerance = tolerance
+        self._default_control = model.control(clone_variables=False)
+        self._no_body_f = wp.zeros(model.body_count, dtype=wp.spatial_vector, device=model.device)
+        self._old_body_qd = wp.zeros(model.body_count, dtype=wp.spatial_vector, device=model.device)
+
+    @property
+    def contact_force(self) -> wp.array:
+        """Force of the ground on each paw in the last step [N], world frame, vec3 of shape (4, num_worlds)."""
+        return self.dynamics.work.contact_force
+
+    @property
+    def peak_force(self) -> wp.array:
+        """Largest total paw force of the last call [N], shape (num_worlds,)."""
+        return self.dynamics.work.peak_force
+
+    @property
+    def torque(self) -> wp.array:
+        """Torque of each motor in the last step [N m], shape (12, num_worlds)."""
+        return self.dynamics.work.torque
+
+    @property
+    def residual(self) -> wp.array:
+        """Largest velocity change [m/s] of the last contact sweep, worst step of the last call, (num_worlds,)."""
+        return self.dynamics.work.residual
+
+    @property
+    def sweeps(self) -> wp.array:
+        """Most contact sweeps of a step in the last call, shape (num_worlds,)."""
+        return self.dynamics.work.sweeps
+
+    @property
+    def invalid(self) -> wp.array:
+        """1 where a world became non-finite and waits for `reset`, shape (num_worlds,)."""
+        return self.dynamics.work.invalid
+
+    def step(
+        self,
+        state_in: newton.State,
+        state_out: newton.State,
+        control: newton.Control | None,
+        contacts: newton.Contacts | None,
+        dt: float,
+        *,
+        observables: SolverBase.Observables | None = None,
+    ) -> None:
+        """Advance every world by dt [s]. `contacts` is not used: the solver finds the paws' contacts itself."""
+        self.validate_observables(observables, contacts)
+        self._advance(state_in, state_out, control, dt, 1, None, None, observables)
+
+    def step_motors(
+        self,
+        state_in: newton.State,
+        state_out: newton.State,
+        motors: Any,
+        target: wp.array,
+        dt: float,
+        substeps: int,
+        *,
+        control: newton.Control | None = None,
+        observables: SolverBase.Observables | None = None,
+    ) -> None:
+        """Advance every world by `substeps` steps of dt [s], the motors following targets, in one launch.
+
+        Args:
+            state_in: State before; may be `state_out`.
+            state_out: State after.
+            motors: `kernels.actuator.MotorArrays` (see `jumper_warp.motors.motor_arrays`).
+            target: Motor angles [rad], shape (12, num_worlds), held.
+            dt: Physics step [s].
+            substeps: Number of physics steps.
+            control: Additional joint forces, held.
+            observables: Observables of the whole call.
+        """
+        self.validate_observables(observables)
+        self._advance(state_in, state_out, control, dt, substeps, motors, target, observables)
+
+    def _advance(
+        self,
+        state_in: newton.State,
+        state_out: newton.State,
+        control: newton.Control | None,
+        dt: float,
+        substeps: int,
+        motors: Any,
+        target: wp.array | None,
+        observables: SolverBase.Observables | None,
+    ) -> None:
+        control = self._default_control if control is None else control
+        body_f = self._no_body_f if state_in.body_f is None else state_in.body_f
+        settings = self.dynamics.settings(dt, substeps, self.max_sweeps, self.tolerance)
+        drive = self.dynamics.drive(control.joint_f, body_f, motors, target)
+        wants_qdd = observables is not None and observables.is_requested(SolverBase.ObservableKind.BODY_QDD)
+        if wants_qdd:
+            wp.copy(self._old_body_qd, state_in.body_qd)
+        self.dynamics.advance(
+            settings, drive, state_in.joint_q, state_in.joint_qd, state_out.joint_q, state_out.joint_qd
+        )
+        self.dynamics.full_state(state_out.joint_q, state_out.joint_qd, state_out.body_q, state_out.body_qd)
+        if wants_qdd:
+            wp.launch(
+                _acceleration_kernel,
+                dim=self.model.body_count,
+                inputs=[self._old_body_qd, state_out.body_qd, dt * substeps],
+                outputs=[observables.body_qdd],
+                device=self.model.device,
+            )
+
+    def notify_model_changed(self, flags: ModelFlags | int) -> None:
+        """Read changed parameters from the model again."""
+        if flags & ModelFlags.BODY_INERTIAL_PROPERTIES:
+            self.dynamics.pack_masses()
+        if flags & (
+            ModelFlags.JOINT_DOF_PROPERTIES
+            | ModelFlags.JOINT_DOF_FORCE_PROPERTIES
+            | ModelFlags.JOINT_DOF_INERTIAL_PROPERTIES
+        ):
+            self.dynamics.pack_joints()
+        if flags & ModelFlags.SHAPE_PROPERTIES:
+            self.dynamics.pack_friction()
+        if flags & ModelFlags.MODEL_PROPERTIES:
+            self.dynamics.pack_gravity()
+
+    def reset(
+        self,
+        state: newton.State,
+        world_mask: wp.array | None = None,
+        flags: StateFlags | int | None = None,
+    ) -> None:
+        """Forget contact history and the invalid flag of the masked worlds, and put them in the reference pose.
+
+        With `flags=StateFlags.NONE` the state is left alone, for callers that write their own.
+        """
+        world_mask = self._normalize_reset_world_mask(world_mask)
+        n, device = self.model.world_count, self.model.device
+        if world_mask is None:
+            world_mask = wp.full(n + 1, True, dtype=wp.bool, device=device)
+        work = self.dynamics.work
+        wp.launch(
+            _clear_kernel,
+            dim=n,
+            inputs=[world_mask],
+            outputs=[work.impulse, work.contact_force, work.invalid],
+            device=device,
+        )
+        if flags is not None and int(flags) == int(StateFlags.NONE):
+            return
+        for reference, values in ((self.model.joint_q, state.joint_q), (self.model.joint_qd, state.joint_qd)):
+            wp.launch(
+                _restore_kernel,
+                dim=(n, values.shape[0] // n),
+                inputs=[world_mask, reference.reshape((n, -1))],
+                outputs=[values.reshape((n, -1))],
+                device=device,
+            )
+        self.dynamics.full_state(state.joint_q, state.joint_qd, state.body_q, state.body_qd)

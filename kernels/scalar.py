@@ -1,0 +1,19 @@
+"""The scalar type of the physics kernels, and the small vectors and matrices made of it.
+
+Every function of the robot's physics is written in terms of `real`. The package is single precision;
+`jumper_warp.precision.float64_kernels()` loads the same files a second time under the name
+`kernels_float64`, where `real` is double precision: the reference for rounding and for gradients.
+"""
+
+import warp as wp
+
+real = wp.float64 if __package__ == "kernels_float64" else wp.float32
+
+vec2 = wp.types.vector(length=2, dtype=real)
+vec3 = wp.types.vector(length=3, dtype=real)
+vec6 = wp.types.vector(length=6, dtype=real)
+quat = wp.types.quaternion(dtype=real)
+mat22 = wp.types.matrix(shape=(2, 2), dtype=real)
+mat33 = wp.types.matrix(shape=(3, 3), dtype=real)
+mat63 = wp.types.matrix(shape=(6, 3), dtype=real)
+mat66 = wp.types.matrix(shape=(6, 6), dtype=real)

@@ -1,0 +1,178 @@
+"""The time step: motors, dynamics, contact and integration of one world, many steps in one launch.
+
+One thread advances one world; everything between the first load and the last store stays in registers and the first
+cache level. Semi-implicit Euler: forces and Jacobians at the start of the step, positions moved with the velocities
+at its end.
+"""
+
+import warp as wp
+
+from .actuator import MotorArrays, load_motor, motor_torque
+from .base_dynamics import (
+    BaseInverse,
+    BaseSystem,
+    LegSolve,
+    add_leg,
+    base_alone,
+    eliminate_leg,
+)
+from .contact import (
+    CONTACT_MARGIN,
+    STICK_SPEED,
+    PawContact,
+    contact_jacobian,
+    couple_contact,
+    goal_velocity,
+)
+from .geometry import LegGeometry
+from .ground import Ground, ground_distance, ground_normal
+from .joint_forces import joint_forces
+from .leg_dynamics import PawKinematics, leg_dynamics, leg_five_bar, paw_kinematics
+from .parameters import (
+    BASE,
+    LEG_ROWS,
+    MU_DYNAMIC,
+    MU_STATIC,
+    load_joint_params,
+    load_masses,
+    load_moments,
+)
+from .scalar import quat, real, vec3
+from .state import BaseState, base_com
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.struct
+class Robot:
+    """What the step reads of the robot and the ground, besides its state."""
+
+    geometry: wp.array(dtype=LegGeometry)  # (4,)
+    table: wp.array2d(dtype=real)  # parameters, see `parameters`
+    ground: Ground
+
+
+@wp.struct
+class StepSettings:
+    """Numerical settings of the step."""
+
+    dt: real  # [s]
+    substeps: int
+    max_sweeps: int
+    tolerance: real  # [m/s], of the contact iteration
+
+
+@wp.struct
+class Wrench:
+    """External force [N] and moment [N m] about the base origin, body axes."""
+
+    force: vec3
+    moment: vec3
+
+
+@wp.func
+def leg_terms(
+    robot: Robot, world: int, k: int, angles: vec3, rates: vec3, torque: vec3, omega: vec3, g: vec3, dt: real,
+    system: BaseSystem, legs: wp.array(dtype=LegSolve), paws: wp.array(dtype=PawKinematics),
+) -> BaseSystem:  # fmt: skip
+    """Eliminate leg k and add it to the base's system; its solution and paw go to `legs` and `paws`."""
+    geo = robot.geometry[k]
+    loop = leg_five_bar(geo, angles)
+    dynamics = leg_dynamics(geo, load_masses(robot.table, k, world), loop, angles, rates, omega, g)
+    params = load_joint_params(robot.table, k, world)
+    passive = joint_forces(params, loop, geo.front, angles, rates, dt)
+    solve = eliminate_leg(dynamics, passive.inertia + wp.diag(params.armature), torque + passive.torque)
+    legs[k] = solve
+    paws[k] = paw_kinematics(geo, loop, wp.cos(angles[0]), geo.side * wp.sin(angles[0]))
+    return add_leg(system, dynamics, solve)
+
+
+@wp.func
+def paw_contact(
+    robot: Robot, world: int, k: int, base: BaseState, lin: vec3, ang: vec3, rates: vec3, old_rates: vec3,
+    impulse: vec3, paw: PawKinematics, leg: LegSolve, inverse: BaseInverse, dt: real,
+) -> PawContact:  # fmt: skip
+    """Return paw k's contact problem.
+
+    lin, ang, rates: base twist (body axes) and motor rates at the end of the step without contact; old_rates and
+    `base`: at its start; impulse: first guess [N s], world frame.
+    """
+    contact = PawContact()
+    centre = base.pos + wp.quat_rotate(base.quat, paw.position)
+    radius = robot.geometry[k].paw_radius
+    gap = ground_distance(robot.ground, centre) - radius
+    normal = wp.quat_rotate_inv(base.quat, ground_normal(robot.ground, centre))
+    arm = -radius * normal
+    point = paw.position + arm
+    contact.jacobian = contact_jacobian(paw, arm)
+    contact.normal = normal
+    contact.free = lin + wp.cross(ang, point) + contact.jacobian * rates
+    if gap + dt * wp.min(wp.dot(contact.free, normal), real(0.0)) > CONTACT_MARGIN:
+        return contact
+    contact.active = 1
+    contact.goal = goal_velocity(gap, dt)
+    contact.impulse = wp.quat_rotate_inv(base.quat, impulse)
+    before = wp.quat_rotate_inv(base.quat, base.lin) + wp.cross(base.ang, point) + contact.jacobian * old_rates
+    slip = before - wp.dot(before, normal) * normal
+    contact.mu = robot.table[k * LEG_ROWS + MU_DYNAMIC, world]
+    if wp.dot(slip, slip) < STICK_SPEED * STICK_SPEED and wp.dot(contact.impulse, normal) > real(0.0):
+        contact.mu = robot.table[k * LEG_ROWS + MU_STATIC, world]
+    return couple_contact(contact, point, leg, inverse)
+
+
+@wp.func
+def exp_rotation(turn: vec3) -> quat:
+    """Return the quaternion (xyzw) of a rotation vector [rad]."""
+    half_sq = real(0.25) * wp.dot(turn, turn)
+    # sin(h)/h and cos(h) to float32 rounding for the turns of one step (h < 0.2)
+    sinc = real(1.0) - half_sq / real(6.0) * (real(1.0) - half_sq / real(20.0) * (real(1.0) - half_sq / real(42.0)))
+    v = real(0.5) * sinc * turn
+    cosine = real(1.0) - half_sq / real(2.0) * (
+        real(1.0) - half_sq / real(12.0) * (real(1.0) - half_sq / real(30.0) * (real(1.0) - half_sq / real(56.0)))
+    )
+    return wp.normalize(quat(v[0], v[1], v[2], cosine))
+
+
+@wp.func
+def moved_base(base: BaseState, lin: vec3, ang: vec3, dt: real) -> BaseState:
+    """Return the base moved for dt [s]; lin, ang: its new twist in the present body axes [m/s], [rad/s]."""
+    moved = BaseState()
+    moved.lin = wp.quat_rotate(base.quat, lin)
+    moved.ang = ang
+    moved.pos = base.pos + dt * moved.lin
+    moved.quat = wp.normalize(base.quat * exp_rotation(dt * ang))
+    return moved
+
+
+@wp.func
+def external_wrench(base: BaseState, com: vec3, force_at_com: vec3, moment: vec3) -> Wrench:
+    """Return a wrench given in world axes at the base's centre of mass, in body axes about the base origin."""
+    wrench = Wrench()
+    wrench.force = wp.quat_rotate_inv(base.quat, force_at_com)
+    wrench.moment = wp.quat_rotate_inv(base.quat, moment) + wp.cross(com, wrench.force)
+    return wrench
+
+
+@wp.func
+def base_system(robot: Robot, world: int, base: BaseState, g: vec3, force: vec3, moment: vec3) -> BaseSystem:
+    """Return the base link's own equations; force [N] and moment [N m] from outside at its com, world axes."""
+    wrench = external_wrench(base, base_com(robot.table, world), force, moment)
+    return base_alone(load_moments(robot.table, BASE, world), base.ang, g, wrench.force, wrench.moment)
+
+
+@wp.func
+def finite_base(base: BaseState) -> bool:
+    """Return whether a base state holds finite values only."""
+    q = base.quat
+    total = wp.dot(base.pos, base.pos) + wp.dot(base.lin, base.lin) + wp.dot(base.ang, base.ang)
+    return wp.isfinite(total + q[0] + q[1] + q[2] + q[3])
+
+
+@wp.func
+def drive_torque(motors: MotorArrays, k: int, world: int, target: vec3, angles: vec3, rates: vec3) -> vec3:
+    """Return the torques [N m] of leg k's motors for targets, angles [rad] and rates [rad/s]."""
+    return vec3(
+        motor_torque(target[0], angles[0], rates[0], load_motor(motors, 3 * k, world)),
+        motor_torque(target[1], angles[1], rates[1], load_motor(motors, 3 * k + 1, world)),
+        motor_torque(target[2], angles[2], rates[2], load_motor(motors, 3 * k + 2, world)),
+    )
