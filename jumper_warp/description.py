@@ -72,6 +72,7 @@ def load_description(path: Path | None = None) -> RobotDescription:
         loops=reader.loops(),
         motors=reader.motors(),
         knee_damping=reader.positive(reader.root, "knee_damping", ""),
+        knee_damping_limit=reader.positive(reader.root, "knee_damping_limit", ""),
         transversal_sum=reader.range_deg("transversal_sum_deg"),
         poses=reader.poses(),
     )

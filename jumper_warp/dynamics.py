@@ -17,7 +17,8 @@ from jumper_warp.robot import leg_geometry_array
 LINKS = ("housing", "outer_thigh", "outer_shank", "inner_thigh", "inner_shank")
 JOINTS = ("lateral", "outer", "outer_knee", "inner", "inner_knee")
 KERNEL_MODULES = (
-    "actuator", "advance", "contact", "full_state", "geometry", "ground", "parameters", "scalar", "state", "step",
+    "actuator", "advance", "command_filter", "contact", "contact_adjoint", "differentiable", "full_state", "geometry",
+    "ground", "parameters", "scalar", "state", "step",
 )  # fmt: skip
 
 
@@ -172,7 +173,7 @@ class JumperDynamics:
             self.modules.parameters.pack_joints_kernel,
             (self.num_worlds, 4),
             [m.joint_armature, m.joint_friction, m.joint_damping, m.joint_limit_lower, m.joint_limit_upper,
-             m.joint_limit_ke, m.joint_limit_kd, lower, upper],
+             m.joint_limit_ke, m.joint_limit_kd, m.joint_effort_limit, lower, upper],
         )  # fmt: skip
 
     def pack_friction(self) -> None:
@@ -205,9 +206,7 @@ class JumperDynamics:
             drive.closed_loop, drive.motors, drive.target = 1, motors, target
         return drive
 
-    def advance(
-        self, settings: Any, drive: Any, q: wp.array, qd: wp.array, q_out: wp.array, qd_out: wp.array
-    ) -> None:
+    def advance(self, settings: Any, drive: Any, q: wp.array, qd: wp.array, q_out: wp.array, qd_out: wp.array) -> None:
         """Advance base and motor coordinates of every world by `settings.substeps` steps, in place if out is in."""
         wp.launch(
             self.modules.advance.advance_kernel,

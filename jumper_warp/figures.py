@@ -28,7 +28,7 @@ def output_dir(name: str, out: Path | None = None) -> Path:
         ValueError: `name` is empty or holds a path separator.
         FileExistsError: `out` is a file.
     """
-    if not name or Path(name).name != name:
+    if name in ("", "..") or Path(name).name != name:
         raise ValueError(f"an experiment name is one path component, got {name!r}")
     if out is not None:
         out.mkdir(parents=True, exist_ok=True)
@@ -82,10 +82,9 @@ def _plain(name: str, value: Any) -> Scalar | list[Scalar]:
 def _plain_scalar(name: str, value: Any) -> Scalar:
     if isinstance(value, np.generic):
         value = value.item()
-    if not isinstance(value, float | int | str | bool | None):
-        raise TypeError(
-            f"figure {name!r} must be a number, string, bool, None or flat list, got {type(value).__name__}"
-        )
+    if not isinstance(value, Scalar):
+        kind = type(value).__name__
+        raise TypeError(f"figure {name!r} must be a number, string, bool, None or flat list, got {kind}")
     if isinstance(value, float) and not math.isfinite(value):
         raise ValueError(f"figure {name!r} is {value}: only finite numbers are reported")
     return value

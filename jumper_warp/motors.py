@@ -27,7 +27,9 @@ class MotorKindCfg:
     kd: float
     """[N m s/rad]"""
     saturation: float
-    """[N m] Largest torque."""
+    """[N m] Largest torque that the controller asks for."""
+    peak: float
+    """[N m] Largest torque that the motor gives, up to the cutoff speed."""
     cutoff_speed: float
     """[rad/s] Full driving torque up to here."""
     no_load_speed: float
@@ -38,8 +40,8 @@ class MotorKindCfg:
         for name, value in vars(self).items():
             if not (math.isfinite(value) and value >= 0.0):
                 raise ValueError(f"motor {name} must be finite and not negative, got {value}")
-        if self.saturation == 0.0:
-            raise ValueError("motor saturation must be > 0, got 0")
+        if self.saturation == 0.0 or self.peak == 0.0:
+            raise ValueError("motor saturation and peak torque must be > 0, got 0")
         if self.no_load_speed <= self.cutoff_speed:
             raise ValueError(f"no_load_speed must be > cutoff_speed = {self.cutoff_speed}, got {self.no_load_speed}")
 
@@ -84,7 +86,14 @@ class MotorCfg:
 def motor_kind(motor: Motor, gains: Literal["jumping", "walking"], torque: float) -> MotorKindCfg:
     """Return the settings of a motor type, limited to `torque` [N m] and to its peak torque."""
     chosen = getattr(motor, gains)
-    return MotorKindCfg(chosen.kp, chosen.kd, min(torque, motor.peak_torque), motor.cutoff_speed, motor.no_load_speed)
+    return MotorKindCfg(
+        kp=chosen.kp,
+        kd=chosen.kd,
+        saturation=min(torque, motor.peak_torque),
+        peak=motor.peak_torque,
+        cutoff_speed=motor.cutoff_speed,
+        no_load_speed=motor.no_load_speed,
+    )
 
 
 def jumping_motors(torque: float = 18.0, lateral_torque: float | None = None) -> MotorCfg:

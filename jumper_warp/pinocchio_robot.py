@@ -94,6 +94,8 @@ class PinocchioRobot:
         v = np.zeros(self.model.nv)
         v[self.motor_v] = motor_rates
         pin.computeJointJacobians(self.model, self.data, q)
+        for constraint, data in zip(self.constraints, self.constraint_data, strict=True):
+            constraint.calc(self.model, self.data, data)
         jacobian = pin.getConstraintsJacobian(self.model, self.data, self.constraints, self.constraint_data)
         v[self.knee_v] = np.linalg.lstsq(jacobian[:, self.knee_v], -jacobian @ v, rcond=1.0e-9)[0]
         v[0:6] = base_twist

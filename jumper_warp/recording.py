@@ -7,6 +7,7 @@ import json
 import os
 import re
 import zipfile
+import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -35,16 +36,20 @@ class Recording:
 
     times: np.ndarray
     """(num_frames,) float64 [s], increasing."""
+    worlds: tuple[int, ...]
+    """Which of the model's worlds these are."""
     bodies: tuple[str, ...]
-    """Names of the recorded bodies, `world_<i>/<link>`."""
+    """Names of the recorded bodies, `world_<i>/<link>`, one world after the other."""
     poses: np.ndarray
     """(num_frames, num_bodies, 7) float32: origin [m] and quaternion xyzw, body to world."""
     series: dict[str, np.ndarray]
     """`group/quantity [unit]` to (num_frames,) float64."""
     contact_points: np.ndarray
-    """(num_frames, num_contacts, 3) float32 [m], world frame."""
+    """(num_frames, num_worlds, contacts_per_world, 3) float32 [m], world frame."""
     contact_forces: np.ndarray
-    """(num_frames, num_contacts, 3) float32 [N], world frame, on the robot."""
+    """The same shape, float32 [N], world frame, on the robot."""
+    spacing: float = 0.0
+    """Distance along y by which each world is drawn beside the one before it [m]; the data are not moved."""
     shapes: tuple[ShapeMesh, ...] = ()
     """What to draw; `body` is here an index of `bodies`."""
     notes: dict[str, Any] = field(default_factory=dict)
@@ -55,9 +60,11 @@ class Recording:
         header = {
             "format": FORMAT,
             "version": VERSION,
+            "worlds": self.worlds,
             "bodies": self.bodies,
             "series": list(self.series),
             "shapes": [{"name": shape.name, "body": shape.body, "color": shape.color} for shape in self.shapes],
+            "spacing": self.spacing,
             "notes": self.notes,
         }
         arrays = {
@@ -101,7 +108,7 @@ def load_npz(path: Path) -> Recording:
             return _from_archive(header, archive)
     except RecordingError:
         raise
-    except (OSError, EOFError, KeyError, TypeError, ValueError, zipfile.BadZipFile, zipfile.zlib.error) as error:
+    except (OSError, EOFError, KeyError, TypeError, ValueError, zipfile.BadZipFile, zlib.error) as error:
         raise RecordingError(f"{path}: cannot be read as a recording ({type(error).__name__}: {error})") from error
 
 
@@ -119,11 +126,13 @@ def _from_archive(header: dict[str, Any], archive: Mapping[str, np.ndarray]) -> 
     ]
     return Recording(
         times=archive["times"],
+        worlds=tuple(header["worlds"]),
         bodies=tuple(header["bodies"]),
         poses=archive["poses"],
         series=dict(zip(header["series"], archive["series"], strict=True)),
         contact_points=archive["contact_points"],
         contact_forces=archive["contact_forces"],
+        spacing=header["spacing"],
         shapes=tuple(shapes),
         notes=header["notes"],
     )
@@ -164,12 +173,9 @@ class Recorder:
             if world not in world_of_body:
                 raise ValueError(f"world {world} has no bodies: the model has {model.world_count} worlds")
         self._worlds = tuple(worlds)
-        self._bodies = np.concatenate([np.flatnonzero(world_of_body == world) for world in worlds])
+        self._spacing = spacing
         self._body_count = model.body_count
-        self._offset = np.array([[0.0, spacing * rank, 0.0] for rank in range(len(self._worlds))])
-        self._rank = np.concatenate(
-            [np.full(np.count_nonzero(world_of_body == world), rank) for rank, world in enumerate(worlds)]
-        )
+        self._bodies = np.concatenate([np.flatnonzero(world_of_body == world) for world in worlds])
         self._names = tuple(f"world_{world_of_body[b]}/{model.body_label[b].split('/')[-1]}" for b in self._bodies)
         index = {int(body): position for position, body in enumerate(self._bodies)} | {-1: -1}
         self._shapes = tuple(
@@ -211,40 +217,38 @@ class Recorder:
         contacts = self._checked_contacts(contact_points, contact_forces)
         self._append_series({} if series is None else series)
         self._times.append(float(time))
-        shown = poses[self._bodies]
-        shown[:, :3] += self._offset[self._rank]
-        self._poses.append(shown)
+        self._poses.append(poses[self._bodies])
         self._contacts.append(contacts)
 
     def _append_series(self, series: Mapping[str, float]) -> None:
+        values = {name: float(value) for name, value in series.items()}
         if self._series is None:
             malformed = [name for name in series if not SERIES_NAME.fullmatch(name)]
             if malformed:
                 raise ValueError(f"series are named 'group/quantity [unit]', got {malformed[0]!r}")
             self._series = {name: [] for name in series}
-        different = set(series) ^ set(self._series)
+        different = set(values) ^ set(self._series)
         if different:
             raise ValueError(f"every frame needs the same series; new or missing: {sorted(different)}")
-        for name, value in series.items():
-            self._series[name].append(float(value))
+        for name, value in values.items():
+            self._series[name].append(value)
 
     def _checked_contacts(self, points: np.ndarray | None, forces: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
-        """Return copies of a frame's contacts, (num_contacts, 3) each, the points where they are drawn."""
+        """Return copies of a frame's contacts, (num_worlds, contacts_per_world, 3) each."""
         if (points is None) != (forces is None):
             raise ValueError("contact_points and contact_forces come together")
         if points is None:
             points = forces = np.zeros((len(self._worlds), 0, 3))
         points, forces = (np.array(given, dtype=np.float32) for given in (points, forces))
-        if points.ndim == 2:
-            points = points[None]
-        if points.ndim != 3 or points.shape[::2] != (len(self._worlds), 3) or forces.size != points.size:
+        if points.ndim == 2 and len(self._worlds) == 1:
+            points, forces = points[None], forces[None]
+        if points.ndim != 3 or points.shape[::2] != (len(self._worlds), 3) or forces.shape != points.shape:
             raise ValueError(
                 f"contacts must have shape ({len(self._worlds)}, n, 3), got {points.shape}, {forces.shape}"
             )
-        pair = ((points + self._offset[:, None]).reshape(-1, 3).astype(np.float32), forces.reshape(-1, 3))
-        if self._contacts and self._contacts[0][0].shape != pair[0].shape:
-            raise ValueError(f"every frame needs {len(self._contacts[0][0])} contacts, got {len(pair[0])}")
-        return pair
+        if self._contacts and self._contacts[0][0].shape != points.shape:
+            raise ValueError(f"every frame needs contacts of shape {self._contacts[0][0].shape}, got {points.shape}")
+        return points, forces
 
     def recording(self) -> Recording:
         """Return what was recorded so far.
@@ -256,11 +260,13 @@ class Recorder:
             raise ValueError("nothing was recorded")
         return Recording(
             times=np.array(self._times),
+            worlds=self._worlds,
             bodies=self._names,
             poses=np.stack(self._poses),
             series={name: np.array(values) for name, values in self._series.items()},
             contact_points=np.stack([points for points, _ in self._contacts]),
             contact_forces=np.stack([forces for _, forces in self._contacts]),
+            spacing=self._spacing,
             shapes=self._shapes,
             notes=self._notes,
         )

@@ -4,7 +4,7 @@ Entities:
     scene/<shape>                 ground and whatever else is fixed to the world
     scene/world_<i>/<link>        pose of a link over time
     scene/world_<i>/<link>/<shape>
-    scene/contact_forces          arrows at the contacts
+    scene/world_<i>/contact_forces
     series/<group>/<quantity [unit]>
 
 No viewer is started and no port is opened.
@@ -72,15 +72,23 @@ def _log_scene(rr: ModuleType, stream: Any, recording: "Recording") -> None:
         pos, quat = np.split(recording.poses[:, index], [3], axis=1)
         columns = rr.Transform3D.columns(translation=pos, quaternion=quat)
         stream.send_columns(rr.new_entity_path(["scene", *body.split("/")]), times, columns)
-    frames, contacts = recording.contact_points.shape[:2]
+    for rank, world in enumerate(recording.worlds):
+        offset = rr.Transform3D(translation=[0.0, rank * recording.spacing, 0.0])
+        stream.log(f"scene/world_{world}", offset, static=True)
+        _log_contacts(rr, stream, f"scene/world_{world}/contact_forces", times, recording, rank)
+
+
+def _log_contacts(
+    rr: ModuleType, stream: Any, entity: str, times: list[Any], recording: "Recording", rank: int
+) -> None:
+    """Log the contact forces of one world as arrows. rank: index of the world in the recording."""
+    points, forces = recording.contact_points[:, rank], recording.contact_forces[:, rank]
+    frames, contacts = points.shape[:2]
     if contacts == 0:
         return
-    stream.log("scene/contact_forces", rr.Arrows3D.from_fields(radii=ARROW_RADIUS, colors=ARROW_COLOR), static=True)
-    columns = rr.Arrows3D.columns(
-        origins=recording.contact_points.reshape(-1, 3),
-        vectors=FORCE_SCALE * recording.contact_forces.reshape(-1, 3),
-    )
-    stream.send_columns("scene/contact_forces", times, columns.partition([contacts] * frames))
+    stream.log(entity, rr.Arrows3D.from_fields(radii=ARROW_RADIUS, colors=ARROW_COLOR), static=True)
+    columns = rr.Arrows3D.columns(origins=points.reshape(-1, 3), vectors=FORCE_SCALE * forces.reshape(-1, 3))
+    stream.send_columns(entity, times, columns.partition([contacts] * frames))
 
 
 def _mesh(rr: ModuleType, shape: ShapeMesh) -> Any:
@@ -123,7 +131,9 @@ def _blueprint(recording: "Recording") -> Any:
 
 def _viewpoint(recording: "Recording") -> tuple[np.ndarray, np.ndarray]:
     """Return the point to look at and the eye [m], so that the whole motion is in view."""
-    points = recording.poses[..., :3].reshape(-1, 3)
+    pos = recording.poses[..., :3].reshape(len(recording.times), len(recording.worlds), -1, 3)
+    pos = pos + recording.spacing * np.arange(len(recording.worlds))[:, None, None] * np.array([0.0, 1.0, 0.0])
+    points = pos.reshape(-1, 3)
     points = points[np.isfinite(points).all(axis=1)]
     if len(points) == 0:
         return np.zeros(3), EYE_OFFSET

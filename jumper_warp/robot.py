@@ -43,8 +43,9 @@ PHYSICS_DT = 1.0 / 480.0
 """Physics step [s] that contacts and loops are tuned for."""
 
 CONTACT_STIFFNESS = 56689.0
-"""[1/s^2 scaled as Newton does] Critically damped over two physics steps; softer contacts cost jump height."""
 CONTACT_DAMPING = 476.0
+"""Contact `ke` and `kd`: MuJoCo's solref becomes (2 / kd, kd / (2 sqrt(ke))), critically damped over two physics
+steps. Softer contacts cost jump height."""
 CONTACT_IMPEDANCE = (0.95, 0.99, 0.001, 0.5, 2.0)
 GROUND_FRICTION = 1.0e-4
 """[1] Tiny: a contact takes the larger of its two coefficients, which is then the paw's."""
@@ -52,7 +53,9 @@ GROUND_COLOR = (0.42, 0.46, 0.48)
 LIMIT_STIFFNESS = 1.0e4
 LIMIT_DAMPING = 10.0
 NO_EFFORT_LIMIT = 1.0e6
-"""[N m] Motor models saturate torque; the model itself does not."""
+"""[N m] Motor models saturate torque; the model itself does not. A knee's limit is that of its damping."""
+KNEE_DOFS = [6 + 5 * leg + joint for leg in range(4) for joint in (2, 4)]
+"""A world's knees in `joint_qd`."""
 PAW_GROUP = -1
 """Collision group of the paws: they meet the ground, but not each other."""
 
@@ -138,12 +141,15 @@ def standing_configuration(description: RobotDescription, pose: str = "default")
 def mujoco_solver(model: newton.Model, *, dt: float = PHYSICS_DT, **overrides) -> newton.solvers.SolverMuJoCo:
     """Return Newton's MuJoCo solver with stiff loops for physics steps of `dt` [s].
 
+    It knows neither a damper with a largest torque nor a stop of the sum of two angles: it comes without knee damping,
+    and `jumper_warp.simulation` adds both as torques (`kernels.passive`).
+
     `overrides` replace settings of `newton.solvers.SolverMuJoCo`.
     """
     heightfield = newton.GeoType.HFIELD in model.shape_type.numpy()
     settings = {
         "njmax": 128 if heightfield else 64,
-        "nconmax": 72 if heightfield else 12,
+        "nconmax": None if heightfield else 12,  # None: as many as the heightfield may need
         "iterations": 6,
         "ls_iterations": 6,
         "cone": "pyramidal",
@@ -156,6 +162,9 @@ def mujoco_solver(model: newton.Model, *, dt: float = PHYSICS_DT, **overrides) -
     impedance = solver.mjw_model.eq_solimp.numpy()
     impedance[:] = (0.99, 0.999, 0.001, 0.5, 2.0)
     solver.mjw_model.eq_solimp.assign(impedance)
+    damping = solver.mjw_model.dof_damping.numpy()
+    damping[:, KNEE_DOFS] = 0.0
+    solver.mjw_model.dof_damping.assign(damping)
     return solver
 
 
@@ -208,7 +217,7 @@ def _add_joints(builder: newton.ModelBuilder, bodies: dict[str, int], descriptio
                 armature=motor.armature if motor else 0.0,
                 friction=motor.coulomb_friction if motor else 0.0,
                 damping=0.0 if motor else description.knee_damping,
-                effort_limit=NO_EFFORT_LIMIT,
+                effort_limit=NO_EFFORT_LIMIT if motor else description.knee_damping_limit,
                 label=joint.name,
             )
         )

@@ -147,6 +147,8 @@ class RobotDescription:
     """12, in motor order."""
     knee_damping: float
     """[N m s/rad], every knee."""
+    knee_damping_limit: float
+    """[N m] Largest torque of a knee's damping."""
     transversal_sum: tuple[float, float]
     """[rad] Stops of outer plus inner angle of a leg."""
     poses: dict[str, tuple[float, float]]

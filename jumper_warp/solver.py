@@ -10,12 +10,15 @@ from newton import ModelFlags, StateFlags
 from newton.solvers import SolverBase
 
 from jumper_warp.description import RobotDescription
+from jumper_warp.differentiable import DifferentiableStep
 from jumper_warp.dynamics import JumperDynamics
 
 MAX_SWEEPS = 50
 """Most sweeps of the contact iteration in a step."""
 TOLERANCE = 1.0e-5
 """[m/s] The contact iteration ends when a sweep changes no contact velocity by more."""
+DIFFERENTIABLE_TOLERANCE = 1.0e-6
+"""[m/s] The same where gradients are asked for, which inherit the error."""
 
 
 @wp.kernel(enable_backward=False)
@@ -73,6 +76,10 @@ class SolverJumper(SolverBase):
     body. Forces on other bodies and passive joints are not read. One thread owns one world and nothing is
     accumulated across threads, so results repeat bit for bit on a device.
 
+    Where the states carry gradients (`finalize(requires_grad=True)`) `step` runs kernel by kernel so that `wp.Tape` can
+    run it backwards, with a state of its own for every step. Record `dynamics.pack_masses()` or `pack_joints()` on the
+    tape for gradients with respect to the model's arrays.
+
     A world that becomes non-finite is flagged in `invalid`, parked at rest in the model's reference pose and left
     there until `reset` clears it.
     """
@@ -99,6 +106,7 @@ class SolverJumper(SolverBase):
         self.dynamics = JumperDynamics(model, description=description)
         self.max_sweeps = max_sweeps
         self.tolerance = tolerance
+        self._differentiable = DifferentiableStep(self.dynamics, max_sweeps, min(tolerance, DIFFERENTIABLE_TOLERANCE))
         self._default_control = model.control(clone_variables=False)
         self._no_body_f = wp.zeros(model.body_count, dtype=wp.spatial_vector, device=model.device)
         self._old_body_qd = wp.zeros(model.body_count, dtype=wp.spatial_vector, device=model.device)
@@ -192,9 +200,14 @@ class SolverJumper(SolverBase):
         wants_qdd = observables is not None and observables.is_requested(SolverBase.ObservableKind.BODY_QDD)
         if wants_qdd:
             wp.copy(self._old_body_qd, state_in.body_qd)
-        self.dynamics.advance(
-            settings, drive, state_in.joint_q, state_in.joint_qd, state_out.joint_q, state_out.joint_qd
-        )
+        coordinates = (state_in.joint_q, state_in.joint_qd)
+        out = (state_out.joint_q, state_out.joint_qd)
+        if state_out.joint_q.requires_grad:
+            if motors is not None or substeps != 1:
+                raise ValueError("step_motors is not differentiable; see jumper_warp.rollout")
+            self._differentiable.step(*coordinates, control.joint_f, body_f, *out, dt)
+        else:
+            self.dynamics.advance(settings, drive, *coordinates, *out)
         self.dynamics.full_state(state_out.joint_q, state_out.joint_qd, state_out.body_q, state_out.body_qd)
         if wants_qdd:
             wp.launch(

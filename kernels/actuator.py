@@ -11,7 +11,8 @@ class MotorParams:
 
     kp: real  # [N m/rad]
     kd: real  # [N m s/rad]
-    saturation: real  # [N m] largest torque either way
+    saturation: real  # [N m] largest torque that the controller asks for, either way
+    peak: real  # [N m] largest torque that the motor gives, up to the cutoff speed
     cutoff_speed: real  # [rad/s] full driving torque up to here
     no_load_speed: real  # [rad/s] no driving torque from here, > cutoff_speed
     offset: real  # [rad] what the position sensor reads above the true angle
@@ -26,6 +27,7 @@ class MotorArrays:
     kp: wp.array2d(dtype=real)
     kd: wp.array2d(dtype=real)
     saturation: wp.array2d(dtype=real)
+    peak: wp.array2d(dtype=real)
     cutoff_speed: wp.array2d(dtype=real)
     no_load_speed: wp.array2d(dtype=real)
     offset: wp.array2d(dtype=real)
@@ -47,6 +49,7 @@ def load_motor(motors: MotorArrays, motor: int, world: int) -> MotorParams:
     params.kp = motors.kp[motor, world]
     params.kd = motors.kd[motor, world]
     params.saturation = motors.saturation[motor, world]
+    params.peak = motors.peak[motor, world]
     params.cutoff_speed = motors.cutoff_speed[motor, world]
     params.no_load_speed = motors.no_load_speed[motor, world]
     params.offset = motors.offset[motor, world]
@@ -59,11 +62,11 @@ def load_motor(motors: MotorArrays, motor: int, world: int) -> MotorParams:
 def envelope(direction: real, vel: real, motor: MotorParams) -> real:
     """Return the largest torque [N m], >= 0, along `direction` (+1 or -1) at joint speed `vel` [rad/s].
 
-    Braking keeps the full saturation torque. Driving keeps it up to the cutoff speed, then loses it linearly until
-    the no-load speed.
+    The motor brakes with its peak torque. Driving it keeps the peak up to the cutoff speed, then loses it linearly
+    until the no-load speed. The controller asks for no more than the saturation torque.
     """
     headroom = (motor.no_load_speed - direction * vel) / (motor.no_load_speed - motor.cutoff_speed)
-    return motor.saturation * wp.clamp(headroom, real(0.0), real(1.0))
+    return wp.min(motor.saturation, motor.peak * wp.clamp(headroom, real(0.0), real(1.0)))
 
 
 @wp.func

@@ -4,6 +4,7 @@ import warp as wp
 
 from .actuator import MotorArrays
 from .base_dynamics import LegSolve, invert, motor_acceleration, solve_ang, solve_lin
+from .base_motion import moved_base
 from .contact import ContactState, PawContact, solve_contacts
 from .leg_dynamics import PawKinematics
 from .parameters import BODIES, COORDS, DOFS, GRAVITY, load_vec3
@@ -16,7 +17,6 @@ from .step import (
     drive_torque,
     finite_base,
     leg_terms,
-    moved_base,
     paw_contact,
 )
 

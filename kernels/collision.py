@@ -6,7 +6,8 @@ along the lateral axes, and the shell is four boxes. Pairs between links are mea
 
 Not measured, because the mechanism keeps them apart or together at any joint angle: a leg with its own housing and
 with the motor drums at its own end of the body, around whose axis it turns at a fixed distance; thighs with the shanks
-that hang from them; housings with one another and with other legs (a leg meets the shell or its neighbour first).
+that hang from them; a paw with its own thighs; housings with one another and with other legs (a leg meets the shell or
+its neighbour first).
 """
 
 import warp as wp
@@ -132,7 +133,8 @@ def leg_box_distance(capsules: LegCapsules, box: int, bound: real) -> real:
     center = SHELL_CENTER[box]
     half = SHELL_HALF[box]
     nearest = bound
-    # the whole leg lies in one plane: if that clears the box, so does every link
+    # the whole leg lies in one plane: if that clears the box, so does every link (the thighs' upper ends lie knee_y
+    # inside the plane, which their smaller radius makes good)
     plane_gap = wp.abs(wp.dot(capsules.normal, capsules.hip - center) + capsules.offset) - wp.dot(
         wp.abs(capsules.normal), half
     )
@@ -180,6 +182,7 @@ def leg_leg_distance(leg: LegCapsules, other: LegCapsules, bound: real) -> real:
 def body_ground_distance(ground: Ground, pos: vec3, rotation: mat33) -> real:
     """Return the distance [m] of the shell from the ground, at the lower corners of its boxes.
 
+    Exact over a plane; over a heightfield, what rises between the corners (0.2 m apart at most along x) is missed.
     pos: base position [m], world; rotation: body to world.
     """
     lower = wp.where(rotation[2, 2] < real(0.0), real(1.0), real(-1.0))

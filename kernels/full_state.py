@@ -5,7 +5,7 @@ import warp as wp
 from .five_bar import five_bar, five_bar_bias
 from .geometry import LegGeometry
 from .leg_links import in_plane
-from .parameters import BODIES, DOFS, LEG_BODIES
+from .parameters import BODIES, LEG_BODIES
 from .scalar import quat, real, vec2, vec3
 from .state import BaseState, leg_coord, leg_dof, load_base, load_motors
 

@@ -55,20 +55,31 @@ def joint_friction(p: JointParams, rates: vec3) -> vec3:
 
 
 @wp.func
+def capped_damping(damping: real, rate: real, limit: real) -> real:
+    """Return the viscous coefficient [N m s/rad] of a damper whose torque never exceeds `limit` [N m]."""
+    return wp.min(damping, limit / wp.max(wp.abs(rate), real(1.0e-6)))
+
+
+@wp.func
+def knee_damping(p: JointParams, loop: FiveBar, front: real, rates: vec3) -> mat33:
+    """Return the motor-space damping matrix [N m s/rad] of a leg's passive knees."""
+    zero = real(0.0)
+    # knee rate = shank rate - thigh rate, per outer and inner motor rate
+    outer_knee = vec3(zero, loop.outer_shank_do + front, loop.outer_shank_di)
+    inner_knee = vec3(zero, loop.inner_shank_do, loop.inner_shank_di - front)
+    outer = capped_damping(p.knee_damping_outer, wp.dot(outer_knee, rates), p.knee_limit_outer)
+    inner = capped_damping(p.knee_damping_inner, wp.dot(inner_knee, rates), p.knee_limit_inner)
+    return outer * wp.outer(outer_knee, outer_knee) + inner * wp.outer(inner_knee, inner_knee)
+
+
+@wp.func
 def joint_forces(p: JointParams, loop: FiveBar, front: real, angles: vec3, rates: vec3, dt: real) -> JointForces:
     """Return friction, knee damping and hard stops of one leg.
 
     angles, rates: lateral, outer, inner [rad], [rad/s]; dt: step [s].
     """
     zero = real(0.0)
-    c = joint_friction(p, rates)
-    # knee rate = shank rate - thigh rate, per outer and inner motor rate
-    outer_knee = vec3(zero, loop.outer_shank_do + front, loop.outer_shank_di)
-    inner_knee = vec3(zero, loop.inner_shank_do, loop.inner_shank_di - front)
-    knees = p.knee_damping_outer * wp.outer(outer_knee, outer_knee) + p.knee_damping_inner * wp.outer(
-        inner_knee, inner_knee
-    )
-    damping = knees + wp.diag(c)
+    damping = knee_damping(p, loop, front, rates) + wp.diag(joint_friction(p, rates))
     fold = angles[1] + angles[2]
     fold_rate = rates[1] + rates[2]
     stops = vec3(

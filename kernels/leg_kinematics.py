@@ -56,12 +56,12 @@ def leg_jacobian(geo: LegGeometry, lateral: real, outer: real, inner: real) -> m
 
 @wp.func
 def damped_ratio(value: real, divisor: real) -> real:
-    """Return value / divisor, fading to zero where the divisor's magnitude is below 2 mm.
+    """Return value / divisor, fading to zero where the divisor's magnitude is below 10 mm.
 
-    The divisor is the ankle's lever about a thigh axis along the shank [m/rad]; 2 mm are 0.7 degrees short of a
-    stretched or folded leg, where no rate gives the wanted velocity.
+    The divisor is the ankle's lever about a thigh axis along the shank [m/rad]; it is below 10 mm where thigh and shank
+    are within 3.3 degrees of one line, and no sensible rate gives the wanted velocity.
     """
-    floor = real(0.002)
+    floor = real(0.01)
     return value * divisor / wp.max(divisor * divisor, floor * floor)
 
 
@@ -69,12 +69,13 @@ def damped_ratio(value: real, divisor: real) -> real:
 def leg_inverse_velocity(geo: LegGeometry, angles: vec3, ankle_vel: vec3) -> vec3:
     """Return motor rates [rad/s] that move the ankle at `ankle_vel` [m/s] relative to the body, in the body frame.
 
-    The inverse of `leg_jacobian`, exact unless a thigh and its shank are within 0.7 degrees of one line.
+    The inverse of `leg_jacobian`, exact within joint limits unless a thigh and its shank are within 3.3 degrees of one
+    line; nearer to it the rates are damped: at most 100 rad/s per m/s along the shank.
     """
     loop = five_bar(geo, angles[1], angles[2])
     vel = turn_lateral(geo, -angles[0], ankle_vel)
-    # only the lateral motor moves the ankle along housing y; the ankle is always below the hip
-    lateral_rate = -geo.side * vel[1] / loop.ankle[1]
+    # only the lateral motor moves the ankle along housing y; within joint limits the ankle is 0.1 m below or more
+    lateral_rate = -geo.side * vel[1] / wp.min(loop.ankle[1], real(-0.01))
     in_plane = vec2(vel[0], vel[2] - geo.side * lateral_rate * (geo.plane_y + geo.knee_y))
     # shanks are rigid: ankle and knee move equally fast along them
     outer_rate = damped_ratio(wp.dot(loop.outer_shank, in_plane), wp.dot(loop.outer_shank, loop.outer_knee_do))

@@ -30,12 +30,13 @@ STOP_KE = wp.constant(69)  # [N m/rad]
 STOP_KD = wp.constant(70)  # [N m s/rad]
 MU_DYNAMIC = wp.constant(71)
 MU_STATIC = wp.constant(72)
-LEG_ROWS = wp.constant(73)
+KNEE_LIMIT = wp.constant(73)  # 2: outer, inner: largest torque of the knee damping [N m]
+LEG_ROWS = wp.constant(75)
 
 # rows of the base block
-BASE = wp.constant(4 * 73)
-GRAVITY = wp.constant(4 * 73 + MOMENT_ROWS)  # 3, world frame [m/s^2]
-PARAMETER_ROWS = 4 * 73 + MOMENT_ROWS + 3
+BASE = wp.constant(4 * 75)
+GRAVITY = wp.constant(4 * 75 + MOMENT_ROWS)  # 3, world frame [m/s^2]
+PARAMETER_ROWS = 4 * 75 + MOMENT_ROWS + 3
 
 BODIES = wp.constant(21)  # per world: base, then 5 links a leg
 LEG_BODIES = wp.constant(5)
@@ -52,6 +53,8 @@ class JointParams:
     damping: vec3  # [N m s/rad]
     knee_damping_outer: real  # [N m s/rad]
     knee_damping_inner: real
+    knee_limit_outer: real  # [N m] largest torque of the knee damping
+    knee_limit_inner: real
     lower: vec3  # [rad]
     upper: vec3
     sum_lower: real  # [rad]
@@ -106,6 +109,8 @@ def load_joint_params(table: wp.array2d(dtype=real), leg: int, world: int) -> Jo
     p.damping = load_vec3(table, row + DAMPING, world)
     p.knee_damping_outer = table[row + KNEE_DAMPING, world]
     p.knee_damping_inner = table[row + KNEE_DAMPING + 1, world]
+    p.knee_limit_outer = table[row + KNEE_LIMIT, world]
+    p.knee_limit_inner = table[row + KNEE_LIMIT + 1, world]
     p.lower = load_vec3(table, row + LOWER, world)
     p.upper = load_vec3(table, row + UPPER, world)
     p.sum_lower = table[row + SUM_LOWER, world]
@@ -161,6 +166,7 @@ def pack_joints_kernel(
     upper: wp.array(dtype=float),
     limit_ke: wp.array(dtype=float),
     limit_kd: wp.array(dtype=float),
+    effort_limit: wp.array(dtype=float),
     sum_lower: float,
     sum_upper: float,
     # out
@@ -182,6 +188,8 @@ def pack_joints_kernel(
         table[row + UPPER + j, world] = real(upper[i])
     table[row + KNEE_DAMPING, world] = real(damping[dof + 2])
     table[row + KNEE_DAMPING + 1, world] = real(damping[dof + 4])
+    table[row + KNEE_LIMIT, world] = real(effort_limit[dof + 2])
+    table[row + KNEE_LIMIT + 1, world] = real(effort_limit[dof + 4])
     table[row + SUM_LOWER, world] = real(sum_lower)
     table[row + SUM_UPPER, world] = real(sum_upper)
     table[row + STOP_KE, world] = real(limit_ke[dof + 1])

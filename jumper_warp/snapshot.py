@@ -1,0 +1,137 @@
+"""Pictures of a Newton model, ray-traced without a display."""
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+
+import matplotlib.figure
+import matplotlib.image
+import newton
+import numpy as np
+import warp as wp
+from newton.sensors import SensorCamera
+
+EYE = (1.1, 1.4, 0.6)
+"""Default position of the eye [m], world frame: ahead of the robot, on its left."""
+TARGET = (0.0, 0.0, 0.25)
+"""Default point that it looks at [m]."""
+SIZE = (640, 480)
+"""Default width and height [px]."""
+FIELD_OF_VIEW = math.radians(40.0)
+"""Vertical angle of view [rad]."""
+LIGHT_DIRECTION = (-0.35, -0.45, -0.82)
+"""Where the light shines, world frame; over the default eye's shoulder."""
+AMBIENT = (0.55, 0.56, 0.60)
+"""Linear RGB from above and from below, so that the shaded sides stay readable."""
+SKY = 0xFFF5F0EC
+"""Color behind everything: alpha, blue, green, red."""
+SAMPLES = 4
+"""Rays per pixel."""
+
+
+class Camera:
+    """A fixed camera on a model; one picture per call."""
+
+    def __init__(
+        self,
+        model: newton.Model,
+        eye: Sequence[float] = EYE,
+        target: Sequence[float] = TARGET,
+        size: tuple[int, int] = SIZE,
+        world: int = 0,
+    ) -> None:
+        """Place the camera.
+
+        Args:
+            model: Its visible shapes are drawn.
+            eye: Position [m], world frame, shape (3,).
+            target: Point in the middle of the picture [m], world frame, shape (3,).
+            size: Width and height [px].
+            world: Which world to draw.
+
+        Raises:
+            ValueError: Eye and target coincide or lie on one vertical, or the model has no such world.
+        """
+        if not 0 <= world < model.world_count:
+            raise ValueError(f"world {world} is outside the model's {model.world_count} worlds")
+        self._model = model
+        self._sensor = SensorCamera(model)
+        self._sensor.create_default_light(direction=wp.normalize(wp.vec3(*LIGHT_DIRECTION)))
+        self._sensor.set_ambient_light(AMBIENT)
+        self._sensor.default_clear_data = SensorCamera.ClearData(clear_color=SKY)
+        self._sensor.default_render_config.enable_shadows = True
+        self._sensor.default_render_config.anti_aliasing = SensorCamera.AntiAliasing.SSAA
+        self._rays = SensorCamera.compute_camera_rays_pinhole(
+            *size, camera_fov=FIELD_OF_VIEW, sample_count=SAMPLES, device=model.device
+        )
+        self._pose = wp.array([look_at(eye, target)], dtype=wp.transformf, device=model.device)
+        self._world = wp.array([world], dtype=wp.int32, device=model.device)
+        self._pixels = self._sensor.allocate_image_color(1, *size)
+
+    def picture(self, state: newton.State) -> np.ndarray:
+        """Return the picture of a state, from its `body_q`: (height, width, 3) uint8, RGB."""
+        self._model.bvh_refit_shapes(state)
+        self._sensor.update(state, self._pose, self._rays, color_image=self._pixels, world_indices=self._world)
+        return SensorCamera.Utils.to_rgba_from_color(self._pixels).numpy()[0, ..., :3].copy()
+
+
+def look_at(eye: Sequence[float], target: Sequence[float]) -> wp.transformf:
+    """Return the pose of a camera, looking along its -z with +y up, from eye to target [m], world z up.
+
+    Raises:
+        ValueError: Eye and target coincide or lie on one vertical.
+    """
+    ahead = np.asarray(target, dtype=float) - np.asarray(eye, dtype=float)
+    right = np.cross(ahead, [0.0, 0.0, 1.0])
+    if np.linalg.norm(right) < 1.0e-6 * max(1.0, float(np.linalg.norm(ahead))):
+        raise ValueError(f"cannot look from {tuple(eye)} to {tuple(target)}: no horizontal distance")
+    ahead /= np.linalg.norm(ahead)
+    right /= np.linalg.norm(right)
+    axes = np.stack([right, np.cross(right, ahead), -ahead], axis=1)
+    return wp.transformf(wp.vec3(*map(float, eye)), wp.quat_from_matrix(wp.mat33(*axes.ravel().tolist())))
+
+
+def render(
+    model: newton.Model,
+    state: newton.State,
+    path: Path,
+    eye: Sequence[float] = EYE,
+    target: Sequence[float] = TARGET,
+    size: tuple[int, int] = SIZE,
+) -> Path:
+    """Write a picture of world 0 as a PNG file, see `Camera`; return its path."""
+    matplotlib.image.imsave(path, Camera(model, eye, target, size).picture(state))
+    return Path(path)
+
+
+def contact_sheet(
+    pictures: Sequence[np.ndarray], path: Path, captions: Sequence[str] | None = None, columns: int | None = None
+) -> Path:
+    """Write pictures side by side as one PNG file; return its path.
+
+    Args:
+        pictures: (height, width, 3) uint8 each, all of one size.
+        path: Where to write.
+        captions: One per picture, drawn in its upper left corner.
+        columns: Pictures per row. Default: all in one row, a filmstrip.
+
+    Raises:
+        ValueError: No pictures, unequal sizes, or another number of captions.
+    """
+    if not pictures or len({picture.shape for picture in pictures}) != 1:
+        raise ValueError("a contact sheet needs pictures, all of one size")
+    captions = [""] * len(pictures) if captions is None else captions
+    if len(captions) != len(pictures):
+        raise ValueError(f"{len(pictures)} pictures have {len(captions)} captions")
+    columns = len(pictures) if columns is None else columns
+    rows = -(-len(pictures) // columns)
+    height, width, _ = pictures[0].shape
+    sheet = np.full((rows * height, columns * width, 3), 255, dtype=np.uint8)
+    figure = matplotlib.figure.Figure(figsize=(columns * width / 100, rows * height / 100), dpi=100)
+    for index, (picture, caption) in enumerate(zip(pictures, captions, strict=True)):
+        y, x = height * (index // columns), width * (index % columns)
+        sheet[y : y + height, x : x + width] = picture
+        figure.text((x + 8) / sheet.shape[1], 1.0 - (y + 8) / sheet.shape[0], caption, va="top", fontsize=10)
+    figure.figimage(sheet)
+    figure.savefig(path, dpi=100)
+    return Path(path)

@@ -1,0 +1,3 @@
+import warp as wp
+
+wp.config.log_level = wp.LOG_WARNING
