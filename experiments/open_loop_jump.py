@@ -36,6 +36,10 @@ STAND, RAMP, HOLD, EXTEND, LAND = 60, 25, 50, 40, 60
 """Ticks of 1/60 s: default pose, ramp into the squat, squat, full extension, default pose again."""
 
 
+PER_MOTOR = tuple(f"peak_{what}_{leg}" for what in ("torque", "speed") for leg in LEGS)
+"""Beginnings of the figures that are saved but not printed."""
+
+
 @dataclass(frozen=True)
 class Args:
     """Flags."""

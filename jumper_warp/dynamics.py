@@ -198,12 +198,25 @@ class JumperDynamics:
         settings.max_sweeps, settings.tolerance = max_sweeps, tolerance
         return settings
 
-    def drive(self, joint_f: wp.array, body_f: wp.array, motors: Any = None, target: wp.array | None = None) -> Any:
-        """Return the kernels' `Drive`; with `motors` (MotorArrays) and `target` (12, num_worlds) the loop is closed."""
+    def drive(
+        self,
+        joint_f: wp.array,
+        body_f: wp.array,
+        motors: Any = None,
+        target: wp.array | None = None,
+        previous: wp.array | None = None,
+        delay: wp.array | None = None,
+    ) -> Any:
+        """Return the kernels' `Drive`; with `motors` (MotorArrays) and `target` (12, num_worlds) the loop is closed.
+
+        With `delay` [steps], shape (num_worlds,), the motors follow `previous` until the target arrives.
+        """
         drive = self.modules.advance.Drive()
         drive.joint_f, drive.body_f = joint_f, body_f
         if motors is not None:
             drive.closed_loop, drive.motors, drive.target = 1, motors, target
+        if delay is not None:
+            drive.previous, drive.delay = previous, delay
         return drive
 
     def advance(self, settings: Any, drive: Any, q: wp.array, qd: wp.array, q_out: wp.array, qd_out: wp.array) -> None:

@@ -66,11 +66,11 @@ def _find_apex_kernel(
 ):
     """Find the row of the largest height, and the last row up to there that ends a step with a paw on the ground."""
     world = wp.tid()
-    apex = 0
+    apex = wp.int32(0)
     for row in range(1, height.shape[0]):
         if height[row, world] > height[apex, world]:
             apex = row
-    takeoff = apex
+    takeoff = wp.int32(apex)
     while takeoff > 0 and touching[takeoff, world] == 0:
         takeoff -= 1
     apex_row[world] = apex
@@ -219,7 +219,7 @@ class DifferentiableRollout:
             q.append(new_q)
             qd.append(new_qd)
             self._launch(_base_motion_kernel, self.num_worlds, [new_q, new_qd, step + 1], [height, speed])
-            self._launch(_touch_kernel, self.num_worlds, [work.impulse, step + 1], [touching])
+            self._launch(_touch_kernel, self.num_worlds, [work.impulse, step + 1], [touching], record=False)
         return Rollout(q, qd, height, speed, touching, *self._apexes(height, speed, touching))
 
     def _check(self, targets: wp.array, joint_q: wp.array, joint_qd: wp.array) -> None:
@@ -254,7 +254,7 @@ class DifferentiableRollout:
         """Return the last four fields of `Rollout`."""
         n, device = self.num_worlds, self.dynamics.device
         apex_row, takeoff_row = (wp.zeros(n, dtype=int, device=device) for _ in range(2))
-        self._launch(_find_apex_kernel, n, [height, touching], [apex_row, takeoff_row])
+        self._launch(_find_apex_kernel, n, [height, touching], [apex_row, takeoff_row], record=False)
         apex, ballistic = self._zeros(n), self._zeros(n)
         self._launch(_gather_kernel, n, [height, apex_row], [apex])
         table = self.dynamics.robot.table
@@ -264,5 +264,7 @@ class DifferentiableRollout:
     def _zeros(self, shape: int | tuple[int, ...]) -> wp.array:
         return wp.zeros(shape, dtype=self.real, device=self.dynamics.device, requires_grad=True)
 
-    def _launch(self, kernel: wp.Kernel, dim: int | tuple[int, ...], inputs: list, outputs: list) -> None:
-        wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.dynamics.device)
+    def _launch(
+        self, kernel: wp.Kernel, dim: int | tuple[int, ...], inputs: list, outputs: list, record: bool = True
+    ) -> None:
+        wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.dynamics.device, record_tape=record)

@@ -17,7 +17,7 @@ from kernels.actuator import motor_torque_kernel
 from kernels.command_filter import command_filter_kernel
 from kernels.parameters import COORDS, DOFS
 from kernels.passive import passive_torque_kernel
-from kernels.readout import motor_values_kernel, paw_force_kernel
+from kernels.readout import arrived_target_kernel, motor_values_kernel, paw_force_kernel
 
 SUBSTEPS = 8
 """Physics steps of 1/480 s in a policy step of 1/60 s."""
@@ -100,6 +100,7 @@ class Simulation:
         self.torque = wp.zeros((12, n), dtype=float, device=self.device)
         self.paw_force = wp.zeros((4, n), dtype=wp.vec3, device=self.device)
         self.peak_force = wp.zeros(n, dtype=float, device=self.device)
+        self._arrived = wp.zeros((12, n), dtype=float, device=self.device)
         self._sensor = self._contacts = self._observables = None
         if observe_forces:
             pipeline = newton.CollisionPipeline(
@@ -150,36 +151,48 @@ class Simulation:
         )
 
     def _physics(self, substeps: int) -> None:
+        self.physics(substeps, self._safe_target)
+
+    def physics(
+        self,
+        substeps: int,
+        target: wp.array,
+        previous: wp.array | None = None,
+        delay: wp.array | None = None,
+        bodies: bool = True,
+    ) -> None:
+        """Launch physics steps towards motor targets [rad], shape (12, num_worlds), without the filter.
+
+        With `delay` [physics steps], shape (num_worlds,), the motors follow `previous` until the target arrives.
+        `bodies` False leaves passive joints and bodies of the state behind on SolverJumper, which does not need them.
+        """
         if isinstance(self.solver, SolverJumper):
-            self.solver.step_motors(self.state, self.state, self.motors, self._safe_target, self.dt, substeps)
+            self.solver.step_motors(
+                self.state, self.state, self.motors, target, self.dt, substeps,
+                previous=previous, delay=delay, bodies=bodies,
+            )  # fmt: skip
             return
         for i in range(substeps):
-            wp.launch(
-                motor_torque_kernel,
-                dim=(12, self.num_worlds),
-                inputs=[self._safe_target, self.state.joint_q, self.state.joint_qd, COORDS, DOFS, self.motors],
-                outputs=[self.control.joint_f],
-                device=self.device,
-            )
-            wp.launch(
-                motor_values_kernel,
-                dim=(12, self.num_worlds),
-                inputs=[self.control.joint_f],
-                outputs=[self.torque],
-                device=self.device,
-            )
-            wp.launch(
-                passive_torque_kernel,
-                dim=(self.num_worlds, 4),
-                inputs=[self.state.joint_q, self.state.joint_qd, *self._passive],
-                outputs=[self.control.joint_f],
-                device=self.device,
-            )
-            self.solver.step(
-                self.state, self.state, self.control, self._contacts, self.dt, observables=self._observables
-            )
-            if self._sensor is not None:
-                self._read_paw_forces(restart=i == 0)
+            if delay is not None:
+                self._launch(
+                    arrived_target_kernel, (12, self.num_worlds), [target, previous, delay, i], [self._arrived]
+                )
+            self._mujoco_step(target if delay is None else self._arrived, restart=i == 0)
+
+    def _mujoco_step(self, target: wp.array, restart: bool) -> None:
+        """Launch one physics step of SolverMuJoCo."""
+        q, qd = self.state.joint_q, self.state.joint_qd
+        joint_f = self.control.joint_f
+        motors = (12, self.num_worlds)
+        self._launch(motor_torque_kernel, motors, [target, q, qd, COORDS, DOFS, self.motors], [joint_f])
+        self._launch(motor_values_kernel, motors, [joint_f], [self.torque])
+        self._launch(passive_torque_kernel, (self.num_worlds, 4), [q, qd, *self._passive], [joint_f])
+        self.solver.step(self.state, self.state, self.control, self._contacts, self.dt, observables=self._observables)
+        if self._sensor is not None:
+            self._read_paw_forces(restart)
+
+    def _launch(self, kernel: wp.Kernel, dim: int | tuple[int, ...], inputs: list, outputs: list) -> None:
+        wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device)
 
     def _read_paw_forces(self, restart: bool) -> None:
         self._sensor.update(self.state, self._contacts, observables=self._observables)

@@ -153,7 +153,10 @@ class SolverJumper(SolverBase):
     ) -> None:
         """Advance every world by dt [s]. `contacts` is not used: the solver finds the paws' contacts itself."""
         self.validate_observables(observables, contacts)
-        self._advance(state_in, state_out, control, dt, 1, None, None, observables)
+        body_f = self._no_body_f if state_in.body_f is None else state_in.body_f
+        joint_f = (self._default_control if control is None else control).joint_f
+        drive = self.dynamics.drive(joint_f, body_f)
+        self._advance(state_in, state_out, drive, dt, 1, observables, bodies=True)
 
     def step_motors(
         self,
@@ -165,6 +168,9 @@ class SolverJumper(SolverBase):
         substeps: int,
         *,
         control: newton.Control | None = None,
+        previous: wp.array | None = None,
+        delay: wp.array | None = None,
+        bodies: bool = True,
         observables: SolverBase.Observables | None = None,
     ) -> None:
         """Advance every world by `substeps` steps of dt [s], the motors following targets, in one launch.
@@ -177,38 +183,41 @@ class SolverJumper(SolverBase):
             dt: Physics step [s].
             substeps: Number of physics steps.
             control: Additional joint forces, held.
+            previous: Motor angles [rad] that the motors follow until the target arrives.
+            delay: Physics steps until it does, shape (num_worlds,).
+            bodies: Whether to write passive joints, loop joints and bodies; the solver itself does not need them.
             observables: Observables of the whole call.
         """
         self.validate_observables(observables)
-        self._advance(state_in, state_out, control, dt, substeps, motors, target, observables)
+        body_f = self._no_body_f if state_in.body_f is None else state_in.body_f
+        joint_f = (self._default_control if control is None else control).joint_f
+        drive = self.dynamics.drive(joint_f, body_f, motors, target, previous, delay)
+        self._advance(state_in, state_out, drive, dt, substeps, observables, bodies)
 
     def _advance(
         self,
         state_in: newton.State,
         state_out: newton.State,
-        control: newton.Control | None,
+        drive: Any,
         dt: float,
         substeps: int,
-        motors: Any,
-        target: wp.array | None,
         observables: SolverBase.Observables | None,
+        bodies: bool,
     ) -> None:
-        control = self._default_control if control is None else control
-        body_f = self._no_body_f if state_in.body_f is None else state_in.body_f
-        settings = self.dynamics.settings(dt, substeps, self.max_sweeps, self.tolerance)
-        drive = self.dynamics.drive(control.joint_f, body_f, motors, target)
         wants_qdd = observables is not None and observables.is_requested(SolverBase.ObservableKind.BODY_QDD)
         if wants_qdd:
             wp.copy(self._old_body_qd, state_in.body_qd)
         coordinates = (state_in.joint_q, state_in.joint_qd)
         out = (state_out.joint_q, state_out.joint_qd)
         if state_out.joint_q.requires_grad:
-            if motors is not None or substeps != 1:
+            if drive.closed_loop or substeps != 1:
                 raise ValueError("step_motors is not differentiable; see jumper_warp.rollout")
-            self._differentiable.step(*coordinates, control.joint_f, body_f, *out, dt)
+            self._differentiable.step(*coordinates, drive.joint_f, drive.body_f, *out, dt)
         else:
+            settings = self.dynamics.settings(dt, substeps, self.max_sweeps, self.tolerance)
             self.dynamics.advance(settings, drive, *coordinates, *out)
-        self.dynamics.full_state(state_out.joint_q, state_out.joint_qd, state_out.body_q, state_out.body_qd)
+        if bodies or wants_qdd:
+            self.dynamics.full_state(*out, state_out.body_q, state_out.body_qd)
         if wants_qdd:
             wp.launch(
                 _acceleration_kernel,

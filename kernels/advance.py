@@ -30,6 +30,8 @@ class Drive:
     closed_loop: int  # 1: the motors follow `target`; 0: only `joint_f` acts
     motors: MotorArrays
     target: wp.array2d(dtype=real)  # [rad], (12, num_worlds)
+    previous: wp.array2d(dtype=real)  # [rad], (12, num_worlds), followed before the target arrives
+    delay: wp.array(dtype=int)  # steps until it does, (num_worlds,); empty: none
     joint_f: wp.array(dtype=real)  # [N m] and, for the base, world wrench at its com; Newton's layout
     body_f: wp.array(dtype=wp.spatial_vector)  # world wrench at the com of each body; the base's is used
 
@@ -61,11 +63,18 @@ def park(work: Workspace, world: int, joint_q: wp.array(dtype=real), joint_qd: w
 
 
 @wp.func
-def applied_torque(drive: Drive, world: int, k: int, angles: vec3, rates: vec3, torque: wp.array2d(dtype=real)) -> vec3:
+def applied_torque(
+    drive: Drive, world: int, k: int, step: int, angles: vec3, rates: vec3, torque: wp.array2d(dtype=real)
+) -> vec3:
     """Return leg k's motor-space torque [N m]; the motors' share is written to `torque`."""
     motor = vec3(real(0.0))
     if drive.closed_loop != 0:
         target = vec3(drive.target[3 * k, world], drive.target[3 * k + 1, world], drive.target[3 * k + 2, world])
+        if drive.delay.shape[0] > 0:
+            if step < drive.delay[world]:
+                target = vec3(
+                    drive.previous[3 * k, world], drive.previous[3 * k + 1, world], drive.previous[3 * k + 2, world]
+                )
         motor = drive_torque(drive.motors, k, world, target, angles, rates)
     total = motor + load_motors(drive.joint_f, leg_dof(world, k))
     for j in range(3):
@@ -86,7 +95,7 @@ def base_wrench(drive: Drive, world: int) -> wp.spatial_vector:
 
 @wp.func
 def advance_once(
-    robot: Robot, settings: StepSettings, drive: Drive, work: Workspace, world: int, base: BaseState,
+    robot: Robot, settings: StepSettings, drive: Drive, work: Workspace, world: int, step: int, base: BaseState,
     angles: wp.array(dtype=vec3), rates: wp.array(dtype=vec3), legs: wp.array(dtype=LegSolve),
     paws: wp.array(dtype=PawKinematics), contacts: wp.array(dtype=PawContact),
 ) -> BaseState:  # fmt: skip
@@ -98,7 +107,7 @@ def advance_once(
     moment = vec3(real(wrench[3]), real(wrench[4]), real(wrench[5]))
     system = base_system(robot, world, base, g, force, moment)
     for k in range(legs.shape[0]):
-        torque = applied_torque(drive, world, k, angles[k], rates[k], work.torque)
+        torque = applied_torque(drive, world, k, step, angles[k], rates[k], work.torque)
         system = leg_terms(robot, world, k, angles[k], rates[k], torque, base.ang, g, dt, system, legs, paws)
     inverse = invert(system)
     lin_acc = solve_lin(inverse, system.force, system.moment)
@@ -173,8 +182,8 @@ def advance_kernel(
     work.residual[world] = real(0.0)
     work.sweeps[world] = 0
     work.peak_force[world] = real(0.0)
-    for _step in range(settings.substeps):
-        base = advance_once(robot, settings, drive, work, world, base, angles, rates, legs, paws, contacts)
+    for step in range(settings.substeps):
+        base = advance_once(robot, settings, drive, work, world, step, base, angles, rates, legs, paws, contacts)
     total = real(0.0)
     for k in range(angles.shape[0]):
         store_motors(joint_q_out, leg_coord(world, k), angles[k])

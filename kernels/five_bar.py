@@ -49,7 +49,7 @@ class FiveBarBias:
 
 @wp.func
 def turn_rate(direction: vec2, velocity: vec2, length: real) -> real:
-    """Return the rotation rate about +y [rad/s] of a link whose far end moves at `velocity` relative to its near end."""
+    """Return the rate about +y [rad/s] of a link whose far end moves at `velocity` relative to its near end."""
     return (direction[1] * velocity[0] - direction[0] * velocity[1]) / length
 
 

@@ -43,3 +43,18 @@ def paw_force_kernel(
     if restart != 0:
         peak = 0.0
     peak_force[world] = wp.max(peak, wp.length(total))
+
+
+@wp.kernel
+def arrived_target_kernel(
+    # in
+    target: wp.array2d(dtype=float),
+    previous: wp.array2d(dtype=float),
+    delay: wp.array(dtype=int),
+    step: int,
+    # out
+    arrived: wp.array2d(dtype=float),
+):
+    """Write the motor targets [rad] of a physics step: before `delay` the previous ones; (12, num_worlds) threads."""
+    motor, world = wp.tid()
+    arrived[motor, world] = wp.where(step < delay[world], previous[motor, world], target[motor, world])

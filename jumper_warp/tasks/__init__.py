@@ -1,0 +1,19 @@
+"""The tasks by name."""
+
+from collections.abc import Callable
+
+from jumper_warp.tasks.task import TaskCfg
+from jumper_warp.tasks.vertical_jump import vertical_jump
+
+TASKS: dict[str, Callable[[], TaskCfg]] = {
+    "vertical-jump": vertical_jump,
+}
+ALIASES = {"Olympus-Vertical-Jump": "vertical-jump"}
+
+
+def make_task(name: str) -> TaskCfg:
+    """Return a task by name or alias. Raises ValueError for an unknown one."""
+    name = ALIASES.get(name, name)
+    if name not in TASKS:
+        raise ValueError(f"unknown task {name!r}; there are {', '.join(TASKS)}")
+    return TASKS[name]()

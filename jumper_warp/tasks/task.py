@@ -1,0 +1,212 @@
+"""What a task is: observation, reward table, terminations, resets, curriculum and randomisation, as data."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, fields
+from typing import Any
+
+import warp as wp
+
+from jumper_warp.motors import FilterCfg, MotorCfg
+from jumper_warp.randomization import RandomizationCfg
+from kernels.observe import SensorNoise
+from kernels.reset import ResetRanges
+
+Pair = tuple[float, float]
+
+
+@dataclass(frozen=True)
+class Term:
+    """One line of the reward table."""
+
+    func: wp.Function
+    """(view: RobotView, task: JumpTask, p: wp.vec4) -> float"""
+    weight: float
+    """Multiplies the term; carries the sign."""
+    params: tuple[float, ...] = ()
+    """Up to four numbers that the function reads as p."""
+    once: bool = False
+    """Whether the term is paid per event; otherwise it is multiplied by the policy step [s]."""
+
+    def __post_init__(self) -> None:
+        _check_params(self.func, self.params)
+        if not math.isfinite(self.weight):
+            raise ValueError(f"the weight of {self.name} must be finite, got {self.weight}")
+
+    @property
+    def name(self) -> str:
+        """The function's name."""
+        return self.func.key.split(".")[-1]
+
+
+@dataclass(frozen=True)
+class Rule:
+    """One reason for an episode to end. The first that holds counts; a success must be the table's first."""
+
+    func: wp.Function
+    """(view: RobotView, task: JumpTask, p: wp.vec4) -> bool"""
+    params: tuple[float, ...] = ()
+    """Up to four numbers that the function reads as p."""
+    success: bool = False
+    """Whether this is no failure: the value of what would follow is counted."""
+
+    def __post_init__(self) -> None:
+        _check_params(self.func, self.params)
+
+    @property
+    def name(self) -> str:
+        """The function's name."""
+        return self.func.key.split(".")[-1]
+
+
+def _check_params(func: wp.Function, params: tuple[float, ...]) -> None:
+    if len(params) > 4 or not all(math.isfinite(p) for p in params):
+        raise ValueError(f"{func.key} takes up to four finite parameters, got {params}")
+
+
+@dataclass(frozen=True)
+class ResetCfg:
+    """Reference state initialisation: shares of the schemes and ranges of their states; angles in degrees."""
+
+    standing: float = 0.60
+    default: float = 0.15
+    in_flight: float = 0.20
+    touchdown: float = 0.0
+    """Shares; what is left begins just landed."""
+    base_xy: float = 0.05
+    """[m]"""
+    tilt: float = 5.0
+    """[deg] Roll, pitch and yaw."""
+    forward_pitch: float = 0.0
+    """[deg] Of standing states."""
+    heading: float = 0.0
+    """[deg] Half width of the heading."""
+    front_x: Pair = (0.20, 0.22)
+    """[m] Paw positions relative to the base."""
+    front_y: Pair = (0.15, 0.17)
+    """[m]"""
+    back_x: Pair = (0.20, 0.22)
+    """[m]"""
+    back_y: Pair = (0.20, 0.22)
+    """[m]"""
+    takeoff_height: Pair = (0.40, 0.45)
+    """[m]"""
+    flight_time: Pair = (0.01, 0.95)
+    """[1] Share of the time in the air."""
+    flight_lateral: float = 10.0
+    """[deg]"""
+    flight_transversal: Pair = (0.0, 90.0)
+    """[deg]"""
+    touchdown_time: Pair = (0.03, 0.15)
+    """[s] Before landing."""
+    paw_depth: Pair = (0.30, 0.45)
+    """[m] Paws below the base before touchdown."""
+    landed_height: Pair = (0.30, 0.42)
+    """[m]"""
+    landed_speed: Pair = (0.0, 1.0)
+    """[m/s] Downward."""
+    command_delay: float = 0.5
+    """[s] Longest time until the jump is commanded."""
+
+    def ranges(self, step_dt: float) -> Any:
+        """Return the kernels' `ResetRanges`. Raises ValueError for shares that do not add up."""
+        shares = (self.standing, self.default, self.in_flight, self.touchdown)
+        if min(shares) < 0.0 or sum(shares) > 1.0 + 1e-9:
+            raise ValueError(f"reset shares must be >= 0 and add up to at most 1, got {shares}")
+        ranges = ResetRanges()
+        ranges.shares = wp.vec4(*(sum(shares[: i + 1]) for i in range(4)))
+        degrees = ("tilt", "forward_pitch", "heading", "flight_lateral", "flight_transversal")
+        for spec in fields(self)[4:-1]:
+            value = getattr(self, spec.name)
+            scale = math.pi / 180.0 if spec.name in degrees else 1.0
+            if isinstance(value, tuple):
+                setattr(ranges, spec.name, wp.vec2(scale * value[0], scale * value[1]))
+            else:
+                setattr(ranges, spec.name, scale * value)
+        ranges.command_delay = round(self.command_delay / step_dt)
+        return ranges
+
+
+@dataclass(frozen=True)
+class Level:
+    """One level of the curriculum."""
+
+    goal_lower: tuple[float, float, float]
+    """Smallest goal; its meaning is the task's."""
+    goal_upper: tuple[float, float, float]
+    """Largest goal."""
+    base_height: Pair
+    """[m] Of standing starts; low ones are deep squats."""
+
+
+@dataclass(frozen=True)
+class NoiseCfg:
+    """Observation noise (paper, Table VI); standard deviations, cut at one."""
+
+    lin_vel: float = 0.1
+    """[m/s]"""
+    ang_vel: float = 0.1
+    """[rad/s]"""
+    gravity: float = 0.05
+    """[1] 0.5 m/s^2 of 9.81."""
+    angle: float = 3.0
+    """[deg]"""
+    rate: float = 10.0
+    """[deg/s]"""
+    height: float = 0.005
+    """[m]"""
+
+    def sensor_noise(self, enabled: bool = True) -> Any:
+        """Return the kernels' `SensorNoise`; all zero unless enabled."""
+        noise = SensorNoise()
+        for spec in fields(self):
+            scale = math.pi / 180.0 if spec.name in ("angle", "rate") else 1.0
+            setattr(noise, spec.name, scale * getattr(self, spec.name) if enabled else 0.0)
+        return noise
+
+
+@dataclass(frozen=True)
+class TaskCfg:
+    """A task on the robot."""
+
+    name: str
+    observe: wp.Function
+    """Writes the task's own observation columns."""
+    columns: tuple[str, ...]
+    """Names of these columns."""
+    error: wp.Function
+    """(view, task) -> distance from the goal [m]."""
+    terms: tuple[Term, ...]
+    rules: tuple[Rule, ...]
+    levels: tuple[Level, ...]
+    motors: MotorCfg
+    command_filter: FilterCfg
+    action_scale: Pair
+    """[deg] Lateral and transversal."""
+    reset: ResetCfg = field(default_factory=ResetCfg)
+    noise: NoiseCfg = field(default_factory=NoiseCfg)
+    randomization: RandomizationCfg = field(default_factory=RandomizationCfg)
+    takeoff_speed: float = 0.75
+    """[m/s] Upward speed without contact that begins a flight."""
+    contact_force: float = 0.1
+    """[N] Above it a paw counts as in contact."""
+    games: int = 5
+    """Successes in a row that raise the level."""
+
+    def __post_init__(self) -> None:
+        names = [term.name for term in self.terms]
+        if len(set(names)) < len(names):
+            raise ValueError(f"every term of {self.name} needs a name of its own, got {names}")
+        if not self.rules or not self.rules[0].success:
+            raise ValueError(f"the first rule of {self.name} must be its success")
+        if not self.levels:
+            raise ValueError(f"{self.name} needs at least one level")
+
+    @property
+    def observation_names(self) -> tuple[str, ...]:
+        """Names of all observation columns in order."""
+        motors = [f"{leg}_{m}" for leg in ("FL", "FR", "BL", "BR") for m in ("lateral", "outer", "inner")]
+        robot = [f"{what}_{axis}" for what in ("lin_vel", "ang_vel", "gravity") for axis in "xyz"]
+        joints = [f"{what}_{m}" for what in ("angle", "rate", "last_action") for m in motors]
+        return (*self.columns, *robot, *joints)

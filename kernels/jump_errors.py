@@ -1,0 +1,11 @@
+"""How far a finished jump is from its goal."""
+
+import warp as wp
+
+from .task import JumpTask, RobotView
+
+
+@wp.func
+def height_error(view: RobotView, task: JumpTask) -> float:
+    """Return the distance [m] of the highest base height from the wanted one."""
+    return wp.abs(task.max_height - task.goal[2])

@@ -1,0 +1,74 @@
+"""The jump's phases (stance, in flight, landed), and where its projectile will go."""
+
+import warp as wp
+
+from .task import FLIGHT, LANDED, STANCE, JumpTask, RobotView
+
+GRAVITY = wp.constant(9.81)  # [m/s^2]
+
+
+@wp.func
+def estimated_apex(pos: wp.vec3, lin_vel: wp.vec3) -> float:
+    """Return the height [m] that a projectile will reach: h_max = z + v_z^2 / 2g, or z if it falls."""
+    up = wp.max(lin_vel[2], 0.0)
+    return pos[2] + up * up / (2.0 * GRAVITY)
+
+
+@wp.func
+def time_to_height(z: float, vz: float, height: float) -> float:
+    """Return the time [s] at which a projectile falls through a height [m]; 0 if it never gets there."""
+    under_root = vz * vz + 2.0 * GRAVITY * (z - height)
+    return wp.max((vz + wp.sqrt(wp.max(under_root, 0.0))) / GRAVITY, 0.0)
+
+
+@wp.func
+def estimated_landing(pos: wp.vec3, lin_vel: wp.vec3, height: float) -> wp.vec2:
+    """Return where (x, y) [m] a projectile falls through a height [m]."""
+    t = time_to_height(pos[2], lin_vel[2], height)
+    return wp.vec2(pos[0] + t * lin_vel[0], pos[1] + t * lin_vel[1])
+
+
+@wp.func
+def tilt(view: RobotView) -> float:
+    """Return the angle [rad] between body z and world z."""
+    return wp.acos(wp.clamp(-view.gravity[2], -1.0, 1.0))
+
+
+@wp.func
+def next_phase(task: JumpTask, view: RobotView, takeoff_speed: float) -> int:
+    """Return the phase after this policy step; a takeoff needs free paws and an upward speed [m/s]."""
+    if task.phase == STANCE and view.contacts == 0 and view.lin_vel[2] > takeoff_speed:
+        return FLIGHT
+    if task.phase == FLIGHT and view.contacts > 0:
+        return LANDED
+    return task.phase
+
+
+@wp.func
+def advance_jump(task: JumpTask, view: RobotView, old_lin_vel: wp.vec3, takeoff_speed: float) -> JumpTask:
+    """Return the episode's state one policy step later; old_lin_vel [m/s]: of the base, the step before."""
+    t = task
+    t.steps = task.steps + 1
+    phase = next_phase(task, view, takeoff_speed)
+    t.took_off = wp.where(task.phase == STANCE and phase == FLIGHT, 1, 0)
+    t.touched_down = wp.where(task.phase == FLIGHT and phase == LANDED, 1, 0)
+    t.phase_steps = wp.where(phase == task.phase, task.phase_steps + 1, 0)
+    t.phase = phase
+    if t.took_off == 1:
+        t.max_height = view.pos[2]
+        t.apex_passed = 0
+    t.at_apex = 0
+    if phase != STANCE and task.apex_passed == 0:
+        t.max_height = wp.max(t.max_height, view.pos[2])
+        if view.lin_vel[2] <= 0.0 or t.touched_down == 1:
+            t.apex_passed = 1
+            t.at_apex = 1
+    if t.touched_down == 1:
+        t.touchdown_vel = old_lin_vel
+        t.peak_tilt = 0.0
+    if phase == LANDED:
+        t.peak_tilt = wp.max(t.peak_tilt, tilt(view))
+    t.idle_steps = 0
+    if phase == STANCE and t.steps >= t.command_step and wp.length(view.lin_vel) < 0.1:
+        t.idle_steps = task.idle_steps + 1
+    return t

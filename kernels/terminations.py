@@ -1,0 +1,86 @@
+"""Why an episode ends. Each rule is a pure function of robot, episode and parameters p; times in policy steps."""
+
+import warp as wp
+
+from .jump_phase import tilt
+from .rewards import braking
+from .task import FLIGHT, LANDED, STANCE, JumpTask, RobotView, speed_limit_broken, waiting
+
+
+@wp.func
+def success(view: RobotView, task: JumpTask, p: wp.vec4) -> bool:
+    """p0 policy steps after touchdown: the jump is over."""
+    return task.phase == LANDED and task.phase_steps >= int(p[0])
+
+
+@wp.func
+def too_long(view: RobotView, task: JumpTask, p: wp.vec4) -> bool:
+    """Episode of p0 policy steps."""
+    return task.steps >= int(p[0])
+
+
+@wp.func
+def came_apart(view: RobotView, task: JumpTask, p: wp.vec4) -> bool:
+    """State non-finite or absurdly fast."""
+    return speed_limit_broken(view)
+
+
+@wp.func
+def wrong_height(view: RobotView, task: JumpTask, p: wp.vec4) -> bool:
+    """At touchdown the jump missed its height by more than p0 [m]."""
+    return task.touched_down == 1 and wp.abs(task.max_height - task.goal[2]) > p[0]
+
+
+@wp.func
+def low_touchdown(view: RobotView, task: JumpTask, p: wp.vec4) -> bool:
+    """Base below p0 [m] at touchdown."""
+    return task.touched_down == 1 and view.pos[2] < p[0]
+
+
+@wp.func
+def low_base(view: RobotView, task: JumpTask, p: wp.vec4) -> bool:
+    """Base below p0 [m]."""
+    return view.pos[2] < p[0]
+
+
+@wp.func
+def moved_away(view: RobotView, task: JumpTask, p: wp.vec4) -> bool:
+    """Base more than p0 [m] from where it started, at any time."""
+    return wp.length(wp.vec2(view.pos[0] - task.start[0], view.pos[1] - task.start[1])) > p[0]
+
+
+@wp.func
+def slanted_takeoff(view: RobotView, task: JumpTask, p: wp.vec4) -> bool:
+    """Horizontal speed above p0 [m/s] at takeoff."""
+    return task.took_off == 1 and wp.length(wp.vec2(view.lin_vel[0], view.lin_vel[1])) > p[0]
+
+
+@wp.func
+def tilted(view: RobotView, task: JumpTask, p: wp.vec4) -> bool:
+    """Body z more than p0 [rad] from vertical."""
+    return tilt(view) > p[0]
+
+
+@wp.func
+def hard_impact(view: RobotView, task: JumpTask, p: wp.vec4) -> bool:
+    """Deceleration above p0 [m/s^2] in stance or after landing, p1 in flight or at touchdown."""
+    limit = wp.where(task.phase == FLIGHT or task.touched_down == 1, p[1], p[0])
+    return braking(view) < -limit
+
+
+@wp.func
+def no_jump(view: RobotView, task: JumpTask, p: wp.vec4) -> bool:
+    """A commanded jump did not begin within p0 policy steps, or the base rested for p1."""
+    return waiting(task) and (task.steps - task.command_step > int(p[0]) or task.idle_steps > int(p[1]))
+
+
+@wp.func
+def collided(view: RobotView, task: JumpTask, p: wp.vec4) -> bool:
+    """Anything but a paw touched the ground, or links touched each other."""
+    return view.collisions != 0
+
+
+@wp.func
+def early_takeoff(view: RobotView, task: JumpTask, p: wp.vec4) -> bool:
+    """Jumped before the jump was commanded."""
+    return task.took_off == 1 and task.steps < task.command_step and task.phase != STANCE

@@ -1,0 +1,312 @@
+import dataclasses
+import math
+
+import newton
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from solver_helpers import BODIES, DOFS, MOTOR_Q, MOTOR_V, SHANKS, random_states
+
+from jumper_warp.motors import jumping_motors
+from jumper_warp.simulation import Simulation
+from jumper_warp.solver import TOLERANCE
+
+WEIGHT = 14.5 * 9.81
+PAW_RADIUS = 0.025
+
+
+def simulation(num_worlds, **arguments):
+    return Simulation(num_worlds, visuals=False, device="cpu", **arguments)
+
+
+def write_state(sim, q=None, qd=None):
+    """Write joint_q (num_worlds, 43) and joint_qd (num_worlds, 38); knees and bodies follow."""
+    state = sim.state
+    if q is not None:
+        state.joint_q.assign(np.asarray(q, dtype=np.float32).ravel())
+    if qd is not None:
+        state.joint_qd.assign(np.asarray(qd, dtype=np.float32).ravel())
+    sim.solver.dynamics.full_state(state.joint_q, state.joint_qd, state.body_q, state.body_qd)
+
+
+def command(sim, angles):
+    """Command motor angles [rad], (num_worlds, 12)."""
+    sim.target.assign(np.ascontiguousarray(np.broadcast_to(angles, (sim.num_worlds, 12)).T, dtype=np.float32))
+
+
+def paw_forces(sim):
+    """Ground forces on the paws [N], (num_worlds, 4, 3)."""
+    return sim.paw_force.numpy().transpose(1, 0, 2).astype(float)
+
+
+def paw_centres(sim):
+    """Paw centres [m], (num_worlds, 4, 3)."""
+    poses = sim.state.body_q.numpy().reshape(-1, BODIES, 7)[:, SHANKS].astype(float)
+    arm = Rotation.from_quat(poses[..., 3:].reshape(-1, 4)).apply([0.0, 0.0, -0.3]).reshape(-1, 4, 3)
+    return poses[..., :3] + arm
+
+
+def slip_velocities(sim, joint_q):
+    """Velocities [m/s] of the material points at the bottom of the paws, at present rates, (num_worlds, 4, 3).
+
+    joint_q: coordinates at which the contact was solved, those before the last step.
+    """
+    model, q, qd = sim.model, wp.array(joint_q.ravel(), dtype=float, device="cpu"), wp.clone(sim.state.joint_qd)
+    body_q, body_qd = wp.empty_like(sim.state.body_q), wp.empty_like(sim.state.body_qd)
+    sim.solver.dynamics.full_state(q, qd, body_q, body_qd)
+    poses = body_q.numpy().reshape(-1, BODIES, 7)[:, SHANKS].astype(float)
+    twists = body_qd.numpy().reshape(-1, BODIES, 6)[:, SHANKS].astype(float)
+    turn = Rotation.from_quat(poses[..., 3:].reshape(-1, 4))
+    com = turn.apply(model.body_com.numpy().reshape(-1, BODIES, 3)[:, SHANKS].reshape(-1, 3))
+    bottom = turn.apply([0.0, 0.0, -0.3]) - [0.0, 0.0, PAW_RADIUS] - com
+    return twists[..., :3] + np.cross(twists[..., 3:], bottom.reshape(-1, 4, 3))
+
+
+def thrown(sim, seed, height=(0.4, 1.0), speed=1.5, joint_rate=4.0):
+    """Throw all robots in random attitudes, command random angles."""
+    n = sim.num_worlds
+    rng, states = np.random.default_rng(seed), random_states(n, seed, joint_rate=joint_rate)
+    states.pos = rng.uniform([-1.0, -1.0, height[0]], [1.0, 1.0, height[1]], (n, 3))
+    states.quat = Rotation.from_rotvec(0.3 * rng.normal(size=(n, 3))).as_quat()
+    states.com_vel = speed * rng.normal(size=(n, 3))
+    write_state(sim, states.joint_q(), states.joint_qd())
+    command(sim, states.angles)
+    sim.filter_targets()
+
+
+@pytest.fixture(scope="module")
+def standing():
+    """A robot that has stood for two seconds."""
+    sim = simulation(1)
+    for _ in range(120):
+        sim.step()
+    return sim
+
+
+def test_paw_forces_of_a_standing_robot_carry_its_weight(standing):
+    total = paw_forces(standing)[0].sum(axis=0)
+    assert total == pytest.approx([0.0, 0.0, WEIGHT], abs=1e-3 * WEIGHT)
+
+
+def test_standing_robot_creeps_less_than_a_millimetre_in_ten_seconds(standing):
+    base, paws = standing.joint_q()[0, :7].copy(), paw_centres(standing)[0]
+    for _ in range(600):
+        standing.step()
+    assert np.abs(standing.joint_q()[0, :3] - base[:3]).max() < 1e-3
+    assert np.abs(paw_centres(standing)[0] - paws).max() < 1e-3
+
+
+def test_contacts_of_thrown_robots_never_pull_and_stay_in_the_cone():
+    sim = simulation(64, friction=0.6)
+    thrown(sim, 11)
+    touched = np.zeros(64, dtype=bool)
+    for _ in range(480):
+        sim.physics_step()
+        force = paw_forces(sim)
+        normal, tangential = force[..., 2], np.linalg.norm(force[..., :2], axis=-1)
+        assert normal.min() >= 0.0
+        assert (tangential <= 0.6 * normal * (1.0 + 1e-4) + 1e-4).all()
+        touched |= (normal > 0.0).any(axis=1)
+    assert touched.all()
+
+
+def test_contact_iteration_reaches_its_tolerance():
+    sim = simulation(64)
+    thrown(sim, 12)
+    worst = 0.0
+    for _ in range(90):
+        sim.step()
+        worst = np.maximum(worst, sim.solver.residual.numpy().max())
+    print("residual", worst, sim.solver.sweeps.numpy().max())
+    assert worst <= TOLERANCE
+
+
+def test_friction_opposes_sliding_at_mu_times_the_normal_force():
+    sim = simulation(8, friction=0.3)
+    qd = np.zeros((8, DOFS))
+    heading = np.arange(8) * math.pi / 4.0
+    qd[:, 0], qd[:, 1] = 2.0 * np.cos(heading), 2.0 * np.sin(heading)
+    write_state(sim, qd=qd)
+    checked = 0
+    for _ in range(120):
+        joint_q = sim.joint_q().copy()
+        sim.physics_step()
+        force, slip = paw_forces(sim), slip_velocities(sim, joint_q)[..., :2]
+        speed = np.linalg.norm(slip, axis=-1)
+        sliding = (speed > 0.2) & (force[..., 2] > 1.0)
+        friction, normal = force[sliding][:, :2], force[sliding][:, 2]
+        checked += sliding.sum()
+        assert np.linalg.norm(friction, axis=1) == pytest.approx(0.3 * normal, rel=1e-3)
+        along = (friction * slip[sliding]).sum(axis=1) / (np.linalg.norm(friction, axis=1) * speed[sliding])
+        assert along.max() < -0.999
+    assert checked > 1000
+
+
+def slope(degrees, height=0.0):
+    """A plane that rises along x, as a heightfield."""
+    x = np.linspace(-20.0, 20.0, 41)
+    heights = np.tile(height + math.tan(math.radians(degrees)) * x, (41, 1))
+    return newton.Heightfield(data=heights.astype(np.float32), nrow=41, ncol=41, hx=20.0, hy=20.0)
+
+
+def on_slope(num_worlds, degrees, friction):
+    """Robots standing on a slope, the base parallel to it."""
+    sim = simulation(num_worlds, ground=slope(degrees), friction=friction)
+    q = sim.joint_q().copy()
+    tilt = Rotation.from_euler("y", -degrees, degrees=True)
+    q[:, :3], q[:, 3:7] = tilt.apply([0.0, 0.0, q[0, 2]]), tilt.as_quat()
+    write_state(sim, q)
+    return sim, tilt
+
+
+def test_robot_holds_on_a_slope_below_the_friction_angle():
+    # atan(0.3) is 16.7 degrees
+    sim, _ = on_slope(1, 12.0, friction=0.3)
+    for _ in range(60):
+        sim.step()
+    before = paw_centres(sim)
+    for _ in range(120):
+        sim.step()
+    assert np.abs(paw_centres(sim) - before).max() < 1e-3
+    assert paw_forces(sim)[0].sum(axis=0) == pytest.approx([0.0, 0.0, WEIGHT], abs=1e-3 * WEIGHT)
+
+
+def test_robot_slides_down_a_slope_above_the_friction_angle():
+    # atan(0.15) is 8.5 degrees; the slope's own direction downhill is -x of the tilted base
+    sim, tilt = on_slope(1, 12.0, friction=0.15)
+    for _ in range(60):
+        sim.step()
+    before = -tilt.inv().apply(sim.base_velocity()[0])[0]
+    for _ in range(30):
+        sim.step()
+    gained = -tilt.inv().apply(sim.base_velocity()[0])[0] - before
+    expected = 9.81 * (math.sin(math.radians(12.0)) - 0.15 * math.cos(math.radians(12.0)))
+    assert gained / 0.5 == pytest.approx(expected, rel=0.02)
+
+
+def test_static_friction_holds_where_dynamic_friction_alone_slides():
+    # atan(0.20) = 11.3 degrees < 12.4 degrees < atan(0.24) = 13.5 degrees
+    sim, _ = on_slope(2, 12.4, friction=0.2)
+    ratio = sim.solver.dynamics.static_friction_ratio
+    ratio.fill_(5.0)
+    sim.solver.dynamics.pack_friction()
+    for _ in range(60):
+        sim.step()
+    ratio.assign(np.array([1.2, 1.0], dtype=np.float32))
+    sim.solver.dynamics.pack_friction()
+    before = paw_centres(sim)
+    for _ in range(120):
+        sim.step()
+    moved = np.abs(paw_centres(sim) - before).max(axis=(1, 2))
+    print("moved", moved)
+    assert moved[0] < 1e-3
+    # 0.5 (sin 12.4 - 0.2 cos 12.4) g t^2 = 0.38 m
+    assert moved[1] == pytest.approx(0.38, rel=0.1)
+
+
+def test_flat_heightfield_behaves_as_the_plane():
+    height = 0.4
+    plane, field = simulation(16), simulation(16, ground=slope(0.0, height))
+    for sim in (plane, field):
+        thrown(sim, 13, height=(0.5, 0.8), speed=0.5)
+    q = field.joint_q().copy()
+    q[:, 2] += height
+    write_state(field, q)
+    for _ in range(20):
+        plane.step()
+        field.step()
+    difference = field.joint_q() - plane.joint_q()
+    difference[:, 2] -= height
+    print("difference", np.abs(difference).max())
+    assert np.abs(difference).max() < 1e-3
+
+
+def test_robot_survives_a_drop_from_one_metre():
+    sim = simulation(1)
+    q = sim.joint_q().copy()
+    q[0, 2] += 1.0
+    write_state(sim, q)
+    peak = 0.0
+    for _ in range(180):
+        sim.step()
+        peak = max(peak, sim.peak_force.numpy()[0])
+    assert np.isfinite(sim.joint_q()).all()
+    assert sim.joint_q()[0, 2] == pytest.approx(0.36, abs=0.03)
+    assert peak > 5.0 * WEIGHT
+
+
+def worst_excess(sim):
+    """How far [deg] the angles pass the stops: motors, and sums of a leg's transversals."""
+    angles = np.degrees(sim.joint_q()[:, MOTOR_Q].astype(float))
+    total = angles[:, 1::3] + angles[:, 2::3]
+    lower, upper = np.array([-50.0, -30.0, -30.0] * 4), np.array([110.0, 140.0, 140.0] * 4)
+    motors = max((lower - angles).max(), (angles - upper).max())
+    return motors, max(-total.min(), total.max() - 240.0)
+
+
+def push(sim, torque_of_step, steps):
+    """Step with explicit torques [N m] (num_worlds, 12) and return the worst excess [deg] of motors and sums."""
+    joint_f = np.zeros((sim.num_worlds, DOFS), dtype=np.float32)
+    worst = np.array([-np.inf, -np.inf])
+    for i in range(steps):
+        joint_f[:, MOTOR_V] = torque_of_step(i)
+        sim.control.joint_f.assign(joint_f.ravel())
+        sim.solver.step(sim.state, sim.state, sim.control, None, sim.dt)
+        worst = np.maximum(worst, worst_excess(sim))
+    assert not sim.solver.invalid.numpy().any()
+    print("excess", worst)
+    return worst
+
+
+@pytest.mark.parametrize("ground", ["plane", None])
+def test_stops_hold_constant_torque(ground):
+    # worlds 0 to 23: one motor each, both ways; then both transversals of every leg together, and against each other
+    torque = np.zeros((28, 12))
+    for motor in range(12):
+        torque[2 * motor, motor], torque[2 * motor + 1, motor] = 24.8, -24.8
+    for world, (outer, inner) in enumerate(((1, 1), (-1, -1), (1, -1), (-1, 1)), start=24):
+        torque[world, 1::3], torque[world, 2::3] = 24.8 * outer, 24.8 * inner
+    motors, sums = push(simulation(28, ground=ground), lambda _: torque, 480)
+    assert motors < 3.0
+    assert sums < 5.0
+
+
+def test_stops_hold_random_torque():
+    rng = np.random.default_rng(14)
+    torques = np.repeat(rng.uniform(-24.8, 24.8, (48, 64, 12)), 20, axis=0)
+    sim = simulation(64)
+    thrown(sim, 15)
+    motors, sums = push(sim, lambda i: torques[i], len(torques))
+    assert motors < 3.0
+    assert sums < 5.0
+
+
+def test_stops_hold_in_drops_from_two_metres_on_stiff_legs():
+    motors = jumping_motors(24.8)
+    stiff = dataclasses.replace(
+        motors,
+        lateral=dataclasses.replace(motors.lateral, kp=300.0, kd=3.0),
+        transversal=dataclasses.replace(motors.transversal, kp=300.0, kd=3.0),
+    )
+    sim = simulation(64, motors=stiff)
+    thrown(sim, 16, height=(2.4, 2.5), joint_rate=0.0)
+    worst = np.array([-np.inf, -np.inf])
+    for _ in range(480):
+        sim.physics_step()
+        worst = np.maximum(worst, worst_excess(sim))
+    print("excess", worst)
+    assert not sim.solver.invalid.numpy().any()
+    assert worst[0] < 3.0
+    assert worst[1] < 5.0
+
+
+def test_thousand_policy_steps_of_random_targets_stay_finite():
+    sim = simulation(64)
+    rng = np.random.default_rng(17)
+    lower, upper = np.radians([-50.0, -30.0, -30.0] * 4), np.radians([110.0, 140.0, 140.0] * 4)
+    for _ in range(1000):
+        command(sim, rng.uniform(lower, upper, (64, 12)))
+        sim.step()
+    assert not sim.solver.invalid.numpy().any()
+    assert np.isfinite(sim.joint_q()).all()
+    assert np.abs(sim.joint_qd()).max() < 500.0
