@@ -13,7 +13,7 @@ class Captured:
     def __init__(self, procedure: Callable[[], None], enabled: bool) -> None:
         """procedure: reads and writes the same tensors in every call, and waits for no result."""
         self._procedure = procedure
-        self._enabled = enabled
+        self.enabled = enabled
         self.forget()
 
     def forget(self) -> None:
@@ -23,7 +23,7 @@ class Captured:
 
     def __call__(self) -> None:
         """Run the procedure once."""
-        if not (self._enabled and self._warm):
+        if not (self.enabled and self._warm):
             self._procedure()
             self._warm = True
             return

@@ -73,7 +73,7 @@ class RunningMoments(nn.Module):
         """shape: that of one sample; () for a scalar."""
         super().__init__()
         self.register_buffer("mean", torch.zeros(tuple(shape), dtype=torch.float64))
-        self.register_buffer("var", torch.ones(tuple(shape), dtype=torch.float64))
+        self.register_buffer("var", torch.full(tuple(shape), 1.0 - EPS, dtype=torch.float64))
         self.register_buffer("count", torch.zeros((), dtype=torch.float64))
 
     @torch.no_grad()

@@ -247,7 +247,8 @@ class Ppo:
         actor = [*self.model.actor.parameters(), self.model.log_std]
         critic = list(self.model.critic.parameters())
         self.lr = torch.full((), cfg.lr, device=env.device)
-        self.optimiser = torch.optim.Adam([*actor, *critic], lr=self.lr, fused=True, capturable=cuda)
+        self.update = Captured(self._update, cuda and cfg.graphs and world_size() == 1)
+        self.optimiser = torch.optim.Adam([*actor, *critic], lr=self.lr, fused=True, capturable=self.update.enabled)
         self._flatten_gradients(actor, critic)
         self.rollout = Rollout(cfg.num_steps, env)
         self._sums = torch.zeros(len(STATISTICS), device=env.device)
@@ -255,7 +256,6 @@ class Ppo:
         self._episode = torch.zeros(2, env.num_envs, device=env.device)  # return and length so far
         self._finished = torch.zeros(3, device=env.device)  # sums of return and length, count
         self.collect = Captured(self._collect, cuda and cfg.graphs)
-        self.update = Captured(self._update, cuda and cfg.graphs and world_size() == 1)
 
     def _flatten_gradients(self, actor: list[torch.nn.Parameter], critic: list[torch.nn.Parameter]) -> None:
         """Make all gradients views of one vector, whose last entry carries the divergence to the other ranks."""

@@ -39,6 +39,7 @@ class PawContact:
     active: int  # 0: too far from the ground to touch within the step
     normal: vec3
     mu: real
+    mu_row: int  # row of mu in the parameter table
     goal: real  # smallest admissible normal velocity at the end of the step [m/s]
     free: vec3  # contact point velocity without any impulse [m/s]
     jacobian: mat33  # contact velocity per motor rate [m/rad]

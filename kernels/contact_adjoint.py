@@ -4,7 +4,6 @@ import warp as wp
 
 from .contact import SEPARATE, SLIDE, PawContact, contact_mode, solve_contacts
 from .differentiable import BaseArrays, LegArrays, Velocities, load_inverse, load_paw, load_solve
-from .parameters import LEG_ROWS, MU_DYNAMIC, MU_STATIC
 from .scalar import mat33, real, vec3
 from .state import base_com, leg_dof, load_base, load_motors
 from .step import Robot, paw_contact
@@ -67,11 +66,8 @@ def contact_kernel(
     base = load_base(joint_q, joint_qd, base_com(robot.table, world), world)
     for k in range(contacts.shape[0]):
         c = contacts[k]
-        row = k * LEG_ROWS + MU_DYNAMIC
-        if c.mu != robot.table[row, world]:
-            row = k * LEG_ROWS + MU_STATIC
         solution.impulse[k, world] = c.impulse
-        solution.mu_row[k, world] = row
+        solution.mu_row[k, world] = c.mu_row
         solution.mode[k, world] = contact_mode(c.impulse, c.normal, c.mu)
         in_world = wp.quat_rotate(base.quat, c.impulse)
         guess[k, world] = in_world

@@ -36,7 +36,7 @@ from .state import base_com, leg_coord, leg_dof, load_base, load_motors, store_b
 
 @wp.struct
 class LegArrays:
-    """What the legs contribute, arrays of shape (4, num_worlds); fields of `LegSolve`, `BaseSystem`, `PawKinematics`."""
+    """What the legs contribute, arrays of shape (4, num_worlds); fields as in `LegSolve`, `BaseSystem`, ..."""
 
     inverse: wp.array2d(dtype=mat33)
     free: wp.array2d(dtype=vec3)

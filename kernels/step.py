@@ -107,9 +107,10 @@ def paw_contact(
     contact.impulse = wp.quat_rotate_inv(base.quat, impulse)
     before = wp.quat_rotate_inv(base.quat, base.lin) + wp.cross(base.ang, point) + contact.jacobian * old_rates
     slip = before - wp.dot(before, normal) * normal
-    contact.mu = robot.table[k * LEG_ROWS + MU_DYNAMIC, world]
+    contact.mu_row = k * LEG_ROWS + MU_DYNAMIC
     if wp.dot(slip, slip) < STICK_SPEED * STICK_SPEED and wp.dot(contact.impulse, normal) > real(0.0):
-        contact.mu = robot.table[k * LEG_ROWS + MU_STATIC, world]
+        contact.mu_row = k * LEG_ROWS + MU_STATIC
+    contact.mu = robot.table[contact.mu_row, world]
     return couple_contact(contact, point, leg, inverse)
 
 

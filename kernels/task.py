@@ -105,7 +105,7 @@ def load_base_view(arrays: ViewArrays, world: int) -> RobotView:
 
 @wp.func
 def load_view(arrays: ViewArrays, world: int, contact_force: float) -> RobotView:
-    """Return the robot of a world, collisions left out; a paw pressed harder than `contact_force` [N] is in contact."""
+    """Return the robot of a world, without collisions; paws pressed harder than `contact_force` [N] are in contact."""
     view = load_base_view(arrays, world)
     contacts = int(0)
     for k in range(4):

@@ -4,7 +4,7 @@ import warp as wp
 
 from .jump_phase import tilt
 from .rewards import braking
-from .task import FLIGHT, LANDED, STANCE, JumpTask, RobotView, speed_limit_broken, waiting
+from .task import LANDED, STANCE, JumpTask, RobotView, speed_limit_broken, waiting
 
 
 @wp.func
@@ -63,8 +63,8 @@ def tilted(view: RobotView, task: JumpTask, p: wp.vec4) -> bool:
 
 @wp.func
 def hard_impact(view: RobotView, task: JumpTask, p: wp.vec4) -> bool:
-    """Deceleration above p0 [m/s^2] in stance or after landing, p1 in flight or at touchdown."""
-    limit = wp.where(task.phase == FLIGHT or task.touched_down == 1, p[1], p[0])
+    """Deceleration above p0 [m/s^2] in stance, p1 in flight and after touchdown."""
+    limit = wp.where(task.phase == STANCE, p[0], p[1])
     return braking(view) < -limit
 
 

@@ -175,6 +175,23 @@ def test_jump_gradient_matches_differences(name, loss):
     assert_matches([gradient[entry] for entry in entries], loss, name, directions, h)
 
 
+def test_targets_within_the_limits_pass_the_filter_untouched():
+    """With and without a filter the jump and its gradient are the same."""
+    targets = np.tile(np.radians([0.0, 20.0, 25.0]), (TICKS, 4))
+    found = []
+    for command_filter in (None, vertical_jump_filter()):
+        rollout = DifferentiableRollout(jump().model, command_filter=command_filter, double=True, dt=DT, substeps=4)
+        inputs = [targets[:, :, None], jump().values["q"], jump().values["qd"]]
+        arrays = [wp.array(values, dtype=wp.float64, requires_grad=True) for values in inputs]
+        with wp.Tape() as tape:
+            apexes = rollout.run(*arrays).apex
+        tape.backward(grads={apexes: wp.ones_like(apexes)})
+        found.append((apexes.numpy()[0], arrays[0].grad.numpy()))
+    assert found[0][0] == pytest.approx(found[1][0], abs=1.0e-12)
+    assert np.abs(found[0][1]).max() > 1.0e-3
+    np.testing.assert_allclose(found[0][1], found[1][1], rtol=0.0, atol=1.0e-12)
+
+
 def mass_directions(model, bodies: list[int]) -> np.ndarray:
     """What 1 kg more of each body, its density scaled at fixed inertia about the com, adds to the parameter table.
 

@@ -69,7 +69,7 @@ def vertical_jump() -> TaskCfg:
         error=jump_errors.height_error,
         terms=TERMS,
         rules=RULES,
-        levels=(level(0.5, 0.7, 0.35), level(0.5, 0.9, 0.45), level(0.5, 1.15, 0.45)),
+        levels=(level(0.5, 0.7, 0.35), level(0.45, 0.95, 0.45), level(0.45, 1.2, 0.45)),
         motors=jumping_motors(18.0, lateral_torque=10.0),
         command_filter=vertical_jump_filter(),
         action_scale=(15.0, 90.0),
