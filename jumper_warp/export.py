@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import onnx
+import tyro
 from onnx import TensorProto, helper, numpy_helper
 
-if TYPE_CHECKING:
-    from jumper_warp.policy import Policy
+from jumper_warp.checkpoint import write_whole
+from jumper_warp.policy import Policy, save_policy
+from jumper_warp.saved_run import is_run, learning_curve, open_policy
 
 OPSET = 18
 IR_VERSION = 9
@@ -81,8 +83,8 @@ def onnx_model(policy: Policy, origin: Mapping[str, Any] | None = None) -> onnx.
 def metadata(policy: Policy, origin: Mapping[str, Any] | None = None) -> dict[str, str]:
     """Return the entries of the model's metadata.
 
-    `jumper_warp` is JSON with the whole `PolicyInterface`; the others repeat parts of it, comma-separated and unrounded,
-    under the names that common deployment tools read.
+    `jumper_warp` is JSON with the whole `PolicyInterface`; the others repeat parts of it, comma-separated and
+    unrounded, under the names that common deployment tools read.
     """
     face = policy.interface
     joints = ("joint_names", "joint_stiffness", "joint_damping", "default_joint_pos", "action_scale")
@@ -101,10 +103,43 @@ def export_onnx(policy: Policy, path: Path) -> Path:
     """Write a policy as one ONNX file, whole or not at all; return its path."""
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    aside = path.with_name(f".{path.name}.{os.getpid()}")
-    try:
-        aside.write_bytes(onnx_bytes(policy, {key: policy.config.get(key) for key in ("commit", "dirty")}))
-        os.replace(aside, path)
-    finally:
-        aside.unlink(missing_ok=True)
+    write_whole(path, onnx_bytes(policy, {key: policy.config.get(key) for key in ("commit", "dirty")}))
+    return path
+
+
+@dataclass(frozen=True)
+class ExportCfg:
+    """Turn a training run into a policy's folder, or a policy into one ONNX file."""
+
+    source: tyro.conf.Positional[str]
+    """A run's folder, a checkpoint, or a policy's name or folder."""
+    out: Path | None = None
+    """A file that ends in .onnx, or the folder of the new policy (default: policy/ in the run, or <task>.onnx)."""
+    newest: bool = False
+    """Of a run, take the newest checkpoint, not the best."""
+    overwrite: bool = False
+    """Replace a policy that is there already, figures and README included."""
+
+
+def export(cfg: ExportCfg) -> Path:
+    """Write what the configuration asks for, print where, and return the path.
+
+    Raises:
+        PolicyError: The source cannot be used, or the folder exists and is not to be overwritten.
+        CheckpointError: The checkpoint cannot be used.
+    """
+    source = Path(cfg.source)
+    trained = is_run(source)
+    policy = open_policy(cfg.source, newest=cfg.newest)
+    out = cfg.out
+    if out is None:
+        run = source.parents[1] if source.suffix == ".pt" else source
+        out = run / "policy" if trained else Path(f"{policy.interface.task}.onnx")
+    if out.suffix == ".onnx":
+        path = export_onnx(policy, out)
+    else:
+        curve = learning_curve(source) if trained else None
+        files = {} if curve is None else {"learning_curve.jsonl": curve}
+        path = save_policy(out, policy, files=files, overwrite=cfg.overwrite)
+    print(path)
     return path

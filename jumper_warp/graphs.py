@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
 
 import torch
@@ -24,7 +25,9 @@ class Captured:
     def __call__(self) -> None:
         """Run the procedure once."""
         if not (self.enabled and self._warm):
-            self._procedure()
+            with warnings.catch_warnings():
+                warnings.filterwarnings("ignore", "This instance was constructed with capturable=True")
+                self._procedure()
             self._warm = True
             return
         if self._graph is None:

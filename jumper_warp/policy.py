@@ -22,6 +22,7 @@ import torch
 from safetensors import SafetensorError
 from torch import nn
 
+from jumper_warp.checkpoint import write_whole
 from jumper_warp.policy_interface import PolicyError, PolicyInterface
 from jumper_warp.runtime import git_commit, versions
 
@@ -96,7 +97,7 @@ class Policy(nn.Module):
         interface: PolicyInterface,
         config: Mapping[str, Any] | None = None,
     ) -> Policy:
-        """Return the policy of a trained actor, linear layers with the interface's activation between; see `__init__`."""
+        """Return the policy of a trained actor: linear layers with the interface's activation between."""
         layers = [(module.weight, module.bias) for module in actor if isinstance(module, nn.Linear)]
         return cls(layers, mean, std, interface, config)
 
@@ -221,15 +222,7 @@ def _write(folder: Path, files: Mapping[str, bytes], sums: Mapping[str, str]) ->
     sums = {**sums, **{name: hashlib.sha256(data).hexdigest() for name, data in files.items() if name != README}}
     manifest = {"format": FORMAT, "schema_version": SCHEMA_VERSION, "sha256": dict(sorted(sums.items()))}
     for name, data in {**files, MANIFEST: _json_bytes(manifest)}.items():
-        aside = folder / f".{name}.{os.getpid()}"
-        try:
-            with aside.open("wb") as file:
-                file.write(data)
-                file.flush()
-                os.fsync(file.fileno())
-            os.replace(aside, folder / name)
-        finally:
-            aside.unlink(missing_ok=True)
+        write_whole(folder / name, data)
 
 
 def list_policies() -> tuple[str, ...]:
@@ -287,8 +280,7 @@ def _checked_sums(folder: Path) -> dict[str, str]:
     manifest = _json(path, _bytes(path))
     if manifest.get("format") != FORMAT:
         raise PolicyError(f"{path}: not the manifest of a {FORMAT}")
-    if manifest.get("schema_version") != SCHEMA_VERSION:
-        raise PolicyError(f"{path}: schema version {manifest.get('schema_version')!r:.20}, not {SCHEMA_VERSION}")
+    _check_version(path, manifest)
     sums = manifest.get("sha256")
     if not isinstance(sums, dict) or not {WEIGHTS, CONFIG, ONNX} <= set(sums):
         raise PolicyError(f"{path}: lacks the sums of {WEIGHTS}, {CONFIG} and {ONNX}")
@@ -297,6 +289,12 @@ def _checked_sums(folder: Path) -> dict[str, str]:
             raise PolicyError(f"{path}: names a file {name!r:.60}")
         _checked_bytes(folder / name, digest)
     return sums
+
+
+def _check_version(path: Path, content: Mapping[str, Any]) -> None:
+    found = content.get("schema_version")
+    if found != SCHEMA_VERSION:
+        raise PolicyError(f"{path}: schema version {found!r:.20} is unknown, this is version {SCHEMA_VERSION}")
 
 
 def _checked_bytes(path: Path, digest: Any) -> bytes:

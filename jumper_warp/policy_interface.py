@@ -101,7 +101,7 @@ class PolicyInterface:
 
 def _checked(name: str, value: Any, hint: str) -> Any:
     """Return a JSON value as the type that the hint names, or raise a PolicyError."""
-    kind = next(k for k in ("str", "float", "int", "dict") if k in hint)
+    kind = next(k for k in ("dict", "str", "float", "int") if k in hint)
     types = {"str": str, "float": (float, int), "int": int, "dict": dict}[kind]
     many = hint.startswith("tuple")
     values = value if many and isinstance(value, list) else [value]

@@ -70,8 +70,9 @@ class PpoCfg:
     """Widths of the hidden layers."""
     activation: str = "elu"
     """elu, relu or tanh."""
-    tf32: bool = True
-    """Whether matrix products on a GPU may round their factors to 10 mantissa bits."""
+    tf32: bool = False
+    """Whether matrix products on a GPU may round their factors to 10 mantissa bits. With little exploration noise left,
+    that alone looks like a large divergence and drives the step size to its lower bound."""
     graphs: bool = True
     """Whether a GPU replays captured graphs; the update of several GPUs is always eager."""
 
@@ -373,7 +374,8 @@ class Ppo:
             RuntimeError: A part has another shape.
         """
         self.model.load_state_dict(state["model"])
-        self.optimiser.load_state_dict({**self.optimiser.state_dict(), "state": state["optimiser"]})
+        moments = {i: {k: x.clone() for k, x in each.items()} for i, each in state["optimiser"].items()}
+        self.optimiser.load_state_dict({**self.optimiser.state_dict(), "state": moments})
         for group in self.optimiser.param_groups:
             group["lr"] = self.lr
         self.lr.copy_(state["lr"])

@@ -50,8 +50,9 @@ CONTACT_IMPEDANCE = (0.95, 0.99, 0.001, 0.5, 2.0)
 GROUND_FRICTION = 1.0e-4
 """[1] Tiny: a contact takes the larger of its two coefficients, which is then the paw's."""
 GROUND_COLOR = (0.42, 0.46, 0.48)
-LIMIT_STIFFNESS = 1.0e4
-LIMIT_DAMPING = 10.0
+LIMIT_STIFFNESS = CONTACT_STIFFNESS
+"""[N m/rad] Hard stops: plastic for SolverJumper, critically damped over two physics steps for MuJoCo."""
+LIMIT_DAMPING = CONTACT_DAMPING
 NO_EFFORT_LIMIT = 1.0e6
 """[N m] Motor models saturate torque; the model itself does not. A knee's limit is that of its damping."""
 KNEE_DOFS = [6 + 5 * leg + joint for leg in range(4) for joint in (2, 4)]

@@ -131,7 +131,8 @@ def _summary(figures: dict[str, float]) -> str:
     parts = [f"{figures['Perf/fps']:,.0f} steps/s"]
     if "Train/mean_return" in figures:
         parts.append(f"return {figures['Train/mean_return']:.2f}")
-    parts += [f"success {100.0 * value:.1f} %" for name, value in figures.items() if name.endswith("/success")]
+    if "Metrics/success" in figures:
+        parts.append(f"success {100.0 * figures['Metrics/success']:.1f} %")
     return ", ".join(parts)
 
 

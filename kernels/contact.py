@@ -87,9 +87,10 @@ def couple_contact(contact: PawContact, point: vec3, leg: LegSolve, base: BaseIn
 
 @wp.func
 def sliding_impulse(c: PawContact, impulse: vec3, velocity: vec3) -> vec3:
-    """Return the impulse on the cone's edge that meets the normal condition, given the present impulse and velocity.
+    """Return the next impulse of a sliding paw, meeting the normal condition, from the present impulse and velocity.
 
-    Its direction is that of (present friction - velocity / scale): at the fixed point, opposite to the sliding.
+    Its friction is (present friction - slip / scale), cut at the cone. At the fixed point that is the cone's edge,
+    opposite to the slip; cutting only, never stretching, keeps friction along the slip from being one too.
     """
     n = c.normal
     across = c.total * n
@@ -99,8 +100,11 @@ def sliding_impulse(c: PawContact, impulse: vec3, velocity: vec3) -> vec3:
     pull = pull - wp.dot(pull, n) * n
     edge = n + c.mu * wp.normalize(pull)
     response = wp.max(wp.dot(across, edge), real(0.1) * normal_response)
-    size = (c.goal - wp.dot(n, velocity) + wp.dot(across, impulse)) / response
-    return wp.max(size, real(0.0)) * edge
+    lack = c.goal - wp.dot(n, velocity) + wp.dot(across, impulse)
+    size = (lack - wp.dot(across, pull)) / normal_response
+    if size > real(0.0) and wp.dot(pull, pull) < c.mu * c.mu * size * size:
+        return size * n + pull
+    return wp.max(lack / response, real(0.0)) * edge
 
 
 @wp.func

@@ -336,10 +336,9 @@ def test_two_processes_equal_one_with_all_worlds(tmp_path):
 
 def test_state_is_taken_up_exactly():
     ppo, _ = trained(2)
-    state = {key: value for key, value in ppo.state_dict().items()}
     torch.manual_seed(99)
     other = Ppo(PushTask(128), SMALL)
-    other.load_state_dict(state)
+    other.load_state_dict(ppo.state_dict())
     for each in (ppo, other):
         torch.manual_seed(5)
         each.env.reset()

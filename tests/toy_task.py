@@ -7,6 +7,7 @@ import torch
 from jumper_warp.ppo import Ppo, PpoCfg
 from jumper_warp.train import TrainCfg, train
 
+torch.set_num_threads(1)  # on matrices this small, threads mostly wait for each other
 SMALL = PpoCfg(num_steps=16, hidden=(32, 32), minibatches=4)
 
 
@@ -79,7 +80,6 @@ def local_order(rank: int, size: int) -> torch.Tensor:
 
 
 def join(rank: int, port: int) -> None:
-    torch.set_num_threads(1)
     os.environ.update(RANK=str(rank), LOCAL_RANK=str(rank), WORLD_SIZE="2", MASTER_ADDR="127.0.0.1")
     os.environ["MASTER_PORT"] = str(port)
 
