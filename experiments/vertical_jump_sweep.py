@@ -75,8 +75,8 @@ class Args:
 
     def __post_init__(self) -> None:
         """Check the values."""
-        if not 0 <= self.record <= self.jumps or self.jumps < 2:
-            raise ValueError(f"need 0 <= record <= jumps and at least 2 jumps, got {self.record}, {self.jumps}")
+        if not 0 <= self.record <= self.jumps or self.jumps < 3:
+            raise ValueError(f"need 0 <= record <= jumps and at least 3 jumps, got {self.record}, {self.jumps}")
 
 
 def make_env(policy: Policy, args: Args) -> JumpEnv:
@@ -166,14 +166,15 @@ def moments(height: np.ndarray, command: int) -> list[int]:
     apex = command + int(np.argmax(height[command:]))
     squat = command + int(np.argmin(height[command : apex + 1]))
     catch = apex + int(np.argmin(height[apex : apex + 60]))
-    return [command, squat, (squat + apex) // 2, apex, (apex + catch) // 2, catch, len(height) - 1]
+    push = squat + int(np.argmax(height[squat : apex + 1] >= 0.5 * (height[squat] + height[apex])))
+    return [command, squat, push, apex, (apex + catch) // 2, catch, len(height) - 1]
 
 
 def figures(jumps: Jumps, early: np.ndarray) -> dict:
     """Return the figures of the sweep; early: (jumps,) whether a jump was begun before the command."""
     target, error = jumps.target, np.abs(jumps.error)
     near = (error <= NEAR) & ~early
-    tilt = np.degrees(jumps.tilt)
+    tilt = np.where(np.isnan(error), 0.0, np.degrees(jumps.tilt))
     landed = jumps.success & (tilt < LEVEL) & (jumps.rest_speed < REST_SPEED)
 
     def share(what: np.ndarray, lower: float, upper: float) -> float:
@@ -192,7 +193,7 @@ def figures(jumps: Jumps, early: np.ndarray) -> dict:
         "success_rate_0_6_1_1": share(near, 0.6, 1.1),
         "success_rate_reachable": share(near, LOWER, reachable),
         "reachable_share": float((target <= reachable).mean()),
-        "largest_reached_m": float(np.nanmax(jumps.apex)),
+        "largest_reached_m": float(np.nanmax(jumps.error + target)),
         "open_loop_limit_m": OPEN_LOOP_LIMIT,
         "success_and_landing_rate": float((near & landed).mean()),
         "landing_rate": float(landed.mean()),

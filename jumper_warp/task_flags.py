@@ -53,7 +53,7 @@ class TaskFlags:
         terms = tuple(
             dataclasses.replace(
                 term,
-                weight=term.weight,
+                weight=self.weights[flag_name(term)],
                 params=self.term_params.get(flag_name(term), term.params),
             )
             for term in task.terms

@@ -18,8 +18,8 @@ from jumper_warp.tasks import make_task
 from jumper_warp.tasks.task import TaskCfg
 from jumper_warp.train_command import parse_train
 
-TRAIN = ["vertical-jump", "--num-envs", "16", "--iterations", "2", "--ppo.num-steps", "4", "--ppo.minibatches", "2"]
-TRAIN += ["--ppo.hidden", "16", "8", "--no-tensorboard", "--device", "cpu", "--env.games", "2"]
+TRAIN = ["train", "vertical-jump", "--num-envs", "16", "--iterations", "2", "--no-tensorboard", "--device", "cpu"]
+TRAIN += ["--ppo.num-steps", "4", "--ppo.minibatches", "2", "--ppo.hidden", "16", "8", "--env.games", "2"]
 
 
 def run(capsys, *args):
@@ -37,7 +37,7 @@ def run(capsys, *args):
 def trained_run(tmp_path_factory):
     """Folder of a short training, and the policy exported from it."""
     root = tmp_path_factory.mktemp("logs")
-    cli.main(["train", *TRAIN, "--log-root", str(root)])
+    cli.main([*TRAIN, "--log-root", str(root)])
     (folder,) = (root / "vertical-jump").iterdir()
     cli.main(["export", str(folder)])
     return folder
@@ -69,15 +69,16 @@ def test_every_command_has_help(capsys, command):
         (["fly"], "no command 'fly'; there are train, play, evaluate, export, list"),
         (["train", "swim"], "unknown task 'swim'; there are vertical-jump"),
         (["train", "--iterations", "3"], "the task comes first"),
-        (["train", "vertical-jump", "--task", "other"], "give the task once"),
-        (["train", "vertical-jump", "--env.weights.jump-height", "nan"], "weight of jump_height must be finite"),
-        (["train", "vertical-jump", "--device", "abacus"], "no device 'abacus'"),
+        ([*TRAIN, "--task", "other"], "give the task once"),
+        ([*TRAIN, "--env.weights.jump-height", "nan"], "weight of jump_height must be finite"),
+        ([*TRAIN, "--device", "abacus"], "no device 'abacus'"),
         (["play", "missing"], "no policy 'missing'"),
         (["evaluate", "missing"], "no policy 'missing'"),
         (["export", "missing/model.pt"], "missing/manifest.json: No such file or directory"),
     ],
 )
-def test_unusable_input_is_one_line_and_code_2(capsys, args, message):
+def test_unusable_input_is_one_line_and_code_2(capsys, tmp_path, monkeypatch, args, message):
+    monkeypatch.chdir(tmp_path)
     code, out, err = run(capsys, *args)
     assert (code, out) == (2, "")
     assert len(err) == 1 and err[0].startswith("jumper: ") and message in err[0]

@@ -2,10 +2,14 @@ import math
 
 import numpy as np
 import pytest
+from jump_helpers import DEG, Table, make_episode, make_view, tilted_by
 
 from kernels import terminations
 from kernels.task import FLIGHT, LANDED, STANCE
-from tests.jump_helpers import DEG, make_episode, make_view, tilted_by
+
+NAMES = """success too_long came_apart wrong_height low_touchdown low_base moved_away slanted_takeoff tilted hard_impact
+no_jump collided early_takeoff"""
+holds = Table(terminations, NAMES, bool)
 
 
 def test_success_comes_a_time_after_touchdown():
@@ -95,15 +99,14 @@ def test_hard_impact_has_a_limit_for_stance_and_one_for_the_rest(phase, limit):
 
 
 def test_no_jump_within_the_time_or_at_rest_for_too_long():
-    p = 180.0, 60.0
     view = make_view()
-    assert not holds("no_jump", view, make_episode(steps=210, command_step=30), p)
-    assert holds("no_jump", view, make_episode(steps=211, command_step=30), p)
-    assert not holds("no_jump", view, make_episode(steps=100, command_step=30, idle_steps=60), p)
-    assert holds("no_jump", view, make_episode(steps=100, command_step=30, idle_steps=61), p)
+    assert not holds("no_jump", view, make_episode(steps=210, command_step=30), 180.0, 60.0)
+    assert holds("no_jump", view, make_episode(steps=211, command_step=30), 180.0, 60.0)
+    assert not holds("no_jump", view, make_episode(steps=100, command_step=30, idle_steps=60), 180.0, 60.0)
+    assert holds("no_jump", view, make_episode(steps=100, command_step=30, idle_steps=61), 180.0, 60.0)
     for phase in (FLIGHT, LANDED):
-        assert not holds("no_jump", view, make_episode(phase=phase, steps=999, idle_steps=99), p)
-    assert not holds("no_jump", view, make_episode(steps=20, command_step=30, idle_steps=99), p)
+        assert not holds("no_jump", view, make_episode(phase=phase, steps=999, idle_steps=99), 180.0, 60.0)
+    assert not holds("no_jump", view, make_episode(steps=20, command_step=30, idle_steps=99), 180.0, 60.0)
 
 
 @pytest.mark.parametrize("flag", [1 << bit for bit in range(8)])

@@ -1,0 +1,164 @@
+"""What each idea of the vertical jump's training is worth: success over training time without it.
+
+    python experiments/ablations.py --seconds 120 --envs 8192 --out outputs/ablations
+
+Every variant trains from nothing for the same time. Every few seconds, off the clock, its policy makes the same nominal
+jumps to heights of 0.5 to 1.1 m from standing; a jump counts if it meets its height within 0.1 m and is landed.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import matplotlib
+import numpy as np
+import torch
+import tyro
+import warp as wp
+from rich.console import Console
+from rich.table import Table
+
+from jumper_warp.env import JumpEnv
+from jumper_warp.evaluate import run_jumps
+from jumper_warp.figures import output_dir, write_figures
+from jumper_warp.networks import sanitise
+from jumper_warp.ppo import Ppo, PpoCfg
+from jumper_warp.runtime import report_device
+from jumper_warp.tasks import make_task
+from jumper_warp.tasks.ablations import ABLATIONS
+from jumper_warp.tasks.task import TaskCfg
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt
+
+FULL = "full"
+"""Name of the training that lacks nothing."""
+GOOD = 0.8
+"""Success rate whose time is reported."""
+
+
+@dataclass(frozen=True)
+class Args:
+    """Flags."""
+
+    seconds: float = 60.0
+    """[s] Training time of each variant, its evaluations not counted."""
+    every: float = 5.0
+    """[s] Training time between two evaluations."""
+    variants: list[str] = field(default_factory=lambda: [FULL, *ABLATIONS])
+    """Which variants to train."""
+    envs: int = 8192
+    """Number of environments."""
+    jumps: int = 200
+    """Jumps of an evaluation."""
+    randomize: bool = True
+    """Train with randomisation and noise."""
+    seed: int = 1
+    """Of weights, noise and worlds."""
+    ppo: PpoCfg = field(default_factory=PpoCfg)
+    """Settings of the algorithm."""
+    out: Path | None = None
+    """Folder for figures.json and the plot (default: outputs/ablations/<time>)."""
+    device: str | None = None
+    """Warp device."""
+
+    def __post_init__(self) -> None:
+        """Check the values."""
+        unknown = set(self.variants) - {FULL, *ABLATIONS}
+        if unknown or not self.variants:
+            raise ValueError(f"variants are {', '.join((FULL, *ABLATIONS))}, got {self.variants}")
+
+
+@dataclass
+class Curve:
+    """Success of one variant over its training time."""
+
+    seconds: list[float] = field(default_factory=list)
+    success: list[float] = field(default_factory=list)
+    iterations: int = 0
+
+    def seconds_to(self, rate: float) -> float | None:
+        """Return the first training time [s] at which an evaluation had at least this success rate, if any."""
+        return next((t for t, success in zip(self.seconds, self.success, strict=True) if success >= rate), None)
+
+
+def success(ppo: Ppo, judge: JumpEnv, jumps: int) -> float:
+    """Return the share of the test's jumps that succeed."""
+
+    @torch.no_grad()
+    def act(obs: torch.Tensor) -> torch.Tensor:
+        return ppo.model.actor(ppo.model.features(sanitise(obs))).clamp(-1.0, 1.0)
+
+    return float(run_jumps(act, judge, np.linspace(0.5, 1.1, jumps)).success.mean())
+
+
+def train_variant(task: TaskCfg, judge: JumpEnv, args: Args) -> Curve:
+    """Train for the given time and return the curve; kernels are compiled off the clock."""
+    torch.manual_seed(args.seed)
+    env = JumpEnv(task, args.envs, seed=args.seed, device=args.device, randomize=args.randomize, noise=args.randomize)
+    ppo = Ppo(env, args.ppo)
+    env.reset()
+    env.step(torch.zeros(env.num_envs, env.num_actions, device=env.device))
+    env.reset()
+    env.metrics()
+    curve, trained = Curve(), 0.0
+    while trained < args.seconds:
+        wp.synchronize_device(env.wp_device)
+        start = time.perf_counter()
+        until = min(trained + args.every, args.seconds)
+        while trained + time.perf_counter() - start < until:
+            ppo.collect()
+            ppo.update()
+            curve.iterations += 1
+            wp.synchronize_device(env.wp_device)
+        trained += time.perf_counter() - start
+        curve.seconds.append(trained)
+        curve.success.append(success(ppo, judge, args.jumps))
+    return curve
+
+
+def plot(curves: dict[str, Curve], path: Path) -> None:
+    """Draw success over training time."""
+    fig, axis = plt.subplots(figsize=(7, 4.5), constrained_layout=True)
+    for name, curve in curves.items():
+        axis.plot([0.0, *curve.seconds], [0.0, *(100.0 * s for s in curve.success)], label=name.replace("_", " "))
+    axis.set(xlabel="training time [s]", ylabel="success [%]", ylim=(0.0, 102.0))
+    axis.grid(alpha=0.3)
+    axis.legend(loc="lower right")
+    fig.savefig(path, dpi=110)
+    plt.close(fig)
+
+
+def main(args: Args) -> dict:
+    """Train all variants and return the figures."""
+    wp.config.log_level = wp.LOG_WARNING
+    report_device(args.device)
+    folder = output_dir("ablations", args.out)
+    task = make_task("vertical-jump")
+    judge = JumpEnv(task, args.jumps, device=args.device, randomize=False, noise=False, auto_reset=False)
+    table = Table("variant", "success", f"seconds to {100 * GOOD:g} %", "iterations")
+    curves: dict[str, Curve] = {}
+    values: dict = {"seconds": args.seconds, "envs": args.envs, "randomize": args.randomize, "seed": args.seed}
+    for name in args.variants:
+        curve = curves[name] = train_variant(ABLATIONS.get(name, lambda same: same)(task), judge, args)
+        reached = curve.seconds_to(GOOD)
+        values |= {
+            f"success_{name}": 1.0,
+            f"seconds_to_80_percent_{name}": reached,
+            f"iterations_{name}": curve.iterations,
+            f"curve_seconds_{name}": curve.seconds,
+            f"curve_success_{name}": curve.success,
+        }
+        never = "not reached" if reached is None else f"{reached:.1f}"
+        table.add_row(name, f"{100.0 * curve.success[-1]:.1f} %", never, str(curve.iterations))
+        write_figures(folder, values)
+        plot(curves, folder / "ablations.png")
+    Console().print(table)
+    print(f"figures and plot in {folder}")
+    return values
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Args))

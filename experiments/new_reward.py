@@ -1,0 +1,81 @@
+"""How to add a reward term from a script of your own, without touching the package.
+
+    python experiments/new_reward.py --iterations 5
+
+A term is a pure Warp function of the robot (`kernels.task.RobotView`), the episode (`kernels.task.JumpTask`) and four
+numbers, and a line that gives it a weight. It is compiled into the task's one reward kernel and logged by its name.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import torch
+import tyro
+import warp as wp
+
+from jumper_warp.env import JumpEnv
+from jumper_warp.figures import output_dir, write_figures
+from jumper_warp.ppo import PpoCfg
+from jumper_warp.tasks import make_task
+from jumper_warp.tasks.task import Term
+from jumper_warp.train import TrainCfg, train
+from kernels.task import FLIGHT, JumpTask, RobotView
+
+
+@wp.func
+def even_load(view: RobotView, task: JumpTask, p: wp.vec4) -> float:
+    """Even load: exp(-spread / p0) of the paw forces [N] about their mean, on the ground."""
+    if task.phase == FLIGHT:
+        return 0.0
+    mean = (view.paw_force[0] + view.paw_force[1] + view.paw_force[2] + view.paw_force[3]) / 4.0
+    off = view.paw_force - wp.vec4(mean, mean, mean, mean)
+    return wp.exp(-wp.length(off) / p[0])
+
+
+TASK = make_task("vertical-jump")
+TASK = replace(TASK, terms=TASK.terms + (Term(even_load, weight=5.0, params=(50.0,)),))
+
+
+def make_env(num_envs: int, seed: int, device: torch.device) -> JumpEnv:
+    """Return the environment with the new term, for `train`."""
+    return JumpEnv(TASK, num_envs, seed=seed, device=str(device))
+
+
+@dataclass(frozen=True)
+class Args:
+    """Flags."""
+
+    envs: int = 256
+    """Number of environments."""
+    iterations: int = 5
+    """Training iterations."""
+    steps: int = 32
+    """Policy steps of each environment in an iteration."""
+    out: Path | None = None
+    """Folder for the run and figures.json (default: outputs/new_reward/<time>)."""
+    device: str | None = None
+    """Torch device."""
+
+
+def main(args: Args) -> dict:
+    """Train for a few iterations and return what was logged of the new term."""
+    wp.config.log_level = wp.LOG_WARNING
+    folder = output_dir("new_reward", args.out)
+    ppo = PpoCfg(num_steps=args.steps)
+    cfg = TrainCfg(num_envs=args.envs, iterations=args.iterations, log_interval=1, log_root=folder / "logs", ppo=ppo,
+                   device=args.device, tensorboard=False)  # fmt: skip
+    result = train(cfg, make_env)
+    values = {
+        "even_load_per_episode": result.figures["Episode_Reward/even_load"],
+        "mean_return": result.figures.get("Train/mean_return"),
+        "iterations": result.iteration,
+    }
+    write_figures(folder, values)
+    print(f"Episode_Reward/even_load {values['even_load_per_episode']:.4f}; run in {result.folder}")
+    return values
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Args))
