@@ -145,7 +145,7 @@ def main(args: Args) -> dict:
         curve = curves[name] = train_variant(ABLATIONS.get(name, lambda same: same)(task), judge, args)
         reached = curve.seconds_to(GOOD)
         values |= {
-            f"success_{name}": 1.0,
+            f"success_{name}": curve.success[-1],
             f"seconds_to_80_percent_{name}": reached,
             f"iterations_{name}": curve.iterations,
             f"curve_seconds_{name}": curve.seconds,

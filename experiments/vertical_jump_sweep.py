@@ -48,8 +48,6 @@ ENDS = ("success", "came_apart", "low_base", "tilted", "collided", "no_jump", "t
 FALLS = ("low_base", "tilted")
 PAPER = {"mean_abs_error_m": 0.04, "success_rate": 0.91, "success_rate_in_range": 1.0}
 """The paper's figures for this test, in its simulation."""
-SPACING = 1.2
-"""[m] Between the robots of the recording."""
 
 
 @dataclass(frozen=True)
@@ -112,7 +110,7 @@ class Observer:
         from jumper_warp.robot import build_model
 
         self.model = build_model(count)
-        self.recorder = Recorder(self.model, range(count), spacing=SPACING, notes={"targets_m": self.targets.tolist()})
+        self.recorder = Recorder(self.model, range(count), spacing=1.2, notes={"targets_m": self.targets.tolist()})
 
     def act(self, obs: torch.Tensor) -> torch.Tensor:
         """Return the actions, as `Policy.act`."""
@@ -142,8 +140,6 @@ class Observer:
 
     def save(self, folder: Path) -> None:
         """Write `jumps.rrd` and the filmstrip of the jump closest to 1 m."""
-        if len(self.worlds) == 0:
-            return
         from jumper_warp.snapshot import Camera, contact_sheet
 
         recording = self.recorder.recording()
@@ -186,7 +182,6 @@ def figures(jumps: Jumps, early: np.ndarray) -> dict:
         "jumps": len(target),
         "mean_abs_error_m": float(np.nanmean(error)),
         "mean_abs_error_in_range_m": float(np.nanmean(error[target <= 1.1 + 5e-4])),
-        "median_abs_error_m": float(np.nanmedian(error)),
         "mean_error_m": float(np.nanmean(jumps.error)),
         "success_rate": float(near.mean()),
         "success_rate_in_range": share(near, 0.5, 1.1),
@@ -197,14 +192,12 @@ def figures(jumps: Jumps, early: np.ndarray) -> dict:
         "open_loop_limit_m": OPEN_LOOP_LIMIT,
         "success_and_landing_rate": float((near & landed).mean()),
         "landing_rate": float(landed.mean()),
-        "landing_rate_0_6_1_1": share(landed, 0.6, 1.1),
         "collision_rate": float((jumps.outcomes == COLLIDED).mean()),
         "fall_rate": float(np.isin(jumps.outcomes, FALLS).mean()),
         "no_jump_rate": float((jumps.outcomes == "no_jump").mean()),
         "early_rate": float(early.mean()),
         "at_rest_within_1_s_rate": float((jumps.rest_speed < REST_SPEED).mean()),
         "largest_tilt_deg": float(tilt.max()),
-        "mean_tilt_deg": float(tilt.mean()),
         "came_apart": int(np.isnan(jumps.error).sum()),
     }
 
@@ -220,7 +213,6 @@ def plot(jumps: Jumps, path: Path, title: str) -> None:
     axis.scatter(jumps.target[near], jumps.apex[near], s=9, color="tab:blue", label="reached")
     axis.scatter(jumps.target[~near], jumps.apex[~near], s=14, color="tab:red", marker="x", label="missed")
     axis.set(xlabel="commanded base height [m]", ylabel="highest base height [m]", title=title)
-    axis.grid(alpha=0.3)
     axis.legend(loc="upper left")
     fig.savefig(path, dpi=110)
     plt.close(fig)
@@ -244,7 +236,8 @@ def main(args: Args) -> dict:
     write_figures(folder, values)
     title = f"{args.jumps} jumps, {args.solver}, {'randomised' if args.randomize else 'nominal'}"
     plot(jumps, folder / "sweep.png", title)
-    observer.save(folder)
+    if args.record:
+        observer.save(folder)
     table = Table("figure", title, "paper")
     for name, value in values.items():
         table.add_row(name, f"{value:.4g}" if isinstance(value, float) else str(value), str(PAPER.get(name, "")))

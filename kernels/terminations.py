@@ -83,4 +83,4 @@ def collided(view: RobotView, task: JumpTask, p: wp.vec4) -> bool:
 @wp.func
 def early_takeoff(view: RobotView, task: JumpTask, p: wp.vec4) -> bool:
     """Jumped before the jump was commanded."""
-    return task.took_off == 1 and task.steps < task.command_step and task.phase != STANCE
+    return task.took_off == 1 and task.steps < task.command_step

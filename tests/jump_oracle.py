@@ -78,7 +78,7 @@ def expected_terms(task, before: dict, after: dict, action: np.ndarray) -> np.nd
         "air_posture": flight * posture("air_posture"),
         "retract": soon * posture("retract", p["retract"][1]),
         "soft_impact": soon * np.maximum(1.0 - deceleration / p["soft_impact"][0], 0.0),
-        "stance_impact": -stance * np.minimum(deceleration / p["stance_impact"][0], 1.0),
+        "stance_impact": -1.0 * stance * np.minimum(deceleration / p["stance_impact"][0], 1.0),
         "catch_landing": soon * np.clip(-vel[:, 2], 0.0, 1.0),
         "damp_landing": soon * np.clip(after["rate"][T], 0.0, 1.0).mean(axis=0),
         "ground_force": np.sum(after["force"] ** 2, axis=0) / p["ground_force"][0] ** 2,

@@ -42,6 +42,7 @@ TERMS = (
 RULES = (
     Rule(terminations.success, (1.0 * SECOND,), success=True),
     Rule(terminations.came_apart),
+    Rule(terminations.early_takeoff),
     Rule(terminations.wrong_height, (0.10,)),
     Rule(terminations.low_touchdown, (0.20,)),
     Rule(terminations.low_base, (0.10,)),
