@@ -23,9 +23,10 @@ from rich.table import Table
 from jumper_warp.figures import output_dir, write_figures
 from jumper_warp.motors import MotorCfg, jumping_motors, loose_filter, vertical_jump_filter
 from jumper_warp.recording import Recorder
-from jumper_warp.robot import LEGS, MOTOR_JOINTS
+from jumper_warp.robot import LEGS, MOTOR_JOINTS, build_model
 from jumper_warp.runtime import report_device
 from jumper_warp.simulation import Simulation, motor_values
+from jumper_warp.snapshot import Camera, contact_sheet
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
@@ -36,6 +37,8 @@ STAND, RAMP, HOLD, EXTEND, LAND = 60, 25, 50, 40, 60
 """Ticks of 1/60 s: default pose, ramp into the squat, squat, full extension, default pose again."""
 
 
+MOMENTS = (0.9, 2.2, 2.32, 2.45, 2.7, 2.95, 3.15, 3.8)
+"""[s] Of the filmstrip: standing, squatting, push-off, rising, apex, falling, landing, standing."""
 PER_MOTOR = tuple(f"peak_{what}_{leg}" for what in ("torque", "speed") for leg in LEGS)
 """Beginnings of the figures that are saved but not printed."""
 
@@ -128,6 +131,18 @@ def record(recorder: Recorder, sim: Simulation, row: tuple) -> None:
     recorder.record(now, sim.state.body_q, series, contact_points=points, contact_forces=force)
 
 
+def draw_filmstrip(frames: list[np.ndarray], path: Path) -> None:
+    """Draw the robot at a few moments side by side; frames: body poses of every tick, (21, 7) each."""
+    model = build_model(1)
+    state = model.state()
+    camera = Camera(model, eye=(1.6, 2.0, 0.75), target=(0.0, 0.0, 0.55), size=(300, 400))
+    pictures = []
+    for moment in MOMENTS:
+        state.body_q.assign(frames[round(60 * moment)])
+        pictures.append(camera.picture(state))
+    contact_sheet(pictures, path, [f"{moment:.2f} s" for moment in MOMENTS])
+
+
 def figures(args: Args, trace: Trace) -> dict:
     """Return the figures of the jump."""
     contact = np.linalg.norm(trace.force, axis=2).max(axis=1) > 0.1
@@ -204,6 +219,7 @@ def main(args: Args) -> dict:
     folder = output_dir("open_loop_jump", args.out)
     start = time.perf_counter()
     trace, recorder, frames = run(args)
+    draw_filmstrip(frames, folder / "jump_strip.png")
     values = figures(args, trace)
     write_figures(folder, values)
     plot(trace, folder / "jump.png", f"Open-loop jump, {args.solver}, {args.torque:g} N m")

@@ -142,8 +142,8 @@ def standing_configuration(description: RobotDescription, pose: str = "default")
 def mujoco_solver(model: newton.Model, *, dt: float = PHYSICS_DT, **overrides) -> newton.solvers.SolverMuJoCo:
     """Return Newton's MuJoCo solver with stiff loops for physics steps of `dt` [s].
 
-    It knows neither a damper with a largest torque nor a stop of the sum of two angles: it comes without knee damping,
-    and `jumper_warp.simulation` adds both as torques (`kernels.passive`).
+    It knows neither a damper with a largest torque nor a stop of the sum of two angles. `jumper_warp.simulation` takes
+    the knees' damping out of its model and adds both as torques (`kernels.passive`); here the damping has no cap.
 
     `overrides` replace settings of `newton.solvers.SolverMuJoCo`.
     """
@@ -163,9 +163,6 @@ def mujoco_solver(model: newton.Model, *, dt: float = PHYSICS_DT, **overrides) -
     impedance = solver.mjw_model.eq_solimp.numpy()
     impedance[:] = (0.99, 0.999, 0.001, 0.5, 2.0)
     solver.mjw_model.eq_solimp.assign(impedance)
-    damping = solver.mjw_model.dof_damping.numpy()
-    damping[:, KNEE_DOFS] = 0.0
-    solver.mjw_model.dof_damping.assign(damping)
     return solver
 
 

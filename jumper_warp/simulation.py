@@ -11,7 +11,7 @@ from newton.sensors import SensorContact
 
 from jumper_warp.description import load_description
 from jumper_warp.motors import FilterCfg, MotorCfg, filter_params, jumping_motors, motor_arrays
-from jumper_warp.robot import PHYSICS_DT, build_model, mujoco_solver
+from jumper_warp.robot import KNEE_DOFS, PHYSICS_DT, build_model, mujoco_solver
 from jumper_warp.solver import SolverJumper
 from kernels.actuator import motor_torque_kernel
 from kernels.command_filter import command_filter_kernel
@@ -90,6 +90,9 @@ class Simulation:
                 self.solver.torque, self.solver.contact_force, self.solver.peak_force,
             )  # fmt: skip
         else:
+            damping = self.model.joint_damping.numpy().reshape(num_worlds, -1)
+            damping[:, KNEE_DOFS] = 0.0
+            self.model.joint_damping.assign(damping.ravel())
             self.solver = mujoco_solver(self.model, dt=dt)
             self._prepare_mujoco(observe_forces)
 

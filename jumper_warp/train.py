@@ -138,6 +138,9 @@ def join_ranks(device: str | None = None) -> Rank:
         kind = torch.device("cuda", 0)
     if kind.type == "cuda":
         torch.cuda.set_device(kind)
+    elif "OMP_NUM_THREADS" not in os.environ:
+        # small networks lose more to waiting threads than they gain, far more on a busy machine
+        torch.set_num_threads(max(1, (os.cpu_count() or 1) // 2))
     if size > 1 and not torch.distributed.is_initialized():
         torch.distributed.init_process_group("nccl" if kind.type == "cuda" else "gloo")
     return Rank(int(os.environ.get("RANK", "0")) if size > 1 else 0, size, kind)

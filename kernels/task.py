@@ -135,9 +135,10 @@ def load_view(arrays: ViewArrays, world: int, contact_force: float) -> RobotView
 def speed_limit_broken(view: RobotView) -> bool:
     """Return whether a state is non-finite or faster than the robot can ever be: the world has come apart."""
     fastest = float(0.0)
+    total = wp.length_sq(view.pos) + wp.length_sq(view.lin_vel) + wp.length_sq(view.ang_vel)
     for m in range(12):
         fastest = wp.max(fastest, wp.abs(view.rate[m]))
-    total = wp.length_sq(view.pos) + wp.length_sq(view.lin_vel) + wp.length_sq(view.ang_vel) + fastest
+        total += view.rate[m] * view.rate[m] + view.angle[m] * view.angle[m]  # max() would pass over a NaN
     if not wp.isfinite(total):
         return True
     return wp.length(view.lin_vel) > 15.0 or wp.length(view.ang_vel) > 40.0 or fastest > 120.0
