@@ -235,7 +235,8 @@ class JumpEnv:
         )  # fmt: skip
 
     def _launch(self, kernel: wp.Kernel, dim: int | tuple[int, ...], inputs: list, outputs: list) -> None:
-        wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.wp_device)
+        # small blocks spread a few thousand heavy threads over all multiprocessors
+        wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.wp_device, block_dim=32)
 
     # ------------------------------------------------------------------ looking at it
 

@@ -50,16 +50,18 @@ class PpoCfg:
     """Whether the value loss is clipped."""
     normalise_value: bool = True
     """Whether the critic predicts the return in its running standard deviations."""
-    entropy_coef: float = 0.00075
+    entropy_coef: float = 0.0003
     """Weight of the entropy bonus."""
     lr: float = 1.0e-3
     """Adam's step size at the start."""
-    min_lr: float = 1.0e-5
+    min_lr: float = 1.0e-6
     """Its lower bound."""
     max_lr: float = 1.0e-2
     """Its upper bound."""
     desired_kl: float = 0.01
     """The step size falls above twice and rises below half of this divergence; 0 keeps it fixed."""
+    final_kl: float = 0.002
+    """What desired_kl falls to, in a straight line over the second half of a training; smaller steps, finer policy."""
     max_grad_norm: float = 1.0
     """Gradients of the actor and of the critic are each shortened to this norm."""
     init_std: float = 1.0
@@ -70,9 +72,8 @@ class PpoCfg:
     """Widths of the hidden layers."""
     activation: str = "elu"
     """elu, relu or tanh."""
-    tf32: bool = False
-    """Whether matrix products on a GPU may round their factors to 10 mantissa bits. With little exploration noise left,
-    that alone looks like a large divergence and drives the step size to its lower bound."""
+    tf32: bool = True
+    """Whether matrix products on a GPU may round their factors to 10 mantissa bits."""
     graphs: bool = True
     """Whether a GPU replays captured graphs; the update of several GPUs is always eager."""
 
@@ -219,12 +220,15 @@ def losses(model: ActorCritic, batch: Batch, old_log_std: torch.Tensor, cfg: Ppo
     return Losses(total, surrogate, value_loss, entropy, kl)
 
 
-def adapted_lr(lr: torch.Tensor, kl: torch.Tensor, cfg: PpoCfg) -> torch.Tensor:
+def adapted_lr(
+    lr: torch.Tensor, kl: torch.Tensor, cfg: PpoCfg, desired_kl: torch.Tensor | float | None = None
+) -> torch.Tensor:
     """Return the step size after a divergence: 1.5 times smaller above twice the desired one, larger below half."""
     if cfg.desired_kl <= 0.0:
         return lr
-    slower = torch.where(kl > 2.0 * cfg.desired_kl, (lr / 1.5).clamp(min=cfg.min_lr), lr)
-    too_slow = (kl < 0.5 * cfg.desired_kl) & (kl > 0.0)
+    desired_kl = cfg.desired_kl if desired_kl is None else desired_kl
+    slower = torch.where(kl > 2.0 * desired_kl, (lr / 1.5).clamp(min=cfg.min_lr), lr)
+    too_slow = (kl < 0.5 * desired_kl) & (kl > 0.0)
     return torch.where(too_slow, (lr * 1.5).clamp(max=cfg.max_lr), slower)
 
 
@@ -248,6 +252,7 @@ class Ppo:
         actor = [*self.model.actor.parameters(), self.model.log_std]
         critic = list(self.model.critic.parameters())
         self.lr = torch.full((), cfg.lr, device=env.device)
+        self._desired_kl = torch.full((), cfg.desired_kl, device=env.device)
         self.update = Captured(self._update, cuda and cfg.graphs and world_size() == 1)
         self.optimiser = torch.optim.Adam([*actor, *critic], lr=self.lr, fused=True, capturable=self.update.enabled)
         self._flatten_gradients(actor, critic)
@@ -337,12 +342,17 @@ class Ppo:
             for part, norm in zip(self._gradients, norms, strict=True):
                 part.mul_((self.cfg.max_grad_norm / (norm + 1.0e-6)).clamp(max=1.0))
             self._vector.nan_to_num_(nan=0.0, posinf=0.0, neginf=0.0)
-            self.lr.copy_(adapted_lr(self.lr, kl, self.cfg))
+            self.lr.copy_(adapted_lr(self.lr, kl, self.cfg, self._desired_kl))
             self.optimiser.step()
             skipped = 1.0 - norms.isfinite().all().float()
             terms = torch.stack([found.surrogate, found.value, found.entropy, kl, *norms, skipped])
             self._sums += torch.nan_to_num(terms, nan=0.0, posinf=0.0, neginf=0.0)
             self._sum_count += 1.0
+
+    def set_progress(self, progress: float) -> None:
+        """Tell how much of the training is over, from 0 to 1; does not wait for the device."""
+        late = min(max(2.0 * progress - 1.0, 0.0), 1.0)
+        self._desired_kl.fill_((1.0 - late) * self.cfg.desired_kl + late * min(self.cfg.final_kl, self.cfg.desired_kl))
 
     def statistics(self) -> dict[str, float]:
         """Return averages since the last call, of losses and of finished episodes; waits for the device."""

@@ -41,7 +41,7 @@ class TrainCfg:
     """Name of the task; also the name of the folder of its runs."""
     num_envs: int = 8192
     """Worlds, over all processes."""
-    iterations: int = 1500
+    iterations: int = 3300
     """Iterations that the run has at its end, those before a resume included."""
     max_seconds: float = 0.0
     """Wall-clock limit of the iterations [s]; 0: none."""
@@ -238,6 +238,7 @@ class Run:
             since = self.iteration
             while not ending:
                 watch.start()
+                ppo.set_progress(self._progress(begin))
                 ppo.collect()
                 watch.mark()
                 ppo.update()
@@ -253,6 +254,13 @@ class Run:
                 if ending or self.iteration % cfg.save_interval == 0:
                     self._save(log, must=ending)
         return TrainResult(self.folder, self.iteration, time.perf_counter() - begin, self.figures)
+
+    def _progress(self, begin: float) -> float:
+        """Return how much of the training is over, by iterations or time, whichever is further."""
+        done = self.iteration / self.cfg.iterations
+        if self.cfg.max_seconds > 0.0:
+            done = max(done, (time.perf_counter() - begin) / self.cfg.max_seconds)
+        return done
 
     def _ending(self, stop: Stop, begin: float) -> bool:
         """Return whether this iteration is the last; the processes agree, which they ask when they log."""

@@ -161,19 +161,32 @@ def test_flights_cover_the_leg_ranges_and_touchdowns_reach_for_the_ground(drawn)
     assert np.ptp(height, axis=1).max() < 1e-4
 
 
-def test_no_state_collides_and_paws_are_not_under_the_ground(drawn):
-    env, episodes, q, _ = drawn
-    flags = wp.zeros(N, dtype=int, device="cpu")
-    clearance = wp.zeros(N, dtype=float, device="cpu")
+def collision_flags(env):
+    """Return the flags of forbidden contacts of every world."""
+    flags, clearance = (wp.zeros(env.num_envs, dtype=kind, device="cpu") for kind in (int, float))
     robot = env._dynamics.robot
     inputs = [robot.geometry, robot.ground, env.sim.state.joint_q, 43, 0.0]
-    wp.launch(collision_kernel, N, inputs, [flags, clearance], device="cpu")
-    assert not flags.numpy().any()
+    wp.launch(collision_kernel, env.num_envs, inputs, [flags, clearance], device="cpu")
+    return flags.numpy()
+
+
+def test_no_state_collides_and_paws_are_not_under_the_ground(drawn):
+    env, episodes, q, _ = drawn
+    assert not collision_flags(env).any()
     flying = some(episodes, "in_flight")
     assert paws_and_velocities(env, flying)[0][..., 2].min() >= PAW_RADIUS + 0.01 - 1e-4
     sums = q[:, MOTOR_Q].reshape(N, 4, 3)[..., 1:].sum(axis=2)
     assert sums.min() >= -1e-4 and sums.max() <= 240.0 * DEG + 1e-4
     assert np.abs(q[:, MOTOR_Q[::3]]).max() <= 15.0 * DEG + 1e-4
+
+
+def test_draws_that_collide_are_drawn_again():
+    # bases so low that shanks lie on the ground, and thighs so far in that they meet
+    level = Level((0.0, 0.0, 0.5), (0.0, 0.0, 0.6), (0.10, 0.30))
+    for reset in (only("standing"), only("in_flight", flight_transversal=(-30.0, 60.0))):
+        env = make_env(1024, task=dataclasses.replace(TASK, reset=reset, levels=(level,)))
+        assert not collision_flags(env).any()
+        assert np.mean(env.task_arrays()["scheme"] == SCHEMES.index("default")) < 0.5
 
 
 def test_the_same_draw_is_taken_once(drawn):
