@@ -190,7 +190,7 @@ def test_moments_start_as_identity():
     ],
 )
 def test_step_size_follows_the_divergence(lr, kl, expected):
-    found = adapted_lr(torch.tensor(lr), torch.tensor(kl), PpoCfg(desired_kl=0.01))
+    found = adapted_lr(torch.tensor(lr), torch.tensor(kl), PpoCfg(desired_kl=0.01, min_lr=1.0e-5))
     assert found.item() == pytest.approx(expected)
 
 
