@@ -50,7 +50,7 @@ class PpoCfg:
     """Whether the value loss is clipped."""
     normalise_value: bool = True
     """Whether the critic predicts the return in its running standard deviations."""
-    entropy_coef: float = 0.0003
+    entropy_coef: float = 0.0015
     """Weight of the entropy bonus."""
     lr: float = 1.0e-3
     """Adam's step size at the start."""

@@ -8,6 +8,7 @@ from .ground import Ground
 from .jump_phase import advance_jump
 from .scalar import real
 from .task import JumpTask, ViewArrays, load_view, speed_limit_broken
+from .terminations import came_apart
 
 NO_RULE = -1
 
@@ -62,6 +63,7 @@ def make_episode_kernel(terms: tuple, rules: tuple, task_error: wp.Function) -> 
     rule_funcs = [rule.func for rule in rules]
     rule_success = [bool(rule.success) for rule in rules]
     num_terms, num_rules = len(terms), len(rules)
+    broken_rule = rule_funcs.index(came_apart)
 
     @wp.kernel(module="unique", enable_backward=False)
     def episode_kernel(
@@ -86,11 +88,13 @@ def make_episode_kernel(terms: tuple, rules: tuple, task_error: wp.Function) -> 
 
         rule = int(NO_RULE)
         timeout = float(0.0)
+        broken = invalid[world] != 0 or speed_limit_broken(view)
+        if broken:
+            rule = wp.static(broken_rule)
         for i in range(wp.static(num_rules)):
             if rule == NO_RULE and wp.static(rule_funcs[i])(view, task, rule_params[i]):
                 rule = i
                 timeout = wp.where(wp.static(rule_success[i]), 1.0, 0.0)
-        broken = invalid[world] != 0 or speed_limit_broken(view)
 
         total = float(0.0)
         for i in range(wp.static(num_terms)):
@@ -102,6 +106,8 @@ def make_episode_kernel(terms: tuple, rules: tuple, task_error: wp.Function) -> 
             out.term_value[i, world] = value
             out.term_sum[i, world] = out.term_sum[i, world] + value
             total += value
+        if not wp.isfinite(total):
+            total = float(0.0)
         out.reward[world] = wp.max(total, 0.0)
         out.rule[world] = rule
         out.done[world] = wp.where(rule == NO_RULE, 0.0, 1.0)

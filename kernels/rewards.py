@@ -116,10 +116,10 @@ def joint_symmetry(view: RobotView, task: JumpTask, p: wp.vec4) -> float:
 
 @wp.func
 def ground_posture(view: RobotView, task: JumpTask, p: wp.vec4) -> float:
-    """Desired joint position on the ground: phi_p0 of the offset from default, transversal motors + p1."""
+    """Desired joint position on the ground: phi_p0 of the offset from default, transversal + p1; share p2 while due."""
     if task.phase == FLIGHT:
         return 0.0
-    return phi(transversal_offset(view, p[1]), p[0])
+    return phi(transversal_offset(view, p[1]), p[0]) * patience(task, p[2])
 
 
 @wp.func
