@@ -1,4 +1,4 @@
-# make demo   the open-loop jump, with figures and a recording, in outputs/demo
+# make demo   the open-loop jump, then 200 jumps of the shipped policy, with figures and recordings, in outputs/demo
 # make test   all tests
 # make lint   style and format
 # Each makes .venv/ first if it is missing or older than pyproject.toml or constraints.txt.
@@ -11,7 +11,8 @@ STAMP := $(VENV)/.installed
 .DELETE_ON_ERROR:
 
 demo: $(STAMP)
-	$(VENV)/bin/python experiments/open_loop_jump.py --out outputs/demo
+	$(VENV)/bin/python experiments/open_loop_jump.py --out outputs/demo/open_loop
+	$(VENV)/bin/python experiments/vertical_jump_sweep.py --out outputs/demo/vertical_jump
 
 test: $(STAMP)
 	$(VENV)/bin/python -m pytest

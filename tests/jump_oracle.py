@@ -74,7 +74,7 @@ def expected_terms(task, before: dict, after: dict, action: np.ndarray) -> np.nd
         "orientation": phi(after["lean"], p["orientation"][0]) * due("orientation"),
         "angular_velocity": phi(after["spin"], p["angular_velocity"][0]) * due("angular_velocity"),
         "joint_symmetry": symmetric * due("joint_symmetry"),
-        "ground_posture": ~flight * posture("ground_posture", p["ground_posture"][1]),
+        "ground_posture": ~flight * posture("ground_posture", p["ground_posture"][1]) * due("ground_posture"),
         "air_posture": flight * posture("air_posture"),
         "retract": soon * posture("retract", p["retract"][1]),
         "soft_impact": soon * np.maximum(1.0 - deceleration / p["soft_impact"][0], 0.0),

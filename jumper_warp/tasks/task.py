@@ -10,6 +10,7 @@ import warp as wp
 
 from jumper_warp.motors import FilterCfg, MotorCfg
 from jumper_warp.randomization import RandomizationCfg
+from kernels import terminations
 from kernels.observe import SensorNoise
 from kernels.reset import ResetRanges
 
@@ -200,6 +201,8 @@ class TaskCfg:
             raise ValueError(f"every term of {self.name} needs a name of its own, got {names}")
         if not self.rules or not self.rules[0].success:
             raise ValueError(f"the first rule of {self.name} must be its success")
+        if terminations.came_apart not in [rule.func for rule in self.rules]:
+            raise ValueError(f"{self.name} needs the rule came_apart, which ends worlds whose state is no longer one")
         if not self.levels:
             raise ValueError(f"{self.name} needs at least one level")
 

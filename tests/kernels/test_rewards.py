@@ -90,7 +90,7 @@ def test_joint_symmetry_falls_with_variance_and_with_lateral_angles():
 
 
 POSTURES = [
-    ("ground_posture", 35.0 * DEG, (10.0 * DEG, 35.0 * DEG), PHASES[0::2]),
+    ("ground_posture", 35.0 * DEG, (10.0 * DEG, 35.0 * DEG, 1.0), PHASES[0::2]),
     ("air_posture", 0.0, (10.0 * DEG,), PHASES[1:2]),
     ("retract", 15.0 * DEG, (10.0 * DEG, 15.0 * DEG), PHASES[2:]),
 ]
