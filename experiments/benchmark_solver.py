@@ -120,10 +120,10 @@ def measure(solver: SolverName, envs: int, args: Args) -> dict:
     jump, apex = time_jump(sim, args)
     values = {
         "setup_s": setup,
-        "standing_ms_per_step": 1e3 * standing,
-        "standing_steps_per_s": envs / standing,
-        "jump_ms_per_step": 1e3 * jump,
-        "jump_steps_per_s": envs / jump,
+        "ms_per_step_standing": 1e3 * standing,
+        "steps_per_s_standing": envs / standing,
+        "ms_per_step_jump": 1e3 * jump,
+        "steps_per_s_jump": envs / jump,
         "apex_m": apex,
     }
     if sim.device.is_cuda:
@@ -141,7 +141,7 @@ def compare(envs: int, args: Args) -> dict:
         for name, value in measure(solver, envs, args).items():
             figures[f"{solver}_{name}"] = value
     for phase in ("standing", "jump"):
-        rates = [figures.get(f"{solver}_{phase}_steps_per_s") for solver in ("jumper", "mujoco")]
+        rates = [figures.get(f"{solver}_steps_per_s_{phase}") for solver in ("jumper", "mujoco")]
         if all(rates):
             figures[f"ratio_{phase}"] = rates[0] / rates[1]
     return figures
