@@ -145,12 +145,11 @@ class Simulation:
         if self._filter is None:
             wp.copy(self._safe_target, self.target)
             return
-        wp.launch(
+        self._launch(
             command_filter_kernel,
-            dim=(4, self.num_worlds),
-            inputs=[self.target, self.state.joint_q, self.state.joint_qd, COORDS, DOFS, self._filter],
-            outputs=[self._safe_target],
-            device=self.device,
+            (4, self.num_worlds),
+            [self.target, self.state.joint_q, self.state.joint_qd, COORDS, DOFS, self._filter],
+            [self._safe_target],
         )
 
     def _physics(self, substeps: int) -> None:
@@ -199,13 +198,8 @@ class Simulation:
 
     def _read_paw_forces(self, restart: bool) -> None:
         self._sensor.update(self.state, self._contacts, observables=self._observables)
-        wp.launch(
-            paw_force_kernel,
-            dim=self.num_worlds,
-            inputs=[self._sensor.total_force, int(restart)],
-            outputs=[self.paw_force, self.peak_force],
-            device=self.device,
-        )
+        inputs = [self._sensor.total_force, int(restart)]
+        self._launch(paw_force_kernel, self.num_worlds, inputs, [self.paw_force, self.peak_force])
 
     def joint_q(self) -> np.ndarray:
         """Return the joint coordinates, (num_worlds, 43)."""

@@ -153,9 +153,7 @@ class SolverJumper(SolverBase):
     ) -> None:
         """Advance every world by dt [s]. `contacts` is not used: the solver finds the paws' contacts itself."""
         self.validate_observables(observables, contacts)
-        body_f = self._no_body_f if state_in.body_f is None else state_in.body_f
-        joint_f = (self._default_control if control is None else control).joint_f
-        drive = self.dynamics.drive(joint_f, body_f)
+        drive = self.dynamics.drive(*self._forces(state_in, control))
         self._advance(state_in, state_out, drive, dt, 1, observables, bodies=True)
 
     def step_motors(
@@ -189,10 +187,13 @@ class SolverJumper(SolverBase):
             observables: Observables of the whole call.
         """
         self.validate_observables(observables)
-        body_f = self._no_body_f if state_in.body_f is None else state_in.body_f
-        joint_f = (self._default_control if control is None else control).joint_f
-        drive = self.dynamics.drive(joint_f, body_f, motors, target, previous, delay)
+        drive = self.dynamics.drive(*self._forces(state_in, control), motors, target, previous, delay)
         self._advance(state_in, state_out, drive, dt, substeps, observables, bodies)
+
+    def _forces(self, state: newton.State, control: newton.Control | None) -> tuple[wp.array, wp.array]:
+        """Return the joint forces and body wrenches that act."""
+        control = self._default_control if control is None else control
+        return control.joint_f, self._no_body_f if state.body_f is None else state.body_f
 
     def _advance(
         self,

@@ -141,10 +141,8 @@ def record_contacts(
         work.contact_force[k, world] = impulse / dt
         total += impulse / dt
     work.peak_force[world] = wp.max(work.peak_force[world], wp.length(total))
-    if solved.sweeps > 0:
-        work.sweeps[world] = wp.max(work.sweeps[world], solved.sweeps)
-        if solved.sweeps > 1 or solved.change <= real(1.0e6):
-            work.residual[world] = wp.max(work.residual[world], solved.change)
+    work.sweeps[world] = wp.max(work.sweeps[world], solved.sweeps)
+    work.residual[world] = wp.max(work.residual[world], solved.change)
 
 
 @wp.kernel

@@ -34,9 +34,9 @@ KNEE_LIMIT = wp.constant(73)  # 2: outer, inner: largest torque of the knee damp
 LEG_ROWS = wp.constant(75)
 
 # rows of the base block
-BASE = wp.constant(4 * 75)
-GRAVITY = wp.constant(4 * 75 + MOMENT_ROWS)  # 3, world frame [m/s^2]
-PARAMETER_ROWS = 4 * 75 + MOMENT_ROWS + 3
+BASE = wp.constant(4 * LEG_ROWS)
+GRAVITY = wp.constant(BASE + MOMENT_ROWS)  # 3, world frame [m/s^2]
+PARAMETER_ROWS = GRAVITY + 3
 
 BODIES = wp.constant(21)  # per world: base, then 5 links a leg
 LEG_BODIES = wp.constant(5)
