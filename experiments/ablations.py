@@ -21,8 +21,8 @@ from rich.console import Console
 from rich.table import Table
 
 from jumper_warp.env import JumpEnv
-from jumper_warp.evaluate import run_jumps
 from jumper_warp.figures import output_dir, write_figures
+from jumper_warp.jumps import run_jumps
 from jumper_warp.networks import sanitise
 from jumper_warp.ppo import Ppo, PpoCfg
 from jumper_warp.runtime import report_device

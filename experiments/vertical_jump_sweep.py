@@ -25,16 +25,17 @@ from rich.console import Console
 from rich.table import Table
 
 from jumper_warp.env import JumpEnv
-from jumper_warp.evaluate import COLLIDED, REST_SPEED, Jumps, check_task, run_jumps
 from jumper_warp.figures import output_dir, write_figures
-from jumper_warp.policy import Policy
+from jumper_warp.film import Film, moments
+from jumper_warp.jumps import COLLIDED, REST_SPEED, Jumps, rule_names, run
+from jumper_warp.policy import Policy, PolicyError
 from jumper_warp.runtime import report_device
 from jumper_warp.saved_run import open_policy, restored_task
-from jumper_warp.solver import SolverJumper
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 
+TASK = "vertical-jump"
 LOWER, UPPER = 0.5, 1.2
 """[m] Commanded base heights."""
 NEAR = 0.1
@@ -94,23 +95,14 @@ def make_env(policy: Policy, args: Args) -> JumpEnv:
 
 
 class Observer:
-    """Acts with the policy and watches: who jumped before being told to, and what some of the robots look like."""
+    """Acts with the policy and sees who jumped before being told to."""
 
-    def __init__(self, policy: Policy, env: JumpEnv, targets: np.ndarray, count: int) -> None:
-        """Record `count` of the worlds, evenly chosen; targets: (num_envs,) commanded heights [m]."""
+    def __init__(self, policy: Policy, env: JumpEnv) -> None:
+        """Begin before the first step."""
         self.policy, self.env = policy, env
-        self.worlds = np.linspace(0, env.num_envs - 1, count).round().astype(int)
-        self.targets = targets[self.worlds]
         self.early = np.zeros(env.num_envs, dtype=bool)
         self.steps = 0
         self.command_step = 0
-        if count == 0:
-            return
-        from jumper_warp.recording import Recorder  # not needed on a machine without viewer and meshes
-        from jumper_warp.robot import build_model
-
-        self.model = build_model(count)
-        self.recorder = Recorder(self.model, range(count), spacing=1.2, notes={"targets_m": self.targets.tolist()})
 
     def act(self, obs: torch.Tensor) -> torch.Tensor:
         """Return the actions, as `Policy.act`."""
@@ -118,52 +110,18 @@ class Observer:
             self.command_step = int(self.env.task_arrays()["command_step"][0])
         if self.steps == self.command_step:
             self.early = self.env.task_arrays()["phase"] != 0
-        if len(self.worlds):
-            self._record()
         self.steps += 1
         return self.policy.act(obs)
 
-    def _record(self) -> None:
-        from jumper_warp.play import ankles
 
-        sim, state = self.env.sim, self.env.sim.state
-        if isinstance(sim.solver, SolverJumper):
-            sim.solver.dynamics.full_state(state.joint_q, state.joint_qd, state.body_q, state.body_qd)
-        poses = state.body_q.numpy().reshape(sim.num_worlds, -1, 7)[self.worlds]
-        series = {}
-        for world, target, base in zip(self.worlds, self.targets, poses[:, 0], strict=True):
-            series[f"height/base of jump {world} [m]"] = base[2]
-            series[f"height/target of jump {world} [m]"] = target
-        forces = sim.paw_force.numpy().transpose(1, 0, 2)[self.worlds]
-        now = (self.steps + 1) * self.env.step_dt
-        self.recorder.record(now, poses.reshape(-1, 7), series, ankles(poses), forces)
-
-    def save(self, folder: Path) -> None:
-        """Write `jumps.rrd` and the filmstrip of the jump closest to 1 m."""
-        from jumper_warp.snapshot import Camera, contact_sheet
-
-        recording = self.recorder.recording()
-        recording.save_rrd(folder / "jumps.rrd")
-        index = int(np.argmin(np.abs(self.targets - 1.0)))
-        height = recording.poses[:, index * len(recording.bodies) // len(self.worlds), 2]
-        frames = moments(height, self.command_step)
-        camera = Camera(self.model, (1.5, 2.0, 0.9), (0.0, 0.0, 0.55), (320, 420), world=index)
-        state, pictures = self.model.state(), []
-        for frame in frames:
-            state.body_q.assign(recording.poses[frame])
-            pictures.append(camera.picture(state))
-        captions = [f"{recording.times[frame]:.2f} s, {height[frame]:.2f} m" for frame in frames]
-        contact_sheet(pictures, folder / f"jump_{self.targets[index]:.2f}_m.png", captions)
-
-
-def moments(height: np.ndarray, command: int) -> list[int]:
-    """Return the frames of a filmstrip: command, squat, push-off, apex, fall, catch, end; height (frames,) [m]."""
-    command = min(command, len(height) - 1)
-    apex = command + int(np.argmax(height[command:]))
-    squat = command + int(np.argmin(height[command : apex + 1]))
-    catch = apex + int(np.argmin(height[apex : apex + 60]))
-    push = squat + int(np.argmax(height[squat : apex + 1] >= 0.5 * (height[squat] + height[apex])))
-    return [command, squat, push, apex, (apex + catch) // 2, catch, len(height) - 1]
+def save_film(film: Film, targets: np.ndarray, command_step: int, folder: Path) -> None:
+    """Write `jumps.rrd` and the filmstrip of the jump closest to 1 m; targets (filmed worlds,) [m]."""
+    film.save_rrd(folder / "jumps.rrd")
+    index = int(np.argmin(np.abs(targets - 1.0)))
+    height = film.base(index)[:, 2]
+    frames = moments(height, command_step - 1)
+    captions = [f"{(frame + 1) * film.env.step_dt:.2f} s, {height[frame]:.2f} m" for frame in frames]
+    film.strip(folder / f"jump_{targets[index]:.2f}_m.png", index, frames, captions, (1.5, 2.0, 0.9), (0.0, 0.0, 0.55))
 
 
 def figures(jumps: Jumps, early: np.ndarray) -> dict:
@@ -224,20 +182,24 @@ def main(args: Args) -> dict:
     report_device(args.device)
     start = time.perf_counter()
     policy = open_policy(args.policy)
-    check_task(policy.interface.task)
+    if policy.interface.task != TASK:
+        raise PolicyError(f"this needs a policy of {TASK}, {args.policy} is of {policy.interface.task!r:.60}")
     env = make_env(policy, args)
     policy.to(env.device)
     targets = np.linspace(LOWER, UPPER, args.jumps)
-    observer = Observer(policy, env, targets, args.record)
-    jumps = run_jumps(observer.act, env, targets)
+    observer = Observer(policy, env)
+    jumps = Jumps(targets, rule_names(env))
+    worlds = np.linspace(0, args.jumps - 1, args.record).round().astype(int).tolist()
+    film = Film(env, jumps, worlds, notes={"targets_m": targets[worlds].tolist()}) if worlds else None
+    run(observer.act, env, jumps, watch=film)
     conditions = {"solver": args.solver, "randomize": args.randomize, "seed": args.seed}
     values = conditions | {"torque_limit_nm": env.task.motors.transversal.saturation} | figures(jumps, observer.early)
     folder = output_dir("vertical_jump_sweep", args.out)
     write_figures(folder, values)
     title = f"{args.jumps} jumps, {args.solver}, {'randomised' if args.randomize else 'nominal'}"
     plot(jumps, folder / "sweep.png", title)
-    if args.record:
-        observer.save(folder)
+    if film is not None:
+        save_film(film, targets[worlds], observer.command_step, folder)
     table = Table("figure", title, "paper")
     for name, value in values.items():
         table.add_row(name, f"{value:.4g}" if isinstance(value, float) else str(value), str(PAPER.get(name, "")))

@@ -52,10 +52,12 @@ class DifferentiableStep:
     ) -> None:
         """Advance base and motor coordinates by dt [s]; arrays as in `JumperDynamics.advance`, none shared.
 
-        Raises ValueError if the result would overwrite what the step read.
+        Raises ValueError if the result would overwrite what the step read, or if there are blocks.
         """
         if q.ptr == q_out.ptr or qd.ptr == qd_out.ptr:
             raise ValueError("a differentiable step needs its own output state: state_out must not be state_in")
+        if self._dynamics.robot.ground.blocks.shape[0] > 0:
+            raise ValueError("a step with a moving block is not differentiable")
         dyn, n = self._dynamics, self._dynamics.num_worlds
         robot, kernels, adjoint = dyn.robot, dyn.modules.differentiable, dyn.modules.contact_adjoint
         legs = self._fields(kernels.LegArrays, (4, n))

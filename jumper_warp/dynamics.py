@@ -11,6 +11,7 @@ import numpy as np
 import warp as wp
 
 from jumper_warp.description import LEGS, RobotDescription, load_description
+from jumper_warp.grounds import BlockCfg
 from jumper_warp.precision import float64_kernels
 from jumper_warp.robot import leg_geometry_array
 
@@ -104,6 +105,19 @@ def ground_struct(model: newton.Model, shape: int, ground_module: ModuleType) ->
     return ground
 
 
+def block_array(cfg: BlockCfg | None, num_worlds: int, modules: SimpleNamespace, device: wp.DeviceLike) -> wp.array:
+    """Return the kernels' `Block` of every world, at rest at its start; empty without blocks."""
+    block = modules.ground.Block
+    fields = {} if cfg is None else cfg.per_world(num_worlds)
+    values = np.zeros(num_worlds if fields else 0, dtype=block.numpy_dtype())
+    for name, value in fields.items():
+        values[name] = value
+    if fields:
+        values["exists"] = 1
+        values["start"] = values["center"]
+    return wp.array(values, dtype=block, device=device)
+
+
 class JumperDynamics:
     """Parameters, geometry and work arrays of the dedicated dynamics for every world of a model.
 
@@ -111,8 +125,18 @@ class JumperDynamics:
     its states are arrays of float64 in the layout of `joint_q` and `joint_qd`.
     """
 
-    def __init__(self, model: newton.Model, *, description: RobotDescription | None = None, double: bool = False):
-        """Read everything from the model. Raises NotThisRobotError if it is not this robot."""
+    def __init__(
+        self,
+        model: newton.Model,
+        *,
+        description: RobotDescription | None = None,
+        block: BlockCfg | None = None,
+        double: bool = False,
+    ):
+        """Read everything from the model; `block` adds one to every world.
+
+        Raises NotThisRobotError if it is not this robot, ValueError for a block that does not fit the number of worlds.
+        """
         check_model(model)
         self.model = model
         self.description = load_description() if description is None else description
@@ -134,6 +158,7 @@ class JumperDynamics:
             requires_grad=model.requires_grad,
         )
         self.robot.ground = ground_struct(model, self._ground_shape, self.modules.ground)
+        self.robot.ground.blocks = block_array(block, self.num_worlds, self.modules, self.device)
         self.work = self._workspace()
         self.pack()
 

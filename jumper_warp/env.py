@@ -12,16 +12,18 @@ import warp as wp
 
 from jumper_warp.description import load_description
 from jumper_warp.dynamics import JumperDynamics
+from jumper_warp.env_state import load_state, save_state
+from jumper_warp.grounds import BlockCfg
 from jumper_warp.motors import filter_params
-from jumper_warp.randomization import RandomizationCfg, Randomizer, no_motion
+from jumper_warp.randomization import NUM_DRAWN, RandomizationCfg, Randomizer, no_motion
 from jumper_warp.simulation import Simulation, SolverName
 from jumper_warp.solver import SolverJumper
 from jumper_warp.tasks.task import TaskCfg
 from kernels.control import ActionScales, action_kernel, push_kernel
 from kernels.episode import EpisodeArrays, EpisodeSettings, make_episode_kernel
-from kernels.evaluation import begin_evaluation_kernel
+from kernels.evaluation import begin_evaluation_kernel, next_jump_kernel
 from kernels.inverse_kinematics import LegLimits
-from kernels.observe import make_observe_kernel
+from kernels.observe import NUM_EPISODE_COLUMNS, Observations, make_observe_kernel
 from kernels.reset import clear_world_kernel, reset_kernel
 from kernels.task import JumpTask, ViewArrays
 
@@ -35,6 +37,7 @@ class JumpEnv:
     Attributes, tensors on the device, rewritten in place by `reset` and `step`:
         obs: (num_envs, num_obs), of the next step; an ended episode has begun anew.
         final_obs: the same before that new beginning.
+        critic_obs, final_critic_obs: the same without noise, with the episode's state and the drawn parameters.
         reward, done, timeout: (num_envs,); done 1 where an episode ended, timeout 1 where it did without failure.
     """
 
@@ -51,14 +54,15 @@ class JumpEnv:
         auto_reset: bool = True,
         visuals: bool = False,
         ground: Any = "plane",
+        block: BlockCfg | None = None,
     ):
-        """Build everything; call `reset` before the first step.
+        """Build everything; call `reset` before the first step. ground, block: as in `Simulation`.
 
         Raises ValueError for less than one environment, or as `Simulation`.
         """
         self.task, self.num_envs, self.seed = task, num_envs, seed
         self.sim = Simulation(
-            num_envs, solver=solver, motors=task.motors, visuals=visuals, device=device, ground=ground,
+            num_envs, solver=solver, motors=task.motors, visuals=visuals, device=device, ground=ground, block=block,
             friction=0.85 if task.randomization.dynamic_friction else 0.9,
         )  # fmt: skip
         self.wp_device = self.sim.device
@@ -78,6 +82,9 @@ class JumpEnv:
         cfg = task.randomization if randomize else RandomizationCfg.off()
         self.randomizer = Randomizer(self.sim.model, self.sim.motors, cfg, seed)
         self.randomizer.apply(self)
+        drawn = torch.from_numpy(self.randomizer.drawn(self).T).to(self.device)
+        for critic_obs in (self.critic_obs, self.final_critic_obs):
+            critic_obs[:, -NUM_DRAWN:] = drawn
 
     # ------------------------------------------------------------------ set-up
 
@@ -95,7 +102,11 @@ class JumpEnv:
             np.random.default_rng(self.seed + 7919).integers(1, 2**31, n, dtype=np.uint32), device=self.wp_device
         )
         self._action = self._zeros((n, 12))
-        self._obs, self._final_obs = self._zeros((n, self.num_obs)), self._zeros((n, self.num_obs))
+        self.num_critic_obs = self.num_obs + int(NUM_EPISODE_COLUMNS) + NUM_DRAWN
+        self._obs, self._final_obs = Observations(), Observations()
+        for observations in (self._obs, self._final_obs):
+            observations.actor = self._zeros((n, self.num_obs))
+            observations.critic = self._zeros((n, self.num_critic_obs))
         self.tasks = wp.zeros(n, dtype=JumpTask, device=self.wp_device)
         self._invalid = sim.solver.invalid if isinstance(sim.solver, SolverJumper) else self._zeros(n, int)
         self._impulse = (
@@ -112,7 +123,9 @@ class JumpEnv:
         self._views = self._view_arrays()
         self._ones = wp.full(n, 1.0, dtype=float, device=self.wp_device)
         self.action = wp.to_torch(self._action)
-        self.obs, self.final_obs = wp.to_torch(self._obs), wp.to_torch(self._final_obs)
+        self.obs, self.final_obs = wp.to_torch(self._obs.actor), wp.to_torch(self._final_obs.actor)
+        self.critic_obs = wp.to_torch(self._obs.critic)
+        self.final_critic_obs = wp.to_torch(self._final_obs.critic)
         self.reward, self.done = wp.to_torch(out.reward), wp.to_torch(out.done)
         self.timeout = wp.to_torch(out.timeout)
 
@@ -138,7 +151,7 @@ class JumpEnv:
         self._filter = filter_params(task.command_filter)
         settings = EpisodeSettings()
         settings.step_dt, settings.contact_force = self.step_dt, task.contact_force
-        settings.takeoff_speed, settings.games = task.takeoff_speed, task.games
+        settings.takeoff_speed, settings.games, settings.near = task.takeoff_speed, task.games, task.near
         settings.num_levels, settings.counting_schemes = len(task.levels), COUNTING_SCHEMES
         self._settings = settings
 
@@ -165,7 +178,7 @@ class JumpEnv:
         """Begin a new episode in every world."""
         self._begin(self._ones)
         self._observe(self._final_obs, everywhere=1)
-        wp.copy(self._obs, self._final_obs)
+        self._copy_observations()
 
     def step(self, action: torch.Tensor) -> None:
         """Advance one policy step; action: (num_envs, 12), clamped to -1..1."""
@@ -183,7 +196,12 @@ class JumpEnv:
 
     def _launch_step(self) -> None:
         n, sim, views = self.num_envs, self.sim, self._views
-        self._launch(action_kernel, (n, 4), [self._action, self._scales, self._filter, views], [self._previous_target])
+        self._launch(
+            action_kernel,
+            (n, 4),
+            [self._action, self._scales, self._filter, views, self.joint_offset],
+            [self._previous_target],
+        )
         self._launch(push_kernel, n, [self.tasks, self.push], [sim.state.body_f])
         sim.physics(sim.substeps, views.safe_target, self._previous_target, self.delay, bodies=False)
         self._launch(
@@ -194,11 +212,10 @@ class JumpEnv:
             [],
         )  # fmt: skip
         self._observe(self._final_obs, everywhere=1)
-        if not self.auto_reset:
-            wp.copy(self._obs, self._final_obs)
-            return
-        self._begin(self._out.done)
-        self._observe(self._obs, everywhere=0)
+        self._copy_observations()
+        if self.auto_reset:
+            self._begin(self._out.done)
+            self._observe(self._obs, everywhere=0)
 
     def _begin(self, done: wp.array) -> None:
         """Begin new episodes where `done` is not 0."""
@@ -225,12 +242,16 @@ class JumpEnv:
         if not isinstance(sim.solver, SolverJumper):
             self._dynamics.full_state(sim.state.joint_q, sim.state.joint_qd, sim.state.body_q, sim.state.body_qd)
 
-    def _observe(self, out: wp.array, everywhere: int) -> None:
+    def _copy_observations(self) -> None:
+        wp.copy(self._obs.actor, self._final_obs.actor)
+        wp.copy(self._obs.critic, self._final_obs.critic)
+
+    def _observe(self, out: Any, everywhere: int) -> None:
         self._launch(
             self._observe_kernel,
             self.num_envs,
-            [self._views, self.tasks, self.joint_offset, self.noise, self._out.done, everywhere, self._final_obs,
-             self._random],
+            [self._views, self._dynamics.robot.ground, self.tasks, self.joint_offset, self.noise, self._out.done,
+             everywhere, self._random],
             [out],
         )  # fmt: skip
 
@@ -240,23 +261,43 @@ class JumpEnv:
 
     # ------------------------------------------------------------------ looking at it
 
-    def evaluation_reset(self, goals: torch.Tensor | np.ndarray, command_delay: float = 0.5) -> None:
+    def evaluation_reset(
+        self,
+        goals: torch.Tensor | np.ndarray,
+        command_delay: float = 0.5,
+        headings: np.ndarray | float = 0.0,
+    ) -> None:
         """Stand every world in the default pose with a goal of its own, shape (num_envs, 3), and end no episode.
 
+        goals [m]: relative to start and heading, as in `JumpTask.goal`.
         command_delay [s]: time until the jump is commanded.
+        headings [rad]: (num_envs,) or one for all.
         """
         self.auto_reset = False
-        goals = wp.array(np.asarray(goals, dtype=np.float32), dtype=wp.vec3, device=self.wp_device)
+        headings = np.broadcast_to(np.asarray(headings, dtype=np.float32), self.num_envs).copy()
         self._launch(
             begin_evaluation_kernel,
             self.num_envs,
-            [goals, round(command_delay / self.step_dt), self.sim.model.joint_q],
+            [self._vectors(goals), wp.array(headings, device=self.wp_device), round(command_delay / self.step_dt),
+             self.sim.model.joint_q],
             [self.tasks, self.sim.state.joint_q, self.sim.state.joint_qd],
-        )
+        )  # fmt: skip
         self._clear(self._ones)
         self._out.done.zero_()
         self._observe(self._final_obs, everywhere=1)
-        wp.copy(self._obs, self._final_obs)
+        self._copy_observations()
+
+    def next_jump(self, goals: torch.Tensor | np.ndarray, worlds: np.ndarray) -> None:
+        """Command another jump in some worlds, those of them that have landed; the policy sees it after the next step.
+
+        goals [m]: (num_envs, 3), relative to base and yaw as they are. worlds: (num_envs,) bool.
+        """
+        chosen = wp.array(np.asarray(worlds).astype(np.int32), dtype=int, device=self.wp_device)
+        inputs = [self._vectors(goals), chosen, self.sim.state.joint_q]
+        self._launch(next_jump_kernel, self.num_envs, inputs, [self.tasks])
+
+    def _vectors(self, values: torch.Tensor | np.ndarray) -> wp.array:
+        return wp.array(np.asarray(values, dtype=np.float32), dtype=wp.vec3, device=self.wp_device)
 
     def task_arrays(self) -> dict[str, np.ndarray]:
         """Return the state of every world's episode, one array of shape (num_envs, ...) a field (waits for the device).
@@ -301,22 +342,12 @@ class JumpEnv:
         }
 
     def state_dict(self) -> dict[str, torch.Tensor]:
-        """Return curriculum and random state."""
-        records = self.tasks.numpy()
-        return {
-            "level": torch.from_numpy(np.array(records["level"])),
-            "streak": torch.from_numpy(np.array(records["streak"])),
-            "random": torch.from_numpy(self._random.numpy().astype(np.int64)),
-        }
+        """Return everything that the next step depends on, as `jumper_warp.env_state.save_state`."""
+        return save_state(self)
 
     def load_state_dict(self, state: dict[str, torch.Tensor]) -> None:
-        """Take up curriculum and random state; call `reset` afterwards. Raises ValueError for another size."""
-        if state["level"].shape != (self.num_envs,):
-            raise ValueError(f"saved for {state['level'].shape[0]} environments, there are {self.num_envs}")
-        records = self.tasks.numpy()
-        records["level"], records["streak"] = state["level"].numpy(), state["streak"].numpy()
-        self.tasks.assign(wp.array(records, dtype=JumpTask, device=self.wp_device))
-        self._random.assign(state["random"].numpy().astype(np.uint32))
+        """Go on from a saved state, in the same steps; raises ValueError as `jumper_warp.env_state.load_state`."""
+        load_state(self, state)
 
 
 def _leg_limits(task: TaskCfg) -> Any:

@@ -42,9 +42,9 @@ def batch_moments(x: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, int]:
     return mean, var, x.shape[0] * world_size()
 
 
-def sanitise(obs: torch.Tensor) -> torch.Tensor:
-    """Return observations with non-finite entries set to 0 and the rest clamped to ±RAW_LIMIT."""
-    return torch.nan_to_num(obs, nan=0.0, posinf=0.0, neginf=0.0).clamp(-RAW_LIMIT, RAW_LIMIT)
+def sanitise(obs: torch.Tensor, out: torch.Tensor | None = None) -> torch.Tensor:
+    """Return a copy of observations, in `out` if given: non-finite entries 0, the rest clamped to ±RAW_LIMIT."""
+    return torch.nan_to_num(obs, nan=0.0, posinf=0.0, neginf=0.0, out=out).clamp_(-RAW_LIMIT, RAW_LIMIT)
 
 
 def gaussian_log_prob(x: torch.Tensor, mean: torch.Tensor, log_std: torch.Tensor) -> torch.Tensor:
@@ -112,39 +112,56 @@ def mlp(sizes: Sequence[int], activation: str, out_gain: float) -> nn.Sequential
 
 
 class ActorCritic(nn.Module):
-    """Two separate networks on the same normalised observation; the noise does not depend on the state."""
+    """Two separate networks, each on its own normalised observation; the noise does not depend on the state."""
 
     def __init__(
-        self, num_obs: int, num_actions: int, hidden: Sequence[int], activation: str = "elu", init_std: float = 1.0
+        self,
+        num_obs: int,
+        num_actions: int,
+        hidden: Sequence[int],
+        activation: str = "elu",
+        init_std: float = 1.0,
+        num_critic_obs: int | None = None,
     ) -> None:
         """Args:
 
-        num_obs: Entries of an observation.
+        num_obs: Entries of the actor's observation.
         num_actions: Entries of an action.
         hidden: Widths of the hidden layers of both networks.
         activation: A key of ACTIVATIONS.
         init_std: Standard deviation of the noise on every action at the start.
+        num_critic_obs: Entries of the critic's observation (default: num_obs).
         """
         super().__init__()
+        num_critic_obs = num_obs if num_critic_obs is None else num_critic_obs
         self.actor = mlp((num_obs, *hidden, num_actions), activation, out_gain=0.01)
-        self.critic = mlp((num_obs, *hidden, 1), activation, out_gain=1.0)
+        self.critic = mlp((num_critic_obs, *hidden, 1), activation, out_gain=1.0)
         self.log_std = nn.Parameter(torch.full((num_actions,), math.log(init_std)))
         self.obs_moments = RunningMoments((num_obs,))
+        self.critic_moments = RunningMoments((num_critic_obs,))
         self.value_moments = RunningMoments()
 
     def features(self, obs: torch.Tensor) -> torch.Tensor:
-        """Return what the networks see of raw observations (..., num_obs): finite, scaled, within ±NORMALISED_LIMIT."""
-        return self.obs_moments.normalise(sanitise(obs)).clamp(-NORMALISED_LIMIT, NORMALISED_LIMIT)
+        """Return what the actor sees of raw observations (..., num_obs): finite, scaled, within ±NORMALISED_LIMIT."""
+        return _features(obs, self.obs_moments)
 
-    def value_head(self, features: torch.Tensor) -> torch.Tensor:
+    def critic_features(self, critic_obs: torch.Tensor) -> torch.Tensor:
+        """Return what the critic sees of its raw observations (..., num_critic_obs), likewise."""
+        return _features(critic_obs, self.critic_moments)
+
+    def value_head(self, critic_features: torch.Tensor) -> torch.Tensor:
         """Return the critic's output, in standard deviations of the return; (...)."""
-        return self.critic(features).squeeze(-1)
+        return self.critic(critic_features).squeeze(-1)
 
-    def value(self, obs: torch.Tensor) -> torch.Tensor:
-        """Return the expected return from raw observations (..., num_obs); (...)."""
-        return self.value_moments.restore(self.value_head(self.features(obs)))
+    def value(self, critic_obs: torch.Tensor) -> torch.Tensor:
+        """Return the expected return from the critic's raw observations (..., num_critic_obs); (...)."""
+        return self.value_moments.restore(self.value_head(self.critic_features(critic_obs)))
 
     @torch.no_grad()
     def act(self, obs: torch.Tensor) -> torch.Tensor:
-        """Return the mean action clipped to ±1, (..., num_actions), for raw observations."""
+        """Return the mean action clipped to ±1, (..., num_actions), for raw observations (..., num_obs)."""
         return self.actor(self.features(obs)).clamp(-1.0, 1.0)
+
+
+def _features(obs: torch.Tensor, moments: RunningMoments) -> torch.Tensor:
+    return moments.normalise(sanitise(obs)).clamp(-NORMALISED_LIMIT, NORMALISED_LIMIT)

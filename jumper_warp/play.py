@@ -1,4 +1,4 @@
-"""Playing a policy: jumps to heights from the command line, as a recording for the Rerun viewer."""
+"""Playing a policy: jumps from the command line, as a recording for the Rerun viewer."""
 
 from __future__ import annotations
 
@@ -6,28 +6,106 @@ import subprocess
 import sys
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated, Literal
 
 import numpy as np
 import tyro
 from rich.console import Console
 from rich.table import Table
 
-from jumper_warp.evaluate import Jumps, check_task
+from jumper_warp.evaluate import flags_for, measure_of
 from jumper_warp.figures import output_dir, write_figures
-from jumper_warp.recording import Recorder
-from jumper_warp.robot import LEGS, MOTOR_JOINTS
+from jumper_warp.film import Film
+from jumper_warp.jumps import JumpLog, Jumps, rule_names
+from jumper_warp.landings import Landings
 from jumper_warp.saved_run import Conditions, env_of_policy, open_policy
-from jumper_warp.solver import SolverJumper
 
-if TYPE_CHECKING:
-    from jumper_warp.env import JumpEnv
-
-SPACING = 1.2
-"""[m] Between robots in the picture."""
-SHANK_LENGTH = 0.3
-"""[m] From the knee to the ankle, along the shank's -z."""
 MAX_ROBOTS = 64
+SECONDS = 3.5
+"""[s] Length of a recording of one jump."""
+SECONDS_MORE = 2.5
+"""[s] For each further jump."""
+
+Place = tuple[float, float]
+
+
+@dataclass(frozen=True)
+class HeightGoals:
+    """What vertical jumps are asked for."""
+
+    height: tuple[float, ...] = (0.6, 0.9, 1.1)
+    """[m] Commanded base heights, one robot each; vertical jumps only."""
+
+    spacing = 1.2
+    """[m] Between robots in the picture."""
+
+    def __post_init__(self) -> None:
+        """Raises ValueError: a height is out of range, or their number."""
+        if not 1 <= len(self.height) <= MAX_ROBOTS or not all(0.0 < height < 10.0 for height in self.height):
+            raise ValueError(f"height takes 1 to {MAX_ROBOTS} numbers in (0, 10) m, got {self.height}")
+
+    def __len__(self) -> int:
+        return len(self.height)
+
+    @property
+    def seconds(self) -> float:
+        """[s] Length of the recording."""
+        return SECONDS
+
+    @property
+    def notes(self) -> dict[str, tuple]:
+        """What to save with the recording."""
+        return {"heights_m": self.height}
+
+    def log(self, rules: tuple[str, ...]) -> Jumps:
+        """Return one jump a robot."""
+        return Jumps(np.array(self.height), rules)
+
+
+@dataclass(frozen=True)
+class PlaceGoals:
+    """What jumps to places are asked for."""
+
+    goal: tyro.conf.UseAppendAction[tuple[Place, ...]] = ()
+    """[m] Where to land, ahead and to the left; once for each robot (default: 0.5, 0.9 and 1.3 ahead). Horizontal
+    jumps only, like the next."""
+    then: tyro.conf.UseAppendAction[tuple[Place, ...]] = ()
+    """[m] Where all robots jump next, a second after touchdown, from where they are by then; once for each jump."""
+
+    spacing = 2.0
+    """[m] Between robots in the picture."""
+
+    def __post_init__(self) -> None:
+        """Raises ValueError: a place is out of range, or their number."""
+        for name in ("goal", "then"):
+            places = getattr(self, name)
+            if len(places) > MAX_ROBOTS or not all(-10.0 < value < 10.0 for place in places for value in place):
+                raise ValueError(f"{name} takes up to {MAX_ROBOTS} places in (-10, 10) m, got {places}")
+
+    def __len__(self) -> int:
+        return len(self.goal)
+
+    @property
+    def seconds(self) -> float:
+        """[s] Length of the recording."""
+        return SECONDS + SECONDS_MORE * len(self.then)
+
+    @property
+    def notes(self) -> dict[str, tuple]:
+        """What to save with the recording."""
+        return {"goals_m": self.goal, "then_m": self.then}
+
+    def log(self, rules: tuple[str, ...]) -> Landings:
+        """Return one row of jumps a robot."""
+        return Landings(np.array([[goal, *self.then] for goal in self.goal]), rules)
+
+
+GOALS: dict[str, HeightGoals | PlaceGoals] = {
+    "vertical-jump": HeightGoals(),
+    "horizontal-jump": PlaceGoals(((0.5, 0.0), (0.9, 0.0), (1.3, 0.0))),
+    "omnidirectional-jump": PlaceGoals(((0.5, 0.0), (0.0, 0.5), (-0.5, 0.0))),
+}
+"""What policies of a task play unless told otherwise."""
 
 
 @dataclass(frozen=True)
@@ -36,10 +114,13 @@ class PlayCfg:
 
     policy: tyro.conf.Positional[str]
     """Name or folder of a policy, a run's folder, or a checkpoint."""
-    height: tuple[float, ...] = (0.6, 0.9, 1.1)
-    """[m] Commanded base heights, one robot each."""
-    seconds: float = 3.5
-    """[s] Length of the recording; the jump is commanded after half a second."""
+    heights: Annotated[HeightGoals, tyro.conf.arg(name="")] = field(default_factory=HeightGoals)
+    """For vertical jumps."""
+    places: Annotated[PlaceGoals, tyro.conf.arg(name="")] = field(default_factory=PlaceGoals)
+    """For jumps to places."""
+    seconds: float | None = None
+    """[s] Length of the recording; the jump is commanded after half a second (default: 3.5, and 2.5 for each further
+    jump)."""
     conditions: Annotated[Conditions, tyro.conf.arg(name="")] = field(default_factory=Conditions)
     """What the policy is tried in."""
     out: Path | None = None
@@ -49,9 +130,7 @@ class PlayCfg:
 
     def __post_init__(self) -> None:
         """Raises ValueError: a setting is out of range."""
-        if not 1 <= len(self.height) <= MAX_ROBOTS or not all(0.0 < height < 10.0 for height in self.height):
-            raise ValueError(f"height takes 1 to {MAX_ROBOTS} numbers in (0, 10) m, got {self.height}")
-        if not 0.0 < self.seconds <= 600.0:
+        if self.seconds is not None and not 0.0 < self.seconds <= 600.0:
             raise ValueError(f"seconds must be in (0, 600], got {self.seconds}")
 
 
@@ -59,58 +138,31 @@ def play(cfg: PlayCfg) -> Path:
     """Simulate the jumps, write `jump.rrd` and `figures.json`, print a table; return the path of the recording.
 
     Raises:
-        PolicyError: The policy cannot be used, or does not jump vertically.
+        PolicyError: The policy cannot be used, its task cannot be played, or a flag is not for its task.
         CheckpointError: The checkpoint cannot be used.
     """
     policy = open_policy(cfg.policy)
-    check_task(policy.interface.task)
-    env = env_of_policy(policy, len(cfg.height), cfg.conditions, visuals=True)
+    task = policy.interface.task
+    measure = measure_of(task)
+    asked = flags_for(task, GOALS[task], cfg.heights, cfg.places)
+    env = env_of_policy(policy, len(asked), cfg.conditions, change=measure.change)
     policy.to(env.device)
-    goals = np.zeros((env.num_envs, 3), dtype=np.float32)
-    goals[:, 2] = cfg.height
-    env.evaluation_reset(goals)
-    notes = {"task": policy.interface.task, "heights_m": cfg.height, "solver": cfg.conditions.solver}
-    recorder = Recorder(env.sim.model, range(env.num_envs), spacing=SPACING, notes=notes)
-    jumps = Jumps(np.array(cfg.height), tuple(rule.name for rule in env.task.rules))
-    for tick in range(1, round(cfg.seconds / env.step_dt) + 1):
+    log = asked.log(rule_names(env))
+    log.begin(env)
+    notes = {"task": task, **asked.notes, "solver": cfg.conditions.solver}
+    film = Film(env, log, range(len(asked)), spacing=asked.spacing, notes=notes, motors=True)
+    for _ in range(round((cfg.seconds or asked.seconds) / env.step_dt)):
         env.step(policy.act(env.obs))
-        jumps.update(env.task_arrays(), env.step_dt)
-        record_frame(recorder, env, tick * env.step_dt, cfg.height)
+        log.follow(env)
+        film()
     folder = output_dir("play", cfg.out)
-    path = recorder.save_rrd(folder / "jump.rrd")
-    write_figures(folder, jump_columns(jumps))
-    print_jumps(jumps)
+    path = film.save_rrd(folder / "jump.rrd", log.marks(range(len(asked))))
+    write_figures(folder, log.columns())
+    print_jumps(log)
     Console(stderr=True).print(str(path), highlight=False, soft_wrap=True)
     if cfg.viewer == "rerun":
         subprocess.run(viewer_command(path), check=False)
     return path
-
-
-def record_frame(recorder: Recorder, env: JumpEnv, time: float, heights: tuple[float, ...]) -> None:
-    """Add the environment's state to a recording; motors are those of the first world. time [s], heights [m]."""
-    sim = env.sim
-    if isinstance(sim.solver, SolverJumper):
-        sim.solver.dynamics.full_state(sim.state.joint_q, sim.state.joint_qd, sim.state.body_q, sim.state.body_qd)
-    poses = sim.state.body_q.numpy()
-    base_height = sim.joint_q()[:, 2]
-    torque, action = sim.torque.numpy()[:, 0], env.action[0].cpu().numpy()
-    series: dict[str, float] = {}
-    for world, height in enumerate(heights):
-        series[f"height/base of {world} [m]"] = base_height[world]
-        series[f"height/target of {world} [m]"] = height
-    for i, name in enumerate(MOTOR_JOINTS):
-        series[f"torque/{name} [N m]"] = torque[i]
-        series[f"action/{name} [1]"] = action[i]
-    forces = sim.paw_force.numpy().transpose(1, 0, 2)
-    recorder.record(time, poses, series, ankles(poses.reshape(env.num_envs, -1, 7)), forces)
-
-
-def ankles(poses: np.ndarray) -> np.ndarray:
-    """Return the ankles [m], world frame, (num_worlds, 4, 3), from the poses (num_worlds, 21, 7) of all links."""
-    shanks = poses[:, 5 * np.arange(1, len(LEGS) + 1)]
-    x, y, z, w = np.moveaxis(shanks[..., 3:], -1, 0)
-    axis = np.stack([2.0 * (x * z + w * y), 2.0 * (y * z - w * x), 1.0 - 2.0 * (x * x + y * y)], axis=-1)
-    return shanks[..., :3] - SHANK_LENGTH * axis
 
 
 def viewer_command(path: Path) -> list[str]:
@@ -118,15 +170,10 @@ def viewer_command(path: Path) -> list[str]:
     return [sys.executable, "-m", "rerun", str(path), "--bind", "127.0.0.1"]
 
 
-def jump_columns(jumps: Jumps) -> dict[str, list]:
-    """Return targets and apexes [m] and the ends, for `write_figures`."""
-    apex = [float(height) if np.isfinite(height) else None for height in jumps.apex]
-    return {"target_m": jumps.target.tolist(), "apex_m": apex, "end": jumps.outcomes.tolist()}
-
-
-def print_jumps(jumps: Jumps) -> None:
+def print_jumps(log: JumpLog) -> None:
     """Print one line a jump to standard output."""
-    table = Table("target [m]", "apex [m]", "error [m]", "end", box=None)
-    for target, apex, end in zip(jumps.target, jumps.apex, jumps.outcomes, strict=True):
-        table.add_row(f"{target:.3f}", f"{apex:.3f}", f"{apex - target:+.3f}", str(end))
+    columns = log.columns()
+    table = Table(*columns, box=None)
+    for row in zip(*columns.values(), strict=True):
+        table.add_row(*(f"{value:.3f}" if isinstance(value, float) else str(value) for value in row))
     Console().print(table)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import torch
 
@@ -23,6 +23,7 @@ from jumper_warp.networks import (
     sanitise,
     world_size,
 )
+from jumper_warp.vectask import VecTask
 
 STATISTICS = ("surrogate", "value", "entropy", "kl", "gradient_actor", "gradient_critic", "skipped")
 """What `Ppo.statistics` averages over minibatches; skipped is the share of steps with a non-finite gradient."""
@@ -46,6 +47,8 @@ class PpoCfg:
     """Clipping range of the probability ratio, and of the value in standard deviations of the return."""
     value_coef: float = 2.0
     """Weight of the value loss."""
+    asymmetric: bool = True
+    """Whether the critic sees what only a simulation knows, instead of the actor's observation."""
     clip_value: bool = True
     """Whether the value loss is clipped."""
     normalise_value: bool = True
@@ -93,53 +96,19 @@ class PpoCfg:
             raise ValueError(f"activation must be one of {', '.join(ACTIVATIONS)}, got {self.activation}")
 
 
-class VecTask(Protocol):
-    """What PPO asks of an environment of many worlds. All tensors keep their place and are rewritten by `step`."""
-
-    num_envs: int
-    num_obs: int
-    num_actions: int
-    device: torch.device
-    obs: torch.Tensor
-    """(num_envs, num_obs), of the new episode where one has just begun."""
-    reward: torch.Tensor
-    """(num_envs,)"""
-    done: torch.Tensor
-    """(num_envs,), 1 where the step ended the episode."""
-    timeout: torch.Tensor
-    """(num_envs,), 1 where it did so for a reason that says nothing against the state, so that its value counts."""
-    final_obs: torch.Tensor
-    """(num_envs, num_obs), the last observation of the old episode, where one has ended."""
-
-    def reset(self) -> None:
-        """Begin a new episode in all worlds."""
-
-    def step(self, action: torch.Tensor) -> None:
-        """Advance by a policy period; action (num_envs, num_actions) is read only, and no work waits for the host."""
-
-    def metrics(self) -> dict[str, float]:
-        """Return what to log of the episodes since the last call; waits for the device."""
-
-    def config(self) -> dict[str, Any]:
-        """Return all settings, ready for JSON."""
-
-    def state_dict(self) -> dict[str, Any]:
-        """Return what a resumed training needs, tensors only."""
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Take up what `state_dict` gave."""
-
-
 class Rollout:
     """Buffers of num_steps policy steps of all worlds; time is the first axis."""
 
-    def __init__(self, num_steps: int, env: VecTask) -> None:
+    def __init__(self, num_steps: int, env: VecTask, num_critic_obs: int) -> None:
+        """num_critic_obs: entries of what the critic sees, which need not be the environment's `critic_obs`."""
+
         def buffer(*shape: int) -> torch.Tensor:
             return torch.zeros(*shape, device=env.device)
 
         steps, worlds, actions = num_steps, env.num_envs, env.num_actions
         self.obs = buffer(steps + 1, worlds, env.num_obs)
-        self.final_obs = buffer(steps, worlds, env.num_obs)
+        self.critic_obs = buffer(steps + 1, worlds, num_critic_obs)
+        self.final_critic_obs = buffer(steps, worlds, num_critic_obs)
         self.action = buffer(steps, worlds, actions)
         self.mean = buffer(steps, worlds, actions)
         self.log_std = buffer(actions)
@@ -153,6 +122,8 @@ class Batch(NamedTuple):
 
     features: torch.Tensor
     """(batch, num_obs) normalised observations."""
+    critic_features: torch.Tensor
+    """(batch, num_critic_obs) the critic's, normalised."""
     action: torch.Tensor
     mean: torch.Tensor
     """(batch, num_actions) mean of the policy that acted."""
@@ -207,7 +178,7 @@ def losses(model: ActorCritic, batch: Batch, old_log_std: torch.Tensor, cfg: Ppo
     ratio = torch.exp(gaussian_log_prob(batch.action, mean, model.log_std) - batch.log_prob)
     clipped_ratio = ratio.clamp(1.0 - cfg.clip, 1.0 + cfg.clip)
     surrogate = -torch.min(batch.advantage * ratio, batch.advantage * clipped_ratio).mean()
-    value = model.value_head(batch.features)
+    value = model.value_head(batch.critic_features)
     value_loss = (value - batch.target).square()
     if cfg.clip_value:
         near = batch.value + (value - batch.value).clamp(-cfg.clip, cfg.clip)
@@ -248,7 +219,12 @@ class Ppo:
         cuda = env.device.type == "cuda"
         if cuda:
             torch.set_float32_matmul_precision("high" if cfg.tf32 else "highest")
-        self.model = ActorCritic(env.num_obs, env.num_actions, cfg.hidden, cfg.activation, cfg.init_std).to(env.device)
+        self._critic_obs = env.critic_obs if cfg.asymmetric else env.obs
+        self._final_critic_obs = env.final_critic_obs if cfg.asymmetric else env.final_obs
+        num_critic_obs = env.num_critic_obs if cfg.asymmetric else env.num_obs
+        self.model = ActorCritic(
+            env.num_obs, env.num_actions, cfg.hidden, cfg.activation, cfg.init_std, num_critic_obs
+        ).to(env.device)
         actor = [*self.model.actor.parameters(), self.model.log_std]
         critic = list(self.model.critic.parameters())
         self.lr = torch.full((), cfg.lr, device=env.device)
@@ -256,7 +232,7 @@ class Ppo:
         self.update = Captured(self._update, cuda and cfg.graphs and world_size() == 1)
         self.optimiser = torch.optim.Adam([*actor, *critic], lr=self.lr, fused=True, capturable=self.update.enabled)
         self._flatten_gradients(actor, critic)
-        self.rollout = Rollout(cfg.num_steps, env)
+        self.rollout = Rollout(cfg.num_steps, env, num_critic_obs)
         self._sums = torch.zeros(len(STATISTICS), device=env.device)
         self._sum_count = torch.zeros((), device=env.device)
         self._episode = torch.zeros(2, env.num_envs, device=env.device)  # return and length so far
@@ -280,7 +256,7 @@ class Ppo:
         rollout.log_std.copy_(model.log_std)
         std = rollout.log_std.exp()
         for step in range(self.cfg.num_steps):
-            rollout.obs[step] = sanitise(env.obs)
+            self._observe(step)
             mean = model.actor(model.features(rollout.obs[step]))
             rollout.mean[step] = mean
             rollout.action[step] = mean + std * torch.randn_like(mean)
@@ -289,9 +265,13 @@ class Ppo:
             rollout.reward[step] = reward * self.cfg.reward_scale
             rollout.done[step] = env.done
             rollout.timeout[step] = env.timeout
-            rollout.final_obs[step] = env.final_obs
+            rollout.final_critic_obs[step] = self._final_critic_obs
             self._count_episodes(reward, rollout.done[step])
-        rollout.obs[-1] = sanitise(env.obs)
+        self._observe(-1)
+
+    def _observe(self, step: int) -> None:
+        sanitise(self.env.obs, out=self.rollout.obs[step])
+        sanitise(self._critic_obs, out=self.rollout.critic_obs[step])
 
     def _count_episodes(self, reward: torch.Tensor, done: torch.Tensor) -> None:
         self._episode[0] += reward
@@ -304,9 +284,9 @@ class Ppo:
     def batch(self) -> Batch:
         """Return the rollout as samples, time-major, and take it into the running statistics."""
         cfg, model, rollout = self.cfg, self.model, self.rollout
-        features = model.features(rollout.obs)
-        head = model.value_head(features)
-        reward = rollout.reward + cfg.gamma * rollout.timeout * model.value(rollout.final_obs)
+        critic_features = model.critic_features(rollout.critic_obs)
+        head = model.value_head(critic_features)
+        reward = rollout.reward + cfg.gamma * rollout.timeout * model.value(rollout.final_critic_obs)
         advantage, target = gae(reward, rollout.done, model.value_moments.restore(head), cfg.gamma, cfg.lam)
         mean, var, count = batch_moments(advantage.flatten())
         std = (var * count / (count - 1)).sqrt()
@@ -314,9 +294,12 @@ class Ppo:
         if cfg.normalise_value:
             model.value_moments.update(target.flatten())
             target = model.value_moments.normalise(target)
+        features = model.features(rollout.obs[:-1])
         model.obs_moments.update(rollout.obs[:-1].flatten(0, 1))
+        model.critic_moments.update(rollout.critic_obs[:-1].flatten(0, 1))
         log_prob = gaussian_log_prob(rollout.action, rollout.mean, rollout.log_std)
-        parts = (features[:-1], rollout.action, rollout.mean, log_prob, head[:-1], advantage, target)
+        acted = (rollout.action, rollout.mean, log_prob)
+        parts = (features, critic_features[:-1], *acted, head[:-1], advantage, target)
         return Batch(*(part.flatten(0, 1) for part in parts))
 
     def order(self) -> torch.Tensor:

@@ -14,6 +14,8 @@ from newton import ModelFlags
 from jumper_warp.dynamics import find_paws
 
 Range = tuple[float, float] | None
+NUM_DRAWN = 50
+"""Rows of `Randomizer.drawn`."""
 MOTOR_DOFS = np.array([6 + 5 * leg + j for leg in range(4) for j in (0, 1, 3)])
 
 
@@ -44,7 +46,7 @@ class RandomizationCfg:
     joint_offset: Range = (-2.0, 2.0)
     """[deg] Constant error of each motor's position sensor."""
     latency: Range = (0.0, 16.0)
-    """[ms] From action to motor, in whole physics steps."""
+    """[ms] From action to motor, rounded down to whole physics steps."""
     force: Range = (-5.0, 5.0)
     """[N] On the base, along each world axis, while not in flight."""
     torque: Range = (-3.0, 3.0)
@@ -93,7 +95,7 @@ class Randomizer:
         wrench = np.concatenate([self._draw(cfg.force, (n, 3), 0.0), self._draw(cfg.torque, (n, 3), 0.0)], axis=1)
         env.push.assign(wrench.astype(np.float32))
         delay = self._draw(cfg.latency, (n,), 0.0) / 1000.0 / env.physics_dt
-        env.delay.assign(np.round(delay).astype(np.int32))
+        env.delay.assign(np.floor(delay + 1.0e-6).astype(np.int32))  # a whole step stays one despite rounding errors
         offset = np.radians(self._draw(cfg.joint_offset, (12, n), 0.0)).astype(np.float32)
         env.joint_offset.assign(offset)
         self._motors.offset.assign(offset)
@@ -103,6 +105,29 @@ class Randomizer:
             | ModelFlags.JOINT_DOF_INERTIAL_PROPERTIES
             | ModelFlags.SHAPE_PROPERTIES
         )
+
+    def drawn(self, env: Any) -> np.ndarray:
+        """Return what was drawn and matters most to a jump, (NUM_DRAWN, num_worlds) float32, of order 1; 0 if nominal.
+
+        Base mass and centre, mass of the legs, kp and no-load speed of each motor, latency, friction, sensor offsets,
+        push.
+        """
+        n, model = self._n, self._model
+        mass = model.body_mass.numpy().reshape(n, -1)
+        off = mass - self._nominal["body_mass"].reshape(n, -1)
+        com = (model.body_com.numpy() - self._nominal["body_com"]).reshape(n, -1, 3)[:, 0]
+        ratio = {
+            name: getattr(self._motors, name).numpy() / self._nominal_motors[name] - 1.0
+            for name in ("kp", "no_load_speed")
+        }
+        mu = model.shape_material_mu.numpy()[self._paws[:, 0]] - self._nominal["shape_material_mu"][self._paws[:, 0]]
+        push = env.push.numpy().reshape(n, 6)
+        rows = [
+            off[:, :1].T, off[:, 1:].sum(axis=1)[None], com.T / 0.03, ratio["kp"], ratio["no_load_speed"],
+            env.delay.numpy()[None] / 8.0, mu[None] * 10.0, env.static_friction_ratio.numpy()[None] - 1.0,
+            env.joint_offset.numpy() / 0.035, push[:, :3].T / 5.0, push[:, 3:].T / 3.0,
+        ]  # fmt: skip
+        return np.concatenate(rows).astype(np.float32)
 
     def _bodies(self) -> None:
         n, cfg, model = self._n, self.cfg, self._model

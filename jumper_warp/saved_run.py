@@ -9,6 +9,7 @@ import dataclasses
 import json
 import math
 import types
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, get_args, get_type_hints
@@ -103,8 +104,22 @@ def learning_curve(source: Path) -> bytes | None:
     return path.read_bytes() if path.is_file() else None
 
 
-def env_of_policy(policy: Policy, num_envs: int, conditions: Conditions, *, visuals: bool = False) -> JumpEnv:
+def env_of_policy(
+    policy: Policy,
+    num_envs: int,
+    conditions: Conditions,
+    *,
+    change: Callable[[TaskCfg], TaskCfg] | None = None,
+    **scene: Any,
+) -> JumpEnv:
     """Return the environment that a policy was trained in, with other conditions.
+
+    Args:
+        policy: Its configuration tells the task.
+        num_envs: Number of worlds.
+        conditions: Physics, randomisation and noise.
+        change: Returns the task that is wanted instead.
+        scene: More settings of `JumpEnv`, such as its ground.
 
     Raises:
         PolicyError: This version of the project cannot rebuild it, or its observation is not the policy's.
@@ -115,7 +130,7 @@ def env_of_policy(policy: Policy, num_envs: int, conditions: Conditions, *, visu
     if task.observation_names != policy.interface.observation_names:
         raise PolicyError("the policy's observation is not the one that this version of its task gives")
     return JumpEnv(
-        task,
+        task if change is None else change(task),
         num_envs,
         seed=conditions.seed,
         device=conditions.device,
@@ -123,7 +138,7 @@ def env_of_policy(policy: Policy, num_envs: int, conditions: Conditions, *, visu
         randomize=conditions.randomize,
         noise=conditions.noise,
         auto_reset=False,
-        visuals=visuals,
+        **scene,
     )
 
 
@@ -194,8 +209,9 @@ def _restored_tuple(default: tuple, saved: Any, where: str) -> tuple:
         return tuple(
             _restored(_row(default, row, f"{where}[{i}]"), row, f"{where}[{i}]") for i, row in enumerate(saved)
         )
-    if where.endswith(".params"):
-        return tuple(_restored(0.0, value, where) for value in saved)
+    if where.endswith((".params", ".hidden")):
+        kind = 0 if where.endswith(".hidden") else 0.0
+        return tuple(_restored(kind, value, where) for value in saved)
     if len(saved) != len(default):
         raise PolicyError(f"{where}: expected {len(default)} entries, got {len(saved)}")
     return tuple(_restored(d, value, f"{where}[{i}]") for i, (d, value) in enumerate(zip(default, saved, strict=True)))

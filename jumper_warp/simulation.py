@@ -10,6 +10,7 @@ import warp as wp
 from newton.sensors import SensorContact
 
 from jumper_warp.description import load_description
+from jumper_warp.grounds import BlockCfg
 from jumper_warp.motors import FilterCfg, MotorCfg, filter_params, jumping_motors, motor_arrays
 from jumper_warp.robot import KNEE_DOFS, PHYSICS_DT, build_model, mujoco_solver
 from jumper_warp.solver import SolverJumper
@@ -43,6 +44,7 @@ class Simulation:
         motors: MotorCfg | None = None,
         command_filter: FilterCfg | None = None,
         ground: str | newton.Heightfield | None = "plane",
+        block: BlockCfg | None = None,
         friction: float = 0.9,
         dt: float = PHYSICS_DT,
         substeps: int = SUBSTEPS,
@@ -58,6 +60,7 @@ class Simulation:
             motors: By default the jumping gains at 18 N m.
             command_filter: None leaves the targets as they are.
             ground: As in `build_model`.
+            block: A block in each world that slides when the robot pushes it; on SolverJumper only.
             friction: Of the paws [1].
             dt: Physics step [s].
             substeps: Physics steps in a policy step.
@@ -66,10 +69,12 @@ class Simulation:
             device: Warp device.
 
         Raises:
-            ValueError: unknown solver, or as `build_model`.
+            ValueError: unknown solver, a block on MuJoCo, or as `build_model` and `SolverJumper`.
         """
         if solver not in ("jumper", "mujoco"):
             raise ValueError(f"solver must be 'jumper' or 'mujoco', got {solver!r}")
+        if solver == "mujoco" and block is not None:
+            raise ValueError("a moving block needs solver='jumper', got 'mujoco'")
         self.model = build_model(num_worlds, ground=ground, friction=friction, visuals=visuals, device=device)
         self.device = self.model.device
         self.num_worlds = num_worlds
@@ -85,7 +90,7 @@ class Simulation:
         self._safe_target = wp.clone(self.target)
         self._graphs: dict[str, object] = {}
         if solver == "jumper":
-            self.solver = SolverJumper(self.model)
+            self.solver = SolverJumper(self.model, block=block)
             self.torque, self.paw_force, self.peak_force = (
                 self.solver.torque, self.solver.contact_force, self.solver.peak_force,
             )  # fmt: skip

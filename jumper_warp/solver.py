@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import newton
+import numpy as np
 import warp as wp
 from newton import ModelFlags, StateFlags
 from newton.solvers import SolverBase
@@ -12,6 +14,8 @@ from newton.solvers import SolverBase
 from jumper_warp.description import RobotDescription
 from jumper_warp.differentiable import DifferentiableStep
 from jumper_warp.dynamics import JumperDynamics
+from jumper_warp.grounds import BlockCfg
+from kernels.ground import Ground, rest_block
 
 MAX_SWEEPS = 50
 """Most sweeps of the contact iteration in a step."""
@@ -36,6 +40,18 @@ def _clear_kernel(
         for k in range(4):
             impulse[k, world] = wp.vec3(0.0)
             contact_force[k, world] = wp.vec3(0.0)
+
+
+@wp.kernel(enable_backward=False)
+def _rest_blocks_kernel(
+    # in
+    mask: wp.array(dtype=wp.bool),
+    # in, out
+    ground: Ground,
+):
+    world = wp.tid()
+    if mask[world]:
+        rest_block(ground, world)
 
 
 @wp.kernel(enable_backward=False)
@@ -80,6 +96,9 @@ class SolverJumper(SolverBase):
     run it backwards, with a state of its own for every step. Record `dynamics.pack_masses()` or `pack_joints()` on the
     tape for gradients with respect to the model's arrays.
 
+    With `block`, each world has a block of its own that slides on the floor under the paws that push it. A paw touches
+    floor or block, whichever is nearer. Gradients do not go through blocks.
+
     A world that becomes non-finite is flagged in `invalid`, parked at rest in the model's reference pose and left
     there until `reset` clears it.
     """
@@ -91,6 +110,7 @@ class SolverJumper(SolverBase):
         model: newton.Model,
         *,
         description: RobotDescription | None = None,
+        block: BlockCfg | None = None,
         max_sweeps: int = MAX_SWEEPS,
         tolerance: float = TOLERANCE,
     ):
@@ -98,12 +118,13 @@ class SolverJumper(SolverBase):
 
         Raises:
             NotThisRobotError: the model is another robot's.
-            ValueError: `max_sweeps` below 1 or `tolerance` [m/s] not positive.
+            ValueError: `max_sweeps` below 1, `tolerance` [m/s] not positive, or arrays of `block` that do not have one
+                row per world.
         """
         super().__init__(model)
         if max_sweeps < 1 or not tolerance > 0.0:
             raise ValueError(f"max_sweeps must be >= 1 and tolerance > 0, got {max_sweeps}, {tolerance}")
-        self.dynamics = JumperDynamics(model, description=description)
+        self.dynamics = JumperDynamics(model, description=description, block=block)
         self.max_sweeps = max_sweeps
         self.tolerance = tolerance
         self._differentiable = DifferentiableStep(self.dynamics, max_sweeps, min(tolerance, DIFFERENTIABLE_TOLERANCE))
@@ -228,6 +249,44 @@ class SolverJumper(SolverBase):
                 device=self.model.device,
             )
 
+    def block_position(self) -> np.ndarray:
+        """Return the centres of the blocks [m], world frame, (num_worlds, 2). Raises ValueError without blocks."""
+        return self._blocks().numpy()["center"]
+
+    def block_velocity(self) -> np.ndarray:
+        """Return the velocities of the blocks [m/s], world frame, (num_worlds, 2). Raises ValueError without blocks."""
+        return self._blocks().numpy()["velocity"]
+
+    def place_blocks(self, center: np.ndarray) -> None:
+        """Put all blocks at rest to new starts [m], world frame, (2,) or (num_worlds, 2).
+
+        Raises ValueError without blocks.
+        """
+        values = self._blocks().numpy()
+        values["start"] = center
+        self._blocks().assign(values)
+        self.reset_blocks()
+
+    def reset_blocks(self, worlds: Sequence[int] | wp.array | None = None) -> None:
+        """Put the blocks of some worlds, by default all, back to their starts, at rest.
+
+        `worlds`: indices, or a mask on the device, bool of shape (num_worlds,). Raises ValueError without blocks.
+        """
+        n, device = self._blocks().shape[0], self.model.device
+        mask = worlds
+        if not isinstance(worlds, wp.array):
+            chosen = np.zeros(n, dtype=bool)
+            chosen[slice(None) if worlds is None else list(worlds)] = True
+            mask = wp.array(chosen, dtype=wp.bool, device=device)
+        wp.launch(_rest_blocks_kernel, dim=n, inputs=[mask, self.dynamics.robot.ground], device=device)
+
+    def _blocks(self) -> wp.array:
+        """Return the kernels' `Block` of every world. Raises ValueError without blocks."""
+        blocks = self.dynamics.robot.ground.blocks
+        if blocks.shape[0] == 0:
+            raise ValueError("the solver was made without a block")
+        return blocks
+
     def notify_model_changed(self, flags: ModelFlags | int) -> None:
         """Read changed parameters from the model again."""
         if flags & ModelFlags.BODY_INERTIAL_PROPERTIES:
@@ -251,6 +310,7 @@ class SolverJumper(SolverBase):
     ) -> None:
         """Forget contact history and the invalid flag of the masked worlds, and put them in the reference pose.
 
+        Blocks return to their starts.
         With `flags=StateFlags.NONE` the state is left alone, for callers that write their own.
         """
         world_mask = self._normalize_reset_world_mask(world_mask)
@@ -267,6 +327,8 @@ class SolverJumper(SolverBase):
         )
         if flags is not None and int(flags) == int(StateFlags.NONE):
             return
+        if self.dynamics.robot.ground.blocks.shape[0] > 0:
+            self.reset_blocks(world_mask)
         for reference, values in ((self.model.joint_q, state.joint_q), (self.model.joint_qd, state.joint_qd)):
             wp.launch(
                 _restore_kernel,

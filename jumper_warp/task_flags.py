@@ -33,6 +33,8 @@ class TaskFlags:
     """[m/s] Upward speed without contact that begins a flight."""
     contact_force: float
     """[N] Above it a paw counts as in contact."""
+    near: float
+    """[m] Error up to which a landed jump is a success."""
     games: int
     """Successes in a row that raise the level."""
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import io
 import json
 import os
 import signal
@@ -41,7 +42,7 @@ class TrainCfg:
     """Name of the task; also the name of the folder of its runs."""
     num_envs: int = 8192
     """Worlds, over all processes."""
-    iterations: int = 3300
+    iterations: int = 2800
     """Iterations that the run has at its end, those before a resume included."""
     max_seconds: float = 0.0
     """Wall-clock limit of the iterations [s]; 0: none."""
@@ -209,17 +210,17 @@ class Run:
         path, state, refusals = find_checkpoint(self.cfg)
         self.notes += [f"passed over: {refusal}" for refusal in refusals] + [f"resumed {path}"]
         try:
-            self.ppo.load_state_dict(state["ppo"])
-            self.env.load_state_dict(state["env"])
+            processes = 1 + len(state["others"])
+            if processes != self.rank.size:
+                raise ValueError(f"saved by {processes} processes, there are {self.rank.size}")
+            own = state["others"][self.rank.index - 1] if self.rank.index else state
+            self.ppo.load_state_dict({**state["ppo"], **own["ppo"]})
+            self.env.load_state_dict(own["env"])
         except (RuntimeError, KeyError, ValueError, TypeError) as error:
             reason = " ".join(str(error).split())[:300]
             raise CheckpointError(f"{path}: does not fit these settings: {reason}") from error
         self.iteration = state["iteration"]
-        self.env.reset()
-        if self.rank.index == 0:
-            set_random_state(state["rng"])
-        else:
-            torch.manual_seed(self.cfg.seed + 1 + self.rank.index + 1000 * self.iteration)
+        set_random_state(own["rng"])
         return path.parent.parent
 
     def iterate(self, stop: Stop) -> TrainResult:
@@ -289,15 +290,11 @@ class Run:
 
     def _save(self, log: TrainingLog | _Silent, must: bool) -> None:
         """Save a checkpoint; a failure is only told, and tried again next time, unless this one must be."""
+        own = {"ppo": self.ppo.state_dict(), "env": self.env.state_dict(), "rng": random_state()}
+        others = self._others(own)
         if self.rank.index != 0:
             return
-        state = {
-            "iteration": self.iteration,
-            "ppo": self.ppo.state_dict(),
-            "env": self.env.state_dict(),
-            "rng": random_state(),
-            "config": json.dumps(self.config),
-        }
+        state = {"iteration": self.iteration, **own, "others": others, "config": json.dumps(self.config)}
         folder = self.folder / CHECKPOINTS
         try:
             save_checkpoint(folder, state, self.figures.get(self.cfg.best_by), self.cfg.keep)
@@ -305,6 +302,12 @@ class Run:
             if must:
                 raise CheckpointError(f"{folder}: not saved: {error.strerror}") from error
             log.say(f"{folder}: not saved, will try again: {error.strerror}")
+
+    def _others(self, own: dict[str, Any]) -> list[dict[str, Any]]:
+        """Return, in process 0, what only the other processes know: their worlds and random numbers."""
+        if world_size() == 1:
+            return []
+        return gather({**own, "ppo": {"episode": own["ppo"]["episode"].cpu()}}, self.rank)[1:]
 
 
 class _Silent:
@@ -321,6 +324,22 @@ class _Silent:
 
     def log(self, iteration: int, figures: dict[str, float]) -> None:
         pass
+
+
+def gather(state: dict[str, Any], rank: Rank) -> list[dict[str, Any]]:
+    """Return the state of every process, in process 0; tensors travel as bytes and are read as weights only."""
+    buffer = io.BytesIO()
+    torch.save(state, buffer)
+    data = torch.frombuffer(bytearray(buffer.getvalue()), dtype=torch.uint8).to(rank.device)
+    sizes = [torch.zeros(1, dtype=torch.int64, device=rank.device) for _ in range(rank.size)]
+    torch.distributed.all_gather(sizes, torch.tensor([len(data)], device=rank.device))
+    longest = max(int(size) for size in sizes)
+    parts = [torch.zeros(longest, dtype=torch.uint8, device=rank.device) for _ in range(rank.size)]
+    torch.distributed.all_gather(parts, torch.nn.functional.pad(data, (0, longest - len(data))))
+    if rank.index != 0:
+        return []
+    sent = [part[: int(size)].cpu().numpy().tobytes() for part, size in zip(parts, sizes, strict=True)]
+    return [torch.load(io.BytesIO(part), weights_only=True) for part in sent]
 
 
 def new_folder(cfg: TrainCfg, rank: Rank) -> Path:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -49,12 +50,12 @@ def parse_train(args: Sequence[str]) -> tuple[TrainArgs, TaskCfg]:
         TrainArgs,
         prog="jumper train TASK",
         description=f"Train a policy on a task: {names}. Values shown are those of {task.name}.",
-        default=TrainArgs(TrainCfg(task=task.name), TaskFlags.of(task)),
+        default=TrainArgs(TrainCfg(task=task.name, ppo=task.ppo), TaskFlags.of(task)),
         args=["--help"] if asks_help else list(args[1:]),
     )
     if parsed.cfg.task != task.name:
         raise UsageError(f"give the task once, got {task.name} and --task {parsed.cfg.task}")
-    return parsed, parsed.env.apply(task)
+    return parsed, dataclasses.replace(parsed.env.apply(task), ppo=parsed.cfg.ppo)
 
 
 def env_maker(task: TaskCfg, args: TrainArgs) -> MakeEnv:
@@ -77,8 +78,10 @@ def env_maker(task: TaskCfg, args: TrainArgs) -> MakeEnv:
 def run_train(args: Sequence[str]) -> TrainResult:
     """Train as the arguments say; raises as `parse_train` and `jumper_warp.train.train`."""
     parsed, task = parse_train(args)
-    if os.environ.get("RANK", "0") == "0":
+    first = os.environ.get("RANK", "0") == "0"
+    if first:
         announce(parsed.cfg.device)
     result = train(parsed.cfg, env_maker(task, parsed))
-    print(result.folder)
+    if first:
+        print(result.folder)
     return result

@@ -11,7 +11,8 @@ from rsl_rl.runners import OnPolicyRunner
 from tensordict import TensorDict
 
 from jumper_warp.networks import sanitise
-from jumper_warp.ppo import PpoCfg, VecTask
+from jumper_warp.ppo import PpoCfg
+from jumper_warp.vectask import VecTask
 
 
 class RslRlVecEnv(VecEnv):
@@ -43,8 +44,9 @@ class RslRlVecEnv(VecEnv):
         self._episode_length.copy_(value)
 
     def get_observations(self) -> TensorDict:
-        """Return the observations as group `policy`, finite and bounded."""
-        return TensorDict({"policy": sanitise(self.env.obs)}, batch_size=[self.num_envs])
+        """Return the observations as groups `policy` and `critic`, finite and bounded."""
+        groups = {"policy": sanitise(self.env.obs), "critic": sanitise(self.env.critic_obs)}
+        return TensorDict(groups, batch_size=[self.num_envs])
 
     def step(self, actions: torch.Tensor) -> tuple[TensorDict, torch.Tensor, torch.Tensor, dict[str, Any]]:
         """Advance by a policy period; actions (num_envs, num_actions)."""
@@ -70,7 +72,7 @@ def rsl_rl_config(cfg: PpoCfg, save_interval: int, seed: int) -> dict[str, Any]:
         "seed": seed,
         "check_for_nan": False,
         "logger": "tensorboard",
-        "obs_groups": {"actor": ["policy"], "critic": ["policy"]},
+        "obs_groups": {"actor": ["policy"], "critic": ["critic" if cfg.asymmetric else "policy"]},
         "actor": {**network, "distribution_cfg": noise},
         "critic": dict(network),
         "algorithm": {

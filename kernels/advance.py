@@ -3,9 +3,10 @@
 import warp as wp
 
 from .actuator import MotorArrays
-from .base_dynamics import LegSolve, invert, motor_acceleration, solve_ang, solve_lin
+from .base_dynamics import BaseInverse, LegSolve, invert, motor_acceleration, solve_ang, solve_lin
 from .base_motion import moved_base
-from .contact import ContactState, PawContact, solve_contacts
+from .contact import BlockLaw, ContactState, PawContact, block_velocity, on_block, solve_contacts
+from .ground import move_block, rest_block
 from .leg_dynamics import PawKinematics
 from .parameters import BODIES, COORDS, DOFS, GRAVITY, load_vec3
 from .scalar import real, vec3
@@ -14,10 +15,13 @@ from .step import (
     Robot,
     StepSettings,
     base_system,
+    block_law,
     drive_torque,
     finite_base,
     leg_terms,
     paw_contact,
+    touch_block,
+    touch_floor,
 )
 
 wp.set_module_options({"enable_backward": False})
@@ -51,8 +55,9 @@ class Workspace:
 
 
 @wp.func
-def park(work: Workspace, world: int, joint_q: wp.array(dtype=real), joint_qd: wp.array(dtype=real)):
-    """Put a world at rest in its reference pose."""
+def park(robot: Robot, work: Workspace, world: int, joint_q: wp.array(dtype=real), joint_qd: wp.array(dtype=real)):
+    """Put a world at rest in its reference pose, its block at rest at its start."""
+    rest_block(robot.ground, world)
     for i in range(int(COORDS)):
         joint_q[world * COORDS + i] = work.reference_q[world * COORDS + i]
     for i in range(int(DOFS)):
@@ -94,6 +99,25 @@ def base_wrench(drive: Drive, world: int) -> wp.spatial_vector:
 
 
 @wp.func
+def load_contact(
+    robot: Robot, work: Workspace, world: int, k: int, base: BaseState, lin: vec3, ang: vec3, rates: vec3,
+    old_rates: vec3, paw: PawKinematics, leg: LegSolve, inverse: BaseInverse, block: BlockLaw, dt: real,
+    contacts: wp.array(dtype=PawContact),
+):  # fmt: skip
+    """Write paw k's contact problem, with floor or block, whichever is nearer, to `contacts`; see `paw_contact`."""
+    guess = work.impulse[k, world]
+    touch = touch_floor(robot, k, base, paw)
+    contacts[k] = paw_contact(robot, world, k, base, lin, ang, rates, old_rates, guess, paw, leg, inverse, touch, dt)
+    if robot.ground.blocks.shape[0] > 0:
+        above = touch_block(robot, world, k, base, paw, block)
+        if above.gap < touch.gap:
+            contact = paw_contact(
+                robot, world, k, base, lin, ang, rates, old_rates, guess, paw, leg, inverse, above, dt
+            )  # fmt: skip
+            contacts[k] = on_block(contact, block)
+
+
+@wp.func
 def advance_once(
     robot: Robot, settings: StepSettings, drive: Drive, work: Workspace, world: int, step: int, base: BaseState,
     angles: wp.array(dtype=vec3), rates: wp.array(dtype=vec3), legs: wp.array(dtype=LegSolve),
@@ -114,13 +138,16 @@ def advance_once(
     ang_acc = solve_ang(inverse, system.force, system.moment)
     lin = wp.quat_rotate_inv(base.quat, base.lin) + dt * lin_acc
     ang = base.ang + dt * ang_acc
+    block = block_law(robot, world, base, dt)
     for k in range(legs.shape[0]):
         old = rates[k]
         rates[k] = old + dt * motor_acceleration(legs[k], lin_acc, ang_acc)
-        contacts[k] = paw_contact(
-            robot, world, k, base, lin, ang, rates[k], old, work.impulse[k, world], paws[k], legs[k], inverse, dt
+        load_contact(
+            robot, work, world, k, base, lin, ang, rates[k], old, paws[k], legs[k], inverse, block, dt, contacts
         )
-    change = solve_contacts(contacts, settings.max_sweeps, settings.tolerance)
+    change = solve_contacts(contacts, block, settings.max_sweeps, settings.tolerance)
+    if robot.ground.blocks.shape[0] > 0:
+        move_block(robot.ground, world, wp.quat_rotate(base.quat, block_velocity(block, contacts)), dt)
     record_contacts(work, world, base, contacts, change, dt)
     for k in range(legs.shape[0]):
         push = legs[k].inverse * (wp.transpose(contacts[k].jacobian) * contacts[k].impulse)
@@ -165,7 +192,7 @@ def advance_kernel(
     """
     world = wp.tid()
     if work.invalid[world] != 0:
-        park(work, world, joint_q_out, joint_qd_out)
+        park(robot, work, world, joint_q_out, joint_qd_out)
         return
     com = base_com(robot.table, world)
     base = load_base(joint_q, joint_qd, com, world)
@@ -190,4 +217,4 @@ def advance_kernel(
     store_base(joint_q_out, joint_qd_out, com, world, base)
     if not (finite_base(base) and wp.isfinite(total)):
         work.invalid[world] = 1
-        park(work, world, joint_q_out, joint_qd_out)
+        park(robot, work, world, joint_q_out, joint_qd_out)

@@ -15,7 +15,8 @@ import warp as wp
 from .collision_shapes import segment_box_bound_sq, segment_box_sq, segment_segment_sq, swell
 from .five_bar import five_bar
 from .geometry import LegGeometry
-from .ground import Ground, ground_distance
+from .ground import Ground, ground_distance, world_ground
+from .parameters import COORDS
 from .scalar import mat33, quat, real, vec3
 
 wp.set_module_options({"enable_backward": False})
@@ -254,8 +255,9 @@ def world_collisions(
     """Return the contacts that must not exist and the smallest distance [m] of one robot, at most `margin`.
 
     geometry: the four legs. joint_q: base position [m] and quaternion xyzw, then five coordinates a leg [rad], from
-    index `start`. margin: distances [m] above it (>= 0) are not resolved, and with 0 only the flags mean anything:
-    a small margin is fast. A state that is not finite raises no dependable flag.
+    index `start`, from which the world with its block follows. margin: distances [m] above it (>= 0) are not resolved,
+    and with 0 only the flags mean anything: a small margin is fast. A state that is not finite raises no dependable
+    flag.
     """
     pos = vec3(real(joint_q[start]), real(joint_q[start + 1]), real(joint_q[start + 2]))
     rotation = wp.quat_to_matrix(
@@ -263,11 +265,12 @@ def world_collisions(
     )
     found = Collisions()
     found.clearance = margin
-    found = record(found, body_ground_distance(ground, pos, rotation), BODY_GROUND)
+    here = world_ground(ground, start // COORDS)
+    found = record(found, body_ground_distance(here, pos, rotation), BODY_GROUND)
     capsules = load_leg(geometry, joint_q, start, 0)
     count = wp.int32(4)
     for i in range(count):
-        over_ground = leg_ground_distances(ground, capsules, pos, rotation)
+        over_ground = leg_ground_distances(here, capsules, pos, rotation)
         found = record(found, over_ground[0], HOUSING_GROUND)
         found = record(found, over_ground[1], THIGH_GROUND)
         found = record(found, over_ground[2], KNEE_GROUND)

@@ -10,6 +10,10 @@ v_free = -gap / dt lets an open gap close exactly. The four paws are coupled thr
     v_k = v_k0 + A_k p_k + G_k (change of base twist),   change of base twist = S^-1 sum_k G_k^T p_k,
 
 so block Gauss-Seidel over the paws, each solved exactly as a 3x3 problem, converges quickly. Vectors are in body axes.
+
+Velocities of paws that touch a sliding block are relative to it. The block obeys friction with the floor exactly, at
+every stage of the iteration: its velocity is a function of the impulses (`block_velocity`), so that paws and block
+agree at the end of a step, whatever the block's mass.
 """
 
 import warp as wp
@@ -37,6 +41,7 @@ class PawContact:
     """One paw in the contact problem."""
 
     active: int  # 0: too far from the ground to touch within the step
+    on_block: int  # 1: the ground is the sliding block there
     normal: vec3
     mu: real
     mu_row: int  # row of mu in the parameter table
@@ -48,9 +53,20 @@ class PawContact:
     to_lin: mat33  # S^-1 G^T: base twist per impulse
     to_ang: mat33
     own: mat33  # A: contact velocity per impulse through the leg alone [1/kg]
-    total_inv: mat33  # (A + G S^-1 G^T)^-1 [kg]
-    total: mat33
+    total_inv: mat33  # inverse of `total` [kg]
+    total: mat33  # A + G S^-1 G^T, plus 1/mass of the block along the floor: relative velocity per impulse [1/kg]
     impulse: vec3  # [N s]
+
+
+@wp.struct
+class BlockLaw:
+    """What decides the velocity of a sliding block at the end of a step, given the paws' impulses."""
+
+    velocity: vec3  # at the start of the step [m/s]
+    up: vec3  # world z
+    mass: real  # [kg]
+    friction: real  # coefficient of friction with the floor [1]
+    weight: real  # impulse of the block's own weight on the floor [N s]
 
 
 @wp.func
@@ -125,6 +141,35 @@ def local_impulse(c: PawContact, impulse: vec3, velocity: vec3) -> vec3:
     return sliding_impulse(c, impulse, velocity)
 
 
+@wp.func
+def block_velocity(block: BlockLaw, contacts: wp.array(dtype=PawContact)) -> vec3:
+    """Return the block's velocity [m/s] at the end of the step, pushed by the paws and slowed by the floor.
+
+    Coulomb friction under the weight and the paws' load takes speed off, and never more than there is.
+    """
+    push = vec3(real(0.0))
+    for k in range(contacts.shape[0]):
+        if contacts[k].on_block != 0:
+            push -= contacts[k].impulse
+    upward = wp.dot(push, block.up)
+    free = block.velocity + (push - upward * block.up) / block.mass
+    loss = block.friction * wp.max(block.weight - upward, real(0.0)) / block.mass
+    speed = wp.length(free)
+    if speed <= loss:
+        return vec3(real(0.0))
+    return (real(1.0) - loss / speed) * free
+
+
+@wp.func
+def on_block(contact: PawContact, block: BlockLaw) -> PawContact:
+    """Return a contact with the block, whose response to impulses includes the block's."""
+    c = contact
+    c.on_block = 1
+    c.total += (wp.identity(n=3, dtype=real) - wp.outer(block.up, block.up)) / block.mass
+    c.total_inv = wp.inverse(c.total)
+    return c
+
+
 @wp.struct
 class ContactState:
     """Progress of the contact iteration."""
@@ -136,7 +181,7 @@ class ContactState:
 
 
 @wp.func
-def sweep_contacts(contacts: wp.array(dtype=PawContact), state: ContactState) -> ContactState:
+def sweep_contacts(contacts: wp.array(dtype=PawContact), block: BlockLaw, state: ContactState) -> ContactState:
     """Run one Gauss-Seidel sweep over the active paws, updating their impulses in place."""
     s = state
     s.change = real(0.0)
@@ -145,6 +190,8 @@ def sweep_contacts(contacts: wp.array(dtype=PawContact), state: ContactState) ->
         if contacts[k].active != 0:
             c = contacts[k]
             velocity = c.free + c.from_lin * s.lin + c.from_ang * s.ang + c.own * c.impulse
+            if c.on_block != 0:
+                velocity -= block_velocity(block, contacts)
             impulse = local_impulse(c, c.impulse, velocity)
             step = impulse - c.impulse
             contacts[k].impulse = impulse
@@ -155,7 +202,9 @@ def sweep_contacts(contacts: wp.array(dtype=PawContact), state: ContactState) ->
 
 
 @wp.func
-def solve_contacts(contacts: wp.array(dtype=PawContact), max_sweeps: int, tolerance: real) -> ContactState:
+def solve_contacts(
+    contacts: wp.array(dtype=PawContact), block: BlockLaw, max_sweeps: int, tolerance: real
+) -> ContactState:
     """Solve the contact problem from the impulses in `contacts`; returns the change of base twist and the residual.
 
     Stops when a sweep changes no contact velocity by more than `tolerance` [m/s].
@@ -167,7 +216,7 @@ def solve_contacts(contacts: wp.array(dtype=PawContact), max_sweeps: int, tolera
             state.ang += contacts[k].to_ang * contacts[k].impulse
     state.change = real(2.0) * tolerance + real(1.0)
     while state.sweeps < max_sweeps and state.change > tolerance:
-        state = sweep_contacts(contacts, state)
+        state = sweep_contacts(contacts, block, state)
     return state
 
 

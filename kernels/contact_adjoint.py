@@ -2,11 +2,11 @@
 
 import warp as wp
 
-from .contact import SEPARATE, SLIDE, PawContact, contact_mode, solve_contacts
+from .contact import SEPARATE, SLIDE, BlockLaw, PawContact, contact_mode, solve_contacts
 from .differentiable import BaseArrays, LegArrays, Velocities, load_inverse, load_paw, load_solve
 from .scalar import mat33, real, vec3
 from .state import base_com, leg_dof, load_base, load_motors
-from .step import Robot, paw_contact
+from .step import Robot, paw_contact, touch_floor
 
 wp.set_module_options({"enable_backward": False})
 
@@ -36,9 +36,11 @@ def load_contacts(
         rates = old + dt * (
             solve.free - solve.to_lin * base_eqs.lin_acc[world] - solve.to_ang * base_eqs.ang_acc[world]
         )
+        paw = load_paw(legs, k, world)
         contacts[k] = paw_contact(
-            robot, world, k, base, lin, ang, rates, old, guess[k, world], load_paw(legs, k, world), solve, inverse, dt
-        )
+            robot, world, k, base, lin, ang, rates, old, guess[k, world], paw, solve, inverse,
+            touch_floor(robot, k, base, paw), dt,
+        )  # fmt: skip
 
 
 @wp.kernel
@@ -62,7 +64,7 @@ def contact_kernel(
     world = wp.tid()
     contacts = wp.zeros(shape=(4,), dtype=PawContact)
     load_contacts(robot, world, joint_q, joint_qd, legs, base_eqs, guess, dt, contacts)
-    solve_contacts(contacts, max_sweeps, tolerance)
+    solve_contacts(contacts, BlockLaw(), max_sweeps, tolerance)
     base = load_base(joint_q, joint_qd, base_com(robot.table, world), world)
     for k in range(contacts.shape[0]):
         c = contacts[k]

@@ -24,11 +24,13 @@ def action_kernel(
     scales: ActionScales,
     command_filter: FilterParams,
     arrays: ViewArrays,
+    offset: wp.array2d(dtype=float),
     # out
     previous_target: wp.array2d(dtype=float),
 ):
     """Clamp, scale and filter the action (num_worlds, 12), and remember the old one; one thread per (world, leg).
 
+    offset [rad], (12, num_worlds): constant error of each motor's position sensor, which the filter reads.
     previous_target [rad], (12, num_worlds): the filtered target that acts until the new one arrives.
     """
     world, leg = wp.tid()
@@ -46,6 +48,7 @@ def action_kernel(
         arrays.old_action[m, world] = arrays.action[m, world]
         arrays.action[m, world] = action
         arrays.old_rate[m, world] = rates[j]
+        angles[j] = angles[j] + offset[m, world]
         target[j] = action * scale + arrays.default_angle[m]
     safe = filter_leg(target, angles, rates, command_filter)
     for j in range(3):

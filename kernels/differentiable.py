@@ -25,7 +25,7 @@ from .base_dynamics import (
 from .base_motion import external_wrench, moved_base
 from .contact import SEPARATE, SLIDE, contact_jacobian, goal_velocity
 from .geometry import LegGeometry
-from .ground import Ground, ground_distance, ground_normal
+from .ground import Ground, floor_distance, floor_normal
 from .inertia import inertia_matrix, skew
 from .joint_forces import joint_forces
 from .leg_dynamics import PawKinematics, leg_dynamics, leg_five_bar, paw_kinematics
@@ -197,7 +197,7 @@ class PawPush:
 @wp.func
 def contact_arm(geo: LegGeometry, ground: Ground, centre: vec3) -> vec3:
     """Return the vector [m] from a paw's centre to its contact point, world frame."""
-    return -geo.paw_radius * ground_normal(ground, centre)
+    return -geo.paw_radius * floor_normal(ground, centre)
 
 
 @wp.func
@@ -296,8 +296,8 @@ def residual_kernel(
     base = load_base(joint_q, joint_qd, base_com(table, world), world)
     paw = load_paw(legs, k, world)
     centre = base.pos + wp.quat_rotate(base.quat, paw.position)
-    gap = ground_distance(ground, centre) - geometry[k].paw_radius
-    normal = wp.quat_rotate_inv(base.quat, ground_normal(ground, centre))
+    gap = floor_distance(ground, centre) - geometry[k].paw_radius
+    normal = wp.quat_rotate_inv(base.quat, floor_normal(ground, centre))
     arm = wp.quat_rotate_inv(base.quat, contact_arm(geometry[k], ground, centre))
     velocity = (
         velocities.lin[world]

@@ -20,6 +20,7 @@ class EpisodeSettings:
     step_dt: float  # [s]
     contact_force: float  # [N] above which a paw counts as in contact
     takeoff_speed: float  # [m/s] upward, that begins a flight
+    near: float  # [m] error up to which a landed jump is a success
     games: int  # successes in a row that raise the level
     num_levels: int
     counting_schemes: int  # reset schemes below this number count for curriculum and success
@@ -82,7 +83,7 @@ def make_episode_kernel(terms: tuple, rules: tuple, task_error: wp.Function) -> 
     ):
         """Move every world's episode on by one policy step; one thread per world."""
         world = wp.tid()
-        view = load_view(arrays, world, settings.contact_force)
+        view = load_view(arrays, ground, world, settings.contact_force)
         view.collisions = world_collisions(geometry, ground, arrays.joint_q, world * 43, real(0.0)).flags
         task = advance_jump(tasks[world], view, arrays.old_lin_vel[world], settings.takeoff_speed)
 
@@ -115,12 +116,13 @@ def make_episode_kernel(terms: tuple, rules: tuple, task_error: wp.Function) -> 
         if rule != NO_RULE:
             out.rule_count[rule, world] = out.rule_count[rule, world] + 1
             if task.scheme < settings.counting_schemes:
-                success = rule == 0
+                error = task_error(view, task)
+                success = rule == 0 and error <= settings.near
                 task = next_level(task, success, settings)
                 out.counted[world] = out.counted[world] + 1
                 if success:
                     out.succeeded[world] = out.succeeded[world] + 1
-                    out.error_sum[world] = out.error_sum[world] + task_error(view, task)
+                    out.error_sum[world] = out.error_sum[world] + error
         tasks[world] = task
 
     return episode_kernel

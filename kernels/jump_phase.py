@@ -16,7 +16,7 @@ def estimated_apex(pos: wp.vec3, lin_vel: wp.vec3) -> float:
 
 @wp.func
 def time_to_height(z: float, vz: float, height: float) -> float:
-    """Return the time [s] at which a projectile falls through a height [m]; 0 if it never gets there."""
+    """Return the time [s] at which a projectile falls through a height [m]; if it never gets there, at its apex."""
     under_root = vz * vz + 2.0 * GRAVITY * (z - height)
     return wp.max((vz + wp.sqrt(wp.max(under_root, 0.0))) / GRAVITY, 0.0)
 
@@ -26,6 +26,13 @@ def estimated_landing(pos: wp.vec3, lin_vel: wp.vec3, height: float) -> wp.vec2:
     """Return where (x, y) [m] a projectile falls through a height [m]."""
     t = time_to_height(pos[2], lin_vel[2], height)
     return wp.vec2(pos[0] + t * lin_vel[0], pos[1] + t * lin_vel[1])
+
+
+@wp.func
+def landing_error_estimate(view: RobotView, task: JumpTask, height: float) -> float:
+    """Return how far from the goal [m] the base's projectile falls through a height [m]."""
+    landing = estimated_landing(view.pos, view.lin_vel, height)
+    return wp.length(wp.vec2(task.goal[0] - landing[0], task.goal[1] - landing[1]))
 
 
 @wp.func

@@ -12,144 +12,40 @@ from .collision import world_collisions
 from .geometry import LegGeometry
 from .ground import Ground, surface
 from .inverse_kinematics import LegLimits, clamped_closed_form
-from .jump_phase import GRAVITY
 from .leg_kinematics import leg_forward_kinematics, leg_inverse_velocity
 from .parameters import COORDS, DOFS
+from .reset_draws import (
+    AFTER_LANDING,
+    DEFAULT,
+    IN_FLIGHT,
+    TOUCHDOWN,
+    Draw,
+    ResetRanges,
+    between,
+    draw_base,
+    draw_box,
+    draw_paw,
+    draw_scheme,
+    turned,
+    within,
+)
 from .scalar import real
 from .state import leg_coord, leg_dof, store_motors
-from .task import FLIGHT, LANDED, JumpTask
+from .task import FLIGHT, LANDED, STANCE, JumpTask, yaw_of
 
 wp.set_module_options({"enable_backward": False})
 
-STANDING = wp.constant(0)
-DEFAULT = wp.constant(1)
-IN_FLIGHT = wp.constant(2)
-TOUCHDOWN = wp.constant(3)
-AFTER_LANDING = wp.constant(4)
-
-ATTEMPTS = wp.constant(8)
-
-
-@wp.struct
-class ResetRanges:
-    """Ranges of the drawn states; pairs are (lower, upper), angles [rad], lengths [m]."""
-
-    shares: wp.vec4  # cumulative shares of standing, default, in flight, touchdown; the rest has landed
-    base_xy: float  # half width
-    tilt: float  # half width of roll, pitch; of yaw too around the heading
-    forward_pitch: float  # added to the pitch of standing states
-    heading: float  # half width of the heading
-    front_x: wp.vec2  # paw ahead of the base
-    front_y: wp.vec2  # paw beside the base, absolute
-    back_x: wp.vec2  # paw behind the base, absolute
-    back_y: wp.vec2
-    takeoff_height: wp.vec2
-    flight_time: wp.vec2  # share of the time in the air
-    flight_lateral: float  # half width
-    flight_transversal: wp.vec2
-    touchdown_time: wp.vec2  # [s] before landing
-    paw_depth: wp.vec2  # paws below the base before touchdown
-    landed_height: wp.vec2
-    landed_speed: wp.vec2  # [m/s] downward
-    command_delay: int  # most policy steps until the jump is commanded
-
-
-@wp.struct
-class Draw:
-    """A drawn state; paws relative to the base origin, world axes."""
-
-    pos: wp.vec3
-    quat: wp.quat
-    lin_vel: wp.vec3
-    lateral: float  # [rad], in flight only
-    use_paws: int  # 1: joint angles from the paw positions; 0: from `lateral` and the flight range
-
-
-@wp.func
-def between(state: wp.uint32, column: int, lower: float, upper: float) -> float:
-    """Return a uniform draw, independent for every column."""
-    draw = wp.rand_init(int(state), column)
-    return lower + (upper - lower) * wp.randf(draw)
-
-
-@wp.func
-def draw_quat(state: wp.uint32, ranges: ResetRanges, heading: float, pitch: float) -> wp.quat:
-    """Return an orientation (xyzw) around a heading and a pitch [rad]."""
-    yaw = heading + between(state, 10, -ranges.tilt, ranges.tilt)
-    tip = pitch + between(state, 11, -ranges.tilt, ranges.tilt)
-    roll = between(state, 12, -ranges.tilt, ranges.tilt)
-    return (
-        wp.quat_from_axis_angle(wp.vec3(0.0, 0.0, 1.0), yaw)
-        * wp.quat_from_axis_angle(wp.vec3(0.0, 1.0, 0.0), tip)
-        * wp.quat_from_axis_angle(wp.vec3(1.0, 0.0, 0.0), roll)
-    )
-
-
-@wp.func
-def draw_scheme(state: wp.uint32, ranges: ResetRanges) -> int:
-    """Return a reset scheme by the shares."""
-    u = between(state, 1, 0.0, 1.0)
-    scheme = int(AFTER_LANDING)
-    for i in range(4):
-        if u < ranges.shares[3 - i]:
-            scheme = 3 - i
-    return scheme
-
-
-@wp.func
-def draw_paw(state: wp.uint32, ranges: ResetRanges, leg: int, heading: float) -> wp.vec3:
-    """Return a paw's place on the ground [m] relative to the spot under the base, world axes, z = 0."""
-    x = between(state, 20 + leg, ranges.front_x[0], ranges.front_x[1])
-    y = between(state, 24 + leg, ranges.front_y[0], ranges.front_y[1])
-    if leg >= 2:
-        x = -between(state, 20 + leg, ranges.back_x[0], ranges.back_x[1])
-        y = between(state, 24 + leg, ranges.back_y[0], ranges.back_y[1])
-    if leg % 2 == 1:
-        y = -y
-    return wp.quat_rotate(wp.quat_from_axis_angle(wp.vec3(0.0, 0.0, 1.0), heading), wp.vec3(x, y, 0.0))
-
-
-@wp.func
-def draw_base(
-    state: wp.uint32, ranges: ResetRanges, scheme: int, heading: float, height: wp.vec2, goal: wp.vec3
-) -> Draw:
-    """Return pose and velocity of the base for a scheme of the vertical jump; goal as in `JumpTask`."""
-    d = Draw()
-    x = between(state, 2, -ranges.base_xy, ranges.base_xy)
-    y = between(state, 3, -ranges.base_xy, ranges.base_xy)
-    d.quat = draw_quat(state, ranges, heading, 0.0)
-    d.use_paws = 1
-    if scheme == STANDING:
-        d.pos = wp.vec3(x, y, between(state, 4, height[0], height[1]))
-        d.quat = draw_quat(state, ranges, heading, ranges.forward_pitch)
-    elif scheme == AFTER_LANDING:
-        d.pos = wp.vec3(x, y, between(state, 4, ranges.landed_height[0], ranges.landed_height[1]))
-        d.lin_vel = wp.vec3(0.0, 0.0, -between(state, 5, ranges.landed_speed[0], ranges.landed_speed[1]))
-    else:
-        takeoff = between(state, 4, ranges.takeoff_height[0], ranges.takeoff_height[1])
-        speed = wp.sqrt(wp.max(2.0 * GRAVITY * (goal[2] - takeoff), 0.0))
-        whole = 2.0 * speed / GRAVITY
-        t = whole * between(state, 5, ranges.flight_time[0], ranges.flight_time[1])
-        if scheme == TOUCHDOWN:
-            t = wp.max(whole - between(state, 5, ranges.touchdown_time[0], ranges.touchdown_time[1]), 0.0)
-        else:
-            d.use_paws = 0
-            d.lateral = between(state, 6, -ranges.flight_lateral, ranges.flight_lateral)
-        d.pos = wp.vec3(x, y, takeoff + speed * t - 0.5 * GRAVITY * t * t)
-        d.lin_vel = wp.vec3(0.0, 0.0, speed - GRAVITY * t)
-    return d
+ATTEMPTS = wp.constant(6)
 
 
 @wp.func
 def draw_leg_in_flight(state: wp.uint32, ranges: ResetRanges, leg: int, lateral: float) -> wp.vec3:
     """Return motor angles [rad] of a leg in flight: both thighs about alike, all legs about alike."""
-    middle = between(state, 7, ranges.flight_transversal[0], ranges.flight_transversal[1])
-    outer = wp.clamp(
-        middle + between(state, 30 + leg, -0.1, 0.1), ranges.flight_transversal[0], ranges.flight_transversal[1]
-    )
-    inner = wp.clamp(
-        middle + between(state, 34 + leg, -0.1, 0.1), ranges.flight_transversal[0], ranges.flight_transversal[1]
-    )
+    lower = ranges.flight_transversal[0]
+    upper = ranges.flight_transversal[1]
+    middle = within(state, 7, ranges.flight_transversal)
+    outer = wp.clamp(middle + between(state, 30 + leg, -0.1, 0.1), lower, upper)
+    inner = wp.clamp(middle + between(state, 34 + leg, -0.1, 0.1), lower, upper)
     return wp.vec3(lateral + between(state, 38 + leg, -0.03, 0.03), outer, inner)
 
 
@@ -193,19 +89,17 @@ def store_draw(
     joint_q[q + 2] = d.pos[2] + lift
     for j in range(4):
         joint_q[q + 3 + j] = d.quat[j]
-    depth = between(state, 8, ranges.paw_depth[0], ranges.paw_depth[1])
+    depth = within(state, 8, ranges.paw_depth)
     for leg in range(geometry.shape[0]):
         geo = geometry[leg]
-        spot = draw_paw(state, ranges, leg, heading)
-        paw = wp.vec3(0.0)
+        spot = d.spot + draw_paw(state, ranges, leg, heading)
+        paw = spot - d.pos
         if scheme == TOUCHDOWN:
             # paws hang below the base, a little above the ground at least
-            drop = wp.min(depth, d.pos[2] - geo.paw_radius - 0.025)
-            paw = wp.vec3(spot[0], spot[1], -drop)
+            paw[2] = -wp.min(depth, d.pos[2] - geo.paw_radius - 0.025)
         else:
-            # on the ground, around the spot that the episode began on
             here = surface(ground, spot[0], spot[1])
-            paw = wp.vec3(spot[0] - d.pos[0], spot[1] - d.pos[1], here[0] + geo.paw_radius - d.pos[2] - lift)
+            paw[2] = here[0] + geo.paw_radius - d.pos[2] - lift
         air = draw_leg_in_flight(state, ranges, leg, d.lateral)
         moving = wp.where(scheme == AFTER_LANDING, 1, 0)
         if store_leg(geo, limits, world, leg, d, paw, air, moving, joint_q, joint_qd) == 0:
@@ -258,6 +152,13 @@ def store_default(
 
 
 @wp.func
+def draw_again(state: wp.uint32, ranges: ResetRanges) -> int:
+    """Return how many policy steps after touchdown another goal comes; 0: none."""
+    steps = int(within(state, 19, ranges.again_delay))
+    return wp.where(between(state, 18, 0.0, 1.0) < ranges.jump_again, wp.max(steps, 1), 0)
+
+
+@wp.func
 def begin_task(
     old: JumpTask, state: wp.uint32, ranges: ResetRanges, scheme: int, goal: wp.vec3, pos: wp.vec3, vz: float
 ) -> JumpTask:
@@ -270,18 +171,39 @@ def begin_task(
     task.start = pos
     task.max_height = pos[2]
     task.command_step = int(between(state, 9, 0.0, float(ranges.command_delay) + 0.999))
+    if old.level > 0:
+        task.again_step = draw_again(state, ranges)
     if scheme == IN_FLIGHT or scheme == TOUCHDOWN:
         task.phase = FLIGHT
         task.command_step = 0
         if vz <= 0.0:
             task.apex_passed = 1
-            task.max_height = goal[2]
+            task.max_height = wp.max(goal[2], pos[2])
     if scheme == AFTER_LANDING:
         task.phase = LANDED
         task.command_step = 0
         task.apex_passed = 1
-        task.max_height = goal[2]
+        task.max_height = wp.max(goal[2], pos[2])
         task.phase_steps = int(between(state, 9, 0.0, 17.999))
+    return task
+
+
+@wp.func
+def begin_next_jump(old: JumpTask, goal: wp.vec3, pos: wp.vec3, heading: float) -> JumpTask:
+    """Return the state of an episode that goes on with another jump at once; goal relative to base and heading."""
+    task = old
+    task.heading = heading
+    task.goal = turned(goal, heading) + wp.vec3(pos[0], pos[1], 0.0)
+    task.start = pos
+    task.phase = STANCE
+    task.phase_steps = 0
+    task.command_step = old.steps
+    task.apex_passed = 0
+    task.idle_steps = 0
+    task.max_height = pos[2]
+    task.peak_tilt = 0.0
+    task.again_step = 0
+    task.jumps = old.jumps + 1
     return task
 
 
@@ -303,30 +225,44 @@ def reset_kernel(
     joint_q: wp.array(dtype=float),
     joint_qd: wp.array(dtype=float),
 ):
-    """Begin a new episode where one is done; one thread per world. Goals and base heights: one entry per level."""
+    """Begin a new episode where one is done, or the next jump where it is due; one thread per world.
+
+    Goals, relative to the start, and base heights: one entry per level.
+    """
     world = wp.tid()
-    if done[world] == 0.0:
+    task = tasks[world]
+    again = task.phase == LANDED and task.again_step > 0 and task.phase_steps == task.again_step
+    if done[world] == 0.0 and not again:
         return
     state = wp.rand_init(int(random[world]), world + 1)
+    random[world] = wp.rand_init(int(state), 99)
     levels = goal_lower.shape[0]
-    level = tasks[world].level
+    level = task.level
     if level >= levels:
         level = wp.min(int(between(state, 0, 0.0, float(levels))), levels - 1)
-    goal = wp.vec3(0.0)
-    for j in range(3):
-        goal[j] = between(state, 50 + j, goal_lower[level][j], goal_upper[level][j])
+    goal = draw_box(state, 50, goal_lower[level], goal_upper[level])
+    q = world * COORDS
+    if done[world] == 0.0:
+        pos = wp.vec3(joint_q[q], joint_q[q + 1], joint_q[q + 2])
+        quat = wp.quat(joint_q[q + 3], joint_q[q + 4], joint_q[q + 5], joint_q[q + 6])
+        task = begin_next_jump(task, goal, pos, yaw_of(quat))
+        task.again_step = draw_again(state, ranges)
+        tasks[world] = task
+        return
     scheme = draw_scheme(state, ranges)
     heading = between(state, 13, -ranges.heading, ranges.heading)
-    here = surface(ground, 0.0, 0.0)
+    goal = turned(goal, heading)
     taken = draw_until_taken(
         geometry, ground, limits, ranges, state, world, scheme, heading, base_height[level], goal, joint_q, joint_qd
     )
     if taken == 0:
         scheme = int(DEFAULT)
+        here = surface(ground, 0.0, 0.0)
         store_default(reference_q, world, heading, here[0], joint_q, joint_qd)
-    pos = wp.vec3(joint_q[world * COORDS], joint_q[world * COORDS + 1], joint_q[world * COORDS + 2])
-    tasks[world] = begin_task(tasks[world], state, ranges, scheme, goal, pos, joint_qd[world * DOFS + 2])
-    random[world] = wp.rand_init(int(state), 99)
+    pos = wp.vec3(joint_q[q], joint_q[q + 1], joint_q[q + 2])
+    task = begin_task(task, state, ranges, scheme, goal, pos, joint_qd[world * DOFS + 2])
+    task.heading = heading
+    tasks[world] = task
 
 
 @wp.kernel

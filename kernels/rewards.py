@@ -5,10 +5,22 @@ phi_s(x) = exp(-x^2 / s^2), psi_s(x) = exp(-|x| / s). Times are counted in polic
 
 import warp as wp
 
-from .jump_phase import estimated_apex
-from .task import FLIGHT, LANDED, STANCE, JumpTask, RobotView, vec12, waiting
+from .jump_phase import estimated_apex, landing_error_estimate
+from .task import (
+    FLIGHT,
+    LANDED,
+    STANCE,
+    JumpTask,
+    RobotView,
+    commanded,
+    goal_offset,
+    rotation_from,
+    vec12,
+    waiting,
+)
 
 SOON = wp.constant(18)  # policy steps: the first 0.3 s after touchdown
+RECOVERED = wp.constant(30)  # policy steps: 0.5 s after touchdown
 
 
 @wp.func
@@ -51,6 +63,14 @@ def patience(task: JumpTask, share: float) -> float:
 def just_landed(task: JumpTask) -> bool:
     """Return whether the touchdown was within the last 0.3 s."""
     return task.phase == LANDED and task.phase_steps < SOON
+
+
+@wp.func
+def should_rest(task: JumpTask) -> bool:
+    """Return whether the robot should stand still: before the command, and from 0.5 s after touchdown."""
+    if task.phase == LANDED:
+        return task.phase_steps >= RECOVERED
+    return task.phase == STANCE and not commanded(task)
 
 
 # ---------------------------------------------------------------- vertical jump
@@ -138,6 +158,65 @@ def retract(view: RobotView, task: JumpTask, p: wp.vec4) -> float:
     return phi(transversal_offset(view, p[1]), p[0])
 
 
+# ---------------------------------------------------------------- horizontal jump
+
+
+@wp.func
+def tracking(view: RobotView, task: JumpTask, p: wp.vec4) -> float:
+    """Tracking: phi_p0 + p2 phi_p1 of the distance from the goal [m], after takeoff."""
+    if task.phase == STANCE:
+        return 0.0
+    error = wp.length(goal_offset(view, task))
+    return phi(error, p[0]) + p[2] * phi(error, p[1])
+
+
+@wp.func
+def estimated_tracking(view: RobotView, task: JumpTask, p: wp.vec4) -> float:
+    """Est tracking: phi_p0 + 0.1 phi_p1 + 0.3 phi_p2 of the ballistic landing's distance from the goal, in flight.
+
+    The landing is where the base falls through p3 [m].
+    """
+    if task.phase != FLIGHT:
+        return 0.0
+    error = landing_error_estimate(view, task, p[3])
+    return phi(error, p[0]) + 0.1 * phi(error, p[1]) + 0.3 * phi(error, p[2])
+
+
+@wp.func
+def flight_orientation(view: RobotView, task: JumpTask, p: wp.vec4) -> float:
+    """Orientation error: phi_p0 of the rotation from level and heading, in flight while moving toward the goal."""
+    if task.phase != FLIGHT or wp.dot(view.lin_vel, goal_offset(view, task)) <= 0.0:
+        return 0.0
+    return phi(rotation_from(view.quat, task.heading), p[0])
+
+
+@wp.func
+def flight_angular_velocity(view: RobotView, task: JumpTask, p: wp.vec4) -> float:
+    """Angular velocity: phi_p0(|w|), in flight."""
+    if task.phase != FLIGHT:
+        return 0.0
+    return phi(wp.length(view.ang_vel), p[0])
+
+
+@wp.func
+def left_right_symmetry(view: RobotView, task: JumpTask, p: wp.vec4) -> float:
+    """Joint symmetry: phi_p0 of the rms difference of left and right transversal angles; share p1 while due."""
+    total = float(0.0)
+    for m in range(12):
+        if m % 3 != 0 and (m / 3) % 2 == 0:
+            off = view.angle[m] - view.angle[m + 3]
+            total += off * off
+    return phi(wp.sqrt(total / 4.0), p[0]) * patience(task, p[1])
+
+
+@wp.func
+def standing_posture(view: RobotView, task: JumpTask, p: wp.vec4) -> float:
+    """Stance: phi_p0 of the offset from default, transversal motors + p1, while the robot should rest."""
+    if not should_rest(task):
+        return 0.0
+    return phi(transversal_offset(view, p[1]), p[0])
+
+
 # ---------------------------------------------------------------- impacts and landing
 
 
@@ -184,6 +263,23 @@ def damp_landing(view: RobotView, task: JumpTask, p: wp.vec4) -> float:
         if m % 3 != 0:
             total += wp.clamp(view.rate[m], 0.0, 1.0)
     return total / 8.0
+
+
+@wp.func
+def rest(view: RobotView, task: JumpTask, p: wp.vec4) -> float:
+    """Rest: phi_p0(|v|) phi_p1(|w|), while the robot should rest."""
+    if not should_rest(task):
+        return 0.0
+    return phi(wp.length(view.lin_vel), p[0]) * phi(wp.length(view.ang_vel), p[1])
+
+
+@wp.func
+def landing_tilt(view: RobotView, task: JumpTask, p: wp.vec4) -> float:
+    """Tilt after touchdown: squared sine of the angle between body z and world z over that of p0 [rad]."""
+    if task.phase != LANDED:
+        return 0.0
+    sine = wp.length(wp.vec2(view.gravity[0], view.gravity[1])) / wp.sin(p[0])
+    return sine * sine
 
 
 # ---------------------------------------------------------------- regularization

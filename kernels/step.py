@@ -20,17 +20,19 @@ from .base_motion import external_wrench
 from .contact import (
     CONTACT_MARGIN,
     STICK_SPEED,
+    BlockLaw,
     PawContact,
     contact_jacobian,
     couple_contact,
     goal_velocity,
 )
 from .geometry import LegGeometry
-from .ground import Ground, ground_distance, ground_normal
+from .ground import Ground, block_distance, block_normal, floor_distance, floor_normal
 from .joint_forces import joint_forces
 from .leg_dynamics import PawKinematics, leg_dynamics, leg_five_bar, paw_kinematics
 from .parameters import (
     BASE,
+    GRAVITY,
     LEG_ROWS,
     MU_DYNAMIC,
     MU_STATIC,
@@ -80,33 +82,77 @@ def leg_terms(
     return add_leg(system, dynamics, solve)
 
 
+@wp.struct
+class Touch:
+    """The nearest point of a surface to a paw."""
+
+    gap: real  # [m] between surface and paw
+    normal: vec3  # body axes
+    velocity: vec3  # of the surface [m/s], body axes
+
+
+@wp.func
+def block_law(robot: Robot, world: int, base: BaseState, dt: real) -> BlockLaw:
+    """Return the law of a world's block in body axes; a block without mass where there is none."""
+    law = BlockLaw()
+    if robot.ground.blocks.shape[0] > 0:
+        block = robot.ground.blocks[world]
+        law.velocity = wp.quat_rotate_inv(base.quat, vec3(block.velocity[0], block.velocity[1], real(0.0)))
+        law.up = wp.quat_rotate_inv(base.quat, vec3(real(0.0), real(0.0), real(1.0)))
+        law.mass = block.mass
+        law.friction = block.friction
+        law.weight = -dt * block.mass * robot.table[GRAVITY + 2, world]
+    return law
+
+
+@wp.func
+def touch_floor(robot: Robot, k: int, base: BaseState, paw: PawKinematics) -> Touch:
+    """Return where paw k is nearest to the floor."""
+    centre = base.pos + wp.quat_rotate(base.quat, paw.position)
+    touch = Touch()
+    touch.gap = floor_distance(robot.ground, centre) - robot.geometry[k].paw_radius
+    touch.normal = wp.quat_rotate_inv(base.quat, floor_normal(robot.ground, centre))
+    return touch
+
+
+@wp.func
+def touch_block(robot: Robot, world: int, k: int, base: BaseState, paw: PawKinematics, law: BlockLaw) -> Touch:
+    """Return where paw k is nearest to the block."""
+    centre = base.pos + wp.quat_rotate(base.quat, paw.position)
+    block = robot.ground.blocks[world]
+    touch = Touch()
+    touch.gap = block_distance(block, centre) - robot.geometry[k].paw_radius
+    touch.normal = wp.quat_rotate_inv(base.quat, block_normal(block, centre))
+    touch.velocity = law.velocity
+    return touch
+
+
 @wp.func
 def paw_contact(
     robot: Robot, world: int, k: int, base: BaseState, lin: vec3, ang: vec3, rates: vec3, old_rates: vec3,
-    impulse: vec3, paw: PawKinematics, leg: LegSolve, inverse: BaseInverse, dt: real,
+    impulse: vec3, paw: PawKinematics, leg: LegSolve, inverse: BaseInverse, touch: Touch, dt: real,
 ) -> PawContact:  # fmt: skip
-    """Return paw k's contact problem.
+    """Return paw k's contact problem with a surface.
 
     lin, ang, rates: base twist (body axes) and motor rates at the end of the step without contact; old_rates and
     `base`: at its start; impulse: first guess [N s], world frame.
     """
     contact = PawContact()
-    centre = base.pos + wp.quat_rotate(base.quat, paw.position)
-    radius = robot.geometry[k].paw_radius
-    gap = ground_distance(robot.ground, centre) - radius
-    normal = wp.quat_rotate_inv(base.quat, ground_normal(robot.ground, centre))
-    arm = -radius * normal
+    gap = touch.gap
+    normal = touch.normal
+    arm = -robot.geometry[k].paw_radius * normal
     point = paw.position + arm
     contact.jacobian = contact_jacobian(paw, arm)
     contact.normal = normal
     contact.free = lin + wp.cross(ang, point) + contact.jacobian * rates
-    if gap + dt * wp.min(wp.dot(contact.free, normal), real(0.0)) > CONTACT_MARGIN:
+    if gap + dt * wp.min(wp.dot(contact.free - touch.velocity, normal), real(0.0)) > CONTACT_MARGIN:
         return contact
     contact.active = 1
     contact.goal = goal_velocity(gap, dt)
     contact.impulse = wp.quat_rotate_inv(base.quat, impulse)
     before = wp.quat_rotate_inv(base.quat, base.lin) + wp.cross(base.ang, point) + contact.jacobian * old_rates
-    slip = before - wp.dot(before, normal) * normal
+    slip = before - touch.velocity
+    slip -= wp.dot(slip, normal) * normal
     contact.mu_row = k * LEG_ROWS + MU_DYNAMIC
     if wp.dot(slip, slip) < STICK_SPEED * STICK_SPEED and wp.dot(contact.impulse, normal) > real(0.0):
         contact.mu_row = k * LEG_ROWS + MU_STATIC

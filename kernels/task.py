@@ -3,6 +3,7 @@
 import warp as wp
 
 from .actuator import motor_slot
+from .ground import Ground, surface, world_ground
 from .parameters import BODIES, COORDS, DOFS
 
 vec12 = wp.types.vector(length=12, dtype=wp.float32)
@@ -17,6 +18,7 @@ class RobotView:
     """The robot at the end of a policy step; motors in the order FL, FR, BL, BR by lateral, outer, inner."""
 
     pos: wp.vec3  # [m] base origin, world
+    height: float  # [m] of the base origin above the ground below it
     quat: wp.quat  # xyzw, body to world
     lin_vel: wp.vec3  # [m/s] base origin, world
     lin_acc: wp.vec3  # [m/s^2] base origin, world, mean of the policy step
@@ -39,8 +41,9 @@ class RobotView:
 class JumpTask:
     """State of one world's episode."""
 
-    goal: wp.vec3  # vertical jump: start x, start y, wanted height of the base [m]; horizontal: wanted base x, y, 0
-    start: wp.vec3  # [m] base origin where the episode began
+    goal: wp.vec3  # [m] where to land: base x, y; and its wanted height at the apex, 0 if any will do
+    start: wp.vec3  # [m] base origin where the jump began
+    heading: float  # [rad] yaw of the jump
     phase: int  # STANCE, FLIGHT, LANDED
     steps: int  # policy steps since the episode began
     phase_steps: int  # policy steps in this phase
@@ -54,6 +57,8 @@ class JumpTask:
     touchdown_vel: wp.vec3  # [m/s] of the base, step before touchdown
     peak_tilt: float  # [rad] largest between body and world z since touchdown
     scheme: int  # reset scheme that began the episode
+    again_step: int  # policy steps after touchdown at which another goal comes, 0: never
+    jumps: int  # jumps that were followed by another in this episode
     level: int  # curriculum
     streak: int  # successes in a row
 
@@ -104,9 +109,11 @@ def load_base_view(arrays: ViewArrays, world: int) -> RobotView:
 
 
 @wp.func
-def load_view(arrays: ViewArrays, world: int, contact_force: float) -> RobotView:
+def load_view(arrays: ViewArrays, ground: Ground, world: int, contact_force: float) -> RobotView:
     """Return the robot of a world, without collisions; paws pressed harder than `contact_force` [N] are in contact."""
     view = load_base_view(arrays, world)
+    below = surface(world_ground(ground, world), view.pos[0], view.pos[1])
+    view.height = view.pos[2] - below[0]
     contacts = int(0)
     for k in range(4):
         force = wp.length(arrays.paw_force[k, world])
@@ -142,6 +149,28 @@ def speed_limit_broken(view: RobotView) -> bool:
     if not wp.isfinite(total):
         return True
     return wp.length(view.lin_vel) > 15.0 or wp.length(view.ang_vel) > 40.0 or fastest > 120.0
+
+
+@wp.func
+def yaw_of(quat: wp.quat) -> float:
+    """Return the yaw [rad] of an orientation (xyzw): the heading of body x in the world plane."""
+    ahead = wp.quat_rotate(quat, wp.vec3(1.0, 0.0, 0.0))
+    return wp.atan2(ahead[1], ahead[0])
+
+
+@wp.func
+def rotation_from(quat: wp.quat, heading: float) -> float:
+    """Return the angle [rad] between an orientation (xyzw) and the level one with a heading [rad]."""
+    half = 0.5 * heading
+    level = wp.quat(0.0, 0.0, wp.sin(half), wp.cos(half))
+    off = wp.quat_inverse(level) * quat
+    return 2.0 * wp.atan2(wp.length(wp.vec3(off[0], off[1], off[2])), wp.abs(off[3]))
+
+
+@wp.func
+def goal_offset(view: RobotView, task: JumpTask) -> wp.vec3:
+    """Return the horizontal way from the base to the goal [m], world axes."""
+    return wp.vec3(task.goal[0] - view.pos[0], task.goal[1] - view.pos[1], 0.0)
 
 
 @wp.func

@@ -2,9 +2,20 @@
 
 import warp as wp
 
-from .jump_phase import tilt
+from .jump_phase import landing_error_estimate, tilt
 from .rewards import braking
-from .task import LANDED, STANCE, JumpTask, RobotView, speed_limit_broken, waiting
+from .task import (
+    FLIGHT,
+    LANDED,
+    STANCE,
+    JumpTask,
+    RobotView,
+    goal_offset,
+    rotation_from,
+    speed_limit_broken,
+    waiting,
+    yaw_of,
+)
 
 
 @wp.func
@@ -32,21 +43,49 @@ def wrong_height(view: RobotView, task: JumpTask, p: wp.vec4) -> bool:
 
 
 @wp.func
+def missed_goal(view: RobotView, task: JumpTask, p: wp.vec4) -> bool:
+    """Base more than p0 [m] beside the goal at touchdown."""
+    return task.touched_down == 1 and wp.length(goal_offset(view, task)) > p[0]
+
+
+@wp.func
+def predicted_miss(view: RobotView, task: JumpTask, p: wp.vec4) -> bool:
+    """p1 policy steps after takeoff the projectile falls through height p2 [m] more than p0 [m] beside the goal."""
+    if task.phase != FLIGHT or task.phase_steps != int(p[1]):
+        return False
+    return landing_error_estimate(view, task, p[2]) > p[0]
+
+
+@wp.func
+def turned_touchdown(view: RobotView, task: JumpTask, p: wp.vec4) -> bool:
+    """At touchdown rotated by more than p0 [rad] from level and heading, or by p1 in yaw alone."""
+    yaw = yaw_of(view.quat) - task.heading
+    off = wp.abs(wp.atan2(wp.sin(yaw), wp.cos(yaw)))
+    return task.touched_down == 1 and (rotation_from(view.quat, task.heading) > p[0] or off > p[1])
+
+
+@wp.func
 def low_touchdown(view: RobotView, task: JumpTask, p: wp.vec4) -> bool:
-    """Base below p0 [m] at touchdown."""
-    return task.touched_down == 1 and view.pos[2] < p[0]
+    """Base less than p0 [m] above the ground at touchdown."""
+    return task.touched_down == 1 and view.height < p[0]
 
 
 @wp.func
 def low_base(view: RobotView, task: JumpTask, p: wp.vec4) -> bool:
-    """Base below p0 [m]."""
-    return view.pos[2] < p[0]
+    """Base less than p0 [m] above the ground."""
+    return view.height < p[0]
 
 
 @wp.func
 def moved_away(view: RobotView, task: JumpTask, p: wp.vec4) -> bool:
     """Base more than p0 [m] from where it started, at any time."""
     return wp.length(wp.vec2(view.pos[0] - task.start[0], view.pos[1] - task.start[1])) > p[0]
+
+
+@wp.func
+def left_stance(view: RobotView, task: JumpTask, p: wp.vec4) -> bool:
+    """Base more than p0 [m] from where the jump began, still standing."""
+    return task.phase == STANCE and moved_away(view, task, p)
 
 
 @wp.func

@@ -8,11 +8,14 @@ import warp as wp
 
 from jumper_warp.env import JumpEnv
 from jumper_warp.tasks import make_task
-from jumper_warp.tasks.task import ResetCfg
-from kernels.task import JumpTask, RobotView, vec12
+from jumper_warp.tasks.task import NoiseCfg, ResetCfg
+from kernels.ground import Ground
+from kernels.observe import Observations
+from kernels.task import JumpTask, RobotView, ViewArrays, vec12
 
 DEG = np.pi / 180.0
 DEFAULT_ANGLE = np.tile([0.0, 45.0 * DEG, 45.0 * DEG], 4)
+MOTOR_SLOTS = np.array([5 * leg + joint for leg in range(4) for joint in (0, 1, 3)])
 SCHEMES = ("standing", "default", "in_flight", "touchdown", "landed")
 
 
@@ -31,19 +34,25 @@ class Table:
             views: wp.array(dtype=RobotView),
             tasks: wp.array(dtype=JumpTask),
             p: wp.vec4,
-            out: wp.array(dtype=wp.bool if returns is bool else float),
+            out: wp.array2d(dtype=wp.bool if returns is bool else float),
         ):
+            j = wp.tid()
             for i in range(wp.static(count)):
-                out[i] = wp.static(funcs[i])(views[0], tasks[0], p)
+                out[j, i] = wp.static(funcs[i])(views[j], tasks[j], p)
 
         self._kernel = table_kernel
 
     def __call__(self, name: str, view: RobotView, task: JumpTask, *p: float) -> float | bool:
         """Return the value of one function."""
-        out = wp.zeros(len(self._names), dtype=wp.bool if self._returns is bool else float, device="cpu")
-        inputs = [wp.array([view], dtype=RobotView, device="cpu"), wp.array([task], dtype=JumpTask, device="cpu")]
-        wp.launch(self._kernel, 1, [*inputs, wp.vec4(*p, *([0.0] * (4 - len(p))))], [out], device="cpu")
-        return self._returns(out.numpy()[self._names.index(name)])
+        return self._returns(self.all(name, [view], [task], *p)[0])
+
+    def all(self, name: str, views: list, tasks: list, *p: float) -> np.ndarray:
+        """Return the values of one function, one a robot and its episode."""
+        shape = (len(views), len(self._names))
+        out = wp.zeros(shape, dtype=wp.bool if self._returns is bool else float, device="cpu")
+        inputs = [wp.array(views, dtype=RobotView, device="cpu"), wp.array(tasks, dtype=JumpTask, device="cpu")]
+        wp.launch(self._kernel, len(views), [*inputs, wp.vec4(*p, *([0.0] * (4 - len(p))))], [out], device="cpu")
+        return out.numpy()[:, self._names.index(name)]
 
 
 def make_view(**fields) -> RobotView:
@@ -54,6 +63,7 @@ def make_view(**fields) -> RobotView:
     for name, value in fields.items():
         kind = type(getattr(view, name))
         setattr(view, name, kind(*value) if np.ndim(value) else value)
+    view.height = fields.get("height", view.pos[2])
     return view
 
 
@@ -65,16 +75,64 @@ def make_episode(**fields) -> JumpTask:
     return task
 
 
+class Robots:
+    """Robots that stand at rest in the default pose, to be changed by the tests, and what is observed of them."""
+
+    def __init__(self, kernel: wp.Kernel, n: int = 1):
+        """kernel: of `make_observe_kernel`."""
+        self.kernel, self.n = kernel, n
+        self.q, self.qd = np.zeros((n, 43)), np.zeros((n, 38))
+        self.q[:, 2], self.q[:, 6], self.q[:, 7 + MOTOR_SLOTS] = 0.35, 1.0, DEFAULT_ANGLE
+        self.com, self.action, self.offset = np.zeros(3), np.zeros((12, n)), np.zeros((12, n))
+        self.force, self.heights = np.zeros((4, n, 3)), np.zeros((1, 1))
+        self.tasks = [make_episode(goal=(0.0, 0.0, 0.8), command_step=5)] * n
+        self.random = np.arange(1, n + 1, dtype=np.uint32) * np.uint32(7919)
+
+    def observe(self, noise: bool = False) -> np.ndarray:
+        """Return the actor's observations, (n, 48); draws go on from call to call."""
+        return self.both(noise)[0]
+
+    def both(self, noise: bool = False) -> tuple[np.ndarray, np.ndarray]:
+        """Return the actor's observations, (n, 48), and the critic's, (n, 65); its last two columns were 7 before."""
+
+        def array(value, dtype=float):
+            return wp.array(np.asarray(value), dtype=dtype, device="cpu")
+
+        views, n = ViewArrays(), self.n
+        views.joint_q, views.joint_qd = array(self.q.ravel()), array(self.qd.ravel())
+        views.body_com = array(np.tile(self.com, (21 * n, 1)), wp.vec3)
+        views.paw_force = array(self.force, wp.vec3)
+        for name in ("torque", "old_action", "target", "safe_target", "old_rate"):
+            setattr(views, name, wp.zeros((12, n), dtype=float, device="cpu"))
+        views.action = array(self.action)
+        views.old_lin_vel = wp.zeros(n, dtype=wp.vec3, device="cpu")
+        views.default_angle, views.step_dt = array(DEFAULT_ANGLE), 1.0 / 60.0
+        out, none = Observations(), wp.zeros(n, dtype=float, device="cpu")
+        out.actor = wp.zeros((n, 48), dtype=float, device="cpu")
+        out.critic = wp.full((n, 65), 7.0, dtype=float, device="cpu")
+        random = array(self.random, wp.uint32)
+        tasks = wp.array(self.tasks, dtype=JumpTask, device="cpu")
+        sensors = NoiseCfg().sensor_noise(noise)
+        ground = Ground()
+        ground.heights = wp.array(self.heights, dtype=float, device="cpu")
+        ground.rows, ground.cols = self.heights.shape if self.heights.size > 1 else (0, 0)
+        ground.half_x = ground.half_y = 2.0
+        inputs = [views, ground, tasks, array(self.offset), sensors, none, 1, random]
+        wp.launch(self.kernel, n, inputs, [out], device="cpu")
+        self.random = random.numpy()
+        return out.actor.numpy().astype(float), out.critic.numpy().astype(float)
+
+
 def tilted_by(angle: float, axis=(1.0, 0.0, 0.0)) -> dict:
     """Return orientation and gravity of a robot tilted by an angle [rad] about a horizontal axis."""
     quat = wp.quat_from_axis_angle(wp.vec3(*axis), float(angle))
     return {"quat": tuple(quat), "gravity": tuple(wp.quat_rotate_inv(quat, wp.vec3(0.0, 0.0, -1.0)))}
 
 
-def only(scheme: str, **ranges) -> ResetCfg:
-    """Return resets that all follow one scheme."""
+def only(scheme: str, reset: ResetCfg | None = None, **ranges) -> ResetCfg:
+    """Return resets that all follow one scheme, otherwise as `reset`."""
     shares = dict.fromkeys(SCHEMES[:4], 0.0) | ({} if scheme == "landed" else {scheme: 1.0})
-    return ResetCfg(**shares, **ranges)
+    return dataclasses.replace(ResetCfg() if reset is None else reset, **shares, **ranges)
 
 
 def make_env(num_envs: int, *, seed: int = 0, reset: ResetCfg | None = None, task=None, **arguments) -> JumpEnv:

@@ -1,36 +1,84 @@
-"""The vertical jump's reward table once more, in NumPy, from the paper's formulas and the robot's arrays."""
+"""The jumps' reward terms once more, in NumPy, from the paper's formulas and the robot's arrays."""
 
 import numpy as np
-from jump_helpers import DEFAULT_ANGLE
+from jump_helpers import DEFAULT_ANGLE, make_episode, make_view
 from scipy.spatial.transform import Rotation
 
 DT = 1.0 / 60.0
+G = 9.81
 SLOTS = np.array([5 * leg + joint for leg in range(4) for joint in (0, 1, 3)])
 T = np.arange(12) % 3 != 0
 STANCE, FLIGHT, LANDED = 0, 1, 2
+EPISODE = """goal heading start phase phase_steps steps command_step took_off touched_down at_apex apex_passed
+max_height""".split()
 
 
 def robot_of(env) -> dict[str, np.ndarray]:
-    """Return copies of what the rewards need; worlds are the last index."""
+    """Return copies of what the rewards need; the joints' arrays have the world as their last index."""
     q, qd = env.sim.joint_q().astype(float), env.sim.joint_qd().astype(float)
     turn = Rotation.from_quat(q[:, 3:7])
     com = env.sim.model.body_com.numpy().reshape(len(q), -1, 3)[:, 0]
     views, tasks = env._views, env.tasks.numpy()
     robot = {
-        "z": q[:, 2],
+        "pos": q[:, :3],
+        "quat": q[:, 3:7],
         "vel": qd[:, :3] - np.cross(qd[:, 3:6], turn.apply(com)),
-        "spin": np.linalg.norm(qd[:, 3:6], axis=1),
-        "lean": np.linalg.norm(turn.inv().apply([0.0, 0.0, 1.0])[:, :2], axis=1),
+        "spin": qd[:, 3:6],
         "angle": q[:, 7 + SLOTS].T,
         "rate": qd[:, 6 + SLOTS].T,
         "torque": views.torque.numpy().astype(float),
         "action": views.action.numpy().astype(float),
         "force": np.linalg.norm(views.paw_force.numpy().astype(float), axis=2),
         "clipped": np.sum((views.target.numpy().astype(float) - views.safe_target.numpy()) ** 2, axis=0),
-        "goal": tasks["goal"][:, 2].astype(float),
     }
-    names = ("phase", "phase_steps", "steps", "command_step", "at_apex", "apex_passed", "max_height")
-    return robot | {name: tasks[name].copy() for name in names}
+    return robot | {name: tasks[name].copy() for name in EPISODE}
+
+
+def random_robots(n: int, seed: int) -> dict[str, np.ndarray]:
+    """Return robots in all phases, near and far from their goals and headings, some of them next to yaw 180 degrees."""
+    rng = np.random.default_rng(seed)
+    near = 10.0 ** rng.uniform(-2.0, 0.0, (n, 1))
+    heading = np.where(rng.random(n) < 0.3, np.pi * rng.choice([-1.0, 1.0], n), rng.uniform(-np.pi, np.pi, n))
+    turn = Rotation.from_euler("z", heading[:, None]) * Rotation.from_rotvec(near * rng.normal(size=(n, 3)))
+    goal = np.concatenate([rng.uniform(-2.0, 2.0, (n, 2)), np.zeros((n, 1))], axis=1)
+    pos = goal + near * rng.normal(size=(n, 3))
+    pos[:, 2] = rng.uniform(0.15, 0.9, n)
+    vel = near * np.array([2.0, 2.0, 3.0]) * rng.normal(size=(n, 3))
+    return {
+        "pos": pos, "quat": turn.as_quat(), "vel": vel, "acc": 40.0 * rng.normal(size=(n, 3)),
+        "spin": 10.0 * near * rng.normal(size=(n, 3)), "rate": rng.normal(size=(12, n)),
+        "angle": DEFAULT_ANGLE[:, None] + near.T * rng.normal(size=(12, n)),
+        "rate_change": 100.0 * rng.normal(size=(12, n)),
+        "torque": 9.0 * rng.normal(size=(12, n)), "action": rng.uniform(-1.0, 1.0, (12, n)),
+        "old_action": rng.uniform(-1.0, 1.0, (12, n)), "force": 100.0 * rng.random((4, n)), "clipped": rng.random(n),
+        "goal": goal, "heading": heading, "start": pos + near * rng.normal(size=(n, 3)), "phase": rng.integers(0, 3, n),
+        "phase_steps": rng.integers(0, 60, n), "steps": rng.integers(0, 60, n), "command_step": rng.integers(0, 60, n),
+        "took_off": rng.integers(0, 2, n), "touched_down": rng.integers(0, 2, n), "at_apex": rng.integers(0, 2, n),
+        "apex_passed": rng.integers(0, 2, n), "max_height": rng.uniform(0.3, 1.0, n),
+    }  # fmt: skip
+
+
+def kernel_inputs(r: dict) -> tuple[list, list]:
+    """Return the `RobotView` and the `JumpTask` of each of some robots."""
+    views, tasks = [], []
+    gravity = Rotation.from_quat(r["quat"]).inv().apply([0.0, 0.0, -1.0])
+    motors = ("angle", "rate", "rate_change", "torque", "action", "old_action")
+    for i in range(len(r["pos"])):
+        base = {"pos": r["pos"][i], "quat": r["quat"][i], "lin_vel": r["vel"][i], "lin_acc": r["acc"][i]}
+        base |= {"ang_vel": r["spin"][i], "gravity": gravity[i], "paw_force": r["force"][:, i]}
+        views.append(make_view(**base, **{name: r[name][:, i] for name in motors}, clipped=float(r["clipped"][i])))
+        tasks.append(make_episode(**{name: r[name][i] if r[name].ndim > 1 else r[name][i].item() for name in EPISODE}))
+    return views, tasks
+
+
+def between(before: dict, after: dict, action: np.ndarray) -> dict[str, np.ndarray]:
+    """Return the robot after a step, with what follows from the step; action: (12, worlds)."""
+    return after | {
+        "acc": (after["vel"] - before["vel"]) / DT,
+        "rate_change": (after["rate"] - before["rate"]) / DT,
+        "action": action,
+        "old_action": before["action"],
+    }
 
 
 def phi(x, s):
@@ -43,48 +91,130 @@ def height_kernel(error, p):
     return phi(error, p[0]) + 3.0 * np.exp(-np.abs(error) / p[1]) + phi(error, p[2])
 
 
+def norm(vectors):
+    """Lengths of the rows."""
+    return np.linalg.norm(vectors, axis=1)
+
+
+def soon(r):
+    """The first 0.3 s after touchdown."""
+    return (r["phase"] == LANDED) & (r["phase_steps"] * DT < 0.3 - 1e-9)
+
+
+def at_ease(r):
+    """Standing without a command, or 0.5 s and more after touchdown."""
+    unasked = (r["phase"] == STANCE) & (r["steps"] < r["command_step"])
+    return unasked | ((r["phase"] == LANDED) & (r["phase_steps"] * DT >= 0.5 - 1e-9))
+
+
+def due(r, share):
+    """Weight of what pays without jumping."""
+    return np.where((r["phase"] == STANCE) & (r["steps"] >= r["command_step"]), share, 1.0)
+
+
+def posture(r, width, shift=0.0):
+    """phi of the rms offset of all motors from default, the transversal ones shifted."""
+    off = r["angle"] - DEFAULT_ANGLE[:, None] - shift * T[:, None]
+    return phi(np.sqrt(np.mean(off**2, axis=0)), width)
+
+
+def lean(r):
+    """Sine of the angle between body z and world z."""
+    return norm(Rotation.from_quat(r["quat"]).apply([0.0, 0.0, 1.0])[:, :2])
+
+
+def rotation_error(r):
+    """Angle [rad] between the body and the level frame with the heading."""
+    level = Rotation.from_euler("z", r["heading"][:, None])
+    return (level.inv() * Rotation.from_quat(r["quat"])).magnitude()
+
+
+def yaw_error(r):
+    """Yaw [rad] beyond the heading, within -pi to pi."""
+    return np.angle(np.exp(1j * (Rotation.from_quat(r["quat"]).as_euler("ZYX")[:, 0] - r["heading"])))
+
+
+def error(r):
+    """Distance [m] from the goal in the plane."""
+    return norm(r["goal"][:, :2] - r["pos"][:, :2])
+
+
+def estimated_error(r, height):
+    """Distance from the goal [m] at which a point mass falls through a height [m]; where it is, if it is below."""
+    found = []
+    for pos, vel, goal in zip(r["pos"], r["vel"], r["goal"], strict=True):
+        times = np.roots([-0.5 * G, vel[2], pos[2] - height])
+        time = max(times.real.max(), 0.0) if np.isreal(times).all() else max(vel[2] / G, 0.0)
+        found.append(np.linalg.norm(pos[:2] + time * vel[:2] - goal[:2]))
+    return np.array(found)
+
+
+def deceleration(r):
+    """Acceleration against the direction of motion [m/s^2], 0 where it speeds up."""
+    speed = norm(r["vel"])
+    return np.where(speed > 1e-6, np.maximum(-np.sum(r["acc"] * r["vel"], axis=1) / np.maximum(speed, 1e-9), 0.0), 0.0)
+
+
+def symmetry(r, p):
+    """Vertical jump: variance of the transversal, size of the lateral angles."""
+    return phi(np.var(r["angle"][T], axis=0), p[0]) * phi(np.linalg.norm(r["angle"][~T], axis=0), p[1])
+
+
+def left_right(r):
+    """Rms difference [rad] of left and right transversal angles."""
+    legs = r["angle"].reshape(4, 3, -1)
+    return np.sqrt(np.mean((legs[[0, 2], 1:] - legs[[1, 3], 1:]) ** 2, axis=(0, 1)))
+
+
+def rising_to(r):
+    """Ballistic apex [m]."""
+    return r["pos"][:, 2] + np.maximum(r["vel"][:, 2], 0.0) ** 2 / (2.0 * G)
+
+
+TERMS = {
+    "jump_height": lambda r, p: r["at_apex"] * height_kernel(r["max_height"] - r["goal"][:, 2], p),
+    "estimated_jump_height": lambda r, p: (
+        ((r["phase"] == FLIGHT) & (r["apex_passed"] == 0)) * height_kernel(rising_to(r) - r["goal"][:, 2], p)
+    ),
+    "horizontal_velocity": lambda r, p: (
+        np.exp(-norm(r["vel"][:, :2]) / p[0]) * np.where(r["phase"] == STANCE, 1.0, 2.0) * due(r, p[1])
+    ),
+    "orientation": lambda r, p: phi(lean(r), p[0]) * due(r, p[1]),
+    "angular_velocity": lambda r, p: phi(norm(r["spin"]), p[0]) * due(r, p[1]),
+    "joint_symmetry": lambda r, p: symmetry(r, p) * due(r, p[2]),
+    "ground_posture": lambda r, p: (r["phase"] != FLIGHT) * posture(r, p[0], p[1]) * due(r, p[2]),
+    "air_posture": lambda r, p: (r["phase"] == FLIGHT) * posture(r, p[0]),
+    "retract": lambda r, p: soon(r) * posture(r, p[0], p[1]),
+    "tracking": lambda r, p: (r["phase"] != STANCE) * (phi(error(r), p[0]) + p[2] * phi(error(r), p[1])),
+    "estimated_tracking": lambda r, p: (
+        (r["phase"] == FLIGHT)
+        * sum(share * phi(estimated_error(r, p[3]), width) for share, width in zip((1.0, 0.1, 0.3), p, strict=False))
+    ),
+    "flight_orientation": lambda r, p: (
+        ((r["phase"] == FLIGHT) & (np.sum((r["goal"] - r["pos"])[:, :2] * r["vel"][:, :2], axis=1) > 0.0))
+        * phi(rotation_error(r), p[0])
+    ),
+    "flight_angular_velocity": lambda r, p: (r["phase"] == FLIGHT) * phi(norm(r["spin"]), p[0]),
+    "left_right_symmetry": lambda r, p: phi(left_right(r), p[0]) * due(r, p[1]),
+    "standing_posture": lambda r, p: at_ease(r) * posture(r, p[0], p[1]),
+    "rest": lambda r, p: at_ease(r) * phi(norm(r["vel"]), p[0]) * phi(norm(r["spin"]), p[1]),
+    "landing_tilt": lambda r, p: (r["phase"] == LANDED) * (lean(r) / np.sin(p[0])) ** 2,
+    "soft_impact": lambda r, p: soon(r) * np.maximum(1.0 - deceleration(r) / p[0], 0.0),
+    "stance_impact": lambda r, p: -1.0 * (r["phase"] == STANCE) * np.minimum(deceleration(r) / p[0], 1.0),
+    "catch_landing": lambda r, p: soon(r) * np.clip(-r["vel"][:, 2], 0.0, 1.0),
+    "damp_landing": lambda r, p: soon(r) * np.clip(r["rate"][T], 0.0, 1.0).mean(axis=0),
+    "ground_force": lambda r, p: np.sum(r["force"] ** 2, axis=0) / p[0] ** 2,
+    "action_clip": lambda r, p: r["clipped"],
+    "motor_torque_sq": lambda r, p: np.sum(r["torque"] ** 2, axis=0),
+    "joint_acceleration": lambda r, p: np.sum(r["rate_change"] ** 2, axis=0),
+    "action_rate": lambda r, p: np.sum((r["action"] - r["old_action"]) ** 2, axis=0),
+}
+"""(robot, parameters) -> value of every world, before weight and step."""
+
+
 def expected_terms(task, before: dict, after: dict, action: np.ndarray) -> np.ndarray:
     """Return the weighted terms of the step between two states, (terms, worlds); action: (12, worlds)."""
-    p = {term.name: term.params for term in task.terms}
-    stance, flight, landed = (after["phase"] == phase for phase in (STANCE, FLIGHT, LANDED))
-    soon = landed & (after["phase_steps"] < 18)
-    waiting = stance & (after["steps"] >= after["command_step"])
-    vel, speed = after["vel"], np.linalg.norm(after["vel"], axis=1)
-    along = np.sum((vel - before["vel"]) / DT * vel, axis=1) / np.maximum(speed, 1e-9)
-    deceleration = np.where(speed > 1e-6, np.maximum(-along, 0.0), 0.0)
-    apex = after["z"] + np.maximum(vel[:, 2], 0.0) ** 2 / 19.62
-
-    def posture(name, shift=0.0):
-        off = after["angle"] - DEFAULT_ANGLE[:, None] - shift * T[:, None]
-        return phi(np.sqrt(np.mean(off**2, axis=0)), p[name][0])
-
-    def due(name):
-        return np.where(waiting, p[name][-1], 1.0)
-
-    transversal, lateral = after["angle"][T], after["angle"][~T]
-    symmetric = phi(np.var(transversal, axis=0), p["joint_symmetry"][0])
-    symmetric = symmetric * phi(np.linalg.norm(lateral, axis=0), p["joint_symmetry"][1])
-    rising = flight & (after["apex_passed"] == 0)
-    values = {
-        "jump_height": after["at_apex"] * height_kernel(after["max_height"] - after["goal"], p["jump_height"]),
-        "estimated_jump_height": rising * height_kernel(apex - after["goal"], p["estimated_jump_height"]),
-        "horizontal_velocity": np.exp(-np.linalg.norm(vel[:, :2], axis=1) / p["horizontal_velocity"][0])
-        * np.where(stance, 1.0, 2.0)
-        * due("horizontal_velocity"),
-        "orientation": phi(after["lean"], p["orientation"][0]) * due("orientation"),
-        "angular_velocity": phi(after["spin"], p["angular_velocity"][0]) * due("angular_velocity"),
-        "joint_symmetry": symmetric * due("joint_symmetry"),
-        "ground_posture": ~flight * posture("ground_posture", p["ground_posture"][1]) * due("ground_posture"),
-        "air_posture": flight * posture("air_posture"),
-        "retract": soon * posture("retract", p["retract"][1]),
-        "soft_impact": soon * np.maximum(1.0 - deceleration / p["soft_impact"][0], 0.0),
-        "stance_impact": -1.0 * stance * np.minimum(deceleration / p["stance_impact"][0], 1.0),
-        "catch_landing": soon * np.clip(-vel[:, 2], 0.0, 1.0),
-        "damp_landing": soon * np.clip(after["rate"][T], 0.0, 1.0).mean(axis=0),
-        "ground_force": np.sum(after["force"] ** 2, axis=0) / p["ground_force"][0] ** 2,
-        "action_clip": after["clipped"],
-        "motor_torque_sq": np.sum(after["torque"] ** 2, axis=0),
-        "joint_acceleration": np.sum(((after["rate"] - before["rate"]) / DT) ** 2, axis=0),
-        "action_rate": np.sum((action - before["action"]) ** 2, axis=0),
-    }
-    return np.array([values[term.name] * term.weight * (1.0 if term.once else DT) for term in task.terms])
+    robot = between(before, after, action)
+    return np.array(
+        [TERMS[term.name](robot, term.params) * term.weight * (1.0 if term.once else DT) for term in task.terms]
+    )

@@ -5,13 +5,14 @@ import sys
 
 import numpy as np
 import pytest
+from landing_helpers import still_policy
 from rerun.chunk import RrdReader
 
 from jumper_warp import cli
 from jumper_warp.checkpoint import CheckpointError
-from jumper_warp.evaluate import EvaluateCfg
-from jumper_warp.play import PlayCfg, ankles, viewer_command
-from jumper_warp.policy import PolicyError, load_policy
+from jumper_warp.evaluate import EvaluateCfg, HeightFlags, PlaceFlags
+from jumper_warp.play import HeightGoals, PlaceGoals, PlayCfg, viewer_command
+from jumper_warp.policy import PolicyError, load_policy, save_policy
 from jumper_warp.saved_run import open_policy, restored_task
 from jumper_warp.task_flags import TaskFlags
 from jumper_warp.tasks import make_task
@@ -41,6 +42,14 @@ def trained_run(tmp_path_factory):
     (folder,) = (root / "vertical-jump").iterdir()
     cli.main(["export", str(folder)])
     return folder
+
+
+@pytest.fixture(scope="module")
+def still(tmp_path_factory):
+    """Folder of a policy for jumps to places that holds the default pose."""
+    folder = tmp_path_factory.mktemp("policies") / "still"
+    save_policy(folder, still_policy("horizontal-jump"))
+    return str(folder)
 
 
 def test_help_imports_nothing_heavy():
@@ -108,7 +117,7 @@ def test_interrupt_exits_with_130(capsys, monkeypatch):
 
 def test_every_setting_of_a_task_has_a_flag():
     flags = {spec.name for spec in dataclasses.fields(TaskFlags)}
-    code = {"name", "observe", "columns", "error"}
+    code = {"name", "observe", "columns", "error", "ppo"}  # those of PPO are --ppo flags
     tables = {"terms", "rules"}
     assert {spec.name for spec in dataclasses.fields(TaskCfg)} - code - tables == flags - {
         "weights", "term_params", "rule_params",
@@ -137,10 +146,15 @@ def test_flags_change_training_and_task():
     ("make", "message"),
     [
         (lambda: EvaluateCfg("p", jumps=0), "jumps must be at least 1"),
-        (lambda: EvaluateCfg("p", lower=1.0, upper=0.5), "heights must be"),
-        (lambda: EvaluateCfg("p", in_range=(0.0, 1.0)), "heights must be"),
-        (lambda: PlayCfg("p", height=()), "height takes 1 to 64"),
-        (lambda: PlayCfg("p", height=(-1.0,)), "height takes 1 to 64"),
+        (lambda: HeightFlags(lower=1.0, upper=0.5), "heights must be"),
+        (lambda: HeightFlags(lower=0.0), "heights must be"),
+        (lambda: PlaceFlags(x=(1.0, 0.5)), "x must be in"),
+        (lambda: PlaceFlags(heading=float("inf")), "heading must be finite or any"),
+        (lambda: EvaluateCfg("p", in_range=(1.0, 0.5)), "in_range must be in"),
+        (lambda: HeightGoals(height=()), "height takes 1 to 64"),
+        (lambda: HeightGoals(height=(-1.0,)), "height takes 1 to 64"),
+        (lambda: PlaceGoals(goal=((float("nan"), 0.0),)), "goal takes up to 64"),
+        (lambda: PlaceGoals(then=((0.5, 0.0),) * 65), "then takes up to 64"),
         (lambda: PlayCfg("p", seconds=0.0), "seconds must be in"),
     ],
 )
@@ -188,6 +202,47 @@ def test_play_records_every_step_of_every_robot(trained_run, tmp_path, capsys):
     assert 0.2 < found["base of 0 [m]"][0][0] < 0.5
 
 
+def test_evaluation_of_jumps_to_places(still, tmp_path, capsys):
+    args = ["--jumps", "3", "--x", "0.4", "0.8", "--heading", "90", "--device", "cpu", "--out", str(tmp_path)]
+    code, out, _ = run(capsys, "evaluate", still, *args)
+    figures = json.loads((tmp_path / "figures.json").read_text())
+    assert code == 0 and "success_rate_in_range" in out
+    assert (figures["jumps"], figures["task"], figures["failed_by_no_jump"]) == (3, "horizontal-jump", 3)
+    assert figures["mean_error_m"] == pytest.approx(0.6, abs=0.02)
+    rows = [row.split(",") for row in (tmp_path / "jumps.csv").read_text().splitlines()]
+    assert [row[0] for row in rows] == ["goal_x_m", "0.400000", "0.600000", "0.800000"]
+    assert [float(row[2]) for row in rows[1:]] == pytest.approx([90.0] * 3, abs=1e-4)
+
+
+def test_play_of_jumps_to_places_records_the_distance_and_marks_the_goals(still, tmp_path, capsys):
+    goals = ["--goal", "0.8", "0.2", "--goal", "0.5", "0", "--then", "0.75", "-0.2", "--seconds", "0.25"]
+    code, out, _ = run(capsys, "play", still, *goals, "--device", "cpu", "--out", str(tmp_path))
+    assert code == 0 and out.count("not_begun") == 2
+    found, entities = {}, set()
+    for chunk in RrdReader(tmp_path / "jump.rrd").stream().to_chunks():
+        entities.add(str(chunk.entity_path))
+        batch = chunk.to_record_batch()
+        if "Scalars:scalars" in batch.schema.names:
+            name = str(chunk.entity_path).split("/")[-1].replace("\\", "")
+            found[name] = np.ravel(batch.column("Scalars:scalars").to_pylist())
+    assert found["goal of 0 [m]"] == pytest.approx([np.hypot(0.8, 0.2)] * 15, abs=0.02)
+    assert found["goal of 1 [m]"] == pytest.approx([0.5] * 15, abs=0.02)
+    assert {"/scene/goal_0_0", "/scene/goal_1_0"} <= entities
+
+
+@pytest.mark.parametrize(
+    ("args", "message"),
+    [
+        (["evaluate", "--upper", "1.0"], "--upper is not for policies of horizontal-jump"),
+        (["play", "--height", "0.9"], "--height is not for policies of horizontal-jump"),
+        (["evaluate", "--x", "0.8", "0.4"], "x must be in"),
+    ],
+)
+def test_flags_of_another_task_and_no_ranges_are_one_line(still, capsys, args, message):
+    code, _, err = run(capsys, args[0], still, *args[1:], "--device", "cpu")
+    assert code == 2 and message in err[-1]
+
+
 def test_truncated_checkpoint_is_one_line(trained_run, tmp_path, capsys):
     folder = tmp_path / "checkpoints"
     folder.mkdir()
@@ -206,24 +261,13 @@ def test_run_keeps_no_figures(trained_run, capsys):
 
 
 def test_policy_of_another_observation_is_not_played(trained_run, tmp_path):
-    from jumper_warp.evaluate import Conditions, env_of_policy
+    from jumper_warp.saved_run import Conditions, env_of_policy
 
     policy = open_policy(trained_run)
     names = ("other", *policy.interface.observation_names[1:])
     policy.interface = dataclasses.replace(policy.interface, observation_names=names)
     with pytest.raises(PolicyError, match="observation is not the one"):
         env_of_policy(policy, 1, Conditions(device="cpu"))
-
-
-def test_ankles_hang_from_the_knees():
-    poses = np.zeros((1, 21, 7))
-    poses[..., 6] = 1.0
-    poses[0, 5, 2] = 1.0
-    poses[0, 10] = [0.0, 0.0, 1.0, 0.0, np.sqrt(0.5), 0.0, np.sqrt(0.5)]  # 90° about y: z points to x
-    points = ankles(poses)
-    assert points.shape == (1, 4, 3)
-    assert points[0, 0] == pytest.approx([0.0, 0.0, 0.7])
-    assert points[0, 1] == pytest.approx([-0.3, 0.0, 1.0])
 
 
 def test_viewer_listens_on_loopback_only(tmp_path):

@@ -136,8 +136,9 @@ def test_counters_are_means_of_the_episodes_that_ended(env):
 
 def finish(env, worlds, success: bool) -> None:
     """End the episodes of some worlds by success or failure."""
-    episode = {"phase": LANDED, "phase_steps": 59} if success else {"phase": STANCE, "steps": 999, "command_step": 0}
-    edit_episodes(env, worlds, **episode)
+    wanted = env.task_arrays()["goal"][worlds, 2]
+    landed = {"phase": LANDED, "phase_steps": 59, "max_height": wanted}
+    edit_episodes(env, worlds, **(landed if success else {"phase": STANCE, "steps": 999, "command_step": 0}))
     env.step(REST)
     assert env.done[worlds].all()
 
@@ -280,21 +281,6 @@ def test_replayed_launches_equal_eager_ones():
         eager.action.copy_(action)
         eager._launch_step()
         assert torch.equal(eager.obs, trace[4 * i]) and torch.equal(eager.reward, trace[4 * i + 2])
-
-
-def test_it_goes_on_from_a_saved_state():
-    saved, fresh = make_env(N, seed=1), make_env(N, seed=2)
-    edit_episodes(saved, level=np.arange(N) % 4, streak=np.arange(N) % 5)
-    run(saved, random_actions(N, 5))
-    fresh.load_state_dict(saved.state_dict())
-    for env in (saved, fresh):
-        env.reset()
-    assert (fresh.task_arrays()["level"] == saved.task_arrays()["level"]).all()
-    assert (fresh.task_arrays()["streak"] == saved.task_arrays()["streak"]).all()
-    actions = random_actions(N, 10)
-    assert all(torch.equal(a, b) for a, b in zip(run(saved, actions), run(fresh, actions), strict=True))
-    with pytest.raises(ValueError, match="32 environments, there are 4"):
-        make_env(4).load_state_dict(saved.state_dict())
 
 
 def test_mujoco_takes_the_same_steps():

@@ -7,7 +7,7 @@ import torch
 
 from experiments import ablations, benchmark_training, new_reward, vertical_jump_sweep
 from jumper_warp.env import plain
-from jumper_warp.evaluate import Jumps, run_jumps
+from jumper_warp.jumps import Jumps, run_jumps
 from jumper_warp.ppo import PpoCfg
 from jumper_warp.tasks import make_task
 from jumper_warp.tasks.ablations import (
@@ -93,11 +93,6 @@ def test_a_world_that_came_apart_is_no_success_and_no_error():
     assert figures["largest_reached_m"] == pytest.approx(0.65)
 
 
-def test_filmstrip_shows_squat_apex_and_catch():
-    height = np.array([0.35, 0.35, 0.30, 0.20, 0.40, 0.70, 0.90, 0.70, 0.40, 0.25, 0.30, 0.35])
-    assert vertical_jump_sweep.moments(height, command=1) == [1, 3, 5, 6, 7, 9, 11]
-
-
 class Script:
     """Squats for a second and then stretches, beginning at a policy step."""
 
@@ -120,7 +115,7 @@ def sweep_env():
 @pytest.mark.parametrize(("begin", "early"), [(31, False), (-45, True)])
 def test_scripted_jump_reaches_the_open_loop_height_and_lands(sweep_env, begin, early):
     targets = np.array([0.5, 0.7, 1.05])
-    observer = vertical_jump_sweep.Observer(Script(begin), sweep_env, targets, count=0)
+    observer = vertical_jump_sweep.Observer(Script(begin), sweep_env)
     figures = vertical_jump_sweep.figures(run_jumps(observer.act, sweep_env, targets), observer.early)
     assert figures["largest_reached_m"] == pytest.approx(vertical_jump_sweep.OPEN_LOOP_LIMIT, abs=0.02)
     assert figures["landing_rate"] == 1.0
@@ -161,7 +156,7 @@ def test_each_ablation_changes_its_own_part_only():
     }  # fmt: skip
     weights = {term.name: term.weight for term in without_estimate(task).terms}
     assert weights["estimated_jump_height"] == 0.0
-    assert weights["jump_height"] == 20.0
+    assert weights["jump_height"] == {term.name: term.weight for term in task.terms}["jump_height"] > 0.0
     reset = without_reference_states(task).reset
     assert (reset.standing, reset.default, reset.in_flight, reset.touchdown) == (0.8, 0.2, 0.0, 0.0)
     assert without_curriculum(task).levels == (task.levels[-1],)

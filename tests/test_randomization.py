@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import torch
 import warp as wp
-from jump_helpers import DEG, edit_episodes, make_env, only
+from jump_helpers import DEG, edit_coordinates, edit_episodes, make_env, only
 from newton.solvers import SolverMuJoCo
 
 from jumper_warp.randomization import RandomizationCfg
@@ -148,7 +148,13 @@ def test_static_friction_is_not_below_dynamic(drawn):
 
 def test_latency_is_in_whole_physics_steps_within_the_range(drawn):
     # 16 ms are 7.68 steps of 1/480 s
-    assert set(np.unique(drawn["latency"])) <= set(range(9)) and drawn["latency"].max() >= 7
+    assert set(np.unique(drawn["latency"])) == set(range(8))
+
+
+@pytest.mark.parametrize("steps", [1, 8, 13])  # the last is 12.999999999999998 in floating point
+def test_a_latency_of_whole_physics_steps_is_kept(steps):
+    env = randomized(dataclasses.replace(OFF, latency=(1000.0 * steps / 480.0,) * 2), 2)
+    assert env.delay.numpy().tolist() == [steps] * 2
 
 
 def test_a_link_gains_mass_and_inertia_alike(drawn, nominal):
@@ -261,6 +267,20 @@ def test_a_sensor_offset_acts_on_the_motor_and_on_the_observation():
     np.testing.assert_allclose(wrong.sim.joint_q(), honest.sim.joint_q(), atol=1e-4)
     seen = (wrong.obs - honest.obs)[0, 12:24].numpy()
     np.testing.assert_allclose(seen, offset[:, 0], atol=1e-4)
+
+
+def test_the_command_filter_reads_the_position_sensor():
+    """With both thighs at 97 degrees the sum is 1 degree before its hard zone; a sensor 2 too high sees it inside."""
+    env = randomized(OFF, 2)
+    offset = np.zeros((12, 2), dtype=np.float32)
+    offset[4, 1] = 2.0 * DEG  # outer motor of leg 1
+    env.joint_offset.assign(offset)
+    for world in range(2):
+        edit_coordinates(env, world, q={13: 97.0 * DEG, 15: 97.0 * DEG})
+    env.auto_reset = False
+    env.step(torch.ones((2, 12)))  # 135 degrees each, 30 more than the sum may be
+    safe = env._views.safe_target.numpy()[4:6] / DEG
+    np.testing.assert_allclose(safe, [[135.0, 120.0], [135.0, 120.0]], atol=1e-3)
 
 
 def test_drawn_sensor_offsets_are_the_same_for_motor_and_observation(drawn):

@@ -11,7 +11,7 @@ from rsl_rl.runners import OnPolicyRunner
 from tensordict import TensorDict
 from toy_task import SMALL, PushTask, train_rank
 
-from jumper_warp.checkpoint import MANIFEST, CheckpointError, load_checkpoint
+from jumper_warp.checkpoint import MANIFEST, CheckpointError, load_checkpoint, save_checkpoint
 from jumper_warp.ppo import PpoCfg
 from jumper_warp.train import CHECKPOINTS, CONFIG, TrainCfg, train
 from jumper_warp.training_log import FIGURES
@@ -94,11 +94,23 @@ def test_a_named_checkpoint_that_is_damaged_is_refused(cfg):
         train(dataclasses.replace(cfg, resume=str(path)), make_env)
 
 
-def test_a_checkpoint_of_other_networks_is_refused_in_one_line(cfg):
+@pytest.mark.parametrize("change", [{"hidden": (16, 16)}, {"asymmetric": False}])
+def test_a_checkpoint_of_other_networks_is_refused_in_one_line(cfg, change):
     result = train(cfg, make_env)
-    other = dataclasses.replace(cfg, resume=str(result.folder), ppo=dataclasses.replace(SMALL, hidden=(16, 16)))
+    other = dataclasses.replace(cfg, resume=str(result.folder), ppo=dataclasses.replace(SMALL, **change))
     with pytest.raises(CheckpointError, match="does not fit these settings") as caught:
         train(other, make_env)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_checkpoint_without_the_critics_statistics_is_refused_in_one_line(cfg):
+    result = train(cfg, make_env)
+    old = final_state(result)
+    for name in ("mean", "var", "count"):
+        del old["ppo"]["model"][f"critic_moments.{name}"]
+    save_checkpoint(result.folder / CHECKPOINTS, old)
+    with pytest.raises(CheckpointError, match=r"does not fit these settings: .*critic_moments") as caught:
+        train(dataclasses.replace(cfg, resume=str(result.folder)), make_env)
     assert "\n" not in str(caught.value)
 
 
@@ -203,13 +215,29 @@ def test_rsl_rl_gets_copies():
     env.reset()
     adapter = RslRlVecEnv(env, metrics_every=2)
     first = adapter.get_observations()
-    kept = first["policy"].clone()
     obs, reward, done, extras = adapter.step(torch.ones(3, 1))
-    shown = [value.clone() for value in (obs["policy"], reward, done, extras["time_outs"])]
+    found = (first["policy"], first["critic"], obs["policy"], obs["critic"], reward, done, extras["time_outs"])
+    shown = [value.clone() for value in found]
     adapter.step(torch.ones(3, 1))
-    assert torch.equal(first["policy"], kept)
-    for value, copy in zip((obs["policy"], reward, done, extras["time_outs"]), shown, strict=True):
+    for value, copy in zip(found, shown, strict=True):
         assert torch.equal(value, copy)
+
+
+@pytest.mark.parametrize(("asymmetric", "column"), [(True, 2), (False, 0)])
+def test_rsl_rl_gives_the_critic_its_own_observation(asymmetric, column):
+    env = PushTask(4, episode_length=50)
+    env.reset()
+    adapter = RslRlVecEnv(env, metrics_every=4)
+    config = rsl_rl_config(dataclasses.replace(SMALL, asymmetric=asymmetric), 1, 0)
+    algorithm = OnPolicyRunner(adapter, config, log_dir=None, device="cpu").alg
+    obs = adapter.get_observations()
+    assert torch.equal(obs["critic"], env.critic_obs)
+    assert (algorithm.actor.obs_dim, algorithm.critic.obs_dim) == (2, 3 if asymmetric else 2)
+    with torch.inference_mode():
+        before = algorithm.actor(obs), algorithm.critic(obs)
+        obs["critic" if asymmetric else "policy"][:, column] += 1.0
+        assert torch.equal(algorithm.actor(obs), before[0]) == asymmetric
+        assert not torch.equal(algorithm.critic(obs), before[1])
 
 
 def test_rsl_rl_counts_steps_and_gets_metrics_once_per_iteration():

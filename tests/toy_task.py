@@ -12,14 +12,19 @@ SMALL = PpoCfg(num_steps=16, hidden=(32, 32), minibatches=4)
 
 
 class PushTask:
-    """Position and velocity of each mass are the observation, its acceleration the action."""
+    """Position and velocity of each mass are the observation, its acceleration the action.
 
-    num_obs, num_actions = 2, 1
+    The critic sees the distance from the origin too.
+    """
+
+    num_obs, num_critic_obs, num_actions = 2, 3, 1
+    STATE = ("steps", "obs", "critic_obs", "age")
 
     def __init__(self, num_envs: int, seed: int = 0, device: torch.device | str = "cpu", episode_length: int = 50):
         self.num_envs, self.seed, self.device = num_envs, seed, torch.device(device)
         self.episode_length = episode_length
         self.obs, self.final_obs = (torch.zeros(num_envs, 2, device=self.device) for _ in range(2))
+        self.critic_obs, self.final_critic_obs = (torch.zeros(num_envs, 3, device=self.device) for _ in range(2))
         self.reward, self.done, self.timeout, self.age = (torch.zeros(num_envs, device=self.device) for _ in range(4))
         self.steps = torch.zeros((), device=self.device)
         start = torch.linspace(-1.0, 1.0, num_envs, device=self.device)
@@ -28,6 +33,10 @@ class PushTask:
     def reset(self) -> None:
         self.obs.copy_(self.start)
         self.age.zero_()
+        self.show_critic(self.critic_obs, self.obs)
+
+    def show_critic(self, critic_obs: torch.Tensor, obs: torch.Tensor) -> None:
+        critic_obs.copy_(torch.cat([obs, obs[:, :1].abs()], dim=1))
 
     def step(self, action: torch.Tensor) -> None:
         velocity = self.obs[:, 1] + 0.2 * action[:, 0].clamp(-1.0, 1.0)
@@ -36,12 +45,14 @@ class PushTask:
         self.reward.copy_(torch.exp(-position.square() - 0.1 * velocity.square()))
         self.age += 1.0
         self.steps += 1.0
+        self.show_critic(self.final_critic_obs, self.final_obs)
         lost = (position.abs() > 5.0).float()
         self.timeout.copy_((self.age >= self.episode_length).float() * (1.0 - lost))
         self.done.copy_(lost + self.timeout)
         ended = self.done[:, None]
         self.obs.copy_(self.final_obs * (1.0 - ended) + self.start * ended)
         self.age *= 1.0 - self.done
+        self.show_critic(self.critic_obs, self.obs)
 
     def metrics(self) -> dict[str, float]:
         return {"Metrics/success": float(self.obs[:, 0].abs().lt(0.1).float().mean())}
@@ -50,10 +61,11 @@ class PushTask:
         return {"episode_length": self.episode_length}
 
     def state_dict(self) -> dict[str, torch.Tensor]:
-        return {"steps": self.steps}
+        return {name: getattr(self, name) for name in self.STATE}
 
     def load_state_dict(self, state: dict[str, torch.Tensor]) -> None:
-        self.steps.copy_(state["steps"])
+        for name in self.STATE:
+            getattr(self, name).copy_(state[name])
 
 
 def fill(ppo: Ppo, worlds: slice, num_worlds: int) -> None:
@@ -65,7 +77,8 @@ def fill(ppo: Ppo, worlds: slice, num_worlds: int) -> None:
 
     steps = ppo.cfg.num_steps
     rollout.obs.copy_(3.0 + 2.0 * draw(steps + 1, 2))
-    rollout.final_obs.copy_(3.0 + 2.0 * draw(steps, 2))
+    rollout.critic_obs.copy_(0.5 * draw(steps + 1, 3) - 1.0)
+    rollout.final_critic_obs.copy_(0.5 * draw(steps, 3) - 1.0)
     rollout.reward.copy_(draw(steps))
     rollout.done.copy_((draw(steps) > 1.0).float())
     rollout.timeout.copy_(rollout.done * (draw(steps) > 0.0).float())

@@ -2,13 +2,16 @@
 
 from collections.abc import Callable
 
+from jumper_warp.tasks.horizontal_jump import horizontal_jump, omnidirectional_jump
 from jumper_warp.tasks.task import TaskCfg
 from jumper_warp.tasks.vertical_jump import vertical_jump
 
 TASKS: dict[str, Callable[[], TaskCfg]] = {
     "vertical-jump": vertical_jump,
+    "horizontal-jump": horizontal_jump,
+    "omnidirectional-jump": omnidirectional_jump,
 }
-ALIASES = {"Olympus-Vertical-Jump": "vertical-jump"}
+ALIASES = {"Olympus-Vertical-Jump": "vertical-jump", "Olympus-Horizontal-Jump": "horizontal-jump"}
 
 
 def make_task(name: str) -> TaskCfg:

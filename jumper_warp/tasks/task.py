@@ -9,10 +9,11 @@ from typing import Any
 import warp as wp
 
 from jumper_warp.motors import FilterCfg, MotorCfg
+from jumper_warp.ppo import PpoCfg
 from jumper_warp.randomization import RandomizationCfg
 from kernels import terminations
 from kernels.observe import SensorNoise
-from kernels.reset import ResetRanges
+from kernels.reset_draws import ResetRanges
 
 Pair = tuple[float, float]
 
@@ -80,7 +81,7 @@ class ResetCfg:
     tilt: float = 5.0
     """[deg] Roll, pitch and yaw."""
     forward_pitch: float = 0.0
-    """[deg] Of standing states."""
+    """[deg] Largest mean pitch of standing states."""
     heading: float = 0.0
     """[deg] Half width of the heading."""
     front_x: Pair = (0.20, 0.22)
@@ -93,6 +94,14 @@ class ResetCfg:
     """[m]"""
     takeoff_height: Pair = (0.40, 0.45)
     """[m]"""
+    takeoff_ahead: Pair = (0.0, 0.0)
+    """[m] Base ahead of its start, towards the goal."""
+    takeoff_angle: Pair = (50.0, 75.0)
+    """[deg] Above the horizon, where the goal names no apex."""
+    highest_apex: float = 1.0
+    """[m] Of jumps with a drawn takeoff angle."""
+    landing_height: float = 0.42
+    """[m] Of the base, where the projectile ends."""
     flight_time: Pair = (0.01, 0.95)
     """[1] Share of the time in the air."""
     flight_lateral: float = 10.0
@@ -101,14 +110,22 @@ class ResetCfg:
     """[deg]"""
     touchdown_time: Pair = (0.03, 0.15)
     """[s] Before landing."""
+    touchdown_behind: Pair = (0.0, 0.0)
+    """[m] Base behind the projectile before touchdown, so that the paws are ahead of it."""
     paw_depth: Pair = (0.30, 0.45)
     """[m] Paws below the base before touchdown."""
     landed_height: Pair = (0.30, 0.42)
     """[m]"""
+    landed_ahead: Pair = (0.0, 0.0)
+    """[m] Base ahead of the goal just after landing."""
     landed_speed: Pair = (0.0, 1.0)
     """[m/s] Downward."""
+    jump_again: float = 0.0
+    """[1] Share of episodes past the first level in which a landed robot gets another goal."""
     command_delay: float = 0.5
     """[s] Longest time until the jump is commanded."""
+    again_delay: Pair = (0.2, 0.7)
+    """[s] From touchdown to the other goal."""
 
     def ranges(self, step_dt: float) -> Any:
         """Return the kernels' `ResetRanges`. Raises ValueError for shares that do not add up."""
@@ -117,8 +134,8 @@ class ResetCfg:
             raise ValueError(f"reset shares must be >= 0 and add up to at most 1, got {shares}")
         ranges = ResetRanges()
         ranges.shares = wp.vec4(*(sum(shares[: i + 1]) for i in range(4)))
-        degrees = ("tilt", "forward_pitch", "heading", "flight_lateral", "flight_transversal")
-        for spec in fields(self)[4:-1]:
+        degrees = ("tilt", "forward_pitch", "heading", "takeoff_angle", "flight_lateral", "flight_transversal")
+        for spec in fields(self)[4:-2]:
             value = getattr(self, spec.name)
             scale = math.pi / 180.0 if spec.name in degrees else 1.0
             if isinstance(value, tuple):
@@ -126,6 +143,7 @@ class ResetCfg:
             else:
                 setattr(ranges, spec.name, scale * value)
         ranges.command_delay = round(self.command_delay / step_dt)
+        ranges.again_delay = wp.vec2(*(delay / step_dt for delay in self.again_delay))
         return ranges
 
 
@@ -134,7 +152,7 @@ class Level:
     """One level of the curriculum."""
 
     goal_lower: tuple[float, float, float]
-    """Smallest goal; its meaning is the task's."""
+    """Smallest goal relative to start and heading [m]: landing x, y, and base height at the apex (0: any)."""
     goal_upper: tuple[float, float, float]
     """Largest goal."""
     base_height: Pair
@@ -155,8 +173,8 @@ class NoiseCfg:
     """[deg]"""
     rate: float = 10.0
     """[deg/s]"""
-    height: float = 0.005
-    """[m]"""
+    position: float = 0.005
+    """[m] Of the base's height and of the way to the goal."""
 
     def sensor_noise(self, enabled: bool = True) -> Any:
         """Return the kernels' `SensorNoise`; all zero unless enabled."""
@@ -188,10 +206,14 @@ class TaskCfg:
     reset: ResetCfg = field(default_factory=ResetCfg)
     noise: NoiseCfg = field(default_factory=NoiseCfg)
     randomization: RandomizationCfg = field(default_factory=RandomizationCfg)
+    ppo: PpoCfg = field(default_factory=PpoCfg)
+    """What `jumper train` starts from."""
     takeoff_speed: float = 0.75
     """[m/s] Upward speed without contact that begins a flight."""
     contact_force: float = 0.1
     """[N] Above it a paw counts as in contact."""
+    near: float = 0.10
+    """[m] Error up to which a landed jump is a success."""
     games: int = 5
     """Successes in a row that raise the level."""
 

@@ -20,15 +20,17 @@ PATIENCE = 0.1
 """Share that the always-paid terms keep while a commanded jump has not begun."""
 
 TERMS = (
-    Term(rewards.jump_height, 20.0, (0.10, 0.05, 0.4), once=True),
+    Term(rewards.jump_height, 40.0, (0.10, 0.05, 0.4), once=True),
     Term(rewards.estimated_jump_height, 20.0, (0.10, 0.05, 0.4)),
     Term(rewards.horizontal_velocity, 10.0, (0.04, PATIENCE)),
-    Term(rewards.orientation, 5.0, (0.1, PATIENCE)),
+    Term(rewards.orientation, 15.0, (0.1, PATIENCE)),
     Term(rewards.angular_velocity, 2.0, (2.0, PATIENCE)),
     Term(rewards.joint_symmetry, 35.0, (0.05, 0.35, PATIENCE)),
     Term(rewards.ground_posture, 30.0, (10.0 * DEG, 35.0 * DEG, PATIENCE)),
     Term(rewards.air_posture, 80.0, (15.0 * DEG,)),
     Term(rewards.retract, 10.0, (15.0 * DEG, 15.0 * DEG)),
+    Term(rewards.rest, 20.0, (0.1, 0.5)),
+    Term(rewards.landing_tilt, -120.0, (10.0 * DEG,)),
     Term(rewards.soft_impact, 5.0, (5.0 * G,)),
     Term(rewards.stance_impact, 100.0, (2.5 * G,)),
     Term(rewards.catch_landing, 3.0),
@@ -71,7 +73,7 @@ def vertical_jump() -> TaskCfg:
         error=jump_errors.height_error,
         terms=TERMS,
         rules=RULES,
-        levels=(level(0.5, 0.7, 0.35), level(0.45, 0.95, 0.45), level(0.45, 1.12, 0.45)),
+        levels=(level(0.5, 0.7, 0.35), level(0.45, 0.95, 0.45), level(0.45, 1.15, 0.45)),
         motors=jumping_motors(18.0, lateral_torque=10.0),
         command_filter=vertical_jump_filter(),
         action_scale=(15.0, 90.0),

@@ -1,4 +1,5 @@
 import dataclasses
+import math
 
 import newton
 import numpy as np
@@ -221,7 +222,11 @@ def test_a_state_that_cannot_be_reached_becomes_the_default_pose():
 def test_heading_and_forward_pitch():
     env = make_env(N, reset=only("standing", heading=180.0, forward_pitch=10.0))
     angles = euler(env.sim.joint_q()[:, 3:7].astype(float))
-    assert within(angles[:, 1], 5.0 * DEG, 15.0 * DEG)
+    # a mean from 0 to 10 degrees, and 5 degrees to either side of it
+    assert within(angles[:, 1], -5.0 * DEG, 15.0 * DEG, 0.05)
+    spread = math.sqrt(2.0 * 10.0**2 / 12.0) * DEG
+    assert angles[:, 1].mean() == pytest.approx(5.0 * DEG, abs=4.0 * spread / math.sqrt(N))
+    assert angles[:, 1].std() == pytest.approx(spread, rel=4.0 / math.sqrt(2.0 * N))
     assert angles[:, 2].min() < -3.1 and angles[:, 2].max() > 3.1
     position, _ = paws_and_velocities(env, np.arange(30))
     # paws stand around the origin, turned with the heading

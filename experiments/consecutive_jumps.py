@@ -1,0 +1,139 @@
+"""The paper's test of jumps in a row, and a longer one: the next jump is commanded a second after touchdown.
+
+    python experiments/consecutive_jumps.py --policy horizontal_jump --out outputs/consecutive
+
+The paper's pairs are (0.8, 0.2) m then (0.75, -0.2) m, and 0.8 m then 0.8 m straight ahead. Ten in a row go to goals
+drawn within 0.4 to 0.9 m ahead and 0.2 m to either side. A goal is relative to where the robot stands and looks when
+the jump is commanded. Robots differ in heading and in how long they wait for the first command.
+
+The error of a jump is the distance of the base from its goal when the next one is commanded; after a fall or a
+collision no further jump counts. A row is kept up if none of its jumps ended so, wherever they landed.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import matplotlib
+import numpy as np
+import tyro
+
+from jumper_warp.jumps import REST_TIME
+from jumper_warp.landings import Landings, landing_figures, random_headings
+from jumper_warp.trial import Trial, TrialArgs
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt
+
+PAIRS = {"diagonal": ((0.8, 0.2), (0.75, -0.2)), "straight": ((0.8, 0.0), (0.8, 0.0))}
+"""[m]"""
+ROW_LOWER, ROW_UPPER = (0.4, -0.2), (0.9, 0.2)
+"""[m] Goals of the jumps in a long row."""
+DELAY = (0.3, 1.0)
+"""[s] Until the first command."""
+PAPER = {"mean_error_m": 0.0054}
+"""The paper's figure for the pairs, on the robot."""
+
+
+@dataclass(frozen=True)
+class Args(TrialArgs):
+    """Flags."""
+
+    jumps: int = 20
+    """Number of times that each pair is jumped."""
+    trials: int = 100
+    """Number of long rows."""
+    row: int = 10
+    """Number of jumps in one."""
+    rest: float = REST_TIME
+    """[s] From touchdown to the next command."""
+
+    def __post_init__(self) -> None:
+        """Check the values."""
+        super().__post_init__()
+        if min(self.jumps, self.trials, self.row) < 1:
+            raise ValueError(f"need at least one jump, trial and row, got {self.jumps}, {self.trials}, {self.row}")
+        if not 0.1 <= self.rest <= 10.0:
+            raise ValueError(f"rest must be in [0.1, 10] s, got {self.rest}")
+
+
+class Track:
+    """Keeps where every base was."""
+
+    def __init__(self) -> None:
+        self.places: list[np.ndarray] = []
+
+    def __call__(self, landings: Landings) -> None:
+        """Add the moment; places of rows that have ended are not numbers."""
+        running = landings.current < landings.goals.shape[1]
+        self.places.append(np.where(running[:, None], landings.seen["base_pos"][:, :2], np.nan))
+
+    def in_start_frame(self, headings: np.ndarray) -> np.ndarray:
+        """Return the places [m], (worlds, steps, 2), ahead and to the left of start and heading (worlds,) [rad]."""
+        x, y = np.moveaxis(np.stack(self.places, axis=1), -1, 0)
+        cos, sin = np.cos(headings)[:, None], np.sin(headings)[:, None]
+        return np.stack([cos * x + sin * y, cos * y - sin * x], axis=-1)
+
+
+def figures(pairs: Landings, row: Landings) -> dict:
+    """Return the figures of both tests; the first half of the pairs are the diagonal ones."""
+    values = landing_figures(pairs)
+    half = len(pairs.goals) // 2
+    for name, part in zip(PAIRS, (slice(None, half), slice(half, None)), strict=True):
+        values[f"mean_error_{name}_m"] = _mean(pairs.error[part])
+    values |= {f"mean_error_jump_{i + 1}_m": _mean(pairs.error[:, i]) for i in range(2)}
+    values["both_landed_rate"] = float(pairs.landed.all(axis=1).mean())
+    ten = landing_figures(row)
+    return values | {
+        "row": row.goals.shape[1],
+        "trials": len(row.goals),
+        "ten_in_a_row_rate": float(row.landed.all(axis=1).mean()),
+        "mean_jumps_until_the_end": float(row.landed.sum(axis=1).mean()),
+        "mean_error_ten_m": ten["mean_error_m"],
+        "success_rate_ten": ten["success_rate"],
+        "at_rest_rate_ten": ten["at_rest_within_1_s_rate"],
+        "mean_error_by_number_m": [_mean(row.error[:, i]) for i in range(row.goals.shape[1])],
+    }
+
+
+def _mean(values: np.ndarray) -> float | None:
+    return None if np.isnan(values).all() else float(np.nanmean(values))
+
+
+def plot(paths: dict[str, np.ndarray], path: Path, title: str) -> None:
+    """Draw the ways of the bases from above, starts at the origin and headings to the right; a panel a test."""
+    fig, axes = plt.subplots(1, len(paths), figsize=(5.0 * len(paths), 4.5), constrained_layout=True)
+    for axis, (name, places) in zip(axes, paths.items(), strict=True):
+        for way in places:
+            axis.plot(way[:, 0], way[:, 1], linewidth=0.8, alpha=0.5, color="tab:blue")
+        if name in PAIRS:
+            goals = np.cumsum(PAIRS[name], axis=0)
+            axis.scatter(goals[:, 0], goals[:, 1], s=50, color="tab:red", marker="x", zorder=3, label="goal, no error")
+            axis.legend(loc="upper left")
+        axis.set(xlabel="ahead [m]", ylabel="to the left [m]", title=f"{name}, {title}", aspect="equal")
+        axis.margins(0.1, 0.3)
+    fig.savefig(path, dpi=110)
+    plt.close(fig)
+
+
+def main(args: Args) -> dict:
+    """Run both tests and return the figures."""
+    trial = Trial("consecutive_jumps", args)
+    rng = np.random.default_rng(args.seed)
+    pairs = np.repeat(np.array(list(PAIRS.values())), args.jumps, axis=0)
+    rows = rng.uniform(ROW_LOWER, ROW_UPPER, (args.trials, args.row, 2))
+    done, paths = [], []
+    for name, goals in (("pairs", pairs), ("row", rows)):
+        headings, track = random_headings(len(goals), args.seed), Track()
+        delay = rng.uniform(*DELAY, len(goals))
+        env = trial.env(len(goals))
+        done.append(trial.jump(env, goals, film=name, watch=track, headings=headings, delay=delay, rest=args.rest))
+        paths.append(track.in_start_frame(headings))
+    names = (*PAIRS, f"{args.row} in a row")
+    plot(dict(zip(names, (*np.split(paths[0], 2), paths[1]), strict=True)), trial.folder / "paths.png", trial.title)
+    return trial.report({"rest_s": args.rest, **figures(*done)}, PAPER)
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Args))

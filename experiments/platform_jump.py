@@ -1,0 +1,119 @@
+"""The paper's tests of the ground: off a platform of 0.15 m, onto uneven ground, and onto a block that moves.
+
+    python experiments/platform_jump.py --policy horizontal_jump --out outputs/platform
+
+The policy knows nothing of the ground but the base's height above the spot below it. Uneven ground has
+bumps of up to 0.05 m around a level start, and every robot jumps in a direction of its own. The block, 10 kg and 0.05 m
+high, reaches from before the goal to beyond it and slides when the robot lands on it; the goal stays. Errors and
+success are those of `horizontal_jump_sweep.py`. SolverMuJoCo has no sliding block: with it that scene is left out.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+import numpy as np
+import tyro
+
+from jumper_warp.grounds import BlockCfg, platform, uneven
+from jumper_warp.landings import Landings, landing_figures
+from jumper_warp.trial import Trial, TrialArgs
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt
+
+DROP = 0.15
+"""[m] Height of the platform."""
+EDGE = 0.45
+"""[m] From the start to its edge, clear of the paws at takeoff."""
+AMPLITUDE = 0.05
+"""[m] Of the uneven ground."""
+FLAT_RADIUS = 0.35
+"""[m] Level ground around the start."""
+BLOCK_HEIGHT, BLOCK_MASS, BLOCK_FRICTION = 0.05, 10.0, 0.4
+"""[m], [kg], [1] with the floor."""
+BLOCK_NEAR, BLOCK_BEYOND, BLOCK_WIDTH = 0.42, 0.45, 0.9
+"""[m] From the start to the block's near side, clear of the paws at takeoff and behind them at touchdown; from the goal
+to its far side; along y."""
+AHEAD, ASIDE = (1.0, 1.25), (-0.15, 0.15)
+"""[m] Goals: off the platform, or on the block, with all paws; no farther than the paper's longest jump."""
+SCENES = ("platform", "uneven", "block")
+
+
+@dataclass(frozen=True)
+class Args(TrialArgs):
+    """Flags."""
+
+    jumps: int = 100
+    """Number of jumps in each scene."""
+    scenes: tuple[str, ...] = SCENES
+    """Which of platform, uneven, block."""
+
+    def __post_init__(self) -> None:
+        """Check the values."""
+        super().__post_init__()
+        if self.jumps < 1:
+            raise ValueError(f"need at least one jump, got {self.jumps}")
+        if not self.scenes or set(self.scenes) - set(SCENES):
+            raise ValueError(f"scenes are {', '.join(SCENES)}, got {self.scenes}")
+
+
+def scene(name: str, goals: np.ndarray, rng: np.random.Generator) -> tuple[dict[str, Any], np.ndarray]:
+    """Return what is special about a scene's environment, and the headings; goals [m], (num_envs, 2)."""
+    straight = np.zeros(len(goals))
+    if name == "platform":
+        return {"ground": platform(-DROP, edge=EDGE)}, straight
+    if name == "uneven":
+        ground = uneven(AMPLITUDE, int(rng.integers(2**31)), flat_radius=FLAT_RADIUS)
+        return {"ground": ground}, rng.uniform(-math.pi, math.pi, len(goals))
+    far = goals[:, 0] + BLOCK_BEYOND
+    center = np.stack([0.5 * (BLOCK_NEAR + far), goals[:, 1]], axis=1)
+    half = np.stack([0.5 * (far - BLOCK_NEAR), np.full(len(goals), 0.5 * BLOCK_WIDTH)], axis=1)
+    return {"block": BlockCfg(center, half, BLOCK_HEIGHT, BLOCK_MASS, BLOCK_FRICTION)}, straight
+
+
+def plot(done: dict[str, Landings], path: Path, title: str) -> None:
+    """Draw goals and landings, seen from above with the start at the origin; a panel a scene."""
+    fig, axes = plt.subplots(1, len(done), figsize=(5.0 * len(done), 4.0), constrained_layout=True, squeeze=False)
+    for axis, (name, landings) in zip(axes[0], done.items(), strict=True):
+        good = landings.success[:, 0]
+        goals, landing = landings.goals[:, 0], landings.landing[:, 0]
+        axis.plot(*np.stack([goals, landing]).transpose(2, 0, 1), color="0.7", linewidth=0.8)
+        axis.scatter(goals[:, 0], goals[:, 1], s=20, color="0.4", marker="x", linewidth=0.8, label="goal")
+        axis.scatter(landing[good, 0], landing[good, 1], s=12, color="tab:blue", label="landed there")
+        axis.scatter(landing[~good, 0], landing[~good, 1], s=12, color="tab:red", label="failed")
+        axis.set(xlabel="ahead [m]", ylabel="to the left [m]", title=f"{name}, {title}", aspect="equal")
+    axes[0, 0].legend(loc="upper left")
+    fig.savefig(path, dpi=110)
+    plt.close(fig)
+
+
+def main(args: Args) -> dict:
+    """Run the scenes and return the figures, each scene's under its name, and the mean of all."""
+    trial = Trial("platform_jump", args)
+    rng = np.random.default_rng(args.seed)
+    goals = rng.uniform((AHEAD[0], ASIDE[0]), (AHEAD[1], ASIDE[1]), (args.jumps, 2))
+    done: dict[str, Landings] = {}
+    values: dict[str, Any] = {}
+    for name in args.scenes:
+        if name == "block" and args.solver == "mujoco":
+            continue
+        special, headings = scene(name, goals, rng)
+        env = trial.env(args.jumps, **special)
+        done[name] = trial.jump(env, goals[:, None], film=name, drawn=special, headings=headings)
+        values |= {f"{name}_{figure}": value for figure, value in landing_figures(done[name]).items()}
+        if name == "block":
+            moved = np.linalg.norm(env.sim.solver.block_position() - special["block"].center, axis=1)
+            values |= {"block_mean_slide_m": float(moved.mean()), "block_max_slide_m": float(moved.max())}
+    plot(done, trial.folder / "landings.png", trial.title)
+    summary = {name: float(np.mean([values[f"{scene}_{name}"] for scene in done])) for name in
+               ("mean_error_m", "success_rate", "success_rate_in_range")}  # fmt: skip
+    return trial.report({"jumps": args.jumps * len(done), **summary, **values}, {})
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Args))

@@ -1,0 +1,136 @@
+"""Grounds to jump from and to land on: platforms, uneven ground, and a block that slides.
+
+Heightfields are for `build_model(ground=...)` and `Simulation(ground=...)`: square, centred on the origin, z = 0 around
+it, where the robot starts. Beyond their rim the ground goes on at the height of the rim.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import newton
+import numpy as np
+
+SIZE = 4.0
+"""[m] Edge of the square, by default: a jump of 2 m from its middle ends on it."""
+CELL = 0.02
+"""[m] Distance between nodes, by default: less than a paw's radius of 0.025 m."""
+
+
+@dataclass(frozen=True)
+class BlockCfg:
+    """A block in every world, which slides on the floor without turning. Each value may be an array, a row per world.
+
+    Its walls are upright and its top is level. The floor's friction acts under the block's own weight and the paws'
+    load. It leans on nothing: where it meets steps of a heightfield it passes through them.
+    """
+
+    center: tuple[float, float] | np.ndarray
+    """[m] x and y at the start, world."""
+    half: tuple[float, float] | np.ndarray = (0.4, 0.4)
+    """[m] Half extents along x and y."""
+    height: float | np.ndarray = 0.1
+    """[m] Of the top above z = 0."""
+    mass: float | np.ndarray = 10.0
+    """[kg]"""
+    friction: float | np.ndarray = 0.4
+    """[1] Coefficient of friction between block and floor."""
+
+    def __post_init__(self) -> None:
+        for name in ("half", "height", "mass"):
+            if not np.all(np.asarray(getattr(self, name)) > 0.0):
+                raise ValueError(f"block {name} must be positive, got {getattr(self, name)}")
+        if not np.all(np.asarray(self.friction) >= 0.0):
+            raise ValueError(f"block friction must not be negative, got {self.friction}")
+        if not np.all(np.isfinite(self.center)):
+            raise ValueError(f"block center must be finite, got {self.center}")
+
+    def per_world(self, num_worlds: int) -> dict[str, np.ndarray]:
+        """Return the values by name, `center` and `half` (num_worlds, 2), the others (num_worlds,).
+
+        Raises ValueError for arrays of another number of worlds.
+        """
+        shapes = {name: (num_worlds, 2) if name in ("center", "half") else (num_worlds,) for name in vars(self)}
+        try:
+            return {name: np.broadcast_to(getattr(self, name), shape) for name, shape in shapes.items()}
+        except ValueError as error:
+            raise ValueError(f"block values must be one, or one for each of {num_worlds} worlds: {error}") from None
+
+
+def platform(height: float, *, edge: float = 0.5, size: float = SIZE, cell: float = CELL) -> newton.Heightfield:
+    """Return level ground with a step across x: z = 0 up to `edge`, beyond it `height`.
+
+    Args:
+        height: Of the ground beyond the edge [m]; negative for a drop, so that the robot starts on a platform.
+        edge: Where the step begins [m] along x, moved back to the nearest node; the wall takes one cell.
+        size: Edge of the square [m].
+        cell: Distance between nodes [m], at most; it is made to divide `size`.
+
+    Raises:
+        ValueError: `height` is zero or not finite, an edge not between 0 and the rim, or as `uneven` for size and cell.
+    """
+    x = _nodes(size, cell)
+    if not (np.isfinite(height) and height != 0.0):
+        raise ValueError(f"platform height must be finite and not zero, got {height}")
+    if not 0.0 < edge < 0.5 * size:
+        raise ValueError(f"platform edge must lie between 0 and {0.5 * size:g} m, got {edge}")
+    row = np.where(x <= edge + 1.0e-9, 0.0, height)
+    return _heightfield(np.tile(row, (len(x), 1)), size)
+
+
+def uneven(
+    amplitude: float = 0.05,
+    seed: int = 0,
+    *,
+    flat_radius: float = 0.6,
+    length: float = 0.2,
+    size: float = SIZE,
+    cell: float = CELL,
+) -> newton.Heightfield:
+    """Return smooth random bumps, level within `flat_radius` of the origin.
+
+    Args:
+        amplitude: Largest height or depth [m].
+        seed: Of the bumps; the same seed gives the same ground.
+        flat_radius: Radius [m] of the level ground at the start; the bumps grow to full height over the next
+            two `length`s.
+        length: Correlation length [m], where the correlation of two heights has fallen to 1/e. With the defaults slopes
+            reach 20 to 25 degrees.
+        size: Edge of the square [m].
+        cell: Distance between nodes [m], at most; it is made to divide `size`.
+
+    Raises:
+        ValueError: a length that is not positive, a cell above half of `size`, or no room beyond `flat_radius`.
+    """
+    x = _nodes(size, cell)
+    if not (amplitude > 0.0 and length > 0.0):
+        raise ValueError(f"uneven ground needs amplitude > 0 and length > 0, got {amplitude} and {length}")
+    if not 0.0 <= flat_radius < 0.5 * size:
+        raise ValueError(f"flat_radius must lie between 0 and {0.5 * size:g} m, got {flat_radius}")
+    bumps = _gaussian_field(np.random.default_rng(seed), len(x), x[1] - x[0], length)
+    radius = np.hypot(x[:, None], x[None, :])
+    share = np.clip((radius - flat_radius) / (2.0 * length), 0.0, 1.0)
+    bumps *= share * share * (3.0 - 2.0 * share)
+    return _heightfield(bumps * amplitude / np.abs(bumps).max(), size)
+
+
+def _nodes(size: float, cell: float) -> np.ndarray:
+    """Return the coordinates [m] of the nodes along an axis."""
+    if not (size > 0.0 and 0.0 < cell <= 0.5 * size):
+        raise ValueError(f"a ground needs size > 0 and 0 < cell <= size / 2, got {size} and {cell}")
+    return np.linspace(-0.5 * size, 0.5 * size, int(np.ceil(size / cell - 1.0e-9)) + 1)
+
+
+def _gaussian_field(rng: np.random.Generator, nodes: int, cell: float, length: float) -> np.ndarray:
+    """Return a random field of zero mean and correlation exp(-(distance / length)^2), (nodes, nodes)."""
+    padded = nodes + int(np.ceil(4.0 * length / cell))  # the transform is periodic: the rims must not know each other
+    wave = 2.0 * np.pi * np.fft.fftfreq(padded, cell)
+    spectrum = np.exp(-0.125 * length**2 * (wave[:, None] ** 2 + wave[None, :] ** 2))
+    return np.fft.ifft2(np.fft.fft2(rng.normal(size=(padded, padded))) * spectrum).real[:nodes, :nodes]
+
+
+def _heightfield(heights: np.ndarray, size: float) -> newton.Heightfield:
+    """Return heights [m], rows along y, as a heightfield."""
+    rows, cols = heights.shape
+    half = 0.5 * size
+    return newton.Heightfield(data=heights.astype(np.float32), nrow=rows, ncol=cols, hx=half, hy=half)
