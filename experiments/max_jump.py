@@ -53,12 +53,14 @@ class Args(TrialArgs):
 
     jumps: int = 100
     """Number of jumps in each bin."""
+    first: float = FIRST
+    """[m] Middle of the first bin."""
 
     def __post_init__(self) -> None:
         """Check the values."""
         super().__post_init__()
-        if self.jumps < 1:
-            raise ValueError(f"need at least one jump, got {self.jumps}")
+        if self.jumps < 1 or not 0.1 <= self.first <= LAST:
+            raise ValueError(f"need a jump and first in 0.1..{LAST:g} m, got {self.jumps}, {self.first}")
 
 
 def figures(bins: dict[float, Landings]) -> dict[str, Any]:
@@ -106,7 +108,7 @@ def plot(values: dict[str, Any], path: Path, title: str) -> None:
         top.plot(values["bin_m"], [100.0 * rate for rate in values[name]], marker="o", label=label)
     top.axhline(100.0 * RELIABLE, color="0.5", linestyle="--", linewidth=1.0)
     for work, distance in PUBLISHED.items():
-        if distance >= FIRST:
+        if distance >= values["bin_m"][0]:
             top.axvline(distance, color="tab:green", linewidth=1.0, label=f"{work}, {distance:g} m")
     top.set(ylabel="success [%]", ylim=(0.0, 103.0), title=title)
     top.legend(loc="lower left")
@@ -142,8 +144,8 @@ def main(args: Args) -> dict:
     env = trial.env(args.jumps)
     headings = random_headings(args.jumps, args.seed)
     bins: dict[float, Landings] = {}
-    for number in range(round((LAST - FIRST) / BIN) + 1):
-        middle = round(FIRST + number * BIN, 6)
+    for number in range(round((LAST - args.first) / BIN) + 1):
+        middle = round(args.first + number * BIN, 6)
         goals = np.zeros((args.jumps, 1, 2))
         goals[:, 0, 0] = middle + BIN * (np.linspace(0.0, 1.0, args.jumps) - 0.5 if args.jumps > 1 else 0.0)
         bins[middle] = trial.jump(env, goals, film=f"jump_{middle:.1f}_m", headings=headings)

@@ -27,6 +27,8 @@ from kernels.observe import NUM_EPISODE_COLUMNS, Observations, make_observe_kern
 from kernels.reset import clear_world_kernel, reset_kernel
 from kernels.task import JumpTask, ViewArrays
 
+CONTACT_TOLERANCE = 1.0e-4
+"""[m/s] Of the contact iteration: a fifth fewer sweeps than the solver's default."""
 COUNTING_SCHEMES = 2
 """Standing and default starts count for the curriculum and the success rate."""
 
@@ -63,6 +65,7 @@ class JumpEnv:
         self.task, self.num_envs, self.seed = task, num_envs, seed
         self.sim = Simulation(
             num_envs, solver=solver, motors=task.motors, visuals=visuals, device=device, ground=ground, block=block,
+            tolerance=CONTACT_TOLERANCE,
             friction=0.85 if task.randomization.dynamic_friction else 0.9,
         )  # fmt: skip
         self.wp_device = self.sim.device

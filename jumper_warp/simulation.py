@@ -13,7 +13,7 @@ from jumper_warp.description import load_description
 from jumper_warp.grounds import BlockCfg
 from jumper_warp.motors import FilterCfg, MotorCfg, filter_params, jumping_motors, motor_arrays
 from jumper_warp.robot import KNEE_DOFS, PHYSICS_DT, build_model, mujoco_solver
-from jumper_warp.solver import SolverJumper
+from jumper_warp.solver import TOLERANCE, SolverJumper
 from kernels.actuator import motor_torque_kernel
 from kernels.command_filter import command_filter_kernel
 from kernels.parameters import COORDS, DOFS
@@ -48,6 +48,7 @@ class Simulation:
         friction: float = 0.9,
         dt: float = PHYSICS_DT,
         substeps: int = SUBSTEPS,
+        tolerance: float = TOLERANCE,
         observe_forces: bool = True,
         visuals: bool = True,
         device: wp.DeviceLike = None,
@@ -64,6 +65,7 @@ class Simulation:
             friction: Of the paws [1].
             dt: Physics step [s].
             substeps: Physics steps in a policy step.
+            tolerance: Of SolverJumper's contact iteration [m/s].
             observe_forces: Whether to measure paw forces on MuJoCo, which costs time; SolverJumper always has them.
             visuals: Whether to add shapes that only viewers see.
             device: Warp device.
@@ -90,7 +92,7 @@ class Simulation:
         self._safe_target = wp.clone(self.target)
         self._graphs: dict[str, object] = {}
         if solver == "jumper":
-            self.solver = SolverJumper(self.model, block=block)
+            self.solver = SolverJumper(self.model, block=block, tolerance=tolerance)
             self.torque, self.paw_force, self.peak_force = (
                 self.solver.torque, self.solver.contact_force, self.solver.peak_force,
             )  # fmt: skip
