@@ -89,12 +89,6 @@ def left_stance(view: RobotView, task: JumpTask, p: wp.vec4) -> bool:
 
 
 @wp.func
-def second_hop(view: RobotView, task: JumpTask, p: wp.vec4) -> bool:
-    """All paws off the ground again, more than p0 policy steps after touchdown."""
-    return task.phase == LANDED and task.phase_steps > int(p[0]) and view.contacts == 0
-
-
-@wp.func
 def slanted_takeoff(view: RobotView, task: JumpTask, p: wp.vec4) -> bool:
     """Horizontal speed above p0 [m/s] at takeoff."""
     return task.took_off == 1 and wp.length(wp.vec2(view.lin_vel[0], view.lin_vel[1])) > p[0]

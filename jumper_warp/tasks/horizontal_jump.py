@@ -50,7 +50,6 @@ RULES = (
     Rule(terminations.missed_goal, (0.50,)),
     Rule(terminations.turned_touchdown, (30.0 * DEG, 10.0 * DEG)),
     Rule(terminations.low_touchdown, (0.25,)),
-    Rule(terminations.second_hop, (0.1 * SECOND,)),
     Rule(terminations.low_base, (0.10,)),
     Rule(terminations.left_stance, (0.30,)),
     Rule(terminations.hard_impact, (2.5 * G, 5.0 * G)),

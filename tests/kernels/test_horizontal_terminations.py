@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 from jumper_warp.tasks import make_task
 from kernels import terminations
 
-holds = Table(terminations, "missed_goal predicted_miss turned_touchdown left_stance second_hop", bool)
+holds = Table(terminations, "missed_goal predicted_miss turned_touchdown left_stance", bool)
 HEADINGS = [0.0, 100.0, 175.0, 180.0, -175.0]
 
 RULES = {
@@ -105,19 +105,3 @@ def test_left_stance_is_measured_in_the_plane_while_standing():
         assert holds("left_stance", view, make_episode(**fields), 0.3) is left
         for phase in (FLIGHT, LANDED):
             assert not holds("left_stance", view, make_episode(phase=phase, **fields), 0.3)
-
-
-@pytest.mark.parametrize(
-    ("phase", "steps", "contacts", "hopped"),
-    [
-        (LANDED, 7, 0, True),
-        (LANDED, 6, 0, False),
-        (LANDED, 7, 1, False),
-        (FLIGHT, 30, 0, False),
-        (STANCE, 30, 0, False),
-    ],
-)
-def test_a_second_hop_is_no_paw_on_the_ground_after_the_bounce(phase, steps, contacts, hopped):
-    assert (
-        holds("second_hop", make_view(contacts=contacts), make_episode(phase=phase, phase_steps=steps), 6.0) is hopped
-    )
