@@ -1,4 +1,5 @@
-# make demo   the open-loop jump, then 200 jumps of the shipped policy, with figures and recordings, in outputs/demo
+# make demo   the open-loop jump, then 200 vertical and 200 horizontal jumps of the shipped policies: figures, plots and
+#             recordings in outputs/demo
 # make test   all tests
 # make lint   style and format
 # Each makes .venv/ first if it is missing or older than pyproject.toml or constraints.txt.
@@ -13,6 +14,7 @@ STAMP := $(VENV)/.installed
 demo: $(STAMP)
 	$(VENV)/bin/python experiments/open_loop_jump.py --out outputs/demo/open_loop
 	$(VENV)/bin/python experiments/vertical_jump_sweep.py --out outputs/demo/vertical_jump
+	$(VENV)/bin/python experiments/horizontal_jump_sweep.py --out outputs/demo/horizontal_jump
 
 test: $(STAMP)
 	$(VENV)/bin/python -m pytest

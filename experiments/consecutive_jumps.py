@@ -7,7 +7,9 @@ drawn within 0.4 to 0.9 m ahead and 0.2 m to either side. A goal is relative to 
 the jump is commanded. Robots differ in heading and in how long they wait for the first command.
 
 The error of a jump is the distance of the base from its goal when the next one is commanded; after a fall or a
-collision no further jump counts. A row is kept up if none of its jumps ended so, wherever they landed.
+collision no further jump counts. `ten_in_a_row_rate` is the share of rows in which none of the jumps ended so, wherever
+they landed; `row_all_on_goal_rate` that of rows in which every jump succeeded as in `horizontal_jump_sweep.py`. At its
+end, `rest_s` after touchdown, a landed base should be at rest. The range of `success_rate_in_range` is all goals.
 """
 
 from __future__ import annotations
@@ -19,7 +21,8 @@ import matplotlib
 import numpy as np
 import tyro
 
-from jumper_warp.jumps import REST_TIME
+from jumper_warp.cli import run_command
+from jumper_warp.jumps import REST_TIME, mean
 from jumper_warp.landings import Landings, landing_figures, random_headings
 from jumper_warp.trial import Trial, TrialArgs
 
@@ -32,6 +35,8 @@ ROW_LOWER, ROW_UPPER = (0.4, -0.2), (0.9, 0.2)
 """[m] Goals of the jumps in a long row."""
 DELAY = (0.3, 1.0)
 """[s] Until the first command."""
+AT_END = "below_0_1_m_s_at_the_end_rate"
+"""Name of the share of landed jumps whose base was at rest (`REST_SPEED`) when the next jump was due."""
 PAPER = {"mean_error_m": 0.0054}
 """The paper's figure for the pairs, on the robot."""
 
@@ -78,27 +83,26 @@ class Track:
 
 def figures(pairs: Landings, row: Landings) -> dict:
     """Return the figures of both tests; the first half of the pairs are the diagonal ones."""
-    values = landing_figures(pairs)
+    values, ten = (landing_figures(landings) for landings in (pairs, row))
+    values[AT_END], ten[AT_END] = (part.pop("at_rest_within_1_s_rate") for part in (values, ten))
+    values["success_rate_in_range"] = values["success_rate"]
     half = len(pairs.goals) // 2
     for name, part in zip(PAIRS, (slice(None, half), slice(half, None)), strict=True):
-        values[f"mean_error_{name}_m"] = _mean(pairs.error[part])
-    values |= {f"mean_error_jump_{i + 1}_m": _mean(pairs.error[:, i]) for i in range(2)}
+        values[f"mean_error_{name}_m"] = mean(pairs.error[part])
+    values |= {f"mean_error_jump_{i + 1}_m": mean(pairs.error[:, i]) for i in range(2)}
     values["both_landed_rate"] = float(pairs.landed.all(axis=1).mean())
-    ten = landing_figures(row)
     return values | {
         "row": row.goals.shape[1],
         "trials": len(row.goals),
         "ten_in_a_row_rate": float(row.landed.all(axis=1).mean()),
+        "row_all_on_goal_rate": float(row.success.all(axis=1).mean()),
         "mean_jumps_until_the_end": float(row.landed.sum(axis=1).mean()),
         "mean_error_ten_m": ten["mean_error_m"],
         "success_rate_ten": ten["success_rate"],
-        "at_rest_rate_ten": ten["at_rest_within_1_s_rate"],
-        "mean_error_by_number_m": [_mean(row.error[:, i]) for i in range(row.goals.shape[1])],
+        "step_rate_ten": ten["step_rate"],
+        f"{AT_END}_ten": ten[AT_END],
+        "mean_error_by_number_m": [mean(row.error[:, i]) for i in range(row.goals.shape[1])],
     }
-
-
-def _mean(values: np.ndarray) -> float | None:
-    return None if np.isnan(values).all() else float(np.nanmean(values))
 
 
 def plot(paths: dict[str, np.ndarray], path: Path, title: str) -> None:
@@ -136,4 +140,4 @@ def main(args: Args) -> dict:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Args))
+    run_command(lambda: main(tyro.cli(Args)))

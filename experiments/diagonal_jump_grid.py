@@ -15,6 +15,7 @@ import matplotlib
 import numpy as np
 import tyro
 
+from jumper_warp.cli import run_command
 from jumper_warp.landings import NEAR, Landings, landing_figures, random_headings
 from jumper_warp.trial import Trial, TrialArgs
 
@@ -82,4 +83,4 @@ def main(args: Args) -> dict:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Args))
+    run_command(lambda: main(tyro.cli(Args)))

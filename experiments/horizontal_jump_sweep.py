@@ -5,8 +5,9 @@
 Every robot stands in the default pose, with a heading of its own drawn from the full circle, and is told to jump after
 half a second. The error is the distance of the base from its goal in the plane a second after touchdown, or where the
 jump failed before. A jump succeeds if it was begun on command, ends within 0.1 m of its goal, and nothing but the paws
-touched anything. `--randomize` adds the randomisation, noise and latency of the training; `--solver mujoco` is a check
-against physics that the policy was not trained on.
+touched anything; a landing may go on with steps or a second hop, which are told apart. `--randomize` adds the
+randomisation, noise and latency of the training; `--solver mujoco` is a check against physics that the policy was not
+trained on.
 """
 
 from __future__ import annotations
@@ -18,8 +19,9 @@ import matplotlib
 import numpy as np
 import tyro
 
+from jumper_warp.cli import run_command
 from jumper_warp.jumps import within
-from jumper_warp.landings import NEAR, Landings, landing_figures, random_headings
+from jumper_warp.landings import NEAR, Landings, landing_figures, random_headings, trained_range
 from jumper_warp.trial import Trial, TrialArgs
 
 matplotlib.use("Agg")
@@ -59,18 +61,22 @@ def figures(landings: Landings) -> dict:
     return values
 
 
-def plot(landings: Landings, path: Path, title: str) -> None:
-    """Draw reached over commanded distance."""
+def plot(landings: Landings, trained: tuple[float, float], path: Path, title: str) -> None:
+    """Draw reached over commanded distance; trained [m]: distances of the policy's training."""
     line = np.array([LOWER, UPPER])
     target, reached = landings.goals[:, 0, 0], landings.landing[:, 0, 0]
     good = landings.success[:, 0]
     fig, axis = plt.subplots(figsize=(6, 5.5), constrained_layout=True)
     axis.fill_between(line, line - NEAR, line + NEAR, color="tab:green", alpha=0.12, label=f"within {NEAR:g} m")
     axis.plot(line, line, color="tab:green", linewidth=1.0, label="commanded")
-    axis.axvspan(*TRAINED, color="0.5", alpha=0.08, label="the paper's training")
+    axis.axvspan(*TRAINED, color="0.5", alpha=0.08, label="training of the paper")
+    axis.axvspan(
+        *trained, color="tab:orange", alpha=0.06, label=f"training of this policy, {trained[0]:g}-{trained[1]:g} m"
+    )
     axis.scatter(target[good], reached[good], s=9, color="tab:blue", label="landed there")
     axis.scatter(target[~good], reached[~good], s=14, color="tab:red", marker="x", label="failed")
     axis.set(xlabel="commanded distance [m]", ylabel="distance of the base at the end [m]", title=title)
+    axis.set_xlim(LOWER - 0.05, UPPER + 0.05)
     axis.legend(loc="upper left")
     fig.savefig(path, dpi=110)
     plt.close(fig)
@@ -82,10 +88,13 @@ def main(args: Args) -> dict:
     goals = np.zeros((args.jumps, 1, 2))
     goals[:, 0, 0] = np.linspace(LOWER, UPPER, args.jumps)
     headings = random_headings(args.jumps, args.seed)
-    landings = trial.jump(trial.env(args.jumps), goals, film="jumps", headings=headings)
-    plot(landings, trial.folder / "sweep.png", f"{args.jumps} jumps, {trial.title}")
-    return trial.report(figures(landings), PAPER)
+    env = trial.env(args.jumps)
+    landings = trial.jump(env, goals, film="jumps", headings=headings)
+    trained = trained_range(env.task)
+    limits = (trained["trained_lower_m"], trained["trained_upper_m"])
+    plot(landings, limits, trial.folder / "sweep.png", f"{args.jumps} jumps, {trial.title}")
+    return trial.report(figures(landings) | trained, PAPER)
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Args))
+    run_command(lambda: main(tyro.cli(Args)))

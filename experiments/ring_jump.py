@@ -15,6 +15,7 @@ import matplotlib
 import numpy as np
 import tyro
 
+from jumper_warp.cli import run_command
 from jumper_warp.landings import NEAR, Landings, landing_figures, random_headings
 from jumper_warp.trial import Trial, TrialArgs
 
@@ -53,7 +54,7 @@ def sectors(goals: np.ndarray) -> np.ndarray:
 
 def figures(landings: Landings) -> dict:
     """Return the figures of the ring, with the success of each quarter."""
-    values = landing_figures(landings, np.ones(landings.success.shape, dtype=bool))
+    values = landing_figures(landings)
     sector = sectors(landings.goals)
     for index, name in enumerate(SECTORS):
         values[f"success_rate_{name}"] = float(landings.success[sector == index].mean())
@@ -84,4 +85,4 @@ def main(args: Args) -> dict:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Args))
+    run_command(lambda: main(tyro.cli(Args)))

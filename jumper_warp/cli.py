@@ -13,6 +13,8 @@ from typing import Any
 
 import tyro
 
+OWN = ("jumper_warp", "experiments", "__main__")
+"""First names of modules whose word on their input is a refusal; an experiment that is run is `__main__`."""
 USAGE_ERROR = 2
 """Exit code for input that cannot be used."""
 INTERRUPTED = 130
@@ -124,10 +126,20 @@ def main(argv: Sequence[str] | None = None) -> None:
     if not args or args[0] in ("-h", "--help"):
         print(usage())
         raise SystemExit(0 if args else USAGE_ERROR)
+    run_command(lambda: dispatch(args))
+
+
+def dispatch(args: Sequence[str]) -> None:
+    """Run the command that comes first. Raises UsageError if there is none of that name."""
+    if args[0] not in COMMANDS:
+        raise UsageError(f"no command {args[0]!r}; there are {', '.join(COMMANDS)}")
+    COMMANDS[args[0]](args[1:])
+
+
+def run_command(command: Callable[[], object]) -> None:
+    """Call a command or an experiment; exits with 2 and one line on standard error if its input cannot be used."""
     try:
-        if args[0] not in COMMANDS:
-            raise UsageError(f"no command {args[0]!r}; there are {', '.join(COMMANDS)}")
-        COMMANDS[args[0]](args[1:])
+        command()
     except KeyboardInterrupt:
         raise SystemExit(INTERRUPTED) from None
     except (ValueError, OSError) as error:
@@ -138,8 +150,8 @@ def main(argv: Sequence[str] | None = None) -> None:
 
 
 def is_refusal(error: Exception) -> bool:
-    """Return whether an error is this package's word on its input, and not a fault inside some library."""
+    """Return whether an error is this project's word on its input, and not a fault inside some library."""
     if isinstance(error, OSError):
         return error.filename is not None
     frames = [frame.f_globals.get("__name__", "") for frame, _ in traceback.walk_tb(error.__traceback__)]
-    return bool(frames) and frames[-1].split(".")[0] == "jumper_warp"
+    return bool(frames) and frames[-1].split(".")[0] in OWN

@@ -282,7 +282,7 @@ class JumpEnv:
             begin_evaluation_kernel,
             self.num_envs,
             [self._vectors(goals), wp.array(headings, device=self.wp_device), round(command_delay / self.step_dt),
-             self.sim.model.joint_q],
+             self._dynamics.robot.ground, self.sim.model.joint_q],
             [self.tasks, self.sim.state.joint_q, self.sim.state.joint_qd],
         )  # fmt: skip
         self._clear(self._ones)
@@ -340,6 +340,7 @@ class JumpEnv:
             "seed": self.seed,
             "physics_dt_s": self.physics_dt,
             "policy_dt_s": self.step_dt,
+            "contact_tolerance_m_s": CONTACT_TOLERANCE,
             "solver": type(self.sim.solver).__name__,
             "quaternion_order": "xyzw",
         }

@@ -36,7 +36,12 @@ def save_state(env: JumpEnv) -> dict[str, torch.Tensor]:
 
     The world is the last axis of Warp's arrays and the first of observations and episodes. Drawn parameters are not
     in it, only their fingerprint: the seed draws them anew.
+
+    Raises:
+        ValueError: The environment has moving blocks.
     """
+    if env.sim.block is not None:
+        raise ValueError("the state of an environment with moving blocks cannot be saved")
     state = {name: tensor.to("cpu", copy=True) for name, tensor in _tensors(env).items()}
     records = env.tasks.numpy()
     state |= {EPISODE + name: torch.from_numpy(np.array(records[name])) for name in records.dtype.names}

@@ -29,14 +29,15 @@ Pair = tuple[float, float]
 class HeightFlags:
     """What vertical jumps are asked for."""
 
-    lower: float = 0.5
-    """[m] Lowest commanded base height; vertical jumps only, like the next."""
-    upper: float = 1.2
-    """[m] Highest."""
+    lower: float | None = None
+    """[m] Lowest commanded base height; vertical jumps only, like the next (default: 0.5)."""
+    upper: float | None = None
+    """[m] Highest (default: 1.2)."""
 
     def __post_init__(self) -> None:
         """Raises ValueError: a height is out of range."""
-        if not 0.0 < self.lower <= self.upper < 10.0:
+        heights = [height for height in (self.lower, self.upper) if height is not None]
+        if heights != sorted(heights) or not all(0.0 < height < 10.0 for height in heights):
             raise ValueError(f"heights must be in (0, 10) m and rise, got {self.lower}, {self.upper}")
 
     def log(self, count: int, rules: tuple[str, ...], seed: int) -> Jumps:
@@ -53,8 +54,8 @@ class PlaceFlags:
     omnidirectional jumps -0.7 0.7)."""
     y: Pair | None = None
     """[m] Goals to the left, drawn between these (default: 0 0, for omnidirectional jumps -0.7 0.7)."""
-    heading: Literal["any"] | float = "any"
-    """[deg] Heading of all robots, or any: drawn from the full circle."""
+    heading: Literal["any"] | float | None = None
+    """[deg] Heading of all robots, or any: drawn from the full circle (default: any)."""
 
     def __post_init__(self) -> None:
         """Raises ValueError: a range is not one."""
@@ -62,7 +63,7 @@ class PlaceFlags:
             pair = getattr(self, name)
             if pair is not None and not -10.0 < pair[0] <= pair[1] < 10.0:
                 raise ValueError(f"{name} must be in (-10, 10) m and rise, got {pair[0]}, {pair[1]}")
-        if self.heading != "any" and not math.isfinite(self.heading):
+        if self.heading not in (None, "any") and not math.isfinite(self.heading):
             raise ValueError(f"heading must be finite or any, got {self.heading}")
 
     def log(self, count: int, rules: tuple[str, ...], seed: int) -> Landings:
@@ -93,9 +94,11 @@ class Measure:
 
 
 MEASURES = {
-    "vertical-jump": Measure(HeightFlags(), (0.5, 1.1), jump_figures),
-    "horizontal-jump": Measure(PlaceFlags((0.3, 1.5), (0.0, 0.0)), (0.3, 1.4), place_figures, ends_of_a_test),
-    "omnidirectional-jump": Measure(PlaceFlags((-0.7, 0.7), (-0.7, 0.7)), (0.0, 0.7), place_figures, ends_of_a_test),
+    "vertical-jump": Measure(HeightFlags(0.5, 1.2), (0.5, 1.1), jump_figures),
+    "horizontal-jump": Measure(PlaceFlags((0.3, 1.5), (0.0, 0.0), "any"), (0.3, 1.4), place_figures, ends_of_a_test),
+    "omnidirectional-jump": Measure(
+        PlaceFlags((-0.7, 0.7), (-0.7, 0.7), "any"), (0.0, 0.7), place_figures, ends_of_a_test
+    ),
 }
 
 
@@ -135,6 +138,7 @@ def evaluate(cfg: EvaluateCfg) -> dict[str, Any]:
     Raises:
         PolicyError: The policy cannot be used, its task has no measure, or a flag is not for its task.
         CheckpointError: The checkpoint cannot be used.
+        OSError: The folder cannot be made.
     """
     policy = open_policy(cfg.policy)
     task = policy.interface.task
@@ -142,6 +146,7 @@ def evaluate(cfg: EvaluateCfg) -> dict[str, Any]:
     flags = flags_for(task, measure.flags, cfg.heights, cfg.places)
     if cfg.keep and is_run(cfg.policy):
         raise PolicyError(f"{cfg.policy}: a run keeps no figures; export it first")
+    folder = output_dir("evaluate", cfg.out)
     env = env_of_policy(policy, cfg.jumps, cfg.conditions, change=measure.change)
     policy.to(env.device)
     log = flags.log(cfg.jumps, rule_names(env), cfg.conditions.seed)
@@ -151,7 +156,6 @@ def evaluate(cfg: EvaluateCfg) -> dict[str, Any]:
         **{name: getattr(cfg.conditions, name) for name in ("solver", "randomize", "noise", "seed")},
         **measure.figures(log, cfg.in_range or measure.in_range),
     }
-    folder = output_dir("evaluate", cfg.out)
     write_figures(folder, figures)
     (folder / "jumps.csv").write_text(csv_text(log))
     if cfg.keep:

@@ -233,9 +233,9 @@ def within(values: np.ndarray, limits: tuple[float, float]) -> np.ndarray:
     return (values >= limits[0] - 5e-4) & (values <= limits[1] + 5e-4)
 
 
-def mean(values: np.ndarray) -> float | None:
+def mean(values: np.ndarray | Sequence[float | None]) -> float | None:
     """Return the mean of what is a number, None if nothing is."""
-    values = values.astype(float)
+    values = np.asarray(values, dtype=float)
     values = values[~np.isnan(values)]
     return float(values.mean()) if len(values) else None
 

@@ -1,7 +1,7 @@
 """Following jumps to places in the plane: where they land, and what becomes of the robot.
 
 A jump is over once the robot has had a second to come to rest; the distance between base and goal then is its error. A
-jump that fails before is measured where it failed. Whether the robot jumped again to get there, is told apart.
+jump that fails before is measured where it failed. Whether the robot hopped or stepped to get there, is told apart.
 """
 
 from __future__ import annotations
@@ -34,7 +34,12 @@ from kernels.task import JumpTask
 NEAR = 0.1
 """[m] A landed jump that ends this close to its goal succeeds."""
 HOP_TIME = 0.05
-"""[s] A robot that is off the ground for longer after touchdown has jumped again."""
+"""[s] A robot that is off the ground for longer after touchdown has jumped again; one that lifts a paw, which had come
+down, for as long has stepped."""
+SOON = 0.3
+"""[s] After touchdown, when the base is looked at as well."""
+TIME_EPS = 1.0e-6
+"""[s] Rounding of sums of steps."""
 ENDS = ("success", "came_apart", "low_base", "collided", "no_jump")
 """Rules of the task that end a jump here; the others only shape the training."""
 FALLS = ("came_apart", "low_base", "collided")
@@ -91,6 +96,10 @@ class Landings(JumpLog):
     """[m] (..., 2) Base at touchdown, world."""
     air_time: np.ndarray = field(init=False)
     """[s] Longest that no paw was on the ground after touchdown."""
+    lift_time: np.ndarray = field(init=False)
+    """[s] Longest that any paw was off the ground again after its own first contact since touchdown."""
+    place_soon: np.ndarray = field(init=False)
+    """[m] (..., 2) Base SOON after touchdown, world; not a number if the jump was over before."""
     early: np.ndarray = field(init=False)
     """Whether the jump began before the command."""
 
@@ -101,8 +110,10 @@ class Landings(JumpLog):
             raise ValueError(f"goals must have shape (num_envs, jumps, 2), got {self.goals.shape}")
         shape = self.goals.shape[:2]
         self.current, self.end = np.zeros(shape[0], dtype=int), np.full(shape, -1)
-        self.place, self.target, self.touchdown = (np.full((*shape, 2), np.nan) for _ in range(3))
+        self.place, self.target, self.touchdown, self.place_soon = (np.full((*shape, 2), np.nan) for _ in range(4))
         self.air_time, self._aloft = np.zeros(shape), np.zeros(shape[0])
+        self.lift_time, self._lifted = np.zeros(shape), np.zeros((shape[0], 4))
+        self._came_down = np.zeros((shape[0], 4), dtype=bool)
         self.yaw, self.heading, self.apex, self.tilt = (np.full(shape, np.nan) for _ in range(4))
         self.rest_speed, self.early = np.full(shape, np.inf), np.zeros(shape, dtype=bool)
 
@@ -115,9 +126,9 @@ class Landings(JumpLog):
             delay_commands(env, np.asarray(self.delay))
 
     def look(self, env: EvaluationEnv) -> dict[str, np.ndarray]:
-        """Return the state of every world's episode, and how many of its paws are on the ground."""
+        """Return the state of every world's episode, and which of its paws are on the ground."""
         force = np.linalg.norm(env.sim.paw_force.numpy(), axis=2)
-        return env.task_arrays() | {"contacts": (force > env.task.contact_force).sum(axis=0)}
+        return env.task_arrays() | {"paws_down": (force > env.task.contact_force).T}
 
     def follow(self, env: EvaluationEnv) -> bool:
         """Look at the environment after a policy step, and command the jumps that are due."""
@@ -142,10 +153,10 @@ class Landings(JumpLog):
         self.apex[at], self.tilt[at] = now["max_height"], now["peak_tilt"]
         self.early[at] |= (now["took_off"] == 1) & (now["steps"] < now["command_step"])
         landed = now["phase"] == LANDED
-        first = landed & (now["touched_down"] == 1)
+        first, soon = landed & (now["touched_down"] == 1), landed & (now["phase_steps"] == round(SOON / step_dt))
         self.touchdown[row[first], self.current[row[first]]] = now["base_pos"][first, :2]
-        self._aloft[row] = np.where(landed & (now["contacts"] == 0), self._aloft[row] + step_dt, 0.0)
-        self.air_time[at] = np.maximum(self.air_time[at], self._aloft[row])
+        self.place_soon[row[soon], self.current[row[soon]]] = now["base_pos"][soon, :2]
+        self._update_paws(row, landed[:, None] & now["paws_down"], landed, step_dt)
         failed = now["rule"] > 0
         rested = ~failed & landed & (now["phase_steps"] >= round(self.rest / step_dt))
         speed = np.linalg.norm(now["base_vel"], axis=1)
@@ -154,6 +165,15 @@ class Landings(JumpLog):
         self.current[row[rested]] += 1
         self.current[row[failed]] = count
         return bool((self.current >= count).all())
+
+    def _update_paws(self, row: np.ndarray, down: np.ndarray, landed: np.ndarray, step_dt: float) -> None:
+        """Take in which paws (rows, 4) are on the ground, of robots (rows,) after touchdown and before it."""
+        at = (row, self.current[row])
+        self._aloft[row] = np.where(landed & ~down.any(axis=1), self._aloft[row] + step_dt, 0.0)
+        self.air_time[at] = np.maximum(self.air_time[at], self._aloft[row])
+        self._came_down[row] = landed[:, None] & (self._came_down[row] | down)
+        self._lifted[row] = np.where(self._came_down[row] & ~down, self._lifted[row] + step_dt, 0.0)
+        self.lift_time[at] = np.maximum(self.lift_time[at], self._lifted[row].max(axis=1))
 
     @property
     def offset(self) -> np.ndarray:
@@ -199,12 +219,27 @@ class Landings(JumpLog):
     @property
     def hopped(self) -> np.ndarray:
         """Whether the robot jumped again after touchdown."""
-        return self.air_time > HOP_TIME + 1.0e-6
+        return self.air_time > HOP_TIME + TIME_EPS
+
+    @property
+    def step_free(self) -> np.ndarray:
+        """Whether the jump succeeded without a step after touchdown, and so without another jump."""
+        return self.success & ~self.stepped
+
+    @property
+    def stepped(self) -> np.ndarray:
+        """Whether any paw that had come down was off the ground again for HOP_TIME or longer."""
+        return self.lift_time > HOP_TIME - TIME_EPS
 
     @property
     def touchdown_error(self) -> np.ndarray:
         """[m] Distance of the base from the goal at touchdown; not a number without one."""
         return np.linalg.norm(self.touchdown - self.target, axis=-1)
+
+    @property
+    def error_soon(self) -> np.ndarray:
+        """[m] Distance of the base from the goal SOON after touchdown; not a number if the jump was over before."""
+        return np.linalg.norm(self.place_soon - self.target, axis=-1)
 
     @property
     def outcomes(self) -> np.ndarray:
@@ -273,30 +308,31 @@ def landing_figures(landings: Landings, inside: np.ndarray | None = None) -> Fig
     """Return the figures of jumps to places, all rows together.
 
     Errors are over all jumps, failed ones included, but those whose simulation came apart, which `came_apart` counts,
-    and those that were not begun. `ahead` and `left` are signed. Tilts and turns are those of the landed jumps.
+    and those that were not begun. `ahead` and `left` are signed. Tilts, turns, hops and steps are those of the landed
+    jumps.
 
-    inside: which jumps `success_rate_in_range` counts, shaped like `landings.end`; all unless given.
+    inside: which jumps the figures in range count, shaped like `landings.end`; without it there are none.
     """
     begun = landings.ends != NOT_BEGUN
-    inside = begun if inside is None else begun & inside
     error, success, landed = landings.error, landings.success, landings.landed
     offset = np.where(np.isnan(error)[..., None], np.nan, landings.offset)
     tilt, yaw = np.degrees(landings.tilt), np.degrees(landings.yaw)
     figures: Figures = {
         "jumps": int(begun.sum()),
         "mean_error_m": mean(error),
-        "mean_error_in_range_m": mean(error[inside]),
         "mean_error_of_successes_m": mean(error[success]),
         "max_error_of_successes_m": largest(error[success]),
         "max_error_m": largest(error),
         "mean_error_ahead_m": mean(offset[..., 0]),
         "mean_error_left_m": mean(offset[..., 1]),
         "success_rate": mean(success[begun]),
-        "success_rate_in_range": mean(success[inside]),
         "single_jump_success_rate": mean(landings.single[begun]),
+        "step_free_success_rate": mean(landings.step_free[begun]),
         "landing_rate": mean(landed[begun]),
         "second_hop_rate": mean(landings.hopped[landed]),
+        "step_rate": mean(landings.stepped[landed]),
         "mean_error_at_touchdown_m": mean(landings.touchdown_error[landed]),
+        "mean_error_0_3_s_after_touchdown_m": mean(landings.error_soon[landed]),
         "at_rest_within_1_s_rate": mean((landings.rest_speed < REST_SPEED)[landed]),
         "mean_landing_tilt_deg": mean(tilt[landed]),
         "max_landing_tilt_deg": largest(tilt[landed]),
@@ -307,4 +343,13 @@ def landing_figures(landings: Landings, inside: np.ndarray | None = None) -> Fig
         "early_rate": mean(landings.early[begun]),
         CAME_APART: int((landings.ends == CAME_APART).sum()),
     }
+    if inside is not None:
+        inside = begun & inside
+        figures |= {"mean_error_in_range_m": mean(error[inside]), "success_rate_in_range": mean(success[inside])}
     return figures | failures(landings.outcomes[begun & ~success])
+
+
+def trained_range(task: TaskCfg) -> dict[str, float]:
+    """Return the distances straight ahead [m] that the levels of a task's training drew goals from."""
+    lower, upper = zip(*((level.goal_lower[0], level.goal_upper[0]) for level in task.levels), strict=True)
+    return {"trained_lower_m": max(min(lower), 0.0), "trained_upper_m": max(upper)}

@@ -33,14 +33,16 @@ Place = tuple[float, float]
 class HeightGoals:
     """What vertical jumps are asked for."""
 
-    height: tuple[float, ...] = (0.6, 0.9, 1.1)
-    """[m] Commanded base heights, one robot each; vertical jumps only."""
+    height: tuple[float, ...] | None = None
+    """[m] Commanded base heights, one robot each; vertical jumps only (default: 0.6 0.9 1.1)."""
 
     spacing = 1.2
     """[m] Between robots in the picture."""
 
     def __post_init__(self) -> None:
         """Raises ValueError: a height is out of range, or their number."""
+        if self.height is None:
+            return
         if not 1 <= len(self.height) <= MAX_ROBOTS or not all(0.0 < height < 10.0 for height in self.height):
             raise ValueError(f"height takes 1 to {MAX_ROBOTS} numbers in (0, 10) m, got {self.height}")
 
@@ -101,7 +103,7 @@ class PlaceGoals:
 
 
 GOALS: dict[str, HeightGoals | PlaceGoals] = {
-    "vertical-jump": HeightGoals(),
+    "vertical-jump": HeightGoals((0.6, 0.9, 1.1)),
     "horizontal-jump": PlaceGoals(((0.5, 0.0), (0.9, 0.0), (1.3, 0.0))),
     "omnidirectional-jump": PlaceGoals(((0.5, 0.0), (0.0, 0.5), (-0.5, 0.0))),
 }
@@ -140,11 +142,13 @@ def play(cfg: PlayCfg) -> Path:
     Raises:
         PolicyError: The policy cannot be used, its task cannot be played, or a flag is not for its task.
         CheckpointError: The checkpoint cannot be used.
+        OSError: The folder cannot be made.
     """
     policy = open_policy(cfg.policy)
     task = policy.interface.task
     measure = measure_of(task)
     asked = flags_for(task, GOALS[task], cfg.heights, cfg.places)
+    folder = output_dir("play", cfg.out)
     env = env_of_policy(policy, len(asked), cfg.conditions, change=measure.change)
     policy.to(env.device)
     log = asked.log(rule_names(env))
@@ -155,7 +159,6 @@ def play(cfg: PlayCfg) -> Path:
         env.step(policy.act(env.obs))
         log.follow(env)
         film()
-    folder = output_dir("play", cfg.out)
     path = film.save_rrd(folder / "jump.rrd", log.marks(range(len(asked))))
     write_figures(folder, log.columns())
     print_jumps(log)

@@ -80,6 +80,7 @@ class Simulation:
         self.model = build_model(num_worlds, ground=ground, friction=friction, visuals=visuals, device=device)
         self.device = self.model.device
         self.num_worlds = num_worlds
+        self.block = block
         self.dt = dt
         self.substeps = substeps
         self.motors = motor_arrays(motors or jumping_motors(), num_worlds, device=self.device)

@@ -251,11 +251,11 @@ class SolverJumper(SolverBase):
 
     def block_position(self) -> np.ndarray:
         """Return the centres of the blocks [m], world frame, (num_worlds, 2). Raises ValueError without blocks."""
-        return self._blocks().numpy()["center"]
+        return self._blocks().numpy()["center"].copy()
 
     def block_velocity(self) -> np.ndarray:
         """Return the velocities of the blocks [m/s], world frame, (num_worlds, 2). Raises ValueError without blocks."""
-        return self._blocks().numpy()["velocity"]
+        return self._blocks().numpy()["velocity"].copy()
 
     def place_blocks(self, center: np.ndarray) -> None:
         """Put all blocks at rest to new starts [m], world frame, (2,) or (num_worlds, 2).

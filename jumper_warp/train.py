@@ -45,7 +45,7 @@ class TrainCfg:
     iterations: int = 2800
     """Iterations that the run has at its end, those before a resume included."""
     max_seconds: float = 0.0
-    """Wall-clock limit of the iterations [s]; 0: none."""
+    """Wall-clock limit of the iterations [s], those before a resume included; 0: none."""
     seed: int = 1
     """Of weights, noise and worlds; every process derives its own."""
     device: str | None = None
@@ -198,7 +198,7 @@ class Run:
         self.cfg, self.env, self.rank = cfg, env, rank
         self.ppo = Ppo(env, cfg.ppo)
         self.config = full_config(cfg, env, rank)
-        self.iteration = 0
+        self.iteration, self.seconds = 0, 0.0  # that the run had before this process
         self.figures: dict[str, float] = {}
         self.notes: list[str] = []
         torch.manual_seed(cfg.seed + 1 + rank.index)
@@ -216,6 +216,7 @@ class Run:
             own = state["others"][self.rank.index - 1] if self.rank.index else state
             self.ppo.load_state_dict({**state["ppo"], **own["ppo"]})
             self.env.load_state_dict(own["env"])
+            self.seconds = float(state.get("seconds", 0.0))
         except (RuntimeError, KeyError, ValueError, TypeError) as error:
             reason = " ".join(str(error).split())[:300]
             raise CheckpointError(f"{path}: does not fit these settings: {reason}") from error
@@ -228,14 +229,15 @@ class Run:
         cfg, ppo = self.cfg, self.ppo
         if self.iteration == 0:
             self.env.reset()
-        begin = logged = time.perf_counter()
+        start = logged = time.perf_counter()
+        begin = start - self.seconds
         watch, log = Stopwatch(self.rank.device), None
         if self.rank.index == 0:
             log = TrainingLog(self.folder, self.config, cfg.iterations, cfg.tensorboard, cfg.wandb)
         with log or _Silent() as log:
             for note in self.notes:
                 log.say(note)
-            ending = self.iteration >= cfg.iterations
+            ending = self.iteration >= cfg.iterations or 0.0 < cfg.max_seconds <= self.seconds
             since = self.iteration
             while not ending:
                 watch.start()
@@ -253,11 +255,11 @@ class Run:
                     logged, since = now, self.iteration
                     log.log(self.iteration, self.figures)
                 if ending or self.iteration % cfg.save_interval == 0:
-                    self._save(log, must=ending)
-        return TrainResult(self.folder, self.iteration, time.perf_counter() - begin, self.figures)
+                    self._save(log, time.perf_counter() - begin, must=ending)
+        return TrainResult(self.folder, self.iteration, time.perf_counter() - start, self.figures)
 
     def _progress(self, begin: float) -> float:
-        """Return how much of the training is over, by iterations or time, whichever is further."""
+        """Return how much of the training is over, by iterations or by time since begin [s], whichever is further."""
         done = self.iteration / self.cfg.iterations
         if self.cfg.max_seconds > 0.0:
             done = max(done, (time.perf_counter() - begin) / self.cfg.max_seconds)
@@ -288,13 +290,14 @@ class Run:
             "Perf/elapsed_s": elapsed,
         }
 
-    def _save(self, log: TrainingLog | _Silent, must: bool) -> None:
+    def _save(self, log: TrainingLog | _Silent, seconds: float, must: bool) -> None:
         """Save a checkpoint; a failure is only told, and tried again next time, unless this one must be."""
         own = {"ppo": self.ppo.state_dict(), "env": self.env.state_dict(), "rng": random_state()}
         others = self._others(own)
         if self.rank.index != 0:
             return
-        state = {"iteration": self.iteration, **own, "others": others, "config": json.dumps(self.config)}
+        state = {"iteration": self.iteration, "seconds": seconds, **own, "others": others}
+        state["config"] = json.dumps(self.config)
         folder = self.folder / CHECKPOINTS
         try:
             save_checkpoint(folder, state, self.figures.get(self.cfg.best_by), self.cfg.keep)

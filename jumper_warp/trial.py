@@ -10,17 +10,16 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-import warp as wp
 from rich.console import Console
 from rich.table import Table
 
+from jumper_warp.cli import announce
 from jumper_warp.env import JumpEnv
 from jumper_warp.figures import output_dir, write_figures
 from jumper_warp.film import Film, moments
 from jumper_warp.jumps import rule_names, run
 from jumper_warp.landings import Landings, ends_of_a_test, longest
 from jumper_warp.policy_interface import PolicyError
-from jumper_warp.runtime import report_device
 from jumper_warp.saved_run import Conditions, env_of_policy, open_policy
 
 TASKS = ("horizontal-jump", "omnidirectional-jump")
@@ -72,14 +71,14 @@ class Trial:
         Raises:
             PolicyError: The policy cannot be used, or does not jump to places.
             CheckpointError: The checkpoint cannot be used.
+            UsageError: There is no such device.
         """
-        wp.config.log_level = wp.LOG_WARNING
-        report_device(args.device)
         self.args, self.started = args, time.perf_counter()
         self.policy = open_policy(args.policy)
         self.task = self.policy.interface.task
         if self.task not in TASKS:
             raise PolicyError(f"this needs a policy of {' or '.join(TASKS)}, {args.policy} is of {self.task!r:.60}")
+        announce(args.device)
         self.folder = output_dir(name, args.out)
         self.torque_limit = 0.0
 
@@ -162,11 +161,17 @@ class Trial:
         write_figures(self.folder, values)
         table = Table("figure", self.title, "paper")
         for name, value in values.items():
-            shown = f"{value:.4g}" if isinstance(value, float) else str(value)
-            table.add_row(name, shown, str(paper.get(name, "")))
+            table.add_row(name, shown(value), str(paper.get(name, "")))
         Console().print(table)
         print(f"{time.perf_counter() - self.started:.1f} s; figures, plots and recordings in {self.folder}")
         return values
+
+
+def shown(value: Any) -> str:
+    """Return a figure as it is printed: numbers, and those in lists, with four digits."""
+    if isinstance(value, list):
+        return ", ".join(shown(item) for item in value)
+    return f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
 def beside(start: np.ndarray, end: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

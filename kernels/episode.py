@@ -6,6 +6,7 @@ from .collision import world_collisions
 from .geometry import LegGeometry
 from .ground import Ground
 from .jump_phase import advance_jump
+from .parameters import COORDS
 from .scalar import real
 from .task import JumpTask, ViewArrays, load_view, speed_limit_broken
 from .terminations import came_apart
@@ -84,7 +85,7 @@ def make_episode_kernel(terms: tuple, rules: tuple, task_error: wp.Function) -> 
         """Move every world's episode on by one policy step; one thread per world."""
         world = wp.tid()
         view = load_view(arrays, ground, world, settings.contact_force)
-        view.collisions = world_collisions(geometry, ground, arrays.joint_q, world * 43, real(0.0)).flags
+        view.collisions = world_collisions(geometry, ground, arrays.joint_q, world * COORDS, real(0.0)).flags
         task = advance_jump(tasks[world], view, arrays.old_lin_vel[world], settings.takeoff_speed)
 
         rule = int(NO_RULE)

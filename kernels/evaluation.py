@@ -2,6 +2,7 @@
 
 import warp as wp
 
+from .ground import Ground, rest_block
 from .parameters import COORDS, DOFS
 from .reset import begin_next_jump
 from .reset_draws import turned
@@ -16,6 +17,7 @@ def begin_evaluation_kernel(
     goals: wp.array(dtype=wp.vec3),
     headings: wp.array(dtype=float),
     command_step: int,
+    ground: Ground,
     reference_q: wp.array(dtype=float),
     # out
     tasks: wp.array(dtype=JumpTask),
@@ -27,6 +29,7 @@ def begin_evaluation_kernel(
     Goals [m] are relative to the start and heading.
     """
     world = wp.tid()
+    rest_block(ground, world)
     for j in range(int(COORDS)):
         joint_q[world * COORDS + j] = reference_q[world * COORDS + j]
     for j in range(int(DOFS)):

@@ -8,9 +8,10 @@ whose paws are below the ground is drawn again; the default pose stands in after
 
 import warp as wp
 
+from .actuator import motor_slot
 from .collision import world_collisions
 from .geometry import LegGeometry
-from .ground import Ground, surface
+from .ground import Ground, rest_block, surface
 from .inverse_kinematics import LegLimits, clamped_closed_form
 from .leg_kinematics import leg_forward_kinematics, leg_inverse_velocity
 from .parameters import COORDS, DOFS
@@ -231,7 +232,7 @@ def reset_kernel(
     """
     world = wp.tid()
     task = tasks[world]
-    again = task.phase == LANDED and task.again_step > 0 and task.phase_steps == task.again_step
+    again = task.phase == LANDED and task.again_step > 0 and task.phase_steps >= task.again_step
     if done[world] == 0.0 and not again:
         return
     state = wp.rand_init(int(random[world]), world + 1)
@@ -249,6 +250,7 @@ def reset_kernel(
         task.again_step = draw_again(state, ranges)
         tasks[world] = task
         return
+    rest_block(ground, world)
     scheme = draw_scheme(state, ranges)
     heading = between(state, 13, -ranges.heading, ranges.heading)
     goal = turned(goal, heading)
@@ -291,7 +293,7 @@ def clear_world_kernel(
         impulse[k, world] = wp.vec3(0.0)
         paw_force[k, world] = wp.vec3(0.0)
     for m in range(12):
-        slot = 5 * (m / 3) + m % 3 + (m % 3) / 2
+        slot = motor_slot(m)
         torque[m, world] = 0.0
         action[m, world] = 0.0
         old_action[m, world] = 0.0

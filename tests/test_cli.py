@@ -234,13 +234,28 @@ def test_play_of_jumps_to_places_records_the_distance_and_marks_the_goals(still,
     ("args", "message"),
     [
         (["evaluate", "--upper", "1.0"], "--upper is not for policies of horizontal-jump"),
+        (["evaluate", "--lower", "0.5"], "--lower is not for policies of horizontal-jump"),  # its own default
         (["play", "--height", "0.9"], "--height is not for policies of horizontal-jump"),
+        (["play", "--height", "0.6", "0.9", "1.1"], "--height is not for policies of horizontal-jump"),
         (["evaluate", "--x", "0.8", "0.4"], "x must be in"),
     ],
 )
 def test_flags_of_another_task_and_no_ranges_are_one_line(still, capsys, args, message):
     code, _, err = run(capsys, args[0], still, *args[1:], "--device", "cpu")
     assert code == 2 and message in err[-1]
+
+
+@pytest.mark.parametrize("command", ["evaluate", "play"])
+def test_folder_that_cannot_be_made_is_told_before_anything_is_simulated(tmp_path, capsys, command):
+    policy = still_policy("horizontal-jump")
+    names = ("other", *policy.interface.observation_names[1:])  # whose environment is refused
+    policy.interface = dataclasses.replace(policy.interface, observation_names=names)
+    save_policy(tmp_path / "policy", policy)
+    (tmp_path / "file").touch()
+    args = [command, str(tmp_path / "policy"), "--device", "cpu", "--out"]
+    assert "observation is not the one" in run(capsys, *args, str(tmp_path / "new"))[2][-1]
+    code, _, err = run(capsys, *args, str(tmp_path / "file"))
+    assert code == 2 and "File exists" in err[-1]
 
 
 def test_truncated_checkpoint_is_one_line(trained_run, tmp_path, capsys):

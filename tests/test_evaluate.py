@@ -43,6 +43,8 @@ def test_one_heading_is_that_of_all_in_radians():
 def test_flags_of_another_task_are_refused():
     with pytest.raises(PolicyError, match="--x is not for policies of vertical-jump"):
         flags_for("vertical-jump", HeightFlags(), HeightFlags(), PlaceFlags(x=(0.3, 0.5)))
+    with pytest.raises(PolicyError, match="--heading is not for policies of vertical-jump"):
+        flags_for("vertical-jump", HeightFlags(), HeightFlags(), PlaceFlags(heading="any"))  # its own default
     with pytest.raises(PolicyError, match="--upper is not for policies of horizontal-jump"):
         flags_for("horizontal-jump", PlaceFlags(), HeightFlags(upper=1.0), PlaceFlags())
 

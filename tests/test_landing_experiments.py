@@ -18,11 +18,12 @@ from experiments import (
     platform_jump,
 )
 from experiments.vertical_jump_sweep import OPEN_LOOP_LIMIT
+from jumper_warp.cli import UsageError
 from jumper_warp.jumps import rule_names, run
 from jumper_warp.landings import ENDS, Landings
 from jumper_warp.policy import PolicyError, save_policy
 from jumper_warp.saved_run import Conditions, env_of_policy
-from jumper_warp.trial import Trial, TrialArgs, beside
+from jumper_warp.trial import Trial, TrialArgs, beside, shown
 
 COLLIDED, NO_JUMP = ENDS.index("collided"), ENDS.index("no_jump")
 SHARED = {"mean_error_m", "success_rate", "success_rate_in_range", "jumps", "solver", "randomize", "seed"}
@@ -86,23 +87,36 @@ def test_consecutive_figures_by_hand():
     pairs = ended(goals, np.add(goals, off), 0)
     row = ended(np.ones((2, 3, 2)), np.ones((2, 3, 2)) + [0.0, 0.04], [[0, 0, 0], [0, COLLIDED, -1]])
     row.heading[1, 2] = row.place[1, 2] = np.nan
+    row.rest_speed[:] = [[0.05, 0.2, 0.05], [0.05, np.inf, np.inf]]
     figures = consecutive_jumps.figures(pairs, row)
     expected = {
         "jumps": 4,
         "mean_error_m": 0.29 / 4,
         "success_rate": 3 / 4,
+        "success_rate_in_range": 3 / 4,
         "mean_error_diagonal_m": 0.02,
         "mean_error_straight_m": 0.125,
         "mean_error_jump_1_m": 0.03,
         "mean_error_jump_2_m": 0.115,
         "both_landed_rate": 1.0,
         "ten_in_a_row_rate": 0.5,
+        "row_all_on_goal_rate": 0.5,
+        "below_0_1_m_s_at_the_end_rate": 0.0,
+        "below_0_1_m_s_at_the_end_rate_ten": 3 / 4,
         "mean_jumps_until_the_end": 2.0,
         "mean_error_ten_m": 0.04,
         "success_rate_ten": 4 / 5,
     }
     assert {name: figures[name] for name in expected} == pytest.approx(expected)
     assert figures["mean_error_by_number_m"] == pytest.approx([0.04, 0.04, 0.04])
+    assert "at_rest_within_1_s_rate" not in figures  # the rest may be of another length
+
+
+def test_row_without_a_fall_may_miss_its_goals():
+    off = np.ones((2, 3, 2)) + [[[0.0, 0.0]] * 3, [[0.0, 0.0], [0.3, 0.0], [0.0, 0.0]]]
+    pairs = np.ones((2, 2, 2))
+    figures = consecutive_jumps.figures(ended(pairs, pairs, 0), ended(np.ones((2, 3, 2)), off, 0))
+    assert (figures["ten_in_a_row_rate"], figures["row_all_on_goal_rate"]) == (1.0, 0.5)
 
 
 def test_paths_are_drawn_from_the_start_and_along_the_heading():
@@ -118,29 +132,49 @@ def test_paths_are_drawn_from_the_start_and_along_the_heading():
     assert paths[1, 1] == pytest.approx([0.0, 1.0]) and np.isnan(paths[1, 2]).all()
 
 
-def test_reliable_distance_is_the_last_bin_before_the_first_that_is_not():
-    def of(middle, good, hopped=0):
-        goals = ahead([middle] * 20)
-        end = [[0]] * (good + hopped) + [[COLLIDED]] * (20 - good - hopped)
-        return ended(goals, goals + [0.01, 0.0], end, air_time=[[0.0]] * good + [[0.1]] * (20 - good))
+def of(middle, *, clean, stepped=0, hopped=0):
+    """Return 20 jumps of a bin, so many of which succeed, the rest collides; touchdown 0.2 m before the goal."""
+    goals, good = ahead([middle] * 20), clean + stepped + hopped
+    air = [[0.0]] * (clean + stepped) + [[0.1]] * (20 - clean - stepped)
+    lift = [[0.0]] * clean + [[0.1]] * (20 - clean)
+    end = [[0]] * good + [[COLLIDED]] * (20 - good)
+    return ended(goals, goals + [0.01, 0.0], end, air_time=air, lift_time=lift, touchdown=goals - [0.2, 0.0])
 
-    bins = {1.0: of(1.0, 20), 1.1: of(1.1, 19), 1.2: of(1.2, 10, hopped=8), 1.3: of(1.3, 20), 1.4: of(1.4, 5)}
+
+def test_reliable_distance_is_the_last_bin_before_the_first_that_is_not():
+    bins = {
+        1.2: of(1.2, clean=19),
+        1.3: of(1.3, clean=10, stepped=10),
+        1.4: of(1.4, clean=10, hopped=9),
+        1.5: of(1.5, clean=10, stepped=8),
+        1.6: of(1.6, clean=20),
+    }
     figures = max_jump.figures(bins)
-    assert figures["largest_reliable_m"] == 1.1
-    assert figures["base_at_touchdown_m"] == pytest.approx(1.11)
-    assert figures["farthest_good_m"] == pytest.approx(1.41)
-    assert figures["bin_single_jump_success_rate"] == pytest.approx([1.0, 0.95, 0.5, 1.0, 0.25])
-    assert figures["bin_success_rate"] == pytest.approx([1.0, 0.95, 0.9, 1.0, 0.25])
-    assert figures["single_jump_success_rate"] == pytest.approx(0.74)
-    assert figures["success_rate"] == pytest.approx(0.82)
-    assert figures["success_rate_in_range"] == pytest.approx(0.975)
-    assert (figures["jumps"], figures["mean_error_m"]) == (100, pytest.approx(0.01))
+    expected = {
+        "largest_reliable_m": 1.4, "largest_reliable_without_hop_m": 1.3, "largest_reliable_without_step_m": 1.2,
+        "base_at_touchdown_m": 1.2, "base_at_touchdown_without_hop_m": 1.1, "base_at_touchdown_without_step_m": 1.0,
+        "success_rate": 0.96, "single_jump_success_rate": 0.87, "step_free_success_rate": 0.69,
+        "success_rate_in_range": 58 / 60, "farthest_success_m": 1.61, "jumps": 100, "mean_error_m": 0.01,
+    }  # fmt: skip
+    assert {name: figures[name] for name in expected} == pytest.approx(expected)
+    assert figures["bin_success_rate"] == pytest.approx([0.95, 1.0, 0.95, 0.9, 1.0])
+    assert figures["bin_single_jump_success_rate"] == pytest.approx([0.95, 1.0, 0.5, 0.9, 1.0])
+    assert figures["bin_step_free_success_rate"] == pytest.approx([0.95, 0.5, 0.5, 0.5, 1.0])
+    assert figures["bin_base_at_touchdown_m"] == pytest.approx([1.0, 1.1, 1.2, 1.3, 1.4])
+    assert "may go on with steps" in max_jump.verdict(figures)
+    assert "Of 1.4 m the base itself flew to 1.20 m" in max_jump.verdict(figures)
 
 
 def test_distance_without_any_reliable_bin_is_none():
     goals = ahead([1.0, 1.0])
     figures = max_jump.figures({1.0: ended(goals, goals, [[NO_JUMP], [NO_JUMP]])})
-    assert figures["largest_reliable_m"] is None and figures["farthest_good_m"] is None
+    assert figures["largest_reliable_m"] is None and figures["farthest_success_m"] is None
+    assert figures["bin_base_at_touchdown_m"] == [None]
+    assert max_jump.row_of(figures, 0) == ["1.0", "0.0", "0.0", "0.0", ""]
+
+
+def test_figures_are_printed_with_four_digits_in_lists_too():
+    assert shown([0.123456, None, 2]) == "0.1235, None, 2" and shown(1.0 / 3.0) == "0.3333"
 
 
 def test_scenes_put_the_ground_where_it_is_said_to_be():
@@ -242,6 +276,7 @@ def test_randomised_robot_that_stands_still_is_off_by_the_whole_way(policy, tmp_
     values = horizontal_jump_sweep.main(args)
     assert values["mean_error_m"] == pytest.approx(0.9, abs=0.05)
     assert values["randomize"] and values["landing_rate"] == 0.0
+    assert (values["trained_lower_m"], values["trained_upper_m"]) == (0.2, 2.2)
 
 
 def test_nothing_of_viewer_and_meshes_is_needed_without_a_recording(policy, tmp_path):
@@ -263,6 +298,20 @@ def test_policy_of_another_task_is_refused_in_one_line(tmp_path):
         Trial("test", TrialArgs(policy="vertical_jump", out=tmp_path, device="cpu"))
 
 
+def test_missing_device_is_refused(policy, tmp_path):
+    with pytest.raises(UsageError, match="no device 'abacus'"):
+        Trial("test", TrialArgs(policy=policy, out=tmp_path, device="abacus"))
+
+
+def test_script_refuses_a_policy_of_another_task_in_one_line_with_code_2(policy):
+    root = Path(__file__).parents[1]
+    command = [sys.executable, "experiments/vertical_jump_sweep.py", "--policy", policy]
+    done = subprocess.run(command, cwd=root, capture_output=True, text=True)
+    (line,) = done.stderr.splitlines()
+    assert (done.returncode, done.stdout) == (2, "")
+    assert line.startswith("jumper: this needs a policy of vertical-jump")
+
+
 @pytest.mark.parametrize(
     ("make", "message"),
     [
@@ -271,6 +320,7 @@ def test_policy_of_another_task_is_refused_in_one_line(tmp_path):
         (lambda: diagonal_jump_grid.Args(rows=0), "at least one jump, column and row"),
         (lambda: consecutive_jumps.Args(rest=0.0), "rest must be in"),
         (lambda: platform_jump.Args(scenes=("moon",)), "scenes are platform, uneven, block"),
+        (lambda: platform_jump.Args(scenes=("block",), solver="mujoco"), "SolverMuJoCo has no sliding block"),
         (lambda: max_jump.Args(jumps=0), "at least one jump"),
     ],
 )

@@ -10,6 +10,7 @@ from jumper_warp.landings import (
     ends_of_a_test,
     landing_figures,
     longest,
+    trained_range,
     wrapped,
     yaw_of,
 )
@@ -62,6 +63,12 @@ class Stub:
         for name, value in changes.items():
             self.arrays[name][:] = value
 
+    def stand_on(self, *down):
+        """Load the given paws of every world by 9 N, the others by a twentieth of a newton."""
+        loads = np.zeros((4, self.num_envs, 3))
+        loads[..., 2] = np.where(np.isin(range(4), down), 9.0, 0.05)[:, None]
+        self.sim.paw_force.assign(loads)
+
 
 def five_jumps():
     """One good, one that misses, one that comes apart, one that collides, one without a jump; heading left."""
@@ -74,6 +81,8 @@ def five_jumps():
     env.now(base_pos=touchdown, phase=[2, 2, 1, 1, 0], touched_down=[1, 1, 0, 0, 0])
     assert not landings.follow(env)
     env.now(touched_down=0)
+    env.now(base_pos=[[0.05, 0.93, 0.3], [-0.2, 0.7, 0.3], *([[0.0] * 3] * 3)], phase_steps=[18, 18, 3, 3, 9])
+    assert not landings.follow(env)
     env.now(
         base_pos=[[0.03, 0.96, 0.3], [-0.2, 0.8, 0.3], [1e9, 0.0, 0.0], [0.0, 0.9, 0.1], [0.0, 0.0, 0.3]],
         base_quat=[about_z(QUARTER + 0.1), about_z(QUARTER - 0.3), *([[0.0, 0.0, 0.0, 1.0]] * 3)],
@@ -107,9 +116,12 @@ def test_figures_by_hand():
         "success_rate": 1 / 5,
         "success_rate_in_range": 1 / 3,
         "single_jump_success_rate": 1 / 5,
+        "step_free_success_rate": 1 / 5,
         "landing_rate": 2 / 5,
         "second_hop_rate": 0.0,
+        "step_rate": 0.0,
         "mean_error_at_touchdown_m": (math.hypot(0.05, 0.1) + 0.2) / 2,
+        "mean_error_0_3_s_after_touchdown_m": (math.hypot(0.05, 0.07) + 0.1) / 2,
         "at_rest_within_1_s_rate": 1 / 2,
         "mean_landing_tilt_deg": math.degrees(0.15),
         "max_landing_tilt_deg": math.degrees(0.2),
@@ -166,6 +178,45 @@ def test_long_enough_in_the_air_after_touchdown_is_another_jump(steps, hopped):
     assert figures["single_jump_success_rate"] == float(not hopped)
 
 
+@pytest.mark.parametrize(
+    ("contacts", "stepped"),
+    [
+        ([((0, 1), 8), ((0, 1, 2, 3), 20)], False),  # hind paws that come down later were not lifted
+        ([((0, 1, 2, 3), 2), ((1, 2, 3), 2), ((0, 1, 2, 3), 2), ((1, 2, 3), 2), ((0, 1, 2, 3), 2)], False),
+        ([((0, 1, 2, 3), 2), ((1, 2, 3), 3), ((0, 1, 2, 3), 2)], True),
+        ([((0,), 1), ((1, 2), 3), ((0, 1, 2, 3), 2)], True),
+    ],
+)
+def test_paw_lifted_again_after_its_own_contact_is_a_step(contacts, stepped):
+    landings, env = Landings(np.zeros((1, 1, 2)), RULES), Stub(1)
+    landings.begin(env)
+    for phase, rows in ((0, [((0, 1, 2, 3), 5)]), (1, [((), 20)]), (2, contacts)):
+        env.now(phase=phase)
+        for down, count in rows:
+            env.stand_on(*down)
+            for _ in range(count):
+                assert not landings.follow(env)
+    env.now(phase_steps=60)
+    assert landings.follow(env)
+    figures = landing_figures(landings)
+    assert (figures["success_rate"], figures["second_hop_rate"]) == (1.0, 0.0)
+    assert (figures["step_rate"], figures["step_free_success_rate"]) == (float(stepped), float(not stepped))
+
+
+def test_flight_of_the_next_jump_is_no_step():
+    landings, env = Landings(np.zeros((1, 2, 2)), RULES), Stub(1)
+    landings.begin(env)
+    env.now(phase=2, phase_steps=60)
+    assert not landings.follow(env) and len(env.commanded) == 1
+    env.now(phase=1)
+    env.stand_on()
+    for _ in range(9):
+        assert not landings.follow(env)
+    env.now(phase=2, phase_steps=60)
+    assert landings.follow(env)
+    assert landings.success.all() and not landings.stepped.any()
+
+
 def test_jump_that_does_not_end_fails_where_it_is():
     landings, env = Landings(np.array([[[0.4, 0.0]]]), RULES), Stub(1)
     landings.begin(env)
@@ -200,6 +251,7 @@ def test_next_jump_is_measured_from_its_own_goal():
     assert landings.outcomes.tolist() == [["success", "success"], ["collided", "not_begun"]]
     figures = landing_figures(landings)
     assert figures["jumps"] == 3 and figures["success_rate"] == pytest.approx(2 / 3)
+    assert "success_rate_in_range" not in figures and "mean_error_in_range_m" not in figures
     everywhere = landing_figures(landings, np.ones((2, 2), dtype=bool))
     assert everywhere["success_rate_in_range"] == pytest.approx(2 / 3)
     assert landings.marks([0])[0, :, :2] == pytest.approx(np.array([[0.8, 0.2], [1.5, 0.15]]))
@@ -217,6 +269,11 @@ def test_columns_have_a_row_a_jump_and_none_for_jumps_that_were_not_begun():
 def test_ends_of_a_test_leave_the_shaping_out():
     rules = ends_of_a_test(make_task("horizontal-jump")).rules
     assert {rule.name for rule in rules} == set(RULES) and rules[0].name == "success"
+
+
+@pytest.mark.parametrize(("task", "range_m"), [("horizontal-jump", [0.2, 2.2]), ("omnidirectional-jump", [0.0, 0.7])])
+def test_trained_range_is_that_of_all_levels_straight_ahead(task, range_m):
+    assert list(trained_range(make_task(task)).values()) == range_m
 
 
 def test_each_world_may_have_its_own_time_of_the_command():

@@ -15,10 +15,12 @@ from test_solver_contact import (
 )
 
 from jumper_warp.dynamics import JumperDynamics
+from jumper_warp.env import JumpEnv
 from jumper_warp.grounds import BlockCfg
 from jumper_warp.robot import PHYSICS_DT, build_model
 from jumper_warp.simulation import SUBSTEPS
 from jumper_warp.solver import TOLERANCE, SolverJumper
+from jumper_warp.tasks import make_task
 from kernels.collision import SHANK_GROUND, collision_kernel
 from kernels.contact import BlockLaw, PawContact, block_velocity
 from kernels.ground import Ground, block_normal, ground_distance, surface, world_ground
@@ -357,3 +359,24 @@ def test_block_values_need_one_row_per_world():
     model = build_model(2, visuals=False, device="cpu")
     with pytest.raises(ValueError, match="each of 2 worlds"):
         SolverJumper(model, block=BlockCfg(center=(0.0, 0.0), mass=np.array([5.0, 5.0, 5.0])))
+
+
+@pytest.mark.parametrize("begin", ["reset", "evaluation_reset"])
+def test_a_new_episode_puts_the_block_back(begin):
+    block = BlockCfg(center=(1.0, 0.0), half=(0.3, 0.3), height=0.05, mass=10.0, friction=0.4)
+    env = JumpEnv(make_task("horizontal-jump"), 2, device="cpu", block=block)
+    start = env.sim.solver.block_position()
+    blocks = env._dynamics.robot.ground.blocks
+    moved = blocks.numpy()
+    moved["center"] += 0.2
+    moved["velocity"] = 0.5
+    blocks.assign(moved)
+    assert np.abs(env.sim.solver.block_position() - start).min() > 0.1
+    if begin == "reset":
+        env.reset()
+    else:
+        env.evaluation_reset(np.tile([0.8, 0.0, 0.0], (2, 1)))
+    np.testing.assert_allclose(env.sim.solver.block_position(), start, atol=1e-6)
+    assert not env.sim.solver.block_velocity().any()
+    with pytest.raises(ValueError, match="moving blocks"):
+        env.state_dict()

@@ -13,7 +13,7 @@ from toy_task import SMALL, PushTask, train_rank
 
 from jumper_warp.checkpoint import MANIFEST, CheckpointError, load_checkpoint, save_checkpoint
 from jumper_warp.ppo import PpoCfg
-from jumper_warp.train import CHECKPOINTS, CONFIG, TrainCfg, train
+from jumper_warp.train import CHECKPOINTS, CONFIG, Rank, Run, Stop, TrainCfg, train
 from jumper_warp.training_log import FIGURES
 from jumper_warp.vecenv import RslRlVecEnv, rsl_rl_config, train_rsl_rl
 
@@ -75,6 +75,39 @@ def test_a_resumed_run_equals_an_uninterrupted_one(cfg):
     found = final_state(resumed)
     for part in ("ppo", "env", "rng"):
         assert equal(found[part], whole[part]), part
+
+
+def resume_after(cfg, seconds, limit):
+    """Resume a checkpoint that tells of so many seconds (None: of none) under a time limit; return run and result."""
+    half = train(dataclasses.replace(cfg, iterations=2), make_env)
+    state = final_state(half)
+    assert 0.0 < state.pop("seconds") <= half.seconds
+    save_checkpoint(half.folder / CHECKPOINTS, state if seconds is None else {**state, "seconds": seconds})
+    cfg = dataclasses.replace(cfg, iterations=100_000, max_seconds=limit, resume=str(half.folder))
+    run = Run(cfg, make_env(cfg.num_envs, 1, "cpu"), Rank(0, 1, torch.device("cpu")))
+    with Stop() as stop:
+        return run, run.iterate(stop)
+
+
+def test_a_resumed_run_goes_on_in_time(cfg):
+    run, result = resume_after(cfg, 99.7, limit=100.0)
+    assert result.iteration > 2 and result.seconds < 5.0
+    assert final_state(result)["seconds"] >= result.figures["Perf/elapsed_s"] >= 100.0
+    assert run.ppo._desired_kl.item() == pytest.approx(cfg.ppo.final_kl, rel=0.05)  # desired_kl by its own time alone
+
+
+def test_a_resumed_run_whose_time_is_over_ends_at_once(cfg):
+    assert resume_after(cfg, 100.0, limit=100.0)[1].iteration == 2
+
+
+def test_a_checkpoint_that_tells_no_time_counts_from_zero(cfg):
+    result = resume_after(cfg, None, limit=0.3)[1]
+    assert 0.3 <= final_state(result)["seconds"] <= result.seconds < 5.0
+
+
+def test_a_checkpoint_with_an_unreadable_time_is_refused_in_one_line(cfg):
+    with pytest.raises(CheckpointError, match="does not fit these settings: could not convert string to float"):
+        resume_after(cfg, "late", limit=100.0)
 
 
 def test_latest_passes_over_a_damaged_checkpoint(cfg, capsys):

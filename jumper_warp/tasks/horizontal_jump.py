@@ -13,12 +13,9 @@ from dataclasses import replace
 from jumper_warp.motors import horizontal_jump_filter, jumping_motors
 from jumper_warp.ppo import PpoCfg
 from jumper_warp.tasks.task import Level, ResetCfg, Rule, TaskCfg, Term
+from jumper_warp.tasks.units import DEG, SECOND, G
 from kernels import jump_errors, observe, rewards, terminations
 
-G = 9.81
-DEG = 0.017453292519943295
-SECOND = 60.0
-"""Policy steps."""
 LANDING_HEIGHT = 0.30
 """[m] Of the base, at which the ballistic estimate ends."""
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, fields
+from itertools import accumulate
 from typing import Any
 
 import warp as wp
@@ -127,21 +128,37 @@ class ResetCfg:
     again_delay: Pair = (0.2, 0.7)
     """[s] From touchdown to the other goal."""
 
-    def ranges(self, step_dt: float) -> Any:
-        """Return the kernels' `ResetRanges`. Raises ValueError for shares that do not add up."""
-        shares = (self.standing, self.default, self.in_flight, self.touchdown)
-        if min(shares) < 0.0 or sum(shares) > 1.0 + 1e-9:
+    def __post_init__(self) -> None:
+        """Raises ValueError: shares do not add up, a pair is reversed, or a delay or a share is out of range."""
+        shares = self._shares()
+        if not min(shares) >= 0.0 or sum(shares) > 1.0 + 1e-9:
             raise ValueError(f"reset shares must be >= 0 and add up to at most 1, got {shares}")
+        for name, value in vars(self).items():
+            if isinstance(value, tuple) and not value[0] <= value[1]:
+                raise ValueError(f"reset {name} must be (lower, upper), got {value}")
+        for name, least in (("command_delay", self.command_delay), ("again_delay", self.again_delay[0])):
+            if not least >= 0.0:
+                raise ValueError(f"reset {name} must not be negative, got {least}")
+        if not 0.0 <= self.jump_again <= 1.0:
+            raise ValueError(f"reset jump_again must be in [0, 1], got {self.jump_again}")
+
+    def _shares(self) -> tuple[float, ...]:
+        return (self.standing, self.default, self.in_flight, self.touchdown)
+
+    def ranges(self, step_dt: float) -> Any:
+        """Return the kernels' `ResetRanges`: angles in radians, delays in policy steps of step_dt [s]."""
         ranges = ResetRanges()
-        ranges.shares = wp.vec4(*(sum(shares[: i + 1]) for i in range(4)))
+        ranges.shares = wp.vec4(*accumulate(self._shares()))
         degrees = ("tilt", "forward_pitch", "heading", "takeoff_angle", "flight_lateral", "flight_transversal")
-        for spec in fields(self)[4:-2]:
-            value = getattr(self, spec.name)
-            scale = math.pi / 180.0 if spec.name in degrees else 1.0
+        apart = ("standing", "default", "in_flight", "touchdown", "command_delay", "again_delay")
+        for name, value in vars(self).items():
+            if name in apart:
+                continue
+            scale = math.pi / 180.0 if name in degrees else 1.0
             if isinstance(value, tuple):
-                setattr(ranges, spec.name, wp.vec2(scale * value[0], scale * value[1]))
+                setattr(ranges, name, wp.vec2(scale * value[0], scale * value[1]))
             else:
-                setattr(ranges, spec.name, scale * value)
+                setattr(ranges, name, scale * value)
         ranges.command_delay = round(self.command_delay / step_dt)
         ranges.again_delay = wp.vec2(*(delay / step_dt for delay in self.again_delay))
         return ranges

@@ -10,12 +10,9 @@ from __future__ import annotations
 
 from jumper_warp.motors import jumping_motors, vertical_jump_filter
 from jumper_warp.tasks.task import Level, ResetCfg, Rule, TaskCfg, Term
+from jumper_warp.tasks.units import DEG, SECOND, G
 from kernels import jump_errors, observe, rewards, terminations
 
-G = 9.81
-DEG = 0.017453292519943295
-SECOND = 60.0
-"""Policy steps."""
 PATIENCE = 0.1
 """Share that the always-paid terms keep while a commanded jump has not begun."""
 

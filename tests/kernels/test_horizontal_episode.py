@@ -191,12 +191,20 @@ def test_an_ended_episode_begins_anew_instead(env):
     assert env.done.all() and not after["jumps"].any() and not after["steps"].any()
 
 
-@pytest.mark.parametrize("wait", [{"phase_steps": 11}, {"phase_steps": 13}, {"phase": STANCE}, {"phase": FLIGHT}])
+@pytest.mark.parametrize("wait", [{"phase_steps": 11}, {"phase": STANCE}, {"phase": FLIGHT}])
 def test_another_jump_waits_for_its_time_after_touchdown(env, wait):
     land(env, **({"again_step": 13} | wait))
     env.step(REST)
     going = env.done.numpy() == 0.0
     np.testing.assert_array_equal(env.task_arrays()["jumps"][going], (np.arange(N) % 3)[going])
+
+
+def test_another_jump_that_is_overdue_begins(env):
+    land(env, again_step=13, phase_steps=20)
+    env.step(REST)
+    going = env.done.numpy() == 0.0
+    assert going.any()
+    np.testing.assert_array_equal(env.task_arrays()["jumps"][going], (np.arange(N) % 3 + 1)[going])
 
 
 # ---------------------------------------------------------------- the caller's next jump

@@ -253,4 +253,31 @@ def test_worlds_past_the_last_level_draw_a_level_each_time():
 )
 def test_impossible_shares_are_refused(shares):
     with pytest.raises(ValueError, match="shares"):
-        ResetCfg(**shares).ranges(1.0 / 60.0)
+        ResetCfg(**shares)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"paw_depth": (0.45, 0.3)}, r"paw_depth must be \(lower, upper\), got \(0.45, 0.3\)"),
+        ({"again_delay": (0.7, 0.2)}, "again_delay must be"),
+        ({"landed_speed": (math.nan, 1.0)}, "landed_speed must be"),
+        ({"command_delay": -0.1}, "command_delay must not be negative, got -0.1"),
+        ({"again_delay": (-0.1, 0.2)}, "again_delay must not be negative"),
+        ({"jump_again": 1.1}, "jump_again must be in"),
+        ({"jump_again": -0.1}, "jump_again must be in"),
+    ],
+)
+def test_impossible_starts_are_refused(change, message):
+    with pytest.raises(ValueError, match=message) as caught:
+        ResetCfg(**change)
+    assert "\n" not in str(caught.value)
+
+
+def test_settings_reach_the_kernels_by_name_in_radians_and_steps():
+    cfg = ResetCfg(standing=0.5, default=0.25, in_flight=0.125, tilt=180.0, paw_depth=(0.25, 0.5), jump_again=0.75)
+    ranges = dataclasses.replace(cfg, command_delay=0.25, again_delay=(0.5, 1.0)).ranges(1.0 / 60.0)
+    assert list(ranges.shares) == [0.5, 0.75, 0.875, 0.875]
+    assert ranges.tilt == pytest.approx(math.pi) and list(ranges.takeoff_angle) == pytest.approx([0.872665, 1.308997])
+    assert (list(ranges.paw_depth), ranges.jump_again) == ([0.25, 0.5], 0.75)
+    assert ranges.command_delay == 15 and list(ranges.again_delay) == pytest.approx([30.0, 60.0])
