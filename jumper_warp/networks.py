@@ -22,6 +22,12 @@ def world_size() -> int:
     return torch.distributed.get_world_size() if torch.distributed.is_initialized() else 1
 
 
+def wait_for_ranks() -> None:
+    """Wait until every process got here, so that none leaves the group while another still uses it."""
+    if world_size() > 1:
+        torch.distributed.barrier()
+
+
 def average_over_ranks(x: torch.Tensor) -> torch.Tensor:
     """Average a tensor in place over all training processes, and return it."""
     if world_size() > 1:

@@ -18,7 +18,7 @@ from typing import Any, Literal, NamedTuple
 import torch
 
 from jumper_warp.checkpoint import CheckpointError, latest_checkpoint, load_checkpoint, save_checkpoint, write_whole
-from jumper_warp.networks import world_size
+from jumper_warp.networks import wait_for_ranks, world_size
 from jumper_warp.ppo import Ppo, PpoCfg, VecTask
 from jumper_warp.runtime import git_commit, versions
 from jumper_warp.training_log import Stopwatch, TrainingLog
@@ -168,6 +168,7 @@ def train(cfg: TrainCfg, make_env: MakeEnv) -> TrainResult:
         run = Run(cfg, env, rank)
         with Stop() as stop:
             result = run.iterate(stop)
+        wait_for_ranks()
         if stop.asked:
             raise SystemExit(INTERRUPTED)
         return result
