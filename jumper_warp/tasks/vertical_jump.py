@@ -3,8 +3,8 @@
 Forms and constants are the paper's and its authors' training configuration. Three changes make it learn instead of
 standing still for the terms that pay always: while a commanded jump has not begun these count a tenth (the posture on
 the ground too, or squatting would cost), both height terms have a wide third kernel, and the first levels ask for low
-jumps. An episode ends if the robot jumps before it is told to. The height at the apex pays twice, orientation three times
-as much; rest after landing pays and tilt costs; changes of the action cost ten times as much.
+jumps. An episode ends if the robot jumps before it is told to. The height at the apex pays twice, orientation three
+times as much; rest after landing pays and tilt costs; changes of the action cost ten times as much.
 """
 
 from __future__ import annotations
