@@ -18,7 +18,7 @@ from jumper_warp.motors import filter_params
 from jumper_warp.randomization import NUM_DRAWN, RandomizationCfg, Randomizer, no_motion
 from jumper_warp.simulation import Simulation, SolverName
 from jumper_warp.solver import SolverJumper
-from jumper_warp.tasks.task import TaskCfg
+from jumper_warp.tasks.task import GroundCfg, TaskCfg
 from kernels.control import ActionScales, action_kernel, push_kernel
 from kernels.episode import EpisodeArrays, EpisodeSettings, make_episode_kernel
 from kernels.evaluation import begin_evaluation_kernel, next_jump_kernel
@@ -58,11 +58,16 @@ class JumpEnv:
         ground: Any = "plane",
         block: BlockCfg | None = None,
     ):
-        """Build everything; call `reset` before the first step. ground, block: as in `Simulation`.
+        """Build everything; call `reset` before the first step.
 
+        ground, block: as in `Simulation`. By default those of the task if randomised on SolverJumper, else a plane.
         Raises ValueError for less than one environment, or as `Simulation`.
         """
         self.task, self.num_envs, self.seed = task, num_envs, seed
+        level = not randomize or solver != "jumper" or ground != "plane" or block is not None
+        self.drawn_ground = GroundCfg() if level else task.ground
+        if self.drawn_ground.drawn:
+            block = BlockCfg((0.0, 0.0))
         self.sim = Simulation(
             num_envs, solver=solver, motors=task.motors, visuals=visuals, device=device, ground=ground, block=block,
             tolerance=CONTACT_TOLERANCE,
@@ -77,6 +82,8 @@ class JumpEnv:
         self.auto_reset = auto_reset
         self.noise = task.noise.sensor_noise(noise)
         self._graphs: dict[bool, Any] = {}
+        if self.drawn_ground.drawn:
+            self.sim.solver.dynamics.robot.ground.blocks.zero_()  # until `reset` draws them
         self._allocate()
         self._prepare_kernels()
         jumper = isinstance(self.sim.solver, SolverJumper)
@@ -164,7 +171,7 @@ class JumpEnv:
 
         self.weights = wp.array([term.weight for term in task.terms], dtype=float, device=device)
         self._term_params, self._rule_params = params(task.terms), params(task.rules)
-        self._ranges = task.reset.ranges(self.step_dt)
+        self._ranges, self._grounds = task.reset.ranges(self.step_dt), self.drawn_ground.ranges()
         self._goal_lower = wp.array([level.goal_lower for level in task.levels], dtype=wp.vec3, device=device)
         self._goal_upper = wp.array([level.goal_upper for level in task.levels], dtype=wp.vec3, device=device)
         self._base_height = wp.array([level.base_height for level in task.levels], dtype=wp.vec2, device=device)
@@ -226,8 +233,8 @@ class JumpEnv:
         self._launch(
             reset_kernel,
             n,
-            [done, dyn.robot.geometry, dyn.robot.ground, self._limits, self._ranges, self._goal_lower,
-             self._goal_upper, self._base_height, sim.model.joint_q, self._random, self.tasks,
+            [done, dyn.robot.geometry, dyn.robot.ground, self._limits, self._ranges, self._grounds,
+             self._goal_lower, self._goal_upper, self._base_height, sim.model.joint_q, self._random, self.tasks,
              sim.state.joint_q, sim.state.joint_qd],
             [],
         )  # fmt: skip
@@ -277,6 +284,8 @@ class JumpEnv:
         headings [rad]: (num_envs,) or one for all.
         """
         self.auto_reset = False
+        if self.drawn_ground.drawn:
+            self._dynamics.robot.ground.blocks.zero_()
         headings = np.broadcast_to(np.asarray(headings, dtype=np.float32), self.num_envs).copy()
         self._launch(
             begin_evaluation_kernel,
@@ -296,7 +305,7 @@ class JumpEnv:
         goals [m]: (num_envs, 3), relative to base and yaw as they are. worlds: (num_envs,) bool.
         """
         chosen = wp.array(np.asarray(worlds).astype(np.int32), dtype=int, device=self.wp_device)
-        inputs = [self._vectors(goals), chosen, self.sim.state.joint_q]
+        inputs = [self._vectors(goals), chosen, self._dynamics.robot.ground, self.sim.state.joint_q]
         self._launch(next_jump_kernel, self.num_envs, inputs, [self.tasks])
 
     def _vectors(self, values: torch.Tensor | np.ndarray) -> wp.array:

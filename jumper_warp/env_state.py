@@ -10,7 +10,7 @@ import torch
 import warp as wp
 
 from jumper_warp.solver import SolverJumper
-from kernels.task import JumpTask, ViewArrays
+from kernels.task import ViewArrays
 
 if TYPE_CHECKING:
     from jumper_warp.env import JumpEnv
@@ -25,8 +25,8 @@ DRAWN_OUTSIDE = ("push", "delay", "joint_offset", "static_friction_ratio")
 """Parameters of the model, its motors and the environment that the seed decides."""
 MUJOCO = ("qacc_warmstart", "cvel", "cdof_dot")
 """What SolverMuJoCo carries from step to step beside Newton's state."""
-EPISODE = "episode."
-"""Before the name of a field of `JumpTask`."""
+EPISODE, BLOCK = "episode.", "block."
+"""Before the name of a field of `JumpTask` and of `Block`."""
 FINGERPRINT = "parameters"
 """Name of the drawn parameters' fingerprint."""
 
@@ -36,15 +36,11 @@ def save_state(env: JumpEnv) -> dict[str, torch.Tensor]:
 
     The world is the last axis of Warp's arrays and the first of observations and episodes. Drawn parameters are not
     in it, only their fingerprint: the seed draws them anew.
-
-    Raises:
-        ValueError: The environment has moving blocks.
     """
-    if env.sim.block is not None:
-        raise ValueError("the state of an environment with moving blocks cannot be saved")
     state = {name: tensor.to("cpu", copy=True) for name, tensor in _tensors(env).items()}
-    records = env.tasks.numpy()
-    state |= {EPISODE + name: torch.from_numpy(np.array(records[name])) for name in records.dtype.names}
+    for prefix, array in _records(env).items():
+        records = array.numpy()
+        state |= {prefix + name: torch.from_numpy(np.array(records[name])) for name in records.dtype.names}
     return state | {FINGERPRINT: parameter_fingerprint(env)}
 
 
@@ -54,8 +50,9 @@ def load_state(env: JumpEnv, state: dict[str, torch.Tensor]) -> None:
     Raises:
         ValueError: It is of another number of environments, other fields or other robots; nothing is changed.
     """
-    tensors, records = _tensors(env), env.tasks.numpy().copy()
-    names = {*tensors, *(EPISODE + name for name in records.dtype.names), FINGERPRINT}
+    tensors, records = _tensors(env), {prefix: array.numpy().copy() for prefix, array in _records(env).items()}
+    fields = {prefix + name: (prefix, name) for prefix, values in records.items() for name in values.dtype.names}
+    names = {*tensors, *fields, FINGERPRINT}
     if names != state.keys():
         raise ValueError(
             f"saved by another version or solver: lacks {sorted(names - state.keys())}, "
@@ -69,9 +66,10 @@ def load_state(env: JumpEnv, state: dict[str, torch.Tensor]) -> None:
             raise ValueError(f"saved {name} has shape {tuple(state[name].shape)}, expected {tuple(tensor.shape)}")
     if not torch.equal(state[FINGERPRINT], parameter_fingerprint(env)):
         raise ValueError("saved with other robots: seed, description or randomisation differ")
-    for name in records.dtype.names:
-        records[name] = state[EPISODE + name].numpy()
-    env.tasks.assign(wp.array(records, dtype=JumpTask, device=env.wp_device))
+    for field, (prefix, name) in fields.items():
+        records[prefix][name] = state[field].numpy()
+    for prefix, array in _records(env).items():
+        array.assign(wp.array(records[prefix], dtype=array.dtype, device=env.wp_device))
     for name, tensor in tensors.items():
         tensor.copy_(state[name])
 
@@ -83,6 +81,12 @@ def parameter_fingerprint(env: JumpEnv) -> torch.Tensor:
         for name in names:
             digest.update(getattr(owner, name).numpy().tobytes())
     return torch.frombuffer(bytearray(digest.digest()), dtype=torch.uint8)
+
+
+def _records(env: JumpEnv) -> dict[str, wp.array]:
+    """Return the environment's arrays of structs by the prefix of their fields; blocks only where there are any."""
+    blocks = env._dynamics.robot.ground.blocks
+    return {EPISODE: env.tasks} | ({BLOCK: blocks} if blocks.shape[0] else {})
 
 
 def _tensors(env: JumpEnv) -> dict[str, torch.Tensor]:

@@ -21,7 +21,8 @@ from jumper_warp.networks import EPS, NORMALISED_LIMIT, RAW_LIMIT
 from jumper_warp.policy import Policy, load_policy
 from jumper_warp.policy_interface import PolicyError, interface_of_task
 from jumper_warp.tasks import make_task
-from jumper_warp.tasks.task import TaskCfg
+from jumper_warp.tasks.task import Rule, TaskCfg, Term
+from kernels import rewards, terminations
 
 if TYPE_CHECKING:
     from jumper_warp.env import JumpEnv
@@ -145,8 +146,8 @@ def env_of_policy(
 def restored_task(config: dict[str, Any]) -> TaskCfg:
     """Return the task of a saved configuration, from its entry `env` (`JumpEnv.config`).
 
-    Settings that the file lacks keep the project's defaults. Reward terms that the project does not have are left out,
-    as a policy does not need them; anything else unknown is refused.
+    Settings that the file lacks have the defaults of their class: what they did before they existed. Reward terms that
+    the project does not have are left out, as a policy does not need them; anything else unknown is refused.
 
     Raises:
         PolicyError: The configuration is not of a task of the project.
@@ -155,7 +156,7 @@ def restored_task(config: dict[str, Any]) -> TaskCfg:
         saved = dict(config["env"]["task"])
         default = make_task(saved["name"])
         known = {term.func.key for term in default.terms}
-        saved["terms"] = [term for term in saved["terms"] if term["func"] in known]
+        saved["terms"] = [term for term in saved["terms"] if term["func"] in known or _on(rewards, term["func"])]
     except (KeyError, TypeError, ValueError) as error:
         raise PolicyError(f"no task in the configuration ({type(error).__name__}: {error})") from error
     try:
@@ -193,6 +194,11 @@ def _restored_fields(default: Any, saved: Any, where: str) -> Any:
         raise PolicyError(f"{where}: unknown setting {unknown[0]!r:.60}")
     hints = get_type_hints(type(default))
     changes = {}
+    for spec in dataclasses.fields(default):
+        if spec.name not in saved and spec.default_factory is not dataclasses.MISSING:
+            changes[spec.name] = spec.default_factory()
+        elif spec.name not in saved and spec.default is not dataclasses.MISSING:
+            changes[spec.name] = spec.default
     for name, value in saved.items():
         if value is None and types.NoneType in get_args(hints[name]):
             changes[name] = None
@@ -217,12 +223,25 @@ def _restored_tuple(default: tuple, saved: Any, where: str) -> tuple:
     return tuple(_restored(d, value, f"{where}[{i}]") for i, (d, value) in enumerate(zip(default, saved, strict=True)))
 
 
+def _on(shelf: types.ModuleType, name: Any) -> wp.Function | None:
+    """Return the Warp function of a name that a module defines."""
+    func = getattr(shelf, name, None) if isinstance(name, str) else None
+    return func if isinstance(func, wp.Function) and func.func.__module__ == shelf.__name__ else None
+
+
 def _row(rows: tuple, saved: Any, where: str) -> Any:
-    """Return the default row that a saved row builds on: the one with the same function, if rows have functions."""
+    """Return the default row that a saved row builds on: the one with the same function, if rows have functions.
+
+    A function that the task does not use is looked up among the project's rewards or terminations.
+    """
     if not hasattr(rows[0], "func"):
         return rows[0]
     key = saved.get("func") if isinstance(saved, dict) else None
     for row in rows:
         if row.func.key == key:
             return row
+    if isinstance(rows[0], Term) and _on(rewards, key):
+        return Term(_on(rewards, key), 0.0)
+    if isinstance(rows[0], Rule) and _on(terminations, key):
+        return Rule(_on(terminations, key))
     raise PolicyError(f"{where}: this version has no {key!r:.60}")

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from jumper_warp.motors import FilterCfg, MotorCfg
 from jumper_warp.randomization import RandomizationCfg
-from jumper_warp.tasks.task import Level, NoiseCfg, Pair, ResetCfg, Rule, TaskCfg, Term
+from jumper_warp.tasks.task import GroundCfg, Level, NoiseCfg, Pair, ResetCfg, Rule, TaskCfg, Term
 
 
 @dataclass(frozen=True)
@@ -27,6 +27,7 @@ class TaskFlags:
     action_scale: Pair
     """[deg] Lateral and transversal."""
     reset: ResetCfg
+    ground: GroundCfg
     noise: NoiseCfg
     randomization: RandomizationCfg
     takeoff_speed: float

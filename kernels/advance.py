@@ -6,7 +6,7 @@ from .actuator import MotorArrays
 from .base_dynamics import BaseInverse, LegSolve, invert, motor_acceleration, solve_ang, solve_lin
 from .base_motion import moved_base
 from .contact import BlockLaw, ContactState, PawContact, block_velocity, on_block, solve_contacts
-from .ground import move_block, rest_block
+from .ground import has_block, move_block, rest_block
 from .leg_dynamics import PawKinematics
 from .parameters import BODIES, COORDS, DOFS, GRAVITY, load_vec3
 from .scalar import real, vec3
@@ -108,7 +108,7 @@ def load_contact(
     guess = work.impulse[k, world]
     touch = touch_floor(robot, k, base, paw)
     contacts[k] = paw_contact(robot, world, k, base, lin, ang, rates, old_rates, guess, paw, leg, inverse, touch, dt)
-    if robot.ground.blocks.shape[0] > 0:
+    if has_block(robot.ground, world):
         above = touch_block(robot, world, k, base, paw, block)
         if above.gap < touch.gap:
             contact = paw_contact(
@@ -146,7 +146,7 @@ def advance_once(
             robot, work, world, k, base, lin, ang, rates[k], old, paws[k], legs[k], inverse, block, dt, contacts
         )
     change = solve_contacts(contacts, block, settings.max_sweeps, settings.tolerance)
-    if robot.ground.blocks.shape[0] > 0:
+    if has_block(robot.ground, world):
         move_block(robot.ground, world, wp.quat_rotate(base.quat, block_velocity(block, contacts)), dt)
     record_contacts(work, world, base, contacts, change, dt)
     for k in range(legs.shape[0]):

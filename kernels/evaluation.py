@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from .ground import Ground, rest_block
+from .ground import Ground, rest_block, surface, world_ground
 from .parameters import COORDS, DOFS
 from .reset import begin_next_jump
 from .reset_draws import turned
@@ -40,9 +40,12 @@ def begin_evaluation_kernel(
         joint_q[i + 3 + j] = turn[j]
     task = JumpTask()
     task.heading = headings[world]
+    here = world_ground(ground, world)
+    joint_q[i + 2] = joint_q[i + 2] + surface(here, 0.0, 0.0)[0]
     task.level = tasks[world].level
     task.start = wp.vec3(joint_q[i], joint_q[i + 1], joint_q[i + 2])
     task.goal = turned(goals[world], headings[world]) + wp.vec3(task.start[0], task.start[1], 0.0)
+    task.goal_ground = surface(here, task.goal[0], task.goal[1])[0]
     task.max_height = joint_q[i + 2]
     task.command_step = command_step
     tasks[world] = task
@@ -53,6 +56,7 @@ def next_jump_kernel(
     # in
     goals: wp.array(dtype=wp.vec3),
     chosen: wp.array(dtype=int),
+    ground: Ground,
     joint_q: wp.array(dtype=float),
     # in, out
     tasks: wp.array(dtype=JumpTask),
@@ -64,4 +68,4 @@ def next_jump_kernel(
     i = world * COORDS
     pos = wp.vec3(joint_q[i], joint_q[i + 1], joint_q[i + 2])
     quat = wp.quat(joint_q[i + 3], joint_q[i + 4], joint_q[i + 5], joint_q[i + 6])
-    tasks[world] = begin_next_jump(tasks[world], goals[world], pos, yaw_of(quat))
+    tasks[world] = begin_next_jump(tasks[world], world_ground(ground, world), goals[world], pos, yaw_of(quat))

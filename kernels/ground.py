@@ -50,6 +50,14 @@ def world_ground(ground: Ground, world: int) -> Ground:
 
 
 @wp.func
+def has_block(ground: Ground, world: int) -> bool:
+    """Return whether there is a block in a world."""
+    if ground.blocks.shape[0] == 0:
+        return False
+    return ground.blocks[world].exists != 0
+
+
+@wp.func
 def move_block(ground: Ground, world: int, velocity: vec3, dt: real):
     """Let the block of a world slide for dt [s] with a velocity [m/s], world frame; upward parts do not count."""
     block = ground.blocks[world]

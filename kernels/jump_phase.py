@@ -30,8 +30,8 @@ def estimated_landing(pos: wp.vec3, lin_vel: wp.vec3, height: float) -> wp.vec2:
 
 @wp.func
 def landing_error_estimate(view: RobotView, task: JumpTask, height: float) -> float:
-    """Return how far from the goal [m] the base's projectile falls through a height [m]."""
-    landing = estimated_landing(view.pos, view.lin_vel, height)
+    """Return how far from the goal [m] the base's projectile falls through a height [m] above the ground there."""
+    landing = estimated_landing(view.pos, view.lin_vel, height + task.goal_ground)
     return wp.length(wp.vec2(task.goal[0] - landing[0], task.goal[1] - landing[1]))
 
 

@@ -114,7 +114,7 @@ def observe_horizontal(
 def observe_episode(out: wp.array2d(dtype=float), world: int, first: int, view: RobotView, task: JumpTask):
     """Write phase, times [s], estimates [m] and paw forces for the critic, from column `first`."""
     yaw = yaw_of(view.quat)
-    landing = estimated_landing(view.pos, view.lin_vel, 0.3)
+    landing = estimated_landing(view.pos, view.lin_vel, 0.3 + task.goal_ground)
     miss = in_heading(wp.vec3(task.goal[0] - landing[0], task.goal[1] - landing[1], 0.0), yaw)
     way = in_heading(goal_offset(view, task), yaw)
     for j in range(3):

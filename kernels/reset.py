@@ -11,7 +11,8 @@ import warp as wp
 from .actuator import motor_slot
 from .collision import world_collisions
 from .geometry import LegGeometry
-from .ground import Ground, rest_block, surface
+from .ground import Block, Ground, rest_block, surface, world_ground
+from .ground_draws import GroundRanges, draw_ground, footprint
 from .inverse_kinematics import LegLimits, clamped_closed_form
 from .leg_kinematics import leg_forward_kinematics, leg_inverse_velocity
 from .parameters import COORDS, DOFS
@@ -19,6 +20,7 @@ from .reset_draws import (
     AFTER_LANDING,
     DEFAULT,
     IN_FLIGHT,
+    STANDING,
     TOUCHDOWN,
     Draw,
     ResetRanges,
@@ -190,11 +192,12 @@ def begin_task(
 
 
 @wp.func
-def begin_next_jump(old: JumpTask, goal: wp.vec3, pos: wp.vec3, heading: float) -> JumpTask:
+def begin_next_jump(old: JumpTask, ground: Ground, goal: wp.vec3, pos: wp.vec3, heading: float) -> JumpTask:
     """Return the state of an episode that goes on with another jump at once; goal relative to base and heading."""
     task = old
     task.heading = heading
     task.goal = turned(goal, heading) + wp.vec3(pos[0], pos[1], 0.0)
+    task.goal_ground = surface(ground, task.goal[0], task.goal[1])[0]
     task.start = pos
     task.phase = STANCE
     task.phase_steps = 0
@@ -208,6 +211,22 @@ def begin_next_jump(old: JumpTask, goal: wp.vec3, pos: wp.vec3, heading: float) 
     return task
 
 
+@wp.func
+def place_ground(
+    ground: Ground, world: int, state: wp.uint32, ranges: ResetRanges, grounds: GroundRanges, scheme: int,
+    heading: float, goal: wp.vec3,
+) -> Ground:  # fmt: skip
+    """Put the block of a world to its start, or draw another if blocks are drawn; returns the ground as it is there."""
+    if grounds.platform + grounds.block > 0.0:
+        block = Block()
+        if scheme == STANDING or scheme == DEFAULT:
+            block = draw_ground(state, grounds, footprint(ranges, heading), goal)
+        ground.blocks[world] = block
+    else:
+        rest_block(ground, world)
+    return world_ground(ground, world)
+
+
 @wp.kernel
 def reset_kernel(
     # in
@@ -216,6 +235,7 @@ def reset_kernel(
     ground: Ground,
     limits: LegLimits,
     ranges: ResetRanges,
+    grounds: GroundRanges,
     goal_lower: wp.array(dtype=wp.vec3),
     goal_upper: wp.array(dtype=wp.vec3),
     base_height: wp.array(dtype=wp.vec2),
@@ -246,24 +266,24 @@ def reset_kernel(
     if done[world] == 0.0:
         pos = wp.vec3(joint_q[q], joint_q[q + 1], joint_q[q + 2])
         quat = wp.quat(joint_q[q + 3], joint_q[q + 4], joint_q[q + 5], joint_q[q + 6])
-        task = begin_next_jump(task, goal, pos, yaw_of(quat))
+        task = begin_next_jump(task, world_ground(ground, world), goal, pos, yaw_of(quat))
         task.again_step = draw_again(state, ranges)
         tasks[world] = task
         return
-    rest_block(ground, world)
     scheme = draw_scheme(state, ranges)
     heading = between(state, 13, -ranges.heading, ranges.heading)
     goal = turned(goal, heading)
+    here = place_ground(ground, world, state, ranges, grounds, scheme, heading, goal)
     taken = draw_until_taken(
-        geometry, ground, limits, ranges, state, world, scheme, heading, base_height[level], goal, joint_q, joint_qd
+        geometry, here, limits, ranges, state, world, scheme, heading, base_height[level], goal, joint_q, joint_qd
     )
     if taken == 0:
         scheme = int(DEFAULT)
-        here = surface(ground, 0.0, 0.0)
-        store_default(reference_q, world, heading, here[0], joint_q, joint_qd)
+        store_default(reference_q, world, heading, surface(here, 0.0, 0.0)[0], joint_q, joint_qd)
     pos = wp.vec3(joint_q[q], joint_q[q + 1], joint_q[q + 2])
     task = begin_task(task, state, ranges, scheme, goal, pos, joint_qd[world * DOFS + 2])
     task.heading = heading
+    task.goal_ground = surface(here, goal[0], goal[1])[0]
     tasks[world] = task
 
 

@@ -282,6 +282,14 @@ def landing_tilt(view: RobotView, task: JumpTask, p: wp.vec4) -> float:
     return sine * sine
 
 
+@wp.func
+def lifted_paws(view: RobotView, task: JumpTask, p: wp.vec4) -> float:
+    """Steps after landing: paws off the ground later than p0 policy steps after touchdown, 0 to 4."""
+    if task.phase != LANDED or task.phase_steps <= int(p[0]):
+        return 0.0
+    return float(4 - view.contacts)
+
+
 # ---------------------------------------------------------------- regularization
 
 

@@ -43,6 +43,7 @@ class JumpTask:
 
     goal: wp.vec3  # [m] where to land: base x, y; and its wanted height at the apex, 0 if any will do
     start: wp.vec3  # [m] base origin where the jump began
+    goal_ground: float  # [m] height of the ground there
     heading: float  # [rad] yaw of the jump
     phase: int  # STANCE, FLIGHT, LANDED
     steps: int  # policy steps since the episode began

@@ -5,6 +5,7 @@ from jump_helpers import DEFAULT_ANGLE, make_episode, make_view
 from scipy.spatial.transform import Rotation
 
 DT = 1.0 / 60.0
+CONTACT_FORCE = 0.1  # [N]
 G = 9.81
 SLOTS = np.array([5 * leg + joint for leg in range(4) for joint in (0, 1, 3)])
 T = np.arange(12) % 3 != 0
@@ -50,7 +51,8 @@ def random_robots(n: int, seed: int) -> dict[str, np.ndarray]:
         "angle": DEFAULT_ANGLE[:, None] + near.T * rng.normal(size=(12, n)),
         "rate_change": 100.0 * rng.normal(size=(12, n)),
         "torque": 9.0 * rng.normal(size=(12, n)), "action": rng.uniform(-1.0, 1.0, (12, n)),
-        "old_action": rng.uniform(-1.0, 1.0, (12, n)), "force": 100.0 * rng.random((4, n)), "clipped": rng.random(n),
+        "old_action": rng.uniform(-1.0, 1.0, (12, n)), "force": 100.0 * rng.uniform(-0.5, 1.0, (4, n)).clip(0.0),
+        "clipped": rng.random(n),
         "goal": goal, "heading": heading, "start": pos + near * rng.normal(size=(n, 3)), "phase": rng.integers(0, 3, n),
         "phase_steps": rng.integers(0, 60, n), "steps": rng.integers(0, 60, n), "command_step": rng.integers(0, 60, n),
         "took_off": rng.integers(0, 2, n), "touched_down": rng.integers(0, 2, n), "at_apex": rng.integers(0, 2, n),
@@ -66,6 +68,7 @@ def kernel_inputs(r: dict) -> tuple[list, list]:
     for i in range(len(r["pos"])):
         base = {"pos": r["pos"][i], "quat": r["quat"][i], "lin_vel": r["vel"][i], "lin_acc": r["acc"][i]}
         base |= {"ang_vel": r["spin"][i], "gravity": gravity[i], "paw_force": r["force"][:, i]}
+        base |= {"contacts": int(np.count_nonzero(r["force"][:, i] > CONTACT_FORCE))}
         views.append(make_view(**base, **{name: r[name][:, i] for name in motors}, clipped=float(r["clipped"][i])))
         tasks.append(make_episode(**{name: r[name][i] if r[name].ndim > 1 else r[name][i].item() for name in EPISODE}))
     return views, tasks
@@ -199,6 +202,9 @@ TERMS = {
     "standing_posture": lambda r, p: at_ease(r) * posture(r, p[0], p[1]),
     "rest": lambda r, p: at_ease(r) * phi(norm(r["vel"]), p[0]) * phi(norm(r["spin"]), p[1]),
     "landing_tilt": lambda r, p: (r["phase"] == LANDED) * (lean(r) / np.sin(p[0])) ** 2,
+    "lifted_paws": lambda r, p: (
+        ((r["phase"] == LANDED) & (r["phase_steps"] > p[0])) * np.count_nonzero(r["force"] <= CONTACT_FORCE, axis=0)
+    ),
     "soft_impact": lambda r, p: soon(r) * np.maximum(1.0 - deceleration(r) / p[0], 0.0),
     "stance_impact": lambda r, p: -1.0 * (r["phase"] == STANCE) * np.minimum(deceleration(r) / p[0], 1.0),
     "catch_landing": lambda r, p: soon(r) * np.clip(-r["vel"][:, 2], 0.0, 1.0),

@@ -13,6 +13,7 @@ from jumper_warp.env import JumpEnv
 from jumper_warp.env_state import parameter_fingerprint
 from jumper_warp.ppo import PpoCfg
 from jumper_warp.tasks import make_task
+from jumper_warp.tasks.task import GroundCfg
 from jumper_warp.train import CHECKPOINTS, TrainCfg, train
 
 N = 16
@@ -101,6 +102,51 @@ def test_an_environment_goes_on_from_a_saved_state_bit_for_bit(solver):
         ended += saved.done.sum().item()
     assert (saved.tasks.numpy() == fresh.tasks.numpy()).all()
     assert 0.0 < ended
+
+
+def ground_env(count=N, platform=0.4, block=0.6, **arguments):
+    """Environment of far goals, whose starts have a platform or a block where there is room."""
+    task = make_task("horizontal-jump")
+    task = dataclasses.replace(task, levels=task.levels[-1:], ground=GroundCfg(platform=platform, block=block))
+    return make_env(count, task=task, **({"seed": 1} | ALL_ON | arguments))
+
+
+def test_an_environment_goes_on_with_its_drawn_grounds_bit_for_bit():
+    saved, fresh = ground_env(), ground_env()
+    for action in random_actions(N, 5):
+        saved.step(action)
+    blocks = saved._dynamics.robot.ground.blocks
+    sliding = blocks.numpy().copy()
+    assert sliding["exists"].any() and not sliding["exists"].all()
+    sliding["velocity"] = 0.3 * sliding["exists"][:, None]
+    blocks.assign(sliding)
+    fresh.load_state_dict(saved.state_dict())
+    ended = 0.0
+    for step, action in enumerate(random_actions(N, 25, seed=1)):
+        for env in (saved, fresh):
+            env.step(action)
+        for name in ("obs", "final_obs", "reward", "done", "timeout"):
+            assert torch.equal(getattr(saved, name), getattr(fresh, name)), (step, name)
+        found, expected = (env._dynamics.robot.ground.blocks.numpy() for env in (fresh, saved))
+        assert (found == expected).all(), step
+        ended += saved.done.sum().item()
+        if step == 0:
+            moved = np.abs(expected["center"] - sliding["center"]).max(axis=1)
+            assert (moved[(sliding["exists"] == 1) & (sliding["mass"] < 1.0e3)] > 1e-3).any()
+    np.testing.assert_array_equal(saved.sim.joint_qd(), fresh.sim.joint_qd())
+    assert (saved.tasks.numpy() == fresh.tasks.numpy()).all()
+    assert 0.0 < ended
+
+
+@pytest.mark.parametrize(("blocks", "message"), [(True, "lacks .*'block.center'"), (False, "has .*'block.center'")])
+def test_blocks_in_only_one_of_state_and_environment_are_refused(blocks, message):
+    with_blocks, level = ground_env(2), ground_env(2, platform=0.0, block=0.0)
+    env, other = (with_blocks, level) if blocks else (level, with_blocks)
+    before = env.state_dict()
+    with pytest.raises(ValueError, match=message) as caught:
+        env.load_state_dict(other.state_dict())
+    assert "\n" not in str(caught.value)
+    assert equal(env.state_dict(), before)
 
 
 def test_a_saved_state_does_not_change_with_the_environment():

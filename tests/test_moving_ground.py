@@ -367,16 +367,18 @@ def test_a_new_episode_puts_the_block_back(begin):
     env = JumpEnv(make_task("horizontal-jump"), 2, device="cpu", block=block)
     start = env.sim.solver.block_position()
     blocks = env._dynamics.robot.ground.blocks
-    moved = blocks.numpy()
+    moved = blocks.numpy().copy()
     moved["center"] += 0.2
     moved["velocity"] = 0.5
     blocks.assign(moved)
     assert np.abs(env.sim.solver.block_position() - start).min() > 0.1
+    state = env.state_dict()
     if begin == "reset":
         env.reset()
     else:
         env.evaluation_reset(np.tile([0.8, 0.0, 0.0], (2, 1)))
     np.testing.assert_allclose(env.sim.solver.block_position(), start, atol=1e-6)
     assert not env.sim.solver.block_velocity().any()
-    with pytest.raises(ValueError, match="moving blocks"):
-        env.state_dict()
+    env.load_state_dict(state)
+    np.testing.assert_array_equal(env.sim.solver.block_position(), moved["center"])
+    np.testing.assert_array_equal(env.sim.solver.block_velocity(), np.full((2, 2), 0.5))

@@ -8,6 +8,8 @@ from jumper_warp.env import plain
 from jumper_warp.policy_interface import PolicyError, PolicyInterface, interface_of_task
 from jumper_warp.saved_run import restored_task
 from jumper_warp.tasks import make_task
+from jumper_warp.tasks.task import GroundCfg, Rule, Term
+from kernels import rewards, terminations
 
 
 def test_interface_of_the_vertical_jump_has_the_robots_figures():
@@ -49,6 +51,45 @@ def test_unknown_reward_is_left_out(saved):
     task, config = saved
     config["env"]["task"]["terms"].append({"func": "my_own", "weight": 1.0, "params": [], "once": False})
     assert restored_task(config) == task
+
+
+def test_a_reward_that_the_task_does_not_use_comes_back(saved):
+    task, config = saved
+    term = Term(rewards.lifted_paws, -3.0, (30.0,))
+    config["env"]["task"]["terms"].append(json.loads(json.dumps(plain(term))))
+    assert restored_task(config) == dataclasses.replace(task, terms=(*task.terms, term))
+
+
+@pytest.mark.parametrize("success", [False, True])
+def test_a_rule_that_the_task_does_not_use_comes_back(saved, success):
+    task, config = saved
+    rule = Rule(terminations.left_stance, (0.3,), success=success)
+    config["env"]["task"]["rules"].append(json.loads(json.dumps(plain(rule))))
+    assert restored_task(config) == dataclasses.replace(task, rules=(*task.rules, rule))
+
+
+def test_drawn_grounds_come_back_and_default_to_none(saved):
+    task, config = saved
+    ground = GroundCfg(platform=0.25, block=0.5, drop=(0.05, 0.1), clearance=0.2)
+    config["env"]["task"]["ground"] = json.loads(json.dumps(plain(ground)))
+    assert restored_task(config) == dataclasses.replace(task, ground=ground)
+    del config["env"]["task"]["ground"]
+    assert restored_task(config) == dataclasses.replace(task, ground=GroundCfg())
+
+
+def test_a_task_from_before_its_grounds_stays_level():
+    task = make_task("horizontal-jump")
+    config = json.loads(json.dumps({"env": {"task": plain(task)}}))
+    del config["env"]["task"]["ground"]
+    assert task.ground.drawn and restored_task(config) == dataclasses.replace(task, ground=GroundCfg())
+
+
+@pytest.mark.parametrize("name", ["wp", "SOON", "__doc__", "landing_error_estimate", "", "cartwheel", 3, None])
+def test_a_rule_that_is_no_termination_is_refused(saved, name):
+    _, config = saved
+    config["env"]["task"]["rules"][1]["func"] = name
+    with pytest.raises(PolicyError, match=rf"task.rules\[1\]: this version has no {name!r}"):
+        restored_task(config)
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,9 @@ wider (0.5 m instead of 0.2), that of the predicted error too (0.55 m instead of
 second later decides instead; the base may be as low as 0.25 m at touchdown (0.30); the symmetry counts a tenth while a
 commanded jump has not begun; standing still and level before the command and after the landing pays, tilt after
 touchdown and ground forces cost; changes of the action cost 1.0 instead of 0.03 and the entropy bonus is a third, since
-the exploration noise grew and grew. Goals reach 2.2 m instead of 1.0. Starts have any heading.
+the exploration noise grew and grew. Goals reach 2.2 m instead of 1.0. Starts have any heading. A randomised training
+also jumps off platforms and onto blocks; paws that are lifted again later than 0.2 s after touchdown cost; projectiles
+of starts in flight may leave at 35 degrees (50).
 """
 
 from __future__ import annotations
@@ -15,7 +17,7 @@ from dataclasses import replace
 
 from jumper_warp.motors import horizontal_jump_filter, jumping_motors
 from jumper_warp.ppo import PpoCfg
-from jumper_warp.tasks.task import Level, ResetCfg, Rule, TaskCfg, Term
+from jumper_warp.tasks.task import GroundCfg, Level, ResetCfg, Rule, TaskCfg, Term
 from jumper_warp.tasks.units import DEG, SECOND, G
 from kernels import jump_errors, observe, rewards, terminations
 
@@ -32,6 +34,7 @@ TERMS = (
     Term(rewards.standing_posture, 50.0, (20.0 * DEG, 25.0 * DEG)),
     Term(rewards.rest, 40.0, (0.1, 0.5)),
     Term(rewards.landing_tilt, -20.0, (10.0 * DEG,)),
+    Term(rewards.lifted_paws, -5.0, (0.2 * SECOND,)),
     Term(rewards.soft_impact, 20.0, (5.0 * G,)),
     Term(rewards.catch_landing, 20.0),
     Term(rewards.damp_landing, 25.0),
@@ -88,6 +91,7 @@ def horizontal_jump() -> TaskCfg:
         motors=jumping_motors(18.0, lateral_torque=12.0),
         command_filter=horizontal_jump_filter(),
         action_scale=(15.0, 90.0),
+        ground=GroundCfg(platform=0.35, block=0.25),
         ppo=PpoCfg(gamma=0.99, entropy_coef=0.0003),
         takeoff_speed=0.25,
         reset=ResetCfg(
@@ -98,6 +102,7 @@ def horizontal_jump() -> TaskCfg:
             forward_pitch=10.0,
             heading=180.0,
             takeoff_ahead=(0.0, 0.1),
+            takeoff_angle=(35.0, 75.0),
             landing_height=LANDING_HEIGHT,
             flight_time=(0.02, 0.10),
             flight_transversal=(40.0, 80.0),

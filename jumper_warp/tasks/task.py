@@ -13,6 +13,7 @@ from jumper_warp.motors import FilterCfg, MotorCfg
 from jumper_warp.ppo import PpoCfg
 from jumper_warp.randomization import RandomizationCfg
 from kernels import terminations
+from kernels.ground_draws import EVERY_SIDE, GroundRanges
 from kernels.observe import SensorNoise
 from kernels.reset_draws import ResetRanges
 
@@ -203,6 +204,51 @@ class NoiseCfg:
 
 
 @dataclass(frozen=True)
+class GroundCfg:
+    """What standing starts of a randomised training stand on or jump to; elsewhere the ground is level."""
+
+    platform: float = 0.0
+    """[1] Share that begins on a platform, where the paws have room to land beside it."""
+    block: float = 0.0
+    """[1] Share with a block under the goal that slides, where there is room before it."""
+    drop: Pair = (0.03, 0.20)
+    """[m] Height of the platform."""
+    rise: Pair = (0.02, 0.08)
+    """[m] Height of the block."""
+    room: float = 0.30
+    """[m] Most between the paws and an edge, each way."""
+    clearance: float = 0.12
+    """[m] Least between an edge that must be crossed and the paws at the goal."""
+    mass: Pair = (5.0, 100.0)
+    """[kg] Of the block."""
+    friction: Pair = (0.3, 1.0)
+    """[1] Of block and floor."""
+
+    def __post_init__(self) -> None:
+        """Raises ValueError: shares or lengths out of range, or a pair that is reversed, not positive or not finite."""
+        if not (min(self.platform, self.block) >= 0.0 and self.platform + self.block <= 1.0):
+            raise ValueError(f"ground shares must be >= 0 and add up to at most 1, got {self.platform}, {self.block}")
+        for name, value in vars(self).items():
+            if isinstance(value, tuple) and not 0.0 < value[0] <= value[1] < math.inf:
+                raise ValueError(f"ground {name} must be (lower, upper), positive and finite, got {value}")
+        for name, least in (("room", EVERY_SIDE), ("clearance", 0.0)):
+            if not least <= getattr(self, name) < math.inf:
+                raise ValueError(f"ground {name} must be finite and at least {least:g}, got {getattr(self, name)}")
+
+    @property
+    def drawn(self) -> bool:
+        """Whether there is anything but level ground."""
+        return self.platform + self.block > 0.0
+
+    def ranges(self) -> Any:
+        """Return the kernels' `GroundRanges`."""
+        ranges = GroundRanges()
+        for name, value in vars(self).items():
+            setattr(ranges, name, wp.vec2(*value) if isinstance(value, tuple) else value)
+        return ranges
+
+
+@dataclass(frozen=True)
 class TaskCfg:
     """A task on the robot."""
 
@@ -221,6 +267,7 @@ class TaskCfg:
     action_scale: Pair
     """[deg] Lateral and transversal."""
     reset: ResetCfg = field(default_factory=ResetCfg)
+    ground: GroundCfg = field(default_factory=GroundCfg)
     noise: NoiseCfg = field(default_factory=NoiseCfg)
     randomization: RandomizationCfg = field(default_factory=RandomizationCfg)
     ppo: PpoCfg = field(default_factory=PpoCfg)

@@ -166,6 +166,13 @@ def test_the_critic_sees_heights_way_and_predicted_miss_even_before_the_command(
     np.testing.assert_allclose(found, expected, atol=1e-5)
 
 
+def test_the_predicted_miss_is_that_above_the_ground_at_the_goal():
+    robots = robot_with(goal=(1.6, -0.8, 0.0), goal_ground=0.08)
+    robots.q[0, :3], robots.qd[0, :3] = (1.0, -1.0, 0.60625), (1.0, -0.6, 2.0)
+    # half a second to 0.38 m, at (1.5, -1.3)
+    np.testing.assert_allclose(robots.both()[1][0, ROBOT + 7 : ROBOT + 9], [0.1, 0.5], atol=1e-5)
+
+
 def test_the_critic_sees_paw_forces_in_body_weights_and_no_more_than_five():
     robots = robot_with()
     robots.force[:, 0] = [(0.0, 0.0, 0.0), (84.0, 0.0, 112.0), (0.0, 0.0, 70.0), (0.0, 9000.0, 0.0)]

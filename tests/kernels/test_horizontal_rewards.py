@@ -74,6 +74,14 @@ def test_est_tracking_is_of_the_ballistic_landing_and_paid_in_flight(miss, expec
         assert paid("estimated_tracking", view, make_episode(phase=phase, goal=goal), *p) == 0.0
 
 
+@pytest.mark.parametrize("rise", [0.08, -0.2])
+def test_est_tracking_ends_above_the_ground_at_the_goal(rise):
+    # as above, all of it higher by the ground at the goal
+    view = make_view(pos=(0.2, 0.3, 0.52625 + rise), lin_vel=(1.0, -0.6, 2.0))
+    flying = make_episode(phase=FLIGHT, goal=(0.7, 0.0, 0.0), goal_ground=rise)
+    assert paid("estimated_tracking", view, flying, 0.30, 0.50, 0.10, 0.30) == pytest.approx(1.4, rel=1e-4)
+
+
 @pytest.mark.parametrize("heading", [0.0, 90.0, 179.0, -179.0, 180.0])
 @pytest.mark.parametrize(("yaw", "pitch"), [(2.0, 0.0), (-2.0, 0.0), (0.0, 8.0), (6.0, -8.0)])
 def test_flight_orientation_is_the_rotation_from_level_and_heading(heading, yaw, pitch):

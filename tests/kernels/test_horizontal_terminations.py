@@ -67,6 +67,13 @@ def test_predicted_miss_is_decided_once_a_tenth_of_a_second_after_takeoff(miss, 
         assert not holds("predicted_miss", view, elsewhere, 0.55, 6.0, 0.3)
 
 
+@pytest.mark.parametrize(("miss", "missed"), [(0.54, False), (0.56, True)])
+def test_predicted_miss_is_that_above_the_ground_at_the_goal(miss, missed):
+    view = make_view(pos=(0.2, 0.0, 0.60625), lin_vel=(1.0, 0.0, 2.0))  # half a second to 0.38 m
+    flying = make_episode(phase=FLIGHT, phase_steps=6, goal=(0.7 + miss, 0.0, 0.0), goal_ground=0.08)
+    assert holds("predicted_miss", view, flying, 0.55, 6.0, 0.3) is missed
+
+
 def test_predicted_miss_of_the_task_is_decided_at_a_whole_step():
     rules = {rule.name: rule.params for rule in make_task("horizontal-jump").rules}
     assert rules["predicted_miss"][1] == 6.0 and rules["success"] == (60.0,)
