@@ -5,9 +5,10 @@
 The policy knows nothing of the ground but the base's height above the spot below it. Uneven ground has
 bumps of up to 0.05 m around a level start, and every robot jumps in a direction of its own. The block, 10 kg and 0.05 m
 high, reaches from before the goal to beyond it and slides when the robot lands on it; the goal stays. Errors and
-success are those of `horizontal_jump_sweep.py`; the range of `success_rate_in_range` is all goals. Edge, walls and
-goals were placed while looking at the shipped policy, clear of its paws; elsewhere it fails more often. SolverMuJoCo
-has no sliding block: with it that scene is left out.
+success are those of `horizontal_jump_sweep.py`; the range of `success_rate_in_range` is all goals. The platform ends,
+and the block begins, 0.40 m from the start, 0.13 m beyond the paws of a robot that stands there; at the nearest goal,
+0.8 m, its paws stand as far beyond that edge. `--edge` moves it. SolverMuJoCo has no sliding block: with it that scene
+is left out.
 """
 
 from __future__ import annotations
@@ -32,18 +33,17 @@ import matplotlib.pyplot as plt
 
 DROP = 0.15
 """[m] Height of the platform."""
-EDGE = 0.45
-"""[m] From the start to its edge, clear of the paws at takeoff."""
+EDGE = 0.40
+"""[m] From the start to the platform's edge, and to the block's near side."""
 AMPLITUDE = 0.05
 """[m] Of the uneven ground."""
 FLAT_RADIUS = 0.35
 """[m] Level ground around the start."""
 BLOCK_HEIGHT, BLOCK_MASS, BLOCK_FRICTION = 0.05, 10.0, 0.4
 """[m], [kg], [1] with the floor."""
-BLOCK_NEAR, BLOCK_BEYOND, BLOCK_WIDTH = 0.42, 0.45, 0.9
-"""[m] From the start to the block's near side, clear of the paws at takeoff and behind them at touchdown; from the goal
-to its far side; along y."""
-AHEAD, ASIDE = (1.0, 1.25), (-0.15, 0.15)
+BLOCK_BEYOND, BLOCK_WIDTH = 0.40, 0.8
+"""[m] From the goal to the block's far side; along y."""
+AHEAD, ASIDE = (0.8, 1.4), (-0.15, 0.15)
 """[m] Goals: off the platform, or on the block, with all paws; no farther than the paper's longest jump."""
 SCENES = ("platform", "uneven", "block")
 
@@ -56,29 +56,33 @@ class Args(TrialArgs):
     """Number of jumps in each scene."""
     scenes: tuple[str, ...] = SCENES
     """Which of platform, uneven, block."""
+    edge: float = EDGE
+    """[m] From the start to the platform's edge, and to the block's near side."""
 
     def __post_init__(self) -> None:
         """Check the values."""
         super().__post_init__()
         if self.jumps < 1:
             raise ValueError(f"need at least one jump, got {self.jumps}")
+        if not 0.3 <= self.edge < AHEAD[0]:
+            raise ValueError(f"edge must be from 0.3 m to below {AHEAD[0]} m, got {self.edge}")
         if not self.scenes or set(self.scenes) - set(SCENES):
             raise ValueError(f"scenes are {', '.join(SCENES)}, got {self.scenes}")
         if self.solver == "mujoco" and set(self.scenes) == {"block"}:
             raise ValueError("the scene block needs --solver jumper: SolverMuJoCo has no sliding block")
 
 
-def scene(name: str, goals: np.ndarray, rng: np.random.Generator) -> tuple[dict[str, Any], np.ndarray]:
-    """Return what is special about a scene's environment, and the headings; goals [m], (num_envs, 2)."""
+def scene(name: str, goals: np.ndarray, edge: float, rng: np.random.Generator) -> tuple[dict[str, Any], np.ndarray]:
+    """Return what is special about a scene's environment, and the headings; goals [m], (num_envs, 2); edge [m]."""
     straight = np.zeros(len(goals))
     if name == "platform":
-        return {"ground": platform(-DROP, edge=EDGE)}, straight
+        return {"ground": platform(-DROP, edge=edge)}, straight
     if name == "uneven":
         ground = uneven(AMPLITUDE, int(rng.integers(2**31)), flat_radius=FLAT_RADIUS)
         return {"ground": ground}, rng.uniform(-math.pi, math.pi, len(goals))
     far = goals[:, 0] + BLOCK_BEYOND
-    center = np.stack([0.5 * (BLOCK_NEAR + far), goals[:, 1]], axis=1)
-    half = np.stack([0.5 * (far - BLOCK_NEAR), np.full(len(goals), 0.5 * BLOCK_WIDTH)], axis=1)
+    center = np.stack([0.5 * (edge + far), goals[:, 1]], axis=1)
+    half = np.stack([0.5 * (far - edge), np.full(len(goals), 0.5 * BLOCK_WIDTH)], axis=1)
     return {"block": BlockCfg(center, half, BLOCK_HEIGHT, BLOCK_MASS, BLOCK_FRICTION)}, straight
 
 
@@ -109,7 +113,7 @@ def main(args: Args) -> dict:
         if name == "block" and args.solver == "mujoco":
             print("scene block left out: SolverMuJoCo has no sliding block")
             continue
-        special, headings = scene(name, goals, rng)
+        special, headings = scene(name, goals, args.edge, rng)
         env = trial.env(args.jumps, **special)
         done[name] = trial.jump(env, goals[:, None], film=name, drawn=special, headings=headings)
         values |= {f"{name}_{figure}": value for figure, value in landing_figures(done[name]).items()}
@@ -119,7 +123,7 @@ def main(args: Args) -> dict:
     plot(done, trial.folder / "landings.png", trial.title)
     summary = {name: mean([values[f"{scene}_{name}"] for scene in done]) for name in ("mean_error_m", "success_rate")}
     summary["success_rate_in_range"] = summary["success_rate"]
-    return trial.report({"jumps": args.jumps * len(done), **summary, **values}, {})
+    return trial.report({"jumps": args.jumps * len(done), "edge_m": args.edge, **summary, **values}, {})
 
 
 if __name__ == "__main__":

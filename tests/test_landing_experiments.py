@@ -179,15 +179,18 @@ def test_figures_are_printed_with_four_digits_in_lists_too():
 
 def test_scenes_put_the_ground_where_it_is_said_to_be():
     rng, goals = np.random.default_rng(0), np.array([[0.8, 0.1], [1.0, -0.1]])
-    special, _ = platform_jump.scene("platform", goals, rng)
+    special, _ = platform_jump.scene("platform", goals, 0.46, rng)
     ground = special["ground"]
     assert (ground.min_z, ground.max_z) == pytest.approx((-0.15, 0.0))
-    special, headings = platform_jump.scene("uneven", goals, rng)
+    x = np.linspace(-ground.hx, ground.hx, ground.ncol)
+    heights = np.asarray(ground.data).reshape(ground.nrow, ground.ncol)
+    assert x[heights[0] > 0.5].max() == pytest.approx(0.46) and (heights == heights[0]).all()
+    special, headings = platform_jump.scene("uneven", goals, 0.46, rng)
     assert len(set(headings)) == 2
-    special, headings = platform_jump.scene("block", goals, rng)
+    special, headings = platform_jump.scene("block", goals, 0.46, rng)
     block = special["block"]
     near, far = (block.center[:, 0] + side * block.half[:, 0] for side in (-1.0, 1.0))
-    assert near == pytest.approx(0.42) and far == pytest.approx(goals[:, 0] + 0.45)
+    assert near == pytest.approx(0.46) and far == pytest.approx(goals[:, 0] + 0.40)
     assert block.center[:, 1] == pytest.approx(goals[:, 1]) and not headings.any()
 
 
@@ -320,6 +323,7 @@ def test_script_refuses_a_policy_of_another_task_in_one_line_with_code_2(policy)
         (lambda: diagonal_jump_grid.Args(rows=0), "at least one jump, column and row"),
         (lambda: consecutive_jumps.Args(rest=0.0), "rest must be in"),
         (lambda: platform_jump.Args(scenes=("moon",)), "scenes are platform, uneven, block"),
+        (lambda: platform_jump.Args(edge=0.2), "edge must be from 0.3 m to below 0.8 m"),
         (lambda: platform_jump.Args(scenes=("block",), solver="mujoco"), "SolverMuJoCo has no sliding block"),
         (lambda: max_jump.Args(jumps=0), "at least one jump"),
     ],
