@@ -274,24 +274,23 @@ class JumpEnv:
     def evaluation_reset(
         self,
         goals: torch.Tensor | np.ndarray,
-        command_delay: float = 0.5,
+        command_delay: np.ndarray | float = 0.5,
         headings: np.ndarray | float = 0.0,
     ) -> None:
         """Stand every world in the default pose with a goal of its own, shape (num_envs, 3), and end no episode.
 
         goals [m]: relative to start and heading, as in `JumpTask.goal`.
-        command_delay [s]: time until the jump is commanded.
-        headings [rad]: (num_envs,) or one for all.
+        command_delay [s], headings [rad]: until the jump is commanded, and of the robot; (num_envs,) or one for all.
         """
         self.auto_reset = False
         if self.drawn_ground.drawn:
             self._dynamics.robot.ground.blocks.zero_()
-        headings = np.broadcast_to(np.asarray(headings, dtype=np.float32), self.num_envs).copy()
+        headings = self._each(headings, np.float32)
+        command_step = self._each(np.round(np.asarray(command_delay) / self.step_dt), np.int32)
         self._launch(
             begin_evaluation_kernel,
             self.num_envs,
-            [self._vectors(goals), wp.array(headings, device=self.wp_device), round(command_delay / self.step_dt),
-             self._dynamics.robot.ground, self.sim.model.joint_q],
+            [self._vectors(goals), headings, command_step, self._dynamics.robot.ground, self.sim.model.joint_q],
             [self.tasks, self.sim.state.joint_q, self.sim.state.joint_qd],
         )  # fmt: skip
         self._clear(self._ones)
@@ -307,6 +306,10 @@ class JumpEnv:
         chosen = wp.array(np.asarray(worlds).astype(np.int32), dtype=int, device=self.wp_device)
         inputs = [self._vectors(goals), chosen, self._dynamics.robot.ground, self.sim.state.joint_q]
         self._launch(next_jump_kernel, self.num_envs, inputs, [self.tasks])
+
+    def _each(self, values: np.ndarray | float, dtype: type) -> wp.array:
+        """Return values (num_envs,), or one for all, on the device."""
+        return wp.array(np.broadcast_to(np.asarray(values, dtype=dtype), self.num_envs), device=self.wp_device)
 
     def _vectors(self, values: torch.Tensor | np.ndarray) -> wp.array:
         return wp.array(np.asarray(values, dtype=np.float32), dtype=wp.vec3, device=self.wp_device)

@@ -37,7 +37,7 @@ class EvaluationEnv(Protocol):
     sim: Any
 
     def evaluation_reset(
-        self, goals: np.ndarray, command_delay: float = 0.5, headings: np.ndarray | float = 0.0
+        self, goals: np.ndarray, command_delay: np.ndarray | float = 0.5, headings: np.ndarray | float = 0.0
     ) -> None:
         """Stand every world still with its goal (num_envs, 3), and end no episode."""
 

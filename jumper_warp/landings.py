@@ -11,7 +11,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-import warp as wp
 
 from jumper_warp.jumps import (
     CAME_APART,
@@ -29,7 +28,6 @@ from jumper_warp.jumps import (
     mean,
 )
 from jumper_warp.tasks.task import TaskCfg
-from kernels.task import JumpTask
 
 NEAR = 0.1
 """[m] A landed jump that ends this close to its goal succeeds."""
@@ -121,9 +119,7 @@ class Landings(JumpLog):
         """Stand every world in the default pose with its first goal."""
         goals = np.zeros((env.num_envs, 3), dtype=np.float32)
         goals[:, :2] = self.goals[:, 0]
-        env.evaluation_reset(goals, float(np.max(self.delay)), self.headings)
-        if np.ndim(self.delay):
-            delay_commands(env, np.asarray(self.delay))
+        env.evaluation_reset(goals, self.delay, self.headings)
 
     def look(self, env: EvaluationEnv) -> dict[str, np.ndarray]:
         """Return the state of every world's episode, and which of its paws are on the ground."""
@@ -279,13 +275,6 @@ class Landings(JumpLog):
 def longest(jumps: int, rest: float = REST_TIME) -> float:
     """Return how long [s] jumps in a row may take: waiting, squatting and flying at most 3.5 s, and resting."""
     return 1.0 + jumps * (3.5 + rest)
-
-
-def delay_commands(env: EvaluationEnv, delays: np.ndarray) -> None:
-    """Command the jump of each world after its own time (num_envs,) [s]; follows `JumpEnv.evaluation_reset`."""
-    records = env.tasks.numpy().copy()
-    records["command_step"] = np.round(delays / env.step_dt)
-    env.tasks.assign(wp.array(records, dtype=JumpTask, device=env.tasks.device))
 
 
 def yaw_of(quat: np.ndarray) -> np.ndarray:

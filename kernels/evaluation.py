@@ -16,7 +16,7 @@ def begin_evaluation_kernel(
     # in
     goals: wp.array(dtype=wp.vec3),
     headings: wp.array(dtype=float),
-    command_step: int,
+    command_step: wp.array(dtype=int),
     ground: Ground,
     reference_q: wp.array(dtype=float),
     # out
@@ -26,7 +26,7 @@ def begin_evaluation_kernel(
 ):
     """Stand every world in the model's reference pose with its heading [rad] and goal; one thread per world.
 
-    Goals [m] are relative to the start and heading.
+    Goals [m] are relative to the start and heading; the jump is commanded at policy step `command_step`.
     """
     world = wp.tid()
     rest_block(ground, world)
@@ -47,7 +47,7 @@ def begin_evaluation_kernel(
     task.goal = turned(goals[world], headings[world]) + wp.vec3(task.start[0], task.start[1], 0.0)
     task.goal_ground = surface(here, task.goal[0], task.goal[1])[0]
     task.max_height = joint_q[i + 2]
-    task.command_step = command_step
+    task.command_step = command_step[world]
     tasks[world] = task
 
 

@@ -236,6 +236,15 @@ def test_a_new_episode_forgets_the_old_one():
     np.testing.assert_array_equal(views.safe_target.numpy().T, angles)
 
 
+def test_commands_of_a_measurement_may_come_one_by_one(env):
+    delays = np.arange(N) / 120.0  # every other one between two policy steps
+    env.evaluation_reset(np.zeros((N, 3)), command_delay=delays)
+    found = env.task_arrays()["command_step"]
+    np.testing.assert_array_equal(found[::2], np.arange(len(found[::2])))
+    assert (np.abs(found - 60.0 * delays) <= 0.5).all()
+    env.auto_reset = True
+
+
 def test_a_policy_is_measured_from_equal_starts(env):
     goals = np.zeros((N, 3))
     goals[:, 2] = np.linspace(0.5, 1.2, N)
