@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import torch
 
 from experiments import distance_limit as limit
 from jumper_warp.cli import run_command
@@ -13,14 +12,7 @@ from jumper_warp.trial import Trial, TrialArgs
 from kernels import parameters
 
 ARGS = limit.Args(population=8, device="cpu")
-
-
-@pytest.fixture(scope="module", autouse=True)
-def one_thread():
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
+pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 @pytest.fixture(scope="module")

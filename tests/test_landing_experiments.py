@@ -27,14 +27,7 @@ from jumper_warp.trial import Trial, TrialArgs, beside, shown
 
 COLLIDED, NO_JUMP = ENDS.index("collided"), ENDS.index("no_jump")
 SHARED = {"mean_error_m", "success_rate", "success_rate_in_range", "jumps", "solver", "randomize", "seed"}
-
-
-@pytest.fixture(scope="module", autouse=True)
-def one_thread():
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
+pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 @pytest.fixture(scope="module")
