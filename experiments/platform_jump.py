@@ -44,7 +44,7 @@ BLOCK_HEIGHT, BLOCK_MASS, BLOCK_FRICTION = 0.05, 10.0, 0.4
 BLOCK_BEYOND, BLOCK_WIDTH = 0.40, 0.8
 """[m] From the goal to the block's far side; along y."""
 AHEAD, ASIDE = (0.8, 1.4), (-0.15, 0.15)
-"""[m] Goals: off the platform, or on the block, with all paws; no farther than the paper's longest jump."""
+"""[m] Goals: off the platform, or on the block, with all paws; as far as the paper's simulation always succeeds."""
 SCENES = ("platform", "uneven", "block")
 
 
@@ -57,7 +57,7 @@ class Args(TrialArgs):
     scenes: tuple[str, ...] = SCENES
     """Which of platform, uneven, block."""
     edge: float = EDGE
-    """[m] From the start to the platform's edge, and to the block's near side."""
+    """[m] From the start to the platform's edge, moved back to a multiple of 0.02 m, and to the block's near side."""
 
     def __post_init__(self) -> None:
         """Check the values."""

@@ -20,7 +20,7 @@ class GroundRanges:
     block: float  # share
     drop: wp.vec2  # [m] height of the platform
     rise: wp.vec2  # [m] height of the block
-    room: float  # [m] most between the paws and an edge
+    room: float  # [m] most between the paws and an edge, but for a block's near side
     clearance: float  # [m] least between an edge and the place of the paws at the goal
     mass: wp.vec2  # [kg] of the block
     friction: wp.vec2  # of block and floor [1]

@@ -205,7 +205,10 @@ class NoiseCfg:
 
 @dataclass(frozen=True)
 class GroundCfg:
-    """What standing starts of a randomised training stand on or jump to; elsewhere the ground is level."""
+    """What standing starts of a randomised training on SolverJumper stand on or jump to; elsewhere the ground is level.
+
+    An environment that is given a ground or a block draws none.
+    """
 
     platform: float = 0.0
     """[1] Share that begins on a platform, where the paws have room to land beside it."""
@@ -216,7 +219,7 @@ class GroundCfg:
     rise: Pair = (0.02, 0.08)
     """[m] Height of the block."""
     room: float = 0.30
-    """[m] Most between the paws and an edge, each way."""
+    """[m] Most between the paws and an edge, each way; the near side of a block may be farther from both."""
     clearance: float = 0.12
     """[m] Least between an edge that must be crossed and the paws at the goal."""
     mass: Pair = (5.0, 100.0)
