@@ -6,8 +6,8 @@ import hashlib
 import io
 import json
 import os
-import pickle
 from pathlib import Path
+from pickle import UnpicklingError
 from typing import Any
 
 import torch
@@ -95,7 +95,7 @@ def load_checkpoint(path: Path) -> dict[str, Any]:
         raise CheckpointError(f"{path}: differs from its checksum in {MANIFEST}")
     try:
         state = torch.load(io.BytesIO(data), map_location="cpu", weights_only=True)
-    except (RuntimeError, EOFError, ValueError, KeyError, pickle.UnpicklingError) as error:
+    except (RuntimeError, EOFError, ValueError, KeyError, UnpicklingError) as error:
         raise CheckpointError(f"{path}: not readable as tensors: {str(error).splitlines()[0]}") from error
     missing = [key for key in REQUIRED if not isinstance(state, dict) or key not in state]
     if missing:

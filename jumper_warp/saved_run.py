@@ -155,8 +155,7 @@ def restored_task(config: dict[str, Any]) -> TaskCfg:
     try:
         saved = dict(config["env"]["task"])
         default = make_task(saved["name"])
-        known = {term.func.key for term in default.terms}
-        saved["terms"] = [term for term in saved["terms"] if term["func"] in known or _on(rewards, term["func"])]
+        saved["terms"] = [term for term in saved["terms"] if _on(rewards, term["func"])]
     except (KeyError, TypeError, ValueError) as error:
         raise PolicyError(f"no task in the configuration ({type(error).__name__}: {error})") from error
     try:

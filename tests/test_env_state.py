@@ -84,6 +84,21 @@ def test_the_same_seed_trains_the_same_and_another_does_not(cfg):
 # ---------------------------------------------------------------- the environment alone
 
 
+def go_on_alike(saved, fresh):
+    """Step two environments with the same actions, which must stay the same and end some episodes; yields each step."""
+    ended = 0.0
+    for step, action in enumerate(random_actions(saved.num_envs, 25, seed=1)):
+        for env in (saved, fresh):
+            env.step(action)
+        for name in ("obs", "final_obs", "reward", "done", "timeout"):
+            assert torch.equal(getattr(saved, name), getattr(fresh, name)), (step, name)
+        np.testing.assert_array_equal(saved.sim.joint_qd(), fresh.sim.joint_qd())
+        ended += saved.done.sum().item()
+        yield step
+    assert (saved.tasks.numpy() == fresh.tasks.numpy()).all()
+    assert 0.0 < ended
+
+
 @pytest.mark.parametrize("solver", ["jumper", "mujoco"])
 def test_an_environment_goes_on_from_a_saved_state_bit_for_bit(solver):
     count = 8 if solver == "mujoco" else N
@@ -92,16 +107,7 @@ def test_an_environment_goes_on_from_a_saved_state_bit_for_bit(solver):
         saved.step(action)
     edit_episodes(saved, level=np.arange(count) % 4, streak=np.arange(count) % 5)
     fresh.load_state_dict(saved.state_dict())
-    ended = 0.0
-    for step, action in enumerate(random_actions(count, 25, seed=1)):
-        for env in (saved, fresh):
-            env.step(action)
-        for name in ("obs", "final_obs", "reward", "done", "timeout"):
-            assert torch.equal(getattr(saved, name), getattr(fresh, name)), (step, name)
-        np.testing.assert_array_equal(saved.sim.joint_qd(), fresh.sim.joint_qd())
-        ended += saved.done.sum().item()
-    assert (saved.tasks.numpy() == fresh.tasks.numpy()).all()
-    assert 0.0 < ended
+    assert len(list(go_on_alike(saved, fresh))) == 25
 
 
 def ground_env(count=N, platform=0.4, block=0.6, **arguments):
@@ -121,21 +127,12 @@ def test_an_environment_goes_on_with_its_drawn_grounds_bit_for_bit():
     sliding["velocity"] = 0.3 * sliding["exists"][:, None]
     blocks.assign(sliding)
     fresh.load_state_dict(saved.state_dict())
-    ended = 0.0
-    for step, action in enumerate(random_actions(N, 25, seed=1)):
-        for env in (saved, fresh):
-            env.step(action)
-        for name in ("obs", "final_obs", "reward", "done", "timeout"):
-            assert torch.equal(getattr(saved, name), getattr(fresh, name)), (step, name)
+    for step in go_on_alike(saved, fresh):
         found, expected = (env._dynamics.robot.ground.blocks.numpy() for env in (fresh, saved))
         assert (found == expected).all(), step
-        ended += saved.done.sum().item()
         if step == 0:
             moved = np.abs(expected["center"] - sliding["center"]).max(axis=1)
             assert (moved[(sliding["exists"] == 1) & (sliding["mass"] < 1.0e3)] > 1e-3).any()
-    np.testing.assert_array_equal(saved.sim.joint_qd(), fresh.sim.joint_qd())
-    assert (saved.tasks.numpy() == fresh.tasks.numpy()).all()
-    assert 0.0 < ended
 
 
 @pytest.mark.parametrize(("blocks", "message"), [(True, "lacks .*'block.center'"), (False, "has .*'block.center'")])
