@@ -20,15 +20,15 @@ import warp as wp
 from rich.console import Console
 from rich.table import Table
 
-from jumper_warp.env import JumpEnv
-from jumper_warp.figures import output_dir, write_figures
-from jumper_warp.jumps import run_jumps
-from jumper_warp.networks import sanitise
-from jumper_warp.ppo import Ppo, PpoCfg
-from jumper_warp.runtime import report_device
-from jumper_warp.tasks import make_task
-from jumper_warp.tasks.ablations import ABLATIONS
-from jumper_warp.tasks.task import TaskCfg
+from jumper_warp.envs.env import JumpEnv
+from jumper_warp.evaluation.jumps import run_jumps
+from jumper_warp.registry import make_task
+from jumper_warp.rl.networks import sanitise
+from jumper_warp.rl.ppo import Ppo, PpoCfg
+from jumper_warp.tasks.cfg import TaskCfg
+from jumper_warp.tasks.jump.ablations import ABLATIONS
+from jumper_warp.utils.output import output_dir, write_figures
+from jumper_warp.utils.runtime import report_device
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt

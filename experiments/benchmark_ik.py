@@ -15,13 +15,13 @@ import numpy as np
 import tyro
 import warp as wp
 
-from jumper_warp.description import RobotDescription, load_description
-from jumper_warp.figures import output_dir, write_figures
-from jumper_warp.robot import MOTOR_JOINTS, leg_geometry_array
-from jumper_warp.runtime import report_device
-from kernels import geometry
-from kernels.inverse_kinematics import LegLimits, inverse_kinematics_kernel
-from kernels.leg_kinematics import leg_forward_kinematics
+from jumper_warp.robot.description import RobotDescription, load_description
+from jumper_warp.robot.model import MOTOR_JOINTS, leg_geometry_array
+from jumper_warp.utils.output import output_dir, write_figures
+from jumper_warp.utils.runtime import report_device
+from kernels.kinematics import geometry
+from kernels.kinematics.inverse import LegLimits, inverse_kinematics_kernel
+from kernels.kinematics.leg import leg_forward_kinematics
 
 
 @dataclass(frozen=True)

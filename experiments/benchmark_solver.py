@@ -19,10 +19,10 @@ import warp as wp
 from rich.console import Console
 from rich.table import Table
 
-from jumper_warp.figures import output_dir, write_figures
-from jumper_warp.robot import build_model
-from jumper_warp.runtime import report_device
-from jumper_warp.simulation import Simulation, SolverName
+from jumper_warp.robot.model import build_model
+from jumper_warp.sim.simulation import Simulation, SolverName
+from jumper_warp.utils.output import output_dir, write_figures
+from jumper_warp.utils.runtime import report_device
 
 SQUAT, DEFAULT, EXTEND = 110.0, 45.0, -10.0
 """[deg] Commanded transversal angles of the scripted jump."""

@@ -25,13 +25,13 @@ import warp as wp
 from rich.console import Console
 from rich.table import Table
 
-from jumper_warp.env import JumpEnv
-from jumper_warp.figures import output_dir, write_figures
-from jumper_warp.ppo import Ppo, PpoCfg
-from jumper_warp.runtime import report_device
-from jumper_warp.simulation import Simulation
-from jumper_warp.tasks import make_task
-from jumper_warp.training_log import Stopwatch
+from jumper_warp.envs.env import JumpEnv
+from jumper_warp.registry import make_task
+from jumper_warp.rl.logger import Stopwatch
+from jumper_warp.rl.ppo import Ppo, PpoCfg
+from jumper_warp.sim.simulation import Simulation
+from jumper_warp.utils.output import output_dir, write_figures
+from jumper_warp.utils.runtime import report_device
 
 PARTS = {
     "action_kernel": "action",
@@ -177,7 +177,7 @@ def time_ppo(envs: int, args: Args) -> dict[str, float]:
 
 def time_rsl_rl(envs: int, args: Args) -> dict[str, float]:
     """Return figures of training with rsl-rl-lib on the same environment, with the same settings."""
-    from jumper_warp.vecenv import train_rsl_rl
+    from jumper_warp.envs.rsl_rl import train_rsl_rl
 
     env, _ = make_env(envs, args)
     with contextlib.redirect_stdout(io.StringIO()):

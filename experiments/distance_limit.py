@@ -3,12 +3,12 @@
     python experiments/distance_limit.py --out outputs/limit
 
 Actions as a policy gives them, but fixed in advance and equal left and right, are searched for the farthest flight of
-the centre of mass (`jumper_warp.takeoffs`) from standing still: 60 Hz, within -1..1, through the command filter and
-motors of the task, lateral motors held. Penalties keep out jumps that collide, whose base leaves its start by more than
-0.3 m while standing or lands beyond 30 degrees of level, as the task's training does, and those whose hind paws go
-forward on the ground, a run-up. The pitch at landing is taken from the angular momentum at takeoff and the inertia of
-the standing posture. Then one limit after the other is changed, and the search goes on from the nominal robot's best;
-gains are counted from how far the nominal robot gets in as many further generations.
+the centre of mass (`jumper_warp.evaluation.takeoffs`) from standing still: 60 Hz, within -1..1, through the command
+filter and motors of the task, lateral motors held. Penalties keep out jumps that collide, whose base leaves its start
+by more than 0.3 m while standing or lands beyond 30 degrees of level, as the task's training does, and those whose
+hind paws go forward on the ground, a run-up. The pitch at landing is taken from the angular momentum at takeoff and
+the inertia of the standing posture. Then one limit after the other is changed, and the search goes on from the nominal
+robot's best; gains are counted from how far the nominal robot gets in as many further generations.
 
 The search is an evolution strategy with covariance matrix adaptation (Hansen 2016, arXiv:1604.00772), from the package
 `cma`. Every optimum is a lower bound of what is possible: searches of the nominal robot that begin elsewhere end about
@@ -37,18 +37,18 @@ from newton import ModelFlags
 from rich.console import Console
 from rich.table import Column, Table
 
-from jumper_warp.cli import UsageError, run_command
-from jumper_warp.env import JumpEnv
-from jumper_warp.figures import write_figures
-from jumper_warp.landings import ENDS, Landings
-from jumper_warp.motors import horizontal_jump_filter, jumping_motors, loose_filter, vertical_jump_filter
-from jumper_warp.robot import KNEE_DOFS
-from jumper_warp.takeoffs import LANDING_ACTION, Act, Flight, Takeoffs, fly, mean_of_sides, reach
-from jumper_warp.tasks import make_task
-from jumper_warp.tasks.horizontal_jump import LANDING_HEIGHT
-from jumper_warp.tasks.task import TaskCfg
+from jumper_warp.cli.main import UsageError, run_command
+from jumper_warp.envs.env import JumpEnv
+from jumper_warp.evaluation.landings import ENDS, Landings
+from jumper_warp.evaluation.takeoffs import LANDING_ACTION, Act, Flight, Takeoffs, fly, mean_of_sides, reach
+from jumper_warp.evaluation.trial import Trial, TrialArgs
+from jumper_warp.registry import make_task
+from jumper_warp.robot.model import KNEE_DOFS
+from jumper_warp.robot.motors import horizontal_jump_filter, jumping_motors, loose_filter, vertical_jump_filter
+from jumper_warp.tasks.cfg import TaskCfg
+from jumper_warp.tasks.jump.horizontal import LANDING_HEIGHT
 from jumper_warp.tasks.units import G
-from jumper_warp.trial import Trial, TrialArgs
+from jumper_warp.utils.output import write_figures
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt

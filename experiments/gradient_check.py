@@ -21,13 +21,13 @@ import warp as wp
 from rich.console import Console
 from rich.table import Table
 
-from jumper_warp.description import load_description
-from jumper_warp.figures import output_dir, write_figures
-from jumper_warp.motors import jumping_motors, vertical_jump_filter
-from jumper_warp.robot import build_model, standing_configuration
-from jumper_warp.rollout import DifferentiableRollout, Rollout
-from jumper_warp.runtime import report_device
-from kernels.parameters import BASE, LEG_ROWS, MOMENT_ROWS, MU_DYNAMIC, MU_STATIC
+from jumper_warp.optim.rollout import DifferentiableRollout, Rollout
+from jumper_warp.robot.description import load_description
+from jumper_warp.robot.model import build_model, standing_configuration
+from jumper_warp.robot.motors import jumping_motors, vertical_jump_filter
+from jumper_warp.utils.output import output_dir, write_figures
+from jumper_warp.utils.runtime import report_device
+from kernels.layout import BASE, LEG_ROWS, MOMENT_ROWS, MU_DYNAMIC, MU_STATIC
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt

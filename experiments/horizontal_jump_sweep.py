@@ -19,10 +19,10 @@ import matplotlib
 import numpy as np
 import tyro
 
-from jumper_warp.cli import run_command
-from jumper_warp.jumps import within
-from jumper_warp.landings import NEAR, Landings, landing_figures, random_headings, trained_range
-from jumper_warp.trial import Trial, TrialArgs
+from jumper_warp.cli.main import run_command
+from jumper_warp.evaluation.jumps import within
+from jumper_warp.evaluation.landings import NEAR, Landings, landing_figures, random_headings, trained_range
+from jumper_warp.evaluation.trial import Trial, TrialArgs
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt

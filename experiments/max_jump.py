@@ -24,10 +24,10 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
-from jumper_warp.cli import run_command
-from jumper_warp.jumps import largest, mean, within
-from jumper_warp.landings import Landings, landing_figures, random_headings, trained_range
-from jumper_warp.trial import Trial, TrialArgs
+from jumper_warp.cli.main import run_command
+from jumper_warp.evaluation.jumps import largest, mean, within
+from jumper_warp.evaluation.landings import Landings, landing_figures, random_headings, trained_range
+from jumper_warp.evaluation.trial import Trial, TrialArgs
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt

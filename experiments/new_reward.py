@@ -2,8 +2,9 @@
 
     python experiments/new_reward.py --iterations 5
 
-A term is a pure Warp function of the robot (`kernels.task.RobotView`), the episode (`kernels.task.JumpTask`) and four
-numbers, and a line that gives it a weight. It is compiled into the task's one reward kernel and logged by its name.
+A term is a pure Warp function of the robot (`kernels.jump.task.RobotView`), the episode (`kernels.jump.task.JumpTask`)
+and four numbers, and a line that gives it a weight. It is compiled into the task's one reward kernel and logged by its
+name.
 """
 
 from __future__ import annotations
@@ -15,13 +16,13 @@ import torch
 import tyro
 import warp as wp
 
-from jumper_warp.env import JumpEnv
-from jumper_warp.figures import output_dir, write_figures
-from jumper_warp.ppo import PpoCfg
-from jumper_warp.tasks import make_task
-from jumper_warp.tasks.task import Term
-from jumper_warp.train import TrainCfg, train
-from kernels.task import FLIGHT, JumpTask, RobotView
+from jumper_warp.envs.env import JumpEnv
+from jumper_warp.registry import make_task
+from jumper_warp.rl.ppo import PpoCfg
+from jumper_warp.rl.runner import TrainCfg, train
+from jumper_warp.tasks.cfg import Term
+from jumper_warp.utils.output import output_dir, write_figures
+from kernels.jump.task import FLIGHT, JumpTask, RobotView
 
 
 @wp.func

@@ -20,13 +20,13 @@ import warp as wp
 from rich.console import Console
 from rich.table import Table
 
-from jumper_warp.figures import output_dir, write_figures
-from jumper_warp.motors import MotorCfg, jumping_motors, loose_filter, vertical_jump_filter
-from jumper_warp.recording import Recorder
-from jumper_warp.robot import LEGS, MOTOR_JOINTS, build_model
-from jumper_warp.runtime import report_device
-from jumper_warp.simulation import Simulation, motor_values
-from jumper_warp.snapshot import Camera, contact_sheet
+from jumper_warp.robot.model import LEGS, MOTOR_JOINTS, build_model
+from jumper_warp.robot.motors import MotorCfg, jumping_motors, loose_filter, vertical_jump_filter
+from jumper_warp.sim.simulation import Simulation, motor_values
+from jumper_warp.utils.output import output_dir, write_figures
+from jumper_warp.utils.runtime import report_device
+from jumper_warp.viz.recorder import Recorder
+from jumper_warp.viz.snapshot import Camera, contact_sheet
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt

@@ -22,11 +22,11 @@ import matplotlib
 import numpy as np
 import tyro
 
-from jumper_warp.cli import run_command
-from jumper_warp.grounds import BlockCfg, platform, uneven
-from jumper_warp.jumps import mean
-from jumper_warp.landings import Landings, landing_figures
-from jumper_warp.trial import Trial, TrialArgs
+from jumper_warp.cli.main import run_command
+from jumper_warp.evaluation.jumps import mean
+from jumper_warp.evaluation.landings import Landings, landing_figures
+from jumper_warp.evaluation.trial import Trial, TrialArgs
+from jumper_warp.robot.grounds import BlockCfg, platform, uneven
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt

@@ -17,11 +17,11 @@ import numpy as np
 import tyro
 import warp as wp
 
-from jumper_warp.figures import output_dir, write_figures
-from jumper_warp.motors import vertical_jump_filter
-from jumper_warp.runtime import report_device
-from jumper_warp.simulation import Simulation
-from jumper_warp.solver import TOLERANCE
+from jumper_warp.robot.motors import vertical_jump_filter
+from jumper_warp.sim.simulation import Simulation
+from jumper_warp.sim.solver import TOLERANCE
+from jumper_warp.utils.output import output_dir, write_figures
+from jumper_warp.utils.runtime import report_device
 
 
 @dataclass(frozen=True)

@@ -23,14 +23,15 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
-from jumper_warp.cli import announce, run_command
-from jumper_warp.env import JumpEnv
-from jumper_warp.figures import output_dir, write_figures
-from jumper_warp.film import Film, moments
-from jumper_warp.jumps import COLLIDED, REST_SPEED, Jumps, largest, mean, rule_names, run, within
-from jumper_warp.policy import Policy, PolicyError
-from jumper_warp.saved_run import Conditions, env_of_policy, open_policy
-from jumper_warp.tasks.task import TaskCfg
+from jumper_warp.cli.main import announce, run_command
+from jumper_warp.envs.env import JumpEnv
+from jumper_warp.evaluation.film import Film, moments
+from jumper_warp.evaluation.jumps import COLLIDED, REST_SPEED, Jumps, largest, mean, rule_names, run, within
+from jumper_warp.policies.policy import Policy
+from jumper_warp.policies.restore import Conditions, env_of_policy, open_policy
+from jumper_warp.policies.spec import PolicyError
+from jumper_warp.tasks.cfg import TaskCfg
+from jumper_warp.utils.output import output_dir, write_figures
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt

@@ -1,7 +1,7 @@
 """The scalar type of the physics kernels, and the small vectors and matrices made of it.
 
 Every function of the robot's physics is written in terms of `real`. The package is single precision;
-`jumper_warp.precision.float64_kernels()` loads the same files a second time under the name
+`jumper_warp.sim.precision.float64_kernels()` loads the same files a second time under the name
 `kernels_float64`, where `real` is double precision: the reference for rounding and for gradients.
 """
 

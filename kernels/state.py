@@ -7,7 +7,7 @@ are the velocity of its centre of mass and its angular velocity, both in the wor
 
 import warp as wp
 
-from .parameters import BASE, COORDS, DOFS
+from .layout import BASE, COORDS, DOFS
 from .scalar import quat, real, vec3
 
 

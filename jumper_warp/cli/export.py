@@ -1,0 +1,50 @@
+"""`jumper export`: a run's policy as a folder, or a policy as one ONNX file."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import tyro
+
+from jumper_warp.policies.folder import save_policy
+from jumper_warp.policies.onnx import export_onnx
+from jumper_warp.policies.restore import is_run, learning_curve, open_policy
+
+
+@dataclass(frozen=True)
+class ExportCfg:
+    """Turn a training run into a policy's folder, or a policy into one ONNX file."""
+
+    source: tyro.conf.Positional[str]
+    """A run's folder, a checkpoint, or a policy's name or folder."""
+    out: Path | None = None
+    """A file that ends in .onnx, or the folder of the new policy (default: policy/ in the run, or <task>.onnx)."""
+    newest: bool = False
+    """Of a run, take the newest checkpoint, not the best."""
+    overwrite: bool = False
+    """Replace a policy that is there already, figures and README included."""
+
+
+def export(cfg: ExportCfg) -> Path:
+    """Write what the configuration asks for, print where, and return the path.
+
+    Raises:
+        PolicyError: The source cannot be used, or the folder exists and is not to be overwritten.
+        CheckpointError: The checkpoint cannot be used.
+    """
+    source = Path(cfg.source)
+    trained = is_run(source)
+    policy = open_policy(cfg.source, newest=cfg.newest)
+    out = cfg.out
+    if out is None:
+        run = source.parents[1] if source.suffix == ".pt" else source
+        out = run / "policy" if trained else Path(f"{policy.interface.task}.onnx")
+    if out.suffix == ".onnx":
+        path = export_onnx(policy, out)
+    else:
+        curve = learning_curve(source) if trained else None
+        files = {} if curve is None else {"learning_curve.jsonl": curve}
+        path = save_policy(out, policy, files=files, overwrite=cfg.overwrite)
+    print(path)
+    return path

@@ -1,0 +1,87 @@
+"""`jumper train TASK`: every setting of training and task as a flag."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Annotated
+
+import torch
+import tyro
+
+from jumper_warp.cli.main import UsageError, announce
+from jumper_warp.cli.task_flags import TaskFlags
+from jumper_warp.envs.env import JumpEnv
+from jumper_warp.registry import TASKS, make_task
+from jumper_warp.rl.runner import MakeEnv, TrainCfg, TrainResult, train
+from jumper_warp.sim.simulation import SolverName
+from jumper_warp.tasks.cfg import TaskCfg
+
+
+@dataclass(frozen=True)
+class TrainArgs:
+    """Train a policy on a task."""
+
+    cfg: Annotated[TrainCfg, tyro.conf.arg(name="")]
+    env: TaskFlags
+    solver: SolverName = "jumper"
+    """Physics: the dedicated solver, or Newton's SolverMuJoCo."""
+    randomize: bool = True
+    """Draw masses, friction, motors, latency and pushes for each world; single rows are under --env.randomization."""
+    noise: bool = True
+    """Add noise to observations."""
+
+
+def parse_train(args: Sequence[str]) -> tuple[TrainArgs, TaskCfg]:
+    """Return the settings, and the task with its settings; exits where tyro does.
+
+    Raises:
+        UsageError: The task is missing or given twice.
+        ValueError: The task is unknown, or a setting is out of range.
+    """
+    names = ", ".join(TASKS)
+    asks_help = not args or args[0] in ("-h", "--help")
+    if not asks_help and args[0].startswith("-"):
+        raise UsageError(f"the task comes first: jumper train TASK [flags]; tasks: {names}")
+    task = make_task(next(iter(TASKS)) if asks_help else args[0])
+    parsed = tyro.cli(
+        TrainArgs,
+        prog="jumper train TASK",
+        description=f"Train a policy on a task: {names}. Values shown are those of {task.name}.",
+        default=TrainArgs(TrainCfg(task=task.name, ppo=task.ppo), TaskFlags.of(task)),
+        args=["--help"] if asks_help else list(args[1:]),
+    )
+    if parsed.cfg.task != task.name:
+        raise UsageError(f"give the task once, got {task.name} and --task {parsed.cfg.task}")
+    return parsed, dataclasses.replace(parsed.env.apply(task), ppo=parsed.cfg.ppo)
+
+
+def env_maker(task: TaskCfg, args: TrainArgs) -> MakeEnv:
+    """Return what makes the environment of a training."""
+
+    def make(num_envs: int, seed: int, device: torch.device) -> JumpEnv:
+        return JumpEnv(
+            task,
+            num_envs,
+            seed=seed,
+            device=str(device),
+            solver=args.solver,
+            randomize=args.randomize,
+            noise=args.noise,
+        )
+
+    return make
+
+
+def run_train(args: Sequence[str]) -> TrainResult:
+    """Train as the arguments say; raises as `parse_train` and `jumper_warp.rl.runner.train`."""
+    parsed, task = parse_train(args)
+    first = os.environ.get("RANK", "0") == "0"
+    if first:
+        announce(parsed.cfg.device)
+    result = train(parsed.cfg, env_maker(task, parsed))
+    if first:
+        print(result.folder)
+    return result

@@ -1,0 +1,138 @@
+"""Filming an environment: some of its worlds as a recording for the Rerun viewer, and as strips of pictures.
+
+Nothing of the viewer or the pictures is imported before there is something to film.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from jumper_warp.robot.model import LEGS, build_model
+from jumper_warp.sim.solver import SolverJumper
+
+if TYPE_CHECKING:
+    from jumper_warp.envs.env import JumpEnv
+    from jumper_warp.evaluation.jumps import JumpLog
+    from jumper_warp.robot.grounds import BlockCfg
+
+SHANK_LENGTH = 0.3
+"""[m] From the knee to the ankle, along the shank's -z."""
+
+
+class Film:
+    """Collects what some worlds of an environment look like; call it after every policy step."""
+
+    def __init__(
+        self,
+        env: JumpEnv,
+        log: JumpLog,
+        worlds: Sequence[int],
+        *,
+        spacing: float = 1.2,
+        ground: Any = "plane",
+        block: BlockCfg | None = None,
+        notes: Mapping[str, Any] | None = None,
+        motors: bool = False,
+    ) -> None:
+        """Film worlds of the environment, together with the series of the log.
+
+        Args:
+            env: What is filmed.
+            log: Follows its jumps.
+            worlds: Indices, at least one.
+            spacing: Distance [m] along y by which each world is drawn beside the one before it; 0 on a heightfield.
+            ground: What is drawn below, as in `build_model`.
+            block: The environment's sliding blocks, if it has any.
+            notes: Saved along; must be JSON.
+            motors: Whether to add torques and actions of the first world.
+        """
+        from jumper_warp.viz.recorder import Recorder
+
+        self.env, self.log, self.worlds, self.spacing, self.motors = env, log, list(worlds), spacing, motors
+        self.model = build_model(len(worlds), ground=ground, device=env.wp_device)
+        self.recorder = Recorder(self.model, range(len(worlds)), spacing=spacing, notes=notes)
+        self.frames = 0
+        self.block = None if block is None else block.per_world(env.num_envs)
+        self.block_places: list[np.ndarray] = []
+
+    def __call__(self) -> None:
+        """Add the environment's state of the moment."""
+        sim, state = self.env.sim, self.env.sim.state
+        if isinstance(sim.solver, SolverJumper):
+            sim.solver.dynamics.full_state(state.joint_q, state.joint_qd, state.body_q, state.body_qd)
+        poses = state.body_q.numpy().reshape(sim.num_worlds, -1, 7)[self.worlds]
+        series = self.log.series(self.worlds) | (self._motor_series() if self.motors else {})
+        forces = sim.paw_force.numpy().transpose(1, 0, 2)[self.worlds]
+        if self.block is not None:
+            self.block_places.append(sim.solver.block_position()[self.worlds])
+        self.frames += 1
+        self.recorder.record(self.frames * self.env.step_dt, poses.reshape(-1, 7), series, ankles(poses), forces)
+
+    def _motor_series(self) -> dict[str, float]:
+        from jumper_warp.robot.model import MOTOR_JOINTS
+
+        world = self.worlds[0]
+        torque, action = self.env.sim.torque.numpy()[:, world], self.env.action[world].cpu().numpy()
+        series = {f"torque/{name} [N m]": torque[i] for i, name in enumerate(MOTOR_JOINTS)}
+        return series | {f"action/{name} [1]": action[i] for i, name in enumerate(MOTOR_JOINTS)}
+
+    def base(self, index: int) -> np.ndarray:
+        """Return the base's positions [m], world frame, (frames, 3), of the index-th filmed world."""
+        recording = self.recorder.recording()
+        return recording.poses[:, index * len(recording.bodies) // len(self.worlds), :3]
+
+    def save_rrd(self, path: Path, goals: np.ndarray | None = None) -> Path:
+        """Write the recording; goals [m]: (filmed worlds, goals a world, 3) places to mark, world frame."""
+        from jumper_warp.viz.props import with_blocks, with_marks
+        from jumper_warp.viz.rerun import write_rrd
+
+        recording = self.recorder.recording()
+        if goals is not None:
+            recording = with_marks(recording, goals)
+        if self.block is not None:
+            half, height = self.block["half"][self.worlds], self.block["height"][self.worlds]
+            recording = with_blocks(recording, np.stack(self.block_places), half, height)
+        return write_rrd(recording, path)
+
+    def strip(
+        self,
+        path: Path,
+        index: int,
+        frames: Sequence[int],
+        captions: Sequence[str],
+        eye: Sequence[float],
+        target: Sequence[float],
+        size: tuple[int, int] = (320, 420),
+    ) -> None:
+        """Write pictures of the index-th filmed world side by side; eye and target [m], size (width, height) [px]."""
+        from jumper_warp.viz.snapshot import Camera, contact_sheet
+
+        recording = self.recorder.recording()
+        camera = Camera(self.model, eye, target, size, world=index)
+        state, pictures = self.model.state(), []
+        for frame in frames:
+            state.body_q.assign(recording.poses[frame])
+            pictures.append(camera.picture(state))
+        contact_sheet(pictures, path, captions)
+
+
+def ankles(poses: np.ndarray) -> np.ndarray:
+    """Return the ankles [m], world frame, (num_worlds, 4, 3), from the poses (num_worlds, 21, 7) of all links."""
+    shanks = poses[:, 5 * np.arange(1, len(LEGS) + 1)]
+    x, y, z, w = np.moveaxis(shanks[..., 3:], -1, 0)
+    axis = np.stack([2.0 * (x * z + w * y), 2.0 * (y * z - w * x), 1.0 - 2.0 * (x * x + y * y)], axis=-1)
+    return shanks[..., :3] - SHANK_LENGTH * axis
+
+
+def moments(height: np.ndarray, command: int) -> list[int]:
+    """Return the frames of a filmstrip: command, squat, push-off, apex, fall, catch, end; height (frames,) [m]."""
+    command = min(max(command, 0), len(height) - 1)
+    apex = command + int(np.argmax(height[command:]))
+    squat = command + int(np.argmin(height[command : apex + 1]))
+    catch = apex + int(np.argmin(height[apex : apex + 60]))
+    push = squat + int(np.argmax(height[squat : apex + 1] >= 0.5 * (height[squat] + height[apex])))
+    return [command, squat, push, apex, (apex + catch) // 2, catch, len(height) - 1]

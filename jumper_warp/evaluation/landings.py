@@ -1,0 +1,344 @@
+"""Following jumps to places in the plane: where they land, and what becomes of the robot.
+
+A jump is over once the robot has had a second to come to rest; the distance between base and goal then is its error. A
+jump that fails before is measured where it failed. Whether the robot hopped or stepped to get there, is told apart.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from jumper_warp.evaluation.jumps import (
+    CAME_APART,
+    COLLIDED,
+    LANDED,
+    NO_END,
+    REST_SPEED,
+    REST_TIME,
+    EvaluationEnv,
+    Figures,
+    JumpLog,
+    failures,
+    finite,
+    largest,
+    mean,
+)
+from jumper_warp.tasks.cfg import TaskCfg
+
+NEAR = 0.1
+"""[m] A landed jump that ends this close to its goal succeeds."""
+HOP_TIME = 0.05
+"""[s] A robot that is off the ground for longer after touchdown has jumped again; one that lifts a paw, which had come
+down, for as long has stepped."""
+SOON = 0.3
+"""[s] After touchdown, when the base is looked at as well."""
+TIME_EPS = 1.0e-6
+"""[s] Rounding of sums of steps."""
+ENDS = ("success", "came_apart", "low_base", "collided", "no_jump")
+"""Rules of the task that end a jump here; the others only shape the training."""
+FALLS = ("came_apart", "low_base", "collided")
+MISSED = "missed"
+"""Outcome of a jump that landed well, but elsewhere."""
+EARLY = "early"
+"""Outcome of a jump that began before the command."""
+NOT_BEGUN = "not_begun"
+"""Outcome of a jump that was due after one that failed."""
+
+
+def ends_of_a_test(task: TaskCfg) -> TaskCfg:
+    """Return a task with the ends that a jump has in a test."""
+    return replace(task, rules=tuple(rule for rule in task.rules if rule.name in ENDS))
+
+
+@dataclass
+class Landings(JumpLog):
+    """What became of one row of jumps per world; arrays have shape (num_envs, jumps in a row), not a number before.
+
+    The first jump goes to a place relative to start and heading, each other one relative to the base's place and yaw
+    when it is commanded.
+    """
+
+    goals: np.ndarray
+    """[m] (num_envs, jumps in a row, 2), ahead and to the left."""
+    rules: tuple[str, ...]
+    """Names of the ends of an episode; the first is the success."""
+    headings: np.ndarray | float = 0.0
+    """[rad] (num_envs,) or one for all."""
+    delay: np.ndarray | float = 0.5
+    """[s] Until the first jump is commanded; (num_envs,) or one for all."""
+    rest: float = REST_TIME
+    """[s] From touchdown until the jump is over, and the next one commanded."""
+    current: np.ndarray = field(init=False)
+    """(num_envs,) Number of the jump under way; that of jumps in a row after the end."""
+    end: np.ndarray = field(init=False)
+    """Index of the end in `rules`, -1 before it."""
+    place: np.ndarray = field(init=False)
+    """[m] (..., 2) Base at the end, world."""
+    target: np.ndarray = field(init=False)
+    """[m] (..., 2) Where it should be, world."""
+    yaw: np.ndarray = field(init=False)
+    """[rad] Of the base at the end, from the jump's heading."""
+    heading: np.ndarray = field(init=False)
+    """[rad] Of the jump."""
+    apex: np.ndarray = field(init=False)
+    """[m] Largest base height."""
+    tilt: np.ndarray = field(init=False)
+    """[rad] Largest since touchdown."""
+    rest_speed: np.ndarray = field(init=False)
+    """[m/s] Of the base at the end of a landed jump; infinite otherwise."""
+    touchdown: np.ndarray = field(init=False)
+    """[m] (..., 2) Base at touchdown, world."""
+    air_time: np.ndarray = field(init=False)
+    """[s] Longest that no paw was on the ground after touchdown."""
+    lift_time: np.ndarray = field(init=False)
+    """[s] Longest that any paw was off the ground again after its own first contact since touchdown."""
+    place_soon: np.ndarray = field(init=False)
+    """[m] (..., 2) Base SOON after touchdown, world; not a number if the jump was over before."""
+    early: np.ndarray = field(init=False)
+    """Whether the jump began before the command."""
+
+    def __post_init__(self) -> None:
+        """Begin with no jump ended. Raises ValueError for goals of another shape."""
+        self.goals = np.asarray(self.goals, dtype=float)
+        if self.goals.ndim != 3 or self.goals.shape[2] != 2:
+            raise ValueError(f"goals must have shape (num_envs, jumps, 2), got {self.goals.shape}")
+        shape = self.goals.shape[:2]
+        self.current, self.end = np.zeros(shape[0], dtype=int), np.full(shape, -1)
+        self.place, self.target, self.touchdown, self.place_soon = (np.full((*shape, 2), np.nan) for _ in range(4))
+        self.air_time, self._aloft = np.zeros(shape), np.zeros(shape[0])
+        self.lift_time, self._lifted = np.zeros(shape), np.zeros((shape[0], 4))
+        self._came_down = np.zeros((shape[0], 4), dtype=bool)
+        self.yaw, self.heading, self.apex, self.tilt = (np.full(shape, np.nan) for _ in range(4))
+        self.rest_speed, self.early = np.full(shape, np.inf), np.zeros(shape, dtype=bool)
+
+    def begin(self, env: EvaluationEnv) -> None:
+        """Stand every world in the default pose with its first goal."""
+        goals = np.zeros((env.num_envs, 3), dtype=np.float32)
+        goals[:, :2] = self.goals[:, 0]
+        env.evaluation_reset(goals, self.delay, self.headings)
+
+    def look(self, env: EvaluationEnv) -> dict[str, np.ndarray]:
+        """Return the state of every world's episode, and which of its paws are on the ground."""
+        force = np.linalg.norm(env.sim.paw_force.numpy(), axis=2)
+        return env.task_arrays() | {"paws_down": (force > env.task.contact_force).T}
+
+    def follow(self, env: EvaluationEnv) -> bool:
+        """Look at the environment after a policy step, and command the jumps that are due."""
+        before = self.current.copy()
+        ended = super().follow(env)
+        due = (self.current > before) & (self.current < self.goals.shape[1])
+        if due.any():
+            goals = np.zeros((env.num_envs, 3), dtype=np.float32)
+            goals[due, :2] = self.goals[due, self.current[due]]
+            env.next_jump(goals, due)
+        return ended
+
+    def update(self, arrays: dict[str, np.ndarray], step_dt: float) -> bool:
+        """Take in a policy step; return whether all jumps have ended."""
+        count = self.goals.shape[1]
+        row = np.flatnonzero(self.current < count)
+        now = {name: values[row] for name, values in arrays.items()}
+        at = (row, self.current[row])
+        self.place[at], self.target[at] = now["base_pos"][:, :2], now["goal"][:, :2]
+        self.heading[at] = now["heading"]
+        self.yaw[at] = wrapped(yaw_of(now["base_quat"]) - now["heading"])
+        self.apex[at], self.tilt[at] = now["max_height"], now["peak_tilt"]
+        self.early[at] |= (now["took_off"] == 1) & (now["steps"] < now["command_step"])
+        landed = now["phase"] == LANDED
+        first, soon = landed & (now["touched_down"] == 1), landed & (now["phase_steps"] == round(SOON / step_dt))
+        self.touchdown[row[first], self.current[row[first]]] = now["base_pos"][first, :2]
+        self.place_soon[row[soon], self.current[row[soon]]] = now["base_pos"][soon, :2]
+        self._update_paws(row, landed[:, None] & now["paws_down"], landed, step_dt)
+        failed = now["rule"] > 0
+        rested = ~failed & landed & (now["phase_steps"] >= round(self.rest / step_dt))
+        speed = np.linalg.norm(now["base_vel"], axis=1)
+        self.rest_speed[at] = np.where(rested, speed, np.inf)
+        self.end[at] = np.where(failed, now["rule"], np.where(rested, 0, -1))
+        self.current[row[rested]] += 1
+        self.current[row[failed]] = count
+        return bool((self.current >= count).all())
+
+    def _update_paws(self, row: np.ndarray, down: np.ndarray, landed: np.ndarray, step_dt: float) -> None:
+        """Take in which paws (rows, 4) are on the ground, of robots (rows,) after touchdown and before it."""
+        at = (row, self.current[row])
+        self._aloft[row] = np.where(landed & ~down.any(axis=1), self._aloft[row] + step_dt, 0.0)
+        self.air_time[at] = np.maximum(self.air_time[at], self._aloft[row])
+        self._came_down[row] = landed[:, None] & (self._came_down[row] | down)
+        self._lifted[row] = np.where(self._came_down[row] & ~down, self._lifted[row] + step_dt, 0.0)
+        self.lift_time[at] = np.maximum(self.lift_time[at], self._lifted[row].max(axis=1))
+
+    @property
+    def offset(self) -> np.ndarray:
+        """[m] (..., 2) From goal to base at the end, ahead and to the left of the jump's heading."""
+        turn = -self.heading[..., None]
+        x, y = np.moveaxis(self.place - self.target, -1, 0)
+        cos, sin = np.cos(turn[..., 0]), np.sin(turn[..., 0])
+        return np.stack([cos * x - sin * y, sin * x + cos * y], axis=-1)
+
+    @property
+    def landing(self) -> np.ndarray:
+        """[m] (..., 2) Base at the end, where the goals are measured."""
+        return self.goals + self.offset
+
+    @property
+    def error(self) -> np.ndarray:
+        """[m] Distance of the base from the goal at the end; not a number where the simulation came apart."""
+        broken = (self.ends == CAME_APART) | ~np.isfinite(self.place).all(axis=-1)
+        return np.where(broken, np.nan, np.linalg.norm(self.place - self.target, axis=-1))
+
+    @property
+    def ends(self) -> np.ndarray:
+        """Name of each jump's end, whether or not it met its goal."""
+        names = np.array([*self.rules, NO_END], dtype=object)[self.end]
+        return np.where(np.isnan(self.heading), NOT_BEGUN, names)
+
+    @property
+    def landed(self) -> np.ndarray:
+        """Whether the robot came down on its paws and stayed there, wherever it was."""
+        return self.end == 0
+
+    @property
+    def success(self) -> np.ndarray:
+        """Whether the jump, begun on command, was landed near its goal."""
+        near = np.nan_to_num(self.error, nan=np.inf) <= NEAR
+        return self.landed & near & ~self.early
+
+    @property
+    def single(self) -> np.ndarray:
+        """Whether the jump succeeded without another one after touchdown."""
+        return self.success & ~self.hopped
+
+    @property
+    def hopped(self) -> np.ndarray:
+        """Whether the robot jumped again after touchdown."""
+        return self.air_time > HOP_TIME + TIME_EPS
+
+    @property
+    def step_free(self) -> np.ndarray:
+        """Whether the jump succeeded without a step after touchdown, and so without another jump."""
+        return self.success & ~self.stepped
+
+    @property
+    def stepped(self) -> np.ndarray:
+        """Whether any paw that had come down was off the ground again for HOP_TIME or longer."""
+        return self.lift_time > HOP_TIME - TIME_EPS
+
+    @property
+    def touchdown_error(self) -> np.ndarray:
+        """[m] Distance of the base from the goal at touchdown; not a number without one."""
+        return np.linalg.norm(self.touchdown - self.target, axis=-1)
+
+    @property
+    def error_soon(self) -> np.ndarray:
+        """[m] Distance of the base from the goal SOON after touchdown; not a number if the jump was over before."""
+        return np.linalg.norm(self.place_soon - self.target, axis=-1)
+
+    @property
+    def outcomes(self) -> np.ndarray:
+        """Name of each jump's end."""
+        missed = np.where(self.landed & ~self.success, np.where(self.early, EARLY, MISSED), self.ends)
+        return np.where(self.success, self.rules[0], missed)
+
+    def columns(self) -> dict[str, list]:
+        """Return goals, headings, landings and errors, and the ends; row after row."""
+        goals, landing = self.goals.reshape(-1, 2), self.landing.reshape(-1, 2)
+        numbers = {
+            "goal_x_m": goals[:, 0],
+            "goal_y_m": goals[:, 1],
+            "heading_deg": np.degrees(self.heading).ravel(),
+            "landing_x_m": landing[:, 0],
+            "landing_y_m": landing[:, 1],
+            "error_m": self.error.ravel(),
+        }
+        ends = {"end": self.outcomes.ravel().tolist()}
+        return {name: finite(values) for name, values in numbers.items()} | ends
+
+    def series(self, worlds: Sequence[int]) -> dict[str, float]:
+        """Return the base's height and its distance from the goal of the moment [m]."""
+        pos, goal = self.seen["base_pos"], self.seen["goal"]
+        series = {}
+        for world in worlds:
+            series[f"height/base of {world} [m]"] = pos[world, 2]
+            series[f"distance/goal of {world} [m]"] = np.linalg.norm(pos[world, :2] - goal[world, :2])
+        return series
+
+    def marks(self, worlds: Sequence[int]) -> np.ndarray:
+        """Return the goals that were commanded [m], world frame, (worlds, jumps in a row, 3), z = 0."""
+        target = self.target[list(worlds)]
+        return np.concatenate([target, np.zeros_like(target[..., :1])], axis=-1)
+
+
+def longest(jumps: int, rest: float = REST_TIME) -> float:
+    """Return how long [s] jumps in a row may take: waiting, squatting and flying at most 3.5 s, and resting."""
+    return 1.0 + jumps * (3.5 + rest)
+
+
+def yaw_of(quat: np.ndarray) -> np.ndarray:
+    """Return the yaw [rad] of orientations (..., 4), xyzw: the heading of body x in the world plane."""
+    x, y, z, w = np.moveaxis(quat, -1, 0)
+    return np.arctan2(2.0 * (x * y + w * z), 1.0 - 2.0 * (y * y + z * z))
+
+
+def wrapped(angle: np.ndarray) -> np.ndarray:
+    """Return angles [rad] within -pi..pi."""
+    return np.arctan2(np.sin(angle), np.cos(angle))
+
+
+def random_headings(count: int, seed: int) -> np.ndarray:
+    """Return headings (count,) [rad] over the full circle."""
+    return np.random.default_rng(seed).uniform(-math.pi, math.pi, count)
+
+
+def landing_figures(landings: Landings, inside: np.ndarray | None = None) -> Figures:
+    """Return the figures of jumps to places, all rows together.
+
+    Errors are over all jumps, failed ones included, but those whose simulation came apart, which `came_apart` counts,
+    and those that were not begun. `ahead` and `left` are signed. Tilts, turns, hops and steps are those of the landed
+    jumps.
+
+    inside: which jumps the figures in range count, shaped like `landings.end`; without it there are none.
+    """
+    begun = landings.ends != NOT_BEGUN
+    error, success, landed = landings.error, landings.success, landings.landed
+    offset = np.where(np.isnan(error)[..., None], np.nan, landings.offset)
+    tilt, yaw = np.degrees(landings.tilt), np.degrees(landings.yaw)
+    figures: Figures = {
+        "jumps": int(begun.sum()),
+        "mean_error_m": mean(error),
+        "mean_error_of_successes_m": mean(error[success]),
+        "max_error_of_successes_m": largest(error[success]),
+        "max_error_m": largest(error),
+        "mean_error_ahead_m": mean(offset[..., 0]),
+        "mean_error_left_m": mean(offset[..., 1]),
+        "success_rate": mean(success[begun]),
+        "single_jump_success_rate": mean(landings.single[begun]),
+        "step_free_success_rate": mean(landings.step_free[begun]),
+        "landing_rate": mean(landed[begun]),
+        "second_hop_rate": mean(landings.hopped[landed]),
+        "step_rate": mean(landings.stepped[landed]),
+        "mean_error_at_touchdown_m": mean(landings.touchdown_error[landed]),
+        "mean_error_0_3_s_after_touchdown_m": mean(landings.error_soon[landed]),
+        "at_rest_within_1_s_rate": mean((landings.rest_speed < REST_SPEED)[landed]),
+        "mean_landing_tilt_deg": mean(tilt[landed]),
+        "max_landing_tilt_deg": largest(tilt[landed]),
+        "mean_turn_deg": mean(np.abs(yaw[landed])),
+        "max_turn_deg": largest(np.abs(yaw[landed])),
+        "collision_rate": mean((landings.ends == COLLIDED)[begun]),
+        "fall_rate": mean(np.isin(landings.ends, FALLS)[begun]),
+        "early_rate": mean(landings.early[begun]),
+        CAME_APART: int((landings.ends == CAME_APART).sum()),
+    }
+    if inside is not None:
+        inside = begun & inside
+        figures |= {"mean_error_in_range_m": mean(error[inside]), "success_rate_in_range": mean(success[inside])}
+    return figures | failures(landings.outcomes[begun & ~success])
+
+
+def trained_range(task: TaskCfg) -> dict[str, float]:
+    """Return the distances straight ahead [m] that the levels of a task's training drew goals from."""
+    lower, upper = zip(*((level.goal_lower[0], level.goal_upper[0]) for level in task.levels), strict=True)
+    return {"trained_lower_m": max(min(lower), 0.0), "trained_upper_m": max(upper)}

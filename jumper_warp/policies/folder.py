@@ -1,0 +1,229 @@
+"""The folder that a policy is kept in.
+
+It holds `policy.safetensors` (weights and normaliser), `config.json` (interface, environment, training, commit,
+versions), `policy.onnx`, whatever is added (`figures.json`, a learning curve), and `manifest.json` with the SHA-256 of
+each of these. A `README.md` beside them is prose and not in the manifest. The sums find damage and mix-ups; they are no
+signature. Nothing that is loaded can execute code.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import re
+import shutil
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import safetensors.torch
+import torch
+from safetensors import SafetensorError
+
+from jumper_warp.policies.onnx import onnx_bytes
+from jumper_warp.policies.policy import Policy, check_tensors
+from jumper_warp.policies.spec import PolicyError, PolicyInterface
+from jumper_warp.utils.files import write_whole
+from jumper_warp.utils.runtime import git_commit, versions
+
+POLICIES = Path(__file__).resolve().parents[2] / "assets" / "policies"
+"""Where the project's own policies lie."""
+FORMAT = "jumper-warp policy"
+SCHEMA_VERSION = 1
+MANIFEST = "manifest.json"
+WEIGHTS = "policy.safetensors"
+CONFIG = "config.json"
+ONNX = "policy.onnx"
+README = "README.md"
+MAX_BYTES = 256 * 2**20
+"""Larger files are refused unread."""
+FILE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
+
+
+def save_policy(
+    folder: Path,
+    policy: Policy,
+    *,
+    readme: str | None = None,
+    files: Mapping[str, bytes] | None = None,
+    overwrite: bool = False,
+) -> Path:
+    """Write a policy's folder, whole or not at all; return its path.
+
+    Args:
+        folder: Where to; its parent is made if need be.
+        policy: What to save. Commit and versions are added to its configuration unless it brings its own.
+        readme: Text of `README.md`; by default a few lines on what the folder holds.
+        files: More files by name, such as a learning curve.
+        overwrite: Whether a policy that is there already is replaced, with all its files.
+
+    Raises:
+        PolicyError: The folder exists and is not to be overwritten, or is no policy's; or a name is malformed.
+    """
+    folder = Path(folder)
+    if folder.exists() and not (overwrite and (folder / MANIFEST).is_file()):
+        raise PolicyError(f"{folder} exists" + ("" if not overwrite else " and is no policy's"))
+    commit = git_commit()
+    origin = {"commit": commit.hash if commit else None, "dirty": commit.dirty if commit else None}
+    config = {**origin, "versions": versions(), **policy.config}
+    config |= {"schema_version": SCHEMA_VERSION, "interface": policy.interface.to_json()}
+    content = {
+        **(files or {}),
+        WEIGHTS: safetensors.torch.save(policy.tensors()),
+        CONFIG: _json_bytes(config),
+        ONNX: onnx_bytes(policy, {key: config[key] for key in origin}),
+        README: (readme or default_readme(policy)).encode(),
+    }
+    aside = folder.with_name(f".{folder.name}.{os.getpid()}")
+    old = folder.with_name(f".{folder.name}.{os.getpid()}.old")
+    aside.mkdir(parents=True)
+    try:
+        _write(aside, content, {})
+        if folder.exists():
+            os.replace(folder, old)
+        os.replace(aside, folder)
+    finally:
+        shutil.rmtree(aside, ignore_errors=True)
+        shutil.rmtree(old, ignore_errors=True)
+    return folder
+
+
+def add_files(folder: Path, files: Mapping[str, bytes]) -> None:
+    """Add or replace files of a policy, such as its figures. The rest of the folder is checked first.
+
+    Raises:
+        PolicyError: The folder is not a whole policy, or a name is malformed or one of the policy's own.
+    """
+    folder = Path(folder)
+    sums = _checked_sums(folder)
+    taken = sorted({WEIGHTS, CONFIG, ONNX, MANIFEST} & set(files))
+    if taken:
+        raise PolicyError(f"{folder}: {taken[0]} is the policy itself")
+    _write(folder, files, sums)
+
+
+def _write(folder: Path, files: Mapping[str, bytes], sums: Mapping[str, str]) -> None:
+    """Write files, and last the manifest of these and of `sums`."""
+    for name in files:
+        if not FILE_NAME.fullmatch(name) or name == MANIFEST:
+            raise PolicyError(f"a policy cannot hold a file named {name!r:.60}")
+    sums = {**sums, **{name: hashlib.sha256(data).hexdigest() for name, data in files.items() if name != README}}
+    manifest = {"format": FORMAT, "schema_version": SCHEMA_VERSION, "sha256": dict(sorted(sums.items()))}
+    for name, data in {**files, MANIFEST: _json_bytes(manifest)}.items():
+        write_whole(folder / name, data)
+
+
+def list_policies() -> tuple[str, ...]:
+    """Return the names of the project's own policies."""
+    return tuple(sorted(path.parent.name for path in POLICIES.glob(f"*/{MANIFEST}")))
+
+
+def find_policy(name: str | Path) -> Path:
+    """Return the folder of one of the project's policies by name (- for _ will do), or a policy's folder as it is.
+
+    Raises:
+        PolicyError: There is none.
+    """
+    text = str(name)
+    own = POLICIES / text.replace("-", "_")
+    if FILE_NAME.fullmatch(text) and (own / MANIFEST).is_file():
+        return own
+    if not Path(name).is_dir():
+        raise PolicyError(f"no policy {text!r}: give a policy's folder or one of: {', '.join(list_policies()) or '-'}")
+    return Path(name)
+
+
+def load_policy(name: str | Path, device: str | torch.device = "cpu") -> Policy:
+    """Return a policy by name or folder, with every file checked. See `find_policy`.
+
+    Raises:
+        PolicyError: The policy is missing, truncated, altered, of another version, or its weights are not finite or
+            not of the shape that its configuration asks for.
+    """
+    folder = find_policy(name)
+    sums = _checked_sums(folder)
+    config = _json(folder / CONFIG, _checked_bytes(folder / CONFIG, sums[CONFIG]))
+    if config.get("schema_version") != SCHEMA_VERSION:
+        raise PolicyError(
+            f"{folder / CONFIG}: schema version {config.get('schema_version')!r:.20}, not {SCHEMA_VERSION}"
+        )
+    data = _checked_bytes(folder / WEIGHTS, sums[WEIGHTS])
+    try:
+        tensors = safetensors.torch.load(data)
+    except (SafetensorError, KeyError, ValueError, RuntimeError) as error:
+        raise PolicyError(f"{folder / WEIGHTS}: cannot be read ({type(error).__name__}: {error})") from error
+    try:
+        interface = PolicyInterface.from_json(config.get("interface"))
+        check_tensors(tensors, interface)
+    except PolicyError as error:
+        raise PolicyError(f"{folder}: {error}") from error
+    layers = [(tensors[f"actor.{i}.weight"], tensors[f"actor.{i}.bias"]) for i in range(len(interface.sizes) - 1)]
+    policy = Policy(layers, tensors["normaliser.mean"], tensors["normaliser.std"], interface, config)
+    return policy.to(device)
+
+
+def _checked_sums(folder: Path) -> dict[str, str]:
+    """Return the sums of a manifest of this version, with all its files present and unaltered."""
+    path = folder / MANIFEST
+    manifest = _json(path, _bytes(path))
+    if manifest.get("format") != FORMAT:
+        raise PolicyError(f"{path}: not the manifest of a {FORMAT}")
+    _check_version(path, manifest)
+    sums = manifest.get("sha256")
+    if not isinstance(sums, dict) or not {WEIGHTS, CONFIG, ONNX} <= set(sums):
+        raise PolicyError(f"{path}: lacks the sums of {WEIGHTS}, {CONFIG} and {ONNX}")
+    for name, digest in sums.items():
+        if not FILE_NAME.fullmatch(name):
+            raise PolicyError(f"{path}: names a file {name!r:.60}")
+        _checked_bytes(folder / name, digest)
+    return sums
+
+
+def _check_version(path: Path, content: Mapping[str, Any]) -> None:
+    found = content.get("schema_version")
+    if found != SCHEMA_VERSION:
+        raise PolicyError(f"{path}: schema version {found!r:.20} is unknown, this is version {SCHEMA_VERSION}")
+
+
+def _checked_bytes(path: Path, digest: Any) -> bytes:
+    data = _bytes(path)
+    if hashlib.sha256(data).hexdigest() != digest:
+        raise PolicyError(f"{path}: truncated or altered, its SHA-256 is not the manifest's")
+    return data
+
+
+def _bytes(path: Path) -> bytes:
+    try:
+        if path.stat().st_size > MAX_BYTES:
+            raise PolicyError(f"{path}: larger than {MAX_BYTES >> 20} MiB")
+        return path.read_bytes()
+    except OSError as error:
+        raise PolicyError(f"{path}: cannot be read ({error.strerror})") from error
+
+
+def _json(path: Path, data: bytes) -> dict[str, Any]:
+    try:
+        content = json.loads(data)
+    except (ValueError, RecursionError) as error:
+        raise PolicyError(f"{path}: not JSON ({type(error).__name__})") from error
+    if not isinstance(content, dict):
+        raise PolicyError(f"{path}: not a JSON object")
+    return content
+
+
+def _json_bytes(content: Mapping[str, Any]) -> bytes:
+    return (json.dumps(content, indent=2, ensure_ascii=False, allow_nan=False) + "\n").encode()
+
+
+def default_readme(policy: Policy) -> str:
+    """Return a few lines on what a policy's folder holds and how to use it."""
+    face = policy.interface
+    return (
+        f"# Policy for {face.task}\n\n"
+        f"Reads {face.sizes[0]} numbers, drives {face.sizes[-1]} motors at {1.0 / face.policy_dt:.0f} Hz.\n"
+        f"`{WEIGHTS}` holds the weights, `{CONFIG}` everything that made them, `{ONNX}` the same policy with its\n"
+        "normaliser for use without PyTorch.\n\n"
+        "    jumper play FOLDER\n"
+        "    jumper evaluate FOLDER\n"
+    )

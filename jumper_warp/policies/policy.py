@@ -1,0 +1,120 @@
+"""Trained policies: the network that acts."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import torch
+from torch import nn
+
+from jumper_warp.policies.spec import PolicyError, PolicyInterface
+
+ACTIVATION_MODULES = {"elu": nn.ELU, "relu": nn.ReLU, "tanh": nn.Tanh}
+
+Layers = Sequence[tuple[torch.Tensor, torch.Tensor]]
+
+
+class Policy(nn.Module):
+    """The actor with its normaliser. `act` is the whole way from raw observations to actions."""
+
+    def __init__(
+        self,
+        layers: Layers,
+        mean: torch.Tensor,
+        std: torch.Tensor,
+        interface: PolicyInterface,
+        config: Mapping[str, Any] | None = None,
+    ) -> None:
+        """Copy the tensors, as float32.
+
+        Args:
+            layers: Weight (out, in) and bias (out,) of each layer, first to last.
+            mean: (num_obs,) of the raw observations.
+            std: (num_obs,) what observations are divided by.
+            interface: What the policy reads and drives.
+            config: Whatever else made it, as JSON holds it: environment, training.
+
+        Raises:
+            PolicyError: A tensor has another shape than the interface asks for, is not finite, or std is not positive.
+        """
+        super().__init__()
+        self.interface = interface
+        self.config = dict(config or {})
+        tensors = {"normaliser.mean": mean, "normaliser.std": std}
+        for i, (weight, bias) in enumerate(layers):
+            tensors |= {f"actor.{i}.weight": weight, f"actor.{i}.bias": bias}
+        tensors = {name: tensor.detach().float().cpu().clone() for name, tensor in tensors.items()}
+        check_tensors(tensors, interface)
+        self.register_buffer("mean", tensors["normaliser.mean"])
+        self.register_buffer("std", tensors["normaliser.std"])
+        self.actor = nn.Sequential()
+        for i in range(len(layers)):
+            weight = tensors[f"actor.{i}.weight"]
+            linear = nn.utils.skip_init(nn.Linear, weight.shape[1], weight.shape[0])
+            linear.weight.data, linear.bias.data = weight, tensors[f"actor.{i}.bias"]
+            self.actor.append(linear)
+            if i < len(layers) - 1:
+                self.actor.append(ACTIVATION_MODULES[interface.activation]())
+        self.requires_grad_(False)
+
+    @classmethod
+    def from_actor(
+        cls,
+        actor: nn.Sequential,
+        mean: torch.Tensor,
+        std: torch.Tensor,
+        interface: PolicyInterface,
+        config: Mapping[str, Any] | None = None,
+    ) -> Policy:
+        """Return the policy of a trained actor: linear layers with the interface's activation between."""
+        layers = [(module.weight, module.bias) for module in actor if isinstance(module, nn.Linear)]
+        return cls(layers, mean, std, interface, config)
+
+    @property
+    def layers(self) -> list[tuple[torch.Tensor, torch.Tensor]]:
+        """Weight and bias of each layer."""
+        return [(module.weight, module.bias) for module in self.actor if isinstance(module, nn.Linear)]
+
+    def tensors(self) -> dict[str, torch.Tensor]:
+        """Return all tensors by the names that they are saved under, on the CPU."""
+        found = {"normaliser.mean": self.mean, "normaliser.std": self.std}
+        for i, (weight, bias) in enumerate(self.layers):
+            found |= {f"actor.{i}.weight": weight, f"actor.{i}.bias": bias}
+        return {name: tensor.detach().cpu().contiguous() for name, tensor in found.items()}
+
+    @torch.no_grad()
+    def act(self, obs: torch.Tensor) -> torch.Tensor:
+        """Return the mean action clipped to ±1, (..., num_actions), for raw observations (..., num_obs).
+
+        Entries of an observation that are not finite count as 0. Nothing waits for the device.
+
+        Raises:
+            ValueError: The last axis has another size than the policy's observation.
+        """
+        if obs.shape[-1] != len(self.mean):
+            raise ValueError(f"the policy reads {len(self.mean)} numbers, got observations of {obs.shape[-1]}")
+        limit = self.interface.observation_limit
+        finite = torch.nan_to_num(obs, nan=0.0, posinf=0.0, neginf=0.0).clamp(-limit, limit)
+        limit = self.interface.normalised_limit
+        features = ((finite - self.mean) / self.std).clamp(-limit, limit)
+        return self.actor(features).clamp(-1.0, 1.0)
+
+
+def check_tensors(tensors: Mapping[str, torch.Tensor], interface: PolicyInterface) -> None:
+    """Raise a PolicyError unless names, shapes and values are those of a usable policy of this interface."""
+    sizes = interface.sizes
+    expected = {"normaliser.mean": (sizes[0],), "normaliser.std": (sizes[0],)}
+    for i in range(len(sizes) - 1):
+        expected |= {f"actor.{i}.weight": (sizes[i + 1], sizes[i]), f"actor.{i}.bias": (sizes[i + 1],)}
+    different = sorted(set(expected) ^ set(tensors))
+    if different:
+        raise PolicyError(f"its configuration asks for layers {sizes}; missing or unknown: {', '.join(different)}")
+    for name, shape in expected.items():
+        tensor = tensors[name]
+        if tuple(tensor.shape) != shape:
+            raise PolicyError(f"its configuration asks for {name} of shape {shape}, it has {tuple(tensor.shape)}")
+        if not tensor.isfinite().all():
+            raise PolicyError(f"{name} is not finite")
+    if not (tensors["normaliser.std"] > 0.0).all():
+        raise PolicyError("normaliser.std must be positive")

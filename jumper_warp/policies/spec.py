@@ -1,0 +1,142 @@
+"""What a policy reads and drives: all that is needed to run it on a robot, apart from its weights."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, get_type_hints
+
+if TYPE_CHECKING:
+    from jumper_warp.robot.motors import MotorKindCfg
+    from jumper_warp.tasks.cfg import TaskCfg
+
+ACTIVATIONS = ("elu", "relu", "tanh")
+
+
+class PolicyError(ValueError):
+    """A policy that is missing, damaged, or does not fit its configuration. The message is one line."""
+
+
+@dataclass(frozen=True)
+class PolicyInterface:
+    """Observation, network sizes, and the way from an action to motor torques.
+
+    Observations are SI units and rad, not scaled, of the present step only; velocities and gravity in body axes, angles
+    relative to `default_joint_pos`. An action a in [-1, 1] commands a · action_scale + default_joint_pos.
+    """
+
+    task: str
+    observation_names: tuple[str, ...]
+    """Of every entry of the observation, in order."""
+    joint_names: tuple[str, ...]
+    """Motors in the order of the action; the tuples below follow it."""
+    action_scale: tuple[float, ...]
+    """[rad]"""
+    default_joint_pos: tuple[float, ...]
+    """[rad]"""
+    joint_stiffness: tuple[float, ...]
+    """[N m/rad]"""
+    joint_damping: tuple[float, ...]
+    """[N m s/rad]"""
+    torque_limit: tuple[float, ...]
+    """[N m]"""
+    command_filter: dict[str, Any]
+    """Fields of `jumper_warp.robot.motors.FilterCfg`: degrees, horizon in seconds."""
+    policy_dt: float
+    """[s] Time between actions."""
+    physics_dt: float
+    """[s] Step of the simulation that it was trained in."""
+    hidden: tuple[int, ...]
+    """Widths of the hidden layers."""
+    activation: str = "elu"
+    observation_limit: float = 100.0
+    """Raw observations are clamped to plus and minus this; what is not finite counts as 0."""
+    normalised_limit: float = 10.0
+    """Observations in standard deviations are clamped to plus and minus this."""
+    quaternion_order: str = "xyzw"
+
+    def __post_init__(self) -> None:
+        """Check that the parts fit each other. Raises PolicyError."""
+        for name in ("observation_names", "joint_names"):
+            names = getattr(self, name)
+            if not names or len(set(names)) < len(names):
+                raise PolicyError(f"{name} must be distinct and not empty")
+        for name in ("action_scale", "default_joint_pos", "joint_stiffness", "joint_damping", "torque_limit"):
+            values = getattr(self, name)
+            if len(values) != len(self.joint_names):
+                raise PolicyError(f"{name} needs {len(self.joint_names)} numbers, one a joint, got {len(values)}")
+            if not all(math.isfinite(value) for value in values):
+                raise PolicyError(f"{name} must be finite, got {values}")
+        for name in ("policy_dt", "physics_dt", "observation_limit", "normalised_limit"):
+            if not 0.0 < getattr(self, name) < math.inf:
+                raise PolicyError(f"{name} must be finite and positive, got {getattr(self, name)}")
+        if not self.hidden or not all(1 <= width <= 65536 for width in self.hidden):
+            raise PolicyError(f"hidden must name widths from 1 to 65536, got {self.hidden}")
+        if self.activation not in ACTIVATIONS:
+            raise PolicyError(f"activation must be one of {', '.join(ACTIVATIONS)}, got {self.activation!r:.40}")
+        if self.quaternion_order != "xyzw":
+            raise PolicyError(f"quaternion_order must be xyzw, got {self.quaternion_order!r:.40}")
+
+    @property
+    def sizes(self) -> tuple[int, ...]:
+        """Widths of all layers, observation and action included."""
+        return (len(self.observation_names), *self.hidden, len(self.joint_names))
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the fields as JSON holds them."""
+        return dataclasses.asdict(self)
+
+    @classmethod
+    def from_json(cls, data: Any) -> PolicyInterface:
+        """Return what `to_json` described. Raises PolicyError: a field is missing, unknown or of another type."""
+        if not isinstance(data, dict):
+            raise PolicyError("the interface must be a JSON object")
+        hints = get_type_hints(cls)
+        different = sorted(set(data) ^ set(hints))
+        if different:
+            raise PolicyError(f"interface fields missing or unknown: {', '.join(map(str, different))}")
+        return cls(**{name: _checked(name, data[name], str(hint)) for name, hint in hints.items()})
+
+
+def _checked(name: str, value: Any, hint: str) -> Any:
+    """Return a JSON value as the type that the hint names, or raise a PolicyError."""
+    kind = next(k for k in ("dict", "str", "float", "int") if k in hint)
+    types = {"str": str, "float": (float, int), "int": int, "dict": dict}[kind]
+    many = hint.startswith("tuple")
+    values = value if many and isinstance(value, list) else [value]
+    if many != isinstance(value, list) or not all(isinstance(v, types) and not isinstance(v, bool) for v in values):
+        raise PolicyError(f"interface field {name} must be {'a list of ' if many else 'a '}{kind}, got {value!r:.60}")
+    if kind == "float":
+        values = [float(v) if abs(v) < 1.0e300 else math.inf for v in values]
+    return tuple(values) if many else values[0]
+
+
+def interface_of_task(
+    task: TaskCfg, *, policy_dt: float, physics_dt: float, hidden: tuple[int, ...], activation: str = "elu"
+) -> PolicyInterface:
+    """Return the interface of policies of a task; policy_dt, physics_dt [s], hidden: widths of the layers."""
+    from jumper_warp.robot.description import MOTOR_JOINTS, load_description
+
+    def per_motor(lateral: float, transversal: float) -> tuple[float, ...]:
+        return (lateral, transversal, transversal) * (len(MOTOR_JOINTS) // 3)
+
+    def torque(kind: MotorKindCfg) -> float:
+        return min(kind.saturation, kind.peak)
+
+    motors = task.motors
+    return PolicyInterface(
+        task=task.name,
+        observation_names=task.observation_names,
+        joint_names=MOTOR_JOINTS,
+        action_scale=per_motor(*map(math.radians, task.action_scale)),
+        default_joint_pos=tuple(float(angle) for angle in load_description().pose("default")),
+        joint_stiffness=per_motor(motors.lateral.kp, motors.transversal.kp),
+        joint_damping=per_motor(motors.lateral.kd, motors.transversal.kd),
+        torque_limit=per_motor(torque(motors.lateral), torque(motors.transversal)),
+        command_filter=dataclasses.asdict(task.command_filter),
+        policy_dt=policy_dt,
+        physics_dt=physics_dt,
+        hidden=tuple(hidden),
+        activation=activation,
+    )

@@ -1,0 +1,156 @@
+"""What PPO trains: actor, critic, exploration noise, and the running statistics that scale observations and values."""
+
+import math
+from collections.abc import Sequence
+from itertools import pairwise
+
+import torch
+from torch import nn
+
+from jumper_warp.rl.distributed import average_over_ranks, world_size
+
+RAW_LIMIT = 100.0
+"""Raw observations are clamped to plus and minus this, so that one absurd world cannot spoil the statistics."""
+NORMALISED_LIMIT = 10.0
+"""The networks see observations within plus and minus this many standard deviations."""
+EPS = 1.0e-5
+"""Added to a variance before its root is taken."""
+ACTIVATIONS = {"elu": nn.ELU, "relu": nn.ReLU, "tanh": nn.Tanh}
+"""Activations by the name that a configuration gives."""
+
+
+def batch_moments(x: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, int]:
+    """Return mean, population variance (both float64) and count over the first axis of all ranks' batches.
+
+    The batches of all ranks must have the same size; x: (batch, ...).
+    """
+    var, own_mean = torch.var_mean(x, dim=0, correction=0)
+    own_mean = own_mean.double()
+    mean = average_over_ranks(own_mean.clone())
+    var = average_over_ranks(var.double() + (own_mean - mean).square())
+    return mean, var, x.shape[0] * world_size()
+
+
+def sanitise(obs: torch.Tensor, out: torch.Tensor | None = None) -> torch.Tensor:
+    """Return a copy of observations, in `out` if given: non-finite entries 0, the rest clamped to ±RAW_LIMIT."""
+    return torch.nan_to_num(obs, nan=0.0, posinf=0.0, neginf=0.0, out=out).clamp_(-RAW_LIMIT, RAW_LIMIT)
+
+
+def gaussian_log_prob(x: torch.Tensor, mean: torch.Tensor, log_std: torch.Tensor) -> torch.Tensor:
+    """Return the log density at x (..., n) of independent Gaussians of mean (..., n) and log_std (n,); (...)."""
+    z = (x - mean) * torch.exp(-log_std)
+    return (-0.5 * z.square() - log_std - 0.5 * math.log(2.0 * math.pi)).sum(-1)
+
+
+def gaussian_kl(
+    mean: torch.Tensor, log_std: torch.Tensor, new_mean: torch.Tensor, new_log_std: torch.Tensor
+) -> torch.Tensor:
+    """Return KL(old ‖ new) between independent Gaussians; means (..., n), log_std (n,); (...)."""
+    ratio = (2.0 * (log_std - new_log_std)).exp()
+    miss = ((mean - new_mean) * torch.exp(-new_log_std)).square()
+    return (new_log_std - log_std + 0.5 * (ratio + miss - 1.0)).sum(-1)
+
+
+class RunningMoments(nn.Module):
+    """Mean and variance of everything seen so far, and the scaling by them. Starts as the identity."""
+
+    mean: torch.Tensor
+    var: torch.Tensor
+    count: torch.Tensor
+
+    def __init__(self, shape: Sequence[int] = ()) -> None:
+        """shape: that of one sample; () for a scalar."""
+        super().__init__()
+        self.register_buffer("mean", torch.zeros(tuple(shape), dtype=torch.float64))
+        self.register_buffer("var", torch.full(tuple(shape), 1.0 - EPS, dtype=torch.float64))
+        self.register_buffer("count", torch.zeros((), dtype=torch.float64))
+
+    @torch.no_grad()
+    def update(self, x: torch.Tensor) -> None:
+        """Take in a batch of finite samples (batch, *shape); those of the other ranks come with it, exactly."""
+        mean, var, size = batch_moments(x)
+        share = size / (self.count + size)
+        delta = mean - self.mean
+        self.var.lerp_(var, share).add_(delta.square() * share * (1.0 - share))
+        self.mean.add_(delta * share)
+        self.count.add_(size)
+
+    def scale(self) -> torch.Tensor:
+        """Return the standard deviation, float32, of the sample's shape."""
+        return (self.var + EPS).sqrt().float()
+
+    def normalise(self, x: torch.Tensor) -> torch.Tensor:
+        """Return (x - mean) / scale."""
+        return (x - self.mean.float()) / self.scale()
+
+    def restore(self, x: torch.Tensor) -> torch.Tensor:
+        """Return x · scale + mean, the inverse of `normalise`."""
+        return x * self.scale() + self.mean.float()
+
+
+def mlp(sizes: Sequence[int], activation: str, out_gain: float) -> nn.Sequential:
+    """Return linear layers of these sizes with activations between, orthogonal weights and zero biases."""
+    layers: list[nn.Module] = []
+    for index, (num_in, num_out) in enumerate(pairwise(sizes)):
+        last = index == len(sizes) - 2
+        linear = nn.Linear(num_in, num_out)
+        nn.init.orthogonal_(linear.weight, out_gain if last else math.sqrt(2.0))
+        nn.init.zeros_(linear.bias)
+        layers += [linear] if last else [linear, ACTIVATIONS[activation]()]
+    return nn.Sequential(*layers)
+
+
+class ActorCritic(nn.Module):
+    """Two separate networks, each on its own normalised observation; the noise does not depend on the state."""
+
+    def __init__(
+        self,
+        num_obs: int,
+        num_actions: int,
+        hidden: Sequence[int],
+        activation: str = "elu",
+        init_std: float = 1.0,
+        num_critic_obs: int | None = None,
+    ) -> None:
+        """Args:
+
+        num_obs: Entries of the actor's observation.
+        num_actions: Entries of an action.
+        hidden: Widths of the hidden layers of both networks.
+        activation: A key of ACTIVATIONS.
+        init_std: Standard deviation of the noise on every action at the start.
+        num_critic_obs: Entries of the critic's observation (default: num_obs).
+        """
+        super().__init__()
+        num_critic_obs = num_obs if num_critic_obs is None else num_critic_obs
+        self.actor = mlp((num_obs, *hidden, num_actions), activation, out_gain=0.01)
+        self.critic = mlp((num_critic_obs, *hidden, 1), activation, out_gain=1.0)
+        self.log_std = nn.Parameter(torch.full((num_actions,), math.log(init_std)))
+        self.obs_moments = RunningMoments((num_obs,))
+        self.critic_moments = RunningMoments((num_critic_obs,))
+        self.value_moments = RunningMoments()
+
+    def features(self, obs: torch.Tensor) -> torch.Tensor:
+        """Return what the actor sees of raw observations (..., num_obs): finite, scaled, within ±NORMALISED_LIMIT."""
+        return _features(obs, self.obs_moments)
+
+    def critic_features(self, critic_obs: torch.Tensor) -> torch.Tensor:
+        """Return what the critic sees of its raw observations (..., num_critic_obs), likewise."""
+        return _features(critic_obs, self.critic_moments)
+
+    def value_head(self, critic_features: torch.Tensor) -> torch.Tensor:
+        """Return the critic's output, in standard deviations of the return; (...)."""
+        return self.critic(critic_features).squeeze(-1)
+
+    def value(self, critic_obs: torch.Tensor) -> torch.Tensor:
+        """Return the expected return from the critic's raw observations (..., num_critic_obs); (...)."""
+        return self.value_moments.restore(self.value_head(self.critic_features(critic_obs)))
+
+    @torch.no_grad()
+    def act(self, obs: torch.Tensor) -> torch.Tensor:
+        """Return the mean action clipped to ±1, (..., num_actions), for raw observations (..., num_obs)."""
+        return self.actor(self.features(obs)).clamp(-1.0, 1.0)
+
+
+def _features(obs: torch.Tensor, moments: RunningMoments) -> torch.Tensor:
+    return moments.normalise(sanitise(obs)).clamp(-NORMALISED_LIMIT, NORMALISED_LIMIT)

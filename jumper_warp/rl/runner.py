@@ -1,0 +1,350 @@
+"""Training: one process per device, logged, interruptible at any time, and resumed where it was left."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import signal
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from datetime import datetime
+from pathlib import Path
+from types import FrameType
+from typing import Any, Literal, NamedTuple
+
+import torch
+
+from jumper_warp.rl.checkpoint import CheckpointError, latest_checkpoint, load_checkpoint, save_checkpoint
+from jumper_warp.rl.distributed import Rank, gather, join_ranks, wait_for_ranks, world_size
+from jumper_warp.rl.logger import Stopwatch, TrainingLog
+from jumper_warp.rl.ppo import Ppo, PpoCfg, VecTask
+from jumper_warp.utils.files import write_whole
+from jumper_warp.utils.runtime import git_commit, versions
+
+CHECKPOINTS = "checkpoints"
+"""Folder of a run that holds its checkpoints."""
+CONFIG = "config.json"
+"""File of a run: all settings, versions and the commit."""
+INTERRUPTED = 130
+"""Exit code of a training that was asked to stop."""
+
+MakeEnv = Callable[[int, int, torch.device], VecTask]
+"""Makes an environment from the number of its worlds, a seed and a device."""
+
+
+@dataclass(frozen=True)
+class TrainCfg:
+    """Settings of a training."""
+
+    task: str = "vertical-jump"
+    """Name of the task; also the name of the folder of its runs."""
+    num_envs: int = 8192
+    """Worlds, over all processes."""
+    iterations: int = 2800
+    """Iterations that the run has at its end, those before a resume included."""
+    max_seconds: float = 0.0
+    """Wall-clock limit of the iterations [s], those before a resume included; 0: none."""
+    seed: int = 1
+    """Of weights, noise and worlds; every process derives its own."""
+    device: str | None = None
+    """A torch device; default: a GPU if there is one."""
+    log_root: Path = Path("logs")
+    """A run is written to log_root/task/time of its start."""
+    log_interval: int = 10
+    """Iterations between two logged ones."""
+    save_interval: int = 100
+    """Iterations between two checkpoints."""
+    keep: int = 3
+    """How many of the newest checkpoints stay; the best stays anyway."""
+    best_by: str = "Metrics/success"
+    """The logged figure that makes a checkpoint the best; higher is better."""
+    resume: str | None = None
+    """A checkpoint, a run's folder, or `latest` for the task's latest run."""
+    trainer: Literal["ppo", "rsl-rl"] = "ppo"
+    """This package's PPO, or that of rsl-rl-lib for comparison."""
+    tensorboard: bool = True
+    """Write TensorBoard events, if TensorBoard is installed."""
+    wandb: bool = False
+    """Upload to Weights & Biases."""
+    ppo: PpoCfg = field(default_factory=PpoCfg)
+    """Settings of the algorithm."""
+
+    def __post_init__(self) -> None:
+        """Raises ValueError: a setting is out of range."""
+        for name in ("num_envs", "iterations", "log_interval", "save_interval", "keep"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
+        if self.max_seconds < 0.0:
+            raise ValueError(f"max_seconds must not be negative, got {self.max_seconds}")
+        if self.trainer == "rsl-rl" and self.resume:
+            raise ValueError("resume is not offered with trainer rsl-rl")
+
+
+class TrainResult(NamedTuple):
+    """What a finished training leaves."""
+
+    folder: Path
+    """The run's."""
+    iteration: int
+    """Iterations that the policy has had."""
+    seconds: float
+    """Wall-clock time of this process's iterations [s]."""
+    figures: dict[str, float]
+    """The last logged ones."""
+
+
+class Stop:
+    """Context in which Ctrl-C and SIGTERM set `asked`; the second Ctrl-C interrupts at once."""
+
+    def __enter__(self) -> Stop:
+        """Take over the signals."""
+        self.asked = False
+        self._previous = {number: signal.signal(number, self._ask) for number in (signal.SIGINT, signal.SIGTERM)}
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Give the signals back."""
+        for number, handler in self._previous.items():
+            signal.signal(number, handler)
+
+    def _ask(self, number: int, frame: FrameType | None) -> None:
+        self.asked = True
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+def train(cfg: TrainCfg, make_env: MakeEnv) -> TrainResult:
+    """Train to the last iteration or the time limit, and save.
+
+    Raises:
+        ValueError: A setting does not fit the environment or the machine.
+        CheckpointError: There is nothing usable to resume from, or the end could not be saved.
+        SystemExit: With code INTERRUPTED, after Ctrl-C or SIGTERM ended the iteration and it was saved.
+    """
+    rank = join_ranks(cfg.device)
+    try:
+        if cfg.trainer == "rsl-rl" and rank.size > 1:
+            raise ValueError("trainer rsl-rl is offered for one process only")
+        if cfg.num_envs % rank.size:
+            raise ValueError(f"num_envs {cfg.num_envs} is not divisible by {rank.size} processes")
+        env = make_env(cfg.num_envs // rank.size, cfg.seed + 1000 * rank.index, rank.device)
+        if cfg.trainer == "rsl-rl":
+            return _train_rsl_rl(cfg, env, rank)
+        torch.manual_seed(cfg.seed)  # the same weights in all processes
+        run = Run(cfg, env, rank)
+        with Stop() as stop:
+            result = run.iterate(stop)
+        wait_for_ranks()
+        if stop.asked:
+            raise SystemExit(INTERRUPTED)
+        return result
+    finally:
+        if torch.distributed.is_initialized():
+            torch.distributed.destroy_process_group()
+
+
+def full_config(cfg: TrainCfg, env: VecTask, rank: Rank) -> dict[str, Any]:
+    """Return all settings with versions and commit, ready for JSON."""
+    settings = json.loads(json.dumps(dataclasses.asdict(cfg), default=str))
+    commit = git_commit()
+    return {
+        "train": settings,
+        "env": env.config(),
+        "processes": rank.size,
+        "device": str(rank.device),
+        "versions": versions(),
+        "commit": commit and commit._asdict(),
+    }
+
+
+class Run:
+    """A training under way in this process."""
+
+    def __init__(self, cfg: TrainCfg, env: VecTask, rank: Rank) -> None:
+        """Build the algorithm, take up a checkpoint if the configuration names one, and begin the episodes."""
+        self.cfg, self.env, self.rank = cfg, env, rank
+        self.ppo = Ppo(env, cfg.ppo)
+        self.config = full_config(cfg, env, rank)
+        self.iteration, self.seconds = 0, 0.0  # that the run had before this process
+        self.figures: dict[str, float] = {}
+        self.notes: list[str] = []
+        torch.manual_seed(cfg.seed + 1 + rank.index)
+        self.folder = self._resume() if cfg.resume else new_folder(cfg, rank)
+        if rank.index == 0:
+            write_whole(self.folder / CONFIG, json.dumps(self.config, indent=1).encode())
+
+    def _resume(self) -> Path:
+        path, state, refusals = find_checkpoint(self.cfg)
+        self.notes += [f"passed over: {refusal}" for refusal in refusals] + [f"resumed {path}"]
+        try:
+            processes = 1 + len(state["others"])
+            if processes != self.rank.size:
+                raise ValueError(f"saved by {processes} processes, there are {self.rank.size}")
+            own = state["others"][self.rank.index - 1] if self.rank.index else state
+            self.ppo.load_state_dict({**state["ppo"], **own["ppo"]})
+            self.env.load_state_dict(own["env"])
+            self.seconds = float(state.get("seconds", 0.0))
+        except (RuntimeError, KeyError, ValueError, TypeError) as error:
+            reason = " ".join(str(error).split())[:300]
+            raise CheckpointError(f"{path}: does not fit these settings: {reason}") from error
+        self.iteration = state["iteration"]
+        set_random_state(own["rng"])
+        return path.parent.parent
+
+    def iterate(self, stop: Stop) -> TrainResult:
+        """Iterate until the end, the time limit or a wish to stop; log and save on the way."""
+        cfg, ppo = self.cfg, self.ppo
+        if self.iteration == 0:
+            self.env.reset()
+        start = logged = time.perf_counter()
+        begin = start - self.seconds
+        watch, log = Stopwatch(self.rank.device), None
+        if self.rank.index == 0:
+            log = TrainingLog(self.folder, self.config, cfg.iterations, cfg.tensorboard, cfg.wandb)
+        with log or _Silent() as log:
+            for note in self.notes:
+                log.say(note)
+            ending = self.iteration >= cfg.iterations or 0.0 < cfg.max_seconds <= self.seconds
+            since = self.iteration
+            while not ending:
+                watch.start()
+                ppo.set_progress(self._progress(begin))
+                ppo.collect()
+                watch.mark()
+                ppo.update()
+                watch.mark()
+                self.iteration += 1
+                ending = self._ending(stop, begin)
+                if ending or self.iteration % cfg.log_interval == 0:
+                    times = watch.read()
+                    now = time.perf_counter()
+                    self.figures = self._read(times, (now - logged) / (self.iteration - since), now - begin)
+                    logged, since = now, self.iteration
+                    log.log(self.iteration, self.figures)
+                if ending or self.iteration % cfg.save_interval == 0:
+                    self._save(log, time.perf_counter() - begin, must=ending)
+        return TrainResult(self.folder, self.iteration, time.perf_counter() - start, self.figures)
+
+    def _progress(self, begin: float) -> float:
+        """Return how much of the training is over, by iterations or by time since begin [s], whichever is further."""
+        done = self.iteration / self.cfg.iterations
+        if self.cfg.max_seconds > 0.0:
+            done = max(done, (time.perf_counter() - begin) / self.cfg.max_seconds)
+        return done
+
+    def _ending(self, stop: Stop, begin: float) -> bool:
+        """Return whether this iteration is the last; the processes agree, which they ask when they log."""
+        if self.iteration >= self.cfg.iterations:
+            return True
+        if world_size() > 1 and self.iteration % self.cfg.log_interval:
+            return False
+        late = 0.0 < self.cfg.max_seconds <= time.perf_counter() - begin
+        if world_size() > 1:
+            wish = torch.tensor([float(stop.asked), float(late)], device=self.rank.device)
+            torch.distributed.all_reduce(wish, op=torch.distributed.ReduceOp.MAX)
+            stop.asked, late = (value > 0.0 for value in wish.tolist())
+        return stop.asked or late
+
+    def _read(self, times: list[float], seconds: float, elapsed: float) -> dict[str, float]:
+        """Return the figures to log; times: of collect and update [s], seconds: of an iteration."""
+        steps = self.cfg.ppo.num_steps * self.cfg.num_envs
+        return {
+            **self.ppo.statistics(),
+            **self.env.metrics(),
+            "Perf/fps": steps / seconds,
+            "Perf/collect_s": times[0],
+            "Perf/update_s": times[1],
+            "Perf/elapsed_s": elapsed,
+        }
+
+    def _save(self, log: TrainingLog | _Silent, seconds: float, must: bool) -> None:
+        """Save a checkpoint; a failure is only told, and tried again next time, unless this one must be."""
+        own = {"ppo": self.ppo.state_dict(), "env": self.env.state_dict(), "rng": random_state()}
+        others = self._others(own)
+        if self.rank.index != 0:
+            return
+        state = {"iteration": self.iteration, "seconds": seconds, **own, "others": others}
+        state["config"] = json.dumps(self.config)
+        folder = self.folder / CHECKPOINTS
+        try:
+            save_checkpoint(folder, state, self.figures.get(self.cfg.best_by), self.cfg.keep)
+        except OSError as error:
+            if must:
+                raise CheckpointError(f"{folder}: not saved: {error.strerror}") from error
+            log.say(f"{folder}: not saved, will try again: {error.strerror}")
+
+    def _others(self, own: dict[str, Any]) -> list[dict[str, Any]]:
+        """Return, in process 0, what only the other processes know: their worlds and random numbers."""
+        if world_size() == 1:
+            return []
+        return gather({**own, "ppo": {"episode": own["ppo"]["episode"].cpu()}}, self.rank)[1:]
+
+
+class _Silent:
+    """Stands for the log where nobody listens."""
+
+    def __enter__(self) -> _Silent:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        pass
+
+    def say(self, line: str) -> None:
+        pass
+
+    def log(self, iteration: int, figures: dict[str, float]) -> None:
+        pass
+
+
+def new_folder(cfg: TrainCfg, rank: Rank) -> Path:
+    """Make and return the folder of a run that begins now."""
+    name = datetime.now().strftime("%Y-%m-%d_%H-%M-%S_%f")
+    folder = cfg.log_root / cfg.task / name
+    if rank.index == 0:
+        folder.mkdir(parents=True)
+    return folder
+
+
+def find_checkpoint(cfg: TrainCfg) -> tuple[Path, dict[str, Any], list[str]]:
+    """Return path and content of the checkpoint to resume, and why newer ones were passed over.
+
+    Raises:
+        CheckpointError: There is none that can be used.
+    """
+    if cfg.resume == "latest":
+        runs = cfg.log_root / cfg.task
+        folders = sorted(path.parent for path in runs.glob(f"*/{CHECKPOINTS}/manifest.json"))
+        if not folders:
+            raise CheckpointError(f"{runs}: no run to resume")
+        return latest_checkpoint(folders[-1])
+    path = Path(cfg.resume or "")
+    if path.suffix == ".pt":
+        return path, load_checkpoint(path), []
+    return latest_checkpoint(path if path.name == CHECKPOINTS else path / CHECKPOINTS)
+
+
+def random_state() -> dict[str, torch.Tensor]:
+    """Return the states of torch's generators."""
+    state = {"cpu": torch.get_rng_state()}
+    if torch.cuda.is_available():
+        state["cuda"] = torch.cuda.get_rng_state()
+    return state
+
+
+def set_random_state(state: dict[str, torch.Tensor]) -> None:
+    """Take up what `random_state` gave; a GPU's only where there is one."""
+    torch.set_rng_state(state["cpu"])
+    if "cuda" in state and torch.cuda.is_available():
+        torch.cuda.set_rng_state(state["cuda"])
+
+
+def _train_rsl_rl(cfg: TrainCfg, env: VecTask, rank: Rank) -> TrainResult:
+    from jumper_warp.envs.rsl_rl import train_rsl_rl
+
+    folder = new_folder(cfg, rank)
+    if rank.index == 0:
+        write_whole(folder / CONFIG, json.dumps(full_config(cfg, env, rank), indent=1).encode())
+    begin = time.perf_counter()
+    torch.manual_seed(cfg.seed + rank.index)
+    train_rsl_rl(env, cfg.ppo, cfg.iterations, cfg.save_interval, cfg.seed, folder)
+    return TrainResult(folder, cfg.iterations, time.perf_counter() - begin, {})

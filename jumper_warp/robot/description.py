@@ -1,0 +1,219 @@
+"""The robot description: a URDF for the tree, and a JSON file for what a URDF cannot say (loops, motors, poses).
+
+Angles of the legs: lateral positive swings the paw outward; outer and inner thigh positive move the thigh tip away
+from its twin. Quaternions are xyzw.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from jumper_warp.robot.checks import LegDimensions, check_description, knee_angles, leg_dimensions
+from jumper_warp.robot.parts import (
+    LEGS,
+    MOTOR_JOINTS,
+    Gains,
+    Joint,
+    Link,
+    Loop,
+    Motor,
+    RobotDescription,
+    RobotDescriptionError,
+    Shape,
+    TriangleMesh,
+)
+from jumper_warp.robot.urdf import UrdfReader, file_inside, read_text
+
+__all__ = [
+    "DEFAULT_DESCRIPTION",
+    "LEGS",
+    "MOTOR_JOINTS",
+    "Gains",
+    "Joint",
+    "LegDimensions",
+    "Link",
+    "Loop",
+    "Motor",
+    "RobotDescription",
+    "RobotDescriptionError",
+    "Shape",
+    "TriangleMesh",
+    "knee_angles",
+    "leg_dimensions",
+    "load_description",
+]
+
+DEFAULT_DESCRIPTION = Path(__file__).resolve().parents[2] / "assets" / "jumper" / "jumper.json"
+
+RAD_PER_S_PER_RPM = 2.0 * math.pi / 60.0
+
+
+def load_description(path: Path | None = None) -> RobotDescription:
+    """Return the checked robot description of a JSON file, by default the project's own.
+
+    Raises RobotDescriptionError for whatever is missing, malformed or impossible.
+    """
+    path = DEFAULT_DESCRIPTION if path is None else Path(path)
+    reader = JsonReader(path)
+    urdf_file = file_inside(path, reader.text(reader.root, "urdf", ""), "urdf")
+    urdf_text = read_text(urdf_file)
+    urdf = UrdfReader(urdf_file, urdf_text)
+    description = RobotDescription(
+        path=path,
+        urdf_path=urdf_file,
+        urdf=urdf_text,
+        links=urdf.links(),
+        joints=urdf.joints(),
+        loops=reader.loops(),
+        motors=reader.motors(),
+        knee_damping=reader.positive(reader.root, "knee_damping", ""),
+        knee_damping_limit=reader.positive(reader.root, "knee_damping_limit", ""),
+        transversal_sum=reader.range_deg("transversal_sum_deg"),
+        poses=reader.poses(),
+    )
+    return check_description(description)
+
+
+class JsonReader:
+    """Reads the JSON part. Every method raises RobotDescriptionError on bad input."""
+
+    def __init__(self, file: Path):
+        self.file = file
+        try:
+            self.root = json.loads(
+                read_text(file), object_pairs_hook=self.unique_keys, parse_constant=self.refuse_constant
+            )
+        except json.JSONDecodeError as err:
+            raise RobotDescriptionError(file, f"line {err.lineno}", f"expected JSON ({err.msg})") from err
+        except RobotDescriptionError:
+            raise
+        except (ValueError, RecursionError) as err:
+            raise RobotDescriptionError(file, "", f"expected JSON ({type(err).__name__})") from err
+        if not isinstance(self.root, dict):
+            raise RobotDescriptionError(file, "", "expected a JSON object")
+
+    def unique_keys(self, pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+        """Build an object, refusing a key that occurs twice."""
+        table = dict(pairs)
+        if len(table) < len(pairs):
+            keys = [key for key, _ in pairs]
+            double = next(key for key in keys if keys.count(key) > 1)
+            raise RobotDescriptionError(self.file, double, "expected one entry, found it twice")
+        return table
+
+    def refuse_constant(self, name: str) -> None:
+        """Refuse NaN and Infinity."""
+        raise RobotDescriptionError(self.file, "", f"expected finite numbers, found {name}")
+
+    def get(self, table: dict, key: str, part: str, kind: type) -> Any:
+        """Return an entry of a given JSON type."""
+        value = table.get(key)
+        if not isinstance(value, kind):
+            found = "nothing" if value is None else type(value).__name__
+            raise RobotDescriptionError(self.file, part, f"expected {key} to be a {kind.__name__}, found {found}")
+        return value
+
+    def text(self, table: dict, key: str, part: str) -> str:
+        """Return a string entry."""
+        return self.get(table, key, part, str)
+
+    def number(self, value: Any, key: str, part: str) -> float:
+        """Return a finite number."""
+        number = math.nan
+        if isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < 1.0e9:
+            number = float(value)
+        if not math.isfinite(number):
+            raise RobotDescriptionError(self.file, part, f"expected {key} to be a finite number, found {value!r:.60}")
+        return number
+
+    def positive(self, table: dict, key: str, part: str) -> float:
+        """Return a number above zero."""
+        number = self.number(table.get(key), key, part)
+        if number <= 0.0:
+            raise RobotDescriptionError(self.file, part, f"expected {key} > 0, found {number}")
+        return number
+
+    def vector(self, table: dict, key: str, count: int, part: str) -> list[float]:
+        """Return a list of finite numbers."""
+        values = self.get(table, key, part, list)
+        if len(values) != count:
+            raise RobotDescriptionError(self.file, part, f"expected {count} numbers in {key}, found {len(values)}")
+        return [self.number(value, key, part) for value in values]
+
+    def range_deg(self, key: str) -> tuple[float, float]:
+        """Return a (lower, upper) range given in degrees, in radians."""
+        lower, upper = self.vector(self.root, key, 2, "")
+        if lower >= upper:
+            raise RobotDescriptionError(self.file, key, f"expected lower < upper, found {lower} and {upper}")
+        return math.radians(lower), math.radians(upper)
+
+    def motors(self) -> tuple[Motor, ...]:
+        """Return the 12 motors in motor order."""
+        types = {
+            name: self.motor_type(name, self.get(self.root["motor_types"], name, "motor_types", dict))
+            for name in self.get(self.root, "motor_types", "", dict)
+        }
+        table = self.get(self.root, "motors", "", dict)
+        for joint in table:
+            if joint not in MOTOR_JOINTS:
+                raise RobotDescriptionError(self.file, f"motor {joint}", f"expected one of {', '.join(MOTOR_JOINTS)}")
+        motors = []
+        for joint in MOTOR_JOINTS:
+            name = self.text(table, joint, "motors")
+            if name not in types:
+                raise RobotDescriptionError(self.file, f"motor {joint}", f"unknown motor type {name!r:.60}")
+            motors.append(types[name])
+        return tuple(motors)
+
+    def motor_type(self, name: str, table: dict) -> Motor:
+        """Return the constants of one motor type."""
+        part = f"motor type {name}"
+        gains = self.get(table, "gains", part, dict)
+        motor = Motor(
+            type=name,
+            gear_ratio=self.positive(table, "gear_ratio", part),
+            rotor_inertia=self.positive(table, "rotor_inertia", part),
+            peak_torque=self.positive(table, "peak_torque", part),
+            cutoff_speed=RAD_PER_S_PER_RPM * self.positive(table, "cutoff_speed_rpm", part),
+            no_load_speed=RAD_PER_S_PER_RPM * self.positive(table, "no_load_speed_rpm", part),
+            coulomb_friction=self.positive(table, "coulomb_friction", part),
+            jumping=self.gains(gains, "jumping", part),
+            walking=self.gains(gains, "walking", part),
+        )
+        if motor.cutoff_speed >= motor.no_load_speed:
+            raise RobotDescriptionError(self.file, part, "expected cutoff_speed_rpm < no_load_speed_rpm")
+        return motor
+
+    def gains(self, table: dict, use: str, part: str) -> Gains:
+        """Return the gains for one use."""
+        gains = self.get(table, use, part, dict)
+        return Gains(self.positive(gains, "kp", f"{part} {use}"), self.positive(gains, "kd", f"{part} {use}"))
+
+    def loops(self) -> tuple[Loop, ...]:
+        """Return the loop joints in leg order."""
+        table = self.get(self.root, "loops", "", dict)
+        names = [f"{leg}_ankle" for leg in LEGS]
+        for name in table:
+            if name not in names:
+                raise RobotDescriptionError(self.file, f"loop {name}", f"expected one of {', '.join(names)}")
+        loops = []
+        for name in names:
+            loop = self.get(table, name, "loops", dict)
+            anchors = (np.array(self.vector(loop, f"{side}_anchor", 3, f"loop {name}")) for side in ("parent", "child"))
+            parent, child = (self.text(loop, side, f"loop {name}") for side in ("parent", "child"))
+            loops.append(Loop(name, parent, child, *anchors))
+        return tuple(loops)
+
+    def poses(self) -> dict[str, tuple[float, float]]:
+        """Return the named poses [rad]."""
+        poses = {}
+        for name in self.get(self.root, "poses", "", dict):
+            pose = self.get(self.root["poses"], name, "poses", dict)
+            degrees = (self.number(pose.get(key), key, f"pose {name}") for key in ("lateral_deg", "transversal_deg"))
+            poses[name] = tuple(map(math.radians, degrees))
+        return poses

@@ -1,0 +1,266 @@
+"""The robot as a Newton model, and as the constants that the kernels read.
+
+Per world, `joint_q` holds the base (position [m], quaternion xyzw), then per leg in FL, FR, BL, BR order the angles
+[rad] lateral, outer, outer knee, inner, inner knee, then per leg the quaternion of the ankle's loop joint.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from types import ModuleType
+
+import newton
+import numpy as np
+import warp as wp
+
+from jumper_warp.robot.description import (
+    LEGS,
+    MOTOR_JOINTS,
+    LegDimensions,
+    Link,
+    RobotDescription,
+    Shape,
+    knee_angles,
+    leg_dimensions,
+    load_description,
+)
+from jumper_warp.robot.pinocchio_model import PinocchioRobot, build_pinocchio
+
+__all__ = [
+    "LEGS",
+    "MOTOR_JOINTS",
+    "PinocchioRobot",
+    "build_model",
+    "build_pinocchio",
+    "leg_geometry",
+    "leg_geometry_array",
+    "standing_configuration",
+]
+
+PHYSICS_DT = 1.0 / 480.0
+"""Physics step [s] that contacts and loops are tuned for."""
+
+CONTACT_STIFFNESS = 56689.0
+CONTACT_DAMPING = 476.0
+"""Contact `ke` and `kd`: MuJoCo's solref becomes (2 / kd, kd / (2 sqrt(ke))), critically damped over two physics
+steps. Softer contacts cost jump height."""
+CONTACT_IMPEDANCE = (0.95, 0.99, 0.001, 0.5, 2.0)
+GROUND_FRICTION = 1.0e-4
+"""[1] Tiny: a contact takes the larger of its two coefficients, which is then the paw's."""
+GROUND_COLOR = (0.42, 0.46, 0.48)
+LIMIT_STIFFNESS = CONTACT_STIFFNESS
+"""[N m/rad] Hard stops: plastic for SolverJumper, critically damped over two physics steps for MuJoCo."""
+LIMIT_DAMPING = CONTACT_DAMPING
+NO_EFFORT_LIMIT = 1.0e6
+"""[N m] Motor models saturate torque; the model itself does not. A knee's limit is that of its damping."""
+KNEE_DOFS = [6 + 5 * leg + joint for leg in range(4) for joint in (2, 4)]
+"""A world's knees in `joint_qd`."""
+PAW_GROUP = -1
+"""Collision group of the paws: they meet the ground, but not each other."""
+
+
+def build_model(
+    num_worlds: int,
+    *,
+    description: RobotDescription | None = None,
+    ground: str | newton.Heightfield | None = "plane",
+    friction: float = 0.9,
+    device: wp.DeviceLike = None,
+    requires_grad: bool = False,
+    visuals: bool = True,
+) -> newton.Model:
+    """Return a Newton model of `num_worlds` robots, standing in the default pose.
+
+    Args:
+        num_worlds: Number of worlds, one robot each; labels start with `world_i/`.
+        description: The robot; by default the project's own.
+        ground: "plane" (z = 0), a heightfield, or None for free flight.
+        friction: Coulomb friction coefficient of the paws [1].
+        device: Warp device.
+        requires_grad: Whether the model's arrays carry gradients.
+        visuals: Whether to add shapes that only viewers see. Without them large batches build faster.
+
+    Raises:
+        ValueError: `num_worlds` below 1, negative `friction`, or an unknown `ground`.
+        RobotDescriptionError: the default description cannot be read.
+    """
+    if num_worlds < 1:
+        raise ValueError(f"num_worlds must be at least 1, got {num_worlds}")
+    if not friction >= 0.0:
+        raise ValueError(f"friction must not be negative, got {friction}")
+    description = load_description() if description is None else description
+    builder = newton.ModelBuilder()
+    newton.solvers.SolverMuJoCo.register_custom_attributes(builder)
+    robot = _robot_builder(description, friction, visuals)
+    builder.replicate(robot, num_worlds, label_prefixes=[f"world_{i}" for i in range(num_worlds)])
+    _add_ground(builder, ground)
+    return builder.finalize(device=device, requires_grad=requires_grad)
+
+
+def leg_geometry(description: RobotDescription) -> list[dict]:
+    """Return the fields of the kernels' `LegGeometry` for the four legs, derived from the joint origins."""
+    return [dataclasses.asdict(leg_dimensions(description, leg)) for leg in LEGS]
+
+
+def leg_geometry_array(
+    description: RobotDescription, geometry_module: ModuleType, device: wp.DeviceLike = None
+) -> wp.array:
+    """Return the four legs as a `wp.array` of the module's LegGeometry.
+
+    `geometry_module` is `kernels.kinematics.geometry` or its double-precision twin.
+    """
+    legs = []
+    for fields in leg_geometry(description):
+        leg = geometry_module.LegGeometry()
+        for name, value in fields.items():
+            setattr(leg, name, value)
+        legs.append(leg)
+    return wp.array(legs, dtype=geometry_module.LegGeometry, device=device)
+
+
+def standing_configuration(description: RobotDescription, pose: str = "default") -> np.ndarray:
+    """Return one world's `joint_q`, shape (43,): level base at the origin, paws touching z = 0, in a named pose.
+
+    Raises KeyError for an unknown pose.
+    """
+    angles = description.pose(pose).reshape(4, 3)
+    joints, loops, depths = [], [], []
+    for name, (lateral, outer, inner) in zip(LEGS, angles, strict=True):
+        leg = leg_dimensions(description, name)
+        outer_knee, inner_knee, ankle_z = knee_angles(leg, outer, inner)
+        joints += [lateral, outer, outer_knee, inner, inner_knee]
+        # both shanks turn about the housing's y, the outer one by front * (knee - thigh), the inner one the other way
+        half_turn = 0.5 * leg.front * (outer_knee - outer + inner_knee - inner)
+        loops += [0.0, math.sin(half_turn), 0.0, math.cos(half_turn)]
+        depths.append(_paw_depth(leg, lateral, ankle_z))
+    base = [0.0, 0.0, max(depths), 0.0, 0.0, 0.0, 1.0]
+    return np.array(base + joints + loops)
+
+
+def _paw_depth(leg: LegDimensions, lateral: float, ankle_z: float) -> float:
+    """Return how far the paw reaches below the hips [m] for a level base."""
+    ankle_y = leg.plane_y + leg.knee_y
+    return leg.paw_radius - math.cos(lateral) * ankle_z - leg.side * math.sin(lateral) * ankle_y
+
+
+def _robot_builder(description: RobotDescription, friction: float, visuals: bool) -> newton.ModelBuilder:
+    """Return the builder of one robot."""
+    builder = newton.ModelBuilder()
+    newton.solvers.SolverMuJoCo.register_custom_attributes(builder)
+    bodies = {}
+    for link in description.links:
+        bodies[link.name] = builder.add_link(
+            mass=link.mass,
+            com=wp.vec3(*link.com),
+            inertia=wp.mat33(*link.inertia.flatten()),
+            lock_inertia=True,
+            label=link.name,
+        )
+    meshes: dict[int, newton.Mesh] = {}
+    for link in description.links:
+        if visuals:
+            _add_visuals(builder, bodies[link.name], link, meshes)
+        for paw in link.collisions:
+            _add_paw(builder, bodies[link.name], paw, f"{link.name[:2]}_paw", friction, visible=not visuals)
+    _add_joints(builder, bodies, description)
+    builder.joint_q[:] = [float(value) for value in standing_configuration(description)]
+    return builder
+
+
+def _add_joints(builder: newton.ModelBuilder, bodies: dict[str, int], description: RobotDescription) -> None:
+    """Add the base, the tree as one articulation, and the loop joints outside it."""
+    motors = dict(zip(MOTOR_JOINTS, description.motors, strict=True))
+    tree = [builder.add_joint_free(bodies["body"], label="base")]
+    for joint in description.joints:
+        motor = motors.get(joint.name)
+        tree.append(
+            builder.add_joint_revolute(
+                bodies[joint.parent],
+                bodies[joint.child],
+                parent_xform=wp.transform(joint.origin, wp.quat_identity()),
+                axis=wp.vec3(*joint.axis),
+                limit_lower=joint.lower,
+                limit_upper=joint.upper,
+                limit_ke=LIMIT_STIFFNESS,
+                limit_kd=LIMIT_DAMPING,
+                armature=motor.armature if motor else 0.0,
+                friction=motor.coulomb_friction if motor else 0.0,
+                damping=0.0 if motor else description.knee_damping,
+                effort_limit=NO_EFFORT_LIMIT if motor else description.knee_damping_limit,
+                label=joint.name,
+            )
+        )
+    builder.add_articulation(tree, label="jumper")
+    for loop in description.loops:
+        builder.add_joint_ball(
+            bodies[loop.parent],
+            bodies[loop.child],
+            parent_xform=wp.transform(loop.parent_anchor, wp.quat_identity()),
+            child_xform=wp.transform(loop.child_anchor, wp.quat_identity()),
+            label=loop.name,
+        )
+
+
+def _add_paw(
+    builder: newton.ModelBuilder, body: int, paw: Shape, label: str, friction: float, *, visible: bool
+) -> None:
+    """Add the sphere that touches the ground; it is hidden where a visual shape shows the paw."""
+    config = newton.ModelBuilder.ShapeConfig(
+        density=0.0,
+        mu=friction,
+        ke=CONTACT_STIFFNESS,
+        kd=CONTACT_DAMPING,
+        collision_group=PAW_GROUP,
+        is_visible=visible,
+    )
+    builder.add_shape_sphere(
+        body,
+        xform=wp.transform(paw.position, wp.quat(*paw.rotation)),
+        radius=paw.size[0],
+        cfg=config,
+        label=label,
+        custom_attributes={"mujoco:geom_solimp": CONTACT_IMPEDANCE},
+    )
+
+
+def _add_visuals(builder: newton.ModelBuilder, body: int, link: Link, meshes: dict[int, newton.Mesh]) -> None:
+    """Add shapes that neither collide nor weigh anything; equal meshes are shared."""
+    config = newton.ModelBuilder.ShapeConfig(density=0.0, has_shape_collision=False, has_particle_collision=False)
+    for index, shape in enumerate(link.visuals):
+        common = {
+            "xform": wp.transform(shape.position, wp.quat(*shape.rotation)),
+            "cfg": config,
+            "color": shape.color,
+            "label": f"{link.name}_visual_{index}",
+        }
+        if shape.kind == "box":
+            hx, hy, hz = (0.5 * edge for edge in shape.size)
+            builder.add_shape_box(body, hx=hx, hy=hy, hz=hz, **common)
+        elif shape.kind == "cylinder":
+            builder.add_shape_cylinder(body, radius=shape.size[0], half_height=0.5 * shape.size[1], **common)
+        elif shape.kind == "sphere":
+            builder.add_shape_sphere(body, radius=shape.size[0], **common)
+        else:
+            mesh = meshes.get(id(shape.mesh))
+            if mesh is None:
+                mesh = newton.Mesh(shape.mesh.vertices, shape.mesh.triangles.flatten(), compute_inertia=False)
+                meshes[id(shape.mesh)] = mesh
+            builder.add_shape_mesh(body, mesh=mesh, **common)
+
+
+def _add_ground(builder: newton.ModelBuilder, ground: str | newton.Heightfield | None) -> None:
+    """Add the ground that all worlds share. Raises ValueError."""
+    config = newton.ModelBuilder.ShapeConfig(density=0.0, mu=GROUND_FRICTION, ke=CONTACT_STIFFNESS, kd=CONTACT_DAMPING)
+    common = {
+        "cfg": config,
+        "color": GROUND_COLOR,
+        "label": "ground",
+        "custom_attributes": {"mujoco:geom_solimp": CONTACT_IMPEDANCE},
+    }
+    if isinstance(ground, newton.Heightfield):
+        builder.add_shape_heightfield(heightfield=ground, **common)
+    elif isinstance(ground, str) and ground == "plane":
+        builder.add_shape_plane(plane=(0.0, 0.0, 1.0, 0.0), width=0.0, length=0.0, **common)
+    elif ground is not None:
+        raise ValueError(f'ground must be "plane", a newton.Heightfield or None, got {ground!r}')

@@ -1,0 +1,236 @@
+"""Settings of the motors and of the motor command filter, and the kernel structures made of them."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from types import ModuleType
+from typing import Any, Literal
+
+import numpy as np
+import warp as wp
+
+from jumper_warp.robot.description import RobotDescription, load_description
+from jumper_warp.robot.parts import Motor
+from kernels.actuation import command_filter
+from kernels.actuation import motors as actuator
+
+OVERSPEED_START = math.radians(2000.0)
+OVERSPEED_END = math.radians(2500.0)
+
+
+@dataclass(frozen=True)
+class MotorKindCfg:
+    """Constants of one kind of motor, at the joint."""
+
+    kp: float
+    """[N m/rad]"""
+    kd: float
+    """[N m s/rad]"""
+    saturation: float
+    """[N m] Largest torque that the controller asks for."""
+    peak: float
+    """[N m] Largest torque that the motor gives, up to the cutoff speed."""
+    cutoff_speed: float
+    """[rad/s] Full driving torque up to here."""
+    no_load_speed: float
+    """[rad/s] No driving torque from here."""
+
+    def __post_init__(self) -> None:
+        """Check the values."""
+        for name, value in vars(self).items():
+            if not (math.isfinite(value) and value >= 0.0):
+                raise ValueError(f"motor {name} must be finite and not negative, got {value}")
+        if self.saturation == 0.0 or self.peak == 0.0:
+            raise ValueError("motor saturation and peak torque must be > 0, got 0")
+        if self.no_load_speed <= self.cutoff_speed:
+            raise ValueError(f"no_load_speed must be > cutoff_speed = {self.cutoff_speed}, got {self.no_load_speed}")
+
+
+@dataclass(frozen=True)
+class MotorCfg:
+    """Settings of the twelve motors."""
+
+    lateral: MotorKindCfg
+    transversal: MotorKindCfg
+    fade_start: float = OVERSPEED_START
+    """[rad/s] Over-speed protection takes torque away from here."""
+    fade_end: float = OVERSPEED_END
+    """[rad/s] No torque from here."""
+
+    def __post_init__(self) -> None:
+        """Check the values."""
+        if not 0.0 <= self.fade_start < self.fade_end < math.inf:
+            raise ValueError(f"fade_start and fade_end must rise, got {self.fade_start}, {self.fade_end}")
+
+    @classmethod
+    def from_description(
+        cls,
+        description: RobotDescription,
+        gains: Literal["jumping", "walking"],
+        lateral_torque: float,
+        transversal_torque: float,
+    ) -> MotorCfg:
+        """Return the robot's motors with a choice of gains and torque limits [N m], cut to what each motor can give.
+
+        Raises ValueError if the motors of one kind are not alike.
+        """
+        motors = description.motors
+        if len({*motors[0::3]}) > 1 or len({*motors[1::3], *motors[2::3]}) > 1:
+            raise ValueError(f"{description.path}: the lateral motors, and the transversal ones, must be of one type")
+        return cls(
+            lateral=motor_kind(motors[0], gains, lateral_torque),
+            transversal=motor_kind(motors[1], gains, transversal_torque),
+        )
+
+
+def motor_kind(motor: Motor, gains: Literal["jumping", "walking"], torque: float) -> MotorKindCfg:
+    """Return the settings of a motor type, limited to `torque` [N m] and to its peak torque."""
+    chosen = getattr(motor, gains)
+    return MotorKindCfg(
+        kp=chosen.kp,
+        kd=chosen.kd,
+        saturation=min(torque, motor.peak_torque),
+        peak=motor.peak_torque,
+        cutoff_speed=motor.cutoff_speed,
+        no_load_speed=motor.no_load_speed,
+    )
+
+
+def jumping_motors(torque: float = 18.0, lateral_torque: float | None = None) -> MotorCfg:
+    """Return the motors for jumping, limited to a torque [N m]; `lateral_torque` defaults to the same."""
+    lateral_torque = torque if lateral_torque is None else lateral_torque
+    return MotorCfg.from_description(load_description(), "jumping", lateral_torque, torque)
+
+
+def walking_motors(torque: float = 10.0) -> MotorCfg:
+    """Return the motors for walking, limited to a torque [N m]."""
+    return MotorCfg.from_description(load_description(), "walking", torque, torque)
+
+
+def motor_arrays(
+    cfg: MotorCfg,
+    num_worlds: int,
+    *,
+    module: ModuleType = actuator,
+    device: wp.DeviceLike = None,
+    requires_grad: bool = False,
+) -> Any:
+    """Return the `MotorArrays` of `num_worlds` equal worlds, without sensor offsets.
+
+    module: `actuator` in either precision. Raises ValueError for less than one world.
+    """
+    if num_worlds < 1:
+        raise ValueError(f"num_worlds must be >= 1, got {num_worlds}")
+
+    def spread(lateral: float, transversal: float) -> wp.array:
+        column = np.tile([lateral, transversal, transversal], 4)[:, None]
+        values = np.repeat(column, num_worlds, axis=1)
+        return wp.array(values, dtype=module.real, device=device, requires_grad=requires_grad)
+
+    motors = module.MotorArrays()
+    for name in vars(cfg.lateral):
+        setattr(motors, name, spread(getattr(cfg.lateral, name), getattr(cfg.transversal, name)))
+    motors.offset = spread(0.0, 0.0)
+    motors.fade_start = cfg.fade_start
+    motors.fade_end = cfg.fade_end
+    return motors
+
+
+@dataclass(frozen=True)
+class LimitsCfg:
+    """Limits of one quantity that the filter watches."""
+
+    lower: float
+    """[deg]"""
+    upper: float
+    """[deg]"""
+    lower_zone: float = 0.0
+    """[deg] Width of the hard zone before the lower limit."""
+    upper_zone: float = 0.0
+    """[deg] Width of the hard zone before the upper limit."""
+
+    def __post_init__(self) -> None:
+        """Check the values."""
+        if not -math.inf < self.lower < self.upper < math.inf:
+            raise ValueError(f"limits must be finite and rise, got {self.lower}, {self.upper}")
+        if not (self.lower_zone >= 0.0 and self.upper_zone >= 0.0):
+            raise ValueError(f"hard zones must be >= 0, got {self.lower_zone}, {self.upper_zone}")
+        if not self.lower_zone + self.upper_zone <= self.upper - self.lower:
+            raise ValueError(f"hard zones {self.lower_zone}, {self.upper_zone} overlap between the limits")
+
+
+@dataclass(frozen=True)
+class FilterCfg:
+    """Settings of the motor command filter."""
+
+    lateral: LimitsCfg
+    transversal: LimitsCfg
+    sum: LimitsCfg
+    """Of the two transversal angles of a leg."""
+    horizon: float
+    """[s] Time to violation below which the limits begin to bind."""
+    speed_floor: float = 60.0
+    """[deg/s] Least speed assumed toward a limit."""
+
+    def __post_init__(self) -> None:
+        """Check the values."""
+        for name in ("horizon", "speed_floor"):
+            if not 0.0 < getattr(self, name) < math.inf:
+                raise ValueError(f"filter {name} must be finite and > 0, got {getattr(self, name)}")
+
+
+def vertical_jump_filter() -> FilterCfg:
+    """Return the filter for vertical jumps."""
+    return FilterCfg(
+        lateral=LimitsCfg(-15.0, 15.0, lower_zone=10.0, upper_zone=15.0),
+        transversal=LimitsCfg(-30.0, 140.0, lower_zone=10.0, upper_zone=15.0),
+        sum=LimitsCfg(0.0, 240.0, lower_zone=35.0, upper_zone=45.0),
+        horizon=8.0 / 60.0,
+    )
+
+
+def horizontal_jump_filter() -> FilterCfg:
+    """Return the filter for horizontal jumps."""
+    return FilterCfg(
+        lateral=LimitsCfg(-15.0, 15.0, lower_zone=10.0, upper_zone=15.0),
+        transversal=LimitsCfg(-30.0, 140.0, lower_zone=10.0, upper_zone=15.0),
+        sum=LimitsCfg(0.0, 220.0, lower_zone=30.0, upper_zone=30.0),
+        horizon=8.0 / 60.0,
+    )
+
+
+def walking_filter() -> FilterCfg:
+    """Return the filter for walking: no hard zones, and the lateral range that the robot's hard stops leave."""
+    return FilterCfg(
+        lateral=LimitsCfg(-50.0, 110.0),
+        transversal=LimitsCfg(-30.0, 140.0),
+        sum=LimitsCfg(0.0, 220.0),
+        horizon=5.0 / 60.0,
+    )
+
+
+def loose_filter() -> FilterCfg:
+    """Return a filter that leaves full torque to the last, for the jump with all that the motors can give.
+
+    It looks two policy steps ahead.
+    """
+    return FilterCfg(
+        lateral=LimitsCfg(-15.0, 15.0),
+        transversal=LimitsCfg(-30.0, 140.0),
+        sum=LimitsCfg(0.0, 240.0),
+        horizon=2.0 / 60.0,
+    )
+
+
+def filter_params(cfg: FilterCfg, *, module: ModuleType = command_filter) -> Any:
+    """Return the `FilterParams` of a filter; module: `command_filter` in either precision."""
+    params = module.FilterParams()
+    for name in ("lateral", "transversal", "sum"):
+        limits = module.Limits()
+        for field, degrees in vars(getattr(cfg, name)).items():
+            setattr(limits, field, math.radians(degrees))
+        setattr(params, name, limits)
+    params.horizon = cfg.horizon
+    params.speed_floor = math.radians(cfg.speed_floor)
+    return params

@@ -1,0 +1,167 @@
+"""The robot in Pinocchio: an independent reference for kinematics and rigid-body dynamics."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from jumper_warp.robot.description import LEGS, MOTOR_JOINTS, RobotDescription, load_description
+
+if TYPE_CHECKING:
+    import pinocchio as pin
+
+PROXIMAL_ACCURACY = 1.0e-12
+PROXIMAL_DAMPING = 1.0e-10
+"""A planar loop has three rows of rank two; the proximal term keeps the solve regular."""
+PROXIMAL_ITERATIONS = 20
+CLOSED = 1.0e-9
+"""[m] Largest gap of a loop that counts as closed."""
+
+
+@dataclass(frozen=True, eq=False)
+class PinocchioRobot:
+    """Pinocchio's model of the robot with its rigid loop constraints.
+
+    Velocities follow Pinocchio: the base's six are the linear velocity of the body origin [m/s] and the angular
+    velocity [rad/s], both in the body frame. Joints are in Pinocchio's own order; the index arrays map to it.
+    The buffers in `data` are overwritten by every call.
+    """
+
+    model: pin.Model
+    data: pin.Data
+    constraints: Any
+    """Loop constraint models, in leg order."""
+    constraint_data: Any
+    motor_q: np.ndarray
+    """(12,) index into q of each motor, in motor order."""
+    motor_v: np.ndarray
+    """(12,) index into v."""
+    knee_q: np.ndarray
+    """(8,) index into q of the knees: outer, inner per leg."""
+    knee_v: np.ndarray
+    """(8,) index into v."""
+
+    def configuration(self, base_pos: np.ndarray, base_quat_xyzw: np.ndarray, motors: np.ndarray) -> np.ndarray:
+        """Return q, shape (27,), with the knee angles that close the loops, ankles below the knees.
+
+        Args:
+            base_pos: Body origin [m], shape (3,), world frame.
+            base_quat_xyzw: Body to world, unit, shape (4,).
+            motors: Motor angles [rad], shape (12,), motor order.
+
+        Raises:
+            ValueError: a loop cannot be closed.
+        """
+        import pinocchio as pin
+
+        q = pin.neutral(self.model)
+        q[0:3] = base_pos
+        q[3:7] = base_quat_xyzw
+        q[self.motor_q] = motors
+        for leg, name in enumerate(LEGS):
+            q[self.knee_q[2 * leg : 2 * leg + 2]] = self._knees(name, motors[3 * leg + 1], motors[3 * leg + 2])
+        gap = self.loop_gap(q)
+        if not gap < CLOSED:
+            raise ValueError(f"expected closed loops, found a gap of {gap:.3g} m")
+        return q
+
+    def loop_gap(self, q: np.ndarray) -> float:
+        """Return the largest distance [m] between the two anchors of a loop."""
+        import pinocchio as pin
+
+        pin.forwardKinematics(self.model, self.data, q)
+        anchors = [
+            [self.data.oMi[joint].act(placement.translation) for joint, placement in ends]
+            for ends in (
+                ((c.joint1_id, c.joint1_placement), (c.joint2_id, c.joint2_placement)) for c in self.constraints
+            )
+        ]
+        return max(float(np.linalg.norm(a - b)) for a, b in anchors)
+
+    def closed_velocity(self, q: np.ndarray, base_twist: np.ndarray, motor_rates: np.ndarray) -> np.ndarray:
+        """Return v, shape (26,), with the knee rates that keep the loops closed.
+
+        Args:
+            q: Configuration with closed loops, shape (27,).
+            base_twist: Linear velocity of the body origin and angular velocity, body frame, shape (6,).
+            motor_rates: [rad/s], shape (12,), motor order.
+        """
+        import pinocchio as pin
+
+        v = np.zeros(self.model.nv)
+        v[self.motor_v] = motor_rates
+        pin.computeJointJacobians(self.model, self.data, q)
+        for constraint, data in zip(self.constraints, self.constraint_data, strict=True):
+            constraint.calc(self.model, self.data, data)
+        jacobian = pin.getConstraintsJacobian(self.model, self.data, self.constraints, self.constraint_data)
+        v[self.knee_v] = np.linalg.lstsq(jacobian[:, self.knee_v], -jacobian @ v, rcond=1.0e-9)[0]
+        v[0:6] = base_twist
+        return v
+
+    def forward_dynamics(self, q: np.ndarray, v: np.ndarray, motor_torques: np.ndarray) -> np.ndarray:
+        """Return the acceleration, shape (26,), of the robot in free flight under gravity, loops rigid.
+
+        Motors carry their armature; friction and knee damping are left out. `motor_torques` [N m]: (12,), motor order.
+        """
+        import pinocchio as pin
+
+        torques = np.zeros(self.model.nv)
+        torques[self.motor_v] = motor_torques
+        pin.initConstraintDynamics(self.model, self.data, self.constraints, self.constraint_data)
+        settings = pin.ProximalSettings(PROXIMAL_ACCURACY, PROXIMAL_DAMPING, PROXIMAL_ITERATIONS)
+        return pin.constraintDynamics(
+            self.model, self.data, q, v, torques, self.constraints, self.constraint_data, settings
+        ).copy()
+
+    def _knees(self, leg: str, outer: float, inner: float) -> tuple[float, float]:
+        """Return outer and inner knee angle [rad] from the triangle of the two knees and the ankle."""
+        place = {name: self.model.jointPlacements[self.model.getJointId(f"{leg}_{name}")].translation
+                 for name in ("outer", "inner", "outer_knee")}  # fmt: skip
+        separation = abs(place["outer"][0] - place["inner"][0])
+        thigh = -place["outer_knee"][2]
+        shank = -self.constraints[LEGS.index(leg)].joint1_placement.translation[2]
+        # inner to outer knee, in the plane (toward the outer side, down)
+        across = separation + thigh * (math.sin(outer) + math.sin(inner))
+        down = thigh * (math.cos(outer) - math.cos(inner))
+        cosine = 0.5 * math.hypot(across, down) / shank
+        if not cosine < 1.0:
+            raise ValueError(f"expected knees of {leg} within reach of the shanks, found {2.0 * shank * cosine:.4f} m")
+        base, slope = math.acos(cosine), math.atan2(down, across)
+        return outer + 0.5 * math.pi + slope - base, inner + 0.5 * math.pi - slope - base
+
+
+def build_pinocchio(description: RobotDescription | None = None) -> PinocchioRobot:
+    """Return the robot in Pinocchio, with a free-flying base. Raises ImportError where Pinocchio is not installed."""
+    import pinocchio as pin
+
+    description = load_description() if description is None else description
+    model = pin.buildModelFromXML(description.urdf, pin.JointModelFreeFlyer())
+    joints = [model.joints[model.getJointId(name)] for name in MOTOR_JOINTS]
+    knees = [model.joints[model.getJointId(f"{leg}_{bar}_knee")] for leg in LEGS for bar in ("outer", "inner")]
+    armature = np.zeros(model.nv)
+    for joint, motor in zip(joints, description.motors, strict=True):
+        armature[joint.idx_v] = motor.armature
+    model.armature = armature
+    constraints = pin.StdVec_RigidConstraintModel()
+    constraint_data = pin.StdVec_RigidConstraintData()
+    link_joint = {joint.child: model.getJointId(joint.name) for joint in description.joints}
+    for loop in description.loops:
+        ends = []
+        for link, anchor in ((loop.parent, loop.parent_anchor), (loop.child, loop.child_anchor)):
+            ends += [link_joint[link], pin.SE3(np.eye(3), anchor)]
+        constraint = pin.RigidConstraintModel(pin.ContactType.CONTACT_3D, model, *ends, pin.ReferenceFrame.LOCAL)
+        constraints.append(constraint)
+        constraint_data.append(constraint.createData())
+    return PinocchioRobot(
+        model=model,
+        data=model.createData(),
+        constraints=constraints,
+        constraint_data=constraint_data,
+        motor_q=np.array([joint.idx_q for joint in joints]),
+        motor_v=np.array([joint.idx_v for joint in joints]),
+        knee_q=np.array([knee.idx_q for knee in knees]),
+        knee_v=np.array([knee.idx_v for knee in knees]),
+    )

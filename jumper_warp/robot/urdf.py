@@ -1,0 +1,254 @@
+"""Strict reader of the URDF subset that the robot uses: hinge trees, exact inertias, simple shapes, OBJ meshes."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from pathlib import Path
+from xml.etree.ElementTree import Element, TreeBuilder
+from xml.parsers import expat
+
+import numpy as np
+
+from jumper_warp.robot.parts import Joint, Link, RobotDescriptionError, Shape, TriangleMesh
+
+MAX_FILE_BYTES = 8_000_000
+SHAPE_SIZES = {"box": ("size", 3), "cylinder": ("radius length", 1), "sphere": ("radius", 1)}
+
+
+def read_text(file: Path) -> str:
+    """Return the UTF-8 text of a file. Raises RobotDescriptionError."""
+    try:
+        if file.stat().st_size > MAX_FILE_BYTES:
+            raise RobotDescriptionError(file, "", f"expected at most {MAX_FILE_BYTES} bytes")
+        return file.read_bytes().decode("utf-8")
+    except OSError as err:
+        raise RobotDescriptionError(file, "", f"cannot be read ({err.strerror})") from err
+    except UnicodeDecodeError as err:
+        raise RobotDescriptionError(file, "", f"expected UTF-8 text ({err.reason} at byte {err.start})") from err
+    except ValueError as err:
+        raise RobotDescriptionError(file, "", "is not a file name") from err
+
+
+def parse_xml(file: Path, text: str) -> Element:
+    """Return the root element of an XML text without a document type, hence without entities.
+
+    Raises RobotDescriptionError.
+    """
+    builder = TreeBuilder()
+    parser = expat.ParserCreate()
+
+    def refuse_doctype(*_: object) -> None:
+        raise RobotDescriptionError(file, f"line {parser.CurrentLineNumber}", "expected no document type or entities")
+
+    parser.StartDoctypeDeclHandler = refuse_doctype
+    parser.StartElementHandler = builder.start
+    parser.EndElementHandler = builder.end
+    try:
+        parser.Parse(text, True)
+        return builder.close()
+    except expat.ExpatError as err:
+        problem = f"expected well-formed XML ({expat.ErrorString(err.code)})"
+        raise RobotDescriptionError(file, f"line {err.lineno}", problem) from err
+    except UnicodeError as err:
+        raise RobotDescriptionError(file, "", "expected Unicode text") from err
+
+
+class UrdfReader:
+    """Reads one URDF text into links and joints. Every method raises RobotDescriptionError on bad input."""
+
+    def __init__(self, file: Path, text: str):
+        self.file = file
+        self.root = parse_xml(file, text)
+        if self.root.tag != "robot":
+            raise RobotDescriptionError(file, "", f"expected <robot>, found <{self.root.tag}>")
+        self.meshes: dict[str, TriangleMesh] = {}
+        self.colors = {}
+        for material in self.root.findall("material"):
+            color = self.child(material, "color", "material")
+            self.colors[material.get("name")] = tuple(self.numbers(color, "rgba", 4, "material")[:3])
+
+    def links(self) -> tuple[Link, ...]:
+        """Return all links in file order."""
+        return tuple(self.link(element) for element in self.named("link"))
+
+    def joints(self) -> tuple[Joint, ...]:
+        """Return all joints in file order."""
+        return tuple(self.joint(element) for element in self.named("joint"))
+
+    def named(self, tag: str) -> list[Element]:
+        """Return the elements of one kind, each with its own name."""
+        elements = self.root.findall(tag)
+        for name, count in Counter(element.get("name") for element in elements).items():
+            if not name:
+                raise RobotDescriptionError(self.file, tag, "expected a name")
+            if count > 1:
+                raise RobotDescriptionError(self.file, f"{tag} {name}", f"expected one, found {count}")
+        return elements
+
+    def child(self, element: Element, tag: str, part: str) -> Element:
+        """Return the only child element with a tag."""
+        found = element.findall(tag)
+        if len(found) != 1:
+            raise RobotDescriptionError(self.file, part, f"expected one <{tag}>, found {len(found)}")
+        return found[0]
+
+    def numbers(self, element: Element, attribute: str, count: int, part: str, default: str = "") -> list[float]:
+        """Return an attribute's finite numbers."""
+        text = element.get(attribute, default)
+        try:
+            values = [float(word) for word in text.split()]
+        except ValueError:
+            values = []
+        if len(values) != count or not all(map(math.isfinite, values)):
+            problem = f"expected {count} finite number(s) in {attribute} of <{element.tag}>, found {text[:60]!r}"
+            raise RobotDescriptionError(self.file, part, problem)
+        return values
+
+    def placement(self, element: Element, part: str, turned: bool) -> tuple[np.ndarray, np.ndarray]:
+        """Return position [m] and rotation (xyzw) of an element's <origin>; only shapes may be turned."""
+        if element.find("origin") is None:
+            return np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0])
+        origin = self.child(element, "origin", part)
+        angles = self.numbers(origin, "rpy", 3, part, default="0 0 0")
+        if any(angles) and not turned:
+            raise RobotDescriptionError(
+                self.file, part, "expected a frame parallel to its parent's, found rpy not zero"
+            )
+        return np.array(self.numbers(origin, "xyz", 3, part, default="0 0 0")), quat_from_rpy(*angles)
+
+    def link(self, element: Element) -> Link:
+        """Return one link, with its mass and inertia checked."""
+        name = element.get("name")
+        part = f"link {name}"
+        inertial = self.child(element, "inertial", part)
+        mass = self.numbers(self.child(inertial, "mass", part), "value", 1, part)[0]
+        if mass <= 0.0:
+            raise RobotDescriptionError(self.file, part, f"expected mass > 0, found {mass}")
+        moments = self.child(inertial, "inertia", part)
+        keys = ("ixx", "iyy", "izz", "ixy", "ixz", "iyz")
+        ixx, iyy, izz, ixy, ixz, iyz = (self.numbers(moments, key, 1, part)[0] for key in keys)
+        inertia = np.array([[ixx, ixy, ixz], [ixy, iyy, iyz], [ixz, iyz, izz]])
+        self.check_inertia(inertia, part)
+        com = self.placement(inertial, part, turned=False)[0]
+        visuals = tuple(self.shape(shape, part) for shape in element.findall("visual"))
+        collisions = tuple(self.shape(shape, part) for shape in element.findall("collision"))
+        return Link(name, mass, com, inertia, visuals, collisions)
+
+    def check_inertia(self, inertia: np.ndarray, part: str) -> None:
+        """Refuse an inertia tensor that no distribution of mass has."""
+        if np.abs(inertia).max() > 1.0e6:
+            raise RobotDescriptionError(self.file, part, "expected moments of inertia below 1e6 kg m^2")
+        low, middle, high = np.linalg.eigvalsh(inertia)
+        if low <= 0.0:
+            raise RobotDescriptionError(self.file, part, f"expected a positive inertia, found a moment of {low:.3g}")
+        if low + middle < high * (1.0 - 1.0e-9):
+            problem = (
+                f"expected principal moments within the triangle inequality, found {low:.3g} {middle:.3g} {high:.3g}"
+            )
+            raise RobotDescriptionError(self.file, part, problem)
+
+    def joint(self, element: Element) -> Joint:
+        """Return one joint, with its axis and limits checked."""
+        name = element.get("name")
+        part = f"joint {name}"
+        if element.get("type") != "revolute":
+            raise RobotDescriptionError(self.file, part, f"expected type revolute, found {element.get('type')}")
+        parent, child = (self.child(element, tag, part).get("link") or "" for tag in ("parent", "child"))
+        axis = np.array(self.numbers(self.child(element, "axis", part), "xyz", 3, part))
+        if not abs(np.linalg.norm(axis) - 1.0) < 1.0e-6:
+            raise RobotDescriptionError(self.file, part, f"expected an axis of length 1, found {axis.tolist()}")
+        limit = self.child(element, "limit", part)
+        keys = ("lower", "upper", "effort", "velocity")
+        lower, upper, effort, velocity = (self.numbers(limit, key, 1, part)[0] for key in keys)
+        if lower >= upper:
+            raise RobotDescriptionError(self.file, part, f"expected lower < upper limit, found {lower} and {upper}")
+        if effort <= 0.0 or velocity <= 0.0:
+            raise RobotDescriptionError(
+                self.file, part, f"expected effort and velocity > 0, found {effort}, {velocity}"
+            )
+        origin = self.placement(element, part, turned=False)[0]
+        return Joint(name, parent, child, origin, axis, lower, upper, effort, velocity)
+
+    def shape(self, element: Element, part: str) -> Shape:
+        """Return one visual or collision shape."""
+        geometry = self.child(element, "geometry", part)
+        if len(geometry) != 1 or geometry[0].tag not in (*SHAPE_SIZES, "mesh"):
+            raise RobotDescriptionError(self.file, part, "expected one box, cylinder, sphere or mesh in <geometry>")
+        kind, size, mesh = geometry[0].tag, [], None
+        if kind == "mesh":
+            mesh = self.mesh(geometry[0].get("filename", ""), part)
+        else:
+            keys, count = SHAPE_SIZES[kind]
+            size = [value for key in keys.split() for value in self.numbers(geometry[0], key, count, part)]
+            if min(size) <= 0.0:
+                raise RobotDescriptionError(self.file, part, f"expected a {kind} of positive size, found {size}")
+        position, rotation = self.placement(element, part, turned=True)
+        material = element.find("material")
+        color = None
+        if material is not None:
+            color = self.colors.get(material.get("name"))
+            if color is None:
+                raise RobotDescriptionError(self.file, part, f"unknown material {material.get('name')}")
+        return Shape(kind, tuple(size), position, rotation, color, mesh)
+
+    def mesh(self, name: str, part: str) -> TriangleMesh:
+        """Return a mesh of the robot's folder."""
+        if name not in self.meshes:
+            file = file_inside(self.file, name, part)
+            if file.suffix != ".obj":
+                raise RobotDescriptionError(self.file, part, f"expected an .obj mesh, found {name!r}")
+            self.meshes[name] = read_obj(file)
+        return self.meshes[name]
+
+
+def file_inside(source: Path, name: str, part: str) -> Path:
+    """Return the file that `source` names relative to its own folder. Raises RobotDescriptionError."""
+    folder = source.parent.resolve()
+    try:
+        file = (folder / name).resolve()
+        exists = file.is_file()
+    except (OSError, ValueError, RuntimeError) as err:
+        raise RobotDescriptionError(source, part, f"{name!r} is not a file name") from err
+    if ":" in name or not file.is_relative_to(folder):
+        raise RobotDescriptionError(source, part, f"expected a file inside {folder}, found {name!r}")
+    if not exists:
+        raise RobotDescriptionError(source, part, f"missing file {name!r}")
+    return file
+
+
+def read_obj(file: Path) -> TriangleMesh:
+    """Return the triangles of a Wavefront OBJ file of `v` and triangular `f` lines. Raises RobotDescriptionError."""
+    vertices, triangles = [], []
+    for number, line in enumerate(read_text(file).splitlines(), start=1):
+        word, *values = line.split() or [""]
+        try:
+            if word == "v":
+                x, y, z = map(float, values)
+                vertices.append((x, y, z))
+            elif word == "f":
+                a, b, c = (int(value) - 1 for value in values)
+                triangles.append((a, b, c))
+        except ValueError as err:
+            raise RobotDescriptionError(file, f"line {number}", "expected 'v x y z' or 'f a b c'") from err
+    flat = [index for triangle in triangles for index in triangle]
+    if not flat or min(flat) < 0 or max(flat) >= len(vertices):
+        raise RobotDescriptionError(file, "", f"expected triangles between the {len(vertices)} vertices")
+    points = np.array(vertices)
+    if not np.isfinite(points).all() or np.abs(points).max() > 1.0e3:
+        raise RobotDescriptionError(file, "", "expected finite vertices within 1 km")
+    return TriangleMesh(points, np.array(triangles, dtype=np.int32))
+
+
+def quat_from_rpy(roll: float, pitch: float, yaw: float) -> np.ndarray:
+    """Return the quaternion (xyzw) of a URDF's fixed-axis roll, pitch, yaw [rad]."""
+    cr, cp, cy = (math.cos(0.5 * angle) for angle in (roll, pitch, yaw))
+    sr, sp, sy = (math.sin(0.5 * angle) for angle in (roll, pitch, yaw))
+    return np.array(
+        [
+            sr * cp * cy - cr * sp * sy,
+            cr * sp * cy + sr * cp * sy,
+            cr * cp * sy - sr * sp * cy,
+            cr * cp * cy + sr * sp * sy,
+        ]
+    )

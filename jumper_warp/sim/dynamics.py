@@ -1,0 +1,269 @@
+"""The dedicated dynamics on the arrays of a Newton model, in single or double precision."""
+
+from __future__ import annotations
+
+import importlib
+from types import ModuleType, SimpleNamespace
+from typing import Any
+
+import newton
+import numpy as np
+import warp as wp
+
+from jumper_warp.robot.description import LEGS, RobotDescription, load_description
+from jumper_warp.robot.grounds import BlockCfg
+from jumper_warp.robot.model import leg_geometry_array
+from jumper_warp.sim.precision import float64_kernels
+
+LINKS = ("housing", "outer_thigh", "outer_shank", "inner_thigh", "inner_shank")
+JOINTS = ("lateral", "outer", "outer_knee", "inner", "inner_knee")
+KERNEL_MODULES = (
+    "actuation.command_filter", "actuation.motors", "dynamics.advance", "dynamics.contact", "dynamics.contact_adjoint",
+    "dynamics.differentiable", "dynamics.parameters", "dynamics.step", "kinematics.full_state", "kinematics.geometry",
+    "layout", "scalar", "state", "terrain.ground",
+)  # fmt: skip
+
+
+class NotThisRobotError(ValueError):
+    """A Newton model whose bodies, joints or shapes are not those of this robot."""
+
+
+def kernel_modules(double: bool = False) -> SimpleNamespace:
+    """Return the kernel modules by the last part of their name, in single or double precision."""
+    package = float64_kernels().__name__ if double else "kernels"
+    return SimpleNamespace(
+        **{name.split(".")[-1]: importlib.import_module(f"{package}.{name}") for name in KERNEL_MODULES}
+    )
+
+
+def check_model(model: newton.Model) -> None:
+    """Raise NotThisRobotError unless every world of a model holds this robot, its labels in the expected order."""
+    bodies = ["body"] + [f"{leg}_{link}" for leg in LEGS for link in LINKS]
+    joints = ["base"] + [f"{leg}_{joint}" for leg in LEGS for joint in JOINTS] + [f"{leg}_ankle" for leg in LEGS]
+    count = model.world_count
+    if count < 1:
+        raise NotThisRobotError("the model has no worlds; build it with jumper_warp.robot.model.build_model")
+    for what, labels, expected in (("body", model.body_label, bodies), ("joint", model.joint_label, joints)):
+        found = [label.split("/")[-1] for label in labels]
+        if len(found) != count * len(expected):
+            raise NotThisRobotError(
+                f"{count} worlds of this robot have {count * len(expected)} {what} labels, the model has {len(found)}"
+            )
+        for i, name in enumerate(found):
+            if name != expected[i % len(expected)]:
+                raise NotThisRobotError(f"{what} {i} must be {expected[i % len(expected)]!r}, found {name!r}")
+    for name, have, want in (("joint_q", model.joint_coord_count, 43), ("joint_qd", model.joint_dof_count, 38)):
+        if have != count * want:
+            raise NotThisRobotError(f"{name} must hold {want} values a world, found {have / count:g}")
+
+
+def find_paws(model: newton.Model) -> np.ndarray:
+    """Return the shape indices of the paws, shape (num_worlds, 4)."""
+    paws = {leg: [] for leg in LEGS}
+    for i, label in enumerate(model.shape_label):
+        name = label.split("/")[-1]
+        if name.endswith("_paw") and name[:2] in paws:
+            paws[name[:2]].append(i)
+    for leg, shapes in paws.items():
+        if len(shapes) != model.world_count:
+            raise NotThisRobotError(f"each world must have one shape {leg}_paw, found {len(shapes)} in all")
+    return np.array([paws[leg] for leg in LEGS], dtype=np.int32).T
+
+
+def find_ground(model: newton.Model) -> int:
+    """Return the index of the ground shape, a plane z = 0 or a heightfield of the global world; -1 without one.
+
+    Raises NotThisRobotError for more than one, or a plane that is not z = 0.
+    """
+    worlds, types = model.shape_world.numpy(), model.shape_type.numpy()
+    kinds = (int(newton.GeoType.PLANE), int(newton.GeoType.HFIELD))
+    found = [i for i in np.flatnonzero(worlds == -1) if types[i] in kinds]
+    if len(found) > 1:
+        raise NotThisRobotError(f"the ground must be one plane or heightfield, found {len(found)}")
+    if not found:
+        return -1
+    pose = model.shape_transform.numpy()[found[0]]
+    turned = np.abs(pose[3:5]).max() > 1e-6
+    if turned or (types[found[0]] == kinds[0] and abs(pose[2]) > 1e-6):
+        raise NotThisRobotError("the ground plane must be z = 0 and a heightfield must not be tilted")
+    return int(found[0])
+
+
+def ground_struct(model: newton.Model, shape: int, ground_module: ModuleType) -> Any:
+    """Return the kernels' `Ground` for a ground shape; without one (-1) a plane far below."""
+    ground = ground_module.Ground()
+    heights = np.zeros((1, 1), dtype=np.float32)
+    if shape < 0:
+        # a flat grid a kilometre down: nothing is ever in reach
+        heights = np.full((2, 2), -1000.0, dtype=np.float32)
+        ground.rows, ground.cols, ground.half_x, ground.half_y = 2, 2, 1.0, 1.0
+    elif model.shape_type.numpy()[shape] == int(newton.GeoType.HFIELD):
+        field = model.shape_source[shape]
+        pose = model.shape_transform.numpy()[shape]
+        heights = field.min_z + np.asarray(field.data, dtype=np.float32) * (field.max_z - field.min_z) + pose[2]
+        ground.rows, ground.cols = heights.shape
+        ground.center_x, ground.center_y = float(pose[0]), float(pose[1])
+        ground.half_x, ground.half_y = field.hx, field.hy
+    ground.heights = wp.array(heights.astype(np.float32), dtype=wp.float32, device=model.device)
+    return ground
+
+
+def block_array(cfg: BlockCfg | None, num_worlds: int, modules: SimpleNamespace, device: wp.DeviceLike) -> wp.array:
+    """Return the kernels' `Block` of every world, at rest at its start; empty without blocks."""
+    block = modules.ground.Block
+    fields = {} if cfg is None else cfg.per_world(num_worlds)
+    values = np.zeros(num_worlds if fields else 0, dtype=block.numpy_dtype())
+    for name, value in fields.items():
+        values[name] = value
+    if fields:
+        values["exists"] = 1
+        values["start"] = values["center"]
+    return wp.array(values, dtype=block, device=device)
+
+
+class JumperDynamics:
+    """Parameters, geometry and work arrays of the dedicated dynamics for every world of a model.
+
+    `SolverJumper` drives it in single precision. In double precision it is the reference for rounding and gradients;
+    its states are arrays of float64 in the layout of `joint_q` and `joint_qd`.
+    """
+
+    def __init__(
+        self,
+        model: newton.Model,
+        *,
+        description: RobotDescription | None = None,
+        block: BlockCfg | None = None,
+        double: bool = False,
+    ):
+        """Read everything from the model; `block` adds one to every world.
+
+        Raises NotThisRobotError if it is not this robot, ValueError for a block that does not fit the number of worlds.
+        """
+        check_model(model)
+        self.model = model
+        self.description = load_description() if description is None else description
+        self.modules = kernel_modules(double)
+        self.real = self.modules.scalar.real
+        self.device = model.device
+        self.num_worlds = model.world_count
+        self._paws = wp.array(find_paws(model).flatten(), dtype=int, device=self.device)
+        self._ground_shape = find_ground(model)
+        self.static_friction_ratio = wp.full(self.num_worlds, 1.0, dtype=float, device=self.device)
+        """Static over dynamic friction coefficient [1], shape (num_worlds,); call `pack_friction` after a change."""
+
+        self.robot = self.modules.step.Robot()
+        self.robot.geometry = leg_geometry_array(self.description, self.modules.geometry, self.device)
+        self.robot.table = wp.zeros(
+            (self.modules.layout.PARAMETER_ROWS, self.num_worlds),
+            dtype=self.real,
+            device=self.device,
+            requires_grad=model.requires_grad,
+        )
+        self.robot.ground = ground_struct(model, self._ground_shape, self.modules.ground)
+        self.robot.ground.blocks = block_array(block, self.num_worlds, self.modules, self.device)
+        self.work = self._workspace()
+        self.pack()
+
+    def _workspace(self) -> Any:
+        """Return fresh work arrays."""
+        scalar, n = self.modules.scalar, self.num_worlds
+        work = self.modules.advance.Workspace()
+        work.impulse = wp.zeros((4, n), dtype=scalar.vec3, device=self.device)
+        work.contact_force = wp.zeros((4, n), dtype=scalar.vec3, device=self.device)
+        work.peak_force = wp.zeros(n, dtype=scalar.real, device=self.device)
+        work.torque = wp.zeros((12, n), dtype=scalar.real, device=self.device)
+        work.residual = wp.zeros(n, dtype=scalar.real, device=self.device)
+        work.sweeps = wp.zeros(n, dtype=int, device=self.device)
+        work.invalid = wp.zeros(n, dtype=int, device=self.device)
+        work.reference_q = wp.array(self.model.joint_q.numpy(), dtype=scalar.real, device=self.device)
+        return work
+
+    def pack(self) -> None:
+        """Read masses, joints, friction and gravity of every world from the model."""
+        self.pack_masses()
+        self.pack_joints()
+        self.pack_friction()
+        self.pack_gravity()
+
+    def pack_masses(self) -> None:
+        """Read masses, centres of mass and inertias."""
+        m = self.model
+        self._launch(
+            self.modules.parameters.pack_masses_kernel, (self.num_worlds, 21), [m.body_mass, m.body_com, m.body_inertia]
+        )
+
+    def pack_joints(self) -> None:
+        """Read armature, friction, damping and hard stops."""
+        m = self.model
+        lower, upper = self.description.transversal_sum
+        self._launch(
+            self.modules.parameters.pack_joints_kernel,
+            (self.num_worlds, 4),
+            [m.joint_armature, m.joint_friction, m.joint_damping, m.joint_limit_lower, m.joint_limit_upper,
+             m.joint_limit_ke, m.joint_limit_kd, m.joint_effort_limit, lower, upper],
+        )  # fmt: skip
+
+    def pack_friction(self) -> None:
+        """Read the friction coefficients of paws and ground."""
+        self._launch(
+            self.modules.parameters.pack_friction_kernel,
+            (self.num_worlds, 4),
+            [self._paws, self._ground_shape, self.model.shape_material_mu, self.static_friction_ratio],
+        )
+
+    def pack_gravity(self) -> None:
+        """Read gravity."""
+        self._launch(self.modules.parameters.pack_gravity_kernel, self.num_worlds, [self.model.gravity])
+
+    def _launch(self, kernel: wp.Kernel, dim: int | tuple[int, ...], inputs: list) -> None:
+        wp.launch(kernel, dim=dim, inputs=inputs, outputs=[self.robot.table], device=self.device)
+
+    def settings(self, dt: float, substeps: int, max_sweeps: int, tolerance: float) -> Any:
+        """Return the kernels' `StepSettings`."""
+        settings = self.modules.step.StepSettings()
+        settings.dt, settings.substeps = dt, substeps
+        settings.max_sweeps, settings.tolerance = max_sweeps, tolerance
+        return settings
+
+    def drive(
+        self,
+        joint_f: wp.array,
+        body_f: wp.array,
+        motors: Any = None,
+        target: wp.array | None = None,
+        previous: wp.array | None = None,
+        delay: wp.array | None = None,
+    ) -> Any:
+        """Return the kernels' `Drive`; with `motors` (MotorArrays) and `target` (12, num_worlds) the loop is closed.
+
+        With `delay` [steps], shape (num_worlds,), the motors follow `previous` until the target arrives.
+        """
+        drive = self.modules.advance.Drive()
+        drive.joint_f, drive.body_f = joint_f, body_f
+        if motors is not None:
+            drive.closed_loop, drive.motors, drive.target = 1, motors, target
+        if delay is not None:
+            drive.previous, drive.delay = previous, delay
+        return drive
+
+    def advance(self, settings: Any, drive: Any, q: wp.array, qd: wp.array, q_out: wp.array, qd_out: wp.array) -> None:
+        """Advance base and motor coordinates of every world by `settings.substeps` steps, in place if out is in."""
+        wp.launch(
+            self.modules.advance.advance_kernel,
+            dim=self.num_worlds,
+            inputs=[self.robot, settings, drive, q, qd, self.work],
+            outputs=[q_out, qd_out],
+            device=self.device,
+            block_dim=32,
+        )
+
+    def full_state(self, q: wp.array, qd: wp.array, body_q: wp.array, body_qd: wp.array) -> None:
+        """Write passive and loop joints (into q, qd) and all bodies from the base and motor coordinates."""
+        wp.launch(
+            self.modules.full_state.full_state_kernel,
+            dim=(self.num_worlds, 4),
+            inputs=[self.robot.geometry, self.model.body_com, q, qd],
+            outputs=[body_q, body_qd],
+            device=self.device,
+        )

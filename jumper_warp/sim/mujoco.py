@@ -1,0 +1,33 @@
+"""Newton's MuJoCo solver with settings for this robot."""
+
+import newton
+import warp as wp
+
+from jumper_warp.robot.model import PHYSICS_DT
+
+
+def mujoco_solver(model: newton.Model, *, dt: float = PHYSICS_DT, **overrides) -> newton.solvers.SolverMuJoCo:
+    """Return Newton's MuJoCo solver with stiff loops for physics steps of `dt` [s].
+
+    It knows neither a damper with a largest torque nor a stop of the sum of two angles. `Simulation` takes the knees'
+    damping out of its model and adds both as torques (`kernels.actuation.passive`); here the damping has no cap.
+
+    `overrides` replace settings of `newton.solvers.SolverMuJoCo`.
+    """
+    heightfield = newton.GeoType.HFIELD in model.shape_type.numpy()
+    settings = {
+        "njmax": 128 if heightfield else 64,
+        "nconmax": None if heightfield else 12,  # None: as many as the heightfield may need
+        "iterations": 6,
+        "ls_iterations": 6,
+        "cone": "pyramidal",
+        "integrator": "implicitfast",
+        "kinematic_switchable_roots": False,
+    }
+    solver = newton.solvers.SolverMuJoCo(model, **(settings | overrides))
+    solver.mjw_model.opt.warn_overflow = 0
+    solver.mjw_model.eq_solref.fill_(wp.vec2(2.0 * dt, 1.0))
+    impedance = solver.mjw_model.eq_solimp.numpy()
+    impedance[:] = (0.99, 0.999, 0.001, 0.5, 2.0)
+    solver.mjw_model.eq_solimp.assign(impedance)
+    return solver

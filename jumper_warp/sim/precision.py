@@ -1,0 +1,23 @@
+"""A double-precision build of the kernels, for reference."""
+
+import importlib.util
+import sys
+from types import ModuleType
+
+import kernels
+
+
+def float64_kernels() -> ModuleType:
+    """Return the package `kernels_float64`: the files of `kernels`, loaded again with a float64 `real`.
+
+    Import its modules as usual afterwards: `importlib.import_module("kernels_float64.kinematics.five_bar")`.
+    """
+    name = "kernels_float64"
+    if name not in sys.modules:
+        spec = importlib.util.spec_from_file_location(
+            name, kernels.__file__, submodule_search_locations=list(kernels.__path__)
+        )
+        package = importlib.util.module_from_spec(spec)
+        sys.modules[name] = package
+        spec.loader.exec_module(package)
+    return sys.modules[name]

@@ -1,0 +1,247 @@
+"""The robot with its motors, motor command filter and a solver: what a policy step acts on."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import newton
+import numpy as np
+import warp as wp
+from newton.sensors import SensorContact
+
+from jumper_warp.robot.description import load_description
+from jumper_warp.robot.grounds import BlockCfg
+from jumper_warp.robot.model import KNEE_DOFS, PHYSICS_DT, build_model
+from jumper_warp.robot.motors import FilterCfg, MotorCfg, filter_params, jumping_motors, motor_arrays
+from jumper_warp.sim.mujoco import mujoco_solver
+from jumper_warp.sim.solver import TOLERANCE, SolverJumper
+from kernels.actuation.command_filter import command_filter_kernel
+from kernels.actuation.motors import motor_torque_kernel
+from kernels.actuation.passive import passive_torque_kernel
+from kernels.actuation.readout import arrived_target_kernel, motor_values_kernel, paw_force_kernel
+from kernels.layout import COORDS, DOFS
+
+SUBSTEPS = 8
+"""Physics steps of 1/480 s in a policy step of 1/60 s."""
+
+EXPLICIT_STOP = (1000.0, 2.0)
+"""[N m/rad], [N m s/rad] Stops of the transversal sum on MuJoCo, explicit and therefore softer than SolverJumper's."""
+
+SolverName = Literal["jumper", "mujoco"]
+
+
+class Simulation:
+    """Worlds of the robot under position targets, on either solver.
+
+    Write raw motor targets [rad] to `target`, shape (12, num_worlds), then call `step` for one policy step: the filter
+    once, then `substeps` times motors and physics. Everything is on the device; nothing waits for it.
+    """
+
+    def __init__(
+        self,
+        num_worlds: int,
+        *,
+        solver: SolverName = "jumper",
+        motors: MotorCfg | None = None,
+        command_filter: FilterCfg | None = None,
+        ground: str | newton.Heightfield | None = "plane",
+        block: BlockCfg | None = None,
+        friction: float = 0.9,
+        dt: float = PHYSICS_DT,
+        substeps: int = SUBSTEPS,
+        tolerance: float = TOLERANCE,
+        observe_forces: bool = True,
+        visuals: bool = True,
+        device: wp.DeviceLike = None,
+    ):
+        """Build the model, solver and motors, the robot standing in the default pose.
+
+        Args:
+            num_worlds: Number of worlds.
+            solver: "jumper" or "mujoco" (Newton's SolverMuJoCo).
+            motors: By default the jumping gains at 18 N m.
+            command_filter: None leaves the targets as they are.
+            ground: As in `build_model`.
+            block: A block in each world that slides when the robot pushes it; on SolverJumper only.
+            friction: Of the paws [1].
+            dt: Physics step [s].
+            substeps: Physics steps in a policy step.
+            tolerance: Of SolverJumper's contact iteration [m/s].
+            observe_forces: Whether to measure paw forces on MuJoCo, which costs time; SolverJumper always has them.
+            visuals: Whether to add shapes that only viewers see.
+            device: Warp device.
+
+        Raises:
+            ValueError: unknown solver, a block on MuJoCo, or as `build_model` and `SolverJumper`.
+        """
+        if solver not in ("jumper", "mujoco"):
+            raise ValueError(f"solver must be 'jumper' or 'mujoco', got {solver!r}")
+        if solver == "mujoco" and block is not None:
+            raise ValueError("a moving block needs solver='jumper', got 'mujoco'")
+        self.model = build_model(num_worlds, ground=ground, friction=friction, visuals=visuals, device=device)
+        self.device = self.model.device
+        self.num_worlds = num_worlds
+        self.block = block
+        self.dt = dt
+        self.substeps = substeps
+        self.motors = motor_arrays(motors or jumping_motors(), num_worlds, device=self.device)
+        self._filter = None if command_filter is None else filter_params(command_filter)
+        self.state = self.model.state()
+        self.control = self.model.control()
+        newton.eval_fk(self.model, self.state.joint_q, self.state.joint_qd, self.state)
+        standing = motor_values(self.model.joint_q.numpy().reshape(num_worlds, -1)[:, 7:])
+        self.target = wp.array(standing.T, dtype=float, device=self.device)
+        self._safe_target = wp.clone(self.target)
+        self._graphs: dict[str, object] = {}
+        if solver == "jumper":
+            self.solver = SolverJumper(self.model, block=block, tolerance=tolerance)
+            self.torque, self.paw_force, self.peak_force = (
+                self.solver.torque, self.solver.contact_force, self.solver.peak_force,
+            )  # fmt: skip
+        else:
+            damping = self.model.joint_damping.numpy().reshape(num_worlds, -1)
+            damping[:, KNEE_DOFS] = 0.0
+            self.model.joint_damping.assign(damping.ravel())
+            self.solver = mujoco_solver(self.model, dt=dt)
+            self._prepare_mujoco(observe_forces)
+
+    def _prepare_mujoco(self, observe_forces: bool) -> None:
+        n = self.num_worlds
+        robot = load_description()
+        self._passive = [robot.knee_damping, robot.knee_damping_limit, *robot.transversal_sum, *EXPLICIT_STOP]
+        self.torque = wp.zeros((12, n), dtype=float, device=self.device)
+        self.paw_force = wp.zeros((4, n), dtype=wp.vec3, device=self.device)
+        self.peak_force = wp.zeros(n, dtype=float, device=self.device)
+        self._arrived = wp.zeros((12, n), dtype=float, device=self.device)
+        self._sensor = self._contacts = self._observables = None
+        if observe_forces:
+            pipeline = newton.CollisionPipeline(
+                self.model, rigid_contact_max=self.solver.get_max_contact_count(), soft_contact_max=0
+            )
+            self._contacts = pipeline.contacts()
+            self._sensor = SensorContact(self.model, sensing_shapes="*_paw", request_contact_attributes=False)
+            self._observables = self.solver.observables({"contact_f"}, contacts=self._contacts)
+
+    def step(self) -> None:
+        """Advance one policy step towards `target`."""
+        self._captured("step", self._step)
+
+    def filter_targets(self) -> None:
+        """Run the motor command filter on `target` once; follow with `physics_step`s."""
+        self._captured("filter", self._filter_targets)
+
+    def physics_step(self) -> None:
+        """Advance one physics step towards the filtered targets."""
+        self._captured("physics", lambda: self._physics(1))
+
+    def _step(self) -> None:
+        self._filter_targets()
+        self._physics(self.substeps)
+
+    def _captured(self, name: str, body) -> None:
+        """Run a body eagerly the first time, then as a captured graph."""
+        if name not in self._graphs:
+            body()
+            self._graphs[name] = None
+            return
+        if self._graphs[name] is None:
+            with wp.ScopedCapture(device=self.device) as capture:
+                body()
+            self._graphs[name] = capture.graph
+        wp.capture_launch(self._graphs[name])
+
+    def _filter_targets(self) -> None:
+        if self._filter is None:
+            wp.copy(self._safe_target, self.target)
+            return
+        self._launch(
+            command_filter_kernel,
+            (4, self.num_worlds),
+            [self.target, self.state.joint_q, self.state.joint_qd, COORDS, DOFS, self._filter],
+            [self._safe_target],
+        )
+
+    def _physics(self, substeps: int) -> None:
+        self.physics(substeps, self._safe_target)
+
+    def physics(
+        self,
+        substeps: int,
+        target: wp.array,
+        previous: wp.array | None = None,
+        delay: wp.array | None = None,
+        bodies: bool = True,
+    ) -> None:
+        """Launch physics steps towards motor targets [rad], shape (12, num_worlds), without the filter.
+
+        With `delay` [physics steps], shape (num_worlds,), the motors follow `previous` until the target arrives.
+        `bodies` False leaves passive joints and bodies of the state behind on SolverJumper, which does not need them.
+        """
+        if isinstance(self.solver, SolverJumper):
+            self.solver.step_motors(
+                self.state, self.state, self.motors, target, self.dt, substeps,
+                previous=previous, delay=delay, bodies=bodies,
+            )  # fmt: skip
+            return
+        for i in range(substeps):
+            if delay is not None:
+                self._launch(
+                    arrived_target_kernel, (12, self.num_worlds), [target, previous, delay, i], [self._arrived]
+                )
+            self._mujoco_step(target if delay is None else self._arrived, restart=i == 0)
+
+    def _mujoco_step(self, target: wp.array, restart: bool) -> None:
+        """Launch one physics step of SolverMuJoCo."""
+        q, qd = self.state.joint_q, self.state.joint_qd
+        joint_f = self.control.joint_f
+        motors = (12, self.num_worlds)
+        self._launch(motor_torque_kernel, motors, [target, q, qd, COORDS, DOFS, self.motors], [joint_f])
+        self._launch(motor_values_kernel, motors, [joint_f], [self.torque])
+        self._launch(passive_torque_kernel, (self.num_worlds, 4), [q, qd, *self._passive], [joint_f])
+        self.solver.step(self.state, self.state, self.control, self._contacts, self.dt, observables=self._observables)
+        if self._sensor is not None:
+            self._read_paw_forces(restart)
+
+    def _launch(self, kernel: wp.Kernel, dim: int | tuple[int, ...], inputs: list, outputs: list) -> None:
+        wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device)
+
+    def _read_paw_forces(self, restart: bool) -> None:
+        self._sensor.update(self.state, self._contacts, observables=self._observables)
+        inputs = [self._sensor.total_force, int(restart)]
+        self._launch(paw_force_kernel, self.num_worlds, inputs, [self.paw_force, self.peak_force])
+
+    def joint_q(self) -> np.ndarray:
+        """Return the joint coordinates, (num_worlds, 43)."""
+        return self.state.joint_q.numpy().reshape(self.num_worlds, -1)
+
+    def joint_qd(self) -> np.ndarray:
+        """Return the joint rates, (num_worlds, 38)."""
+        return self.state.joint_qd.numpy().reshape(self.num_worlds, -1)
+
+    def base_velocity(self) -> np.ndarray:
+        """Return the velocity of the base link's origin [m/s], world frame, (num_worlds, 3)."""
+        pose = self.state.body_q.numpy().reshape(self.num_worlds, -1, 7)[:, 0]
+        twist = self.state.body_qd.numpy().reshape(self.num_worlds, -1, 6)[:, 0]
+        com = self.model.body_com.numpy().reshape(self.num_worlds, -1, 3)[:, 0]
+        arm = com + 2.0 * np.cross(pose[:, 3:6], np.cross(pose[:, 3:6], com) + pose[:, 6:] * com)
+        return twist[:, :3] - np.cross(twist[:, 3:], arm)
+
+    def loop_gap(self) -> np.ndarray:
+        """Return the largest distance [m] between the two ankle anchors of a leg, (num_worlds,)."""
+        model = self.model
+        parents, children = model.joint_parent.numpy(), model.joint_child.numpy()
+        frames = self.state.body_q.numpy()
+        gaps = []
+        for joint in (i for i, label in enumerate(model.joint_label) if label.endswith("_ankle")):
+            ends = []
+            for body, anchor in ((parents[joint], model.joint_X_p), (children[joint], model.joint_X_c)):
+                point, quat = anchor.numpy()[joint, :3], frames[body, 3:6]
+                turned = point + 2.0 * np.cross(quat, np.cross(quat, point) + frames[body, 6] * point)
+                ends.append(frames[body, :3] + turned)
+            gaps.append(np.linalg.norm(ends[0] - ends[1]))
+        return np.array(gaps).reshape(self.num_worlds, 4).max(axis=1)
+
+
+def motor_values(joint_values: np.ndarray) -> np.ndarray:
+    """Return the 12 motors' columns of values of the joints behind the base, (..., 20 or more) to (..., 12)."""
+    return joint_values[..., [5 * leg + j for leg in range(4) for j in (0, 1, 3)]]

@@ -1,0 +1,340 @@
+"""`SolverJumper`: the robot's dedicated solver behind Newton's solver interface."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import newton
+import numpy as np
+import warp as wp
+from newton import ModelFlags, StateFlags
+from newton.solvers import SolverBase
+
+from jumper_warp.robot.description import RobotDescription
+from jumper_warp.robot.grounds import BlockCfg
+from jumper_warp.sim.differentiable import DifferentiableStep
+from jumper_warp.sim.dynamics import JumperDynamics
+from kernels.terrain.ground import Ground, rest_block
+
+MAX_SWEEPS = 50
+"""Most sweeps of the contact iteration in a step."""
+TOLERANCE = 1.0e-5
+"""[m/s] The contact iteration ends when a sweep changes no contact velocity by more."""
+DIFFERENTIABLE_TOLERANCE = 1.0e-6
+"""[m/s] The same where gradients are asked for, which inherit the error."""
+
+
+@wp.kernel(enable_backward=False)
+def _clear_kernel(
+    # in
+    mask: wp.array(dtype=wp.bool),
+    # out
+    impulse: wp.array2d(dtype=wp.vec3),
+    contact_force: wp.array2d(dtype=wp.vec3),
+    invalid: wp.array(dtype=int),
+):
+    world = wp.tid()
+    if mask[world]:
+        invalid[world] = 0
+        for k in range(4):
+            impulse[k, world] = wp.vec3(0.0)
+            contact_force[k, world] = wp.vec3(0.0)
+
+
+@wp.kernel(enable_backward=False)
+def _rest_blocks_kernel(
+    # in
+    mask: wp.array(dtype=wp.bool),
+    # in, out
+    ground: Ground,
+):
+    world = wp.tid()
+    if mask[world]:
+        rest_block(ground, world)
+
+
+@wp.kernel(enable_backward=False)
+def _restore_kernel(
+    # in
+    mask: wp.array(dtype=wp.bool),
+    reference: wp.array2d(dtype=float),
+    # out
+    values: wp.array2d(dtype=float),
+):
+    world, i = wp.tid()
+    if mask[world]:
+        values[world, i] = reference[world, i]
+
+
+@wp.kernel(enable_backward=False)
+def _acceleration_kernel(
+    # in
+    before: wp.array(dtype=wp.spatial_vector),
+    after: wp.array(dtype=wp.spatial_vector),
+    dt: float,
+    # out
+    body_qdd: wp.array(dtype=wp.spatial_vector),
+):
+    body = wp.tid()
+    body_qdd[body] = (after[body] - before[body]) / dt
+
+
+class SolverJumper(SolverBase):
+    """Exact 18-coordinate dynamics of the Jumper with rigid paw contact.
+
+    The five-bar loops hold by construction. Semi-implicit Euler; contact by block Gauss-Seidel on the four paws to
+    `tolerance`. Per-world masses, inertias, armature, motor friction, damping, joint stops, paw friction and gravity
+    are read from the model: write the model's arrays, then call `notify_model_changed`.
+
+    Reads base and motor coordinates of `joint_q`/`joint_qd`, `control.joint_f` of base and motors (world wrench [N],
+    [N m] at the base's com; motor torques [N m]) and `state.body_f` of the base. Writes every joint, loop joint and
+    body. Forces on other bodies and passive joints are not read. One thread owns one world and nothing is
+    accumulated across threads, so results repeat bit for bit on a device.
+
+    Where the states carry gradients (`finalize(requires_grad=True)`) `step` runs kernel by kernel so that `wp.Tape` can
+    run it backwards, with a state of its own for every step. Record `dynamics.pack_masses()` or `pack_joints()` on the
+    tape for gradients with respect to the model's arrays.
+
+    With `block`, each world has a block of its own that slides on the floor under the paws that push it. A paw touches
+    floor or block, whichever is nearer. Gradients do not go through blocks.
+
+    A world that becomes non-finite is flagged in `invalid`, parked at rest in the model's reference pose and left
+    there until `reset` clears it.
+    """
+
+    SUPPORTED_OBSERVABLES = frozenset({SolverBase.ObservableKind.BODY_QDD})
+
+    def __init__(
+        self,
+        model: newton.Model,
+        *,
+        description: RobotDescription | None = None,
+        block: BlockCfg | None = None,
+        max_sweeps: int = MAX_SWEEPS,
+        tolerance: float = TOLERANCE,
+    ):
+        """Prepare for a model of `jumper_warp.robot.model.build_model`.
+
+        Raises:
+            NotThisRobotError: the model is another robot's.
+            ValueError: `max_sweeps` below 1, `tolerance` [m/s] not positive, or arrays of `block` that do not have one
+                row per world.
+        """
+        super().__init__(model)
+        if max_sweeps < 1 or not tolerance > 0.0:
+            raise ValueError(f"max_sweeps must be >= 1 and tolerance > 0, got {max_sweeps}, {tolerance}")
+        self.dynamics = JumperDynamics(model, description=description, block=block)
+        self.max_sweeps = max_sweeps
+        self.tolerance = tolerance
+        self._differentiable = DifferentiableStep(self.dynamics, max_sweeps, min(tolerance, DIFFERENTIABLE_TOLERANCE))
+        self._default_control = model.control(clone_variables=False)
+        self._no_body_f = wp.zeros(model.body_count, dtype=wp.spatial_vector, device=model.device)
+        self._old_body_qd = wp.zeros(model.body_count, dtype=wp.spatial_vector, device=model.device)
+
+    @property
+    def contact_force(self) -> wp.array:
+        """Force of the ground on each paw in the last step [N], world frame, vec3 of shape (4, num_worlds)."""
+        return self.dynamics.work.contact_force
+
+    @property
+    def peak_force(self) -> wp.array:
+        """Largest total paw force of the last call [N], shape (num_worlds,)."""
+        return self.dynamics.work.peak_force
+
+    @property
+    def torque(self) -> wp.array:
+        """Torque of each motor in the last step [N m], shape (12, num_worlds)."""
+        return self.dynamics.work.torque
+
+    @property
+    def residual(self) -> wp.array:
+        """Largest velocity change [m/s] of the last contact sweep, worst step of the last call, (num_worlds,)."""
+        return self.dynamics.work.residual
+
+    @property
+    def sweeps(self) -> wp.array:
+        """Most contact sweeps of a step in the last call, shape (num_worlds,)."""
+        return self.dynamics.work.sweeps
+
+    @property
+    def invalid(self) -> wp.array:
+        """1 where a world became non-finite and waits for `reset`, shape (num_worlds,)."""
+        return self.dynamics.work.invalid
+
+    def step(
+        self,
+        state_in: newton.State,
+        state_out: newton.State,
+        control: newton.Control | None,
+        contacts: newton.Contacts | None,
+        dt: float,
+        *,
+        observables: SolverBase.Observables | None = None,
+    ) -> None:
+        """Advance every world by dt [s]. `contacts` is not used: the solver finds the paws' contacts itself."""
+        self.validate_observables(observables, contacts)
+        drive = self.dynamics.drive(*self._forces(state_in, control))
+        self._advance(state_in, state_out, drive, dt, 1, observables, bodies=True)
+
+    def step_motors(
+        self,
+        state_in: newton.State,
+        state_out: newton.State,
+        motors: Any,
+        target: wp.array,
+        dt: float,
+        substeps: int,
+        *,
+        control: newton.Control | None = None,
+        previous: wp.array | None = None,
+        delay: wp.array | None = None,
+        bodies: bool = True,
+        observables: SolverBase.Observables | None = None,
+    ) -> None:
+        """Advance every world by `substeps` steps of dt [s], the motors following targets, in one launch.
+
+        Args:
+            state_in: State before; may be `state_out`.
+            state_out: State after.
+            motors: `kernels.actuation.motors.MotorArrays` (see `jumper_warp.robot.motors.motor_arrays`).
+            target: Motor angles [rad], shape (12, num_worlds), held.
+            dt: Physics step [s].
+            substeps: Number of physics steps.
+            control: Additional joint forces, held.
+            previous: Motor angles [rad] that the motors follow until the target arrives.
+            delay: Physics steps until it does, shape (num_worlds,).
+            bodies: Whether to write passive joints, loop joints and bodies; the solver itself does not need them.
+            observables: Observables of the whole call.
+        """
+        self.validate_observables(observables)
+        drive = self.dynamics.drive(*self._forces(state_in, control), motors, target, previous, delay)
+        self._advance(state_in, state_out, drive, dt, substeps, observables, bodies)
+
+    def _forces(self, state: newton.State, control: newton.Control | None) -> tuple[wp.array, wp.array]:
+        """Return the joint forces and body wrenches that act."""
+        control = self._default_control if control is None else control
+        return control.joint_f, self._no_body_f if state.body_f is None else state.body_f
+
+    def _advance(
+        self,
+        state_in: newton.State,
+        state_out: newton.State,
+        drive: Any,
+        dt: float,
+        substeps: int,
+        observables: SolverBase.Observables | None,
+        bodies: bool,
+    ) -> None:
+        wants_qdd = observables is not None and observables.is_requested(SolverBase.ObservableKind.BODY_QDD)
+        if wants_qdd:
+            wp.copy(self._old_body_qd, state_in.body_qd)
+        coordinates = (state_in.joint_q, state_in.joint_qd)
+        out = (state_out.joint_q, state_out.joint_qd)
+        if state_out.joint_q.requires_grad:
+            if drive.closed_loop or substeps != 1:
+                raise ValueError("step_motors is not differentiable; see jumper_warp.optim.rollout")
+            self._differentiable.step(*coordinates, drive.joint_f, drive.body_f, *out, dt)
+        else:
+            settings = self.dynamics.settings(dt, substeps, self.max_sweeps, self.tolerance)
+            self.dynamics.advance(settings, drive, *coordinates, *out)
+        if bodies or wants_qdd:
+            self.dynamics.full_state(*out, state_out.body_q, state_out.body_qd)
+        if wants_qdd:
+            wp.launch(
+                _acceleration_kernel,
+                dim=self.model.body_count,
+                inputs=[self._old_body_qd, state_out.body_qd, dt * substeps],
+                outputs=[observables.body_qdd],
+                device=self.model.device,
+            )
+
+    def block_position(self) -> np.ndarray:
+        """Return the centres of the blocks [m], world frame, (num_worlds, 2). Raises ValueError without blocks."""
+        return self._blocks().numpy()["center"].copy()
+
+    def block_velocity(self) -> np.ndarray:
+        """Return the velocities of the blocks [m/s], world frame, (num_worlds, 2). Raises ValueError without blocks."""
+        return self._blocks().numpy()["velocity"].copy()
+
+    def place_blocks(self, center: np.ndarray) -> None:
+        """Put all blocks at rest to new starts [m], world frame, (2,) or (num_worlds, 2).
+
+        Raises ValueError without blocks.
+        """
+        values = self._blocks().numpy()
+        values["start"] = center
+        self._blocks().assign(values)
+        self.reset_blocks()
+
+    def reset_blocks(self, worlds: Sequence[int] | wp.array | None = None) -> None:
+        """Put the blocks of some worlds, by default all, back to their starts, at rest.
+
+        `worlds`: indices, or a mask on the device, bool of shape (num_worlds,). Raises ValueError without blocks.
+        """
+        n, device = self._blocks().shape[0], self.model.device
+        mask = worlds
+        if not isinstance(worlds, wp.array):
+            chosen = np.zeros(n, dtype=bool)
+            chosen[slice(None) if worlds is None else list(worlds)] = True
+            mask = wp.array(chosen, dtype=wp.bool, device=device)
+        wp.launch(_rest_blocks_kernel, dim=n, inputs=[mask, self.dynamics.robot.ground], device=device)
+
+    def _blocks(self) -> wp.array:
+        """Return the kernels' `Block` of every world. Raises ValueError without blocks."""
+        blocks = self.dynamics.robot.ground.blocks
+        if blocks.shape[0] == 0:
+            raise ValueError("the solver was made without a block")
+        return blocks
+
+    def notify_model_changed(self, flags: ModelFlags | int) -> None:
+        """Read changed parameters from the model again."""
+        if flags & ModelFlags.BODY_INERTIAL_PROPERTIES:
+            self.dynamics.pack_masses()
+        if flags & (
+            ModelFlags.JOINT_DOF_PROPERTIES
+            | ModelFlags.JOINT_DOF_FORCE_PROPERTIES
+            | ModelFlags.JOINT_DOF_INERTIAL_PROPERTIES
+        ):
+            self.dynamics.pack_joints()
+        if flags & ModelFlags.SHAPE_PROPERTIES:
+            self.dynamics.pack_friction()
+        if flags & ModelFlags.MODEL_PROPERTIES:
+            self.dynamics.pack_gravity()
+
+    def reset(
+        self,
+        state: newton.State,
+        world_mask: wp.array | None = None,
+        flags: StateFlags | int | None = None,
+    ) -> None:
+        """Forget contact history and the invalid flag of the masked worlds, and put them in the reference pose.
+
+        Blocks return to their starts.
+        With `flags=StateFlags.NONE` the state is left alone, for callers that write their own.
+        """
+        world_mask = self._normalize_reset_world_mask(world_mask)
+        n, device = self.model.world_count, self.model.device
+        if world_mask is None:
+            world_mask = wp.full(n + 1, True, dtype=wp.bool, device=device)
+        work = self.dynamics.work
+        wp.launch(
+            _clear_kernel,
+            dim=n,
+            inputs=[world_mask],
+            outputs=[work.impulse, work.contact_force, work.invalid],
+            device=device,
+        )
+        if flags is not None and int(flags) == int(StateFlags.NONE):
+            return
+        if self.dynamics.robot.ground.blocks.shape[0] > 0:
+            self.reset_blocks(world_mask)
+        for reference, values in ((self.model.joint_q, state.joint_q), (self.model.joint_qd, state.joint_qd)):
+            wp.launch(
+                _restore_kernel,
+                dim=(n, values.shape[0] // n),
+                inputs=[world_mask, reference.reshape((n, -1))],
+                outputs=[values.reshape((n, -1))],
+                device=device,
+            )
+        self.dynamics.full_state(state.joint_q, state.joint_qd, state.body_q, state.body_qd)

@@ -1,0 +1,60 @@
+"""What a recording shows beside the robots: marks on the ground, and blocks that move."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import trimesh
+
+from jumper_warp.viz.recording import Recording
+from jumper_warp.viz.shapes import ShapeMesh
+
+MARK_RADIUS = 0.04
+"""[m]"""
+MARK_LIFT = 0.003
+"""[m] Above the ground, so that it is seen."""
+MARK_CORNERS = 24
+MARK_COLOR = (0.85, 0.15, 0.15)
+BLOCK_COLOR = (0.55, 0.45, 0.35)
+
+
+def with_marks(recording: Recording, places: np.ndarray) -> Recording:
+    """Return the recording with a disc at each place, (recorded worlds, places a world, 3) [m], that is a number."""
+    angle = np.linspace(0.0, 2.0 * math.pi, MARK_CORNERS, endpoint=False)
+    rim = MARK_RADIUS * np.stack([np.cos(angle), np.sin(angle), np.zeros_like(angle)], axis=1)
+    disc = np.concatenate([np.zeros((1, 3)), rim]) + (0.0, 0.0, MARK_LIFT)
+    corner = np.arange(MARK_CORNERS)
+    triangles = np.stack([np.zeros_like(corner), 1 + corner, 1 + (corner + 1) % MARK_CORNERS], axis=1).astype(np.int32)
+    normals = np.tile(np.float32([0.0, 0.0, 1.0]), (len(disc), 1))
+    marks = []
+    for rank, of_world in enumerate(places):
+        for number, place in enumerate(of_world):
+            if np.isfinite(place).all():
+                vertices = (disc + place + (0.0, rank * recording.spacing, 0.0)).astype(np.float32)
+                marks.append(ShapeMesh(f"goal_{rank}_{number}", -1, MARK_COLOR, vertices, normals, triangles))
+    return replace(recording, shapes=(*recording.shapes, *marks))
+
+
+def with_blocks(recording: Recording, centers: np.ndarray, half: np.ndarray, height: np.ndarray) -> Recording:
+    """Return the recording with a moving block in each world, standing on z = 0.
+
+    Args:
+        recording: As it is without.
+        centers: [m] x and y, world frame, (frames, recorded worlds, 2).
+        half: [m] Half extents along x and y, (recorded worlds, 2).
+        height: [m] (recorded worlds,)
+    """
+    poses, names, shapes = [recording.poses], list(recording.bodies), list(recording.shapes)
+    for rank, world in enumerate(recording.worlds):
+        pose = np.zeros((len(recording.times), 1, 7), dtype=np.float32)
+        pose[:, 0, :2] = centers[:, rank]
+        pose[:, 0, 2] = 0.5 * height[rank]
+        pose[:, 0, 6] = 1.0
+        box = trimesh.creation.box(extents=(*(2.0 * half[rank]), height[rank])).smooth_shaded
+        surface = (np.asarray(box.vertices, np.float32), np.asarray(box.vertex_normals, np.float32))
+        shapes.append(ShapeMesh("block", len(names), BLOCK_COLOR, *surface, np.asarray(box.faces, np.int32)))
+        names.append(f"world_{world}/block")
+        poses.append(pose)
+    return replace(recording, poses=np.concatenate(poses, axis=1), bodies=tuple(names), shapes=tuple(shapes))

@@ -1,0 +1,155 @@
+"""Recording a simulation as it runs."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import newton
+import numpy as np
+import warp as wp
+
+from jumper_warp.viz.recording import SERIES_NAME, Recording
+from jumper_warp.viz.rerun import write_rrd
+from jumper_warp.viz.shapes import ShapeMesh, shape_meshes
+
+
+class Recorder:
+    """Collects the frames of a rollout of a Newton model.
+
+    ```python
+    recorder = Recorder(model)
+    recorder.record(time, state.body_q, {"base/height [m]": height, "torque/FL_outer [N m]": torque})
+    recorder.save_rrd(folder / "jump.rrd")
+    ```
+    """
+
+    def __init__(
+        self,
+        model: newton.Model,
+        worlds: Sequence[int] = (0,),
+        *,
+        spacing: float = 0.0,
+        notes: Mapping[str, Any] | None = None,
+    ) -> None:
+        """Record some worlds of a model.
+
+        Args:
+            model: Where the bodies and shapes are read from, once.
+            worlds: Indices of the worlds to record.
+            spacing: Distance [m] along y by which each world is drawn beside the one before it. Zero keeps the true
+                positions, as a heightfield needs.
+            notes: Saved along; must be JSON.
+
+        Raises:
+            ValueError: A world has no bodies, or a visible shape cannot be drawn.
+        """
+        world_of_body = model.body_world.numpy()
+        for world in worlds:
+            if world not in world_of_body:
+                raise ValueError(f"world {world} has no bodies: the model has {model.world_count} worlds")
+        self._worlds = tuple(worlds)
+        self._spacing = spacing
+        self._body_count = model.body_count
+        self._bodies = np.concatenate([np.flatnonzero(world_of_body == world) for world in worlds])
+        self._names = tuple(f"world_{world_of_body[b]}/{model.body_label[b].split('/')[-1]}" for b in self._bodies)
+        index = {int(body): position for position, body in enumerate(self._bodies)} | {-1: -1}
+        self._shapes = tuple(
+            ShapeMesh(s.name, index[s.body], s.color, s.vertices, s.normals, s.triangles)
+            for s in shape_meshes(model, self._worlds)
+        )
+        self._notes = dict(notes or {})
+        self._times: list[float] = []
+        self._poses: list[np.ndarray] = []
+        self._series: dict[str, list[float]] | None = None
+        self._contacts: list[tuple[np.ndarray, np.ndarray]] = []
+
+    def record(
+        self,
+        time: float,
+        body_poses: wp.array | np.ndarray,
+        series: Mapping[str, float] | None = None,
+        contact_points: np.ndarray | None = None,
+        contact_forces: np.ndarray | None = None,
+    ) -> None:
+        """Add a frame.
+
+        Args:
+            time: [s], later than the frame before.
+            body_poses: Poses of all bodies of the model, as in `state.body_q`: (body_count, 7), pos [m] and quat xyzw.
+            series: `group/quantity [unit]` to value; the same names in every frame.
+            contact_points: [m], world frame, (num_worlds, contacts_per_world, 3) or (contacts, 3) for one world; the
+                same number in every frame.
+            contact_forces: [N] on the robot, same shape and frame.
+
+        Raises:
+            ValueError: Time does not increase, a shape is wrong, or a name is malformed, new or missing.
+        """
+        if self._times and not time > self._times[-1]:
+            raise ValueError(f"time must increase, got {time} s after {self._times[-1]} s")
+        poses = np.asarray(body_poses.numpy() if isinstance(body_poses, wp.array) else body_poses, dtype=np.float32)
+        if poses.shape != (self._body_count, 7):
+            raise ValueError(f"body_poses must have shape ({self._body_count}, 7), got {poses.shape}")
+        contacts = self._checked_contacts(contact_points, contact_forces)
+        self._append_series({} if series is None else series)
+        self._times.append(float(time))
+        self._poses.append(poses[self._bodies])
+        self._contacts.append(contacts)
+
+    def _append_series(self, series: Mapping[str, float]) -> None:
+        values = {name: float(value) for name, value in series.items()}
+        if self._series is None:
+            malformed = [name for name in series if not SERIES_NAME.fullmatch(name)]
+            if malformed:
+                raise ValueError(f"series are named 'group/quantity [unit]', got {malformed[0]!r}")
+            self._series = {name: [] for name in series}
+        different = set(values) ^ set(self._series)
+        if different:
+            raise ValueError(f"every frame needs the same series; new or missing: {sorted(different)}")
+        for name, value in values.items():
+            self._series[name].append(value)
+
+    def _checked_contacts(self, points: np.ndarray | None, forces: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
+        """Return copies of a frame's contacts, (num_worlds, contacts_per_world, 3) each."""
+        if (points is None) != (forces is None):
+            raise ValueError("contact_points and contact_forces come together")
+        if points is None:
+            points = forces = np.zeros((len(self._worlds), 0, 3))
+        points, forces = (np.array(given, dtype=np.float32) for given in (points, forces))
+        if points.ndim == 2 and len(self._worlds) == 1:
+            points, forces = points[None], forces[None]
+        if points.ndim != 3 or points.shape[::2] != (len(self._worlds), 3) or forces.shape != points.shape:
+            raise ValueError(
+                f"contacts must have shape ({len(self._worlds)}, n, 3), got {points.shape}, {forces.shape}"
+            )
+        if self._contacts and self._contacts[0][0].shape != points.shape:
+            raise ValueError(f"every frame needs contacts of shape {self._contacts[0][0].shape}, got {points.shape}")
+        return points, forces
+
+    def recording(self) -> Recording:
+        """Return what was recorded so far.
+
+        Raises:
+            ValueError: There is no frame.
+        """
+        if not self._times:
+            raise ValueError("nothing was recorded")
+        return Recording(
+            times=np.array(self._times),
+            worlds=self._worlds,
+            bodies=self._names,
+            poses=np.stack(self._poses),
+            series={name: np.array(values) for name, values in self._series.items()},
+            contact_points=np.stack([points for points, _ in self._contacts]),
+            contact_forces=np.stack([forces for _, forces in self._contacts]),
+            spacing=self._spacing,
+            shapes=self._shapes,
+            notes=self._notes,
+        )
+
+    def save_npz(self, path: Path) -> Path:
+        """Write what was recorded so far as a NumPy archive; `load_npz` reads it."""
+        return self.recording().save_npz(path)
+
+    def save_rrd(self, path: Path) -> Path:
+        """Write what was recorded so far for the Rerun viewer."""
+        return write_rrd(self.recording(), Path(path))

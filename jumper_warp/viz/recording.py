@@ -1,0 +1,131 @@
+"""Recordings of rollouts: body poses, named series and contact forces over time, with the shapes to draw them.
+
+A recording stands on its own: what was seen can be drawn without the model that made it.
+"""
+
+import json
+import os
+import re
+import zipfile
+import zlib
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from jumper_warp.viz.shapes import ShapeMesh
+
+FORMAT = "jumper-warp recording"
+VERSION = 1
+SERIES_NAME = re.compile(r"[^/\[\]]+/[^/\[\]]+ \[[^\[\]]+\]")
+"""Names of series: `group/quantity [unit]`, with 1 as the unit of a pure number."""
+
+
+class RecordingError(ValueError):
+    """A file that is not a recording, or not a whole one. The message is one line and names the file."""
+
+
+@dataclass(frozen=True)
+class Recording:
+    """One rollout of one or a few worlds, with a fixed set of bodies, series and contacts."""
+
+    times: np.ndarray
+    """(num_frames,) float64 [s], increasing."""
+    worlds: tuple[int, ...]
+    """Which of the model's worlds these are."""
+    bodies: tuple[str, ...]
+    """Names of the recorded bodies, `world_<i>/<link>`, one world after the other."""
+    poses: np.ndarray
+    """(num_frames, num_bodies, 7) float32: origin [m] and quaternion xyzw, body to world."""
+    series: dict[str, np.ndarray]
+    """`group/quantity [unit]` to (num_frames,) float64."""
+    contact_points: np.ndarray
+    """(num_frames, num_worlds, contacts_per_world, 3) float32 [m], world frame."""
+    contact_forces: np.ndarray
+    """The same shape, float32 [N], world frame, on the robot."""
+    spacing: float = 0.0
+    """Distance along y by which each world is drawn beside the one before it [m]; the data are not moved."""
+    shapes: tuple[ShapeMesh, ...] = ()
+    """What to draw; `body` is here an index of `bodies`."""
+    notes: dict[str, Any] = field(default_factory=dict)
+    """Anything that JSON holds: seed, gains, commit."""
+
+    def save_npz(self, path: Path) -> Path:
+        """Write the recording to one NumPy archive without pickles, whole or not at all; return its path."""
+        header = {
+            "format": FORMAT,
+            "version": VERSION,
+            "worlds": self.worlds,
+            "bodies": self.bodies,
+            "series": list(self.series),
+            "shapes": [{"name": shape.name, "body": shape.body, "color": shape.color} for shape in self.shapes],
+            "spacing": self.spacing,
+            "notes": self.notes,
+        }
+        arrays = {
+            "header": np.array(json.dumps(header)),
+            "times": self.times,
+            "poses": self.poses,
+            "series": np.array(list(self.series.values()), dtype=np.float64).reshape(len(self.series), -1),
+            "contact_points": self.contact_points,
+            "contact_forces": self.contact_forces,
+        }
+        for index, shape in enumerate(self.shapes):
+            arrays[f"shape{index}_vertices"] = shape.vertices
+            arrays[f"shape{index}_normals"] = shape.normals
+            arrays[f"shape{index}_triangles"] = shape.triangles
+        path = Path(path)
+        aside = path.with_name(f".{path.name}.{os.getpid()}")
+        try:
+            with aside.open("wb") as file:
+                np.savez_compressed(file, **arrays)
+            os.replace(aside, path)
+        finally:
+            aside.unlink(missing_ok=True)
+        return path
+
+
+def load_npz(path: Path) -> Recording:
+    """Read what `Recording.save_npz` wrote.
+
+    Raises:
+        RecordingError: The file is missing, damaged, of another kind or of another version.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            header = json.loads(str(archive["header"]))
+            if header["format"] != FORMAT or header["version"] != VERSION:
+                raise RecordingError(f"{path}: expected a {FORMAT} of version {VERSION}")
+            return _from_archive(header, archive)
+    except RecordingError:
+        raise
+    except (OSError, EOFError, KeyError, TypeError, ValueError, zipfile.BadZipFile, zlib.error) as error:
+        raise RecordingError(f"{path}: cannot be read as a recording ({type(error).__name__}: {error})") from error
+
+
+def _from_archive(header: dict[str, Any], archive: Mapping[str, np.ndarray]) -> Recording:
+    shapes = [
+        ShapeMesh(
+            shape["name"],
+            shape["body"],
+            tuple(shape["color"]),
+            archive[f"shape{index}_vertices"],
+            archive[f"shape{index}_normals"],
+            archive[f"shape{index}_triangles"],
+        )
+        for index, shape in enumerate(header["shapes"])
+    ]
+    return Recording(
+        times=archive["times"],
+        worlds=tuple(header["worlds"]),
+        bodies=tuple(header["bodies"]),
+        poses=archive["poses"],
+        series=dict(zip(header["series"], archive["series"], strict=True)),
+        contact_points=archive["contact_points"],
+        contact_forces=archive["contact_forces"],
+        spacing=header["spacing"],
+        shapes=tuple(shapes),
+        notes=header["notes"],
+    )

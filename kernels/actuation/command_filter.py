@@ -1,0 +1,118 @@
+"""The motor command filter (paper, Section III): position targets give way to the limits as these come near.
+
+A quantity x (a motor angle, or the sum of a leg's two transversal angles) has limits [lower, upper]. With margins
+m_u = upper - x and m_l = x - lower, and the speed floor v_0, the time to violation is
+
+    t = min( m_u / max(x', v_0), m_l / max(-x', v_0) )
+
+and a command c becomes, with T the horizon,
+
+    c + w (clamp(c, lower, upper) - c),   w = clamp(1 - t / T, 0, 1)
+
+so that a command within the limits is never touched. Two rules override w, the second winning:
+
+1. within a hard zone before a limit (m < zone): w = 1 if c lies toward that limit from x, 0 if away from it;
+2. outside the limits: w = 1.
+
+The result is continuous in c, x and x' except where a command that violates a limit meets the border of a hard zone,
+or where x leaves the limits on one side while c lies beyond the other.
+"""
+
+import warp as wp
+
+from ..scalar import real, vec3
+
+# [rad] Two turns: commands are bounded to this before anything else, which keeps an infinite one from becoming NaN.
+COMMAND_BOUND = wp.constant(real(12.566370614359172))
+
+
+@wp.struct
+class Limits:
+    """Limits of one quantity, and the width of the hard zones before them (0: none)."""
+
+    lower: real  # [rad]
+    upper: real  # [rad]
+    lower_zone: real  # [rad] >= 0
+    upper_zone: real  # [rad] >= 0
+
+
+@wp.struct
+class FilterParams:
+    """Constants of the filter, the same for all legs and worlds."""
+
+    lateral: Limits
+    transversal: Limits  # outer and inner alike
+    sum: Limits  # of outer and inner transversal angle
+    horizon: real  # [s] > 0, time to violation below which the limits begin to bind
+    speed_floor: real  # [rad/s] > 0, least speed assumed toward a limit
+
+
+@wp.func
+def limit_weight(command: real, pos: real, vel: real, limits: Limits, horizon: real, speed_floor: real) -> real:
+    """Return the weight [1] of the limits, from 0 (ignored) to 1 (in force), for a command and position [rad]."""
+    upper_margin = limits.upper - pos
+    lower_margin = pos - limits.lower
+    time_left = wp.min(upper_margin / wp.max(vel, speed_floor), lower_margin / wp.max(-vel, speed_floor))
+    outside = upper_margin < real(0.0) or lower_margin < real(0.0)
+    in_upper_zone = upper_margin < limits.upper_zone
+    in_lower_zone = lower_margin < limits.lower_zone
+    toward = (in_upper_zone and command > pos) or (in_lower_zone and command < pos)
+    if outside or toward:
+        return real(1.0)
+    if in_upper_zone or in_lower_zone:
+        return real(0.0)
+    return wp.clamp(real(1.0) - time_left / horizon, real(0.0), real(1.0))
+
+
+@wp.func
+def limit_command(command: real, pos: real, vel: real, limits: Limits, horizon: real, speed_floor: real) -> real:
+    """Return the safe command [rad] for a quantity at `pos` [rad] that moves at `vel` [rad/s]."""
+    weight = limit_weight(command, pos, vel, limits, horizon, speed_floor)
+    return command + weight * (wp.clamp(command, limits.lower, limits.upper) - command)
+
+
+@wp.func
+def filter_leg(target: vec3, pos: vec3, vel: vec3, params: FilterParams) -> vec3:
+    """Return the safe targets [rad] of one leg. All vectors: (lateral, outer, inner), [rad] and [rad/s].
+
+    The single motors' limits come first. The limits of the transversal sum then act on the sum of what is left, and
+    both transversal commands give way by half of what they must.
+    """
+    t, h, v = params.transversal, params.horizon, params.speed_floor
+    lateral = limit_command(wp.clamp(target[0], -COMMAND_BOUND, COMMAND_BOUND), pos[0], vel[0], params.lateral, h, v)
+    outer = limit_command(wp.clamp(target[1], -COMMAND_BOUND, COMMAND_BOUND), pos[1], vel[1], t, h, v)
+    inner = limit_command(wp.clamp(target[2], -COMMAND_BOUND, COMMAND_BOUND), pos[2], vel[2], t, h, v)
+    total = outer + inner
+    share = real(0.5) * (limit_command(total, pos[1] + pos[2], vel[1] + vel[2], params.sum, h, v) - total)
+    return vec3(lateral, outer + share, inner + share)
+
+
+@wp.kernel
+def command_filter_kernel(
+    # in
+    raw_target: wp.array2d(dtype=real),
+    joint_q: wp.array(dtype=real),
+    joint_qd: wp.array(dtype=real),
+    coords_per_world: int,
+    dofs_per_world: int,
+    params: FilterParams,
+    # out
+    safe_target: wp.array2d(dtype=real),
+):
+    """Filter the motor targets of every leg. Launch over (4, num_worlds).
+
+    raw_target, safe_target [rad]: (12, num_worlds). joint_q, joint_qd: flat over worlds, laid out as Newton's.
+    """
+    leg, world = wp.tid()
+    lateral, outer, inner = 3 * leg, 3 * leg + 1, 3 * leg + 2
+    coord = coords_per_world * world + 7 + 5 * leg
+    dof = dofs_per_world * world + 6 + 5 * leg
+    safe = filter_leg(
+        vec3(raw_target[lateral, world], raw_target[outer, world], raw_target[inner, world]),
+        vec3(joint_q[coord], joint_q[coord + 1], joint_q[coord + 3]),
+        vec3(joint_qd[dof], joint_qd[dof + 1], joint_qd[dof + 3]),
+        params,
+    )
+    safe_target[lateral, world] = safe[0]
+    safe_target[outer, world] = safe[1]
+    safe_target[inner, world] = safe[2]

@@ -1,0 +1,98 @@
+"""The motors: position control, torque-speed envelope and over-speed protection."""
+
+import warp as wp
+
+from ..layout import motor_slot
+from ..scalar import real
+
+
+@wp.struct
+class MotorParams:
+    """Constants of one motor, at the joint (behind the gear)."""
+
+    kp: real  # [N m/rad]
+    kd: real  # [N m s/rad]
+    saturation: real  # [N m] largest torque that the controller asks for, either way
+    peak: real  # [N m] largest torque that the motor gives, up to the cutoff speed
+    cutoff_speed: real  # [rad/s] full driving torque up to here
+    no_load_speed: real  # [rad/s] no driving torque from here, > cutoff_speed
+    offset: real  # [rad] what the position sensor reads above the true angle
+    fade_start: real  # [rad/s] over-speed protection takes torque away from here
+    fade_end: real  # [rad/s] and has taken all of it here, > fade_start
+
+
+@wp.struct
+class MotorArrays:
+    """Constants of all motors, arrays of shape (12, num_worlds); units as in `MotorParams`."""
+
+    kp: wp.array2d(dtype=real)
+    kd: wp.array2d(dtype=real)
+    saturation: wp.array2d(dtype=real)
+    peak: wp.array2d(dtype=real)
+    cutoff_speed: wp.array2d(dtype=real)
+    no_load_speed: wp.array2d(dtype=real)
+    offset: wp.array2d(dtype=real)
+    fade_start: real
+    fade_end: real
+
+
+@wp.func
+def load_motor(motors: MotorArrays, motor: int, world: int) -> MotorParams:
+    """Return the constants of one motor of one world."""
+    params = MotorParams()
+    params.kp = motors.kp[motor, world]
+    params.kd = motors.kd[motor, world]
+    params.saturation = motors.saturation[motor, world]
+    params.peak = motors.peak[motor, world]
+    params.cutoff_speed = motors.cutoff_speed[motor, world]
+    params.no_load_speed = motors.no_load_speed[motor, world]
+    params.offset = motors.offset[motor, world]
+    params.fade_start = motors.fade_start
+    params.fade_end = motors.fade_end
+    return params
+
+
+@wp.func
+def envelope(direction: real, vel: real, motor: MotorParams) -> real:
+    """Return the largest torque [N m], >= 0, along `direction` (+1 or -1) at joint speed `vel` [rad/s].
+
+    The motor brakes with its peak torque. Driving it keeps the peak up to the cutoff speed, then loses it linearly
+    until the no-load speed. The controller asks for no more than the saturation torque.
+    """
+    headroom = (motor.no_load_speed - direction * vel) / (motor.no_load_speed - motor.cutoff_speed)
+    return wp.min(motor.saturation, motor.peak * wp.clamp(headroom, real(0.0), real(1.0)))
+
+
+@wp.func
+def motor_torque(target: real, pos: real, vel: real, motor: MotorParams) -> real:
+    """Return the torque [N m] at the joint, for a target and a true position [rad] and a speed [rad/s].
+
+    Position control, bounded by the torque-speed envelope; then over-speed protection fades driving and braking alike.
+    """
+    command = motor.kp * (target - (pos + motor.offset)) - motor.kd * vel
+    bounded = wp.clamp(command, -envelope(real(-1.0), vel, motor), envelope(real(1.0), vel, motor))
+    fade = (motor.fade_end - wp.abs(vel)) / (motor.fade_end - motor.fade_start)
+    return bounded * wp.clamp(fade, real(0.0), real(1.0))
+
+
+@wp.kernel
+def motor_torque_kernel(
+    # in
+    target: wp.array2d(dtype=real),
+    joint_q: wp.array(dtype=real),
+    joint_qd: wp.array(dtype=real),
+    coords_per_world: int,
+    dofs_per_world: int,
+    motors: MotorArrays,
+    # out
+    joint_f: wp.array(dtype=real),
+):
+    """Write the motor torques [N m] into generalized forces laid out as Newton's; other entries stay as they are.
+
+    Launch over (12, num_worlds). target [rad]: (12, num_worlds). joint_q, joint_qd, joint_f: flat over worlds.
+    """
+    motor, world = wp.tid()
+    coord = coords_per_world * world + 7 + motor_slot(motor)
+    dof = dofs_per_world * world + 6 + motor_slot(motor)
+    params = load_motor(motors, motor, world)
+    joint_f[dof] = motor_torque(target[motor, world], joint_q[coord], joint_qd[dof], params)

@@ -1,0 +1,45 @@
+"""Passive joint forces that general solvers lack, as explicit torques: damped knees with a cap, stops of the fold.
+
+`SolverJumper` has both built in, implicitly (`joint_forces`).
+"""
+
+import warp as wp
+
+from ..layout import COORDS, DOFS
+from ..scalar import real
+from .joint_forces import capped_damping, stop_torque
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.kernel
+def passive_torque_kernel(
+    # in
+    joint_q: wp.array(dtype=real),
+    joint_qd: wp.array(dtype=real),
+    knee_damping: real,
+    knee_limit: real,
+    sum_lower: real,
+    sum_upper: real,
+    stop_ke: real,
+    stop_kd: real,
+    # in, out
+    joint_f: wp.array(dtype=real),
+):
+    """Write the knees' torques and add the stops of outer + inner [N m]; one thread per (world, leg).
+
+    knee_damping [N m s/rad] acts up to knee_limit [N m]; stop_ke [N m/rad], stop_kd [N m s/rad] must be soft enough
+    for explicit integration.
+    """
+    world, leg = wp.tid()
+    q = world * COORDS + 7 + 5 * leg
+    d = world * DOFS + 6 + 5 * leg
+    outer_rate = joint_qd[d + 2]
+    inner_rate = joint_qd[d + 4]
+    joint_f[d + 2] = -capped_damping(knee_damping, outer_rate, knee_limit) * outer_rate
+    joint_f[d + 4] = -capped_damping(knee_damping, inner_rate, knee_limit) * inner_rate
+    fold = joint_q[q + 1] + joint_q[q + 3]
+    fold_rate = joint_qd[d + 1] + joint_qd[d + 3]
+    stop = stop_torque(fold, fold_rate, sum_lower, sum_upper, stop_ke, stop_kd, real(0.0))
+    joint_f[d + 1] = joint_f[d + 1] + stop
+    joint_f[d + 3] = joint_f[d + 3] + stop

@@ -1,0 +1,59 @@
+"""Reading motor values and paw forces out of Newton's arrays."""
+
+import warp as wp
+
+from ..layout import DOFS, motor_slot
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.kernel
+def motor_values_kernel(
+    # in
+    joint_values: wp.array(dtype=float),
+    # out
+    motor_values: wp.array2d(dtype=float),
+):
+    """Gather the motors' entries of a per-dof array into shape (12, num_worlds); launch over that shape."""
+    motor, world = wp.tid()
+    motor_values[motor, world] = joint_values[DOFS * world + 6 + motor_slot(motor)]
+
+
+@wp.kernel
+def paw_force_kernel(
+    # in
+    total_force: wp.array(dtype=wp.vec3),
+    restart: int,
+    # out
+    paw_force: wp.array2d(dtype=wp.vec3),
+    peak_force: wp.array(dtype=float),
+):
+    """Turn a contact sensor's forces [N], four rows a world, into shape (4, num_worlds), and keep the largest sum.
+
+    Launch over worlds. restart 1: forget the largest sum so far.
+    """
+    world = wp.tid()
+    total = wp.vec3(0.0)
+    for k in range(4):
+        force = total_force[4 * world + k]
+        paw_force[k, world] = force
+        total += force
+    peak = peak_force[world]
+    if restart != 0:
+        peak = 0.0
+    peak_force[world] = wp.max(peak, wp.length(total))
+
+
+@wp.kernel
+def arrived_target_kernel(
+    # in
+    target: wp.array2d(dtype=float),
+    previous: wp.array2d(dtype=float),
+    delay: wp.array(dtype=int),
+    step: int,
+    # out
+    arrived: wp.array2d(dtype=float),
+):
+    """Write the motor targets [rad] of a physics step: before `delay` the previous ones; (12, num_worlds) threads."""
+    motor, world = wp.tid()
+    arrived[motor, world] = wp.where(step < delay[world], previous[motor, world], target[motor, world])

@@ -1,0 +1,78 @@
+"""Distances between the simple shapes that stand for links: capsules and boxes.
+
+A sphere is a capsule of zero length. Distances are signed as far as the radii go: two overlapping capsules report
+minus their overlap, but never less than minus the sum of their radii.
+"""
+
+import warp as wp
+
+from ..scalar import real, vec3
+
+
+@wp.func
+def segment_segment_sq(start_a: vec3, end_a: vec3, start_b: vec3, end_b: vec3) -> real:
+    """Return the squared distance [m^2] between two segments, either of which may be a point."""
+    a = end_a - start_a
+    b = end_b - start_b
+    between = start_a - start_b
+    aa = wp.max(wp.dot(a, a), real(1.0e-12))
+    bb = wp.max(wp.dot(b, b), real(1.0e-12))
+    ab = wp.dot(a, b)
+    a_between = wp.dot(a, between)
+    b_between = wp.dot(b, between)
+    # for (nearly) parallel segments the floor on the determinant turns the division into a step downhill
+    det = wp.max(aa * bb - ab * ab, real(1.0e-7) * aa * bb)
+    along_a = wp.clamp((ab * b_between - a_between * bb) / det, real(0.0), real(1.0))
+    along_b = wp.clamp((ab * along_a + b_between) / bb, real(0.0), real(1.0))
+    nearest_a = wp.clamp((ab * along_b - a_between) / aa, real(0.0), real(1.0))
+    gap = between + nearest_a * a - along_b * b
+    return wp.dot(gap, gap)
+
+
+@wp.func
+def outside_box(point: vec3, half: vec3) -> vec3:
+    """Return the vector [m] from the nearest point of a box centred at the origin to `point`; zero inside."""
+    return point - wp.min(wp.max(point, -half), half)
+
+
+@wp.func
+def segment_box_sq(start: vec3, end: vec3, half: vec3) -> real:
+    """Return the squared distance [m^2] between a segment and an axis-aligned box of half extents `half` at the origin.
+
+    Along the segment the squared distance is convex and piecewise quadratic, with a seam where the segment crosses
+    the plane of a face. Its slope finds the piece that holds the minimum; within that piece the slope is linear.
+    """
+    step = end - start
+    low = real(0.0)
+    high = real(1.0)
+    for i in range(6):
+        axis = i // 2
+        face = wp.where(i % 2 == 0, half[axis], -half[axis])
+        seam = (face - start[axis]) / wp.where(step[axis] == real(0.0), real(1.0e-12), step[axis])
+        if seam > low and seam < high:
+            if wp.dot(step, outside_box(start + seam * step, half)) > real(0.0):
+                high = seam
+            else:
+                low = seam
+    slope_low = wp.min(wp.dot(step, outside_box(start + low * step, half)), real(0.0))
+    slope_high = wp.max(wp.dot(step, outside_box(start + high * step, half)), real(0.0))
+    share = -slope_low / wp.max(slope_high - slope_low, real(1.0e-20))
+    gap = outside_box(start + (low + share * (high - low)) * step, half)
+    return wp.dot(gap, gap)
+
+
+@wp.func
+def segment_box_bound_sq(start: vec3, end: vec3, half: vec3) -> real:
+    """Return a cheap lower bound on `segment_box_sq`: the squared distance of the segment's bounding box."""
+    gap = wp.max(wp.min(start, end) - half, -half - wp.max(start, end))
+    gap_outside = wp.max(gap, vec3(real(0.0)))
+    return wp.dot(gap_outside, gap_outside)
+
+
+@wp.func
+def swell(distance_sq: real, radius: real, bound: real) -> real:
+    """Return the distance [m] of shapes swollen by `radius` in total, or `bound` (>= 0) if it is not below that."""
+    reach = bound + radius
+    if distance_sq >= reach * reach:
+        return bound
+    return wp.sqrt(distance_sq) - radius

@@ -1,0 +1,305 @@
+"""Contacts that must not happen: links with the ground, with other legs, with their own leg and with the shell.
+
+Paws may touch the ground; that contact belongs to the dynamics. Each leg is five capsules (two thighs, two shanks,
+the paw as a capsule of zero length) whose ends come from the five-bar in closed form, the housings are capsules
+along the lateral axes, and the shell is four boxes. Pairs between links are measured in the body frame.
+
+Not measured, because the mechanism keeps them apart or together at any joint angle: a leg with its own housing and
+with the motor drums at its own end of the body, around whose axis it turns at a fixed distance; thighs with the shanks
+that hang from them; a paw with its own thighs; housings with one another and with other legs (a leg meets the shell or
+its neighbour first).
+"""
+
+import warp as wp
+
+from ..kinematics.five_bar import five_bar
+from ..kinematics.geometry import LegGeometry
+from ..layout import COORDS
+from ..scalar import mat33, quat, real, vec3
+from ..terrain.ground import Ground, ground_distance, world_ground
+from .distances import segment_box_bound_sq, segment_box_sq, segment_segment_sq, swell
+
+wp.set_module_options({"enable_backward": False})
+
+BODY_GROUND = wp.constant(1)
+HOUSING_GROUND = wp.constant(2)
+THIGH_GROUND = wp.constant(4)
+KNEE_GROUND = wp.constant(8)
+SHANK_GROUND = wp.constant(16)
+LEG_LEG = wp.constant(32)
+LEG_SELF = wp.constant(64)
+LEG_SHELL = wp.constant(128)
+
+HOUSING_LENGTH = wp.constant(real(0.19))  # [m] from the hip outward along the lateral axis
+HOUSING_RADIUS = wp.constant(real(0.048))  # [m]
+THIGH_RADIUS = wp.constant(real(0.019))  # [m], knees too
+SHANK_RADIUS = wp.constant(real(0.012))  # [m]
+SHANK_FREE = wp.constant(real(0.9))  # share of a shank, from the knee, that must not touch the ground
+SHANK_APART = wp.constant(real(0.5))  # share of a shank, from the knee, that must not touch its twin
+
+vec4 = wp.types.vector(length=4, dtype=real)
+mat43 = wp.types.matrix(shape=(4, 3), dtype=real)
+mat53 = wp.types.matrix(shape=(5, 3), dtype=real)
+
+# Shell boxes in the body frame [m]: nose to tail, trunk, front motor drums, rear motor drums.
+SHELL_BOXES = wp.constant(4)
+SHELL_CENTER = wp.constant(mat43(0.0, 0.0, 0.025, 0.0, 0.0, 0.025, 0.1125, 0.0, 0.0, -0.112, 0.0, 0.0))
+SHELL_HALF = wp.constant(
+    mat43(0.343, 0.05, 0.074, 0.144, 0.112, 0.074, 0.0315, 0.154, 0.049, 0.032, 0.199, 0.049),
+)
+
+
+@wp.struct
+class LegCapsules:
+    """The capsules of one leg, in the body frame."""
+
+    ends: mat53  # [m] rows: outer transversal axis, inner transversal axis, outer knee, inner knee, ankle
+    low: vec3  # [m] smallest coordinates of the ends
+    high: vec3  # [m] largest coordinates of the ends
+    hip: vec3  # [m]
+    normal: vec3  # unit normal of the leg's plane
+    offset: real  # [m] of the knees and the ankle along the normal, from the hip
+    front: real  # +1 front leg, -1 back leg
+    paw_radius: real  # [m]
+
+
+@wp.struct
+class Collisions:
+    """Result for one robot."""
+
+    flags: int  # bitmask of the contacts that exist
+    clearance: real  # [m] smallest distance found, negative in contact
+
+
+@wp.func
+def leg_capsules(geo: LegGeometry, lateral: real, outer: real, inner: real) -> LegCapsules:
+    """Return the capsules of one leg for its motor angles [rad]."""
+    loop = five_bar(geo, outer, inner)
+    normal = vec3(real(0.0), wp.cos(lateral), geo.side * wp.sin(lateral))
+    up = vec3(real(0.0), -normal[2], normal[1])
+    forward = vec3(real(1.0), real(0.0), real(0.0))
+    capsules = LegCapsules()
+    capsules.offset = geo.plane_y + geo.knee_y
+    root = geo.hip + geo.plane_y * normal
+    plane = geo.hip + capsules.offset * normal
+    outer_axis = root + geo.outer_x * forward
+    inner_axis = root + geo.inner_x * forward
+    outer_knee = plane + loop.outer_knee[0] * forward + loop.outer_knee[1] * up
+    inner_knee = plane + loop.inner_knee[0] * forward + loop.inner_knee[1] * up
+    ankle = plane + loop.ankle[0] * forward + loop.ankle[1] * up
+    capsules.ends = wp.matrix_from_rows(outer_axis, inner_axis, outer_knee, inner_knee, ankle)
+    capsules.low = wp.min(wp.min(wp.min(outer_axis, inner_axis), wp.min(outer_knee, inner_knee)), ankle)
+    capsules.high = wp.max(wp.max(wp.max(outer_axis, inner_axis), wp.max(outer_knee, inner_knee)), ankle)
+    capsules.hip = geo.hip
+    capsules.normal = normal
+    capsules.front = geo.front
+    capsules.paw_radius = geo.paw_radius
+    return capsules
+
+
+@wp.func
+def capsule_end(k: int) -> int:
+    """Return the row of `LegCapsules.ends` where link k ends; it starts at row k. Links as in `capsule_radius`."""
+    return wp.min(k + 2, 4)
+
+
+@wp.func
+def capsule_radius(capsules: LegCapsules, k: int) -> real:
+    """Return the radius [m] of link k: thighs 0 and 1, shanks 2 and 3, paw 4."""
+    return wp.where(k < 2, THIGH_RADIUS, wp.where(k < 4, SHANK_RADIUS, capsules.paw_radius))
+
+
+@wp.func
+def leg_self_distance(capsules: LegCapsules, bound: real) -> real:
+    """Return the distance [m] between links of one leg, at most `bound` (>= 0).
+
+    Counted are thigh to thigh, each thigh to the shank of the other, and shank to shank. The shanks meet in the
+    ankle, so only their upper parts count; those are nearest at their lower ends.
+    """
+    outer_axis, inner_axis = capsules.ends[0], capsules.ends[1]
+    outer_knee, inner_knee, ankle = capsules.ends[2], capsules.ends[3], capsules.ends[4]
+    thighs_sq = segment_segment_sq(outer_axis, outer_knee, inner_axis, inner_knee)
+    outer_thigh_sq = segment_segment_sq(outer_axis, outer_knee, inner_knee, ankle)
+    inner_thigh_sq = segment_segment_sq(inner_axis, inner_knee, outer_knee, ankle)
+    span = SHANK_APART * (outer_knee - inner_knee)
+    thighs = swell(thighs_sq, real(2.0) * THIGH_RADIUS, bound)
+    crossed = swell(wp.min(outer_thigh_sq, inner_thigh_sq), THIGH_RADIUS + SHANK_RADIUS, bound)
+    shanks = swell(wp.dot(span, span), real(2.0) * SHANK_RADIUS, bound)
+    return wp.min(thighs, wp.min(crossed, shanks))
+
+
+@wp.func
+def leg_box_distance(capsules: LegCapsules, box: int, bound: real) -> real:
+    """Return the distance [m] between a leg and one box of the shell, at most `bound` (>= 0)."""
+    center = SHELL_CENTER[box]
+    half = SHELL_HALF[box]
+    nearest = bound
+    # the whole leg lies in one plane: if that clears the box, so does every link (the thighs' upper ends lie knee_y
+    # inside the plane, which their smaller radius makes good)
+    plane_gap = wp.abs(wp.dot(capsules.normal, capsules.hip - center) + capsules.offset) - wp.dot(
+        wp.abs(capsules.normal), half
+    )
+    bounding_sq = segment_box_bound_sq(capsules.low - center, capsules.high - center, half)
+    reach = bound + capsules.paw_radius
+    if plane_gap < reach and bounding_sq < reach * reach:
+        count = wp.int32(5)
+        for k in range(count):
+            start = capsules.ends[k] - center
+            end = capsules.ends[capsule_end(k)] - center
+            radius = capsule_radius(capsules, k)
+            if swell(segment_box_bound_sq(start, end, half), radius, nearest) < nearest:
+                nearest = wp.min(nearest, swell(segment_box_sq(start, end, half), radius, bound))
+    return nearest
+
+
+@wp.func
+def leg_shell_distance(capsules: LegCapsules, bound: real) -> real:
+    """Return the distance [m] between a leg and the shell without the motor drums at its own end, at most `bound`."""
+    drums = wp.where(capsules.front > real(0.0), 3, 2)
+    nearest = wp.min(leg_box_distance(capsules, 0, bound), leg_box_distance(capsules, 1, bound))
+    return wp.min(nearest, leg_box_distance(capsules, drums, bound))
+
+
+@wp.func
+def leg_leg_distance(leg: LegCapsules, other: LegCapsules, bound: real) -> real:
+    """Return the distance [m] between two legs' thighs, shanks and paws, at most `bound` (>= 0)."""
+    gap = wp.max(wp.max(other.low - leg.high, leg.low - other.high), vec3(real(0.0)))
+    reach = bound + leg.paw_radius + other.paw_radius
+    nearest = bound
+    if wp.dot(gap, gap) < reach * reach:
+        count = wp.int32(25)
+        for pair in range(count):
+            k = pair // 5
+            m = pair % 5
+            radius = capsule_radius(leg, k) + capsule_radius(other, m)
+            distance_sq = segment_segment_sq(
+                leg.ends[k], leg.ends[capsule_end(k)], other.ends[m], other.ends[capsule_end(m)]
+            )
+            nearest = wp.min(nearest, swell(distance_sq, radius, bound))
+    return nearest
+
+
+@wp.func
+def body_ground_distance(ground: Ground, pos: vec3, rotation: mat33) -> real:
+    """Return the distance [m] of the shell from the ground, at the lower corners of its boxes.
+
+    Exact over a plane; over a heightfield, what rises between the corners (0.2 m apart at most along x) is missed.
+    pos: base position [m], world; rotation: body to world.
+    """
+    lower = wp.where(rotation[2, 2] < real(0.0), real(1.0), real(-1.0))
+    nearest = real(1.0e6)
+    count = wp.int32(16)
+    for i in range(count):
+        half = SHELL_HALF[i // 4]
+        x = wp.where(i % 2 == 0, half[0], -half[0])
+        y = wp.where((i // 2) % 2 == 0, half[1], -half[1])
+        corner = SHELL_CENTER[i // 4] + vec3(x, y, lower * half[2])
+        nearest = wp.min(nearest, ground_distance(ground, pos + rotation * corner))
+    return nearest
+
+
+@wp.func
+def leg_ground_distances(ground: Ground, capsules: LegCapsules, pos: vec3, rotation: mat33) -> vec4:
+    """Return the distances [m] of one leg's (housing, thighs, knees, shanks) from the ground.
+
+    A knee is the end of its thigh; the thigh counts from its axis to its middle, the shank down to `SHANK_FREE`.
+    Exact over a plane; over a heightfield links are probed every 0.09 m. pos: base position [m], world;
+    rotation: body to world.
+    """
+    housing = ground_distance(ground, pos + rotation * capsules.hip)
+    tip = capsules.hip + vec3(capsules.front * HOUSING_LENGTH, real(0.0), real(0.0))
+    housing = wp.min(housing, ground_distance(ground, pos + rotation * tip))
+    thigh = real(1.0e6)
+    knee = real(1.0e6)
+    shank = real(1.0e6)
+    ankle_world = pos + rotation * capsules.ends[4]
+    for k in range(2):
+        axis_world = pos + rotation * capsules.ends[k]
+        knee_world = pos + rotation * capsules.ends[k + 2]
+        thigh = wp.min(thigh, ground_distance(ground, axis_world))
+        thigh = wp.min(thigh, ground_distance(ground, real(0.5) * (axis_world + knee_world)))
+        knee = wp.min(knee, ground_distance(ground, knee_world))
+        for i in range(3):
+            share = SHANK_FREE * real(i + 1) / real(3.0)
+            shank = wp.min(shank, ground_distance(ground, knee_world + share * (ankle_world - knee_world)))
+    shank = wp.min(shank, knee)
+    return vec4(housing - HOUSING_RADIUS, thigh - THIGH_RADIUS, knee - THIGH_RADIUS, shank - SHANK_RADIUS)
+
+
+@wp.func
+def record(found: Collisions, distance: real, flag: int) -> Collisions:
+    """Return the result with one more distance [m] taken into account: below zero it raises `flag`."""
+    result = Collisions()
+    result.flags = found.flags | wp.where(distance < real(0.0), flag, 0)
+    result.clearance = wp.min(found.clearance, distance)
+    return result
+
+
+@wp.func
+def load_leg(
+    geometry: wp.array(dtype=LegGeometry), joint_q: wp.array(dtype=wp.float32), start: int, leg: int
+) -> LegCapsules:
+    """Return the capsules of one leg in the world whose joint coordinates begin at index `start`."""
+    motor = start + 7 + 5 * leg
+    return leg_capsules(geometry[leg], real(joint_q[motor]), real(joint_q[motor + 1]), real(joint_q[motor + 3]))
+
+
+@wp.func
+def world_collisions(
+    geometry: wp.array(dtype=LegGeometry),
+    ground: Ground,
+    joint_q: wp.array(dtype=wp.float32),
+    start: int,
+    margin: real,
+) -> Collisions:
+    """Return the contacts that must not exist and the smallest distance [m] of one robot, at most `margin`.
+
+    geometry: the four legs. joint_q: base position [m] and quaternion xyzw, then five coordinates a leg [rad], from
+    index `start`, from which the world with its block follows. margin: distances [m] above it (>= 0) are not resolved,
+    and with 0 only the flags mean anything: a small margin is fast. A state that is not finite raises no dependable
+    flag.
+    """
+    pos = vec3(real(joint_q[start]), real(joint_q[start + 1]), real(joint_q[start + 2]))
+    rotation = wp.quat_to_matrix(
+        quat(real(joint_q[start + 3]), real(joint_q[start + 4]), real(joint_q[start + 5]), real(joint_q[start + 6]))
+    )
+    found = Collisions()
+    found.clearance = margin
+    here = world_ground(ground, start // COORDS)
+    found = record(found, body_ground_distance(here, pos, rotation), BODY_GROUND)
+    capsules = load_leg(geometry, joint_q, start, 0)
+    count = wp.int32(4)
+    for i in range(count):
+        over_ground = leg_ground_distances(here, capsules, pos, rotation)
+        found = record(found, over_ground[0], HOUSING_GROUND)
+        found = record(found, over_ground[1], THIGH_GROUND)
+        found = record(found, over_ground[2], KNEE_GROUND)
+        found = record(found, over_ground[3], SHANK_GROUND)
+        bound = wp.max(found.clearance, real(0.0))
+        found = record(found, leg_self_distance(capsules, bound), LEG_SELF)
+        found = record(found, leg_shell_distance(capsules, bound), LEG_SHELL)
+        # around the body, each leg and its next neighbour: FL, FR, BR, BL
+        turn = (i + 1) % 4
+        neighbour = load_leg(geometry, joint_q, start, turn ^ (turn >> 1))
+        found = record(found, leg_leg_distance(capsules, neighbour, bound), LEG_LEG)
+        capsules = neighbour
+    return found
+
+
+@wp.kernel
+def collision_kernel(
+    # in
+    geometry: wp.array(dtype=LegGeometry),
+    ground: Ground,
+    joint_q: wp.array(dtype=wp.float32),
+    coords_per_world: int,
+    margin: real,
+    # out
+    flags: wp.array(dtype=wp.int32),
+    clearance: wp.array(dtype=wp.float32),
+):
+    """Check one world per thread; see `world_collisions`. joint_q: Newton's, flat, `coords_per_world` a world."""
+    world = wp.tid()
+    found = world_collisions(geometry, ground, joint_q, world * coords_per_world, margin)
+    flags[world] = found.flags
+    clearance[world] = wp.float32(found.clearance)

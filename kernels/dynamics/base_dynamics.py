@@ -1,0 +1,109 @@
+"""The arrow-shaped system: legs eliminated onto the base's six equations, solved, and substituted back."""
+
+import warp as wp
+
+from ..scalar import mat33, vec3
+from .inertia import MassMoments, inertia_matrix, inertia_mul, skew
+from .leg_dynamics import LegDynamics
+
+
+@wp.struct
+class LegSolve:
+    """One leg with its motors eliminated: q'' = free - to_lin a - to_ang alpha."""
+
+    inverse: mat33  # inverse of D, implicit terms included [1/(kg m^2)]
+    free: vec3  # D^-1 (tau - h) [rad/s^2]
+    to_lin: mat33  # D^-1 Bv^T
+    to_ang: mat33  # D^-1 Bw^T
+
+
+@wp.struct
+class BaseSystem:
+    """Equations of the base, in 3x3 blocks: [lin cross; cross^T ang] [a; alpha] = [force; moment]."""
+
+    lin: mat33
+    cross: mat33
+    ang: mat33
+    force: vec3
+    moment: vec3
+
+
+@wp.struct
+class BaseInverse:
+    """Inverse of the base's system in 3x3 blocks."""
+
+    lin: mat33
+    cross: mat33
+    ang: mat33
+
+
+@wp.func
+def eliminate_leg(leg: LegDynamics, implicit: mat33, torque: vec3) -> LegSolve:
+    """Return the leg's elimination; implicit: addition to D [kg m^2]; torque: motor-space torque [N m]."""
+    solve = LegSolve()
+    inverse = wp.inverse(leg.inertia + implicit)
+    solve.inverse = inverse
+    solve.free = inverse * (torque - leg.bias_torque)
+    solve.to_lin = inverse * wp.transpose(leg.coupling_lin)
+    solve.to_ang = inverse * wp.transpose(leg.coupling_ang)
+    return solve
+
+
+@wp.func
+def base_alone(body: MassMoments, omega: vec3, g: vec3, force: vec3, moment: vec3) -> BaseSystem:
+    """Return the system of the base link alone.
+
+    omega: angular velocity [rad/s], g: gravity [m/s^2], force [N] and moment about the origin [N m] from outside;
+    all in body axes.
+    """
+    system = BaseSystem()
+    system.lin = wp.diag(vec3(body.mass))
+    system.cross = -skew(body.first)
+    system.ang = inertia_matrix(body.second)
+    system.force = force + body.mass * g - wp.cross(omega, wp.cross(omega, body.first))
+    system.moment = moment + wp.cross(body.first, g) - wp.cross(omega, inertia_mul(body.second, omega))
+    return system
+
+
+@wp.func
+def add_leg(system: BaseSystem, leg: LegDynamics, solve: LegSolve) -> BaseSystem:
+    """Return the system with a leg added, its motors eliminated."""
+    s = BaseSystem()
+    s.lin = system.lin + wp.diag(vec3(leg.body.mass)) - leg.coupling_lin * solve.to_lin
+    s.cross = system.cross - skew(leg.body.first) - leg.coupling_lin * solve.to_ang
+    s.ang = system.ang + inertia_matrix(leg.body.second) - leg.coupling_ang * solve.to_ang
+    s.force = system.force - leg.bias_force - leg.coupling_lin * solve.free
+    s.moment = system.moment - leg.bias_moment - leg.coupling_ang * solve.free
+    return s
+
+
+@wp.func
+def invert(system: BaseSystem) -> BaseInverse:
+    """Return the inverse of a symmetric positive definite system by block elimination."""
+    lin_inv = wp.inverse(system.lin)
+    across = lin_inv * system.cross
+    inverse = BaseInverse()
+    ang = wp.inverse(system.ang - wp.transpose(system.cross) * across)
+    cross = -across * ang
+    inverse.ang = ang
+    inverse.cross = cross
+    inverse.lin = lin_inv - cross * wp.transpose(across)
+    return inverse
+
+
+@wp.func
+def solve_lin(inverse: BaseInverse, force: vec3, moment: vec3) -> vec3:
+    """Return the linear part of the solution."""
+    return inverse.lin * force + inverse.cross * moment
+
+
+@wp.func
+def solve_ang(inverse: BaseInverse, force: vec3, moment: vec3) -> vec3:
+    """Return the angular part of the solution."""
+    return wp.transpose(inverse.cross) * force + inverse.ang * moment
+
+
+@wp.func
+def motor_acceleration(solve: LegSolve, lin: vec3, ang: vec3) -> vec3:
+    """Return the motor accelerations [rad/s^2] of a leg for base accelerations in body axes."""
+    return solve.free - solve.to_lin * lin - solve.to_ang * ang

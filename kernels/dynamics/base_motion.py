@@ -1,0 +1,47 @@
+"""Rigid motion of the base: integration of its pose, and wrenches moved to its origin."""
+
+import warp as wp
+
+from ..scalar import quat, real, vec3
+from ..state import BaseState
+
+
+@wp.struct
+class Wrench:
+    """External force [N] and moment [N m] about the base origin, body axes."""
+
+    force: vec3
+    moment: vec3
+
+
+@wp.func
+def external_wrench(base: BaseState, com: vec3, force_at_com: vec3, moment: vec3) -> Wrench:
+    """Return a wrench given in world axes at the base's centre of mass, in body axes about the base origin."""
+    wrench = Wrench()
+    wrench.force = wp.quat_rotate_inv(base.quat, force_at_com)
+    wrench.moment = wp.quat_rotate_inv(base.quat, moment) + wp.cross(com, wrench.force)
+    return wrench
+
+
+@wp.func
+def exp_rotation(turn: vec3) -> quat:
+    """Return the quaternion (xyzw) of a rotation vector [rad]."""
+    half_sq = real(0.25) * wp.dot(turn, turn)
+    # sin(h)/h and cos(h) to float32 rounding for the turns of one step (h < 0.2)
+    sinc = real(1.0) - half_sq / real(6.0) * (real(1.0) - half_sq / real(20.0) * (real(1.0) - half_sq / real(42.0)))
+    v = real(0.5) * sinc * turn
+    cosine = real(1.0) - half_sq / real(2.0) * (
+        real(1.0) - half_sq / real(12.0) * (real(1.0) - half_sq / real(30.0) * (real(1.0) - half_sq / real(56.0)))
+    )
+    return wp.normalize(quat(v[0], v[1], v[2], cosine))
+
+
+@wp.func
+def moved_base(base: BaseState, lin: vec3, ang: vec3, dt: real) -> BaseState:
+    """Return the base moved for dt [s]; lin, ang: its new twist in the present body axes [m/s], [rad/s]."""
+    moved = BaseState()
+    moved.lin = wp.quat_rotate(base.quat, lin)
+    moved.ang = ang
+    moved.pos = base.pos + dt * moved.lin
+    moved.quat = wp.normalize(base.quat * exp_rotation(dt * ang))
+    return moved

@@ -1,0 +1,232 @@
+"""Contact of the four paws with the ground: rigid, inelastic, Coulomb friction, solved for impulses.
+
+At the end of a step each paw satisfies, with v the velocity of its contact point, n the normal, and impulse p:
+
+    0 <= p_n  complementary to  v_n - v_free >= 0,      |p_t| <= mu p_n,
+    p_t = -mu p_n v_t / |v_t|  where the paw slides,    v_t = 0 where it sticks,
+
+v_free = -gap / dt lets an open gap close exactly. The four paws are coupled through the base alone,
+
+    v_k = v_k0 + A_k p_k + G_k (change of base twist),   change of base twist = S^-1 sum_k G_k^T p_k,
+
+so block Gauss-Seidel over the paws, each solved exactly as a 3x3 problem, converges quickly. Vectors are in body axes.
+
+Velocities of paws that touch a sliding block are relative to it. The block obeys friction with the floor exactly, at
+every stage of the iteration: its velocity is a function of the impulses (`block_velocity`), so that paws and block
+agree at the end of a step, whatever the block's mass.
+"""
+
+import warp as wp
+
+from ..scalar import mat33, real, vec3
+from .base_dynamics import BaseInverse, LegSolve
+from .inertia import skew
+from .leg_dynamics import PawKinematics
+
+# share of a penetration that is pushed out per step, and the fastest push [m/s]
+PUSH_OUT = wp.constant(real(0.2))
+PUSH_OUT_SPEED = wp.constant(real(1.0))
+# paws that could close this much [m] more than their free motion are solved for
+CONTACT_MARGIN = wp.constant(real(0.02))
+# slower contacts [m/s] start the step with static friction
+STICK_SPEED = wp.constant(real(0.01))
+
+SEPARATE = wp.constant(0)
+STICK = wp.constant(1)
+SLIDE = wp.constant(2)
+
+
+@wp.struct
+class PawContact:
+    """One paw in the contact problem."""
+
+    active: int  # 0: too far from the ground to touch within the step
+    on_block: int  # 1: the ground is the sliding block there
+    normal: vec3
+    mu: real
+    mu_row: int  # row of mu in the parameter table
+    goal: real  # smallest admissible normal velocity at the end of the step [m/s]
+    free: vec3  # contact point velocity without any impulse [m/s]
+    jacobian: mat33  # contact velocity per motor rate [m/rad]
+    from_lin: mat33  # G: contact velocity per base twist
+    from_ang: mat33
+    to_lin: mat33  # S^-1 G^T: base twist per impulse
+    to_ang: mat33
+    own: mat33  # A: contact velocity per impulse through the leg alone [1/kg]
+    total_inv: mat33  # inverse of `total` [kg]
+    total: mat33  # A + G S^-1 G^T, plus 1/mass of the block along the floor: relative velocity per impulse [1/kg]
+    impulse: vec3  # [N s]
+
+
+@wp.struct
+class BlockLaw:
+    """What decides the velocity of a sliding block at the end of a step, given the paws' impulses."""
+
+    velocity: vec3  # at the start of the step [m/s]
+    up: vec3  # world z
+    mass: real  # [kg]
+    friction: real  # coefficient of friction with the floor [1]
+    weight: real  # impulse of the block's own weight on the floor [N s]
+
+
+@wp.func
+def contact_jacobian(paw: PawKinematics, arm: vec3) -> mat33:
+    """Return the contact point's velocity per motor rate; arm [m] leads from the paw centre to the point."""
+    return paw.jacobian - skew(arm) * paw.spin
+
+
+@wp.func
+def goal_velocity(gap: real, dt: real) -> real:
+    """Return the smallest admissible normal velocity [m/s] for a gap [m]: close it exactly, push penetration out."""
+    if gap > real(0.0):
+        return -gap / dt
+    return wp.min(-PUSH_OUT * gap / dt, PUSH_OUT_SPEED)
+
+
+@wp.func
+def couple_contact(contact: PawContact, point: vec3, leg: LegSolve, base: BaseInverse) -> PawContact:
+    """Return the contact with its responses filled in; point [m] from the base origin."""
+    c = contact
+    eye = wp.identity(n=3, dtype=real)
+    leg_response = leg.inverse * wp.transpose(c.jacobian)
+    c.from_lin = eye - c.jacobian * leg.to_lin
+    c.from_ang = -skew(point) - c.jacobian * leg.to_ang
+    lin_t = wp.transpose(c.from_lin)
+    ang_t = wp.transpose(c.from_ang)
+    c.to_lin = base.lin * lin_t + base.cross * ang_t
+    c.to_ang = wp.transpose(base.cross) * lin_t + base.ang * ang_t
+    c.own = c.jacobian * leg_response
+    c.total = c.own + c.from_lin * c.to_lin + c.from_ang * c.to_ang
+    c.total_inv = wp.inverse(c.total)
+    return c
+
+
+@wp.func
+def sliding_impulse(c: PawContact, impulse: vec3, velocity: vec3) -> vec3:
+    """Return the next impulse of a sliding paw, meeting the normal condition, from the present impulse and velocity.
+
+    Its friction is (present friction - slip / scale), cut at the cone. At the fixed point that is the cone's edge,
+    opposite to the slip; cutting only, never stretching, keeps friction along the slip from being one too.
+    """
+    n = c.normal
+    across = c.total * n
+    normal_response = wp.dot(n, across)
+    scale = (c.total[0, 0] + c.total[1, 1] + c.total[2, 2]) - normal_response
+    pull = impulse - velocity / scale
+    pull = pull - wp.dot(pull, n) * n
+    edge = n + c.mu * wp.normalize(pull)
+    response = wp.max(wp.dot(across, edge), real(0.1) * normal_response)
+    lack = c.goal - wp.dot(n, velocity) + wp.dot(across, impulse)
+    size = (lack - wp.dot(across, pull)) / normal_response
+    if size > real(0.0) and wp.dot(pull, pull) < c.mu * c.mu * size * size:
+        return size * n + pull
+    return wp.max(lack / response, real(0.0)) * edge
+
+
+@wp.func
+def local_impulse(c: PawContact, impulse: vec3, velocity: vec3) -> vec3:
+    """Return the impulse that solves one paw's contact law, the others fixed.
+
+    impulse [N s] and velocity [m/s]: present values at this paw.
+    """
+    n = c.normal
+    stick = impulse + c.total_inv * (c.goal * n - velocity)
+    normal = wp.dot(stick, n)
+    tangential = stick - normal * n
+    if normal > real(0.0) and wp.dot(tangential, tangential) <= c.mu * c.mu * normal * normal:
+        return stick
+    # separated if the velocity without this paw's impulse is admissible
+    if wp.dot(n, velocity - c.total * impulse) >= c.goal:
+        return vec3(real(0.0))
+    return sliding_impulse(c, impulse, velocity)
+
+
+@wp.func
+def block_velocity(block: BlockLaw, contacts: wp.array(dtype=PawContact)) -> vec3:
+    """Return the block's velocity [m/s] at the end of the step, pushed by the paws and slowed by the floor.
+
+    Coulomb friction under the weight and the paws' load takes speed off, and never more than there is.
+    """
+    push = vec3(real(0.0))
+    for k in range(contacts.shape[0]):
+        if contacts[k].on_block != 0:
+            push -= contacts[k].impulse
+    upward = wp.dot(push, block.up)
+    free = block.velocity + (push - upward * block.up) / block.mass
+    loss = block.friction * wp.max(block.weight - upward, real(0.0)) / block.mass
+    speed = wp.length(free)
+    if speed <= loss:
+        return vec3(real(0.0))
+    return (real(1.0) - loss / speed) * free
+
+
+@wp.func
+def on_block(contact: PawContact, block: BlockLaw) -> PawContact:
+    """Return a contact with the block, whose response to impulses includes the block's."""
+    c = contact
+    c.on_block = 1
+    c.total += (wp.identity(n=3, dtype=real) - wp.outer(block.up, block.up)) / block.mass
+    c.total_inv = wp.inverse(c.total)
+    return c
+
+
+@wp.struct
+class ContactState:
+    """Progress of the contact iteration."""
+
+    lin: vec3  # change of the base's linear velocity [m/s]
+    ang: vec3  # change of its angular velocity [rad/s]
+    change: real  # largest velocity change of the last sweep [m/s]
+    sweeps: int
+
+
+@wp.func
+def sweep_contacts(contacts: wp.array(dtype=PawContact), block: BlockLaw, state: ContactState) -> ContactState:
+    """Run one Gauss-Seidel sweep over the active paws, updating their impulses in place."""
+    s = state
+    s.change = real(0.0)
+    s.sweeps = state.sweeps + 1
+    for k in range(contacts.shape[0]):
+        if contacts[k].active != 0:
+            c = contacts[k]
+            velocity = c.free + c.from_lin * s.lin + c.from_ang * s.ang + c.own * c.impulse
+            if c.on_block != 0:
+                velocity -= block_velocity(block, contacts)
+            impulse = local_impulse(c, c.impulse, velocity)
+            step = impulse - c.impulse
+            contacts[k].impulse = impulse
+            s.lin += c.to_lin * step
+            s.ang += c.to_ang * step
+            s.change = wp.max(s.change, wp.length(c.total * step))
+    return s
+
+
+@wp.func
+def solve_contacts(
+    contacts: wp.array(dtype=PawContact), block: BlockLaw, max_sweeps: int, tolerance: real
+) -> ContactState:
+    """Solve the contact problem from the impulses in `contacts`; returns the change of base twist and the residual.
+
+    Stops when a sweep changes no contact velocity by more than `tolerance` [m/s].
+    """
+    state = ContactState()
+    for k in range(contacts.shape[0]):
+        if contacts[k].active != 0:
+            state.lin += contacts[k].to_lin * contacts[k].impulse
+            state.ang += contacts[k].to_ang * contacts[k].impulse
+    state.change = real(2.0) * tolerance + real(1.0)
+    while state.sweeps < max_sweeps and state.change > tolerance:
+        state = sweep_contacts(contacts, block, state)
+    return state
+
+
+@wp.func
+def contact_mode(impulse: vec3, normal: vec3, mu: real) -> int:
+    """Return SEPARATE, STICK or SLIDE for a solved impulse."""
+    size = wp.dot(impulse, normal)
+    if size <= real(0.0):
+        return SEPARATE
+    tangential = wp.length(impulse - size * normal)
+    if tangential < mu * size * real(0.9999):
+        return STICK
+    return SLIDE

@@ -1,0 +1,117 @@
+"""Mass properties: zeroth, first and second moments of a mass distribution.
+
+Second moments are kept as S = integral of r r^T dm about a stated point, packed (xx, yy, zz, xy, xz, yz): they add up
+without case distinctions, and the inertia tensor is trace(S) 1 - S.
+"""
+
+import warp as wp
+
+from ..scalar import mat33, real, vec3, vec6
+
+
+@wp.struct
+class MassMoments:
+    """Moments of one or more links about a point and in axes that the context names."""
+
+    mass: real  # [kg]
+    first: vec3  # [kg m]
+    second: vec6  # [kg m^2], xx yy zz xy xz yz
+
+
+@wp.func
+def trace(s: vec6) -> real:
+    """Return the trace of packed second moments."""
+    return s[0] + s[1] + s[2]
+
+
+@wp.func
+def mul(s: vec6, v: vec3) -> vec3:
+    """Return S v for packed second moments."""
+    return vec3(
+        s[0] * v[0] + s[3] * v[1] + s[4] * v[2],
+        s[3] * v[0] + s[1] * v[1] + s[5] * v[2],
+        s[4] * v[0] + s[5] * v[1] + s[2] * v[2],
+    )
+
+
+@wp.func
+def inertia_mul(s: vec6, v: vec3) -> vec3:
+    """Return I v for the inertia tensor of packed second moments."""
+    return trace(s) * v - mul(s, v)
+
+
+@wp.func
+def inertia_matrix(s: vec6) -> mat33:
+    """Return the inertia tensor [kg m^2] of packed second moments."""
+    return mat33(
+        s[1] + s[2], -s[3], -s[4],
+        -s[3], s[0] + s[2], -s[5],
+        -s[4], -s[5], s[0] + s[1],
+    )  # fmt: skip
+
+
+@wp.func
+def sym_outer(a: vec3, b: vec3) -> vec6:
+    """Return a b^T + b a^T, packed."""
+    two = real(2.0)
+    return vec6(
+        two * a[0] * b[0],
+        two * a[1] * b[1],
+        two * a[2] * b[2],
+        a[0] * b[1] + a[1] * b[0],
+        a[0] * b[2] + a[2] * b[0],
+        a[1] * b[2] + a[2] * b[1],
+    )
+
+
+@wp.func
+def rotate_y(v: vec3, c: real, s: real) -> vec3:
+    """Return v turned about y by the angle with cosine c and sine s."""
+    return vec3(c * v[0] + s * v[2], v[1], c * v[2] - s * v[0])
+
+
+@wp.func
+def rotate_y_second(m: vec6, c: real, s: real) -> vec6:
+    """Return packed second moments turned about y."""
+    cc = c * c
+    ss = s * s
+    cs = c * s
+    cross = real(2.0) * cs * m[4]
+    return vec6(
+        cc * m[0] + cross + ss * m[2],
+        m[1],
+        ss * m[0] - cross + cc * m[2],
+        c * m[3] + s * m[5],
+        cs * (m[2] - m[0]) + (cc - ss) * m[4],
+        c * m[5] - s * m[3],
+    )
+
+
+@wp.func
+def rotate_x(v: vec3, c: real, s: real) -> vec3:
+    """Return v turned about x by the angle with cosine c and sine s."""
+    return vec3(v[0], c * v[1] - s * v[2], s * v[1] + c * v[2])
+
+
+@wp.func
+def rotate_x_second(m: vec6, c: real, s: real) -> vec6:
+    """Return packed second moments turned about x."""
+    cc = c * c
+    ss = s * s
+    cs = c * s
+    cross = real(2.0) * cs * m[5]
+    return vec6(
+        m[0],
+        cc * m[1] - cross + ss * m[2],
+        ss * m[1] + cross + cc * m[2],
+        c * m[3] - s * m[4],
+        s * m[3] + c * m[4],
+        cs * (m[1] - m[2]) + (cc - ss) * m[5],
+    )
+
+
+@wp.func
+def skew(v: vec3) -> mat33:
+    """Return [v]x, with [v]x u = v x u."""
+    zero = real(0.0)
+    return mat33(zero, -v[2], v[1], v[2], zero, -v[0], -v[1], v[0], zero)

@@ -1,0 +1,177 @@
+"""The time step: motors, dynamics, contact and integration of one world, many steps in one launch.
+
+One thread advances one world; everything between the first load and the last store stays in registers and the first
+cache level. Semi-implicit Euler: forces and Jacobians at the start of the step, positions moved with the velocities
+at its end.
+"""
+
+import warp as wp
+
+from ..actuation.joint_forces import joint_forces
+from ..actuation.motors import MotorArrays, load_motor, motor_torque
+from ..kinematics.geometry import LegGeometry
+from ..layout import BASE, GRAVITY, LEG_ROWS, MU_DYNAMIC, MU_STATIC
+from ..scalar import real, vec3
+from ..state import BaseState, base_com
+from ..terrain.ground import Ground, block_distance, block_normal, floor_distance, floor_normal
+from .base_dynamics import (
+    BaseInverse,
+    BaseSystem,
+    LegSolve,
+    add_leg,
+    base_alone,
+    eliminate_leg,
+)
+from .base_motion import external_wrench
+from .contact import (
+    CONTACT_MARGIN,
+    STICK_SPEED,
+    BlockLaw,
+    PawContact,
+    contact_jacobian,
+    couple_contact,
+    goal_velocity,
+)
+from .leg_dynamics import PawKinematics, leg_dynamics, leg_five_bar, paw_kinematics
+from .parameters import load_joint_params, load_masses, load_moments
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.struct
+class Robot:
+    """What the step reads of the robot and the ground, besides its state."""
+
+    geometry: wp.array(dtype=LegGeometry)  # (4,)
+    table: wp.array2d(dtype=real)  # parameters, see `parameters`
+    ground: Ground
+
+
+@wp.struct
+class StepSettings:
+    """Numerical settings of the step."""
+
+    dt: real  # [s]
+    substeps: int
+    max_sweeps: int
+    tolerance: real  # [m/s], of the contact iteration
+
+
+@wp.func
+def leg_terms(
+    robot: Robot, world: int, k: int, angles: vec3, rates: vec3, torque: vec3, omega: vec3, g: vec3, dt: real,
+    system: BaseSystem, legs: wp.array(dtype=LegSolve), paws: wp.array(dtype=PawKinematics),
+) -> BaseSystem:  # fmt: skip
+    """Eliminate leg k and add it to the base's system; its solution and paw go to `legs` and `paws`."""
+    geo = robot.geometry[k]
+    loop = leg_five_bar(geo, angles)
+    dynamics = leg_dynamics(geo, load_masses(robot.table, k, world), loop, angles, rates, omega, g)
+    params = load_joint_params(robot.table, k, world)
+    passive = joint_forces(params, loop, geo.front, angles, rates, dt)
+    solve = eliminate_leg(dynamics, passive.inertia + wp.diag(params.armature), torque + passive.torque)
+    legs[k] = solve
+    paws[k] = paw_kinematics(geo, loop, wp.cos(angles[0]), geo.side * wp.sin(angles[0]))
+    return add_leg(system, dynamics, solve)
+
+
+@wp.struct
+class Touch:
+    """The nearest point of a surface to a paw."""
+
+    gap: real  # [m] between surface and paw
+    normal: vec3  # body axes
+    velocity: vec3  # of the surface [m/s], body axes
+
+
+@wp.func
+def block_law(robot: Robot, world: int, base: BaseState, dt: real) -> BlockLaw:
+    """Return the law of a world's block in body axes; a block without mass where there is none."""
+    law = BlockLaw()
+    if robot.ground.blocks.shape[0] > 0:
+        block = robot.ground.blocks[world]
+        law.velocity = wp.quat_rotate_inv(base.quat, vec3(block.velocity[0], block.velocity[1], real(0.0)))
+        law.up = wp.quat_rotate_inv(base.quat, vec3(real(0.0), real(0.0), real(1.0)))
+        law.mass = block.mass
+        law.friction = block.friction
+        law.weight = -dt * block.mass * robot.table[GRAVITY + 2, world]
+    return law
+
+
+@wp.func
+def touch_floor(robot: Robot, k: int, base: BaseState, paw: PawKinematics) -> Touch:
+    """Return where paw k is nearest to the floor."""
+    centre = base.pos + wp.quat_rotate(base.quat, paw.position)
+    touch = Touch()
+    touch.gap = floor_distance(robot.ground, centre) - robot.geometry[k].paw_radius
+    touch.normal = wp.quat_rotate_inv(base.quat, floor_normal(robot.ground, centre))
+    return touch
+
+
+@wp.func
+def touch_block(robot: Robot, world: int, k: int, base: BaseState, paw: PawKinematics, law: BlockLaw) -> Touch:
+    """Return where paw k is nearest to the block."""
+    centre = base.pos + wp.quat_rotate(base.quat, paw.position)
+    block = robot.ground.blocks[world]
+    touch = Touch()
+    touch.gap = block_distance(block, centre) - robot.geometry[k].paw_radius
+    touch.normal = wp.quat_rotate_inv(base.quat, block_normal(block, centre))
+    touch.velocity = law.velocity
+    return touch
+
+
+@wp.func
+def paw_contact(
+    robot: Robot, world: int, k: int, base: BaseState, lin: vec3, ang: vec3, rates: vec3, old_rates: vec3,
+    impulse: vec3, paw: PawKinematics, leg: LegSolve, inverse: BaseInverse, touch: Touch, dt: real,
+) -> PawContact:  # fmt: skip
+    """Return paw k's contact problem with a surface.
+
+    lin, ang, rates: base twist (body axes) and motor rates at the end of the step without contact; old_rates and
+    `base`: at its start; impulse: first guess [N s], world frame.
+    """
+    contact = PawContact()
+    gap = touch.gap
+    normal = touch.normal
+    arm = -robot.geometry[k].paw_radius * normal
+    point = paw.position + arm
+    contact.jacobian = contact_jacobian(paw, arm)
+    contact.normal = normal
+    contact.free = lin + wp.cross(ang, point) + contact.jacobian * rates
+    if gap + dt * wp.min(wp.dot(contact.free - touch.velocity, normal), real(0.0)) > CONTACT_MARGIN:
+        return contact
+    contact.active = 1
+    contact.goal = goal_velocity(gap, dt)
+    contact.impulse = wp.quat_rotate_inv(base.quat, impulse)
+    before = wp.quat_rotate_inv(base.quat, base.lin) + wp.cross(base.ang, point) + contact.jacobian * old_rates
+    slip = before - touch.velocity
+    slip -= wp.dot(slip, normal) * normal
+    contact.mu_row = k * LEG_ROWS + MU_DYNAMIC
+    if wp.dot(slip, slip) < STICK_SPEED * STICK_SPEED and wp.dot(contact.impulse, normal) > real(0.0):
+        contact.mu_row = k * LEG_ROWS + MU_STATIC
+    contact.mu = robot.table[contact.mu_row, world]
+    return couple_contact(contact, point, leg, inverse)
+
+
+@wp.func
+def base_system(robot: Robot, world: int, base: BaseState, g: vec3, force: vec3, moment: vec3) -> BaseSystem:
+    """Return the base link's own equations; force [N] and moment [N m] from outside at its com, world axes."""
+    wrench = external_wrench(base, base_com(robot.table, world), force, moment)
+    return base_alone(load_moments(robot.table, BASE, world), base.ang, g, wrench.force, wrench.moment)
+
+
+@wp.func
+def finite_base(base: BaseState) -> bool:
+    """Return whether a base state holds finite values only."""
+    q = base.quat
+    total = wp.dot(base.pos, base.pos) + wp.dot(base.lin, base.lin) + wp.dot(base.ang, base.ang)
+    return wp.isfinite(total + q[0] + q[1] + q[2] + q[3])
+
+
+@wp.func
+def drive_torque(motors: MotorArrays, k: int, world: int, target: vec3, angles: vec3, rates: vec3) -> vec3:
+    """Return the torques [N m] of leg k's motors for targets, angles [rad] and rates [rad/s]."""
+    return vec3(
+        motor_torque(target[0], angles[0], rates[0], load_motor(motors, 3 * k, world)),
+        motor_torque(target[1], angles[1], rates[1], load_motor(motors, 3 * k + 1, world)),
+        motor_torque(target[2], angles[2], rates[2], load_motor(motors, 3 * k + 2, world)),
+    )

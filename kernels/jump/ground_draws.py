@@ -1,0 +1,98 @@
+"""Draws of the ground that an episode begins on: level, off a platform, or onto a block that may slide."""
+
+import warp as wp
+
+from ..scalar import real, vec2
+from ..terrain.ground import Block
+from .reset_draws import ResetRanges, between, within
+
+wp.set_module_options({"enable_backward": False})
+
+EVERY_SIDE = wp.constant(0.05)  # [m] between the paws' centres and an edge, at least
+DEFAULT_PAWS = wp.constant(wp.vec2(0.24, 0.2102))  # [m] from the base, ahead and beside, in the default pose
+
+
+@wp.struct
+class GroundRanges:
+    """Shares of standing starts, and ranges of what they stand on or jump to; pairs are (lower, upper)."""
+
+    platform: float  # share
+    block: float  # share
+    drop: wp.vec2  # [m] height of the platform
+    rise: wp.vec2  # [m] height of the block
+    room: float  # [m] most between the paws and an edge, but for a block's near side
+    clearance: float  # [m] least between an edge and the place of the paws at the goal
+    mass: wp.vec2  # [kg] of the block
+    friction: wp.vec2  # of block and floor [1]
+
+
+@wp.func
+def footprint(ranges: ResetRanges, heading: float) -> wp.vec2:
+    """Return the half extents [m] along world x and y of the rectangle that the paws' centres fill."""
+    half_length = wp.max(wp.max(ranges.front_x[1], ranges.back_x[1]), DEFAULT_PAWS[0])
+    half_width = wp.max(wp.max(ranges.front_y[1], ranges.back_y[1]), DEFAULT_PAWS[1])
+    c = wp.abs(wp.cos(heading))
+    s = wp.abs(wp.sin(heading))
+    return wp.vec2(c * half_length + s * half_width, s * half_length + c * half_width)
+
+
+@wp.func
+def fixed_block(center: wp.vec2, half: wp.vec2, height: float) -> Block:
+    """Return a block that is too heavy to slide; lengths [m]."""
+    block = Block()
+    block.exists = 1
+    block.start = vec2(real(center[0]), real(center[1]))
+    block.center = block.start
+    block.half = vec2(real(half[0]), real(half[1]))
+    block.height = real(height)
+    block.mass = real(1.0e6)
+    block.friction = real(1.0)
+    return block
+
+
+@wp.func
+def draw_platform(state: wp.uint32, ranges: GroundRanges, foot: wp.vec2, goal: wp.vec3) -> Block:
+    """Return a platform under a robot at the origin; none if its paws could not land beside it."""
+    half = foot + wp.vec2(
+        between(state, 61, EVERY_SIDE, ranges.room),
+        between(state, 62, EVERY_SIDE, ranges.room),
+    )
+    beyond = wp.vec2(wp.abs(goal[0]), wp.abs(goal[1])) - half - foot
+    if wp.max(beyond) < ranges.clearance:
+        return Block()
+    return fixed_block(wp.vec2(0.0), half, within(state, 63, ranges.drop))
+
+
+@wp.func
+def draw_block(state: wp.uint32, ranges: GroundRanges, foot: wp.vec2, goal: wp.vec3) -> Block:
+    """Return a block under the goal; none without room for its near side between the paws before and after the jump.
+
+    The near side is anywhere there, across the axis along which the goal is farther.
+    """
+    along = wp.where(wp.abs(goal[0]) >= wp.abs(goal[1]), 0, 1)
+    way = wp.abs(goal[along])
+    nearest = foot[along] + EVERY_SIDE
+    farthest = way - foot[along] - ranges.clearance
+    if nearest > farthest:
+        return Block()
+    near = between(state, 61, nearest, farthest)
+    far = way + foot[along] + between(state, 62, EVERY_SIDE, ranges.room)
+    center = wp.vec2(goal[0], goal[1])
+    center[along] = wp.sign(goal[along]) * 0.5 * (near + far)
+    half = foot + wp.vec2(between(state, 64, EVERY_SIDE, ranges.room))
+    half[along] = 0.5 * (far - near)
+    block = fixed_block(center, half, within(state, 63, ranges.rise))
+    block.mass = real(within(state, 65, ranges.mass))
+    block.friction = real(within(state, 66, ranges.friction))
+    return block
+
+
+@wp.func
+def draw_ground(state: wp.uint32, ranges: GroundRanges, foot: wp.vec2, goal: wp.vec3) -> Block:
+    """Return the block of a standing start at the origin with a goal [m], world axes; mostly there is none."""
+    u = between(state, 60, 0.0, 1.0)
+    if u < ranges.platform:
+        return draw_platform(state, ranges, foot, goal)
+    if u < ranges.platform + ranges.block:
+        return draw_block(state, ranges, foot, goal)
+    return Block()

@@ -1,0 +1,137 @@
+"""The planar five-bar loop of one leg: position, velocity and bias acceleration in closed form.
+
+All points are (x, z) [m] in the motor housing frame. The two thighs turn about the transversal axes; a positive
+motor angle moves the thigh tip away from its twin. The loop constraint (paper, Eq. 1) is met by construction: the
+ankle is the intersection of the two shank circles, on the branch below the knees.
+
+Rotation angles of links are counted about housing +y, from a link that hangs along -z.
+"""
+
+import warp as wp
+
+from ..scalar import real, vec2, vec3
+from .geometry import LegGeometry
+
+
+@wp.struct
+class FiveBar:
+    """Configuration of the loop and its first derivatives with respect to the outer and inner motor angles."""
+
+    outer_knee: vec2  # [m]
+    inner_knee: vec2  # [m]
+    ankle: vec2  # [m]
+    outer_shank: vec2  # unit vector, outer knee to ankle
+    inner_shank: vec2  # unit vector, inner knee to ankle
+    outer_knee_do: vec2  # [m/rad] d outer_knee / d outer angle
+    inner_knee_di: vec2  # [m/rad] d inner_knee / d inner angle
+    ankle_do: vec2  # [m/rad] d ankle / d outer angle
+    ankle_di: vec2  # [m/rad] d ankle / d inner angle
+    outer_shank_do: real  # [1] d (rotation of the outer shank) / d outer angle
+    outer_shank_di: real
+    inner_shank_do: real
+    inner_shank_di: real
+
+
+@wp.struct
+class FiveBarBias:
+    """Rates of the loop, and its accelerations while the motor accelerations are zero."""
+
+    outer_thigh_rate: real  # [rad/s] about +y
+    inner_thigh_rate: real
+    outer_shank_rate: real
+    inner_shank_rate: real
+    outer_knee_acc: vec2  # [m/s^2]
+    inner_knee_acc: vec2
+    ankle_acc: vec2
+    outer_shank_acc: real  # [rad/s^2] about +y
+    inner_shank_acc: real
+
+
+@wp.func
+def turn_rate(direction: vec2, velocity: vec2, length: real) -> real:
+    """Return the rate about +y [rad/s] of a link whose far end moves at `velocity` relative to its near end."""
+    return (direction[1] * velocity[0] - direction[0] * velocity[1]) / length
+
+
+@wp.func
+def meet_projections(a: vec2, b: vec2, along_a: real, along_b: real) -> vec2:
+    """Return the vector x with a.x = along_a and b.x = along_b, for unit vectors a and b."""
+    det = a[0] * b[1] - a[1] * b[0]
+    # the shanks are parallel only where the knees coincide: keep the division finite there
+    if wp.abs(det) < real(1.0e-4):
+        det = wp.where(det < real(0.0), real(-1.0e-4), real(1.0e-4))
+    return vec2(along_a * b[1] - along_b * a[1], along_b * a[0] - along_a * b[0]) / det
+
+
+@wp.func
+def five_bar(geo: LegGeometry, outer: real, inner: real) -> FiveBar:
+    """Return the loop's configuration and derivatives for motor angles `outer` and `inner` [rad]."""
+    f = geo.front
+    loop = FiveBar()
+    outer_sin, outer_cos = wp.sin(outer), wp.cos(outer)
+    inner_sin, inner_cos = wp.sin(inner), wp.cos(inner)
+    outer_knee = vec2(geo.outer_x + f * geo.thigh * outer_sin, -geo.thigh * outer_cos)
+    inner_knee = vec2(geo.inner_x - f * geo.thigh * inner_sin, -geo.thigh * inner_cos)
+    outer_knee_do = vec2(f * geo.thigh * outer_cos, geo.thigh * outer_sin)
+    inner_knee_di = vec2(-f * geo.thigh * inner_cos, geo.thigh * inner_sin)
+
+    span = outer_knee - inner_knee
+    span_sq = wp.max(wp.dot(span, span), real(1.0e-8))
+    height_sq = wp.max(geo.shank * geo.shank - real(0.25) * span_sq, real(1.0e-8))
+    ankle = real(0.5) * (outer_knee + inner_knee) + f * wp.sqrt(height_sq / span_sq) * vec2(span[1], -span[0])
+    outer_shank = (ankle - outer_knee) / geo.shank
+    inner_shank = (ankle - inner_knee) / geo.shank
+    ankle_do = meet_projections(outer_shank, inner_shank, wp.dot(outer_shank, outer_knee_do), real(0.0))
+    ankle_di = meet_projections(outer_shank, inner_shank, real(0.0), wp.dot(inner_shank, inner_knee_di))
+
+    loop.outer_knee = outer_knee
+    loop.inner_knee = inner_knee
+    loop.ankle = ankle
+    loop.outer_shank = outer_shank
+    loop.inner_shank = inner_shank
+    loop.outer_knee_do = outer_knee_do
+    loop.inner_knee_di = inner_knee_di
+    loop.ankle_do = ankle_do
+    loop.ankle_di = ankle_di
+    loop.outer_shank_do = turn_rate(outer_shank, ankle_do - outer_knee_do, geo.shank)
+    loop.outer_shank_di = turn_rate(outer_shank, ankle_di, geo.shank)
+    loop.inner_shank_do = turn_rate(inner_shank, ankle_do, geo.shank)
+    loop.inner_shank_di = turn_rate(inner_shank, ankle_di - inner_knee_di, geo.shank)
+    return loop
+
+
+@wp.func
+def five_bar_bias(geo: LegGeometry, loop: FiveBar, outer_rate: real, inner_rate: real) -> FiveBarBias:
+    """Return the loop's rates and velocity-product accelerations for motor rates [rad/s]."""
+    f = geo.front
+    bias = FiveBarBias()
+    outer_knee_vel = outer_rate * loop.outer_knee_do
+    inner_knee_vel = inner_rate * loop.inner_knee_di
+    ankle_vel = outer_rate * loop.ankle_do + inner_rate * loop.ankle_di
+    # circular motion of the knees about the transversal axes
+    outer_knee_acc = outer_rate * outer_rate * (vec2(geo.outer_x, real(0.0)) - loop.outer_knee)
+    inner_knee_acc = inner_rate * inner_rate * (vec2(geo.inner_x, real(0.0)) - loop.inner_knee)
+    outer_rel = ankle_vel - outer_knee_vel
+    inner_rel = ankle_vel - inner_knee_vel
+    ankle_acc = meet_projections(
+        loop.outer_shank,
+        loop.inner_shank,
+        wp.dot(loop.outer_shank, outer_knee_acc) - wp.dot(outer_rel, outer_rel) / geo.shank,
+        wp.dot(loop.inner_shank, inner_knee_acc) - wp.dot(inner_rel, inner_rel) / geo.shank,
+    )
+    bias.outer_thigh_rate = -f * outer_rate
+    bias.inner_thigh_rate = f * inner_rate
+    bias.outer_shank_rate = loop.outer_shank_do * outer_rate + loop.outer_shank_di * inner_rate
+    bias.inner_shank_rate = loop.inner_shank_do * outer_rate + loop.inner_shank_di * inner_rate
+    bias.outer_knee_acc = outer_knee_acc
+    bias.inner_knee_acc = inner_knee_acc
+    bias.ankle_acc = ankle_acc
+    bias.outer_shank_acc = turn_rate(loop.outer_shank, ankle_acc - outer_knee_acc, geo.shank)
+    bias.inner_shank_acc = turn_rate(loop.inner_shank, ankle_acc - inner_knee_acc, geo.shank)
+    return bias
+
+
+@wp.func
+def in_plane(p: vec2, y: real) -> vec3:
+    """Return a point of the five-bar plane as a vector of the housing frame."""
+    return vec3(p[0], y, p[1])

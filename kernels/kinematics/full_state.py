@@ -1,0 +1,153 @@
+"""From the 18 coordinates to everything else that a Newton state holds: passive joints, loop joints, all bodies."""
+
+import warp as wp
+
+from ..layout import BODIES, LEG_BODIES
+from ..scalar import quat, real, vec2, vec3
+from ..state import BaseState, leg_coord, leg_dof, load_base, load_motors
+from .five_bar import five_bar, five_bar_bias, in_plane
+from .geometry import LegGeometry
+
+
+@wp.struct
+class Frame:
+    """Pose and velocity of a link frame's origin in the world."""
+
+    pos: vec3  # [m]
+    quat: quat  # xyzw
+    lin: vec3  # [m/s], of the origin
+    ang: vec3  # [rad/s]
+
+
+@wp.func
+def rotation_x(angle: real) -> quat:
+    """Return a rotation about x [rad]."""
+    return quat(wp.sin(real(0.5) * angle), real(0.0), real(0.0), wp.cos(real(0.5) * angle))
+
+
+@wp.func
+def rotation_y(angle: real) -> quat:
+    """Return a rotation about y [rad]."""
+    return quat(real(0.0), wp.sin(real(0.5) * angle), real(0.0), wp.cos(real(0.5) * angle))
+
+
+@wp.func
+def shank_angle(direction: vec2) -> real:
+    """Return the rotation about y [rad] of a shank along `direction` (x, z)."""
+    return wp.atan2(-direction[0], -direction[1])
+
+
+@wp.func
+def housing_frame(base: BaseState, geo: LegGeometry, angle: real, rate: real) -> Frame:
+    """Return the motor housing's frame for the lateral motor's angle [rad] and rate [rad/s]."""
+    frame = Frame()
+    arm = wp.quat_rotate(base.quat, geo.hip)
+    ang = wp.quat_rotate(base.quat, base.ang)
+    frame.pos = base.pos + arm
+    frame.lin = base.lin + wp.cross(ang, arm)
+    frame.quat = base.quat * rotation_x(geo.side * angle)
+    frame.ang = ang + wp.quat_rotate(base.quat, vec3(geo.side * rate, real(0.0), real(0.0)))
+    return frame
+
+
+@wp.func
+def link_frame(housing: Frame, origin: vec3, velocity: vec3, angle: real, rate: real) -> Frame:
+    """Return the frame of a link of the five-bar plane.
+
+    origin [m], velocity [m/s]: of its origin in the housing frame; angle [rad], rate [rad/s]: about housing y.
+    """
+    frame = Frame()
+    arm = wp.quat_rotate(housing.quat, origin)
+    frame.pos = housing.pos + arm
+    frame.lin = housing.lin + wp.cross(housing.ang, arm) + wp.quat_rotate(housing.quat, velocity)
+    frame.quat = housing.quat * rotation_y(angle)
+    frame.ang = housing.ang + wp.quat_rotate(housing.quat, vec3(real(0.0), rate, real(0.0)))
+    return frame
+
+
+@wp.func
+def store_body(
+    frame: Frame,
+    body: int,
+    body_com: wp.array(dtype=wp.vec3),
+    body_q: wp.array(dtype=wp.transform),
+    body_qd: wp.array(dtype=wp.spatial_vector),
+):
+    """Write a body's pose, and its velocity at the centre of mass."""
+    com = body_com[body]
+    lin = frame.lin + wp.cross(frame.ang, wp.quat_rotate(frame.quat, vec3(real(com[0]), real(com[1]), real(com[2]))))
+    body_q[body] = wp.transform(
+        wp.vec3(float(frame.pos[0]), float(frame.pos[1]), float(frame.pos[2])),
+        wp.quat(float(frame.quat[0]), float(frame.quat[1]), float(frame.quat[2]), float(frame.quat[3])),
+    )
+    body_qd[body] = wp.spatial_vector(
+        float(lin[0]), float(lin[1]), float(lin[2]), float(frame.ang[0]), float(frame.ang[1]), float(frame.ang[2])
+    )
+
+
+@wp.kernel
+def full_state_kernel(
+    # in
+    geometry: wp.array(dtype=LegGeometry),
+    body_com: wp.array(dtype=wp.vec3),
+    # in, out
+    joint_q: wp.array(dtype=real),
+    joint_qd: wp.array(dtype=real),
+    # out
+    body_q: wp.array(dtype=wp.transform),
+    body_qd: wp.array(dtype=wp.spatial_vector),
+):
+    """Write knees, loop joints and bodies from the base and motor coordinates; one thread per (world, leg)."""
+    world, k = wp.tid()
+    zero = real(0.0)
+    geo = geometry[k]
+    com = body_com[world * BODIES]
+    base = load_base(joint_q, joint_qd, vec3(real(com[0]), real(com[1]), real(com[2])), world)
+    coord = leg_coord(world, k)
+    dof = leg_dof(world, k)
+    angles = load_motors(joint_q, coord)
+    rates = load_motors(joint_qd, dof)
+    loop = five_bar(geo, angles[1], angles[2])
+    bias = five_bar_bias(geo, loop, rates[1], rates[2])
+    outer = shank_angle(loop.outer_shank)
+    inner = shank_angle(loop.inner_shank)
+    outer_thigh = -geo.front * angles[1]
+    inner_thigh = geo.front * angles[2]
+
+    joint_q[coord + 2] = geo.front * (outer - outer_thigh)
+    joint_q[coord + 4] = -geo.front * (inner - inner_thigh)
+    joint_qd[dof + 2] = geo.front * (bias.outer_shank_rate - bias.outer_thigh_rate)
+    joint_qd[dof + 4] = -geo.front * (bias.inner_shank_rate - bias.inner_thigh_rate)
+    across = rotation_y(outer - inner)
+    # behind the 27 tree coordinates and 26 tree rates of the world
+    loop_coord = coord + 20 - k
+    loop_dof = dof + 20 - 2 * k
+    for i in range(4):
+        joint_q[loop_coord + i] = across[i]
+    joint_qd[loop_dof] = zero
+    joint_qd[loop_dof + 1] = bias.outer_shank_rate - bias.inner_shank_rate
+    joint_qd[loop_dof + 2] = zero
+
+    if k == 0:
+        frame = Frame()
+        frame.pos = base.pos
+        frame.quat = base.quat
+        frame.lin = base.lin
+        frame.ang = wp.quat_rotate(base.quat, base.ang)
+        store_body(frame, world * BODIES, body_com, body_q, body_qd)
+    y = geo.plane_y + geo.knee_y
+    outer_axis = vec3(geo.outer_x, geo.plane_y, zero)
+    inner_axis = vec3(geo.inner_x, geo.plane_y, zero)
+    outer_vel = in_plane(rates[1] * loop.outer_knee_do, zero)
+    inner_vel = in_plane(rates[2] * loop.inner_knee_di, zero)
+    body = world * BODIES + 1 + LEG_BODIES * k
+    housing = housing_frame(base, geo, angles[0], rates[0])
+    f1 = link_frame(housing, outer_axis, vec3(zero), outer_thigh, bias.outer_thigh_rate)
+    f2 = link_frame(housing, in_plane(loop.outer_knee, y), outer_vel, outer, bias.outer_shank_rate)
+    f3 = link_frame(housing, inner_axis, vec3(zero), inner_thigh, bias.inner_thigh_rate)
+    f4 = link_frame(housing, in_plane(loop.inner_knee, y), inner_vel, inner, bias.inner_shank_rate)
+    store_body(housing, body, body_com, body_q, body_qd)
+    store_body(f1, body + 1, body_com, body_q, body_qd)
+    store_body(f2, body + 2, body_com, body_q, body_qd)
+    store_body(f3, body + 3, body_com, body_q, body_qd)
+    store_body(f4, body + 4, body_com, body_q, body_qd)

@@ -1,0 +1,25 @@
+"""Geometry of one leg, as the kernels read it."""
+
+import warp as wp
+
+from ..scalar import real, vec3
+
+
+@wp.struct
+class LegGeometry:
+    """Constants of one leg, in the body frame (x forward, y left, z up) and the motor housing frame.
+
+    The housing frame has its origin on the lateral motor's axis (the hip), x along body x, and turns about x with
+    the lateral motor. The five-bar loop lies in the housing's x-z plane, at `plane_y`.
+    """
+
+    hip: vec3  # [m] lateral axis in the body frame
+    front: real  # +1 front leg, -1 back leg
+    side: real  # +1 left leg, -1 right leg
+    outer_x: real  # [m] outer transversal axis, housing x
+    inner_x: real  # [m] inner transversal axis, housing x
+    plane_y: real  # [m] both transversal axes, housing y
+    knee_y: real  # [m] offset of knees, ankle and paw from the thigh plane, along housing y
+    thigh: real  # [m] transversal axis to knee
+    shank: real  # [m] knee to ankle
+    paw_radius: real  # [m] sphere centred at the ankle

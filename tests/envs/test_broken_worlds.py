@@ -1,0 +1,97 @@
+"""Worlds that come apart, and numbers that are not finite: they end the episode and reach nobody."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+import torch
+import warp as wp
+from jump_helpers import edit_coordinates, edit_episodes, make_env, only, rule_names
+
+from jumper_warp.registry import make_task
+from jumper_warp.tasks.cfg import Term
+from kernels.jump import rewards
+from kernels.jump.task import LANDED, JumpTask, RobotView
+
+TASK = make_task("vertical-jump")
+N = 32
+REST = torch.zeros((N, 12))
+
+
+@wp.func
+def poisonous_term(view: RobotView, task: JumpTask, p: wp.vec4) -> float:
+    """Infinity times p0."""
+    return p[0] * wp.inf
+
+
+@pytest.fixture(scope="module")
+def env():
+    """Standing starts, nominal, without noise."""
+    return make_env(N, reset=only("default"))
+
+
+NAN, INF = math.nan, math.inf
+BROKEN = {
+    "position": {"q": {0: NAN}},
+    "height": {"q": {2: INF}},
+    "motor angle": {"q": {8: NAN}},
+    "huge motor angle": {"q": {8: 1.0e30}},
+    "base velocity": {"qd": {1: NAN}},
+    "turning": {"qd": {4: INF}},
+    "motor rate": {"qd": {7: NAN}},
+    "absurd velocity": {"qd": {2: 50.0}},
+    "absurd turning": {"qd": {5: 400.0}},
+    "absurd motor rate": {"qd": {9: 1.0e4}},
+    "finite but huge": {"qd": {0: 1.0e13}},
+}
+
+
+SUCCEEDING = {"phase": LANDED, "phase_steps": 100}
+
+
+@pytest.mark.parametrize(
+    ("case", "episode"),
+    [*((case, {}) for case in BROKEN), ("motor angle", SUCCEEDING), ("absurd velocity", SUCCEEDING)],
+    ids=[*BROKEN, "motor angle at success", "absurd velocity at success"],
+)
+def test_a_world_that_came_apart_ends_at_once_and_touches_no_other(env, case, episode):
+    outcomes = []
+    for broken in (False, True):
+        env._random.assign(np.arange(1, N + 1, dtype=np.uint32))
+        env.reset()
+        edit_episodes(env, command_step=1000)
+        if broken:
+            edit_coordinates(env, 9, **BROKEN[case])
+            edit_episodes(env, 9, **episode)
+        env.step(REST)
+        ended = (rule_names(env)[9], env.reward[9].item(), env.timeout[9].item())
+        outcomes.append([env.obs.clone(), env.final_obs.clone(), env.reward.clone(), env._invalid.numpy().copy()])
+    assert ended == ("came_apart", 0.0, 0.0)
+    others = [world for world in range(N) if world != 9]
+    for whole, harmed in zip(outcomes[0][:3], outcomes[1][:3], strict=True):
+        assert torch.equal(whole[others], harmed[others])
+        assert torch.isfinite(harmed).all()
+    assert outcomes[1][0].abs().max() < 50.0  # a new episode's
+    assert not outcomes[1][3].any()
+
+
+@pytest.mark.parametrize("sign", [1.0, 0.0, -1.0], ids=["infinite", "nan", "minus infinite"])
+def test_a_term_that_is_not_finite_is_named_and_never_rewarded(sign):
+    task = dataclasses.replace(
+        TASK, terms=(Term(rewards.orientation, 1.0, (0.1, 1.0)), Term(poisonous_term, 1.0, (sign,)))
+    )
+    env = make_env(N, task=task)
+    env.step(REST)
+    assert torch.isfinite(env.reward).all() and env.reward.max() <= 1.0 / 60.0
+    assert [n for n, value in env.metrics().items() if not math.isfinite(value)] == ["Episode_Reward/poisonous_term"]
+
+
+@pytest.mark.parametrize("value", [NAN, INF, -INF, 7.0])
+def test_an_action_out_of_bounds_acts_as_one_within(env, value):
+    env.reset()
+    action = REST.clone()
+    action[4, 7] = value
+    env.step(action)
+    assert torch.isfinite(env.obs).all() and env.done[4] == 0.0
+    assert abs(env.obs[4, 36 + 7].item()) == 1.0

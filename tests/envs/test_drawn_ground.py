@@ -1,0 +1,200 @@
+"""When an environment draws the ground of its episodes, and what knows of the ground then."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+import torch
+from jump_helpers import edit_coordinates, edit_episodes, make_env, only
+from simulation_helpers import PAW_RADIUS, paw_centres
+
+from jumper_warp.envs.env import JumpEnv
+from jumper_warp.registry import make_task
+from jumper_warp.robot.grounds import BlockCfg, platform
+from jumper_warp.tasks.cfg import GroundCfg, TaskCfg
+from kernels.jump.task import LANDED, STANCE
+
+N = 16
+REST = torch.zeros((N, 12))
+HALF_SPACE = BlockCfg((5.0, 0.0), half=(4.5, 6.0), height=0.06, mass=1.0e6)
+"""From x = 0.5 m on."""
+
+
+def ground_task(**shares) -> TaskCfg:
+    """Return the horizontal jump with far goals, whose starts have drawn grounds."""
+    task = make_task("horizontal-jump")
+    return dataclasses.replace(task, levels=task.levels[-1:], ground=GroundCfg(**(shares or {"block": 1.0})))
+
+
+def blocks_of(env: JumpEnv) -> np.ndarray:
+    return env._dynamics.robot.ground.blocks.numpy()
+
+
+# ---------------------------------------------------------------- when
+
+
+def test_a_randomised_training_draws_its_ground_from_the_first_reset_on():
+    env = JumpEnv(ground_task(), N, device="cpu")
+    assert not blocks_of(env)["exists"].any() and len(blocks_of(env)) == N
+    env.reset()
+    assert blocks_of(env)["exists"].any()
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        {"randomize": False},
+        {"solver": "mujoco"},
+        {"ground": platform(-0.1)},
+        {"ground": None},
+        {"task": ground_task(block=0.0)},
+        {"task": make_task("vertical-jump")},
+    ],
+    ids=["nominal", "mujoco", "heightfield", "no ground", "no share", "vertical"],
+)
+def test_nothing_is_drawn_otherwise(arguments):
+    env = make_env(2, **({"task": ground_task(), "randomize": True} | arguments))
+    assert not env.drawn_ground.drawn and env.sim.block is None and len(blocks_of(env)) == 0
+
+
+def test_a_block_that_is_given_stays_as_it_is():
+    env = make_env(2, task=ground_task(), randomize=True, block=HALF_SPACE)
+    found = blocks_of(env)
+    assert not env.drawn_ground.drawn and found["exists"].all()
+    np.testing.assert_allclose(found["center"], [HALF_SPACE.center] * 2)
+    np.testing.assert_allclose(found["height"], 0.06)
+
+
+def test_an_evaluation_levels_the_ground_and_a_reset_draws_it_again():
+    env = make_env(N, task=ground_task(platform=0.5, block=0.5), reset=only("default"), randomize=True)
+    assert blocks_of(env)["exists"].any()
+    env.evaluation_reset(np.tile([1.5, 0.0, 0.0], (N, 1)))
+    assert not blocks_of(env)["exists"].any() and not env.task_arrays()["goal_ground"].any()
+    np.testing.assert_allclose(env.sim.joint_q()[:, 2], env.sim.model.joint_q.numpy()[2], atol=1e-6)
+    env.step(REST)
+    assert not blocks_of(env)["exists"].any()
+    env.reset()
+    assert blocks_of(env)["exists"].any()
+
+
+# ---------------------------------------------------------------- evaluations and further jumps
+
+
+def test_an_evaluation_stands_robots_on_the_block_below_them():
+    tops = np.linspace(0.02, 0.2, N)
+    block = BlockCfg((0.1, 0.0), half=(0.5, 0.5), height=tops, mass=1.0e6, friction=1.0)
+    env = make_env(N, task=make_task("horizontal-jump"), block=block)
+    goals = np.tile([0.55, 0.0, 0.0], (N, 1))
+    goals[::2, 0] = 0.65
+    env.evaluation_reset(goals)
+    episodes, height = env.task_arrays(), env.sim.model.joint_q.numpy()[2] + tops
+    for found in (env.sim.joint_q()[:, 2], episodes["start"][:, 2], episodes["max_height"]):
+        np.testing.assert_allclose(found, height, atol=1e-6)
+    # the block ends at x = 0.6 m
+    np.testing.assert_allclose(episodes["goal_ground"], np.where(np.arange(N) % 2, tops, 0.0), atol=1e-6)
+    np.testing.assert_allclose(env.obs[:, 2], env.sim.model.joint_q.numpy()[2], atol=1e-5)
+    for _ in range(20):
+        env.step(REST)
+        assert not env.done.any() and not env._invalid.numpy().any()
+    env._dynamics.full_state(*(getattr(env.sim.state, name) for name in ("joint_q", "joint_qd", "body_q", "body_qd")))
+    np.testing.assert_allclose(paw_centres(env.sim)[..., 2], tops[:, None] + PAW_RADIUS + np.zeros(4), atol=2e-3)
+
+
+def test_an_evaluation_stands_robots_on_the_floor_beside_a_block():
+    env = make_env(2, task=make_task("horizontal-jump"), block=HALF_SPACE)
+    env.evaluation_reset([[0.45, 0.0, 0.0], [0.55, 0.0, 0.0]])
+    np.testing.assert_allclose(env.sim.joint_q()[:, 2], env.sim.model.joint_q.numpy()[2], atol=1e-6)
+    np.testing.assert_allclose(env.task_arrays()["goal_ground"], [0.0, 0.06], atol=1e-6)
+
+
+def test_an_evaluation_knows_the_height_of_uneven_ground_at_its_goals():
+    env = make_env(3, task=make_task("horizontal-jump"), ground=platform(-0.15, edge=0.5))
+    env.evaluation_reset([[0.45, 0.0, 0.0], [0.8, 0.0, 0.0], [0.8, 0.0, 0.0]], headings=np.array([0.0, 0.0, np.pi]))
+    np.testing.assert_allclose(env.task_arrays()["goal_ground"], [0.0, -0.15, 0.0], atol=1e-5)
+
+
+@pytest.fixture
+def landed():
+    """Robots that have landed at x = 0, 0.1, ... m before or on the block."""
+    env = make_env(N, task=make_task("horizontal-jump"), reset=only("default", heading=180.0), block=HALF_SPACE)
+    for world in range(N):
+        edit_coordinates(env, world, q={0: 0.1 * world})
+    edit_episodes(env, phase=LANDED, phase_steps=20, goal=(0.0, 0.0, 0.0), goal_ground=-7.0)
+    return env
+
+
+def on_block(goal: np.ndarray) -> np.ndarray:
+    """Height [m] of the ground at goals."""
+    return np.where(goal[:, 0] > 0.5, 0.06, 0.0)
+
+
+def test_the_next_jump_of_an_evaluation_knows_the_ground_at_its_goal(landed):
+    goals = np.tile([0.75, 0.3, 0.0], (N, 1))
+    landed.next_jump(goals, np.arange(N) > 1)
+    found = landed.task_arrays()
+    assert (found["phase"][2:] == STANCE).all() and (found["phase"][:2] == LANDED).all()
+    np.testing.assert_array_equal(found["goal_ground"][:2], -7.0)
+    np.testing.assert_allclose(found["goal_ground"][2:], on_block(found["goal"])[2:], atol=1e-6)
+    assert len(set(found["goal_ground"][2:])) == 2
+
+
+def test_another_jump_of_an_episode_knows_the_ground_at_its_goal(landed):
+    edit_episodes(landed, again_step=5, level=4)
+    landed._begin(landed._out.done)
+    found = landed.task_arrays()
+    assert (found["phase"] == STANCE).all() and (found["jumps"] == 1).all() and not landed.done.any()
+    np.testing.assert_allclose(found["goal_ground"], on_block(found["goal"]), atol=1e-6)
+    assert len(set(found["goal_ground"])) == 2
+
+
+def test_another_jump_looks_for_its_goal_on_the_block_where_it_is_now(landed):
+    moved = blocks_of(landed)
+    moved["center"][:, 0] += 20.0
+    landed._dynamics.robot.ground.blocks.assign(moved)
+    landed.next_jump(np.tile([0.75, 0.3, 0.0], (N, 1)), np.full(N, True))
+    assert not landed.task_arrays()["goal_ground"].any()
+
+
+# ---------------------------------------------------------------- the configuration
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"platform": -0.1}, "shares must be >= 0 and add up to at most 1, got -0.1, 0.0"),
+        ({"block": -0.1}, "shares must be"),
+        ({"platform": 0.6, "block": 0.5}, "shares must be .* got 0.6, 0.5"),
+        ({"platform": math.nan}, "shares must be"),
+        ({"block": math.nan}, "shares must be"),
+        ({"drop": (0.2, 0.1)}, r"ground drop must be \(lower, upper\), positive and finite, got \(0.2, 0.1\)"),
+        ({"rise": (0.0, 0.1)}, "ground rise must be"),
+        ({"mass": (5.0, math.inf)}, "ground mass must be"),
+        ({"friction": (math.nan, 1.0)}, "ground friction must be"),
+        ({"room": 0.04}, "ground room must be finite and at least 0.05, got 0.04"),
+        ({"room": math.inf}, "ground room must be"),
+        ({"clearance": -0.01}, "ground clearance must be finite and at least 0, got -0.01"),
+        ({"clearance": math.nan}, "ground clearance must be"),
+    ],
+)
+def test_impossible_grounds_are_refused(values, message):
+    with pytest.raises(ValueError, match=message) as caught:
+        GroundCfg(**values)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(("platform_share", "block_share"), [(1.0, 0.0), (0.0, 1.0), (0.5, 0.5)])
+def test_shares_up_to_all_starts_are_taken(platform_share, block_share):
+    assert GroundCfg(platform=platform_share, block=block_share).drawn
+    assert not GroundCfg().drawn
+
+
+def test_settings_reach_the_kernels_by_name():
+    cfg = GroundCfg(
+        platform=0.25, block=0.5, drop=(0.125, 0.25), rise=(0.0625, 0.5), room=0.75, clearance=0.375,
+        mass=(2.0, 4.0), friction=(0.5, 0.625),
+    )  # fmt: skip
+    ranges = cfg.ranges()
+    assert (ranges.platform, ranges.block, ranges.room, ranges.clearance) == (0.25, 0.5, 0.75, 0.375)
+    pairs = (ranges.drop, ranges.rise, ranges.mass, ranges.friction)
+    assert [tuple(pair) for pair in pairs] == [(0.125, 0.25), (0.0625, 0.5), (2.0, 4.0), (0.5, 0.625)]

@@ -1,0 +1,348 @@
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+import torch
+import warp as wp
+from jump_helpers import (
+    edit_coordinates,
+    edit_episodes,
+    make_env,
+    only,
+    random_actions,
+    rule_names,
+)  # fmt: skip
+from jump_oracle import expected_terms, robot_of
+
+from jumper_warp.envs.env import JumpEnv
+from jumper_warp.registry import make_task
+from jumper_warp.tasks.cfg import Rule, TaskCfg, Term
+from kernels.jump import rewards, terminations
+from kernels.jump.task import FLIGHT, LANDED, STANCE, JumpTask, RobotView
+
+TASK = make_task("vertical-jump")
+N = 32
+REST = torch.zeros((N, 12))
+CROUCH = torch.tensor([0.0, 0.6, 0.6] * 4).repeat(N, 1)
+STRETCH = torch.tensor([0.0, -1.0, -1.0] * 4).repeat(N, 1)
+
+
+@wp.func
+def my_own_term(view: RobotView, task: JumpTask, p: wp.vec4) -> float:
+    """Height of the base times p0."""
+    return p[0] * view.pos[2]
+
+
+def stand(env: JumpEnv, **fields) -> None:
+    """Begin episodes in the default pose, and overwrite fields of all of them."""
+    env.reset()
+    edit_episodes(env, **fields)
+
+
+@pytest.fixture(scope="module")
+def env():
+    """Standing starts, nominal, without noise; the tests begin with `stand`."""
+    return make_env(N, reset=only("default"))
+
+
+# ---------------------------------------------------------------- rewards and rules
+
+
+@pytest.fixture(scope="module")
+def rollout():
+    """Logged and expected terms of jumps from all starts, (steps, terms, worlds), with rewards and phases."""
+    env = make_env(64, seed=3)
+    logged, expected, rewarded, phases = [], [], [], []
+    noise = 0.2 * random_actions(64, 150)
+    for step in range(150):
+        action = noise[step] + (CROUCH if step % 75 < 40 else STRETCH)[:1]
+        before = robot_of(env)
+        env.auto_reset = False
+        env.step(action)
+        after = robot_of(env)
+        logged.append(env._out.term_value.numpy().copy())
+        expected.append(expected_terms(TASK, before, after, action.clamp(-1.0, 1.0).numpy().T))
+        rewarded.append(env.reward.clone().numpy())
+        phases.append(after["phase"])
+        done = wp.clone(env._out.done)
+        env._begin(done)
+    return np.array(logged), np.array(expected), np.array(rewarded), np.array(phases)
+
+
+def test_the_rollout_meets_every_phase_and_term(rollout):
+    logged, _, _, phases = rollout
+    assert {int(STANCE), int(FLIGHT), int(LANDED)} == set(np.unique(phases).tolist())
+    paid = {term.name for term, values in zip(TASK.terms, logged.transpose(1, 0, 2), strict=True) if values.any()}
+    assert paid == {term.name for term in TASK.terms}
+
+
+@pytest.mark.parametrize("index", range(len(TASK.terms)), ids=[term.name for term in TASK.terms])
+def test_a_term_is_logged_as_computed_by_hand(rollout, index):
+    logged, expected, _, _ = rollout
+    scale = np.abs(expected[:, index]).max()
+    np.testing.assert_allclose(logged[:, index], expected[:, index], rtol=2e-3, atol=2e-4 * scale)
+
+
+def test_the_reward_is_the_sum_of_the_terms_but_not_negative(rollout):
+    logged, _, rewarded, _ = rollout
+    total = logged.sum(axis=1)
+    np.testing.assert_allclose(rewarded, np.maximum(total, 0.0), rtol=1e-4, atol=1e-4)
+    assert (total < -0.1).any() and (rewarded >= 0.0).all()
+
+
+RULE_CASES = {
+    "success": {"phase": LANDED, "phase_steps": 59, "steps": 5000},  # holds together with too_long
+    "low_base": {},
+    "moved_away": {"start": (0.3, 0.0, 0.3)},
+    "no_jump": {"steps": 180, "command_step": 0},
+    "too_long": {"phase": LANDED, "phase_steps": -2000, "steps": 1199},
+}
+
+
+@pytest.mark.parametrize("rule", RULE_CASES)
+def test_a_rule_ends_the_episode(env, rule):
+    stand(env, command_step=1000)
+    edit_episodes(env, 3, **RULE_CASES[rule])
+    if rule == "low_base":
+        edit_coordinates(env, 3, q={2: 0.05})
+    env.step(REST)
+    assert rule_names(env) == ["" if world != 3 else rule for world in range(N)]
+    assert env.done.tolist() == [float(world == 3) for world in range(N)]
+    assert env.timeout.tolist() == [float(world == 3 and rule in ("success", "too_long")) for world in range(N)]
+
+
+def test_counters_are_means_of_the_episodes_that_ended(env):
+    stand(env, command_step=1000)
+    env.metrics()
+    edit_episodes(env, slice(0, 3), phase=LANDED, phase_steps=59, max_height=0.8, goal=(0.0, 0.0, 0.77))
+    edit_episodes(env, slice(3, 7), steps=200, command_step=0)
+    edit_episodes(env, slice(7, 9), phase=LANDED, phase_steps=59, scheme=4)  # begun just landed: not counted
+    env.step(REST)
+    total = env._out.term_value.numpy().sum(axis=1)
+    figures = env.metrics()
+    assert figures["Metrics/success"] == pytest.approx(3.0 / 7.0)
+    assert figures["Metrics/error_m"] == pytest.approx(0.03, abs=1e-6)
+    assert figures["Episode_Termination/success"] == pytest.approx(5.0 / 9.0)
+    assert figures["Episode_Termination/no_jump"] == pytest.approx(4.0 / 9.0)
+    for term, value in zip(TASK.terms, total, strict=True):
+        assert figures[f"Episode_Reward/{term.name}"] == pytest.approx(value / 9.0, rel=1e-4, abs=1e-6)
+    cleared = env.metrics()
+    assert not any(value for name, value in cleared.items() if not name.startswith("Curriculum"))
+
+
+# ---------------------------------------------------------------- curriculum
+
+
+def finish(env, worlds, success: bool) -> None:
+    """End the episodes of some worlds by success or failure."""
+    wanted = env.task_arrays()["goal"][worlds, 2]
+    landed = {"phase": LANDED, "phase_steps": 59, "max_height": wanted}
+    edit_episodes(env, worlds, **(landed if success else {"phase": STANCE, "steps": 999, "command_step": 0}))
+    env.step(REST)
+    assert env.done[worlds].all()
+
+
+def test_five_successes_in_a_row_raise_the_level(env):
+    stand(env, level=0, streak=0, command_step=1000)
+    for count in range(1, 5):
+        finish(env, [0, 1], True)
+        assert env.task_arrays()["streak"][:2].tolist() == [count] * 2
+    finish(env, [1], False)
+    finish(env, [0, 1], True)
+    arrays = env.task_arrays()
+    assert arrays["level"].tolist() == [1] + [0] * (N - 1)
+    assert arrays["streak"][:3].tolist() == [0, 1, 0]
+
+
+def test_the_level_stays_past_the_last_one(env):
+    last = len(TASK.levels)
+    stand(env, level=last - 1, streak=4, command_step=1000)
+    finish(env, [0], True)
+    assert env.task_arrays()["level"][:2].tolist() == [last, last - 1]
+    edit_episodes(env, [0], streak=4)
+    finish(env, [0], True)
+    assert env.task_arrays()["level"][0] == last
+
+
+@pytest.mark.parametrize("scheme", [2, 3, 4])
+@pytest.mark.parametrize("success", [True, False])
+def test_other_starts_do_not_count_for_the_curriculum(env, scheme, success):
+    stand(env, level=1, streak=3, command_step=1000)
+    edit_episodes(env, [0], scheme=scheme)
+    finish(env, [0], success)
+    assert (env.task_arrays()["level"][0], env.task_arrays()["streak"][0]) == (1, 3)
+
+
+# ---------------------------------------------------------------- beginning anew
+
+
+def twins(**arguments):
+    """Return two equal environments, some steps into equal episodes."""
+    pair = [make_env(N, seed=5, noise=True, randomize=True, **arguments) for _ in range(2)]
+    for action in random_actions(N, 3):
+        for env in pair:
+            env.step(action)
+    return pair
+
+
+def test_a_new_episode_leaves_other_worlds_alone():
+    one, other = twins()
+    edit_episodes(one, 7, phase=LANDED, phase_steps=59)
+    for env in (one, other):
+        env.step(REST)
+    assert one.done[7] == 1.0
+    rest = [world for world in range(N) if world != 7 and other.done[world] == 0.0]
+    assert len(rest) > N // 2
+    for name in ("obs", "final_obs", "reward"):
+        assert torch.equal(getattr(one, name)[rest], getattr(other, name)[rest]), name
+    np.testing.assert_array_equal(one.sim.joint_q()[rest], other.sim.joint_q()[rest])
+    np.testing.assert_array_equal(one.sim.joint_qd()[rest], other.sim.joint_qd()[rest])
+    np.testing.assert_array_equal(one._random.numpy()[rest], other._random.numpy()[rest])
+    assert (one.tasks.numpy()[rest] == other.tasks.numpy()[rest]).all()
+
+
+def test_the_last_observation_of_an_episode_is_kept_beside_the_first_of_the_next():
+    one, other = twins()
+    other.auto_reset = False
+    for env in (one, other):
+        edit_episodes(env, slice(0, 5), phase=LANDED, phase_steps=59)
+        env.step(REST)
+    ended = one.done == 1.0
+    assert ended[:5].all() and not ended.all()
+    assert torch.equal(one.final_obs, other.final_obs)  # of a twin that does not begin anew
+    assert torch.equal(one.obs[~ended], one.final_obs[~ended])
+    assert (one.obs[ended] != one.final_obs[ended]).any(dim=1).all()
+    height = one.sim.joint_q()[:, 2]
+    assert np.abs(one.obs[:, 2].numpy() - height).max() <= 0.005 + 1e-6
+
+
+def test_a_new_episode_forgets_the_old_one():
+    env = make_env(N, reset=only("standing"), seed=2)
+    for action in random_actions(N, 10):
+        env.step(action)
+    edit_episodes(env, phase=LANDED, phase_steps=59, idle_steps=7)
+    env.step(random_actions(N, 1)[0])
+    assert env.done.all()
+    arrays, views = env.task_arrays(), env._views
+    for name in ("steps", "phase", "phase_steps", "idle_steps", "took_off", "touched_down", "at_apex", "apex_passed"):
+        assert not arrays[name].any(), name
+    for name in ("action", "old_action", "old_rate", "torque"):
+        assert not getattr(views, name).numpy().any(), name
+    assert not env.obs[:, -12:].any() and env.final_obs[:, -12:].any()
+    assert not views.paw_force.numpy().any() and not env._impulse.numpy().any()
+    assert not views.old_lin_vel.numpy().any()
+    angles = env.sim.joint_q()[:, 7:27].reshape(N, 4, 5)[:, :, [0, 1, 3]].reshape(N, 12)
+    np.testing.assert_array_equal(views.safe_target.numpy().T, angles)
+
+
+def test_commands_of_a_measurement_may_come_one_by_one(env):
+    delays = np.arange(N) / 120.0  # every other one between two policy steps
+    env.evaluation_reset(np.zeros((N, 3)), command_delay=delays)
+    found = env.task_arrays()["command_step"]
+    np.testing.assert_array_equal(found[::2], np.arange(len(found[::2])))
+    assert (np.abs(found - 60.0 * delays) <= 0.5).all()
+    env.auto_reset = True
+
+
+def test_a_policy_is_measured_from_equal_starts(env):
+    goals = np.zeros((N, 3))
+    goals[:, 2] = np.linspace(0.5, 1.2, N)
+    env.evaluation_reset(goals, command_delay=0.25)
+    arrays = env.task_arrays()
+    np.testing.assert_allclose(arrays["goal"], goals, atol=1e-6)
+    assert (arrays["command_step"] == 15).all() and not arrays["steps"].any()
+    np.testing.assert_array_equal(env.sim.joint_q(), env.sim.model.joint_q.numpy().reshape(N, -1))
+    np.testing.assert_allclose(env.obs[:, 0], goals[:, 2], atol=1e-6)
+    edit_episodes(env, 0, phase=LANDED, phase_steps=59)
+    env.step(REST)
+    assert env.done[0] == 1.0 and env.task_arrays()["steps"][0] == 1  # ended, but not begun anew
+    env.auto_reset = True
+
+
+# ---------------------------------------------------------------- the sequence of launches
+
+
+def run(env, actions):
+    trace = []
+    for action in actions:
+        env.step(action)
+        trace += [env.obs.clone(), env.final_obs.clone(), env.reward.clone(), env.done.clone()]
+    return trace
+
+
+def test_the_same_seed_gives_the_same_hundred_steps_and_another_does_not():
+    actions = random_actions(N, 100)
+    first, again, other = (
+        run(make_env(N, seed=seed, noise=True, randomize=True), actions) for seed in (11, 11, 12)
+    )  # fmt: skip
+    assert all(torch.equal(a, b) for a, b in zip(first, again, strict=True))
+    assert not torch.equal(first[0], other[0])
+    assert sum(done.sum() for done in first[3::4]) > 10
+
+
+def test_replayed_launches_equal_eager_ones():
+    actions = random_actions(N, 40)
+    replayed, eager = (make_env(N, seed=4, noise=True, randomize=True) for _ in range(2))
+    trace = run(replayed, actions)
+    assert replayed._graphs
+    for i, action in enumerate(actions):
+        eager.action.copy_(action)
+        eager._launch_step()
+        assert torch.equal(eager.obs, trace[4 * i]) and torch.equal(eager.reward, trace[4 * i + 2])
+
+
+def test_mujoco_takes_the_same_steps():
+    """A stand of half a second: both solvers end in the same pose and pay alike."""
+    ends = []
+    for solver in ("jumper", "mujoco"):
+        env = make_env(2, reset=only("default", command_delay=0.0), solver=solver)
+        total = torch.zeros(2)
+        for _ in range(30):
+            env.step(torch.zeros((2, 12)))
+            total += env.reward
+        assert not env.done.any() and env.task_arrays()["phase"].tolist() == [STANCE] * 2
+        ends.append((env.obs[:, 2:].clone(), total))
+        assert env.sim.paw_force.numpy()[:, 0, 2].sum() == pytest.approx(14.5 * 9.81, rel=0.05)
+    assert torch.abs(ends[0][0] - ends[1][0]).max() < 0.1
+    assert torch.abs(ends[0][0][:, :1] - ends[1][0][:, :1]).max() < 0.005
+    np.testing.assert_allclose(ends[0][1], ends[1][1], rtol=0.05)
+
+
+# ---------------------------------------------------------------- tables
+
+
+def test_a_term_of_ones_own_is_compiled_and_logged():
+    task = dataclasses.replace(TASK, terms=(Term(my_own_term, 3.0, (2.0,)), Term(rewards.action_rate, -1.0)))
+    env = make_env(N, task=task, reset=only("default"))
+    env.step(REST)
+    height = env.sim.joint_q()[:, 2]
+    np.testing.assert_allclose(env.reward, 6.0 * height / 60.0, rtol=1e-5)
+    assert env.metrics()["Episode_Reward/my_own_term"] == pytest.approx(np.sum(6.0 * height / 60.0), rel=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: dataclasses.replace(TASK, terms=(*TASK.terms, TASK.terms[0])), "name of its own"),
+        (lambda: dataclasses.replace(TASK, rules=()), "success"),
+        (lambda: dataclasses.replace(TASK, rules=TASK.rules[1:]), "success"),
+        (lambda: dataclasses.replace(TASK, levels=()), "level"),
+        (lambda: Term(my_own_term, math.nan), "weight of my_own_term"),
+        (lambda: Term(my_own_term, 1.0, (1.0,) * 5), "up to four"),
+        (lambda: Term(my_own_term, 1.0, (math.inf,)), "finite"),
+        (lambda: Rule(terminations.too_long, (math.nan,)), "finite"),
+        (lambda: make_task("vertical-jumpp"), "unknown task 'vertical-jumpp'"),
+        (lambda: JumpEnv(TASK, 0, device="cpu"), "at least 1"),
+        (lambda: JumpEnv(TASK, 1, device="cpu", solver="bullet"), "solver must be"),
+    ],
+)
+def test_impossible_configurations_are_refused(make, message):
+    with pytest.raises(ValueError, match=message):
+        make()
+
+
+def test_the_configuration_names_its_functions(env):
+    config = env.config()
+    assert isinstance(env.task, TaskCfg) and config["task"]["terms"][0]["func"].endswith("jump_height")
+    assert config["policy_dt_s"] == pytest.approx(1.0 / 60.0) and len(config["observation_names"]) == 48

@@ -1,0 +1,232 @@
+import dataclasses
+import shutil
+import socket
+
+import numpy as np
+import pytest
+import torch
+from jump_helpers import edit_episodes, make_env, random_actions
+from toy_task import SMALL, PushTask, join
+
+from jumper_warp.envs.env import JumpEnv
+from jumper_warp.envs.state import parameter_fingerprint
+from jumper_warp.registry import make_task
+from jumper_warp.rl.checkpoint import CheckpointError, load_checkpoint
+from jumper_warp.rl.ppo import PpoCfg
+from jumper_warp.rl.runner import CHECKPOINTS, TrainCfg, train
+from jumper_warp.tasks.cfg import GroundCfg
+
+N = 16
+PPO = PpoCfg(num_steps=8, hidden=(32, 32), minibatches=4)
+ALL_ON = {"randomize": True, "noise": True}
+
+
+class Recorded(JumpEnv):
+    """Keeps the rewards of all steps."""
+
+    def step(self, action):
+        super().step(action)
+        self.rewards = [*getattr(self, "rewards", []), self.reward.clone()]
+
+
+def train_jump(cfg):
+    """Train on the vertical jump with everything random; return the environment and the last checkpoint."""
+    made = []
+
+    def make(num_envs, seed, device):
+        made.append(Recorded(make_task("vertical-jump"), num_envs, seed=seed, device="cpu"))
+        return made[-1]
+
+    result = train(cfg, make)
+    return made[0], load_checkpoint(result.folder / CHECKPOINTS / f"iteration_{result.iteration:06d}.pt")
+
+
+def equal(a, b):
+    if isinstance(a, (dict, list)):
+        keys = a.keys() if isinstance(a, dict) else range(len(a))
+        return len(a) == len(b) and all(equal(a[key], b[key]) for key in keys)
+    return torch.equal(a, b) if isinstance(a, torch.Tensor) else a == b
+
+
+@pytest.fixture
+def cfg(tmp_path):
+    return TrainCfg(
+        task="jump", num_envs=N, iterations=4, device="cpu", log_root=tmp_path, log_interval=4, save_interval=2,
+        tensorboard=False, ppo=PPO,
+    )  # fmt: skip
+
+
+def test_a_resumed_training_goes_on_bit_for_bit(cfg):
+    whole, expected = train_jump(cfg)
+    assert sum(state.sum() for state in whole.rewards) > 0.0
+    (path,) = cfg.log_root.glob("jump/*/checkpoints/iteration_000002.pt")
+    torch.manual_seed(12345)
+    resumed, found = train_jump(dataclasses.replace(cfg, resume=str(path)))
+    assert len(resumed.rewards) == 16 and len(whole.rewards) == 32
+    assert all(torch.equal(a, b) for a, b in zip(resumed.rewards, whole.rewards[16:], strict=True))
+    np.testing.assert_array_equal(resumed.sim.joint_q(), whole.sim.joint_q())
+    np.testing.assert_array_equal(resumed.sim.joint_qd(), whole.sim.joint_qd())
+    assert torch.equal(resumed.obs, whole.obs)
+    for part in ("ppo", "env", "rng"):
+        assert equal(found[part], expected[part]), part
+
+
+def test_the_same_seed_trains_the_same_and_another_does_not(cfg):
+    cfg = dataclasses.replace(cfg, iterations=3)
+    first, again, other = (train_jump(dataclasses.replace(cfg, seed=seed)) for seed in (1, 1, 2))
+    assert all(torch.equal(a, b) for a, b in zip(first[0].rewards, again[0].rewards, strict=True))
+    assert equal(first[1]["ppo"], again[1]["ppo"]) and equal(first[1]["env"], again[1]["env"])
+    assert not torch.equal(first[0].obs, other[0].obs)
+    weights = [state["ppo"]["model"]["actor.0.weight"] for _, state in (first, other)]
+    assert not torch.equal(*weights)
+
+
+# ---------------------------------------------------------------- the environment alone
+
+
+def go_on_alike(saved, fresh):
+    """Step two environments with the same actions, which must stay the same and end some episodes; yields each step."""
+    ended = 0.0
+    for step, action in enumerate(random_actions(saved.num_envs, 25, seed=1)):
+        for env in (saved, fresh):
+            env.step(action)
+        for name in ("obs", "final_obs", "reward", "done", "timeout"):
+            assert torch.equal(getattr(saved, name), getattr(fresh, name)), (step, name)
+        np.testing.assert_array_equal(saved.sim.joint_qd(), fresh.sim.joint_qd())
+        ended += saved.done.sum().item()
+        yield step
+    assert (saved.tasks.numpy() == fresh.tasks.numpy()).all()
+    assert 0.0 < ended
+
+
+@pytest.mark.parametrize("solver", ["jumper", "mujoco"])
+def test_an_environment_goes_on_from_a_saved_state_bit_for_bit(solver):
+    count = 8 if solver == "mujoco" else N
+    saved, fresh = (make_env(count, seed=1, solver=solver, **ALL_ON) for _ in range(2))
+    for action in random_actions(count, 5):
+        saved.step(action)
+    edit_episodes(saved, level=np.arange(count) % 4, streak=np.arange(count) % 5)
+    fresh.load_state_dict(saved.state_dict())
+    assert len(list(go_on_alike(saved, fresh))) == 25
+
+
+def ground_env(count=N, platform=0.4, block=0.6, **arguments):
+    """Environment of far goals, whose starts have a platform or a block where there is room."""
+    task = make_task("horizontal-jump")
+    task = dataclasses.replace(task, levels=task.levels[-1:], ground=GroundCfg(platform=platform, block=block))
+    return make_env(count, task=task, **({"seed": 1} | ALL_ON | arguments))
+
+
+def test_an_environment_goes_on_with_its_drawn_grounds_bit_for_bit():
+    saved, fresh = ground_env(), ground_env()
+    for action in random_actions(N, 5):
+        saved.step(action)
+    blocks = saved._dynamics.robot.ground.blocks
+    sliding = blocks.numpy().copy()
+    assert sliding["exists"].any() and not sliding["exists"].all()
+    sliding["velocity"] = 0.3 * sliding["exists"][:, None]
+    blocks.assign(sliding)
+    fresh.load_state_dict(saved.state_dict())
+    for step in go_on_alike(saved, fresh):
+        found, expected = (env._dynamics.robot.ground.blocks.numpy() for env in (fresh, saved))
+        assert (found == expected).all(), step
+        if step == 0:
+            moved = np.abs(expected["center"] - sliding["center"]).max(axis=1)
+            assert (moved[(sliding["exists"] == 1) & (sliding["mass"] < 1.0e3)] > 1e-3).any()
+
+
+@pytest.mark.parametrize(("blocks", "message"), [(True, "lacks .*'block.center'"), (False, "has .*'block.center'")])
+def test_blocks_in_only_one_of_state_and_environment_are_refused(blocks, message):
+    with_blocks, level = ground_env(2), ground_env(2, platform=0.0, block=0.0)
+    env, other = (with_blocks, level) if blocks else (level, with_blocks)
+    before = env.state_dict()
+    with pytest.raises(ValueError, match=message) as caught:
+        env.load_state_dict(other.state_dict())
+    assert "\n" not in str(caught.value)
+    assert equal(env.state_dict(), before)
+
+
+def test_a_saved_state_does_not_change_with_the_environment():
+    env = make_env(2)
+    state = env.state_dict()
+    kept = {name: value.clone() for name, value in state.items()}
+    env.step(torch.ones((2, 12)))
+    assert equal(state, kept)
+    assert all(value.device.type == "cpu" for value in state.values())
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"num_envs": 4}, "saved for 2 environments, there are 4"),
+        ({"seed": 9}, "saved with other robots"),
+        ({"randomize": False}, "saved with other robots"),
+        ({"solver": "mujoco"}, "lacks .*'qacc_warmstart'"),
+    ],
+)
+def test_a_state_that_does_not_fit_is_refused_and_nothing_changes(change, message):
+    state = make_env(2, seed=1, randomize=True).state_dict()
+    arguments = {"num_envs": 2, "seed": 1, "randomize": True} | change
+    env = make_env(arguments.pop("num_envs"), **arguments)
+    before = env.state_dict()
+    with pytest.raises(ValueError, match=message) as caught:
+        env.load_state_dict(state)
+    assert "\n" not in str(caught.value)
+    assert equal(env.state_dict(), before)
+
+
+def test_a_field_that_came_or_went_is_told():
+    env = make_env(2)
+    state = env.state_dict()
+    state["episode.cadence"] = state.pop("episode.phase")
+    with pytest.raises(ValueError, match=r"lacks \['episode.phase'\], has \['episode.cadence'\] besides"):
+        env.load_state_dict(state)
+
+
+def test_the_fingerprint_sees_every_drawn_parameter():
+    env = make_env(2)
+    before = parameter_fingerprint(env)
+    model, motors = env.sim.model, env.sim.motors
+    for array in (model.body_mass, model.shape_material_mu, motors.kp, env.push, env.static_friction_ratio, env.delay):
+        values = array.numpy().copy()
+        array.assign(values + 1)
+        assert not torch.equal(parameter_fingerprint(env), before)
+        array.assign(values)
+    assert torch.equal(parameter_fingerprint(env), before)
+
+
+# ---------------------------------------------------------------- several processes
+
+
+def train_push(rank, ports, cfg):
+    """One of two processes: train to the end, then again from the middle; episodes outlast an iteration."""
+    torch.set_num_threads(1)
+
+    def make(num_envs, seed, device):
+        return PushTask(num_envs, seed, device, episode_length=20 + 7 * rank)
+
+    join(rank, ports[0])
+    train(cfg, make)
+    (folder,) = cfg.log_root.glob(f"jump/*/{CHECKPOINTS}")
+    if rank == 0:
+        shutil.copyfile(folder / "iteration_000004.pt", cfg.log_root / "whole.pt")
+    join(rank, ports[1])
+    train(dataclasses.replace(cfg, resume=str(folder / "iteration_000002.pt")), make)
+
+
+def test_every_process_takes_up_its_own_worlds(cfg):
+    cfg = dataclasses.replace(cfg, ppo=SMALL)
+    with socket.socket() as one, socket.socket() as two:
+        for probe in (one, two):
+            probe.bind(("127.0.0.1", 0))
+        ports = (one.getsockname()[1], two.getsockname()[1])
+    torch.multiprocessing.spawn(train_push, (ports, cfg), nprocs=2)
+    (folder,) = cfg.log_root.glob(f"jump/*/{CHECKPOINTS}")
+    expected = torch.load(cfg.log_root / "whole.pt", weights_only=True)
+    found = load_checkpoint(folder / "iteration_000004.pt")
+    assert not equal(expected["env"], expected["others"][0]["env"])
+    for part in ("ppo", "env", "rng", "others"):
+        assert equal(found[part], expected[part]), part
+    alone = dataclasses.replace(cfg, num_envs=N // 2, resume=str(folder / "iteration_000002.pt"))
+    with pytest.raises(CheckpointError, match="saved by 2 processes, there are 1"):
+        train(alone, lambda n, seed, device: PushTask(n, seed))

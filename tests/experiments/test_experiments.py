@@ -1,0 +1,211 @@
+import json
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+from landing_helpers import still_policy
+
+from experiments import ablations, benchmark_training, new_reward, vertical_jump_sweep
+from jumper_warp.envs.env import plain
+from jumper_warp.evaluation.jumps import Jumps, run_jumps
+from jumper_warp.registry import make_task
+from jumper_warp.rl.ppo import PpoCfg
+from jumper_warp.tasks.jump.ablations import (
+    ABLATIONS,
+    without_curriculum,
+    without_estimate,
+    without_reference_states,
+)
+
+SWEEP_RULES = ("success", "came_apart", "low_base", "tilted", "collided", "no_jump", "too_long")
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    """Folder, figures and run of a short training with the script's own reward."""
+    folder = tmp_path_factory.mktemp("new_reward")
+    values = new_reward.main(new_reward.Args(envs=16, iterations=2, steps=48, out=folder, device="cpu"))
+    (run,) = (folder / "logs" / "vertical-jump").iterdir()
+    return folder, values, run
+
+
+# ---------------------------------------------------------------- a new reward
+
+
+def test_new_reward_is_trained_with_and_logged_by_its_name(trained):
+    folder, values, run = trained
+    line = json.loads((run / "metrics.jsonl").read_text().splitlines()[-1])
+    assert values["even_load_per_episode"] == line["Episode_Reward/even_load"]
+    assert values["even_load_per_episode"] > 0.0
+    assert json.loads((folder / "figures.json").read_text())["iterations"] == 2
+
+
+# ---------------------------------------------------------------- the sweep
+
+
+def jumps_of(target, apex, end, tilt_deg, rest_speed):
+    jumps = Jumps(np.array(target), SWEEP_RULES)
+    jumps.apex, jumps.end = np.array(apex), np.array(end)
+    jumps.tilt, jumps.rest_speed = np.radians(tilt_deg), np.array(rest_speed)
+    return jumps
+
+
+def test_sweep_figures_against_hand_numbers():
+    jumps = jumps_of(
+        target=[0.50, 0.60, 0.80, 1.00, 1.10, 1.15, 1.18, 1.20],
+        apex=[0.59, 0.60, 0.80, 0.80, 1.08, 1.08, 1.09, 1.05],
+        end=[0, 0, 4, 0, 2, 0, 0, 0],
+        tilt_deg=[5.0, 9.0, 1.0, 2.0, 20.0, 11.0, 3.0, 4.0],
+        rest_speed=[0.01, 0.2, np.inf, 0.02, np.inf, 0.01, 0.01, 0.01],
+    )
+    early = np.array([False] * 6 + [True, False])
+    figures = vertical_jump_sweep.figures(jumps, early)
+    # errors 0.09 0 0 -0.20 -0.02 -0.07 -0.09 -0.15
+    assert figures["mean_abs_error_m"] == pytest.approx(0.62 / 8)
+    assert figures["mean_abs_error_in_range_m"] == pytest.approx(0.31 / 5)
+    assert figures["mean_error_m"] == pytest.approx(-0.44 / 8)
+    assert figures["success_rate"] == pytest.approx(5 / 8)
+    assert figures["success_rate_in_range"] == pytest.approx(4 / 5)
+    assert figures["success_rate_0_6_1_1"] == pytest.approx(3 / 4)
+    assert figures["largest_reached_m"] == pytest.approx(1.09)
+    assert figures["landing_rate"] == pytest.approx(4 / 8)
+    assert figures["success_and_landing_rate"] == pytest.approx(1 / 8)
+    assert figures["largest_tilt_deg"] == pytest.approx(20.0)
+    assert (figures["collision_rate"], figures["fall_rate"], figures["early_rate"]) == (1 / 8, 1 / 8, 1 / 8)
+    assert list(figures).index("success_and_landing_rate") == list(figures).index("success_rate") + 1
+    expected = {
+        "open_loop_limit_m": 1.0748,
+        "open_loop_mean_abs_error_m": (0.0252 + 0.0752 + 0.1052 + 0.1252) / 8,
+        "mean_abs_error_up_to_limit_m": 0.29 / 4,
+        "success_rate_reachable": 5 / 6,
+        "reachable_share": 6 / 8,
+    }
+    assert vertical_jump_sweep.limit_figures(jumps, early) == pytest.approx(expected)
+
+
+def test_a_world_that_came_apart_is_no_success_and_no_error():
+    jumps = jumps_of([0.6, 0.8, 1.0], [0.65, 1e6, np.nan], [0, 1, 1], [1.0] * 3, [0.0] * 3)
+    figures = vertical_jump_sweep.figures(jumps, np.zeros(3, dtype=bool))
+    assert figures["mean_abs_error_m"] == pytest.approx(0.05)
+    assert figures["success_rate"] == pytest.approx(1 / 3)
+    assert figures["came_apart"] == 2
+    assert figures["largest_reached_m"] == pytest.approx(0.65)
+
+
+class Script:
+    """Squats for a second and then stretches, beginning at a policy step."""
+
+    def __init__(self, begin):
+        self.begin, self.step = begin, 0
+
+    def act(self, obs):
+        since = self.step - self.begin
+        self.step += 1
+        level = 0.0 if since < 0 else min(since / 25, 1.0) if since < 60 else -1.0 if since < 80 else 0.0
+        return torch.tensor([0.0, level, level] * 4).repeat(len(obs), 1)
+
+
+@pytest.fixture(scope="module")
+def sweep_env():
+    return vertical_jump_sweep.make_env(
+        still_policy("vertical-jump"), vertical_jump_sweep.Args(jumps=3, record=0, device="cpu")
+    )
+
+
+@pytest.mark.parametrize(("begin", "early"), [(31, False), (-45, True)])
+def test_scripted_jump_reaches_the_open_loop_height_and_lands(sweep_env, begin, early):
+    targets = np.array([0.5, 0.7, 1.05])
+    observer = vertical_jump_sweep.Observer(Script(begin), sweep_env)
+    figures = vertical_jump_sweep.figures(run_jumps(observer.act, sweep_env, targets), observer.early)
+    assert figures["largest_reached_m"] == pytest.approx(vertical_jump_sweep.OPEN_LOOP_LIMIT, abs=0.02)
+    assert figures["landing_rate"] == 1.0
+    assert figures["early_rate"] == (1.0 if early else 0.0)
+    assert figures["success_rate"] == pytest.approx(0.0 if early else 1 / 3)
+
+
+def test_sweep_of_a_run_leaves_figures_plot_recording_and_filmstrip(trained, tmp_path):
+    args = vertical_jump_sweep.Args(
+        policy=str(trained[2]), jumps=3, record=2, randomize=True, out=tmp_path, device="cpu"
+    )
+    values = vertical_jump_sweep.main(args)
+    saved = json.loads((tmp_path / "figures.json").read_text())
+    assert saved == values
+    assert {
+        "mean_abs_error_m",
+        "success_rate",
+        "success_rate_in_range",
+        "success_rate_0_6_1_1",
+        "jumps",
+    } <= saved.keys()
+    assert {"landing_rate", "largest_tilt_deg", "largest_reached_m"} <= saved.keys()
+    of_the_nominal_robot = vertical_jump_sweep.limit_figures(Jumps(np.array([0.6]), SWEEP_RULES), np.zeros(1, bool))
+    assert not saved.keys() & of_the_nominal_robot.keys()
+    assert (saved["jumps"], saved["torque_limit_nm"], saved["randomize"]) == (3, 18.0, True)
+    for name in ("sweep.png", "jumps.rrd", "jump_1.20_m.png"):
+        assert (tmp_path / name).stat().st_size > 1000, name
+
+
+# ---------------------------------------------------------------- ablations
+
+
+def test_each_ablation_changes_its_own_part_only():
+    task = make_task("vertical-jump")
+    plainly = plain(task)
+    parts = {name: {key for key, value in plain(change(task)).items() if value != plainly[key]}
+             for name, change in ABLATIONS.items()}  # fmt: skip
+    assert parts == {
+        "without_estimate": {"terms"}, "without_reference_states": {"reset"}, "without_curriculum": {"levels"},
+    }  # fmt: skip
+    weights = {term.name: term.weight for term in without_estimate(task).terms}
+    assert weights["estimated_jump_height"] == 0.0
+    assert weights["jump_height"] == {term.name: term.weight for term in task.terms}["jump_height"] > 0.0
+    reset = without_reference_states(task).reset
+    assert (reset.standing, reset.default, reset.in_flight, reset.touchdown) == (0.8, 0.2, 0.0, 0.0)
+    assert without_curriculum(task).levels == (task.levels[-1],)
+
+
+def test_ablation_of_a_task_without_the_estimate_is_refused():
+    task = make_task("vertical-jump")
+    with pytest.raises(ValueError, match="estimated_jump_height"):
+        without_estimate(SimpleNamespace(name="other", terms=task.terms[:1]))
+
+
+def test_seconds_to_a_rate_are_those_of_the_first_evaluation_that_has_it():
+    curve = ablations.Curve(seconds=[5.0, 10.0, 15.0, 20.0], success=[0.1, 0.85, 0.7, 0.9])
+    assert curve.seconds_to(0.8) == 10.0
+    assert curve.seconds_to(0.95) is None
+
+
+def test_ablations_write_a_curve_per_variant(tmp_path):
+    names = ["full", "without_curriculum"]
+    args = ablations.Args(
+        seconds=0.5, every=0.25, variants=names, envs=8, jumps=2, ppo=PpoCfg(num_steps=8), out=tmp_path, device="cpu"
+    )
+    values = ablations.main(args)
+    assert values == json.loads((tmp_path / "figures.json").read_text())
+    for name in names:
+        assert values[f"curve_seconds_{name}"][-1] >= 0.5
+        assert values[f"success_{name}"] == values[f"curve_success_{name}"][-1] == 0.0
+        assert values[f"seconds_to_80_percent_{name}"] is None
+        assert values[f"iterations_{name}"] >= 1
+    assert (tmp_path / "ablations.png").is_file()
+
+
+# ---------------------------------------------------------------- benchmark
+
+
+def test_benchmark_reports_solver_environment_and_both_trainers(tmp_path):
+    args = benchmark_training.Args(
+        envs=(8,), train_envs=16, steps=4, repeats=1, iterations=1, num_steps=8, out=tmp_path, device="cpu"
+    )
+    values = benchmark_training.main(args)
+    assert values == json.loads((tmp_path / "figures.json").read_text())
+    rates = [values[f"{what}_steps_per_s_{n}"] for what in ("solver", "env") for n in (8, 16)]
+    rates += [values["ppo_steps_per_s"], values["rsl_rl_steps_per_s"]]
+    assert min(rates) > 0.0
+    parts = ("action", "physics", "episode", "observe", "reset")
+    assert sum(values[f"{part}_share"] for part in parts) == pytest.approx(1.0)
+    assert all(values[f"{part}_us"] > 0.0 for part in parts)
+    assert values["ppo_collect_s"] + values["ppo_update_s"] == pytest.approx(values["ppo_iteration_s"], rel=0.2)

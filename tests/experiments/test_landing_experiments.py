@@ -1,0 +1,327 @@
+import dataclasses
+import json
+import math
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from landing_helpers import still_policy
+
+from experiments import (
+    consecutive_jumps,
+    diagonal_jump_grid,
+    horizontal_jump_sweep,
+    max_jump,
+    platform_jump,
+)
+from experiments.vertical_jump_sweep import OPEN_LOOP_LIMIT
+from jumper_warp.cli.main import UsageError
+from jumper_warp.evaluation.jumps import rule_names, run
+from jumper_warp.evaluation.landings import ENDS, Landings
+from jumper_warp.evaluation.trial import Trial, TrialArgs, beside, shown
+from jumper_warp.policies.folder import save_policy
+from jumper_warp.policies.restore import Conditions, env_of_policy
+from jumper_warp.policies.spec import PolicyError
+
+COLLIDED, NO_JUMP = ENDS.index("collided"), ENDS.index("no_jump")
+SHARED = {"mean_error_m", "success_rate", "success_rate_in_range", "jumps", "solver", "randomize", "seed"}
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+
+@pytest.fixture(scope="module")
+def policy(tmp_path_factory):
+    """Folder of a policy that stands still."""
+    folder = tmp_path_factory.mktemp("policy") / "still"
+    save_policy(folder, still_policy("horizontal-jump"))
+    return str(folder)
+
+
+def ended(goals, landing, end, **changes):
+    """Return rows of jumps that ended as told; goals and landing [m], (rows, jumps, 2), heading 0."""
+    landings = Landings(np.array(goals, dtype=float), ENDS)
+    landings.end[:] = end
+    landings.target[:], landings.place[:], landings.touchdown[:] = goals, landing, landing
+    landings.heading[:], landings.yaw[:], landings.tilt[:] = 0.0, 0.0, 0.0
+    for name, value in changes.items():
+        getattr(landings, name)[:] = value
+    return landings
+
+
+def ahead(distances):
+    return np.stack([distances, np.zeros(len(distances))], axis=1)[:, None]
+
+
+# ---------------------------------------------------------------- figures by hand
+
+
+def test_sweep_counts_ranges_by_distance():
+    goals = ahead([0.3, 0.7, 1.0, 1.4, 1.5])
+    landings = ended(goals, goals + [[[0.02, 0.0]], [[0.0, 0.04]], [[0.0, 0.2]], [[0.03, 0.0]], [[-0.5, 0.0]]], 0)
+    figures = horizontal_jump_sweep.figures(landings)
+    assert figures["mean_error_m"] == pytest.approx(0.79 / 5)
+    assert figures["success_rate"] == pytest.approx(3 / 5)
+    assert figures["success_rate_in_range"] == pytest.approx(3 / 4)
+    assert figures["success_rate_0_4_1_0"] == pytest.approx(1 / 2)
+
+
+def test_grid_has_every_goal_as_often_as_wanted():
+    goals = diagonal_jump_grid.grid(columns=3, rows=2, jumps=2)
+    assert goals.shape == (12, 1, 2)
+    assert goals[:4, 0].tolist() == [[0.35, -0.35], [0.35, -0.35], [0.35, 0.35], [0.35, 0.35]]
+    assert goals[-1, 0].tolist() == [1.4, 0.35]
+    assert len(diagonal_jump_grid.grid(22, 5, 2)) == 220
+
+
+def test_consecutive_figures_by_hand():
+    goals = [[[0.8, 0.2], [0.75, -0.2]], [[0.8, 0.0], [0.8, 0.0]]]
+    off = [[[0.01, 0.0], [0.0, 0.03]], [[0.05, 0.0], [0.2, 0.0]]]
+    pairs = ended(goals, np.add(goals, off), 0)
+    row = ended(np.ones((2, 3, 2)), np.ones((2, 3, 2)) + [0.0, 0.04], [[0, 0, 0], [0, COLLIDED, -1]])
+    row.heading[1, 2] = row.place[1, 2] = np.nan
+    row.rest_speed[:] = [[0.05, 0.2, 0.05], [0.05, np.inf, np.inf]]
+    figures = consecutive_jumps.figures(pairs, row)
+    expected = {
+        "jumps": 4,
+        "mean_error_m": 0.29 / 4,
+        "success_rate": 3 / 4,
+        "success_rate_in_range": 3 / 4,
+        "mean_error_diagonal_m": 0.02,
+        "mean_error_straight_m": 0.125,
+        "mean_error_jump_1_m": 0.03,
+        "mean_error_jump_2_m": 0.115,
+        "both_landed_rate": 1.0,
+        "ten_in_a_row_rate": 0.5,
+        "row_all_on_goal_rate": 0.5,
+        "below_0_1_m_s_at_the_end_rate": 0.0,
+        "below_0_1_m_s_at_the_end_rate_ten": 3 / 4,
+        "mean_jumps_until_the_end": 2.0,
+        "mean_error_ten_m": 0.04,
+        "success_rate_ten": 4 / 5,
+    }
+    assert {name: figures[name] for name in expected} == pytest.approx(expected)
+    assert figures["mean_error_by_number_m"] == pytest.approx([0.04, 0.04, 0.04])
+    assert "at_rest_within_1_s_rate" not in figures  # the rest may be of another length
+
+
+def test_row_without_a_fall_may_miss_its_goals():
+    off = np.ones((2, 3, 2)) + [[[0.0, 0.0]] * 3, [[0.0, 0.0], [0.3, 0.0], [0.0, 0.0]]]
+    pairs = np.ones((2, 2, 2))
+    figures = consecutive_jumps.figures(ended(pairs, pairs, 0), ended(np.ones((2, 3, 2)), off, 0))
+    assert (figures["ten_in_a_row_rate"], figures["row_all_on_goal_rate"]) == (1.0, 0.5)
+
+
+def test_paths_are_drawn_from_the_start_and_along_the_heading():
+    track = consecutive_jumps.Track()
+    landings = Landings(np.zeros((2, 1, 2)), ENDS)
+    for place in ([0.0, 0.0, 0.3], [0.0, 1.0, 0.3]):
+        landings.seen = {"base_pos": np.array([place, place])}
+        track(landings)
+    landings.current[1] = 1
+    track(landings)
+    paths = track.in_start_frame(np.array([0.5 * math.pi, 0.0]))
+    assert paths[0] == pytest.approx(np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 0.0]]))
+    assert paths[1, 1] == pytest.approx([0.0, 1.0]) and np.isnan(paths[1, 2]).all()
+
+
+def of(middle, *, clean, stepped=0, hopped=0):
+    """Return 20 jumps of a bin, so many of which succeed, the rest collides; touchdown 0.2 m before the goal."""
+    goals, good = ahead([middle] * 20), clean + stepped + hopped
+    air = [[0.0]] * (clean + stepped) + [[0.1]] * (20 - clean - stepped)
+    lift = [[0.0]] * clean + [[0.1]] * (20 - clean)
+    end = [[0]] * good + [[COLLIDED]] * (20 - good)
+    return ended(goals, goals + [0.01, 0.0], end, air_time=air, lift_time=lift, touchdown=goals - [0.2, 0.0])
+
+
+def test_reliable_distance_is_the_last_bin_before_the_first_that_is_not():
+    bins = {
+        1.2: of(1.2, clean=19),
+        1.3: of(1.3, clean=10, stepped=10),
+        1.4: of(1.4, clean=10, hopped=9),
+        1.5: of(1.5, clean=10, stepped=8),
+        1.6: of(1.6, clean=20),
+    }
+    figures = max_jump.figures(bins)
+    expected = {
+        "largest_reliable_m": 1.4, "largest_reliable_without_hop_m": 1.3, "largest_reliable_without_step_m": 1.2,
+        "base_at_touchdown_m": 1.2, "base_at_touchdown_without_hop_m": 1.1, "base_at_touchdown_without_step_m": 1.0,
+        "success_rate": 0.96, "single_jump_success_rate": 0.87, "step_free_success_rate": 0.69,
+        "success_rate_in_range": 58 / 60, "farthest_success_m": 1.61, "jumps": 100, "mean_error_m": 0.01,
+    }  # fmt: skip
+    assert {name: figures[name] for name in expected} == pytest.approx(expected)
+    assert figures["bin_success_rate"] == pytest.approx([0.95, 1.0, 0.95, 0.9, 1.0])
+    assert figures["bin_single_jump_success_rate"] == pytest.approx([0.95, 1.0, 0.5, 0.9, 1.0])
+    assert figures["bin_step_free_success_rate"] == pytest.approx([0.95, 0.5, 0.5, 0.5, 1.0])
+    assert figures["bin_base_at_touchdown_m"] == pytest.approx([1.0, 1.1, 1.2, 1.3, 1.4])
+    assert "may go on with steps" in max_jump.verdict(figures)
+    assert "Of 1.4 m the base itself flew to 1.20 m" in max_jump.verdict(figures)
+
+
+def test_distance_without_any_reliable_bin_is_none():
+    goals = ahead([1.0, 1.0])
+    figures = max_jump.figures({1.0: ended(goals, goals, [[NO_JUMP], [NO_JUMP]])})
+    assert figures["largest_reliable_m"] is None and figures["farthest_success_m"] is None
+    assert figures["bin_base_at_touchdown_m"] == [None]
+    assert max_jump.row_of(figures, 0) == ["1.0", "0.0", "0.0", "0.0", ""]
+
+
+def test_figures_are_printed_with_four_digits_in_lists_too():
+    assert shown([0.123456, None, 2]) == "0.1235, None, 2" and shown(1.0 / 3.0) == "0.3333"
+
+
+def test_scenes_put_the_ground_where_it_is_said_to_be():
+    rng, goals = np.random.default_rng(0), np.array([[0.8, 0.1], [1.0, -0.1]])
+    special, _ = platform_jump.scene("platform", goals, 0.46, rng)
+    ground = special["ground"]
+    assert (ground.min_z, ground.max_z) == pytest.approx((-0.15, 0.0))
+    x = np.linspace(-ground.hx, ground.hx, ground.ncol)
+    heights = np.asarray(ground.data).reshape(ground.nrow, ground.ncol)
+    assert x[heights[0] > 0.5].max() == pytest.approx(0.46) and (heights == heights[0]).all()
+    special, headings = platform_jump.scene("uneven", goals, 0.46, rng)
+    assert len(set(headings)) == 2
+    special, headings = platform_jump.scene("block", goals, 0.46, rng)
+    block = special["block"]
+    near, far = (block.center[:, 0] + side * block.half[:, 0] for side in (-1.0, 1.0))
+    assert near == pytest.approx(0.46) and far == pytest.approx(goals[:, 0] + 0.40)
+    assert block.center[:, 1] == pytest.approx(goals[:, 1]) and not headings.any()
+
+
+def test_eye_looks_across_the_path():
+    eye, target = beside(np.array([0.0, 0.0]), np.array([0.0, 1.0]))
+    assert target == pytest.approx([0.0, 0.5, 0.4])
+    assert eye == pytest.approx([2.4, 0.5, 0.75])
+
+
+# ---------------------------------------------------------------- real jumps
+
+
+class Hop:
+    """Squats and stretches a second after the start, and again whenever a jump was commanded since."""
+
+    def __init__(self):
+        self.step, self.begin = 0, 31
+
+    def act(self, obs):
+        since, self.step = self.step - self.begin, self.step + 1
+        level = 0.0 if since < 0 else min(since / 25, 1.0) if since < 60 else -1.0 if since < 80 else 0.0
+        return torch.tensor([0.0, level, level] * 4).repeat(len(obs), 1)
+
+
+@pytest.fixture(scope="module")
+def hops():
+    """Hops on the spot, each world asked for another place, and a second hop that follows at once."""
+    policy = still_policy("horizontal-jump")
+    rules = set(ENDS) - {"no_jump"}  # the script squats too long for the task's patience
+
+    def change(task):
+        return dataclasses.replace(task, rules=tuple(rule for rule in task.rules if rule.name in rules))
+
+    env = env_of_policy(policy, 3, Conditions(device="cpu"), change=change)
+    goals = np.array([[[0.0, 0.0], [0.0, 0.05]], [[0.05, 0.0], [0.3, 0.0]], [[0.5, -0.2], [0.0, 0.0]]])
+    landings = Landings(goals, rule_names(env), headings=np.array([0.0, 2.0, -1.5]), delay=np.array([0.5, 0.4, 0.3]))
+    script = Hop()
+
+    def again():
+        if (landings.current == 1).any() and script.begin == 31:
+            script.begin = script.step + 1
+
+    run(script.act, env, landings, 8.0, again)
+    return landings
+
+
+def test_hop_on_the_spot_lands_near_its_start_and_off_its_goal(hops):
+    assert hops.landed.all() and not hops.early.any() and not hops.hopped.any()
+    assert ((hops.apex > 0.9) & (hops.apex < OPEN_LOOP_LIMIT)).all()
+    assert hops.landing[:, 0] == pytest.approx(np.zeros((3, 2)), abs=0.06)
+    assert hops.outcomes[:, 0].tolist() == ["success", "success", "missed"]
+    assert hops.error[2, 0] == pytest.approx(math.hypot(0.5, 0.2), abs=0.06)
+
+
+def test_second_hop_is_measured_from_where_the_first_one_ended(hops):
+    start = hops.target[:, 1] - hops.place[:, 0]
+    assert np.linalg.norm(start, axis=1) == pytest.approx([0.05, 0.3, 0.0], abs=1e-3)
+    assert hops.outcomes[:, 1].tolist() == ["success", "missed", "success"]
+
+
+# ---------------------------------------------------------------- the scripts
+
+
+@pytest.mark.parametrize(
+    ("experiment", "settings", "files"),
+    [
+        (horizontal_jump_sweep, {"jumps": 3}, ("sweep.png", "jumps.rrd", "jumps.png")),
+        (diagonal_jump_grid, {"columns": 2, "rows": 2, "jumps": 1}, ("grid.png", "jumps.rrd")),
+        (consecutive_jumps, {"jumps": 1, "trials": 2, "row": 3}, ("paths.png", "pairs.rrd", "row.rrd")),
+        (platform_jump, {"jumps": 2}, ("landings.png", "platform.rrd", "uneven.png", "block.rrd")),
+        (max_jump, {"jumps": 3}, ("max_jump.png", "jump_1.0_m.rrd")),
+    ],
+)
+def test_experiment_leaves_figures_plot_and_recording(experiment, settings, files, policy, tmp_path):
+    args = experiment.Args(policy=policy, record=1, out=tmp_path, device="cpu", **settings)
+    values = experiment.main(args)
+    saved = json.loads((tmp_path / "figures.json").read_text())
+    assert saved == values and saved.keys() >= SHARED
+    assert (saved["success_rate"], saved["torque_limit_nm"]) == (0.0, 18.0)
+    for name in files:
+        assert (tmp_path / name).stat().st_size > 1000, name
+
+
+def test_randomised_robot_that_stands_still_is_off_by_the_whole_way(policy, tmp_path):
+    args = horizontal_jump_sweep.Args(policy=policy, jumps=4, record=0, randomize=True, out=tmp_path, device="cpu")
+    values = horizontal_jump_sweep.main(args)
+    assert values["mean_error_m"] == pytest.approx(0.9, abs=0.05)
+    assert values["randomize"] and values["landing_rate"] == 0.0
+    assert (values["trained_lower_m"], values["trained_upper_m"]) == (0.2, 2.2)
+
+
+def test_nothing_of_viewer_and_meshes_is_needed_without_a_recording(policy, tmp_path):
+    code = (
+        "import sys\n"
+        "for name in ('rerun', 'trimesh', 'pin', 'pinocchio'): sys.modules[name] = None\n"
+        "from experiments import consecutive_jumps, diagonal_jump_grid, max_jump, platform_jump, vertical_jump_sweep\n"
+        "from experiments.horizontal_jump_sweep import Args, main\n"
+        "from pathlib import Path\n"
+        f"main(Args(policy={policy!r}, jumps=3, record=0, out=Path({str(tmp_path)!r}), device='cpu'))"
+    )
+    root = Path(__file__).parents[2]
+    subprocess.run([sys.executable, "-c", code], cwd=root, check=True, capture_output=True)
+    assert {path.name for path in tmp_path.iterdir()} == {"figures.json", "run.json", "sweep.png"}
+
+
+def test_policy_of_another_task_is_refused_in_one_line(tmp_path):
+    with pytest.raises(PolicyError, match="needs a policy of horizontal-jump or omnidirectional-jump"):
+        Trial("test", TrialArgs(policy="vertical_jump", out=tmp_path, device="cpu"))
+
+
+def test_missing_device_is_refused(policy, tmp_path):
+    with pytest.raises(UsageError, match="no device 'abacus'"):
+        Trial("test", TrialArgs(policy=policy, out=tmp_path, device="abacus"))
+
+
+def test_script_refuses_a_policy_of_another_task_in_one_line_with_code_2(policy):
+    root = Path(__file__).parents[2]
+    command = [sys.executable, "experiments/vertical_jump_sweep.py", "--policy", policy]
+    done = subprocess.run(command, cwd=root, capture_output=True, text=True)
+    (line,) = done.stderr.splitlines()
+    assert (done.returncode, done.stdout) == (2, "")
+    assert line.startswith("jumper: this needs a policy of vertical-jump")
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: TrialArgs(record=-1), "record must not be negative"),
+        (lambda: horizontal_jump_sweep.Args(jumps=2), "at least 3 jumps"),
+        (lambda: diagonal_jump_grid.Args(rows=0), "at least one jump, column and row"),
+        (lambda: consecutive_jumps.Args(rest=0.0), "rest must be in"),
+        (lambda: platform_jump.Args(scenes=("moon",)), "scenes are platform, uneven, block"),
+        (lambda: platform_jump.Args(edge=0.2), "edge must be from 0.3 m to below 0.8 m"),
+        (lambda: platform_jump.Args(scenes=("block",), solver="mujoco"), "SolverMuJoCo has no sliding block"),
+        (lambda: max_jump.Args(jumps=0), "at least one jump"),
+    ],
+)
+def test_impossible_settings_are_refused(make, message):
+    with pytest.raises(ValueError, match=message):
+        make()

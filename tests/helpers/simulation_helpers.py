@@ -1,0 +1,83 @@
+"""Driving a simulation by hand in tests, and reading paws out of it."""
+
+import dataclasses
+
+import numpy as np
+import warp as wp
+from scipy.spatial.transform import Rotation
+from solver_helpers import BODIES, SHANKS, random_states
+
+from jumper_warp.robot.motors import jumping_motors
+from jumper_warp.sim.simulation import Simulation
+
+WEIGHT = 14.5 * 9.81
+PAW_RADIUS = 0.025
+
+
+def simulation(num_worlds, **arguments):
+    return Simulation(num_worlds, visuals=False, device="cpu", **arguments)
+
+
+def write_state(sim, q=None, qd=None):
+    """Write joint_q (num_worlds, 43) and joint_qd (num_worlds, 38); knees and bodies follow."""
+    state = sim.state
+    if q is not None:
+        state.joint_q.assign(np.asarray(q, dtype=np.float32).ravel())
+    if qd is not None:
+        state.joint_qd.assign(np.asarray(qd, dtype=np.float32).ravel())
+    sim.solver.dynamics.full_state(state.joint_q, state.joint_qd, state.body_q, state.body_qd)
+
+
+def command(sim, angles):
+    """Command motor angles [rad], (num_worlds, 12)."""
+    sim.target.assign(np.ascontiguousarray(np.broadcast_to(angles, (sim.num_worlds, 12)).T, dtype=np.float32))
+
+
+def paw_forces(sim):
+    """Ground forces on the paws [N], (num_worlds, 4, 3)."""
+    return sim.paw_force.numpy().transpose(1, 0, 2).astype(float)
+
+
+def paw_centres(sim):
+    """Paw centres [m], (num_worlds, 4, 3)."""
+    poses = sim.state.body_q.numpy().reshape(-1, BODIES, 7)[:, SHANKS].astype(float)
+    arm = Rotation.from_quat(poses[..., 3:].reshape(-1, 4)).apply([0.0, 0.0, -0.3]).reshape(-1, 4, 3)
+    return poses[..., :3] + arm
+
+
+def slip_velocities(sim, joint_q):
+    """Velocities [m/s] of the material points at the bottom of the paws, at present rates, (num_worlds, 4, 3).
+
+    joint_q: coordinates at which the contact was solved, those before the last step.
+    """
+    model, q, qd = sim.model, wp.array(joint_q.ravel(), dtype=float, device="cpu"), wp.clone(sim.state.joint_qd)
+    body_q, body_qd = wp.empty_like(sim.state.body_q), wp.empty_like(sim.state.body_qd)
+    sim.solver.dynamics.full_state(q, qd, body_q, body_qd)
+    poses = body_q.numpy().reshape(-1, BODIES, 7)[:, SHANKS].astype(float)
+    twists = body_qd.numpy().reshape(-1, BODIES, 6)[:, SHANKS].astype(float)
+    turn = Rotation.from_quat(poses[..., 3:].reshape(-1, 4))
+    com = turn.apply(model.body_com.numpy().reshape(-1, BODIES, 3)[:, SHANKS].reshape(-1, 3))
+    bottom = turn.apply([0.0, 0.0, -0.3]) - [0.0, 0.0, PAW_RADIUS] - com
+    return twists[..., :3] + np.cross(twists[..., 3:], bottom.reshape(-1, 4, 3))
+
+
+def thrown(sim, seed, height=(0.4, 1.0), speed=1.5, joint_rate=4.0):
+    """Throw all robots in random attitudes, command random angles."""
+    n = sim.num_worlds
+    rng, states = np.random.default_rng(seed), random_states(n, seed, joint_rate=joint_rate)
+    states.pos = rng.uniform([-1.0, -1.0, height[0]], [1.0, 1.0, height[1]], (n, 3))
+    states.quat = Rotation.from_rotvec(0.3 * rng.normal(size=(n, 3))).as_quat()
+    states.com_vel = speed * rng.normal(size=(n, 3))
+    write_state(sim, states.joint_q(), states.joint_qd())
+    command(sim, states.angles)
+    sim.filter_targets()
+
+
+def stiff_motors():
+    """Motors that hold the legs' shape."""
+    motors = jumping_motors(24.8)
+    return dataclasses.replace(
+        motors,
+        lateral=dataclasses.replace(motors.lateral, kp=300.0, kd=3.0),
+        transversal=dataclasses.replace(motors.transversal, kp=300.0, kd=3.0),
+    )

@@ -1,0 +1,132 @@
+"""A mass on a line that is to be pushed to the origin: small enough to train in a second."""
+
+import os
+
+import torch
+
+from jumper_warp.rl.ppo import Ppo, PpoCfg
+from jumper_warp.rl.runner import TrainCfg, train
+
+torch.set_num_threads(1)  # on matrices this small, threads mostly wait for each other
+SMALL = PpoCfg(num_steps=16, hidden=(32, 32), minibatches=4)
+
+
+class PushTask:
+    """Position and velocity of each mass are the observation, its acceleration the action.
+
+    The critic sees the distance from the origin too.
+    """
+
+    num_obs, num_critic_obs, num_actions = 2, 3, 1
+    STATE = ("steps", "obs", "critic_obs", "age")
+
+    def __init__(self, num_envs: int, seed: int = 0, device: torch.device | str = "cpu", episode_length: int = 50):
+        self.num_envs, self.seed, self.device = num_envs, seed, torch.device(device)
+        self.episode_length = episode_length
+        self.obs, self.final_obs = (torch.zeros(num_envs, 2, device=self.device) for _ in range(2))
+        self.critic_obs, self.final_critic_obs = (torch.zeros(num_envs, 3, device=self.device) for _ in range(2))
+        self.reward, self.done, self.timeout, self.age = (torch.zeros(num_envs, device=self.device) for _ in range(4))
+        self.steps = torch.zeros((), device=self.device)
+        start = torch.linspace(-1.0, 1.0, num_envs, device=self.device)
+        self.start = torch.stack([start, -0.5 * start.flip(0)], dim=1)
+
+    def reset(self) -> None:
+        self.obs.copy_(self.start)
+        self.age.zero_()
+        self.show_critic(self.critic_obs, self.obs)
+
+    def show_critic(self, critic_obs: torch.Tensor, obs: torch.Tensor) -> None:
+        critic_obs.copy_(torch.cat([obs, obs[:, :1].abs()], dim=1))
+
+    def step(self, action: torch.Tensor) -> None:
+        velocity = self.obs[:, 1] + 0.2 * action[:, 0].clamp(-1.0, 1.0)
+        position = self.obs[:, 0] + 0.2 * velocity
+        self.final_obs.copy_(torch.stack([position, velocity], dim=1))
+        self.reward.copy_(torch.exp(-position.square() - 0.1 * velocity.square()))
+        self.age += 1.0
+        self.steps += 1.0
+        self.show_critic(self.final_critic_obs, self.final_obs)
+        lost = (position.abs() > 5.0).float()
+        self.timeout.copy_((self.age >= self.episode_length).float() * (1.0 - lost))
+        self.done.copy_(lost + self.timeout)
+        ended = self.done[:, None]
+        self.obs.copy_(self.final_obs * (1.0 - ended) + self.start * ended)
+        self.age *= 1.0 - self.done
+        self.show_critic(self.critic_obs, self.obs)
+
+    def metrics(self) -> dict[str, float]:
+        return {"Metrics/success": float(self.obs[:, 0].abs().lt(0.1).float().mean())}
+
+    def config(self) -> dict:
+        return {"episode_length": self.episode_length}
+
+    def state_dict(self) -> dict[str, torch.Tensor]:
+        return {name: getattr(self, name) for name in self.STATE}
+
+    def load_state_dict(self, state: dict[str, torch.Tensor]) -> None:
+        for name in self.STATE:
+            getattr(self, name).copy_(state[name])
+
+
+def fill(ppo: Ppo, worlds: slice, num_worlds: int) -> None:
+    """Fill a rollout with the part of some made-up experience that belongs to these worlds."""
+    rollout, generator = ppo.rollout, torch.Generator().manual_seed(3)
+
+    def draw(*shape: int) -> torch.Tensor:
+        return torch.randn(shape[0], num_worlds, *shape[1:], generator=generator)[:, worlds]
+
+    steps = ppo.cfg.num_steps
+    rollout.obs.copy_(3.0 + 2.0 * draw(steps + 1, 2))
+    rollout.critic_obs.copy_(0.5 * draw(steps + 1, 3) - 1.0)
+    rollout.final_critic_obs.copy_(0.5 * draw(steps, 3) - 1.0)
+    rollout.reward.copy_(draw(steps))
+    rollout.done.copy_((draw(steps) > 1.0).float())
+    rollout.timeout.copy_(rollout.done * (draw(steps) > 0.0).float())
+    with torch.no_grad():
+        rollout.mean.copy_(ppo.model.actor(ppo.model.features(rollout.obs[:-1])))
+        rollout.log_std.copy_(ppo.model.log_std)
+    rollout.action.copy_(rollout.mean + draw(steps, 1))
+
+
+def local_order(rank: int, size: int) -> torch.Tensor:
+    return torch.randperm(size, generator=torch.Generator().manual_seed(rank))
+
+
+def join(rank: int, port: int) -> None:
+    os.environ.update(RANK=str(rank), LOCAL_RANK=str(rank), WORLD_SIZE="2", MASTER_ADDR="127.0.0.1")
+    os.environ["MASTER_PORT"] = str(port)
+
+
+def update_half(rank: int, port: int, cfg: PpoCfg, path: str) -> None:
+    """One of two processes: learn from half of the worlds and save the outcome to path + rank."""
+    join(rank, port)
+    torch.distributed.init_process_group("gloo")
+    torch.manual_seed(0)
+    ppo = Ppo(PushTask(4), cfg)
+    fill(ppo, slice(4 * rank, 4 * rank + 4), 8)
+    ppo.order = lambda: local_order(rank, ppo.batch_size)
+    ppo.update()
+    torch.save(ppo.state_dict(), path + str(rank))
+    torch.distributed.destroy_process_group()
+
+
+def train_rank(rank: int, port: int, cfg: TrainCfg, path: str) -> None:
+    """One of two processes of a training; saves the networks to path + rank."""
+    join(rank, port)
+    made = []
+
+    def make_env(num_envs: int, seed: int, device: torch.device) -> PushTask:
+        made.append(PushTask(num_envs, seed, device))
+        return made[-1]
+
+    networks = []
+    original = Ppo.__init__
+
+    def remember(self: Ppo, env: PushTask, ppo_cfg: PpoCfg) -> None:
+        original(self, env, ppo_cfg)
+        networks.append(self.model)
+
+    Ppo.__init__ = remember
+    result = train(cfg, make_env)
+    outcome = {"model": networks[0].state_dict(), "seed": made[0].seed, "num_envs": made[0].num_envs}
+    torch.save({**outcome, "iteration": result.iteration}, path + str(rank))

@@ -1,0 +1,240 @@
+import importlib
+import math
+
+import newton
+import numpy as np
+import pytest
+import warp as wp
+from hypothesis import given
+from hypothesis import strategies as st
+from newton.actuators import ClampingDCMotor, DrivePD
+
+from jumper_warp.robot.motors import MotorCfg, MotorKindCfg, jumping_motors, motor_arrays, walking_motors
+from jumper_warp.sim.precision import float64_kernels
+from kernels.actuation import motors as actuator
+
+float64_kernels()
+actuator64 = importlib.import_module("kernels_float64.actuation.motors")
+
+MOTOR_COORDS = [7, 8, 10, 12, 13, 15, 17, 18, 20, 22, 23, 25]
+MOTOR_DOFS = [6, 7, 9, 11, 12, 14, 16, 17, 19, 21, 22, 24]
+COORDS, DOFS = 43, 38
+
+
+def make_motor(**values):
+    """A motor whose torque is its saturation, unless told otherwise: 18 N m to 20 rad/s, none at 40 rad/s."""
+    motor = actuator.MotorParams()
+    defaults = dict(kp=1.0e4, kd=0.0, saturation=18.0, peak=18.0, cutoff_speed=20.0, no_load_speed=40.0, offset=0.0)
+    for name, value in (defaults | dict(fade_start=1.0e3, fade_end=2.0e3) | values).items():
+        setattr(motor, name, value)
+    return motor
+
+
+def transversal_motor(kp=1.0e4, kd=0.0):
+    """The robot's transversal motor with the jumping torque."""
+    rpm = math.pi / 30.0
+    overspeed = dict(fade_start=math.radians(2000.0), fade_end=math.radians(2500.0))
+    return make_motor(kp=kp, kd=kd, cutoff_speed=225.0 * rpm, no_load_speed=382.0 * rpm, **overspeed)
+
+
+def test_position_control_by_hand():
+    motor = make_motor(kp=17.0, kd=0.8, offset=0.1)
+    # 17 (0.5 - (0.2 + 0.1)) - 0.8 * 1 = 2.6
+    assert actuator.motor_torque(0.5, 0.2, 1.0, motor) == pytest.approx(2.6, abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("vel", "torque"), [(0.0, 18.0), (20.0, 18.0), (25.0, 13.5), (30.0, 9.0), (40.0, 0.0), (45.0, 0.0)]
+)
+def test_driving_torque_is_flat_then_linear_to_zero_at_no_load(vel, torque):
+    assert actuator.motor_torque(1.0, 0.0, vel, make_motor()) == pytest.approx(torque, abs=1e-5)
+    assert actuator.motor_torque(-1.0, 0.0, -vel, make_motor()) == pytest.approx(-torque, abs=1e-5)
+
+
+@pytest.mark.parametrize(("vel", "torque"), [(0.0, 18.0), (24.0, 18.0), (25.0, 18.0), (30.0, 12.0), (40.0, 0.0)])
+def test_saturation_below_the_peak_holds_until_the_motor_gives_less(vel, torque):
+    # the motor gives 24 (40 - v) / 20 N m beyond the cutoff: 18 at 25 rad/s
+    assert actuator.motor_torque(1.0, 0.0, vel, make_motor(peak=24.0)) == pytest.approx(torque, abs=1e-5)
+
+
+@pytest.mark.parametrize("vel", [5.0, 30.0, 60.0])
+def test_braking_keeps_full_torque(vel):
+    assert actuator.motor_torque(1.0, 0.0, -vel, make_motor()) == pytest.approx(18.0)
+    assert actuator.motor_torque(-1.0, 0.0, vel, make_motor()) == pytest.approx(-18.0)
+
+
+@pytest.mark.parametrize(("vel", "torque"), [(35.0, 18.0), (40.0, 9.0), (44.0, 1.8), (45.0, 0.0), (50.0, 0.0)])
+def test_overspeed_fades_driving_and_braking_alike(vel, torque):
+    motor = make_motor(cutoff_speed=100.0, no_load_speed=200.0, fade_start=35.0, fade_end=45.0)
+    for target, speed in [(1.0, vel), (1.0, -vel)]:
+        assert actuator.motor_torque(target, 0.0, speed, motor) == pytest.approx(torque, abs=1e-5)
+        assert actuator.motor_torque(-target, 0.0, -speed, motor) == pytest.approx(-torque, abs=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("vel", "torque"),
+    [
+        (23.56, 18.0),
+        (30.0, 10.951),  # 18 (40.003 - 30) / (40.003 - 23.562)
+        (35.0, 5.419),  # 18 (40.003 - 35) / 16.441 = 5.477, faded by (43.633 - 35) / 8.727
+        (37.0, 2.499),  # 3.288 faded by 0.7601
+        (-40.0, 7.494),  # braking: 18 faded by 0.4163
+    ],
+)
+def test_transversal_motor_curve(vel, torque):
+    assert actuator.motor_torque(1.0, 0.0, vel, transversal_motor()) == pytest.approx(torque, abs=2e-3)
+
+
+finite = st.floats(-60.0, 60.0, width=32)
+
+
+@given(target=finite, pos=finite, vel=finite)
+def test_torque_is_bounded_and_odd(target, pos, vel):
+    motor = transversal_motor(kp=17.0, kd=0.8)
+    torque = actuator.motor_torque(target, pos, vel, motor)
+    assert abs(torque) <= 18.0 + 1e-5
+    assert actuator.motor_torque(-target, -pos, -vel, motor) == pytest.approx(-torque, abs=1e-5)
+
+
+def test_equals_newtons_drive_and_dc_motor_below_no_load_speed():
+    num = 400
+    rng = np.random.default_rng(3)
+    cutoff, no_load, saturation = 225.0 * math.pi / 30.0, 382.0 * math.pi / 30.0, 18.0
+    clamping = dict(
+        max_motor_effort=saturation, velocity_limit=no_load, saturation_effort=saturation / (1.0 - cutoff / no_load)
+    )
+    builder = newton.ModelBuilder()
+    for _ in range(num):
+        joint = builder.add_joint_revolute(parent=-1, child=builder.add_link(mass=1.0, inertia=wp.mat33(np.eye(3))))
+        builder.add_articulation([joint])
+        builder.add_actuator(DrivePD, index=joint, kp=17.0, kd=0.8, clamping=[(ClampingDCMotor, clamping)])
+    model = builder.finalize(device="cpu")
+    state, control = model.state(), model.control()
+    # every speed at which the over-speed protection is idle: 2000 deg/s = 34.9 rad/s
+    target, pos, vel = rng.uniform(-3.0, 3.0, num), rng.uniform(-3.0, 3.0, num), rng.uniform(-34.5, 34.5, num)
+    control.joint_target_q.assign(target)
+    state.joint_q.assign(pos)
+    state.joint_qd.assign(vel)
+    newton_actuator = model.actuators[0]
+    newton_actuator.step(state, control, newton_actuator.state(), newton_actuator.state(), dt=1.0 / 480.0)
+    expected = control.joint_f.numpy()
+    assert np.sum((np.abs(expected) > 1.0) & (np.abs(expected) < 17.9)) > 50, "the oracle never left saturation"
+
+    motor = transversal_motor(kp=17.0, kd=0.8)
+    ours = [actuator.motor_torque(*map(float, args), motor) for args in zip(target, pos, vel, strict=True)]
+    np.testing.assert_allclose(ours, expected, atol=2e-4)
+
+
+def distinct_motors(num_worlds, module=actuator, requires_grad=False):
+    """Motors with their own constants each, and what these are."""
+    motors = motor_arrays(jumping_motors(), num_worlds, module=module, device="cpu", requires_grad=requires_grad)
+    rng = np.random.default_rng(5)
+    for name in ("kp", "kd", "saturation", "peak", "cutoff_speed", "no_load_speed"):
+        array = getattr(motors, name)
+        array.assign(array.numpy() * rng.uniform(0.9, 1.1, (12, num_worlds)))
+    motors.offset.assign(rng.uniform(-0.1, 0.1, (12, num_worlds)))
+    return motors
+
+
+def test_kernel_writes_each_motors_torque_and_nothing_else():
+    num_worlds = 16
+    rng = np.random.default_rng(1)
+    motors = distinct_motors(num_worlds)
+    q, qd = rng.uniform(-1.0, 1.0, (num_worlds, COORDS)), rng.uniform(-45.0, 45.0, (num_worlds, DOFS))
+    target = rng.uniform(-4.0, 4.0, (12, num_worlds))
+    joint_f = wp.full(num_worlds * DOFS, 7.0, dtype=float, device="cpu")
+    arrays = [wp.array(x, dtype=float, device="cpu") for x in (target, q.ravel(), qd.ravel())]
+    wp.launch(actuator.motor_torque_kernel, (12, num_worlds), [*arrays, COORDS, DOFS, motors], [joint_f], device="cpu")
+
+    pos, vel = q[:, MOTOR_COORDS].T, qd[:, MOTOR_DOFS].T
+    command = motors.kp.numpy() * (target - pos - motors.offset.numpy()) - motors.kd.numpy() * vel
+    speeds = motors.cutoff_speed.numpy(), motors.no_load_speed.numpy()
+    slope = np.clip((speeds[1] - np.abs(vel)) / (speeds[1] - speeds[0]), 0.0, 1.0)
+    available = motors.peak.numpy() * np.where(command * vel > 0.0, slope, 1.0)
+    bound = np.minimum(motors.saturation.numpy(), available)
+    fade = np.interp(np.abs(vel), np.radians([2000.0, 2500.0]), [1.0, 0.0])
+    torque = np.clip(command, -bound, bound) * fade
+
+    written = joint_f.numpy().reshape(num_worlds, DOFS)
+    np.testing.assert_allclose(written[:, MOTOR_DOFS].T, torque, atol=1e-4)
+    others = np.setdiff1d(np.arange(DOFS), MOTOR_DOFS)
+    assert np.all(written[:, others] == 7.0)
+
+
+def test_gradients_equal_central_differences():
+    num_worlds, step = 64, 1.0e-6
+    rng = np.random.default_rng(2)
+    motors = distinct_motors(num_worlds, actuator64, requires_grad=True)
+    weights = wp.array(rng.uniform(0.5, 1.5, num_worlds * DOFS), dtype=wp.float64, device="cpu")
+
+    def array(low, high, shape):
+        return wp.array(rng.uniform(low, high, shape), dtype=wp.float64, device="cpu", requires_grad=True)
+
+    inputs = {
+        "target": array(-2.5, 2.5, (12, num_worlds)),
+        "q": array(-0.5, 0.5, num_worlds * COORDS),
+        "qd": array(-42.0, 42.0, num_worlds * DOFS),
+    }
+
+    def torques():
+        joint_f = wp.zeros(num_worlds * DOFS, dtype=wp.float64, device="cpu", requires_grad=True)
+        wp.launch(
+            actuator64.motor_torque_kernel,
+            (12, num_worlds),
+            [*inputs.values(), COORDS, DOFS, motors],
+            [joint_f],
+            device="cpu",
+        )
+        return joint_f
+
+    with wp.Tape() as tape:
+        joint_f = torques()
+    tape.backward(grads={joint_f: weights})
+
+    constants = ("kp", "kd", "saturation", "peak", "cutoff_speed", "no_load_speed", "offset")
+    for name, varied in (inputs | {name: getattr(motors, name) for name in constants}).items():
+        base, direction = varied.numpy().copy(), rng.normal(size=varied.shape)
+        sides = []
+        for sign in (1.0, -1.0):
+            varied.assign(base + sign * step * direction)
+            sides.append(np.dot(weights.numpy(), torques().numpy()))
+        varied.assign(base)
+        numeric = (sides[0] - sides[1]) / (2.0 * step)
+        assert abs(numeric) > 1e-2, f"{name}: nothing to compare"
+        assert np.sum(varied.grad.numpy() * direction) == pytest.approx(numeric, rel=1e-6), name
+
+
+def test_saturation_is_cut_to_what_the_motor_gives():
+    # peak: 18 N m lateral, 24.8 N m transversal
+    full = jumping_motors(24.8)
+    assert (full.lateral.saturation, full.transversal.saturation) == (18.0, 24.8)
+    task = jumping_motors(18.0, lateral_torque=10.0)
+    assert (task.lateral.saturation, task.transversal.saturation) == (10.0, 18.0)
+
+
+def test_arrays_repeat_lateral_and_transversal_constants():
+    motors = motor_arrays(walking_motors(), 2, device="cpu")
+    np.testing.assert_allclose(motors.kd.numpy(), np.tile([[2.07], [0.92], [0.92]], (4, 2)), rtol=1e-6)
+    np.testing.assert_allclose(motors.saturation.numpy(), np.full((12, 2), 10.0))
+    np.testing.assert_allclose(motors.no_load_speed.numpy()[:3, 1], [49.218, 40.003, 40.003], atol=1e-3)
+    assert motors.fade_start == pytest.approx(34.9066, abs=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("bad", "message"),
+    [
+        (dict(saturation=0.0), "saturation"),
+        (dict(kp=math.nan), "kp"),
+        (dict(kd=-1.0), "kd"),
+        (dict(no_load_speed=20.0), "no_load_speed"),
+    ],
+)
+def test_impossible_motor_is_refused(bad, message):
+    good = dict(kp=17.0, kd=0.8, saturation=18.0, peak=24.8, cutoff_speed=20.0, no_load_speed=40.0)
+    with pytest.raises(ValueError, match=message):
+        MotorKindCfg(**(good | bad))
+    kind = MotorKindCfg(**good)
+    with pytest.raises(ValueError, match="fade_start"):
+        MotorCfg(kind, kind, fade_start=3.0, fade_end=2.0)
+    with pytest.raises(ValueError, match="num_worlds"):
+        motor_arrays(MotorCfg(kind, kind), 0, device="cpu")

@@ -1,0 +1,304 @@
+import importlib
+import math
+
+import numpy as np
+import pytest
+import warp as wp
+from hypothesis import given
+from hypothesis import strategies as st
+
+from jumper_warp.robot.motors import (
+    FilterCfg,
+    LimitsCfg,
+    filter_params,
+    horizontal_jump_filter,
+    jumping_motors,
+    motor_arrays,
+    vertical_jump_filter,
+    walking_filter,
+)
+from jumper_warp.sim.precision import float64_kernels
+from kernels.actuation import command_filter
+from kernels.actuation.command_filter import FilterParams, filter_leg
+from kernels.actuation.motors import MotorArrays, load_motor, motor_torque
+from kernels.scalar import real, vec3
+
+float64_kernels()
+filter64 = importlib.import_module("kernels_float64.actuation.command_filter")
+
+JUMP = filter_params(vertical_jump_filter())
+WALK = filter_params(walking_filter())
+COORDS, DOFS = 43, 38
+MOTOR_COORDS = [7, 8, 10, 12, 13, 15, 17, 18, 20, 22, 23, 25]
+MOTOR_DOFS = [6, 7, 9, 11, 12, 14, 16, 17, 19, 21, 22, 24]
+
+
+def safe_leg(target, pos, vel=(0.0, 0.0, 0.0), params=JUMP):
+    """Filter one leg; everything in degrees and degrees per second."""
+    args = [vec3(*(math.radians(x) for x in values)) for values in (target, pos, vel)]
+    return [math.degrees(x) for x in command_filter.filter_leg(*args, params)]
+
+
+# Each case: raw target, position, velocity, safe target of (lateral, outer, inner) [deg, deg/s]. Jumping: lateral
+# -15..15 (hard zones 10, 15), transversal -30..140 (10, 15), sum 0..240 (35, 45), horizon 8/60 s.
+JUMP_CASES = {
+    "within the limits: untouched": ((10, 100, 90), (0, 50, 50), (0, 0, 0), (10, 100, 90)),
+    "far from the limits: a command beyond them is untouched": ((0, 200, 45), (0, 45, 45), (0, 300, 0), (0, 200, 45)),
+    # the margin of 60 deg lasts 60/900 = 1/15 s, half the horizon: half of the 60 deg beyond 140 go
+    "half the horizon left: half way to the limit": ((0, 200, 0), (0, 80, 0), (0, 900, 0), (0, 170, 0)),
+    "a quarter of the horizon left": ((0, 200, 0), (0, 80, 0), (0, 1800, 0), (0, 155, 0)),
+    "moving away from the near limit: untouched": ((0, 200, 45), (0, 80, 45), (0, -300, 0), (0, 200, 45)),
+    # lower limit, -30: a margin of 40 deg at 600 deg/s lasts 1/15 s
+    "lower limit, half way": ((0, -50, 90), (0, 10, 90), (0, -600, 0), (0, -40, 90)),
+    # 7 deg before 140, hard zone 15, at rest
+    "upper hard zone, commanded toward: clamped": ((0, 200, 20), (0, 133, 20), (0, 0, 0), (0, 140, 20)),
+    "upper hard zone, commanded away: untouched": ((0, -45, 60), (0, 133, 20), (0, 900, 0), (0, -45, 60)),
+    "lower hard zone, commanded toward: clamped": ((0, -60, 90), (0, -25, 90), (0, 0, 0), (0, -30, 90)),
+    "lower hard zone, commanded away: untouched": ((0, 150, 60), (0, -25, 90), (0, -900, 0), (0, 150, 60)),
+    "lateral upper hard zone is 15 deg": ((40, 45, 45), (1, 45, 45), (0, 0, 0), (15, 45, 45)),
+    "lateral lower hard zone is 10 deg": ((-40, 45, 45), (-6, 45, 45), (0, 0, 0), (-15, 45, 45)),
+    "outside above: clamped": ((0, 150, 20), (0, 145, 20), (0, -900, 0), (0, 140, 20)),
+    "outside below: clamped": ((-20, 45, 45), (-16, 45, 45), (0, 0, 0), (-15, 45, 45)),
+    # the sum: 230 of 240, hard zone 45; 250 commanded, so 5 deg each
+    "sum, hard zone toward: both give way equally": ((0, 130, 120), (0, 120, 110), (0, 0, 0), (0, 125, 115)),
+    "sum, hard zone away: untouched": ((0, 100, 110), (0, 120, 110), (0, 900, 0), (0, 100, 110)),
+    # sum 0..240 with 150 at 1350 deg/s: 90/1350 = 1/15 s, half of the 40 deg too much go, 10 deg each
+    "sum, half the horizon left": ((0, 140, 140), (0, 75, 75), (0, 675, 675), (0, 130, 130)),
+    "sum, one thigh's speed cancels the other's": ((0, 140, 140), (0, 75, 75), (0, 675, -675), (0, 140, 140)),
+    # 20 deg of sum, hard zone 35; -50 commanded, so 25 deg each; the single angles are far from their own limits
+    "sum, lower hard zone": ((0, -20, -30), (0, 10, 10), (0, 0, 0), (0, 5, -5)),
+    "sum outside below: clamped": ((0, -15, 5), (0, -5, -5), (0, 900, 900), (0, -10, 10)),
+    # single limits first: the outer 170 -> 140, then 140 + 130 is 30 too much
+    "single limits come before the sum": ((0, 170, 130), (0, 130, 105), (0, 0, 0), (0, 125, 115)),
+}
+
+
+@pytest.mark.parametrize("case", JUMP_CASES)
+def test_jump_filter_by_hand(case):
+    target, pos, vel, safe = JUMP_CASES[case]
+    assert safe_leg(target, pos, vel) == pytest.approx(safe, abs=2e-4)
+
+
+# walking: no hard zones, horizon 5/60 s, so the speed floor of 60 deg/s matters within 5 deg
+WALK_CASES = {
+    "slower than the floor: 2 deg at 60 deg/s last 2/5 of the horizon": (160, 138, 10, 148),
+    "at rest the floor counts too": (160, 138, 0, 148),
+    "faster than the floor: 10 deg at 240 deg/s last half the horizon": (160, 130, 240, 150),
+    "outside the horizon": (160, 120, 240, 160),
+    "no hard zone": (160, 134, 0, 160),
+    "outside": (160, 141, -100, 140),
+    # 37.5 deg at 900 deg/s last half the horizon: one weight holds for both limits
+    "near one limit, the other binds too": (-60, 102.5, 900, -45),
+}
+
+
+@pytest.mark.parametrize("case", WALK_CASES)
+def test_walking_filter_by_hand(case):
+    target, pos, vel, safe = WALK_CASES[case]
+    assert safe_leg((0, target, 0), (0, pos, 0), (0, vel, 0), WALK)[1] == pytest.approx(safe, abs=2e-4)
+
+
+def test_filters_are_the_published_ones():
+    vertical, horizontal, walking = vertical_jump_filter(), horizontal_jump_filter(), walking_filter()
+    assert (vertical.sum.upper, vertical.sum.lower_zone, vertical.sum.upper_zone) == (240.0, 35.0, 45.0)
+    assert (horizontal.sum.upper, horizontal.sum.lower_zone, horizontal.sum.upper_zone) == (220.0, 30.0, 30.0)
+    assert vertical.horizon == horizontal.horizon == pytest.approx(0.13333, abs=1e-5)
+    assert walking.horizon == pytest.approx(0.08333, abs=1e-5)
+    for limits in (walking.lateral, walking.transversal, walking.sum):
+        assert limits.lower_zone == limits.upper_zone == 0.0
+    params = filter_params(horizontal)
+    assert params.sum.upper == pytest.approx(3.83972, abs=1e-5)  # 220 deg
+    assert params.lateral.lower_zone == pytest.approx(0.174533, abs=1e-6)  # 10 deg
+    assert params.speed_floor == pytest.approx(1.047198, abs=1e-6)  # 60 deg/s
+
+
+@pytest.mark.parametrize("command", [math.inf, -math.inf, 3.0e38])
+@pytest.mark.parametrize("params", [JUMP, WALK], ids=["jump", "walk"])
+@pytest.mark.parametrize("pos", [(0.0, 45.0, 45.0), (15.0, 140.0, 100.0), (-30.0, -90.0, 90.0)])
+def test_endless_command_becomes_finite(command, params, pos):
+    assert np.all(np.abs(safe_leg((command,) * 3, pos, (0.0, 0.0, 0.0), params)) <= 720.1)
+
+
+ROUNDING = 1.0e-4
+"""[deg] Nearer to a limit, degrees and single precision radians may be on different sides of it."""
+angle = st.floats(-300.0, 300.0, width=32)
+speed = st.floats(-2000.0, 2000.0, width=32)
+
+
+@given(raw=st.tuples(angle, angle), pos=st.tuples(angle, angle), vel=st.tuples(speed, speed))
+def test_transversal_commands_give_way_to_the_sum_equally(raw, pos, vel):
+    wide = LimitsCfg(-1.0e4, 1.0e4)
+    only_sum = filter_params(FilterCfg(wide, wide, sum=LimitsCfg(0.0, 240.0, 35.0, 45.0), horizon=0.1))
+    _, outer, inner = safe_leg((0.0, *raw), (0.0, *pos), (0.0, *vel), only_sum)
+    assert outer - raw[0] == pytest.approx(inner - raw[1], abs=1e-3)
+    if not -ROUNDING <= sum(pos) <= 240.0 + ROUNDING:
+        assert -1e-3 <= outer + inner <= 240.001
+
+
+@given(raw=angle, pos=st.floats(-200.0, 200.0, width=32), vel=speed)
+def test_outside_or_toward_the_limit_in_its_hard_zone_the_command_ends_within(raw, pos, vel):
+    outside = not -15.0 - ROUNDING <= pos <= 15.0 + ROUNDING
+    toward = (pos > 0.001 and raw > pos) or (pos < -5.001 and raw < pos)
+    safe = safe_leg((raw, 45.0, 45.0), (pos, 45.0, 45.0), (vel, 0.0, 0.0))[0]
+    if outside or toward:
+        assert -15.001 <= safe <= 15.001
+    assert min(raw, -15.0) - 1e-3 <= safe <= max(raw, 15.0) + 1e-3
+
+
+@given(raw=st.tuples(angle, angle, angle), pos=st.floats(60.0, 80.0, width=32), vel=st.floats(-200.0, 200.0, width=32))
+def test_far_from_the_limits_nothing_is_touched(raw, pos, vel):
+    # 60 deg of margin and more at 200 deg/s at most, 75 deg of the sum at 400: beyond the horizon
+    walk = (0.0, pos, pos)
+    assert safe_leg(raw, walk, (0.0, vel, vel), WALK) == pytest.approx(raw, abs=1e-3)
+
+
+@given(raw=st.tuples(angle, angle), pos=angle, vel=speed)
+def test_a_greater_command_never_gives_a_smaller_target(raw, pos, vel):
+    low, high = sorted(raw)
+    # without hard zones: these judge by the command's direction, which lets one away from the limit pass untouched
+    safe = [safe_leg((command, 45.0, 45.0), (pos, 45.0, 45.0), (vel, 0.0, 0.0), WALK)[0] for command in (low, high)]
+    assert safe[0] <= safe[1] + 1e-3
+
+
+def launch(module, target, q, qd, params, requires_grad=False):
+    """Run the filter kernel of either precision; returns the safe targets."""
+    safe = wp.zeros(target.shape, dtype=module.real, device="cpu", requires_grad=requires_grad)
+    dim = (4, target.shape[1])
+    wp.launch(module.command_filter_kernel, dim, [target, q, qd, COORDS, DOFS, params], [safe], device="cpu")
+    return safe
+
+
+def test_kernel_reads_and_writes_every_leg_of_every_world():
+    num_worlds = 3
+    rng = np.random.default_rng(4)
+    q, qd = np.full((num_worlds, COORDS), math.nan), np.full((num_worlds, DOFS), math.nan)
+    q[:, MOTOR_COORDS] = rng.uniform(-1.0, 3.0, (num_worlds, 12))
+    qd[:, MOTOR_DOFS] = rng.uniform(-20.0, 20.0, (num_worlds, 12))
+    target = rng.uniform(-2.0, 4.0, (12, num_worlds))
+    arrays = [wp.array(x, dtype=float, device="cpu") for x in (target, q.ravel(), qd.ravel())]
+    safe = launch(command_filter, *arrays, JUMP).numpy()
+    for world in range(num_worlds):
+        for leg in range(4):
+            mine = slice(3 * leg, 3 * leg + 3)
+            pos, vel = q[world, MOTOR_COORDS][mine], qd[world, MOTOR_DOFS][mine]
+            expected = command_filter.filter_leg(vec3(*target[mine, world]), vec3(*pos), vec3(*vel), JUMP)
+            np.testing.assert_allclose(safe[mine, world], list(expected), atol=1e-5)
+
+
+@pytest.mark.parametrize("cfg", [vertical_jump_filter(), walking_filter()], ids=["jump", "walk"])
+def test_gradients_equal_central_differences(cfg):
+    num_worlds, step = 64, 1.0e-7
+    rng = np.random.default_rng(6)
+    params = filter_params(cfg, module=filter64)
+    motors = rng.uniform(-0.5, 2.4, (num_worlds, 12))
+    q, qd = np.zeros((num_worlds, COORDS)), np.zeros((num_worlds, DOFS))
+    q[:, MOTOR_COORDS], qd[:, MOTOR_DOFS] = motors, rng.uniform(-25.0, 25.0, (num_worlds, 12))
+    values = (rng.uniform(-2.0, 4.0, (12, num_worlds)), q.ravel(), qd.ravel())
+    inputs = [wp.array(x, dtype=wp.float64, device="cpu", requires_grad=True) for x in values]
+    weights = rng.uniform(0.5, 1.5, (12, num_worlds))
+
+    with wp.Tape() as tape:
+        safe = launch(filter64, *inputs, params, requires_grad=True)
+    tape.backward(grads={safe: wp.array(weights, dtype=wp.float64, device="cpu")})
+    for name, varied, base in zip(("target", "q", "qd"), inputs, values, strict=True):
+        direction = rng.normal(size=base.shape)
+        sides = []
+        for sign in (1.0, -1.0):
+            varied.assign(base + sign * step * direction)
+            sides.append(np.sum(weights * launch(filter64, *inputs, params).numpy()))
+        varied.assign(base)
+        numeric = (sides[0] - sides[1]) / (2.0 * step)
+        assert abs(numeric) > 0.1, f"{name}: nothing to compare"
+        assert np.sum(varied.grad.numpy() * direction) == pytest.approx(numeric, rel=1e-5), name
+
+
+def test_gradient_of_the_blend_by_hand():
+    # the upper limit u = 140 deg, margin 60 deg, w = 1 - margin / (v T): d safe / d raw = 1 - w = 1/2 at half the
+    # horizon; d safe / d vel = -(raw - u) margin / (v^2 T) = -(60 deg) (60 deg) / (900^2 (8/60)) = -1/30 s
+    q, qd = np.zeros(COORDS), np.zeros(DOFS)
+    q[8], qd[7] = math.radians(80.0), math.radians(900.0)
+    target = np.zeros((12, 1))
+    target[1] = math.radians(200.0)
+    inputs = [wp.array(x, dtype=wp.float64, device="cpu", requires_grad=True) for x in (target, q, qd)]
+    params = filter_params(vertical_jump_filter(), module=filter64)
+    with wp.Tape() as tape:
+        safe = launch(filter64, *inputs, params, requires_grad=True)
+    tape.backward(grads={safe: wp.array(np.eye(12)[:, 1:2], dtype=wp.float64, device="cpu")})
+    assert inputs[0].grad.numpy()[1, 0] == pytest.approx(0.5)
+    assert inputs[2].grad.numpy()[7] == pytest.approx(-1.0 / 30.0)
+
+
+@wp.kernel(enable_backward=False)
+def overshoot_kernel(
+    # in
+    command: wp.array2d(dtype=vec3),
+    filtered: bool,
+    params: FilterParams,
+    motors: MotorArrays,
+    inertia: real,
+    # out
+    overshoot: wp.array2d(dtype=real),
+):
+    """Drive three free joints through commands at 60 Hz and motors at 480 Hz; overshoot of each and of the sum."""
+    world = wp.tid()
+    dt = real(1.0 / 480.0)
+    pos, vel, over = vec3(0.0, 0.7854, 0.7854), vec3(), wp.vec4()
+    for step in range(command.shape[0]):
+        target = command[step, world]
+        if filtered:
+            target = filter_leg(target, pos, vel, params)
+        for _ in range(8):
+            for j in range(3):
+                vel[j] += dt / inertia * motor_torque(target[j], pos[j], vel[j], load_motor(motors, j, world))
+            pos += dt * vel
+            total = pos[1] + pos[2]
+            over[0] = wp.max(over[0], wp.max(pos[0] - params.lateral.upper, params.lateral.lower - pos[0]))
+            over[1] = wp.max(over[1], wp.max(pos[1] - params.transversal.upper, params.transversal.lower - pos[1]))
+            over[2] = wp.max(over[2], wp.max(pos[2] - params.transversal.upper, params.transversal.lower - pos[2]))
+            over[3] = wp.max(over[3], wp.max(total - params.sum.upper, params.sum.lower - total))
+    for k in range(4):
+        overshoot[k, world] = over[k]
+
+
+def worst_overshoot(low, high, filtered):
+    """Largest overshoot [deg] of lateral, outer, inner and sum in 64 runs of 5 s, jumping between two commands."""
+    rng = np.random.default_rng(0)
+    steps, num_worlds, ends = 300, 64, np.radians([low, high])
+    last = rng.integers(0, 2, (num_worlds, 3))
+    commands = np.empty((steps, num_worlds, 3))
+    for step in range(steps):
+        last = np.where(rng.random(last.shape) < 0.1, 1 - last, last)
+        commands[step] = np.take_along_axis(ends, last, axis=0)
+    overshoot = wp.zeros((4, num_worlds), dtype=float, device="cpu")
+    motors = motor_arrays(jumping_motors(), num_worlds, device="cpu")
+    inputs = [wp.array(commands, dtype=vec3, device="cpu"), filtered, JUMP, motors, 0.02]
+    wp.launch(overshoot_kernel, num_worlds, inputs, [overshoot], device="cpu")
+    return np.degrees(overshoot.numpy()).max(axis=1)
+
+
+def test_wildest_actions_overshoot_little_with_the_filter_only():
+    # a free joint of 0.02 kg m^2; commands are bounded by the actions: 45 +- 90 deg transversal, +-15 deg lateral
+    low, high = (-15.0, -45.0, -45.0), (15.0, 135.0, 135.0)
+    assert np.all(worst_overshoot(low, high, filtered=True) < [0.1, 10.0, 10.0, 20.0])
+    assert np.all(worst_overshoot(low, high, filtered=False)[1:] > [20.0, 20.0, 90.0])
+
+
+def test_commands_far_beyond_the_limits_overshoot_less_than_they_ask():
+    low, high = (-180.0,) * 3, (180.0,) * 3
+    assert np.all(worst_overshoot(low, high, filtered=True) < [30.0, 21.0, 21.0, 60.0])
+    assert np.all(worst_overshoot(low, high, filtered=False) > [120.0, 120.0, 120.0, 300.0])
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: LimitsCfg(10.0, 10.0), "rise"),
+        (lambda: LimitsCfg(math.nan, 10.0), "finite"),
+        (lambda: LimitsCfg(0.0, 10.0, lower_zone=-1.0), "hard zones"),
+        (lambda: LimitsCfg(0.0, 10.0, 6.0, 6.0), "overlap"),
+        (lambda: FilterCfg(LimitsCfg(0, 1), LimitsCfg(0, 1), LimitsCfg(0, 1), horizon=0.0), "horizon"),
+    ],
+)
+def test_impossible_filter_is_refused(make, message):
+    with pytest.raises(ValueError, match=message):
+        make()

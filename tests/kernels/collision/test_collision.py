@@ -1,0 +1,338 @@
+import importlib
+from functools import cache
+
+import numpy as np
+import pytest
+import warp as wp
+from coal_shapes import box, capsule, coal_distance
+from scipy.spatial.transform import Rotation
+
+from jumper_warp.sim.precision import float64_kernels
+from kernels.collision import robot as collision_module
+from kernels.kinematics import geometry as geometry_module
+from kernels.kinematics.geometry import LegGeometry
+from kernels.scalar import quat, vec3
+from kernels.terrain import ground
+from kernels.terrain.ground import Ground
+
+wp.set_module_options({"enable_backward": False})
+
+LEGS = ((1, 1), (1, -1), (-1, 1), (-1, -1))  # FL, FR, BL, BR as (front, side)
+PAIRS = ((0, 1), (2, 3), (0, 2), (1, 3))
+FLAGS = (
+    "BODY_GROUND",
+    "HOUSING_GROUND",
+    "THIGH_GROUND",
+    "KNEE_GROUND",
+    "SHANK_GROUND",
+    "LEG_LEG",
+    "LEG_SELF",
+    "LEG_SHELL",
+)
+MASKS = np.array([getattr(collision_module, name) for name in FLAGS])
+THIGH, SHANK, PAW, HOUSING = 0.019, 0.012, 0.025, 0.048  # radii [m]
+# shell boxes [m]: smallest and largest corner
+NOSE = ((-0.343, -0.05, -0.049), (0.343, 0.05, 0.099))
+TRUNK = ((-0.144, -0.112, -0.049), (0.144, 0.112, 0.099))
+FRONT_DRUMS = ((0.081, -0.154, -0.049), (0.144, 0.154, 0.049))
+REAR_DRUMS = ((-0.144, -0.199, -0.049), (-0.080, 0.199, 0.049))
+
+
+def leg_array(module=geometry_module):
+    legs = []
+    for front, side in LEGS:
+        leg = module.LegGeometry()
+        leg.hip = wp.vec3d(front * 0.1433, side * (0.105 if front > 0 else 0.150), 0.0)
+        leg.front, leg.side = front, side
+        leg.outer_x, leg.inner_x = front * 0.1417, front * 0.0517
+        leg.plane_y, leg.knee_y = side * 0.05945, side * 0.00075
+        leg.thigh, leg.shank, leg.paw_radius = 0.175, 0.3, PAW
+        legs.append(leg)
+    return wp.array(legs, dtype=module.LegGeometry, device="cpu")
+
+
+def make_ground(module=ground, heights=None):
+    """A plane, or heights [m] over x and y within ±2 m."""
+    result = module.Ground()
+    result.rows, result.cols = (0, 0) if heights is None else heights.shape
+    result.half_x = result.half_y = 2.0
+    result.heights = wp.array(np.zeros((1, 1)) if heights is None else heights, dtype=wp.float32, device="cpu")
+    return result
+
+
+def joint_coordinates(pos, quat_xyzw, motors):
+    """Newton's joint_q, shape (n, 43), for motor angles [rad], shape (n, 12). Knees and loops are not read: NaN."""
+    motors = np.atleast_2d(motors)
+    joint_q = np.full((len(motors), 43), np.nan, np.float32)
+    joint_q[:, :3], joint_q[:, 3:7] = pos, quat_xyzw
+    for leg in range(4):
+        joint_q[:, 7 + 5 * leg + np.array([0, 1, 3])] = motors[:, 3 * leg : 3 * leg + 3]
+    return joint_q
+
+
+def collide(pos, quat_xyzw, motors_deg, margin=1.0, heights=None, module=collision_module):
+    """Flags and clearance [m], each shape (n,)."""
+    package = module.__package__.split(".")[0]
+    joint_q = joint_coordinates(pos, quat_xyzw, np.radians(motors_deg))
+    flags = wp.zeros(len(joint_q), dtype=wp.int32, device="cpu")
+    clearance = wp.zeros(len(joint_q), dtype=wp.float32, device="cpu")
+    legs = leg_array(importlib.import_module(f"{package}.kinematics.geometry"))
+    surface = make_ground(importlib.import_module(f"{package}.terrain.ground"), heights)
+    inputs = [legs, surface, wp.array(joint_q.ravel(), dtype=wp.float32, device="cpu"), 43, margin]
+    wp.launch(module.collision_kernel, len(joint_q), inputs=inputs, outputs=[flags, clearance], device="cpu")
+    return flags.numpy(), clearance.numpy()
+
+
+@wp.kernel
+def category_kernel(
+    legs: wp.array(dtype=LegGeometry),
+    surface: Ground,
+    joint_q: wp.array(dtype=wp.float32),
+    bound: float,
+    out: wp.array2d(dtype=wp.float32),
+):
+    """Distance of each category, in the order of FLAGS."""
+    world = wp.tid()
+    start = 43 * world
+    pos = vec3(joint_q[start], joint_q[start + 1], joint_q[start + 2])
+    rotation = wp.quat_to_matrix(quat(joint_q[start + 3], joint_q[start + 4], joint_q[start + 5], joint_q[start + 6]))
+    out[world, 0] = collision_module.body_ground_distance(surface, pos, rotation)
+    for k in range(1, 5):
+        out[world, k] = 1.0e6
+    for k in range(5, 8):
+        out[world, k] = bound
+    for leg in range(4):
+        capsules = collision_module.load_leg(legs, joint_q, start, leg)
+        over_ground = collision_module.leg_ground_distances(surface, capsules, pos, rotation)
+        for k in range(4):
+            out[world, 1 + k] = wp.min(out[world, 1 + k], over_ground[k])
+        for other in range(leg):
+            if leg + other != 3:
+                neighbour = collision_module.load_leg(legs, joint_q, start, other)
+                distance = collision_module.leg_leg_distance(capsules, neighbour, bound)
+                out[world, 5] = wp.min(out[world, 5], distance)
+        out[world, 6] = wp.min(out[world, 6], collision_module.leg_self_distance(capsules, bound))
+        out[world, 7] = wp.min(out[world, 7], collision_module.leg_shell_distance(capsules, bound))
+
+
+def category_distances(poses, bound=10.0, heights=None):
+    """Distances [m], shape (n, 8)."""
+    joint_q = joint_coordinates(*poses)
+    out = wp.zeros((len(joint_q), 8), dtype=wp.float32, device="cpu")
+    surface = make_ground(heights=heights)
+    inputs = [leg_array(), surface, wp.array(joint_q.ravel(), dtype=wp.float32, device="cpu"), bound]
+    wp.launch(category_kernel, len(joint_q), inputs=inputs, outputs=[out], device="cpu")
+    return out.numpy()
+
+
+def transversal_angles(rng, count, low, high, sum_low, sum_high):
+    """Pairs (outer, inner) in degrees, uniform over low..high where the sum lies in sum_low..sum_high."""
+    angles = rng.uniform(low, high, (8 * count, 2))
+    inside = (angles.sum(axis=1) >= sum_low) & (angles.sum(axis=1) <= sum_high)
+    return angles[inside][:count]
+
+
+@cache
+def random_poses():
+    """300 poses within the hard stops (and a little below the least sum), near the ground, in any attitude."""
+    rng = np.random.default_rng(7)
+    motors = np.hstack(
+        [
+            np.column_stack([rng.uniform(-50, 110, 300), transversal_angles(rng, 300, -30, 140, -20, 240)])
+            for _ in range(4)
+        ]
+    )
+    pos = rng.uniform((-1, -1, 0.1), (1, 1, 0.7), (300, 3))
+    return pos, Rotation.random(300, random_state=7).as_quat(), np.radians(motors)
+
+
+# ---- oracle: link positions by rotations, distances by coal
+
+
+def leg_points(leg, lateral, outer, inner):
+    """Transversal axes, knees and ankle [m] of one leg in the body frame: rows outer, inner, outer, inner, ankle."""
+    front, side = LEGS[leg]
+    hip = np.array([front * 0.1433, side * (0.105 if front > 0 else 0.150), 0.0])
+    housing = Rotation.from_rotvec([side * lateral, 0, 0])
+    axes = np.array([[front * 0.1417, side * 0.05945, 0.0], [front * 0.0517, side * 0.05945, 0.0]])
+    hanging = [0.0, side * 0.00075, -0.175]
+    knees = axes + [
+        Rotation.from_rotvec([0, -front * outer, 0]).apply(hanging),
+        Rotation.from_rotvec([0, front * inner, 0]).apply(hanging),
+    ]
+    across = complex(*(knees[1] - knees[0])[[0, 2]])
+    shank = 0.3 * np.exp(1j * (np.angle(across) + front * np.arccos(abs(across) / 0.6)))
+    ankle = knees[0] + [shank.real, 0.0, shank.imag]
+    return hip + housing.apply(np.vstack([axes, knees, ankle]))
+
+
+def links(points):
+    radii = (THIGH, THIGH, SHANK, SHANK)
+    bars = [capsule(points[k], points[min(k + 2, 4)], radius) for k, radius in enumerate(radii)]
+    return [*bars, capsule(points[4], points[4], PAW)]
+
+
+def self_distance(points):
+    bars = links(points)
+    upper = [capsule(points[k], (points[k] + points[4]) / 2, SHANK) for k in (2, 3)]
+    return min(coal_distance(*pair) for pair in ((bars[0], bars[1]), (bars[0], bars[3]), (bars[1], bars[2]), upper))
+
+
+def ground_oracle(pos, quat_xyzw, points):
+    """Lowest points [m] of shell, housings, thighs, knees and shanks over z = 0."""
+    turn = Rotation.from_quat(quat_xyzw)
+
+    def height(body_points):
+        return np.min(pos[2] + turn.apply(np.reshape(body_points, (-1, 3)))[:, 2])
+
+    corners = [
+        np.where(pick, high, low)
+        for low, high in (NOSE, TRUNK, FRONT_DRUMS, REAR_DRUMS)
+        for pick in np.ndindex(2, 2, 2)
+    ]
+    hips = np.array([[f * 0.1433, s * (0.105 if f > 0 else 0.150), 0.0] for f, s in LEGS])
+    tips = hips + [[f * 0.19, 0.0, 0.0] for f, _ in LEGS]
+    axes, knees = points[:, :2], points[:, 2:4]
+    lower_shank = knees + 0.9 * (points[:, 4:] - knees)
+    return (
+        height(corners),
+        height([hips, tips]) - HOUSING,
+        height([axes, (axes + knees) / 2]) - THIGH,
+        height(knees) - THIGH,
+        height([knees, lower_shank]) - SHANK,
+    )
+
+
+@cache
+def oracle_distances():
+    pos, quat_xyzw, motors = random_poses()
+    out = []
+    for i in range(len(pos)):
+        points = np.array([leg_points(leg, *motors[i, 3 * leg : 3 * leg + 3]) for leg in range(4)])
+        bars = [links(p) for p in points]
+        between = min(coal_distance(a, b) for one, two in PAIRS for a in bars[one] for b in bars[two])
+        shells = [[box(*NOSE), box(*TRUNK), box(*(REAR_DRUMS if f > 0 else FRONT_DRUMS))] for f, _ in LEGS]
+        shell = min(coal_distance(a, b) for leg in range(4) for a in bars[leg] for b in shells[leg])
+        own = min(self_distance(p) for p in points)
+        out.append((*ground_oracle(pos[i], quat_xyzw[i], points), between, own, shell))
+    return np.array(out)
+
+
+# ---- whole robot
+
+
+@pytest.mark.parametrize("category", range(8), ids=FLAGS)
+def test_category_distance_agrees_with_coal(category):
+    ours = category_distances(random_poses())[:, category]
+    np.testing.assert_allclose(ours, oracle_distances()[:, category], atol=1e-5)
+
+
+@pytest.mark.parametrize("bound", [0.0, 0.01, 0.1])
+def test_bound_cuts_off_and_changes_nothing_below(bound):
+    full = category_distances(random_poses())[:, 5:]
+    np.testing.assert_allclose(category_distances(random_poses(), bound)[:, 5:], np.minimum(full, bound), atol=1e-6)
+
+
+@pytest.mark.parametrize("margin", [0.0, 0.02, 5.0])
+def test_flags_and_clearance_agree_with_coal(margin):
+    pos, quat_xyzw, motors = random_poses()
+    flags, clearance = collide(pos, quat_xyzw, np.degrees(motors), margin)
+    expected = oracle_distances()
+    np.testing.assert_allclose(clearance, np.minimum(expected.min(axis=1), margin), atol=1e-5)
+    clear_cut = np.abs(expected) > 1e-5
+    raised = (flags[:, None] & MASKS) != 0
+    np.testing.assert_array_equal(raised[clear_cut], (expected < 0)[clear_cut])
+    assert raised.any(axis=0).all(), "every flag occurs among the poses"
+
+
+def test_double_precision_agrees():
+    float64_kernels()
+    module = importlib.import_module("kernels_float64.collision.robot")
+    pos, quat_xyzw, motors = random_poses()
+    single = collide(pos, quat_xyzw, np.degrees(motors))
+    double = collide(pos, quat_xyzw, np.degrees(motors), module=module)
+    np.testing.assert_allclose(single[1], double[1], atol=2e-6)
+
+
+LEVEL = (0.0, 0.0, 0.0, 1.0)
+STAND = (0, 45, 45) * 4
+CASES = {
+    "standing": ((0, 0, 0.397), LEVEL, STAND, ()),
+    # shell bottom 0.049 below the base, legs stretched out sideways above it
+    "belly 1 mm in the ground": ((0, 0, 0.048), LEVEL, (90, 45, 45) * 4, ("BODY_GROUND",)),
+    # the housings end 0.001 above the shell's bottom
+    "on the belly and housings": ((0, 0, 0.047), LEVEL, (90, 45, 45) * 4, ("BODY_GROUND", "HOUSING_GROUND")),
+    # outer knees at 0.175 cos(30°) = 0.152 under the axes, shanks folded up and down around them
+    "knees down": ((0, 0, 0.165), LEVEL, (0, 30, 30) * 4, ("KNEE_GROUND", "SHANK_GROUND")),
+    # upside down the trunk's top, 0.099 above the base, comes first
+    "on the back": ((0, 0, 0.098), (1.0, 0.0, 0.0, 0.0), STAND, ("BODY_GROUND",)),
+    # knees 0.09 + 2 * 0.175 sin(-8°) = 0.041 apart: thighs clear by 0.003, upper shanks (0.5 * 0.041 < 0.024) not
+    "shanks of a leg": ((0, 0, 1), LEVEL, (0, -8, -8, 0, 45, 45, 0, 45, 45, 0, 45, 45), ("LEG_SELF",)),
+    # both front paws swing to the middle: hip 0.105 + 0.0602 cos(30°) - 0.4716 sin(30°) < 0
+    "front paws cross": ((0, 0, 1), LEVEL, (-30, 0, 0, -30, 0, 0, 0, 45, 45, 0, 45, 45), ("LEG_LEG",)),
+    # left legs reach for one another under the trunk, and 15° of lateral bring them into one plane
+    "left legs cross": ((0, 0, 1), LEVEL, (5, 0, 110, 0, 45, 45, -8, 0, 110, 0, 45, 45), ("LEG_LEG",)),
+    # laterals straight up turn raised thighs down into the trunk
+    "thigh into the trunk": ((0, 0, 1), LEVEL, (100, 60, 135, *STAND[3:]), ("LEG_SHELL",)),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_flags_by_hand(case):
+    pos, quat_xyzw, motors, expected = CASES[case]
+    flags, _ = collide(pos, quat_xyzw, motors)
+    assert {name for name, mask in zip(FLAGS, MASKS, strict=True) if flags[0] & mask} == set(expected)
+
+
+def test_standing_clearance_by_hand():
+    # thigh plane 0.105 + 0.05945, trunk half width 0.112, thigh radius 0.019; the knee adds up to 0.00075 outward
+    clearance = collide((0, 0, 1), LEVEL, STAND)[1]
+    assert clearance[0] == pytest.approx(0.105 + 0.05945 - 0.112 - 0.019, abs=5e-4)
+
+
+def workspace(count):
+    """Motor angles in degrees, shape (count, 12), over the range that the jumping tasks use."""
+    rng = np.random.default_rng(11)
+    legs = [(rng.uniform(-15, 15, count), transversal_angles(rng, count, -10, 135, 0, 230)) for _ in range(4)]
+    return np.hstack([np.column_stack(leg) for leg in legs])
+
+
+def test_jumping_workspace_is_free_of_self_and_shell_contacts():
+    flags, _ = collide((0, 0, 2), LEVEL, workspace(20000), margin=0.0)
+    assert not np.any(flags & ~collision_module.LEG_LEG)
+
+
+def test_legs_meet_in_the_jumping_workspace_only_when_one_reaches_far_inward():
+    motors = workspace(20000)
+    inward = np.abs(motors[:, 2::3] - motors[:, 1::3]).max(axis=1)
+    flags, _ = collide((0, 0, 2), LEVEL, motors, margin=0.0)
+    assert 0.0 < np.mean(flags != 0) < 0.01
+    assert not np.any(flags[inward < 80.0])
+
+
+# ---- heightfield
+
+
+@pytest.mark.parametrize(("height", "raised"), [(0.34, False), (0.36, True)])
+def test_shell_corner_meets_a_mesa(height, raised):
+    # the shell's bottom stands at 0.397 - 0.049 = 0.348; of it only the left rear drums, x -0.144, y 0.199, overlap
+    # the mesa x < -0.13, 0.18 < y < 0.205; the paws stand outside
+    heights = np.zeros((801, 801))
+    y, x = np.meshgrid(np.linspace(-2, 2, 801), np.linspace(-2, 2, 801), indexing="ij")
+    heights[(x < -0.13) & (x > -0.16) & (y > 0.18) & (y < 0.21)] = height
+    flags, _ = collide((0, 0, 0.397), LEVEL, STAND, heights=heights)
+    assert bool(flags[0] & collision_module.BODY_GROUND) == raised
+
+
+def test_slope_agrees_with_level_ground_seen_from_a_tilted_frame():
+    slope = np.radians(20.0)
+    heights = np.tile(np.linspace(-2, 2, 61) * np.tan(slope), (61, 1))
+    tilt = Rotation.from_rotvec([0, -slope, 0])
+    pos, quat_xyzw, motors = random_poses()
+    tilted = tilt * Rotation.from_quat(quat_xyzw)
+    ours = category_distances((tilt.apply(pos), tilted.as_quat(), motors), heights=heights)
+    level = category_distances(random_poses())
+    np.testing.assert_allclose(ours[:, 1:5], level[:, 1:5], atol=2e-5)
+    # the shell is probed at the corners that are lower in the world, so both attitudes must agree on which these are
+    same_side = Rotation.from_quat(quat_xyzw).as_matrix()[:, 2, 2] * tilted.as_matrix()[:, 2, 2] > 0
+    np.testing.assert_allclose(ours[same_side, 0], level[same_side, 0], atol=2e-5)

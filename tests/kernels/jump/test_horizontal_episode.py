@@ -1,0 +1,296 @@
+import math
+
+import numpy as np
+import pytest
+import torch
+from jump_helpers import (
+    DEG,
+    edit_coordinates,
+    edit_episodes,
+    make_env,
+    only,
+    random_actions,
+    rule_names,
+)  # fmt: skip
+from scipy.spatial.transform import Rotation
+
+from jumper_warp.registry import make_task
+from kernels.jump.task import FLIGHT, LANDED, STANCE
+
+TASK = make_task("horizontal-jump")
+N = 64
+REST = torch.zeros((N, 12))
+AGAIN = np.arange(10, 20)
+"""Worlds that get another goal, where a test asks for some."""
+
+
+@pytest.fixture(scope="module")
+def env():
+    """Standing starts with any heading, nominal, without noise; another goal is always planned past the first level."""
+    return make_env(N, task=TASK, reset=only("default", heading=180.0, jump_again=1.0), seed=4)
+
+
+def stand(env, **fields):
+    """Begin episodes in the default pose, and overwrite fields of all of them."""
+    env.auto_reset = True
+    env.reset()
+    edit_episodes(env, **({"command_step": 1000, "again_step": 0} | fields))
+
+
+def yaw_of(arrays):
+    """Return the yaw of the bases [rad]."""
+    return Rotation.from_quat(arrays["base_quat"]).as_euler("ZYX")[:, 0]
+
+
+def in_yaw_frame(vectors, yaw):
+    """Return horizontal vectors in axes turned about z."""
+    return Rotation.from_euler("z", yaw[:, None]).inv().apply(vectors)
+
+
+def angle_between(one, other):
+    """Return the distance of two angles [rad] on the circle."""
+    return np.abs(np.angle(np.exp(1j * (one - other))))
+
+
+# ---------------------------------------------------------------- turning the world
+
+
+def test_a_turned_world_runs_alike():
+    """Two robots, one turned by 137 degrees, jump off under the same random actions."""
+    env = make_env(2, task=TASK)
+    turn = 137.0 * DEG
+    env.evaluation_reset(np.tile([0.8, 0.2, 0.0], (2, 1)), command_delay=0.1, headings=np.array([0.0, turn]))
+    phases = set()
+    for step, action in enumerate(random_actions(1, 30, seed=2)):
+        action = 0.5 * action
+        action[:, [1, 2, 4, 5, 7, 8, 10, 11]] += 0.8 if step < 12 else -1.0
+        env.step(action.repeat(2, 1))
+        for seen in (env.obs, env.critic_obs):
+            torch.testing.assert_close(seen[1], seen[0], atol=2e-3, rtol=2e-3)
+        assert env.reward[1].item() == pytest.approx(env.reward[0].item(), abs=2e-3, rel=2e-3)
+        assert env.done[0] == env.done[1]
+        arrays = env.task_arrays()
+        assert arrays["phase"][0] == arrays["phase"][1] and arrays["rule"][0] == arrays["rule"][1]
+        phases.add(int(arrays["phase"][0]))
+    assert phases == {int(STANCE), int(FLIGHT)}
+    expected = Rotation.from_euler("z", turn).apply(arrays["base_pos"][0])
+    np.testing.assert_allclose(arrays["base_pos"][1], expected, atol=1e-4)
+    assert angle_between(*yaw_of(arrays)) == pytest.approx(turn, abs=1e-3)
+
+
+@pytest.mark.parametrize("turn", [0.0, 90.0, 180.0])
+def test_an_evaluation_starts_with_its_heading_and_goal(turn):
+    env = make_env(2, task=TASK)
+    env.evaluation_reset(np.array([[0.8, 0.2, 0.0], [0.3, -0.1, 0.0]]), headings=turn * DEG)
+    arrays = env.task_arrays()
+    np.testing.assert_allclose(arrays["goal"][:, :2] @ [[math.cos(turn * DEG), -math.sin(turn * DEG)],
+                                                        [math.sin(turn * DEG), math.cos(turn * DEG)]],
+                               [[0.8, 0.2], [0.3, -0.1]], atol=1e-5)  # fmt: skip
+    np.testing.assert_allclose(arrays["heading"], turn * DEG, atol=1e-6)
+    assert angle_between(yaw_of(arrays), turn * DEG).max() < 1e-5
+    assert not env.obs[:, :2].any()  # the jump is commanded later
+    assert (arrays["again_step"] == 0).all()
+
+
+# ---------------------------------------------------------------- another jump
+
+
+def land(env, **fields):
+    """Let some robots stand as if landed a fifth of a second ago, at different places, headings and steps."""
+    stand(env, level=1)
+    edit_episodes(env, phase=LANDED, phase_steps=12, apex_passed=1, steps=np.arange(N), command_step=0)
+    edit_episodes(env, jumps=np.arange(N) % 3)
+    edit_episodes(env, **fields)
+    for world in range(N):
+        edit_coordinates(env, world, q={0: 0.1 * world, 1: -0.2 * world})
+
+
+@pytest.fixture(scope="module")
+def second(env):
+    """Episodes before and after the step in which some worlds got another goal."""
+    land(env)
+    edit_episodes(env, AGAIN, again_step=13, level=np.arange(10) % 4 + 1)
+    before = env.task_arrays()
+    env.step(REST)
+    return before, env.task_arrays()
+
+
+def test_another_jump_begins_at_its_time_where_the_robot_is(second):
+    before, after = second
+    np.testing.assert_array_equal(np.flatnonzero(after["phase"] == STANCE), AGAIN)
+    assert not after["done"].any()
+    np.testing.assert_array_equal(after["jumps"] - before["jumps"], np.isin(np.arange(N), AGAIN))
+    for name in ("phase_steps", "idle_steps", "apex_passed", "peak_tilt", "took_off", "touched_down", "at_apex"):
+        assert not after[name][AGAIN].any(), name
+    np.testing.assert_array_equal(after["start"][AGAIN], after["base_pos"][AGAIN])
+    np.testing.assert_array_equal(after["max_height"][AGAIN], after["base_pos"][AGAIN, 2])
+    assert angle_between(after["heading"], yaw_of(after))[AGAIN].max() < 1e-5
+
+
+def test_the_second_jump_is_commanded_at_once(second):
+    _, after = second
+    np.testing.assert_array_equal(after["steps"], np.arange(1, N + 1))
+    np.testing.assert_array_equal(after["command_step"][AGAIN], after["steps"][AGAIN])
+
+
+def test_the_second_goal_is_in_the_levels_box_before_the_robot(env):
+    ahead, level = [], []
+    for _ in range(8):
+        land(env, again_step=13, level=1 + np.arange(N) % 4)
+        env.step(REST)
+        after = env.task_arrays()
+        assert (after["phase"] == STANCE).all()
+        ahead.append(in_yaw_frame((after["goal"] - after["base_pos"]) * [1.0, 1.0, 0.0], yaw_of(after)))
+        level.append(after["level"])
+    ahead, level = np.concatenate(ahead), np.concatenate(level)
+    for number in range(1, 5):
+        here, box = ahead[level == number], TASK.levels[number]
+        for axis in (0, 1):
+            lower, upper = box.goal_lower[axis], box.goal_upper[axis]
+            assert here[:, axis].min() >= lower - 1e-5 and here[:, axis].max() <= upper + 1e-5
+            assert np.ptp(here[:, axis]) > 0.85 * (upper - lower)
+
+
+def test_others_keep_their_episode(second):
+    before, after = second
+    others = np.setdiff1d(np.arange(N), AGAIN)
+    for name in ("goal", "start", "heading", "command_step", "jumps", "again_step"):
+        np.testing.assert_array_equal(after[name][others], before[name][others])
+    np.testing.assert_array_equal(after["phase_steps"][others], 13)
+
+
+def test_another_goal_moves_nothing_but_the_episode():
+    pair = [make_env(N, task=TASK, reset=only("default", jump_again=1.0), seed=4) for _ in range(2)]
+    for env, when in zip(pair, (13, 0), strict=True):
+        edit_episodes(env, level=1, phase=LANDED, phase_steps=12, again_step=when)
+        for action in 0.3 * random_actions(N, 5):
+            env.step(action)
+    one, other = pair
+    assert (one.task_arrays()["jumps"] == 1).all() and not other.task_arrays()["jumps"].any()
+    np.testing.assert_array_equal(one.sim.joint_q(), other.sim.joint_q())
+    np.testing.assert_array_equal(one.sim.joint_qd(), other.sim.joint_qd())
+    assert torch.equal(one.obs[:, 2:], other.obs[:, 2:]) and not torch.equal(one.obs[:, :2], other.obs[:, :2])
+
+
+def test_jumps_follow_each_other_as_often_as_planned(env):
+    land(env, again_step=13)
+    env.step(REST)
+    planned = env.task_arrays()["again_step"]  # jump_again = 1: after every second jump a third
+    assert planned.min() >= 12 and planned.max() <= 42
+    never = make_env(N, task=TASK, reset=only("default", jump_again=0.0))
+    land(never, again_step=13)
+    never.step(REST)
+    arrays = never.task_arrays()
+    assert (arrays["phase"] == STANCE).all() and not arrays["again_step"].any()
+
+
+def test_an_ended_episode_begins_anew_instead(env):
+    land(env, again_step=60, phase_steps=59)
+    env.step(REST)
+    after = env.task_arrays()
+    assert env.done.all() and not after["jumps"].any() and not after["steps"].any()
+
+
+@pytest.mark.parametrize("wait", [{"phase_steps": 11}, {"phase": STANCE}, {"phase": FLIGHT}])
+def test_another_jump_waits_for_its_time_after_touchdown(env, wait):
+    land(env, **({"again_step": 13} | wait))
+    env.step(REST)
+    going = env.done.numpy() == 0.0
+    np.testing.assert_array_equal(env.task_arrays()["jumps"][going], (np.arange(N) % 3)[going])
+
+
+def test_another_jump_that_is_overdue_begins(env):
+    land(env, again_step=13, phase_steps=20)
+    env.step(REST)
+    going = env.done.numpy() == 0.0
+    assert going.any()
+    np.testing.assert_array_equal(env.task_arrays()["jumps"][going], (np.arange(N) % 3 + 1)[going])
+
+
+# ---------------------------------------------------------------- the caller's next jump
+
+
+def test_next_jump_changes_chosen_landed_worlds(env):
+    land(env)
+    phase = np.array([STANCE, FLIGHT, LANDED, LANDED])[np.arange(N) % 4]
+    edit_episodes(env, phase=phase, idle_steps=3, apex_passed=1, touched_down=0)
+    chosen = np.arange(N) % 8 < 6
+    goals = np.stack([np.linspace(0.3, 1.5, N), np.linspace(-0.3, 0.3, N), np.zeros(N)], axis=1)
+    before, q, qd = env.task_arrays(), env.sim.joint_q().copy(), env.sim.joint_qd().copy()
+    env.next_jump(goals, chosen)
+    after = env.task_arrays()
+    begun = chosen & (phase == LANDED)
+    assert 0 < begun.sum() < chosen.sum()
+    for name in env.tasks.numpy().dtype.names:
+        np.testing.assert_array_equal(after[name][~begun], before[name][~begun], name)
+    offset = in_yaw_frame((after["goal"] - after["base_pos"]) * [1.0, 1.0, 0.0], yaw_of(after))
+    np.testing.assert_allclose(offset[begun], goals[begun], atol=1e-5)
+    assert (after["phase"][begun] == STANCE).all() and not after["phase_steps"][begun].any()
+    np.testing.assert_array_equal(after["command_step"][begun], after["steps"][begun])
+    np.testing.assert_array_equal(after["jumps"][begun], before["jumps"][begun] + 1)
+    np.testing.assert_array_equal(env.sim.joint_q(), q)
+    np.testing.assert_array_equal(env.sim.joint_qd(), qd)
+
+
+def test_the_policy_sees_its_next_jump_after_the_next_step(env):
+    land(env, goal=(0.0, 0.0, 0.0))
+    env.auto_reset = False
+    goals = np.tile([0.7, -0.2, 0.0], (N, 1))
+    env.next_jump(goals, np.ones(N, dtype=bool))
+    env.step(REST)
+    np.testing.assert_allclose(env.obs[:, :2], goals[:, :2], atol=0.01)  # the base moves by millimetres in a step
+
+
+# ---------------------------------------------------------------- success
+
+
+@pytest.mark.parametrize(("miss", "near"), [(0.0, True), (0.095, True), (0.105, False), (0.4, False)])
+def test_a_jump_counts_where_it_ended_near_its_goal(env, miss, near):
+    stand(env, level=1, streak=2)
+    position = env.task_arrays()["base_pos"]
+    edit_episodes(env, phase=LANDED, phase_steps=59, goal=position + [0.6 * miss, -0.8 * miss, 0.0])
+    env.metrics()
+    env.step(REST)
+    assert rule_names(env) == ["success"] * N and (env.timeout == 1.0).all()
+    assert env.task_arrays()["streak"].tolist() == [3 if near else 0] * N
+    figures = env.metrics()
+    assert figures["Metrics/success"] == float(near)
+    assert figures["Metrics/error_m"] == pytest.approx(miss if near else 0.0, abs=3e-3)
+
+
+@pytest.mark.parametrize(
+    ("rule", "episode"),
+    [("too_long", {"steps": 1199, "phase_steps": 10}), ("no_jump", {"phase": STANCE, "steps": 500, "command_step": 0})],
+)
+def test_any_other_end_at_the_goal_is_no_success(env, rule, episode):
+    stand(env, level=1, streak=2)
+    edit_episodes(env, goal=env.task_arrays()["base_pos"], **({"phase": LANDED} | episode))
+    env.metrics()
+    env.step(REST)
+    assert rule_names(env) == [rule] * N
+    assert not env.task_arrays()["streak"].any() and env.metrics()["Metrics/success"] == 0.0
+
+
+def test_five_near_landings_raise_the_level_and_a_far_one_does_not(env):
+    stand(env, level=1, streak=4)
+    position = env.task_arrays()["base_pos"]
+    miss = np.where(np.arange(N) < 32, 0.05, 0.2)[:, None] * [1.0, 0.0, 0.0]
+    edit_episodes(env, phase=LANDED, phase_steps=59, goal=position + miss)
+    env.step(REST)
+    assert env.task_arrays()["level"].tolist() == [2] * 32 + [1] * 32
+
+
+# ---------------------------------------------------------------- the critic's observation at an episode's end
+
+
+def test_the_critics_last_observation_is_kept_beside_the_first_of_the_next_episode(env):
+    stand(env)
+    edit_episodes(env, slice(0, 5), phase=LANDED, phase_steps=59)
+    env.step(0.2 * random_actions(N, 1)[0])
+    ended = env.done == 1.0
+    assert ended.tolist() == [True] * 5 + [False] * (N - 5)
+    assert torch.equal(env.critic_obs[~ended], env.final_critic_obs[~ended])
+    first, last = env.critic_obs[ended], env.final_critic_obs[ended]
+    assert last[:, 48:51].tolist() == [[0.0, 0.0, 1.0]] * 5 and first[:, 48:51].tolist() == [[1.0, 0.0, 0.0]] * 5
+    np.testing.assert_allclose(last[:, 51], 1.0, atol=1e-6)
+    assert not first[:, 51].any()

@@ -1,0 +1,222 @@
+import math
+
+import numpy as np
+import pytest
+from jump_helpers import DEG, MOTOR_SLOTS, Robots, make_env, make_episode, only
+from scipy.spatial.transform import Rotation
+
+from jumper_warp.registry import make_task
+from kernels.jump.observe import make_observe_kernel, observe_horizontal, observe_vertical
+from kernels.jump.task import FLIGHT, LANDED, STANCE
+
+HORIZONTAL, VERTICAL = make_observe_kernel(observe_horizontal), make_observe_kernel(observe_vertical)
+NAMES = make_task("horizontal-jump").observation_names
+ROBOT, EPISODE = 48, 15  # columns
+N = 200
+
+
+def random_robots(kernel, turn=0.0, seed=0):
+    """Return robots in any attitude with goals around them, all of it turned about z by an angle [rad]."""
+    rng = np.random.default_rng(seed)
+    robots = Robots(kernel, N)
+    heading = rng.uniform(-np.pi, np.pi, N)
+    heading[:50] = np.pi + rng.uniform(-0.02, 0.02, 50)
+    tilt = Rotation.from_rotvec(rng.uniform(-0.8, 0.8, (N, 3)))
+    world = Rotation.from_euler("z", turn)
+    robots.q[:, :3] = world.apply(rng.uniform(-1.0, 1.0, (N, 3)))
+    robots.q[:, 3:7] = (world * Rotation.from_euler("z", heading[:, None]) * tilt).as_quat()
+    robots.q[:, 7 + MOTOR_SLOTS] += rng.uniform(-1.0, 1.0, (N, 12))
+    robots.qd[:, :3], robots.qd[:, 3:6] = world.apply(rng.normal(size=(N, 3))), world.apply(rng.normal(size=(N, 3)))
+    robots.qd[:, 6:] = rng.normal(size=(N, 32))
+    robots.com = rng.uniform(-0.05, 0.05, 3)
+    robots.action, robots.offset = rng.uniform(-1.0, 1.0, (12, N)), rng.uniform(-0.03, 0.03, (12, N))
+    robots.force = 200.0 * rng.normal(size=(4, N, 3))
+    goals = world.apply(np.concatenate([rng.uniform(-2.0, 2.0, (N, 2)), rng.uniform(0.0, 1.0, (N, 1))], axis=1))
+    robots.tasks = [
+        make_episode(
+            goal=goal, heading=turn, phase=int(phase), phase_steps=int(steps), steps=200, max_height=float(height)
+        )
+        for goal, phase, steps, height in zip(
+            goals, rng.integers(0, 3, N), rng.integers(0, 200, N), rng.uniform(0.3, 1.0, N), strict=True
+        )
+    ]
+    return robots
+
+
+def robot_with(kernel=HORIZONTAL, **fields):
+    """Return one robot at rest with an episode."""
+    robots = Robots(kernel)
+    robots.tasks = [make_episode(**fields)]
+    return robots
+
+
+def yaw_quat(angle):
+    """Return the quaternion of a turn about z [deg]."""
+    return Rotation.from_euler("z", angle, degrees=True).as_quat()
+
+
+# ---------------------------------------------------------------- the actor's
+
+
+def test_the_layout_begins_with_the_way_to_the_goal():
+    assert NAMES[:4] == ("goal_x", "goal_y", "height", "lin_vel_x") and len(NAMES) == ROBOT
+    assert NAMES[3:] == make_task("vertical-jump").observation_names[3:]
+
+
+@pytest.mark.parametrize(
+    ("yaw", "way"),
+    [(0.0, (0.6, 0.2)), (90.0, (0.2, -0.6)), (180.0, (-0.6, -0.2)), (-180.0, (-0.6, -0.2)), (-90.0, (-0.2, 0.6))],
+)
+def test_the_way_to_the_goal_is_in_the_yaw_aligned_frame(yaw, way):
+    robots = robot_with(goal=(1.6, -0.8, 0.0))
+    robots.q[0, :3], robots.q[0, 3:7] = (1.0, -1.0, 0.4), yaw_quat(yaw)
+    np.testing.assert_allclose(robots.observe()[0, :3], [*way, 0.4], atol=1e-6)
+
+
+def test_the_way_does_not_change_with_pitch_and_roll():
+    robots = robot_with(goal=(0.6, 0.2, 0.0))
+    robots.q[0, 3:7] = Rotation.from_euler("ZYX", [90.0, 40.0, -30.0], degrees=True).as_quat()
+    np.testing.assert_allclose(robots.observe()[0, :2], [0.2, -0.6], atol=1e-6)
+
+
+@pytest.mark.parametrize("turn", [0.3, 137.0 * DEG, math.pi, -2.0])
+def test_turning_robot_and_goal_about_the_vertical_changes_nothing(turn):
+    before, after = random_robots(HORIZONTAL).both(), random_robots(HORIZONTAL, turn).both()
+    for one, other in zip(before, after, strict=True):
+        np.testing.assert_allclose(one, other, atol=2e-5)
+    assert np.abs(before[0][:, :2]).max() > 1.0
+
+
+@pytest.mark.parametrize(
+    ("episode", "told"),
+    [
+        ({"phase": STANCE, "steps": 4}, False),
+        ({"phase": STANCE, "steps": 5}, True),
+        ({"phase": FLIGHT, "steps": 5}, True),
+        ({"phase": LANDED, "steps": 50}, True),
+    ],
+)
+def test_the_goal_is_zero_before_the_command_and_stays_after_the_landing(episode, told):
+    robots = robot_with(goal=(0.6, 0.2, 0.0), command_step=5, **episode)
+    np.testing.assert_allclose(robots.observe()[0, :2], [0.6 * told, 0.2 * told], atol=1e-6)
+
+
+@pytest.mark.parametrize("steps", [4, 5])
+def test_noise_of_way_and_height_ends_at_one_sigma(steps):
+    robots = Robots(HORIZONTAL, 4096)
+    robots.tasks = [make_episode(goal=(0.6, 0.2, 0.0), command_step=5, steps=steps)] * 4096
+    clean = robots.observe()
+    noise = (robots.observe(noise=True) - clean)[:, :3] / 0.005
+    assert np.abs(noise).max() <= 1.0 + 1e-3
+    assert noise.std(axis=0) == pytest.approx(math.sqrt(0.5161), abs=4.0 * 0.4 / 64.0)
+    assert noise.mean(axis=0) == pytest.approx(0.0, abs=4.0 * 0.7184 / 64.0)
+    assert np.abs(np.corrcoef(noise.T) - np.eye(3)).max() < 5.0 / 64.0
+
+
+def test_the_height_is_that_above_the_ground_below_the_base():
+    robots = Robots(HORIZONTAL, 2)
+    robots.heights = np.array([[0.0, 0.0, -0.15], [0.0, 0.0, -0.15]])  # falls from x = 0 to x = 2 m
+    robots.q[:, 0], robots.q[:, 2] = (-1.0, 1.0), (0.4, 0.3)
+    np.testing.assert_allclose(robots.observe()[:, 2], [0.4, 0.3 + 0.075], atol=1e-6)
+
+
+# ---------------------------------------------------------------- the critic's
+
+
+@pytest.mark.parametrize("kernel", [HORIZONTAL, VERTICAL], ids=["horizontal", "vertical"])
+def test_the_critic_sees_what_the_actor_does_without_noise(kernel):
+    robots = random_robots(kernel)
+    clean, critic = robots.both()
+    np.testing.assert_array_equal(critic[:, :ROBOT], clean)
+    noisy, same = robots.both(noise=True)
+    np.testing.assert_array_equal(same, critic)
+    assert (noisy[:, 2:36] != clean[:, 2:36]).mean() > 0.99
+
+
+def test_the_columns_after_the_episodes_are_left_alone():
+    np.testing.assert_array_equal(random_robots(VERTICAL).both()[1][:, -2:], 7.0)
+
+
+@pytest.mark.parametrize("phase", [STANCE, FLIGHT, LANDED])
+def test_the_critic_sees_phase_and_times(phase):
+    robots = robot_with(phase=phase, phase_steps=90, steps=150, command_step=60)
+    found = robots.both()[1][0, ROBOT : ROBOT + 5]
+    np.testing.assert_allclose(found, [*(float(phase == i) for i in range(3)), 1.5, 1.5], atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("episode", "times"),
+    [
+        ({"phase_steps": 500, "steps": 900, "command_step": 0}, [2.0, 3.0]),
+        ({"phase_steps": 6, "steps": 0, "command_step": 30}, [0.1, -0.5]),
+        ({"phase_steps": 0, "steps": 0, "command_step": 90}, [0.0, -1.0]),
+    ],
+)
+def test_times_are_bounded(episode, times):
+    np.testing.assert_allclose(robot_with(**episode).both()[1][0, ROBOT + 3 : ROBOT + 5], times, atol=1e-6)
+
+
+def test_the_critic_sees_heights_way_and_predicted_miss_even_before_the_command():
+    robots = robot_with(goal=(1.6, -0.8, 0.9), max_height=0.7, steps=0, command_step=30)
+    robots.q[0, :3], robots.q[0, 3:7] = (1.0, -1.0, 0.52625), yaw_quat(90.0)
+    robots.qd[0, :3] = (1.0, -0.6, 2.0)
+    found = robots.both()[1][0, ROBOT + 5 : ROBOT + 11]
+    # apex 0.52625 + 4 / 19.62 m; half a second to 0.3 m, at (1.5, -1.3); body x is world y, body y is world -x
+    expected = [0.7 - 0.9, 0.52625 + 4.0 / 19.62 - 0.9, 0.5, -0.1, 0.2, -0.6]
+    np.testing.assert_allclose(found, expected, atol=1e-5)
+
+
+def test_the_predicted_miss_is_that_above_the_ground_at_the_goal():
+    robots = robot_with(goal=(1.6, -0.8, 0.0), goal_ground=0.08)
+    robots.q[0, :3], robots.qd[0, :3] = (1.0, -1.0, 0.60625), (1.0, -0.6, 2.0)
+    # half a second to 0.38 m, at (1.5, -1.3)
+    np.testing.assert_allclose(robots.both()[1][0, ROBOT + 7 : ROBOT + 9], [0.1, 0.5], atol=1e-5)
+
+
+def test_the_critic_sees_paw_forces_in_body_weights_and_no_more_than_five():
+    robots = robot_with()
+    robots.force[:, 0] = [(0.0, 0.0, 0.0), (84.0, 0.0, 112.0), (0.0, 0.0, 70.0), (0.0, 9000.0, 0.0)]
+    found = robots.both()[1][0, ROBOT + 11 : ROBOT + EPISODE]
+    np.testing.assert_allclose(found, [0.0, 1.0, 0.5, 5.0], atol=1e-6)
+
+
+def test_what_is_not_finite_is_seen_as_zero_by_both():
+    robots = random_robots(HORIZONTAL)
+    robots.q[3, 0], robots.qd[4, 0], robots.q[5, 3], robots.force[1, 6, 0] = math.nan, math.inf, math.nan, math.nan
+    actor, critic = robots.both()
+    assert np.isfinite(actor).all() and np.isfinite(critic).all()
+    assert not critic[3, [0, 1, ROBOT + 7, ROBOT + 9]].any()
+
+
+# ---------------------------------------------------------------- in the environment
+
+
+@pytest.fixture(scope="module")
+def env():
+    return make_env(256, task=make_task("horizontal-jump"), reset=only("default"), randomize=True, noise=True, seed=8)
+
+
+def test_the_environment_shows_the_critic_what_was_drawn(env):
+    model, motors = env.sim.model, env.sim.motors
+    nominal = make_env(1, task=make_task("horizontal-jump"), reset=only("default")).sim
+    mass, com = model.body_mass.numpy().reshape(256, -1), model.body_com.numpy().reshape(256, -1, 3)
+    mass = mass - nominal.model.body_mass.numpy()
+    friction = model.shape_material_mu.numpy()[model.shape_world.numpy() >= 0].reshape(256, -1)
+    push = env.push.numpy()
+    columns = [
+        mass[:, :1], mass[:, 1:].sum(axis=1, keepdims=True), (com[:, 0] - nominal.model.body_com.numpy()[0]) / 0.03,
+        (motors.kp.numpy() / nominal.motors.kp.numpy() - 1.0).T,
+        (motors.no_load_speed.numpy() / nominal.motors.no_load_speed.numpy() - 1.0).T,
+        env.delay.numpy()[:, None] / 8.0, (friction[:, :1] - 0.85) * 10.0,
+        env.static_friction_ratio.numpy()[:, None] - 1.0, env.joint_offset.numpy().T / 0.035,
+        push[:, :3] / 5.0, push[:, 3:] / 3.0,
+    ]  # fmt: skip
+    np.testing.assert_allclose(env.critic_obs[:, ROBOT + EPISODE :], np.concatenate(columns, axis=1), atol=1e-4)
+
+
+def test_drawn_parameters_are_of_order_one_and_zero_without_randomisation(env):
+    shown = env.critic_obs[:, ROBOT + EPISODE :].numpy()
+    assert shown.shape[1] == env.num_critic_obs - ROBOT - EPISODE
+    assert np.abs(shown).max() < 3.0 and (np.abs(shown).max(axis=0) > 0.04).all()
+    nominal = make_env(16, task=make_task("horizontal-jump"), reset=only("default"))
+    assert not nominal.critic_obs[:, ROBOT + EPISODE :].any()

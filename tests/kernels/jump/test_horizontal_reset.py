@@ -1,0 +1,310 @@
+import dataclasses
+
+import numpy as np
+import pinocchio as pin
+import pytest
+import warp as wp
+from jump_helpers import DEG, SCHEMES, edit_episodes, make_env, only
+from scipy.spatial.transform import Rotation
+from solver_helpers import MOTOR_Q, MOTOR_V, Reference, States, paw_joint
+
+from jumper_warp.registry import make_task
+from kernels.collision.robot import collision_kernel
+from kernels.jump.task import FLIGHT, LANDED, STANCE
+
+N = 4096
+G = 9.81
+PAW_RADIUS, LANDING_HEIGHT = 0.025, 0.30  # [m]
+NAMES = ("horizontal-jump", "omnidirectional-jump")
+CORNER = 0.05 * np.sqrt(2.0)  # [m] how far the start of a jump lies from the origin at most
+
+
+class Starts:
+    """Thousands of beginnings of one scheme, every world at its own level; exact: the jump starts at the origin."""
+
+    def __init__(self, env, scheme: str, exact: bool = False):
+        reset = only(scheme, env.task.reset, **({"base_xy": 0.0} if exact else {}))
+        env._ranges = reset.ranges(env.step_dt)
+        self.level = np.arange(N) % len(env.task.levels)
+        edit_episodes(env, level=self.level)
+        env.reset()
+        drawn = env.tasks.numpy()["scheme"] == SCHEMES.index(scheme)
+        self.fallbacks = 1.0 - drawn.mean()
+        self.flags = collision_flags(env)
+        self.reference = Reference(env.sim.model)
+        episodes = env.tasks.numpy()[drawn]
+        self.episodes = {name: episodes[name].astype(float) for name in episodes.dtype.names}
+        self.q, self.qd = env.sim.joint_q()[drawn].astype(float), env.sim.joint_qd()[drawn].astype(float)
+        self.level = self.level[drawn]
+        self.pos, self.vel = self.q[:, :3], self.qd[:, :3]
+        self.heading = Rotation.from_euler("z", self.episodes["heading"][:, None])
+        self.goal = self.episodes["goal"] * [1.0, 1.0, 0.0]
+        self.distance = np.linalg.norm(self.goal, axis=1)
+        self.along = self.goal / self.distance[:, None]
+        self.paws = self._paws()
+
+    def _paws(self) -> np.ndarray:
+        """Return the places of the paws [m] from Pinocchio, (worlds, 4, 3)."""
+        states, robot = States.read(self.q, self.qd), self.reference.robot
+        joints = [paw_joint(self.reference, leg) for leg in range(4)]
+        paws = np.zeros((len(self.q), 4, 3))
+        for i in range(len(paws)):
+            pin.forwardKinematics(
+                robot.model, robot.data, robot.configuration(states.pos[i], states.quat[i], states.angles[i])
+            )
+            paws[i] = [robot.data.oMi[joint].act(np.array([0.0, 0.0, -0.3])) for joint in joints]
+        return paws
+
+    def split(self, vectors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the parts of horizontal vectors towards the goal and to its left."""
+        left = np.cross([0.0, 0.0, 1.0], self.along)
+        return np.sum(vectors * self.along, axis=1), np.sum(vectors * left, axis=1)
+
+    def paws_around(self, spot: np.ndarray) -> np.ndarray:
+        """Return the paws relative to places (worlds, 3), in the jump's heading, all as if they were front left."""
+        relative = self.paws - spot[:, None]
+        turned = np.stack([self.heading.inv().apply(relative[:, leg]) for leg in range(4)], axis=1)
+        return turned * np.array([[1, 1, 1], [1, -1, 1], [-1, 1, 1], [-1, -1, 1]])
+
+
+def collision_flags(env) -> np.ndarray:
+    """Return the flags of forbidden contacts of every world."""
+    flags, clearance = (wp.zeros(env.num_envs, dtype=kind, device="cpu") for kind in (int, float))
+    robot = env._dynamics.robot
+    inputs = [robot.geometry, robot.ground, env.sim.state.joint_q, 43, 0.0]
+    wp.launch(collision_kernel, env.num_envs, inputs, [flags, clearance], device="cpu")
+    return flags.numpy()
+
+
+def land(pos: np.ndarray, vel: np.ndarray, height: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return place [m] and time [s] at which point masses fall through a height, by small steps."""
+    pos, vel, dt = pos.copy(), vel.copy(), 2.0e-3
+    found, when = np.full_like(pos, np.nan), np.full(len(pos), np.nan)
+    for step in range(600):
+        after = pos + dt * vel - [0.0, 0.0, 0.5 * G * dt**2]
+        through = np.isnan(when) & (pos[:, 2] >= height) & (after[:, 2] < height)
+        share = (pos[:, 2] - height) / np.maximum(pos[:, 2] - after[:, 2], 1e-12)
+        found[through] = (pos + share[:, None] * (after - pos))[through]
+        when[through] = dt * (step + share[through])
+        pos, vel = after, vel - [0.0, 0.0, G * dt]
+    return found, when
+
+
+def covers(values, lower, upper, reach=0.03):
+    """Whether values stay in a range and come near both of its ends."""
+    width = upper - lower
+    inside = values.min() >= lower - 2e-4 and values.max() <= upper + 2e-4
+    return inside and values.min() <= lower + reach * width and values.max() >= upper - reach * width
+
+
+@pytest.fixture(scope="module", params=NAMES)
+def env(request):
+    return make_env(N, task=make_task(request.param), seed=1)
+
+
+@pytest.fixture(scope="module")
+def starts(env):
+    """Beginnings of every scheme, (scheme) -> Starts, and those of jumps from the very origin, (exact scheme)."""
+    found = {scheme: Starts(env, scheme) for scheme in SCHEMES}
+    return found | {
+        f"exact {scheme}": Starts(env, scheme, exact=True) for scheme in ("in_flight", "touchdown", "landed")
+    }
+
+
+def test_schemes_have_the_tasks_shares(env):
+    env._ranges = env.task.reset.ranges(env.step_dt)
+    edit_episodes(env, level=np.arange(N) % len(env.task.levels))
+    env.reset()
+    shares = np.bincount(env.tasks.numpy()["scheme"], minlength=5) / N
+    # 0.02: default poses that stand in for what cannot be drawn
+    assert np.abs(shares - [0.45, 0.15, 0.175, 0.175, 0.05]).max() < 4.0 * np.sqrt(0.25 / N) + 0.02
+
+
+@pytest.mark.parametrize("scheme", SCHEMES)
+def test_no_state_collides_or_crosses_the_motor_limits(starts, scheme):
+    assert not starts[scheme].flags.any()
+    angles = starts[scheme].q[:, MOTOR_Q].reshape(-1, 4, 3)
+    assert np.abs(angles[..., 0]).max() <= 15.0 * DEG + 1e-4
+    sums = angles[..., 1:].sum(axis=2)
+    assert sums.min() >= -1e-4 and sums.max() <= 220.0 * DEG + 1e-4
+
+
+@pytest.mark.parametrize("scheme", [name for name in SCHEMES if name != "default"])
+def test_the_default_pose_rarely_stands_in(starts, scheme):
+    assert starts[scheme].fallbacks < 0.02
+
+
+@pytest.mark.parametrize("scheme", SCHEMES)
+def test_headings_cover_the_circle(starts, scheme):
+    found = starts[scheme]
+    heading = found.episodes["heading"]
+    assert covers(heading, -np.pi, np.pi, 0.01)
+    shares = np.histogram(heading, np.linspace(-np.pi, np.pi, 9))[0] / len(heading)
+    assert np.abs(shares - 0.125).max() < 5.0 * np.sqrt(0.125 * 0.875 / len(heading))
+    body = (found.heading.inv() * Rotation.from_quat(found.q[:, 3:7])).as_euler("ZYX")
+    half = 0.0 if scheme == "default" else 5.0 * DEG
+    assert np.abs(body[:, [0, 2]]).max() <= half + 1e-4
+    if scheme not in ("standing", "default"):
+        assert covers(body[:, 0], -half, half) and covers(body[:, 1], -half, half) and covers(body[:, 2], -half, half)
+
+
+def test_only_forward_jumps_begin_pitched_forward(env, starts):
+    body = (starts["standing"].heading.inv() * Rotation.from_quat(starts["standing"].q[:, 3:7])).as_euler("ZYX")
+    mean = 10.0 * DEG if env.task.name == "horizontal-jump" else 0.0
+    assert covers(body[:, 1], -5.0 * DEG, mean + 5.0 * DEG, 0.1)
+    assert body[:, 1].mean() == pytest.approx(0.5 * mean, abs=4.0 * 5.0 * DEG / np.sqrt(len(body)))
+
+
+@pytest.mark.parametrize("scheme", SCHEMES)
+def test_goals_lie_in_the_levels_box_turned_by_the_heading(env, starts, scheme):
+    found = starts[scheme]
+    ahead = found.heading.inv().apply(found.goal)
+    for number, level in enumerate(env.task.levels):
+        here = ahead[found.level == number]
+        for axis in (0, 1):
+            assert covers(here[:, axis], level.goal_lower[axis], level.goal_upper[axis], 0.05)
+    assert not found.episodes["goal"][:, 2].any()
+
+
+def test_phases_and_the_command_fit_the_scheme(starts):
+    for scheme, phase in zip(SCHEMES, (STANCE, STANCE, FLIGHT, FLIGHT, LANDED), strict=True):
+        episodes = starts[scheme].episodes
+        assert (episodes["phase"] == int(phase)).all()
+        if phase == STANCE:
+            assert set(episodes["command_step"]) == set(range(31))
+        else:
+            assert not episodes["command_step"].any()
+        if phase == LANDED:
+            assert set(episodes["phase_steps"]) == set(range(18))
+        else:
+            assert not episodes["phase_steps"].any()
+        for name in ("steps", "jumps", "took_off", "touched_down", "idle_steps"):
+            assert not episodes[name].any(), name
+
+
+# ---------------------------------------------------------------- on the ground
+
+
+def test_standing_paws_are_on_the_ground_within_their_boxes(env, starts):
+    found = starts["standing"]
+    paws = found.paws_around(np.zeros_like(found.pos))
+    np.testing.assert_allclose(found.paws[..., 2], PAW_RADIUS, atol=2e-4)
+    assert covers(paws[..., 0], 0.20, 0.22)
+    assert covers(paws[:, :2, 1], 0.15, 0.17) and covers(paws[:, 2:, 1], 0.20, 0.22)
+    assert covers(found.pos[:, 0], -0.05, 0.05) and covers(found.pos[:, 1], -0.05, 0.05)
+    for number, level in enumerate(env.task.levels):
+        assert covers(found.pos[found.level == number, 2], *level.base_height)
+    assert not found.qd.any()
+
+
+def test_landed_robots_are_around_their_goal_with_paws_at_rest_on_the_ground(starts):
+    found = starts["landed"]
+    np.testing.assert_allclose(found.paws[..., 2], PAW_RADIUS, atol=2e-4)
+    paws = found.paws_around(found.goal)
+    assert covers(paws[..., 0], 0.20, 0.22)
+    assert covers(paws[:, :2, 1], 0.15, 0.17) and covers(paws[:, 2:, 1], 0.20, 0.22)
+    assert covers(found.pos[:, 2], 0.30, 0.45)
+    assert covers(-found.vel[:, 2], 0.0, 1.0) and not found.vel[:, :2].any()
+    exact = starts["exact landed"]
+    ahead, aside = exact.split((exact.pos - exact.goal) * [1.0, 1.0, 0.0])
+    assert covers(ahead, -0.15, 0.10) and np.abs(aside).max() < 1e-5
+    error = np.linalg.norm((found.pos - found.goal)[:, :2], axis=1)
+    assert error.max() < 0.15 + CORNER + 1e-5
+
+
+# ---------------------------------------------------------------- in the air
+
+
+def test_flights_lead_to_the_goal(starts):
+    found, spread = starts["exact in_flight"], starts["in_flight"]
+    place, _ = land(found.pos, found.vel, LANDING_HEIGHT)
+    assert not np.isnan(place).any()
+    miss = place - found.goal
+    far = found.distance >= 0.1
+    np.testing.assert_allclose(miss[far, :2], 0.0, atol=5e-4)
+    # a takeoff up to 0.1 m ahead may lie beyond a nearer goal: the jump then goes straight up
+    ahead, aside = found.split(miss * [1.0, 1.0, 0.0])
+    assert ahead[~far].min(initial=0.0) >= -5e-4 and np.abs(aside[~far]).max(initial=0.0) < 5e-4
+    assert (ahead + found.distance)[~far].max(initial=0.0) <= 0.1 + 5e-4
+    miss = (land(spread.pos, spread.vel, LANDING_HEIGHT)[0] - spread.goal)[spread.distance >= 0.1]
+    assert covers(miss[:, 0], -0.05, 0.05) and covers(miss[:, 1], -0.05, 0.05)
+
+
+def test_flights_take_off_within_their_angles_but_not_too_high(starts):
+    found = starts["exact in_flight"]
+    _, left = land(found.pos, found.vel, LANDING_HEIGHT)
+    # the share of the flight that has passed is 0.02 to 0.10
+    up = [found.vel[:, 2] + G * left * share / (1.0 - share) for share in (0.02, 0.10)]
+    forward = np.linalg.norm(found.vel[:, :2], axis=1)
+    apex = found.pos[:, 2] + np.maximum(found.vel[:, 2], 0.0) ** 2 / (2.0 * G)
+    assert apex.max() <= 1.0 + 1e-4
+    free = (apex < 0.999) & (found.distance > 0.15)
+    shallowest, steepest = (np.degrees(np.arctan2(v, forward)) for v in up)
+    assert shallowest[free].max() <= 75.0 + 0.1 and steepest[free].min() >= 35.0 - 0.1
+    assert np.ptp(0.5 * (shallowest + steepest)[free]) > 35.0
+    start = [found.pos[:, 2] - v * t + 0.5 * G * t**2 for v, t in zip(up, (left / 49.0, left / 9.0), strict=True)]
+    assert np.maximum(*start).min() >= 0.40 - 1e-3 and np.minimum(*start).max() <= 0.45 + 1e-3
+
+
+def test_flights_begin_with_bent_legs_and_paws_off_the_ground(starts):
+    found = starts["in_flight"]
+    angles = found.q[:, MOTOR_Q].reshape(-1, 4, 3)
+    assert covers(angles[..., 1:], 40.0 * DEG, 80.0 * DEG)
+    assert covers(angles[..., 0], -10.0 * DEG - 0.03, 10.0 * DEG + 0.03, 0.1)
+    assert found.paws[..., 2].min() >= PAW_RADIUS + 0.01 - 1e-4
+    assert not found.qd[:, MOTOR_V].any() and not found.qd[:, 3:6].any()
+
+
+def test_touchdowns_lead_to_the_goal_once_their_lag_is_made_up(env, starts):
+    found = starts["exact touchdown"]
+    place, left = land(found.pos, found.vel, LANDING_HEIGHT)
+    assert left.min() >= 0.03 - 2e-3 and left.max() <= 0.15 + 2e-3
+    lag, aside = found.split((found.goal - place) * [1.0, 1.0, 0.0])
+    far = found.distance >= 0.1
+    assert covers(lag[far], *env.task.reset.touchdown_behind) and np.abs(aside[far]).max() < 5e-4
+    assert lag[~far].max(initial=0.0) <= 0.20 + 5e-4 and np.abs(aside).max() < 5e-4
+    shares = np.histogram(lag[far], np.linspace(*env.task.reset.touchdown_behind, 4))[0] / far.sum()
+    assert shares.min() > 0.1  # long lags are out of the legs' reach more often, above all sideways
+    spread = starts["touchdown"]
+    lag, aside = spread.split((spread.goal - land(spread.pos, spread.vel, LANDING_HEIGHT)[0]) * [1.0, 1.0, 0.0])
+    far = spread.distance >= 0.1
+    assert lag[far].min() >= 0.05 - CORNER and lag[far].max() <= 0.20 + CORNER and np.abs(aside).max() <= CORNER + 5e-4
+
+
+def test_touchdowns_have_their_paws_ahead_of_the_base_towards_the_goal(env, starts):
+    behind = env.task.reset.touchdown_behind
+    found = starts["touchdown"]
+    # the paws' boxes are centred on the projectile to 1 cm in x and y
+    ahead, aside = found.split((found.paws.mean(axis=1) - found.pos) * [1.0, 1.0, 0.0])
+    assert ahead.min() > behind[0] - 0.0142 and ahead.max() < behind[1] + 0.0142
+    assert np.abs(aside).max() < 0.0142
+    assert ahead.mean() > behind[0] + 0.25 * (behind[1] - behind[0])
+
+
+def test_touchdowns_reach_for_the_ground_but_not_below_it(starts):
+    found = starts["touchdown"]
+    depth, height = found.pos[:, 2, None] - found.paws[..., 2], found.pos[:, 2, None]
+    assert np.ptp(found.paws[..., 2], axis=1).max() < 2e-4
+    assert found.paws[..., 2].min() >= 0.05 - 1e-4
+    assert depth.max() <= 0.45 + 1e-4 and (depth >= np.minimum(0.30, height - 0.05) - 2e-4).all()
+    assert (found.pos[:, 2] > LANDING_HEIGHT - 1e-4).all() and not found.qd[:, MOTOR_V].any()
+
+
+def test_touchdowns_fall(starts):
+    assert (starts["touchdown"].vel[starts["touchdown"].distance > 0.2, 2] < 0.0).all()
+
+
+# ---------------------------------------------------------------- more than one jump
+
+
+def test_another_goal_is_planned_past_the_first_level_only(env, starts):
+    planned = np.concatenate([starts[scheme].episodes["again_step"] for scheme in SCHEMES])
+    level = np.concatenate([starts[scheme].level for scheme in SCHEMES])
+    assert not planned[level == 0].any()
+    share = (planned[level > 0] > 0).mean()
+    assert share == pytest.approx(0.175, abs=4.0 * np.sqrt(0.175 * 0.825 / (level > 0).sum()))
+    assert covers(planned[planned > 0], 12.0, 42.0, 0.05)  # 0.2 to 0.7 s
+    plain = dataclasses.replace(env.task.reset, jump_again=0.0)
+    env._ranges = plain.ranges(env.step_dt)
+    env.reset()
+    assert not env.tasks.numpy()["again_step"].any()

@@ -1,0 +1,188 @@
+import dataclasses
+import math
+
+import jump_oracle
+import numpy as np
+import pytest
+from jump_helpers import DEFAULT_ANGLE, DEG, Table, make_env, make_episode, make_view, random_actions, tilted_by
+from jump_oracle import expected_terms, kernel_inputs, random_robots, robot_of
+from scipy.spatial.transform import Rotation
+
+from jumper_warp.registry import make_task
+from kernels.jump import rewards
+from kernels.jump.task import FLIGHT, LANDED, STANCE
+
+TASK = make_task("horizontal-jump")
+E = math.exp
+PHASES = [int(STANCE), int(FLIGHT), int(LANDED)]
+TRANSVERSAL = np.tile([0.0, 1.0, 1.0], 4)
+paid = Table(rewards, " ".join(term.name for term in TASK.terms), float)
+
+
+@pytest.fixture(scope="module")
+def robots():
+    """A thousand robots in all phases, as the oracle reads them and as the kernels do."""
+    robot = random_robots(1000, seed=0)
+    return robot, *kernel_inputs(robot)
+
+
+@pytest.mark.parametrize("term", TASK.terms, ids=lambda term: term.name)
+def test_a_term_has_the_papers_value_in_any_state(robots, term):
+    robot, views, tasks = robots
+    expected = jump_oracle.TERMS[term.name](robot, term.params)
+    assert np.count_nonzero(np.abs(expected) > 0.05) > 20
+    found = paid.all(term.name, views, tasks, *term.params)
+    np.testing.assert_allclose(found, expected, rtol=2e-3, atol=2e-5 * np.abs(expected).max())
+    assert not found[expected == 0.0].any()
+
+
+@pytest.mark.parametrize(
+    ("miss", "expected"),
+    [
+        (0.0, 1.6),
+        (0.03, E(-0.04) + 0.6 * E(-1.0)),
+        (0.15, E(-1.0) + 0.6 * E(-25.0)),
+        (0.30, E(-4.0)),
+    ],
+)
+def test_tracking_has_a_wide_and_a_narrow_kernel_and_is_paid_after_takeoff(miss, expected):
+    # 3-4-5 beside the goal; the height does not matter
+    view = make_view(pos=(1.0 + 0.6 * miss, -2.0 + 0.8 * miss, 0.7))
+    for phase in (FLIGHT, LANDED):
+        task = make_episode(phase=phase, goal=(1.0, -2.0, 0.0))
+        assert paid("tracking", view, task, 0.15, 0.03, 0.6) == pytest.approx(expected, rel=1e-4)
+    assert paid("tracking", view, make_episode(goal=(1.0, -2.0, 0.0)), 0.15, 0.03, 0.6) == 0.0
+
+
+@pytest.mark.parametrize(
+    ("miss", "expected"),
+    [
+        (0.0, 1.4),
+        (0.10, E(-1.0 / 9.0) + 0.1 * E(-0.04) + 0.3 * E(-1.0)),
+        (0.30, E(-1.0) + 0.1 * E(-0.36) + 0.3 * E(-9.0)),
+        (0.50, E(-25.0 / 9.0) + 0.1 * E(-1.0) + 0.3 * E(-25.0)),
+    ],
+)
+def test_est_tracking_is_of_the_ballistic_landing_and_paid_in_flight(miss, expected):
+    # half a second from z = 0.52625 m upward with 2 m/s to 0.3 m: 0.52625 + 2 / 2 - 9.81 / 8 = 0.3
+    view = make_view(pos=(0.2, 0.3, 0.52625), lin_vel=(1.0, -0.6, 2.0))
+    goal = (0.7 + 0.6 * miss, -0.8 * miss, 0.0)
+    p = (0.30, 0.50, 0.10, 0.30)
+    flying = make_episode(phase=FLIGHT, goal=goal)
+    assert paid("estimated_tracking", view, flying, *p) == pytest.approx(expected, rel=1e-3)
+    for phase in (STANCE, LANDED):
+        assert paid("estimated_tracking", view, make_episode(phase=phase, goal=goal), *p) == 0.0
+
+
+@pytest.mark.parametrize("rise", [0.08, -0.2])
+def test_est_tracking_ends_above_the_ground_at_the_goal(rise):
+    # as above, all of it higher by the ground at the goal
+    view = make_view(pos=(0.2, 0.3, 0.52625 + rise), lin_vel=(1.0, -0.6, 2.0))
+    flying = make_episode(phase=FLIGHT, goal=(0.7, 0.0, 0.0), goal_ground=rise)
+    assert paid("estimated_tracking", view, flying, 0.30, 0.50, 0.10, 0.30) == pytest.approx(1.4, rel=1e-4)
+
+
+@pytest.mark.parametrize("heading", [0.0, 90.0, 179.0, -179.0, 180.0])
+@pytest.mark.parametrize(("yaw", "pitch"), [(2.0, 0.0), (-2.0, 0.0), (0.0, 8.0), (6.0, -8.0)])
+def test_flight_orientation_is_the_rotation_from_level_and_heading(heading, yaw, pitch):
+    quat = Rotation.from_euler("ZYX", [heading + yaw, pitch, 0.0], degrees=True).as_quat()
+    # turns about perpendicular axes: cos(w / 2) = cos(yaw / 2) cos(pitch / 2)
+    angle = 2.0 * math.acos(math.cos(0.5 * yaw * DEG) * math.cos(0.5 * pitch * DEG))
+    expected = E(-((angle / (10.0 * DEG)) ** 2))
+    for sign in (1.0, -1.0):  # both quaternions of the orientation
+        view = make_view(quat=sign * quat, lin_vel=(1.0, 0.0, 0.0))
+        flying = make_episode(phase=FLIGHT, heading=heading * DEG, goal=(1.0, 0.0, 0.0))
+        assert paid("flight_orientation", view, flying, 10.0 * DEG) == pytest.approx(expected, rel=2e-3)
+
+
+@pytest.mark.parametrize(
+    ("vel", "share"), [((0.1, 5.0, 0.0), 1.0), ((0.0, 5.0, 3.0), 0.0), ((-0.1, 0.0, 3.0), 0.0), ((0.0, 0.0, -3.0), 0.0)]
+)
+def test_flight_orientation_is_paid_while_moving_towards_the_goal(vel, share):
+    fields = {"goal": (2.0, 1.0, 0.0)}
+    view = make_view(pos=(1.0, 1.0, 0.5), lin_vel=vel)
+    flying = make_episode(phase=FLIGHT, **fields)
+    assert paid("flight_orientation", view, flying, 10.0 * DEG) == pytest.approx(share)
+    for phase in (STANCE, LANDED):
+        assert paid("flight_orientation", view, make_episode(phase=phase, **fields), 10.0 * DEG) == 0.0
+
+
+@pytest.mark.parametrize("phase", PHASES)
+def test_flight_angular_velocity(phase):
+    view = make_view(ang_vel=(6.0, 0.0, -8.0))
+    expected = E(-1.0) if phase == FLIGHT else 0.0
+    assert paid("flight_angular_velocity", view, make_episode(phase=phase), 10.0) == pytest.approx(expected, rel=1e-4)
+
+
+def test_left_right_symmetry_compares_transversal_motors_of_a_pair():
+    mirrored = make_view(angle=np.array([0.3, 0.1, 0.9, -0.5, 0.1, 0.9, 0.2, 1.1, 0.4, 0.0, 1.1, 0.4]))
+    unasked = make_episode(command_step=1)
+    assert paid("left_right_symmetry", mirrored, unasked, 0.5, 0.1) == pytest.approx(1.0)
+    # one of the four pairs differs by 1 rad: rms 0.5
+    for motor in (1, 2, 4, 5, 7, 8, 10, 11):
+        view = make_view(angle=DEFAULT_ANGLE + np.eye(12)[motor])
+        assert paid("left_right_symmetry", view, unasked, 0.5, 0.1) == pytest.approx(E(-1.0), rel=1e-4)
+        assert paid("left_right_symmetry", view, make_episode(), 0.5, 0.1) == pytest.approx(0.1 * E(-1.0), rel=1e-4)
+
+
+AT_EASE = [
+    ({"steps": 9, "command_step": 10}, True),
+    ({"steps": 10, "command_step": 10}, False),
+    ({"phase": FLIGHT, "steps": 9, "command_step": 10}, False),
+    ({"phase": FLIGHT, "phase_steps": 60}, False),
+    ({"phase": LANDED, "phase_steps": 0}, False),
+    ({"phase": LANDED, "phase_steps": 29}, False),
+    ({"phase": LANDED, "phase_steps": 30}, True),
+]
+
+
+@pytest.mark.parametrize(("episode", "due"), AT_EASE)
+def test_standing_is_paid_before_the_command_and_half_a_second_after_touchdown(episode, due):
+    task = make_episode(**episode)
+    posture, still = (20.0 * DEG, 25.0 * DEG), (0.1, 0.5)
+    wanted = make_view(angle=DEFAULT_ANGLE + 25.0 * DEG * TRANSVERSAL)
+    assert paid("standing_posture", wanted, task, *posture) == pytest.approx(float(due))
+    off = make_view(angle=DEFAULT_ANGLE + 25.0 * DEG * TRANSVERSAL + 20.0 * DEG)
+    assert paid("standing_posture", off, task, *posture) == pytest.approx(due * E(-1.0), rel=1e-4)
+    assert paid("rest", make_view(), task, *still) == pytest.approx(float(due))
+    slow = make_view(lin_vel=(0.06, 0.0, -0.08))
+    assert paid("rest", slow, task, *still) == pytest.approx(due * E(-1.0), rel=1e-4)
+    turning = make_view(lin_vel=(0.06, 0.0, -0.08), ang_vel=(0.3, 0.4, 0.0))
+    assert paid("rest", turning, task, *still) == pytest.approx(due * E(-2.0), rel=1e-4)
+
+
+@pytest.mark.parametrize("axis", [(1.0, 0.0, 0.0), (0.6, -0.8, 0.0)])
+def test_landing_tilt_is_1_at_its_limit_and_counts_after_touchdown(axis):
+    view = make_view(**tilted_by(10.0 * DEG, axis))
+    half = make_view(**tilted_by(5.0 * DEG, axis))
+    assert paid("landing_tilt", view, make_episode(phase=LANDED), 10.0 * DEG) == pytest.approx(1.0, rel=1e-4)
+    share = (math.sin(5.0 * DEG) / math.sin(10.0 * DEG)) ** 2
+    assert paid("landing_tilt", half, make_episode(phase=LANDED), 10.0 * DEG) == pytest.approx(share, rel=1e-4)
+    assert paid("landing_tilt", make_view(), make_episode(phase=LANDED), 10.0 * DEG) == 0.0
+    for phase in (STANCE, FLIGHT):
+        assert paid("landing_tilt", view, make_episode(phase=phase), 10.0 * DEG) == 0.0
+
+
+@pytest.fixture(scope="module")
+def rollout():
+    """Logged and expected terms of jumps from all starts, (steps, terms, worlds)."""
+    shares = {"standing": 0.2, "default": 0.2, "in_flight": 0.2, "touchdown": 0.2}
+    env = make_env(64, task=dataclasses.replace(TASK, reset=dataclasses.replace(TASK.reset, **shares)), seed=3)
+    env.auto_reset = False
+    logged, expected = [], []
+    for step, action in enumerate(0.2 * random_actions(64, 60)):
+        action[:, TRANSVERSAL > 0.0] += 0.6 if step < 40 else -1.0
+        before = robot_of(env)
+        env.step(action)
+        after = robot_of(env)
+        logged.append(env._out.term_value.numpy().copy())
+        expected.append(expected_terms(TASK, before, after, action.clamp(-1.0, 1.0).numpy().T))
+        env._begin(env._out.done)
+    return np.array(logged), np.array(expected)
+
+
+@pytest.mark.parametrize("index", range(len(TASK.terms)), ids=[term.name for term in TASK.terms])
+def test_a_term_is_logged_as_computed_by_hand(rollout, index):
+    logged, expected = (values[:, index] for values in rollout)
+    assert expected.any()
+    np.testing.assert_allclose(logged, expected, rtol=2e-3, atol=2e-4 * np.abs(expected).max())

@@ -1,0 +1,283 @@
+import dataclasses
+import math
+
+import newton
+import numpy as np
+import pytest
+import warp as wp
+from jump_helpers import DEFAULT_ANGLE, DEG, SCHEMES, edit_episodes, make_env, only
+from solver_helpers import MOTOR_Q, MOTOR_V, Reference, States, paw_joint
+
+from jumper_warp.registry import make_task
+from jumper_warp.tasks.cfg import Level, ResetCfg
+from kernels.collision.robot import collision_kernel
+from kernels.jump.task import FLIGHT, LANDED, STANCE
+
+N = 4096
+TASK = make_task("vertical-jump")
+G = 9.81
+PAW_RADIUS = 0.025
+ALL = ResetCfg(standing=0.3, default=0.1, in_flight=0.25, touchdown=0.2)
+SHARES = np.array([0.3, 0.1, 0.25, 0.2, 0.15])
+
+
+@pytest.fixture(scope="module", params=range(len(TASK.levels)), ids=lambda level: f"level{level}")
+def drawn(request):
+    """Thousands of beginnings at one level: environment, episodes, coordinates and rates."""
+    env = make_env(N, reset=ALL, seed=request.param)
+    edit_episodes(env, level=request.param)
+    env.reset()
+    episodes = {name: env.tasks.numpy()[name].copy() for name in env.tasks.numpy().dtype.names}
+    return env, episodes, env.sim.joint_q().astype(float), env.sim.joint_qd().astype(float)
+
+
+def within(values, lower, upper, reach=0.02):
+    """Whether values stay in a range and come near both of its ends."""
+    width = upper - lower
+    inside = values.min() >= lower - 1e-5 and values.max() <= upper + 1e-5
+    return inside and values.min() <= lower + reach * width and values.max() >= upper - reach * width
+
+
+def euler(quat):
+    """Return roll, pitch, yaw [rad] of quaternions xyzw, turned about z, then y, then x."""
+    x, y, z, w = quat.T
+    roll = np.arctan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y))
+    pitch = np.arcsin(np.clip(2.0 * (w * y - z * x), -1.0, 1.0))
+    return np.stack([roll, pitch, np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))], axis=1)
+
+
+def paws_and_velocities(env, worlds):
+    """Return position [m] and velocity [m/s] of the paws of some worlds from Pinocchio, (worlds, 4, 3) each."""
+    reference = Reference(env.sim.model)
+    states = States.read(env.sim.joint_q()[worlds], env.sim.joint_qd()[worlds])
+    robot, pin = reference.robot, pytest.importorskip("pinocchio")
+    paws = np.zeros((2, len(worlds), 4, 3))
+    for i in range(len(worlds)):
+        q, v = reference.state(states, i)
+        pin.forwardKinematics(robot.model, robot.data, q, v)
+        for leg in range(4):
+            joint = paw_joint(reference, leg)
+            twist, ankle = robot.data.v[joint], np.array([0.0, 0.0, -0.3])
+            paws[0, i, leg] = robot.data.oMi[joint].act(ankle)
+            paws[1, i, leg] = robot.data.oMi[joint].rotation @ (twist.linear + np.cross(twist.angular, ankle))
+    return paws
+
+
+def some(episodes, scheme, count=60):
+    return np.flatnonzero(episodes["scheme"] == SCHEMES.index(scheme))[:count]
+
+
+def test_schemes_have_their_shares(drawn):
+    _, episodes, _, _ = drawn
+    shares = np.bincount(episodes["scheme"], minlength=5) / N
+    assert np.abs(shares - SHARES).max() < 4.0 * np.sqrt(0.25 / N)
+
+
+def test_phase_and_counters_fit_the_scheme(drawn):
+    _, episodes, _, qd = drawn
+    phases = np.array([STANCE, STANCE, FLIGHT, FLIGHT, LANDED])[episodes["scheme"]]
+    np.testing.assert_array_equal(episodes["phase"], phases)
+    for name in ("steps", "idle_steps", "took_off", "touched_down", "at_apex", "streak"):
+        assert not episodes[name].any(), name
+    on_feet = episodes["scheme"] < 2
+    assert within(episodes["command_step"][on_feet], 0, 30) and not episodes["command_step"][~on_feet].any()
+    landed = episodes["phase"] == LANDED
+    assert within(episodes["phase_steps"][landed], 0, 17) and not episodes["phase_steps"][~landed].any()
+    # a flight on its way down, and a landed robot, have reached the goal
+    passed = landed | ((episodes["phase"] == FLIGHT) & (qd[:, 2] <= 0.0))
+    np.testing.assert_array_equal(episodes["apex_passed"], passed)
+    np.testing.assert_array_equal(episodes["max_height"][passed], episodes["goal"][passed, 2])
+
+
+def test_goals_and_starts_are_within_the_level(drawn):
+    env, episodes, q, _ = drawn
+    level = env.task.levels[episodes["level"][0]]
+    assert within(episodes["goal"][:, 2], level.goal_lower[2], level.goal_upper[2])
+    standing = some(episodes, "standing", N)
+    assert within(q[standing, 2], *level.base_height)
+    np.testing.assert_array_equal(episodes["start"], q[:, :3].astype(np.float32))
+    default = q[some(episodes, "default", N)][:, MOTOR_Q]
+    np.testing.assert_array_equal(default, np.broadcast_to(DEFAULT_ANGLE.astype(np.float32), default.shape))
+
+
+@pytest.mark.parametrize("scheme", ["standing", "in_flight", "touchdown", "landed"])
+def test_base_place_and_attitude_cover_their_ranges(drawn, scheme):
+    _, episodes, q, qd = drawn
+    worlds = some(episodes, scheme, N)
+    for axis in (0, 1):
+        assert within(q[worlds, axis], -0.05, 0.05)
+        assert within(euler(q[worlds, 3:7])[:, axis], -5.0 * DEG, 5.0 * DEG)
+    assert within(euler(q[worlds, 3:7])[:, 2], -5.0 * DEG, 5.0 * DEG)
+    np.testing.assert_allclose(np.linalg.norm(q[worlds, 3:7], axis=1), 1.0, atol=1e-6)
+    assert not qd[worlds, :2].any() and not qd[worlds, 3:6].any()
+
+
+@pytest.mark.parametrize("scheme", ["standing", "default", "landed"])
+def test_robots_on_their_feet_have_their_paws_at_rest_on_the_ground(drawn, scheme):
+    env, episodes, _, _ = drawn
+    worlds = some(episodes, scheme)
+    position, velocity = paws_and_velocities(env, worlds)
+    np.testing.assert_allclose(position[..., 2], PAW_RADIUS, atol=2e-4)
+    np.testing.assert_allclose(velocity, 0.0, atol=2e-3)
+    if scheme != "default":
+        spots = position * np.array([[1, 1, 1], [1, -1, 1], [-1, 1, 1], [-1, -1, 1]])
+        assert within(spots[..., 0], 0.20, 0.22, 0.1)
+        assert within(spots[:, :2, 1], 0.15, 0.17, 0.1) and within(spots[:, 2:, 1], 0.20, 0.22, 0.1)
+
+
+def test_landed_robots_still_fall(drawn):
+    _, episodes, q, qd = drawn
+    worlds = some(episodes, "landed", N)
+    assert within(-qd[worlds, 2], 0.0, 1.0) and within(q[worlds, 2], 0.30, 0.42)
+    assert np.abs(qd[worlds][:, MOTOR_V]).max() > 1.0
+
+
+@pytest.mark.parametrize("scheme", ["in_flight", "touchdown"])
+def test_flights_are_on_a_projectile_to_the_goal(drawn, scheme):
+    _, episodes, q, qd = drawn
+    worlds = some(episodes, scheme, N)
+    apex = q[worlds, 2] + qd[worlds, 2] ** 2 / (2.0 * G)
+    # from a takeoff height of 0.40 to 0.45 m; a goal below it is the takeoff itself
+    goal = episodes["goal"][worlds, 2]
+    reachable = goal > 0.45
+    assert reachable.mean() > 0.95
+    np.testing.assert_allclose(apex[reachable], goal[reachable], atol=2e-5)
+    assert (q[worlds, 2] > 0.39).all()
+    assert not qd[worlds][:, MOTOR_V].any()
+    # touchdowns begin at most 0.15 s before landing: after the apex of a jump of more than 0.3 s
+    rising = np.mean(qd[worlds[goal > 0.6], 2] > 0.0)
+    assert rising == 0.0 if scheme == "touchdown" else 0.3 < rising < 0.7
+
+
+def test_flights_cover_the_leg_ranges_and_touchdowns_reach_for_the_ground(drawn):
+    env, episodes, q, _ = drawn
+    angles = q[some(episodes, "in_flight", N)][:, MOTOR_Q].reshape(-1, 4, 3)
+    assert np.abs(angles[..., 0]).max() <= 10.0 * DEG + 0.03 + 1e-5
+    assert within(angles[..., 1:], 0.0, 90.0 * DEG)
+    worlds = some(episodes, "touchdown")
+    height = paws_and_velocities(env, worlds)[0][..., 2]
+    depth = q[worlds, 2][:, None] - height
+    assert height.min() >= 0.05 - 1e-4
+    assert depth.min() >= 0.30 - 1e-4 and depth.max() <= 0.45 + 1e-4
+    assert np.ptp(height, axis=1).max() < 1e-4
+
+
+def collision_flags(env):
+    """Return the flags of forbidden contacts of every world."""
+    flags, clearance = (wp.zeros(env.num_envs, dtype=kind, device="cpu") for kind in (int, float))
+    robot = env._dynamics.robot
+    inputs = [robot.geometry, robot.ground, env.sim.state.joint_q, 43, 0.0]
+    wp.launch(collision_kernel, env.num_envs, inputs, [flags, clearance], device="cpu")
+    return flags.numpy()
+
+
+def test_no_state_collides_and_paws_are_not_under_the_ground(drawn):
+    env, episodes, q, _ = drawn
+    assert not collision_flags(env).any()
+    flying = some(episodes, "in_flight")
+    assert paws_and_velocities(env, flying)[0][..., 2].min() >= PAW_RADIUS + 0.01 - 1e-4
+    sums = q[:, MOTOR_Q].reshape(N, 4, 3)[..., 1:].sum(axis=2)
+    assert sums.min() >= -1e-4 and sums.max() <= 240.0 * DEG + 1e-4
+    assert np.abs(q[:, MOTOR_Q[::3]]).max() <= 15.0 * DEG + 1e-4
+
+
+def test_draws_that_collide_are_drawn_again():
+    # bases so low that shanks lie on the ground, and thighs so far in that they meet
+    level = Level((0.0, 0.0, 0.5), (0.0, 0.0, 0.6), (0.10, 0.30))
+    for reset in (only("standing"), only("in_flight", flight_transversal=(-30.0, 60.0))):
+        env = make_env(1024, task=dataclasses.replace(TASK, reset=reset, levels=(level,)))
+        assert not collision_flags(env).any()
+        assert np.mean(env.task_arrays()["scheme"] == SCHEMES.index("default")) < 0.5
+
+
+def test_the_same_draw_is_taken_once(drawn):
+    _, episodes, q, _ = drawn
+    moving = episodes["scheme"] != SCHEMES.index("default")
+    assert len(np.unique(q[moving, :3], axis=0)) == moving.sum()
+
+
+def test_loops_are_closed():
+    env = make_env(64, reset=ALL)
+    state = env.sim.state
+    env._dynamics.full_state(state.joint_q, state.joint_qd, state.body_q, state.body_qd)
+    newton.eval_fk(env.sim.model, state.joint_q, state.joint_qd, state)
+    assert env.sim.loop_gap().max() < 1e-5
+
+
+@pytest.mark.parametrize("scheme", ["standing", "in_flight", "touchdown", "landed"])
+def test_the_default_pose_rarely_stands_in(scheme):
+    level = Level((0.0, 0.0, 0.45), (0.0, 0.0, 1.2), (0.22, 0.45))
+    env = make_env(N, task=dataclasses.replace(TASK, reset=only(scheme), levels=(level,)))
+    assert np.mean(env.task_arrays()["scheme"] == SCHEMES.index("default")) < 0.005
+
+
+def test_a_state_that_cannot_be_reached_becomes_the_default_pose():
+    # a base 0.7 m above paws on the ground: beyond the legs' length
+    level = Level((0.0, 0.0, 0.5), (0.0, 0.0, 0.6), (0.7, 0.8))
+    env = make_env(16, task=dataclasses.replace(TASK, reset=only("standing"), levels=(level,)))
+    assert env.task_arrays()["scheme"].tolist() == [SCHEMES.index("default")] * 16
+    np.testing.assert_array_equal(env.sim.joint_q(), env.sim.model.joint_q.numpy().reshape(16, -1))
+
+
+def test_heading_and_forward_pitch():
+    env = make_env(N, reset=only("standing", heading=180.0, forward_pitch=10.0))
+    angles = euler(env.sim.joint_q()[:, 3:7].astype(float))
+    # a mean from 0 to 10 degrees, and 5 degrees to either side of it
+    assert within(angles[:, 1], -5.0 * DEG, 15.0 * DEG, 0.05)
+    spread = math.sqrt(2.0 * 10.0**2 / 12.0) * DEG
+    assert angles[:, 1].mean() == pytest.approx(5.0 * DEG, abs=4.0 * spread / math.sqrt(N))
+    assert angles[:, 1].std() == pytest.approx(spread, rel=4.0 / math.sqrt(2.0 * N))
+    assert angles[:, 2].min() < -3.1 and angles[:, 2].max() > 3.1
+    position, _ = paws_and_velocities(env, np.arange(30))
+    # paws stand around the origin, turned with the heading
+    ahead = (position[:, 0, :2] + position[:, 1, :2] - position[:, 2, :2] - position[:, 3, :2]) / 4.0
+    turn = np.arctan2(ahead[:, 1], ahead[:, 0]) - angles[:30, 2]
+    assert np.abs((turn + np.pi) % (2.0 * np.pi) - np.pi).max() < 8.0 * DEG
+
+
+def test_worlds_past_the_last_level_draw_a_level_each_time():
+    env = make_env(N)
+    edit_episodes(env, level=len(TASK.levels))
+    env.reset()
+    goals = env.task_arrays()["goal"][:, 2]
+    lower, upper = [np.array([getattr(level, end)[2] for level in TASK.levels]) for end in ("goal_lower", "goal_upper")]
+    cuts = np.linspace(0.4, 1.3, 19)
+    expected = sum(np.clip((cuts - a) / (b - a), 0.0, 1.0) for a, b in zip(lower, upper, strict=True)) / len(lower)
+    found = np.mean(goals[:, None] < cuts, axis=0)
+    assert np.abs(found - expected).max() < 4.0 * np.sqrt(0.25 / N)
+    assert set(env.task_arrays()["level"]) == {len(TASK.levels)}
+
+
+@pytest.mark.parametrize(
+    "shares", [{"standing": -0.1}, {"standing": 0.9}, {"standing": 0.0, "default": 0.0, "in_flight": 1.1}]
+)
+def test_impossible_shares_are_refused(shares):
+    with pytest.raises(ValueError, match="shares"):
+        ResetCfg(**shares)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"paw_depth": (0.45, 0.3)}, r"paw_depth must be \(lower, upper\), got \(0.45, 0.3\)"),
+        ({"again_delay": (0.7, 0.2)}, "again_delay must be"),
+        ({"landed_speed": (math.nan, 1.0)}, "landed_speed must be"),
+        ({"command_delay": -0.1}, "command_delay must not be negative, got -0.1"),
+        ({"again_delay": (-0.1, 0.2)}, "again_delay must not be negative"),
+        ({"jump_again": 1.1}, "jump_again must be in"),
+        ({"jump_again": -0.1}, "jump_again must be in"),
+    ],
+)
+def test_impossible_starts_are_refused(change, message):
+    with pytest.raises(ValueError, match=message) as caught:
+        ResetCfg(**change)
+    assert "\n" not in str(caught.value)
+
+
+def test_settings_reach_the_kernels_by_name_in_radians_and_steps():
+    cfg = ResetCfg(standing=0.5, default=0.25, in_flight=0.125, tilt=180.0, paw_depth=(0.25, 0.5), jump_again=0.75)
+    ranges = dataclasses.replace(cfg, command_delay=0.25, again_delay=(0.5, 1.0)).ranges(1.0 / 60.0)
+    assert list(ranges.shares) == [0.5, 0.75, 0.875, 0.875]
+    assert ranges.tilt == pytest.approx(math.pi) and list(ranges.takeoff_angle) == pytest.approx([0.872665, 1.308997])
+    assert (list(ranges.paw_depth), ranges.jump_again) == ([0.25, 0.5], 0.75)
+    assert ranges.command_delay == 15 and list(ranges.again_delay) == pytest.approx([30.0, 60.0])

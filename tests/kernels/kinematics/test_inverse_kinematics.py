@@ -1,0 +1,405 @@
+"""Inverse kinematics against Pinocchio, a sampled search for the nearest reachable point, and hand figures."""
+
+import importlib
+import math
+
+import numpy as np
+import pinocchio as pin
+import pytest
+import warp as wp
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+
+from jumper_warp.robot.description import load_description
+from jumper_warp.robot.model import build_pinocchio, leg_geometry, leg_geometry_array
+from jumper_warp.sim.precision import float64_kernels
+
+LATERAL = (-50.0, 110.0)
+TRANSVERSAL = (-30.0, 140.0)
+SUM = (0.0, 240.0)
+"""[deg] Hard stops of the robot."""
+ROBOTS = 200
+
+
+def make_leg_kernel(package):
+    """Return a kernel that evaluates the functions of one leg at given joint angles."""
+    five_bar, geometry, scalar, leg_kinematics = (
+        importlib.import_module(f"{package}.{name}")
+        for name in (
+            "kinematics.five_bar",
+            "kinematics.geometry",
+            "scalar",
+            "kinematics.leg",
+        )
+    )
+    real, vec2, vec3 = scalar.real, scalar.vec2, scalar.vec3
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def leg_kernel(
+        legs: wp.array(dtype=geometry.LegGeometry),
+        motors: wp.array2d(dtype=real),
+        knees: wp.array2d(dtype=real),
+        target: wp.array2d(dtype=vec3),
+        ankle: wp.array2d(dtype=vec3),
+        jacobian: wp.array2d(dtype=scalar.mat33),
+        closed_knees: wp.array2d(dtype=vec2),
+        constraint: wp.array2d(dtype=leg_kinematics.vec5),
+        closure: wp.array2d(dtype=leg_kinematics.mat24),
+    ):
+        k, i = wp.tid()
+        geo = legs[k]
+        angles = vec3(motors[3 * k, i], motors[3 * k + 1, i], motors[3 * k + 2, i])
+        passive = vec2(knees[2 * k, i], knees[2 * k + 1, i])
+        ankle[k, i] = leg_kinematics.leg_forward_kinematics(geo, angles[0], angles[1], angles[2])
+        jacobian[k, i] = leg_kinematics.leg_jacobian(geo, angles[0], angles[1], angles[2])
+        loop = five_bar.five_bar(geo, angles[1], angles[2])
+        closed_knees[k, i] = leg_kinematics.knee_angles(geo, loop, angles[1], angles[2])
+        constraint[k, i] = leg_kinematics.kinematic_constraint(geo, angles, passive, target[k, i])
+        closure[k, i] = leg_kinematics.closure_jacobian(geo, angles, passive)
+
+    return leg_kernel
+
+
+class Build:
+    """One precision of the kernels, launched on numpy arrays; robots are the last index of joint arrays."""
+
+    def __init__(self, package):
+        float64_kernels()
+        self.ik = importlib.import_module(f"{package}.kinematics.inverse")
+        self.leg_module = importlib.import_module(f"{package}.kinematics.leg")
+        self.scalar = importlib.import_module(f"{package}.scalar")
+        self.double = package == "kernels_float64"
+        geometry = importlib.import_module(f"{package}.kinematics.geometry")
+        self.legs = leg_geometry_array(load_description(), geometry, "cpu")
+        self.leg_kernel = make_leg_kernel(package)
+        self.limits = self.ik.LegLimits()
+        for name, (lower, upper) in {"lateral": LATERAL, "transversal": TRANSVERSAL, "sum": SUM}.items():
+            setattr(self.limits, f"{name}_lower", math.radians(lower))
+            setattr(self.limits, f"{name}_upper", math.radians(upper))
+
+    def array(self, values, dtype):
+        return wp.array(np.asarray(values, np.float64 if self.double else np.float32), dtype=dtype, device="cpu")
+
+    def zeros(self, rows, n, dtype=None):
+        return wp.zeros((rows, n), dtype=dtype or self.scalar.real, device="cpu")
+
+    def solve(self, paws, base_pos=None, base_quat=None):
+        """Return motors (12, n), knees (8, n), reachable (4, n), residual (4, n) for paws (4, n, 3)."""
+        n, vec3, quat = paws.shape[1], self.scalar.vec3, self.scalar.quat
+        in_world = base_pos is not None
+        pos = self.array(base_pos if in_world else np.zeros((n, 3)), vec3)
+        turn = self.array(base_quat if in_world else np.zeros((n, 4)), quat)
+        out = [self.zeros(12, n), self.zeros(8, n), self.zeros(4, n, wp.int32), self.zeros(4, n)]
+        inputs = [self.legs, self.limits, pos, turn, self.array(paws, vec3), int(in_world)]
+        wp.launch(self.ik.inverse_kinematics_kernel, (4, n), inputs, out, device="cpu")
+        return [array.numpy() for array in out]
+
+    def velocities(self, motors, paw_vel, base=None):
+        """Return motor rates (12, n) and knee rates (8, n); base: quat, linear and angular velocity, world frame."""
+        n, vec3 = motors.shape[1], self.scalar.vec3
+        turn, lin, ang = base if base is not None else (np.zeros((n, 4)), np.zeros((n, 3)), np.zeros((n, 3)))
+        inputs = [self.legs, self.array(turn, self.scalar.quat), self.array(lin, vec3), self.array(ang, vec3)]
+        inputs += [self.array(motors, self.scalar.real), self.array(paw_vel, vec3), int(base is not None)]
+        out = [self.zeros(12, n), self.zeros(8, n)]
+        wp.launch(self.ik.inverse_velocity_kernel, (4, n), inputs, out, device="cpu")
+        return [array.numpy() for array in out]
+
+    def legs_at(self, motors, knees=None, target=None):
+        """Return ankle (4, n, 3), jacobian, closed-loop knees, constraint and closure jacobian for motors (12, n)."""
+        n, s, m = motors.shape[1], self.scalar, self.leg_module
+        inputs = [self.legs, self.array(motors, s.real)]
+        inputs.append(self.array(np.zeros((8, n)) if knees is None else knees, s.real))
+        inputs.append(self.array(np.zeros((4, n, 3)) if target is None else target, s.vec3))
+        out = [self.zeros(4, n, dtype) for dtype in (s.vec3, s.mat33, s.vec2, m.vec5, m.mat24)]
+        wp.launch(self.leg_kernel, (4, n), inputs, out, device="cpu")
+        return [array.numpy() for array in out]
+
+
+@pytest.fixture(scope="module", params=["kernels", "kernels_float64"])
+def build(request):
+    return Build(request.param)
+
+
+@pytest.fixture(scope="module")
+def double():
+    return Build("kernels_float64")
+
+
+@pytest.fixture(scope="module")
+def robot():
+    return build_pinocchio()
+
+
+def random_motors(n, seed=0):
+    """Return motor angles [rad] within limits, shape (12, n)."""
+    rng = np.random.default_rng(seed)
+    thighs = rng.uniform(*TRANSVERSAL, (16 * n, 2))
+    thighs = thighs[(thighs.sum(1) >= SUM[0]) & (thighs.sum(1) <= SUM[1])][: 4 * n].reshape(4, n, 2)
+    motors = np.concatenate([rng.uniform(*LATERAL, (4, n, 1)), thighs], axis=2)
+    return np.radians(motors.transpose(0, 2, 1).reshape(12, n))
+
+
+def random_bases(n, seed=1):
+    """Return base positions (n, 3) [m] and quaternions xyzw (n, 4)."""
+    rng = np.random.default_rng(seed)
+    return rng.uniform(-1.0, 1.0, (n, 3)), Rotation.random(n, random_state=seed).as_quat()
+
+
+def reached_by_pinocchio(robot, q):
+    """Return the far ends of inner and outer shanks in the world, both (4, 3) [m]."""
+    pin.forwardKinematics(robot.model, robot.data, q)
+    ends = [
+        [robot.data.oMi[c.joint1_id].act(c.joint1_placement).translation for c in robot.constraints],
+        [robot.data.oMi[c.joint2_id].act(c.joint2_placement).translation for c in robot.constraints],
+    ]
+    return np.array(ends)
+
+
+# --- Forward: hand figures and derivatives ---
+
+
+def test_default_pose_puts_paws_at_hand_figures(build):
+    motors = np.tile(np.radians([0.0, 45.0, 45.0]), 4)[:, None]
+    ankle = build.legs_at(motors)[0][:, 0]
+    # x: 0.1433 + (0.1417 + 0.0517) / 2; y: hip + 0.05945 + 0.00075; z: five-bar at 45 degrees
+    want = [[0.24, 0.1652, -0.3718], [0.24, -0.1652, -0.3718], [-0.24, 0.2102, -0.3718], [-0.24, -0.2102, -0.3718]]
+    np.testing.assert_allclose(ankle, want, atol=5.0e-5)
+
+
+def test_positive_lateral_angle_swings_paws_outward_about_the_hip(build):
+    motors = np.tile(np.radians([90.0, 0.0, 0.0]), 4)[:, None]
+    ankle = build.legs_at(motors)[0][:, 0]
+    # a quarter turn about the hip: out by the leg's 0.4716, and the plane's offset of 0.0602 now points up
+    assert ankle[:, 1] == pytest.approx([0.105 + 0.4716, -0.105 - 0.4716, 0.15 + 0.4716, -0.15 - 0.4716], abs=5.0e-5)
+    assert ankle[:, 2] == pytest.approx(0.0602, abs=5.0e-5)
+
+
+def test_jacobian_matches_central_differences(double):
+    motors, h = random_motors(ROBOTS), 1.0e-5
+    jacobian = double.legs_at(motors)[1]
+    for joint in range(3):
+        step = np.zeros((12, 1))
+        step[joint::3] = h
+        slope = (double.legs_at(motors + step)[0] - double.legs_at(motors - step)[0]) / (2.0 * h)
+        np.testing.assert_allclose(jacobian[:, :, :, joint], slope, atol=2.0e-8)
+
+
+# --- Position: reachable targets ---
+
+
+def test_pose_found_puts_both_shank_ends_on_the_paw_in_pinocchio(build, robot):
+    tolerance = 1.0e-12 if build.double else 5.0e-6
+    base_pos, base_quat = random_bases(ROBOTS)
+    want = np.empty((4, ROBOTS, 3))
+    for i, motors in enumerate(random_motors(ROBOTS).T):
+        want[:, i] = reached_by_pinocchio(robot, robot.configuration(base_pos[i], base_quat[i], motors))[0]
+    motors, knees, reachable, residual = build.solve(want, base_pos, base_quat)
+    assert reachable.all()
+    assert residual.max() < tolerance
+    for i in range(ROBOTS):
+        q = robot.configuration(base_pos[i], base_quat[i], random_motors(1)[:, 0])
+        q[robot.motor_q] = motors[:, i]
+        q[robot.knee_q] = knees[:, i]
+        inner_ends, outer_ends = reached_by_pinocchio(robot, q)
+        np.testing.assert_allclose(inner_ends, want[:, i], atol=tolerance)
+        np.testing.assert_allclose(outer_ends, want[:, i], atol=tolerance)
+
+
+def test_every_paw_position_within_limits_is_reached(build):
+    paws = build.legs_at(random_motors(5000, seed=2))[0]
+    motors, _, reachable, residual = build.solve(paws)
+    assert reachable.all()
+    assert residual.max() < (1.0e-12 if build.double else 1.0e-6)
+    np.testing.assert_allclose(build.legs_at(motors)[0], paws, atol=1.0e-12 if build.double else 1.0e-6)
+
+
+def test_angles_come_back_from_a_normal_stance(build):
+    # knees outward: both knees bent, as for every thigh at 10 degrees or more
+    rng = np.random.default_rng(3)
+    want = np.radians(rng.uniform(10.0, 100.0, (12, 500)))
+    motors, knees, _, _ = build.solve(build.legs_at(want)[0])
+    np.testing.assert_allclose(motors, want, atol=1.0e-11 if build.double else 2.0e-5)
+    assert (knees > 0.0).all()
+
+
+def test_stacked_constraint_vanishes_at_the_pose_found(build):
+    paws = build.legs_at(random_motors(ROBOTS, seed=4))[0]
+    motors, knees, _, _ = build.solve(paws)
+    constraint = build.legs_at(motors, knees, paws)[3]
+    assert np.abs(constraint).max() < (1.0e-12 if build.double else 1.0e-6)
+
+
+def test_closure_jacobian_matches_central_differences_of_open_loops(double):
+    rng, h = np.random.default_rng(5), 1.0e-6
+    motors, knees = rng.uniform(-1.0, 2.0, (12, 50)), rng.uniform(-1.0, 2.0, (8, 50))
+    closure = double.legs_at(motors, knees)[4]
+    for column, (rows, start, stride) in enumerate([("m", 1, 3), ("k", 0, 2), ("m", 2, 3), ("k", 1, 2)]):
+        step_m, step_k = np.zeros((12, 1)), np.zeros((8, 1))
+        (step_m if rows == "m" else step_k)[start::stride] = h
+        gap = [double.legs_at(motors + sign * step_m, knees + sign * step_k)[3][:, :, :2] for sign in (1, -1)]
+        np.testing.assert_allclose(closure[:, :, :, column], (gap[0] - gap[1]) / (2.0 * h), atol=1.0e-9)
+
+
+# --- Position: targets out of reach ---
+
+
+def sampled_ankle(geo, q):
+    """Return ankles [m] in the body frame, (..., 3), for (lateral, outer, inner) [rad]."""
+    lateral, outer, inner = np.moveaxis(q, -1, 0)
+    front, thigh = geo["front"], geo["thigh"]
+    outer_knee = geo["outer_x"] + front * thigh * np.sin(outer) - 1j * thigh * np.cos(outer)
+    inner_knee = geo["inner_x"] - front * thigh * np.sin(inner) - 1j * thigh * np.cos(inner)
+    span = outer_knee - inner_knee
+    down = -1j * front * span / np.abs(span)
+    ankle = 0.5 * (outer_knee + inner_knee) + down * np.sqrt(geo["shank"] ** 2 - 0.25 * np.abs(span) ** 2)
+    across = (geo["plane_y"] + geo["knee_y"] + 1j * ankle.imag) * np.exp(1j * geo["side"] * lateral)
+    return np.array(geo["hip"]) + np.stack([ankle.real, across.real, across.imag], axis=-1)
+
+
+def into_limits(q):
+    """Return joint angles moved within limits."""
+    lower, upper = np.radians([LATERAL, TRANSVERSAL, TRANSVERSAL]).T
+    clamped = np.clip(q, lower, upper)
+    total = clamped[..., 1] + clamped[..., 2]
+    clamped[..., 1:] += 0.5 * (np.clip(total, *np.radians(SUM)) - total)[..., None]
+    return clamped
+
+
+def nearest_by_sampling(geo, targets):
+    """Return the distance [m] to the nearest reachable point: a grid, then finer ones around its 20 best points."""
+    axes = [np.radians(np.linspace(*limits, n)) for limits, n in ((LATERAL, 41), (TRANSVERSAL, 52), (TRANSVERSAL, 52))]
+    grid = into_limits(np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3))
+    centers = grid[cKDTree(sampled_ankle(geo, grid)).query(targets, 20)[1]]
+    offsets = np.stack(np.meshgrid(*[np.linspace(-1.0, 1.0, 7)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+    for width in np.radians(5.0) * 0.5 ** np.arange(7):
+        around = into_limits(centers[:, :, None] + width * offsets)
+        miss = np.linalg.norm(sampled_ankle(geo, around) - targets[:, None, None], axis=-1)
+        best = miss.argmin(axis=-1)
+        centers = np.take_along_axis(around, best[..., None, None], axis=2)[:, :, 0]
+    return miss.min(axis=(1, 2))
+
+
+@pytest.mark.parametrize("leg", [0, 3])
+def test_nearest_reachable_point_is_within_2_mm_of_a_sampled_search(build, leg):
+    geo = leg_geometry(load_description())[leg]
+    targets = np.array(geo["hip"]) + np.random.default_rng(leg).uniform(-0.7, 0.7, (120, 3))
+    motors, _, reachable, residual = build.solve(np.tile(targets, (4, 1, 1)))
+    nearest = nearest_by_sampling(geo, targets)
+    assert 0 < reachable[leg].sum() < 60
+    assert (residual[leg] - nearest).max() < 2.0e-3
+    assert (residual[leg] - nearest).min() > -3.0e-4  # the sampled search stops near 0.2 mm
+    ankle = sampled_ankle(geo, motors[3 * leg : 3 * leg + 3].T.astype(np.float64))
+    np.testing.assert_allclose(np.linalg.norm(ankle - targets, axis=1), residual[leg], atol=2.0e-6)
+
+
+def test_reachable_flag_agrees_with_a_zero_distance(build):
+    paws = build.legs_at(random_motors(1000, seed=6))[0]
+    far_paws = paws + np.array([0.0, 0.0, -1.0])
+    for targets in (paws, far_paws):
+        _, _, reachable, residual = build.solve(targets)
+        np.testing.assert_array_equal(reachable == 1, residual < 1.0e-5)
+
+
+def test_target_below_a_stretched_leg_is_answered_by_the_stretched_leg(build):
+    # 0.1 m below the deepest point, 0.4716 below the axes in a plane 0.0602 beside the hip
+    geo = leg_geometry(load_description())[0]
+    below = np.array(geo["hip"]) + [0.0967, 0.0602, -0.5716]
+    motors, _, reachable, residual = build.solve(np.tile(below, (4, 1, 1)))
+    assert reachable[0, 0] == 0
+    assert motors[1:3, 0] == pytest.approx([0.0, 0.0], abs=1.0e-3)
+    assert residual[0, 0] == pytest.approx(math.hypot(0.5716, 0.0602) - math.hypot(0.4716, 0.0602), abs=2.0e-5)
+
+
+def test_every_pose_is_within_limits(build):
+    targets = np.random.default_rng(7).uniform(-1.0, 1.0, (4, 500, 3))
+    motors = np.degrees(build.solve(targets)[0].astype(np.float64)).reshape(4, 3, 500)
+    slack = 1.0e-4
+    total = motors[:, 1] + motors[:, 2]
+    assert motors[:, 0].min() > LATERAL[0] - slack and motors[:, 0].max() < LATERAL[1] + slack
+    assert motors[:, 1:].min() > TRANSVERSAL[0] - slack and motors[:, 1:].max() < TRANSVERSAL[1] + slack
+    assert total.min() > SUM[0] - slack and total.max() < SUM[1] + slack
+
+
+@pytest.mark.parametrize("depth", [1.0e3, 1.0e12, 1.0e30])
+def test_target_far_below_stretches_the_legs_under_the_hips(build, depth):
+    motors, _, reachable, _ = build.solve(np.tile([0.0, 0.0, -depth], (4, 1, 1)))
+    assert not reachable.any()
+    # the ankle, 0.4716 below and 0.0602 beside the hip in the housing, swings in below it by their ratio's angle
+    np.testing.assert_allclose(motors[0::3], -math.atan2(0.0602, 0.4716), atol=math.radians(2.0))
+    np.testing.assert_allclose(motors[1::3], 0.0, atol=math.radians(2.0))
+    np.testing.assert_allclose(motors[2::3], 0.0, atol=math.radians(2.0))
+
+
+def test_target_that_is_not_finite_puts_the_ankle_0_3_below_the_axes(build):
+    motors = build.solve(np.full((4, 1, 3), math.nan))[0]
+    ankle = build.legs_at(motors)[0][:, 0]
+    want = [[0.24, 0.1652, -0.3], [0.24, -0.1652, -0.3], [-0.24, 0.2102, -0.3], [-0.24, -0.2102, -0.3]]
+    np.testing.assert_allclose(ankle, want, atol=1.0e-6)
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf, 1.0e30, -1.0e30, 0.0])
+@pytest.mark.parametrize("axes", [[0], [1], [2], [0, 1, 2]])
+def test_bad_targets_give_finite_poses_and_no_flag(build, value, axes):
+    targets = np.array([leg["hip"] for leg in leg_geometry(load_description())])[:, None]
+    targets[:, :, axes] = value  # value 0: the centre of the body and points level with the hips
+    motors, knees, reachable, residual = build.solve(targets)
+    assert np.isfinite(motors).all() and np.isfinite(knees).all()
+    assert not reachable.any()
+    assert not np.isnan(residual).any() and (residual > 0.05).all()
+
+
+def test_base_that_is_not_finite_gives_finite_poses_and_no_flag(build):
+    motors, knees, reachable, _ = build.solve(np.zeros((4, 1, 3)), np.full((1, 3), math.nan), [[0.0, 0.0, 0.0, 1.0]])
+    assert np.isfinite(motors).all() and np.isfinite(knees).all()
+    assert not reachable.any()
+
+
+# --- Velocity ---
+
+
+def test_inverse_velocity_undoes_the_jacobian(build):
+    rng = np.random.default_rng(8)
+    motors = np.radians(rng.uniform(-5.0, 110.0, (12, 500)))
+    motors[1::3] = np.abs(motors[1::3])
+    motors[2::3] = np.abs(motors[2::3])
+    wanted = rng.uniform(-1.0, 1.0, (4, 500, 3))
+    jacobian = build.legs_at(motors)[1]
+    rates = build.velocities(motors, wanted)[0].reshape(4, 3, 500).transpose(0, 2, 1)
+    reached = np.einsum("lnij,lnj->lni", jacobian, rates)
+    np.testing.assert_allclose(reached, wanted, atol=1.0e-12 if build.double else 2.0e-5)
+
+
+def test_inverse_velocity_of_a_stretched_leg_is_finite_and_damped(build):
+    # with the inner thigh at 25 degrees, the outer thigh passes through its shank's line in this sweep
+    outer = np.radians(np.linspace(-20.0, 5.0, 2001))
+    motors = np.tile([0.0, 0.0, math.radians(25.0)], 4)[:, None] * np.ones((1, 2001))
+    motors[1::3] = outer
+    knees = build.legs_at(motors)[2][:, :, 0]
+    assert knees.min() < -0.05 and knees.max() > 0.05
+    rates = build.velocities(motors, np.tile([0.0, 0.0, -1.0], (4, 2001, 1)))[0]
+    # at most 1 m/s over the 10 mm of lever at which damping sets in, and nothing in the straight pose itself
+    assert np.isfinite(rates).all() and np.abs(rates).max() < 101.0
+    straight = np.abs(knees).argmin(axis=1)
+    assert (np.abs(rates[1::3][np.arange(4), straight]) < 5.0).all()
+
+
+def test_rates_that_hold_the_paws_still_do_so_in_pinocchio(build, robot):
+    tolerance = 1.0e-9 if build.double else 5.0e-5
+    rng = np.random.default_rng(9)
+    n = 50
+    base_pos, base_quat = random_bases(n)
+    lin, ang = rng.uniform(-1.0, 1.0, (2, n, 3))
+    motors = np.radians(rng.uniform(10.0, 100.0, (12, n)))
+    rates, knee_rates = build.velocities(motors, np.zeros((4, n, 3)), (base_quat, lin, ang))
+    for i in range(n):
+        to_body = Rotation.from_quat(base_quat[i]).inv()
+        q = robot.configuration(base_pos[i], base_quat[i], motors[:, i])
+        v = np.zeros(robot.model.nv)
+        v[:6] = np.concatenate([to_body.apply(lin[i]), to_body.apply(ang[i])])
+        v[robot.motor_v] = rates[:, i]
+        v[robot.knee_v] = knee_rates[:, i]
+        pin.forwardKinematics(robot.model, robot.data, q, v)
+        for c in robot.constraints:
+            for joint, placement in ((c.joint1_id, c.joint1_placement), (c.joint2_id, c.joint2_placement)):
+                end = placement.actInv(robot.data.v[joint]).linear
+                np.testing.assert_allclose(end, 0.0, atol=tolerance)

@@ -1,0 +1,338 @@
+import hashlib
+import json
+import math
+import pickle
+
+import numpy as np
+import onnx
+import onnxruntime
+import pytest
+import safetensors.torch
+import torch
+
+from jumper_warp.policies import folder as folder_module
+from jumper_warp.policies.folder import add_files, list_policies, load_policy, save_policy
+from jumper_warp.policies.onnx import export_onnx, onnx_bytes
+from jumper_warp.policies.policy import Policy
+from jumper_warp.policies.spec import PolicyError, PolicyInterface
+from jumper_warp.rl.networks import ActorCritic
+
+
+def make_interface(num_obs=1, num_actions=1, hidden=(1,), **changes):
+    values = {
+        "task": "vertical-jump",
+        "observation_names": tuple(f"obs_{i}" for i in range(num_obs)),
+        "joint_names": tuple(f"motor_{i}" for i in range(num_actions)),
+        "command_filter": {"horizon": 8.0 / 60.0},
+        "policy_dt": 1.0 / 60.0,
+        "physics_dt": 1.0 / 480.0,
+        "hidden": hidden,
+    }
+    per_joint = ("action_scale", "default_joint_pos", "joint_stiffness", "joint_damping", "torque_limit")
+    values |= {name: tuple(0.1 * (i + 1) for i in range(num_actions)) for name in per_joint}
+    return PolicyInterface(**(values | changes))
+
+
+def scalar_policy(out_weight=1.0):
+    """obs -> (obs - 1) / 2 -> elu(x - 2) -> out_weight * x."""
+    one = torch.ones(1, 1)
+    layers = [(one, torch.tensor([-2.0])), (out_weight * one, torch.zeros(1))]
+    return Policy(layers, torch.tensor([1.0]), torch.tensor([2.0]), make_interface())
+
+
+@pytest.fixture(scope="module")
+def model():
+    """Actor of the size of the real one, its running statistics fed with skewed data."""
+    torch.manual_seed(3)
+    model = ActorCritic(48, 12, (64, 32))
+    model.obs_moments.update(torch.randn(1000, 48) * torch.linspace(0.1, 5.0, 48) + torch.linspace(-3.0, 3.0, 48))
+    with torch.no_grad():
+        model.actor[-1].weight.mul_(100.0)  # from the tiny initial weights to actions that reach the limits
+    return model
+
+
+@pytest.fixture(scope="module")
+def trained(model):
+    interface = make_interface(48, 12, (64, 32))
+    moments = model.obs_moments
+    return Policy.from_actor(
+        model.actor, moments.mean, moments.scale(), interface, {"env": {"seed": 5}, "commit": "abc"}
+    )
+
+
+@pytest.fixture(scope="module")
+def observations():
+    """Some in the ordinary range, some absurd, some not finite."""
+    torch.manual_seed(4)
+    obs = 4.0 * torch.randn(9, 48)
+    obs[1, 3], obs[2, 4], obs[3, 5], obs[4, 6] = math.nan, math.inf, -math.inf, 1.0e13
+    return obs
+
+
+@pytest.fixture
+def folder(trained, tmp_path):
+    return save_policy(tmp_path / "jump", trained)
+
+
+def reseal(folder, name, data):
+    """Replace a file as someone does who also mends the manifest."""
+    (folder / name).write_bytes(data)
+    manifest = json.loads((folder / "manifest.json").read_text())
+    manifest["sha256"][name] = hashlib.sha256(data).hexdigest()
+    (folder / "manifest.json").write_text(json.dumps(manifest))
+
+
+def edit_json(folder, name, change):
+    content = json.loads((folder / name).read_text())
+    change(content)
+    data = json.dumps(content).encode()
+    if name == "manifest.json":
+        (folder / name).write_bytes(data)
+    else:
+        reseal(folder, name, data)
+
+
+# ---------------------------------------------------------------------- acting
+
+
+def test_action_by_hand():
+    assert scalar_policy().act(torch.tensor([[3.0]])).item() == pytest.approx(math.exp(-1.0) - 1.0, abs=1e-6)
+
+
+def test_action_is_clipped():
+    assert scalar_policy(10.0).act(torch.tensor([3.0])).item() == -1.0
+
+
+def test_normalised_observation_is_limited_to_ten_standard_deviations():
+    policy = scalar_policy(0.1)  # (90 - 1) / 2 = 44.5, limited to 10, minus 2, times 0.1
+    assert policy.act(torch.tensor([90.0])).item() == pytest.approx(0.8, abs=1e-6)
+
+
+def test_policy_acts_as_the_trained_network(model, trained, observations):
+    assert torch.equal(trained.act(observations), model.act(observations))
+    actions = trained.act(observations).abs()
+    assert (actions == 1.0).any() and (actions < 1.0).any()
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
+def test_observation_that_is_not_finite_counts_as_zero(bad):
+    assert scalar_policy().act(torch.tensor([bad])) == scalar_policy().act(torch.tensor([0.0]))
+
+
+def test_observation_of_another_size_is_refused():
+    with pytest.raises(ValueError, match="reads 1 numbers, got observations of 2"):
+        scalar_policy().act(torch.zeros(3, 2))
+
+
+# ---------------------------------------------------------------------- saving and loading
+
+
+def test_policy_comes_back_bitwise(trained, folder, observations):
+    loaded = load_policy(folder)
+    assert loaded.interface == trained.interface
+    assert loaded.config["env"] == {"seed": 5} and loaded.config["commit"] == "abc"
+    assert torch.equal(loaded.act(observations), trained.act(observations))
+    assert {path.name for path in folder.iterdir()} == {
+        "policy.safetensors", "config.json", "policy.onnx", "manifest.json", "README.md",
+    }  # fmt: skip
+
+
+def test_policy_that_is_there_is_replaced_only_on_request(folder, trained):
+    (folder / "old.txt").write_text("old")
+    with pytest.raises(PolicyError, match="exists"):
+        save_policy(folder, trained)
+    save_policy(folder, trained, overwrite=True)
+    assert load_policy(folder) and not (folder / "old.txt").exists()
+    assert [path.name for path in folder.parent.iterdir()] == ["jump"]
+
+
+def test_folder_that_is_no_policy_is_never_replaced(tmp_path, trained):
+    (tmp_path / "mine.txt").write_text("mine")
+    with pytest.raises(PolicyError, match="no policy's"):
+        save_policy(tmp_path, trained, overwrite=True)
+    assert (tmp_path / "mine.txt").exists()
+
+
+@pytest.mark.parametrize("name", ["../evil", "manifest.json", ".hidden", ""])
+def test_save_with_a_malformed_name_leaves_nothing(tmp_path, trained, name):
+    with pytest.raises(PolicyError, match="cannot hold a file named"):
+        save_policy(tmp_path / "jump", trained, files={name: b""})
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_added_figures_are_in_the_manifest(folder):
+    add_files(folder, {"figures.json": b"{}", "README.md": b"how it was made"})
+    assert load_policy(folder) and (folder / "README.md").read_bytes() == b"how it was made"
+    (folder / "figures.json").write_bytes(b"{ }")
+    with pytest.raises(PolicyError, match=r"figures\.json: truncated or altered"):
+        load_policy(folder)
+
+
+def test_added_files_neither_replace_the_policy_nor_seal_an_altered_one(folder):
+    with pytest.raises(PolicyError, match="is the policy itself"):
+        add_files(folder, {"policy.onnx": b""})
+    (folder / "config.json").write_text("{}")
+    with pytest.raises(PolicyError, match="truncated or altered"):
+        add_files(folder, {"figures.json": b"{}"})
+
+
+def test_project_policies_are_found_by_name(tmp_path, trained, monkeypatch):
+    monkeypatch.setattr(folder_module, "POLICIES", tmp_path)
+    save_policy(tmp_path / "vertical_jump", trained)
+    assert list_policies() == ("vertical_jump",)
+    assert load_policy("vertical-jump").interface == trained.interface
+    with pytest.raises(PolicyError, match=r"no policy 'walk'.*vertical_jump"):
+        load_policy("walk")
+
+
+class Payload:
+    """Creates a file when unpickled."""
+
+    def __init__(self, path):
+        self.path = path
+
+    def __reduce__(self):
+        return open, (str(self.path), "w")
+
+
+def flip_a_bit(folder):
+    data = bytearray((folder / "policy.safetensors").read_bytes())
+    data[-1] ^= 1
+    (folder / "policy.safetensors").write_bytes(data)
+
+
+def change_tensors(**changes):
+    def change(folder):
+        tensors = safetensors.torch.load((folder / "policy.safetensors").read_bytes())
+        tensors |= {name.replace("__", "."): value for name, value in changes.items()}
+        reseal(folder, "policy.safetensors", safetensors.torch.save(tensors))
+
+    return change
+
+
+REFUSALS = {
+    "manifest missing": (lambda f: (f / "manifest.json").unlink(), "manifest.json: cannot be read"),
+    "manifest not JSON": (lambda f: (f / "manifest.json").write_text("{"), "manifest.json: not JSON"),
+    "manifest of something else": (
+        lambda f: edit_json(f, "manifest.json", lambda m: m.update(format="x")),
+        "not the manifest of",
+    ),
+    "manifest lacks a sum": (
+        lambda f: edit_json(f, "manifest.json", lambda m: m["sha256"].pop("policy.onnx")),
+        "lacks the sums",
+    ),
+    "manifest names a file outside": (
+        lambda f: edit_json(f, "manifest.json", lambda m: m["sha256"].update({"../x": ""})),
+        "names a file",
+    ),
+    "manifest of the future": (
+        lambda f: edit_json(f, "manifest.json", lambda m: m.update(schema_version=2)),
+        "schema version 2",
+    ),
+    "config of the future": (
+        lambda f: edit_json(f, "config.json", lambda c: c.update(schema_version=2)),
+        "config.json: schema version 2",
+    ),
+    "file missing": (lambda f: (f / "policy.onnx").unlink(), "policy.onnx: cannot be read"),
+    "truncated": (
+        lambda f: (f / "policy.safetensors").write_bytes((f / "policy.safetensors").read_bytes()[:-4]),
+        "policy.safetensors: truncated or altered",
+    ),
+    "one bit": (flip_a_bit, "policy.safetensors: truncated or altered"),
+    "empty but sealed": (lambda f: reseal(f, "policy.safetensors", b""), "policy.safetensors: cannot be read"),
+    "layer of another shape": (
+        change_tensors(actor__1__weight=torch.zeros(32, 65)),
+        r"asks for actor.1.weight of shape \(32, 64\), it has \(32, 65\)",
+    ),
+    "layer too many": (change_tensors(actor__3__weight=torch.zeros(12, 12)), "missing or unknown: actor.3.weight"),
+    "not finite": (change_tensors(actor__0__bias=torch.full((64,), math.nan)), "actor.0.bias is not finite"),
+    "no deviation": (change_tensors(normaliser__std=torch.zeros(48)), "std must be positive"),
+    "other sizes in config": (
+        lambda f: edit_json(f, "config.json", lambda c: c["interface"].update(hidden=[64, 32, 8])),
+        "missing or unknown: actor.3",
+    ),
+    "interface lacks a field": (
+        lambda f: edit_json(f, "config.json", lambda c: c["interface"].pop("policy_dt")),
+        "missing or unknown: policy_dt",
+    ),
+    "interface of a wrong type": (
+        lambda f: edit_json(f, "config.json", lambda c: c["interface"].update(policy_dt="fast")),
+        "policy_dt must be a float",
+    ),
+    "no interface": (lambda f: edit_json(f, "config.json", lambda c: c.pop("interface")), "must be a JSON object"),
+}
+
+
+@pytest.mark.parametrize("case", REFUSALS)
+def test_unusable_policy_is_refused_in_one_line(folder, case):
+    damage, message = REFUSALS[case]
+    damage(folder)
+    with pytest.raises(PolicyError, match=message) as refusal:
+        load_policy(folder)
+    assert "\n" not in str(refusal.value)
+
+
+def test_pickle_in_place_of_the_weights_is_not_executed(folder, tmp_path):
+    trap = tmp_path / "executed"
+    reseal(folder, "policy.safetensors", pickle.dumps(Payload(trap)))
+    with pytest.raises(PolicyError, match="cannot be read"):
+        load_policy(folder)
+    assert not trap.exists()
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"joint_names": ("a", "a")}, "joint_names must be distinct"),
+        ({"torque_limit": (1.0, 2.0)}, "torque_limit needs 1 numbers"),
+        ({"action_scale": (math.nan,)}, "action_scale must be finite"),
+        ({"policy_dt": 0.0}, "policy_dt must be finite and positive"),
+        ({"hidden": ()}, "hidden must name widths"),
+        ({"activation": "gelu"}, "activation must be one of"),
+        ({"quaternion_order": "wxyz"}, "quaternion_order must be xyzw"),
+    ],
+)
+def test_impossible_interface_is_refused(change, message):
+    with pytest.raises(PolicyError, match=message):
+        make_interface(**change)
+
+
+# ---------------------------------------------------------------------- ONNX
+
+
+@pytest.mark.parametrize("batch", [1, 9])
+def test_onnx_runtime_agrees_with_torch(folder, trained, observations, batch):
+    session = onnxruntime.InferenceSession(str(folder / "policy.onnx"), providers=["CPUExecutionProvider"])
+    obs = observations[:batch]
+    actions = session.run(["actions"], {"obs": obs.numpy()})[0]
+    assert actions.shape == (batch, 12)
+    np.testing.assert_allclose(actions, trained.act(obs).numpy(), rtol=0.0, atol=1e-5)
+
+
+@pytest.mark.parametrize("activation", ["relu", "tanh"])
+def test_onnx_runtime_agrees_with_other_activations(tmp_path, activation):
+    torch.manual_seed(0)
+    interface = make_interface(4, 2, (8, 8), activation=activation)
+    layers = [(torch.randn(o, i), torch.randn(o)) for i, o in ((4, 8), (8, 8), (8, 2))]
+    policy = Policy(layers, torch.randn(4), torch.rand(4) + 0.1, interface)
+    session = onnxruntime.InferenceSession(str(export_onnx(policy, tmp_path / "p.onnx")))
+    obs = torch.randn(5, 4)
+    np.testing.assert_allclose(session.run(None, {"obs": obs.numpy()})[0], policy.act(obs).numpy(), atol=1e-5)
+
+
+def test_onnx_metadata_tells_the_interface_in_full_precision(folder, trained):
+    model = onnx.load(folder / "policy.onnx", load_external_data=False)
+    entries = {entry.key: entry.value for entry in model.metadata_props}
+    full = json.loads(entries["jumper_warp"])
+    assert full["commit"] == "abc" and full["quaternion_order"] == "xyzw"
+    assert full["policy_dt"] == 1.0 / 60.0
+    assert full["action_scale"] == list(trained.interface.action_scale)
+    assert entries["joint_names"].split(",") == list(trained.interface.joint_names)
+    assert [float(text) for text in entries["joint_stiffness"].split(",")] == full["joint_stiffness"]
+    assert len(entries["observation_names"].split(",")) == 48
+
+
+def test_onnx_is_one_file_and_reproducible(folder, trained):
+    model = onnx.load(folder / "policy.onnx", load_external_data=False)
+    assert all(tensor.data_location == onnx.TensorProto.DEFAULT for tensor in model.graph.initializer)
+    assert onnx_bytes(trained) == onnx_bytes(trained)

@@ -1,0 +1,141 @@
+import json
+import os
+import pickle
+
+import pytest
+import torch
+
+from jumper_warp.rl.checkpoint import (
+    MANIFEST,
+    CheckpointError,
+    best_checkpoint,
+    latest_checkpoint,
+    load_checkpoint,
+    save_checkpoint,
+)
+from jumper_warp.utils.files import write_whole
+
+
+def state(iteration):
+    parts = {"ppo": {"weight": torch.full((3,), float(iteration))}, "env": {}, "rng": {}, "config": "{}"}
+    return {"iteration": iteration, **parts}
+
+
+def weight(checkpoint):
+    return checkpoint["ppo"]["weight"].tolist()
+
+
+def test_what_is_saved_is_loaded(tmp_path):
+    path = save_checkpoint(tmp_path / "new", state(7))
+    assert path.name == "iteration_000007.pt"
+    assert weight(load_checkpoint(path)) == [7.0, 7.0, 7.0]
+    assert sorted(entry.name for entry in path.parent.iterdir()) == [path.name, MANIFEST]
+
+
+def test_the_newest_and_the_best_stay(tmp_path):
+    for iteration, score in enumerate([0.1, 0.9, 0.3, None, 0.2], start=1):
+        save_checkpoint(tmp_path, state(iteration), score, keep=2)
+    assert sorted(path.stem for path in tmp_path.glob("*.pt")) == [f"iteration_00000{i}" for i in (2, 4, 5)]
+    assert best_checkpoint(tmp_path).stem == "iteration_000002"
+
+
+def test_without_scores_the_newest_is_the_best(tmp_path):
+    save_checkpoint(tmp_path, state(1))
+    newest = save_checkpoint(tmp_path, state(2))
+    assert best_checkpoint(tmp_path) == newest
+
+
+def flip(path):
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 1
+    path.write_bytes(data)
+
+
+def cut(path):
+    path.write_bytes(path.read_bytes()[:-100])
+
+
+def forget(path):
+    (path.parent / MANIFEST).write_text("{}")
+
+
+def scramble_manifest(path):
+    (path.parent / MANIFEST).write_text('{"iteration_000002.pt": 3}')
+
+
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        (flip, "differs from its checksum"),
+        (cut, "differs from its checksum"),
+        (os.remove, "no such checkpoint"),
+        (forget, "has no checksum"),
+        (scramble_manifest, "manifest.json: not readable"),
+        (lambda path: os.remove(path.parent / MANIFEST), "manifest.json: No such file"),
+    ],
+)
+def test_a_damaged_checkpoint_is_refused_in_one_line(tmp_path, damage, message):
+    path = save_checkpoint(tmp_path, state(2))
+    damage(path)
+    with pytest.raises(CheckpointError, match=message) as caught:
+        load_checkpoint(path)
+    assert "\n" not in str(caught.value)
+
+
+class Payload:
+    def __reduce__(self):
+        return os.system, ("touch executed",)
+
+
+def test_nothing_in_a_checkpoint_is_executed(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    path = save_checkpoint(tmp_path, {**state(1), "env": Payload()})
+    with pytest.raises(CheckpointError, match="not readable as tensors"):
+        load_checkpoint(path)
+    assert not (tmp_path / "executed").exists()
+    pickle.loads(pickle.dumps(Payload()))
+    assert (tmp_path / "executed").exists()
+
+
+def test_a_checkpoint_without_its_parts_is_refused(tmp_path):
+    path = save_checkpoint(tmp_path, {"iteration": 1, "ppo": {}})
+    with pytest.raises(CheckpointError, match="lacks env, rng, config"):
+        load_checkpoint(path)
+
+
+def test_the_latest_usable_one_is_found_behind_damaged_ones(tmp_path):
+    paths = [save_checkpoint(tmp_path, state(iteration)) for iteration in (1, 2, 3)]
+    cut(paths[2])
+    flip(paths[1])
+    path, found, refusals = latest_checkpoint(tmp_path)
+    assert (path, found["iteration"]) == (paths[0], 1)
+    assert [refusal.split(":")[0] for refusal in refusals] == [str(paths[2]), str(paths[1])]
+
+
+def test_no_usable_checkpoint_is_told(tmp_path):
+    cut(save_checkpoint(tmp_path, state(1)))
+    with pytest.raises(CheckpointError, match=r"no usable checkpoint.*differs from its checksum"):
+        latest_checkpoint(tmp_path)
+
+
+def test_a_failed_write_leaves_the_old_file(tmp_path, monkeypatch):
+    path = tmp_path / "file"
+    write_whole(path, b"old")
+
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(OSError, match="No space left"):
+        write_whole(path, b"new")
+    assert path.read_bytes() == b"old"
+    assert [entry.name for entry in tmp_path.iterdir()] == ["file"]
+
+
+def test_a_checkpoint_that_the_manifest_does_not_know_is_no_latest_one(tmp_path):
+    first = save_checkpoint(tmp_path, state(1))
+    manifest = (tmp_path / MANIFEST).read_text()
+    save_checkpoint(tmp_path, state(2))
+    (tmp_path / MANIFEST).write_text(manifest)  # as after a cut between the two writes
+    assert latest_checkpoint(tmp_path)[0] == first
+    assert json.loads(manifest).keys() == {first.name}

@@ -1,0 +1,352 @@
+import dataclasses
+import socket
+
+import pytest
+import torch
+from rsl_rl.algorithms import PPO
+from rsl_rl.models import MLPModel
+from rsl_rl.storage import RolloutStorage
+from tensordict import TensorDict
+from torch.utils._python_dispatch import TorchDispatchMode
+from toy_task import SMALL, PushTask, fill, local_order, update_half
+
+from jumper_warp.rl.ppo import Batch, Ppo, PpoCfg, adapted_lr, gae
+
+PLAIN = PpoCfg(
+    num_steps=8, epochs=1, minibatches=1, hidden=(16, 8), normalise_value=False, reward_scale=1.0, max_grad_norm=1e9
+)
+
+
+def groups(obs, critic_obs):
+    return TensorDict({"policy": obs, "critic": critic_obs}, batch_size=[obs.shape[0]])
+
+
+def as_rsl_rl(ppo):
+    """rsl-rl's PPO with the same weights and settings."""
+    cfg, env, ours = ppo.cfg, ppo.env, ppo.model
+    obs = groups(torch.zeros(env.num_envs, 2), torch.zeros(env.num_envs, 3))
+    sets = {"actor": ["policy"], "critic": ["critic"]}
+    noise = {"class_name": "GaussianDistribution", "init_std": cfg.init_std, "std_type": "log"}
+    actor = MLPModel(obs, sets, "actor", 1, cfg.hidden, "elu", distribution_cfg=noise)
+    critic = MLPModel(obs, sets, "critic", 1, cfg.hidden, "elu")
+    theirs = PPO(
+        actor, critic, RolloutStorage("rl", env.num_envs, cfg.num_steps, obs, [1]), num_learning_epochs=1,
+        num_mini_batches=1, gamma=cfg.gamma, lam=cfg.lam, value_loss_coef=cfg.value_coef, max_grad_norm=1e9,
+        entropy_coef=cfg.entropy_coef, schedule="adaptive", desired_kl=cfg.desired_kl, learning_rate=cfg.lr,
+    )  # fmt: skip
+    copy_weights(ours, theirs)
+    return theirs
+
+
+def copy_weights(ours, theirs):
+    theirs.actor.mlp.load_state_dict(ours.actor.state_dict())
+    theirs.critic.mlp.load_state_dict(ours.critic.state_dict())
+    theirs.actor.distribution.log_std_param.data.copy_(ours.log_std.data)
+
+
+def feed(theirs, rollout):
+    """Give rsl-rl our rollout, as if it had acted itself."""
+    for step in range(rollout.reward.shape[0]):
+        obs = groups(rollout.obs[step], rollout.critic_obs[step])
+        theirs.act(obs)
+        transition = theirs.transition
+        transition.actions = rollout.action[step]
+        transition.actions_log_prob = theirs.actor.get_output_log_prob(rollout.action[step]).detach()
+        theirs.process_env_step(obs, rollout.reward[step], rollout.done[step], {})
+    theirs.compute_returns(groups(rollout.obs[-1], rollout.critic_obs[-1]))
+
+
+@pytest.fixture(scope="module")
+def pair():
+    """Ours and rsl-rl's after one update of the same weights, changed since they acted, on the same experience."""
+    torch.manual_seed(0)
+    ppo = Ppo(PushTask(16), PLAIN)
+    fill(ppo, slice(None), 16)
+    ppo.rollout.timeout.zero_()
+    theirs = as_rsl_rl(ppo)
+    feed(theirs, ppo.rollout)
+    batch = ppo.batch()
+    with torch.no_grad():
+        for param in ppo.model.parameters():
+            param.add_(0.1 * torch.randn_like(param))
+    copy_weights(ppo.model, theirs)
+    their_losses = theirs.update()
+    ppo._descend(batch)
+    return ppo, batch, theirs, their_losses, ppo.statistics()
+
+
+def test_returns_and_advantages_equal_rsl_rl(pair):
+    _, batch, theirs, _, _ = pair
+    torch.testing.assert_close(batch.target, theirs.storage.returns.flatten(), atol=1e-5, rtol=1e-5)
+    torch.testing.assert_close(batch.advantage, theirs.storage.advantages.flatten(), atol=1e-5, rtol=1e-5)
+
+
+@pytest.mark.parametrize("name", ["surrogate", "value", "entropy"])
+def test_losses_equal_rsl_rl(pair, name):
+    _, _, _, their_losses, ours = pair
+    assert ours[f"Loss/{name}"] == pytest.approx(their_losses[name], abs=1e-5, rel=1e-5)
+
+
+def test_gradients_equal_rsl_rl(pair):
+    ppo, _, theirs, _, _ = pair
+    ours = {**dict(ppo.model.actor.named_parameters()), "noise": ppo.model.log_std}
+    their_actor = {**dict(theirs.actor.mlp.named_parameters()), "noise": theirs.actor.distribution.log_std_param}
+    for name, param in ours.items():
+        torch.testing.assert_close(param.grad, their_actor[name].grad, atol=1e-5, rtol=1e-5)
+    for a, b in zip(ppo.model.critic.parameters(), theirs.critic.mlp.parameters(), strict=True):
+        torch.testing.assert_close(a.grad, b.grad, atol=1e-5, rtol=1e-5)
+    assert ppo._vector.norm() > 0.1
+
+
+def test_step_size_after_the_update_equals_rsl_rl(pair):
+    ppo, _, theirs, _, statistics = pair
+    assert statistics["Loss/kl"] > 0.02
+    assert ppo.lr.item() == pytest.approx(theirs.learning_rate)
+
+
+def test_gradients_are_shortened_as_rsl_rl_does():
+    torch.manual_seed(0)
+    ppo = Ppo(PushTask(16), dataclasses.replace(PLAIN, max_grad_norm=0.05))
+    fill(ppo, slice(None), 16)
+    ppo.update()
+    actor, critic = (part.norm().item() for part in ppo._gradients)
+    assert actor == pytest.approx(0.05, rel=1e-4)
+    assert critic == pytest.approx(0.05, rel=1e-4)
+
+
+def test_gae_by_hand():
+    # gamma 0.5, lambda 0.5; the second step ends an episode.
+    # delta: 1 + 0.5*4 - 2 = 1;  2 - 4 = -2;  3 + 0.5*8 - 6 = 1.  Advantage: 1 - 0.25*2 = 0.5; -2; 1.
+    advantage, returns = gae(
+        torch.tensor([[1.0], [2.0], [3.0]]),
+        torch.tensor([[0.0], [1.0], [0.0]]),
+        torch.tensor([[2.0], [4.0], [6.0], [8.0]]),
+        0.5,
+        0.5,
+    )
+    assert advantage.flatten().tolist() == [0.5, -2.0, 1.0]
+    assert returns.flatten().tolist() == [2.5, 2.0, 7.0]
+
+
+def test_a_timeout_counts_the_value_of_the_last_observation():
+    cfg = dataclasses.replace(PLAIN, num_steps=1, gamma=0.5)
+    ppo = Ppo(PushTask(2), cfg)
+    for linear in ppo.model.critic[:-1:2]:
+        torch.nn.init.zeros_(linear.weight)
+    torch.nn.init.constant_(ppo.model.critic[-1].bias, 10.0)  # every state is worth 10
+    ppo.rollout.reward.copy_(torch.tensor([[1.0, 1.0]]))
+    ppo.rollout.done.copy_(torch.tensor([[1.0, 1.0]]))
+    ppo.rollout.timeout.copy_(torch.tensor([[0.0, 1.0]]))
+    assert ppo.batch().target.tolist() == pytest.approx([1.0, 6.0])  # 1 and 1 + 0.5 * 10
+
+
+def test_the_timeout_looks_at_the_old_episode():
+    ppo = Ppo(PushTask(2), dataclasses.replace(PLAIN, num_steps=1))
+    ppo.rollout.done.fill_(1.0)
+    ppo.rollout.timeout.fill_(1.0)
+    ppo.rollout.critic_obs[1] = 7.0  # where the new episode begins
+    ppo.rollout.final_critic_obs.copy_(torch.tensor([[[0.5, -0.5, 3.0], [2.0, 1.0, 0.0]]]))
+    expected = PLAIN.gamma * ppo.model.value(ppo.rollout.final_critic_obs[0])
+    torch.testing.assert_close(ppo.batch().target, expected.detach())
+
+
+@pytest.mark.parametrize(
+    ("lr", "kl", "expected"),
+    [
+        (1e-3, 0.021, 1e-3 / 1.5),
+        (1e-3, 0.004, 1.5e-3),
+        (1e-3, 0.010, 1e-3),
+        (1e-3, 0.0, 1e-3),
+        (1.2e-5, 1.0, 1e-5),
+        (9e-3, 0.001, 1e-2),
+        (1e-3, float("nan"), 1e-3),
+    ],
+)
+def test_step_size_follows_the_divergence(lr, kl, expected):
+    found = adapted_lr(torch.tensor(lr), torch.tensor(kl), PpoCfg(desired_kl=0.01, min_lr=1.0e-5))
+    assert found.item() == pytest.approx(expected)
+
+
+def test_step_size_stays_without_desired_divergence():
+    cfg = PpoCfg(desired_kl=0.0)
+    assert adapted_lr(torch.tensor(1e-3), torch.tensor(9.0), cfg).item() == pytest.approx(1e-3)
+
+
+def trained(iterations):
+    torch.manual_seed(1)
+    ppo = Ppo(PushTask(128), SMALL)
+    ppo.env.reset()
+    history = []
+    for _ in range(iterations):
+        ppo.collect()
+        ppo.update()
+        history.append(ppo.statistics())
+    return ppo, history
+
+
+def test_training_learns_to_push_the_mass_to_the_origin():
+    ppo, history = trained(30)
+    returns = [figures["Train/mean_return"] for figures in history if "Train/mean_return" in figures]
+    assert returns[0] < 25.0
+    assert returns[-1] > 44.0  # of at most 50
+    env = ppo.env
+    env.reset()
+    for _ in range(40):
+        env.step(ppo.model.act(env.obs))
+    assert env.obs[:, 0].abs().max() < 0.2
+
+
+def test_the_critic_learns_the_return_in_its_own_unit():
+    ppo, history = trained(30)
+    # Held at the origin, a mass earns the scaled reward 0.6 for ever: 0.6 / (1 - 0.985) = 40.
+    expected = 40.0 * history[-2]["Train/mean_return"] / 50.0
+    with torch.no_grad():
+        head = ppo.model.value_head(ppo.model.critic_features(ppo.rollout.critic_obs))
+        value = ppo.model.value(ppo.rollout.critic_obs)
+    assert value.mean().item() == pytest.approx(expected, rel=0.1)
+    assert head.abs().max() < 5.0
+
+
+def test_the_same_seed_gives_the_same_bits():
+    first, second = trained(3)[0].model.state_dict(), trained(3)[0].model.state_dict()
+    assert all(torch.equal(value, second[name]) for name, value in first.items())
+
+
+class BrokenWorlds(PushTask):
+    """Worlds 0 to 2 come apart at every step."""
+
+    def step(self, action):
+        super().step(action)
+        bad = torch.tensor([float("nan"), float("inf"), 1.0e13])
+        for array in (self.obs, self.final_obs, self.critic_obs, self.final_critic_obs):
+            array[:3] = bad[:, None]
+        self.reward[:2] = bad[:2]
+
+
+def test_worlds_that_come_apart_reach_neither_networks_nor_statistics():
+    torch.manual_seed(0)
+    ppo = Ppo(BrokenWorlds(128), SMALL)
+    ppo.env.reset()
+    for _ in range(3):
+        ppo.collect()
+        ppo.update()
+    for kept in (ppo.rollout.obs, ppo.rollout.critic_obs):
+        assert kept.isfinite().all()
+        assert kept.abs().max() <= 100.0
+    assert all(value.isfinite().all() for value in ppo.model.state_dict().values())
+    assert ppo.model.obs_moments.var.max() < 200.0  # one world in 128 at 100 gives 78
+    assert ppo.model.critic_moments.var[:2].max() < 200.0
+    assert ppo.model.features(torch.full((1, 2), 1e30)).abs().max() <= 10.0
+    assert ppo.model.critic_features(torch.full((1, 3), 1e30)).abs().max() <= 10.0
+    assert ppo.statistics()["Loss/skipped"] == 0.0
+
+
+def test_a_gradient_that_is_not_finite_changes_nothing():
+    ppo = Ppo(PushTask(16), PLAIN)
+    fill(ppo, slice(None), 16)
+    batch = ppo.batch()
+    before = {name: value.clone() for name, value in ppo.model.named_parameters()}
+    ppo._descend(batch._replace(advantage=batch.advantage * float("nan"), target=batch.target * float("inf")))
+    assert all(torch.equal(value, before[name]) for name, value in ppo.model.named_parameters())
+    assert ppo.statistics()["Loss/skipped"] == 1.0
+
+
+class NoHost(TorchDispatchMode):
+    """Refuses the operations that wait for a device's result or whose shape depends on it."""
+
+    refused = ("_local_scalar_dense", "nonzero", "masked_select", "unique", "equal")
+
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+        name = func.overloadpacket.__name__
+        assert name not in self.refused, name
+        if name in ("index", "index_put", "index_put_"):
+            assert all(index is None or index.dtype != torch.bool for index in args[1]), "boolean index"
+        return func(*args, **(kwargs or {}))
+
+
+def test_an_iteration_never_waits_for_the_host():
+    ppo = Ppo(PushTask(16), PLAIN)
+    ppo.env.reset()
+    with NoHost():
+        ppo.collect()
+        ppo.update()
+
+
+def test_the_check_for_waiting_sees_an_item():
+    with pytest.raises(AssertionError, match="_local_scalar_dense"), NoHost():
+        torch.ones(()).item()
+
+
+def free_port():
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return probe.getsockname()[1]
+
+
+def test_two_processes_equal_one_with_all_worlds(tmp_path):
+    cfg = PpoCfg(num_steps=8, epochs=2, minibatches=2, hidden=(16, 8))
+    processes = torch.multiprocessing.spawn(
+        update_half, (free_port(), cfg, str(tmp_path / "half")), nprocs=2, join=False
+    )
+    torch.manual_seed(0)
+    whole = Ppo(PushTask(8), cfg)
+    fill(whole, slice(None), 8)
+    orders = [local_order(rank, 32).chunk(2) for rank in range(2)]
+    parts = [
+        order // 4 * 8 + order % 4 + 4 * rank for pair in zip(*orders, strict=True) for rank, order in enumerate(pair)
+    ]
+    whole.order = lambda: torch.cat(parts)
+    start = {name: value.clone() for name, value in whole.model.state_dict().items()}
+    whole.update()
+    while not processes.join():
+        pass
+    expected = whole.state_dict()
+    for rank in range(2):
+        found = torch.load(tmp_path / f"half{rank}", weights_only=True)
+        for name, value in expected["model"].items():
+            torch.testing.assert_close(found["model"][name], value, atol=1e-5, rtol=1e-5, msg=name)
+            assert not torch.equal(value, start[name]), name
+        torch.testing.assert_close(found["lr"], expected["lr"])
+
+
+def test_state_is_taken_up_exactly():
+    ppo, _ = trained(2)
+    torch.manual_seed(99)
+    other = Ppo(PushTask(128), SMALL)
+    other.load_state_dict(ppo.state_dict())
+    for each in (ppo, other):
+        torch.manual_seed(5)
+        each.env.reset()
+        each.collect()
+        each.update()
+    ours, theirs = ppo.model.state_dict(), other.model.state_dict()
+    assert all(torch.equal(value, theirs[name]) for name, value in ours.items())
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"gamma": 1.5}, "gamma must be in"),
+        ({"num_steps": 0}, "num_steps must be positive"),
+        ({"lr": 1.0}, "min_lr <= lr <= max_lr"),
+        ({"hidden": ()}, "hidden must name"),
+        ({"activation": "gelu"}, "activation must be one of elu, relu, tanh, got gelu"),
+        ({"clip": float("nan")}, "clip must be positive"),
+    ],
+)
+def test_settings_out_of_range_are_refused(change, message):
+    with pytest.raises(ValueError, match=message):
+        PpoCfg(**change)
+
+
+def test_minibatches_must_divide_the_batch():
+    with pytest.raises(ValueError, match="7 minibatches do not divide 8 x 16"):
+        Ppo(PushTask(16), dataclasses.replace(PLAIN, minibatches=7))
+
+
+def test_a_batch_is_time_major():
+    ppo = Ppo(PushTask(4), PLAIN)
+    fill(ppo, slice(None), 4)
+    batch = ppo.batch()
+    assert isinstance(batch, Batch)
+    torch.testing.assert_close(batch.action[5], ppo.rollout.action[1, 1])

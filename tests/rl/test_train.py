@@ -1,0 +1,328 @@
+import dataclasses
+import json
+import os
+import signal
+import socket
+import time
+
+import pytest
+import torch
+from rsl_rl.runners import OnPolicyRunner
+from tensordict import TensorDict
+from toy_task import SMALL, PushTask, train_rank
+
+from jumper_warp.envs.rsl_rl import RslRlVecEnv, rsl_rl_config, train_rsl_rl
+from jumper_warp.rl.checkpoint import MANIFEST, CheckpointError, load_checkpoint, save_checkpoint
+from jumper_warp.rl.distributed import Rank
+from jumper_warp.rl.logger import FIGURES
+from jumper_warp.rl.ppo import PpoCfg
+from jumper_warp.rl.runner import CHECKPOINTS, CONFIG, Run, Stop, TrainCfg, train
+
+
+def make_env(num_envs, seed, device):
+    return PushTask(num_envs, seed, device, episode_length=SMALL.num_steps)
+
+
+@pytest.fixture
+def cfg(tmp_path):
+    return TrainCfg(
+        task="push", num_envs=32, iterations=4, device="cpu", log_root=tmp_path / "logs", log_interval=2,
+        save_interval=2, tensorboard=False, ppo=SMALL,
+    )  # fmt: skip
+
+
+def final_state(result):
+    return load_checkpoint(result.folder / CHECKPOINTS / f"iteration_{result.iteration:06d}.pt")
+
+
+def equal(a, b):
+    if isinstance(a, dict):
+        return a.keys() == b.keys() and all(equal(a[key], b[key]) for key in a)
+    return torch.equal(a, b)
+
+
+def test_a_run_leaves_settings_figures_and_checkpoints(cfg):
+    result = train(cfg, make_env)
+    assert result.folder.parent == cfg.log_root / "push"
+    settings = json.loads((result.folder / CONFIG).read_text())
+    assert settings["train"]["ppo"]["num_steps"] == 16
+    assert settings["env"] == {"episode_length": 16}
+    assert settings["versions"]["torch"].split("+")[0] == torch.__version__.split("+")[0]
+    lines = [json.loads(line) for line in (result.folder / FIGURES).read_text().splitlines()]
+    assert [line["iteration"] for line in lines] == [2, 4]
+    assert lines[-1]["Train/mean_length"] == 16.0
+    assert {"Perf/fps", "Perf/collect_s", "Perf/update_s", "Loss/kl", "Metrics/success"} <= lines[0].keys()
+    assert json.loads((result.folder / CHECKPOINTS / MANIFEST).read_text()).keys() == {
+        "iteration_000002.pt",
+        "iteration_000004.pt",
+    }
+    assert json.loads(final_state(result)["config"]) == settings
+
+
+def test_each_logged_iteration_is_told(cfg, capsys):
+    figures = train(cfg, make_env).figures
+    (line,) = [line for line in capsys.readouterr().err.splitlines() if line.startswith("iteration 4: ")]
+    fps, total = f"{figures['Perf/fps']:,.0f}", f"{figures['Train/mean_return']:.2f}"
+    success = f"{100.0 * figures['Metrics/success']:.1f}"
+    assert line == f"iteration 4: {fps} steps/s, return {total}, success {success} %"
+
+
+def test_a_resumed_run_equals_an_uninterrupted_one(cfg):
+    whole = final_state(train(cfg, make_env))
+    half = train(dataclasses.replace(cfg, iterations=2), make_env)
+    torch.manual_seed(12345)
+    resumed = train(dataclasses.replace(cfg, resume=str(half.folder)), make_env)
+    assert (resumed.folder, resumed.iteration) == (half.folder, 4)
+    found = final_state(resumed)
+    for part in ("ppo", "env", "rng"):
+        assert equal(found[part], whole[part]), part
+
+
+def resume_after(cfg, seconds, limit):
+    """Resume a checkpoint that tells of so many seconds (None: of none) under a time limit; return run and result."""
+    half = train(dataclasses.replace(cfg, iterations=2), make_env)
+    state = final_state(half)
+    assert 0.0 < state.pop("seconds") <= half.seconds
+    save_checkpoint(half.folder / CHECKPOINTS, state if seconds is None else {**state, "seconds": seconds})
+    cfg = dataclasses.replace(cfg, iterations=100_000, max_seconds=limit, resume=str(half.folder))
+    run = Run(cfg, make_env(cfg.num_envs, 1, "cpu"), Rank(0, 1, torch.device("cpu")))
+    with Stop() as stop:
+        return run, run.iterate(stop)
+
+
+def test_a_resumed_run_goes_on_in_time(cfg):
+    run, result = resume_after(cfg, 99.7, limit=100.0)
+    assert result.iteration > 2 and result.seconds < 5.0
+    assert final_state(result)["seconds"] >= result.figures["Perf/elapsed_s"] >= 100.0
+    assert run.ppo._desired_kl.item() == pytest.approx(cfg.ppo.final_kl, rel=0.05)  # desired_kl by its own time alone
+
+
+def test_a_resumed_run_whose_time_is_over_ends_at_once(cfg):
+    assert resume_after(cfg, 100.0, limit=100.0)[1].iteration == 2
+
+
+def test_a_checkpoint_that_tells_no_time_counts_from_zero(cfg):
+    result = resume_after(cfg, None, limit=0.3)[1]
+    assert 0.3 <= final_state(result)["seconds"] <= result.seconds < 5.0
+
+
+def test_a_checkpoint_with_an_unreadable_time_is_refused_in_one_line(cfg):
+    with pytest.raises(CheckpointError, match="does not fit these settings: could not convert string to float"):
+        resume_after(cfg, "late", limit=100.0)
+
+
+def test_latest_passes_over_a_damaged_checkpoint(cfg, capsys):
+    result = train(cfg, make_env)
+    (result.folder / CHECKPOINTS / "iteration_000004.pt").write_bytes(b"cut")
+    resumed = train(dataclasses.replace(cfg, resume="latest", iterations=3), make_env)
+    assert (resumed.folder, resumed.iteration) == (result.folder, 3)
+    told = capsys.readouterr().err
+    assert "passed over" in told
+    assert "iteration_000002.pt" in told
+
+
+def test_a_named_checkpoint_that_is_damaged_is_refused(cfg):
+    path = train(cfg, make_env).folder / CHECKPOINTS / "iteration_000004.pt"
+    path.write_bytes(b"cut")
+    with pytest.raises(CheckpointError, match="differs from its checksum"):
+        train(dataclasses.replace(cfg, resume=str(path)), make_env)
+
+
+@pytest.mark.parametrize("change", [{"hidden": (16, 16)}, {"asymmetric": False}])
+def test_a_checkpoint_of_other_networks_is_refused_in_one_line(cfg, change):
+    result = train(cfg, make_env)
+    other = dataclasses.replace(cfg, resume=str(result.folder), ppo=dataclasses.replace(SMALL, **change))
+    with pytest.raises(CheckpointError, match="does not fit these settings") as caught:
+        train(other, make_env)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_checkpoint_without_the_critics_statistics_is_refused_in_one_line(cfg):
+    result = train(cfg, make_env)
+    old = final_state(result)
+    for name in ("mean", "var", "count"):
+        del old["ppo"]["model"][f"critic_moments.{name}"]
+    save_checkpoint(result.folder / CHECKPOINTS, old)
+    with pytest.raises(CheckpointError, match=r"does not fit these settings: .*critic_moments") as caught:
+        train(dataclasses.replace(cfg, resume=str(result.folder)), make_env)
+    assert "\n" not in str(caught.value)
+
+
+def test_nothing_to_resume_is_told(cfg):
+    with pytest.raises(CheckpointError, match="no run to resume"):
+        train(dataclasses.replace(cfg, resume="latest"), make_env)
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_ends_the_iteration_and_saves(cfg, number):
+    class Signalled(PushTask):
+        def step(self, action):
+            super().step(action)
+            if self.steps == 40:  # in the third iteration of 16 steps
+                os.kill(os.getpid(), number)
+
+    before = signal.getsignal(number)
+    with pytest.raises(SystemExit) as caught:
+        train(dataclasses.replace(cfg, iterations=100), lambda n, seed, device: Signalled(n, seed, device))
+    assert caught.value.code == 130
+    assert signal.getsignal(number) is before
+    (path,) = cfg.log_root.glob("push/*/checkpoints/iteration_000003.pt")
+    assert load_checkpoint(path)["env"]["steps"] == 48
+
+
+def test_the_second_interrupt_does_not_wait(cfg):
+    class Signalled(PushTask):
+        def step(self, action):
+            super().step(action)
+            os.kill(os.getpid(), signal.SIGINT)
+
+    with pytest.raises(KeyboardInterrupt):
+        train(cfg, lambda n, seed, device: Signalled(n, seed, device))
+
+
+def test_the_time_limit_ends_and_saves(cfg):
+    begin = time.perf_counter()
+    result = train(dataclasses.replace(cfg, iterations=100_000, max_seconds=0.5), make_env)
+    assert time.perf_counter() - begin < 10.0
+    assert 0.5 <= result.seconds < 5.0
+    assert final_state(result)["iteration"] == result.iteration
+
+
+def test_a_full_disk_is_told_and_training_goes_on(cfg, capsys):
+    class Blocking(PushTask):
+        def metrics(self):
+            (folder,) = cfg.log_root.glob("push/*")
+            (folder / CHECKPOINTS).touch()  # a file where the folder should go
+            return super().metrics()
+
+    with pytest.raises(CheckpointError, match="not saved"):
+        train(cfg, lambda n, seed, device: Blocking(n, seed, device))
+    assert "will try again" in capsys.readouterr().err
+    (figures,) = cfg.log_root.glob(f"push/*/{FIGURES}")
+    assert len(figures.read_text().splitlines()) == 2
+
+
+def test_tensorboard_gets_the_figures(cfg):
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    result = train(dataclasses.replace(cfg, tensorboard=True), make_env)
+    events = EventAccumulator(str(result.folder))
+    events.Reload()
+    assert [event.step for event in events.Scalars("Loss/value")] == [2, 4]
+
+
+def test_two_processes_train_one_policy(cfg, tmp_path):
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    torch.multiprocessing.spawn(train_rank, (port, cfg, str(tmp_path / "rank")), nprocs=2)
+    first, second = (torch.load(tmp_path / f"rank{rank}", weights_only=True) for rank in range(2))
+    assert equal(first["model"], second["model"])
+    assert (first["num_envs"], second["num_envs"]) == (16, 16)
+    assert (first["iteration"], second["iteration"]) == (4, 4)
+    assert first["seed"] != second["seed"]
+    (folder,) = cfg.log_root.glob("push/*")
+    assert equal(load_checkpoint(folder / CHECKPOINTS / "iteration_000004.pt")["ppo"]["model"], first["model"])
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"iterations": 0}, "iterations must be at least 1, got 0"),
+        ({"max_seconds": -1.0}, "max_seconds must not be negative"),
+        ({"trainer": "rsl-rl", "resume": "latest"}, "resume is not offered"),
+    ],
+)
+def test_settings_out_of_range_are_refused(change, message):
+    with pytest.raises(ValueError, match=message):
+        TrainCfg(**change)
+
+
+def test_a_device_that_is_not_there_is_refused(cfg, monkeypatch):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    with pytest.raises(ValueError, match="torch finds no GPU"):
+        train(dataclasses.replace(cfg, device="cuda"), make_env)
+
+
+def test_rsl_rl_gets_copies():
+    env = PushTask(3, episode_length=2)  # ended by time in the second step, not in the first
+    env.reset()
+    adapter = RslRlVecEnv(env, metrics_every=2)
+    first = adapter.get_observations()
+    obs, reward, done, extras = adapter.step(torch.ones(3, 1))
+    found = (first["policy"], first["critic"], obs["policy"], obs["critic"], reward, done, extras["time_outs"])
+    shown = [value.clone() for value in found]
+    adapter.step(torch.ones(3, 1))
+    for value, copy in zip(found, shown, strict=True):
+        assert torch.equal(value, copy)
+
+
+@pytest.mark.parametrize(("asymmetric", "column"), [(True, 2), (False, 0)])
+def test_rsl_rl_gives_the_critic_its_own_observation(asymmetric, column):
+    env = PushTask(4, episode_length=50)
+    env.reset()
+    adapter = RslRlVecEnv(env, metrics_every=4)
+    config = rsl_rl_config(dataclasses.replace(SMALL, asymmetric=asymmetric), 1, 0)
+    algorithm = OnPolicyRunner(adapter, config, log_dir=None, device="cpu").alg
+    obs = adapter.get_observations()
+    assert torch.equal(obs["critic"], env.critic_obs)
+    assert (algorithm.actor.obs_dim, algorithm.critic.obs_dim) == (2, 3 if asymmetric else 2)
+    with torch.inference_mode():
+        before = algorithm.actor(obs), algorithm.critic(obs)
+        obs["critic" if asymmetric else "policy"][:, column] += 1.0
+        assert torch.equal(algorithm.actor(obs), before[0]) == asymmetric
+        assert not torch.equal(algorithm.critic(obs), before[1])
+
+
+def test_rsl_rl_counts_steps_and_gets_metrics_once_per_iteration():
+    env = PushTask(3, episode_length=3)
+    env.reset()
+    adapter = RslRlVecEnv(env, metrics_every=2)
+    logs, lengths = [], []
+    for _ in range(4):
+        extras = adapter.step(torch.zeros(3, 1))[3]
+        logs.append("log" in extras)
+        lengths.append(adapter.episode_length_buf[0].item())
+    assert logs == [False, True, False, True]
+    assert lengths == [1, 2, 0, 1]
+    adapter.episode_length_buf = torch.tensor([5, 6, 7])
+    assert adapter.episode_length_buf.tolist() == [5, 6, 7]
+
+
+def test_rsl_rl_bootstraps_the_timeout():
+    env = PushTask(4, episode_length=2)
+    env.reset()
+    cfg = PpoCfg(num_steps=4, minibatches=1, hidden=(8,), gamma=0.9)
+    adapter = RslRlVecEnv(env, metrics_every=4)
+    config = rsl_rl_config(cfg, 1, 0)
+    algorithm = OnPolicyRunner(adapter, config, log_dir=None, device="cpu").alg
+    with torch.inference_mode():
+        rewards = []
+        obs = adapter.get_observations()
+        for _ in range(2):
+            action = algorithm.act(obs)
+            obs, reward, done, extras = adapter.step(action)
+            rewards.append(reward.clone())
+            algorithm.process_env_step(obs, reward, done, extras)
+    stored, values = algorithm.storage.rewards.squeeze(-1), algorithm.storage.values.squeeze(-1)
+    torch.testing.assert_close(stored[0], rewards[0])  # in the middle of the episode
+    torch.testing.assert_close(stored[1], rewards[1] + 0.9 * values[1])  # at its end by time
+    assert values[1].abs().min() > 1e-4
+
+
+def test_rsl_rl_trains(cfg, tmp_path):
+    result = train(dataclasses.replace(cfg, trainer="rsl-rl", iterations=2), make_env)
+    assert (result.folder / "model_1.pt").exists()
+    assert (result.folder / CONFIG).exists()
+
+
+def test_rsl_rl_learns_to_push_the_mass_to_the_origin():
+    torch.manual_seed(0)
+    env = PushTask(128)
+    runner = train_rsl_rl(env, SMALL, iterations=30, save_interval=100, seed=0, folder=None)
+    env.reset()
+    actor = runner.alg.get_policy().eval()
+    with torch.inference_mode():
+        for _ in range(40):
+            env.step(actor(TensorDict({"policy": env.obs}, batch_size=[128])))
+    assert env.obs[:, 0].abs().max() < 0.3

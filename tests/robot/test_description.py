@@ -1,0 +1,79 @@
+import math
+
+import numpy as np
+import pytest
+
+from jumper_warp.robot.description import knee_angles, leg_dimensions, load_description
+
+
+@pytest.fixture(scope="module")
+def description():
+    return load_description()
+
+
+def test_total_mass_is_14_5_kg(description):
+    assert description.mass == pytest.approx(14.5, abs=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("motor", "armature", "no_load", "cutoff", "peak"),
+    [(0, 4.69e-3, 49.2, 35.1, 18.0), (1, 4.14e-3, 40.0, 23.6, 24.8), (2, 4.14e-3, 40.0, 23.6, 24.8)],
+)
+def test_motor_constants(description, motor, armature, no_load, cutoff, peak):
+    constants = description.motors[motor + 9]
+    assert constants.armature == pytest.approx(armature, rel=1e-4)
+    assert constants.no_load_speed == pytest.approx(no_load, rel=1e-3)
+    assert constants.cutoff_speed == pytest.approx(cutoff, rel=2e-3)
+    assert constants.peak_torque == peak
+
+
+def test_paw_is_merged_into_the_inner_shank_by_the_parallel_axis_theorem(description):
+    shank = description.link("FL_inner_shank")
+    # 0.1993 kg at (-0.0183, 0, -0.1819), 0.020 kg at (0, 0, -0.3)
+    assert shank.mass == pytest.approx(0.2193)
+    assert shank.com == pytest.approx([-0.0166311, 0.0, -0.1926707], abs=1e-7)
+    # reduced mass 0.018176 kg, offset (0.0183, 0, -0.1181): Ixx += m z^2, Iyy += m (x^2 + z^2), Ixz -= m x z
+    assert np.diag(shank.inertia) == pytest.approx([1.65351e-3, 1.66960e-3, 3.6087e-5], rel=1e-5)
+    assert shank.inertia[0, 2] == pytest.approx(-6.7e-5 + 3.9283e-5, rel=1e-3)
+
+
+def test_products_of_inertia_change_sign_with_each_mirror(description):
+    products = [description.link(f"{leg}_housing").inertia[0, 1] for leg in ("FL", "FR", "BL", "BR")]
+    assert products == [-0.000296, 0.000296, 0.000296, -0.000296]
+
+
+def test_leg_dimensions_of_the_back_right_leg(description):
+    leg = leg_dimensions(description, "BR")
+    assert leg.hip == (-0.1433, -0.15, 0.0)
+    assert (leg.front, leg.side) == (-1.0, -1.0)
+    assert (leg.outer_x, leg.inner_x, leg.plane_y, leg.knee_y) == (-0.1417, -0.0517, -0.05945, -0.00075)
+    assert (leg.thigh, leg.shank, leg.paw_radius) == (0.175, 0.3, 0.025)
+
+
+@pytest.mark.parametrize("leg", ["FL", "BR"])
+@pytest.mark.parametrize(("degrees", "depth"), [(0, 0.4716), (45, 0.3718)])
+def test_ankle_depth_below_the_hips(description, leg, degrees, depth):
+    angle = math.radians(degrees)
+    outer_knee, inner_knee, ankle_z = knee_angles(leg_dimensions(description, leg), angle, angle)
+    assert -ankle_z == pytest.approx(depth, abs=5e-5)
+    # the leg is symmetric: each shank leans by asin((0.045 + 0.175 sin q) / 0.3)
+    lean = math.asin((0.045 + 0.175 * math.sin(angle)) / 0.3)
+    assert (outer_knee, inner_knee) == pytest.approx((angle + lean, angle + lean))
+
+
+def test_knees_coincide_at_minus_14_9_degrees(description):
+    angle = -math.asin(0.045 / 0.175)
+    assert math.degrees(angle) == pytest.approx(-14.9, abs=0.05)
+    with pytest.raises(ValueError, match="do not meet"):
+        knee_angles(leg_dimensions(description, "FL"), angle, angle)
+
+
+def test_stops(description):
+    stops = [np.degrees((joint.lower, joint.upper)) for joint in description.joints[:2]]
+    assert stops[0] == pytest.approx((-50.0, 110.0), abs=1e-3)
+    assert stops[1] == pytest.approx((-30.0, 140.0), abs=1e-3)
+    assert np.degrees(description.transversal_sum) == pytest.approx((0.0, 240.0))
+
+
+def test_default_pose(description):
+    assert np.degrees(description.pose("default")) == pytest.approx([0.0, 45.0, 45.0] * 4)

@@ -1,0 +1,194 @@
+import re
+import shutil
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from jumper_warp.robot.description import DEFAULT_DESCRIPTION, RobotDescriptionError, load_description
+
+URDF = "jumper.urdf"
+JSON = "jumper.json"
+
+
+@pytest.fixture
+def assets(tmp_path):
+    """A writable copy of the robot's folder."""
+    return shutil.copytree(DEFAULT_DESCRIPTION.parent, tmp_path / "jumper")
+
+
+def edit(folder, file, pattern, replacement):
+    """Replace every match of a regular expression in a file of the folder; there must be one."""
+    text, found = re.subn(pattern, replacement, (folder / file).read_text(), flags=re.DOTALL)
+    assert found, f"{pattern} does not occur in {file}"
+    (folder / file).write_text(text)
+
+
+def refusal(folder):
+    with pytest.raises(RobotDescriptionError) as caught:
+        load_description(folder / JSON)
+    message = str(caught.value)
+    assert "\n" not in message
+    return message
+
+
+def at(element, inner, new):
+    """Replace `inner` within an element given as "tag name"."""
+    tag, name = element.split()
+    return rf'(<{tag} name="{name}"(?:(?!</{tag}>).)*?){inner}', rf"\g<1>{new}"
+
+
+NUMBERS = '"[^"]*"'
+
+BAD_URDF = {
+    "negative mass": (at("link FR_housing", f"value={NUMBERS}", 'value="-1"'), "link FR_housing: expected mass > 0"),
+    "nan mass": (at("link body", f"value={NUMBERS}", 'value="nan"'), "link body: expected 1 finite"),
+    "infinite inertia": (at("link body", f"ixx={NUMBERS}", 'ixx="inf"'), "link body: expected 1 finite"),
+    "zero moment": (at("link BL_housing", f"izz={NUMBERS}", 'izz="0"'), "link BL_housing: expected a positive inertia"),
+    "triangle": (at("link body", f"izz={NUMBERS}", 'izz="0.3"'), "link body: expected principal moments"),
+    "zero axis": (at("joint FL_outer", "0 -1 0", "0 0 0"), "joint FL_outer: expected an axis of length 1"),
+    "long axis": (at("joint FL_outer", "0 -1 0", "0 -2 0"), "joint FL_outer: expected an axis of length 1"),
+    "wrong axis": (at("joint FL_outer", "0 -1 0", "0 1 0"), "joint FL_outer: expected axis"),
+    "inverted limits": (
+        at("joint BR_inner", f"lower={NUMBERS}", 'lower="3"'),
+        "joint BR_inner: expected lower < upper",
+    ),
+    "turned frame": (
+        at("joint BR_inner", "<origin", '<origin rpy="0 0 1"'),
+        "joint BR_inner: expected a frame parallel",
+    ),
+    "unlike motor": (('effort="24.8"', 'effort="18"'), "joint FL_outer: expected effort 24.8 as of motor AK70-10"),
+    "heavy leg": (
+        at("link BR_outer_thigh", '"0.081"', '"0.09"'),
+        "link BR_outer_thigh: expected mass, com, inertia to",
+    ),
+    "unmirrored com": (at("link FR_housing", "0928 -", "0928 "), "link FR_housing: expected mass, com, inertia to"),
+    "moved hip": (at("joint FR_lateral", "-0.105", "-0.1"), "joint FR_lateral: expected to mirror FL_lateral"),
+    "no paw": (
+        at("link BL_inner_shank", "<collision>.*?</collision>", ""),
+        "link BL_inner_shank: expected 1 collision",
+    ),
+    "missing mesh": (("meshes/thigh.obj", "meshes/none.obj"), "missing file 'meshes/none.obj'"),
+    "mesh outside": (("meshes/thigh.obj", "../../../etc/thigh.obj"), "expected a file inside"),
+    "remote mesh": (("meshes/thigh.obj", "https://example.org/thigh.obj"), "expected a file inside"),
+    "file uri": (("meshes/thigh.obj", "file:///tmp/thigh.obj"), "expected a file inside"),
+    "second link": (("</robot>", '<link name="body"/></robot>'), "link body: expected one, found 2"),
+    "second joint": (('joint name="FR_outer"', 'joint name="FL_outer"'), "joint FL_outer: expected one, found 2"),
+    "second parent": (('child link="BR_inner_shank"', 'child link="BR_outer_shank"'), "expected one parent joint"),
+    "renamed root": (('name="body"', 'name="trunk"'), "joint FL_lateral: unknown link 'body'"),
+    "cycle": (at("joint FL_lateral", '"body"', '"FL_inner_shank"'), "joint FL_lateral: expected to lead from body"),
+    "second root": (
+        (r'  <joint name="FL_lateral".*?</joint>\n', ""),
+        "expected the one root link body, found body, FL_h",
+    ),
+    "entity": (("<robot", '<!DOCTYPE robot [<!ENTITY a "b">]><robot'), "expected no document type"),
+    "truncated": (("</robot>.*", ""), "expected well-formed XML"),
+    "other root": (("<robot(.*)</robot>", r"<sdf\1</sdf>"), "expected <robot>, found <sdf>"),
+}
+
+BAD_JSON = {
+    "missing loop": ((r'"BR_ankle": \{.*?\}', '"extra": {}'), "loop extra: expected one of"),
+    "doubled loop": (('"BR_ankle": ', '"BL_ankle": '), "BL_ankle: expected one entry, found it twice"),
+    "unknown link": (('"child": "FL_outer_shank"', '"child": "FL_paw"'), "loop FL_ankle: unknown link 'FL_paw'"),
+    "other link": (('"FL_outer_shank"', '"FR_outer_shank"'), "loop FL_ankle: expected link FL_outer_shank"),
+    "open anchor": (
+        (r'"child_anchor": \[0, 0, -0.3', '"child_anchor": [0, 0, -0.31'),
+        "loop FL_ankle: expected both anc",
+    ),
+    "unknown motor": (('"FR_outer": "AK70-10"', '"FR_outer": "AK60"'), "motor FR_outer: unknown motor type 'AK60'"),
+    "missing motor": (('"FR_outer": "AK70-10", ', ""), "motors: expected FR_outer to be a str, found nothing"),
+    "extra motor": (('"FR_outer": ', '"tail": "AK80-9", "FR_outer": '), "motor tail: expected one of"),
+    "swapped motor": (('"FR_outer": "AK70-10"', '"FR_outer": "AK80-9"'), "motor FR_outer: expected AK70-10"),
+    "negative rotor": (("5.79e-5", "-5.79e-5"), "motor type AK80-9: expected rotor_inertia > 0"),
+    "zero gain": (('"kp": 17.0', '"kp": 0'), "motor type AK80-9 jumping: expected kp > 0"),
+    "high cutoff": (('"cutoff_speed_rpm": 335', '"cutoff_speed_rpm": 500'), "AK80-9: expected cutoff_speed_rpm <"),
+    "infinite number": (('"knee_damping": 0.1', '"knee_damping": 1e999'), "knee_damping to be a finite number"),
+    "nan": (('"knee_damping": 0.1', '"knee_damping": NaN'), "expected finite numbers, found NaN"),
+    "huge integer": (('"knee_damping": 0.1', '"knee_damping": ' + "9" * 5000), "expected JSON (ValueError)"),
+    "no default pose": (('"default": ', '"other": '), "poses: expected a pose named default"),
+    "pose beyond stops": (
+        ('"transversal_deg": 45', '"transversal_deg": 150'),
+        "pose default: expected FL_outer within",
+    ),
+    "pose beyond sum": (
+        ('"transversal_deg": 45', '"transversal_deg": 125'),
+        "pose default: expected the transversal sum",
+    ),
+    "inverted sum": ((r"\[0, 240\]", "[240, 0]"), "transversal_sum_deg: expected lower < upper"),
+    "urdf outside": (('"jumper.urdf"', '"../jumper.urdf"'), "urdf: expected a file inside"),
+    "urdf missing": (('"jumper.urdf"', '"other.urdf"'), "urdf: missing file"),
+    "urdf nul": (('"jumper.urdf"', r'"a\\u0000b"'), "is not a file name"),
+    "list": (("^.*$", "[]"), "expected a JSON object"),
+    "deep": (("^.*$", "[" * 100000), "expected JSON (RecursionError)"),
+    "malformed": ((r"\}\s*$", ""), "expected JSON"),
+}
+
+
+@pytest.mark.parametrize("case", BAD_URDF)
+def test_refuses_urdf_with(assets, case):
+    change, message = BAD_URDF[case]
+    edit(assets, URDF, *change)
+    assert message in refusal(assets)
+
+
+@pytest.mark.parametrize("case", BAD_JSON)
+def test_refuses_json_with(assets, case):
+    change, message = BAD_JSON[case]
+    edit(assets, JSON, *change)
+    assert message in refusal(assets)
+
+
+def test_refuses_a_loop_that_cannot_close(assets):
+    # at 45 degrees the knees are 0.09 + 0.35 sin(45) = 0.3375 m apart, out of reach of two shanks of 0.15 m
+    edit(assets, JSON, r"-0\.3\]", "-0.15]")
+    edit(assets, URDF, r"(<collision><origin xyz=\"0 0 )-0\.3", r"\g<1>-0.15")
+    assert "pose default: the loop FL_ankle cannot close" in refusal(assets)
+
+
+def test_refuses_a_missing_file_and_a_folder(tmp_path):
+    for path in (tmp_path / "none.json", tmp_path):
+        with pytest.raises(RobotDescriptionError, match="cannot be read"):
+            load_description(path)
+
+
+def test_refuses_a_mesh_with_an_index_beyond_its_vertices(assets):
+    (assets / "meshes" / "thigh.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 4\n")
+    assert "thigh.obj: expected triangles between the 3 vertices" in refusal(assets)
+
+
+TOKENS = [
+    b"nan",
+    b"1e999",
+    b"-1",
+    b"0",
+    b"<",
+    b">",
+    b"&lt;",
+    b"&x;",
+    b'"',
+    b"{",
+    b"]",
+    b"\xff",
+    b"\x00",
+    b"null",
+    b"\\ud800",
+]
+
+
+@settings(max_examples=400, deadline=2000, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(data=st.data())
+def test_damaged_files_load_or_are_refused(assets, data):
+    file = data.draw(st.sampled_from([URDF, JSON, "meshes/shank.obj"]))
+    original = (DEFAULT_DESCRIPTION.parent / file).read_bytes()
+    start = data.draw(st.integers(0, len(original)))
+    length = data.draw(st.integers(0, 40))
+    insert = data.draw(st.sampled_from([*TOKENS, b""]) | st.binary(max_size=8))
+    keep_tail = data.draw(st.booleans())
+    damaged = original[:start] + insert + (original[start + length :] if keep_tail else b"")
+    (assets / file).write_bytes(damaged)
+    try:
+        load_description(assets / JSON)
+    except RobotDescriptionError as err:
+        assert "\n" not in str(err)
+    finally:
+        (assets / file).write_bytes(original)

@@ -1,0 +1,146 @@
+import numpy as np
+import pytest
+import warp as wp
+from simulation_helpers import PAW_RADIUS, WEIGHT, paw_centres, paw_forces, simulation, thrown, write_state
+
+from jumper_warp.robot import grounds
+from jumper_warp.robot.model import build_model
+from jumper_warp.sim.dynamics import find_ground, ground_struct
+from kernels.terrain import ground as ground_module
+from kernels.terrain.ground import Ground, surface
+
+wp.set_module_options({"enable_backward": False})
+
+
+def heights(field):
+    """Heights of the nodes [m], rows along y."""
+    return field.min_z + np.asarray(field.data, dtype=float) * (field.max_z - field.min_z)
+
+
+@wp.kernel
+def surface_kernel(ground: Ground, x: wp.array(dtype=float), y: wp.array(dtype=float), out: wp.array(dtype=wp.vec3)):
+    i = wp.tid()
+    out[i] = surface(ground, x[i], y[i])
+
+
+def probe(field, x, y):
+    """Height [m] and slopes of the ground as the solver has it, (n, 3)."""
+    model = build_model(1, ground=field, visuals=False, device="cpu")
+    ground = ground_struct(model, find_ground(model), ground_module)
+    x, y = (np.asarray(v, dtype=np.float32) for v in np.broadcast_arrays(x, y))
+    out = wp.zeros(len(x), dtype=wp.vec3, device="cpu")
+    inputs = [ground, wp.array(x, device="cpu"), wp.array(y, device="cpu"), out]
+    wp.launch(surface_kernel, len(x), inputs=inputs, device="cpu")
+    return out.numpy()
+
+
+@pytest.mark.parametrize("height", [-0.15, 0.15])
+def test_platform_steps_within_one_cell_behind_its_edge(height):
+    field = grounds.platform(height, edge=0.5)
+    found = probe(field, [-3.0, 0.0, 0.499, 0.51, 0.521, 3.0], [0.0, 0.7, -1.9, 1.0, -0.3, 0.2])
+    assert found[:, 0] == pytest.approx([0.0, 0.0, 0.0, 0.5 * height, height, height], abs=1e-5)
+    assert found[:, 1] == pytest.approx([0.0, 0.0, 0.0, height / 0.02, 0.0, 0.0], abs=1e-3)
+    assert found[:, 2] == pytest.approx(np.zeros(6), abs=1e-5)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_uneven_ground_keeps_its_amplitude_its_slopes_and_a_level_start(seed):
+    field = grounds.uneven(0.05, seed, flat_radius=0.6)
+    z = heights(field)
+    x = np.linspace(-2.0, 2.0, z.shape[0])
+    assert np.abs(z).max() == pytest.approx(0.05, abs=1e-6)
+    assert np.abs(z[np.hypot(x[:, None], x) <= 0.6]).max() < 1e-6
+    slope = np.degrees(np.arctan(np.hypot(*np.gradient(z, x[1] - x[0]))))
+    assert 18.0 < slope.max() < 28.0
+
+
+def test_uneven_ground_has_its_correlation_length():
+    pairs = []
+    for seed in range(8):
+        z = heights(grounds.uneven(seed=seed, length=0.2, flat_radius=0.0, cell=0.025))
+        z = z / z.std()
+        pairs += [(z[:, 8:] * z[:, :-8]).mean(), (z[8:] * z[:-8]).mean()]  # 8 cells are 0.2 m
+    assert np.mean(pairs) == pytest.approx(np.exp(-1.0), abs=0.08)
+
+
+def test_uneven_ground_repeats_with_its_seed_only():
+    first = heights(grounds.uneven(seed=3))
+    assert np.array_equal(first, heights(grounds.uneven(seed=3)))
+    assert np.abs(first - heights(grounds.uneven(seed=4))).max() > 0.02
+
+
+@pytest.mark.parametrize("field", [grounds.platform(0.1), grounds.uneven()])
+def test_grounds_are_fine_and_wide_enough_to_jump_two_metres(field):
+    assert (field.hx, field.hy) == (2.0, 2.0)
+    assert 2.0 * field.hx / (field.ncol - 1) <= 0.0251
+    assert field.nrow == field.ncol
+
+
+def test_finer_cells_divide_the_size():
+    field = grounds.platform(0.1, edge=0.3, size=1.0, cell=0.03)
+    assert field.ncol == 35
+    assert heights(field)[0, -1] == pytest.approx(0.1)
+
+
+@pytest.mark.parametrize(
+    ("build", "message"),
+    [
+        (lambda: grounds.platform(0.0), "height must be finite and not zero"),
+        (lambda: grounds.platform(0.1, edge=2.0), "edge must lie between 0 and 2 m"),
+        (lambda: grounds.platform(0.1, cell=3.0), "0 < cell <= size / 2"),
+        (lambda: grounds.uneven(-0.05), "amplitude > 0"),
+        (lambda: grounds.uneven(length=0.0), "length > 0"),
+        (lambda: grounds.uneven(flat_radius=2.0), "flat_radius must lie between 0 and 2 m"),
+    ],
+)
+def test_impossible_grounds_are_refused(build, message):
+    with pytest.raises(ValueError, match=message):
+        build()
+
+
+def dropped(field, offset, lift, num_worlds=1):
+    """Robots dropped in the standing pose at x = offset [m], their paws lift [m] above z = 0."""
+    sim = simulation(num_worlds, ground=field)
+    q = sim.joint_q().copy()
+    q[:, 0] += offset
+    q[:, 2] += lift
+    write_state(sim, q)
+    return sim
+
+
+@pytest.mark.parametrize("height", [-0.15, 0.15])
+def test_robot_lands_on_a_platform(height):
+    sim = dropped(grounds.platform(height, edge=0.5), offset=1.2, lift=height + 0.3)
+    for _ in range(150):
+        sim.step()
+    assert paw_centres(sim)[0, :, 2] == pytest.approx(np.full(4, height + PAW_RADIUS), abs=1e-3)
+    assert paw_forces(sim)[0].sum(axis=0) == pytest.approx([0.0, 0.0, WEIGHT], abs=0.01 * WEIGHT)
+
+
+def test_robot_stands_on_uneven_ground():
+    field = grounds.uneven()
+    sim = dropped(field, offset=1.2, lift=0.15)
+    for _ in range(180):
+        sim.step()
+    before = paw_centres(sim)
+    for _ in range(60):
+        sim.step()
+    paws = paw_centres(sim)
+    assert np.abs(paws - before).max() < 1e-3
+    z, along, across = probe(field, paws[0, :, 0], paws[0, :, 1]).T
+    # a sphere on a slope: its centre is radius / cos(slope) above the surface, up to the curvature
+    assert paws[0, :, 2] - z == pytest.approx(PAW_RADIUS * np.sqrt(1.0 + along**2 + across**2), abs=2e-3)
+    assert paw_forces(sim)[0].sum(axis=0) == pytest.approx([0.0, 0.0, WEIGHT], abs=0.01 * WEIGHT)
+
+
+def test_robots_thrown_across_an_edge_stay_finite_and_above_ground():
+    sim = simulation(32, ground=grounds.platform(-0.15, edge=0.3))
+    thrown(sim, 5, height=(0.4, 0.7))
+    for _ in range(90):
+        sim.step()
+        assert np.abs(sim.base_velocity()).max() < 8.0
+    assert not sim.solver.invalid.numpy().any()
+    paws = paw_centres(sim)
+    upper = paws[..., 0] < 0.3 - PAW_RADIUS
+    assert paws[upper][:, 2].min() > PAW_RADIUS - 5e-3
+    assert paws[..., 2].min() > -0.15 + PAW_RADIUS - 5e-3

@@ -1,0 +1,298 @@
+import dataclasses
+import importlib
+import math
+
+import newton
+import numpy as np
+import pytest
+import warp as wp
+from scipy.optimize import minimize_scalar
+from scipy.spatial.transform import Rotation
+
+from jumper_warp.robot.description import load_description
+from jumper_warp.robot.model import (
+    build_model,
+    build_pinocchio,
+    leg_geometry,
+    leg_geometry_array,
+    standing_configuration,
+)
+from jumper_warp.sim.mujoco import mujoco_solver
+from jumper_warp.sim.precision import float64_kernels
+
+COORDS, DOFS = 43, 38
+LEGS = ("FL", "FR", "BL", "BR")
+FRONT = np.array([1, 1, -1, -1])
+SIDE = np.array([1, -1, 1, -1])
+MOTOR_DOFS = np.array([6 + 5 * leg + joint for leg in range(4) for joint in (0, 1, 3)])
+
+
+@pytest.fixture(scope="module")
+def description():
+    return load_description()
+
+
+@pytest.fixture(scope="module")
+def model():
+    return build_model(2, device="cpu")
+
+
+def body_poses(model, joint_q):
+    """World 0's link positions (21, 3) and rotations for one world's joint_q."""
+    state = model.state()
+    coords = state.joint_q.numpy()
+    coords[:COORDS] = joint_q
+    state.joint_q.assign(coords)
+    newton.eval_fk(model, state.joint_q, state.joint_qd, state)
+    poses = state.body_q.numpy()[:21].astype(float)
+    return poses[:, :3], Rotation.from_quat(poses[:, 3:])
+
+
+def far_ends(model, joint_q, link, length):
+    """World positions (4, 3) of the far ends of link 0..4 of each leg."""
+    positions, rotations = body_poses(model, joint_q)
+    bodies = [1 + 5 * leg + link for leg in range(4)]
+    return positions[bodies] + rotations[bodies].apply([0.0, 0.0, -length])
+
+
+def test_labels_and_layout(model):
+    per_leg = ["lateral", "outer", "outer_knee", "inner", "inner_knee"]
+    joints = ["base", *(f"{leg}_{joint}" for leg in LEGS for joint in per_leg), *(f"{leg}_ankle" for leg in LEGS)]
+    links = ["housing", "outer_thigh", "outer_shank", "inner_thigh", "inner_shank"]
+    bodies = ["body", *(f"{leg}_{link}" for leg in LEGS for link in links)]
+    assert model.joint_label == [f"world_{world}/{joint}" for world in (0, 1) for joint in joints]
+    assert model.body_label == [f"world_{world}/{body}" for world in (0, 1) for body in bodies]
+    assert (model.joint_coord_count, model.joint_dof_count) == (2 * COORDS, 2 * DOFS)
+    starts = np.array([0, *range(7, 27), *range(27, COORDS, 4)])
+    assert model.joint_q_start.numpy()[:-1].tolist() == [*starts, *(COORDS + starts)]
+    assert model.joint_qd_start.numpy()[:25].tolist() == [0, *range(6, 26), 26, 29, 32, 35]
+
+
+def test_masses_and_inertias_are_those_described(model, description):
+    masses = model.body_mass.numpy().reshape(2, 21)
+    assert masses.sum(axis=1) == pytest.approx([14.5, 14.5], rel=1e-6)
+    inertia = np.array([link.inertia for link in description.links])
+    assert model.body_inertia.numpy()[21:] == pytest.approx(inertia, rel=1e-6, abs=1e-12)
+
+
+def test_motor_and_knee_properties(model):
+    def legs(array):
+        return array.numpy().reshape(2, DOFS)[1, 6:26].reshape(4, 5)
+
+    assert legs(model.joint_armature) == pytest.approx(np.tile([4.69e-3, 4.14e-3, 0, 4.14e-3, 0], (4, 1)), rel=1e-3)
+    assert legs(model.joint_friction) == pytest.approx(np.tile([0.02, 0.02, 0, 0.02, 0], (4, 1)))
+    assert legs(model.joint_damping) == pytest.approx(np.tile([0, 0, 0.1, 0, 0.1], (4, 1)))
+    assert np.degrees(legs(model.joint_limit_lower))[:, [0, 1, 3]] == pytest.approx(np.tile([-50, -30, -30], (4, 1)))
+    assert np.degrees(legs(model.joint_limit_upper))[:, [0, 1, 3]] == pytest.approx(np.tile([110, 140, 140], (4, 1)))
+
+
+def test_default_pose_stands_on_closed_legs(model):
+    joint_q = model.joint_q.numpy()[COORDS:]
+    # base height: ankle depth 0.3718 at 45 degrees plus the paw radius
+    assert joint_q[2] == pytest.approx(0.3718 + 0.025, abs=5e-5)
+    outer = far_ends(model, joint_q, 2, 0.3)
+    inner = far_ends(model, joint_q, 4, 0.3)
+    assert inner == pytest.approx(outer, abs=1e-6)
+    assert inner[:, 2] == pytest.approx(np.full(4, 0.025), abs=1e-6)
+    # under the middle between the transversal axes, 0.1433 + (0.1417 + 0.0517) / 2
+    assert inner[:, 0] == pytest.approx(0.24 * FRONT, abs=1e-6)
+    assert inner[:, 1] == pytest.approx(SIDE * (np.array([0.105, 0.105, 0.15, 0.15]) + 0.0602), abs=1e-6)
+
+
+def test_loop_coordinates_are_the_shanks_relative_rotations(model):
+    joint_q = model.joint_q.numpy()[:COORDS]
+    _, rotations = body_poses(model, joint_q)
+    for leg in range(4):
+        relative = rotations[5 + 5 * leg].inv() * rotations[3 + 5 * leg]
+        stored = Rotation.from_quat(joint_q[27 + 4 * leg : 31 + 4 * leg])
+        assert (stored.inv() * relative).magnitude() < 1e-6
+
+
+def test_positive_lateral_swings_the_paw_outward(model):
+    joint_q = model.joint_q.numpy()[:COORDS].astype(float)
+    before = far_ends(model, joint_q, 4, 0.3)
+    joint_q[7:27:5] += 0.1
+    moved = far_ends(model, joint_q, 4, 0.3) - before
+    assert (SIDE * moved[:, 1] > 0.03).all()
+
+
+@pytest.mark.parametrize(("joint", "link", "direction"), [(1, 1, 1), (3, 3, -1)], ids=["outer", "inner"])
+def test_positive_thigh_angle_moves_its_tip_away_from_its_twin(model, joint, link, direction):
+    joint_q = model.joint_q.numpy()[:COORDS].astype(float)
+    before = far_ends(model, joint_q, link, 0.175)
+    joint_q[7 + joint : 27 : 5] += 0.1
+    moved = far_ends(model, joint_q, link, 0.175) - before
+    assert (direction * FRONT * moved[:, 0] > 0.01).all()
+
+
+@pytest.mark.parametrize("joint", [2, 4], ids=["outer", "inner"])
+def test_positive_knee_angle_folds_the_shank_under_the_body(model, joint):
+    # in the default pose the knees point away from each other, and each shank swings toward the other
+    joint_q = model.joint_q.numpy()[:COORDS].astype(float)
+    before = far_ends(model, joint_q, joint, 0.3)
+    joint_q[7 + joint : 27 : 5] += 0.1
+    moved = far_ends(model, joint_q, joint, 0.3) - before
+    direction = -1 if joint == 2 else 1
+    assert (direction * FRONT * moved[:, 0] > 0.01).all()
+
+
+def test_nominal_pose_stands_at_the_nominal_height(description):
+    assert standing_configuration(description, "nominal")[2] == pytest.approx(0.35, abs=2e-3)
+
+
+def test_standing_height_with_the_legs_swung_outward(model, description):
+    swung = dataclasses.replace(description, poses={"swung": (math.radians(30.0), math.radians(60.0))})
+    paws = far_ends(model, standing_configuration(swung, "swung"), 4, 0.3)
+    # the hips are level, and the legs alike
+    assert paws[:, 2] == pytest.approx(np.full(4, 0.025), abs=1e-6)
+
+
+def test_leg_geometry_is_read_off_the_joint_origins(description):
+    front_left = leg_geometry(description)[0]
+    assert front_left == {
+        "hip": (0.1433, 0.105, 0.0), "front": 1.0, "side": 1.0, "outer_x": 0.1417, "inner_x": 0.0517,
+        "plane_y": 0.05945, "knee_y": 0.00075, "thigh": 0.175, "shank": 0.3, "paw_radius": 0.025,
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize(("package", "bits"), [("kernels", 32), ("kernels_float64", 64)])
+def test_leg_geometry_array_in_both_precisions(description, package, bits):
+    float64_kernels()
+    module = importlib.import_module(f"{package}.kinematics.geometry")
+    legs = leg_geometry_array(description, module, device="cpu").numpy()
+    assert legs["thigh"].dtype == f"float{bits}"
+    assert legs["outer_x"] == pytest.approx(0.1417 * FRONT, rel=1e-6)
+    assert legs["hip"][:, 1] == pytest.approx([0.105, -0.105, 0.15, -0.15], rel=1e-6)
+
+
+def test_only_the_paws_meet_the_ground():
+    solver = mujoco_solver(build_model(1, visuals=False, device="cpu"))
+    kind, affinity = solver.mj_model.geom_contype, solver.mj_model.geom_conaffinity
+    meets = (kind[:, None] & affinity[None, :]) | (kind[None, :] & affinity[:, None])
+    # the ground is global and comes first
+    assert meets[0, 1:].all()
+    assert not meets[1:, 1:].any()
+
+
+def test_contact_has_the_paw_friction_and_is_stiff():
+    model = build_model(1, friction=0.6, visuals=False, device="cpu")
+    solver = mujoco_solver(model)
+    joint_q = model.joint_q.numpy()
+    joint_q[2] -= 1e-3
+    model.joint_q.assign(joint_q)
+    state, control = model.state(), model.control()
+    solver.step(state, state, control, None, 1.0 / 480.0)
+    contact = solver.mjw_data.contact
+    assert solver.mjw_data.nacon.numpy()[0] == 4
+    assert contact.friction.numpy()[:4, 0] == pytest.approx(np.full(4, 0.6))
+    assert contact.solref.numpy()[:4] == pytest.approx(np.tile([2.0 / 476.0, 1.0], (4, 1)), rel=1e-3)
+    assert contact.solimp.numpy()[:4, :2] == pytest.approx(np.tile([0.95, 0.99], (4, 1)))
+
+
+def standing_energy(angle):
+    """Base height [m] and energy [J] of the robot on legs of 17 N m/rad commanded to 45 degrees, all at one angle.
+
+    In the leg's plane each shank leans by asin((0.045 + 0.175 sin q) / 0.3); heights follow from the paws upward.
+    """
+    lean = math.asin((0.045 + 0.175 * math.sin(angle)) / 0.3)
+    knee = 0.025 + 0.3 * math.cos(lean)
+    hip = knee + 0.175 * math.cos(angle)
+    # two thighs, the outer shank, the inner shank with its paw: mass times height of each centre of mass
+    thighs = 2 * 0.081 * (hip - 0.0594 * math.cos(angle))
+    shanks = 0.1992 * (knee - 0.1647 * math.cos(lean)) + 0.2193 * (knee - 0.1927 * math.cos(lean))
+    weight = 9.81 * ((14.5 - 4 * 0.5805) * hip + 4 * (thighs + shanks))
+    springs = 8 * 0.5 * 17.0 * (angle - math.pi / 4.0) ** 2
+    return hip, weight + springs
+
+
+def test_robot_stands_under_position_control():
+    model = build_model(1, visuals=False, device="cpu")
+    solver = mujoco_solver(model)
+    state, control = model.state(), model.control()
+    target = np.radians([0.0, 45.0, 45.0] * 4)
+    damping = np.array([1.8, 0.8, 0.8] * 4)
+    torque = np.zeros(DOFS, dtype=np.float32)
+    for _ in range(200):
+        angle, rate = state.joint_q.numpy()[MOTOR_DOFS + 1], state.joint_qd.numpy()[MOTOR_DOFS]
+        torque[MOTOR_DOFS] = 17.0 * (target - angle) - damping * rate
+        control.joint_f.assign(torque)
+        solver.step(state, state, control, None, 1.0 / 480.0)
+    joint_q = state.joint_q.numpy()
+    assert np.isfinite(joint_q).all()
+    sagged = minimize_scalar(lambda angle: standing_energy(angle)[1], bounds=(0.5, 1.5), method="bounded").x
+    assert joint_q[2] == pytest.approx(standing_energy(sagged)[0], abs=0.003)
+    assert joint_q[3:7] == pytest.approx([0.0, 0.0, 0.0, 1.0], abs=0.02)
+    gap = far_ends(model, joint_q, 2, 0.3) - far_ends(model, joint_q, 4, 0.3)
+    assert np.abs(gap).max() < 1e-3
+
+
+def test_accelerations_in_flight_agree_with_pinocchio(description):
+    rng = np.random.default_rng(7)
+    motors = description.pose("default") + rng.uniform(-0.4, 0.4, 12)
+    quat = Rotation.from_euler("xyz", [0.4, -0.3, 1.0]).as_quat()
+    torques = rng.uniform(-10.0, 10.0, 12)
+    reference = build_pinocchio(description)
+    q = reference.configuration([0.0, 0.0, 1.0], quat, motors)
+    expected = reference.forward_dynamics(q, np.zeros(26), torques)
+
+    model = build_model(1, ground=None, visuals=False, device="cpu")
+    model.joint_friction.zero_()
+    joint_q = model.joint_q.numpy()
+    joint_q[:7] = q[:7]
+    joint_q[MOTOR_DOFS + 1] = motors
+    knees = np.array([9 + 5 * leg + 2 * bar for leg in range(4) for bar in (0, 1)])
+    joint_q[knees] = q[reference.knee_q]
+    model.joint_q.assign(joint_q)
+    state, control = model.state(), model.control()
+    forces = np.zeros(DOFS, dtype=np.float32)
+    forces[MOTOR_DOFS] = torques
+    control.joint_f.assign(forces)
+    solver = mujoco_solver(model, iterations=50, integrator="euler")
+    solver.mjw_model.eq_solimp.fill_(wp.types.vector(5, float)(0.9999, 0.9999, 0.001, 0.5, 2.0))  # all but rigid loops
+    for _ in range(3):  # the solver warm-starts from the previous call
+        solver.step(state, model.state(), control, None, 1.0e-5)
+    found = solver.mjw_data.qacc.numpy()[0]
+
+    scale = np.abs(expected).max()
+    # MuJoCo: linear acceleration of the base in the world frame, angular in the body frame
+    assert found[:3] == pytest.approx(Rotation.from_quat(quat).apply(expected[:3]), abs=3e-4 * scale)
+    assert found[3:6] == pytest.approx(expected[3:6], abs=3e-4 * scale)
+    assert found[MOTOR_DOFS] == pytest.approx(expected[reference.motor_v], abs=3e-4 * scale)
+    assert found[knees - 1] == pytest.approx(expected[reference.knee_v], abs=3e-4 * scale)
+
+
+def test_robot_on_a_heightfield():
+    heights = np.full((21, 21), 0.1, dtype=np.float32)
+    heights[0, 0] = 0.0
+    ground = newton.Heightfield(data=heights, nrow=21, ncol=21, hx=2.0, hy=2.0)
+    model = build_model(1, ground=ground, visuals=False, device="cpu")
+    joint_q = model.joint_q.numpy()
+    joint_q[2] += 0.099
+    model.joint_q.assign(joint_q)
+    solver = mujoco_solver(model)
+    state = model.state()
+    solver.step(state, state, model.control(), None, 1.0 / 480.0)
+    contacts = solver.mjw_data.nacon.numpy()[0]
+    assert contacts >= 4
+    assert solver.mjw_data.contact.dist.numpy()[:contacts].min() == pytest.approx(-0.001, abs=2e-4)
+
+
+def test_free_flight_has_no_ground():
+    assert "ground" not in build_model(1, ground=None, visuals=False, device="cpu").shape_label
+
+
+def test_gradients_on_request():
+    assert build_model(1, visuals=False, requires_grad=True, device="cpu").joint_q.requires_grad
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"num_worlds": 0}, "num_worlds must be at least 1"),
+        ({"num_worlds": 1, "friction": math.nan}, "friction must not be negative"),
+        ({"num_worlds": 1, "ground": "sea"}, "ground must be"),
+    ],
+)
+def test_build_model_refuses(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        build_model(**arguments, device="cpu")

@@ -1,0 +1,384 @@
+import numpy as np
+import pytest
+import warp as wp
+from simulation_helpers import (
+    PAW_RADIUS,
+    WEIGHT,
+    paw_centres,
+    paw_forces,
+    simulation,
+    slip_velocities,
+    stiff_motors,
+    thrown,
+    write_state,
+)
+from solver_helpers import COORDS, MOTOR_V, Reference, States
+
+from jumper_warp.envs.env import JumpEnv
+from jumper_warp.registry import make_task
+from jumper_warp.robot.grounds import BlockCfg
+from jumper_warp.robot.model import PHYSICS_DT, build_model
+from jumper_warp.sim.dynamics import JumperDynamics
+from jumper_warp.sim.simulation import SUBSTEPS
+from jumper_warp.sim.solver import TOLERANCE, SolverJumper
+from kernels.collision.robot import SHANK_GROUND, collision_kernel
+from kernels.dynamics.contact import BlockLaw, PawContact, block_velocity
+from kernels.scalar import vec3
+from kernels.terrain.ground import Ground, block_normal, ground_distance, surface, world_ground
+
+wp.set_module_options({"enable_backward": False})
+
+MASS = 14.5
+TOP = 0.1
+WIDE = {"center": (0.0, 0.0), "half": (1.0, 1.0), "height": TOP}
+"""A block under the whole robot."""
+
+
+def on_block(num_worlds, settle=60, **block):
+    """Robots standing on their blocks' middle."""
+    arguments = {name: block.pop(name) for name in ("motors", "friction_paws") if name in block}
+    arguments = {"friction": arguments.pop("friction_paws", 0.9), **arguments}
+    sim = simulation(num_worlds, block=BlockCfg(**(WIDE | block)), **arguments)
+    q = sim.joint_q().copy()
+    q[:, 2] += TOP
+    write_state(sim, q)
+    for _ in range(settle):
+        sim.step()
+    return sim
+
+
+def set_block_velocity(sim, velocity):
+    """Set the blocks' velocities [m/s], (num_worlds, 2)."""
+    blocks = sim.solver.dynamics.robot.ground.blocks
+    values = blocks.numpy()
+    values["velocity"] = velocity
+    blocks.assign(values)
+
+
+def momenta(sim, reference):
+    """Horizontal momenta of the robots [kg m/s], (num_worlds, 2)."""
+    states = States.read(sim.joint_q(), sim.joint_qd())
+    return np.array([reference.momentum(states, i)[:2] for i in range(sim.num_worlds)])
+
+
+@wp.kernel
+def block_velocity_kernel(law: BlockLaw, impulse: wp.array(dtype=vec3), out: wp.array(dtype=vec3)):
+    contacts = wp.zeros(shape=(4,), dtype=PawContact)
+    for k in range(contacts.shape[0]):
+        contacts[k].active = 1
+        contacts[k].on_block = wp.where(k < 2, 1, 0)
+        contacts[k].impulse = impulse[k]
+    out[0] = block_velocity(law, contacts)
+
+
+@pytest.mark.parametrize(
+    ("speed", "paw_impulse", "expected"),
+    [
+        # (100 N - 0.5 * 8 kg * 9.81 m/s^2) / 8 kg for 0.01 s
+        (0.0, (-1.0, 0.0, 0.0), (1.0 - 0.3924) / 8.0),
+        # a load of 60 N on top takes another 0.5 * 60 N
+        (0.0, (-1.0, 0.0, 0.6), (1.0 - 0.3924 - 0.3) / 8.0),
+        # friction holds against 30 N, and stops a slow block without turning it back
+        (0.0, (-0.3, 0.0, 0.0), 0.0),
+        (0.04, (0.0, 0.0, 0.0), 0.0),
+        (-1.0, (0.0, 0.0, 0.0), -1.0 + 0.3924 / 8.0),
+    ],
+)
+def test_a_paw_force_pushes_the_block_against_friction(speed, paw_impulse, expected):
+    law = BlockLaw()
+    law.velocity, law.up = vec3(speed, 0.0, 0.0), vec3(0.0, 0.0, 1.0)
+    law.mass, law.friction, law.weight = 8.0, 0.5, 8.0 * 9.81 * 0.01
+    impulses = np.array([paw_impulse, (0.0,) * 3, (5.0, 5.0, 5.0), (0.0,) * 3])  # the third paw is not on the block
+    out = wp.zeros(1, dtype=vec3, device="cpu")
+    wp.launch(block_velocity_kernel, 1, inputs=[law, wp.array(impulses, dtype=vec3, device="cpu"), out], device="cpu")
+    assert out.numpy()[0] == pytest.approx([expected, 0.0, 0.0], abs=1e-6)
+
+
+def test_standing_robot_leaves_a_block_at_rest_where_it_is():
+    sim = on_block(2, settle=0, mass=np.array([5.0, 20.0]))
+    for _ in range(60):
+        sim.step()
+    paws = paw_centres(sim)
+    for _ in range(120):
+        sim.step()
+    assert np.abs(sim.solver.block_position()).max() < 1e-3
+    assert np.abs(paw_centres(sim) - paws).max() < 1e-3
+    assert paw_centres(sim)[..., 2] == pytest.approx(TOP + PAW_RADIUS, abs=1e-3)
+    assert paw_forces(sim).sum(axis=1) == pytest.approx(np.tile([0.0, 0.0, WEIGHT], (2, 1)), abs=1e-3 * WEIGHT)
+
+
+def test_robot_and_block_accelerate_together_under_a_force():
+    masses, force, friction = np.array([5.0, 10.0]), 40.0, 0.1
+    sim = on_block(2, mass=masses, friction=friction, motors=stiff_motors())
+    wrench = np.zeros((2, 21, 6), dtype=np.float32)
+    wrench[:, 0, 0] = force
+    sim.state.body_f.assign(wrench.reshape(-1, 6))
+    for _ in range(30):
+        sim.step()
+    before = sim.solver.block_velocity()[:, 0].copy()
+    for _ in range(30):
+        sim.step()
+    gained = (sim.solver.block_velocity()[:, 0] - before) / 0.5
+    total = MASS + masses
+    assert gained == pytest.approx((force - friction * total * 9.81) / total, rel=0.01)
+
+
+@pytest.mark.parametrize("friction", [0.0, 0.3])
+def test_block_gains_what_paws_and_floor_give_in_every_step(friction):
+    masses = np.array([5.0, 10.0, 40.0, 5.0])
+    sim = on_block(4, settle=0, mass=masses, friction=friction, half=(3.0, 3.0))
+    thrown(sim, 21, height=(0.5, 0.7), speed=1.0)
+    moved = 0
+    for _ in range(240):
+        before = sim.solver.block_velocity().astype(float)
+        sim.physics_step()
+        force, after = paw_forces(sim).sum(axis=1), sim.solver.block_velocity().astype(float)
+        lost = masses[:, None] * (before - after) - PHYSICS_DT * force[:, :2]
+        most = friction * PHYSICS_DT * (masses * 9.81 + force[:, 2])
+        speed = np.linalg.norm(after, axis=1)
+        sliding = speed > 1e-4
+        expected = most[:, None] * after / np.maximum(speed, 1e-9)[:, None]
+        assert lost[sliding] == pytest.approx(expected[sliding], abs=2e-5)
+        assert np.all(np.linalg.norm(lost, axis=1) <= most + 2e-5)
+        moved += sliding.sum()
+    assert moved > 100
+
+
+def test_landing_on_a_frictionless_block_conserves_momentum():
+    masses = np.array([5.0, 15.0, 50.0])
+    sim = on_block(3, settle=0, mass=masses, friction=0.0)
+    reference = Reference(sim.model)
+    q, qd = sim.joint_q().copy(), sim.joint_qd().copy()
+    q[:, 2] += 0.15
+    qd[:, 0], qd[:, 1] = 1.2, 0.3
+    write_state(sim, q, qd)
+    before = momenta(sim, reference)
+    for _ in range(24):
+        sim.step()
+    block = masses[:, None] * sim.solver.block_velocity()
+    assert paw_forces(sim)[..., 2].sum(axis=1).min() > 10.0
+    assert block[:, 0].min() > 2.0
+    # free flight alone drifts by the integration error
+    assert momenta(sim, reference) + block == pytest.approx(before, abs=0.01 * MASS * 1.2)
+
+
+def test_sticking_paws_move_with_a_light_block():
+    sim = on_block(4, settle=20, mass=np.array([1.0, 5.0, 10.0, 100.0]), friction=0.05)
+    qd = sim.joint_qd().copy()
+    qd[:, 0] = 0.5
+    write_state(sim, qd=qd)
+    compared, fastest = 0, 0.0
+    for _ in range(120):
+        before = sim.joint_q().copy()
+        sim.physics_step()
+        force, velocity = paw_forces(sim), sim.solver.block_velocity()
+        slip = slip_velocities(sim, before)[..., :2] - velocity[:, None]
+        sticking = np.linalg.norm(force[..., :2], axis=-1) < 0.85 * force[..., 2]
+        assert np.abs(slip[sticking]).max(initial=0.0) < 1e-3
+        assert sim.solver.residual.numpy().max() <= TOLERANCE
+        compared += sticking[:2].sum()
+        fastest = max(fastest, np.abs(velocity).max())
+    assert compared > 100
+    assert fastest > 0.1
+
+
+def test_static_friction_holds_on_a_block_that_moves():
+    # riding a heavy block at 0.5 m/s, pulled with a quarter of the weight: more than 0.2 holds, far less than 0.8
+    sim = on_block(2, mass=1000.0, friction=0.0, friction_paws=0.2, motors=stiff_motors())
+    dynamics = sim.solver.dynamics
+    dynamics.static_friction_ratio.assign(np.array([4.0, 1.0], dtype=np.float32))
+    dynamics.pack_friction()
+    qd = sim.joint_qd().copy()
+    qd[:, 0] = 0.5
+    write_state(sim, qd=qd)
+    set_block_velocity(sim, [0.5, 0.0])
+    before = paw_centres(sim)[..., :2] - sim.solver.block_position()[:, None]
+    wrench = np.zeros((2, 21, 6), dtype=np.float32)
+    wrench[:, 0, 0] = 0.25 * WEIGHT
+    sim.state.body_f.assign(wrench.reshape(-1, 6))
+    for _ in range(30):
+        sim.step()
+    slipped = np.abs(paw_centres(sim)[..., :2] - sim.solver.block_position()[:, None] - before).max(axis=(1, 2))
+    assert slipped[0] < 6e-3  # the paws roll as the legs lean
+    assert slipped[1] > 0.03
+
+
+def test_robots_thrown_on_light_blocks_converge_and_stay_finite():
+    sim = on_block(32, settle=0, mass=np.repeat([1.0, 5.0], 16), friction=0.0, half=(3.0, 3.0))
+    thrown(sim, 11, height=(0.5, 1.1))
+    for _ in range(90):
+        sim.step()
+        assert sim.solver.residual.numpy().max() <= TOLERANCE
+        assert np.linalg.norm(sim.solver.block_velocity(), axis=1).max() < 10.0
+    assert not sim.solver.invalid.numpy().any()
+
+
+def test_paws_push_the_side_of_a_block():
+    masses = np.array([5.0, 15.0])
+    block = BlockCfg(center=(0.9, 0.0), half=(0.4, 0.6), height=TOP, mass=masses, friction=0.0)
+    sim = simulation(2, friction=0.0, block=block)
+    qd = sim.joint_qd().copy()
+    qd[:, 0] = 1.0
+    write_state(sim, qd=qd)
+    reference = Reference(sim.model)
+    before = momenta(sim, reference)
+    for _ in range(36):
+        sim.step()
+        side = sim.solver.block_position()[:, 0] - 0.4
+        assert np.all(paw_centres(sim)[:, :2, 0].max(axis=1) < side - PAW_RADIUS + 0.01)
+    gained = masses * sim.solver.block_velocity()[:, 0]
+    assert gained.min() > 2.0
+    assert momenta(sim, reference)[:, 0] + gained == pytest.approx(before[:, 0], abs=0.01 * before[0, 0])
+
+
+@wp.kernel
+def probe_kernel(ground: Ground, point: wp.array(dtype=vec3), out: wp.array2d(dtype=float)):
+    """Height, distance and block normal at a point, in each world."""
+    world, i = wp.tid()
+    here = world_ground(ground, world)
+    normal = block_normal(ground.blocks[world], point[i])
+    row = world * point.shape[0] + i
+    out[row, 0] = surface(here, point[i][0], point[i][1])[0]
+    out[row, 1] = ground_distance(here, point[i])
+    for j in range(3):
+        out[row, 2 + j] = normal[j]
+
+
+def test_surface_and_distance_of_a_block():
+    block = BlockCfg(center=np.array([[1.0, 0.0], [5.0, 0.0]]), half=(0.4, 0.2), height=0.1)
+    ground = SolverJumper(build_model(2, visuals=False, device="cpu"), block=block).dynamics.robot.ground
+    points = [(1.3, 0.1, 0.15), (0.5, 0.0, 0.06), (1.43, 0.0, 0.14), (1.0, 0.19, 0.02)]
+    out = wp.zeros((8, 5), dtype=float, device="cpu")
+    wp.launch(probe_kernel, (2, 4), inputs=[ground, wp.array(points, dtype=vec3, device="cpu"), out], device="cpu")
+    found = out.numpy().reshape(2, 4, 5)
+    # above the top; beside a wall, the floor as near; off an edge, 0.03 and 0.04 m away; inside, near a wall
+    assert found[0, :, 0] == pytest.approx([0.1, 0.0, 0.0, 0.1])
+    assert found[0, :, 1] == pytest.approx([0.05, 0.06, 0.05, -0.01], abs=1e-6)
+    normals = [(0, 0, 1), (-1, 0, 0), (0.6, 0, 0.8), (0, 1, 0)]
+    assert found[0, :, 2:] == pytest.approx(np.array(normals, dtype=float), abs=1e-5)
+    assert found[1, :, 0] == pytest.approx(np.zeros(4))
+    assert found[1, :, 1] == pytest.approx([0.15, 0.06, 0.14, 0.02], abs=1e-6)
+
+
+def test_shin_in_a_block_is_a_collision():
+    # the front shanks lean forward over a block in world 0; in world 1 the block is elsewhere
+    block = BlockCfg(center=np.array([[0.69, 0.0], [3.0, 0.0]]), half=(0.4, 0.5), height=0.15)
+    sim = simulation(2, block=block)
+    flags, clearance = wp.zeros(2, dtype=int, device="cpu"), wp.zeros(2, dtype=float, device="cpu")
+    robot = sim.solver.dynamics.robot
+    inputs = [robot.geometry, robot.ground, sim.state.joint_q, COORDS, 0.0]
+    wp.launch(collision_kernel, 2, inputs=inputs, outputs=[flags, clearance], device="cpu")
+    assert flags.numpy()[0] & int(SHANK_GROUND)
+    assert flags.numpy()[1] == 0
+
+
+def test_blocks_return_to_their_starts():
+    sim = on_block(3, settle=0, mass=5.0, friction=0.0)
+    starts = np.array([[0.1, 0.0], [0.0, 0.2], [0.3, 0.1]], dtype=np.float32)
+    sim.solver.place_blocks(starts)
+    thrown(sim, 3, height=(0.5, 0.6))
+    for _ in range(40):
+        sim.step()
+    moved = sim.solver.block_position()
+    assert np.abs(moved - starts).max(axis=1).min() > 1e-3
+    sim.solver.reset_blocks([1])
+    assert np.array_equal(sim.solver.block_position(), [moved[0], starts[1], moved[2]])
+    assert not sim.solver.block_velocity()[1].any()
+    sim.solver.reset_blocks(wp.array([True, False, False], dtype=wp.bool, device="cpu"))
+    assert np.array_equal(sim.solver.block_position(), [starts[0], starts[1], moved[2]])
+    sim.solver.reset(sim.state)
+    assert np.array_equal(sim.solver.block_position(), starts)
+
+
+def test_block_of_a_broken_world_returns_to_its_start():
+    sim = on_block(2, settle=2, mass=5.0, friction=0.0)
+    set_block_velocity(sim, [[1.0, 0.0], [1.0, 0.0]])
+    sim.step()
+    assert sim.solver.block_position()[:, 0].min() > 1e-3
+    rates = sim.joint_qd().copy()
+    rates[0, 7] = np.nan
+    sim.state.joint_qd.assign(rates.ravel())
+    sim.step()
+    sim.step()
+    assert sim.solver.invalid.numpy().tolist() == [1, 0]
+    assert np.array_equal(sim.solver.block_position()[0], [0.0, 0.0])
+    assert np.isfinite(sim.solver.block_velocity()).all()
+
+
+def test_double_precision_moves_the_block_alike():
+    sim = on_block(2, settle=30, mass=np.array([5.0, 20.0]), friction=0.1)
+    qd = sim.joint_qd().copy()
+    qd[:, 0] = 1.0
+    write_state(sim, qd=qd)
+    double = JumperDynamics(sim.model, block=BlockCfg(**WIDE, mass=np.array([5.0, 20.0]), friction=0.1), double=True)
+    q, qd = (wp.array(v.ravel(), dtype=wp.float64, device="cpu") for v in (sim.joint_q(), sim.joint_qd()))
+    for _ in range(SUBSTEPS * 4):
+        sim.physics_step()
+        joint_f = np.zeros((2, 38))
+        joint_f[:, MOTOR_V] = sim.torque.numpy().T
+        drive = double.drive(
+            wp.array(joint_f.ravel(), dtype=wp.float64, device="cpu"),
+            wp.zeros(42, dtype=wp.spatial_vector, device="cpu"),
+        )
+        double.advance(double.settings(PHYSICS_DT, 1, 50, 1.0e-9), drive, q, qd, q, qd)
+    blocks = double.robot.ground.blocks.numpy()
+    assert blocks["center"].dtype == np.float64
+    assert blocks["center"][:, 0].min() > 1e-3
+    assert blocks["center"] == pytest.approx(sim.solver.block_position(), abs=1e-4)
+
+
+def test_what_does_not_know_blocks_says_so():
+    block = BlockCfg(center=(1.0, 0.0))
+    with pytest.raises(ValueError, match="needs solver='jumper'"):
+        simulation(1, solver="mujoco", block=block)
+    model = build_model(1, visuals=False, device="cpu", requires_grad=True)
+    solver = SolverJumper(model, block=block)
+    with pytest.raises(ValueError, match="not differentiable"):
+        solver.step(model.state(), model.state(), None, None, PHYSICS_DT)
+    plain = SolverJumper(build_model(1, visuals=False, device="cpu"))
+    with pytest.raises(ValueError, match="without a block"):
+        plain.reset_blocks()
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"mass": 0.0}, "mass must be positive"),
+        ({"half": (0.4, -0.1)}, "half must be positive"),
+        ({"height": float("nan")}, "height must be positive"),
+        ({"friction": -0.1}, "friction must not be negative"),
+        ({"center": (np.inf, 0.0)}, "center must be finite"),
+    ],
+)
+def test_impossible_blocks_are_refused(values, message):
+    with pytest.raises(ValueError, match=message):
+        BlockCfg(**({"center": (0.0, 0.0)} | values))
+
+
+def test_block_values_need_one_row_per_world():
+    model = build_model(2, visuals=False, device="cpu")
+    with pytest.raises(ValueError, match="each of 2 worlds"):
+        SolverJumper(model, block=BlockCfg(center=(0.0, 0.0), mass=np.array([5.0, 5.0, 5.0])))
+
+
+@pytest.mark.parametrize("begin", ["reset", "evaluation_reset"])
+def test_a_new_episode_puts_the_block_back(begin):
+    block = BlockCfg(center=(1.0, 0.0), half=(0.3, 0.3), height=0.05, mass=10.0, friction=0.4)
+    env = JumpEnv(make_task("horizontal-jump"), 2, device="cpu", block=block)
+    start = env.sim.solver.block_position()
+    blocks = env._dynamics.robot.ground.blocks
+    moved = blocks.numpy().copy()
+    moved["center"] += 0.2
+    moved["velocity"] = 0.5
+    blocks.assign(moved)
+    assert np.abs(env.sim.solver.block_position() - start).min() > 0.1
+    state = env.state_dict()
+    if begin == "reset":
+        env.reset()
+    else:
+        env.evaluation_reset(np.tile([0.8, 0.0, 0.0], (2, 1)))
+    np.testing.assert_allclose(env.sim.solver.block_position(), start, atol=1e-6)
+    assert not env.sim.solver.block_velocity().any()
+    env.load_state_dict(state)
+    np.testing.assert_array_equal(env.sim.solver.block_position(), moved["center"])
+    np.testing.assert_array_equal(env.sim.solver.block_velocity(), np.full((2, 2), 0.5))

@@ -1,0 +1,280 @@
+import newton
+import numpy as np
+import pytest
+import warp as wp
+from newton import ModelFlags, StateFlags
+from newton.sensors import SensorIMU
+from newton.solvers import SolverBase
+from solver_helpers import BODIES, COORDS, DOFS, KNEE_V, MOTOR_V
+
+from jumper_warp.robot.model import build_model
+from jumper_warp.sim.dynamics import NotThisRobotError
+from jumper_warp.sim.simulation import Simulation
+from jumper_warp.sim.solver import SolverJumper
+
+DT = 1.0 / 480.0
+
+
+def simulation(num_worlds, **arguments):
+    return Simulation(num_worlds, visuals=False, device="cpu", **arguments)
+
+
+def launch(sim):
+    """Slide along x and drop from 0.2 m: friction, masses, motors and gravity all matter."""
+    sim.solver.reset(sim.state)
+    q, qd = sim.joint_q().copy(), sim.joint_qd().copy()
+    q[:, 2] += 0.2
+    qd[:, 0] = 1.5
+    sim.state.joint_q.assign(q.ravel())
+    sim.state.joint_qd.assign(qd.ravel())
+
+
+def command(sim, step):
+    """Move all motors, into the stops of the transversals at 140 degrees."""
+    degrees = np.tile([10.0, 160.0 if 10 <= step < 20 else 60.0, 50.0], 4)
+    sim.target.assign(np.repeat(np.radians(degrees)[:, None], sim.num_worlds, axis=1).astype(np.float32))
+
+
+def trajectory(sim, steps=30):
+    """The motion of all worlds after `launch`, (steps, num_worlds, 43)."""
+    launch(sim)
+    motion = []
+    for step in range(steps):
+        command(sim, step)
+        sim.step()
+        motion.append(sim.joint_q().copy())
+    return np.array(motion)
+
+
+def test_plain_model_is_refused():
+    builder = newton.ModelBuilder()
+    body = builder.add_body(label="box")
+    builder.add_shape_box(body, hx=0.1, hy=0.1, hz=0.1)
+    with pytest.raises(NotThisRobotError, match="labels"):
+        SolverJumper(builder.finalize(device="cpu"))
+
+
+@pytest.mark.parametrize("labels", ["body_label", "joint_label"])
+def test_robot_with_another_label_is_refused(labels):
+    model = build_model(2, visuals=False, device="cpu")
+    getattr(model, labels)[30] = "world_1/wheel"
+    with pytest.raises(NotThisRobotError, match="'wheel'"):
+        SolverJumper(model)
+
+
+def test_robot_without_a_paw_is_refused():
+    model = build_model(1, visuals=False, device="cpu")
+    index = next(i for i, label in enumerate(model.shape_label) if label.endswith("BL_paw"))
+    model.shape_label[index] = "world_0/BL_wheel"
+    with pytest.raises(NotThisRobotError, match="BL_paw"):
+        SolverJumper(model)
+
+
+@pytest.mark.parametrize(("argument", "value"), [("max_sweeps", 0), ("tolerance", 0.0)])
+def test_bad_settings_are_refused(argument, value):
+    with pytest.raises(ValueError, match=argument):
+        SolverJumper(build_model(1, visuals=False, device="cpu"), **{argument: value})
+
+
+CHANGES = [
+    ("body_mass", BODIES, slice(0, 1), 1.3, ModelFlags.BODY_INERTIAL_PROPERTIES),
+    ("body_com", BODIES, slice(0, 1), 3.0, ModelFlags.BODY_INERTIAL_PROPERTIES),
+    ("body_inertia", BODIES, slice(1, 21), 2.0, ModelFlags.BODY_INERTIAL_PROPERTIES),
+    ("joint_armature", DOFS, MOTOR_V, 3.0, ModelFlags.JOINT_DOF_INERTIAL_PROPERTIES),
+    ("joint_armature", DOFS, MOTOR_V, 3.0, ModelFlags.JOINT_DOF_PROPERTIES),
+    ("joint_friction", DOFS, MOTOR_V, 10.0, ModelFlags.JOINT_DOF_FORCE_PROPERTIES),
+    ("joint_damping", DOFS, KNEE_V, 0.1, ModelFlags.JOINT_DOF_FORCE_PROPERTIES),
+    ("joint_effort_limit", DOFS, KNEE_V, 0.2, ModelFlags.JOINT_DOF_FORCE_PROPERTIES),
+    ("joint_limit_upper", DOFS, MOTOR_V, 0.6, ModelFlags.JOINT_DOF_PROPERTIES),
+    ("shape_material_mu", None, None, 0.5, ModelFlags.SHAPE_PROPERTIES),
+    ("gravity", 1, slice(0, 1), 0.5, ModelFlags.MODEL_PROPERTIES),
+]
+
+
+@pytest.fixture(scope="module")
+def pair():
+    """Two worlds and their unchanged motion."""
+    sim = simulation(2)
+    return sim, trajectory(sim)
+
+
+@pytest.mark.parametrize("change", CHANGES, ids=[f"{c[0]}-{c[4].name}" for c in CHANGES])
+def test_notified_change_acts_on_its_own_world_alone(pair, change):
+    sim, before = pair
+    name, rows, which, factor, flag = change
+    array = getattr(sim.model, name)
+    original = array.numpy().copy()
+    values = original.copy()
+    if name == "shape_material_mu":
+        values[[label.startswith("world_1/") for label in sim.model.shape_label]] *= factor
+    else:
+        values[rows : 2 * rows][which] *= factor
+    array.assign(values)
+    try:
+        unnoticed = trajectory(sim)
+        sim.solver.notify_model_changed(flag)
+        after = trajectory(sim)
+    finally:
+        array.assign(original)
+        sim.solver.notify_model_changed(flag)
+    if name != "body_com":  # joint_qd itself refers to the model's com
+        assert np.array_equal(unnoticed, before)
+    assert np.array_equal(after[:, 0], before[:, 0])
+    assert np.abs(after[:, 1, :27] - before[:, 1, :27]).max() > 1e-3
+
+
+def test_gravity_of_each_world():
+    sim = simulation(2, ground=None)
+    sim.model.gravity.assign(np.array([[0.0, 0.0, -9.81], [1.0, 2.0, -3.0], [0.0, 0.0, 0.0]], dtype=np.float32))
+    sim.solver.notify_model_changed(ModelFlags.MODEL_PROPERTIES)
+    sim.solver.step(sim.state, sim.state, None, None, DT)
+    # all links fall alike, so the base does too
+    assert sim.joint_qd()[:, :3] == pytest.approx(np.array([[0.0, 0.0, -9.81], [1.0, 2.0, -3.0]]) * DT, abs=1e-6)
+
+
+def test_reset_restores_only_the_masked_worlds():
+    sim = simulation(3)
+    reference = sim.joint_q().copy()
+    trajectory(sim, steps=10)
+    moved, rates = sim.joint_q().copy(), sim.joint_qd().copy()
+    sim.solver.reset(sim.state, wp.array([False, True, False, False], dtype=wp.bool, device="cpu"))
+    assert sim.joint_q()[1] == pytest.approx(reference[1], abs=1e-6)
+    assert not sim.joint_qd()[1].any()
+    for world in (0, 2):
+        assert sim.joint_q()[world] == pytest.approx(moved[world], abs=1e-6)
+        assert sim.joint_qd()[world] == pytest.approx(rates[world], abs=1e-4)
+
+
+def test_reset_of_the_solver_alone_leaves_the_state():
+    sim = simulation(2)
+    trajectory(sim, steps=25)
+    moved = sim.joint_q().copy()
+    assert sim.paw_force.numpy().any()
+    sim.solver.reset(sim.state, flags=StateFlags.NONE)
+    assert np.array_equal(sim.joint_q(), moved)
+    assert not sim.paw_force.numpy().any()
+
+
+def test_world_with_nan_is_parked_and_disturbs_no_other():
+    sims = [simulation(3), simulation(3)]
+    for sim in sims:
+        launch(sim)
+        command(sim, 0)
+        for _ in range(3):
+            sim.step()
+    broken, intact = sims
+    rates = broken.joint_qd().copy()
+    rates[1, 7] = np.nan
+    broken.state.joint_qd.assign(rates.ravel())
+    for _ in range(20):
+        broken.step()
+        intact.step()
+    assert broken.solver.invalid.numpy().tolist() == [0, 1, 0]
+    assert broken.joint_q()[1] == pytest.approx(broken.model.joint_q.numpy().reshape(3, COORDS)[1], abs=1e-6)
+    assert not broken.joint_qd()[1].any()
+    for world in (0, 2):
+        assert np.array_equal(broken.joint_q()[world], intact.joint_q()[world])
+        assert np.array_equal(broken.joint_qd()[world], intact.joint_qd()[world])
+    mask = wp.array([False, True, False, False], dtype=wp.bool, device="cpu")
+    for sim in sims:
+        sim.solver.reset(sim.state, mask)
+        sim.step()
+        sim.step()
+    assert not broken.solver.invalid.numpy().any()
+    assert np.array_equal(broken.joint_q(), intact.joint_q())
+
+
+def test_runs_repeat_bit_for_bit(pair):
+    sim, before = pair
+    assert np.array_equal(trajectory(sim), before)
+    assert np.array_equal(trajectory(simulation(2)), before)
+
+
+def test_explicit_torques_move_as_the_motors_do():
+    driven, explicit = simulation(2), simulation(2)
+    for sim in (driven, explicit):
+        launch(sim)
+    command(driven, 12)
+    driven.filter_targets()
+    largest = 0.0
+    for _ in range(60):
+        before = driven.joint_q().copy(), driven.joint_qd().copy()
+        driven.physics_step()
+        joint_f = np.zeros((2, DOFS), dtype=np.float32)
+        joint_f[:, MOTOR_V] = driven.torque.numpy().T
+        explicit.control.joint_f.assign(joint_f.ravel())
+        explicit.state.joint_q.assign(before[0].ravel())
+        explicit.state.joint_qd.assign(before[1].ravel())
+        explicit.solver.step(explicit.state, explicit.state, explicit.control, None, DT)
+        assert explicit.joint_qd() == pytest.approx(driven.joint_qd(), abs=1e-5)
+        assert explicit.joint_q() == pytest.approx(driven.joint_q(), abs=1e-5)
+        largest = max(largest, np.abs(joint_f).max())
+    assert largest > 10.0
+
+
+def test_step_leaves_its_input_alone():
+    sim = simulation(2)
+    launch(sim)
+    out = sim.model.state()
+    before = sim.joint_q().copy(), sim.joint_qd().copy()
+    sim.solver.step(sim.state, out, None, None, DT)
+    assert np.array_equal(sim.joint_q(), before[0])
+    assert np.array_equal(sim.joint_qd(), before[1])
+    sim.solver.reset(sim.state, flags=StateFlags.NONE)
+    sim.solver.step(sim.state, sim.state, None, None, DT)
+    assert np.array_equal(sim.joint_q().ravel(), out.joint_q.numpy())
+
+
+def test_bodies_are_those_of_newtons_kinematics(pair):
+    sim, _ = pair
+    trajectory(sim, steps=15)
+    state = sim.model.state()
+    newton.eval_fk(sim.model, sim.state.joint_q, sim.state.joint_qd, state)
+    found, expected = sim.state.body_q.numpy(), state.body_q.numpy()
+    expected[:, 3:] *= np.sign((found[:, 3:] * expected[:, 3:]).sum(axis=1))[:, None]
+    assert found == pytest.approx(expected, abs=2e-6)
+    assert sim.state.body_qd.numpy() == pytest.approx(state.body_qd.numpy(), abs=1e-4)
+    assert sim.loop_gap().max() < 1e-6
+
+
+def imu_site(sim):
+    """Make a paw shape a site and return its label."""
+    index = next(i for i, label in enumerate(sim.model.shape_label) if label.endswith("world_0/FL_paw"))
+    flags = sim.model.shape_flags.numpy()
+    flags[index] |= int(newton.ShapeFlags.SITE)
+    sim.model.shape_flags.assign(flags)
+    return sim.model.shape_label[index]
+
+
+def test_imu_on_a_standing_robot_measures_gravity():
+    sim = simulation(1)
+    sensor = SensorIMU(sim.model, sites=imu_site(sim), request_state_attributes=False)
+    observables = sim.solver.observables(kinds=sensor.solver_observable_kinds)
+    for _ in range(120):
+        sim.step()
+    sim.solver.step_motors(sim.state, sim.state, sim.motors, sim.target, DT, 1, observables=observables)
+    sensor.update(sim.state, observables=observables)
+    assert np.linalg.norm(sensor.accelerometer.numpy()[0]) == pytest.approx(9.81, abs=0.02)
+    assert np.linalg.norm(sensor.gyroscope.numpy()[0]) < 0.01
+
+
+def test_body_accelerations_are_observable():
+    sim = simulation(1, ground=None)
+    observables = sim.solver.observables({SolverBase.ObservableKind.BODY_QDD})
+    sim.solver.step(sim.state, sim.state, None, None, DT, observables=observables)
+    fall = np.tile([0.0, 0.0, -9.81, 0.0, 0.0, 0.0], (BODIES, 1))
+    assert observables.body_qdd.numpy() == pytest.approx(fall, abs=5e-3)
+    with pytest.raises(ValueError, match="contact_f"):
+        sim.solver.observables({"contact_f"})
+
+
+def test_viewer_takes_the_state():
+    sim = simulation(2)
+    viewer = newton.viewer.ViewerNull(num_frames=2)
+    viewer.set_model(sim.model)
+    while viewer.is_running():
+        sim.step()
+        viewer.begin_frame(0.0)
+        viewer.log_state(sim.state)
+        viewer.end_frame()
+    assert viewer.frame_count == 2

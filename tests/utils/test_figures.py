@@ -1,0 +1,145 @@
+import json
+import math
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from jumper_warp.utils import output as figures
+from jumper_warp.utils import runtime
+
+
+def test_default_folder_is_outputs_name_and_second(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    folder = figures.output_dir("jump")
+    assert folder.is_dir()
+    assert folder.parent.as_posix() == "outputs/jump"
+    assert [len(part) for part in folder.name.split("_")] == [len("2026-01-31"), len("23-59-59")]
+
+
+def test_two_runs_never_share_a_default_folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert len({figures.output_dir("jump") for _ in range(3)}) == 3
+
+
+def test_given_folder_is_used_as_it_is(tmp_path):
+    assert figures.output_dir("jump", tmp_path / "a" / "b") == tmp_path / "a" / "b"
+    assert figures.output_dir("jump", tmp_path / "a" / "b").is_dir()
+
+
+@pytest.mark.parametrize("name", ["", "..", "a/b", "/tmp"])
+def test_name_that_is_no_path_component_is_refused(name):
+    with pytest.raises(ValueError, match="one path component"):
+        figures.output_dir(name)
+
+
+def test_figures_come_back_as_written(tmp_path):
+    given = {
+        "apex [m]": 1.075,
+        "worlds": 4096,
+        "method": "open loop",
+        "passed": True,
+        "gap": None,
+        "torques": [18.0, 1],
+    }
+    path = figures.write_figures(tmp_path, given)
+    assert path == tmp_path / "figures.json"
+    assert json.loads(path.read_text(encoding="utf-8")) == given
+
+
+def test_numpy_scalars_are_written_as_numbers(tmp_path):
+    path = figures.write_figures(tmp_path, {"a": np.float32(0.5), "b": [np.int64(3)], "c": np.bool_(True)})
+    assert json.loads(path.read_text()) == {"a": 0.5, "b": [3], "c": True}
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf, np.float32("nan")])
+@pytest.mark.parametrize(("shape", "name"), [(lambda x: x, "'apex'"), (lambda x: [0.0, x], r"'apex\[1\]'")])
+def test_non_finite_figure_is_refused_by_name_and_nothing_is_written(tmp_path, bad, shape, name):
+    with pytest.raises(ValueError, match=name):
+        figures.write_figures(tmp_path, {"fine": 1.0, "apex": shape(bad)})
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("nested", [{"x": 1}, [[1]], np.zeros(2), object()])
+def test_nested_figure_is_refused_by_name(tmp_path, nested):
+    with pytest.raises(TypeError, match="apex"):
+        figures.write_figures(tmp_path, {"apex": nested})
+
+
+def test_old_figures_stay_whole_if_writing_fails(tmp_path, monkeypatch):
+    figures.write_figures(tmp_path, {"apex": 1.0})
+
+    def full_disk(*_):
+        raise OSError("no space left")
+
+    monkeypatch.setattr(figures.os, "replace", full_disk)
+    with pytest.raises(OSError, match="no space left"):
+        figures.write_figures(tmp_path, {"apex": 2.0})
+    assert json.loads((tmp_path / "figures.json").read_text()) == {"apex": 1.0}
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["figures.json", "run.json"]
+
+
+def test_run_says_what_made_the_figures_and_nothing_of_the_environment(tmp_path, monkeypatch):
+    monkeypatch.setenv("SOME_TOKEN", "hush-4711")
+    monkeypatch.setattr(sys, "argv", ["/home/someone/experiments/jump.py", "--torque", "18"])
+    figures.write_figures(tmp_path, {})
+    text = (tmp_path / "run.json").read_text()
+    run = json.loads(text)
+    assert set(run) == {"commit", "dirty", "versions", "device", "command"}
+    assert run["command"] == ["jump.py", "--torque", "18"]
+    assert run["versions"]["newton"].startswith("1.8.")
+    assert run["device"]["alias"].startswith(("cpu", "cuda"))
+    assert "hush" not in text and "/home" not in text
+
+
+def _git(folder, *arguments):
+    identity = ["-c", "user.name=A", "-c", "user.email=a@example.org", "-c", "commit.gpgsign=false"]
+    done = subprocess.run(["git", *identity, *arguments], cwd=folder, check=True, capture_output=True, text=True)
+    return done.stdout.strip()
+
+
+def test_commit_is_none_outside_git_and_before_the_first_commit(tmp_path):
+    assert runtime.git_commit(tmp_path) is None
+    _git(tmp_path, "init")
+    (tmp_path / "file").write_text("1")
+    _git(tmp_path, "add", "file")
+    assert runtime.git_commit(tmp_path) is None
+
+
+def test_commit_follows_head_and_tells_changes(tmp_path):
+    _git(tmp_path, "init")
+    (tmp_path / "package").mkdir()
+    (tmp_path / "package" / "file").write_text("1")
+    _git(tmp_path, "add", ".")
+    _git(tmp_path, "commit", "-m", "Begin")
+    head = _git(tmp_path, "rev-parse", "HEAD")
+    assert runtime.git_commit(tmp_path / "package") == (head, False)
+    (tmp_path / "beside").write_text("2")
+    assert runtime.git_commit(tmp_path / "package") == (head, True)
+
+
+def test_commit_of_another_projects_tree_is_not_taken_for_ours(tmp_path):
+    _git(tmp_path, "init")
+    (tmp_path / ".gitignore").write_text(".venv\n")
+    _git(tmp_path, "add", ".")
+    _git(tmp_path, "commit", "-m", "Begin")
+    installed = tmp_path / ".venv" / "jumper_warp"
+    installed.mkdir(parents=True)
+    assert runtime.git_commit(installed) is None
+
+
+def test_device_report_is_one_line_with_the_facts():
+    console = Console(record=True, width=40, quiet=False)
+    info = runtime.report_device("cpu", console)
+    lines = console.export_text().splitlines()
+    assert len(lines) == 1
+    assert info == ("cpu", info.name, None, False, True)
+    assert lines[0].startswith("device cpu") and "no CUDA device" in lines[0] and "graph capture on" in lines[0]
+
+
+def test_versions_name_python_and_tell_a_missing_package(monkeypatch):
+    monkeypatch.setattr(runtime, "PACKAGES", ("numpy", "no-such-package-here"))
+    version = ".".join(map(str, sys.version_info[:3]))
+    assert runtime.versions() == {"python": version, "numpy": np.__version__, "no-such-package-here": None}

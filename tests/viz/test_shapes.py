@@ -1,0 +1,104 @@
+import math
+
+import newton
+import numpy as np
+import pytest
+import trimesh
+import warp as wp
+
+from jumper_warp.viz import shapes
+
+QUARTER_TURN = wp.quat(0.0, 0.0, math.sin(math.pi / 4), math.cos(math.pi / 4))  # about z
+
+
+def build(add=lambda builder, body: None, add_ground=lambda scene: None):
+    """Return the meshes of world 0 of 2, with shapes from `add(builder, body)` on its one body, and a ground."""
+    builder = newton.ModelBuilder()
+    body = builder.add_link(mass=1.0, inertia=wp.mat33(np.eye(3)), label="base")
+    builder.add_articulation([builder.add_joint_free(body)])
+    add(builder, body)
+    scene = newton.ModelBuilder()
+    scene.replicate(builder, 2, label_prefixes=["world_0", "world_1"])
+    add_ground(scene)
+    return shapes.shape_meshes(scene.finalize(device="cpu"), (0,))
+
+
+def extent(mesh):
+    return mesh.vertices.max(axis=0) - mesh.vertices.min(axis=0)
+
+
+def volume(mesh):
+    return trimesh.Trimesh(mesh.vertices, mesh.triangles).volume
+
+
+@pytest.mark.parametrize(
+    ("add", "size", "content", "tolerance"),
+    [
+        (lambda b, i: b.add_shape_box(i, hx=0.1, hy=0.2, hz=0.3), (0.2, 0.4, 0.6), 0.048, 1e-6),
+        (lambda b, i: b.add_shape_sphere(i, radius=0.1), (0.2, 0.2, 0.2), 4.18879e-3, 0.02),
+        (lambda b, i: b.add_shape_capsule(i, radius=0.1, half_height=0.2), (0.2, 0.2, 0.6), 1.675516e-2, 0.05),
+        (lambda b, i: b.add_shape_cylinder(i, radius=0.1, half_height=0.2), (0.2, 0.2, 0.4), 1.256637e-2, 0.02),
+        (lambda b, i: b.add_shape_ellipsoid(i, rx=0.1, ry=0.2, rz=0.3), (0.2, 0.4, 0.6), 2.513274e-2, 0.02),
+    ],
+    ids=["box", "sphere", "capsule", "cylinder", "ellipsoid"],
+)
+def test_primitive_has_its_extent_and_volume(add, size, content, tolerance):
+    (mesh,) = build(add)
+    assert extent(mesh) == pytest.approx(size, rel=0.01)
+    assert volume(mesh) == pytest.approx(content, rel=tolerance)
+    assert mesh.body == 0
+
+
+def test_normals_are_unit_and_point_outward():
+    (mesh,) = build(lambda b, i: b.add_shape_box(i, hx=0.1, hy=0.2, hz=0.3))
+    assert np.linalg.norm(mesh.normals, axis=1) == pytest.approx(1.0)
+    assert (np.sum(mesh.normals * mesh.vertices, axis=1) > 0.09).all()
+
+
+def test_mesh_takes_its_scale_place_and_color():
+    corners = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], dtype=np.float32)
+    faces = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])
+    source = newton.Mesh(corners, faces.ravel(), compute_inertia=False)
+    place = wp.transform(wp.vec3(10.0, 0.0, 0.0), QUARTER_TURN)
+    (mesh,) = build(
+        lambda b, i: b.add_shape_mesh(i, xform=place, mesh=source, scale=(1.0, 2.0, 3.0), color=(0.2, 0.4, 0.6))
+    )
+    # x goes to y, y to -x
+    assert mesh.vertices.min(axis=0) == pytest.approx([8.0, 0.0, 0.0], abs=1e-5)
+    assert mesh.vertices.max(axis=0) == pytest.approx([10.0, 1.0, 3.0], abs=1e-5)
+    assert volume(mesh) == pytest.approx(1.0, rel=1e-5)
+    assert mesh.color == pytest.approx((0.2, 0.4, 0.6))
+
+
+def test_infinite_plane_becomes_a_checkered_patch_facing_up():
+    light, dark = build(add_ground=lambda b: b.add_ground_plane(label="ground"))
+    assert (light.name, dark.name) == ("ground_light", "ground_dark")
+    assert light.body == dark.body == -1
+    assert len(light.triangles) == len(dark.triangles) == 40 * 40  # half of 40 x 40 fields, two triangles each
+    assert extent(light) == pytest.approx([20.0, 20.0, 0.0])
+    for half in (light, dark):
+        assert half.normals == pytest.approx(np.tile([0.0, 0.0, 1.0], (len(half.normals), 1)))
+        assert trimesh.Trimesh(half.vertices, half.triangles).area == pytest.approx(200.0, rel=1e-5)
+
+
+def test_heightfield_keeps_its_heights_where_they_belong():
+    heights = np.array([[0.0, 1.0, 2.0], [10.0, 11.0, 12.0]])  # rows follow y, columns x
+    field = newton.Heightfield(data=heights, nrow=2, ncol=3, hx=3.0, hy=0.5)
+    (mesh,) = build(add_ground=lambda b: b.add_shape_heightfield(heightfield=field, label="ground"))
+    expected = {(-3, -0.5, 0), (0, -0.5, 1), (3, -0.5, 2), (-3, 0.5, 10), (0, 0.5, 11), (3, 0.5, 12)}
+    assert {tuple(np.round(vertex, 5).tolist()) for vertex in mesh.vertices} == expected
+    assert len(mesh.triangles) == 4
+    assert (mesh.normals[:, 2] > 0.0).all()
+
+
+def test_hidden_shapes_and_other_worlds_are_left_out():
+    def add(builder, body):
+        builder.add_shape_box(body, label="seen")
+        builder.add_shape_box(body, label="hidden", cfg=newton.ModelBuilder.ShapeConfig(is_visible=False))
+
+    assert [mesh.name for mesh in build(add)] == ["seen"]
+
+
+def test_shape_that_cannot_be_drawn_is_refused_by_name():
+    with pytest.raises(ValueError, match="'hat' is a CONE"):
+        build(lambda b, i: b.add_shape_cone(i, label="hat"))
