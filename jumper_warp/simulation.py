@@ -13,7 +13,7 @@ from jumper_warp.description import load_description
 from jumper_warp.grounds import BlockCfg
 from jumper_warp.motors import FilterCfg, MotorCfg, filter_params, jumping_motors, motor_arrays
 from jumper_warp.robot import KNEE_DOFS, PHYSICS_DT, build_model, mujoco_solver
-from jumper_warp.solver import TOLERANCE, SolverJumper
+from jumper_warp.solver import TOLERANCE, SolverJumper, check_step, check_tolerance
 from kernels.actuator import motor_torque_kernel
 from kernels.command_filter import command_filter_kernel
 from kernels.parameters import COORDS, DOFS
@@ -71,12 +71,15 @@ class Simulation:
             device: Warp device.
 
         Raises:
-            ValueError: unknown solver, a block on MuJoCo, or as `build_model` and `SolverJumper`.
+            ValueError: unknown solver, a block on MuJoCo, dt or tolerance not finite and positive, substeps no whole
+                number of at least 1, or as `build_model` and `SolverJumper`.
         """
         if solver not in ("jumper", "mujoco"):
             raise ValueError(f"solver must be 'jumper' or 'mujoco', got {solver!r}")
         if solver == "mujoco" and block is not None:
             raise ValueError("a moving block needs solver='jumper', got 'mujoco'")
+        check_step(dt, substeps)
+        check_tolerance(tolerance)
         self.model = build_model(num_worlds, ground=ground, friction=friction, visuals=visuals, device=device)
         self.device = self.model.device
         self.num_worlds = num_worlds
