@@ -13,6 +13,7 @@ import json
 import os
 import re
 import shutil
+import stat
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -42,6 +43,11 @@ MAX_BYTES = 256 * 2**20
 FILE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
 ACTIVATION_MODULES = {"elu": nn.ELU, "relu": nn.ReLU, "tanh": nn.Tanh}
 
+DTYPES = (torch.float16, torch.bfloat16, torch.float32, torch.float64)
+"""Of weights that can be read; they are computed with in single precision."""
+LARGEST = 1.0e38
+"""Below the largest number of single precision."""
+
 Layers = Sequence[tuple[torch.Tensor, torch.Tensor]]
 
 
@@ -66,7 +72,8 @@ class Policy(nn.Module):
             config: Whatever else made it, as JSON holds it: environment, training.
 
         Raises:
-            PolicyError: A tensor has another shape than the interface asks for, is not finite, or std is not positive.
+            PolicyError: A tensor has another shape than the interface asks for, is not finite or so large that an
+                action would not be, or std is not positive.
         """
         super().__init__()
         self.interface = interface
@@ -139,15 +146,29 @@ def _check_tensors(tensors: Mapping[str, torch.Tensor], interface: PolicyInterfa
         expected |= {f"actor.{i}.weight": (sizes[i + 1], sizes[i]), f"actor.{i}.bias": (sizes[i + 1],)}
     different = sorted(set(expected) ^ set(tensors))
     if different:
-        raise PolicyError(f"its configuration asks for layers {sizes}; missing or unknown: {', '.join(different)}")
+        raise PolicyError(f"its configuration asks for layers {sizes}; missing or unknown: {', '.join(different):.200}")
     for name, shape in expected.items():
         tensor = tensors[name]
         if tuple(tensor.shape) != shape:
             raise PolicyError(f"its configuration asks for {name} of shape {shape}, it has {tuple(tensor.shape)}")
+        if tensor.dtype not in DTYPES:
+            raise PolicyError(f"{name} must hold floating-point numbers of 16, 32 or 64 bits, found {tensor.dtype}")
         if not tensor.isfinite().all():
             raise PolicyError(f"{name} is not finite")
     if not (tensors["normaliser.std"] > 0.0).all():
         raise PolicyError("normaliser.std must be positive")
+    _check_overflow(tensors, interface)
+
+
+def _check_overflow(tensors: Mapping[str, torch.Tensor], interface: PolicyInterface) -> None:
+    """Raise a PolicyError if there may be an observation for which a layer leaves single precision."""
+    reach = torch.full((interface.sizes[0],), interface.normalised_limit, dtype=torch.float64)
+    for i in range(len(interface.sizes) - 1):
+        reach = tensors[f"actor.{i}.weight"].double().abs() @ reach + tensors[f"actor.{i}.bias"].double().abs()
+        if not reach.max() < LARGEST:
+            raise PolicyError(f"the weights of layer {i} are so large that its outputs may overflow")
+        # no activation is larger than what it is given, or than 1
+        reach = torch.ones_like(reach) if interface.activation == "tanh" else reach.clamp(min=1.0)
 
 
 def save_policy(
@@ -263,14 +284,14 @@ def load_policy(name: str | Path, device: str | torch.device = "cpu") -> Policy:
     try:
         tensors = safetensors.torch.load(data)
     except (SafetensorError, KeyError, ValueError, RuntimeError) as error:
-        raise PolicyError(f"{folder / WEIGHTS}: cannot be read ({type(error).__name__}: {error})") from error
+        raise PolicyError(f"{folder / WEIGHTS}: cannot be read ({type(error).__name__}: {error!s:.200})") from error
     try:
         interface = PolicyInterface.from_json(config.get("interface"))
         _check_tensors(tensors, interface)
+        layers = [(tensors[f"actor.{i}.weight"], tensors[f"actor.{i}.bias"]) for i in range(len(interface.sizes) - 1)]
+        policy = Policy(layers, tensors["normaliser.mean"], tensors["normaliser.std"], interface, config)
     except PolicyError as error:
         raise PolicyError(f"{folder}: {error}") from error
-    layers = [(tensors[f"actor.{i}.weight"], tensors[f"actor.{i}.bias"]) for i in range(len(interface.sizes) - 1)]
-    policy = Policy(layers, tensors["normaliser.mean"], tensors["normaliser.std"], interface, config)
     return policy.to(device)
 
 
@@ -306,7 +327,10 @@ def _checked_bytes(path: Path, digest: Any) -> bytes:
 
 def _bytes(path: Path) -> bytes:
     try:
-        if path.stat().st_size > MAX_BYTES:
+        status = path.stat()
+        if not stat.S_ISREG(status.st_mode):
+            raise PolicyError(f"{path}: cannot be read (not a file)")
+        if status.st_size > MAX_BYTES:
             raise PolicyError(f"{path}: larger than {MAX_BYTES >> 20} MiB")
         return path.read_bytes()
     except OSError as error:
@@ -316,6 +340,7 @@ def _bytes(path: Path) -> bytes:
 def _json(path: Path, data: bytes) -> dict[str, Any]:
     try:
         content = json.loads(data)
+        _json_bytes(content)  # neither NaN nor half a character, which could not be written again
     except (ValueError, RecursionError) as error:
         raise PolicyError(f"{path}: not JSON ({type(error).__name__})") from error
     if not isinstance(content, dict):
