@@ -13,6 +13,7 @@ import json
 import os
 import re
 import shutil
+import stat
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -152,14 +153,14 @@ def load_policy(name: str | Path, device: str | torch.device = "cpu") -> Policy:
     try:
         tensors = safetensors.torch.load(data)
     except (SafetensorError, KeyError, ValueError, RuntimeError) as error:
-        raise PolicyError(f"{folder / WEIGHTS}: cannot be read ({type(error).__name__}: {error})") from error
+        raise PolicyError(f"{folder / WEIGHTS}: cannot be read ({type(error).__name__}: {error!s:.200})") from error
     try:
         interface = PolicyInterface.from_json(config.get("interface"))
         check_tensors(tensors, interface)
+        layers = [(tensors[f"actor.{i}.weight"], tensors[f"actor.{i}.bias"]) for i in range(len(interface.sizes) - 1)]
+        policy = Policy(layers, tensors["normaliser.mean"], tensors["normaliser.std"], interface, config)
     except PolicyError as error:
         raise PolicyError(f"{folder}: {error}") from error
-    layers = [(tensors[f"actor.{i}.weight"], tensors[f"actor.{i}.bias"]) for i in range(len(interface.sizes) - 1)]
-    policy = Policy(layers, tensors["normaliser.mean"], tensors["normaliser.std"], interface, config)
     return policy.to(device)
 
 
@@ -195,7 +196,10 @@ def _checked_bytes(path: Path, digest: Any) -> bytes:
 
 def _bytes(path: Path) -> bytes:
     try:
-        if path.stat().st_size > MAX_BYTES:
+        status = path.stat()
+        if not stat.S_ISREG(status.st_mode):
+            raise PolicyError(f"{path}: cannot be read (not a file)")
+        if status.st_size > MAX_BYTES:
             raise PolicyError(f"{path}: larger than {MAX_BYTES >> 20} MiB")
         return path.read_bytes()
     except OSError as error:
@@ -205,6 +209,7 @@ def _bytes(path: Path) -> bytes:
 def _json(path: Path, data: bytes) -> dict[str, Any]:
     try:
         content = json.loads(data)
+        _json_bytes(content)  # neither NaN nor half a character, which could not be written again
     except (ValueError, RecursionError) as error:
         raise PolicyError(f"{path}: not JSON ({type(error).__name__})") from error
     if not isinstance(content, dict):

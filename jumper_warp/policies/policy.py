@@ -12,6 +12,11 @@ from jumper_warp.policies.spec import PolicyError, PolicyInterface
 
 ACTIVATION_MODULES = {"elu": nn.ELU, "relu": nn.ReLU, "tanh": nn.Tanh}
 
+DTYPES = (torch.float16, torch.bfloat16, torch.float32, torch.float64)
+"""Of weights that can be read; they are computed with in single precision."""
+LARGEST = 1.0e38
+"""Below the largest number of single precision."""
+
 Layers = Sequence[tuple[torch.Tensor, torch.Tensor]]
 
 
@@ -36,7 +41,8 @@ class Policy(nn.Module):
             config: Whatever else made it, as JSON holds it: environment, training.
 
         Raises:
-            PolicyError: A tensor has another shape than the interface asks for, is not finite, or std is not positive.
+            PolicyError: A tensor has another shape than the interface asks for, is not finite or so large that an
+                action would not be, or std is not positive.
         """
         super().__init__()
         self.interface = interface
@@ -109,12 +115,26 @@ def check_tensors(tensors: Mapping[str, torch.Tensor], interface: PolicyInterfac
         expected |= {f"actor.{i}.weight": (sizes[i + 1], sizes[i]), f"actor.{i}.bias": (sizes[i + 1],)}
     different = sorted(set(expected) ^ set(tensors))
     if different:
-        raise PolicyError(f"its configuration asks for layers {sizes}; missing or unknown: {', '.join(different)}")
+        raise PolicyError(f"its configuration asks for layers {sizes}; missing or unknown: {', '.join(different):.200}")
     for name, shape in expected.items():
         tensor = tensors[name]
         if tuple(tensor.shape) != shape:
             raise PolicyError(f"its configuration asks for {name} of shape {shape}, it has {tuple(tensor.shape)}")
+        if tensor.dtype not in DTYPES:
+            raise PolicyError(f"{name} must hold floating-point numbers of 16, 32 or 64 bits, found {tensor.dtype}")
         if not tensor.isfinite().all():
             raise PolicyError(f"{name} is not finite")
     if not (tensors["normaliser.std"] > 0.0).all():
         raise PolicyError("normaliser.std must be positive")
+    _check_overflow(tensors, interface)
+
+
+def _check_overflow(tensors: Mapping[str, torch.Tensor], interface: PolicyInterface) -> None:
+    """Raise a PolicyError if there may be an observation for which a layer leaves single precision."""
+    reach = torch.full((interface.sizes[0],), interface.normalised_limit, dtype=torch.float64)
+    for i in range(len(interface.sizes) - 1):
+        reach = tensors[f"actor.{i}.weight"].double().abs() @ reach + tensors[f"actor.{i}.bias"].double().abs()
+        if not reach.max() < LARGEST:
+            raise PolicyError(f"the weights of layer {i} are so large that its outputs may overflow")
+        # no activation is larger than what it is given, or than 1
+        reach = torch.ones_like(reach) if interface.activation == "tanh" else reach.clamp(min=1.0)

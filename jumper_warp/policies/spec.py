@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import re
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, get_type_hints
 
@@ -12,10 +13,33 @@ if TYPE_CHECKING:
     from jumper_warp.tasks.cfg import TaskCfg
 
 ACTIVATIONS = ("elu", "relu", "tanh")
+MAX_HIDDEN = 64
+"""Most hidden layers."""
+NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_. -]{0,99}")
+"""Of a task, an entry of the observation, or a joint: lists of them are joined by commas, and name files."""
+TURN = 2.0 * math.pi
+PER_JOINT = {
+    "action_scale": (-TURN, TURN),  # [rad]
+    "default_joint_pos": (-TURN, TURN),  # [rad]
+    "joint_stiffness": (0.0, 1.0e4),  # [N m/rad]
+    "joint_damping": (0.0, 1.0e3),  # [N m s/rad]
+    "torque_limit": (1.0e-3, 1.0e4),  # [N m]
+}
+"""Least and largest value of what an interface holds for every joint."""
+SINGLE = {
+    "policy_dt": (1.0e-4, 1.0),  # [s]
+    "physics_dt": (1.0e-6, 1.0),  # [s]
+    "observation_limit": (1.0e-3, 1.0e6),
+    "normalised_limit": (1.0e-3, 1.0e6),
+}
+"""The same of single numbers; the limits are far within single precision."""
 
 
 class PolicyError(ValueError):
     """A policy that is missing, damaged, or does not fit its configuration. The message is one line."""
+
+    def __init__(self, message: str):
+        super().__init__(" ".join(message.split()))
 
 
 @dataclass(frozen=True)
@@ -62,17 +86,21 @@ class PolicyInterface:
             names = getattr(self, name)
             if not names or len(set(names)) < len(names):
                 raise PolicyError(f"{name} must be distinct and not empty")
-        for name in ("action_scale", "default_joint_pos", "joint_stiffness", "joint_damping", "torque_limit"):
+        for name in (self.task, *self.observation_names, *self.joint_names):
+            if not NAME.fullmatch(name):
+                raise PolicyError(f"names must be of letters, digits, and _ . - or spaces, got {name!r:.60}")
+        for name, (low, high) in (PER_JOINT | SINGLE).items():
             values = getattr(self, name)
-            if len(values) != len(self.joint_names):
+            if name in PER_JOINT and len(values) != len(self.joint_names):
                 raise PolicyError(f"{name} needs {len(self.joint_names)} numbers, one a joint, got {len(values)}")
-            if not all(math.isfinite(value) for value in values):
-                raise PolicyError(f"{name} must be finite, got {values}")
-        for name in ("policy_dt", "physics_dt", "observation_limit", "normalised_limit"):
-            if not 0.0 < getattr(self, name) < math.inf:
-                raise PolicyError(f"{name} must be finite and positive, got {getattr(self, name)}")
-        if not self.hidden or not all(1 <= width <= 65536 for width in self.hidden):
-            raise PolicyError(f"hidden must name widths from 1 to 65536, got {self.hidden}")
+            for value in values if name in PER_JOINT else (values,):
+                if not low <= value <= high:
+                    raise PolicyError(f"{name} must lie in {low:.4g} to {high:.4g}, got {value:.4g}")
+        if self.physics_dt > self.policy_dt:
+            raise PolicyError(f"physics_dt must be at most policy_dt = {self.policy_dt}, got {self.physics_dt}")
+        if not 1 <= len(self.hidden) <= MAX_HIDDEN or not all(1 <= width <= 65536 for width in self.hidden):
+            raise PolicyError(f"hidden must name 1 to {MAX_HIDDEN} widths from 1 to 65536, got {self.hidden!s:.100}")
+        _check_filter(self.command_filter)
         if self.activation not in ACTIVATIONS:
             raise PolicyError(f"activation must be one of {', '.join(ACTIVATIONS)}, got {self.activation!r:.40}")
         if self.quaternion_order != "xyzw":
@@ -95,7 +123,7 @@ class PolicyInterface:
         hints = get_type_hints(cls)
         different = sorted(set(data) ^ set(hints))
         if different:
-            raise PolicyError(f"interface fields missing or unknown: {', '.join(map(str, different))}")
+            raise PolicyError(f"interface fields missing or unknown: {', '.join(different):.200}")
         return cls(**{name: _checked(name, data[name], str(hint)) for name, hint in hints.items()})
 
 
@@ -110,6 +138,17 @@ def _checked(name: str, value: Any, hint: str) -> Any:
     if kind == "float":
         values = [float(v) if abs(v) < 1.0e300 else math.inf for v in values]
     return tuple(values) if many else values[0]
+
+
+def _check_filter(fields: dict[str, Any]) -> None:
+    """Raise PolicyError unless the values of a command filter, or of a part of it, are finite numbers by name."""
+    for name, value in fields.items():
+        if not NAME.fullmatch(name):
+            raise PolicyError(f"command_filter cannot hold {name!r:.60}")
+        if isinstance(value, dict):
+            _check_filter(value)
+        elif isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < 1.0e6:
+            raise PolicyError(f"command_filter {name} must be a number within 1e6, got {value!r:.60}")
 
 
 def interface_of_task(

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from jumper_warp.robot.bounds import LENGTH, PAW_RADIUS, Reading, check_bounds, refuse_outside
 from jumper_warp.robot.parts import LEGS, MOTOR_JOINTS, Joint, Link, RobotDescription, RobotDescriptionError
 
 TOLERANCE = 1.0e-6
@@ -72,10 +73,12 @@ def knee_angles(leg: LegDimensions, outer: float, inner: float) -> tuple[float, 
 
 def check_description(description: RobotDescription) -> RobotDescription:
     """Return the description with links and joints in tree order. Raises RobotDescriptionError if it is impossible."""
+    check_bounds(description)
     description = in_tree_order(description)
     check_loops(description)
     for leg in LEGS:
         check_leg(description, leg)
+        check_lengths(description, leg)
         check_mirror(description, leg)
     check_motors(description)
     check_poses(description)
@@ -177,6 +180,29 @@ def check_leg(description: RobotDescription, leg: str) -> None:
         raise RobotDescriptionError(file, f"link {loop.parent}", "expected its collision sphere, the paw, at the ankle")
     if description.link("body").collisions:
         raise RobotDescriptionError(file, "link body", "expected no collision shape")
+
+
+def check_lengths(description: RobotDescription, leg: str) -> None:
+    """Refuse a leg of no size, in which what has to be divided by vanishes."""
+    dimensions = leg_dimensions(description, leg)
+    axes = abs(dimensions.outer_x - dimensions.inner_x)
+    refuse_outside(
+        description.urdf_path,
+        f"joint {leg}_lateral",
+        [Reading(f"hip {axis}", abs(dimensions.hip[i]), LENGTH) for i, axis in enumerate("xy")],
+    )
+    refuse_outside(
+        description.urdf_path, f"joint {leg}_outer", [Reading("distance from its twin's axis", axes, LENGTH)]
+    )
+    refuse_outside(
+        description.urdf_path, f"joint {leg}_outer_knee", [Reading("thigh length", dimensions.thigh, LENGTH)]
+    )
+    refuse_outside(description.path, f"loop {leg}_ankle", [Reading("shank length", dimensions.shank, LENGTH)])
+    refuse_outside(
+        description.urdf_path,
+        f"link {leg}_inner_shank",
+        [Reading("paw radius", dimensions.paw_radius, PAW_RADIUS)],
+    )
 
 
 def check_mirror(description: RobotDescription, leg: str) -> None:

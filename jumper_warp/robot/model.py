@@ -48,6 +48,8 @@ steps. Softer contacts cost jump height."""
 CONTACT_IMPEDANCE = (0.95, 0.99, 0.001, 0.5, 2.0)
 GROUND_FRICTION = 1.0e-4
 """[1] Tiny: a contact takes the larger of its two coefficients, which is then the paw's."""
+MAX_FRICTION = 10.0
+"""[1] Of the paws: ten times that of rubber on concrete."""
 GROUND_COLOR = (0.42, 0.46, 0.48)
 LIMIT_STIFFNESS = CONTACT_STIFFNESS
 """[N m/rad] Hard stops: plastic for SolverJumper, critically damped over two physics steps for MuJoCo."""
@@ -82,13 +84,13 @@ def build_model(
         visuals: Whether to add shapes that only viewers see. Without them large batches build faster.
 
     Raises:
-        ValueError: `num_worlds` below 1, negative `friction`, or an unknown `ground`.
+        ValueError: `num_worlds` below 1, `friction` not in 0 to 10, or an unknown `ground`.
         RobotDescriptionError: the default description cannot be read.
     """
     if num_worlds < 1:
         raise ValueError(f"num_worlds must be at least 1, got {num_worlds}")
-    if not friction >= 0.0:
-        raise ValueError(f"friction must not be negative, got {friction}")
+    if not 0.0 <= friction <= MAX_FRICTION:
+        raise ValueError(f"friction must lie in 0 to {MAX_FRICTION:g}, got {friction}")
     description = load_description() if description is None else description
     builder = newton.ModelBuilder()
     newton.solvers.SolverMuJoCo.register_custom_attributes(builder)

@@ -115,6 +115,8 @@ class UrdfReader:
             raise RobotDescriptionError(
                 self.file, part, "expected a frame parallel to its parent's, found rpy not zero"
             )
+        if max(map(abs, angles)) > 2.0 * math.pi:
+            raise RobotDescriptionError(self.file, part, f"expected rpy within a turn, found {angles}")
         return np.array(self.numbers(origin, "xyz", 3, part, default="0 0 0")), quat_from_rpy(*angles)
 
     def link(self, element: Element) -> Link:
@@ -235,8 +237,8 @@ def read_obj(file: Path) -> TriangleMesh:
     if not flat or min(flat) < 0 or max(flat) >= len(vertices):
         raise RobotDescriptionError(file, "", f"expected triangles between the {len(vertices)} vertices")
     points = np.array(vertices)
-    if not np.isfinite(points).all() or np.abs(points).max() > 1.0e3:
-        raise RobotDescriptionError(file, "", "expected finite vertices within 1 km")
+    if not np.isfinite(points).all():
+        raise RobotDescriptionError(file, "", "expected finite vertices")
     return TriangleMesh(points, np.array(triangles, dtype=np.int32))
 
 

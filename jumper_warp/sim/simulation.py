@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, Literal
 
 import newton
 import numpy as np
@@ -14,12 +15,21 @@ from jumper_warp.robot.grounds import BlockCfg
 from jumper_warp.robot.model import KNEE_DOFS, PHYSICS_DT, build_model
 from jumper_warp.robot.motors import FilterCfg, MotorCfg, filter_params, jumping_motors, motor_arrays
 from jumper_warp.sim.mujoco import mujoco_solver
-from jumper_warp.sim.solver import TOLERANCE, SolverJumper
+from jumper_warp.sim.solver import TOLERANCE, SolverJumper, check_step, check_tolerance
 from kernels.actuation.command_filter import command_filter_kernel
 from kernels.actuation.motors import motor_torque_kernel
 from kernels.actuation.passive import passive_torque_kernel
-from kernels.actuation.readout import arrived_target_kernel, motor_values_kernel, paw_force_kernel
+from kernels.actuation.readout import (
+    arrived_target_kernel,
+    base_velocity_kernel,
+    motor_values_kernel,
+    paw_force_kernel,
+)
+from kernels.dynamics.restore import StateArrays, restore_motors_kernel, restore_state_kernel, zero_worlds_kernel
 from kernels.layout import COORDS, DOFS
+
+if TYPE_CHECKING:
+    import torch
 
 SUBSTEPS = 8
 """Physics steps of 1/480 s in a policy step of 1/60 s."""
@@ -72,12 +82,15 @@ class Simulation:
             device: Warp device.
 
         Raises:
-            ValueError: unknown solver, a block on MuJoCo, or as `build_model` and `SolverJumper`.
+            ValueError: unknown solver, a block on MuJoCo, dt or tolerance not finite and positive, substeps no whole
+                number of at least 1, or as `build_model` and `SolverJumper`.
         """
         if solver not in ("jumper", "mujoco"):
             raise ValueError(f"solver must be 'jumper' or 'mujoco', got {solver!r}")
         if solver == "mujoco" and block is not None:
             raise ValueError("a moving block needs solver='jumper', got 'mujoco'")
+        check_step(dt, substeps)
+        check_tolerance(tolerance)
         self.model = build_model(num_worlds, ground=ground, friction=friction, visuals=visuals, device=device)
         self.device = self.model.device
         self.num_worlds = num_worlds
@@ -90,8 +103,13 @@ class Simulation:
         self.control = self.model.control()
         newton.eval_fk(self.model, self.state.joint_q, self.state.joint_qd, self.state)
         standing = motor_values(self.model.joint_q.numpy().reshape(num_worlds, -1)[:, 7:])
-        self.target = wp.array(standing.T, dtype=float, device=self.device)
-        self._safe_target = wp.clone(self.target)
+        self._standing = wp.array(standing.T, dtype=float, device=self.device)
+        self.target, self._safe_target = wp.clone(self._standing), wp.clone(self._standing)
+        start = self.model.state()
+        start.assign(self.state)
+        self._start = state_arrays(start)
+        self._mask = wp.zeros(num_worlds + 1, dtype=wp.bool, device=self.device)  # the last one: no world
+        self._base_velocity = wp.zeros(num_worlds, dtype=wp.vec3, device=self.device)
         self._graphs: dict[str, object] = {}
         if solver == "jumper":
             self.solver = SolverJumper(self.model, block=block, tolerance=tolerance)
@@ -125,6 +143,47 @@ class Simulation:
     def step(self) -> None:
         """Advance one policy step towards `target`."""
         self._captured("step", self._step)
+
+    def reset(self, mask: Sequence[bool] | np.ndarray | torch.Tensor | wp.array | None = None) -> None:
+        """Put worlds back to where they were when the simulation was made: standing at rest, commanded to stand.
+
+        Contact history, torques, forces and the mark of a world that became non-finite are forgotten; blocks return
+        to their starts. What was changed in the model stays. A captured graph may hold the call with a mask on the
+        device, which it reads at every replay.
+
+        mask: Which worlds, bool of shape (num_worlds,), by default all. Raises ValueError for anything else.
+        """
+        self._take_mask(mask)
+        self.solver.reset(self.state, self._mask, flags=newton.StateFlags.NONE)
+        if self.block is not None:
+            self.solver.reset_blocks(self._mask)
+        if not isinstance(self.solver, SolverJumper):
+            # the loops' rows of the next step are made with the velocities of the last one
+            for left_over in (self.solver.mjw_data.cvel, self.solver.mjw_data.cdof_dot):
+                self._launch(zero_worlds_kernel, left_over.shape, [self._mask], [left_over])
+        inputs = [self._mask, self._start]
+        self._launch(restore_state_kernel, (self.num_worlds, int(COORDS)), inputs, [state_arrays(self.state)])
+        results = [self.target, self._safe_target, self.torque, self.paw_force, self.peak_force]
+        self._launch(restore_motors_kernel, self.num_worlds, [self._mask, self._standing], results)
+
+    def _take_mask(self, mask: Sequence[bool] | np.ndarray | torch.Tensor | wp.array | None) -> None:
+        """Copy a mask of worlds to the device. Raises ValueError."""
+        if mask is None:
+            self._mask.fill_(True)
+            return
+        of_torch = hasattr(mask, "is_cuda")
+        try:
+            mask = mask if of_torch or isinstance(mask, wp.array) else np.asarray(mask)
+            kind, shape = getattr(mask.dtype, "__name__", str(mask.dtype)), tuple(mask.shape)
+        except ValueError:  # lists of different lengths
+            kind, shape = "lists", "several lengths"
+        if kind not in ("bool", "torch.bool") or shape != (self.num_worlds,):
+            raise ValueError(f"mask must be bool of shape ({self.num_worlds},), got {kind} of shape {shape}")
+        if of_torch:
+            mask = wp.from_torch(mask.contiguous())
+        elif isinstance(mask, np.ndarray):
+            mask = wp.array(mask, dtype=wp.bool, device=self.device)
+        wp.copy(self._mask, mask, count=self.num_worlds)
 
     def filter_targets(self) -> None:
         """Run the motor command filter on `target` once; follow with `physics_step`s."""
@@ -219,12 +278,17 @@ class Simulation:
         return self.state.joint_qd.numpy().reshape(self.num_worlds, -1)
 
     def base_velocity(self) -> np.ndarray:
-        """Return the velocity of the base link's origin [m/s], world frame, (num_worlds, 3)."""
-        pose = self.state.body_q.numpy().reshape(self.num_worlds, -1, 7)[:, 0]
-        twist = self.state.body_qd.numpy().reshape(self.num_worlds, -1, 6)[:, 0]
-        com = self.model.body_com.numpy().reshape(self.num_worlds, -1, 3)[:, 0]
-        arm = com + 2.0 * np.cross(pose[:, 3:6], np.cross(pose[:, 3:6], com) + pose[:, 6:] * com)
-        return twist[:, :3] - np.cross(twist[:, 3:], arm)
+        """Return the velocity of the base link's origin [m/s], world frame, (num_worlds, 3). Waits for the device."""
+        return self.read_base_velocity().numpy().copy()
+
+    def read_base_velocity(self) -> wp.array:
+        """Return the velocity of the base link's origin [m/s], world frame, vec3 of shape (num_worlds,).
+
+        It is the same array in every call, written anew on the device; a captured graph may hold the call.
+        """
+        inputs = [self.state.joint_q, self.state.joint_qd, self.model.body_com]
+        self._launch(base_velocity_kernel, self.num_worlds, inputs, [self._base_velocity])
+        return self._base_velocity
 
     def loop_gap(self) -> np.ndarray:
         """Return the largest distance [m] between the two ankle anchors of a leg, (num_worlds,)."""
@@ -240,6 +304,14 @@ class Simulation:
                 ends.append(frames[body, :3] + turned)
             gaps.append(np.linalg.norm(ends[0] - ends[1]))
         return np.array(gaps).reshape(self.num_worlds, 4).max(axis=1)
+
+
+def state_arrays(state: newton.State) -> Any:
+    """Return the kernels' view of a state."""
+    arrays = StateArrays()
+    arrays.joint_q, arrays.joint_qd = state.joint_q, state.joint_qd
+    arrays.body_q, arrays.body_qd = state.body_q, state.body_qd
+    return arrays
 
 
 def motor_values(joint_values: np.ndarray) -> np.ndarray:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
+from numbers import Integral
 from typing import Any
 
 import newton
@@ -23,6 +25,20 @@ TOLERANCE = 1.0e-5
 """[m/s] The contact iteration ends when a sweep changes no contact velocity by more."""
 DIFFERENTIABLE_TOLERANCE = 1.0e-6
 """[m/s] The same where gradients are asked for, which inherit the error."""
+
+
+def check_step(dt: float, substeps: int = 1) -> None:
+    """Raise ValueError unless dt [s] is finite and above 0 and substeps a whole number of at least 1."""
+    if not 0.0 < dt < math.inf:
+        raise ValueError(f"dt must be finite and above 0 [s], got {dt!r}")
+    if not isinstance(substeps, Integral) or substeps < 1:
+        raise ValueError(f"substeps must be a whole number of at least 1, got {substeps!r}")
+
+
+def check_tolerance(tolerance: float) -> None:
+    """Raise ValueError unless the tolerance [m/s] of a contact iteration is finite and above 0."""
+    if not 0.0 < tolerance < math.inf:
+        raise ValueError(f"tolerance must be finite and above 0 [m/s], got {tolerance!r}")
 
 
 @wp.kernel(enable_backward=False)
@@ -118,12 +134,13 @@ class SolverJumper(SolverBase):
 
         Raises:
             NotThisRobotError: the model is another robot's.
-            ValueError: `max_sweeps` below 1, `tolerance` [m/s] not positive, or arrays of `block` that do not have one
-                row per world.
+            ValueError: `max_sweeps` below 1, `tolerance` [m/s] not finite and positive, or arrays of `block` that do
+                not have one row per world.
         """
         super().__init__(model)
-        if max_sweeps < 1 or not tolerance > 0.0:
-            raise ValueError(f"max_sweeps must be >= 1 and tolerance > 0, got {max_sweeps}, {tolerance}")
+        if max_sweeps < 1:
+            raise ValueError(f"max_sweeps must be at least 1, got {max_sweeps}")
+        check_tolerance(tolerance)
         self.dynamics = JumperDynamics(model, description=description, block=block)
         self.max_sweeps = max_sweeps
         self.tolerance = tolerance
@@ -172,7 +189,10 @@ class SolverJumper(SolverBase):
         *,
         observables: SolverBase.Observables | None = None,
     ) -> None:
-        """Advance every world by dt [s]. `contacts` is not used: the solver finds the paws' contacts itself."""
+        """Advance every world by dt [s]. `contacts` is not used: the solver finds the paws' contacts itself.
+
+        Raises ValueError for a dt that is not finite and positive.
+        """
         self.validate_observables(observables, contacts)
         drive = self.dynamics.drive(*self._forces(state_in, control))
         self._advance(state_in, state_out, drive, dt, 1, observables, bodies=True)
@@ -206,6 +226,9 @@ class SolverJumper(SolverBase):
             delay: Physics steps until it does, shape (num_worlds,).
             bodies: Whether to write passive joints, loop joints and bodies; the solver itself does not need them.
             observables: Observables of the whole call.
+
+        Raises:
+            ValueError: dt is not finite and positive, or substeps no whole number of at least 1.
         """
         self.validate_observables(observables)
         drive = self.dynamics.drive(*self._forces(state_in, control), motors, target, previous, delay)
@@ -226,6 +249,7 @@ class SolverJumper(SolverBase):
         observables: SolverBase.Observables | None,
         bodies: bool,
     ) -> None:
+        check_step(dt, substeps)
         wants_qdd = observables is not None and observables.is_requested(SolverBase.ObservableKind.BODY_QDD)
         if wants_qdd:
             wp.copy(self._old_body_qd, state_in.body_qd)

@@ -1,8 +1,9 @@
-"""Reading motor values and paw forces out of Newton's arrays."""
+"""Reading motor values, paw forces and the base's velocity out of Newton's arrays."""
 
 import warp as wp
 
-from ..layout import DOFS, motor_slot
+from ..layout import BODIES, DOFS, motor_slot
+from ..state import load_base
 
 wp.set_module_options({"enable_backward": False})
 
@@ -57,3 +58,17 @@ def arrived_target_kernel(
     """Write the motor targets [rad] of a physics step: before `delay` the previous ones; (12, num_worlds) threads."""
     motor, world = wp.tid()
     arrived[motor, world] = wp.where(step < delay[world], previous[motor, world], target[motor, world])
+
+
+@wp.kernel
+def base_velocity_kernel(
+    # in
+    joint_q: wp.array(dtype=float),
+    joint_qd: wp.array(dtype=float),
+    body_com: wp.array(dtype=wp.vec3),
+    # out
+    velocity: wp.array(dtype=wp.vec3),
+):
+    """Write the velocity of the base link's origin [m/s], world frame; launch over worlds."""
+    world = wp.tid()
+    velocity[world] = load_base(joint_q, joint_qd, body_com[world * BODIES], world).lin

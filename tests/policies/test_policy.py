@@ -1,6 +1,7 @@
 import hashlib
 import json
 import math
+import os
 import pickle
 
 import numpy as np
@@ -233,6 +234,14 @@ REFUSALS = {
         lambda f: edit_json(f, "config.json", lambda c: c.update(schema_version=2)),
         "config.json: schema version 2",
     ),
+    "folder in place of a file": (
+        lambda f: ((f / "policy.onnx").unlink(), (f / "policy.onnx").mkdir()),
+        "policy.onnx: cannot be read",
+    ),
+    "pipe in place of a file": (
+        lambda f: ((f / "policy.onnx").unlink(), os.mkfifo(f / "policy.onnx")),
+        r"policy.onnx: cannot be read \(not a file\)",
+    ),
     "file missing": (lambda f: (f / "policy.onnx").unlink(), "policy.onnx: cannot be read"),
     "truncated": (
         lambda f: (f / "policy.safetensors").write_bytes((f / "policy.safetensors").read_bytes()[:-4]),
@@ -284,10 +293,18 @@ def test_pickle_in_place_of_the_weights_is_not_executed(folder, tmp_path):
     ("change", "message"),
     [
         ({"joint_names": ("a", "a")}, "joint_names must be distinct"),
+        ({"joint_names": ("a,b",)}, "names must be of letters, digits"),
+        ({"task": "../jump"}, "names must be of letters, digits"),
+        ({"torque_limit": (0.0,)}, "torque_limit must lie in 0.001 to 1e"),
+        ({"joint_damping": (-1.0,)}, "joint_damping must lie in 0 to 1000, got -1"),
+        ({"physics_dt": 0.1}, "physics_dt must be at most policy_dt"),
+        ({"normalised_limit": 1e300}, "normalised_limit must lie in 0.001 to 1e"),
+        ({"hidden": (1,) * 65}, "hidden must name 1 to 64 widths"),
+        ({"command_filter": {"horizon": math.inf}}, "command_filter horizon must be a number"),
         ({"torque_limit": (1.0, 2.0)}, "torque_limit needs 1 numbers"),
-        ({"action_scale": (math.nan,)}, "action_scale must be finite"),
-        ({"policy_dt": 0.0}, "policy_dt must be finite and positive"),
-        ({"hidden": ()}, "hidden must name widths"),
+        ({"action_scale": (math.nan,)}, "action_scale must lie in -6.283 to 6.283, got nan"),
+        ({"policy_dt": 0.0}, "policy_dt must lie in 0.0001 to 1, got 0"),
+        ({"hidden": ()}, "hidden must name 1 to 64 widths"),
         ({"activation": "gelu"}, "activation must be one of"),
         ({"quaternion_order": "wxyz"}, "quaternion_order must be xyzw"),
     ],

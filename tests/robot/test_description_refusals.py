@@ -81,6 +81,34 @@ BAD_URDF = {
         (r'  <joint name="FL_lateral".*?</joint>\n', ""),
         "expected the one root link body, found body, FL_h",
     ),
+    "heavy body": (
+        at("link body", '"6.43"', '"6.43e3"'),
+        "link body: expected mass in 0.001 to 100 kg, found 6430",
+    ),
+    "compact body": (
+        at("link body", 'ixx="0.0536" iyy="0.1495" izz="0.1952"', 'ixx="5.36e-5" iyy="1.495e-4" izz="1.952e-4"'),
+        "link body: expected largest radius of gyration in 0.1 to 1.5 of the link's reach, found 0.0144",
+    ),
+    "wide body": (
+        at("link body", '"6.43"', '"0.00643"'),
+        "link body: expected smallest radius of gyration in 0.001 to 2 m, found 2.887",
+    ),
+    "thin link": (
+        at("link FL_outer_thigh", 'ixx="0.000518" iyy="0.000524" izz="7.9e-06"', 'ixx="5e-4" iyy="5e-4" izz="7.9e-9"'),
+        "link FL_outer_thigh: expected smallest radius of gyration in 0.001 to 2 m, found 0.000312",
+    ),
+    "far com": (at("link body", "0.0111", "11.1"), "link body: expected z of centre of mass in -2 to 2 m, found 11.1"),
+    "huge paw": (('radius="0.025"', 'radius="1e30"'), "link FL_inner_shank: expected sphere size in 0.0001 to 2 m"),
+    "large paw": (('radius="0.025"', 'radius="0.25"'), "link FL_inner_shank: expected paw radius in 0.001 to 0.2 m"),
+    "far hip": (at("joint FR_lateral", "-0.105", "-105"), "joint FR_lateral: expected y of origin in -2 to 2 m"),
+    "narrow hips": (('(xyz="-?0.1433) ', r"\g<1>e-6 "), "joint FL_lateral: expected hip x in 0.001 to 2 m"),
+    "stop beyond a turn": (
+        at("joint BR_inner", "2.443461", "140"),
+        "joint BR_inner: expected upper in -6.283 to 6.283",
+    ),
+    "effort": (at("joint FL_inner_knee", '"1000"', '"1e9"'), "joint FL_inner_knee: expected effort in 0.1 to 1e+04"),
+    "shape turned in degrees": (("1.5707963267948966", "90"), "link body: expected rpy within a turn"),
+    "color of 255": (("0.93 0.42 0.1 1", "237 107 25 1"), "link body: expected color in 0 to 1, found 237"),
     "entity": (("<robot", '<!DOCTYPE robot [<!ENTITY a "b">]><robot'), "expected no document type"),
     "truncated": (("</robot>.*", ""), "expected well-formed XML"),
     "other root": (("<robot(.*)</robot>", r"<sdf\1</sdf>"), "expected <robot>, found <sdf>"),
@@ -102,6 +130,29 @@ BAD_JSON = {
     "negative rotor": (("5.79e-5", "-5.79e-5"), "motor type AK80-9: expected rotor_inertia > 0"),
     "zero gain": (('"kp": 17.0', '"kp": 0'), "motor type AK80-9 jumping: expected kp > 0"),
     "high cutoff": (('"cutoff_speed_rpm": 335', '"cutoff_speed_rpm": 500'), "AK80-9: expected cutoff_speed_rpm <"),
+    "friction": (
+        ('"coulomb_friction": 0.02', '"coulomb_friction": 1e8'),
+        "motor type AK80-9: expected coulomb_friction in 0 to 10 N m, found 1e+08",
+    ),
+    "friction above torque": (
+        ('"peak_torque": 18.0(.*?)0.02', r'"peak_torque": 1.8\g<1>2.0'),
+        "AK80-9: expected coulomb_friction in 0 to 1.8 N m, its peak_torque, found 2",
+    ),
+    "rotor in g cm^2": (("5.79e-5", "579"), "motor type AK80-9: expected rotor_inertia in 1e-08 to 0.01 kg m^2"),
+    "speed in rpm": (
+        ('"no_load_speed_rpm": 470', '"no_load_speed_rpm": 47000'),
+        "expected no-load speed in 0.1 to 1000",
+    ),
+    "gain": (
+        ('"kp": 17.0, "kd": 1.8', '"kp": 17.0, "kd": 1800'),
+        "AK80-9: expected jumping kd in 0.01 to 100 N m s/rad",
+    ),
+    "knee damping": (('"knee_damping": 0.1', '"knee_damping": 1e5'), "expected knee_damping in 1e-06 to 10 N m s/rad"),
+    "sum in tenths": ((r"\[0, 240\]", "[0, 2400]"), "expected upper transversal_sum in -12.57 to 12.57 rad"),
+    "long shank": (
+        (r'"child_anchor": \[0, 0, -0.3', '"child_anchor": [0, 0, -300'),
+        "loop FL_ankle: expected z of anchor",
+    ),
     "infinite number": (('"knee_damping": 0.1', '"knee_damping": 1e999'), "knee_damping to be a finite number"),
     "nan": (('"knee_damping": 0.1', '"knee_damping": NaN'), "expected finite numbers, found NaN"),
     "huge integer": (('"knee_damping": 0.1', '"knee_damping": ' + "9" * 5000), "expected JSON (ValueError)"),
@@ -149,6 +200,11 @@ def test_refuses_a_missing_file_and_a_folder(tmp_path):
     for path in (tmp_path / "none.json", tmp_path):
         with pytest.raises(RobotDescriptionError, match="cannot be read"):
             load_description(path)
+
+
+def test_refuses_a_mesh_in_millimetres(assets):
+    edit(assets, "meshes/shell.obj", r"v (\S+) ", r"v \g<1>e3 ")
+    assert "link body: expected smallest mesh coordinate in -2 to 2 m, found -3" in refusal(assets)
 
 
 def test_refuses_a_mesh_with_an_index_beyond_its_vertices(assets):

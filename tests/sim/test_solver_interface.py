@@ -70,10 +70,45 @@ def test_robot_without_a_paw_is_refused():
         SolverJumper(model)
 
 
-@pytest.mark.parametrize(("argument", "value"), [("max_sweeps", 0), ("tolerance", 0.0)])
+@pytest.mark.parametrize(("argument", "value"), [("max_sweeps", 0), ("tolerance", 0.0), ("tolerance", float("nan"))])
 def test_bad_settings_are_refused(argument, value):
     with pytest.raises(ValueError, match=argument):
         SolverJumper(build_model(1, visuals=False, device="cpu"), **{argument: value})
+
+
+BAD_DT = [0.0, -DT, float("nan"), float("inf")]
+BAD_SUBSTEPS = [0, -1, 1.5, float("nan")]
+
+
+@pytest.mark.parametrize("dt", BAD_DT)
+def test_steps_of_no_time_are_refused_and_change_nothing(pair, dt):
+    sim, _ = pair
+    before = sim.joint_q().copy()
+    with pytest.raises(ValueError, match="dt must be"):
+        sim.solver.step(sim.state, sim.state, None, None, dt)
+    with pytest.raises(ValueError, match="dt must be"):
+        sim.solver.step_motors(sim.state, sim.state, sim.motors, sim.target, dt, 1)
+    assert np.array_equal(sim.joint_q(), before)
+
+
+@pytest.mark.parametrize("substeps", BAD_SUBSTEPS)
+def test_other_than_whole_positive_numbers_of_steps_are_refused(pair, substeps):
+    sim, _ = pair
+    before = sim.joint_q().copy()
+    with pytest.raises(ValueError, match="substeps must be"):
+        sim.solver.step_motors(sim.state, sim.state, sim.motors, sim.target, DT, substeps)
+    assert np.array_equal(sim.joint_q(), before)
+
+
+@pytest.mark.parametrize("solver", ["jumper", "mujoco"])
+@pytest.mark.parametrize(
+    ("argument", "value"),
+    [*(("dt", dt) for dt in BAD_DT), *(("substeps", n) for n in BAD_SUBSTEPS), ("tolerance", 0.0), ("tolerance", -1.0),
+     ("tolerance", float("nan")), ("tolerance", float("inf"))],
+)  # fmt: skip
+def test_simulation_refuses(solver, argument, value):
+    with pytest.raises(ValueError, match=f"{argument} must be"):
+        simulation(1, solver=solver, **{argument: value})
 
 
 CHANGES = [

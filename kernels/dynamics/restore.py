@@ -1,0 +1,78 @@
+"""Putting worlds back to where they started."""
+
+import warp as wp
+
+from ..layout import BODIES, COORDS, DOFS
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.struct
+class StateArrays:
+    """What is known of the motion of all worlds, in Newton's layout."""
+
+    joint_q: wp.array(dtype=float)  # (43 num_worlds,)
+    joint_qd: wp.array(dtype=float)  # (38 num_worlds,)
+    body_q: wp.array(dtype=wp.transform)  # (21 num_worlds,)
+    body_qd: wp.array(dtype=wp.spatial_vector)  # (21 num_worlds,)
+
+
+@wp.kernel
+def restore_state_kernel(
+    # in
+    mask: wp.array(dtype=wp.bool),
+    start: StateArrays,
+    # out
+    state: StateArrays,
+):
+    """Copy the state of the masked worlds from `start`; launch over (num_worlds, 43)."""
+    world, i = wp.tid()
+    if not mask[world]:
+        return
+    coord = world * COORDS + i
+    state.joint_q[coord] = start.joint_q[coord]
+    if i < DOFS:
+        dof = world * DOFS + i
+        state.joint_qd[dof] = start.joint_qd[dof]
+    if i < BODIES:
+        body = world * BODIES + i
+        state.body_q[body] = start.body_q[body]
+        state.body_qd[body] = start.body_qd[body]
+
+
+@wp.kernel
+def restore_motors_kernel(
+    # in
+    mask: wp.array(dtype=wp.bool),
+    standing: wp.array2d(dtype=float),
+    # out
+    target: wp.array2d(dtype=float),
+    safe_target: wp.array2d(dtype=float),
+    torque: wp.array2d(dtype=float),
+    paw_force: wp.array2d(dtype=wp.vec3),
+    peak_force: wp.array(dtype=float),
+):
+    """Command the standing angles [rad] in the masked worlds, and forget torques and forces; launch over worlds."""
+    world = wp.tid()
+    if not mask[world]:
+        return
+    for motor in range(12):
+        target[motor, world] = standing[motor, world]
+        safe_target[motor, world] = standing[motor, world]
+        torque[motor, world] = 0.0
+    for k in range(4):
+        paw_force[k, world] = wp.vec3(0.0)
+    peak_force[world] = 0.0
+
+
+@wp.kernel
+def zero_worlds_kernel(
+    # in
+    mask: wp.array(dtype=wp.bool),
+    # out
+    values: wp.array2d(dtype=wp.spatial_vector),
+):
+    """Zero the rows of the masked worlds; launch over the shape of `values`, (num_worlds, any)."""
+    world, i = wp.tid()
+    if mask[world]:
+        values[world, i] = wp.spatial_vector()

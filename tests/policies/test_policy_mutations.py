@@ -1,0 +1,234 @@
+"""A policy's folder with one thing changed: it is refused in one line, or still a policy that acts and can be saved."""
+
+import hashlib
+import itertools
+import json
+import math
+
+import pytest
+import safetensors.torch
+import torch
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from jumper_warp.policies.folder import load_policy, save_policy
+from jumper_warp.policies.onnx import onnx_bytes
+from jumper_warp.policies.policy import Policy
+from jumper_warp.policies.spec import PolicyError, PolicyInterface
+
+SIZES = (5, 6, 4, 2)
+FILES = ("policy.safetensors", "config.json", "policy.onnx", "manifest.json", "README.md")
+VALUES = [
+    None, True, 0, -1, 1, 2, 10**30, 1e-30, 1e30, 1e300, -1e300, math.nan, math.inf, -math.inf, 0.5, -0.5, "", "x",
+    "a\nb", "\ud800", "../x", "1", [], [1], [1.0, 2.0], ["a", "b"], [[1.0]], {}, {"a": 1}, {"a\nb": [math.nan]},
+]  # fmt: skip
+OBSERVATIONS = torch.cat(
+    [torch.zeros(1, 5), 1e3 * torch.eye(5), -1e30 * torch.ones(1, 5), torch.full((1, 5), math.nan)]
+)
+COMMON = settings(max_examples=400, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+
+
+def small_policy():
+    torch.manual_seed(2)
+    per_joint = ("action_scale", "default_joint_pos", "joint_stiffness", "joint_damping", "torque_limit")
+    interface = PolicyInterface(
+        task="vertical-jump",
+        observation_names=tuple(f"obs_{i}" for i in range(SIZES[0])),
+        joint_names=("hip", "knee"),
+        command_filter={"sum": {"lower": 0.0, "upper": 240.0}, "horizon": 0.1},
+        policy_dt=1.0 / 60.0,
+        physics_dt=1.0 / 480.0,
+        hidden=SIZES[1:-1],
+        **{name: (0.5, 1.0) for name in per_joint},
+    )
+    layers = [(torch.randn(o, i), torch.randn(o)) for i, o in itertools.pairwise(SIZES)]
+    return Policy(layers, torch.randn(5), torch.rand(5) + 0.1, interface, {"env": {"seed": 5, "list": [1, 2.0, None]}})
+
+
+@pytest.fixture(scope="module")
+def original(tmp_path_factory):
+    """A saved policy's folder."""
+    return save_policy(tmp_path_factory.mktemp("policies") / "original", small_policy())
+
+
+@pytest.fixture(scope="module")
+def folder(original):
+    """A folder beside it to write changed policies to."""
+    (original.parent / "changed").mkdir()
+    return original.parent / "changed"
+
+
+def write(folder, content):
+    """Make the folder hold these files by name, and no others."""
+    for path in folder.iterdir():
+        path.unlink()
+    for name, data in content.items():
+        (folder / name).write_bytes(data)
+
+
+def content_of(folder):
+    return {name: (folder / name).read_bytes() for name in FILES}
+
+
+def resign(content):
+    """Mend the sums of a manifest that can still be read."""
+    manifest = json.loads(content["manifest.json"])
+    for name in manifest["sha256"]:
+        manifest["sha256"][name] = hashlib.sha256(content[name]).hexdigest()
+    content["manifest.json"] = json.dumps(manifest).encode()
+
+
+def check(folder, saved):
+    """Load the folder: either a refusal in one line, or a policy that acts, is exported, and comes back alike.
+
+    saved: where to save it; deleted afterwards. Returns whether it was loaded.
+    """
+    try:
+        policy = load_policy(folder)
+    except PolicyError as error:
+        assert len(str(error).splitlines()) == 1 and len(str(error)) < 1000
+        return False
+    with torch.no_grad():
+        actions = policy.act(torch.cat([OBSERVATIONS, torch.randn(8, 5)]))
+    assert actions.shape == (len(OBSERVATIONS) + 8, 2)
+    assert actions.isfinite().all() and actions.abs().max() <= 1.0
+    face = policy.interface
+    assert 0.0 < face.physics_dt <= face.policy_dt <= 1.0
+    assert min(face.torque_limit) > 0.0 and min(*face.joint_stiffness, *face.joint_damping) >= 0.0
+    assert onnx_bytes(policy)
+    again = load_policy(save_policy(saved, policy, overwrite=True))
+    assert torch.equal(again.act(OBSERVATIONS), policy.act(OBSERVATIONS)) and again.interface == face
+    return True
+
+
+def places(tree):
+    """Every place of a JSON tree: its container, and its key or index."""
+    for key in list(tree) if isinstance(tree, dict) else range(len(tree)):
+        yield tree, key
+        if isinstance(tree[key], dict | list):
+            yield from places(tree[key])
+
+
+def change_one(tree, data):
+    """Change, delete or add one entry of a JSON tree."""
+    table, key = data.draw(st.sampled_from(list(places(tree))))
+    kind = data.draw(st.sampled_from(["value", "value", "value", "scale", "delete", "add"]))
+    if kind == "delete":
+        del table[key]
+    elif kind == "add" and isinstance(table, dict):
+        table[data.draw(st.sampled_from(["", "extra", "a\nb", "\ud800"]))] = data.draw(st.sampled_from(VALUES))
+    elif kind == "add":
+        table.insert(key, data.draw(st.sampled_from([table[key], *VALUES])))
+    elif kind == "scale" and isinstance(table[key], int | float):
+        table[key] *= data.draw(st.sampled_from([-1, 1e-6, 1e6, 1e30, 1e-300]))
+    else:
+        table[key] = data.draw(st.sampled_from(VALUES))
+
+
+def test_the_policy_itself_passes(original, tmp_path):
+    assert check(original, tmp_path / "saved")
+
+
+@COMMON
+@given(data=st.data())
+def test_damaged_files(original, folder, data):
+    content = content_of(original)
+    name = data.draw(st.sampled_from(FILES))
+    kind = data.draw(st.sampled_from(["delete", "truncate", "flip", "insert"]))
+    bytes_of = bytearray(content[name])
+    at = data.draw(st.integers(0, len(bytes_of) - 1))
+    if kind == "truncate":
+        del bytes_of[at:]
+    elif kind == "flip":
+        bytes_of[at] ^= data.draw(st.integers(1, 255))
+    else:
+        bytes_of[at:at] = data.draw(st.binary(min_size=1, max_size=8))
+    content[name] = bytes(bytes_of)
+    if kind == "delete":
+        del content[name]
+    write(folder, content)
+    loaded = check(folder, folder.parent / "saved")
+    # the README is prose; the manifest has no sum of its own, and may be spaced otherwise
+    assert name in ("README.md", "manifest.json") or not loaded
+
+
+@COMMON
+@given(data=st.data())
+def test_damaged_weights_with_a_mended_sum(original, folder, data):
+    content = content_of(original)
+    weights = bytearray(content["policy.safetensors"])
+    header = int.from_bytes(weights[:8], "little") + 8
+    at = data.draw(st.integers(0, header - 1) | st.integers(0, len(weights) - 1))
+    weights[at] = data.draw(st.integers(0, 255) | st.sampled_from(b'\x00\n"0189{}[],:F'))
+    content["policy.safetensors"] = bytes(weights[: data.draw(st.sampled_from([None, at + 1, -1]))])
+    resign(content)
+    write(folder, content)
+    check(folder, folder.parent / "saved")
+
+
+@pytest.mark.parametrize("name", ["config.json", "manifest.json"])
+@COMMON
+@given(data=st.data())
+def test_changed_json_with_mended_sums(original, folder, name, data):
+    content = content_of(original)
+    tree = json.loads(content[name])
+    change_one(tree, data)
+    content[name] = json.dumps(tree).encode()
+    if name == "config.json":
+        resign(content)
+    write(folder, content)
+    check(folder, folder.parent / "saved")
+
+
+@COMMON
+@given(data=st.data())
+def test_changed_interface_with_mended_sums(original, folder, data):
+    content = content_of(original)
+    tree = json.loads(content["config.json"])
+    change_one(tree["interface"], data)
+    content["config.json"] = json.dumps(tree).encode()
+    resign(content)
+    write(folder, content)
+    check(folder, folder.parent / "saved")
+
+
+DTYPES = [
+    torch.float64, torch.float16, torch.bfloat16, torch.float8_e4m3fn, torch.float8_e5m2, torch.int64, torch.uint8,
+    torch.bool, torch.complex64,
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("dtype", DTYPES, ids=str)
+def test_weights_of_another_type(original, folder, dtype):
+    content = content_of(original)
+    tensors = safetensors.torch.load(content["policy.safetensors"])
+    content["policy.safetensors"] = safetensors.torch.save({name: t.abs().to(dtype) for name, t in tensors.items()})
+    resign(content)
+    write(folder, content)
+    check(folder, folder.parent / "saved")
+
+
+@pytest.mark.parametrize("scale", [1e-45, 1e-30, 1e10, 1e20, 1e38])
+@pytest.mark.parametrize(
+    "part", ["actor.0.weight", "actor.1.bias", "actor.2.weight", "normaliser.mean", "normaliser.std"]
+)
+def test_weights_of_another_size(original, folder, part, scale):
+    content = content_of(original)
+    tensors = safetensors.torch.load(content["policy.safetensors"])
+    tensors[part] = scale * tensors[part].abs().clamp(min=1.0)
+    content["policy.safetensors"] = safetensors.torch.save(tensors)
+    resign(content)
+    write(folder, content)
+    check(folder, folder.parent / "saved")
+
+
+@pytest.mark.parametrize("activation", ["elu", "relu", "tanh"])
+def test_weights_that_overflow_are_refused(activation):
+    policy = small_policy()
+    layers = [(weight * 1e20, bias) for weight, bias in policy.layers]
+    interface = PolicyInterface(**{**vars(policy.interface), "activation": activation})
+    if activation == "tanh":  # it limits what the next layer reads
+        assert Policy(layers, policy.mean, policy.std, interface).act(OBSERVATIONS).isfinite().all()
+        return
+    with pytest.raises(PolicyError, match="overflow"):
+        Policy(layers, policy.mean, policy.std, interface)

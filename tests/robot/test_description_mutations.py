@@ -1,0 +1,183 @@
+"""The shipped description with one thing changed: it is refused in one line, or still describes a robot."""
+
+import json
+import math
+import shutil
+import warnings
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from jumper_warp.robot.description import DEFAULT_DESCRIPTION, RobotDescriptionError, load_description
+
+JSON = json.loads(DEFAULT_DESCRIPTION.read_text())
+FACTORS = [1e-30, 1e-6, 1e-3, -1.0, 1e3, 1e6, 1e30]
+NOT_FINITE = [math.nan, math.inf]
+JUNK = ["", "x", "1 2 3 4", "body", [], {}, [1.0], True, None, 10**400, "\n", "nan"]
+
+
+def urdf_without_twins():
+    """The shipped tree, its legs but the first without visual shapes, to be quick."""
+    root = ElementTree.parse(DEFAULT_DESCRIPTION.parent / "jumper.urdf").getroot()
+    for link in root.findall("link"):
+        if link.get("name")[:2] in ("FR", "BL", "BR"):
+            for visual in link.findall("visual"):
+                link.remove(visual)
+    return ElementTree.tostring(root, encoding="unicode")
+
+
+URDF = urdf_without_twins()
+
+
+@pytest.fixture(scope="module")
+def assets(tmp_path_factory):
+    """A writable copy of the robot's folder, with a tetrahedron for each mesh."""
+    folder = shutil.copytree(DEFAULT_DESCRIPTION.parent, tmp_path_factory.mktemp("robot") / "jumper")
+    for mesh in (folder / "meshes").iterdir():
+        mesh.write_text("v 0.1 0 0\nv 0 0.1 0\nv 0 0 0.1\nv 0 0 -0.1\nf 1 2 3\nf 1 2 4\nf 1 3 4\nf 2 3 4\n")
+    return folder
+
+
+def attributes(root):
+    """Every attribute of an XML tree that holds numbers: its element's attributes, its name, its words."""
+    for element in root.iter():
+        for name, text in element.attrib.items():
+            try:
+                yield element.attrib, name, [float(word) for word in text.split()]
+            except ValueError:
+                continue
+
+
+def slots(tree):
+    """Every place of a JSON tree: its container, and its key or index."""
+    for key in list(tree) if isinstance(tree, dict) else range(len(tree)):
+        yield tree, key
+        if isinstance(tree[key], dict | list):
+            yield from slots(tree[key])
+
+
+def is_number(value):
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
+def magnitudes():
+    """The absolute values of all numbers of the description."""
+    found = {abs(value) for _, _, values in attributes(ElementTree.fromstring(URDF)) for value in values}
+    found |= {abs(table[key]) for table, key in slots(JSON) if is_number(table[key])}
+    return sorted(found - {0.0})
+
+
+def change_everywhere(magnitude, change):
+    """Both files with every number of this absolute value changed: legs, motors and loops stay alike."""
+    root = ElementTree.fromstring(URDF)
+    for holder, name, values in attributes(root):
+        if magnitude in map(abs, values):
+            holder[name] = " ".join(repr(change(v) if abs(v) == magnitude else v) for v in values)
+    tree = json.loads(json.dumps(JSON))
+    for table, key in slots(tree):
+        if is_number(table[key]) and abs(table[key]) == magnitude:
+            table[key] = change(table[key])
+    return ElementTree.tostring(root, encoding="unicode"), json.dumps(tree)
+
+
+def load(assets, urdf, text):
+    """The description of these texts, or None if it was refused in one line; whatever else is raised passes through."""
+    (assets / "jumper.urdf").write_text(urdf, encoding="utf-8")
+    (assets / "jumper.json").write_text(text, encoding="utf-8")
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            return load_description(assets / "jumper.json")
+    except RobotDescriptionError as error:
+        assert "\n" not in str(error) and len(str(error)) < 1000
+        return None
+
+
+def assert_is_a_robot(robot):
+    """Say what a person with scales and a ruler would ask of a legged robot."""
+    for link in robot.links:
+        assert 1e-3 <= link.mass <= 100.0
+        assert np.abs(link.com).max() <= 2.0
+        moments = np.linalg.eigvalsh(link.inertia)
+        # between that of a bead of 1 mm, and of all mass on a ring of 3 m
+        assert 1e-6 * link.mass <= moments[0] * 1.001 and moments[-1] <= 9.0 * link.mass
+        for shape in (*link.visuals, *link.collisions):
+            assert np.abs(shape.position).max() <= 2.0 and all(1e-4 <= size <= 2.0 for size in shape.size)
+    for joint in robot.joints:
+        assert np.abs(joint.origin).max() <= 2.0
+        assert -6.3 < joint.lower < joint.upper < 6.3
+        assert 0.0 < joint.effort <= 1e4 and 0.0 < joint.velocity <= 1e4
+    for leg in ("FL", "FR", "BL", "BR"):
+        assert -2.0 <= robot.joint(f"{leg}_outer_knee").origin[2] <= -1e-3
+        assert 1e-3 <= robot.link(f"{leg}_inner_shank").collisions[0].size[0] <= 0.2
+    for motor in robot.motors:
+        assert 1.0 <= motor.gear_ratio <= 1000.0 and 1e-6 <= motor.armature <= 1.0
+        assert 0.1 <= motor.peak_torque <= 1000.0 and 0.0 < motor.coulomb_friction <= min(10.0, motor.peak_torque)
+        assert 0.1 <= motor.cutoff_speed < motor.no_load_speed <= 1000.0
+        for gains in (motor.jumping, motor.walking):
+            assert 0.1 <= gains.kp <= 1e4 and 1e-3 <= gains.kd <= 1e3
+    assert 0.0 < robot.knee_damping <= 10.0 and 0.0 < robot.knee_damping_limit <= 1e3
+
+
+def test_numbers_of_another_unit_or_exponent_are_refused_or_still_a_robot(assets):
+    refused = 0
+    for magnitude in magnitudes():
+        for factor in FACTORS:
+            robot = load(assets, *change_everywhere(magnitude, lambda value, factor=factor: value * factor))
+            refused += robot is None
+            if robot is not None:
+                assert_is_a_robot(robot)
+    assert refused > 0.7 * len(magnitudes()) * len(FACTORS)
+
+
+def test_numbers_that_are_not_finite_are_refused(assets):
+    for magnitude in magnitudes():
+        for value in NOT_FINITE:
+            assert load(assets, *change_everywhere(magnitude, lambda _, value=value: value)) is None, magnitude
+
+
+@settings(max_examples=250, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(data=st.data())
+def test_one_changed_place_of_the_json_is_refused_or_harmless(assets, data):
+    tree = json.loads(json.dumps(JSON))
+    table, key = data.draw(st.sampled_from(list(slots(tree))))
+    old = table[key]
+    if data.draw(st.booleans()):
+        table[key] = data.draw(st.sampled_from([*JUNK, *NOT_FINITE, 0, *(old * f for f in FACTORS if is_number(old))]))
+    elif data.draw(st.booleans()):
+        del table[key]
+    elif isinstance(table, list):
+        table.insert(key, old)
+    else:
+        table[f"{key} again"] = old
+    robot = load(assets, URDF, json.dumps(tree))
+    if robot is not None:
+        assert_is_a_robot(robot)
+
+
+@settings(max_examples=250, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(data=st.data())
+def test_one_changed_place_of_the_urdf_is_refused_or_harmless(assets, data):
+    root = ElementTree.fromstring(URDF)
+    parents = [(parent, index) for parent in root.iter() for index in range(len(parent))]
+    parent, index = data.draw(st.sampled_from(parents))
+    element = parent[index]
+    kind = data.draw(st.sampled_from(["delete", "double", "attribute", "number"]))
+    if kind == "delete":
+        parent.remove(element)
+    elif kind == "double":
+        parent.insert(index, element)
+    elif kind == "attribute" and element.attrib:
+        name = data.draw(st.sampled_from(sorted(element.attrib)))
+        element.attrib[name] = data.draw(st.sampled_from([text for text in JUNK if isinstance(text, str)]))
+    else:
+        holder, name, values = data.draw(st.sampled_from(list(attributes(root))))
+        which = data.draw(st.integers(0, len(values) - 1)) if values else 0
+        new = data.draw(st.sampled_from([*NOT_FINITE, 0.0, *(values[which] * factor for factor in FACTORS)]))
+        holder[name] = " ".join(repr(new if i == which else value) for i, value in enumerate(values))
+    robot = load(assets, ElementTree.tostring(root, encoding="unicode"), json.dumps(JSON))
+    if robot is not None:
+        assert_is_a_robot(robot)

@@ -1,0 +1,191 @@
+"""Putting worlds back, and the velocity of the base, on both solvers."""
+
+import numpy as np
+import pytest
+import torch
+import warp as wp
+
+from jumper_warp.robot.grounds import BlockCfg
+from jumper_warp.robot.motors import vertical_jump_filter
+from jumper_warp.sim.simulation import Simulation
+
+SOLVERS = ("jumper", "mujoco")
+RESULTS = ("torque", "paw_force", "peak_force")
+
+
+def simulation(num_worlds, solver, **arguments):
+    return Simulation(
+        num_worlds, solver=solver, command_filter=vertical_jump_filter(), visuals=False, device="cpu", **arguments
+    )
+
+
+def command(sim, step):
+    """Squat, then stretch, each world a little more than the one before."""
+    degrees = np.array([0.0, 70.0, 70.0] if step < 6 else [0.0, 25.0, 25.0])
+    spread = degrees[:, None] * np.linspace(1.0, 1.2, sim.num_worlds)
+    sim.target.assign(np.radians(np.tile(spread, (4, 1))).astype(np.float32))
+
+
+def jump(sim, steps=10):
+    """What a simulation goes through in a jump, as one array of numbers per step."""
+    story = []
+    for step in range(steps):
+        command(sim, step)
+        sim.step()
+        story.append(np.concatenate([sim.joint_q(), sim.joint_qd(), sim.torque.numpy().T], axis=1))
+    return np.array(story)
+
+
+def snapshot(sim):
+    """Everything that a fresh simulation shows, the world first."""
+    n = sim.num_worlds
+    state = [getattr(sim.state, name).numpy().reshape(n, -1) for name in ("joint_q", "joint_qd", "body_q", "body_qd")]
+    moved = [np.moveaxis(getattr(sim, name).numpy(), 0 if name == "peak_force" else 1, 0) for name in RESULTS]
+    return [values.reshape(n, -1).copy() for values in [*state, *moved, sim.target.numpy().T]]
+
+
+def break_world(sim, world):
+    rates = sim.joint_qd().copy()
+    rates[world, 7] = np.nan
+    sim.state.joint_qd.assign(rates.ravel())
+
+
+@pytest.mark.parametrize("solver", SOLVERS)
+def test_reset_simulation_is_bitwise_a_fresh_one(solver):
+    sim = simulation(2, solver)
+    fresh = snapshot(sim)
+    first = jump(sim)
+    assert not np.array_equal(first[-1], first[0])
+    sim.reset()
+    assert all(np.array_equal(found, expected) for found, expected in zip(snapshot(sim), fresh, strict=True))
+    assert np.array_equal(jump(sim), first)
+
+
+@pytest.mark.parametrize("solver", SOLVERS)
+@pytest.mark.parametrize("kind", ["list", "numpy", "torch", "warp"])
+def test_reset_leaves_other_worlds_alone(solver, kind):
+    sim, other = simulation(3, solver), simulation(3, solver)
+    fresh = snapshot(sim)
+    jump(sim, 8), jump(other, 8)
+    chosen = [False, True, False]
+    mask = {
+        "list": chosen,
+        "numpy": np.array(chosen),
+        "torch": torch.tensor(chosen),
+        "warp": wp.array(chosen, dtype=wp.bool, device="cpu"),
+    }[kind]
+    sim.reset(mask)
+    for found, start, going_on in zip(snapshot(sim), fresh, snapshot(other), strict=True):
+        assert np.array_equal(found[1], start[1])
+        assert np.array_equal(found[[0, 2]], going_on[[0, 2]])
+    moving, reference = jump(sim, 3), jump(other, 3)
+    assert np.array_equal(moving[:, [0, 2]], reference[:, [0, 2]])
+
+
+@pytest.mark.parametrize("solver", SOLVERS)
+def test_broken_world_recovers_by_a_reset(solver):
+    sim = simulation(2, solver)
+    first = jump(sim)
+    sim.reset()
+    jump(sim, 4)
+    break_world(sim, 1)
+    jump(sim, 3)
+    if solver == "mujoco":
+        assert np.isnan(sim.joint_q()[1]).any()
+    else:
+        assert sim.solver.invalid.numpy()[1] == 1
+    sim.reset(np.array([False, True]))
+    again = jump(sim)
+    assert np.array_equal(again[:, 1], first[:, 1])
+
+
+@pytest.mark.parametrize("solver", SOLVERS)
+def test_standing_robot_stays_standing_after_a_reset(solver):
+    sim = simulation(2, solver)
+    height = sim.joint_q()[:, 2].copy()
+    jump(sim, 4)
+    sim.reset()
+    for _ in range(30):
+        sim.step()
+    assert sim.joint_q()[:, 2] == pytest.approx(height, abs=0.06)  # it sags on its motors, and no more
+
+
+@pytest.mark.parametrize("solver", SOLVERS)
+def test_captured_reset_reads_its_mask_at_every_replay(solver):
+    sim = simulation(3, solver)
+    start = sim.joint_q().copy()
+    mask = wp.zeros(3, dtype=wp.bool, device="cpu")
+    jump(sim, 3)
+    sim.reset(mask)
+    with wp.ScopedCapture(device=sim.device) as capture:
+        sim.reset(mask)
+    for world in range(3):
+        jump(sim, 3)
+        moved = sim.joint_q().copy()
+        mask.assign(np.arange(3) == world)
+        wp.capture_launch(capture.graph)
+        expected = np.where((np.arange(3) == world)[:, None], start, moved)
+        assert np.array_equal(sim.joint_q(), expected)
+
+
+def test_reset_puts_blocks_back():
+    sim = simulation(2, "jumper", block=BlockCfg(center=(0.2, 0.0), mass=1.0, friction=0.0))
+    start = sim.solver.block_position()
+    jump(sim, 12)
+    moved = sim.solver.block_position()
+    assert np.abs(moved - start).max() > 1e-5
+    sim.reset([True, False])
+    assert np.array_equal(sim.solver.block_position()[0], start[0])
+    assert np.array_equal(sim.solver.block_position()[1], moved[1])
+
+
+@pytest.mark.parametrize(
+    "mask",
+    [[True], [[True, False]], [0, 1], np.array([1.0, 0.0]), torch.tensor([0, 1]), "ab", [True, None], [[True], []]],
+    ids=repr,
+)
+def test_reset_refuses_what_is_no_mask(mask):
+    sim = simulation(2, "jumper")
+    with pytest.raises(ValueError, match=r"mask must be bool of shape \(2,\)") as refusal:
+        sim.reset(mask)
+    assert "\n" not in str(refusal.value)
+
+
+def spinning(solver):
+    """Two worlds in the air that move and turn."""
+    sim = simulation(2, solver, ground=None)
+    rates = sim.joint_qd().copy()
+    rates[:, :6] = [[1.0, -2.0, 0.5, 2.0, -3.0, 1.0], [0.0, 0.0, 0.0, -4.0, 0.0, 5.0]]
+    sim.state.joint_qd.assign(rates.ravel())
+    return sim
+
+
+@pytest.mark.parametrize("solver", SOLVERS)
+def test_base_velocity_is_the_way_that_the_base_goes(solver):
+    sim = spinning(solver)
+    for _ in range(5):
+        before = sim.joint_q()[:, :3].astype(float)
+        sim.physics_step()
+        found = sim.base_velocity()
+        gone = (sim.joint_q()[:, :3].astype(float) - before) / sim.dt
+        assert found.shape == (2, 3)
+        # MuJoCo moves by the mean of two velocities of the com on its way around the origin
+        assert found == pytest.approx(gone, abs=1e-3 if solver == "jumper" else 5e-3)
+    com_velocity = sim.joint_qd()[:, :3]
+    assert np.abs(found - com_velocity).max() > 0.02
+
+
+def test_base_velocity_in_a_captured_graph():
+    sim = spinning("jumper")
+    sim.physics_step()
+    velocity = sim.read_base_velocity()
+    assert velocity.dtype == wp.vec3 and velocity.shape == (2,)
+    with wp.ScopedCapture(device=sim.device) as capture:
+        sim.solver.step(sim.state, sim.state, None, None, sim.dt)
+        sim.read_base_velocity()
+    seen = []
+    for _ in range(3):
+        wp.capture_launch(capture.graph)
+        seen.append(velocity.numpy().copy())
+        assert np.array_equal(seen[-1], sim.base_velocity())
+    assert np.abs(np.diff(seen, axis=0)).min(axis=(1, 2)).max() > 0.0
