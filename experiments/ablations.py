@@ -20,7 +20,7 @@ import warp as wp
 from rich.console import Console
 from rich.table import Table
 
-from jumper_warp.envs.env import JumpEnv
+from jumper_warp.envs.env import Env
 from jumper_warp.evaluation.jumps import run_jumps
 from jumper_warp.registry import make_task
 from jumper_warp.rl.networks import sanitise
@@ -84,7 +84,7 @@ class Curve:
         return next((t for t, success in zip(self.seconds, self.success, strict=True) if success >= rate), None)
 
 
-def success(ppo: Ppo, judge: JumpEnv, jumps: int) -> float:
+def success(ppo: Ppo, judge: Env, jumps: int) -> float:
     """Return the share of the test's jumps that succeed."""
 
     @torch.no_grad()
@@ -94,10 +94,10 @@ def success(ppo: Ppo, judge: JumpEnv, jumps: int) -> float:
     return float(run_jumps(act, judge, np.linspace(0.5, 1.1, jumps)).success.mean())
 
 
-def train_variant(task: TaskCfg, judge: JumpEnv, args: Args) -> Curve:
+def train_variant(task: TaskCfg, judge: Env, args: Args) -> Curve:
     """Train for the given time and return the curve; kernels are compiled off the clock."""
     torch.manual_seed(args.seed)
-    env = JumpEnv(task, args.envs, seed=args.seed, device=args.device, randomize=args.randomize, noise=args.randomize)
+    env = Env(task, args.envs, seed=args.seed, device=args.device, randomize=args.randomize, noise=args.randomize)
     ppo = Ppo(env, args.ppo)
     env.reset()
     env.step(torch.zeros(env.num_envs, env.num_actions, device=env.device))
@@ -137,7 +137,7 @@ def main(args: Args) -> dict:
     report_device(args.device)
     folder = output_dir("ablations", args.out)
     task = make_task("vertical-jump")
-    judge = JumpEnv(task, args.jumps, device=args.device, randomize=False, noise=False, auto_reset=False)
+    judge = Env(task, args.jumps, device=args.device, randomize=False, noise=False, auto_reset=False)
     table = Table("variant", "success", f"seconds to {100 * GOOD:g} %", "iterations")
     curves: dict[str, Curve] = {}
     values: dict = {"seconds": args.seconds, "envs": args.envs, "randomize": args.randomize, "seed": args.seed}

@@ -25,7 +25,7 @@ import warp as wp
 from rich.console import Console
 from rich.table import Table
 
-from jumper_warp.envs.env import JumpEnv
+from jumper_warp.envs.env import Env
 from jumper_warp.registry import make_task
 from jumper_warp.rl.logger import Stopwatch
 from jumper_warp.rl.ppo import Ppo, PpoCfg
@@ -101,9 +101,9 @@ def time_solver(envs: int, args: Args) -> float:
     return seconds(lambda: wp.capture_launch(capture.graph), args.steps, args)
 
 
-def make_env(envs: int, args: Args) -> tuple[JumpEnv, Callable[[], None]]:
+def make_env(envs: int, args: Args) -> tuple[Env, Callable[[], None]]:
     """Return an environment in the middle of its episodes, and what steps it with random actions."""
-    env = JumpEnv(make_task("vertical-jump"), envs, device=args.device)
+    env = Env(make_task("vertical-jump"), envs, device=args.device)
     actions = torch.rand(16, envs, env.num_actions, device=env.device) * 2.0 - 1.0
     count = 0
 

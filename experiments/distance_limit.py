@@ -38,7 +38,7 @@ from rich.console import Console
 from rich.table import Column, Table
 
 from jumper_warp.cli.main import UsageError, run_command
-from jumper_warp.envs.env import JumpEnv
+from jumper_warp.envs.env import Env
 from jumper_warp.evaluation.landings import ENDS, Landings
 from jumper_warp.evaluation.takeoffs import LANDING_ACTION, Act, Flight, Takeoffs, fly, mean_of_sides, reach
 from jumper_warp.evaluation.trial import Trial, TrialArgs
@@ -87,7 +87,7 @@ class Limit:
 
     label: str
     task: Callable[[TaskCfg], TaskCfg] = lambda task: task
-    model: Callable[[JumpEnv], None] = lambda env: None
+    model: Callable[[Env], None] = lambda env: None
     stance: bool = True
     """Whether the base stays within 0.3 m of its start while standing."""
     pitch: float = MOST_PITCH
@@ -115,14 +115,14 @@ def with_speed(task: TaskCfg, scale: float) -> TaskCfg:
     return replace(task, motors=replace(motors, transversal=faster, **fade))
 
 
-def set_friction(env: JumpEnv, friction: float) -> None:
+def set_friction(env: Env, friction: float) -> None:
     """Give the paws another friction coefficient [1]."""
     mu = env.sim.model.shape_material_mu
     mu.assign(np.where(mu.numpy() > 0.1, friction, mu.numpy()).astype(np.float32))
     env.notify(ModelFlags.SHAPE_PROPERTIES)
 
 
-def set_mass(env: JumpEnv, scale: float) -> None:
+def set_mass(env: Env, scale: float) -> None:
     """Scale mass and inertia of every link."""
     model = env.sim.model
     model.body_mass.assign(scale * model.body_mass.numpy())
@@ -130,7 +130,7 @@ def set_mass(env: JumpEnv, scale: float) -> None:
     env.notify(ModelFlags.BODY_INERTIAL_PROPERTIES)
 
 
-def free_knees(env: JumpEnv) -> None:
+def free_knees(env: Env) -> None:
     """Take the damping of the passive knees away."""
     damping = env.sim.model.joint_damping.numpy().reshape(env.num_envs, -1)
     damping[:, KNEE_DOFS] = 0.0
@@ -196,12 +196,12 @@ def cma_package() -> ModuleType:
     return cma
 
 
-def env_of_limit(limit: Limit, args: Args) -> JumpEnv:
+def env_of_limit(limit: Limit, args: Args) -> Env:
     """Return nominal robots on the task, one limit changed, with the ends that a search needs."""
     task = limit.task(make_task("horizontal-jump"))
     names = {*ENDS, "left_stance"} - {"no_jump"} if limit.stance else {*ENDS} - {"no_jump"}
-    task = replace(task, rules=tuple(rule for rule in task.rules if rule.name in names))
-    env = JumpEnv(task, args.population, device=args.device, randomize=False, noise=False, auto_reset=False)
+    task = replace(task, terminations=tuple(rule for rule in task.terminations if rule.name in names))
+    env = Env(task, args.population, device=args.device, randomize=False, noise=False, auto_reset=False)
     limit.model(env)
     return env
 
@@ -227,7 +227,7 @@ def knots_of(actions: np.ndarray) -> np.ndarray:
     return np.clip(np.linalg.lstsq(WEIGHTS, rows, rcond=None)[0], -1.0, 1.0).ravel()
 
 
-def random_squat(env: JumpEnv, limit: Limit, seed: int) -> np.ndarray:
+def random_squat(env: Env, limit: Limit, seed: int) -> np.ndarray:
     """Return the best (n,) of 32 generations: two postures, then stretched legs, front and hind at their times."""
     rng, found, shape = np.random.default_rng(seed), [], (env.num_envs, 1, 4)
     for _ in range(32):
@@ -242,7 +242,7 @@ def random_squat(env: JumpEnv, limit: Limit, seed: int) -> np.ndarray:
 
 
 def search(
-    env: JumpEnv, limit: Limit, begin: np.ndarray, sigma: float, generations: int, seed: int
+    env: Env, limit: Limit, begin: np.ndarray, sigma: float, generations: int, seed: int
 ) -> tuple[np.ndarray, float]:
     """Return the best candidate (n,) found around `begin`, which is one of the first generation, and its score [m]."""
     settings = {"popsize": env.num_envs, "seed": seed + 1, "verbose": -9}
@@ -263,7 +263,7 @@ def search(
 
 
 def fly_best(
-    env: JumpEnv, best: np.ndarray, after: float | Act = LANDING_ACTION, goals: np.ndarray | None = None
+    env: Env, best: np.ndarray, after: float | Act = LANDING_ACTION, goals: np.ndarray | None = None
 ) -> Takeoffs:
     """Return jumps of the same candidate in every world, to their rest; after, goals: as of `fly`."""
     return fly(env, actions_of(np.tile(best, (env.num_envs, 1))), after, goals=goals, to_rest=True)

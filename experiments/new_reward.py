@@ -15,14 +15,14 @@ from pathlib import Path
 import torch
 import tyro
 import warp as wp
+from kernels.jump.task import FLIGHT, JumpTask, RobotView
 
-from jumper_warp.envs.env import JumpEnv
+from jumper_warp.envs.env import Env
 from jumper_warp.registry import make_task
 from jumper_warp.rl.ppo import PpoCfg
 from jumper_warp.rl.runner import TrainCfg, train
 from jumper_warp.tasks.cfg import Term
 from jumper_warp.utils.output import output_dir, write_figures
-from kernels.jump.task import FLIGHT, JumpTask, RobotView
 
 
 @wp.func
@@ -39,9 +39,9 @@ TASK = make_task("vertical-jump")
 TASK = replace(TASK, terms=TASK.terms + (Term(even_load, weight=5.0, params=(50.0,)),))
 
 
-def make_env(num_envs: int, seed: int, device: torch.device) -> JumpEnv:
+def make_env(num_envs: int, seed: int, device: torch.device) -> Env:
     """Return the environment with the new term, for `train`."""
-    return JumpEnv(TASK, num_envs, seed=seed, device=str(device))
+    return Env(TASK, num_envs, seed=seed, device=str(device))
 
 
 @dataclass(frozen=True)

@@ -24,7 +24,7 @@ from rich.console import Console
 from rich.table import Table
 
 from jumper_warp.cli.main import announce, run_command
-from jumper_warp.envs.env import JumpEnv
+from jumper_warp.envs.env import Env
 from jumper_warp.evaluation.film import Film, moments
 from jumper_warp.evaluation.jumps import COLLIDED, REST_SPEED, Jumps, largest, mean, rule_names, run, within
 from jumper_warp.policies.policy import Policy
@@ -88,22 +88,22 @@ class Args:
 
 def ends_of_the_sweep(task: TaskCfg) -> TaskCfg:
     """Return a task with this test's ends of a jump."""
-    return replace(task, rules=tuple(rule for rule in task.rules if rule.name in ENDS))
+    return replace(task, terminations=tuple(rule for rule in task.terminations if rule.name in ENDS))
 
 
-def make_env(policy: Policy, args: Args) -> JumpEnv:
+def make_env(policy: Policy, args: Args) -> Env:
     """Return the environment that the policy was trained in, with this test's ends of a jump and its latency."""
     conditions = Conditions(args.solver, args.randomize, args.randomize, args.seed, args.device)
     env = env_of_policy(policy, args.jumps, conditions, change=ends_of_the_sweep)
     if not args.randomize:
-        env.delay.fill_(int(args.latency / 1000.0 / env.physics_dt + 1.0e-6))
+        env.parameters.latency.fill_(int(args.latency / 1000.0 / env.physics_dt + 1.0e-6))
     return env
 
 
 class Observer:
     """Acts with the policy and sees who jumped before being told to."""
 
-    def __init__(self, policy: Policy, env: JumpEnv) -> None:
+    def __init__(self, policy: Policy, env: Env) -> None:
         """Begin before the first step."""
         self.policy, self.env = policy, env
         self.early = np.zeros(env.num_envs, dtype=bool)

@@ -46,7 +46,7 @@ class TaskFlags:
         return cls(
             weights={flag_name(term): term.weight for term in task.terms},
             term_params={flag_name(term): term.params for term in task.terms if term.params},
-            rule_params={flag_name(rule): rule.params for rule in task.rules if rule.params},
+            rule_params={flag_name(rule): rule.params for rule in task.terminations if rule.params},
             **{name: getattr(task, name) for name in names},
         )
 

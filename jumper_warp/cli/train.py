@@ -13,7 +13,7 @@ import tyro
 
 from jumper_warp.cli.main import UsageError, announce
 from jumper_warp.cli.task_flags import TaskFlags
-from jumper_warp.envs.env import JumpEnv
+from jumper_warp.envs.env import Env
 from jumper_warp.registry import TASKS, make_task
 from jumper_warp.rl.runner import MakeEnv, TrainCfg, TrainResult, train
 from jumper_warp.sim.simulation import SolverName
@@ -61,8 +61,8 @@ def parse_train(args: Sequence[str]) -> tuple[TrainArgs, TaskCfg]:
 def env_maker(task: TaskCfg, args: TrainArgs) -> MakeEnv:
     """Return what makes the environment of a training."""
 
-    def make(num_envs: int, seed: int, device: torch.device) -> JumpEnv:
-        return JumpEnv(
+    def make(num_envs: int, seed: int, device: torch.device) -> Env:
+        return Env(
             task,
             num_envs,
             seed=seed,

@@ -9,42 +9,33 @@ import numpy as np
 import torch
 import warp as wp
 
-from jumper_warp.sim.solver import SolverJumper
-from kernels.jump.task import ViewArrays
+from kernels.mdp.env import Delays, EnvArrays
+from kernels.mdp.parameters import RobotParameters
+from kernels.mdp.view import RobotArrays
 
 if TYPE_CHECKING:
-    from jumper_warp.envs.env import JumpEnv
+    from jumper_warp.envs.env import Env
 
-RESULTS = ("obs", "final_obs", "critic_obs", "final_critic_obs", "reward", "done", "timeout")
-"""What `JumpEnv.step` leaves behind, as far as an environment has it."""
-CONSTANT_VIEWS = ("body_com", "default_angle")
-"""Arrays of `ViewArrays` that are no state."""
-DRAWN = ("body_mass", "body_com", "body_inertia", "joint_armature", "joint_friction", "shape_material_mu")
-DRAWN_MOTORS = ("kp", "kd", "saturation", "peak", "no_load_speed", "cutoff_speed", "offset")
-DRAWN_OUTSIDE = ("push", "delay", "joint_offset", "static_friction_ratio")
-"""Parameters of the model, its motors and the environment that the seed decides."""
-MUJOCO = ("qacc_warmstart", "cvel", "cdof_dot")
-"""What SolverMuJoCo carries from step to step beside Newton's state."""
-EPISODE, BLOCK = "episode.", "block."
-"""Before the name of a field of `JumpTask` and of `Block`."""
-FINGERPRINT = "parameters"
-"""Name of the drawn parameters' fingerprint."""
+CONSTANT = ("gravity", "default_angle", "paw_shapes")
+"""Arrays of the kernels' structs that are no state; those that begin with `nominal_` are none either."""
+MOTORS = ("kp", "kd", "saturation", "peak", "no_load_speed", "cutoff_speed", "offset")
+FINGERPRINT = "nominal"
+"""Name of the nominal parameters' fingerprint."""
 
 
-def save_state(env: JumpEnv) -> dict[str, torch.Tensor]:
+def save_state(env: Env) -> dict[str, torch.Tensor]:
     """Return everything that the next step depends on, on the CPU (waits for the device); counters are left out.
 
-    The world is the last axis of Warp's arrays and the first of observations and episodes. Drawn parameters are not
-    in it, only their fingerprint: the seed draws them anew.
+    Drawn parameters are in it, nominal ones only as a fingerprint.
     """
     state = {name: tensor.to("cpu", copy=True) for name, tensor in _tensors(env).items()}
     for prefix, array in _records(env).items():
         records = array.numpy()
         state |= {prefix + name: torch.from_numpy(np.array(records[name])) for name in records.dtype.names}
-    return state | {FINGERPRINT: parameter_fingerprint(env)}
+    return state | {FINGERPRINT: nominal_fingerprint(env)}
 
 
-def load_state(env: JumpEnv, state: dict[str, torch.Tensor]) -> None:
+def load_state(env: Env, state: dict[str, torch.Tensor]) -> None:
     """Put a saved state back, so that the next step is the one that would have followed.
 
     Raises:
@@ -55,47 +46,56 @@ def load_state(env: JumpEnv, state: dict[str, torch.Tensor]) -> None:
     names = {*tensors, *fields, FINGERPRINT}
     if names != state.keys():
         raise ValueError(
-            f"saved by another version or solver: lacks {sorted(names - state.keys())}, "
-            f"has {sorted(state.keys() - names)} besides"
+            f"saved by another version, task or solver: lacks {sorted(names - state.keys())[:5]}, "
+            f"has {sorted(state.keys() - names)[:5]} besides"
         )
-    saved = state["done"].shape[0]
+    saved = state["env.done"].shape[0]
     if saved != env.num_envs:
         raise ValueError(f"saved for {saved} environments, there are {env.num_envs}")
-    for name, tensor in tensors.items():
-        if state[name].shape != tensor.shape:
-            raise ValueError(f"saved {name} has shape {tuple(state[name].shape)}, expected {tuple(tensor.shape)}")
-    if not torch.equal(state[FINGERPRINT], parameter_fingerprint(env)):
-        raise ValueError("saved with other robots: seed, description or randomisation differ")
+    expected = {name: tuple(tensor.shape) for name, tensor in tensors.items()}
+    expected |= {field: records[prefix][name].shape for field, (prefix, name) in fields.items()}
+    for name, shape in expected.items():
+        if tuple(state[name].shape) != shape:
+            raise ValueError(f"saved {name} has shape {tuple(state[name].shape)}, expected {shape}")
+    if not torch.equal(state[FINGERPRINT], nominal_fingerprint(env)):
+        raise ValueError("saved with other robots: the description or the task's motors differ")
     for field, (prefix, name) in fields.items():
         records[prefix][name] = state[field].numpy()
     for prefix, array in _records(env).items():
         array.assign(wp.array(records[prefix], dtype=array.dtype, device=env.wp_device))
     for name, tensor in tensors.items():
         tensor.copy_(state[name])
+    env.restored()
 
 
-def parameter_fingerprint(env: JumpEnv) -> torch.Tensor:
-    """Return the SHA-256 (32 bytes) of all drawn parameters; it does not depend on the device."""
+def nominal_fingerprint(env: Env) -> torch.Tensor:
+    """Return the SHA-256 (32 bytes) of all nominal parameters; it does not depend on the device."""
     digest = hashlib.sha256()
-    for owner, names in ((env.sim.model, DRAWN), (env.sim.motors, DRAWN_MOTORS), (env, DRAWN_OUTSIDE)):
-        for name in names:
-            digest.update(getattr(owner, name).numpy().tobytes())
+    for name in RobotParameters.vars:
+        if name.startswith("nominal_"):
+            digest.update(getattr(env.parameters, name).numpy().tobytes())
     return torch.frombuffer(bytearray(digest.digest()), dtype=torch.uint8)
 
 
-def _records(env: JumpEnv) -> dict[str, wp.array]:
+def _records(env: Env) -> dict[str, wp.array]:
     """Return the environment's arrays of structs by the prefix of their fields; blocks only where there are any."""
-    blocks = env._dynamics.robot.ground.blocks
-    return {EPISODE: env.tasks} | ({BLOCK: blocks} if blocks.shape[0] else {})
+    blocks = env.sim.physics.dynamics.robot.ground.blocks
+    states = {f"{skill.task.name}.": skill.states for skill in env.skills}
+    return states | ({"block.": blocks} if blocks.shape[0] else {})
 
 
-def _tensors(env: JumpEnv) -> dict[str, torch.Tensor]:
+def _tensors(env: Env) -> dict[str, torch.Tensor]:
     """Return views of the environment's own memory by name."""
-    arrays: dict[str, Any] = {name: getattr(env._views, name) for name in ViewArrays.vars if name not in CONSTANT_VIEWS}
-    arrays |= {"previous_target": env._previous_target, "impulse": env._impulse, "invalid": env._invalid}
-    arrays["random"] = env._random
-    if not isinstance(env.sim.solver, SolverJumper):
-        arrays |= {"body_q": env.sim.state.body_q, "body_qd": env.sim.state.body_qd}
-        arrays |= {name: getattr(env.sim.solver.mjw_data, name) for name in MUJOCO}
-    tensors = {name: wp.to_torch(array) for name, array in arrays.items() if isinstance(array, wp.array)}
-    return tensors | {name: getattr(env, name) for name in RESULTS if hasattr(env, name)}
+    found: dict[str, Any] = {}
+    for prefix, struct in (("robot", env.robot), ("env", env.worlds), ("delays", env.delays),
+                           ("parameters", env.parameters)):  # fmt: skip
+        kind = {"robot": RobotArrays, "env": EnvArrays, "delays": Delays, "parameters": RobotParameters}[prefix]
+        for name in kind.vars:
+            if name not in CONSTANT and not name.startswith("nominal_"):
+                found[f"{prefix}.{name}"] = getattr(struct, name)
+    found |= {f"motors.{name}": getattr(env.sim.motors, name) for name in MOTORS}
+    found |= {f"solver.{name}": array for name, array in env.sim.physics.carried().items()}
+    for skill in env.skills:
+        found |= {f"{skill.task.name}/{name}": getattr(skill.observations, name) for name in ("now", "final", "past")}
+        found[f"{skill.task.name}/timer"] = skill.timer
+    return {name: wp.to_torch(array) for name, array in found.items() if isinstance(array, wp.array)}

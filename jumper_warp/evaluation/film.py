@@ -15,7 +15,7 @@ from jumper_warp.robot.model import LEGS, build_model
 from jumper_warp.sim.solver import SolverJumper
 
 if TYPE_CHECKING:
-    from jumper_warp.envs.env import JumpEnv
+    from jumper_warp.envs.env import Env
     from jumper_warp.evaluation.jumps import JumpLog
     from jumper_warp.robot.grounds import BlockCfg
 
@@ -28,7 +28,7 @@ class Film:
 
     def __init__(
         self,
-        env: JumpEnv,
+        env: Env,
         log: JumpLog,
         worlds: Sequence[int],
         *,

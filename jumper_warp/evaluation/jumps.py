@@ -27,7 +27,7 @@ Figures = dict[str, float | int | None]
 
 
 class EvaluationEnv(Protocol):
-    """What following jumps asks of an environment; `jumper_warp.envs.env.JumpEnv` is one."""
+    """What following jumps asks of an environment; `jumper_warp.envs.env.Env` is one."""
 
     num_envs: int
     device: torch.device
@@ -36,19 +36,27 @@ class EvaluationEnv(Protocol):
     task: Any
     sim: Any
 
-    def evaluation_reset(
-        self, goals: np.ndarray, command_delay: np.ndarray | float = 0.5, headings: np.ndarray | float = 0.0
-    ) -> None:
-        """Stand every world still with its goal (num_envs, 3), and end no episode."""
+    def evaluation_reset(self, commands: np.ndarray, headings: np.ndarray | float = 0.0) -> None:
+        """Stand every world still with its command, and end no episode."""
 
-    def next_jump(self, goals: np.ndarray, worlds: np.ndarray) -> None:
-        """Command another jump in some of the landed worlds."""
+    def command(self, commands: np.ndarray, worlds: np.ndarray | None = None) -> None:
+        """Give some of the worlds another command."""
 
     def step(self, action: torch.Tensor) -> None:
         """Advance one policy step."""
 
     def task_arrays(self) -> dict[str, np.ndarray]:
         """Return the state of every world's episode, one array a field of `JumpTask`, and of its base."""
+
+
+def jump_commands(goals: np.ndarray, delay: np.ndarray | float, step_dt: float) -> np.ndarray:
+    """Return commands (num_envs, 4) of jump tasks.
+
+    goals [m]: (num_envs, 3), landing x, y relative to start and heading, and base height at the apex, 0 if any will do.
+    delay [s]: until the jump is commanded; (num_envs,) or one for all.
+    """
+    steps = np.broadcast_to(np.round(np.asarray(delay) / step_dt), len(goals))
+    return np.concatenate([goals, steps[:, None]], axis=1).astype(np.float32)
 
 
 class JumpLog(ABC):
@@ -139,9 +147,9 @@ class Jumps(JumpLog):
 
     def begin(self, env: EvaluationEnv) -> None:
         """Stand every world in the default pose with its height to reach."""
-        goals = np.zeros((env.num_envs, 3), dtype=np.float32)
+        goals = np.zeros((env.num_envs, 3))
         goals[:, 2] = self.target
-        env.evaluation_reset(goals)
+        env.evaluation_reset(jump_commands(goals, 0.5, env.step_dt))
 
     def update(self, arrays: dict[str, np.ndarray], step_dt: float) -> bool:
         """Take in a policy step; return whether all jumps have ended."""
@@ -150,8 +158,8 @@ class Jumps(JumpLog):
         self.tilt[running] = arrays["peak_tilt"][running]
         due = running & (arrays["phase"] == LANDED) & (arrays["phase_steps"] == round(REST_TIME / step_dt))
         self.rest_speed[due] = np.linalg.norm(arrays["base_vel"][due], axis=1)
-        ended = running & (arrays["rule"] >= 0)
-        self.end[ended] = arrays["rule"][ended]
+        ended = running & (arrays["ending"] >= 0)
+        self.end[ended] = arrays["ending"][ended]
         return bool((self.end >= 0).all())
 
     @property
@@ -199,7 +207,7 @@ def run_jumps(
 
 def rule_names(env: EvaluationEnv) -> tuple[str, ...]:
     """Return the names of the ends of an episode."""
-    return tuple(rule.name for rule in env.task.rules)
+    return tuple(term.name for term in env.task.terminations)
 
 
 def jump_figures(jumps: Jumps, in_range: tuple[float, float]) -> Figures:

@@ -24,6 +24,7 @@ from jumper_warp.evaluation.jumps import (
     JumpLog,
     failures,
     finite,
+    jump_commands,
     largest,
     mean,
 )
@@ -51,7 +52,7 @@ NOT_BEGUN = "not_begun"
 
 def ends_of_a_test(task: TaskCfg) -> TaskCfg:
     """Return a task with the ends that a jump has in a test."""
-    return replace(task, rules=tuple(rule for rule in task.rules if rule.name in ENDS))
+    return replace(task, terminations=tuple(term for term in task.terminations if term.name in ENDS))
 
 
 @dataclass
@@ -117,9 +118,9 @@ class Landings(JumpLog):
 
     def begin(self, env: EvaluationEnv) -> None:
         """Stand every world in the default pose with its first goal."""
-        goals = np.zeros((env.num_envs, 3), dtype=np.float32)
+        goals = np.zeros((env.num_envs, 3))
         goals[:, :2] = self.goals[:, 0]
-        env.evaluation_reset(goals, self.delay, self.headings)
+        env.evaluation_reset(jump_commands(goals, self.delay, env.step_dt), self.headings)
 
     def look(self, env: EvaluationEnv) -> dict[str, np.ndarray]:
         """Return the state of every world's episode, and which of its paws are on the ground."""
@@ -134,7 +135,7 @@ class Landings(JumpLog):
         if due.any():
             goals = np.zeros((env.num_envs, 3), dtype=np.float32)
             goals[due, :2] = self.goals[due, self.current[due]]
-            env.next_jump(goals, due)
+            env.command(goals, due)
         return ended
 
     def update(self, arrays: dict[str, np.ndarray], step_dt: float) -> bool:
@@ -153,11 +154,11 @@ class Landings(JumpLog):
         self.touchdown[row[first], self.current[row[first]]] = now["base_pos"][first, :2]
         self.place_soon[row[soon], self.current[row[soon]]] = now["base_pos"][soon, :2]
         self._update_paws(row, landed[:, None] & now["paws_down"], landed, step_dt)
-        failed = now["rule"] > 0
+        failed = now["ending"] > 0
         rested = ~failed & landed & (now["phase_steps"] >= round(self.rest / step_dt))
         speed = np.linalg.norm(now["base_vel"], axis=1)
         self.rest_speed[at] = np.where(rested, speed, np.inf)
-        self.end[at] = np.where(failed, now["rule"], np.where(rested, 0, -1))
+        self.end[at] = np.where(failed, now["ending"], np.where(rested, 0, -1))
         self.current[row[rested]] += 1
         self.current[row[failed]] = count
         return bool((self.current >= count).all())

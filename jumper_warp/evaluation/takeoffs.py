@@ -16,9 +16,9 @@ import torch
 import warp as wp
 from scipy.spatial.transform import Rotation
 
-from jumper_warp.envs.env import JumpEnv
+from jumper_warp.envs.env import Env
 from jumper_warp.evaluation.film import ankles
-from jumper_warp.evaluation.jumps import LANDED
+from jumper_warp.evaluation.jumps import LANDED, jump_commands
 from jumper_warp.robot.description import load_description
 from jumper_warp.robot.model import leg_geometry
 from jumper_warp.robot.motors import FilterCfg
@@ -48,7 +48,7 @@ Act = Callable[[torch.Tensor], torch.Tensor]
 class Takeoffs:
     """What became of a jump a world; arrays of shape (num_envs, ...), zero before it happened."""
 
-    env: JumpEnv
+    env: Env
     """Its worlds have just been reset for an evaluation, heading along x."""
     off: np.ndarray = field(init=False)
     """Whether the robot has taken off."""
@@ -127,9 +127,9 @@ class Takeoffs:
         back = self._base_start[:, 0] - pose[:, 0, 0]
         self.back = np.where(self.off, self.back, np.maximum(self.back, back))
         early = self._since <= CLEAR
-        self.bad |= (~self.off & stepped) | (early & (task["rule"] > 0))
+        self.bad |= (~self.off & stepped) | (early & (task["ending"] > 0))
         self.bad |= early & self.off & (task["phase"] == LANDED)
-        self.end = np.where((self.end < 0) & self.off, task["rule"], self.end)
+        self.end = np.where((self.end < 0) & self.off, task["ending"], self.end)
         new = np.flatnonzero((task["took_off"] == 1) & ~self.off)
         if len(new):
             self.com[new], self.com_vel[new], momentum, _ = self._whole(new, pose, twist)
@@ -181,7 +181,7 @@ def mean_of_sides(actions: np.ndarray) -> np.ndarray:
 
 
 def fly(
-    env: JumpEnv,
+    env: Env,
     actions: np.ndarray,
     after: float | Act = LANDING_ACTION,
     *,
@@ -197,7 +197,8 @@ def fly(
         goals: [m] (num_envs, 3), what a policy is told; by default none is away from the start.
         to_rest: Whether to go on until REST, and not only until all takeoffs are known.
     """
-    env.evaluation_reset(np.zeros((env.num_envs, 3)) if goals is None else goals, 0.0)
+    goals = np.zeros((env.num_envs, 3)) if goals is None else goals
+    env.evaluation_reset(jump_commands(goals, 0.0, env.step_dt))
     takeoffs = Takeoffs(env)
     for tick in range(LATEST + (REST if to_rest else CLEAR)):
         action = torch.from_numpy(both_sides(actions[:, min(tick, actions.shape[1] - 1)])).to(env.device)

@@ -14,7 +14,7 @@ from rich.console import Console
 from rich.table import Table
 
 from jumper_warp.cli.main import announce
-from jumper_warp.envs.env import JumpEnv
+from jumper_warp.envs.env import Env
 from jumper_warp.evaluation.film import Film, moments
 from jumper_warp.evaluation.jumps import rule_names, run
 from jumper_warp.evaluation.landings import Landings, ends_of_a_test, longest
@@ -87,8 +87,8 @@ class Trial:
         """What the jumps were made in."""
         return f"{self.args.solver}, {'randomised' if self.args.randomize else 'nominal'}"
 
-    def env(self, count: int, **scene: Any) -> JumpEnv:
-        """Return the policy's environment with the ends of a test; scene: more settings of `JumpEnv`."""
+    def env(self, count: int, **scene: Any) -> Env:
+        """Return the policy's environment with the ends of a test; scene: more settings of `Env`."""
         args = self.args
         conditions = Conditions(args.solver, args.randomize, args.randomize, args.seed, args.device)
         env = env_of_policy(self.policy, count, conditions, change=ends_of_a_test, **scene)
@@ -98,7 +98,7 @@ class Trial:
 
     def jump(
         self,
-        env: JumpEnv,
+        env: Env,
         goals: np.ndarray,
         *,
         film: str = "",
@@ -127,7 +127,7 @@ class Trial:
             self._develop(pictures, landings, film)
         return landings
 
-    def _film(self, env: JumpEnv, landings: Landings, drawn: Mapping[str, Any]) -> Film:
+    def _film(self, env: Env, landings: Landings, drawn: Mapping[str, Any]) -> Film:
         """Return the film of some worlds, evenly chosen."""
         ground = drawn.get("ground", "plane")
         worlds = np.linspace(0, env.num_envs - 1, min(self.args.record, env.num_envs)).round().astype(int).tolist()

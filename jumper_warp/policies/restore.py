@@ -1,32 +1,30 @@
 """Reading back what a policy or a training run was made with: its task, its environment, its weights.
 
-Configurations are data: numbers, names and structure are taken from the file, functions only from the project's tasks.
+Configurations are data: functions are looked up in the project's modules and in those that the user has named.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import json
-import math
-import types
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, get_args, get_type_hints
-
-import warp as wp
+from types import ModuleType
+from typing import TYPE_CHECKING, Any, Literal
 
 from jumper_warp.policies.folder import load_policy
+from jumper_warp.policies.legacy import upgraded
 from jumper_warp.policies.policy import Policy
-from jumper_warp.policies.spec import PolicyError, interface_of_task
-from jumper_warp.registry import make_task
+from jumper_warp.policies.spec import PolicyError, make_interface
 from jumper_warp.rl.checkpoint import CheckpointError, best_checkpoint, latest_checkpoint, load_checkpoint
 from jumper_warp.rl.networks import EPS, NORMALISED_LIMIT, RAW_LIMIT
-from jumper_warp.tasks.cfg import Rule, TaskCfg, Term
-from kernels.jump import rewards, terminations
+from jumper_warp.tasks.cfg import TaskCfg
+from jumper_warp.tasks.interface import interface
+from jumper_warp.tasks.saving import TaskError, task_from_json
 
 if TYPE_CHECKING:
-    from jumper_warp.envs.env import JumpEnv
+    from jumper_warp.envs.env import Env
 
 CHECKPOINTS = "checkpoints"
 METRICS = "metrics.jsonl"
@@ -92,9 +90,10 @@ def _policy_of_checkpoint(path: Path, state: dict[str, Any]) -> Policy:
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise CheckpointError(f"{path}: not of a training of this project ({type(error).__name__}: {error})") from error
     try:
-        interface = interface_of_task(restored_task(config), **times, **shape)
-        interface = dataclasses.replace(interface, observation_limit=RAW_LIMIT, normalised_limit=NORMALISED_LIMIT)
-        return Policy(layers, mean, std, interface, config)
+        described = env["interface"] if "interface" in env else interface(restored_task(config))
+        face = make_interface(described, **times, **shape)
+        face = dataclasses.replace(face, observation_limit=RAW_LIMIT, normalised_limit=NORMALISED_LIMIT)
+        return Policy(layers, mean, std, face, config)
     except PolicyError as error:
         raise PolicyError(f"{path}: {error}") from error
 
@@ -106,32 +105,54 @@ def learning_curve(source: Path) -> bytes | None:
     return path.read_bytes() if path.is_file() else None
 
 
+def restored_task(config: dict[str, Any], modules: Iterable[ModuleType] = ()) -> TaskCfg:
+    """Return the task of a saved configuration, from its entry `env` (`Env.config`), without rewards.
+
+    modules: that the user has named; functions that are not the project's are looked up there.
+
+    Raises:
+        PolicyError: The configuration is not of a task that is known here.
+    """
+    try:
+        saved = config["env"]["task"]
+    except (KeyError, TypeError) as error:
+        raise PolicyError(f"no task in the configuration ({type(error).__name__}: {error})") from error
+    try:
+        if isinstance(saved, dict) and "version" not in saved:
+            saved = upgraded(saved)
+        return task_from_json(saved, modules, rewards=False)
+    except TaskError as error:
+        raise PolicyError(f"task in the configuration: {error}") from error
+
+
 def env_of_policy(
     policy: Policy,
     num_envs: int,
     conditions: Conditions,
     *,
     change: Callable[[TaskCfg], TaskCfg] | None = None,
+    modules: Iterable[ModuleType] = (),
     **scene: Any,
-) -> JumpEnv:
-    """Return the environment that a policy was trained in, with other conditions.
+) -> Env:
+    """Return the environment that a policy was trained in, with other conditions and without rewards.
 
     Args:
         policy: Its configuration tells the task.
         num_envs: Number of worlds.
         conditions: Physics, randomisation and noise.
         change: Returns the task that is wanted instead.
-        scene: More settings of `JumpEnv`, such as its ground.
+        modules: That the user has named, for tasks that are not the project's.
+        scene: More settings of `Env`, such as its ground.
 
     Raises:
         PolicyError: This version of the project cannot rebuild it, or its observation is not the policy's.
     """
-    from jumper_warp.envs.env import JumpEnv
+    from jumper_warp.envs.env import Env
 
-    task = restored_task(policy.config)
+    task = restored_task(policy.config, modules)
     if task.observation_names != policy.interface.observation_names:
         raise PolicyError("the policy's observation is not the one that this version of its task gives")
-    return JumpEnv(
+    return Env(
         task if change is None else change(task),
         num_envs,
         seed=conditions.seed,
@@ -142,106 +163,3 @@ def env_of_policy(
         auto_reset=False,
         **scene,
     )
-
-
-def restored_task(config: dict[str, Any]) -> TaskCfg:
-    """Return the task of a saved configuration, from its entry `env` (`JumpEnv.config`).
-
-    Settings that the file lacks have the defaults of their class: what they did before they existed. Reward terms that
-    the project does not have are left out, as a policy does not need them; anything else unknown is refused.
-
-    Raises:
-        PolicyError: The configuration is not of a task of the project.
-    """
-    try:
-        saved = dict(config["env"]["task"])
-        default = make_task(saved["name"])
-        saved["terms"] = [term for term in saved["terms"] if _on(rewards, term["func"])]
-    except (KeyError, TypeError, ValueError) as error:
-        raise PolicyError(f"no task in the configuration ({type(error).__name__}: {error})") from error
-    try:
-        return _restored(default, saved, "task")
-    except PolicyError:
-        raise
-    except (ValueError, TypeError) as error:
-        raise PolicyError(f"task in the configuration: {error}") from error
-
-
-def _restored(default: Any, saved: Any, where: str) -> Any:
-    """Return a value of the default's structure with the saved numbers and names."""
-    if isinstance(default, wp.Function):
-        if saved != default.key:
-            raise PolicyError(f"{where}: this version has {default.key}, the configuration {saved!r:.60}")
-        return default
-    if dataclasses.is_dataclass(default):
-        return _restored_fields(default, saved, where)
-    if isinstance(default, tuple):
-        return _restored_tuple(default, saved, where)
-    kinds = (float, int) if isinstance(default, float) else type(default)
-    if isinstance(saved, bool) != isinstance(default, bool) or not isinstance(saved, kinds):
-        raise PolicyError(f"{where}: expected {type(default).__name__}, got {saved!r:.60}")
-    if isinstance(default, float) and not math.isfinite(saved):
-        raise PolicyError(f"{where}: must be finite, got {saved}")
-    return type(default)(saved)
-
-
-def _restored_fields(default: Any, saved: Any, where: str) -> Any:
-    if not isinstance(saved, dict):
-        raise PolicyError(f"{where}: expected settings by name, got {saved!r:.60}")
-    names = [spec.name for spec in dataclasses.fields(default)]
-    unknown = sorted(set(saved) - set(names))
-    if unknown:
-        raise PolicyError(f"{where}: unknown setting {unknown[0]!r:.60}")
-    hints = get_type_hints(type(default))
-    changes = {}
-    for spec in dataclasses.fields(default):
-        if spec.name not in saved and spec.default_factory is not dataclasses.MISSING:
-            changes[spec.name] = spec.default_factory()
-        elif spec.name not in saved and spec.default is not dataclasses.MISSING:
-            changes[spec.name] = spec.default
-    for name, value in saved.items():
-        if value is None and types.NoneType in get_args(hints[name]):
-            changes[name] = None
-        else:
-            changes[name] = _restored(getattr(default, name), value, f"{where}.{name}")
-    return dataclasses.replace(default, **changes)
-
-
-def _restored_tuple(default: tuple, saved: Any, where: str) -> tuple:
-    """Return a tuple of rows (of as many as were saved), or of numbers or names."""
-    if not isinstance(saved, list):
-        raise PolicyError(f"{where}: expected a list, got {saved!r:.60}")
-    if default and dataclasses.is_dataclass(default[0]):
-        return tuple(
-            _restored(_row(default, row, f"{where}[{i}]"), row, f"{where}[{i}]") for i, row in enumerate(saved)
-        )
-    if where.endswith((".params", ".hidden")):
-        kind = 0 if where.endswith(".hidden") else 0.0
-        return tuple(_restored(kind, value, where) for value in saved)
-    if len(saved) != len(default):
-        raise PolicyError(f"{where}: expected {len(default)} entries, got {len(saved)}")
-    return tuple(_restored(d, value, f"{where}[{i}]") for i, (d, value) in enumerate(zip(default, saved, strict=True)))
-
-
-def _on(shelf: types.ModuleType, name: Any) -> wp.Function | None:
-    """Return the Warp function of a name that a module defines."""
-    func = getattr(shelf, name, None) if isinstance(name, str) else None
-    return func if isinstance(func, wp.Function) and func.func.__module__ == shelf.__name__ else None
-
-
-def _row(rows: tuple, saved: Any, where: str) -> Any:
-    """Return the default row that a saved row builds on: the one with the same function, if rows have functions.
-
-    A function that the task does not use is looked up among the project's rewards or terminations.
-    """
-    if not hasattr(rows[0], "func"):
-        return rows[0]
-    key = saved.get("func") if isinstance(saved, dict) else None
-    for row in rows:
-        if row.func.key == key:
-            return row
-    if isinstance(rows[0], Term) and _on(rewards, key):
-        return Term(_on(rewards, key), 0.0)
-    if isinstance(rows[0], Rule) and _on(terminations, key):
-        return Rule(_on(terminations, key))
-    raise PolicyError(f"{where}: this version has no {key!r:.60}")

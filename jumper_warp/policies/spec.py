@@ -5,12 +5,8 @@ from __future__ import annotations
 import dataclasses
 import math
 import re
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, get_type_hints
-
-if TYPE_CHECKING:
-    from jumper_warp.robot.motors import MotorKindCfg
-    from jumper_warp.tasks.cfg import TaskCfg
+from dataclasses import dataclass, field
+from typing import Any, get_type_hints
 
 ACTIVATIONS = ("elu", "relu", "tanh")
 MAX_HIDDEN = 64
@@ -74,6 +70,8 @@ class PolicyInterface:
     hidden: tuple[int, ...]
     """Widths of the hidden layers."""
     activation: str = "elu"
+    observation_layout: dict[str, Any] = field(default_factory=dict)
+    """Terms by name: first and end column, scale, clip and history; empty in policies of before it was kept."""
     observation_limit: float = 100.0
     """Raw observations are clamped to plus and minus this; what is not finite counts as 0."""
     normalised_limit: float = 10.0
@@ -121,6 +119,7 @@ class PolicyInterface:
         if not isinstance(data, dict):
             raise PolicyError("the interface must be a JSON object")
         hints = get_type_hints(cls)
+        data = {**({"observation_layout": {}} if "observation_layout" not in data else {}), **data}
         different = sorted(set(data) ^ set(hints))
         if different:
             raise PolicyError(f"interface fields missing or unknown: {', '.join(different):.200}")
@@ -151,31 +150,21 @@ def _check_filter(fields: dict[str, Any]) -> None:
             raise PolicyError(f"command_filter {name} must be a number within 1e6, got {value!r:.60}")
 
 
-def interface_of_task(
-    task: TaskCfg, *, policy_dt: float, physics_dt: float, hidden: tuple[int, ...], activation: str = "elu"
+def make_interface(
+    described: dict[str, Any], *, policy_dt: float, physics_dt: float, hidden: tuple[int, ...], activation: str = "elu"
 ) -> PolicyInterface:
-    """Return the interface of policies of a task; policy_dt, physics_dt [s], hidden: widths of the layers."""
-    from jumper_warp.robot.description import MOTOR_JOINTS, load_description
+    """Return the interface of policies of a task.
 
-    def per_motor(lateral: float, transversal: float) -> tuple[float, ...]:
-        return (lateral, transversal, transversal) * (len(MOTOR_JOINTS) // 3)
+    described: what `jumper_warp.tasks.interface` says of it. policy_dt, physics_dt [s]; hidden: widths of the layers.
+    Raises PolicyError: it does not fit together.
+    """
+    shape = {"policy_dt": policy_dt, "physics_dt": physics_dt, "hidden": list(hidden), "activation": activation}
+    optional = {name: value for name, value in defaults().items() if name not in shape}
+    return PolicyInterface.from_json(optional | described | shape)
 
-    def torque(kind: MotorKindCfg) -> float:
-        return min(kind.saturation, kind.peak)
 
-    motors = task.motors
-    return PolicyInterface(
-        task=task.name,
-        observation_names=task.observation_names,
-        joint_names=MOTOR_JOINTS,
-        action_scale=per_motor(*map(math.radians, task.action_scale)),
-        default_joint_pos=tuple(float(angle) for angle in load_description().pose("default")),
-        joint_stiffness=per_motor(motors.lateral.kp, motors.transversal.kp),
-        joint_damping=per_motor(motors.lateral.kd, motors.transversal.kd),
-        torque_limit=per_motor(torque(motors.lateral), torque(motors.transversal)),
-        command_filter=dataclasses.asdict(task.command_filter),
-        policy_dt=policy_dt,
-        physics_dt=physics_dt,
-        hidden=tuple(hidden),
-        activation=activation,
-    )
+def defaults() -> dict[str, Any]:
+    """Return the fields that an interface need not name, as JSON holds them."""
+    fields = dataclasses.fields(PolicyInterface)
+    values = {f.name: f.default for f in fields if f.default is not dataclasses.MISSING}
+    return values | {f.name: f.default_factory() for f in fields if f.default_factory is not dataclasses.MISSING}

@@ -149,6 +149,7 @@ class JumperDynamics:
         self.num_worlds = model.world_count
         self._paws = wp.array(find_paws(model).flatten(), dtype=int, device=self.device)
         self._ground_shape = find_ground(model)
+        self._no_mask = wp.zeros(0, dtype=float, device=self.device)
         self.static_friction_ratio = wp.full(self.num_worlds, 1.0, dtype=float, device=self.device)
         """Static over dynamic friction coefficient [1], shape (num_worlds,); call `pack_friction` after a change."""
 
@@ -172,6 +173,7 @@ class JumperDynamics:
         work.impulse = wp.zeros((4, n), dtype=scalar.vec3, device=self.device)
         work.contact_force = wp.zeros((4, n), dtype=scalar.vec3, device=self.device)
         work.peak_force = wp.zeros(n, dtype=scalar.real, device=self.device)
+        work.peak_paw_force = wp.zeros((4, n), dtype=scalar.real, device=self.device)
         work.torque = wp.zeros((12, n), dtype=scalar.real, device=self.device)
         work.residual = wp.zeros(n, dtype=scalar.real, device=self.device)
         work.sweeps = wp.zeros(n, dtype=int, device=self.device)
@@ -186,35 +188,46 @@ class JumperDynamics:
         self.pack_friction()
         self.pack_gravity()
 
-    def pack_masses(self) -> None:
-        """Read masses, centres of mass and inertias."""
+    def pack_masses(self, mask: wp.array | None = None) -> None:
+        """Read masses, centres of mass and inertias, where mask (num_worlds,) float is not 0; None: everywhere."""
         m = self.model
         self._launch(
-            self.modules.parameters.pack_masses_kernel, (self.num_worlds, 21), [m.body_mass, m.body_com, m.body_inertia]
+            self.modules.parameters.pack_masses_kernel,
+            (self.num_worlds, 21),
+            [m.body_mass, m.body_com, m.body_inertia, self._everywhere(mask)],
         )
 
-    def pack_joints(self) -> None:
-        """Read armature, friction, damping and hard stops."""
+    def pack_joints(self, mask: wp.array | None = None) -> None:
+        """Read armature, friction, damping and hard stops; mask as above."""
         m = self.model
         lower, upper = self.description.transversal_sum
         self._launch(
             self.modules.parameters.pack_joints_kernel,
             (self.num_worlds, 4),
             [m.joint_armature, m.joint_friction, m.joint_damping, m.joint_limit_lower, m.joint_limit_upper,
-             m.joint_limit_ke, m.joint_limit_kd, m.joint_effort_limit, lower, upper],
+             m.joint_limit_ke, m.joint_limit_kd, m.joint_effort_limit, lower, upper, self._everywhere(mask)],
         )  # fmt: skip
 
-    def pack_friction(self) -> None:
-        """Read the friction coefficients of paws and ground."""
+    def pack_friction(self, mask: wp.array | None = None) -> None:
+        """Read the friction coefficients of paws and ground; mask as above."""
         self._launch(
             self.modules.parameters.pack_friction_kernel,
             (self.num_worlds, 4),
-            [self._paws, self._ground_shape, self.model.shape_material_mu, self.static_friction_ratio],
+            [
+                self._paws,
+                self._ground_shape,
+                self.model.shape_material_mu,
+                self.static_friction_ratio,
+                self._everywhere(mask),
+            ],
         )
 
     def pack_gravity(self) -> None:
         """Read gravity."""
         self._launch(self.modules.parameters.pack_gravity_kernel, self.num_worlds, [self.model.gravity])
+
+    def _everywhere(self, mask: wp.array | None) -> wp.array:
+        return self._no_mask if mask is None else mask
 
     def _launch(self, kernel: wp.Kernel, dim: int | tuple[int, ...], inputs: list) -> None:
         wp.launch(kernel, dim=dim, inputs=inputs, outputs=[self.robot.table], device=self.device)

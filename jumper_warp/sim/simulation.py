@@ -8,24 +8,15 @@ from typing import TYPE_CHECKING, Any, Literal
 import newton
 import numpy as np
 import warp as wp
-from newton.sensors import SensorContact
 
-from jumper_warp.robot.description import load_description
 from jumper_warp.robot.grounds import BlockCfg
-from jumper_warp.robot.model import KNEE_DOFS, PHYSICS_DT, build_model
+from jumper_warp.robot.model import PHYSICS_DT, build_model
 from jumper_warp.robot.motors import FilterCfg, MotorCfg, filter_params, jumping_motors, motor_arrays
-from jumper_warp.sim.mujoco import mujoco_solver
-from jumper_warp.sim.solver import TOLERANCE, SolverJumper, check_step, check_tolerance
+from jumper_warp.sim.physics import JumperPhysics, MujocoPhysics, Physics
+from jumper_warp.sim.solver import TOLERANCE, check_step, check_tolerance
 from kernels.actuation.command_filter import command_filter_kernel
-from kernels.actuation.motors import motor_torque_kernel
-from kernels.actuation.passive import passive_torque_kernel
-from kernels.actuation.readout import (
-    arrived_target_kernel,
-    base_velocity_kernel,
-    motor_values_kernel,
-    paw_force_kernel,
-)
-from kernels.dynamics.restore import StateArrays, restore_motors_kernel, restore_state_kernel, zero_worlds_kernel
+from kernels.actuation.readout import base_velocity_kernel
+from kernels.dynamics.restore import StateArrays, restore_motors_kernel, restore_state_kernel
 from kernels.layout import COORDS, DOFS
 
 if TYPE_CHECKING:
@@ -33,9 +24,6 @@ if TYPE_CHECKING:
 
 SUBSTEPS = 8
 """Physics steps of 1/480 s in a policy step of 1/60 s."""
-
-EXPLICIT_STOP = (1000.0, 2.0)
-"""[N m/rad], [N m s/rad] Stops of the transversal sum on MuJoCo, explicit and therefore softer than SolverJumper's."""
 
 SolverName = Literal["jumper", "mujoco"]
 
@@ -111,34 +99,12 @@ class Simulation:
         self._mask = wp.zeros(num_worlds + 1, dtype=wp.bool, device=self.device)  # the last one: no world
         self._base_velocity = wp.zeros(num_worlds, dtype=wp.vec3, device=self.device)
         self._graphs: dict[str, object] = {}
-        if solver == "jumper":
-            self.solver = SolverJumper(self.model, block=block, tolerance=tolerance)
-            self.torque, self.paw_force, self.peak_force = (
-                self.solver.torque, self.solver.contact_force, self.solver.peak_force,
-            )  # fmt: skip
-        else:
-            damping = self.model.joint_damping.numpy().reshape(num_worlds, -1)
-            damping[:, KNEE_DOFS] = 0.0
-            self.model.joint_damping.assign(damping.ravel())
-            self.solver = mujoco_solver(self.model, dt=dt)
-            self._prepare_mujoco(observe_forces)
-
-    def _prepare_mujoco(self, observe_forces: bool) -> None:
-        n = self.num_worlds
-        robot = load_description()
-        self._passive = [robot.knee_damping, robot.knee_damping_limit, *robot.transversal_sum, *EXPLICIT_STOP]
-        self.torque = wp.zeros((12, n), dtype=float, device=self.device)
-        self.paw_force = wp.zeros((4, n), dtype=wp.vec3, device=self.device)
-        self.peak_force = wp.zeros(n, dtype=float, device=self.device)
-        self._arrived = wp.zeros((12, n), dtype=float, device=self.device)
-        self._sensor = self._contacts = self._observables = None
-        if observe_forces:
-            pipeline = newton.CollisionPipeline(
-                self.model, rigid_contact_max=self.solver.get_max_contact_count(), soft_contact_max=0
-            )
-            self._contacts = pipeline.contacts()
-            self._sensor = SensorContact(self.model, sensing_shapes="*_paw", request_contact_attributes=False)
-            self._observables = self.solver.observables({"contact_f"}, contacts=self._contacts)
+        self.physics: Physics = (
+            JumperPhysics(self, block, tolerance) if solver == "jumper" else MujocoPhysics(self, observe_forces)
+        )
+        self.solver = self.physics.solver
+        self.torque, self.paw_force = self.physics.torque, self.physics.paw_force
+        self.peak_force = self.physics.peak_force
 
     def step(self) -> None:
         """Advance one policy step towards `target`."""
@@ -154,13 +120,7 @@ class Simulation:
         mask: Which worlds, bool of shape (num_worlds,), by default all. Raises ValueError for anything else.
         """
         self._take_mask(mask)
-        self.solver.reset(self.state, self._mask, flags=newton.StateFlags.NONE)
-        if self.block is not None:
-            self.solver.reset_blocks(self._mask)
-        if not isinstance(self.solver, SolverJumper):
-            # the loops' rows of the next step are made with the velocities of the last one
-            for left_over in (self.solver.mjw_data.cvel, self.solver.mjw_data.cdof_dot):
-                self._launch(zero_worlds_kernel, left_over.shape, [self._mask], [left_over])
+        self.physics.forget(self._mask)
         inputs = [self._mask, self._start]
         self._launch(restore_state_kernel, (self.num_worlds, int(COORDS)), inputs, [state_arrays(self.state)])
         results = [self.target, self._safe_target, self.torque, self.paw_force, self.peak_force]
@@ -221,53 +181,10 @@ class Simulation:
         )
 
     def _physics(self, substeps: int) -> None:
-        self.physics(substeps, self._safe_target)
-
-    def physics(
-        self,
-        substeps: int,
-        target: wp.array,
-        previous: wp.array | None = None,
-        delay: wp.array | None = None,
-        bodies: bool = True,
-    ) -> None:
-        """Launch physics steps towards motor targets [rad], shape (12, num_worlds), without the filter.
-
-        With `delay` [physics steps], shape (num_worlds,), the motors follow `previous` until the target arrives.
-        `bodies` False leaves passive joints and bodies of the state behind on SolverJumper, which does not need them.
-        """
-        if isinstance(self.solver, SolverJumper):
-            self.solver.step_motors(
-                self.state, self.state, self.motors, target, self.dt, substeps,
-                previous=previous, delay=delay, bodies=bodies,
-            )  # fmt: skip
-            return
-        for i in range(substeps):
-            if delay is not None:
-                self._launch(
-                    arrived_target_kernel, (12, self.num_worlds), [target, previous, delay, i], [self._arrived]
-                )
-            self._mujoco_step(target if delay is None else self._arrived, restart=i == 0)
-
-    def _mujoco_step(self, target: wp.array, restart: bool) -> None:
-        """Launch one physics step of SolverMuJoCo."""
-        q, qd = self.state.joint_q, self.state.joint_qd
-        joint_f = self.control.joint_f
-        motors = (12, self.num_worlds)
-        self._launch(motor_torque_kernel, motors, [target, q, qd, COORDS, DOFS, self.motors], [joint_f])
-        self._launch(motor_values_kernel, motors, [joint_f], [self.torque])
-        self._launch(passive_torque_kernel, (self.num_worlds, 4), [q, qd, *self._passive], [joint_f])
-        self.solver.step(self.state, self.state, self.control, self._contacts, self.dt, observables=self._observables)
-        if self._sensor is not None:
-            self._read_paw_forces(restart)
+        self.physics.advance(substeps, self._safe_target)
 
     def _launch(self, kernel: wp.Kernel, dim: int | tuple[int, ...], inputs: list, outputs: list) -> None:
         wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device)
-
-    def _read_paw_forces(self, restart: bool) -> None:
-        self._sensor.update(self.state, self._contacts, observables=self._observables)
-        inputs = [self._sensor.total_force, int(restart)]
-        self._launch(paw_force_kernel, self.num_worlds, inputs, [self.paw_force, self.peak_force])
 
     def joint_q(self) -> np.ndarray:
         """Return the joint coordinates, (num_worlds, 43)."""

@@ -28,10 +28,11 @@ def paw_force_kernel(
     # out
     paw_force: wp.array2d(dtype=wp.vec3),
     peak_force: wp.array(dtype=float),
+    peak_paw_force: wp.array2d(dtype=float),
 ):
-    """Turn a contact sensor's forces [N], four rows a world, into shape (4, num_worlds), and keep the largest sum.
+    """Turn a contact sensor's forces [N], four rows a world, into shape (4, num_worlds), and keep the largest.
 
-    Launch over worlds. restart 1: forget the largest sum so far.
+    Launch over worlds. peak_force is of their sum. restart 1: forget the largest so far.
     """
     world = wp.tid()
     total = wp.vec3(0.0)
@@ -39,6 +40,8 @@ def paw_force_kernel(
         force = total_force[4 * world + k]
         paw_force[k, world] = force
         total += force
+        largest = wp.where(restart != 0, 0.0, peak_paw_force[k, world])
+        peak_paw_force[k, world] = wp.max(largest, wp.length(force))
     peak = peak_force[world]
     if restart != 0:
         peak = 0.0

@@ -245,6 +245,28 @@ def load_leg(
 
 
 @wp.func
+def next_leg(turn: int) -> int:
+    """Return the leg at a place of the way around the body: FL, FR, BR, BL."""
+    return (turn % 4) ^ ((turn % 4) >> 1)
+
+
+@wp.func
+def add_leg(
+    found: Collisions, ground: Ground, leg: LegCapsules, neighbour: LegCapsules, pos: vec3, rotation: mat33
+) -> Collisions:
+    """Return the result with one leg taken into account: with the ground, itself, the shell and the next leg."""
+    over_ground = leg_ground_distances(ground, leg, pos, rotation)
+    result = record(found, over_ground[0], HOUSING_GROUND)
+    result = record(result, over_ground[1], THIGH_GROUND)
+    result = record(result, over_ground[2], KNEE_GROUND)
+    result = record(result, over_ground[3], SHANK_GROUND)
+    bound = wp.max(result.clearance, real(0.0))
+    result = record(result, leg_self_distance(leg, bound), LEG_SELF)
+    result = record(result, leg_shell_distance(leg, bound), LEG_SHELL)
+    return record(result, leg_leg_distance(leg, neighbour, bound), LEG_LEG)
+
+
+@wp.func
 def world_collisions(
     geometry: wp.array(dtype=LegGeometry),
     ground: Ground,
@@ -267,23 +289,32 @@ def world_collisions(
     found.clearance = margin
     here = world_ground(ground, start // COORDS)
     found = record(found, body_ground_distance(here, pos, rotation), BODY_GROUND)
-    capsules = load_leg(geometry, joint_q, start, 0)
+    leg = load_leg(geometry, joint_q, start, 0)
     count = wp.int32(4)
-    for i in range(count):
-        over_ground = leg_ground_distances(here, capsules, pos, rotation)
-        found = record(found, over_ground[0], HOUSING_GROUND)
-        found = record(found, over_ground[1], THIGH_GROUND)
-        found = record(found, over_ground[2], KNEE_GROUND)
-        found = record(found, over_ground[3], SHANK_GROUND)
-        bound = wp.max(found.clearance, real(0.0))
-        found = record(found, leg_self_distance(capsules, bound), LEG_SELF)
-        found = record(found, leg_shell_distance(capsules, bound), LEG_SHELL)
-        # around the body, each leg and its next neighbour: FL, FR, BR, BL
-        turn = (i + 1) % 4
-        neighbour = load_leg(geometry, joint_q, start, turn ^ (turn >> 1))
-        found = record(found, leg_leg_distance(capsules, neighbour, bound), LEG_LEG)
-        capsules = neighbour
+    for turn in range(count):
+        neighbour = load_leg(geometry, joint_q, start, next_leg(turn + 1))
+        found = add_leg(found, here, leg, neighbour, pos, rotation)
+        leg = neighbour
     return found
+
+
+@wp.func
+def leg_collisions(
+    geometry: wp.array(dtype=LegGeometry), ground: Ground, joint_q: wp.array(dtype=wp.float32), world: int, turn: int
+) -> int:
+    """Return the flags of one leg, counted around the body; together the four give those of `world_collisions`."""
+    start = world * COORDS
+    pos = vec3(real(joint_q[start]), real(joint_q[start + 1]), real(joint_q[start + 2]))
+    rotation = wp.quat_to_matrix(
+        quat(real(joint_q[start + 3]), real(joint_q[start + 4]), real(joint_q[start + 5]), real(joint_q[start + 6]))
+    )
+    found = Collisions()
+    here = world_ground(ground, world)
+    if turn == 0:
+        found = record(found, body_ground_distance(here, pos, rotation), BODY_GROUND)
+    leg = load_leg(geometry, joint_q, start, next_leg(turn))
+    neighbour = load_leg(geometry, joint_q, start, next_leg(turn + 1))
+    return add_leg(found, here, leg, neighbour, pos, rotation).flags
 
 
 @wp.kernel

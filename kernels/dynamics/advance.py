@@ -48,6 +48,7 @@ class Workspace:
     impulse: wp.array2d(dtype=vec3)  # [N s] of each paw in the last step, world frame, (4, num_worlds)
     contact_force: wp.array2d(dtype=vec3)  # [N] on each paw in the last step, world frame, (4, num_worlds)
     peak_force: wp.array(dtype=real)  # [N] largest total paw force of the launch
+    peak_paw_force: wp.array2d(dtype=real)  # [N] largest on each paw in the launch, (4, num_worlds)
     torque: wp.array2d(dtype=real)  # [N m] of each motor in the last step, (12, num_worlds)
     residual: wp.array(dtype=real)  # [m/s] of the contact iteration, largest of the launch
     sweeps: wp.array(dtype=int)  # of the contact iteration, most of the launch
@@ -166,8 +167,10 @@ def record_contacts(
     for k in range(contacts.shape[0]):
         impulse = wp.quat_rotate(base.quat, contacts[k].impulse)
         work.impulse[k, world] = impulse
-        work.contact_force[k, world] = impulse / dt
-        total += impulse / dt
+        force = impulse / dt
+        work.contact_force[k, world] = force
+        work.peak_paw_force[k, world] = wp.max(work.peak_paw_force[k, world], wp.length(force))
+        total += force
     work.peak_force[world] = wp.max(work.peak_force[world], wp.length(total))
     work.sweeps[world] = wp.max(work.sweeps[world], solved.sweeps)
     work.residual[world] = wp.max(work.residual[world], solved.change)
@@ -208,6 +211,8 @@ def advance_kernel(
     work.residual[world] = real(0.0)
     work.sweeps[world] = 0
     work.peak_force[world] = real(0.0)
+    for k in range(4):
+        work.peak_paw_force[k, world] = real(0.0)
     for step in range(settings.substeps):
         base = advance_once(robot, settings, drive, work, world, step, base, angles, rates, legs, paws, contacts)
     total = real(0.0)

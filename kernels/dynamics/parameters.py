@@ -116,11 +116,18 @@ def pack_masses_kernel(
     body_mass: wp.array(dtype=float),
     body_com: wp.array(dtype=wp.vec3),
     body_inertia: wp.array(dtype=wp.mat33),
+    mask: wp.array(dtype=float),
     # out
     table: wp.array2d(dtype=real),
 ):
-    """Write the mass moments of every body; one thread per (world, body)."""
+    """Write the mass moments of every body; one thread per (world, body).
+
+    mask, here and below: (num_worlds,), not 0 where to write; empty: everywhere.
+    """
     world, body = wp.tid()
+    if mask.shape[0] > 0:
+        if mask[world] == 0.0:
+            return
     row = BASE
     if body > 0:
         row = ((body - 1) // LEG_BODIES) * LEG_ROWS + ((body - 1) % LEG_BODIES) * MOMENT_ROWS
@@ -141,11 +148,15 @@ def pack_joints_kernel(
     effort_limit: wp.array(dtype=float),
     sum_lower: float,
     sum_upper: float,
+    mask: wp.array(dtype=float),
     # out
     table: wp.array2d(dtype=real),
 ):
     """Write the joint-space parameters of every leg; one thread per (world, leg)."""
     world, leg = wp.tid()
+    if mask.shape[0] > 0:
+        if mask[world] == 0.0:
+            return
     row = leg * LEG_ROWS
     dof = world * DOFS + 6 + 5 * leg
     for j in range(3):
@@ -175,6 +186,7 @@ def pack_friction_kernel(
     ground_shape: int,
     shape_mu: wp.array(dtype=float),
     static_ratio: wp.array(dtype=float),
+    mask: wp.array(dtype=float),
     # out
     table: wp.array2d(dtype=real),
 ):
@@ -183,6 +195,9 @@ def pack_friction_kernel(
     The pair's coefficient is the larger of paw and ground, as in MuJoCo; static = dynamic * static_ratio[world].
     """
     world, leg = wp.tid()
+    if mask.shape[0] > 0:
+        if mask[world] == 0.0:
+            return
     mu = shape_mu[paw_shapes[world * 4 + leg]]
     if ground_shape >= 0:
         mu = wp.max(mu, shape_mu[ground_shape])

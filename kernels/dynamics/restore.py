@@ -76,3 +76,15 @@ def zero_worlds_kernel(
     world, i = wp.tid()
     if mask[world]:
         values[world, i] = wp.spatial_vector()
+
+
+@wp.kernel
+def mask_kernel(
+    # in
+    mask: wp.array(dtype=float),
+    # out
+    chosen: wp.array(dtype=wp.bool),
+):
+    """Write where a mask is not 0; one thread per world."""
+    world = wp.tid()
+    chosen[world] = mask[world] != 0.0

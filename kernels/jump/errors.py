@@ -2,16 +2,17 @@
 
 import warp as wp
 
-from .task import JumpTask, RobotView, goal_offset
+from ..mdp.view import RobotView
+from .state import JumpState, goal_offset
 
 
 @wp.func
-def height_error(view: RobotView, task: JumpTask) -> float:
+def height_error(view: RobotView, task: JumpState) -> float:
     """Return the distance [m] of the highest base height from the wanted one."""
     return wp.abs(task.max_height - task.goal[2])
 
 
 @wp.func
-def landing_error(view: RobotView, task: JumpTask) -> float:
+def landing_error(view: RobotView, task: JumpState) -> float:
     """Return the horizontal distance [m] of the base from the goal."""
     return wp.length(goal_offset(view, task))

@@ -2,9 +2,10 @@
 
 import warp as wp
 
+from ..mdp.random import Draw, between, within
 from ..scalar import real, vec2
 from ..terrain.ground import Block
-from .reset_draws import ResetRanges, between, within
+from .reset_draws import ResetRanges
 
 wp.set_module_options({"enable_backward": False})
 
@@ -51,20 +52,20 @@ def fixed_block(center: wp.vec2, half: wp.vec2, height: float) -> Block:
 
 
 @wp.func
-def draw_platform(state: wp.uint32, ranges: GroundRanges, foot: wp.vec2, goal: wp.vec3) -> Block:
+def draw_platform(draw: Draw, ranges: GroundRanges, foot: wp.vec2, goal: wp.vec3) -> Block:
     """Return a platform under a robot at the origin; none if its paws could not land beside it."""
     half = foot + wp.vec2(
-        between(state, 61, EVERY_SIDE, ranges.room),
-        between(state, 62, EVERY_SIDE, ranges.room),
+        between(draw, 61, EVERY_SIDE, ranges.room),
+        between(draw, 62, EVERY_SIDE, ranges.room),
     )
     beyond = wp.vec2(wp.abs(goal[0]), wp.abs(goal[1])) - half - foot
     if wp.max(beyond) < ranges.clearance:
         return Block()
-    return fixed_block(wp.vec2(0.0), half, within(state, 63, ranges.drop))
+    return fixed_block(wp.vec2(0.0), half, within(draw, 63, ranges.drop))
 
 
 @wp.func
-def draw_block(state: wp.uint32, ranges: GroundRanges, foot: wp.vec2, goal: wp.vec3) -> Block:
+def draw_block(draw: Draw, ranges: GroundRanges, foot: wp.vec2, goal: wp.vec3) -> Block:
     """Return a block under the goal; none without room for its near side between the paws before and after the jump.
 
     The near side is anywhere there, across the axis along which the goal is farther.
@@ -75,24 +76,24 @@ def draw_block(state: wp.uint32, ranges: GroundRanges, foot: wp.vec2, goal: wp.v
     farthest = way - foot[along] - ranges.clearance
     if nearest > farthest:
         return Block()
-    near = between(state, 61, nearest, farthest)
-    far = way + foot[along] + between(state, 62, EVERY_SIDE, ranges.room)
+    near = between(draw, 61, nearest, farthest)
+    far = way + foot[along] + between(draw, 62, EVERY_SIDE, ranges.room)
     center = wp.vec2(goal[0], goal[1])
     center[along] = wp.sign(goal[along]) * 0.5 * (near + far)
-    half = foot + wp.vec2(between(state, 64, EVERY_SIDE, ranges.room))
+    half = foot + wp.vec2(between(draw, 64, EVERY_SIDE, ranges.room))
     half[along] = 0.5 * (far - near)
-    block = fixed_block(center, half, within(state, 63, ranges.rise))
-    block.mass = real(within(state, 65, ranges.mass))
-    block.friction = real(within(state, 66, ranges.friction))
+    block = fixed_block(center, half, within(draw, 63, ranges.rise))
+    block.mass = real(within(draw, 65, ranges.mass))
+    block.friction = real(within(draw, 66, ranges.friction))
     return block
 
 
 @wp.func
-def draw_ground(state: wp.uint32, ranges: GroundRanges, foot: wp.vec2, goal: wp.vec3) -> Block:
+def draw_ground(draw: Draw, ranges: GroundRanges, foot: wp.vec2, goal: wp.vec3) -> Block:
     """Return the block of a standing start at the origin with a goal [m], world axes; mostly there is none."""
-    u = between(state, 60, 0.0, 1.0)
+    u = between(draw, 60, 0.0, 1.0)
     if u < ranges.platform:
-        return draw_platform(state, ranges, foot, goal)
+        return draw_platform(draw, ranges, foot, goal)
     if u < ranges.platform + ranges.block:
-        return draw_block(state, ranges, foot, goal)
+        return draw_block(draw, ranges, foot, goal)
     return Block()

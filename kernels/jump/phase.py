@@ -2,47 +2,40 @@
 
 import warp as wp
 
-from .task import FLIGHT, LANDED, STANCE, JumpTask, RobotView
-
-GRAVITY = wp.constant(9.81)  # [m/s^2]
+from ..mdp.view import RobotView, tilt
+from .state import FLIGHT, LANDED, STANCE, JumpState
 
 
 @wp.func
-def estimated_apex(pos: wp.vec3, lin_vel: wp.vec3) -> float:
-    """Return the height [m] that a projectile will reach: h_max = z + v_z^2 / 2g, or z if it falls."""
+def estimated_apex(pos: wp.vec3, lin_vel: wp.vec3, g: float) -> float:
+    """Return the height [m] that a projectile will reach, h_max = z + v_z^2 / 2g, or z if it falls; g [m/s^2]."""
     up = wp.max(lin_vel[2], 0.0)
-    return pos[2] + up * up / (2.0 * GRAVITY)
+    return pos[2] + up * up / (2.0 * g)
 
 
 @wp.func
-def time_to_height(z: float, vz: float, height: float) -> float:
+def time_to_height(z: float, vz: float, height: float, g: float) -> float:
     """Return the time [s] at which a projectile falls through a height [m]; if it never gets there, at its apex."""
-    under_root = vz * vz + 2.0 * GRAVITY * (z - height)
-    return wp.max((vz + wp.sqrt(wp.max(under_root, 0.0))) / GRAVITY, 0.0)
+    under_root = vz * vz + 2.0 * g * (z - height)
+    return wp.max((vz + wp.sqrt(wp.max(under_root, 0.0))) / g, 0.0)
 
 
 @wp.func
-def estimated_landing(pos: wp.vec3, lin_vel: wp.vec3, height: float) -> wp.vec2:
+def estimated_landing(pos: wp.vec3, lin_vel: wp.vec3, height: float, g: float) -> wp.vec2:
     """Return where (x, y) [m] a projectile falls through a height [m]."""
-    t = time_to_height(pos[2], lin_vel[2], height)
+    t = time_to_height(pos[2], lin_vel[2], height, g)
     return wp.vec2(pos[0] + t * lin_vel[0], pos[1] + t * lin_vel[1])
 
 
 @wp.func
-def landing_error_estimate(view: RobotView, task: JumpTask, height: float) -> float:
+def landing_error_estimate(view: RobotView, task: JumpState, height: float) -> float:
     """Return how far from the goal [m] the base's projectile falls through a height [m] above the ground there."""
-    landing = estimated_landing(view.pos, view.lin_vel, height + task.goal_ground)
+    landing = estimated_landing(view.pos, view.lin_vel, height + task.goal_ground, view.fall_acc)
     return wp.length(wp.vec2(task.goal[0] - landing[0], task.goal[1] - landing[1]))
 
 
 @wp.func
-def tilt(view: RobotView) -> float:
-    """Return the angle [rad] between body z and world z."""
-    return wp.acos(wp.clamp(-view.gravity[2], -1.0, 1.0))
-
-
-@wp.func
-def next_phase(task: JumpTask, view: RobotView, takeoff_speed: float) -> int:
+def next_phase(task: JumpState, view: RobotView, takeoff_speed: float) -> int:
     """Return the phase after this policy step; a takeoff needs free paws and an upward speed [m/s]."""
     if task.phase == STANCE and view.contacts == 0 and view.lin_vel[2] > takeoff_speed:
         return FLIGHT
@@ -52,8 +45,8 @@ def next_phase(task: JumpTask, view: RobotView, takeoff_speed: float) -> int:
 
 
 @wp.func
-def advance_jump(task: JumpTask, view: RobotView, old_lin_vel: wp.vec3, takeoff_speed: float) -> JumpTask:
-    """Return the episode's state one policy step later; old_lin_vel [m/s]: of the base, the step before."""
+def advance_jump(view: RobotView, task: JumpState, takeoff_speed: float) -> JumpState:
+    """Return the jump's state one policy step later; takeoff_speed [m/s]: upward, that begins a flight."""
     t = task
     t.steps = task.steps + 1
     phase = next_phase(task, view, takeoff_speed)
@@ -71,7 +64,7 @@ def advance_jump(task: JumpTask, view: RobotView, old_lin_vel: wp.vec3, takeoff_
             t.apex_passed = 1
             t.at_apex = 1
     if t.touched_down == 1:
-        t.touchdown_vel = old_lin_vel
+        t.touchdown_vel = view.old_lin_vel
         t.peak_tilt = 0.0
     if phase == LANDED:
         t.peak_tilt = wp.max(t.peak_tilt, tilt(view))

@@ -8,11 +8,16 @@ whose paws are below the ground is drawn again; the default pose stands in after
 
 import warp as wp
 
+from ..actuation.command_filter import FilterParams
 from ..collision.robot import world_collisions
 from ..kinematics.geometry import LegGeometry
 from ..kinematics.inverse import LegLimits, clamped_closed_form
 from ..kinematics.leg import leg_forward_kinematics, leg_inverse_velocity
-from ..layout import COORDS, DOFS, motor_slot
+from ..layout import COORDS, DOFS
+from ..mdp.env import Scene, SkillSettings
+from ..mdp.random import Draw, between, branch, within
+from ..mdp.reset import store_pose
+from ..mdp.view import RobotArrays, RobotView, base_pos, turned, yaw_of
 from ..scalar import real
 from ..state import leg_coord, leg_dof, store_motors
 from ..terrain.ground import Block, Ground, rest_block, surface, world_ground
@@ -23,37 +28,65 @@ from .reset_draws import (
     IN_FLIGHT,
     STANDING,
     TOUCHDOWN,
-    Draw,
+    BaseDraw,
     ResetRanges,
-    between,
     draw_base,
     draw_box,
     draw_paw,
     draw_scheme,
-    turned,
-    within,
 )
-from .task import FLIGHT, LANDED, STANCE, JumpTask, yaw_of
+from .state import FLIGHT, LANDED, STANCE, JumpState
 
 wp.set_module_options({"enable_backward": False})
 
 ATTEMPTS = wp.constant(6)
 
 
+@wp.struct
+class JumpSettings:
+    """How jumps begin."""
+
+    states: ResetRanges
+    grounds: GroundRanges
+
+
+@wp.struct
+class JumpLevel:
+    """One level of the curriculum."""
+
+    goal_lower: wp.vec3  # [m] relative to start and heading: landing x, y, and base height at the apex (0: any)
+    goal_upper: wp.vec3
+    base_height: wp.vec2  # [m] of standing starts
+    jump_again: float  # share of landed robots that get another goal
+
+
 @wp.func
-def draw_leg_in_flight(state: wp.uint32, ranges: ResetRanges, leg: int, lateral: float) -> wp.vec3:
+def leg_limits(params: FilterParams) -> LegLimits:
+    """Return the limits of a command filter as those of the inverse kinematics."""
+    limits = LegLimits()
+    limits.lateral_lower = params.lateral.lower
+    limits.lateral_upper = params.lateral.upper
+    limits.transversal_lower = params.transversal.lower
+    limits.transversal_upper = params.transversal.upper
+    limits.sum_lower = params.sum.lower
+    limits.sum_upper = params.sum.upper
+    return limits
+
+
+@wp.func
+def draw_leg_in_flight(draw: Draw, ranges: ResetRanges, leg: int, lateral: float) -> wp.vec3:
     """Return motor angles [rad] of a leg in flight: both thighs about alike, all legs about alike."""
     lower = ranges.flight_transversal[0]
     upper = ranges.flight_transversal[1]
-    middle = within(state, 7, ranges.flight_transversal)
-    outer = wp.clamp(middle + between(state, 30 + leg, -0.1, 0.1), lower, upper)
-    inner = wp.clamp(middle + between(state, 34 + leg, -0.1, 0.1), lower, upper)
-    return wp.vec3(lateral + between(state, 38 + leg, -0.03, 0.03), outer, inner)
+    middle = within(draw, 7, ranges.flight_transversal)
+    outer = wp.clamp(middle + between(draw, 30 + leg, -0.1, 0.1), lower, upper)
+    inner = wp.clamp(middle + between(draw, 34 + leg, -0.1, 0.1), lower, upper)
+    return wp.vec3(lateral + between(draw, 38 + leg, -0.03, 0.03), outer, inner)
 
 
 @wp.func
 def store_leg(
-    geo: LegGeometry, limits: LegLimits, world: int, leg: int, d: Draw, paw: wp.vec3, angles_in_flight: wp.vec3,
+    geo: LegGeometry, limits: LegLimits, world: int, leg: int, d: BaseDraw, paw: wp.vec3, angles_in_flight: wp.vec3,
     moving: int, joint_q: wp.array(dtype=float), joint_qd: wp.array(dtype=float),
 ) -> int:  # fmt: skip
     """Write a leg's motor angles and rates; returns 0 if its paw position [m], relative to the base, is out of reach.
@@ -78,8 +111,8 @@ def store_leg(
 
 @wp.func
 def store_draw(
-    geometry: wp.array(dtype=LegGeometry), ground: Ground, limits: LegLimits, ranges: ResetRanges, state: wp.uint32,
-    world: int, scheme: int, d: Draw, heading: float, lift: float,
+    geometry: wp.array(dtype=LegGeometry), ground: Ground, limits: LegLimits, ranges: ResetRanges, draw: Draw,
+    world: int, scheme: int, d: BaseDraw, heading: float, lift: float,
     joint_q: wp.array(dtype=float), joint_qd: wp.array(dtype=float),
 ) -> int:  # fmt: skip
     """Write a drawn state; returns 0 if it cannot be taken. lift [m]: ground height under the base."""
@@ -91,10 +124,10 @@ def store_draw(
     joint_q[q + 2] = d.pos[2] + lift
     for j in range(4):
         joint_q[q + 3 + j] = d.quat[j]
-    depth = within(state, 8, ranges.paw_depth)
+    depth = within(draw, 8, ranges.paw_depth)
     for leg in range(geometry.shape[0]):
         geo = geometry[leg]
-        spot = d.spot + draw_paw(state, ranges, leg, heading)
+        spot = d.spot + draw_paw(draw, ranges, leg, heading)
         paw = spot - d.pos
         if scheme == TOUCHDOWN:
             # paws hang below the base, a little above the ground at least
@@ -102,7 +135,7 @@ def store_draw(
         else:
             here = surface(ground, spot[0], spot[1])
             paw[2] = here[0] + geo.paw_radius - d.pos[2] - lift
-        air = draw_leg_in_flight(state, ranges, leg, d.lateral)
+        air = draw_leg_in_flight(draw, ranges, leg, d.lateral)
         moving = wp.where(scheme == AFTER_LANDING, 1, 0)
         if store_leg(geo, limits, world, leg, d, paw, air, moving, joint_q, joint_qd) == 0:
             return 0
@@ -117,8 +150,8 @@ def store_draw(
 
 @wp.func
 def draw_until_taken(
-    geometry: wp.array(dtype=LegGeometry), ground: Ground, limits: LegLimits, ranges: ResetRanges, state: wp.uint32,
-    world: int, scheme: int, heading: float, height: wp.vec2, goal: wp.vec3,
+    geometry: wp.array(dtype=LegGeometry), ground: Ground, limits: LegLimits, ranges: ResetRanges, draw: Draw,
+    world: int, scheme: int, heading: float, height: wp.vec2, goal: wp.vec3, g: float,
     joint_q: wp.array(dtype=float), joint_qd: wp.array(dtype=float),
 ) -> int:  # fmt: skip
     """Draw states of a scheme until one can be taken; returns 0 if none of the attempts could."""
@@ -126,8 +159,8 @@ def draw_until_taken(
         return 0
     here = surface(ground, 0.0, 0.0)
     for attempt in range(int(ATTEMPTS)):
-        fresh = wp.rand_init(int(state), attempt)
-        d = draw_base(fresh, ranges, scheme, heading, height, goal)
+        fresh = branch(draw, attempt)
+        d = draw_base(fresh, ranges, scheme, heading, height, goal, g)
         if (
             store_draw(geometry, ground, limits, ranges, fresh, world, scheme, d, heading, here[0], joint_q, joint_qd)
             != 0
@@ -137,44 +170,24 @@ def draw_until_taken(
 
 
 @wp.func
-def store_default(
-    reference_q: wp.array(dtype=float), world: int, heading: float, lift: float,
-    joint_q: wp.array(dtype=float), joint_qd: wp.array(dtype=float),
-):  # fmt: skip
-    """Write the model's reference pose at rest, turned to a heading [rad]."""
-    q = world * COORDS
-    for j in range(int(COORDS)):
-        joint_q[q + j] = reference_q[q + j]
-    for j in range(int(DOFS)):
-        joint_qd[world * DOFS + j] = 0.0
-    turn = wp.quat_from_axis_angle(wp.vec3(0.0, 0.0, 1.0), heading)
-    for j in range(4):
-        joint_q[q + 3 + j] = turn[j]
-    joint_q[q + 2] = reference_q[q + 2] + lift
-
-
-@wp.func
-def draw_again(state: wp.uint32, ranges: ResetRanges) -> int:
-    """Return how many policy steps after touchdown another goal comes; 0: none."""
-    steps = int(within(state, 19, ranges.again_delay))
-    return wp.where(between(state, 18, 0.0, 1.0) < ranges.jump_again, wp.max(steps, 1), 0)
+def draw_again(draw: Draw, ranges: ResetRanges, share: float) -> int:
+    """Return how many policy steps after touchdown another goal comes; 0: none, in all but a share of draws."""
+    steps = int(within(draw, 19, ranges.again_delay))
+    return wp.where(between(draw, 18, 0.0, 1.0) < share, wp.max(steps, 1), 0)
 
 
 @wp.func
 def begin_task(
-    old: JumpTask, state: wp.uint32, ranges: ResetRanges, scheme: int, goal: wp.vec3, pos: wp.vec3, vz: float
-) -> JumpTask:
+    draw: Draw, ranges: ResetRanges, scheme: int, goal: wp.vec3, pos: wp.vec3, vz: float, jump_again: float
+) -> JumpState:
     """Return the state of a new episode that begins with a scheme at a base position [m] and upward speed [m/s]."""
-    task = JumpTask()
-    task.level = old.level
-    task.streak = old.streak
+    task = JumpState()
     task.scheme = scheme
     task.goal = goal
     task.start = pos
     task.max_height = pos[2]
-    task.command_step = int(between(state, 9, 0.0, float(ranges.command_delay) + 0.999))
-    if old.level > 0:
-        task.again_step = draw_again(state, ranges)
+    task.command_step = int(between(draw, 9, 0.0, float(ranges.command_delay) + 0.999))
+    task.again_step = draw_again(draw, ranges, jump_again)
     if scheme == IN_FLIGHT or scheme == TOUCHDOWN:
         task.phase = FLIGHT
         task.command_step = 0
@@ -186,12 +199,12 @@ def begin_task(
         task.command_step = 0
         task.apex_passed = 1
         task.max_height = wp.max(goal[2], pos[2])
-        task.phase_steps = int(between(state, 9, 0.0, 17.999))
+        task.phase_steps = int(between(draw, 9, 0.0, 17.999))
     return task
 
 
 @wp.func
-def begin_next_jump(old: JumpTask, ground: Ground, goal: wp.vec3, pos: wp.vec3, heading: float) -> JumpTask:
+def begin_next_jump(old: JumpState, ground: Ground, goal: wp.vec3, pos: wp.vec3, heading: float) -> JumpState:
     """Return the state of an episode that goes on with another jump at once; goal relative to base and heading."""
     task = old
     task.heading = heading
@@ -212,111 +225,84 @@ def begin_next_jump(old: JumpTask, ground: Ground, goal: wp.vec3, pos: wp.vec3, 
 
 @wp.func
 def place_ground(
-    ground: Ground, world: int, state: wp.uint32, ranges: ResetRanges, grounds: GroundRanges, scheme: int,
+    ground: Ground, world: int, draw: Draw, ranges: ResetRanges, grounds: GroundRanges, scheme: int,
     heading: float, goal: wp.vec3,
 ) -> Ground:  # fmt: skip
     """Put the block of a world to its start, or draw another if blocks are drawn; returns the ground as it is there."""
     if grounds.platform + grounds.block > 0.0:
         block = Block()
         if scheme == STANDING or scheme == DEFAULT:
-            block = draw_ground(state, grounds, footprint(ranges, heading), goal)
+            block = draw_ground(draw, grounds, footprint(ranges, heading), goal)
         ground.blocks[world] = block
     else:
         rest_block(ground, world)
     return world_ground(ground, world)
 
 
-@wp.kernel
-def reset_kernel(
-    # in
-    done: wp.array(dtype=float),
-    geometry: wp.array(dtype=LegGeometry),
-    ground: Ground,
-    limits: LegLimits,
-    ranges: ResetRanges,
-    grounds: GroundRanges,
-    goal_lower: wp.array(dtype=wp.vec3),
-    goal_upper: wp.array(dtype=wp.vec3),
-    base_height: wp.array(dtype=wp.vec2),
-    reference_q: wp.array(dtype=float),
-    # in, out
-    random: wp.array(dtype=wp.uint32),
-    tasks: wp.array(dtype=JumpTask),
-    joint_q: wp.array(dtype=float),
-    joint_qd: wp.array(dtype=float),
-):
-    """Begin a new episode where one is done, or the next jump where it is due; one thread per world.
-
-    Goals, relative to the start, and base heights: one entry per level.
-    """
-    world = wp.tid()
-    task = tasks[world]
-    again = task.phase == LANDED and task.again_step > 0 and task.phase_steps >= task.again_step
-    if done[world] == 0.0 and not again:
-        return
-    state = wp.rand_init(int(random[world]), world + 1)
-    random[world] = wp.rand_init(int(state), 99)
-    levels = goal_lower.shape[0]
-    level = task.level
-    if level >= levels:
-        level = wp.min(int(between(state, 0, 0.0, float(levels))), levels - 1)
-    goal = draw_box(state, 50, goal_lower[level], goal_upper[level])
-    q = world * COORDS
-    if done[world] == 0.0:
-        pos = wp.vec3(joint_q[q], joint_q[q + 1], joint_q[q + 2])
-        quat = wp.quat(joint_q[q + 3], joint_q[q + 4], joint_q[q + 5], joint_q[q + 6])
-        task = begin_next_jump(task, world_ground(ground, world), goal, pos, yaw_of(quat))
-        task.again_step = draw_again(state, ranges)
-        tasks[world] = task
-        return
-    scheme = draw_scheme(state, ranges)
-    heading = between(state, 13, -ranges.heading, ranges.heading)
-    goal = turned(goal, heading)
-    here = place_ground(ground, world, state, ranges, grounds, scheme, heading, goal)
+@wp.func
+def reset_jump(
+    robot: RobotArrays, scene: Scene, skill: SkillSettings, old: JumpState, settings: JumpSettings, level: JumpLevel,
+    draw: Draw,
+) -> JumpState:  # fmt: skip
+    """Begin an episode at a stage of a jump, and return its state."""
+    world = draw.world
+    ranges = settings.states
+    g = -robot.gravity[world][2]
+    scheme = draw_scheme(draw, ranges)
+    heading = between(draw, 13, -ranges.heading, ranges.heading)
+    goal = turned(draw_box(draw, 50, level.goal_lower, level.goal_upper), heading)
+    here = place_ground(scene.ground, world, draw, ranges, settings.grounds, scheme, heading, goal)
     taken = draw_until_taken(
-        geometry, here, limits, ranges, state, world, scheme, heading, base_height[level], goal, joint_q, joint_qd
-    )
+        scene.geometry, here, leg_limits(skill.command_filter), ranges, draw, world, scheme, heading,
+        level.base_height, goal, g, robot.joint_q, robot.joint_qd,
+    )  # fmt: skip
     if taken == 0:
         scheme = int(DEFAULT)
-        store_default(reference_q, world, heading, surface(here, 0.0, 0.0)[0], joint_q, joint_qd)
-    pos = wp.vec3(joint_q[q], joint_q[q + 1], joint_q[q + 2])
-    task = begin_task(task, state, ranges, scheme, goal, pos, joint_qd[world * DOFS + 2])
+        store_pose(robot, scene, world, heading, surface(here, 0.0, 0.0)[0])
+    pos = base_pos(robot, world)
+    task = begin_task(draw, ranges, scheme, goal, pos, robot.joint_qd[world * DOFS + 2], level.jump_again)
     task.heading = heading
     task.goal_ground = surface(here, goal[0], goal[1])[0]
-    tasks[world] = task
+    return task
 
 
-@wp.kernel
-def clear_world_kernel(
-    # in
-    done: wp.array(dtype=float),
-    joint_q: wp.array(dtype=float),
-    # out
-    impulse: wp.array2d(dtype=wp.vec3),
-    paw_force: wp.array2d(dtype=wp.vec3),
-    invalid: wp.array(dtype=int),
-    torque: wp.array2d(dtype=float),
-    action: wp.array2d(dtype=float),
-    old_action: wp.array2d(dtype=float),
-    safe_target: wp.array2d(dtype=float),
-    old_rate: wp.array2d(dtype=float),
-    old_lin_vel: wp.array(dtype=wp.vec3),
-    joint_qd: wp.array(dtype=float),
-):
-    """Forget the past of worlds that began a new episode; one thread per world."""
-    world = wp.tid()
-    if done[world] == 0.0:
-        return
-    invalid[world] = 0
-    for k in range(4):
-        impulse[k, world] = wp.vec3(0.0)
-        paw_force[k, world] = wp.vec3(0.0)
-    for m in range(12):
-        slot = motor_slot(m)
-        torque[m, world] = 0.0
-        action[m, world] = 0.0
-        old_action[m, world] = 0.0
-        safe_target[m, world] = joint_q[world * COORDS + 7 + slot]
-        old_rate[m, world] = joint_qd[world * DOFS + 6 + slot]
-    i = world * DOFS
-    old_lin_vel[world] = wp.vec3(joint_qd[i], joint_qd[i + 1], joint_qd[i + 2])
+@wp.func
+def another_jump_due(task: JumpState) -> bool:
+    """Return whether a landed robot gets another goal now."""
+    return task.phase == LANDED and task.again_step > 0 and task.phase_steps >= task.again_step
+
+
+@wp.func
+def draw_next_jump(view: RobotView, scene: Scene, task: JumpState, level: JumpLevel, draw: Draw) -> JumpState:
+    """Return the state of an episode that goes on with another jump, to a drawn goal."""
+    goal = draw_box(draw, 50, level.goal_lower, level.goal_upper)
+    return begin_next_jump(task, world_ground(scene.ground, view.world), goal, view.pos, yaw_of(view.quat))
+
+
+@wp.func
+def give_jump(view: RobotView, scene: Scene, task: JumpState, values: wp.vec4, heading: float) -> JumpState:
+    """Ask a robot that stands at its start, or has landed, for a jump.
+
+    values: goal x, y [m] relative to base and heading, base height at the apex [m], and at a start the policy step of
+    the command.
+    """
+    here = world_ground(scene.ground, view.world)
+    goal = wp.vec3(values[0], values[1], values[2])
+    if task.steps > 0:
+        if task.phase != LANDED:
+            return task
+        return begin_next_jump(task, here, goal, view.pos, heading)
+    new = JumpState()
+    new.heading = heading
+    new.start = view.pos
+    new.goal = turned(goal, heading) + wp.vec3(view.pos[0], view.pos[1], 0.0)
+    new.goal_ground = surface(here, new.goal[0], new.goal[1])[0]
+    new.max_height = view.pos[2]
+    new.command_step = int(values[3])
+    return new
+
+
+@wp.func
+def from_standing(task: JumpState) -> bool:
+    """Return whether an episode began standing, and so counts for the curriculum."""
+    return task.scheme <= DEFAULT

@@ -6,7 +6,9 @@ wanted at the apex; where none is wanted, the takeoff angle is drawn.
 
 import warp as wp
 
-from .phase import GRAVITY, time_to_height
+from ..mdp.random import Draw, between, within
+from ..mdp.view import turned
+from .phase import time_to_height
 
 wp.set_module_options({"enable_backward": False})
 
@@ -50,7 +52,7 @@ class ResetRanges:
 
 
 @wp.struct
-class Draw:
+class BaseDraw:
     """A drawn state of the base; paws are placed around `spot`."""
 
     pos: wp.vec3
@@ -62,40 +64,21 @@ class Draw:
 
 
 @wp.func
-def between(state: wp.uint32, column: int, lower: float, upper: float) -> float:
-    """Return a uniform draw, independent for every column."""
-    draw = wp.rand_init(int(state), column)
-    return lower + (upper - lower) * wp.randf(draw)
-
-
-@wp.func
-def within(state: wp.uint32, column: int, pair: wp.vec2) -> float:
-    """Return a uniform draw from a pair (lower, upper)."""
-    return between(state, column, pair[0], pair[1])
-
-
-@wp.func
-def draw_box(state: wp.uint32, column: int, lower: wp.vec3, upper: wp.vec3) -> wp.vec3:
+def draw_box(draw: Draw, column: int, lower: wp.vec3, upper: wp.vec3) -> wp.vec3:
     """Return a uniform draw from a box."""
     return wp.vec3(
-        between(state, column, lower[0], upper[0]),
-        between(state, column + 1, lower[1], upper[1]),
-        between(state, column + 2, lower[2], upper[2]),
+        between(draw, column, lower[0], upper[0]),
+        between(draw, column + 1, lower[1], upper[1]),
+        between(draw, column + 2, lower[2], upper[2]),
     )
 
 
 @wp.func
-def turned(v: wp.vec3, heading: float) -> wp.vec3:
-    """Return a vector turned about z by a heading [rad]."""
-    return wp.quat_rotate(wp.quat_from_axis_angle(wp.vec3(0.0, 0.0, 1.0), heading), v)
-
-
-@wp.func
-def draw_quat(state: wp.uint32, ranges: ResetRanges, heading: float, pitch: float) -> wp.quat:
+def draw_quat(draw: Draw, ranges: ResetRanges, heading: float, pitch: float) -> wp.quat:
     """Return an orientation (xyzw) around a heading and a pitch [rad]."""
-    yaw = heading + between(state, 10, -ranges.tilt, ranges.tilt)
-    tip = pitch + between(state, 11, -ranges.tilt, ranges.tilt)
-    roll = between(state, 12, -ranges.tilt, ranges.tilt)
+    yaw = heading + between(draw, 10, -ranges.tilt, ranges.tilt)
+    tip = pitch + between(draw, 11, -ranges.tilt, ranges.tilt)
+    roll = between(draw, 12, -ranges.tilt, ranges.tilt)
     return (
         wp.quat_from_axis_angle(wp.vec3(0.0, 0.0, 1.0), yaw)
         * wp.quat_from_axis_angle(wp.vec3(0.0, 1.0, 0.0), tip)
@@ -104,9 +87,9 @@ def draw_quat(state: wp.uint32, ranges: ResetRanges, heading: float, pitch: floa
 
 
 @wp.func
-def draw_scheme(state: wp.uint32, ranges: ResetRanges) -> int:
+def draw_scheme(draw: Draw, ranges: ResetRanges) -> int:
     """Return a reset scheme by the shares."""
-    u = between(state, 1, 0.0, 1.0)
+    u = between(draw, 1, 0.0, 1.0)
     scheme = int(AFTER_LANDING)
     for i in range(4):
         if u < ranges.shares[3 - i]:
@@ -115,83 +98,95 @@ def draw_scheme(state: wp.uint32, ranges: ResetRanges) -> int:
 
 
 @wp.func
-def draw_paw(state: wp.uint32, ranges: ResetRanges, leg: int, heading: float) -> wp.vec3:
+def draw_paw(draw: Draw, ranges: ResetRanges, leg: int, heading: float) -> wp.vec3:
     """Return a paw's place [m] relative to the spot that they surround, world axes, z = 0."""
-    x = within(state, 20 + leg, ranges.front_x)
-    y = within(state, 24 + leg, ranges.front_y)
+    x = within(draw, 20 + leg, ranges.front_x)
+    y = within(draw, 24 + leg, ranges.front_y)
     if leg >= 2:
-        x = -within(state, 20 + leg, ranges.back_x)
-        y = within(state, 24 + leg, ranges.back_y)
+        x = -within(draw, 20 + leg, ranges.back_x)
+        y = within(draw, 24 + leg, ranges.back_y)
     if leg % 2 == 1:
         y = -y
     return turned(wp.vec3(x, y, 0.0), heading)
 
 
 @wp.func
-def takeoff_speed(state: wp.uint32, ranges: ResetRanges, height: float, distance: float, apex: float) -> float:
+def takeoff_speed(draw: Draw, ranges: ResetRanges, height: float, distance: float, apex: float, g: float) -> float:
     """Return the upward speed [m/s] with which a jump over a distance [m] leaves a height [m]."""
     if apex > 0.0:
-        return wp.sqrt(wp.max(2.0 * GRAVITY * (apex - height), 0.0))
+        return wp.sqrt(wp.max(2.0 * g * (apex - height), 0.0))
     # height + v_z t - g t^2 / 2 = landing_height, where v_z t = distance tan(angle)
-    climb = distance * wp.tan(within(state, 16, ranges.takeoff_angle))
-    t = wp.sqrt(wp.max(2.0 * (height - ranges.landing_height + climb) / GRAVITY, 1.0e-6))
-    limit = wp.sqrt(wp.max(2.0 * GRAVITY * (ranges.highest_apex - height), 0.0))
+    climb = distance * wp.tan(within(draw, 16, ranges.takeoff_angle))
+    t = wp.sqrt(wp.max(2.0 * (height - ranges.landing_height + climb) / g, 1.0e-6))
+    limit = wp.sqrt(wp.max(2.0 * g * (ranges.highest_apex - height), 0.0))
     return wp.min(climb / t, limit)
 
 
 @wp.func
 def draw_airborne(
-    state: wp.uint32, ranges: ResetRanges, scheme: int, heading: float, goal: wp.vec3, along: wp.vec3
-) -> Draw:
+    draw: Draw,
+    ranges: ResetRanges,
+    scheme: int,
+    heading: float,
+    goal: wp.vec3,
+    along: wp.vec3,
+    g: float,
+) -> BaseDraw:
     """Return a state on the projectile to the goal; along: unit vector towards it."""
-    d = Draw()
-    d.quat = draw_quat(state, ranges, heading, 0.0)
-    height = within(state, 4, ranges.takeoff_height)
+    d = BaseDraw()
+    d.quat = draw_quat(draw, ranges, heading, 0.0)
+    height = within(draw, 4, ranges.takeoff_height)
     way = wp.length(wp.vec3(goal[0], goal[1], 0.0))
-    ahead = wp.min(within(state, 14, ranges.takeoff_ahead), way)
+    ahead = wp.min(within(draw, 14, ranges.takeoff_ahead), way)
     distance = way - ahead
-    up = takeoff_speed(state, ranges, height, distance, goal[2])
-    whole = wp.max(time_to_height(height, up, ranges.landing_height), 1.0e-3)
-    t = whole * within(state, 5, ranges.flight_time)
+    up = takeoff_speed(draw, ranges, height, distance, goal[2], g)
+    whole = wp.max(time_to_height(height, up, ranges.landing_height, g), 1.0e-3)
+    t = whole * within(draw, 5, ranges.flight_time)
     if scheme == TOUCHDOWN:
-        t = wp.max(whole - within(state, 5, ranges.touchdown_time), 0.0)
+        t = wp.max(whole - within(draw, 5, ranges.touchdown_time), 0.0)
     forward = distance / whole
     off = wp.vec3(
-        between(state, 2, -ranges.base_xy, ranges.base_xy), between(state, 3, -ranges.base_xy, ranges.base_xy), 0.0
+        between(draw, 2, -ranges.base_xy, ranges.base_xy), between(draw, 3, -ranges.base_xy, ranges.base_xy), 0.0
     )
-    d.pos = off + (ahead + forward * t) * along + wp.vec3(0.0, 0.0, height + up * t - 0.5 * GRAVITY * t * t)
-    d.lin_vel = forward * along + wp.vec3(0.0, 0.0, up - GRAVITY * t)
+    d.pos = off + (ahead + forward * t) * along + wp.vec3(0.0, 0.0, height + up * t - 0.5 * g * t * t)
+    d.lin_vel = forward * along + wp.vec3(0.0, 0.0, up - g * t)
     d.spot = wp.vec3(d.pos[0], d.pos[1], 0.0)
     if scheme == TOUCHDOWN:
         d.use_paws = 1
-        d.pos = d.pos - within(state, 15, ranges.touchdown_behind) * along
+        d.pos = d.pos - within(draw, 15, ranges.touchdown_behind) * along
     else:
-        d.lateral = between(state, 6, -ranges.flight_lateral, ranges.flight_lateral)
+        d.lateral = between(draw, 6, -ranges.flight_lateral, ranges.flight_lateral)
     return d
 
 
 @wp.func
 def draw_base(
-    state: wp.uint32, ranges: ResetRanges, scheme: int, heading: float, height: wp.vec2, goal: wp.vec3
-) -> Draw:
+    draw: Draw,
+    ranges: ResetRanges,
+    scheme: int,
+    heading: float,
+    height: wp.vec2,
+    goal: wp.vec3,
+    g: float,
+) -> BaseDraw:
     """Return pose and velocity of the base for a scheme; height [m]: range of standing starts."""
     to_goal = wp.vec3(goal[0], goal[1], 0.0)
     along = turned(wp.vec3(1.0, 0.0, 0.0), heading)
     if wp.length(to_goal) > 1.0e-3:
         along = wp.normalize(to_goal)
     if scheme == IN_FLIGHT or scheme == TOUCHDOWN:
-        return draw_airborne(state, ranges, scheme, heading, goal, along)
-    d = Draw()
+        return draw_airborne(draw, ranges, scheme, heading, goal, along, g)
+    d = BaseDraw()
     d.use_paws = 1
     off = wp.vec3(
-        between(state, 2, -ranges.base_xy, ranges.base_xy), between(state, 3, -ranges.base_xy, ranges.base_xy), 0.0
+        between(draw, 2, -ranges.base_xy, ranges.base_xy), between(draw, 3, -ranges.base_xy, ranges.base_xy), 0.0
     )
-    d.quat = draw_quat(state, ranges, heading, between(state, 17, 0.0, ranges.forward_pitch))
-    d.pos = off + wp.vec3(0.0, 0.0, within(state, 4, height))
+    d.quat = draw_quat(draw, ranges, heading, between(draw, 17, 0.0, ranges.forward_pitch))
+    d.pos = off + wp.vec3(0.0, 0.0, within(draw, 4, height))
     if scheme == AFTER_LANDING:
-        d.quat = draw_quat(state, ranges, heading, 0.0)
+        d.quat = draw_quat(draw, ranges, heading, 0.0)
         d.spot = to_goal
-        d.pos = off + to_goal + within(state, 14, ranges.landed_ahead) * along
-        d.pos[2] = within(state, 4, ranges.landed_height)
-        d.lin_vel = wp.vec3(0.0, 0.0, -within(state, 5, ranges.landed_speed))
+        d.pos = off + to_goal + within(draw, 14, ranges.landed_ahead) * along
+        d.pos[2] = within(draw, 4, ranges.landed_height)
+        d.lin_vel = wp.vec3(0.0, 0.0, -within(draw, 5, ranges.landed_speed))
     return d

@@ -1,72 +1,33 @@
-"""Reward terms (paper, Tables I to III). Each is a pure function of the robot, the episode and its parameters p.
+"""Reward terms of jumps (paper, Tables I to III): pure functions of the robot, the jump and named numbers.
 
-phi_s(x) = exp(-x^2 / s^2), psi_s(x) = exp(-|x| / s). Times are counted in policy steps of 1/60 s.
+Times are counted in policy steps of 1/60 s.
 """
 
 import warp as wp
 
+from ..mdp.rewards import phi, posture_offset, psi
+from ..mdp.view import RobotView, braking, rotation_from
 from .phase import estimated_apex, landing_error_estimate
-from .task import (
-    FLIGHT,
-    LANDED,
-    STANCE,
-    JumpTask,
-    RobotView,
-    commanded,
-    goal_offset,
-    rotation_from,
-    vec12,
-    waiting,
-)
+from .state import FLIGHT, LANDED, STANCE, JumpState, commanded, goal_offset, waiting
 
 SOON = wp.constant(18)  # policy steps: the first 0.3 s after touchdown
 RECOVERED = wp.constant(30)  # policy steps: 0.5 s after touchdown
 
 
 @wp.func
-def phi(x: float, s: float) -> float:
-    """Return the exponential kernel phi_s(x)."""
-    return wp.exp(-x * x / (s * s))
-
-
-@wp.func
-def psi(x: float, s: float) -> float:
-    """Return the Laplacian kernel psi_s(x)."""
-    return wp.exp(-wp.abs(x) / s)
-
-
-@wp.func
-def square_sum(v: vec12) -> float:
-    """Return the sum of squares."""
-    return wp.dot(v, v)
-
-
-@wp.func
-def transversal_offset(view: RobotView, shift: float) -> float:
-    """Return the rms offset [rad] of all motors from the default pose, the transversal ones shifted by `shift`."""
-    total = float(0.0)
-    for m in range(12):
-        off = view.angle[m] - view.default_angle[m]
-        if m % 3 != 0:
-            off = off - shift
-        total += off * off
-    return wp.sqrt(total / 12.0)
-
-
-@wp.func
-def patience(task: JumpTask, share: float) -> float:
+def patience(task: JumpState, share: float) -> float:
     """Return the weight of what pays without jumping: `share` while a commanded jump has not begun, else 1."""
     return wp.where(waiting(task), share, 1.0)
 
 
 @wp.func
-def just_landed(task: JumpTask) -> bool:
+def just_landed(task: JumpState) -> bool:
     """Return whether the touchdown was within the last 0.3 s."""
     return task.phase == LANDED and task.phase_steps < SOON
 
 
 @wp.func
-def should_rest(task: JumpTask) -> bool:
+def should_rest(task: JumpState) -> bool:
     """Return whether the robot should stand still: before the command, and from 0.5 s after touchdown."""
     if task.phase == LANDED:
         return task.phase_steps >= RECOVERED
@@ -77,176 +38,172 @@ def should_rest(task: JumpTask) -> bool:
 
 
 @wp.func
-def height_kernel(error: float, p: wp.vec4) -> float:
-    """Return phi_p0 + 3 psi_p1 + phi_p2 of a height error [m]; the last, wide one gives a slope to low jumps."""
-    return phi(error, p[0]) + 3.0 * psi(error, p[1]) + phi(error, p[2])
+def height_kernel(error: float, fine: float, sharp: float, wide: float) -> float:
+    """Return phi_fine + 3 psi_sharp + phi_wide of a height error [m]; the last, wide one gives a slope to low jumps."""
+    return phi(error, fine) + 3.0 * psi(error, sharp) + phi(error, wide)
 
 
 @wp.func
-def jump_height(view: RobotView, task: JumpTask, p: wp.vec4) -> float:
+def jump_height(view: RobotView, task: JumpState, fine: float, sharp: float, wide: float) -> float:
     """Jump height: closeness of the highest base height to the goal, once, at the apex."""
     if task.at_apex == 0:
         return 0.0
-    return height_kernel(task.max_height - task.goal[2], p)
+    return height_kernel(task.max_height - task.goal[2], fine, sharp, wide)
 
 
 @wp.func
-def estimated_jump_height(view: RobotView, task: JumpTask, p: wp.vec4) -> float:
+def estimated_jump_height(view: RobotView, task: JumpState, fine: float, sharp: float, wide: float) -> float:
     """Est jump height: the same of the ballistic estimate, in flight until the apex."""
     if task.phase != FLIGHT or task.apex_passed != 0:
         return 0.0
-    return height_kernel(estimated_apex(view.pos, view.lin_vel) - task.goal[2], p)
+    return height_kernel(estimated_apex(view.pos, view.lin_vel, view.fall_acc) - task.goal[2], fine, sharp, wide)
 
 
 @wp.func
-def horizontal_velocity(view: RobotView, task: JumpTask, p: wp.vec4) -> float:
-    """Staying over the spot: exp(-|v_xy| / p0), doubled off stance; share p1 while a jump is due."""
+def horizontal_velocity(view: RobotView, task: JumpState, width: float, share: float) -> float:
+    """Staying over the spot: exp(-|v_xy| / width), doubled off stance; `share` of it while a jump is due."""
     speed = wp.length(wp.vec2(view.lin_vel[0], view.lin_vel[1]))
-    return wp.exp(-speed / p[0]) * wp.where(task.phase == STANCE, 1.0, 2.0) * patience(task, p[1])
+    return wp.exp(-speed / width) * wp.where(task.phase == STANCE, 1.0, 2.0) * patience(task, share)
 
 
 @wp.func
-def orientation(view: RobotView, task: JumpTask, p: wp.vec4) -> float:
-    """Orientation error: phi_p0 of the horizontal part of projected gravity; share p1 while a jump is due."""
-    return phi(wp.length(wp.vec2(view.gravity[0], view.gravity[1])), p[0]) * patience(task, p[1])
+def orientation(view: RobotView, task: JumpState, width: float, share: float) -> float:
+    """Orientation error: phi_width of the horizontal part of projected gravity; `share` of it while a jump is due."""
+    return phi(wp.length(wp.vec2(view.gravity[0], view.gravity[1])), width) * patience(task, share)
 
 
 @wp.func
-def angular_velocity(view: RobotView, task: JumpTask, p: wp.vec4) -> float:
-    """Angular velocity: phi_p0(|w|); share p1 while a jump is due."""
-    return phi(wp.length(view.ang_vel), p[0]) * patience(task, p[1])
+def angular_velocity(view: RobotView, task: JumpState, width: float, share: float) -> float:
+    """Angular velocity: phi_width(|w|); `share` of it while a jump is due."""
+    return phi(wp.length(view.ang_vel), width) * patience(task, share)
 
 
 @wp.func
-def joint_symmetry(view: RobotView, task: JumpTask, p: wp.vec4) -> float:
-    """Joint symmetry: phi_p0(variance of the transversal angles) phi_p1(|lateral angles|); share p2 while due."""
+def joint_symmetry(view: RobotView, task: JumpState, variance: float, lateral: float, share: float) -> float:
+    """Joint symmetry: phi of the transversal angles' variance and of |lateral angles|; `share` of it while due."""
     total = float(0.0)
     total_sq = float(0.0)
-    lateral = float(0.0)
+    lateral_sq = float(0.0)
     for m in range(12):
         a = view.angle[m]
         if m % 3 == 0:
-            lateral += a * a
+            lateral_sq += a * a
         else:
             total += a
             total_sq += a * a
-    variance = total_sq / 8.0 - total * total / 64.0
-    return phi(variance, p[0]) * phi(wp.sqrt(lateral), p[1]) * patience(task, p[2])
+    spread = total_sq / 8.0 - total * total / 64.0
+    return phi(spread, variance) * phi(wp.sqrt(lateral_sq), lateral) * patience(task, share)
 
 
 @wp.func
-def ground_posture(view: RobotView, task: JumpTask, p: wp.vec4) -> float:
-    """Desired joint position on the ground: phi_p0 of the offset from default, transversal + p1; share p2 while due."""
+def ground_posture(view: RobotView, task: JumpState, width: float, shift: float, share: float) -> float:
+    """Desired joint position on the ground: phi_width of the offset from default, transversal motors + shift.
+
+    `share` of it while a jump is due.
+    """
     if task.phase == FLIGHT:
         return 0.0
-    return phi(transversal_offset(view, p[1]), p[0]) * patience(task, p[2])
+    return phi(posture_offset(view, shift), width) * patience(task, share)
 
 
 @wp.func
-def air_posture(view: RobotView, task: JumpTask, p: wp.vec4) -> float:
-    """Desired joint position in the air: phi_p0 of the offset from default."""
+def air_posture(view: RobotView, task: JumpState, width: float) -> float:
+    """Desired joint position in the air: phi_width of the offset from default."""
     if task.phase != FLIGHT:
         return 0.0
-    return phi(transversal_offset(view, 0.0), p[0])
+    return phi(posture_offset(view, 0.0), width)
 
 
 @wp.func
-def retract(view: RobotView, task: JumpTask, p: wp.vec4) -> float:
-    """Retracting after landing: phi_p0 of the offset from default, transversal motors + p1, first 0.3 s."""
+def retract(view: RobotView, task: JumpState, width: float, shift: float) -> float:
+    """Retracting after landing: phi_width of the offset from default, transversal motors + shift, first 0.3 s."""
     if not just_landed(task):
         return 0.0
-    return phi(transversal_offset(view, p[1]), p[0])
+    return phi(posture_offset(view, shift), width)
 
 
 # ---------------------------------------------------------------- horizontal jump
 
 
 @wp.func
-def tracking(view: RobotView, task: JumpTask, p: wp.vec4) -> float:
-    """Tracking: phi_p0 + p2 phi_p1 of the distance from the goal [m], after takeoff."""
+def tracking(view: RobotView, task: JumpState, wide: float, fine: float, fine_share: float) -> float:
+    """Tracking: phi_wide + fine_share phi_fine of the distance from the goal [m], after takeoff."""
     if task.phase == STANCE:
         return 0.0
     error = wp.length(goal_offset(view, task))
-    return phi(error, p[0]) + p[2] * phi(error, p[1])
+    return phi(error, wide) + fine_share * phi(error, fine)
 
 
 @wp.func
-def estimated_tracking(view: RobotView, task: JumpTask, p: wp.vec4) -> float:
-    """Est tracking: phi_p0 + 0.1 phi_p1 + 0.3 phi_p2 of the ballistic landing's distance from the goal, in flight.
+def estimated_tracking(
+    view: RobotView, task: JumpState, middle: float, wide: float, fine: float, height: float
+) -> float:
+    """Est tracking: phi_middle + 0.1 phi_wide + 0.3 phi_fine of the ballistic landing's distance from the goal.
 
-    The landing is where the base falls through p3 [m].
+    In flight. The landing is where the base falls through a height [m].
     """
     if task.phase != FLIGHT:
         return 0.0
-    error = landing_error_estimate(view, task, p[3])
-    return phi(error, p[0]) + 0.1 * phi(error, p[1]) + 0.3 * phi(error, p[2])
+    error = landing_error_estimate(view, task, height)
+    return phi(error, middle) + 0.1 * phi(error, wide) + 0.3 * phi(error, fine)
 
 
 @wp.func
-def flight_orientation(view: RobotView, task: JumpTask, p: wp.vec4) -> float:
-    """Orientation error: phi_p0 of the rotation from level and heading, in flight while moving toward the goal."""
+def flight_orientation(view: RobotView, task: JumpState, width: float) -> float:
+    """Orientation error: phi_width of the rotation from level and heading, in flight while moving toward the goal."""
     if task.phase != FLIGHT or wp.dot(view.lin_vel, goal_offset(view, task)) <= 0.0:
         return 0.0
-    return phi(rotation_from(view.quat, task.heading), p[0])
+    return phi(rotation_from(view.quat, task.heading), width)
 
 
 @wp.func
-def flight_angular_velocity(view: RobotView, task: JumpTask, p: wp.vec4) -> float:
-    """Angular velocity: phi_p0(|w|), in flight."""
+def flight_angular_velocity(view: RobotView, task: JumpState, width: float) -> float:
+    """Angular velocity: phi_width(|w|), in flight."""
     if task.phase != FLIGHT:
         return 0.0
-    return phi(wp.length(view.ang_vel), p[0])
+    return phi(wp.length(view.ang_vel), width)
 
 
 @wp.func
-def left_right_symmetry(view: RobotView, task: JumpTask, p: wp.vec4) -> float:
-    """Joint symmetry: phi_p0 of the rms difference of left and right transversal angles; share p1 while due."""
+def left_right_symmetry(view: RobotView, task: JumpState, width: float, share: float) -> float:
+    """Joint symmetry: phi_width of the rms difference of left and right transversal angles; `share` of it while due."""
     total = float(0.0)
     for m in range(12):
         if m % 3 != 0 and (m / 3) % 2 == 0:
             off = view.angle[m] - view.angle[m + 3]
             total += off * off
-    return phi(wp.sqrt(total / 4.0), p[0]) * patience(task, p[1])
+    return phi(wp.sqrt(total / 4.0), width) * patience(task, share)
 
 
 @wp.func
-def standing_posture(view: RobotView, task: JumpTask, p: wp.vec4) -> float:
-    """Stance: phi_p0 of the offset from default, transversal motors + p1, while the robot should rest."""
+def standing_posture(view: RobotView, task: JumpState, width: float, shift: float) -> float:
+    """Stance: phi_width of the offset from default, transversal motors + shift, while the robot should rest."""
     if not should_rest(task):
         return 0.0
-    return phi(transversal_offset(view, p[1]), p[0])
+    return phi(posture_offset(view, shift), width)
 
 
 # ---------------------------------------------------------------- impacts and landing
 
 
 @wp.func
-def braking(view: RobotView) -> float:
-    """Return the base's acceleration along its motion where it slows down [m/s^2], <= 0."""
-    speed = wp.length(view.lin_vel)
-    if speed < 1.0e-6:
-        return 0.0
-    return wp.min(wp.dot(view.lin_acc, view.lin_vel) / speed, 0.0)
-
-
-@wp.func
-def soft_impact(view: RobotView, task: JumpTask, p: wp.vec4) -> float:
-    """Soft impact: max(0, 1 - deceleration / p0), first 0.3 s after touchdown."""
+def soft_impact(view: RobotView, task: JumpState, limit: float) -> float:
+    """Soft impact: max(0, 1 - deceleration / limit), first 0.3 s after touchdown."""
     if not just_landed(task):
         return 0.0
-    return wp.max(0.0, 1.0 + braking(view) / p[0])
+    return wp.max(0.0, 1.0 + braking(view) / limit)
 
 
 @wp.func
-def stance_impact(view: RobotView, task: JumpTask, p: wp.vec4) -> float:
-    """Stance impact: deceleration / p0 in stance, in -1..0."""
+def stance_impact(view: RobotView, task: JumpState, limit: float) -> float:
+    """Stance impact: deceleration / limit in stance, in -1..0."""
     if task.phase != STANCE:
         return 0.0
-    return wp.clamp(braking(view) / p[0], -1.0, 0.0)
+    return wp.clamp(braking(view) / limit, -1.0, 0.0)
 
 
 @wp.func
-def catch_landing(view: RobotView, task: JumpTask, p: wp.vec4) -> float:
+def catch_landing(view: RobotView, task: JumpState) -> float:
     """Catch landing: let the base fall on, clamp(-v_z, 0, 1), first 0.3 s."""
     if not just_landed(task):
         return 0.0
@@ -254,7 +211,7 @@ def catch_landing(view: RobotView, task: JumpTask, p: wp.vec4) -> float:
 
 
 @wp.func
-def damp_landing(view: RobotView, task: JumpTask, p: wp.vec4) -> float:
+def damp_landing(view: RobotView, task: JumpState) -> float:
     """Damp landing: fold the legs, mean clamp(transversal rates, 0, 1), first 0.3 s."""
     if not just_landed(task):
         return 0.0
@@ -266,58 +223,25 @@ def damp_landing(view: RobotView, task: JumpTask, p: wp.vec4) -> float:
 
 
 @wp.func
-def rest(view: RobotView, task: JumpTask, p: wp.vec4) -> float:
-    """Rest: phi_p0(|v|) phi_p1(|w|), while the robot should rest."""
+def rest(view: RobotView, task: JumpState, speed: float, spin: float) -> float:
+    """Rest: phi_speed(|v|) phi_spin(|w|), while the robot should rest."""
     if not should_rest(task):
         return 0.0
-    return phi(wp.length(view.lin_vel), p[0]) * phi(wp.length(view.ang_vel), p[1])
+    return phi(wp.length(view.lin_vel), speed) * phi(wp.length(view.ang_vel), spin)
 
 
 @wp.func
-def landing_tilt(view: RobotView, task: JumpTask, p: wp.vec4) -> float:
-    """Tilt after touchdown: squared sine of the angle between body z and world z over that of p0 [rad]."""
+def landing_tilt(view: RobotView, task: JumpState, width: float) -> float:
+    """Tilt after touchdown: squared sine of the angle between body z and world z over that of width [rad]."""
     if task.phase != LANDED:
         return 0.0
-    sine = wp.length(wp.vec2(view.gravity[0], view.gravity[1])) / wp.sin(p[0])
+    sine = wp.length(wp.vec2(view.gravity[0], view.gravity[1])) / wp.sin(width)
     return sine * sine
 
 
 @wp.func
-def lifted_paws(view: RobotView, task: JumpTask, p: wp.vec4) -> float:
-    """Steps after landing: paws off the ground later than p0 policy steps after touchdown, 0 to 4."""
-    if task.phase != LANDED or task.phase_steps <= int(p[0]):
+def lifted_paws(view: RobotView, task: JumpState, steps: float) -> float:
+    """Steps after landing: paws off the ground later than steps policy steps after touchdown, 0 to 4."""
+    if task.phase != LANDED or task.phase_steps <= int(steps):
         return 0.0
     return float(4 - view.contacts)
-
-
-# ---------------------------------------------------------------- regularization
-
-
-@wp.func
-def ground_force(view: RobotView, task: JumpTask, p: wp.vec4) -> float:
-    """Ground force L2: sum of squared paw forces over squared weight p0 [N]."""
-    return wp.dot(view.paw_force, view.paw_force) / (p[0] * p[0])
-
-
-@wp.func
-def action_clip(view: RobotView, task: JumpTask, p: wp.vec4) -> float:
-    """Action clip: squared distance that the command filter moved the targets [rad^2]."""
-    return view.clipped
-
-
-@wp.func
-def motor_torque_sq(view: RobotView, task: JumpTask, p: wp.vec4) -> float:
-    """Motor torque: sum of squares [N^2 m^2]."""
-    return square_sum(view.torque)
-
-
-@wp.func
-def joint_acceleration(view: RobotView, task: JumpTask, p: wp.vec4) -> float:
-    """Joint acceleration: sum of squares [rad^2/s^4]."""
-    return square_sum(view.rate_change)
-
-
-@wp.func
-def action_rate(view: RobotView, task: JumpTask, p: wp.vec4) -> float:
-    """Action rate: sum of squared changes of the action."""
-    return square_sum(view.action - view.old_action)

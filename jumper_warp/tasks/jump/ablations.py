@@ -6,7 +6,6 @@ from collections.abc import Callable
 from dataclasses import replace
 
 from jumper_warp.tasks.cfg import TaskCfg
-from kernels.jump import rewards
 
 
 def without_estimate(task: TaskCfg) -> TaskCfg:
@@ -14,15 +13,13 @@ def without_estimate(task: TaskCfg) -> TaskCfg:
 
     Raises ValueError for a task without this term.
     """
-    if rewards.estimated_jump_height not in [term.func for term in task.terms]:
-        raise ValueError(f"{task.name} has no term {rewards.estimated_jump_height.key}")
-    terms = (replace(term, weight=0.0) if term.func is rewards.estimated_jump_height else term for term in task.terms)
-    return replace(task, terms=tuple(terms))
+    return task.with_terms("rewards", estimated_jump_height={"weight": 0.0})
 
 
 def without_reference_states(task: TaskCfg) -> TaskCfg:
     """Return the task whose episodes all begin standing: none in flight, at touchdown or landed."""
-    return replace(task, reset=replace(task.reset, standing=0.8, default=0.2, in_flight=0.0, touchdown=0.0))
+    settings = replace(task.reset.settings, standing=0.8, default=0.2, in_flight=0.0, touchdown=0.0)
+    return replace(task, reset=replace(task.reset, settings=settings))
 
 
 def without_curriculum(task: TaskCfg) -> TaskCfg:

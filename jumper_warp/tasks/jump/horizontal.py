@@ -15,75 +15,105 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from jumper_warp.rl.ppo import PpoCfg
 from jumper_warp.robot.motors import horizontal_jump_filter, jumping_motors
-from jumper_warp.tasks.cfg import GroundCfg, Level, ResetCfg, Rule, TaskCfg, Term
+from jumper_warp.tasks.cfg import Command, Reset, TaskCfg
+from jumper_warp.tasks.jump.cfg import GroundCfg, Level, ResetCfg
+from jumper_warp.tasks.jump.observations import HORIZONTAL, critic
+from jumper_warp.tasks.terms import Advance, Curriculum, RewardTerm, TerminationTerm
 from jumper_warp.tasks.units import DEG, SECOND, G
-from kernels.jump import errors as jump_errors
-from kernels.jump import observe, rewards, terminations
+from kernels.jump import errors, phase, reset, rewards, terminations
+from kernels.jump.state import JumpState
+from kernels.mdp import rewards as mdp_rewards
+from kernels.mdp import terminations as mdp_terminations
 
 LANDING_HEIGHT = 0.30
 """[m] Of the base, at which the ballistic estimate ends."""
 
-TERMS = (
-    Term(rewards.tracking, 50.0, (0.15, 0.03, 0.6)),
-    Term(rewards.estimated_tracking, 100.0, (0.30, 0.50, 0.10, LANDING_HEIGHT)),
-    Term(rewards.flight_orientation, 20.0, (10.0 * DEG,)),
-    Term(rewards.orientation, 15.0, (0.15, 0.1)),
-    Term(rewards.flight_angular_velocity, 4.0, (10.0,)),
-    Term(rewards.left_right_symmetry, 20.0, (0.5, 0.1)),
-    Term(rewards.standing_posture, 50.0, (20.0 * DEG, 25.0 * DEG)),
-    Term(rewards.rest, 40.0, (0.1, 0.5)),
-    Term(rewards.landing_tilt, -20.0, (10.0 * DEG,)),
-    Term(rewards.lifted_paws, -5.0, (0.2 * SECOND,)),
-    Term(rewards.soft_impact, 20.0, (5.0 * G,)),
-    Term(rewards.catch_landing, 20.0),
-    Term(rewards.damp_landing, 25.0),
-    Term(rewards.ground_force, -0.5, (14.5 * G,)),
-    Term(rewards.action_clip, -2.0),
-    Term(rewards.motor_torque_sq, -1.0e-5),
-    Term(rewards.joint_acceleration, -5.0e-7),
-    Term(rewards.action_rate, -1.0),
+REWARDS = (
+    RewardTerm(rewards.tracking, 50.0, wide=0.15, fine=0.03, fine_share=0.6),
+    RewardTerm(rewards.estimated_tracking, 100.0, middle=0.30, wide=0.50, fine=0.10, height=LANDING_HEIGHT),
+    RewardTerm(rewards.flight_orientation, 20.0, width=10.0 * DEG),
+    RewardTerm(rewards.orientation, 15.0, width=0.15, share=0.1),
+    RewardTerm(rewards.flight_angular_velocity, 4.0, width=10.0),
+    RewardTerm(rewards.left_right_symmetry, 20.0, width=0.5, share=0.1),
+    RewardTerm(rewards.standing_posture, 50.0, width=20.0 * DEG, shift=25.0 * DEG),
+    RewardTerm(rewards.rest, 40.0, speed=0.1, spin=0.5),
+    RewardTerm(rewards.landing_tilt, -20.0, width=10.0 * DEG),
+    RewardTerm(rewards.lifted_paws, -5.0, steps=0.2 * SECOND),
+    RewardTerm(rewards.soft_impact, 20.0, limit=5.0 * G),
+    RewardTerm(rewards.catch_landing, 20.0),
+    RewardTerm(rewards.damp_landing, 25.0),
+    RewardTerm(mdp_rewards.ground_force, -0.5, weight_force=14.5 * G),
+    RewardTerm(mdp_rewards.action_clip, -2.0),
+    RewardTerm(mdp_rewards.motor_torque_sq, -1.0e-5),
+    RewardTerm(mdp_rewards.joint_acceleration, -5.0e-7),
+    RewardTerm(mdp_rewards.action_rate, -1.0),
 )
 
-RULES = (
-    Rule(terminations.success, (1.0 * SECOND,), success=True),
-    Rule(terminations.came_apart),
-    Rule(terminations.early_takeoff),
-    Rule(terminations.predicted_miss, (0.55, 0.1 * SECOND, LANDING_HEIGHT)),
-    Rule(terminations.missed_goal, (0.50,)),
-    Rule(terminations.turned_touchdown, (30.0 * DEG, 10.0 * DEG)),
-    Rule(terminations.low_touchdown, (0.25,)),
-    Rule(terminations.low_base, (0.10,)),
-    Rule(terminations.left_stance, (0.30,)),
-    Rule(terminations.hard_impact, (2.5 * G, 5.0 * G)),
-    Rule(terminations.no_jump, (2.0 * SECOND, 0.3 * SECOND)),
-    Rule(terminations.collided),
-    Rule(terminations.too_long, (20.0 * SECOND,), success=True),
+TERMINATIONS = (
+    TerminationTerm(terminations.success, steps=1.0 * SECOND, time_out=True, success=True),
+    TerminationTerm(mdp_terminations.came_apart),
+    TerminationTerm(terminations.early_takeoff),
+    TerminationTerm(terminations.predicted_miss, tolerance=0.55, steps=0.1 * SECOND, height=LANDING_HEIGHT),
+    TerminationTerm(terminations.missed_goal, tolerance=0.50),
+    TerminationTerm(terminations.turned_touchdown, rotation=30.0 * DEG, yaw=10.0 * DEG),
+    TerminationTerm(terminations.low_touchdown, height=0.25),
+    TerminationTerm(mdp_terminations.low_base, height=0.10),
+    TerminationTerm(terminations.left_stance, distance=0.30),
+    TerminationTerm(terminations.hard_impact, stance=2.5 * G, flight=5.0 * G),
+    TerminationTerm(terminations.no_jump, steps=2.0 * SECOND, idle_steps=0.3 * SECOND),
+    TerminationTerm(mdp_terminations.collided),
+    TerminationTerm(mdp_terminations.too_long, steps=20.0 * SECOND, time_out=True),
 )
 
 
-def level(x: tuple[float, float], y: float, tallest_start: float) -> Level:
+JUMP_AGAIN = 0.175
+"""Share of the episodes past the first level in which a landed robot gets another goal."""
+
+RESET = ResetCfg(
+    standing=0.45,
+    default=0.15,
+    in_flight=0.175,
+    touchdown=0.175,
+    forward_pitch=10.0,
+    heading=180.0,
+    takeoff_ahead=(0.0, 0.1),
+    takeoff_angle=(35.0, 75.0),
+    landing_height=LANDING_HEIGHT,
+    flight_time=(0.02, 0.10),
+    flight_transversal=(40.0, 80.0),
+    touchdown_behind=(0.05, 0.20),
+    landed_height=(0.30, 0.45),
+    landed_ahead=(-0.15, 0.10),
+    ground=GroundCfg(platform=0.35, block=0.25),
+)
+
+
+def level(x: tuple[float, float], y: float, tallest_start: float, jump_again: float = JUMP_AGAIN) -> Level:
     """Return a level with goals ahead within x [m], up to y [m] to either side."""
-    return Level((x[0], -y, 0.0), (x[1], y, 0.0), (0.22, tallest_start))
+    return Level((x[0], -y, 0.0), (x[1], y, 0.0), (0.22, tallest_start), jump_again)
 
 
 def ring(reach: float, tallest_start: float) -> Level:
     """Return a level with goals up to `reach` [m] ahead, back and to either side."""
-    return Level((-reach, -reach, 0.0), (reach, reach, 0.0), (0.22, tallest_start))
+    return Level((-reach, -reach, 0.0), (reach, reach, 0.0), (0.22, tallest_start), JUMP_AGAIN)
 
 
 def horizontal_jump() -> TaskCfg:
     """Return the task, with the torque limits of the paper's tests: 18 N m, 12 N m for the lateral motors."""
     return TaskCfg(
         name="horizontal-jump",
-        observe=observe.observe_horizontal,
-        columns=("goal_x", "goal_y", "height"),
-        error=jump_errors.landing_error,
-        terms=TERMS,
-        rules=RULES,
+        state=JumpState,
+        advance=Advance(phase.advance_jump, takeoff_speed=0.25),
+        reset=Reset(reset.reset_jump, RESET),
+        command=Command(reset.give_jump, reset.another_jump_due, reset.draw_next_jump),
+        curriculum=Curriculum(errors.landing_error, tolerance=0.10, counts=reset.from_standing),
+        rewards=REWARDS,
+        terminations=TERMINATIONS,
+        policy=HORIZONTAL,
+        critic=critic(HORIZONTAL),
         levels=(
-            level((0.2, 0.5), 0.0, 0.35),
+            level((0.2, 0.5), 0.0, 0.35, jump_again=0.0),
             level((0.25, 0.8), 0.15, 0.45),
             level((0.3, 1.1), 0.3, 0.45),
             level((0.3, 1.5), 0.35, 0.45),
@@ -92,35 +122,15 @@ def horizontal_jump() -> TaskCfg:
         motors=jumping_motors(18.0, lateral_torque=12.0),
         command_filter=horizontal_jump_filter(),
         action_scale=(15.0, 90.0),
-        ground=GroundCfg(platform=0.35, block=0.25),
-        ppo=PpoCfg(gamma=0.99, entropy_coef=0.0003),
-        takeoff_speed=0.25,
-        reset=ResetCfg(
-            standing=0.45,
-            default=0.15,
-            in_flight=0.175,
-            touchdown=0.175,
-            forward_pitch=10.0,
-            heading=180.0,
-            takeoff_ahead=(0.0, 0.1),
-            takeoff_angle=(35.0, 75.0),
-            landing_height=LANDING_HEIGHT,
-            flight_time=(0.02, 0.10),
-            flight_transversal=(40.0, 80.0),
-            touchdown_behind=(0.05, 0.20),
-            landed_height=(0.30, 0.45),
-            landed_ahead=(-0.15, 0.10),
-            jump_again=0.175,
-        ),
+        evaluation="place",
     )
 
 
 def omnidirectional_jump() -> TaskCfg:
     """Return the same task with goals all around: nothing but the curriculum of goals and starts differs."""
-    task = horizontal_jump()
     return replace(
-        task,
+        horizontal_jump(),
         name="omnidirectional-jump",
-        levels=(level((0.2, 0.5), 0.0, 0.35), ring(0.3, 0.45), ring(0.5, 0.45), ring(0.7, 0.45)),
-        reset=replace(task.reset, forward_pitch=0.0, touchdown_behind=(0.05, 0.12)),
+        levels=(level((0.2, 0.5), 0.0, 0.35, jump_again=0.0), ring(0.3, 0.45), ring(0.5, 0.45), ring(0.7, 0.45)),
+        reset=Reset(reset.reset_jump, replace(RESET, forward_pitch=0.0, touchdown_behind=(0.05, 0.12))),
     )

@@ -10,51 +10,56 @@ times as much; rest after landing pays and tilt costs; changes of the action cos
 from __future__ import annotations
 
 from jumper_warp.robot.motors import jumping_motors, vertical_jump_filter
-from jumper_warp.tasks.cfg import Level, ResetCfg, Rule, TaskCfg, Term
+from jumper_warp.tasks.cfg import Command, Reset, TaskCfg
+from jumper_warp.tasks.jump.cfg import Level, ResetCfg
+from jumper_warp.tasks.jump.observations import VERTICAL, critic
+from jumper_warp.tasks.terms import Advance, Curriculum, RewardTerm, TerminationTerm
 from jumper_warp.tasks.units import DEG, SECOND, G
-from kernels.jump import errors as jump_errors
-from kernels.jump import observe, rewards, terminations
+from kernels.jump import errors, phase, reset, rewards, terminations
+from kernels.jump.state import JumpState
+from kernels.mdp import rewards as mdp_rewards
+from kernels.mdp import terminations as mdp_terminations
 
 PATIENCE = 0.1
 """Share that the always-paid terms keep while a commanded jump has not begun."""
 
-TERMS = (
-    Term(rewards.jump_height, 40.0, (0.10, 0.05, 0.4), once=True),
-    Term(rewards.estimated_jump_height, 20.0, (0.10, 0.05, 0.4)),
-    Term(rewards.horizontal_velocity, 10.0, (0.04, PATIENCE)),
-    Term(rewards.orientation, 15.0, (0.1, PATIENCE)),
-    Term(rewards.angular_velocity, 2.0, (2.0, PATIENCE)),
-    Term(rewards.joint_symmetry, 35.0, (0.05, 0.35, PATIENCE)),
-    Term(rewards.ground_posture, 30.0, (10.0 * DEG, 35.0 * DEG, PATIENCE)),
-    Term(rewards.air_posture, 80.0, (15.0 * DEG,)),
-    Term(rewards.retract, 10.0, (15.0 * DEG, 15.0 * DEG)),
-    Term(rewards.rest, 20.0, (0.1, 0.5)),
-    Term(rewards.landing_tilt, -120.0, (10.0 * DEG,)),
-    Term(rewards.soft_impact, 5.0, (5.0 * G,)),
-    Term(rewards.stance_impact, 100.0, (2.5 * G,)),
-    Term(rewards.catch_landing, 3.0),
-    Term(rewards.damp_landing, 10.0),
-    Term(rewards.ground_force, -0.5, (14.5 * G,)),
-    Term(rewards.action_clip, -1.0),
-    Term(rewards.motor_torque_sq, -5.0e-4),
-    Term(rewards.joint_acceleration, -1.5e-7),
-    Term(rewards.action_rate, -1.0),
+REWARDS = (
+    RewardTerm(rewards.jump_height, 40.0, fine=0.10, sharp=0.05, wide=0.4, once=True),
+    RewardTerm(rewards.estimated_jump_height, 20.0, fine=0.10, sharp=0.05, wide=0.4),
+    RewardTerm(rewards.horizontal_velocity, 10.0, width=0.04, share=PATIENCE),
+    RewardTerm(rewards.orientation, 15.0, width=0.1, share=PATIENCE),
+    RewardTerm(rewards.angular_velocity, 2.0, width=2.0, share=PATIENCE),
+    RewardTerm(rewards.joint_symmetry, 35.0, variance=0.05, lateral=0.35, share=PATIENCE),
+    RewardTerm(rewards.ground_posture, 30.0, width=10.0 * DEG, shift=35.0 * DEG, share=PATIENCE),
+    RewardTerm(rewards.air_posture, 80.0, width=15.0 * DEG),
+    RewardTerm(rewards.retract, 10.0, width=15.0 * DEG, shift=15.0 * DEG),
+    RewardTerm(rewards.rest, 20.0, speed=0.1, spin=0.5),
+    RewardTerm(rewards.landing_tilt, -120.0, width=10.0 * DEG),
+    RewardTerm(rewards.soft_impact, 5.0, limit=5.0 * G),
+    RewardTerm(rewards.stance_impact, 100.0, limit=2.5 * G),
+    RewardTerm(rewards.catch_landing, 3.0),
+    RewardTerm(rewards.damp_landing, 10.0),
+    RewardTerm(mdp_rewards.ground_force, -0.5, weight_force=14.5 * G),
+    RewardTerm(mdp_rewards.action_clip, -1.0),
+    RewardTerm(mdp_rewards.motor_torque_sq, -5.0e-4),
+    RewardTerm(mdp_rewards.joint_acceleration, -1.5e-7),
+    RewardTerm(mdp_rewards.action_rate, -1.0),
 )
 
-RULES = (
-    Rule(terminations.success, (1.0 * SECOND,), success=True),
-    Rule(terminations.came_apart),
-    Rule(terminations.early_takeoff),
-    Rule(terminations.wrong_height, (0.10,)),
-    Rule(terminations.low_touchdown, (0.20,)),
-    Rule(terminations.low_base, (0.10,)),
-    Rule(terminations.moved_away, (0.30,)),
-    Rule(terminations.slanted_takeoff, (0.75,)),
-    Rule(terminations.tilted, (25.0 * DEG,)),
-    Rule(terminations.hard_impact, (2.5 * G, 5.0 * G)),
-    Rule(terminations.no_jump, (3.0 * SECOND, 1.0 * SECOND)),
-    Rule(terminations.collided),
-    Rule(terminations.too_long, (20.0 * SECOND,), success=True),
+TERMINATIONS = (
+    TerminationTerm(terminations.success, steps=1.0 * SECOND, time_out=True, success=True),
+    TerminationTerm(mdp_terminations.came_apart),
+    TerminationTerm(terminations.early_takeoff),
+    TerminationTerm(terminations.wrong_height, tolerance=0.10),
+    TerminationTerm(terminations.low_touchdown, height=0.20),
+    TerminationTerm(mdp_terminations.low_base, height=0.10),
+    TerminationTerm(terminations.moved_away, distance=0.30),
+    TerminationTerm(terminations.slanted_takeoff, speed=0.75),
+    TerminationTerm(mdp_terminations.tilted, angle=25.0 * DEG),
+    TerminationTerm(terminations.hard_impact, stance=2.5 * G, flight=5.0 * G),
+    TerminationTerm(terminations.no_jump, steps=3.0 * SECOND, idle_steps=1.0 * SECOND),
+    TerminationTerm(mdp_terminations.collided),
+    TerminationTerm(mdp_terminations.too_long, steps=20.0 * SECOND, time_out=True),
 )
 
 
@@ -67,14 +72,18 @@ def vertical_jump() -> TaskCfg:
     """Return the task, with the torque limits of the paper's tests: 18 N m, 10 N m for the lateral motors."""
     return TaskCfg(
         name="vertical-jump",
-        observe=observe.observe_vertical,
-        columns=("wanted_height", "jump_command", "height"),
-        error=jump_errors.height_error,
-        terms=TERMS,
-        rules=RULES,
+        state=JumpState,
+        advance=Advance(phase.advance_jump, takeoff_speed=0.75),
+        reset=Reset(reset.reset_jump, ResetCfg()),
+        command=Command(reset.give_jump, reset.another_jump_due, reset.draw_next_jump),
+        curriculum=Curriculum(errors.height_error, tolerance=0.10, counts=reset.from_standing),
+        rewards=REWARDS,
+        terminations=TERMINATIONS,
+        policy=VERTICAL,
+        critic=critic(VERTICAL),
         levels=(level(0.5, 0.7, 0.35), level(0.45, 0.95, 0.45), level(0.45, 1.15, 0.45)),
         motors=jumping_motors(18.0, lateral_torque=10.0),
         command_filter=vertical_jump_filter(),
         action_scale=(15.0, 90.0),
-        reset=ResetCfg(),
+        evaluation="height",
     )

@@ -1,0 +1,133 @@
+"""The arrays that the stages of a policy step share, and checks of what comes from outside."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import torch
+import warp as wp
+
+from jumper_warp.envs.skill import RING
+from jumper_warp.robot.description import load_description
+from jumper_warp.sim.simulation import Simulation
+from jumper_warp.tasks.cfg import TaskCfg
+from kernels.mdp.env import Delays, EnvArrays, Scene
+from kernels.mdp.view import RobotArrays
+
+FIRST_CLOCK = 2 * RING
+"""Of every world, so that rings can look back from the first step on."""
+
+
+def robot_arrays(sim: Simulation, step_dt: float) -> Any:
+    """Return the kernels' `RobotArrays` on a simulation's memory; step_dt [s]: policy step."""
+    n, device, robot = sim.num_worlds, sim.device, RobotArrays()
+    robot.joint_q, robot.joint_qd, robot.body_f = sim.state.joint_q, sim.state.joint_qd, sim.state.body_f
+    robot.body_com, robot.gravity = sim.model.body_com, sim.model.gravity
+    robot.invalid, robot.impulse = sim.physics.invalid, sim.physics.impulse
+    robot.paw_force, robot.peak_force = sim.paw_force, sim.physics.peak_paw_force
+    robot.torque, robot.joint_offset = sim.torque, sim.motors.offset
+    for name in ("paw_pos", "paw_vel"):
+        setattr(robot, name, wp.zeros((4, n), dtype=wp.vec3, device=device))
+    for name in ("contact_time", "air_time", "touchdown_speed"):
+        setattr(robot, name, wp.zeros((4, n), dtype=float, device=device))
+    robot.collisions = wp.zeros((4, n), dtype=int, device=device)
+    for name in ("old_torque", "action", "old_action", "target", "safe_target", "old_rate"):
+        setattr(robot, name, wp.zeros((12, n), dtype=float, device=device))
+    robot.old_lin_vel = wp.zeros(n, dtype=wp.vec3, device=device)
+    robot.default_angle = wp.array(load_description().pose("default"), dtype=float, device=device)
+    robot.step_dt = step_dt
+    return robot
+
+
+def env_arrays(num_envs: int, seed: int, skill: wp.array, device: Any) -> Any:
+    """Return the kernels' `EnvArrays`."""
+    env = EnvArrays()
+    env.seed, env.skill = seed, skill
+    for name in ("request", "fresh", "ending", "broken", "bad_action", "level", "streak"):
+        setattr(env, name, wp.zeros(num_envs, dtype=int, device=device))
+    env.clock = wp.full(num_envs, FIRST_CLOCK, dtype=int, device=device)
+    for name in ("reward", "done", "timeout"):
+        setattr(env, name, wp.zeros(num_envs, dtype=float, device=device))
+    for name in ("terminated", "truncated"):
+        setattr(env, name, wp.zeros(num_envs, dtype=wp.bool, device=device))
+    env.request.fill_(-1)
+    return env
+
+
+def delay_arrays(num_envs: int, latency: wp.array, substeps: int, device: Any) -> Any:
+    """Return the kernels' `Delays`; latency [physics steps]: (num_envs,)."""
+    delays = Delays()
+    delays.past_target = wp.zeros((RING, 12, num_envs), dtype=float, device=device)
+    delays.late_target = wp.zeros((12, num_envs), dtype=float, device=device)
+    delays.earlier_target = wp.zeros((12, num_envs), dtype=float, device=device)
+    delays.late_steps = wp.zeros(num_envs, dtype=int, device=device)
+    delays.steps, delays.substeps = latency, substeps
+    return delays
+
+
+def scene_of(sim: Simulation) -> Any:
+    """Return the kernels' `Scene`."""
+    scene, robot = Scene(), sim.physics.dynamics.robot
+    scene.geometry, scene.ground, scene.reference_q = robot.geometry, robot.ground, sim.model.joint_q
+    return scene
+
+
+def prepared(
+    tasks: Sequence[TaskCfg], randomize: bool, noise: bool, ground_may_vary: bool
+) -> tuple[tuple[TaskCfg, ...], bool]:
+    """Return the tasks as an environment runs them, and whether their grounds are drawn."""
+    found, draws = [], False
+    for task in tasks:
+        if not (randomize and ground_may_vary):
+            task = task.on_level_ground()
+        draws = draws or task.draws_ground
+        task = task if randomize else task.nominal()
+        found.append(task if noise else task.without_noise())
+    return tuple(found), draws
+
+
+def checked_action(action: Any, shape: tuple[int, ...], device: torch.device) -> torch.Tensor:
+    """Return an action without its gradient. Raises ValueError for another shape, kind of numbers or device."""
+    if not isinstance(action, torch.Tensor):
+        raise ValueError(f"an action must be a torch tensor, got {type(action).__name__}")
+    if tuple(action.shape) != shape:
+        raise ValueError(f"an action must have shape {shape}, got {tuple(action.shape)}")
+    if not action.is_floating_point():
+        raise ValueError(f"an action must hold floating-point numbers, got {action.dtype}")
+    if action.device != device:
+        raise ValueError(f"an action must be on {device}, got {action.device}")
+    return action.detach()
+
+
+def checked_values(values: Any, shape: tuple[int, ...], what: str) -> np.ndarray:
+    """Return values as float32, one for all or of a shape. Raises ValueError: another shape, or not finite."""
+    if isinstance(values, torch.Tensor):
+        values = values.detach().cpu().numpy()
+    array = np.asarray(values, dtype=np.float32)
+    if array.ndim and array.shape != shape:
+        raise ValueError(f"{what} must have shape {shape}, got {array.shape}")
+    if not np.isfinite(array).all():
+        raise ValueError(f"{what} must be finite")
+    return np.ascontiguousarray(np.broadcast_to(array, shape))
+
+
+def checked_mask(worlds: Any, num_envs: int) -> np.ndarray:
+    """Return which worlds are meant as float32 ones and zeros, all for None. Raises ValueError for another shape."""
+    if worlds is None:
+        return np.ones(num_envs, dtype=np.float32)
+    if isinstance(worlds, torch.Tensor):
+        worlds = worlds.detach().cpu().numpy()
+    array = np.asarray(worlds)
+    if array.shape != (num_envs,) or array.dtype != bool:
+        raise ValueError(f"worlds must be bool of shape ({num_envs},), got {array.dtype} of shape {array.shape}")
+    return array.astype(np.float32)
+
+
+def checked_commands(commands: Mapping[str, Any] | Any, num_envs: int) -> np.ndarray:
+    """Return commands, up to four numbers a world, as (num_envs, 4); raises ValueError: another shape, not finite."""
+    array = np.asarray(commands.detach().cpu() if isinstance(commands, torch.Tensor) else commands, dtype=np.float32)
+    if array.ndim != 2 or array.shape[0] != num_envs or not 1 <= array.shape[1] <= 4:
+        raise ValueError(f"commands must have shape ({num_envs}, 1 to 4), got {array.shape}")
+    return checked_values(np.pad(array, ((0, 0), (0, 4 - array.shape[1]))), (num_envs, 4), "commands")

@@ -1,0 +1,52 @@
+"""The arrays that domain randomisation writes, taken from a simulation."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from jumper_warp.sim.dynamics import find_paws
+from jumper_warp.sim.simulation import Simulation
+from jumper_warp.tasks.cfg import TaskCfg
+from kernels.layout import BODIES, DOFS
+from kernels.mdp.parameters import RobotParameters
+
+MODEL = (
+    "body_mass", "body_inv_mass", "body_com", "body_inertia", "body_inv_inertia", "joint_armature", "joint_friction",
+)  # fmt: skip
+"""Arrays of Newton's model."""
+NOMINAL = {"body_mass": "mass", "body_com": "com", "body_inertia": "inertia", "joint_armature": "armature"}
+"""Arrays of the model whose values of one world are kept."""
+
+
+def robot_parameters(sim: Simulation, tasks: tuple[TaskCfg, ...], skill: wp.array) -> Any:
+    """Return the kernels' `RobotParameters`; the model's values of the moment are the nominal ones.
+
+    skill: index of each world's task among `tasks`, (num_worlds,).
+    """
+    model, n, device = sim.model, sim.num_worlds, sim.device
+    robot = RobotParameters()
+    for name in MODEL:
+        setattr(robot, name, getattr(model, name))
+    for name, short in NOMINAL.items():
+        array = getattr(model, name)
+        one = array.numpy()[: int(BODIES) if name.startswith("body") else int(DOFS)]
+        setattr(robot, f"nominal_{short}", wp.array(one, dtype=array.dtype, device=device))
+    robot.shape_mu = model.shape_material_mu
+    robot.paw_shapes = wp.array(find_paws(model).flatten(), dtype=int, device=device)
+    robot.static_ratio = sim.physics.dynamics.static_friction_ratio
+    robot.motors, robot.physics_dt, robot.skill = sim.motors, sim.dt, skill
+    robot.latency = wp.zeros(n, dtype=int, device=device)
+    robot.observation_latency = wp.zeros(n, dtype=int, device=device)
+    robot.push = wp.zeros(n, dtype=wp.spatial_vector, device=device)
+    robot.gain_ratio = wp.full((12, n), wp.vec2(1.0, 1.0), dtype=wp.vec2, device=device)
+    for name, attribute in (("kp", "kp"), ("kd", "kd"), ("no_load", "no_load_speed"), ("cutoff", "cutoff_speed"),
+                            ("saturation", "saturation")):  # fmt: skip
+        rows = []
+        for task in tasks:
+            lateral, transversal = getattr(task.motors.lateral, attribute), getattr(task.motors.transversal, attribute)
+            rows.append(4 * [lateral, transversal, transversal])
+        setattr(robot, f"nominal_{name}", wp.array(np.array(rows, dtype=np.float32), dtype=float, device=device))
+    return robot

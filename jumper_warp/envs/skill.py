@@ -1,0 +1,142 @@
+"""One task in an environment: its kernels and all that it keeps of every world."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import torch
+import warp as wp
+
+from jumper_warp.robot.motors import filter_params
+from jumper_warp.tasks.cfg import TaskCfg
+from kernels.mdp.env import Counters, Nothing, SkillSettings
+from kernels.mdp.events import make_event_kernel
+from kernels.mdp.observe import ObservationArrays, Slot, make_observe_kernel
+from kernels.mdp.reset import make_give_kernel, make_reset_kernel
+from kernels.mdp.step import make_step_kernel
+from kernels.mdp.view import vec12
+
+RING = 8
+"""Policy steps that the rings of past targets and observations hold."""
+_KERNELS: dict[tuple, dict[str, wp.Kernel]] = {}
+
+
+class Skill:
+    """The side of an environment that belongs to one task. Struct and array attributes are the kernels' arguments."""
+
+    def __init__(self, task: TaskCfg, index: int, num_envs: int, step_dt: float, substeps: int, device: Any) -> None:
+        """Allocate everything; index: of the skill in the environment; step_dt [s]: policy step."""
+        self.task, self.index, self.num_envs, self.device = task, index, num_envs, device
+        self.kernels = kernels_of(task)
+        self.numbers = wp.array(task.numbers, dtype=float, device=device)
+        self.states = wp.zeros(num_envs, dtype=task.state, device=device)
+        self.num_events, self.num_terms = len(task.rows["events"]), sum(len(task.rows[g]) for g in task.groups)
+        self.timer = wp.zeros((max(self.num_events, 1), num_envs), dtype=int, device=device)
+        self.term_value = wp.zeros((max(len(task.rewards), 1), num_envs), dtype=float, device=device)
+        self.counters = self._counters()
+        self.settings = self._structs([] if task.reset.settings is None else [task.reset.settings.values(step_dt)])
+        self.levels = self._structs([level.values() for level in task.levels], task.level_type)
+        self._allocate_observations(substeps)
+
+    def _counters(self) -> Any:
+        n, task, counters = self.num_envs, self.task, Counters()
+        counters.term_sum = wp.zeros((max(len(task.rewards), 1), n), dtype=wp.float64, device=self.device)
+        counters.ending_count = wp.zeros((len(task.terminations), n), dtype=int, device=self.device)
+        for name in ("counted", "succeeded", "bad_actions"):
+            setattr(counters, name, wp.zeros(n, dtype=int, device=self.device))
+        counters.error_sum = wp.zeros(n, dtype=wp.float64, device=self.device)
+        return counters
+
+    def _structs(self, values: list, kind: Any = None) -> wp.array:
+        """Return structs as an array; an unused one where there are none."""
+        values = values or [Nothing()]
+        return wp.array(values, dtype=kind or values[0]._cls, device=self.device)
+
+    def _allocate_observations(self, substeps: int) -> None:
+        n, task = self.num_envs, self.task
+        layouts = {group: task.layout(group) for group in task.groups}
+        widths = {group: max((end for _, end in layout.values()), default=0) for group, layout in layouts.items()}
+        slots, start, past = [], 0, 0
+        for index, group in enumerate(task.groups):
+            for row in task.rows[group]:
+                term = row.term
+                delayed = term.options["delayed"]
+                slots.append((index, start, widths[group], row.first, layouts[group][term.name][0], term.width,
+                              term.options["history"], int(delayed), past))  # fmt: skip
+                past += term.width if delayed else 0
+            start += n * widths[group]
+        self.slots = wp.array(np.array(slots, dtype=Slot.numpy_dtype()), dtype=Slot, device=self.device)
+        arrays = ObservationArrays()
+        arrays.now = wp.zeros(start, dtype=float, device=self.device)
+        arrays.final = wp.zeros(start, dtype=float, device=self.device)
+        arrays.past = wp.zeros((RING, n, max(past, 1)), dtype=float, device=self.device)
+        arrays.substeps = substeps
+        self.observations = arrays
+        self.obs, self.final_obs = (self._views(a, widths) for a in (arrays.now, arrays.final))
+
+    def _views(self, array: wp.array, widths: dict[str, int]) -> dict[str, torch.Tensor]:
+        """Return torch views (num_envs, columns) of each group's rows."""
+        flat, first, views = wp.to_torch(array), 0, {}
+        for group, width in widths.items():
+            views[group] = flat[first : first + self.num_envs * width].view(self.num_envs, width)
+            first += self.num_envs * width
+        return views
+
+    def settings_of_skill(self) -> Any:
+        """Return the kernels' `SkillSettings`."""
+        lateral, transversal = (math.radians(scale) for scale in self.task.action_scale)
+        settings = SkillSettings()
+        settings.action_scale = vec12(*(4 * (lateral, transversal, transversal)))
+        settings.command_filter = filter_params(self.task.command_filter)
+        settings.contact_force = self.task.contact_force
+        settings.push_in_flight = int(self.task.randomization.push_in_flight)
+        return settings
+
+    def set(self, section: str, name: str, **numbers: float) -> None:
+        """Change numbers of a term, at once and in captured graphs too.
+
+        Raises ValueError for an unknown term or number, or a value that is not finite.
+        """
+        for key, value in numbers.items():
+            if not math.isfinite(value):
+                raise ValueError(f"{section} {name}: {key} must be finite, got {value}")
+            i = self.task.place(section, name, key)
+            self.numbers[i : i + 1].fill_(value)
+
+    def metrics(self) -> dict[str, float]:
+        """Return means since the last call, and clear the counters (waits for the device)."""
+        task, counters, figures = self.task, self.counters, {}
+        endings = counters.ending_count.numpy().sum(axis=1)
+        ended = max(int(endings.sum()), 1)
+        for term, total in zip(task.rewards, counters.term_sum.numpy().sum(axis=1), strict=False):
+            figures[f"Episode_Reward/{term.name}"] = float(total) / ended
+        for term, count in zip(task.terminations, endings, strict=True):
+            figures[f"Episode_Termination/{term.name}"] = float(count) / ended
+        counted, succeeded = int(counters.counted.numpy().sum()), int(counters.succeeded.numpy().sum())
+        figures["Metrics/success"] = succeeded / max(counted, 1)
+        figures["Metrics/error_m"] = float(counters.error_sum.numpy().sum()) / max(succeeded, 1)
+        figures["Metrics/bad_actions"] = float(counters.bad_actions.numpy().sum())
+        for name in Counters.vars:
+            getattr(counters, name).zero_()
+        return figures
+
+
+def kernels_of(task: TaskCfg) -> dict[str, wp.Kernel]:
+    """Return a task's kernels; tasks that differ in numbers only share them."""
+    rows = tuple(
+        (section, row.func, row.first, row.lo, row.hi, tuple(row.term.options.items()))
+        for section, section_rows in task.rows.items()
+        for row in section_rows
+    )
+    key = (task.state, task.settings_type, task.level_type, task.reset.func, task.command, task.reward_floor, rows)
+    if key not in _KERNELS:
+        _KERNELS[key] = {
+            "step": make_step_kernel(task),
+            "reset": make_reset_kernel(task),
+            "give": make_give_kernel(task),
+            "observe": make_observe_kernel(task),
+            "event": make_event_kernel(task.rows["events"]),
+        }
+    return _KERNELS[key]

@@ -1,0 +1,225 @@
+"""How a simulation is advanced, on either solver, behind one small protocol."""
+
+from __future__ import annotations
+
+from typing import Any, Protocol
+
+import newton
+import warp as wp
+from newton import ModelFlags
+from newton.sensors import SensorContact
+
+from jumper_warp.robot.description import load_description
+from jumper_warp.robot.grounds import BlockCfg
+from jumper_warp.robot.model import KNEE_DOFS
+from jumper_warp.sim.dynamics import JumperDynamics
+from jumper_warp.sim.mujoco import mujoco_solver
+from jumper_warp.sim.solver import SolverJumper
+from kernels.actuation.motors import motor_torque_kernel
+from kernels.actuation.passive import passive_torque_kernel
+from kernels.actuation.readout import arrived_target_kernel, motor_values_kernel, paw_force_kernel
+from kernels.dynamics.restore import mask_kernel, zero_worlds_kernel
+from kernels.layout import COORDS, DOFS
+
+EXPLICIT_STOP = (1000.0, 2.0)
+"""[N m/rad], [N m s/rad] Stops of the transversal sum on MuJoCo, explicit and therefore softer than SolverJumper's."""
+DRAWN_FLAGS = (
+    ModelFlags.BODY_INERTIAL_PROPERTIES
+    | ModelFlags.JOINT_DOF_FORCE_PROPERTIES
+    | ModelFlags.JOINT_DOF_INERTIAL_PROPERTIES
+    | ModelFlags.SHAPE_PROPERTIES
+)
+"""What domain randomisation changes."""
+
+
+class Physics(Protocol):
+    """What a simulation and an environment ask of a solver. Arrays keep their place."""
+
+    solver: newton.solvers.SolverBase
+    dynamics: JumperDynamics
+    """Geometry, ground and friction ratio; on other solvers for kinematics only."""
+    invalid: wp.array
+    """(num_worlds,) int, 1: the solver gave the world up."""
+    impulse: wp.array
+    """(4, num_worlds) vec3 [N s], what the contact solver carries over."""
+    torque: wp.array
+    """(12, num_worlds) [N m], of the last physics step."""
+    paw_force: wp.array
+    """(4, num_worlds) vec3 [N], of the last physics step."""
+    peak_force: wp.array
+    """(num_worlds,) [N], largest total paw force of the last call of `advance`."""
+    peak_paw_force: wp.array
+    """(4, num_worlds) [N], largest on each paw in the last call of `advance`."""
+
+    def advance(
+        self,
+        substeps: int,
+        target: wp.array,
+        previous: wp.array | None = None,
+        delay: wp.array | None = None,
+        bodies: bool = True,
+    ) -> None:
+        """Launch physics steps towards motor targets [rad], shape (12, num_worlds).
+
+        With `delay` [physics steps], shape (num_worlds,), the motors follow `previous` until the target arrives.
+        bodies False: passive joints and bodies of the state need not be written.
+        """
+
+    def parameters_changed(self, mask: wp.array | None = None) -> None:
+        """Read the model's masses, joints and friction again, where mask (num_worlds,) is not 0; None: everywhere."""
+
+    def after_reset(self, mask: wp.array) -> None:
+        """Let everything follow from coordinates that were written anew where mask (num_worlds,) is not 0."""
+
+    def forget(self, mask: wp.array) -> None:
+        """Drop what is carried from step to step where mask (num_worlds + 1,) bool is set."""
+
+    def write_bodies(self) -> None:
+        """Bring the state's passive joints and bodies up to date."""
+
+    def carried(self) -> dict[str, wp.array]:
+        """Return what the next step depends on besides coordinates and impulses, by name."""
+
+
+class JumperPhysics:
+    """`SolverJumper`: a policy step in one launch."""
+
+    def __init__(self, sim: Any, block: BlockCfg | None, tolerance: float) -> None:
+        """Make the solver for a simulation's model; raises ValueError as `SolverJumper`."""
+        self._sim = sim
+        self.solver = SolverJumper(sim.model, block=block, tolerance=tolerance)
+        self.dynamics = self.solver.dynamics
+        work = self.dynamics.work
+        self.invalid, self.impulse, self.torque = work.invalid, work.impulse, work.torque
+        self.paw_force, self.peak_force, self.peak_paw_force = work.contact_force, work.peak_force, work.peak_paw_force
+
+    def advance(
+        self,
+        substeps: int,
+        target: wp.array,
+        previous: wp.array | None = None,
+        delay: wp.array | None = None,
+        bodies: bool = True,
+    ) -> None:
+        """See `Physics.advance`."""
+        state, sim = self._sim.state, self._sim
+        self.solver.step_motors(
+            state, state, sim.motors, target, sim.dt, substeps, previous=previous, delay=delay, bodies=bodies
+        )
+
+    def parameters_changed(self, mask: wp.array | None = None) -> None:
+        """See `Physics.parameters_changed`."""
+        self.dynamics.pack_masses(mask)
+        self.dynamics.pack_joints(mask)
+        self.dynamics.pack_friction(mask)
+
+    def after_reset(self, mask: wp.array) -> None:
+        """See `Physics.after_reset`; the solver reads base and motors only."""
+
+    def forget(self, mask: wp.array) -> None:
+        """See `Physics.forget`."""
+        self.solver.reset(self._sim.state, mask, flags=newton.StateFlags.NONE)
+        if self._sim.block is not None:
+            self.solver.reset_blocks(mask)
+
+    def write_bodies(self) -> None:
+        """See `Physics.write_bodies`."""
+        state = self._sim.state
+        self.dynamics.full_state(state.joint_q, state.joint_qd, state.body_q, state.body_qd)
+
+    def carried(self) -> dict[str, wp.array]:
+        """See `Physics.carried`."""
+        return {}
+
+
+class MujocoPhysics:
+    """Newton's SolverMuJoCo, physics step by physics step, with this robot's motors and passive joints."""
+
+    def __init__(self, sim: Any, observe_forces: bool) -> None:
+        """Make the solver for a simulation's model, whose knee damping it takes over."""
+        self._sim, n, device, model = sim, sim.num_worlds, sim.device, sim.model
+        damping = model.joint_damping.numpy().reshape(n, -1)
+        damping[:, KNEE_DOFS] = 0.0
+        model.joint_damping.assign(damping.ravel())
+        self.solver = mujoco_solver(model, dt=sim.dt)
+        self.dynamics = JumperDynamics(model)
+        robot = load_description()
+        self._passive = [robot.knee_damping, robot.knee_damping_limit, *robot.transversal_sum, *EXPLICIT_STOP]
+        self.invalid = wp.zeros(n, dtype=int, device=device)
+        self.impulse = wp.zeros((4, n), dtype=wp.vec3, device=device)
+        self.torque = wp.zeros((12, n), dtype=float, device=device)
+        self.paw_force = wp.zeros((4, n), dtype=wp.vec3, device=device)
+        self.peak_force = wp.zeros(n, dtype=float, device=device)
+        self.peak_paw_force = wp.zeros((4, n), dtype=float, device=device)
+        self._arrived = wp.zeros((12, n), dtype=float, device=device)
+        self._mask = wp.zeros(n + 1, dtype=wp.bool, device=device)  # the last one: no world
+        self._sensor = self._contacts = self._observables = None
+        if observe_forces:
+            pipeline = newton.CollisionPipeline(
+                model, rigid_contact_max=self.solver.get_max_contact_count(), soft_contact_max=0
+            )
+            self._contacts = pipeline.contacts()
+            self._sensor = SensorContact(model, sensing_shapes="*_paw", request_contact_attributes=False)
+            self._observables = self.solver.observables({"contact_f"}, contacts=self._contacts)
+
+    def advance(
+        self,
+        substeps: int,
+        target: wp.array,
+        previous: wp.array | None = None,
+        delay: wp.array | None = None,
+        bodies: bool = True,
+    ) -> None:
+        """See `Physics.advance`; bodies are always written."""
+        for i in range(substeps):
+            if delay is not None:
+                self._launch(
+                    arrived_target_kernel, (12, self._sim.num_worlds), [target, previous, delay, i], [self._arrived]
+                )
+            self._step(target if delay is None else self._arrived, restart=i == 0)
+
+    def _step(self, target: wp.array, restart: bool) -> None:
+        sim, state, joint_f = self._sim, self._sim.state, self._sim.control.joint_f
+        q, qd, motors = state.joint_q, state.joint_qd, (12, sim.num_worlds)
+        self._launch(motor_torque_kernel, motors, [target, q, qd, COORDS, DOFS, sim.motors], [joint_f])
+        self._launch(motor_values_kernel, motors, [joint_f], [self.torque])
+        self._launch(passive_torque_kernel, (sim.num_worlds, 4), [q, qd, *self._passive], [joint_f])
+        self.solver.step(state, state, sim.control, self._contacts, sim.dt, observables=self._observables)
+        if self._sensor is not None:
+            self._sensor.update(state, self._contacts, observables=self._observables)
+            inputs = [self._sensor.total_force, int(restart)]
+            self._launch(
+                paw_force_kernel, sim.num_worlds, inputs, [self.paw_force, self.peak_force, self.peak_paw_force]
+            )
+
+    def parameters_changed(self, mask: wp.array | None = None) -> None:
+        """See `Physics.parameters_changed`; MuJoCo reads all worlds."""
+        self.solver.notify_model_changed(DRAWN_FLAGS)
+        self.dynamics.pack_friction(mask)
+
+    def after_reset(self, mask: wp.array) -> None:
+        """See `Physics.after_reset`."""
+        self._launch(mask_kernel, self._sim.num_worlds, [mask], [self._mask])
+        self.forget(self._mask)
+        self.write_bodies()
+
+    def forget(self, mask: wp.array) -> None:
+        """See `Physics.forget`; rows of the loops are made with the velocities of the last step."""
+        self.solver.reset(self._sim.state, mask, flags=newton.StateFlags.NONE)
+        for left_over in (self.solver.mjw_data.cvel, self.solver.mjw_data.cdof_dot):
+            self._launch(zero_worlds_kernel, left_over.shape, [mask], [left_over])
+
+    def write_bodies(self) -> None:
+        """See `Physics.write_bodies`."""
+        state = self._sim.state
+        self.dynamics.full_state(state.joint_q, state.joint_qd, state.body_q, state.body_qd)
+
+    def carried(self) -> dict[str, wp.array]:
+        """See `Physics.carried`."""
+        data = self.solver.mjw_data
+        names = ("qacc_warmstart", "cvel", "cdof_dot")
+        bodies = {"body_q": self._sim.state.body_q, "body_qd": self._sim.state.body_qd}
+        return bodies | {name: getattr(data, name) for name in names}
+
+    def _launch(self, kernel: wp.Kernel, dim: int | tuple[int, ...], inputs: list, outputs: list) -> None:
+        wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self._sim.device)

@@ -1,0 +1,39 @@
+"""What a policy of a task reads and drives, as plain data that goes with every policy."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from typing import Any
+
+from jumper_warp.robot.description import MOTOR_JOINTS, load_description
+from jumper_warp.robot.motors import MotorKindCfg
+from jumper_warp.tasks.cfg import TaskCfg
+
+
+def interface(task: TaskCfg) -> dict[str, Any]:
+    """Return observation columns and layout, scales, gains [N m/rad], [N m s/rad], limits [N m] and command filter."""
+
+    def per_motor(lateral: float, transversal: float) -> list[float]:
+        return [lateral, transversal, transversal] * (len(MOTOR_JOINTS) // 3)
+
+    def torque(kind: MotorKindCfg) -> float:
+        return min(kind.saturation, kind.peak)
+
+    motors = task.motors
+    return {
+        "task": task.name,
+        "observation_names": list(task.observation_names),
+        "observation_layout": {
+            term.name: {"first": first, "end": end, "scale": term.numbers["scale"], "clip": term.numbers["clip"],
+                        "history": term.options["history"]}
+            for term, (first, end) in zip(task.policy, task.layout("policy").values(), strict=True)
+        },
+        "joint_names": list(MOTOR_JOINTS),
+        "action_scale": per_motor(*map(math.radians, task.action_scale)),
+        "default_joint_pos": [float(angle) for angle in load_description().pose("default")],
+        "joint_stiffness": per_motor(motors.lateral.kp, motors.transversal.kp),
+        "joint_damping": per_motor(motors.lateral.kd, motors.transversal.kd),
+        "torque_limit": per_motor(torque(motors.lateral), torque(motors.transversal)),
+        "command_filter": dataclasses.asdict(task.command_filter),
+    }  # fmt: skip

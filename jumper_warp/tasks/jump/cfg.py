@@ -1,0 +1,207 @@
+"""How jumps begin: reference states, grounds and the levels of the curriculum, as data."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, replace
+from itertools import accumulate
+from typing import Any
+
+import warp as wp
+
+from kernels.jump.ground_draws import EVERY_SIDE, GroundRanges
+from kernels.jump.reset import JumpLevel, JumpSettings
+from kernels.jump.reset_draws import ResetRanges
+
+Pair = tuple[float, float]
+
+
+@dataclass(frozen=True)
+class GroundCfg:
+    """What standing starts of a randomised training on SolverJumper stand on or jump to; elsewhere the ground is level.
+
+    An environment that is given a ground or a block draws none.
+    """
+
+    platform: float = 0.0
+    """[1] Share that begins on a platform, where the paws have room to land beside it."""
+    block: float = 0.0
+    """[1] Share with a block under the goal that slides, where there is room before it."""
+    drop: Pair = (0.03, 0.20)
+    """[m] Height of the platform."""
+    rise: Pair = (0.02, 0.08)
+    """[m] Height of the block."""
+    room: float = 0.30
+    """[m] Most between the paws and an edge, each way; the near side of a block may be farther from both."""
+    clearance: float = 0.12
+    """[m] Least between an edge that must be crossed and the paws at the goal."""
+    mass: Pair = (5.0, 100.0)
+    """[kg] Of the block."""
+    friction: Pair = (0.3, 1.0)
+    """[1] Of block and floor."""
+
+    def __post_init__(self) -> None:
+        """Raises ValueError: shares or lengths out of range, or a pair that is reversed, not positive or not finite."""
+        if not (min(self.platform, self.block) >= 0.0 and self.platform + self.block <= 1.0):
+            raise ValueError(f"ground shares must be >= 0 and add up to at most 1, got {self.platform}, {self.block}")
+        for name, value in vars(self).items():
+            if isinstance(value, tuple) and not 0.0 < value[0] <= value[1] < math.inf:
+                raise ValueError(f"ground {name} must be (lower, upper), positive and finite, got {value}")
+        for name, least in (("room", EVERY_SIDE), ("clearance", 0.0)):
+            if not least <= getattr(self, name) < math.inf:
+                raise ValueError(f"ground {name} must be finite and at least {least:g}, got {getattr(self, name)}")
+
+    @property
+    def drawn(self) -> bool:
+        """Whether there is anything but level ground."""
+        return self.platform + self.block > 0.0
+
+    def ranges(self) -> Any:
+        """Return the kernels' `GroundRanges`."""
+        ranges = GroundRanges()
+        for name, value in vars(self).items():
+            setattr(ranges, name, wp.vec2(*value) if isinstance(value, tuple) else value)
+        return ranges
+
+
+@dataclass(frozen=True)
+class Level:
+    """One level of the curriculum."""
+
+    goal_lower: tuple[float, float, float]
+    """Smallest goal relative to start and heading [m]: landing x, y, and base height at the apex (0: any)."""
+    goal_upper: tuple[float, float, float]
+    """Largest goal."""
+    base_height: Pair
+    """[m] Of standing starts; low ones are deep squats."""
+    jump_again: float = 0.0
+    """[1] Share of the episodes in which a landed robot gets another goal."""
+
+    struct = JumpLevel
+    """What the kernels read."""
+
+    def __post_init__(self) -> None:
+        """Raises ValueError: a range is not one."""
+        pairs = [*zip(self.goal_lower, self.goal_upper, strict=True), self.base_height]
+        if not all(-math.inf < low <= high < math.inf for low, high in pairs):
+            raise ValueError(f"a level's ranges must be finite and rise, got {self}")
+        if not 0.0 <= self.jump_again <= 1.0:
+            raise ValueError(f"level jump_again must be in [0, 1], got {self.jump_again}")
+
+    def values(self) -> Any:
+        """Return the kernels' `JumpLevel`."""
+        level = JumpLevel()
+        level.goal_lower, level.goal_upper = wp.vec3(*self.goal_lower), wp.vec3(*self.goal_upper)
+        level.base_height, level.jump_again = wp.vec2(*self.base_height), self.jump_again
+        return level
+
+
+@dataclass(frozen=True)
+class ResetCfg:
+    """Reference state initialisation: shares of the schemes and ranges of their states; angles in degrees."""
+
+    standing: float = 0.60
+    default: float = 0.15
+    in_flight: float = 0.20
+    touchdown: float = 0.0
+    """Shares; what is left begins just landed."""
+    base_xy: float = 0.05
+    """[m]"""
+    tilt: float = 5.0
+    """[deg] Roll, pitch and yaw."""
+    forward_pitch: float = 0.0
+    """[deg] Largest mean pitch of standing states."""
+    heading: float = 0.0
+    """[deg] Half width of the heading."""
+    front_x: Pair = (0.20, 0.22)
+    """[m] Paw positions relative to the base."""
+    front_y: Pair = (0.15, 0.17)
+    """[m]"""
+    back_x: Pair = (0.20, 0.22)
+    """[m]"""
+    back_y: Pair = (0.20, 0.22)
+    """[m]"""
+    takeoff_height: Pair = (0.40, 0.45)
+    """[m]"""
+    takeoff_ahead: Pair = (0.0, 0.0)
+    """[m] Base ahead of its start, towards the goal."""
+    takeoff_angle: Pair = (50.0, 75.0)
+    """[deg] Above the horizon, where the goal names no apex."""
+    highest_apex: float = 1.0
+    """[m] Of jumps with a drawn takeoff angle."""
+    landing_height: float = 0.42
+    """[m] Of the base, where the projectile ends."""
+    flight_time: Pair = (0.01, 0.95)
+    """[1] Share of the time in the air."""
+    flight_lateral: float = 10.0
+    """[deg]"""
+    flight_transversal: Pair = (0.0, 90.0)
+    """[deg]"""
+    touchdown_time: Pair = (0.03, 0.15)
+    """[s] Before landing."""
+    touchdown_behind: Pair = (0.0, 0.0)
+    """[m] Base behind the projectile before touchdown, so that the paws are ahead of it."""
+    paw_depth: Pair = (0.30, 0.45)
+    """[m] Paws below the base before touchdown."""
+    landed_height: Pair = (0.30, 0.42)
+    """[m]"""
+    landed_ahead: Pair = (0.0, 0.0)
+    """[m] Base ahead of the goal just after landing."""
+    landed_speed: Pair = (0.0, 1.0)
+    """[m/s] Downward."""
+    ground: GroundCfg = field(default_factory=GroundCfg)
+    """What standing starts stand on or jump to."""
+    command_delay: float = 0.5
+    """[s] Longest time until the jump is commanded."""
+    again_delay: Pair = (0.2, 0.7)
+    """[s] From touchdown to the other goal."""
+
+    def __post_init__(self) -> None:
+        """Raises ValueError: shares do not add up, a pair is reversed, or a delay or a share is out of range."""
+        shares = self._shares()
+        if not min(shares) >= 0.0 or sum(shares) > 1.0 + 1e-9:
+            raise ValueError(f"reset shares must be >= 0 and add up to at most 1, got {shares}")
+        for name, value in vars(self).items():
+            if isinstance(value, tuple) and not value[0] <= value[1]:
+                raise ValueError(f"reset {name} must be (lower, upper), got {value}")
+        for name, least in (("command_delay", self.command_delay), ("again_delay", self.again_delay[0])):
+            if not least >= 0.0:
+                raise ValueError(f"reset {name} must not be negative, got {least}")
+
+    def _shares(self) -> tuple[float, ...]:
+        return (self.standing, self.default, self.in_flight, self.touchdown)
+
+    struct = JumpSettings
+    """What the kernels read."""
+
+    def values(self, step_dt: float) -> Any:
+        """Return the kernels' `JumpSettings`: angles in radians, delays in policy steps of step_dt [s]."""
+        settings = JumpSettings()
+        settings.states, settings.grounds = self._ranges(step_dt), self.ground.ranges()
+        return settings
+
+    @property
+    def draws_ground(self) -> bool:
+        """Whether there is anything but level ground."""
+        return self.ground.drawn
+
+    def on_level_ground(self) -> ResetCfg:
+        """Return the same with level ground only."""
+        return replace(self, ground=GroundCfg())
+
+    def _ranges(self, step_dt: float) -> Any:
+        ranges = ResetRanges()
+        ranges.shares = wp.vec4(*accumulate(self._shares()))
+        degrees = ("tilt", "forward_pitch", "heading", "takeoff_angle", "flight_lateral", "flight_transversal")
+        apart = ("standing", "default", "in_flight", "touchdown", "command_delay", "again_delay", "ground")
+        for name, value in vars(self).items():
+            if name in apart:
+                continue
+            scale = math.pi / 180.0 if name in degrees else 1.0
+            if isinstance(value, tuple):
+                setattr(ranges, name, wp.vec2(scale * value[0], scale * value[1]))
+            else:
+                setattr(ranges, name, scale * value)
+        ranges.command_delay = round(self.command_delay / step_dt)
+        ranges.again_delay = wp.vec2(*(delay / step_dt for delay in self.again_delay))
+        return ranges

@@ -1,0 +1,135 @@
+"""Domain randomisation as data (paper, Table V): ranges by name, turned into events."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from jumper_warp.tasks.terms import EventTerm
+from kernels.mdp import parameters
+
+Range = tuple[float, float] | None
+NOMINAL_FRICTION = 0.9
+"""[1] Of the paws, where it is not drawn."""
+LONGEST_LATENCY = 100.0
+"""[ms] What the ring of past targets and observations holds."""
+
+
+@dataclass(frozen=True)
+class RandomizationCfg:
+    """Ranges of uniform draws; None turns a row off. The defaults are those for jumping."""
+
+    static_friction: Range = (0.9, 1.2)
+    """[1] Not below the dynamic coefficient of the same environment."""
+    dynamic_friction: Range = (0.8, 0.9)
+    """[1]"""
+    base_mass: Range = (-1.0, 2.0)
+    """[kg] Added to the base."""
+    link_mass: Range = (0.8, 1.2)
+    """[1] Scales mass and inertia of each link."""
+    com_shift: Range = (-0.03, 0.03)
+    """[m] Of the base, along each axis."""
+    gains: Range = (0.6, 1.4)
+    """[1] Scales kp and kd of each motor."""
+    no_load_speed: Range = (0.8, 1.2)
+    """[1] Scales each motor's."""
+    cutoff_speed: Range = (0.8, 1.4)
+    """[1] Scales each motor's; stays below the no-load speed."""
+    motor_friction: Range = (0.005, 0.04)
+    """[N m] Coulomb friction of each motor."""
+    armature: Range = (0.6, 1.4)
+    """[1] Scales each motor's."""
+    joint_offset: Range = (-2.0, 2.0)
+    """[deg] Constant error of each motor's position sensor."""
+    latency: Range = (0.0, 16.0)
+    """[ms] From action to motor, rounded down to whole physics steps."""
+    observation_latency: Range = None
+    """[ms] From sensor to policy, rounded down to whole physics steps."""
+    force: Range = (-5.0, 5.0)
+    """[N] On the base, along each world axis, while a paw is on the ground."""
+    torque: Range = (-3.0, 3.0)
+    """[N m] On the base, about each world axis, while a paw is on the ground."""
+    push_interval: Range = None
+    """[s] Between two pushes; None: one for the whole episode."""
+    push_share: float = 1.0
+    """[1] Share of the intervals in which there is a push."""
+    push_in_flight: bool = False
+    """Whether pushes act in the air too."""
+    redraw: Literal["startup", "reset"] = "reset"
+    """When all but the pushes is drawn: once, or at every reset of a world."""
+
+    def __post_init__(self) -> None:
+        """Raises ValueError: a range is not one."""
+        for name, value in vars(self).items():
+            if isinstance(value, tuple) and not (-math.inf < value[0] <= value[1] < math.inf):
+                raise ValueError(f"randomisation range {name} must be finite and rise, got {value}")
+        for name in ("latency", "observation_latency"):
+            value = getattr(self, name)
+            if value is not None and not 0.0 <= value[0] <= value[1] <= LONGEST_LATENCY:
+                raise ValueError(f"randomisation range {name} must be in 0 to {LONGEST_LATENCY:g} ms, got {value}")
+        if not 0.0 <= self.push_share <= 1.0:
+            raise ValueError(f"randomisation push_share must be in [0, 1], got {self.push_share}")
+
+    @classmethod
+    def off(cls) -> RandomizationCfg:
+        """Return a configuration with every row off."""
+        rows = [name for name, field in cls.__dataclass_fields__.items() if "Range" in str(field.type)]
+        return cls(**dict.fromkeys(rows))
+
+    @classmethod
+    def walking(cls) -> RandomizationCfg:
+        """Return the paper's ranges for walking."""
+        return cls(
+            static_friction=(0.8, 0.95),
+            dynamic_friction=(0.7, 0.8),
+            no_load_speed=(0.6, 1.2),
+            cutoff_speed=(0.6, 1.4),
+            latency=(0.0, 32.0),
+            observation_latency=(0.0, 32.0),
+            force=(-10.0, 10.0),
+            push_interval=(0.2, 0.5),
+            push_share=0.25,
+            push_in_flight=True,
+        )
+
+    def events(self) -> tuple[EventTerm, ...]:
+        """Return the rows that are on as events."""
+        found = []
+
+        def add(func: Any, pair: Range, scale: float = 1.0) -> None:
+            if pair is not None:
+                found.append(EventTerm(func, mode=self.redraw, lower=scale * pair[0], upper=scale * pair[1]))
+
+        add(parameters.base_mass, self.base_mass)
+        add(parameters.link_mass, self.link_mass)
+        add(parameters.com_shift, self.com_shift)
+        add(parameters.armature, self.armature)
+        add(parameters.motor_friction, self.motor_friction)
+        add(parameters.gains, self.gains)
+        if self.no_load_speed or self.cutoff_speed:
+            low, high = self.no_load_speed or (1.0, 1.0), self.cutoff_speed or (1.0, 1.0)
+            found.append(
+                EventTerm(parameters.speed_limits, mode=self.redraw, no_load_lower=low[0], no_load_upper=low[1],
+                          cutoff_lower=high[0], cutoff_upper=high[1])
+            )  # fmt: skip
+        add(parameters.joint_offset, self.joint_offset, math.pi / 180.0)
+        if self.dynamic_friction or self.static_friction:
+            dynamic = self.dynamic_friction or (NOMINAL_FRICTION, NOMINAL_FRICTION)
+            static = self.static_friction or (0.0, 0.0)  # not below the dynamic one
+            found.append(
+                EventTerm(parameters.friction, mode=self.redraw, dynamic_lower=dynamic[0], dynamic_upper=dynamic[1],
+                          static_lower=static[0], static_upper=static[1])
+            )  # fmt: skip
+        add(parameters.action_latency, self.latency, 1.0e-3)
+        add(parameters.observation_latency, self.observation_latency, 1.0e-3)
+        if self.force or self.torque:
+            force, torque = self.force or (0.0, 0.0), self.torque or (0.0, 0.0)
+            timing: dict[str, Any] = {"mode": "reset", "repack": False}
+            if self.push_interval is not None:
+                timing |= {"mode": "interval", "least": self.push_interval[0], "most": self.push_interval[1]}
+            found.append(
+                EventTerm(parameters.push, **timing, share=self.push_share, force_lower=force[0], force_upper=force[1],
+                          torque_lower=torque[0], torque_upper=torque[1])
+            )  # fmt: skip
+        return tuple(found)

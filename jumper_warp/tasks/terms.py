@@ -1,0 +1,210 @@
+"""Terms of a task: a Warp function and its numbers by name, checked when they are written down.
+
+The first arguments of a function come from the kernel; its other parameters, all float, are numbers of the term. All
+numbers of a task lie in one array on the device, so that each can change while a captured graph replays.
+"""
+
+from __future__ import annotations
+
+import inspect
+import math
+from typing import Any, ClassVar, NamedTuple, get_type_hints
+
+import warp as wp
+
+from kernels.mdp.events import AT_RESET, AT_STEP, MODES
+
+REQUIRED = inspect.Parameter.empty
+AXES = {2: ("x", "y"), 3: ("x", "y", "z")}
+LEGS = ("FL", "FR", "BL", "BR")
+MOTORS = tuple(f"{leg}_{motor}" for leg in LEGS for motor in ("lateral", "outer", "inner"))
+
+
+class Term:
+    """A Warp function with its numbers. Equal terms have the same function, name, numbers and options."""
+
+    context: ClassVar[int] = 2
+    """How many arguments of the function come from the kernel."""
+    settings: ClassVar[dict[str, float]] = {}
+    """Numbers that the kernel itself reads, with their defaults; they come before those of the function."""
+    options: ClassVar[dict[str, Any]] = {}
+    """What is compiled in, with its defaults."""
+
+    def __init__(self, func: wp.Function, *, name: str = "", **given: Any) -> None:
+        """Args:
+
+        func: Signature as the class says.
+        name: Under which it is logged and set by flags (default: the function's).
+        given: Numbers and options by name.
+
+        Raises:
+            ValueError: A number is missing, unknown or not finite, or the function is not one for such a term.
+        """
+        kind = type(self).__name__
+        if not isinstance(func, wp.Function):
+            raise ValueError(f"{kind}: {func!r:.60} is not a @wp.func")
+        self.func, self.name = func, name or func.key.split(".")[-1]
+        where = f"{kind} {self.name}"
+        params = list(inspect.signature(func.func).parameters.values())[self.context :]
+        known = self.settings | {p.name: p.default for p in params}
+        if len(known) < len(self.settings) + len(params) or set(known) & {"func", "name", *self.options}:
+            raise ValueError(
+                f"{where}: a parameter has the name of a setting, one of {[*self.settings, *self.options]}"
+            )
+        for p in params:
+            if func.input_types.get(p.name) not in (float, wp.float32):
+                raise ValueError(f"{where}: parameter {p.name!r} must be annotated float")
+        for key in given:
+            if key not in known and key not in self.options:
+                raise ValueError(f"{where}: unknown parameter {key!r}; it has {[*known, *self.options]}")
+        self.numbers = {key: given.get(key, default) for key, default in known.items()}
+        for key, value in self.numbers.items():
+            if value is REQUIRED:
+                raise ValueError(f"{where}: parameter {key!r} is missing")
+            if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+                raise ValueError(f"{where}: parameter {key!r} must be a finite number, got {value!r:.60}")
+        self.options = {key: given.get(key, default) for key, default in type(self).options.items()}
+        self.num_params = len(params)
+
+    def replace(self, **changes: Any) -> Any:
+        """Return the term with other numbers or options; raises ValueError as the constructor."""
+        return type(self)(**({"func": self.func, "name": self.name} | self.numbers | self.options | changes))
+
+    @property
+    def of_state(self) -> Any:
+        """The struct of the task's state that the function reads, or Any."""
+        return self.func.input_types.get("task", Any)
+
+    def __eq__(self, other: object) -> bool:
+        return type(self) is type(other) and all(
+            getattr(self, name) == getattr(other, name) for name in ("func", "name", "numbers", "options")
+        )
+
+    def __hash__(self) -> int:
+        return hash((type(self), self.name))
+
+    def __repr__(self) -> str:
+        numbers = "".join(f", {key}={value!r}" for key, value in (self.numbers | self.options).items())
+        return f"{type(self).__name__}({self.name}{numbers})"
+
+
+class RewardTerm(Term):
+    """(view: RobotView, task, ...) -> float; times the weight, and times the policy step [s] unless paid `once`."""
+
+    settings: ClassVar = {"weight": REQUIRED}
+    options: ClassVar = {"once": False}
+
+    def __init__(self, func: wp.Function, weight: float, **given: Any) -> None:
+        super().__init__(func, weight=weight, **given)
+
+    @property
+    def weight(self) -> float:
+        """Multiplies the term; carries the sign."""
+        return self.numbers["weight"]
+
+
+class TerminationTerm(Term):
+    """(view: RobotView, task, ...) -> bool.
+
+    time_out: an end that says nothing against the state, so that what would follow counts. success: what the success
+    rate and the curriculum count.
+    """
+
+    options: ClassVar = {"time_out": False, "success": False}
+
+
+class ObservationTerm(Term):
+    """(view: RobotView, task, ...) -> float or vector; or (parameters: RobotParameters, world: int) likewise.
+
+    noise: standard deviation, cut at one. Then clipped to plus and minus `clip`, and scaled. history: frames, the
+    oldest first. delayed: whether it comes as late as the world's sensors do.
+    """
+
+    settings: ClassVar = {"noise": 0.0, "scale": 1.0, "clip": 100.0}
+    options: ClassVar = {"history": 1, "delayed": False}
+
+    def __init__(self, func: wp.Function, **given: Any) -> None:
+        super().__init__(func, **given)
+        history = self.options["history"]
+        if not isinstance(history, int) or history < 1:
+            raise ValueError(f"ObservationTerm {self.name}: history must be at least 1, got {history!r:.40}")
+        if self.numbers["noise"] < 0.0 or self.numbers["clip"] <= 0.0:
+            raise ValueError(f"ObservationTerm {self.name}: noise must not be negative and clip must be positive")
+
+    @property
+    def width(self) -> int:
+        """Number of columns of one frame."""
+        returned = get_type_hints(self.func.func)["return"]
+        return 1 if returned in (float, wp.float32) else returned._length_
+
+    @property
+    def columns(self) -> tuple[str, ...]:
+        """Names of the columns of all frames."""
+        width = self.width
+        if width == 1:
+            frame = (self.name,)
+        else:
+            ends = AXES.get(width) or {4: LEGS, 12: MOTORS}.get(width) or tuple(map(str, range(width)))
+            frame = tuple(f"{self.name}_{end}" for end in ends)
+        ages = range(self.options["history"] - 1, -1, -1)
+        return tuple(f"{column}_{age}_ago" if age else column for age in ages for column in frame)
+
+
+class EventTerm(Term):
+    """(parameters: RobotParameters, draw: Draw, ...), writes the parameters of `draw.world`.
+
+    mode: once at the start ("startup"), at every "reset", or also at "interval"s of `least` to `most` seconds.
+    repack: whether the solver must read the model again, as after any but pushes and latencies.
+    """
+
+    settings: ClassVar = {"least": 0.0, "most": 0.0}
+    options: ClassVar = {"mode": "reset", "repack": True}
+
+    def __init__(self, func: wp.Function, **given: Any) -> None:
+        super().__init__(func, **given)
+        mode, least, most = self.options["mode"], self.numbers["least"], self.numbers["most"]
+        if mode not in ("startup", "reset", "interval"):
+            raise ValueError(f"EventTerm {self.name}: mode must be startup, reset or interval, got {mode!r:.40}")
+        if mode == "interval" and not 0.0 < least <= most:
+            raise ValueError(f"EventTerm {self.name}: an interval needs 0 < least <= most [s], got {least}, {most}")
+
+    def due_at(self, stage: int) -> bool:
+        """Return whether it may be due at a stage of `kernels.mdp.events`."""
+        mode = MODES[self.options["mode"]]
+        return stage == mode or (mode == AT_STEP and stage == AT_RESET)
+
+
+class Advance(Term):
+    """(view: RobotView, task, ...) -> task, one policy step later: the task's phase machine."""
+
+
+class Curriculum(Term):
+    """(view: RobotView, task) -> error of an ended episode.
+
+    An episode that ends with success and an error up to `tolerance` is one; `promote_after` of them in a row raise the
+    world's level. counts: (task) -> bool, whether an episode counts at all.
+    """
+
+    settings: ClassVar = {"tolerance": REQUIRED, "promote_after": 5}
+    options: ClassVar = {"counts": REQUIRED}
+
+    def __init__(self, func: wp.Function, **given: Any) -> None:
+        super().__init__(func, **given)
+        if not isinstance(self.options["counts"], wp.Function):
+            raise ValueError(f"Curriculum {self.name}: counts must be a @wp.func (task) -> bool")
+        if self.numbers["tolerance"] < 0.0 or self.numbers["promote_after"] < 1:
+            raise ValueError(f"Curriculum {self.name}: tolerance must not be negative, promote_after at least 1")
+
+
+class Row(NamedTuple):
+    """A term as the kernels see it: a function, and the places of its numbers in the task's array."""
+
+    func: wp.Function
+    first: int
+    """Of the settings."""
+    lo: int
+    """Of the function's parameters."""
+    hi: int
+    plain: bool
+    """No parameters; Warp refuses an empty `*p[lo:lo]`."""
+    term: Term

@@ -1,0 +1,52 @@
+"""The state of a jump, and what follows from it."""
+
+import warp as wp
+
+from ..mdp.view import RobotView
+
+STANCE = wp.constant(0)
+FLIGHT = wp.constant(1)
+LANDED = wp.constant(2)
+
+
+@wp.struct
+class JumpState:
+    """State of one world's episode."""
+
+    goal: wp.vec3  # [m] where to land: base x, y; and its wanted height at the apex, 0 if any will do
+    start: wp.vec3  # [m] base origin where the jump began
+    goal_ground: float  # [m] height of the ground there
+    heading: float  # [rad] yaw of the jump
+    phase: int  # STANCE, FLIGHT, LANDED
+    steps: int  # policy steps since the episode began
+    phase_steps: int  # policy steps in this phase
+    command_step: int  # policy step from which the jump is commanded
+    idle_steps: int  # policy steps without motion while a jump was commanded
+    took_off: int  # 1 in the step of the takeoff
+    touched_down: int  # 1 in the step of the touchdown
+    at_apex: int  # 1 in the step in which the base begins to fall
+    apex_passed: int
+    max_height: float  # [m] of the base since takeoff
+    touchdown_vel: wp.vec3  # [m/s] of the base, step before touchdown
+    peak_tilt: float  # [rad] largest between body and world z since touchdown
+    scheme: int  # reset scheme that began the episode
+    again_step: int  # policy steps after touchdown at which another goal comes, 0: never
+    jumps: int  # jumps that were followed by another in this episode
+
+
+@wp.func
+def goal_offset(view: RobotView, task: JumpState) -> wp.vec3:
+    """Return the horizontal way from the base to the goal [m], world axes."""
+    return wp.vec3(task.goal[0] - view.pos[0], task.goal[1] - view.pos[1], 0.0)
+
+
+@wp.func
+def commanded(task: JumpState) -> bool:
+    """Return whether a jump is asked for and not yet landed (the paper's c)."""
+    return task.steps >= task.command_step and task.phase != LANDED
+
+
+@wp.func
+def waiting(task: JumpState) -> bool:
+    """Return whether a jump is asked for but the robot still stands."""
+    return task.phase == STANCE and task.steps >= task.command_step

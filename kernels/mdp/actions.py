@@ -1,0 +1,101 @@
+"""From the policy's action to motor targets, and the push that acts during a policy step."""
+
+import warp as wp
+
+from ..actuation.command_filter import filter_leg
+from ..layout import BODIES, COORDS, DOFS
+from .env import Counters, Delays, EnvArrays, SkillSettings
+from .view import RobotArrays, base_quat, base_velocity
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.func
+def remember(
+    robot: RobotArrays, env: EnvArrays, push: wp.array(dtype=wp.spatial_vector), skill: SkillSettings, world: int
+):
+    """Begin a world's policy step: keep the base's velocity, apply its push, move its clock on."""
+    robot.old_lin_vel[world] = base_velocity(robot, world, base_quat(robot, world))
+    grounded = skill.push_in_flight
+    for k in range(4):
+        if robot.contact_time[k, world] > 0.0:
+            grounded = int(1)
+    wrench = wp.spatial_vector()
+    if grounded != 0:
+        wrench = push[world]
+    robot.body_f[world * BODIES] = wrench
+    env.clock[world] = env.clock[world] + 1
+    env.fresh[world] = 0
+
+
+@wp.func
+def delayed(delays: Delays, clock: int, world: int, m: int):
+    """Choose what a motor follows: the target of as many physics steps ago as the latency asks for."""
+    depth = delays.past_target.shape[0]
+    whole = delays.steps[world] // delays.substeps
+    delays.late_target[m, world] = delays.past_target[(clock - whole) % depth, m, world]
+    delays.earlier_target[m, world] = delays.past_target[(clock - whole - 1) % depth, m, world]
+    if m == 0:
+        delays.late_steps[world] = delays.steps[world] - whole * delays.substeps
+
+
+@wp.kernel
+def action_kernel(
+    # in
+    policy_action: wp.array3d(dtype=float),
+    skills: wp.array(dtype=SkillSettings),
+    push: wp.array(dtype=wp.spatial_vector),
+    # in, out
+    robot: RobotArrays,
+    env: EnvArrays,
+    counters: Counters,
+    delays: Delays,
+):
+    """Clamp, scale and filter the action (skills, num_worlds, 12) of each world's skill; one thread per (world, leg).
+
+    An action that is not finite counts as 0, and its world as broken.
+    """
+    world, leg = wp.tid()
+    skill = skills[env.skill[world]]
+    q = world * COORDS + 7 + 5 * leg
+    d = world * DOFS + 6 + 5 * leg
+    angles = wp.vec3(robot.joint_q[q], robot.joint_q[q + 1], robot.joint_q[q + 3])
+    rates = wp.vec3(robot.joint_qd[d], robot.joint_qd[d + 1], robot.joint_qd[d + 3])
+    target = wp.vec3(0.0)
+    for j in range(3):
+        m = 3 * leg + j
+        asked = policy_action[env.skill[world], world, m]
+        if not wp.isfinite(asked):
+            asked = 0.0
+            env.bad_action[world] = 1
+        action = wp.clamp(asked, -1.0, 1.0)
+        robot.old_action[m, world] = robot.action[m, world]
+        robot.action[m, world] = action
+        robot.old_rate[m, world] = rates[j]
+        robot.old_torque[m, world] = robot.torque[m, world]
+        angles[j] = angles[j] + robot.joint_offset[m, world]
+        target[j] = action * skill.action_scale[m] + robot.default_angle[m]
+    safe = filter_leg(target, angles, rates, skill.command_filter)
+    clock = env.clock[world]
+    for j in range(3):
+        m = 3 * leg + j
+        robot.target[m, world] = target[j]
+        robot.safe_target[m, world] = safe[j]
+        delays.past_target[clock % delays.past_target.shape[0], m, world] = safe[j]
+        delayed(delays, clock, world, m)
+
+
+@wp.kernel
+def begin_step_kernel(
+    # in
+    skills: wp.array(dtype=SkillSettings),
+    push: wp.array(dtype=wp.spatial_vector),
+    # in, out
+    robot: RobotArrays,
+    env: EnvArrays,
+    counters: Counters,
+):
+    """Begin every world's policy step, after its action is known; one thread per world."""
+    world = wp.tid()
+    remember(robot, env, push, skills[env.skill[world]], world)
+    counters.bad_actions[world] = counters.bad_actions[world] + env.bad_action[world]

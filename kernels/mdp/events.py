@@ -1,0 +1,60 @@
+"""The stage that changes parameters: at the start, at resets, and at intervals within an episode."""
+
+import warp as wp
+
+from .env import EnvArrays
+from .parameters import RobotParameters
+from .random import EVENT, Draw, between, make_draw
+
+STARTUP, AT_RESET, AT_STEP = 0, 1, 2
+MODES = {"startup": STARTUP, "reset": AT_RESET, "interval": AT_STEP}
+
+
+@wp.func
+def steps_until(draw: Draw, least: float, most: float, step_dt: float) -> int:
+    """Return a drawn number of policy steps between two times [s], at least one."""
+    return wp.max(int(wp.round(between(draw, -1, least, most) / step_dt)), 1)
+
+
+def make_event_kernel(rows: list) -> wp.Kernel:
+    """Return the kernel of a task's events; rows: see `jumper_warp.tasks.terms.Row`."""
+    modes = [MODES[row.term.options["mode"]] for row in rows]
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def event_kernel(
+        # in
+        skill: int,
+        stage: int,
+        mask: wp.array(dtype=float),
+        step_dt: float,
+        env: EnvArrays,
+        p: wp.array(dtype=float),
+        # in, out
+        timer: wp.array2d(dtype=int),
+        robot: RobotParameters,
+    ):
+        """Run what is due at a stage where mask is not 0; one thread per (event, world).
+
+        timer: policy steps until the next time, (events, num_worlds). An interval event is due at a reset as well.
+        """
+        row, world = wp.tid()
+        if env.skill[world] != skill or mask[world] == 0.0:
+            return
+        for i in range(wp.static(len(rows))):
+            if row == i:
+                draw = make_draw(env.seed, world, env.clock[world], EVENT + i)
+                due = stage == wp.static(modes[i])
+                if wp.static(modes[i] == AT_STEP):
+                    left = timer[i, world] - 1
+                    due = stage == wp.static(AT_RESET) or (stage == wp.static(AT_STEP) and left <= 0)
+                    if due:
+                        left = steps_until(draw, p[wp.static(rows[i].first)], p[wp.static(rows[i].first + 1)], step_dt)
+                    if stage != wp.static(STARTUP):
+                        timer[i, world] = left
+                if due:
+                    if wp.static(rows[i].plain):
+                        wp.static(rows[i].func)(robot, draw)
+                    else:
+                        wp.static(rows[i].func)(robot, draw, *p[wp.static(rows[i].lo) : wp.static(rows[i].hi)])
+
+    return event_kernel

@@ -1,0 +1,63 @@
+"""Handing a world over from one skill to another; the robot is left as it is."""
+
+from typing import Any
+
+import warp as wp
+
+from ..terrain.ground import Ground
+from .env import EnvArrays, SkillSettings
+from .parameters import RobotParameters, set_gains
+from .view import RobotArrays, load_view
+
+wp.set_module_options({"enable_backward": False})
+
+NONE = wp.constant(-1)
+
+
+@wp.func
+def hand_over(
+    robot: RobotArrays, parameters: RobotParameters, env: EnvArrays, skills: wp.array(dtype=SkillSettings),
+    world: int, target: int,
+):  # fmt: skip
+    """Make another skill the active one: its gains from now on, and as last action the one that holds the targets."""
+    env.skill[world] = target
+    env.request[world] = NONE
+    env.fresh[world] = 1
+    for m in range(12):
+        off = robot.safe_target[m, world] - robot.default_angle[m]
+        action = wp.clamp(off / skills[target].action_scale[m], -1.0, 1.0)
+        robot.action[m, world] = action
+        robot.old_action[m, world] = action
+        set_gains(parameters, world, m)
+
+
+def make_handover_kernel(handover: Any) -> wp.Kernel:
+    """Return the kernel of a handover; handover: see `jumper_warp.tasks.cfg.Handover`."""
+    when, begin = handover.when, handover.begin
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def handover_kernel(
+        # in
+        source: int,
+        target: int,
+        ground: Ground,
+        skills: wp.array(dtype=SkillSettings),
+        moved: wp.array(dtype=int),
+        # in, out
+        robot: RobotArrays,
+        parameters: RobotParameters,
+        env: EnvArrays,
+        sources: wp.array(dtype=handover.source.state),
+        targets: wp.array(dtype=handover.target.state),
+    ):
+        """Hand worlds over whose time has come; moved: 1 where that happened in this step; one thread per world."""
+        world = wp.tid()
+        if env.skill[world] != source or env.done[world] != 0.0 or moved[world] != 0:
+            return
+        view = load_view(robot, ground, world)
+        if wp.static(when)(view, sources[world], env.request[world] == target):
+            targets[world] = wp.static(begin)(view, sources[world])
+            hand_over(robot, parameters, env, skills, world, target)
+            moved[world] = 1
+
+    return handover_kernel

@@ -1,0 +1,141 @@
+"""Observation terms that any task can use: of the robot, or of the parameters that were drawn for it."""
+
+from typing import Any
+
+import warp as wp
+
+from .parameters import RobotParameters
+from .view import RobotView, vec12
+
+vec6 = wp.types.vector(length=6, dtype=wp.float32)
+
+
+@wp.func
+def lin_vel(view: RobotView, task: Any) -> wp.vec3:
+    """Velocity of the base [m/s], body axes."""
+    return wp.quat_rotate_inv(view.quat, view.lin_vel)
+
+
+@wp.func
+def ang_vel(view: RobotView, task: Any) -> wp.vec3:
+    """Angular velocity of the base [rad/s], body axes."""
+    return view.ang_vel
+
+
+@wp.func
+def gravity(view: RobotView, task: Any) -> wp.vec3:
+    """Direction of gravity, body axes [1]."""
+    return view.gravity
+
+
+@wp.func
+def height(view: RobotView, task: Any) -> float:
+    """Height of the base above the ground below it [m]."""
+    return view.height
+
+
+@wp.func
+def angle(view: RobotView, task: Any) -> vec12:
+    """Motor angles as the sensors read them, relative to the default pose [rad]."""
+    return view.sensed_angle - view.default_angle
+
+
+@wp.func
+def rate(view: RobotView, task: Any) -> vec12:
+    """Motor rates [rad/s]."""
+    return view.rate
+
+
+@wp.func
+def last_action(view: RobotView, task: Any) -> vec12:
+    """The action before [1]."""
+    return view.action
+
+
+@wp.func
+def paw_forces(view: RobotView, task: Any) -> wp.vec4:
+    """Forces on the paws over the robot's weight, at most 5 [1]."""
+    force = wp.vec4(0.0)
+    for k in range(4):
+        force[k] = wp.min(view.paw_force[k] / 140.0, 5.0)
+    return force
+
+
+@wp.func
+def air_times(view: RobotView, task: Any) -> wp.vec4:
+    """Time that each paw has been in the air [s]."""
+    return view.air_time
+
+
+@wp.func
+def contacts(view: RobotView, task: Any) -> wp.vec4:
+    """Which paws are on the ground [1]."""
+    return view.contact
+
+
+# ---------------------------------------------------------------- drawn parameters, of order 1, 0 if nominal
+
+
+@wp.func
+def drawn_mass(robot: RobotParameters, world: int) -> wp.vec2:
+    """Mass added to the base and to all legs [kg]."""
+    first = world * 21
+    legs = float(0.0)
+    for body in range(1, 21):
+        legs += robot.body_mass[first + body] - robot.nominal_mass[body]
+    return wp.vec2(robot.body_mass[first] - robot.nominal_mass[0], legs)
+
+
+@wp.func
+def drawn_com(robot: RobotParameters, world: int) -> wp.vec3:
+    """Shift of the base's centre of mass over 0.03 m."""
+    return (robot.body_com[world * 21] - robot.nominal_com[0]) / 0.03
+
+
+@wp.func
+def drawn_gains(robot: RobotParameters, world: int) -> vec12:
+    """Relative change of kp of each motor."""
+    change = vec12()
+    for m in range(12):
+        change[m] = robot.gain_ratio[m, world][0] - 1.0
+    return change
+
+
+@wp.func
+def drawn_speed_limits(robot: RobotParameters, world: int) -> vec12:
+    """Relative change of the no-load speed of each motor."""
+    change = vec12()
+    for m in range(12):
+        change[m] = robot.motors.no_load_speed[m, world] / robot.nominal_no_load[robot.skill[world], m] - 1.0
+    return change
+
+
+@wp.func
+def drawn_latency(robot: RobotParameters, world: int) -> float:
+    """Latency of actions in policy steps of 8 physics steps."""
+    return float(robot.latency[world]) / 8.0
+
+
+@wp.func
+def drawn_friction(robot: RobotParameters, world: int) -> wp.vec2:
+    """Dynamic friction from 0.85, in tenths, and by how much the static coefficient is larger [1]."""
+    dynamic = robot.shape_mu[robot.paw_shapes[4 * world]]
+    return wp.vec2((dynamic - 0.85) * 10.0, robot.static_ratio[world] - 1.0)
+
+
+@wp.func
+def drawn_offset(robot: RobotParameters, world: int) -> vec12:
+    """Error of each position sensor over 2 degrees."""
+    error = vec12()
+    for m in range(12):
+        error[m] = robot.motors.offset[m, world] / 0.035
+    return error
+
+
+@wp.func
+def drawn_push(robot: RobotParameters, world: int) -> vec6:
+    """Push on the base over 5 N and 3 N m."""
+    wrench = robot.push[world]
+    return vec6(
+        wrench[0] / 5.0, wrench[1] / 5.0, wrench[2] / 5.0, wrench[3] / 3.0, wrench[4] / 3.0, wrench[5] / 3.0
+    )  # fmt: skip

@@ -1,0 +1,175 @@
+"""What domain randomisation may change of every robot, and the events that change it (paper, Table V).
+
+An event is a pure function of (parameters, draw, named numbers) that writes one world's parameters, always from the
+nominal values. Ranges are uniform; lower and upper are its numbers.
+"""
+
+import warp as wp
+
+from ..actuation.motors import MotorArrays
+from ..layout import BODIES, DOFS, motor_slot
+from .random import Draw, between
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.struct
+class RobotParameters:
+    """Parameters of all worlds, and what they are without randomisation."""
+
+    body_mass: wp.array(dtype=float)  # [kg] Newton's, like the next ones
+    body_inv_mass: wp.array(dtype=float)
+    body_com: wp.array(dtype=wp.vec3)  # [m]
+    body_inertia: wp.array(dtype=wp.mat33)  # [kg m^2]
+    body_inv_inertia: wp.array(dtype=wp.mat33)
+    joint_armature: wp.array(dtype=float)  # [kg m^2]
+    joint_friction: wp.array(dtype=float)  # [N m]
+    shape_mu: wp.array(dtype=float)  # [1]
+    paw_shapes: wp.array(dtype=int)  # (4 num_worlds,) indices of the paws in shape_mu
+    static_ratio: wp.array(dtype=float)  # [1] (num_worlds,) static over dynamic friction
+    motors: MotorArrays
+    latency: wp.array(dtype=int)  # [physics steps] (num_worlds,) from action to motor
+    observation_latency: wp.array(dtype=int)  # [physics steps] (num_worlds,) from sensor to policy
+    push: wp.array(dtype=wp.spatial_vector)  # [N], [N m] (num_worlds,) on the base at its com, world axes
+    gain_ratio: wp.array2d(dtype=wp.vec2)  # [1] (12, num_worlds) of kp and kd to those of the active skill
+    physics_dt: float  # [s]
+    nominal_mass: wp.array(dtype=float)  # (21,) of one world, like all below
+    nominal_com: wp.array(dtype=wp.vec3)
+    nominal_inertia: wp.array(dtype=wp.mat33)
+    nominal_armature: wp.array(dtype=float)  # (38,)
+    nominal_kp: wp.array2d(dtype=float)  # (skills, 12), like all below
+    nominal_kd: wp.array2d(dtype=float)
+    nominal_no_load: wp.array2d(dtype=float)  # [rad/s]
+    nominal_cutoff: wp.array2d(dtype=float)  # [rad/s]
+    nominal_saturation: wp.array2d(dtype=float)  # [N m]
+    skill: wp.array(dtype=int)  # (num_worlds,) the active one
+
+
+@wp.func
+def write_mass(robot: RobotParameters, world: int, body: int, scale: float):
+    """Scale mass and inertia of a link."""
+    i = world * BODIES + body
+    mass = scale * robot.nominal_mass[body]
+    inertia = scale * robot.nominal_inertia[body]
+    robot.body_mass[i] = mass
+    robot.body_inv_mass[i] = 1.0 / mass
+    robot.body_inertia[i] = inertia
+    robot.body_inv_inertia[i] = wp.inverse(inertia)
+
+
+@wp.func
+def base_mass(robot: RobotParameters, draw: Draw, lower: float, upper: float):
+    """Add a mass [kg] to the base, its inertia in proportion."""
+    write_mass(robot, draw.world, 0, 1.0 + between(draw, 0, lower, upper) / robot.nominal_mass[0])
+
+
+@wp.func
+def link_mass(robot: RobotParameters, draw: Draw, lower: float, upper: float):
+    """Scale mass and inertia of each link of the legs."""
+    for body in range(1, BODIES):
+        write_mass(robot, draw.world, body, between(draw, body, lower, upper))
+
+
+@wp.func
+def com_shift(robot: RobotParameters, draw: Draw, lower: float, upper: float):
+    """Shift the base's centre of mass [m] along each axis."""
+    shift = wp.vec3(between(draw, 0, lower, upper), between(draw, 1, lower, upper), between(draw, 2, lower, upper))
+    robot.body_com[draw.world * BODIES] = robot.nominal_com[0] + shift
+
+
+@wp.func
+def armature(robot: RobotParameters, draw: Draw, lower: float, upper: float):
+    """Scale each motor's armature."""
+    for m in range(12):
+        dof = 6 + motor_slot(m)
+        robot.joint_armature[draw.world * DOFS + dof] = robot.nominal_armature[dof] * between(draw, m, lower, upper)
+
+
+@wp.func
+def motor_friction(robot: RobotParameters, draw: Draw, lower: float, upper: float):
+    """Give each motor a Coulomb friction [N m]."""
+    for m in range(12):
+        robot.joint_friction[draw.world * DOFS + 6 + motor_slot(m)] = between(draw, m, lower, upper)
+
+
+@wp.func
+def set_gains(robot: RobotParameters, world: int, m: int):
+    """Write gains and torque limit of a motor: those of the active skill, by the drawn ratios."""
+    skill = robot.skill[world]
+    robot.motors.kp[m, world] = robot.nominal_kp[skill, m] * robot.gain_ratio[m, world][0]
+    robot.motors.kd[m, world] = robot.nominal_kd[skill, m] * robot.gain_ratio[m, world][1]
+    robot.motors.saturation[m, world] = robot.nominal_saturation[skill, m]
+
+
+@wp.func
+def gains(robot: RobotParameters, draw: Draw, lower: float, upper: float):
+    """Scale kp and kd of each motor."""
+    for m in range(12):
+        robot.gain_ratio[m, draw.world] = wp.vec2(between(draw, m, lower, upper), between(draw, 12 + m, lower, upper))
+        set_gains(robot, draw.world, m)
+
+
+@wp.func
+def speed_limits(
+    robot: RobotParameters, draw: Draw, no_load_lower: float, no_load_upper: float, cutoff_lower: float,
+    cutoff_upper: float,
+):  # fmt: skip
+    """Scale no-load and cutoff speed of each motor; the cutoff stays below the no-load speed."""
+    skill = robot.skill[draw.world]
+    for m in range(12):
+        no_load = robot.nominal_no_load[skill, m] * between(draw, m, no_load_lower, no_load_upper)
+        cutoff = robot.nominal_cutoff[skill, m] * between(draw, 12 + m, cutoff_lower, cutoff_upper)
+        robot.motors.no_load_speed[m, draw.world] = no_load
+        robot.motors.cutoff_speed[m, draw.world] = wp.min(cutoff, 0.95 * no_load)
+
+
+@wp.func
+def joint_offset(robot: RobotParameters, draw: Draw, lower: float, upper: float):
+    """Give each motor's position sensor a constant error [rad]."""
+    for m in range(12):
+        robot.motors.offset[m, draw.world] = between(draw, m, lower, upper)
+
+
+@wp.func
+def friction(
+    robot: RobotParameters, draw: Draw, dynamic_lower: float, dynamic_upper: float, static_lower: float,
+    static_upper: float,
+):  # fmt: skip
+    """Draw the paws' dynamic coefficient, and a static one that is not below it."""
+    dynamic = between(draw, 0, dynamic_lower, dynamic_upper)
+    static = wp.max(between(draw, 1, static_lower, static_upper), dynamic)
+    for k in range(4):
+        robot.shape_mu[robot.paw_shapes[4 * draw.world + k]] = dynamic
+    robot.static_ratio[draw.world] = static / dynamic
+
+
+@wp.func
+def physics_steps(robot: RobotParameters, seconds: float) -> int:
+    """Return whole physics steps of a time, rounded down; a whole step stays one despite rounding errors."""
+    return int(wp.floor(seconds / robot.physics_dt + 1.0e-4))
+
+
+@wp.func
+def action_latency(robot: RobotParameters, draw: Draw, lower: float, upper: float):
+    """Delay actions [s]."""
+    robot.latency[draw.world] = physics_steps(robot, between(draw, 0, lower, upper))
+
+
+@wp.func
+def observation_latency(robot: RobotParameters, draw: Draw, lower: float, upper: float):
+    """Delay what the policy reads of its sensors [s]."""
+    robot.observation_latency[draw.world] = physics_steps(robot, between(draw, 0, lower, upper))
+
+
+@wp.func
+def push(
+    robot: RobotParameters, draw: Draw, share: float, force_lower: float, force_upper: float, torque_lower: float,
+    torque_upper: float,
+):  # fmt: skip
+    """Push the base with a force [N] along and a torque [N m] about each world axis in a share of draws, else not."""
+    wrench = wp.spatial_vector()
+    if between(draw, 6, 0.0, 1.0) < share:
+        for i in range(3):
+            wrench[i] = between(draw, i, force_lower, force_upper)
+            wrench[3 + i] = between(draw, 3 + i, torque_lower, torque_upper)
+    robot.push[draw.world] = wrench

@@ -1,0 +1,53 @@
+"""Random numbers that depend on seed, world, clock and stream alone: whatever else is drawn changes none of them."""
+
+import warp as wp
+
+# streams; events and observation groups have one each from these on
+RESET = wp.constant(1)
+COMMAND = wp.constant(2)
+EVENT = wp.constant(100)
+OBSERVATION = wp.constant(200)
+
+
+@wp.struct
+class Draw:
+    """Independent random numbers of one world."""
+
+    world: int
+    seed: wp.uint32
+
+
+@wp.func
+def make_draw(seed: int, world: int, clock: int, stream: int) -> Draw:
+    """Return the numbers of a stream; clock: policy steps that the world has made."""
+    draw = Draw()
+    draw.world = world
+    draw.seed = wp.rand_init(int(wp.rand_init(int(wp.rand_init(seed, world)), clock)), stream)
+    return draw
+
+
+@wp.func
+def branch(draw: Draw, i: int) -> Draw:
+    """Return other numbers, independent for every i."""
+    other = Draw()
+    other.world = draw.world
+    other.seed = wp.rand_init(int(draw.seed), 7919 + i)
+    return other
+
+
+@wp.func
+def between(draw: Draw, i: int, lower: float, upper: float) -> float:
+    """Return the i-th number, uniform in [lower, upper)."""
+    return lower + (upper - lower) * wp.randf(wp.rand_init(int(draw.seed), i))
+
+
+@wp.func
+def within(draw: Draw, i: int, pair: wp.vec2) -> float:
+    """Return the i-th number, uniform in a pair (lower, upper)."""
+    return between(draw, i, pair[0], pair[1])
+
+
+@wp.func
+def cut_gaussian(draw: Draw, i: int) -> float:
+    """Return the i-th number, standard normal, cut at one standard deviation."""
+    return wp.clamp(wp.randn(wp.rand_init(int(draw.seed), i)), -1.0, 1.0)

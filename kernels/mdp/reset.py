@@ -1,0 +1,176 @@
+"""The stage that begins: new episodes where they ended, and new commands where they are due."""
+
+from typing import Any
+
+import warp as wp
+
+from ..layout import COORDS, DOFS, motor_slot
+from ..terrain.ground import rest_block, surface, world_ground
+from .env import Delays, EnvArrays, Scene, SkillSettings
+from .random import COMMAND, RESET, between, make_draw
+from .view import RobotArrays, load_view, yaw_of
+
+wp.set_module_options({"enable_backward": False})
+
+
+def make_reset_kernel(task: Any) -> wp.Kernel:
+    """Return the kernel that begins a task's episodes; task: see `jumper_warp.tasks.cfg.TaskCfg`."""
+    reset, due, command = task.reset.func, task.command.due, task.command.draw
+    settings_type, level_type = task.settings_type, task.level_type
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def reset_kernel(
+        # in
+        skill: int,
+        mask: wp.array(dtype=float),
+        scene: Scene,
+        skills: wp.array(dtype=SkillSettings),
+        settings: wp.array(dtype=settings_type),
+        levels: wp.array(dtype=level_type),
+        # in, out
+        env: EnvArrays,
+        states: wp.array(dtype=task.state),
+        robot: RobotArrays,
+    ):
+        """Begin a new episode where mask is not 0, else a new command where it is due; one thread per world."""
+        world = wp.tid()
+        if env.skill[world] != skill:
+            return
+        begins = mask[world] != 0.0
+        commanded = bool(False)
+        if wp.static(due is not None):
+            commanded = wp.static(due)(states[world])
+        if not (begins or commanded):
+            return
+        draw = make_draw(env.seed, world, env.clock[world], RESET)
+        level = env.level[world]
+        if level >= levels.shape[0]:
+            level = wp.min(int(between(draw, -2, 0.0, float(levels.shape[0]))), levels.shape[0] - 1)
+        if begins:
+            states[world] = wp.static(reset)(
+                robot, scene, skills[skill], states[world], settings[0], levels[level], draw
+            )
+            env.fresh[world] = 1
+            env.broken[world] = 0
+        elif wp.static(command is not None):
+            view = load_view(robot, scene.ground, world)
+            fresh = make_draw(env.seed, world, env.clock[world], COMMAND)
+            states[world] = wp.static(command)(view, scene, states[world], levels[level], fresh)
+
+    return reset_kernel
+
+
+def make_give_kernel(task: Any) -> wp.Kernel:
+    """Return the kernel that gives worlds a command from outside."""
+    give = task.command.give
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def give_kernel(
+        # in
+        skill: int,
+        mask: wp.array(dtype=float),
+        begins: int,
+        values: wp.array(dtype=wp.vec4),
+        headings: wp.array(dtype=float),
+        scene: Scene,
+        robot: RobotArrays,
+        # in, out
+        env: EnvArrays,
+        states: wp.array(dtype=task.state),
+    ):
+        """Give a command where mask is not 0; one thread per world.
+
+        begins 1: to a new episode, with its heading [rad]; 0: to the one under way, in the heading that the robot has.
+        """
+        world = wp.tid()
+        if env.skill[world] != skill or mask[world] == 0.0:
+            return
+        view = load_view(robot, scene.ground, world)
+        if begins != 0:
+            fresh = task.state()
+            states[world] = wp.static(give)(view, scene, fresh, values[world], headings[world])
+            env.fresh[world] = 1
+            env.broken[world] = 0
+        else:
+            states[world] = wp.static(give)(view, scene, states[world], values[world], yaw_of(view.quat))
+
+    return give_kernel
+
+
+@wp.func
+def store_pose(robot: RobotArrays, scene: Scene, world: int, heading: float, lift: float):
+    """Write the model's reference pose at rest, turned to a heading [rad] and lifted [m]."""
+    q = world * COORDS
+    for j in range(int(COORDS)):
+        robot.joint_q[q + j] = scene.reference_q[q + j]
+    for j in range(int(DOFS)):
+        robot.joint_qd[world * DOFS + j] = 0.0
+    turn = wp.quat_from_axis_angle(wp.vec3(0.0, 0.0, 1.0), heading)
+    for j in range(4):
+        robot.joint_q[q + 3 + j] = turn[j]
+    robot.joint_q[q + 2] = scene.reference_q[q + 2] + lift
+
+
+@wp.kernel
+def stand_kernel(
+    # in
+    mask: wp.array(dtype=float),
+    headings: wp.array(dtype=float),
+    scene: Scene,
+    # in, out
+    robot: RobotArrays,
+):
+    """Stand robots in the default pose with a heading [rad] where mask is not 0, blocks at their starts."""
+    world = wp.tid()
+    if mask[world] != 0.0:
+        rest_block(scene.ground, world)
+        lift = surface(world_ground(scene.ground, world), 0.0, 0.0)[0]
+        store_pose(robot, scene, world, headings[world], lift)
+
+
+@wp.kernel
+def tick_kernel(
+    # in
+    mask: wp.array(dtype=float),
+    # in, out
+    env: EnvArrays,
+):
+    """Move the clock on where mask is not 0, so that what follows draws anew; one thread per world."""
+    world = wp.tid()
+    if mask[world] != 0.0:
+        env.clock[world] = env.clock[world] + 1
+
+
+@wp.kernel
+def forget_kernel(
+    # in
+    mask: wp.array(dtype=float),
+    # in, out
+    robot: RobotArrays,
+    delays: Delays,
+):
+    """Forget the past where mask is not 0: actions, torques, contacts; one thread per (motor, world)."""
+    m, world = wp.tid()
+    if mask[world] == 0.0:
+        return
+    slot = motor_slot(m)
+    angle = robot.joint_q[world * COORDS + 7 + slot]
+    robot.torque[m, world] = 0.0
+    robot.old_torque[m, world] = 0.0
+    robot.action[m, world] = 0.0
+    robot.old_action[m, world] = 0.0
+    robot.safe_target[m, world] = angle
+    robot.old_rate[m, world] = robot.joint_qd[world * DOFS + 6 + slot]
+    for i in range(delays.past_target.shape[0]):
+        delays.past_target[i, m, world] = angle
+    if m < 4:
+        robot.impulse[m, world] = wp.vec3(0.0)
+        robot.paw_force[m, world] = wp.vec3(0.0)
+        robot.peak_force[m, world] = 0.0
+        robot.contact_time[m, world] = 0.0
+        robot.air_time[m, world] = 0.0
+        robot.touchdown_speed[m, world] = 0.0
+    if m == 0:
+        robot.invalid[world] = 0
+        i = world * DOFS
+        robot.old_lin_vel[world] = wp.vec3(robot.joint_qd[i], robot.joint_qd[i + 1], robot.joint_qd[i + 2])

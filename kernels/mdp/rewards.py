@@ -1,0 +1,70 @@
+"""Reward terms that any task can use: pure functions of the robot, the task's state and named numbers.
+
+phi(x, s) = exp(-x^2 / s^2), psi(x, s) = exp(-|x| / s) as in the paper's tables.
+"""
+
+from typing import Any
+
+import warp as wp
+
+from .view import RobotView, vec12
+
+
+@wp.func
+def phi(x: float, s: float) -> float:
+    """Return the exponential kernel phi_s(x)."""
+    return wp.exp(-x * x / (s * s))
+
+
+@wp.func
+def psi(x: float, s: float) -> float:
+    """Return the Laplacian kernel psi_s(x)."""
+    return wp.exp(-wp.abs(x) / s)
+
+
+@wp.func
+def square_sum(v: vec12) -> float:
+    """Return the sum of squares."""
+    return wp.dot(v, v)
+
+
+@wp.func
+def posture_offset(view: RobotView, shift: float) -> float:
+    """Return the rms offset [rad] of all motors from the default pose, the transversal ones shifted by `shift`."""
+    total = float(0.0)
+    for m in range(12):
+        off = view.angle[m] - view.default_angle[m]
+        if m % 3 != 0:
+            off = off - shift
+        total += off * off
+    return wp.sqrt(total / 12.0)
+
+
+@wp.func
+def ground_force(view: RobotView, task: Any, weight_force: float) -> float:
+    """Ground force L2: sum of squared paw forces over that of the robot's weight [N]."""
+    return wp.dot(view.paw_force, view.paw_force) / (weight_force * weight_force)
+
+
+@wp.func
+def action_clip(view: RobotView, task: Any) -> float:
+    """Action clip: squared distance that the command filter moved the targets [rad^2]."""
+    return view.clipped
+
+
+@wp.func
+def motor_torque_sq(view: RobotView, task: Any) -> float:
+    """Motor torque: sum of squares [N^2 m^2]."""
+    return square_sum(view.torque)
+
+
+@wp.func
+def joint_acceleration(view: RobotView, task: Any) -> float:
+    """Joint acceleration: sum of squares [rad^2/s^4]."""
+    return square_sum(view.rate_change)
+
+
+@wp.func
+def action_rate(view: RobotView, task: Any) -> float:
+    """Action rate: sum of squared changes of the action."""
+    return square_sum(view.action - view.old_action)

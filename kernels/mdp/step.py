@@ -1,0 +1,123 @@
+"""The end of a policy step: the task moves on, its terminations and rewards, and the curriculum."""
+
+from typing import Any
+
+import warp as wp
+
+from ..terrain.ground import Ground
+from .env import Counters, EnvArrays
+from .terminations import came_apart
+from .view import RobotArrays, load_view, speed_limit_broken
+
+NOT_ENDED = wp.constant(-1)
+
+
+@wp.func
+def count_episode(
+    env: EnvArrays, counters: Counters, world: int, success: bool, error: float, promote_after: float, num_levels: int
+):
+    """Take an ended episode into the curriculum: successes in a row raise the world's level."""
+    streak = wp.where(success, env.streak[world] + 1, 0)
+    if streak >= int(promote_after):
+        streak = int(0)
+        env.level[world] = wp.min(env.level[world] + 1, num_levels)
+    env.streak[world] = streak
+    counters.counted[world] = counters.counted[world] + 1
+    if success:
+        counters.succeeded[world] = counters.succeeded[world] + 1
+        counters.error_sum[world] = counters.error_sum[world] + wp.float64(error)
+
+
+def make_step_kernel(task: Any) -> wp.Kernel:
+    """Return the kernel that ends a policy step; task: see `jumper_warp.tasks.cfg.TaskCfg`."""
+    (advance,), endings, rewards = (task.rows[name] for name in ("advance", "terminations", "rewards"))
+    (curriculum,) = task.rows["curriculum"]
+    counts = task.curriculum.options["counts"]
+    time_outs = [bool(row.term.options["time_out"]) for row in endings]
+    successes = [bool(row.term.options["success"]) for row in endings]
+    once = [bool(row.term.options["once"]) for row in rewards]
+    broken_ending = [row.func for row in endings].index(came_apart)
+    floor = task.reward_floor
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def step_kernel(
+        # in
+        skill: int,
+        robot: RobotArrays,
+        ground: Ground,
+        num_levels: int,
+        p: wp.array(dtype=float),
+        # in, out
+        env: EnvArrays,
+        states: wp.array(dtype=task.state),
+        # out
+        term_value: wp.array2d(dtype=float),
+        counters: Counters,
+    ):
+        """Move every world of the skill on by one policy step; one thread per world.
+
+        term_value: rewards of this step, weights applied, (rewards, num_worlds).
+        """
+        world = wp.tid()
+        if env.skill[world] != skill:
+            return
+        view = load_view(robot, ground, world)
+        if wp.static(advance.plain):
+            state = wp.static(advance.func)(view, states[world])
+        else:
+            state = wp.static(advance.func)(view, states[world], *p[wp.static(advance.lo) : wp.static(advance.hi)])
+
+        ending = int(NOT_ENDED)
+        timeout = float(0.0)
+        success = bool(False)
+        broken = robot.invalid[world] != 0 or env.bad_action[world] != 0 or speed_limit_broken(view)
+        if broken:
+            ending = wp.static(broken_ending)
+        for i in range(wp.static(len(endings))):
+            if ending == NOT_ENDED:
+                if wp.static(endings[i].plain):
+                    holds = wp.static(endings[i].func)(view, state)
+                else:
+                    holds = wp.static(endings[i].func)(
+                        view, state, *p[wp.static(endings[i].lo) : wp.static(endings[i].hi)]
+                    )
+                if holds:
+                    ending = i
+                    timeout = wp.where(wp.static(time_outs[i]), 1.0, 0.0)
+                    success = wp.static(successes[i])
+
+        total = float(0.0)
+        for i in range(wp.static(len(rewards))):
+            if wp.static(rewards[i].plain):
+                raw = wp.static(rewards[i].func)(view, state)
+            else:
+                raw = wp.static(rewards[i].func)(view, state, *p[wp.static(rewards[i].lo) : wp.static(rewards[i].hi)])
+            value = p[wp.static(rewards[i].first)] * raw
+            if wp.static(not once[i]):
+                value = value * robot.step_dt
+            if broken:
+                value = float(0.0)
+            term_value[i, world] = value
+            counters.term_sum[i, world] = counters.term_sum[i, world] + wp.float64(value)
+            total += value
+        if not wp.isfinite(total):
+            total = float(0.0)
+        if wp.static(floor is not None):
+            total = wp.max(total, wp.static(0.0 if floor is None else float(floor)))
+        env.reward[world] = total
+        env.ending[world] = ending
+        env.done[world] = wp.where(ending == NOT_ENDED, 0.0, 1.0)
+        env.timeout[world] = timeout
+        env.terminated[world] = ending != NOT_ENDED and timeout == 0.0
+        env.truncated[world] = timeout != 0.0
+        env.broken[world] = wp.where(broken, 1, 0)
+        env.bad_action[world] = 0
+        states[world] = state
+        if ending != NOT_ENDED:
+            counters.ending_count[ending, world] = counters.ending_count[ending, world] + 1
+            if wp.static(counts)(state):
+                error = wp.static(curriculum.func)(view, state)
+                success = success and error <= p[wp.static(curriculum.first)]
+                count_episode(env, counters, world, success, error, p[wp.static(curriculum.first + 1)], num_levels)
+
+    return step_kernel

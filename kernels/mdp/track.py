@@ -1,0 +1,62 @@
+"""Following the paws over a policy step: where they are, how long they have been down or up, and what touches what."""
+
+import warp as wp
+
+from ..collision.robot import leg_collisions
+from ..kinematics.geometry import LegGeometry
+from ..kinematics.leg import leg_forward_kinematics, leg_jacobian
+from ..state import leg_coord, leg_dof, load_motors
+from ..terrain.ground import Ground
+from .env import EnvArrays, SkillSettings
+from .view import RobotArrays, base_pos, base_quat, base_velocity
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.func
+def follow_paw(robot: RobotArrays, geo: LegGeometry, world: int, leg: int):
+    """Write place and velocity of a paw."""
+    quat = base_quat(robot, world)
+    angles = load_motors(robot.joint_q, leg_coord(world, leg))
+    rates = load_motors(robot.joint_qd, leg_dof(world, leg))
+    arm = wp.quat_rotate(quat, leg_forward_kinematics(geo, angles[0], angles[1], angles[2]))
+    i = leg_dof(world, 0) - 3
+    ang = wp.vec3(robot.joint_qd[i], robot.joint_qd[i + 1], robot.joint_qd[i + 2])
+    along = wp.quat_rotate(quat, leg_jacobian(geo, angles[0], angles[1], angles[2]) * rates)
+    robot.paw_pos[leg, world] = base_pos(robot, world) + arm
+    robot.paw_vel[leg, world] = base_velocity(robot, world, quat) + wp.cross(ang, arm) + along
+
+
+@wp.func
+def time_contact(robot: RobotArrays, world: int, leg: int, down: bool):
+    """Count how long a paw has been down or up; `air_time` stays through the step of its first contact."""
+    was_down = robot.contact_time[leg, world] > 0.0
+    if down:
+        if was_down:
+            robot.air_time[leg, world] = 0.0
+        elif robot.air_time[leg, world] > 0.0:
+            robot.touchdown_speed[leg, world] = wp.max(-robot.paw_vel[leg, world][2], 0.0)
+        robot.contact_time[leg, world] = robot.contact_time[leg, world] + robot.step_dt
+    else:
+        if was_down:
+            robot.air_time[leg, world] = 0.0
+        robot.air_time[leg, world] = robot.air_time[leg, world] + robot.step_dt
+        robot.contact_time[leg, world] = 0.0
+
+
+@wp.kernel
+def track_kernel(
+    # in
+    geometry: wp.array(dtype=LegGeometry),
+    ground: Ground,
+    skills: wp.array(dtype=SkillSettings),
+    env: EnvArrays,
+    # in, out
+    robot: RobotArrays,
+):
+    """Follow every paw, and find what must not touch; one thread per (leg, world)."""
+    leg, world = wp.tid()
+    down = wp.length(robot.paw_force[leg, world]) > skills[env.skill[world]].contact_force
+    time_contact(robot, world, leg, down)  # before the velocity of the step before is written over
+    follow_paw(robot, geometry[leg], world, leg)
+    robot.collisions[leg, world] = leg_collisions(geometry, ground, robot.joint_q, world, leg)

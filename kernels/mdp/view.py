@@ -1,0 +1,215 @@
+"""What rewards, terminations and observations of every task may read of a robot, and where it is stored."""
+
+import warp as wp
+
+from ..layout import BODIES, COORDS, DOFS, motor_slot
+from ..terrain.ground import Ground, surface, world_ground
+
+vec12 = wp.types.vector(length=12, dtype=wp.float32)
+mat43 = wp.types.matrix(shape=(4, 3), dtype=wp.float32)
+
+
+@wp.struct
+class RobotView:
+    """One robot at the end of a policy step; motors in the order FL, FR, BL, BR by lateral, outer, inner."""
+
+    world: int  # index of the world
+    pos: wp.vec3  # [m] base origin, world
+    height: float  # [m] of the base origin above the ground below it
+    quat: wp.quat  # xyzw, body to world
+    lin_vel: wp.vec3  # [m/s] base origin, world
+    old_lin_vel: wp.vec3  # [m/s] the same one policy step before
+    lin_acc: wp.vec3  # [m/s^2] base origin, world, mean of the policy step
+    ang_vel: wp.vec3  # [rad/s] body axes
+    gravity: wp.vec3  # [1] direction of gravity in body axes
+    fall_acc: float  # [m/s^2] of gravity, downward
+    angle: vec12  # [rad]
+    sensed_angle: vec12  # [rad] as the motors' position sensors read it
+    rate: vec12  # [rad/s]
+    rate_change: vec12  # [rad/s^2] mean of the policy step
+    torque: vec12  # [N m] last physics step
+    old_torque: vec12  # [N m] last physics step of the policy step before
+    action: vec12  # [1] within -1..1
+    old_action: vec12
+    clipped: float  # [rad^2] squared distance that the command filter moved the targets
+    default_angle: vec12  # [rad]
+    contacts: int  # number of paws on the ground
+    collisions: int  # bits of `kernels.collision.robot`
+    contact: wp.vec4  # [1] 1: the paw is on the ground
+    first_contact: wp.vec4  # [1] 1: it came down in this step
+    air_time: wp.vec4  # [s] since the paw left the ground; at its first contact how long it was off it, later 0
+    contact_time: wp.vec4  # [s] since the paw came down; 0 in the air
+    touchdown_speed: wp.vec4  # [m/s] downward, of the paw in the step before it came down
+    paw_force: wp.vec4  # [N] on each paw, last physics step
+    peak_force: wp.vec4  # [N] on each paw, largest of the policy step
+    paw_pos: mat43  # [m] centres, world
+    paw_vel: mat43  # [m/s] centres, world
+
+
+@wp.struct
+class RobotArrays:
+    """Where the robots' state is; the old_ arrays hold the values of the policy step before."""
+
+    joint_q: wp.array(dtype=float)
+    joint_qd: wp.array(dtype=float)
+    body_com: wp.array(dtype=wp.vec3)
+    body_f: wp.array(dtype=wp.spatial_vector)  # [N], [N m] wrench on each body at its com, world axes
+    gravity: wp.array(dtype=wp.vec3)  # [m/s^2] (num_worlds + 1,), world axes
+    invalid: wp.array(dtype=int)  # (num_worlds,) 1: the solver gave the world up
+    impulse: wp.array2d(dtype=wp.vec3)  # [N s] (4, num_worlds) first guess of the next contact
+    paw_force: wp.array2d(dtype=wp.vec3)  # [N] (4, num_worlds), like all of paws
+    peak_force: wp.array2d(dtype=float)  # [N]
+    paw_pos: wp.array2d(dtype=wp.vec3)
+    paw_vel: wp.array2d(dtype=wp.vec3)
+    contact_time: wp.array2d(dtype=float)  # [s] 0 in the air
+    air_time: wp.array2d(dtype=float)
+    touchdown_speed: wp.array2d(dtype=float)
+    collisions: wp.array2d(dtype=int)
+    torque: wp.array2d(dtype=float)  # (12, num_worlds), like all below
+    old_torque: wp.array2d(dtype=float)
+    action: wp.array2d(dtype=float)
+    old_action: wp.array2d(dtype=float)
+    target: wp.array2d(dtype=float)  # [rad] before the filter
+    safe_target: wp.array2d(dtype=float)  # [rad] after it
+    old_rate: wp.array2d(dtype=float)
+    joint_offset: wp.array2d(dtype=float)  # [rad] constant error of each motor's position sensor
+    old_lin_vel: wp.array(dtype=wp.vec3)  # (num_worlds,)
+    default_angle: wp.array(dtype=float)  # (12,)
+    step_dt: float  # [s] policy step
+
+
+@wp.func
+def base_velocity(robot: RobotArrays, world: int, quat: wp.quat) -> wp.vec3:
+    """Return the velocity of the base origin [m/s], world frame."""
+    i = world * DOFS
+    com_vel = wp.vec3(robot.joint_qd[i], robot.joint_qd[i + 1], robot.joint_qd[i + 2])
+    ang = wp.vec3(robot.joint_qd[i + 3], robot.joint_qd[i + 4], robot.joint_qd[i + 5])
+    return com_vel - wp.cross(ang, wp.quat_rotate(quat, robot.body_com[world * BODIES]))
+
+
+@wp.func
+def base_pos(robot: RobotArrays, world: int) -> wp.vec3:
+    """Return the base origin [m], world frame."""
+    i = world * COORDS
+    return wp.vec3(robot.joint_q[i], robot.joint_q[i + 1], robot.joint_q[i + 2])
+
+
+@wp.func
+def base_quat(robot: RobotArrays, world: int) -> wp.quat:
+    """Return the base's orientation, xyzw, body to world."""
+    i = world * COORDS + 3
+    return wp.quat(robot.joint_q[i], robot.joint_q[i + 1], robot.joint_q[i + 2], robot.joint_q[i + 3])
+
+
+@wp.func
+def load_base_view(robot: RobotArrays, ground: Ground, world: int) -> RobotView:
+    """Return the view with the base's entries filled in."""
+    j = world * DOFS
+    view = RobotView()
+    view.world = world
+    view.pos = base_pos(robot, world)
+    quat = base_quat(robot, world)
+    view.quat = quat
+    view.lin_vel = base_velocity(robot, world, quat)
+    view.old_lin_vel = robot.old_lin_vel[world]
+    view.lin_acc = (view.lin_vel - view.old_lin_vel) / robot.step_dt
+    ang = wp.vec3(robot.joint_qd[j + 3], robot.joint_qd[j + 4], robot.joint_qd[j + 5])
+    view.ang_vel = wp.quat_rotate_inv(quat, ang)
+    view.gravity = wp.quat_rotate_inv(quat, wp.vec3(0.0, 0.0, -1.0))
+    view.fall_acc = -robot.gravity[world][2]
+    below = surface(world_ground(ground, world), view.pos[0], view.pos[1])
+    view.height = view.pos[2] - below[0]
+    return view
+
+
+@wp.func
+def load_view(robot: RobotArrays, ground: Ground, world: int) -> RobotView:
+    """Return the robot of a world."""
+    view = load_base_view(robot, ground, world)
+    contacts = int(0)
+    collisions = int(0)
+    for k in range(4):
+        time = robot.contact_time[k, world]
+        down = time > 0.0
+        contacts += wp.where(down, 1, 0)
+        collisions = collisions | robot.collisions[k, world]
+        view.contact[k] = wp.where(down, 1.0, 0.0)
+        view.first_contact[k] = wp.where(down and robot.air_time[k, world] > 0.0, 1.0, 0.0)
+        view.contact_time[k] = time
+        view.air_time[k] = robot.air_time[k, world]
+        view.touchdown_speed[k] = robot.touchdown_speed[k, world]
+        view.paw_force[k] = wp.length(robot.paw_force[k, world])
+        view.peak_force[k] = robot.peak_force[k, world]
+        for j in range(3):
+            view.paw_pos[k, j] = robot.paw_pos[k, world][j]
+            view.paw_vel[k, j] = robot.paw_vel[k, world][j]
+    view.contacts = contacts
+    view.collisions = collisions
+    clipped = float(0.0)
+    for m in range(12):
+        slot = motor_slot(m)
+        rate = robot.joint_qd[world * DOFS + 6 + slot]
+        angle = robot.joint_q[world * COORDS + 7 + slot]
+        view.angle[m] = angle
+        view.sensed_angle[m] = angle + robot.joint_offset[m, world]
+        view.rate[m] = rate
+        view.rate_change[m] = (rate - robot.old_rate[m, world]) / robot.step_dt
+        view.torque[m] = robot.torque[m, world]
+        view.old_torque[m] = robot.old_torque[m, world]
+        view.action[m] = robot.action[m, world]
+        view.old_action[m] = robot.old_action[m, world]
+        view.default_angle[m] = robot.default_angle[m]
+        off = robot.target[m, world] - robot.safe_target[m, world]
+        clipped += off * off
+    view.clipped = clipped
+    return view
+
+
+@wp.func
+def speed_limit_broken(view: RobotView) -> bool:
+    """Return whether a state is non-finite or faster than the robot can ever be: the world has come apart."""
+    fastest = float(0.0)
+    total = wp.length_sq(view.pos) + wp.length_sq(view.lin_vel) + wp.length_sq(view.ang_vel)
+    for m in range(12):
+        fastest = wp.max(fastest, wp.abs(view.rate[m]))
+        total += view.rate[m] * view.rate[m] + view.angle[m] * view.angle[m]  # max() would pass over a NaN
+    if not wp.isfinite(total):
+        return True
+    return wp.length(view.lin_vel) > 15.0 or wp.length(view.ang_vel) > 40.0 or fastest > 120.0
+
+
+@wp.func
+def yaw_of(quat: wp.quat) -> float:
+    """Return the yaw [rad] of an orientation (xyzw): the heading of body x in the world plane."""
+    ahead = wp.quat_rotate(quat, wp.vec3(1.0, 0.0, 0.0))
+    return wp.atan2(ahead[1], ahead[0])
+
+
+@wp.func
+def turned(v: wp.vec3, heading: float) -> wp.vec3:
+    """Return a vector turned about z by a heading [rad]."""
+    return wp.quat_rotate(wp.quat_from_axis_angle(wp.vec3(0.0, 0.0, 1.0), heading), v)
+
+
+@wp.func
+def rotation_from(quat: wp.quat, heading: float) -> float:
+    """Return the angle [rad] between an orientation (xyzw) and the level one with a heading [rad]."""
+    half = 0.5 * heading
+    level = wp.quat(0.0, 0.0, wp.sin(half), wp.cos(half))
+    off = wp.quat_inverse(level) * quat
+    return 2.0 * wp.atan2(wp.length(wp.vec3(off[0], off[1], off[2])), wp.abs(off[3]))
+
+
+@wp.func
+def tilt(view: RobotView) -> float:
+    """Return the angle [rad] between body z and world z."""
+    return wp.acos(wp.clamp(-view.gravity[2], -1.0, 1.0))
+
+
+@wp.func
+def braking(view: RobotView) -> float:
+    """Return the base's acceleration along its motion where it slows down [m/s^2], <= 0."""
+    speed = wp.length(view.lin_vel)
+    if speed < 1.0e-6:
+        return 0.0
+    return wp.min(wp.dot(view.lin_acc, view.lin_vel) / speed, 0.0)
