@@ -15,19 +15,18 @@ end, `rest_s` after touchdown, a landed base should be at rest. The range of `su
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 
-import matplotlib
 import numpy as np
 import tyro
 
 from jumper_warp.cli.main import run_command
-from jumper_warp.evaluation.jumps import REST_TIME, mean
-from jumper_warp.evaluation.landings import Landings, landing_figures, random_headings
-from jumper_warp.evaluation.trial import Trial, TrialArgs
-
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt
+from jumper_warp.evaluation.jumps import REST_TIME
+from jumper_warp.evaluation.landings import Landings
+from jumper_warp.evaluation.log import mean, termination_names
+from jumper_warp.evaluation.places import landing_metrics, random_headings
+from jumper_warp.evaluation.plots import Track, draw_paths
+from jumper_warp.evaluation.run import EvaluationArgs, EvaluationRun
+from jumper_warp.utils.errors import InputError
 
 PAIRS = {"diagonal": ((0.8, 0.2), (0.75, -0.2)), "straight": ((0.8, 0.0), (0.8, 0.0))}
 """[m]"""
@@ -42,7 +41,7 @@ PAPER = {"mean_error_m": 0.0054}
 
 
 @dataclass(frozen=True)
-class Args(TrialArgs):
+class Args(EvaluationArgs):
     """Flags."""
 
     jumps: int = 20
@@ -58,32 +57,14 @@ class Args(TrialArgs):
         """Check the values."""
         super().__post_init__()
         if min(self.jumps, self.trials, self.row) < 1:
-            raise ValueError(f"need at least one jump, trial and row, got {self.jumps}, {self.trials}, {self.row}")
+            raise InputError(f"need at least one jump, trial and row, got {self.jumps}, {self.trials}, {self.row}")
         if not 0.1 <= self.rest <= 10.0:
-            raise ValueError(f"rest must be in [0.1, 10] s, got {self.rest}")
+            raise InputError(f"rest must be in [0.1, 10] s, got {self.rest}")
 
 
-class Track:
-    """Keeps where every base was."""
-
-    def __init__(self) -> None:
-        self.places: list[np.ndarray] = []
-
-    def __call__(self, landings: Landings) -> None:
-        """Add the moment; places of rows that have ended are not numbers."""
-        running = landings.current < landings.goals.shape[1]
-        self.places.append(np.where(running[:, None], landings.seen["base_pos"][:, :2], np.nan))
-
-    def in_start_frame(self, headings: np.ndarray) -> np.ndarray:
-        """Return the places [m], (worlds, steps, 2), ahead and to the left of start and heading (worlds,) [rad]."""
-        x, y = np.moveaxis(np.stack(self.places, axis=1), -1, 0)
-        cos, sin = np.cos(headings)[:, None], np.sin(headings)[:, None]
-        return np.stack([cos * x + sin * y, cos * y - sin * x], axis=-1)
-
-
-def figures(pairs: Landings, row: Landings) -> dict:
-    """Return the figures of both tests; the first half of the pairs are the diagonal ones."""
-    values, ten = (landing_figures(landings) for landings in (pairs, row))
+def metrics(pairs: Landings, row: Landings) -> dict:
+    """Return the metrics of both tests; the first half of the pairs are the diagonal ones."""
+    values, ten = (landing_metrics(landings) for landings in (pairs, row))
     values[AT_END], ten[AT_END] = (part.pop("at_rest_within_1_s_rate") for part in (values, ten))
     values["success_rate_in_range"] = values["success_rate"]
     half = len(pairs.goals) // 2
@@ -105,25 +86,9 @@ def figures(pairs: Landings, row: Landings) -> dict:
     }
 
 
-def plot(paths: dict[str, np.ndarray], path: Path, title: str) -> None:
-    """Draw the ways of the bases from above, starts at the origin and headings to the right; a panel a test."""
-    fig, axes = plt.subplots(1, len(paths), figsize=(5.0 * len(paths), 4.5), constrained_layout=True)
-    for axis, (name, places) in zip(axes, paths.items(), strict=True):
-        for way in places:
-            axis.plot(way[:, 0], way[:, 1], linewidth=0.8, alpha=0.5, color="tab:blue")
-        if name in PAIRS:
-            goals = np.cumsum(PAIRS[name], axis=0)
-            axis.scatter(goals[:, 0], goals[:, 1], s=50, color="tab:red", marker="x", zorder=3, label="goal, no error")
-            axis.legend(loc="upper left")
-        axis.set(xlabel="ahead [m]", ylabel="to the left [m]", title=f"{name}, {title}", aspect="equal")
-        axis.margins(0.1, 0.3)
-    fig.savefig(path, dpi=110)
-    plt.close(fig)
-
-
 def main(args: Args) -> dict:
     """Run both tests and return the figures."""
-    trial = Trial("consecutive_jumps", args)
+    run = EvaluationRun.of("consecutive_jumps", args)
     rng = np.random.default_rng(args.seed)
     pairs = np.repeat(np.array(list(PAIRS.values())), args.jumps, axis=0)
     rows = rng.uniform(ROW_LOWER, ROW_UPPER, (args.trials, args.row, 2))
@@ -131,12 +96,14 @@ def main(args: Args) -> dict:
     for name, goals in (("pairs", pairs), ("row", rows)):
         headings, track = random_headings(len(goals), args.seed), Track()
         delay = rng.uniform(*DELAY, len(goals))
-        env = trial.env(len(goals))
-        done.append(trial.jump(env, goals, film=name, watch=track, headings=headings, delay=delay, rest=args.rest))
+        env = run.env(len(goals))
+        asked = Landings(goals, termination_names(env.task), headings, delay=delay, rest=args.rest)
+        done.append(run.follow(env, asked, film=name, watch=track))
         paths.append(track.in_start_frame(headings))
     names = (*PAIRS, f"{args.row} in a row")
-    plot(dict(zip(names, (*np.split(paths[0], 2), paths[1]), strict=True)), trial.folder / "paths.png", trial.title)
-    return trial.report({"rest_s": args.rest, **figures(*done)}, PAPER)
+    parts = dict(zip(names, (*np.split(paths[0], 2), paths[1]), strict=True))
+    draw_paths(run.folder / "paths.png", parts, PAIRS, run.title)
+    return run.report({"rest_s": args.rest, **metrics(*done)}, PAPER)
 
 
 if __name__ == "__main__":

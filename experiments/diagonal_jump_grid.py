@@ -9,18 +9,17 @@ Each jump has a heading of its own, drawn from the full circle. Errors and succe
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 
-import matplotlib
 import numpy as np
 import tyro
 
 from jumper_warp.cli.main import run_command
-from jumper_warp.evaluation.landings import NEAR, Landings, landing_figures, random_headings
-from jumper_warp.evaluation.trial import Trial, TrialArgs
-
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt
+from jumper_warp.evaluation.landings import Landings
+from jumper_warp.evaluation.log import termination_names
+from jumper_warp.evaluation.places import landing_metrics, random_headings
+from jumper_warp.evaluation.plots import draw_landings, drawn
+from jumper_warp.evaluation.run import EvaluationArgs, EvaluationRun
+from jumper_warp.utils.errors import InputError
 
 AHEAD = (0.35, 1.4)
 """[m]"""
@@ -31,7 +30,7 @@ PAPER = {"mean_error_m": 0.025, "success_rate": 0.968, "success_rate_in_range": 
 
 
 @dataclass(frozen=True)
-class Args(TrialArgs):
+class Args(EvaluationArgs):
     """Flags."""
 
     jumps: int = 2
@@ -45,7 +44,7 @@ class Args(TrialArgs):
         """Check the values."""
         super().__post_init__()
         if min(self.jumps, self.columns, self.rows) < 1:
-            raise ValueError(f"need at least one jump, column and row, got {self.jumps}, {self.columns}, {self.rows}")
+            raise InputError(f"need at least one jump, column and row, got {self.jumps}, {self.columns}, {self.rows}")
 
 
 def grid(columns: int, rows: int, jumps: int) -> np.ndarray:
@@ -54,32 +53,17 @@ def grid(columns: int, rows: int, jumps: int) -> np.ndarray:
     return np.repeat(np.stack([x.ravel(), y.ravel()], axis=1), jumps, axis=0)[:, None]
 
 
-def plot(landings: Landings, path: Path, title: str) -> None:
-    """Draw goals and landings, seen from above with the start at the origin."""
-    goals, landing = landings.goals[:, 0], landings.landing[:, 0]
-    fig, axis = plt.subplots(figsize=(8, 5), constrained_layout=True)
-    axis.scatter(goals[:, 0], goals[:, 1], s=40, color="tab:red", marker="x", linewidth=1.0, label="goal")
-    dots = axis.scatter(
-        landing[:, 0], landing[:, 1], s=16, c=landings.error[:, 0], cmap="viridis", vmin=0.0, vmax=NEAR, label="landing"
-    )
-    failed = ~landings.success[:, 0]
-    axis.scatter(landing[failed, 0], landing[failed, 1], s=60, facecolors="none", edgecolors="tab:red", label="failed")
-    fig.colorbar(dots, ax=axis, label="distance from the goal [m]")
-    axis.set(xlabel="ahead [m]", ylabel="to the left [m]", title=title, aspect="equal")
-    axis.legend(loc="upper center", bbox_to_anchor=(0.5, -0.12), ncols=3)
-    fig.savefig(path, dpi=110)
-    plt.close(fig)
-
-
 def main(args: Args) -> dict:
     """Run all jumps of the grid and return the figures."""
-    trial = Trial("diagonal_jump_grid", args)
+    run = EvaluationRun.of("diagonal_jump_grid", args)
     goals = grid(args.columns, args.rows, args.jumps)
-    headings = random_headings(len(goals), args.seed)
-    landings = trial.jump(trial.env(len(goals)), goals, film="jumps", headings=headings)
-    plot(landings, trial.folder / "grid.png", f"{len(goals)} jumps, {trial.title}")
+    env = run.env(len(goals))
+    asked = Landings(goals, termination_names(env.task), random_headings(len(goals), args.seed))
+    landings = run.follow(env, asked, film="jumps")
+    with drawn(run.folder / "grid.png", figsize=(8, 5)) as axis:
+        draw_landings(axis, landings, f"{len(goals)} jumps, {run.title}")
     inside = goals[..., 0] < AHEAD[1] - 1.0e-6
-    return trial.report({"goals": len(goals) // args.jumps, **landing_figures(landings, inside)}, PAPER)
+    return run.report({"goals": len(goals) // args.jumps, **landing_metrics(landings, inside)}, PAPER)
 
 
 if __name__ == "__main__":

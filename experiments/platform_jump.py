@@ -15,21 +15,19 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
-import matplotlib
 import numpy as np
 import tyro
 
 from jumper_warp.cli.main import run_command
-from jumper_warp.evaluation.jumps import mean
-from jumper_warp.evaluation.landings import Landings, landing_figures
-from jumper_warp.evaluation.trial import Trial, TrialArgs
+from jumper_warp.evaluation.landings import Landings
+from jumper_warp.evaluation.log import mean, termination_names
+from jumper_warp.evaluation.places import landing_metrics
+from jumper_warp.evaluation.plots import draw_landings, drawn
+from jumper_warp.evaluation.run import EvaluationArgs, EvaluationRun
 from jumper_warp.robot.grounds import BlockCfg, platform, uneven
-
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt
+from jumper_warp.utils.errors import InputError
 
 DROP = 0.15
 """[m] Height of the platform."""
@@ -49,7 +47,7 @@ SCENES = ("platform", "uneven", "block")
 
 
 @dataclass(frozen=True)
-class Args(TrialArgs):
+class Args(EvaluationArgs):
     """Flags."""
 
     jumps: int = 100
@@ -63,13 +61,13 @@ class Args(TrialArgs):
         """Check the values."""
         super().__post_init__()
         if self.jumps < 1:
-            raise ValueError(f"need at least one jump, got {self.jumps}")
+            raise InputError(f"need at least one jump, got {self.jumps}")
         if not 0.3 <= self.edge < AHEAD[0]:
-            raise ValueError(f"edge must be from 0.3 m to below {AHEAD[0]} m, got {self.edge}")
+            raise InputError(f"edge must be from 0.3 m to below {AHEAD[0]} m, got {self.edge}")
         if not self.scenes or set(self.scenes) - set(SCENES):
-            raise ValueError(f"scenes are {', '.join(SCENES)}, got {self.scenes}")
+            raise InputError(f"scenes are {', '.join(SCENES)}, got {self.scenes}")
         if self.solver == "mujoco" and set(self.scenes) == {"block"}:
-            raise ValueError("the scene block needs --solver jumper: SolverMuJoCo has no sliding block")
+            raise InputError("the scene block needs --solver jumper: SolverMuJoCo has no sliding block")
 
 
 def scene(name: str, goals: np.ndarray, edge: float, rng: np.random.Generator) -> tuple[dict[str, Any], np.ndarray]:
@@ -86,25 +84,9 @@ def scene(name: str, goals: np.ndarray, edge: float, rng: np.random.Generator) -
     return {"block": BlockCfg(center, half, BLOCK_HEIGHT, BLOCK_MASS, BLOCK_FRICTION)}, straight
 
 
-def plot(done: dict[str, Landings], path: Path, title: str) -> None:
-    """Draw goals and landings, seen from above with the start at the origin; a panel a scene."""
-    fig, axes = plt.subplots(1, len(done), figsize=(5.0 * len(done), 4.0), constrained_layout=True, squeeze=False)
-    for axis, (name, landings) in zip(axes[0], done.items(), strict=True):
-        good = landings.success[:, 0]
-        goals, landing = landings.goals[:, 0], landings.landing[:, 0]
-        axis.plot(*np.stack([goals, landing]).transpose(2, 0, 1), color="0.7", linewidth=0.8)
-        axis.scatter(goals[:, 0], goals[:, 1], s=20, color="0.4", marker="x", linewidth=0.8, label="goal")
-        axis.scatter(landing[good, 0], landing[good, 1], s=12, color="tab:blue", label="landed there")
-        axis.scatter(landing[~good, 0], landing[~good, 1], s=12, color="tab:red", label="failed")
-        axis.set(xlabel="ahead [m]", ylabel="to the left [m]", title=f"{name}, {title}", aspect="equal")
-    axes[0, 0].legend(loc="upper left")
-    fig.savefig(path, dpi=110)
-    plt.close(fig)
-
-
 def main(args: Args) -> dict:
     """Run the scenes and return the figures, each scene's under its name, and the mean of all."""
-    trial = Trial("platform_jump", args)
+    run = EvaluationRun.of("platform_jump", args)
     rng = np.random.default_rng(args.seed)
     goals = rng.uniform((AHEAD[0], ASIDE[0]), (AHEAD[1], ASIDE[1]), (args.jumps, 2))
     done: dict[str, Landings] = {}
@@ -114,16 +96,19 @@ def main(args: Args) -> dict:
             print("scene block left out: SolverMuJoCo has no sliding block")
             continue
         special, headings = scene(name, goals, args.edge, rng)
-        env = trial.env(args.jumps, **special)
-        done[name] = trial.jump(env, goals[:, None], film=name, drawn=special, headings=headings)
-        values |= {f"{name}_{figure}": value for figure, value in landing_figures(done[name]).items()}
+        env = run.env(args.jumps, **special)
+        asked = Landings(goals[:, None], termination_names(env.task), headings)
+        done[name] = run.follow(env, asked, film=name, drawn=special)
+        values |= {f"{name}_{figure}": value for figure, value in landing_metrics(done[name]).items()}
         if name == "block":
             moved = np.linalg.norm(env.sim.solver.block_position() - special["block"].center, axis=1)
             values |= {"block_mean_slide_m": float(moved.mean()), "block_max_slide_m": float(moved.max())}
-    plot(done, trial.folder / "landings.png", trial.title)
+    with drawn(run.folder / "landings.png", 1, len(done), figsize=(5.0 * len(done), 4.0), squeeze=False) as axes:
+        for axis, (name, landings) in zip(axes[0], done.items(), strict=True):
+            draw_landings(axis, landings, f"{name}, {run.title}")
     summary = {name: mean([values[f"{scene}_{name}"] for scene in done]) for name in ("mean_error_m", "success_rate")}
     summary["success_rate_in_range"] = summary["success_rate"]
-    return trial.report({"jumps": args.jumps * len(done), "edge_m": args.edge, **summary, **values}, {})
+    return run.report({"jumps": args.jumps * len(done), "edge_m": args.edge, **summary, **values}, {})
 
 
 if __name__ == "__main__":

@@ -9,25 +9,24 @@ a policy for all directions loses in distance against one that jumps ahead only 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 
-import matplotlib
 import numpy as np
 import tyro
 
 from jumper_warp.cli.main import run_command
-from jumper_warp.evaluation.landings import NEAR, Landings, landing_figures, random_headings
-from jumper_warp.evaluation.trial import Trial, TrialArgs
-
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt
+from jumper_warp.evaluation.landings import Landings
+from jumper_warp.evaluation.log import termination_names
+from jumper_warp.evaluation.places import landing_metrics, random_headings
+from jumper_warp.evaluation.plots import draw_landings, drawn
+from jumper_warp.evaluation.run import EvaluationArgs, EvaluationRun
+from jumper_warp.utils.errors import InputError
 
 SECTORS = ("ahead", "left", "back", "right")
 """Quarters of the ring, each centred on its direction."""
 
 
 @dataclass(frozen=True)
-class Args(TrialArgs):
+class Args(EvaluationArgs):
     """Flags."""
 
     policy: str = "omnidirectional_jump"
@@ -41,7 +40,7 @@ class Args(TrialArgs):
         """Check the values."""
         super().__post_init__()
         if self.jumps < len(SECTORS) or not 0.0 < self.radius < 3.0:
-            raise ValueError(
+            raise InputError(
                 f"need at least {len(SECTORS)} jumps and a radius in (0, 3) m, got {self.jumps}, {self.radius}"
             )
 
@@ -52,36 +51,26 @@ def sectors(goals: np.ndarray) -> np.ndarray:
     return np.round(angle / (0.5 * np.pi)).astype(int) % len(SECTORS)
 
 
-def figures(landings: Landings) -> dict:
-    """Return the figures of the ring, with the success of each quarter."""
-    values = landing_figures(landings)
+def metrics(landings: Landings) -> dict:
+    """Return the metrics of the ring, with the success of each quarter."""
+    values = landing_metrics(landings)
     sector = sectors(landings.goals)
     for index, name in enumerate(SECTORS):
         values[f"success_rate_{name}"] = float(landings.success[sector == index].mean())
     return values
 
 
-def plot(landings: Landings, path: Path, title: str) -> None:
-    """Draw goals and landings in the frame of the start, x ahead."""
-    goals, landing, good = landings.goals[:, 0], landings.landing[:, 0], landings.success[:, 0]
-    fig, axis = plt.subplots(figsize=(6, 6), constrained_layout=True)
-    axis.scatter(goals[:, 0], goals[:, 1], s=22, color="0.4", marker="x", linewidth=0.8, label="goal")
-    axis.scatter(landing[good, 0], landing[good, 1], s=9, color="tab:blue", label=f"landed within {NEAR:g} m")
-    axis.scatter(landing[~good, 0], landing[~good, 1], s=14, color="tab:red", label="failed")
-    axis.set(xlabel="ahead [m]", ylabel="to the left [m]", title=title, aspect="equal")
-    axis.legend(loc="center")
-    fig.savefig(path, dpi=110)
-    plt.close(fig)
-
-
 def main(args: Args) -> dict:
     """Jump to the ring and return the figures."""
-    trial = Trial("ring_jump", args)
+    run = EvaluationRun.of("ring_jump", args)
     angle = np.linspace(0.0, 2.0 * np.pi, args.jumps, endpoint=False)
     goals = args.radius * np.stack([np.cos(angle), np.sin(angle)], axis=-1)[:, None]
-    landings = trial.jump(trial.env(args.jumps), goals, film="jumps", headings=random_headings(args.jumps, args.seed))
-    plot(landings, trial.folder / "landings.png", f"{args.jumps} jumps over {args.radius:g} m, {trial.title}")
-    return trial.report(figures(landings), {})
+    env = run.env(args.jumps)
+    asked = Landings(goals, termination_names(env.task), random_headings(args.jumps, args.seed))
+    landings = run.follow(env, asked, film="jumps")
+    with drawn(run.folder / "landings.png", figsize=(6, 6.5)) as axis:
+        draw_landings(axis, landings, f"{args.jumps} jumps over {args.radius:g} m, {run.title}")
+    return run.report(metrics(landings), {})
 
 
 if __name__ == "__main__":

@@ -1,22 +1,204 @@
-"""The tasks by name."""
+"""The tasks by name: how each is made, how its policies are trained, and where those of users come from.
 
+Importing this module imports no task. A task of a user comes from a file or module that the user names, or from an
+installed package with an entry point of group `jumper_warp.tasks`; nothing else is ever imported for its sake.
+"""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+import keyword
+import sys
+import traceback
 from collections.abc import Callable
+from dataclasses import dataclass, field
+from importlib.metadata import EntryPoint, entry_points
+from pathlib import Path
+from types import ModuleType
+from typing import TYPE_CHECKING
 
-from jumper_warp.tasks.cfg import TaskCfg
-from jumper_warp.tasks.jump.horizontal import horizontal_jump, omnidirectional_jump
-from jumper_warp.tasks.jump.vertical import vertical_jump
+from jumper_warp.rl.ppo import PpoCfg
+from jumper_warp.utils.errors import InputError
 
-TASKS: dict[str, Callable[[], TaskCfg]] = {
-    "vertical-jump": vertical_jump,
-    "horizontal-jump": horizontal_jump,
-    "omnidirectional-jump": omnidirectional_jump,
-}
-ALIASES = {"Olympus-Vertical-Jump": "vertical-jump", "Olympus-Horizontal-Jump": "horizontal-jump"}
+if TYPE_CHECKING:
+    from jumper_warp.tasks.cfg import TaskCfg
+
+GROUP = "jumper_warp.tasks"
+"""Of entry points: name of a task, and `module:function` that returns its `TaskCfg` or `TaskEntry`."""
+
+
+@dataclass(frozen=True)
+class TaskEntry:
+    """How a task is made and trained."""
+
+    make: Callable[[], TaskCfg] | str
+    """Returns the task; or where that function is, `module:function`, imported when the task is made."""
+    ppo: PpoCfg = field(default_factory=PpoCfg)
+    """Settings of the algorithm unless told otherwise."""
+    aliases: tuple[str, ...] = ()
+
+    @property
+    def origin(self) -> str:
+        """Name of the module that makes the task."""
+        return self.make.split(":")[0] if isinstance(self.make, str) else self.make.__module__
+
+    def task(self, name: str) -> TaskCfg:
+        """Return the task; raises InputError: it is none, or not of this name."""
+        from jumper_warp.tasks.cfg import TaskCfg
+
+        make = self.make
+        if isinstance(make, str):
+            module, _, function = make.partition(":")
+            make = getattr(importlib.import_module(module), function)
+        task = make()
+        if not isinstance(task, TaskCfg):
+            raise InputError(f"task {name!r} of {self.origin}: expected a TaskCfg, got {type(task).__name__}")
+        if task.name != name:
+            raise InputError(f"task {name!r} of {self.origin} calls itself {task.name!r:.60}; give both the same name")
+        return task
+
+
+TASKS: dict[str, TaskEntry] = {
+    "vertical-jump": TaskEntry(
+        "jumper_warp.tasks.jump.vertical:vertical_jump", aliases=("Olympus-Vertical-Jump",)
+    ),
+    "horizontal-jump": TaskEntry(
+        "jumper_warp.tasks.jump.horizontal:horizontal_jump",
+        PpoCfg(gamma=0.99, entropy_coef=0.0003),
+        aliases=("Olympus-Horizontal-Jump",),
+    ),
+    "omnidirectional-jump": TaskEntry(
+        "jumper_warp.tasks.jump.horizontal:omnidirectional_jump", PpoCfg(gamma=0.99, entropy_coef=0.0003)
+    ),
+}  # fmt: skip
+"""The project's tasks, and those that were registered or asked for."""
 
 
 def make_task(name: str) -> TaskCfg:
-    """Return a task by name or alias. Raises ValueError for an unknown one."""
-    name = ALIASES.get(name, name)
-    if name not in TASKS:
-        raise ValueError(f"unknown task {name!r}; there are {', '.join(TASKS)}")
-    return TASKS[name]()
+    """Return a task by name or alias. Raises InputError: an unknown one, or one whose maker gives no such task."""
+    name, entry = find_task(name)
+    return entry.task(name)
+
+
+def trainer_settings(name: str) -> PpoCfg:
+    """Return how policies of a task, by name or alias, are trained unless told otherwise; raises as `make_task`."""
+    return find_task(name)[1].ppo
+
+
+def task_names() -> tuple[str, ...]:
+    """Return the names of all tasks; those of installed packages are not loaded for it."""
+    return tuple(dict.fromkeys([*TASKS, *sorted({point.name for point in installed_tasks()})]))
+
+
+def register_task(
+    name: str, make: Callable[[], TaskCfg], *, ppo: PpoCfg | None = None, aliases: tuple[str, ...] = ()
+) -> None:
+    """Let `make` be found by the name of its task, and by aliases; ppo: settings of the algorithm.
+
+    Raises InputError: a name is taken.
+    """
+    _register(name, TaskEntry(make, PpoCfg() if ppo is None else ppo, tuple(aliases)))
+
+
+def _register(name: str, entry: TaskEntry) -> None:
+    taken = {alias: other for other, known in TASKS.items() for alias in (other, *known.aliases)}
+    for each in (name, *entry.aliases):
+        if each in taken:
+            raise InputError(f"there is a task {each!r:.60} already, of {TASKS[taken[each]].origin}")
+    TASKS[name] = entry
+
+
+def find_task(name: str) -> tuple[str, TaskEntry]:
+    """Return a task's name and entry by name or alias; raises InputError for an unknown one."""
+    for known, entry in TASKS.items():
+        if name == known or name in entry.aliases:
+            return known, entry
+    points = [point for point in installed_tasks() if point.name == name]
+    if len(points) > 1:
+        raise InputError(f"task {name!r:.60} is in several packages: {', '.join(package_of(p) for p in points)}")
+    if not points:
+        raise InputError(f"unknown task {name!r:.60}; there are {', '.join(task_names())}")
+    load_installed(points[0])
+    return name, TASKS[name]
+
+
+def installed_tasks() -> tuple[EntryPoint, ...]:
+    """Return the tasks that installed packages offer, without loading them."""
+    return tuple(entry_points(group=GROUP))
+
+
+def package_of(point: EntryPoint) -> str:
+    """Return the name of the package that offers a task."""
+    return point.dist.name if point.dist is not None else point.module
+
+
+def load_installed(point: EntryPoint) -> None:
+    """Load a task of an installed package, and register it.
+
+    Raises InputError: it cannot be imported, or a name is taken.
+    """
+    where = f"task {point.name!r:.60} of package {package_of(point)}"
+    try:
+        make = point.load()
+    except (ImportError, AttributeError) as error:
+        raise InputError(f"{where} cannot be loaded: {type(error).__name__}: {error}") from error
+    if not callable(make):
+        raise InputError(f"{where}: {point.value} is no function")
+    made = make()
+    _register(point.name, made if isinstance(made, TaskEntry) else TaskEntry(make))
+
+
+def load_task_module(name: str) -> ModuleType:
+    """Import a FILE.py, or a module by name, so that the tasks that it registers are known.
+
+    Raises:
+        InputError: There is none, its name belongs to another module, or what it registers or defines is refused.
+        OSError: The file cannot be read.
+    """
+    path, before = Path(name), dict(TASKS)
+    try:
+        if path.suffix == ".py" or len(path.parts) > 1:
+            return _load_file(path)
+        return importlib.import_module(name)
+    except BaseException as error:
+        TASKS.clear()
+        TASKS.update(before)
+        if isinstance(error, ModuleNotFoundError) and f"{name}.".startswith(f"{error.name}."):
+            raise InputError(f"no module {name!r:.80}, give a FILE.py or the name of an installed module") from error
+        raise
+
+
+def _load_file(path: Path) -> ModuleType:
+    """Import a file under its stem; one that was imported before is returned as it is."""
+    if not path.is_file():
+        raise InputError(f"no file {str(path)!r:.200}")
+    path, name = path.resolve(), path.stem
+    if not name.isidentifier() or keyword.iskeyword(name):
+        raise InputError(f"{path.name}: the name of a task's file must be one that Python can import")
+    known = sys.modules.get(name)
+    if known is not None and getattr(known, "__file__", None) == str(path):
+        return known
+    if known is not None or name in sys.stdlib_module_names or _is_elsewhere(name, path):
+        raise InputError(f"{path.name}: {name!r} is the name of another module; give the file another name")
+    spec = importlib.util.spec_from_file_location(name, path)
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[name] = module
+    try:
+        spec.loader.exec_module(module)
+    except BaseException as error:
+        del sys.modules[name]
+        if isinstance(error, SyntaxError) and error.filename == str(path):
+            raise InputError(f"{path.name}:{error.lineno}: {error.msg}") from error
+        if isinstance(error, InputError):
+            lines = [line for frame, line in traceback.walk_tb(error.__traceback__)
+                     if frame.f_code.co_filename == str(path)]  # fmt: skip
+            raise InputError(f"{path.name}:{lines[-1] if lines else 1}: {error}") from error
+        raise
+    return module
+
+
+def _is_elsewhere(name: str, path: Path) -> bool:
+    """Return whether importing a name would give another file than this."""
+    spec = importlib.util.find_spec(name)
+    return spec is not None and spec.origin != str(path)

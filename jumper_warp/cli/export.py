@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from types import ModuleType
 
 import tyro
 
-from jumper_warp.policies.folder import save_policy
-from jumper_warp.policies.onnx import export_onnx
-from jumper_warp.policies.restore import is_run, learning_curve, open_policy
+from jumper_warp.cli.main import parse
 
 
 @dataclass(frozen=True)
@@ -26,6 +26,11 @@ class ExportCfg:
     """Replace a policy that is there already, figures and README included."""
 
 
+def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> None:
+    """Export as the arguments say; raises as `export`. A policy's own interface is enough: no module is needed."""
+    export(parse(ExportCfg, "export", args))
+
+
 def export(cfg: ExportCfg) -> Path:
     """Write what the configuration asks for, print where, and return the path.
 
@@ -33,6 +38,10 @@ def export(cfg: ExportCfg) -> Path:
         PolicyError: The source cannot be used, or the folder exists and is not to be overwritten.
         CheckpointError: The checkpoint cannot be used.
     """
+    from jumper_warp.policies.folder import save_policy
+    from jumper_warp.policies.onnx import export_onnx
+    from jumper_warp.policies.restore import is_run, learning_curve, open_policy
+
     source = Path(cfg.source)
     trained = is_run(source)
     policy = open_policy(cfg.source, newest=cfg.newest)

@@ -3,30 +3,35 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 import os
+import sys
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Annotated
+from dataclasses import dataclass, field
+from types import ModuleType
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-import torch
 import tyro
 
-from jumper_warp.cli.main import UsageError, announce
-from jumper_warp.cli.task_flags import TaskFlags
-from jumper_warp.envs.env import Env
-from jumper_warp.registry import TASKS, make_task
-from jumper_warp.rl.runner import MakeEnv, TrainCfg, TrainResult, train
-from jumper_warp.sim.simulation import SolverName
-from jumper_warp.tasks.cfg import TaskCfg
+from jumper_warp.cli.main import TASK_MODULE_HELP, USAGE_ERROR, UsageError, parse
+from jumper_warp.registry import find_task, make_task, task_names
+from jumper_warp.rl.runner import TrainCfg
+from jumper_warp.utils.errors import InputError
+
+if TYPE_CHECKING:
+    import torch
+
+    from jumper_warp.envs.env import Env
+    from jumper_warp.rl.runner import MakeEnv, TrainResult
+    from jumper_warp.tasks.cfg import TaskCfg
 
 
 @dataclass(frozen=True)
 class TrainArgs:
     """Train a policy on a task."""
 
-    cfg: Annotated[TrainCfg, tyro.conf.arg(name="")]
-    env: TaskFlags
-    solver: SolverName = "jumper"
+    cfg: Annotated[TrainCfg, tyro.conf.arg(name="")] = field(default_factory=TrainCfg)
+    solver: Literal["jumper", "mujoco"] = "jumper"
     """Physics: the dedicated solver, or Newton's SolverMuJoCo."""
     randomize: bool = True
     """Draw masses, friction, motors, latency and pushes for each world; single rows are under --env.randomization."""
@@ -35,31 +40,45 @@ class TrainArgs:
 
 
 def parse_train(args: Sequence[str]) -> tuple[TrainArgs, TaskCfg]:
-    """Return the settings, and the task with its settings; exits where tyro does.
+    """Return the settings, and the task with its settings; exits after help or usage, and where tyro does.
 
     Raises:
-        UsageError: The task is missing or given twice.
-        ValueError: The task is unknown, or a setting is out of range.
+        InputError: The task is missing, unknown or given twice, or a setting is out of range.
     """
-    names = ", ".join(TASKS)
-    asks_help = not args or args[0] in ("-h", "--help")
-    if not asks_help and args[0].startswith("-"):
+    names = ", ".join(task_names())
+    if not args:
+        print(f"usage: jumper train TASK [flags]\n\ntasks: {names}\n\n{TASK_MODULE_HELP}", file=sys.stderr)
+        raise SystemExit(USAGE_ERROR)
+    if args[0] in ("-h", "--help"):
+        about = f"Train a policy on a task: {names}. Its own settings are --env flags: jumper train TASK --help."
+        parse(TrainArgs, "train TASK", ["--help"], description=about)
+    if args[0].startswith("-"):
         raise UsageError(f"the task comes first: jumper train TASK [flags]; tasks: {names}")
-    task = make_task(next(iter(TASKS)) if asks_help else args[0])
-    parsed = tyro.cli(
-        TrainArgs,
-        prog="jumper train TASK",
-        description=f"Train a policy on a task: {names}. Values shown are those of {task.name}.",
-        default=TrainArgs(TrainCfg(task=task.name, ppo=task.ppo), TaskFlags.of(task)),
-        args=["--help"] if asks_help else list(args[1:]),
-    )
-    if parsed.cfg.task != task.name:
-        raise UsageError(f"give the task once, got {task.name} and --task {parsed.cfg.task}")
-    return parsed, dataclasses.replace(parsed.env.apply(task), ppo=parsed.cfg.ppo)
+    name, entry = find_task(args[0])
+    task = make_task(name)
+    parsed = parse_settings(task, TrainArgs(TrainCfg(task=name, ppo=entry.ppo)), args[1:])
+    if parsed.cfg.task != name:
+        raise UsageError(f"give the task once, got {name} and --task {parsed.cfg.task}")
+    from jumper_warp.cli.task_flags import with_flags
+
+    return parsed, with_flags(task, parsed.env)
+
+
+def parse_settings(task: TaskCfg, default: TrainArgs, args: Sequence[str]) -> Any:
+    """Return the settings, with those of the task as `env`; exits where tyro does."""
+    from jumper_warp.cli.task_flags import flags_of
+
+    flags = flags_of(task)
+    made: dict[str, Any] = {"bases": (TrainArgs,), "frozen": True, "namespace": {"__module__": __name__}}
+    kind: Any = dataclasses.make_dataclass("TaskTrainArgs", [("env", type(flags), flags)], **made)
+    given = {spec.name: getattr(default, spec.name) for spec in dataclasses.fields(default)}
+    about = f"Train a policy on {task.name}."
+    return parse(kind, f"train {task.name}", args, default=kind(**given), description=about)
 
 
 def env_maker(task: TaskCfg, args: TrainArgs) -> MakeEnv:
     """Return what makes the environment of a training."""
+    from jumper_warp.envs.env import Env
 
     def make(num_envs: int, seed: int, device: torch.device) -> Env:
         return Env(
@@ -75,9 +94,41 @@ def env_maker(task: TaskCfg, args: TrainArgs) -> MakeEnv:
     return make
 
 
-def run_train(args: Sequence[str]) -> TrainResult:
-    """Train as the arguments say; raises as `parse_train` and `jumper_warp.rl.runner.train`."""
+def check_saving(task: TaskCfg) -> None:
+    """Raise InputError unless the task could be read back from what is saved with its policies."""
+    from jumper_warp.tasks.saving import task_from_json, task_to_json
+
+    saved = json.loads(json.dumps(task_to_json(task)))
+    if task_from_json(saved, [module for module in sys.modules.values() if isinstance(module, ModuleType)]) != task:
+        raise InputError(f"{task.name} would not come back as it is from what is saved with its policies")
+
+
+def check_resume(cfg: TrainCfg) -> None:
+    """Raise CheckpointError if the checkpoint to resume is of a run from before tasks had a version."""
+    from jumper_warp.rl.checkpoint import CheckpointError
+    from jumper_warp.rl.runner import find_checkpoint
+
+    path, state, _ = find_checkpoint(cfg)
+    try:
+        older = "version" not in json.loads(state["config"])["env"]["task"]
+    except (KeyError, TypeError, ValueError) as error:
+        raise CheckpointError(f"{path}: no task in its configuration ({type(error).__name__}: {error})") from error
+    if older:
+        raise CheckpointError(f"{path}: of a run of version 1, which can be exported and played but not resumed")
+
+
+def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> TrainResult:
+    """Train as the arguments say; modules: that the user has named, whose tasks are registered by now.
+
+    Raises as `parse_train` and `jumper_warp.rl.runner.train`.
+    """
     parsed, task = parse_train(args)
+    from jumper_warp.rl.runner import train
+    from jumper_warp.utils.runtime import announce
+
+    check_saving(task)
+    if parsed.cfg.resume:
+        check_resume(parsed.cfg)
     first = os.environ.get("RANK", "0") == "0"
     if first:
         announce(parsed.cfg.device)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -12,7 +12,7 @@ import warp as wp
 from jumper_warp.envs.skill import RING
 from jumper_warp.robot.description import load_description
 from jumper_warp.sim.simulation import Simulation
-from jumper_warp.tasks.cfg import TaskCfg
+from jumper_warp.tasks.cfg import Handover, TaskCfg
 from kernels.mdp.env import Delays, EnvArrays, Scene
 from kernels.mdp.view import RobotArrays
 
@@ -72,6 +72,31 @@ def scene_of(sim: Simulation) -> Any:
     scene, robot = Scene(), sim.physics.dynamics.robot
     scene.geometry, scene.ground, scene.reference_q = robot.geometry, robot.ground, sim.model.joint_q
     return scene
+
+
+def checked_tasks(task: Any, handovers: Sequence[Handover]) -> tuple[TaskCfg, ...]:
+    """Return the tasks of an environment, given as one or several.
+
+    Raises ValueError: not a task, none, two of one name, motors that cannot be those of one robot, or a handover
+    between others.
+    """
+    tasks = (task,) if isinstance(task, TaskCfg | str) or not isinstance(task, Iterable) else tuple(task)
+    for each in tasks:
+        if not isinstance(each, TaskCfg):
+            raise ValueError(f"a task must be a TaskCfg, as make_task returns for a name, got {each!r:.60}")
+    names = [each.name for each in tasks]
+    if not tasks or len(set(names)) < len(names):
+        raise ValueError(f"an environment needs at least one task, each with a name of its own, got {names}")
+    first = tasks[0].motors
+    for each in tasks[1:]:
+        pairs = ((each.motors.lateral, first.lateral), (each.motors.transversal, first.transversal))
+        same = (each.motors.fade_start, each.motors.fade_end) == (first.fade_start, first.fade_end)
+        if not (same and all(one.peak == other.peak for one, other in pairs)):
+            raise ValueError(f"{each.name} needs the peak torque and the over-speed protection of {names[0]}'s motors")
+    for each in handovers:
+        if each.source not in tasks or each.target not in tasks:
+            raise ValueError(f"a handover needs two of the tasks {names}, got {each.source.name} to {each.target.name}")
+    return tasks
 
 
 def prepared(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -10,9 +10,11 @@ import torch
 import warp as wp
 
 from jumper_warp.envs.arrays import (
+    FIRST_CLOCK,
     checked_action,
     checked_commands,
     checked_mask,
+    checked_tasks,
     checked_values,
     delay_arrays,
     env_arrays,
@@ -32,6 +34,8 @@ from kernels.mdp.actions import action_kernel, begin_step_kernel
 from kernels.mdp.env import SkillSettings
 from kernels.mdp.events import AT_RESET, AT_STEP, STARTUP
 from kernels.mdp.handover import make_handover_kernel
+from kernels.mdp.observe import condition_kernel
+from kernels.mdp.parameters import motors_kernel
 from kernels.mdp.reset import forget_kernel, stand_kernel, tick_kernel
 from kernels.mdp.track import track_kernel
 
@@ -84,11 +88,10 @@ class Env:
 
         ground, block: as in `Simulation`; by default what the first task draws if randomised on SolverJumper, else a
         plane. skill: index of the task that each world begins in, (num_envs,) or one for all. handovers: between tasks.
-        Raises ValueError: no task, less than one environment, or as `Simulation`.
+        Raises ValueError: no task, two of one name, motors that cannot be those of one robot, a handover between other
+        tasks, less than one environment, or as `Simulation`.
         """
-        tasks = (task,) if isinstance(task, TaskCfg) else tuple(task)
-        if not tasks:
-            raise ValueError("an environment needs at least one task")
+        tasks = checked_tasks(task, handovers)
         self.task, self.tasks, self.num_envs, self.seed, self.auto_reset = tasks[0], tasks, num_envs, seed, auto_reset
         may_vary = solver == "jumper" and isinstance(ground, str) and ground == "plane" and block is None
         run, self._draws_ground = prepared(tasks, randomize, noise, may_vary)
@@ -101,6 +104,8 @@ class Env:
         self.device = torch.device(wp.device_to_torch(self.wp_device))
         if self.wp_device.is_cuda:
             torch.cuda.set_stream(wp.stream_to_torch(wp.get_stream(self.wp_device)))
+        if self._draws_ground:
+            self.sim.physics.dynamics.robot.ground.blocks.zero_()  # until `reset` draws them
         self.physics_dt, self.step_dt = self.sim.dt, self.sim.dt * self.sim.substeps
         self._ends_episodes, self._started, self._graphs = True, False, {}
         self._allocate(run, skill)
@@ -111,6 +116,7 @@ class Env:
         active = np.ascontiguousarray(np.broadcast_to(np.asarray(skill, dtype=np.int32), n))
         if not ((active >= 0) & (active < len(tasks))).all():
             raise ValueError(f"skill must be an index below {len(tasks)}, got {skill!r:.60}")
+        self._first_skill = active
         active = wp.array(active, dtype=int, device=device)
         self.skills = [Skill(task, i, n, self.step_dt, sim.substeps, device) for i, task in enumerate(tasks)]
         self.parameters = robot_parameters(sim, tuple(tasks), active)
@@ -135,21 +141,40 @@ class Env:
 
     # ------------------------------------------------------------------ stepping
 
-    def reset(self) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
-        """Begin a new episode in every world; return observations by group, and extras."""
+    def reset(self, seed: int | None = None) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
+        """Begin a new episode in every world; return observations by group, and extras.
+
+        seed: draw and begin as a new environment of this seed does, its curriculum included; graphs that were captured
+        outside keep the old one.
+        """
+        if seed is not None:
+            self._start_over(seed)
         self._ends_episodes = True
         self._tick(self._all)
         self._begin(self._all)
         self._observe(beginning=0)
         return self._step.obs, {}
 
+    def _start_over(self, seed: int) -> None:
+        self.seed = self.worlds.seed = seed
+        self._started = False
+        self._graphs.clear()  # they hold the old seed
+        for array, value in ((self.worlds.clock, FIRST_CLOCK), (self.worlds.request, -1),
+                             (self.worlds.level, 0), (self.worlds.streak, 0)):  # fmt: skip
+            array.fill_(value)
+        self.worlds.skill.assign(self._first_skill)
+        for skill in self.skills:
+            skill.timer.zero_()
+
     def step(self, action: torch.Tensor) -> Step:
         """Advance one policy step.
 
         action: (num_envs, 12), clamped to -1..1; with several tasks (tasks, num_envs, 12), of which each world takes
         its own. A world whose action is not finite ends as one that came apart.
-        Raises ValueError: an action of another shape, kind of numbers or device.
+        Raises ValueError: an action of another shape, kind of numbers or device. RuntimeError: no `reset` before.
         """
+        if not self._started:
+            raise RuntimeError("call reset before the first step")
         several = len(self.skills) > 1
         shape = (len(self.skills), self.num_envs, 12) if several else (self.num_envs, 12)
         (self.actions if several else self.action).copy_(checked_action(action, shape, self.device))
@@ -165,26 +190,43 @@ class Env:
         return self._step
 
     def _launch_step(self) -> None:
+        for stage in self.stages().values():
+            stage()
+
+    def stages(self) -> dict[str, Callable[[], None]]:
+        """Return the parts of a step by name, in order: each launches its kernels and does not wait for them."""
+        return {"action": self._act, "physics": self._advance, "episode": self._judge,
+                "observe": lambda: self._observe(beginning=0), "reset": self._renew}  # fmt: skip
+
+    def _act(self) -> None:
         n, robot, env, settings = self.num_envs, self.robot, self.worlds, self._settings
         counters, delays, push = self.skills[0].counters, self.delays, self.parameters.push
         self._launch(action_kernel, (n, 4), [self._action, settings, push, robot, env, counters, delays])
         self._launch(begin_step_kernel, n, [settings, push, robot, env, counters])
         self._events(AT_STEP, self._all)
+
+    def _advance(self) -> None:
+        delays, scene = self.delays, self._scene
         self.sim.physics.advance(
             self.sim.substeps, delays.late_target, delays.earlier_target, delays.late_steps, bodies=False
         )
-        self._launch(track_kernel, (4, n), [self._scene.geometry, self._scene.ground, settings, env, robot])
+        inputs = [scene.geometry, scene.ground, self._settings, self.worlds, self.robot]
+        self._launch(track_kernel, (4, self.num_envs), inputs)
+
+    def _judge(self) -> None:
         for skill in self.skills:
             self._launch(
-                skill.kernels["step"], n,
-                [skill.index, robot, self._scene.ground, len(skill.task.levels), skill.numbers, env, skill.states,
-                 skill.term_value, skill.counters],
+                skill.kernels["step"], self.num_envs,
+                [skill.index, self.robot, self._scene.ground, len(skill.task.levels), skill.numbers, self.worlds,
+                 skill.states, skill.term_value, skill.counters],
             )  # fmt: skip
-        self._observe(beginning=0)
+
+    def _renew(self) -> None:
         self._hand_over()
-        if self.auto_reset and self._ends_episodes:
-            self._begin(env.done)
-        if self._handovers or (self.auto_reset and self._ends_episodes):
+        begins = self.auto_reset and self._ends_episodes
+        if begins:
+            self._begin(self.worlds.done)
+        if self._handovers or begins:
             self._observe(beginning=1)
 
     def _hand_over(self) -> None:
@@ -211,6 +253,7 @@ class Env:
     def _draw(self, mask: wp.array) -> None:
         """Draw parameters of episodes that begin where mask is not 0."""
         if not self._started:
+            self._launch(motors_kernel, (12, self.num_envs), [self.parameters])
             self._events(STARTUP, self._all)
             self._started = True
         self._events(AT_RESET, mask)
@@ -236,11 +279,14 @@ class Env:
 
     def _observe(self, beginning: int) -> None:
         for skill in self.skills:
+            arrays = skill.observations
             self._launch(
-                skill.kernels["observe"], (skill.num_terms, self.num_envs),
-                [skill.index, self.robot, self.parameters, self._scene.ground, self.worlds, skill.states, skill.slots,
-                 skill.numbers, beginning, skill.observations],
+                skill.kernels["observe"], (skill.num_chunks, self.num_envs),
+                [skill.index, self.robot, self.parameters, self._scene.ground, self.worlds, skill.states,
+                 skill.numbers, beginning, arrays.raw],
             )  # fmt: skip
+            inputs = [skill.index, self.worlds, skill.columns, skill.numbers, beginning, arrays]
+            wp.launch(condition_kernel, arrays.raw.shape, inputs, device=self.wp_device)
 
     def _launch(self, kernel: wp.Kernel, dim: int | tuple[int, ...], inputs: list) -> None:
         # small blocks spread a few thousand heavy threads over all multiprocessors
@@ -336,7 +382,7 @@ class Env:
 
     def restored(self) -> None:
         """Let the solver read parameters that were put back."""
-        self._started = True
+        self._started = bool((self.worlds.clock.numpy() > FIRST_CLOCK).all())
         self.sim.physics.parameters_changed()
 
     def load_state_dict(self, state: dict[str, torch.Tensor]) -> None:

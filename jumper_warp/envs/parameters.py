@@ -41,7 +41,8 @@ def robot_parameters(sim: Simulation, tasks: tuple[TaskCfg, ...], skill: wp.arra
     robot.latency = wp.zeros(n, dtype=int, device=device)
     robot.observation_latency = wp.zeros(n, dtype=int, device=device)
     robot.push = wp.zeros(n, dtype=wp.spatial_vector, device=device)
-    robot.gain_ratio = wp.full((12, n), wp.vec2(1.0, 1.0), dtype=wp.vec2, device=device)
+    for name in ("gain_ratio", "speed_ratio"):
+        setattr(robot, name, wp.full((12, n), wp.vec2(1.0, 1.0), dtype=wp.vec2, device=device))
     for name, attribute in (("kp", "kp"), ("kd", "kd"), ("no_load", "no_load_speed"), ("cutoff", "cutoff_speed"),
                             ("saturation", "saturation")):  # fmt: skip
         rows = []

@@ -1,29 +1,24 @@
-"""The environment as rsl-rl's VecEnv, and a training with rsl-rl."""
+"""The environment as rsl-rl sees one."""
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import torch
-from rsl_rl.env import VecEnv
-from rsl_rl.runners import OnPolicyRunner
+from rsl_rl.env import VecEnv as RslRlEnv
 from tensordict import TensorDict
 
-from jumper_warp.envs.vec_env import VecTask
-from jumper_warp.rl.networks import sanitise
-from jumper_warp.rl.ppo import PpoCfg
+from jumper_warp.envs.vec_env import VecEnv, sanitise
 
 
-class RslRlVecEnv(VecEnv):
+class RslRlVecEnv(RslRlEnv):
     """Adapter. What it returns are copies, because rsl-rl keeps references over the next step."""
 
-    def __init__(self, env: VecTask, metrics_every: int, max_episode_length: int = 1200) -> None:
-        """Args:
+    def __init__(self, env: VecEnv, metrics_every: int = 24, max_episode_length: int = 1200) -> None:
+        """Take an environment that was reset, or call `reset` of the adapter before a training.
 
-        env: Its worlds restart by themselves.
-        metrics_every: Steps between two readings of the environment's metrics, which wait for the device.
-        max_episode_length: Policy steps after which no episode goes on; only reported.
+        metrics_every: Policy steps between two readings of the environment's metrics, which wait for the device; those
+            of an iteration log it once. max_episode_length: Policy steps after which no episode goes on; only reported.
         """
         self.env = env
         self.num_envs, self.num_actions = env.num_envs, env.num_actions
@@ -36,20 +31,31 @@ class RslRlVecEnv(VecEnv):
 
     @property
     def episode_length_buf(self) -> torch.Tensor:
-        """(num_envs,) steps since each episode began; assigning copies."""
+        """(num_envs,) int64, policy steps since each episode began; assigning copies, and changes no episode."""
         return self._episode_length
 
     @episode_length_buf.setter
     def episode_length_buf(self, value: torch.Tensor) -> None:
         self._episode_length.copy_(value)
 
+    def reset(self) -> tuple[TensorDict, dict[str, Any]]:
+        """Begin a new episode in every world; return its first observations, and extras (none)."""
+        self.env.reset()
+        self._episode_length.zero_()
+        return self.get_observations(), {}
+
     def get_observations(self) -> TensorDict:
         """Return the observations as groups `policy` and `critic`, finite and bounded."""
         groups = {"policy": sanitise(self.env.obs), "critic": sanitise(self.env.critic_obs)}
-        return TensorDict(groups, batch_size=[self.num_envs])
+        return TensorDict(groups, batch_size=[self.num_envs], device=self.device)
 
     def step(self, actions: torch.Tensor) -> tuple[TensorDict, torch.Tensor, torch.Tensor, dict[str, Any]]:
-        """Advance by a policy period; actions (num_envs, num_actions)."""
+        """Advance by a policy period.
+
+        actions: (num_envs, num_actions). Returns observations, of the new episode where one has ended, rewards and
+        dones (num_envs,), and extras: `time_outs` (num_envs,), 1 where the episode ended without failure, and now and
+        then `log`, the metrics by name. Raises ValueError as the environment.
+        """
         env = self.env
         env.step(actions)
         self._steps += 1
@@ -61,45 +67,16 @@ class RslRlVecEnv(VecEnv):
         return self.get_observations(), reward, env.done.long(), extras
 
 
-def rsl_rl_config(cfg: PpoCfg, save_interval: int, seed: int) -> dict[str, Any]:
-    """Return rsl-rl's configuration with the same settings; it knows no value normalisation and no reward scale."""
-    network = {"class_name": "MLPModel", "hidden_dims": list(cfg.hidden), "activation": cfg.activation}
-    network["obs_normalization"] = True
-    noise = {"class_name": "GaussianDistribution", "init_std": cfg.init_std, "std_type": "log"}
-    return {
-        "num_steps_per_env": cfg.num_steps,
-        "save_interval": save_interval,
-        "seed": seed,
-        "check_for_nan": False,
-        "logger": "tensorboard",
-        "obs_groups": {"actor": ["policy"], "critic": ["critic" if cfg.asymmetric else "policy"]},
-        "actor": {**network, "distribution_cfg": noise},
-        "critic": dict(network),
-        "algorithm": {
-            "class_name": "PPO",
-            "num_learning_epochs": cfg.epochs,
-            "num_mini_batches": cfg.minibatches,
-            "learning_rate": cfg.lr,
-            "schedule": "adaptive" if cfg.desired_kl > 0.0 else "fixed",
-            "desired_kl": cfg.desired_kl,
-            "gamma": cfg.gamma,
-            "lam": cfg.lam,
-            "entropy_coef": cfg.entropy_coef,
-            "clip_param": cfg.clip,
-            "value_loss_coef": cfg.value_coef,
-            "max_grad_norm": cfg.max_grad_norm,
-            "use_clipped_value_loss": cfg.clip_value,
-        },
-    }
+def train_rsl_rl(env: VecEnv, cfg: Any, *args: Any, **arguments: Any) -> Any:
+    """Train as `jumper_warp.rl.rsl_rl.train_rsl_rl`, whose place this was."""
+    from jumper_warp.rl import rsl_rl
 
-
-def train_rsl_rl(
-    env: VecTask, cfg: PpoCfg, iterations: int, save_interval: int, seed: int, folder: Path | None
-) -> OnPolicyRunner:
-    """Train with rsl-rl's PPO and return its runner; without a folder it writes nothing."""
     env.reset()
-    adapter = RslRlVecEnv(env, metrics_every=cfg.num_steps)
-    config = rsl_rl_config(cfg, save_interval, seed)
-    runner = OnPolicyRunner(adapter, config, log_dir=folder and str(folder), device=str(env.device))
-    runner.learn(iterations)
-    return runner
+    return rsl_rl.train_rsl_rl(RslRlVecEnv(env, cfg.num_steps), cfg, *args, **arguments)
+
+
+def rsl_rl_config(*args: Any) -> dict[str, Any]:
+    """Return `jumper_warp.rl.rsl_rl.rsl_rl_config`, whose place this was."""
+    from jumper_warp.rl import rsl_rl
+
+    return rsl_rl.rsl_rl_config(*args)

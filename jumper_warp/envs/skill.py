@@ -13,7 +13,7 @@ from jumper_warp.robot.motors import filter_params
 from jumper_warp.tasks.cfg import TaskCfg
 from kernels.mdp.env import Counters, Nothing, SkillSettings
 from kernels.mdp.events import make_event_kernel
-from kernels.mdp.observe import ObservationArrays, Slot, make_observe_kernel
+from kernels.mdp.observe import CHUNK, Column, ObservationArrays, make_observe_kernel
 from kernels.mdp.reset import make_give_kernel, make_reset_kernel
 from kernels.mdp.step import make_step_kernel
 from kernels.mdp.view import vec12
@@ -32,7 +32,7 @@ class Skill:
         self.kernels = kernels_of(task)
         self.numbers = wp.array(task.numbers, dtype=float, device=device)
         self.states = wp.zeros(num_envs, dtype=task.state, device=device)
-        self.num_events, self.num_terms = len(task.rows["events"]), sum(len(task.rows[g]) for g in task.groups)
+        self.num_events = len(task.rows["events"])
         self.timer = wp.zeros((max(self.num_events, 1), num_envs), dtype=int, device=device)
         self.term_value = wp.zeros((max(len(task.rewards), 1), num_envs), dtype=float, device=device)
         self.counters = self._counters()
@@ -58,17 +58,20 @@ class Skill:
         n, task = self.num_envs, self.task
         layouts = {group: task.layout(group) for group in task.groups}
         widths = {group: max((end for _, end in layout.values()), default=0) for group, layout in layouts.items()}
-        slots, start, past = [], 0, 0
+        columns, start, past = [], 0, 0
         for index, group in enumerate(task.groups):
             for row in task.rows[group]:
-                term = row.term
-                delayed = term.options["delayed"]
-                slots.append((index, start, widths[group], row.first, layouts[group][term.name][0], term.width,
-                              term.options["history"], int(delayed), past))  # fmt: skip
-                past += term.width if delayed else 0
+                term, oldest = row.term, layouts[group][row.term.name][0]
+                delayed = int(term.options["delayed"])
+                for j in range(term.width):
+                    columns.append((len(columns), index, start, widths[group], row.first, oldest + j, term.width,
+                                    term.options["history"], delayed, past))  # fmt: skip
+                    past += delayed
             start += n * widths[group]
-        self.slots = wp.array(np.array(slots, dtype=Slot.numpy_dtype()), dtype=Slot, device=self.device)
+        self.columns = wp.array(np.array(columns, dtype=Column.numpy_dtype()), dtype=Column, device=self.device)
+        self.num_chunks = -(-sum(len(task.rows[group]) for group in task.groups) // CHUNK)
         arrays = ObservationArrays()
+        arrays.raw = wp.zeros((n, len(columns)), dtype=float, device=self.device)
         arrays.now = wp.zeros(start, dtype=float, device=self.device)
         arrays.final = wp.zeros(start, dtype=float, device=self.device)
         arrays.past = wp.zeros((RING, n, max(past, 1)), dtype=float, device=self.device)

@@ -21,29 +21,31 @@ CONSTANT = ("gravity", "default_angle", "paw_shapes")
 MOTORS = ("kp", "kd", "saturation", "peak", "no_load_speed", "cutoff_speed", "offset")
 FINGERPRINT = "nominal"
 """Name of the nominal parameters' fingerprint."""
+SEED = "seed"
+"""Name of the seed."""
 
 
 def save_state(env: Env) -> dict[str, torch.Tensor]:
     """Return everything that the next step depends on, on the CPU (waits for the device); counters are left out.
 
-    Drawn parameters are in it, nominal ones only as a fingerprint.
+    Drawn parameters are in it, nominal ones only as a fingerprint; numbers of the task's terms are not.
     """
     state = {name: tensor.to("cpu", copy=True) for name, tensor in _tensors(env).items()}
     for prefix, array in _records(env).items():
         records = array.numpy()
         state |= {prefix + name: torch.from_numpy(np.array(records[name])) for name in records.dtype.names}
-    return state | {FINGERPRINT: nominal_fingerprint(env)}
+    return state | {FINGERPRINT: nominal_fingerprint(env), SEED: torch.tensor(env.seed)}
 
 
 def load_state(env: Env, state: dict[str, torch.Tensor]) -> None:
     """Put a saved state back, so that the next step is the one that would have followed.
 
     Raises:
-        ValueError: It is of another number of environments, other fields or other robots; nothing is changed.
+        ValueError: It is of another number of environments, other fields, robots or seed; nothing is changed.
     """
     tensors, records = _tensors(env), {prefix: array.numpy().copy() for prefix, array in _records(env).items()}
     fields = {prefix + name: (prefix, name) for prefix, values in records.items() for name in values.dtype.names}
-    names = {*tensors, *fields, FINGERPRINT}
+    names = {*tensors, *fields, FINGERPRINT, SEED}
     if names != state.keys():
         raise ValueError(
             f"saved by another version, task or solver: lacks {sorted(names - state.keys())[:5]}, "
@@ -52,6 +54,9 @@ def load_state(env: Env, state: dict[str, torch.Tensor]) -> None:
     saved = state["env.done"].shape[0]
     if saved != env.num_envs:
         raise ValueError(f"saved for {saved} environments, there are {env.num_envs}")
+    for skill in env.skills:
+        if state[f"{skill.task.name}/timer"].shape[0] != skill.timer.shape[0]:
+            raise ValueError(f"saved with other randomisation or events of {skill.task.name}")
     expected = {name: tuple(tensor.shape) for name, tensor in tensors.items()}
     expected |= {field: records[prefix][name].shape for field, (prefix, name) in fields.items()}
     for name, shape in expected.items():
@@ -59,6 +64,8 @@ def load_state(env: Env, state: dict[str, torch.Tensor]) -> None:
             raise ValueError(f"saved {name} has shape {tuple(state[name].shape)}, expected {shape}")
     if not torch.equal(state[FINGERPRINT], nominal_fingerprint(env)):
         raise ValueError("saved with other robots: the description or the task's motors differ")
+    if int(state[SEED]) != env.seed:
+        raise ValueError(f"saved with seed {int(state[SEED])}, this environment draws with seed {env.seed}")
     for field, (prefix, name) in fields.items():
         records[prefix][name] = state[field].numpy()
     for prefix, array in _records(env).items():

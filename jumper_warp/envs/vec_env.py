@@ -1,4 +1,4 @@
-"""The side of an environment that training sees."""
+"""The side of an environment that training sees, and how observations are kept within bounds."""
 
 from __future__ import annotations
 
@@ -6,47 +6,73 @@ from typing import Any, Protocol
 
 import torch
 
+RAW_LIMIT = 100.0
+"""Raw observations are clamped to plus and minus this, so that one absurd world cannot spoil the statistics."""
 
-class VecTask(Protocol):
-    """What PPO asks of an environment of many worlds.
 
-    All tensors keep their place; `reset` and `step` write them anew.
+class VecEnv(Protocol):
+    """What PPO asks of an environment of many worlds that begin new episodes by themselves.
+
+    The tensors are on `device` and keep their place: `reset`, `step` and `load_state_dict` write them anew.
     """
 
     num_envs: int
+    """Worlds, each with an episode of its own."""
     num_obs: int
+    """Columns of `obs`."""
     num_critic_obs: int
+    """Columns of `critic_obs`."""
     num_actions: int
+    """Columns of an action."""
     device: torch.device
+    """Where all tensors are, the action too."""
     obs: torch.Tensor
-    """(num_envs, num_obs), what the actor sees, of the new episode where one has just begun."""
+    """(num_envs, num_obs) float32, what the actor sees, of the new episode where one has just begun."""
     critic_obs: torch.Tensor
-    """(num_envs, num_critic_obs), what the critic sees, of the new episode where one has just begun."""
+    """(num_envs, num_critic_obs) float32, what the critic sees, of the new episode where one has just begun."""
     reward: torch.Tensor
-    """(num_envs,)"""
+    """(num_envs,) float32, of the last step."""
     done: torch.Tensor
-    """(num_envs,), 1 where the step ended the episode."""
+    """(num_envs,) float32, 1 where the last step ended the episode, else 0."""
     timeout: torch.Tensor
-    """(num_envs,), 1 where it did so for a reason that says nothing against the state, so that its value counts."""
+    """(num_envs,) float32, 1 where it did so without failure, so that the value of the final state counts."""
     final_obs: torch.Tensor
-    """(num_envs, num_obs), the last observation of the old episode, where one has ended."""
+    """(num_envs, num_obs) float32, the last observation of the old episode, where one has ended."""
     final_critic_obs: torch.Tensor
-    """(num_envs, num_critic_obs), likewise."""
+    """(num_envs, num_critic_obs) float32, likewise."""
 
-    def reset(self) -> None:
-        """Begin a new episode in all worlds."""
+    def reset(self) -> Any:
+        """Begin a new episode in all worlds; `obs` and `critic_obs` are those of its beginning.
 
-    def step(self, action: torch.Tensor) -> None:
-        """Advance by a policy period; action (num_envs, num_actions) is read only, and no work waits for the host."""
+        What it returns is not read.
+        """
+
+    def step(self, action: torch.Tensor) -> Any:
+        """Advance by a policy period, and begin a new episode where one has ended; what it returns is not read.
+
+        action: (num_envs, num_actions), only read. No work waits for the host, so that a graph can hold many steps.
+        """
 
     def metrics(self) -> dict[str, float]:
-        """Return what to log of the episodes since the last call; waits for the device."""
+        """Return what to log of the episodes that ended since the last call, by name (waits for the device)."""
 
     def config(self) -> dict[str, Any]:
-        """Return all settings, ready for JSON."""
+        """Return all settings that define the environment, ready for JSON."""
 
     def state_dict(self) -> dict[str, Any]:
-        """Return all that the next step depends on, tensors only."""
+        """Return all that the next step depends on, tensors only; later steps do not change them."""
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Take up what `state_dict` gave; `reset` does not follow."""
+        """Take up what `state_dict` gave; the next step, without a `reset`, is the one that would have followed.
+
+        Raises ValueError: the state does not fit this environment.
+        """
+
+
+VecTask = VecEnv
+"""Former name."""
+
+
+def sanitise(obs: torch.Tensor, out: torch.Tensor | None = None) -> torch.Tensor:
+    """Return a copy of observations, in `out` if given: non-finite entries 0, the rest clamped to ±RAW_LIMIT."""
+    return torch.nan_to_num(obs, nan=0.0, posinf=0.0, neginf=0.0, out=out).clamp_(-RAW_LIMIT, RAW_LIMIT)

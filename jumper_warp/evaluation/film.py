@@ -6,21 +6,40 @@ Nothing of the viewer or the pictures is imported before there is something to f
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from jumper_warp.evaluation.links import Links
 from jumper_warp.robot.model import LEGS, build_model
-from jumper_warp.sim.solver import SolverJumper
 
 if TYPE_CHECKING:
     from jumper_warp.envs.env import Env
-    from jumper_warp.evaluation.jumps import JumpLog
+    from jumper_warp.evaluation.log import EvaluationLog
     from jumper_warp.robot.grounds import BlockCfg
 
 SHANK_LENGTH = 0.3
 """[m] From the knee to the ankle, along the shank's -z."""
+
+
+@dataclass(frozen=True)
+class Strip:
+    """What a filmstrip shows."""
+
+    index: int
+    """Of the filmed world."""
+    frames: Sequence[int]
+    captions: Sequence[str]
+    eye: Sequence[float]
+    """[m] Of the camera, world frame."""
+    target: Sequence[float]
+    """[m] Where it looks."""
+    size: tuple[int, int]
+    """[px] Width and height of a picture."""
+    name: str = ""
+    """Of the file (default: the film's)."""
 
 
 class Film:
@@ -29,7 +48,7 @@ class Film:
     def __init__(
         self,
         env: Env,
-        log: JumpLog,
+        log: EvaluationLog,
         worlds: Sequence[int],
         *,
         spacing: float = 1.2,
@@ -42,7 +61,7 @@ class Film:
 
         Args:
             env: What is filmed.
-            log: Follows its jumps.
+            log: Follows its episodes.
             worlds: Indices, at least one.
             spacing: Distance [m] along y by which each world is drawn beside the one before it; 0 on a heightfield.
             ground: What is drawn below, as in `build_model`.
@@ -53,6 +72,7 @@ class Film:
         from jumper_warp.viz.recorder import Recorder
 
         self.env, self.log, self.worlds, self.spacing, self.motors = env, log, list(worlds), spacing, motors
+        self.links = Links(env)
         self.model = build_model(len(worlds), ground=ground, device=env.wp_device)
         self.recorder = Recorder(self.model, range(len(worlds)), spacing=spacing, notes=notes)
         self.frames = 0
@@ -61,10 +81,8 @@ class Film:
 
     def __call__(self) -> None:
         """Add the environment's state of the moment."""
-        sim, state = self.env.sim, self.env.sim.state
-        if isinstance(sim.solver, SolverJumper):
-            sim.solver.dynamics.full_state(state.joint_q, state.joint_qd, state.body_q, state.body_qd)
-        poses = state.body_q.numpy().reshape(sim.num_worlds, -1, 7)[self.worlds]
+        sim = self.env.sim
+        poses = self.links.read()[0][self.worlds]
         series = self.log.series(self.worlds) | (self._motor_series() if self.motors else {})
         forces = sim.paw_force.numpy().transpose(1, 0, 2)[self.worlds]
         if self.block is not None:
@@ -98,26 +116,17 @@ class Film:
             recording = with_blocks(recording, np.stack(self.block_places), half, height)
         return write_rrd(recording, path)
 
-    def strip(
-        self,
-        path: Path,
-        index: int,
-        frames: Sequence[int],
-        captions: Sequence[str],
-        eye: Sequence[float],
-        target: Sequence[float],
-        size: tuple[int, int] = (320, 420),
-    ) -> None:
-        """Write pictures of the index-th filmed world side by side; eye and target [m], size (width, height) [px]."""
+    def save_strip(self, strip: Strip, path: Path) -> None:
+        """Write the pictures of a filmstrip side by side."""
         from jumper_warp.viz.snapshot import Camera, contact_sheet
 
         recording = self.recorder.recording()
-        camera = Camera(self.model, eye, target, size, world=index)
+        camera = Camera(self.model, strip.eye, strip.target, strip.size, world=strip.index)
         state, pictures = self.model.state(), []
-        for frame in frames:
+        for frame in strip.frames:
             state.body_q.assign(recording.poses[frame])
             pictures.append(camera.picture(state))
-        contact_sheet(pictures, path, captions)
+        contact_sheet(pictures, path, strip.captions)
 
 
 def ankles(poses: np.ndarray) -> np.ndarray:

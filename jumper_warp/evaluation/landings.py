@@ -6,31 +6,24 @@ jump that fails before is measured where it failed. Whether the robot hopped or 
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
-from jumper_warp.evaluation.jumps import (
+from jumper_warp.evaluation.film import Film, Strip, moments
+from jumper_warp.evaluation.jumps import LANDED, REST_TIME, jump_commands
+from jumper_warp.evaluation.log import (
     CAME_APART,
-    COLLIDED,
-    LANDED,
     NO_END,
-    REST_SPEED,
-    REST_TIME,
     EvaluationEnv,
-    Figures,
-    JumpLog,
-    failures,
+    EvaluationLog,
     finite,
-    jump_commands,
-    largest,
-    mean,
 )
 from jumper_warp.tasks.cfg import TaskCfg
 
-NEAR = 0.1
+SUCCESS_TOLERANCE = 0.1
 """[m] A landed jump that ends this close to its goal succeeds."""
 HOP_TIME = 0.05
 """[s] A robot that is off the ground for longer after touchdown has jumped again; one that lifts a paw, which had come
@@ -40,7 +33,13 @@ SOON = 0.3
 TIME_EPS = 1.0e-6
 """[s] Rounding of sums of steps."""
 ENDS = ("success", "came_apart", "low_base", "collided", "no_jump")
-"""Rules of the task that end a jump here; the others only shape the training."""
+"""Terminations of the task that end a jump here; the others only shape the training."""
+SHOWN_DISTANCE = 1.0
+"""[m] The filmstrip shows the jump nearest to this."""
+EYE_DISTANCE = 2.4
+"""[m] From the jump's path to the eye."""
+PICTURE = (400, 320)
+"""[px]"""
 FALLS = ("came_apart", "low_base", "collided")
 MISSED = "missed"
 """Outcome of a jump that landed well, but elsewhere."""
@@ -50,13 +49,13 @@ NOT_BEGUN = "not_begun"
 """Outcome of a jump that was due after one that failed."""
 
 
-def ends_of_a_test(task: TaskCfg) -> TaskCfg:
-    """Return a task with the ends that a jump has in a test."""
+def for_evaluation(task: TaskCfg) -> TaskCfg:
+    """Return a task with the terminations that count in an evaluation."""
     return replace(task, terminations=tuple(term for term in task.terminations if term.name in ENDS))
 
 
 @dataclass
-class Landings(JumpLog):
+class Landings(EvaluationLog):
     """What became of one row of jumps per world; arrays have shape (num_envs, jumps in a row), not a number before.
 
     The first jump goes to a place relative to start and heading, each other one relative to the base's place and yaw
@@ -65,7 +64,7 @@ class Landings(JumpLog):
 
     goals: np.ndarray
     """[m] (num_envs, jumps in a row, 2), ahead and to the left."""
-    rules: tuple[str, ...]
+    terminations: tuple[str, ...]
     """Names of the ends of an episode; the first is the success."""
     headings: np.ndarray | float = 0.0
     """[rad] (num_envs,) or one for all."""
@@ -76,7 +75,7 @@ class Landings(JumpLog):
     current: np.ndarray = field(init=False)
     """(num_envs,) Number of the jump under way; that of jumps in a row after the end."""
     end: np.ndarray = field(init=False)
-    """Index of the end in `rules`, -1 before it."""
+    """Index of the end in `terminations`, -1 before it."""
     place: np.ndarray = field(init=False)
     """[m] (..., 2) Base at the end, world."""
     target: np.ndarray = field(init=False)
@@ -102,6 +101,8 @@ class Landings(JumpLog):
     early: np.ndarray = field(init=False)
     """Whether the jump began before the command."""
 
+    spacing = 3.0
+
     def __post_init__(self) -> None:
         """Begin with no jump ended. Raises ValueError for goals of another shape."""
         self.goals = np.asarray(self.goals, dtype=float)
@@ -115,6 +116,11 @@ class Landings(JumpLog):
         self._came_down = np.zeros((shape[0], 4), dtype=bool)
         self.yaw, self.heading, self.apex, self.tilt = (np.full(shape, np.nan) for _ in range(4))
         self.rest_speed, self.early = np.full(shape, np.inf), np.zeros(shape, dtype=bool)
+
+    @property
+    def seconds(self) -> float:
+        """[s] In which a row has ended."""
+        return longest(self.goals.shape[1], self.rest) + float(np.max(self.delay))
 
     def begin(self, env: EvaluationEnv) -> None:
         """Stand every world in the default pose with its first goal."""
@@ -194,7 +200,7 @@ class Landings(JumpLog):
     @property
     def ends(self) -> np.ndarray:
         """Name of each jump's end, whether or not it met its goal."""
-        names = np.array([*self.rules, NO_END], dtype=object)[self.end]
+        names = np.array([*self.terminations, NO_END], dtype=object)[self.end]
         return np.where(np.isnan(self.heading), NOT_BEGUN, names)
 
     @property
@@ -205,7 +211,7 @@ class Landings(JumpLog):
     @property
     def success(self) -> np.ndarray:
         """Whether the jump, begun on command, was landed near its goal."""
-        near = np.nan_to_num(self.error, nan=np.inf) <= NEAR
+        near = np.nan_to_num(self.error, nan=np.inf) <= SUCCESS_TOLERANCE
         return self.landed & near & ~self.early
 
     @property
@@ -242,7 +248,7 @@ class Landings(JumpLog):
     def outcomes(self) -> np.ndarray:
         """Name of each jump's end."""
         missed = np.where(self.landed & ~self.success, np.where(self.early, EARLY, MISSED), self.ends)
-        return np.where(self.success, self.rules[0], missed)
+        return np.where(self.success, self.terminations[0], missed)
 
     def columns(self) -> dict[str, list]:
         """Return goals, headings, landings and errors, and the ends; row after row."""
@@ -272,10 +278,39 @@ class Landings(JumpLog):
         target = self.target[list(worlds)]
         return np.concatenate([target, np.zeros_like(target[..., :1])], axis=-1)
 
+    def notes(self, worlds: Sequence[int]) -> dict[str, Any]:
+        """Return the goals [m]."""
+        return {"goals_m": self.goals[list(worlds)].tolist()}
+
+    def strip(self, film: Film) -> Strip:
+        """Return pictures of the jump, or row of jumps, that begins with about SHOWN_DISTANCE."""
+        distance = np.linalg.norm(self.goals[film.worlds, 0], axis=1)
+        index = int(np.argmin(np.abs(distance - SHOWN_DISTANCE)))
+        base = film.base(index)
+        if self.goals.shape[1] == 1:
+            delay = np.broadcast_to(self.delay, film.env.num_envs)[film.worlds[index]]
+            frames = moments(base[:, 2], round(delay / film.env.step_dt) - 1)
+        else:
+            frames = np.linspace(0, len(base) - 1, 9).round().astype(int).tolist()
+        ends = self.place[film.worlds[index]]
+        eye, target = beside(base[0, :2], ends[np.isfinite(ends[:, 0])][-1])
+        captions = [f"{(frame + 1) * film.env.step_dt:.2f} s" for frame in frames]
+        return Strip(index, frames, captions, eye, target, PICTURE)
+
 
 def longest(jumps: int, rest: float = REST_TIME) -> float:
     """Return how long [s] jumps in a row may take: waiting, squatting and flying at most 3.5 s, and resting."""
     return 1.0 + jumps * (3.5 + rest)
+
+
+def beside(start: np.ndarray, end: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return an eye beside the way from start to end (2,), and the point that it looks at, (3,); [m], world frame."""
+    way = end - start
+    length = float(np.linalg.norm(way))
+    ahead = way / length if length > 1.0e-3 else np.array([1.0, 0.0])
+    middle = np.append(start + 0.5 * way, 0.4)
+    back = EYE_DISTANCE * max(1.0, length / 1.5)
+    return middle + np.array([back * ahead[1], -back * ahead[0], 0.35]), middle
 
 
 def yaw_of(quat: np.ndarray) -> np.ndarray:
@@ -287,59 +322,3 @@ def yaw_of(quat: np.ndarray) -> np.ndarray:
 def wrapped(angle: np.ndarray) -> np.ndarray:
     """Return angles [rad] within -pi..pi."""
     return np.arctan2(np.sin(angle), np.cos(angle))
-
-
-def random_headings(count: int, seed: int) -> np.ndarray:
-    """Return headings (count,) [rad] over the full circle."""
-    return np.random.default_rng(seed).uniform(-math.pi, math.pi, count)
-
-
-def landing_figures(landings: Landings, inside: np.ndarray | None = None) -> Figures:
-    """Return the figures of jumps to places, all rows together.
-
-    Errors are over all jumps, failed ones included, but those whose simulation came apart, which `came_apart` counts,
-    and those that were not begun. `ahead` and `left` are signed. Tilts, turns, hops and steps are those of the landed
-    jumps.
-
-    inside: which jumps the figures in range count, shaped like `landings.end`; without it there are none.
-    """
-    begun = landings.ends != NOT_BEGUN
-    error, success, landed = landings.error, landings.success, landings.landed
-    offset = np.where(np.isnan(error)[..., None], np.nan, landings.offset)
-    tilt, yaw = np.degrees(landings.tilt), np.degrees(landings.yaw)
-    figures: Figures = {
-        "jumps": int(begun.sum()),
-        "mean_error_m": mean(error),
-        "mean_error_of_successes_m": mean(error[success]),
-        "max_error_of_successes_m": largest(error[success]),
-        "max_error_m": largest(error),
-        "mean_error_ahead_m": mean(offset[..., 0]),
-        "mean_error_left_m": mean(offset[..., 1]),
-        "success_rate": mean(success[begun]),
-        "single_jump_success_rate": mean(landings.single[begun]),
-        "step_free_success_rate": mean(landings.step_free[begun]),
-        "landing_rate": mean(landed[begun]),
-        "second_hop_rate": mean(landings.hopped[landed]),
-        "step_rate": mean(landings.stepped[landed]),
-        "mean_error_at_touchdown_m": mean(landings.touchdown_error[landed]),
-        "mean_error_0_3_s_after_touchdown_m": mean(landings.error_soon[landed]),
-        "at_rest_within_1_s_rate": mean((landings.rest_speed < REST_SPEED)[landed]),
-        "mean_landing_tilt_deg": mean(tilt[landed]),
-        "max_landing_tilt_deg": largest(tilt[landed]),
-        "mean_turn_deg": mean(np.abs(yaw[landed])),
-        "max_turn_deg": largest(np.abs(yaw[landed])),
-        "collision_rate": mean((landings.ends == COLLIDED)[begun]),
-        "fall_rate": mean(np.isin(landings.ends, FALLS)[begun]),
-        "early_rate": mean(landings.early[begun]),
-        CAME_APART: int((landings.ends == CAME_APART).sum()),
-    }
-    if inside is not None:
-        inside = begun & inside
-        figures |= {"mean_error_in_range_m": mean(error[inside]), "success_rate_in_range": mean(success[inside])}
-    return figures | failures(landings.outcomes[begun & ~success])
-
-
-def trained_range(task: TaskCfg) -> dict[str, float]:
-    """Return the distances straight ahead [m] that the levels of a task's training drew goals from."""
-    lower, upper = zip(*((level.goal_lower[0], level.goal_upper[0]) for level in task.levels), strict=True)
-    return {"trained_lower_m": max(min(lower), 0.0), "trained_upper_m": max(upper)}

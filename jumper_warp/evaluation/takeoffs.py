@@ -19,6 +19,7 @@ from scipy.spatial.transform import Rotation
 from jumper_warp.envs.env import Env
 from jumper_warp.evaluation.film import ankles
 from jumper_warp.evaluation.jumps import LANDED, jump_commands
+from jumper_warp.evaluation.links import Links
 from jumper_warp.robot.description import load_description
 from jumper_warp.robot.model import leg_geometry
 from jumper_warp.robot.motors import FilterCfg
@@ -53,7 +54,7 @@ class Takeoffs:
     off: np.ndarray = field(init=False)
     """Whether the robot has taken off."""
     bad: np.ndarray = field(init=False)
-    """Whether it broke a rule of the environment, stepped before takeoff, or came down right after."""
+    """Whether the jump ended, stepped before takeoff, or came down right after."""
     com: np.ndarray = field(init=False)
     """[m] (..., 3) Centre of mass of the robot at takeoff."""
     com_vel: np.ndarray = field(init=False)
@@ -73,7 +74,7 @@ class Takeoffs:
     apex: np.ndarray = field(init=False)
     """[m] Largest base height up to then."""
     end: np.ndarray = field(init=False)
-    """Index of the environment's rule that ended the jump after takeoff, 0 for a success, -1 before."""
+    """Index of the termination that ended the jump after takeoff, 0 for a success, -1 before."""
     start: np.ndarray = field(init=False)
     """[m] (..., 3) Centre of mass at the start."""
     landing_height: np.ndarray = field(init=False)
@@ -90,18 +91,12 @@ class Takeoffs:
         self.pitch, self.spin, self.back, self.touchdown = (np.zeros(n) for _ in range(4))
         self.touchdown_pitch, self.paws_ahead, self.apex = (np.zeros(n) for _ in range(3))
         self.end = np.full(n, -1)
+        self._links = Links(self.env).read
         pose, twist = self._links()
         self.start, _, _, self._standing = self._whole(np.arange(n), pose, twist)
         self._base_start = pose[:, 0, :3].copy()
         self._hind_start = ankles(pose)[:, HIND, 0].max(axis=1)
         self.landing_height = LANDING_HEIGHT + self.start[:, 2] - self._base_start[:, 2]
-
-    def _links(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return pose (n, links, 7) and twist (n, links, 6) of every link."""
-        sim, n = self.env.sim, self.env.num_envs
-        state = sim.state
-        sim.solver.dynamics.full_state(state.joint_q, state.joint_qd, state.body_q, state.body_qd)
-        return state.body_q.numpy().reshape(n, -1, 7), state.body_qd.numpy().reshape(n, -1, 6)
 
     def _whole(self, worlds: np.ndarray, pose: np.ndarray, twist: np.ndarray) -> tuple[np.ndarray, ...]:
         """Return centre of mass [m], its velocity [m/s], angular momentum and inertia about y of some robots."""

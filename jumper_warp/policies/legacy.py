@@ -3,71 +3,119 @@
 from __future__ import annotations
 
 import inspect
+import math
+from types import ModuleType
 from typing import Any
 
-from jumper_warp.registry import make_task
-from jumper_warp.tasks.saving import TaskError, name_of, plain
+import warp as wp
+
+from jumper_warp.tasks.jump.horizontal import horizontal_jump, omnidirectional_jump
+from jumper_warp.tasks.jump.vertical import vertical_jump
+from jumper_warp.tasks.saving import MAX_ENTRIES, VERSION, TaskError, name_of, plain, shown
 from kernels.jump import rewards, terminations
 from kernels.mdp import rewards as mdp_rewards
 from kernels.mdp import terminations as mdp_terminations
 
-NOISE = {"lin_vel": "lin_vel", "ang_vel": "ang_vel", "gravity": "gravity", "angle": "angle", "rate": "rate",
-         "goal": "position", "height": "position"}  # fmt: skip
-"""Observation terms by the noise that they had."""
-DEGREES = ("angle", "rate")
-"""Noise that was saved in degrees."""
-FROM_TASK = ("motors", "command_filter", "action_scale", "contact_force")
-"""Fields that are as they were."""
+PLACE = {"observe": "observe_horizontal", "columns": ["goal_x", "goal_y", "height"], "error": "landing_error"}
+HEIGHT = {"observe": "observe_vertical", "columns": ["wanted_height", "jump_command", "height"],
+          "error": "height_error"}  # fmt: skip
+TASKS = {
+    "vertical-jump": (vertical_jump, HEIGHT),
+    "horizontal-jump": (horizontal_jump, PLACE),
+    "omnidirectional-jump": (omnidirectional_jump, PLACE),
+}
+"""All tasks that there were, with what each of them observed."""
+REQUIRED = ("name", "terms", "rules", "levels", "motors", "command_filter", "action_scale")
+DEFAULTS: dict[str, Any] = {
+    "reset": {}, "ground": {}, "randomization": {}, "noise": {}, "ppo": {}, "takeoff_speed": 0.75,
+    "contact_force": 0.1, "near": 0.10, "games": 5,
+}  # fmt: skip
+"""Of the settings that a configuration could lack; those of PPO are not the task's any more."""
+NOISE = {"lin_vel": ("lin_vel", 1.0), "ang_vel": ("ang_vel", 1.0), "gravity": ("gravity", 1.0),
+         "angle": ("angle", math.pi / 180.0), "rate": ("rate", math.pi / 180.0), "goal": ("position", 1.0),
+         "height": ("position", 1.0)}  # fmt: skip
+"""Observation terms: the noise that they had, and its unit."""
 
 
-def upgraded(saved: Any) -> dict[str, Any]:
+def upgraded(saved: dict[str, Any]) -> dict[str, Any]:
     """Return a task of version 1 as JSON of today's version; settings that it lacks are what they were then.
 
     Raises:
         TaskError: It is not a jump of version 1.
     """
+    name = saved.get("name")
+    if not isinstance(name, str) or name not in TASKS:
+        raise TaskError(f"unknown task {shown(name)}, version 1 had {', '.join(TASKS)}")
+    make, observed = TASKS[name]
+    missing = [key for key in REQUIRED if key not in saved]
+    unknown = [key for key in saved if key not in (*REQUIRED, *DEFAULTS, *observed)]
+    if missing or unknown:
+        raise TaskError(f"task: {'no ' if missing else 'unknown setting '}{(missing or unknown)[0]!r:.60}")
+    for key, expected in observed.items():
+        if saved.get(key, expected) != expected:
+            raise TaskError(f"task.{key}: this version has {expected}, got {shown(saved[key])}")
     try:
-        task = make_task(saved["name"])
-        content: dict[str, Any] = plain(task)
-        content |= {name: saved[name] for name in FROM_TASK}
-        content["advance"]["takeoff_speed"] = saved["takeoff_speed"]
-        content["curriculum"] |= {"tolerance": saved["near"], "promote_after": saved["games"]}
-        content["rewards"] = [_row(row, "reward", (rewards, mdp_rewards)) for row in saved["terms"]]
-        content["terminations"] = [_row(row, "termination", (terminations, mdp_terminations)) for row in saved["rules"]]
-        kind = content["randomization"]["type"]
-        content["randomization"] = {"type": kind, **saved["randomization"], "redraw": "startup"}
-        settings = content["reset"]["settings"]
-        level_ground = {"type": settings["ground"]["type"]}
-        states = {name: value for name, value in saved["reset"].items() if name != "jump_again"}
-        settings = {"type": settings["type"], **states, "ground": level_ground | saved.get("ground", {})}
-        content["reset"]["settings"] = settings
-        kind, again = content["levels"][0]["type"], saved["reset"]["jump_again"]
-        content["levels"] = [
-            {"type": kind, **level, "jump_again": again if i else 0.0} for i, level in enumerate(saved["levels"])
-        ]
-        for term in content["policy"]:
-            if term["name"] in NOISE:
-                noise = NOISE[term["name"]]
-                scale = 0.017453292519943295 if noise in DEGREES else 1.0
-                term["noise"] = scale * saved["noise"][noise]
-    except (KeyError, TypeError, IndexError, AttributeError) as error:
-        raise TaskError(f"no task of version 1 ({type(error).__name__}: {error})") from error
-    except ValueError as error:
-        raise TaskError(str(error)) from error
-    return {"version": 2, **content}
+        return {"version": VERSION, **_content(plain(make()), DEFAULTS | saved)}
+    except (KeyError, TypeError, AttributeError, ArithmeticError) as error:
+        raise TaskError(f"no task of version 1 ({type(error).__name__}: {error!s:.100})") from error
 
 
-def _row(saved: dict[str, Any], what: str, shelves: tuple) -> dict[str, Any]:
-    """Return a reward or termination; numbers that had places then have names now."""
-    func = next((getattr(shelf, saved["func"]) for shelf in shelves if hasattr(shelf, saved["func"])), None)
-    if func is None:
-        raise TaskError(f"this version has no {what} {saved['func']!r:.60}")
-    names = list(inspect.signature(func.func).parameters)[2:]
-    if len(saved["params"]) != len(names):
-        raise TaskError(f"{what} {saved['func']} has {len(names)} numbers, the configuration {len(saved['params'])}")
-    kind = "RewardTerm" if what == "reward" else "TerminationTerm"
-    row = {"type": f"jumper_warp.tasks.terms:{kind}", "func": name_of(func), "name": saved["func"]}
-    row |= dict(zip(names, saved["params"], strict=True))
-    if what == "reward":
-        return row | {"weight": saved["weight"], "once": saved["once"]}
-    return row | {"time_out": saved["success"], "success": saved["func"] == "success"}
+def _content(today: dict[str, Any], saved: dict[str, Any]) -> dict[str, Any]:
+    """Return today's JSON of the same task with the saved settings."""
+    today |= {name: saved[name] for name in ("motors", "command_filter", "action_scale", "contact_force")}
+    today["advance"]["takeoff_speed"] = saved["takeoff_speed"]
+    today["curriculum"] |= {"tolerance": saved["near"], "promote_after": saved["games"]}
+    today["rewards"] = _rows(saved, "terms", (rewards, mdp_rewards))
+    today["terminations"] = _rows(saved, "rules", (terminations, mdp_terminations))
+    today["randomization"] = {**saved["randomization"], "redraw": "startup"}
+    states = {**saved["reset"]}
+    again = states.pop("jump_again", 0.0)
+    today["reset"]["settings"] = {
+        "type": today["reset"]["settings"]["type"], **states, "ground": saved["ground"],
+    }  # fmt: skip
+    kind = today["levels"][0]["type"]
+    today["levels"] = [
+        {"type": kind, **level, "jump_again": again if i else 0.0} for i, level in enumerate(_list(saved, "levels"))
+    ]
+    noise = {**saved["noise"]}
+    unknown = [key for key in noise if key not in {name for name, _ in NOISE.values()}]
+    if unknown:
+        raise TaskError(f"task.noise: unknown setting {unknown[0]!r:.60}")
+    for term in today["policy"]:
+        name, unit = NOISE.get(term["name"], ("", 1.0))
+        if name in noise:
+            term["noise"] = unit * noise[name]
+    return today
+
+
+def _list(saved: dict[str, Any], section: str) -> list[Any]:
+    rows = saved[section]
+    if not isinstance(rows, list) or len(rows) > MAX_ENTRIES or not all(isinstance(row, dict) for row in rows):
+        raise TaskError(f"task.{section}: expected a list of settings by name, at most {MAX_ENTRIES}")
+    return rows
+
+
+def _rows(saved: dict[str, Any], section: str, shelves: tuple[ModuleType, ...]) -> list[dict[str, Any]]:
+    """Return rewards or terminations; numbers that had places then have names now."""
+    made = []
+    for i, row in enumerate(_list(saved, section)):
+        where, name, params = f"task.{section}[{i}]", row.get("func"), row.get("params")
+        found = [vars(shelf).get(name) for shelf in shelves] if isinstance(name, str) else []
+        func = next((func for func in found if isinstance(func, wp.Function)), None)
+        if func is None:
+            raise TaskError(f"{where}: this version has no {shown(name)}")
+        extra = [key for key in row if key not in ("func", "params", "weight", "once", "success")]
+        if extra:
+            raise TaskError(f"{where}: unknown setting {extra[0]!r:.60}")
+        names = list(inspect.signature(func.func).parameters)[2:]
+        if not isinstance(params, list) or len(params) != len(names):
+            raise TaskError(f"{where}: {name} has {len(names)} numbers by place")
+        kind = "RewardTerm" if section == "terms" else "TerminationTerm"
+        term = {"type": f"jumper_warp.tasks.terms:{kind}", "func": name_of(func), "name": name}
+        term |= dict(zip(names, params, strict=True))
+        if section == "terms":
+            term |= {"weight": row["weight"], "once": row.get("once", False)}
+        else:
+            term |= {"time_out": row.get("success", False), "success": name == "success"}
+        made.append(term)
+    return made

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
@@ -21,7 +21,7 @@ from jumper_warp.rl.checkpoint import CheckpointError, best_checkpoint, latest_c
 from jumper_warp.rl.networks import EPS, NORMALISED_LIMIT, RAW_LIMIT
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.tasks.interface import interface
-from jumper_warp.tasks.saving import TaskError, task_from_json
+from jumper_warp.tasks.saving import OPTIONAL, TaskError, task_from_json
 
 if TYPE_CHECKING:
     from jumper_warp.envs.env import Env
@@ -105,10 +105,16 @@ def learning_curve(source: Path) -> bytes | None:
     return path.read_bytes() if path.is_file() else None
 
 
-def restored_task(config: dict[str, Any], modules: Iterable[ModuleType] = ()) -> TaskCfg:
-    """Return the task of a saved configuration, from its entry `env` (`Env.config`), without rewards.
+def restored_task(
+    config: dict[str, Any], modules: Iterable[ModuleType] = (), *, leave_out: Collection[str] = OPTIONAL
+) -> TaskCfg:
+    """Return the task of a saved configuration, from its entry `env` (`Env.config`).
 
-    modules: that the user has named; functions that are not the project's are looked up there.
+    Args:
+        config: What a policy or a run was made with.
+        modules: That the user has named; functions that are not the project's are looked up there.
+        leave_out: Sections that are not wanted, and whose functions need not be found; by default all that only a
+            training needs.
 
     Raises:
         PolicyError: The configuration is not of a task that is known here.
@@ -119,8 +125,8 @@ def restored_task(config: dict[str, Any], modules: Iterable[ModuleType] = ()) ->
         raise PolicyError(f"no task in the configuration ({type(error).__name__}: {error})") from error
     try:
         if isinstance(saved, dict) and "version" not in saved:
-            saved = upgraded(saved)
-        return task_from_json(saved, modules, rewards=False)
+            saved = upgraded(saved | {"terms": []} if "rewards" in leave_out else saved)
+        return task_from_json(saved, modules, leave_out=leave_out)
     except TaskError as error:
         raise PolicyError(f"task in the configuration: {error}") from error
 
@@ -134,7 +140,10 @@ def env_of_policy(
     modules: Iterable[ModuleType] = (),
     **scene: Any,
 ) -> Env:
-    """Return the environment that a policy was trained in, with other conditions and without rewards.
+    """Return the environment that a policy was trained in, with other conditions.
+
+    Without rewards, without what the critic sees, and unless randomised without events: so their functions need not be
+    found, and are not run.
 
     Args:
         policy: Its configuration tells the task.
@@ -149,7 +158,8 @@ def env_of_policy(
     """
     from jumper_warp.envs.env import Env
 
-    task = restored_task(policy.config, modules)
+    leave_out = [section for section in OPTIONAL if section != "events" or not conditions.randomize]
+    task = restored_task(policy.config, modules, leave_out=leave_out)
     if task.observation_names != policy.interface.observation_names:
         raise PolicyError("the policy's observation is not the one that this version of its task gives")
     return Env(

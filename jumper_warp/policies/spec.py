@@ -8,6 +8,8 @@ import re
 from dataclasses import dataclass, field
 from typing import Any, get_type_hints
 
+from jumper_warp.utils.errors import InputError
+
 ACTIVATIONS = ("elu", "relu", "tanh")
 MAX_HIDDEN = 64
 """Most hidden layers."""
@@ -29,21 +31,20 @@ SINGLE = {
     "normalised_limit": (1.0e-3, 1.0e6),
 }
 """The same of single numbers; the limits are far within single precision."""
+LAYOUT = ("first", "end", "scale", "clip", "history")
+"""What is told of every term of an observation."""
 
 
-class PolicyError(ValueError):
+class PolicyError(InputError):
     """A policy that is missing, damaged, or does not fit its configuration. The message is one line."""
-
-    def __init__(self, message: str):
-        super().__init__(" ".join(message.split()))
 
 
 @dataclass(frozen=True)
 class PolicyInterface:
     """Observation, network sizes, and the way from an action to motor torques.
 
-    Observations are SI units and rad, not scaled, of the present step only; velocities and gravity in body axes, angles
-    relative to `default_joint_pos`. An action a in [-1, 1] commands a · action_scale + default_joint_pos.
+    Observations are SI units and rad; velocities and gravity in body axes, angles relative to `default_joint_pos`. Where
+    `observation_layout` tells it, a term is clipped, then scaled, and keeps frames of the past. An action a in [-1, 1] commands a · action_scale + default_joint_pos.
     """
 
     task: str
@@ -99,6 +100,7 @@ class PolicyInterface:
         if not 1 <= len(self.hidden) <= MAX_HIDDEN or not all(1 <= width <= 65536 for width in self.hidden):
             raise PolicyError(f"hidden must name 1 to {MAX_HIDDEN} widths from 1 to 65536, got {self.hidden!s:.100}")
         _check_filter(self.command_filter)
+        _check_layout(self.observation_layout, len(self.observation_names))
         if self.activation not in ACTIVATIONS:
             raise PolicyError(f"activation must be one of {', '.join(ACTIVATIONS)}, got {self.activation!r:.40}")
         if self.quaternion_order != "xyzw":
@@ -148,6 +150,22 @@ def _check_filter(fields: dict[str, Any]) -> None:
             _check_filter(value)
         elif isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < 1.0e6:
             raise PolicyError(f"command_filter {name} must be a number within 1e6, got {value!r:.60}")
+
+
+def _check_layout(layout: dict[str, Any], width: int) -> None:
+    """Raise PolicyError unless the terms follow each other and fill a number of columns; an empty layout tells nothing."""
+    first = 0
+    for name, term in layout.items():
+        numbers = list(term.values()) if isinstance(term, dict) and set(term) == set(LAYOUT) else [None]
+        if not NAME.fullmatch(name) or not all(
+            isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < 1.0e9 for value in numbers
+        ):
+            raise PolicyError(f"observation_layout {name!r:.60} must have the numbers {', '.join(LAYOUT)}")
+        if term["first"] != first or term["end"] <= first or (term["end"] - first) % max(term["history"], 1):
+            raise PolicyError(f"observation_layout {name!r:.60} must begin at column {first} and hold whole frames")
+        first = term["end"]
+    if layout and first != width:
+        raise PolicyError(f"observation_layout has {first} columns, the observation {width}")
 
 
 def make_interface(

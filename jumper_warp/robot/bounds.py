@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from jumper_warp.robot.parts import Joint, Link, Motor, RobotDescription, RobotDescriptionError, Shape
 
@@ -147,7 +146,8 @@ def shape_corners(shape: Shape) -> np.ndarray:
         }[shape.kind]()
         low = -high
     corners = np.array(list(itertools.product(*zip(low, high, strict=True))))
-    return shape.position + Rotation.from_quat(shape.rotation).apply(corners)
+    *axis, w = shape.rotation / np.linalg.norm(shape.rotation)
+    return shape.position + corners + 2.0 * np.cross(axis, np.cross(axis, corners) + w * corners)
 
 
 def of_motor(motor: Motor) -> Iterator[Reading]:

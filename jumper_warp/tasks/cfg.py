@@ -105,6 +105,7 @@ class TaskCfg:
                     raise ValueError(
                         f"{self.name} {section}: {row.term.name} is for {row.term.of_state.key}, not {self.state.key}"
                     )
+        self._check_functions()
         if came_apart not in [term.func for term in self.terminations]:
             raise ValueError(f"{self.name} needs the termination came_apart, for worlds whose state is no longer one")
         if not all(0.0 < scale < math.inf for scale in self.action_scale):
@@ -113,6 +114,28 @@ class TaskCfg:
             raise ValueError(f"{self.name}: contact_force must be finite and >= 0, got {self.contact_force}")
         if self.reward_floor is not None and not math.isfinite(self.reward_floor):
             raise ValueError(f"{self.name}: reward_floor must be finite or None, got {self.reward_floor}")
+
+    def _check_functions(self) -> None:
+        """Raises ValueError: a function outside the tables takes other structs than those of this task."""
+        if len({level.struct for level in self.levels}) > 1:
+            raise ValueError(f"{self.name}: all levels must be of one kind")
+        state, level = self.state, self.level_type
+        expected = {
+            "reset": (self.reset.func, {3: state, 4: self.settings_type, 5: level}),
+            "command give": (self.command.give, {2: state}),
+            "command due": (self.command.due, {0: state}),
+            "command draw": (self.command.draw, {2: state, 3: level}),
+            "curriculum counts": (self.curriculum.options["counts"], {0: state}),
+        }
+        for where, (func, structs) in expected.items():
+            found = [] if func is None else list(func.input_types.values())
+            for place, struct in structs.items() if found else ():
+                kind = found[place] if len(found) > place else None
+                if kind not in (Any, struct):
+                    takes = getattr(kind, "key", kind)
+                    raise ValueError(
+                        f"{self.name} {where}: argument {place + 1} of {func.key} is {takes}, the task has {struct.key}"
+                    )
 
     @functools.cached_property
     def rows(self) -> dict[str, list[Row]]:

@@ -85,6 +85,7 @@ class RandomizationCfg:
             dynamic_friction=(0.7, 0.8),
             no_load_speed=(0.6, 1.2),
             cutoff_speed=(0.6, 1.4),
+            motor_friction=(0.0, 0.04),
             latency=(0.0, 32.0),
             observation_latency=(0.0, 32.0),
             force=(-10.0, 10.0),

@@ -1,4 +1,4 @@
-"""Tasks as JSON, and back. Functions and types are saved as `module:name`; reading one imports nothing.
+"""Tasks as JSON, and back. Functions and types are saved as `module:name`; reading one imports nothing for its sake.
 
 They are looked up in the project's own modules and in those that a user has named, nowhere else.
 """
@@ -6,52 +6,78 @@ They are looked up in the project's own modules and in those that a user has nam
 from __future__ import annotations
 
 import dataclasses
+import functools
+import importlib
+import math
+import pkgutil
+import re
 import sys
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
+from pathlib import Path
 from types import ModuleType, UnionType
 from typing import Any, Union, get_args, get_origin, get_type_hints
 
 import warp as wp
 
+import jumper_warp.tasks
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.tasks.terms import RewardTerm, Term
+from jumper_warp.utils.errors import InputError
+from kernels.mdp.env import Nothing
 
 VERSION = 2
 """Of the form in which tasks are saved."""
 OWN = ("jumper_warp.tasks.", "jumper_warp.robot.", "kernels.")
 """Beginnings of the names of the project's modules that a task may name."""
+OPTIONAL = ("rewards", "critic", "events")
+"""Sections that a policy needs for training only."""
+NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_. -]{0,99}")
+"""Of a task or a term."""
+MAX_ENTRIES = 1000
+"""Longest list; a kernel of more terms would not be compiled in a day."""
+Struct = type(Nothing)
 
 
-class TaskError(ValueError):
-    """A saved task that cannot be restored. The message is one line."""
+class TaskError(InputError):
+    """A saved task that cannot be restored, or a task that could not be. The message is one line."""
+
+
+# ---------------------------------------------------------------------- to JSON
 
 
 def name_of(thing: Any) -> str:
-    """Return `module:name` of a Warp function, a struct or a class. Raises TaskError for one that cannot be found."""
+    """Return `module:name` of a Warp function, a struct or a class.
+
+    Of a file that runs as a program the module is its stem, under which `--task-module` loads it.
+    Raises TaskError for one that would not be found again.
+    """
     python = thing.func if isinstance(thing, wp.Function) else getattr(thing, "cls", thing)
-    if "<locals>" in python.__qualname__:
-        raise TaskError(f"{python.__qualname__} cannot be saved: define it at the top level of a module")
-    return f"{python.__module__}:{python.__qualname__}"
+    module, name = python.__module__, python.__qualname__
+    if vars(sys.modules.get(module, object)).get(name) is not thing:
+        raise TaskError(f"{module}:{name} cannot be saved: define it under this name at the top level of a module")
+    if module == "__main__":
+        main = sys.modules[module]
+        module = main.__spec__.name if main.__spec__ else Path(getattr(main, "__file__", module)).stem
+    return f"{module}:{name}"
 
 
 def plain(value: Any) -> Any:
-    """Return a configuration as JSON can hold it."""
+    """Return a configuration as JSON can hold it. Raises TaskError: a part of it could not be read back."""
     if isinstance(value, Term):
         options = {key: plain(option) for key, option in value.options.items()}
-        return {
-            "type": name_of(type(value)),
-            "func": name_of(value.func),
-            "name": value.name,
-            **value.numbers,
-            **options,
-        }
+        named = {"type": name_of(type(value)), "func": name_of(value.func), "name": value.name}
+        return {**named, **value.numbers, **options}
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         fields = {spec.name: plain(getattr(value, spec.name)) for spec in dataclasses.fields(value)}
         return {"type": name_of(type(value)), **fields}
-    if isinstance(value, wp.Function) or hasattr(value, "cls"):
+    if isinstance(value, wp.Function | Struct):
         return name_of(value)
-    if isinstance(value, tuple | list):
+    if isinstance(value, tuple):
         return [plain(v) for v in value]
+    if not (value is None or isinstance(value, bool | int | float | str)):
+        raise TaskError(f"{shown(value)} cannot be saved: settings are numbers, strings, tuples and dataclasses")
+    if isinstance(value, float) and not math.isfinite(value):
+        raise TaskError(f"settings must be finite, got {value}")
     return value
 
 
@@ -60,66 +86,93 @@ def task_to_json(task: TaskCfg) -> dict[str, Any]:
     return {"version": VERSION, **plain(task)}
 
 
+def shown(value: Any) -> str:
+    """Return a short word on a value, however deep or long it is."""
+    if value is None or isinstance(value, bool | int | float | str):
+        return f"{value!r:.60}" if not isinstance(value, int) or abs(value) < 10**18 else "a huge integer"
+    return f"a {type(value).__name__}"
+
+
+# ---------------------------------------------------------------------- from JSON
+
+
+@functools.cache
+def load_own_modules() -> None:
+    """Import the project's tasks, and with them the functions that saved ones may name."""
+    for module in pkgutil.walk_packages(jumper_warp.tasks.__path__, f"{jumper_warp.tasks.__name__}."):
+        importlib.import_module(module.name)
+
+
 class Finder:
     """Looks functions and types up by name."""
 
     def __init__(self, modules: Iterable[ModuleType] = ()) -> None:
         """modules: those that the user has named, besides the project's own."""
+        load_own_modules()
         self.modules = {module.__name__: module for module in modules}
 
     def __call__(self, name: Any, where: str) -> Any:
         """Return a Warp function, struct, dataclass or kind of term by `module:name`. Raises TaskError."""
         if not isinstance(name, str) or name.count(":") != 1:
-            raise TaskError(f"{where}: expected module:name, got {name!r:.60}")
+            raise TaskError(f"{where}: expected module:name, got {shown(name)}")
         module_name, _, attribute = name.partition(":")
         module = self.modules.get(module_name)
         if module is None and module_name.startswith(OWN):
             module = sys.modules.get(module_name)
-        found = getattr(module, attribute, None)
-        usable = isinstance(found, wp.Function) or hasattr(found, "cls")
+        found = None if module is None else vars(module).get(attribute)
+        usable = isinstance(found, wp.Function | Struct)
         if isinstance(found, type):
             usable = dataclasses.is_dataclass(found) or issubclass(found, Term)
         if not usable:
-            own = module_name.startswith(OWN)
-            hint = "this version has no such one" if own else "name the file that defines it with --task-module"
+            known = module is not None or module_name.startswith(OWN)
+            hint = "there is no such one here" if known else "name the file that defines it with --task-module"
             raise TaskError(f"{where} needs {name!r:.80}: {hint}")
         return found
 
 
-def task_from_json(saved: Any, modules: Iterable[ModuleType] = (), *, rewards: bool = True) -> TaskCfg:
-    """Return a saved task.
+def task_from_json(saved: Any, modules: Iterable[ModuleType] = (), *, leave_out: Collection[str] = ()) -> TaskCfg:
+    """Return a saved task; settings that it lacks have their defaults.
 
     Args:
         saved: What `task_to_json` gave.
         modules: That the user has named.
-        rewards: Whether its reward terms are wanted; playing and measuring a policy need none.
+        leave_out: Sections of OPTIONAL that are not wanted, and whose functions need not be found.
 
     Raises:
         TaskError: It is not a task of this version, or a function is in none of the modules.
     """
     if not isinstance(saved, dict):
-        raise TaskError("the task must be a JSON object")
+        raise TaskError(f"the task must be a JSON object, got {shown(saved)}")
     if saved.get("version") != VERSION:
-        raise TaskError(f"the task has version {saved.get('version')!r:.20}, this is version {VERSION}")
+        raise TaskError(f"the task has version {shown(saved.get('version'))}, this is version {VERSION}")
     content = {key: value for key, value in saved.items() if key not in ("version", "type")}
-    if not rewards:
-        content["rewards"] = []
+    content |= {section: [] for section in OPTIONAL if section in leave_out}
     try:
-        return _build(TaskCfg, content, "task", Finder(modules))
+        task = _build(TaskCfg, content, "task", Finder(modules))
+        _check_kernels_types(task)
+        task.rows  # noqa: B018 (builds the events of the randomisation, which may refuse their numbers)
     except TaskError:
         raise
-    except (ValueError, TypeError, KeyError, AttributeError) as error:
-        raise TaskError(f"task: {' '.join(str(error).split())[:200]}") from error
+    except (ValueError, TypeError, KeyError, AttributeError, ArithmeticError, NameError) as error:
+        raise TaskError(f"task: {error!s:.200}") from error
+    return task
 
 
 def _build(kind: type, saved: dict[str, Any], where: str, find: Finder) -> Any:
     """Return a dataclass of a kind from its saved fields; fields that are missing have their defaults."""
     hints = get_type_hints(kind)
-    fields = {spec.name for spec in dataclasses.fields(kind)}
-    unknown = sorted(set(saved) - fields)
+    fields = {spec.name: spec for spec in dataclasses.fields(kind) if spec.init}
+    unknown = [name for name in saved if name not in fields]
     if unknown:
         raise TaskError(f"{where}: unknown setting {unknown[0]!r:.60}")
-    return kind(**{name: _value(value, hints[name], f"{where}.{name}", find) for name, value in saved.items()})
+    for name, spec in fields.items():
+        if name not in saved and spec.default is spec.default_factory is dataclasses.MISSING:
+            raise TaskError(f"{where}.{name} is missing")
+    values = {name: _value(value, hints[name], f"{where}.{name}", find) for name, value in saved.items()}
+    try:
+        return kind(**values)
+    except ValueError as error:
+        raise TaskError(f"{where}: {error!s:.200}") from error
 
 
 def _value(saved: Any, hint: Any, where: str, find: Finder) -> Any:
@@ -132,33 +185,62 @@ def _value(saved: Any, hint: Any, where: str, find: Finder) -> Any:
     if isinstance(saved, dict):
         return _object(saved, hint, where, find)
     if hint is wp.Function or (hint is Any and isinstance(saved, str)):
-        return find(saved, where)
-    if isinstance(saved, list):
-        inner = get_args(hint)
-        if get_origin(hint) is not tuple:
-            raise TaskError(f"{where}: expected no list")
-        if len(inner) == 2 and inner[1] is Ellipsis:
-            return tuple(_value(v, inner[0], f"{where}[{i}]", find) for i, v in enumerate(saved))
-        if len(inner) != len(saved):
-            raise TaskError(f"{where}: expected {len(inner)} entries, got {len(saved)}")
-        return tuple(_value(v, k, f"{where}[{i}]", find) for i, (v, k) in enumerate(zip(saved, inner, strict=True)))
+        found = find(saved, where)
+        if hint is wp.Function and not isinstance(found, wp.Function):
+            raise TaskError(f"{where}: {saved!r:.80} is not a @wp.func")
+        return found
+    if get_origin(hint) is tuple or isinstance(saved, list):
+        return _tuple(saved, hint, where, find)
     return _scalar(saved, hint, where)
 
 
+def _tuple(saved: Any, hint: Any, where: str, find: Finder) -> tuple[Any, ...]:
+    """Return a saved list as the tuple that the hint asks for."""
+    kinds = get_args(hint)
+    if get_origin(hint) is not tuple or not isinstance(saved, list):
+        raise TaskError(f"{where}: expected {_word(hint)}, got {shown(saved)}")
+    if len(saved) > MAX_ENTRIES:
+        raise TaskError(f"{where}: expected at most {MAX_ENTRIES} entries, got {len(saved)}")
+    if len(kinds) == 2 and kinds[1] is Ellipsis:
+        kinds = (kinds[0],) * len(saved)
+    if len(kinds) != len(saved):
+        raise TaskError(f"{where}: expected {len(kinds)} entries, got {len(saved)}")
+    return tuple(_value(v, k, f"{where}[{i}]", find) for i, (v, k) in enumerate(zip(saved, kinds, strict=True)))
+
+
 def _object(saved: dict[str, Any], hint: Any, where: str, find: Finder) -> Any:
-    """Return a saved term or dataclass; of the kind that the field asks for, unless it names another."""
+    """Return a saved term or dataclass; of the kind that the field asks for, unless it names one of these."""
     kind = hint if "type" not in saved and dataclasses.is_dataclass(hint) else find(saved.get("type"), where)
+    wanted = object if hint is Any else hint
+    if not (isinstance(kind, type) and isinstance(wanted, type) and issubclass(kind, wanted)):
+        raise TaskError(f"{where}: expected {_word(hint)}, got {shown(saved.get('type'))}")
     content = {key: value for key, value in saved.items() if key != "type"}
-    if isinstance(kind, type) and issubclass(kind, Term):
-        func = find(content.pop("func", None), where)
-        options = {key: find(value, where) if isinstance(value, str) and ":" in value else value
-                   for key, value in content.items()}  # fmt: skip
-        if kind is RewardTerm and "weight" not in options:
-            raise TaskError(f"{where}: a reward needs a weight")
-        return kind(func, **options)
-    if not (isinstance(kind, type) and dataclasses.is_dataclass(kind)):
-        raise TaskError(f"{where}: {saved.get('type')!r:.60} is not a kind of setting")
-    return _build(kind, content, where, find)
+    return _term(kind, content, where, find) if issubclass(kind, Term) else _build(kind, content, where, find)
+
+
+def _term(kind: type[Term], saved: dict[str, Any], where: str, find: Finder) -> Term:
+    """Return a term of a kind from its saved function, numbers and options."""
+    func = _value(saved.pop("func", None), wp.Function, where, find)
+    name = saved.get("name", "")
+    if not isinstance(name, str) or (name and not NAME.fullmatch(name)):
+        raise TaskError(f"{where}: a name is of letters, digits, and _ . - or spaces, got {shown(name)}")
+    for key, default in kind.options.items():
+        if key not in saved:
+            continue
+        if isinstance(default, bool | int | str):
+            saved[key] = _scalar(saved[key], type(default), f"{where}.{key}")
+        else:
+            saved[key] = _value(saved[key], wp.Function, f"{where}.{key}", find)
+    if not 0 <= saved.get("history", 1) <= MAX_ENTRIES:
+        raise TaskError(f"{where}.history must be at most {MAX_ENTRIES}")
+    for key in set(saved) - set(kind.options) - {"name"}:
+        _scalar(saved[key], float, f"{where}.{key}"[:100])
+    if kind is RewardTerm and "weight" not in saved:
+        raise TaskError(f"{where}: a reward needs a weight")
+    try:
+        return kind(func, **saved)
+    except ValueError as error:
+        raise TaskError(f"{where}: {error!s:.200}") from error
 
 
 def _scalar(saved: Any, hint: Any, where: str) -> Any:
@@ -166,12 +248,39 @@ def _scalar(saved: Any, hint: Any, where: str) -> Any:
     kinds = {float: (float, int), int: (int,), str: (str,), bool: (bool,)}.get(hint)
     if get_args(hint) and not kinds:  # a Literal
         if saved not in get_args(hint):
-            raise TaskError(f"{where}: must be one of {get_args(hint)}, got {saved!r:.60}")
+            raise TaskError(f"{where}: must be one of {get_args(hint)}, got {shown(saved)}")
         return saved
+    number = isinstance(saved, int | float) and not isinstance(saved, bool)
+    if number and not abs(saved) < 1.0e300:
+        raise TaskError(f"{where}: must be finite, got {shown(saved)}")
     if kinds is None:
-        if saved is None or isinstance(saved, bool | int | float | str):
+        if hint is Any and (saved is None or isinstance(saved, bool | int | float | str)):
             return saved
-        raise TaskError(f"{where}: cannot be read, got {saved!r:.60}")
+        raise TaskError(f"{where}: expected {_word(hint)}, got {shown(saved)}")
     if isinstance(saved, bool) != (hint is bool) or not isinstance(saved, kinds):
-        raise TaskError(f"{where}: expected {hint.__name__}, got {saved!r:.60}")
+        raise TaskError(f"{where}: expected {_word(hint)}, got {shown(saved)}")
     return hint(saved)
+
+
+def _word(hint: Any) -> str:
+    """Return what a field of this type holds, in words."""
+    if get_origin(hint) is tuple:
+        return "a list"
+    if isinstance(hint, type) and (dataclasses.is_dataclass(hint) or issubclass(hint, Term)):
+        return f"settings by name, a {hint.__name__}"
+    return getattr(hint, "__name__", str(hint))
+
+
+def _check_kernels_types(task: TaskCfg) -> None:
+    """Raise TaskError unless state, settings and levels are what the kernels can read."""
+    if not NAME.fullmatch(task.name):
+        raise TaskError(f"task.name is of letters, digits, and _ . - or spaces, got {task.name!r:.60}")
+    if not isinstance(task.state, Struct) or "steps" not in task.state.vars:
+        raise TaskError("task.state is not a struct that counts steps")
+    settings = [] if task.reset.settings is None else [("reset.settings", task.reset.settings)]
+    settings += [(f"levels[{i}]", level) for i, level in enumerate(task.levels)]
+    for where, value in settings:
+        if not isinstance(getattr(value, "struct", None), Struct) or not callable(getattr(value, "values", None)):
+            raise TaskError(f"task.{where}: {shown(value)} is not for the kernels: it needs struct and values()")
+    if len({type(level) for level in task.levels}) > 1:
+        raise TaskError("task.levels must all be of one kind")

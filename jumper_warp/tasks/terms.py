@@ -13,6 +13,8 @@ from typing import Any, ClassVar, NamedTuple, get_type_hints
 import warp as wp
 
 from kernels.mdp.events import AT_RESET, AT_STEP, MODES
+from kernels.mdp.parameters import RobotParameters
+from kernels.mdp.view import RobotView
 
 REQUIRED = inspect.Parameter.empty
 AXES = {2: ("x", "y"), 3: ("x", "y", "z")}
@@ -25,6 +27,10 @@ class Term:
 
     context: ClassVar[int] = 2
     """How many arguments of the function come from the kernel."""
+    takes: ClassVar[tuple[Any, ...]] = (RobotView,)
+    """What the first of them may be."""
+    returns: ClassVar[tuple[Any, ...]] = ()
+    """What the function may return; anything if empty."""
     settings: ClassVar[dict[str, float]] = {}
     """Numbers that the kernel itself reads, with their defaults; they come before those of the function."""
     options: ClassVar[dict[str, Any]] = {}
@@ -45,6 +51,7 @@ class Term:
             raise ValueError(f"{kind}: {func!r:.60} is not a @wp.func")
         self.func, self.name = func, name or func.key.split(".")[-1]
         where = f"{kind} {self.name}"
+        self._check_types(where)
         params = list(inspect.signature(func.func).parameters.values())[self.context :]
         known = self.settings | {p.name: p.default for p in params}
         if len(known) < len(self.settings) + len(params) or set(known) & {"func", "name", *self.options}:
@@ -65,6 +72,16 @@ class Term:
                 raise ValueError(f"{where}: parameter {key!r} must be a finite number, got {value!r:.60}")
         self.options = {key: given.get(key, default) for key, default in type(self).options.items()}
         self.num_params = len(params)
+
+    def _check_types(self, where: str) -> None:
+        """Raise ValueError unless the function takes and returns what such a term's does."""
+        first = next(iter(self.func.input_types.values()), None)
+        if first is not Any and first not in self.takes:
+            takes = " or ".join(kind.key for kind in self.takes)
+            raise ValueError(f"{where}: the first argument of the function must be annotated {takes}")
+        returned = get_type_hints(self.func.func).get("return")
+        if self.returns and returned is not None and returned not in self.returns:
+            raise ValueError(f"{where}: the function must return {self.returns[0].__name__}, it returns {returned}")
 
     def replace(self, **changes: Any) -> Any:
         """Return the term with other numbers or options; raises ValueError as the constructor."""
@@ -93,6 +110,7 @@ class RewardTerm(Term):
 
     settings: ClassVar = {"weight": REQUIRED}
     options: ClassVar = {"once": False}
+    returns: ClassVar = (float, wp.float32)
 
     def __init__(self, func: wp.Function, weight: float, **given: Any) -> None:
         super().__init__(func, weight=weight, **given)
@@ -111,6 +129,7 @@ class TerminationTerm(Term):
     """
 
     options: ClassVar = {"time_out": False, "success": False}
+    returns: ClassVar = (bool, wp.bool)
 
 
 class ObservationTerm(Term):
@@ -122,6 +141,7 @@ class ObservationTerm(Term):
 
     settings: ClassVar = {"noise": 0.0, "scale": 1.0, "clip": 100.0}
     options: ClassVar = {"history": 1, "delayed": False}
+    takes: ClassVar = (RobotView, RobotParameters)
 
     def __init__(self, func: wp.Function, **given: Any) -> None:
         super().__init__(func, **given)
@@ -159,6 +179,7 @@ class EventTerm(Term):
 
     settings: ClassVar = {"least": 0.0, "most": 0.0}
     options: ClassVar = {"mode": "reset", "repack": True}
+    takes: ClassVar = (RobotParameters,)
 
     def __init__(self, func: wp.Function, **given: Any) -> None:
         super().__init__(func, **given)
@@ -187,6 +208,7 @@ class Curriculum(Term):
 
     settings: ClassVar = {"tolerance": REQUIRED, "promote_after": 5}
     options: ClassVar = {"counts": REQUIRED}
+    returns: ClassVar = (float, wp.float32)
 
     def __init__(self, func: wp.Function, **given: Any) -> None:
         super().__init__(func, **given)

@@ -9,6 +9,8 @@ from typing import NamedTuple
 import warp as wp
 from rich.console import Console
 
+from jumper_warp.utils.errors import InputError
+
 PACKAGES = ("jumper-warp", "warp-lang", "newton", "mujoco", "mujoco-warp", "torch", "numpy", "rsl-rl-lib")
 """Distributions whose version can change a figure."""
 
@@ -60,6 +62,19 @@ def report_device(device: wp.DeviceLike = None, console: Console | None = None) 
     console = console or Console(stderr=True)
     console.print(", ".join(parts), style="green" if good else "yellow", markup=False, highlight=False, soft_wrap=True)
     return info
+
+
+def announce(device: str | None) -> DeviceInfo:
+    """Print a line on the device that is going to be used, and silence Warp's notes on its modules.
+
+    Raises:
+        InputError: There is no such device.
+    """
+    wp.config.log_level = wp.LOG_WARNING
+    try:
+        return report_device(device)
+    except (ValueError, RuntimeError) as error:
+        raise InputError(f"no device {device!r:.60}") from error
 
 
 def git_commit(folder: Path | None = None) -> Commit | None:

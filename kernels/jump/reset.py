@@ -170,9 +170,12 @@ def draw_until_taken(
 
 
 @wp.func
-def draw_again(draw: Draw, ranges: ResetRanges, share: float) -> int:
-    """Return how many policy steps after touchdown another goal comes; 0: none, in all but a share of draws."""
-    steps = int(within(draw, 19, ranges.again_delay))
+def draw_again(draw: Draw, delay: wp.vec2, share: float) -> int:
+    """Return how many policy steps after touchdown another goal comes; 0: none, in all but a share of draws.
+
+    delay: range in policy steps.
+    """
+    steps = int(within(draw, 19, delay))
     return wp.where(between(draw, 18, 0.0, 1.0) < share, wp.max(steps, 1), 0)
 
 
@@ -187,7 +190,8 @@ def begin_task(
     task.start = pos
     task.max_height = pos[2]
     task.command_step = int(between(draw, 9, 0.0, float(ranges.command_delay) + 0.999))
-    task.again_step = draw_again(draw, ranges, jump_again)
+    task.again_delay = ranges.again_delay
+    task.again_step = draw_again(draw, ranges.again_delay, jump_again)
     if scheme == IN_FLIGHT or scheme == TOUCHDOWN:
         task.phase = FLIGHT
         task.command_step = 0
@@ -276,7 +280,9 @@ def another_jump_due(task: JumpState) -> bool:
 def draw_next_jump(view: RobotView, scene: Scene, task: JumpState, level: JumpLevel, draw: Draw) -> JumpState:
     """Return the state of an episode that goes on with another jump, to a drawn goal."""
     goal = draw_box(draw, 50, level.goal_lower, level.goal_upper)
-    return begin_next_jump(task, world_ground(scene.ground, view.world), goal, view.pos, yaw_of(view.quat))
+    new = begin_next_jump(task, world_ground(scene.ground, view.world), goal, view.pos, yaw_of(view.quat))
+    new.again_step = draw_again(draw, task.again_delay, level.jump_again)
+    return new
 
 
 @wp.func
@@ -288,10 +294,10 @@ def give_jump(view: RobotView, scene: Scene, task: JumpState, values: wp.vec4, h
     """
     here = world_ground(scene.ground, view.world)
     goal = wp.vec3(values[0], values[1], values[2])
-    if task.steps > 0:
-        if task.phase != LANDED:
-            return task
+    if task.phase == LANDED:
         return begin_next_jump(task, here, goal, view.pos, heading)
+    if task.phase != STANCE or task.steps > 0:
+        return task
     new = JumpState()
     new.heading = heading
     new.start = view.pos

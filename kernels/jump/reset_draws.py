@@ -47,7 +47,6 @@ class ResetRanges:
     landed_ahead: wp.vec2  # base ahead of the goal
     landed_speed: wp.vec2  # [m/s] downward
     command_delay: int  # most policy steps until the jump is commanded
-    jump_again: float  # share of landed robots that get another goal
     again_delay: wp.vec2  # policy steps after touchdown
 
 

@@ -31,6 +31,7 @@ class JumpState:
     peak_tilt: float  # [rad] largest between body and world z since touchdown
     scheme: int  # reset scheme that began the episode
     again_step: int  # policy steps after touchdown at which another goal comes, 0: never
+    again_delay: wp.vec2  # policy steps between which that of yet another goal is drawn
     jumps: int  # jumps that were followed by another in this episode
 
 

@@ -6,7 +6,7 @@ import warp as wp
 
 from ..terrain.ground import Ground
 from .env import EnvArrays, SkillSettings
-from .parameters import RobotParameters, set_gains
+from .parameters import RobotParameters, set_motor
 from .view import RobotArrays, load_view
 
 wp.set_module_options({"enable_backward": False})
@@ -19,7 +19,7 @@ def hand_over(
     robot: RobotArrays, parameters: RobotParameters, env: EnvArrays, skills: wp.array(dtype=SkillSettings),
     world: int, target: int,
 ):  # fmt: skip
-    """Make another skill the active one: its gains from now on, and as last action the one that holds the targets."""
+    """Make another skill the active one: its motors from now on, and as last action the one that holds the targets."""
     env.skill[world] = target
     env.request[world] = NONE
     env.fresh[world] = 1
@@ -28,7 +28,7 @@ def hand_over(
         action = wp.clamp(off / skills[target].action_scale[m], -1.0, 1.0)
         robot.action[m, world] = action
         robot.old_action[m, world] = action
-        set_gains(parameters, world, m)
+        set_motor(parameters, world, m)
 
 
 def make_handover_kernel(handover: Any) -> wp.Kernel:

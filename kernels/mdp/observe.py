@@ -1,4 +1,4 @@
-"""The stage that observes: terms of all groups, with latency, noise, clipping, scale and history."""
+"""The stage that observes: terms of all groups, then latency, noise, clipping, scale and history."""
 
 from typing import Any
 
@@ -12,26 +12,31 @@ from .view import RobotArrays, load_view
 
 wp.set_module_options({"enable_backward": False})
 
+CHUNK = 12
+"""Terms that one thread evaluates: each chunk loads the robot once, and chunks run side by side."""
+
 
 @wp.struct
-class Slot:
-    """Where an observation term stands in the rows of its group."""
+class Column:
+    """Where a component of an observation term comes from and stands in the rows of its group."""
 
+    raw: int  # its place in the row of raw values
     group: int
     start: int  # of the group's rows
     stride: int  # columns of the group
     first: int  # of noise, scale and clip in the array of numbers
-    column: int  # of its oldest frame
-    width: int  # of a frame
+    oldest: int  # column of its oldest frame
+    width: int  # columns of a frame
     history: int  # number of frames
     delayed: int  # 1: comes as late as the world's sensors do
-    past: int  # column in the ring of past frames
+    past: int  # column in the ring of past values
 
 
 @wp.struct
 class ObservationArrays:
     """Observations of all worlds, one row a world, one group after the other."""
 
+    raw: wp.array2d(dtype=float)  # (num_worlds, components) what the terms gave
     now: wp.array(dtype=float)  # of the next step; an ended episode has begun anew
     final: wp.array(dtype=float)  # the same before that new beginning
     past: wp.array3d(dtype=float)  # (depth, num_worlds, columns) what sensors gave, a ring over policy steps
@@ -40,16 +45,64 @@ class ObservationArrays:
 
 
 @wp.func
-def store(value: float, i: int, out: wp.array(dtype=float)):
+def store(value: float, world: int, column: int, out: wp.array2d(dtype=float)):
     """Write a number."""
-    out[i] = value
+    out[world, column] = value
 
 
 @wp.func
-def store(value: Any, i: int, out: wp.array(dtype=float)):  # noqa: F811
+def store(value: Any, world: int, column: int, out: wp.array2d(dtype=float)):  # noqa: F811
     """Write a vector."""
     for j in range(len(value)):
-        out[i + j] = value[j]
+        out[world, column + j] = value[j]
+
+
+def make_observe_kernel(task: Any) -> wp.Kernel:
+    """Return the kernel that evaluates all observation terms of a task."""
+    rows = [row for group in task.groups for row in task.rows[group]]
+    of_parameters = [row.func.input_types[next(iter(row.func.input_types))] is RobotParameters for row in rows]
+    places = [sum(row.term.width for row in rows[:i]) for i in range(len(rows))]
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def observe_kernel(
+        # in
+        skill: int,
+        robot: RobotArrays,
+        parameters: RobotParameters,
+        ground: Ground,
+        env: EnvArrays,
+        states: wp.array(dtype=task.state),
+        p: wp.array(dtype=float),
+        beginning: int,
+        # out
+        raw: wp.array2d(dtype=float),
+    ):
+        """Write what the terms give; one thread per (chunk of terms, world).
+
+        beginning 1: only where an episode or the skill has just begun.
+        """
+        chunk, world = wp.tid()
+        if env.skill[world] != skill or (beginning != 0 and env.fresh[world] == 0):
+            return
+        for c in range(wp.static((len(rows) + CHUNK - 1) // CHUNK)):
+            if chunk == c:
+                view = load_view(robot, ground, world)
+                for i in range(wp.static(c * CHUNK), wp.static(min((c + 1) * CHUNK, len(rows)))):
+                    if wp.static(of_parameters[i]):
+                        store(wp.static(rows[i].func)(parameters, world), world, wp.static(places[i]), raw)
+                    elif wp.static(rows[i].plain):
+                        store(wp.static(rows[i].func)(view, states[world]), world, wp.static(places[i]), raw)
+                    else:
+                        store(
+                            wp.static(rows[i].func)(
+                                view, states[world], *p[wp.static(rows[i].lo) : wp.static(rows[i].hi)]
+                            ),
+                            world,
+                            wp.static(places[i]),
+                            raw,
+                        )
+
+    return observe_kernel
 
 
 @wp.func
@@ -68,75 +121,45 @@ def late(arrays: ObservationArrays, clock: int, world: int, column: int, value: 
     return newer + share * (arrays.past[(clock - whole - 1) % depth, world, column] - newer)
 
 
-def make_observe_kernel(task: Any) -> wp.Kernel:
-    """Return the kernel of all observation groups of a task.
+@wp.kernel
+def condition_kernel(
+    # in
+    skill: int,
+    env: EnvArrays,
+    columns: wp.array(dtype=Column),
+    p: wp.array(dtype=float),
+    beginning: int,
+    # in, out
+    arrays: ObservationArrays,
+):
+    """Turn raw values into observations; one thread per (world, component). Rows of worlds that came apart are 0.
 
-    One thread per (term, world): neighbours run the same term. Only the terms are unrolled; what all share is a loop.
+    beginning 1: only where an episode or the skill has just begun, and `final` stays.
     """
-    rows = [row for group in task.groups for row in task.rows[group]]
-    of_parameters = [row.func.input_types[next(iter(row.func.input_types))] is RobotParameters for row in rows]
-
-    @wp.kernel(module="unique", enable_backward=False)
-    def observe_kernel(
-        # in
-        skill: int,
-        robot: RobotArrays,
-        parameters: RobotParameters,
-        ground: Ground,
-        env: EnvArrays,
-        states: wp.array(dtype=task.state),
-        slots: wp.array(dtype=Slot),
-        p: wp.array(dtype=float),
-        beginning: int,
-        # in, out
-        arrays: ObservationArrays,
-    ):
-        """Write the observations; rows of worlds that came apart are 0.
-
-        beginning 1: only where an episode or the skill has just begun, and `final` stays.
-        """
-        row, world = wp.tid()
-        if env.skill[world] != skill or (beginning != 0 and env.fresh[world] == 0):
-            return
-        slot = slots[row]
-        oldest = slot.start + world * slot.stride + slot.column
-        newest = oldest + (slot.history - 1) * slot.width
-        for k in range(oldest, newest):
-            arrays.now[k] = arrays.now[k + slot.width]
-        if env.broken[world] == 0:
-            for i in range(wp.static(len(rows))):
-                if row == i:
-                    if wp.static(of_parameters[i]):
-                        store(wp.static(rows[i].func)(parameters, world), newest, arrays.now)
-                    else:
-                        view = load_view(robot, ground, world)
-                        if wp.static(rows[i].plain):
-                            store(wp.static(rows[i].func)(view, states[world]), newest, arrays.now)
-                        else:
-                            store(
-                                wp.static(rows[i].func)(
-                                    view, states[world], *p[wp.static(rows[i].lo) : wp.static(rows[i].hi)]
-                                ),
-                                newest,
-                                arrays.now,
-                            )
-        else:
-            for j in range(slot.width):
-                arrays.now[newest + j] = 0.0
-        draw = make_draw(env.seed, world, env.clock[world], OBSERVATION + slot.group)
-        for j in range(slot.width):
-            value = arrays.now[newest + j]
-            if slot.delayed != 0:
-                value = late(arrays, env.clock[world], world, slot.past + j, value, env.fresh[world])
-            if p[slot.first] > 0.0 and env.broken[world] == 0:
-                value += p[slot.first] * cut_gaussian(draw, slot.column + j)
-            value = p[slot.first + 1] * wp.clamp(value, -p[slot.first + 2], p[slot.first + 2])
-            arrays.now[newest + j] = value
-            if env.fresh[world] != 0:
-                for k in range(slot.history - 1):
-                    arrays.now[oldest + k * slot.width + j] = value
+    world, component = wp.tid()
+    if env.skill[world] != skill or (beginning != 0 and env.fresh[world] == 0):
+        return
+    column = columns[component]
+    value = arrays.raw[world, column.raw]
+    broken = env.broken[world] != 0
+    if broken:
+        value = 0.0
+    if column.delayed != 0:
+        value = late(arrays, env.clock[world], world, column.past, value, env.fresh[world])
+    noise = p[column.first]
+    if noise > 0.0 and not broken:
+        draw = make_draw(env.seed, world, env.clock[world], OBSERVATION + column.group)
+        value += noise * cut_gaussian(draw, column.oldest)
+    value = p[column.first + 1] * wp.clamp(value, -p[column.first + 2], p[column.first + 2])
+    i = column.start + world * column.stride + column.oldest
+    for _ in range(column.history - 1):
+        frame = arrays.now[i + column.width]
+        if env.fresh[world] != 0:
+            frame = value
+        arrays.now[i] = frame
         if beginning == 0:
-            for k in range(oldest, newest + slot.width):
-                arrays.final[k] = arrays.now[k]
-
-    return observe_kernel
+            arrays.final[i] = frame
+        i += column.width
+    arrays.now[i] = value
+    if beginning == 0:
+        arrays.final[i] = value

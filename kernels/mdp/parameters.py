@@ -10,7 +10,7 @@ from ..actuation.motors import MotorArrays
 from ..layout import BODIES, DOFS, motor_slot
 from .random import Draw, between
 
-wp.set_module_options({"enable_backward": False})
+wp.set_module_options({"enable_backward": False, "max_unroll": 1})  # long loops in short code
 
 
 @wp.struct
@@ -32,6 +32,7 @@ class RobotParameters:
     observation_latency: wp.array(dtype=int)  # [physics steps] (num_worlds,) from sensor to policy
     push: wp.array(dtype=wp.spatial_vector)  # [N], [N m] (num_worlds,) on the base at its com, world axes
     gain_ratio: wp.array2d(dtype=wp.vec2)  # [1] (12, num_worlds) of kp and kd to those of the active skill
+    speed_ratio: wp.array2d(dtype=wp.vec2)  # [1] (12, num_worlds) of no-load and cutoff speed likewise
     physics_dt: float  # [s]
     nominal_mass: wp.array(dtype=float)  # (21,) of one world, like all below
     nominal_com: wp.array(dtype=wp.vec3)
@@ -94,11 +95,41 @@ def motor_friction(robot: RobotParameters, draw: Draw, lower: float, upper: floa
 
 @wp.func
 def set_gains(robot: RobotParameters, world: int, m: int):
-    """Write gains and torque limit of a motor: those of the active skill, by the drawn ratios."""
+    """Write gains of a motor: those of the active skill, by the drawn ratios."""
     skill = robot.skill[world]
     robot.motors.kp[m, world] = robot.nominal_kp[skill, m] * robot.gain_ratio[m, world][0]
     robot.motors.kd[m, world] = robot.nominal_kd[skill, m] * robot.gain_ratio[m, world][1]
-    robot.motors.saturation[m, world] = robot.nominal_saturation[skill, m]
+
+
+@wp.func
+def set_speed_limits(robot: RobotParameters, world: int, m: int):
+    """Write speed limits of a motor likewise; a drawn cutoff stays below the no-load speed."""
+    skill = robot.skill[world]
+    ratio = robot.speed_ratio[m, world]
+    no_load = robot.nominal_no_load[skill, m] * ratio[0]
+    cutoff = robot.nominal_cutoff[skill, m] * ratio[1]
+    if ratio[0] != 1.0 or ratio[1] != 1.0:
+        cutoff = wp.min(cutoff, 0.95 * no_load)
+    robot.motors.no_load_speed[m, world] = no_load
+    robot.motors.cutoff_speed[m, world] = cutoff
+
+
+@wp.func
+def set_motor(robot: RobotParameters, world: int, m: int):
+    """Write all constants of a motor that depend on the active skill."""
+    set_gains(robot, world, m)
+    set_speed_limits(robot, world, m)
+    robot.motors.saturation[m, world] = robot.nominal_saturation[robot.skill[world], m]
+
+
+@wp.kernel
+def motors_kernel(
+    # in, out
+    robot: RobotParameters,
+):
+    """Give every world the motors of its skill; one thread per (motor, world)."""
+    m, world = wp.tid()
+    set_motor(robot, world, m)
 
 
 @wp.func
@@ -115,12 +146,11 @@ def speed_limits(
     cutoff_upper: float,
 ):  # fmt: skip
     """Scale no-load and cutoff speed of each motor; the cutoff stays below the no-load speed."""
-    skill = robot.skill[draw.world]
     for m in range(12):
-        no_load = robot.nominal_no_load[skill, m] * between(draw, m, no_load_lower, no_load_upper)
-        cutoff = robot.nominal_cutoff[skill, m] * between(draw, 12 + m, cutoff_lower, cutoff_upper)
-        robot.motors.no_load_speed[m, draw.world] = no_load
-        robot.motors.cutoff_speed[m, draw.world] = wp.min(cutoff, 0.95 * no_load)
+        robot.speed_ratio[m, draw.world] = wp.vec2(
+            between(draw, m, no_load_lower, no_load_upper), between(draw, 12 + m, cutoff_lower, cutoff_upper)
+        )
+        set_speed_limits(robot, draw.world, m)
 
 
 @wp.func

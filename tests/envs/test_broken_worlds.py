@@ -7,12 +7,14 @@ import numpy as np
 import pytest
 import torch
 import warp as wp
-from jump_helpers import edit_coordinates, edit_episodes, make_env, only, rule_names
+from jump_helpers import edit_coordinates, edit_episodes, ending_names, make_env, only
 
+from jumper_warp.envs.arrays import FIRST_CLOCK
 from jumper_warp.registry import make_task
-from jumper_warp.tasks.cfg import Term
+from jumper_warp.tasks.terms import RewardTerm
 from kernels.jump import rewards
-from kernels.jump.task import LANDED, JumpTask, RobotView
+from kernels.jump.state import LANDED, JumpState
+from kernels.mdp.view import RobotView
 
 TASK = make_task("vertical-jump")
 N = 32
@@ -20,9 +22,9 @@ REST = torch.zeros((N, 12))
 
 
 @wp.func
-def poisonous_term(view: RobotView, task: JumpTask, p: wp.vec4) -> float:
-    """Infinity times p0."""
-    return p[0] * wp.inf
+def poisonous_term(view: RobotView, task: JumpState, sign: float) -> float:
+    """Infinity times the sign."""
+    return sign * wp.inf
 
 
 @pytest.fixture(scope="module")
@@ -58,40 +60,64 @@ SUCCEEDING = {"phase": LANDED, "phase_steps": 100}
 def test_a_world_that_came_apart_ends_at_once_and_touches_no_other(env, case, episode):
     outcomes = []
     for broken in (False, True):
-        env._random.assign(np.arange(1, N + 1, dtype=np.uint32))
+        env.worlds.clock.fill_(FIRST_CLOCK)  # the same draws
         env.reset()
         edit_episodes(env, command_step=1000)
         if broken:
             edit_coordinates(env, 9, **BROKEN[case])
             edit_episodes(env, 9, **episode)
         env.step(REST)
-        ended = (rule_names(env)[9], env.reward[9].item(), env.timeout[9].item())
-        outcomes.append([env.obs.clone(), env.final_obs.clone(), env.reward.clone(), env._invalid.numpy().copy()])
+        ended = (ending_names(env)[9], env.reward[9].item(), env.timeout[9].item())
+        tensors = (env.obs, env.critic_obs, env.final_obs, env.final_critic_obs, env.reward)
+        outcomes.append([*(tensor.clone() for tensor in tensors), env.robot.invalid.numpy().copy()])
     assert ended == ("came_apart", 0.0, 0.0)
     others = [world for world in range(N) if world != 9]
-    for whole, harmed in zip(outcomes[0][:3], outcomes[1][:3], strict=True):
+    for whole, harmed in zip(outcomes[0][:-1], outcomes[1][:-1], strict=True):
         assert torch.equal(whole[others], harmed[others])
         assert torch.isfinite(harmed).all()
     assert outcomes[1][0].abs().max() < 50.0  # a new episode's
-    assert not outcomes[1][3].any()
+    assert not outcomes[1][-1].any()
 
 
 @pytest.mark.parametrize("sign", [1.0, 0.0, -1.0], ids=["infinite", "nan", "minus infinite"])
 def test_a_term_that_is_not_finite_is_named_and_never_rewarded(sign):
-    task = dataclasses.replace(
-        TASK, terms=(Term(rewards.orientation, 1.0, (0.1, 1.0)), Term(poisonous_term, 1.0, (sign,)))
-    )
+    sound = RewardTerm(rewards.orientation, 1.0, width=0.1, share=1.0)
+    task = dataclasses.replace(TASK, rewards=(sound, RewardTerm(poisonous_term, 1.0, sign=sign)))
     env = make_env(N, task=task)
     env.step(REST)
     assert torch.isfinite(env.reward).all() and env.reward.max() <= 1.0 / 60.0
     assert [n for n, value in env.metrics().items() if not math.isfinite(value)] == ["Episode_Reward/poisonous_term"]
 
 
-@pytest.mark.parametrize("value", [NAN, INF, -INF, 7.0])
+@pytest.mark.parametrize("value", [7.0, -7.0])
 def test_an_action_out_of_bounds_acts_as_one_within(env, value):
     env.reset()
     action = REST.clone()
     action[4, 7] = value
     env.step(action)
     assert torch.isfinite(env.obs).all() and env.done[4] == 0.0
-    assert abs(env.obs[4, 36 + 7].item()) == 1.0
+    assert env.obs[4, 36 + 7].item() == math.copysign(1.0, value)
+
+
+@pytest.mark.parametrize("value", [NAN, INF, -INF])
+def test_an_action_that_is_not_finite_is_counted_and_ends_its_world_only(env, value):
+    outcomes = []
+    for wrong in (0.0, value):
+        env.worlds.clock.fill_(FIRST_CLOCK)
+        env.reset()
+        edit_episodes(env, command_step=1000)
+        env.metrics()
+        action = REST.clone()
+        action[4, 7] = wrong
+        env.step(action)
+        tensors = (env.obs, env.final_obs, env.reward)
+        outcomes.append([*(tensor.clone().numpy() for tensor in tensors), env.sim.joint_q().copy()])
+    others = [world for world in range(N) if world != 4]
+    for whole, harmed in zip(*outcomes, strict=True):
+        np.testing.assert_array_equal(whole[others], harmed[others])
+        assert np.isfinite(harmed).all()
+    assert ending_names(env) == ["" if world != 4 else "came_apart" for world in range(N)]
+    assert (env.reward[4].item(), env.done[4].item(), env.timeout[4].item()) == (0.0, 1.0, 0.0)
+    assert env.metrics()["Metrics/bad_actions"] == 1.0
+    env.step(REST)  # the next action is a sound one
+    assert ending_names(env) == [""] * N and env.metrics()["Metrics/bad_actions"] == 0.0

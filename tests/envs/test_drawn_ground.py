@@ -6,14 +6,15 @@ import math
 import numpy as np
 import pytest
 import torch
-from jump_helpers import edit_coordinates, edit_episodes, make_env, only
+from jump_helpers import edit_coordinates, edit_episodes, make_env, only, resets_of, resetting
 from simulation_helpers import PAW_RADIUS, paw_centres
 
-from jumper_warp.envs.env import JumpEnv
+from jumper_warp.envs.env import Env
 from jumper_warp.registry import make_task
 from jumper_warp.robot.grounds import BlockCfg, platform
-from jumper_warp.tasks.cfg import GroundCfg, TaskCfg
-from kernels.jump.task import LANDED, STANCE
+from jumper_warp.tasks.cfg import TaskCfg
+from jumper_warp.tasks.jump.cfg import GroundCfg, ResetCfg
+from kernels.jump.state import LANDED, STANCE
 
 N = 16
 REST = torch.zeros((N, 12))
@@ -24,18 +25,19 @@ HALF_SPACE = BlockCfg((5.0, 0.0), half=(4.5, 6.0), height=0.06, mass=1.0e6)
 def ground_task(**shares) -> TaskCfg:
     """Return the horizontal jump with far goals, whose starts have drawn grounds."""
     task = make_task("horizontal-jump")
-    return dataclasses.replace(task, levels=task.levels[-1:], ground=GroundCfg(**(shares or {"block": 1.0})))
+    task = dataclasses.replace(task, levels=task.levels[-1:])
+    return resetting(task, dataclasses.replace(task.reset.settings, ground=GroundCfg(**(shares or {"block": 1.0}))))
 
 
-def blocks_of(env: JumpEnv) -> np.ndarray:
-    return env._dynamics.robot.ground.blocks.numpy()
+def blocks_of(env: Env) -> np.ndarray:
+    return env.sim.physics.dynamics.robot.ground.blocks.numpy()
 
 
 # ---------------------------------------------------------------- when
 
 
 def test_a_randomised_training_draws_its_ground_from_the_first_reset_on():
-    env = JumpEnv(ground_task(), N, device="cpu")
+    env = Env(ground_task(), N, device="cpu")
     assert not blocks_of(env)["exists"].any() and len(blocks_of(env)) == N
     env.reset()
     assert blocks_of(env)["exists"].any()
@@ -55,19 +57,20 @@ def test_a_randomised_training_draws_its_ground_from_the_first_reset_on():
 )
 def test_nothing_is_drawn_otherwise(arguments):
     env = make_env(2, **({"task": ground_task(), "randomize": True} | arguments))
-    assert not env.drawn_ground.drawn and env.sim.block is None and len(blocks_of(env)) == 0
+    assert not resets_of(env).ground.drawn and env.sim.block is None and len(blocks_of(env)) == 0
 
 
 def test_a_block_that_is_given_stays_as_it_is():
     env = make_env(2, task=ground_task(), randomize=True, block=HALF_SPACE)
     found = blocks_of(env)
-    assert not env.drawn_ground.drawn and found["exists"].all()
+    assert not resets_of(env).ground.drawn and found["exists"].all()
     np.testing.assert_allclose(found["center"], [HALF_SPACE.center] * 2)
     np.testing.assert_allclose(found["height"], 0.06)
 
 
 def test_an_evaluation_levels_the_ground_and_a_reset_draws_it_again():
-    env = make_env(N, task=ground_task(platform=0.5, block=0.5), reset=only("default"), randomize=True)
+    ground = GroundCfg(platform=0.5, block=0.5)
+    env = make_env(N, task=ground_task(), reset=only("default", ResetCfg(ground=ground)), randomize=True)
     assert blocks_of(env)["exists"].any()
     env.evaluation_reset(np.tile([1.5, 0.0, 0.0], (N, 1)))
     assert not blocks_of(env)["exists"].any() and not env.task_arrays()["goal_ground"].any()
@@ -96,8 +99,8 @@ def test_an_evaluation_stands_robots_on_the_block_below_them():
     np.testing.assert_allclose(env.obs[:, 2], env.sim.model.joint_q.numpy()[2], atol=1e-5)
     for _ in range(20):
         env.step(REST)
-        assert not env.done.any() and not env._invalid.numpy().any()
-    env._dynamics.full_state(*(getattr(env.sim.state, name) for name in ("joint_q", "joint_qd", "body_q", "body_qd")))
+        assert not env.done.any() and not env.robot.invalid.numpy().any()
+    env.sim.physics.write_bodies()
     np.testing.assert_allclose(paw_centres(env.sim)[..., 2], tops[:, None] + PAW_RADIUS + np.zeros(4), atol=2e-3)
 
 
@@ -131,7 +134,7 @@ def on_block(goal: np.ndarray) -> np.ndarray:
 
 def test_the_next_jump_of_an_evaluation_knows_the_ground_at_its_goal(landed):
     goals = np.tile([0.75, 0.3, 0.0], (N, 1))
-    landed.next_jump(goals, np.arange(N) > 1)
+    landed.command(goals, np.arange(N) > 1)
     found = landed.task_arrays()
     assert (found["phase"][2:] == STANCE).all() and (found["phase"][:2] == LANDED).all()
     np.testing.assert_array_equal(found["goal_ground"][:2], -7.0)
@@ -141,7 +144,7 @@ def test_the_next_jump_of_an_evaluation_knows_the_ground_at_its_goal(landed):
 
 def test_another_jump_of_an_episode_knows_the_ground_at_its_goal(landed):
     edit_episodes(landed, again_step=5, level=4)
-    landed._begin(landed._out.done)
+    landed._begin(landed.worlds.done)
     found = landed.task_arrays()
     assert (found["phase"] == STANCE).all() and (found["jumps"] == 1).all() and not landed.done.any()
     np.testing.assert_allclose(found["goal_ground"], on_block(found["goal"]), atol=1e-6)
@@ -151,8 +154,8 @@ def test_another_jump_of_an_episode_knows_the_ground_at_its_goal(landed):
 def test_another_jump_looks_for_its_goal_on_the_block_where_it_is_now(landed):
     moved = blocks_of(landed)
     moved["center"][:, 0] += 20.0
-    landed._dynamics.robot.ground.blocks.assign(moved)
-    landed.next_jump(np.tile([0.75, 0.3, 0.0], (N, 1)), np.full(N, True))
+    landed.sim.physics.dynamics.robot.ground.blocks.assign(moved)
+    landed.command(np.tile([0.75, 0.3, 0.0], (N, 1)))
     assert not landed.task_arrays()["goal_ground"].any()
 
 

@@ -8,18 +8,22 @@ import warp as wp
 from jump_helpers import (
     edit_coordinates,
     edit_episodes,
+    ending_names,
+    episodes_of,
     make_env,
     only,
     random_actions,
-    rule_names,
 )  # fmt: skip
 from jump_oracle import expected_terms, robot_of
 
-from jumper_warp.envs.env import JumpEnv
+from jumper_warp.envs.env import Env
+from jumper_warp.evaluation.jumps import jump_commands
 from jumper_warp.registry import make_task
-from jumper_warp.tasks.cfg import Rule, TaskCfg, Term
-from kernels.jump import rewards, terminations
-from kernels.jump.task import FLIGHT, LANDED, STANCE, JumpTask, RobotView
+from jumper_warp.tasks.cfg import TaskCfg
+from jumper_warp.tasks.terms import RewardTerm, TerminationTerm
+from kernels.jump.state import FLIGHT, LANDED, STANCE, JumpState
+from kernels.mdp import rewards, terminations
+from kernels.mdp.view import RobotView
 
 TASK = make_task("vertical-jump")
 N = 32
@@ -29,12 +33,12 @@ STRETCH = torch.tensor([0.0, -1.0, -1.0] * 4).repeat(N, 1)
 
 
 @wp.func
-def my_own_term(view: RobotView, task: JumpTask, p: wp.vec4) -> float:
-    """Height of the base times p0."""
-    return p[0] * view.pos[2]
+def my_own_term(view: RobotView, task: JumpState, scale: float) -> float:
+    """Height of the base times a scale."""
+    return scale * view.pos[2]
 
 
-def stand(env: JumpEnv, **fields) -> None:
+def stand(env: Env, **fields) -> None:
     """Begin episodes in the default pose, and overwrite fields of all of them."""
     env.reset()
     edit_episodes(env, **fields)
@@ -46,7 +50,7 @@ def env():
     return make_env(N, reset=only("default"))
 
 
-# ---------------------------------------------------------------- rewards and rules
+# ---------------------------------------------------------------- rewards and terminations
 
 
 @pytest.fixture(scope="module")
@@ -61,23 +65,22 @@ def rollout():
         env.auto_reset = False
         env.step(action)
         after = robot_of(env)
-        logged.append(env._out.term_value.numpy().copy())
+        logged.append(env.skills[0].term_value.numpy().copy())
         expected.append(expected_terms(TASK, before, after, action.clamp(-1.0, 1.0).numpy().T))
         rewarded.append(env.reward.clone().numpy())
         phases.append(after["phase"])
-        done = wp.clone(env._out.done)
-        env._begin(done)
+        env._begin(wp.clone(env.worlds.done))
     return np.array(logged), np.array(expected), np.array(rewarded), np.array(phases)
 
 
 def test_the_rollout_meets_every_phase_and_term(rollout):
     logged, _, _, phases = rollout
     assert {int(STANCE), int(FLIGHT), int(LANDED)} == set(np.unique(phases).tolist())
-    paid = {term.name for term, values in zip(TASK.terms, logged.transpose(1, 0, 2), strict=True) if values.any()}
-    assert paid == {term.name for term in TASK.terms}
+    paid = {term.name for term, values in zip(TASK.rewards, logged.transpose(1, 0, 2), strict=True) if values.any()}
+    assert paid == {term.name for term in TASK.rewards}
 
 
-@pytest.mark.parametrize("index", range(len(TASK.terms)), ids=[term.name for term in TASK.terms])
+@pytest.mark.parametrize("index", range(len(TASK.rewards)), ids=[term.name for term in TASK.rewards])
 def test_a_term_is_logged_as_computed_by_hand(rollout, index):
     logged, expected, _, _ = rollout
     scale = np.abs(expected[:, index]).max()
@@ -91,7 +94,7 @@ def test_the_reward_is_the_sum_of_the_terms_but_not_negative(rollout):
     assert (total < -0.1).any() and (rewarded >= 0.0).all()
 
 
-RULE_CASES = {
+ENDING_CASES = {
     "success": {"phase": LANDED, "phase_steps": 59, "steps": 5000},  # holds together with too_long
     "low_base": {},
     "moved_away": {"start": (0.3, 0.0, 0.3)},
@@ -100,16 +103,17 @@ RULE_CASES = {
 }
 
 
-@pytest.mark.parametrize("rule", RULE_CASES)
-def test_a_rule_ends_the_episode(env, rule):
+@pytest.mark.parametrize("ending", ENDING_CASES)
+def test_a_termination_ends_the_episode(env, ending):
     stand(env, command_step=1000)
-    edit_episodes(env, 3, **RULE_CASES[rule])
-    if rule == "low_base":
+    edit_episodes(env, 3, **ENDING_CASES[ending])
+    if ending == "low_base":
         edit_coordinates(env, 3, q={2: 0.05})
     env.step(REST)
-    assert rule_names(env) == ["" if world != 3 else rule for world in range(N)]
+    assert ending_names(env) == ["" if world != 3 else ending for world in range(N)]
     assert env.done.tolist() == [float(world == 3) for world in range(N)]
-    assert env.timeout.tolist() == [float(world == 3 and rule in ("success", "too_long")) for world in range(N)]
+    without_failure = ending in ("success", "too_long")
+    assert env.timeout.tolist() == [float(world == 3 and without_failure) for world in range(N)]
 
 
 def test_counters_are_means_of_the_episodes_that_ended(env):
@@ -119,13 +123,13 @@ def test_counters_are_means_of_the_episodes_that_ended(env):
     edit_episodes(env, slice(3, 7), steps=200, command_step=0)
     edit_episodes(env, slice(7, 9), phase=LANDED, phase_steps=59, scheme=4)  # begun just landed: not counted
     env.step(REST)
-    total = env._out.term_value.numpy().sum(axis=1)
+    total = env.skills[0].term_value.numpy().sum(axis=1)
     figures = env.metrics()
     assert figures["Metrics/success"] == pytest.approx(3.0 / 7.0)
     assert figures["Metrics/error_m"] == pytest.approx(0.03, abs=1e-6)
     assert figures["Episode_Termination/success"] == pytest.approx(5.0 / 9.0)
     assert figures["Episode_Termination/no_jump"] == pytest.approx(4.0 / 9.0)
-    for term, value in zip(TASK.terms, total, strict=True):
+    for term, value in zip(TASK.rewards, total, strict=True):
         assert figures[f"Episode_Reward/{term.name}"] == pytest.approx(value / 9.0, rel=1e-4, abs=1e-6)
     cleared = env.metrics()
     assert not any(value for name, value in cleared.items() if not name.startswith("Curriculum"))
@@ -147,10 +151,10 @@ def test_five_successes_in_a_row_raise_the_level(env):
     stand(env, level=0, streak=0, command_step=1000)
     for count in range(1, 5):
         finish(env, [0, 1], True)
-        assert env.task_arrays()["streak"][:2].tolist() == [count] * 2
+        assert episodes_of(env)["streak"][:2].tolist() == [count] * 2
     finish(env, [1], False)
     finish(env, [0, 1], True)
-    arrays = env.task_arrays()
+    arrays = episodes_of(env)
     assert arrays["level"].tolist() == [1] + [0] * (N - 1)
     assert arrays["streak"][:3].tolist() == [0, 1, 0]
 
@@ -171,10 +175,19 @@ def test_other_starts_do_not_count_for_the_curriculum(env, scheme, success):
     stand(env, level=1, streak=3, command_step=1000)
     edit_episodes(env, [0], scheme=scheme)
     finish(env, [0], success)
-    assert (env.task_arrays()["level"][0], env.task_arrays()["streak"][0]) == (1, 3)
+    assert (episodes_of(env)["level"][0], episodes_of(env)["streak"][0]) == (1, 3)
 
 
 # ---------------------------------------------------------------- beginning anew
+
+
+def drawn_of(env) -> dict[str, np.ndarray]:
+    """Return the drawn parameters; the world is the last index."""
+    parameters, motors = env.parameters, env.parameters.motors
+    found = {name: getattr(parameters, name).numpy().copy() for name in ("latency", "static_ratio")}
+    found |= {name: getattr(motors, name).numpy().copy() for name in ("kp", "kd", "no_load_speed", "offset")}
+    table = env.sim.physics.dynamics.robot.table
+    return found | {"table": table.numpy().copy(), "push": parameters.push.numpy().T.copy()}
 
 
 def twins(**arguments):
@@ -198,8 +211,10 @@ def test_a_new_episode_leaves_other_worlds_alone():
         assert torch.equal(getattr(one, name)[rest], getattr(other, name)[rest]), name
     np.testing.assert_array_equal(one.sim.joint_q()[rest], other.sim.joint_q()[rest])
     np.testing.assert_array_equal(one.sim.joint_qd()[rest], other.sim.joint_qd()[rest])
-    np.testing.assert_array_equal(one._random.numpy()[rest], other._random.numpy()[rest])
-    assert (one.tasks.numpy()[rest] == other.tasks.numpy()[rest]).all()
+    np.testing.assert_array_equal(one.worlds.clock.numpy()[rest], other.worlds.clock.numpy()[rest])
+    for name, values in drawn_of(one).items():
+        np.testing.assert_array_equal(values[..., rest], drawn_of(other)[name][..., rest], err_msg=name)
+    assert (one.skills[0].states.numpy()[rest] == other.skills[0].states.numpy()[rest]).all()
 
 
 def test_the_last_observation_of_an_episode_is_kept_beside_the_first_of_the_next():
@@ -224,31 +239,30 @@ def test_a_new_episode_forgets_the_old_one():
     edit_episodes(env, phase=LANDED, phase_steps=59, idle_steps=7)
     env.step(random_actions(N, 1)[0])
     assert env.done.all()
-    arrays, views = env.task_arrays(), env._views
+    arrays, robot = env.task_arrays(), env.robot
     for name in ("steps", "phase", "phase_steps", "idle_steps", "took_off", "touched_down", "at_apex", "apex_passed"):
         assert not arrays[name].any(), name
-    for name in ("action", "old_action", "old_rate", "torque"):
-        assert not getattr(views, name).numpy().any(), name
+    for name in ("action", "old_action", "old_rate", "torque", "old_torque", "paw_force", "impulse", "contact_time",
+                 "air_time", "touchdown_speed", "peak_force", "old_lin_vel"):  # fmt: skip
+        assert not getattr(robot, name).numpy().any(), name
     assert not env.obs[:, -12:].any() and env.final_obs[:, -12:].any()
-    assert not views.paw_force.numpy().any() and not env._impulse.numpy().any()
-    assert not views.old_lin_vel.numpy().any()
     angles = env.sim.joint_q()[:, 7:27].reshape(N, 4, 5)[:, :, [0, 1, 3]].reshape(N, 12)
-    np.testing.assert_array_equal(views.safe_target.numpy().T, angles)
+    np.testing.assert_array_equal(robot.safe_target.numpy().T, angles)
+    np.testing.assert_array_equal(env.delays.past_target.numpy(), np.broadcast_to(angles.T, (8, 12, N)))
 
 
 def test_commands_of_a_measurement_may_come_one_by_one(env):
     delays = np.arange(N) / 120.0  # every other one between two policy steps
-    env.evaluation_reset(np.zeros((N, 3)), command_delay=delays)
+    env.evaluation_reset(jump_commands(np.zeros((N, 3)), delays, env.step_dt))
     found = env.task_arrays()["command_step"]
     np.testing.assert_array_equal(found[::2], np.arange(len(found[::2])))
     assert (np.abs(found - 60.0 * delays) <= 0.5).all()
-    env.auto_reset = True
 
 
 def test_a_policy_is_measured_from_equal_starts(env):
     goals = np.zeros((N, 3))
     goals[:, 2] = np.linspace(0.5, 1.2, N)
-    env.evaluation_reset(goals, command_delay=0.25)
+    env.evaluation_reset(jump_commands(goals, 0.25, env.step_dt))
     arrays = env.task_arrays()
     np.testing.assert_allclose(arrays["goal"], goals, atol=1e-6)
     assert (arrays["command_step"] == 15).all() and not arrays["steps"].any()
@@ -257,7 +271,10 @@ def test_a_policy_is_measured_from_equal_starts(env):
     edit_episodes(env, 0, phase=LANDED, phase_steps=59)
     env.step(REST)
     assert env.done[0] == 1.0 and env.task_arrays()["steps"][0] == 1  # ended, but not begun anew
-    env.auto_reset = True
+    env.reset()  # episodes begin anew again
+    edit_episodes(env, 0, phase=LANDED, phase_steps=59)
+    env.step(REST)
+    assert env.done[0] == 1.0 and env.task_arrays()["steps"].tolist() == [0] + [1] * (N - 1)
 
 
 # ---------------------------------------------------------------- the sequence of launches
@@ -289,7 +306,8 @@ def test_replayed_launches_equal_eager_ones():
     for i, action in enumerate(actions):
         eager.action.copy_(action)
         eager._launch_step()
-        assert torch.equal(eager.obs, trace[4 * i]) and torch.equal(eager.reward, trace[4 * i + 2])
+        found = (eager.obs, eager.final_obs, eager.reward, eager.done)
+        assert all(torch.equal(a, b) for a, b in zip(found, trace[4 * i : 4 * i + 4], strict=True))
 
 
 def test_mujoco_takes_the_same_steps():
@@ -313,7 +331,8 @@ def test_mujoco_takes_the_same_steps():
 
 
 def test_a_term_of_ones_own_is_compiled_and_logged():
-    task = dataclasses.replace(TASK, terms=(Term(my_own_term, 3.0, (2.0,)), Term(rewards.action_rate, -1.0)))
+    rows = (RewardTerm(my_own_term, 3.0, scale=2.0), RewardTerm(rewards.action_rate, -1.0))
+    task = dataclasses.replace(TASK, rewards=rows)
     env = make_env(N, task=task, reset=only("default"))
     env.step(REST)
     height = env.sim.joint_q()[:, 2]
@@ -324,17 +343,18 @@ def test_a_term_of_ones_own_is_compiled_and_logged():
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: dataclasses.replace(TASK, terms=(*TASK.terms, TASK.terms[0])), "name of its own"),
-        (lambda: dataclasses.replace(TASK, rules=()), "success"),
-        (lambda: dataclasses.replace(TASK, rules=TASK.rules[1:]), "success"),
-        (lambda: dataclasses.replace(TASK, levels=()), "level"),
-        (lambda: Term(my_own_term, math.nan), "weight of my_own_term"),
-        (lambda: Term(my_own_term, 1.0, (1.0,) * 5), "up to four"),
-        (lambda: Term(my_own_term, 1.0, (math.inf,)), "finite"),
-        (lambda: Rule(terminations.too_long, (math.nan,)), "finite"),
+        (lambda: dataclasses.replace(TASK, rewards=(*TASK.rewards, TASK.rewards[0])), "name of its own"),
+        (lambda: dataclasses.replace(TASK, terminations=()), "came_apart"),
+        (lambda: dataclasses.replace(TASK, terminations=TASK.terminations[:1]), "came_apart"),
+        (lambda: dataclasses.replace(TASK, levels=()), "argument 6 of reset_jump is JumpLevel, the task has Nothing"),
+        (lambda: RewardTerm(my_own_term, math.nan, scale=1.0), "my_own_term: parameter 'weight' must be a finite"),
+        (lambda: RewardTerm(my_own_term, 1.0, scale=1.0, width=1.0), "unknown parameter 'width'"),
+        (lambda: RewardTerm(my_own_term, 1.0), "parameter 'scale' is missing"),
+        (lambda: RewardTerm(my_own_term, 1.0, scale=math.inf), "finite"),
+        (lambda: TerminationTerm(terminations.too_long, steps=math.nan), "finite"),
         (lambda: make_task("vertical-jumpp"), "unknown task 'vertical-jumpp'"),
-        (lambda: JumpEnv(TASK, 0, device="cpu"), "at least 1"),
-        (lambda: JumpEnv(TASK, 1, device="cpu", solver="bullet"), "solver must be"),
+        (lambda: Env(TASK, 0, device="cpu"), "at least 1"),
+        (lambda: Env(TASK, 1, device="cpu", solver="bullet"), "solver must be"),
     ],
 )
 def test_impossible_configurations_are_refused(make, message):
@@ -344,5 +364,6 @@ def test_impossible_configurations_are_refused(make, message):
 
 def test_the_configuration_names_its_functions(env):
     config = env.config()
-    assert isinstance(env.task, TaskCfg) and config["task"]["terms"][0]["func"].endswith("jump_height")
-    assert config["policy_dt_s"] == pytest.approx(1.0 / 60.0) and len(config["observation_names"]) == 48
+    assert isinstance(env.task, TaskCfg) and config["task"]["rewards"][0]["func"].endswith(":jump_height")
+    assert config["policy_dt_s"] == pytest.approx(1.0 / 60.0)
+    assert len(config["interface"]["observation_names"]) == env.num_obs == 48

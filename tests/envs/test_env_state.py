@@ -5,28 +5,33 @@ import socket
 import numpy as np
 import pytest
 import torch
-from jump_helpers import edit_episodes, make_env, random_actions
+import warp as wp
+from hold_height import hold_height
+from jump_helpers import edit_episodes, make_env, random_actions, resetting
 from toy_task import SMALL, PushTask, join
 
-from jumper_warp.envs.env import JumpEnv
-from jumper_warp.envs.state import parameter_fingerprint
+from jumper_warp.envs.env import Env
+from jumper_warp.envs.state import nominal_fingerprint
 from jumper_warp.registry import make_task
 from jumper_warp.rl.checkpoint import CheckpointError, load_checkpoint
 from jumper_warp.rl.ppo import PpoCfg
 from jumper_warp.rl.runner import CHECKPOINTS, TrainCfg, train
-from jumper_warp.tasks.cfg import GroundCfg
+from jumper_warp.robot.motors import jumping_motors
+from jumper_warp.tasks.jump.cfg import GroundCfg
+from jumper_warp.tasks.randomization import RandomizationCfg
 
 N = 16
 PPO = PpoCfg(num_steps=8, hidden=(32, 32), minibatches=4)
 ALL_ON = {"randomize": True, "noise": True}
 
 
-class Recorded(JumpEnv):
+class Recorded(Env):
     """Keeps the rewards of all steps."""
 
     def step(self, action):
-        super().step(action)
+        result = super().step(action)
         self.rewards = [*getattr(self, "rewards", []), self.reward.clone()]
+        return result
 
 
 def train_jump(cfg):
@@ -90,12 +95,14 @@ def go_on_alike(saved, fresh):
     for step, action in enumerate(random_actions(saved.num_envs, 25, seed=1)):
         for env in (saved, fresh):
             env.step(action)
-        for name in ("obs", "final_obs", "reward", "done", "timeout"):
+        for name in ("obs", "critic_obs", "final_obs", "final_critic_obs", "reward", "done", "timeout"):
             assert torch.equal(getattr(saved, name), getattr(fresh, name)), (step, name)
         np.testing.assert_array_equal(saved.sim.joint_qd(), fresh.sim.joint_qd())
+        table, expected = (env.sim.physics.dynamics.robot.table.numpy() for env in (fresh, saved))
+        np.testing.assert_array_equal(table, expected)
         ended += saved.done.sum().item()
         yield step
-    assert (saved.tasks.numpy() == fresh.tasks.numpy()).all()
+    assert (saved.skills[0].states.numpy() == fresh.skills[0].states.numpy()).all()
     assert 0.0 < ended
 
 
@@ -113,7 +120,8 @@ def test_an_environment_goes_on_from_a_saved_state_bit_for_bit(solver):
 def ground_env(count=N, platform=0.4, block=0.6, **arguments):
     """Environment of far goals, whose starts have a platform or a block where there is room."""
     task = make_task("horizontal-jump")
-    task = dataclasses.replace(task, levels=task.levels[-1:], ground=GroundCfg(platform=platform, block=block))
+    ground = dataclasses.replace(task.reset.settings, ground=GroundCfg(platform=platform, block=block))
+    task = resetting(dataclasses.replace(task, levels=task.levels[-1:]), ground)
     return make_env(count, task=task, **({"seed": 1} | ALL_ON | arguments))
 
 
@@ -121,14 +129,14 @@ def test_an_environment_goes_on_with_its_drawn_grounds_bit_for_bit():
     saved, fresh = ground_env(), ground_env()
     for action in random_actions(N, 5):
         saved.step(action)
-    blocks = saved._dynamics.robot.ground.blocks
+    blocks = saved.sim.physics.dynamics.robot.ground.blocks
     sliding = blocks.numpy().copy()
     assert sliding["exists"].any() and not sliding["exists"].all()
     sliding["velocity"] = 0.3 * sliding["exists"][:, None]
     blocks.assign(sliding)
     fresh.load_state_dict(saved.state_dict())
     for step in go_on_alike(saved, fresh):
-        found, expected = (env._dynamics.robot.ground.blocks.numpy() for env in (fresh, saved))
+        found, expected = (env.sim.physics.dynamics.robot.ground.blocks.numpy() for env in (fresh, saved))
         assert (found == expected).all(), step
         if step == 0:
             moved = np.abs(expected["center"] - sliding["center"]).max(axis=1)
@@ -159,9 +167,10 @@ def test_a_saved_state_does_not_change_with_the_environment():
     ("change", "message"),
     [
         ({"num_envs": 4}, "saved for 2 environments, there are 4"),
-        ({"seed": 9}, "saved with other robots"),
-        ({"randomize": False}, "saved with other robots"),
-        ({"solver": "mujoco"}, "lacks .*'qacc_warmstart'"),
+        ({"seed": 9}, "saved with seed 1, this environment draws with seed 9"),
+        ({"randomize": False}, "saved with other randomisation or events of vertical-jump"),
+        ({"task": dataclasses.replace(make_task("vertical-jump"), motors=jumping_motors(12.0))}, "with other robots"),
+        ({"solver": "mujoco"}, "lacks .*'solver.qacc_warmstart'"),
     ],
 )
 def test_a_state_that_does_not_fit_is_refused_and_nothing_changes(change, message):
@@ -178,21 +187,63 @@ def test_a_state_that_does_not_fit_is_refused_and_nothing_changes(change, messag
 def test_a_field_that_came_or_went_is_told():
     env = make_env(2)
     state = env.state_dict()
-    state["episode.cadence"] = state.pop("episode.phase")
-    with pytest.raises(ValueError, match=r"lacks \['episode.phase'\], has \['episode.cadence'\] besides"):
+    state["vertical-jump.cadence"] = state.pop("vertical-jump.phase")
+    with pytest.raises(ValueError, match=r"lacks \['vertical-jump.phase'\], has \['vertical-jump.cadence'\] besides"):
         env.load_state_dict(state)
 
 
-def test_the_fingerprint_sees_every_drawn_parameter():
+def test_every_drawn_parameter_is_saved_and_the_fingerprint_does_not_see_it():
+    """A drawn parameter that differs changes the state; put back, it is what it was, in the solver too."""
     env = make_env(2)
-    before = parameter_fingerprint(env)
-    model, motors = env.sim.model, env.sim.motors
-    for array in (model.body_mass, model.shape_material_mu, motors.kp, env.push, env.static_friction_ratio, env.delay):
+    whole = env.state_dict()
+    model, motors, parameters = env.sim.model, env.sim.motors, env.parameters
+    drawn = (
+        model.body_mass, model.body_com, model.body_inertia, model.joint_armature, model.joint_friction,
+        model.shape_material_mu, motors.kp, motors.kd, motors.saturation, motors.no_load_speed, motors.cutoff_speed,
+        motors.offset, parameters.push, parameters.static_ratio, parameters.latency, parameters.observation_latency,
+        parameters.gain_ratio, parameters.speed_ratio,
+    )  # fmt: skip
+    table = env.sim.physics.dynamics.robot.table.numpy().copy()
+    for array in drawn:
         values = array.numpy().copy()
         array.assign(values + 1)
-        assert not torch.equal(parameter_fingerprint(env), before)
-        array.assign(values)
-    assert torch.equal(parameter_fingerprint(env), before)
+        env.sim.physics.parameters_changed()
+        assert not equal(env.state_dict(), whole)
+        assert torch.equal(nominal_fingerprint(env), whole["nominal"])
+        env.load_state_dict(whole)
+        np.testing.assert_array_equal(array.numpy(), values)
+        np.testing.assert_array_equal(env.sim.physics.dynamics.robot.table.numpy(), table)
+
+
+def test_an_environment_goes_on_with_late_observations_and_history_bit_for_bit():
+    """Latency to and from the policy, frames of the past, pushes that come and go, all redrawn at every reset."""
+    saved, fresh = (Env(hold_height(), N, seed=1, device="cpu") for _ in range(2))
+    saved.reset()
+    states = saved.skills[0].states
+    records = states.numpy().copy()
+    records["steps"] = 120 - np.linspace(10, 62, N)  # a part ends before the saving, the others after it
+    states.assign(wp.array(records, dtype=states.dtype, device="cpu"))
+    drawn = []
+    for action in random_actions(N, 37):
+        saved.step(action)
+        drawn.append(saved.parameters.observation_latency.numpy().copy())
+    assert len(np.unique(drawn, axis=0)) > 4 and 0 < states.numpy()["steps"].min()
+    fresh.load_state_dict(saved.state_dict())
+    for name in ("obs", "critic_obs"):
+        assert torch.equal(getattr(saved, name), getattr(fresh, name))
+    assert len(list(go_on_alike(saved, fresh))) == 25
+
+
+def test_a_state_of_before_the_first_reset_begins_as_a_new_environment_does():
+    task = dataclasses.replace(make_task("vertical-jump"), randomization=RandomizationCfg(redraw="startup"))
+    saved, fresh = (Env(task, 2, seed=1, device="cpu") for _ in range(2))
+    fresh.load_state_dict(saved.state_dict())
+    with pytest.raises(RuntimeError, match="call reset before the first step"):
+        fresh.step(torch.zeros((2, 12)))
+    for env in (saved, fresh):
+        env.reset()
+    assert equal(saved.state_dict(), fresh.state_dict())
+    assert len(set(fresh.sim.motors.kp.numpy().ravel())) == 24
 
 
 # ---------------------------------------------------------------- several processes

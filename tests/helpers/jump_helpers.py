@@ -1,58 +1,78 @@
 """Hand-made robots and episodes, and ways to bring an environment's worlds into a chosen state, for its tests."""
 
 import dataclasses
+import inspect
 
 import numpy as np
 import torch
 import warp as wp
+from mdp_helpers import DEFAULT_ANGLE, MOTOR_SLOTS, STEP_DT, SUBSTEPS, array, new_worlds, standing_robots
 
-from jumper_warp.envs.env import JumpEnv
+from jumper_warp.envs.env import Env
+from jumper_warp.envs.skill import Skill
 from jumper_warp.registry import make_task
-from jumper_warp.tasks.cfg import NoiseCfg, ResetCfg
-from kernels.jump.observe import Observations
-from kernels.jump.task import JumpTask, RobotView, ViewArrays, vec12
+from jumper_warp.tasks.cfg import TaskCfg
+from jumper_warp.tasks.jump.cfg import ResetCfg
+from jumper_warp.tasks.jump.observations import EPISODE
+from jumper_warp.tasks.observations import exact
+from kernels.jump.reset import JumpSettings
+from kernels.jump.state import JumpState
+from kernels.mdp.parameters import RobotParameters
+from kernels.mdp.view import RobotView, vec12
 from kernels.terrain.ground import Ground
 
 DEG = np.pi / 180.0
-DEFAULT_ANGLE = np.tile([0.0, 45.0 * DEG, 45.0 * DEG], 4)
-MOTOR_SLOTS = np.array([5 * leg + joint for leg in range(4) for joint in (0, 1, 3)])
 SCHEMES = ("standing", "default", "in_flight", "touchdown", "landed")
+OF_WORLD = ("level", "streak")
+"""What a world keeps from episode to episode."""
 
 
 class Table:
-    """Functions of (view, task, p), compiled into one kernel as a task's are, to be called one at a time."""
+    """Functions of (view, task, ...), compiled into one kernel as a task's are, to be called one at a time."""
 
-    def __init__(self, module, names: str, returns: type):
-        """names: of the module's functions, separated by spaces; returns: float or bool."""
-        self._names = names.split()
+    def __init__(self, funcs, returns: type):
+        """funcs: of terms of a jump or of any task; returns: float or bool."""
+        funcs = list(funcs)
+        self._params = {func.func.__name__: list(inspect.signature(func.func).parameters)[2:] for func in funcs}
         self._returns = returns
-        funcs = [getattr(module, name) for name in self._names]
-        count = len(funcs)
+        counts = [len(params) for params in self._params.values()]
 
         @wp.kernel(module="unique", enable_backward=False)
         def table_kernel(
             views: wp.array(dtype=RobotView),
-            tasks: wp.array(dtype=JumpTask),
-            p: wp.vec4,
+            tasks: wp.array(dtype=JumpState),
+            p: wp.array(dtype=float),
             out: wp.array2d(dtype=wp.bool if returns is bool else float),
         ):
             j = wp.tid()
-            for i in range(wp.static(count)):
-                out[j, i] = wp.static(funcs[i])(views[j], tasks[j], p)
+            for i in range(wp.static(len(funcs))):
+                if wp.static(counts[i] == 0):
+                    out[j, i] = wp.static(funcs[i])(views[j], tasks[j])
+                else:
+                    out[j, i] = wp.static(funcs[i])(views[j], tasks[j], *p[0 : wp.static(counts[i])])
 
         self._kernel = table_kernel
 
-    def __call__(self, name: str, view: RobotView, task: JumpTask, *p: float) -> float | bool:
+    def __call__(self, name: str, view: RobotView, task: JumpState, **numbers: float) -> float | bool:
         """Return the value of one function."""
-        return self._returns(self.all(name, [view], [task], *p)[0])
+        return self._returns(self.all(name, [view], [task], **numbers)[0])
 
-    def all(self, name: str, views: list, tasks: list, *p: float) -> np.ndarray:
-        """Return the values of one function, one a robot and its episode."""
-        shape = (len(views), len(self._names))
+    def all(self, name: str, views: list, tasks: list, **numbers: float) -> np.ndarray:
+        """Return the values of one function, one a robot and its episode; numbers: all of its own, by name."""
+        params = self._params[name]
+        assert numbers.keys() == set(params), f"{name} has {params}, got {list(numbers)}"
+        most = max(map(len, self._params.values()))
+        p = array([numbers[key] for key in params] + [1.0] * (most - len(params)))
+        shape = (len(views), len(self._params))
         out = wp.zeros(shape, dtype=wp.bool if self._returns is bool else float, device="cpu")
-        inputs = [wp.array(views, dtype=RobotView, device="cpu"), wp.array(tasks, dtype=JumpTask, device="cpu")]
-        wp.launch(self._kernel, len(views), [*inputs, wp.vec4(*p, *([0.0] * (4 - len(p))))], [out], device="cpu")
-        return out.numpy()[:, self._names.index(name)]
+        inputs = [wp.array(views, dtype=RobotView, device="cpu"), wp.array(tasks, dtype=JumpState, device="cpu")]
+        wp.launch(self._kernel, len(views), [*inputs, p], [out], device="cpu")
+        return out.numpy()[:, list(self._params).index(name)]
+
+
+def functions(module, names: str) -> list[wp.Function]:
+    """Return functions of a module; names: separated by spaces."""
+    return [getattr(module, name) for name in names.split()]
 
 
 def make_view(**fields) -> RobotView:
@@ -60,6 +80,7 @@ def make_view(**fields) -> RobotView:
     view = RobotView()
     view.pos, view.quat, view.gravity = wp.vec3(0.0, 0.0, 0.4), wp.quat_identity(), wp.vec3(0.0, 0.0, -1.0)
     view.angle = view.default_angle = vec12(*DEFAULT_ANGLE)
+    view.fall_acc = 9.81
     for name, value in fields.items():
         kind = type(getattr(view, name))
         setattr(view, name, kind(*value) if np.ndim(value) else value)
@@ -67,60 +88,55 @@ def make_view(**fields) -> RobotView:
     return view
 
 
-def make_episode(**fields) -> JumpTask:
+def make_episode(**fields) -> JumpState:
     """Return an episode in stance whose jump is commanded from the beginning."""
-    task = JumpTask()
+    task = JumpState()
     for name, value in fields.items():
         setattr(task, name, wp.vec3(*value) if np.ndim(value) else value)
     return task
 
 
+def without_draws(task: TaskCfg) -> TaskCfg:
+    """Return a jump whose critic does not see what was drawn for the world: 48 columns as the actor, 15 of its own."""
+    return dataclasses.replace(task, critic=(*exact(task.policy), *EPISODE))
+
+
 class Robots:
     """Robots that stand at rest in the default pose, to be changed by the tests, and what is observed of them."""
 
-    def __init__(self, kernel: wp.Kernel, n: int = 1):
-        """kernel: of `make_observe_kernel`."""
-        self.kernel, self.n = kernel, n
+    def __init__(self, task: TaskCfg, n: int = 1):
+        """task: of jumping; what is drawn for a world is left out."""
+        task = without_draws(task)
+        self.skill, self.n = Skill(task, 0, n, STEP_DT, SUBSTEPS, "cpu"), n
+        self.numbers = {True: array(task.numbers), False: array(task.without_noise().numbers)}
         self.q, self.qd = np.zeros((n, 43)), np.zeros((n, 38))
         self.q[:, 2], self.q[:, 6], self.q[:, 7 + MOTOR_SLOTS] = 0.35, 1.0, DEFAULT_ANGLE
         self.com, self.action, self.offset = np.zeros(3), np.zeros((12, n)), np.zeros((12, n))
         self.force, self.heights = np.zeros((4, n, 3)), np.zeros((1, 1))
         self.tasks = [make_episode(goal=(0.0, 0.0, 0.8), command_step=5)] * n
-        self.random = np.arange(1, n + 1, dtype=np.uint32) * np.uint32(7919)
+        self.worlds = new_worlds(n, seed=7919)
 
     def observe(self, noise: bool = False) -> np.ndarray:
         """Return the actor's observations, (n, 48); draws go on from call to call."""
         return self.both(noise)[0]
 
     def both(self, noise: bool = False) -> tuple[np.ndarray, np.ndarray]:
-        """Return the actor's observations, (n, 48), and the critic's, (n, 65); its last two columns were 7 before."""
-
-        def array(value, dtype=float):
-            return wp.array(np.asarray(value), dtype=dtype, device="cpu")
-
-        views, n = ViewArrays(), self.n
-        views.joint_q, views.joint_qd = array(self.q.ravel()), array(self.qd.ravel())
-        views.body_com = array(np.tile(self.com, (21 * n, 1)), wp.vec3)
-        views.paw_force = array(self.force, wp.vec3)
-        for name in ("torque", "old_action", "target", "safe_target", "old_rate"):
-            setattr(views, name, wp.zeros((12, n), dtype=float, device="cpu"))
-        views.action = array(self.action)
-        views.old_lin_vel = wp.zeros(n, dtype=wp.vec3, device="cpu")
-        views.default_angle, views.step_dt = array(DEFAULT_ANGLE), 1.0 / 60.0
-        out, none = Observations(), wp.zeros(n, dtype=float, device="cpu")
-        out.actor = wp.zeros((n, 48), dtype=float, device="cpu")
-        out.critic = wp.full((n, 65), 7.0, dtype=float, device="cpu")
-        random = array(self.random, wp.uint32)
-        tasks = wp.array(self.tasks, dtype=JumpTask, device="cpu")
-        sensors = NoiseCfg().sensor_noise(noise)
+        """Return the actor's observations, (n, 48), and the critic's, (n, 63)."""
+        robot, n, skill = standing_robots(self.n), self.n, self.skill
+        robot.joint_q, robot.joint_qd = array(self.q.ravel()), array(self.qd.ravel())
+        robot.body_com = array(np.tile(self.com, (21 * n, 1)), wp.vec3)
+        robot.paw_force = array(self.force, wp.vec3)
+        robot.action, robot.joint_offset = array(self.action), array(self.offset)
+        tasks = wp.array(self.tasks, dtype=JumpState, device="cpu")
         ground = Ground()
-        ground.heights = wp.array(self.heights, dtype=float, device="cpu")
+        ground.heights = array(self.heights)
         ground.rows, ground.cols = self.heights.shape if self.heights.size > 1 else (0, 0)
         ground.half_x = ground.half_y = 2.0
-        inputs = [views, ground, tasks, array(self.offset), sensors, none, 1, random]
-        wp.launch(self.kernel, n, inputs, [out], device="cpu")
-        self.random = random.numpy()
-        return out.actor.numpy().astype(float), out.critic.numpy().astype(float)
+        inputs = [0, robot, RobotParameters(), ground, self.worlds, tasks, skill.slots, self.numbers[noise], 0,
+                  skill.observations]  # fmt: skip
+        wp.launch(skill.kernels["observe"], (skill.num_terms, n), inputs, device="cpu")
+        self.worlds.clock.assign(self.worlds.clock.numpy() + 1)
+        return skill.obs["policy"].double().numpy().copy(), skill.obs["critic"].double().numpy().copy()
 
 
 def tilted_by(angle: float, axis=(1.0, 0.0, 0.0)) -> dict:
@@ -135,30 +151,59 @@ def only(scheme: str, reset: ResetCfg | None = None, **ranges) -> ResetCfg:
     return dataclasses.replace(ResetCfg() if reset is None else reset, **shares, **ranges)
 
 
-def make_env(num_envs: int, *, seed: int = 0, reset: ResetCfg | None = None, task=None, **arguments) -> JumpEnv:
+def resetting(task: TaskCfg, reset: ResetCfg) -> TaskCfg:
+    """Return a jump whose episodes begin otherwise."""
+    return dataclasses.replace(task, reset=dataclasses.replace(task.reset, settings=reset))
+
+
+def make_env(num_envs: int, *, seed: int = 0, reset: ResetCfg | None = None, task=None, **arguments) -> Env:
     """Return the vertical jump's environment on the CPU, begun; nominal and without noise unless asked for."""
     task = make_task("vertical-jump") if task is None else task
-    task = task if reset is None else dataclasses.replace(task, reset=reset)
-    env = JumpEnv(task, num_envs, seed=seed, device="cpu", **({"randomize": False, "noise": False} | arguments))
+    task = task if reset is None else resetting(task, reset)
+    env = Env(task, num_envs, seed=seed, device="cpu", **({"randomize": False, "noise": False} | arguments))
     env.reset()
     return env
 
 
-def edit_episodes(env: JumpEnv, worlds=slice(None), **fields) -> None:
-    """Overwrite fields of worlds' episodes."""
-    records = env.tasks.numpy().copy()
+def begin_by(env: Env, reset: ResetCfg) -> None:
+    """Let the next episodes begin by other settings, in captured steps too."""
+    env.skills[0].settings.assign(wp.array([reset.values(env.step_dt)], dtype=JumpSettings, device="cpu"))
+
+
+def resets_of(env: Env) -> ResetCfg:
+    """Return the settings by which an environment's episodes were made to begin."""
+    return env.skills[0].task.reset.settings
+
+
+def edit_episodes(env: Env, worlds=slice(None), **fields) -> None:
+    """Overwrite fields of worlds' episodes, or their level and streak."""
+    states = env.skills[0].states
+    records = states.numpy().copy()
     for name, value in fields.items():
-        records[name][worlds] = value
-    env.tasks.assign(wp.array(records, dtype=JumpTask, device="cpu"))
+        if name in OF_WORLD:
+            kept = getattr(env.worlds, name)
+            values = kept.numpy().copy()
+            values[worlds] = value
+            kept.assign(values)
+        else:
+            records[name][worlds] = value
+    states.assign(wp.array(records, dtype=JumpState, device="cpu"))
 
 
-def edit_coordinates(env: JumpEnv, world: int, *, q: dict | None = None, qd: dict | None = None) -> None:
+def episodes_of(env: Env) -> dict[str, np.ndarray]:
+    """Return copies of all fields of worlds' episodes, and their level and streak."""
+    records = env.skills[0].states.numpy()
+    fields = {name: records[name].copy() for name in records.dtype.names}
+    return fields | {name: getattr(env.worlds, name).numpy().copy() for name in OF_WORLD}
+
+
+def edit_coordinates(env: Env, world: int, *, q: dict | None = None, qd: dict | None = None) -> None:
     """Overwrite entries, by index, of a world's joint coordinates and rates."""
-    for array, width, values in ((env.sim.state.joint_q, 43, q), (env.sim.state.joint_qd, 38, qd)):
-        rows = array.numpy().reshape(-1, width).copy()
+    for coordinates, width, values in ((env.sim.state.joint_q, 43, q), (env.sim.state.joint_qd, 38, qd)):
+        rows = coordinates.numpy().reshape(-1, width).copy()
         for index, value in (values or {}).items():
             rows[world, index] = value
-        array.assign(rows.ravel())
+        coordinates.assign(rows.ravel())
 
 
 def random_actions(num_envs: int, steps: int, seed: int = 0) -> torch.Tensor:
@@ -166,7 +211,7 @@ def random_actions(num_envs: int, steps: int, seed: int = 0) -> torch.Tensor:
     return 2.0 * torch.rand((steps, num_envs, 12), generator=torch.Generator().manual_seed(seed)) - 1.0
 
 
-def rule_names(env: JumpEnv) -> list[str]:
-    """Return the rule that ended each world's episode in the last step, "" where none did."""
-    names = [rule.name for rule in env.task.rules]
-    return [names[i] if i >= 0 else "" for i in env.task_arrays()["rule"]]
+def ending_names(env: Env) -> list[str]:
+    """Return the termination that ended each world's episode in the last step, "" where none did."""
+    names = [term.name for term in env.task.terminations]
+    return [names[i] if i >= 0 else "" for i in env.task_arrays()["ending"]]

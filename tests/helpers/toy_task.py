@@ -12,7 +12,7 @@ SMALL = PpoCfg(num_steps=16, hidden=(32, 32), minibatches=4)
 
 
 class PushTask:
-    """Position and velocity of each mass are the observation, its acceleration the action.
+    """A `VecEnv`: position and velocity of each mass are the observation, its acceleration the action.
 
     The critic sees the distance from the origin too.
     """
@@ -61,7 +61,7 @@ class PushTask:
         return {"episode_length": self.episode_length}
 
     def state_dict(self) -> dict[str, torch.Tensor]:
-        return {name: getattr(self, name) for name in self.STATE}
+        return {name: getattr(self, name).clone() for name in self.STATE}
 
     def load_state_dict(self, state: dict[str, torch.Tensor]) -> None:
         for name in self.STATE:

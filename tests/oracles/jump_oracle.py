@@ -19,7 +19,7 @@ def robot_of(env) -> dict[str, np.ndarray]:
     q, qd = env.sim.joint_q().astype(float), env.sim.joint_qd().astype(float)
     turn = Rotation.from_quat(q[:, 3:7])
     com = env.sim.model.body_com.numpy().reshape(len(q), -1, 3)[:, 0]
-    views, tasks = env._views, env.tasks.numpy()
+    views, tasks = env.robot, env.skills[0].states.numpy()
     robot = {
         "pos": q[:, :3],
         "quat": q[:, 3:7],
@@ -61,7 +61,7 @@ def random_robots(n: int, seed: int) -> dict[str, np.ndarray]:
 
 
 def kernel_inputs(r: dict) -> tuple[list, list]:
-    """Return the `RobotView` and the `JumpTask` of each of some robots."""
+    """Return the `RobotView` and the `JumpState` of each of some robots."""
     views, tasks = [], []
     gravity = Rotation.from_quat(r["quat"]).inv().apply([0.0, 0.0, -1.0])
     motors = ("angle", "rate", "rate_change", "torque", "action", "old_action")
@@ -91,7 +91,7 @@ def phi(x, s):
 
 def height_kernel(error, p):
     """The height reward of Table III with a third, wide kernel."""
-    return phi(error, p[0]) + 3.0 * np.exp(-np.abs(error) / p[1]) + phi(error, p[2])
+    return phi(error, p["fine"]) + 3.0 * np.exp(-np.abs(error) / p["sharp"]) + phi(error, p["wide"])
 
 
 def norm(vectors):
@@ -160,7 +160,8 @@ def deceleration(r):
 
 def symmetry(r, p):
     """Vertical jump: variance of the transversal, size of the lateral angles."""
-    return phi(np.var(r["angle"][T], axis=0), p[0]) * phi(np.linalg.norm(r["angle"][~T], axis=0), p[1])
+    spread = phi(np.var(r["angle"][T], axis=0), p["variance"])
+    return spread * phi(np.linalg.norm(r["angle"][~T], axis=0), p["lateral"])
 
 
 def left_right(r):
@@ -180,47 +181,61 @@ TERMS = {
         ((r["phase"] == FLIGHT) & (r["apex_passed"] == 0)) * height_kernel(rising_to(r) - r["goal"][:, 2], p)
     ),
     "horizontal_velocity": lambda r, p: (
-        np.exp(-norm(r["vel"][:, :2]) / p[0]) * np.where(r["phase"] == STANCE, 1.0, 2.0) * due(r, p[1])
+        np.exp(-norm(r["vel"][:, :2]) / p["width"]) * np.where(r["phase"] == STANCE, 1.0, 2.0) * due(r, p["share"])
     ),
-    "orientation": lambda r, p: phi(lean(r), p[0]) * due(r, p[1]),
-    "angular_velocity": lambda r, p: phi(norm(r["spin"]), p[0]) * due(r, p[1]),
-    "joint_symmetry": lambda r, p: symmetry(r, p) * due(r, p[2]),
-    "ground_posture": lambda r, p: (r["phase"] != FLIGHT) * posture(r, p[0], p[1]) * due(r, p[2]),
-    "air_posture": lambda r, p: (r["phase"] == FLIGHT) * posture(r, p[0]),
-    "retract": lambda r, p: soon(r) * posture(r, p[0], p[1]),
-    "tracking": lambda r, p: (r["phase"] != STANCE) * (phi(error(r), p[0]) + p[2] * phi(error(r), p[1])),
+    "orientation": lambda r, p: phi(lean(r), p["width"]) * due(r, p["share"]),
+    "angular_velocity": lambda r, p: phi(norm(r["spin"]), p["width"]) * due(r, p["share"]),
+    "joint_symmetry": lambda r, p: symmetry(r, p) * due(r, p["share"]),
+    "ground_posture": lambda r, p: (r["phase"] != FLIGHT) * posture(r, p["width"], p["shift"]) * due(r, p["share"]),
+    "air_posture": lambda r, p: (r["phase"] == FLIGHT) * posture(r, p["width"]),
+    "retract": lambda r, p: soon(r) * posture(r, p["width"], p["shift"]),
+    "tracking": lambda r, p: (
+        (r["phase"] != STANCE) * (phi(error(r), p["wide"]) + p["fine_share"] * phi(error(r), p["fine"]))
+    ),
     "estimated_tracking": lambda r, p: (
         (r["phase"] == FLIGHT)
-        * sum(share * phi(estimated_error(r, p[3]), width) for share, width in zip((1.0, 0.1, 0.3), p, strict=False))
+        * sum(
+            share * phi(estimated_error(r, p["height"]), p[width])
+            for share, width in ((1.0, "middle"), (0.1, "wide"), (0.3, "fine"))
+        )
     ),
     "flight_orientation": lambda r, p: (
         ((r["phase"] == FLIGHT) & (np.sum((r["goal"] - r["pos"])[:, :2] * r["vel"][:, :2], axis=1) > 0.0))
-        * phi(rotation_error(r), p[0])
+        * phi(rotation_error(r), p["width"])
     ),
-    "flight_angular_velocity": lambda r, p: (r["phase"] == FLIGHT) * phi(norm(r["spin"]), p[0]),
-    "left_right_symmetry": lambda r, p: phi(left_right(r), p[0]) * due(r, p[1]),
-    "standing_posture": lambda r, p: at_ease(r) * posture(r, p[0], p[1]),
-    "rest": lambda r, p: at_ease(r) * phi(norm(r["vel"]), p[0]) * phi(norm(r["spin"]), p[1]),
-    "landing_tilt": lambda r, p: (r["phase"] == LANDED) * (lean(r) / np.sin(p[0])) ** 2,
+    "flight_angular_velocity": lambda r, p: (r["phase"] == FLIGHT) * phi(norm(r["spin"]), p["width"]),
+    "left_right_symmetry": lambda r, p: phi(left_right(r), p["width"]) * due(r, p["share"]),
+    "standing_posture": lambda r, p: at_ease(r) * posture(r, p["width"], p["shift"]),
+    "rest": lambda r, p: at_ease(r) * phi(norm(r["vel"]), p["speed"]) * phi(norm(r["spin"]), p["spin"]),
+    "landing_tilt": lambda r, p: (r["phase"] == LANDED) * (lean(r) / np.sin(p["width"])) ** 2,
     "lifted_paws": lambda r, p: (
-        ((r["phase"] == LANDED) & (r["phase_steps"] > p[0])) * np.count_nonzero(r["force"] <= CONTACT_FORCE, axis=0)
+        ((r["phase"] == LANDED) & (r["phase_steps"] > p["steps"]))
+        * np.count_nonzero(r["force"] <= CONTACT_FORCE, axis=0)
     ),
-    "soft_impact": lambda r, p: soon(r) * np.maximum(1.0 - deceleration(r) / p[0], 0.0),
-    "stance_impact": lambda r, p: -1.0 * (r["phase"] == STANCE) * np.minimum(deceleration(r) / p[0], 1.0),
+    "soft_impact": lambda r, p: soon(r) * np.maximum(1.0 - deceleration(r) / p["limit"], 0.0),
+    "stance_impact": lambda r, p: -1.0 * (r["phase"] == STANCE) * np.minimum(deceleration(r) / p["limit"], 1.0),
     "catch_landing": lambda r, p: soon(r) * np.clip(-r["vel"][:, 2], 0.0, 1.0),
     "damp_landing": lambda r, p: soon(r) * np.clip(r["rate"][T], 0.0, 1.0).mean(axis=0),
-    "ground_force": lambda r, p: np.sum(r["force"] ** 2, axis=0) / p[0] ** 2,
+    "ground_force": lambda r, p: np.sum(r["force"] ** 2, axis=0) / p["weight_force"] ** 2,
     "action_clip": lambda r, p: r["clipped"],
     "motor_torque_sq": lambda r, p: np.sum(r["torque"] ** 2, axis=0),
     "joint_acceleration": lambda r, p: np.sum(r["rate_change"] ** 2, axis=0),
     "action_rate": lambda r, p: np.sum((r["action"] - r["old_action"]) ** 2, axis=0),
 }
-"""(robot, parameters) -> value of every world, before weight and step."""
+"""(robot, numbers) -> value of every world, before weight and step."""
+
+
+def params_of(term) -> dict[str, float]:
+    """Return a reward term's numbers but its weight."""
+    return {name: value for name, value in term.numbers.items() if name != "weight"}
 
 
 def expected_terms(task, before: dict, after: dict, action: np.ndarray) -> np.ndarray:
     """Return the weighted terms of the step between two states, (terms, worlds); action: (12, worlds)."""
     robot = between(before, after, action)
     return np.array(
-        [TERMS[term.name](robot, term.params) * term.weight * (1.0 if term.once else DT) for term in task.terms]
+        [
+            TERMS[term.name](robot, params_of(term)) * term.weight * (1.0 if term.options["once"] else DT)
+            for term in task.rewards
+        ]
     )

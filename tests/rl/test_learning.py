@@ -1,7 +1,7 @@
 import dataclasses
 import json
 
-from jumper_warp.envs.env import JumpEnv
+from jumper_warp.envs.env import Env
 from jumper_warp.registry import make_task
 from jumper_warp.rl.logger import FIGURES
 from jumper_warp.rl.ppo import PpoCfg
@@ -17,7 +17,7 @@ def mean_returns(cfg: TrainCfg) -> list[float]:
     """Train on the vertical jump as shipped, nominal, its first level only; return each ten iterations' mean return."""
     task = make_task("vertical-jump")
     task = dataclasses.replace(task, levels=task.levels[:1])
-    result = train(cfg, lambda n, seed, _: JumpEnv(task, n, seed=seed, device="cpu", randomize=False, noise=False))
+    result = train(cfg, lambda n, seed, _: Env(task, n, seed=seed, device="cpu", randomize=False, noise=False))
     lines = (result.folder / FIGURES).read_text().splitlines()
     return [json.loads(line)["Train/mean_return"] for line in lines]
 

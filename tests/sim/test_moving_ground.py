@@ -14,7 +14,7 @@ from simulation_helpers import (
 )
 from solver_helpers import COORDS, MOTOR_V, Reference, States
 
-from jumper_warp.envs.env import JumpEnv
+from jumper_warp.envs.env import Env
 from jumper_warp.registry import make_task
 from jumper_warp.robot.grounds import BlockCfg
 from jumper_warp.robot.model import PHYSICS_DT, build_model
@@ -364,9 +364,9 @@ def test_block_values_need_one_row_per_world():
 @pytest.mark.parametrize("begin", ["reset", "evaluation_reset"])
 def test_a_new_episode_puts_the_block_back(begin):
     block = BlockCfg(center=(1.0, 0.0), half=(0.3, 0.3), height=0.05, mass=10.0, friction=0.4)
-    env = JumpEnv(make_task("horizontal-jump"), 2, device="cpu", block=block)
+    env = Env(make_task("horizontal-jump"), 2, device="cpu", block=block)
     start = env.sim.solver.block_position()
-    blocks = env._dynamics.robot.ground.blocks
+    blocks = env.sim.physics.dynamics.robot.ground.blocks
     moved = blocks.numpy().copy()
     moved["center"] += 0.2
     moved["velocity"] = 0.5

@@ -131,6 +131,7 @@ def omnidirectional_jump() -> TaskCfg:
     return replace(
         horizontal_jump(),
         name="omnidirectional-jump",
+        evaluation="around",
         levels=(level((0.2, 0.5), 0.0, 0.35, jump_again=0.0), ring(0.3, 0.45), ring(0.5, 0.45), ring(0.7, 0.45)),
         reset=Reset(reset.reset_jump, replace(RESET, forward_pitch=0.0, touchdown_behind=(0.05, 0.12))),
     )

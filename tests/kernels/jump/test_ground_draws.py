@@ -3,16 +3,27 @@ import dataclasses
 import numpy as np
 import pytest
 import torch
-from jump_helpers import DEFAULT_ANGLE, MOTOR_SLOTS, SCHEMES, edit_episodes, make_env, only
+from jump_helpers import (
+    DEFAULT_ANGLE,
+    MOTOR_SLOTS,
+    begin_by,
+    edit_episodes,
+    episodes_of,
+    make_env,
+    only,
+    resets_of,
+    resetting,
+)
+from jump_starts import PAW_RADIUS, PLACES, Starts, collision_flags, covers
 from scipy.stats import kstest
 from simulation_helpers import WEIGHT, paw_centres, paw_forces
-from test_horizontal_reset import NAMES, PAW_RADIUS, N, Starts, collision_flags, covers
 
-from jumper_warp.envs.randomization import RandomizationCfg
 from jumper_warp.registry import make_task
-from jumper_warp.tasks.cfg import GroundCfg, Level
-from kernels.jump.task import STANCE
+from jumper_warp.tasks.jump.cfg import GroundCfg, Level
+from jumper_warp.tasks.randomization import RandomizationCfg
+from kernels.jump.state import STANCE
 
+N = 4096
 PAWS = np.array([0.24, 0.22])  # [m] ahead and beside, at most: the default pose reaches farther ahead, squats beside
 MARGIN, ROOM, CLEARANCE = 0.05, 0.30, 0.12  # [m]
 DROP, RISE, MASS, FRICTION = (0.03, 0.20), (0.02, 0.08), (5.0, 100.0), (0.3, 1.0)  # [m], [m], [kg], [1]
@@ -33,7 +44,7 @@ def extents(heading):
 
 def drawn_blocks(env):
     """Fields of every world's block."""
-    values = env._dynamics.robot.ground.blocks.numpy()
+    values = env._scene.ground.blocks.numpy()
     return {name: values[name].astype(float) for name in values.dtype.names}
 
 
@@ -41,10 +52,8 @@ class Scenes(Starts):
     """Thousands of starts on one kind of ground; the attributes of `Starts`, and of those `taken` the block's too."""
 
     def __init__(self, env, kind, scheme):
-        env._grounds = KINDS[kind].ranges()
-        super().__init__(env, scheme)
-        drawn = env.tasks.numpy()["scheme"] == SCHEMES.index(scheme)
-        self.block = {name: values[drawn] for name, values in drawn_blocks(env).items()}
+        super().__init__(env, scheme, ground=KINDS[kind])
+        self.block = {name: values[self.drawn] for name, values in drawn_blocks(env).items()}
         self.foot = extents(self.episodes["heading"])
         self.taken = self.block["exists"] == 1
         rows = np.arange(len(self.goal))
@@ -55,13 +64,14 @@ class Scenes(Starts):
         return self.block[name][self.taken]
 
 
-def drawing_env(name, count, ground, seed=2, **changes):
+def drawing_env(name, count, ground, seed=2, reset=None, **changes):
     """Environment whose starts have a drawn ground, its robots nominal."""
-    task = dataclasses.replace(make_task(name), ground=ground, randomization=RandomizationCfg.off(), **changes)
-    return make_env(count, task=task, seed=seed, randomize=True)
+    task = dataclasses.replace(make_task(name), randomization=RandomizationCfg.off(), **changes)
+    reset = dataclasses.replace(reset or task.reset.settings, ground=ground)
+    return make_env(count, task=resetting(task, reset), seed=seed, randomize=True)
 
 
-@pytest.fixture(scope="module", params=NAMES)
+@pytest.fixture(scope="module", params=PLACES)
 def env(request):
     levels = {"levels": WIDE} if request.param == "omnidirectional-jump" else {}
     return drawing_env(request.param, N, GroundCfg(platform=0.5, block=0.5), **levels)
@@ -199,13 +209,12 @@ def test_an_episode_knows_the_ground_at_its_goal(scenes, kind):
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("scheme", ["in_flight", "touchdown", "landed"])
 def test_the_ground_is_level_where_a_jump_has_begun(env, kind, scheme):
-    env._grounds = KINDS[kind].ranges()
     for start in ("default", scheme):
-        env._ranges = only(start, env.task.reset).ranges(env.step_dt)
+        begin_by(env, only(start, resets_of(env), ground=KINDS[kind]))
         edit_episodes(env, level=len(env.task.levels) - 1)
         env.reset()
         assert drawn_blocks(env)["exists"].any() == (start == "default")
-    assert not env.tasks.numpy()["goal_ground"].any() and not collision_flags(env).any()
+    assert not episodes_of(env)["goal_ground"].any() and not collision_flags(env).any()
 
 
 def test_kinds_are_drawn_by_their_shares_where_there_is_room():
@@ -252,8 +261,8 @@ def hold(env, steps=20):
     action = torch.from_numpy((angles - DEFAULT_ANGLE) / scale).float()
     for _ in range(steps):
         env.step(action)
-        assert not env.done.any() and not env._invalid.numpy().any()
-    env._dynamics.full_state(*(getattr(env.sim.state, name) for name in ("joint_q", "joint_qd", "body_q", "body_qd")))
+        assert not env.done.any() and not env.robot.invalid.numpy().any()
+    env.sim.physics.write_bodies()
 
 
 @pytest.mark.parametrize("scheme", ["standing", "default"])

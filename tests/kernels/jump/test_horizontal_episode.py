@@ -1,3 +1,4 @@
+import dataclasses
 import math
 
 import numpy as np
@@ -7,15 +8,17 @@ from jump_helpers import (
     DEG,
     edit_coordinates,
     edit_episodes,
+    ending_names,
+    episodes_of,
     make_env,
     only,
     random_actions,
-    rule_names,
-)  # fmt: skip
+)
 from scipy.spatial.transform import Rotation
 
+from jumper_warp.evaluation.jumps import jump_commands
 from jumper_warp.registry import make_task
-from kernels.jump.task import FLIGHT, LANDED, STANCE
+from kernels.jump.state import FLIGHT, LANDED, STANCE
 
 TASK = make_task("horizontal-jump")
 N = 64
@@ -27,7 +30,13 @@ AGAIN = np.arange(10, 20)
 @pytest.fixture(scope="module")
 def env():
     """Standing starts with any heading, nominal, without noise; another goal is always planned past the first level."""
-    return make_env(N, task=TASK, reset=only("default", heading=180.0, jump_again=1.0), seed=4)
+    return make_env(N, task=again_and_again(1.0), reset=only("default", heading=180.0), seed=4)
+
+
+def again_and_again(share):
+    """Return the task in which a share of the landed robots gets another goal past the first level."""
+    levels = (TASK.levels[0], *(dataclasses.replace(level, jump_again=share) for level in TASK.levels[1:]))
+    return dataclasses.replace(TASK, levels=levels)
 
 
 def stand(env, **fields):
@@ -59,7 +68,8 @@ def test_a_turned_world_runs_alike():
     """Two robots, one turned by 137 degrees, jump off under the same random actions."""
     env = make_env(2, task=TASK)
     turn = 137.0 * DEG
-    env.evaluation_reset(np.tile([0.8, 0.2, 0.0], (2, 1)), command_delay=0.1, headings=np.array([0.0, turn]))
+    goals = np.tile([0.8, 0.2, 0.0], (2, 1))
+    env.evaluation_reset(jump_commands(goals, 0.1, env.step_dt), headings=np.array([0.0, turn]))
     phases = set()
     for step, action in enumerate(random_actions(1, 30, seed=2)):
         action = 0.5 * action
@@ -70,7 +80,7 @@ def test_a_turned_world_runs_alike():
         assert env.reward[1].item() == pytest.approx(env.reward[0].item(), abs=2e-3, rel=2e-3)
         assert env.done[0] == env.done[1]
         arrays = env.task_arrays()
-        assert arrays["phase"][0] == arrays["phase"][1] and arrays["rule"][0] == arrays["rule"][1]
+        assert arrays["phase"][0] == arrays["phase"][1] and arrays["ending"][0] == arrays["ending"][1]
         phases.add(int(arrays["phase"][0]))
     assert phases == {int(STANCE), int(FLIGHT)}
     expected = Rotation.from_euler("z", turn).apply(arrays["base_pos"][0])
@@ -81,7 +91,8 @@ def test_a_turned_world_runs_alike():
 @pytest.mark.parametrize("turn", [0.0, 90.0, 180.0])
 def test_an_evaluation_starts_with_its_heading_and_goal(turn):
     env = make_env(2, task=TASK)
-    env.evaluation_reset(np.array([[0.8, 0.2, 0.0], [0.3, -0.1, 0.0]]), headings=turn * DEG)
+    goals = np.array([[0.8, 0.2, 0.0], [0.3, -0.1, 0.0]])
+    env.evaluation_reset(jump_commands(goals, 0.5, env.step_dt), headings=turn * DEG)
     arrays = env.task_arrays()
     np.testing.assert_allclose(arrays["goal"][:, :2] @ [[math.cos(turn * DEG), -math.sin(turn * DEG)],
                                                         [math.sin(turn * DEG), math.cos(turn * DEG)]],
@@ -103,6 +114,11 @@ def land(env, **fields):
     edit_episodes(env, **fields)
     for world in range(N):
         edit_coordinates(env, world, q={0: 0.1 * world, 1: -0.2 * world})
+
+
+def every_array(env):
+    """Return what is known of every world's episode."""
+    return env.task_arrays() | episodes_of(env)
 
 
 @pytest.fixture(scope="module")
@@ -160,7 +176,7 @@ def test_others_keep_their_episode(second):
 
 
 def test_another_goal_moves_nothing_but_the_episode():
-    pair = [make_env(N, task=TASK, reset=only("default", jump_again=1.0), seed=4) for _ in range(2)]
+    pair = [make_env(N, task=again_and_again(1.0), reset=only("default"), seed=4) for _ in range(2)]
     for env, when in zip(pair, (13, 0), strict=True):
         edit_episodes(env, level=1, phase=LANDED, phase_steps=12, again_step=when)
         for action in 0.3 * random_actions(N, 5):
@@ -176,8 +192,8 @@ def test_jumps_follow_each_other_as_often_as_planned(env):
     land(env, again_step=13)
     env.step(REST)
     planned = env.task_arrays()["again_step"]  # jump_again = 1: after every second jump a third
-    assert planned.min() >= 12 and planned.max() <= 42
-    never = make_env(N, task=TASK, reset=only("default", jump_again=0.0))
+    assert planned.min() >= 12 and planned.max() <= 42 and len(set(planned)) > 20
+    never = make_env(N, task=again_and_again(0.0), reset=only("default"))
     land(never, again_step=13)
     never.step(REST)
     arrays = never.task_arrays()
@@ -210,18 +226,18 @@ def test_another_jump_that_is_overdue_begins(env):
 # ---------------------------------------------------------------- the caller's next jump
 
 
-def test_next_jump_changes_chosen_landed_worlds(env):
-    land(env)
+def test_a_command_changes_chosen_landed_worlds(env):
+    land(env, steps=1 + np.arange(N))
     phase = np.array([STANCE, FLIGHT, LANDED, LANDED])[np.arange(N) % 4]
     edit_episodes(env, phase=phase, idle_steps=3, apex_passed=1, touched_down=0)
     chosen = np.arange(N) % 8 < 6
     goals = np.stack([np.linspace(0.3, 1.5, N), np.linspace(-0.3, 0.3, N), np.zeros(N)], axis=1)
-    before, q, qd = env.task_arrays(), env.sim.joint_q().copy(), env.sim.joint_qd().copy()
-    env.next_jump(goals, chosen)
-    after = env.task_arrays()
+    before, q, qd = every_array(env), env.sim.joint_q().copy(), env.sim.joint_qd().copy()
+    env.command(goals, chosen)
+    after = every_array(env)
     begun = chosen & (phase == LANDED)
     assert 0 < begun.sum() < chosen.sum()
-    for name in env.tasks.numpy().dtype.names:
+    for name in episodes_of(env):
         np.testing.assert_array_equal(after[name][~begun], before[name][~begun], name)
     offset = in_yaw_frame((after["goal"] - after["base_pos"]) * [1.0, 1.0, 0.0], yaw_of(after))
     np.testing.assert_allclose(offset[begun], goals[begun], atol=1e-5)
@@ -232,11 +248,32 @@ def test_next_jump_changes_chosen_landed_worlds(env):
     np.testing.assert_array_equal(env.sim.joint_qd(), qd)
 
 
+def test_a_command_before_the_first_step_waits_for_no_flight_and_goes_on_from_a_landing(env):
+    land(env)
+    phase = np.array([FLIGHT, LANDED])[np.arange(N) % 2]
+    edit_episodes(env, phase=phase, steps=0, jumps=0)
+    before = every_array(env)
+    env.command(np.tile([0.7, -0.2, 0.0], (N, 1)))
+    after = every_array(env)
+    for name in episodes_of(env):
+        np.testing.assert_array_equal(after[name][phase == FLIGHT], before[name][phase == FLIGHT], name)
+    np.testing.assert_array_equal(after["jumps"], phase == LANDED)
+
+
+def test_a_command_before_the_first_step_is_taken_by_a_robot_that_stands(env):
+    stand(env)
+    env.command(np.tile([0.7, -0.2, 0.0], (N, 1)))
+    after = env.task_arrays()
+    offset = in_yaw_frame((after["goal"] - after["base_pos"]) * [1.0, 1.0, 0.0], yaw_of(after))
+    np.testing.assert_allclose(offset, np.tile([0.7, -0.2, 0.0], (N, 1)), atol=1e-5)
+    assert not after["command_step"].any() and not after["jumps"].any()
+
+
 def test_the_policy_sees_its_next_jump_after_the_next_step(env):
     land(env, goal=(0.0, 0.0, 0.0))
     env.auto_reset = False
     goals = np.tile([0.7, -0.2, 0.0], (N, 1))
-    env.next_jump(goals, np.ones(N, dtype=bool))
+    env.command(goals, np.ones(N, dtype=bool))
     env.step(REST)
     np.testing.assert_allclose(env.obs[:, :2], goals[:, :2], atol=0.01)  # the base moves by millimetres in a step
 
@@ -251,24 +288,24 @@ def test_a_jump_counts_where_it_ended_near_its_goal(env, miss, near):
     edit_episodes(env, phase=LANDED, phase_steps=59, goal=position + [0.6 * miss, -0.8 * miss, 0.0])
     env.metrics()
     env.step(REST)
-    assert rule_names(env) == ["success"] * N and (env.timeout == 1.0).all()
-    assert env.task_arrays()["streak"].tolist() == [3 if near else 0] * N
+    assert ending_names(env) == ["success"] * N and (env.timeout == 1.0).all()
+    assert episodes_of(env)["streak"].tolist() == [3 if near else 0] * N
     figures = env.metrics()
     assert figures["Metrics/success"] == float(near)
     assert figures["Metrics/error_m"] == pytest.approx(miss if near else 0.0, abs=3e-3)
 
 
 @pytest.mark.parametrize(
-    ("rule", "episode"),
+    ("ending", "episode"),
     [("too_long", {"steps": 1199, "phase_steps": 10}), ("no_jump", {"phase": STANCE, "steps": 500, "command_step": 0})],
 )
-def test_any_other_end_at_the_goal_is_no_success(env, rule, episode):
+def test_any_other_end_at_the_goal_is_no_success(env, ending, episode):
     stand(env, level=1, streak=2)
     edit_episodes(env, goal=env.task_arrays()["base_pos"], **({"phase": LANDED} | episode))
     env.metrics()
     env.step(REST)
-    assert rule_names(env) == [rule] * N
-    assert not env.task_arrays()["streak"].any() and env.metrics()["Metrics/success"] == 0.0
+    assert ending_names(env) == [ending] * N
+    assert not episodes_of(env)["streak"].any() and env.metrics()["Metrics/success"] == 0.0
 
 
 def test_five_near_landings_raise_the_level_and_a_far_one_does_not(env):

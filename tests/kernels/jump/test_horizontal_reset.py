@@ -1,79 +1,21 @@
 import dataclasses
 
 import numpy as np
-import pinocchio as pin
 import pytest
 import warp as wp
-from jump_helpers import DEG, SCHEMES, edit_episodes, make_env, only
+from jump_helpers import DEG, SCHEMES, begin_by, edit_episodes, episodes_of, make_env, resets_of
+from jump_starts import PAW_RADIUS, PLACES, Starts, covers
 from scipy.spatial.transform import Rotation
-from solver_helpers import MOTOR_Q, MOTOR_V, Reference, States, paw_joint
+from solver_helpers import MOTOR_Q, MOTOR_V
 
 from jumper_warp.registry import make_task
-from kernels.collision.robot import collision_kernel
-from kernels.jump.task import FLIGHT, LANDED, STANCE
+from kernels.jump.reset import JumpLevel
+from kernels.jump.state import FLIGHT, LANDED, STANCE
 
 N = 4096
 G = 9.81
-PAW_RADIUS, LANDING_HEIGHT = 0.025, 0.30  # [m]
-NAMES = ("horizontal-jump", "omnidirectional-jump")
+LANDING_HEIGHT = 0.30  # [m]
 CORNER = 0.05 * np.sqrt(2.0)  # [m] how far the start of a jump lies from the origin at most
-
-
-class Starts:
-    """Thousands of beginnings of one scheme, every world at its own level; exact: the jump starts at the origin."""
-
-    def __init__(self, env, scheme: str, exact: bool = False):
-        reset = only(scheme, env.task.reset, **({"base_xy": 0.0} if exact else {}))
-        env._ranges = reset.ranges(env.step_dt)
-        self.level = np.arange(N) % len(env.task.levels)
-        edit_episodes(env, level=self.level)
-        env.reset()
-        drawn = env.tasks.numpy()["scheme"] == SCHEMES.index(scheme)
-        self.fallbacks = 1.0 - drawn.mean()
-        self.flags = collision_flags(env)
-        self.reference = Reference(env.sim.model)
-        episodes = env.tasks.numpy()[drawn]
-        self.episodes = {name: episodes[name].astype(float) for name in episodes.dtype.names}
-        self.q, self.qd = env.sim.joint_q()[drawn].astype(float), env.sim.joint_qd()[drawn].astype(float)
-        self.level = self.level[drawn]
-        self.pos, self.vel = self.q[:, :3], self.qd[:, :3]
-        self.heading = Rotation.from_euler("z", self.episodes["heading"][:, None])
-        self.goal = self.episodes["goal"] * [1.0, 1.0, 0.0]
-        self.distance = np.linalg.norm(self.goal, axis=1)
-        self.along = self.goal / self.distance[:, None]
-        self.paws = self._paws()
-
-    def _paws(self) -> np.ndarray:
-        """Return the places of the paws [m] from Pinocchio, (worlds, 4, 3)."""
-        states, robot = States.read(self.q, self.qd), self.reference.robot
-        joints = [paw_joint(self.reference, leg) for leg in range(4)]
-        paws = np.zeros((len(self.q), 4, 3))
-        for i in range(len(paws)):
-            pin.forwardKinematics(
-                robot.model, robot.data, robot.configuration(states.pos[i], states.quat[i], states.angles[i])
-            )
-            paws[i] = [robot.data.oMi[joint].act(np.array([0.0, 0.0, -0.3])) for joint in joints]
-        return paws
-
-    def split(self, vectors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the parts of horizontal vectors towards the goal and to its left."""
-        left = np.cross([0.0, 0.0, 1.0], self.along)
-        return np.sum(vectors * self.along, axis=1), np.sum(vectors * left, axis=1)
-
-    def paws_around(self, spot: np.ndarray) -> np.ndarray:
-        """Return the paws relative to places (worlds, 3), in the jump's heading, all as if they were front left."""
-        relative = self.paws - spot[:, None]
-        turned = np.stack([self.heading.inv().apply(relative[:, leg]) for leg in range(4)], axis=1)
-        return turned * np.array([[1, 1, 1], [1, -1, 1], [-1, 1, 1], [-1, -1, 1]])
-
-
-def collision_flags(env) -> np.ndarray:
-    """Return the flags of forbidden contacts of every world."""
-    flags, clearance = (wp.zeros(env.num_envs, dtype=kind, device="cpu") for kind in (int, float))
-    robot = env._dynamics.robot
-    inputs = [robot.geometry, robot.ground, env.sim.state.joint_q, 43, 0.0]
-    wp.launch(collision_kernel, env.num_envs, inputs, [flags, clearance], device="cpu")
-    return flags.numpy()
 
 
 def land(pos: np.ndarray, vel: np.ndarray, height: float) -> tuple[np.ndarray, np.ndarray]:
@@ -90,14 +32,7 @@ def land(pos: np.ndarray, vel: np.ndarray, height: float) -> tuple[np.ndarray, n
     return found, when
 
 
-def covers(values, lower, upper, reach=0.03):
-    """Whether values stay in a range and come near both of its ends."""
-    width = upper - lower
-    inside = values.min() >= lower - 2e-4 and values.max() <= upper + 2e-4
-    return inside and values.min() <= lower + reach * width and values.max() >= upper - reach * width
-
-
-@pytest.fixture(scope="module", params=NAMES)
+@pytest.fixture(scope="module", params=PLACES)
 def env(request):
     return make_env(N, task=make_task(request.param), seed=1)
 
@@ -112,10 +47,10 @@ def starts(env):
 
 
 def test_schemes_have_the_tasks_shares(env):
-    env._ranges = env.task.reset.ranges(env.step_dt)
+    begin_by(env, resets_of(env))
     edit_episodes(env, level=np.arange(N) % len(env.task.levels))
     env.reset()
-    shares = np.bincount(env.tasks.numpy()["scheme"], minlength=5) / N
+    shares = np.bincount(episodes_of(env)["scheme"], minlength=5) / N
     # 0.02: default poses that stand in for what cannot be drawn
     assert np.abs(shares - [0.45, 0.15, 0.175, 0.175, 0.05]).max() < 4.0 * np.sqrt(0.25 / N) + 0.02
 
@@ -261,9 +196,9 @@ def test_touchdowns_lead_to_the_goal_once_their_lag_is_made_up(env, starts):
     assert left.min() >= 0.03 - 2e-3 and left.max() <= 0.15 + 2e-3
     lag, aside = found.split((found.goal - place) * [1.0, 1.0, 0.0])
     far = found.distance >= 0.1
-    assert covers(lag[far], *env.task.reset.touchdown_behind) and np.abs(aside[far]).max() < 5e-4
+    assert covers(lag[far], *env.task.reset.settings.touchdown_behind) and np.abs(aside[far]).max() < 5e-4
     assert lag[~far].max(initial=0.0) <= 0.20 + 5e-4 and np.abs(aside).max() < 5e-4
-    shares = np.histogram(lag[far], np.linspace(*env.task.reset.touchdown_behind, 4))[0] / far.sum()
+    shares = np.histogram(lag[far], np.linspace(*env.task.reset.settings.touchdown_behind, 4))[0] / far.sum()
     assert shares.min() > 0.1  # long lags are out of the legs' reach more often, above all sideways
     spread = starts["touchdown"]
     lag, aside = spread.split((spread.goal - land(spread.pos, spread.vel, LANDING_HEIGHT)[0]) * [1.0, 1.0, 0.0])
@@ -272,7 +207,7 @@ def test_touchdowns_lead_to_the_goal_once_their_lag_is_made_up(env, starts):
 
 
 def test_touchdowns_have_their_paws_ahead_of_the_base_towards_the_goal(env, starts):
-    behind = env.task.reset.touchdown_behind
+    behind = env.task.reset.settings.touchdown_behind
     found = starts["touchdown"]
     # the paws' boxes are centred on the projectile to 1 cm in x and y
     ahead, aside = found.split((found.paws.mean(axis=1) - found.pos) * [1.0, 1.0, 0.0])
@@ -304,7 +239,7 @@ def test_another_goal_is_planned_past_the_first_level_only(env, starts):
     share = (planned[level > 0] > 0).mean()
     assert share == pytest.approx(0.175, abs=4.0 * np.sqrt(0.175 * 0.825 / (level > 0).sum()))
     assert covers(planned[planned > 0], 12.0, 42.0, 0.05)  # 0.2 to 0.7 s
-    plain = dataclasses.replace(env.task.reset, jump_again=0.0)
-    env._ranges = plain.ranges(env.step_dt)
+    never = [dataclasses.replace(level, jump_again=0.0).values() for level in env.task.levels]
+    env.skills[0].levels.assign(wp.array(never, dtype=JumpLevel, device="cpu"))
     env.reset()
-    assert not env.tasks.numpy()["again_step"].any()
+    assert not episodes_of(env)["again_step"].any()

@@ -4,19 +4,28 @@ import math
 import jump_oracle
 import numpy as np
 import pytest
-from jump_helpers import DEFAULT_ANGLE, DEG, Table, make_env, make_episode, make_view, random_actions, tilted_by
-from jump_oracle import expected_terms, kernel_inputs, random_robots, robot_of
+from jump_helpers import (
+    DEFAULT_ANGLE,
+    DEG,
+    Table,
+    make_env,
+    make_episode,
+    make_view,
+    random_actions,
+    tilted_by,
+)  # fmt: skip
+from jump_oracle import expected_terms, kernel_inputs, params_of, random_robots, robot_of
 from scipy.spatial.transform import Rotation
 
 from jumper_warp.registry import make_task
-from kernels.jump import rewards
-from kernels.jump.task import FLIGHT, LANDED, STANCE
+from kernels.jump.state import FLIGHT, LANDED, STANCE
 
 TASK = make_task("horizontal-jump")
 E = math.exp
 PHASES = [int(STANCE), int(FLIGHT), int(LANDED)]
 TRANSVERSAL = np.tile([0.0, 1.0, 1.0], 4)
-paid = Table(rewards, " ".join(term.name for term in TASK.terms), float)
+ESTIMATE = {"middle": 0.30, "wide": 0.50, "fine": 0.10, "height": 0.30}
+paid = Table([term.func for term in TASK.rewards], float)
 
 
 @pytest.fixture(scope="module")
@@ -26,12 +35,12 @@ def robots():
     return robot, *kernel_inputs(robot)
 
 
-@pytest.mark.parametrize("term", TASK.terms, ids=lambda term: term.name)
+@pytest.mark.parametrize("term", TASK.rewards, ids=lambda term: term.name)
 def test_a_term_has_the_papers_value_in_any_state(robots, term):
     robot, views, tasks = robots
-    expected = jump_oracle.TERMS[term.name](robot, term.params)
+    expected = jump_oracle.TERMS[term.name](robot, params_of(term))
     assert np.count_nonzero(np.abs(expected) > 0.05) > 20
-    found = paid.all(term.name, views, tasks, *term.params)
+    found = paid.all(term.name, views, tasks, **params_of(term))
     np.testing.assert_allclose(found, expected, rtol=2e-3, atol=2e-5 * np.abs(expected).max())
     assert not found[expected == 0.0].any()
 
@@ -48,10 +57,11 @@ def test_a_term_has_the_papers_value_in_any_state(robots, term):
 def test_tracking_has_a_wide_and_a_narrow_kernel_and_is_paid_after_takeoff(miss, expected):
     # 3-4-5 beside the goal; the height does not matter
     view = make_view(pos=(1.0 + 0.6 * miss, -2.0 + 0.8 * miss, 0.7))
+    widths = {"wide": 0.15, "fine": 0.03, "fine_share": 0.6}
     for phase in (FLIGHT, LANDED):
         task = make_episode(phase=phase, goal=(1.0, -2.0, 0.0))
-        assert paid("tracking", view, task, 0.15, 0.03, 0.6) == pytest.approx(expected, rel=1e-4)
-    assert paid("tracking", view, make_episode(goal=(1.0, -2.0, 0.0)), 0.15, 0.03, 0.6) == 0.0
+        assert paid("tracking", view, task, **widths) == pytest.approx(expected, rel=1e-4)
+    assert paid("tracking", view, make_episode(goal=(1.0, -2.0, 0.0)), **widths) == 0.0
 
 
 @pytest.mark.parametrize(
@@ -67,11 +77,10 @@ def test_est_tracking_is_of_the_ballistic_landing_and_paid_in_flight(miss, expec
     # half a second from z = 0.52625 m upward with 2 m/s to 0.3 m: 0.52625 + 2 / 2 - 9.81 / 8 = 0.3
     view = make_view(pos=(0.2, 0.3, 0.52625), lin_vel=(1.0, -0.6, 2.0))
     goal = (0.7 + 0.6 * miss, -0.8 * miss, 0.0)
-    p = (0.30, 0.50, 0.10, 0.30)
     flying = make_episode(phase=FLIGHT, goal=goal)
-    assert paid("estimated_tracking", view, flying, *p) == pytest.approx(expected, rel=1e-3)
+    assert paid("estimated_tracking", view, flying, **ESTIMATE) == pytest.approx(expected, rel=1e-3)
     for phase in (STANCE, LANDED):
-        assert paid("estimated_tracking", view, make_episode(phase=phase, goal=goal), *p) == 0.0
+        assert paid("estimated_tracking", view, make_episode(phase=phase, goal=goal), **ESTIMATE) == 0.0
 
 
 @pytest.mark.parametrize("rise", [0.08, -0.2])
@@ -79,7 +88,7 @@ def test_est_tracking_ends_above_the_ground_at_the_goal(rise):
     # as above, all of it higher by the ground at the goal
     view = make_view(pos=(0.2, 0.3, 0.52625 + rise), lin_vel=(1.0, -0.6, 2.0))
     flying = make_episode(phase=FLIGHT, goal=(0.7, 0.0, 0.0), goal_ground=rise)
-    assert paid("estimated_tracking", view, flying, 0.30, 0.50, 0.10, 0.30) == pytest.approx(1.4, rel=1e-4)
+    assert paid("estimated_tracking", view, flying, **ESTIMATE) == pytest.approx(1.4, rel=1e-4)
 
 
 @pytest.mark.parametrize("heading", [0.0, 90.0, 179.0, -179.0, 180.0])
@@ -92,7 +101,7 @@ def test_flight_orientation_is_the_rotation_from_level_and_heading(heading, yaw,
     for sign in (1.0, -1.0):  # both quaternions of the orientation
         view = make_view(quat=sign * quat, lin_vel=(1.0, 0.0, 0.0))
         flying = make_episode(phase=FLIGHT, heading=heading * DEG, goal=(1.0, 0.0, 0.0))
-        assert paid("flight_orientation", view, flying, 10.0 * DEG) == pytest.approx(expected, rel=2e-3)
+        assert paid("flight_orientation", view, flying, width=10.0 * DEG) == pytest.approx(expected, rel=2e-3)
 
 
 @pytest.mark.parametrize(
@@ -102,27 +111,27 @@ def test_flight_orientation_is_paid_while_moving_towards_the_goal(vel, share):
     fields = {"goal": (2.0, 1.0, 0.0)}
     view = make_view(pos=(1.0, 1.0, 0.5), lin_vel=vel)
     flying = make_episode(phase=FLIGHT, **fields)
-    assert paid("flight_orientation", view, flying, 10.0 * DEG) == pytest.approx(share)
+    assert paid("flight_orientation", view, flying, width=10.0 * DEG) == pytest.approx(share)
     for phase in (STANCE, LANDED):
-        assert paid("flight_orientation", view, make_episode(phase=phase, **fields), 10.0 * DEG) == 0.0
+        assert paid("flight_orientation", view, make_episode(phase=phase, **fields), width=10.0 * DEG) == 0.0
 
 
 @pytest.mark.parametrize("phase", PHASES)
 def test_flight_angular_velocity(phase):
     view = make_view(ang_vel=(6.0, 0.0, -8.0))
     expected = E(-1.0) if phase == FLIGHT else 0.0
-    assert paid("flight_angular_velocity", view, make_episode(phase=phase), 10.0) == pytest.approx(expected, rel=1e-4)
+    assert paid("flight_angular_velocity", view, make_episode(phase=phase), width=10.0) == pytest.approx(expected, rel=1e-4)
 
 
 def test_left_right_symmetry_compares_transversal_motors_of_a_pair():
     mirrored = make_view(angle=np.array([0.3, 0.1, 0.9, -0.5, 0.1, 0.9, 0.2, 1.1, 0.4, 0.0, 1.1, 0.4]))
     unasked = make_episode(command_step=1)
-    assert paid("left_right_symmetry", mirrored, unasked, 0.5, 0.1) == pytest.approx(1.0)
+    assert paid("left_right_symmetry", mirrored, unasked, width=0.5, share=0.1) == pytest.approx(1.0)
     # one of the four pairs differs by 1 rad: rms 0.5
     for motor in (1, 2, 4, 5, 7, 8, 10, 11):
         view = make_view(angle=DEFAULT_ANGLE + np.eye(12)[motor])
-        assert paid("left_right_symmetry", view, unasked, 0.5, 0.1) == pytest.approx(E(-1.0), rel=1e-4)
-        assert paid("left_right_symmetry", view, make_episode(), 0.5, 0.1) == pytest.approx(0.1 * E(-1.0), rel=1e-4)
+        assert paid("left_right_symmetry", view, unasked, width=0.5, share=0.1) == pytest.approx(E(-1.0), rel=1e-4)
+        assert paid("left_right_symmetry", view, make_episode(), width=0.5, share=0.1) == pytest.approx(0.1 * E(-1.0), rel=1e-4)
 
 
 AT_EASE = [
@@ -139,35 +148,35 @@ AT_EASE = [
 @pytest.mark.parametrize(("episode", "due"), AT_EASE)
 def test_standing_is_paid_before_the_command_and_half_a_second_after_touchdown(episode, due):
     task = make_episode(**episode)
-    posture, still = (20.0 * DEG, 25.0 * DEG), (0.1, 0.5)
+    posture, still = {"width": 20.0 * DEG, "shift": 25.0 * DEG}, {"speed": 0.1, "spin": 0.5}
     wanted = make_view(angle=DEFAULT_ANGLE + 25.0 * DEG * TRANSVERSAL)
-    assert paid("standing_posture", wanted, task, *posture) == pytest.approx(float(due))
+    assert paid("standing_posture", wanted, task, **posture) == pytest.approx(float(due))
     off = make_view(angle=DEFAULT_ANGLE + 25.0 * DEG * TRANSVERSAL + 20.0 * DEG)
-    assert paid("standing_posture", off, task, *posture) == pytest.approx(due * E(-1.0), rel=1e-4)
-    assert paid("rest", make_view(), task, *still) == pytest.approx(float(due))
+    assert paid("standing_posture", off, task, **posture) == pytest.approx(due * E(-1.0), rel=1e-4)
+    assert paid("rest", make_view(), task, **still) == pytest.approx(float(due))
     slow = make_view(lin_vel=(0.06, 0.0, -0.08))
-    assert paid("rest", slow, task, *still) == pytest.approx(due * E(-1.0), rel=1e-4)
+    assert paid("rest", slow, task, **still) == pytest.approx(due * E(-1.0), rel=1e-4)
     turning = make_view(lin_vel=(0.06, 0.0, -0.08), ang_vel=(0.3, 0.4, 0.0))
-    assert paid("rest", turning, task, *still) == pytest.approx(due * E(-2.0), rel=1e-4)
+    assert paid("rest", turning, task, **still) == pytest.approx(due * E(-2.0), rel=1e-4)
 
 
 @pytest.mark.parametrize("axis", [(1.0, 0.0, 0.0), (0.6, -0.8, 0.0)])
 def test_landing_tilt_is_1_at_its_limit_and_counts_after_touchdown(axis):
     view = make_view(**tilted_by(10.0 * DEG, axis))
     half = make_view(**tilted_by(5.0 * DEG, axis))
-    assert paid("landing_tilt", view, make_episode(phase=LANDED), 10.0 * DEG) == pytest.approx(1.0, rel=1e-4)
+    assert paid("landing_tilt", view, make_episode(phase=LANDED), width=10.0 * DEG) == pytest.approx(1.0, rel=1e-4)
     share = (math.sin(5.0 * DEG) / math.sin(10.0 * DEG)) ** 2
-    assert paid("landing_tilt", half, make_episode(phase=LANDED), 10.0 * DEG) == pytest.approx(share, rel=1e-4)
-    assert paid("landing_tilt", make_view(), make_episode(phase=LANDED), 10.0 * DEG) == 0.0
+    assert paid("landing_tilt", half, make_episode(phase=LANDED), width=10.0 * DEG) == pytest.approx(share, rel=1e-4)
+    assert paid("landing_tilt", make_view(), make_episode(phase=LANDED), width=10.0 * DEG) == 0.0
     for phase in (STANCE, FLIGHT):
-        assert paid("landing_tilt", view, make_episode(phase=phase), 10.0 * DEG) == 0.0
+        assert paid("landing_tilt", view, make_episode(phase=phase), width=10.0 * DEG) == 0.0
 
 
 @pytest.fixture(scope="module")
 def rollout():
     """Logged and expected terms of jumps from all starts, (steps, terms, worlds)."""
     shares = {"standing": 0.2, "default": 0.2, "in_flight": 0.2, "touchdown": 0.2}
-    env = make_env(64, task=dataclasses.replace(TASK, reset=dataclasses.replace(TASK.reset, **shares)), seed=3)
+    env = make_env(64, task=TASK, reset=dataclasses.replace(TASK.reset.settings, **shares), seed=3)
     env.auto_reset = False
     logged, expected = [], []
     for step, action in enumerate(0.2 * random_actions(64, 60)):
@@ -175,13 +184,13 @@ def rollout():
         before = robot_of(env)
         env.step(action)
         after = robot_of(env)
-        logged.append(env._out.term_value.numpy().copy())
+        logged.append(env.skills[0].term_value.numpy().copy())
         expected.append(expected_terms(TASK, before, after, action.clamp(-1.0, 1.0).numpy().T))
-        env._begin(env._out.done)
+        env._begin(env.worlds.done)
     return np.array(logged), np.array(expected)
 
 
-@pytest.mark.parametrize("index", range(len(TASK.terms)), ids=[term.name for term in TASK.terms])
+@pytest.mark.parametrize("index", range(len(TASK.rewards)), ids=[term.name for term in TASK.rewards])
 def test_a_term_is_logged_as_computed_by_hand(rollout, index):
     logged, expected = (values[:, index] for values in rollout)
     assert expected.any()

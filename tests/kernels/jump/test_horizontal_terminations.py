@@ -1,6 +1,6 @@
 import numpy as np
 import pytest
-from jump_helpers import DEG, Table, make_episode, make_view
+from jump_helpers import DEG, Table, functions, make_episode, make_view
 from jump_oracle import (
     FLIGHT,
     LANDED,
@@ -18,40 +18,44 @@ from scipy.spatial.transform import Rotation
 from jumper_warp.registry import make_task
 from kernels.jump import terminations
 
-holds = Table(terminations, "missed_goal predicted_miss turned_touchdown left_stance", bool)
+holds = Table(functions(terminations, "missed_goal predicted_miss turned_touchdown left_stance"), bool)
+PREDICTED = {"tolerance": 0.55, "steps": 6.0, "height": 0.3}
 HEADINGS = [0.0, 100.0, 175.0, 180.0, -175.0]
 
-RULES = {
-    "missed_goal": ((0.5,), lambda r: (r["touched_down"] == 1) & (error(r) > 0.5)),
+ENDINGS = {
+    "missed_goal": ({"tolerance": 0.5}, lambda r: (r["touched_down"] == 1) & (error(r) > 0.5)),
     "predicted_miss": (
-        (0.55, 6.0, 0.3),
+        PREDICTED,
         lambda r: (r["phase"] == FLIGHT) & (r["phase_steps"] == 6) & (estimated_error(r, 0.3) > 0.55),
     ),
     "turned_touchdown": (
-        (30.0 * DEG, 10.0 * DEG),
+        {"rotation": 30.0 * DEG, "yaw": 10.0 * DEG},
         lambda r: (r["touched_down"] == 1) & ((rotation_error(r) > 30.0 * DEG) | (np.abs(yaw_error(r)) > 10.0 * DEG)),
     ),
-    "left_stance": ((0.3,), lambda r: (r["phase"] == STANCE) & (norm((r["pos"] - r["start"])[:, :2]) > 0.3)),
+    "left_stance": (
+        {"distance": 0.3},
+        lambda r: (r["phase"] == STANCE) & (norm((r["pos"] - r["start"])[:, :2]) > 0.3),
+    ),
 }
 
 
-@pytest.mark.parametrize("rule", RULES)
-def test_a_rule_holds_where_it_should(rule):
+@pytest.mark.parametrize("name", ENDINGS)
+def test_a_termination_holds_where_it_should(name):
     robots = random_robots(3000, seed=1)
     robots["phase_steps"] = 5 + robots["phase_steps"] % 3
-    limits, oracle = RULES[rule]
+    limits, oracle = ENDINGS[name]
     expected = oracle(robots)
     assert 20 < np.count_nonzero(expected) < 2980
-    np.testing.assert_array_equal(holds.all(rule, *kernel_inputs(robots), *limits), expected)
+    np.testing.assert_array_equal(holds.all(name, *kernel_inputs(robots), **limits), expected)
 
 
 @pytest.mark.parametrize(("miss", "missed"), [(0.49, False), (0.51, True)])
 def test_missed_goal_counts_at_touchdown_in_the_plane(miss, missed):
     view = make_view(pos=(1.0 - 0.6 * miss, 2.0 + 0.8 * miss, 0.9))
     touching = make_episode(phase=LANDED, touched_down=1, goal=(1.0, 2.0, 0.0))
-    assert holds("missed_goal", view, touching, 0.5) is missed
+    assert holds("missed_goal", view, touching, tolerance=0.5) is missed
     for episode in ({"phase": FLIGHT}, {"phase": LANDED, "phase_steps": 1}, {"phase": STANCE}):
-        assert not holds("missed_goal", view, make_episode(goal=(1.0, 2.0, 0.0), **episode), 0.5)
+        assert not holds("missed_goal", view, make_episode(goal=(1.0, 2.0, 0.0), **episode), tolerance=0.5)
 
 
 @pytest.mark.parametrize(("miss", "missed"), [(0.54, False), (0.56, True)])
@@ -61,22 +65,22 @@ def test_predicted_miss_is_decided_once_a_tenth_of_a_second_after_takeoff(miss, 
     goal = (0.7 + 0.6 * miss, -0.8 * miss, 0.0)
     for steps in range(12):
         flying = make_episode(phase=FLIGHT, phase_steps=steps, goal=goal)
-        assert holds("predicted_miss", view, flying, 0.55, 6.0, 0.3) is (missed and steps == 6)
+        assert holds("predicted_miss", view, flying, **PREDICTED) is (missed and steps == 6)
     for phase in (STANCE, LANDED):
         elsewhere = make_episode(phase=phase, phase_steps=6, goal=goal)
-        assert not holds("predicted_miss", view, elsewhere, 0.55, 6.0, 0.3)
+        assert not holds("predicted_miss", view, elsewhere, **PREDICTED)
 
 
 @pytest.mark.parametrize(("miss", "missed"), [(0.54, False), (0.56, True)])
 def test_predicted_miss_is_that_above_the_ground_at_the_goal(miss, missed):
     view = make_view(pos=(0.2, 0.0, 0.60625), lin_vel=(1.0, 0.0, 2.0))  # half a second to 0.38 m
     flying = make_episode(phase=FLIGHT, phase_steps=6, goal=(0.7 + miss, 0.0, 0.0), goal_ground=0.08)
-    assert holds("predicted_miss", view, flying, 0.55, 6.0, 0.3) is missed
+    assert holds("predicted_miss", view, flying, **PREDICTED) is missed
 
 
 def test_predicted_miss_of_the_task_is_decided_at_a_whole_step():
-    rules = {rule.name: rule.params for rule in make_task("horizontal-jump").rules}
-    assert rules["predicted_miss"][1] == 6.0 and rules["success"] == (60.0,)
+    numbers = {term.name: term.numbers for term in make_task("horizontal-jump").terminations}
+    assert numbers["predicted_miss"]["steps"] == 6.0 and numbers["success"] == {"steps": 60.0}
 
 
 @pytest.mark.parametrize("heading", HEADINGS)
@@ -97,18 +101,18 @@ def test_predicted_miss_of_the_task_is_decided_at_a_whole_step():
 )
 def test_turned_touchdown_measures_from_the_heading_across_180_degrees(heading, yaw, pitch, turned):
     quat = Rotation.from_euler("ZYX", [heading + yaw, pitch, 0.0], degrees=True).as_quat()
-    limits = (30.0 * DEG, 10.0 * DEG)
+    limits = {"rotation": 30.0 * DEG, "yaw": 10.0 * DEG}
     for sign in (1.0, -1.0):
         view = make_view(quat=sign * quat)
         touching = make_episode(phase=LANDED, touched_down=1, heading=heading * DEG)
-        assert holds("turned_touchdown", view, touching, *limits) is turned
-        assert not holds("turned_touchdown", view, make_episode(phase=LANDED, heading=heading * DEG), *limits)
+        assert holds("turned_touchdown", view, touching, **limits) is turned
+        assert not holds("turned_touchdown", view, make_episode(phase=LANDED, heading=heading * DEG), **limits)
 
 
 def test_left_stance_is_measured_in_the_plane_while_standing():
     fields = {"start": (1.0, -1.0, 0.3)}
     for miss, left in ((0.29, False), (0.31, True)):
         view = make_view(pos=(1.0 + 0.6 * miss, -1.0 - 0.8 * miss, 0.9))
-        assert holds("left_stance", view, make_episode(**fields), 0.3) is left
+        assert holds("left_stance", view, make_episode(**fields), distance=0.3) is left
         for phase in (FLIGHT, LANDED):
-            assert not holds("left_stance", view, make_episode(phase=phase, **fields), 0.3)
+            assert not holds("left_stance", view, make_episode(phase=phase, **fields), distance=0.3)

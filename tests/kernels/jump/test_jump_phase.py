@@ -1,3 +1,4 @@
+import itertools
 import math
 
 import numpy as np
@@ -8,28 +9,28 @@ from jump_helpers import make_episode, make_view, tilted_by
 from kernels.jump import phase as jump_phase
 from kernels.jump import rewards
 from kernels.jump.phase import advance_jump
-from kernels.jump.task import FLIGHT, LANDED, STANCE, JumpTask, RobotView
+from kernels.jump.state import FLIGHT, LANDED, STANCE, JumpState
+from kernels.mdp.view import RobotView
 
 STEP = 1.0 / 60.0
 G = 9.81
 TAKEOFF_SPEED = 0.75
-HEIGHT = wp.vec4(0.1, 0.05, 0.4, 0.0)
+HEIGHT = (0.1, 0.05, 0.4)
 
 
 @wp.kernel(enable_backward=False)
 def advance_kernel(
     views: wp.array(dtype=RobotView),
-    vel_before: wp.array(dtype=wp.vec3),
-    p: wp.vec4,
-    tasks: wp.array(dtype=JumpTask),
+    p: wp.array(dtype=float),
+    tasks: wp.array(dtype=JumpState),
     height_reward: wp.array(dtype=float),
     estimate: wp.array(dtype=float),
 ):
     """Advance an episode through one view after the other; tasks: the beginning, then the state after each."""
     for step in range(views.shape[0]):
-        task = advance_jump(tasks[step], views[step], vel_before[step], TAKEOFF_SPEED)
-        height_reward[step] = rewards.jump_height(views[step], task, p)
-        estimate[step] = rewards.estimated_jump_height(views[step], task, p)
+        task = advance_jump(views[step], tasks[step], TAKEOFF_SPEED)
+        height_reward[step] = rewards.jump_height(views[step], task, p[0], p[1], p[2])
+        estimate[step] = rewards.estimated_jump_height(views[step], task, p[0], p[1], p[2])
         tasks[step + 1] = task
 
 
@@ -37,12 +38,12 @@ def advance(views, start=None):
     """Return the episode after every view as a structured array, jump height rewards, and est jump height rewards."""
     count = len(views)
     start = make_episode() if start is None else start
-    tasks = wp.array([start] + [JumpTask()] * count, dtype=JumpTask, device="cpu")
-    before = [(0.0, 0.0, 0.0)] + [tuple(view.lin_vel) for view in views[:-1]]
-    vel = wp.array(before, dtype=wp.vec3, device="cpu")
+    tasks = wp.array([start] + [JumpState()] * count, dtype=JumpState, device="cpu")
+    for before, view in itertools.pairwise(views):
+        view.old_lin_vel = before.lin_vel
     paid, estimate = (wp.zeros(count, dtype=float, device="cpu") for _ in range(2))
-    inputs = [wp.array(views, dtype=RobotView, device="cpu"), vel, HEIGHT]
-    wp.launch(advance_kernel, 1, [*inputs], [tasks, paid, estimate], device="cpu")
+    inputs = [wp.array(views, dtype=RobotView, device="cpu"), wp.array(HEIGHT, dtype=float, device="cpu")]
+    wp.launch(advance_kernel, 1, inputs, [tasks, paid, estimate], device="cpu")
     return tasks.numpy()[1:], paid.numpy(), estimate.numpy()
 
 
@@ -90,11 +91,11 @@ def test_the_apex_is_found_and_paid_exactly_once(speed):
     assert apex - sampled - 1e-5 <= tasks["max_height"][-1] <= apex + 1e-5
     assert np.flatnonzero(paid).tolist() == at_apex.tolist()
     reached = float(tasks["max_height"][-1])
-    assert paid.sum() == pytest.approx(rewards.height_kernel(reached - 0.9, HEIGHT))
+    assert paid.sum() == pytest.approx(rewards.height_kernel(reached - 0.9, *HEIGHT))
     # est jump height: from takeoff (in flight from the third view on) to the step before the apex
     assert np.flatnonzero(estimate).tolist() == list(range(2, at_apex[0]))
     # a projectile's estimate does not change: the final height all the way
-    exact = rewards.height_kernel(apex - 0.9, HEIGHT)
+    exact = rewards.height_kernel(apex - 0.9, *HEIGHT)
     np.testing.assert_allclose(estimate[2 : at_apex[0]], exact, rtol=1e-3)
 
 
@@ -152,13 +153,13 @@ def integrate(pos, vel, height):
 )
 def test_the_ballistic_estimate_agrees_with_integration(pos, vel, height):
     apex, landing = integrate(pos, vel, height)
-    assert jump_phase.estimated_apex(wp.vec3(*pos), wp.vec3(*vel)) == pytest.approx(apex, abs=1e-4)
-    found = jump_phase.estimated_landing(wp.vec3(*pos), wp.vec3(*vel), height)
+    assert jump_phase.estimated_apex(wp.vec3(*pos), wp.vec3(*vel), G) == pytest.approx(apex, abs=1e-4)
+    found = jump_phase.estimated_landing(wp.vec3(*pos), wp.vec3(*vel), height, G)
     np.testing.assert_allclose(list(found), landing, atol=1e-3)
 
 
 def test_a_projectile_that_never_reaches_a_height_lands_nowhere_else():
     # at 0.2 m, falling: below 0.3 m already, so the estimate stays where it is
-    found = jump_phase.estimated_landing(wp.vec3(0.5, 0.6, 0.2), wp.vec3(1.0, 1.0, -0.5), 0.3)
+    found = jump_phase.estimated_landing(wp.vec3(0.5, 0.6, 0.2), wp.vec3(1.0, 1.0, -0.5), 0.3, G)
     np.testing.assert_allclose(list(found), [0.5, 0.6], atol=1e-6)
-    assert jump_phase.estimated_apex(wp.vec3(0.0, 0.0, 0.2), wp.vec3(0.0, 0.0, -5.0)) == pytest.approx(0.2)
+    assert jump_phase.estimated_apex(wp.vec3(0.0, 0.0, 0.2), wp.vec3(0.0, 0.0, -5.0), G) == pytest.approx(0.2)

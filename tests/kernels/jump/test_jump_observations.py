@@ -5,11 +5,10 @@ import pytest
 from jump_helpers import DEFAULT_ANGLE, DEG, MOTOR_SLOTS, Robots, make_episode
 
 from jumper_warp.registry import make_task
-from kernels.jump.observe import make_observe_kernel, observe_vertical
-from kernels.jump.task import FLIGHT, LANDED, STANCE
+from kernels.jump.state import FLIGHT, LANDED, STANCE
 
-KERNEL = make_observe_kernel(observe_vertical)
-NAMES = make_task("vertical-jump").observation_names
+TASK = make_task("vertical-jump")
+NAMES = TASK.observation_names
 COLUMN = {name: i for i, name in enumerate(NAMES)}
 MOTORS = [f"{leg}_{motor}" for leg in ("FL", "FR", "BL", "BR") for motor in ("lateral", "outer", "inner")]
 SCALES = np.concatenate(
@@ -21,7 +20,7 @@ SCALES = np.concatenate(
 
 def standing(n=1):
     """Return robots in front of a vertical jump of 0.8 m."""
-    return Robots(KERNEL, n)
+    return Robots(TASK, n)
 
 
 def columns(prefix, names):

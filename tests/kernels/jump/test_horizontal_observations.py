@@ -3,22 +3,22 @@ import math
 import numpy as np
 import pytest
 from jump_helpers import DEG, MOTOR_SLOTS, Robots, make_env, make_episode, only
+from mdp_helpers import array
 from scipy.spatial.transform import Rotation
 
 from jumper_warp.registry import make_task
-from kernels.jump.observe import make_observe_kernel, observe_horizontal, observe_vertical
-from kernels.jump.task import FLIGHT, LANDED, STANCE
+from kernels.jump.state import FLIGHT, LANDED, STANCE
 
-HORIZONTAL, VERTICAL = make_observe_kernel(observe_horizontal), make_observe_kernel(observe_vertical)
-NAMES = make_task("horizontal-jump").observation_names
+HORIZONTAL, VERTICAL = make_task("horizontal-jump"), make_task("vertical-jump")
+NAMES = HORIZONTAL.observation_names
 ROBOT, EPISODE = 48, 15  # columns
 N = 200
 
 
-def random_robots(kernel, turn=0.0, seed=0):
+def random_robots(task, turn=0.0, seed=0):
     """Return robots in any attitude with goals around them, all of it turned about z by an angle [rad]."""
     rng = np.random.default_rng(seed)
-    robots = Robots(kernel, N)
+    robots = Robots(task, N)
     heading = rng.uniform(-np.pi, np.pi, N)
     heading[:50] = np.pi + rng.uniform(-0.02, 0.02, 50)
     tilt = Rotation.from_rotvec(rng.uniform(-0.8, 0.8, (N, 3)))
@@ -43,9 +43,9 @@ def random_robots(kernel, turn=0.0, seed=0):
     return robots
 
 
-def robot_with(kernel=HORIZONTAL, **fields):
+def robot_with(task=HORIZONTAL, **fields):
     """Return one robot at rest with an episode."""
-    robots = Robots(kernel)
+    robots = Robots(task)
     robots.tasks = [make_episode(**fields)]
     return robots
 
@@ -60,7 +60,7 @@ def yaw_quat(angle):
 
 def test_the_layout_begins_with_the_way_to_the_goal():
     assert NAMES[:4] == ("goal_x", "goal_y", "height", "lin_vel_x") and len(NAMES) == ROBOT
-    assert NAMES[3:] == make_task("vertical-jump").observation_names[3:]
+    assert NAMES[3:] == VERTICAL.observation_names[3:]
 
 
 @pytest.mark.parametrize(
@@ -123,9 +123,9 @@ def test_the_height_is_that_above_the_ground_below_the_base():
 # ---------------------------------------------------------------- the critic's
 
 
-@pytest.mark.parametrize("kernel", [HORIZONTAL, VERTICAL], ids=["horizontal", "vertical"])
-def test_the_critic_sees_what_the_actor_does_without_noise(kernel):
-    robots = random_robots(kernel)
+@pytest.mark.parametrize("task", [HORIZONTAL, VERTICAL], ids=lambda task: task.name)
+def test_the_critic_sees_what_the_actor_does_without_noise(task):
+    robots = random_robots(task)
     clean, critic = robots.both()
     np.testing.assert_array_equal(critic[:, :ROBOT], clean)
     noisy, same = robots.both(noise=True)
@@ -133,8 +133,15 @@ def test_the_critic_sees_what_the_actor_does_without_noise(kernel):
     assert (noisy[:, 2:36] != clean[:, 2:36]).mean() > 0.99
 
 
-def test_the_columns_after_the_episodes_are_left_alone():
-    np.testing.assert_array_equal(random_robots(VERTICAL).both()[1][:, -2:], 7.0)
+def test_every_column_of_every_row_is_written_and_nothing_after_the_last():
+    robots = random_robots(VERTICAL)
+    arrays = robots.skill.observations
+    marked = np.full(arrays.now.shape[0] + 7, 7.0)
+    arrays.now, last = array(marked), arrays.now.shape[0]
+    robots.both()
+    found = arrays.now.numpy()
+    assert last == N * (ROBOT + ROBOT + EPISODE) and not (found[:last] == 7.0).any()
+    np.testing.assert_array_equal(found[last:], 7.0)
 
 
 @pytest.mark.parametrize("phase", [STANCE, FLIGHT, LANDED])
@@ -193,22 +200,22 @@ def test_what_is_not_finite_is_seen_as_zero_by_both():
 
 @pytest.fixture(scope="module")
 def env():
-    return make_env(256, task=make_task("horizontal-jump"), reset=only("default"), randomize=True, noise=True, seed=8)
+    return make_env(256, task=HORIZONTAL, reset=only("default"), randomize=True, noise=True, seed=8)
 
 
 def test_the_environment_shows_the_critic_what_was_drawn(env):
     model, motors = env.sim.model, env.sim.motors
-    nominal = make_env(1, task=make_task("horizontal-jump"), reset=only("default")).sim
+    nominal = make_env(1, task=HORIZONTAL, reset=only("default")).sim
     mass, com = model.body_mass.numpy().reshape(256, -1), model.body_com.numpy().reshape(256, -1, 3)
     mass = mass - nominal.model.body_mass.numpy()
     friction = model.shape_material_mu.numpy()[model.shape_world.numpy() >= 0].reshape(256, -1)
-    push = env.push.numpy()
+    push = env.parameters.push.numpy()
     columns = [
         mass[:, :1], mass[:, 1:].sum(axis=1, keepdims=True), (com[:, 0] - nominal.model.body_com.numpy()[0]) / 0.03,
         (motors.kp.numpy() / nominal.motors.kp.numpy() - 1.0).T,
         (motors.no_load_speed.numpy() / nominal.motors.no_load_speed.numpy() - 1.0).T,
-        env.delay.numpy()[:, None] / 8.0, (friction[:, :1] - 0.85) * 10.0,
-        env.static_friction_ratio.numpy()[:, None] - 1.0, env.joint_offset.numpy().T / 0.035,
+        env.parameters.latency.numpy()[:, None] / 8.0, (friction[:, :1] - 0.85) * 10.0,
+        env.parameters.static_ratio.numpy()[:, None] - 1.0, motors.offset.numpy().T / 0.035,
         push[:, :3] / 5.0, push[:, 3:] / 3.0,
     ]  # fmt: skip
     np.testing.assert_allclose(env.critic_obs[:, ROBOT + EPISODE :], np.concatenate(columns, axis=1), atol=1e-4)
@@ -218,5 +225,5 @@ def test_drawn_parameters_are_of_order_one_and_zero_without_randomisation(env):
     shown = env.critic_obs[:, ROBOT + EPISODE :].numpy()
     assert shown.shape[1] == env.num_critic_obs - ROBOT - EPISODE
     assert np.abs(shown).max() < 3.0 and (np.abs(shown).max(axis=0) > 0.04).all()
-    nominal = make_env(16, task=make_task("horizontal-jump"), reset=only("default"))
+    nominal = make_env(16, task=HORIZONTAL, reset=only("default"))
     assert not nominal.critic_obs[:, ROBOT + EPISODE :].any()

@@ -4,19 +4,17 @@ import math
 import newton
 import numpy as np
 import pytest
-import warp as wp
-from jump_helpers import DEFAULT_ANGLE, DEG, SCHEMES, edit_episodes, make_env, only
-from solver_helpers import MOTOR_Q, MOTOR_V, Reference, States, paw_joint
+from jump_helpers import DEFAULT_ANGLE, DEG, SCHEMES, edit_episodes, episodes_of, make_env, only
+from jump_starts import PAW_RADIUS, collision_flags, paws_and_velocities
+from solver_helpers import MOTOR_Q, MOTOR_V
 
 from jumper_warp.registry import make_task
-from jumper_warp.tasks.cfg import Level, ResetCfg
-from kernels.collision.robot import collision_kernel
-from kernels.jump.task import FLIGHT, LANDED, STANCE
+from jumper_warp.tasks.jump.cfg import Level, ResetCfg
+from kernels.jump.state import FLIGHT, LANDED, STANCE
 
 N = 4096
 TASK = make_task("vertical-jump")
 G = 9.81
-PAW_RADIUS = 0.025
 ALL = ResetCfg(standing=0.3, default=0.1, in_flight=0.25, touchdown=0.2)
 SHARES = np.array([0.3, 0.1, 0.25, 0.2, 0.15])
 
@@ -27,8 +25,7 @@ def drawn(request):
     env = make_env(N, reset=ALL, seed=request.param)
     edit_episodes(env, level=request.param)
     env.reset()
-    episodes = {name: env.tasks.numpy()[name].copy() for name in env.tasks.numpy().dtype.names}
-    return env, episodes, env.sim.joint_q().astype(float), env.sim.joint_qd().astype(float)
+    return env, episodes_of(env), env.sim.joint_q().astype(float), env.sim.joint_qd().astype(float)
 
 
 def within(values, lower, upper, reach=0.02):
@@ -44,23 +41,6 @@ def euler(quat):
     roll = np.arctan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y))
     pitch = np.arcsin(np.clip(2.0 * (w * y - z * x), -1.0, 1.0))
     return np.stack([roll, pitch, np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))], axis=1)
-
-
-def paws_and_velocities(env, worlds):
-    """Return position [m] and velocity [m/s] of the paws of some worlds from Pinocchio, (worlds, 4, 3) each."""
-    reference = Reference(env.sim.model)
-    states = States.read(env.sim.joint_q()[worlds], env.sim.joint_qd()[worlds])
-    robot, pin = reference.robot, pytest.importorskip("pinocchio")
-    paws = np.zeros((2, len(worlds), 4, 3))
-    for i in range(len(worlds)):
-        q, v = reference.state(states, i)
-        pin.forwardKinematics(robot.model, robot.data, q, v)
-        for leg in range(4):
-            joint = paw_joint(reference, leg)
-            twist, ankle = robot.data.v[joint], np.array([0.0, 0.0, -0.3])
-            paws[0, i, leg] = robot.data.oMi[joint].act(ankle)
-            paws[1, i, leg] = robot.data.oMi[joint].rotation @ (twist.linear + np.cross(twist.angular, ankle))
-    return paws
 
 
 def some(episodes, scheme, count=60):
@@ -162,15 +142,6 @@ def test_flights_cover_the_leg_ranges_and_touchdowns_reach_for_the_ground(drawn)
     assert np.ptp(height, axis=1).max() < 1e-4
 
 
-def collision_flags(env):
-    """Return the flags of forbidden contacts of every world."""
-    flags, clearance = (wp.zeros(env.num_envs, dtype=kind, device="cpu") for kind in (int, float))
-    robot = env._dynamics.robot
-    inputs = [robot.geometry, robot.ground, env.sim.state.joint_q, 43, 0.0]
-    wp.launch(collision_kernel, env.num_envs, inputs, [flags, clearance], device="cpu")
-    return flags.numpy()
-
-
 def test_no_state_collides_and_paws_are_not_under_the_ground(drawn):
     env, episodes, q, _ = drawn
     assert not collision_flags(env).any()
@@ -185,7 +156,7 @@ def test_draws_that_collide_are_drawn_again():
     # bases so low that shanks lie on the ground, and thighs so far in that they meet
     level = Level((0.0, 0.0, 0.5), (0.0, 0.0, 0.6), (0.10, 0.30))
     for reset in (only("standing"), only("in_flight", flight_transversal=(-30.0, 60.0))):
-        env = make_env(1024, task=dataclasses.replace(TASK, reset=reset, levels=(level,)))
+        env = make_env(1024, reset=reset, task=dataclasses.replace(TASK, levels=(level,)))
         assert not collision_flags(env).any()
         assert np.mean(env.task_arrays()["scheme"] == SCHEMES.index("default")) < 0.5
 
@@ -199,7 +170,7 @@ def test_the_same_draw_is_taken_once(drawn):
 def test_loops_are_closed():
     env = make_env(64, reset=ALL)
     state = env.sim.state
-    env._dynamics.full_state(state.joint_q, state.joint_qd, state.body_q, state.body_qd)
+    env.sim.physics.write_bodies()
     newton.eval_fk(env.sim.model, state.joint_q, state.joint_qd, state)
     assert env.sim.loop_gap().max() < 1e-5
 
@@ -207,14 +178,14 @@ def test_loops_are_closed():
 @pytest.mark.parametrize("scheme", ["standing", "in_flight", "touchdown", "landed"])
 def test_the_default_pose_rarely_stands_in(scheme):
     level = Level((0.0, 0.0, 0.45), (0.0, 0.0, 1.2), (0.22, 0.45))
-    env = make_env(N, task=dataclasses.replace(TASK, reset=only(scheme), levels=(level,)))
+    env = make_env(N, reset=only(scheme), task=dataclasses.replace(TASK, levels=(level,)))
     assert np.mean(env.task_arrays()["scheme"] == SCHEMES.index("default")) < 0.005
 
 
 def test_a_state_that_cannot_be_reached_becomes_the_default_pose():
     # a base 0.7 m above paws on the ground: beyond the legs' length
     level = Level((0.0, 0.0, 0.5), (0.0, 0.0, 0.6), (0.7, 0.8))
-    env = make_env(16, task=dataclasses.replace(TASK, reset=only("standing"), levels=(level,)))
+    env = make_env(16, reset=only("standing"), task=dataclasses.replace(TASK, levels=(level,)))
     assert env.task_arrays()["scheme"].tolist() == [SCHEMES.index("default")] * 16
     np.testing.assert_array_equal(env.sim.joint_q(), env.sim.model.joint_q.numpy().reshape(16, -1))
 
@@ -264,8 +235,6 @@ def test_impossible_shares_are_refused(shares):
         ({"landed_speed": (math.nan, 1.0)}, "landed_speed must be"),
         ({"command_delay": -0.1}, "command_delay must not be negative, got -0.1"),
         ({"again_delay": (-0.1, 0.2)}, "again_delay must not be negative"),
-        ({"jump_again": 1.1}, "jump_again must be in"),
-        ({"jump_again": -0.1}, "jump_again must be in"),
     ],
 )
 def test_impossible_starts_are_refused(change, message):
@@ -274,10 +243,23 @@ def test_impossible_starts_are_refused(change, message):
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.parametrize("share", [1.1, -0.1, math.nan])
+def test_impossible_shares_of_another_jump_are_refused(share):
+    with pytest.raises(ValueError, match="jump_again must be in") as caught:
+        Level((0.0, 0.0, 0.5), (0.0, 0.0, 0.6), (0.22, 0.35), jump_again=share)
+    assert "\n" not in str(caught.value)
+
+
 def test_settings_reach_the_kernels_by_name_in_radians_and_steps():
-    cfg = ResetCfg(standing=0.5, default=0.25, in_flight=0.125, tilt=180.0, paw_depth=(0.25, 0.5), jump_again=0.75)
-    ranges = dataclasses.replace(cfg, command_delay=0.25, again_delay=(0.5, 1.0)).ranges(1.0 / 60.0)
+    cfg = ResetCfg(standing=0.5, default=0.25, in_flight=0.125, tilt=180.0, paw_depth=(0.25, 0.5))
+    ranges = dataclasses.replace(cfg, command_delay=0.25, again_delay=(0.5, 1.0)).values(1.0 / 60.0).states
     assert list(ranges.shares) == [0.5, 0.75, 0.875, 0.875]
     assert ranges.tilt == pytest.approx(math.pi) and list(ranges.takeoff_angle) == pytest.approx([0.872665, 1.308997])
-    assert (list(ranges.paw_depth), ranges.jump_again) == ([0.25, 0.5], 0.75)
+    assert list(ranges.paw_depth) == [0.25, 0.5]
     assert ranges.command_delay == 15 and list(ranges.again_delay) == pytest.approx([30.0, 60.0])
+
+
+def test_a_levels_numbers_reach_the_kernels():
+    level = Level((0.25, -0.5, 0.0), (0.5, 0.75, 1.0), (0.125, 0.375), jump_again=0.75).values()
+    assert (list(level.goal_lower), list(level.goal_upper)) == ([0.25, -0.5, 0.0], [0.5, 0.75, 1.0])
+    assert (list(level.base_height), level.jump_again) == ([0.125, 0.375], 0.75)

@@ -1,0 +1,142 @@
+"""What `jumper evaluate` and `jumper play` do with a policy that was opened: run, write and print."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any, Generic, Literal, TypeVar
+
+import tyro
+from rich.console import Console
+from rich.table import Table
+
+from jumper_warp.evaluation.film import Film
+from jumper_warp.evaluation.log import EvaluationLog, run_evaluation
+from jumper_warp.evaluation.run import EvaluationRun
+from jumper_warp.policies.folder import add_files, find_policy
+from jumper_warp.policies.restore import Conditions, is_run
+from jumper_warp.policies.spec import PolicyError
+from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.output import write_figures
+
+Flags = TypeVar("Flags")
+
+
+@dataclass(frozen=True)
+class EvaluateCfg(Generic[Flags]):
+    """Try a policy many times and report how well it did."""
+
+    flags: Annotated[Flags, tyro.conf.arg(name="")]
+    """`jumper_warp.evaluation.registry.EvaluationFlags`"""
+    conditions: Annotated[Conditions, tyro.conf.arg(name="")] = field(default_factory=Conditions)
+    """What the policy is tried in."""
+    out: Path | None = None
+    """Folder for figures.json and a list of all that was tried (default: outputs/evaluate/<time>)."""
+    keep: bool = False
+    """Also put the figures into the policy's folder."""
+
+
+def evaluate(run: EvaluationRun, cfg: EvaluateCfg) -> dict[str, Any]:
+    """Evaluate, print a table, write `figures.json` and the rows of the log as CSV, and return the figures.
+
+    Raises:
+        PolicyError: The policy cannot be used or cannot keep figures.
+        OSError: The folder cannot be made.
+    """
+    if cfg.keep and is_run(run.source):
+        raise PolicyError(f"{run.source}: a run keeps no figures; export it first")
+    run.prepare("evaluate", cfg.conditions, cfg.out)
+    env = run.env(cfg.flags.count)
+    log = run.follow(env, cfg.flags.log(env.task, cfg.conditions.seed))
+    figures = {
+        "task": run.policy.interface.task,
+        **{name: getattr(cfg.conditions, name) for name in ("solver", "randomize", "noise", "seed")},
+        **cfg.flags.metrics(log),
+    }
+    write_figures(run.folder, figures)
+    rows = f"{log.row}s.csv"
+    (run.folder / rows).write_text(csv_text(log))
+    if cfg.keep:
+        files = {name: (run.folder / name).read_bytes() for name in ("figures.json", "run.json", rows)}
+        add_files(find_policy(run.source), files)
+    print_figures(figures)
+    Console(stderr=True).print(f"{run.folder}/figures.json", highlight=False, soft_wrap=True)
+    return figures
+
+
+def csv_text(log: EvaluationLog) -> str:
+    """Return a heading and one line a row: what was asked for, what came of it, and how it ended."""
+    columns = log.columns()
+    lines = [",".join(columns)]
+    for row in zip(*columns.values(), strict=True):
+        lines.append(",".join(f"{value:.6f}" if isinstance(value, float) else str(value or "") for value in row))
+    return "\n".join(lines) + "\n"
+
+
+def print_figures(figures: dict[str, Any]) -> None:
+    """Print a table of figures to standard output."""
+    table = Table("figure", "value", box=None)
+    for name, value in figures.items():
+        table.add_row(name, f"{value:.4g}" if isinstance(value, float) else json.dumps(value))
+    Console().print(table)
+
+
+@dataclass(frozen=True)
+class PlayCfg(Generic[Flags]):
+    """Let a policy act, and record it."""
+
+    flags: Annotated[Flags, tyro.conf.arg(name="")]
+    """`jumper_warp.evaluation.registry.PlayFlags`"""
+    seconds: float | None = None
+    """[s] Length of the recording (default: for jumps 3.5, and 2.5 for each further one; else 10)."""
+    conditions: Annotated[Conditions, tyro.conf.arg(name="")] = field(default_factory=Conditions)
+    """What the policy is tried in."""
+    out: Path | None = None
+    """Folder for the recording and figures.json (default: outputs/play/<time>)."""
+    viewer: Literal["none", "rerun"] = "none"
+    """Open the recording in Rerun's viewer, which then listens on this machine's loopback address only."""
+
+    def __post_init__(self) -> None:
+        """Raises InputError: a setting is out of range."""
+        if self.seconds is not None and not 0.0 < self.seconds <= 600.0:
+            raise InputError(f"seconds must be in (0, 600], got {self.seconds}")
+
+
+def play(run: EvaluationRun, cfg: PlayCfg) -> Path:
+    """Simulate, write a recording and `figures.json`, print a table; return the path of the recording.
+
+    Raises:
+        PolicyError: The policy cannot be used.
+        OSError: The folder cannot be made.
+    """
+    flags, name = cfg.flags, run.policy.interface.task
+    run.prepare("play", cfg.conditions, cfg.out)
+    env = run.env(flags.count)
+    log = flags.log(env.task)
+    notes = {"task": name, **flags.notes, "solver": cfg.conditions.solver}
+    film = Film(env, log, range(flags.count), spacing=flags.spacing, notes=notes, motors=True)
+    run_evaluation(run.policy.act, env, log, seconds=cfg.seconds or flags.seconds, watch=film, stop=False)
+    path = film.save_rrd(run.folder / f"{log.row}.rrd", log.marks(range(flags.count)))
+    write_figures(run.folder, log.columns())
+    print_rows(log)
+    Console(stderr=True).print(str(path), highlight=False, soft_wrap=True)
+    if cfg.viewer == "rerun":
+        subprocess.run(viewer_command(path), check=False)
+    return path
+
+
+def viewer_command(path: Path) -> list[str]:
+    """Return the command that shows a recording and listens on loopback only."""
+    return [sys.executable, "-m", "rerun", str(path), "--bind", "127.0.0.1"]
+
+
+def print_rows(log: EvaluationLog) -> None:
+    """Print one line a row of a log to standard output."""
+    columns = log.columns()
+    table = Table(*columns, box=None)
+    for row in zip(*columns.values(), strict=True):
+        table.add_row(*(f"{value:.3f}" if isinstance(value, float) else str(value) for value in row))
+    Console().print(table)

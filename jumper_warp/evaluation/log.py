@@ -1,0 +1,163 @@
+"""An evaluation run: what every world is asked for, step by step, and what became of it.
+
+One log follows one episode a world. `run_evaluation` is the loop; what is asked for and told differs between tasks.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+import torch
+
+from jumper_warp.tasks.cfg import TaskCfg
+
+if TYPE_CHECKING:
+    from jumper_warp.evaluation.film import Film, Strip
+
+CAME_APART = "came_apart"
+COLLIDED = "collided"
+NO_END = "no_end"
+"""Outcome of what was still under way at the end."""
+
+Metrics = dict[str, float | int | None]
+
+
+class EvaluationEnv(Protocol):
+    """What an evaluation run asks of an environment; `jumper_warp.envs.env.Env` is one."""
+
+    num_envs: int
+    device: torch.device
+    step_dt: float
+    obs: torch.Tensor
+    task: Any
+    sim: Any
+
+    def evaluation_reset(self, commands: np.ndarray, headings: np.ndarray | float = 0.0) -> None:
+        """Stand every world still with its command, and end no episode."""
+
+    def command(self, commands: np.ndarray, worlds: np.ndarray | None = None) -> None:
+        """Give some of the worlds another command."""
+
+    def step(self, action: torch.Tensor) -> Any:
+        """Advance one policy step."""
+
+    def task_arrays(self) -> dict[str, np.ndarray]:
+        """Return the state of every world's episode, one array a field of the task's state, and of its base."""
+
+
+class EvaluationLog(ABC):
+    """Asks every world for something, and keeps what became of it."""
+
+    row = "jump"
+    """What a row of `columns` is about, in a word."""
+    spacing = 1.2
+    """[m] Between robots that are drawn side by side."""
+    seen: dict[str, np.ndarray]
+    """What was seen of the environment last."""
+
+    @property
+    @abstractmethod
+    def seconds(self) -> float:
+        """[s] Simulated time after which what has not ended is a failure."""
+
+    @abstractmethod
+    def begin(self, env: EvaluationEnv) -> None:
+        """Stand every world at its start."""
+
+    @abstractmethod
+    def update(self, arrays: dict[str, np.ndarray], step_dt: float) -> bool:
+        """Take in a policy step; return whether everything has ended."""
+
+    @abstractmethod
+    def columns(self) -> dict[str, list]:
+        """Return what to tell of every row, one list a quantity."""
+
+    @abstractmethod
+    def series(self, worlds: Sequence[int]) -> dict[str, float]:
+        """Return what to draw of some worlds over time, `group/quantity [unit]` to its present value."""
+
+    def marks(self, worlds: Sequence[int]) -> np.ndarray | None:
+        """Return places to mark in a picture [m], world frame, (worlds, places a world, 3), if there are any."""
+        return None
+
+    def notes(self, worlds: Sequence[int]) -> dict[str, Any]:
+        """Return what to save with a recording of some worlds, as JSON can hold it."""
+        return {}
+
+    def strip(self, film: Film) -> Strip | None:
+        """Return the filmstrip that shows most of a film, if there is one."""
+        return None
+
+    def look(self, env: EvaluationEnv) -> dict[str, np.ndarray]:
+        """Return what is to be known of every world after a policy step."""
+        return env.task_arrays()
+
+    def follow(self, env: EvaluationEnv) -> bool:
+        """Look at the environment after a policy step; return whether everything has ended."""
+        self.seen = self.look(env)
+        return self.update(self.seen, env.step_dt)
+
+
+def run_evaluation(
+    act: Callable[[torch.Tensor], torch.Tensor],
+    env: EvaluationEnv,
+    log: EvaluationLog,
+    *,
+    seconds: float | None = None,
+    watch: Callable[[], object] | None = None,
+    stop: bool = True,
+) -> None:
+    """Let every world do what the log asks, until everything has ended.
+
+    Args:
+        act: Observations (num_envs, num_obs) to actions, such as `Policy.act`.
+        env: One world a row of the log.
+        log: What is asked for, and what becomes of it.
+        seconds: Simulated time at most (default: the log's).
+        watch: Called after every policy step.
+        stop: Whether to stop when everything has ended, instead of at the end of the time.
+    """
+    log.begin(env)
+    for _ in range(round((log.seconds if seconds is None else seconds) / env.step_dt)):
+        env.step(act(env.obs))
+        ended = log.follow(env)
+        if watch is not None:
+            watch()
+        if ended and stop:
+            return
+
+
+def termination_names(task: TaskCfg) -> tuple[str, ...]:
+    """Return the names of a task's terminations."""
+    return tuple(term.name for term in task.terminations)
+
+
+def within(values: np.ndarray, limits: tuple[float, float]) -> np.ndarray:
+    """Return which values [m] are between limits, give or take half a millimetre for those that were evenly spaced."""
+    return (values >= limits[0] - 5e-4) & (values <= limits[1] + 5e-4)
+
+
+def mean(values: np.ndarray | Sequence[float | None]) -> float | None:
+    """Return the mean of what is a number, None if nothing is."""
+    values = np.asarray(values, dtype=float)
+    values = values[~np.isnan(values)]
+    return float(values.mean()) if len(values) else None
+
+
+def largest(values: np.ndarray) -> float | None:
+    """Return the largest of what is a number, None if nothing is."""
+    values = values[~np.isnan(values)]
+    return float(values.max()) if len(values) else None
+
+
+def failures(outcomes: np.ndarray) -> Metrics:
+    """Return how many failed rows ended in which way."""
+    return {f"failed_by_{name}": int((outcomes == name).sum()) for name in sorted(set(outcomes))}
+
+
+def finite(values: np.ndarray) -> list[float | None]:
+    """Return values as JSON holds them, None where there is no number."""
+    return [float(value) if np.isfinite(value) else None for value in values]

@@ -1,0 +1,85 @@
+"""Plots that several experiments draw."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+import numpy as np
+
+from jumper_warp.evaluation.landings import Landings
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt
+
+
+@contextmanager
+def drawn(path: Path, *shape: int, **settings: Any) -> Iterator[Any]:
+    """Give the axes of a figure, which is written to a file afterwards; shape, settings: as of `subplots`."""
+    fig, axes = plt.subplots(*shape, constrained_layout=True, **settings)
+    yield axes
+    fig.savefig(path, dpi=110)
+    plt.close(fig)
+
+
+def draw_sweep(
+    axis: Any, commanded: np.ndarray, reached: np.ndarray, good: np.ndarray, tolerance: float, names: tuple[str, str]
+) -> None:
+    """Draw reached over commanded values [m], and what counts as reached; names: of the good ones and the others."""
+    line = np.array([commanded.min(), commanded.max()])
+    axis.fill_between(
+        line, line - tolerance, line + tolerance, color="tab:green", alpha=0.12, label=f"within {tolerance:g} m"
+    )
+    axis.plot(line, line, color="tab:green", linewidth=1.0, label="commanded")
+    axis.scatter(commanded[good], reached[good], s=9, color="tab:blue", label=names[0])
+    axis.scatter(commanded[~good], reached[~good], s=14, color="tab:red", marker="x", label=names[1])
+    axis.legend(loc="upper left")
+
+
+def draw_landings(axis: Any, landings: Landings, title: str) -> None:
+    """Draw goals and landings of first jumps, seen from above with the start at the origin."""
+    good, goals, landing = landings.success[:, 0], landings.goals[:, 0], landings.landing[:, 0]
+    axis.plot(*np.stack([goals, landing]).transpose(2, 0, 1), color="0.7", linewidth=0.8)
+    axis.scatter(goals[:, 0], goals[:, 1], s=20, color="0.4", marker="x", linewidth=0.8, label="goal")
+    axis.scatter(landing[good, 0], landing[good, 1], s=12, color="tab:blue", label="landed there")
+    axis.scatter(landing[~good, 0], landing[~good, 1], s=14, color="tab:red", label="failed")
+    axis.set(xlabel="ahead [m]", ylabel="to the left [m]", title=title, aspect="equal")
+    axis.legend(loc="upper center", bbox_to_anchor=(0.5, -0.15), ncols=3)
+
+
+class Track:
+    """Keeps where every base was."""
+
+    def __init__(self) -> None:
+        self.places: list[np.ndarray] = []
+
+    def __call__(self, landings: Landings) -> None:
+        """Add the moment; places of rows that have ended are not numbers."""
+        running = landings.current < landings.goals.shape[1]
+        self.places.append(np.where(running[:, None], landings.seen["base_pos"][:, :2], np.nan))
+
+    def in_start_frame(self, headings: np.ndarray) -> np.ndarray:
+        """Return the places [m], (worlds, steps, 2), ahead and to the left of start and heading (worlds,) [rad]."""
+        x, y = np.moveaxis(np.stack(self.places, axis=1), -1, 0)
+        cos, sin = np.cos(headings)[:, None], np.sin(headings)[:, None]
+        return np.stack([cos * x + sin * y, cos * y - sin * x], axis=-1)
+
+
+def draw_paths(path: Path, paths: dict[str, np.ndarray], goals: dict[str, Sequence], title: str) -> None:
+    """Draw ways of bases from above, a panel a test; where a test has a row of goals, these if no jump has an error.
+
+    paths [m]: by test, of `Track.in_start_frame`; goals [m]: by test, each relative to the one before.
+    """
+    with drawn(path, 1, len(paths), figsize=(5.0 * len(paths), 4.5)) as axes:
+        for axis, (name, places) in zip(axes, paths.items(), strict=True):
+            for way in places:
+                axis.plot(way[:, 0], way[:, 1], linewidth=0.8, alpha=0.5, color="tab:blue")
+            if name in goals:
+                ideal = np.cumsum(goals[name], axis=0)
+                axis.scatter(*ideal.T, s=50, color="tab:red", marker="x", zorder=3, label="goal, no error")
+                axis.legend(loc="upper left")
+            axis.set(xlabel="ahead [m]", ylabel="to the left [m]", title=f"{name}, {title}", aspect="equal")
+            axis.margins(0.1, 0.3)

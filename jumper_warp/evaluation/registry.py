@@ -1,0 +1,77 @@
+"""How policies are evaluated and played, by the key that a task names in `TaskCfg.evaluation`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+from jumper_warp.evaluation import landings
+from jumper_warp.evaluation.episodes import EpisodeFlags, EpisodeGoals
+from jumper_warp.evaluation.heights import HeightFlags, HeightGoals
+from jumper_warp.evaluation.log import EvaluationLog, Metrics
+from jumper_warp.evaluation.places import PlaceFlags, PlaceGoals
+from jumper_warp.policies.spec import PolicyError
+from jumper_warp.tasks.cfg import TaskCfg
+
+
+class EvaluationFlags(Protocol):
+    """A frozen dataclass: flags of `jumper evaluate`."""
+
+    @property
+    def count(self) -> int:
+        """Number of worlds."""
+
+    def log(self, task: TaskCfg, seed: int) -> EvaluationLog:
+        """Return what is asked for, one row a world."""
+
+    def metrics(self, log: EvaluationLog) -> Metrics:
+        """Return what to report."""
+
+
+class PlayFlags(Protocol):
+    """A frozen dataclass: flags of `jumper play`."""
+
+    count: int
+    """Number of worlds."""
+    seconds: float
+    """[s] Length of the recording."""
+    spacing: float
+    """[m] Between robots in the picture."""
+    notes: dict[str, Any]
+    """What to save with the recording."""
+
+    def log(self, task: TaskCfg) -> EvaluationLog:
+        """Return what is asked for, one row a world."""
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """How policies of a task are evaluated."""
+
+    flags: EvaluationFlags
+    """What is asked for in an evaluation, unless told otherwise."""
+    play: PlayFlags
+    """What is played, unless told otherwise."""
+    for_evaluation: Callable[[TaskCfg], TaskCfg] = lambda task: task
+    """Returns the task with the terminations that count here."""
+
+
+EVALUATIONS: dict[str, Evaluation] = {
+    "height": Evaluation(HeightFlags(), HeightGoals()),
+    "place": Evaluation(PlaceFlags(), PlaceGoals(), landings.for_evaluation),
+    "around": Evaluation(
+        PlaceFlags(x=(-0.7, 0.7), y=(-0.7, 0.7), in_range=(0.0, 0.7)),
+        PlaceGoals(unless_told=((0.5, 0.0), (0.0, 0.5), (-0.5, 0.0))),
+        landings.for_evaluation,
+    ),
+    "episode": Evaluation(EpisodeFlags(), EpisodeGoals()),
+}
+"""A user's module may add its own."""
+
+
+def evaluation_of(task: TaskCfg) -> Evaluation:
+    """Return how policies of a task are evaluated. Raises PolicyError for a key that is not there."""
+    if task.evaluation not in EVALUATIONS:
+        raise PolicyError(f"{task.name} asks for the evaluation {task.evaluation!r:.60}; there are {[*EVALUATIONS]}")
+    return EVALUATIONS[task.evaluation]

@@ -1,0 +1,199 @@
+"""A policy under evaluation: its environment, runs that are followed and filmed, and their report.
+
+Experiments and the commands `jumper evaluate` and `jumper play` share it.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from types import ModuleType
+from typing import Any, Literal, TypeVar
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from jumper_warp.envs.env import Env
+from jumper_warp.evaluation.film import Film
+from jumper_warp.evaluation.log import EvaluationLog, run_evaluation
+from jumper_warp.evaluation.registry import evaluation_of
+from jumper_warp.policies.restore import Conditions, env_of_policy, open_policy, restored_task
+from jumper_warp.policies.spec import PolicyError
+from jumper_warp.tasks.cfg import TaskCfg
+from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.output import output_dir, write_figures
+from jumper_warp.utils.runtime import announce
+
+HEIGHTS = ("height",)
+"""Evaluations of policies that jump to heights."""
+PLACES = ("place", "around")
+"""Of those that jump to places."""
+Log = TypeVar("Log", bound=EvaluationLog)
+
+
+@dataclass(frozen=True)
+class EvaluationArgs:
+    """Flags of every experiment that evaluates a policy."""
+
+    policy: str = "horizontal_jump"
+    """Name or folder of a policy, a run's folder, or a checkpoint."""
+    solver: Literal["jumper", "mujoco"] = "jumper"
+    """Physics: the dedicated solver, or Newton's SolverMuJoCo."""
+    randomize: bool = False
+    """Randomisation, observation noise, latency and pushes as in training."""
+    seed: int = 0
+    """Of these, and of whatever else is drawn."""
+    record: int = 1
+    """Number of jumps to record for the Rerun viewer and, one of them, as a filmstrip; 0: none."""
+    out: Path | None = None
+    """Folder for figures, plots, recordings and filmstrips (default: outputs/<name>/<time>)."""
+    device: str | None = None
+    """Warp device."""
+
+    def __post_init__(self) -> None:
+        """Check the values."""
+        if self.record < 0:
+            raise InputError(f"record must not be negative, got {self.record}")
+
+
+class EvaluationRun:
+    """Opens a policy, follows it as often as wanted, and reports."""
+
+    folder: Path
+
+    def __init__(self, source: str | Path, modules: Iterable[ModuleType] = ()) -> None:
+        """Open a policy; call `prepare` before anything else.
+
+        Args:
+            source: Name or folder of a policy, a run's folder, or a checkpoint.
+            modules: That the user has named, for tasks that are not the project's.
+
+        Raises:
+            PolicyError: The policy cannot be used, or nothing is known of how it is evaluated.
+            CheckpointError: The checkpoint cannot be used.
+        """
+        self.started, self.source, self.modules = time.perf_counter(), source, list(modules)
+        self.policy = open_policy(source)
+        self.task = restored_task(self.policy.config, self.modules)
+        self.evaluation = evaluation_of(self.task)
+        self.conditions, self.record = Conditions(), 0
+        self.told: dict[str, Any] = {}
+
+    @classmethod
+    def of(cls, name: str, args: EvaluationArgs, evaluations: Sequence[str] = PLACES) -> EvaluationRun:
+        """Return the run of an experiment, prepared.
+
+        Args:
+            name: Of the experiment and its folder.
+            args: Flags.
+            evaluations: Keys of `EVALUATIONS`, one of which the policy must have.
+
+        Raises:
+            PolicyError: The policy cannot be used, or is evaluated otherwise.
+            CheckpointError: The checkpoint cannot be used.
+            InputError: There is no such device.
+        """
+        run = cls(args.policy)
+        if run.task.evaluation not in evaluations:
+            raise PolicyError(
+                f"this needs a policy that is evaluated by {' or '.join(evaluations)}, "
+                f"{args.policy} is of {run.task.name}, by {run.task.evaluation}"
+            )
+        conditions = Conditions(args.solver, args.randomize, args.randomize, args.seed, args.device)
+        run.prepare(name, conditions, args.out, record=args.record)
+        run.told = {"task": run.task.name} if len(evaluations) > 1 else {}
+        return run
+
+    def prepare(self, name: str, conditions: Conditions, out: Path | None = None, *, record: int = 0) -> None:
+        """Take up the conditions, look for the device and make the folder, before anything is simulated.
+
+        name: of the folder, unless `out` is given; record: number of worlds that are filmed.
+        Raises InputError: there is no such device; OSError: the folder cannot be made.
+        """
+        announce(conditions.device)
+        self.conditions, self.record = conditions, record
+        self.folder = output_dir(name, out)
+
+    @property
+    def title(self) -> str:
+        """What the policy is tried in."""
+        return f"{self.conditions.solver}, {'randomised' if self.conditions.randomize else 'nominal'}"
+
+    def env(self, count: int, change: Callable[[TaskCfg], TaskCfg] | None = None, **scene: Any) -> Env:
+        """Return the policy's environment.
+
+        change: returns the task with the terminations that count, by default as its evaluation says; scene: more
+        settings of `Env`. Raises PolicyError as `env_of_policy`.
+        """
+        change = change or self.evaluation.for_evaluation
+        env = env_of_policy(self.policy, count, self.conditions, change=change, modules=self.modules, **scene)
+        self.policy.to(env.device)
+        self.told["torque_limit_nm"] = env.task.motors.transversal.saturation
+        return env
+
+    def follow(
+        self,
+        env: Env,
+        log: Log,
+        *,
+        film: str = "",
+        drawn: Mapping[str, Any] | None = None,
+        watch: Callable[[Log], None] | None = None,
+    ) -> Log:
+        """Let every world do what a log asks, and return the log.
+
+        Args:
+            env: Of `env`.
+            log: One row a world.
+            film: Name of the recording and filmstrip of some of the worlds; no film without.
+            drawn: The environment's `ground` and `block`, if they are to be seen in the film.
+            watch: Called with the log after every policy step.
+        """
+        pictures = self._film(env, log, drawn or {}) if film and self.record else None
+
+        def look() -> None:
+            if watch is not None:
+                watch(log)
+            if pictures is not None:
+                pictures()
+
+        run_evaluation(self.policy.act, env, log, watch=look)
+        if pictures is not None:
+            self._develop(pictures, film)
+        return log
+
+    def _film(self, env: Env, log: EvaluationLog, drawn: Mapping[str, Any]) -> Film:
+        """Return the film of some worlds, evenly chosen."""
+        ground = drawn.get("ground", "plane")
+        worlds = np.linspace(0, env.num_envs - 1, min(self.record, env.num_envs)).round().astype(int).tolist()
+        spacing = log.spacing if isinstance(ground, str) else 0.0
+        return Film(env, log, worlds, spacing=spacing, ground=ground, block=drawn.get("block"), notes=log.notes(worlds))
+
+    def _develop(self, film: Film, name: str) -> None:
+        """Write a film as a recording, and as a filmstrip; this shows no blocks."""
+        film.save_rrd(self.folder / f"{name}.rrd", film.log.marks(film.worlds))
+        strip = None if film.block is not None else film.log.strip(film)
+        if strip is not None:
+            film.save_strip(strip, self.folder / f"{strip.name or name}.png")
+
+    def report(self, metrics: Mapping[str, Any], paper: Mapping[str, float]) -> dict[str, Any]:
+        """Write and print metrics beside the paper's, conditions before them; return all."""
+        values = {name: getattr(self.conditions, name) for name in ("solver", "randomize", "seed")}
+        values = self.told | values | dict(metrics)
+        write_figures(self.folder, values)
+        table = Table("figure", self.title, "paper")
+        for name, value in values.items():
+            table.add_row(name, shown(value), str(paper.get(name, "")))
+        Console().print(table)
+        print(f"{time.perf_counter() - self.started:.1f} s; figures, plots and recordings in {self.folder}")
+        return values
+
+
+def shown(value: Any) -> str:
+    """Return a figure as it is printed: numbers, and those in lists, with four digits."""
+    if isinstance(value, list):
+        return ", ".join(shown(item) for item in value)
+    return f"{value:.4g}" if isinstance(value, float) else str(value)

@@ -1,0 +1,59 @@
+"""Training with rsl-rl's PPO instead of this package's."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from rsl_rl.env import VecEnv as RslRlEnv
+from rsl_rl.runners import OnPolicyRunner
+
+from jumper_warp.rl.ppo import PpoCfg
+
+
+def rsl_rl_config(cfg: PpoCfg, save_interval: int, seed: int) -> dict[str, Any]:
+    """Return rsl-rl's configuration with the same settings; it knows no value normalisation and no reward scale.
+
+    The environment has the observation groups `policy` and `critic`; save_interval: iterations between checkpoints.
+    """
+    network = {"class_name": "MLPModel", "hidden_dims": list(cfg.hidden), "activation": cfg.activation}
+    network["obs_normalization"] = True
+    noise = {"class_name": "GaussianDistribution", "init_std": cfg.init_std, "std_type": "log"}
+    return {
+        "num_steps_per_env": cfg.num_steps,
+        "save_interval": save_interval,
+        "seed": seed,
+        "check_for_nan": False,
+        "logger": "tensorboard",
+        "obs_groups": {"actor": ["policy"], "critic": ["critic" if cfg.asymmetric else "policy"]},
+        "actor": {**network, "distribution_cfg": noise},
+        "critic": dict(network),
+        "algorithm": {
+            "class_name": "PPO",
+            "num_learning_epochs": cfg.epochs,
+            "num_mini_batches": cfg.minibatches,
+            "learning_rate": cfg.lr,
+            "schedule": "adaptive" if cfg.desired_kl > 0.0 else "fixed",
+            "desired_kl": cfg.desired_kl,
+            "gamma": cfg.gamma,
+            "lam": cfg.lam,
+            "entropy_coef": cfg.entropy_coef,
+            "clip_param": cfg.clip,
+            "value_loss_coef": cfg.value_coef,
+            "max_grad_norm": cfg.max_grad_norm,
+            "use_clipped_value_loss": cfg.clip_value,
+        },
+    }
+
+
+def train_rsl_rl(
+    env: RslRlEnv, cfg: PpoCfg, iterations: int, save_interval: int, seed: int, folder: Path | None = None
+) -> OnPolicyRunner:
+    """Train with rsl-rl's PPO, and return its runner.
+
+    env: as rsl-rl sees one, reset; folder: for checkpoints and TensorBoard's events, None: nothing is written.
+    """
+    config = rsl_rl_config(cfg, save_interval, seed)
+    runner = OnPolicyRunner(env, config, log_dir=folder and str(folder), device=str(env.device))
+    runner.learn(iterations)
+    return runner

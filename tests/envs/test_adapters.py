@@ -1,0 +1,379 @@
+import dataclasses
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from gymnasium.utils import env_checker
+from gymnasium.wrappers.vector import NormalizeReward, RecordEpisodeStatistics
+from rsl_rl.runners import OnPolicyRunner
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from toy_task import SMALL
+
+from jumper_warp.envs.env import Env
+from jumper_warp.envs.gymnasium import GymVectorEnv
+from jumper_warp.envs.rsl_rl import RslRlVecEnv
+from jumper_warp.envs.vec_env import RAW_LIMIT
+from jumper_warp.gym import env_id, register_envs
+from jumper_warp.registry import TASKS, make_task
+from jumper_warp.rl.rsl_rl import rsl_rl_config, train_rsl_rl
+
+N, STEPS = 8, 40
+TASK = make_task("vertical-jump")
+SHORT = TASK.with_terms("terminations", too_long={"steps": 12.0}, tilted={"angle": 0.15})
+"""Episodes that end by time and by failure within a few steps."""
+ACTIONS = 2.0 * np.random.default_rng(0).random((STEPS, N, 12), dtype=np.float32) - 1.0
+
+pytestmark = pytest.mark.filterwarnings("error::UserWarning:gymnasium")
+
+
+def jumper(num_envs=N, task=SHORT, **arguments) -> Env:
+    return Env(task, num_envs, device="cpu", **arguments)
+
+
+def played(envs, actions=ACTIONS):
+    """Return what every step gives."""
+    return [envs.step(action) for action in actions]
+
+
+def assert_same(first, second):
+    for a, b in zip(first, second, strict=True):
+        for x, y in zip(a[:4], b[:4], strict=True):
+            np.testing.assert_array_equal(x, y)
+
+
+# ---------------------------------------------------------------- Gymnasium: spaces and data
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_gymnasium_knows_every_task_by_name(task):
+    spec = gymnasium.spec(env_id(task))
+    assert (spec.kwargs, spec.vector_entry_point) == ({"task": task}, "jumper_warp.gym:make_vector_env")
+
+
+def test_names_are_registered_once():
+    before = dict(gymnasium.registry)
+    register_envs()
+    assert gymnasium.registry == before
+    assert "jumper_warp/VerticalJump-v0" in before
+
+
+def test_gymnasium_makes_the_named_task():
+    envs = gymnasium.make_vec("jumper_warp/VerticalJump-v0", num_envs=2, device="cpu", seed=7, all_groups=True)
+    assert isinstance(envs, GymVectorEnv)
+    assert (envs.env.task.name, envs.env.num_envs, envs.env.seed) == ("vertical-jump", 2, 7)
+    assert set(envs.single_observation_space) == {"policy", "critic"}
+    assert envs.spec.id == "jumper_warp/VerticalJump-v0"
+
+
+@pytest.mark.parametrize("all_groups", [False, True])
+def test_what_a_step_gives_is_in_its_space(all_groups):
+    envs = GymVectorEnv(jumper(), all_groups=all_groups)
+    assert envs.single_action_space == gymnasium.spaces.Box(-1.0, 1.0, (12,))
+    space = envs.single_observation_space
+    assert (space["policy"] if all_groups else space).shape == (envs.env.num_obs,)
+    obs, infos = envs.reset(seed=1)
+    assert obs in envs.observation_space and infos == {}
+    results = played(envs)
+    for obs, reward, terminated, truncated, _ in results:
+        assert obs in envs.observation_space
+        assert (reward.shape, reward.dtype) == ((N,), np.float32)
+        assert (terminated.shape, terminated.dtype) == (truncated.shape, truncated.dtype) == ((N,), np.bool_)
+    finals = [row for *_, infos in results for row in infos.get("final_obs", []) if row is not None]
+    assert len(finals) > N
+    assert all(row in space for row in finals)
+
+
+def test_gymnasiums_own_checks_pass():
+    envs = GymVectorEnv(jumper(1))
+    for space, kind in ((envs.single_observation_space, "observation"), (envs.single_action_space, "action")):
+        getattr(env_checker, f"check_{kind}_space")(space)
+        env_checker.check_space_limit(space, kind)
+    for name in ("reset_return_type", "reset_seed_determinism", "reset_options", "seed_deprecation",
+                 "reset_return_info_deprecation", "returned_data_not_reused"):  # fmt: skip
+        getattr(env_checker, f"check_{name}")(envs)
+
+
+@pytest.mark.parametrize("tensors", [False, True])
+def test_gymnasium_gets_copies(tensors):
+    envs = GymVectorEnv(jumper(), tensors=tensors)
+    actions = torch.from_numpy(ACTIONS) if tensors else ACTIONS
+    obs, infos = envs.reset(seed=2)
+    given = [obs]
+    for action in actions[:13]:
+        *values, step_infos = envs.step(action)
+        given += values
+        infos = step_infos or infos
+    given += [infos["_final_obs"], infos["_final_info"], infos["final_info"]["ending"], infos["final_info"]["_ending"]]
+    given += [infos["final_obs"]] if tensors else [row for row in infos["final_obs"] if row is not None]
+    shown = [value.clone() if tensors else value.copy() for value in given]
+    played(envs, actions[13:])
+    for value, copy in zip(given, shown, strict=True):
+        np.testing.assert_array_equal(value, copy)
+
+
+def test_absurd_observations_and_rewards_are_kept_out():
+    envs = GymVectorEnv(jumper())
+    envs.reset()
+    original = envs.env.step
+
+    def step(action):
+        result = original(action)
+        result.obs["policy"][0, :3] = torch.tensor([torch.nan, 1.0e6, -torch.inf])
+        result.reward[0] = torch.nan
+        return result
+
+    envs.env.step = step
+    obs, reward, *_ = envs.step(ACTIONS[0])
+    assert obs[0, :3].tolist() == [0.0, RAW_LIMIT, 0.0]
+    assert obs in envs.observation_space
+    assert reward[0] == 0.0
+
+
+# ---------------------------------------------------------------- Gymnasium: episodes
+
+
+def test_an_ended_episode_begins_anew_in_the_same_step():
+    envs, unreset, reset = GymVectorEnv(jumper(seed=3)), jumper(seed=3, auto_reset=False), jumper(seed=3)
+    assert envs.metadata["autoreset_mode"] is gymnasium.vector.AutoresetMode.SAME_STEP
+    envs.reset()
+    unreset.reset()
+    reset.reset()
+    first = np.ones(N, dtype=bool)  # worlds in their first episode, where the unreset environment can follow
+    seen = np.zeros(2, dtype=int)
+    for action in ACTIONS:
+        obs, reward, terminated, truncated, infos = envs.step(action)
+        old, new = unreset.step(torch.from_numpy(action)), reset.step(torch.from_numpy(action))
+        np.testing.assert_array_equal(obs, new.obs["policy"])
+        np.testing.assert_array_equal(reward[first], old.reward.numpy()[first])
+        np.testing.assert_array_equal(terminated[first], old.terminated.numpy()[first])
+        np.testing.assert_array_equal(truncated[first], old.truncated.numpy()[first])
+        ended = terminated | truncated
+        np.testing.assert_array_equal(infos.get("_final_obs", np.zeros(N, dtype=bool)), ended)
+        for world in np.flatnonzero(ended & first):
+            np.testing.assert_array_equal(infos["final_obs"][world], old.obs["policy"][world])
+            assert not np.array_equal(obs[world], old.obs["policy"][world])
+        if ended.any():
+            assert all(row is None for row in infos["final_obs"][~ended])
+        seen += [(terminated & first).sum(), (truncated & first).sum()]
+        first &= ~ended
+    assert not first.any() and (seen > 0).all(), seen
+
+
+def test_final_infos_tell_why_an_episode_ended():
+    envs = GymVectorEnv(jumper())
+    envs.reset()
+    seen = set()
+    for _, _, terminated, truncated, infos in played(envs):
+        for world in np.flatnonzero(terminated | truncated):
+            assert infos["_final_info"][world] and infos["final_info"]["_ending"][world]
+            name = envs.endings[infos["final_info"]["ending"][world]]
+            assert (name in ("too_long", "success")) == truncated[world]
+            seen.add(name)
+    assert {"too_long", "tilted"} <= seen
+
+
+def test_tensors_are_what_arrays_are():
+    arrays, tensors = GymVectorEnv(jumper(seed=3), all_groups=True), GymVectorEnv(
+        jumper(seed=3), all_groups=True, tensors=True
+    )  # fmt: skip
+    arrays.reset()
+    assert isinstance(tensors.reset()[0]["critic"], torch.Tensor)
+    for action in ACTIONS:
+        obs, *values, infos = arrays.step(action)
+        other, *others, other_infos = tensors.step(torch.from_numpy(action))
+        for a, b in zip([*obs.values(), *values], [*other.values(), *others], strict=True):
+            assert isinstance(b, torch.Tensor)
+            np.testing.assert_array_equal(a, b)
+        for world in np.flatnonzero(other_infos["_final_obs"]):
+            for group in ("policy", "critic"):
+                np.testing.assert_array_equal(infos["final_obs"][world][group], other_infos["final_obs"][group][world])
+        if "final_info" in infos:
+            np.testing.assert_array_equal(infos["final_info"]["ending"], other_infos["final_info"]["ending"])
+
+
+def test_statistics_of_a_wrapper_are_those_counted_by_hand():
+    plain, envs = GymVectorEnv(jumper(seed=4)), RecordEpisodeStatistics(GymVectorEnv(jumper(seed=4)))
+    plain.reset()
+    envs.reset()
+    returns, lengths = np.zeros(N), np.zeros(N, dtype=int)
+    expected = []
+    for action in ACTIONS:
+        _, reward, terminated, truncated, _ = plain.step(action)
+        *_, infos = envs.step(action)
+        returns += reward
+        lengths += 1
+        ended = terminated | truncated
+        if ended.any():
+            np.testing.assert_array_equal(infos["_episode"], ended)
+            np.testing.assert_array_equal(infos["episode"]["r"], np.where(ended, returns, 0.0))
+            np.testing.assert_array_equal(infos["episode"]["l"], np.where(ended, lengths, 0))
+        expected += lengths[ended].tolist()
+        returns[ended], lengths[ended] = 0.0, 0
+    assert list(envs.length_queue) == expected and 12 in expected
+
+
+def test_wrappers_stack():
+    envs = NormalizeReward(RecordEpisodeStatistics(GymVectorEnv(jumper())))
+    obs, _ = envs.reset(seed=1)
+    assert obs in envs.observation_space
+    rewards = np.array([reward for _, reward, *_ in played(envs)])
+    assert np.isfinite(rewards).all() and rewards.std() > 0.0
+
+
+# ---------------------------------------------------------------- Gymnasium: seeds
+
+
+def test_a_seed_makes_what_a_new_environment_of_it_makes():
+    envs, new = GymVectorEnv(jumper(seed=1)), GymVectorEnv(jumper(seed=5))
+    envs.reset()
+    played(envs)
+    envs.env.worlds.level.fill_(2)  # as if the curriculum had gone on
+    np.testing.assert_array_equal(envs.reset(seed=5)[0], new.reset()[0])
+    assert_same(played(envs), played(new))
+    np.testing.assert_array_equal(envs.reset()[0], new.reset()[0])
+
+
+def test_seeds_reproduce_and_differ():
+    envs = GymVectorEnv(jumper())
+    first, other, again = (envs.reset(seed=seed)[0] for seed in (5, 6, 5))
+    np.testing.assert_array_equal(first, again)
+    assert (first != other).any(axis=1).all()
+    assert (envs.reset()[0] != first).any(axis=1).all()  # draws go on
+
+
+@pytest.mark.parametrize(("seed", "taken"), [(2**31 - 1, 2**31 - 1), (2**31, -(2**31)), (2**40 + 3, 3)])
+def test_large_seeds_are_taken_too(seed, taken):
+    envs = GymVectorEnv(jumper(1))
+    envs.reset(seed=seed)
+    assert envs.env.seed == taken
+
+
+@pytest.mark.parametrize("seed", [-1, 1.5])
+def test_what_is_no_seed_is_refused(seed):
+    envs = GymVectorEnv(jumper(1))
+    with pytest.raises(gymnasium.error.Error, match="Seed must be"):
+        envs.reset(seed=seed)
+
+
+# ---------------------------------------------------------------- Gymnasium: refusals
+
+
+@pytest.mark.parametrize(
+    "actions",
+    [np.zeros((N, 11)), np.zeros(12), np.zeros((N + 1, 12)), np.full((N, 12), "1"), np.zeros((N, 12), dtype=complex)],
+)
+def test_wrong_actions_are_refused(actions):
+    envs = GymVectorEnv(jumper())
+    envs.reset()
+    with pytest.raises(ValueError, match=rf"actions must be numbers of shape \({N}, 12\), got "):
+        envs.step(actions)
+
+
+def test_wrong_tensors_are_refused():
+    envs = GymVectorEnv(jumper(), tensors=True)
+    envs.reset()
+    for actions in (torch.zeros(N, 11), torch.zeros(N, 12, dtype=torch.int64), np.zeros((N, 12))):
+        with pytest.raises(ValueError, match="an action must"):
+            envs.step(actions)
+
+
+def test_numbers_of_other_kinds_are_taken():
+    envs = GymVectorEnv(jumper())
+    envs.reset()
+    for actions in (np.zeros((N, 12), dtype=int), [[0.0] * 12] * N):
+        assert envs.step(actions)[0] in envs.observation_space
+
+
+def test_what_comes_out_of_order_is_refused():
+    envs = GymVectorEnv(jumper())
+    with pytest.raises(gymnasium.error.ResetNeeded):
+        envs.step(ACTIONS[0])
+    with pytest.raises(ValueError, match="reset takes no options, got 'reset_mask'"):
+        envs.reset(options={"reset_mask": np.ones(N, dtype=bool)})
+    envs.reset()
+    envs.close()
+    envs.close()
+    for call in (envs.reset, lambda: envs.step(ACTIONS[0])):
+        with pytest.raises(gymnasium.error.ClosedEnvironmentError):
+            call()
+
+
+def test_environments_that_do_not_fit_are_refused():
+    with pytest.raises(ValueError, match="needs an environment with auto_reset"):
+        GymVectorEnv(jumper(1, auto_reset=False))
+    with pytest.raises(ValueError, match="needs an environment of one task, this one has 2"):
+        GymVectorEnv(jumper(1, task=[TASK, dataclasses.replace(TASK, name="other")]))
+
+
+# ---------------------------------------------------------------- rsl-rl
+
+
+def test_rsl_rl_sees_the_environments_groups():
+    env = jumper()
+    adapter = RslRlVecEnv(env, metrics_every=100)
+    obs, extras = adapter.reset()
+    assert (obs.batch_size, extras) == (torch.Size([N]), {})
+    assert torch.equal(obs["policy"], env.obs) and torch.equal(obs["critic"], env.critic_obs)
+    obs, reward, done, extras = adapter.step(torch.from_numpy(ACTIONS[0]))
+    assert (obs["policy"].shape, obs["critic"].shape) == ((N, env.num_obs), (N, env.num_critic_obs))
+    assert reward.shape == done.shape == extras["time_outs"].shape == (N,)
+    assert done.dtype == torch.long
+
+
+def test_rsl_rl_restarts_its_count_with_the_episodes():
+    adapter = RslRlVecEnv(jumper(), metrics_every=100)
+    adapter.reset()
+    expected = torch.zeros(N, dtype=torch.long)
+    for action in ACTIONS:
+        done = adapter.step(torch.from_numpy(action))[2]
+        expected = (expected + 1) * (1 - done)
+        assert torch.equal(adapter.episode_length_buf, expected)
+    adapter.reset()
+    assert not adapter.episode_length_buf.any()
+
+
+def test_rsl_rl_trains_on_the_environment(one_thread):
+    torch.manual_seed(0)
+    env = jumper()
+    adapter = RslRlVecEnv(env, metrics_every=SMALL.num_steps)
+    adapter.reset()
+    before = env.worlds.clock.numpy().copy()
+    runner = OnPolicyRunner(adapter, rsl_rl_config(SMALL, 100, 0), log_dir=None, device="cpu")
+    old = [p.detach().clone() for p in runner.alg.actor.parameters()]
+    runner.learn(2, init_at_random_ep_len=True)
+    new = list(runner.alg.actor.parameters())
+    assert all(p.isfinite().all() for p in new)
+    assert any(not torch.equal(a, b) for a, b in zip(old, new, strict=True))
+    assert (env.worlds.clock.numpy() - before == 2 * SMALL.num_steps).all()
+
+
+def test_rsl_rl_bootstraps_time_outs_but_not_failures(one_thread):
+    torch.manual_seed(0)
+    adapter = RslRlVecEnv(jumper(16, seed=3), metrics_every=100)
+    obs, _ = adapter.reset()
+    config = rsl_rl_config(dataclasses.replace(SMALL, gamma=0.9), 100, 0)
+    algorithm = OnPolicyRunner(adapter, config, log_dir=None, device="cpu").alg
+    rewards, dones, time_outs = [], [], []
+    with torch.inference_mode():
+        for _ in range(SMALL.num_steps):
+            obs, reward, done, extras = adapter.step(algorithm.act(obs))
+            rewards.append(reward.clone())
+            dones.append(done)
+            time_outs.append(extras["time_outs"])
+            algorithm.process_env_step(obs, reward, done, extras)
+    reward, done, time_out = torch.stack(rewards), torch.stack(dones), torch.stack(time_outs)
+    stored, value = algorithm.storage.rewards.squeeze(-1), algorithm.storage.values.squeeze(-1)
+    torch.testing.assert_close(stored, reward + 0.9 * time_out * value)
+    assert time_out.any() and (done.bool() & ~time_out.bool()).any()
+    assert (stored - reward)[time_out.bool()].abs().min() > 1.0e-4
+
+
+def test_rsl_rl_writes_the_metrics(tmp_path, one_thread):
+    adapter = RslRlVecEnv(jumper(4), metrics_every=SMALL.num_steps)
+    adapter.reset()
+    train_rsl_rl(adapter, SMALL, 2, save_interval=1, seed=0, folder=tmp_path)
+    assert (tmp_path / "model_1.pt").exists()
+    events = EventAccumulator(str(tmp_path))
+    events.Reload()
+    assert [event.step for event in events.Scalars("/Episode_Termination/too_long")] == [0, 1]

@@ -1,0 +1,98 @@
+"""Thousands of beginnings of jumps, and what they are made of, for tests of resets."""
+
+import numpy as np
+import pinocchio as pin
+import warp as wp
+from jump_helpers import SCHEMES, begin_by, edit_episodes, episodes_of, only, resets_of
+from scipy.spatial.transform import Rotation
+from solver_helpers import Reference, States, paw_joint
+
+from jumper_warp.envs.env import Env
+from kernels.collision.robot import collision_kernel
+
+PLACES = ("horizontal-jump", "omnidirectional-jump")
+"""Names of the tasks of jumping to a place."""
+PAW_RADIUS = 0.025  # [m]
+ANKLE = np.array([0.0, 0.0, -0.3])
+"""[m] Of a paw's centre from the joint that carries it."""
+
+
+class Starts:
+    """Beginnings of one scheme, every world at its own level; exact: the jump starts at the origin."""
+
+    def __init__(self, env: Env, scheme: str, exact: bool = False, **settings):
+        """settings: of the reset, besides the scheme."""
+        settings |= {"base_xy": 0.0} if exact else {}
+        begin_by(env, only(scheme, resets_of(env), **settings))
+        self.level = np.arange(env.num_envs) % len(env.task.levels)
+        edit_episodes(env, level=self.level)
+        env.reset()
+        episodes = episodes_of(env)
+        drawn = episodes["scheme"] == SCHEMES.index(scheme)
+        self.drawn, self.fallbacks = drawn, 1.0 - drawn.mean()
+        self.flags = collision_flags(env)
+        self.episodes = {name: values[drawn].astype(float) for name, values in episodes.items()}
+        self.q, self.qd = env.sim.joint_q()[drawn].astype(float), env.sim.joint_qd()[drawn].astype(float)
+        self.level = self.level[drawn]
+        self.pos, self.vel = self.q[:, :3], self.qd[:, :3]
+        self.heading = Rotation.from_euler("z", self.episodes["heading"][:, None])
+        self.goal = self.episodes["goal"] * [1.0, 1.0, 0.0]
+        self.distance = np.linalg.norm(self.goal, axis=1)
+        self.along = self.goal / self.distance[:, None]
+        self.paws = paws_of(env, self.q, self.qd)
+
+    def split(self, vectors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the parts of horizontal vectors towards the goal and to its left."""
+        left = np.cross([0.0, 0.0, 1.0], self.along)
+        return np.sum(vectors * self.along, axis=1), np.sum(vectors * left, axis=1)
+
+    def paws_around(self, spot: np.ndarray) -> np.ndarray:
+        """Return the paws relative to places (worlds, 3), in the jump's heading, all as if they were front left."""
+        relative = self.paws - spot[:, None]
+        turned = np.stack([self.heading.inv().apply(relative[:, leg]) for leg in range(4)], axis=1)
+        return turned * np.array([[1, 1, 1], [1, -1, 1], [-1, 1, 1], [-1, -1, 1]])
+
+
+def paws_of(env: Env, q: np.ndarray, qd: np.ndarray) -> np.ndarray:
+    """Return the places of the paws [m] from Pinocchio, (worlds, 4, 3), of rows of joint_q and joint_qd."""
+    reference, states = Reference(env.sim.model), States.read(q, qd)
+    robot, joints = reference.robot, [paw_joint(reference, leg) for leg in range(4)]
+    paws = np.zeros((len(states.pos), 4, 3))
+    for i in range(len(paws)):
+        pin.forwardKinematics(
+            robot.model, robot.data, robot.configuration(states.pos[i], states.quat[i], states.angles[i])
+        )
+        paws[i] = [robot.data.oMi[joint].act(ANKLE) for joint in joints]
+    return paws
+
+
+def paws_and_velocities(env: Env, worlds: np.ndarray) -> np.ndarray:
+    """Return places [m] and velocities [m/s] of the paws of some worlds from Pinocchio, (2, worlds, 4, 3)."""
+    reference = Reference(env.sim.model)
+    states = States.read(env.sim.joint_q()[worlds], env.sim.joint_qd()[worlds])
+    robot, joints = reference.robot, [paw_joint(reference, leg) for leg in range(4)]
+    paws = np.zeros((2, len(worlds), 4, 3))
+    for i in range(len(worlds)):
+        q, v = reference.state(states, i)
+        pin.forwardKinematics(robot.model, robot.data, q, v)
+        for leg, joint in enumerate(joints):
+            twist = robot.data.v[joint]
+            paws[0, i, leg] = robot.data.oMi[joint].act(ANKLE)
+            paws[1, i, leg] = robot.data.oMi[joint].rotation @ (twist.linear + np.cross(twist.angular, ANKLE))
+    return paws
+
+
+def collision_flags(env: Env) -> np.ndarray:
+    """Return the flags of forbidden contacts of every world."""
+    flags, clearance = (wp.zeros(env.num_envs, dtype=kind, device="cpu") for kind in (int, float))
+    robot = env.sim.physics.dynamics.robot
+    inputs = [robot.geometry, robot.ground, env.sim.state.joint_q, 43, 0.0]
+    wp.launch(collision_kernel, env.num_envs, inputs, [flags, clearance], device="cpu")
+    return flags.numpy()
+
+
+def covers(values: np.ndarray, lower: float, upper: float, reach: float = 0.03) -> bool:
+    """Return whether values stay in a range and come near both of its ends."""
+    width = upper - lower
+    inside = values.min() >= lower - 2e-4 and values.max() <= upper + 2e-4
+    return inside and values.min() <= lower + reach * width and values.max() >= upper - reach * width

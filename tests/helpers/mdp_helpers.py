@@ -1,0 +1,63 @@
+"""Arrays of robots and worlds made by hand, for tests of the stage kernels that every task shares."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import warp as wp
+
+from jumper_warp.envs.arrays import delay_arrays, env_arrays
+from kernels.layout import BODIES, COORDS, DOFS
+from kernels.mdp.view import RobotArrays
+
+STEP_DT = 1.0 / 60.0  # [s]
+SUBSTEPS = 8
+DEFAULT_ANGLE = np.tile([0.0, np.pi / 4.0, np.pi / 4.0], 4)  # [rad]
+MOTOR_SLOTS = np.array([5 * leg + joint for leg in range(4) for joint in (0, 1, 3)])
+PAWS = ("impulse", "paw_force", "peak_force", "paw_pos", "paw_vel", "contact_time", "air_time", "touchdown_speed",
+        "collisions")  # fmt: skip
+MOTORS = ("torque", "old_torque", "action", "old_action", "target", "safe_target", "old_rate", "joint_offset")
+
+
+def array(values, dtype=float) -> wp.array:
+    """Return values as a Warp array on the CPU."""
+    return wp.array(np.asarray(values), dtype=dtype, device="cpu")
+
+
+def standing_robots(n: int):
+    """Return `RobotArrays` of robots at rest in the default pose, 0.35 m high, that have done nothing yet."""
+    robot, q = RobotArrays(), np.zeros((n, int(COORDS)))
+    q[:, 2], q[:, 6], q[:, 7 + MOTOR_SLOTS] = 0.35, 1.0, DEFAULT_ANGLE
+    robot.joint_q, robot.joint_qd = array(q.ravel()), array(np.zeros(n * int(DOFS)))
+    robot.body_com = array(np.zeros((n * int(BODIES), 3)), wp.vec3)
+    robot.body_f = array(np.zeros((n * int(BODIES), 6)), wp.spatial_vector)
+    robot.gravity = array(np.tile([0.0, 0.0, -9.81], (n + 1, 1)), wp.vec3)
+    robot.invalid = array(np.zeros(n), int)
+    for names, rows in ((PAWS, 4), (MOTORS, 12)):
+        for name in names:
+            setattr(robot, name, wp.zeros((rows, n), dtype=RobotArrays.vars[name].type.dtype, device="cpu"))
+    robot.old_lin_vel = array(np.zeros((n, 3)), wp.vec3)
+    robot.default_angle, robot.step_dt = array(DEFAULT_ANGLE), STEP_DT
+    return robot
+
+
+def new_worlds(n: int, seed: int = 0, skill=0):
+    """Return `EnvArrays` of worlds that have made no step."""
+    return env_arrays(n, seed, array(np.broadcast_to(skill, n), int), "cpu")
+
+
+def no_delays(n: int, steps=0):
+    """Return `Delays` of worlds that command nothing yet; steps: latency [physics steps]."""
+    return delay_arrays(n, array(np.broadcast_to(steps, n), int), SUBSTEPS, "cpu")
+
+
+def write(target: wp.array, where, values) -> None:
+    """Overwrite a part of an array."""
+    copy = target.numpy().copy()
+    copy[where] = values
+    target.assign(copy)
+
+
+def values_of(struct, kind) -> SimpleNamespace:
+    """Return copies of all arrays of a struct as NumPy."""
+    found = {name: getattr(struct, name) for name in kind.vars}
+    return SimpleNamespace(**{name: v.numpy().copy() for name, v in found.items() if isinstance(v, wp.array)})

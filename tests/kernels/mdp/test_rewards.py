@@ -1,0 +1,35 @@
+import math
+
+import numpy as np
+import pytest
+from jump_helpers import Table, functions, make_episode, make_view
+
+from kernels.mdp import rewards
+
+NAMES = "ground_force action_clip motor_torque_sq joint_acceleration action_rate"
+paid = Table(functions(rewards, NAMES), float)
+E = math.exp
+
+
+def test_kernels_of_the_paper():
+    assert rewards.phi(0.2, 0.2) == pytest.approx(E(-1.0))
+    assert rewards.phi(-0.6, 0.2) == pytest.approx(E(-9.0))
+    assert rewards.psi(-0.6, 0.2) == pytest.approx(E(-3.0))
+
+
+@pytest.mark.parametrize("phase", range(3))
+def test_regularization_is_a_sum_of_squares_in_every_phase(phase):
+    task = make_episode(phase=phase)
+    view = make_view(
+        paw_force=(10.0, 20.0, 0.0, 20.0),
+        clipped=0.7,
+        torque=np.arange(12.0),
+        rate_change=2.0 * np.arange(12.0),
+        action=np.full(12, 0.5),
+        old_action=np.full(12, -0.5),
+    )
+    assert paid("ground_force", view, task, weight_force=30.0) == pytest.approx(1.0)
+    assert paid("action_clip", view, task) == pytest.approx(0.7)
+    assert paid("motor_torque_sq", view, task) == pytest.approx(506.0)
+    assert paid("joint_acceleration", view, task) == pytest.approx(2024.0)
+    assert paid("action_rate", view, task) == pytest.approx(12.0)

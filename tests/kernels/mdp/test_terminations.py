@@ -1,0 +1,59 @@
+import math
+
+import numpy as np
+import pytest
+from jump_helpers import DEG, Table, functions, make_episode, make_view, tilted_by
+
+from kernels.mdp import terminations
+
+holds = Table(functions(terminations, "too_long came_apart low_base tilted collided"), bool)
+
+
+def test_too_long():
+    for steps, over in ((1199, False), (1200, True)):
+        assert holds("too_long", make_view(), make_episode(steps=steps), steps=1200.0) is over
+
+
+@pytest.mark.parametrize(
+    ("robot", "broken"),
+    [
+        ({}, False),
+        ({"lin_vel": (0.0, 0.0, 14.9)}, False),
+        ({"lin_vel": (0.0, 0.0, 15.1)}, True),
+        ({"ang_vel": (0.0, 39.9, 0.0)}, False),
+        ({"ang_vel": (0.0, -40.1, 0.0)}, True),
+        ({"rate": np.eye(12)[7] * -119.9}, False),
+        ({"rate": np.eye(12)[7] * -120.1}, True),
+        ({"pos": (math.nan, 0.0, 0.4)}, True),
+        ({"lin_vel": (0.0, math.inf, 0.0)}, True),
+        ({"ang_vel": (0.0, math.nan, 0.0)}, True),
+        ({"rate": np.where(np.arange(12) == 7, math.nan, 0.0)}, True),
+        ({"angle": np.where(np.arange(12) == 7, math.nan, 0.0)}, True),
+    ],
+)
+def test_came_apart_at_speeds_and_values_no_robot_has(robot, broken):
+    assert holds("came_apart", make_view(**robot), make_episode()) is broken
+
+
+def test_low_base():
+    for z, low in ((0.21, False), (0.19, True)):
+        assert holds("low_base", make_view(pos=(0.0, 0.0, z)), make_episode(), height=0.2) is low
+        # above the ground below it, not above z = 0
+        assert holds("low_base", make_view(pos=(0.0, 0.0, 1.0), height=z), make_episode(), height=0.2) is low
+
+
+@pytest.mark.parametrize("axis", [(1.0, 0.0, 0.0), (0.0, -1.0, 0.0), (0.6, 0.8, 0.0)])
+def test_tilted_about_any_horizontal_axis(axis):
+    assert not holds("tilted", make_view(**tilted_by(24.9 * DEG, axis)), make_episode(), angle=25.0 * DEG)
+    assert holds("tilted", make_view(**tilted_by(25.1 * DEG, axis)), make_episode(), angle=25.0 * DEG)
+    assert holds("tilted", make_view(**tilted_by(180.0 * DEG, axis)), make_episode(), angle=25.0 * DEG)
+
+
+def test_turning_about_the_vertical_is_no_tilt():
+    assert not holds("tilted", make_view(**tilted_by(2.0, (0.0, 0.0, 1.0))), make_episode(), angle=25.0 * DEG)
+
+
+@pytest.mark.parametrize("flag", [1 << bit for bit in range(8)])
+def test_any_collision_ends_the_episode(flag):
+    assert holds("collided", make_view(collisions=flag), make_episode())
+    assert not holds("collided", make_view(), make_episode())
