@@ -8,7 +8,9 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Callable
 from types import ModuleType
+from typing import Any
 
 import newton
 import numpy as np
@@ -49,6 +51,8 @@ steps. Softer contacts cost jump height."""
 CONTACT_IMPEDANCE = (0.95, 0.99, 0.001, 0.5, 2.0)
 GROUND_FRICTION = 1.0e-4
 """[1] Tiny: a contact takes the larger of its two coefficients, which is then the paw's."""
+MUJOCO_FRICTION = 0.005
+"""[1] Least friction of the paws on SolverMuJoCo: at 0.001 its pyramidal cone gives NaN in single precision."""
 MAX_FRICTION = 10.0
 """[1] Of the paws: ten times that of rubber on concrete."""
 GROUND_COLOR = (0.42, 0.46, 0.48)
@@ -59,8 +63,13 @@ NO_EFFORT_LIMIT = 1.0e6
 """[N m] Motor models saturate torque; the model itself does not. A knee's limit is that of its damping."""
 KNEE_DOFS = [6 + 5 * leg + joint for leg in range(4) for joint in (2, 4)]
 """A world's knees in `joint_qd`."""
+PAWS = tuple(f"{leg}_paw" for leg in LEGS)
+"""Labels of the shapes that touch the ground, behind the world's prefix."""
 PAW_GROUP = -1
 """Collision group of the paws: they meet the ground, but not each other."""
+
+Extras = Callable[[newton.ModelBuilder], Any]
+"""Adds to the builder of one robot what every world shall have beside it; what it returns is not used."""
 
 
 def build_model(
@@ -72,6 +81,7 @@ def build_model(
     device: wp.DeviceLike = None,
     requires_grad: bool = False,
     visuals: bool = True,
+    extras: Extras | None = None,
 ) -> newton.Model:
     """Return a Newton model of `num_worlds` robots, standing in the default pose.
 
@@ -83,6 +93,11 @@ def build_model(
         device: Warp device.
         requires_grad: Whether the model's arrays carry gradients.
         visuals: Whether to add shapes that only viewers see. Without them large batches build faster.
+        extras: Adds the caller's own sites and shapes. It is called once, with the builder of one robot, whose links
+            are `builder.body_label.index("FL_inner_shank")` and so on; what it adds is in every world, with the
+            world's prefix before its label. Sites and shapes that do not collide serve sensors and viewers on every
+            solver. Colliding shapes and obstacles (body -1) act on Newton's solvers; SolverJumper ignores them with
+            a warning, and refuses bodies, joints and particles.
 
     Raises:
         ValueError: `num_worlds` below 1, `friction` not in 0 to 10, or an unknown `ground`.
@@ -96,9 +111,19 @@ def build_model(
     builder = newton.ModelBuilder()
     newton.solvers.SolverMuJoCo.register_custom_attributes(builder)
     robot = _robot_builder(description, friction, visuals)
+    if extras is not None:
+        extras(robot)
     builder.replicate(robot, num_worlds, label_prefixes=[f"world_{i}" for i in range(num_worlds)])
     _add_ground(builder, ground)
     return builder.finalize(device=device, requires_grad=requires_grad)
+
+
+def other_colliders(model: newton.Model) -> np.ndarray:
+    """Return the indices of the shapes that collide and are neither paws nor the ground that all worlds share."""
+    flags, worlds, kinds = model.shape_flags.numpy(), model.shape_world.numpy(), model.shape_type.numpy()
+    ground = (worlds == -1) & np.isin(kinds, [int(newton.GeoType.PLANE), int(newton.GeoType.HFIELD)])
+    paws = np.array([label.split("/")[-1] in PAWS for label in model.shape_label], dtype=bool)
+    return np.flatnonzero(((flags & int(newton.ShapeFlags.COLLIDE_SHAPES)) != 0) & ~ground & ~paws)
 
 
 def leg_geometry(description: RobotDescription) -> list[dict]:
@@ -147,12 +172,17 @@ def mujoco_solver(model: newton.Model, *, dt: float = PHYSICS_DT, **overrides) -
     It knows neither a damper with a largest torque nor a stop of the sum of two angles. `jumper_warp.simulation` takes
     the knees' damping out of its model and adds both as torques (`kernels.passive`); here the damping has no cap.
 
-    `overrides` replace settings of `newton.solvers.SolverMuJoCo`.
+    `overrides` replace settings of `newton.solvers.SolverMuJoCo`. Raises ValueError for paws of less friction than it
+    can compute with.
     """
-    heightfield = newton.GeoType.HFIELD in model.shape_type.numpy()
+    paws = [index for index, label in enumerate(model.shape_label) if label.split("/")[-1] in PAWS]
+    friction = model.shape_material_mu.numpy()[paws].min(initial=math.inf)
+    if not friction >= MUJOCO_FRICTION:
+        raise ValueError(f"SolverMuJoCo needs paws of friction {MUJOCO_FRICTION:g} or more, got {friction:g}")
+    rich = newton.GeoType.HFIELD in model.shape_type.numpy() or len(other_colliders(model)) > 0
     settings = {
-        "njmax": 128 if heightfield else 64,
-        "nconmax": None if heightfield else 12,  # None: as many as the heightfield may need
+        "njmax": 128 if rich else 64,
+        "nconmax": None if rich else 12,  # None: as many as heightfield and obstacles may need
         "iterations": 6,
         "ls_iterations": 6,
         "cone": "pyramidal",

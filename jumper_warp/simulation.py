@@ -11,9 +11,10 @@ import warp as wp
 from newton.sensors import SensorContact
 
 from jumper_warp.description import load_description
+from jumper_warp.dynamics import check_model
 from jumper_warp.grounds import BlockCfg
 from jumper_warp.motors import FilterCfg, MotorCfg, filter_params, jumping_motors, motor_arrays
-from jumper_warp.robot import KNEE_DOFS, PHYSICS_DT, build_model, mujoco_solver
+from jumper_warp.robot import KNEE_DOFS, PHYSICS_DT, Extras, build_model, mujoco_solver
 from jumper_warp.solver import TOLERANCE, SolverJumper, check_step, check_tolerance
 from kernels.actuator import motor_torque_kernel
 from kernels.command_filter import command_filter_kernel
@@ -56,6 +57,7 @@ class Simulation:
         tolerance: float = TOLERANCE,
         observe_forces: bool = True,
         visuals: bool = True,
+        extras: Extras | None = None,
         device: wp.DeviceLike = None,
     ):
         """Build the model, solver and motors, the robot standing in the default pose.
@@ -73,11 +75,13 @@ class Simulation:
             tolerance: Of SolverJumper's contact iteration [m/s].
             observe_forces: Whether to measure paw forces on MuJoCo, which costs time; SolverJumper always has them.
             visuals: Whether to add shapes that only viewers see.
+            extras: Adds the caller's own sites and shapes to every world, as in `build_model`.
             device: Warp device.
 
         Raises:
             ValueError: unknown solver, a block on MuJoCo, dt or tolerance not finite and positive, substeps no whole
                 number of at least 1, or as `build_model` and `SolverJumper`.
+            NotThisRobotError: `extras` adds more than sites and shapes.
         """
         if solver not in ("jumper", "mujoco"):
             raise ValueError(f"solver must be 'jumper' or 'mujoco', got {solver!r}")
@@ -85,7 +89,10 @@ class Simulation:
             raise ValueError("a moving block needs solver='jumper', got 'mujoco'")
         check_step(dt, substeps)
         check_tolerance(tolerance)
-        self.model = build_model(num_worlds, ground=ground, friction=friction, visuals=visuals, device=device)
+        self.model = build_model(
+            num_worlds, ground=ground, friction=friction, visuals=visuals, extras=extras, device=device
+        )
+        check_model(self.model)
         self.device = self.model.device
         self.num_worlds = num_worlds
         self.block = block

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Sequence
 from numbers import Integral
 from typing import Any
@@ -17,6 +18,7 @@ from jumper_warp.description import RobotDescription
 from jumper_warp.differentiable import DifferentiableStep
 from jumper_warp.dynamics import JumperDynamics
 from jumper_warp.grounds import BlockCfg
+from jumper_warp.robot import other_colliders
 from kernels.ground import Ground, rest_block
 
 MAX_SWEEPS = 50
@@ -39,6 +41,17 @@ def check_tolerance(tolerance: float) -> None:
     """Raise ValueError unless the tolerance [m/s] of a contact iteration is finite and above 0."""
     if not 0.0 < tolerance < math.inf:
         raise ValueError(f"tolerance must be finite and above 0 [m/s], got {tolerance!r}")
+
+
+def warn_of_colliders(model: newton.Model) -> None:
+    """Say which shapes collide in the model but not on SolverJumper."""
+    ignored = other_colliders(model)
+    if len(ignored) > 0:
+        warnings.warn(
+            f"SolverJumper ignores the collisions of {len(ignored)} shapes, such as "
+            f"{model.shape_label[ignored[0]]!r:.60}: only the paws touch, ground and blocks",
+            stacklevel=3,
+        )
 
 
 @wp.kernel(enable_backward=False)
@@ -115,6 +128,9 @@ class SolverJumper(SolverBase):
     With `block`, each world has a block of its own that slides on the floor under the paws that push it. A paw touches
     floor or block, whichever is nearer. Gradients do not go through blocks.
 
+    Shapes of the model other than paws and ground do not collide; a warning names the first that would. Sites and
+    shapes that do not collide serve sensors and viewers.
+
     A world that becomes non-finite is flagged in `invalid`, parked at rest in the model's reference pose and left
     there until `reset` clears it.
     """
@@ -133,7 +149,7 @@ class SolverJumper(SolverBase):
         """Prepare for a model of `jumper_warp.robot.build_model`.
 
         Raises:
-            NotThisRobotError: the model is another robot's.
+            NotThisRobotError: the model is another robot's, or holds more bodies, joints or particles than it.
             ValueError: `max_sweeps` below 1, `tolerance` [m/s] not finite and positive, or arrays of `block` that do
                 not have one row per world.
         """
@@ -142,6 +158,7 @@ class SolverJumper(SolverBase):
             raise ValueError(f"max_sweeps must be at least 1, got {max_sweeps}")
         check_tolerance(tolerance)
         self.dynamics = JumperDynamics(model, description=description, block=block)
+        warn_of_colliders(model)
         self.max_sweeps = max_sweeps
         self.tolerance = tolerance
         self._differentiable = DifferentiableStep(self.dynamics, max_sweeps, min(tolerance, DIFFERENTIABLE_TOLERANCE))
