@@ -122,8 +122,8 @@ def other_colliders(model: newton.Model) -> np.ndarray:
     """Return the indices of the shapes that collide and are neither paws nor the ground that all worlds share."""
     flags, worlds, kinds = model.shape_flags.numpy(), model.shape_world.numpy(), model.shape_type.numpy()
     ground = (worlds == -1) & np.isin(kinds, [int(newton.GeoType.PLANE), int(newton.GeoType.HFIELD)])
-    paws = np.array([label.split("/")[-1] in PAWS for label in model.shape_label], dtype=bool)
-    return np.flatnonzero(((flags & int(newton.ShapeFlags.COLLIDE_SHAPES)) != 0) & ~ground & ~paws)
+    colliding = np.flatnonzero(((flags & int(newton.ShapeFlags.COLLIDE_SHAPES)) != 0) & ~ground)
+    return np.array([i for i in colliding if model.shape_label[i].split("/")[-1] not in PAWS], dtype=int)
 
 
 def leg_geometry(description: RobotDescription) -> list[dict]:

@@ -92,7 +92,6 @@ class Simulation:
         self.model = build_model(
             num_worlds, ground=ground, friction=friction, visuals=visuals, extras=extras, device=device
         )
-        check_model(self.model)
         self.device = self.model.device
         self.num_worlds = num_worlds
         self.block = block
@@ -118,6 +117,7 @@ class Simulation:
                 self.solver.torque, self.solver.contact_force, self.solver.peak_force,
             )  # fmt: skip
         else:
+            check_model(self.model)
             damping = self.model.joint_damping.numpy().reshape(num_worlds, -1)
             damping[:, KNEE_DOFS] = 0.0
             self.model.joint_damping.assign(damping.ravel())

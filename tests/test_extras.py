@@ -54,12 +54,14 @@ def ball(builder):
 
 
 def arm(builder):
-    elbow = builder.add_joint_revolute(-1, builder.add_link(mass=1.0, label="forearm"), label="elbow")
+    elbow = builder.add_joint_revolute(
+        -1, builder.add_link(mass=1.0, inertia=wp.mat33(np.eye(3)), label="forearm"), label="elbow"
+    )
     builder.add_articulation([elbow])
 
 
 def leash(builder):
-    builder.add_joint_ball(-1, link(builder, "body"), label="leash")
+    builder.add_joint_ball(link(builder, "FL_inner_shank"), link(builder, "FR_inner_shank"), label="leash")
 
 
 def grain(builder):
