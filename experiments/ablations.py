@@ -8,30 +8,25 @@ jumps to heights of 0.5 to 1.1 m from standing; a jump counts if it meets its he
 
 from __future__ import annotations
 
-import time
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import matplotlib
-import numpy as np
 import torch
 import tyro
-import warp as wp
 from rich.console import Console
 from rich.table import Table
 
+from jumper_warp.cli.main import run_command
 from jumper_warp.envs.env import Env
-from jumper_warp.evaluation.jumps import run_jumps
+from jumper_warp.evaluation.learning import Curve, learning_curve
+from jumper_warp.evaluation.plots import drawn
 from jumper_warp.registry import make_task
-from jumper_warp.rl.networks import sanitise
 from jumper_warp.rl.ppo import Ppo, PpoCfg
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.tasks.jump.ablations import ABLATIONS
+from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.output import output_dir, write_figures
-from jumper_warp.utils.runtime import report_device
-
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt
+from jumper_warp.utils.runtime import announce
 
 FULL = "full"
 """Name of the training that lacks nothing."""
@@ -68,73 +63,29 @@ class Args:
         """Check the values."""
         unknown = set(self.variants) - {FULL, *ABLATIONS}
         if unknown or not self.variants:
-            raise ValueError(f"variants are {', '.join((FULL, *ABLATIONS))}, got {self.variants}")
-
-
-@dataclass
-class Curve:
-    """Success of one variant over its training time."""
-
-    seconds: list[float] = field(default_factory=list)
-    success: list[float] = field(default_factory=list)
-    iterations: int = 0
-
-    def seconds_to(self, rate: float) -> float | None:
-        """Return the first training time [s] at which an evaluation had at least this success rate, if any."""
-        return next((t for t, success in zip(self.seconds, self.success, strict=True) if success >= rate), None)
-
-
-def success(ppo: Ppo, judge: Env, jumps: int) -> float:
-    """Return the share of the test's jumps that succeed."""
-
-    @torch.no_grad()
-    def act(obs: torch.Tensor) -> torch.Tensor:
-        return ppo.model.actor(ppo.model.features(sanitise(obs))).clamp(-1.0, 1.0)
-
-    return float(run_jumps(act, judge, np.linspace(0.5, 1.1, jumps)).success.mean())
+            raise InputError(f"variants are {', '.join((FULL, *ABLATIONS))}, got {self.variants}")
 
 
 def train_variant(task: TaskCfg, judge: Env, args: Args) -> Curve:
-    """Train for the given time and return the curve; kernels are compiled off the clock."""
+    """Train from nothing for the given time and return the curve."""
     torch.manual_seed(args.seed)
     env = Env(task, args.envs, seed=args.seed, device=args.device, randomize=args.randomize, noise=args.randomize)
-    ppo = Ppo(env, args.ppo)
-    env.reset()
-    env.step(torch.zeros(env.num_envs, env.num_actions, device=env.device))
-    env.reset()
-    env.metrics()
-    curve, trained = Curve(), 0.0
-    while trained < args.seconds:
-        wp.synchronize_device(env.wp_device)
-        start = time.perf_counter()
-        until = min(trained + args.every, args.seconds)
-        while trained + time.perf_counter() - start < until:
-            ppo.collect()
-            ppo.update()
-            curve.iterations += 1
-            wp.synchronize_device(env.wp_device)
-        trained += time.perf_counter() - start
-        curve.seconds.append(trained)
-        curve.success.append(success(ppo, judge, args.jumps))
-    return curve
+    return learning_curve(env, Ppo(env, args.ppo), judge, args.seconds, args.every)
 
 
 def plot(curves: dict[str, Curve], path: Path) -> None:
     """Draw success over training time."""
-    fig, axis = plt.subplots(figsize=(7, 4.5), constrained_layout=True)
-    for name, curve in curves.items():
-        axis.plot([0.0, *curve.seconds], [0.0, *(100.0 * s for s in curve.success)], label=name.replace("_", " "))
-    axis.set(xlabel="training time [s]", ylabel="success [%]", ylim=(0.0, 102.0))
-    axis.grid(alpha=0.3)
-    axis.legend(loc="lower right")
-    fig.savefig(path, dpi=110)
-    plt.close(fig)
+    with drawn(path, figsize=(7, 4.5)) as axis:
+        for name, curve in curves.items():
+            axis.plot([0.0, *curve.seconds], [0.0, *(100.0 * s for s in curve.success)], label=name.replace("_", " "))
+        axis.set(xlabel="training time [s]", ylabel="success [%]", ylim=(0.0, 102.0))
+        axis.grid(alpha=0.3)
+        axis.legend(loc="lower right")
 
 
 def main(args: Args) -> dict:
     """Train all variants and return the figures."""
-    wp.config.log_level = wp.LOG_WARNING
-    report_device(args.device)
+    announce(args.device)
     folder = output_dir("ablations", args.out)
     task = make_task("vertical-jump")
     judge = Env(task, args.jumps, device=args.device, randomize=False, noise=False, auto_reset=False)
@@ -161,4 +112,4 @@ def main(args: Args) -> dict:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Args))
+    run_command(lambda: main(tyro.cli(Args)))

@@ -7,7 +7,6 @@ Before anything is timed the answer is checked: every paw position that a pose w
 
 from __future__ import annotations
 
-import time
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,10 +14,12 @@ import numpy as np
 import tyro
 import warp as wp
 
+from jumper_warp.cli.main import run_command
 from jumper_warp.robot.description import RobotDescription, load_description
 from jumper_warp.robot.model import MOTOR_JOINTS, leg_geometry_array
 from jumper_warp.utils.output import output_dir, write_figures
-from jumper_warp.utils.runtime import report_device
+from jumper_warp.utils.runtime import announce
+from jumper_warp.utils.timing import median_time
 from kernels.kinematics import geometry
 from kernels.kinematics.inverse import LegLimits, inverse_kinematics_kernel
 from kernels.kinematics.leg import leg_forward_kinematics
@@ -75,63 +76,39 @@ def random_motors(limits: LegLimits, n: int, rng: np.random.Generator) -> np.nda
     return np.concatenate([lateral, outer, rng.uniform(lowest, highest)], axis=1).reshape(12, n)
 
 
-class Launch:
-    """The inverse kinematics of a batch on one device."""
-
-    def __init__(self, legs: wp.array, limits: LegLimits, n: int, device: wp.Device) -> None:
-        self.legs, self.limits, self.n, self.device = legs, limits, n, device
-        self.base_pos = wp.zeros(n, dtype=wp.vec3, device=device)
-        self.base_quat = wp.zeros(n, dtype=wp.quat, device=device)
-        self.motors, self.knees = (wp.zeros((rows, n), dtype=float, device=device) for rows in (12, 8))
-        self.reachable = wp.zeros((4, n), dtype=wp.int32, device=device)
-        self.residual = wp.zeros((4, n), dtype=float, device=device)
-
-    def __call__(self, paws: wp.array) -> float:
-        """Solve for paws (4, n) [m] in the body frame and return the wall time [s]."""
-        wp.synchronize_device(self.device)
-        start = time.perf_counter()
-        wp.launch(
-            inverse_kinematics_kernel,
-            (4, self.n),
-            [self.legs, self.limits, self.base_pos, self.base_quat, paws, 0],
-            [self.motors, self.knees, self.reachable, self.residual],
-            device=self.device,
-        )
-        wp.synchronize_device(self.device)
-        return time.perf_counter() - start
-
-
 def main(args: Args) -> dict:
     """Run the benchmark and return its figures."""
-    wp.config.log_level = wp.LOG_WARNING
-    info = report_device(args.device)
+    info, device, n = announce(args.device), wp.get_device(args.device), args.poses
     folder = output_dir("benchmark_ik", args.out)
-    device = wp.get_device(args.device)
     description = load_description()
-    legs = leg_geometry_array(description, geometry, device)
-    limits = leg_limits(description)
+    legs, limits = leg_geometry_array(description, geometry, device), leg_limits(description)
     rng = np.random.default_rng(args.seed)
-    motors = wp.array(random_motors(limits, args.poses, rng).astype(np.float32), dtype=float, device=device)
-    paws = wp.zeros((4, args.poses), dtype=wp.vec3, device=device)
-    wp.launch(paws_kernel, (4, args.poses), [legs, motors], [paws], device=device)
-    offset = rng.uniform(-args.scatter, args.scatter, (4, args.poses, 3)).astype(np.float32)
+    motors = wp.array(random_motors(limits, n, rng).astype(np.float32), dtype=float, device=device)
+    paws = wp.zeros((4, n), dtype=wp.vec3, device=device)
+    wp.launch(paws_kernel, (4, n), [legs, motors], [paws], device=device)
+    offset = rng.uniform(-args.scatter, args.scatter, (4, n, 3)).astype(np.float32)
     scattered = wp.array(paws.numpy() + offset, dtype=wp.vec3, device=device)
+    base = [wp.zeros(n, dtype=kind, device=device) for kind in (wp.vec3, wp.quat)]
+    found = [wp.zeros((rows, n), dtype=float, device=device) for rows in (12, 8)]
+    reachable, residual = (wp.zeros((4, n), dtype=kind, device=device) for kind in (wp.int32, float))
 
-    launch = Launch(legs, limits, args.poses, device)
-    launch(paws)
-    reached, residual = launch.reachable.numpy().mean(), launch.residual.numpy().max()
-    if reached < 1.0 or not residual < 1.0e-5:
-        raise RuntimeError(f"{100.0 * reached:.4f} % reached, residual {residual:.2e} m: the time means nothing")
-    reachable_time = float(np.median([launch(paws) for _ in range(args.repeats)]))
-    scattered_time = float(np.median([launch(scattered) for _ in range(args.repeats)]))
+    def solve(targets: wp.array) -> None:
+        inputs, outputs = [legs, limits, *base, targets, 0], [*found, reachable, residual]
+        wp.launch(inverse_kinematics_kernel, (4, n), inputs, outputs, device=device)
+
+    solve(paws)
+    reached, farthest = reachable.numpy().mean(), residual.numpy().max()
+    if reached < 1.0 or not farthest < 1.0e-5:
+        raise RuntimeError(f"{100.0 * reached:.4f} % reached, residual {farthest:.2e} m: the time means nothing")
+    times = [median_time(lambda aim=aim: solve(aim), device, repeats=args.repeats) for aim in (paws, scattered)]
     figures = {
         "device": info.name,
-        "poses": args.poses,
-        "reachable_time [ms]": 1.0e3 * reachable_time,
-        "reachable_rate [poses/s]": args.poses / reachable_time,
-        "reachable_max_residual [m]": residual,
-        "scattered_time [ms]": 1.0e3 * scattered_time,
-        "scattered_reachable [%]": 100.0 * launch.reachable.numpy().mean(),
+        "poses": n,
+        "reachable_time [ms]": 1.0e3 * times[0],
+        "reachable_rate [poses/s]": n / times[0],
+        "reachable_max_residual [m]": farthest,
+        "scattered_time [ms]": 1.0e3 * times[1],
+        "scattered_reachable [%]": 100.0 * reachable.numpy().mean(),
     }
     write_figures(folder, figures)
     for name, value in figures.items():
@@ -141,4 +118,4 @@ def main(args: Args) -> dict:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Args))
+    run_command(lambda: main(tyro.cli(Args)))

@@ -33,6 +33,7 @@ from typing import Any
 import matplotlib
 import numpy as np
 import tyro
+from jumper_warp.evaluation.trial import Trial, TrialArgs
 from newton import ModelFlags
 from rich.console import Console
 from rich.table import Column, Table
@@ -41,7 +42,6 @@ from jumper_warp.cli.main import UsageError, run_command
 from jumper_warp.envs.env import Env
 from jumper_warp.evaluation.landings import ENDS, Landings
 from jumper_warp.evaluation.takeoffs import LANDING_ACTION, Act, Flight, Takeoffs, fly, mean_of_sides, reach
-from jumper_warp.evaluation.trial import Trial, TrialArgs
 from jumper_warp.registry import make_task
 from jumper_warp.robot.model import KNEE_DOFS
 from jumper_warp.robot.motors import horizontal_jump_filter, jumping_motors, loose_filter, vertical_jump_filter
@@ -52,6 +52,8 @@ from jumper_warp.utils.output import write_figures
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
+
+from jumper_warp.utils.errors import InputError
 
 TICKS = 48
 """Policy steps that are searched; the last action is held until takeoff."""
@@ -182,9 +184,9 @@ class Args:
         """Check the values."""
         unknown = [name for name in self.limits if name not in LIMITS]
         if unknown:
-            raise ValueError(f"no limit {unknown[0]!r:.40}; there are {', '.join(LIMITS)}")
+            raise InputError(f"no limit {unknown[0]!r:.40}; there are {', '.join(LIMITS)}")
         if self.population < 8 or min(self.generations, self.further) < 1 or self.squats < 0:
-            raise ValueError("need a population of at least 8, a generation in each search, and no negative squats")
+            raise InputError("need a population of at least 8, a generation in each search, and no negative squats")
 
 
 def cma_package() -> ModuleType:

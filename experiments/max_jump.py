@@ -23,7 +23,7 @@ from rich.console import Console
 from rich.table import Table
 
 from jumper_warp.cli.main import run_command
-from jumper_warp.evaluation.distances import KINDS, RELIABLE, distance_metrics, progress, row_of, verdict
+from jumper_warp.evaluation.distances import KINDS, PUBLISHED, RELIABLE, distance_metrics, progress, row_of, verdict
 from jumper_warp.evaluation.landings import Landings
 from jumper_warp.evaluation.log import termination_names
 from jumper_warp.evaluation.places import random_headings, trained_range
@@ -41,15 +41,6 @@ IN_RANGE = (1.0, 1.4)
 """[m]"""
 GIVEN_UP = 0.5
 """[1] Success below which no farther bin is tried."""
-PUBLISHED = {
-    "Barkour (Caluwaerts et al. 2023)": 0.5,
-    "Margolis et al. 2021": 0.66,
-    "Liu et al. 2023": 0.8,
-    "Cheng et al. 2024": 0.8,
-    "Atanassov et al. 2024": 0.9,
-    "Jumper, the paper's robot": 1.25,
-}
-"""[m] The paper's table of jump distances."""
 PAPER = {"largest_reliable_m": 1.25}
 
 

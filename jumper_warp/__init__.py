@@ -22,7 +22,7 @@ _PLACES = {
     "make_task": "jumper_warp.registry",
 }
 """Modules of the names below; each is imported when a name of it is first used."""
-__all__ = list(_PLACES)  # noqa: PLE0604
+__all__ = list(_PLACES)
 
 
 def __getattr__(name: str) -> Any:

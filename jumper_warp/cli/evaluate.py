@@ -9,7 +9,8 @@ from collections.abc import Callable, Sequence
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
-from jumper_warp.utils.errors import InputError
+from jumper_warp.cli.main import TASK_MODULE_HELP, UsageError
+from jumper_warp.cli.main import parse as parse_flags
 
 if TYPE_CHECKING:
     from jumper_warp.evaluation.registry import Evaluation
@@ -29,7 +30,7 @@ ABOUT = "Try a policy many times and report how well it did: figures.json, and a
 def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> None:
     """Evaluate as the arguments say; modules: that the user has named, for tasks that are not the project's.
 
-    Raises InputError or OSError with one line: the policy or a flag cannot be used. Exits where tyro does.
+    Raises UsageError or OSError with one line: the policy or a flag cannot be used. Exits where tyro does.
     """
     policy = policy_of("evaluate", ABOUT, args)
     from jumper_warp.evaluation.commands import EvaluateCfg, evaluate
@@ -39,12 +40,12 @@ def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> None:
 
 
 def policy_of(command: str, about: str, args: Sequence[str]) -> str:
-    """Return the policy, which comes first; exits after the help that is the same for all. Raises InputError."""
+    """Return the policy, which comes first; exits after the help that is the same for all. Raises UsageError."""
     if args and args[0] in ("-h", "--help"):
-        print(HELP.format(command=command, about=about))
+        print(f"{HELP.format(command=command, about=about)}\n\n{TASK_MODULE_HELP}")
         raise SystemExit(0)
     if not args or args[0].startswith("-"):
-        raise InputError(f"the policy comes first: jumper {command} POLICY [flags]")
+        raise UsageError(f"the policy comes first: jumper {command} POLICY [flags]")
     return args[0]
 
 
@@ -60,19 +61,18 @@ def parse(
 ) -> Any:
     """Return the settings of a kind, with the flags of the policy's evaluation; exits where tyro does.
 
-    Raises InputError: a flag is not one of the policy's task, or a setting is out of range.
+    Raises UsageError: a flag is not one of the policy's task, or a setting is out of range.
     """
-    import tyro
-
-    flags = flags_of(opened.evaluation)
-    cfg, unknown = tyro.cli(
+    flags, about = flags_of(opened.evaluation), kind.__doc__
+    cfg, unknown = parse_flags(
         kind[type(flags)],
-        prog=f"jumper {command} {opened.source}",
+        f"{command} {opened.source}",
+        args,
+        description=about,
         default=kind(flags),
-        args=list(args),
         return_unknown_args=True,
     )
     if unknown:
         what = f"{unknown[0]} is not for policies of {opened.task.name}"
-        raise InputError(f"{what}; jumper {command} {opened.source} --help shows what is")
+        raise UsageError(f"{what}; jumper {command} {opened.source} --help shows what is")
     return cfg

@@ -16,7 +16,7 @@ ABOUT = "Let a policy act and record it for the Rerun viewer; --viewer rerun ope
 def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> None:
     """Play as the arguments say; modules: that the user has named, for tasks that are not the project's.
 
-    Raises InputError or OSError with one line: the policy or a flag cannot be used. Exits where tyro does.
+    Raises UsageError or OSError with one line: the policy or a flag cannot be used. Exits where tyro does.
     """
     policy = policy_of("play", ABOUT, args)
     from jumper_warp.evaluation.commands import PlayCfg, play

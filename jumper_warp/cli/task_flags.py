@@ -10,6 +10,7 @@ from __future__ import annotations
 import ast
 import dataclasses
 import inspect
+import itertools
 import re
 import textwrap
 from typing import Annotated, Any, NamedTuple, get_type_hints
@@ -19,7 +20,6 @@ import tyro
 from jumper_warp.tasks.cfg import Reset, TaskCfg
 from jumper_warp.tasks.terms import Term
 from jumper_warp.utils.errors import InputError
-
 
 NO_SOURCE = __package__
 """Module of the classes made here. Tyro looks for their source there: in an empty file, so that it takes no seconds."""
@@ -66,7 +66,7 @@ def field_docs(kind: type) -> dict[str, str]:
     body = ast.parse(textwrap.dedent(inspect.getsource(kind))).body[0].body
     return {
         field.target.id: " ".join(text.value.value.split())
-        for field, text in zip(body, body[1:], strict=False)
+        for field, text in itertools.pairwise(body)
         if isinstance(field, ast.AnnAssign) and isinstance(text, ast.Expr) and isinstance(text.value, ast.Constant)
     }
 
@@ -80,7 +80,7 @@ def _flag(value: Any, hint: Any, where: str) -> Flag | None:
     if isinstance(value, tuple) and value and all(isinstance(term, Term) for term in value):
         terms = {term.name: _flag_of_term(term, f"{where} {term.name}") for term in value}
         return _group(None, {name: flag for name, flag in terms.items() if flag is not None}, where)
-    if isinstance(value, str | tuple) and not value or isinstance(value, str) or not _is_data(value):
+    if (isinstance(value, str | tuple) and not value) or isinstance(value, str) or not _is_data(value):
         return None
     if isinstance(value, tuple) and dataclasses.is_dataclass(value[0]):
         return Flag(tuple[tuple(type(v) for v in value)], value)

@@ -13,6 +13,7 @@ from jumper_warp.envs.skill import RING
 from jumper_warp.robot.description import load_description
 from jumper_warp.sim.simulation import Simulation
 from jumper_warp.tasks.cfg import Handover, TaskCfg
+from jumper_warp.utils.errors import InputError
 from kernels.mdp.env import Delays, EnvArrays, Scene
 from kernels.mdp.view import RobotArrays
 
@@ -83,19 +84,19 @@ def checked_tasks(task: Any, handovers: Sequence[Handover]) -> tuple[TaskCfg, ..
     tasks = (task,) if isinstance(task, TaskCfg | str) or not isinstance(task, Iterable) else tuple(task)
     for each in tasks:
         if not isinstance(each, TaskCfg):
-            raise ValueError(f"a task must be a TaskCfg, as make_task returns for a name, got {each!r:.60}")
+            raise InputError(f"a task must be a TaskCfg, as make_task returns for a name, got {each!r:.60}")
     names = [each.name for each in tasks]
     if not tasks or len(set(names)) < len(names):
-        raise ValueError(f"an environment needs at least one task, each with a name of its own, got {names}")
+        raise InputError(f"an environment needs at least one task, each with a name of its own, got {names}")
     first = tasks[0].motors
     for each in tasks[1:]:
         pairs = ((each.motors.lateral, first.lateral), (each.motors.transversal, first.transversal))
         same = (each.motors.fade_start, each.motors.fade_end) == (first.fade_start, first.fade_end)
         if not (same and all(one.peak == other.peak for one, other in pairs)):
-            raise ValueError(f"{each.name} needs the peak torque and the over-speed protection of {names[0]}'s motors")
+            raise InputError(f"{each.name} needs the peak torque and the over-speed protection of {names[0]}'s motors")
     for each in handovers:
         if each.source not in tasks or each.target not in tasks:
-            raise ValueError(f"a handover needs two of the tasks {names}, got {each.source.name} to {each.target.name}")
+            raise InputError(f"a handover needs two of the tasks {names}, got {each.source.name} to {each.target.name}")
     return tasks
 
 
@@ -116,13 +117,13 @@ def prepared(
 def checked_action(action: Any, shape: tuple[int, ...], device: torch.device) -> torch.Tensor:
     """Return an action without its gradient. Raises ValueError for another shape, kind of numbers or device."""
     if not isinstance(action, torch.Tensor):
-        raise ValueError(f"an action must be a torch tensor, got {type(action).__name__}")
+        raise InputError(f"an action must be a torch tensor, got {type(action).__name__}")
     if tuple(action.shape) != shape:
-        raise ValueError(f"an action must have shape {shape}, got {tuple(action.shape)}")
+        raise InputError(f"an action must have shape {shape}, got {tuple(action.shape)}")
     if not action.is_floating_point():
-        raise ValueError(f"an action must hold floating-point numbers, got {action.dtype}")
+        raise InputError(f"an action must hold floating-point numbers, got {action.dtype}")
     if action.device != device:
-        raise ValueError(f"an action must be on {device}, got {action.device}")
+        raise InputError(f"an action must be on {device}, got {action.device}")
     return action.detach()
 
 
@@ -132,9 +133,9 @@ def checked_values(values: Any, shape: tuple[int, ...], what: str) -> np.ndarray
         values = values.detach().cpu().numpy()
     array = np.asarray(values, dtype=np.float32)
     if array.ndim and array.shape != shape:
-        raise ValueError(f"{what} must have shape {shape}, got {array.shape}")
+        raise InputError(f"{what} must have shape {shape}, got {array.shape}")
     if not np.isfinite(array).all():
-        raise ValueError(f"{what} must be finite")
+        raise InputError(f"{what} must be finite")
     return np.ascontiguousarray(np.broadcast_to(array, shape))
 
 
@@ -146,7 +147,7 @@ def checked_mask(worlds: Any, num_envs: int) -> np.ndarray:
         worlds = worlds.detach().cpu().numpy()
     array = np.asarray(worlds)
     if array.shape != (num_envs,) or array.dtype != bool:
-        raise ValueError(f"worlds must be bool of shape ({num_envs},), got {array.dtype} of shape {array.shape}")
+        raise InputError(f"worlds must be bool of shape ({num_envs},), got {array.dtype} of shape {array.shape}")
     return array.astype(np.float32)
 
 
@@ -154,5 +155,5 @@ def checked_commands(commands: Mapping[str, Any] | Any, num_envs: int) -> np.nda
     """Return commands, up to four numbers a world, as (num_envs, 4); raises ValueError: another shape, not finite."""
     array = np.asarray(commands.detach().cpu() if isinstance(commands, torch.Tensor) else commands, dtype=np.float32)
     if array.ndim != 2 or array.shape[0] != num_envs or not 1 <= array.shape[1] <= 4:
-        raise ValueError(f"commands must have shape ({num_envs}, 1 to 4), got {array.shape}")
+        raise InputError(f"commands must have shape ({num_envs}, 1 to 4), got {array.shape}")
     return checked_values(np.pad(array, ((0, 0), (0, 4 - array.shape[1]))), (num_envs, 4), "commands")

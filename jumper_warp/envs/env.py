@@ -30,6 +30,7 @@ from jumper_warp.sim.simulation import Simulation, SolverName
 from jumper_warp.tasks.cfg import Handover, TaskCfg
 from jumper_warp.tasks.interface import interface
 from jumper_warp.tasks.saving import task_to_json
+from jumper_warp.utils.errors import InputError
 from kernels.mdp.actions import action_kernel, begin_step_kernel
 from kernels.mdp.env import SkillSettings
 from kernels.mdp.events import AT_RESET, AT_STEP, STARTUP
@@ -115,7 +116,7 @@ class Env:
         n, device, sim = self.num_envs, self.wp_device, self.sim
         active = np.ascontiguousarray(np.broadcast_to(np.asarray(skill, dtype=np.int32), n))
         if not ((active >= 0) & (active < len(tasks))).all():
-            raise ValueError(f"skill must be an index below {len(tasks)}, got {skill!r:.60}")
+            raise InputError(f"skill must be an index below {len(tasks)}, got {skill!r:.60}")
         self._first_skill = active
         active = wp.array(active, dtype=int, device=device)
         self.skills = [Skill(task, i, n, self.step_dt, sim.substeps, device) for i, task in enumerate(tasks)]
@@ -163,8 +164,6 @@ class Env:
                              (self.worlds.level, 0), (self.worlds.streak, 0)):  # fmt: skip
             array.fill_(value)
         self.worlds.skill.assign(self._first_skill)
-        for skill in self.skills:
-            skill.timer.zero_()
 
     def step(self, action: torch.Tensor) -> Step:
         """Advance one policy step.
@@ -327,7 +326,7 @@ class Env:
     def request(self, skill: int, worlds: Any = None) -> None:
         """Ask worlds to hand over to another skill as soon as a handover allows it. Raises ValueError: no such one."""
         if not 0 <= skill < len(self.skills):
-            raise ValueError(f"skill must be an index below {len(self.skills)}, got {skill}")
+            raise InputError(f"skill must be an index below {len(self.skills)}, got {skill}")
         wanted = self.worlds.request.numpy()
         wanted[checked_mask(worlds, self.num_envs) > 0.0] = skill
         self.worlds.request.assign(wanted)

@@ -13,6 +13,7 @@ from gymnasium.vector.utils import batch_space
 
 from jumper_warp.envs.env import Env
 from jumper_warp.envs.vec_env import RAW_LIMIT, sanitise
+from jumper_warp.utils.errors import InputError
 
 Obs = Any
 """Observations of all worlds: an array (num_envs, columns), or a dict of them by group."""
@@ -40,9 +41,9 @@ class GymVectorEnv(gymnasium.vector.VectorEnv):
         Raises ValueError: the environment's worlds do not restart by themselves, or it has several tasks.
         """
         if not env.auto_reset:
-            raise ValueError("Gymnasium's adapter needs an environment with auto_reset")
+            raise InputError("Gymnasium's adapter needs an environment with auto_reset")
         if len(env.tasks) > 1:
-            raise ValueError(f"Gymnasium's adapter needs an environment of one task, this one has {len(env.tasks)}")
+            raise InputError(f"Gymnasium's adapter needs an environment of one task, this one has {len(env.tasks)}")
         self.env, self.num_envs = env, env.num_envs
         self.endings = tuple(term.name for term in env.task.terminations)
         self._all_groups, self._tensors, self._began = all_groups, tensors, False
@@ -62,7 +63,7 @@ class GymVectorEnv(gymnasium.vector.VectorEnv):
         """
         self._check_open()
         if options:
-            raise ValueError(f"reset takes no options, got {', '.join(map(repr, options))}")
+            raise InputError(f"reset takes no options, got {', '.join(map(repr, options))}")
         super().reset(seed=seed)
         if seed is not None:
             seed = (seed + 2**31) % 2**32 - 2**31  # 32 bits with a sign
@@ -101,7 +102,7 @@ class GymVectorEnv(gymnasium.vector.VectorEnv):
     def _checked(self, actions: Any) -> torch.Tensor:
         array, shape = np.asarray(actions), self.action_space.shape
         if array.shape != shape or array.dtype.kind not in "fiu":
-            raise ValueError(f"actions must be numbers of shape {shape}, got {array.dtype} of shape {array.shape}")
+            raise InputError(f"actions must be numbers of shape {shape}, got {array.dtype} of shape {array.shape}")
         return torch.from_numpy(np.array(array, dtype=np.float32)).to(self.env.device)
 
     def _given(self, tensor: torch.Tensor) -> Any:

@@ -11,6 +11,7 @@ import warp as wp
 
 from jumper_warp.robot.motors import filter_params
 from jumper_warp.tasks.cfg import TaskCfg
+from jumper_warp.utils.errors import InputError
 from kernels.mdp.env import Counters, Nothing, SkillSettings
 from kernels.mdp.events import make_event_kernel
 from kernels.mdp.observe import CHUNK, Column, ObservationArrays, make_observe_kernel
@@ -104,7 +105,7 @@ class Skill:
         """
         for key, value in numbers.items():
             if not math.isfinite(value):
-                raise ValueError(f"{section} {name}: {key} must be finite, got {value}")
+                raise InputError(f"{section} {name}: {key} must be finite, got {value}")
             i = self.task.place(section, name, key)
             self.numbers[i : i + 1].fill_(value)
 

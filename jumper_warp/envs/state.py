@@ -9,6 +9,7 @@ import numpy as np
 import torch
 import warp as wp
 
+from jumper_warp.utils.errors import InputError
 from kernels.mdp.env import Delays, EnvArrays
 from kernels.mdp.parameters import RobotParameters
 from kernels.mdp.view import RobotArrays
@@ -47,25 +48,25 @@ def load_state(env: Env, state: dict[str, torch.Tensor]) -> None:
     fields = {prefix + name: (prefix, name) for prefix, values in records.items() for name in values.dtype.names}
     names = {*tensors, *fields, FINGERPRINT, SEED}
     if names != state.keys():
-        raise ValueError(
+        raise InputError(
             f"saved by another version, task or solver: lacks {sorted(names - state.keys())[:5]}, "
             f"has {sorted(state.keys() - names)[:5]} besides"
         )
     saved = state["env.done"].shape[0]
     if saved != env.num_envs:
-        raise ValueError(f"saved for {saved} environments, there are {env.num_envs}")
+        raise InputError(f"saved for {saved} environments, there are {env.num_envs}")
     for skill in env.skills:
         if state[f"{skill.task.name}/timer"].shape[0] != skill.timer.shape[0]:
-            raise ValueError(f"saved with other randomisation or events of {skill.task.name}")
+            raise InputError(f"saved with other randomisation or events of {skill.task.name}")
     expected = {name: tuple(tensor.shape) for name, tensor in tensors.items()}
     expected |= {field: records[prefix][name].shape for field, (prefix, name) in fields.items()}
     for name, shape in expected.items():
         if tuple(state[name].shape) != shape:
-            raise ValueError(f"saved {name} has shape {tuple(state[name].shape)}, expected {shape}")
+            raise InputError(f"saved {name} has shape {tuple(state[name].shape)}, expected {shape}")
     if not torch.equal(state[FINGERPRINT], nominal_fingerprint(env)):
-        raise ValueError("saved with other robots: the description or the task's motors differ")
+        raise InputError("saved with other robots: the description or the task's motors differ")
     if int(state[SEED]) != env.seed:
-        raise ValueError(f"saved with seed {int(state[SEED])}, this environment draws with seed {env.seed}")
+        raise InputError(f"saved with seed {int(state[SEED])}, this environment draws with seed {env.seed}")
     for field, (prefix, name) in fields.items():
         records[prefix][name] = state[field].numpy()
     for prefix, array in _records(env).items():

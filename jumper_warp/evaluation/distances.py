@@ -23,6 +23,15 @@ EACH = (
     "fall_rate",
 )
 """Figures with an entry a bin."""
+PUBLISHED = {
+    "Barkour (Caluwaerts et al. 2023)": 0.5,
+    "Margolis et al. 2021": 0.66,
+    "Liu et al. 2023": 0.8,
+    "Cheng et al. 2024": 0.8,
+    "Atanassov et al. 2024": 0.9,
+    "Jumper, the paper's robot": 1.25,
+}
+"""[m] The paper's table of jump distances."""
 
 
 def distance_metrics(bins: dict[float, Landings], in_range: tuple[float, float]) -> dict[str, Any]:

@@ -22,6 +22,7 @@ from jumper_warp.evaluation.log import (
     finite,
 )
 from jumper_warp.tasks.cfg import TaskCfg
+from jumper_warp.utils.errors import InputError
 
 SUCCESS_TOLERANCE = 0.1
 """[m] A landed jump that ends this close to its goal succeeds."""
@@ -107,7 +108,7 @@ class Landings(EvaluationLog):
         """Begin with no jump ended. Raises ValueError for goals of another shape."""
         self.goals = np.asarray(self.goals, dtype=float)
         if self.goals.ndim != 3 or self.goals.shape[2] != 2:
-            raise ValueError(f"goals must have shape (num_envs, jumps, 2), got {self.goals.shape}")
+            raise InputError(f"goals must have shape (num_envs, jumps, 2), got {self.goals.shape}")
         shape = self.goals.shape[:2]
         self.current, self.end = np.zeros(shape[0], dtype=int), np.full(shape, -1)
         self.place, self.target, self.touchdown, self.place_soon = (np.full((*shape, 2), np.nan) for _ in range(4))

@@ -13,6 +13,7 @@ from jumper_warp.robot.motors import FilterCfg, MotorCfg, filter_params, jumping
 from jumper_warp.sim.differentiable import DifferentiableStep
 from jumper_warp.sim.dynamics import JumperDynamics
 from jumper_warp.sim.simulation import SUBSTEPS
+from jumper_warp.utils.errors import InputError
 from kernels.layout import COORDS, DOFS, GRAVITY
 
 MAX_SWEEPS = 200
@@ -172,9 +173,9 @@ class DifferentiableRollout:
             ValueError: dt not positive, substeps below 1, or a model without gradients.
         """
         if not dt > 0.0 or substeps < 1:
-            raise ValueError(f"dt must be > 0 and substeps >= 1, got {dt}, {substeps}")
+            raise InputError(f"dt must be > 0 and substeps >= 1, got {dt}, {substeps}")
         if not model.requires_grad:
-            raise ValueError("the model carries no gradients: build it with requires_grad=True")
+            raise InputError("the model carries no gradients: build it with requires_grad=True")
         self.dynamics = JumperDynamics(model, double=double)
         self.num_worlds = model.world_count
         self.real = self.dynamics.real
@@ -226,13 +227,13 @@ class DifferentiableRollout:
         """Raise ValueError unless the arguments of `run` fit."""
         n = self.num_worlds
         if targets.ndim != 3 or targets.shape[0] < 1 or targets.shape[1:] != (12, n):
-            raise ValueError(f"targets must have shape (T, 12, {n}) with T >= 1, got {targets.shape}")
+            raise InputError(f"targets must have shape (T, 12, {n}) with T >= 1, got {targets.shape}")
         for name, array, count in (("joint_q", joint_q, int(COORDS)), ("joint_qd", joint_qd, int(DOFS))):
             if array.shape != (count * n,):
-                raise ValueError(f"{name} must have shape ({count * n},), got {array.shape}")
+                raise InputError(f"{name} must have shape ({count * n},), got {array.shape}")
         for name, array in (("targets", targets), ("joint_q", joint_q), ("joint_qd", joint_qd)):
             if array.dtype != self.real:
-                raise ValueError(f"{name} must be of {self.real.__name__}, got {array.dtype.__name__}")
+                raise InputError(f"{name} must be of {self.real.__name__}, got {array.dtype.__name__}")
 
     def _filtered(self, target: wp.array, q: wp.array, qd: wp.array) -> wp.array:
         """Return the targets [rad] that the filter lets through, shape (12, num_worlds)."""

@@ -9,6 +9,7 @@ import torch
 from torch import nn
 
 from jumper_warp.policies.spec import PolicyError, PolicyInterface
+from jumper_warp.utils.errors import InputError
 
 ACTIVATION_MODULES = {"elu": nn.ELU, "relu": nn.ReLU, "tanh": nn.Tanh}
 
@@ -99,7 +100,7 @@ class Policy(nn.Module):
             ValueError: The last axis has another size than the policy's observation.
         """
         if obs.shape[-1] != len(self.mean):
-            raise ValueError(f"the policy reads {len(self.mean)} numbers, got observations of {obs.shape[-1]}")
+            raise InputError(f"the policy reads {len(self.mean)} numbers, got observations of {obs.shape[-1]}")
         limit = self.interface.observation_limit
         finite = torch.nan_to_num(obs, nan=0.0, posinf=0.0, neginf=0.0).clamp(-limit, limit)
         limit = self.interface.normalised_limit

@@ -43,8 +43,9 @@ class PolicyError(InputError):
 class PolicyInterface:
     """Observation, network sizes, and the way from an action to motor torques.
 
-    Observations are SI units and rad; velocities and gravity in body axes, angles relative to `default_joint_pos`. Where
-    `observation_layout` tells it, a term is clipped, then scaled, and keeps frames of the past. An action a in [-1, 1] commands a · action_scale + default_joint_pos.
+    Observations are SI units and rad; velocities and gravity in body axes, angles relative to `default_joint_pos`.
+    Where `observation_layout` tells it, a term is clipped, then scaled, and keeps frames of the past. An action a in
+    [-1, 1] commands a · action_scale + default_joint_pos.
     """
 
     task: str
@@ -153,7 +154,7 @@ def _check_filter(fields: dict[str, Any]) -> None:
 
 
 def _check_layout(layout: dict[str, Any], width: int) -> None:
-    """Raise PolicyError unless the terms follow each other and fill a number of columns; an empty layout tells nothing."""
+    """Raise PolicyError unless the terms follow each other and fill a number of columns; an empty layout may do."""
     first = 0
     for name, term in layout.items():
         numbers = list(term.values()) if isinstance(term, dict) and set(term) == set(LAYOUT) else [None]

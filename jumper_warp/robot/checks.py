@@ -10,6 +10,7 @@ import numpy as np
 
 from jumper_warp.robot.bounds import LENGTH, PAW_RADIUS, Reading, check_bounds, refuse_outside
 from jumper_warp.robot.parts import LEGS, MOTOR_JOINTS, Joint, Link, RobotDescription, RobotDescriptionError
+from jumper_warp.utils.errors import InputError
 
 TOLERANCE = 1.0e-6
 """Largest deviation of a mirrored leg from the front left one, and of a leg from its planar form [m, kg, rad]."""
@@ -61,7 +62,7 @@ def knee_angles(leg: LegDimensions, outer: float, inner: float) -> tuple[float, 
     span = outer_knee - inner_knee
     distance = math.hypot(*span)
     if not 1.0e-6 < distance < 2.0 * leg.shank:
-        raise ValueError(f"the shanks of {leg.shank} m do not meet, the knees are {distance:.4f} m apart")
+        raise InputError(f"the shanks of {leg.shank} m do not meet, the knees are {distance:.4f} m apart")
     rise = math.sqrt(leg.shank**2 - 0.25 * distance**2) / distance
     ankle = 0.5 * (outer_knee + inner_knee) + leg.front * rise * np.array([span[1], -span[0]])
     # tilt of each shank from -z toward +front

@@ -11,6 +11,8 @@ from dataclasses import dataclass
 import newton
 import numpy as np
 
+from jumper_warp.utils.errors import InputError
+
 SIZE = 4.0
 """[m] Edge of the square, by default: a jump of 2 m from its middle ends on it."""
 CELL = 0.02
@@ -39,11 +41,11 @@ class BlockCfg:
     def __post_init__(self) -> None:
         for name in ("half", "height", "mass"):
             if not np.all(np.asarray(getattr(self, name)) > 0.0):
-                raise ValueError(f"block {name} must be positive, got {getattr(self, name)}")
+                raise InputError(f"block {name} must be positive, got {getattr(self, name)}")
         if not np.all(np.asarray(self.friction) >= 0.0):
-            raise ValueError(f"block friction must not be negative, got {self.friction}")
+            raise InputError(f"block friction must not be negative, got {self.friction}")
         if not np.all(np.isfinite(self.center)):
-            raise ValueError(f"block center must be finite, got {self.center}")
+            raise InputError(f"block center must be finite, got {self.center}")
 
     def per_world(self, num_worlds: int) -> dict[str, np.ndarray]:
         """Return the values by name, `center` and `half` (num_worlds, 2), the others (num_worlds,).
@@ -54,7 +56,7 @@ class BlockCfg:
         try:
             return {name: np.broadcast_to(getattr(self, name), shape) for name, shape in shapes.items()}
         except ValueError as error:
-            raise ValueError(f"block values must be one, or one for each of {num_worlds} worlds: {error}") from None
+            raise InputError(f"block values must be one, or one for each of {num_worlds} worlds: {error}") from None
 
 
 def platform(height: float, *, edge: float = 0.5, size: float = SIZE, cell: float = CELL) -> newton.Heightfield:
@@ -71,9 +73,9 @@ def platform(height: float, *, edge: float = 0.5, size: float = SIZE, cell: floa
     """
     x = _nodes(size, cell)
     if not (np.isfinite(height) and height != 0.0):
-        raise ValueError(f"platform height must be finite and not zero, got {height}")
+        raise InputError(f"platform height must be finite and not zero, got {height}")
     if not 0.0 < edge < 0.5 * size:
-        raise ValueError(f"platform edge must lie between 0 and {0.5 * size:g} m, got {edge}")
+        raise InputError(f"platform edge must lie between 0 and {0.5 * size:g} m, got {edge}")
     row = np.where(x <= edge + 1.0e-9, 0.0, height)
     return _heightfield(np.tile(row, (len(x), 1)), size)
 
@@ -104,9 +106,9 @@ def uneven(
     """
     x = _nodes(size, cell)
     if not (amplitude > 0.0 and length > 0.0):
-        raise ValueError(f"uneven ground needs amplitude > 0 and length > 0, got {amplitude} and {length}")
+        raise InputError(f"uneven ground needs amplitude > 0 and length > 0, got {amplitude} and {length}")
     if not 0.0 <= flat_radius < 0.5 * size:
-        raise ValueError(f"flat_radius must lie between 0 and {0.5 * size:g} m, got {flat_radius}")
+        raise InputError(f"flat_radius must lie between 0 and {0.5 * size:g} m, got {flat_radius}")
     bumps = _gaussian_field(np.random.default_rng(seed), len(x), x[1] - x[0], length)
     radius = np.hypot(x[:, None], x[None, :])
     share = np.clip((radius - flat_radius) / (2.0 * length), 0.0, 1.0)
@@ -117,7 +119,7 @@ def uneven(
 def _nodes(size: float, cell: float) -> np.ndarray:
     """Return the coordinates [m] of the nodes along an axis."""
     if not (size > 0.0 and 0.0 < cell <= 0.5 * size):
-        raise ValueError(f"a ground needs size > 0 and 0 < cell <= size / 2, got {size} and {cell}")
+        raise InputError(f"a ground needs size > 0 and 0 < cell <= size / 2, got {size} and {cell}")
     return np.linspace(-0.5 * size, 0.5 * size, int(np.ceil(size / cell - 1.0e-9)) + 1)
 
 

@@ -8,7 +8,9 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Callable
 from types import ModuleType
+from typing import Any
 
 import newton
 import numpy as np
@@ -26,6 +28,7 @@ from jumper_warp.robot.description import (
     load_description,
 )
 from jumper_warp.robot.pinocchio_model import PinocchioRobot, build_pinocchio
+from jumper_warp.utils.errors import InputError
 
 __all__ = [
     "LEGS",
@@ -58,8 +61,13 @@ NO_EFFORT_LIMIT = 1.0e6
 """[N m] Motor models saturate torque; the model itself does not. A knee's limit is that of its damping."""
 KNEE_DOFS = [6 + 5 * leg + joint for leg in range(4) for joint in (2, 4)]
 """A world's knees in `joint_qd`."""
+PAWS = tuple(f"{leg}_paw" for leg in LEGS)
+"""Labels of the shapes that touch the ground, behind the world's prefix."""
 PAW_GROUP = -1
 """Collision group of the paws: they meet the ground, but not each other."""
+
+Extras = Callable[[newton.ModelBuilder], Any]
+"""Adds to the builder of one robot what every world shall have beside it; what it returns is not used."""
 
 
 def build_model(
@@ -71,6 +79,7 @@ def build_model(
     device: wp.DeviceLike = None,
     requires_grad: bool = False,
     visuals: bool = True,
+    extras: Extras | None = None,
 ) -> newton.Model:
     """Return a Newton model of `num_worlds` robots, standing in the default pose.
 
@@ -82,22 +91,37 @@ def build_model(
         device: Warp device.
         requires_grad: Whether the model's arrays carry gradients.
         visuals: Whether to add shapes that only viewers see. Without them large batches build faster.
+        extras: Adds the caller's own sites and shapes. It is called once, with the builder of one robot, whose links
+            are `builder.body_label.index("FL_inner_shank")` and so on; what it adds is in every world, with the
+            world's prefix before its label. Sites and shapes that do not collide serve sensors and viewers on every
+            solver. Colliding shapes and obstacles (body -1) act on Newton's solvers; SolverJumper ignores them with
+            a warning, and refuses bodies, joints and particles.
 
     Raises:
         ValueError: `num_worlds` below 1, `friction` not in 0 to 10, or an unknown `ground`.
         RobotDescriptionError: the default description cannot be read.
     """
     if num_worlds < 1:
-        raise ValueError(f"num_worlds must be at least 1, got {num_worlds}")
+        raise InputError(f"num_worlds must be at least 1, got {num_worlds}")
     if not 0.0 <= friction <= MAX_FRICTION:
-        raise ValueError(f"friction must lie in 0 to {MAX_FRICTION:g}, got {friction}")
+        raise InputError(f"friction must lie in 0 to {MAX_FRICTION:g}, got {friction}")
     description = load_description() if description is None else description
     builder = newton.ModelBuilder()
     newton.solvers.SolverMuJoCo.register_custom_attributes(builder)
     robot = _robot_builder(description, friction, visuals)
+    if extras is not None:
+        extras(robot)
     builder.replicate(robot, num_worlds, label_prefixes=[f"world_{i}" for i in range(num_worlds)])
     _add_ground(builder, ground)
     return builder.finalize(device=device, requires_grad=requires_grad)
+
+
+def other_colliders(model: newton.Model) -> np.ndarray:
+    """Return the indices of the shapes that collide and are neither paws nor the ground that all worlds share."""
+    flags, worlds, kinds = model.shape_flags.numpy(), model.shape_world.numpy(), model.shape_type.numpy()
+    ground = (worlds == -1) & np.isin(kinds, [int(newton.GeoType.PLANE), int(newton.GeoType.HFIELD)])
+    colliding = np.flatnonzero(((flags & int(newton.ShapeFlags.COLLIDE_SHAPES)) != 0) & ~ground)
+    return np.array([i for i in colliding if model.shape_label[i].split("/")[-1] not in PAWS], dtype=int)
 
 
 def leg_geometry(description: RobotDescription) -> list[dict]:
@@ -265,4 +289,4 @@ def _add_ground(builder: newton.ModelBuilder, ground: str | newton.Heightfield |
     elif isinstance(ground, str) and ground == "plane":
         builder.add_shape_plane(plane=(0.0, 0.0, 1.0, 0.0), width=0.0, length=0.0, **common)
     elif ground is not None:
-        raise ValueError(f'ground must be "plane", a newton.Heightfield or None, got {ground!r}')
+        raise InputError(f'ground must be "plane", a newton.Heightfield or None, got {ground!r}')

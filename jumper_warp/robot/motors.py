@@ -12,6 +12,7 @@ import warp as wp
 
 from jumper_warp.robot.description import RobotDescription, load_description
 from jumper_warp.robot.parts import Motor
+from jumper_warp.utils.errors import InputError
 from kernels.actuation import command_filter
 from kernels.actuation import motors as actuator
 
@@ -40,11 +41,11 @@ class MotorKindCfg:
         """Check the values."""
         for name, value in vars(self).items():
             if not (math.isfinite(value) and value >= 0.0):
-                raise ValueError(f"motor {name} must be finite and not negative, got {value}")
+                raise InputError(f"motor {name} must be finite and not negative, got {value}")
         if self.saturation == 0.0 or self.peak == 0.0:
-            raise ValueError("motor saturation and peak torque must be > 0, got 0")
+            raise InputError("motor saturation and peak torque must be > 0, got 0")
         if self.no_load_speed <= self.cutoff_speed:
-            raise ValueError(f"no_load_speed must be > cutoff_speed = {self.cutoff_speed}, got {self.no_load_speed}")
+            raise InputError(f"no_load_speed must be > cutoff_speed = {self.cutoff_speed}, got {self.no_load_speed}")
 
 
 @dataclass(frozen=True)
@@ -61,7 +62,7 @@ class MotorCfg:
     def __post_init__(self) -> None:
         """Check the values."""
         if not 0.0 <= self.fade_start < self.fade_end < math.inf:
-            raise ValueError(f"fade_start and fade_end must rise, got {self.fade_start}, {self.fade_end}")
+            raise InputError(f"fade_start and fade_end must rise, got {self.fade_start}, {self.fade_end}")
 
     @classmethod
     def from_description(
@@ -77,7 +78,7 @@ class MotorCfg:
         """
         motors = description.motors
         if len({*motors[0::3]}) > 1 or len({*motors[1::3], *motors[2::3]}) > 1:
-            raise ValueError(f"{description.path}: the lateral motors, and the transversal ones, must be of one type")
+            raise InputError(f"{description.path}: the lateral motors, and the transversal ones, must be of one type")
         return cls(
             lateral=motor_kind(motors[0], gains, lateral_torque),
             transversal=motor_kind(motors[1], gains, transversal_torque),
@@ -121,7 +122,7 @@ def motor_arrays(
     module: `actuator` in either precision. Raises ValueError for less than one world.
     """
     if num_worlds < 1:
-        raise ValueError(f"num_worlds must be >= 1, got {num_worlds}")
+        raise InputError(f"num_worlds must be >= 1, got {num_worlds}")
 
     def spread(lateral: float, transversal: float) -> wp.array:
         column = np.tile([lateral, transversal, transversal], 4)[:, None]
@@ -153,11 +154,11 @@ class LimitsCfg:
     def __post_init__(self) -> None:
         """Check the values."""
         if not -math.inf < self.lower < self.upper < math.inf:
-            raise ValueError(f"limits must be finite and rise, got {self.lower}, {self.upper}")
+            raise InputError(f"limits must be finite and rise, got {self.lower}, {self.upper}")
         if not (self.lower_zone >= 0.0 and self.upper_zone >= 0.0):
-            raise ValueError(f"hard zones must be >= 0, got {self.lower_zone}, {self.upper_zone}")
+            raise InputError(f"hard zones must be >= 0, got {self.lower_zone}, {self.upper_zone}")
         if not self.lower_zone + self.upper_zone <= self.upper - self.lower:
-            raise ValueError(f"hard zones {self.lower_zone}, {self.upper_zone} overlap between the limits")
+            raise InputError(f"hard zones {self.lower_zone}, {self.upper_zone} overlap between the limits")
 
 
 @dataclass(frozen=True)
@@ -177,7 +178,7 @@ class FilterCfg:
         """Check the values."""
         for name in ("horizon", "speed_floor"):
             if not 0.0 < getattr(self, name) < math.inf:
-                raise ValueError(f"filter {name} must be finite and > 0, got {getattr(self, name)}")
+                raise InputError(f"filter {name} must be finite and > 0, got {getattr(self, name)}")
 
 
 def vertical_jump_filter() -> FilterCfg:

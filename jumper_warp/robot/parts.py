@@ -8,6 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
+from jumper_warp.utils.errors import InputError
+
 LEGS = ("FL", "FR", "BL", "BR")
 """Legs in the order of every array: front left, front right, back left, back right."""
 
@@ -15,7 +17,7 @@ MOTOR_JOINTS = tuple(f"{leg}_{joint}" for leg in LEGS for joint in ("lateral", "
 """The 12 motor joints in motor order: index 3 * leg + {0 lateral, 1 outer, 2 inner}."""
 
 
-class RobotDescriptionError(ValueError):
+class RobotDescriptionError(InputError):
     """A robot description that cannot be used. The message is one line: file, part, what was expected."""
 
     def __init__(self, file: Path, part: str, problem: str):

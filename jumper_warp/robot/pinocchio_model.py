@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from jumper_warp.robot.description import LEGS, MOTOR_JOINTS, RobotDescription, load_description
+from jumper_warp.utils.errors import InputError
 
 if TYPE_CHECKING:
     import pinocchio as pin
@@ -65,7 +66,7 @@ class PinocchioRobot:
             q[self.knee_q[2 * leg : 2 * leg + 2]] = self._knees(name, motors[3 * leg + 1], motors[3 * leg + 2])
         gap = self.loop_gap(q)
         if not gap < CLOSED:
-            raise ValueError(f"expected closed loops, found a gap of {gap:.3g} m")
+            raise InputError(f"expected closed loops, found a gap of {gap:.3g} m")
         return q
 
     def loop_gap(self, q: np.ndarray) -> float:
@@ -128,7 +129,7 @@ class PinocchioRobot:
         down = thigh * (math.cos(outer) - math.cos(inner))
         cosine = 0.5 * math.hypot(across, down) / shank
         if not cosine < 1.0:
-            raise ValueError(f"expected knees of {leg} within reach of the shanks, found {2.0 * shank * cosine:.4f} m")
+            raise InputError(f"expected knees of {leg} within reach of the shanks, found {2.0 * shank * cosine:.4f} m")
         base, slope = math.acos(cosine), math.atan2(down, across)
         return outer + 0.5 * math.pi + slope - base, inner + 0.5 * math.pi - slope - base
 

@@ -7,6 +7,7 @@ from typing import Any
 import warp as wp
 
 from jumper_warp.sim.dynamics import JumperDynamics
+from jumper_warp.utils.errors import InputError
 
 
 class DifferentiableStep:
@@ -55,9 +56,9 @@ class DifferentiableStep:
         Raises ValueError if the result would overwrite what the step read, or if there are blocks.
         """
         if q.ptr == q_out.ptr or qd.ptr == qd_out.ptr:
-            raise ValueError("a differentiable step needs its own output state: state_out must not be state_in")
+            raise InputError("a differentiable step needs its own output state: state_out must not be state_in")
         if self._dynamics.robot.ground.blocks.shape[0] > 0:
-            raise ValueError("a step with a moving block is not differentiable")
+            raise InputError("a step with a moving block is not differentiable")
         dyn, n = self._dynamics, self._dynamics.num_worlds
         robot, kernels, adjoint = dyn.robot, dyn.modules.differentiable, dyn.modules.contact_adjoint
         legs = self._fields(kernels.LegArrays, (4, n))

@@ -14,6 +14,7 @@ from jumper_warp.robot.description import LEGS, RobotDescription, load_descripti
 from jumper_warp.robot.grounds import BlockCfg
 from jumper_warp.robot.model import leg_geometry_array
 from jumper_warp.sim.precision import float64_kernels
+from jumper_warp.utils.errors import InputError
 
 LINKS = ("housing", "outer_thigh", "outer_shank", "inner_thigh", "inner_shank")
 JOINTS = ("lateral", "outer", "outer_knee", "inner", "inner_knee")
@@ -24,7 +25,10 @@ KERNEL_MODULES = (
 )  # fmt: skip
 
 
-class NotThisRobotError(ValueError):
+ALONE = "this robot alone, shapes and sites aside"
+
+
+class NotThisRobotError(InputError):
     """A Newton model whose bodies, joints or shapes are not those of this robot."""
 
 
@@ -45,6 +49,9 @@ def check_model(model: newton.Model) -> None:
         raise NotThisRobotError("the model has no worlds; build it with jumper_warp.robot.model.build_model")
     for what, labels, expected in (("body", model.body_label, bodies), ("joint", model.joint_label, joints)):
         found = [label.split("/")[-1] for label in labels]
+        stranger = next((label for label, name in zip(labels, found, strict=True) if name not in expected), None)
+        if stranger is not None and len(found) > count * len(expected):
+            raise NotThisRobotError(f"{what} {stranger!r:.60} cannot be simulated: every world must hold {ALONE}")
         if len(found) != count * len(expected):
             raise NotThisRobotError(
                 f"{count} worlds of this robot have {count * len(expected)} {what} labels, the model has {len(found)}"
@@ -55,6 +62,16 @@ def check_model(model: newton.Model) -> None:
     for name, have, want in (("joint_q", model.joint_coord_count, 43), ("joint_qd", model.joint_dof_count, 38)):
         if have != count * want:
             raise NotThisRobotError(f"{name} must hold {want} values a world, found {have / count:g}")
+    others = {
+        "particles": model.particle_count,
+        "muscles": model.muscle_count,
+        "tendons": model.tendon_count,
+        "mimic joints": np.count_nonzero(model.joint_mimic_joint.numpy() >= 0) + model.constraint_mimic_count,
+        **{name: n for name, n in model.custom_frequency_counts.items() if name.startswith("mujoco:")},
+    }
+    for what, number in others.items():
+        if number > 0:
+            raise NotThisRobotError(f"{number} {what} cannot be simulated: every world must hold {ALONE}")
 
 
 def find_paws(model: newton.Model) -> np.ndarray:

@@ -1,9 +1,15 @@
 """Newton's MuJoCo solver with settings for this robot."""
 
+import math
+
 import newton
 import warp as wp
 
-from jumper_warp.robot.model import PHYSICS_DT
+from jumper_warp.robot.model import PAWS, PHYSICS_DT, other_colliders
+from jumper_warp.utils.errors import InputError
+
+MUJOCO_FRICTION = 0.005
+"""[1] Least friction of the paws on SolverMuJoCo: at 0.001 its pyramidal cone gives NaN in single precision."""
 
 
 def mujoco_solver(model: newton.Model, *, dt: float = PHYSICS_DT, **overrides) -> newton.solvers.SolverMuJoCo:
@@ -12,12 +18,17 @@ def mujoco_solver(model: newton.Model, *, dt: float = PHYSICS_DT, **overrides) -
     It knows neither a damper with a largest torque nor a stop of the sum of two angles. `Simulation` takes the knees'
     damping out of its model and adds both as torques (`kernels.actuation.passive`); here the damping has no cap.
 
-    `overrides` replace settings of `newton.solvers.SolverMuJoCo`.
+    `overrides` replace settings of `newton.solvers.SolverMuJoCo`. Raises ValueError for paws of less friction than it
+    can compute with.
     """
-    heightfield = newton.GeoType.HFIELD in model.shape_type.numpy()
+    paws = [index for index, label in enumerate(model.shape_label) if label.split("/")[-1] in PAWS]
+    friction = model.shape_material_mu.numpy()[paws].min(initial=math.inf)
+    if not friction >= MUJOCO_FRICTION:
+        raise InputError(f"SolverMuJoCo needs paws of friction {MUJOCO_FRICTION:g} or more, got {friction:g}")
+    rich = newton.GeoType.HFIELD in model.shape_type.numpy() or len(other_colliders(model)) > 0
     settings = {
-        "njmax": 128 if heightfield else 64,
-        "nconmax": None if heightfield else 12,  # None: as many as the heightfield may need
+        "njmax": 128 if rich else 64,
+        "nconmax": None if rich else 12,  # None: as many as heightfield and obstacles may need
         "iterations": 6,
         "ls_iterations": 6,
         "cone": "pyramidal",

@@ -138,11 +138,11 @@ class MujocoPhysics:
     def __init__(self, sim: Any, observe_forces: bool) -> None:
         """Make the solver for a simulation's model, whose knee damping it takes over."""
         self._sim, n, device, model = sim, sim.num_worlds, sim.device, sim.model
+        self.dynamics = JumperDynamics(model)  # refuses another robot
         damping = model.joint_damping.numpy().reshape(n, -1)
         damping[:, KNEE_DOFS] = 0.0
         model.joint_damping.assign(damping.ravel())
         self.solver = mujoco_solver(model, dt=sim.dt)
-        self.dynamics = JumperDynamics(model)
         robot = load_description()
         self._passive = [robot.knee_damping, robot.knee_damping_limit, *robot.transversal_sum, *EXPLICIT_STOP]
         self.invalid = wp.zeros(n, dtype=int, device=device)

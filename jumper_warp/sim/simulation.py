@@ -10,10 +10,11 @@ import numpy as np
 import warp as wp
 
 from jumper_warp.robot.grounds import BlockCfg
-from jumper_warp.robot.model import PHYSICS_DT, build_model
+from jumper_warp.robot.model import PHYSICS_DT, Extras, build_model
 from jumper_warp.robot.motors import FilterCfg, MotorCfg, filter_params, jumping_motors, motor_arrays
 from jumper_warp.sim.physics import JumperPhysics, MujocoPhysics, Physics
 from jumper_warp.sim.solver import TOLERANCE, check_step, check_tolerance
+from jumper_warp.utils.errors import InputError
 from kernels.actuation.command_filter import command_filter_kernel
 from kernels.actuation.readout import base_velocity_kernel
 from kernels.dynamics.restore import StateArrays, restore_motors_kernel, restore_state_kernel
@@ -50,6 +51,7 @@ class Simulation:
         tolerance: float = TOLERANCE,
         observe_forces: bool = True,
         visuals: bool = True,
+        extras: Extras | None = None,
         device: wp.DeviceLike = None,
     ):
         """Build the model, solver and motors, the robot standing in the default pose.
@@ -67,19 +69,23 @@ class Simulation:
             tolerance: Of SolverJumper's contact iteration [m/s].
             observe_forces: Whether to measure paw forces on MuJoCo, which costs time; SolverJumper always has them.
             visuals: Whether to add shapes that only viewers see.
+            extras: Adds the caller's own sites and shapes to every world, as in `build_model`.
             device: Warp device.
 
         Raises:
             ValueError: unknown solver, a block on MuJoCo, dt or tolerance not finite and positive, substeps no whole
                 number of at least 1, or as `build_model` and `SolverJumper`.
+            NotThisRobotError: `extras` adds more than sites and shapes.
         """
         if solver not in ("jumper", "mujoco"):
-            raise ValueError(f"solver must be 'jumper' or 'mujoco', got {solver!r}")
+            raise InputError(f"solver must be 'jumper' or 'mujoco', got {solver!r}")
         if solver == "mujoco" and block is not None:
-            raise ValueError("a moving block needs solver='jumper', got 'mujoco'")
+            raise InputError("a moving block needs solver='jumper', got 'mujoco'")
         check_step(dt, substeps)
         check_tolerance(tolerance)
-        self.model = build_model(num_worlds, ground=ground, friction=friction, visuals=visuals, device=device)
+        self.model = build_model(
+            num_worlds, ground=ground, friction=friction, visuals=visuals, extras=extras, device=device
+        )
         self.device = self.model.device
         self.num_worlds = num_worlds
         self.block = block
@@ -89,13 +95,9 @@ class Simulation:
         self._filter = None if command_filter is None else filter_params(command_filter)
         self.state = self.model.state()
         self.control = self.model.control()
-        newton.eval_fk(self.model, self.state.joint_q, self.state.joint_qd, self.state)
         standing = motor_values(self.model.joint_q.numpy().reshape(num_worlds, -1)[:, 7:])
         self._standing = wp.array(standing.T, dtype=float, device=self.device)
         self.target, self._safe_target = wp.clone(self._standing), wp.clone(self._standing)
-        start = self.model.state()
-        start.assign(self.state)
-        self._start = state_arrays(start)
         self._mask = wp.zeros(num_worlds + 1, dtype=wp.bool, device=self.device)  # the last one: no world
         self._base_velocity = wp.zeros(num_worlds, dtype=wp.vec3, device=self.device)
         self._graphs: dict[str, object] = {}
@@ -105,6 +107,10 @@ class Simulation:
         self.solver = self.physics.solver
         self.torque, self.paw_force = self.physics.torque, self.physics.paw_force
         self.peak_force = self.physics.peak_force
+        self.physics.write_bodies()
+        start = self.model.state()
+        start.assign(self.state)
+        self._start = state_arrays(start)
 
     def step(self) -> None:
         """Advance one policy step towards `target`."""
@@ -138,7 +144,7 @@ class Simulation:
         except ValueError:  # lists of different lengths
             kind, shape = "lists", "several lengths"
         if kind not in ("bool", "torch.bool") or shape != (self.num_worlds,):
-            raise ValueError(f"mask must be bool of shape ({self.num_worlds},), got {kind} of shape {shape}")
+            raise InputError(f"mask must be bool of shape ({self.num_worlds},), got {kind} of shape {shape}")
         if of_torch:
             mask = wp.from_torch(mask.contiguous())
         elif isinstance(mask, np.ndarray):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Sequence
 from numbers import Integral
 from typing import Any
@@ -15,8 +16,10 @@ from newton.solvers import SolverBase
 
 from jumper_warp.robot.description import RobotDescription
 from jumper_warp.robot.grounds import BlockCfg
+from jumper_warp.robot.model import other_colliders
 from jumper_warp.sim.differentiable import DifferentiableStep
 from jumper_warp.sim.dynamics import JumperDynamics
+from jumper_warp.utils.errors import InputError
 from kernels.terrain.ground import Ground, rest_block
 
 MAX_SWEEPS = 50
@@ -30,15 +33,26 @@ DIFFERENTIABLE_TOLERANCE = 1.0e-6
 def check_step(dt: float, substeps: int = 1) -> None:
     """Raise ValueError unless dt [s] is finite and above 0 and substeps a whole number of at least 1."""
     if not 0.0 < dt < math.inf:
-        raise ValueError(f"dt must be finite and above 0 [s], got {dt!r}")
+        raise InputError(f"dt must be finite and above 0 [s], got {dt!r}")
     if not isinstance(substeps, Integral) or substeps < 1:
-        raise ValueError(f"substeps must be a whole number of at least 1, got {substeps!r}")
+        raise InputError(f"substeps must be a whole number of at least 1, got {substeps!r}")
 
 
 def check_tolerance(tolerance: float) -> None:
     """Raise ValueError unless the tolerance [m/s] of a contact iteration is finite and above 0."""
     if not 0.0 < tolerance < math.inf:
-        raise ValueError(f"tolerance must be finite and above 0 [m/s], got {tolerance!r}")
+        raise InputError(f"tolerance must be finite and above 0 [m/s], got {tolerance!r}")
+
+
+def warn_of_colliders(model: newton.Model) -> None:
+    """Say which shapes collide in the model but not on SolverJumper."""
+    ignored = other_colliders(model)
+    if len(ignored) > 0:
+        warnings.warn(
+            f"SolverJumper ignores the collisions of {len(ignored)} shapes, such as "
+            f"{model.shape_label[ignored[0]]!r:.60}: only the paws touch, ground and blocks",
+            stacklevel=3,
+        )
 
 
 @wp.kernel(enable_backward=False)
@@ -115,6 +129,9 @@ class SolverJumper(SolverBase):
     With `block`, each world has a block of its own that slides on the floor under the paws that push it. A paw touches
     floor or block, whichever is nearer. Gradients do not go through blocks.
 
+    Shapes of the model other than paws and ground do not collide; a warning names the first that would. Sites and
+    shapes that do not collide serve sensors and viewers.
+
     A world that becomes non-finite is flagged in `invalid`, parked at rest in the model's reference pose and left
     there until `reset` clears it.
     """
@@ -133,15 +150,16 @@ class SolverJumper(SolverBase):
         """Prepare for a model of `jumper_warp.robot.model.build_model`.
 
         Raises:
-            NotThisRobotError: the model is another robot's.
+            NotThisRobotError: the model is another robot's, or holds more bodies, joints or particles than it.
             ValueError: `max_sweeps` below 1, `tolerance` [m/s] not finite and positive, or arrays of `block` that do
                 not have one row per world.
         """
         super().__init__(model)
         if max_sweeps < 1:
-            raise ValueError(f"max_sweeps must be at least 1, got {max_sweeps}")
+            raise InputError(f"max_sweeps must be at least 1, got {max_sweeps}")
         check_tolerance(tolerance)
         self.dynamics = JumperDynamics(model, description=description, block=block)
+        warn_of_colliders(model)
         self.max_sweeps = max_sweeps
         self.tolerance = tolerance
         self._differentiable = DifferentiableStep(self.dynamics, max_sweeps, min(tolerance, DIFFERENTIABLE_TOLERANCE))
@@ -257,7 +275,7 @@ class SolverJumper(SolverBase):
         out = (state_out.joint_q, state_out.joint_qd)
         if state_out.joint_q.requires_grad:
             if drive.closed_loop or substeps != 1:
-                raise ValueError("step_motors is not differentiable; see jumper_warp.optim.rollout")
+                raise InputError("step_motors is not differentiable; see jumper_warp.optim.rollout")
             self._differentiable.step(*coordinates, drive.joint_f, drive.body_f, *out, dt)
         else:
             settings = self.dynamics.settings(dt, substeps, self.max_sweeps, self.tolerance)
@@ -308,7 +326,7 @@ class SolverJumper(SolverBase):
         """Return the kernels' `Block` of every world. Raises ValueError without blocks."""
         blocks = self.dynamics.robot.ground.blocks
         if blocks.shape[0] == 0:
-            raise ValueError("the solver was made without a block")
+            raise InputError("the solver was made without a block")
         return blocks
 
     def notify_model_changed(self, flags: ModelFlags | int) -> None:

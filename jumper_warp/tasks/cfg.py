@@ -22,6 +22,7 @@ from jumper_warp.tasks.terms import (
     Term,
     TerminationTerm,
 )
+from jumper_warp.utils.errors import InputError
 from kernels.mdp.env import Nothing
 from kernels.mdp.terminations import came_apart
 
@@ -53,7 +54,7 @@ class Command:
     def __post_init__(self) -> None:
         """Raises ValueError: one of due and draw is missing."""
         if (self.due is None) != (self.draw is None):
-            raise ValueError("a command needs both due and draw, or neither")
+            raise InputError("a command needs both due and draw, or neither")
 
 
 @dataclass(frozen=True)
@@ -98,27 +99,27 @@ class TaskCfg:
         for section in ("rewards", "terminations", *self.groups, "events"):
             names = [term.name for term in getattr(self, section)]
             if len(set(names)) < len(names):
-                raise ValueError(f"every term of {self.name}'s {section} needs a name of its own, got {names}")
+                raise InputError(f"every term of {self.name}'s {section} needs a name of its own, got {names}")
         for section, rows in self.rows.items():
             for row in rows:
                 if row.term.of_state not in (Any, self.state):
-                    raise ValueError(
+                    raise InputError(
                         f"{self.name} {section}: {row.term.name} is for {row.term.of_state.key}, not {self.state.key}"
                     )
         self._check_functions()
         if came_apart not in [term.func for term in self.terminations]:
-            raise ValueError(f"{self.name} needs the termination came_apart, for worlds whose state is no longer one")
+            raise InputError(f"{self.name} needs the termination came_apart, for worlds whose state is no longer one")
         if not all(0.0 < scale < math.inf for scale in self.action_scale):
-            raise ValueError(f"{self.name}: action_scale must be positive and finite [deg], got {self.action_scale}")
+            raise InputError(f"{self.name}: action_scale must be positive and finite [deg], got {self.action_scale}")
         if not 0.0 <= self.contact_force < math.inf:
-            raise ValueError(f"{self.name}: contact_force must be finite and >= 0, got {self.contact_force}")
+            raise InputError(f"{self.name}: contact_force must be finite and >= 0, got {self.contact_force}")
         if self.reward_floor is not None and not math.isfinite(self.reward_floor):
-            raise ValueError(f"{self.name}: reward_floor must be finite or None, got {self.reward_floor}")
+            raise InputError(f"{self.name}: reward_floor must be finite or None, got {self.reward_floor}")
 
     def _check_functions(self) -> None:
         """Raises ValueError: a function outside the tables takes other structs than those of this task."""
         if len({level.struct for level in self.levels}) > 1:
-            raise ValueError(f"{self.name}: all levels must be of one kind")
+            raise InputError(f"{self.name}: all levels must be of one kind")
         state, level = self.state, self.level_type
         expected = {
             "reset": (self.reset.func, {3: state, 4: self.settings_type, 5: level}),
@@ -133,7 +134,7 @@ class TaskCfg:
                 kind = found[place] if len(found) > place else None
                 if kind not in (Any, struct):
                     takes = getattr(kind, "key", kind)
-                    raise ValueError(
+                    raise InputError(
                         f"{self.name} {where}: argument {place + 1} of {func.key} is {takes}, the task has {struct.key}"
                     )
 
@@ -164,7 +165,7 @@ class TaskCfg:
         for row in self.rows.get(section, ()):
             if row.term.name == name and key in row.term.numbers:
                 return row.first + list(row.term.numbers).index(key)
-        raise ValueError(f"{self.name} has no {key!r} of a {section} term {name!r}")
+        raise InputError(f"{self.name} has no {key!r} of a {section} term {name!r}")
 
     def layout(self, group: str) -> dict[str, tuple[int, int]]:
         """Return the columns of an observation group, (first, end) by the name of the term."""
@@ -202,7 +203,7 @@ class TaskCfg:
         terms: tuple[Term, ...] = getattr(self, section)
         unknown = set(changes) - {term.name for term in terms}
         if unknown:
-            raise ValueError(f"{self.name} has no {section} term {sorted(unknown)[0]!r}")
+            raise InputError(f"{self.name} has no {section} term {sorted(unknown)[0]!r}")
         return replace(self, **{section: tuple(term.replace(**changes.get(term.name, {})) for term in terms)})
 
     def without_noise(self) -> TaskCfg:

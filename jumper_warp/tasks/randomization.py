@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 from jumper_warp.tasks.terms import EventTerm
+from jumper_warp.utils.errors import InputError
 from kernels.mdp import parameters
 
 Range = tuple[float, float] | None
@@ -63,13 +64,13 @@ class RandomizationCfg:
         """Raises ValueError: a range is not one."""
         for name, value in vars(self).items():
             if isinstance(value, tuple) and not (-math.inf < value[0] <= value[1] < math.inf):
-                raise ValueError(f"randomisation range {name} must be finite and rise, got {value}")
+                raise InputError(f"randomisation range {name} must be finite and rise, got {value}")
         for name in ("latency", "observation_latency"):
             value = getattr(self, name)
             if value is not None and not 0.0 <= value[0] <= value[1] <= LONGEST_LATENCY:
-                raise ValueError(f"randomisation range {name} must be in 0 to {LONGEST_LATENCY:g} ms, got {value}")
+                raise InputError(f"randomisation range {name} must be in 0 to {LONGEST_LATENCY:g} ms, got {value}")
         if not 0.0 <= self.push_share <= 1.0:
-            raise ValueError(f"randomisation push_share must be in [0, 1], got {self.push_share}")
+            raise InputError(f"randomisation push_share must be in [0, 1], got {self.push_share}")
 
     @classmethod
     def off(cls) -> RandomizationCfg:

@@ -150,7 +150,6 @@ def task_from_json(saved: Any, modules: Iterable[ModuleType] = (), *, leave_out:
     try:
         task = _build(TaskCfg, content, "task", Finder(modules))
         _check_kernels_types(task)
-        task.rows  # noqa: B018 (builds the events of the randomisation, which may refuse their numbers)
     except TaskError:
         raise
     except (ValueError, TypeError, KeyError, AttributeError, ArithmeticError, NameError) as error:

@@ -12,6 +12,7 @@ from typing import Any, ClassVar, NamedTuple, get_type_hints
 
 import warp as wp
 
+from jumper_warp.utils.errors import InputError
 from kernels.mdp.events import AT_RESET, AT_STEP, MODES
 from kernels.mdp.parameters import RobotParameters
 from kernels.mdp.view import RobotView
@@ -48,28 +49,28 @@ class Term:
         """
         kind = type(self).__name__
         if not isinstance(func, wp.Function):
-            raise ValueError(f"{kind}: {func!r:.60} is not a @wp.func")
+            raise InputError(f"{kind}: {func!r:.60} is not a @wp.func")
         self.func, self.name = func, name or func.key.split(".")[-1]
         where = f"{kind} {self.name}"
         self._check_types(where)
         params = list(inspect.signature(func.func).parameters.values())[self.context :]
         known = self.settings | {p.name: p.default for p in params}
         if len(known) < len(self.settings) + len(params) or set(known) & {"func", "name", *self.options}:
-            raise ValueError(
+            raise InputError(
                 f"{where}: a parameter has the name of a setting, one of {[*self.settings, *self.options]}"
             )
         for p in params:
             if func.input_types.get(p.name) not in (float, wp.float32):
-                raise ValueError(f"{where}: parameter {p.name!r} must be annotated float")
+                raise InputError(f"{where}: parameter {p.name!r} must be annotated float")
         for key in given:
             if key not in known and key not in self.options:
-                raise ValueError(f"{where}: unknown parameter {key!r}; it has {[*known, *self.options]}")
+                raise InputError(f"{where}: unknown parameter {key!r}; it has {[*known, *self.options]}")
         self.numbers = {key: given.get(key, default) for key, default in known.items()}
         for key, value in self.numbers.items():
             if value is REQUIRED:
-                raise ValueError(f"{where}: parameter {key!r} is missing")
+                raise InputError(f"{where}: parameter {key!r} is missing")
             if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-                raise ValueError(f"{where}: parameter {key!r} must be a finite number, got {value!r:.60}")
+                raise InputError(f"{where}: parameter {key!r} must be a finite number, got {value!r:.60}")
         self.options = {key: given.get(key, default) for key, default in type(self).options.items()}
         self.num_params = len(params)
 
@@ -78,10 +79,10 @@ class Term:
         first = next(iter(self.func.input_types.values()), None)
         if first is not Any and first not in self.takes:
             takes = " or ".join(kind.key for kind in self.takes)
-            raise ValueError(f"{where}: the first argument of the function must be annotated {takes}")
+            raise InputError(f"{where}: the first argument of the function must be annotated {takes}")
         returned = get_type_hints(self.func.func).get("return")
         if self.returns and returned is not None and returned not in self.returns:
-            raise ValueError(f"{where}: the function must return {self.returns[0].__name__}, it returns {returned}")
+            raise InputError(f"{where}: the function must return {self.returns[0].__name__}, it returns {returned}")
 
     def replace(self, **changes: Any) -> Any:
         """Return the term with other numbers or options; raises ValueError as the constructor."""
@@ -147,9 +148,9 @@ class ObservationTerm(Term):
         super().__init__(func, **given)
         history = self.options["history"]
         if not isinstance(history, int) or history < 1:
-            raise ValueError(f"ObservationTerm {self.name}: history must be at least 1, got {history!r:.40}")
+            raise InputError(f"ObservationTerm {self.name}: history must be at least 1, got {history!r:.40}")
         if self.numbers["noise"] < 0.0 or self.numbers["clip"] <= 0.0:
-            raise ValueError(f"ObservationTerm {self.name}: noise must not be negative and clip must be positive")
+            raise InputError(f"ObservationTerm {self.name}: noise must not be negative and clip must be positive")
 
     @property
     def width(self) -> int:
@@ -185,9 +186,9 @@ class EventTerm(Term):
         super().__init__(func, **given)
         mode, least, most = self.options["mode"], self.numbers["least"], self.numbers["most"]
         if mode not in ("startup", "reset", "interval"):
-            raise ValueError(f"EventTerm {self.name}: mode must be startup, reset or interval, got {mode!r:.40}")
+            raise InputError(f"EventTerm {self.name}: mode must be startup, reset or interval, got {mode!r:.40}")
         if mode == "interval" and not 0.0 < least <= most:
-            raise ValueError(f"EventTerm {self.name}: an interval needs 0 < least <= most [s], got {least}, {most}")
+            raise InputError(f"EventTerm {self.name}: an interval needs 0 < least <= most [s], got {least}, {most}")
 
     def due_at(self, stage: int) -> bool:
         """Return whether it may be due at a stage of `kernels.mdp.events`."""
@@ -213,9 +214,9 @@ class Curriculum(Term):
     def __init__(self, func: wp.Function, **given: Any) -> None:
         super().__init__(func, **given)
         if not isinstance(self.options["counts"], wp.Function):
-            raise ValueError(f"Curriculum {self.name}: counts must be a @wp.func (task) -> bool")
+            raise InputError(f"Curriculum {self.name}: counts must be a @wp.func (task) -> bool")
         if self.numbers["tolerance"] < 0.0 or self.numbers["promote_after"] < 1:
-            raise ValueError(f"Curriculum {self.name}: tolerance must not be negative, promote_after at least 1")
+            raise InputError(f"Curriculum {self.name}: tolerance must not be negative, promote_after at least 1")
 
 
 class Row(NamedTuple):

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.runtime import device_info, git_commit, versions
 
 Scalar = float | int | str | bool | None
@@ -29,7 +30,7 @@ def output_dir(name: str, out: Path | None = None) -> Path:
         FileExistsError: `out` is a file.
     """
     if name in ("", "..") or Path(name).name != name:
-        raise ValueError(f"an experiment name is one path component, got {name!r}")
+        raise InputError(f"an experiment name is one path component, got {name!r}")
     if out is not None:
         out.mkdir(parents=True, exist_ok=True)
         return out
@@ -86,7 +87,7 @@ def _plain_scalar(name: str, value: Any) -> Scalar:
         kind = type(value).__name__
         raise TypeError(f"figure {name!r} must be a number, string, bool, None or flat list, got {kind}")
     if isinstance(value, float) and not math.isfinite(value):
-        raise ValueError(f"figure {name!r} is {value}: only finite numbers are reported")
+        raise InputError(f"figure {name!r} is {value}: only finite numbers are reported")
     return value
 
 

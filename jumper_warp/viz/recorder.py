@@ -8,6 +8,7 @@ import newton
 import numpy as np
 import warp as wp
 
+from jumper_warp.utils.errors import InputError
 from jumper_warp.viz.recording import SERIES_NAME, Recording
 from jumper_warp.viz.rerun import write_rrd
 from jumper_warp.viz.shapes import ShapeMesh, shape_meshes
@@ -46,7 +47,7 @@ class Recorder:
         world_of_body = model.body_world.numpy()
         for world in worlds:
             if world not in world_of_body:
-                raise ValueError(f"world {world} has no bodies: the model has {model.world_count} worlds")
+                raise InputError(f"world {world} has no bodies: the model has {model.world_count} worlds")
         self._worlds = tuple(worlds)
         self._spacing = spacing
         self._body_count = model.body_count
@@ -85,10 +86,10 @@ class Recorder:
             ValueError: Time does not increase, a shape is wrong, or a name is malformed, new or missing.
         """
         if self._times and not time > self._times[-1]:
-            raise ValueError(f"time must increase, got {time} s after {self._times[-1]} s")
+            raise InputError(f"time must increase, got {time} s after {self._times[-1]} s")
         poses = np.asarray(body_poses.numpy() if isinstance(body_poses, wp.array) else body_poses, dtype=np.float32)
         if poses.shape != (self._body_count, 7):
-            raise ValueError(f"body_poses must have shape ({self._body_count}, 7), got {poses.shape}")
+            raise InputError(f"body_poses must have shape ({self._body_count}, 7), got {poses.shape}")
         contacts = self._checked_contacts(contact_points, contact_forces)
         self._append_series({} if series is None else series)
         self._times.append(float(time))
@@ -100,29 +101,29 @@ class Recorder:
         if self._series is None:
             malformed = [name for name in series if not SERIES_NAME.fullmatch(name)]
             if malformed:
-                raise ValueError(f"series are named 'group/quantity [unit]', got {malformed[0]!r}")
+                raise InputError(f"series are named 'group/quantity [unit]', got {malformed[0]!r}")
             self._series = {name: [] for name in series}
         different = set(values) ^ set(self._series)
         if different:
-            raise ValueError(f"every frame needs the same series; new or missing: {sorted(different)}")
+            raise InputError(f"every frame needs the same series; new or missing: {sorted(different)}")
         for name, value in values.items():
             self._series[name].append(value)
 
     def _checked_contacts(self, points: np.ndarray | None, forces: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
         """Return copies of a frame's contacts, (num_worlds, contacts_per_world, 3) each."""
         if (points is None) != (forces is None):
-            raise ValueError("contact_points and contact_forces come together")
+            raise InputError("contact_points and contact_forces come together")
         if points is None:
             points = forces = np.zeros((len(self._worlds), 0, 3))
         points, forces = (np.array(given, dtype=np.float32) for given in (points, forces))
         if points.ndim == 2 and len(self._worlds) == 1:
             points, forces = points[None], forces[None]
         if points.ndim != 3 or points.shape[::2] != (len(self._worlds), 3) or forces.shape != points.shape:
-            raise ValueError(
+            raise InputError(
                 f"contacts must have shape ({len(self._worlds)}, n, 3), got {points.shape}, {forces.shape}"
             )
         if self._contacts and self._contacts[0][0].shape != points.shape:
-            raise ValueError(f"every frame needs contacts of shape {self._contacts[0][0].shape}, got {points.shape}")
+            raise InputError(f"every frame needs contacts of shape {self._contacts[0][0].shape}, got {points.shape}")
         return points, forces
 
     def recording(self) -> Recording:
@@ -132,7 +133,7 @@ class Recorder:
             ValueError: There is no frame.
         """
         if not self._times:
-            raise ValueError("nothing was recorded")
+            raise InputError("nothing was recorded")
         return Recording(
             times=np.array(self._times),
             worlds=self._worlds,

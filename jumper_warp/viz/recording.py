@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from jumper_warp.utils.errors import InputError
 from jumper_warp.viz.shapes import ShapeMesh
 
 FORMAT = "jumper-warp recording"
@@ -23,7 +24,7 @@ SERIES_NAME = re.compile(r"[^/\[\]]+/[^/\[\]]+ \[[^\[\]]+\]")
 """Names of series: `group/quantity [unit]`, with 1 as the unit of a pure number."""
 
 
-class RecordingError(ValueError):
+class RecordingError(InputError):
     """A file that is not a recording, or not a whole one. The message is one line and names the file."""
 
 

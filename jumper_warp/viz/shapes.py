@@ -7,6 +7,8 @@ import numpy as np
 import trimesh
 from newton import GeoType
 
+from jumper_warp.utils.errors import InputError
+
 PLANE_EXTENT = 10.0
 """Half the side of the patch drawn for an infinite plane [m]."""
 CHECKER_CELL = 0.5
@@ -74,7 +76,7 @@ def _surface(kind: GeoType, scale: np.ndarray, source: object, label: str) -> tr
         return trimesh.Trimesh(np.asarray(source.vertices) * scale, np.asarray(source.indices).reshape(-1, 3))
     if kind == GeoType.HFIELD:
         return _heightfield(source, scale)
-    raise ValueError(f"shape {label!r} is a {kind.name}, which cannot be drawn")
+    raise InputError(f"shape {label!r} is a {kind.name}, which cannot be drawn")
 
 
 def _heightfield(field: newton.Heightfield, scale: np.ndarray) -> trimesh.Trimesh:

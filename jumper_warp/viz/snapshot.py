@@ -11,6 +11,8 @@ import numpy as np
 import warp as wp
 from newton.sensors import SensorCamera
 
+from jumper_warp.utils.errors import InputError
+
 EYE = (1.1, 1.4, 0.6)
 """Default position of the eye [m], world frame: ahead of the robot, on its left."""
 TARGET = (0.0, 0.0, 0.25)
@@ -53,7 +55,7 @@ class Camera:
             ValueError: Eye and target coincide or lie on one vertical, or the model has no such world.
         """
         if not 0 <= world < model.world_count:
-            raise ValueError(f"world {world} is outside the model's {model.world_count} worlds")
+            raise InputError(f"world {world} is outside the model's {model.world_count} worlds")
         self._model = model
         self._sensor = SensorCamera(model)
         self._sensor.create_default_light(direction=wp.normalize(wp.vec3(*LIGHT_DIRECTION)))
@@ -84,7 +86,7 @@ def look_at(eye: Sequence[float], target: Sequence[float]) -> wp.transformf:
     ahead = np.asarray(target, dtype=float) - np.asarray(eye, dtype=float)
     right = np.cross(ahead, [0.0, 0.0, 1.0])
     if np.linalg.norm(right) < 1.0e-6 * max(1.0, float(np.linalg.norm(ahead))):
-        raise ValueError(f"cannot look from {tuple(eye)} to {tuple(target)}: no horizontal distance")
+        raise InputError(f"cannot look from {tuple(eye)} to {tuple(target)}: no horizontal distance")
     ahead /= np.linalg.norm(ahead)
     right /= np.linalg.norm(right)
     axes = np.stack([right, np.cross(right, ahead), -ahead], axis=1)
@@ -119,10 +121,10 @@ def contact_sheet(
         ValueError: No pictures, unequal sizes, or another number of captions.
     """
     if not pictures or len({picture.shape for picture in pictures}) != 1:
-        raise ValueError("a contact sheet needs pictures, all of one size")
+        raise InputError("a contact sheet needs pictures, all of one size")
     captions = [""] * len(pictures) if captions is None else captions
     if len(captions) != len(pictures):
-        raise ValueError(f"{len(pictures)} pictures have {len(captions)} captions")
+        raise InputError(f"{len(pictures)} pictures have {len(captions)} captions")
     columns = len(pictures) if columns is None else columns
     rows = -(-len(pictures) // columns)
     height, width, _ = pictures[0].shape

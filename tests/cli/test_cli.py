@@ -5,23 +5,38 @@ import sys
 
 import numpy as np
 import pytest
+from hold_height import hold_height
 from landing_helpers import still_policy
 from rerun.chunk import RrdReader
 
 from jumper_warp.cli import main as cli
-from jumper_warp.cli.evaluate import EvaluateCfg, HeightFlags, PlaceFlags
-from jumper_warp.cli.play import HeightGoals, PlaceGoals, PlayCfg, viewer_command
-from jumper_warp.cli.task_flags import TaskFlags
-from jumper_warp.cli.train import parse_train
+from jumper_warp.cli.task_flags import flag_name, flags_of, with_flags
+from jumper_warp.cli.train import TrainArgs, parse_settings, parse_train
+from jumper_warp.envs.env import Env
+from jumper_warp.evaluation.commands import PlayCfg, viewer_command
+from jumper_warp.evaluation.heights import HeightFlags, HeightGoals
+from jumper_warp.evaluation.places import PlaceFlags, PlaceGoals
 from jumper_warp.policies.folder import load_policy, save_policy
 from jumper_warp.policies.restore import open_policy, restored_task
 from jumper_warp.policies.spec import PolicyError
-from jumper_warp.registry import make_task
+from jumper_warp.registry import TASKS, make_task
 from jumper_warp.rl.checkpoint import CheckpointError
+from jumper_warp.rl.ppo import PpoCfg
 from jumper_warp.tasks.cfg import TaskCfg
+from jumper_warp.utils.errors import InputError
 
 TRAIN = ["train", "vertical-jump", "--num-envs", "16", "--iterations", "2", "--no-tensorboard", "--device", "cpu"]
-TRAIN += ["--ppo.num-steps", "4", "--ppo.minibatches", "2", "--ppo.hidden", "16", "8", "--env.games", "2"]
+TRAIN += [
+    "--ppo.num-steps",
+    "4",
+    "--ppo.minibatches",
+    "2",
+    "--ppo.hidden",
+    "16",
+    "8",
+    "--env.curriculum.promote-after",
+    "2",
+]
 
 
 def run(capsys, *args):
@@ -53,15 +68,37 @@ def still(tmp_path_factory):
     return str(folder)
 
 
-def test_help_imports_nothing_heavy():
+HEAVY = ("torch", "newton", "pinocchio", "rerun", "matplotlib", "scipy", "onnx")
+
+
+@pytest.mark.parametrize(
+    ("args", "none_of"),
+    [
+        (["--help"], (*HEAVY, "warp", "numpy", "tyro")),
+        (["train"], (*HEAVY, "warp")),
+        (["train", "--help"], (*HEAVY, "warp")),
+        (["train", "vertical-jump", "--help"], HEAVY),
+        (["play", "--help"], (*HEAVY, "warp", "numpy")),
+        (["evaluate", "--help"], (*HEAVY, "warp", "numpy")),
+        (["export", "--help"], (*HEAVY, "warp")),
+        (["list", "--help"], (*HEAVY, "warp")),
+    ],
+    ids=" ".join,
+)
+def test_help_imports_nothing_heavy(args, none_of):
     code = (
         "import sys; from jumper_warp.cli.main import main\n"
-        "try: main(['--help'])\n"
-        "except SystemExit as end: print(end.code, [m for m in ('torch', 'warp', 'newton') if m in sys.modules])"
+        f"try: main({args})\n"
+        f"except SystemExit as end: print(end.code, [m for m in {none_of} if m in sys.modules])"
     )
-    answer = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
-    assert answer.splitlines()[-1] == "0 []"
-    assert all(f"  {command} " in answer for command in ("train", "play", "evaluate", "export", "list"))
+    answer = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert answer.stdout.splitlines()[-1] == f"{2 if args == ['train'] else 0} []"
+
+
+def test_help_names_every_command_and_the_flag_for_tasks_of_ones_own(capsys):
+    code, out, _ = run(capsys, "--help")
+    assert code == 0 and "--task-module FILE_OR_MODULE" in out
+    assert all(f"  {command} " in out for command in ("train", "play", "evaluate", "export", "list"))
 
 
 @pytest.mark.parametrize(
@@ -70,7 +107,7 @@ def test_help_imports_nothing_heavy():
 def test_every_command_has_help(capsys, command):
     code, out, _ = run(capsys, *command, "--help")
     assert code == 0
-    assert "usage: jumper" in out
+    assert "usage: jumper" in out and "--task-module FILE_OR_MODULE" in out
 
 
 @pytest.mark.parametrize(
@@ -80,7 +117,16 @@ def test_every_command_has_help(capsys, command):
         (["train", "swim"], "unknown task 'swim'; there are vertical-jump"),
         (["train", "--iterations", "3"], "the task comes first"),
         ([*TRAIN, "--task", "other"], "give the task once"),
-        ([*TRAIN, "--env.weights.jump-height", "nan"], "weight of jump_height must be finite"),
+        (
+            [*TRAIN, "--env.rewards.jump-height.weight", "nan"],
+            "jump_height: parameter 'weight' must be a finite number",
+        ),
+        ([*TRAIN, "--env.terminations.tilted.angle", "inf"], "tilted: parameter 'angle' must be a finite number"),
+        (["list", "--task-module"], "--task-module needs a FILE.py or the name of a module"),
+        (["list", "--task-module="], "--task-module needs a FILE.py or the name of a module"),
+        (["train", "--task-module", "--iterations", "3"], "--task-module needs a FILE.py"),
+        (["list", "--task-module", "missing.py"], "no file 'missing.py'"),
+        (["play", "vertical_jump", "--task-module", "not_a_module"], "no module 'not_a_module'"),
         ([*TRAIN, "--device", "abacus"], "no device 'abacus'"),
         (["play", "missing"], "no policy 'missing'"),
         (["evaluate", "missing"], "no policy 'missing'"),
@@ -95,72 +141,211 @@ def test_unusable_input_is_one_line_and_code_2(capsys, tmp_path, monkeypatch, ar
 
 
 def test_bare_command_shows_usage_with_code_2(capsys):
-    code, out, _ = run(capsys)
-    assert code == 2 and out.startswith("usage: jumper COMMAND")
+    code, out, err = run(capsys)
+    assert (code, out) == (2, "") and err[0].startswith("usage: jumper COMMAND")
 
 
-def test_fault_inside_a_library_is_not_hidden(monkeypatch):
-    monkeypatch.setitem(cli.COMMANDS, "list", lambda args: np.zeros(3).reshape(2))
-    with pytest.raises(ValueError, match="cannot reshape"):
+def test_training_of_nothing_shows_usage_and_the_tasks_with_code_2(capsys):
+    code, out, err = run(capsys, "train")
+    assert (code, out) == (2, "") and err[0] == "usage: jumper train TASK [flags]"
+    assert all(name in "\n".join(err) for name in TASKS)
+
+
+@pytest.mark.parametrize(
+    "fault",
+    [
+        lambda *_: np.zeros(3).reshape(2),  # ValueError of a library
+        lambda *_: json.loads("{"),
+        lambda *_: {}["missing"],
+        lambda *_: (_ for _ in ()).throw(OSError("no file of ours")),
+    ],
+)
+def test_fault_inside_a_library_is_not_hidden(monkeypatch, fault):
+    monkeypatch.setattr("jumper_warp.cli.list.run", fault)
+    with pytest.raises((ValueError, KeyError, OSError)):
         cli.main(["list"])
 
 
+def test_refusal_is_told_by_its_type_wherever_it_was_raised(capsys, monkeypatch):
+    def refuse(*_):
+        raise InputError("expected a,\n  got b")
+
+    monkeypatch.setattr("jumper_warp.cli.list.run", refuse)
+    assert run(capsys, "list") == (2, "", ["jumper: expected a, got b"])
+
+
+def test_file_that_is_missing_is_one_line(capsys, monkeypatch):
+    monkeypatch.setattr("jumper_warp.cli.list.run", lambda *_: open("/no/such/file"))
+    code, _, err = run(capsys, "list")
+    assert code == 2 and len(err) == 1 and "'/no/such/file'" in err[0]
+
+
 def test_interrupt_exits_with_130(capsys, monkeypatch):
-    def interrupted(args):
+    def interrupted(*_):
         raise KeyboardInterrupt
 
-    monkeypatch.setitem(cli.COMMANDS, "list", interrupted)
+    monkeypatch.setattr("jumper_warp.cli.list.run", interrupted)
     assert run(capsys, "list")[0] == 130
 
 
 # ---------------------------------------------------------------------- flags
 
 
-def test_every_setting_of_a_task_has_a_flag():
-    flags = {spec.name for spec in dataclasses.fields(TaskFlags)}
-    code = {"name", "observe", "columns", "error", "ppo"}  # those of PPO are --ppo flags
-    tables = {"terms", "rules"}
-    assert {spec.name for spec in dataclasses.fields(TaskCfg)} - code - tables == flags - {
-        "weights", "term_params", "rule_params",
+def flag_of(section, term, key):
+    """Flag of a number of a term."""
+    middle = "" if section in ("advance", "curriculum") else f".{flag_name(term)}"
+    return f"--env.{section}{middle}.{flag_name(key)}"
+
+
+@pytest.mark.parametrize("name", ["vertical-jump", "horizontal-jump", "hold-height"])
+def test_every_number_of_every_term_has_a_flag_that_reaches_the_kernels(name):
+    task = hold_height() if name == "hold-height" else make_task(name)
+    own_events = {term.name for term in task.events}
+    args, expected = [], {}
+    for section, rows in task.rows.items():
+        for row in rows:
+            if section == "events" and row.term.name not in own_events:
+                continue  # of the randomisation, which has flags of its own
+            for key, value in row.term.numbers.items():
+                changed = value + (0.0 if key == "most" else 1.0)
+                args += [flag_of(section, row.term.name, key), f"{changed:g}" if changed % 1 == 0 else repr(changed)]
+                expected[section, row.term.name, key] = changed
+    changed_task = parsed(task, args)
+    for (section, term, key), value in expected.items():
+        assert changed_task.numbers[changed_task.place(section, term, key)] == value, (section, term, key)
+    assert len(expected) + sum(
+        len(r.term.numbers) for r in task.rows["events"] if r.term.name not in own_events
+    ) == len(task.numbers)
+
+
+def parsed(task, args):
+    """Task with the flags of a command line."""
+    return with_flags(task, parse_settings(task, TrainArgs(), args).env)
+
+
+def leaves(value, path=""):
+    """Every number, and the flag that it should have, of settings that are no terms."""
+    if dataclasses.is_dataclass(value):
+        for spec in dataclasses.fields(value):
+            yield from leaves(getattr(value, spec.name), f"{path}.{flag_name(spec.name)}")
+    elif isinstance(value, tuple) and value and dataclasses.is_dataclass(value[0]):
+        for i, each in enumerate(value):
+            yield from leaves(each, f"{path}.{i}")
+    else:
+        yield f"--env{path}", value
+
+
+@pytest.mark.parametrize("name", ["horizontal-jump", "hold-height"])
+def test_every_other_setting_has_a_flag(name):
+    task = hold_height() if name == "hold-height" else make_task(name)
+    parts = {
+        "reset": task.reset.settings, "levels": task.levels, "motors": task.motors, "randomization": task.randomization,
+        "command-filter": task.command_filter, "action-scale": task.action_scale, "contact-force": task.contact_force,
+        "reward-floor": task.reward_floor,
     }  # fmt: skip
+    found = dict(leaf for part, value in parts.items() for leaf in leaves(value, f".{part}"))
+    args = []
+    for flag, value in found.items():
+        if isinstance(value, bool):
+            args.append(flag if value else f"{flag[: flag.rindex('.') + 1]}no-{flag[flag.rindex('.') + 1 :]}")
+        else:
+            args += [flag, *(map(str, value) if isinstance(value, tuple) else [str(value)])]
+    assert parsed(task, args) == task and len(found) > 40
 
 
-def test_flags_left_alone_leave_the_task_alone():
-    task = make_task("vertical-jump")
-    assert TaskFlags.of(task).apply(task) == task
+def test_fields_of_a_task_without_a_flag_are_its_code_and_its_names():
+    flags = {spec.metadata["flag"] for spec in dataclasses.fields(flags_of(hold_height()))}
+    names = {flag_name(spec.name) for spec in dataclasses.fields(TaskCfg)}
+    assert names - flags == {"name", "state", "command", "evaluation"} and not flags - names
+
+
+@pytest.mark.parametrize("name", ["vertical-jump", "horizontal-jump", "omnidirectional-jump", "hold-height"])
+def test_flags_left_alone_leave_the_task_alone(name):
+    task = hold_height() if name == "hold-height" else make_task(name)
+    assert with_flags(task, flags_of(task)) == task == parsed(task, [])
 
 
 def test_flags_change_training_and_task():
     flags = (
-        "--env.weights.jump-height 25 --env.term-params.jump-height 0.2 0.1 0.3 --env.rule-params.wrong-height 0.07 "
-        "--env.reset.standing 0.5 --ppo.gamma 0.9 --env.randomization.latency None --no-noise --solver mujoco"
+        "--env.rewards.jump-height.weight 25 --env.rewards.jump-height.fine 0.2"
+        " --env.terminations.wrong-height.tolerance 0.07 --env.policy.lin-vel.noise 0.3 --env.policy.gravity.history 2 --env.advance.takeoff-speed 0.5"
+        " --env.curriculum.tolerance 0.05 --env.curriculum.promote-after 7 --env.reset.standing 0.5"
+        " --env.reset.ground.drop 0.1 0.2 --env.levels.1.jump-again 0.5 --env.motors.lateral.kp 11"
+        " --env.command-filter.sum.upper 200 --env.randomization.latency None --env.action-scale 10 80"
+        " --env.contact-force 0.2 --env.reward-floor None --ppo.gamma 0.9 --no-noise --solver mujoco"
     )
     args, task = parse_train(["Olympus-Vertical-Jump", *flags.split()])
-    assert (task.terms[0].weight, task.terms[0].params) == (25.0, (0.2, 0.1, 0.3))
-    assert {rule.name: rule.params for rule in task.rules}["wrong_height"] == (0.07,)
-    assert task.reset.standing == 0.5 and task.randomization.latency is None
+    assert task.rewards[0].numbers == {"weight": 25.0, "fine": 0.2, "sharp": 0.05, "wide": 0.4}
+    assert {end.name: end.numbers for end in task.terminations}["wrong_height"] == {"tolerance": 0.07}
+    seen = {term.name: term for term in task.policy}
+    assert (seen["lin_vel"].numbers["noise"], seen["gravity"].options["history"]) == (0.3, 2)
+    assert task.advance.numbers == {"takeoff_speed": 0.5}
+    assert task.curriculum.numbers == {"tolerance": 0.05, "promote_after": 7}
+    assert task.reset.settings.standing == 0.5 and task.reset.settings.ground.drop == (0.1, 0.2)
+    assert task.levels[1].jump_again == 0.5 and task.levels[0] == make_task("vertical-jump").levels[0]
+    assert task.motors.lateral.kp == 11.0 and task.command_filter.sum.upper == 200.0
+    assert task.randomization.latency is None and task.action_scale == (10.0, 80.0)
+    assert (task.contact_force, task.reward_floor) == (0.2, None)
     assert args.cfg.ppo.gamma == 0.9 and args.cfg.task == "vertical-jump"
     assert (args.solver, args.noise, args.randomize) == ("mujoco", False, True)
+
+
+def test_flags_reach_the_arrays_that_kernels_read():
+    flags = "--env.rewards.jump-height.weight 25 --env.terminations.tilted.angle 0.4 --env.policy.lin-vel.noise 0.3"
+    flags += " --env.reset.tilt 9 --env.levels.0.base-height 0.3 0.31 --env.contact-force 0.7 --env.action-scale 10 80"
+    _, task = parse_train(["vertical-jump", *flags.split()])
+    env = Env(task, 2, device="cpu", randomize=False)
+    skill = env.skills[0]
+    numbers = skill.numbers.numpy()
+    places = (("rewards", "jump_height", "weight"), ("terminations", "tilted", "angle"), ("policy", "lin_vel", "noise"))
+    assert [numbers[env.skills[0].task.place(*place)] for place in places] == pytest.approx([25.0, 0.4, 0.3])
+    assert skill.settings.numpy()["states"]["tilt"][0] == pytest.approx(np.radians(9.0))
+    assert skill.levels.numpy()["base_height"][0] == pytest.approx([0.3, 0.31])
+    settings = skill.settings_of_skill()
+    assert settings.contact_force == pytest.approx(0.7)
+    assert settings.action_scale[1] == pytest.approx(np.radians(80.0))
+
+
+@pytest.mark.parametrize(
+    ("name", "ppo"),
+    [
+        ("vertical-jump", PpoCfg()),
+        ("horizontal-jump", PpoCfg(gamma=0.99, entropy_coef=0.0003)),
+        ("omnidirectional-jump", PpoCfg(gamma=0.99, entropy_coef=0.0003)),
+    ],
+)
+def test_training_has_the_settings_of_its_task(name, ppo):
+    assert parse_train([name])[0].cfg.ppo == ppo
+
+
+def test_terms_whose_names_make_the_same_flag_are_refused():
+    task = make_task("vertical-jump")
+    rest = next(term for term in task.rewards if term.name == "rest")
+    task = dataclasses.replace(task, rewards=(rest, rest.replace(name="Rest_")))
+    with pytest.raises(InputError, match="make the same flags"):
+        flags_of(task)
 
 
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: EvaluateCfg("p", jumps=0), "jumps must be at least 1"),
+        (lambda: HeightFlags(jumps=0), "jumps must be at least 1"),
+        (lambda: PlaceFlags(jumps=0), "jumps must be at least 1"),
         (lambda: HeightFlags(lower=1.0, upper=0.5), "heights must be"),
         (lambda: HeightFlags(lower=0.0), "heights must be"),
         (lambda: PlaceFlags(x=(1.0, 0.5)), "x must be in"),
         (lambda: PlaceFlags(heading=float("inf")), "heading must be finite or any"),
-        (lambda: EvaluateCfg("p", in_range=(1.0, 0.5)), "in_range must be in"),
+        (lambda: HeightFlags(in_range=(1.0, 0.5)), "in_range must be in"),
+        (lambda: PlaceFlags(in_range=(1.0, 0.5)), "in_range must be in"),
         (lambda: HeightGoals(height=()), "height takes 1 to 64"),
         (lambda: HeightGoals(height=(-1.0,)), "height takes 1 to 64"),
         (lambda: PlaceGoals(goal=((float("nan"), 0.0),)), "goal takes up to 64"),
         (lambda: PlaceGoals(then=((0.5, 0.0),) * 65), "then takes up to 64"),
-        (lambda: PlayCfg("p", seconds=0.0), "seconds must be in"),
+        (lambda: PlayCfg(HeightGoals(), seconds=0.0), "seconds must be in"),
     ],
 )
 def test_impossible_settings_are_refused(make, message):
-    with pytest.raises(ValueError, match=message):
+    with pytest.raises(InputError, match=message):
         make()
 
 
@@ -171,7 +356,7 @@ def test_exported_policy_is_that_of_the_run(trained_run):
     policy, same = load_policy(trained_run / "policy"), open_policy(trained_run)
     assert policy.interface == same.interface and policy.interface.sizes == (48, 16, 8, 12)
     assert all(np.array_equal(policy.tensors()[name], tensor) for name, tensor in same.tensors().items())
-    assert restored_task(policy.config).games == 2
+    assert restored_task(policy.config).curriculum.numbers["promote_after"] == 2
     assert policy.config["train"]["num_envs"] == 16 and policy.config["iteration"] == 2
     assert (trained_run / "policy" / "learning_curve.jsonl").read_text().count("\n") >= 1
 

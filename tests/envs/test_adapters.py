@@ -17,6 +17,7 @@ from jumper_warp.envs.vec_env import RAW_LIMIT
 from jumper_warp.gym import env_id, register_envs
 from jumper_warp.registry import TASKS, make_task
 from jumper_warp.rl.rsl_rl import rsl_rl_config, train_rsl_rl
+from jumper_warp.tasks.randomization import RandomizationCfg
 
 N, STEPS = 8, 40
 TASK = make_task("vertical-jump")
@@ -224,14 +225,26 @@ def test_wrappers_stack():
 # ---------------------------------------------------------------- Gymnasium: seeds
 
 
-def test_a_seed_makes_what_a_new_environment_of_it_makes():
-    envs, new = GymVectorEnv(jumper(seed=1)), GymVectorEnv(jumper(seed=5))
+@pytest.mark.parametrize("redraw", ["reset", "startup"])
+def test_a_seed_makes_what_a_new_environment_of_it_makes(redraw):
+    task = dataclasses.replace(SHORT, randomization=RandomizationCfg(redraw=redraw))
+    envs, new = (GymVectorEnv(jumper(task=task, seed=seed)) for seed in (1, 5))
     envs.reset()
     played(envs)
     envs.env.worlds.level.fill_(2)  # as if the curriculum had gone on
     np.testing.assert_array_equal(envs.reset(seed=5)[0], new.reset()[0])
     assert_same(played(envs), played(new))
     np.testing.assert_array_equal(envs.reset()[0], new.reset()[0])
+
+
+def test_a_seed_brings_every_world_back_to_its_first_task():
+    env = jumper(2, task=[TASK, dataclasses.replace(TASK, name="other")], skill=np.array([1, 0]))
+    env.reset()
+    env.worlds.skill.zero_()
+    env.request(1)
+    env.reset(seed=5)
+    assert env.worlds.skill.numpy().tolist() == [1, 0]
+    assert env.worlds.request.numpy().tolist() == [-1, -1]
 
 
 def test_seeds_reproduce_and_differ():

@@ -6,7 +6,7 @@ import inspect
 import numpy as np
 import torch
 import warp as wp
-from mdp_helpers import DEFAULT_ANGLE, MOTOR_SLOTS, STEP_DT, SUBSTEPS, array, new_worlds, standing_robots
+from mdp_helpers import DEFAULT_ANGLE, MOTOR_SLOTS, STEP_DT, SUBSTEPS, array, new_worlds, observe, standing_robots
 
 from jumper_warp.envs.env import Env
 from jumper_warp.envs.skill import Skill
@@ -132,9 +132,7 @@ class Robots:
         ground.heights = array(self.heights)
         ground.rows, ground.cols = self.heights.shape if self.heights.size > 1 else (0, 0)
         ground.half_x = ground.half_y = 2.0
-        inputs = [0, robot, RobotParameters(), ground, self.worlds, tasks, skill.slots, self.numbers[noise], 0,
-                  skill.observations]  # fmt: skip
-        wp.launch(skill.kernels["observe"], (skill.num_terms, n), inputs, device="cpu")
+        observe(skill, robot, RobotParameters(), ground, self.worlds, tasks, self.numbers[noise])
         self.worlds.clock.assign(self.worlds.clock.numpy() + 1)
         return skill.obs["policy"].double().numpy().copy(), skill.obs["critic"].double().numpy().copy()
 

@@ -7,6 +7,7 @@ import warp as wp
 
 from jumper_warp.envs.arrays import delay_arrays, env_arrays
 from kernels.layout import BODIES, COORDS, DOFS
+from kernels.mdp.observe import condition_kernel
 from kernels.mdp.view import RobotArrays
 
 STEP_DT = 1.0 / 60.0  # [s]
@@ -61,3 +62,12 @@ def values_of(struct, kind) -> SimpleNamespace:
     """Return copies of all arrays of a struct as NumPy."""
     found = {name: getattr(struct, name) for name in kind.vars}
     return SimpleNamespace(**{name: v.numpy().copy() for name, v in found.items() if isinstance(v, wp.array)})
+
+
+def observe(skill, robot, parameters, ground, worlds, states, numbers, beginning: int = 0) -> None:
+    """Launch the stage that observes on a skill's arrays; beginning 1: only where something has just begun."""
+    arrays = skill.observations
+    inputs = [skill.index, robot, parameters, ground, worlds, states, numbers, beginning, arrays.raw]
+    wp.launch(skill.kernels["observe"], (skill.num_chunks, skill.num_envs), inputs, device="cpu")
+    inputs = [skill.index, worlds, skill.columns, numbers, beginning, arrays]
+    wp.launch(condition_kernel, arrays.raw.shape, inputs, device="cpu")

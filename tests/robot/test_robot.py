@@ -261,6 +261,20 @@ def test_accelerations_in_flight_agree_with_pinocchio(description):
     assert found[knees - 1] == pytest.approx(expected[reference.knee_v], abs=3e-4 * scale)
 
 
+def test_robot_slides_on_mujoco_with_the_least_friction():
+    with pytest.raises(ValueError, match=r"friction 0\.005 or more, got 0\.004"):
+        mujoco_solver(build_model(1, friction=0.004, visuals=False, device="cpu"))
+    model = build_model(1, friction=0.005, visuals=False, device="cpu")
+    solver, state, control = mujoco_solver(model), model.state(), model.control()
+    rates = state.joint_qd.numpy()
+    rates[0] = 3.0
+    state.joint_qd.assign(rates)
+    for _ in range(48):
+        solver.step(state, state, control, None, 1.0 / 480.0)
+    # it loses 0.005 g for 0.1 s
+    assert state.joint_q.numpy()[0] == pytest.approx(0.3, abs=0.002)
+
+
 def test_robot_on_a_heightfield():
     heights = np.full((21, 21), 0.1, dtype=np.float32)
     heights[0, 0] = 0.0

@@ -9,6 +9,7 @@ from typing import Any
 
 import warp as wp
 
+from jumper_warp.utils.errors import InputError
 from kernels.jump.ground_draws import EVERY_SIDE, GroundRanges
 from kernels.jump.reset import JumpLevel, JumpSettings
 from kernels.jump.reset_draws import ResetRanges
@@ -43,13 +44,13 @@ class GroundCfg:
     def __post_init__(self) -> None:
         """Raises ValueError: shares or lengths out of range, or a pair that is reversed, not positive or not finite."""
         if not (min(self.platform, self.block) >= 0.0 and self.platform + self.block <= 1.0):
-            raise ValueError(f"ground shares must be >= 0 and add up to at most 1, got {self.platform}, {self.block}")
+            raise InputError(f"ground shares must be >= 0 and add up to at most 1, got {self.platform}, {self.block}")
         for name, value in vars(self).items():
             if isinstance(value, tuple) and not 0.0 < value[0] <= value[1] < math.inf:
-                raise ValueError(f"ground {name} must be (lower, upper), positive and finite, got {value}")
+                raise InputError(f"ground {name} must be (lower, upper), positive and finite, got {value}")
         for name, least in (("room", EVERY_SIDE), ("clearance", 0.0)):
             if not least <= getattr(self, name) < math.inf:
-                raise ValueError(f"ground {name} must be finite and at least {least:g}, got {getattr(self, name)}")
+                raise InputError(f"ground {name} must be finite and at least {least:g}, got {getattr(self, name)}")
 
     @property
     def drawn(self) -> bool:
@@ -84,9 +85,9 @@ class Level:
         """Raises ValueError: a range is not one."""
         pairs = [*zip(self.goal_lower, self.goal_upper, strict=True), self.base_height]
         if not all(-math.inf < low <= high < math.inf for low, high in pairs):
-            raise ValueError(f"a level's ranges must be finite and rise, got {self}")
+            raise InputError(f"a level's ranges must be finite and rise, got {self}")
         if not 0.0 <= self.jump_again <= 1.0:
-            raise ValueError(f"level jump_again must be in [0, 1], got {self.jump_again}")
+            raise InputError(f"level jump_again must be in [0, 1], got {self.jump_again}")
 
     def values(self) -> Any:
         """Return the kernels' `JumpLevel`."""
@@ -160,13 +161,13 @@ class ResetCfg:
         """Raises ValueError: shares do not add up, a pair is reversed, or a delay or a share is out of range."""
         shares = self._shares()
         if not min(shares) >= 0.0 or sum(shares) > 1.0 + 1e-9:
-            raise ValueError(f"reset shares must be >= 0 and add up to at most 1, got {shares}")
+            raise InputError(f"reset shares must be >= 0 and add up to at most 1, got {shares}")
         for name, value in vars(self).items():
             if isinstance(value, tuple) and not value[0] <= value[1]:
-                raise ValueError(f"reset {name} must be (lower, upper), got {value}")
+                raise InputError(f"reset {name} must be (lower, upper), got {value}")
         for name, least in (("command_delay", self.command_delay), ("again_delay", self.again_delay[0])):
             if not least >= 0.0:
-                raise ValueError(f"reset {name} must not be negative, got {least}")
+                raise InputError(f"reset {name} must not be negative, got {least}")
 
     def _shares(self) -> tuple[float, ...]:
         return (self.standing, self.default, self.in_flight, self.touchdown)

@@ -1,0 +1,66 @@
+"""Success of a policy for jumps to heights over the time of its training."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, field
+
+import numpy as np
+import torch
+import warp as wp
+
+from jumper_warp.envs.env import Env
+from jumper_warp.evaluation.jumps import run_jumps
+from jumper_warp.rl.networks import sanitise
+from jumper_warp.rl.ppo import Ppo
+
+TESTED = (0.5, 1.1)
+"""[m] Heights of the test's jumps."""
+
+
+@dataclass
+class Curve:
+    """Success of one variant over its training time."""
+
+    seconds: list[float] = field(default_factory=list)
+    success: list[float] = field(default_factory=list)
+    iterations: int = 0
+
+    def seconds_to(self, rate: float) -> float | None:
+        """Return the first training time [s] at which an evaluation had at least this success rate, if any."""
+        return next((t for t, success in zip(self.seconds, self.success, strict=True) if success >= rate), None)
+
+
+def success(ppo: Ppo, judge: Env) -> float:
+    """Return the share of jumps to heights of 0.5 to 1.1 m that succeed, one a world."""
+
+    @torch.no_grad()
+    def act(obs: torch.Tensor) -> torch.Tensor:
+        return ppo.model.actor(ppo.model.features(sanitise(obs))).clamp(-1.0, 1.0)
+
+    return float(run_jumps(act, judge, np.linspace(*TESTED, judge.num_envs)).success.mean())
+
+
+def learning_curve(env: Env, ppo: Ppo, judge: Env, seconds: float, every: float) -> Curve:
+    """Train for a time [s] and return the curve; kernels are compiled, and the test's jumps made, off the clock.
+
+    env: of the training, not yet reset; judge: one world a jump; every [s]: training time between two evaluations.
+    """
+    env.reset()
+    env.step(torch.zeros(env.num_envs, env.num_actions, device=env.device))
+    env.reset()
+    env.metrics()
+    curve, trained = Curve(), 0.0
+    while trained < seconds:
+        wp.synchronize_device(env.wp_device)
+        start = time.perf_counter()
+        until = min(trained + every, seconds)
+        while trained + time.perf_counter() - start < until:
+            ppo.collect()
+            ppo.update()
+            curve.iterations += 1
+            wp.synchronize_device(env.wp_device)
+        trained += time.perf_counter() - start
+        curve.seconds.append(trained)
+        curve.success.append(success(ppo, judge))
+    return curve

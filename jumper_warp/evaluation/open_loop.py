@@ -1,0 +1,105 @@
+"""The open-loop jump: squat, hold, full extension, followed at every physics step."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from jumper_warp.robot.model import LEGS, MOTOR_JOINTS
+from jumper_warp.sim.simulation import Simulation, motor_values
+from jumper_warp.viz.recorder import Recorder
+
+STAND, RAMP, HOLD, EXTEND, LAND = 60, 25, 50, 40, 60
+"""Ticks of 1/60 s: default pose, ramp into the squat, squat, full extension, default pose again."""
+
+
+def transversal_command(tick: int) -> float:
+    """Return the commanded transversal angle [rad] at a tick."""
+    ramp = np.clip((tick - STAND) / RAMP, 0.0, 1.0)
+    degrees = 45.0 + 90.0 * ramp
+    if tick >= STAND + RAMP + HOLD:
+        degrees = -45.0
+    if tick >= STAND + RAMP + HOLD + EXTEND:
+        degrees = 45.0
+    return np.radians(degrees)
+
+
+@dataclass
+class Trace:
+    """What was measured at every physics step."""
+
+    time: np.ndarray  # (n,) [s]
+    height: np.ndarray  # (n,) [m]
+    speed: np.ndarray  # (n,) [m/s], vertical, of the base origin
+    angle: np.ndarray  # (n, 12) [rad]
+    rate: np.ndarray  # (n, 12) [rad/s]
+    torque: np.ndarray  # (n, 12) [N m]
+    force: np.ndarray  # (n, 4, 3) [N]
+    gap: np.ndarray  # (n,) [m]
+
+
+def follow_jump(sim: Simulation, notes: Mapping[str, Any]) -> tuple[Trace, Recorder, list[np.ndarray]]:
+    """Simulate the jump in one world; also return a recording at 60 Hz with notes, and the body poses of every tick."""
+    recorder = Recorder(sim.model, notes=notes)
+    rows, frames = [], []
+    total = STAND + RAMP + HOLD + EXTEND + LAND
+    for tick in range(total):
+        target = np.tile([0.0, 1.0, 1.0], 4) * transversal_command(tick)
+        sim.target.assign(target[:, None].astype(np.float32))
+        sim.filter_targets()
+        for _ in range(sim.substeps):
+            sim.physics_step()
+            now = (len(rows) + 1) * sim.dt
+            q, qd = sim.joint_q()[0], sim.joint_qd()[0]
+            rows.append(
+                (now, q[2], sim.base_velocity()[0, 2], motor_values(q[7:]), motor_values(qd[6:]),
+                 sim.torque.numpy()[:, 0].copy(), sim.paw_force.numpy()[:, 0].copy(), sim.loop_gap()[0])
+            )  # fmt: skip
+        record(recorder, sim, rows[-1])
+        frames.append(sim.state.body_q.numpy().copy())
+    return Trace(*(np.array(column) for column in zip(*rows, strict=True))), recorder, frames
+
+
+def record(recorder: Recorder, sim: Simulation, row: tuple) -> None:
+    """Add a frame to the recording."""
+    now, height, speed, angle, rate, torque, force, _ = row
+    series = {"base/height [m]": height, "base/vertical speed [m s⁻¹]": speed}
+    for i, name in enumerate(MOTOR_JOINTS):
+        series[f"torque/{name} [N m]"] = torque[i]
+        series[f"angle/{name} [deg]"] = np.degrees(angle[i])
+        series[f"speed/{name} [rad s⁻¹]"] = rate[i]
+    paws = sim.state.body_q.numpy()[[5, 10, 15, 20]]
+    down = np.array([0.0, 0.0, -0.3])
+    points = paws[:, :3] + down + 2.0 * np.cross(paws[:, 3:6], np.cross(paws[:, 3:6], down) + paws[:, 6:] * down)
+    for i, leg in enumerate(LEGS):
+        series[f"paw force/{leg} [N]"] = float(np.linalg.norm(force[i]))
+    recorder.record(now, sim.state.body_q, series, contact_points=points, contact_forces=force)
+
+
+def jump_metrics(trace: Trace) -> dict[str, float]:
+    """Return the metrics of the jump, in SI units but for the gap of the loops [mm]."""
+    contact = np.linalg.norm(trace.force, axis=2).max(axis=1) > 0.1
+    extend = trace.time > (STAND + RAMP + HOLD) / 60.0
+    apex = int(np.argmax(np.where(extend, trace.height, 0.0)))
+    takeoff = int(np.flatnonzero(contact[:apex])[-1])
+    push = trace.time <= trace.time[takeoff]
+    values = {
+        "apex_height_m": trace.height[apex],
+        "apex_time_s": trace.time[apex] - (STAND + RAMP + HOLD) / 60.0,
+        "takeoff_speed_m_s": trace.speed[takeoff],
+        "takeoff_height_m": trace.height[takeoff],
+        "takeoff_time_s": trace.time[takeoff] - (STAND + RAMP + HOLD) / 60.0,
+        "squat_height_m": trace.height[int((STAND + RAMP + HOLD) * 8 - 1)],
+        "peak_torque_nm": np.abs(trace.torque).max(),
+        "peak_speed_rad_s": np.abs(trace.rate).max(),
+        "peak_contact_force_n": np.linalg.norm(trace.force.sum(axis=1), axis=1)[push].max(),
+        "peak_landing_force_n": np.linalg.norm(trace.force.sum(axis=1), axis=1)[apex:].max(),
+        "largest_loop_gap_mm": 1000.0 * trace.gap.max(),
+    }
+    for i, name in enumerate(MOTOR_JOINTS):
+        values[f"peak_torque_{name}_nm"] = np.abs(trace.torque[:, i]).max()
+        values[f"peak_speed_{name}_rad_s"] = np.abs(trace.rate[:, i]).max()
+    return {name: float(value) for name, value in values.items()}

@@ -1,0 +1,261 @@
+"""A task whose every number is in the hands of a test: its terms read what the test writes into its state."""
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+import warp as wp
+from mdp_helpers import STEP_DT, SUBSTEPS, array, new_worlds, no_delays, observe, standing_robots
+
+from jumper_warp.envs.skill import Skill
+from jumper_warp.robot.motors import jumping_motors, vertical_jump_filter
+from jumper_warp.tasks.cfg import Command, Reset, TaskCfg
+from jumper_warp.tasks.randomization import RandomizationCfg
+from jumper_warp.tasks.terms import Advance, Curriculum, ObservationTerm, RewardTerm, TerminationTerm
+from kernels.mdp import terminations
+from kernels.mdp.env import Scene, SkillSettings
+from kernels.mdp.parameters import RobotParameters
+from kernels.mdp.random import Draw, between
+from kernels.mdp.reset import store_pose
+from kernels.mdp.view import RobotArrays, RobotView
+from kernels.terrain.ground import Ground
+
+
+@wp.struct
+class ProbeState:
+    """State of one world's episode."""
+
+    steps: int
+    value: float
+    other: float
+    counts: int
+
+
+@wp.struct
+class ProbeSettings:
+    """How an episode begins."""
+
+    value: float
+
+
+@wp.struct
+class ProbeLevel:
+    """One level of the curriculum."""
+
+    number: int
+
+
+@dataclasses.dataclass(frozen=True)
+class ProbeReset:
+    """How an episode begins."""
+
+    value: float = 2.5
+
+    struct = ProbeSettings
+
+    def values(self, step_dt: float) -> Any:
+        """Return the kernels' `ProbeSettings`."""
+        settings = ProbeSettings()
+        settings.value = self.value
+        return settings
+
+
+@dataclasses.dataclass(frozen=True)
+class ProbeLevelCfg:
+    """One level of the curriculum."""
+
+    number: int
+
+    struct = ProbeLevel
+
+    def values(self) -> Any:
+        """Return the kernels' `ProbeLevel`."""
+        level = ProbeLevel()
+        level.number = self.number
+        return level
+
+
+@wp.func
+def advance_probe(view: RobotView, task: ProbeState, growth: float) -> ProbeState:
+    """Let the value grow."""
+    new = task
+    new.steps = task.steps + 1
+    new.value = task.value + growth
+    return new
+
+
+@wp.func
+def reset_probe(
+    robot: RobotArrays, scene: Scene, skill: SkillSettings, old: ProbeState, settings: ProbeSettings, level: ProbeLevel,
+    draw: Draw,
+) -> ProbeState:  # fmt: skip
+    """Stand; keep a draw in `other` and the level in `counts`."""
+    store_pose(robot, scene, draw.world, 0.5, 0.25)
+    new = ProbeState()
+    new.value = settings.value
+    new.other = between(draw, 0, 0.0, 1.0)
+    new.counts = level.number
+    return new
+
+
+@wp.func
+def give_probe(view: RobotView, scene: Scene, task: ProbeState, values: wp.vec4, heading: float) -> ProbeState:
+    """Take over the first value and the heading."""
+    new = task
+    new.value = values[0]
+    new.other = heading
+    return new
+
+
+@wp.func
+def command_due(task: ProbeState) -> bool:
+    """Due at a value of 7."""
+    return task.value == 7.0
+
+
+@wp.func
+def draw_command(view: RobotView, scene: Scene, task: ProbeState, level: ProbeLevel, draw: Draw) -> ProbeState:
+    """Keep a draw in `other` and the level in `counts`."""
+    new = task
+    new.other = between(draw, 0, 0.0, 1.0)
+    new.counts = level.number
+    return new
+
+
+@wp.func
+def value(view: RobotView, task: ProbeState) -> float:
+    """The value."""
+    return task.value
+
+
+@wp.func
+def offset_square(view: RobotView, task: ProbeState, offset: float, scale: float) -> float:
+    """Squared distance of the value from an offset, times a scale."""
+    return scale * (task.value - offset) * (task.value - offset)
+
+
+@wp.func
+def other(view: RobotView, task: ProbeState) -> float:
+    """The other number."""
+    return task.other
+
+
+@wp.func
+def base_height(view: RobotView, task: Any) -> float:
+    """Height of the base [m]."""
+    return view.height
+
+
+@wp.func
+def other_above(view: RobotView, task: ProbeState, limit: float) -> bool:
+    """Whether the other number is above a limit."""
+    return task.other > limit
+
+
+@wp.func
+def counts(task: ProbeState) -> bool:
+    """Whether the episode counts for the curriculum."""
+    return task.counts != 0
+
+
+@wp.func
+def both(view: RobotView, task: ProbeState) -> wp.vec2:
+    """Both numbers."""
+    return wp.vec2(task.value, task.other)
+
+
+@wp.func
+def latency_of(robot: RobotParameters, world: int) -> float:
+    """Latency of a world's actions."""
+    return float(robot.latency[world])
+
+
+def probe_task(**changes) -> TaskCfg:
+    """Return the task; changes: of its fields."""
+    task = TaskCfg(
+        name="probe",
+        state=ProbeState,
+        advance=Advance(advance_probe, growth=0.25),
+        reset=Reset(reset_probe, ProbeReset()),
+        command=Command(give_probe, command_due, draw_command),
+        curriculum=Curriculum(value, tolerance=2.0, promote_after=3, counts=counts),
+        rewards=(
+            RewardTerm(value, 3.0),
+            RewardTerm(offset_square, -0.5, offset=1.5, scale=2.0),
+            RewardTerm(other, 4.0, once=True),
+            RewardTerm(base_height, 10.0),
+        ),
+        terminations=(
+            TerminationTerm(other_above, limit=1.0e3, name="first"),
+            TerminationTerm(other_above, limit=1.0e2, name="second", time_out=True),
+            TerminationTerm(other_above, limit=1.0e1, name="third", time_out=True, success=True),
+            TerminationTerm(terminations.came_apart),
+            TerminationTerm(terminations.too_long, steps=100.0),
+        ),
+        policy=(
+            ObservationTerm(value, noise=0.5, scale=10.0, clip=4.0),
+            ObservationTerm(both, history=3),
+            ObservationTerm(both, name="late", delayed=True),
+        ),
+        critic=(ObservationTerm(other), ObservationTerm(latency_of), ObservationTerm(value, name="late", delayed=True,
+                                                                                    history=2)),  # fmt: skip
+        motors=jumping_motors(18.0),
+        command_filter=vertical_jump_filter(),
+        action_scale=(15.0, 90.0),
+        levels=tuple(ProbeLevelCfg(i) for i in (11, 12)),
+        randomization=RandomizationCfg.off(),
+        reward_floor=None,
+    )
+    return dataclasses.replace(task, **changes)
+
+
+class Probe:
+    """Worlds of the task with all their arrays, the robots at rest, and launches of its stages."""
+
+    def __init__(self, n: int, task: TaskCfg | None = None, index: int = 0, seed: int = 0):
+        """index: of the skill."""
+        self.n, self.task = n, probe_task() if task is None else task
+        self.skill = Skill(self.task, index, n, STEP_DT, SUBSTEPS, "cpu")
+        self.robot, self.worlds, self.delays = standing_robots(n), new_worlds(n, seed), no_delays(n)
+        self.parameters, self.ground = RobotParameters(), Ground()
+        self.ground.heights = array(np.zeros((1, 1)))
+        self.parameters.latency = array(np.zeros(n), int)
+        self.parameters.skill = self.worlds.skill
+        self.latency = array(np.zeros(n), int)
+        self.skill.observations.latency = self.latency
+
+    def write(self, **fields) -> None:
+        """Overwrite fields of all worlds' states."""
+        records = self.skill.states.numpy().copy()
+        for name, values in fields.items():
+            records[name] = values
+        self.skill.states.assign(wp.array(records, dtype=ProbeState, device="cpu"))
+
+    def read(self, name: str) -> np.ndarray:
+        """Return a field of all worlds' states."""
+        return self.skill.states.numpy()[name].copy()
+
+    def world(self, name: str) -> np.ndarray:
+        """Return an array of `EnvArrays`."""
+        return getattr(self.worlds, name).numpy().copy()
+
+    def step(self) -> None:
+        """Launch the end of a step."""
+        skill = self.skill
+        inputs = [skill.index, self.robot, self.ground, len(self.task.levels), skill.numbers, self.worlds, skill.states,
+                  skill.term_value, skill.counters]  # fmt: skip
+        wp.launch(skill.kernels["step"], self.n, inputs, device="cpu")
+
+    def observe(self, beginning: int = 0) -> None:
+        """Launch the observation."""
+        states, numbers = self.skill.states, self.skill.numbers
+        observe(self.skill, self.robot, self.parameters, self.ground, self.worlds, states, numbers, beginning)
+
+    def next_clock(self) -> None:
+        """Let all worlds be one policy step further on, and no longer new."""
+        self.worlds.clock.assign(self.worlds.clock.numpy() + 1)
+        self.worlds.fresh.zero_()
+
+    def obs(self, group: str, final: bool = False) -> np.ndarray:
+        """Return an observation group, (n, columns)."""
+        return (self.skill.final_obs if final else self.skill.obs)[group].numpy().copy()

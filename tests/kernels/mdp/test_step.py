@@ -1,0 +1,229 @@
+import numpy as np
+import pytest
+from mdp_helpers import STEP_DT, write
+from probe_task import Probe, probe_task
+
+N = 64
+NAMES = ["first", "second", "third", "came_apart", "too_long"]
+FIRST, SECOND, THIRD, APART, LONG = range(5)
+NONE = -1
+GROWTH = 0.25
+
+
+@pytest.fixture
+def probe():
+    return Probe(N)
+
+
+def random_state(probe, seed=0):
+    """Give all worlds random values, and return them as they are after the step: value, other, height."""
+    rng = np.random.default_rng(seed)
+    value, other, height = rng.normal(size=N), rng.normal(size=N), rng.uniform(0.2, 1.0, N)
+    write(probe.robot.joint_q, slice(2, None, 43), height)
+    probe.write(value=value, other=other)
+    return (value + GROWTH).astype(np.float32), other.astype(np.float32), height.astype(np.float32)
+
+
+def weighted(value, other, height):
+    """Return the terms of the probe's rewards, once more, (terms, worlds)."""
+    return np.array(
+        [3.0 * value * STEP_DT, -0.5 * 2.0 * (value - 1.5) ** 2 * STEP_DT, 4.0 * other, 10.0 * height * STEP_DT]
+    )
+
+
+def endings(probe):
+    return [NAMES[i] if i >= 0 else "" for i in probe.world("ending")]
+
+
+# ---------------------------------------------------------------- rewards
+
+
+def test_rewards_are_weighted_and_times_the_step_unless_paid_once(probe):
+    expected = weighted(*random_state(probe))
+    probe.step()
+    np.testing.assert_allclose(probe.skill.term_value.numpy(), expected, rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(probe.world("reward"), expected.sum(axis=0), rtol=1e-5, atol=1e-5)
+    assert expected.sum(axis=0).min() < -1.0
+
+
+def test_a_floor_is_the_least_reward_of_a_step():
+    probe = Probe(N, probe_task(reward_floor=-1.0))
+    expected = weighted(*random_state(probe))
+    probe.step()
+    total = expected.sum(axis=0)
+    assert 0 < np.count_nonzero(total < -1.0) < N
+    np.testing.assert_allclose(probe.world("reward"), np.maximum(total, -1.0), rtol=1e-5, atol=1e-5)
+    np.testing.assert_allclose(probe.skill.term_value.numpy(), expected, rtol=1e-5, atol=1e-6)
+
+
+def test_weights_and_parameters_change_while_it_runs(probe):
+    state = random_state(probe)
+    probe.skill.set("rewards", "value", weight=-7.0)
+    probe.skill.set("rewards", "offset_square", offset=0.5)
+    probe.step()
+    expected = weighted(*state)
+    expected[0] *= -7.0 / 3.0
+    expected[1] = -0.5 * 2.0 * (state[0] - 0.5) ** 2 * STEP_DT
+    np.testing.assert_allclose(probe.skill.term_value.numpy(), expected, rtol=1e-5, atol=1e-6)
+
+
+def test_a_total_that_is_not_finite_is_no_reward(probe):
+    random_state(probe)
+    probe.write(value=np.where(np.arange(N) < 5, np.inf, 1.0))
+    probe.step()
+    reward = probe.world("reward")
+    assert not reward[:5].any() and reward[5:].all()
+
+
+def test_sums_count_on_where_single_precision_would_not(probe):
+    random_state(probe)
+    probe.write(value=-GROWTH, other=0.25 / 4.0)
+    write(probe.skill.counters.term_sum, slice(None), 2.0**24 * 8.0)
+    for _ in range(4):
+        probe.write(value=-GROWTH)
+        probe.step()
+    sums = probe.skill.counters.term_sum.numpy()
+    np.testing.assert_array_equal(sums[2], 2.0**27 + 4 * 0.25)
+    np.testing.assert_array_equal(sums[0], 2.0**27)
+
+
+# ---------------------------------------------------------------- the task's state
+
+
+def test_the_state_moves_on_before_it_is_judged(probe):
+    random_state(probe)
+    probe.write(value=1.0, other=0.0, steps=np.where(np.arange(N) < 7, 99, 98))
+    probe.step()
+    np.testing.assert_array_equal(probe.read("value"), 1.25)
+    np.testing.assert_array_equal(probe.read("steps"), np.where(np.arange(N) < 7, 100, 99))
+    assert endings(probe) == ["too_long"] * 7 + [""] * (N - 7)
+
+
+def test_worlds_of_another_skill_are_passed_over(probe):
+    random_state(probe)
+    away = np.arange(N) % 3 == 0
+    probe.worlds.skill.assign(np.where(away, 1, 0))
+    probe.write(other=2.0e3)
+    for name in ("reward", "done", "timeout", "ending", "broken"):
+        write(getattr(probe.worlds, name), slice(None), 5)
+    before = probe.skill.states.numpy().copy()
+    probe.step()
+    np.testing.assert_array_equal(probe.skill.states.numpy()[away], before[away])
+    assert (probe.read("steps")[~away] == 1).all()
+    for name in ("reward", "done", "timeout", "ending", "broken"):
+        values = probe.world(name)
+        assert (values[away] == 5).all() and (values[~away] != 5).all(), name
+    assert not probe.skill.counters.ending_count.numpy()[:, away].any()
+
+
+# ---------------------------------------------------------------- ends
+
+
+@pytest.mark.parametrize(
+    ("other", "ending", "time_out"),
+    [(5.0, NONE, False), (11.0, THIRD, True), (101.0, SECOND, True), (1001.0, FIRST, False)],
+)
+def test_the_first_termination_that_holds_ends_the_episode(probe, other, ending, time_out):
+    probe.write(other=other)
+    probe.step()
+    done = ending != NONE
+    assert (probe.world("ending") == ending).all() and (probe.world("done") == float(done)).all()
+    assert (probe.world("timeout") == float(time_out)).all() and (probe.world("truncated") == time_out).all()
+    assert (probe.world("terminated") == (done and not time_out)).all()
+    counted = probe.skill.counters.ending_count.numpy()
+    expected = np.zeros((5, N))
+    if done:
+        expected[ending] = 1
+    np.testing.assert_array_equal(counted, expected)
+
+
+def break_world(probe, how, world):
+    """Make a world one whose state is not that of a robot."""
+    if how == "invalid":
+        write(probe.robot.invalid, world, 1)
+    elif how == "action":
+        write(probe.worlds.bad_action, world, 1)
+    elif how == "fast":
+        write(probe.robot.joint_qd, 38 * world + 2, 15.1)
+    else:
+        write(probe.robot.joint_q, 43 * world + 8, np.nan)
+
+
+@pytest.mark.parametrize("how", ["invalid", "action", "fast", "nan"])
+@pytest.mark.parametrize("other", [0.0, 2.0e3])
+def test_a_broken_world_ends_as_one_that_came_apart_and_pays_nothing(probe, how, other):
+    probe.write(value=1.0, other=other)
+    break_world(probe, how, 3)
+    probe.step()
+    others = np.delete(np.arange(N), 3)
+    assert probe.world("ending")[3] == APART and (probe.world("ending")[others] == (FIRST if other else NONE)).all()
+    assert probe.world("terminated")[3] and not probe.world("truncated")[3]
+    assert probe.world("reward")[3] == 0.0 and (probe.world("reward")[others] != 0.0).all()
+    assert not probe.skill.term_value.numpy()[:, 3].any() and not probe.skill.counters.term_sum.numpy()[:, 3].any()
+    assert probe.world("broken").tolist() == (np.arange(N) == 3).astype(int).tolist()
+    assert not probe.world("bad_action").any()
+
+
+# ---------------------------------------------------------------- curriculum
+
+
+def end(probe, error=0.0, other=11.0, counts=1):
+    """End an episode in every world; the third termination is a success."""
+    probe.write(value=error - GROWTH, other=other, counts=counts, steps=0)
+    probe.step()
+
+
+def test_successes_in_a_row_raise_the_level_up_to_past_the_last(probe):
+    for number in range(1, 10):
+        end(probe)
+        assert (probe.world("level") == min(number // 3, 2)).all()
+        assert (probe.world("streak") == number % 3).all()
+    np.testing.assert_array_equal(probe.skill.counters.counted.numpy(), 9)
+    np.testing.assert_array_equal(probe.skill.counters.succeeded.numpy(), 9)
+
+
+@pytest.mark.parametrize(
+    "failure",
+    [{"error": 2.01}, {"other": 101.0}, {"other": 1001.0}],
+    ids=["far", "time out without success", "failure"],
+)
+def test_anything_else_breaks_the_row(probe, failure):
+    end(probe)
+    end(probe)
+    end(probe, **failure)
+    assert not probe.world("level").any() and not probe.world("streak").any()
+    assert (probe.skill.counters.counted.numpy() == 3).all() and (probe.skill.counters.succeeded.numpy() == 2).all()
+    for _ in range(3):
+        end(probe)
+    assert (probe.world("level") == 1).all()
+
+
+def test_a_broken_world_is_no_success(probe):
+    write(probe.worlds.streak, slice(None), 2)
+    break_world(probe, "invalid", 0)
+    end(probe)
+    assert probe.world("level").tolist() == [0] + [1] * (N - 1)
+
+
+def test_episodes_that_do_not_count_change_neither_level_nor_row(probe):
+    end(probe)
+    end(probe, counts=0)
+    end(probe, counts=0, other=1001.0)
+    assert (probe.world("streak") == 1).all() and (probe.skill.counters.counted.numpy() == 1).all()
+    assert (probe.skill.counters.ending_count.numpy().sum(axis=0) == 3).all()
+
+
+def test_the_errors_of_successes_add_up_in_double_precision(probe):
+    write(probe.skill.counters.error_sum, slice(None), 2.0**27)
+    end(probe, error=0.5)
+    end(probe, error=1.5)
+    end(probe, error=3.0)
+    np.testing.assert_array_equal(probe.skill.counters.error_sum.numpy(), 2.0**27 + 2.0)
+
+
+def test_tolerance_and_length_of_the_row_change_while_it_runs(probe):
+    probe.skill.set("curriculum", "value", tolerance=0.5, promote_after=1)
+    end(probe, error=0.6)
+    assert not probe.world("level").any()
+    end(probe, error=0.4)
+    assert (probe.world("level") == 1).all()
