@@ -59,8 +59,7 @@ def paws_kernel(
 def leg_limits(description: RobotDescription) -> LegLimits:
     """Return the hard stops of a leg."""
     joints = {joint.name: joint for joint in description.joints}
-    lateral, outer = joints[MOTOR_JOINTS[0]], joints[MOTOR_JOINTS[1]]
-    limits = LegLimits()
+    lateral, outer, limits = joints[MOTOR_JOINTS[0]], joints[MOTOR_JOINTS[1]], LegLimits()
     limits.lateral_lower, limits.lateral_upper = lateral.lower, lateral.upper
     limits.transversal_lower, limits.transversal_upper = outer.lower, outer.upper
     limits.sum_lower, limits.sum_upper = description.transversal_sum

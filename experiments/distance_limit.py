@@ -1,4 +1,4 @@
-"""What limits how far the robot can jump: its motors, the ground, the rules of the task, or the policy?
+"""What limits how far the robot can jump: its motors, the ground, the terminations of the task, or the policy?
 
     python experiments/distance_limit.py --out outputs/limit
 
@@ -30,17 +30,18 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-import matplotlib
 import numpy as np
 import tyro
-from jumper_warp.evaluation.trial import Trial, TrialArgs
-from newton import ModelFlags
 from rich.console import Console
 from rich.table import Column, Table
 
 from jumper_warp.cli.main import UsageError, run_command
 from jumper_warp.envs.env import Env
+from jumper_warp.evaluation.jumps import jump_commands
 from jumper_warp.evaluation.landings import ENDS, Landings
+from jumper_warp.evaluation.log import termination_names
+from jumper_warp.evaluation.plots import drawn
+from jumper_warp.evaluation.run import EvaluationArgs, EvaluationRun
 from jumper_warp.evaluation.takeoffs import LANDING_ACTION, Act, Flight, Takeoffs, fly, mean_of_sides, reach
 from jumper_warp.registry import make_task
 from jumper_warp.robot.model import KNEE_DOFS
@@ -48,12 +49,8 @@ from jumper_warp.robot.motors import horizontal_jump_filter, jumping_motors, loo
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.tasks.jump.horizontal import LANDING_HEIGHT
 from jumper_warp.tasks.units import G
-from jumper_warp.utils.output import write_figures
-
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt
-
 from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.output import write_figures
 
 TICKS = 48
 """Policy steps that are searched; the last action is held until takeoff."""
@@ -66,7 +63,7 @@ SIGMA, FURTHER_SIGMA = 0.3, 0.1
 MOST_PITCH = 30.0
 """[deg] At landing, either way."""
 BAD, PITCH, BACK, OUTSIDE = 1.0, 0.05, 5.0, 0.05
-"""Costs of a broken rule [m], pitch beyond the limit [m/deg], leaning back beyond it [1], knots outside -1..1 [m]."""
+"""Costs of a jump that ended [m], pitch beyond the limit [m/deg], leaning back beyond it [1], wild knots [m]."""
 NO_TAKEOFF = -3.0
 """[m] What a jump counts that does not leave the ground."""
 FRICTION = 0.85
@@ -121,7 +118,7 @@ def set_friction(env: Env, friction: float) -> None:
     """Give the paws another friction coefficient [1]."""
     mu = env.sim.model.shape_material_mu
     mu.assign(np.where(mu.numpy() > 0.1, friction, mu.numpy()).astype(np.float32))
-    env.notify(ModelFlags.SHAPE_PROPERTIES)
+    env.sim.physics.parameters_changed()
 
 
 def set_mass(env: Env, scale: float) -> None:
@@ -129,7 +126,7 @@ def set_mass(env: Env, scale: float) -> None:
     model = env.sim.model
     model.body_mass.assign(scale * model.body_mass.numpy())
     model.body_inertia.assign(scale * model.body_inertia.numpy())
-    env.notify(ModelFlags.BODY_INERTIAL_PROPERTIES)
+    env.sim.physics.parameters_changed()
 
 
 def free_knees(env: Env) -> None:
@@ -137,7 +134,7 @@ def free_knees(env: Env) -> None:
     damping = env.sim.model.joint_damping.numpy().reshape(env.num_envs, -1)
     damping[:, KNEE_DOFS] = 0.0
     env.sim.model.joint_damping.assign(damping.ravel())
-    env.notify(ModelFlags.JOINT_DOF_PROPERTIES)
+    env.sim.physics.parameters_changed()
 
 
 NOMINAL = Limit("nominal")
@@ -202,7 +199,7 @@ def env_of_limit(limit: Limit, args: Args) -> Env:
     """Return nominal robots on the task, one limit changed, with the ends that a search needs."""
     task = limit.task(make_task("horizontal-jump"))
     names = {*ENDS, "left_stance"} - {"no_jump"} if limit.stance else {*ENDS} - {"no_jump"}
-    task = replace(task, terminations=tuple(rule for rule in task.terminations if rule.name in names))
+    task = replace(task, terminations=tuple(term for term in task.terminations if term.name in names))
     env = Env(task, args.population, device=args.device, randomize=False, noise=False, auto_reset=False)
     limit.model(env)
     return env
@@ -271,10 +268,10 @@ def fly_best(
     return fly(env, actions_of(np.tile(best, (env.num_envs, 1))), after, goals=goals, to_rest=True)
 
 
-def fly_policy(trial: Trial) -> tuple[Takeoffs, Landings, np.ndarray]:
+def fly_policy(run: EvaluationRun) -> tuple[Takeoffs, Landings, np.ndarray]:
     """Let the policy jump to POLICY_GOALS; return the jumps, and its actions up to takeoff for SEED_GOAL (steps, 4)."""
-    env, seed = trial.env(len(POLICY_GOALS)), POLICY_GOALS.index(SEED_GOAL)
-    env.evaluation_reset(np.zeros((env.num_envs, 3)))
+    env, seed = run.env(len(POLICY_GOALS)), POLICY_GOALS.index(SEED_GOAL)
+    env.evaluation_reset(jump_commands(np.zeros((env.num_envs, 3)), 0.0, env.step_dt))
     takeoffs, actions = Takeoffs(env), []
 
     def watch(_: Landings) -> None:
@@ -283,13 +280,14 @@ def fly_policy(trial: Trial) -> tuple[Takeoffs, Landings, np.ndarray]:
         takeoffs.look()
 
     goals = np.outer(POLICY_GOALS, [1.0, 0.0])[:, None]
-    return takeoffs, trial.jump(env, goals, watch=watch), np.array(actions)
+    landings = run.follow(env, Landings(goals, termination_names(env.task)), watch=watch)
+    return takeoffs, landings, np.array(actions)
 
 
-def caught(trial: Trial, best: np.ndarray) -> dict[str, Any]:
+def caught(run: EvaluationRun, best: np.ndarray) -> dict[str, Any]:
     """Return how the policy lands a jump if it takes over at takeoff, told each of POLICY_GOALS."""
     goals = np.outer(POLICY_GOALS, [1.0, 0.0, 0.0])
-    takeoffs = fly_best(trial.env(len(goals)), best, trial.policy.act, goals)
+    takeoffs = fly_best(run.env(len(goals)), best, run.policy.act, goals)
     landed = (takeoffs.end == 0).tolist()
     told = ", ".join(f"{goal:g} m: {'yes' if good else 'no'}" for goal, good in zip(POLICY_GOALS, landed, strict=True))
     print(f"the policy takes over the nominal jump at takeoff and lands it, told a goal of {told}")
@@ -323,8 +321,8 @@ def of_nominal(rows: Rows) -> Rows:
     return {name: row for name, row in rows.items() if name == "nominal" or name.startswith("policy")}
 
 
-def figures(rows: Rows) -> dict[str, float]:
-    """Return the figures of all jumps, the gain over the nominal best among them."""
+def metrics(rows: Rows) -> dict[str, float]:
+    """Return the metrics of all jumps, the gain over the nominal best among them."""
     values, told = {}, of_nominal(rows)
     for name, (_, jump) in rows.items():
         values[f"{name}_gain_m"] = jump.flight_m - rows["nominal"][1].flight_m
@@ -356,25 +354,25 @@ def show(rows: Rows, ahead: float) -> None:
 def plot(rows: Rows, path: Path) -> None:
     """Draw the flights as bars, and those of the policy as lines."""
     bars = {label: jump.flight_m for name, (label, jump) in rows.items() if not name.startswith("policy")}
-    fig, axis = plt.subplots(figsize=(8, 5), constrained_layout=True)
     colors = ["tab:blue" if label == NOMINAL.label else "0.7" for label in bars]
-    axis.bar_label(axis.barh(list(bars), list(bars.values()), color=colors), fmt="%.2f", padding=3)
-    for goal, style, color in zip(POLICY_GOALS, ("-", "--", ":"), ("orange", "tab:red", "black"), strict=True):
-        flight = rows[f"policy_{goal:g}"][1].flight_m
-        axis.axvline(flight, color=color, linestyle=style, label=f"policy, goal {goal:g} m: {flight:.2f} m")
-    axis.invert_yaxis()
-    axis.set(xlabel="flight of the centre of mass [m]", title="Farthest flight found, a lower bound; one limit changed")
-    axis.margins(x=0.1)
-    fig.legend(loc="outside lower center", ncols=len(POLICY_GOALS))
-    fig.savefig(path, dpi=110)
-    plt.close(fig)
+    with drawn(path, figsize=(8, 5)) as axis:
+        axis.bar_label(axis.barh(list(bars), list(bars.values()), color=colors), fmt="%.2f", padding=3)
+        for goal, style, color in zip(POLICY_GOALS, ("-", "--", ":"), ("orange", "tab:red", "black"), strict=True):
+            flight = rows[f"policy_{goal:g}"][1].flight_m
+            axis.axvline(flight, color=color, linestyle=style, label=f"policy, goal {goal:g} m: {flight:.2f} m")
+        axis.invert_yaxis()
+        axis.set(
+            xlabel="flight of the centre of mass [m]", title="Farthest flight found, a lower bound; one limit changed"
+        )
+        axis.margins(x=0.1)
+        axis.figure.legend(loc="outside lower center", ncols=len(POLICY_GOALS))
 
 
 def main(args: Args) -> dict[str, Any]:
     """Search, and return the figures."""
     cma_package()  # that it is missing is said before anything else
-    trial = Trial("distance_limit", TrialArgs(args.policy, record=0, out=args.out, device=args.device))
-    flown, landings, actions = fly_policy(trial)
+    run = EvaluationRun.of("distance_limit", EvaluationArgs(args.policy, record=0, out=args.out, device=args.device))
+    flown, landings, actions = fly_policy(run)
     begin, values = nominal_best(actions, args)
     rows: Rows = {}
     for i, goal in enumerate(POLICY_GOALS):
@@ -386,15 +384,15 @@ def main(args: Args) -> dict[str, Any]:
         best, _ = search(env, limit, begin, FURTHER_SIGMA, args.further, args.seed)
         rows[name] = (limit.label, Flight.of(fly_best(env, best), 0, FRICTION))
         if name == "nominal":
-            values |= caught(trial, best)
-            np.save(trial.folder / "actions.npy", actions_of(best[None])[0])
-    values |= highest(args) | figures(rows)
+            values |= caught(run, best)
+            np.save(run.folder / "actions.npy", actions_of(best[None])[0])
+    values |= highest(args) | metrics(rows)
     values["reach_ahead_of_base_m"] = reach(horizontal_jump_filter(), LANDING_HEIGHT)
     show(rows, values["reach_ahead_of_base_m"])
-    plot(rows, trial.folder / "distance_limit.png")
-    values["seconds"] = time.perf_counter() - trial.started
-    write_figures(trial.folder, values)
-    print(f"{values['seconds']:.0f} s; figures, plot and the nominal robot's actions in {trial.folder}")
+    plot(rows, run.folder / "distance_limit.png")
+    values["seconds"] = time.perf_counter() - run.started
+    write_figures(run.folder, values)
+    print(f"{values['seconds']:.0f} s; figures, plot and the nominal robot's actions in {run.folder}")
     return values
 
 

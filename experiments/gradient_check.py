@@ -79,13 +79,9 @@ def plot(rollout: Any, actions: tuple[np.ndarray, np.ndarray], ascent: Ascent, p
         for motor, name in ((OUTER, "outer"), (INNER, "inner")):
             (line,) = axes[3].plot(ticks, np.degrees(ascent.before[:, motor]), "--", label=f"FL {name}, before")
             axes[3].plot(ticks, np.degrees(ascent.after[:, motor]), color=line.get_color(), label="after")
-        labels = (
-            ("time of the target [s]", "d apex / d target [cm/rad]"),
-            ("time [s]", "base height [m]"),
-            ("step of the ascent", "apex [m]"),
-            ("time [s]", "target [deg]"),
-        )
-        for axis, (x, y) in zip(axes, labels, strict=True):
+        across = ("time of the target [s]", "time [s]", "step of the ascent", "time [s]")
+        up = ("d apex / d target [cm/rad]", "base height [m]", "apex [m]", "target [deg]")
+        for axis, x, y in zip(axes, across, up, strict=True):
             axis.set(xlabel=x, ylabel=y)
             axis.grid(alpha=0.3)
         for axis in (axes[0], axes[1], axes[3]):

@@ -2,9 +2,10 @@
 
     python experiments/new_reward.py --iterations 5
 
-A term is a pure Warp function of the robot (`kernels.jump.task.RobotView`), the episode (`kernels.jump.task.JumpTask`)
-and four numbers, and a line that gives it a weight. It is compiled into the task's one reward kernel and logged by its
-name.
+A term is a pure Warp function of the robot (`kernels.mdp.view.RobotView`), the state of the task
+(`kernels.jump.state.JumpState`; `Any` for a term that every task can use) and numbers by name, and a line that gives
+it a weight and these numbers. It is compiled into the task's one step kernel and logged by its name; weight and numbers
+can be changed while a training runs: `env.skills[0].set("rewards", "even_load", weight=2.0)`.
 """
 
 from __future__ import annotations
@@ -15,28 +16,29 @@ from pathlib import Path
 import torch
 import tyro
 import warp as wp
-from kernels.jump.task import FLIGHT, JumpTask, RobotView
 
 from jumper_warp.envs.env import Env
 from jumper_warp.registry import make_task
 from jumper_warp.rl.ppo import PpoCfg
 from jumper_warp.rl.runner import TrainCfg, train
-from jumper_warp.tasks.cfg import Term
+from jumper_warp.tasks.terms import RewardTerm
 from jumper_warp.utils.output import output_dir, write_figures
+from kernels.jump.state import FLIGHT, JumpState
+from kernels.mdp.view import RobotView
 
 
 @wp.func
-def even_load(view: RobotView, task: JumpTask, p: wp.vec4) -> float:
-    """Even load: exp(-spread / p0) of the paw forces [N] about their mean, on the ground."""
+def even_load(view: RobotView, task: JumpState, spread: float) -> float:
+    """Even load: exp(-deviation / spread) of the paw forces [N] from their mean, on the ground."""
     if task.phase == FLIGHT:
         return 0.0
     mean = (view.paw_force[0] + view.paw_force[1] + view.paw_force[2] + view.paw_force[3]) / 4.0
     off = view.paw_force - wp.vec4(mean, mean, mean, mean)
-    return wp.exp(-wp.length(off) / p[0])
+    return wp.exp(-wp.length(off) / spread)
 
 
 TASK = make_task("vertical-jump")
-TASK = replace(TASK, terms=TASK.terms + (Term(even_load, weight=5.0, params=(50.0,)),))
+TASK = replace(TASK, rewards=(*TASK.rewards, RewardTerm(even_load, weight=5.0, spread=50.0)))
 
 
 def make_env(num_envs: int, seed: int, device: torch.device) -> Env:

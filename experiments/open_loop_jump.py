@@ -54,20 +54,11 @@ class Args:
     """Warp device."""
 
 
-def make_simulation(args: Args) -> Simulation:
-    """Return one robot with the motors and filter of the chosen variant."""
-    motors = jumping_motors(args.torque)
-    motors = replace(motors, transversal=replace(motors.transversal, kp=args.kp))
-    command_filter = loose_filter() if args.loose else vertical_jump_filter()
-    return Simulation(1, solver=args.solver, motors=motors, command_filter=command_filter, device=args.device)
-
-
 def draw_filmstrip(frames: list[np.ndarray], path: Path) -> None:
     """Draw the robot at a few moments side by side; frames: body poses of every tick, (21, 7) each."""
     model = build_model(1)
     state = model.state()
-    camera = Camera(model, eye=(1.6, 2.0, 0.75), target=(0.0, 0.0, 0.55), size=(300, 400))
-    pictures = []
+    camera, pictures = Camera(model, eye=(1.6, 2.0, 0.75), target=(0.0, 0.0, 0.55), size=(300, 400)), []
     for moment in MOMENTS:
         state.body_q.assign(frames[round(60 * moment)])
         pictures.append(camera.picture(state))
@@ -90,8 +81,8 @@ def plot(trace: Trace, path: Path, title: str) -> None:
         for axis, label in zip(axes, labels, strict=True):
             axis.set_ylabel(label)
             axis.grid(alpha=0.3)
-        for axis in axes[[0, 2, 3, 4]]:
-            axis.legend(ncols=4, fontsize=8, loc="upper left")
+            if axis is not axes[1]:
+                axis.legend(ncols=4, fontsize=8, loc="upper left")
         axes[-1].set_xlabel("time [s]")
         axes[0].set_title(title)
 
@@ -102,12 +93,17 @@ def main(args: Args) -> dict:
     announce(args.device)
     folder = output_dir("open_loop_jump", args.out)
     variant = {"solver": args.solver, "torque_limit_nm": args.torque, "kp_nm_rad": args.kp, "loose_filter": args.loose}
-    trace, recorder, frames = follow_jump(make_simulation(args), variant)
+    motors = jumping_motors(args.torque)
+    motors = replace(motors, transversal=replace(motors.transversal, kp=args.kp))
+    command_filter = loose_filter() if args.loose else vertical_jump_filter()
+    sim = Simulation(1, solver=args.solver, motors=motors, command_filter=command_filter, device=args.device)
+    trace, recorder, frames = follow_jump(sim, variant)
     draw_filmstrip(frames, folder / "jump_strip.png")
-    hardware = HARDWARE_APEX if args.torque == 18.0 and not args.loose else None
-    values: dict[str, Any] = {**variant, **jump_metrics(trace), "hardware_apex_height_m": hardware}
-    write_figures(folder, values)
+    values: dict[str, Any] = {**variant, **jump_metrics(trace), "hardware_apex_height_m": None}
+    if args.torque == 18.0 and not args.loose:
+        values["hardware_apex_height_m"] = HARDWARE_APEX
     title = f"Open-loop jump, {args.solver}, {args.torque:g} N m"
+    write_figures(folder, values)
     plot(trace, folder / "jump.png", title)
     recorder.save_rrd(folder / "jump.rrd")
     table = Table("figure", "value", title=title)

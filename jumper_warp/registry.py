@@ -160,6 +160,8 @@ def load_task_module(name: str) -> ModuleType:
     try:
         if path.suffix == ".py" or len(path.parts) > 1:
             return _load_file(path)
+        if not all(part.isidentifier() for part in name.split(".")):
+            raise ModuleNotFoundError(name=name)
         return importlib.import_module(name)
     except BaseException as error:
         TASKS.clear()

@@ -13,7 +13,6 @@ import warp as wp
 
 from jumper_warp.envs.env import Env
 from jumper_warp.sim.simulation import Simulation
-from jumper_warp.sim.solver import TOLERANCE
 from jumper_warp.utils.errors import InputError
 
 
@@ -104,7 +103,7 @@ def soak(sim: Simulation, steps: Iterator[torch.Tensor], args: SoakArgs) -> dict
     for step, bad in enumerate(steps):
         speed = torch.maximum(speed, rates[:, :3].norm(dim=1).max())
         joint_speed = torch.maximum(joint_speed, rates[:, 6:26].abs().max())
-        unsolved += (residual > TOLERANCE).sum()
+        unsolved += (residual > sim.solver.tolerance).sum()
         flagged += bad.sum()
         if (step + 1) % args.episode == 0 and not bool(rates.isfinite().all()):
             raise RuntimeError(f"a world holds values that are not finite but was not flagged, step {step}")

@@ -5,13 +5,14 @@ from __future__ import annotations
 import inspect
 import math
 from types import ModuleType
-from typing import Any
+from typing import Any, get_type_hints
 
 import warp as wp
 
 from jumper_warp.tasks.jump.horizontal import horizontal_jump, omnidirectional_jump
 from jumper_warp.tasks.jump.vertical import vertical_jump
 from jumper_warp.tasks.saving import MAX_ENTRIES, VERSION, TaskError, name_of, plain, shown
+from jumper_warp.tasks.terms import RewardTerm, TerminationTerm
 from kernels.jump import rewards, terminations
 from kernels.mdp import rewards as mdp_rewards
 from kernels.mdp import terminations as mdp_terminations
@@ -97,11 +98,12 @@ def _list(saved: dict[str, Any], section: str) -> list[Any]:
 
 def _rows(saved: dict[str, Any], section: str, shelves: tuple[ModuleType, ...]) -> list[dict[str, Any]]:
     """Return rewards or terminations; numbers that had places then have names now."""
-    made = []
+    made, kind = [], RewardTerm if section == "terms" else TerminationTerm
     for i, row in enumerate(_list(saved, section)):
         where, name, params = f"task.{section}[{i}]", row.get("func"), row.get("params")
         found = [vars(shelf).get(name) for shelf in shelves] if isinstance(name, str) else []
-        func = next((func for func in found if isinstance(func, wp.Function)), None)
+        found = [func for func in found if isinstance(func, wp.Function)]
+        func = next((func for func in found if get_type_hints(func.func).get("return") in kind.returns), None)
         if func is None:
             raise TaskError(f"{where}: this version has no {shown(name)}")
         extra = [key for key in row if key not in ("func", "params", "weight", "once", "success")]
@@ -110,8 +112,7 @@ def _rows(saved: dict[str, Any], section: str, shelves: tuple[ModuleType, ...]) 
         names = list(inspect.signature(func.func).parameters)[2:]
         if not isinstance(params, list) or len(params) != len(names):
             raise TaskError(f"{where}: {name} has {len(names)} numbers by place")
-        kind = "RewardTerm" if section == "terms" else "TerminationTerm"
-        term = {"type": f"jumper_warp.tasks.terms:{kind}", "func": name_of(func), "name": name}
+        term = {"type": name_of(kind), "func": name_of(func), "name": name}
         term |= dict(zip(names, params, strict=True))
         if section == "terms":
             term |= {"weight": row["weight"], "once": row.get("once", False)}

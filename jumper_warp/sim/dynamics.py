@@ -166,7 +166,6 @@ class JumperDynamics:
         self.num_worlds = model.world_count
         self._paws = wp.array(find_paws(model).flatten(), dtype=int, device=self.device)
         self._ground_shape = find_ground(model)
-        self._no_mask = wp.zeros(0, dtype=float, device=self.device)
         self.static_friction_ratio = wp.full(self.num_worlds, 1.0, dtype=float, device=self.device)
         """Static over dynamic friction coefficient [1], shape (num_worlds,); call `pack_friction` after a change."""
 
@@ -205,28 +204,28 @@ class JumperDynamics:
         self.pack_friction()
         self.pack_gravity()
 
-    def pack_masses(self, mask: wp.array | None = None) -> None:
-        """Read masses, centres of mass and inertias, where mask (num_worlds,) float is not 0; None: everywhere."""
+    def pack_masses(self) -> None:
+        """Read masses, centres of mass and inertias."""
         m = self.model
         self._launch(
             self.modules.parameters.pack_masses_kernel,
             (self.num_worlds, 21),
-            [m.body_mass, m.body_com, m.body_inertia, self._everywhere(mask)],
+            [m.body_mass, m.body_com, m.body_inertia],
         )
 
-    def pack_joints(self, mask: wp.array | None = None) -> None:
-        """Read armature, friction, damping and hard stops; mask as above."""
+    def pack_joints(self) -> None:
+        """Read armature, friction, damping and hard stops."""
         m = self.model
         lower, upper = self.description.transversal_sum
         self._launch(
             self.modules.parameters.pack_joints_kernel,
             (self.num_worlds, 4),
             [m.joint_armature, m.joint_friction, m.joint_damping, m.joint_limit_lower, m.joint_limit_upper,
-             m.joint_limit_ke, m.joint_limit_kd, m.joint_effort_limit, lower, upper, self._everywhere(mask)],
+             m.joint_limit_ke, m.joint_limit_kd, m.joint_effort_limit, lower, upper],
         )  # fmt: skip
 
-    def pack_friction(self, mask: wp.array | None = None) -> None:
-        """Read the friction coefficients of paws and ground; mask as above."""
+    def pack_friction(self) -> None:
+        """Read the friction coefficients of paws and ground."""
         self._launch(
             self.modules.parameters.pack_friction_kernel,
             (self.num_worlds, 4),
@@ -235,16 +234,22 @@ class JumperDynamics:
                 self._ground_shape,
                 self.model.shape_material_mu,
                 self.static_friction_ratio,
-                self._everywhere(mask),
             ],
         )
+
+    def repack(self, mask: wp.array) -> None:
+        """Read masses, armature, motor friction and friction of paws, where mask (num_worlds,) float is not 0."""
+        m = self.model
+        self._launch(
+            self.modules.parameters.repack_kernel,
+            (self.num_worlds, 25),
+            [mask, m.body_mass, m.body_com, m.body_inertia, m.joint_armature, m.joint_friction, self._paws,
+             self._ground_shape, m.shape_material_mu, self.static_friction_ratio],
+        )  # fmt: skip
 
     def pack_gravity(self) -> None:
         """Read gravity."""
         self._launch(self.modules.parameters.pack_gravity_kernel, self.num_worlds, [self.model.gravity])
-
-    def _everywhere(self, mask: wp.array | None) -> wp.array:
-        return self._no_mask if mask is None else mask
 
     def _launch(self, kernel: wp.Kernel, dim: int | tuple[int, ...], inputs: list) -> None:
         wp.launch(kernel, dim=dim, inputs=inputs, outputs=[self.robot.table], device=self.device)

@@ -109,9 +109,10 @@ class JumperPhysics:
 
     def parameters_changed(self, mask: wp.array | None = None) -> None:
         """See `Physics.parameters_changed`."""
-        self.dynamics.pack_masses(mask)
-        self.dynamics.pack_joints(mask)
-        self.dynamics.pack_friction(mask)
+        if mask is None:
+            self.dynamics.pack()
+        else:
+            self.dynamics.repack(mask)
 
     def after_reset(self, mask: wp.array) -> None:
         """See `Physics.after_reset`; the solver reads base and motors only."""
@@ -195,7 +196,6 @@ class MujocoPhysics:
     def parameters_changed(self, mask: wp.array | None = None) -> None:
         """See `Physics.parameters_changed`; MuJoCo reads all worlds."""
         self.solver.notify_model_changed(DRAWN_FLAGS)
-        self.dynamics.pack_friction(mask)
 
     def after_reset(self, mask: wp.array) -> None:
         """See `Physics.after_reset`."""

@@ -148,13 +148,11 @@ def task_from_json(saved: Any, modules: Iterable[ModuleType] = (), *, leave_out:
     content = {key: value for key, value in saved.items() if key not in ("version", "type")}
     content |= {section: [] for section in OPTIONAL if section in leave_out}
     try:
-        task = _build(TaskCfg, content, "task", Finder(modules))
-        _check_kernels_types(task)
+        return _build(TaskCfg, content, "task", Finder(modules))
     except TaskError:
         raise
     except (ValueError, TypeError, KeyError, AttributeError, ArithmeticError, NameError) as error:
         raise TaskError(f"task: {error!s:.200}") from error
-    return task
 
 
 def _build(kind: type, saved: dict[str, Any], where: str, find: Finder) -> Any:
@@ -168,6 +166,8 @@ def _build(kind: type, saved: dict[str, Any], where: str, find: Finder) -> Any:
         if name not in saved and spec.default is spec.default_factory is dataclasses.MISSING:
             raise TaskError(f"{where}.{name} is missing")
     values = {name: _value(value, hints[name], f"{where}.{name}", find) for name, value in saved.items()}
+    if kind is TaskCfg:
+        _check_kernels_types(values)
     try:
         return kind(**values)
     except ValueError as error:
@@ -270,16 +270,16 @@ def _word(hint: Any) -> str:
     return getattr(hint, "__name__", str(hint))
 
 
-def _check_kernels_types(task: TaskCfg) -> None:
-    """Raise TaskError unless state, settings and levels are what the kernels can read."""
-    if not NAME.fullmatch(task.name):
-        raise TaskError(f"task.name is of letters, digits, and _ . - or spaces, got {task.name!r:.60}")
-    if not isinstance(task.state, Struct) or "steps" not in task.state.vars:
+def _check_kernels_types(task: dict[str, Any]) -> None:
+    """Raise TaskError unless name, state, settings and levels of a task are what the kernels and files can hold."""
+    if not NAME.fullmatch(task["name"]):
+        raise TaskError(f"task.name is of letters, digits, and _ . - or spaces, got {task['name']!r:.60}")
+    if not isinstance(task["state"], Struct) or "steps" not in task["state"].vars:
         raise TaskError("task.state is not a struct that counts steps")
-    settings = [] if task.reset.settings is None else [("reset.settings", task.reset.settings)]
-    settings += [(f"levels[{i}]", level) for i, level in enumerate(task.levels)]
-    for where, value in settings:
+    levels, settings = task.get("levels", ()), task["reset"].settings
+    read = [] if settings is None else [("reset.settings", settings)]
+    for where, value in [*read, *((f"levels[{i}]", level) for i, level in enumerate(levels))]:
         if not isinstance(getattr(value, "struct", None), Struct) or not callable(getattr(value, "values", None)):
             raise TaskError(f"task.{where}: {shown(value)} is not for the kernels: it needs struct and values()")
-    if len({type(level) for level in task.levels}) > 1:
+    if len({type(level) for level in levels}) > 1:
         raise TaskError("task.levels must all be of one kind")

@@ -123,7 +123,7 @@ def load_contact(
 def advance_once(
     robot: Robot, settings: StepSettings, drive: Drive, work: Workspace, world: int, step: int, base: BaseState,
     angles: wp.array(dtype=vec3), rates: wp.array(dtype=vec3), legs: wp.array(dtype=LegSolve),
-    paws: wp.array(dtype=PawKinematics), contacts: wp.array(dtype=PawContact),
+    paws: wp.array(dtype=PawKinematics), contacts: wp.array(dtype=PawContact), peaks: wp.array(dtype=real),
 ) -> BaseState:  # fmt: skip
     """Advance one world by one step; angles and rates of the legs' motors are updated in place."""
     dt = settings.dt
@@ -150,7 +150,7 @@ def advance_once(
     change = solve_contacts(contacts, block, settings.max_sweeps, settings.tolerance)
     if has_block(robot.ground, world):
         move_block(robot.ground, world, wp.quat_rotate(base.quat, block_velocity(block, contacts)), dt)
-    record_contacts(work, world, base, contacts, change, dt)
+    record_contacts(work, world, base, contacts, change, dt, peaks)
     for k in range(legs.shape[0]):
         push = legs[k].inverse * (wp.transpose(contacts[k].jacobian) * contacts[k].impulse)
         rates[k] += push - legs[k].to_lin * change.lin - legs[k].to_ang * change.ang
@@ -160,16 +160,17 @@ def advance_once(
 
 @wp.func
 def record_contacts(
-    work: Workspace, world: int, base: BaseState, contacts: wp.array(dtype=PawContact), solved: ContactState, dt: real
-):
-    """Write the paws' impulses and forces, and keep the largest force and residual of the launch."""
+    work: Workspace, world: int, base: BaseState, contacts: wp.array(dtype=PawContact), solved: ContactState, dt: real,
+    peaks: wp.array(dtype=real),
+):  # fmt: skip
+    """Write the paws' impulses and forces, and keep the largest force and residual; peaks [N]: on each paw."""
     total = vec3(real(0.0))
     for k in range(contacts.shape[0]):
         impulse = wp.quat_rotate(base.quat, contacts[k].impulse)
         work.impulse[k, world] = impulse
         force = impulse / dt
         work.contact_force[k, world] = force
-        work.peak_paw_force[k, world] = wp.max(work.peak_paw_force[k, world], wp.length(force))
+        peaks[k] = wp.max(peaks[k], wp.length(force))
         total += force
     work.peak_force[world] = wp.max(work.peak_force[world], wp.length(total))
     work.sweeps[world] = wp.max(work.sweeps[world], solved.sweeps)
@@ -211,12 +212,12 @@ def advance_kernel(
     work.residual[world] = real(0.0)
     work.sweeps[world] = 0
     work.peak_force[world] = real(0.0)
-    for k in range(4):
-        work.peak_paw_force[k, world] = real(0.0)
+    peaks = wp.zeros(shape=(4,), dtype=real)
     for step in range(settings.substeps):
-        base = advance_once(robot, settings, drive, work, world, step, base, angles, rates, legs, paws, contacts)
+        base = advance_once(robot, settings, drive, work, world, step, base, angles, rates, legs, paws, contacts, peaks)
     total = real(0.0)
     for k in range(angles.shape[0]):
+        work.peak_paw_force[k, world] = peaks[k]
         store_motors(joint_q_out, leg_coord(world, k), angles[k])
         store_motors(joint_qd_out, leg_dof(world, k), rates[k])
         total += wp.dot(angles[k], angles[k]) + wp.dot(rates[k], rates[k])

@@ -29,6 +29,7 @@ from ..layout import (
     SUM_LOWER,
     SUM_UPPER,
     UPPER,
+    motor_slot,
 )
 from ..scalar import real, vec3, vec6
 from .inertia import MassMoments
@@ -110,29 +111,33 @@ def store_link(table: wp.array2d(dtype=real), row: int, world: int, mass: float,
     table[row + 9, world] = m * c[1] * c[2] - real(0.5) * (real(inertia[1, 2]) + real(inertia[2, 1]))
 
 
+@wp.func
+def body_row(body: int) -> int:
+    """Return the first row of a body's mass moments."""
+    if body == 0:
+        return BASE
+    return ((body - 1) // LEG_BODIES) * LEG_ROWS + ((body - 1) % LEG_BODIES) * MOMENT_ROWS
+
+
+@wp.func
+def motor_dof(leg: int, motor: int) -> int:
+    """Return a motor's place among the rates of its world; motors: lateral, outer, inner."""
+    return 6 + motor_slot(3 * leg + motor)
+
+
 @wp.kernel
 def pack_masses_kernel(
     # in
     body_mass: wp.array(dtype=float),
     body_com: wp.array(dtype=wp.vec3),
     body_inertia: wp.array(dtype=wp.mat33),
-    mask: wp.array(dtype=float),
     # out
     table: wp.array2d(dtype=real),
 ):
-    """Write the mass moments of every body; one thread per (world, body).
-
-    mask, here and below: (num_worlds,), not 0 where to write; empty: everywhere.
-    """
+    """Write the mass moments of every body; one thread per (world, body)."""
     world, body = wp.tid()
-    if mask.shape[0] > 0:
-        if mask[world] == 0.0:
-            return
-    row = BASE
-    if body > 0:
-        row = ((body - 1) // LEG_BODIES) * LEG_ROWS + ((body - 1) % LEG_BODIES) * MOMENT_ROWS
     i = world * BODIES + body
-    store_link(table, row, world, body_mass[i], body_com[i], body_inertia[i])
+    store_link(table, body_row(body), world, body_mass[i], body_com[i], body_inertia[i])
 
 
 @wp.kernel
@@ -148,22 +153,15 @@ def pack_joints_kernel(
     effort_limit: wp.array(dtype=float),
     sum_lower: float,
     sum_upper: float,
-    mask: wp.array(dtype=float),
     # out
     table: wp.array2d(dtype=real),
 ):
     """Write the joint-space parameters of every leg; one thread per (world, leg)."""
     world, leg = wp.tid()
-    if mask.shape[0] > 0:
-        if mask[world] == 0.0:
-            return
     row = leg * LEG_ROWS
     dof = world * DOFS + 6 + 5 * leg
     for j in range(3):
-        # dofs of a leg: lateral, outer, outer knee, inner, inner knee
-        i = dof + j
-        if j == 2:
-            i = dof + 3
+        i = world * DOFS + motor_dof(leg, j)
         table[row + ARMATURE + j, world] = real(armature[i])
         table[row + FRICTION + j, world] = real(friction[i])
         table[row + DAMPING + j, world] = real(damping[i])
@@ -179,6 +177,24 @@ def pack_joints_kernel(
     table[row + STOP_KD, world] = real(limit_kd[dof + 1])
 
 
+@wp.func
+def paw_friction(
+    paw_shapes: wp.array(dtype=int), ground_shape: int, shape_mu: wp.array(dtype=float), world: int, leg: int
+) -> float:
+    """Return a paw's coefficient on the ground: the larger of the two, as in MuJoCo."""
+    mu = shape_mu[paw_shapes[world * 4 + leg]]
+    if ground_shape >= 0:
+        mu = wp.max(mu, shape_mu[ground_shape])
+    return mu
+
+
+@wp.func
+def store_friction(table: wp.array2d(dtype=real), leg: int, world: int, mu: float, static_ratio: float):
+    """Write a paw's dynamic coefficient and its static one, static_ratio times as large."""
+    table[leg * LEG_ROWS + MU_DYNAMIC, world] = real(mu)
+    table[leg * LEG_ROWS + MU_STATIC, world] = real(mu * static_ratio)
+
+
 @wp.kernel
 def pack_friction_kernel(
     # in
@@ -186,23 +202,47 @@ def pack_friction_kernel(
     ground_shape: int,
     shape_mu: wp.array(dtype=float),
     static_ratio: wp.array(dtype=float),
-    mask: wp.array(dtype=float),
     # out
     table: wp.array2d(dtype=real),
 ):
-    """Write the friction coefficients of every paw; one thread per (world, leg).
-
-    The pair's coefficient is the larger of paw and ground, as in MuJoCo; static = dynamic * static_ratio[world].
-    """
+    """Write the friction coefficients of every paw; one thread per (world, leg)."""
     world, leg = wp.tid()
-    if mask.shape[0] > 0:
-        if mask[world] == 0.0:
-            return
-    mu = shape_mu[paw_shapes[world * 4 + leg]]
-    if ground_shape >= 0:
-        mu = wp.max(mu, shape_mu[ground_shape])
-    table[leg * LEG_ROWS + MU_DYNAMIC, world] = real(mu)
-    table[leg * LEG_ROWS + MU_STATIC, world] = real(mu * static_ratio[world])
+    store_friction(table, leg, world, paw_friction(paw_shapes, ground_shape, shape_mu, world, leg), static_ratio[world])
+
+
+@wp.kernel
+def repack_kernel(
+    # in
+    mask: wp.array(dtype=float),
+    body_mass: wp.array(dtype=float),
+    body_com: wp.array(dtype=wp.vec3),
+    body_inertia: wp.array(dtype=wp.mat33),
+    armature: wp.array(dtype=float),
+    friction: wp.array(dtype=float),
+    paw_shapes: wp.array(dtype=int),
+    ground_shape: int,
+    shape_mu: wp.array(dtype=float),
+    static_ratio: wp.array(dtype=float),
+    # out
+    table: wp.array2d(dtype=real),
+):
+    """Write what domain randomisation draws, where mask (num_worlds,) is not 0; launch over (num_worlds, 25).
+
+    The first 21 threads of a world write a body each, the others a leg's motors and paw.
+    """
+    world, part = wp.tid()
+    if mask[world] == 0.0:
+        return
+    if part < BODIES:
+        i = world * BODIES + part
+        store_link(table, body_row(part), world, body_mass[i], body_com[i], body_inertia[i])
+        return
+    leg = part - BODIES
+    for j in range(3):
+        dof = world * DOFS + motor_dof(leg, j)
+        table[leg * LEG_ROWS + ARMATURE + j, world] = real(armature[dof])
+        table[leg * LEG_ROWS + FRICTION + j, world] = real(friction[dof])
+    store_friction(table, leg, world, paw_friction(paw_shapes, ground_shape, shape_mu, world, leg), static_ratio[world])
 
 
 @wp.kernel

@@ -106,6 +106,14 @@ def make_observe_kernel(task: Any) -> wp.Kernel:
 
 
 @wp.func
+def or_zero(value: float, broken: bool) -> float:
+    """Return 0 instead of the value of a world that came apart, or of one that is not finite."""
+    if broken or not wp.isfinite(value):
+        return 0.0
+    return value
+
+
+@wp.func
 def late(arrays: ObservationArrays, clock: int, world: int, column: int, value: float, fresh: int) -> float:
     """Return what a sensor gave as long ago as its latency says, between policy steps a straight line."""
     depth = arrays.past.shape[0]
@@ -132,29 +140,28 @@ def condition_kernel(
     # in, out
     arrays: ObservationArrays,
 ):
-    """Turn raw values into observations; one thread per (world, component). Rows of worlds that came apart are 0.
+    """Turn raw values into observations; one thread per (world, component).
 
+    Rows of worlds that came apart are 0, history and all, and so is what else is not finite.
     beginning 1: only where an episode or the skill has just begun, and `final` stays.
     """
     world, component = wp.tid()
     if env.skill[world] != skill or (beginning != 0 and env.fresh[world] == 0):
         return
     column = columns[component]
-    value = arrays.raw[world, column.raw]
     broken = env.broken[world] != 0
-    if broken:
-        value = 0.0
+    value = or_zero(arrays.raw[world, column.raw], broken)
     if column.delayed != 0:
         value = late(arrays, env.clock[world], world, column.past, value, env.fresh[world])
     noise = p[column.first]
-    if noise > 0.0 and not broken:
+    if noise > 0.0:
         draw = make_draw(env.seed, world, env.clock[world], OBSERVATION + column.group)
         value += noise * cut_gaussian(draw, column.oldest)
-    value = p[column.first + 1] * wp.clamp(value, -p[column.first + 2], p[column.first + 2])
+    value = or_zero(p[column.first + 1] * wp.clamp(value, -p[column.first + 2], p[column.first + 2]), broken)
     i = column.start + world * column.stride + column.oldest
     for _ in range(column.history - 1):
         frame = arrays.now[i + column.width]
-        if env.fresh[world] != 0:
+        if broken or env.fresh[world] != 0:
             frame = value
         arrays.now[i] = frame
         if beginning == 0:

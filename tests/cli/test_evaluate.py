@@ -1,68 +1,117 @@
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
+from landing_helpers import still_policy
 
-from jumper_warp.cli.evaluate import MEASURES, HeightFlags, PlaceFlags, csv_text, flags_for, measure_of, place_figures
+from jumper_warp.cli import evaluate, play
+from jumper_warp.evaluation.commands import csv_text
+from jumper_warp.evaluation.heights import HeightFlags
 from jumper_warp.evaluation.jumps import Jumps
 from jumper_warp.evaluation.landings import ENDS
+from jumper_warp.evaluation.places import PlaceFlags
+from jumper_warp.evaluation.registry import EVALUATIONS, evaluation_of
+from jumper_warp.policies.folder import save_policy
 from jumper_warp.policies.spec import PolicyError
 from jumper_warp.registry import TASKS, make_task
+from jumper_warp.utils.errors import InputError
 
-RULES = ("success", "came_apart", "low_base")
+TASK = EVALUATIONS["place"].for_evaluation(make_task("horizontal-jump"))
+
+
+@pytest.fixture(scope="module")
+def policies(tmp_path_factory):
+    """Folders of policies by task, which hold the default pose."""
+    folder = tmp_path_factory.mktemp("policies")
+    for name in ("vertical-jump", "horizontal-jump"):
+        save_policy(folder / name, still_policy(name))
+    return folder
 
 
 def test_every_task_is_measured_by_a_success_that_comes_first():
-    assert set(MEASURES) == set(TASKS)
-    for name, measure in MEASURES.items():
-        task = make_task(name)
-        rules = [rule.name for rule in (task if measure.change is None else measure.change(task)).rules]
-        assert rules[0] == "success" and (measure.change is None or set(rules) == set(ENDS))
+    kinds = {name: evaluation_of(make_task(name)) for name in TASKS if name.endswith("-jump")}
+    assert [kinds[name] is EVALUATIONS[key] for name, key in (
+        ("vertical-jump", "height"), ("horizontal-jump", "place"), ("omnidirectional-jump", "around"),
+    )] == [True] * 3  # fmt: skip
+    for name, kind in kinds.items():
+        ends = [term.name for term in kind.for_evaluation(make_task(name)).terminations]
+        assert ends[0] == "success" and (name == "vertical-jump" or set(ends) == set(ENDS))
 
 
-def test_task_without_a_measure_is_refused():
-    with pytest.raises(PolicyError, match=r"vertical-jump, horizontal-jump, .* this one is of 'walk'"):
-        measure_of("walk")
+def test_task_with_an_unknown_evaluation_is_refused():
+    with pytest.raises(PolicyError, match=r"horizontal-jump asks for the evaluation 'walk'; there are \['height', 'pl"):
+        evaluation_of(replace(TASK, evaluation="walk"))
 
 
 def test_places_are_spread_ahead_and_drawn_aside_and_headings_too():
-    flags = flags_for("horizontal-jump", MEASURES["horizontal-jump"].flags, HeightFlags(), PlaceFlags(y=(-0.2, 0.1)))
-    log = flags.log(5, RULES, seed=3)
+    flags = PlaceFlags(jumps=5, y=(-0.2, 0.1))
+    log = flags.log(TASK, seed=3)
     assert log.goals[:, 0, 0] == pytest.approx([0.3, 0.6, 0.9, 1.2, 1.5])
     aside = log.goals[:, 0, 1]
     assert -0.2 <= aside.min() < aside.max() <= 0.1
     assert len(set(log.headings)) == 5 and np.abs(log.headings).max() <= math.pi
-    assert np.array_equal(flags.log(5, RULES, seed=3).goals, log.goals)
-    assert not np.array_equal(flags.log(5, RULES, seed=4).headings, log.headings)
+    assert np.array_equal(flags.log(TASK, seed=3).goals, log.goals)
+    assert not np.array_equal(flags.log(TASK, seed=4).headings, log.headings)
 
 
 def test_one_heading_is_that_of_all_in_radians():
-    assert PlaceFlags((0.3, 0.4), (0.0, 0.0), 90.0).log(2, RULES, 0).headings == pytest.approx(0.5 * math.pi)
+    assert PlaceFlags(2, (0.3, 0.4), (0.0, 0.0), 90.0).log(TASK, 0).headings == pytest.approx(0.5 * math.pi)
 
 
-def test_flags_of_another_task_are_refused():
-    with pytest.raises(PolicyError, match="--x is not for policies of vertical-jump"):
-        flags_for("vertical-jump", HeightFlags(), HeightFlags(), PlaceFlags(x=(0.3, 0.5)))
-    with pytest.raises(PolicyError, match="--heading is not for policies of vertical-jump"):
-        flags_for("vertical-jump", HeightFlags(), HeightFlags(), PlaceFlags(heading="any"))  # its own default
-    with pytest.raises(PolicyError, match="--upper is not for policies of horizontal-jump"):
-        flags_for("horizontal-jump", PlaceFlags(), HeightFlags(upper=1.0), PlaceFlags())
+@pytest.mark.parametrize(
+    ("task", "args", "flag"),
+    [
+        ("vertical-jump", ["--x", "0.3", "0.5"], "--x"),
+        ("vertical-jump", ["--heading", "any"], "--heading"),
+        ("horizontal-jump", ["--upper", "1.0"], "--upper"),
+        ("horizontal-jump", ["--episodes", "3"], "--episodes"),
+    ],
+)
+def test_flags_of_another_task_are_refused(policies, task, args, flag):
+    with pytest.raises(InputError, match=f"{flag} is not for policies of {task}; jumper evaluate .* --help shows"):
+        evaluate.run([str(policies / task), *args], [])
+
+
+@pytest.mark.parametrize("command", [evaluate, play])
+def test_help_shows_the_flags_of_the_policy_only(policies, capsys, command):
+    shown = {}
+    for task in ("vertical-jump", "horizontal-jump"):
+        with pytest.raises(SystemExit) as end:
+            command.run([str(policies / task), "--help"], [])
+        assert end.value.code == 0
+        shown[task] = capsys.readouterr().out
+    flags = {evaluate: ("--upper", "--heading"), play: ("--height", "--goal")}[command]
+    for task, there, missing in (("vertical-jump", *flags), ("horizontal-jump", *reversed(flags))):
+        assert there in shown[task] and missing not in shown[task] and "--solver" in shown[task]
+
+
+@pytest.mark.parametrize("command", [evaluate, play])
+@pytest.mark.parametrize("args", [[], ["--height", "0.9", "vertical_jump"]])
+def test_policy_comes_first(command, args):
+    with pytest.raises(InputError, match="the policy comes first: jumper (play|evaluate) POLICY"):
+        command.run(args, [])
 
 
 def test_range_of_places_counts_distances():
     goals = [[0.3, 0.0], [0.0, -0.3], [0.6, 0.6]]
-    landings = PlaceFlags((0.0, 0.0), (0.0, 0.0), 0.0).log(3, RULES, 0)
+    flags = PlaceFlags(3, (0.0, 0.0), (0.0, 0.0), 0.0, in_range=(0.3, 0.5))
+    landings = flags.log(TASK, 0)
     landings.goals[:, 0] = goals
     landings.place[:, 0], landings.target[:, 0] = goals, goals
     landings.heading[:], landings.yaw[:], landings.tilt[:] = 0.0, 0.0, 0.0
     landings.end[:, 0] = [0, 0, 2]
-    figures = place_figures(landings, (0.3, 0.5))
-    assert (figures["success_rate_in_range"], figures["success_rate"]) == (1.0, pytest.approx(2 / 3))
-    assert (figures["range_lower_m"], figures["range_upper_m"]) == (0.3, 0.5)
+    metrics = flags.metrics(landings)
+    assert (metrics["success_rate_in_range"], metrics["success_rate"]) == (1.0, pytest.approx(2 / 3))
+    assert (metrics["range_lower_m"], metrics["range_upper_m"]) == (0.3, 0.5)
+
+
+def test_heights_are_spread_evenly():
+    assert HeightFlags(3, 0.6, 1.0).log(TASK, 0).target == pytest.approx([0.6, 0.8, 1.0])
 
 
 def test_csv_has_a_line_a_jump_and_nothing_where_there_is_no_number():
-    jumps = Jumps(np.array([0.5, 0.8]), RULES)
+    jumps = Jumps(np.array([0.5, 0.8]), ("success", "came_apart", "low_base"))
     jumps.end[:], jumps.apex[:] = [0, 1], [0.52, np.nan]
     assert csv_text(jumps).splitlines() == [
         "target_m,apex_m,error_m,end",

@@ -3,27 +3,29 @@ import math
 import numpy as np
 import pytest
 
-from jumper_warp.evaluation.jumps import Jumps, jump_figures
+from jumper_warp.evaluation.heights import jump_metrics
+from jumper_warp.evaluation.jumps import Jumps
 
 
 def step_of(jumps, **changes):
     count = len(jumps.target)
     arrays = {
-        "phase": np.zeros(count, dtype=int), "phase_steps": np.zeros(count, dtype=int), "rule": np.full(count, -1),
+        "phase": np.zeros(count, dtype=int), "phase_steps": np.zeros(count, dtype=int), "ending": np.full(count, -1),
         "max_height": np.zeros(count), "peak_tilt": np.zeros(count), "base_vel": np.zeros((count, 3)),
+        "steps": np.full(count, 40), "command_step": np.full(count, 30),
     }  # fmt: skip
     return arrays | {name: np.array(value) for name, value in changes.items()}
 
 
-def test_figures_by_hand():
+def test_metrics_by_hand():
     jumps = Jumps(np.array([0.5, 0.8, 1.1, 1.2]), ("success", "came_apart", "collided"))
     landed = {"phase": [2, 0, 2, 0], "phase_steps": [60, 0, 60, 0]}
     heights = {"max_height": [0.52, 1.0e13, 1.06, 0.4], "peak_tilt": [0.1, 3.0, 0.2, 0.0]}
     speeds = {"base_vel": [[0.0, 0.03, 0.04], [9.0] * 3, [0.0, 0.0, -0.2], [0.0] * 3]}
-    assert not jumps.update(step_of(jumps, rule=[0, 1, 0, -1], **landed, **heights, **speeds), 1.0 / 60.0)
+    assert not jumps.update(step_of(jumps, ending=[0, 1, 0, -1], **landed, **heights, **speeds), 1.0 / 60.0)
     later = {"max_height": [9.0, 9.0, 9.0, 0.9], "peak_tilt": [3.0] * 4}
-    assert jumps.update(step_of(jumps, rule=[2, 2, 2, 2], **later), 1.0 / 60.0)
-    figures = jump_figures(jumps, (0.5, 1.1))
+    assert jumps.update(step_of(jumps, ending=[2, 2, 2, 2], **later), 1.0 / 60.0)
+    metrics = jump_metrics(jumps, (0.5, 1.1))
     expected = {
         "jumps": 4,
         "mean_abs_error_m": (0.02 + 0.04 + 0.3) / 3,
@@ -39,21 +41,28 @@ def test_figures_by_hand():
         "failed_by_came_apart": 1,
         "failed_by_collided": 1,
     }
-    assert {name: figures[name] for name in expected} == pytest.approx(expected, abs=1e-9)
+    assert {name: metrics[name] for name in expected} == pytest.approx(expected, abs=1e-9)
 
 
 def test_jump_that_never_ends_is_a_failure():
     jumps = Jumps(np.array([0.5]), ("success",))
     assert not jumps.update(step_of(jumps), 1.0 / 60.0)
-    figures = jump_figures(jumps, (0.5, 1.1))
-    assert figures["success_rate"] == 0.0 and figures["failed_by_no_end"] == 1
-    assert figures["max_landing_tilt_deg"] is None
+    metrics = jump_metrics(jumps, (0.5, 1.1))
+    assert metrics["success_rate"] == 0.0 and metrics["failed_by_no_end"] == 1
+    assert metrics["max_landing_tilt_deg"] is None
 
 
 def test_columns_have_a_row_a_jump_and_none_where_there_is_no_number():
     jumps = Jumps(np.array([0.5, 0.8]), ("success", "came_apart"))
-    jumps.update(step_of(jumps, rule=[0, 1], max_height=[0.52, np.nan]), 1.0 / 60.0)
+    jumps.update(step_of(jumps, ending=[0, 1], max_height=[0.52, np.nan]), 1.0 / 60.0)
     assert jumps.columns() == {
         "target_m": [0.5, 0.8], "apex_m": [pytest.approx(0.52), None], "error_m": [pytest.approx(0.02), None],
         "end": ["success", "came_apart"],
     }  # fmt: skip
+
+
+def test_jump_is_early_if_it_has_begun_when_the_command_comes():
+    jumps = Jumps(np.array([0.5, 0.8, 1.0]), ("success", "came_apart"))
+    for step, phase in ((29, [0, 1, 0]), (30, [0, 1, 0]), (31, [1, 2, 0])):
+        jumps.update(step_of(jumps, steps=[step] * 3, phase=phase), 1.0 / 60.0)
+    assert jumps.early.tolist() == [False, True, False]

@@ -5,19 +5,12 @@ import numpy as np
 import pytest
 import warp as wp
 
-from jumper_warp.evaluation.landings import (
-    Landings,
-    ends_of_a_test,
-    landing_figures,
-    longest,
-    trained_range,
-    wrapped,
-    yaw_of,
-)
+from jumper_warp.evaluation.landings import Landings, for_evaluation, longest, wrapped, yaw_of
+from jumper_warp.evaluation.places import landing_metrics, trained_range
 from jumper_warp.registry import make_task
 
 DT = 1.0 / 60.0
-RULES = ("success", "came_apart", "low_base", "collided", "no_jump")
+TERMINATIONS = ("success", "came_apart", "low_base", "collided", "no_jump")
 COLLIDED, NO_JUMP = 3, 4
 QUARTER = math.radians(90.0)
 
@@ -37,23 +30,23 @@ class Stub:
             "base_pos": np.zeros((count, 3)), "base_quat": np.tile([0.0, 0.0, 0.0, 1.0], (count, 1)),
             "base_vel": np.zeros((count, 3)), "goal": np.zeros((count, 3)), "heading": np.zeros(count),
             "max_height": np.zeros(count), "peak_tilt": np.zeros(count), "took_off": np.zeros(count, dtype=int),
-            "steps": np.full(count, 40), "command_step": np.full(count, 30), "rule": np.full(count, -1),
+            "steps": np.full(count, 40), "command_step": np.full(count, 30), "ending": np.full(count, -1),
             "touched_down": np.zeros(count, dtype=int),
             "phase": np.zeros(count, dtype=int), "phase_steps": np.zeros(count, dtype=int),
         }  # fmt: skip
 
-    def evaluation_reset(self, goals, command_delay, headings):
-        self.delay = command_delay
+    def evaluation_reset(self, goals, headings):
+        self.command_step = goals[:, 3]
         cos, sin = np.cos(headings), np.sin(headings)
         self.arrays["goal"][:, 0] = cos * goals[:, 0] - sin * goals[:, 1]
         self.arrays["goal"][:, 1] = sin * goals[:, 0] + cos * goals[:, 1]
         self.arrays["heading"][:] = headings
 
-    def next_jump(self, goals, worlds):
+    def command(self, goals, worlds):
         self.commanded.append((goals.copy(), worlds.copy()))
         for name in ("phase", "phase_steps"):
             self.arrays[name][worlds] = 0
-        self.arrays["goal"][worlds] = self.arrays["base_pos"][worlds] + goals[worlds]
+        self.arrays["goal"][worlds] = self.arrays["base_pos"][worlds] + goals[worlds, :3]
 
     def task_arrays(self):
         return self.arrays
@@ -72,7 +65,7 @@ class Stub:
 def five_jumps():
     """One good, one that misses, one that comes apart, one that collides, one without a jump; heading left."""
     goals = np.array([[[1.0, 0.0]], [[0.6, 0.2]], [[0.8, 0.0]], [[1.2, 0.0]], [[0.5, 0.0]]])
-    landings = Landings(goals, RULES, QUARTER)
+    landings = Landings(goals, TERMINATIONS, QUARTER)
     env = Stub(5)
     landings.begin(env)
     # headed to the left, the goals lie at (-y, x)
@@ -86,7 +79,7 @@ def five_jumps():
         base_pos=[[0.03, 0.96, 0.3], [-0.2, 0.8, 0.3], [1e9, 0.0, 0.0], [0.0, 0.9, 0.1], [0.0, 0.0, 0.3]],
         base_quat=[about_z(QUARTER + 0.1), about_z(QUARTER - 0.3), *([[0.0, 0.0, 0.0, 1.0]] * 3)],
         base_vel=[[0.0, 0.06, 0.0], [0.2, 0.0, 0.0], *([[0.0] * 3] * 3)],
-        phase=[2, 2, 1, 2, 0], phase_steps=[60, 60, 3, 20, 9], rule=[0, -1, 1, COLLIDED, NO_JUMP],
+        phase=[2, 2, 1, 2, 0], phase_steps=[60, 60, 3, 20, 9], ending=[0, -1, 1, COLLIDED, NO_JUMP],
         peak_tilt=[0.1, 0.2, 3.0, 1.0, 0.0], max_height=[0.6, 0.5, 9.0, 0.7, 0.3],
     )  # fmt: skip
     assert landings.follow(env)
@@ -100,7 +93,7 @@ def test_landing_is_measured_ahead_and_to_the_left_of_the_heading():
     assert landings.outcomes[:, 0].tolist() == ["success", "missed", "came_apart", "collided", "no_jump"]
 
 
-def test_figures_by_hand():
+def test_metrics_by_hand():
     landings = five_jumps()
     inside = np.array([True, True, True, False, False])[:, None]
     expected = {
@@ -135,33 +128,33 @@ def test_figures_by_hand():
         "failed_by_collided": 1,
         "failed_by_no_jump": 1,
     }
-    assert landing_figures(landings, inside) == pytest.approx(expected, abs=1e-6)
+    assert landing_metrics(landings, inside) == pytest.approx(expected, abs=1e-6)
 
 
 def test_nothing_changes_after_the_end():
     landings = five_jumps()
     before = landings.landing.copy()
     later = Stub(5)
-    later.now(rule=COLLIDED, base_pos=7.0)
+    later.now(ending=COLLIDED, base_pos=7.0)
     assert landings.follow(later)
     assert np.array_equal(landings.landing, before) and landings.success.sum() == 1
 
 
 def test_jump_before_the_command_is_no_success():
-    landings, env = Landings(np.zeros((1, 1, 2)), RULES), Stub(1)
+    landings, env = Landings(np.zeros((1, 1, 2)), TERMINATIONS), Stub(1)
     landings.begin(env)
     env.now(took_off=1, steps=29)
     assert not landings.follow(env)
     env.now(took_off=0, steps=120, phase=2, phase_steps=60)
     assert landings.follow(env)
-    figures = landing_figures(landings)
-    assert (figures["success_rate"], figures["early_rate"], figures["landing_rate"]) == (0.0, 1.0, 1.0)
-    assert figures["failed_by_early"] == 1
+    metrics = landing_metrics(landings)
+    assert (metrics["success_rate"], metrics["early_rate"], metrics["landing_rate"]) == (0.0, 1.0, 1.0)
+    assert metrics["failed_by_early"] == 1
 
 
 @pytest.mark.parametrize(("steps", "hopped"), [([3, 3], False), ([1, 4], True)])
 def test_long_enough_in_the_air_after_touchdown_is_another_jump(steps, hopped):
-    landings, env = Landings(np.zeros((1, 1, 2)), RULES), Stub(1)
+    landings, env = Landings(np.zeros((1, 1, 2)), TERMINATIONS), Stub(1)
     landings.begin(env)
     for phase, force, count in ((1, 0.0, 20), (2, 0.0, steps[0]), (2, 9.0, 2), (2, 0.05, steps[1])):
         env.now(phase=phase)
@@ -172,9 +165,9 @@ def test_long_enough_in_the_air_after_touchdown_is_another_jump(steps, hopped):
     env.sim.paw_force.fill_(wp.vec3(0.0, 0.0, 9.0))
     assert landings.follow(env)
     assert landings.air_time[0, 0] == pytest.approx(max(steps) * DT)
-    figures = landing_figures(landings)
-    assert (figures["success_rate"], figures["second_hop_rate"]) == (1.0, float(hopped))
-    assert figures["single_jump_success_rate"] == float(not hopped)
+    metrics = landing_metrics(landings)
+    assert (metrics["success_rate"], metrics["second_hop_rate"]) == (1.0, float(hopped))
+    assert metrics["single_jump_success_rate"] == float(not hopped)
 
 
 @pytest.mark.parametrize(
@@ -187,7 +180,7 @@ def test_long_enough_in_the_air_after_touchdown_is_another_jump(steps, hopped):
     ],
 )
 def test_paw_lifted_again_after_its_own_contact_is_a_step(contacts, stepped):
-    landings, env = Landings(np.zeros((1, 1, 2)), RULES), Stub(1)
+    landings, env = Landings(np.zeros((1, 1, 2)), TERMINATIONS), Stub(1)
     landings.begin(env)
     for phase, rows in ((0, [((0, 1, 2, 3), 5)]), (1, [((), 20)]), (2, contacts)):
         env.now(phase=phase)
@@ -197,13 +190,13 @@ def test_paw_lifted_again_after_its_own_contact_is_a_step(contacts, stepped):
                 assert not landings.follow(env)
     env.now(phase_steps=60)
     assert landings.follow(env)
-    figures = landing_figures(landings)
-    assert (figures["success_rate"], figures["second_hop_rate"]) == (1.0, 0.0)
-    assert (figures["step_rate"], figures["step_free_success_rate"]) == (float(stepped), float(not stepped))
+    metrics = landing_metrics(landings)
+    assert (metrics["success_rate"], metrics["second_hop_rate"]) == (1.0, 0.0)
+    assert (metrics["step_rate"], metrics["step_free_success_rate"]) == (float(stepped), float(not stepped))
 
 
 def test_flight_of_the_next_jump_is_no_step():
-    landings, env = Landings(np.zeros((1, 2, 2)), RULES), Stub(1)
+    landings, env = Landings(np.zeros((1, 2, 2)), TERMINATIONS), Stub(1)
     landings.begin(env)
     env.now(phase=2, phase_steps=60)
     assert not landings.follow(env) and len(env.commanded) == 1
@@ -217,18 +210,18 @@ def test_flight_of_the_next_jump_is_no_step():
 
 
 def test_jump_that_does_not_end_fails_where_it_is():
-    landings, env = Landings(np.array([[[0.4, 0.0]]]), RULES), Stub(1)
+    landings, env = Landings(np.array([[[0.4, 0.0]]]), TERMINATIONS), Stub(1)
     landings.begin(env)
     assert not landings.follow(env)
-    figures = landing_figures(landings)
-    assert figures["mean_error_m"] == pytest.approx(0.4) and figures["failed_by_no_end"] == 1
+    metrics = landing_metrics(landings)
+    assert metrics["mean_error_m"] == pytest.approx(0.4) and metrics["failed_by_no_end"] == 1
 
 
 def two_in_a_row():
     """A row that goes through, and one whose first jump collides."""
-    landings, env = Landings(np.array([[[0.8, 0.2], [0.7, 0.0]]] * 2), RULES, rest=0.5), Stub(2)
+    landings, env = Landings(np.array([[[0.8, 0.2], [0.7, 0.0]]] * 2), TERMINATIONS, rest=0.5), Stub(2)
     landings.begin(env)
-    env.now(base_pos=[0.8, 0.15, 0.3], phase=2, phase_steps=[29, 10], rule=[-1, COLLIDED])
+    env.now(base_pos=[0.8, 0.15, 0.3], phase=2, phase_steps=[29, 10], ending=[-1, COLLIDED])
     assert not landings.follow(env) and not env.commanded
     env.now(phase_steps=30)
     assert not landings.follow(env)
@@ -244,14 +237,14 @@ def test_next_jump_is_commanded_after_the_rest_and_only_after_a_landing():
 
 def test_next_jump_is_measured_from_its_own_goal():
     landings, env = two_in_a_row()
-    env.now(base_pos=[[1.48, 0.15, 0.3], [0.0, 0.0, 0.0]], phase=2, phase_steps=30, rule=0)
+    env.now(base_pos=[[1.48, 0.15, 0.3], [0.0, 0.0, 0.0]], phase=2, phase_steps=30, ending=0)
     assert landings.follow(env)
     assert landings.error[0] == pytest.approx([0.05, 0.02])
     assert landings.outcomes.tolist() == [["success", "success"], ["collided", "not_begun"]]
-    figures = landing_figures(landings)
-    assert figures["jumps"] == 3 and figures["success_rate"] == pytest.approx(2 / 3)
-    assert "success_rate_in_range" not in figures and "mean_error_in_range_m" not in figures
-    everywhere = landing_figures(landings, np.ones((2, 2), dtype=bool))
+    metrics = landing_metrics(landings)
+    assert metrics["jumps"] == 3 and metrics["success_rate"] == pytest.approx(2 / 3)
+    assert "success_rate_in_range" not in metrics and "mean_error_in_range_m" not in metrics
+    everywhere = landing_metrics(landings, np.ones((2, 2), dtype=bool))
     assert everywhere["success_rate_in_range"] == pytest.approx(2 / 3)
     assert landings.marks([0])[0, :, :2] == pytest.approx(np.array([[0.8, 0.2], [1.5, 0.15]]))
 
@@ -265,9 +258,9 @@ def test_columns_have_a_row_a_jump_and_none_for_jumps_that_were_not_begun():
     assert landings.series([1])["distance/goal of 1 [m]"] == pytest.approx(0.05)
 
 
-def test_ends_of_a_test_leave_the_shaping_out():
-    rules = ends_of_a_test(make_task("horizontal-jump")).rules
-    assert {rule.name for rule in rules} == set(RULES) and rules[0].name == "success"
+def test_terminations_of_an_evaluation_leave_the_shaping_out():
+    terms = for_evaluation(make_task("horizontal-jump")).terminations
+    assert {term.name for term in terms} == set(TERMINATIONS) and terms[0].name == "success"
 
 
 @pytest.mark.parametrize(("task", "range_m"), [("horizontal-jump", [0.2, 2.2]), ("omnidirectional-jump", [0.0, 0.7])])
@@ -277,8 +270,8 @@ def test_trained_range_is_that_of_all_levels_straight_ahead(task, range_m):
 
 def test_each_world_may_have_its_own_time_of_the_command():
     env = Stub(2)
-    Landings(np.zeros((2, 1, 2)), RULES, delay=np.array([0.5, 0.25])).begin(env)
-    assert env.delay.tolist() == [0.5, 0.25]
+    Landings(np.zeros((2, 1, 2)), TERMINATIONS, delay=np.array([0.5, 0.25])).begin(env)
+    assert env.command_step.tolist() == [30.0, 15.0]
 
 
 def test_row_has_time_for_every_jump():
@@ -287,7 +280,7 @@ def test_row_has_time_for_every_jump():
 
 def test_goals_of_another_shape_are_refused():
     with pytest.raises(ValueError, match="goals must have shape"):
-        Landings(np.zeros((3, 2)), RULES)
+        Landings(np.zeros((3, 2)), TERMINATIONS)
 
 
 @pytest.mark.parametrize("angle", [-3.0, -0.5, 0.0, 2.0])

@@ -29,7 +29,7 @@ def env():
 
 @pytest.fixture
 def standing(env):
-    env.evaluation_reset(np.zeros((8, 3)), 0.0)
+    env.evaluation_reset(np.zeros((8, 4)))
     return Takeoffs(env)
 
 

@@ -7,7 +7,7 @@ import pytest
 
 from experiments import distance_limit as limit
 from jumper_warp.cli.main import run_command
-from jumper_warp.evaluation.trial import Trial, TrialArgs
+from jumper_warp.evaluation.run import EvaluationArgs, EvaluationRun
 from jumper_warp.registry import make_task
 from kernels import layout
 
@@ -24,7 +24,7 @@ def env():
 
 
 def test_score_against_hand_numbers(env):
-    env.evaluation_reset(np.zeros((8, 3)), 0.0)
+    env.evaluation_reset(np.zeros((8, 4)))
     takeoffs = limit.Takeoffs(env)
     takeoffs.off[:7] = True
     takeoffs.com[:] = takeoffs.start + [0.3, 0.0, 0.0]
@@ -42,8 +42,8 @@ def test_score_against_hand_numbers(env):
 
 def test_policy_takes_off_as_its_own_touchdown_says(tmp_path):
     """The flight told for the policy is where its base comes down, but for posture and height."""
-    trial = Trial("distance_limit", TrialArgs(record=0, out=tmp_path, device="cpu"))
-    takeoffs, landings, actions = limit.fly_policy(trial)
+    run = EvaluationRun.of("distance_limit", EvaluationArgs(record=0, out=tmp_path, device="cpu"))
+    takeoffs, landings, actions = limit.fly_policy(run)
     assert (takeoffs.flight > 1.2).all() and landings.success.all()
     assert takeoffs.touchdown == pytest.approx(takeoffs.flight, abs=0.15)
     assert takeoffs.touchdown == pytest.approx(landings.touchdown[:, 0, 0], abs=1e-6)
@@ -62,15 +62,15 @@ def test_each_limit_changes_what_it_names():
     assert kinds["speed"].no_load_speed == pytest.approx(1.5 * kinds["pitch"].no_load_speed)
     assert {kinds[name] for name in ("knees", "friction_1_5", "stance", "filter", "mass")} == {task.motors.transversal}
     assert limit.LIMITS["filter"].task(task).command_filter.horizon < task.command_filter.horizon
-    rules = limit.env_of_limit(limit.NOMINAL, ARGS).task.rules
-    assert [rule.name for rule in rules] == ["success", "came_apart", "low_base", "left_stance", "collided"]
-    names = [rule.name for rule in limit.env_of_limit(limit.LIMITS["stance"], ARGS).task.rules]
+    terms = limit.env_of_limit(limit.NOMINAL, ARGS).task.terminations
+    assert [term.name for term in terms] == ["success", "came_apart", "low_base", "left_stance", "collided"]
+    names = [term.name for term in limit.env_of_limit(limit.LIMITS["stance"], ARGS).task.terminations]
     assert names == ["success", "came_apart", "low_base", "collided"]
 
 
 def test_limits_of_the_model_reach_the_solver():
     changed = limit.env_of_limit(limit.NOMINAL, ARGS)
-    table = changed._dynamics.robot.table
+    table = changed.sim.physics.dynamics.robot.table
     before = table.numpy()[:, 0].copy()
     mass = [layout.BASE, layout.HOUSING]
     for name, rows, ratio in (("mass", mass, 0.9), ("friction_0_6", [layout.MU_STATIC], 0.6 / 0.85)):

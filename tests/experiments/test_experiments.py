@@ -1,14 +1,19 @@
 import json
-from types import SimpleNamespace
+from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from landing_helpers import still_policy
 
-from experiments import ablations, benchmark_training, new_reward, vertical_jump_sweep
-from jumper_warp.envs.env import plain
+from experiments import ablations, benchmark_solver, benchmark_training, new_reward, soak_test, vertical_jump_sweep
+from jumper_warp.evaluation.heights import sweep_metrics
 from jumper_warp.evaluation.jumps import Jumps, run_jumps
+from jumper_warp.evaluation.learning import Curve
+from jumper_warp.evaluation.run import HEIGHTS, EvaluationRun
+from jumper_warp.evaluation.soak import SoakArgs
+from jumper_warp.policies.folder import save_policy
 from jumper_warp.registry import make_task
 from jumper_warp.rl.ppo import PpoCfg
 from jumper_warp.tasks.jump.ablations import (
@@ -17,8 +22,11 @@ from jumper_warp.tasks.jump.ablations import (
     without_estimate,
     without_reference_states,
 )
+from jumper_warp.tasks.saving import plain
+from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.timing import flags_of, over_baseline
 
-SWEEP_RULES = ("success", "came_apart", "low_base", "tilted", "collided", "no_jump", "too_long")
+SWEEP_ENDS = ("success", "came_apart", "low_base", "tilted", "collided", "no_jump", "too_long")
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 
@@ -45,10 +53,11 @@ def test_new_reward_is_trained_with_and_logged_by_its_name(trained):
 # ---------------------------------------------------------------- the sweep
 
 
-def jumps_of(target, apex, end, tilt_deg, rest_speed):
-    jumps = Jumps(np.array(target), SWEEP_RULES)
+def jumps_of(target, apex, end, tilt_deg, rest_speed, early=False):
+    jumps = Jumps(np.array(target), SWEEP_ENDS)
     jumps.apex, jumps.end = np.array(apex), np.array(end)
     jumps.tilt, jumps.rest_speed = np.radians(tilt_deg), np.array(rest_speed)
+    jumps.early[:] = early
     return jumps
 
 
@@ -59,9 +68,9 @@ def test_sweep_figures_against_hand_numbers():
         end=[0, 0, 4, 0, 2, 0, 0, 0],
         tilt_deg=[5.0, 9.0, 1.0, 2.0, 20.0, 11.0, 3.0, 4.0],
         rest_speed=[0.01, 0.2, np.inf, 0.02, np.inf, 0.01, 0.01, 0.01],
+        early=[False] * 6 + [True, False],
     )
-    early = np.array([False] * 6 + [True, False])
-    figures = vertical_jump_sweep.figures(jumps, early)
+    figures = sweep_metrics(jumps, vertical_jump_sweep.IN_RANGE)
     # errors 0.09 0 0 -0.20 -0.02 -0.07 -0.09 -0.15
     assert figures["mean_abs_error_m"] == pytest.approx(0.62 / 8)
     assert figures["mean_abs_error_in_range_m"] == pytest.approx(0.31 / 5)
@@ -82,12 +91,12 @@ def test_sweep_figures_against_hand_numbers():
         "success_rate_reachable": 5 / 6,
         "reachable_share": 6 / 8,
     }
-    assert vertical_jump_sweep.limit_figures(jumps, early) == pytest.approx(expected)
+    assert vertical_jump_sweep.limit_metrics(jumps) == pytest.approx(expected)
 
 
 def test_a_world_that_came_apart_is_no_success_and_no_error():
     jumps = jumps_of([0.6, 0.8, 1.0], [0.65, 1e6, np.nan], [0, 1, 1], [1.0] * 3, [0.0] * 3)
-    figures = vertical_jump_sweep.figures(jumps, np.zeros(3, dtype=bool))
+    figures = sweep_metrics(jumps, vertical_jump_sweep.IN_RANGE)
     assert figures["mean_abs_error_m"] == pytest.approx(0.05)
     assert figures["success_rate"] == pytest.approx(1 / 3)
     assert figures["came_apart"] == 2
@@ -108,17 +117,17 @@ class Script:
 
 
 @pytest.fixture(scope="module")
-def sweep_env():
-    return vertical_jump_sweep.make_env(
-        still_policy("vertical-jump"), vertical_jump_sweep.Args(jumps=3, record=0, device="cpu")
-    )
+def sweep_env(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("sweep")
+    save_policy(folder / "still", still_policy("vertical-jump"))
+    args = vertical_jump_sweep.Args(policy=str(folder / "still"), jumps=3, record=0, out=folder, device="cpu")
+    return vertical_jump_sweep.make_env(EvaluationRun.of("sweep", args, HEIGHTS), args)
 
 
 @pytest.mark.parametrize(("begin", "early"), [(31, False), (-45, True)])
 def test_scripted_jump_reaches_the_open_loop_height_and_lands(sweep_env, begin, early):
     targets = np.array([0.5, 0.7, 1.05])
-    observer = vertical_jump_sweep.Observer(Script(begin), sweep_env)
-    figures = vertical_jump_sweep.figures(run_jumps(observer.act, sweep_env, targets), observer.early)
+    figures = sweep_metrics(run_jumps(Script(begin).act, sweep_env, targets), vertical_jump_sweep.IN_RANGE)
     assert figures["largest_reached_m"] == pytest.approx(vertical_jump_sweep.OPEN_LOOP_LIMIT, abs=0.02)
     assert figures["landing_rate"] == 1.0
     assert figures["early_rate"] == (1.0 if early else 0.0)
@@ -140,7 +149,7 @@ def test_sweep_of_a_run_leaves_figures_plot_recording_and_filmstrip(trained, tmp
         "jumps",
     } <= saved.keys()
     assert {"landing_rate", "largest_tilt_deg", "largest_reached_m"} <= saved.keys()
-    of_the_nominal_robot = vertical_jump_sweep.limit_figures(Jumps(np.array([0.6]), SWEEP_RULES), np.zeros(1, bool))
+    of_the_nominal_robot = vertical_jump_sweep.limit_metrics(Jumps(np.array([0.6]), SWEEP_ENDS))
     assert not saved.keys() & of_the_nominal_robot.keys()
     assert (saved["jumps"], saved["torque_limit_nm"], saved["randomize"]) == (3, 18.0, True)
     for name in ("sweep.png", "jumps.rrd", "jump_1.20_m.png"):
@@ -156,12 +165,12 @@ def test_each_ablation_changes_its_own_part_only():
     parts = {name: {key for key, value in plain(change(task)).items() if value != plainly[key]}
              for name, change in ABLATIONS.items()}  # fmt: skip
     assert parts == {
-        "without_estimate": {"terms"}, "without_reference_states": {"reset"}, "without_curriculum": {"levels"},
+        "without_estimate": {"rewards"}, "without_reference_states": {"reset"}, "without_curriculum": {"levels"},
     }  # fmt: skip
-    weights = {term.name: term.weight for term in without_estimate(task).terms}
+    weights = {term.name: term.weight for term in without_estimate(task).rewards}
     assert weights["estimated_jump_height"] == 0.0
-    assert weights["jump_height"] == {term.name: term.weight for term in task.terms}["jump_height"] > 0.0
-    reset = without_reference_states(task).reset
+    assert weights["jump_height"] == {term.name: term.weight for term in task.rewards}["jump_height"] > 0.0
+    reset = without_reference_states(task).reset.settings
     assert (reset.standing, reset.default, reset.in_flight, reset.touchdown) == (0.8, 0.2, 0.0, 0.0)
     assert without_curriculum(task).levels == (task.levels[-1],)
 
@@ -169,11 +178,11 @@ def test_each_ablation_changes_its_own_part_only():
 def test_ablation_of_a_task_without_the_estimate_is_refused():
     task = make_task("vertical-jump")
     with pytest.raises(ValueError, match="estimated_jump_height"):
-        without_estimate(SimpleNamespace(name="other", terms=task.terms[:1]))
+        without_estimate(replace(task, name="other", rewards=task.rewards[:1]))
 
 
 def test_seconds_to_a_rate_are_those_of_the_first_evaluation_that_has_it():
-    curve = ablations.Curve(seconds=[5.0, 10.0, 15.0, 20.0], success=[0.1, 0.85, 0.7, 0.9])
+    curve = Curve(seconds=[5.0, 10.0, 15.0, 20.0], success=[0.1, 0.85, 0.7, 0.9])
     assert curve.seconds_to(0.8) == 10.0
     assert curve.seconds_to(0.95) is None
 
@@ -209,3 +218,59 @@ def test_benchmark_reports_solver_environment_and_both_trainers(tmp_path):
     assert sum(values[f"{part}_share"] for part in parts) == pytest.approx(1.0)
     assert all(values[f"{part}_us"] > 0.0 for part in parts)
     assert values["ppo_collect_s"] + values["ppo_update_s"] == pytest.approx(values["ppo_iteration_s"], rel=0.2)
+
+
+def test_soak_of_a_simulation_and_of_an_environment_finds_finite_worlds(tmp_path):
+    for task in (None, "horizontal-jump"):
+        args = SoakArgs(envs=8, steps=40, episode=20, task=task, out=tmp_path, device="cpu")
+        values = soak_test.main(args)
+        saved = json.loads((tmp_path / "figures.json").read_text())
+        assert saved == values | {"envs": 8, "filter": False, "seed": 0}
+        assert (values["steps"], values["non_finite_worlds"]) == (320, 0)
+        assert 0.01 < values["largest_speed_m_s"] < 10.0 and values["largest_joint_speed_rad_s"] > 1.0
+
+
+def test_worlds_that_come_apart_in_a_soaked_environment_are_counted(tmp_path, monkeypatch):
+    step = soak_test.Env.step
+    monkeypatch.setattr(soak_test.Env, "step", lambda env, action: step(env, torch.full_like(action, torch.nan)))
+    args = SoakArgs(envs=4, steps=5, episode=100, task="vertical-jump", out=tmp_path, device="cpu")
+    assert soak_test.main(args)["non_finite_worlds"] == 20
+
+
+def test_rates_are_told_over_those_of_a_baseline(tmp_path):
+    script = tmp_path / "base" / "experiments" / "script.py"
+    script.parent.mkdir(parents=True)
+    script.write_text(
+        "import json, sys\n"
+        "assert sys.argv[1:6] == ['--envs', '4', '8', '--no-noise', '--out'], sys.argv\n"
+        "json.dump({'steps_per_s_jump': 50.0, 'apex_m': 1.0}, open(sys.argv[6] + '/figures.json', 'w'))"
+    )
+
+    @dataclass
+    class Args:
+        envs: tuple
+        noise: bool
+        baseline: Path
+        out: Path | None = None
+        device: str | None = None
+
+    figures = {"steps_per_s_jump": 100.0, "steps_per_s_new": 7.0, "apex_m": 1.1}
+    args = Args((4, 8), False, tmp_path / "base")
+    ratios = over_baseline(args.baseline, "experiments/script.py", args, figures)
+    assert ratios == {"steps_per_s_jump_over_baseline": 2.0}
+    assert over_baseline(None, "experiments/script.py", args, figures) == {}
+    with pytest.raises(InputError, match="fails: .*AssertionError"):
+        over_baseline(args.baseline, "experiments/script.py", Args((4,), False, args.baseline), figures)
+    with pytest.raises(InputError, match="no experiments/other.py in"):
+        over_baseline(args.baseline, "experiments/other.py", args, figures)
+    assert flags_of(Args((4,), True, tmp_path, device="cpu")) == ["--envs", "4", "--noise", "--device", "cpu"]
+
+
+def test_benchmark_of_solvers_tells_both_and_their_ratio(tmp_path):
+    args = benchmark_solver.Args(envs=[2], repeats=1, steps=2, out=tmp_path, device="cpu")
+    values = benchmark_solver.main(args)
+    assert values == json.loads((tmp_path / "figures.json").read_text())
+    for solver in ("jumper", "mujoco"):
+        assert values[f"{solver}_apex_m"] > 0.8 and values[f"{solver}_steps_per_s_jump"] > 0.0
+    expected = values["jumper_steps_per_s_standing"] / values["mujoco_steps_per_s_standing"]
+    assert values["ratio_standing"] == pytest.approx(expected) and values["ratio_jump"] > 0.0

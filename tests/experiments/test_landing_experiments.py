@@ -18,13 +18,15 @@ from experiments import (
     platform_jump,
 )
 from experiments.vertical_jump_sweep import OPEN_LOOP_LIMIT
-from jumper_warp.cli.main import UsageError
-from jumper_warp.evaluation.jumps import rule_names, run
-from jumper_warp.evaluation.landings import ENDS, Landings
-from jumper_warp.evaluation.trial import Trial, TrialArgs, beside, shown
+from jumper_warp.evaluation.distances import distance_metrics, row_of, verdict
+from jumper_warp.evaluation.landings import ENDS, Landings, beside
+from jumper_warp.evaluation.log import run_evaluation, termination_names
+from jumper_warp.evaluation.plots import Track
+from jumper_warp.evaluation.run import EvaluationArgs, EvaluationRun, shown
 from jumper_warp.policies.folder import save_policy
 from jumper_warp.policies.restore import Conditions, env_of_policy
 from jumper_warp.policies.spec import PolicyError
+from jumper_warp.utils.errors import InputError
 
 COLLIDED, NO_JUMP = ENDS.index("collided"), ENDS.index("no_jump")
 SHARED = {"mean_error_m", "success_rate", "success_rate_in_range", "jumps", "solver", "randomize", "seed"}
@@ -60,7 +62,7 @@ def ahead(distances):
 def test_sweep_counts_ranges_by_distance():
     goals = ahead([0.3, 0.7, 1.0, 1.4, 1.5])
     landings = ended(goals, goals + [[[0.02, 0.0]], [[0.0, 0.04]], [[0.0, 0.2]], [[0.03, 0.0]], [[-0.5, 0.0]]], 0)
-    figures = horizontal_jump_sweep.figures(landings)
+    figures = horizontal_jump_sweep.metrics(landings)
     assert figures["mean_error_m"] == pytest.approx(0.79 / 5)
     assert figures["success_rate"] == pytest.approx(3 / 5)
     assert figures["success_rate_in_range"] == pytest.approx(3 / 4)
@@ -82,7 +84,7 @@ def test_consecutive_figures_by_hand():
     row = ended(np.ones((2, 3, 2)), np.ones((2, 3, 2)) + [0.0, 0.04], [[0, 0, 0], [0, COLLIDED, -1]])
     row.heading[1, 2] = row.place[1, 2] = np.nan
     row.rest_speed[:] = [[0.05, 0.2, 0.05], [0.05, np.inf, np.inf]]
-    figures = consecutive_jumps.figures(pairs, row)
+    figures = consecutive_jumps.metrics(pairs, row)
     expected = {
         "jumps": 4,
         "mean_error_m": 0.29 / 4,
@@ -109,12 +111,12 @@ def test_consecutive_figures_by_hand():
 def test_row_without_a_fall_may_miss_its_goals():
     off = np.ones((2, 3, 2)) + [[[0.0, 0.0]] * 3, [[0.0, 0.0], [0.3, 0.0], [0.0, 0.0]]]
     pairs = np.ones((2, 2, 2))
-    figures = consecutive_jumps.figures(ended(pairs, pairs, 0), ended(np.ones((2, 3, 2)), off, 0))
+    figures = consecutive_jumps.metrics(ended(pairs, pairs, 0), ended(np.ones((2, 3, 2)), off, 0))
     assert (figures["ten_in_a_row_rate"], figures["row_all_on_goal_rate"]) == (1.0, 0.5)
 
 
 def test_paths_are_drawn_from_the_start_and_along_the_heading():
-    track = consecutive_jumps.Track()
+    track = Track()
     landings = Landings(np.zeros((2, 1, 2)), ENDS)
     for place in ([0.0, 0.0, 0.3], [0.0, 1.0, 0.3]):
         landings.seen = {"base_pos": np.array([place, place])}
@@ -143,7 +145,7 @@ def test_reliable_distance_is_the_last_bin_before_the_first_that_is_not():
         1.5: of(1.5, clean=10, stepped=8),
         1.6: of(1.6, clean=20),
     }
-    figures = max_jump.figures(bins)
+    figures = distance_metrics(bins, max_jump.IN_RANGE)
     expected = {
         "largest_reliable_m": 1.4, "largest_reliable_without_hop_m": 1.3, "largest_reliable_without_step_m": 1.2,
         "base_at_touchdown_m": 1.2, "base_at_touchdown_without_hop_m": 1.1, "base_at_touchdown_without_step_m": 1.0,
@@ -155,16 +157,17 @@ def test_reliable_distance_is_the_last_bin_before_the_first_that_is_not():
     assert figures["bin_single_jump_success_rate"] == pytest.approx([0.95, 1.0, 0.5, 0.9, 1.0])
     assert figures["bin_step_free_success_rate"] == pytest.approx([0.95, 0.5, 0.5, 0.5, 1.0])
     assert figures["bin_base_at_touchdown_m"] == pytest.approx([1.0, 1.1, 1.2, 1.3, 1.4])
-    assert "may go on with steps" in max_jump.verdict(figures)
-    assert "Of 1.4 m the base itself flew to 1.20 m" in max_jump.verdict(figures)
+    assert "may go on with steps" in verdict(figures)
+    assert "Of 1.4 m the base itself flew to 1.20 m" in verdict(figures)
 
 
 def test_distance_without_any_reliable_bin_is_none():
     goals = ahead([1.0, 1.0])
-    figures = max_jump.figures({1.0: ended(goals, goals, [[NO_JUMP], [NO_JUMP]])})
+    bins = {1.0: ended(goals, goals, [[NO_JUMP], [NO_JUMP]])}
+    figures = distance_metrics(bins, max_jump.IN_RANGE)
     assert figures["largest_reliable_m"] is None and figures["farthest_success_m"] is None
     assert figures["bin_base_at_touchdown_m"] == [None]
-    assert max_jump.row_of(figures, 0) == ["1.0", "0.0", "0.0", "0.0", ""]
+    assert row_of(figures, 0) == ["1.0", "0.0", "0.0", "0.0", ""]
 
 
 def test_figures_are_printed_with_four_digits_in_lists_too():
@@ -213,21 +216,23 @@ class Hop:
 def hops():
     """Hops on the spot, each world asked for another place, and a second hop that follows at once."""
     policy = still_policy("horizontal-jump")
-    rules = set(ENDS) - {"no_jump"}  # the script squats too long for the task's patience
+    ends = set(ENDS) - {"no_jump"}  # the script squats too long for the task's patience
 
     def change(task):
-        return dataclasses.replace(task, rules=tuple(rule for rule in task.rules if rule.name in rules))
+        return dataclasses.replace(task, terminations=tuple(term for term in task.terminations if term.name in ends))
 
     env = env_of_policy(policy, 3, Conditions(device="cpu"), change=change)
     goals = np.array([[[0.0, 0.0], [0.0, 0.05]], [[0.05, 0.0], [0.3, 0.0]], [[0.5, -0.2], [0.0, 0.0]]])
-    landings = Landings(goals, rule_names(env), headings=np.array([0.0, 2.0, -1.5]), delay=np.array([0.5, 0.4, 0.3]))
+    landings = Landings(
+        goals, termination_names(env.task), headings=np.array([0.0, 2.0, -1.5]), delay=np.array([0.5, 0.4, 0.3])
+    )
     script = Hop()
 
     def again():
         if (landings.current == 1).any() and script.begin == 31:
             script.begin = script.step + 1
 
-    run(script.act, env, landings, 8.0, again)
+    run_evaluation(script.act, env, landings, seconds=8.0, watch=again)
     return landings
 
 
@@ -291,13 +296,14 @@ def test_nothing_of_viewer_and_meshes_is_needed_without_a_recording(policy, tmp_
 
 
 def test_policy_of_another_task_is_refused_in_one_line(tmp_path):
-    with pytest.raises(PolicyError, match="needs a policy of horizontal-jump or omnidirectional-jump"):
-        Trial("test", TrialArgs(policy="vertical_jump", out=tmp_path, device="cpu"))
+    message = "needs a policy that is evaluated by place or around, vertical_jump is of vertical-jump, by height"
+    with pytest.raises(PolicyError, match=message):
+        EvaluationRun.of("test", EvaluationArgs(policy="vertical_jump", out=tmp_path, device="cpu"))
 
 
 def test_missing_device_is_refused(policy, tmp_path):
-    with pytest.raises(UsageError, match="no device 'abacus'"):
-        Trial("test", TrialArgs(policy=policy, out=tmp_path, device="abacus"))
+    with pytest.raises(InputError, match="no device 'abacus'"):
+        EvaluationRun.of("test", EvaluationArgs(policy=policy, out=tmp_path, device="abacus"))
 
 
 def test_script_refuses_a_policy_of_another_task_in_one_line_with_code_2(policy):
@@ -306,13 +312,13 @@ def test_script_refuses_a_policy_of_another_task_in_one_line_with_code_2(policy)
     done = subprocess.run(command, cwd=root, capture_output=True, text=True)
     (line,) = done.stderr.splitlines()
     assert (done.returncode, done.stdout) == (2, "")
-    assert line.startswith("jumper: this needs a policy of vertical-jump")
+    assert line.startswith("jumper: this needs a policy that is evaluated by height")
 
 
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: TrialArgs(record=-1), "record must not be negative"),
+        (lambda: EvaluationArgs(record=-1), "record must not be negative"),
         (lambda: horizontal_jump_sweep.Args(jumps=2), "at least 3 jumps"),
         (lambda: diagonal_jump_grid.Args(rows=0), "at least one jump, column and row"),
         (lambda: consecutive_jumps.Args(rest=0.0), "rest must be in"),

@@ -1,19 +1,29 @@
+import copy
 import dataclasses
 import json
 import math
+import random
+import sys
 
+import hold_height
 import pytest
 
-from jumper_warp.envs.env import plain
-from jumper_warp.policies.restore import restored_task
-from jumper_warp.policies.spec import PolicyError, PolicyInterface, interface_of_task
+from jumper_warp.policies.folder import list_policies, load_policy
+from jumper_warp.policies.restore import Conditions, env_of_policy, restored_task
+from jumper_warp.policies.spec import PolicyError, PolicyInterface, make_interface
 from jumper_warp.registry import make_task
-from jumper_warp.tasks.cfg import GroundCfg, Rule, Term
+from jumper_warp.tasks.cfg import TaskCfg
+from jumper_warp.tasks.interface import interface
+from jumper_warp.tasks.jump.cfg import GroundCfg
+from jumper_warp.tasks.saving import task_to_json
+from jumper_warp.tasks.terms import RewardTerm, TerminationTerm
 from kernels.jump import rewards, terminations
+
+SHAPE = {"policy_dt": 1 / 60, "physics_dt": 1 / 480, "hidden": (256, 128, 128)}
 
 
 def test_interface_of_the_vertical_jump_has_the_robots_figures():
-    face = interface_of_task(make_task("vertical-jump"), policy_dt=1 / 60, physics_dt=1 / 480, hidden=(256, 128, 128))
+    face = make_interface(interface(make_task("vertical-jump")), **SHAPE)
     assert face.sizes == (48, 256, 128, 128, 12)
     assert face.joint_names[:4] == ("FL_lateral", "FL_outer", "FL_inner", "FR_lateral")
     assert face.action_scale[:3] == pytest.approx([0.261799, 1.570796, 1.570796], abs=1e-6)
@@ -22,90 +32,127 @@ def test_interface_of_the_vertical_jump_has_the_robots_figures():
     assert face.joint_damping[:3] == (1.8, 0.8, 0.8)
     assert face.torque_limit[:3] == (10.0, 18.0, 18.0)
     assert face.command_filter["sum"] == {"lower": 0.0, "upper": 240.0, "lower_zone": 35.0, "upper_zone": 45.0}
+    assert face.observation_layout["lin_vel"] == {"first": 3, "end": 6, "scale": 1.0, "clip": 100.0, "history": 1}
     assert PolicyInterface.from_json(json.loads(json.dumps(face.to_json()))) == face
+
+
+def test_interface_tells_scales_and_history():
+    layout = make_interface(interface(hold_height.hold_height()), **SHAPE).observation_layout
+    assert layout["height"] == {"first": 1, "end": 4, "scale": 5.0, "clip": 100.0, "history": 3}
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda layout: layout["lin_vel"].update(first=4), "'lin_vel' must begin at column 3"),
+        (lambda layout: layout["height"].update(end=2), "'height' must begin at column 2"),
+        (lambda layout: layout["lin_vel"].update(history=2), "must begin at column 3 and hold whole frames"),
+        (lambda layout: layout.pop("last_action"), "observation_layout has 36 columns, the observation 48"),
+        (lambda layout: layout["height"].pop("scale"), "'height' must have the numbers first, end, scale"),
+        (lambda layout: layout["height"].update(scale=math.nan), "'height' must have the numbers"),
+        (lambda layout: layout.update(height=[1]), "'height' must have the numbers"),
+    ],
+)
+def test_layout_that_does_not_fit_is_refused(change, message):
+    face = make_interface(interface(make_task("vertical-jump")), **SHAPE).to_json()
+    change(face["observation_layout"])
+    with pytest.raises(PolicyError, match=message):
+        PolicyInterface.from_json(json.loads(json.dumps(face)))
 
 
 @pytest.fixture
 def saved():
-    """Configuration of a changed vertical jump, as a file holds it."""
-    task = make_task("vertical-jump")
-    terms = (dataclasses.replace(task.terms[0], weight=7.0, params=(0.2, 0.1)), *task.terms[2:])
+    """Configuration of a changed vertical jump, as a file holds it, and the task without what only a training needs."""
+    task = make_task("vertical-jump").with_terms("rewards", jump_height={"weight": 7.0, "fine": 0.2})
     randomization = dataclasses.replace(task.randomization, latency=None, gains=(0.9, 1.1))
-    task = dataclasses.replace(task, terms=terms, levels=task.levels[:2], randomization=randomization, games=3)
-    return task, json.loads(json.dumps({"env": {"task": plain(task)}}))
+    curriculum = task.curriculum.replace(promote_after=3)
+    task = dataclasses.replace(
+        task, rewards=task.rewards[:1] + task.rewards[2:], levels=task.levels[:2], randomization=randomization,
+        curriculum=curriculum,
+    )  # fmt: skip
+    return task, json.loads(json.dumps({"env": {"task": task_to_json(task)}}))
+
+
+def whole(config, *modules):
+    return restored_task(config, modules, leave_out=())
 
 
 def test_task_comes_back_from_its_configuration(saved):
     task, config = saved
-    assert restored_task(config) == task
-    assert task != make_task("vertical-jump")
+    assert whole(config) == task != make_task("vertical-jump")
+    assert restored_task(config) == dataclasses.replace(task, rewards=(), critic=(), events=())
 
 
 def test_setting_that_is_not_saved_keeps_its_default(saved):
     task, config = saved
-    del config["env"]["task"]["games"]
-    assert restored_task(config) == dataclasses.replace(task, games=5)
+    del config["env"]["task"]["curriculum"]["promote_after"]
+    assert whole(config) == dataclasses.replace(task, curriculum=task.curriculum.replace(promote_after=5))
 
 
-def test_unknown_reward_is_left_out(saved):
-    task, config = saved
-    config["env"]["task"]["terms"].append({"func": "my_own", "weight": 1.0, "params": [], "once": False})
-    assert restored_task(config) == task
+def test_unknown_reward_is_refused_unless_rewards_are_not_wanted(saved):
+    _, config = saved
+    config["env"]["task"]["rewards"].append({"type": "jumper_warp.tasks.terms:RewardTerm", "func": "mine:my_own"})
+    with pytest.raises(PolicyError, match=r"task.rewards\[19\] needs 'mine:my_own': name the file"):
+        whole(config)
+    assert restored_task(config).name == "vertical-jump"
 
 
 def test_a_reward_that_the_task_does_not_use_comes_back(saved):
     task, config = saved
-    term = Term(rewards.lifted_paws, -3.0, (30.0,))
-    config["env"]["task"]["terms"].append(json.loads(json.dumps(plain(term))))
-    assert restored_task(config) == dataclasses.replace(task, terms=(*task.terms, term))
+    task = dataclasses.replace(task, rewards=(*task.rewards, RewardTerm(rewards.lifted_paws, -3.0, steps=30.0)))
+    config["env"]["task"] = json.loads(json.dumps(task_to_json(task)))
+    assert whole(config) == task
 
 
 @pytest.mark.parametrize("success", [False, True])
-def test_a_rule_that_the_task_does_not_use_comes_back(saved, success):
+def test_a_termination_that_the_task_does_not_use_comes_back(saved, success):
     task, config = saved
-    rule = Rule(terminations.left_stance, (0.3,), success=success)
-    config["env"]["task"]["rules"].append(json.loads(json.dumps(plain(rule))))
-    assert restored_task(config) == dataclasses.replace(task, rules=(*task.rules, rule))
+    ending = TerminationTerm(terminations.left_stance, distance=0.3, success=success, time_out=success)
+    task = dataclasses.replace(task, terminations=(*task.terminations, ending))
+    config["env"]["task"] = json.loads(json.dumps(task_to_json(task)))
+    assert whole(config) == task
+
+
+def with_ground(task, ground):
+    return dataclasses.replace(
+        task, reset=dataclasses.replace(task.reset, settings=dataclasses.replace(task.reset.settings, ground=ground))
+    )
 
 
 def test_drawn_grounds_come_back_and_default_to_none(saved):
     task, config = saved
-    ground = GroundCfg(platform=0.25, block=0.5, drop=(0.05, 0.1), clearance=0.2)
-    config["env"]["task"]["ground"] = json.loads(json.dumps(plain(ground)))
-    assert restored_task(config) == dataclasses.replace(task, ground=ground)
-    del config["env"]["task"]["ground"]
-    assert restored_task(config) == dataclasses.replace(task, ground=GroundCfg())
+    drawn = with_ground(task, GroundCfg(platform=0.25, block=0.5, drop=(0.05, 0.1), clearance=0.2))
+    config["env"]["task"] = json.loads(json.dumps(task_to_json(drawn)))
+    assert whole(config) == drawn
+    del config["env"]["task"]["reset"]["settings"]["ground"]
+    assert whole(config) == task
 
 
-def test_a_task_from_before_its_grounds_stays_level():
-    task = make_task("horizontal-jump")
-    config = json.loads(json.dumps({"env": {"task": plain(task)}}))
-    del config["env"]["task"]["ground"]
-    assert task.ground.drawn and restored_task(config) == dataclasses.replace(task, ground=GroundCfg())
-
-
-@pytest.mark.parametrize("name", ["wp", "SOON", "__doc__", "landing_error_estimate", "", "cartwheel", 3, None])
-def test_a_rule_that_is_no_termination_is_refused(saved, name):
+@pytest.mark.parametrize(
+    "name", ["wp", "SOON", "__doc__", "landing_error_estimate", "", "cartwheel", "success:x", 3, None]
+)
+@pytest.mark.parametrize("prefix", ["", "kernels.jump.terminations:", "kernels.jump.phase:"])
+def test_a_termination_that_is_none_is_refused(saved, name, prefix):
     _, config = saved
-    config["env"]["task"]["rules"][1]["func"] = name
-    with pytest.raises(PolicyError, match=rf"task.rules\[1\]: this version has no {name!r}"):
+    config["env"]["task"]["terminations"][1]["func"] = f"{prefix}{name}" if prefix else name
+    with pytest.raises(PolicyError, match=r"task.terminations\[1\]"):
         restored_task(config)
 
 
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda t: t.update(name="fly"), "unknown task 'fly'"),
-        (lambda t: t.pop("terms"), "no task in the configuration"),
-        (lambda t: t["rules"][1].update(func="os.system"), r"task.rules\[1\]: this version has no 'os.system'"),
-        (lambda t: t.update(observe="other"), "task.observe: this version has"),
-        (lambda t: t["reset"].update(wings=2), "task.reset: unknown setting 'wings'"),
-        (lambda t: t["reset"].update(standing="much"), "task.reset.standing: expected float, got 'much'"),
-        (lambda t: t["reset"].update(standing=math.nan), "task.reset.standing: must be finite"),
+        (lambda t: t.update(name=""), "task.name is of letters"),
+        (lambda t: t.pop("terminations"), "task.terminations is missing"),
+        (lambda t: t["terminations"][1].update(func="os:system"), r"task.terminations\[1\] needs 'os:system'"),
+        (lambda t: t["policy"][0].update(func="other"), r"task.policy\[0\]: expected module:name, got 'other'"),
+        (lambda t: t["reset"]["settings"].update(wings=2), "task.reset.settings: unknown setting 'wings'"),
+        (lambda t: t["reset"]["settings"].update(standing="much"), "settings.standing: expected float, got 'much'"),
+        (lambda t: t["reset"]["settings"].update(standing=math.nan), "settings.standing: must be finite"),
         (lambda t: t["motors"]["lateral"].update(kp=-1.0), "kp must be finite and not negative"),
         (lambda t: t.update(action_scale=[1.0]), "task.action_scale: expected 2 entries, got 1"),
-        (lambda t: t.update(games=True), "task.games: expected int, got True"),
-        (lambda t: t.update(reset=3), "task.reset: expected settings by name"),
+        (lambda t: t["curriculum"].update(promote_after=True), "curriculum.promote_after: expected float, got True"),
+        (lambda t: t.update(reset=3), "task.reset: expected settings by name, a Reset, got 3"),
     ],
 )
 def test_configuration_that_is_no_task_is_refused(saved, change, message):
@@ -113,3 +160,118 @@ def test_configuration_that_is_no_task_is_refused(saved, change, message):
     change(config["env"]["task"])
     with pytest.raises(PolicyError, match=message):
         restored_task(config)
+
+
+@pytest.mark.parametrize("config", [{}, {"env": {}}, {"env": None}, {"env": {"task": 3}}, {"env": {"task": []}}])
+def test_configuration_without_a_task_is_refused(config):
+    with pytest.raises(PolicyError, match="task"):
+        restored_task(config)
+
+
+# ---------------------------------------------------------------------- policies of version 1
+
+
+@pytest.fixture(params=["vertical_jump", "horizontal_jump", "omnidirectional_jump"])
+def old(request):
+    """Configuration of a policy of the project, trained when there was one environment for jumps only."""
+    assert request.param in list_policies()
+    return copy.deepcopy(load_policy(request.param).config)
+
+
+def test_task_of_version_1_is_todays_with_its_own_numbers(old):
+    saved = old["env"]["task"]
+    task = whole(old)
+    today = make_task(saved["name"])
+    assert (task.name, task.policy, task.motors) == (today.name, today.policy, today.motors)
+    assert [term.weight for term in task.rewards] == [term["weight"] for term in saved["terms"]]
+    assert [[*term.numbers.values()][1:] for term in task.rewards] == [term["params"] for term in saved["terms"]]
+    assert [term.name for term in task.terminations] == [rule["func"] for rule in saved["rules"]]
+    assert [[*term.numbers.values()] for term in task.terminations] == [rule["params"] for rule in saved["rules"]]
+    assert [term.options["time_out"] for term in task.terminations] == [rule["success"] for rule in saved["rules"]]
+    assert [term.name for term in task.terminations if term.options["success"]] == ["success"]
+    assert task.randomization.redraw == "startup" and task.randomization.gains == tuple(saved["randomization"]["gains"])
+    assert task.reset.settings.heading == saved["reset"]["heading"]
+    assert [level.jump_again for level in task.levels] == [
+        saved["reset"]["jump_again"] if i else 0.0 for i in range(len(task.levels))
+    ]
+    assert task.draws_ground == ("ground" in saved and saved["ground"]["platform"] > 0.0)
+    assert task.curriculum.numbers == {"tolerance": saved["near"], "promote_after": saved["games"]}
+    assert task.advance.numbers == {"takeoff_speed": saved["takeoff_speed"]}
+
+
+def test_setting_that_version_1_did_not_save_is_what_it_was_then(old):
+    saved = old["env"]["task"]
+    for name in ("games", "ground", "noise", "near", "contact_force"):
+        saved.pop(name, None)
+    task = whole(old)
+    assert task.reset.settings.ground == GroundCfg()
+    assert task.curriculum.numbers == {"tolerance": 0.10, "promote_after": 5} and task.contact_force == 0.1
+
+
+def test_policy_of_version_1_gets_its_environment(old):
+    policy = load_policy(old["env"]["task"]["name"])
+    env = env_of_policy(policy, 2, Conditions(device="cpu"))
+    assert env.num_obs == len(policy.interface.observation_names)
+    assert env.task.rewards == () and env.task.name == policy.interface.task
+
+
+@pytest.mark.parametrize("name", ["wp", "SOON", "__doc__", "landing_error_estimate", "", "cartwheel", 3, None])
+def test_a_rule_of_version_1_that_is_no_termination_is_refused(old, name):
+    old["env"]["task"]["rules"][1]["func"] = name
+    with pytest.raises(PolicyError, match=rf"task.rules\[1\]: this version has no {name!r}"):
+        restored_task(old)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda t: t.update(name="fly"), "unknown task 'fly'"),
+        (lambda t: t.pop("terms") and t.pop("levels"), "task: no 'levels'"),
+        (lambda t: t["rules"][1].update(func="os.system"), r"task.rules\[1\]: this version has no 'os.system'"),
+        (lambda t: t["rules"][1].update(mode=1), r"task.rules\[1\]: unknown setting 'mode'"),
+        (lambda t: t["rules"][0].update(params=[]), r"task.rules\[0\]: success has 1 numbers by place"),
+        (lambda t: t.update(observe="other"), "task.observe: this version has"),
+        (lambda t: t.update(columns=["height"]), "task.columns: this version has"),
+        (lambda t: t.update(wings=2), "task: unknown setting 'wings'"),
+        (lambda t: t["noise"].update(wings=2), "task.noise: unknown setting 'wings'"),
+        (lambda t: t["reset"].update(wings=2), "settings: unknown setting 'wings'"),
+        (lambda t: t["reset"].update(standing="much"), "settings.standing: expected float, got 'much'"),
+        (lambda t: t["reset"].update(standing=math.nan), "settings.standing: must be finite"),
+        (lambda t: t["motors"]["lateral"].update(kp=-1.0), "kp must be finite and not negative"),
+        (lambda t: t.update(action_scale=[1.0]), "task.action_scale: expected 2 entries, got 1"),
+        (lambda t: t.update(games=True), "curriculum.promote_after: expected float, got True"),
+        (lambda t: t.update(reset=3), "no task of version 1"),
+    ],
+)
+def test_configuration_that_is_no_task_of_version_1_is_refused(old, change, message):
+    change(old["env"]["task"])
+    with pytest.raises(PolicyError, match=message):
+        restored_task(old)
+
+
+VALUES = [None, True, 0, -1, 1e300, math.nan, 10**400, "", "os.system", "a\nb", [], [1.0], {}, {"a": 1}, [{}] * 5000]
+
+
+def test_mutated_configuration_of_version_1_is_a_task_or_refused_in_one_line(old):
+    rng, loaded = random.Random(old["env"]["task"]["name"]), set(sys.modules)
+
+    def places(tree):
+        for key in list(tree) if isinstance(tree, dict) else range(len(tree)):
+            yield tree, key
+            if isinstance(tree[key], dict | list):
+                yield from places(tree[key])
+
+    refused = 0
+    for _ in range(50):
+        config = {"env": {"task": copy.deepcopy(old["env"]["task"])}}
+        table, key = rng.choice(list(places(config["env"]["task"])))
+        if rng.random() < 0.2:
+            del table[key]
+        else:
+            table[key] = copy.deepcopy(rng.choice(VALUES))
+        try:
+            assert isinstance(whole(config), TaskCfg)
+        except PolicyError as error:
+            refused += 1
+            assert len(str(error).splitlines()) == 1 and len(str(error)) < 500
+    assert set(sys.modules) == loaded and 15 < refused < 50

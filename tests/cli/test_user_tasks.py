@@ -1,0 +1,275 @@
+"""A task of one's own, in a file that nothing of the package knows, from training to a recording."""
+
+import json
+import shutil
+import sys
+
+import numpy as np
+import pytest
+
+from jumper_warp.cli import main as cli
+from jumper_warp.cli.main import split_task_modules
+from jumper_warp.cli.train import check_saving
+from jumper_warp.policies.folder import load_policy
+from jumper_warp.policies.restore import open_policy, restored_task
+from jumper_warp.policies.spec import PolicyError
+from jumper_warp.registry import TASKS, make_task
+from jumper_warp.rl.checkpoint import save_checkpoint
+from jumper_warp.tasks.saving import TaskError
+from kernels.jump import rewards
+
+TASK = '''\
+"""Two jumps with a `rest` that is not the project's."""
+
+from dataclasses import replace
+from typing import Any
+
+import warp as wp
+
+from jumper_warp.registry import register_task
+from jumper_warp.rl.ppo import PpoCfg
+from jumper_warp.tasks.jump.vertical import vertical_jump
+from jumper_warp.tasks.terms import EventTerm, ObservationTerm, RewardTerm, TerminationTerm
+from kernels.mdp.parameters import RobotParameters
+from kernels.mdp.random import Draw, between
+from kernels.mdp.view import RobotView
+
+
+@wp.func
+def rest(view: RobotView, task: Any, height: float) -> float:
+    """Base height over a height [m]."""
+    return view.height / height
+
+
+@wp.func
+def strange(view: RobotView, task: Any) -> float:
+    """What the critic sees: one."""
+    return 1.0
+
+
+@wp.func
+def slow(robot: RobotParameters, draw: Draw, lower: float, upper: float):
+    """Scale the proportional gain of every motor."""
+    for m in range(12):
+        robot.motors.kp[m, draw.world] = 17.0 * between(draw, m, lower, upper)
+
+
+@wp.func
+def too_high(view: RobotView, task: Any, height: float) -> bool:
+    """The base is above a height [m]."""
+    return view.height > height
+
+
+def tame_jump():
+    """Only what a training needs is this file's."""
+    task = vertical_jump()
+    return replace(
+        task,
+        name="tame-jump",
+        rewards=(RewardTerm(rest, 2.0, height=0.5), *task.rewards[:3]),
+        critic=(*task.critic, ObservationTerm(strange)),
+        events=(EventTerm(slow, lower=0.9, upper=1.0),),
+    )
+
+
+def low_jump():
+    """An end of the episode too."""
+    task = tame_jump()
+    return replace(task, name="low-jump", terminations=(*task.terminations, TerminationTerm(too_high, height=3.0)))
+
+
+register_task("tame-jump", tame_jump, ppo=PpoCfg(gamma=0.9), aliases=("Tame",))
+register_task("low-jump", low_jump, ppo=PpoCfg(gamma=0.9))
+'''
+TRAIN = ["--num-envs", "4", "--iterations", "1", "--no-tensorboard", "--device", "cpu", "--ppo.num-steps", "2"]
+TRAIN += ["--ppo.minibatches", "2", "--ppo.hidden", "8", "--env.rewards.rest.height", "0.4"]
+
+
+def run(capsys, *args):
+    """Return exit code, output and error lines of a command."""
+    code = 0
+    try:
+        cli.main(args)
+    except SystemExit as end:
+        code = end.code
+    captured = capsys.readouterr()
+    return code, captured.out, captured.err.splitlines()
+
+
+def forget():
+    """Let the file never have been loaded."""
+    sys.modules.pop("my_jumps", None)
+    for name in ("tame-jump", "low-jump"):
+        TASKS.pop(name, None)
+
+
+@pytest.fixture(autouse=True)
+def forgotten():
+    yield
+    forget()
+
+
+@pytest.fixture(scope="module")
+def path(tmp_path_factory):
+    """The file of the tasks."""
+    path = tmp_path_factory.mktemp("user") / "my_jumps.py"
+    path.write_text(TASK)
+    return str(path)
+
+
+@pytest.fixture(scope="module")
+def runs(path, tmp_path_factory):
+    """Folders of a short training of each task."""
+    root, folders = tmp_path_factory.mktemp("logs"), {}
+    for name in ("tame-jump", "low-jump"):
+        cli.main(["train", "--task-module", path, name, *TRAIN, "--log-root", str(root)])
+        (folders[name],) = (root / name).iterdir()
+    forget()
+    return folders
+
+
+def play(source, *args):
+    return ["play", str(source), "--height", "0.6", "--seconds", "0.1", "--device", "cpu", *args]
+
+
+def test_modules_are_told_from_the_other_arguments():
+    args = ["a", "--task-module", "x.py", "--b", "--task-module=pack.age", "--task_module", "y.py", "c"]
+    assert split_task_modules(args) == (["a", "--b", "c"], ["x.py", "pack.age", "y.py"])
+
+
+def test_list_shows_tasks_aliases_origins_and_policies(capsys, path):
+    code, out, _ = run(capsys, "list", f"--task-module={path}")
+    lines = [" ".join(line.split()) for line in out.splitlines()]
+    assert code == 0 and "task tame-jump (Tame) from my_jumps" in lines
+    assert "task vertical-jump (Olympus-Vertical-Jump) from jumper_warp.tasks.jump.vertical" in lines
+    assert "policy vertical_jump" in lines
+
+
+def test_list_shows_installed_tasks_and_what_is_wrong_with_others(capsys, tmp_path, monkeypatch):
+    info = tmp_path / "their_tasks-1.0.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: their-tasks\nVersion: 1.0\n")
+    points = "[jumper_warp.tasks]\nlow-jump = my_jumps_installed:low_jump\nbad-jump = my_jumps_installed:bad\n"
+    (info / "entry_points.txt").write_text(points)
+    (tmp_path / "my_jumps_installed.py").write_text(TASK[: TASK.index("register_task(")] + "def bad(): 1 / 0\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    code, out, _ = run(capsys, "list")
+    assert code == 0 and "low-jump  from my_jumps_installed, package their-tasks" in out
+    assert "bad-jump  of package their-tasks is left out: ZeroDivisionError" in out and "policy  vertical_jump" in out
+
+
+def test_help_of_a_task_has_its_own_flags(capsys, path):
+    code, out, _ = run(capsys, "train", "Tame", "--task-module", path, "--help")
+    assert code == 0 and "--env.rewards.rest.height FLOAT" in out and "--env.events.slow.lower FLOAT" in out
+    assert "--ppo.gamma FLOAT" in out and "(default: 0.9)" in out
+
+
+def test_training_saves_functions_by_module_and_name(runs):
+    config = json.loads((runs["tame-jump"] / "config.json").read_text())
+    (rest,) = (term for term in config["env"]["task"]["rewards"] if term["name"] == "rest")
+    assert (rest["func"], rest["height"]) == ("my_jumps:rest", 0.4)
+    assert config["train"]["ppo"]["gamma"] == 0.9 and config["train"]["task"] == "tame-jump"
+
+
+def test_run_is_exported_without_the_module(capsys, runs, tmp_path):
+    code, _, err = run(capsys, "export", str(runs["low-jump"]), "--out", str(tmp_path / "policy"))
+    assert (code, err) == (0, []) and "my_jumps" not in sys.modules
+    policy = load_policy(tmp_path / "policy")
+    assert policy.interface.task == "low-jump" and policy.interface == open_policy(runs["low-jump"]).interface
+    assert run(capsys, "export", str(tmp_path / "policy"), "--out", str(tmp_path / "low.onnx"))[0] == 0
+
+
+def test_functions_of_a_training_are_not_asked_for_in_play(capsys, runs, tmp_path):
+    code, _, err = run(capsys, *play(runs["tame-jump"], "--out", str(tmp_path)))
+    assert code == 0, err
+    assert (tmp_path / "jump.rrd").is_file() and "my_jumps" not in sys.modules
+
+
+def test_function_that_runs_in_play_asks_for_its_module(capsys, runs, path, tmp_path):
+    code, _, err = run(capsys, *play(runs["low-jump"]))
+    assert code == 2 and len(err) == 1 and "needs 'my_jumps:too_high': name the file" in err[0]
+    assert "--task-module" in err[0] and "my_jumps" not in sys.modules
+    assert run(capsys, *play(runs["low-jump"], "--task-module", path, "--out", str(tmp_path)))[0] == 0
+
+
+def test_events_are_asked_for_where_they_run(capsys, runs):
+    code, _, err = run(capsys, *play(runs["tame-jump"], "--randomize"))
+    assert code == 2 and "task.events[0] needs 'my_jumps:slow'" in err[-1]
+
+
+def test_reward_of_a_user_does_not_become_the_projects(runs, path):
+    config = open_policy(runs["tame-jump"]).config
+    with pytest.raises(PolicyError, match=r"task.rewards\[0\] needs 'my_jumps:rest'"):
+        restored_task(config, leave_out=())
+    from jumper_warp.registry import load_task_module
+
+    module = load_task_module(path)
+    task = restored_task(config, [module], leave_out=())
+    assert task.rewards[0].func is module.rest is not rewards.rest
+    assert task == make_task("tame-jump").with_terms("rewards", rest={"height": 0.4})
+
+
+def test_training_is_resumed(capsys, runs, path, tmp_path):
+    folder = tmp_path / "tame-jump" / "run"
+    shutil.copytree(runs["tame-jump"], folder)
+    args = [*TRAIN, "--iterations", "2", "--resume", str(folder)]
+    code, _, err = run(capsys, "train", "tame-jump", "--task-module", path, *args)
+    assert code == 0, err
+    assert (folder / "checkpoints" / "iteration_000002.pt").is_file()
+
+
+def test_task_whose_functions_could_not_be_found_again_is_not_trained(capsys, tmp_path):
+    lost = TASK.replace("register_task(", "kept, rest = rest, None\nregister_task(", 1).replace("RewardTerm(rest", "RewardTerm(kept")
+    (tmp_path / "my_jumps.py").write_text(lost)
+    args = ["train", "tame-jump", "--task-module", str(tmp_path / "my_jumps.py"), *TRAIN, "--log-root", str(tmp_path)]
+    code, out, err = run(capsys, *args)
+    assert (code, out) == (2, "") and "my_jumps:rest cannot be saved: define it under this name" in err[-1]
+    assert not (tmp_path / "tame-jump").exists()
+
+
+def test_all_of_the_projects_tasks_can_be_trained():
+    for name in TASKS:
+        check_saving(make_task(name))
+    with pytest.raises(TaskError):
+        check_saving(make_task("vertical-jump").with_terms("rewards", rest={"name": "a:b"}))
+
+
+# ---------------------------------------------------------------------- runs of version 1
+
+
+@pytest.fixture
+def old_run(tmp_path):
+    """A run whose checkpoint is of version 1, with the weights of the project's vertical jump."""
+    policy = load_policy("vertical_jump")
+    tensors, model = policy.tensors(), {}
+    layers = len(policy.interface.sizes) - 1
+    for i in range(layers):
+        for part in ("weight", "bias"):
+            model[f"actor.{2 * i}.{part}"] = tensors[f"actor.{i}.{part}"]
+    model |= {"obs_moments.mean": tensors["normaliser.mean"].double(),
+              "obs_moments.var": tensors["normaliser.std"].double().square() - 1.0e-5}  # fmt: skip
+    config = {key: policy.config[key] for key in ("train", "env", "versions")}
+    config["commit"] = {"hash": policy.config["commit"], "dirty": False}
+    state = {"iteration": 7, "ppo": {"model": model}, "env": {}, "rng": {}, "others": [], "config": json.dumps(config)}
+    save_checkpoint(tmp_path / "logs" / "vertical-jump" / "run" / "checkpoints", state)
+    return tmp_path / "logs" / "vertical-jump" / "run"
+
+
+@pytest.mark.parametrize("resume", ["latest", "run", "checkpoints", "file"])
+def test_run_of_version_1_is_not_resumed(capsys, old_run, resume):
+    sources = {"latest": "latest", "run": str(old_run), "checkpoints": str(old_run / "checkpoints"),
+               "file": str(old_run / "checkpoints" / "iteration_000007.pt")}  # fmt: skip
+    args = ["--device", "cpu", "--num-envs", "4", "--log-root", str(old_run.parents[1]), "--resume", sources[resume]]
+    code, out, err = run(capsys, "train", "vertical-jump", *args)
+    assert (code, out) == (2, "") and len(err) == 1
+    assert "of a run of version 1, which can be exported and played but not resumed" in err[0]
+
+
+def test_run_of_version_1_is_exported_and_played(capsys, old_run, tmp_path):
+    code, _, err = run(capsys, "export", str(old_run), "--out", str(tmp_path / "policy"))
+    assert (code, err) == (0, [])
+    policy, original = load_policy(tmp_path / "policy"), load_policy("vertical_jump")
+    assert policy.interface.observation_names == original.interface.observation_names
+    assert np.array_equal(policy.tensors()["actor.0.weight"], original.tensors()["actor.0.weight"])
+    code, _, err = run(capsys, *play(old_run, "--out", str(tmp_path / "played")))
+    assert code == 0, err

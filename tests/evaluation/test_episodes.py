@@ -1,0 +1,128 @@
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from landing_helpers import still_policy
+
+from jumper_warp.cli import evaluate, play
+from jumper_warp.evaluation.episodes import EpisodeFlags, EpisodeGoals, Episodes, episode_metrics
+from jumper_warp.policies.folder import save_policy
+from jumper_warp.registry import make_task
+from jumper_warp.tasks.saving import task_to_json
+
+DT = 0.5
+TASK = make_task("vertical-jump")
+ENDS = [term.name for term in TASK.terminations]
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+
+class Stub:
+    """An environment whose bases are where the test says."""
+
+    num_envs, step_dt = 4, DT
+
+    def __init__(self):
+        self.arrays = {"base_pos": np.tile([1.0, 0.0, 0.3], (4, 1)), "ending": np.full(4, -1)}
+
+    def evaluation_reset(self, commands):
+        self.commands = commands
+
+    def task_arrays(self):
+        return self.arrays
+
+    def now(self, **changes):
+        for name, value in changes.items():
+            self.arrays[name] = np.array(value)
+
+
+@pytest.fixture
+def episodes():
+    """One that ends well after a step, one that falls after two, one that goes on, one that comes apart."""
+    log, env = EpisodeFlags(4, command=(0.5, 0.1)).log(TASK, 0), Stub()
+    log.begin(env)
+    assert env.commands.tolist() == [[0.5, 0.1, 0.0, 0.0]] * 4
+    env.now(ending=[0, -1, -1, ENDS.index("came_apart")])
+    env.now(base_pos=[[1.5, 0.0, 0.4], [1.0, 0.1, 0.2], [1.0, 0.0, 0.3], [np.nan, 0.0, 9.0]])
+    assert not log.follow(env)
+    env.now(ending=[ENDS.index("tilted"), ENDS.index("low_base"), -1, -1])
+    env.now(base_pos=[[9.0, 9.0, 9.0], [1.0, 0.4, 0.0], [1.0, 0.0, 0.3], [9.0, 9.0, 9.0]])
+    assert not log.follow(env)
+    return log
+
+
+def test_metrics_by_hand(episodes):
+    expected = {
+        "episodes": 4,
+        "mean_episode_s": (0.5 + 1.0 + 1.0 + 0.5) / 4,
+        "success_rate": 0.25,
+        "failure_rate": 0.5,
+        "no_end_rate": 0.25,
+        "mean_base_height_m": (0.4 + 0.1 + 0.3 + 9.0) / 4,
+        "mean_base_height_at_the_end_m": (0.4 + 0.0 + 0.3 + 9.0) / 4,
+        "mean_distance_from_start_m": (0.5 + 0.4 + 0.0) / 3,
+        "mean_moved_x_m": 0.5 / 3,
+        "mean_moved_y_m": 0.1,
+        "ended_by_success": 1,
+        "ended_by_low_base": 1,
+        "ended_by_no_end": 1,
+        "ended_by_came_apart": 1,
+    }
+    assert episode_metrics(episodes) == pytest.approx(expected)
+
+
+def test_columns_have_a_row_an_episode_and_none_where_there_is_no_number(episodes):
+    columns = episodes.columns()
+    assert columns["command_0"] == [0.5] * 4 and columns["command_3"] == [0.0] * 4
+    assert columns["length_s"] == [0.5, 1.0, 1.0, 0.5]
+    assert columns["base_x_m"] == [1.5, 1.0, 1.0, None]
+    assert columns["end"] == ["success", "low_base", "no_end", "came_apart"]
+    assert episodes.series([1]) == {"height/base of 1 [m]": 0.0, "distance/start of 1 [m]": pytest.approx(0.4)}
+
+
+def test_all_ended_is_told():
+    log = Episodes(np.zeros((1, 4)), TASK)
+    assert log.update({"base_pos": np.zeros((1, 3)), "ending": np.array([3])}, DT)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: EpisodeFlags(episodes=0), "episodes must be at least 1"),
+        (lambda: EpisodeFlags(command=(0.0,) * 5), "command takes up to 4 finite numbers"),
+        (lambda: EpisodeGoals(command=(float("nan"),)), "command takes up to 4 finite numbers"),
+        (lambda: EpisodeFlags(seconds=0.0), r"seconds must be in \(0, 600\]"),
+    ],
+)
+def test_impossible_settings_are_refused(make, message):
+    with pytest.raises(ValueError, match=message):
+        make()
+
+
+@pytest.fixture(scope="module")
+def policy(tmp_path_factory):
+    """Folder of a policy of a task that says nothing of its evaluation, which holds the default pose."""
+    folder, still = tmp_path_factory.mktemp("policy") / "still", still_policy("horizontal-jump")
+    task = replace(make_task("horizontal-jump"), name="any-task", evaluation="episode")
+    still.config = {"env": {"task": task_to_json(task)}}
+    still.interface = replace(still.interface, task="any-task")
+    save_policy(folder, still)
+    return str(folder)
+
+
+def test_policy_of_any_task_is_evaluated(policy, tmp_path):
+    evaluate.run(
+        [policy, *"--episodes 3 --command 0.5 0 0 30 --seconds 4 --device cpu --out".split(), str(tmp_path)], []
+    )
+    figures = json.loads((tmp_path / "figures.json").read_text())
+    assert (figures["task"], figures["episodes"], figures["ended_by_no_jump"]) == ("any-task", 3, 3)
+    assert figures["mean_base_height_m"] == pytest.approx(0.35, abs=0.02)
+    assert figures["mean_episode_s"] < 4.0 and figures["failure_rate"] == 1.0
+    rows = (tmp_path / "episodes.csv").read_text().splitlines()
+    assert len(rows) == 4 and rows[0].startswith("command_0,command_1") and rows[1].endswith("no_jump")
+
+
+def test_policy_of_any_task_is_played(policy, tmp_path):
+    play.run([policy, *"--seconds 0.25 --device cpu --out".split(), str(tmp_path)], [])
+    assert (tmp_path / "episode.rrd").stat().st_size > 1000
+    assert json.loads((tmp_path / "figures.json").read_text())["end"] == ["no_end"]

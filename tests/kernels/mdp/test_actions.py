@@ -1,0 +1,249 @@
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+import warp as wp
+from jump_helpers import ending_names, make_env, only, random_actions
+from mdp_helpers import DEFAULT_ANGLE, MOTOR_SLOTS, STEP_DT, SUBSTEPS, array, new_worlds, no_delays, standing_robots
+from probe_task import probe_task
+from solver_helpers import MOTOR_Q, MOTOR_V
+
+from jumper_warp.envs.skill import Skill
+from jumper_warp.registry import make_task
+from jumper_warp.robot.motors import LimitsCfg, vertical_jump_filter
+from jumper_warp.tasks.randomization import RandomizationCfg
+from kernels.mdp.actions import action_kernel, begin_step_kernel
+from kernels.mdp.env import SkillSettings
+from kernels.mdp.parameters import action_latency
+
+DEG = np.pi / 180.0
+SCALE = np.tile([15.0, 90.0, 90.0], 4) * DEG
+DELAYS = np.arange(49)
+"""[physics steps] Every latency that the ring of targets holds."""
+
+
+class Commands:
+    """Worlds that are commanded step by step."""
+
+    def __init__(self, n, tasks=(), delay=0):
+        """tasks: of the skills, (by default one); delay [physics steps]: of each world."""
+        skills = [Skill(task, i, n, STEP_DT, SUBSTEPS, "cpu") for i, task in enumerate(tasks or [probe_task()])]
+        self.n, self.robot, self.worlds = n, standing_robots(n), new_worlds(n)
+        self.counters, self.delays = skills[0].counters, no_delays(n, delay)
+        self.settings = wp.array([s.settings_of_skill() for s in skills], dtype=SkillSettings, device="cpu")
+        self.push = wp.zeros(n, dtype=wp.spatial_vector, device="cpu")
+        self.delays.past_target.assign(np.tile(DEFAULT_ANGLE[None, :, None], (8, 1, n)))
+
+    def act(self, action):
+        """Begin a step with an action, (n, 12) or (skills, n, 12)."""
+        action = array(np.reshape(action, (-1, self.n, 12)))
+        changed = [self.robot, self.worlds, self.counters]
+        wp.launch(
+            action_kernel, (self.n, 4), [action, self.settings, self.push, *changed, self.delays], device="cpu"
+        )
+        wp.launch(begin_step_kernel, self.n, [self.settings, self.push, *changed], device="cpu")
+
+    def motors(self, name):
+        """Return an array of the motors, (n, 12)."""
+        return getattr(self.robot, name).numpy().T.copy()
+
+
+def random_action(n, size=1.0, seed=0):
+    return np.random.default_rng(seed).uniform(-size, size, (n, 12)).astype(np.float32)
+
+
+# ---------------------------------------------------------------- from action to target
+
+
+def test_an_action_is_clamped_and_scaled_about_the_default_pose():
+    commands, action = Commands(32), random_action(32, 2.0)
+    commands.act(action)
+    clamped = np.clip(action, -1.0, 1.0)
+    np.testing.assert_array_equal(commands.motors("action"), clamped)
+    np.testing.assert_allclose(commands.motors("target"), DEFAULT_ANGLE + SCALE * clamped, atol=1e-6)
+    assert not commands.motors("old_action").any()
+    commands.act(0.5 * action)
+    np.testing.assert_array_equal(commands.motors("old_action"), clamped)
+
+
+def test_a_world_takes_the_action_and_the_scale_of_its_own_skill():
+    other = dataclasses.replace(probe_task(), name="other", action_scale=(30.0, 45.0))
+    commands = Commands(32, [probe_task(), other])
+    commands.worlds.skill.assign(np.arange(32) % 2)
+    actions = np.stack([random_action(32, seed=1), random_action(32, seed=2)])
+    commands.act(actions)
+    odd = (np.arange(32) % 2 == 1)[:, None]
+    scale = np.where(odd, np.tile([30.0, 45.0, 45.0], 4) * DEG, SCALE)
+    np.testing.assert_allclose(
+        commands.motors("target"), DEFAULT_ANGLE + scale * np.where(odd, actions[1], actions[0]), atol=1e-6
+    )
+
+
+def test_what_happened_before_the_step_is_kept():
+    commands = Commands(32)
+    rates, torque = random_action(32, seed=3), random_action(32, seed=4)
+    qd = np.zeros((32, 38), dtype=np.float32)
+    qd[:, 6 + MOTOR_SLOTS], qd[:, :3] = rates, [1.0, 2.0, 3.0]
+    commands.robot.joint_qd.assign(qd.ravel())
+    commands.robot.torque.assign(torque.T)
+    commands.act(np.zeros((32, 12)))
+    np.testing.assert_array_equal(commands.motors("old_rate"), rates)
+    np.testing.assert_array_equal(commands.motors("old_torque"), torque)
+    np.testing.assert_array_equal(commands.robot.old_lin_vel.numpy(), np.tile([1.0, 2.0, 3.0], (32, 1)))
+
+
+@pytest.mark.parametrize(("offset", "safe"), [(0.0, 24.375), (4.0, 16.875), (-10.0, 30.0)])
+def test_targets_are_filtered_by_what_the_sensors_read(offset, safe):
+    """At 10 degrees, read with an error of `offset`, before a limit of 15, 30 degrees are asked for.
+
+    At the least speed of 60 deg/s the limit is 5, 1 or 15 degrees away: a weight of 1 - 5/8, 1 - 1/8 or 0 of 15 degrees.
+    """
+    open_filter = dataclasses.replace(vertical_jump_filter(), lateral=LimitsCfg(-15.0, 15.0))
+    commands = Commands(1, [probe_task(action_scale=(30.0, 90.0), command_filter=open_filter)])
+    q = commands.robot.joint_q.numpy().copy()
+    q[7] = 10.0 * DEG
+    commands.robot.joint_q.assign(q)
+    commands.robot.joint_offset.assign(np.full((12, 1), offset * DEG))
+    commands.act(np.eye(1, 12))
+    assert commands.motors("target")[0, 0] == pytest.approx(30.0 * DEG)
+    assert commands.motors("safe_target")[0, 0] == pytest.approx(safe * DEG, abs=1e-5)
+    np.testing.assert_array_equal(commands.motors("target")[0, 1:], commands.motors("safe_target")[0, 1:])
+
+
+# ---------------------------------------------------------------- actions that are no numbers
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+def test_an_action_that_is_not_finite_counts_as_0_and_is_counted_once_a_world(bad):
+    commands, action = Commands(8), random_action(8)
+    action[3, 7], action[5] = bad, bad
+    commands.act(action)
+    expected = np.where(np.isfinite(action), action, 0.0)
+    np.testing.assert_array_equal(commands.motors("action"), expected)
+    assert commands.worlds.bad_action.numpy().tolist() == [0, 0, 0, 1, 0, 1, 0, 0]
+    assert commands.counters.bad_actions.numpy().tolist() == [0, 0, 0, 1, 0, 1, 0, 0]
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+def test_a_world_with_a_bad_action_ends_as_one_that_came_apart_and_others_notice_nothing(bad):
+    pair = [make_env(6, reset=only("default"), seed=3) for _ in range(2)]
+    for step, action in enumerate(random_actions(6, 8, seed=5) * 0.3):
+        spoilt = action.clone()
+        if step == 4:
+            spoilt[2, 7] = bad
+        for env, given in zip(pair, (action, spoilt), strict=True):
+            env.step(given)
+        names = ending_names(pair[1])
+        assert names[2] == ("came_apart" if step == 4 else "") and not pair[0].done.any()
+        others = [0, 1, 3, 4, 5]
+        for name in ("obs", "critic_obs", "final_obs", "reward", "done"):
+            values = [getattr(env, name) for env in pair]
+            assert torch.equal(values[0][others], values[1][others]), name
+        for read in ("joint_q", "joint_qd"):
+            good, spoilt_state = (getattr(env.sim, read)() for env in pair)
+            np.testing.assert_array_equal(good[others], spoilt_state[others])
+            assert np.isfinite(spoilt_state).all()
+        if step == 4:
+            assert pair[1].reward[2] == 0.0 and not pair[1].final_obs[2].any()
+    assert pair[1].metrics()["Metrics/bad_actions"] == 1.0 and pair[0].metrics()["Metrics/bad_actions"] == 0.0
+
+
+# ---------------------------------------------------------------- latency
+
+
+def test_motors_follow_the_target_of_as_many_physics_steps_ago_as_the_latency():
+    """One world a latency, a target of its own in every policy step; before the first all was the default pose."""
+    commands = Commands(len(DELAYS), delay=DELAYS)
+    steps = 30
+    asked = 0.2 * np.random.default_rng(0).uniform(-1.0, 1.0, (steps, 12))
+    wanted = DEFAULT_ANGLE + SCALE * asked  # well within the limits, so that the filter leaves them alone
+    followed = []
+    for action in asked:
+        commands.act(np.tile(action, (len(DELAYS), 1)))
+        np.testing.assert_array_equal(commands.motors("safe_target"), commands.motors("target"))
+        late, earlier = commands.delays.late_target.numpy().T, commands.delays.earlier_target.numpy().T
+        when = commands.delays.late_steps.numpy()
+        assert (when >= 0).all() and (when < SUBSTEPS).all()
+        followed += [np.where((substep < when)[:, None], earlier, late) for substep in range(SUBSTEPS)]
+    followed = np.array(followed)
+    commanded = np.repeat(wanted, SUBSTEPS, axis=0)  # by physics step
+    for world, delay in enumerate(DELAYS):
+        expected = np.concatenate([np.tile(DEFAULT_ANGLE, (delay, 1)), commanded])[: steps * SUBSTEPS]
+        np.testing.assert_allclose(followed[:, world], expected, atol=1e-6, err_msg=f"latency {delay}")
+
+
+def test_the_ring_goes_on_over_thousands_of_steps():
+    commands = Commands(len(DELAYS), delay=DELAYS)
+    commands.worlds.clock.fill_(2**20 - 3)
+    past = [np.tile(DEFAULT_ANGLE, (len(DELAYS), 1)).astype(np.float32)] * 8
+    for step in range(40):
+        commands.act(0.2 * random_action(len(DELAYS), seed=step))
+        past.append(commands.motors("safe_target"))
+        late, earlier = commands.delays.late_target.numpy().T, commands.delays.earlier_target.numpy().T
+        for world, delay in enumerate(DELAYS):
+            np.testing.assert_array_equal(late[world], past[-1 - delay // 8][world])
+            np.testing.assert_array_equal(earlier[world], past[-2 - delay // 8][world])
+
+
+def test_the_solvers_motors_follow_it_too():
+    """Against the same robots, driven physics step by physics step with targets that the test delays itself."""
+    delays = np.array([0, 1, 7, 8, 13, 16, 31, 48])
+    env, other = (make_env(len(delays), reset=only("default")) for _ in range(2))
+    env.parameters.latency.assign(delays)
+    physics, past = other.sim.physics, []
+    still = env.sim.joint_q()[:, 7 + MOTOR_SLOTS]
+    now = wp.zeros((12, len(delays)), dtype=float, device="cpu")
+    for action in 0.3 * random_actions(len(delays), 12, seed=1):
+        env.step(action)
+        past += SUBSTEPS * [env.robot.safe_target.numpy().T.copy()]
+        for substep in range(SUBSTEPS):
+            when = len(past) - SUBSTEPS + substep - delays
+            targets = [past[at][world] if at >= 0 else still[world] for world, at in enumerate(when)]
+            now.assign(np.array(targets).T)
+            physics.advance(1, now)
+        assert not env.done.any()
+        motors, rates = [*range(7), *MOTOR_Q], [*range(6), *MOTOR_V]  # knees are not written in between
+        np.testing.assert_allclose(env.sim.joint_q()[:, motors], other.sim.joint_q()[:, motors], atol=1e-5)
+        np.testing.assert_allclose(env.sim.joint_qd()[:, rates], other.sim.joint_qd()[:, rates], atol=0.01)
+    assert np.abs(env.sim.joint_qd()[1:] - env.sim.joint_qd()[:1]).max() > 0.1
+
+
+def test_a_drawn_latency_is_the_one_that_acts():
+    """A range of one value in milliseconds gives that many physics steps in the motors of every world."""
+    for delay in (0, 3, 48):
+        milliseconds = 1000.0 * delay / 480.0
+        drawn = dataclasses.replace(RandomizationCfg.off(), latency=(milliseconds, milliseconds))
+        (event,) = drawn.events()
+        assert event.func is action_latency
+        task = dataclasses.replace(make_task("vertical-jump"), randomization=drawn)
+        env = make_env(3, task=task, randomize=True)
+        assert env.delays.steps.numpy().tolist() == [delay] * 3
+
+
+# ---------------------------------------------------------------- pushes and the clock
+
+
+def test_a_push_acts_on_the_base_while_a_paw_is_down_or_in_the_air_too_where_the_skill_says_so():
+    flying = probe_task(name="flying", randomization=dataclasses.replace(RandomizationCfg.off(), push_in_flight=True))
+    commands = Commands(8, [probe_task(), flying])
+    commands.worlds.skill.assign([0, 0, 0, 0, 1, 1, 1, 1])
+    wrench = np.arange(48.0).reshape(8, 6) + 1.0
+    commands.push.assign(wrench)
+    time = np.zeros((4, 8))
+    time[2, 1] = time[:, 3] = time[0, 5] = STEP_DT
+    commands.robot.contact_time.assign(time)
+    commands.act(np.zeros((2, 8, 12)))
+    pushed = np.array([False, True, False, True, True, True, True, True])
+    found = commands.robot.body_f.numpy().reshape(8, 21, 6)
+    np.testing.assert_array_equal(found[:, 0], np.where(pushed[:, None], wrench, 0.0))
+    assert not found[:, 1:].any()
+
+
+def test_a_step_moves_the_clock_on_and_nothing_is_new_any_more():
+    commands = Commands(4)
+    commands.worlds.fresh.fill_(1)
+    clock = commands.worlds.clock.numpy().copy()
+    commands.act(np.zeros((4, 12)))
+    np.testing.assert_array_equal(commands.worlds.clock.numpy(), clock + 1)
+    assert not commands.worlds.fresh.numpy().any()

@@ -1,0 +1,287 @@
+import dataclasses
+import subprocess
+import sys
+
+import pytest
+
+import jumper_warp
+from jumper_warp import registry
+from jumper_warp.policies.restore import restored_task
+from jumper_warp.policies.spec import PolicyError
+from jumper_warp.registry import (
+    TASKS,
+    TaskEntry,
+    find_task,
+    load_task_module,
+    make_task,
+    register_task,
+    task_names,
+    trainer_settings,
+)
+from jumper_warp.rl.ppo import PpoCfg
+from jumper_warp.tasks.saving import task_to_json
+from jumper_warp.utils.errors import InputError
+
+OWN = ("vertical-jump", "horizontal-jump", "omnidirectional-jump")
+TASK_FILE = """\
+from dataclasses import replace
+
+from jumper_warp.registry import TaskEntry, register_task
+from jumper_warp.rl.ppo import PpoCfg
+from jumper_warp.tasks.jump.vertical import vertical_jump
+
+
+def low_jump():
+    return replace(vertical_jump(), name="low-jump")
+
+
+def entry():
+    return TaskEntry(low_jump, PpoCfg(gamma=0.9), ("Low-Jump",))
+"""
+REGISTER = 'register_task("low-jump", low_jump, ppo=PpoCfg(gamma=0.9), aliases=("Low-Jump",))\n'
+
+
+@pytest.fixture(autouse=True)
+def registered():
+    """Tasks and modules are afterwards as they were."""
+    tasks, modules = dict(TASKS), set(sys.modules)
+    yield
+    TASKS.clear()
+    TASKS.update(tasks)
+    for name in set(sys.modules) - modules:
+        if name.startswith(("my_", "their_")):
+            del sys.modules[name]
+
+
+def renamed(name):
+    return lambda: dataclasses.replace(make_task("vertical-jump"), name=name)
+
+
+# ---------------------------------------------------------------------- names
+
+
+def test_tasks_are_found_by_name_and_alias():
+    assert task_names()[:3] == OWN
+    assert make_task("Olympus-Vertical-Jump") == make_task("vertical-jump")
+    assert find_task("Olympus-Horizontal-Jump")[0] == "horizontal-jump"
+    assert [make_task(name).name for name in OWN] == list(OWN)
+
+
+def test_unknown_task_is_refused_with_those_that_there_are():
+    with pytest.raises(InputError, match="unknown task 'swim'; there are vertical-jump, horizontal-jump"):
+        make_task("swim")
+
+
+def test_trainer_settings_are_those_of_the_task():
+    assert trainer_settings("vertical-jump") == PpoCfg()
+    assert trainer_settings("Olympus-Horizontal-Jump") == PpoCfg(gamma=0.99, entropy_coef=0.0003)
+    assert trainer_settings("omnidirectional-jump") == PpoCfg(gamma=0.99, entropy_coef=0.0003)
+
+
+def test_registered_task_is_made_and_trained_as_told():
+    register_task("my-jump", renamed("my-jump"), ppo=PpoCfg(gamma=0.5), aliases=("Mine",))
+    assert make_task("Mine").name == "my-jump" and trainer_settings("my-jump").gamma == 0.5
+    assert "my-jump" in task_names() and TASKS["my-jump"].origin == __name__
+
+
+@pytest.mark.parametrize(
+    ("name", "aliases", "taken"),
+    [("vertical-jump", (), "vertical-jump"), ("Olympus-Vertical-Jump", (), "Olympus-Vertical-Jump"),
+     ("my-jump", ("horizontal-jump",), "horizontal-jump"), ("my-jump", ("Olympus-Vertical-Jump",), "Olympus")],
+)  # fmt: skip
+def test_name_that_is_taken_is_refused(name, aliases, taken):
+    with pytest.raises(InputError, match=f"there is a task '{taken}.* already, of jumper_warp.tasks.jump"):
+        register_task(name, renamed(name), aliases=aliases)
+    assert tuple(TASKS) == OWN
+
+
+def test_task_that_calls_itself_otherwise_is_refused():
+    register_task("my-jump", renamed("vertical-jump"))
+    with pytest.raises(InputError, match="'my-jump' of .* calls itself 'vertical-jump'"):
+        make_task("my-jump")
+
+
+def test_maker_of_something_else_is_refused():
+    register_task("my-jump", lambda: 3)
+    with pytest.raises(InputError, match="expected a TaskCfg, got int"):
+        make_task("my-jump")
+
+
+# ---------------------------------------------------------------------- files and modules
+
+
+def test_file_is_loaded_once_and_registers_its_tasks(tmp_path):
+    path = tmp_path / "my_tasks.py"
+    path.write_text(TASK_FILE + REGISTER)
+    module = load_task_module(str(path))
+    assert module is sys.modules["my_tasks"] is load_task_module(str(path))
+    assert make_task("Low-Jump").name == "low-jump" and TASKS["low-jump"].origin == "my_tasks"
+
+
+def test_module_is_loaded_by_name(tmp_path, monkeypatch):
+    (tmp_path / "my_module.py").write_text(TASK_FILE + REGISTER)
+    monkeypatch.syspath_prepend(tmp_path)
+    assert load_task_module("my_module").__name__ == TASKS["low-jump"].origin == "my_module"
+
+
+@pytest.mark.parametrize(
+    "name", ["json", "os", "test", "numpy", "torch", "pytest", "jumper_warp", "kernels", "hypothesis", "__main__"]
+)
+def test_file_with_the_name_of_another_module_is_refused(tmp_path, name):
+    (tmp_path / f"{name}.py").write_text("raise SystemExit('run')")
+    before = sys.modules.get(name)
+    with pytest.raises(InputError, match=f"'{name}' is the name of another module; give the file another name"):
+        load_task_module(str(tmp_path / f"{name}.py"))
+    assert sys.modules.get(name) is before
+
+
+def test_second_file_of_a_name_is_refused(tmp_path):
+    for folder in ("a", "b"):
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / "my_tasks.py").touch()
+    load_task_module(str(tmp_path / "a" / "my_tasks.py"))
+    with pytest.raises(InputError, match="is the name of another module"):
+        load_task_module(str(tmp_path / "b" / "my_tasks.py"))
+
+
+@pytest.mark.parametrize("name", ["my-tasks.py", "class.py", "1st.py", "my tasks.py"])
+def test_file_that_python_cannot_name_is_refused(tmp_path, name):
+    (tmp_path / name).touch()
+    with pytest.raises(InputError, match="must be one that Python can import"):
+        load_task_module(str(tmp_path / name))
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [("missing.py", "no file 'missing.py'"), ("missing/tasks", "no file"), ("no_such", "no module 'no_such'"),
+     ("no_such.tasks", "no module 'no_such.tasks'"), (".", "no module"), ("jumper_warp.no_such", "no module")],
+)  # fmt: skip
+def test_what_is_not_there_is_refused(tmp_path, monkeypatch, name, message):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(InputError, match=message):
+        load_task_module(name)
+
+
+@pytest.mark.parametrize(
+    ("code", "message"),
+    [
+        ("RewardTerm(rewards.rest, 1.0, speed=0.1, spin=0.5, fine=2.0)", "unknown parameter 'fine'"),
+        ("register_task('vertical-jump', low_jump)", "there is a task 'vertical-jump' already"),
+        ("def broken(:", "invalid syntax"),
+    ],
+)
+def test_mistake_in_a_file_is_told_with_its_line_and_leaves_nothing(tmp_path, code, message):
+    path = tmp_path / "my_tasks.py"
+    text = "from kernels.jump import rewards\nfrom jumper_warp.tasks.terms import RewardTerm\n" + TASK_FILE + REGISTER
+    path.write_text(text + code + "\n")
+    with pytest.raises(InputError, match=rf"my_tasks.py:{text.count(chr(10)) + 1}: .*{message}"):
+        load_task_module(str(path))
+    assert "my_tasks" not in sys.modules and tuple(TASKS) == OWN
+
+
+@pytest.mark.parametrize(
+    ("code", "kind"), [("1 / 0", ZeroDivisionError), ("import no_such_module", ModuleNotFoundError), ("int('x')", ValueError)]
+)  # fmt: skip
+def test_fault_in_a_file_keeps_its_traceback(tmp_path, code, kind):
+    path = tmp_path / "my_tasks.py"
+    path.write_text(TASK_FILE + REGISTER + code)
+    with pytest.raises(kind) as caught:
+        load_task_module(str(path))
+    assert not isinstance(caught.value, InputError)
+    assert "my_tasks" not in sys.modules and tuple(TASKS) == OWN
+
+
+# ---------------------------------------------------------------------- installed packages
+
+
+@pytest.fixture
+def install(tmp_path, monkeypatch):
+    """Function that installs a package with entry points, by name of the task."""
+    monkeypatch.syspath_prepend(tmp_path)
+
+    def install(package, points, code=TASK_FILE):
+        info = tmp_path / f"{package}-1.0.dist-info"
+        info.mkdir()
+        (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {package}\nVersion: 1.0\n")
+        lines = [f"{name} = {value}\n" for name, value in points.items()]
+        (info / "entry_points.txt").write_text("[jumper_warp.tasks]\n" + "".join(lines))
+        (tmp_path / f"{package}.py").write_text(code)
+
+    return install
+
+
+@pytest.mark.parametrize("function", ["low_jump", "entry"])
+def test_installed_task_is_loaded_when_it_is_asked_for_and_not_before(install, function):
+    install("their_tasks", {"low-jump": f"their_tasks:{function}"})
+    assert "low-jump" in task_names() and make_task("vertical-jump")
+    with pytest.raises(InputError, match="there are .*low-jump"):
+        make_task("swim")
+    assert "their_tasks" not in sys.modules
+    assert make_task("low-jump").name == "low-jump" and TASKS["low-jump"].origin == "their_tasks"
+    assert trainer_settings("low-jump").gamma == (0.9 if function == "entry" else PpoCfg().gamma)
+
+
+def test_saved_configuration_loads_no_installed_task(install):
+    install("their_tasks", {"low-jump": "their_tasks:low_jump"})
+    new = task_to_json(make_task("vertical-jump")) | {"name": "low-jump"}
+    new["rewards"][0]["func"] = "their_tasks:reward"
+    for saved in (new, {"name": "low-jump", "terms": [], "rules": []}):
+        with pytest.raises(PolicyError):
+            restored_task({"env": {"task": saved}}, leave_out=())
+    assert "their_tasks" not in sys.modules and "low-jump" not in TASKS
+
+
+@pytest.mark.parametrize(
+    ("value", "message"),
+    [
+        ("their_tasks:missing", "task 'low-jump' of package their_tasks cannot be loaded: AttributeError"),
+        ("their_missing:low_jump", "cannot be loaded: ModuleNotFoundError: No module named 'their_missing'"),
+        ("their_tasks:PpoCfg.gamma", "their_tasks:PpoCfg.gamma is no function"),
+    ],
+)
+def test_installed_task_that_cannot_be_loaded_is_refused(install, value, message):
+    install("their_tasks", {"low-jump": value})
+    with pytest.raises(InputError, match=message):
+        make_task("low-jump")
+
+
+def test_task_of_two_packages_is_refused(install):
+    install("their_tasks", {"low-jump": "their_tasks:low_jump"})
+    install("their_others", {"low-jump": "their_others:low_jump"})
+    with pytest.raises(InputError, match="'low-jump' is in several packages: their_"):
+        make_task("low-jump")
+
+
+def test_package_takes_no_name_of_the_project(install):
+    install("their_tasks", {"vertical-jump": "their_tasks:low_jump"})
+    assert make_task("vertical-jump").name == "vertical-jump" and "their_tasks" not in sys.modules
+    (point,) = registry.installed_tasks()
+    with pytest.raises(InputError, match="there is a task 'vertical-jump' already"):
+        registry.load_installed(point)
+    assert TASKS["vertical-jump"] == TaskEntry(
+        "jumper_warp.tasks.jump.vertical:vertical_jump", aliases=("Olympus-Vertical-Jump",)
+    )
+
+
+# ---------------------------------------------------------------------- what is exposed
+
+
+def test_names_of_every_day_are_exposed_on_demand():
+    code = (
+        "import sys, jumper_warp\n"
+        "assert not {'torch', 'warp', 'newton', 'numpy'} & set(sys.modules)\n"
+        "from jumper_warp import make_task\n"
+        "assert not {'torch', 'warp', 'newton'} & set(sys.modules)\n"
+        "assert 'Env' in dir(jumper_warp) and jumper_warp.Env.__module__ == 'jumper_warp.envs.env'\n"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)
+    for name in jumper_warp.__all__:
+        assert getattr(jumper_warp, name).__name__ == name
+    assert sorted(jumper_warp.__all__) == [
+        "Env", "Simulation", "SolverJumper", "build_model", "load_policy", "make_task",
+    ]  # fmt: skip
+
+
+def test_other_names_are_not_exposed():
+    with pytest.raises(AttributeError, match="has no attribute 'JumpEnv'"):
+        _ = jumper_warp.JumpEnv
