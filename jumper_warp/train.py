@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-import io
 import json
-import os
 import signal
 import time
 from collections.abc import Callable
@@ -17,14 +15,14 @@ from typing import Any, Literal, NamedTuple
 
 import torch
 
-from jumper_warp.checkpoint import CheckpointError, latest_checkpoint, load_checkpoint, save_checkpoint, write_whole
+from jumper_warp.checkpoint import CheckpointError, save_checkpoint, write_whole
 from jumper_warp.networks import wait_for_ranks, world_size
 from jumper_warp.ppo import Ppo, PpoCfg, VecTask
+from jumper_warp.ranks import Rank, gather, join_ranks
+from jumper_warp.resume import CHECKPOINTS, find_checkpoint, random_state, set_random_state
 from jumper_warp.runtime import git_commit, versions
 from jumper_warp.training_log import Stopwatch, TrainingLog
 
-CHECKPOINTS = "checkpoints"
-"""Folder of a run that holds its checkpoints."""
 CONFIG = "config.json"
 """File of a run: all settings, versions and the commit."""
 INTERRUPTED = 130
@@ -95,15 +93,6 @@ class TrainResult(NamedTuple):
     """The last logged ones."""
 
 
-class Rank(NamedTuple):
-    """This process among those that train together."""
-
-    index: int
-    """0 for the one that logs and saves."""
-    size: int
-    device: torch.device
-
-
 class Stop:
     """Context in which Ctrl-C and SIGTERM set `asked`; the second Ctrl-C interrupts at once."""
 
@@ -121,30 +110,6 @@ class Stop:
     def _ask(self, number: int, frame: FrameType | None) -> None:
         self.asked = True
         signal.signal(signal.SIGINT, signal.default_int_handler)
-
-
-def join_ranks(device: str | None = None) -> Rank:
-    """Return this process's place; under torchrun (RANK, LOCAL_RANK, WORLD_SIZE), join the other processes.
-
-    Raises:
-        ValueError: There is no such device.
-    """
-    kind = torch.device(device or ("cuda" if torch.cuda.is_available() else "cpu"))
-    if kind.type == "cuda" and not torch.cuda.is_available():
-        raise ValueError(f"device {device} asked for, but torch finds no GPU")
-    size = int(os.environ.get("WORLD_SIZE", "1"))
-    if size > 1 and kind.type == "cuda":
-        kind = torch.device("cuda", int(os.environ["LOCAL_RANK"]))
-    elif kind.type == "cuda" and kind.index is None:
-        kind = torch.device("cuda", 0)
-    if kind.type == "cuda":
-        torch.cuda.set_device(kind)
-    elif "OMP_NUM_THREADS" not in os.environ:
-        # small networks lose more to waiting threads than they gain, far more on a busy machine
-        torch.set_num_threads(max(1, (os.cpu_count() or 1) // 2))
-    if size > 1 and not torch.distributed.is_initialized():
-        torch.distributed.init_process_group("nccl" if kind.type == "cuda" else "gloo")
-    return Rank(int(os.environ.get("RANK", "0")) if size > 1 else 0, size, kind)
 
 
 def train(cfg: TrainCfg, make_env: MakeEnv) -> TrainResult:
@@ -330,22 +295,6 @@ class _Silent:
         pass
 
 
-def gather(state: dict[str, Any], rank: Rank) -> list[dict[str, Any]]:
-    """Return the state of every process, in process 0; tensors travel as bytes and are read as weights only."""
-    buffer = io.BytesIO()
-    torch.save(state, buffer)
-    data = torch.frombuffer(bytearray(buffer.getvalue()), dtype=torch.uint8).to(rank.device)
-    sizes = [torch.zeros(1, dtype=torch.int64, device=rank.device) for _ in range(rank.size)]
-    torch.distributed.all_gather(sizes, torch.tensor([len(data)], device=rank.device))
-    longest = max(int(size) for size in sizes)
-    parts = [torch.zeros(longest, dtype=torch.uint8, device=rank.device) for _ in range(rank.size)]
-    torch.distributed.all_gather(parts, torch.nn.functional.pad(data, (0, longest - len(data))))
-    if rank.index != 0:
-        return []
-    sent = [part[: int(size)].cpu().numpy().tobytes() for part, size in zip(parts, sizes, strict=True)]
-    return [torch.load(io.BytesIO(part), weights_only=True) for part in sent]
-
-
 def new_folder(cfg: TrainCfg, rank: Rank) -> Path:
     """Make and return the folder of a run that begins now."""
     name = datetime.now().strftime("%Y-%m-%d_%H-%M-%S_%f")
@@ -353,39 +302,6 @@ def new_folder(cfg: TrainCfg, rank: Rank) -> Path:
     if rank.index == 0:
         folder.mkdir(parents=True)
     return folder
-
-
-def find_checkpoint(cfg: TrainCfg) -> tuple[Path, dict[str, Any], list[str]]:
-    """Return path and content of the checkpoint to resume, and why newer ones were passed over.
-
-    Raises:
-        CheckpointError: There is none that can be used.
-    """
-    if cfg.resume == "latest":
-        runs = cfg.log_root / cfg.task
-        folders = sorted(path.parent for path in runs.glob(f"*/{CHECKPOINTS}/manifest.json"))
-        if not folders:
-            raise CheckpointError(f"{runs}: no run to resume")
-        return latest_checkpoint(folders[-1])
-    path = Path(cfg.resume or "")
-    if path.suffix == ".pt":
-        return path, load_checkpoint(path), []
-    return latest_checkpoint(path if path.name == CHECKPOINTS else path / CHECKPOINTS)
-
-
-def random_state() -> dict[str, torch.Tensor]:
-    """Return the states of torch's generators."""
-    state = {"cpu": torch.get_rng_state()}
-    if torch.cuda.is_available():
-        state["cuda"] = torch.cuda.get_rng_state()
-    return state
-
-
-def set_random_state(state: dict[str, torch.Tensor]) -> None:
-    """Take up what `random_state` gave; a GPU's only where there is one."""
-    torch.set_rng_state(state["cpu"])
-    if "cuda" in state and torch.cuda.is_available():
-        torch.cuda.set_rng_state(state["cuda"])
 
 
 def _train_rsl_rl(cfg: TrainCfg, env: VecTask, rank: Rank) -> TrainResult:

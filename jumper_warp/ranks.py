@@ -1,0 +1,58 @@
+"""The processes that train together: each one's place, and what they send each other."""
+
+from __future__ import annotations
+
+import io
+import os
+from typing import Any, NamedTuple
+
+import torch
+
+
+class Rank(NamedTuple):
+    """This process among those that train together."""
+
+    index: int
+    """0 for the one that logs and saves."""
+    size: int
+    device: torch.device
+
+
+def join_ranks(device: str | None = None) -> Rank:
+    """Return this process's place; under torchrun (RANK, LOCAL_RANK, WORLD_SIZE), join the other processes.
+
+    Raises:
+        ValueError: There is no such device.
+    """
+    kind = torch.device(device or ("cuda" if torch.cuda.is_available() else "cpu"))
+    if kind.type == "cuda" and not torch.cuda.is_available():
+        raise ValueError(f"device {device} asked for, but torch finds no GPU")
+    size = int(os.environ.get("WORLD_SIZE", "1"))
+    if size > 1 and kind.type == "cuda":
+        kind = torch.device("cuda", int(os.environ["LOCAL_RANK"]))
+    elif kind.type == "cuda" and kind.index is None:
+        kind = torch.device("cuda", 0)
+    if kind.type == "cuda":
+        torch.cuda.set_device(kind)
+    elif "OMP_NUM_THREADS" not in os.environ:
+        # small networks lose more to waiting threads than they gain, far more on a busy machine
+        torch.set_num_threads(max(1, (os.cpu_count() or 1) // 2))
+    if size > 1 and not torch.distributed.is_initialized():
+        torch.distributed.init_process_group("nccl" if kind.type == "cuda" else "gloo")
+    return Rank(int(os.environ.get("RANK", "0")) if size > 1 else 0, size, kind)
+
+
+def gather(state: dict[str, Any], rank: Rank) -> list[dict[str, Any]]:
+    """Return the state of every process, in process 0; tensors travel as bytes and are read as weights only."""
+    buffer = io.BytesIO()
+    torch.save(state, buffer)
+    data = torch.frombuffer(bytearray(buffer.getvalue()), dtype=torch.uint8).to(rank.device)
+    sizes = [torch.zeros(1, dtype=torch.int64, device=rank.device) for _ in range(rank.size)]
+    torch.distributed.all_gather(sizes, torch.tensor([len(data)], device=rank.device))
+    longest = max(int(size) for size in sizes)
+    parts = [torch.zeros(longest, dtype=torch.uint8, device=rank.device) for _ in range(rank.size)]
+    torch.distributed.all_gather(parts, torch.nn.functional.pad(data, (0, longest - len(data))))
+    if rank.index != 0:
+        return []
+    sent = [part[: int(size)].cpu().numpy().tobytes() for part, size in zip(parts, sizes, strict=True)]
+    return [torch.load(io.BytesIO(part), weights_only=True) for part in sent]
