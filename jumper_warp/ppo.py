@@ -233,10 +233,11 @@ class Ppo:
         self.optimiser = torch.optim.Adam([*actor, *critic], lr=self.lr, fused=True, capturable=self.update.enabled)
         self._flatten_gradients(actor, critic)
         self.rollout = Rollout(cfg.num_steps, env, num_critic_obs)
-        self._sums = torch.zeros(len(STATISTICS), device=env.device)
-        self._sum_count = torch.zeros((), device=env.device)
-        self._episode = torch.zeros(2, env.num_envs, device=env.device)  # return and length so far
-        self._finished = torch.zeros(3, device=env.device)  # sums of return and length, count
+        counts = {"dtype": torch.float64, "device": env.device}  # float32 counts to 2^24 only
+        self._sums = torch.zeros(len(STATISTICS), **counts)
+        self._sum_count = torch.zeros((), **counts)
+        self._episode = torch.zeros(2, env.num_envs, **counts)  # return and length so far
+        self._finished = torch.zeros(3, **counts)  # sums of return and length, count
         self.collect = Captured(self._collect, cuda and cfg.graphs)
 
     def _flatten_gradients(self, actor: list[torch.nn.Parameter], critic: list[torch.nn.Parameter]) -> None:
