@@ -10,6 +10,7 @@ from typing import Any, Literal
 import numpy as np
 import warp as wp
 
+from jumper_warp.checks import check_not_negative
 from jumper_warp.description import RobotDescription, load_description
 from jumper_warp.robot_parts import Motor
 from kernels import actuator, command_filter
@@ -38,8 +39,7 @@ class MotorKindCfg:
     def __post_init__(self) -> None:
         """Check the values."""
         for name, value in vars(self).items():
-            if not (math.isfinite(value) and value >= 0.0):
-                raise ValueError(f"motor {name} must be finite and not negative, got {value}")
+            check_not_negative(f"motor {name}", value)
         if self.saturation == 0.0 or self.peak == 0.0:
             raise ValueError("motor saturation and peak torque must be > 0, got 0")
         if self.no_load_speed <= self.cutoff_speed:

@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 
 import torch
 
+from jumper_warp.checks import check_finite, check_not_negative, check_positive
 from jumper_warp.graphs import Captured
 from jumper_warp.networks import (
     ACTIVATIONS,
@@ -83,17 +84,32 @@ class PpoCfg:
     def __post_init__(self) -> None:
         """Raises ValueError: a setting is out of range."""
         for name in ("num_steps", "epochs", "minibatches", "lr", "max_grad_norm", "init_std", "clip", "reward_scale"):
-            if not getattr(self, name) > 0:
-                raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
+            check_positive(name, getattr(self, name))
+        for name in ("value_coef", "entropy_coef", "desired_kl", "final_kl"):
+            check_not_negative(name, getattr(self, name))
         for name in ("gamma", "lam"):
             if not 0.0 <= getattr(self, name) <= 1.0:
                 raise ValueError(f"{name} must be in [0, 1], got {getattr(self, name)}")
+        check_finite("max_lr", self.max_lr)
         if not 0.0 < self.min_lr <= self.lr <= self.max_lr:
             raise ValueError(f"need 0 < min_lr <= lr <= max_lr, got {self.min_lr}, {self.lr}, {self.max_lr}")
         if not self.hidden or min(self.hidden) < 1:
             raise ValueError(f"hidden must name at least one positive width, got {self.hidden}")
         if self.activation not in ACTIVATIONS:
             raise ValueError(f"activation must be one of {', '.join(ACTIVATIONS)}, got {self.activation}")
+
+    def batch_size(self, num_envs: int) -> int:
+        """Return the samples that num_envs worlds give in an iteration.
+
+        Raises:
+            ValueError: There is only one, which has no standard deviation, or the minibatches do not divide them.
+        """
+        size = self.num_steps * num_envs
+        if size < 2:
+            raise ValueError(f"an iteration needs at least 2 samples, got {self.num_steps} x {num_envs}")
+        if size % self.minibatches:
+            raise ValueError(f"{self.minibatches} minibatches do not divide {self.num_steps} x {num_envs} samples")
+        return size
 
 
 class Rollout:
@@ -210,11 +226,9 @@ class Ppo:
         """Build networks and buffers on the environment's device; the weights follow torch's CPU seed.
 
         Raises:
-            ValueError: The minibatches do not divide the batch.
+            ValueError: As `PpoCfg.batch_size`.
         """
-        self.batch_size = cfg.num_steps * env.num_envs
-        if self.batch_size % cfg.minibatches:
-            raise ValueError(f"{cfg.minibatches} minibatches do not divide {cfg.num_steps} x {env.num_envs} samples")
+        self.batch_size = cfg.batch_size(env.num_envs)
         self.env, self.cfg = env, cfg
         cuda = env.device.type == "cuda"
         if cuda:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cache
 from typing import Any
 
 import newton
@@ -11,6 +12,8 @@ import numpy as np
 import warp as wp
 from newton import ModelFlags
 
+from jumper_warp.checks import check_finite
+from jumper_warp.description import load_description
 from jumper_warp.dynamics import find_paws
 
 Range = tuple[float, float] | None
@@ -21,7 +24,7 @@ MOTOR_DOFS = np.array([6 + 5 * leg + j for leg in range(4) for j in (0, 1, 3)])
 
 @dataclass(frozen=True)
 class RandomizationCfg:
-    """Ranges of uniform draws; None turns a row off."""
+    """Ranges of uniform draws; None turns a row off. Masses and scales stay positive; friction and latency may be 0."""
 
     static_friction: Range = (0.9, 1.2)
     """[1] Not below the dynamic coefficient of the same environment."""
@@ -53,14 +56,39 @@ class RandomizationCfg:
     """[N m] On the base, about each world axis, while not in flight."""
 
     def __post_init__(self) -> None:
+        """Raises ValueError: a range falls, is not finite, or reaches what no robot can have."""
         for name, value in vars(self).items():
-            if value is not None and not (-math.inf < value[0] <= value[1] < math.inf):
-                raise ValueError(f"randomisation range {name} must be finite and rise, got {value}")
+            if value is None:
+                continue
+            check_finite(f"randomisation range {name}", *value)
+            least, above = _least(name)
+            if not value[0] <= value[1]:
+                raise ValueError(f"randomisation range {name} must rise, got {value}")
+            if value[0] < least or (above and value[0] == least):
+                bound = f"be above {least:g}" if above else "not be negative"
+                raise ValueError(f"randomisation range {name} must {bound}, got {value}")
 
     @classmethod
     def off(cls) -> RandomizationCfg:
         """Return a configuration with every row off."""
         return cls(**dict.fromkeys(cls.__dataclass_fields__))
+
+
+@cache
+def _base_mass() -> float:
+    """Return the mass of the base as described [kg]."""
+    return load_description().links[0].mass
+
+
+def _least(name: str) -> tuple[float, bool]:
+    """Return the least value of a row, and whether the row must stay above it."""
+    if name == "base_mass":
+        return -_base_mass(), True
+    if name in ("link_mass", "gains", "no_load_speed", "cutoff_speed", "armature"):
+        return 0.0, True
+    if name in ("static_friction", "dynamic_friction", "motor_friction", "latency"):
+        return 0.0, False
+    return -math.inf, False
 
 
 class Randomizer:
@@ -176,7 +204,9 @@ class Randomizer:
             mu[self._paws] = dynamic[:, None]
         static = dynamic if self.cfg.static_friction is None else self._draw(self.cfg.static_friction, (self._n,), 0.0)
         self._model.shape_material_mu.assign(mu.astype(np.float32))
-        env.static_friction_ratio.assign((np.maximum(static, dynamic) / dynamic).astype(np.float32))
+        ratio = np.ones_like(dynamic)  # without dynamic friction there is no static one either
+        np.divide(np.maximum(static, dynamic), dynamic, out=ratio, where=dynamic > 0.0)
+        env.static_friction_ratio.assign(ratio.astype(np.float32))
 
 
 def no_motion(device: wp.DeviceLike, num_worlds: int) -> dict[str, wp.array]:

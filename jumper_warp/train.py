@@ -16,6 +16,7 @@ from typing import Any, Literal, NamedTuple
 import torch
 
 from jumper_warp.checkpoint import CheckpointError, save_checkpoint, write_whole
+from jumper_warp.checks import check_not_negative
 from jumper_warp.networks import wait_for_ranks, world_size
 from jumper_warp.ppo import Ppo, PpoCfg, VecTask
 from jumper_warp.ranks import Rank, gather, join_ranks
@@ -45,7 +46,7 @@ class TrainCfg:
     max_seconds: float = 0.0
     """Wall-clock limit of the iterations [s], those before a resume included; 0: none."""
     seed: int = 1
-    """Of weights, noise and worlds; every process derives its own."""
+    """Of weights, noise and worlds, 0 to 2^31 - 1; every process derives its own."""
     device: str | None = None
     """A torch device; default: a GPU if there is one."""
     log_root: Path = Path("logs")
@@ -71,11 +72,13 @@ class TrainCfg:
 
     def __post_init__(self) -> None:
         """Raises ValueError: a setting is out of range."""
+        object.__setattr__(self, "log_root", Path(self.log_root))
         for name in ("num_envs", "iterations", "log_interval", "save_interval", "keep"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
-        if self.max_seconds < 0.0:
-            raise ValueError(f"max_seconds must not be negative, got {self.max_seconds}")
+        check_not_negative("max_seconds", self.max_seconds)
+        if not 0 <= self.seed < 2**31:
+            raise ValueError(f"seed must be in 0 .. {2**31 - 1}, got {self.seed}")
         if self.trainer == "rsl-rl" and self.resume:
             raise ValueError("resume is not offered with trainer rsl-rl")
 
@@ -122,10 +125,7 @@ def train(cfg: TrainCfg, make_env: MakeEnv) -> TrainResult:
     """
     rank = join_ranks(cfg.device)
     try:
-        if cfg.trainer == "rsl-rl" and rank.size > 1:
-            raise ValueError("trainer rsl-rl is offered for one process only")
-        if cfg.num_envs % rank.size:
-            raise ValueError(f"num_envs {cfg.num_envs} is not divisible by {rank.size} processes")
+        _check_division(cfg, rank)
         env = make_env(cfg.num_envs // rank.size, cfg.seed + 1000 * rank.index, rank.device)
         if cfg.trainer == "rsl-rl":
             return _train_rsl_rl(cfg, env, rank)
@@ -140,6 +140,16 @@ def train(cfg: TrainCfg, make_env: MakeEnv) -> TrainResult:
     finally:
         if torch.distributed.is_initialized():
             torch.distributed.destroy_process_group()
+
+
+def _check_division(cfg: TrainCfg, rank: Rank) -> None:
+    """Raises ValueError: worlds or samples do not divide among processes or minibatches."""
+    if cfg.trainer == "rsl-rl" and rank.size > 1:
+        raise ValueError("trainer rsl-rl is offered for one process only")
+    if cfg.num_envs % rank.size:
+        raise ValueError(f"num_envs {cfg.num_envs} is not divisible by {rank.size} processes")
+    if cfg.trainer == "ppo":
+        cfg.ppo.batch_size(cfg.num_envs // rank.size)
 
 
 def full_config(cfg: TrainCfg, env: VecTask, rank: Rank) -> dict[str, Any]:

@@ -17,7 +17,7 @@ from jump_oracle import expected_terms, robot_of
 
 from jumper_warp.env import JumpEnv
 from jumper_warp.tasks import make_task
-from jumper_warp.tasks.task import Rule, TaskCfg, Term
+from jumper_warp.tasks.task import NoiseCfg, Rule, TaskCfg, Term
 from kernels import rewards, terminations
 from kernels.task import FLIGHT, LANDED, STANCE, JumpTask, RobotView
 
@@ -332,6 +332,17 @@ def test_a_term_of_ones_own_is_compiled_and_logged():
         (lambda: Term(my_own_term, 1.0, (1.0,) * 5), "up to four"),
         (lambda: Term(my_own_term, 1.0, (math.inf,)), "finite"),
         (lambda: Rule(terminations.too_long, (math.nan,)), "finite"),
+        (lambda: dataclasses.replace(TASK, action_scale=(math.inf, 90.0)), "action_scale must be positive and finite"),
+        (lambda: dataclasses.replace(TASK, near=math.nan), "near must be positive and finite, got nan"),
+        (lambda: dataclasses.replace(TASK, games=0), "games must be at least 1, got 0"),
+        (lambda: dataclasses.replace(TASK, takeoff_speed=math.nan), "takeoff_speed must be finite"),
+        (lambda: dataclasses.replace(TASK, contact_force=-1.0), "contact_force must be finite and not negative"),
+        (lambda: dataclasses.replace(TASK.motors.lateral, kp=1e39), "motor kp must be finite"),
+        (lambda: NoiseCfg(angle=math.nan), "noise angle must be finite and not negative, got nan"),
+        (lambda: NoiseCfg(rate=-1.0), "noise rate must be finite and not negative"),
+        (lambda: dataclasses.replace(TASK.levels[0], goal_upper=(0.0, 0.0, math.inf)), "goals of a level must be fin"),
+        (lambda: dataclasses.replace(TASK.levels[0], goal_upper=(0.0, 0.0, 0.1)), "must be lower, then upper"),
+        (lambda: dataclasses.replace(TASK.levels[0], base_height=(0.0, 0.3)), "base_height of a level must be pos"),
         (lambda: make_task("vertical-jumpp"), "unknown task 'vertical-jumpp'"),
         (lambda: JumpEnv(TASK, 0, device="cpu"), "at least 1"),
         (lambda: JumpEnv(TASK, 1, device="cpu", solver="bullet"), "solver must be"),

@@ -359,6 +359,14 @@ def test_state_is_taken_up_exactly():
         ({"hidden": ()}, "hidden must name"),
         ({"activation": "gelu"}, "activation must be one of elu, relu, tanh, got gelu"),
         ({"clip": float("nan")}, "clip must be positive"),
+        ({"reward_scale": float("inf")}, "reward_scale must be positive and finite, got inf"),
+        ({"init_std": 1e39}, "init_std must be positive and finite"),  # infinite in single precision
+        ({"entropy_coef": float("nan")}, "entropy_coef must be finite and not negative, got nan"),
+        ({"value_coef": float("inf")}, "value_coef must be finite"),
+        ({"desired_kl": float("nan")}, "desired_kl must be finite"),
+        ({"final_kl": -1.0}, "final_kl must be finite and not negative"),
+        ({"max_lr": float("inf")}, "max_lr must be finite"),
+        ({"lr": float("nan")}, "lr must be positive"),
     ],
 )
 def test_settings_out_of_range_are_refused(change, message):

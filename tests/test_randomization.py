@@ -311,6 +311,30 @@ def test_an_action_arrives_after_its_delay():
     assert np.min(np.max(spread, axis=0)) > 0.5  # [rad/s] each delay differs from the next
 
 
+@pytest.mark.parametrize(
+    ("row", "value", "message"),
+    [
+        ("base_mass", (-100.0, 0.0), "base_mass must be above -6.43, got"),
+        ("base_mass", (-6.43, 0.0), "base_mass must be above -6.43, got"),
+        *((row, (0.0, 1.0), f"{row} must be above 0, got") for row in (
+            "link_mass", "gains", "no_load_speed", "cutoff_speed", "armature",
+        )),
+        *((row, (-0.1, 1.0), f"{row} must not be negative, got") for row in (
+            "static_friction", "dynamic_friction", "motor_friction", "latency",
+        )),
+    ],
+)  # fmt: skip
+def test_ranges_that_reach_what_no_robot_has_are_refused(row, value, message):
+    with pytest.raises(ValueError, match=message):
+        RandomizationCfg(**{row: value})
+
+
+def test_a_world_without_friction_is_finite():
+    found = read(randomized(dataclasses.replace(OFF, static_friction=(0.5, 1.0), dynamic_friction=(0.0, 0.0)), 4))
+    for name in ("dynamic_friction", "static_friction"):
+        assert (found[name] <= 1.001e-4).all(), name  # the solver's least
+
+
 @pytest.mark.parametrize("value", [(1.0, 0.5), (math.nan, 1.0), (0.0, math.inf)])
 def test_impossible_ranges_are_refused(value):
     with pytest.raises(ValueError, match="base_mass"):

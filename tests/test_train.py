@@ -1,5 +1,6 @@
 import dataclasses
 import json
+import math
 import os
 import signal
 import socket
@@ -228,13 +229,42 @@ def test_two_processes_train_one_policy(cfg, tmp_path):
     ("change", "message"),
     [
         ({"iterations": 0}, "iterations must be at least 1, got 0"),
-        ({"max_seconds": -1.0}, "max_seconds must not be negative"),
+        ({"max_seconds": -1.0}, "max_seconds must be finite and not negative, got -1.0"),
+        ({"max_seconds": math.nan}, "max_seconds must be finite and not negative, got nan"),
+        ({"max_seconds": math.inf}, "max_seconds must be finite and not negative, got inf"),
+        ({"seed": -1}, r"seed must be in 0 \.\. 2147483647, got -1"),
+        ({"seed": 2**31}, "seed must be in"),
         ({"trainer": "rsl-rl", "resume": "latest"}, "resume is not offered"),
     ],
 )
 def test_settings_out_of_range_are_refused(change, message):
     with pytest.raises(ValueError, match=message):
         TrainCfg(**change)
+
+
+def must_not_be_built(num_envs, seed, device):
+    pytest.fail("the environment was built")
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"ppo": dataclasses.replace(SMALL, minibatches=7)}, "7 minibatches do not divide 16 x 32 samples"),
+        ({"num_envs": 1, "ppo": dataclasses.replace(SMALL, num_steps=1, minibatches=1)}, "at least 2 samples"),
+    ],
+)
+def test_what_cannot_be_divided_is_refused_before_anything_is_built(cfg, change, message):
+    with pytest.raises(ValueError, match=message):
+        train(dataclasses.replace(cfg, **change), must_not_be_built)
+
+
+def test_the_largest_seed_trains(cfg):
+    assert train(dataclasses.replace(cfg, seed=2**31 - 1, iterations=1), make_env).iteration == 1
+
+
+def test_a_folder_of_logs_may_be_a_text(cfg):
+    result = train(dataclasses.replace(cfg, log_root=str(cfg.log_root), iterations=1), make_env)
+    assert result.folder.parent == cfg.log_root / "push"
 
 
 def test_a_device_that_is_not_there_is_refused(cfg, monkeypatch):

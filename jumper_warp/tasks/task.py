@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, fields
+from dataclasses import astuple, dataclass, field, fields
 from itertools import accumulate
 from typing import Any
 
 import warp as wp
 
+from jumper_warp.checks import check_finite, check_not_negative, check_positive
 from jumper_warp.motors import FilterCfg, MotorCfg
 from jumper_warp.ppo import PpoCfg
 from jumper_warp.randomization import RandomizationCfg
@@ -35,8 +36,7 @@ class Term:
 
     def __post_init__(self) -> None:
         _check_params(self.func, self.params)
-        if not math.isfinite(self.weight):
-            raise ValueError(f"the weight of {self.name} must be finite, got {self.weight}")
+        check_finite(f"the weight of {self.name}", self.weight)
 
     @property
     def name(self) -> str:
@@ -65,8 +65,9 @@ class Rule:
 
 
 def _check_params(func: wp.Function, params: tuple[float, ...]) -> None:
-    if len(params) > 4 or not all(math.isfinite(p) for p in params):
-        raise ValueError(f"{func.key} takes up to four finite parameters, got {params}")
+    check_finite(f"parameters of {func.key}", *params)
+    if len(params) > 4:
+        raise ValueError(f"{func.key} takes up to four parameters, got {params}")
 
 
 @dataclass(frozen=True)
@@ -130,11 +131,12 @@ class ResetCfg:
     """[s] From touchdown to the other goal."""
 
     def __post_init__(self) -> None:
-        """Raises ValueError: shares do not add up, a pair is reversed, or a delay or a share is out of range."""
+        """Raises ValueError: shares do not add up, a pair is reversed, a number not finite or out of range."""
         shares = self._shares()
         if not min(shares) >= 0.0 or sum(shares) > 1.0 + 1e-9:
             raise ValueError(f"reset shares must be >= 0 and add up to at most 1, got {shares}")
         for name, value in vars(self).items():
+            check_finite(f"reset {name}", *(value if isinstance(value, tuple) else (value,)))
             if isinstance(value, tuple) and not value[0] <= value[1]:
                 raise ValueError(f"reset {name} must be (lower, upper), got {value}")
         for name, least in (("command_delay", self.command_delay), ("again_delay", self.again_delay[0])):
@@ -176,6 +178,14 @@ class Level:
     base_height: Pair
     """[m] Of standing starts; low ones are deep squats."""
 
+    def __post_init__(self) -> None:
+        """Raises ValueError: goals are reversed or not finite, or heights are reversed or not positive."""
+        check_finite("goals of a level", *self.goal_lower, *self.goal_upper)
+        check_positive("base_height of a level", *self.base_height)
+        pairs = (*zip(self.goal_lower, self.goal_upper, strict=True), self.base_height)
+        if not all(lower <= upper for lower, upper in pairs):
+            raise ValueError(f"goals and heights of a level must be lower, then upper, got {astuple(self)}")
+
 
 @dataclass(frozen=True)
 class NoiseCfg:
@@ -193,6 +203,11 @@ class NoiseCfg:
     """[deg/s]"""
     position: float = 0.005
     """[m] Of the base's height and of the way to the goal."""
+
+    def __post_init__(self) -> None:
+        """Raises ValueError: a standard deviation is negative or not finite."""
+        for name, value in vars(self).items():
+            check_not_negative(f"noise {name}", value)
 
     def sensor_noise(self, enabled: bool = True) -> Any:
         """Return the kernels' `SensorNoise`; all zero unless enabled."""
@@ -285,6 +300,7 @@ class TaskCfg:
     """Successes in a row that raise the level."""
 
     def __post_init__(self) -> None:
+        """Raises ValueError: a table is not one that can be trained on, or a number is out of range."""
         names = [term.name for term in self.terms]
         if len(set(names)) < len(names):
             raise ValueError(f"every term of {self.name} needs a name of its own, got {names}")
@@ -294,6 +310,12 @@ class TaskCfg:
             raise ValueError(f"{self.name} needs the rule came_apart, which ends worlds whose state is no longer one")
         if not self.levels:
             raise ValueError(f"{self.name} needs at least one level")
+        check_positive("action_scale", *self.action_scale)
+        check_positive("near", self.near)
+        check_finite("takeoff_speed", self.takeoff_speed)
+        check_not_negative("contact_force", self.contact_force)
+        if self.games < 1:
+            raise ValueError(f"games must be at least 1, got {self.games}")
 
     @property
     def observation_names(self) -> tuple[str, ...]:
