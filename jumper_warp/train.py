@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import shlex
 import signal
+import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -22,7 +24,7 @@ from jumper_warp.ppo import Ppo, PpoCfg, VecTask
 from jumper_warp.ranks import Rank, gather, join_ranks
 from jumper_warp.resume import CHECKPOINTS, find_checkpoint, random_state, set_random_state
 from jumper_warp.runtime import git_commit, versions
-from jumper_warp.training_log import Stopwatch, TrainingLog
+from jumper_warp.training_log import Pace, Stopwatch, TrainingLog
 
 CONFIG = "config.json"
 """File of a run: all settings, versions and the commit."""
@@ -44,7 +46,8 @@ class TrainCfg:
     iterations: int = 2800
     """Iterations that the run has at its end, those before a resume included."""
     max_seconds: float = 0.0
-    """Wall-clock limit of the iterations [s], those before a resume included; 0: none."""
+    """Wall-clock limit [s]; 0: none. What counts is the time from the end of each process's first iteration to the end
+    of its last, with logging and saving between, over all resumes: building, compiling and that iteration do not."""
     seed: int = 1
     """Of weights, noise and worlds, 0 to 2^31 - 1; every process derives its own."""
     device: str | None = None
@@ -91,7 +94,7 @@ class TrainResult(NamedTuple):
     iteration: int
     """Iterations that the policy has had."""
     seconds: float
-    """Wall-clock time of this process's iterations [s]."""
+    """Wall-clock time of this process's iterations [s], the first one included."""
     figures: dict[str, float]
     """The last logged ones."""
 
@@ -115,8 +118,10 @@ class Stop:
         signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
-def train(cfg: TrainCfg, make_env: MakeEnv) -> TrainResult:
+def train(cfg: TrainCfg, make_env: MakeEnv, command: str | None = None) -> TrainResult:
     """Train to the last iteration or the time limit, and save.
+
+    command: What the user would type to train so, without `--resume`; by default `jumper train TASK`.
 
     Raises:
         ValueError: A setting does not fit the environment or the machine.
@@ -130,7 +135,7 @@ def train(cfg: TrainCfg, make_env: MakeEnv) -> TrainResult:
         if cfg.trainer == "rsl-rl":
             return _train_rsl_rl(cfg, env, rank)
         torch.manual_seed(cfg.seed)  # the same weights in all processes
-        run = Run(cfg, env, rank)
+        run = Run(cfg, env, rank, command)
         with Stop() as stop:
             result = run.iterate(stop)
         wait_for_ranks()
@@ -169,12 +174,14 @@ def full_config(cfg: TrainCfg, env: VecTask, rank: Rank) -> dict[str, Any]:
 class Run:
     """A training under way in this process."""
 
-    def __init__(self, cfg: TrainCfg, env: VecTask, rank: Rank) -> None:
-        """Build the algorithm, take up a checkpoint if the configuration names one, and begin the episodes."""
+    def __init__(self, cfg: TrainCfg, env: VecTask, rank: Rank, command: str | None = None) -> None:
+        """Build the algorithm, and take up a checkpoint if the configuration names one; command: as in `train`."""
         self.cfg, self.env, self.rank = cfg, env, rank
+        self._command = command or f"jumper train {cfg.task}"
         self.ppo = Ppo(env, cfg.ppo)
         self.config = full_config(cfg, env, rank)
         self.iteration, self.seconds = 0, 0.0  # that the run had before this process
+        self._begin: float | None = None  # on the clock, as if all seconds that count were of this process
         self.figures: dict[str, float] = {}
         self.notes: list[str] = []
         torch.manual_seed(cfg.seed + 1 + rank.index)
@@ -205,56 +212,79 @@ class Run:
         cfg, ppo = self.cfg, self.ppo
         if self.iteration == 0:
             self.env.reset()
-        start = logged = time.perf_counter()
-        begin = start - self.seconds
-        watch, log = Stopwatch(self.rank.device), None
-        if self.rank.index == 0:
-            log = TrainingLog(self.folder, self.config, cfg.iterations, cfg.tensorboard, cfg.wandb)
-        with log or _Silent() as log:
-            for note in self.notes:
+        start, first = time.perf_counter(), self.iteration + 1
+        watch, pace = Stopwatch(self.rank.device), Pace(self.iteration)
+        with self._log() as log:
+            for note in [f"run {self.folder}", *self.notes]:
                 log.say(note)
             ending = self.iteration >= cfg.iterations or 0.0 < cfg.max_seconds <= self.seconds
-            since = self.iteration
+            if ending:
+                log.say(f"nothing is left to train after iteration {self.iteration}")
             while not ending:
                 watch.start()
-                ppo.set_progress(self._progress(begin))
+                ppo.set_progress(self._progress())
                 ppo.collect()
                 watch.mark()
                 ppo.update()
                 watch.mark()
                 self.iteration += 1
-                ending = self._ending(stop, begin)
+                if self.iteration == first:
+                    self._begin_counting()
+                ending = self._ending(stop)
                 if ending or self.iteration % cfg.log_interval == 0:
-                    times = watch.read()
-                    now = time.perf_counter()
-                    self.figures = self._read(times, (now - logged) / (self.iteration - since), now - begin)
-                    logged, since = now, self.iteration
-                    log.log(self.iteration, self.figures)
+                    times, seconds = watch.read(), pace.lap(self.iteration)
+                    self.figures = self._read(times, seconds)
+                    log.log(self.iteration, self.figures, self._left(seconds))
+                elif self.iteration == first:  # its time tells nothing of the others
+                    watch.read(), pace.lap(self.iteration)
                 if ending or self.iteration % cfg.save_interval == 0:
-                    self._save(log, time.perf_counter() - begin, must=ending)
+                    self._save(log, ending, stop)
         return TrainResult(self.folder, self.iteration, time.perf_counter() - start, self.figures)
 
-    def _progress(self, begin: float) -> float:
-        """Return how much of the training is over, by iterations or by time since begin [s], whichever is further."""
+    def _log(self) -> TrainingLog | _Silent:
+        if self.rank.index != 0:
+            return _Silent()
+        cfg = self.cfg
+        return TrainingLog(self.folder, self.config, cfg.iterations, cfg.tensorboard, cfg.wandb, self.iteration)
+
+    def _begin_counting(self) -> None:
+        """Count the run's time from here on, when the device has done what it was asked to."""
+        if self.rank.device.type == "cuda":
+            torch.cuda.synchronize()
+        self._begin = time.perf_counter() - self.seconds
+
+    def _elapsed(self) -> float:
+        """Return the seconds of the run that count, see `TrainCfg.max_seconds`."""
+        return self.seconds if self._begin is None else time.perf_counter() - self._begin
+
+    def _progress(self) -> float:
+        """Return how much of the training is over, by iterations or by time, whichever is further."""
         done = self.iteration / self.cfg.iterations
         if self.cfg.max_seconds > 0.0:
-            done = max(done, (time.perf_counter() - begin) / self.cfg.max_seconds)
+            done = max(done, self._elapsed() / self.cfg.max_seconds)
         return done
 
-    def _ending(self, stop: Stop, begin: float) -> bool:
+    def _left(self, seconds: float) -> float:
+        """Return how long the rest takes [s] at so many seconds an iteration."""
+        left = (self.cfg.iterations - self.iteration) * seconds
+        if self.cfg.max_seconds > 0.0:
+            left = min(left, max(self.cfg.max_seconds - self._elapsed(), 0.0))
+        return left
+
+    def _ending(self, stop: Stop) -> bool:
         """Return whether this iteration is the last; the processes agree, which they ask when they log."""
         if self.iteration >= self.cfg.iterations:
             return True
         if world_size() > 1 and self.iteration % self.cfg.log_interval:
             return False
-        late = 0.0 < self.cfg.max_seconds <= time.perf_counter() - begin
+        late = 0.0 < self.cfg.max_seconds <= self._elapsed()
         if world_size() > 1:
             wish = torch.tensor([float(stop.asked), float(late)], device=self.rank.device)
             torch.distributed.all_reduce(wish, op=torch.distributed.ReduceOp.MAX)
             stop.asked, late = (value > 0.0 for value in wish.tolist())
         return stop.asked or late
 
-    def _read(self, times: list[float], seconds: float, elapsed: float) -> dict[str, float]:
+    def _read(self, times: list[float], seconds: float) -> dict[str, float]:
         """Return the figures to log; times: of collect and update [s], seconds: of an iteration."""
         steps = self.cfg.ppo.num_steps * self.cfg.num_envs
         return {
@@ -263,11 +293,12 @@ class Run:
             "Perf/fps": steps / seconds,
             "Perf/collect_s": times[0],
             "Perf/update_s": times[1],
-            "Perf/elapsed_s": elapsed,
+            "Perf/elapsed_s": self._elapsed(),
         }
 
-    def _save(self, log: TrainingLog | _Silent, seconds: float, must: bool) -> None:
-        """Save a checkpoint; a failure is only told, and tried again next time, unless this one must be."""
+    def _save(self, log: TrainingLog | _Silent, ending: bool, stop: Stop) -> None:
+        """Save a checkpoint; a failure is only told, and tried again next time, unless this is the last."""
+        seconds = self._elapsed()
         own = {"ppo": self.ppo.state_dict(), "env": self.env.state_dict(), "rng": random_state()}
         others = self._others(own)
         if self.rank.index != 0:
@@ -276,11 +307,15 @@ class Run:
         state["config"] = json.dumps(self.config)
         folder = self.folder / CHECKPOINTS
         try:
-            save_checkpoint(folder, state, self.figures.get(self.cfg.best_by), self.cfg.keep)
+            path = save_checkpoint(folder, state, self.figures.get(self.cfg.best_by), self.cfg.keep)
         except OSError as error:
-            if must:
+            if ending:
                 raise CheckpointError(f"{folder}: not saved: {error.strerror}") from error
             log.say(f"{folder}: not saved, will try again: {error.strerror}")
+            return
+        if ending:
+            more = f", continue with: {self._command} --resume {shlex.quote(str(self.folder))}" if stop.asked else ""
+            log.say(f"saved {path}{more}")
 
     def _others(self, own: dict[str, Any]) -> list[dict[str, Any]]:
         """Return, in process 0, what only the other processes know: their worlds and random numbers."""
@@ -301,7 +336,7 @@ class _Silent:
     def say(self, line: str) -> None:
         pass
 
-    def log(self, iteration: int, figures: dict[str, float]) -> None:
+    def log(self, iteration: int, figures: dict[str, float], left: float) -> None:
         pass
 
 
@@ -319,6 +354,7 @@ def _train_rsl_rl(cfg: TrainCfg, env: VecTask, rank: Rank) -> TrainResult:
 
     folder = new_folder(cfg, rank)
     if rank.index == 0:
+        print(f"run {folder}", file=sys.stderr)
         write_whole(folder / CONFIG, json.dumps(full_config(cfg, env, rank), indent=1).encode())
     begin = time.perf_counter()
     torch.manual_seed(cfg.seed + rank.index)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import os
+import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated
@@ -75,13 +76,22 @@ def env_maker(task: TaskCfg, args: TrainArgs) -> MakeEnv:
     return make
 
 
+def command_line(args: Sequence[str]) -> str:
+    """Return what was typed, without `--resume`."""
+    kept = [arg for arg in args if not arg.startswith("--resume=")]
+    while "--resume" in kept:
+        at = kept.index("--resume")
+        del kept[at : at + 2]
+    return shlex.join(["jumper", "train", *kept])
+
+
 def run_train(args: Sequence[str]) -> TrainResult:
     """Train as the arguments say; raises as `parse_train` and `jumper_warp.train.train`."""
     parsed, task = parse_train(args)
     first = os.environ.get("RANK", "0") == "0"
     if first:
         announce(parsed.cfg.device)
-    result = train(parsed.cfg, env_maker(task, parsed))
+    result = train(parsed.cfg, env_maker(task, parsed), command_line(args))
     if first:
         print(result.folder)
     return result

@@ -17,7 +17,7 @@ from jumper_warp.saved_run import open_policy, restored_task
 from jumper_warp.task_flags import TaskFlags
 from jumper_warp.tasks import make_task
 from jumper_warp.tasks.task import TaskCfg
-from jumper_warp.train_command import parse_train
+from jumper_warp.train_command import command_line, parse_train
 
 TRAIN = ["train", "vertical-jump", "--num-envs", "16", "--iterations", "2", "--no-tensorboard", "--device", "cpu"]
 TRAIN += ["--ppo.num-steps", "4", "--ppo.minibatches", "2", "--ppo.hidden", "16", "8", "--env.games", "2"]
@@ -140,6 +140,11 @@ def test_flags_change_training_and_task():
     assert task.reset.standing == 0.5 and task.randomization.latency is None
     assert args.cfg.ppo.gamma == 0.9 and args.cfg.task == "vertical-jump"
     assert (args.solver, args.noise, args.randomize) == ("mujoco", False, True)
+
+
+def test_the_command_that_goes_on_is_the_one_that_was_typed():
+    typed = ["push", "--resume", "old run", "--task", "a b", "--resume=older", "--num-envs", "4"]
+    assert command_line(typed) == "jumper train push --task 'a b' --num-envs 4"
 
 
 @pytest.mark.parametrize(

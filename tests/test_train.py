@@ -60,11 +60,14 @@ def test_a_run_leaves_settings_figures_and_checkpoints(cfg):
 
 
 def test_each_logged_iteration_is_told(cfg, capsys):
-    figures = train(cfg, make_env).figures
-    (line,) = [line for line in capsys.readouterr().err.splitlines() if line.startswith("iteration 4: ")]
+    result = train(cfg, make_env)
+    figures, told = result.figures, capsys.readouterr().err.splitlines()
     fps, total = f"{figures['Perf/fps']:,.0f}", f"{figures['Train/mean_return']:.2f}"
     success = f"{100.0 * figures['Metrics/success']:.1f}"
-    assert line == f"iteration 4: {fps} steps/s, return {total}, success {success} %"
+    assert told[0] == f"run {result.folder}"
+    assert told[1].startswith("iteration 2/4: ") and told[1].endswith(" s left")
+    assert told[2] == f"iteration 4/4: {fps} steps/s, return {total}, success {success} %, 0 s left"
+    assert told[3:] == [f"saved {result.folder / CHECKPOINTS / 'iteration_000004.pt'}"]
 
 
 def test_a_resumed_run_equals_an_uninterrupted_one(cfg):
@@ -154,7 +157,7 @@ def test_nothing_to_resume_is_told(cfg):
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_ends_the_iteration_and_saves(cfg, number):
+def test_a_signal_ends_the_iteration_saves_and_tells_how_to_go_on(cfg, number, capsys):
     class Signalled(PushTask):
         def step(self, action):
             super().step(action)
@@ -168,6 +171,8 @@ def test_a_signal_ends_the_iteration_and_saves(cfg, number):
     assert signal.getsignal(number) is before
     (path,) = cfg.log_root.glob("push/*/checkpoints/iteration_000003.pt")
     assert load_checkpoint(path)["env"]["steps"] == 48
+    last = capsys.readouterr().err.splitlines()[-1]
+    assert last == f"saved {path}, continue with: jumper train push --resume {path.parent.parent}"
 
 
 def test_the_second_interrupt_does_not_wait(cfg):
@@ -191,8 +196,8 @@ def test_the_time_limit_ends_and_saves(cfg):
 def test_a_full_disk_is_told_and_training_goes_on(cfg, capsys):
     class Blocking(PushTask):
         def metrics(self):
-            (folder,) = cfg.log_root.glob("push/*")
-            (folder / CHECKPOINTS).touch()  # a file where the folder should go
+            for folder in cfg.log_root.glob("push/*"):
+                (folder / CHECKPOINTS).touch()  # a file where the folder should go
             return super().metrics()
 
     with pytest.raises(CheckpointError, match="not saved"):
