@@ -10,6 +10,7 @@ import torch
 import warp as wp
 
 from jumper_warp.solver import SolverJumper
+from jumper_warp.state_checks import check_tensor, check_values
 from kernels.task import ViewArrays
 
 if TYPE_CHECKING:
@@ -48,8 +49,11 @@ def load_state(env: JumpEnv, state: dict[str, torch.Tensor]) -> None:
     """Put a saved state back, so that the next step is the one that would have followed.
 
     Raises:
-        ValueError: It is of another number of environments, other fields or other robots; nothing is changed.
+        ValueError: It is of another number of environments, other fields or other robots, or a field is no tensor or
+            of another shape or type; nothing is changed.
     """
+    if not isinstance(state, dict):
+        raise ValueError(f"a saved environment must be a dictionary, got {type(state).__name__}")
     tensors, records = _tensors(env), {prefix: array.numpy().copy() for prefix, array in _records(env).items()}
     fields = {prefix + name: (prefix, name) for prefix, values in records.items() for name in values.dtype.names}
     names = {*tensors, *fields, FINGERPRINT}
@@ -58,12 +62,15 @@ def load_state(env: JumpEnv, state: dict[str, torch.Tensor]) -> None:
             f"saved by another version or solver: lacks {sorted(names - state.keys())}, "
             f"has {sorted(state.keys() - names)} besides"
         )
-    saved = state["done"].shape[0]
-    if saved != env.num_envs:
-        raise ValueError(f"saved for {saved} environments, there are {env.num_envs}")
+    done = state["done"]
+    if isinstance(done, torch.Tensor) and done.dim() == 1 and len(done) != env.num_envs:
+        raise ValueError(f"saved for {len(done)} environments, there are {env.num_envs}")
     for name, tensor in tensors.items():
-        if state[name].shape != tensor.shape:
-            raise ValueError(f"saved {name} has shape {tuple(state[name].shape)}, expected {tuple(tensor.shape)}")
+        check_tensor(state[name], tensor, f"saved {name}")
+    for field, (prefix, name) in fields.items():
+        check_tensor(state[field], torch.from_numpy(records[prefix][name].copy()), f"saved {field}")
+    check_values(state[EPISODE + "level"], f"saved {EPISODE}level", 0)  # indexes the curriculum
+    check_tensor(state[FINGERPRINT], parameter_fingerprint(env), f"saved {FINGERPRINT}")
     if not torch.equal(state[FINGERPRINT], parameter_fingerprint(env)):
         raise ValueError("saved with other robots: seed, description or randomisation differ")
     for field, (prefix, name) in fields.items():

@@ -24,6 +24,7 @@ from jumper_warp.networks import (
     sanitise,
     world_size,
 )
+from jumper_warp.state_checks import check_ppo
 from jumper_warp.vectask import VecTask
 
 STATISTICS = ("surrogate", "value", "entropy", "kl", "gradient_actor", "gradient_critic", "skipped")
@@ -378,9 +379,10 @@ class Ppo:
         """Take up what `state_dict` gave.
 
         Raises:
-            KeyError: A part is missing.
-            RuntimeError: A part has another shape.
+            ValueError: A part is missing, unknown, of another shape or type, or not finite; nothing is changed.
         """
+        (group,) = self.optimiser.param_groups
+        check_ppo(state, self.model.state_dict(), group["params"], self.lr, self._episode)
         self.model.load_state_dict(state["model"])
         moments = {i: {k: x.clone() for k, x in each.items()} for i, each in state["optimiser"].items()}
         self.optimiser.load_state_dict({**self.optimiser.state_dict(), "state": moments})

@@ -16,7 +16,14 @@ from typing import TYPE_CHECKING, Any, Literal, get_args, get_type_hints
 
 import warp as wp
 
-from jumper_warp.checkpoint import CheckpointError, best_checkpoint, latest_checkpoint, load_checkpoint
+from jumper_warp.checkpoint import (
+    DAMAGE,
+    CheckpointError,
+    best_checkpoint,
+    latest_checkpoint,
+    load_checkpoint,
+    one_line,
+)
 from jumper_warp.networks import EPS, NORMALISED_LIMIT, RAW_LIMIT
 from jumper_warp.policy import Policy, load_policy
 from jumper_warp.policy_interface import PolicyError, interface_of_task
@@ -88,14 +95,20 @@ def _policy_of_checkpoint(path: Path, state: dict[str, Any]) -> Policy:
         shape = {"hidden": tuple(ppo["hidden"]), "activation": ppo["activation"]}
         commit = config.get("commit") or {"hash": None, "dirty": None}
         config |= {"commit": commit["hash"], "dirty": commit["dirty"], "iteration": state["iteration"]}
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise CheckpointError(f"{path}: not of a training of this project ({type(error).__name__}: {error})") from error
+    except DAMAGE as error:
+        raise _no_training(path, error) from error
     try:
         interface = interface_of_task(restored_task(config), **times, **shape)
         interface = dataclasses.replace(interface, observation_limit=RAW_LIMIT, normalised_limit=NORMALISED_LIMIT)
         return Policy(layers, mean, std, interface, config)
     except PolicyError as error:
         raise PolicyError(f"{path}: {error}") from error
+    except DAMAGE as error:
+        raise _no_training(path, error) from error
+
+
+def _no_training(path: Path, error: Exception) -> CheckpointError:
+    return CheckpointError(f"{path}: not of a training of this project ({type(error).__name__}: {one_line(error)})")
 
 
 def learning_curve(source: Path) -> bytes | None:

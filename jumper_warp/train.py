@@ -17,12 +17,12 @@ from typing import Any, Literal, NamedTuple
 
 import torch
 
-from jumper_warp.checkpoint import CheckpointError, save_checkpoint, write_whole
+from jumper_warp.checkpoint import DAMAGE, CheckpointError, one_line, save_checkpoint, write_whole
 from jumper_warp.checks import check_not_negative
 from jumper_warp.networks import wait_for_ranks, world_size
 from jumper_warp.ppo import Ppo, PpoCfg, VecTask
 from jumper_warp.ranks import Rank, gather, join_ranks
-from jumper_warp.resume import CHECKPOINTS, find_checkpoint, random_state, set_random_state
+from jumper_warp.resume import CHECKPOINTS, find_checkpoint, own_part, random_state, set_random_state, spent_seconds
 from jumper_warp.runtime import git_commit, versions
 from jumper_warp.training_log import Pace, Stopwatch, TrainingLog
 
@@ -193,18 +193,14 @@ class Run:
         path, state, refusals = find_checkpoint(self.cfg)
         self.notes += [f"passed over: {refusal}" for refusal in refusals] + [f"resumed {path}"]
         try:
-            processes = 1 + len(state["others"])
-            if processes != self.rank.size:
-                raise ValueError(f"saved by {processes} processes, there are {self.rank.size}")
-            own = state["others"][self.rank.index - 1] if self.rank.index else state
+            own = own_part(state, self.rank)
             self.ppo.load_state_dict({**state["ppo"], **own["ppo"]})
             self.env.load_state_dict(own["env"])
-            self.seconds = float(state.get("seconds", 0.0))
-        except (RuntimeError, KeyError, ValueError, TypeError) as error:
-            reason = " ".join(str(error).split())[:300]
-            raise CheckpointError(f"{path}: does not fit these settings: {reason}") from error
+            self.seconds = spent_seconds(state)
+            set_random_state(own["rng"])
+        except DAMAGE as error:
+            raise CheckpointError(f"{path}: does not fit these settings: {one_line(error)}") from error
         self.iteration = state["iteration"]
-        set_random_state(own["rng"])
         return path.parent.parent
 
     def iterate(self, stop: Stop) -> TrainResult:

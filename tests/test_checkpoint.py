@@ -39,6 +39,19 @@ def test_the_newest_and_the_best_stay(tmp_path):
     assert best_checkpoint(tmp_path).stem == "iteration_000002"
 
 
+def test_what_follows_an_older_checkpoint_is_the_newest(tmp_path):
+    for iteration in (100, 200, 300, 110, 300, 120):  # resumed from 100 after 300, and from 110
+        newest = save_checkpoint(tmp_path, state(iteration), keep=2)
+        assert latest_checkpoint(tmp_path)[0] == newest
+    assert sorted(path.stem for path in tmp_path.glob("*.pt")) == ["iteration_000120", "iteration_000300"]
+
+
+def test_a_score_that_is_no_number_is_none(tmp_path):
+    best = save_checkpoint(tmp_path, state(1), 0.5)
+    save_checkpoint(tmp_path, state(2), float("nan"))
+    assert best_checkpoint(tmp_path) == best
+
+
 def test_without_scores_the_newest_is_the_best(tmp_path):
     save_checkpoint(tmp_path, state(1))
     newest = save_checkpoint(tmp_path, state(2))
