@@ -30,6 +30,12 @@ from jumper_warp.vectask import VecTask
 STATISTICS = ("surrogate", "value", "entropy", "kl", "gradient_actor", "gradient_critic", "skipped")
 """What `Ppo.statistics` averages over minibatches; skipped is the share of steps with a non-finite gradient."""
 
+FIGURES = (
+    *(f"Loss/{name}" for name in STATISTICS), "Loss/learning_rate", "Policy/mean_std", "Train/mean_return",
+    "Train/mean_length",
+)  # fmt: skip
+"""Names of all that `Ppo.statistics` returns; those of Train/ once an episode has ended."""
+
 
 @dataclass(frozen=True)
 class PpoCfg:

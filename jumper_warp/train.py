@@ -20,7 +20,7 @@ import torch
 from jumper_warp.checkpoint import DAMAGE, CheckpointError, one_line, save_checkpoint, write_whole
 from jumper_warp.checks import check_not_negative
 from jumper_warp.networks import wait_for_ranks, world_size
-from jumper_warp.ppo import Ppo, PpoCfg, VecTask
+from jumper_warp.ppo import FIGURES, Ppo, PpoCfg, VecTask
 from jumper_warp.ranks import Rank, gather, join_ranks
 from jumper_warp.resume import CHECKPOINTS, find_checkpoint, own_part, random_state, set_random_state, spent_seconds
 from jumper_warp.runtime import git_commit, versions
@@ -28,6 +28,8 @@ from jumper_warp.training_log import Pace, Stopwatch, TrainingLog
 
 CONFIG = "config.json"
 """File of a run: all settings, versions and the commit."""
+PERF = ("Perf/fps", "Perf/collect_s", "Perf/update_s", "Perf/elapsed_s")
+"""Logged figures of the training itself: steps per second, and seconds."""
 INTERRUPTED = 130
 """Exit code of a training that was asked to stop."""
 
@@ -157,6 +159,13 @@ def _check_division(cfg: TrainCfg, rank: Rank) -> None:
         cfg.ppo.batch_size(cfg.num_envs // rank.size)
 
 
+def _check_best_by(name: str, logged: set[str]) -> None:
+    """Raises ValueError: no figure of this name is logged."""
+    if name not in logged:
+        some = ", ".join(sorted(each for each in logged if each.startswith(("Metrics/", "Train/"))))
+        raise ValueError(f"best_by must name a logged figure, such as {some}, got {name!r:.60}")
+
+
 def full_config(cfg: TrainCfg, env: VecTask, rank: Rank) -> dict[str, Any]:
     """Return all settings with versions and commit, ready for JSON."""
     settings = json.loads(json.dumps(dataclasses.asdict(cfg), default=str))
@@ -179,6 +188,7 @@ class Run:
         self.cfg, self.env, self.rank = cfg, env, rank
         self._command = command or f"jumper train {cfg.task}"
         self.ppo = Ppo(env, cfg.ppo)
+        _check_best_by(cfg.best_by, {*env.metrics(), *FIGURES, *PERF})
         self.config = full_config(cfg, env, rank)
         self.iteration, self.seconds = 0, 0.0  # that the run had before this process
         self._begin: float | None = None  # on the clock, as if all seconds that count were of this process
@@ -283,14 +293,8 @@ class Run:
     def _read(self, times: list[float], seconds: float) -> dict[str, float]:
         """Return the figures to log; times: of collect and update [s], seconds: of an iteration."""
         steps = self.cfg.ppo.num_steps * self.cfg.num_envs
-        return {
-            **self.ppo.statistics(),
-            **self.env.metrics(),
-            "Perf/fps": steps / seconds,
-            "Perf/collect_s": times[0],
-            "Perf/update_s": times[1],
-            "Perf/elapsed_s": self._elapsed(),
-        }
+        perf = (steps / seconds, *times, self._elapsed())
+        return {**self.ppo.statistics(), **self.env.metrics(), **dict(zip(PERF, perf, strict=True))}
 
     def _save(self, log: TrainingLog | _Silent, ending: bool, stop: Stop) -> None:
         """Save a checkpoint; a failure is only told, and tried again next time, unless this is the last."""

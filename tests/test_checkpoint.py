@@ -47,8 +47,9 @@ def test_what_follows_an_older_checkpoint_is_the_newest(tmp_path):
 
 
 def test_a_score_that_is_no_number_is_none(tmp_path):
-    best = save_checkpoint(tmp_path, state(1), 0.5)
-    save_checkpoint(tmp_path, state(2), float("nan"))
+    save_checkpoint(tmp_path, state(1), float("nan"))
+    best = save_checkpoint(tmp_path, state(2), 0.5)
+    save_checkpoint(tmp_path, state(3), float("nan"))
     assert best_checkpoint(tmp_path) == best
 
 

@@ -263,6 +263,24 @@ def test_what_cannot_be_divided_is_refused_before_anything_is_built(cfg, change,
         train(dataclasses.replace(cfg, **change), must_not_be_built)
 
 
+def test_a_score_that_is_never_logged_is_refused_before_the_first_iteration(cfg):
+    class Unmoved(PushTask):
+        def step(self, action):
+            pytest.fail("an iteration began")
+
+    message = r"best_by must name a logged figure, such as Metrics/success, Train/mean_length, .*, got 'nonsense'"
+    with pytest.raises(ValueError, match=message):
+        train(dataclasses.replace(cfg, best_by="nonsense"), Unmoved)
+    assert not cfg.log_root.exists()
+
+
+def test_every_logged_figure_can_be_the_score(cfg):
+    figures = train(cfg, make_env).figures
+    for name in figures:
+        Run(dataclasses.replace(cfg, best_by=name), make_env(32, 1, "cpu"), Rank(0, 1, torch.device("cpu")))
+    assert {"Train/mean_return", "Perf/fps", "Loss/kl", "Metrics/success"} <= figures.keys()
+
+
 def test_the_largest_seed_trains(cfg):
     assert train(dataclasses.replace(cfg, seed=2**31 - 1, iterations=1), make_env).iteration == 1
 
