@@ -19,6 +19,7 @@ from jumper_warp.task_flags import TaskFlags
 from jumper_warp.tasks import TASKS, make_task
 from jumper_warp.tasks.task import TaskCfg
 from jumper_warp.train import MakeEnv, TrainCfg, TrainResult, train
+from jumper_warp.training_memory import check_memory
 
 
 @dataclass(frozen=True)
@@ -60,9 +61,10 @@ def parse_train(args: Sequence[str]) -> tuple[TrainArgs, TaskCfg]:
 
 
 def env_maker(task: TaskCfg, args: TrainArgs) -> MakeEnv:
-    """Return what makes the environment of a training."""
+    """Return what makes the environment of a training; it raises ValueError, too, if memory is short."""
 
     def make(num_envs: int, seed: int, device: torch.device) -> JumpEnv:
+        check_memory(task, args.solver, num_envs, device)
         return JumpEnv(
             task,
             num_envs,

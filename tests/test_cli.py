@@ -8,7 +8,7 @@ import pytest
 from landing_helpers import still_policy
 from rerun.chunk import RrdReader
 
-from jumper_warp import cli
+from jumper_warp import cli, train_command
 from jumper_warp.checkpoint import CheckpointError
 from jumper_warp.evaluate import EvaluateCfg, HeightFlags, PlaceFlags
 from jumper_warp.play import HeightGoals, PlaceGoals, PlayCfg, viewer_command
@@ -91,6 +91,14 @@ def test_unusable_input_is_one_line_and_code_2(capsys, tmp_path, monkeypatch, ar
     code, out, err = run(capsys, *args)
     assert (code, out) == (2, "")
     assert len(err) == 1 and err[0].startswith("jumper: ") and message in err[0]
+
+
+def test_a_billion_worlds_are_refused_before_anything_is_built(capsys, monkeypatch, tmp_path):
+    monkeypatch.setattr(train_command, "JumpEnv", lambda *_, **__: pytest.fail("the environment was built"))
+    code, out, err = run(capsys, *TRAIN, "--num-envs", "1000000000", "--log-root", str(tmp_path))
+    assert (code, out, len(err)) == (2, "", 2) and err[0].startswith("device cpu")
+    assert err[1].startswith("jumper: num_envs 1000000000 needs about ") and err[1].endswith(" would fit")
+    assert not list(tmp_path.iterdir())
 
 
 def test_bare_command_shows_usage_with_code_2(capsys):
