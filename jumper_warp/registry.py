@@ -18,7 +18,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING
 
-from jumper_warp.rl.ppo import PpoCfg
+from jumper_warp.rl.cfg import PpoCfg
 from jumper_warp.utils.errors import InputError
 
 if TYPE_CHECKING:

@@ -18,7 +18,7 @@ from jumper_warp.registry import (
     task_names,
     trainer_settings,
 )
-from jumper_warp.rl.ppo import PpoCfg
+from jumper_warp.rl.cfg import PpoCfg
 from jumper_warp.tasks.saving import task_to_json
 from jumper_warp.utils.errors import InputError
 
@@ -27,7 +27,7 @@ TASK_FILE = """\
 from dataclasses import replace
 
 from jumper_warp.registry import TaskEntry, register_task
-from jumper_warp.rl.ppo import PpoCfg
+from jumper_warp.rl.cfg import PpoCfg
 from jumper_warp.tasks.jump.vertical import vertical_jump
 
 
@@ -97,7 +97,7 @@ def test_name_that_is_taken_is_refused(name, aliases, taken):
 
 def test_task_that_calls_itself_otherwise_is_refused():
     register_task("my-jump", renamed("vertical-jump"))
-    with pytest.raises(InputError, match="'my-jump' of .* calls itself 'vertical-jump'"):
+    with pytest.raises(InputError, match=r"'my-jump' of .* calls itself 'vertical-jump'"):
         make_task("my-jump")
 
 
@@ -180,8 +180,9 @@ def test_mistake_in_a_file_is_told_with_its_line_and_leaves_nothing(tmp_path, co
 
 
 @pytest.mark.parametrize(
-    ("code", "kind"), [("1 / 0", ZeroDivisionError), ("import no_such_module", ModuleNotFoundError), ("int('x')", ValueError)]
-)  # fmt: skip
+    ("code", "kind"),
+    [("1 / 0", ZeroDivisionError), ("import no_such_module", ModuleNotFoundError), ("int('x')", ValueError)],
+)
 def test_fault_in_a_file_keeps_its_traceback(tmp_path, code, kind):
     path = tmp_path / "my_tasks.py"
     path.write_text(TASK_FILE + REGISTER + code)
@@ -214,7 +215,7 @@ def install(tmp_path, monkeypatch):
 def test_installed_task_is_loaded_when_it_is_asked_for_and_not_before(install, function):
     install("their_tasks", {"low-jump": f"their_tasks:{function}"})
     assert "low-jump" in task_names() and make_task("vertical-jump")
-    with pytest.raises(InputError, match="there are .*low-jump"):
+    with pytest.raises(InputError, match=r"there are .*low-jump"):
         make_task("swim")
     assert "their_tasks" not in sys.modules
     assert make_task("low-jump").name == "low-jump" and TASKS["low-jump"].origin == "their_tasks"

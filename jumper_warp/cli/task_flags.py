@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import ast
 import dataclasses
+import functools
 import inspect
 import itertools
 import re
@@ -36,24 +37,12 @@ class Flag(NamedTuple):
 
 def flags_of(task: TaskCfg) -> Any:
     """Return a task's settings as a dataclass that tyro makes flags of. Raises InputError: two flags are the same."""
-    hints, docs = get_type_hints(TaskCfg), field_docs(TaskCfg)
-    found = {}
-    for spec in dataclasses.fields(task):
-        flag = _flag(getattr(task, spec.name), hints[spec.name], f"{task.name} {spec.name}")
-        if flag is not None:
-            found[spec.name] = flag._replace(about=flag.about or docs.get(spec.name))
-    return _group("Settings of the task.", found, task.name).value
+    return _flag_of_dataclass(task, task.name).value
 
 
 def with_flags(task: TaskCfg, flags: Any) -> TaskCfg:
     """Return the task with the settings of `flags_of`, changed or not. Raises ValueError as `TaskCfg` does."""
-    given = _members(flags)
-    changes = {
-        spec.name: _changed(getattr(task, spec.name), given[flag_name(spec.name)])
-        for spec in dataclasses.fields(task)
-        if flag_name(spec.name) in given
-    }
-    return dataclasses.replace(task, **changes)
+    return _changed(task, flags)
 
 
 def flag_name(name: str) -> str:
@@ -61,14 +50,19 @@ def flag_name(name: str) -> str:
     return re.sub(r"[^0-9A-Za-z]+", "-", name).strip("-").lower()
 
 
+@functools.cache
 def field_docs(kind: type) -> dict[str, str]:
-    """Return what the strings below the fields of a dataclass tell, by field."""
-    body = ast.parse(textwrap.dedent(inspect.getsource(kind))).body[0].body
-    return {
-        field.target.id: " ".join(text.value.value.split())
-        for field, text in itertools.pairwise(body)
-        if isinstance(field, ast.AnnAssign) and isinstance(text, ast.Expr) and isinstance(text.value, ast.Constant)
-    }
+    """Return what the strings below the fields of a dataclass tell, by field; nothing where there is no source."""
+    docs = {}
+    for base in reversed(kind.__mro__[:-1]):
+        try:
+            body = ast.parse(textwrap.dedent(inspect.getsource(base))).body[0].body
+        except (OSError, TypeError, SyntaxError):
+            continue
+        for field, text in itertools.pairwise(body):
+            if isinstance(field, ast.AnnAssign) and isinstance(text, ast.Expr) and isinstance(text.value, ast.Constant):
+                docs[field.target.id] = " ".join(text.value.value.split())
+    return docs
 
 
 def _flag(value: Any, hint: Any, where: str) -> Flag | None:
@@ -76,15 +70,23 @@ def _flag(value: Any, hint: Any, where: str) -> Flag | None:
     if isinstance(value, Term):
         return _flag_of_term(value, where)
     if isinstance(value, Reset):
-        return None if value.settings is None else _flag(value.settings, type(value.settings), where)
-    if isinstance(value, tuple) and value and all(isinstance(term, Term) for term in value):
-        terms = {term.name: _flag_of_term(term, f"{where} {term.name}") for term in value}
-        return _group(None, {name: flag for name, flag in terms.items() if flag is not None}, where)
-    if (isinstance(value, str | tuple) and not value) or isinstance(value, str) or not _is_data(value):
-        return None
-    if isinstance(value, tuple) and dataclasses.is_dataclass(value[0]):
-        return Flag(tuple[tuple(type(v) for v in value)], value)
-    return Flag(type(value) if dataclasses.is_dataclass(value) else hint, value)
+        return _flag(value.settings, Any, where)
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return _flag_of_dataclass(value, where)
+    if _has_parts(value):
+        parts = {name: _flag(part, Any, f"{where} {name}") for name, part in _parts(value).items()}
+        return _group(None, {name: flag for name, flag in parts.items() if flag is not None}, where)
+    return Flag(hint, value) if _is_number(value, hint) else None
+
+
+def _flag_of_dataclass(value: Any, where: str) -> Flag | None:
+    """Return the flags of the fields of a dataclass; those that hold functions and names have none."""
+    hints, docs, flags = get_type_hints(type(value)), field_docs(type(value)), {}
+    for spec in dataclasses.fields(value):
+        flag = _flag(getattr(value, spec.name), hints[spec.name], f"{where} {spec.name}")
+        if flag is not None:
+            flags[spec.name] = flag._replace(about=docs.get(spec.name, flag.about))
+    return _group(_first_paragraph(type(value).__doc__), flags, where) if flags else None
 
 
 def _flag_of_term(term: Term, where: str) -> Flag | None:
@@ -92,8 +94,7 @@ def _flag_of_term(term: Term, where: str) -> Flag | None:
     settings = term.settings | term.options
     numbers = term.numbers | {key: option for key, option in term.options.items() if type(option) is int}
     flags = {key: Flag(int if type(settings.get(key)) is int else float, value) for key, value in numbers.items()}
-    about = (inspect.getdoc(term.func.func) or "").split("\n\n")[0]
-    return _group(" ".join(about.split()) or None, flags, where) if flags else None
+    return _group(_first_paragraph(inspect.getdoc(term.func.func)), flags, where) if flags else None
 
 
 def _group(about: str | None, flags: dict[str, Flag], where: str) -> Flag:
@@ -124,17 +125,44 @@ def _changed(value: Any, flags: Any) -> Any:
         new = {key: given[flag_name(key)] for key in known if flag_name(key) in given}
         return value.replace(**{key: number for key, number in new.items() if number != known[key]})
     if isinstance(value, Reset):
-        return dataclasses.replace(value, settings=flags)
-    if isinstance(value, tuple) and value and all(isinstance(term, Term) for term in value):
+        return dataclasses.replace(value, settings=_changed(value.settings, flags))
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
         given = _members(flags)
-        return tuple(_changed(term, given[name]) if (name := flag_name(term.name)) in given else term for term in value)
+        parts = {spec.name: getattr(value, spec.name) for spec in dataclasses.fields(value)}
+        new = {name: _changed(part, given[flag_name(name)]) for name, part in parts.items() if flag_name(name) in given}
+        return dataclasses.replace(value, **new)
+    if _has_parts(value):
+        given = _members(flags)
+        return tuple(
+            _changed(part, given[flag_name(name)]) if flag_name(name) in given else part
+            for name, part in _parts(value).items()
+        )
     return flags
 
 
-def _is_data(value: Any) -> bool:
-    """Return whether a setting is numbers, names and nothing, and not a function of the task."""
-    if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        return all(_is_data(getattr(value, spec.name)) for spec in dataclasses.fields(value))
+def _has_parts(value: Any) -> bool:
+    """Return whether a setting is a tuple of terms or of groups of settings."""
+    return (
+        isinstance(value, tuple)
+        and bool(value)
+        and all(isinstance(v, Term) or dataclasses.is_dataclass(v) for v in value)
+    )
+
+
+def _parts(value: tuple[Any, ...]) -> dict[str, Any]:
+    """Return the terms of a tuple by name, or its groups of settings by number."""
+    return {part.name if isinstance(part, Term) else str(i): part for i, part in enumerate(value)}
+
+
+def _is_number(value: Any, hint: Any) -> bool:
+    """Return whether a setting is a number, a choice, a few of them, or none: all but functions, structs and names."""
+    if isinstance(value, str):
+        return hint is not str
     if isinstance(value, tuple):
-        return all(_is_data(v) for v in value)
-    return value is None or isinstance(value, bool | int | float | str)
+        return bool(value) and all(_is_number(v, Any) for v in value)
+    return (value is None and hint is not Any) or isinstance(value, bool | int | float)
+
+
+def _first_paragraph(doc: str | None) -> str | None:
+    """Return the beginning of a docstring in one line."""
+    return " ".join(inspect.cleandoc(doc or "").split("\n\n")[0].split()) or None

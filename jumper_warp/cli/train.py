@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import os
+import shlex
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -15,7 +16,7 @@ import tyro
 
 from jumper_warp.cli.main import TASK_MODULE_HELP, USAGE_ERROR, UsageError, parse
 from jumper_warp.registry import find_task, make_task, task_names
-from jumper_warp.rl.runner import TrainCfg
+from jumper_warp.rl.cfg import TrainCfg
 from jumper_warp.utils.errors import InputError
 
 if TYPE_CHECKING:
@@ -78,9 +79,11 @@ def parse_settings(task: TaskCfg, default: TrainArgs, args: Sequence[str]) -> An
 
 def env_maker(task: TaskCfg, args: TrainArgs) -> MakeEnv:
     """Return what makes the environment of a training."""
+    from jumper_warp.cli.training_memory import check_memory
     from jumper_warp.envs.env import Env
 
     def make(num_envs: int, seed: int, device: torch.device) -> Env:
+        check_memory(task, args.cfg.ppo, args.solver, num_envs, device)
         return Env(
             task,
             num_envs,
@@ -92,6 +95,15 @@ def env_maker(task: TaskCfg, args: TrainArgs) -> MakeEnv:
         )
 
     return make
+
+
+def command_line(args: Sequence[str]) -> str:
+    """Return what was typed, without `--resume`."""
+    kept = [arg for arg in args if not arg.startswith("--resume=")]
+    while "--resume" in kept:
+        at = kept.index("--resume")
+        del kept[at : at + 2]
+    return shlex.join(["jumper", "train", *kept])
 
 
 def check_saving(task: TaskCfg) -> None:
@@ -132,7 +144,10 @@ def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> TrainResult:
     first = os.environ.get("RANK", "0") == "0"
     if first:
         announce(parsed.cfg.device)
-    result = train(parsed.cfg, env_maker(task, parsed))
+    as_rsl_rl = None
+    if parsed.cfg.trainer == "rsl-rl":
+        from jumper_warp.envs.rsl_rl import RslRlVecEnv as as_rsl_rl
+    result = train(parsed.cfg, env_maker(task, parsed), as_rsl_rl)
     if first:
         print(result.folder)
     return result

@@ -270,7 +270,7 @@ class Env:
                 self.sim.physics.parameters_changed(mask)
 
     def _forget(self, mask: wp.array) -> None:
-        self._launch(forget_kernel, (12, self.num_envs), [mask, self.robot, self.delays])
+        self._launch(forget_kernel, (12, self.num_envs), [mask, self._scene.geometry, self.robot, self.delays])
         self.sim.physics.after_reset(mask)
 
     def _tick(self, mask: wp.array) -> None:

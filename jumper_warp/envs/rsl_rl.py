@@ -65,18 +65,3 @@ class RslRlVecEnv(RslRlEnv):
             extras["log"] = {f"/{name}": value for name, value in env.metrics().items()}
         reward = torch.nan_to_num(env.reward, nan=0.0, posinf=0.0, neginf=0.0)
         return self.get_observations(), reward, env.done.long(), extras
-
-
-def train_rsl_rl(env: VecEnv, cfg: Any, *args: Any, **arguments: Any) -> Any:
-    """Train as `jumper_warp.rl.rsl_rl.train_rsl_rl`, whose place this was."""
-    from jumper_warp.rl import rsl_rl
-
-    env.reset()
-    return rsl_rl.train_rsl_rl(RslRlVecEnv(env, cfg.num_steps), cfg, *args, **arguments)
-
-
-def rsl_rl_config(*args: Any) -> dict[str, Any]:
-    """Return `jumper_warp.rl.rsl_rl.rsl_rl_config`, whose place this was."""
-    from jumper_warp.rl import rsl_rl
-
-    return rsl_rl.rsl_rl_config(*args)

@@ -10,6 +10,7 @@ import torch
 import warp as wp
 
 from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.state_checks import check_tensor, check_values
 from kernels.mdp.env import Delays, EnvArrays
 from kernels.mdp.parameters import RobotParameters
 from kernels.mdp.view import RobotArrays
@@ -44,6 +45,8 @@ def load_state(env: Env, state: dict[str, torch.Tensor]) -> None:
     Raises:
         ValueError: It is of another number of environments, other fields, robots or seed; nothing is changed.
     """
+    if not isinstance(state, dict):
+        raise InputError(f"a saved environment must be a dictionary, got {type(state).__name__}")
     tensors, records = _tensors(env), {prefix: array.numpy().copy() for prefix, array in _records(env).items()}
     fields = {prefix + name: (prefix, name) for prefix, values in records.items() for name in values.dtype.names}
     names = {*tensors, *fields, FINGERPRINT, SEED}
@@ -52,17 +55,15 @@ def load_state(env: Env, state: dict[str, torch.Tensor]) -> None:
             f"saved by another version, task or solver: lacks {sorted(names - state.keys())[:5]}, "
             f"has {sorted(state.keys() - names)[:5]} besides"
         )
-    saved = state["env.done"].shape[0]
-    if saved != env.num_envs:
-        raise InputError(f"saved for {saved} environments, there are {env.num_envs}")
-    for skill in env.skills:
-        if state[f"{skill.task.name}/timer"].shape[0] != skill.timer.shape[0]:
-            raise InputError(f"saved with other randomisation or events of {skill.task.name}")
-    expected = {name: tuple(tensor.shape) for name, tensor in tensors.items()}
-    expected |= {field: records[prefix][name].shape for field, (prefix, name) in fields.items()}
-    for name, shape in expected.items():
-        if tuple(state[name].shape) != shape:
-            raise InputError(f"saved {name} has shape {tuple(state[name].shape)}, expected {shape}")
+    done = state["env.done"]
+    if isinstance(done, torch.Tensor) and done.dim() == 1 and len(done) != env.num_envs:
+        raise InputError(f"saved for {len(done)} environments, there are {env.num_envs}")
+    for name, tensor in tensors.items():
+        check_tensor(state[name], tensor, f"saved {name}")
+    for field, (prefix, name) in fields.items():
+        check_tensor(state[field], torch.from_numpy(records[prefix][name].copy()), f"saved {field}")
+    check_values(state["env.level"], "saved env.level", 0)  # indexes the curriculum
+    check_tensor(state[FINGERPRINT], nominal_fingerprint(env), f"saved {FINGERPRINT}")
     if not torch.equal(state[FINGERPRINT], nominal_fingerprint(env)):
         raise InputError("saved with other robots: the description or the task's motors differ")
     if int(state[SEED]) != env.seed:

@@ -69,10 +69,6 @@ class VecEnv(Protocol):
         """
 
 
-VecTask = VecEnv
-"""Former name."""
-
-
 def sanitise(obs: torch.Tensor, out: torch.Tensor | None = None) -> torch.Tensor:
     """Return a copy of observations, in `out` if given: non-finite entries 0, the rest clamped to ±RAW_LIMIT."""
     return torch.nan_to_num(obs, nan=0.0, posinf=0.0, neginf=0.0, out=out).clamp_(-RAW_LIMIT, RAW_LIMIT)

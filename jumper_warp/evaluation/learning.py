@@ -10,8 +10,8 @@ import torch
 import warp as wp
 
 from jumper_warp.envs.env import Env
+from jumper_warp.envs.vec_env import sanitise
 from jumper_warp.evaluation.jumps import run_jumps
-from jumper_warp.rl.networks import sanitise
 from jumper_warp.rl.ppo import Ppo
 
 TESTED = (0.5, 1.1)

@@ -12,8 +12,9 @@ import warp as wp
 
 from jumper_warp.envs.env import Env
 from jumper_warp.registry import make_task
+from jumper_warp.rl.cfg import PpoCfg
 from jumper_warp.rl.logger import Stopwatch
-from jumper_warp.rl.ppo import Ppo, PpoCfg
+from jumper_warp.rl.ppo import Ppo
 from jumper_warp.sim.simulation import Simulation
 from jumper_warp.utils.timing import median_time, wall_time
 

@@ -13,12 +13,13 @@ from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any, Literal
 
+from jumper_warp.envs.vec_env import RAW_LIMIT
 from jumper_warp.policies.folder import load_policy
 from jumper_warp.policies.legacy import upgraded
 from jumper_warp.policies.policy import Policy
 from jumper_warp.policies.spec import PolicyError, make_interface
 from jumper_warp.rl.checkpoint import CheckpointError, best_checkpoint, latest_checkpoint, load_checkpoint
-from jumper_warp.rl.networks import EPS, NORMALISED_LIMIT, RAW_LIMIT
+from jumper_warp.rl.networks import EPS, NORMALISED_LIMIT
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.tasks.interface import interface
 from jumper_warp.tasks.saving import OPTIONAL, TaskError, task_from_json

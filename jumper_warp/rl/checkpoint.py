@@ -5,8 +5,8 @@ from __future__ import annotations
 import hashlib
 import io
 import json
+import math
 from pathlib import Path
-from pickle import UnpicklingError
 from typing import Any
 
 import torch
@@ -15,8 +15,10 @@ from jumper_warp.utils.files import write_whole
 
 MANIFEST = "manifest.json"
 """Beside the checkpoints: SHA-256, iteration and score of each."""
-REQUIRED = ("iteration", "ppo", "env", "rng", "config")
-"""What every checkpoint holds."""
+REQUIRED = {"iteration": int, "ppo": dict, "env": dict, "rng": dict, "config": str}
+"""What every checkpoint holds, and of which type."""
+DAMAGE = (LookupError, TypeError, ValueError, AttributeError, RuntimeError)
+"""What reading a part of a checkpoint raises that is missing or of another kind."""
 
 
 class CheckpointError(ValueError):
@@ -29,8 +31,8 @@ def save_checkpoint(folder: Path, state: dict[str, Any], score: float | None = N
     Args:
         folder: Made if need be.
         state: Has at least the keys of REQUIRED.
-        score: The higher, the better; the best checkpoint is never removed.
-        keep: How many of the newest stay, at least 1.
+        score: The higher, the better, NaN is none; the best checkpoint is never removed.
+        keep: How many of the last saved stay, at least 1.
 
     Raises:
         OSError: The disk is full or the folder cannot be written.
@@ -42,12 +44,13 @@ def save_checkpoint(folder: Path, state: dict[str, Any], score: float | None = N
     path = folder / f"iteration_{state['iteration']:06d}.pt"
     write_whole(path, data)
     manifest = _read_manifest(folder, missing_ok=True)
+    manifest.pop(path.name, None)  # the order is that of saving
     manifest[path.name] = {
         "sha256": hashlib.sha256(data).hexdigest(),
         "iteration": state["iteration"],
         "score": score,
     }
-    newest = sorted(manifest, key=lambda name: manifest[name]["iteration"])[-keep:]
+    newest = list(manifest)[-keep:]
     best = _best(manifest)
     old = [name for name in manifest if name not in newest and name != best]
     for name in old:
@@ -62,35 +65,49 @@ def load_checkpoint(path: Path) -> dict[str, Any]:
     """Return what was saved, on the CPU.
 
     Raises:
-        CheckpointError: The file is missing, has no checksum, differs from it, or is no checkpoint.
+        CheckpointError: The file is missing, has no checksum, differs from it, or is no checkpoint; or its iteration
+            is not the one of the manifest.
     """
     entry = _read_manifest(path.parent).get(path.name)
     if not path.is_file():
         raise CheckpointError(f"{path}: no such checkpoint")
     if entry is None:
         raise CheckpointError(f"{path}: has no checksum in {MANIFEST}")
-    data = path.read_bytes()
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise CheckpointError(f"{path}: {error.strerror}") from error
     if hashlib.sha256(data).hexdigest() != entry["sha256"]:
         raise CheckpointError(f"{path}: differs from its checksum in {MANIFEST}")
     try:
         state = torch.load(io.BytesIO(data), map_location="cpu", weights_only=True)
-    except (RuntimeError, EOFError, ValueError, KeyError, UnpicklingError) as error:
-        raise CheckpointError(f"{path}: not readable as tensors: {str(error).splitlines()[0]}") from error
+    except Exception as error:  # a damaged pickle raises anything
+        raise CheckpointError(f"{path}: not readable as tensors: {one_line(error)}") from error
     missing = [key for key in REQUIRED if not isinstance(state, dict) or key not in state]
     if missing:
         raise CheckpointError(f"{path}: lacks {', '.join(missing)}")
+    for key, kind in REQUIRED.items():
+        if type(state[key]) is not kind:
+            raise CheckpointError(f"{path}: {key} must be {kind.__name__}, got {type(state[key]).__name__}")
+    if state["iteration"] != entry["iteration"]:
+        raise CheckpointError(f"{path}: of iteration {state['iteration']}, {MANIFEST} says {entry['iteration']}")
     return state
 
 
+def one_line(error: Exception) -> str:
+    """Return what an error says, on one line of at most 300 characters; its type if it says nothing."""
+    return " ".join(str(error).split())[:300] or type(error).__name__
+
+
 def latest_checkpoint(folder: Path) -> tuple[Path, dict[str, Any], list[str]]:
-    """Return path and content of the newest usable checkpoint, and why each newer one was passed over.
+    """Return path and content of the last saved usable checkpoint, and why each newer one was passed over.
 
     Raises:
         CheckpointError: None is usable.
     """
     manifest = _read_manifest(folder)
     refusals: list[str] = []
-    for name in sorted(manifest, key=lambda name: manifest[name]["iteration"], reverse=True):
+    for name in reversed(manifest):
         try:
             return folder / name, load_checkpoint(folder / name), refusals
         except CheckpointError as error:
@@ -99,7 +116,7 @@ def latest_checkpoint(folder: Path) -> tuple[Path, dict[str, Any], list[str]]:
 
 
 def best_checkpoint(folder: Path) -> Path:
-    """Return the path of the checkpoint with the highest score, or of the newest if none has one.
+    """Return the path of the checkpoint with the highest score, or of the last saved if none has one.
 
     Raises:
         CheckpointError: There is none.
@@ -107,11 +124,11 @@ def best_checkpoint(folder: Path) -> Path:
     manifest = _read_manifest(folder)
     if not manifest:
         raise CheckpointError(f"{folder}: no checkpoint")
-    return folder / (_best(manifest) or max(manifest, key=lambda name: manifest[name]["iteration"]))
+    return folder / (_best(manifest) or list(manifest)[-1])
 
 
 def _best(manifest: dict[str, dict[str, Any]]) -> str | None:
-    scored = [name for name, entry in manifest.items() if entry["score"] is not None]
+    scored = [name for name, entry in manifest.items() if entry["score"] is not None and math.isfinite(entry["score"])]
     return max(scored, key=lambda name: manifest[name]["score"], default=None)
 
 
@@ -121,11 +138,18 @@ def _read_manifest(folder: Path, missing_ok: bool = False) -> dict[str, dict[str
         return {}
     try:
         manifest = json.loads(path.read_text())
-        complete = all({"sha256", "iteration", "score"} <= entry.keys() for entry in manifest.values())
+        complete = all(_is_entry(entry) for entry in manifest.values())
     except OSError as error:
         raise CheckpointError(f"{path}: {error.strerror}") from error
-    except (ValueError, AttributeError) as error:
+    except (ValueError, AttributeError, RecursionError) as error:
         raise CheckpointError(f"{path}: not readable") from error
     if not complete:
         raise CheckpointError(f"{path}: not readable")
     return manifest
+
+
+def _is_entry(entry: Any) -> bool:
+    if not isinstance(entry, dict) or not {"sha256", "iteration", "score"} <= entry.keys():
+        return False
+    scored = type(entry["score"]) in (int, float, type(None))
+    return isinstance(entry["sha256"], str) and type(entry["iteration"]) is int and scored

@@ -2,29 +2,21 @@
 
 from __future__ import annotations
 
-import json
 import time
+from contextlib import suppress
 from itertools import pairwise
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Protocol
+from typing import Any
 
 import torch
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
+from jumper_warp.rl.figure_files import EventFile, FiguresFile
+
 FIGURES = "metrics.jsonl"
 """In a run's folder: one JSON object per logged iteration."""
-
-
-class Writer(Protocol):
-    """Takes scalars under a name, as TensorBoard's SummaryWriter does."""
-
-    def add_scalar(self, tag: str, scalar_value: float, global_step: int) -> None:
-        """Log one figure."""
-
-    def close(self) -> None:
-        """Write out what is left."""
 
 
 class Stopwatch:
@@ -59,11 +51,31 @@ class Stopwatch:
         return [sum(part) / len(part) for part in zip(*seconds, strict=True)]
 
 
+class Pace:
+    """Seconds of an iteration, on the host's clock."""
+
+    def __init__(self, iteration: int) -> None:
+        """iteration: how many have been done."""
+        self._time, self._iteration = time.perf_counter(), iteration
+
+    def lap(self, iteration: int) -> float:
+        """Return the mean seconds of the iterations since the last lap; `iteration`, more than then, have been done."""
+        since, done = self._time, self._iteration
+        self._time, self._iteration = time.perf_counter(), iteration
+        return (self._time - since) / (iteration - done)
+
+
 class TrainingLog:
-    """Context in which figures are logged; silent on all ranks but the first."""
+    """Context in which figures are logged. Nothing that cannot be written stops the training; it is told once."""
 
     def __init__(
-        self, folder: Path, config: dict[str, Any], total: int, tensorboard: bool = True, wandb: bool = False
+        self,
+        folder: Path,
+        config: dict[str, Any],
+        total: int,
+        tensorboard: bool = True,
+        wandb: bool = False,
+        iteration: int = 0,
     ) -> None:
         """Args:
 
@@ -72,13 +84,18 @@ class TrainingLog:
         total: Iterations that the run is to have at its end.
         tensorboard: Write events, if TensorBoard is installed.
         wandb: Upload to Weights & Biases.
+        iteration: How many the run has had; what was logged of later ones is dropped.
 
         Raises:
             ValueError: Weights & Biases is asked for and not installed.
+            OSError: The figures cannot be read or written.
         """
-        self._console = Console(stderr=True)
-        self._file = (folder / FIGURES).open("a")
-        self._writers = [writer for writer in (tensorboard and _tensorboard(folder),) if writer]
+        self._console = _LastingConsole(stderr=True)
+        self._figures = FiguresFile(folder / FIGURES, iteration)
+        events = _event_file(folder, iteration) if tensorboard else None
+        self._files = [self._figures, events] if events else [self._figures]
+        self._full = False
+        self._total = total
         self._wandb = _wandb(folder, config) if wandb else None
         self._progress = Progress(
             TextColumn("{task.description}"),
@@ -94,6 +111,8 @@ class TrainingLog:
     def __enter__(self) -> TrainingLog:
         """Show the progress."""
         self._progress.start()
+        if self._figures.dropped:
+            self.say(f"{self._figures.path}: dropped {self._figures.dropped} lines, cut or of later iterations")
         return self
 
     def __exit__(
@@ -101,29 +120,39 @@ class TrainingLog:
     ) -> None:
         """Close everything."""
         self._progress.stop()
-        self._file.close()
-        for writer in self._writers:
-            writer.close()
+        for file in self._files:
+            with suppress(OSError):
+                file.close()
         if self._wandb:
             self._wandb.finish()
 
     def say(self, line: str) -> None:
         """Print a line above the progress."""
-        self._console.print(line, markup=False, highlight=False, soft_wrap=True)
+        with suppress(OSError):  # where would that be told
+            self._console.print(line, markup=False, highlight=False, soft_wrap=True)
 
-    def log(self, iteration: int, figures: dict[str, float]) -> None:
-        """Log figures under names such as `Loss/value`; `iteration` have been done."""
-        self._file.write(json.dumps({"iteration": iteration, **figures}) + "\n")
-        self._file.flush()
-        for writer in self._writers:
-            for name, value in figures.items():
-                writer.add_scalar(name, value, iteration)
+    def log(self, iteration: int, figures: dict[str, float], left: float) -> None:
+        """Log figures under names such as `Loss/value`; `iteration` have been done, for the rest `left` [s] is left."""
+        for file in self._files:
+            try:
+                file.add(iteration, figures)
+            except OSError as error:
+                if not self._full:
+                    self.say(f"{file.path}: {error.strerror}; training goes on, its figures follow when there is room")
+                self._full = True
         if self._wandb:
             self._wandb.log(figures, step=iteration)
         summary = _summary(figures)
         self._progress.update(self._task, completed=iteration, description=summary)
         if not self._console.is_terminal:
-            self.say(f"iteration {iteration}: {summary}")
+            self.say(f"iteration {iteration}/{self._total}: {summary}, {_duration(left)} left")
+
+
+class _LastingConsole(Console):
+    """Falls silent when its reader is gone, where rich would end the process."""
+
+    def on_broken_pipe(self) -> None:
+        self.quiet = True
 
 
 def _summary(figures: dict[str, float]) -> str:
@@ -136,12 +165,19 @@ def _summary(figures: dict[str, float]) -> str:
     return ", ".join(parts)
 
 
-def _tensorboard(folder: Path) -> Writer | None:
+def _duration(seconds: float) -> str:
+    """Return a duration in words, to the second, minute or minute of an hour."""
+    if seconds < 59.5:
+        return f"{seconds:.0f} s"
+    hours, minutes = divmod(round(seconds / 60.0), 60)
+    return f"{hours} h {minutes} min" if hours else f"{minutes} min"
+
+
+def _event_file(folder: Path, iteration: int) -> EventFile | None:
     try:
-        from torch.utils.tensorboard import SummaryWriter
+        return EventFile(folder, iteration)
     except ImportError:
         return None
-    return SummaryWriter(str(folder))
 
 
 def _wandb(folder: Path, config: dict[str, Any]) -> Any:

@@ -7,10 +7,9 @@ from itertools import pairwise
 import torch
 from torch import nn
 
+from jumper_warp.envs.vec_env import sanitise
 from jumper_warp.rl.distributed import average_over_ranks, world_size
 
-RAW_LIMIT = 100.0
-"""Raw observations are clamped to plus and minus this, so that one absurd world cannot spoil the statistics."""
 NORMALISED_LIMIT = 10.0
 """The networks see observations within plus and minus this many standard deviations."""
 EPS = 1.0e-5
@@ -29,11 +28,6 @@ def batch_moments(x: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, int]:
     mean = average_over_ranks(own_mean.clone())
     var = average_over_ranks(var.double() + (own_mean - mean).square())
     return mean, var, x.shape[0] * world_size()
-
-
-def sanitise(obs: torch.Tensor, out: torch.Tensor | None = None) -> torch.Tensor:
-    """Return a copy of observations, in `out` if given: non-finite entries 0, the rest clamped to ±RAW_LIMIT."""
-    return torch.nan_to_num(obs, nan=0.0, posinf=0.0, neginf=0.0, out=out).clamp_(-RAW_LIMIT, RAW_LIMIT)
 
 
 def gaussian_log_prob(x: torch.Tensor, mean: torch.Tensor, log_std: torch.Tensor) -> torch.Tensor:

@@ -7,91 +7,31 @@ Nothing between the first action and the last optimiser step waits for the host.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import torch
 
-from jumper_warp.envs.vec_env import VecTask
+from jumper_warp.envs.vec_env import VecEnv, sanitise
+from jumper_warp.rl.cfg import PpoCfg
 from jumper_warp.rl.distributed import average_over_ranks, world_size
 from jumper_warp.rl.graphs import Captured
-from jumper_warp.rl.networks import ACTIVATIONS, ActorCritic, batch_moments, gaussian_kl, gaussian_log_prob, sanitise
+from jumper_warp.rl.networks import ActorCritic, batch_moments, gaussian_kl, gaussian_log_prob
+from jumper_warp.rl.state_checks import check_ppo
 
 STATISTICS = ("surrogate", "value", "entropy", "kl", "gradient_actor", "gradient_critic", "skipped")
 """What `Ppo.statistics` averages over minibatches; skipped is the share of steps with a non-finite gradient."""
 
-
-@dataclass(frozen=True)
-class PpoCfg:
-    """Settings of the algorithm; the defaults are those of the vertical jump."""
-
-    num_steps: int = 32
-    """Policy steps of each world per iteration."""
-    epochs: int = 5
-    """Passes over the batch per iteration."""
-    minibatches: int = 8
-    """Optimiser steps per pass; divides the number of worlds times num_steps."""
-    gamma: float = 0.985
-    """Discount per policy step."""
-    lam: float = 0.95
-    """Weight of longer advantage estimates, the λ of GAE."""
-    clip: float = 0.2
-    """Clipping range of the probability ratio, and of the value in standard deviations of the return."""
-    value_coef: float = 2.0
-    """Weight of the value loss."""
-    asymmetric: bool = True
-    """Whether the critic sees what only a simulation knows, instead of the actor's observation."""
-    clip_value: bool = True
-    """Whether the value loss is clipped."""
-    normalise_value: bool = True
-    """Whether the critic predicts the return in its running standard deviations."""
-    entropy_coef: float = 0.0015
-    """Weight of the entropy bonus."""
-    lr: float = 1.0e-3
-    """Adam's step size at the start."""
-    min_lr: float = 1.0e-6
-    """Its lower bound."""
-    max_lr: float = 1.0e-2
-    """Its upper bound."""
-    desired_kl: float = 0.01
-    """The step size falls above twice and rises below half of this divergence; 0 keeps it fixed."""
-    final_kl: float = 0.002
-    """What desired_kl falls to, in a straight line over the second half of a training; smaller steps, finer policy."""
-    max_grad_norm: float = 1.0
-    """Gradients of the actor and of the critic are each shortened to this norm."""
-    init_std: float = 1.0
-    """Exploration noise at the start, in units of the action."""
-    reward_scale: float = 0.6
-    """Multiplies every reward."""
-    hidden: tuple[int, ...] = (256, 128, 128)
-    """Widths of the hidden layers."""
-    activation: str = "elu"
-    """elu, relu or tanh."""
-    tf32: bool = True
-    """Whether matrix products on a GPU may round their factors to 10 mantissa bits."""
-    graphs: bool = True
-    """Whether a GPU replays captured graphs; the update of several GPUs is always eager."""
-
-    def __post_init__(self) -> None:
-        """Raises ValueError: a setting is out of range."""
-        for name in ("num_steps", "epochs", "minibatches", "lr", "max_grad_norm", "init_std", "clip", "reward_scale"):
-            if not getattr(self, name) > 0:
-                raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
-        for name in ("gamma", "lam"):
-            if not 0.0 <= getattr(self, name) <= 1.0:
-                raise ValueError(f"{name} must be in [0, 1], got {getattr(self, name)}")
-        if not 0.0 < self.min_lr <= self.lr <= self.max_lr:
-            raise ValueError(f"need 0 < min_lr <= lr <= max_lr, got {self.min_lr}, {self.lr}, {self.max_lr}")
-        if not self.hidden or min(self.hidden) < 1:
-            raise ValueError(f"hidden must name at least one positive width, got {self.hidden}")
-        if self.activation not in ACTIVATIONS:
-            raise ValueError(f"activation must be one of {', '.join(ACTIVATIONS)}, got {self.activation}")
+FIGURES = (
+    *(f"Loss/{name}" for name in STATISTICS), "Loss/learning_rate", "Policy/mean_std", "Train/mean_return",
+    "Train/mean_length",
+)  # fmt: skip
+"""Names of all that `Ppo.statistics` returns; those of Train/ once an episode has ended."""
 
 
 class Rollout:
     """Buffers of num_steps policy steps of all worlds; time is the first axis."""
 
-    def __init__(self, num_steps: int, env: VecTask, num_critic_obs: int) -> None:
+    def __init__(self, num_steps: int, env: VecEnv, num_critic_obs: int) -> None:
         """num_critic_obs: entries of what the critic sees, which need not be the environment's `critic_obs`."""
 
         def buffer(*shape: int) -> torch.Tensor:
@@ -198,15 +138,13 @@ def adapted_lr(
 class Ppo:
     """The algorithm on one environment: `collect` fills the rollout, `update` learns from it."""
 
-    def __init__(self, env: VecTask, cfg: PpoCfg) -> None:
+    def __init__(self, env: VecEnv, cfg: PpoCfg) -> None:
         """Build networks and buffers on the environment's device; the weights follow torch's CPU seed.
 
         Raises:
-            ValueError: The minibatches do not divide the batch.
+            ValueError: As `PpoCfg.batch_size`.
         """
-        self.batch_size = cfg.num_steps * env.num_envs
-        if self.batch_size % cfg.minibatches:
-            raise ValueError(f"{cfg.minibatches} minibatches do not divide {cfg.num_steps} x {env.num_envs} samples")
+        self.batch_size = cfg.batch_size(env.num_envs)
         self.env, self.cfg = env, cfg
         cuda = env.device.type == "cuda"
         if cuda:
@@ -225,10 +163,11 @@ class Ppo:
         self.optimiser = torch.optim.Adam([*actor, *critic], lr=self.lr, fused=True, capturable=self.update.enabled)
         self._flatten_gradients(actor, critic)
         self.rollout = Rollout(cfg.num_steps, env, num_critic_obs)
-        self._sums = torch.zeros(len(STATISTICS), device=env.device)
-        self._sum_count = torch.zeros((), device=env.device)
-        self._episode = torch.zeros(2, env.num_envs, device=env.device)  # return and length so far
-        self._finished = torch.zeros(3, device=env.device)  # sums of return and length, count
+        counts = {"dtype": torch.float64, "device": env.device}  # float32 counts to 2^24 only
+        self._sums = torch.zeros(len(STATISTICS), **counts)
+        self._sum_count = torch.zeros((), **counts)
+        self._episode = torch.zeros(2, env.num_envs, **counts)  # return and length so far
+        self._finished = torch.zeros(3, **counts)  # sums of return and length, count
         self.collect = Captured(self._collect, cuda and cfg.graphs)
 
     def _flatten_gradients(self, actor: list[torch.nn.Parameter], critic: list[torch.nn.Parameter]) -> None:
@@ -355,9 +294,10 @@ class Ppo:
         """Take up what `state_dict` gave.
 
         Raises:
-            KeyError: A part is missing.
-            RuntimeError: A part has another shape.
+            ValueError: A part is missing, unknown, of another shape or type, or not finite; nothing is changed.
         """
+        (group,) = self.optimiser.param_groups
+        check_ppo(state, self.model.state_dict(), group["params"], self.lr, self._episode)
         self.model.load_state_dict(state["model"])
         moments = {i: {k: x.clone() for k, x in each.items()} for i, each in state["optimiser"].items()}
         self.optimiser.load_state_dict({**self.optimiser.state_dict(), "state": moments})

@@ -8,7 +8,7 @@ from typing import Any
 from rsl_rl.env import VecEnv as RslRlEnv
 from rsl_rl.runners import OnPolicyRunner
 
-from jumper_warp.rl.ppo import PpoCfg
+from jumper_warp.rl.cfg import PpoCfg
 
 
 def rsl_rl_config(cfg: PpoCfg, save_interval: int, seed: int) -> dict[str, Any]:

@@ -4,81 +4,39 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import shlex
 import signal
+import sys
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
 from datetime import datetime
 from pathlib import Path
 from types import FrameType
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 
-from jumper_warp.rl.checkpoint import CheckpointError, latest_checkpoint, load_checkpoint, save_checkpoint
+from jumper_warp.envs.vec_env import VecEnv
+from jumper_warp.rl.cfg import TrainCfg
+from jumper_warp.rl.checkpoint import DAMAGE, CheckpointError, one_line, save_checkpoint
 from jumper_warp.rl.distributed import Rank, gather, join_ranks, wait_for_ranks, world_size
-from jumper_warp.rl.logger import Stopwatch, TrainingLog
-from jumper_warp.rl.ppo import Ppo, PpoCfg, VecTask
+from jumper_warp.rl.logger import Pace, Stopwatch, TrainingLog
+from jumper_warp.rl.ppo import FIGURES, Ppo
+from jumper_warp.rl.resume import CHECKPOINTS, find_checkpoint, own_part, random_state, set_random_state, spent_seconds
 from jumper_warp.utils.files import write_whole
 from jumper_warp.utils.runtime import git_commit, versions
 
-CHECKPOINTS = "checkpoints"
-"""Folder of a run that holds its checkpoints."""
 CONFIG = "config.json"
 """File of a run: all settings, versions and the commit."""
+PERF = ("Perf/fps", "Perf/collect_s", "Perf/update_s", "Perf/elapsed_s")
+"""Logged figures of the training itself: steps per second, and seconds."""
 INTERRUPTED = 130
 """Exit code of a training that was asked to stop."""
 
-MakeEnv = Callable[[int, int, torch.device], VecTask]
+MakeEnv = Callable[[int, int, torch.device], VecEnv]
 """Makes an environment from the number of its worlds, a seed and a device."""
-
-
-@dataclass(frozen=True)
-class TrainCfg:
-    """Settings of a training."""
-
-    task: str = "vertical-jump"
-    """Name of the task; also the name of the folder of its runs."""
-    num_envs: int = 8192
-    """Worlds, over all processes."""
-    iterations: int = 2800
-    """Iterations that the run has at its end, those before a resume included."""
-    max_seconds: float = 0.0
-    """Wall-clock limit of the iterations [s], those before a resume included; 0: none."""
-    seed: int = 1
-    """Of weights, noise and worlds; every process derives its own."""
-    device: str | None = None
-    """A torch device; default: a GPU if there is one."""
-    log_root: Path = Path("logs")
-    """A run is written to log_root/task/time of its start."""
-    log_interval: int = 10
-    """Iterations between two logged ones."""
-    save_interval: int = 100
-    """Iterations between two checkpoints."""
-    keep: int = 3
-    """How many of the newest checkpoints stay; the best stays anyway."""
-    best_by: str = "Metrics/success"
-    """The logged figure that makes a checkpoint the best; higher is better."""
-    resume: str | None = None
-    """A checkpoint, a run's folder, or `latest` for the task's latest run."""
-    trainer: Literal["ppo", "rsl-rl"] = "ppo"
-    """This package's PPO, or that of rsl-rl-lib for comparison."""
-    tensorboard: bool = True
-    """Write TensorBoard events, if TensorBoard is installed."""
-    wandb: bool = False
-    """Upload to Weights & Biases."""
-    ppo: PpoCfg = field(default_factory=PpoCfg)
-    """Settings of the algorithm."""
-
-    def __post_init__(self) -> None:
-        """Raises ValueError: a setting is out of range."""
-        for name in ("num_envs", "iterations", "log_interval", "save_interval", "keep"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
-        if self.max_seconds < 0.0:
-            raise ValueError(f"max_seconds must not be negative, got {self.max_seconds}")
-        if self.trainer == "rsl-rl" and self.resume:
-            raise ValueError("resume is not offered with trainer rsl-rl")
+AsRslRl = Callable[[VecEnv, int], Any]
+"""Makes rsl-rl's view of an environment, which reads its metrics once in so many steps."""
 
 
 class TrainResult(NamedTuple):
@@ -89,7 +47,7 @@ class TrainResult(NamedTuple):
     iteration: int
     """Iterations that the policy has had."""
     seconds: float
-    """Wall-clock time of this process's iterations [s]."""
+    """Wall-clock time of this process's iterations [s], the first one included."""
     figures: dict[str, float]
     """The last logged ones."""
 
@@ -113,8 +71,12 @@ class Stop:
         signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
-def train(cfg: TrainCfg, make_env: MakeEnv) -> TrainResult:
+def train(
+    cfg: TrainCfg, make_env: MakeEnv, command: str | None = None, as_rsl_rl: AsRslRl | None = None
+) -> TrainResult:
     """Train to the last iteration or the time limit, and save.
+
+    command: What the user would type to train so, without `--resume`; by default `jumper train TASK`.
 
     Raises:
         ValueError: A setting does not fit the environment or the machine.
@@ -123,15 +85,12 @@ def train(cfg: TrainCfg, make_env: MakeEnv) -> TrainResult:
     """
     rank = join_ranks(cfg.device)
     try:
-        if cfg.trainer == "rsl-rl" and rank.size > 1:
-            raise ValueError("trainer rsl-rl is offered for one process only")
-        if cfg.num_envs % rank.size:
-            raise ValueError(f"num_envs {cfg.num_envs} is not divisible by {rank.size} processes")
+        _check_division(cfg, rank)
         env = make_env(cfg.num_envs // rank.size, cfg.seed + 1000 * rank.index, rank.device)
         if cfg.trainer == "rsl-rl":
-            return _train_rsl_rl(cfg, env, rank)
+            return _train_rsl_rl(cfg, env, as_rsl_rl, rank)
         torch.manual_seed(cfg.seed)  # the same weights in all processes
-        run = Run(cfg, env, rank)
+        run = Run(cfg, env, rank, command)
         with Stop() as stop:
             result = run.iterate(stop)
         wait_for_ranks()
@@ -143,7 +102,24 @@ def train(cfg: TrainCfg, make_env: MakeEnv) -> TrainResult:
             torch.distributed.destroy_process_group()
 
 
-def full_config(cfg: TrainCfg, env: VecTask, rank: Rank) -> dict[str, Any]:
+def _check_division(cfg: TrainCfg, rank: Rank) -> None:
+    """Raises ValueError: worlds or samples do not divide among processes or minibatches."""
+    if cfg.trainer == "rsl-rl" and rank.size > 1:
+        raise ValueError("trainer rsl-rl is offered for one process only")
+    if cfg.num_envs % rank.size:
+        raise ValueError(f"num_envs {cfg.num_envs} is not divisible by {rank.size} processes")
+    if cfg.trainer == "ppo":
+        cfg.ppo.batch_size(cfg.num_envs // rank.size)
+
+
+def _check_best_by(name: str, logged: set[str]) -> None:
+    """Raises ValueError: no figure of this name is logged."""
+    if name not in logged:
+        some = ", ".join(sorted(each for each in logged if each.startswith(("Metrics/", "Train/"))))
+        raise ValueError(f"best_by must name a logged figure, such as {some}, got {name!r:.60}")
+
+
+def full_config(cfg: TrainCfg, env: VecEnv, rank: Rank) -> dict[str, Any]:
     """Return all settings with versions and commit, ready for JSON."""
     settings = json.loads(json.dumps(dataclasses.asdict(cfg), default=str))
     commit = git_commit()
@@ -160,12 +136,15 @@ def full_config(cfg: TrainCfg, env: VecTask, rank: Rank) -> dict[str, Any]:
 class Run:
     """A training under way in this process."""
 
-    def __init__(self, cfg: TrainCfg, env: VecTask, rank: Rank) -> None:
-        """Build the algorithm, take up a checkpoint if the configuration names one, and begin the episodes."""
+    def __init__(self, cfg: TrainCfg, env: VecEnv, rank: Rank, command: str | None = None) -> None:
+        """Build the algorithm, and take up a checkpoint if the configuration names one; command: as in `train`."""
         self.cfg, self.env, self.rank = cfg, env, rank
+        self._command = command or f"jumper train {cfg.task}"
         self.ppo = Ppo(env, cfg.ppo)
+        _check_best_by(cfg.best_by, {*env.metrics(), *FIGURES, *PERF})
         self.config = full_config(cfg, env, rank)
         self.iteration, self.seconds = 0, 0.0  # that the run had before this process
+        self._begin: float | None = None  # on the clock, as if all seconds that count were of this process
         self.figures: dict[str, float] = {}
         self.notes: list[str] = []
         torch.manual_seed(cfg.seed + 1 + rank.index)
@@ -177,18 +156,14 @@ class Run:
         path, state, refusals = find_checkpoint(self.cfg)
         self.notes += [f"passed over: {refusal}" for refusal in refusals] + [f"resumed {path}"]
         try:
-            processes = 1 + len(state["others"])
-            if processes != self.rank.size:
-                raise ValueError(f"saved by {processes} processes, there are {self.rank.size}")
-            own = state["others"][self.rank.index - 1] if self.rank.index else state
+            own = own_part(state, self.rank)
             self.ppo.load_state_dict({**state["ppo"], **own["ppo"]})
             self.env.load_state_dict(own["env"])
-            self.seconds = float(state.get("seconds", 0.0))
-        except (RuntimeError, KeyError, ValueError, TypeError) as error:
-            reason = " ".join(str(error).split())[:300]
-            raise CheckpointError(f"{path}: does not fit these settings: {reason}") from error
+            self.seconds = spent_seconds(state)
+            set_random_state(own["rng"])
+        except DAMAGE as error:
+            raise CheckpointError(f"{path}: does not fit these settings: {one_line(error)}") from error
         self.iteration = state["iteration"]
-        set_random_state(own["rng"])
         return path.parent.parent
 
     def iterate(self, stop: Stop) -> TrainResult:
@@ -196,69 +171,87 @@ class Run:
         cfg, ppo = self.cfg, self.ppo
         if self.iteration == 0:
             self.env.reset()
-        start = logged = time.perf_counter()
-        begin = start - self.seconds
-        watch, log = Stopwatch(self.rank.device), None
-        if self.rank.index == 0:
-            log = TrainingLog(self.folder, self.config, cfg.iterations, cfg.tensorboard, cfg.wandb)
-        with log or _Silent() as log:
-            for note in self.notes:
+        start, first = time.perf_counter(), self.iteration + 1
+        watch, pace = Stopwatch(self.rank.device), Pace(self.iteration)
+        with self._log() as log:
+            for note in [f"run {self.folder}", *self.notes]:
                 log.say(note)
             ending = self.iteration >= cfg.iterations or 0.0 < cfg.max_seconds <= self.seconds
-            since = self.iteration
+            if ending:
+                log.say(f"nothing is left to train after iteration {self.iteration}")
             while not ending:
                 watch.start()
-                ppo.set_progress(self._progress(begin))
+                ppo.set_progress(self._progress())
                 ppo.collect()
                 watch.mark()
                 ppo.update()
                 watch.mark()
                 self.iteration += 1
-                ending = self._ending(stop, begin)
+                if self.iteration == first:
+                    self._begin_counting()
+                ending = self._ending(stop)
                 if ending or self.iteration % cfg.log_interval == 0:
-                    times = watch.read()
-                    now = time.perf_counter()
-                    self.figures = self._read(times, (now - logged) / (self.iteration - since), now - begin)
-                    logged, since = now, self.iteration
-                    log.log(self.iteration, self.figures)
+                    times, seconds = watch.read(), pace.lap(self.iteration)
+                    self.figures = self._read(times, seconds)
+                    log.log(self.iteration, self.figures, self._left(seconds))
+                elif self.iteration == first:  # its time tells nothing of the others
+                    watch.read(), pace.lap(self.iteration)
                 if ending or self.iteration % cfg.save_interval == 0:
-                    self._save(log, time.perf_counter() - begin, must=ending)
+                    self._save(log, ending, stop)
         return TrainResult(self.folder, self.iteration, time.perf_counter() - start, self.figures)
 
-    def _progress(self, begin: float) -> float:
-        """Return how much of the training is over, by iterations or by time since begin [s], whichever is further."""
+    def _log(self) -> TrainingLog | _Silent:
+        if self.rank.index != 0:
+            return _Silent()
+        cfg = self.cfg
+        return TrainingLog(self.folder, self.config, cfg.iterations, cfg.tensorboard, cfg.wandb, self.iteration)
+
+    def _begin_counting(self) -> None:
+        """Count the run's time from here on, when the device has done what it was asked to."""
+        if self.rank.device.type == "cuda":
+            torch.cuda.synchronize()
+        self._begin = time.perf_counter() - self.seconds
+
+    def _elapsed(self) -> float:
+        """Return the seconds of the run that count, see `TrainCfg.max_seconds`."""
+        return self.seconds if self._begin is None else time.perf_counter() - self._begin
+
+    def _progress(self) -> float:
+        """Return how much of the training is over, by iterations or by time, whichever is further."""
         done = self.iteration / self.cfg.iterations
         if self.cfg.max_seconds > 0.0:
-            done = max(done, (time.perf_counter() - begin) / self.cfg.max_seconds)
+            done = max(done, self._elapsed() / self.cfg.max_seconds)
         return done
 
-    def _ending(self, stop: Stop, begin: float) -> bool:
+    def _left(self, seconds: float) -> float:
+        """Return how long the rest takes [s] at so many seconds an iteration."""
+        left = (self.cfg.iterations - self.iteration) * seconds
+        if self.cfg.max_seconds > 0.0:
+            left = min(left, max(self.cfg.max_seconds - self._elapsed(), 0.0))
+        return left
+
+    def _ending(self, stop: Stop) -> bool:
         """Return whether this iteration is the last; the processes agree, which they ask when they log."""
         if self.iteration >= self.cfg.iterations:
             return True
         if world_size() > 1 and self.iteration % self.cfg.log_interval:
             return False
-        late = 0.0 < self.cfg.max_seconds <= time.perf_counter() - begin
+        late = 0.0 < self.cfg.max_seconds <= self._elapsed()
         if world_size() > 1:
             wish = torch.tensor([float(stop.asked), float(late)], device=self.rank.device)
             torch.distributed.all_reduce(wish, op=torch.distributed.ReduceOp.MAX)
             stop.asked, late = (value > 0.0 for value in wish.tolist())
         return stop.asked or late
 
-    def _read(self, times: list[float], seconds: float, elapsed: float) -> dict[str, float]:
+    def _read(self, times: list[float], seconds: float) -> dict[str, float]:
         """Return the figures to log; times: of collect and update [s], seconds: of an iteration."""
         steps = self.cfg.ppo.num_steps * self.cfg.num_envs
-        return {
-            **self.ppo.statistics(),
-            **self.env.metrics(),
-            "Perf/fps": steps / seconds,
-            "Perf/collect_s": times[0],
-            "Perf/update_s": times[1],
-            "Perf/elapsed_s": elapsed,
-        }
+        perf = (steps / seconds, *times, self._elapsed())
+        return {**self.ppo.statistics(), **self.env.metrics(), **dict(zip(PERF, perf, strict=True))}
 
-    def _save(self, log: TrainingLog | _Silent, seconds: float, must: bool) -> None:
-        """Save a checkpoint; a failure is only told, and tried again next time, unless this one must be."""
+    def _save(self, log: TrainingLog | _Silent, ending: bool, stop: Stop) -> None:
+        """Save a checkpoint; a failure is only told, and tried again next time, unless this is the last."""
+        seconds = self._elapsed()
         own = {"ppo": self.ppo.state_dict(), "env": self.env.state_dict(), "rng": random_state()}
         others = self._others(own)
         if self.rank.index != 0:
@@ -267,11 +260,15 @@ class Run:
         state["config"] = json.dumps(self.config)
         folder = self.folder / CHECKPOINTS
         try:
-            save_checkpoint(folder, state, self.figures.get(self.cfg.best_by), self.cfg.keep)
+            path = save_checkpoint(folder, state, self.figures.get(self.cfg.best_by), self.cfg.keep)
         except OSError as error:
-            if must:
+            if ending:
                 raise CheckpointError(f"{folder}: not saved: {error.strerror}") from error
             log.say(f"{folder}: not saved, will try again: {error.strerror}")
+            return
+        if ending:
+            more = f", continue with: {self._command} --resume {shlex.quote(str(self.folder))}" if stop.asked else ""
+            log.say(f"saved {path}{more}")
 
     def _others(self, own: dict[str, Any]) -> list[dict[str, Any]]:
         """Return, in process 0, what only the other processes know: their worlds and random numbers."""
@@ -292,7 +289,7 @@ class _Silent:
     def say(self, line: str) -> None:
         pass
 
-    def log(self, iteration: int, figures: dict[str, float]) -> None:
+    def log(self, iteration: int, figures: dict[str, float], left: float) -> None:
         pass
 
 
@@ -305,46 +302,16 @@ def new_folder(cfg: TrainCfg, rank: Rank) -> Path:
     return folder
 
 
-def find_checkpoint(cfg: TrainCfg) -> tuple[Path, dict[str, Any], list[str]]:
-    """Return path and content of the checkpoint to resume, and why newer ones were passed over.
-
-    Raises:
-        CheckpointError: There is none that can be used.
-    """
-    if cfg.resume == "latest":
-        runs = cfg.log_root / cfg.task
-        folders = sorted(path.parent for path in runs.glob(f"*/{CHECKPOINTS}/manifest.json"))
-        if not folders:
-            raise CheckpointError(f"{runs}: no run to resume")
-        return latest_checkpoint(folders[-1])
-    path = Path(cfg.resume or "")
-    if path.suffix == ".pt":
-        return path, load_checkpoint(path), []
-    return latest_checkpoint(path if path.name == CHECKPOINTS else path / CHECKPOINTS)
-
-
-def random_state() -> dict[str, torch.Tensor]:
-    """Return the states of torch's generators."""
-    state = {"cpu": torch.get_rng_state()}
-    if torch.cuda.is_available():
-        state["cuda"] = torch.cuda.get_rng_state()
-    return state
-
-
-def set_random_state(state: dict[str, torch.Tensor]) -> None:
-    """Take up what `random_state` gave; a GPU's only where there is one."""
-    torch.set_rng_state(state["cpu"])
-    if "cuda" in state and torch.cuda.is_available():
-        torch.cuda.set_rng_state(state["cuda"])
-
-
-def _train_rsl_rl(cfg: TrainCfg, env: VecTask, rank: Rank) -> TrainResult:
-    from jumper_warp.envs.rsl_rl import train_rsl_rl
+def _train_rsl_rl(cfg: TrainCfg, env: VecEnv, as_rsl_rl: AsRslRl, rank: Rank) -> TrainResult:
+    from jumper_warp.rl.rsl_rl import train_rsl_rl
 
     folder = new_folder(cfg, rank)
     if rank.index == 0:
+        print(f"run {folder}", file=sys.stderr)
         write_whole(folder / CONFIG, json.dumps(full_config(cfg, env, rank), indent=1).encode())
     begin = time.perf_counter()
     torch.manual_seed(cfg.seed + rank.index)
-    train_rsl_rl(env, cfg.ppo, cfg.iterations, cfg.save_interval, cfg.seed, folder)
+    env.reset()
+    adapter = as_rsl_rl(env, cfg.ppo.num_steps)
+    train_rsl_rl(adapter, cfg.ppo, cfg.iterations, cfg.save_interval, cfg.seed, folder)
     return TrainResult(folder, cfg.iterations, time.perf_counter() - begin, {})

@@ -12,6 +12,7 @@ import warp as wp
 
 from jumper_warp.robot.description import RobotDescription, load_description
 from jumper_warp.robot.parts import Motor
+from jumper_warp.utils.checks import check_not_negative
 from jumper_warp.utils.errors import InputError
 from kernels.actuation import command_filter
 from kernels.actuation import motors as actuator
@@ -40,8 +41,7 @@ class MotorKindCfg:
     def __post_init__(self) -> None:
         """Check the values."""
         for name, value in vars(self).items():
-            if not (math.isfinite(value) and value >= 0.0):
-                raise InputError(f"motor {name} must be finite and not negative, got {value}")
+            check_not_negative(f"motor {name}", value)
         if self.saturation == 0.0 or self.peak == 0.0:
             raise InputError("motor saturation and peak torque must be > 0, got 0")
         if self.no_load_speed <= self.cutoff_speed:

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cache
 from typing import Any, Literal
 
+from jumper_warp.robot.description import load_description
 from jumper_warp.tasks.terms import EventTerm
+from jumper_warp.utils.checks import check_finite
 from jumper_warp.utils.errors import InputError
 from kernels.mdp import parameters
 
@@ -17,9 +20,29 @@ LONGEST_LATENCY = 100.0
 """[ms] What the ring of past targets and observations holds."""
 
 
+@cache
+def _base_mass() -> float:
+    """Return the mass of the base as described [kg]."""
+    return load_description().links[0].mass
+
+
+def _least(name: str) -> tuple[float, bool]:
+    """Return the least value of a row, and whether the row must stay above it."""
+    if name == "base_mass":
+        return -_base_mass(), True
+    if name in ("link_mass", "gains", "no_load_speed", "cutoff_speed", "armature", "push_interval"):
+        return 0.0, True
+    if name in ("static_friction", "dynamic_friction", "motor_friction", "latency", "observation_latency"):
+        return 0.0, False
+    return -math.inf, False
+
+
 @dataclass(frozen=True)
 class RandomizationCfg:
-    """Ranges of uniform draws; None turns a row off. The defaults are those for jumping."""
+    """Ranges of uniform draws; None turns a row off. The defaults are those for jumping.
+
+    Masses and scales stay positive; friction and latency may be 0.
+    """
 
     static_friction: Range = (0.9, 1.2)
     """[1] Not below the dynamic coefficient of the same environment."""
@@ -61,10 +84,17 @@ class RandomizationCfg:
     """When all but the pushes is drawn: once, or at every reset of a world."""
 
     def __post_init__(self) -> None:
-        """Raises ValueError: a range is not one."""
+        """Raises ValueError: a range falls, is not finite, or reaches what no robot can have."""
         for name, value in vars(self).items():
-            if isinstance(value, tuple) and not (-math.inf < value[0] <= value[1] < math.inf):
-                raise InputError(f"randomisation range {name} must be finite and rise, got {value}")
+            if not isinstance(value, tuple):
+                continue
+            check_finite(f"randomisation range {name}", *value)
+            if not value[0] <= value[1]:
+                raise InputError(f"randomisation range {name} must rise, got {value}")
+            least, above = _least(name)
+            if value[0] < least or (above and value[0] == least):
+                bound = f"be above {least:g}" if above else "not be negative"
+                raise InputError(f"randomisation range {name} must {bound}, got {value}")
         for name in ("latency", "observation_latency"):
             value = getattr(self, name)
             if value is not None and not 0.0 <= value[0] <= value[1] <= LONGEST_LATENCY:

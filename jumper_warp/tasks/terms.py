@@ -7,11 +7,11 @@ numbers of a task lie in one array on the device, so that each can change while 
 from __future__ import annotations
 
 import inspect
-import math
 from typing import Any, ClassVar, NamedTuple, get_type_hints
 
 import warp as wp
 
+from jumper_warp.utils.checks import FLOAT32_MAX
 from jumper_warp.utils.errors import InputError
 from kernels.mdp.events import AT_RESET, AT_STEP, MODES
 from kernels.mdp.parameters import RobotParameters
@@ -69,7 +69,7 @@ class Term:
         for key, value in self.numbers.items():
             if value is REQUIRED:
                 raise InputError(f"{where}: parameter {key!r} is missing")
-            if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+            if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) <= FLOAT32_MAX:
                 raise InputError(f"{where}: parameter {key!r} must be a finite number, got {value!r:.60}")
         self.options = {key: given.get(key, default) for key, default in type(self).options.items()}
         self.num_params = len(params)

@@ -170,7 +170,8 @@ def friction(
     static = wp.max(between(draw, 1, static_lower, static_upper), dynamic)
     for k in range(4):
         robot.shape_mu[robot.paw_shapes[4 * draw.world + k]] = dynamic
-    robot.static_ratio[draw.world] = static / dynamic
+    # without dynamic friction there is no static one either
+    robot.static_ratio[draw.world] = wp.where(dynamic > 0.0, static / wp.max(dynamic, 1.0e-9), 1.0)
 
 
 @wp.func

@@ -4,11 +4,13 @@ from typing import Any
 
 import warp as wp
 
+from ..kinematics.geometry import LegGeometry
 from ..layout import COORDS, DOFS, motor_slot
 from ..terrain.ground import rest_block, surface, world_ground
 from .env import Delays, EnvArrays, Scene, SkillSettings
 from .random import COMMAND, RESET, between, make_draw
-from .view import RobotArrays, load_view, yaw_of
+from .track import follow_paw
+from .view import RobotArrays, base_quat, base_velocity, load_view, yaw_of
 
 wp.set_module_options({"enable_backward": False})
 
@@ -145,11 +147,15 @@ def tick_kernel(
 def forget_kernel(
     # in
     mask: wp.array(dtype=float),
+    geometry: wp.array(dtype=LegGeometry),
     # in, out
     robot: RobotArrays,
     delays: Delays,
 ):
-    """Forget the past where mask is not 0: actions, torques, contacts; one thread per (motor, world)."""
+    """Forget the past where mask is not 0: actions, torques, contacts; one thread per (motor, world).
+
+    Paws are taken to be where they are now.
+    """
     m, world = wp.tid()
     if mask[world] == 0.0:
         return
@@ -159,6 +165,7 @@ def forget_kernel(
     robot.old_torque[m, world] = 0.0
     robot.action[m, world] = 0.0
     robot.old_action[m, world] = 0.0
+    robot.target[m, world] = angle
     robot.safe_target[m, world] = angle
     robot.old_rate[m, world] = robot.joint_qd[world * DOFS + 6 + slot]
     for i in range(delays.past_target.shape[0]):
@@ -170,7 +177,8 @@ def forget_kernel(
         robot.contact_time[m, world] = 0.0
         robot.air_time[m, world] = 0.0
         robot.touchdown_speed[m, world] = 0.0
+        robot.collisions[m, world] = 0
+        follow_paw(robot, geometry[m], world, m)
     if m == 0:
         robot.invalid[world] = 0
-        i = world * DOFS
-        robot.old_lin_vel[world] = wp.vec3(robot.joint_qd[i], robot.joint_qd[i + 1], robot.joint_qd[i + 2])
+        robot.old_lin_vel[world] = base_velocity(robot, world, base_quat(robot, world))

@@ -20,8 +20,8 @@ from jumper_warp.policies.folder import load_policy, save_policy
 from jumper_warp.policies.restore import open_policy, restored_task
 from jumper_warp.policies.spec import PolicyError
 from jumper_warp.registry import TASKS, make_task
+from jumper_warp.rl.cfg import PpoCfg
 from jumper_warp.rl.checkpoint import CheckpointError
-from jumper_warp.rl.ppo import PpoCfg
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.utils.errors import InputError
 

@@ -27,7 +27,7 @@ from typing import Any
 import warp as wp
 
 from jumper_warp.registry import register_task
-from jumper_warp.rl.ppo import PpoCfg
+from jumper_warp.rl.cfg import PpoCfg
 from jumper_warp.tasks.jump.vertical import vertical_jump
 from jumper_warp.tasks.terms import EventTerm, ObservationTerm, RewardTerm, TerminationTerm
 from kernels.mdp.parameters import RobotParameters
@@ -219,7 +219,9 @@ def test_training_is_resumed(capsys, runs, path, tmp_path):
 
 
 def test_task_whose_functions_could_not_be_found_again_is_not_trained(capsys, tmp_path):
-    lost = TASK.replace("register_task(", "kept, rest = rest, None\nregister_task(", 1).replace("RewardTerm(rest", "RewardTerm(kept")
+    lost = TASK.replace("register_task(", "kept, rest = rest, None\nregister_task(", 1).replace(
+        "RewardTerm(rest", "RewardTerm(kept"
+    )
     (tmp_path / "my_jumps.py").write_text(lost)
     args = ["train", "tame-jump", "--task-module", str(tmp_path / "my_jumps.py"), *TRAIN, "--log-root", str(tmp_path)]
     code, out, err = run(capsys, *args)

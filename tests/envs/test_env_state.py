@@ -13,9 +13,10 @@ from toy_task import SMALL, PushTask, join
 from jumper_warp.envs.env import Env
 from jumper_warp.envs.state import nominal_fingerprint
 from jumper_warp.registry import make_task
+from jumper_warp.rl.cfg import PpoCfg
 from jumper_warp.rl.checkpoint import CheckpointError, load_checkpoint
-from jumper_warp.rl.ppo import PpoCfg
-from jumper_warp.rl.runner import CHECKPOINTS, TrainCfg, train
+from jumper_warp.rl.runner import CHECKPOINTS, train
+from jumper_warp.rl.cfg import TrainCfg
 from jumper_warp.robot.motors import jumping_motors
 from jumper_warp.tasks.jump.cfg import GroundCfg
 from jumper_warp.tasks.randomization import RandomizationCfg

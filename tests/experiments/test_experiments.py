@@ -15,7 +15,7 @@ from jumper_warp.evaluation.run import HEIGHTS, EvaluationRun
 from jumper_warp.evaluation.soak import SoakArgs
 from jumper_warp.policies.folder import save_policy
 from jumper_warp.registry import make_task
-from jumper_warp.rl.ppo import PpoCfg
+from jumper_warp.rl.cfg import PpoCfg
 from jumper_warp.tasks.jump.ablations import (
     ABLATIONS,
     without_curriculum,

@@ -163,9 +163,10 @@ def wanted_height(view: RobotView, task: HoldState) -> float:
 
 @wp.func
 def weak_motors(robot: RobotParameters, draw: Draw, lower: float, upper: float):
-    """Scale the peak torque of each motor."""
+    """Scale the torque limit of each motor."""
     for m in range(12):
-        robot.motors.peak[m, draw.world] = 30.0 * between(draw, m, lower, upper)
+        limit = robot.nominal_saturation[robot.skill[draw.world], m]
+        robot.motors.saturation[m, draw.world] = limit * between(draw, m, lower, upper)
 
 
 def hold_height() -> TaskCfg:

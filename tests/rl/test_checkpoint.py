@@ -39,6 +39,20 @@ def test_the_newest_and_the_best_stay(tmp_path):
     assert best_checkpoint(tmp_path).stem == "iteration_000002"
 
 
+def test_what_follows_an_older_checkpoint_is_the_newest(tmp_path):
+    for iteration in (100, 200, 300, 110, 300, 120):  # resumed from 100 after 300, and from 110
+        newest = save_checkpoint(tmp_path, state(iteration), keep=2)
+        assert latest_checkpoint(tmp_path)[0] == newest
+    assert sorted(path.stem for path in tmp_path.glob("*.pt")) == ["iteration_000120", "iteration_000300"]
+
+
+def test_a_score_that_is_no_number_is_none(tmp_path):
+    save_checkpoint(tmp_path, state(1), float("nan"))
+    best = save_checkpoint(tmp_path, state(2), 0.5)
+    save_checkpoint(tmp_path, state(3), float("nan"))
+    assert best_checkpoint(tmp_path) == best
+
+
 def test_without_scores_the_newest_is_the_best(tmp_path):
     save_checkpoint(tmp_path, state(1))
     newest = save_checkpoint(tmp_path, state(2))
@@ -126,8 +140,9 @@ def test_a_failed_write_leaves_the_old_file(tmp_path, monkeypatch):
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(os, "fsync", full)
-    with pytest.raises(OSError, match="No space left"):
+    with pytest.raises(OSError, match="No space left") as caught:
         write_whole(path, b"new")
+    assert caught.value.filename == str(path)  # by which the command line knows a refusal
     assert path.read_bytes() == b"old"
     assert [entry.name for entry in tmp_path.iterdir()] == ["file"]
 

@@ -3,9 +3,9 @@ import json
 
 from jumper_warp.envs.env import Env
 from jumper_warp.registry import make_task
+from jumper_warp.rl.cfg import PpoCfg, TrainCfg
 from jumper_warp.rl.logger import FIGURES
-from jumper_warp.rl.ppo import PpoCfg
-from jumper_warp.rl.runner import TrainCfg, train
+from jumper_warp.rl.runner import train
 
 CFG = TrainCfg(
     task="vertical-jump", num_envs=128, iterations=50, device="cpu", seed=1, log_interval=10, tensorboard=False,

@@ -1,7 +1,8 @@
 import numpy as np
 import torch
 
-from jumper_warp.rl.networks import ActorCritic, RunningMoments, gaussian_kl, gaussian_log_prob, sanitise
+from jumper_warp.envs.vec_env import sanitise
+from jumper_warp.rl.networks import ActorCritic, RunningMoments, gaussian_kl, gaussian_log_prob
 
 
 def test_log_density_and_divergence_equal_torch():

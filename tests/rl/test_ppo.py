@@ -10,7 +10,8 @@ from tensordict import TensorDict
 from torch.utils._python_dispatch import TorchDispatchMode
 from toy_task import SMALL, PushTask, fill, local_order, update_half
 
-from jumper_warp.rl.ppo import Batch, Ppo, PpoCfg, adapted_lr, gae
+from jumper_warp.rl.cfg import PpoCfg
+from jumper_warp.rl.ppo import STATISTICS, Batch, Ppo, adapted_lr, gae
 
 PLAIN = PpoCfg(
     num_steps=8, epochs=1, minibatches=1, hidden=(16, 8), normalise_value=False, reward_scale=1.0, max_grad_norm=1e9
@@ -309,6 +310,33 @@ def test_two_processes_equal_one_with_all_worlds(tmp_path):
         torch.testing.assert_close(found["lr"], expected["lr"])
 
 
+FULL = 2.0**24
+"""Where a count in single precision stands still."""
+
+
+def test_counts_go_on_where_single_precision_stands_still():
+    ppo = Ppo(PushTask(1, episode_length=5), dataclasses.replace(PLAIN, num_steps=16, epochs=1, minibatches=1))
+    ppo.env.reset()
+    for count in (ppo._episode, ppo._finished, ppo._sums, ppo._sum_count):
+        count.fill_(FULL)
+    ppo.collect()
+    ppo.update()
+    assert ppo._finished.tolist()[1:] == [2.0 * FULL + 15.0, FULL + 3.0]  # lengths and number of three episodes
+    assert ppo._episode[1].tolist() == [1.0]
+    assert ppo._sum_count.item() == FULL + 1.0
+    entropy, skipped = (ppo._sums[STATISTICS.index(name)].item() - FULL for name in ("entropy", "skipped"))
+    assert 0.0 < abs(entropy) < 10.0 and entropy != round(entropy) and skipped == 0.0
+
+
+def test_an_old_checkpoints_episodes_in_single_precision_are_taken_up():
+    ppo, _ = trained(2)
+    state = ppo.state_dict()
+    old = {**state, "episode": state["episode"].float()}
+    other = Ppo(PushTask(128), SMALL)
+    other.load_state_dict(old)
+    assert torch.equal(other._episode, old["episode"].double())
+
+
 def test_state_is_taken_up_exactly():
     ppo, _ = trained(2)
     torch.manual_seed(99)
@@ -332,6 +360,14 @@ def test_state_is_taken_up_exactly():
         ({"hidden": ()}, "hidden must name"),
         ({"activation": "gelu"}, "activation must be one of elu, relu, tanh, got gelu"),
         ({"clip": float("nan")}, "clip must be positive"),
+        ({"reward_scale": float("inf")}, "reward_scale must be positive and finite, got inf"),
+        ({"init_std": 1e39}, "init_std must be positive and finite"),  # infinite in single precision
+        ({"entropy_coef": float("nan")}, "entropy_coef must be finite and not negative, got nan"),
+        ({"value_coef": float("inf")}, "value_coef must be finite"),
+        ({"desired_kl": float("nan")}, "desired_kl must be finite"),
+        ({"final_kl": -1.0}, "final_kl must be finite and not negative"),
+        ({"max_lr": float("inf")}, "max_lr must be finite"),
+        ({"lr": float("nan")}, "lr must be positive"),
     ],
 )
 def test_settings_out_of_range_are_refused(change, message):

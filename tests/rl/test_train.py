@@ -1,5 +1,6 @@
 import dataclasses
 import json
+import math
 import os
 import signal
 import socket
@@ -11,12 +12,13 @@ from rsl_rl.runners import OnPolicyRunner
 from tensordict import TensorDict
 from toy_task import SMALL, PushTask, train_rank
 
-from jumper_warp.envs.rsl_rl import RslRlVecEnv, rsl_rl_config, train_rsl_rl
+from jumper_warp.envs.rsl_rl import RslRlVecEnv
+from jumper_warp.rl.cfg import PpoCfg, TrainCfg
 from jumper_warp.rl.checkpoint import MANIFEST, CheckpointError, load_checkpoint, save_checkpoint
 from jumper_warp.rl.distributed import Rank
 from jumper_warp.rl.logger import FIGURES
-from jumper_warp.rl.ppo import PpoCfg
-from jumper_warp.rl.runner import CHECKPOINTS, CONFIG, Run, Stop, TrainCfg, train
+from jumper_warp.rl.rsl_rl import rsl_rl_config, train_rsl_rl
+from jumper_warp.rl.runner import CHECKPOINTS, CONFIG, Run, Stop, train
 
 
 def make_env(num_envs, seed, device):
@@ -60,11 +62,14 @@ def test_a_run_leaves_settings_figures_and_checkpoints(cfg):
 
 
 def test_each_logged_iteration_is_told(cfg, capsys):
-    figures = train(cfg, make_env).figures
-    (line,) = [line for line in capsys.readouterr().err.splitlines() if line.startswith("iteration 4: ")]
+    result = train(cfg, make_env)
+    figures, told = result.figures, capsys.readouterr().err.splitlines()
     fps, total = f"{figures['Perf/fps']:,.0f}", f"{figures['Train/mean_return']:.2f}"
     success = f"{100.0 * figures['Metrics/success']:.1f}"
-    assert line == f"iteration 4: {fps} steps/s, return {total}, success {success} %"
+    assert told[0] == f"run {result.folder}"
+    assert told[1].startswith("iteration 2/4: ") and told[1].endswith(" s left")
+    assert told[2] == f"iteration 4/4: {fps} steps/s, return {total}, success {success} %, 0 s left"
+    assert told[3:] == [f"saved {result.folder / CHECKPOINTS / 'iteration_000004.pt'}"]
 
 
 def test_a_resumed_run_equals_an_uninterrupted_one(cfg):
@@ -107,7 +112,7 @@ def test_a_checkpoint_that_tells_no_time_counts_from_zero(cfg):
 
 
 def test_a_checkpoint_with_an_unreadable_time_is_refused_in_one_line(cfg):
-    with pytest.raises(CheckpointError, match="does not fit these settings: could not convert string to float"):
+    with pytest.raises(CheckpointError, match=r"does not fit these settings: seconds must be .*'late'"):
         resume_after(cfg, "late", limit=100.0)
 
 
@@ -154,7 +159,7 @@ def test_nothing_to_resume_is_told(cfg):
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_ends_the_iteration_and_saves(cfg, number):
+def test_a_signal_ends_the_iteration_saves_and_tells_how_to_go_on(cfg, number, capsys):
     class Signalled(PushTask):
         def step(self, action):
             super().step(action)
@@ -168,6 +173,8 @@ def test_a_signal_ends_the_iteration_and_saves(cfg, number):
     assert signal.getsignal(number) is before
     (path,) = cfg.log_root.glob("push/*/checkpoints/iteration_000003.pt")
     assert load_checkpoint(path)["env"]["steps"] == 48
+    last = capsys.readouterr().err.splitlines()[-1]
+    assert last == f"saved {path}, continue with: jumper train push --resume {path.parent.parent}"
 
 
 def test_the_second_interrupt_does_not_wait(cfg):
@@ -191,8 +198,8 @@ def test_the_time_limit_ends_and_saves(cfg):
 def test_a_full_disk_is_told_and_training_goes_on(cfg, capsys):
     class Blocking(PushTask):
         def metrics(self):
-            (folder,) = cfg.log_root.glob("push/*")
-            (folder / CHECKPOINTS).touch()  # a file where the folder should go
+            for folder in cfg.log_root.glob("push/*"):
+                (folder / CHECKPOINTS).touch()  # a file where the folder should go
             return super().metrics()
 
     with pytest.raises(CheckpointError, match="not saved"):
@@ -229,13 +236,60 @@ def test_two_processes_train_one_policy(cfg, tmp_path):
     ("change", "message"),
     [
         ({"iterations": 0}, "iterations must be at least 1, got 0"),
-        ({"max_seconds": -1.0}, "max_seconds must not be negative"),
+        ({"max_seconds": -1.0}, "max_seconds must be finite and not negative, got -1.0"),
+        ({"max_seconds": math.nan}, "max_seconds must be finite and not negative, got nan"),
+        ({"max_seconds": math.inf}, "max_seconds must be finite and not negative, got inf"),
+        ({"seed": -1}, r"seed must be in 0 \.\. 2147483647, got -1"),
+        ({"seed": 2**31}, "seed must be in"),
         ({"trainer": "rsl-rl", "resume": "latest"}, "resume is not offered"),
     ],
 )
 def test_settings_out_of_range_are_refused(change, message):
     with pytest.raises(ValueError, match=message):
         TrainCfg(**change)
+
+
+def must_not_be_built(num_envs, seed, device):
+    pytest.fail("the environment was built")
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"ppo": dataclasses.replace(SMALL, minibatches=7)}, "7 minibatches do not divide 16 x 32 samples"),
+        ({"num_envs": 1, "ppo": dataclasses.replace(SMALL, num_steps=1, minibatches=1)}, "at least 2 samples"),
+    ],
+)
+def test_what_cannot_be_divided_is_refused_before_anything_is_built(cfg, change, message):
+    with pytest.raises(ValueError, match=message):
+        train(dataclasses.replace(cfg, **change), must_not_be_built)
+
+
+def test_a_score_that_is_never_logged_is_refused_before_the_first_iteration(cfg):
+    class Unmoved(PushTask):
+        def step(self, action):
+            pytest.fail("an iteration began")
+
+    message = r"best_by must name a logged figure, such as Metrics/success, Train/mean_length, .*, got 'nonsense'"
+    with pytest.raises(ValueError, match=message):
+        train(dataclasses.replace(cfg, best_by="nonsense"), Unmoved)
+    assert not cfg.log_root.exists()
+
+
+def test_every_logged_figure_can_be_the_score(cfg):
+    figures = train(cfg, make_env).figures
+    for name in figures:
+        Run(dataclasses.replace(cfg, best_by=name), make_env(32, 1, "cpu"), Rank(0, 1, torch.device("cpu")))
+    assert {"Train/mean_return", "Perf/fps", "Loss/kl", "Metrics/success"} <= figures.keys()
+
+
+def test_the_largest_seed_trains(cfg):
+    assert train(dataclasses.replace(cfg, seed=2**31 - 1, iterations=1), make_env).iteration == 1
+
+
+def test_a_folder_of_logs_may_be_a_text(cfg):
+    result = train(dataclasses.replace(cfg, log_root=str(cfg.log_root), iterations=1), make_env)
+    assert result.folder.parent == cfg.log_root / "push"
 
 
 def test_a_device_that_is_not_there_is_refused(cfg, monkeypatch):
@@ -311,7 +365,7 @@ def test_rsl_rl_bootstraps_the_timeout():
 
 
 def test_rsl_rl_trains(cfg, tmp_path):
-    result = train(dataclasses.replace(cfg, trainer="rsl-rl", iterations=2), make_env)
+    result = train(dataclasses.replace(cfg, trainer="rsl-rl", iterations=2), make_env, RslRlVecEnv)
     assert (result.folder / "model_1.pt").exists()
     assert (result.folder / CONFIG).exists()
 
@@ -319,7 +373,9 @@ def test_rsl_rl_trains(cfg, tmp_path):
 def test_rsl_rl_learns_to_push_the_mass_to_the_origin():
     torch.manual_seed(0)
     env = PushTask(128)
-    runner = train_rsl_rl(env, SMALL, iterations=30, save_interval=100, seed=0, folder=None)
+    adapter = RslRlVecEnv(env, SMALL.num_steps)
+    adapter.reset()
+    runner = train_rsl_rl(adapter, SMALL, iterations=30, save_interval=100, seed=0)
     env.reset()
     actor = runner.alg.get_policy().eval()
     with torch.inference_mode():

@@ -6,7 +6,6 @@ import newton
 import numpy as np
 import pytest
 import warp as wp
-from jumper_warp.viz.shapes import shape_meshes
 from newton.sensors import SensorFrameTransform, SensorIMU
 from scipy.spatial.transform import Rotation
 
@@ -15,6 +14,7 @@ from jumper_warp.sim.dynamics import NotThisRobotError
 from jumper_warp.sim.mujoco import mujoco_solver
 from jumper_warp.sim.simulation import Simulation
 from jumper_warp.sim.solver import SolverJumper
+from jumper_warp.viz.shapes import shape_meshes
 
 DT = 1.0 / 480.0
 CORNER = (0.3, 0.05, 0.1)

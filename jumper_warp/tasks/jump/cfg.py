@@ -9,6 +9,7 @@ from typing import Any
 
 import warp as wp
 
+from jumper_warp.utils.checks import check_finite, check_positive
 from jumper_warp.utils.errors import InputError
 from kernels.jump.ground_draws import EVERY_SIDE, GroundRanges
 from kernels.jump.reset import JumpLevel, JumpSettings
@@ -86,6 +87,7 @@ class Level:
         pairs = [*zip(self.goal_lower, self.goal_upper, strict=True), self.base_height]
         if not all(-math.inf < low <= high < math.inf for low, high in pairs):
             raise InputError(f"a level's ranges must be finite and rise, got {self}")
+        check_positive("base_height of a level", *self.base_height)
         if not 0.0 <= self.jump_again <= 1.0:
             raise InputError(f"level jump_again must be in [0, 1], got {self.jump_again}")
 
@@ -158,11 +160,13 @@ class ResetCfg:
     """[s] From touchdown to the other goal."""
 
     def __post_init__(self) -> None:
-        """Raises ValueError: shares do not add up, a pair is reversed, or a delay or a share is out of range."""
+        """Raises ValueError: shares do not add up, a pair is reversed, a number not finite or out of range."""
         shares = self._shares()
         if not min(shares) >= 0.0 or sum(shares) > 1.0 + 1e-9:
             raise InputError(f"reset shares must be >= 0 and add up to at most 1, got {shares}")
         for name, value in vars(self).items():
+            if name != "ground":
+                check_finite(f"reset {name}", *(value if isinstance(value, tuple) else (value,)))
             if isinstance(value, tuple) and not value[0] <= value[1]:
                 raise InputError(f"reset {name} must be (lower, upper), got {value}")
         for name, least in (("command_delay", self.command_delay), ("again_delay", self.again_delay[0])):

@@ -233,6 +233,8 @@ def test_impossible_shares_are_refused(shares):
         ({"paw_depth": (0.45, 0.3)}, r"paw_depth must be \(lower, upper\), got \(0.45, 0.3\)"),
         ({"again_delay": (0.7, 0.2)}, "again_delay must be"),
         ({"landed_speed": (math.nan, 1.0)}, "landed_speed must be"),
+        ({"landed_speed": (0.0, math.inf)}, "landed_speed must be finite, got inf"),
+        ({"base_xy": math.nan}, "base_xy must be finite, got nan"),
         ({"command_delay": -0.1}, "command_delay must not be negative, got -0.1"),
         ({"again_delay": (-0.1, 0.2)}, "again_delay must not be negative"),
     ],

@@ -21,7 +21,6 @@ COUNTS = [len(func.input_types) - 2 for func in FUNCS]
 MOTORS = ("kp", "kd", "saturation", "no_load_speed", "cutoff_speed", "offset")
 DRAWN = [name for name in RobotParameters.vars if not name.startswith("nominal_") and name not in
          ("motors", "physics_dt", "skill", "paw_shapes")]  # fmt: skip
-CORNERS = [7 * leg + j for leg in range(4) for j in range(3)]
 
 
 @wp.kernel(enable_backward=False)
@@ -40,6 +39,8 @@ def made():
     tasks = (make_task("vertical-jump"), make_task("horizontal-jump"))
     robot = robot_parameters(sim, tasks, array(np.arange(N) % 2, int))
     wp.launch(parameters.motors_kernel, (12, N), [robot], device="cpu")
+    robot.latency.fill_(-1)
+    robot.observation_latency.fill_(-1)
     robot.push.fill_(wp.spatial_vector(1.0, 2.0, 3.0, 4.0, 5.0, 6.0))
     return SimpleNamespace(sim=sim, robot=robot, tasks=tasks, nominal=copies(robot))
 
@@ -195,7 +196,7 @@ def test_each_sensor_has_a_constant_error(made, drawn):
 
 
 @pytest.mark.parametrize(
-    ("dynamic", "static", "bound"), [((0.8, 0.9), (0.9, 1.2), 0.0), ((0.7, 0.9), (0.6, 1.0), 0.3)]
+    ("dynamic", "static", "bound"), [((0.8, 0.9), (0.9, 1.2), 0.0), ((0.7, 0.9), (0.6, 1.0), 0.5)]
 )
 def test_paws_have_one_dynamic_coefficient_and_a_static_one_that_is_not_below_it(made, drawn, dynamic, static, bound):
     found = drawn("friction", *dynamic, *static, only=("shape_mu", "static_ratio"))
@@ -206,7 +207,7 @@ def test_paws_have_one_dynamic_coefficient_and_a_static_one_that_is_not_below_it
     np.testing.assert_array_equal(found.shape_mu[others], made.nominal["shape_mu"][others])
     ratio, sticking = found.static_ratio, found.static_ratio * mu[:, 0]
     assert ratio.min() >= 1.0 and sticking.max() <= static[1] + 1e-5
-    assert np.mean(ratio == 1.0) == pytest.approx(bound, abs=0.12)
+    assert np.mean(ratio == 1.0) == pytest.approx(bound, abs=4.0 * np.sqrt(0.25 / N))
     assert np.ptp(sticking) > 0.8 * (static[1] - max(static[0], dynamic[0]))
 
 
@@ -223,9 +224,6 @@ def test_a_latency_is_whole_physics_steps_rounded_down(made, drawn, name):
 @pytest.mark.parametrize("name", ["action_latency", "observation_latency"])
 def test_a_latency_of_whole_steps_stays_so_many(made, drawn, name):
     array_of = {"action_latency": "latency", "observation_latency": "observation_latency"}[name]
-    made.robot.latency.fill_(-1)
-    made.robot.observation_latency.fill_(-1)
-    made.nominal.update(latency=np.full(N, -1), observation_latency=np.full(N, -1))
     for steps in range(49):
         seconds = float(np.float32(steps / 480.0))
         assert (getattr(drawn(name, seconds, seconds, only=(array_of,)), array_of) == steps).all(), steps

@@ -1,0 +1,76 @@
+"""Memory that each world of a training takes: main memory while the environment is built, and its arrays on the device.
+
+The slope between two numbers of worlds, each in a process of its own; `jumper_warp.cli.training_memory` holds the
+figures.
+
+    python experiments/measure_memory.py --solver mujoco
+"""
+
+from __future__ import annotations
+
+import gc
+import json
+import resource
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+import tyro
+import warp as wp
+from jumper_warp.figures import output_dir, write_figures
+
+from jumper_warp.envs.env import JumpEnv
+from jumper_warp.registry import make_task
+from jumper_warp.sim.simulation import SolverName
+
+
+@dataclass(frozen=True)
+class Args:
+    """Memory of each world."""
+
+    solver: SolverName = "jumper"
+    """Physics."""
+    task: str = "vertical-jump"
+    """Task."""
+    envs: tuple[int, ...] = (256, 2048)
+    """Numbers of worlds; a single one is measured in this process."""
+    out: Path | None = None
+    """Folder for figures.json (default: outputs/measure_memory/<time>)."""
+
+
+def array_bytes() -> int:
+    """Return the bytes of all Warp arrays that own their memory."""
+    arrays = [each for each in gc.get_objects() if type(each) is wp.array and each.ptr and each.deleter is not None]
+    return sum({array.ptr: array.capacity for array in arrays}.values())
+
+
+def measure(args: Args) -> dict[str, int]:
+    """Return the peak of this process's main memory and the size of all arrays [byte] after building one environment.
+
+    All is on the CPU; the arrays are the same on a GPU.
+    """
+    wp.config.log_level = wp.LOG_WARNING
+    env = JumpEnv(make_task(args.task), args.envs[0], device="cpu", solver=args.solver)
+    env.reset()
+    return {"building": 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss, "standing": array_bytes()}
+
+
+def main(args: Args) -> dict[str, float]:
+    """Return the bytes of each world."""
+    if len(args.envs) == 1:
+        values = measure(args)
+        print(json.dumps(values))
+        return values
+    few, many = min(args.envs), max(args.envs)
+    common = [sys.executable, __file__, "--solver", args.solver, "--task", args.task, "--envs"]
+    runs = [subprocess.run([*common, str(n)], capture_output=True, text=True, check=True) for n in (few, many)]
+    less, more = (json.loads(run.stdout.splitlines()[-1]) for run in runs)
+    values = {f"{name}_bytes_per_world": (more[name] - less[name]) / (many - few) for name in less}
+    write_figures(output_dir("measure_memory", args.out), {**values, "solver": args.solver, "task": args.task})
+    print(json.dumps(values))
+    return values
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Args))

@@ -1,0 +1,99 @@
+"""How much memory a training needs, and a refusal before anything is built if there is less."""
+
+from __future__ import annotations
+
+import math
+import os
+from itertools import pairwise
+from pathlib import Path
+from typing import NamedTuple
+
+import torch
+
+from jumper_warp.rl.cfg import PpoCfg
+from jumper_warp.rl.distributed import world_size
+from jumper_warp.sim.simulation import SolverName
+from jumper_warp.tasks.cfg import TaskCfg
+from jumper_warp.utils.errors import InputError
+
+NUM_ACTIONS = 12
+BUILDING: dict[SolverName, int] = {"jumper": 70_000, "mujoco": 88_000}
+"""[byte] Of main memory for each world while the environment is built (`experiments/measure_memory.py`)."""
+STANDING: dict[SolverName, int] = {"jumper": 22_600, "mujoco": 68_250}
+"""[byte] Of the environment's own arrays on the device for each world, measured likewise."""
+FLOAT = 4
+"""[byte]"""
+
+
+class Need(NamedTuple):
+    """Memory that a process needs [byte]."""
+
+    fixed: int
+    per_world: int
+
+
+class Place(NamedTuple):
+    """A memory, and what this process may take of it."""
+
+    name: str
+    need: Need
+    free: int
+    """[byte]"""
+
+
+def learning_need(cfg: PpoCfg, num_obs: int, num_critic_obs: int) -> Need:
+    """Return what PPO takes on the device, for networks and rollouts; num_critic_obs: the environment's, of a world.
+
+    The peak is in the critic's pass over the whole rollout: the buffers, the normalised observations with a copy of
+    them, and the two widest layers.
+    """
+    critic_obs = num_critic_obs if cfg.asymmetric else num_obs
+    sizes = ((num_obs, *cfg.hidden, NUM_ACTIONS), (critic_obs, *cfg.hidden, 1))
+    weights = sum((a + 1) * b for each in sizes for a, b in pairwise(each))
+    passing = FLOAT * cfg.num_steps * (2 * critic_obs + 2 * max(cfg.hidden))
+    return Need(4 * FLOAT * weights, rollout_bytes(cfg.num_steps, num_obs, critic_obs) + passing)
+
+
+def rollout_bytes(num_steps: int, num_obs: int, num_critic_obs: int) -> int:
+    """Return the size of `Rollout` for each world [byte], but for its log_std; num_critic_obs: what the critic sees."""
+    each = num_obs + 2 * num_critic_obs + 2 * NUM_ACTIONS + 3  # and one more of what follows the last step
+    return FLOAT * (num_steps * each + num_obs + num_critic_obs)
+
+
+def free_main_memory() -> int:
+    """Return what programs can still take of main memory [byte]; all of it where the system does not tell."""
+    try:
+        lines = Path("/proc/meminfo").read_text().splitlines()
+        return next(1024 * int(line.split()[1]) for line in lines if line.startswith("MemAvailable:"))
+    except (OSError, StopIteration):
+        return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+
+
+def check_memory(task: TaskCfg, ppo: PpoCfg, solver: SolverName, num_envs: int, device: torch.device) -> None:
+    """Refuse a training of so many worlds in this process that does not fit into memory.
+
+    Raises:
+        ValueError: It does not; the line tells the estimate, what is free, and a number of worlds that fits.
+    """
+    widths = [max(end for _, end in task.layout(group).values()) for group in ("policy", "critic")]
+    learning = learning_need(ppo, *widths)
+    main = free_main_memory() // int(os.environ.get("LOCAL_WORLD_SIZE", "1"))
+    if device.type == "cuda":
+        standing = Need(learning.fixed, STANDING[solver] + learning.per_world)
+        places = [
+            Place("main memory", Need(0, BUILDING[solver]), main),
+            Place(f"memory of {device}", standing, torch.cuda.mem_get_info(device)[0]),
+        ]
+    else:
+        places = [Place("main memory", Need(learning.fixed, BUILDING[solver] + learning.per_world), main)]
+    fit = min((place.free - place.need.fixed) // place.need.per_world for place in places)
+    if num_envs <= fit:
+        return
+    short = min(places, key=lambda place: (place.free - place.need.fixed) // place.need.per_world)
+    needed = (short.need.fixed + num_envs * short.need.per_world) / 1.0e9
+    grain = ppo.minibatches // math.gcd(ppo.minibatches, ppo.num_steps)
+    most = world_size() * (fit // grain * grain)
+    raise InputError(
+        f"num_envs {world_size() * num_envs} needs about {needed:,.1f} GB of {short.name} in each process, "
+        f"{short.free / 1.0e9:,.1f} GB are free: " + (f"num_envs {most} would fit" if most > 0 else "none would fit")
+    )

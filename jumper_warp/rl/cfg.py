@@ -1,0 +1,146 @@
+"""Settings of a training, which need no PyTorch to be read."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+from jumper_warp.utils.checks import check_finite, check_not_negative, check_positive
+from jumper_warp.utils.errors import InputError
+
+ACTIVATIONS = ("elu", "relu", "tanh")
+"""Names of activations."""
+
+
+@dataclass(frozen=True)
+class PpoCfg:
+    """Settings of the algorithm; the defaults are those of the vertical jump."""
+
+    num_steps: int = 32
+    """Policy steps of each world per iteration."""
+    epochs: int = 5
+    """Passes over the batch per iteration."""
+    minibatches: int = 8
+    """Optimiser steps per pass; divides the number of worlds times num_steps."""
+    gamma: float = 0.985
+    """Discount per policy step."""
+    lam: float = 0.95
+    """Weight of longer advantage estimates, the λ of GAE."""
+    clip: float = 0.2
+    """Clipping range of the probability ratio, and of the value in standard deviations of the return."""
+    value_coef: float = 2.0
+    """Weight of the value loss."""
+    asymmetric: bool = True
+    """Whether the critic sees what only a simulation knows, instead of the actor's observation."""
+    clip_value: bool = True
+    """Whether the value loss is clipped."""
+    normalise_value: bool = True
+    """Whether the critic predicts the return in its running standard deviations."""
+    entropy_coef: float = 0.0015
+    """Weight of the entropy bonus."""
+    lr: float = 1.0e-3
+    """Adam's step size at the start."""
+    min_lr: float = 1.0e-6
+    """Its lower bound."""
+    max_lr: float = 1.0e-2
+    """Its upper bound."""
+    desired_kl: float = 0.01
+    """The step size falls above twice and rises below half of this divergence; 0 keeps it fixed."""
+    final_kl: float = 0.002
+    """What desired_kl falls to, in a straight line over the second half of a training; smaller steps, finer policy."""
+    max_grad_norm: float = 1.0
+    """Gradients of the actor and of the critic are each shortened to this norm."""
+    init_std: float = 1.0
+    """Exploration noise at the start, in units of the action."""
+    reward_scale: float = 0.6
+    """Multiplies every reward."""
+    hidden: tuple[int, ...] = (256, 128, 128)
+    """Widths of the hidden layers."""
+    activation: str = "elu"
+    """elu, relu or tanh."""
+    tf32: bool = True
+    """Whether matrix products on a GPU may round their factors to 10 mantissa bits."""
+    graphs: bool = True
+    """Whether a GPU replays captured graphs; the update of several GPUs is always eager."""
+
+    def __post_init__(self) -> None:
+        """Raises ValueError: a setting is out of range."""
+        for name in ("num_steps", "epochs", "minibatches", "lr", "max_grad_norm", "init_std", "clip", "reward_scale"):
+            check_positive(name, getattr(self, name))
+        for name in ("value_coef", "entropy_coef", "desired_kl", "final_kl"):
+            check_not_negative(name, getattr(self, name))
+        for name in ("gamma", "lam"):
+            if not 0.0 <= getattr(self, name) <= 1.0:
+                raise InputError(f"{name} must be in [0, 1], got {getattr(self, name)}")
+        check_finite("max_lr", self.max_lr)
+        if not 0.0 < self.min_lr <= self.lr <= self.max_lr:
+            raise InputError(f"need 0 < min_lr <= lr <= max_lr, got {self.min_lr}, {self.lr}, {self.max_lr}")
+        if not self.hidden or min(self.hidden) < 1:
+            raise InputError(f"hidden must name at least one positive width, got {self.hidden}")
+        if self.activation not in ACTIVATIONS:
+            raise InputError(f"activation must be one of {', '.join(ACTIVATIONS)}, got {self.activation}")
+
+    def batch_size(self, num_envs: int) -> int:
+        """Return the samples that num_envs worlds give in an iteration.
+
+        Raises:
+            ValueError: There is only one, which has no standard deviation, or the minibatches do not divide them.
+        """
+        size = self.num_steps * num_envs
+        if size < 2:
+            raise InputError(f"an iteration needs at least 2 samples, got {self.num_steps} x {num_envs}")
+        if size % self.minibatches:
+            raise InputError(f"{self.minibatches} minibatches do not divide {self.num_steps} x {num_envs} samples")
+        return size
+
+
+@dataclass(frozen=True)
+class TrainCfg:
+    """Settings of a training."""
+
+    task: str = "vertical-jump"
+    """Name of the task; also the name of the folder of its runs."""
+    num_envs: int = 8192
+    """Worlds, over all processes."""
+    iterations: int = 2800
+    """Iterations that the run has at its end, those before a resume included."""
+    max_seconds: float = 0.0
+    """Wall-clock limit [s]; 0: none. What counts is the time from the end of each process's first iteration to the end
+    of its last, with logging and saving between, over all resumes: building, compiling and that iteration do not."""
+    seed: int = 1
+    """Of weights, noise and worlds, 0 to 2^31 - 1; every process derives its own."""
+    device: str | None = None
+    """A torch device; default: a GPU if there is one."""
+    log_root: Path = Path("logs")
+    """A run is written to log_root/task/time of its start."""
+    log_interval: int = 10
+    """Iterations between two logged ones."""
+    save_interval: int = 100
+    """Iterations between two checkpoints."""
+    keep: int = 3
+    """How many of the newest checkpoints stay; the best stays anyway."""
+    best_by: str = "Metrics/success"
+    """The logged figure that makes a checkpoint the best; higher is better."""
+    resume: str | None = None
+    """A checkpoint, a run's folder, or `latest` for the task's latest run."""
+    trainer: Literal["ppo", "rsl-rl"] = "ppo"
+    """This package's PPO, or that of rsl-rl-lib for comparison."""
+    tensorboard: bool = True
+    """Write TensorBoard events, if TensorBoard is installed."""
+    wandb: bool = False
+    """Upload to Weights & Biases."""
+    ppo: PpoCfg = field(default_factory=PpoCfg)
+    """Settings of the algorithm."""
+
+    def __post_init__(self) -> None:
+        """Raises ValueError: a setting is out of range."""
+        object.__setattr__(self, "log_root", Path(self.log_root))
+        for name in ("num_envs", "iterations", "log_interval", "save_interval", "keep"):
+            if getattr(self, name) < 1:
+                raise InputError(f"{name} must be at least 1, got {getattr(self, name)}")
+        check_not_negative("max_seconds", self.max_seconds)
+        if not 0 <= self.seed < 2**31:
+            raise InputError(f"seed must be in 0 .. {2**31 - 1}, got {self.seed}")
+        if self.trainer == "rsl-rl" and self.resume:
+            raise InputError("resume is not offered with trainer rsl-rl")

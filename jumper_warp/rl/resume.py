@@ -1,0 +1,91 @@
+"""Going on with a training: which checkpoint, and the random numbers where they were left."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import torch
+
+from jumper_warp.rl.checkpoint import CheckpointError, latest_checkpoint, load_checkpoint
+from jumper_warp.utils.state_checks import check_parts, check_tensor
+
+if TYPE_CHECKING:
+    from jumper_warp.rl.cfg import TrainCfg
+    from jumper_warp.rl.distributed import Rank
+
+CHECKPOINTS = "checkpoints"
+"""Folder of a run that holds its checkpoints."""
+
+
+def find_checkpoint(cfg: TrainCfg) -> tuple[Path, dict[str, Any], list[str]]:
+    """Return path and content of the checkpoint to resume, and why newer ones were passed over.
+
+    Raises:
+        CheckpointError: There is none that can be used.
+    """
+    if cfg.resume == "latest":
+        runs = cfg.log_root / cfg.task
+        folders = sorted(path.parent for path in runs.glob(f"*/{CHECKPOINTS}/manifest.json"))
+        if not folders:
+            raise CheckpointError(f"{runs}: no run to resume")
+        return latest_checkpoint(folders[-1])
+    path = Path(cfg.resume or "")
+    if path.suffix == ".pt":
+        return path, load_checkpoint(path), []
+    return latest_checkpoint(path if path.name == CHECKPOINTS else path / CHECKPOINTS)
+
+
+def own_part(state: dict[str, Any], rank: Rank) -> dict[str, Any]:
+    """Return the part of a checkpoint that is a process's own: `env`, `rng` and its part of `ppo`.
+
+    Raises:
+        ValueError: It was saved by another number of processes, or a part is missing.
+    """
+    others = state.get("others")
+    if not isinstance(others, list):
+        raise ValueError(f"others must be a list, got {type(others).__name__}")
+    if 1 + len(others) != rank.size:
+        raise ValueError(f"saved by {1 + len(others)} processes, there are {rank.size}")
+    if rank.index == 0:
+        return state
+    own = others[rank.index - 1]
+    check_parts(own, ("ppo", "env", "rng"), f"others.{rank.index - 1}")
+    return own
+
+
+def spent_seconds(state: dict[str, Any]) -> float:
+    """Return the seconds of the run that a checkpoint tells, 0 if it tells none. Raises ValueError: it is no time."""
+    seconds = state.get("seconds", 0.0)
+    if type(seconds) not in (int, float) or not 0.0 <= seconds < math.inf:
+        raise ValueError(f"seconds must be a number, finite and not negative, got {seconds!r:.60}")
+    return float(seconds)
+
+
+def random_state() -> dict[str, torch.Tensor]:
+    """Return the states of torch's generators."""
+    state = {"cpu": torch.get_rng_state()}
+    if torch.cuda.is_available():
+        state["cuda"] = torch.cuda.get_rng_state()
+    return state
+
+
+def set_random_state(state: dict[str, torch.Tensor]) -> None:
+    """Take up what `random_state` gave; a GPU's only where there is one.
+
+    Raises:
+        ValueError: A part is missing or no state of a generator; nothing is changed.
+    """
+    own = random_state()
+    if not isinstance(state, dict) or "cpu" not in state:
+        raise ValueError("rng lacks cpu")
+    for name in own.keys() & state.keys():
+        check_tensor(state[name], own[name], f"rng.{name}")
+    try:
+        torch.set_rng_state(state["cpu"])
+        if "cuda" in own.keys() & state.keys():
+            torch.cuda.set_rng_state(state["cuda"])
+    except RuntimeError as error:
+        torch.set_rng_state(own["cpu"])
+        raise ValueError(f"rng is not the state of a generator: {error}") from error

@@ -1,0 +1,275 @@
+"""A task that is not the package's (`hold_height`) trains, is saved, and is read back where its file is named."""
+
+import importlib.util
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import hold_height
+import numpy as np
+import pytest
+import torch
+
+from jumper_warp.envs.env import Env
+from jumper_warp.rl.cfg import PpoCfg
+from jumper_warp.rl.ppo import Ppo
+from jumper_warp.tasks.randomization import RandomizationCfg
+from jumper_warp.tasks.saving import TaskError, task_from_json, task_to_json
+
+ROOT = Path(__file__).parents[2]
+FILE = ROOT / "tests/helpers/hold_height.py"
+N = 8
+PPO = PpoCfg(num_steps=12, epochs=4, minibatches=4, hidden=(32,), lr=2e-3, desired_kl=0.0, init_std=0.5, gamma=0.9)
+
+
+def make_env(num_envs=N, task=None, **arguments) -> Env:
+    env = Env(task or hold_height.hold_height(), num_envs, **({"seed": 1, "device": "cpu"} | arguments))
+    env.reset()
+    return env
+
+
+def states_of(env) -> np.ndarray:
+    return env.skills[0].states.numpy().copy()
+
+
+def edit(env, worlds=slice(None), **fields) -> None:
+    """Overwrite fields of worlds' states."""
+    records = states_of(env)
+    for name, value in fields.items():
+        records[name][worlds] = value
+    env.skills[0].states.assign(records)
+
+
+# ---------------------------------------------------------------- it works
+
+
+def mean_error(env, ppo) -> float:
+    """Distance from the commanded height [m] of the policy without exploration, from 0.25 s after a command on."""
+    env.reset()
+    errors = []
+    with torch.no_grad():
+        for _ in range(110):
+            env.step(ppo.model.actor(ppo.model.features(env.obs)))
+            states = env.skills[0].states.numpy()
+            settled = states["age"] >= 15
+            errors.append(np.abs(env.sim.joint_q()[:, 2] - states["goal"])[settled])
+    return float(np.concatenate(errors).mean())
+
+
+def test_it_learns_to_hold_heights(one_thread):
+    """123,000 steps, everything random."""
+    torch.manual_seed(1)
+    env = make_env(128)
+    ppo = Ppo(env, PPO)
+    before = mean_error(env, ppo)
+    env.reset()
+    for _ in range(80):
+        ppo.collect()
+        ppo.update()
+    assert mean_error(env, ppo) < 0.6 * before
+
+
+def test_its_state_settings_and_levels_are_its_own():
+    env = make_env(64)
+    states = states_of(env)
+    assert set(states["lasts"]) == {30} and not states["steps"].any()
+    assert states["goal"].min() < 0.25 and states["goal"].max() > 0.39
+    assert ((states["goal"] >= 0.22) & (states["goal"] <= 0.42)).all()
+    for _ in range(30):
+        env.step(torch.zeros((64, 12)))
+    found = states_of(env)
+    going_on = env.done.numpy() == 0.0
+    assert going_on.sum() > 32 and (found["steps"][going_on] == 30).all()
+    assert not found["age"][going_on].any() and (found["goal"] != states["goal"])[going_on].all()  # commanded anew
+    env.worlds.level.fill_(1)
+    env.reset()
+    assert states_of(env)["goal"].min() < 0.22
+
+
+def test_a_command_reaches_reward_and_observation():
+    env = make_env(randomize=False, noise=False)
+    height = env.sim.joint_q()[:, 2].copy()
+    goals = np.linspace(0.25, 0.4, N)[:, None].astype(np.float32)
+    chosen = np.arange(N) % 2 == 0
+    env.command(goals, chosen)
+    assert (states_of(env)["goal"] == goals[:, 0]).tolist() == chosen.tolist()
+    env.evaluation_reset(goals)
+    np.testing.assert_allclose(env.obs[:, 0], 5.0 * goals[:, 0], rtol=1e-6)
+    np.testing.assert_allclose(env.obs[:, 1:4], np.tile(5.0 * height[0], (N, 3)), rtol=1e-5)  # history, begun anew
+    env.step(torch.zeros((N, 12)))
+    height = env.sim.joint_q()[:, 2]
+    np.testing.assert_allclose(env.reward, np.exp(-np.abs(height - goals[:, 0]) / 0.05), rtol=1e-4)
+    np.testing.assert_allclose(env.obs[:, 3], 5.0 * height, rtol=1e-5)
+    assert (states_of(env)["goal"] == goals[:, 0]).all() and (env.obs[:, 1:3] == env.obs[0, 1]).all()
+
+
+def test_its_terminations_and_curriculum_are_its_own():
+    env = make_env(randomize=False, noise=False)
+    goal = states_of(env)["goal"]
+    height = env.sim.joint_q()[0, 2]
+    edit(env, 0, near=99, goal=height)
+    edit(env, 1, steps=119, goal=height + 0.2)
+    env.worlds.streak.fill_(1)
+    env.step(torch.zeros((N, 12)))
+    names = [term.name for term in env.task.terminations]
+    assert [names[i] if i >= 0 else "" for i in env.worlds.ending.numpy()] == ["held", "too_long"] + [""] * (N - 2)
+    assert env.timeout.tolist() == [1.0, 1.0] + [0.0] * (N - 2)
+    assert env.worlds.level.numpy().tolist() == [1] + [0] * (N - 1)
+    assert env.worlds.streak.numpy().tolist() == [0, 0] + [1] * (N - 2)
+    assert (states_of(env)["goal"][2:] == goal[2:]).all()
+    assert env.metrics()["Metrics/success"] == 0.5
+
+
+def test_its_own_event_is_drawn_at_every_reset_of_a_world():
+    task = hold_height.hold_height()
+    env = make_env(task=task)
+    nominal = np.tile([task.motors.lateral.saturation, *2 * [task.motors.transversal.saturation]], 4)[:, None]
+    torques = []
+    for _ in range(3):
+        torques.append(env.sim.motors.saturation.numpy() / nominal)
+        edit(env, 3, steps=119)
+        env.step(torch.zeros((N, 12)))
+        assert env.done.tolist() == [float(world == 3) for world in range(N)]
+    torques = np.array(torques)
+    assert 0.8 <= torques.min() < 0.83 and 0.97 < torques.max() <= 1.0
+    others = np.arange(N) != 3
+    assert (torques[1:, :, others] == torques[:-1, :, others]).all() and (torques[1:, :, 3] != torques[:-1, :, 3]).all()
+    assert (make_env(task=task, randomize=False).sim.motors.saturation.numpy() == nominal.astype(np.float32)).all()
+
+
+# ---------------------------------------------------------------- saved and read back
+
+FRESH = """
+import importlib.util, json, sys
+import numpy as np
+import torch
+
+sys.modules["hold_height"] = module = importlib.util.module_from_spec(
+    importlib.util.spec_from_file_location("hold_height", sys.argv[1])
+)
+module.__spec__.loader.exec_module(module)
+
+from jumper_warp.envs.env import Env
+from jumper_warp.tasks.saving import task_from_json
+
+with open(sys.argv[2]) as file:
+    task = task_from_json(json.load(file), [module])
+env = Env(task, 8, seed=1, device="cpu")
+env.reset()
+rewards = []
+for action in torch.from_numpy(np.load(sys.argv[3])):
+    env.step(action)
+    rewards.append(env.reward.numpy().copy())
+np.save(sys.argv[4], rewards)
+"""
+"""Of a process that knows the task from its file and its saved configuration alone."""
+
+UNNAMED = """
+import json, sys
+from jumper_warp.tasks.saving import TaskError, task_from_json
+
+with open(sys.argv[1]) as file:
+    saved = json.load(file)
+before = set(sys.modules)
+try:
+    task_from_json(saved)
+except TaskError as error:
+    print(error)
+assert "hold_height" not in sys.modules and "trap" not in sys.modules
+"""
+"""Of a process to which no module is named."""
+
+
+def python(code: str, *arguments: Path, path: Path | None = None) -> str:
+    """Run code in a new process and return what it prints; path: where modules could be imported from besides."""
+    paths = [str(ROOT), *([str(path)] if path else [])]
+    environment = {"PYTHONPATH": ":".join(paths), "PATH": "", "HOME": str(Path.home())}
+    command = [sys.executable, "-c", code, *map(str, arguments)]
+    done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT / "assets", env=environment)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+@pytest.fixture
+def saved(tmp_path) -> Path:
+    """A task with a number and a range changed, as JSON on the disk."""
+    task = hold_height.hold_height().with_terms("rewards", near_goal={"weight": 50.0, "width": 0.04})
+    path = tmp_path / "task.json"
+    path.write_text(json.dumps(task_to_json(task)))
+    return path
+
+
+def test_it_is_read_back_as_it_was(saved):
+    task = task_from_json(json.loads(saved.read_text()), [hold_height])
+    expected = hold_height.hold_height().with_terms("rewards", near_goal={"weight": 50.0, "width": 0.04})
+    assert task == expected and task != hold_height.hold_height()
+    assert task.randomization == RandomizationCfg.walking() and task.numbers == expected.numbers
+
+
+def test_a_new_process_that_is_told_its_file_gives_the_same_rewards(saved, tmp_path):
+    actions = 0.5 * (2.0 * torch.rand((150, N, 12), generator=torch.Generator().manual_seed(0)) - 1.0)
+    np.save(tmp_path / "actions.npy", actions.numpy())
+    python(FRESH, FILE, saved, tmp_path / "actions.npy", tmp_path / "rewards.npy")
+    env, ended = make_env(task=task_from_json(json.loads(saved.read_text()), [hold_height])), 0.0
+    for action, expected in zip(actions, np.load(tmp_path / "rewards.npy"), strict=True):
+        env.step(action)
+        ended += env.done.sum()
+        np.testing.assert_array_equal(env.reward, expected)
+    assert ended >= N and len(np.unique(expected)) == N
+
+
+def test_a_new_process_that_is_not_told_its_file_says_what_it_needs(saved):
+    said = python(UNNAMED, saved, path=FILE.parent)
+    assert said.count("\n") == 1
+    assert "needs 'hold_height:" in said and "--task-module" in said
+
+
+# ---------------------------------------------------------------- nothing is imported
+
+
+def places(saved, path=()):
+    """Yield where functions and types are named in a saved task."""
+    entries = saved.items() if isinstance(saved, dict) else enumerate(saved)
+    for key, value in entries:
+        if isinstance(value, dict | list):
+            yield from places(value, (*path, key))
+        elif isinstance(value, str) and ":" in value and path + (key,) != ("type",):
+            yield (*path, key)
+
+
+def replaced(saved, place, value):
+    """Return a saved task with another entry at a place."""
+    copy = json.loads(json.dumps(saved))
+    inner = copy
+    for key in place[:-1]:
+        inner = inner[key]
+    inner[place[-1]] = value
+    return copy
+
+
+SAVED = task_to_json(hold_height.hold_height())
+
+
+@pytest.mark.parametrize("place", list(places(SAVED)), ids=lambda place: ".".join(map(str, place)))
+def test_a_name_that_is_in_no_named_module_is_refused(place):
+    for name in ("os:system", "builtins:exec", "trap:advance_hold", "hold_height:os", "jumper_warp.tasks.saving:sys"):
+        with pytest.raises(TaskError) as caught:
+            task_from_json(replaced(SAVED, place, name), [hold_height])
+        assert "\n" not in str(caught.value) and f"needs {name!r}" in str(caught.value)
+
+
+def test_a_configuration_imports_nothing(tmp_path):
+    """Not even where a module of that name lies on the path: it would leave a file behind."""
+    mark = tmp_path / "imported"
+    (tmp_path / "trap.py").write_text(f"open({str(mark)!r}, 'w').close()\n")
+    for name in ("trap:advance_hold", "os:system"):
+        path = tmp_path / "task.json"
+        path.write_text(json.dumps([replaced(SAVED, place, name) for place in places(SAVED)]))
+        every = UNNAMED.replace("    task_from_json(saved)", "    [task_from_json(each) for each in saved]")
+        said = python(every, path, path=tmp_path)
+        assert said.count("\n") == 1 and "--task-module" in said
+    assert not mark.exists()
+    spec = importlib.util.spec_from_file_location("trap", tmp_path / "trap.py")
+    spec.loader.exec_module(importlib.util.module_from_spec(spec))
+    assert mark.exists()  # the trap works

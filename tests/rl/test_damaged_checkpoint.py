@@ -1,0 +1,207 @@
+"""Whatever a checkpoint holds, it is taken up or refused in one line: with the right checksum, too."""
+
+import copy
+import hashlib
+import json
+
+import pytest
+import torch
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from jump_helpers import make_env
+from jumper_warp.policy_interface import PolicyError
+
+from jumper_warp.policies.restore import open_policy
+from jumper_warp.rl.cfg import PpoCfg, TrainCfg
+from jumper_warp.rl.checkpoint import MANIFEST, CheckpointError, load_checkpoint, save_checkpoint
+from jumper_warp.rl.distributed import Rank
+from jumper_warp.rl.runner import CHECKPOINTS, Run, train
+
+PPO = PpoCfg(num_steps=4, hidden=(8, 4), minibatches=2, epochs=1)
+ALONE = Rank(0, 1, torch.device("cpu"))
+NEVER = float("nan")
+
+
+class Saved:
+    """A checkpoint of a short training, its environment, and the files that damaged copies go to."""
+
+    def __init__(self, folder):
+        self.env = make_env(2, seed=1, randomize=True, noise=True)
+        self.cfg = TrainCfg(
+            task="jump", num_envs=2, iterations=1, device="cpu", log_root=folder, tensorboard=False, ppo=PPO
+        )
+        self.path = train(self.cfg, lambda *_: self.env).folder / CHECKPOINTS / "iteration_000001.pt"
+        self.data, self.state = self.path.read_bytes(), load_checkpoint(self.path)
+
+    def sign(self, data):
+        """Write the checkpoint's file and its checksum."""
+        self.path.write_bytes(data)
+        manifest = json.loads((self.path.parent / MANIFEST).read_text())
+        manifest[self.path.name]["sha256"] = hashlib.sha256(data).hexdigest()
+        (self.path.parent / MANIFEST).write_text(json.dumps(manifest))
+
+    def resume(self):
+        """Return what is wrong with the checkpoint, or None after an iteration from it."""
+        cfg = TrainCfg(**{**vars(self.cfg), "iterations": 100, "resume": str(self.path)})
+        try:
+            run = Run(cfg, self.env, ALONE)
+        except CheckpointError as error:
+            return str(error)
+        run.ppo.collect()
+        run.ppo.update()
+        return None
+
+    def save(self, state):
+        """Sign a state."""
+        torch.save(state, self.path)
+        self.sign(self.path.read_bytes())
+
+
+@pytest.fixture(scope="module")
+def saved(tmp_path_factory, one_thread):
+    return Saved(tmp_path_factory.mktemp("run"))
+
+
+def places(state, start=()):
+    """Return the keys that lead to each part of nested dictionaries and lists."""
+    keys = state.keys() if isinstance(state, dict) else range(len(state)) if isinstance(state, list) else ()
+    return [start + (key,) for key in keys] + [place for key in keys for place in places(state[key], start + (key,))]
+
+
+def changed(state, place, change):
+    """Return a copy of a state with one part changed, or taken away if `change` gives that."""
+    state = part = copy.deepcopy(state)
+    for key in place[:-1]:
+        part = part[key]
+    new = change(part[place[-1]])
+    if new is NEVER:
+        del part[place[-1]]
+    else:
+        part[place[-1]] = new
+    return state
+
+
+def of_tensor(change):
+    return lambda value: change(value.clone()) if isinstance(value, torch.Tensor) else change(torch.zeros(3))
+
+
+JUNK = [None, True, -1, 2**70, 1.5, float("inf"), "late", "", b"\0", [], {}, [1], {"a": 1}, {3: {}}, torch.zeros(0)]
+CHANGES = {
+    "gone": lambda value: NEVER,
+    **{f"{junk!r}": (lambda value, junk=junk: junk) for junk in JUNK},
+    "nan": of_tensor(lambda x: torch.full_like(x, float("nan")) if x.is_floating_point() else -x),
+    "infinite": of_tensor(lambda x: x + float("inf") if x.is_floating_point() else x + 100),
+    "negative": of_tensor(lambda x: -x.double().abs().sub(-1.0).to(x.dtype)),
+    "flat": of_tensor(lambda x: x.flatten()),
+    "one less": of_tensor(lambda x: x.flatten()[:-1]),
+    "one more axis": of_tensor(lambda x: x[None]),
+    "double": of_tensor(lambda x: x.double()),
+    "half": of_tensor(lambda x: x.half()),
+    "whole": of_tensor(lambda x: torch.nan_to_num(x).long()),
+    "complex": of_tensor(lambda x: x.to(torch.complex64)),
+    "sparse": of_tensor(lambda x: x.float().to_sparse()),
+    "other key": lambda value: {**value, "besides": 1} if isinstance(value, dict) else {"besides": value},
+}
+
+
+def is_refusal(message, path):
+    return "\n" not in message and message.startswith(f"{path}: ") and len(message) < len(str(path)) + 400
+
+
+@settings(max_examples=120, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck))
+@given(data=st.data())
+def test_a_changed_part_is_taken_up_or_refused_in_one_line(saved, data):
+    place = data.draw(st.sampled_from(places(saved.state)))
+    change = CHANGES[data.draw(st.sampled_from(sorted(CHANGES)))]
+    saved.save(changed(saved.state, place, change))
+    message = saved.resume()
+    assert message is None or is_refusal(message, saved.path)
+
+
+@settings(max_examples=40, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck))
+@given(data=st.data())
+def test_changed_bytes_with_a_right_checksum_are_taken_up_or_refused_in_one_line(saved, data):
+    content = bytearray(saved.data)
+    if data.draw(st.booleans()):
+        del content[data.draw(st.integers(0, len(content))) :]
+    else:
+        for at in data.draw(st.lists(st.integers(0, len(content) - 1), min_size=1, max_size=40)):
+            content[at] = data.draw(st.integers(0, 255))
+    saved.sign(bytes(content))
+    message = saved.resume()
+    assert message is None or is_refusal(message, saved.path)
+
+
+@pytest.mark.filterwarnings("ignore:Casting complex")
+@settings(max_examples=30, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck))
+@given(data=st.data())
+def test_a_policy_of_a_changed_checkpoint_is_opened_or_refused_in_one_line(saved, data):
+    read = [place for place in places(saved.state) if place[0] in ("iteration", "config") or "model" in place]
+    change = CHANGES[data.draw(st.sampled_from(sorted(CHANGES)))]
+    saved.save(changed(saved.state, data.draw(st.sampled_from(read)), change))
+    try:
+        open_policy(saved.path)
+    except (CheckpointError, PolicyError) as error:
+        assert is_refusal(str(error), saved.path)
+
+
+def test_the_untouched_checkpoint_is_taken_up(saved):
+    saved.sign(saved.data)
+    assert saved.resume() is None
+
+
+WRONG = [
+    (("iteration",), "late", "iteration must be int, got str"),
+    (("iteration",), 7, "of iteration 7, manifest.json says 1"),
+    (("rng", "cpu"), NEVER, "rng lacks cpu"),
+    (("rng", "cpu"), torch.zeros(5), "rng.cpu has shape (5,), expected (5056,)"),
+    (("rng", "cpu"), torch.zeros(5056, dtype=torch.uint8), "rng is not the state of a generator"),
+    (("ppo",), [], "ppo must be dict, got list"),
+    (("ppo", "optimiser"), {}, "ppo.optimiser lacks 0, 1, 10 and 10 more, has nothing besides"),
+    (("ppo", "optimiser", 0, "step"), NEVER, "ppo.optimiser.0 lacks step, has nothing besides"),
+    (("ppo", "optimiser", 0, "exp_avg"), torch.zeros(2), "ppo.optimiser.0.exp_avg has shape (2,), expected (8, 48)"),
+    (("ppo", "optimiser", 1, "exp_avg_sq"), torch.full((8,), -1.0), "ppo.optimiser.1.exp_avg_sq must not be below 0"),
+    (("ppo", "model", "actor.0.bias"), torch.full((8,), float("nan")), "ppo.model.actor.0.bias is not finite"),
+    (("ppo", "model", "log_std"), "x", "ppo.model.log_std must be a tensor, got str"),
+    (("ppo", "model", "critic.0.bias"), torch.zeros(8).long(), "ppo.model.critic.0.bias has type torch.int64"),
+    (("ppo", "model", "value_moments.var"), torch.tensor(-1.0).double(), "value_moments.var must not be below 0, got"),
+    (("ppo", "lr"), torch.tensor(float("inf")), "ppo.lr is not finite"),
+    (("ppo", "episode"), torch.zeros(3), "ppo.episode has shape (3,), expected (2, 2)"),
+    (("env", "obs"), None, "saved obs must be a tensor, got NoneType"),
+    (("env", "joint_q"), torch.zeros(3), "saved joint_q has shape (3,), expected (86,)"),
+    (("env", "episode.goal"), torch.zeros(2, 3).double(), "saved episode.goal has type torch.float64"),
+    (("env", "episode.level"), torch.tensor([0, -1], dtype=torch.int32), "saved episode.level must not be below 0"),
+    (("others",), 3, "others must be a list, got int"),
+    (("seconds",), float("nan"), "seconds must be a number, finite and not negative, got nan"),
+]
+
+
+@pytest.mark.parametrize(("place", "value", "message"), WRONG)
+def test_what_is_wrong_is_named(saved, place, value, message):
+    saved.save(changed(saved.state, place, lambda _: value))
+    found = saved.resume()
+    assert found is not None and message in found and is_refusal(found, saved.path)
+
+
+def test_an_empty_file_with_a_right_checksum_is_refused(saved):
+    saved.sign(b"")
+    assert "not readable as tensors: " in saved.resume()
+
+
+def test_parts_of_another_process_are_named(saved):
+    own = {"ppo": {"episode": saved.state["ppo"]["episode"]}, "env": saved.state["env"]}
+    saved.save({**saved.state, "others": [own]})
+    cfg = TrainCfg(**{**vars(saved.cfg), "resume": str(saved.path)})
+    with pytest.raises(CheckpointError, match=r"others\.0 lacks rng, has nothing besides"):
+        Run(cfg, saved.env, Rank(1, 2, torch.device("cpu")))
+
+
+@pytest.mark.parametrize("entry", [{"sha256": 3}, {"iteration": "1"}, {"iteration": True}, {"score": "high"}, 3])
+def test_a_damaged_manifest_is_refused(tmp_path, entry):
+    state = {"iteration": 1, "ppo": {}, "env": {}, "rng": {}, "config": "{}"}
+    path = save_checkpoint(tmp_path, state, 0.5)
+    manifest = json.loads((tmp_path / MANIFEST).read_text())
+    manifest[path.name] = {**manifest[path.name], **entry} if isinstance(entry, dict) else entry
+    (tmp_path / MANIFEST).write_text(json.dumps(manifest))
+    with pytest.raises(CheckpointError, match=r"manifest\.json: not readable"):
+        load_checkpoint(path)

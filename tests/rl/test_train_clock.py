@@ -1,0 +1,66 @@
+"""What a training's time limit counts and what is told of the rest, on a clock that the test moves."""
+
+import dataclasses
+import time
+
+import pytest
+from toy_task import SMALL, PushTask
+
+from jumper_warp.rl.cfg import TrainCfg
+from jumper_warp.rl.checkpoint import load_checkpoint
+from jumper_warp.rl.runner import CHECKPOINTS, train
+
+
+@pytest.fixture
+def cfg(tmp_path):
+    return TrainCfg(
+        task="push", num_envs=32, iterations=100, device="cpu", log_root=tmp_path / "logs", log_interval=2,
+        save_interval=2, tensorboard=False, ppo=SMALL,
+    )  # fmt: skip
+
+
+def saved_seconds(result):
+    return load_checkpoint(result.folder / CHECKPOINTS / f"iteration_{result.iteration:06d}.pt")["seconds"]
+
+
+class Clocked(PushTask):
+    """Its steps take as long as `durations` says [s] on the clock `now`, as long as there are any."""
+
+    def __init__(self, *args, durations, **arguments):
+        super().__init__(*args, **arguments)
+        self.durations, self.now = list(durations), 1000.0
+
+    def step(self, action):
+        super().step(action)
+        self.now += self.durations.pop(0)
+
+
+def train_clocked(monkeypatch, cfg, durations, **arguments):
+    """Train on a clock that only the environment's steps move."""
+    env = Clocked(cfg.num_envs, durations=durations, episode_length=SMALL.num_steps)
+    monkeypatch.setattr(time, "perf_counter", lambda: env.now)
+    return train(cfg, lambda *_: env, **arguments)
+
+
+def test_the_time_limit_counts_from_the_end_of_the_first_iteration(cfg, monkeypatch):
+    limited = dataclasses.replace(cfg, max_seconds=60.0)
+    result = train_clocked(monkeypatch, limited, [500.0] + [1.0] * 79)  # 16 steps an iteration; the first compiles
+    assert (result.iteration, result.seconds) == (5, 515.0 + 4 * 16.0)
+    assert (result.figures["Perf/elapsed_s"], saved_seconds(result)) == (64.0, 64.0)
+    on = dataclasses.replace(limited, max_seconds=80.0, resume=str(result.folder))
+    again = train_clocked(monkeypatch, on, [700.0] + [1.0] * 31)  # another iteration to warm up, and one that counts
+    assert (again.iteration, saved_seconds(again)) == (7, 80.0)
+
+
+@pytest.mark.parametrize(
+    ("seconds", "limit", "left"),
+    [(1.0, 0.0, "27 min"), (3.0, 0.0, "1 h 20 min"), (1.0, 90.0, "58 s"), (0.01, 0.0, "16 s")],
+)
+def test_what_is_left_follows_the_pace_after_the_first_iteration_and_the_limit(
+    cfg, monkeypatch, capsys, seconds, limit, left
+):
+    limited = dataclasses.replace(cfg, iterations=103, max_seconds=limit, log_interval=3)
+    with pytest.raises(IndexError):
+        train_clocked(monkeypatch, limited, [9000.0, *[seconds] * 3 * 16])
+    (line,) = [line for line in capsys.readouterr().err.splitlines() if line.startswith("iteration 3/103: ")]
+    assert line.endswith(f", {left} left")

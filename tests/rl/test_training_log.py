@@ -1,0 +1,147 @@
+import contextlib
+import dataclasses
+import json
+import resource
+
+import pytest
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from toy_task import SMALL, PushTask
+
+from jumper_warp.rl.cfg import TrainCfg
+from jumper_warp.rl.figure_files import FiguresFile
+from jumper_warp.rl.logger import FIGURES, TrainingLog, _duration
+from jumper_warp.rl.runner import CHECKPOINTS, train
+
+NUMBERS = {"Perf/fps": 1234.0, "Metrics/success": 0.5}
+
+
+@pytest.fixture
+def cfg(tmp_path):
+    return TrainCfg(
+        task="push", num_envs=32, iterations=6, device="cpu", log_root=tmp_path / "logs", log_interval=1,
+        save_interval=2, tensorboard=False, ppo=SMALL,
+    )  # fmt: skip
+
+
+@contextlib.contextmanager
+def full_disk(size=0):
+    """No file of this process can grow past so many bytes: writes fail in the midst, as on a full disk."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+
+
+def iterations(path):
+    return [json.loads(line)["iteration"] for line in path.read_text().splitlines()]
+
+
+def steps(folder):
+    events = EventAccumulator(str(folder))
+    events.Reload()
+    return [event.step for event in events.Scalars("Loss/value")]
+
+
+def test_figures_that_found_no_room_follow_in_order(tmp_path):
+    path = tmp_path / FIGURES
+    file = FiguresFile(path, 0)
+    file.add(1, {"Loss/value": 0.5})
+    before = path.read_bytes()
+    for iteration in (2, 3):
+        with full_disk(len(before) + 5), pytest.raises(OSError, match="too large"):
+            file.add(iteration, {"Loss/value": 0.5})
+        assert path.read_bytes() == before
+    file.add(4, {})
+    assert iterations(path) == [1, 2, 3, 4]
+
+
+class Filling(PushTask):
+    """The disk is full while the figures of the second and third iteration are logged."""
+
+    stack: contextlib.ExitStack
+
+    def metrics(self):
+        if self.steps == 2 * 16:
+            self.stack.enter_context(full_disk())
+        return super().metrics()
+
+    def step(self, action):
+        super().step(action)
+        if self.steps == 3 * 16 + 1:
+            self.stack.close()
+
+
+@pytest.mark.parametrize("tensorboard", [False, True])
+def test_a_disk_that_is_full_for_a_while_loses_no_figure_and_is_told_once(cfg, capsys, tensorboard):
+    cfg = dataclasses.replace(cfg, tensorboard=tensorboard)
+    with contextlib.ExitStack() as Filling.stack:
+        result = train(cfg, Filling)
+    assert iterations(result.folder / FIGURES) == [1, 2, 3, 4, 5, 6]
+    assert (result.folder / CHECKPOINTS / "iteration_000006.pt").exists()
+    told = capsys.readouterr().err.splitlines()
+    assert ["training goes on" in line for line in told].count(True) == 1
+    if tensorboard:
+        assert steps(result.folder) == [1, 2, 3, 4, 5, 6]
+
+
+def test_a_terminal_that_is_gone_stops_nothing(tmp_path, monkeypatch):
+    class Gone:
+        def write(self, _):
+            raise BrokenPipeError(32, "Broken pipe")
+
+        flush = fileno = isatty = lambda self: 0
+
+    with TrainingLog(tmp_path, {}, 10, tensorboard=False) as log:
+        log._console.file = Gone()
+        for iteration in (1, 2):
+            log.log(iteration, NUMBERS, 5.0)
+    assert iterations(tmp_path / FIGURES) == [1, 2]
+
+
+def test_a_resumed_run_drops_a_half_line_and_later_iterations(cfg, capsys):
+    half = train(dataclasses.replace(cfg, iterations=4), PushTask)
+    path = half.folder / FIGURES
+    kept = path.read_text().splitlines()[:2]
+    path.write_bytes(path.read_bytes()[:-30])
+    resume = str(half.folder / CHECKPOINTS / "iteration_000002.pt")
+    capsys.readouterr()
+    train(dataclasses.replace(cfg, resume=resume), PushTask)
+    assert iterations(path) == [1, 2, 3, 4, 5, 6]
+    assert path.read_text().splitlines()[:2] == kept
+    told = [line for line in capsys.readouterr().err.splitlines() if str(path) in line]
+    assert told == [f"{path}: dropped 2 lines, cut or of later iterations"]
+
+
+@pytest.mark.parametrize(
+    ("content", "kept"),
+    [
+        (b'{"iteration": 1}\n{"iterat', [1]),
+        (b'{"iteration": 1}\n{"iteration": 2}', [1, 2]),  # whole but for the end of the line
+        (b'{"iteration": 1}\n{"iter{"iteration": 2}\n{"iteration": 2}\n', [1, 2]),
+        (b'{"iteration": 1}\n{"iteration": 3}\n{"iteration": 2}\n', [1, 2]),
+        (b'{"iteration": null}\n[1]\n7\n\xff\xfe\n\n', []),
+        (b"", []),
+    ],
+)
+def test_a_file_of_figures_is_whole_again(tmp_path, content, kept):
+    path = tmp_path / FIGURES
+    path.write_bytes(content)
+    FiguresFile(path, 2).add(3, {})
+    assert iterations(path) == [*kept, 3]
+
+
+def test_events_of_iterations_after_the_resumed_one_are_hidden(cfg):
+    cfg = dataclasses.replace(cfg, tensorboard=True)
+    half = train(dataclasses.replace(cfg, iterations=4), PushTask)
+    train(dataclasses.replace(cfg, resume=str(half.folder / CHECKPOINTS / "iteration_000002.pt")), PushTask)
+    assert steps(half.folder) == [1, 2, 3, 4, 5, 6]
+
+
+@pytest.mark.parametrize(
+    ("seconds", "text"),
+    [(0.0, "0 s"), (59.4, "59 s"), (59.6, "1 min"), (3569.0, "59 min"), (3571.0, "1 h 0 min"), (9000.0, "2 h 30 min")],
+)
+def test_a_duration_is_told_in_words(seconds, text):
+    assert _duration(seconds) == text

@@ -1,0 +1,112 @@
+import dataclasses
+import os
+
+import pytest
+import torch
+from jump_helpers import make_env
+from toy_task import SMALL
+
+from experiments.measure_memory import array_bytes
+from jumper_warp import training_memory
+from jumper_warp.cli.training_memory import STANDING, check_memory, free_main_memory, learning_need, rollout_bytes
+from jumper_warp.registry import make_task
+from jumper_warp.rl.ppo import Ppo
+from jumper_warp.tasks.cfg import TaskCfg
+
+TASK = make_task("vertical-jump")
+CPU = torch.device("cpu")
+
+
+def limit(monkeypatch, main, card=10**15):
+    monkeypatch.setattr(training_memory, "free_main_memory", lambda: int(main))
+    monkeypatch.setattr(torch.cuda, "mem_get_info", lambda device: (int(card), 2 * int(card)))
+
+
+@pytest.fixture(scope="module")
+def envs():
+    """Environments of 8 and 40 worlds, each with the bytes of all arrays that it added."""
+    found = []
+    for count in (8, 40):
+        before = array_bytes()
+        found.append((make_env(count, task=TASK, randomize=True), array_bytes() - before))
+    return found
+
+
+def test_an_environments_arrays_take_what_is_said(envs):
+    (_, few), (_, many) = envs
+    assert (many - few) / 32.0 == pytest.approx(STANDING["jumper"], rel=0.05)
+
+
+@pytest.mark.parametrize("asymmetric", [True, False])
+def test_the_rollout_takes_what_is_said(envs, asymmetric):
+    cfg = dataclasses.replace(SMALL, asymmetric=asymmetric)
+    for env, _ in envs:
+        ppo = Ppo(env, cfg)
+        buffers = sum(x.numel() * x.element_size() for name, x in vars(ppo.rollout).items() if name != "log_std")
+        critic_obs = env.num_critic_obs if asymmetric else env.num_obs
+        assert buffers == env.num_envs * rollout_bytes(cfg.num_steps, env.num_obs, critic_obs)
+        need = learning_need(cfg, env.num_obs, env.num_critic_obs)
+        adam = 4 * 4 * sum(p.numel() for p in ppo.model.parameters())  # weight, gradient and two moments
+        assert need.fixed == pytest.approx(adam, rel=0.01)
+        assert buffers / env.num_envs < need.per_world < 10 * buffers / env.num_envs
+
+
+@pytest.mark.parametrize(
+    ("main", "card", "device", "memory"),
+    [
+        (4e9, 0.0, "cpu", "main memory"),
+        (4e9, 80e9, "cuda:0", "main memory"),
+        (400e9, 3e9, "cuda:0", "memory of cuda:0"),
+    ],
+)
+def test_too_many_worlds_are_refused_with_a_number_that_fits(monkeypatch, main, card, device, memory):
+    limit(monkeypatch, main, card)
+    device = torch.device(device)
+    pattern = rf"num_envs 1000000000 needs about [\d,]+\.\d GB of {memory} in each process, [34]\.0 GB are free: "
+    with pytest.raises(ValueError, match=pattern + r"num_envs (\d+) would fit$") as caught:
+        check_memory(TASK, "jumper", 10**9, device)
+    fit = int(str(caught.value).split()[-3])
+    assert 10_000 < fit < 100_000
+    check_memory(TASK, "jumper", fit, device)
+    with pytest.raises(ValueError, match=f"num_envs {fit} would fit"):
+        check_memory(TASK, "jumper", fit + 8, device)
+
+
+def task_with(**changes) -> TaskCfg:
+    return dataclasses.replace(TASK, ppo=dataclasses.replace(TASK.ppo, **changes))
+
+
+def test_the_number_that_fits_can_be_trained_with(monkeypatch):
+    limit(monkeypatch, 1e9)
+    task = task_with(num_steps=6, minibatches=21)
+    with pytest.raises(ValueError, match="would fit") as caught:
+        check_memory(task, "jumper", 10**9, CPU)
+    assert task.ppo.batch_size(int(str(caught.value).split()[-3]))
+
+
+@pytest.mark.parametrize("changes", [{"hidden": (10**6, 10**6)}, {"num_steps": 10**9}])
+def test_settings_that_no_world_has_room_for_are_refused(monkeypatch, changes):
+    limit(monkeypatch, 4e9)
+    with pytest.raises(ValueError, match="GB are free: none would fit"):
+        check_memory(task_with(**changes), "jumper", 8, CPU)
+
+
+def test_processes_of_one_host_share_its_memory(monkeypatch):
+    limit(monkeypatch, 4e9)
+    with pytest.raises(ValueError, match=r"4\.0 GB are free") as alone:
+        check_memory(TASK, "jumper", 10**9, CPU)
+    monkeypatch.setenv("LOCAL_WORLD_SIZE", "4")
+    with pytest.raises(ValueError, match=r"1\.0 GB are free") as shared:
+        check_memory(TASK, "jumper", 10**9, CPU)
+    first, second = (int(str(caught.value).split()[-3]) for caught in (alone, shared))
+    assert first == pytest.approx(4 * second, rel=0.01)
+
+
+def test_the_projects_trainings_have_room(monkeypatch):
+    limit(monkeypatch, 16e9, 8e9)
+    for name in ("vertical-jump", "horizontal-jump", "omnidirectional-jump"):
+        check_memory(make_task(name), "jumper", 8192, torch.device("cuda", 0))
+
+
+def test_free_memory_is_some_of_the_machines():
+    assert 0 < free_main_memory() <= os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
