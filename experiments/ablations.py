@@ -21,8 +21,8 @@ from jumper_warp.envs.env import Env
 from jumper_warp.evaluation.learning import Curve, learning_curve
 from jumper_warp.evaluation.plots import drawn
 from jumper_warp.registry import make_task
-from jumper_warp.rl.ppo import Ppo
 from jumper_warp.rl.cfg import PpoCfg
+from jumper_warp.rl.ppo import Ppo
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.tasks.jump.ablations import ABLATIONS
 from jumper_warp.utils.errors import InputError

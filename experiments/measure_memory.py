@@ -18,11 +18,11 @@ from pathlib import Path
 
 import tyro
 import warp as wp
-from jumper_warp.figures import output_dir, write_figures
 
-from jumper_warp.envs.env import JumpEnv
+from jumper_warp.envs.env import Env
 from jumper_warp.registry import make_task
 from jumper_warp.sim.simulation import SolverName
+from jumper_warp.utils.output import output_dir, write_figures
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ def measure(args: Args) -> dict[str, int]:
     All is on the CPU; the arrays are the same on a GPU.
     """
     wp.config.log_level = wp.LOG_WARNING
-    env = JumpEnv(make_task(args.task), args.envs[0], device="cpu", solver=args.solver)
+    env = Env(make_task(args.task), args.envs[0], device="cpu", solver=args.solver)
     env.reset()
     return {"building": 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss, "standing": array_bytes()}
 

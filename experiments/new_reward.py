@@ -19,9 +19,8 @@ import warp as wp
 
 from jumper_warp.envs.env import Env
 from jumper_warp.registry import make_task
-from jumper_warp.rl.cfg import PpoCfg
+from jumper_warp.rl.cfg import PpoCfg, TrainCfg
 from jumper_warp.rl.runner import train
-from jumper_warp.rl.cfg import TrainCfg
 from jumper_warp.tasks.terms import RewardTerm
 from jumper_warp.utils.output import output_dir, write_figures
 from kernels.jump.state import FLIGHT, JumpState

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
-from jumper_warp.cli.main import TASK_MODULE_HELP, USAGE_ERROR, UsageError, parse
+from jumper_warp.cli.main import TASK_MODULE, TASK_MODULE_HELP, USAGE_ERROR, UsageError, parse
 from jumper_warp.registry import find_task, make_task, task_names
 from jumper_warp.rl.cfg import TrainCfg
 from jumper_warp.utils.errors import InputError
@@ -97,12 +97,15 @@ def env_maker(task: TaskCfg, args: TrainArgs) -> MakeEnv:
     return make
 
 
-def command_line(args: Sequence[str]) -> str:
-    """Return what was typed, without `--resume`."""
+def command_line(args: Sequence[str], modules: Sequence[ModuleType]) -> str:
+    """Return what was typed, without `--resume`; modules are named by their file, those of a package by their name."""
     kept = [arg for arg in args if not arg.startswith("--resume=")]
     while "--resume" in kept:
         at = kept.index("--resume")
         del kept[at : at + 2]
+    for module in modules:
+        name = module.__name__ if "." in module.__name__ or not module.__file__ else module.__file__
+        kept += [TASK_MODULE, name]
     return shlex.join(["jumper", "train", *kept])
 
 
@@ -118,7 +121,7 @@ def check_saving(task: TaskCfg) -> None:
 def check_resume(cfg: TrainCfg) -> None:
     """Raise CheckpointError if the checkpoint to resume is of a run from before tasks had a version."""
     from jumper_warp.rl.checkpoint import CheckpointError
-    from jumper_warp.rl.runner import find_checkpoint
+    from jumper_warp.rl.resume import find_checkpoint
 
     path, state, _ = find_checkpoint(cfg)
     try:
@@ -147,7 +150,7 @@ def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> TrainResult:
     as_rsl_rl = None
     if parsed.cfg.trainer == "rsl-rl":
         from jumper_warp.envs.rsl_rl import RslRlVecEnv as as_rsl_rl
-    result = train(parsed.cfg, env_maker(task, parsed), as_rsl_rl)
+    result = train(parsed.cfg, env_maker(task, parsed), command_line(args, modules), as_rsl_rl)
     if first:
         print(result.folder)
     return result

@@ -17,9 +17,9 @@ from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.utils.errors import InputError
 
 NUM_ACTIONS = 12
-BUILDING: dict[SolverName, int] = {"jumper": 70_000, "mujoco": 88_000}
+BUILDING: dict[SolverName, int] = {"jumper": 70_000, "mujoco": 112_000}
 """[byte] Of main memory for each world while the environment is built (`experiments/measure_memory.py`)."""
-STANDING: dict[SolverName, int] = {"jumper": 22_600, "mujoco": 68_250}
+STANDING: dict[SolverName, int] = {"jumper": 25_750, "mujoco": 71_400}
 """[byte] Of the environment's own arrays on the device for each world, measured likewise."""
 FLOAT = 4
 """[byte]"""
@@ -55,7 +55,7 @@ def learning_need(cfg: PpoCfg, num_obs: int, num_critic_obs: int) -> Need:
 
 
 def rollout_bytes(num_steps: int, num_obs: int, num_critic_obs: int) -> int:
-    """Return the size of `Rollout` for each world [byte], but for its log_std; num_critic_obs: what the critic sees."""
+    """Return the size of `RolloutBuffer` for each world [byte] but for log_std; num_critic_obs: of what the critic sees."""
     each = num_obs + 2 * num_critic_obs + 2 * NUM_ACTIONS + 3  # and one more of what follows the last step
     return FLOAT * (num_steps * each + num_obs + num_critic_obs)
 

@@ -127,16 +127,34 @@ def checked_action(action: Any, shape: tuple[int, ...], device: torch.device) ->
     return action.detach()
 
 
-def checked_values(values: Any, shape: tuple[int, ...], what: str) -> np.ndarray:
-    """Return values as float32, one for all or of a shape. Raises ValueError: another shape, or not finite."""
+def as_numbers(values: Any, what: str) -> np.ndarray:
+    """Return values as float32. Raises ValueError: not numbers, or lists of different lengths."""
     if isinstance(values, torch.Tensor):
         values = values.detach().cpu().numpy()
-    array = np.asarray(values, dtype=np.float32)
+    try:
+        return np.asarray(values, dtype=np.float32)
+    except (ValueError, TypeError) as error:
+        raise InputError(f"{what} must be an array of numbers, got {type(values).__name__}: {error}") from error
+
+
+def checked_values(values: Any, shape: tuple[int, ...], what: str) -> np.ndarray:
+    """Return values as float32, one for all or of a shape. Raises ValueError: another shape, or not finite."""
+    array = as_numbers(values, what)
     if array.ndim and array.shape != shape:
         raise InputError(f"{what} must have shape {shape}, got {array.shape}")
     if not np.isfinite(array).all():
         raise InputError(f"{what} must be finite")
     return np.ascontiguousarray(np.broadcast_to(array, shape))
+
+
+def checked_skill(skill: Any, num_envs: int, num_skills: int) -> np.ndarray:
+    """Return each world's index of a task as int32, given for all or one by one. Raises ValueError for another."""
+    array = np.asarray(skill)
+    if array.shape not in ((), (num_envs,)) or array.dtype.kind not in "iu":
+        raise InputError(f"skill must be an index or {num_envs} whole ones, got {array.dtype} of shape {array.shape}")
+    if not ((array >= 0) & (array < num_skills)).all():
+        raise InputError(f"skill must be an index below {num_skills}, got {array.min()} to {array.max()}")
+    return np.ascontiguousarray(np.broadcast_to(array.astype(np.int32), num_envs))
 
 
 def checked_mask(worlds: Any, num_envs: int) -> np.ndarray:
@@ -153,7 +171,7 @@ def checked_mask(worlds: Any, num_envs: int) -> np.ndarray:
 
 def checked_commands(commands: Mapping[str, Any] | Any, num_envs: int) -> np.ndarray:
     """Return commands, up to four numbers a world, as (num_envs, 4); raises ValueError: another shape, not finite."""
-    array = np.asarray(commands.detach().cpu() if isinstance(commands, torch.Tensor) else commands, dtype=np.float32)
+    array = as_numbers(commands, "commands")
     if array.ndim != 2 or array.shape[0] != num_envs or not 1 <= array.shape[1] <= 4:
         raise InputError(f"commands must have shape ({num_envs}, 1 to 4), got {array.shape}")
     return checked_values(np.pad(array, ((0, 0), (0, 4 - array.shape[1]))), (num_envs, 4), "commands")

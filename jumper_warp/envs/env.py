@@ -14,6 +14,7 @@ from jumper_warp.envs.arrays import (
     checked_action,
     checked_commands,
     checked_mask,
+    checked_skill,
     checked_tasks,
     checked_values,
     delay_arrays,
@@ -114,10 +115,7 @@ class Env:
 
     def _allocate(self, tasks: Sequence[TaskCfg], skill: np.ndarray | int) -> None:
         n, device, sim = self.num_envs, self.wp_device, self.sim
-        active = np.ascontiguousarray(np.broadcast_to(np.asarray(skill, dtype=np.int32), n))
-        if not ((active >= 0) & (active < len(tasks))).all():
-            raise InputError(f"skill must be an index below {len(tasks)}, got {skill!r:.60}")
-        self._first_skill = active
+        self._first_skill = active = checked_skill(skill, n, len(tasks))
         active = wp.array(active, dtype=int, device=device)
         self.skills = [Skill(task, i, n, self.step_dt, sim.substeps, device) for i, task in enumerate(tasks)]
         self.parameters = robot_parameters(sim, tuple(tasks), active)

@@ -43,6 +43,7 @@ def robot_parameters(sim: Simulation, tasks: tuple[TaskCfg, ...], skill: wp.arra
     robot.push = wp.zeros(n, dtype=wp.spatial_vector, device=device)
     for name in ("gain_ratio", "speed_ratio"):
         setattr(robot, name, wp.full((12, n), wp.vec2(1.0, 1.0), dtype=wp.vec2, device=device))
+    robot.torque_ratio = wp.full((12, n), 1.0, dtype=float, device=device)
     for name, attribute in (("kp", "kp"), ("kd", "kd"), ("no_load", "no_load_speed"), ("cutoff", "cutoff_speed"),
                             ("saturation", "saturation")):  # fmt: skip
         rows = []

@@ -47,7 +47,8 @@ def draw_landings(axis: Any, landings: Landings, title: str) -> None:
     axis.scatter(landing[good, 0], landing[good, 1], s=12, color="tab:blue", label="landed there")
     axis.scatter(landing[~good, 0], landing[~good, 1], s=14, color="tab:red", label="failed")
     axis.set(xlabel="ahead [m]", ylabel="to the left [m]", title=title, aspect="equal")
-    axis.legend(loc="upper center", bbox_to_anchor=(0.5, -0.15), ncols=3)
+    if not axis.figure.legends:
+        axis.figure.legend(*axis.get_legend_handles_labels(), loc="outside lower center", ncols=3)
 
 
 class Track:

@@ -65,6 +65,8 @@ def randomize(sim: Simulation, rng: np.random.Generator) -> None:
 
 def simulation_steps(sim: Simulation, args: SoakArgs) -> Iterator[torch.Tensor]:
     """Make all steps of a simulation under random targets; after each, give which worlds are flagged as non-finite."""
+    if sim.device.is_cuda:
+        torch.cuda.set_stream(wp.stream_to_torch(wp.get_stream(sim.device)))
     randomize(sim, np.random.default_rng(args.seed))
     target, invalid = wp.to_torch(sim.target), wp.to_torch(sim.physics.invalid)
     lateral, low, high = (np.radians(value) for value in (args.lateral, *args.transversal))

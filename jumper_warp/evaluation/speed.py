@@ -72,7 +72,8 @@ def standing_solver(envs: int, device: str | None) -> Callable[[], None]:
         raise RuntimeError(f"the robots do not stand: heights {standing.min():.3f} to {standing.max():.3f} m")
     with wp.ScopedCapture(device=sim.device) as capture:
         sim.physics.advance(sim.substeps, sim.target, bodies=False)
-    return lambda: wp.capture_launch(capture.graph)
+    kept = (sim, capture.graph)  # the graph works on the simulation's arrays
+    return lambda: wp.capture_launch(kept[1])
 
 
 def stepping_env(envs: int, device: str | None) -> tuple[Env, Callable[[], None]]:

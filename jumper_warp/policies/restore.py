@@ -18,7 +18,14 @@ from jumper_warp.policies.folder import load_policy
 from jumper_warp.policies.legacy import upgraded
 from jumper_warp.policies.policy import Policy
 from jumper_warp.policies.spec import PolicyError, make_interface
-from jumper_warp.rl.checkpoint import CheckpointError, best_checkpoint, latest_checkpoint, load_checkpoint
+from jumper_warp.rl.checkpoint import (
+    DAMAGE,
+    CheckpointError,
+    best_checkpoint,
+    latest_checkpoint,
+    load_checkpoint,
+    one_line,
+)
 from jumper_warp.rl.networks import EPS, NORMALISED_LIMIT
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.tasks.interface import interface
@@ -88,8 +95,8 @@ def _policy_of_checkpoint(path: Path, state: dict[str, Any]) -> Policy:
         shape = {"hidden": tuple(ppo["hidden"]), "activation": ppo["activation"]}
         commit = config.get("commit") or {"hash": None, "dirty": None}
         config |= {"commit": commit["hash"], "dirty": commit["dirty"], "iteration": state["iteration"]}
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise CheckpointError(f"{path}: not of a training of this project ({type(error).__name__}: {error})") from error
+    except DAMAGE as error:
+        raise _no_training(path, error) from error
     try:
         described = env["interface"] if "interface" in env else interface(restored_task(config))
         face = make_interface(described, **times, **shape)
@@ -97,6 +104,12 @@ def _policy_of_checkpoint(path: Path, state: dict[str, Any]) -> Policy:
         return Policy(layers, mean, std, face, config)
     except PolicyError as error:
         raise PolicyError(f"{path}: {error}") from error
+    except DAMAGE as error:
+        raise _no_training(path, error) from error
+
+
+def _no_training(path: Path, error: Exception) -> CheckpointError:
+    return CheckpointError(f"{path}: not of a training of this project ({type(error).__name__}: {one_line(error)})")
 
 
 def learning_curve(source: Path) -> bytes | None:

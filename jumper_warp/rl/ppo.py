@@ -28,7 +28,7 @@ FIGURES = (
 """Names of all that `Ppo.statistics` returns; those of Train/ once an episode has ended."""
 
 
-class Rollout:
+class RolloutBuffer:
     """Buffers of num_steps policy steps of all worlds; time is the first axis."""
 
     def __init__(self, num_steps: int, env: VecEnv, num_critic_obs: int) -> None:
@@ -162,7 +162,7 @@ class Ppo:
         self.update = Captured(self._update, cuda and cfg.graphs and world_size() == 1)
         self.optimiser = torch.optim.Adam([*actor, *critic], lr=self.lr, fused=True, capturable=self.update.enabled)
         self._flatten_gradients(actor, critic)
-        self.rollout = Rollout(cfg.num_steps, env, num_critic_obs)
+        self.rollout = RolloutBuffer(cfg.num_steps, env, num_critic_obs)
         counts = {"dtype": torch.float64, "device": env.device}  # float32 counts to 2^24 only
         self._sums = torch.zeros(len(STATISTICS), **counts)
         self._sum_count = torch.zeros((), **counts)

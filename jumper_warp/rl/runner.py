@@ -23,6 +23,7 @@ from jumper_warp.rl.distributed import Rank, gather, join_ranks, wait_for_ranks,
 from jumper_warp.rl.logger import Pace, Stopwatch, TrainingLog
 from jumper_warp.rl.ppo import FIGURES, Ppo
 from jumper_warp.rl.resume import CHECKPOINTS, find_checkpoint, own_part, random_state, set_random_state, spent_seconds
+from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.files import write_whole
 from jumper_warp.utils.runtime import git_commit, versions
 
@@ -85,7 +86,7 @@ def train(
     """
     rank = join_ranks(cfg.device)
     try:
-        _check_division(cfg, rank)
+        _check_processes(cfg, rank, as_rsl_rl is not None)
         env = make_env(cfg.num_envs // rank.size, cfg.seed + 1000 * rank.index, rank.device)
         if cfg.trainer == "rsl-rl":
             return _train_rsl_rl(cfg, env, as_rsl_rl, rank)
@@ -102,12 +103,14 @@ def train(
             torch.distributed.destroy_process_group()
 
 
-def _check_division(cfg: TrainCfg, rank: Rank) -> None:
-    """Raises ValueError: worlds or samples do not divide among processes or minibatches."""
+def _check_processes(cfg: TrainCfg, rank: Rank, adapted: bool) -> None:
+    """Raises ValueError: the trainer cannot be had, or worlds or samples do not divide."""
     if cfg.trainer == "rsl-rl" and rank.size > 1:
-        raise ValueError("trainer rsl-rl is offered for one process only")
+        raise InputError("trainer rsl-rl is offered for one process only")
+    if cfg.trainer == "rsl-rl" and not adapted:
+        raise InputError("trainer rsl-rl needs as_rsl_rl, which adapts the environment")
     if cfg.num_envs % rank.size:
-        raise ValueError(f"num_envs {cfg.num_envs} is not divisible by {rank.size} processes")
+        raise InputError(f"num_envs {cfg.num_envs} is not divisible by {rank.size} processes")
     if cfg.trainer == "ppo":
         cfg.ppo.batch_size(cfg.num_envs // rank.size)
 
@@ -116,7 +119,7 @@ def _check_best_by(name: str, logged: set[str]) -> None:
     """Raises ValueError: no figure of this name is logged."""
     if name not in logged:
         some = ", ".join(sorted(each for each in logged if each.startswith(("Metrics/", "Train/"))))
-        raise ValueError(f"best_by must name a logged figure, such as {some}, got {name!r:.60}")
+        raise InputError(f"best_by must name a logged figure, such as {some}, got {name!r:.60}")
 
 
 def full_config(cfg: TrainCfg, env: VecEnv, rank: Rank) -> dict[str, Any]:

@@ -35,7 +35,8 @@ def make_event_kernel(rows: list) -> wp.Kernel:
     ):
         """Run what is due at a stage where mask is not 0; one thread per (event, world).
 
-        timer: policy steps until the next time, (events, num_worlds). An interval event is due at a reset as well.
+        timer: policy steps until the next time, (events, num_worlds), 0: not set yet, as after a handover. An interval
+        event is due at a reset as well.
         """
         row, world = wp.tid()
         if env.skill[world] != skill or mask[world] == 0.0:
@@ -46,8 +47,8 @@ def make_event_kernel(rows: list) -> wp.Kernel:
                 due = stage == wp.static(modes[i])
                 if wp.static(modes[i] == AT_STEP):
                     left = timer[i, world] - 1
-                    due = stage == wp.static(AT_RESET) or (stage == wp.static(AT_STEP) and left <= 0)
-                    if due:
+                    due = stage == wp.static(AT_RESET) or (stage == wp.static(AT_STEP) and left == 0)
+                    if due or left < 0:
                         left = steps_until(draw, p[wp.static(rows[i].first)], p[wp.static(rows[i].first + 1)], step_dt)
                     if stage != wp.static(STARTUP):
                         timer[i, world] = left

@@ -33,6 +33,7 @@ class RobotParameters:
     push: wp.array(dtype=wp.spatial_vector)  # [N], [N m] (num_worlds,) on the base at its com, world axes
     gain_ratio: wp.array2d(dtype=wp.vec2)  # [1] (12, num_worlds) of kp and kd to those of the active skill
     speed_ratio: wp.array2d(dtype=wp.vec2)  # [1] (12, num_worlds) of no-load and cutoff speed likewise
+    torque_ratio: wp.array2d(dtype=float)  # [1] (12, num_worlds) of the torque limit likewise
     physics_dt: float  # [s]
     nominal_mass: wp.array(dtype=float)  # (21,) of one world, like all below
     nominal_com: wp.array(dtype=wp.vec3)
@@ -115,11 +116,17 @@ def set_speed_limits(robot: RobotParameters, world: int, m: int):
 
 
 @wp.func
+def set_torque_limit(robot: RobotParameters, world: int, m: int):
+    """Write the torque limit of a motor likewise."""
+    robot.motors.saturation[m, world] = robot.nominal_saturation[robot.skill[world], m] * robot.torque_ratio[m, world]
+
+
+@wp.func
 def set_motor(robot: RobotParameters, world: int, m: int):
     """Write all constants of a motor that depend on the active skill."""
     set_gains(robot, world, m)
     set_speed_limits(robot, world, m)
-    robot.motors.saturation[m, world] = robot.nominal_saturation[robot.skill[world], m]
+    set_torque_limit(robot, world, m)
 
 
 @wp.kernel

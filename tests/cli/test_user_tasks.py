@@ -9,11 +9,11 @@ import pytest
 
 from jumper_warp.cli import main as cli
 from jumper_warp.cli.main import split_task_modules
-from jumper_warp.cli.train import check_saving
+from jumper_warp.cli.train import check_saving, command_line
 from jumper_warp.policies.folder import load_policy
 from jumper_warp.policies.restore import open_policy, restored_task
 from jumper_warp.policies.spec import PolicyError
-from jumper_warp.registry import TASKS, make_task
+from jumper_warp.registry import TASKS, load_task_module, make_task
 from jumper_warp.rl.checkpoint import save_checkpoint
 from jumper_warp.tasks.saving import TaskError
 from kernels.jump import rewards
@@ -201,12 +201,18 @@ def test_reward_of_a_user_does_not_become_the_projects(runs, path):
     config = open_policy(runs["tame-jump"]).config
     with pytest.raises(PolicyError, match=r"task.rewards\[0\] needs 'my_jumps:rest'"):
         restored_task(config, leave_out=())
-    from jumper_warp.registry import load_task_module
-
     module = load_task_module(path)
     task = restored_task(config, [module], leave_out=())
     assert task.rewards[0].func is module.rest is not rewards.rest
     assert task == make_task("tame-jump").with_terms("rewards", rest={"height": 0.4})
+
+
+def test_command_that_goes_on_names_the_module(path):
+    import json.decoder as module
+
+    args = ["tame-jump", "--seed", "3", "--resume", "latest", "--resume=x"]
+    expected = f"jumper train tame-jump --seed 3 --task-module {path} --task-module json.decoder"
+    assert command_line(args, [load_task_module(path), module]) == expected
 
 
 def test_training_is_resumed(capsys, runs, path, tmp_path):
@@ -219,9 +225,8 @@ def test_training_is_resumed(capsys, runs, path, tmp_path):
 
 
 def test_task_whose_functions_could_not_be_found_again_is_not_trained(capsys, tmp_path):
-    lost = TASK.replace("register_task(", "kept, rest = rest, None\nregister_task(", 1).replace(
-        "RewardTerm(rest", "RewardTerm(kept"
-    )
+    lost = TASK.replace("RewardTerm(rest", "RewardTerm(kept")
+    lost = lost.replace("def tame_jump", "kept, rest = rest, None\n\n\ndef tame_jump")
     (tmp_path / "my_jumps.py").write_text(lost)
     args = ["train", "tame-jump", "--task-module", str(tmp_path / "my_jumps.py"), *TRAIN, "--log-root", str(tmp_path)]
     code, out, err = run(capsys, *args)

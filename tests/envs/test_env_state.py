@@ -13,10 +13,9 @@ from toy_task import SMALL, PushTask, join
 from jumper_warp.envs.env import Env
 from jumper_warp.envs.state import nominal_fingerprint
 from jumper_warp.registry import make_task
-from jumper_warp.rl.cfg import PpoCfg
+from jumper_warp.rl.cfg import PpoCfg, TrainCfg
 from jumper_warp.rl.checkpoint import CheckpointError, load_checkpoint
 from jumper_warp.rl.runner import CHECKPOINTS, train
-from jumper_warp.rl.cfg import TrainCfg
 from jumper_warp.robot.motors import jumping_motors
 from jumper_warp.tasks.jump.cfg import GroundCfg
 from jumper_warp.tasks.randomization import RandomizationCfg
@@ -202,7 +201,7 @@ def test_every_drawn_parameter_is_saved_and_the_fingerprint_does_not_see_it():
         model.body_mass, model.body_com, model.body_inertia, model.joint_armature, model.joint_friction,
         model.shape_material_mu, motors.kp, motors.kd, motors.saturation, motors.no_load_speed, motors.cutoff_speed,
         motors.offset, parameters.push, parameters.static_ratio, parameters.latency, parameters.observation_latency,
-        parameters.gain_ratio, parameters.speed_ratio,
+        parameters.gain_ratio, parameters.speed_ratio, parameters.torque_ratio,
     )  # fmt: skip
     table = env.sim.physics.dynamics.robot.table.numpy().copy()
     for array in drawn:

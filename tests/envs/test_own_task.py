@@ -58,7 +58,10 @@ def mean_error(env, ppo) -> float:
 
 
 def test_it_learns_to_hold_heights(one_thread):
-    """123,000 steps, everything random."""
+    """123,000 steps, everything random; the error over that of before, against a bound between sound and broken.
+
+    Seeds 1 to 3: 5.5 to 2.0 cm, 5.5 to 1.9 and 5.4 to 1.7; with a step size of 1e-6 it stays above 5.0.
+    """
     torch.manual_seed(1)
     env = make_env(128)
     ppo = Ppo(env, PPO)
@@ -67,7 +70,7 @@ def test_it_learns_to_hold_heights(one_thread):
     for _ in range(80):
         ppo.collect()
         ppo.update()
-    assert mean_error(env, ppo) < 0.6 * before
+    assert mean_error(env, ppo) < 0.5 * before
 
 
 def test_its_state_settings_and_levels_are_its_own():
@@ -171,14 +174,14 @@ from jumper_warp.tasks.saving import TaskError, task_from_json
 
 with open(sys.argv[1]) as file:
     saved = json.load(file)
-before = set(sys.modules)
-try:
-    task_from_json(saved)
-except TaskError as error:
-    print(error)
+for each in saved:
+    try:
+        task_from_json(each)
+    except TaskError as error:
+        print(error)
 assert "hold_height" not in sys.modules and "trap" not in sys.modules
 """
-"""Of a process to which no module is named."""
+"""Of a process to which no module is named; says what is wrong with each of some tasks."""
 
 
 def python(code: str, *arguments: Path, path: Path | None = None) -> str:
@@ -220,7 +223,9 @@ def test_a_new_process_that_is_told_its_file_gives_the_same_rewards(saved, tmp_p
 
 
 def test_a_new_process_that_is_not_told_its_file_says_what_it_needs(saved):
-    said = python(UNNAMED, saved, path=FILE.parent)
+    path = saved.with_name("tasks.json")
+    path.write_text(f"[{saved.read_text()}]")
+    said = python(UNNAMED, path, path=FILE.parent)
     assert said.count("\n") == 1
     assert "needs 'hold_height:" in said and "--task-module" in said
 
@@ -266,9 +271,8 @@ def test_a_configuration_imports_nothing(tmp_path):
     for name in ("trap:advance_hold", "os:system"):
         path = tmp_path / "task.json"
         path.write_text(json.dumps([replaced(SAVED, place, name) for place in places(SAVED)]))
-        every = UNNAMED.replace("    task_from_json(saved)", "    [task_from_json(each) for each in saved]")
-        said = python(every, path, path=tmp_path)
-        assert said.count("\n") == 1 and "--task-module" in said
+        said = python(UNNAMED, path, path=tmp_path).splitlines()
+        assert len(said) == len(list(places(SAVED))) and all("--task-module" in line for line in said)
     assert not mark.exists()
     spec = importlib.util.spec_from_file_location("trap", tmp_path / "trap.py")
     spec.loader.exec_module(importlib.util.module_from_spec(spec))

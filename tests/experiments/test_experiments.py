@@ -259,9 +259,9 @@ def test_rates_are_told_over_those_of_a_baseline(tmp_path):
     ratios = over_baseline(args.baseline, "experiments/script.py", args, figures)
     assert ratios == {"steps_per_s_jump_over_baseline": 2.0}
     assert over_baseline(None, "experiments/script.py", args, figures) == {}
-    with pytest.raises(InputError, match="fails: .*AssertionError"):
+    with pytest.raises(InputError, match=r"fails: .*AssertionError"):
         over_baseline(args.baseline, "experiments/script.py", Args((4,), False, args.baseline), figures)
-    with pytest.raises(InputError, match="no experiments/other.py in"):
+    with pytest.raises(InputError, match=r"no experiments/other\.py in"):
         over_baseline(args.baseline, "experiments/other.py", args, figures)
     assert flags_of(Args((4,), True, tmp_path, device="cpu")) == ["--envs", "4", "--noise", "--device", "cpu"]
 

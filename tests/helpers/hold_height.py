@@ -15,7 +15,7 @@ from kernels.mdp import observations as mdp_observations
 from kernels.mdp import rewards as mdp_rewards
 from kernels.mdp import terminations as mdp_terminations
 from kernels.mdp.env import Scene, SkillSettings
-from kernels.mdp.parameters import RobotParameters
+from kernels.mdp.parameters import RobotParameters, set_torque_limit
 from kernels.mdp.random import Draw, between, within
 from kernels.mdp.reset import store_pose
 from kernels.mdp.view import RobotArrays, RobotView
@@ -165,8 +165,8 @@ def wanted_height(view: RobotView, task: HoldState) -> float:
 def weak_motors(robot: RobotParameters, draw: Draw, lower: float, upper: float):
     """Scale the torque limit of each motor."""
     for m in range(12):
-        limit = robot.nominal_saturation[robot.skill[draw.world], m]
-        robot.motors.saturation[m, draw.world] = limit * between(draw, m, lower, upper)
+        robot.torque_ratio[m, draw.world] = between(draw, m, lower, upper)
+        set_torque_limit(robot, draw.world, m)
 
 
 def hold_height() -> TaskCfg:

@@ -197,8 +197,11 @@ def probe_task(**changes) -> TaskCfg:
             ObservationTerm(both, history=3),
             ObservationTerm(both, name="late", delayed=True),
         ),
-        critic=(ObservationTerm(other), ObservationTerm(latency_of), ObservationTerm(value, name="late", delayed=True,
-                                                                                    history=2)),  # fmt: skip
+        critic=(
+            ObservationTerm(other),
+            ObservationTerm(latency_of),
+            ObservationTerm(value, name="late", delayed=True, history=2),
+        ),
         motors=jumping_motors(18.0),
         command_filter=vertical_jump_filter(),
         action_scale=(15.0, 90.0),

@@ -9,9 +9,9 @@ import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from jump_helpers import make_env
-from jumper_warp.policy_interface import PolicyError
 
 from jumper_warp.policies.restore import open_policy
+from jumper_warp.policies.spec import PolicyError
 from jumper_warp.rl.cfg import PpoCfg, TrainCfg
 from jumper_warp.rl.checkpoint import MANIFEST, CheckpointError, load_checkpoint, save_checkpoint
 from jumper_warp.rl.distributed import Rank
@@ -167,10 +167,10 @@ WRONG = [
     (("ppo", "model", "value_moments.var"), torch.tensor(-1.0).double(), "value_moments.var must not be below 0, got"),
     (("ppo", "lr"), torch.tensor(float("inf")), "ppo.lr is not finite"),
     (("ppo", "episode"), torch.zeros(3), "ppo.episode has shape (3,), expected (2, 2)"),
-    (("env", "obs"), None, "saved obs must be a tensor, got NoneType"),
-    (("env", "joint_q"), torch.zeros(3), "saved joint_q has shape (3,), expected (86,)"),
-    (("env", "episode.goal"), torch.zeros(2, 3).double(), "saved episode.goal has type torch.float64"),
-    (("env", "episode.level"), torch.tensor([0, -1], dtype=torch.int32), "saved episode.level must not be below 0"),
+    (("env", "vertical-jump/now"), None, "saved vertical-jump/now must be a tensor, got NoneType"),
+    (("env", "robot.joint_q"), torch.zeros(3), "saved robot.joint_q has shape (3,), expected (86,)"),
+    (("env", "vertical-jump.goal"), torch.zeros(2, 3).double(), "saved vertical-jump.goal has type torch.float64"),
+    (("env", "env.level"), torch.tensor([0, -1], dtype=torch.int32), "saved env.level must not be below 0"),
     (("others",), 3, "others must be a list, got int"),
     (("seconds",), float("nan"), "seconds must be a number, finite and not negative, got nan"),
 ]

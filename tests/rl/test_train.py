@@ -365,7 +365,7 @@ def test_rsl_rl_bootstraps_the_timeout():
 
 
 def test_rsl_rl_trains(cfg, tmp_path):
-    result = train(dataclasses.replace(cfg, trainer="rsl-rl", iterations=2), make_env, RslRlVecEnv)
+    result = train(dataclasses.replace(cfg, trainer="rsl-rl", iterations=2), make_env, as_rsl_rl=RslRlVecEnv)
     assert (result.folder / "model_1.pt").exists()
     assert (result.folder / CONFIG).exists()
 

@@ -7,13 +7,12 @@ from jump_helpers import make_env
 from toy_task import SMALL
 
 from experiments.measure_memory import array_bytes
-from jumper_warp import training_memory
+from jumper_warp.cli import training_memory
 from jumper_warp.cli.training_memory import STANDING, check_memory, free_main_memory, learning_need, rollout_bytes
-from jumper_warp.registry import make_task
+from jumper_warp.registry import make_task, trainer_settings
 from jumper_warp.rl.ppo import Ppo
-from jumper_warp.tasks.cfg import TaskCfg
 
-TASK = make_task("vertical-jump")
+TASK, PPO = make_task("vertical-jump"), trainer_settings("vertical-jump")
 CPU = torch.device("cpu")
 
 
@@ -64,40 +63,36 @@ def test_too_many_worlds_are_refused_with_a_number_that_fits(monkeypatch, main, 
     device = torch.device(device)
     pattern = rf"num_envs 1000000000 needs about [\d,]+\.\d GB of {memory} in each process, [34]\.0 GB are free: "
     with pytest.raises(ValueError, match=pattern + r"num_envs (\d+) would fit$") as caught:
-        check_memory(TASK, "jumper", 10**9, device)
+        check_memory(TASK, PPO, "jumper", 10**9, device)
     fit = int(str(caught.value).split()[-3])
     assert 10_000 < fit < 100_000
-    check_memory(TASK, "jumper", fit, device)
+    check_memory(TASK, PPO, "jumper", fit, device)
     with pytest.raises(ValueError, match=f"num_envs {fit} would fit"):
-        check_memory(TASK, "jumper", fit + 8, device)
-
-
-def task_with(**changes) -> TaskCfg:
-    return dataclasses.replace(TASK, ppo=dataclasses.replace(TASK.ppo, **changes))
+        check_memory(TASK, PPO, "jumper", fit + 8, device)
 
 
 def test_the_number_that_fits_can_be_trained_with(monkeypatch):
     limit(monkeypatch, 1e9)
-    task = task_with(num_steps=6, minibatches=21)
+    ppo = dataclasses.replace(PPO, num_steps=6, minibatches=21)
     with pytest.raises(ValueError, match="would fit") as caught:
-        check_memory(task, "jumper", 10**9, CPU)
-    assert task.ppo.batch_size(int(str(caught.value).split()[-3]))
+        check_memory(TASK, ppo, "jumper", 10**9, CPU)
+    assert ppo.batch_size(int(str(caught.value).split()[-3]))
 
 
 @pytest.mark.parametrize("changes", [{"hidden": (10**6, 10**6)}, {"num_steps": 10**9}])
 def test_settings_that_no_world_has_room_for_are_refused(monkeypatch, changes):
     limit(monkeypatch, 4e9)
     with pytest.raises(ValueError, match="GB are free: none would fit"):
-        check_memory(task_with(**changes), "jumper", 8, CPU)
+        check_memory(TASK, dataclasses.replace(PPO, **changes), "jumper", 8, CPU)
 
 
 def test_processes_of_one_host_share_its_memory(monkeypatch):
     limit(monkeypatch, 4e9)
     with pytest.raises(ValueError, match=r"4\.0 GB are free") as alone:
-        check_memory(TASK, "jumper", 10**9, CPU)
+        check_memory(TASK, PPO, "jumper", 10**9, CPU)
     monkeypatch.setenv("LOCAL_WORLD_SIZE", "4")
     with pytest.raises(ValueError, match=r"1\.0 GB are free") as shared:
-        check_memory(TASK, "jumper", 10**9, CPU)
+        check_memory(TASK, PPO, "jumper", 10**9, CPU)
     first, second = (int(str(caught.value).split()[-3]) for caught in (alone, shared))
     assert first == pytest.approx(4 * second, rel=0.01)
 
@@ -105,7 +100,7 @@ def test_processes_of_one_host_share_its_memory(monkeypatch):
 def test_the_projects_trainings_have_room(monkeypatch):
     limit(monkeypatch, 16e9, 8e9)
     for name in ("vertical-jump", "horizontal-jump", "omnidirectional-jump"):
-        check_memory(make_task(name), "jumper", 8192, torch.device("cuda", 0))
+        check_memory(make_task(name), trainer_settings(name), "jumper", 8192, torch.device("cuda", 0))
 
 
 def test_free_memory_is_some_of_the_machines():

@@ -39,9 +39,7 @@ class Commands:
         """Begin a step with an action, (n, 12) or (skills, n, 12)."""
         action = array(np.reshape(action, (-1, self.n, 12)))
         changed = [self.robot, self.worlds, self.counters]
-        wp.launch(
-            action_kernel, (self.n, 4), [action, self.settings, self.push, *changed, self.delays], device="cpu"
-        )
+        wp.launch(action_kernel, (self.n, 4), [action, self.settings, self.push, *changed, self.delays], device="cpu")
         wp.launch(begin_step_kernel, self.n, [self.settings, self.push, *changed], device="cpu")
 
     def motors(self, name):
@@ -97,7 +95,7 @@ def test_what_happened_before_the_step_is_kept():
 def test_targets_are_filtered_by_what_the_sensors_read(offset, safe):
     """At 10 degrees, read with an error of `offset`, before a limit of 15, 30 degrees are asked for.
 
-    At the least speed of 60 deg/s the limit is 5, 1 or 15 degrees away: a weight of 1 - 5/8, 1 - 1/8 or 0 of 15 degrees.
+    The limit is 5, 1 or 15 degrees away at the least speed of 60 deg/s: a weight of 1 - 5/8, 1 - 1/8 or 0.
     """
     open_filter = dataclasses.replace(vertical_jump_filter(), lateral=LimitsCfg(-15.0, 15.0))
     commands = Commands(1, [probe_task(action_scale=(30.0, 90.0), command_filter=open_filter)])

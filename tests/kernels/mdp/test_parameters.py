@@ -195,9 +195,7 @@ def test_each_sensor_has_a_constant_error(made, drawn):
 # ---------------------------------------------------------------- friction, latency, push
 
 
-@pytest.mark.parametrize(
-    ("dynamic", "static", "bound"), [((0.8, 0.9), (0.9, 1.2), 0.0), ((0.7, 0.9), (0.6, 1.0), 0.5)]
-)
+@pytest.mark.parametrize(("dynamic", "static", "bound"), [((0.8, 0.9), (0.9, 1.2), 0.0), ((0.7, 0.9), (0.6, 1.0), 0.5)])
 def test_paws_have_one_dynamic_coefficient_and_a_static_one_that_is_not_below_it(made, drawn, dynamic, static, bound):
     found = drawn("friction", *dynamic, *static, only=("shape_mu", "static_ratio"))
     paws = made.robot.paw_shapes.numpy().reshape(N, 4)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import warp as wp
 from mdp_helpers import DEFAULT_ANGLE, MOTOR_SLOTS, array, values_of, write
-from probe_task import Probe, ProbeState, probe_task
+from probe_task import Probe, probe_task
 from scipy.spatial.transform import Rotation
 from scipy.stats import kstest
 
@@ -12,6 +12,7 @@ from jumper_warp.robot.grounds import BlockCfg
 from jumper_warp.sim.simulation import Simulation
 from kernels.mdp.env import Delays, EnvArrays, Scene, SkillSettings
 from kernels.mdp.reset import forget_kernel, stand_kernel, tick_kernel
+from kernels.mdp.track import track_kernel
 from kernels.mdp.view import RobotArrays
 
 N = 96
@@ -296,8 +297,6 @@ def test_nothing_has_been_done_felt_or_touched_before_a_beginning(stage):
 
 def test_paws_are_known_where_they_are_at_a_beginning():
     """As the stage that follows paws finds them in the same state."""
-    from kernels.mdp.track import track_kernel
-
     stage = Stage()
     stage.scramble()
     stage.forget(SOME)
@@ -314,4 +313,3 @@ def test_motors_hold_still_after_a_beginning_however_late_they_are(stage):
     stage.forget(1.0)
     angles = stage.robot.joint_q.numpy().reshape(N, 43)[:, 7 + MOTOR_SLOTS]
     assert (stage.delays.past_target.numpy() == angles.T).all()
-    assert stage.skill.states.dtype == ProbeState

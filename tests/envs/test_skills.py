@@ -1,0 +1,320 @@
+"""Several tasks on one simulation: each world has one, and goes from one to another without a jolt."""
+
+import dataclasses
+
+import hold_height
+import numpy as np
+import pytest
+import torch
+import warp as wp
+from hold_height import HoldState
+from jump_helpers import random_actions
+
+from jumper_warp.envs.env import Env
+from jumper_warp.registry import make_task
+from jumper_warp.robot.motors import jumping_motors
+from jumper_warp.tasks.cfg import Handover
+from jumper_warp.tasks.randomization import RandomizationCfg
+from kernels.jump.state import JumpState
+from kernels.mdp.view import RobotView
+
+N = 16
+DEG = np.pi / 180.0
+JUMP = dataclasses.replace(make_task("vertical-jump"), action_scale=(40.0, 90.0))
+HOLD = dataclasses.replace(hold_height.hold_height(), action_scale=(40.0, 40.0))
+SKILL = np.arange(N) % 3 == 1
+
+
+@wp.func
+def when_asked_to_jump(view: RobotView, task: HoldState, requested: bool) -> bool:
+    return requested
+
+
+@wp.func
+def when_asked_to_hold(view: RobotView, task: JumpState, requested: bool) -> bool:
+    return requested
+
+
+@wp.func
+def always(view: RobotView, task: HoldState, requested: bool) -> bool:
+    return True
+
+
+@wp.func
+def begin_jump(view: RobotView, task: HoldState) -> JumpState:
+    new = JumpState()
+    new.start = view.pos
+    new.max_height = view.pos[2]
+    new.goal = wp.vec3(view.pos[0], view.pos[1], 0.6 + task.goal)
+    new.command_step = 1000
+    return new
+
+
+@wp.func
+def begin_hold(view: RobotView, task: JumpState) -> HoldState:
+    new = HoldState()
+    new.goal = 0.3
+    return new
+
+
+@wp.func
+def go_on_holding(view: RobotView, task: HoldState) -> HoldState:
+    return task
+
+
+TO_JUMP = Handover(HOLD, JUMP, when_asked_to_jump, begin_jump)
+TO_HOLD = Handover(JUMP, HOLD, when_asked_to_hold, begin_hold)
+
+
+def make(*tasks, **arguments) -> Env:
+    env = Env(tasks if len(tasks) > 1 else tasks[0], N, **({"seed": 5, "device": "cpu"} | arguments))
+    env.reset()
+    return env
+
+
+def parameters_of(env) -> dict[str, np.ndarray]:
+    """Return everything that is drawn for a world; the world is the last index."""
+    parameters, motors = env.parameters, env.sim.motors
+    names = ("kp", "kd", "saturation", "peak", "no_load_speed", "cutoff_speed", "offset")
+    found = {name: getattr(motors, name).numpy().copy() for name in names}
+    found |= {name: getattr(parameters, name).numpy().copy() for name in ("latency", "observation_latency")}
+    found |= {"push": parameters.push.numpy().T.copy()}
+    return found | {"table": env.sim.physics.dynamics.robot.table.numpy().copy()}
+
+
+def coordinates(env) -> np.ndarray:
+    return np.concatenate([env.sim.joint_q(), env.sim.joint_qd()], axis=1)
+
+
+# ---------------------------------------------------------------- side by side
+
+
+@pytest.mark.parametrize("nominal", [False, True], ids=["drawn", "nominal"])
+@pytest.mark.parametrize("index", [0, 1])
+def test_worlds_of_a_skill_are_those_of_an_environment_with_that_skill_alone(index, nominal):
+    """Bit for bit; the other skill's actions are not even numbers."""
+    arguments = {"randomize": not nominal, "noise": not nominal}
+    both = make(JUMP, HOLD, skill=SKILL.astype(int), **arguments)
+    alone = make(both.tasks[index], **arguments)
+    mine = np.flatnonzero(index == SKILL)
+    ended = np.zeros(N)
+    for step, action in enumerate(0.5 * random_actions(N, 220)):
+        actions = torch.full((2, N, 12), torch.nan)
+        actions[index, mine] = action[mine]
+        actions[1 - index, index != SKILL] = 0.0
+        both.step(actions)
+        alone.step(action)
+        skill, expected = both.skills[index], alone.skills[0]
+        for group in ("policy", "critic"):
+            for kind in ("obs", "final_obs"):
+                found, wanted = (getattr(each, kind)[group][mine] for each in (skill, expected))
+                assert torch.equal(found, wanted), (step, group, kind)
+        for name in ("reward", "done", "timeout"):
+            assert torch.equal(getattr(both, name)[mine], getattr(alone, name)[mine]), (step, name)
+        np.testing.assert_array_equal(coordinates(both)[mine], coordinates(alone)[mine])
+        assert (skill.states.numpy()[mine] == expected.states.numpy()[mine]).all()
+        for name, values in parameters_of(both).items():
+            np.testing.assert_array_equal(values[..., mine], parameters_of(alone)[name][..., mine], err_msg=name)
+        ended += both.done.numpy()
+    assert (ended[mine] > 0).all() and not skill.metrics()["Metrics/bad_actions"]
+    np.testing.assert_array_equal(both.worlds.skill.numpy(), SKILL)
+
+
+def test_every_skill_counts_its_own():
+    env = make(JUMP, HOLD, skill=SKILL.astype(int))
+    ended = np.zeros(N)
+    for action in random_actions(N, 130):
+        env.step(action.repeat(2, 1, 1))
+        ended += env.done.numpy()
+    for index, skill in enumerate(env.skills):
+        counted = skill.counters.ending_count.numpy().sum(axis=0)
+        np.testing.assert_array_equal(counted, np.where(index == SKILL, ended, 0.0))
+
+
+# ---------------------------------------------------------------- handing over
+
+ASKED = np.arange(N) < 6
+
+
+def followed(env, actions, request_at=None, skill=0, worlds=ASKED):
+    """Step with the same action for every skill; returns coordinates and skills after every step."""
+    trace, skills = [], []
+    for step, action in enumerate(actions):
+        if step == request_at:
+            env.request(skill, worlds)
+        env.step(action.repeat(len(env.skills), 1, 1))
+        trace.append(coordinates(env).copy())
+        skills.append(env.worlds.skill.numpy().copy())
+    return np.array(trace), np.array(skills)
+
+
+def test_worlds_that_are_asked_for_switch_once_and_others_never():
+    env = make(JUMP, HOLD, skill=1, handovers=(TO_JUMP, TO_HOLD))
+    trace, skills = followed(env, 0.2 * random_actions(N, 12), request_at=5)
+    assert (skills[:5] == 1).all() and (skills[5:] == ~ASKED).all()
+    assert (env.worlds.request.numpy() == -1).all() and not env.done.any()
+    states = env.skills[0].states.numpy()
+    assert (states["steps"][ASKED] == 6).all() and not states["steps"][~ASKED].any()
+    np.testing.assert_allclose(states["start"][ASKED], trace[5, ASKED, :3])
+    np.testing.assert_allclose(states["goal"][ASKED, 2], 0.6 + env.skills[1].states.numpy()["goal"][ASKED], rtol=1e-6)
+
+
+def test_a_switch_leaves_the_robot_and_all_other_worlds_as_they_are():
+    """Against an environment that nobody asks for anything."""
+    asked, twin = (make(JUMP, HOLD, skill=1, handovers=(TO_JUMP, TO_HOLD)) for _ in range(2))
+    for step, action in enumerate(0.3 * random_actions(N, 40)):
+        if step == 5:
+            asked.request(0, ASKED)
+        for env in (asked, twin):
+            env.step(action.repeat(2, 1, 1))
+        if step == 5:  # the coordinates at the switch
+            np.testing.assert_array_equal(coordinates(asked), coordinates(twin))
+        for name, values in parameters_of(asked).items():
+            unchanged = slice(None) if name in ("table", "offset", "latency", "observation_latency") else ~ASKED
+            if step <= 5:
+                np.testing.assert_array_equal(values[..., unchanged], parameters_of(twin)[name][..., unchanged])
+        rest = ~ASKED
+        np.testing.assert_array_equal(coordinates(asked)[rest], coordinates(twin)[rest])
+        assert torch.equal(asked.reward[rest], twin.reward[rest])
+        assert torch.equal(asked.skills[1].obs["policy"][rest], twin.skills[1].obs["policy"][rest])
+    assert (coordinates(asked)[ASKED] != coordinates(twin)[ASKED]).any()  # other motors, filter and scales
+
+
+def test_a_switch_between_skills_of_equal_motors_changes_no_step_at_all():
+    """The same targets with a switch and without: masses, latency and pushes are those of before."""
+    other = dataclasses.replace(HOLD, name="hold-again", rewards=HOLD.rewards[:1])
+    there = Handover(HOLD, other, when_asked_to_jump, go_on_holding)
+    back = Handover(other, HOLD, when_asked_to_jump, go_on_holding)
+    actions = 0.1 * random_actions(N, 10)
+    quiet, asked = (make(HOLD, other, handovers=(there, back)) for _ in range(2))
+    expected, _ = followed(quiet, actions)
+    found, skills = followed(asked, actions, request_at=3, skill=1)
+    assert (skills[3:] == ASKED).all() and not asked.done.any() and not quiet.done.any()
+    np.testing.assert_array_equal(found, expected)
+    for name, values in parameters_of(quiet).items():
+        np.testing.assert_array_equal(parameters_of(asked)[name], values, err_msg=name)
+
+
+def test_motors_filter_and_scales_become_those_of_the_new_skill_and_drawn_ratios_stay():
+    task = dataclasses.replace(JUMP, motors=dataclasses.replace(
+        JUMP.motors, transversal=dataclasses.replace(JUMP.motors.transversal, kp=30.0, no_load_speed=35.0))
+    )  # fmt: skip
+    still = RandomizationCfg.walking()
+    hold = dataclasses.replace(HOLD, events=(), randomization=dataclasses.replace(still, force=None, torque=None))
+    env = make(task, hold, skill=1, handovers=(Handover(hold, task, when_asked_to_jump, begin_jump),))
+    before, action = parameters_of(env), torch.zeros((2, N, 12))
+    action[:, :, ::3] = 1.0  # lateral
+    env.step(action)
+    np.testing.assert_allclose(env.robot.safe_target.numpy()[::3], 40.0 * DEG, rtol=1e-6)
+    env.request(0, ASKED)
+    env.step(action)
+    assert not env.done.any()
+    held = env.robot.safe_target.numpy() - env.robot.default_angle.numpy()[:, None]
+    scale = np.tile([40.0, 90.0, 90.0], 4)[:, None] * DEG
+    np.testing.assert_allclose(env.robot.action.numpy()[:, ASKED], (held / scale)[:, ASKED], atol=1e-6)
+    after = parameters_of(env)
+    for name, values in after.items():
+        switched = name in ("kp", "kd", "saturation", "no_load_speed", "cutoff_speed")
+        np.testing.assert_array_equal(values[..., ~ASKED], before[name][..., ~ASKED], err_msg=name)
+        if not switched:
+            np.testing.assert_array_equal(values, before[name], err_msg=name)
+    for name in ("kp", "kd", "no_load_speed", "saturation"):
+        old, new = (
+            np.tile([getattr(motors.lateral, name), *2 * [getattr(motors.transversal, name)]], 4)[:, None]
+            for motors in (hold.motors, task.motors)
+        )
+        np.testing.assert_allclose(after[name][:, ASKED] / new, before[name][:, ASKED] / old, rtol=1e-5, err_msg=name)
+    assert (after["cutoff_speed"] <= 0.95 * after["no_load_speed"] + 1e-5).all()
+    env.step(action)
+    lateral = env.robot.safe_target.numpy()[::3] / DEG
+    np.testing.assert_allclose(env.robot.target.numpy()[::3], 40.0 * DEG, rtol=1e-6)
+    near = lateral[:, ASKED] < 15.0 + 1e-4  # the filter binds where the limit is near
+    assert near.mean() > 0.3 and (np.abs(lateral[:, ASKED][~near] - 40.0) < 1e-4).all()
+    assert (np.abs(lateral[:, ~ASKED] - 40.0) < 1e-4).all()
+
+
+def test_a_new_skill_sees_nothing_of_before_its_beginning():
+    """The history of observations and what sensors give late, also of a skill that the world was in before."""
+    env = make(JUMP, HOLD, skill=1, handovers=(TO_JUMP, TO_HOLD), noise=False)
+    first, end = HOLD.layout("policy")["height"]
+    actions = 0.3 * random_actions(N, 30)
+    followed(env, actions[:8], request_at=5)  # to jumping
+    kept = env.skills[1].obs["policy"].clone()
+    followed(env, actions[8:15], request_at=6, skill=1)  # and back
+    assert (env.worlds.skill.numpy() == 1).all() and not env.done.any()
+    seen = env.skills[1].obs["policy"][ASKED, first:end].numpy()
+    height = env.sim.joint_q()[ASKED, 2]
+    np.testing.assert_allclose(seen, np.repeat(5.0 * height[:, None], 3, axis=1), rtol=1e-5)
+    assert (seen != kept[ASKED, first:end].numpy()).all()
+    followed(env, actions[15:16])
+    following = env.skills[1].obs["policy"][ASKED, first:end].numpy()
+    np.testing.assert_array_equal(following[:, :2], seen[:, 1:])
+    last_first, last_end = HOLD.layout("policy")["last_action"]
+    np.testing.assert_array_equal(env.skills[1].obs["policy"][ASKED, last_first:last_end], actions[15][ASKED])
+
+
+def test_a_world_goes_over_at_most_once_a_step_and_not_where_its_episode_ends():
+    other = dataclasses.replace(HOLD, name="hold-again")
+    handovers = (Handover(HOLD, other, always, go_on_holding), Handover(other, HOLD, always, go_on_holding))
+    env = make(HOLD, other, handovers=handovers)
+    records = env.skills[0].states.numpy().copy()
+    records["steps"][2] = 119  # ends now, and begins anew in the skill that it is in
+    env.skills[0].states.assign(records)
+    skills = followed(env, torch.zeros((5, N, 12)))[1]
+    rest = np.arange(N) != 2
+    assert (skills[:, rest] == np.array([1, 0, 1, 0, 1])[:, None]).all()
+    assert skills[:, 2].tolist() == [0, 1, 0, 1, 0]
+
+
+def test_an_environment_with_handovers_goes_on_from_a_saved_state():
+    saved, fresh = (make(JUMP, HOLD, skill=1, handovers=(TO_JUMP, TO_HOLD)) for _ in range(2))
+    actions = 0.3 * random_actions(N, 60)
+    followed(saved, actions[:12], request_at=5)
+    saved.request(1, ASKED)
+    fresh.load_state_dict(saved.state_dict())
+    for found, expected in zip(followed(fresh, actions[12:]), followed(saved, actions[12:]), strict=True):
+        np.testing.assert_array_equal(found, expected)
+    assert torch.equal(fresh.reward, saved.reward) and (saved.worlds.skill.numpy() == 1).all()
+
+
+def test_beginning_with_a_seed_puts_the_skills_and_their_motors_back():
+    env, fresh = (make(JUMP, HOLD, skill=1, handovers=(TO_JUMP,), randomize=False) for _ in range(2))
+    followed(env, torch.zeros((3, N, 12)), request_at=1)
+    assert set(env.worlds.skill.numpy()) == {0, 1}
+    env.reset(seed=5)
+    assert (env.worlds.skill.numpy() == 1).all()
+    for name, values in parameters_of(fresh).items():
+        np.testing.assert_array_equal(parameters_of(env)[name], values, err_msg=name)
+
+
+# ---------------------------------------------------------------- what cannot be
+
+
+@pytest.mark.parametrize(
+    ("make_env", "message"),
+    [
+        (lambda: Env([], N), r"at least one task, each with a name of its own, got \[\]"),
+        (lambda: Env([HOLD, HOLD], N), "a name of its own, got .*'hold-height', 'hold-height'"),
+        (lambda: Env([JUMP, HOLD], N, skill=2), "skill must be an index below 2, got 2 to 2"),
+        (lambda: Env([JUMP, HOLD], N, skill=-1), "skill must be an index below 2, got -1 to -1"),
+        (
+            lambda: Env([JUMP, HOLD], N, skill=np.zeros(N + 1, dtype=int)),
+            r"skill must be .* 16 whole ones, got int64 of shape \(17,\)",
+        ),
+        (lambda: Env([JUMP, HOLD], N, skill=np.full(N, 0.5)), "skill must be .* got float64"),
+        (lambda: Env([JUMP, make_task("horizontal-jump")], N, handovers=[TO_JUMP]), "hold-height to vertical-jump"),
+        (lambda: make(JUMP, HOLD).request(2), "skill must be an index below 2, got 2"),
+        (lambda: make(JUMP, HOLD).step(torch.zeros((N, 12))), r"shape \(2, 16, 12\), got \(16, 12\)"),
+    ],
+)
+def test_impossible_skills_are_refused(make_env, message):
+    with pytest.raises(ValueError, match=message) as caught:
+        make_env()
+    assert "\n" not in str(caught.value)
+
+
+def test_skills_whose_motors_are_not_of_one_robot_are_refused():
+    motors = jumping_motors(18.0)
+    other = dataclasses.replace(motors, transversal=dataclasses.replace(motors.transversal, peak=30.0))
+    with pytest.raises(ValueError, match=r"hold-height needs the peak torque .* of vertical-jump's motors"):
+        Env([JUMP, dataclasses.replace(HOLD, motors=other)], N, device="cpu")
