@@ -11,6 +11,7 @@ from typing import Any
 
 import torch
 
+from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.files import write_whole
 
 MANIFEST = "manifest.json"
@@ -21,7 +22,7 @@ DAMAGE = (LookupError, TypeError, ValueError, AttributeError, RuntimeError)
 """What reading a part of a checkpoint raises that is missing or of another kind."""
 
 
-class CheckpointError(ValueError):
+class CheckpointError(InputError):
     """A checkpoint that cannot be used, said in one line."""
 
 

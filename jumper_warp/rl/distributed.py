@@ -6,6 +6,8 @@ from typing import Any, NamedTuple
 
 import torch
 
+from jumper_warp.utils.errors import InputError
+
 
 def world_size() -> int:
     """Return the number of training processes."""
@@ -43,7 +45,7 @@ def join_ranks(device: str | None = None) -> Rank:
     """
     kind = torch.device(device or ("cuda" if torch.cuda.is_available() else "cpu"))
     if kind.type == "cuda" and not torch.cuda.is_available():
-        raise ValueError(f"device {device} asked for, but torch finds no GPU")
+        raise InputError(f"device {device} asked for, but torch finds no GPU")
     size = int(os.environ.get("WORLD_SIZE", "1"))
     if size > 1 and kind.type == "cuda":
         kind = torch.device("cuda", int(os.environ["LOCAL_RANK"]))

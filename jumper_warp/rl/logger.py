@@ -14,6 +14,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from jumper_warp.rl.figure_files import EventFile, FiguresFile
+from jumper_warp.utils.errors import InputError
 
 FIGURES = "metrics.jsonl"
 """In a run's folder: one JSON object per logged iteration."""
@@ -184,5 +185,5 @@ def _wandb(folder: Path, config: dict[str, Any]) -> Any:
     try:
         import wandb
     except ImportError as error:
-        raise ValueError("wandb is asked for but not installed: pip install wandb") from error
+        raise InputError("wandb is asked for but not installed: pip install wandb") from error
     return wandb.init(project="jumper-warp", dir=str(folder), config=config)

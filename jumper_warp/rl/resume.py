@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from jumper_warp.rl.checkpoint import CheckpointError, latest_checkpoint, load_checkpoint
+from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.state_checks import check_parts, check_tensor
 
 if TYPE_CHECKING:
@@ -45,9 +46,9 @@ def own_part(state: dict[str, Any], rank: Rank) -> dict[str, Any]:
     """
     others = state.get("others")
     if not isinstance(others, list):
-        raise ValueError(f"others must be a list, got {type(others).__name__}")
+        raise InputError(f"others must be a list, got {type(others).__name__}")
     if 1 + len(others) != rank.size:
-        raise ValueError(f"saved by {1 + len(others)} processes, there are {rank.size}")
+        raise InputError(f"saved by {1 + len(others)} processes, there are {rank.size}")
     if rank.index == 0:
         return state
     own = others[rank.index - 1]
@@ -59,7 +60,7 @@ def spent_seconds(state: dict[str, Any]) -> float:
     """Return the seconds of the run that a checkpoint tells, 0 if it tells none. Raises ValueError: it is no time."""
     seconds = state.get("seconds", 0.0)
     if type(seconds) not in (int, float) or not 0.0 <= seconds < math.inf:
-        raise ValueError(f"seconds must be a number, finite and not negative, got {seconds!r:.60}")
+        raise InputError(f"seconds must be a number, finite and not negative, got {seconds!r:.60}")
     return float(seconds)
 
 
@@ -79,7 +80,7 @@ def set_random_state(state: dict[str, torch.Tensor]) -> None:
     """
     own = random_state()
     if not isinstance(state, dict) or "cpu" not in state:
-        raise ValueError("rng lacks cpu")
+        raise InputError("rng lacks cpu")
     for name in own.keys() & state.keys():
         check_tensor(state[name], own[name], f"rng.{name}")
     try:
@@ -88,4 +89,4 @@ def set_random_state(state: dict[str, torch.Tensor]) -> None:
             torch.cuda.set_rng_state(state["cuda"])
     except RuntimeError as error:
         torch.set_rng_state(own["cpu"])
-        raise ValueError(f"rng is not the state of a generator: {error}") from error
+        raise InputError(f"rng is not the state of a generator: {error}") from error

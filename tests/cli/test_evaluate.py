@@ -102,7 +102,7 @@ def test_help_of_all_policies_imports_nothing_heavy(command):
 @pytest.mark.parametrize("command", [evaluate, play])
 @pytest.mark.parametrize("args", [[], ["--height", "0.9", "vertical_jump"]])
 def test_policy_comes_first(command, args):
-    with pytest.raises(InputError, match="the policy comes first: jumper (play|evaluate) POLICY"):
+    with pytest.raises(InputError, match=r"the policy comes first: jumper (play|evaluate) POLICY"):
         command.run(args, [])
 
 

@@ -12,10 +12,10 @@ from jumper_warp.envs.env import Env
 from jumper_warp.envs.skill import Skill
 from jumper_warp.registry import make_task
 from jumper_warp.tasks.cfg import TaskCfg
-from jumper_warp.tasks.jump.cfg import ResetCfg
+from jumper_warp.tasks.jump.cfg import Level, ResetCfg
 from jumper_warp.tasks.jump.observations import EPISODE
 from jumper_warp.tasks.observations import exact
-from kernels.jump.reset import JumpSettings
+from kernels.jump.reset import JumpLevel, JumpSettings
 from kernels.jump.state import JumpState
 from kernels.mdp.parameters import RobotParameters
 from kernels.mdp.view import RobotView, vec12
@@ -166,6 +166,13 @@ def make_env(num_envs: int, *, seed: int = 0, reset: ResetCfg | None = None, tas
 def begin_by(env: Env, reset: ResetCfg) -> None:
     """Let the next episodes begin by other settings, in captured steps too."""
     env.skills[0].settings.assign(wp.array([reset.values(env.step_dt)], dtype=JumpSettings, device="cpu"))
+
+
+def set_levels(env: Env, *levels: Level) -> None:
+    """Give an environment other levels, as many as it has, or one for all."""
+    levels = levels if len(levels) > 1 else levels * len(env.task.levels)
+    values = [level.values() for level in levels]
+    env.skills[0].levels.assign(wp.array(values, dtype=JumpLevel, device="cpu"))
 
 
 def resets_of(env: Env) -> ResetCfg:

@@ -2,14 +2,12 @@ import dataclasses
 
 import numpy as np
 import pytest
-import warp as wp
-from jump_helpers import DEG, SCHEMES, begin_by, edit_episodes, episodes_of, make_env, resets_of
+from jump_helpers import DEG, SCHEMES, begin_by, edit_episodes, episodes_of, make_env, resets_of, set_levels
 from jump_starts import PAW_RADIUS, PLACES, Starts, covers
 from scipy.spatial.transform import Rotation
 from solver_helpers import MOTOR_Q, MOTOR_V
 
 from jumper_warp.registry import make_task
-from kernels.jump.reset import JumpLevel
 from kernels.jump.state import FLIGHT, LANDED, STANCE
 
 N = 4096
@@ -239,7 +237,6 @@ def test_another_goal_is_planned_past_the_first_level_only(env, starts):
     share = (planned[level > 0] > 0).mean()
     assert share == pytest.approx(0.175, abs=4.0 * np.sqrt(0.175 * 0.825 / (level > 0).sum()))
     assert covers(planned[planned > 0], 12.0, 42.0, 0.05)  # 0.2 to 0.7 s
-    never = [dataclasses.replace(level, jump_again=0.0).values() for level in env.task.levels]
-    env.skills[0].levels.assign(wp.array(never, dtype=JumpLevel, device="cpu"))
+    set_levels(env, *(dataclasses.replace(level, jump_again=0.0) for level in env.task.levels))
     env.reset()
     assert not episodes_of(env)["again_step"].any()

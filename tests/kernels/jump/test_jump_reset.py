@@ -4,7 +4,17 @@ import math
 import newton
 import numpy as np
 import pytest
-from jump_helpers import DEFAULT_ANGLE, DEG, SCHEMES, edit_episodes, episodes_of, make_env, only
+from jump_helpers import (
+    DEFAULT_ANGLE,
+    DEG,
+    SCHEMES,
+    begin_by,
+    edit_episodes,
+    episodes_of,
+    make_env,
+    only,
+    set_levels,
+)
 from jump_starts import PAW_RADIUS, collision_flags, paws_and_velocities
 from solver_helpers import MOTOR_Q, MOTOR_V
 
@@ -19,13 +29,36 @@ ALL = ResetCfg(standing=0.3, default=0.1, in_flight=0.25, touchdown=0.2)
 SHARES = np.array([0.3, 0.1, 0.25, 0.2, 0.15])
 
 
+@pytest.fixture(scope="module")
+def of_all_schemes():
+    return make_env(N, reset=ALL)
+
+
 @pytest.fixture(scope="module", params=range(len(TASK.levels)), ids=lambda level: f"level{level}")
-def drawn(request):
+def drawn(request, of_all_schemes):
     """Thousands of beginnings at one level: environment, episodes, coordinates and rates."""
-    env = make_env(N, reset=ALL, seed=request.param)
+    env = of_all_schemes
     edit_episodes(env, level=request.param)
     env.reset()
     return env, episodes_of(env), env.sim.joint_q().astype(float), env.sim.joint_qd().astype(float)
+
+
+@pytest.fixture(scope="module")
+def other_env():
+    return make_env(N, seed=1)
+
+
+@pytest.fixture
+def begun(other_env):
+    """(reset, level) -> an environment that has just begun so in every world."""
+
+    def begin(reset, *levels):
+        begin_by(other_env, reset)
+        set_levels(other_env, *(levels or TASK.levels))
+        other_env.reset()
+        return other_env
+
+    return begin
 
 
 def within(values, lower, upper, reach=0.02):
@@ -152,11 +185,11 @@ def test_no_state_collides_and_paws_are_not_under_the_ground(drawn):
     assert np.abs(q[:, MOTOR_Q[::3]]).max() <= 15.0 * DEG + 1e-4
 
 
-def test_draws_that_collide_are_drawn_again():
+def test_draws_that_collide_are_drawn_again(begun):
     # bases so low that shanks lie on the ground, and thighs so far in that they meet
     level = Level((0.0, 0.0, 0.5), (0.0, 0.0, 0.6), (0.10, 0.30))
     for reset in (only("standing"), only("in_flight", flight_transversal=(-30.0, 60.0))):
-        env = make_env(1024, reset=reset, task=dataclasses.replace(TASK, levels=(level,)))
+        env = begun(reset, level)
         assert not collision_flags(env).any()
         assert np.mean(env.task_arrays()["scheme"] == SCHEMES.index("default")) < 0.5
 
@@ -176,9 +209,8 @@ def test_loops_are_closed():
 
 
 @pytest.mark.parametrize("scheme", ["standing", "in_flight", "touchdown", "landed"])
-def test_the_default_pose_rarely_stands_in(scheme):
-    level = Level((0.0, 0.0, 0.45), (0.0, 0.0, 1.2), (0.22, 0.45))
-    env = make_env(N, reset=only(scheme), task=dataclasses.replace(TASK, levels=(level,)))
+def test_the_default_pose_rarely_stands_in(begun, scheme):
+    env = begun(only(scheme), Level((0.0, 0.0, 0.45), (0.0, 0.0, 1.2), (0.22, 0.45)))
     assert np.mean(env.task_arrays()["scheme"] == SCHEMES.index("default")) < 0.005
 
 
@@ -190,8 +222,8 @@ def test_a_state_that_cannot_be_reached_becomes_the_default_pose():
     np.testing.assert_array_equal(env.sim.joint_q(), env.sim.model.joint_q.numpy().reshape(16, -1))
 
 
-def test_heading_and_forward_pitch():
-    env = make_env(N, reset=only("standing", heading=180.0, forward_pitch=10.0))
+def test_heading_and_forward_pitch(begun):
+    env = begun(only("standing", heading=180.0, forward_pitch=10.0))
     angles = euler(env.sim.joint_q()[:, 3:7].astype(float))
     # a mean from 0 to 10 degrees, and 5 degrees to either side of it
     assert within(angles[:, 1], -5.0 * DEG, 15.0 * DEG, 0.05)
@@ -206,17 +238,18 @@ def test_heading_and_forward_pitch():
     assert np.abs((turn + np.pi) % (2.0 * np.pi) - np.pi).max() < 8.0 * DEG
 
 
-def test_worlds_past_the_last_level_draw_a_level_each_time():
-    env = make_env(N)
+def test_worlds_past_the_last_level_draw_a_level_each_time(begun):
+    env = begun(ResetCfg())
     edit_episodes(env, level=len(TASK.levels))
     env.reset()
-    goals = env.task_arrays()["goal"][:, 2]
+    goals, levels = env.task_arrays()["goal"][:, 2], set(env.task_arrays()["level"])
+    edit_episodes(env, level=0)
     lower, upper = [np.array([getattr(level, end)[2] for level in TASK.levels]) for end in ("goal_lower", "goal_upper")]
     cuts = np.linspace(0.4, 1.3, 19)
     expected = sum(np.clip((cuts - a) / (b - a), 0.0, 1.0) for a, b in zip(lower, upper, strict=True)) / len(lower)
     found = np.mean(goals[:, None] < cuts, axis=0)
     assert np.abs(found - expected).max() < 4.0 * np.sqrt(0.25 / N)
-    assert set(env.task_arrays()["level"]) == {len(TASK.levels)}
+    assert levels == {len(TASK.levels)}
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,300 @@
+"""What an environment takes from outside, and what it refuses in one line, as it stands."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+import torch
+from jump_helpers import edit_episodes, make_env, only, random_actions
+
+from jumper_warp.envs.env import Env
+from jumper_warp.evaluation.jumps import jump_commands
+from jumper_warp.registry import make_task
+from kernels.jump.state import LANDED, STANCE
+
+N = 8
+TASK = make_task("vertical-jump")
+REST = torch.zeros((N, 12))
+NAN, INF = math.nan, math.inf
+
+
+@pytest.fixture(scope="module")
+def env():
+    """Standing starts, nominal, without noise."""
+    return make_env(N, reset=only("default"))
+
+
+def refused(env, message, call, *arguments):
+    """Whether a call raises one line that matches, and leaves the environment as it was."""
+    before = env.state_dict()
+    with pytest.raises(ValueError, match=message) as caught:
+        call(*arguments)
+    assert "\n" not in str(caught.value)
+    after = env.state_dict()
+    assert all(torch.equal(value, after[name]) for name, value in before.items() if value.dtype.is_floating_point)
+
+
+# ---------------------------------------------------------------- actions
+
+
+@pytest.mark.parametrize(
+    ("action", "message"),
+    [
+        (torch.tensor(0.0), r"shape \(8, 12\), got \(\)"),
+        (torch.zeros(12), r"shape \(8, 12\), got \(12,\)"),
+        (torch.zeros((1, 12)), r"shape \(8, 12\), got \(1, 12\)"),
+        (torch.zeros((N, 1)), r"shape \(8, 12\), got \(8, 1\)"),
+        (torch.zeros((N + 1, 12)), r"shape \(8, 12\), got \(9, 12\)"),
+        (torch.zeros((12, N)), r"shape \(8, 12\), got \(12, 8\)"),
+        (torch.zeros((1, N, 12)), r"shape \(8, 12\), got \(1, 8, 12\)"),
+        (torch.zeros((N, 12), dtype=torch.int64), "floating-point numbers, got torch.int64"),
+        (torch.zeros((N, 12), dtype=torch.bool), "floating-point numbers, got torch.bool"),
+        (torch.zeros((N, 12), device="meta"), "on cpu, got meta"),
+        (np.zeros((N, 12), dtype=np.float32), "torch tensor, got ndarray"),
+        ([[0.0] * 12] * N, "torch tensor, got list"),
+        (None, "torch tensor, got NoneType"),
+    ],
+    ids=lambda value: value[:40] if isinstance(value, str) else "",
+)
+def test_an_action_that_is_none_is_refused(env, action, message):
+    refused(env, "an action must .*" + message, env.step, action)
+
+
+@pytest.mark.parametrize("kind", [torch.float64, torch.float16])
+def test_an_action_may_be_of_any_precision(kind):
+    one, other = (make_env(N, reset=only("default")) for _ in range(2))
+    action = torch.full((N, 12), 0.25)
+    one.step(action)
+    other.step(action.to(kind))
+    assert torch.equal(one.obs, other.obs)
+
+
+def test_an_action_may_carry_a_gradient_that_ends_here(env):
+    action = torch.zeros((N, 12), requires_grad=True)
+    for _ in range(2):
+        step = env.step(action * 2.0)
+    assert not (step.reward.requires_grad or env.obs.requires_grad or env.action.requires_grad)
+    assert all(not obs.requires_grad for obs in step.obs.values())
+
+
+def test_an_action_is_not_written_to(env):
+    action = 3.0 * random_actions(N, 1)[0]
+    kept = action.clone()
+    env.step(action)
+    assert torch.equal(action, kept)
+
+
+# ---------------------------------------------------------------- what a step gives
+
+
+def test_a_step_gives_the_tensors_of_the_environment():
+    """Views, rewritten in place, that agree with each other."""
+    env = make_env(N, noise=True, randomize=True, seed=3)
+    obs, extras = env.reset()
+    assert obs["policy"] is env.obs and obs["critic"] is env.critic_obs and extras == {}
+    kept, ends = None, torch.zeros(2)
+    for action in random_actions(N, 200):
+        step = env.step(action)
+        assert kept is None or all(a is b for a, b in zip(step, kept, strict=True))
+        kept = step
+        assert step.obs["policy"] is env.obs and step.extras["final_obs"]["critic"] is env.final_critic_obs
+        assert step.reward is env.reward and step.extras["time_outs"] is env.timeout
+        assert step.terminated.dtype == step.truncated.dtype == torch.bool
+        assert torch.equal(step.truncated, env.timeout == 1.0)
+        assert torch.equal(step.terminated, (env.done == 1.0) & (env.timeout == 0.0))
+        ends += torch.stack([step.terminated.sum(), step.truncated.sum()])
+        edit_episodes(env, 0, phase=LANDED, phase_steps=59)
+    assert (ends > 5).all()
+
+
+# ---------------------------------------------------------------- commands
+
+WRONG_COMMANDS = [
+    (np.zeros((3, 4)), r"commands must have shape \(8, 1 to 4\), got \(3, 4\)"),
+    (np.zeros(N), r"got \(8,\)"),
+    (np.zeros((N, 5)), r"got \(8, 5\)"),
+    (np.zeros((N, 0)), r"got \(8, 0\)"),
+    (np.zeros((1, N, 3)), r"got \(1, 8, 3\)"),
+    (0.5, r"got \(\)"),
+    (torch.zeros((3, 3)), r"got \(3, 3\)"),
+    (np.full((N, 3), NAN), "commands must be finite"),
+    (torch.full((N, 3), INF), "commands must be finite"),
+    ([[0.0], [0.0, 1.0]], "commands must be an array of numbers, got list"),
+    ("up", "commands must be an array of numbers, got str"),
+]
+WRONG_WORLDS = [
+    (np.zeros(3, dtype=bool), r"worlds must be bool of shape \(8,\), got bool of shape \(3,\)"),
+    (np.zeros((N, 1), dtype=bool), r"got bool of shape \(8, 1\)"),
+    (np.zeros(N), "got float64"),
+    (torch.zeros(N), "got float32"),
+    (np.arange(2), "got int64"),
+    (True, r"got bool of shape \(\)"),
+]
+WRONG_HEADINGS = [
+    (np.zeros(3), r"headings must have shape \(8,\), got \(3,\)"),
+    (np.zeros((N, 1)), r"headings must have shape \(8,\), got \(8, 1\)"),
+    (NAN, "headings must be finite"),
+    (np.full(N, INF), "headings must be finite"),
+    ("north", "headings must be an array of numbers, got str"),
+]
+
+
+@pytest.mark.parametrize(("commands", "message"), WRONG_COMMANDS)
+def test_commands_that_are_none_are_refused(env, commands, message):
+    refused(env, message, env.evaluation_reset, commands)
+    refused(env, message, env.command, commands)
+
+
+@pytest.mark.parametrize(("worlds", "message"), WRONG_WORLDS)
+def test_worlds_that_are_none_are_refused(env, worlds, message):
+    commands = np.zeros((N, 3))
+    refused(env, message, env.evaluation_reset, commands, 0.0, worlds)
+    refused(env, message, env.command, commands, worlds)
+    refused(env, message, env.request, 0, worlds)
+
+
+@pytest.mark.parametrize(("headings", "message"), WRONG_HEADINGS)
+def test_headings_that_are_none_are_refused(env, headings, message):
+    refused(env, message, env.evaluation_reset, np.zeros((N, 3)), headings)
+
+
+def test_what_was_refused_leaves_episodes_ending_as_before(env):
+    env.reset()
+    with pytest.raises(ValueError, match="headings"):
+        env.evaluation_reset(np.zeros((N, 3)), NAN)
+    edit_episodes(env, 0, phase=LANDED, phase_steps=59)
+    env.step(REST)
+    assert env.done[0] == 1.0 and env.task_arrays()["steps"].tolist() == [0] + [1] * (N - 1)
+
+
+@pytest.mark.parametrize("kind", [np.asarray, torch.as_tensor, list])
+def test_commands_may_come_in_any_container(kind):
+    env = make_env(N, reset=only("default"))
+    heights, headings = np.linspace(0.5, 0.9, N), np.linspace(-1.0, 1.0, N)
+    chosen = np.arange(N) % 2 == 0
+    commands = np.stack([np.zeros(N), np.zeros(N), heights, np.arange(N)], axis=1)
+    env.evaluation_reset(kind(commands), kind(headings), kind(chosen))
+    found = env.task_arrays()
+    np.testing.assert_allclose(found["goal"][chosen, 2], heights[chosen], rtol=1e-6)
+    np.testing.assert_allclose(found["heading"][chosen], headings[chosen], rtol=1e-6)
+    np.testing.assert_array_equal(found["command_step"][chosen], np.arange(N)[chosen])
+    assert (found["goal"][~chosen, 2] != heights[~chosen]).all()
+
+
+# ---------------------------------------------------------------- evaluation and training
+
+
+def test_an_evaluation_ends_no_episode_until_reset():
+    """In the environment that a training goes on with: its episodes end again, in the same launches as before."""
+    env = make_env(N, reset=only("default"))
+    for begin, ends in ((env.reset, True), (None, False), (env.reset, True), (None, False)):
+        if begin is None:
+            env.evaluation_reset(jump_commands(np.tile([0.0, 0.0, 0.7], (N, 1)), 10.0, env.step_dt))
+        else:
+            begin()
+        edit_episodes(env, 0, phase=LANDED, phase_steps=59, command_step=1000)
+        env.step(REST)
+        found = env.task_arrays()
+        assert env.done[0] == 1.0 and found["steps"][0] == (0 if ends else 1)
+        assert found["phase"][0] == (STANCE if ends else LANDED)
+    assert set(env._graphs) == {True, False}
+
+
+def test_an_environment_that_begins_nothing_by_itself_never_does():
+    env = make_env(N, reset=only("default"), auto_reset=False)
+    edit_episodes(env, 0, phase=LANDED, phase_steps=59)
+    for steps in (1, 2):
+        env.step(REST)
+        assert env.done[0] == 1.0 and env.task_arrays()["steps"][0] == steps
+
+
+def test_a_part_of_the_worlds_may_be_evaluated_anew():
+    env = make_env(N, reset=only("default"))
+    for action in random_actions(N, 5):
+        env.step(action)
+    chosen = np.arange(N) < 3
+    before, obs = env.sim.joint_q().copy(), env.obs.clone()
+    env.evaluation_reset(np.tile([0.0, 0.0, 0.7], (N, 1)), worlds=chosen)
+    np.testing.assert_array_equal(env.sim.joint_q()[~chosen], before[~chosen])
+    assert torch.equal(env.obs[~chosen], obs[~chosen])
+    steps = env.task_arrays()["steps"]
+    assert not steps[chosen].any() and (steps[~chosen] == 5).all()
+    standing = env.sim.model.joint_q.numpy().reshape(N, -1)
+    np.testing.assert_array_equal(env.sim.joint_q()[chosen], standing[chosen])
+
+
+# ---------------------------------------------------------------- making one
+
+
+@pytest.mark.parametrize("device", [torch.device("cpu"), "cpu"])
+def test_a_device_may_be_one_of_torch(device):
+    env = Env(TASK, 2, device=device)
+    env.reset()
+    env.step(torch.zeros((2, 12)))
+    assert env.device == torch.device("cpu") and env.obs.device == env.device
+
+
+@pytest.mark.parametrize(
+    ("task", "message"),
+    [
+        ("vertical-jump", "a TaskCfg, as make_task returns for a name, got 'vertical-jump'"),
+        (["vertical-jump"], "a TaskCfg, as make_task returns for a name, got 'vertical-jump'"),
+        (None, "a TaskCfg, as make_task returns for a name, got None"),
+        (make_task, "got <function make_task"),
+        ([TASK, 3], "got 3"),
+        ((), "at least one task"),
+    ],
+)
+def test_a_task_that_is_none_is_refused_at_once(task, message):
+    with pytest.raises(ValueError, match=message) as caught:
+        Env(task, 4)
+    assert "\n" not in str(caught.value)
+
+
+def test_the_first_step_needs_a_reset():
+    env = Env(TASK, 2, device="cpu")
+    with pytest.raises(RuntimeError, match="call reset before the first step"):
+        env.step(torch.zeros((2, 12)))
+    env.reset()
+    env.step(torch.zeros((2, 12)))
+    measured = Env(TASK, 2, device="cpu")
+    measured.evaluation_reset(np.zeros((2, 3)))
+    measured.step(torch.zeros((2, 12)))
+    loaded = Env(TASK, 2, device="cpu")
+    loaded.load_state_dict(env.state_dict())
+    loaded.step(torch.zeros((2, 12)))
+
+
+# ---------------------------------------------------------------- numbers of terms while it runs
+
+
+def test_a_number_of_a_term_may_change_in_captured_steps():
+    rows = tuple(term for term in TASK.rewards if term.name in ("orientation", "action_rate"))
+    env = make_env(N, task=dataclasses.replace(TASK, rewards=rows), reset=only("default"))
+    edit_episodes(env, command_step=1000)
+    for _ in range(3):
+        env.step(REST)
+    before = env.skills[0].term_value.numpy().copy()
+    env.skills[0].set("rewards", "orientation", weight=2.0 * rows[0].weight)
+    env.step(REST)
+    np.testing.assert_allclose(env.skills[0].term_value.numpy()[0], 2.0 * before[0], rtol=1e-3)
+    env.skills[0].set("terminations", "low_base", height=10.0)
+    env.step(REST)
+    assert env.done.all() and [TASK.terminations[i].name for i in env.worlds.ending.numpy()] == ["low_base"] * N
+
+
+@pytest.mark.parametrize(
+    ("section", "name", "numbers", "message"),
+    [
+        ("rewards", "orientation", {"weight": NAN}, "orientation: weight must be finite, got nan"),
+        ("rewards", "orientation", {"depth": 1.0}, "no 'depth' of a rewards term 'orientation'"),
+        ("rewards", "levitation", {"weight": 1.0}, "no 'weight' of a rewards term 'levitation'"),
+        ("prizes", "orientation", {"weight": 1.0}, "no 'weight' of a prizes term 'orientation'"),
+    ],
+)
+def test_a_number_that_is_none_is_refused(env, section, name, numbers, message):
+    before = env.skills[0].numbers.numpy().copy()
+    with pytest.raises(ValueError, match=message):
+        env.skills[0].set(section, name, **numbers)
+    np.testing.assert_array_equal(env.skills[0].numbers.numpy(), before)
