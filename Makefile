@@ -1,7 +1,7 @@
 # make demo   the open-loop jump, then 200 vertical and 200 horizontal jumps of the shipped policies: figures, plots and
 #             recordings in outputs/demo
-# make test   all tests
-# make lint   style and format
+# make test   all tests, and the import rules
+# make lint   style, format and import rules
 # Each makes .venv/ first if it is missing or older than pyproject.toml or constraints.txt.
 
 PYTHON ?= python3
@@ -17,11 +17,13 @@ demo: $(STAMP)
 	$(VENV)/bin/python experiments/horizontal_jump_sweep.py --out outputs/demo/horizontal_jump
 
 test: $(STAMP)
+	$(VENV)/bin/lint-imports --no-logo
 	$(VENV)/bin/python -m pytest
 
 lint: $(STAMP)
 	$(VENV)/bin/ruff check .
 	$(VENV)/bin/ruff format --check .
+	$(VENV)/bin/lint-imports --no-logo
 
 clean:
 	rm -rf $(VENV)

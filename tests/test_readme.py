@@ -9,7 +9,7 @@ README = Path(__file__).parents[1] / "README.md"
 def test_examples_of_the_readme_run_and_the_robot_squats(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     examples = re.findall(r"```python\n(.*?)```", README.read_text(encoding="utf-8"), re.DOTALL)
-    assert len(examples) == 2
+    assert len(examples) == 4
     names = {}
     for example in examples:
         exec(example, names)
@@ -20,6 +20,8 @@ def test_examples_of_the_readme_run_and_the_robot_squats(tmp_path, monkeypatch):
     # ankle 0.272 m and paw 0.297 m below. (A little less is borne by the motors: shanks and paws rest on the ground.)
     assert height[-1] == pytest.approx(0.297, abs=0.02)
     assert (tmp_path / "squat.rrd").stat().st_size > 0
+    assert names["step"].reward.shape == (64,)
+    assert names["gradient"].shape == (10, 12, 1) and abs(names["gradient"]).max() > 1.0e-4
 
 
 def test_linked_files_exist():

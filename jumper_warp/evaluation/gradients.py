@@ -12,7 +12,7 @@ import math
 import numpy as np
 import warp as wp
 
-from jumper_warp.optim.rollout import DifferentiableRollout, Rollout
+from jumper_warp.optim.rollout import DifferentiableRollout, Trajectory
 from jumper_warp.robot.description import load_description
 from jumper_warp.robot.model import build_model, standing_configuration
 from jumper_warp.robot.motors import jumping_motors, vertical_jump_filter
@@ -54,7 +54,7 @@ class GradientJump:
         self.values = {"targets": schedule(PUSH), "q": q, "qd": np.zeros(38)}
         self.values |= {name: array.numpy()[:, 0].astype(float) for name, array in self._parameters.items()}
 
-    def run(self, inputs: dict[str, np.ndarray], pack: bool = False) -> tuple[dict[str, wp.array], Rollout]:
+    def run(self, inputs: dict[str, np.ndarray], pack: bool = False) -> tuple[dict[str, wp.array], Trajectory]:
         """Simulate. Inputs have the world as first axis where they differ; pack: read masses from the model first."""
         full = {}
         for name, value in (self.values | inputs).items():
@@ -69,7 +69,7 @@ class GradientJump:
             self.rollout.dynamics.pack_masses()
         return arrays, self.rollout.run(arrays["targets"], arrays["q"], arrays["qd"])
 
-    def gradients(self, inputs: dict[str, np.ndarray], pack: bool = False) -> tuple[Rollout, dict[str, np.ndarray]]:
+    def gradients(self, inputs: dict[str, np.ndarray], pack: bool = False) -> tuple[Trajectory, dict[str, np.ndarray]]:
         """Return a jump in one world and the gradients of its apex; with `pack` also that of the bodies' mass."""
         with wp.Tape() as tape:
             arrays, rollout = self.run(inputs, pack)
@@ -110,7 +110,7 @@ def mass_directions(jump: GradientJump) -> np.ndarray:
     return directions
 
 
-def check(device: str | None) -> tuple[Rollout, dict[str, tuple[np.ndarray, np.ndarray]]]:
+def check(device: str | None) -> tuple[Trajectory, dict[str, tuple[np.ndarray, np.ndarray]]]:
     """Return the jump, and by input the gradient of its apex beside the differences."""
     jump = GradientJump(1, double=True, device=device)
     rollout, grads = jump.gradients({})

@@ -109,7 +109,7 @@ def _ballistic_kernel(
 
 
 @dataclass(frozen=True)
-class Rollout:
+class Trajectory:
     """What a rollout of K physics steps left behind; all arrays but the integer ones carry gradients."""
 
     joint_q: list[wp.array]
@@ -193,7 +193,7 @@ class DifferentiableRollout:
         self._step = DifferentiableStep(self.dynamics, MAX_SWEEPS, TOLERANCE_DOUBLE if double else TOLERANCE)
         self._no_body_f = wp.zeros(model.body_count, dtype=wp.spatial_vector, device=model.device, requires_grad=True)
 
-    def run(self, targets: wp.array, joint_q: wp.array, joint_qd: wp.array) -> Rollout:
+    def run(self, targets: wp.array, joint_q: wp.array, joint_qd: wp.array) -> Trajectory:
         """Simulate, starting without contact history.
 
         Args:
@@ -221,7 +221,7 @@ class DifferentiableRollout:
             qd.append(new_qd)
             self._launch(_base_motion_kernel, self.num_worlds, [new_q, new_qd, step + 1], [height, speed])
             self._launch(_touch_kernel, self.num_worlds, [work.impulse, step + 1], [touching], record=False)
-        return Rollout(q, qd, height, speed, touching, *self._apexes(height, speed, touching))
+        return Trajectory(q, qd, height, speed, touching, *self._apexes(height, speed, touching))
 
     def _check(self, targets: wp.array, joint_q: wp.array, joint_qd: wp.array) -> None:
         """Raise ValueError unless the arguments of `run` fit."""
@@ -252,7 +252,7 @@ class DifferentiableRollout:
         self._step.step(q, qd, joint_f, self._no_body_f, q_out, qd_out, self.dt)
 
     def _apexes(self, height: wp.array, speed: wp.array, touching: wp.array) -> tuple[wp.array, ...]:
-        """Return the last four fields of `Rollout`."""
+        """Return the last four fields of `Trajectory`."""
         n, device = self.num_worlds, self.dynamics.device
         apex_row, takeoff_row = (wp.zeros(n, dtype=int, device=device) for _ in range(2))
         self._launch(_find_apex_kernel, n, [height, touching], [apex_row, takeoff_row], record=False)

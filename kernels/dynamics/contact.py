@@ -76,7 +76,7 @@ def contact_jacobian(paw: PawKinematics, arm: vec3) -> mat33:
 
 
 @wp.func
-def goal_velocity(gap: real, dt: real) -> real:
+def target_normal_velocity(gap: real, dt: real) -> real:
     """Return the smallest admissible normal velocity [m/s] for a gap [m]: close it exactly, push penetration out."""
     if gap > real(0.0):
         return -gap / dt

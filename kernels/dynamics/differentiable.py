@@ -29,7 +29,7 @@ from .base_dynamics import (
     solve_lin,
 )
 from .base_motion import external_wrench, moved_base
-from .contact import SEPARATE, SLIDE, contact_jacobian, goal_velocity
+from .contact import SEPARATE, SLIDE, contact_jacobian, target_normal_velocity
 from .inertia import inertia_matrix, skew
 from .leg_dynamics import PawKinematics, leg_dynamics, leg_five_bar, paw_kinematics
 from .parameters import load_joint_params, load_masses, load_moments, load_vec3
@@ -307,7 +307,7 @@ def residual_kernel(
     )
     mu = table[mu_row[k, world], world]
     residual[k, world] = contact_residual(
-        impulse[k, world], velocity, normal, goal_velocity(gap, dt), mu, mode[k, world]
+        impulse[k, world], velocity, normal, target_normal_velocity(gap, dt), mu, mode[k, world]
     )
 
 

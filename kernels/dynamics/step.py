@@ -30,7 +30,7 @@ from .contact import (
     PawContact,
     contact_jacobian,
     couple_contact,
-    goal_velocity,
+    target_normal_velocity,
 )
 from .leg_dynamics import PawKinematics, leg_dynamics, leg_five_bar, paw_kinematics
 from .parameters import load_joint_params, load_masses, load_moments
@@ -140,7 +140,7 @@ def paw_contact(
     if gap + dt * wp.min(wp.dot(contact.free - touch.velocity, normal), real(0.0)) > CONTACT_MARGIN:
         return contact
     contact.active = 1
-    contact.goal = goal_velocity(gap, dt)
+    contact.goal = target_normal_velocity(gap, dt)
     contact.impulse = wp.quat_rotate_inv(base.quat, impulse)
     before = wp.quat_rotate_inv(base.quat, base.lin) + wp.cross(base.ang, point) + contact.jacobian * old_rates
     slip = before - touch.velocity

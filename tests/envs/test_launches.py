@@ -63,7 +63,7 @@ CASES = {
     "randomised": ((JUMP,), {}, 13),
     # events in every step
     "pushed": ((WALKING,), {}, 14),
-    # the second skill's: events, packing, events in every step; step, observe, reset, observe
+    # of the second skill: events in every step, step, 2 to observe; then events, packing, reset, 2 to observe
     "two skills": ((JUMP, HOLD), {}, 22),
 }
 """Tasks, settings and number of launches."""

@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 import warp as wp
 
-from jumper_warp.optim.rollout import DifferentiableRollout, Rollout
+from jumper_warp.optim.rollout import DifferentiableRollout, Trajectory
 from jumper_warp.robot.description import load_description
 from jumper_warp.robot.model import build_model, standing_configuration
 from jumper_warp.robot.motors import jumping_motors, vertical_jump_filter
@@ -35,23 +35,23 @@ MOTOR_DOFS = [6 + 5 * leg + j for leg in range(4) for j in (0, 1, 3)]
 BASE_ROW = int(BASE)
 MU_ROWS = [leg * int(LEG_ROWS) + int(row) for leg in range(4) for row in (MU_DYNAMIC, MU_STATIC)]
 
-Loss = Callable[[Rollout], tuple[wp.array, int]]
+Loss = Callable[[Trajectory], tuple[wp.array, int]]
 """Picks an array of the rollout and, of its entries for one world, the one to differentiate."""
 
 
-def apex(rollout: Rollout):
+def apex(rollout: Trajectory):
     return rollout.apex, 0
 
 
-def ballistic_apex(rollout: Rollout):
+def ballistic_apex(rollout: Trajectory):
     return rollout.ballistic_apex, 0
 
 
-def final_height(rollout: Rollout):
+def final_height(rollout: Trajectory):
     return rollout.joint_q[-1], 2
 
 
-def final_forward_speed(rollout: Rollout):
+def final_forward_speed(rollout: Trajectory):
     return rollout.joint_qd[-1], 0
 
 
@@ -85,7 +85,7 @@ class Jump:
             name: array.numpy()[:, 0].astype(float) for name, array in self.parameters.items()
         }
 
-    def run(self, changes: dict[str, np.ndarray], pack: Callable[[], None] | None = None) -> tuple[dict, Rollout]:
+    def run(self, changes: dict[str, np.ndarray], pack: Callable[[], None] | None = None) -> tuple[dict, Trajectory]:
         """Run with arrays (num_worlds, ...) or (...) in place of the standard values.
 
         Returns the input arrays and the rollout. pack: reads parameters from the model first.

@@ -23,15 +23,8 @@ ROBOTS = 200
 
 def make_leg_kernel(package):
     """Return a kernel that evaluates the functions of one leg at given joint angles."""
-    five_bar, geometry, scalar, leg_kinematics = (
-        importlib.import_module(f"{package}.{name}")
-        for name in (
-            "kinematics.five_bar",
-            "kinematics.geometry",
-            "scalar",
-            "kinematics.leg",
-        )
-    )
+    names = ("kinematics.five_bar", "kinematics.geometry", "scalar", "kinematics.leg")
+    five_bar, geometry, scalar, leg_kinematics = (importlib.import_module(f"{package}.{name}") for name in names)
     real, vec2, vec3 = scalar.real, scalar.vec2, scalar.vec3
 
     @wp.kernel(module="unique", enable_backward=False)
