@@ -32,11 +32,11 @@ from jumper_warp.tasks.cfg import Handover, TaskCfg
 from jumper_warp.tasks.interface import interface
 from jumper_warp.tasks.saving import task_to_json
 from jumper_warp.utils.errors import InputError
-from kernels.mdp.actions import action_kernel, begin_step_kernel
+from kernels.mdp.actions import action_kernel
 from kernels.mdp.env import SkillSettings
 from kernels.mdp.events import AT_RESET, AT_STEP, STARTUP
 from kernels.mdp.handover import make_handover_kernel
-from kernels.mdp.observe import condition_kernel
+from kernels.mdp.observe import LANES, condition_kernel
 from kernels.mdp.parameters import motors_kernel
 from kernels.mdp.reset import forget_kernel, stand_kernel, tick_kernel
 from kernels.mdp.track import track_kernel
@@ -197,9 +197,8 @@ class Env:
 
     def _act(self) -> None:
         n, robot, env, settings = self.num_envs, self.robot, self.worlds, self._settings
-        counters, delays, push = self.skills[0].counters, self.delays, self.parameters.push
-        self._launch(action_kernel, (n, 4), [self._action, settings, push, robot, env, counters, delays])
-        self._launch(begin_step_kernel, n, [settings, push, robot, env, counters])
+        delays, push = self.delays, self.parameters.push
+        self._launch(action_kernel, (n, 4), [self._action, settings, push, robot, env, delays])
         self._events(AT_STEP, self._all)
 
     def _advance(self) -> None:
@@ -283,7 +282,7 @@ class Env:
                  skill.numbers, beginning, arrays.raw],
             )  # fmt: skip
             inputs = [skill.index, self.worlds, skill.columns, skill.numbers, beginning, arrays]
-            wp.launch(condition_kernel, arrays.raw.shape, inputs, device=self.wp_device)
+            wp.launch(condition_kernel, (self.num_envs, int(LANES)), inputs, device=self.wp_device)
 
     def _launch(self, kernel: wp.Kernel, dim: int | tuple[int, ...], inputs: list) -> None:
         # small blocks spread a few thousand heavy threads over all multiprocessors

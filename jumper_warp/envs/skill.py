@@ -72,7 +72,7 @@ class Skill:
         self.columns = wp.array(np.array(columns, dtype=Column.numpy_dtype()), dtype=Column, device=self.device)
         self.num_chunks = -(-sum(len(task.rows[group]) for group in task.groups) // CHUNK)
         arrays = ObservationArrays()
-        arrays.raw = wp.zeros((n, len(columns)), dtype=float, device=self.device)
+        arrays.raw = wp.zeros((len(columns), n), dtype=float, device=self.device)
         arrays.now = wp.zeros(start, dtype=float, device=self.device)
         arrays.final = wp.zeros(start, dtype=float, device=self.device)
         arrays.past = wp.zeros((RING, n, max(past, 1)), dtype=float, device=self.device)

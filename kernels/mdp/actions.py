@@ -4,28 +4,24 @@ import warp as wp
 
 from ..actuation.command_filter import filter_leg
 from ..layout import BODIES, COORDS, DOFS
-from .env import Counters, Delays, EnvArrays, SkillSettings
+from .env import Delays, EnvArrays, SkillSettings
 from .view import RobotArrays, base_quat, base_velocity
 
 wp.set_module_options({"enable_backward": False})
 
 
 @wp.func
-def remember(
-    robot: RobotArrays, env: EnvArrays, push: wp.array(dtype=wp.spatial_vector), skill: SkillSettings, world: int
-):
-    """Begin a world's policy step: keep the base's velocity, apply its push, move its clock on."""
+def remember(robot: RobotArrays, push: wp.array(dtype=wp.spatial_vector), push_in_flight: int, world: int):
+    """Begin a world's policy step: keep the base's velocity, apply its push."""
     robot.old_lin_vel[world] = base_velocity(robot, world, base_quat(robot, world))
-    grounded = skill.push_in_flight
+    pushed = push_in_flight
     for k in range(4):
         if robot.contact_time[k, world] > 0.0:
-            grounded = int(1)
+            pushed = int(1)
     wrench = wp.spatial_vector()
-    if grounded != 0:
+    if pushed != 0:
         wrench = push[world]
     robot.body_f[world * BODIES] = wrench
-    env.clock[world] = env.clock[world] + 1
-    env.fresh[world] = 0
 
 
 @wp.func
@@ -48,7 +44,6 @@ def action_kernel(
     # in, out
     robot: RobotArrays,
     env: EnvArrays,
-    counters: Counters,
     delays: Delays,
 ):
     """Clamp, scale and filter the action (skills, num_worlds, 12) of each world's skill; one thread per (world, leg).
@@ -83,19 +78,5 @@ def action_kernel(
         robot.safe_target[m, world] = safe[j]
         delays.past_target[clock % delays.past_target.shape[0], m, world] = safe[j]
         delayed(delays, clock, world, m)
-
-
-@wp.kernel
-def begin_step_kernel(
-    # in
-    skills: wp.array(dtype=SkillSettings),
-    push: wp.array(dtype=wp.spatial_vector),
-    # in, out
-    robot: RobotArrays,
-    env: EnvArrays,
-    counters: Counters,
-):
-    """Begin every world's policy step, after its action is known; one thread per world."""
-    world = wp.tid()
-    remember(robot, env, push, skills[env.skill[world]], world)
-    counters.bad_actions[world] = counters.bad_actions[world] + env.bad_action[world]
+    if leg == 0:
+        remember(robot, push, skill.push_in_flight, world)

@@ -43,7 +43,7 @@ def make_event_kernel(rows: list) -> wp.Kernel:
             return
         for i in range(wp.static(len(rows))):
             if row == i:
-                draw = make_draw(env.seed, world, env.clock[world], EVENT + i)
+                draw = make_draw(env.seed, world, env.clock[world], EVENT + 100 * stage + i)
                 due = stage == wp.static(modes[i])
                 if wp.static(modes[i] == AT_STEP):
                     left = timer[i, world] - 1

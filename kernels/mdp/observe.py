@@ -14,13 +14,15 @@ wp.set_module_options({"enable_backward": False})
 
 CHUNK = 12
 """Terms that one thread evaluates: each chunk loads the robot once, and chunks run side by side."""
+LANES = wp.constant(32)
+"""Threads that share the components of a world: a warp writes neighbouring columns."""
 
 
 @wp.struct
 class Column:
     """Where a component of an observation term comes from and stands in the rows of its group."""
 
-    raw: int  # its place in the row of raw values
+    raw: int  # its row among the raw values
     group: int
     start: int  # of the group's rows
     stride: int  # columns of the group
@@ -36,7 +38,7 @@ class Column:
 class ObservationArrays:
     """Observations of all worlds, one row a world, one group after the other."""
 
-    raw: wp.array2d(dtype=float)  # (num_worlds, components) what the terms gave
+    raw: wp.array2d(dtype=float)  # (components, num_worlds) what the terms gave
     now: wp.array(dtype=float)  # of the next step; an ended episode has begun anew
     final: wp.array(dtype=float)  # the same before that new beginning
     past: wp.array3d(dtype=float)  # (depth, num_worlds, columns) what sensors gave, a ring over policy steps
@@ -45,16 +47,16 @@ class ObservationArrays:
 
 
 @wp.func
-def store(value: float, world: int, column: int, out: wp.array2d(dtype=float)):
+def store(value: float, row: int, world: int, out: wp.array2d(dtype=float)):
     """Write a number."""
-    out[world, column] = value
+    out[row, world] = value
 
 
 @wp.func
-def store(value: Any, world: int, column: int, out: wp.array2d(dtype=float)):  # noqa: F811
+def store(value: Any, row: int, world: int, out: wp.array2d(dtype=float)):  # noqa: F811
     """Write a vector."""
     for j in range(len(value)):
-        out[world, column + j] = value[j]
+        out[row + j, world] = value[j]
 
 
 def make_observe_kernel(task: Any) -> wp.Kernel:
@@ -89,16 +91,16 @@ def make_observe_kernel(task: Any) -> wp.Kernel:
                 view = load_view(robot, ground, world)
                 for i in range(wp.static(c * CHUNK), wp.static(min((c + 1) * CHUNK, len(rows)))):
                     if wp.static(of_parameters[i]):
-                        store(wp.static(rows[i].func)(parameters, world), world, wp.static(places[i]), raw)
+                        store(wp.static(rows[i].func)(parameters, world), wp.static(places[i]), world, raw)
                     elif wp.static(rows[i].plain):
-                        store(wp.static(rows[i].func)(view, states[world]), world, wp.static(places[i]), raw)
+                        store(wp.static(rows[i].func)(view, states[world]), wp.static(places[i]), world, raw)
                     else:
                         store(
                             wp.static(rows[i].func)(
                                 view, states[world], *p[wp.static(rows[i].lo) : wp.static(rows[i].hi)]
                             ),
-                            world,
                             wp.static(places[i]),
+                            world,
                             raw,
                         )
 
@@ -129,28 +131,13 @@ def late(arrays: ObservationArrays, clock: int, world: int, column: int, value: 
     return newer + share * (arrays.past[(clock - whole - 1) % depth, world, column] - newer)
 
 
-@wp.kernel
-def condition_kernel(
-    # in
-    skill: int,
-    env: EnvArrays,
-    columns: wp.array(dtype=Column),
-    p: wp.array(dtype=float),
+@wp.func
+def condition(
+    env: EnvArrays, arrays: ObservationArrays, column: Column, p: wp.array(dtype=float), world: int, broken: bool,
     beginning: int,
-    # in, out
-    arrays: ObservationArrays,
-):
-    """Turn raw values into observations; one thread per (world, component).
-
-    Rows of worlds that came apart are 0, history and all, and so is what else is not finite.
-    beginning 1: only where an episode or the skill has just begun, and `final` stays.
-    """
-    world, component = wp.tid()
-    if env.skill[world] != skill or (beginning != 0 and env.fresh[world] == 0):
-        return
-    column = columns[component]
-    broken = env.broken[world] != 0
-    value = or_zero(arrays.raw[world, column.raw], broken)
+):  # fmt: skip
+    """Turn a component's raw value into an observation, behind the frames before."""
+    value = or_zero(arrays.raw[column.raw, world], broken)
     if column.delayed != 0:
         value = late(arrays, env.clock[world], world, column.past, value, env.fresh[world])
     noise = p[column.first]
@@ -170,3 +157,27 @@ def condition_kernel(
     arrays.now[i] = value
     if beginning == 0:
         arrays.final[i] = value
+
+
+@wp.kernel
+def condition_kernel(
+    # in
+    skill: int,
+    env: EnvArrays,
+    columns: wp.array(dtype=Column),
+    p: wp.array(dtype=float),
+    beginning: int,
+    # in, out
+    arrays: ObservationArrays,
+):
+    """Turn raw values into observations; launch over (num_worlds, LANES).
+
+    Rows of worlds that came apart are 0, history and all, and so is what else is not finite.
+    beginning 1: only where an episode or the skill has just begun, and `final` stays.
+    """
+    world, lane = wp.tid()
+    if env.skill[world] != skill or (beginning != 0 and env.fresh[world] == 0):
+        return
+    broken = env.broken[world] != 0
+    for component in range(lane, columns.shape[0], LANES):
+        condition(env, arrays, columns[component], p, world, broken, beginning)

@@ -5,8 +5,8 @@ import warp as wp
 # streams; events and observation groups have one each from these on
 RESET = wp.constant(1)
 COMMAND = wp.constant(2)
-EVENT = wp.constant(100)
-OBSERVATION = wp.constant(200)
+OBSERVATION = wp.constant(100)
+EVENT = wp.constant(1000)  # a hundred for each stage
 
 
 @wp.struct

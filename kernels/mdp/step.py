@@ -111,7 +111,10 @@ def make_step_kernel(task: Any) -> wp.Kernel:
         env.terminated[world] = ending != NOT_ENDED and timeout == 0.0
         env.truncated[world] = timeout != 0.0
         env.broken[world] = wp.where(broken, 1, 0)
+        counters.bad_actions[world] = counters.bad_actions[world] + env.bad_action[world]
         env.bad_action[world] = 0
+        env.clock[world] = env.clock[world] + 1
+        env.fresh[world] = 0
         states[world] = state
         if ending != NOT_ENDED:
             counters.ending_count[ending, world] = counters.ending_count[ending, world] + 1

@@ -56,15 +56,15 @@ def eager_counts(env, monkeypatch, steps=30):
 JUMP, HOLD = make_task("vertical-jump"), hold_height.hold_height()
 WALKING = dataclasses.replace(JUMP, randomization=RandomizationCfg.walking())
 CASES = {
-    # action, begin, physics, track, step, 2 to observe; then reset, forget, 2 to observe what has begun
-    "nominal": ((JUMP,), {"randomize": False, "noise": False}, 11),
-    "measured": ((JUMP,), {"auto_reset": False}, 7),
+    # action, physics, track, step, 2 to observe; then reset, forget, 2 to observe what has begun
+    "nominal": ((JUMP,), {"randomize": False, "noise": False}, 10),
+    "measured": ((JUMP,), {"auto_reset": False}, 6),
     # events, and packing what they drew
-    "randomised": ((JUMP,), {}, 13),
+    "randomised": ((JUMP,), {}, 12),
     # events in every step
-    "pushed": ((WALKING,), {}, 14),
+    "pushed": ((WALKING,), {}, 13),
     # of the second skill: events in every step, step, 2 to observe; then events, packing, reset, 2 to observe
-    "two skills": ((JUMP, HOLD), {}, 22),
+    "two skills": ((JUMP, HOLD), {}, 21),
 }
 """Tasks, settings and number of launches."""
 

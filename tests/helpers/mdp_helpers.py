@@ -7,7 +7,7 @@ import warp as wp
 
 from jumper_warp.envs.arrays import delay_arrays, env_arrays
 from kernels.layout import BODIES, COORDS, DOFS
-from kernels.mdp.observe import condition_kernel
+from kernels.mdp.observe import LANES, condition_kernel
 from kernels.mdp.view import RobotArrays
 
 STEP_DT = 1.0 / 60.0  # [s]
@@ -70,4 +70,4 @@ def observe(skill, robot, parameters, ground, worlds, states, numbers, beginning
     inputs = [skill.index, robot, parameters, ground, worlds, states, numbers, beginning, arrays.raw]
     wp.launch(skill.kernels["observe"], (skill.num_chunks, skill.num_envs), inputs, device="cpu")
     inputs = [skill.index, worlds, skill.columns, numbers, beginning, arrays]
-    wp.launch(condition_kernel, arrays.raw.shape, inputs, device="cpu")
+    wp.launch(condition_kernel, (skill.num_envs, int(LANES)), inputs, device="cpu")

@@ -13,9 +13,10 @@ from jumper_warp.envs.skill import Skill
 from jumper_warp.registry import make_task
 from jumper_warp.robot.motors import LimitsCfg, vertical_jump_filter
 from jumper_warp.tasks.randomization import RandomizationCfg
-from kernels.mdp.actions import action_kernel, begin_step_kernel
+from kernels.mdp.actions import action_kernel
 from kernels.mdp.env import SkillSettings
 from kernels.mdp.parameters import action_latency
+from kernels.mdp.reset import tick_kernel
 
 DEG = np.pi / 180.0
 SCALE = np.tile([15.0, 90.0, 90.0], 4) * DEG
@@ -30,7 +31,7 @@ class Commands:
         """tasks: of the skills, (by default one); delay [physics steps]: of each world."""
         skills = [Skill(task, i, n, STEP_DT, SUBSTEPS, "cpu") for i, task in enumerate(tasks or [probe_task()])]
         self.n, self.robot, self.worlds = n, standing_robots(n), new_worlds(n)
-        self.counters, self.delays = skills[0].counters, no_delays(n, delay)
+        self.delays = no_delays(n, delay)
         self.settings = wp.array([s.settings_of_skill() for s in skills], dtype=SkillSettings, device="cpu")
         self.push = wp.zeros(n, dtype=wp.spatial_vector, device="cpu")
         self.delays.past_target.assign(np.tile(DEFAULT_ANGLE[None, :, None], (8, 1, n)))
@@ -38,9 +39,9 @@ class Commands:
     def act(self, action):
         """Begin a step with an action, (n, 12) or (skills, n, 12)."""
         action = array(np.reshape(action, (-1, self.n, 12)))
-        changed = [self.robot, self.worlds, self.counters]
-        wp.launch(action_kernel, (self.n, 4), [action, self.settings, self.push, *changed, self.delays], device="cpu")
-        wp.launch(begin_step_kernel, self.n, [self.settings, self.push, *changed], device="cpu")
+        inputs = [action, self.settings, self.push, self.robot, self.worlds, self.delays]
+        wp.launch(action_kernel, (self.n, 4), inputs, device="cpu")
+        wp.launch(tick_kernel, self.n, [array(np.ones(self.n)), self.worlds], device="cpu")
 
     def motors(self, name):
         """Return an array of the motors, (n, 12)."""
@@ -113,14 +114,13 @@ def test_targets_are_filtered_by_what_the_sensors_read(offset, safe):
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
-def test_an_action_that_is_not_finite_counts_as_0_and_is_counted_once_a_world(bad):
+def test_an_action_that_is_not_finite_counts_as_0_and_is_told(bad):
     commands, action = Commands(8), random_action(8)
     action[3, 7], action[5] = bad, bad
     commands.act(action)
     expected = np.where(np.isfinite(action), action, 0.0)
     np.testing.assert_array_equal(commands.motors("action"), expected)
     assert commands.worlds.bad_action.numpy().tolist() == [0, 0, 0, 1, 0, 1, 0, 0]
-    assert commands.counters.bad_actions.numpy().tolist() == [0, 0, 0, 1, 0, 1, 0, 0]
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf])
@@ -239,9 +239,9 @@ def test_a_push_acts_on_the_base_while_a_paw_is_down_or_in_the_air_too_where_the
 
 
 def test_a_step_moves_the_clock_on_and_nothing_is_new_any_more():
-    commands = Commands(4)
-    commands.worlds.fresh.fill_(1)
-    clock = commands.worlds.clock.numpy().copy()
-    commands.act(np.zeros((4, 12)))
-    np.testing.assert_array_equal(commands.worlds.clock.numpy(), clock + 1)
-    assert not commands.worlds.fresh.numpy().any()
+    env = make_env(4)
+    env.worlds.fresh.fill_(1)
+    clock = env.worlds.clock.numpy().copy()
+    env.step(torch.zeros(4, 12))
+    np.testing.assert_array_equal(env.worlds.clock.numpy(), clock + 1)
+    assert not env.worlds.fresh.numpy().any()
