@@ -17,7 +17,10 @@ MODEL = (
     "body_mass", "body_inv_mass", "body_com", "body_inertia", "body_inv_inertia", "joint_armature", "joint_friction",
 )  # fmt: skip
 """Arrays of Newton's model."""
-NOMINAL = {"body_mass": "mass", "body_com": "com", "body_inertia": "inertia", "joint_armature": "armature"}
+NOMINAL = {
+    "body_mass": "mass", "body_com": "com", "body_inertia": "inertia", "body_inv_inertia": "inv_inertia",
+    "joint_armature": "armature",
+}  # fmt: skip
 """Arrays of the model whose values of one world are kept."""
 
 

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import hashlib
+import math
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 import warp as wp
 
+from jumper_warp.envs.arrays import FIRST_CLOCK
+from jumper_warp.envs.skill import RING
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.state_checks import check_tensor, check_values
 from kernels.mdp.env import Delays, EnvArrays
@@ -58,14 +61,19 @@ def load_state(env: Env, state: dict[str, torch.Tensor]) -> None:
     done = state["env.done"]
     if isinstance(done, torch.Tensor) and done.dim() == 1 and len(done) != env.num_envs:
         raise InputError(f"saved for {len(done)} environments, there are {env.num_envs}")
+    for skill in env.skills:
+        timer = state[f"{skill.task.name}/timer"]
+        if isinstance(timer, torch.Tensor) and timer.dim() == 2 and len(timer) != skill.timer.shape[0]:
+            raise InputError(f"saved with other randomisation or events of {skill.task.name}")
     for name, tensor in tensors.items():
         check_tensor(state[name], tensor, f"saved {name}")
     for field, (prefix, name) in fields.items():
         check_tensor(state[field], torch.from_numpy(records[prefix][name].copy()), f"saved {field}")
-    check_values(state["env.level"], "saved env.level", 0)  # indexes the curriculum
+    _check_indices(env, state)
     check_tensor(state[FINGERPRINT], nominal_fingerprint(env), f"saved {FINGERPRINT}")
     if not torch.equal(state[FINGERPRINT], nominal_fingerprint(env)):
         raise InputError("saved with other robots: the description or the task's motors differ")
+    check_tensor(state[SEED], torch.tensor(env.seed), f"saved {SEED}")
     if int(state[SEED]) != env.seed:
         raise InputError(f"saved with seed {int(state[SEED])}, this environment draws with seed {env.seed}")
     for field, (prefix, name) in fields.items():
@@ -75,6 +83,22 @@ def load_state(env: Env, state: dict[str, torch.Tensor]) -> None:
     for name, tensor in tensors.items():
         tensor.copy_(state[name])
     env.restored()
+
+
+def _check_indices(env: Env, state: dict[str, torch.Tensor]) -> None:
+    """Raise ValueError where a saved number would index an array beyond its ends."""
+    longest = (RING - 2) * env.sim.substeps
+    bounds = {
+        "env.level": (0, math.inf),
+        "env.skill": (0, len(env.skills) - 1),
+        "env.clock": (FIRST_CLOCK, math.inf),
+        "parameters.latency": (0, longest),
+        "parameters.observation_latency": (0, longest),
+    }
+    for name, (least, most) in bounds.items():
+        check_values(state[name], f"saved {name}", least)
+        if not bool((state[name] <= most).all()):
+            raise InputError(f"saved {name} must be at most {most}, got {state[name].max().item()}")
 
 
 def nominal_fingerprint(env: Env) -> torch.Tensor:

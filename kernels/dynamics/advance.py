@@ -71,9 +71,9 @@ def park(robot: Robot, work: Workspace, world: int, joint_q: wp.array(dtype=real
 
 @wp.func
 def applied_torque(
-    drive: Drive, world: int, k: int, step: int, angles: vec3, rates: vec3, torque: wp.array2d(dtype=real)
+    drive: Drive, world: int, k: int, step: int, last: bool, angles: vec3, rates: vec3, torque: wp.array2d(dtype=real)
 ) -> vec3:
-    """Return leg k's motor-space torque [N m]; the motors' share is written to `torque`."""
+    """Return leg k's motor-space torque [N m]; that of the last step is written to `torque`."""
     motor = vec3(real(0.0))
     if drive.closed_loop != 0:
         target = vec3(drive.target[3 * k, world], drive.target[3 * k + 1, world], drive.target[3 * k + 2, world])
@@ -84,8 +84,9 @@ def applied_torque(
                 )
         motor = drive_torque(drive.motors, k, world, target, angles, rates)
     total = motor + load_motors(drive.joint_f, leg_dof(world, k))
-    for j in range(3):
-        torque[3 * k + j, world] = total[j]
+    if last:
+        for j in range(3):
+            torque[3 * k + j, world] = total[j]
     return total
 
 
@@ -127,13 +128,14 @@ def advance_once(
 ) -> BaseState:  # fmt: skip
     """Advance one world by one step; angles and rates of the legs' motors are updated in place."""
     dt = settings.dt
+    last = step == settings.substeps - 1
     g = wp.quat_rotate_inv(base.quat, load_vec3(robot.table, GRAVITY, world))
     wrench = base_wrench(drive, world)
     force = vec3(real(wrench[0]), real(wrench[1]), real(wrench[2]))
     moment = vec3(real(wrench[3]), real(wrench[4]), real(wrench[5]))
     system = base_system(robot, world, base, g, force, moment)
     for k in range(legs.shape[0]):
-        torque = applied_torque(drive, world, k, step, angles[k], rates[k], work.torque)
+        torque = applied_torque(drive, world, k, step, last, angles[k], rates[k], work.torque)
         system = leg_terms(robot, world, k, angles[k], rates[k], torque, base.ang, g, dt, system, legs, paws)
     inverse = invert(system)
     lin_acc = solve_lin(inverse, system.force, system.moment)
@@ -150,7 +152,7 @@ def advance_once(
     change = solve_contacts(contacts, block, settings.max_sweeps, settings.tolerance)
     if has_block(robot.ground, world):
         move_block(robot.ground, world, wp.quat_rotate(base.quat, block_velocity(block, contacts)), dt)
-    record_contacts(work, world, base, contacts, change, dt, peaks)
+    record_contacts(work, world, base, contacts, change, dt, last, peaks)
     for k in range(legs.shape[0]):
         push = legs[k].inverse * (wp.transpose(contacts[k].jacobian) * contacts[k].impulse)
         rates[k] += push - legs[k].to_lin * change.lin - legs[k].to_ang * change.ang
@@ -161,15 +163,16 @@ def advance_once(
 @wp.func
 def record_contacts(
     work: Workspace, world: int, base: BaseState, contacts: wp.array(dtype=PawContact), solved: ContactState, dt: real,
-    peaks: wp.array(dtype=real),
+    last: bool, peaks: wp.array(dtype=real),
 ):  # fmt: skip
-    """Write the paws' impulses and forces, and keep the largest force and residual; peaks [N]: on each paw."""
+    """Write the paws' impulses, forces in the last step, and keep the largest; peaks [N]: on each paw."""
     total = vec3(real(0.0))
     for k in range(contacts.shape[0]):
         impulse = wp.quat_rotate(base.quat, contacts[k].impulse)
         work.impulse[k, world] = impulse
         force = impulse / dt
-        work.contact_force[k, world] = force
+        if last:
+            work.contact_force[k, world] = force
         peaks[k] = wp.max(peaks[k], wp.length(force))
         total += force
     work.peak_force[world] = wp.max(work.peak_force[world], wp.length(total))

@@ -38,6 +38,7 @@ class RobotParameters:
     nominal_mass: wp.array(dtype=float)  # (21,) of one world, like all below
     nominal_com: wp.array(dtype=wp.vec3)
     nominal_inertia: wp.array(dtype=wp.mat33)
+    nominal_inv_inertia: wp.array(dtype=wp.mat33)
     nominal_armature: wp.array(dtype=float)  # (38,)
     nominal_kp: wp.array2d(dtype=float)  # (skills, 12), like all below
     nominal_kd: wp.array2d(dtype=float)
@@ -56,7 +57,7 @@ def write_mass(robot: RobotParameters, world: int, body: int, scale: float):
     robot.body_mass[i] = mass
     robot.body_inv_mass[i] = 1.0 / mass
     robot.body_inertia[i] = inertia
-    robot.body_inv_inertia[i] = wp.inverse(inertia)
+    robot.body_inv_inertia[i] = robot.nominal_inv_inertia[body] / scale
 
 
 @wp.func

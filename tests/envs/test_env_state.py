@@ -184,6 +184,26 @@ def test_a_state_that_does_not_fit_is_refused_and_nothing_changes(change, messag
     assert equal(env.state_dict(), before)
 
 
+@pytest.mark.parametrize(
+    ("name", "value", "message"),
+    [
+        ("env.level", -1, "saved env.level must not be below 0, got -1"),
+        ("env.skill", 1, "saved env.skill must be at most 0, got 1"),
+        ("env.skill", -1, "saved env.skill must not be below 0, got -1"),
+        ("env.clock", 0, "saved env.clock must not be below 16, got 0"),
+        ("parameters.latency", 49, "saved parameters.latency must be at most 48, got 49"),
+        ("parameters.observation_latency", -1, "saved parameters.observation_latency must not be below 0, got -1"),
+    ],
+)
+def test_a_number_that_points_out_of_an_array_is_refused_and_nothing_changes(name, value, message):
+    env = make_env(2)
+    before, state = env.state_dict(), env.state_dict()
+    state[name][1] = value
+    with pytest.raises(ValueError, match=message):
+        env.load_state_dict(state)
+    assert equal(env.state_dict(), before)
+
+
 def test_a_field_that_came_or_went_is_told():
     env = make_env(2)
     state = env.state_dict()

@@ -1,0 +1,236 @@
+"""When parameters are drawn, and what the drawn ones do."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+import warp as wp
+from jump_helpers import DEG, edit_coordinates, edit_episodes, make_env, only, random_actions, resetting
+from randomization_helpers import (
+    ALL,
+    MOTOR_DOFS,
+    OFF,
+    PAPER,
+    ROWS,
+    TASK,
+    fills,
+    own_model,
+    randomized,
+    read,
+    seen,
+    within,
+)
+
+from jumper_warp.sim.simulation import Simulation
+from jumper_warp.tasks.randomization import RandomizationCfg
+from kernels.jump.state import LANDED
+from kernels.mdp.observations import drawn_push
+
+
+@pytest.fixture(scope="module")
+def nominal():
+    """Parameters with every row off."""
+    return read(randomized(OFF))
+
+
+# ---------------------------------------------------------------- when
+
+
+def test_drawing_again_begins_with_the_nominal_values(nominal):
+    env = randomized(RandomizationCfg(**ALL))
+    before = read(env)
+    for _ in range(3):
+        env.reset()
+    after = read(env)
+    then = {name: values[..., :1] for name, values in nominal.items()}
+    for row, value in ROWS.items():
+        assert not np.array_equal(value(before, then), value(after, then)), row
+        assert within(value(after, then), *ALL[row]), row
+
+
+@pytest.mark.parametrize("solver", ["jumper", "mujoco"])
+def test_a_world_draws_anew_at_its_reset_and_at_no_other_time(solver):
+    """Over 30 steps of random actions, in which some worlds end by themselves."""
+    env = randomized(RandomizationCfg(**ALL), 12, solver=solver)
+    ended = np.zeros(12, dtype=bool)
+    for step, action in enumerate(random_actions(12, 30)):
+        before, of_solver = seen(env), own_model(env)
+        if step % 10 == 9:
+            edit_episodes(env, step // 10, phase=LANDED, phase_steps=59)
+        env.step(action)
+        after, done = seen(env), env.done.numpy() == 1.0
+        for name in before:
+            changed = (before[name] != after[name]).reshape(-1, 12).any(axis=0)
+            np.testing.assert_array_equal(changed & ~done, False, err_msg=name)
+            if name not in ("latency", "observation_latency"):  # whole numbers may be drawn twice
+                np.testing.assert_array_equal(changed, done, err_msg=name)
+        for name, values in own_model(env).items():
+            changed = (values != of_solver[name]).reshape(12, -1).any(axis=1)
+            np.testing.assert_array_equal(changed, done, err_msg=name)
+        ended |= done
+    assert ended[:3].all() and not ended.all()
+
+
+@pytest.mark.parametrize("solver", ["jumper", "mujoco"])
+def test_drawn_at_the_start_stays(solver):
+    env = randomized(RandomizationCfg(**ALL, redraw="startup"), 4, solver=solver)
+    first, of_solver = seen(env), own_model(env)
+    assert len(np.unique(env.sim.model.body_mass.numpy())) == 84
+    for action in random_actions(4, 3):
+        edit_episodes(env, slice(0, 2), phase=LANDED, phase_steps=59)
+        env.step(action)
+        assert env.done[:2].all()
+    env.reset()
+    found = seen(env)
+    for name in first:
+        if name in ("force", "torque"):  # a push is of an episode
+            assert not np.array_equal(found[name], first[name])
+        else:
+            np.testing.assert_array_equal(found[name], first[name], err_msg=name)
+    for name, values in own_model(env).items():
+        np.testing.assert_array_equal(values, of_solver[name], err_msg=name)
+
+
+def test_an_evaluation_draws_for_its_worlds_only():
+    env = randomized(RandomizationCfg(**ALL), 6)
+    before, chosen = read(env), np.arange(6) % 2 == 0
+    env.evaluation_reset(np.zeros((6, 4)), worlds=chosen)
+    after = read(env)
+    for name in ("link_mass", "kp", "joint_offset", "force"):
+        changed = (before[name] != after[name]).any(axis=0)
+        np.testing.assert_array_equal(changed, chosen, err_msg=name)
+
+
+def test_pushes_of_walking_come_and_go():
+    """In a quarter of the intervals, of 0.2 to 0.5 s each, in flight too."""
+    task = dataclasses.replace(TASK, randomization=RandomizationCfg.walking())
+    env = make_env(48, task=resetting(task, only("default")), randomize=True)
+    env.auto_reset = False
+    pushes = []
+    for _ in range(300):
+        env.step(torch.zeros((48, 12)))
+        pushes.append(env.parameters.push.numpy().copy())
+        np.testing.assert_array_equal(env.sim.state.body_f.numpy().reshape(48, 21, 6)[:, 0], pushes[-2:][0])
+    pushes = np.array(pushes)
+    on = pushes.any(axis=2)
+    assert 0.2 < on.mean() < 0.3
+    longest, changes = 0, 0
+    for world in range(48):
+        edges = np.flatnonzero((pushes[1:, world] != pushes[:-1, world]).any(axis=1))
+        gaps = np.diff(edges)  # [policy steps]
+        assert gaps.min(initial=12) >= 12
+        lasted = [gap for gap, at in zip(gaps, edges, strict=False) if on[at + 1, world]]
+        longest, changes = max([longest, *lasted]), changes + len(edges)
+    assert longest <= 30 and changes > 200
+    found = pushes[on]
+    assert fills(found[:, :3], -10.0, 10.0) and fills(found[:, 3:], -3.0, 3.0)
+
+
+def test_a_push_begins_with_an_episode_and_is_what_the_critic_sees():
+    env = randomized(dataclasses.replace(OFF, force=(-5.0, 5.0), torque=(-3.0, 3.0)), 4)
+    first, last = env.task.layout("critic")[drawn_push.key.split(".")[-1]]
+    for _ in range(2):
+        push = env.parameters.push.numpy().copy()
+        np.testing.assert_allclose(env.critic_obs[:, first:last], push / [5.0, 5.0, 5.0, 3.0, 3.0, 3.0], rtol=1e-6)
+        edit_episodes(env, phase=LANDED, phase_steps=59)
+        env.step(torch.zeros((4, 12)))
+        assert env.done.all() and not (env.parameters.push.numpy() == push).any()
+
+
+# ---------------------------------------------------------------- what they do
+
+
+@pytest.mark.parametrize("in_flight", [False, True])
+def test_pushes_act_on_the_ground_only_or_in_flight_too(in_flight):
+    cfg = dataclasses.replace(OFF, force=PAPER["force"], torque=PAPER["torque"], push_in_flight=in_flight)
+    env = randomized(cfg, 9)
+    push = env.parameters.push.numpy()
+    for world in range(3, 6):
+        edit_coordinates(env, world, q={2: 1.0})
+    rest = torch.zeros((9, 12))
+    edit_episodes(env, command_step=1000)
+    env.auto_reset = False
+    for _ in range(2):  # in the first, the paws of all were last seen in the air
+        env.step(rest)
+        wrench = env.sim.state.body_f.numpy().reshape(9, 21, 6)
+    np.testing.assert_array_equal(wrench[[0, 1, 2, 6, 7, 8], 0], push[[0, 1, 2, 6, 7, 8]])
+    np.testing.assert_array_equal(wrench[3:6, 0], in_flight * push[3:6])
+    assert not wrench[:, 1:].any()
+
+
+def test_a_push_accelerates_the_robot():
+    """Lifted off the ground but still counted as standing: momentum grows by force times time."""
+    env = randomized(OFF, 2)
+    push = np.zeros((2, 6))
+    push[1, :3] = [4.0, -3.0, 5.0]
+    env.parameters.push.assign(push.astype(np.float32))
+    q = env.sim.joint_q().copy()
+    q[:, 2] += 0.5
+    env.sim.state.joint_q.assign(q.ravel())
+    env.robot.contact_time.fill_(1.0)
+    env.step(torch.zeros((2, 12)))
+    env.sim.physics.write_bodies()
+    velocity = env.sim.state.body_qd.numpy().reshape(2, 21, 6)[..., :3].astype(float)
+    momentum = (env.sim.model.body_mass.numpy().reshape(2, 21, 1) * velocity).sum(axis=1)
+    np.testing.assert_allclose(momentum[1] - momentum[0], np.array([4.0, -3.0, 5.0]) / 60.0, atol=2e-3)
+
+
+def test_a_sensor_offset_acts_on_the_motor_and_on_the_observation():
+    """A motor whose sensor reads too high by d ends where an honest one told to go d lower does."""
+    wrong, honest = randomized(OFF, 1), randomized(OFF, 1)
+    offset = np.zeros((12, 1), dtype=np.float32)
+    offset[4] = 2.0 * DEG
+    wrong.parameters.motors.offset.assign(offset)
+    action = torch.zeros((1, 12))
+    lower = action.clone()
+    lower[0, 4] = -2.0 / 90.0
+    for _ in range(20):
+        wrong.step(action)
+        honest.step(lower)
+    np.testing.assert_allclose(wrong.sim.joint_q(), honest.sim.joint_q(), atol=1e-4)
+    seen = (wrong.obs - honest.obs)[0, 12:24].numpy()
+    np.testing.assert_allclose(seen, offset[:, 0], atol=1e-4)
+
+
+def test_the_command_filter_reads_the_position_sensor():
+    """With both thighs at 97 degrees the sum is 1 degree before its hard zone; a sensor 2 too high sees it inside."""
+    env = randomized(OFF, 2)
+    offset = np.zeros((12, 2), dtype=np.float32)
+    offset[4, 1] = 2.0 * DEG  # outer motor of leg 1
+    env.parameters.motors.offset.assign(offset)
+    for world in range(2):
+        edit_coordinates(env, world, q={13: 97.0 * DEG, 15: 97.0 * DEG})
+    env.auto_reset = False
+    env.step(torch.ones((2, 12)))  # 135 degrees each, 30 more than the sum may be
+    safe = env.robot.safe_target.numpy()[4:6] / DEG
+    np.testing.assert_allclose(safe, [[135.0, 120.0], [135.0, 120.0]], atol=1e-3)
+
+
+def test_motor_and_observation_share_their_sensor():
+    env = randomized(RandomizationCfg(), 2)
+    assert env.sim.motors.offset.ptr == env.robot.joint_offset.ptr == env.parameters.motors.offset.ptr
+    assert env.sim.motors.offset.numpy().all()
+
+
+def test_an_action_arrives_after_its_delay():
+    """Against the same robot driven step by step, its motors told the old targets until the new ones arrive."""
+    delays = np.array([0, 1, 3, 5, 8, 13])
+    env = randomized(OFF, len(delays))
+    env.parameters.latency.assign(delays.astype(np.int32))
+    sim = Simulation(len(delays), motors=TASK.motors, friction=0.9, visuals=False, device="cpu")
+    sim.state.joint_q.assign(env.sim.state.joint_q)
+    targets = [env.robot.safe_target.numpy().copy()] * 2
+    generator = torch.Generator().manual_seed(5)
+    spread = []
+    for _ in range(6):
+        env.step(0.4 * (2.0 * torch.rand((1, 12), generator=generator) - 1.0).repeat(len(delays), 1))
+        targets.append(env.robot.safe_target.numpy().copy())
+        for step in range(8):
+            age = np.ceil((delays - step) / 8.0).clip(0.0).astype(int)  # policy steps since the target that acts
+            now = np.stack([targets[-1 - age[world]][:, world] for world in range(len(delays))], axis=1)
+            sim.physics.advance(1, wp.array(now, dtype=float, device="cpu"))
+        np.testing.assert_allclose(env.sim.joint_q()[:, :7], sim.joint_q()[:, :7], atol=2e-4)
+        np.testing.assert_allclose(env.sim.joint_qd()[:, MOTOR_DOFS], sim.joint_qd()[:, MOTOR_DOFS], atol=5e-2)
+        spread.append(np.abs(np.diff(env.sim.joint_qd()[:, MOTOR_DOFS], axis=0)).max(axis=1))
+    assert np.min(np.max(spread, axis=0)) > 0.5  # [rad/s] each delay differs from the next

@@ -1,0 +1,117 @@
+"""What domain randomisation changes of an environment, as solver, motors and environment have it."""
+
+import dataclasses
+
+import numpy as np
+from jump_helpers import DEG, make_env, only, resetting
+from newton.solvers import SolverMuJoCo
+
+from jumper_warp.envs.env import Env
+from jumper_warp.registry import make_task
+from jumper_warp.sim.solver import SolverJumper
+from jumper_warp.tasks.randomization import RandomizationCfg
+from kernels import layout
+
+N = 64
+TASK = make_task("vertical-jump")
+OFF = RandomizationCfg.off()
+OF_MODEL = (
+    "base_mass", "base_moments", "link_mass", "link_moments", "com_shift", "armature", "motor_friction",
+    "static_friction", "dynamic_friction",
+)  # fmt: skip
+MOTOR_DOFS = np.array([6 + 5 * leg + joint for leg in range(4) for joint in (0, 1, 3)])
+PAPER = {
+    "static_friction": (0.9, 1.2), "dynamic_friction": (0.8, 0.9), "base_mass": (-1.0, 2.0), "link_mass": (0.8, 1.2),
+    "com_shift": (-0.03, 0.03), "gains": (0.6, 1.4), "no_load_speed": (0.8, 1.2), "cutoff_speed": (0.8, 1.4),
+    "motor_friction": (0.005, 0.04), "armature": (0.6, 1.4), "joint_offset": (-2.0, 2.0), "latency": (0.0, 16.0),
+    "force": (-5.0, 5.0), "torque": (-3.0, 3.0),
+}  # fmt: skip
+"""Table V, jumping."""
+WALKING = PAPER | {
+    "static_friction": (0.8, 0.95), "dynamic_friction": (0.7, 0.8), "no_load_speed": (0.6, 1.2),
+    "cutoff_speed": (0.6, 1.4), "motor_friction": (0.0, 0.04), "latency": (0.0, 32.0),
+    "observation_latency": (0.0, 32.0), "force": (-10.0, 10.0),
+}  # fmt: skip
+"""Table V, walking; the text adds that its latency applies to observations too."""
+BEYOND = {
+    "observation_latency": None, "push_interval": None, "push_share": 1.0, "push_in_flight": False, "redraw": "reset",
+}  # fmt: skip
+"""What the table does not tell, for jumping."""
+ALL = PAPER | {"observation_latency": (0.0, 16.0)}
+"""Every row."""
+
+
+def randomized(cfg, num_envs=N, **arguments):
+    task = resetting(dataclasses.replace(TASK, randomization=cfg), only("default"))
+    return make_env(num_envs, task=task, **({"randomize": True} | arguments))
+
+
+def read(env):
+    """Return every randomised parameter as the solver, the motors and the environment have it; worlds come last."""
+    n, table = env.num_envs, env.sim.physics.dynamics.robot.table.numpy().astype(float)
+    legs = np.array([leg * layout.LEG_ROWS for leg in range(4)])
+    links = np.array([[leg + link * layout.MOMENT_ROWS for link in range(5)] for leg in legs]).ravel()
+    base, motors, parameters = int(layout.BASE), env.sim.motors, env.parameters
+    moments = table[links[:, None] + np.arange(10)].reshape(20, 10, n)
+    three = (legs[:, None] + np.arange(3)).ravel()
+    return {
+        "static_friction": table[legs + int(layout.MU_STATIC)],
+        "dynamic_friction": table[legs + int(layout.MU_DYNAMIC)],
+        "base_mass": table[base],
+        "base_moments": table[base : base + 10],
+        "link_mass": moments[:, 0],
+        "link_moments": moments,
+        "com_shift": table[base + 1 : base + 4] / table[base],
+        "armature": table[three + int(layout.ARMATURE)],
+        "motor_friction": table[three + int(layout.FRICTION)],
+        **{name: getattr(motors, name).numpy().astype(float) for name in ("kp", "kd", "no_load_speed", "cutoff_speed")},
+        "joint_offset": motors.offset.numpy().astype(float),
+        "latency": parameters.latency.numpy().astype(float),
+        "observation_latency": parameters.observation_latency.numpy().astype(float),
+        "force": parameters.push.numpy()[:, :3].T.astype(float),
+        "torque": parameters.push.numpy()[:, 3:].T.astype(float),
+    }
+
+
+def own_model(env: Env) -> dict[str, np.ndarray]:
+    """Return what randomisation changes of SolverMuJoCo's own model, the world first; nothing on SolverJumper."""
+    if not isinstance(env.sim.solver, SolverMuJoCo):
+        return {}
+    model = env.sim.solver.mjw_model
+    names = ("body_mass", "body_inertia", "body_ipos", "dof_armature", "dof_frictionloss", "geom_friction")
+    return {name: getattr(model, name).numpy().copy() for name in names}
+
+
+def seen(env):
+    """Return what `read` does, but on MuJoCo without what `own_model` tells."""
+    left_out = [] if isinstance(env.sim.solver, SolverJumper) else OF_MODEL
+    return {name: values for name, values in read(env).items() if name not in left_out}
+
+
+def within(values, lower, upper):
+    """Whether values stay in a range, but for rounding."""
+    width = upper - lower
+    return values.min() >= lower - 1e-5 * width and values.max() <= upper + 1e-5 * width
+
+
+def fills(values, lower, upper):
+    """Whether values stay in a range, reach its ends and lie about its middle."""
+    width = upper - lower
+    wide = values.min() < lower + 0.03 * width and values.max() > upper - 0.03 * width
+    return within(values, lower, upper) and wide and abs(values.mean() - 0.5 * (lower + upper)) < 0.1 * width
+
+
+ROWS = {
+    "base_mass": lambda now, then: now["base_mass"] - then["base_mass"],
+    "link_mass": lambda now, then: now["link_mass"] / then["link_mass"],
+    "com_shift": lambda now, then: now["com_shift"] - then["com_shift"],
+    "gains": lambda now, then: np.stack([now["kp"] / then["kp"], now["kd"] / then["kd"]]),
+    "no_load_speed": lambda now, then: now["no_load_speed"] / then["no_load_speed"],
+    "motor_friction": lambda now, then: now["motor_friction"],
+    "armature": lambda now, then: now["armature"] / then["armature"],
+    "joint_offset": lambda now, then: now["joint_offset"] / DEG,
+    "force": lambda now, then: now["force"],
+    "torque": lambda now, then: now["torque"],
+    "dynamic_friction": lambda now, then: now["dynamic_friction"],
+    "static_friction": lambda now, then: now["static_friction"],
+}
