@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -14,17 +14,11 @@ from jumper_warp.envs.arrays import (
     checked_action,
     checked_commands,
     checked_mask,
-    checked_skill,
     checked_tasks,
     checked_values,
-    delay_arrays,
-    env_arrays,
     prepared,
-    robot_arrays,
-    scene_of,
 )
-from jumper_warp.envs.parameters import robot_parameters
-from jumper_warp.envs.skill import Skill
+from jumper_warp.envs.stages import Stages
 from jumper_warp.envs.state import load_state, save_state
 from jumper_warp.robot.grounds import BlockCfg
 from jumper_warp.sim.simulation import Simulation, SolverName
@@ -32,14 +26,7 @@ from jumper_warp.tasks.cfg import Handover, TaskCfg
 from jumper_warp.tasks.interface import interface
 from jumper_warp.tasks.saving import task_to_json
 from jumper_warp.utils.errors import InputError
-from kernels.mdp.actions import action_kernel
-from kernels.mdp.env import SkillSettings
-from kernels.mdp.events import AT_RESET, AT_STEP, STARTUP
-from kernels.mdp.handover import make_handover_kernel
-from kernels.mdp.observe import LANES, condition_kernel
-from kernels.mdp.parameters import motors_kernel
-from kernels.mdp.reset import forget_kernel, stand_kernel, tick_kernel
-from kernels.mdp.track import track_kernel
+from kernels.mdp.reset import stand_kernel
 
 CONTACT_TOLERANCE = 1.0e-4
 """[m/s] Of the contact iteration: a fifth fewer sweeps than the solver's default."""
@@ -60,7 +47,7 @@ class Step(NamedTuple):
     """`final_obs`: observations by group before a new beginning; `time_outs`: truncated as float."""
 
 
-class Env:
+class Env(Stages):
     """Many robots on one task, or several tasks of which each world has one. Nothing in `step` waits for the device.
 
     Attributes, tensors on the device, rewritten in place by `reset` and `step`, of the first task:
@@ -110,25 +97,11 @@ class Env:
             self.sim.physics.dynamics.robot.ground.blocks.zero_()  # until `reset` draws them
         self.physics_dt, self.step_dt = self.sim.dt, self.sim.dt * self.sim.substeps
         self._ends_episodes, self._started, self._graphs = True, False, {}
-        self._allocate(run, skill)
-        self._handovers = [(make_handover_kernel(h), tasks.index(h.source), tasks.index(h.target)) for h in handovers]
+        self._allocate(run, skill, handovers)
+        self._show()
 
-    def _allocate(self, tasks: Sequence[TaskCfg], skill: np.ndarray | int) -> None:
-        n, device, sim = self.num_envs, self.wp_device, self.sim
-        self._first_skill = active = checked_skill(skill, n, len(tasks))
-        active = wp.array(active, dtype=int, device=device)
-        self.skills = [Skill(task, i, n, self.step_dt, sim.substeps, device) for i, task in enumerate(tasks)]
-        self.parameters = robot_parameters(sim, tuple(tasks), active)
-        self.robot, self._scene = robot_arrays(sim, self.step_dt), scene_of(sim)
-        self.worlds = env_arrays(n, self.seed, active, device)
-        self.delays = delay_arrays(n, self.parameters.latency, sim.substeps, device)
-        for each in self.skills:
-            each.observations.latency = self.parameters.observation_latency
-        settings = [each.settings_of_skill() for each in self.skills]
-        self._settings = wp.array(settings, dtype=SkillSettings, device=device)
-        self._action = wp.zeros((len(tasks), n, 12), dtype=float, device=device)
-        self._all = wp.full(n, 1.0, dtype=float, device=device)
-        self._moved = wp.zeros(n, dtype=int, device=device)
+    def _show(self) -> None:
+        """Let torch see Warp's memory."""
         self.num_actions, self.actions = 12, wp.to_torch(self._action)
         self.action, first = self.actions[0], self.skills[0]
         self.obs, self.critic_obs = first.obs["policy"], first.obs["critic"]
@@ -186,108 +159,6 @@ class Env:
             wp.capture_launch(self._graphs[resets])
         return self._step
 
-    def _launch_step(self) -> None:
-        for stage in self.stages().values():
-            stage()
-
-    def stages(self) -> dict[str, Callable[[], None]]:
-        """Return the parts of a step by name, in order: each launches its kernels and does not wait for them."""
-        return {"action": self._act, "physics": self._advance, "episode": self._judge,
-                "observe": lambda: self._observe(beginning=0), "reset": self._renew}  # fmt: skip
-
-    def _act(self) -> None:
-        n, robot, env, settings = self.num_envs, self.robot, self.worlds, self._settings
-        delays, push = self.delays, self.parameters.push
-        self._launch(action_kernel, (n, 4), [self._action, settings, push, robot, env, delays])
-        self._events(AT_STEP, self._all)
-
-    def _advance(self) -> None:
-        delays, scene = self.delays, self._scene
-        self.sim.physics.advance(
-            self.sim.substeps, delays.late_target, delays.earlier_target, delays.late_steps, bodies=False
-        )
-        inputs = [scene.geometry, scene.ground, self._settings, self.worlds, self.robot]
-        self._launch(track_kernel, (4, self.num_envs), inputs)
-
-    def _judge(self) -> None:
-        for skill in self.skills:
-            self._launch(
-                skill.kernels["step"], self.num_envs,
-                [skill.index, self.robot, self._scene.ground, len(skill.task.levels), skill.numbers, self.worlds,
-                 skill.states, skill.term_value, skill.counters],
-            )  # fmt: skip
-
-    def _renew(self) -> None:
-        self._hand_over()
-        begins = self.auto_reset and self._ends_episodes
-        if begins:
-            self._begin(self.worlds.done)
-        if self._handovers or begins:
-            self._observe(beginning=1)
-
-    def _hand_over(self) -> None:
-        if self._handovers:
-            self._moved.zero_()
-        for kernel, source, target in self._handovers:
-            self._launch(
-                kernel, self.num_envs,
-                [source, target, self._scene.ground, self._settings, self._moved, self.robot, self.parameters,
-                 self.worlds, self.skills[source].states, self.skills[target].states],
-            )  # fmt: skip
-
-    def _begin(self, mask: wp.array) -> None:
-        """Begin new episodes where mask is not 0, and commands where they are due."""
-        self._draw(mask)
-        for skill in self.skills:
-            self._launch(
-                skill.kernels["reset"], self.num_envs,
-                [skill.index, mask, self._scene, self._settings, skill.settings, skill.levels, self.worlds,
-                 skill.states, self.robot],
-            )  # fmt: skip
-        self._forget(mask)
-
-    def _draw(self, mask: wp.array) -> None:
-        """Draw parameters of episodes that begin where mask is not 0."""
-        if not self._started:
-            self._launch(motors_kernel, (12, self.num_envs), [self.parameters])
-            self._events(STARTUP, self._all)
-            self._started = True
-        self._events(AT_RESET, mask)
-
-    def _events(self, stage: int, mask: wp.array) -> None:
-        """Run the events of a stage, and let the solver read what they changed."""
-        for skill in self.skills:
-            due = [row.term for row in skill.task.rows["events"] if row.term.due_at(stage)]
-            if due:
-                self._launch(
-                    skill.kernels["event"], (skill.num_events, self.num_envs),
-                    [skill.index, stage, mask, self.step_dt, self.worlds, skill.numbers, skill.timer, self.parameters],
-                )  # fmt: skip
-            if any(term.options["repack"] for term in due):
-                self.sim.physics.parameters_changed(mask)
-
-    def _forget(self, mask: wp.array) -> None:
-        self._launch(forget_kernel, (12, self.num_envs), [mask, self._scene.geometry, self.robot, self.delays])
-        self.sim.physics.after_reset(mask)
-
-    def _tick(self, mask: wp.array) -> None:
-        self._launch(tick_kernel, self.num_envs, [mask, self.worlds])
-
-    def _observe(self, beginning: int) -> None:
-        for skill in self.skills:
-            arrays = skill.observations
-            self._launch(
-                skill.kernels["observe"], (skill.num_chunks, self.num_envs),
-                [skill.index, self.robot, self.parameters, self._scene.ground, self.worlds, skill.states,
-                 skill.numbers, beginning, arrays.raw],
-            )  # fmt: skip
-            inputs = [skill.index, self.worlds, skill.columns, skill.numbers, beginning, arrays]
-            wp.launch(condition_kernel, (self.num_envs, int(LANES)), inputs, device=self.wp_device)
-
-    def _launch(self, kernel: wp.Kernel, dim: int | tuple[int, ...], inputs: list) -> None:
-        # small blocks spread a few thousand heavy threads over all multiprocessors
-        wp.launch(kernel, dim=dim, inputs=inputs, device=self.wp_device, block_dim=32)
-
     # ------------------------------------------------------------------ commands from outside
 
     def evaluation_reset(self, commands: Any, headings: Any = 0.0, worlds: Any = None) -> None:
@@ -327,14 +198,6 @@ class Env:
         wanted = self.worlds.request.numpy()
         wanted[checked_mask(worlds, self.num_envs) > 0.0] = skill
         self.worlds.request.assign(wanted)
-
-    def _give(self, mask: wp.array, begins: int, values: np.ndarray, headings: wp.array) -> None:
-        values = wp.array(values, dtype=wp.vec4, device=self.wp_device)
-        for skill in self.skills:
-            self._launch(
-                skill.kernels["give"], self.num_envs,
-                [skill.index, mask, begins, values, headings, self._scene, self.robot, self.worlds, skill.states],
-            )  # fmt: skip
 
     def _array(self, values: np.ndarray) -> wp.array:
         return wp.array(values, dtype=float, device=self.wp_device)

@@ -165,6 +165,17 @@ def test_a_reset_runs_an_interval_event_and_starts_its_interval_anew():
     np.testing.assert_array_equal(np.array(ran), np.where(some, [[0], [0], [1], [0]], [[1], [0], [0], [1]]))
 
 
+def test_an_interval_that_no_reset_began_starts_with_the_first_step():
+    """As in a world that was handed over to the skill."""
+    events, ran = Events("regular"), []
+    for _ in range(7):
+        events.next_clock()
+        before = events.marked()
+        events.run(AT_STEP)
+        ran.append(set(events.marked() - before))
+    assert ran == [{0}, {0}, {0}, {1}, {0}, {0}, {1}]
+
+
 def test_an_interval_shorter_than_a_step_comes_in_every_step():
     events = Events("regular")
     events.skill.set("events", "regular", least=0.1 * STEP_DT, most=0.2 * STEP_DT)

@@ -1,3 +1,4 @@
+import dataclasses
 from types import SimpleNamespace
 
 import numpy as np
@@ -8,6 +9,7 @@ from scipy.stats import kstest
 
 from jumper_warp.envs.parameters import robot_parameters
 from jumper_warp.registry import make_task
+from jumper_warp.robot.motors import jumping_motors
 from jumper_warp.sim.simulation import Simulation
 from kernels.mdp import parameters
 from kernels.mdp.parameters import RobotParameters
@@ -32,11 +34,21 @@ def event_kernel(which: int, p: wp.array(dtype=float), robot: RobotParameters):
             wp.static(FUNCS[i])(robot, draw, *p[0 : wp.static(COUNTS[i])])
 
 
+def other_motors():
+    """Return motors of which nothing is as in a jump."""
+    motors, kinds = jumping_motors(18.0), {}
+    factors = {"kp": 1.25, "kd": 0.75, "saturation": 0.5, "no_load_speed": 1.5, "cutoff_speed": 1.375}
+    for name in ("lateral", "transversal"):
+        kind = getattr(motors, name)
+        kinds[name] = dataclasses.replace(kind, **{key: getattr(kind, key) * f for key, f in factors.items()})
+    return dataclasses.replace(motors, **kinds)
+
+
 @pytest.fixture(scope="module")
 def made():
     """Parameters of robots of two skills, and copies of all that may change."""
     sim = Simulation(N, visuals=False, device="cpu")
-    tasks = (make_task("vertical-jump"), make_task("horizontal-jump"))
+    tasks = (make_task("vertical-jump"), dataclasses.replace(make_task("horizontal-jump"), motors=other_motors()))
     robot = robot_parameters(sim, tasks, array(np.arange(N) % 2, int))
     wp.launch(parameters.motors_kernel, (12, N), [robot], device="cpu")
     robot.latency.fill_(-1)
@@ -253,6 +265,8 @@ def test_every_world_has_the_motors_of_its_skill_by_what_was_drawn(made, drawn):
     nominal = {"kp": robot.nominal_kp, "kd": robot.nominal_kd, "saturation": robot.nominal_saturation,
                "no_load_speed": robot.nominal_no_load, "cutoff_speed": robot.nominal_cutoff}  # fmt: skip
     for name, table in nominal.items():
+        one, other = table.numpy()
+        assert (one != other).all()
         expected = table.numpy()[1 - np.arange(N) % 2].T
         expected = expected * (ratio[..., ["kp", "kd"].index(name)] if name in ("kp", "kd") else 1.0)
         np.testing.assert_allclose(getattr(robot.motors, name).numpy(), expected, rtol=1e-6)

@@ -162,6 +162,7 @@ def test_a_broken_world_ends_as_one_that_came_apart_and_pays_nothing(probe, how,
     assert not probe.skill.term_value.numpy()[:, 3].any() and not probe.skill.counters.term_sum.numpy()[:, 3].any()
     assert probe.world("broken").tolist() == (np.arange(N) == 3).astype(int).tolist()
     assert not probe.world("bad_action").any()
+    np.testing.assert_array_equal(probe.skill.counters.bad_actions.numpy(), (np.arange(N) == 3) * (how == "action"))
 
 
 # ---------------------------------------------------------------- curriculum
