@@ -55,7 +55,7 @@ def learning_need(cfg: PpoCfg, num_obs: int, num_critic_obs: int) -> Need:
 
 
 def rollout_bytes(num_steps: int, num_obs: int, num_critic_obs: int) -> int:
-    """Return the size of `RolloutBuffer` for each world [byte] but for log_std; num_critic_obs: of what the critic sees."""
+    """Return the size of `RolloutBuffer` for each world [byte] but for log_std; `num_critic_obs` the critic sees."""
     each = num_obs + 2 * num_critic_obs + 2 * NUM_ACTIONS + 3  # and one more of what follows the last step
     return FLOAT * (num_steps * each + num_obs + num_critic_obs)
 

@@ -239,11 +239,6 @@ class Env(Stages):
         """Return everything that the next step depends on, as `jumper_warp.envs.state.save_state`."""
         return save_state(self)
 
-    def restored(self) -> None:
-        """Let the solver read parameters that were put back."""
-        self._started = bool((self.worlds.clock.numpy() > FIRST_CLOCK).all())
-        self.sim.physics.parameters_changed()
-
     def load_state_dict(self, state: dict[str, torch.Tensor]) -> None:
         """Go on from a saved state, in the same steps; raises ValueError as `jumper_warp.envs.state.load_state`."""
         load_state(self, state)

@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 import warp as wp
 
-from jumper_warp.envs.arrays import checked_skill, delay_arrays, env_arrays, robot_arrays, scene_of
+from jumper_warp.envs.arrays import FIRST_CLOCK, checked_skill, delay_arrays, env_arrays, robot_arrays, scene_of
 from jumper_warp.envs.parameters import robot_parameters
 from jumper_warp.envs.skill import Skill
 from jumper_warp.sim.simulation import Simulation
@@ -57,6 +57,11 @@ class Stages:
         self._handovers = [
             (make_handover_kernel(h), self.tasks.index(h.source), self.tasks.index(h.target)) for h in handovers
         ]
+
+    def restored(self) -> None:
+        """Let the solver read parameters that were put back."""
+        self._started = bool((self.worlds.clock.numpy() > FIRST_CLOCK).all())
+        self.sim.physics.parameters_changed()
 
     def _launch_step(self) -> None:
         for stage in self.stages().values():

@@ -19,7 +19,7 @@ from kernels.mdp.parameters import RobotParameters
 from kernels.mdp.view import RobotArrays
 
 if TYPE_CHECKING:
-    from jumper_warp.envs.env import Env
+    from jumper_warp.envs.stages import Stages
 
 CONSTANT = ("gravity", "default_angle", "paw_shapes")
 """Arrays of the kernels' structs that are no state; those that begin with `nominal_` are none either."""
@@ -30,7 +30,7 @@ SEED = "seed"
 """Name of the seed."""
 
 
-def save_state(env: Env) -> dict[str, torch.Tensor]:
+def save_state(env: Stages) -> dict[str, torch.Tensor]:
     """Return everything that the next step depends on, on the CPU (waits for the device); counters are left out.
 
     Drawn parameters are in it, nominal ones only as a fingerprint; numbers of the task's terms are not.
@@ -42,7 +42,7 @@ def save_state(env: Env) -> dict[str, torch.Tensor]:
     return state | {FINGERPRINT: nominal_fingerprint(env), SEED: torch.tensor(env.seed)}
 
 
-def load_state(env: Env, state: dict[str, torch.Tensor]) -> None:
+def load_state(env: Stages, state: dict[str, torch.Tensor]) -> None:
     """Put a saved state back, so that the next step is the one that would have followed.
 
     Raises:
@@ -85,7 +85,7 @@ def load_state(env: Env, state: dict[str, torch.Tensor]) -> None:
     env.restored()
 
 
-def _check_indices(env: Env, state: dict[str, torch.Tensor]) -> None:
+def _check_indices(env: Stages, state: dict[str, torch.Tensor]) -> None:
     """Raise ValueError where a saved number would index an array beyond its ends."""
     longest = (RING - 2) * env.sim.substeps
     bounds = {
@@ -101,7 +101,7 @@ def _check_indices(env: Env, state: dict[str, torch.Tensor]) -> None:
             raise InputError(f"saved {name} must be at most {most}, got {state[name].max().item()}")
 
 
-def nominal_fingerprint(env: Env) -> torch.Tensor:
+def nominal_fingerprint(env: Stages) -> torch.Tensor:
     """Return the SHA-256 (32 bytes) of all nominal parameters; it does not depend on the device."""
     digest = hashlib.sha256()
     for name in RobotParameters.vars:
@@ -110,14 +110,14 @@ def nominal_fingerprint(env: Env) -> torch.Tensor:
     return torch.frombuffer(bytearray(digest.digest()), dtype=torch.uint8)
 
 
-def _records(env: Env) -> dict[str, wp.array]:
+def _records(env: Stages) -> dict[str, wp.array]:
     """Return the environment's arrays of structs by the prefix of their fields; blocks only where there are any."""
     blocks = env.sim.physics.dynamics.robot.ground.blocks
     states = {f"{skill.task.name}.": skill.states for skill in env.skills}
     return states | ({"block.": blocks} if blocks.shape[0] else {})
 
 
-def _tensors(env: Env) -> dict[str, torch.Tensor]:
+def _tensors(env: Stages) -> dict[str, torch.Tensor]:
     """Return views of the environment's own memory by name."""
     found: dict[str, Any] = {}
     for prefix, struct in (("robot", env.robot), ("env", env.worlds), ("delays", env.delays),

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
@@ -17,7 +17,6 @@ from jumper_warp.robot.model import LEGS, build_model
 
 if TYPE_CHECKING:
     from jumper_warp.envs.env import Env
-    from jumper_warp.evaluation.log import EvaluationLog
     from jumper_warp.robot.grounds import BlockCfg
 
 SHANK_LENGTH = 0.3
@@ -42,13 +41,20 @@ class Strip:
     """Of the file (default: the film's)."""
 
 
+class HasSeries(Protocol):
+    """Follows worlds and can tell how they are."""
+
+    def series(self, worlds: Sequence[int]) -> Mapping[str, Any]:
+        """Return what to draw of some worlds over time, `group/quantity [unit]` to its present value."""
+
+
 class Film:
     """Collects what some worlds of an environment look like; call it after every policy step."""
 
     def __init__(
         self,
         env: Env,
-        log: EvaluationLog,
+        log: HasSeries,
         worlds: Sequence[int],
         *,
         spacing: float = 1.2,

@@ -173,7 +173,7 @@ def record_contacts(
         force = impulse / dt
         if last:
             work.contact_force[k, world] = force
-        peaks[k] = wp.max(peaks[k], wp.length(force))
+        peaks[k] = wp.max(peaks[k], wp.dot(contacts[k].impulse, contacts[k].impulse))
         total += force
     work.peak_force[world] = wp.max(work.peak_force[world], wp.length(total))
     work.sweeps[world] = wp.max(work.sweeps[world], solved.sweeps)
@@ -220,7 +220,7 @@ def advance_kernel(
         base = advance_once(robot, settings, drive, work, world, step, base, angles, rates, legs, paws, contacts, peaks)
     total = real(0.0)
     for k in range(angles.shape[0]):
-        work.peak_paw_force[k, world] = peaks[k]
+        work.peak_paw_force[k, world] = wp.sqrt(peaks[k]) / settings.dt
         store_motors(joint_q_out, leg_coord(world, k), angles[k])
         store_motors(joint_qd_out, leg_dof(world, k), rates[k])
         total += wp.dot(angles[k], angles[k]) + wp.dot(rates[k], rates[k])
