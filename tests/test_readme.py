@@ -1,7 +1,13 @@
 import re
+import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
+import torch
+
+from jumper_warp.envs.env import Env
+from jumper_warp.registry import TASKS, load_task_module, make_task
 
 README = Path(__file__).parents[1] / "README.md"
 
@@ -9,10 +15,11 @@ README = Path(__file__).parents[1] / "README.md"
 def test_examples_of_the_readme_run_and_the_robot_squats(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     examples = re.findall(r"```python\n(.*?)```", README.read_text(encoding="utf-8"), re.DOTALL)
-    assert len(examples) == 4
+    assert len(examples) == 5
     names = {}
     for example in examples:
-        exec(example, names)
+        if not example.startswith("# my_task.py"):
+            exec(example, names)
     height = names["recorder"].recording().series["base/height [m]"]
     assert len(height) == 60
     # Motors of 17 N m/rad commanded to 1 rad give way under the weight of 14.5 kg, 35.6 N per leg: with the ankle
@@ -22,6 +29,26 @@ def test_examples_of_the_readme_run_and_the_robot_squats(tmp_path, monkeypatch):
     assert (tmp_path / "squat.rrd").stat().st_size > 0
     assert names["step"].reward.shape == (64,)
     assert names["gradient"].shape == (10, 12, 1) and abs(names["gradient"]).max() > 1.0e-4
+
+
+def test_the_task_of_the_readme_pays_a_standing_robot_for_a_level_base(tmp_path, monkeypatch):
+    text = README.read_text(encoding="utf-8")
+    (tmp_path / "my_task.py").write_text(re.search(r"```python\n(# my_task\.py.*?)```", text, re.DOTALL)[1])
+    before = dict(TASKS)
+    monkeypatch.delitem(sys.modules, "my_task", raising=False)
+    try:
+        load_task_module(str(tmp_path / "my_task.py"))
+        task = make_task("level-jump")
+    finally:
+        TASKS.clear()
+        TASKS.update(before)
+        sys.modules.pop("my_task", None)
+    env = Env(task, 4, randomize=False, noise=False, device="cpu")
+    env.evaluation_reset(np.full((4, 1), 0.9))
+    env.step(torch.zeros(4, 12))
+    row = [term.name for term in task.rewards].index("level")
+    # e^0 = 1 of weight 2 over a step of 1/60 s
+    assert env.skills[0].term_value.numpy()[row] == pytest.approx(np.full(4, 2.0 / 60.0), rel=0.05)
 
 
 def test_linked_files_exist():
