@@ -241,7 +241,9 @@ class DifferentiableRollout:
             return target
         safe = self._zeros(target.shape)
         kernel = self.dynamics.modules.command_filter.command_filter_kernel
-        self._launch(kernel, (4, self.num_worlds), [target, q, qd, COORDS, DOFS, self._filter], [safe])
+        self._launch(
+            kernel, (4, self.num_worlds), [target, q, qd, COORDS, DOFS, self.motors.offset, self._filter], [safe]
+        )
         return safe
 
     def _physics(self, target: wp.array, q: wp.array, qd: wp.array, q_out: wp.array, qd_out: wp.array) -> None:

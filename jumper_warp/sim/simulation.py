@@ -152,7 +152,10 @@ class Simulation:
         wp.copy(self._mask, mask, count=self.num_worlds)
 
     def filter_targets(self) -> None:
-        """Run the motor command filter on `target` once; follow with `physics_step`s."""
+        """Run the motor command filter on `target` once, on the angles that the sensors read (`motors.offset`).
+
+        Follow with `physics_step`s. A captured graph may hold the calls.
+        """
         self._captured("filter", self._filter_targets)
 
     def physics_step(self) -> None:
@@ -164,7 +167,10 @@ class Simulation:
         self._physics(self.substeps)
 
     def _captured(self, name: str, body) -> None:
-        """Run a body eagerly the first time, then as a captured graph."""
+        """Run a body eagerly the first time, then as a captured graph; within a capture it becomes part of that."""
+        if self.device.is_capturing:
+            body()
+            return
         if name not in self._graphs:
             body()
             self._graphs[name] = None
@@ -182,7 +188,7 @@ class Simulation:
         self._launch(
             command_filter_kernel,
             (4, self.num_worlds),
-            [self.target, self.state.joint_q, self.state.joint_qd, COORDS, DOFS, self._filter],
+            [self.target, self.state.joint_q, self.state.joint_qd, COORDS, DOFS, self.motors.offset, self._filter],
             [self._safe_target],
         )
 

@@ -95,6 +95,7 @@ def command_filter_kernel(
     joint_qd: wp.array(dtype=real),
     coords_per_world: int,
     dofs_per_world: int,
+    offset: wp.array2d(dtype=real),
     params: FilterParams,
     # out
     safe_target: wp.array2d(dtype=real),
@@ -102,14 +103,16 @@ def command_filter_kernel(
     """Filter the motor targets of every leg. Launch over (4, num_worlds).
 
     raw_target, safe_target [rad]: (12, num_worlds). joint_q, joint_qd: flat over worlds, laid out as Newton's.
+    offset [rad]: what each position sensor reads above the true angle, (12, num_worlds); the filter sees what it reads.
     """
     leg, world = wp.tid()
     lateral, outer, inner = 3 * leg, 3 * leg + 1, 3 * leg + 2
     coord = coords_per_world * world + 7 + 5 * leg
     dof = dofs_per_world * world + 6 + 5 * leg
+    error = vec3(offset[lateral, world], offset[outer, world], offset[inner, world])
     safe = filter_leg(
         vec3(raw_target[lateral, world], raw_target[outer, world], raw_target[inner, world]),
-        vec3(joint_q[coord], joint_q[coord + 1], joint_q[coord + 3]),
+        vec3(joint_q[coord], joint_q[coord + 1], joint_q[coord + 3]) + error,
         vec3(joint_qd[dof], joint_qd[dof + 1], joint_qd[dof + 3]),
         params,
     )

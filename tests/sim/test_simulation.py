@@ -110,6 +110,30 @@ def test_standing_robot_stays_standing_after_a_reset(solver):
     assert sim.joint_q()[:, 2] == pytest.approx(height, abs=0.06)  # it sags on its motors, and no more
 
 
+def test_filter_and_physics_in_a_captured_graph_do_what_single_calls_do():
+    one, held = simulation(2, "jumper"), simulation(2, "jumper")
+    start = one.joint_q()[0, 2]
+
+    def policy_step(sim):
+        sim.filter_targets()
+        for _ in range(sim.substeps):
+            sim.physics_step()
+
+    for sim in (one, held):
+        sim.motors.offset.fill_(0.03)
+        command(sim, 0)
+        policy_step(sim)
+    with wp.ScopedCapture(device=held.device) as capture:
+        policy_step(held)
+    for step in range(1, 6):
+        for sim in (one, held):
+            command(sim, step)
+        policy_step(one)
+        wp.capture_launch(capture.graph)
+        assert np.array_equal(held.joint_q(), one.joint_q()) and np.array_equal(held.joint_qd(), one.joint_qd())
+    assert one.joint_q()[0, 2] < start - 0.05  # it squats
+
+
 @pytest.mark.parametrize("solver", SOLVERS)
 def test_captured_reset_reads_its_mask_at_every_replay(solver):
     sim = simulation(3, solver)

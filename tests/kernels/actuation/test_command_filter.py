@@ -160,11 +160,12 @@ def test_a_greater_command_never_gives_a_smaller_target(raw, pos, vel):
     assert safe[0] <= safe[1] + 1e-3
 
 
-def launch(module, target, q, qd, params, requires_grad=False):
+def launch(module, target, q, qd, params, offset=None, requires_grad=False):
     """Run the filter kernel of either precision; returns the safe targets."""
+    offset = wp.zeros(target.shape, dtype=module.real, device="cpu") if offset is None else offset
     safe = wp.zeros(target.shape, dtype=module.real, device="cpu", requires_grad=requires_grad)
     dim = (4, target.shape[1])
-    wp.launch(module.command_filter_kernel, dim, [target, q, qd, COORDS, DOFS, params], [safe], device="cpu")
+    wp.launch(module.command_filter_kernel, dim, [target, q, qd, COORDS, DOFS, offset, params], [safe], device="cpu")
     return safe
 
 
@@ -175,13 +176,15 @@ def test_kernel_reads_and_writes_every_leg_of_every_world():
     q[:, MOTOR_COORDS] = rng.uniform(-1.0, 3.0, (num_worlds, 12))
     qd[:, MOTOR_DOFS] = rng.uniform(-20.0, 20.0, (num_worlds, 12))
     target = rng.uniform(-2.0, 4.0, (12, num_worlds))
-    arrays = [wp.array(x, dtype=float, device="cpu") for x in (target, q.ravel(), qd.ravel())]
-    safe = launch(command_filter, *arrays, JUMP).numpy()
+    offset = rng.uniform(-0.3, 0.3, (12, num_worlds))  # [rad] of the position sensors
+    arrays = [wp.array(x, dtype=float, device="cpu") for x in (target, q.ravel(), qd.ravel(), offset)]
+    safe = launch(command_filter, *arrays[:3], JUMP, arrays[3]).numpy()
     for world in range(num_worlds):
         for leg in range(4):
             mine = slice(3 * leg, 3 * leg + 3)
             pos, vel = q[world, MOTOR_COORDS][mine], qd[world, MOTOR_DOFS][mine]
-            expected = command_filter.filter_leg(vec3(*target[mine, world]), vec3(*pos), vec3(*vel), JUMP)
+            read = vec3(*(pos + offset[mine, world]))
+            expected = command_filter.filter_leg(vec3(*target[mine, world]), read, vec3(*vel), JUMP)
             np.testing.assert_allclose(safe[mine, world], list(expected), atol=1e-5)
 
 
