@@ -89,7 +89,7 @@ def _check_indices(env: Stages, state: dict[str, torch.Tensor]) -> None:
     """Raise ValueError where a saved number would index an array beyond its ends."""
     longest = (RING - 2) * env.sim.substeps
     bounds = {
-        "env.level": (0, math.inf),
+        "env.level": (0, max(len(skill.task.levels) for skill in env.skills)),
         "env.skill": (0, len(env.skills) - 1),
         "env.clock": (FIRST_CLOCK, math.inf),
         "parameters.latency": (0, longest),

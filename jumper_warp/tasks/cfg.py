@@ -12,7 +12,6 @@ import warp as wp
 from jumper_warp.robot.motors import FilterCfg, MotorCfg
 from jumper_warp.tasks.randomization import RandomizationCfg
 from jumper_warp.tasks.terms import (
-    MOTORS,
     Advance,
     Curriculum,
     EventTerm,
@@ -179,11 +178,6 @@ class TaskCfg:
     def observation_names(self) -> tuple[str, ...]:
         """Names of all columns that the policy sees, in order."""
         return tuple(column for term in self.policy for column in term.columns)
-
-    @property
-    def num_motors(self) -> int:
-        """Entries of an action."""
-        return len(MOTORS)
 
     @property
     def settings_type(self) -> Any:

@@ -188,6 +188,7 @@ def test_a_state_that_does_not_fit_is_refused_and_nothing_changes(change, messag
     ("name", "value", "message"),
     [
         ("env.level", -1, "saved env.level must not be below 0, got -1"),
+        ("env.level", 2**31 - 1, "saved env.level must be at most [1-9], got 2147483647"),
         ("env.skill", 1, "saved env.skill must be at most 0, got 1"),
         ("env.skill", -1, "saved env.skill must not be below 0, got -1"),
         ("env.clock", 0, "saved env.clock must not be below 16, got 0"),
