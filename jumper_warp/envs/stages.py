@@ -12,6 +12,7 @@ from jumper_warp.envs.parameters import robot_parameters
 from jumper_warp.envs.skill import Skill
 from jumper_warp.sim.simulation import Simulation
 from jumper_warp.tasks.cfg import Handover, TaskCfg
+from kernels.mdp import attempts, events
 from kernels.mdp.actions import action_kernel
 from kernels.mdp.env import SkillSettings
 from kernels.mdp.events import AT_RESET, AT_STEP, STARTUP
@@ -116,10 +117,11 @@ class Stages:
         """Begin new episodes where mask is not 0, and commands where they are due."""
         self._draw(mask)
         for skill in self.skills:
+            lanes = attempts.LANES if self.wp_device.is_cuda and skill.task.reset.side_by_side else 1
             self._launch(
-                skill.kernels["reset"], self.num_envs,
-                [skill.index, mask, self._scene, self._settings, skill.settings, skill.levels, self.worlds,
-                 skill.states, self.robot],
+                skill.kernels["reset"], (self.num_envs, lanes),
+                [skill.index, lanes, mask, self._scene, self._settings, skill.settings, skill.levels, self.worlds,
+                 skill.states, self.robot], block_dim=128,
             )  # fmt: skip
         self._forget(mask)
 
@@ -136,9 +138,11 @@ class Stages:
         for skill in self.skills:
             due = [row.term for row in skill.task.rows["events"] if row.term.due_at(stage)]
             if due:
+                lanes = events.LANES if self.wp_device.is_cuda else 1
                 self._launch(
-                    skill.kernels["event"], (skill.num_events, self.num_envs),
-                    [skill.index, stage, mask, self.step_dt, self.worlds, skill.numbers, skill.timer, self.parameters],
+                    skill.kernels["event"], (skill.num_events, lanes, self.num_envs),
+                    [skill.index, stage, lanes, mask, self.step_dt, self.worlds, skill.numbers, skill.timer,
+                     self.parameters], block_dim=256,
                 )  # fmt: skip
             if any(term.options["repack"] for term in due):
                 self.sim.physics.parameters_changed(mask)
@@ -161,9 +165,9 @@ class Stages:
             inputs = [skill.index, self.worlds, skill.columns, skill.numbers, beginning, arrays]
             wp.launch(condition_kernel, (self.num_envs, int(LANES)), inputs, device=self.wp_device)
 
-    def _launch(self, kernel: wp.Kernel, dim: int | tuple[int, ...], inputs: list) -> None:
+    def _launch(self, kernel: wp.Kernel, dim: int | tuple[int, ...], inputs: list, block_dim: int = 32) -> None:
         # small blocks spread a few thousand heavy threads over all multiprocessors
-        wp.launch(kernel, dim=dim, inputs=inputs, device=self.wp_device, block_dim=32)
+        wp.launch(kernel, dim=dim, inputs=inputs, device=self.wp_device, block_dim=block_dim)
 
     def _give(self, mask: wp.array, begins: int, values: np.ndarray, headings: wp.array) -> None:
         values = wp.array(values, dtype=wp.vec4, device=self.wp_device)

@@ -19,9 +19,9 @@ from jumper_warp.utils.errors import InputError
 LINKS = ("housing", "outer_thigh", "outer_shank", "inner_thigh", "inner_shank")
 JOINTS = ("lateral", "outer", "outer_knee", "inner", "inner_knee")
 KERNEL_MODULES = (
-    "actuation.command_filter", "actuation.motors", "dynamics.advance", "dynamics.contact", "dynamics.contact_adjoint",
-    "dynamics.differentiable", "dynamics.parameters", "dynamics.step", "kinematics.full_state", "kinematics.geometry",
-    "layout", "scalar", "state", "terrain.ground",
+    "actuation.command_filter", "actuation.motors", "dynamics.advance", "dynamics.advance_legs", "dynamics.contact",
+    "dynamics.contact_adjoint", "dynamics.differentiable", "dynamics.drive", "dynamics.parameters", "dynamics.step",
+    "kinematics.full_state", "kinematics.geometry", "layout", "scalar", "state", "terrain.ground",
 )  # fmt: skip
 
 
@@ -185,7 +185,7 @@ class JumperDynamics:
     def _workspace(self) -> Any:
         """Return fresh work arrays."""
         scalar, n = self.modules.scalar, self.num_worlds
-        work = self.modules.advance.Workspace()
+        work = self.modules.drive.Workspace()
         work.impulse = wp.zeros((4, n), dtype=scalar.vec3, device=self.device)
         work.contact_force = wp.zeros((4, n), dtype=scalar.vec3, device=self.device)
         work.peak_force = wp.zeros(n, dtype=scalar.real, device=self.device)
@@ -274,7 +274,7 @@ class JumperDynamics:
 
         With `delay` [steps], shape (num_worlds,), the motors follow `previous` until the target arrives.
         """
-        drive = self.modules.advance.Drive()
+        drive = self.modules.drive.Drive()
         drive.joint_f, drive.body_f = joint_f, body_f
         if motors is not None:
             drive.closed_loop, drive.motors, drive.target = 1, motors, target
@@ -282,16 +282,29 @@ class JumperDynamics:
             drive.previous, drive.delay = previous, delay
         return drive
 
-    def advance(self, settings: Any, drive: Any, q: wp.array, qd: wp.array, q_out: wp.array, qd_out: wp.array) -> None:
-        """Advance base and motor coordinates of every world by `settings.substeps` steps, in place if out is in."""
-        wp.launch(
-            self.modules.advance.advance_kernel,
-            dim=self.num_worlds,
-            inputs=[self.robot, settings, drive, q, qd, self.work],
-            outputs=[q_out, qd_out],
-            device=self.device,
-            block_dim=32,
-        )
+    def advance(
+        self,
+        settings: Any,
+        drive: Any,
+        q: wp.array,
+        qd: wp.array,
+        q_out: wp.array,
+        qd_out: wp.array,
+        by_legs: bool | None = None,
+    ) -> None:
+        """Advance base and motor coordinates of every world by `settings.substeps` steps, in place if out is in.
+
+        by_legs: whether a thread has a leg or a world; None: a leg on a GPU, a world on a CPU.
+        """
+        n, inputs, outputs = self.num_worlds, [self.robot, settings, drive, q, qd, self.work], [q_out, qd_out]
+        if by_legs is None:
+            by_legs = self.device.is_cuda
+        if by_legs:
+            kernel, dim, inputs = self.modules.advance_legs.advance_legs_kernel, (-(-n // 8) * 8, 4), [n, *inputs]
+            block = 32 if self.device.is_cuda else 4
+        else:
+            kernel, dim, block = self.modules.advance.advance_kernel, n, 32
+        wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device, block_dim=block)
 
     def full_state(self, q: wp.array, qd: wp.array, body_q: wp.array, body_qd: wp.array) -> None:
         """Write passive and loop joints (into q, qd) and all bodies from the base and motor coordinates."""

@@ -37,6 +37,9 @@ class Reset:
     episode; writes coordinates and rates of `draw.world`."""
     settings: Any = None
     """Frozen dataclass with `struct`, the type of the kernels' settings, and `values(step_dt)`, which makes them."""
+    side_by_side: bool = False
+    """Whether `func` makes attempts `range(draw.lane, number, draw.lanes)`, which threads of a GPU share: they run it
+    with the same arguments but for `draw.lane`, and all that they write otherwise must be the same."""
 
 
 @dataclass(frozen=True)

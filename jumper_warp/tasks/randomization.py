@@ -129,23 +129,24 @@ class RandomizationCfg:
         """Return the rows that are on as events."""
         found = []
 
-        def add(func: Any, pair: Range, scale: float = 1.0) -> None:
+        def add(func: Any, pair: Range, scale: float = 1.0, spread: bool = False) -> None:
             if pair is not None:
-                found.append(EventTerm(func, mode=self.redraw, lower=scale * pair[0], upper=scale * pair[1]))
+                lower, upper = scale * pair[0], scale * pair[1]
+                found.append(EventTerm(func, mode=self.redraw, spread=spread, lower=lower, upper=upper))
 
         add(parameters.base_mass, self.base_mass)
-        add(parameters.link_mass, self.link_mass)
+        add(parameters.link_mass, self.link_mass, spread=True)
         add(parameters.com_shift, self.com_shift)
-        add(parameters.armature, self.armature)
-        add(parameters.motor_friction, self.motor_friction)
-        add(parameters.gains, self.gains)
+        add(parameters.armature, self.armature, spread=True)
+        add(parameters.motor_friction, self.motor_friction, spread=True)
+        add(parameters.gains, self.gains, spread=True)
         if self.no_load_speed or self.cutoff_speed:
             low, high = self.no_load_speed or (1.0, 1.0), self.cutoff_speed or (1.0, 1.0)
             found.append(
-                EventTerm(parameters.speed_limits, mode=self.redraw, no_load_lower=low[0], no_load_upper=low[1],
-                          cutoff_lower=high[0], cutoff_upper=high[1])
+                EventTerm(parameters.speed_limits, mode=self.redraw, spread=True, no_load_lower=low[0],
+                          no_load_upper=low[1], cutoff_lower=high[0], cutoff_upper=high[1])
             )  # fmt: skip
-        add(parameters.joint_offset, self.joint_offset, math.pi / 180.0)
+        add(parameters.joint_offset, self.joint_offset, math.pi / 180.0, spread=True)
         if self.dynamic_friction or self.static_friction:
             dynamic = self.dynamic_friction or (NOMINAL_FRICTION, NOMINAL_FRICTION)
             static = self.static_friction or (0.0, 0.0)  # not below the dynamic one

@@ -176,10 +176,11 @@ class EventTerm(Term):
 
     mode: once at the start ("startup"), at every "reset", or also at "interval"s of `least` to `most` seconds.
     repack: whether the solver must read the model again, as after any but pushes and latencies.
+    spread: whether its loop is one over range(draw.lane, end, draw.lanes), which threads share; not at intervals.
     """
 
     settings: ClassVar = {"least": 0.0, "most": 0.0}
-    options: ClassVar = {"mode": "reset", "repack": True}
+    options: ClassVar = {"mode": "reset", "repack": True, "spread": False}
     takes: ClassVar = (RobotParameters,)
 
     def __init__(self, func: wp.Function, **given: Any) -> None:
@@ -187,6 +188,8 @@ class EventTerm(Term):
         mode, least, most = self.options["mode"], self.numbers["least"], self.numbers["most"]
         if mode not in ("startup", "reset", "interval"):
             raise InputError(f"EventTerm {self.name}: mode must be startup, reset or interval, got {mode!r:.40}")
+        if mode == "interval" and self.options["spread"]:
+            raise InputError(f"EventTerm {self.name}: an event at intervals cannot be spread")
         if mode == "interval" and not 0.0 < least <= most:
             raise InputError(f"EventTerm {self.name}: an interval needs 0 < least <= most [s], got {least}, {most}")
 

@@ -14,7 +14,6 @@ import warp as wp
 
 from ..kinematics.five_bar import five_bar
 from ..kinematics.geometry import LegGeometry
-from ..layout import COORDS
 from ..scalar import mat33, quat, real, vec3
 from ..terrain.ground import Ground, ground_distance, world_ground
 from .distances import segment_box_bound_sq, segment_box_sq, segment_segment_sq, swell
@@ -276,10 +275,10 @@ def world_collisions(
 ) -> Collisions:
     """Return the contacts that must not exist and the smallest distance [m] of one robot, at most `margin`.
 
-    geometry: the four legs. joint_q: base position [m] and quaternion xyzw, then five coordinates a leg [rad], from
-    index `start`, from which the world with its block follows. margin: distances [m] above it (>= 0) are not resolved,
-    and with 0 only the flags mean anything: a small margin is fast. A state that is not finite raises no dependable
-    flag.
+    geometry: the four legs. ground: of the robot's world, see `world_ground`. joint_q: base position [m] and
+    quaternion xyzw, then five coordinates a leg [rad], from index `start`. margin: distances [m] above it (>= 0) are
+    not resolved, and with 0 only the flags mean anything: a small margin is fast. A state that is not finite raises no
+    dependable flag.
     """
     pos = vec3(real(joint_q[start]), real(joint_q[start + 1]), real(joint_q[start + 2]))
     rotation = wp.quat_to_matrix(
@@ -287,34 +286,31 @@ def world_collisions(
     )
     found = Collisions()
     found.clearance = margin
-    here = world_ground(ground, start // COORDS)
-    found = record(found, body_ground_distance(here, pos, rotation), BODY_GROUND)
+    found = record(found, body_ground_distance(ground, pos, rotation), BODY_GROUND)
     leg = load_leg(geometry, joint_q, start, 0)
     count = wp.int32(4)
     for turn in range(count):
         neighbour = load_leg(geometry, joint_q, start, next_leg(turn + 1))
-        found = add_leg(found, here, leg, neighbour, pos, rotation)
+        found = add_leg(found, ground, leg, neighbour, pos, rotation)
         leg = neighbour
     return found
 
 
 @wp.func
 def leg_collisions(
-    geometry: wp.array(dtype=LegGeometry), ground: Ground, joint_q: wp.array(dtype=wp.float32), world: int, turn: int
+    geometry: wp.array(dtype=LegGeometry), ground: Ground, joint_q: wp.array(dtype=wp.float32), start: int, turn: int
 ) -> int:
     """Return the flags of one leg, counted around the body; together the four give those of `world_collisions`."""
-    start = world * COORDS
     pos = vec3(real(joint_q[start]), real(joint_q[start + 1]), real(joint_q[start + 2]))
     rotation = wp.quat_to_matrix(
         quat(real(joint_q[start + 3]), real(joint_q[start + 4]), real(joint_q[start + 5]), real(joint_q[start + 6]))
     )
     found = Collisions()
-    here = world_ground(ground, world)
     if turn == 0:
-        found = record(found, body_ground_distance(here, pos, rotation), BODY_GROUND)
+        found = record(found, body_ground_distance(ground, pos, rotation), BODY_GROUND)
     leg = load_leg(geometry, joint_q, start, next_leg(turn))
     neighbour = load_leg(geometry, joint_q, start, next_leg(turn + 1))
-    return add_leg(found, here, leg, neighbour, pos, rotation).flags
+    return add_leg(found, ground, leg, neighbour, pos, rotation).flags
 
 
 @wp.kernel
@@ -331,6 +327,7 @@ def collision_kernel(
 ):
     """Check one world per thread; see `world_collisions`. joint_q: Newton's, flat, `coords_per_world` a world."""
     world = wp.tid()
-    found = world_collisions(geometry, ground, joint_q, world * coords_per_world, margin)
+    here = world_ground(ground, world)
+    found = world_collisions(geometry, here, joint_q, world * coords_per_world, margin)
     flags[world] = found.flags
     clearance[world] = wp.float32(found.clearance)

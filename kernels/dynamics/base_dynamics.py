@@ -3,7 +3,7 @@
 import warp as wp
 
 from ..scalar import mat33, vec3
-from .inertia import MassMoments, inertia_matrix, inertia_mul, skew
+from .inertia import MassMoments, inertia_matrix, inertia_mul, inverse_symmetric, skew
 from .leg_dynamics import LegDynamics
 
 
@@ -41,7 +41,7 @@ class BaseInverse:
 def eliminate_leg(leg: LegDynamics, implicit: mat33, torque: vec3) -> LegSolve:
     """Return the leg's elimination; implicit: addition to D [kg m^2]; torque: motor-space torque [N m]."""
     solve = LegSolve()
-    inverse = wp.inverse(leg.inertia + implicit)
+    inverse = inverse_symmetric(leg.inertia + implicit)
     solve.inverse = inverse
     solve.free = inverse * (torque - leg.bias_torque)
     solve.to_lin = inverse * wp.transpose(leg.coupling_lin)
@@ -80,10 +80,10 @@ def add_leg(system: BaseSystem, leg: LegDynamics, solve: LegSolve) -> BaseSystem
 @wp.func
 def invert(system: BaseSystem) -> BaseInverse:
     """Return the inverse of a symmetric positive definite system by block elimination."""
-    lin_inv = wp.inverse(system.lin)
+    lin_inv = inverse_symmetric(system.lin)
     across = lin_inv * system.cross
     inverse = BaseInverse()
-    ang = wp.inverse(system.ang - wp.transpose(system.cross) * across)
+    ang = inverse_symmetric(system.ang - wp.transpose(system.cross) * across)
     cross = -across * ang
     inverse.ang = ang
     inverse.cross = cross

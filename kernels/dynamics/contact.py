@@ -142,15 +142,21 @@ def local_impulse(c: PawContact, impulse: vec3, velocity: vec3) -> vec3:
 
 
 @wp.func
-def block_velocity(block: BlockLaw, contacts: wp.array(dtype=PawContact)) -> vec3:
-    """Return the block's velocity [m/s] at the end of the step, pushed by the paws and slowed by the floor.
-
-    Coulomb friction under the weight and the paws' load takes speed off, and never more than there is.
-    """
+def push_on_block(contacts: wp.array(dtype=PawContact)) -> vec3:
+    """Return the impulse [N s] of the paws on the block."""
     push = vec3(real(0.0))
     for k in range(contacts.shape[0]):
         if contacts[k].on_block != 0:
             push -= contacts[k].impulse
+    return push
+
+
+@wp.func
+def block_velocity(block: BlockLaw, push: vec3) -> vec3:
+    """Return the block's velocity [m/s] at the end of the step, pushed by the paws [N s] and slowed by the floor.
+
+    Coulomb friction under the weight and the paws' load takes speed off, and never more than there is.
+    """
     upward = wp.dot(push, block.up)
     free = block.velocity + (push - upward * block.up) / block.mass
     loss = block.friction * wp.max(block.weight - upward, real(0.0)) / block.mass
@@ -161,7 +167,7 @@ def block_velocity(block: BlockLaw, contacts: wp.array(dtype=PawContact)) -> vec
 
 
 @wp.func
-def on_block(contact: PawContact, block: BlockLaw) -> PawContact:
+def add_block(contact: PawContact, block: BlockLaw) -> PawContact:
     """Return a contact with the block, whose response to impulses includes the block's."""
     c = contact
     c.on_block = 1
@@ -191,7 +197,7 @@ def sweep_contacts(contacts: wp.array(dtype=PawContact), block: BlockLaw, state:
             c = contacts[k]
             velocity = c.free + c.from_lin * s.lin + c.from_ang * s.ang + c.own * c.impulse
             if c.on_block != 0:
-                velocity -= block_velocity(block, contacts)
+                velocity -= block_velocity(block, push_on_block(contacts))
             impulse = local_impulse(c, c.impulse, velocity)
             step = impulse - c.impulse
             contacts[k].impulse = impulse

@@ -31,7 +31,7 @@ from .base_dynamics import (
 from .base_motion import external_wrench, moved_base
 from .contact import SEPARATE, SLIDE, contact_jacobian, target_normal_velocity
 from .inertia import inertia_matrix, skew
-from .leg_dynamics import PawKinematics, leg_dynamics, leg_five_bar, paw_kinematics
+from .leg_dynamics import PawKinematics, leg_dynamics, leg_pose, paw_kinematics
 from .parameters import load_joint_params, load_masses, load_moments, load_vec3
 
 
@@ -123,13 +123,13 @@ def legs_kernel(
     angles = load_motors(joint_q, leg_coord(world, k))
     rates = load_motors(joint_qd, leg_dof(world, k))
     g = wp.quat_rotate_inv(base.quat, load_vec3(table, GRAVITY, world))
-    loop = leg_five_bar(geo, angles)
-    leg = leg_dynamics(geo, load_masses(table, k, world), loop, angles, rates, base.ang, g)
+    pose = leg_pose(geo, angles)
+    leg = leg_dynamics(geo, load_masses(table, k, world), pose, rates, base.ang, g)
     params = load_joint_params(table, k, world)
-    passive = joint_forces(params, loop, geo.front, angles, rates, dt)
+    passive = joint_forces(params, pose.loop, geo.front, angles, rates, dt)
     torque = load_motors(joint_f, leg_dof(world, k)) + passive.torque
     solve = eliminate_leg(leg, passive.inertia + wp.diag(params.armature), torque)
-    paw = paw_kinematics(geo, loop, wp.cos(angles[0]), geo.side * wp.sin(angles[0]))
+    paw = paw_kinematics(geo, pose)
     legs.inverse[k, world] = solve.inverse
     legs.free[k, world] = solve.free
     legs.to_lin[k, world] = solve.to_lin

@@ -6,7 +6,7 @@ without case distinctions, and the inertia tensor is trace(S) 1 - S.
 
 import warp as wp
 
-from ..scalar import mat33, real, vec3, vec6
+from ..scalar import mat33, real, vec2, vec3, vec5, vec6
 
 
 @wp.struct
@@ -31,6 +31,16 @@ def mul(s: vec6, v: vec3) -> vec3:
         s[0] * v[0] + s[3] * v[1] + s[4] * v[2],
         s[3] * v[0] + s[1] * v[1] + s[5] * v[2],
         s[4] * v[0] + s[5] * v[1] + s[2] * v[2],
+    )
+
+
+@wp.func
+def mul_plane(s: vec5, v: vec3) -> vec3:
+    """Return S v for packed second moments without yy: xx zz xy xz yz."""
+    return vec3(
+        s[0] * v[0] + s[2] * v[1] + s[3] * v[2],
+        s[2] * v[0] + s[4] * v[2],
+        s[3] * v[0] + s[4] * v[1] + s[1] * v[2],
     )
 
 
@@ -111,7 +121,35 @@ def rotate_x_second(m: vec6, c: real, s: real) -> vec6:
 
 
 @wp.func
+def rotate_x_plane(v: vec2, c: real, s: real) -> vec3:
+    """Return (v_x, 0, v_z) turned about x."""
+    return vec3(v[0], -s * v[1], c * v[1])
+
+
+@wp.func
 def skew(v: vec3) -> mat33:
     """Return [v]x, with [v]x u = v x u."""
     zero = real(0.0)
     return mat33(zero, -v[2], v[1], v[2], zero, -v[0], -v[1], v[0], zero)
+
+
+@wp.func
+def symmetric(xx: real, xy: real, xz: real, yy: real, yz: real, zz: real) -> mat33:
+    """Return the symmetric matrix with this upper triangle."""
+    return mat33(xx, xy, xz, xy, yy, yz, xz, yz, zz)
+
+
+@wp.func
+def inverse_symmetric(m: mat33) -> mat33:
+    """Return the inverse of a symmetric matrix, zero for a singular one; only the upper triangle is read."""
+    xx = m[1, 1] * m[2, 2] - m[1, 2] * m[1, 2]
+    xy = m[0, 2] * m[1, 2] - m[0, 1] * m[2, 2]
+    xz = m[0, 1] * m[1, 2] - m[0, 2] * m[1, 1]
+    det = m[0, 0] * xx + m[0, 1] * xy + m[0, 2] * xz
+    scale = real(0.0)
+    if det != real(0.0):
+        scale = real(1.0) / det
+    yy = m[0, 0] * m[2, 2] - m[0, 2] * m[0, 2]
+    yz = m[0, 1] * m[0, 2] - m[0, 0] * m[1, 2]
+    zz = m[0, 0] * m[1, 1] - m[0, 1] * m[0, 1]
+    return symmetric(scale * xx, scale * xy, scale * xz, scale * yy, scale * yz, scale * zz)

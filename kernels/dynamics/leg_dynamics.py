@@ -11,19 +11,20 @@ All vectors are in body axes, about the base origin.
 
 import warp as wp
 
-from ..kinematics.five_bar import FiveBar, five_bar, five_bar_bias, in_plane
+from ..kinematics.five_bar import FiveBar, five_bar, five_bar_bias
 from ..kinematics.geometry import LegGeometry
-from ..scalar import mat33, real, vec3, vec6
+from ..kinematics.trig import sin_cos
+from ..scalar import mat33, real, vec2, vec3, vec5
 from .inertia import (
     MassMoments,
     inertia_mul,
-    mul,
+    mul_plane,
     rotate_x,
+    rotate_x_plane,
     rotate_x_second,
     sym_outer,
-    trace,
 )
-from .leg_links import LinkSums, add_sums, inner_sums, outer_sums
+from .leg_links import LinkSums, inner_sums, leg_sums, outer_sums
 
 
 @wp.struct
@@ -35,6 +36,15 @@ class LegMasses:
     outer_shank: MassMoments
     inner_thigh: MassMoments
     inner_shank: MassMoments
+
+
+@wp.struct
+class LegPose:
+    """Where a leg is: the five-bar in the housing, and the housing's rotation about body x."""
+
+    loop: FiveBar
+    cosine: real
+    sine: real
 
 
 @wp.struct
@@ -60,42 +70,45 @@ class PawKinematics:
 
 
 @wp.func
+def leg_pose(geo: LegGeometry, angles: vec3) -> LegPose:
+    """Return a leg's pose for its motor angles [rad]: lateral, outer, inner."""
+    turn = sin_cos(angles[0])
+    pose = LegPose()
+    pose.loop = five_bar(geo, angles[1], angles[2])
+    pose.cosine = turn[1]
+    pose.sine = geo.side * turn[0]
+    return pose
+
+
+@wp.func
 def columns(a: vec3, b: vec3, c: vec3) -> mat33:
     """Return the matrix with columns a, b, c."""
     return mat33(a[0], b[0], c[0], a[1], b[1], c[1], a[2], b[2], c[2])
 
 
 @wp.func
-def paw_kinematics(geo: LegGeometry, loop: FiveBar, cosine: real, sine: real) -> PawKinematics:
-    """Return the paw's position and maps; cosine and sine are those of the housing's rotation about body x."""
+def paw_kinematics(geo: LegGeometry, pose: LegPose) -> PawKinematics:
+    """Return the paw's position and maps."""
+    loop, cosine, sine = pose.loop, pose.cosine, pose.sine
     zero = real(0.0)
-    ankle = in_plane(loop.ankle, geo.plane_y + geo.knee_y)
+    y = geo.plane_y + geo.knee_y
+    x, z = loop.ankle[0], loop.ankle[1]
     paw = PawKinematics()
-    paw.position = geo.hip + rotate_x(ankle, cosine, sine)
+    paw.position = geo.hip + rotate_x(vec3(x, y, z), cosine, sine)
     paw.jacobian = columns(
-        rotate_x(vec3(zero, -geo.side * ankle[2], geo.side * ankle[1]), cosine, sine),
-        rotate_x(in_plane(loop.ankle_do, zero), cosine, sine),
-        rotate_x(in_plane(loop.ankle_di, zero), cosine, sine),
+        geo.side * vec3(zero, -(sine * y + cosine * z), cosine * y - sine * z),
+        rotate_x_plane(loop.ankle_do, cosine, sine),
+        rotate_x_plane(loop.ankle_di, cosine, sine),
     )
-    pitch = rotate_x(vec3(zero, real(1.0), zero), cosine, sine)
+    pitch = vec3(zero, cosine, sine)
     paw.spin = columns(vec3(geo.side, zero, zero), loop.inner_shank_do * pitch, loop.inner_shank_di * pitch)
     return paw
 
 
 @wp.func
-def housing_sums(housing: MassMoments) -> LinkSums:
-    """Return the sums of the housing, which does not move in its own frame."""
-    sums = LinkSums()
-    sums.mass = housing.mass
-    sums.first = housing.first
-    sums.second = housing.second
-    return sums
-
-
-@wp.func
-def centrifugal(second_j: vec6, w: vec3) -> real:
+def centrifugal(second_j: vec5, w: vec3) -> real:
     """Return 1/2 w^T (dI/dq_j) w, the centrifugal force on motor j [N m]."""
-    return real(0.5) * (trace(second_j) * wp.dot(w, w) - wp.dot(w, mul(second_j, w)))
+    return real(0.5) * ((second_j[0] + second_j[1]) * wp.dot(w, w) - wp.dot(w, mul_plane(second_j, w)))
 
 
 @wp.func
@@ -108,39 +121,44 @@ def assemble_leg(
     """
     zero = real(0.0)
     lateral_rate = geo.side * rates[0]
-    lateral_axis = vec3(geo.side, zero, zero)
     omega_m = rotate_x(omega, cosine, -sine)  # of the base, in housing axes
     w = omega_m + vec3(lateral_rate, zero, zero)  # of the housing
     w_acc = vec3(zero, omega_m[2] * lateral_rate, -omega_m[1] * lateral_rate)
     hip_acc = rotate_x(wp.cross(omega, wp.cross(omega, geo.hip)) - g, cosine, -sine)
+    hip_plane = vec2(hip_acc[0], hip_acc[2])
 
     lin_rel = rates[1] * sums.lin_o + rates[2] * sums.lin_i
     ang_rel = rates[1] * sums.ang_o + rates[2] * sums.ang_i
     second_rate = rates[1] * sums.second_o + rates[2] * sums.second_i
-    w_first = wp.cross(w, sums.first)
+    swing = wp.cross(w, sums.first) + real(2.0) * vec3(lin_rel[0], zero, lin_rel[1])
     force = (
-        sums.mass * hip_acc + wp.cross(w_acc, sums.first) + wp.cross(w, w_first + real(2.0) * lin_rel) + sums.lin_acc
+        sums.mass * hip_acc
+        + wp.cross(w_acc, sums.first)
+        + wp.cross(w, swing)
+        + vec3(sums.lin_acc[0], zero, sums.lin_acc[1])
     )
     moment = (
         wp.cross(sums.first, hip_acc)
         + inertia_mul(sums.second, w_acc)
         + wp.cross(w, inertia_mul(sums.second, w) + ang_rel)
-        + inertia_mul(second_rate, w)
+        + (second_rate[0] + second_rate[1]) * w
+        - mul_plane(second_rate, w)
         + sums.ang_acc
     )
     swirl = w[1] * sums.coriolis
-    lateral_ang = inertia_mul(sums.second, lateral_axis)
-    lateral_lin = wp.cross(lateral_axis, sums.first)
+    second = sums.second
+    lateral_ang = geo.side * vec3(second[1] + second[2], -second[3], -second[4])  # of a unit rate about x
+    lateral_lin = geo.side * vec3(zero, -sums.first[2], sums.first[1])
 
     leg = LegDynamics()
     leg.bias_torque = vec3(
         geo.side * moment[0],
-        wp.dot(sums.lin_o, hip_acc)
+        wp.dot(sums.lin_o, hip_plane)
         + wp.dot(sums.ang_o, w_acc)
         - centrifugal(sums.second_o, w)
         + swirl * rates[2]
         + sums.bias_o,
-        wp.dot(sums.lin_i, hip_acc)
+        wp.dot(sums.lin_i, hip_plane)
         + wp.dot(sums.ang_i, w_acc)
         - centrifugal(sums.second_i, w)
         - swirl * rates[1]
@@ -153,8 +171,8 @@ def assemble_leg(
     )
     # to body axes, about the base origin
     lin_l = rotate_x(lateral_lin, cosine, sine)
-    lin_o = rotate_x(sums.lin_o, cosine, sine)
-    lin_i = rotate_x(sums.lin_i, cosine, sine)
+    lin_o = rotate_x_plane(sums.lin_o, cosine, sine)
+    lin_i = rotate_x_plane(sums.lin_i, cosine, sine)
     leg.coupling_lin = columns(lin_l, lin_o, lin_i)
     leg.coupling_ang = columns(
         rotate_x(lateral_ang, cosine, sine) + wp.cross(geo.hip, lin_l),
@@ -177,26 +195,14 @@ def assemble_leg(
 
 
 @wp.func
-def leg_dynamics(
-    geo: LegGeometry, masses: LegMasses, loop: FiveBar, angles: vec3, rates: vec3, omega: vec3, g: vec3
-) -> LegDynamics:
+def leg_dynamics(geo: LegGeometry, masses: LegMasses, pose: LegPose, rates: vec3, omega: vec3, g: vec3) -> LegDynamics:
     """Return the dynamics of one leg.
 
-    angles, rates: of the lateral, outer and inner motor [rad], [rad/s]; omega: base angular velocity [rad/s];
-    g: gravity [m/s^2]; both in body axes.
+    rates: of the lateral, outer and inner motor [rad/s]; omega: base angular velocity [rad/s]; g: gravity [m/s^2];
+    both in body axes.
     """
-    bias = five_bar_bias(geo, loop, rates[1], rates[2])
-    sums = add_sums(
-        add_sums(
-            housing_sums(masses.housing),
-            outer_sums(geo, masses.outer_thigh, masses.outer_shank, loop, bias, angles[1]),
-        ),
-        inner_sums(geo, masses.inner_thigh, masses.inner_shank, loop, bias, angles[2]),
-    )
-    return assemble_leg(geo, sums, wp.cos(angles[0]), geo.side * wp.sin(angles[0]), rates, omega, g)
-
-
-@wp.func
-def leg_five_bar(geo: LegGeometry, angles: vec3) -> FiveBar:
-    """Return the five-bar configuration for the three motor angles of a leg [rad]."""
-    return five_bar(geo, angles[1], angles[2])
+    bias = five_bar_bias(geo, pose.loop, rates[1], rates[2])
+    outer = outer_sums(geo, masses.outer_thigh, masses.outer_shank, pose.loop, bias)
+    inner = inner_sums(geo, masses.inner_thigh, masses.inner_shank, pose.loop, bias)
+    sums = leg_sums(masses.housing, outer, inner)
+    return assemble_leg(geo, sums, pose.cosine, pose.sine, rates, omega, g)

@@ -3,74 +3,55 @@
 Each sum is an integral over the mass of a link of products of position r (about the hip) and its derivatives
 r_o, r_i with respect to the outer and inner motor angle. From them follow the leg's kinetic energy and, with
 Lagrange's equations, every inertial coupling and velocity-product force (`leg_dynamics`).
+
+The links move in the five-bar's plane, so derivatives of r and accelerations have no y: they are kept as (x, z).
 """
 
 import warp as wp
 
-from ..kinematics.five_bar import FiveBar, FiveBarBias, in_plane
+from ..kinematics.five_bar import FiveBar, FiveBarBias
 from ..kinematics.geometry import LegGeometry
-from ..scalar import real, vec2, vec3, vec6
+from ..scalar import real, vec2, vec3, vec5, vec6
 from .inertia import MassMoments, rotate_y, rotate_y_second, sym_outer
 
 
 @wp.struct
 class LinkSums:
-    """Integrals over link mass; subscripts o and i mean derivatives by the outer and inner motor angle."""
+    """Integrals over link mass; subscripts o and i mean derivatives by the outer and inner motor angle.
+
+    Of a link or of a side of the leg, o is the motor of its own side and i the other; `leg_sums` tells them apart.
+    """
 
     mass: real  # of 1
     first: vec3  # of r
     second: vec6  # of r r^T
-    second_o: vec6  # of r_o r^T + r r_o^T
-    second_i: vec6
-    lin_o: vec3  # of r_o: linear momentum per motor rate
-    lin_i: vec3
+    second_o: vec5  # of r_o r^T + r r_o^T: xx zz xy xz yz
+    second_i: vec5
+    lin_o: vec2  # of r_o: linear momentum per motor rate
+    lin_i: vec2
     ang_o: vec3  # of r x r_o: angular momentum about the hip per motor rate
     ang_i: vec3
     inertia_oo: real  # of r_o . r_o
     inertia_oi: real
     inertia_ii: real
     coriolis: real  # y component of 2 r_i x r_o
-    lin_acc: vec3  # of the acceleration while motor accelerations are zero
+    lin_acc: vec2  # of the acceleration while motor accelerations are zero
     ang_acc: vec3  # of r x that acceleration
     bias_o: real  # of r_o . that acceleration
     bias_i: real
 
 
 @wp.func
-def add_sums(a: LinkSums, b: LinkSums) -> LinkSums:
-    """Return the sums over both mass distributions."""
-    c = LinkSums()
-    c.mass = a.mass + b.mass
-    c.first = a.first + b.first
-    c.second = a.second + b.second
-    c.second_o = a.second_o + b.second_o
-    c.second_i = a.second_i + b.second_i
-    c.lin_o = a.lin_o + b.lin_o
-    c.lin_i = a.lin_i + b.lin_i
-    c.ang_o = a.ang_o + b.ang_o
-    c.ang_i = a.ang_i + b.ang_i
-    c.inertia_oo = a.inertia_oo + b.inertia_oo
-    c.inertia_oi = a.inertia_oi + b.inertia_oi
-    c.inertia_ii = a.inertia_ii + b.inertia_ii
-    c.coriolis = a.coriolis + b.coriolis
-    c.lin_acc = a.lin_acc + b.lin_acc
-    c.ang_acc = a.ang_acc + b.ang_acc
-    c.bias_o = a.bias_o + b.bias_o
-    c.bias_i = a.bias_i + b.bias_i
-    return c
+def turn_y(v: vec3) -> vec2:
+    """Return x and z of e_y x v."""
+    return vec2(v[2], -v[0])
 
 
 @wp.func
-def turn_y(v: vec3) -> vec3:
-    """Return e_y x v."""
-    return vec3(v[2], real(0.0), -v[0])
-
-
-@wp.func
-def turn_y_second(s: vec6) -> vec6:
+def turn_y_second(s: vec6) -> vec5:
     """Return the derivative of packed second moments by a rotation about y."""
     two = real(2.0)
-    return vec6(two * s[4], real(0.0), -two * s[4], s[5], s[2] - s[0], -s[3])
+    return vec5(two * s[4], -two * s[4], s[5], s[2] - s[0], -s[3])
 
 
 @wp.func
@@ -80,19 +61,31 @@ def spin_y(s: vec6) -> vec3:
 
 
 @wp.func
+def cross_plane(a: vec3, b: vec2) -> vec3:
+    """Return a x (b_x, 0, b_z)."""
+    return vec3(a[1] * b[1], a[2] * b[0] - a[0] * b[1], -a[1] * b[0])
+
+
+@wp.func
+def sym_outer_plane(a: vec2, b: vec3) -> vec5:
+    """Return a b^T + b a^T for a in the plane: xx zz xy xz yz."""
+    two = real(2.0)
+    return vec5(two * a[0] * b[0], two * a[1] * b[2], a[0] * b[1], a[0] * b[2] + a[1] * b[0], a[1] * b[1])
+
+
+@wp.func
 def shank_sums(
     link: MassMoments,
     knee: vec3,
     direction: vec2,
-    knee_do: vec3,
-    knee_di: vec3,
+    knee_do: vec2,
     turn_do: real,
     turn_di: real,
     rate: real,
-    knee_acc: vec3,
+    knee_acc: vec2,
     turn_acc: real,
 ) -> LinkSums:
-    """Return the sums of a shank whose frame sits at the knee and turns about y."""
+    """Return the sums of a shank whose frame sits at the knee of its own side and turns about y."""
     # a shank hanging along -z has direction (0, -1): its rotation has sine -x and cosine -z
     u = rotate_y(link.first, -direction[1], -direction[0])
     s = rotate_y_second(link.second, -direction[1], -direction[0])
@@ -103,113 +96,119 @@ def shank_sums(
     u_o = turn_do * u_turned
     u_i = turn_di * u_turned
     planar = s[0] + s[2]
-    u_acc = turn_acc * u_turned - rate * rate * vec3(u[0], real(0.0), u[2])
+    u_acc = turn_acc * u_turned - rate * rate * vec2(u[0], u[2])
 
     sums = LinkSums()
     sums.mass = link.mass
     sums.first = first
     sums.second = real(0.5) * link.mass * sym_outer(knee, knee) + sym_outer(knee, u) + s
-    sums.second_o = sym_outer(knee_do, first) + sym_outer(u_o, knee) + turn_do * s_turned
-    sums.second_i = sym_outer(knee_di, first) + sym_outer(u_i, knee) + turn_di * s_turned
+    sums.second_o = sym_outer_plane(knee_do, first) + sym_outer_plane(u_o, knee) + turn_do * s_turned
+    sums.second_i = sym_outer_plane(u_i, knee) + turn_di * s_turned
     sums.lin_o = link.mass * knee_do + u_o
-    sums.lin_i = link.mass * knee_di + u_i
-    sums.ang_o = wp.cross(first, knee_do) + wp.cross(knee, u_o) + turn_do * spin
-    sums.ang_i = wp.cross(first, knee_di) + wp.cross(knee, u_i) + turn_di * spin
+    sums.lin_i = u_i
+    sums.ang_o = cross_plane(first, knee_do) + cross_plane(knee, u_o) + turn_do * spin
+    sums.ang_i = cross_plane(knee, u_i) + turn_di * spin
     sums.inertia_oo = wp.dot(knee_do, sums.lin_o) + wp.dot(knee_do, u_o) + turn_do * turn_do * planar
-    sums.inertia_oi = wp.dot(knee_do, sums.lin_i) + wp.dot(knee_di, u_o) + turn_do * turn_di * planar
-    sums.inertia_ii = wp.dot(knee_di, sums.lin_i) + wp.dot(knee_di, u_i) + turn_di * turn_di * planar
-    across = wp.cross(sums.lin_i, knee_do) + wp.cross(knee_di, u_o)
-    sums.coriolis = real(2.0) * across[1]
+    sums.inertia_oi = wp.dot(knee_do, u_i) + turn_do * turn_di * planar
+    sums.inertia_ii = turn_di * turn_di * planar
+    sums.coriolis = real(2.0) * (u_i[1] * knee_do[0] - u_i[0] * knee_do[1])
     sums.lin_acc = link.mass * knee_acc + u_acc
     sums.ang_acc = (
-        wp.cross(first, knee_acc) + wp.cross(knee, u_acc) + turn_acc * spin - rate * rate * vec3(s[5], real(0.0), -s[3])
+        cross_plane(first, knee_acc)
+        + cross_plane(knee, u_acc)
+        + turn_acc * spin
+        - rate * rate * vec3(s[5], real(0.0), -s[3])
     )
     sums.bias_o = wp.dot(knee_do, sums.lin_acc) + wp.dot(u_o, knee_acc) + turn_do * turn_acc * planar
-    sums.bias_i = wp.dot(knee_di, sums.lin_acc) + wp.dot(u_i, knee_acc) + turn_di * turn_acc * planar
+    sums.bias_i = wp.dot(u_i, knee_acc) + turn_di * turn_acc * planar
     return sums
 
 
 @wp.func
-def thigh_sums(link: MassMoments, axis: vec3, cosine: real, sine: real, rate: real, turn: real) -> LinkSums:
-    """Return the sums of a thigh that turns about its fixed transversal axis by `turn` (-1 or +1) per motor angle.
+def add_thigh(
+    shank: LinkSums, link: MassMoments, axis: vec2, cosine: real, sine: real, rate: real, turn: real
+) -> LinkSums:
+    """Return a shank's sums with those of the thigh above it.
 
-    The derivatives by its own motor are put into the `o` fields; `as_inner` moves them.
+    The thigh turns about its transversal axis, at x and y `axis` [m], z = 0, by `turn` (-1 or +1) per angle of its own
+    motor.
     """
     u = rotate_y(link.first, cosine, sine)
     s = rotate_y_second(link.second, cosine, sine)
-    u_own = turn * turn_y(u)
-    u_acc = -rate * rate * vec3(u[0], real(0.0), u[2])
+    x, y = axis[0], axis[1]
+    u_o = turn * turn_y(u)
+    u_acc = -rate * rate * vec2(u[0], u[2])
+    two = real(2.0)
+    along_x = two * u[0] + link.mass * x
 
-    sums = LinkSums()
-    sums.mass = link.mass
-    sums.first = link.mass * axis + u
-    sums.second = real(0.5) * link.mass * sym_outer(axis, axis) + sym_outer(axis, u) + s
-    sums.second_o = sym_outer(u_own, axis) + turn * turn_y_second(s)
-    sums.lin_o = u_own
-    sums.ang_o = wp.cross(axis, u_own) + turn * spin_y(s)
-    sums.inertia_oo = s[0] + s[2]
-    sums.lin_acc = u_acc
-    sums.ang_acc = wp.cross(axis, u_acc) - rate * rate * vec3(s[5], real(0.0), -s[3])
+    sums = shank
+    sums.mass += link.mass
+    sums.first += vec3(link.mass * x + u[0], link.mass * y + u[1], u[2])
+    sums.second += (
+        vec6(
+            x * along_x,
+            y * (two * u[1] + link.mass * y),
+            real(0.0),
+            x * u[1] + y * u[0] + link.mass * x * y,
+            x * u[2],
+            y * u[2],
+        )
+        + s
+    )
+    sums.second_o += vec5(two * u_o[0] * x, real(0.0), u_o[0] * y, u_o[1] * x, u_o[1] * y) + turn * turn_y_second(s)
+    sums.lin_o += u_o
+    sums.ang_o += vec3(y * u_o[1], -x * u_o[1], -y * u_o[0]) + turn * spin_y(s)
+    sums.inertia_oo += s[0] + s[2]
+    sums.lin_acc += u_acc
+    sums.ang_acc += vec3(y * u_acc[1] - rate * rate * s[5], -x * u_acc[1], rate * rate * s[3] - y * u_acc[0])
     return sums
 
 
 @wp.func
-def as_inner(a: LinkSums) -> LinkSums:
-    """Return a thigh's sums with the derivatives of its own motor in the inner fields."""
-    b = LinkSums()
-    b.mass = a.mass
-    b.first = a.first
-    b.second = a.second
-    b.second_i = a.second_o
-    b.lin_i = a.lin_o
-    b.ang_i = a.ang_o
-    b.inertia_ii = a.inertia_oo
-    b.lin_acc = a.lin_acc
-    b.ang_acc = a.ang_acc
-    return b
-
-
-@wp.func
-def outer_sums(
-    geo: LegGeometry, thigh: MassMoments, shank: MassMoments, loop: FiveBar, bias: FiveBarBias, angle: real
-) -> LinkSums:
+def outer_sums(geo: LegGeometry, thigh: MassMoments, shank: MassMoments, loop: FiveBar, bias: FiveBarBias) -> LinkSums:
     """Return the sums of the outer thigh and shank."""
-    zero = real(0.0)
-    axis = vec3(geo.outer_x, geo.plane_y, zero)
-    thigh_part = thigh_sums(thigh, axis, wp.cos(angle), -geo.front * wp.sin(angle), bias.outer_thigh_rate, -geo.front)
-    shank_part = shank_sums(
-        shank,
-        in_plane(loop.outer_knee, geo.plane_y + geo.knee_y),
-        loop.outer_shank,
-        in_plane(loop.outer_knee_do, zero),
-        vec3(zero),
-        loop.outer_shank_do,
-        loop.outer_shank_di,
-        bias.outer_shank_rate,
-        in_plane(bias.outer_knee_acc, zero),
-        bias.outer_shank_acc,
-    )
-    return add_sums(thigh_part, shank_part)
+    turn = loop.outer_turn
+    knee = vec3(loop.outer_knee[0], geo.plane_y + geo.knee_y, loop.outer_knee[1])
+    below = shank_sums(
+        shank, knee, loop.outer_shank, loop.outer_knee_do, loop.outer_shank_do, loop.outer_shank_di,
+        bias.outer_shank_rate, bias.outer_knee_acc, bias.outer_shank_acc,
+    )  # fmt: skip
+    axis = vec2(geo.outer_x, geo.plane_y)
+    return add_thigh(below, thigh, axis, turn[1], -geo.front * turn[0], bias.outer_thigh_rate, -geo.front)
 
 
 @wp.func
-def inner_sums(
-    geo: LegGeometry, thigh: MassMoments, shank: MassMoments, loop: FiveBar, bias: FiveBarBias, angle: real
-) -> LinkSums:
+def inner_sums(geo: LegGeometry, thigh: MassMoments, shank: MassMoments, loop: FiveBar, bias: FiveBarBias) -> LinkSums:
     """Return the sums of the inner thigh and shank."""
-    zero = real(0.0)
-    axis = vec3(geo.inner_x, geo.plane_y, zero)
-    thigh_part = thigh_sums(thigh, axis, wp.cos(angle), geo.front * wp.sin(angle), bias.inner_thigh_rate, geo.front)
-    shank_part = shank_sums(
-        shank,
-        in_plane(loop.inner_knee, geo.plane_y + geo.knee_y),
-        loop.inner_shank,
-        vec3(zero),
-        in_plane(loop.inner_knee_di, zero),
-        loop.inner_shank_do,
-        loop.inner_shank_di,
-        bias.inner_shank_rate,
-        in_plane(bias.inner_knee_acc, zero),
-        bias.inner_shank_acc,
-    )
-    return add_sums(as_inner(thigh_part), shank_part)
+    turn = loop.inner_turn
+    knee = vec3(loop.inner_knee[0], geo.plane_y + geo.knee_y, loop.inner_knee[1])
+    below = shank_sums(
+        shank, knee, loop.inner_shank, loop.inner_knee_di, loop.inner_shank_di, loop.inner_shank_do,
+        bias.inner_shank_rate, bias.inner_knee_acc, bias.inner_shank_acc,
+    )  # fmt: skip
+    axis = vec2(geo.inner_x, geo.plane_y)
+    return add_thigh(below, thigh, axis, turn[1], geo.front * turn[0], bias.inner_thigh_rate, geo.front)
+
+
+@wp.func
+def leg_sums(housing: MassMoments, outer: LinkSums, inner: LinkSums) -> LinkSums:
+    """Return the sums of a whole leg; the housing does not move in its own frame."""
+    c = LinkSums()
+    c.mass = housing.mass + outer.mass + inner.mass
+    c.first = housing.first + outer.first + inner.first
+    c.second = housing.second + outer.second + inner.second
+    c.second_o = outer.second_o + inner.second_i
+    c.second_i = outer.second_i + inner.second_o
+    c.lin_o = outer.lin_o + inner.lin_i
+    c.lin_i = outer.lin_i + inner.lin_o
+    c.ang_o = outer.ang_o + inner.ang_i
+    c.ang_i = outer.ang_i + inner.ang_o
+    c.inertia_oo = outer.inertia_oo + inner.inertia_ii
+    c.inertia_oi = outer.inertia_oi + inner.inertia_oi
+    c.inertia_ii = outer.inertia_ii + inner.inertia_oo
+    c.coriolis = outer.coriolis - inner.coriolis
+    c.lin_acc = outer.lin_acc + inner.lin_acc
+    c.ang_acc = outer.ang_acc + inner.ang_acc
+    c.bias_o = outer.bias_o + inner.bias_i
+    c.bias_i = outer.bias_i + inner.bias_o
+    return c

@@ -7,18 +7,16 @@ at its end.
 
 import warp as wp
 
-from ..actuation.joint_forces import joint_forces
-from ..actuation.motors import MotorArrays, load_motor, motor_torque
+from ..actuation.joint_forces import JointParams, joint_forces
 from ..kinematics.geometry import LegGeometry
 from ..layout import BASE, GRAVITY, LEG_ROWS, MU_DYNAMIC, MU_STATIC
 from ..scalar import real, vec3
 from ..state import BaseState, base_com
-from ..terrain.ground import Ground, block_distance, block_normal, floor_distance, floor_normal
+from ..terrain.ground import Ground, block_distance, block_normal, floor_distance, floor_normal, has_block
 from .base_dynamics import (
     BaseInverse,
     BaseSystem,
     LegSolve,
-    add_leg,
     base_alone,
     eliminate_leg,
 )
@@ -28,11 +26,12 @@ from .contact import (
     STICK_SPEED,
     BlockLaw,
     PawContact,
+    add_block,
     contact_jacobian,
     couple_contact,
     target_normal_velocity,
 )
-from .leg_dynamics import PawKinematics, leg_dynamics, leg_five_bar, paw_kinematics
+from .leg_dynamics import LegDynamics, LegMasses, PawKinematics, leg_dynamics, leg_pose, paw_kinematics
 from .parameters import load_joint_params, load_masses, load_moments
 
 wp.set_module_options({"enable_backward": False})
@@ -57,21 +56,47 @@ class StepSettings:
     tolerance: real  # [m/s], of the contact iteration
 
 
+@wp.struct
+class LegParams:
+    """One leg of one world: what does not change as it moves."""
+
+    geometry: LegGeometry
+    masses: LegMasses
+    joints: JointParams
+
+
+@wp.struct
+class LegTerms:
+    """One leg in the dynamics of a step."""
+
+    dynamics: LegDynamics
+    solve: LegSolve
+    paw: PawKinematics
+
+
 @wp.func
-def leg_terms(
-    robot: Robot, world: int, k: int, angles: vec3, rates: vec3, torque: vec3, omega: vec3, g: vec3, dt: real,
-    system: BaseSystem, legs: wp.array(dtype=LegSolve), paws: wp.array(dtype=PawKinematics),
-) -> BaseSystem:  # fmt: skip
-    """Eliminate leg k and add it to the base's system; its solution and paw go to `legs` and `paws`."""
-    geo = robot.geometry[k]
-    loop = leg_five_bar(geo, angles)
-    dynamics = leg_dynamics(geo, load_masses(robot.table, k, world), loop, angles, rates, omega, g)
-    params = load_joint_params(robot.table, k, world)
-    passive = joint_forces(params, loop, geo.front, angles, rates, dt)
-    solve = eliminate_leg(dynamics, passive.inertia + wp.diag(params.armature), torque + passive.torque)
-    legs[k] = solve
-    paws[k] = paw_kinematics(geo, loop, wp.cos(angles[0]), geo.side * wp.sin(angles[0]))
-    return add_leg(system, dynamics, solve)
+def load_leg(robot: Robot, world: int, k: int) -> LegParams:
+    """Return the parameters of leg k."""
+    params = LegParams()
+    params.geometry = robot.geometry[k]
+    params.masses = load_masses(robot.table, k, world)
+    params.joints = load_joint_params(robot.table, k, world)
+    return params
+
+
+@wp.func
+def leg_terms(params: LegParams, angles: vec3, rates: vec3, torque: vec3, omega: vec3, g: vec3, dt: real) -> LegTerms:
+    """Return a leg's dynamics, its elimination and its paw."""
+    geo = params.geometry
+    joints = params.joints
+    pose = leg_pose(geo, angles)
+    dynamics = leg_dynamics(geo, params.masses, pose, rates, omega, g)
+    passive = joint_forces(joints, pose.loop, geo.front, angles, rates, dt)
+    terms = LegTerms()
+    terms.dynamics = dynamics
+    terms.solve = eliminate_leg(dynamics, passive.inertia + wp.diag(joints.armature), torque + passive.torque)
+    terms.paw = paw_kinematics(geo, pose)
+    return terms
 
 
 @wp.struct
@@ -122,14 +147,21 @@ def touch_block(robot: Robot, world: int, k: int, base: BaseState, paw: PawKinem
 @wp.func
 def paw_contact(
     robot: Robot, world: int, k: int, base: BaseState, lin: vec3, ang: vec3, rates: vec3, old_rates: vec3,
-    impulse: vec3, paw: PawKinematics, leg: LegSolve, inverse: BaseInverse, touch: Touch, dt: real,
+    impulse: vec3, paw: PawKinematics, leg: LegSolve, inverse: BaseInverse, block: BlockLaw, dt: real,
 ) -> PawContact:  # fmt: skip
-    """Return paw k's contact problem with a surface.
+    """Return paw k's contact problem with floor or block, whichever is nearer.
 
     lin, ang, rates: base twist (body axes) and motor rates at the end of the step without contact; old_rates and
     `base`: at its start; impulse: first guess [N s], world frame.
     """
     contact = PawContact()
+    touch = touch_floor(robot, k, base, paw)
+    on_block = bool(False)
+    if has_block(robot.ground, world):
+        above = touch_block(robot, world, k, base, paw, block)
+        if above.gap < touch.gap:
+            touch = above
+            on_block = True
     gap = touch.gap
     normal = touch.normal
     arm = -robot.geometry[k].paw_radius * normal
@@ -149,7 +181,10 @@ def paw_contact(
     if wp.dot(slip, slip) < STICK_SPEED * STICK_SPEED and wp.dot(contact.impulse, normal) > real(0.0):
         contact.mu_row = k * LEG_ROWS + MU_STATIC
     contact.mu = robot.table[contact.mu_row, world]
-    return couple_contact(contact, point, leg, inverse)
+    contact = couple_contact(contact, point, leg, inverse)
+    if on_block:
+        contact = add_block(contact, block)
+    return contact
 
 
 @wp.func
@@ -165,13 +200,3 @@ def finite_base(base: BaseState) -> bool:
     q = base.quat
     total = wp.dot(base.pos, base.pos) + wp.dot(base.lin, base.lin) + wp.dot(base.ang, base.ang)
     return wp.isfinite(total + q[0] + q[1] + q[2] + q[3])
-
-
-@wp.func
-def drive_torque(motors: MotorArrays, k: int, world: int, target: vec3, angles: vec3, rates: vec3) -> vec3:
-    """Return the torques [N m] of leg k's motors for targets, angles [rad] and rates [rad/s]."""
-    return vec3(
-        motor_torque(target[0], angles[0], rates[0], load_motor(motors, 3 * k, world)),
-        motor_torque(target[1], angles[1], rates[1], load_motor(motors, 3 * k + 1, world)),
-        motor_torque(target[2], angles[2], rates[2], load_motor(motors, 3 * k + 2, world)),
-    )

@@ -9,17 +9,27 @@ whose paws are below the ground is drawn again; the default pose stands in after
 import warp as wp
 
 from ..actuation.command_filter import FilterParams
-from ..collision.robot import world_collisions
+from ..collision.robot import leg_collisions
 from ..kinematics.geometry import LegGeometry
 from ..kinematics.inverse import LegLimits, clamped_closed_form
 from ..kinematics.leg import leg_forward_kinematics, leg_inverse_velocity
 from ..layout import COORDS, DOFS
+from ..mdp.attempts import (
+    ATTEMPTS,
+    all_legs,
+    attempt_step,
+    first_attempt,
+    first_leg,
+    leg_step,
+    meet_attempts,
+    of_leg,
+    taken_first,
+)
 from ..mdp.env import Scene, SkillSettings
 from ..mdp.random import Draw, between, branch, within
 from ..mdp.reset import store_pose
 from ..mdp.view import RobotArrays, RobotView, base_pos, turned, yaw_of
-from ..scalar import real
-from ..state import leg_coord, leg_dof, store_motors
+from ..state import leg_coord, leg_dof, load_motors, store_motors
 from ..terrain.ground import Block, Ground, rest_block, surface, world_ground
 from .ground_draws import GroundRanges, draw_ground, footprint
 from .reset_draws import (
@@ -38,8 +48,6 @@ from .reset_draws import (
 from .state import FLIGHT, LANDED, STANCE, JumpState
 
 wp.set_module_options({"enable_backward": False})
-
-ATTEMPTS = wp.constant(6)
 
 
 @wp.struct
@@ -84,89 +92,112 @@ def draw_leg_in_flight(draw: Draw, ranges: ResetRanges, leg: int, lateral: float
     return wp.vec3(lateral + between(draw, 38 + leg, -0.03, 0.03), outer, inner)
 
 
-@wp.func
-def store_leg(
-    geo: LegGeometry, limits: LegLimits, world: int, leg: int, d: BaseDraw, paw: wp.vec3, angles_in_flight: wp.vec3,
-    moving: int, joint_q: wp.array(dtype=float), joint_qd: wp.array(dtype=float),
-) -> int:  # fmt: skip
-    """Write a leg's motor angles and rates; returns 0 if its paw position [m], relative to the base, is out of reach.
+@wp.struct
+class LegDraw:
+    """A drawn leg."""
 
-    moving = 1: the paw rests on the ground while the base moves, so the joints move too.
-    """
-    angles = angles_in_flight
+    angles: wp.vec3  # [rad] of the motors
+    rates: wp.vec3  # [rad/s]
+    possible: bool  # whether it can be so
+
+
+@wp.func
+def draw_leg(
+    geo: LegGeometry, ground: Ground, limits: LegLimits, ranges: ResetRanges, draw: Draw, leg: int, scheme: int,
+    d: BaseDraw, heading: float, lift: float,
+) -> LegDraw:  # fmt: skip
+    """Return a leg of a drawn state: on its paw's place, or in flight. lift [m]: ground height under the base."""
+    found = LegDraw()
+    found.possible = bool(True)
     if d.use_paws != 0:
+        spot = d.spot + draw_paw(draw, ranges, leg, heading)
+        paw = spot - d.pos
+        if scheme == TOUCHDOWN:
+            # paws hang below the base, a little above the ground at least
+            paw[2] = -wp.min(within(draw, 8, ranges.paw_depth), d.pos[2] - geo.paw_radius - 0.025)
+        else:
+            here = surface(ground, spot[0], spot[1])
+            paw[2] = here[0] + geo.paw_radius - d.pos[2] - lift
         ankle = wp.quat_rotate_inv(d.quat, paw)
         angles = clamped_closed_form(geo, limits, ankle - geo.hip)
-        if wp.length(leg_forward_kinematics(geo, angles[0], angles[1], angles[2]) - ankle) > 1.0e-4:
-            return 0
-    rates = wp.vec3(0.0)
-    if moving != 0:
-        rates = leg_inverse_velocity(geo, angles, -wp.quat_rotate_inv(d.quat, d.lin_vel))
-        if wp.length(rates) > 30.0:
-            return 0
-    store_motors(joint_q, leg_coord(world, leg), angles)
-    store_motors(joint_qd, leg_dof(world, leg), rates)
-    return 1
+        found.angles = angles
+        reached = leg_forward_kinematics(geo, angles[0], angles[1], angles[2])
+        found.possible = wp.length(reached - ankle) <= 1.0e-4
+        if scheme == AFTER_LANDING:
+            # the paw rests on the ground while the base moves, so the joints move too
+            found.rates = leg_inverse_velocity(geo, angles, -wp.quat_rotate_inv(d.quat, d.lin_vel))
+            found.possible = found.possible and wp.length(found.rates) <= 30.0
+    else:
+        angles = draw_leg_in_flight(draw, ranges, leg, d.lateral)
+        found.angles = angles
+        ankle = leg_forward_kinematics(geo, angles[0], angles[1], angles[2])
+        found.possible = d.pos[2] + wp.quat_rotate(d.quat, ankle)[2] >= geo.paw_radius + 0.01
+    return found
 
 
 @wp.func
 def store_draw(
     geometry: wp.array(dtype=LegGeometry), ground: Ground, limits: LegLimits, ranges: ResetRanges, draw: Draw,
-    world: int, scheme: int, d: BaseDraw, heading: float, lift: float,
+    scheme: int, d: BaseDraw, heading: float, lift: float,
     joint_q: wp.array(dtype=float), joint_qd: wp.array(dtype=float),
-) -> int:  # fmt: skip
-    """Write a drawn state; returns 0 if it cannot be taken. lift [m]: ground height under the base."""
-    q = world * COORDS
+) -> bool:  # fmt: skip
+    """Write a drawn state of one world, and return whether it can be taken; lift [m]: ground height under the base."""
     for j in range(3):
-        joint_q[q + j] = d.pos[j]
-        joint_qd[world * DOFS + j] = d.lin_vel[j]
-        joint_qd[world * DOFS + 3 + j] = 0.0
-    joint_q[q + 2] = d.pos[2] + lift
+        joint_q[j] = d.pos[j]
+        joint_qd[j] = d.lin_vel[j]
+        joint_qd[3 + j] = 0.0
+    joint_q[2] = d.pos[2] + lift
     for j in range(4):
-        joint_q[q + 3 + j] = d.quat[j]
-    depth = within(draw, 8, ranges.paw_depth)
-    for leg in range(geometry.shape[0]):
-        geo = geometry[leg]
-        spot = d.spot + draw_paw(draw, ranges, leg, heading)
-        paw = spot - d.pos
-        if scheme == TOUCHDOWN:
-            # paws hang below the base, a little above the ground at least
-            paw[2] = -wp.min(depth, d.pos[2] - geo.paw_radius - 0.025)
-        else:
-            here = surface(ground, spot[0], spot[1])
-            paw[2] = here[0] + geo.paw_radius - d.pos[2] - lift
-        air = draw_leg_in_flight(draw, ranges, leg, d.lateral)
-        moving = wp.where(scheme == AFTER_LANDING, 1, 0)
-        if store_leg(geo, limits, world, leg, d, paw, air, moving, joint_q, joint_qd) == 0:
-            return 0
-        if scheme == IN_FLIGHT:
-            ankle = leg_forward_kinematics(geo, air[0], air[1], air[2])
-            if d.pos[2] + wp.quat_rotate(d.quat, ankle)[2] < geo.paw_radius + 0.01:
-                return 0
-    if world_collisions(geometry, ground, joint_q, q, real(0.0)).flags != 0:
-        return 0
-    return 1
+        joint_q[3 + j] = d.quat[j]
+    possible = bool(True)
+    own = LegDraw()
+    for leg in range(first_leg(draw), geometry.shape[0], leg_step(draw)):
+        own = draw_leg(geometry[leg], ground, limits, ranges, draw, leg, scheme, d, heading, lift)
+        possible = possible and own.possible
+        store_motors(joint_q, leg_coord(0, leg), own.angles)
+        store_motors(joint_qd, leg_dof(0, leg), own.rates)
+    if not all_legs(draw, possible):
+        return False
+    if draw.lanes > 1:
+        for leg in range(geometry.shape[0]):
+            store_motors(joint_q, leg_coord(0, leg), of_leg(draw, own.angles, leg))
+            store_motors(joint_qd, leg_dof(0, leg), of_leg(draw, own.rates, leg))
+    flags = int(0)
+    for turn in range(first_leg(draw), geometry.shape[0], leg_step(draw)):
+        flags = flags | leg_collisions(geometry, ground, joint_q, 0, turn)
+    return all_legs(draw, flags == 0)
 
 
 @wp.func
 def draw_until_taken(
     geometry: wp.array(dtype=LegGeometry), ground: Ground, limits: LegLimits, ranges: ResetRanges, draw: Draw,
-    world: int, scheme: int, heading: float, height: wp.vec2, goal: wp.vec3, g: float,
+    scheme: int, heading: float, height: wp.vec2, goal: wp.vec3, g: float,
     joint_q: wp.array(dtype=float), joint_qd: wp.array(dtype=float),
-) -> int:  # fmt: skip
-    """Draw states of a scheme until one can be taken; returns 0 if none of the attempts could."""
+) -> bool:  # fmt: skip
+    """Draw states of a scheme until one can be taken, and write it; returns whether one of the attempts could."""
     if scheme == DEFAULT:
-        return 0
+        return False
     here = surface(ground, 0.0, 0.0)
-    for attempt in range(int(ATTEMPTS)):
-        fresh = branch(draw, attempt)
-        d = draw_base(fresh, ranges, scheme, heading, height, goal, g)
-        if (
-            store_draw(geometry, ground, limits, ranges, fresh, world, scheme, d, heading, here[0], joint_q, joint_qd)
-            != 0
-        ):
-            return 1
-    return 0
+    own_q = wp.zeros(shape=(COORDS,), dtype=float)
+    own_qd = wp.zeros(shape=(DOFS,), dtype=float)
+    taken = int(ATTEMPTS)
+    for attempt in range(first_attempt(draw), ATTEMPTS, attempt_step(draw)):
+        if taken == ATTEMPTS:
+            fresh = branch(draw, attempt)
+            d = draw_base(fresh, ranges, scheme, heading, height, goal, g)
+            if store_draw(geometry, ground, limits, ranges, fresh, scheme, d, heading, here[0], own_q, own_qd):
+                taken = attempt
+    first = taken_first(draw, taken)
+    if taken == first and first < ATTEMPTS and first_leg(draw) == 0:
+        for i in range(7):
+            joint_q[draw.world * COORDS + i] = own_q[i]
+        for i in range(6):
+            joint_qd[draw.world * DOFS + i] = own_qd[i]
+        for leg in range(geometry.shape[0]):
+            store_motors(joint_q, leg_coord(draw.world, leg), load_motors(own_q, leg_coord(0, leg)))
+            store_motors(joint_qd, leg_dof(draw.world, leg), load_motors(own_qd, leg_dof(0, leg)))
+    meet_attempts(draw)
+    return first < ATTEMPTS
 
 
 @wp.func
@@ -257,10 +288,10 @@ def reset_jump(
     goal = turned(draw_box(draw, 50, level.goal_lower, level.goal_upper), heading)
     here = place_ground(scene.ground, world, draw, ranges, settings.grounds, scheme, heading, goal)
     taken = draw_until_taken(
-        scene.geometry, here, leg_limits(skill.command_filter), ranges, draw, world, scheme, heading,
-        level.base_height, goal, g, robot.joint_q, robot.joint_qd,
+        scene.geometry, here, leg_limits(skill.command_filter), ranges, draw, scheme, heading, level.base_height,
+        goal, g, robot.joint_q, robot.joint_qd,
     )  # fmt: skip
-    if taken == 0:
+    if not taken:
         scheme = int(DEFAULT)
         store_pose(robot, scene, world, heading, surface(here, 0.0, 0.0)[0])
     pos = base_pos(robot, world)

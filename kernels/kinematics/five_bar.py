@@ -11,12 +11,15 @@ import warp as wp
 
 from ..scalar import real, vec2, vec3
 from .geometry import LegGeometry
+from .trig import sin_cos
 
 
 @wp.struct
 class FiveBar:
     """Configuration of the loop and its first derivatives with respect to the outer and inner motor angles."""
 
+    outer_turn: vec2  # sine and cosine of the outer motor angle
+    inner_turn: vec2
     outer_knee: vec2  # [m]
     inner_knee: vec2  # [m]
     ankle: vec2  # [m]
@@ -68,8 +71,9 @@ def five_bar(geo: LegGeometry, outer: real, inner: real) -> FiveBar:
     """Return the loop's configuration and derivatives for motor angles `outer` and `inner` [rad]."""
     f = geo.front
     loop = FiveBar()
-    outer_sin, outer_cos = wp.sin(outer), wp.cos(outer)
-    inner_sin, inner_cos = wp.sin(inner), wp.cos(inner)
+    outer_turn, inner_turn = sin_cos(outer), sin_cos(inner)
+    outer_sin, outer_cos = outer_turn[0], outer_turn[1]
+    inner_sin, inner_cos = inner_turn[0], inner_turn[1]
     outer_knee = vec2(geo.outer_x + f * geo.thigh * outer_sin, -geo.thigh * outer_cos)
     inner_knee = vec2(geo.inner_x - f * geo.thigh * inner_sin, -geo.thigh * inner_cos)
     outer_knee_do = vec2(f * geo.thigh * outer_cos, geo.thigh * outer_sin)
@@ -84,6 +88,8 @@ def five_bar(geo: LegGeometry, outer: real, inner: real) -> FiveBar:
     ankle_do = meet_projections(outer_shank, inner_shank, wp.dot(outer_shank, outer_knee_do), real(0.0))
     ankle_di = meet_projections(outer_shank, inner_shank, real(0.0), wp.dot(inner_shank, inner_knee_di))
 
+    loop.outer_turn = outer_turn
+    loop.inner_turn = inner_turn
     loop.outer_knee = outer_knee
     loop.inner_knee = inner_knee
     loop.ankle = ankle

@@ -3,10 +3,13 @@
 import warp as wp
 
 from .env import EnvArrays
+from .options import FAST
 from .parameters import RobotParameters
 from .random import EVENT, Draw, between, make_draw
 
 STARTUP, AT_RESET, AT_STEP = 0, 1, 2
+LANES = 8
+"""Threads of a GPU that share the loops of an event."""
 MODES = {"startup": STARTUP, "reset": AT_RESET, "interval": AT_STEP}
 
 
@@ -19,12 +22,14 @@ def steps_until(draw: Draw, least: float, most: float, step_dt: float) -> int:
 def make_event_kernel(rows: list) -> wp.Kernel:
     """Return the kernel of a task's events; rows: see `jumper_warp.tasks.terms.Row`."""
     modes = [MODES[row.term.options["mode"]] for row in rows]
+    spread = [bool(row.term.options["spread"]) for row in rows]
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @wp.kernel(module="unique", module_options=FAST)
     def event_kernel(
         # in
         skill: int,
         stage: int,
+        lanes: int,
         mask: wp.array(dtype=float),
         step_dt: float,
         env: EnvArrays,
@@ -33,17 +38,22 @@ def make_event_kernel(rows: list) -> wp.Kernel:
         timer: wp.array2d(dtype=int),
         robot: RobotParameters,
     ):
-        """Run what is due at a stage where mask is not 0; one thread per (event, world).
+        """Run what is due at a stage where mask is not 0; launch over (events, lanes, num_worlds).
+
+        The lanes share the loops of events that are `spread`; of the others the first lane is all.
 
         timer: policy steps until the next time, (events, num_worlds), 0: not set yet, as after a handover. An interval
         event is due at a reset as well.
         """
-        row, world = wp.tid()
+        row, lane, world = wp.tid()
         if env.skill[world] != skill or mask[world] == 0.0:
             return
         for i in range(wp.static(len(rows))):
-            if row == i:
+            if row == i and (wp.static(spread[i]) or lane == 0):
                 draw = make_draw(env.seed, world, env.clock[world], EVENT + 100 * stage + i)
+                if wp.static(spread[i]):
+                    draw.lane = lane
+                    draw.lanes = lanes
                 due = stage == wp.static(modes[i])
                 if wp.static(modes[i] == AT_STEP):
                     left = timer[i, world] - 1

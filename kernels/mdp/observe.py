@@ -6,6 +6,7 @@ import warp as wp
 
 from ..terrain.ground import Ground
 from .env import EnvArrays
+from .options import FAST
 from .parameters import RobotParameters
 from .random import OBSERVATION, cut_gaussian, make_draw
 from .view import RobotArrays, load_view
@@ -65,7 +66,7 @@ def make_observe_kernel(task: Any) -> wp.Kernel:
     of_parameters = [row.func.input_types[next(iter(row.func.input_types))] is RobotParameters for row in rows]
     places = [sum(row.term.width for row in rows[:i]) for i in range(len(rows))]
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @wp.kernel(module="unique", module_options=FAST)
     def observe_kernel(
         # in
         skill: int,

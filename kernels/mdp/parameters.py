@@ -1,7 +1,8 @@
 """What domain randomisation may change of every robot, and the events that change it (paper, Table V).
 
 An event is a pure function of (parameters, draw, named numbers) that writes one world's parameters, always from the
-nominal values. Ranges are uniform; lower and upper are its numbers.
+nominal values. Ranges are uniform; lower and upper are its numbers. Those with a loop over motors or links share it
+among `draw.lanes` threads.
 """
 
 import warp as wp
@@ -69,7 +70,7 @@ def base_mass(robot: RobotParameters, draw: Draw, lower: float, upper: float):
 @wp.func
 def link_mass(robot: RobotParameters, draw: Draw, lower: float, upper: float):
     """Scale mass and inertia of each link of the legs."""
-    for body in range(1, BODIES):
+    for body in range(1 + draw.lane, BODIES, draw.lanes):
         write_mass(robot, draw.world, body, between(draw, body, lower, upper))
 
 
@@ -83,7 +84,7 @@ def com_shift(robot: RobotParameters, draw: Draw, lower: float, upper: float):
 @wp.func
 def armature(robot: RobotParameters, draw: Draw, lower: float, upper: float):
     """Scale each motor's armature."""
-    for m in range(12):
+    for m in range(draw.lane, 12, draw.lanes):
         dof = 6 + motor_slot(m)
         robot.joint_armature[draw.world * DOFS + dof] = robot.nominal_armature[dof] * between(draw, m, lower, upper)
 
@@ -91,23 +92,22 @@ def armature(robot: RobotParameters, draw: Draw, lower: float, upper: float):
 @wp.func
 def motor_friction(robot: RobotParameters, draw: Draw, lower: float, upper: float):
     """Give each motor a Coulomb friction [N m]."""
-    for m in range(12):
+    for m in range(draw.lane, 12, draw.lanes):
         robot.joint_friction[draw.world * DOFS + 6 + motor_slot(m)] = between(draw, m, lower, upper)
 
 
 @wp.func
-def set_gains(robot: RobotParameters, world: int, m: int):
-    """Write gains of a motor: those of the active skill, by the drawn ratios."""
+def set_gains(robot: RobotParameters, world: int, m: int, ratio: wp.vec2):
+    """Write gains of a motor: those of the active skill, by the drawn ratios of kp and kd."""
     skill = robot.skill[world]
-    robot.motors.kp[m, world] = robot.nominal_kp[skill, m] * robot.gain_ratio[m, world][0]
-    robot.motors.kd[m, world] = robot.nominal_kd[skill, m] * robot.gain_ratio[m, world][1]
+    robot.motors.kp[m, world] = robot.nominal_kp[skill, m] * ratio[0]
+    robot.motors.kd[m, world] = robot.nominal_kd[skill, m] * ratio[1]
 
 
 @wp.func
-def set_speed_limits(robot: RobotParameters, world: int, m: int):
-    """Write speed limits of a motor likewise; a drawn cutoff stays below the no-load speed."""
+def set_speed_limits(robot: RobotParameters, world: int, m: int, ratio: wp.vec2):
+    """Write no-load and cutoff speed of a motor likewise; a drawn cutoff stays below the no-load speed."""
     skill = robot.skill[world]
-    ratio = robot.speed_ratio[m, world]
     no_load = robot.nominal_no_load[skill, m] * ratio[0]
     cutoff = robot.nominal_cutoff[skill, m] * ratio[1]
     if ratio[0] != 1.0 or ratio[1] != 1.0:
@@ -125,8 +125,8 @@ def set_torque_limit(robot: RobotParameters, world: int, m: int):
 @wp.func
 def set_motor(robot: RobotParameters, world: int, m: int):
     """Write all constants of a motor that depend on the active skill."""
-    set_gains(robot, world, m)
-    set_speed_limits(robot, world, m)
+    set_gains(robot, world, m, robot.gain_ratio[m, world])
+    set_speed_limits(robot, world, m, robot.speed_ratio[m, world])
     set_torque_limit(robot, world, m)
 
 
@@ -143,9 +143,10 @@ def motors_kernel(
 @wp.func
 def gains(robot: RobotParameters, draw: Draw, lower: float, upper: float):
     """Scale kp and kd of each motor."""
-    for m in range(12):
-        robot.gain_ratio[m, draw.world] = wp.vec2(between(draw, m, lower, upper), between(draw, 12 + m, lower, upper))
-        set_gains(robot, draw.world, m)
+    for m in range(draw.lane, 12, draw.lanes):
+        ratio = wp.vec2(between(draw, m, lower, upper), between(draw, 12 + m, lower, upper))
+        robot.gain_ratio[m, draw.world] = ratio
+        set_gains(robot, draw.world, m, ratio)
 
 
 @wp.func
@@ -154,17 +155,18 @@ def speed_limits(
     cutoff_upper: float,
 ):  # fmt: skip
     """Scale no-load and cutoff speed of each motor; the cutoff stays below the no-load speed."""
-    for m in range(12):
-        robot.speed_ratio[m, draw.world] = wp.vec2(
+    for m in range(draw.lane, 12, draw.lanes):
+        ratio = wp.vec2(
             between(draw, m, no_load_lower, no_load_upper), between(draw, 12 + m, cutoff_lower, cutoff_upper)
         )
-        set_speed_limits(robot, draw.world, m)
+        robot.speed_ratio[m, draw.world] = ratio
+        set_speed_limits(robot, draw.world, m, ratio)
 
 
 @wp.func
 def joint_offset(robot: RobotParameters, draw: Draw, lower: float, upper: float):
     """Give each motor's position sensor a constant error [rad]."""
-    for m in range(12):
+    for m in range(draw.lane, 12, draw.lanes):
         robot.motors.offset[m, draw.world] = between(draw, m, lower, upper)
 
 

@@ -15,6 +15,8 @@ class Draw:
 
     world: int
     seed: wp.uint32
+    lane: int  # which of the threads that share the work of a world this is
+    lanes: int  # how many these are
 
 
 @wp.func
@@ -22,6 +24,7 @@ def make_draw(seed: int, world: int, clock: int, stream: int) -> Draw:
     """Return the numbers of a stream; clock: policy steps that the world has made."""
     draw = Draw()
     draw.world = world
+    draw.lanes = 1
     draw.seed = wp.rand_init(int(wp.rand_init(int(wp.rand_init(seed, world)), clock)), stream)
     return draw
 
@@ -29,8 +32,7 @@ def make_draw(seed: int, world: int, clock: int, stream: int) -> Draw:
 @wp.func
 def branch(draw: Draw, i: int) -> Draw:
     """Return other numbers, independent for every i."""
-    other = Draw()
-    other.world = draw.world
+    other = draw
     other.seed = wp.rand_init(int(draw.seed), 7919 + i)
     return other
 

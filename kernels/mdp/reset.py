@@ -7,7 +7,9 @@ import warp as wp
 from ..kinematics.geometry import LegGeometry
 from ..layout import COORDS, DOFS, motor_slot
 from ..terrain.ground import rest_block, surface, world_ground
+from .attempts import meet_attempts
 from .env import Delays, EnvArrays, Scene, SkillSettings
+from .options import FAST
 from .random import COMMAND, RESET, between, make_draw
 from .track import follow_paw
 from .view import RobotArrays, base_quat, base_velocity, load_view, yaw_of
@@ -20,10 +22,11 @@ def make_reset_kernel(task: Any) -> wp.Kernel:
     reset, due, command = task.reset.func, task.command.due, task.command.draw
     settings_type, level_type = task.settings_type, task.level_type
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @wp.kernel(module="unique", module_options=FAST)
     def reset_kernel(
         # in
         skill: int,
+        lanes: int,
         mask: wp.array(dtype=float),
         scene: Scene,
         skills: wp.array(dtype=SkillSettings),
@@ -34,8 +37,11 @@ def make_reset_kernel(task: Any) -> wp.Kernel:
         states: wp.array(dtype=task.state),
         robot: RobotArrays,
     ):
-        """Begin a new episode where mask is not 0, else a new command where it is due; one thread per world."""
-        world = wp.tid()
+        """Begin a new episode where mask is not 0, else a new command where it is due; launch over (num_worlds, lanes).
+
+        The lanes, neighbours in a warp, do the same but for what they share by `draw.lane`.
+        """
+        world, lane = wp.tid()
         if env.skill[world] != skill:
             return
         begins = mask[world] != 0.0
@@ -45,19 +51,23 @@ def make_reset_kernel(task: Any) -> wp.Kernel:
         if not (begins or commanded):
             return
         draw = make_draw(env.seed, world, env.clock[world], RESET)
+        draw.lane = lane
+        draw.lanes = lanes
         level = env.level[world]
         if level >= levels.shape[0]:
             level = wp.min(int(between(draw, -2, 0.0, float(levels.shape[0]))), levels.shape[0] - 1)
         if begins:
-            states[world] = wp.static(reset)(
-                robot, scene, skills[skill], states[world], settings[0], levels[level], draw
-            )
-            env.fresh[world] = 1
-            env.broken[world] = 0
+            state = wp.static(reset)(robot, scene, skills[skill], states[world], settings[0], levels[level], draw)
+            meet_attempts(draw)
+            if lane == 0:
+                states[world] = state
+                env.fresh[world] = 1
+                env.broken[world] = 0
         elif wp.static(command is not None):
-            view = load_view(robot, scene.ground, world)
-            fresh = make_draw(env.seed, world, env.clock[world], COMMAND)
-            states[world] = wp.static(command)(view, scene, states[world], levels[level], fresh)
+            if lane == 0:
+                view = load_view(robot, scene.ground, world)
+                fresh = make_draw(env.seed, world, env.clock[world], COMMAND)
+                states[world] = wp.static(command)(view, scene, states[world], levels[level], fresh)
 
     return reset_kernel
 

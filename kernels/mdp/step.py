@@ -6,6 +6,7 @@ import warp as wp
 
 from ..terrain.ground import Ground
 from .env import Counters, EnvArrays
+from .options import FAST
 from .terminations import came_apart
 from .view import RobotArrays, load_view, speed_limit_broken
 
@@ -39,7 +40,7 @@ def make_step_kernel(task: Any) -> wp.Kernel:
     broken_ending = [row.func for row in endings].index(came_apart)
     floor = task.reward_floor
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @wp.kernel(module="unique", module_options=FAST)
     def step_kernel(
         # in
         skill: int,

@@ -3,14 +3,15 @@
 import warp as wp
 
 from ..collision.robot import leg_collisions
+from ..dynamics.leg_dynamics import leg_pose, paw_kinematics
 from ..kinematics.geometry import LegGeometry
-from ..kinematics.leg import leg_forward_kinematics, leg_jacobian
+from ..layout import COORDS
 from ..state import leg_coord, leg_dof, load_motors
-from ..terrain.ground import Ground
+from ..terrain.ground import Ground, world_ground
 from .env import EnvArrays, SkillSettings
 from .view import RobotArrays, base_pos, base_quat, base_velocity
 
-wp.set_module_options({"enable_backward": False})
+wp.set_module_options({"enable_backward": False, "fast_math": True})
 
 
 @wp.func
@@ -19,10 +20,11 @@ def follow_paw(robot: RobotArrays, geo: LegGeometry, world: int, leg: int):
     quat = base_quat(robot, world)
     angles = load_motors(robot.joint_q, leg_coord(world, leg))
     rates = load_motors(robot.joint_qd, leg_dof(world, leg))
-    arm = wp.quat_rotate(quat, leg_forward_kinematics(geo, angles[0], angles[1], angles[2]))
+    paw = paw_kinematics(geo, leg_pose(geo, angles))
+    arm = wp.quat_rotate(quat, paw.position)
     i = leg_dof(world, 0) - 3
     ang = wp.vec3(robot.joint_qd[i], robot.joint_qd[i + 1], robot.joint_qd[i + 2])
-    along = wp.quat_rotate(quat, leg_jacobian(geo, angles[0], angles[1], angles[2]) * rates)
+    along = wp.quat_rotate(quat, paw.jacobian * rates)
     robot.paw_pos[leg, world] = base_pos(robot, world) + arm
     robot.paw_vel[leg, world] = base_velocity(robot, world, quat) + wp.cross(ang, arm) + along
 
@@ -59,4 +61,6 @@ def track_kernel(
     down = wp.length(robot.paw_force[leg, world]) > skills[env.skill[world]].contact_force
     time_contact(robot, world, leg, down)  # before the velocity of the step before is written over
     follow_paw(robot, geometry[leg], world, leg)
-    robot.collisions[leg, world] = leg_collisions(geometry, ground, robot.joint_q, world, leg)
+    robot.collisions[leg, world] = leg_collisions(
+        geometry, world_ground(ground, world), robot.joint_q, world * COORDS, leg
+    )

@@ -22,7 +22,7 @@ from jumper_warp.sim.dynamics import JumperDynamics
 from jumper_warp.sim.simulation import SUBSTEPS
 from jumper_warp.sim.solver import TOLERANCE, SolverJumper
 from kernels.collision.robot import SHANK_GROUND, collision_kernel
-from kernels.dynamics.contact import BlockLaw, PawContact, block_velocity
+from kernels.dynamics.contact import BlockLaw, PawContact, block_velocity, push_on_block
 from kernels.scalar import vec3
 from kernels.terrain.ground import Ground, block_normal, ground_distance, surface, world_ground
 
@@ -68,7 +68,7 @@ def block_velocity_kernel(law: BlockLaw, impulse: wp.array(dtype=vec3), out: wp.
         contacts[k].active = 1
         contacts[k].on_block = wp.where(k < 2, 1, 0)
         contacts[k].impulse = impulse[k]
-    out[0] = block_velocity(law, contacts)
+    out[0] = block_velocity(law, push_on_block(contacts))
 
 
 @pytest.mark.parametrize(

@@ -76,7 +76,7 @@ def paw_map_kernel(double):
         i, k = wp.tid()
         geo = legs[k]
         q = angles[i, k]
-        paw = leg.paw_kinematics(geo, leg.leg_five_bar(geo, q), wp.cos(q[0]), geo.side * wp.sin(q[0]))
+        paw = leg.paw_kinematics(geo, leg.leg_pose(geo, q))
         position[i, k] = paw.position
         jacobian[i, k] = paw.jacobian
 

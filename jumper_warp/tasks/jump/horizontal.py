@@ -105,7 +105,7 @@ def horizontal_jump() -> TaskCfg:
         name="horizontal-jump",
         state=JumpState,
         advance=Advance(phase.advance_jump, takeoff_speed=0.25),
-        reset=Reset(reset.reset_jump, RESET),
+        reset=Reset(reset.reset_jump, RESET, side_by_side=True),
         command=Command(reset.give_jump, reset.another_jump_due, reset.draw_next_jump),
         curriculum=Curriculum(errors.landing_error, tolerance=0.10, counts=reset.from_standing),
         rewards=REWARDS,
@@ -133,5 +133,7 @@ def omnidirectional_jump() -> TaskCfg:
         name="omnidirectional-jump",
         evaluation="around",
         levels=(level((0.2, 0.5), 0.0, 0.35, jump_again=0.0), ring(0.3, 0.45), ring(0.5, 0.45), ring(0.7, 0.45)),
-        reset=Reset(reset.reset_jump, replace(RESET, forward_pitch=0.0, touchdown_behind=(0.05, 0.12))),
+        reset=Reset(
+            reset.reset_jump, replace(RESET, forward_pitch=0.0, touchdown_behind=(0.05, 0.12)), side_by_side=True
+        ),
     )

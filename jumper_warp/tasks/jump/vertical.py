@@ -74,7 +74,7 @@ def vertical_jump() -> TaskCfg:
         name="vertical-jump",
         state=JumpState,
         advance=Advance(phase.advance_jump, takeoff_speed=0.75),
-        reset=Reset(reset.reset_jump, ResetCfg()),
+        reset=Reset(reset.reset_jump, ResetCfg(), side_by_side=True),
         command=Command(reset.give_jump, reset.another_jump_due, reset.draw_next_jump),
         curriculum=Curriculum(errors.height_error, tolerance=0.10, counts=reset.from_standing),
         rewards=REWARDS,

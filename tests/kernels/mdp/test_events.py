@@ -44,6 +44,8 @@ EVENTS = (
     EventTerm(drawn_force, mode="reset", lower=2.0, upper=3.0),
 )
 REGULAR = 3
+LANES = 3
+"""Threads for each event, of which those that are not spread use one."""
 
 
 class Events(Probe):
@@ -57,8 +59,8 @@ class Events(Probe):
     def run(self, stage, mask=1.0):
         """Launch the events of a stage where mask is not 0."""
         skill, mask = self.skill, array(np.broadcast_to(np.asarray(mask, dtype=float), N))
-        inputs = [skill.index, stage, mask, STEP_DT, self.worlds, skill.numbers, skill.timer, self.parameters]
-        wp.launch(skill.kernels["event"], (skill.num_events, N), inputs, device="cpu")
+        inputs = [skill.index, stage, LANES, mask, STEP_DT, self.worlds, skill.numbers, skill.timer, self.parameters]
+        wp.launch(skill.kernels["event"], (skill.num_events, LANES, N), inputs, device="cpu")
 
     def counted(self):
         """Return how often the counting events ran at the start, and at resets."""

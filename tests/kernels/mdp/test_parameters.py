@@ -27,8 +27,11 @@ DRAWN = [name for name in RobotParameters.vars if not name.startswith("nominal_"
 
 @wp.kernel(enable_backward=False)
 def event_kernel(which: int, p: wp.array(dtype=float), robot: RobotParameters):
-    """Run one of the events in every world."""
-    draw = make_draw(11, wp.tid(), 16, 100 + which)
+    """Run one of the events in every world, two threads a world."""
+    world, lane = wp.tid()
+    draw = make_draw(11, world, 16, 100 + which)
+    draw.lane = lane
+    draw.lanes = 2
     for i in range(wp.static(len(FUNCS))):
         if which == i:
             wp.static(FUNCS[i])(robot, draw, *p[0 : wp.static(COUNTS[i])])
@@ -76,7 +79,7 @@ def copies(robot):
 def draw(made, name, numbers, only):
     assert len(numbers) == COUNTS[NAMES.index(name)]
     inputs = [NAMES.index(name), array([*numbers, *[0.0] * 8]), made.robot]
-    wp.launch(event_kernel, N, inputs, device="cpu")
+    wp.launch(event_kernel, (N, 2), inputs, device="cpu")
     found = copies(made.robot)
     for other, values in found.items():
         if other not in only:

@@ -35,9 +35,9 @@ class Stage(Probe):
     def reset(self, chosen):
         """Launch the beginning of episodes."""
         skill = self.skill
-        inputs = [skill.index, self.mask(chosen), self.scene, self.settings, skill.settings, skill.levels, self.worlds,
-                  skill.states, self.robot]  # fmt: skip
-        wp.launch(skill.kernels["reset"], self.n, inputs, device="cpu")
+        inputs = [skill.index, 1, self.mask(chosen), self.scene, self.settings, skill.settings, skill.levels,
+                  self.worlds, skill.states, self.robot]  # fmt: skip
+        wp.launch(skill.kernels["reset"], (self.n, 1), inputs, device="cpu")
 
     def give(self, chosen, begins, values, headings):
         """Launch commands from outside."""

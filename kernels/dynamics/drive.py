@@ -1,0 +1,113 @@
+"""What drives the robot over a launch, and what the solver keeps of every world."""
+
+import warp as wp
+
+from ..actuation.motors import MotorArrays, MotorParams, load_motor, motor_torque
+from ..layout import BODIES, COORDS, DOFS
+from ..scalar import real, vec3
+from ..state import leg_dof, load_motors
+from ..terrain.ground import rest_block
+from .step import Robot
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.struct
+class Drive:
+    """What acts on the robot: motor targets, joint forces and a wrench on the base, held over the launch."""
+
+    closed_loop: int  # 1: the motors follow `target`; 0: only `joint_f` acts
+    motors: MotorArrays
+    target: wp.array2d(dtype=real)  # [rad], (12, num_worlds)
+    previous: wp.array2d(dtype=real)  # [rad], (12, num_worlds), followed before the target arrives
+    delay: wp.array(dtype=int)  # steps until it does, (num_worlds,); empty: none
+    joint_f: wp.array(dtype=real)  # [N m] and, for the base, world wrench at its com; Newton's layout
+    body_f: wp.array(dtype=wp.spatial_vector)  # world wrench at the com of each body; the base's is used
+
+
+@wp.struct
+class LegDrive:
+    """What drives one leg of one world over the launch; vectors are lateral, outer, inner."""
+
+    closed_loop: int
+    lateral: MotorParams
+    outer: MotorParams
+    inner: MotorParams
+    target: vec3  # [rad]
+    previous: vec3  # [rad]
+    delay: int  # steps
+    extra: vec3  # [N m]
+
+
+@wp.struct
+class Workspace:
+    """The solver's own arrays, per world."""
+
+    impulse: wp.array2d(dtype=vec3)  # [N s] of each paw in the last step, world frame, (4, num_worlds)
+    contact_force: wp.array2d(dtype=vec3)  # [N] on each paw in the last step, world frame, (4, num_worlds)
+    peak_force: wp.array(dtype=real)  # [N] largest total paw force of the launch
+    peak_paw_force: wp.array2d(dtype=real)  # [N] largest on each paw in the launch, (4, num_worlds)
+    torque: wp.array2d(dtype=real)  # [N m] of each motor in the last step, (12, num_worlds)
+    residual: wp.array(dtype=real)  # [m/s] of the contact iteration, largest of the launch
+    sweeps: wp.array(dtype=int)  # of the contact iteration, most of the launch
+    invalid: wp.array(dtype=int)  # 1: the world became non-finite and waits for a reset
+    reference_q: wp.array(dtype=real)  # joint_q where invalid worlds are parked
+
+
+@wp.func
+def park(robot: Robot, work: Workspace, world: int, joint_q: wp.array(dtype=real), joint_qd: wp.array(dtype=real)):
+    """Put a world at rest in its reference pose, its block at rest at its start."""
+    rest_block(robot.ground, world)
+    for i in range(int(COORDS)):
+        joint_q[world * COORDS + i] = work.reference_q[world * COORDS + i]
+    for i in range(int(DOFS)):
+        joint_qd[world * DOFS + i] = real(0.0)
+    for k in range(4):
+        work.impulse[k, world] = vec3(real(0.0))
+        work.contact_force[k, world] = vec3(real(0.0))
+
+
+@wp.func
+def load_leg_drive(drive: Drive, world: int, k: int) -> LegDrive:
+    """Return what drives leg k."""
+    leg = LegDrive()
+    leg.extra = load_motors(drive.joint_f, leg_dof(world, k))
+    leg.closed_loop = drive.closed_loop
+    if drive.closed_loop != 0:
+        leg.lateral = load_motor(drive.motors, 3 * k, world)
+        leg.outer = load_motor(drive.motors, 3 * k + 1, world)
+        leg.inner = load_motor(drive.motors, 3 * k + 2, world)
+        leg.target = vec3(drive.target[3 * k, world], drive.target[3 * k + 1, world], drive.target[3 * k + 2, world])
+        if drive.delay.shape[0] > 0:
+            leg.delay = drive.delay[world]
+            leg.previous = vec3(
+                drive.previous[3 * k, world], drive.previous[3 * k + 1, world], drive.previous[3 * k + 2, world]
+            )
+    return leg
+
+
+@wp.func
+def applied_torque(leg: LegDrive, step: int, angles: vec3, rates: vec3) -> vec3:
+    """Return a leg's motor-space torque [N m] in a step of the launch."""
+    if leg.closed_loop == 0:
+        return leg.extra
+    target = leg.target
+    if step < leg.delay:
+        target = leg.previous
+    motor = vec3(
+        motor_torque(target[0], angles[0], rates[0], leg.lateral),
+        motor_torque(target[1], angles[1], rates[1], leg.outer),
+        motor_torque(target[2], angles[2], rates[2], leg.inner),
+    )
+    return motor + leg.extra
+
+
+@wp.func
+def base_wrench(drive: Drive, world: int) -> wp.spatial_vector:
+    """Return the external wrench on the base at its com, world axes (force [N], moment [N m])."""
+    w = drive.body_f[world * BODIES]
+    i = world * DOFS
+    return w + wp.spatial_vector(
+        float(drive.joint_f[i]), float(drive.joint_f[i + 1]), float(drive.joint_f[i + 2]),
+        float(drive.joint_f[i + 3]), float(drive.joint_f[i + 4]), float(drive.joint_f[i + 5]),
+    )  # fmt: skip

@@ -1,0 +1,101 @@
+"""A thread a leg (for GPUs) does what a thread a world does; on the CPU blocks of four take turns."""
+
+import numpy as np
+import pytest
+import warp as wp
+
+from jumper_warp.robot.grounds import BlockCfg, uneven
+from jumper_warp.robot.model import build_model
+from jumper_warp.sim.dynamics import JumperDynamics
+
+N = 11  # not a multiple of the 8 worlds that share a warp
+MOTORS = [6 + 5 * leg + j for leg in range(4) for j in (0, 1, 3)]
+
+
+@pytest.fixture(autouse=True)
+def blocks_of_threads():
+    """Let the CPU run blocks of several threads."""
+    wp.config.enable_cpu_blocks = True
+    yield
+    wp.config.enable_cpu_blocks = False
+
+
+def states(model, height, seed=0):
+    """Return coordinates, rates and forces of robots near a height [m], any yaw, most paws near the ground."""
+    rng = np.random.default_rng(seed)
+    q = model.joint_q.numpy().reshape(N, 43).astype(np.float64)
+    q[:, :2] = rng.normal(size=(N, 2)) * 0.3
+    q[:, 2] = height + rng.uniform(-0.04, 0.04, N)
+    tilt = np.column_stack([rng.normal(size=(N, 2)) * 0.05, rng.normal(size=N), np.ones(N)])
+    q[:, 3:7] = tilt / np.linalg.norm(tilt, axis=1, keepdims=True)
+    qd = np.zeros((N, 38))
+    qd[:, :6] = rng.normal(size=(N, 6)) * 0.4
+    qd[:, MOTORS] = rng.normal(size=(N, 12))
+    force = np.zeros((N, 38))
+    force[:, MOTORS] = rng.uniform(-12.0, 12.0, (N, 12))
+    return q, qd, force
+
+
+def advance(dynamics, q, qd, force, by_legs, substeps=4, tolerance=1.0e-12):
+    """Return coordinates, rates and work arrays after some steps of 1/480 s."""
+    real = dynamics.real
+    q, qd, force = (wp.array(x.ravel(), dtype=real) for x in (q, qd, force))
+    wrench = np.zeros((N * 21, 6), dtype=np.float32)
+    wrench[::21] = np.random.default_rng(5).normal(size=(N, 6))
+    drive = dynamics.drive(force, wp.array(wrench, dtype=wp.spatial_vector))
+    settings = dynamics.settings(1.0 / 480.0, substeps, 500, tolerance)
+    dynamics.advance(settings, drive, q, qd, q, qd, by_legs=by_legs)
+    work = dynamics.work
+    arrays = (work.impulse, work.contact_force, work.peak_force, work.peak_paw_force, work.torque)
+    return q.numpy(), qd.numpy(), *(each.numpy() for each in arrays)
+
+
+GROUNDS = {
+    "plane": {"ground": "plane"},
+    "heightfield": {"ground": uneven(0.03, seed=3, flat_radius=0.0)},
+    "block": {"ground": "plane", "block": BlockCfg((0.1, 0.0), half=(0.3, 0.2), height=0.02, mass=3.0)},
+}
+
+
+@pytest.mark.parametrize("kind", GROUNDS)
+def test_equals_a_thread_a_world(kind):
+    model = build_model(N, ground=GROUNDS[kind]["ground"], friction=0.5)
+    q, qd, force = states(model, 0.34)
+    legs, world = (JumperDynamics(model, double=True, block=GROUNDS[kind].get("block")) for _ in range(2))
+    found = advance(legs, q, qd, force, by_legs=True)
+    expected = advance(world, q, qd, force, by_legs=False)
+    paws = expected[2]
+    assert (np.abs(paws).max(axis=(1, 2)) > 0.0).sum() >= 3  # legs that push
+    for a, b in zip(found, expected, strict=True):
+        np.testing.assert_allclose(a, b, atol=1.0e-8, rtol=1.0e-8)
+    if kind == "block":
+        moved = [each.robot.ground.blocks.numpy()["center"] for each in (legs, world)]
+        assert np.abs(moved[1] - [0.1, 0.0]).max() > 1.0e-6
+        np.testing.assert_allclose(*moved, atol=1.0e-9)
+
+
+def test_a_world_that_came_apart_is_parked():
+    model = build_model(N)
+    dynamics = JumperDynamics(model, double=True)
+    q, qd, force = states(model, 0.34)
+    qd[4, 3] = np.nan
+    found = advance(dynamics, q, qd, force, by_legs=True)
+    np.testing.assert_array_equal(np.flatnonzero(dynamics.work.invalid.numpy()), [4])
+    np.testing.assert_allclose(found[0].reshape(N, 43)[4], model.joint_q.numpy().reshape(N, 43)[4], atol=1.0e-7)
+    np.testing.assert_array_equal(found[1].reshape(N, 38)[4], 0.0)
+    np.testing.assert_array_equal(found[2][:, 4], 0.0)
+    alone = JumperDynamics(model, double=True)
+    qd[4, 3] = 0.0
+    others = np.arange(N) != 4
+    for a, b in zip(found[:2], advance(alone, q, qd, force, by_legs=True)[:2], strict=True):
+        np.testing.assert_array_equal(a.reshape(N, -1)[others], b.reshape(N, -1)[others])
+
+
+def test_stops_at_the_tolerance_and_tells_it():
+    model = build_model(N)
+    dynamics = JumperDynamics(model, double=True)
+    q, qd, force = states(model, 0.34)
+    advance(dynamics, q, qd, force, by_legs=True, tolerance=1.0e-5)
+    residual, sweeps = dynamics.work.residual.numpy(), dynamics.work.sweeps.numpy()
+    assert 0.0 < residual.max() <= 1.0e-5
+    assert 0 < sweeps.max() < 500
