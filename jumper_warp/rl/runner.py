@@ -26,6 +26,7 @@ from jumper_warp.rl.resume import CHECKPOINTS, find_checkpoint, own_part, random
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.files import write_whole
 from jumper_warp.utils.runtime import git_commit, versions
+from jumper_warp.utils.threads import set_threads
 
 CONFIG = "config.json"
 """File of a run: all settings, versions and the commit."""
@@ -84,6 +85,7 @@ def train(
         CheckpointError: There is nothing usable to resume from, or the end could not be saved.
         SystemExit: With code INTERRUPTED, after Ctrl-C or SIGTERM ended the iteration and it was saved.
     """
+    set_threads(cfg.threads)
     rank = join_ranks(cfg.device)
     try:
         _check_processes(cfg, rank, as_rsl_rl is not None)

@@ -35,7 +35,7 @@ def make_reset_kernel(task: Any) -> wp.Kernel:
         robot: RobotArrays,
     ):
         """Begin a new episode where mask is not 0, else a new command where it is due; one thread per world."""
-        world = wp.tid()
+        world = env.first + wp.tid()
         if env.skill[world] != skill:
             return
         begins = mask[world] != 0.0
@@ -146,6 +146,7 @@ def tick_kernel(
 @wp.kernel
 def forget_kernel(
     # in
+    first: int,
     mask: wp.array(dtype=float),
     geometry: wp.array(dtype=LegGeometry),
     # in, out
@@ -154,9 +155,10 @@ def forget_kernel(
 ):
     """Forget the past where mask is not 0: actions, torques, contacts; one thread per (motor, world).
 
-    Paws are taken to be where they are now.
+    Paws are taken to be where they are now. first: world of the first thread.
     """
     m, world = wp.tid()
+    world += first
     if mask[world] == 0.0:
         return
     slot = motor_slot(m)
