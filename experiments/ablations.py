@@ -59,6 +59,8 @@ class Args:
     """Folder for figures.json and the plot (default: outputs/ablations/<time>)."""
     device: str | None = None
     """Warp device."""
+    threads: int | None = None
+    """CPU threads that share the worlds (default: all cores); they change no result."""
 
     def __post_init__(self) -> None:
         """Check the values."""
@@ -86,7 +88,7 @@ def plot(curves: dict[str, Curve], path: Path) -> None:
 
 def main(args: Args) -> dict:
     """Train all variants and return the figures."""
-    announce(args.device)
+    announce(args.device, args.threads)
     folder = output_dir("ablations", args.out)
     task = make_task("vertical-jump")
     judge = Env(task, args.jumps, device=args.device, randomize=False, noise=False, auto_reset=False)

@@ -4,7 +4,8 @@
 
 A policy step is 8 physics steps of 1/480 s, motors included. Both solvers replay a captured graph. Before anything is
 timed, the outcome is checked: the robots stand, or reach their apex. `--baseline PATH` runs the same script of another
-checkout too, and tells how much faster this one is.
+checkout too, and tells how much faster this one is. `--threads 1 2` compares numbers of CPU threads, on physics and on
+whole environments; all other figures are those of the last number.
 """
 
 from __future__ import annotations
@@ -17,11 +18,13 @@ import tyro
 import warp as wp
 
 from jumper_warp.cli.main import run_command
-from jumper_warp.evaluation.speed import time_jump, time_standing
+from jumper_warp.evaluation.speed import time_jump, time_standing, time_threads
 from jumper_warp.robot.model import build_model
 from jumper_warp.sim.simulation import Simulation, SolverName
+from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.output import output_dir, write_figures
 from jumper_warp.utils.runtime import announce
+from jumper_warp.utils.threads import checked_threads
 from jumper_warp.utils.timing import device_memory, over_baseline, wall_time
 
 
@@ -42,6 +45,13 @@ class Args:
     """Folder for figures.json (default: outputs/benchmark_solver/<time>)."""
     device: str | None = None
     """Warp device."""
+    threads: list[int] | None = None
+    """Numbers of CPU threads to compare (default: all cores, nothing is compared)."""
+
+    def __post_init__(self) -> None:
+        """Raises InputError: a number of threads is not one."""
+        for threads in self.threads or []:
+            checked_threads(threads)
 
 
 def measure(solver: SolverName, envs: int, args: Args) -> dict:
@@ -70,13 +80,17 @@ def measure(solver: SolverName, envs: int, args: Args) -> dict:
 
 def main(args: Args) -> dict:
     """Run the benchmark and return its figures."""
-    values: dict = {"device": announce(args.device).name}
+    values: dict = {"device": announce(args.device, args.threads[-1] if args.threads else None).name}
+    if args.threads and wp.get_device(args.device).is_cuda:
+        raise InputError("threads are compared on a CPU; add --device cpu")
     folder = output_dir("benchmark_solver", args.out)
     for envs in args.envs:
         figures = {f"{s}_{name}": value for s in args.solvers for name, value in measure(s, envs, args).items()}
         for phase in ("standing", "jump") if len(set(args.solvers)) == 2 else ():
             rates = (figures[f"{solver}_steps_per_s_{phase}"] for solver in ("jumper", "mujoco"))
             figures[f"ratio_{phase}"] = next(rates) / next(rates)
+        if args.threads and len(args.threads) > 1:
+            figures |= time_threads(envs, args.threads, args.steps, args.repeats)
         prefix = "" if len(args.envs) == 1 else f"envs_{envs}_"
         values |= {f"{prefix}{name}": value for name, value in figures.items()}
     values |= {"envs": args.envs, **over_baseline(args.baseline, "experiments/benchmark_solver.py", args, values)}

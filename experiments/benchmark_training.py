@@ -50,6 +50,8 @@ class Args:
     """Folder for figures.json (default: outputs/benchmark_training/<time>)."""
     device: str | None = None
     """Warp device."""
+    threads: int | None = None
+    """CPU threads that share the worlds (default: all cores); they change no result."""
 
     def __post_init__(self) -> None:
         """Check the values."""
@@ -60,7 +62,7 @@ class Args:
 
 def main(args: Args) -> dict:
     """Run the benchmark and return its figures."""
-    info = announce(args.device)
+    info = announce(args.device, args.threads)
     folder = output_dir("benchmark_training", args.out)
     gpu = wp.get_device(args.device).is_cuda
     envs = args.envs or ((4096, 8192, 16384) if gpu else (64,))

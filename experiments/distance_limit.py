@@ -176,6 +176,8 @@ class Args:
     """Folder for figures and plot (default: outputs/distance_limit/<time>)."""
     device: str | None = None
     """Warp device."""
+    threads: int | None = None
+    """CPU threads that share the worlds (default: all cores); they change no result."""
 
     def __post_init__(self) -> None:
         """Check the values."""
@@ -371,7 +373,8 @@ def plot(rows: Rows, path: Path) -> None:
 def main(args: Args) -> dict[str, Any]:
     """Search, and return the figures."""
     cma_package()  # that it is missing is said before anything else
-    run = EvaluationRun.of("distance_limit", EvaluationArgs(args.policy, record=0, out=args.out, device=args.device))
+    evaluation = EvaluationArgs(args.policy, record=0, out=args.out, device=args.device, threads=args.threads)
+    run = EvaluationRun.of("distance_limit", evaluation)
     flown, landings, actions = fly_policy(run)
     begin, values = nominal_best(actions, args)
     rows: Rows = {}

@@ -25,7 +25,7 @@ from jumper_warp.utils.runtime import announce
 
 def main(args: SoakArgs) -> dict:
     """Run the soak test and return its figures."""
-    announce(args.device)
+    announce(args.device, args.threads)
     folder = output_dir("soak_test", args.out)
     torch.manual_seed(args.seed)
     if args.task is None:

@@ -146,7 +146,7 @@ def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> TrainResult:
         check_resume(parsed.cfg)
     first = os.environ.get("RANK", "0") == "0"
     if first:
-        announce(parsed.cfg.device)
+        announce(parsed.cfg.device, parsed.cfg.threads)
     as_rsl_rl = None
     if parsed.cfg.trainer == "rsl-rl":
         from jumper_warp.envs.rsl_rl import RslRlVecEnv as as_rsl_rl

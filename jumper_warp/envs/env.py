@@ -22,6 +22,7 @@ from jumper_warp.envs.stages import Stages
 from jumper_warp.envs.state import load_state, save_state
 from jumper_warp.robot.grounds import BlockCfg
 from jumper_warp.sim.simulation import Simulation, SolverName
+from jumper_warp.sim.slices import SlicedGraph
 from jumper_warp.tasks.cfg import Handover, TaskCfg
 from jumper_warp.tasks.interface import interface
 from jumper_warp.tasks.saving import task_to_json
@@ -72,11 +73,13 @@ class Env(Stages):
         block: BlockCfg | None = None,
         skill: np.ndarray | int = 0,
         handovers: Sequence[Handover] = (),
+        threads: int | None = None,
     ):
         """Build everything; call `reset` before the first step.
 
         ground, block: as in `Simulation`; by default what the first task draws if randomised on SolverJumper, else a
         plane. skill: index of the task that each world begins in, (num_envs,) or one for all. handovers: between tasks.
+        threads: of a CPU, as in `Simulation`.
         Raises ValueError: no task, two of one name, motors that cannot be those of one robot, a handover between other
         tasks, less than one environment, or as `Simulation`.
         """
@@ -87,7 +90,7 @@ class Env(Stages):
         self.sim = Simulation(
             num_envs, solver=solver, motors=self.task.motors, visuals=visuals, device=device and str(device),
             ground=ground, block=BlockCfg((0.0, 0.0)) if self._draws_ground else block, tolerance=CONTACT_TOLERANCE,
-            friction=0.85 if self.task.randomization.dynamic_friction else 0.9,
+            friction=0.85 if self.task.randomization.dynamic_friction else 0.9, threads=threads,
         )  # fmt: skip
         self.wp_device = self.sim.device
         self.device = torch.device(wp.device_to_torch(self.wp_device))
@@ -123,8 +126,8 @@ class Env(Stages):
             self._start_over(seed)
         self._ends_episodes = True
         self._tick(self._all)
-        self._begin(self._all)
-        self._observe(beginning=0)
+        self._begin(self._part(), self._all)
+        self._observe(self._part(), beginning=0)
         return self._step.obs, {}
 
     def _start_over(self, seed: int) -> None:
@@ -152,11 +155,9 @@ class Env(Stages):
             self._launch_step()
         elif (resets := self.auto_reset and self._ends_episodes) not in self._graphs:
             self._launch_step()  # loads the modules; counts as this step
-            with wp.ScopedCapture(device=self.wp_device) as capture:
-                self._launch_step()
-            self._graphs[resets] = capture.graph
+            self._graphs[resets] = SlicedGraph(self._launch_step, self.sim.slices, self.wp_device)
         else:
-            wp.capture_launch(self._graphs[resets])
+            self._graphs[resets].replay()
         return self._step
 
     # ------------------------------------------------------------------ commands from outside
@@ -175,12 +176,12 @@ class Env(Stages):
         if self._draws_ground:
             self._scene.ground.blocks.zero_()
         self._tick(mask)
-        self._draw(mask)
+        self._draw(self._part(), mask)
         self._launch(stand_kernel, n, [mask, headings, self._scene, self.robot])
-        self._forget(mask)
+        self._forget(self._part(), mask)
         self._give(mask, 1, values, headings)
         self.worlds.done.zero_()
-        self._observe(beginning=1)
+        self._observe(self._part(), beginning=1)
 
     def command(self, commands: Any, worlds: Any = None) -> None:
         """Give worlds a command within their episode; the policy sees it after the next step.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 import warp as wp
@@ -11,16 +12,26 @@ from jumper_warp.envs.arrays import FIRST_CLOCK, checked_skill, delay_arrays, en
 from jumper_warp.envs.parameters import robot_parameters
 from jumper_warp.envs.skill import Skill
 from jumper_warp.sim.simulation import Simulation
+from jumper_warp.sim.slices import Worlds
 from jumper_warp.tasks.cfg import Handover, TaskCfg
 from kernels.mdp import attempts, events
 from kernels.mdp.actions import action_kernel
-from kernels.mdp.env import SkillSettings
+from kernels.mdp.env import EnvArrays, SkillSettings
 from kernels.mdp.events import AT_RESET, AT_STEP, STARTUP
 from kernels.mdp.handover import make_handover_kernel
 from kernels.mdp.observe import LANES, condition_kernel
 from kernels.mdp.parameters import motors_kernel
 from kernels.mdp.reset import forget_kernel, tick_kernel
 from kernels.mdp.track import track_kernel
+
+
+class Part(NamedTuple):
+    """The worlds that a stage is launched for."""
+
+    first: int
+    count: int
+    env: Any
+    """The kernels' `EnvArrays` that begin at `first`."""
 
 
 class Stages:
@@ -64,106 +75,122 @@ class Stages:
         self._started = bool((self.worlds.clock.numpy() > FIRST_CLOCK).all())
         self.sim.physics.parameters_changed()
 
-    def _launch_step(self) -> None:
-        for stage in self.stages().values():
+    def _part(self, worlds: Worlds | None = None) -> Part:
+        """Return some of the worlds as stages are launched for them, by default all."""
+        if worlds is None or worlds.count == self.num_envs:
+            return Part(0, self.num_envs, self.worlds)
+        env = EnvArrays()
+        for name in EnvArrays.vars:
+            setattr(env, name, getattr(self.worlds, name))
+        env.first = worlds.first
+        return Part(*worlds, env)
+
+    def _launch_step(self, worlds: Worlds | None = None) -> None:
+        for stage in self.stages(worlds).values():
             stage()
 
-    def stages(self) -> dict[str, Callable[[], None]]:
-        """Return the parts of a step by name, in order: each launches its kernels and does not wait for them."""
-        return {"action": self._act, "physics": self._advance, "episode": self._judge,
-                "observe": lambda: self._observe(beginning=0), "reset": self._renew}  # fmt: skip
+    def stages(self, worlds: Worlds | None = None) -> dict[str, Callable[[], None]]:
+        """Return the parts of a step by name, in order: each launches its kernels and does not wait for them.
 
-    def _act(self) -> None:
-        n, robot, env, settings = self.num_envs, self.robot, self.worlds, self._settings
-        delays, push = self.delays, self.parameters.push
-        self._launch(action_kernel, (n, 4), [self._action, settings, push, robot, env, delays])
-        self._events(AT_STEP, self._all)
+        worlds: for which they are launched, by default all; no stage of some reads or writes what is of others.
+        """
+        part = self._part(worlds)
+        return {"action": lambda: self._act(part), "physics": lambda: self._advance(part),
+                "episode": lambda: self._judge(part), "observe": lambda: self._observe(part, beginning=0),
+                "reset": lambda: self._renew(part)}  # fmt: skip
 
-    def _advance(self) -> None:
+    def _act(self, part: Part) -> None:
+        inputs = [self._action, self._settings, self.parameters.push, self.robot, part.env, self.delays]
+        self._launch(action_kernel, (part.count, 4), inputs)
+        self._events(part, AT_STEP, self._all)
+
+    def _advance(self, part: Part) -> None:
         delays, scene = self.delays, self._scene
         self.sim.physics.advance(
-            self.sim.substeps, delays.late_target, delays.earlier_target, delays.late_steps, bodies=False
-        )
-        inputs = [scene.geometry, scene.ground, self._settings, self.worlds, self.robot]
-        self._launch(track_kernel, (4, self.num_envs), inputs)
+            self.sim.substeps, delays.late_target, delays.earlier_target, delays.late_steps, bodies=False,
+            worlds=Worlds(part.first, part.count),
+        )  # fmt: skip
+        inputs = [scene.geometry, scene.ground, self._settings, part.env, self.robot]
+        self._launch(track_kernel, (4, part.count), inputs)
 
-    def _judge(self) -> None:
+    def _judge(self, part: Part) -> None:
         for skill in self.skills:
             self._launch(
-                skill.kernels["step"], self.num_envs,
-                [skill.index, self.robot, self._scene.ground, len(skill.task.levels), skill.numbers, self.worlds,
+                skill.kernels["step"], part.count,
+                [skill.index, self.robot, self._scene.ground, len(skill.task.levels), skill.numbers, part.env,
                  skill.states, skill.term_value, skill.counters],
             )  # fmt: skip
 
-    def _renew(self) -> None:
-        self._hand_over()
+    def _renew(self, part: Part) -> None:
+        self._hand_over(part)
         begins = self.auto_reset and self._ends_episodes
         if begins:
-            self._begin(self.worlds.done)
+            self._begin(part, self.worlds.done)
         if self._handovers or begins:
-            self._observe(beginning=1)
+            self._observe(part, beginning=1)
 
-    def _hand_over(self) -> None:
+    def _hand_over(self, part: Part) -> None:
         if self._handovers:
-            self._moved.zero_()
+            self._moved[part.first : part.first + part.count].zero_()
         for kernel, source, target in self._handovers:
             self._launch(
-                kernel, self.num_envs,
+                kernel, part.count,
                 [source, target, self._scene.ground, self._settings, self._moved, self.robot, self.parameters,
-                 self.worlds, self.skills[source].states, self.skills[target].states],
+                 part.env, self.skills[source].states, self.skills[target].states],
             )  # fmt: skip
 
-    def _begin(self, mask: wp.array) -> None:
+    def _begin(self, part: Part, mask: wp.array) -> None:
         """Begin new episodes where mask is not 0, and commands where they are due."""
-        self._draw(mask)
+        self._draw(part, mask)
         for skill in self.skills:
             lanes = attempts.LANES if self.wp_device.is_cuda and skill.task.reset.side_by_side else 1
             self._launch(
-                skill.kernels["reset"], (self.num_envs, lanes),
-                [skill.index, lanes, mask, self._scene, self._settings, skill.settings, skill.levels, self.worlds,
+                skill.kernels["reset"], (part.count, lanes),
+                [skill.index, lanes, mask, self._scene, self._settings, skill.settings, skill.levels, part.env,
                  skill.states, self.robot], block_dim=128,
             )  # fmt: skip
-        self._forget(mask)
+        self._forget(part, mask)
 
-    def _draw(self, mask: wp.array) -> None:
+    def _draw(self, part: Part, mask: wp.array) -> None:
         """Draw parameters of episodes that begin where mask is not 0."""
-        if not self._started:
+        if not self._started:  # all worlds begin
             self._launch(motors_kernel, (12, self.num_envs), [self.parameters])
-            self._events(STARTUP, self._all)
+            self._events(part, STARTUP, self._all)
             self._started = True
-        self._events(AT_RESET, mask)
+        self._events(part, AT_RESET, mask)
 
-    def _events(self, stage: int, mask: wp.array) -> None:
+    def _events(self, part: Part, stage: int, mask: wp.array) -> None:
         """Run the events of a stage, and let the solver read what they changed."""
         for skill in self.skills:
             due = [row.term for row in skill.task.rows["events"] if row.term.due_at(stage)]
             if due:
                 lanes = events.LANES if self.wp_device.is_cuda else 1
                 self._launch(
-                    skill.kernels["event"], (skill.num_events, lanes, self.num_envs),
-                    [skill.index, stage, lanes, mask, self.step_dt, self.worlds, skill.numbers, skill.timer,
+                    skill.kernels["event"], (skill.num_events, lanes, part.count),
+                    [skill.index, stage, lanes, mask, self.step_dt, part.env, skill.numbers, skill.timer,
                      self.parameters], block_dim=256,
                 )  # fmt: skip
             if any(term.options["repack"] for term in due):
-                self.sim.physics.parameters_changed(mask)
+                self.sim.physics.parameters_changed(mask, Worlds(part.first, part.count))
 
-    def _forget(self, mask: wp.array) -> None:
-        self._launch(forget_kernel, (12, self.num_envs), [mask, self._scene.geometry, self.robot, self.delays])
+    def _forget(self, part: Part, mask: wp.array) -> None:
+        inputs = [part.first, mask, self._scene.geometry, self.robot, self.delays]
+        self._launch(forget_kernel, (12, part.count), inputs)
         self.sim.physics.after_reset(mask)
 
     def _tick(self, mask: wp.array) -> None:
         self._launch(tick_kernel, self.num_envs, [mask, self.worlds])
 
-    def _observe(self, beginning: int) -> None:
+    def _observe(self, part: Part, beginning: int) -> None:
         for skill in self.skills:
             arrays = skill.observations
             self._launch(
-                skill.kernels["observe"], (skill.num_chunks, self.num_envs),
-                [skill.index, self.robot, self.parameters, self._scene.ground, self.worlds, skill.states,
+                skill.kernels["observe"], (skill.num_chunks, part.count),
+                [skill.index, self.robot, self.parameters, self._scene.ground, part.env, skill.states,
                  skill.numbers, beginning, arrays.raw],
             )  # fmt: skip
-            inputs = [skill.index, self.worlds, skill.columns, skill.numbers, beginning, arrays]
-            wp.launch(condition_kernel, (self.num_envs, int(LANES)), inputs, device=self.wp_device)
+            inputs = [skill.index, part.env, skill.columns, skill.numbers, beginning, arrays]
+            wp.launch(condition_kernel, (part.count, int(LANES)), inputs, device=self.wp_device)
 
     def _launch(self, kernel: wp.Kernel, dim: int | tuple[int, ...], inputs: list, block_dim: int = 32) -> None:
         # small blocks spread a few thousand heavy threads over all multiprocessors

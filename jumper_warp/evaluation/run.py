@@ -26,6 +26,7 @@ from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.output import output_dir, write_figures
 from jumper_warp.utils.runtime import announce
+from jumper_warp.utils.threads import checked_threads
 
 HEIGHTS = ("height",)
 """Evaluations of policies that jump to heights."""
@@ -52,11 +53,14 @@ class EvaluationArgs:
     """Folder for figures, plots, recordings and filmstrips (default: outputs/<name>/<time>)."""
     device: str | None = None
     """Warp device."""
+    threads: int | None = None
+    """CPU threads that share the worlds (default: all cores); they change no result."""
 
     def __post_init__(self) -> None:
         """Check the values."""
         if self.record < 0:
             raise InputError(f"record must not be negative, got {self.record}")
+        checked_threads(self.threads)
 
 
 class EvaluationRun:
@@ -102,7 +106,7 @@ class EvaluationRun:
                 f"this needs a policy that is evaluated by {' or '.join(evaluations)}, "
                 f"{args.policy} is of {run.task.name}, by {run.task.evaluation}"
             )
-        conditions = Conditions(args.solver, args.randomize, args.randomize, args.seed, args.device)
+        conditions = Conditions(args.solver, args.randomize, args.randomize, args.seed, args.device, args.threads)
         run.prepare(name, conditions, args.out, record=args.record)
         run.told = {"task": run.task.name} if len(evaluations) > 1 else {}
         return run
@@ -111,9 +115,9 @@ class EvaluationRun:
         """Take up the conditions, look for the device and make the folder, before anything is simulated.
 
         name: of the folder, unless `out` is given; record: number of worlds that are filmed.
-        Raises InputError: there is no such device; OSError: the folder cannot be made.
+        Raises InputError: there is no such device or number of threads; OSError: the folder cannot be made.
         """
-        announce(conditions.device)
+        announce(conditions.device, conditions.threads)
         self.conditions, self.record = conditions, record
         self.folder = output_dir(name, out)
 

@@ -42,6 +42,8 @@ class SoakArgs:
     """Folder for figures.json (default: outputs/soak_test/<time>)."""
     device: str | None = None
     """Warp device."""
+    threads: int | None = None
+    """CPU threads that share the worlds (default: all cores); they change no result."""
 
     def __post_init__(self) -> None:
         """Check the values."""

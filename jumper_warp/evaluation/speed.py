@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import contextlib
 import io
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import torch
-import warp as wp
 
 from jumper_warp.envs.env import Env
 from jumper_warp.registry import make_task
@@ -16,6 +15,7 @@ from jumper_warp.rl.cfg import PpoCfg
 from jumper_warp.rl.logger import Stopwatch
 from jumper_warp.rl.ppo import Ppo
 from jumper_warp.sim.simulation import Simulation
+from jumper_warp.sim.slices import SlicedGraph, Worlds
 from jumper_warp.utils.timing import median_time, wall_time
 
 SQUAT, DEFAULT, EXTEND = 110.0, 45.0, -10.0
@@ -70,15 +70,17 @@ def standing_solver(envs: int, device: str | None) -> Callable[[], None]:
     standing = sim.joint_q()[:, 2]
     if not (np.all(standing > 0.33) and np.all(standing < 0.40)):
         raise RuntimeError(f"the robots do not stand: heights {standing.min():.3f} to {standing.max():.3f} m")
-    with wp.ScopedCapture(device=sim.device) as capture:
-        sim.physics.advance(sim.substeps, sim.target, bodies=False)
-    kept = (sim, capture.graph)  # the graph works on the simulation's arrays
-    return lambda: wp.capture_launch(kept[1])
+
+    def advance(worlds: Worlds) -> None:
+        sim.physics.advance(sim.substeps, sim.target, bodies=False, worlds=worlds)
+
+    kept = (sim, SlicedGraph(advance, sim.slices, sim.device))  # the graph works on the simulation's arrays
+    return kept[1].replay
 
 
-def stepping_env(envs: int, device: str | None) -> tuple[Env, Callable[[], None]]:
+def stepping_env(envs: int, device: str | None, threads: int | None = None) -> tuple[Env, Callable[[], None]]:
     """Return an environment in the middle of its episodes, and what steps it with random actions."""
-    env = Env(make_task("vertical-jump"), envs, device=device)
+    env = Env(make_task("vertical-jump"), envs, device=device, threads=threads)
     actions = torch.rand(16, envs, env.num_actions, device=env.device) * 2.0 - 1.0
     count = 0
 
@@ -96,14 +98,33 @@ def stepping_env(envs: int, device: str | None) -> tuple[Env, Callable[[], None]
     return env, step
 
 
+def time_threads(envs: int, threads: Sequence[int], steps: int, repeats: int) -> dict[str, float]:
+    """Return policy steps a second on a CPU by numbers of threads, and how much faster the last is than the first.
+
+    Repetitions take turns and the best counts, as other work on the machine only slows them down. `thread_speedup` is
+    the smaller one of physics and environment.
+    """
+    bodies: dict[str, list[Callable[[], object]]] = {"physics": [], "env": []}
+    for n in threads:
+        sim = Simulation(envs, visuals=False, device="cpu", threads=n)
+        command(sim, DEFAULT, 90)
+        bodies["physics"].append(sim.step)
+        bodies["env"].append(stepping_env(envs, "cpu", n)[1])
+    figures = {}
+    for name, body in bodies.items():
+        times = np.array([[wall_time(each, "cpu", steps) for each in body] for _ in range(repeats)]).min(axis=0)
+        figures |= {f"{name}_steps_per_s_threads_{n}": envs / t for n, t in zip(threads, times, strict=True)}
+        figures[f"thread_speedup_{name}"] = float(times[0] / times[-1])
+    return figures | {"thread_speedup": min(figures[f"thread_speedup_{name}"] for name in bodies)}
+
+
 def time_stages(envs: int, device: str | None, repeats: int) -> dict[str, float]:
     """Return seconds of each part of a policy step (`Env.stages`), launched again and again from the same state."""
     env, _ = stepping_env(envs, device)
     saved, parts = env.state_dict(), {}
-    for name, stage in env.stages().items():
-        with wp.ScopedCapture(device=env.wp_device) as capture:
-            stage()
-        parts[name] = median_time(lambda graph=capture.graph: wp.capture_launch(graph), device, CALLS, repeats)
+    for name in env.stages():
+        graph = SlicedGraph(lambda worlds, name=name: env.stages(worlds)[name](), env.sim.slices, env.wp_device)
+        parts[name] = median_time(graph.replay, device, CALLS, repeats)
         env.load_state_dict(saved)
     return parts
 

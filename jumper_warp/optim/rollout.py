@@ -242,7 +242,7 @@ class DifferentiableRollout:
         safe = self._zeros(target.shape)
         kernel = self.dynamics.modules.command_filter.command_filter_kernel
         self._launch(
-            kernel, (4, self.num_worlds), [target, q, qd, COORDS, DOFS, self.motors.offset, self._filter], [safe]
+            kernel, (4, self.num_worlds), [0, target, q, qd, COORDS, DOFS, self.motors.offset, self._filter], [safe]
         )
         return safe
 

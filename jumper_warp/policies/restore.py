@@ -52,6 +52,8 @@ class Conditions:
     """Of randomisation and noise."""
     device: str | None = None
     """Warp device (default: a GPU if there is one)."""
+    threads: int | None = None
+    """CPU threads that share the worlds (default: all cores); they change no result."""
 
 
 def is_run(source: str | Path) -> bool:

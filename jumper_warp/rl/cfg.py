@@ -8,6 +8,7 @@ from typing import Literal
 
 from jumper_warp.utils.checks import check_finite, check_not_negative, check_positive
 from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.threads import checked_threads
 
 ACTIVATIONS = ("elu", "relu", "tanh")
 """Names of activations."""
@@ -112,6 +113,9 @@ class TrainCfg:
     """Of weights, noise and worlds, 0 to 2^31 - 1; every process derives its own."""
     device: str | None = None
     """A torch device; default: a GPU if there is one."""
+    threads: int | None = None
+    """CPU threads of each process that share its worlds (default: all cores, shared out to the processes of a machine).
+    They change no result; those of torch do, half the cores unless OMP_NUM_THREADS says otherwise."""
     log_root: Path = Path("logs")
     """A run is written to log_root/task/time of its start."""
     log_interval: int = 10
@@ -140,6 +144,7 @@ class TrainCfg:
             if getattr(self, name) < 1:
                 raise InputError(f"{name} must be at least 1, got {getattr(self, name)}")
         check_not_negative("max_seconds", self.max_seconds)
+        checked_threads(self.threads)
         if not 0 <= self.seed < 2**31:
             raise InputError(f"seed must be in 0 .. {2**31 - 1}, got {self.seed}")
         if self.trainer == "rsl-rl" and self.resume:

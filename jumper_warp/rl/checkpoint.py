@@ -128,6 +128,16 @@ def best_checkpoint(folder: Path) -> Path:
     return folder / (_best(manifest) or list(manifest)[-1])
 
 
+def newest_checksum(folder: Path) -> str | None:
+    """Return the SHA-256 of the last saved checkpoint, usable or not; None: there is none.
+
+    Raises:
+        CheckpointError: The manifest is not readable.
+    """
+    manifest = _read_manifest(folder, missing_ok=True)
+    return manifest[list(manifest)[-1]]["sha256"] if manifest else None
+
+
 def _best(manifest: dict[str, dict[str, Any]]) -> str | None:
     scored = [name for name, entry in manifest.items() if entry["score"] is not None and math.isfinite(entry["score"])]
     return max(scored, key=lambda name: manifest[name]["score"], default=None)

@@ -6,7 +6,9 @@ from typing import Any, NamedTuple
 
 import torch
 
+from jumper_warp.rl.rendezvous import elastic_store
 from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.threads import available_threads
 
 
 def world_size() -> int:
@@ -54,10 +56,13 @@ def join_ranks(device: str | None = None) -> Rank:
     if kind.type == "cuda":
         torch.cuda.set_device(kind)
     elif "OMP_NUM_THREADS" not in os.environ:
-        # small networks lose more to waiting threads than they gain, far more on a busy machine
-        torch.set_num_threads(max(1, (os.cpu_count() or 1) // 2))
+        # small networks lose more to waiting threads than they gain, far more on a busy machine; what the simulation's
+        # threads are does not matter here: torch's sums depend on the number of its threads
+        torch.set_num_threads(max(1, available_threads() // 2))
     if size > 1 and not torch.distributed.is_initialized():
-        torch.distributed.init_process_group("nccl" if kind.type == "cuda" else "gloo")
+        backend, store = "nccl" if kind.type == "cuda" else "gloo", elastic_store()
+        rank = {} if store is None else {"rank": int(os.environ["RANK"]), "world_size": size, "store": store}
+        torch.distributed.init_process_group(backend, **rank)
     return Rank(int(os.environ.get("RANK", "0")) if size > 1 else 0, size, kind)
 
 

@@ -20,12 +20,14 @@ from jumper_warp.envs.vec_env import VecEnv
 from jumper_warp.rl.cfg import TrainCfg
 from jumper_warp.rl.checkpoint import DAMAGE, CheckpointError, one_line, save_checkpoint
 from jumper_warp.rl.distributed import Rank, gather, join_ranks, wait_for_ranks, world_size
+from jumper_warp.rl.elastic import mark_run, own_run
 from jumper_warp.rl.logger import Pace, Stopwatch, TrainingLog
 from jumper_warp.rl.ppo import FIGURES, Ppo
 from jumper_warp.rl.resume import CHECKPOINTS, find_checkpoint, own_part, random_state, set_random_state, spent_seconds
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.files import write_whole
 from jumper_warp.utils.runtime import git_commit, versions
+from jumper_warp.utils.threads import set_threads
 
 CONFIG = "config.json"
 """File of a run: all settings, versions and the commit."""
@@ -84,6 +86,7 @@ def train(
         CheckpointError: There is nothing usable to resume from, or the end could not be saved.
         SystemExit: With code INTERRUPTED, after Ctrl-C or SIGTERM ended the iteration and it was saved.
     """
+    set_threads(cfg.threads)
     rank = join_ranks(cfg.device)
     try:
         _check_processes(cfg, rank, as_rsl_rl is not None)
@@ -91,7 +94,8 @@ def train(
         if cfg.trainer == "rsl-rl":
             return _train_rsl_rl(cfg, env, as_rsl_rl, rank)
         torch.manual_seed(cfg.seed)  # the same weights in all processes
-        run = Run(cfg, env, rank, command)
+        cfg, folder = own_run(cfg, rank)
+        run = Run(cfg, env, rank, command, folder)
         with Stop() as stop:
             result = run.iterate(stop)
         wait_for_ranks()
@@ -139,8 +143,13 @@ def full_config(cfg: TrainCfg, env: VecEnv, rank: Rank) -> dict[str, Any]:
 class Run:
     """A training under way in this process."""
 
-    def __init__(self, cfg: TrainCfg, env: VecEnv, rank: Rank, command: str | None = None) -> None:
-        """Build the algorithm, and take up a checkpoint if the configuration names one; command: as in `train`."""
+    def __init__(
+        self, cfg: TrainCfg, env: VecEnv, rank: Rank, command: str | None = None, folder: Path | None = None
+    ) -> None:
+        """Build the algorithm, and take up a checkpoint if the configuration names one.
+
+        command: as in `train`. folder: of the run, if it has begun before.
+        """
         self.cfg, self.env, self.rank = cfg, env, rank
         self._command = command or f"jumper train {cfg.task}"
         self.ppo = Ppo(env, cfg.ppo)
@@ -151,7 +160,9 @@ class Run:
         self.figures: dict[str, float] = {}
         self.notes: list[str] = []
         torch.manual_seed(cfg.seed + 1 + rank.index)
-        self.folder = self._resume() if cfg.resume else new_folder(cfg, rank)
+        self.folder = self._resume() if cfg.resume else folder or new_folder(cfg, rank)
+        if folder is None:
+            mark_run(self.folder, rank)
         if rank.index == 0:
             write_whole(self.folder / CONFIG, json.dumps(self.config, indent=1).encode())
 

@@ -14,6 +14,7 @@ from jumper_warp.robot.description import LEGS, RobotDescription, load_descripti
 from jumper_warp.robot.grounds import BlockCfg
 from jumper_warp.robot.model import leg_geometry_array
 from jumper_warp.sim.precision import float64_kernels
+from jumper_warp.sim.slices import Worlds
 from jumper_warp.utils.errors import InputError
 
 LINKS = ("housing", "outer_thigh", "outer_shank", "inner_thigh", "inner_shank")
@@ -237,13 +238,16 @@ class JumperDynamics:
             ],
         )
 
-    def repack(self, mask: wp.array) -> None:
-        """Read masses, armature, motor friction and friction of paws, where mask (num_worlds,) float is not 0."""
-        m = self.model
+    def repack(self, mask: wp.array, worlds: Worlds | None = None) -> None:
+        """Read masses, armature, motor friction and friction of paws, where mask (num_worlds,) float is not 0.
+
+        worlds: which are looked at, by default all.
+        """
+        m, (first, count) = self.model, worlds or (0, self.num_worlds)
         self._launch(
             self.modules.parameters.repack_kernel,
-            (self.num_worlds, 25),
-            [mask, m.body_mass, m.body_com, m.body_inertia, m.joint_armature, m.joint_friction, self._paws,
+            (count, 25),
+            [first, mask, m.body_mass, m.body_com, m.body_inertia, m.joint_armature, m.joint_friction, self._paws,
              self._ground_shape, m.shape_material_mu, self.static_friction_ratio],
         )  # fmt: skip
 
@@ -283,35 +287,41 @@ class JumperDynamics:
         return drive
 
     def advance(
-        self,
-        settings: Any,
-        drive: Any,
-        q: wp.array,
-        qd: wp.array,
-        q_out: wp.array,
-        qd_out: wp.array,
-        by_legs: bool | None = None,
-    ) -> None:
-        """Advance base and motor coordinates of every world by `settings.substeps` steps, in place if out is in.
+        self, settings: Any, drive: Any, q: wp.array, qd: wp.array, q_out: wp.array, qd_out: wp.array,
+        worlds: Worlds | None = None, by_legs: bool | None = None,
+    ) -> None:  # fmt: skip
+        """Advance base and motor coordinates by `settings.substeps` steps, in place if out is in.
 
-        by_legs: whether a thread has a leg or a world; None: a leg on a GPU, a world on a CPU.
+        worlds: which are advanced, by default all. by_legs: whether a thread has a leg or a world, by default a leg on
+        a GPU and a world on a CPU.
         """
-        n, inputs, outputs = self.num_worlds, [self.robot, settings, drive, q, qd, self.work], [q_out, qd_out]
+        settings.first, count = worlds or (0, self.num_worlds)
+        inputs, outputs = [self.robot, settings, drive, q, qd, self.work], [q_out, qd_out]
         if by_legs is None:
             by_legs = self.device.is_cuda
         if by_legs:
-            kernel, dim, inputs = self.modules.advance_legs.advance_legs_kernel, (-(-n // 8) * 8, 4), [n, *inputs]
+            kernel, dim, inputs = (
+                self.modules.advance_legs.advance_legs_kernel,
+                (-(-count // 8) * 8, 4),
+                [count, *inputs],
+            )
             block = 32 if self.device.is_cuda else 4
         else:
-            kernel, dim, block = self.modules.advance.advance_kernel, n, 32
+            kernel, dim, block = self.modules.advance.advance_kernel, count, 32
         wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device, block_dim=block)
 
-    def full_state(self, q: wp.array, qd: wp.array, body_q: wp.array, body_qd: wp.array) -> None:
-        """Write passive and loop joints (into q, qd) and all bodies from the base and motor coordinates."""
+    def full_state(
+        self, q: wp.array, qd: wp.array, body_q: wp.array, body_qd: wp.array, worlds: Worlds | None = None
+    ) -> None:
+        """Write passive and loop joints (into q, qd) and all bodies from the base and motor coordinates.
+
+        worlds: whose, by default all.
+        """
+        first, count = worlds or (0, self.num_worlds)
         wp.launch(
             self.modules.full_state.full_state_kernel,
-            dim=(self.num_worlds, 4),
-            inputs=[self.robot.geometry, self.model.body_com, q, qd],
+            dim=(count, 4),
+            inputs=[first, self.robot.geometry, self.model.body_com, q, qd],
             outputs=[body_q, body_qd],
             device=self.device,
         )

@@ -14,6 +14,7 @@ from jumper_warp.robot.grounds import BlockCfg
 from jumper_warp.robot.model import KNEE_DOFS
 from jumper_warp.sim.dynamics import JumperDynamics
 from jumper_warp.sim.mujoco import mujoco_solver
+from jumper_warp.sim.slices import Worlds
 from jumper_warp.sim.solver import SolverJumper
 from kernels.actuation.motors import motor_torque_kernel
 from kernels.actuation.passive import passive_torque_kernel
@@ -35,6 +36,8 @@ DRAWN_FLAGS = (
 class Physics(Protocol):
     """What a simulation and an environment ask of a solver. Arrays keep their place."""
 
+    sliced: bool
+    """Whether it can advance some of the worlds alone."""
     solver: newton.solvers.SolverBase
     dynamics: JumperDynamics
     """Geometry, ground and friction ratio; on other solvers for kinematics only."""
@@ -58,15 +61,20 @@ class Physics(Protocol):
         previous: wp.array | None = None,
         delay: wp.array | None = None,
         bodies: bool = True,
+        worlds: Worlds | None = None,
     ) -> None:
         """Launch physics steps towards motor targets [rad], shape (12, num_worlds).
 
         With `delay` [physics steps], shape (num_worlds,), the motors follow `previous` until the target arrives.
-        bodies False: passive joints and bodies of the state need not be written.
+        bodies False: passive joints and bodies of the state need not be written. worlds: which are advanced, by
+        default all.
         """
 
-    def parameters_changed(self, mask: wp.array | None = None) -> None:
-        """Read the model's masses, joints and friction again, where mask (num_worlds,) is not 0; None: everywhere."""
+    def parameters_changed(self, mask: wp.array | None = None, worlds: Worlds | None = None) -> None:
+        """Read the model's masses, joints and friction again, where mask (num_worlds,) is not 0; None: everywhere.
+
+        worlds: at which the mask is looked at, by default all.
+        """
 
     def after_reset(self, mask: wp.array) -> None:
         """Let everything follow from coordinates that were written anew where mask (num_worlds,) is not 0."""
@@ -84,6 +92,8 @@ class Physics(Protocol):
 class JumperPhysics:
     """`SolverJumper`: a policy step in one launch."""
 
+    sliced = True
+
     def __init__(self, sim: Any, block: BlockCfg | None, tolerance: float) -> None:
         """Make the solver for a simulation's model; raises ValueError as `SolverJumper`."""
         self._sim = sim
@@ -100,19 +110,21 @@ class JumperPhysics:
         previous: wp.array | None = None,
         delay: wp.array | None = None,
         bodies: bool = True,
+        worlds: Worlds | None = None,
     ) -> None:
         """See `Physics.advance`."""
         state, sim = self._sim.state, self._sim
         self.solver.step_motors(
-            state, state, sim.motors, target, sim.dt, substeps, previous=previous, delay=delay, bodies=bodies
-        )
+            state, state, sim.motors, target, sim.dt, substeps, previous=previous, delay=delay, bodies=bodies,
+            worlds=worlds,
+        )  # fmt: skip
 
-    def parameters_changed(self, mask: wp.array | None = None) -> None:
+    def parameters_changed(self, mask: wp.array | None = None, worlds: Worlds | None = None) -> None:
         """See `Physics.parameters_changed`."""
         if mask is None:
             self.dynamics.pack()
         else:
-            self.dynamics.repack(mask)
+            self.dynamics.repack(mask, worlds)
 
     def after_reset(self, mask: wp.array) -> None:
         """See `Physics.after_reset`; the solver reads base and motors only."""
@@ -135,6 +147,8 @@ class JumperPhysics:
 
 class MujocoPhysics:
     """Newton's SolverMuJoCo, physics step by physics step, with this robot's motors and passive joints."""
+
+    sliced = False
 
     def __init__(self, sim: Any, observe_forces: bool) -> None:
         """Make the solver for a simulation's model, whose knee damping it takes over."""
@@ -170,8 +184,9 @@ class MujocoPhysics:
         previous: wp.array | None = None,
         delay: wp.array | None = None,
         bodies: bool = True,
+        worlds: Worlds | None = None,
     ) -> None:
-        """See `Physics.advance`; bodies are always written."""
+        """See `Physics.advance`; all worlds are, and bodies are always written."""
         for i in range(substeps):
             if delay is not None:
                 self._launch(
@@ -193,7 +208,7 @@ class MujocoPhysics:
                 paw_force_kernel, sim.num_worlds, inputs, [self.paw_force, self.peak_force, self.peak_paw_force]
             )
 
-    def parameters_changed(self, mask: wp.array | None = None) -> None:
+    def parameters_changed(self, mask: wp.array | None = None, worlds: Worlds | None = None) -> None:
         """See `Physics.parameters_changed`; MuJoCo reads all worlds."""
         self.solver.notify_model_changed(DRAWN_FLAGS)
 

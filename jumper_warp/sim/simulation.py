@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any, Literal
 
 import newton
@@ -13,8 +13,10 @@ from jumper_warp.robot.grounds import BlockCfg
 from jumper_warp.robot.model import PHYSICS_DT, Extras, build_model
 from jumper_warp.robot.motors import FilterCfg, MotorCfg, filter_params, jumping_motors, motor_arrays
 from jumper_warp.sim.physics import JumperPhysics, MujocoPhysics, Physics
+from jumper_warp.sim.slices import SlicedGraph, Worlds, slices_of
 from jumper_warp.sim.solver import TOLERANCE, check_step, check_tolerance
 from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.threads import checked_threads
 from kernels.actuation.command_filter import command_filter_kernel
 from kernels.actuation.readout import base_velocity_kernel
 from kernels.dynamics.restore import StateArrays, restore_motors_kernel, restore_state_kernel
@@ -53,6 +55,7 @@ class Simulation:
         visuals: bool = True,
         extras: Extras | None = None,
         device: wp.DeviceLike = None,
+        threads: int | None = None,
     ):
         """Build the model, solver and motors, the robot standing in the default pose.
 
@@ -71,10 +74,12 @@ class Simulation:
             visuals: Whether to add shapes that only viewers see.
             extras: Adds the caller's own sites and shapes to every world, as in `build_model`.
             device: Warp device.
+            threads: Of a CPU, which share the worlds out and change no bit; by default what
+                `jumper_warp.utils.threads.set_threads` chose, or all cores. SolverMuJoCo and few worlds use one.
 
         Raises:
-            ValueError: unknown solver, a block on MuJoCo, dt or tolerance not finite and positive, substeps no whole
-                number of at least 1, or as `build_model` and `SolverJumper`.
+            ValueError: unknown solver, a block on MuJoCo, dt or tolerance not finite and positive, substeps or
+                threads no whole number of at least 1, or as `build_model` and `SolverJumper`.
             NotThisRobotError: `extras` adds more than sites and shapes.
         """
         if solver not in ("jumper", "mujoco"):
@@ -83,6 +88,7 @@ class Simulation:
             raise InputError("a moving block needs solver='jumper', got 'mujoco'")
         check_step(dt, substeps)
         check_tolerance(tolerance)
+        threads = checked_threads(threads)
         self.model = build_model(
             num_worlds, ground=ground, friction=friction, visuals=visuals, extras=extras, device=device
         )
@@ -100,10 +106,12 @@ class Simulation:
         self.target, self._safe_target = wp.clone(self._standing), wp.clone(self._standing)
         self._mask = wp.zeros(num_worlds + 1, dtype=wp.bool, device=self.device)  # the last one: no world
         self._base_velocity = wp.zeros(num_worlds, dtype=wp.vec3, device=self.device)
-        self._graphs: dict[str, object] = {}
+        self._graphs: dict[str, SlicedGraph | None] = {}
         self.physics: Physics = (
             JumperPhysics(self, block, tolerance) if solver == "jumper" else MujocoPhysics(self, observe_forces)
         )
+        shared = self.physics.sliced and not self.device.is_cuda
+        self.slices = slices_of(num_worlds, threads if shared else 1)
         self.solver = self.physics.solver
         self.torque, self.paw_force = self.physics.torque, self.physics.paw_force
         self.peak_force = self.physics.peak_force
@@ -160,40 +168,45 @@ class Simulation:
 
     def physics_step(self) -> None:
         """Advance one physics step towards the filtered targets."""
-        self._captured("physics", lambda: self._physics(1))
+        self._captured("physics", lambda worlds: self._physics(1, worlds))
 
-    def _step(self) -> None:
-        self._filter_targets()
-        self._physics(self.substeps)
+    def _step(self, worlds: Worlds) -> None:
+        self._filter_targets(worlds)
+        self._physics(self.substeps, worlds)
 
-    def _captured(self, name: str, body) -> None:
+    def _captured(self, name: str, body: Callable[[Worlds], None]) -> None:
         """Run a body eagerly the first time, then as a captured graph; within a capture it becomes part of that."""
         if self.device.is_capturing:
-            body()
+            body(Worlds(0, self.num_worlds))
             return
         if name not in self._graphs:
-            body()
+            body(Worlds(0, self.num_worlds))
             self._graphs[name] = None
             return
-        if self._graphs[name] is None:
-            with wp.ScopedCapture(device=self.device) as capture:
-                body()
-            self._graphs[name] = capture.graph
-        wp.capture_launch(self._graphs[name])
+        graph = self._graphs[name]
+        if graph is None:
+            graph = self._graphs[name] = SlicedGraph(body, self.slices, self.device)
+        graph.replay()
 
-    def _filter_targets(self) -> None:
+    def _filter_targets(self, worlds: Worlds) -> None:
         if self._filter is None:
-            wp.copy(self._safe_target, self.target)
+            if worlds.count == self.num_worlds:
+                wp.copy(self._safe_target, self.target)
+                return
+            for motor in range(12):  # a copy of whole columns cannot be captured on a CPU
+                first = motor * self.num_worlds + worlds.first
+                wp.copy(self._safe_target.flatten(), self.target.flatten(), first, first, worlds.count)
             return
         self._launch(
             command_filter_kernel,
-            (4, self.num_worlds),
-            [self.target, self.state.joint_q, self.state.joint_qd, COORDS, DOFS, self.motors.offset, self._filter],
+            (4, worlds.count),
+            [worlds.first, self.target, self.state.joint_q, self.state.joint_qd, COORDS, DOFS, self.motors.offset,
+             self._filter],
             [self._safe_target],
-        )
+        )  # fmt: skip
 
-    def _physics(self, substeps: int) -> None:
-        self.physics.advance(substeps, self._safe_target)
+    def _physics(self, substeps: int, worlds: Worlds) -> None:
+        self.physics.advance(substeps, self._safe_target, worlds=worlds)
 
     def _launch(self, kernel: wp.Kernel, dim: int | tuple[int, ...], inputs: list, outputs: list) -> None:
         wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device)

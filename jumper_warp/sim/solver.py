@@ -19,6 +19,7 @@ from jumper_warp.robot.grounds import BlockCfg
 from jumper_warp.robot.model import other_colliders
 from jumper_warp.sim.differentiable import DifferentiableStep
 from jumper_warp.sim.dynamics import JumperDynamics
+from jumper_warp.sim.slices import Worlds
 from jumper_warp.utils.errors import InputError
 from kernels.terrain.ground import Ground, rest_block
 
@@ -229,6 +230,7 @@ class SolverJumper(SolverBase):
         delay: wp.array | None = None,
         bodies: bool = True,
         observables: SolverBase.Observables | None = None,
+        worlds: Worlds | None = None,
     ) -> None:
         """Advance every world by `substeps` steps of dt [s], the motors following targets, in one launch.
 
@@ -244,13 +246,14 @@ class SolverJumper(SolverBase):
             delay: Physics steps until it does, shape (num_worlds,).
             bodies: Whether to write passive joints, loop joints and bodies; the solver itself does not need them.
             observables: Observables of the whole call.
+            worlds: Which are advanced, by default all.
 
         Raises:
             ValueError: dt is not finite and positive, or substeps no whole number of at least 1.
         """
         self.validate_observables(observables)
         drive = self.dynamics.drive(*self._forces(state_in, control), motors, target, previous, delay)
-        self._advance(state_in, state_out, drive, dt, substeps, observables, bodies)
+        self._advance(state_in, state_out, drive, dt, substeps, observables, bodies, worlds)
 
     def _forces(self, state: newton.State, control: newton.Control | None) -> tuple[wp.array, wp.array]:
         """Return the joint forces and body wrenches that act."""
@@ -266,6 +269,7 @@ class SolverJumper(SolverBase):
         substeps: int,
         observables: SolverBase.Observables | None,
         bodies: bool,
+        worlds: Worlds | None = None,
     ) -> None:
         check_step(dt, substeps)
         wants_qdd = observables is not None and observables.is_requested(SolverBase.ObservableKind.BODY_QDD)
@@ -279,9 +283,9 @@ class SolverJumper(SolverBase):
             self._differentiable.step(*coordinates, drive.joint_f, drive.body_f, *out, dt)
         else:
             settings = self.dynamics.settings(dt, substeps, self.max_sweeps, self.tolerance)
-            self.dynamics.advance(settings, drive, *coordinates, *out)
+            self.dynamics.advance(settings, drive, *coordinates, *out, worlds)
         if bodies or wants_qdd:
-            self.dynamics.full_state(*out, state_out.body_q, state_out.body_qd)
+            self.dynamics.full_state(*out, state_out.body_q, state_out.body_qd, worlds)
         if wants_qdd:
             wp.launch(
                 _acceleration_kernel,

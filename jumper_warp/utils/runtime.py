@@ -10,6 +10,7 @@ import warp as wp
 from rich.console import Console
 
 from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.threads import checked_threads, set_threads
 
 PACKAGES = ("jumper-warp", "warp-lang", "newton", "mujoco", "mujoco-warp", "torch", "numpy", "rsl-rl-lib")
 """Distributions whose version can change a figure."""
@@ -54,6 +55,7 @@ def report_device(device: wp.DeviceLike = None, console: Console | None = None) 
     info = device_info(device)
     parts = [f"device {info.alias} ({info.name})"]
     if info.driver is None:
+        parts.append(f"threads {checked_threads(None)}")
         parts.append("no CUDA device in use: large batches will be slow")
     else:
         parts += [f"driver for CUDA {info.driver}", f"mempool {'on' if info.mempool else 'OFF'}"]
@@ -64,12 +66,15 @@ def report_device(device: wp.DeviceLike = None, console: Console | None = None) 
     return info
 
 
-def announce(device: str | None) -> DeviceInfo:
+def announce(device: str | None, threads: int | None = None) -> DeviceInfo:
     """Print a line on the device that is going to be used, and silence Warp's notes on its modules.
 
+    threads: of a CPU, for all simulations that are made from now on, as in `set_threads`.
+
     Raises:
-        InputError: There is no such device.
+        InputError: There is no such device, or no such number of threads.
     """
+    set_threads(threads)
     wp.config.log_level = wp.LOG_WARNING
     try:
         return report_device(device)

@@ -90,6 +90,7 @@ def filter_leg(target: vec3, pos: vec3, vel: vec3, params: FilterParams) -> vec3
 @wp.kernel
 def command_filter_kernel(
     # in
+    first: int,
     raw_target: wp.array2d(dtype=real),
     joint_q: wp.array(dtype=real),
     joint_qd: wp.array(dtype=real),
@@ -100,12 +101,13 @@ def command_filter_kernel(
     # out
     safe_target: wp.array2d(dtype=real),
 ):
-    """Filter the motor targets of every leg. Launch over (4, num_worlds).
+    """Filter the motor targets of every leg. Launch over (4, worlds from `first` on).
 
     raw_target, safe_target [rad]: (12, num_worlds). joint_q, joint_qd: flat over worlds, laid out as Newton's.
     offset [rad]: what each position sensor reads above the true angle, (12, num_worlds); the filter sees what it reads.
     """
     leg, world = wp.tid()
+    world += first
     lateral, outer, inner = 3 * leg, 3 * leg + 1, 3 * leg + 2
     coord = coords_per_world * world + 7 + 5 * leg
     dof = dofs_per_world * world + 6 + 5 * leg

@@ -101,7 +101,7 @@ def advance_kernel(
 
     Writes the base and motor coordinates; the passive ones follow in `full_state`.
     """
-    world = wp.tid()
+    world = settings.first + wp.tid()
     if work.invalid[world] != 0:
         park(robot, work, world, joint_q_out, joint_qd_out)
         return

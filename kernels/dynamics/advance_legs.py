@@ -141,7 +141,7 @@ def advance_leg(
 @wp.kernel
 def advance_legs_kernel(
     # in
-    num_worlds: int,
+    count: int,
     robot: Robot,
     settings: StepSettings,
     drive: Drive,
@@ -153,12 +153,14 @@ def advance_legs_kernel(
     joint_q_out: wp.array(dtype=real),
     joint_qd_out: wp.array(dtype=real),
 ):
-    """Advance every world by `settings.substeps` steps; launch over (num_worlds rounded up to a multiple of 8, 4).
+    """Advance every world by `settings.substeps` steps; launch over (count rounded up to a multiple of 8, 4).
+
+    count: worlds, from `settings.first` on.
 
     Does what `advance_kernel` does, to the contact tolerance.
     """
     place, leg = wp.tid()
-    world = wp.min(place, num_worlds - 1)  # threads beyond the last world repeat it, and write nothing
+    world = settings.first + wp.min(place, count - 1)  # threads beyond the last world repeat it, and write nothing
     com = base_com(robot.table, world)
     s = LegState()
     s.base = load_base(joint_q, joint_qd, com, world)
@@ -168,10 +170,10 @@ def advance_legs_kernel(
     own = load_leg(robot, world, leg)
     motors = load_leg_drive(drive, world, leg)
     for step in range(settings.substeps):
-        s = advance_leg(robot, settings, drive, own, motors, world, leg, step, s, leg == 0 and place < num_worlds)
+        s = advance_leg(robot, settings, drive, own, motors, world, leg, step, s, leg == 0 and place < count)
     total = sum_legs(wp.dot(s.angles, s.angles) + wp.dot(s.rates, s.rates))
     broken = work.invalid[world] != 0 or not (finite_base(s.base) and wp.isfinite(total))
-    if place >= num_worlds:
+    if place >= count:
         return
     if broken:
         if leg == 0:

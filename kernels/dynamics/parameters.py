@@ -213,6 +213,7 @@ def pack_friction_kernel(
 @wp.kernel
 def repack_kernel(
     # in
+    first: int,
     mask: wp.array(dtype=float),
     body_mass: wp.array(dtype=float),
     body_com: wp.array(dtype=wp.vec3),
@@ -226,11 +227,12 @@ def repack_kernel(
     # out
     table: wp.array2d(dtype=real),
 ):
-    """Write what domain randomisation draws, where mask (num_worlds,) is not 0; launch over (num_worlds, 25).
+    """Write what domain randomisation draws, where mask (num_worlds,) is not 0; launch over (worlds from first on, 25).
 
     The first 21 threads of a world write a body each, the others a leg's motors and paw.
     """
     world, part = wp.tid()
+    world += first
     if mask[world] == 0.0:
         return
     if part < BODIES:

@@ -54,6 +54,7 @@ class StepSettings:
     substeps: int
     max_sweeps: int
     tolerance: real  # [m/s], of the contact iteration
+    first: int  # world of the first thread of a launch
 
 
 @wp.struct

@@ -88,6 +88,7 @@ def store_body(
 @wp.kernel
 def full_state_kernel(
     # in
+    first: int,
     geometry: wp.array(dtype=LegGeometry),
     body_com: wp.array(dtype=wp.vec3),
     # in, out
@@ -97,8 +98,12 @@ def full_state_kernel(
     body_q: wp.array(dtype=wp.transform),
     body_qd: wp.array(dtype=wp.spatial_vector),
 ):
-    """Write knees, loop joints and bodies from the base and motor coordinates; one thread per (world, leg)."""
+    """Write knees, loop joints and bodies from the base and motor coordinates; one thread per (world, leg).
+
+    first: world of the first thread.
+    """
     world, k = wp.tid()
+    world += first
     zero = real(0.0)
     geo = geometry[k]
     com = body_com[world * BODIES]

@@ -51,6 +51,7 @@ def action_kernel(
     An action that is not finite counts as 0, and its world as broken.
     """
     world, leg = wp.tid()
+    world += env.first
     skill = skills[env.skill[world]]
     q = world * COORDS + 7 + 5 * leg
     d = world * DOFS + 6 + 5 * leg

@@ -29,6 +29,7 @@ class EnvArrays:
     """Bookkeeping of all worlds, arrays of shape (num_worlds,)."""
 
     seed: int
+    first: int  # world of the first thread of a launch
     clock: wp.array(dtype=int)  # policy steps made; with the seed, all state of the random numbers
     skill: wp.array(dtype=int)  # index of the task that a world is in
     request: wp.array(dtype=int)  # skill that is asked for, -1: none

@@ -46,6 +46,7 @@ def make_event_kernel(rows: list) -> wp.Kernel:
         event is due at a reset as well.
         """
         row, lane, world = wp.tid()
+        world += env.first
         if env.skill[world] != skill or mask[world] == 0.0:
             return
         for i in range(wp.static(len(rows))):

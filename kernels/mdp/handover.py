@@ -51,7 +51,7 @@ def make_handover_kernel(handover: Any) -> wp.Kernel:
         targets: wp.array(dtype=handover.target.state),
     ):
         """Hand worlds over whose time has come; moved: 1 where that happened in this step; one thread per world."""
-        world = wp.tid()
+        world = env.first + wp.tid()
         if env.skill[world] != source or env.done[world] != 0.0 or moved[world] != 0:
             return
         view = load_view(robot, ground, world)

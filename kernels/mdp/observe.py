@@ -85,6 +85,7 @@ def make_observe_kernel(task: Any) -> wp.Kernel:
         beginning 1: only where an episode or the skill has just begun.
         """
         chunk, world = wp.tid()
+        world += env.first
         if env.skill[world] != skill or (beginning != 0 and env.fresh[world] == 0):
             return
         for c in range(wp.static((len(rows) + CHUNK - 1) // CHUNK)):
@@ -177,6 +178,7 @@ def condition_kernel(
     beginning 1: only where an episode or the skill has just begun, and `final` stays.
     """
     world, lane = wp.tid()
+    world += env.first
     if env.skill[world] != skill or (beginning != 0 and env.fresh[world] == 0):
         return
     broken = env.broken[world] != 0

@@ -37,11 +37,12 @@ def make_reset_kernel(task: Any) -> wp.Kernel:
         states: wp.array(dtype=task.state),
         robot: RobotArrays,
     ):
-        """Begin a new episode where mask is not 0, else a new command where it is due; launch over (num_worlds, lanes).
+        """Begin a new episode where mask is not 0, else a new command where it is due; launch over (worlds, lanes).
 
         The lanes, neighbours in a warp, do the same but for what they share by `draw.lane`.
         """
         world, lane = wp.tid()
+        world += env.first
         if env.skill[world] != skill:
             return
         begins = mask[world] != 0.0
@@ -156,6 +157,7 @@ def tick_kernel(
 @wp.kernel
 def forget_kernel(
     # in
+    first: int,
     mask: wp.array(dtype=float),
     geometry: wp.array(dtype=LegGeometry),
     # in, out
@@ -164,9 +166,10 @@ def forget_kernel(
 ):
     """Forget the past where mask is not 0: actions, torques, contacts; one thread per (motor, world).
 
-    Paws are taken to be where they are now.
+    Paws are taken to be where they are now. first: world of the first thread.
     """
     m, world = wp.tid()
+    world += first
     if mask[world] == 0.0:
         return
     slot = motor_slot(m)

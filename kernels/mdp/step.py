@@ -59,7 +59,7 @@ def make_step_kernel(task: Any) -> wp.Kernel:
 
         term_value: rewards of this step, weights applied, (rewards, num_worlds).
         """
-        world = wp.tid()
+        world = env.first + wp.tid()
         if env.skill[world] != skill:
             return
         view = load_view(robot, ground, world)

@@ -58,6 +58,7 @@ def track_kernel(
 ):
     """Follow every paw, and find what must not touch; one thread per (leg, world)."""
     leg, world = wp.tid()
+    world += env.first
     down = wp.length(robot.paw_force[leg, world]) > skills[env.skill[world]].contact_force
     time_contact(robot, world, leg, down)  # before the velocity of the step before is written over
     follow_paw(robot, geometry[leg], world, leg)

@@ -274,3 +274,16 @@ def test_benchmark_of_solvers_tells_both_and_their_ratio(tmp_path):
         assert values[f"{solver}_apex_m"] > 0.8 and values[f"{solver}_steps_per_s_jump"] > 0.0
     expected = values["jumper_steps_per_s_standing"] / values["mujoco_steps_per_s_standing"]
     assert values["ratio_standing"] == pytest.approx(expected) and values["ratio_jump"] > 0.0
+
+
+def test_benchmark_of_solvers_compares_numbers_of_threads(tmp_path):
+    args = benchmark_solver.Args(
+        envs=[32], solvers=["jumper"], repeats=1, steps=2, out=tmp_path, device="cpu", threads=[1, 2]
+    )
+    values = benchmark_solver.main(args)
+    ratios = []
+    for what in ("physics", "env"):
+        one, two = (values[f"{what}_steps_per_s_threads_{n}"] for n in (1, 2))
+        ratios.append(two / one)
+        assert values[f"thread_speedup_{what}"] == pytest.approx(ratios[-1])
+    assert values["thread_speedup"] == pytest.approx(min(ratios)) and values["jumper_apex_m"] > 0.8

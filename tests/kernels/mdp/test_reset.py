@@ -48,7 +48,7 @@ class Stage(Probe):
 
     def forget(self, chosen):
         """Launch what forgets the past."""
-        inputs = [self.mask(chosen), self.scene.geometry, self.robot, self.delays]
+        inputs = [0, self.mask(chosen), self.scene.geometry, self.robot, self.delays]
         wp.launch(forget_kernel, (12, self.n), inputs, device="cpu")
 
     def stand(self, chosen, headings):

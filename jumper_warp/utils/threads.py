@@ -1,0 +1,67 @@
+"""How many threads the CPU's worlds are shared out to, and jobs that run side by side."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor, wait
+
+from jumper_warp.utils.errors import InputError
+
+_chosen: int | None = None
+_pools: dict[int, ThreadPoolExecutor] = {}
+
+
+def available_threads() -> int:
+    """Return the CPU cores that this process may use; processes of one torchrun on one machine share them."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return max(1, cores // max(1, int(os.environ.get("LOCAL_WORLD_SIZE", "1"))))
+
+
+def checked_threads(threads: int | None) -> int:
+    """Return a number of threads; None is what `set_threads` chose. Raises ValueError: no whole number above 0."""
+    if threads is None:
+        return available_threads() if _chosen is None else _chosen
+    if isinstance(threads, bool) or not isinstance(threads, int) or threads < 1:
+        raise InputError(f"threads must be a whole number of at least 1, got {threads!r:.60}")
+    return threads
+
+
+def set_threads(threads: int | None) -> None:
+    """Choose the threads of all simulations that are made from now on; None: `available_threads`.
+
+    Raises ValueError as `checked_threads`.
+    """
+    global _chosen
+    _chosen = None if threads is None else checked_threads(threads)
+
+
+def run_side_by_side(jobs: Iterable[Callable[[], object]], threads: int) -> None:
+    """Run jobs on so many threads, of which the caller's is one, and return when all have ended.
+
+    Raises what one of them raised; jobs that no thread has begun by then are left out.
+    """
+    jobs = list(jobs)
+    threads = min(threads, len(jobs))
+    left = iter(jobs)
+
+    def work() -> None:
+        for job in left:
+            job()
+
+    others = [_pool(threads - 1).submit(work) for _ in range(threads - 1)] if threads > 1 else []
+    try:
+        work()
+    finally:
+        for _ in left:  # after a failure: nothing more is begun
+            pass
+        wait(others)
+    for other in others:
+        other.result()
+
+
+def _pool(workers: int) -> ThreadPoolExecutor:
+    """Return the pool of so many threads; its threads start when they are first needed."""
+    if workers not in _pools:
+        _pools[workers] = ThreadPoolExecutor(workers, thread_name_prefix="worlds")
+    return _pools[workers]

@@ -1,0 +1,265 @@
+"""CPU threads that share the worlds: the same bits, whatever their number."""
+
+import dataclasses
+import os
+import threading
+import time
+from functools import partial
+
+import hold_height
+import numpy as np
+import pytest
+import torch
+import warp as wp
+from hold_height import HoldState
+from jump_helpers import random_actions
+
+from jumper_warp.cli.main import main
+from jumper_warp.envs.env import Env
+from jumper_warp.registry import make_task
+from jumper_warp.rl.cfg import PpoCfg, TrainCfg
+from jumper_warp.rl.checkpoint import load_checkpoint
+from jumper_warp.rl.runner import CHECKPOINTS, train
+from jumper_warp.robot.motors import vertical_jump_filter
+from jumper_warp.sim.simulation import Simulation
+from jumper_warp.sim.slices import LEAST, Worlds, slices_of
+from jumper_warp.tasks.cfg import Handover
+from jumper_warp.tasks.randomization import RandomizationCfg
+from jumper_warp.utils import threads as pool
+from jumper_warp.utils.errors import InputError
+from kernels.jump.state import JumpState
+from kernels.mdp.view import RobotView
+
+N = 3 * LEAST + 2
+JUMP = dataclasses.replace(
+    make_task("vertical-jump"), randomization=RandomizationCfg.walking(), action_scale=(40.0, 90.0)
+)
+HOLD = hold_height.hold_height()
+
+
+@wp.func
+def asked_to_jump(view: RobotView, task: HoldState, requested: bool) -> bool:
+    return requested
+
+
+@wp.func
+def begin_jump(view: RobotView, task: HoldState) -> JumpState:
+    new = JumpState()
+    new.start = view.pos
+    new.max_height = view.pos[2]
+    new.goal = wp.vec3(view.pos[0], view.pos[1], 0.6)
+    return new
+
+
+@wp.func
+def in_the_air(view: RobotView, task: JumpState, requested: bool) -> bool:
+    return view.contacts == 0
+
+
+@wp.func
+def begin_hold(view: RobotView, task: JumpState) -> HoldState:
+    new = HoldState()
+    new.goal = 0.3
+    return new
+
+
+@pytest.fixture(autouse=True)
+def all_cores():
+    yield
+    pool.set_threads(None)
+
+
+def story(threads, steps=240, task=JUMP, **arguments):
+    """Return rows of results, (steps, N, columns), of random actions, the state and metrics after them, and the Env."""
+    env = Env(task, N, seed=3, device="cpu", threads=threads, **arguments)
+    assert len(env.sim.slices) == threads
+    for skill in env.skills:
+        skill.set("curriculum", skill.task.curriculum.name, promote_after=0.0)  # every counted episode promotes
+    env.reset()
+    found = []
+    for step, action in enumerate(random_actions(N, steps)):
+        if len(env.tasks) > 1 and step % 40 == 10:
+            env.request(0)
+        env.step(action.repeat(len(env.tasks), 1, 1) if len(env.tasks) > 1 else action)
+        rows = [*env._step.obs.values(), *env.skills[0].final_obs.values(), env.reward, env.done, env.timeout]
+        found.append(torch.cat([row.reshape(N, -1) for row in rows], dim=1))
+    return torch.stack(found), env.state_dict(), [skill.metrics() for skill in env.skills], env
+
+
+def assert_same(found, expected):
+    """Two results of `story` are the same bit for bit."""
+    assert torch.equal(found[0], expected[0])
+    for name, value in found[1].items():
+        np.testing.assert_array_equal(value.numpy(), expected[1][name].numpy(), err_msg=name)
+    assert found[2] == expected[2]
+
+
+@pytest.fixture(scope="module")
+def alone():
+    return story(1)
+
+
+@pytest.mark.parametrize("threads", [2, 3])
+def test_an_environment_has_the_same_bits_on_any_number_of_threads(alone, threads):
+    """Randomised, with noise, pushes, episodes that end, and a curriculum."""
+    rows, env = alone[0], alone[-1]
+    assert (rows[..., -2].sum(0) > 1).all() and rows[..., -2].sum(0).unique().numel() > 1
+    assert len(np.unique(env.parameters.push.numpy(), axis=0)) > N // 4
+    assert env.worlds.level.numpy().max() > 0
+    assert_same(story(threads), alone)
+
+
+def test_skills_and_their_handovers_have_the_same_bits():
+    there, back = Handover(HOLD, JUMP, asked_to_jump, begin_jump), Handover(JUMP, HOLD, in_the_air, begin_hold)
+    expected, found = (
+        story(threads, 120, (JUMP, HOLD), skill=np.arange(N) % 2, handovers=(there, back)) for threads in (1, 3)
+    )
+    assert len(np.unique(expected[1]["env.skill"])) == 2
+    assert not np.array_equal(expected[1]["env.skill"], np.arange(N) % 2)
+    assert_same(found, expected)
+
+
+@pytest.mark.parametrize("filtered", [False, True])
+def test_a_simulation_has_the_same_bits_on_any_number_of_threads(filtered):
+    def moved(threads):
+        command_filter = vertical_jump_filter() if filtered else None
+        sim = Simulation(N, command_filter=command_filter, visuals=False, device="cpu", threads=threads)
+        target = sim.target.numpy()
+        for step in range(60):
+            degrees = np.linspace(90.0, 110.0, N) if step < 30 else np.linspace(-10.0, 10.0, N)
+            target[np.arange(12) % 3 > 0] = np.radians(degrees)
+            sim.target.assign(target)
+            sim.step()
+            sim.physics_step()
+        arrays = (sim.state.joint_q, sim.state.joint_qd, sim.state.body_q, sim.state.body_qd, sim.torque)
+        return [array.numpy().copy() for array in (*arrays, sim.paw_force, sim.peak_force)]
+
+    expected = moved(1)
+    assert np.ptp(expected[0].reshape(N, -1)[:, 2]) > 0.01
+    for threads in (2, 3):
+        for array, wanted in zip(moved(threads), expected, strict=True):
+            np.testing.assert_array_equal(array, wanted)
+
+
+def test_a_training_has_the_same_bits_on_any_number_of_threads(tmp_path, one_thread):
+    def trained(threads):
+        cfg = TrainCfg(
+            num_envs=N, iterations=3, device="cpu", threads=threads, log_root=tmp_path / str(threads),
+            tensorboard=False, ppo=PpoCfg(num_steps=8, minibatches=4, epochs=2, hidden=(32, 32)),
+        )  # fmt: skip
+        sizes = []
+
+        def make_env(num_envs, seed, device):
+            env = Env(JUMP, num_envs, seed=seed, device=str(device))
+            sizes.append(len(env.sim.slices))
+            return env
+
+        result = train(cfg, make_env)
+        assert sizes == [threads]
+        return load_checkpoint(result.folder / CHECKPOINTS / "iteration_000003.pt")
+
+    expected, found = trained(1), trained(2)
+    for part in ("model", "optimiser"):
+        for name, value in flat(found["ppo"][part]).items():
+            assert torch.equal(value, flat(expected["ppo"][part])[name]), name
+    for name, value in found["env"].items():
+        assert torch.equal(value, expected["env"][name]), name
+
+
+def flat(state, prefix=""):
+    """Return the tensors of nested dictionaries by path."""
+    if isinstance(state, torch.Tensor):
+        return {prefix: state}
+    return {k: v for key, each in state.items() for k, v in flat(each, f"{prefix}.{key}").items()}
+
+
+# ---------------------------------------------------------------- slices
+
+
+@pytest.mark.parametrize(("worlds", "threads"), [(1, 8), (31, 2), (32, 2), (50, 3), (1000, 7), (4096, 64), (20, 1)])
+def test_slices_hold_each_world_once_and_are_about_equal(worlds, threads):
+    slices = slices_of(worlds, threads)
+    assert [world for each in slices for world in range(each.first, each.first + each.count)] == list(range(worlds))
+    assert len(slices) == max(1, min(threads, worlds // LEAST))
+    assert all(each.first % LEAST == 0 for each in slices)
+    counts = [each.count for each in slices]
+    assert max(counts) - min(counts) < 2 * LEAST
+    assert worlds >= 2 * LEAST or slices == [Worlds(0, worlds)]
+
+
+def test_mujoco_has_one_slice():
+    assert Simulation(2 * LEAST, solver="mujoco", visuals=False, device="cpu", threads=2).slices == [(0, 2 * LEAST)]
+
+
+# ---------------------------------------------------------------- threads
+
+
+def test_jobs_run_at_the_same_time():
+    meeting = threading.Barrier(3, timeout=30.0)
+    pool.run_side_by_side([meeting.wait] * 3, 3)
+
+
+def test_each_job_runs_once_whatever_the_number_of_threads():
+    for threads in (1, 2, 5):
+        done: list[int] = []
+        pool.run_side_by_side([partial(done.append, i) for i in range(7)], threads)
+        assert sorted(done) == list(range(7))
+
+
+@pytest.mark.parametrize("failing", [0, 1])
+def test_what_a_job_raises_reaches_the_caller_when_the_others_have_ended(failing):
+    started, ended = threading.Barrier(2, timeout=30.0), []
+
+    def fail():
+        started.wait()
+        raise FloatingPointError("a slice failed")
+
+    def take_time():
+        started.wait()
+        time.sleep(0.05)
+        ended.append(True)
+
+    jobs = [take_time, take_time]
+    jobs[failing] = fail
+    with pytest.raises(FloatingPointError, match="a slice failed"):
+        pool.run_side_by_side(jobs, 2)
+    assert ended == [True]
+    pool.run_side_by_side([lambda: ended.append(True)] * 2, 2)  # the threads go on
+    assert len(ended) == 3
+
+
+def test_a_failing_slice_reaches_the_caller_of_a_step():
+    env = Env(JUMP, 2 * LEAST, device="cpu", threads=2)
+    env.reset()
+    env.step(torch.zeros(2 * LEAST, 12))
+    (graph,) = env._graphs.values()
+    graph._graphs[1].apic_state = object()  # not a graph's
+    with pytest.raises(Exception, match="argument"):
+        env.step(torch.zeros(2 * LEAST, 12))
+
+
+def test_all_cores_are_used_and_shared_by_the_processes_of_a_machine(monkeypatch):
+    monkeypatch.setattr(os, "sched_getaffinity", lambda process: set(range(6)))
+    assert pool.checked_threads(None) == 6
+    for processes, threads in (("2", 3), ("4", 1), ("16", 1)):
+        monkeypatch.setenv("LOCAL_WORLD_SIZE", processes)
+        assert pool.checked_threads(None) == threads
+    pool.set_threads(5)
+    assert pool.checked_threads(None) == 5 and pool.checked_threads(2) == 2
+
+
+@pytest.mark.parametrize("threads", [0, -1, 1.5, True, "2"])
+def test_a_number_of_threads_that_is_none_is_refused(threads):
+    message = "threads must be a whole number of at least 1, got"
+    for use in (pool.set_threads, lambda n: TrainCfg(threads=n), lambda n: Simulation(1, device="cpu", threads=n)):
+        with pytest.raises(InputError, match=message):
+            use(threads)
+
+
+@pytest.mark.parametrize("command", [["train", "vertical-jump"], ["evaluate", "vertical_jump"]])
+def test_a_command_refuses_bad_threads_in_one_line(command, capsys):
+    with pytest.raises(SystemExit) as caught:
+        main([*command, "--threads", "0"])
+    told = capsys.readouterr().err.strip().splitlines()
+    assert caught.value.code == 2
+    assert told == ["jumper: threads must be a whole number of at least 1, got 0"]

@@ -1,0 +1,35 @@
+"""A training for torchrun: `torchrun elastic_task.py FOLDER [DEATH ...]`; each DEATH is `restart,rank,step`.
+
+In its so-manieth start, a process of that rank kills itself in that step of its environment.
+"""
+
+import os
+import signal
+import sys
+from pathlib import Path
+
+from toy_task import SMALL, PushTask
+
+from jumper_warp.rl.cfg import TrainCfg
+from jumper_warp.rl.runner import train
+
+STEPS = SMALL.num_steps
+
+
+class Mortal(PushTask):
+    """Dies when its hour has come, like a machine that is taken away."""
+
+    def step(self, action):
+        super().step(action)
+        self.count = getattr(self, "count", 0) + 1
+        life = [os.environ["TORCHELASTIC_RESTART_COUNT"], os.environ["RANK"], str(self.count)]
+        if ",".join(life) in sys.argv[2:]:
+            os.kill(os.getpid(), signal.SIGKILL)
+
+
+if __name__ == "__main__":
+    cfg = TrainCfg(
+        task="push", num_envs=32, iterations=6, device="cpu", log_root=Path(sys.argv[1]), log_interval=1,
+        save_interval=2, keep=10, tensorboard=False, ppo=SMALL,
+    )  # fmt: skip
+    train(cfg, lambda n, seed, device: Mortal(n, seed, device, episode_length=20 + 7 * int(os.environ["RANK"])))
