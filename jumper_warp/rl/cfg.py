@@ -61,8 +61,14 @@ class PpoCfg:
     """elu, relu or tanh."""
     tf32: bool = True
     """Whether matrix products on a GPU may round their factors to 10 mantissa bits."""
+    precision: Literal["float32", "bfloat16"] = "float32"
+    """What the hidden layers compute in; the last layers, losses and statistics stay in float32."""
+    compile: Literal["auto", "on", "off"] = "auto"
+    """Whether torch.compile fuses what surrounds the matrix products: by default on a GPU. Needs a C++ compiler."""
     graphs: bool = True
-    """Whether a GPU replays captured graphs; the update of several GPUs is always eager."""
+    """Whether a GPU replays captured graphs."""
+    streams: bool = True
+    """Whether a GPU computes the gradients of actor and critic beside each other."""
 
     def __post_init__(self) -> None:
         """Raises ValueError: a setting is out of range."""

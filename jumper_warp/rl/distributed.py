@@ -8,6 +8,10 @@ import torch
 
 from jumper_warp.utils.errors import InputError
 
+NCCL = {"NCCL_NVLS_ENABLE": "0", "NCCL_GRAPH_REGISTER": "0"}
+"""Settings of NCCL that are made unless the user did: no multicast over NVLink, which not every machine allows, and no
+registration of buffers while a graph is captured, for which the ranks would have to wait for each other then."""
+
 
 def world_size() -> int:
     """Return the number of training processes."""
@@ -18,6 +22,20 @@ def wait_for_ranks() -> None:
     """Wait until every process got here, so that none leaves the group while another still uses it."""
     if world_size() > 1:
         torch.distributed.barrier()
+
+
+def all_ranks(agreed: bool) -> bool:
+    """Return whether all processes agree; each waits for the others."""
+    if world_size() == 1:
+        return agreed
+    vote = torch.tensor(float(agreed), device=_device())
+    torch.distributed.all_reduce(vote, op=torch.distributed.ReduceOp.MIN)
+    return vote.item() > 0.0
+
+
+def _device() -> torch.device:
+    """Return where tensors that the processes exchange must lie."""
+    return torch.device("cuda" if torch.distributed.get_backend() == "nccl" else "cpu")
 
 
 def average_over_ranks(x: torch.Tensor) -> torch.Tensor:
@@ -57,6 +75,8 @@ def join_ranks(device: str | None = None) -> Rank:
         # small networks lose more to waiting threads than they gain, far more on a busy machine
         torch.set_num_threads(max(1, (os.cpu_count() or 1) // 2))
     if size > 1 and not torch.distributed.is_initialized():
+        for name, value in NCCL.items():
+            os.environ.setdefault(name, value)
         torch.distributed.init_process_group("nccl" if kind.type == "cuda" else "gloo")
     return Rank(int(os.environ.get("RANK", "0")) if size > 1 else 0, size, kind)
 
