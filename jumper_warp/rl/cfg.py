@@ -67,6 +67,8 @@ class PpoCfg:
     """Whether torch.compile fuses what surrounds the matrix products: by default on a GPU. Needs a C++ compiler."""
     graphs: bool = True
     """Whether a GPU replays captured graphs."""
+    overlap: bool = False
+    """Whether the next rollout runs beside the update, with the weights of one iteration before."""
     streams: bool = True
     """Whether a GPU computes the gradients of actor and critic beside each other."""
 
@@ -123,7 +125,7 @@ class TrainCfg:
     log_interval: int = 10
     """Iterations between two logged ones."""
     save_interval: int = 100
-    """Iterations between two checkpoints."""
+    """Iterations between two checkpoints; with ppo.overlap, one that saves collects nothing ahead."""
     keep: int = 3
     """How many of the newest checkpoints stay; the best stays anyway."""
     best_by: str = "Metrics/success"

@@ -2,6 +2,7 @@
 
 import io
 import os
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import torch
@@ -36,6 +37,18 @@ def all_ranks(agreed: bool) -> bool:
 def _device() -> torch.device:
     """Return where tensors that the processes exchange must lie."""
     return torch.device("cuda" if torch.distributed.get_backend() == "nccl" else "cpu")
+
+
+def one_rank_first(procedure: Callable[[], None]) -> None:
+    """Run a procedure on the first process of each machine, then on the others, which find its files."""
+    if world_size() == 1:
+        procedure()
+        return
+    first = os.environ.get("LOCAL_RANK", "0") == "0"
+    for turn in (True, False):
+        if first == turn:
+            procedure()
+        wait_for_ranks()
 
 
 def average_over_ranks(x: torch.Tensor) -> torch.Tensor:

@@ -2,10 +2,17 @@
 
 Nothing between the first action and the last optimiser step waits for the host. Schulman et al. 2017 for the surrogate,
 2016 for the advantage; observations, returns and advantages are normalised, the step size follows the KL divergence.
+
+With `PpoCfg.overlap` the next rollout runs beside the optimiser steps. Let θ[k] be the weights after iteration k, and
+R[k] the rollout that it learns from. Iteration k computes θ[k] from θ[k - 1] and R[k], while R[k + 1] is collected with
+θ[k - 1] and the statistics that R[k] is part of. The first rollout, and the first after an iteration that drained, is
+collected alone, with the newest weights. Neither reads memory that the other writes, and random numbers are drawn by
+the rollout and by `batch` alone, which never run at once: the same seed gives the same bits, whichever ends first.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import torch
@@ -34,7 +41,7 @@ FIGURES = (
 
 
 class Ppo:
-    """The algorithm on one environment: `collect` fills the rollout, `update` learns from it."""
+    """The algorithm on one environment: `collect` fills the rollout, `update` learns from it, `iterate` does both."""
 
     def __init__(self, env: VecEnv, cfg: PpoCfg) -> None:
         """Build networks and buffers on the environment's device; the weights follow torch's CPU seed.
@@ -67,9 +74,58 @@ class Ppo:
         self._critic_stream = Beside(cuda and cfg.streams)
         self._actor_gradient, self._critic_gradient = compiler(actor_gradient), compiler(critic_gradient)
         self._finish = compiler(_finish)
-        self.collect = Captured(self.collector.collect, cuda and cfg.graphs)
-        self.update = Captured(self._update, cuda and cfg.graphs)
+        self._update_stream = Beside(cuda and cfg.overlap)
+        self.ahead = False
+        """Whether the next iteration's rollout is there already."""
+        procedures = (self.collector.roll, self.batch, self._learn)
+        self._roll, self._batch, self._optimise = (Captured(each, cuda and cfg.graphs) for each in procedures)
 
+    def iterate(self, drain: bool = False, mark: Callable[[], None] = lambda: None) -> None:
+        """Do one iteration.
+
+        drain: collect nothing ahead, so that the state can be saved; of no effect without overlap. mark: called when
+        the rollout, and when the rest of the iteration has been launched.
+        """
+        if not self.ahead:
+            self.collect()
+        if not self.cfg.overlap or drain:
+            mark()
+            self.update()
+            self.ahead = False
+        else:
+            self._batch()
+            self.collector.hand_over()
+            with self._update_stream():
+                self._optimise()
+            self._roll()
+            mark()
+            self._update_stream.join()
+            self.ahead = True
+        mark()
+
+    def collect(self) -> None:
+        """Fill the rollout with the present policy."""
+        self.collector.hand_over()
+        self._roll()
+
+    def update(self) -> None:
+        """Learn from the rollout."""
+        self._batch()
+        self._optimise()
+
+    def prepare(self) -> None:
+        """Compile what is to be compiled, and change nothing that a training depends on."""
+        if not self.compiler.enabled:
+            return
+        changed = [*self.optimiser.vectors, self._sums, self.collector.episode, self.collector.finished]
+        before = [tensor.clone() for tensor in changed]
+        self.collector.rehearse()
+        self.sampler.rehearse()
+        self._step(self._differentiate(self._minibatch))
+        for tensor, value in zip(changed, before, strict=True):
+            tensor.copy_(value)
+
+    @torch.no_grad()
     def batch(self) -> Batch:
         """Return the rollout as samples, time-major, and take it into the running statistics; views of `sampler.rows`.
 
@@ -85,28 +141,34 @@ class Ppo:
         return torch.rand(self.batch_size, device=self.env.device).argsort()
 
     @torch.no_grad()
-    def _update(self) -> None:
-        self.batch()
+    def _learn(self) -> None:
         for order in self._orders:
             for samples in order.chunk(self.cfg.minibatches):
                 torch.index_select(self.sampler.rows, 0, samples, out=self._minibatch)
                 self._descend(self._minibatch)
 
-    @torch.no_grad()
     def _descend(self, rows: torch.Tensor) -> None:
         """Make one optimiser step with samples (batch, columns); a non-finite gradient counts as none."""
-        cfg, flat, layout = self.cfg, self.flat, self.sampler.layout
+        found = self._differentiate(rows)
+        average_over_ranks(self.flat.gradient)
+        self._step(found)
+
+    @torch.no_grad()
+    def _differentiate(self, rows: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        """Fill the gradient; return surrogate, value loss and entropy."""
         (actor, log_std), critic, (to_actor, to_critic) = self._parts
+        layout, cfg, old_log_std = self.sampler.layout, self.cfg, self.sampler.old_log_std
         with self._critic_stream():
             value_loss = self._critic_gradient(rows, layout, critic, cfg, to_critic)
-        surrogate, entropy, kl = self._actor_gradient(
-            rows, layout, actor, log_std, self.sampler.old_log_std, cfg, to_actor
-        )
+        surrogate, entropy, kl = self._actor_gradient(rows, layout, actor, log_std, old_log_std, cfg, to_actor)
         self._critic_stream.join()
-        flat.gradient[-1] = kl
-        average_over_ranks(flat.gradient)
-        found = (surrogate, value_loss, entropy)
-        self._finish(self.optimiser.vectors, flat.actor_size, self._desired_kl, cfg, found, self._sums)
+        self.flat.gradient[-1] = kl
+        return surrogate, value_loss, entropy
+
+    @torch.no_grad()
+    def _step(self, found: tuple[torch.Tensor, ...]) -> None:
+        """Descend along the gradient; found: as `_differentiate` returned it."""
+        self._finish(self.optimiser.vectors, self.flat.actor_size, self._desired_kl, self.cfg, found, self._sums)
 
     def set_progress(self, progress: float) -> None:
         """Tell how much of the training is over, from 0 to 1; does not wait for the device."""
@@ -128,7 +190,13 @@ class Ppo:
         return result
 
     def state_dict(self) -> dict[str, Any]:
-        """Return networks, statistics and optimiser, tensors only."""
+        """Return networks, statistics and optimiser, tensors only.
+
+        Raises:
+            RuntimeError: A rollout has been collected ahead, which is no part of it: `iterate` with drain first.
+        """
+        if self.ahead:
+            raise RuntimeError("the state can be saved after an iteration that drained")
         model = self.model.state_dict()
         return {
             "model": {name: value.clone(memory_format=torch.contiguous_format) for name, value in model.items()},
@@ -148,11 +216,12 @@ class Ppo:
         self.optimiser.load_state_dict(state["optimiser"])
         self.lr.copy_(state["lr"])
         self.collector.episode.copy_(state["episode"])
+        self.ahead = False
 
     def close(self) -> None:
         """Drop all graphs; needed before the group of processes ends."""
-        self.collect.close()
-        self.update.close()
+        for graph in (self._roll, self._batch, self._optimise):
+            graph.close()
 
 
 def _finish(

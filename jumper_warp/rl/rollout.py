@@ -54,11 +54,6 @@ class Collector:
         """Sums of return and length of the episodes that ended, and their number."""
         self._act, self._keep = compiler(_act), compiler(_keep)
 
-    def collect(self) -> None:
-        """Let the present policy act."""
-        self.hand_over()
-        self.roll()
-
     @torch.no_grad()
     def hand_over(self) -> None:
         """Copy weights and statistics that the next rollouts act with."""
@@ -68,19 +63,33 @@ class Collector:
     @torch.no_grad()
     def roll(self) -> None:
         """Act for `num_steps` policy steps."""
-        env, rollout, scaling, dtype = self.env, self.rollout, self._scaling, DTYPES[self.cfg.precision]
+        env, rollout = self.env, self.rollout
         rollout.log_std.copy_(self._log_std)
         rollout.action.normal_()
         for step in range(self.cfg.num_steps):
-            seen, kept = (env.obs, self._critic_obs), (rollout.obs[step], rollout.critic_obs[step])
-            decided = (rollout.mean[step], rollout.action[step])
-            self._act(seen, kept, decided, self._actor, self._log_std, scaling, dtype)
+            self._decide(step)
             env.step(rollout.action[step])
-            happened = (env.reward, env.done, env.timeout, self._final_critic_obs)
-            kept = (rollout.reward[step], rollout.done[step], rollout.timeout[step], rollout.final_critic_obs[step])
-            self._keep(happened, kept, self.episode, self.finished, self.cfg.reward_scale)
+            self._remember(step)
         rollout.obs[-1] = sanitise(env.obs)
         rollout.critic_obs[-1] = sanitise(self._critic_obs)
+
+    @torch.no_grad()
+    def rehearse(self) -> None:
+        """Compile, as if one step were made; spoils the rollout and the counts of episodes."""
+        self._decide(0)
+        self._remember(0)
+
+    def _decide(self, step: int) -> None:
+        rollout, dtype = self.rollout, DTYPES[self.cfg.precision]
+        seen, kept = (self.env.obs, self._critic_obs), (rollout.obs[step], rollout.critic_obs[step])
+        decided = (rollout.mean[step], rollout.action[step])
+        self._act(seen, kept, decided, self._actor, self._log_std, self._scaling, dtype)
+
+    def _remember(self, step: int) -> None:
+        env, rollout = self.env, self.rollout
+        happened = (env.reward, env.done, env.timeout, self._final_critic_obs)
+        kept = (rollout.reward[step], rollout.done[step], rollout.timeout[step], rollout.final_critic_obs[step])
+        self._keep(happened, kept, self.episode, self.finished, self.cfg.reward_scale)
 
 
 Pair = tuple[torch.Tensor, torch.Tensor]

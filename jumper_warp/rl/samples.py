@@ -116,7 +116,7 @@ class Sampler:
         self, rollout: RolloutBuffer, cfg: PpoCfg, model: ActorCritic, flat: FlatParameters, compiler: Compiler
     ) -> None:
         """flat: the parameters of `model`."""
-        self._rollout, self._cfg, self._model, self._flat = rollout, cfg, model, flat
+        self._rollout, self._cfg, self._model, self._critic = rollout, cfg, model, flat.critic()
         steps, worlds, num_actions = rollout.action.shape
         self.layout = RowLayout(rollout.obs.shape[2], rollout.critic_obs.shape[2], num_actions)
         self.rows = rollout.obs.new_zeros(steps * worlds, sum(self.layout.widths))
@@ -128,25 +128,35 @@ class Sampler:
     @torch.no_grad()
     def pack(self) -> None:
         """Write the rollout to `rows` and take it into the running statistics."""
-        cfg, model, rollout = self._cfg, self._model, self._rollout
-        moments = (model.obs_moments, model.critic_moments, model.value_moments)
-        scaling, critic_scaling, value_scaling = (each.scaling() for each in moments)
-        experience = (rollout.critic_obs, rollout.final_critic_obs, rollout.reward, rollout.done, rollout.timeout)
-        estimates, own = self._estimate(
-            experience, rollout.obs, self._flat.critic(), critic_scaling, value_scaling, cfg
-        )
+        model = self._model
+        scaling = model.obs_moments.scaling()  # with which the policy acted
+        estimates, own = self._estimates()
         of_advantage, of_target, of_obs, of_critic_obs = joint_moments(own, self.rows.shape[0])
         model.obs_moments.take(of_obs)
         model.critic_moments.take(of_critic_obs)
-        target_scaling = None
-        if cfg.normalise_value:
+        if self._cfg.normalise_value:
             model.value_moments.take(of_target)
-            target_scaling = model.value_moments.scaling()
         mean, var, count = of_advantage
-        advantage_scaling = mean.float(), ((var * count / (count - 1)).sqrt() + 1.0e-8).float()
+        self._write(scaling, estimates, (mean.float(), ((var * count / (count - 1)).sqrt() + 1.0e-8).float()))
+        self.old_log_std.copy_(self._rollout.log_std)
+
+    @torch.no_grad()
+    def rehearse(self) -> None:
+        """Compile, as if a rollout were packed; spoils `rows`."""
+        scaling = self._model.obs_moments.scaling()
+        self._write(scaling, self._estimates()[0], self._model.value_moments.scaling())
+
+    def _estimates(self) -> tuple[tuple[torch.Tensor, ...], list[Pair]]:
+        rollout, model = self._rollout, self._model
+        experience = (rollout.critic_obs, rollout.final_critic_obs, rollout.reward, rollout.done, rollout.timeout)
+        scalings = (model.critic_moments.scaling(), model.value_moments.scaling())
+        return self._estimate(experience, rollout.obs, self._critic, *scalings, self._cfg)
+
+    def _write(self, scaling: Pair, estimates: tuple[torch.Tensor, ...], advantage_scaling: Pair) -> None:
+        rollout = self._rollout
         acted = (rollout.obs, rollout.action, rollout.mean, rollout.log_std)
+        target_scaling = self._model.value_moments.scaling() if self._cfg.normalise_value else None
         self._pack(self.rows, self.layout, acted, scaling, estimates, advantage_scaling, target_scaling)
-        self.old_log_std.copy_(rollout.log_std)
 
 
 def _estimate(
