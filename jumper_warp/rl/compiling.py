@@ -36,7 +36,7 @@ class Compiler:
             if not self.enabled:
                 return function(*args)
             try:
-                tried = torch.compile(function, fullgraph=True, dynamic=False, backend=BACKEND)
+                tried = torch.compile(function, fullgraph=True, dynamic=False, backend=BACKEND, options=_options())
                 result = tried(*args)
             except Exception as error:  # whatever a compiler, or none, does
                 self.enabled = False
@@ -46,6 +46,15 @@ class Compiler:
             return result
 
         return call
+
+
+def _options() -> dict[str, bool] | None:
+    """Return options of Inductor: it may not choose by time between kernels that add up in another order."""
+    if BACKEND != "inductor":
+        return None
+    from torch._inductor import config
+
+    return {"deterministic": True} if hasattr(config, "deterministic") else {}
 
 
 def _reason(error: Exception) -> str:

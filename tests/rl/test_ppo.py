@@ -10,6 +10,8 @@ from tensordict import TensorDict
 from torch.utils._python_dispatch import TorchDispatchMode
 from toy_task import SMALL, PushTask, fill, local_order, update_half
 
+from jumper_warp.rl import networks
+from jumper_warp.rl import ppo as ppo_module
 from jumper_warp.rl.adam import adapted_lr
 from jumper_warp.rl.cfg import PpoCfg
 from jumper_warp.rl.ppo import STATISTICS, Ppo
@@ -312,6 +314,31 @@ def test_two_processes_equal_one_with_all_worlds(tmp_path):
             torch.testing.assert_close(found["model"][name], value, atol=1e-5, rtol=1e-5, msg=name)
             assert not torch.equal(value, start[name]), name
         torch.testing.assert_close(found["lr"], expected["lr"])
+
+
+def test_an_iteration_exchanges_its_statistics_once_and_a_gradient_a_minibatch(monkeypatch):
+    cfg = dataclasses.replace(PLAIN, epochs=3, minibatches=4, normalise_value=True)
+    ppos = []
+    for ranks in (1, 2):
+        sizes = []
+
+        def exchange(x, sizes=sizes):
+            sizes.append(x.numel())
+            return x  # as if the other rank had seen the same
+
+        monkeypatch.setattr(networks, "world_size", lambda ranks=ranks: ranks)
+        monkeypatch.setattr(networks, "average_over_ranks", exchange)
+        monkeypatch.setattr(ppo_module, "average_over_ranks", exchange)
+        torch.manual_seed(0)
+        ppos.append(Ppo(PushTask(16), cfg))
+        ppos[-1].env.reset()
+        ppos[-1].collect()
+        ppos[-1].update()
+    alone, one_of_two = ppos
+    assert sizes == [2 * (1 + 1 + 2 + 3)] + 12 * [alone.flat.gradient.numel()]
+    torch.testing.assert_close(one_of_two.flat.value, alone.flat.value, atol=2e-5, rtol=1e-3)
+    torch.testing.assert_close(one_of_two.model.obs_moments.var, alone.model.obs_moments.var, atol=1e-6, rtol=1e-3)
+    assert one_of_two.model.obs_moments.count == 2 * alone.model.obs_moments.count
 
 
 FULL = 2.0**24
