@@ -5,6 +5,7 @@
 Steps are policy steps of 1/60 s, 8 physics steps each, of all environments together. The solver stands; environment
 and training see random or learned actions, with randomisation and noise. rsl-rl-lib trains on the same environment
 through the package's adapter. Before anything is timed, its outcome is checked.
+`--variants all` times PPO compiled or not, in either precision, with and without overlap; `--only-ppo` nothing else.
 `--baseline PATH` runs the same script of another checkout too, and tells how much faster this one is.
 """
 
@@ -20,6 +21,8 @@ from rich.table import Table
 
 from jumper_warp.cli.main import run_command
 from jumper_warp.evaluation.speed import standing_solver, stepping_env, time_ppo, time_rsl_rl, time_stages
+from jumper_warp.evaluation.variants import VARIANTS, variant
+from jumper_warp.rl.cfg import PpoCfg
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.output import output_dir, write_figures
 from jumper_warp.utils.runtime import announce
@@ -44,6 +47,10 @@ class Args:
     """Train with rsl-rl-lib too."""
     num_steps: int = 32
     """Policy steps of each environment in an iteration."""
+    variants: tuple[str, ...] = ()
+    """Variants of PPO that are timed too (`jumper_warp.evaluation.variants`), or all."""
+    only_ppo: bool = False
+    """Time PPO and its variants only."""
     baseline: Path | None = None
     """Root of another checkout to compare with."""
     out: Path | None = None
@@ -58,6 +65,26 @@ class Args:
         for name in ("steps", "repeats", "iterations", "num_steps"):
             if getattr(self, name) < 1:
                 raise InputError(f"{name} must be at least 1, got {getattr(self, name)}")
+        for name in self.names():
+            variant(PpoCfg(), name)
+
+    def names(self) -> tuple[str, ...]:
+        """Return the names of the variants."""
+        return tuple(VARIANTS) if self.variants == ("all",) else self.variants
+
+
+def time_parts(args: Args, envs: tuple[int, ...], train_envs: int) -> dict[str, float]:
+    """Return figures of solver and environment."""
+    values: dict[str, float] = {}
+    for n in sorted({*envs, train_envs}):
+        bodies = standing_solver(n, args.device), stepping_env(n, args.device)[1]
+        solver, step = (median_time(body, args.device, args.steps, args.repeats) for body in bodies)
+        values |= {f"solver_steps_per_s_{n}": n / solver, f"env_steps_per_s_{n}": n / step}
+        if n == train_envs:
+            values["env_step_us"] = 1e6 * step
+    parts = time_stages(train_envs, args.device, args.repeats)
+    values |= {f"{part}_us": 1e6 * wall for part, wall in parts.items()}
+    return values | {f"{part}_share": wall / sum(parts.values()) for part, wall in parts.items()}
 
 
 def main(args: Args) -> dict:
@@ -68,18 +95,17 @@ def main(args: Args) -> dict:
     envs = args.envs or ((4096, 8192, 16384) if gpu else (64,))
     train_envs = args.train_envs or (8192 if gpu else 64)
     values: dict = {"device": info.name, "envs": list(envs), "train_envs": train_envs, "num_steps": args.num_steps}
-    step_time = {}
-    for n in sorted({*envs, train_envs}):
-        bodies = standing_solver(n, args.device), stepping_env(n, args.device)[1]
-        solver, step_time[n] = (median_time(body, args.device, args.steps, args.repeats) for body in bodies)
-        values |= {f"solver_steps_per_s_{n}": n / solver, f"env_steps_per_s_{n}": n / step_time[n]}
-    parts = time_stages(train_envs, args.device, args.repeats)
-    values |= {f"{part}_us": 1e6 * wall for part, wall in parts.items()}
-    values |= {f"{part}_share": wall / sum(parts.values()) for part, wall in parts.items()}
-    values["env_step_us"] = 1e6 * step_time[train_envs]
-    values |= time_ppo(train_envs, args.num_steps, args.iterations, args.device)
-    values["collect_env_share"] = args.num_steps * step_time[train_envs] / values["ppo_collect_s"]
-    if args.rsl_rl:
+    if not args.only_ppo:
+        values |= time_parts(args, envs, train_envs)
+    cfg = PpoCfg(num_steps=args.num_steps)
+    values |= time_ppo(train_envs, cfg, args.iterations, args.device)
+    for name in args.names():
+        figures = time_ppo(train_envs, variant(cfg, name), args.iterations, args.device)
+        values |= {f"{figure}_{name}": value for figure, value in figures.items()}
+        write_figures(folder, values)
+    if not args.only_ppo:
+        values["collect_env_share"] = args.num_steps * 1.0e-6 * values["env_step_us"] / values["ppo_collect_s"]
+    if args.rsl_rl and not args.only_ppo:
         values |= time_rsl_rl(train_envs, args.num_steps, args.iterations, args.device)
         values["ppo_over_rsl_rl"] = values["ppo_steps_per_s"] / values["rsl_rl_steps_per_s"]
     values |= over_baseline(args.baseline, "experiments/benchmark_training.py", args, values)

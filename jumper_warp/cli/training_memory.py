@@ -23,6 +23,10 @@ STANDING: dict[SolverName, int] = {"jumper": 25_750, "mujoco": 71_400}
 """[byte] Of the environment's own arrays on the device for each world, measured likewise."""
 FLOAT = 4
 """[byte]"""
+ORDER = 8
+"""[byte] Of a sample's place in the order of an epoch."""
+ZEROS = 21
+"""At most so many numbers fill up a sample's row."""
 
 
 class Need(NamedTuple):
@@ -44,14 +48,16 @@ class Place(NamedTuple):
 def learning_need(cfg: PpoCfg, num_obs: int, num_critic_obs: int) -> Need:
     """Return what PPO takes on the device, for networks and rollouts; num_critic_obs: the environment's, of a world.
 
-    The peak is in the critic's pass over the whole rollout: the buffers, the normalised observations with a copy of
-    them, and the two widest layers.
+    The peak is in the critic's pass over the whole rollout: the buffers, the samples as rows with their orders, the
+    normalised observations with a copy of them, and the two widest layers.
     """
     critic_obs = num_critic_obs if cfg.asymmetric else num_obs
     sizes = ((num_obs, *cfg.hidden, NUM_ACTIONS), (critic_obs, *cfg.hidden, 1))
     weights = sum((a + 1) * b for each in sizes for a, b in pairwise(each))
+    row = FLOAT * (num_obs + critic_obs + 2 * NUM_ACTIONS + 4 + ZEROS)
+    rows = cfg.num_steps * (row * (1.0 + 1.0 / cfg.minibatches) + ORDER * cfg.epochs)
     passing = FLOAT * cfg.num_steps * (2 * critic_obs + 2 * max(cfg.hidden))
-    return Need(4 * FLOAT * weights, rollout_bytes(cfg.num_steps, num_obs, critic_obs) + passing)
+    return Need(4 * FLOAT * weights, rollout_bytes(cfg.num_steps, num_obs, critic_obs) + int(rows) + passing)
 
 
 def rollout_bytes(num_steps: int, num_obs: int, num_critic_obs: int) -> int:

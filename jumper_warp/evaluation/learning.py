@@ -24,6 +24,8 @@ class Curve:
 
     seconds: list[float] = field(default_factory=list)
     success: list[float] = field(default_factory=list)
+    steps: list[int] = field(default_factory=list)
+    """Policy steps of all worlds together, so far."""
     iterations: int = 0
 
     def seconds_to(self, rate: float) -> float | None:
@@ -41,26 +43,34 @@ def success(ppo: Ppo, judge: Env) -> float:
     return float(run_jumps(act, judge, np.linspace(*TESTED, judge.num_envs)).success.mean())
 
 
+def warm_up(env: Env, ppo: Ppo) -> None:
+    """Compile the environment's kernels and the trainer's functions, and begin all episodes anew."""
+    env.reset()
+    env.step(torch.zeros(env.num_envs, env.num_actions, device=env.device))
+    ppo.prepare()
+    env.reset()
+    env.metrics()
+
+
 def learning_curve(env: Env, ppo: Ppo, judge: Env, seconds: float, every: float) -> Curve:
-    """Train for a time [s] and return the curve; kernels are compiled, and the test's jumps made, off the clock.
+    """Train for a time [s] and return the curve; the test's jumps are made off the clock.
+
+    What is compiled is compiled before, see `warm_up`.
 
     env: of the training, not yet reset; judge: one world a jump; every [s]: training time between two evaluations.
     """
-    env.reset()
-    env.step(torch.zeros(env.num_envs, env.num_actions, device=env.device))
-    env.reset()
-    env.metrics()
+    warm_up(env, ppo)
     curve, trained = Curve(), 0.0
     while trained < seconds:
         wp.synchronize_device(env.wp_device)
         start = time.perf_counter()
         until = min(trained + every, seconds)
         while trained + time.perf_counter() - start < until:
-            ppo.collect()
-            ppo.update()
+            ppo.iterate()
             curve.iterations += 1
             wp.synchronize_device(env.wp_device)
         trained += time.perf_counter() - start
         curve.seconds.append(trained)
+        curve.steps.append(curve.iterations * ppo.batch_size)
         curve.success.append(success(ppo, judge))
     return curve

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import contextlib
 import io
+import time
 from collections.abc import Callable, Sequence
 
 import numpy as np
 import torch
+import warp as wp
 
 from jumper_warp.envs.env import Env
 from jumper_warp.registry import make_task
@@ -129,30 +131,33 @@ def time_stages(envs: int, device: str | None, repeats: int) -> dict[str, float]
     return parts
 
 
-def time_ppo(envs: int, num_steps: int, iterations: int, device: str | None) -> dict[str, float]:
-    """Return figures of training with this package's PPO; the policy must have changed and stayed finite."""
+def time_ppo(envs: int, cfg: PpoCfg, iterations: int, device: str | None) -> dict[str, float]:
+    """Return figures of training with this package's PPO; the policy must have changed and stayed finite.
+
+    With overlap, `ppo_update_s` is what the update takes longer than the rollout beside it. `ppo_ready_s`: compilation
+    and the first iterations, until all graphs are captured.
+    """
     env, _ = stepping_env(envs, device)
-    ppo = Ppo(env, PpoCfg(num_steps=num_steps))
+    begin = time.perf_counter()
+    ppo = Ppo(env, cfg)
     before = ppo.model.log_std.detach().clone()
+    ppo.prepare()
     for _ in range(3):  # eager, capture, replay
-        ppo.collect()
-        ppo.update()
-    watch = Stopwatch(env.device)
+        ppo.iterate()
+    wp.synchronize_device(device)
+    ready, watch = time.perf_counter() - begin, Stopwatch(env.device)
 
     def iterate() -> None:
         watch.start()
-        ppo.collect()
-        watch.mark()
-        ppo.update()
-        watch.mark()
+        ppo.iterate(mark=watch.mark)
 
     wall = wall_time(iterate, device, iterations)
     collect, update = watch.read()
     after = ppo.model.log_std.detach()
     if not bool(after.isfinite().all()) or torch.equal(after, before):
         raise RuntimeError("the policy did not learn")
-    steps = num_steps * envs
-    return {"ppo_steps_per_s": steps / wall, "ppo_iteration_s": wall, "ppo_collect_s": collect, "ppo_update_s": update}
+    rate = {"ppo_steps_per_s": cfg.num_steps * envs / wall, "ppo_iteration_s": wall}
+    return {**rate, "ppo_collect_s": collect, "ppo_update_s": update, "ppo_ready_s": ready}
 
 
 def time_rsl_rl(envs: int, num_steps: int, iterations: int, device: str | None) -> dict[str, float]:

@@ -62,8 +62,16 @@ class PpoCfg:
     """elu, relu or tanh."""
     tf32: bool = True
     """Whether matrix products on a GPU may round their factors to 10 mantissa bits."""
+    precision: Literal["float32", "bfloat16"] = "float32"
+    """What the hidden layers compute in; the last layers, losses and statistics stay in float32."""
+    compile: Literal["auto", "on", "off"] = "auto"
+    """Whether torch.compile fuses what surrounds the matrix products: by default on a GPU. Needs a C++ compiler."""
     graphs: bool = True
-    """Whether a GPU replays captured graphs; the update of several GPUs is always eager."""
+    """Whether a GPU replays captured graphs."""
+    overlap: bool = False
+    """Whether the next rollout runs beside the update, with the weights of one iteration before."""
+    streams: bool = True
+    """Whether a GPU computes the gradients of actor and critic beside each other."""
 
     def __post_init__(self) -> None:
         """Raises ValueError: a setting is out of range."""
@@ -121,7 +129,7 @@ class TrainCfg:
     log_interval: int = 10
     """Iterations between two logged ones."""
     save_interval: int = 100
-    """Iterations between two checkpoints."""
+    """Iterations between two checkpoints; with ppo.overlap, one that saves collects nothing ahead."""
     keep: int = 3
     """How many of the newest checkpoints stay; the best stays anyway."""
     best_by: str = "Metrics/success"

@@ -2,6 +2,7 @@
 
 import io
 import os
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import torch
@@ -9,6 +10,10 @@ import torch
 from jumper_warp.rl.rendezvous import elastic_store
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.threads import available_threads
+
+NCCL = {"NCCL_NVLS_ENABLE": "0", "NCCL_GRAPH_REGISTER": "0"}
+"""Settings of NCCL that are made unless the user did: no multicast over NVLink, which not every machine allows, and no
+registration of buffers while a graph is captured, for which the ranks would have to wait for each other then."""
 
 
 def world_size() -> int:
@@ -20,6 +25,32 @@ def wait_for_ranks() -> None:
     """Wait until every process got here, so that none leaves the group while another still uses it."""
     if world_size() > 1:
         torch.distributed.barrier()
+
+
+def all_ranks(agreed: bool) -> bool:
+    """Return whether all processes agree; each waits for the others."""
+    if world_size() == 1:
+        return agreed
+    vote = torch.tensor(float(agreed), device=_device())
+    torch.distributed.all_reduce(vote, op=torch.distributed.ReduceOp.MIN)
+    return vote.item() > 0.0
+
+
+def _device() -> torch.device:
+    """Return where tensors that the processes exchange must lie."""
+    return torch.device("cuda" if torch.distributed.get_backend() == "nccl" else "cpu")
+
+
+def one_rank_first(procedure: Callable[[], None]) -> None:
+    """Run a procedure on the first process of each machine, then on the others, which find its files."""
+    if world_size() == 1:
+        procedure()
+        return
+    first = os.environ.get("LOCAL_RANK", "0") == "0"
+    for turn in (True, False):
+        if first == turn:
+            procedure()
+        wait_for_ranks()
 
 
 def average_over_ranks(x: torch.Tensor) -> torch.Tensor:
@@ -60,6 +91,8 @@ def join_ranks(device: str | None = None) -> Rank:
         # threads are does not matter here: torch's sums depend on the number of its threads
         torch.set_num_threads(max(1, available_threads() // 2))
     if size > 1 and not torch.distributed.is_initialized():
+        for name, value in NCCL.items():
+            os.environ.setdefault(name, value)
         backend, store = "nccl" if kind.type == "cuda" else "gloo", elastic_store()
         rank = {} if store is None else {"rank": int(os.environ["RANK"]), "world_size": size, "store": store}
         torch.distributed.init_process_group(backend, **rank)

@@ -1,39 +1,80 @@
-"""Torch procedures as CUDA graphs."""
+"""Torch procedures as CUDA graphs, and work beside other work."""
 
 from __future__ import annotations
 
-import warnings
-from collections.abc import Callable
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 
 import torch
 
+from jumper_warp.rl.distributed import all_ranks, wait_for_ranks
+
 
 class Captured:
-    """A procedure that, if enabled, runs eagerly once and as a CUDA graph from then on."""
+    """A procedure that, if enabled, runs eagerly once and as a CUDA graph from then on.
+
+    Where it cannot be captured, on any rank, all ranks go on eagerly, and say so.
+    """
 
     def __init__(self, procedure: Callable[[], None], enabled: bool) -> None:
         """procedure: reads and writes the same tensors in every call, and waits for no result."""
         self._procedure = procedure
         self.enabled = enabled
-        self.forget()
-
-    def forget(self) -> None:
-        """Drop the graph, because a tensor that it uses has been replaced."""
         self._graph: torch.cuda.CUDAGraph | None = None
         self._warm = False
 
+    def close(self) -> None:
+        """Drop the graph; NCCL does not end a group while a graph holds exchanges of it."""
+        self._graph = None
+
     def __call__(self) -> None:
         """Run the procedure once."""
-        if not (self.enabled and self._warm):
-            with warnings.catch_warnings():
-                warnings.filterwarnings("ignore", "This instance was constructed with capturable=True")
-                self._procedure()
+        if self.enabled and self._warm and self._graph is None:
+            self._capture()
+        if self._graph is not None:
+            self._graph.replay()
+        else:
+            self._procedure()
             self._warm = True
-            return
-        if self._graph is None:
-            self._graph = torch.cuda.CUDAGraph()
-            current = torch.cuda.current_stream()
-            stream = None if current == torch.cuda.default_stream() else current
-            with torch.cuda.graph(self._graph, stream=stream, capture_error_mode="thread_local"):
+
+    def _capture(self) -> None:
+        torch.cuda.synchronize()
+        wait_for_ranks()  # no exchange of an eager call may be under way on any rank
+        graph, reason = torch.cuda.CUDAGraph(), ""
+        current = torch.cuda.current_stream()
+        stream = None if current == torch.cuda.default_stream() else current
+        try:
+            # the thread that watches NCCL asks for events, which another mode would take for a mistake of the capture
+            with torch.cuda.graph(graph, stream=stream, capture_error_mode="thread_local"):
                 self._procedure()
-        self._graph.replay()
+        except RuntimeError as error:
+            reason = f": {str(error).splitlines()[0]}"[:300]
+        self.enabled = all_ranks(not reason)
+        if self.enabled:
+            self._graph = graph
+        else:
+            print(f"not captured as a CUDA graph, training is slower{reason}", file=sys.stderr)
+
+
+class Beside:
+    """A second stream of a GPU for work that runs beside what follows; elsewhere it runs in its place."""
+
+    def __init__(self, enabled: bool) -> None:
+        """enabled: whether there is a second stream."""
+        self._stream = torch.cuda.Stream() if enabled else None
+
+    @contextmanager
+    def __call__(self) -> Iterator[None]:
+        """Put what is launched in this context on the second stream, after everything that was launched before."""
+        if self._stream is None:
+            yield
+            return
+        self._stream.wait_stream(torch.cuda.current_stream())
+        with torch.cuda.stream(self._stream):
+            yield
+
+    def join(self) -> None:
+        """Let what is launched from here on wait for the second stream."""
+        if self._stream is not None:
+            torch.cuda.current_stream().wait_stream(self._stream)

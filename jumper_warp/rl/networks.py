@@ -18,16 +18,29 @@ ACTIVATIONS = {"elu": nn.ELU, "relu": nn.ReLU, "tanh": nn.Tanh}
 """Activations by the name that a configuration gives."""
 
 
-def batch_moments(x: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, int]:
-    """Return mean, population variance (both float64) and count over the first axis of all ranks' batches.
+Moments = tuple[torch.Tensor, torch.Tensor, int]
+"""Mean and population variance of some columns, float64, and the number of samples."""
 
-    The batches of all ranks must have the same size; x: (batch, ...).
+
+def joint_moments(own: Sequence[tuple[torch.Tensor, torch.Tensor]], size: int) -> list[Moments]:
+    """Return the moments over all ranks' batches, all in one exchange.
+
+    own: mean and population variance of each of some quantities over this rank's batch, of any shape; size: of the
+    batch, the same on every rank. E[x²] - E[x]² loses nothing that counts in float64.
     """
-    var, own_mean = torch.var_mean(x, dim=0, correction=0)
-    own_mean = own_mean.double()
-    mean = average_over_ranks(own_mean.clone())
-    var = average_over_ranks(var.double() + (own_mean - mean).square())
-    return mean, var, x.shape[0] * world_size()
+    moments = [(mean.double(), var.double()) for mean, var in own]
+    if world_size() > 1:
+        vector = torch.cat([part.flatten() for mean, var in moments for part in (mean, var + mean.square())])
+        parts = average_over_ranks(vector).split([mean.numel() for mean, _ in moments for _ in range(2)])
+        pairs = zip(parts[::2], parts[1::2], moments, strict=True)
+        moments = [(a.view_as(like), (b - a.square()).clamp(min=0.0).view_as(like)) for a, b, (like, _) in pairs]
+    return [(mean, var, size * world_size()) for mean, var in moments]
+
+
+def own_moments(x: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return mean and population variance over the first axis of this rank's batch (batch, ...)."""
+    var, mean = torch.var_mean(x, dim=0, correction=0)
+    return mean, var
 
 
 def gaussian_log_prob(x: torch.Tensor, mean: torch.Tensor, log_std: torch.Tensor) -> torch.Tensor:
@@ -62,12 +75,21 @@ class RunningMoments(nn.Module):
     @torch.no_grad()
     def update(self, x: torch.Tensor) -> None:
         """Take in a batch of finite samples (batch, *shape); those of the other ranks come with it, exactly."""
-        mean, var, size = batch_moments(x)
+        self.take(joint_moments([own_moments(x)], x.shape[0])[0])
+
+    @torch.no_grad()
+    def take(self, moments: Moments) -> None:
+        """Take in the moments of a batch of finite samples over all ranks."""
+        mean, var, size = moments
         share = size / (self.count + size)
         delta = mean - self.mean
         self.var.lerp_(var, share).add_(delta.square() * share * (1.0 - share))
         self.mean.add_(delta * share)
         self.count.add_(size)
+
+    def scaling(self) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return mean and standard deviation, float32, of the sample's shape."""
+        return self.mean.float(), self.scale()
 
     def scale(self) -> torch.Tensor:
         """Return the standard deviation, float32, of the sample's shape."""

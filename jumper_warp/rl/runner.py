@@ -19,7 +19,7 @@ import torch
 from jumper_warp.envs.vec_env import VecEnv
 from jumper_warp.rl.cfg import TrainCfg
 from jumper_warp.rl.checkpoint import DAMAGE, CheckpointError, one_line, save_checkpoint
-from jumper_warp.rl.distributed import Rank, gather, join_ranks, wait_for_ranks, world_size
+from jumper_warp.rl.distributed import Rank, gather, join_ranks, one_rank_first, wait_for_ranks, world_size
 from jumper_warp.rl.elastic import mark_run, own_run
 from jumper_warp.rl.logger import Pace, Stopwatch, TrainingLog
 from jumper_warp.rl.ppo import FIGURES, Ppo
@@ -88,6 +88,7 @@ def train(
     """
     set_threads(cfg.threads)
     rank = join_ranks(cfg.device)
+    run: Run | None = None
     try:
         _check_processes(cfg, rank, as_rsl_rl is not None)
         env = make_env(cfg.num_envs // rank.size, cfg.seed + 1000 * rank.index, rank.device)
@@ -103,6 +104,8 @@ def train(
             raise SystemExit(INTERRUPTED)
         return result
     finally:
+        if run is not None:
+            run.ppo.close()
         if torch.distributed.is_initialized():
             torch.distributed.destroy_process_group()
 
@@ -183,6 +186,7 @@ class Run:
     def iterate(self, stop: Stop) -> TrainResult:
         """Iterate until the end, the time limit or a wish to stop; log and save on the way."""
         cfg, ppo = self.cfg, self.ppo
+        one_rank_first(ppo.prepare)
         if self.iteration == 0:
             self.env.reset()
         start, first = time.perf_counter(), self.iteration + 1
@@ -193,26 +197,29 @@ class Run:
             ending = self.iteration >= cfg.iterations or 0.0 < cfg.max_seconds <= self.seconds
             if ending:
                 log.say(f"nothing is left to train after iteration {self.iteration}")
+            drain = False
             while not ending:
                 watch.start()
                 ppo.set_progress(self._progress())
-                ppo.collect()
-                watch.mark()
-                ppo.update()
-                watch.mark()
+                ppo.iterate(drain or self._saves(self.iteration + 1), watch.mark)
                 self.iteration += 1
                 if self.iteration == first:
                     self._begin_counting()
-                ending = self._ending(stop)
+                drain = drain or self._ending(stop)
+                ending = drain and not ppo.ahead  # else after the iteration that learns from the rollout ahead
                 if ending or self.iteration % cfg.log_interval == 0:
                     times, seconds = watch.read(), pace.lap(self.iteration)
                     self.figures = self._read(times, seconds)
                     log.log(self.iteration, self.figures, self._left(seconds))
                 elif self.iteration == first:  # its time tells nothing of the others
                     watch.read(), pace.lap(self.iteration)
-                if ending or self.iteration % cfg.save_interval == 0:
+                if ending or self._saves(self.iteration):
                     self._save(log, ending, stop)
         return TrainResult(self.folder, self.iteration, time.perf_counter() - start, self.figures)
+
+    def _saves(self, iteration: int) -> bool:
+        """Return whether it is known beforehand that an iteration ends with a checkpoint."""
+        return iteration % self.cfg.save_interval == 0 or iteration >= self.cfg.iterations
 
     def _log(self) -> TrainingLog | _Silent:
         if self.rank.index != 0:

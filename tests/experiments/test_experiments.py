@@ -7,7 +7,15 @@ import pytest
 import torch
 from landing_helpers import still_policy
 
-from experiments import ablations, benchmark_solver, benchmark_training, new_reward, soak_test, vertical_jump_sweep
+from experiments import (
+    ablations,
+    benchmark_solver,
+    benchmark_training,
+    learning_curves,
+    new_reward,
+    soak_test,
+    vertical_jump_sweep,
+)
 from jumper_warp.evaluation.heights import sweep_metrics
 from jumper_warp.evaluation.jumps import Jumps, run_jumps
 from jumper_warp.evaluation.learning import Curve
@@ -202,14 +210,40 @@ def test_ablations_write_a_curve_per_variant(tmp_path):
     assert (tmp_path / "ablations.png").is_file()
 
 
+def test_learning_curves_tell_when_each_training_was_good_enough(tmp_path, monkeypatch):
+    def in_process(args, name, seed, path):
+        if seed == 1:
+            return {"ready": 3.0, "seconds": [2.0, 4.0, 6.0], "steps": [10, 20, 30], "success": [0.5, 0.96, 0.9]}
+        learning_curves.main(replace(args, seeds=(seed,), variants=(name,), one=path))
+        return json.loads(path.read_text())
+
+    monkeypatch.setattr(learning_curves, "in_process", in_process)
+    args = learning_curves.Args(
+        seconds=0.3, every=0.2, seeds=(0, 1), variants=("eager_float32",), envs=8, jumps=2, out=tmp_path, device="cpu"
+    )
+    values = learning_curves.main(args)
+    assert values == json.loads((tmp_path / "figures.json").read_text())
+    assert values["trained_to_95_percent_s_eager_float32_0"] is None
+    assert values["curve_steps_eager_float32_0"][-1] % (8 * 32) == 0
+    assert values["trained_to_95_percent_s_eager_float32_1"] == 4.0
+    assert values["from_start_to_95_percent_s_eager_float32_1"] == 7.0
+    assert values["steps_to_95_percent_eager_float32_1"] == 20
+    assert (tmp_path / "learning_curves.png").is_file()
+    assert "eager_float32" in (tmp_path / "learning_curves.txt").read_text()
+    with pytest.raises(InputError, match=r"variants are default, .*, got 'faster'"):
+        replace(args, variants=("faster",))
+
+
 # ---------------------------------------------------------------- benchmark
 
 
 def test_benchmark_reports_solver_environment_and_both_trainers(tmp_path):
     args = benchmark_training.Args(
-        envs=(8,), train_envs=16, steps=4, repeats=1, iterations=1, num_steps=8, out=tmp_path, device="cpu"
-    )
+        envs=(8,), train_envs=16, steps=4, repeats=1, iterations=1, num_steps=8, out=tmp_path, device="cpu",
+        variants=("eager_bfloat16_overlap",),
+    )  # fmt: skip
     values = benchmark_training.main(args)
+    assert values["ppo_steps_per_s_eager_bfloat16_overlap"] > 0.0
     assert values == json.loads((tmp_path / "figures.json").read_text())
     rates = [values[f"{what}_steps_per_s_{n}"] for what in ("solver", "env") for n in (8, 16)]
     rates += [values["ppo_steps_per_s"], values["rsl_rl_steps_per_s"]]

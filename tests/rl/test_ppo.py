@@ -10,8 +10,12 @@ from tensordict import TensorDict
 from torch.utils._python_dispatch import TorchDispatchMode
 from toy_task import SMALL, PushTask, fill, local_order, update_half
 
+from jumper_warp.rl import networks
+from jumper_warp.rl import ppo as ppo_module
+from jumper_warp.rl.adam import adapted_lr
 from jumper_warp.rl.cfg import PpoCfg
-from jumper_warp.rl.ppo import STATISTICS, Batch, Ppo, adapted_lr, gae
+from jumper_warp.rl.ppo import STATISTICS, Ppo
+from jumper_warp.rl.samples import Batch, gae
 
 PLAIN = PpoCfg(
     num_steps=8, epochs=1, minibatches=1, hidden=(16, 8), normalise_value=False, reward_scale=1.0, max_grad_norm=1e9
@@ -66,13 +70,13 @@ def pair():
     ppo.rollout.timeout.zero_()
     theirs = as_rsl_rl(ppo)
     feed(theirs, ppo.rollout)
-    batch = ppo.batch()
+    batch = Batch(*(part.clone() for part in ppo.batch()))
     with torch.no_grad():
         for param in ppo.model.parameters():
             param.add_(0.1 * torch.randn_like(param))
     copy_weights(ppo.model, theirs)
     their_losses = theirs.update()
-    ppo._descend(batch)
+    ppo._descend(ppo.sampler.rows)
     return ppo, batch, theirs, their_losses, ppo.statistics()
 
 
@@ -96,7 +100,7 @@ def test_gradients_equal_rsl_rl(pair):
         torch.testing.assert_close(param.grad, their_actor[name].grad, atol=1e-5, rtol=1e-5)
     for a, b in zip(ppo.model.critic.parameters(), theirs.critic.mlp.parameters(), strict=True):
         torch.testing.assert_close(a.grad, b.grad, atol=1e-5, rtol=1e-5)
-    assert ppo._vector.norm() > 0.1
+    assert ppo.flat.gradient.norm() > 0.1
 
 
 def test_step_size_after_the_update_equals_rsl_rl(pair):
@@ -110,7 +114,7 @@ def test_gradients_are_shortened_as_rsl_rl_does():
     ppo = Ppo(PushTask(16), dataclasses.replace(PLAIN, max_grad_norm=0.05))
     fill(ppo, slice(None), 16)
     ppo.update()
-    actor, critic = (part.norm().item() for part in ppo._gradients)
+    actor, critic = (part.norm().item() for part in ppo.flat.gradients())
     assert actor == pytest.approx(0.05, rel=1e-4)
     assert critic == pytest.approx(0.05, rel=1e-4)
 
@@ -247,7 +251,9 @@ def test_a_gradient_that_is_not_finite_changes_nothing():
     fill(ppo, slice(None), 16)
     batch = ppo.batch()
     before = {name: value.clone() for name, value in ppo.model.named_parameters()}
-    ppo._descend(batch._replace(advantage=batch.advantage * float("nan"), target=batch.target * float("inf")))
+    batch.advantage.mul_(float("nan"))
+    batch.target.mul_(float("inf"))
+    ppo._descend(ppo.sampler.rows)
     assert all(torch.equal(value, before[name]) for name, value in ppo.model.named_parameters())
     assert ppo.statistics()["Loss/skipped"] == 1.0
 
@@ -310,6 +316,31 @@ def test_two_processes_equal_one_with_all_worlds(tmp_path):
         torch.testing.assert_close(found["lr"], expected["lr"])
 
 
+def test_an_iteration_exchanges_its_statistics_once_and_a_gradient_a_minibatch(monkeypatch):
+    cfg = dataclasses.replace(PLAIN, epochs=3, minibatches=4, normalise_value=True)
+    ppos = []
+    for ranks in (1, 2):
+        sizes = []
+
+        def exchange(x, sizes=sizes):
+            sizes.append(x.numel())
+            return x  # as if the other rank had seen the same
+
+        monkeypatch.setattr(networks, "world_size", lambda ranks=ranks: ranks)
+        monkeypatch.setattr(networks, "average_over_ranks", exchange)
+        monkeypatch.setattr(ppo_module, "average_over_ranks", exchange)
+        torch.manual_seed(0)
+        ppos.append(Ppo(PushTask(16), cfg))
+        ppos[-1].env.reset()
+        ppos[-1].collect()
+        ppos[-1].update()
+    alone, one_of_two = ppos
+    assert sizes == [2 * (1 + 1 + 2 + 3)] + 12 * [alone.flat.gradient.numel()]
+    torch.testing.assert_close(one_of_two.flat.value, alone.flat.value, atol=2e-5, rtol=1e-3)
+    torch.testing.assert_close(one_of_two.model.obs_moments.var, alone.model.obs_moments.var, atol=1e-6, rtol=1e-3)
+    assert one_of_two.model.obs_moments.count == 2 * alone.model.obs_moments.count
+
+
 FULL = 2.0**24
 """Where a count in single precision stands still."""
 
@@ -317,13 +348,14 @@ FULL = 2.0**24
 def test_counts_go_on_where_single_precision_stands_still():
     ppo = Ppo(PushTask(1, episode_length=5), dataclasses.replace(PLAIN, num_steps=16, epochs=1, minibatches=1))
     ppo.env.reset()
-    for count in (ppo._episode, ppo._finished, ppo._sums, ppo._sum_count):
+    for count in (ppo.collector.episode, ppo.collector.finished, ppo._sums):
         count.fill_(FULL)
     ppo.collect()
     ppo.update()
-    assert ppo._finished.tolist()[1:] == [2.0 * FULL + 15.0, FULL + 3.0]  # lengths and number of three episodes
-    assert ppo._episode[1].tolist() == [1.0]
-    assert ppo._sum_count.item() == FULL + 1.0
+    lengths, number = ppo.collector.finished[1:, 0].tolist()
+    assert (lengths, number) == (2.0 * FULL + 15.0, FULL + 3.0)  # of three episodes
+    assert ppo.collector.episode[1].tolist() == [1.0]
+    assert ppo._sums[-1].item() == FULL + 1.0
     entropy, skipped = (ppo._sums[STATISTICS.index(name)].item() - FULL for name in ("entropy", "skipped"))
     assert 0.0 < abs(entropy) < 10.0 and entropy != round(entropy) and skipped == 0.0
 
@@ -334,7 +366,7 @@ def test_an_old_checkpoints_episodes_in_single_precision_are_taken_up():
     old = {**state, "episode": state["episode"].float()}
     other = Ppo(PushTask(128), SMALL)
     other.load_state_dict(old)
-    assert torch.equal(other._episode, old["episode"].double())
+    assert torch.equal(other.collector.episode, old["episode"].double())
 
 
 def test_state_is_taken_up_exactly():

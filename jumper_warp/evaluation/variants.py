@@ -1,0 +1,34 @@
+"""Ways to run the trainer that are compared with each other, by name."""
+
+from __future__ import annotations
+
+import dataclasses
+from itertools import product
+from typing import Any
+
+from jumper_warp.rl.cfg import PpoCfg
+from jumper_warp.utils.errors import InputError
+
+DEFAULT = "default"
+"""Name of the trainer as it is."""
+VARIANTS: dict[str, dict[str, Any]] = {
+    DEFAULT: {},
+    **{
+        "_".join([{"off": "eager", "on": "compiled"}[mode], precision, *(["overlap"] if overlap else [])]): {
+            "compile": mode,
+            "precision": precision,
+            "overlap": overlap,
+        }
+        for mode, precision, overlap in product(("off", "on"), ("float32", "bfloat16"), (False, True))
+    },
+    "one_stream": {"streams": False},
+    "four_minibatches": {"minibatches": 4},
+}
+"""What each changes of `PpoCfg`."""
+
+
+def variant(cfg: PpoCfg, name: str) -> PpoCfg:
+    """Return settings changed as a variant says. Raises ValueError: there is no such variant."""
+    if name not in VARIANTS:
+        raise InputError(f"variants are {', '.join(VARIANTS)}, got {name!r:.60}")
+    return dataclasses.replace(cfg, **VARIANTS[name])

@@ -1,0 +1,207 @@
+"""A rollout as samples to learn from: advantages, returns, and one row of memory a sample."""
+
+from __future__ import annotations
+
+from itertools import accumulate
+from typing import NamedTuple
+
+import torch
+
+from jumper_warp.envs.vec_env import sanitise
+from jumper_warp.rl.cfg import PpoCfg
+from jumper_warp.rl.compiling import Compiler
+from jumper_warp.rl.flat import ROW_ALIGNMENT, FlatParameters, Layers, aligned
+from jumper_warp.rl.networks import ActorCritic, gaussian_log_prob, joint_moments, own_moments
+from jumper_warp.rl.passes import DTYPES, forward
+from jumper_warp.rl.rollout import Pair, RolloutBuffer, normalised
+
+
+class Batch(NamedTuple):
+    """Samples to learn from; first axis: sample."""
+
+    features: torch.Tensor
+    """(batch, num_obs) normalised observations."""
+    critic_features: torch.Tensor
+    """(batch, num_critic_obs) the critic's, normalised."""
+    action: torch.Tensor
+    mean: torch.Tensor
+    """(batch, num_actions) mean of the policy that acted."""
+    log_prob: torch.Tensor
+    """(batch,) of the action under that policy."""
+    value: torch.Tensor
+    """(batch,) the critic's output then."""
+    advantage: torch.Tensor
+    target: torch.Tensor
+    """(batch,) what the critic should have put out."""
+
+
+class RowLayout(NamedTuple):
+    """Which columns of a sample's row hold what; each group of columns begins at a multiple of ROW_ALIGNMENT.
+
+    One row a sample is written once an iteration and gathered once a minibatch.
+    """
+
+    num_obs: int
+    num_critic_obs: int
+    num_actions: int
+
+    @property
+    def widths(self) -> tuple[int, int, int]:
+        """Columns of both groups of features and of the rest, filled up."""
+        rest = 2 * self.num_actions + 4
+        return tuple(aligned(width, ROW_ALIGNMENT) for width in (self.num_obs, self.num_critic_obs, rest))  # type: ignore[return-value]
+
+    def features(self, rows: torch.Tensor) -> torch.Tensor:
+        """Return the actor's features with the zero columns that its first weight has."""
+        return rows[:, : self.widths[0]]
+
+    def critic_features(self, rows: torch.Tensor) -> torch.Tensor:
+        """Return the critic's features with the zero columns that its first weight has."""
+        return rows[:, self.widths[0] : sum(self.widths[:2])]
+
+    def split(self, rows: torch.Tensor) -> Batch:
+        """Return views of rows (batch, columns) as a batch."""
+        sizes = (self.num_obs, self.widths[0] - self.num_obs, self.num_critic_obs, self.widths[1] - self.num_critic_obs,
+                 self.num_actions, self.num_actions, 1, 1, 1, 1)  # fmt: skip
+        starts = list(accumulate(sizes, initial=0))
+        parts = [rows[:, first : first + size] for first, size in zip(starts, sizes, strict=False)]
+        features, _, critic_features, _, action, mean, *scalars = parts
+        return Batch(features, critic_features, action, mean, *(each[:, 0] for each in scalars))
+
+    def pack(self, batch: Batch) -> torch.Tensor:
+        """Return a batch as rows (batch, columns)."""
+        scalars = torch.stack([batch.log_prob, batch.value, batch.advantage, batch.target], dim=-1)
+        groups = ([batch.features], [batch.critic_features], [batch.action, batch.mean, scalars])
+        pieces: list[torch.Tensor] = []
+        for group, width in zip(groups, self.widths, strict=True):
+            pieces += group
+            if gap := width - sum(each.shape[1] for each in group):
+                pieces.append(scalars.new_zeros(scalars.shape[0], gap))
+        return torch.cat(pieces, dim=1)
+
+
+def gae(
+    reward: torch.Tensor, done: torch.Tensor, value: torch.Tensor, gamma: float, lam: float
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Generalised advantage estimation (Schulman et al. 2016, eq. 16).
+
+    The recurrence A[t] = δ[t] + w[t] A[t+1] is solved by doubling: log2(steps) passes over all steps at once.
+
+    Args:
+        reward: (steps, num_envs), with the bootstrap of timeouts already in it.
+        done: (steps, num_envs), 1 where nothing follows.
+        value: (steps + 1, num_envs) expected return before each step and after the last.
+        gamma: Discount per step.
+        lam: Weight of longer estimates.
+
+    Returns:
+        Advantages and returns, each (steps, num_envs).
+    """
+    alive = 1.0 - done
+    advantage = reward + gamma * alive * value[1:] - value[:-1]
+    weight = gamma * lam * alive
+    reach = 1  # advantage[t] holds δ[t] .. δ[t + reach - 1], weight[t] is the product of their weights
+    while reach < reward.shape[0]:
+        longer = torch.addcmul(advantage[:-reach], weight[:-reach], advantage[reach:])
+        advantage = torch.cat([longer, advantage[-reach:]])
+        weight = torch.cat([weight[:-reach] * weight[reach:], weight[-reach:]])
+        reach *= 2
+    return advantage, advantage + value[:-1]
+
+
+class Sampler:
+    """Turns a rollout into rows to learn from."""
+
+    def __init__(
+        self, rollout: RolloutBuffer, cfg: PpoCfg, model: ActorCritic, flat: FlatParameters, compiler: Compiler
+    ) -> None:
+        """flat: the parameters of `model`."""
+        self._rollout, self._cfg, self._model, self._critic = rollout, cfg, model, flat.critic()
+        steps, worlds, num_actions = rollout.action.shape
+        self.layout = RowLayout(rollout.obs.shape[2], rollout.critic_obs.shape[2], num_actions)
+        self.rows = rollout.obs.new_zeros(steps * worlds, sum(self.layout.widths))
+        """(steps · worlds, columns of `layout`), time-major."""
+        self.old_log_std = torch.zeros_like(rollout.log_std)
+        """Of the policy that acted."""
+        self._estimate, self._pack = compiler(_estimate), compiler(_pack)
+
+    @torch.no_grad()
+    def pack(self) -> None:
+        """Write the rollout to `rows` and take it into the running statistics."""
+        model = self._model
+        scaling = model.obs_moments.scaling()  # with which the policy acted
+        estimates, own = self._estimates()
+        of_advantage, of_target, of_obs, of_critic_obs = joint_moments(own, self.rows.shape[0])
+        model.obs_moments.take(of_obs)
+        model.critic_moments.take(of_critic_obs)
+        if self._cfg.normalise_value:
+            model.value_moments.take(of_target)
+        mean, var, count = of_advantage
+        self._write(scaling, estimates, (mean.float(), ((var * count / (count - 1)).sqrt() + 1.0e-8).float()))
+        self.old_log_std.copy_(self._rollout.log_std)
+
+    @torch.no_grad()
+    def rehearse(self) -> None:
+        """Compile, as if a rollout were packed; spoils `rows`."""
+        scaling = self._model.obs_moments.scaling()
+        self._write(scaling, self._estimates()[0], self._model.value_moments.scaling())
+
+    def _estimates(self) -> tuple[tuple[torch.Tensor, ...], list[Pair]]:
+        rollout, model = self._rollout, self._model
+        experience = (rollout.critic_obs, rollout.final_critic_obs, rollout.reward, rollout.done, rollout.timeout)
+        scalings = (model.critic_moments.scaling(), model.value_moments.scaling())
+        return self._estimate(experience, rollout.obs, self._critic, *scalings, self._cfg)
+
+    def _write(self, scaling: Pair, estimates: tuple[torch.Tensor, ...], advantage_scaling: Pair) -> None:
+        rollout = self._rollout
+        acted = (rollout.obs, rollout.action, rollout.mean, rollout.log_std)
+        target_scaling = self._model.value_moments.scaling() if self._cfg.normalise_value else None
+        self._pack(self.rows, self.layout, acted, scaling, estimates, advantage_scaling, target_scaling)
+
+
+def _estimate(
+    experience: tuple[torch.Tensor, ...], obs: torch.Tensor, critic: Layers, critic_scaling: Pair, value_scaling: Pair,
+    cfg: PpoCfg,
+) -> tuple[tuple[torch.Tensor, ...], list[Pair]]:  # fmt: skip
+    """Return what the critic makes of a rollout, and moments of it.
+
+    experience: critic_obs, final_critic_obs, reward, done and timeout of a `RolloutBuffer`.
+
+    Returns:
+        The critic's features (samples, columns), its output, advantages and returns (samples,); and mean and variance
+        of advantages, returns, observations and the critic's observations.
+    """
+    critic_obs, final_critic_obs, reward, done, timeout = experience
+    columns, dtype = critic.weights[0].shape[1], DTYPES[cfg.precision]
+
+    def head(raw: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        features = normalised(sanitise(raw.flatten(0, 1)), critic_scaling, columns)
+        return features, forward(critic, features, dtype)[0].view(raw.shape[:2])
+
+    features, now = head(critic_obs)
+    _, final = head(final_critic_obs)
+    now_value, final_value = (x * value_scaling[1] + value_scaling[0] for x in (now, final))
+    advantage, target = gae(reward + cfg.gamma * timeout * final_value, done, now_value, cfg.gamma, cfg.lam)
+    samples = reward.numel()
+    own = [
+        own_moments(x) for x in (advantage.flatten(), target.flatten(), obs[:-1].flatten(0, 1),
+                                 critic_obs[:-1].flatten(0, 1))
+    ]  # fmt: skip
+    return (features[:samples], now[:-1].flatten(), advantage.flatten(), target.flatten()), own
+
+
+def _pack(
+    rows: torch.Tensor, layout: RowLayout, acted: tuple[torch.Tensor, ...], scaling: Pair,
+    estimates: tuple[torch.Tensor, ...], advantage_scaling: Pair, target_scaling: Pair | None,
+) -> None:  # fmt: skip
+    """Write samples to rows; acted: obs, action, mean and log_std of a `RolloutBuffer`, estimates: of `_estimate`."""
+    obs, action, mean, log_std = acted
+    critic_features, value, advantage, target = estimates
+    if target_scaling is not None:
+        target = (target - target_scaling[0]) / target_scaling[1]
+    log_prob = gaussian_log_prob(action, mean, log_std).flatten()
+    features = normalised(obs[:-1].flatten(0, 1), scaling, layout.num_obs)
+    advantage = (advantage - advantage_scaling[0]) / advantage_scaling[1]
+    critic_features = critic_features[:, : layout.num_critic_obs]
+    acting = (action.flatten(0, 1), mean.flatten(0, 1), log_prob)
+    rows.copy_(layout.pack(Batch(features, critic_features, *acting, value, advantage, target)))

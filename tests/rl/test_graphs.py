@@ -1,0 +1,44 @@
+import pytest
+
+from jumper_warp.rl import graphs
+from jumper_warp.rl.graphs import Beside, Captured
+
+
+@pytest.fixture
+def refusing(monkeypatch):
+    """A GPU on which no capture succeeds."""
+
+    def refuse(*_, **__):
+        raise RuntimeError("operation not permitted when stream is capturing\nand more")
+
+    class Cuda:
+        CUDAGraph, graph = object, staticmethod(refuse)
+
+        def __getattr__(self, name):
+            return lambda: None
+
+    class Torch:
+        cuda = Cuda()
+
+    monkeypatch.setattr(graphs, "torch", Torch())
+
+
+@pytest.mark.usefixtures("refusing")
+def test_what_cannot_be_captured_runs_eagerly_and_says_so_once(capsys):
+    calls = []
+    captured = Captured(lambda: calls.append(None), enabled=True)
+    for _ in range(4):
+        captured()
+    assert len(calls) == 4
+    assert capsys.readouterr().err.splitlines() == [
+        "not captured as a CUDA graph, training is slower: operation not permitted when stream is capturing"
+    ]
+
+
+def test_without_a_second_stream_work_is_done_in_its_place():
+    done, beside = [], Beside(enabled=False)
+    with beside():
+        done.append("first")
+    done.append("second")
+    beside.join()
+    assert done == ["first", "second"]

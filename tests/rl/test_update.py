@@ -1,0 +1,220 @@
+"""The update against a plain implementation: autograd, torch.optim.Adam, a loop over time, one tensor a quantity."""
+
+import dataclasses
+import math
+
+import pytest
+import torch
+from toy_task import PushTask, fill
+
+from jumper_warp.rl import compiling
+from jumper_warp.rl.adam import FlatAdam, adam_step
+from jumper_warp.rl.cfg import PpoCfg
+from jumper_warp.rl.flat import FlatParameters
+from jumper_warp.rl.networks import ActorCritic, gaussian_log_prob
+from jumper_warp.rl.passes import backward, forward
+from jumper_warp.rl.ppo import Ppo
+
+CFG = PpoCfg(num_steps=8, epochs=3, minibatches=4, hidden=(16, 9), max_grad_norm=0.3, lr=3e-3)
+WORLDS = 16
+
+
+def reference_losses(model, part, old_log_std, cfg):
+    """Surrogate, value loss, entropy and divergence, by torch.distributions and as the papers write them."""
+    policy = torch.distributions.Normal(model.actor(part["features"]), model.log_std.exp())
+    old = torch.distributions.Normal(part["mean"], old_log_std.exp())
+    ratio = (policy.log_prob(part["action"]) - old.log_prob(part["action"])).sum(-1).exp()
+    clipped = ratio.clamp(1 - cfg.clip, 1 + cfg.clip)
+    surrogate = -torch.min(ratio * part["advantage"], clipped * part["advantage"]).mean()
+    value = model.critic(part["critic_features"])[:, 0]
+    loss = (value - part["target"]) ** 2
+    if cfg.clip_value:
+        near = part["value"] + (value - part["value"]).clamp(-cfg.clip, cfg.clip)
+        loss = torch.max(loss, (near - part["target"]) ** 2)
+    entropy = policy.entropy()[0].sum()
+    kl = torch.distributions.kl_divergence(old, policy).sum(-1).mean()
+    return surrogate, loss.mean(), entropy, kl.detach()
+
+
+def reference_update(model, batch, old_log_std, orders, cfg):
+    """Several epochs of clipped Adam steps; returns the losses of each minibatch."""
+    actor, critic = [*model.actor.parameters(), model.log_std], list(model.critic.parameters())
+    optimiser = torch.optim.Adam([*actor, *critic], lr=cfg.lr)
+    history = []
+    for order in orders:
+        for samples in order.chunk(cfg.minibatches):
+            part = {name: value[samples] for name, value in batch.items()}
+            surrogate, value, entropy, kl = reference_losses(model, part, old_log_std, cfg)
+            optimiser.zero_grad()
+            (surrogate + cfg.value_coef * value - cfg.entropy_coef * entropy).backward()
+            norms = [torch.nn.utils.clip_grad_norm_(each, cfg.max_grad_norm) for each in (actor, critic)]
+            group = optimiser.param_groups[0]
+            if kl > 2 * cfg.desired_kl:
+                group["lr"] = max(group["lr"] / 1.5, cfg.min_lr)
+            elif 0 < kl < cfg.desired_kl / 2:
+                group["lr"] = min(group["lr"] * 1.5, cfg.max_lr)
+            optimiser.step()
+            history.append([float(x.detach()) for x in (surrogate, value, entropy, kl, *norms)])
+    return optimiser, history
+
+
+def learnt(cfg, device="cpu"):
+    """Return PPO after one update on made-up experience, and model, samples and orders from before."""
+    torch.manual_seed(0)
+    ppo = Ppo(PushTask(WORLDS, device=device), cfg)
+    fill(ppo, slice(None), WORLDS)
+    torch.manual_seed(1)
+    ppo.batch()  # running statistics other than the identity
+    before = ActorCritic(2, 1, cfg.hidden, cfg.activation, num_critic_obs=3)
+    before.load_state_dict(ppo.state_dict()["model"])
+    torch.manual_seed(1)
+    ppo.update()
+    batch = {name: part.clone() for name, part in ppo.sampler.layout.split(ppo.sampler.rows)._asdict().items()}
+    return ppo, before, batch, ppo._orders.clone()
+
+
+@pytest.mark.parametrize(
+    "change", [{}, {"clip_value": False}, {"activation": "relu"}, {"activation": "tanh"}, {"clip": 0.02}]
+)
+def test_an_update_equals_autograd_and_adam(change):
+    cfg = dataclasses.replace(CFG, **change)
+    ppo, model, batch, orders = learnt(cfg)
+    optimiser, history = reference_update(model, batch, ppo.rollout.log_std, orders, cfg)
+    ours = dict(ppo.model.named_parameters())
+    for name, param in model.named_parameters():
+        torch.testing.assert_close(ours[name], param, atol=2e-5, rtol=1e-4, msg=name)
+    figures = ppo.statistics()
+    means = torch.tensor(history).mean(0).tolist()
+    names = ("surrogate", "value", "entropy", "kl", "gradient_actor", "gradient_critic")
+    for name, mean in zip(names, means, strict=True):
+        assert figures[f"Loss/{name}"] == pytest.approx(mean, rel=1e-3, abs=1e-5), name
+    assert figures["Loss/learning_rate"] == pytest.approx(optimiser.param_groups[0]["lr"])
+    assert max(row[4] for row in history) > cfg.max_grad_norm  # some were clipped
+    their_state = optimiser.state_dict()["state"]
+    for index, state in ppo.optimiser.state_dict().items():
+        for name in ("step", "exp_avg", "exp_avg_sq"):
+            torch.testing.assert_close(state[name], their_state[index][name], atol=2e-5, rtol=1e-3)
+
+
+def test_samples_equal_those_of_a_loop_over_time():
+    ppo, model, batch, _ = learnt(CFG)
+    rollout, cfg = ppo.rollout, CFG
+
+    def value_of(critic_obs):
+        return model.value(critic_obs).detach()
+
+    values, following, advantages = value_of(rollout.critic_obs), torch.zeros(WORLDS), []
+    for step in reversed(range(cfg.num_steps)):
+        alive = 1 - rollout.done[step]
+        reward = rollout.reward[step] + cfg.gamma * rollout.timeout[step] * value_of(rollout.final_critic_obs[step])
+        delta = reward + cfg.gamma * alive * values[step + 1] - values[step]
+        following = delta + cfg.gamma * cfg.lam * alive * following
+        advantages.insert(0, following)
+    advantage = torch.stack(advantages).flatten()
+    close = {"atol": 1e-5, "rtol": 1e-4}
+    torch.testing.assert_close(batch["advantage"], (advantage - advantage.mean()) / advantage.std(), **close)
+    returns = advantage + values[:-1].flatten()
+    torch.testing.assert_close(ppo.model.value_moments.restore(batch["target"]), returns, **close)
+    torch.testing.assert_close(batch["features"], model.features(rollout.obs[:-1]).flatten(0, 1), **close)
+    torch.testing.assert_close(
+        batch["critic_features"], model.critic_features(rollout.critic_obs[:-1]).flatten(0, 1), **close
+    )
+    head = model.value_head(model.critic_features(rollout.critic_obs[:-1])).flatten().detach()
+    torch.testing.assert_close(batch["value"], head, **close)
+    log_prob = gaussian_log_prob(rollout.action, rollout.mean, rollout.log_std).flatten()
+    torch.testing.assert_close(batch["log_prob"], log_prob, **close)
+
+
+def test_many_steps_equal_adam():
+    torch.manual_seed(0)
+    model = ActorCritic(5, 3, (7, 4), num_critic_obs=6)
+    theirs = [param.detach().clone().requires_grad_() for param in model.actor.parameters()]
+    flat = FlatParameters(model, "elu")
+    ours, optimiser = FlatAdam(flat, 1e-2), torch.optim.Adam(theirs, lr=1e-2)
+    for step in range(2000):
+        for index, param in enumerate(theirs):
+            param.grad = torch.randn_like(param) * 10.0 ** (index - 4) + math.cos(0.1 * step)
+            flat.params[index].grad.copy_(param.grad)
+        adam_step(ours.vectors)
+        optimiser.step()
+        if step in (0, 10, 1999):
+            for mine, param in zip(flat.params, theirs, strict=False):
+                torch.testing.assert_close(mine.data, param.data, atol=2e-6 * (step + 1) ** 0.5, rtol=1e-5)
+    gaps = torch.ones_like(flat.value)
+    for segment in flat.segments:
+        segment.own(gaps).zero_()
+    assert gaps.sum() > 100.0
+    assert not (gaps * flat.value).any()
+
+
+def test_a_networks_passes_equal_autograd_in_double_precision_and_nearly_so_in_half():
+    torch.manual_seed(0)
+    model = ActorCritic(8, 3, (32, 16))
+    flat = FlatParameters(model, "elu")
+    layers, _ = flat.actor(flat.value)
+    x, slope = torch.randn(64, 8), torch.randn(64, 3)
+    expected = torch.autograd.grad(model.actor(x), list(model.actor.parameters()), slope)
+    for dtype, most in ((torch.float32, 1e-5), (torch.bfloat16, 2e-2)):
+        output, seen = forward(layers, x, dtype)
+        assert [each.dtype for each in seen] == [dtype, dtype, torch.float32]
+        scale = model.actor(x).detach().abs().max()
+        assert (output - model.actor(x)).abs().max() < most * scale
+        for found, right in zip(backward(layers, seen, slope, dtype), expected, strict=True):
+            assert found.dtype == torch.float32
+            assert (found - right).norm() < most * right.norm()
+
+
+def test_half_precision_starts_from_a_ratio_of_one_and_learns():
+    torch.manual_seed(0)
+    cfg = dataclasses.replace(CFG, precision="bfloat16", epochs=1, minibatches=1, hidden=(32, 32))
+    ppo = Ppo(PushTask(64), cfg)
+    ppo.env.reset()
+    ppo.collect()
+    ppo.update()
+    assert abs(ppo.statistics()["Loss/kl"]) < 1e-6
+    for _ in range(30):
+        ppo.collect()
+        ppo.update()
+    assert all(param.dtype == torch.float32 for param in ppo.model.parameters())
+    assert ppo.statistics()["Loss/value"] < 0.5
+
+
+# ---------------------------------------------------------------- compilation
+
+
+def test_a_compiled_minibatch_equals_an_eager_one():
+    torch.manual_seed(0)
+    eager = Ppo(PushTask(WORLDS), dataclasses.replace(CFG, hidden=(8,)))
+    fill(eager, slice(None), WORLDS)
+    eager.batch()
+    compiled = Ppo(PushTask(WORLDS), dataclasses.replace(CFG, hidden=(8,), compile="on"))
+    compiled.load_state_dict(eager.state_dict())
+    for ppo in (eager, compiled):
+        ppo.sampler.old_log_std.copy_(eager.rollout.log_std)
+        for samples in torch.arange(ppo.batch_size).chunk(4):
+            ppo._descend(eager.sampler.rows[samples])
+    assert compiled.compiler.enabled
+    torch.testing.assert_close(compiled.flat.value, eager.flat.value, atol=1e-6, rtol=1e-5)
+    assert compiled.statistics() == pytest.approx(eager.statistics(), rel=1e-4, abs=1e-6)
+
+
+def test_without_a_compiler_training_goes_on_and_says_so_once(capsys, monkeypatch):
+    def trained(mode):
+        torch.manual_seed(0)
+        ppo = Ppo(PushTask(WORLDS), dataclasses.replace(CFG, compile=mode))
+        ppo.env.reset()
+        ppo.collect()
+        ppo.update()
+        return ppo.flat.value
+
+    expected = trained("off")
+    assert capsys.readouterr().err == ""
+    monkeypatch.setattr(compiling, "BACKEND", broken_backend)
+    assert torch.equal(trained("on"), expected)
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) == 1 and lines[0].startswith("not compiled, training is slower: ")
+    assert lines[0].endswith("OSError: no compiler here")
+
+
+def broken_backend(graph, inputs):
+    raise OSError("no compiler here")
