@@ -77,7 +77,7 @@ def standing_solver(envs: int, device: str | None) -> Callable[[], None]:
         sim.physics.advance(sim.substeps, sim.target, bodies=False, worlds=worlds)
 
     kept = (sim, SlicedGraph(advance, sim.slices, sim.device))  # the graph works on the simulation's arrays
-    return kept[1].replay
+    return lambda: kept[1].replay()
 
 
 def stepping_env(envs: int, device: str | None, threads: int | None = None) -> tuple[Env, Callable[[], None]]:

@@ -65,7 +65,8 @@ class PpoCfg:
     precision: Literal["float32", "bfloat16"] = "float32"
     """What the hidden layers compute in; the last layers, losses and statistics stay in float32."""
     compile: Literal["auto", "on", "off"] = "auto"
-    """Whether torch.compile fuses what surrounds the matrix products: by default on a GPU. Needs a C++ compiler."""
+    """Whether torch.compile fuses what surrounds the matrix products: auto on a GPU alone, since a CPU gains nothing.
+    Needs a C++ compiler; what was compiled is kept in Inductor's cache on disk."""
     graphs: bool = True
     """Whether a GPU replays captured graphs."""
     overlap: bool = False
