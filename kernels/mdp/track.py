@@ -6,7 +6,7 @@ from ..collision.robot import leg_collisions
 from ..kinematics.geometry import LegGeometry
 from ..kinematics.leg import leg_forward_kinematics, leg_jacobian
 from ..state import leg_coord, leg_dof, load_motors
-from ..terrain.ground import Ground
+from ..terrain.ground import Ground, surface, world_ground
 from .env import EnvArrays, SkillSettings
 from .view import RobotArrays, base_pos, base_quat, base_velocity
 
@@ -25,6 +25,13 @@ def follow_paw(robot: RobotArrays, geo: LegGeometry, world: int, leg: int):
     along = wp.quat_rotate(quat, leg_jacobian(geo, angles[0], angles[1], angles[2]) * rates)
     robot.paw_pos[leg, world] = base_pos(robot, world) + arm
     robot.paw_vel[leg, world] = base_velocity(robot, world, quat) + wp.cross(ang, arm) + along
+
+
+@wp.func
+def height_of_paw(robot: RobotArrays, geo: LegGeometry, ground: Ground, world: int, leg: int) -> float:
+    """Return the height of a paw's lowest point above the ground below its centre [m]."""
+    pos = robot.paw_pos[leg, world]
+    return pos[2] - surface(world_ground(ground, world), pos[0], pos[1])[0] - geo.paw_radius
 
 
 @wp.func
@@ -59,4 +66,5 @@ def track_kernel(
     down = wp.length(robot.paw_force[leg, world]) > skills[env.skill[world]].contact_force
     time_contact(robot, world, leg, down)  # before the velocity of the step before is written over
     follow_paw(robot, geometry[leg], world, leg)
+    robot.paw_height[leg, world] = height_of_paw(robot, geometry[leg], ground, world, leg)
     robot.collisions[leg, world] = leg_collisions(geometry, ground, robot.joint_q, world, leg)
