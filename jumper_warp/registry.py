@@ -79,6 +79,7 @@ TASKS: dict[str, TaskEntry] = {
     "velocity-flat": TaskEntry(
         "jumper_warp.tasks.velocity.flat:velocity_flat", WALKING, ("Olympus-Walk",), "Metrics/score"
     ),
+    "velocity-rough": TaskEntry("jumper_warp.tasks.velocity.rough:velocity_rough", WALKING, best_by="Metrics/score"),
     "velocity-trot": TaskEntry("jumper_warp.tasks.velocity.flat:velocity_trot", WALKING, best_by="Metrics/score"),
 }  # fmt: skip
 """The project's tasks, and those that were registered or asked for."""

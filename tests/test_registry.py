@@ -22,7 +22,8 @@ from jumper_warp.rl.cfg import PpoCfg
 from jumper_warp.tasks.saving import task_to_json
 from jumper_warp.utils.errors import InputError
 
-OWN = ("vertical-jump", "horizontal-jump", "omnidirectional-jump", "velocity-flat", "velocity-trot")
+OWN = ("vertical-jump", "horizontal-jump", "omnidirectional-jump", "velocity-flat", "velocity-rough",
+       "velocity-trot")  # fmt: skip
 TASK_FILE = """\
 from dataclasses import replace
 

@@ -147,6 +147,8 @@ class ObservationTerm(Term):
     takes: ClassVar = (RobotView, RobotParameters, RobotArrays)
 
     def __init__(self, func: wp.Function, **given: Any) -> None:
+        if isinstance(func, wp.Function) and RobotArrays in func.input_types.values():
+            self.context = 3
         super().__init__(func, **given)
         history = self.options["history"]
         if not isinstance(history, int) or history < 1:

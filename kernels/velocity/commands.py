@@ -36,21 +36,25 @@ def reach_of(ranges: CommandRanges, level: int) -> wp.vec4:
 
 @wp.func
 def draw_velocity(draw: Draw, ranges: CommandRanges, level: int) -> wp.vec3:
-    """Return a command; the faster it goes ahead or back, the less far it reaches to the sides and in turning.
+    """Return a command of a level.
 
-    That is the ellipse between the largest reach along x and those of the level across it.
+    Beyond the first level, the faster it goes along x, the less far it reaches across and in turning: an ellipse
+    between the largest reach along x and those of the level across it.
     """
     kind = between(draw, 80, 0.0, 1.0)
     if kind < ranges.stand:
         return wp.vec3(0.0)
     reach = reach_of(ranges, level)
-    if between(draw, 81, 0.0, 1.0) < ranges.narrow_share:
+    easy = level == 0 or between(draw, 81, 0.0, 1.0) < ranges.narrow_share
+    if easy:
         reach = ranges.narrow
     spin = between(draw, 82, -reach[3], reach[3])
     if kind < ranges.stand + ranges.turn:
         return wp.vec3(0.0, 0.0, spin)
     ahead = between(draw, 83, -reach[1], reach[0])
     side = between(draw, 84, -reach[2], reach[2])
+    if easy:
+        return wp.vec3(ahead, side, spin)
     share = ahead / wp.where(ahead > 0.0, ranges.wide[0], ranges.wide[1])
     left = wp.sqrt(wp.max(1.0 - share * share, 0.04))
     return wp.vec3(ahead, left * side, left * spin)

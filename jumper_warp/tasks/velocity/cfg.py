@@ -23,10 +23,10 @@ Reach = tuple[float, float, float, float]
 class CommandCfg:
     """Drawn commands. A reach is (ahead, back, to either side [m/s], turning to either side [rad/s])."""
 
-    narrow: Reach = (0.8, 0.8, 0.6, 0.8)
+    narrow: Reach = (0.8, 0.8, 0.8, 0.8)
     """At the first level."""
-    wide: Reach = (2.8, 1.6, 1.0, 1.6)
-    """At the last level. Going fast ahead or back leaves less room for going sideways and turning."""
+    wide: Reach = (2.8, 1.8, 1.2, 2.0)
+    """At the last level. From the second on, going fast along x leaves less room for going sideways and turning."""
     levels: int = 10
     """Steps from the first level to the last; 0: all commands are of the first."""
     narrow_share: float = 0.3
