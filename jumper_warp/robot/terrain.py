@@ -88,6 +88,15 @@ def terrain_map(cfg: TerrainCfg) -> newton.Heightfield:
     return newton.Heightfield(data=heights, nrow=heights.shape[0], ncol=heights.shape[1], hx=half_x, hy=half_y)
 
 
+def single_tile(cfg: TerrainCfg, kind: str) -> newton.Heightfield:
+    """Return one tile of full difficulty as a heightfield centred on the origin. Raises ValueError for another kind."""
+    if kind not in KINDS:
+        raise InputError(f"terrain must be one of {', '.join(KINDS)}, got {kind!r:.40}")
+    heights = tile_heights(cfg, kind, 1.0, np.random.default_rng(cfg.seed)).astype(np.float32)
+    half = 0.5 * cfg.tile
+    return newton.Heightfield(data=heights, nrow=len(heights), ncol=len(heights), hx=half, hy=half)
+
+
 def tile_heights(cfg: TerrainCfg, kind: str, difficulty: float, rng: np.random.Generator) -> np.ndarray:
     """Return the heights [m] of a tile's nodes, rows along y, 0 on its rim; difficulty: 0 to 1."""
     nodes = math.ceil(cfg.tile / cfg.cell - 1.0e-9) + 1

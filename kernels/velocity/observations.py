@@ -2,10 +2,12 @@
 
 import warp as wp
 
+from ..layout import BODIES
 from ..mdp.view import RobotArrays, RobotView, base_pos, base_quat, turned, yaw_of
 from ..terrain.ground import Ground, surface, world_ground
 from .state import POLICY_RATE, VelocityState
 
+vec6 = wp.types.vector(length=6, dtype=wp.float32)
 vec15 = wp.types.vector(length=15, dtype=wp.float32)
 
 
@@ -44,6 +46,16 @@ def recent_steps(view: RobotView, task: VelocityState) -> wp.vec4:
 def paw_heights(view: RobotView, task: VelocityState) -> wp.vec4:
     """Height of each paw above the ground below it [m], times ten."""
     return 10.0 * view.paw_height
+
+
+@wp.func
+def push(robot: RobotArrays, ground: Ground, world: int) -> vec6:
+    """Push on the base, body axes, over 10 N and 3 N m."""
+    wrench = robot.body_f[world * BODIES]
+    quat = base_quat(robot, world)
+    force = 0.1 * wp.quat_rotate_inv(quat, wp.vec3(wrench[0], wrench[1], wrench[2]))
+    torque = wp.quat_rotate_inv(quat, wp.vec3(wrench[3], wrench[4], wrench[5])) / 3.0
+    return vec6(force[0], force[1], force[2], torque[0], torque[1], torque[2])
 
 
 @wp.func

@@ -46,7 +46,8 @@ CRITIC = (
     ObservationTerm(velocity.recent_steps),
     ObservationTerm(velocity.command_age),
     ObservationTerm(obs.paw_forces),
-    *DRAWN,
+    ObservationTerm(velocity.push),
+    *(term for term in DRAWN if term.func is not obs.drawn_push),  # in world axes, whatever the heading
 )
 """What only a simulation knows besides."""
 
@@ -115,6 +116,7 @@ def velocity_flat() -> TaskCfg:
         action_scale=(60.0, 60.0),
         randomization=RandomizationCfg.walking(),
         metrics=METRICS,
+        evaluation="velocity",
     )
 
 
