@@ -226,24 +226,22 @@ def kept_speeds(walks: Walks, axis: int, seconds: float, share: float) -> np.nda
 def walked(walks: Walks) -> np.ndarray:
     """Return the share of the way that each robot went until it fell, at most 1, commanded to go straight ahead.
 
-    What it goes ahead counts, whatever its heading is then.
+    What it goes ahead counts, whatever its heading is then; the time of setting off, SKIP, is not asked for.
     """
     way = np.nansum(walks.history()[..., 0], axis=0) * walks.step_dt
-    return np.clip(way / (walks.commands[:, 0, 0] * walks.seconds), 0.0, 1.0)
+    return np.clip(way / (walks.commands[:, 0, 0] * (walks.seconds - SKIP)), 0.0, 1.0)
 
 
 def top_speed(commanded: np.ndarray, kept: np.ndarray, share: float = 0.9, width: float = 0.1) -> float:
-    """Return the speed up to which at least a share of the robots kept theirs, in every class of a width.
+    """Return the highest speed that at least a share of the robots kept, of classes of a width; 0 if there is none.
 
-    commanded: (robots,) at least 0; kept: (robots,) bool. The result is the largest commanded one of its class, 0 if
-    there is none.
+    commanded: (robots,) at least 0; kept: (robots,) bool. The result is the largest commanded one of its class.
     """
     classes, top = np.floor(commanded / width + 1.0e-9).astype(int), 0.0
     for each in np.unique(classes):
         inside = classes == each
-        if kept[inside].mean() < share:
-            break
-        top = float(commanded[inside].max())
+        if kept[inside].mean() >= share:
+            top = float(commanded[inside].max())
     return top
 
 

@@ -63,8 +63,8 @@ class TerrainCfg:
 
     @property
     def cols(self) -> int:
-        """Number of kinds."""
-        return len(KINDS)
+        """Number of kinds, 0 without a map."""
+        return len(KINDS) if self.rows else 0
 
 
 def terrain_map(cfg: TerrainCfg) -> newton.Heightfield:
@@ -125,13 +125,14 @@ def _flat(cfg: TerrainCfg, difficulty: float, rng: np.random.Generator, x: np.nd
 def _waves_of(
     cfg: TerrainCfg, difficulty: float, rng: np.random.Generator, x: np.ndarray, y: np.ndarray, lengths: np.ndarray
 ) -> np.ndarray:
-    """Return a sum of plane waves in any direction, wavelengths [m] as given, of the full height."""
+    """Return a sum of plane waves in any direction, wavelengths [m] as given, as high and deep as they may be."""
     total = np.zeros_like(x)
     for length in lengths:
         angle, phase = rng.uniform(0.0, 2.0 * math.pi, 2)
         along = math.cos(angle) * x + math.sin(angle) * y
         total += math.sqrt(length) * np.sin(2.0 * math.pi * along / length + phase)
-    return total / np.abs(total).max() * difficulty * cfg.uneven * _blend(cfg, x, y)
+    total *= _blend(cfg, x, y)
+    return total / np.abs(total).max() * difficulty * cfg.uneven
 
 
 def _uneven(cfg: TerrainCfg, difficulty: float, rng: np.random.Generator, x: np.ndarray, y: np.ndarray) -> np.ndarray:

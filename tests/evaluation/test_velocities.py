@@ -90,18 +90,18 @@ def test_commands_count_from_the_step_after_they_came():
 
 def test_share_of_the_way_stops_at_a_fall():
     commands = np.tile([0.5, 0.0, 0.0], (ROBOTS, 1, 1))
-    walks = followed(lambda t: np.tile([0.4, 0.1, 0.0], (ROBOTS, 1)), commands=commands, falls={2: 61})
-    assert velocities.walked(walks) == pytest.approx([0.8, 0.8, 0.4], rel=1e-5)
+    walks = followed(lambda t: np.tile([0.3, 0.1, 0.0], (ROBOTS, 1)), seconds=3.0, commands=commands, falls={2: 91})
+    assert velocities.walked(walks) == pytest.approx([0.9, 0.9, 0.45], rel=1e-5)  # of the last two seconds
     fast = followed(lambda t: np.tile([0.9, 0.0, 0.0], (ROBOTS, 1)), commands=commands)
     assert velocities.walked(fast) == pytest.approx([1.0] * 3)
 
 
-def test_top_speed_ends_at_the_first_class_that_is_not_kept():
+def test_top_speed_is_that_of_the_highest_class_that_is_kept():
     commanded = np.array([0.31, 0.35, 0.42, 0.48, 0.55, 0.61, 0.66])
-    kept = np.array([True, True, True, True, False, True, True])
+    kept = np.array([False, True, True, True, False, True, False])
     assert velocities.top_speed(commanded, kept) == 0.48
-    assert velocities.top_speed(commanded, kept, share=0.0) == 0.66
-    assert velocities.top_speed(commanded, ~kept) == 0.0
+    assert velocities.top_speed(commanded, kept, share=0.5) == 0.66
+    assert velocities.top_speed(commanded, np.zeros(7, dtype=bool)) == 0.0
 
 
 def test_kept_speed_is_the_mean_of_the_last_seconds():
