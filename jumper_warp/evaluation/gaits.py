@@ -69,18 +69,20 @@ def gait_metrics(
 ) -> Metrics:  # fmt: skip
     """Return the figures of a gait from samples (steps, robots, ...), as `Gait` has them; mass [kg]: (robots,).
 
-    The cost of transport is the mean power over that of lifting the weight at the mean speed. Contact patterns have the
-    names of the paws on the ground.
+    The cost of transport is the mean power over that of lifting the weight at the mean speed; None if a robot does not
+    come on. Contact patterns have the names of the paws on the ground.
     """
     apexes = np.concatenate([np.zeros(0), *(swing_apexes(contact[:, i, k], paw_height[:, i, k])
                                            for i in range(contact.shape[1]) for k in range(4))])  # fmt: skip
     seconds, robots = len(contact) * step_dt, max(contact.shape[1], 1)
     touchdowns = int((contact[1:] & ~contact[:-1]).sum())
-    load = force.sum(axis=2) / (mass * GRAVITY)
+    load, pace = force.sum(axis=2) / (mass * GRAVITY), speed.mean(axis=0)
     metrics: Metrics = {
         "steps_hz": touchdowns / (4.0 * robots * seconds),
         "median_swing_apex_m": float(np.median(apexes)) if len(apexes) else None,
-        "cost_of_transport": float(np.mean(power.mean(axis=0) / (mass * GRAVITY * speed.mean(axis=0)))),
+        "cost_of_transport": float(np.mean(power.mean(axis=0) / (mass * GRAVITY * pace)))
+        if pace.min() > 0.05
+        else None,
         "mean_speed_m_s": float(speed.mean()),
         "largest_torque_nm": float(np.abs(torque).max()),
         "rms_torque_nm": float(np.sqrt(np.mean(torque**2))),
