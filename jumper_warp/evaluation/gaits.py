@@ -54,7 +54,9 @@ class Gait:
         self.speed.append(np.linalg.norm(sim.base_velocity()[:, :2], axis=1))
 
     def metrics(self, standing: np.ndarray) -> Metrics:
-        """Return what robots do that have not fallen; standing: (robots,) bool, which these are."""
+        """Return what robots do that have not fallen, nothing if there are none; standing: (robots,) bool."""
+        if not standing.any():
+            return {}
         mass = self.env.sim.model.body_mass.numpy().reshape(-1, int(BODIES)).sum(axis=1)[standing]
         return gait_metrics(
             np.array(self.contact)[:, standing], np.array(self.paw_height)[:, standing],

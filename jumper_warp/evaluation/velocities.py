@@ -59,9 +59,10 @@ class Walks(EvaluationLog):
         self._is_fall = np.array([*falls, False])
 
     def begin(self, env: EvaluationEnv) -> None:
-        """Stand every robot in the default pose with its first command."""
+        """Stand every robot in the default pose with its first command, and the gait's clock as the task has it."""
         self.step_dt = env.step_dt
-        env.evaluation_reset(self.commands[:, 0], self.headings)
+        gait = np.full((len(self.commands), 1), getattr(self.task.reset.settings, "gait", 0.0))
+        env.evaluation_reset(np.concatenate([self.commands[:, 0], gait], axis=1), self.headings)
 
     def look(self, env: EvaluationEnv) -> dict[str, np.ndarray]:
         """Return attitude and velocity of every base, give the commands that are due, and kick."""

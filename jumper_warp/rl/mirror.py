@@ -59,3 +59,30 @@ class MirrorActor(nn.Module):
         middle = 0.5 * (mean + mirrored)
         spread = 0.5 * (var + var[self.obs_order]) + 0.25 * (mean - mirrored).square()
         return middle, spread
+
+    def layers(self) -> list[tuple[torch.Tensor, torch.Tensor]]:
+        """Return weights and biases of a plain network that answers alike, twice as wide, activations between as here.
+
+        With them a mirrored policy is saved and exported as any other. The network must be linear layers in a row with
+        activations between.
+        """
+        linear = [layer for layer in self.network if isinstance(layer, nn.Linear)]
+        obs, action = _matrix(self.obs_order, self.obs_signs), _matrix(self.action_order, self.action_signs)
+        found = []
+        for index, layer in enumerate(linear):
+            weight, bias = layer.weight.detach(), layer.bias.detach()
+            if len(linear) == 1:
+                weight, bias = 0.5 * (weight + action @ weight @ obs), 0.5 * (bias + action @ bias)
+            elif index == 0:
+                weight, bias = torch.cat([weight, weight @ obs]), torch.cat([bias, bias])
+            elif index < len(linear) - 1:
+                weight, bias = torch.block_diag(weight, weight), torch.cat([bias, bias])
+            else:
+                weight, bias = 0.5 * torch.cat([weight, action @ weight], dim=1), 0.5 * (bias + action @ bias)
+            found.append((weight, bias))
+        return found
+
+
+def _matrix(order: torch.Tensor, signs: torch.Tensor) -> torch.Tensor:
+    """Return the matrix of a mirror image."""
+    return signs[:, None] * torch.eye(len(order), device=signs.device)[order]

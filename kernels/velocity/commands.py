@@ -5,7 +5,7 @@ import warp as wp
 from ..mdp.env import Scene
 from ..mdp.random import Draw, between, within
 from ..mdp.view import RobotView
-from .state import VelocityState
+from .state import POLICY_RATE, VelocityState
 
 wp.set_module_options({"enable_backward": False})
 
@@ -90,10 +90,10 @@ def draw_command(view: RobotView, scene: Scene, task: VelocityState, level: Comm
 def give_velocity(view: RobotView, scene: Scene, task: VelocityState, values: wp.vec4, heading: float) -> VelocityState:
     """Command a velocity until another comes: ahead, to the left [m/s] and about z [rad/s], body axes.
 
-    The fourth value is the gait's frequency in cycles per policy step at the beginning of an episode, where it is used.
+    The fourth value is the gait's frequency [Hz], 0: as it was.
     """
     new = with_command(task, wp.vec3(values[0], values[1], values[2]))
-    if task.steps == 0:
-        new.pace = values[3]
+    if values[3] > 0.0:
+        new.pace = values[3] / POLICY_RATE
     new.command_lasts = 0
     return new

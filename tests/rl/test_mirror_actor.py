@@ -42,6 +42,19 @@ def test_symmetrised_statistics_are_those_of_both_images(actor):
     torch.testing.assert_close(var, both.var(0, correction=0), atol=1e-5, rtol=1e-5)
 
 
+@pytest.mark.parametrize("hidden", [(), (16,), (32, 24)])
+def test_plain_network_of_its_layers_answers_alike(hidden):
+    torch.manual_seed(4)
+    mirror = MirrorActor(mlp((len(OBS.order), *hidden, 12), "elu", out_gain=1.0), OBS, ACTION)
+    obs = torch.randn(16, len(OBS.order))
+    x, layers = obs, mirror.layers()
+    for index, (weight, bias) in enumerate(layers):
+        x = torch.nn.functional.linear(x, weight, bias)
+        x = torch.nn.functional.elu(x) if index < len(layers) - 1 else x
+    assert [weight.shape[0] for weight, _ in layers] == [*(2 * width for width in hidden), 12]
+    torch.testing.assert_close(x, mirror(obs), atol=1e-5, rtol=1e-5)
+
+
 def test_gradients_reach_the_network(actor):
     actor(torch.randn(4, len(OBS.order))).square().sum().backward()
     assert all(p.grad is not None and p.grad.abs().max() > 0.0 for p in actor.parameters())
