@@ -37,6 +37,8 @@ class TaskEntry:
     ppo: PpoCfg = field(default_factory=PpoCfg)
     """Settings of the algorithm unless told otherwise."""
     aliases: tuple[str, ...] = ()
+    best_by: str = "Metrics/success"
+    """The logged figure that makes a checkpoint the best, unless told otherwise."""
 
     @property
     def origin(self) -> str:
@@ -59,6 +61,9 @@ class TaskEntry:
         return task
 
 
+WALKING = PpoCfg(num_steps=24, gamma=0.985, entropy_coef=0.0025, init_std=0.4)
+"""How velocity tracking is trained."""
+
 TASKS: dict[str, TaskEntry] = {
     "vertical-jump": TaskEntry(
         "jumper_warp.tasks.jump.vertical:vertical_jump", aliases=("Olympus-Vertical-Jump",)
@@ -71,6 +76,11 @@ TASKS: dict[str, TaskEntry] = {
     "omnidirectional-jump": TaskEntry(
         "jumper_warp.tasks.jump.horizontal:omnidirectional_jump", PpoCfg(gamma=0.99, entropy_coef=0.0003)
     ),
+    "velocity-flat": TaskEntry(
+        "jumper_warp.tasks.velocity.flat:velocity_flat", WALKING, ("Olympus-Walk",), "Metrics/score"
+    ),
+    "velocity-rough": TaskEntry("jumper_warp.tasks.velocity.rough:velocity_rough", WALKING, best_by="Metrics/score"),
+    "velocity-trot": TaskEntry("jumper_warp.tasks.velocity.flat:velocity_trot", WALKING, best_by="Metrics/score"),
 }  # fmt: skip
 """The project's tasks, and those that were registered or asked for."""
 

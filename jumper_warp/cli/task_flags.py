@@ -75,7 +75,8 @@ def _flag(value: Any, hint: Any, where: str) -> Flag | None:
         return _flag_of_dataclass(value, where)
     if _has_parts(value):
         parts = {name: _flag(part, Any, f"{where} {name}") for name, part in _parts(value).items()}
-        return _group(None, {name: flag for name, flag in parts.items() if flag is not None}, where)
+        found = {name: flag for name, flag in parts.items() if flag is not None}
+        return _group(None, found, where) if found else None
     return Flag(hint, value) if _is_number(value, hint) else None
 
 

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 
 from jumper_warp.cli.main import TASK_MODULE, TASK_MODULE_HELP, USAGE_ERROR, UsageError, parse
-from jumper_warp.registry import find_task, make_task, task_names, trainer_settings
+from jumper_warp.registry import find_task, make_task, task_names
 from jumper_warp.rl.cfg import TrainCfg
 from jumper_warp.utils.errors import InputError
 
@@ -55,9 +55,9 @@ def parse_train(args: Sequence[str]) -> tuple[TrainArgs, TaskCfg]:
         parse(TrainArgs, "train TASK", ["--help"], description=about)
     if args[0].startswith("-"):
         raise UsageError(f"the task comes first: jumper train TASK [flags]; tasks: {names}")
-    name, _ = find_task(args[0])
+    name, entry = find_task(args[0])
     task = make_task(name)
-    parsed = parse_settings(task, TrainArgs(TrainCfg(task=name, ppo=trainer_settings(name))), args[1:])
+    parsed = parse_settings(task, TrainArgs(TrainCfg(task=name, ppo=entry.ppo, best_by=entry.best_by)), args[1:])
     if parsed.cfg.task != name:
         raise UsageError(f"give the task once, got {name} and --task {parsed.cfg.task}")
     from jumper_warp.cli.task_flags import with_flags

@@ -31,7 +31,7 @@ def robot_arrays(sim: Simulation, step_dt: float) -> Any:
     robot.torque, robot.joint_offset = sim.torque, sim.motors.offset
     for name in ("paw_pos", "paw_vel"):
         setattr(robot, name, wp.zeros((4, n), dtype=wp.vec3, device=device))
-    for name in ("contact_time", "air_time", "touchdown_speed"):
+    for name in ("contact_time", "air_time", "touchdown_speed", "paw_height"):
         setattr(robot, name, wp.zeros((4, n), dtype=float, device=device))
     robot.collisions = wp.zeros((4, n), dtype=int, device=device)
     for name in ("old_torque", "action", "old_action", "target", "safe_target", "old_rate"):

@@ -77,9 +77,9 @@ class Env(Stages):
     ):
         """Build everything; call `reset` before the first step.
 
-        ground, block: as in `Simulation`; by default what the first task draws if randomised on SolverJumper, else a
-        plane. skill: index of the task that each world begins in, (num_envs,) or one for all. handovers: between tasks.
-        threads: of a CPU, as in `Simulation`.
+        ground, block: as in `Simulation`; by default the terrain of the first task that has one, or what tasks draw, if
+        randomised on SolverJumper, else a plane. skill: index of the task that each world begins in, (num_envs,) or one
+        for all. handovers: between tasks. threads: of a CPU, as in `Simulation`.
         Raises ValueError: no task, two of one name, motors that cannot be those of one robot, a handover between other
         tasks, less than one environment, or as `Simulation`.
         """
@@ -87,6 +87,8 @@ class Env(Stages):
         self.task, self.tasks, self.num_envs, self.seed, self.auto_reset = tasks[0], tasks, num_envs, seed, auto_reset
         may_vary = solver == "jumper" and isinstance(ground, str) and ground == "plane" and block is None
         run, self._draws_ground = prepared(tasks, randomize, noise, may_vary)
+        terrains = [terrain for each in run if (terrain := each.terrain) is not None]
+        ground = terrains[0] if terrains else ground
         self.sim = Simulation(
             num_envs, solver=solver, motors=self.task.motors, visuals=visuals, device=device and str(device),
             ground=ground, block=BlockCfg((0.0, 0.0)) if self._draws_ground else block, tolerance=CONTACT_TOLERANCE,
@@ -138,6 +140,8 @@ class Env(Stages):
                              (self.worlds.level, 0), (self.worlds.streak, 0)):  # fmt: skip
             array.fill_(value)
         self.worlds.skill.assign(self._first_skill)
+        for skill in self.skills:
+            skill.states.zero_()
 
     def step(self, action: torch.Tensor) -> Step:
         """Advance one policy step.

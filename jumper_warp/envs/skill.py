@@ -120,10 +120,31 @@ class Skill:
             figures[f"Episode_Termination/{term.name}"] = float(count) / ended
         counted, succeeded = int(counters.counted.numpy().sum()), int(counters.succeeded.numpy().sum())
         figures["Metrics/success"] = succeeded / max(counted, 1)
-        figures["Metrics/error_m"] = float(counters.error_sum.numpy().sum()) / max(succeeded, 1)
+        figures[f"Metrics/error_{task.curriculum.options['unit']}"] = float(counters.error_sum.numpy().sum()) / max(
+            succeeded, 1
+        )
         figures["Metrics/bad_actions"] = float(counters.bad_actions.numpy().sum())
         for name in Counters.vars:
             getattr(counters, name).zero_()
+        return figures | self._state_metrics()
+
+    def _state_metrics(self) -> dict[str, float]:
+        """Return what the worlds counted in their states, and begin to count anew."""
+        metrics, figures = self.task.metrics, {}
+        if not metrics:
+            return figures
+        records = self.states.numpy().copy()
+        for metric in metrics:
+            values = records[metric.field].astype(np.float64)
+            if metric.per is None:
+                figures[metric.name] = float(values.mean())
+            else:
+                total = float(records[metric.per].astype(np.float64).sum())
+                figures[metric.name] = float(values.sum()) / total if total else 0.0
+        for metric in metrics:
+            if metric.per is not None:
+                records[metric.field] = records[metric.per] = 0.0
+        self.states.assign(wp.array(records, dtype=self.task.state, device=self.device))
         return figures
 
 

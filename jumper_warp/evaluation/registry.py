@@ -11,6 +11,7 @@ from jumper_warp.evaluation.episodes import EpisodeFlags, EpisodeGoals
 from jumper_warp.evaluation.heights import HeightFlags, HeightGoals
 from jumper_warp.evaluation.log import EvaluationLog, Metrics
 from jumper_warp.evaluation.places import PlaceFlags, PlaceGoals
+from jumper_warp.evaluation.velocities import VelocityFlags, VelocityGoals
 from jumper_warp.policies.spec import PolicyError
 from jumper_warp.tasks.cfg import TaskCfg
 
@@ -65,6 +66,7 @@ EVALUATIONS: dict[str, Evaluation] = {
         PlaceGoals(unless_told=((0.5, 0.0), (0.0, 0.5), (-0.5, 0.0))),
         landings.for_evaluation,
     ),
+    "velocity": Evaluation(VelocityFlags(), VelocityGoals(), TaskCfg.on_level_ground),
     "episode": Evaluation(EpisodeFlags(), EpisodeGoals()),
 }
 """A user's module may add its own."""

@@ -18,6 +18,7 @@ from jumper_warp.tasks.terms import (
     ObservationTerm,
     RewardTerm,
     Row,
+    StateMetric,
     Term,
     TerminationTerm,
 )
@@ -90,6 +91,8 @@ class TaskCfg:
     """[N] Above it a paw counts as in contact."""
     reward_floor: float | None = 0.0
     """Least total reward of a step; None: no floor."""
+    metrics: tuple[StateMetric, ...] = ()
+    """What is logged of the state, besides the means of all terms."""
     evaluation: str = "episode"
     """How policies are measured and played: a key of `jumper_warp.evaluation.registry.EVALUATIONS`."""
 
@@ -113,6 +116,9 @@ class TaskCfg:
             raise InputError(f"{self.name} needs the termination came_apart, for worlds whose state is no longer one")
         if not all(0.0 < scale < math.inf for scale in self.action_scale):
             raise InputError(f"{self.name}: action_scale must be positive and finite [deg], got {self.action_scale}")
+        for metric in self.metrics:
+            for field_name in {metric.field, metric.per or metric.field} - set(self.state.vars):
+                raise InputError(f"{self.name}: metric {metric.name} needs {field_name!r}, which its state has not")
         if not 0.0 <= self.contact_force < math.inf:
             raise InputError(f"{self.name}: contact_force must be finite and >= 0, got {self.contact_force}")
         if self.reward_floor is not None and not math.isfinite(self.reward_floor):
@@ -213,9 +219,15 @@ class TaskCfg:
         """Whether its resets draw another ground than a level one."""
         return bool(getattr(self.reset.settings, "draws_ground", False))
 
+    @property
+    def terrain(self) -> Any:
+        """The heightfield that its episodes begin on, as `Simulation(ground=...)` takes it; None: a plane."""
+        make = getattr(self.reset.settings, "heightfield", None)
+        return None if make is None else make()
+
     def on_level_ground(self) -> TaskCfg:
         """Return the task whose resets leave the ground as it is."""
-        if not self.draws_ground:
+        if not hasattr(self.reset.settings, "on_level_ground"):
             return self
         return replace(self, reset=replace(self.reset, settings=self.reset.settings.on_level_ground()))
 

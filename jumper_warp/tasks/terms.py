@@ -7,6 +7,7 @@ numbers of a task lie in one array on the device, so that each can change while 
 from __future__ import annotations
 
 import inspect
+from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple, get_type_hints
 
 import warp as wp
@@ -15,7 +16,7 @@ from jumper_warp.utils.checks import FLOAT32_MAX
 from jumper_warp.utils.errors import InputError
 from kernels.mdp.events import AT_RESET, AT_STEP, MODES
 from kernels.mdp.parameters import RobotParameters
-from kernels.mdp.view import RobotView
+from kernels.mdp.view import RobotArrays, RobotView
 
 REQUIRED = inspect.Parameter.empty
 AXES = {2: ("x", "y"), 3: ("x", "y", "z")}
@@ -134,7 +135,8 @@ class TerminationTerm(Term):
 
 
 class ObservationTerm(Term):
-    """(view: RobotView, task, ...) -> float or vector; or (parameters: RobotParameters, world: int) likewise.
+    """(view: RobotView, task, ...) -> float or vector; or likewise (parameters: RobotParameters, world: int), or of the
+    ground around the robot (robot: RobotArrays, ground: Ground, world: int).
 
     noise: standard deviation, cut at one. Then clipped to plus and minus `clip`, and scaled. history: frames, the
     oldest first. delayed: whether it comes as late as the world's sensors do.
@@ -142,9 +144,11 @@ class ObservationTerm(Term):
 
     settings: ClassVar = {"noise": 0.0, "scale": 1.0, "clip": 100.0}
     options: ClassVar = {"history": 1, "delayed": False}
-    takes: ClassVar = (RobotView, RobotParameters)
+    takes: ClassVar = (RobotView, RobotParameters, RobotArrays)
 
     def __init__(self, func: wp.Function, **given: Any) -> None:
+        if isinstance(func, wp.Function) and RobotArrays in func.input_types.values():
+            self.context = 3
         super().__init__(func, **given)
         history = self.options["history"]
         if not isinstance(history, int) or history < 1:
@@ -207,11 +211,11 @@ class Curriculum(Term):
     """(view: RobotView, task) -> error of an ended episode.
 
     An episode that ends with success and an error up to `tolerance` is one; `promote_after` of them in a row raise the
-    world's level. counts: (task) -> bool, whether an episode counts at all.
+    world's level. counts: (task) -> bool, whether an episode counts at all. unit: of the error, as it is logged.
     """
 
     settings: ClassVar = {"tolerance": REQUIRED, "promote_after": 5}
-    options: ClassVar = {"counts": REQUIRED}
+    options: ClassVar = {"counts": REQUIRED, "unit": "m"}
     returns: ClassVar = (float, wp.float32)
 
     def __init__(self, func: wp.Function, **given: Any) -> None:
@@ -220,6 +224,18 @@ class Curriculum(Term):
             raise InputError(f"Curriculum {self.name}: counts must be a @wp.func (task) -> bool")
         if self.numbers["tolerance"] < 0.0 or self.numbers["promote_after"] < 1:
             raise InputError(f"Curriculum {self.name}: tolerance must not be negative, promote_after at least 1")
+
+
+@dataclass(frozen=True)
+class StateMetric:
+    """A figure of the training log: what worlds have counted in a field of their state since it was read last."""
+
+    name: str
+    """Under which it is logged, with its unit."""
+    field: str
+    """Field of the task's state, float; all that are read are set to 0."""
+    per: str | None = None
+    """Field by whose sum over all worlds that of `field` is divided; None: its mean over all worlds, which stays."""
 
 
 class Row(NamedTuple):

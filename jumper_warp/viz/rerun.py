@@ -104,7 +104,7 @@ def _mesh(rr: ModuleType, shape: ShapeMesh) -> Any:
 def _log_series(rr: ModuleType, stream: Any, recording: "Recording") -> None:
     times = [rr.TimeColumn(TIMELINE, duration=recording.times)]
     for name, values in recording.series.items():
-        group, quantity = name.split("/")
+        group, quantity = name.split("/", 1)
         entity = rr.new_entity_path(["series", group, quantity])
         stream.log(entity, rr.SeriesLines(names=quantity), static=True)
         stream.send_columns(entity, times, rr.Scalars.columns(scalars=values))

@@ -8,7 +8,6 @@ whose paws are below the ground is drawn again; the default pose stands in after
 
 import warp as wp
 
-from ..actuation.command_filter import FilterParams
 from ..collision.robot import leg_collisions
 from ..kinematics.geometry import LegGeometry
 from ..kinematics.inverse import LegLimits, clamped_closed_form
@@ -27,7 +26,7 @@ from ..mdp.attempts import (
 )
 from ..mdp.env import Scene, SkillSettings
 from ..mdp.random import Draw, between, branch, within
-from ..mdp.reset import store_pose
+from ..mdp.reset import leg_limits, store_pose
 from ..mdp.view import RobotArrays, RobotView, base_pos, turned, yaw_of
 from ..state import leg_coord, leg_dof, load_motors, store_motors
 from ..terrain.ground import Block, Ground, rest_block, surface, world_ground
@@ -66,19 +65,6 @@ class JumpLevel:
     goal_upper: wp.vec3
     base_height: wp.vec2  # [m] of standing starts
     jump_again: float  # share of landed robots that get another goal
-
-
-@wp.func
-def leg_limits(params: FilterParams) -> LegLimits:
-    """Return the limits of a command filter as those of the inverse kinematics."""
-    limits = LegLimits()
-    limits.lateral_lower = params.lateral.lower
-    limits.lateral_upper = params.lateral.upper
-    limits.transversal_lower = params.transversal.lower
-    limits.transversal_upper = params.transversal.upper
-    limits.sum_lower = params.sum.lower
-    limits.sum_upper = params.sum.upper
-    return limits
 
 
 @wp.func

@@ -63,7 +63,9 @@ def store(value: Any, row: int, world: int, out: wp.array2d(dtype=float)):  # no
 def make_observe_kernel(task: Any) -> wp.Kernel:
     """Return the kernel that evaluates all observation terms of a task."""
     rows = [row for group in task.groups for row in task.rows[group]]
-    of_parameters = [row.func.input_types[next(iter(row.func.input_types))] is RobotParameters for row in rows]
+    first = [next(iter(row.func.input_types.values())) for row in rows]
+    of_parameters = [kind is RobotParameters for kind in first]
+    of_ground = [kind is RobotArrays for kind in first]
     places = [sum(row.term.width for row in rows[:i]) for i in range(len(rows))]
 
     @wp.kernel(module="unique", module_options=FAST)
@@ -94,6 +96,8 @@ def make_observe_kernel(task: Any) -> wp.Kernel:
                 for i in range(wp.static(c * CHUNK), wp.static(min((c + 1) * CHUNK, len(rows)))):
                     if wp.static(of_parameters[i]):
                         store(wp.static(rows[i].func)(parameters, world), wp.static(places[i]), world, raw)
+                    elif wp.static(of_ground[i]):
+                        store(wp.static(rows[i].func)(robot, ground, world), wp.static(places[i]), world, raw)
                     elif wp.static(rows[i].plain):
                         store(wp.static(rows[i].func)(view, states[world]), wp.static(places[i]), world, raw)
                     else:

@@ -4,7 +4,9 @@ from typing import Any
 
 import warp as wp
 
+from ..actuation.command_filter import FilterParams
 from ..kinematics.geometry import LegGeometry
+from ..kinematics.inverse import LegLimits
 from ..layout import COORDS, DOFS, motor_slot
 from ..terrain.ground import rest_block, surface, world_ground
 from .attempts import meet_attempts
@@ -111,6 +113,19 @@ def make_give_kernel(task: Any) -> wp.Kernel:
 
 
 @wp.func
+def leg_limits(params: FilterParams) -> LegLimits:
+    """Return the limits of a command filter as those of the inverse kinematics."""
+    limits = LegLimits()
+    limits.lateral_lower = params.lateral.lower
+    limits.lateral_upper = params.lateral.upper
+    limits.transversal_lower = params.transversal.lower
+    limits.transversal_upper = params.transversal.upper
+    limits.sum_lower = params.sum.lower
+    limits.sum_upper = params.sum.upper
+    return limits
+
+
+@wp.func
 def store_pose(robot: RobotArrays, scene: Scene, world: int, heading: float, lift: float):
     """Write the model's reference pose at rest, turned to a heading [rad] and lifted [m]."""
     q = world * COORDS
@@ -190,6 +205,7 @@ def forget_kernel(
         robot.contact_time[m, world] = 0.0
         robot.air_time[m, world] = 0.0
         robot.touchdown_speed[m, world] = 0.0
+        robot.paw_height[m, world] = 0.0
         robot.collisions[m, world] = 0
         follow_paw(robot, geometry[m], world, m)
     if m == 0:

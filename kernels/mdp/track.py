@@ -7,7 +7,7 @@ from ..dynamics.leg_dynamics import leg_pose, paw_kinematics
 from ..kinematics.geometry import LegGeometry
 from ..layout import COORDS
 from ..state import leg_coord, leg_dof, load_motors
-from ..terrain.ground import Ground, world_ground
+from ..terrain.ground import Ground, surface, world_ground
 from .env import EnvArrays, SkillSettings
 from .view import RobotArrays, base_pos, base_quat, base_velocity
 
@@ -27,6 +27,13 @@ def follow_paw(robot: RobotArrays, geo: LegGeometry, world: int, leg: int):
     along = wp.quat_rotate(quat, paw.jacobian * rates)
     robot.paw_pos[leg, world] = base_pos(robot, world) + arm
     robot.paw_vel[leg, world] = base_velocity(robot, world, quat) + wp.cross(ang, arm) + along
+
+
+@wp.func
+def height_of_paw(robot: RobotArrays, geo: LegGeometry, ground: Ground, world: int, leg: int) -> float:
+    """Return the height of a paw's lowest point above the ground below its centre [m]."""
+    pos = robot.paw_pos[leg, world]
+    return pos[2] - surface(world_ground(ground, world), pos[0], pos[1])[0] - geo.paw_radius
 
 
 @wp.func
@@ -62,6 +69,7 @@ def track_kernel(
     down = wp.length(robot.paw_force[leg, world]) > skills[env.skill[world]].contact_force
     time_contact(robot, world, leg, down)  # before the velocity of the step before is written over
     follow_paw(robot, geometry[leg], world, leg)
+    robot.paw_height[leg, world] = height_of_paw(robot, geometry[leg], ground, world, leg)
     robot.collisions[leg, world] = leg_collisions(
         geometry, world_ground(ground, world), robot.joint_q, world * COORDS, leg
     )

@@ -44,6 +44,7 @@ class RobotView:
     peak_force: wp.vec4  # [N] on each paw, largest of the policy step
     paw_pos: mat43  # [m] centres, world
     paw_vel: mat43  # [m/s] centres, world
+    paw_height: wp.vec4  # [m] of each paw above the ground below it; 0 before the first step
 
 
 @wp.struct
@@ -76,6 +77,7 @@ class RobotArrays:
     old_lin_vel: wp.array(dtype=wp.vec3)  # (num_worlds,)
     default_angle: wp.array(dtype=float)  # (12,)
     step_dt: float  # [s] policy step
+    paw_height: wp.array2d(dtype=float)  # [m] (4, num_worlds) above the ground
 
 
 @wp.func
@@ -140,6 +142,7 @@ def load_view(robot: RobotArrays, ground: Ground, world: int) -> RobotView:
         view.touchdown_speed[k] = robot.touchdown_speed[k, world]
         view.paw_force[k] = wp.length(robot.paw_force[k, world])
         view.peak_force[k] = robot.peak_force[k, world]
+        view.paw_height[k] = robot.paw_height[k, world]
         for j in range(3):
             view.paw_pos[k, j] = robot.paw_pos[k, world][j]
             view.paw_vel[k, j] = robot.paw_vel[k, world][j]

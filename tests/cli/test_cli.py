@@ -22,7 +22,7 @@ from jumper_warp.evaluation.places import PlaceFlags, PlaceGoals
 from jumper_warp.policies.folder import load_policy, save_policy
 from jumper_warp.policies.restore import open_policy, restored_task
 from jumper_warp.policies.spec import PolicyError
-from jumper_warp.registry import TASKS, make_task
+from jumper_warp.registry import TASKS, WALKING, make_task
 from jumper_warp.rl.cfg import PpoCfg
 from jumper_warp.rl.checkpoint import CheckpointError
 from jumper_warp.tasks.cfg import TaskCfg
@@ -260,10 +260,10 @@ def test_every_other_setting_has_a_flag(name):
 def test_fields_of_a_task_without_a_flag_are_its_code_and_its_names():
     flags = {spec.metadata["flag"] for spec in dataclasses.fields(flags_of(hold_height()))}
     names = {flag_name(spec.name) for spec in dataclasses.fields(TaskCfg)}
-    assert names - flags == {"name", "state", "command", "evaluation"} and not flags - names
+    assert names - flags == {"name", "state", "command", "evaluation", "metrics"} and not flags - names
 
 
-@pytest.mark.parametrize("name", ["vertical-jump", "horizontal-jump", "omnidirectional-jump", "hold-height"])
+@pytest.mark.parametrize("name", [*TASKS, "hold-height"])
 def test_flags_left_alone_leave_the_task_alone(name):
     task = hold_height() if name == "hold-height" else make_task(name)
     assert with_flags(task, flags_of(task)) == task == parsed(task, [])
@@ -317,10 +317,16 @@ def test_flags_reach_the_arrays_that_kernels_read():
         ("vertical-jump", PpoCfg()),
         ("horizontal-jump", PpoCfg(gamma=0.99, entropy_coef=0.0003)),
         ("omnidirectional-jump", PpoCfg(gamma=0.99, entropy_coef=0.0003)),
+        ("velocity-flat", WALKING),
     ],
 )
 def test_training_has_the_settings_of_its_task(name, ppo):
     assert parse_train([name])[0].cfg.ppo == ppo
+
+
+def test_best_checkpoint_is_chosen_by_the_figure_of_the_task():
+    names = {name: parse_train([name])[0].cfg.best_by for name in ("vertical-jump", "velocity-rough")}
+    assert names == {"vertical-jump": "Metrics/success", "velocity-rough": "Metrics/score"}
 
 
 def test_terms_whose_names_make_the_same_flag_are_refused():

@@ -30,9 +30,9 @@ OF_WORLD = ("level", "streak")
 class Table:
     """Functions of (view, task, ...), compiled into one kernel as a task's are, to be called one at a time."""
 
-    def __init__(self, funcs, returns: type):
-        """funcs: of terms of a jump or of any task; returns: float or bool."""
-        funcs = list(funcs)
+    def __init__(self, funcs, returns: type, state=JumpState):
+        """funcs: of terms of the state's task or of any; returns: float or bool."""
+        funcs, self._state = list(funcs), state
         self._params = {func.func.__name__: list(inspect.signature(func.func).parameters)[2:] for func in funcs}
         self._returns = returns
         counts = [len(params) for params in self._params.values()]
@@ -40,7 +40,7 @@ class Table:
         @wp.kernel(module="unique", enable_backward=False)
         def table_kernel(
             views: wp.array(dtype=RobotView),
-            tasks: wp.array(dtype=JumpState),
+            tasks: wp.array(dtype=state),
             p: wp.array(dtype=float),
             out: wp.array2d(dtype=wp.bool if returns is bool else float),
         ):
@@ -65,7 +65,7 @@ class Table:
         p = array([numbers[key] for key in params] + [1.0] * (most - len(params)))
         shape = (len(views), len(self._params))
         out = wp.zeros(shape, dtype=wp.bool if self._returns is bool else float, device="cpu")
-        inputs = [wp.array(views, dtype=RobotView, device="cpu"), wp.array(tasks, dtype=JumpState, device="cpu")]
+        inputs = [wp.array(views, dtype=RobotView, device="cpu"), wp.array(tasks, dtype=self._state, device="cpu")]
         wp.launch(self._kernel, len(views), [*inputs, p], [out], device="cpu")
         return out.numpy()[:, list(self._params).index(name)]
 

@@ -9,7 +9,7 @@ from toy_task import SMALL
 from experiments.measure_memory import array_bytes
 from jumper_warp.cli import training_memory
 from jumper_warp.cli.training_memory import STANDING, check_memory, free_main_memory, learning_need, rollout_bytes
-from jumper_warp.registry import make_task, trainer_settings
+from jumper_warp.registry import TASKS, make_task, trainer_settings
 from jumper_warp.rl.ppo import Ppo
 
 TASK, PPO = make_task("vertical-jump"), trainer_settings("vertical-jump")
@@ -99,7 +99,7 @@ def test_processes_of_one_host_share_its_memory(monkeypatch):
 
 def test_the_projects_trainings_have_room(monkeypatch):
     limit(monkeypatch, 16e9, 8e9)
-    for name in ("vertical-jump", "horizontal-jump", "omnidirectional-jump"):
+    for name in TASKS:
         check_memory(make_task(name), trainer_settings(name), "jumper", 8192, torch.device("cuda", 0))
 
 

@@ -1,37 +1,9 @@
 import numpy as np
 import pytest
-import warp as wp
+from ground_helpers import heights, probe
 from simulation_helpers import PAW_RADIUS, WEIGHT, paw_centres, paw_forces, simulation, thrown, write_state
 
 from jumper_warp.robot import grounds
-from jumper_warp.robot.model import build_model
-from jumper_warp.sim.dynamics import find_ground, ground_struct
-from kernels.terrain import ground as ground_module
-from kernels.terrain.ground import Ground, surface
-
-wp.set_module_options({"enable_backward": False})
-
-
-def heights(field):
-    """Heights of the nodes [m], rows along y."""
-    return field.min_z + np.asarray(field.data, dtype=float) * (field.max_z - field.min_z)
-
-
-@wp.kernel
-def surface_kernel(ground: Ground, x: wp.array(dtype=float), y: wp.array(dtype=float), out: wp.array(dtype=wp.vec3)):
-    i = wp.tid()
-    out[i] = surface(ground, x[i], y[i])
-
-
-def probe(field, x, y):
-    """Height [m] and slopes of the ground as the solver has it, (n, 3)."""
-    model = build_model(1, ground=field, visuals=False, device="cpu")
-    ground = ground_struct(model, find_ground(model), ground_module)
-    x, y = (np.asarray(v, dtype=np.float32) for v in np.broadcast_arrays(x, y))
-    out = wp.zeros(len(x), dtype=wp.vec3, device="cpu")
-    inputs = [ground, wp.array(x, device="cpu"), wp.array(y, device="cpu"), out]
-    wp.launch(surface_kernel, len(x), inputs=inputs, device="cpu")
-    return out.numpy()
 
 
 @pytest.mark.parametrize("height", [-0.15, 0.15])

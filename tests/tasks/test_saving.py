@@ -33,7 +33,7 @@ def saved(task):
     return json.loads(json.dumps(task_to_json(task)))
 
 
-@pytest.mark.parametrize("name", ["vertical-jump", "horizontal-jump", "omnidirectional-jump"])
+@pytest.mark.parametrize("name", list(TASKS))
 def test_every_task_comes_back(name):
     task = make_task(name)
     assert task_from_json(saved(task)) == task

@@ -273,7 +273,7 @@ def test_forgetting_touches_the_masked_worlds_only(stage):
 
 
 ZERO = ("torque", "old_torque", "action", "old_action", "impulse", "paw_force", "peak_force", "contact_time",
-        "air_time", "touchdown_speed", "invalid", "collisions")  # fmt: skip
+        "air_time", "touchdown_speed", "paw_height", "invalid", "collisions")  # fmt: skip
 FORGOTTEN = (*ZERO, "target", "safe_target", "old_rate", "old_lin_vel", "paw_pos", "paw_vel")
 
 

@@ -1,0 +1,143 @@
+"""How well a walking policy follows commands: on a grid, redrawn while walking, at top speed, and pushed.
+
+    python experiments/walking_tracking.py --policy velocity_flat --per-axis 13 --out outputs/walking
+
+One robot for each point of a grid, from minus to plus 0.8 m/s, 0.8 m/s and 0.8 rad/s, all three at once, walks for
+10 s; the first second does not count. Then as many robots get another command while they walk, 0.8 m/s away from the
+first in any direction; others are asked for ever higher speeds over three seconds, which they must keep for five more
+within 10 %; and others are thrown off by 0.5 m/s in any direction at any moment. The gait is that of straight walking
+at 0.8 m/s. `--randomize` adds the randomisation, noise, latency on both sides and pushes of the training; `--solver
+mujoco` is a check against physics that the policy was not trained on, for which fewer robots will do.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import tyro
+
+from jumper_warp.cli.main import run_command
+from jumper_warp.envs.env import Env
+from jumper_warp.evaluation.gaits import Gait
+from jumper_warp.evaluation.plots import drawn
+from jumper_warp.evaluation.run import EvaluationArgs, EvaluationRun
+from jumper_warp.evaluation.velocities import (
+    AXES,
+    Walks,
+    check_walks,
+    grid,
+    kept_speeds,
+    settling_times,
+    steps_of,
+    top_speed,
+    tracking_metrics,
+)
+from jumper_warp.utils.errors import InputError
+
+REACH, STEP, KICK, GAIT_SPEED = 0.8, 0.8, 0.5, 0.8
+RAMP, KEEP, SHARE = 3.0, 5.0, 0.1
+DIRECTIONS = {"ahead": (0, 1.0, 4.0), "back": (0, -1.0, 4.0), "sideways": (1, 1.0, 2.0), "turning": (2, 1.0, 4.0)}
+"""Axis, sign and highest command [m/s] or [rad/s] of the test of top speed."""
+PAPER = {"rmse_vx_m_s": 0.17, "rmse_vy_m_s": 0.05, "rmse_yaw_rate_rad_s": 0.12}
+"""The paper's figures, on hardware, with commands up to 0.8 that a person gave."""
+
+
+@dataclass(frozen=True)
+class Args(EvaluationArgs):
+    """Flags."""
+
+    policy: str = "velocity_flat"
+    """Name or folder of a policy, a run's folder, or a checkpoint."""
+    per_axis: int = 13
+    """Commands along each axis of the grid; one robot for each of all three, and as many in the other tests."""
+    record: int = 1
+    """Number of robots to record for the Rerun viewer, redirected while they walk; 0: none."""
+
+    def __post_init__(self) -> None:
+        """Check the values."""
+        super().__post_init__()
+        if self.per_axis < 2:
+            raise InputError(f"per_axis must be at least 2, got {self.per_axis}")
+        check_walks(self.per_axis**3, 10.0)
+
+
+def redirected(env: Env, rng: np.random.Generator) -> Walks:
+    """Return walks with another command after 3 s."""
+    commands = steps_of(rng, env.num_envs, REACH, STEP)
+    return Walks(commands, env.task, 7.0, times=np.array([0.0, 3.0]))
+
+
+def sped_up(env: Env) -> tuple[Walks, np.ndarray]:
+    """Return walks at ever higher speeds, and the index of each robot's direction."""
+    which = np.arange(env.num_envs) % len(DIRECTIONS)
+    commands = np.zeros((env.num_envs, 7, 3))
+    for i, (axis, sign, highest) in enumerate(DIRECTIONS.values()):
+        speeds = sign * np.linspace(0.3, highest, int((which == i).sum()))
+        commands[which == i, :, axis] = speeds[:, None] * np.linspace(1.0 / 7.0, 1.0, 7)
+    times = RAMP * np.arange(7) / 7.0
+    return Walks(commands, env.task, RAMP + 1.0 + KEEP, times=times), which
+
+
+def kicked(env: Env, rng: np.random.Generator) -> Walks:
+    """Return walks with drawn commands whose velocity jumps at a drawn moment."""
+    n = env.num_envs
+    commands, angle = rng.uniform(-REACH, REACH, (n, 1, 3)), rng.uniform(0.0, 2.0 * np.pi, n)
+    kick = KICK * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    return Walks(commands, env.task, 7.0, kick_time=rng.uniform(2.0, 4.0, n), kick=kick)
+
+
+def speed_metrics(walks: Walks, which: np.ndarray) -> dict:
+    """Return the highest speed that was kept in each direction."""
+    found = {}
+    for i, (name, (axis, _, _)) in enumerate(DIRECTIONS.items()):
+        unit = "rad_s" if axis == 2 else "m_s"
+        kept = kept_speeds(walks, axis, KEEP, SHARE)[which == i]
+        found[f"top_{name}_{unit}"] = top_speed(np.abs(walks.commands[which == i, -1, axis]), kept)
+    return found
+
+
+def plot(run: EvaluationRun, walks: Walks, settling: np.ndarray) -> None:
+    """Draw mean velocities over commands, and how soon robots settle."""
+    history = walks.history()[round(1.0 / walks.step_dt) :]
+    with drawn(run.folder / "tracking.png", 2, 2, figsize=(9, 8)) as axes:
+        for i, (axis, name) in enumerate(zip(axes.flat, AXES, strict=False)):
+            wanted = walks.commands[:, 0, i]
+            axis.plot([-REACH, REACH], [-REACH, REACH], color="tab:green", linewidth=1.0, label="commanded")
+            standing = ~walks.fallen
+            axis.scatter(wanted[standing], history[:, standing, i].mean(axis=0), s=5, color="tab:blue", label="walked")
+            unit = "rad/s" if i == 2 else "m/s"
+            axis.set(xlabel=f"commanded {name} [{unit}]", ylabel=f"mean [{unit}]")
+        axes[0, 0].set_title(f"{len(walks.end)} robots, {run.title}")
+        axes[0, 0].legend()
+        times = np.sort(settling)
+        axes[1, 1].step(times, np.arange(1, len(times) + 1) / len(times), where="post")
+        axes[1, 1].set(xlabel=f"time to settle after a step of {STEP} m/s [s]", ylabel="share", xlim=(0.0, 4.0))
+
+
+def main(args: Args) -> dict:
+    """Run all tests and return their figures."""
+    run, rng = EvaluationRun.of("walking_tracking", args, ("velocity",)), np.random.default_rng(args.seed)
+    env = run.env(args.per_axis**3)
+    walks = run.follow(env, Walks(grid(args.per_axis, 3 * (REACH,)), env.task))
+    again = run.follow(env, redirected(env, rng), film="walk")
+    settling = settling_times(again)
+    fast, which = sped_up(env)
+    run.follow(env, fast)
+    thrown = run.follow(env, kicked(env, rng))
+    straight, gait = Walks(np.tile([GAIT_SPEED, 0.0, 0.0], (env.num_envs, 1, 1)), env.task), Gait(env)
+    run.follow(env, straight, watch=gait)
+    plot(run, walks, settling)
+    median = float(np.median(settling))
+    return run.report(
+        tracking_metrics(walks)
+        | {"median_settling_s": median if np.isfinite(median) else None,
+           "redirected_fall_rate": float(again.fallen.mean()), "kicked_fall_rate": float(thrown.fallen.mean())}
+        | speed_metrics(fast, which)
+        | gait.metrics(~straight.fallen),
+        PAPER,
+    )  # fmt: skip
+
+
+if __name__ == "__main__":
+    run_command(lambda: main(tyro.cli(Args)))

@@ -1,0 +1,325 @@
+"""Commanded velocities, followed by one robot in every world: how closely, how soon, how fast, and who falls."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from jumper_warp.evaluation.log import EvaluationEnv, EvaluationLog, Metrics, finite
+from jumper_warp.tasks.cfg import TaskCfg
+from jumper_warp.utils.errors import InputError
+
+AXES = ("vx", "vy", "yaw_rate")
+SKIP = 1.0
+"""[s] After a command that do not count for the error."""
+SETTLED = 0.1
+"""[m/s] Error of a robot that has settled on a new command."""
+SMOOTHING = 0.2
+"""[s] Over which velocities are averaged to tell whether it has."""
+MOST_ROBOTS = 20_000
+
+
+@dataclass
+class Walks(EvaluationLog):
+    """What became of one robot per world; nothing of a robot counts after its fall."""
+
+    commands: np.ndarray
+    """(robots, commands, 3) One after the other: ahead, to the left [m/s], about z [rad/s], body axes."""
+    task: TaskCfg
+    seconds: float = 10.0
+    """Simulated time."""
+    times: np.ndarray = field(default_factory=lambda: np.zeros(1))
+    """[s] (commands,) When each command comes; the first at 0."""
+    headings: np.ndarray | float = 0.0
+    """[rad] (robots,) At the start."""
+    kick_time: np.ndarray | None = None
+    """[s] (robots,) When the base's velocity jumps."""
+    kick: np.ndarray | None = None
+    """[m/s] (robots, 2) By how much, world axes."""
+    velocity: list[np.ndarray] = field(default_factory=list, init=False)
+    """(robots, 3) After every policy step, as the commands."""
+    end: np.ndarray = field(init=False)
+    """(robots,) Index of the termination by which a robot fell, -1: it did not."""
+    fall_step: np.ndarray = field(init=False)
+    """(robots,) Policy step of the fall; one past the last where there is none."""
+
+    row = "robot"
+    spacing = 2.0
+
+    def __post_init__(self) -> None:
+        """Begin with nobody fallen."""
+        count = len(self.commands)
+        self.end, self.fall_step = np.full(count, -1), np.zeros(count, dtype=int)
+        self.times = np.asarray(self.times, dtype=float)
+        self.step_dt = 0.0
+        falls = [not term.options["time_out"] for term in self.task.terminations]
+        self._is_fall = np.array([*falls, False])
+
+    def begin(self, env: EvaluationEnv) -> None:
+        """Stand every robot in the default pose with its first command, and the gait's clock as the task has it."""
+        self.step_dt = env.step_dt
+        gait = np.full((len(self.commands), 1), getattr(self.task.reset.settings, "gait", 0.0))
+        env.evaluation_reset(np.concatenate([self.commands[:, 0], gait], axis=1), self.headings)
+
+    def look(self, env: EvaluationEnv) -> dict[str, np.ndarray]:
+        """Return attitude and velocity of every base, give the commands that are due, and kick."""
+        sim = env.sim
+        q, qd = sim.joint_q(), sim.joint_qd()
+        seen = {"base_quat": q[:, 3:7].copy(), "base_vel": sim.base_velocity(), "base_ang_vel": qd[:, 3:6].copy(),
+                "ending": env.task_arrays()["ending"]}  # fmt: skip
+        step = len(self.velocity) + 1
+        due = np.flatnonzero(np.round(self.times / env.step_dt).astype(int) == step)
+        if len(due) and due[-1] > 0:
+            env.command(self.commands[:, due[-1]])
+        if self.kick is not None and self.kick_time is not None:
+            kicked = np.round(self.kick_time / env.step_dt).astype(int) == step
+            if kicked.any():
+                rates = qd.copy()
+                rates[kicked, :2] += self.kick[kicked]
+                sim.state.joint_qd.assign(rates.ravel())
+        return seen
+
+    def update(self, arrays: dict[str, np.ndarray], step_dt: float) -> bool:
+        """Take in a policy step; return whether all have fallen."""
+        self.step_dt = step_dt
+        standing = self.end < 0
+        self.velocity.append(body_velocity(arrays).astype(np.float32))
+        fell = standing & self._is_fall[arrays["ending"]]
+        self.end[fell] = arrays["ending"][fell]
+        self.fall_step[self.end < 0] = len(self.velocity)
+        return bool((self.end >= 0).all())
+
+    @property
+    def fallen(self) -> np.ndarray:
+        """Whether each robot fell."""
+        return self.end >= 0
+
+    @property
+    def outcomes(self) -> np.ndarray:
+        """Name of the termination by which each robot fell, `walked` where it did not."""
+        return np.array([*(term.name for term in self.task.terminations), "walked"])[self.end]
+
+    def history(self) -> np.ndarray:
+        """Return the velocities after every policy step, (steps, robots, 3), NaN from the fall on."""
+        velocity = np.array(self.velocity, dtype=float).reshape(-1, len(self.commands), 3)
+        after = np.arange(len(velocity))[:, None] >= self.fall_step
+        velocity[after] = np.nan
+        return velocity
+
+    def wanted(self) -> np.ndarray:
+        """Return the commands at every policy step, (steps, robots, 3); one counts from the step after it came."""
+        steps = np.arange(1, len(self.velocity) + 1)
+        which = np.searchsorted(np.round(self.times / self.step_dt), steps, side="left") - 1
+        return self.commands[:, np.maximum(which, 0)].transpose(1, 0, 2)
+
+    def columns(self) -> dict[str, list]:
+        """Return the first commands, the errors over all time that counts, and the ends."""
+        error = rms(self.errors(), axis=0)
+        numbers = {f"command_{axis}": self.commands[:, 0, i] for i, axis in enumerate(AXES)}
+        numbers |= {f"rms_error_{axis}": error[:, i] for i, axis in enumerate(AXES)}
+        return {name: finite(values) for name, values in numbers.items()} | {"end": self.outcomes.tolist()}
+
+    def errors(self) -> np.ndarray:
+        """Return velocity less command, (steps, robots, 3), NaN in the first SKIP seconds of each and after falls."""
+        error = self.history() - self.wanted()
+        steps = np.arange(1, len(error) + 1)
+        for time in self.times:
+            since = steps - round(time / self.step_dt)
+            error[(since > 0) & (since <= round(SKIP / self.step_dt))] = np.nan
+        return error
+
+    def series(self, worlds: Sequence[int]) -> dict[str, float]:
+        """Return velocity and command of robots."""
+        series, wanted = {}, self.wanted()[-1]
+        for world in worlds:
+            for i, (axis, unit) in enumerate(zip(AXES, ("m/s", "m/s", "rad/s"), strict=True)):
+                series[f"{axis}/robot {world} [{unit}]"] = float(self.velocity[-1][world, i])
+                series[f"{axis}/command of {world} [{unit}]"] = float(wanted[world, i])
+        return series
+
+    def notes(self, worlds: Sequence[int]) -> dict[str, Any]:
+        """Return the commands."""
+        return {"commands": self.commands[list(worlds)].tolist(), "times_s": self.times.tolist()}
+
+
+def body_velocity(arrays: dict[str, np.ndarray]) -> np.ndarray:
+    """Return the velocity ahead and to the left [m/s] and the yaw rate [rad/s], body axes, (robots, 3)."""
+    x, y, z, w = arrays["base_quat"].T.astype(float)
+    rows = np.array(
+        [
+            [1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y + z * w), 2.0 * (x * z - y * w)],
+            [2.0 * (x * y - z * w), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z + x * w)],
+            [2.0 * (x * z + y * w), 2.0 * (y * z - x * w), 1.0 - 2.0 * (x * x + y * y)],
+        ]
+    )  # of the rotation world to body
+    vel = np.einsum("ijn,nj->ni", rows, arrays["base_vel"])
+    ang = np.einsum("ijn,nj->ni", rows, arrays["base_ang_vel"])
+    return np.stack([vel[:, 0], vel[:, 1], ang[:, 2]], axis=1)
+
+
+def rms(values: np.ndarray, axis: int | tuple[int, ...] | None = None) -> np.ndarray:
+    """Return the root of the mean square of what is a number, NaN where nothing is."""
+    known = np.isfinite(values)
+    total = np.where(known, values, 0.0) ** 2
+    with np.errstate(invalid="ignore"):
+        return np.sqrt(total.sum(axis=axis) / np.where(known.sum(axis=axis) > 0, known.sum(axis=axis), np.nan))
+
+
+def tracking_metrics(walks: Walks) -> Metrics:
+    """Return errors over all robots and all time that counts, and how many fell."""
+    error = rms(walks.errors(), axis=(0, 1))
+    values = dict(zip(("rmse_vx_m_s", "rmse_vy_m_s", "rmse_yaw_rate_rad_s"), finite(error), strict=True))
+    robots, falls = len(walks.end), int(walks.fallen.sum())
+    metrics: Metrics = values | {"robots": robots, "falls": falls, "fall_rate": falls / robots}
+    return metrics | {f"fell_by_{name}": int((walks.outcomes == name).sum())
+                      for name in sorted(set(walks.outcomes[walks.fallen]))}  # fmt: skip
+
+
+def grid(per_axis: int, reach: Sequence[float]) -> np.ndarray:
+    """Return commands on a grid of all three at once, from minus to plus `reach`, (per_axis^3, 1, 3)."""
+    axes = [np.linspace(-limit, limit, per_axis) for limit in reach]
+    return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 1, 3)
+
+
+def steps_of(rng: np.random.Generator, robots: int, reach: float, step: float) -> np.ndarray:
+    """Return two commands a robot whose velocities differ by `step` [m/s] in any direction, (robots, 2, 3)."""
+    commands = np.zeros((robots, 2, 3))
+    commands[..., 2] = rng.uniform(-reach, reach, robots)[:, None]
+    todo = np.arange(robots)
+    while len(todo):
+        first = rng.uniform(-reach, reach, (len(todo), 2))
+        angle = rng.uniform(0.0, 2.0 * np.pi, len(todo))
+        second = first + step * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+        commands[todo, 0, :2], commands[todo, 1, :2] = first, second
+        todo = todo[np.abs(second).max(axis=1) > reach]
+    return commands
+
+
+def settling_times(walks: Walks) -> np.ndarray:
+    """Return how long after the last command each robot's velocity in the plane stays within SETTLED of it [s].
+
+    Velocities are means of the last SMOOTHING seconds. Infinite where it never does, or the robot falls.
+    """
+    window, first = round(SMOOTHING / walks.step_dt), round(walks.times[-1] / walks.step_dt)
+    velocity = walks.history()[..., :2]
+    total = np.cumsum(velocity, axis=0)
+    smooth = velocity.copy()
+    smooth[window:] = (total[window:] - total[:-window]) / window
+    off = np.linalg.norm(smooth[first:] - walks.wanted()[first:, :, :2], axis=2)
+    outside = ~(off <= SETTLED)
+    last = np.where(outside.any(axis=0), len(off) - np.argmax(outside[::-1], axis=0), 0)
+    return np.where(last == len(off), np.inf, last * walks.step_dt)
+
+
+def kept_speeds(walks: Walks, axis: int, seconds: float, share: float) -> np.ndarray:
+    """Return which robots kept their last command along an axis within a share of it over the last seconds on average.
+
+    The two other velocities are not judged.
+    """
+    last = walks.history()[-round(seconds / walks.step_dt) :, :, axis].mean(axis=0)
+    wanted = walks.commands[:, -1, axis]
+    return np.abs(last - wanted) <= share * np.abs(wanted)
+
+
+def walked(walks: Walks) -> np.ndarray:
+    """Return the share of the way that each robot went until it fell, at most 1, commanded to go straight ahead.
+
+    What it goes ahead counts, whatever its heading is then; the time of setting off, SKIP, is not asked for.
+    """
+    way = np.nansum(walks.history()[..., 0], axis=0) * walks.step_dt
+    return np.clip(way / (walks.commands[:, 0, 0] * (walks.seconds - SKIP)), 0.0, 1.0)
+
+
+def top_speed(commanded: np.ndarray, kept: np.ndarray, share: float = 0.9, width: float = 0.1) -> float:
+    """Return the highest speed that at least a share of the robots kept, of classes of a width; 0 if there is none.
+
+    commanded: (robots,) at least 0; kept: (robots,) bool. The result is the largest commanded one of its class.
+    """
+    classes, top = np.floor(commanded / width + 1.0e-9).astype(int), 0.0
+    for each in np.unique(classes):
+        inside = classes == each
+        if kept[inside].mean() >= share:
+            top = float(commanded[inside].max())
+    return top
+
+
+@dataclass(frozen=True)
+class VelocityFlags:
+    """Constant commands on a grid of all three velocities at once."""
+
+    per_axis: int = 8
+    """Commands along each axis of the grid; one robot for each of all three."""
+    reach: tuple[float, float, float] = (0.8, 0.8, 0.8)
+    """[m/s], [m/s], [rad/s] The grid goes from minus to plus this: ahead, to the left, about z."""
+    seconds: float = 10.0
+    """[s] Length; the first second does not count for the error."""
+
+    def __post_init__(self) -> None:
+        """Raises InputError: a setting is out of range."""
+        check_walks(self.per_axis**3, self.seconds, *self.reach)
+        if self.per_axis < 2:
+            raise InputError(f"per_axis must be at least 2, got {self.per_axis}")
+
+    @property
+    def count(self) -> int:
+        """Number of worlds."""
+        return self.per_axis**3
+
+    def log(self, task: TaskCfg, seed: int) -> Walks:
+        """Return walks with these commands."""
+        return Walks(grid(self.per_axis, self.reach), task, self.seconds)
+
+    def metrics(self, log: Walks) -> Metrics:
+        """Return `tracking_metrics`."""
+        return tracking_metrics(log)
+
+
+@dataclass(frozen=True)
+class VelocityGoals:
+    """A walk that is recorded: commands one after the other."""
+
+    vx: tuple[float, ...] = (0.8, 0.0, 0.0, -0.5, 0.6, 0.0)
+    """[m/s] Ahead, one for each command."""
+    vy: tuple[float, ...] = (0.0, 0.5, 0.0, 0.0, 0.3, 0.0)
+    """[m/s] To the left, likewise."""
+    yaw_rate: tuple[float, ...] = (0.0, 0.0, 0.8, 0.0, 0.6, 0.0)
+    """[rad/s] About z, likewise."""
+    each: float = 2.5
+    """[s] From command to command."""
+
+    count = 1
+    spacing = Walks.spacing
+
+    def __post_init__(self) -> None:
+        """Raises InputError: a setting is out of range."""
+        if not len(self.vx) == len(self.vy) == len(self.yaw_rate) >= 1:
+            raise InputError("vx, vy and yaw_rate must have as many numbers, one for each command")
+        check_walks(self.count, self.each, *self.vx, *self.vy, *self.yaw_rate)
+
+    @property
+    def seconds(self) -> float:
+        """[s] Length of the recording."""
+        return self.each * len(self.vx)
+
+    @property
+    def notes(self) -> dict[str, Any]:
+        """What to save with the recording."""
+        return {"vx_m_s": self.vx, "vy_m_s": self.vy, "yaw_rate_rad_s": self.yaw_rate}
+
+    def log(self, task: TaskCfg) -> Walks:
+        """Return one robot's walk."""
+        commands = np.stack([self.vx, self.vy, self.yaw_rate], axis=1)[None].astype(float)
+        return Walks(commands, task, self.seconds, times=self.each * np.arange(len(self.vx)))
+
+
+def check_walks(robots: int, seconds: float, *commands: float) -> None:
+    """Raise InputError unless this can be asked of a number of robots."""
+    if not 1 <= robots <= MOST_ROBOTS:
+        raise InputError(f"robots must be in 1 to {MOST_ROBOTS}, got {robots}")
+    if not 0.0 < seconds <= 600.0:
+        raise InputError(f"seconds must be in (0, 600], got {seconds}")
+    if not all(abs(value) <= 10.0 for value in commands):
+        raise InputError(f"commands must be within 10 m/s or rad/s, got {commands}")

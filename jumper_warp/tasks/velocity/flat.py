@@ -1,0 +1,134 @@
+"""Velocity tracking: walk ahead, back, sideways and turn as commanded; by itself on a plane.
+
+Forms and constants are the paper's and its authors' training configuration, except: the tracking terms have narrow
+second kernels, since the wide ones are flat where a few centimetres per second are to be decided; air time counts ten
+times, with which the robot trots by itself; rapid stepping grows in a straight line, since the clamped exponential has
+no slope where training begins; swings are to reach a height, paws not to slip and to come down softly; torques, joint
+accelerations and changes of the action cost, whose weights the configuration lists and overwrites with 0. Commands are
+redrawn every few seconds, so that transients are learnt, and reach farther as they are followed.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from jumper_warp.robot.motors import walking_filter, walking_motors
+from jumper_warp.tasks.cfg import Command, Reset, TaskCfg
+from jumper_warp.tasks.observations import DRAWN, ROBOT, exact
+from jumper_warp.tasks.randomization import RandomizationCfg
+from jumper_warp.tasks.terms import Advance, Curriculum, ObservationTerm, RewardTerm, StateMetric, TerminationTerm
+from jumper_warp.tasks.units import DEG, SECOND
+from jumper_warp.tasks.velocity.cfg import CommandCfg, VelocityResetCfg
+from kernels.mdp import observations as obs
+from kernels.mdp import rewards as mdp_rewards
+from kernels.mdp import terminations as mdp_terminations
+from kernels.velocity import commands, rewards, state, terminations
+from kernels.velocity import observations as velocity
+from kernels.velocity.reset import reset_velocity
+from kernels.velocity.state import VelocityState
+
+SENSED = ("lin_vel", "ang_vel", "gravity", "angle", "rate")
+"""Observations that come as late as the sensors do."""
+
+POLICY = (
+    ObservationTerm(velocity.command),
+    *(term.replace(delayed=term.name in SENSED) for term in ROBOT),
+)
+"""What the paper's walking policy sees, in another order."""
+
+CRITIC = (
+    *exact(POLICY),
+    ObservationTerm(obs.height),
+    ObservationTerm(obs.contacts),
+    ObservationTerm(obs.air_times),
+    ObservationTerm(velocity.contact_times),
+    ObservationTerm(velocity.paw_heights),
+    ObservationTerm(velocity.recent_steps),
+    ObservationTerm(velocity.command_age),
+    ObservationTerm(obs.paw_forces),
+    ObservationTerm(velocity.push),
+    *(term for term in DRAWN if term.func is not obs.drawn_push),  # in world axes, whatever the heading
+)
+"""What only a simulation knows besides."""
+
+REWARDS = (
+    RewardTerm(rewards.linear_velocity, 2.5, width=0.5),
+    RewardTerm(rewards.linear_velocity, 1.0, name="linear_velocity_fine", width=0.1),
+    RewardTerm(rewards.yaw_rate, 1.5, width=0.5),
+    RewardTerm(rewards.yaw_rate, 0.5, name="yaw_rate_fine", width=0.1),
+    RewardTerm(rewards.vertical_velocity, -1.0),
+    RewardTerm(rewards.lateral_stability, -0.03),
+    RewardTerm(rewards.flat, -50.0),
+    RewardTerm(rewards.stand, 1.5, width=10.0 * DEG),
+    RewardTerm(rewards.restless_stand, -0.2),
+    RewardTerm(rewards.lateral_position, 0.18, steepness=100.0),
+    RewardTerm(rewards.transversal_position, 0.1, steepness=5000.0, shift=10.0 * DEG),
+    RewardTerm(rewards.air_time, 5.0, least=0.25),
+    RewardTerm(rewards.rapid_stepping, -0.1, free=2.0),
+    RewardTerm(rewards.foot_clearance, -30.0, height=0.07),
+    RewardTerm(rewards.slip, -0.25),
+    RewardTerm(rewards.touchdown, -1.0),
+    RewardTerm(mdp_rewards.action_clip, -1.0e-3),
+    RewardTerm(mdp_rewards.motor_torque_sq, -1.0e-4),
+    RewardTerm(mdp_rewards.joint_acceleration, -1.0e-7),
+    RewardTerm(mdp_rewards.action_rate, -0.03),
+    RewardTerm(rewards.jerk, -5.0e-3),
+)
+
+TERMINATIONS = (
+    TerminationTerm(mdp_terminations.came_apart),
+    TerminationTerm(mdp_terminations.collided),
+    TerminationTerm(mdp_terminations.tilted, angle=60.0 * DEG),
+    TerminationTerm(terminations.finished, time_out=True, success=True),
+    TerminationTerm(terminations.left_map, time_out=True),
+)
+
+METRICS = (
+    StateMetric("Metrics/score", "score", "all_steps"),
+    StateMetric("Metrics/error_xy_m_s", "sum_xy", "sum_settled"),
+    StateMetric("Metrics/error_yaw_rad_s", "sum_yaw", "sum_settled"),
+    StateMetric("Metrics/falls_per_minute", "falls", "minutes"),
+    StateMetric("Metrics/swing_apex_m", "apexes", "touchdowns"),
+    StateMetric("Metrics/steps_hz", "touchdowns", "seconds_walking"),
+    StateMetric("Curriculum/command_level", "command_level"),
+    StateMetric("Curriculum/terrain_level", "terrain_level"),
+)
+
+
+def velocity_flat() -> TaskCfg:
+    """Return the task on a plane, with the gains and the torque limit of the paper's walking tests, 10 N m."""
+    return TaskCfg(
+        name="velocity-flat",
+        state=VelocityState,
+        advance=Advance(state.advance_velocity, settle=1.0 * SECOND),
+        reset=Reset(reset_velocity, VelocityResetCfg()),
+        command=Command(commands.give_velocity, commands.command_due, commands.draw_command),
+        curriculum=Curriculum(
+            state.tracking_error, tolerance=0.18, promote_after=1_000_000, counts=state.every_episode, unit="m_s"
+        ),
+        rewards=REWARDS,
+        terminations=TERMINATIONS,
+        policy=POLICY,
+        critic=CRITIC,
+        levels=(CommandCfg(),),
+        motors=walking_motors(),
+        command_filter=walking_filter(),
+        action_scale=(60.0, 60.0),
+        randomization=RandomizationCfg.walking(),
+        metrics=METRICS,
+        evaluation="velocity",
+    )
+
+
+def velocity_trot() -> TaskCfg:
+    """Return the task with a clock that is seen and whose trot is paid for, at 2 Hz."""
+    flat = velocity_flat()
+    clock = ObservationTerm(velocity.clock)
+    return replace(
+        flat,
+        name="velocity-trot",
+        reset=replace(flat.reset, settings=replace(flat.reset.settings, gait=2.0)),
+        rewards=(*flat.rewards, RewardTerm(rewards.trot_schedule, 2.0, duty=0.55)),
+        policy=(*flat.policy, clock),
+        critic=(*flat.critic, clock),
+    )

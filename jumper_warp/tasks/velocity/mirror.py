@@ -1,0 +1,76 @@
+"""The left-right mirror image of what policies of velocity tracking see and do, as permutations and signs.
+
+A robot that is mirrored about its x-z plane sees `signs * x[order]` of what it saw, and answers it by the mirror image
+of its action. Lateral angles are positive outward and transversal ones away from the twin on both sides, so that motors
+swap sides and keep their signs.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from jumper_warp.tasks.cfg import TaskCfg
+from jumper_warp.utils.errors import InputError
+from kernels.mdp import observations as obs
+from kernels.velocity import observations as velocity
+
+
+class Mirror(NamedTuple):
+    """The mirror image of a vector x: `signs * x[order]`."""
+
+    order: np.ndarray
+    """(columns,) int"""
+    signs: np.ndarray
+    """(columns,) float32, 1 or -1"""
+
+
+LEGS = (1, 0, 3, 2)
+"""FL, FR, BL, BR with sides swapped."""
+MOTORS = tuple(3 * leg + j for leg in LEGS for j in range(3))
+"""Motors with sides swapped."""
+ROWS = tuple(3 * (i // 3) + 2 - i % 3 for i in range(15))
+"""Points of `ground_heights` with sides swapped."""
+VECTOR, AXIAL = (1, -1, 1), (-1, 1, -1)
+"""Signs of a vector's components in body axes, and of those of a vector of rotation."""
+
+_PLAIN: dict[Any, tuple[int, ...]] = {
+    obs.lin_vel: VECTOR, obs.ang_vel: AXIAL, obs.gravity: VECTOR, velocity.command: (1, -1, -1),
+    velocity.clock: (-1, -1), velocity.command_age: (1,), velocity.push: VECTOR + AXIAL, obs.height: (1,),
+    obs.drawn_mass: (1, 1), obs.drawn_com: VECTOR, obs.drawn_latency: (1,), obs.drawn_friction: (1, 1),
+}  # fmt: skip
+"""Signs of terms whose columns stay where they are."""
+_SWAPPED: dict[Any, tuple[int, ...]] = {
+    obs.angle: MOTORS, obs.rate: MOTORS, obs.last_action: MOTORS, obs.contacts: LEGS, obs.air_times: LEGS,
+    obs.paw_forces: LEGS, velocity.contact_times: LEGS, velocity.paw_heights: LEGS, velocity.recent_steps: LEGS,
+    velocity.ground_heights: ROWS, obs.drawn_gains: MOTORS, obs.drawn_speed_limits: MOTORS, obs.drawn_offset: MOTORS,
+}  # fmt: skip
+"""Orders of terms that keep their signs."""
+
+
+def mirror_of(task: TaskCfg, group: str) -> Mirror:
+    """Return the mirror image of an observation group's rows.
+
+    Raises ValueError: a term is of none of these.
+    """
+    order: list[int] = []
+    signs: list[int] = []
+    for term in getattr(task, group):
+        width = term.width
+        if term.func in _PLAIN:
+            places, flips = tuple(range(width)), _PLAIN[term.func]
+        elif term.func in _SWAPPED:
+            places, flips = _SWAPPED[term.func], (1,) * width
+        else:
+            raise InputError(f"{task.name} {group}: the mirror image of {term.name} is not known")
+        for _ in range(term.options["history"]):
+            first = len(order)
+            order += [first + place for place in places]
+            signs += flips
+    return Mirror(np.array(order), np.array(signs, dtype=np.float32))
+
+
+def mirror_of_action() -> Mirror:
+    """Return the mirror image of an action."""
+    return Mirror(np.array(MOTORS), np.ones(12, dtype=np.float32))

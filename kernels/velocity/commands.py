@@ -1,0 +1,99 @@
+"""Commands of velocity tracking: how they are drawn, within an episode too, and given from outside."""
+
+import warp as wp
+
+from ..mdp.env import Scene
+from ..mdp.random import Draw, between, within
+from ..mdp.view import RobotView
+from .state import POLICY_RATE, VelocityState
+
+wp.set_module_options({"enable_backward": False})
+
+LEAST = wp.constant(0.05)  # [m/s], [rad/s] a command that is smaller in all three means to stand
+
+
+@wp.struct
+class CommandRanges:
+    """Ranges of drawn commands; reaches are (ahead, back, to either side [m/s], turning [rad/s])."""
+
+    narrow: wp.vec4  # reach at the first level
+    wide: wp.vec4  # reach at the last level
+    levels: int  # from the first to the last
+    narrow_share: float  # share of commands of the first level on all others
+    stand: float  # share of commands to stand
+    turn: float  # share of commands to turn on the spot
+    lasts: wp.vec2  # [policy steps] from command to command
+
+
+@wp.func
+def reach_of(ranges: CommandRanges, level: int) -> wp.vec4:
+    """Return the reach at a level."""
+    if ranges.levels == 0:
+        return ranges.narrow
+    share = float(wp.min(level, ranges.levels)) / float(ranges.levels)
+    return ranges.narrow + share * (ranges.wide - ranges.narrow)
+
+
+@wp.func
+def draw_velocity(draw: Draw, ranges: CommandRanges, level: int) -> wp.vec3:
+    """Return a command of a level.
+
+    Beyond the first level, the faster it goes along x, the less far it reaches across and in turning: an ellipse
+    between the largest reach along x and those of the level across it.
+    """
+    kind = between(draw, 80, 0.0, 1.0)
+    if kind < ranges.stand:
+        return wp.vec3(0.0)
+    reach = reach_of(ranges, level)
+    easy = level == 0 or between(draw, 81, 0.0, 1.0) < ranges.narrow_share
+    if easy:
+        reach = ranges.narrow
+    spin = between(draw, 82, -reach[3], reach[3])
+    if kind < ranges.stand + ranges.turn:
+        return wp.vec3(0.0, 0.0, spin)
+    ahead = between(draw, 83, -reach[1], reach[0])
+    side = between(draw, 84, -reach[2], reach[2])
+    if easy:
+        return wp.vec3(ahead, side, spin)
+    share = ahead / wp.where(ahead > 0.0, ranges.wide[0], ranges.wide[1])
+    left = wp.sqrt(wp.max(1.0 - share * share, 0.04))
+    return wp.vec3(ahead, left * side, left * spin)
+
+
+@wp.func
+def with_command(task: VelocityState, command: wp.vec3) -> VelocityState:
+    """Return the state with a command that has just come."""
+    new = task
+    new.command = command
+    new.command_steps = 0
+    new.standing = wp.where(wp.max(wp.abs(command)) < LEAST, 1, 0)
+    if new.standing == 1:
+        new.command = wp.vec3(0.0)
+    return new
+
+
+@wp.func
+def command_due(task: VelocityState) -> bool:
+    """Return whether the command has lasted long enough."""
+    return task.command_lasts > 0 and task.command_steps >= task.command_lasts
+
+
+@wp.func
+def draw_command(view: RobotView, scene: Scene, task: VelocityState, level: CommandRanges, draw: Draw) -> VelocityState:
+    """Return the state of an episode that goes on with a drawn command."""
+    new = with_command(task, draw_velocity(draw, level, task.command_level))
+    new.command_lasts = wp.max(int(within(draw, 85, level.lasts)), 1)
+    return new
+
+
+@wp.func
+def give_velocity(view: RobotView, scene: Scene, task: VelocityState, values: wp.vec4, heading: float) -> VelocityState:
+    """Command a velocity until another comes: ahead, to the left [m/s] and about z [rad/s], body axes.
+
+    The fourth value is the gait's frequency [Hz], 0: as it was.
+    """
+    new = with_command(task, wp.vec3(values[0], values[1], values[2]))
+    if values[3] > 0.0:
+        new.pace = values[3] / POLICY_RATE
+    new.command_lasts = 0
+    return new

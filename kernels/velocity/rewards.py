@@ -1,0 +1,160 @@
+"""Reward terms of velocity tracking (paper, Tables III and IV): pure functions of robot, command and numbers."""
+
+import warp as wp
+
+from ..mdp.rewards import phi
+from ..mdp.view import RobotView
+from .state import VelocityState, velocity_error
+
+
+@wp.func
+def moving(task: VelocityState) -> float:
+    """Return 1 if the robot is commanded to move, else 0."""
+    return wp.where(task.standing == 0, 1.0, 0.0)
+
+
+@wp.func
+def linear_velocity(view: RobotView, task: VelocityState, width: float) -> float:
+    """Linear velocity tracking: phi_width of the distance [m/s] of the velocity in the plane from the command."""
+    error = velocity_error(view, task)
+    return phi(wp.length(wp.vec2(error[0], error[1])), width)
+
+
+@wp.func
+def yaw_rate(view: RobotView, task: VelocityState, width: float) -> float:
+    """Yaw rate tracking: phi_width of the error [rad/s]."""
+    return phi(velocity_error(view, task)[2], width)
+
+
+@wp.func
+def vertical_velocity(view: RobotView, task: VelocityState) -> float:
+    """Vertical velocity L2: its square [m^2/s^2], body axes."""
+    up = wp.quat_rotate_inv(view.quat, view.lin_vel)[2]
+    return up * up
+
+
+@wp.func
+def lateral_stability(view: RobotView, task: VelocityState) -> float:
+    """Lateral stability L2: square of the angular velocity about body x and y [rad^2/s^2]."""
+    return view.ang_vel[0] * view.ang_vel[0] + view.ang_vel[1] * view.ang_vel[1]
+
+
+@wp.func
+def flat(view: RobotView, task: VelocityState) -> float:
+    """Flat L2: square of the horizontal part of projected gravity [1]."""
+    return view.gravity[0] * view.gravity[0] + view.gravity[1] * view.gravity[1]
+
+
+@wp.func
+def stand(view: RobotView, task: VelocityState, width: float) -> float:
+    """Stand: phi_width of the rms offset [rad] of the transversal angles from default, when commanded to stand."""
+    if task.standing == 0:
+        return 0.0
+    total = float(0.0)
+    for m in range(12):
+        if m % 3 != 0:
+            off = view.angle[m] - view.default_angle[m]
+            total += off * off
+    return phi(wp.sqrt(total / 8.0), width)
+
+
+@wp.func
+def lateral_position(view: RobotView, task: VelocityState, steepness: float) -> float:
+    """Lateral position: sum over lateral motors of exp(-steepness offset^8) - 1, offset from default [rad]."""
+    total = float(0.0)
+    for m in range(12):
+        if m % 3 == 0:
+            square = (view.angle[m] - view.default_angle[m]) * (view.angle[m] - view.default_angle[m])
+            total += wp.exp(-steepness * square * square * square * square) - 1.0
+    return total
+
+
+@wp.func
+def transversal_position(view: RobotView, task: VelocityState, steepness: float, shift: float) -> float:
+    """Transversal position: sum over these motors of exp(-steepness offset^20) - 1, offset from default + shift."""
+    total = float(0.0)
+    for m in range(12):
+        if m % 3 != 0:
+            off = view.angle[m] - view.default_angle[m] - shift
+            fourth = off * off * off * off
+            total += wp.exp(-steepness * fourth * fourth * fourth * fourth * fourth) - 1.0
+    return total
+
+
+@wp.func
+def air_time(view: RobotView, task: VelocityState, least: float) -> float:
+    """Air time: sum of the times in the air less `least` [s] of paws that come down, when commanded to move."""
+    total = float(0.0)
+    for k in range(4):
+        total += view.first_contact[k] * (view.air_time[k] - least)
+    return total * moving(task)
+
+
+@wp.func
+def rapid_stepping(view: RobotView, task: VelocityState, free: float) -> float:
+    """Rapid stepping: sum over paws of steps in the last 0.75 s beyond those that are free; it grows without bound."""
+    total = float(0.0)
+    for k in range(4):
+        total += wp.max(task.recent_steps[k] - free, 0.0)
+    return total
+
+
+@wp.func
+def restless_stand(view: RobotView, task: VelocityState) -> float:
+    """Paws off the ground when commanded to stand, 0 to 4."""
+    return float(4 - view.contacts) * (1.0 - moving(task))
+
+
+@wp.func
+def foot_clearance(view: RobotView, task: VelocityState, height: float) -> float:
+    """Foot clearance: sum over paws in the air of (height above ground - wanted [m])^2 times horizontal speed [m/s]."""
+    total = float(0.0)
+    for k in range(4):
+        off = view.paw_height[k] - height
+        speed = wp.length(wp.vec2(view.paw_vel[k, 0], view.paw_vel[k, 1]))
+        total += (1.0 - view.contact[k]) * off * off * speed
+    return total
+
+
+@wp.func
+def slip(view: RobotView, task: VelocityState) -> float:
+    """Slip: sum of squared horizontal speeds of paws on the ground [m^2/s^2]."""
+    total = float(0.0)
+    for k in range(4):
+        total += view.contact[k] * (view.paw_vel[k, 0] * view.paw_vel[k, 0] + view.paw_vel[k, 1] * view.paw_vel[k, 1])
+    return total
+
+
+@wp.func
+def touchdown(view: RobotView, task: VelocityState) -> float:
+    """Touchdown: sum of squared downward speeds of paws that come down [m^2/s^2]."""
+    total = float(0.0)
+    for k in range(4):
+        total += view.first_contact[k] * view.touchdown_speed[k] * view.touchdown_speed[k]
+    return total
+
+
+@wp.func
+def jerk(view: RobotView, task: VelocityState) -> float:
+    """Jerk: number of motors whose torque changed its sign since the last policy step."""
+    total = float(0.0)
+    for m in range(12):
+        total += wp.where(wp.sign(view.torque[m]) != wp.sign(view.old_torque[m]), 1.0, 0.0)
+    return total
+
+
+@wp.func
+def trot_schedule(view: RobotView, task: VelocityState, duty: float) -> float:
+    """Trot: share of paws that are down or up as the clock says, when commanded to move.
+
+    FL and BR are to be down in the first `duty` of the cycle, FR and BL half a cycle later.
+    """
+    total = float(0.0)
+    for k in range(4):
+        phase = task.phase
+        if k == 1 or k == 2:
+            phase = phase + 0.5
+        phase = phase - wp.floor(phase)
+        wanted = wp.where(phase < duty, 1.0, 0.0)
+        total += 0.25 * (1.0 - wp.abs(wanted - view.contact[k]))
+    return total * moving(task)

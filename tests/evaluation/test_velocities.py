@@ -1,0 +1,157 @@
+"""Figures of walks and gaits, in closed form, of robots that are made up."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from jumper_warp.evaluation import gaits, velocities
+from jumper_warp.evaluation.velocities import VelocityFlags, VelocityGoals, Walks
+from jumper_warp.registry import make_task
+from jumper_warp.utils.errors import InputError
+
+DT = 1.0 / 60.0
+TASK = make_task("velocity-flat")
+NAMES = [term.name for term in TASK.terminations]
+ROBOTS = 3
+
+
+def followed(velocity_of, *, seconds=2.0, falls=None, task=TASK, commands=None, times=(0.0,), **given) -> Walks:
+    """Walks of robots whose velocity (robots, 3) is a function of time [s]; falls: policy step by robot."""
+    commands = np.tile([0.5, -0.2, 0.4], (ROBOTS, 1, 1)) if commands is None else commands
+    walks = Walks(commands, task, seconds, times=np.array(times), **given)
+    turn = Rotation.random(ROBOTS, random_state=4)
+    for step in range(1, round(seconds / DT) + 1):
+        wanted = velocity_of(step * DT)
+        vel, ang = np.zeros((ROBOTS, 3)), np.zeros((ROBOTS, 3))
+        vel[:, :2], vel[:, 2], ang[:, 2], ang[:, 0] = wanted[:, :2], 0.7, wanted[:, 2], 0.3
+        ending = np.full(ROBOTS, -1)
+        for robot, fall in (falls or {}).items():
+            ending[robot] = NAMES.index("collided") if step >= fall else -1
+        arrays = {"base_quat": turn.as_quat(), "base_vel": turn.apply(vel), "base_ang_vel": turn.apply(ang),
+                  "ending": ending}  # fmt: skip
+        walks.update(arrays, DT)
+    return walks
+
+
+def test_errors_are_those_of_body_axes_after_the_first_second():
+    off = np.array([[0.1, 0.0, 0.0], [0.0, -0.2, 0.0], [0.2, 0.0, 0.3]])
+    walks = followed(lambda t: np.array([0.5, -0.2, 0.4]) + off + (0.0 if t > 1.0 + 1e-6 else 5.0))
+    metrics = velocities.tracking_metrics(walks)
+    assert metrics["rmse_vx_m_s"] == pytest.approx(np.sqrt(0.05 / 3.0), rel=1e-5)
+    assert metrics["rmse_vy_m_s"] == pytest.approx(np.sqrt(0.04 / 3.0), rel=1e-5)
+    assert metrics["rmse_yaw_rate_rad_s"] == pytest.approx(np.sqrt(0.09 / 3.0), rel=1e-5)
+    assert (metrics["robots"], metrics["falls"]) == (3, 0)
+    assert walks.columns()["rms_error_vx"] == pytest.approx([0.1, 0.0, 0.2], abs=1e-6)
+
+
+def test_nothing_counts_after_a_fall():
+    walks = followed(lambda t: np.full((ROBOTS, 3), t > 1.5) + np.array([0.5, -0.2, 0.4]), falls={1: 90, 0: 30})
+    metrics = velocities.tracking_metrics(walks)
+    assert (metrics["falls"], metrics["fell_by_collided"], metrics["fall_rate"]) == (2, 2, pytest.approx(2.0 / 3.0))
+    np.testing.assert_array_equal(walks.outcomes, ["collided", "collided", "walked"])
+    np.testing.assert_array_equal(walks.fall_step, [29, 89, 120])
+    # robot 1 counts without error from step 61 to 89, robot 2 from 61 to 120, wrong from 91 on
+    assert metrics["rmse_vx_m_s"] == pytest.approx(np.sqrt(30.0 / (29.0 + 60.0)), rel=1e-5)
+
+
+def test_end_of_the_time_is_no_fall():
+    walks = Walks(np.zeros((1, 1, 3)), TASK, 1.0)
+    arrays = {"base_quat": np.array([[0.0, 0.0, 0.0, 1.0]]), "base_vel": np.zeros((1, 3)),
+              "base_ang_vel": np.zeros((1, 3)), "ending": np.array([NAMES.index("finished")])}  # fmt: skip
+    walks.update(arrays, DT)
+    assert not walks.fallen.any() and walks.outcomes[0] == "walked"
+
+
+def test_settling_is_when_the_mean_velocity_stays_near_the_last_command():
+    commands = np.zeros((ROBOTS, 2, 3))
+    commands[:, 1, 0] = 0.8
+
+    def velocity(t):
+        since, v = t - 1.0, np.zeros((ROBOTS, 3))
+        v[0, 0] = np.clip(0.8 * since / 0.5, 0.0, 0.8)  # a ramp of half a second
+        v[1, 0] = 0.8 * (since > 1e-6)  # at once
+        v[2, 0] = 0.5  # never
+        return v
+
+    settling = velocities.settling_times(followed(velocity, seconds=3.0, commands=commands, times=(0.0, 1.0)))
+    # mean of a ramp over 0.2 s lags 0.1 s: within 0.1 of 0.8 from 0.4375 + about 0.08 s on
+    assert settling[0] == pytest.approx(0.53, abs=0.03)
+    assert settling[1] == pytest.approx(0.2 * 7.0 / 8.0, abs=1.5 * DT) and np.isinf(settling[2])
+
+
+def test_commands_count_from_the_step_after_they_came():
+    commands = np.zeros((ROBOTS, 2, 3))
+    commands[:, 1, 0] = 1.0
+    walks = followed(lambda t: np.zeros((ROBOTS, 3)), commands=commands, times=(0.0, 1.0))
+    np.testing.assert_array_equal(walks.wanted()[:, 0, 0], [0.0] * 60 + [1.0] * 60)
+
+
+def test_share_of_the_way_stops_at_a_fall():
+    commands = np.tile([0.5, 0.0, 0.0], (ROBOTS, 1, 1))
+    walks = followed(lambda t: np.tile([0.3, 0.1, 0.0], (ROBOTS, 1)), seconds=3.0, commands=commands, falls={2: 91})
+    assert velocities.walked(walks) == pytest.approx([0.9, 0.9, 0.45], rel=1e-5)  # of the last two seconds
+    fast = followed(lambda t: np.tile([0.9, 0.0, 0.0], (ROBOTS, 1)), commands=commands)
+    assert velocities.walked(fast) == pytest.approx([1.0] * 3)
+
+
+def test_top_speed_is_that_of_the_highest_class_that_is_kept():
+    commanded = np.array([0.31, 0.35, 0.42, 0.48, 0.55, 0.61, 0.66])
+    kept = np.array([False, True, True, True, False, True, False])
+    assert velocities.top_speed(commanded, kept) == 0.48
+    assert velocities.top_speed(commanded, kept, share=0.5) == 0.66
+    assert velocities.top_speed(commanded, np.zeros(7, dtype=bool)) == 0.0
+
+
+def test_kept_speed_is_the_mean_of_the_last_seconds():
+    walks = followed(lambda t: np.array([[0.46, 0, 0], [0.44, 0, 0], [0.54, 0, 0]]) - (3.0 if t < 1.0 else 0.0))
+    np.testing.assert_array_equal(velocities.kept_speeds(walks, 0, 1.0, 0.1), [True, False, True])
+
+
+def test_grid_and_steps_are_where_they_should_be():
+    commands = velocities.grid(3, (0.8, 0.6, 0.4))
+    assert commands.shape == (27, 1, 3) and {tuple(c) for c in commands[:, 0]} >= {(0.8, -0.6, 0.4), (0.0, 0.0, 0.0)}
+    pairs = velocities.steps_of(np.random.default_rng(0), 200, 0.8, 0.8)
+    np.testing.assert_allclose(np.linalg.norm((pairs[:, 1] - pairs[:, 0])[:, :2], axis=1), 0.8)
+    assert np.abs(pairs).max() <= 0.8 and (pairs[:, 0, 2] == pairs[:, 1, 2]).all()
+
+
+@pytest.mark.parametrize(
+    "make",
+    [lambda: VelocityFlags(per_axis=1), lambda: VelocityFlags(per_axis=40), lambda: VelocityFlags(seconds=0.0),
+     lambda: VelocityFlags(reach=(11.0, 0.0, 0.0)), lambda: VelocityGoals(vx=(0.1,)), lambda: VelocityGoals(each=-1.0)],
+)  # fmt: skip
+def test_settings_out_of_range_are_refused(make):
+    with pytest.raises(InputError):
+        make()
+
+
+def test_gait_of_a_made_up_trot():
+    steps, n = 120, 2  # 2 s; each diagonal down half a second, then up half a second
+    time = np.arange(steps) * DT
+    diagonal = np.mod(time, 1.0) < 0.5 - 1e-9
+    contact = np.stack([diagonal, ~diagonal, ~diagonal, diagonal], axis=1)[:, None].repeat(n, axis=1)
+    height = np.where(contact, 0.0, 0.06) + np.where(time[:, None, None] == time[45], 0.02, 0.0) * ~contact
+    force = contact * 0.5 * 14.0 * 9.81
+    torque = np.zeros((steps, n, 12))
+    torque[:, 0, 0], torque[7, 1, 3] = 2.0, -9.0
+    power, speed, mass = np.full((steps, n), 30.0), np.full((steps, n), 0.5), np.full(n, 14.0)
+    metrics = gaits.gait_metrics(contact, height, force, torque, power, speed, mass, DT)
+    assert metrics["cost_of_transport"] == pytest.approx(30.0 / (14.0 * 9.81 * 0.5))
+    assert metrics["share_down_FL_BR"] == metrics["share_down_FR_BL"] == pytest.approx(0.5)
+    assert metrics["largest_torque_nm"] == 9.0 and metrics["paw_force_ripple"] == pytest.approx(0.0, abs=1e-9)
+    assert metrics["rms_torque_nm"] == pytest.approx(np.sqrt((steps * 4.0 + 81.0) / (steps * n * 12)))
+    assert metrics["steps_hz"] == pytest.approx((2 * 1 + 2 * 2) / 4.0 / 2.0)
+    # FL and BR lift at 0.5 s and land at 1 s, a swing with the peak of 8 cm; FR and BL lift at 1 s, land at 1.5 s
+    assert metrics["median_swing_apex_m"] == pytest.approx(0.07)
+
+
+def test_gait_takes_no_sample_of_the_beginning():
+    env = SimpleNamespace(step_dt=DT)
+    gait = gaits.Gait(env, skip=0.5)
+    for _ in range(30):
+        gait()
+    assert not gait.contact and gait.metrics(np.zeros(2, dtype=bool)) == {}
+    with pytest.raises(AttributeError):
+        gait()  # reads the robots

@@ -1,0 +1,32 @@
+"""Environments of velocity tracking for tests, and ways to change what their worlds do."""
+
+import numpy as np
+import warp as wp
+
+from jumper_warp.envs.env import Env
+from jumper_warp.registry import make_task
+from kernels.velocity.state import VelocityState
+
+FIELDS = tuple(VelocityState.vars)
+
+
+def walking_env(num_envs: int, name: str = "velocity-flat", task=None, **arguments) -> Env:
+    """Return an environment on the CPU that has begun, nominal and without noise unless asked for."""
+    settings = {"seed": 1, "randomize": False, "noise": False} | arguments
+    env = Env(make_task(name) if task is None else task, num_envs, device="cpu", **settings)
+    env.reset()
+    return env
+
+
+def states_of(env: Env) -> dict[str, np.ndarray]:
+    """Return copies of all fields of the worlds' states."""
+    records = env.skills[0].states.numpy()
+    return {name: records[name].copy() for name in FIELDS}
+
+
+def edit(env: Env, worlds=slice(None), **fields) -> None:
+    """Overwrite fields of the worlds' states."""
+    records = env.skills[0].states.numpy().copy()
+    for name, value in fields.items():
+        records[name][worlds] = value
+    env.skills[0].states.assign(wp.array(records, dtype=VelocityState, device="cpu"))

@@ -1,0 +1,122 @@
+"""Rewards of velocity tracking against the same forms in NumPy, on random robots."""
+
+import inspect
+
+import numpy as np
+import pytest
+import warp as wp
+from jump_helpers import Table, functions, make_view
+from mdp_helpers import DEFAULT_ANGLE
+
+from jumper_warp.tasks.velocity.flat import velocity_flat, velocity_trot
+from kernels.mdp.view import mat43, vec12
+from kernels.velocity import rewards
+from kernels.velocity.state import VelocityState
+
+NAMES = """linear_velocity yaw_rate vertical_velocity lateral_stability flat stand lateral_position transversal_position
+air_time rapid_stepping restless_stand foot_clearance slip touchdown jerk trot_schedule"""
+paid = Table(functions(rewards, NAMES), float, VelocityState)
+TRANSVERSAL = np.arange(12) % 3 != 0
+N = 16
+
+
+def make_state(**fields) -> VelocityState:
+    state = VelocityState()
+    for name, value in fields.items():
+        setattr(state, name, type(getattr(state, name))(*value) if np.ndim(value) else value)
+    return state
+
+
+def robots(seed: int = 3):
+    """Random robots and commands: fields of views and states as NumPy, and the structs."""
+    rng = np.random.default_rng(seed)
+    found = []
+    for _ in range(N):
+        quat = wp.normalize(wp.quat(*rng.normal(size=4).tolist()))
+        contact = rng.integers(0, 2, 4).astype(float)
+        view = {
+            "quat": tuple(quat), "lin_vel": rng.normal(size=3), "ang_vel": rng.normal(size=3),
+            "gravity": np.array(wp.quat_rotate_inv(quat, wp.vec3(0.0, 0.0, -1.0))),
+            "angle": DEFAULT_ANGLE + rng.normal(size=12) * 0.4, "torque": rng.normal(size=12),
+            "old_torque": rng.normal(size=12), "contact": contact, "contacts": int(contact.sum()),
+            "first_contact": contact * rng.integers(0, 2, 4), "air_time": rng.uniform(0.0, 0.6, 4),
+            "paw_height": rng.uniform(0.0, 0.15, 4), "touchdown_speed": rng.uniform(0.0, 2.0, 4),
+        }  # fmt: skip
+        paw_vel = rng.normal(size=(4, 3))
+        state = {
+            "command": rng.normal(size=3), "standing": int(rng.integers(0, 2)), "phase": float(rng.uniform()),
+            "recent_steps": rng.integers(0, 6, 4).astype(float),
+        }  # fmt: skip
+        struct = make_view(**view)
+        struct.paw_vel = mat43(*paw_vel.ravel())
+        vel = np.array(wp.quat_rotate_inv(quat, wp.vec3(*view["lin_vel"])))
+        found.append((view | state | {"vel": vel, "paw_vel": paw_vel}, struct, make_state(**state)))
+    return found
+
+
+ROBOTS = robots()
+
+
+def trot(r, duty):
+    phase = np.mod(r["phase"] + np.array([0.0, 0.5, 0.5, 0.0]), 1.0)
+    return np.mean((phase < duty) == (r["contact"] > 0.5)) * (1 - r["standing"])
+
+
+def clearance(r, height):
+    speed = np.linalg.norm(r["paw_vel"][:, :2], axis=1)
+    return np.sum((1.0 - r["contact"]) * (r["paw_height"] - height) ** 2 * speed)
+
+
+OFF = {"angle": lambda r: r["angle"] - DEFAULT_ANGLE}
+EXPECTED = {
+    "linear_velocity": ({"width": 0.5}, lambda r: np.exp(-np.sum((r["vel"] - r["command"])[:2] ** 2) / 0.25)),
+    "yaw_rate": ({"width": 0.5}, lambda r: np.exp(-((r["ang_vel"][2] - r["command"][2]) ** 2) / 0.25)),
+    "vertical_velocity": ({}, lambda r: r["vel"][2] ** 2),
+    "lateral_stability": ({}, lambda r: np.sum(r["ang_vel"][:2] ** 2)),
+    "flat": ({}, lambda r: np.sum(r["gravity"][:2] ** 2)),
+    "stand": (
+        {"width": 0.5},
+        lambda r: np.exp(-np.mean(OFF["angle"](r)[TRANSVERSAL] ** 2) / 0.25) * r["standing"],
+    ),
+    "lateral_position": (
+        {"steepness": 100.0},
+        lambda r: np.sum(np.exp(-100.0 * OFF["angle"](r)[~TRANSVERSAL] ** 8) - 1.0),
+    ),
+    "transversal_position": (
+        {"steepness": 50.0, "shift": 0.2},
+        lambda r: np.sum(np.exp(-50.0 * (OFF["angle"](r)[TRANSVERSAL] - 0.2) ** 20) - 1.0),
+    ),
+    "air_time": (
+        {"least": 0.25},
+        lambda r: np.sum(r["first_contact"] * (r["air_time"] - 0.25)) * (1 - r["standing"]),
+    ),
+    "rapid_stepping": ({"free": 2.0}, lambda r: np.sum(np.maximum(r["recent_steps"] - 2.0, 0.0))),
+    "restless_stand": ({}, lambda r: np.sum(1.0 - r["contact"]) * r["standing"]),
+    "foot_clearance": ({"height": 0.07}, lambda r: clearance(r, 0.07)),
+    "slip": ({}, lambda r: np.sum(r["contact"] * np.sum(r["paw_vel"][:, :2] ** 2, axis=1))),
+    "touchdown": ({}, lambda r: np.sum(r["first_contact"] * r["touchdown_speed"] ** 2)),
+    "jerk": ({}, lambda r: np.sum(np.sign(r["torque"]) != np.sign(r["old_torque"]))),
+    "trot_schedule": ({"duty": 0.55}, lambda r: trot(r, 0.55)),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", NAMES.split())
+def test_reward_is_that_of_numpy(name):
+    numbers, expected = EXPECTED[name]
+    values = paid.all(name, [view for _, view, _ in ROBOTS], [state for _, _, state in ROBOTS], **numbers)
+    wanted = [expected(fields) for fields, _, _ in ROBOTS]
+    np.testing.assert_allclose(values, wanted, rtol=2e-4, atol=2e-6)
+    assert np.ptp(wanted) > 1e-3
+
+
+def test_every_reward_of_the_task_is_compared():
+    used = {term.func.func for task in (velocity_flat(), velocity_trot()) for term in task.rewards}
+    own = {func for func in used if inspect.getmodule(func).__name__ == "kernels.velocity.rewards"}
+    assert {func.__name__ for func in own} == set(EXPECTED)
+
+
+def test_standing_robot_at_rest_gets_full_tracking():
+    state = make_state(standing=1)
+    assert paid("linear_velocity", make_view(), state, width=0.1) == pytest.approx(1.0)
+    assert paid("stand", make_view(), state, width=0.1) == pytest.approx(1.0)
+    assert vec12(*DEFAULT_ANGLE) == make_view().default_angle

@@ -1,0 +1,108 @@
+"""How the state of velocity tracking moves on, against plain Python."""
+
+import numpy as np
+import pytest
+import warp as wp
+from jump_helpers import make_view
+from velocity_helpers import FIELDS
+
+from kernels.mdp.view import RobotView
+from kernels.velocity.state import VelocityState, advance_velocity
+
+WORLDS, STEPS, SETTLE, DT = 6, 140, 30, 1.0 / 60.0
+
+
+@wp.kernel(module="unique", enable_backward=False)
+def advance_kernel(views: wp.array2d(dtype=RobotView), settle: float, states: wp.array(dtype=VelocityState)):
+    """One thread per world follows all its steps."""
+    world = wp.tid()
+    state = states[world]
+    for step in range(views.shape[0]):
+        state = advance_velocity(views[step, world], state, settle)
+    states[world] = state
+
+
+def histories():
+    """Paws that go up and down, and velocities, by (step, world)."""
+    rng = np.random.default_rng(5)
+    down = rng.uniform(size=(STEPS, WORLDS, 4)) < 0.6
+    return {
+        "down": down,
+        "first": down & ~np.concatenate([np.ones((1, WORLDS, 4), dtype=bool), down[:-1]]),
+        "height": rng.uniform(0.0, 0.2, (STEPS, WORLDS, 4)),
+        "lin_vel": rng.normal(size=(STEPS, WORLDS, 3)),
+        "ang_vel": rng.normal(size=(STEPS, WORLDS, 3)),
+    }
+
+
+COMMAND = np.array([0.5, -0.3, 0.7])
+
+
+@pytest.fixture(scope="module")
+def followed():
+    h = histories()
+    h["lin_vel"][50, 1, 0] = np.nan  # worlds that came apart
+    h["ang_vel"][60, 2, 2] = 1e6
+    views = [
+        [
+            make_view(
+                contact=h["down"][t, w].astype(float), first_contact=h["first"][t, w].astype(float),
+                paw_height=h["height"][t, w], lin_vel=h["lin_vel"][t, w], ang_vel=h["ang_vel"][t, w],
+            )
+            for w in range(WORLDS)
+        ]
+        for t in range(STEPS)
+    ]  # fmt: skip
+    states = [VelocityState() for _ in range(WORLDS)]
+    for world, state in enumerate(states):
+        state.command, state.pace, state.terrain_level = wp.vec3(*COMMAND), 0.03, 2
+        state.standing = int(world == 3)
+    array = wp.array(states, dtype=VelocityState, device="cpu")
+    flat = wp.array([view for row in views for view in row], dtype=RobotView, device="cpu")
+    wp.launch(advance_kernel, WORLDS, [flat.reshape((STEPS, WORLDS)), float(SETTLE), array], device="cpu")
+    records = array.numpy()
+    return h, {name: records[name].copy() for name in FIELDS}
+
+
+def test_steps_of_the_last_three_quarters_of_a_second_are_counted(followed):
+    h, state = followed
+    np.testing.assert_array_equal(state["recent_steps"], h["first"][-45:].sum(axis=0))
+    assert state["recent_steps"].min() > 3 and (h["first"][-46] & ~h["first"][-45]).any()
+
+
+def test_errors_count_once_the_command_has_settled(followed):
+    h, state = followed
+    off = np.concatenate([h["lin_vel"][..., :2], h["ang_vel"][..., 2:]], axis=2) - COMMAND
+    xy, yaw = np.linalg.norm(off[..., :2], axis=2)[SETTLE:], np.abs(off[..., 2])[SETTLE:]
+    fine = (xy < 40.0) & (yaw < 40.0)
+    assert (~fine).sum() == 2
+    xy, yaw = np.where(fine, xy, 0.0), np.where(fine, yaw, 0.0)
+    for total in ("error_xy", "sum_xy"):
+        np.testing.assert_allclose(state[total], xy.sum(axis=0), rtol=1e-5)
+    for total in ("error_yaw", "sum_yaw"):
+        np.testing.assert_allclose(state[total], yaw.sum(axis=0), rtol=1e-5)
+    np.testing.assert_array_equal(state["settled"], fine.sum(axis=0))
+    speed = np.hypot(0.5, 0.3) + 0.3 * 0.7
+    score = 1.2 * np.where(fine, speed - 2.0 * (xy + 0.3 * yaw), 0.0).sum(axis=0)
+    np.testing.assert_allclose(state["score"], score, rtol=1e-4)
+
+
+def test_time_and_phase_go_on(followed):
+    _, state = followed
+    assert set(state["steps"]) == set(state["command_steps"]) == {STEPS} and set(state["all_steps"]) == {STEPS}
+    np.testing.assert_allclose(state["minutes"], STEPS * DT / 60.0, rtol=1e-5)
+    np.testing.assert_allclose(state["phase"], (0.03 * STEPS) % 1.0, atol=1e-4)
+    np.testing.assert_allclose(state["seconds_walking"], np.where(np.arange(WORLDS) == 3, 0.0, STEPS * DT), rtol=1e-5)
+
+
+def test_swings_are_as_high_as_the_paw_has_been(followed):
+    h, state = followed
+    apex, steps, high = np.zeros(WORLDS), np.zeros(WORLDS), np.zeros((WORLDS, 4))
+    for down, first, height in zip(h["down"], h["first"], h["height"], strict=True):
+        apex += 0.25 * (first * high).sum(axis=1)
+        steps += 0.25 * first.sum(axis=1)
+        high = np.where(down, 0.0, np.maximum(high, height))
+    moving = np.arange(WORLDS) != 3
+    np.testing.assert_allclose(state["swing_height"], high, rtol=1e-6)
+    np.testing.assert_allclose(state["apexes"], apex * moving, rtol=1e-5)
+    np.testing.assert_allclose(state["touchdowns"], steps * moving, rtol=1e-6)

@@ -1,0 +1,90 @@
+"""The map to walk on: what each kind of tile is, and where it stands, against NumPy and the kernels' own surface."""
+
+import numpy as np
+import pytest
+from ground_helpers import heights, probe
+
+from jumper_warp.robot.terrain import KINDS, TerrainCfg, single_tile, terrain_map, tile_heights
+from jumper_warp.utils.errors import InputError
+
+CFG = TerrainCfg(rows=2, tile=4.0, cell=0.1, start=0.5, border=1.0)
+NODES = 41
+AXIS = np.linspace(-2.0, 2.0, NODES)
+OFF = np.maximum(np.abs(AXIS[:, None]), np.abs(AXIS))
+"""[m] From the middle, as squares count it."""
+
+
+def tile(kind, difficulty=1.0, cfg=CFG, seed=0):
+    return tile_heights(cfg, kind, difficulty, np.random.default_rng(seed))
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_rim_is_at_zero_and_the_start_is_level(kind):
+    z = tile(kind)
+    assert z.shape == (NODES, NODES) and not np.abs(z[OFF > 1.75]).any()
+    assert np.ptp(z[OFF < 0.45]) == 0.0
+    assert kind == "flat" or np.abs(z).max() > 0.04
+
+
+def test_slopes_have_their_angle():
+    z = tile("slope")
+    assert z[20, 30] - z[20, 31] == pytest.approx(0.1 * np.tan(np.radians(15.0)))
+    assert z[20, 20] == pytest.approx((2.0 - 0.3 - 0.5) * np.tan(np.radians(15.0)))
+    np.testing.assert_allclose(tile("bowl", 0.5), -tile("slope", 0.5))
+    np.testing.assert_allclose(tile("slope", 0.5), tile("slope") * np.tan(np.radians(7.5)) / np.tan(np.radians(15.0)))
+
+
+@pytest.mark.parametrize(("difficulty", "step"), [(0.0, 0.03), (1.0, 0.10)])
+def test_stairs_have_steps_of_one_height(difficulty, step):
+    z = tile("stairs", difficulty)
+    assert set(np.round(np.unique(z) / step, 5)) == {0.0, 1.0, 2.0}
+    np.testing.assert_array_equal(tile("pit", difficulty), -z)
+    assert set(np.round(np.unique(tile("blocks", difficulty)), 6)) == {0.0, step}
+
+
+@pytest.mark.parametrize("kind", ["uneven", "waves"])
+def test_random_ground_keeps_its_amplitude_and_seed(kind):
+    z = tile(kind, 0.6)
+    assert np.abs(z).max() == pytest.approx(0.6 * 0.05)
+    np.testing.assert_array_equal(z, tile(kind, 0.6))
+    assert np.abs(z - tile(kind, 0.6, seed=1)).max() > 0.01
+
+
+def test_tiles_stand_where_the_map_says():
+    field = terrain_map(CFG)
+    z, edge = heights(field), 10
+    assert z.shape == (8 * 40 + 1 + 2 * edge, 2 * 40 + 1 + 2 * edge)
+    assert (field.hx, field.hy) == pytest.approx((5.0, 17.0))
+    for row in range(2):
+        for col, kind in enumerate(KINDS):
+            part = z[edge + 40 * col : edge + 40 * col + 41, edge + 40 * row : edge + 40 * row + 41]
+            wanted = tile_heights(CFG, kind, 0.5 * (row + 1), np.random.default_rng([0, row, col]))
+            np.testing.assert_allclose(part, wanted, atol=1e-6)
+    # the middle of the tile of row 1, column 3 (a slope), as the kernels see it
+    found = probe(field, [2.0, 2.0 + 1.0, 2.0], [-2.0, -2.0, -2.0 + 1.5])
+    slope = np.tan(np.radians(15.0))
+    assert found[:, 0] == pytest.approx([1.2 * slope, 0.7 * slope, 0.2 * slope], abs=1e-5)
+    assert found[1, 1] == pytest.approx(-slope, abs=1e-4) and found[2, 2] == pytest.approx(-slope, abs=1e-4)
+
+
+def test_single_tile_is_of_full_difficulty():
+    field = single_tile(CFG, "stairs")
+    np.testing.assert_allclose(heights(field), tile("stairs"), atol=1e-6)
+    assert (field.hx, field.hy) == (2.0, 2.0)
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [{"rows": -1}, {"tile": 0.0}, {"cell": 0.5}, {"start": 4.0}, {"slope": 70.0}, {"step": (0.1, 0.05)},
+     {"uneven": -0.1}, {"border": float("inf")}],
+)  # fmt: skip
+def test_map_that_cannot_be_is_refused(settings):
+    with pytest.raises(InputError, match="terrain"):
+        TerrainCfg(**settings)
+
+
+def test_map_without_rows_and_unknown_kinds_are_refused():
+    with pytest.raises(InputError, match="at least one row"):
+        terrain_map(TerrainCfg.none())
+    with pytest.raises(InputError, match="terrain must be one of flat, uneven"):
+        single_tile(CFG, "swamp")
