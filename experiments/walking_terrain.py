@@ -1,6 +1,6 @@
 """How far a walking policy comes on uneven ground, slopes and steps that it does not see.
 
-    python experiments/walking_terrain.py --policy velocity_rough --robots 500 --out outputs/terrain
+    python experiments/walking_terrain.py --policy walking_rough --robots 500 --out outputs/terrain
 
 Robots start in the middle of a tile with headings of their own and are commanded to go straight ahead at 0.5 m/s for
 10 s. The success rate of a terrain is the share of the way that they walk before they fall, on average. Slopes and
@@ -31,7 +31,7 @@ SECONDS = 10.0
 class Args(EvaluationArgs):
     """Flags."""
 
-    policy: str = "velocity_rough"
+    policy: str = "walking_rough"
     """Name or folder of a policy, a run's folder, or a checkpoint."""
     robots: int = 500
     """Robots on each terrain."""

@@ -1,6 +1,6 @@
 """How well a walking policy follows commands: on a grid, redrawn while walking, at top speed, and pushed.
 
-    python experiments/walking_tracking.py --policy velocity_flat --per-axis 13 --out outputs/walking
+    python experiments/walking_tracking.py --policy walking_flat --per-axis 13 --out outputs/walking
 
 One robot for each point of a grid, from minus to plus 0.8 m/s, 0.8 m/s and 0.8 rad/s, all three at once, walks for
 10 s; the first second does not count. Then as many robots get another command while they walk, 0.8 m/s away from the
@@ -47,7 +47,7 @@ PAPER = {"rmse_vx_m_s": 0.17, "rmse_vy_m_s": 0.05, "rmse_yaw_rate_rad_s": 0.12}
 class Args(EvaluationArgs):
     """Flags."""
 
-    policy: str = "velocity_flat"
+    policy: str = "walking_flat"
     """Name or folder of a policy, a run's folder, or a checkpoint."""
     per_axis: int = 13
     """Commands along each axis of the grid; one robot for each of all three, and as many in the other tests."""
