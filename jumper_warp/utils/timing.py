@@ -48,7 +48,8 @@ def over_baseline(checkout: Path | None, script: str, args: Any, figures: Mappin
     Args:
         checkout: Its root; None: nothing is run or returned.
         script: Path of the script within.
-        args: A dataclass, the flags of this run; `out` and `baseline` are left out.
+        args: A dataclass, the flags of this run; `out`, `baseline` and what is as by default are left out, so that
+            another checkout need not know the newest flags.
         figures: Of this run.
 
     Raises:
@@ -70,11 +71,12 @@ def over_baseline(checkout: Path | None, script: str, args: Any, figures: Mappin
 
 
 def flags_of(args: Any) -> list[str]:
-    """Return a dataclass as flags of the command line, without `out`, `baseline` and what is None."""
+    """Return a dataclass as flags of the command line, without `out`, `baseline` and what is as by default."""
     flags: list[str] = []
     for spec in dataclasses.fields(args):
         value, name = getattr(args, spec.name), spec.name.replace("_", "-")
-        if spec.name in ("out", "baseline") or value is None:
+        made = spec.default_factory is not dataclasses.MISSING
+        if spec.name in ("out", "baseline") or value == (spec.default_factory() if made else spec.default):
             continue
         if isinstance(value, bool):
             flags.append(f"--{name}" if value else f"--no-{name}")

@@ -287,6 +287,7 @@ def test_rates_are_told_over_those_of_a_baseline(tmp_path):
         baseline: Path
         out: Path | None = None
         device: str | None = None
+        newest: int = 3
 
     figures = {"steps_per_s_jump": 100.0, "steps_per_s_new": 7.0, "apex_m": 1.1}
     args = Args((4, 8), False, tmp_path / "base")
@@ -298,6 +299,7 @@ def test_rates_are_told_over_those_of_a_baseline(tmp_path):
     with pytest.raises(InputError, match=r"no experiments/other\.py in"):
         over_baseline(args.baseline, "experiments/other.py", args, figures)
     assert flags_of(Args((4,), True, tmp_path, device="cpu")) == ["--envs", "4", "--noise", "--device", "cpu"]
+    assert flags_of(Args((4,), True, tmp_path, newest=4)) == ["--envs", "4", "--noise", "--newest", "4"]
 
 
 def test_benchmark_of_solvers_tells_both_and_their_ratio(tmp_path):
