@@ -92,7 +92,7 @@ def reflection():
     parameters.observation_latency.zero_()
     env.worlds.broken.zero_()
     env.worlds.fresh.fill_(1)
-    env._observe(beginning=0)
+    env.stages()["observe"]()
     return env.task, {"policy": env.obs.numpy().copy(), "critic": env.critic_obs.numpy().copy()}
 
 
