@@ -31,6 +31,25 @@ def hand_over(
         set_motor(parameters, world, m)
 
 
+@wp.kernel
+def home_kernel(
+    # in
+    mask: wp.array(dtype=float),
+    home: wp.array(dtype=int),
+    # in, out
+    parameters: RobotParameters,
+    env: EnvArrays,
+):
+    """Put worlds into their first skill where mask is not 0, with its motors, and asked for none; one thread each."""
+    world = env.first + wp.tid()
+    if mask[world] == 0.0:
+        return
+    env.skill[world] = home[world]
+    env.request[world] = NONE
+    for m in range(12):
+        set_motor(parameters, world, m)
+
+
 def make_handover_kernel(handover: Any) -> wp.Kernel:
     """Return the kernel of a handover; handover: see `jumper_warp.tasks.cfg.Handover`."""
     when, begin = handover.when, handover.begin
