@@ -137,7 +137,7 @@ class Env(Stages):
         self.seed = self.worlds.seed = seed
         self._started = False
         self._graphs.clear()  # they hold the old seed
-        for array, value in ((self.worlds.clock, FIRST_CLOCK), (self.worlds.request, -1),
+        for array, value in ((self.worlds.clock, FIRST_CLOCK), (self.worlds.request, -1), (self.worlds.told, 0),
                              (self.worlds.level, 0), (self.worlds.streak, 0)):  # fmt: skip
             array.fill_(value)
         self.worlds.skill.assign(self._first_skill)
@@ -200,13 +200,22 @@ class Env(Stages):
         mask = self._array(checked_mask(worlds, self.num_envs))
         self._give(mask, 0, checked_commands(commands, self.num_envs), self._all)
 
-    def request(self, skill: int, worlds: Any = None) -> None:
-        """Ask worlds to hand over to another skill as soon as a handover allows it. Raises ValueError: no such one."""
+    def request(self, skill: int, worlds: Any = None, commands: Any = None) -> None:
+        """Ask worlds to hand over to another skill as soon as a handover allows it.
+
+        worlds: (num_envs,) bool, by default all. commands: (num_envs, up to 4), what the skill's command takes, given
+        as it takes over, relative to base and yaw as they are then; by default the skill begins as the handover says.
+        Raises ValueError: no such skill, or commands of another shape or not finite.
+        """
         if not 0 <= skill < len(self.skills):
             raise InputError(f"skill must be an index below {len(self.skills)}, got {skill}")
-        wanted = self.worlds.request.numpy()
-        wanted[checked_mask(worlds, self.num_envs) > 0.0] = skill
-        self.worlds.request.assign(wanted)
+        mask, n = checked_mask(worlds, self.num_envs) > 0.0, self.num_envs
+        values = np.zeros((n, 4), dtype=np.float32) if commands is None else checked_commands(commands, n)
+        for array, new in ((self.worlds.request, skill), (self.worlds.told, int(commands is not None)),
+                           (self.worlds.wanted, values[mask])):  # fmt: skip
+            kept = array.numpy()
+            kept[mask] = new
+            array.assign(kept)
 
     def _array(self, values: np.ndarray) -> wp.array:
         return wp.array(values, dtype=float, device=self.wp_device)

@@ -135,7 +135,7 @@ class Stages:
         for kernel, source, target in self._handovers:
             self._launch(
                 kernel, part.count,
-                [source, target, self._scene.ground, self._settings, self._moved, self.robot, self.parameters,
+                [source, target, self._scene, self._settings, self._moved, self.robot, self.parameters,
                  part.env, self.skills[source].states, self.skills[target].states],
             )  # fmt: skip
 

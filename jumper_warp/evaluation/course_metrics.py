@@ -9,12 +9,12 @@ import numpy as np
 from jumper_warp.evaluation.courses import STUCK, Course
 from jumper_warp.evaluation.log import Metrics, failures, finite, largest, mean
 from jumper_warp.evaluation.velocities import rms
-from jumper_warp.policies.skills import JUMP_TO, JUMP_UP, STAND, WALK
+from jumper_warp.policies.skills import JUMP_TO, JUMP_UP, WALK
 
 QUIET = 0.2
 """[s] Before a jump takes over, in which paw forces are looked at."""
-COLOURS = {WALK: "white", STAND: "tab:gray", JUMP_UP: "tab:orange", JUMP_TO: "tab:purple"}
-NAMES = {WALK: "walk", STAND: "stand", JUMP_UP: "jump up", JUMP_TO: "jump to"}
+COLOURS = {WALK: "white", JUMP_UP: "tab:orange", JUMP_TO: "tab:purple"}
+NAMES = {WALK: "walk", JUMP_UP: "jump up", JUMP_TO: "jump to"}
 
 
 def course_metrics(course: Course) -> Metrics:
@@ -69,13 +69,13 @@ def tracking_error(course: Course) -> np.ndarray:
 def handover_forces(course: Course) -> tuple[np.ndarray, np.ndarray]:
     """Return how the force on a paw varies before each handover to a jump [N], and by how much it steps there.
 
-    Of the paw where it does so most: peak to peak over the last QUIET seconds of the stand; and from the last policy
-    step of the stand to the first of the jump.
+    Of the paw where it does so most: peak to peak over the last QUIET seconds of the stand before it; and from the last
+    policy step before it to the first after it.
     """
     force, ripples, steps = np.array(course.force, dtype=float), [], []
     window = round(QUIET / course.step_dt)
     for world, command in zip(*np.nonzero(course.switched >= 0), strict=True):
-        last = course.switched[world, command]  # policy steps count from 1: of the stand the last one
+        last = course.switched[world, command]  # the last policy step of walking, counted from 1
         part = force[max(last - window, 0) : last, world]
         ripples.append(np.ptp(part, axis=0).max())
         if last < len(force):

@@ -1,7 +1,8 @@
 """Courses: one robot in every world walks and jumps as its script says, and switches between its skills for it.
 
-Before a jump the robot is commanded to stand and asked for the stand skill; this is told the goal and asked for the
-jump; the jump hands back by itself (`kernels.skills.handovers`). All robots are followed at once.
+For a jump the robot is commanded to stand and asked for the jump with its goal. The jump takes over once the robot is
+at rest, and hands back by itself (`kernels.skills.handovers`). A robot that does not come to rest walks on a little.
+Velocities go from one command to the next at a limited rate.
 """
 
 from __future__ import annotations
@@ -15,12 +16,18 @@ import numpy as np
 from jumper_warp.evaluation.log import EvaluationLog, finite
 from jumper_warp.evaluation.scripts import ScriptStep
 from jumper_warp.evaluation.velocities import AXES, SKIP, body_velocity
-from jumper_warp.policies.skills import JUMP_TO, JUMP_UP, STAND, WALK
+from jumper_warp.policies.skills import JUMP_TO, JUMP_UP, WALK
 from jumper_warp.tasks.switching import FALLS
 from jumper_warp.utils.errors import InputError
 
 SKILL_OF = {"walk": WALK, "stand": WALK, "jump_up": JUMP_UP, "jump_to": JUMP_TO}
-PATIENCE = 10.0
+SLEW = 2.0
+"""[m/s^2], [rad/s^2] How fast a velocity is taken from one command to the next."""
+NUDGE_AFTER, NUDGE_FOR = 2.5, 0.5
+"""[s] Without a jump after which a robot walks on, and how long, so that it plants its paws anew."""
+NUDGE = (0.25, 0.0, 0.0)
+"""[m/s], [rad/s] How it does."""
+PATIENCE = 15.0
 """[s] After which a jump that is not over has failed."""
 STUCK, DONE = len(FALLS), len(FALLS) + 1
 OUTCOMES = (*(term.name for term in FALLS), "stuck", "done")
@@ -55,7 +62,7 @@ class Course(EvaluationLog):
     velocity: list[np.ndarray] = field(default_factory=list, init=False)
     """(robots, 3) After every policy step: ahead, left [m/s], about z [rad/s]; not a number after the end."""
     wanted: list[np.ndarray] = field(default_factory=list, init=False)
-    """(robots, 3) Velocity that was commanded; not a number while walking is not active."""
+    """(robots, 3) Velocity that the policy was commanded; not a number while walking is not active."""
     counts: list[np.ndarray] = field(default_factory=list, init=False)
     """(robots,) Whether the step counts for the tracking error: walking, SKIP seconds after a command."""
     skills: list[np.ndarray] = field(default_factory=list, init=False)
@@ -81,7 +88,7 @@ class Course(EvaluationLog):
         self.began, self.switched, self.takeoff, self.over = (np.full((n, k), -1) for _ in range(4))
         self.began[:, 0] = 0
         self.apex, self.offset = np.full((n, k), np.nan), np.full((n, k, 2), np.nan)
-        self._skill, self._velocity_command = np.zeros(n, dtype=int), np.zeros((n, 3))
+        self._skill, self._aim, self._told = np.zeros(n, dtype=int), np.zeros((n, 3)), np.zeros((n, 3))
 
     @property
     def seconds(self) -> float:
@@ -92,9 +99,9 @@ class Course(EvaluationLog):
         """Stand every robot in the default pose with its first command."""
         self.step_dt = env.step_dt
         first = np.where(self.target[:, :1] == WALK, self.goal[:, 0], 0.0)
-        self._velocity_command = first
-        env.evaluation_reset(first, self.headings)
-        self._ask(env, self.target[:, 0] != WALK, STAND)
+        self._aim = first
+        env.evaluation_reset(self._told, self.headings)
+        self._ask(env, np.full(len(self.end), True))
 
     def look(self, env: Any) -> dict[str, np.ndarray]:
         """Return what is to be known of every robot, and of its last jump of each kind."""
@@ -116,26 +123,30 @@ class Course(EvaluationLog):
         """Look at the environment after a policy step, and command and ask for what is due."""
         before, was = self.current.copy(), self._skill
         ended = super().follow(env)
-        rows = np.arange(len(before))
-        running = self.end < 0
+        rows, running = np.arange(len(before)), self.end < 0
         at = np.minimum(self.current, self.target.shape[1] - 1)
-        jumping, fresh = self.target[rows, at] != WALK, self.current > before
-        self._velocity_command[fresh] = np.where(jumping[fresh, None], 0.0, self.goal[rows, at][fresh])
-        arrived = running & jumping & (self._skill == STAND) & (was == WALK)
-        again = running & jumping & (self._skill == WALK) & (fresh | (was == STAND))
-        values = np.where(arrived[:, None], self.goal[rows, at], self._velocity_command)
-        told = arrived | (running & fresh) | ((self._skill == WALK) & (was != WALK))
-        if told.any():
-            env.command(values, told)
-        self._ask(env, again, STAND)
-        for skill in (JUMP_UP, JUMP_TO):
-            self._ask(env, arrived & (self.target[rows, at] == skill), skill)
+        fresh, jumping = running & (self.current > before), self.target[rows, at] != WALK
+        self._aim[fresh] = np.where(jumping[fresh, None], 0.0, self.goal[rows, at][fresh])
+        waited = (len(self.skills) - self.began[rows, at]) * self.step_dt
+        late = running & jumping & (self._skill == WALK) & (waited >= NUDGE_AFTER)
+        nudged = np.where((np.mod(waited, NUDGE_AFTER) < NUDGE_FOR)[:, None], NUDGE, 0.0)
+        self._aim[late] = nudged[late]
+        told = self._told + np.clip(self._aim - self._told, -SLEW * self.step_dt, SLEW * self.step_dt)
+        told[self._skill != WALK] = 0.0
+        changed = (self._skill == WALK) & ((told != self._told).any(axis=1) | (was != WALK))
+        self._told = told
+        if changed.any():
+            env.command(told, changed)
+        self._ask(env, fresh)
         return ended
 
-    @staticmethod
-    def _ask(env: Any, worlds: np.ndarray, skill: int) -> None:
-        if worlds.any():
-            env.request(skill, worlds)
+    def _ask(self, env: Any, worlds: np.ndarray) -> None:
+        """Ask for the jumps that are the commands of some robots."""
+        rows, at = np.arange(len(worlds)), np.minimum(self.current, self.target.shape[1] - 1)
+        for skill in (JUMP_UP, JUMP_TO):
+            asked = worlds & (self.target[rows, at] == skill)
+            if asked.any():
+                env.request(skill, asked, self.goal[rows, at])
 
     def update(self, arrays: dict[str, np.ndarray], step_dt: float) -> bool:
         """Take in a policy step; return whether all courses have ended."""
@@ -178,7 +189,7 @@ class Course(EvaluationLog):
         at = np.minimum(self.current, self.target.shape[1] - 1)
         alive, walking = running[:, None], (was == WALK)[:, None]
         self.velocity.append(np.where(alive, body_velocity(arrays), np.nan).astype(np.float32))
-        self.wanted.append(np.where(alive & walking, self._velocity_command, np.nan).astype(np.float32))
+        self.wanted.append(np.where(alive & walking, self._told, np.nan).astype(np.float32))
         settled = step - self.began[rows, at] > round(SKIP / self.step_dt)
         self.counts.append(running & walking[:, 0] & settled & (self.target[rows, at] == WALK))
         self.skills.append(was.copy())

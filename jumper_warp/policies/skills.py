@@ -1,4 +1,4 @@
-"""Several policies on one robot: walking, a stand between skills, and jumps."""
+"""Several policies on one robot: walking and jumps."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from jumper_warp.utils.errors import InputError
 if TYPE_CHECKING:
     from jumper_warp.envs.env import Env
 
-WALK, STAND, JUMP_UP, JUMP_TO = range(4)
+WALK, JUMP_UP, JUMP_TO = range(3)
 """Indices of the skills in the environment."""
 
 
@@ -73,12 +73,8 @@ class SkillPolicies:
             policy.to(env.device)
         return env
 
-    @torch.no_grad()
     def act(self, env: Env) -> torch.Tensor:
         """Return every skill's actions for its observations, (skills, num_envs, 12); nothing waits for the device."""
-        obs = [skill.obs["policy"] for skill in env.skills]
-        actions = torch.empty((len(obs), env.num_envs, 12), device=env.device)
-        actions[STAND] = obs[STAND][:, :1] * obs[STAND][:, 1:]
-        for i, policy in zip((WALK, JUMP_UP, JUMP_TO), self.policies, strict=True):
-            actions[i] = policy.act(obs[i])
-        return actions
+        return torch.stack(
+            [policy.act(skill.obs["policy"]) for policy, skill in zip(self.policies, env.skills, strict=True)]
+        )
