@@ -1,6 +1,6 @@
-"""`jumper play POLICY`: a policy acts, as a recording for the Rerun viewer.
+"""`jumper play POLICY`: a policy acts, as a recording for the Rerun viewer. `jumper play --script FILE`: several do.
 
-The policy comes first: what it is decides which flags there are.
+The policy comes first: what it is decides which flags there are. A script says what one robot does with several.
 """
 
 from __future__ import annotations
@@ -9,8 +9,12 @@ from collections.abc import Sequence
 from types import ModuleType
 
 from jumper_warp.cli.evaluate import open_run, parse, policy_of
+from jumper_warp.cli.main import parse as parse_flags
 
-ABOUT = "Let a policy act and record it for the Rerun viewer; --viewer rerun opens the recording."
+ABOUT = """\
+Let a policy act and record it for the Rerun viewer; --viewer rerun opens the recording.
+jumper play --script FILE.json [flags] lets one robot walk and jump with several policies, as the script says."""
+SCRIPT = "--script"
 
 
 def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> None:
@@ -18,6 +22,11 @@ def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> None:
 
     Raises UsageError or OSError with one line: the policy or a flag cannot be used. Exits where tyro does.
     """
+    if args and args[0].startswith("-") and any(arg.partition("=")[0] == SCRIPT for arg in args):
+        from jumper_warp.evaluation.play_script import ScriptCfg, play_script
+
+        play_script(parse_flags(ScriptCfg, f"play {SCRIPT} FILE", args))
+        return
     policy = policy_of("play", ABOUT, args)
     from jumper_warp.evaluation.commands import PlayCfg, play
 

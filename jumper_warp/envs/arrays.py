@@ -46,7 +46,8 @@ def env_arrays(num_envs: int, seed: int, skill: wp.array, device: Any) -> Any:
     """Return the kernels' `EnvArrays`."""
     env = EnvArrays()
     env.seed, env.skill = seed, skill
-    for name in ("request", "fresh", "ending", "broken", "bad_action", "level", "streak"):
+    env.wanted = wp.zeros(num_envs, dtype=wp.vec4, device=device)
+    for name in ("request", "told", "fresh", "ending", "broken", "bad_action", "level", "streak"):
         setattr(env, name, wp.zeros(num_envs, dtype=int, device=device))
     env.clock = wp.full(num_envs, FIRST_CLOCK, dtype=int, device=device)
     for name in ("reward", "done", "timeout"):

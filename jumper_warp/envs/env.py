@@ -25,7 +25,7 @@ from jumper_warp.sim.simulation import Simulation, SolverName
 from jumper_warp.sim.slices import SlicedGraph
 from jumper_warp.tasks.cfg import Handover, TaskCfg
 from jumper_warp.tasks.interface import interface
-from jumper_warp.tasks.saving import task_to_json
+from jumper_warp.tasks.saving import handover_to_json, task_to_json
 from jumper_warp.utils.errors import InputError
 from kernels.mdp.reset import stand_kernel
 
@@ -85,6 +85,7 @@ class Env(Stages):
         """
         tasks = checked_tasks(task, handovers)
         self.task, self.tasks, self.num_envs, self.seed, self.auto_reset = tasks[0], tasks, num_envs, seed, auto_reset
+        self.handovers = tuple(handovers)
         may_vary = solver == "jumper" and isinstance(ground, str) and ground == "plane" and block is None
         run, self._draws_ground = prepared(tasks, randomize, noise, may_vary)
         terrains = [terrain for each in run if (terrain := each.terrain) is not None]
@@ -136,7 +137,7 @@ class Env(Stages):
         self.seed = self.worlds.seed = seed
         self._started = False
         self._graphs.clear()  # they hold the old seed
-        for array, value in ((self.worlds.clock, FIRST_CLOCK), (self.worlds.request, -1),
+        for array, value in ((self.worlds.clock, FIRST_CLOCK), (self.worlds.request, -1), (self.worlds.told, 0),
                              (self.worlds.level, 0), (self.worlds.streak, 0)):  # fmt: skip
             array.fill_(value)
         self.worlds.skill.assign(self._first_skill)
@@ -169,6 +170,8 @@ class Env(Stages):
     def evaluation_reset(self, commands: Any, headings: Any = 0.0, worlds: Any = None) -> None:
         """Stand worlds in the default pose with commands of their own, and end no episode until `reset`.
 
+        They are in their first skill, and asked for no other.
+
         commands: (num_envs, up to 4), what the task's command takes; headings [rad]: (num_envs,) or one for all;
         worlds: (num_envs,) bool, by default all.
         Raises ValueError: values of another shape, or not finite.
@@ -180,6 +183,7 @@ class Env(Stages):
         if self._draws_ground:
             self._scene.ground.blocks.zero_()
         self._tick(mask)
+        self._go_home(self._part(), mask)
         self._draw(self._part(), mask)
         self._launch(stand_kernel, n, [mask, headings, self._scene, self.robot])
         self._forget(self._part(), mask)
@@ -196,13 +200,22 @@ class Env(Stages):
         mask = self._array(checked_mask(worlds, self.num_envs))
         self._give(mask, 0, checked_commands(commands, self.num_envs), self._all)
 
-    def request(self, skill: int, worlds: Any = None) -> None:
-        """Ask worlds to hand over to another skill as soon as a handover allows it. Raises ValueError: no such one."""
+    def request(self, skill: int, worlds: Any = None, commands: Any = None) -> None:
+        """Ask worlds to hand over to another skill as soon as a handover allows it.
+
+        worlds: (num_envs,) bool, by default all. commands: (num_envs, up to 4), what the skill's command takes, given
+        as it takes over, relative to base and yaw as they are then; by default the skill begins as the handover says.
+        Raises ValueError: no such skill, or commands of another shape or not finite.
+        """
         if not 0 <= skill < len(self.skills):
             raise InputError(f"skill must be an index below {len(self.skills)}, got {skill}")
-        wanted = self.worlds.request.numpy()
-        wanted[checked_mask(worlds, self.num_envs) > 0.0] = skill
-        self.worlds.request.assign(wanted)
+        mask, n = checked_mask(worlds, self.num_envs) > 0.0, self.num_envs
+        values = np.zeros((n, 4), dtype=np.float32) if commands is None else checked_commands(commands, n)
+        for array, new in ((self.worlds.request, skill), (self.worlds.told, int(commands is not None)),
+                           (self.worlds.wanted, values[mask])):  # fmt: skip
+            kept = array.numpy()
+            kept[mask] = new
+            array.assign(kept)
 
     def _array(self, values: np.ndarray) -> wp.array:
         return wp.array(values, dtype=float, device=self.wp_device)
@@ -221,14 +234,27 @@ class Env(Stages):
         return arrays | {name: getattr(self.worlds, name).numpy().copy() for name in ("done", "ending", "level")}
 
     def metrics(self) -> dict[str, float]:
-        """Return the first task's means since the last call, and clear the counters (waits for the device)."""
+        """Return means since the last call, and clear the counters (waits for the device).
+
+        Those of the first task have plain names, those of each other one begin with its name and a slash.
+        """
         figures = self.skills[0].metrics()
+        for skill in self.skills[1:]:
+            figures |= {f"{skill.task.name}/{name}": value for name, value in skill.metrics().items()}
         levels = np.bincount(self.worlds.level.numpy(), minlength=len(self.task.levels) + 1)
         return figures | {f"Curriculum/level_{i}": float(count) / self.num_envs for i, count in enumerate(levels)}
 
     def config(self) -> dict:
-        """Return everything that defines the environment, as JSON can hold it."""
-        return {
+        """Return everything that defines the environment, as JSON can hold it.
+
+        `task` and `interface` are of the first task; several have `tasks`, and `handovers` as their functions' names.
+        """
+        several = {
+            "tasks": [task_to_json(task) for task in self.tasks],
+            "first_skill": self._first_skill.tolist(),
+            "handovers": [handover_to_json(handover) for handover in self.handovers],
+        }
+        return (several if len(self.tasks) > 1 else {}) | {
             "task": task_to_json(self.task),
             "interface": interface(self.task),
             "num_envs": self.num_envs,

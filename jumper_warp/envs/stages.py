@@ -18,7 +18,7 @@ from kernels.mdp import attempts, events
 from kernels.mdp.actions import action_kernel
 from kernels.mdp.env import EnvArrays, SkillSettings
 from kernels.mdp.events import AT_RESET, AT_STEP, STARTUP
-from kernels.mdp.handover import make_handover_kernel
+from kernels.mdp.handover import home_kernel, make_handover_kernel
 from kernels.mdp.observe import LANES, condition_kernel
 from kernels.mdp.parameters import motors_kernel
 from kernels.mdp.reset import forget_kernel, tick_kernel
@@ -52,8 +52,8 @@ class Stages:
     def _allocate(self, tasks: Sequence[TaskCfg], skill: np.ndarray | int, handovers: Sequence[Handover]) -> None:
         """Make all arrays and kernels; skill: index of the task that each world begins in."""
         n, device, sim = self.num_envs, self.wp_device, self.sim
-        self._first_skill = active = checked_skill(skill, n, len(tasks))
-        active = wp.array(active, dtype=int, device=device)
+        self._first_skill = checked_skill(skill, n, len(tasks))
+        active, self._home = (wp.array(self._first_skill, dtype=int, device=device) for _ in range(2))
         self.skills = [Skill(task, i, n, self.step_dt, sim.substeps, device) for i, task in enumerate(tasks)]
         self.parameters = robot_parameters(sim, tuple(tasks), active)
         self.robot, self._scene = robot_arrays(sim, self.step_dt), scene_of(sim)
@@ -135,12 +135,13 @@ class Stages:
         for kernel, source, target in self._handovers:
             self._launch(
                 kernel, part.count,
-                [source, target, self._scene.ground, self._settings, self._moved, self.robot, self.parameters,
+                [source, target, self._scene, self._settings, self._moved, self.robot, self.parameters,
                  part.env, self.skills[source].states, self.skills[target].states],
             )  # fmt: skip
 
     def _begin(self, part: Part, mask: wp.array) -> None:
-        """Begin new episodes where mask is not 0, and commands where they are due."""
+        """Begin new episodes where mask is not 0, in the first skill, and commands where they are due."""
+        self._go_home(part, mask)
         self._draw(part, mask)
         for skill in self.skills:
             lanes = attempts.LANES if self.wp_device.is_cuda and skill.task.reset.side_by_side else 1
@@ -150,6 +151,11 @@ class Stages:
                  skill.states, self.robot], block_dim=128,
             )  # fmt: skip
         self._forget(part, mask)
+
+    def _go_home(self, part: Part, mask: wp.array) -> None:
+        """Put worlds back into their first skill where mask is not 0, and forget what they were asked for."""
+        if len(self.skills) > 1:
+            self._launch(home_kernel, part.count, [mask, self._home, self.parameters, part.env])
 
     def _draw(self, part: Part, mask: wp.array) -> None:
         """Draw parameters of episodes that begin where mask is not 0."""

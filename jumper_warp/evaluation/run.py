@@ -13,6 +13,7 @@ from types import ModuleType
 from typing import Any, Literal, TypeVar
 
 import numpy as np
+import torch
 from rich.console import Console
 from rich.table import Table
 
@@ -63,53 +64,25 @@ class EvaluationArgs:
         checked_threads(self.threads)
 
 
-class EvaluationRun:
-    """Opens a policy, follows it as often as wanted, and reports."""
+def conditions_of(args: EvaluationArgs) -> Conditions:
+    """Return the conditions that an experiment's flags ask for."""
+    return Conditions(args.solver, args.randomize, args.randomize, args.seed, args.device, args.threads)
+
+
+class Run:
+    """Follows robots as often as wanted, films some, and reports. Those who inherit say who acts."""
 
     folder: Path
 
-    def __init__(self, source: str | Path, modules: Iterable[ModuleType] = ()) -> None:
-        """Open a policy; call `prepare` before anything else.
-
-        Args:
-            source: Name or folder of a policy, a run's folder, or a checkpoint.
-            modules: That the user has named, for tasks that are not the project's.
-
-        Raises:
-            PolicyError: The policy cannot be used, or nothing is known of how it is evaluated.
-            CheckpointError: The checkpoint cannot be used.
-        """
-        self.started, self.source, self.modules = time.perf_counter(), source, list(modules)
-        self.policy = open_policy(source)
-        self.task = restored_task(self.policy.config, self.modules)
-        self.evaluation = evaluation_of(self.task)
+    def __init__(self) -> None:
+        """Call `prepare` before anything else."""
+        self.started = time.perf_counter()
         self.conditions, self.record = Conditions(), 0
         self.told: dict[str, Any] = {}
 
-    @classmethod
-    def of(cls, name: str, args: EvaluationArgs, evaluations: Sequence[str] = PLACES) -> EvaluationRun:
-        """Return the run of an experiment, prepared.
-
-        Args:
-            name: Of the experiment and its folder.
-            args: Flags.
-            evaluations: Keys of `EVALUATIONS`, one of which the policy must have.
-
-        Raises:
-            PolicyError: The policy cannot be used, or is evaluated otherwise.
-            CheckpointError: The checkpoint cannot be used.
-            InputError: There is no such device.
-        """
-        run = cls(args.policy)
-        if run.task.evaluation not in evaluations:
-            raise PolicyError(
-                f"this needs a policy that is evaluated by {' or '.join(evaluations)}, "
-                f"{args.policy} is of {run.task.name}, by {run.task.evaluation}"
-            )
-        conditions = Conditions(args.solver, args.randomize, args.randomize, args.seed, args.device, args.threads)
-        run.prepare(name, conditions, args.out, record=args.record)
-        run.told = {"task": run.task.name} if len(evaluations) > 1 else {}
-        return run
+    def actor(self, env: Env) -> Callable[[torch.Tensor], torch.Tensor]:
+        """Return what gives actions for the environment's observations, as `run_evaluation` takes it."""
+        raise NotImplementedError
 
     def prepare(self, name: str, conditions: Conditions, out: Path | None = None, *, record: int = 0) -> None:
         """Take up the conditions, look for the device and make the folder, before anything is simulated.
@@ -125,18 +98,6 @@ class EvaluationRun:
     def title(self) -> str:
         """What the policy is tried in."""
         return f"{self.conditions.solver}, {'randomised' if self.conditions.randomize else 'nominal'}"
-
-    def env(self, count: int, change: Callable[[TaskCfg], TaskCfg] | None = None, **scene: Any) -> Env:
-        """Return the policy's environment.
-
-        change: returns the task with the terminations that count, by default as its evaluation says; scene: more
-        settings of `Env`. Raises PolicyError as `env_of_policy`.
-        """
-        change = change or self.evaluation.for_evaluation
-        env = env_of_policy(self.policy, count, self.conditions, change=change, modules=self.modules, **scene)
-        self.policy.to(env.device)
-        self.told["torque_limit_nm"] = env.task.motors.transversal.saturation
-        return env
 
     def follow(
         self,
@@ -164,7 +125,7 @@ class EvaluationRun:
             if pictures is not None:
                 pictures()
 
-        run_evaluation(self.policy.act, env, log, watch=look)
+        run_evaluation(self.actor(env), env, log, watch=look)
         if pictures is not None:
             self._develop(pictures, film)
         return log
@@ -194,6 +155,67 @@ class EvaluationRun:
         Console().print(table)
         print(f"{time.perf_counter() - self.started:.1f} s; figures, plots and recordings in {self.folder}")
         return values
+
+
+class EvaluationRun(Run):
+    """Opens a policy, follows it as often as wanted, and reports."""
+
+    def __init__(self, source: str | Path, modules: Iterable[ModuleType] = ()) -> None:
+        """Open a policy; call `prepare` before anything else.
+
+        Args:
+            source: Name or folder of a policy, a run's folder, or a checkpoint.
+            modules: That the user has named, for tasks that are not the project's.
+
+        Raises:
+            PolicyError: The policy cannot be used, or nothing is known of how it is evaluated.
+            CheckpointError: The checkpoint cannot be used.
+        """
+        super().__init__()
+        self.source, self.modules = source, list(modules)
+        self.policy = open_policy(source)
+        self.task = restored_task(self.policy.config, self.modules)
+        self.evaluation = evaluation_of(self.task)
+
+    @classmethod
+    def of(cls, name: str, args: EvaluationArgs, evaluations: Sequence[str] = PLACES) -> EvaluationRun:
+        """Return the run of an experiment, prepared.
+
+        Args:
+            name: Of the experiment and its folder.
+            args: Flags.
+            evaluations: Keys of `EVALUATIONS`, one of which the policy must have.
+
+        Raises:
+            PolicyError: The policy cannot be used, or is evaluated otherwise.
+            CheckpointError: The checkpoint cannot be used.
+            InputError: There is no such device.
+        """
+        run = cls(args.policy)
+        if run.task.evaluation not in evaluations:
+            raise PolicyError(
+                f"this needs a policy that is evaluated by {' or '.join(evaluations)}, "
+                f"{args.policy} is of {run.task.name}, by {run.task.evaluation}"
+            )
+        run.prepare(name, conditions_of(args), args.out, record=args.record)
+        run.told = {"task": run.task.name} if len(evaluations) > 1 else {}
+        return run
+
+    def actor(self, env: Env) -> Callable[[torch.Tensor], torch.Tensor]:
+        """Return the policy's action."""
+        return self.policy.act
+
+    def env(self, count: int, change: Callable[[TaskCfg], TaskCfg] | None = None, **scene: Any) -> Env:
+        """Return the policy's environment.
+
+        change: returns the task with the terminations that count, by default as its evaluation says; scene: more
+        settings of `Env`. Raises PolicyError as `env_of_policy`.
+        """
+        change = change or self.evaluation.for_evaluation
+        env = env_of_policy(self.policy, count, self.conditions, change=change, modules=self.modules, **scene)
+        self.policy.to(env.device)
+        self.told["torque_limit_nm"] = env.task.motors.transversal.saturation
+        return env
 
 
 def shown(value: Any) -> str:

@@ -7,11 +7,13 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+import tyro
 
 from jumper_warp.evaluation.log import EvaluationEnv, EvaluationLog, Metrics, finite
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.utils.errors import InputError
 
+Velocity = tuple[float, float, float]
 AXES = ("vx", "vy", "yaw_rate")
 SKIP = 1.0
 """[s] After a command that do not count for the error."""
@@ -281,12 +283,12 @@ class VelocityFlags:
 class VelocityGoals:
     """A walk that is recorded: commands one after the other."""
 
-    vx: tuple[float, ...] = (0.8, 0.0, 0.0, -0.5, 0.6, 0.0)
-    """[m/s] Ahead, one for each command."""
-    vy: tuple[float, ...] = (0.0, 0.5, 0.0, 0.0, 0.3, 0.0)
-    """[m/s] To the left, likewise."""
-    yaw_rate: tuple[float, ...] = (0.0, 0.0, 0.8, 0.0, 0.6, 0.0)
-    """[rad/s] About z, likewise."""
+    velocity: tyro.conf.UseAppendAction[tuple[Velocity, ...]] = ()
+    """[m/s], [m/s], [rad/s] Ahead, to the left and about z; once for each command (default: a walk of six)."""
+    unless_told: tyro.conf.Suppress[tuple[Velocity, ...]] = (
+        (0.8, 0.0, 0.0), (0.0, 0.5, 0.0), (0.0, 0.0, 0.8), (-0.5, 0.0, 0.0), (0.6, 0.3, 0.6), (0.0, 0.0, 0.0),
+    )  # fmt: skip
+    """Commands if there are none; flags that are given several times would be added to a default."""
     each: float = 2.5
     """[s] From command to command."""
 
@@ -295,24 +297,27 @@ class VelocityGoals:
 
     def __post_init__(self) -> None:
         """Raises InputError: a setting is out of range."""
-        if not len(self.vx) == len(self.vy) == len(self.yaw_rate) >= 1:
-            raise InputError("vx, vy and yaw_rate must have as many numbers, one for each command")
-        check_walks(self.count, self.each, *self.vx, *self.vy, *self.yaw_rate)
+        check_walks(self.count, self.seconds, *(value for command in self.velocity for value in command))
+
+    @property
+    def velocities(self) -> tuple[Velocity, ...]:
+        """Commands, one after the other."""
+        return self.velocity or self.unless_told
 
     @property
     def seconds(self) -> float:
         """[s] Length of the recording."""
-        return self.each * len(self.vx)
+        return self.each * len(self.velocities)
 
     @property
     def notes(self) -> dict[str, Any]:
         """What to save with the recording."""
-        return {"vx_m_s": self.vx, "vy_m_s": self.vy, "yaw_rate_rad_s": self.yaw_rate}
+        return {"velocities_m_s_rad_s": self.velocities}
 
     def log(self, task: TaskCfg) -> Walks:
         """Return one robot's walk."""
-        commands = np.stack([self.vx, self.vy, self.yaw_rate], axis=1)[None].astype(float)
-        return Walks(commands, task, self.seconds, times=self.each * np.arange(len(self.vx)))
+        commands = np.array(self.velocities, dtype=float)[None]
+        return Walks(commands, task, self.seconds, times=self.each * np.arange(commands.shape[1]))
 
 
 def check_walks(robots: int, seconds: float, *commands: float) -> None:

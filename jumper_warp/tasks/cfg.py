@@ -245,4 +245,4 @@ class Handover:
     when: wp.Function
     """(view, task of the source, requested: bool) -> bool"""
     begin: wp.Function
-    """(view, task of the source) -> task of the target"""
+    """(view, task of the source) -> task of the target; then the target's `Command.give`, if the request has one."""

@@ -20,7 +20,7 @@ from typing import Any, Union, get_args, get_origin, get_type_hints
 import warp as wp
 
 import jumper_warp.tasks
-from jumper_warp.tasks.cfg import TaskCfg
+from jumper_warp.tasks.cfg import Handover, TaskCfg
 from jumper_warp.tasks.terms import RewardTerm, Term
 from jumper_warp.utils.errors import InputError
 from kernels.mdp.env import Nothing
@@ -84,6 +84,12 @@ def plain(value: Any) -> Any:
 def task_to_json(task: TaskCfg) -> dict[str, Any]:
     """Return a task as JSON can hold it. Raises TaskError: a function of it cannot be found again."""
     return {"version": VERSION, **plain(task)}
+
+
+def handover_to_json(handover: Handover) -> dict[str, Any]:
+    """Return a handover as JSON can hold it: names of its tasks and functions. Raises TaskError as `task_to_json`."""
+    tasks = {"source": handover.source.name, "target": handover.target.name}
+    return {**tasks, "when": name_of(handover.when), "begin": name_of(handover.begin)}
 
 
 def shown(value: Any) -> str:

@@ -33,6 +33,8 @@ class EnvArrays:
     clock: wp.array(dtype=int)  # policy steps made; with the seed, all state of the random numbers
     skill: wp.array(dtype=int)  # index of the task that a world is in
     request: wp.array(dtype=int)  # skill that is asked for, -1: none
+    wanted: wp.array(dtype=wp.vec4)  # command that the skill is given when it takes over
+    told: wp.array(dtype=int)  # 1: there is one
     fresh: wp.array(dtype=int)  # 1: an episode or a skill begins; observations have no past
     reward: wp.array(dtype=float)
     done: wp.array(dtype=float)  # 1: the episode ended

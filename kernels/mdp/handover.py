@@ -4,10 +4,9 @@ from typing import Any
 
 import warp as wp
 
-from ..terrain.ground import Ground
-from .env import EnvArrays, SkillSettings
+from .env import EnvArrays, Scene, SkillSettings
 from .parameters import RobotParameters, set_motor
-from .view import RobotArrays, load_view
+from .view import RobotArrays, load_view, yaw_of
 
 wp.set_module_options({"enable_backward": False})
 
@@ -22,6 +21,7 @@ def hand_over(
     """Make another skill the active one: its motors from now on, and as last action the one that holds the targets."""
     env.skill[world] = target
     env.request[world] = NONE
+    env.told[world] = 0
     env.fresh[world] = 1
     for m in range(12):
         off = robot.safe_target[m, world] - robot.default_angle[m]
@@ -31,16 +31,36 @@ def hand_over(
         set_motor(parameters, world, m)
 
 
+@wp.kernel
+def home_kernel(
+    # in
+    mask: wp.array(dtype=float),
+    home: wp.array(dtype=int),
+    # in, out
+    parameters: RobotParameters,
+    env: EnvArrays,
+):
+    """Put worlds into their first skill where mask is not 0, with its motors, and asked for none; one thread each."""
+    world = env.first + wp.tid()
+    if mask[world] == 0.0:
+        return
+    env.skill[world] = home[world]
+    env.request[world] = NONE
+    env.told[world] = 0
+    for m in range(12):
+        set_motor(parameters, world, m)
+
+
 def make_handover_kernel(handover: Any) -> wp.Kernel:
     """Return the kernel of a handover; handover: see `jumper_warp.tasks.cfg.Handover`."""
-    when, begin = handover.when, handover.begin
+    when, begin, give = handover.when, handover.begin, handover.target.command.give
 
     @wp.kernel(module="unique", enable_backward=False)
     def handover_kernel(
         # in
         source: int,
         target: int,
-        ground: Ground,
+        scene: Scene,
         skills: wp.array(dtype=SkillSettings),
         moved: wp.array(dtype=int),
         # in, out
@@ -50,13 +70,20 @@ def make_handover_kernel(handover: Any) -> wp.Kernel:
         sources: wp.array(dtype=handover.source.state),
         targets: wp.array(dtype=handover.target.state),
     ):
-        """Hand worlds over whose time has come; moved: 1 where that happened in this step; one thread per world."""
+        """Hand worlds over whose time has come, and give them the command that they were asked with.
+
+        moved: 1 where that happened in this step; one thread per world.
+        """
         world = env.first + wp.tid()
         if env.skill[world] != source or env.done[world] != 0.0 or moved[world] != 0:
             return
-        view = load_view(robot, ground, world)
+        view = load_view(robot, scene.ground, world)
         if wp.static(when)(view, sources[world], env.request[world] == target):
-            targets[world] = wp.static(begin)(view, sources[world])
+            begun = wp.static(begin)(view, sources[world])
+            if env.request[world] == target and env.told[world] != 0:
+                targets[world] = wp.static(give)(view, scene, begun, env.wanted[world], yaw_of(view.quat))
+            else:
+                targets[world] = begun
             hand_over(robot, parameters, env, skills, world, target)
             moved[world] = 1
 

@@ -19,6 +19,15 @@ from .view import RobotArrays, base_quat, base_velocity, load_view, yaw_of
 wp.set_module_options({"enable_backward": False})
 
 
+@wp.func
+def before_reset(old: Any, done: float):
+    """Return the state that a new episode follows; one that was cut off from outside counts as not begun."""
+    state = old
+    if done == 0.0:
+        state.steps = 0
+    return state
+
+
 def make_reset_kernel(task: Any) -> wp.Kernel:
     """Return the kernel that begins a task's episodes; task: see `jumper_warp.tasks.cfg.TaskCfg`."""
     reset, due, command = task.reset.func, task.command.due, task.command.draw
@@ -60,7 +69,8 @@ def make_reset_kernel(task: Any) -> wp.Kernel:
         if level >= levels.shape[0]:
             level = wp.min(int(between(draw, -2, 0.0, float(levels.shape[0]))), levels.shape[0] - 1)
         if begins:
-            state = wp.static(reset)(robot, scene, skills[skill], states[world], settings[0], levels[level], draw)
+            old = before_reset(states[world], env.done[world])
+            state = wp.static(reset)(robot, scene, skills[skill], old, settings[0], levels[level], draw)
             meet_attempts(draw)
             if lane == 0:
                 states[world] = state

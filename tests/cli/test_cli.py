@@ -442,6 +442,45 @@ def test_flags_of_another_task_and_no_ranges_are_one_line(still, capsys, args, m
     assert code == 2 and message in err[-1]
 
 
+def test_play_of_a_velocity_walks_as_long_as_is_asked(tmp_path, capsys):
+    args = ["--velocity", "0.5", "0", "0.3", "--seconds", "0.25", "--device", "cpu", "--out", str(tmp_path)]
+    code, out, _ = run(capsys, "play", "walking_flat", *args)
+    assert code == 0 and "walked" in out and "0.500" in out and "0.300" in out
+    found = {}
+    for chunk in RrdReader(tmp_path / "robot.rrd").stream().to_chunks():
+        batch = chunk.to_record_batch()
+        if "Scalars:scalars" in batch.schema.names:
+            name = str(chunk.entity_path).replace("\\", "")
+            found[name] = np.ravel(batch.column("Scalars:scalars").to_pylist())
+    (wanted,) = (values for name, values in found.items() if "yaw_rate/command of 0" in name)
+    assert wanted == pytest.approx([0.3] * 15)
+
+
+def test_play_of_a_script_records_what_the_robot_did(tmp_path, capsys):
+    script = tmp_path / "script.json"
+    script.write_text('[{"walk": [0.5, 0, 0.3], "seconds": 0.2}, {"stand": 0.1}]')
+    code, out, _ = run(capsys, "play", "--script", str(script), "--device", "cpu", "--out", str(tmp_path / "out"))
+    assert code == 0 and "success_rate" in out
+    assert json.loads((tmp_path / "out" / "figures.json").read_text())["outcome"] == "done"
+    assert (tmp_path / "out" / "course.rrd").stat().st_size > 10_000 and (tmp_path / "out" / "course.png").is_file()
+
+
+@pytest.mark.parametrize(
+    ("args", "message"),
+    [
+        (["--script", "missing.json"], "missing.json: cannot be read"),
+        (["--script", "SCRIPT"], "command 1 must have one of walk, stand, jump_up, jump_to"),
+        (["--script", "SCRIPT", "--walk", "vertical_jump"], "command 1 must have one of"),
+        (["--height", "0.9"], "the policy comes first"),
+    ],
+)
+def test_script_that_cannot_be_played_is_one_line(tmp_path, capsys, args, message):
+    (tmp_path / "script.json").write_text('[{"fly": 1}]')
+    args = [str(tmp_path / "script.json") if arg == "SCRIPT" else arg for arg in args]
+    code, _, err = run(capsys, "play", *args, "--device", "cpu")
+    assert code == 2 and message in err[-1]
+
+
 @pytest.mark.parametrize("command", ["evaluate", "play"])
 def test_folder_that_cannot_be_made_is_told_before_anything_is_simulated(tmp_path, capsys, command):
     policy = still_policy("horizontal-jump")

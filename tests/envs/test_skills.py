@@ -287,6 +287,67 @@ def test_beginning_with_a_seed_puts_the_skills_and_their_motors_back():
         np.testing.assert_array_equal(parameters_of(env)[name], values, err_msg=name)
 
 
+def test_a_command_that_came_with_the_request_is_given_as_the_skill_takes_over():
+    env = make(JUMP, HOLD, skill=1, handovers=(TO_JUMP, TO_HOLD), randomize=False, noise=False)
+    followed(env, torch.zeros((3, N, 12)))
+    commands = np.zeros((N, 3))
+    commands[:, 2] = np.linspace(0.6, 0.9, N)
+    env.request(0, ASKED, commands)
+    env.request(0, np.arange(N) == 7)
+    followed(env, torch.zeros((1, N, 12)))
+    states = env.skills[0].states.numpy()
+    np.testing.assert_allclose(states["goal"][ASKED, 2], commands[ASKED, 2], rtol=1e-6)
+    assert (states["command_step"][ASKED] == 0).all() and states["command_step"][7] == 1000
+    first, _ = JUMP.layout("policy")["wanted_height"]
+    np.testing.assert_allclose(env.skills[0].obs["policy"][ASKED, first], commands[ASKED, 2], rtol=1e-6)
+    assert not env.worlds.told.numpy()[ASKED].any() and (env.worlds.skill.numpy()[8:] == 1).all()
+    with pytest.raises(ValueError, match=r"commands must have shape \(16, 1 to 4\)"):
+        env.request(0, ASKED, np.zeros((3, 2)))
+
+
+@pytest.mark.parametrize("begin", ["reset", "evaluation_reset", "ended"])
+def test_new_episodes_begin_in_the_first_skill_and_forget_requests(begin):
+    """Worlds of the last case end by themselves; its others stay as they are."""
+    env, fresh = (make(JUMP, HOLD, skill=1, handovers=(TO_JUMP, TO_HOLD), randomize=False) for _ in range(2))
+    followed(env, torch.zeros((3, N, 12)), request_at=1)
+    env.request(1, np.arange(N) == 4, np.ones((N, 1)))
+    new = np.full(N, True)
+    if begin == "reset":
+        env.reset()
+    elif begin == "evaluation_reset":
+        env.evaluation_reset(np.full((N, 1), 0.3))
+    else:
+        new = np.arange(N) == 3
+        records = env.skills[0].states.numpy().copy()
+        records["steps"][3] = 10_000  # too long
+        env.skills[0].states.assign(records)
+        env.request(1, new)
+        followed(env, torch.zeros((1, N, 12)))
+        assert env.done[3]
+    assert (env.worlds.skill.numpy()[new] == 1).all() and (env.worlds.request.numpy()[new] == -1).all()
+    assert not env.worlds.told.numpy()[new].any()
+    assert (env.worlds.skill.numpy()[(~new) & ASKED & (np.arange(N) != 4)] == 0).all()
+    for name, values in parameters_of(fresh).items():
+        np.testing.assert_array_equal(parameters_of(env)[name][..., new], values[..., new], err_msg=name)
+
+
+def test_figures_and_configuration_are_of_all_skills():
+    env = make(JUMP, HOLD, skill=SKILL.astype(int), handovers=(TO_JUMP, TO_HOLD))
+    followed(env, 0.5 * random_actions(N, 130))
+    ended = {
+        name: sum(v for k, v in env.skills[i].metrics().items() if "Termination" in k) for i, name in enumerate("ab")
+    }
+    assert min(ended.values()) > 0.9
+    followed(env, 0.5 * random_actions(N, 130))
+    figures = env.metrics()
+    assert "Episode_Reward/jump_height" in figures and "hold-height/Episode_Reward/near_goal" in figures
+    assert sum(v for k, v in figures.items() if k.startswith("hold-height/Episode_Termination")) == pytest.approx(1.0)
+    config = env.config()
+    assert [task["name"] for task in config["tasks"]] == ["vertical-jump", "hold-height"]
+    assert config["first_skill"] == SKILL.astype(int).tolist()
+    assert config["handovers"][0]["when"].endswith(":when_asked_to_jump")
+
+
 # ---------------------------------------------------------------- what cannot be
 
 

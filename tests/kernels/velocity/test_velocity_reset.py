@@ -96,17 +96,19 @@ def test_commands_of_the_last_level_reach_far_ahead_but_not_across_as_well(env):
 
 
 @pytest.mark.parametrize(
-    ("fields", "level", "falls"),
-    [(CALM, 4, 0.0), (CALM | {"error_xy": 200.0}, 3, 0.0), (CALM | {"steps": 700}, 2, 1.0),
-     (CALM | {"steps": 0}, 3, 0.0), (CALM | {"steps": 700, "limit": (1e-3, 1e-3)}, 3, 0.0)],
-    ids=["followed", "not followed", "fell", "not begun", "left the map"],
+    ("fields", "ended", "level", "falls"),
+    [(CALM, 1.0, 4, 0.0), (CALM | {"error_xy": 200.0}, 1.0, 3, 0.0),
+     (CALM | {"steps": 700}, 1.0, 2, 1.0), (CALM | {"steps": 700}, 0.0, 3, 0.0),
+     (CALM | {"steps": 0}, 1.0, 3, 0.0), (CALM | {"steps": 700, "limit": (1e-3, 1e-3)}, 1.0, 3, 0.0)],
+    ids=["followed", "not followed", "fell", "cut off", "not begun", "left the map"],
 )  # fmt: skip
-def test_levels_follow_how_the_episode_went(env, fields, level, falls):
+def test_levels_follow_how_the_episode_went(env, fields, ended, level, falls):
     q = env.sim.joint_q().copy()
     q[:, :2] = 0.05
     env.sim.state.joint_q.assign(q.ravel())
     edit(env, command_level=3, falls=0.0, limit=(0.0, 0.0))
     edit(env, **fields)
+    env.done.fill_(ended)
     env.reset()
     state = states_of(env)
     assert set(state["command_level"]) == {level} and set(state["falls"]) == {falls}

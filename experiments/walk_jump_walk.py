@@ -1,0 +1,123 @@
+"""The paper's test of several policies on one robot: walk, jump up, walk, jump ahead, walk.
+
+    python experiments/walk_jump_walk.py --robots 200 --out outputs/walk_jump_walk
+
+Every robot walks after commands of its own, redrawn every two seconds within 0.8 m/s and 0.8 rad/s, jumps to 0.75 m,
+walks, jumps 0.85 m ahead, and walks. `--course` gives every robot ten commands of its own instead: to walk, to turn,
+to jump up and to jump to a place, drawn at random. A jump is commanded while the robot walks: it comes to a stop,
+stands, jumps, and walks again. `success_rate` is the share of robots that carried out every command without a fall.
+`--randomize` adds the jumps' randomisation, noise, latency and pushes; `--solver mujoco` is a check against physics
+that the policies were not trained on, for which fewer robots will do.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import tyro
+
+from jumper_warp.cli.main import run_command
+from jumper_warp.evaluation.course_metrics import course_metrics, draw_course
+from jumper_warp.evaluation.courses import Course
+from jumper_warp.evaluation.places import random_headings
+from jumper_warp.evaluation.plots import drawn
+from jumper_warp.evaluation.run import EvaluationArgs
+from jumper_warp.evaluation.scripts import ScriptStep
+from jumper_warp.evaluation.skills import SkillRun
+from jumper_warp.policies.skills import SkillNames
+from jumper_warp.utils.errors import InputError
+
+REACH, EACH = 0.8, 2.0
+"""[m/s] and [rad/s] of the commands; [s] from one to the next."""
+HEIGHT, DISTANCE = 0.75, 0.85
+"""[m] Of the paper's two jumps."""
+WALKS = (3, 3, 2)
+"""Commands before, between and after the jumps."""
+COMMANDS = 10
+"""In a course."""
+PROBABILITIES = (0.4, 0.2, 0.2, 0.2)
+"""Of walking, turning, jumping up and jumping to a place."""
+PAPER = {"rmse_vx_m_s": 0.17, "rmse_vy_m_s": 0.05, "rmse_yaw_rate_rad_s": 0.12}
+"""The paper's figures, one test on the robot."""
+
+
+@dataclass(frozen=True)
+class Args(EvaluationArgs):
+    """Flags."""
+
+    policy: str = "walking_flat"
+    """Policy that walks: name or folder, a run's folder, or a checkpoint."""
+    jump_up: str = "vertical_jump"
+    """Policy that jumps to heights."""
+    jump_to: str = "horizontal_jump"
+    """Policy that jumps to places."""
+    robots: int = 200
+    """Number of robots, each with commands of its own."""
+    course: bool = False
+    """Ten random commands a robot instead of the paper's test."""
+
+    def __post_init__(self) -> None:
+        """Check the values."""
+        super().__post_init__()
+        if not 1 <= self.robots <= 20_000:
+            raise InputError(f"robots must be in 1 to 20000, got {self.robots}")
+
+
+def walks(rng: np.random.Generator, count: int) -> list[ScriptStep]:
+    """Return commands to walk anywhere."""
+    return [ScriptStep("walk", tuple(rng.uniform(-REACH, REACH, 3).tolist()), EACH) for _ in range(count)]
+
+
+def paper_script(rng: np.random.Generator) -> list[ScriptStep]:
+    """Return the paper's test with drawn velocities."""
+    up, ahead = ScriptStep("jump_up", (HEIGHT,)), ScriptStep("jump_to", (DISTANCE, 0.0))
+    before, between, after = (walks(rng, count) for count in WALKS)
+    return [*before, up, *between, ahead, *after]
+
+
+def random_script(rng: np.random.Generator) -> list[ScriptStep]:
+    """Return ten commands: a jump of each kind, the others drawn."""
+    kinds = ["jump_up", "jump_to", *rng.choice(["walk", "turn", "jump_up", "jump_to"], COMMANDS - 2, p=PROBABILITIES)]
+    script = []
+    for kind in rng.permutation(kinds):
+        if kind == "walk":
+            script += walks(rng, 1)
+        elif kind == "turn":
+            rate = float(rng.choice([-1.0, 1.0]) * rng.uniform(0.3, REACH))
+            script.append(ScriptStep("walk", (0.0, 0.0, rate), EACH))
+        elif kind == "jump_up":
+            script.append(ScriptStep("jump_up", (float(rng.uniform(0.55, 0.95)),)))
+        else:
+            script.append(ScriptStep("jump_to", (float(rng.uniform(0.4, 1.1)), float(rng.uniform(-0.2, 0.2)))))
+    return script
+
+
+def plot(run: SkillRun, course: Course, world: int) -> None:
+    """Draw what one robot was told and did."""
+    with drawn(run.folder / "course.png", 5, 1, figsize=(10, 9), sharex=True) as axes:
+        draw_course(axes, course, world)
+        axes[0].set_title(f"walk, jump, walk: robot {world} of {len(course.end)}, {run.title}")
+
+
+def scripts(args: Args) -> Sequence[Sequence[ScriptStep]]:
+    """Return what every robot is to do."""
+    rng = np.random.default_rng(args.seed)
+    make = random_script if args.course else paper_script
+    return [make(rng) for _ in range(args.robots)]
+
+
+def main(args: Args) -> dict:
+    """Run the test and return its figures."""
+    names = SkillNames(args.policy, args.jump_up, args.jump_to)
+    run = SkillRun.of("course" if args.course else "walk_jump_walk", args, names)
+    env = run.env(args.robots)
+    course = Course(scripts(args), random_headings(args.robots, args.seed))
+    run.follow(env, course, film="course" if args.course else "walk_jump_walk")
+    plot(run, course, 0)
+    return run.report(course_metrics(course), {} if args.course else PAPER)
+
+
+if __name__ == "__main__":
+    run_command(lambda: main(tyro.cli(Args)))

@@ -1,0 +1,251 @@
+"""Courses: one robot in every world walks and jumps as its script says, and switches between its skills for it.
+
+For a jump the robot is commanded to stand and asked for the jump with its goal. The jump takes over once the robot is
+at rest, and hands back by itself (`kernels.skills.handovers`). A robot that does not come to rest walks on a little.
+Velocities go from one command to the next at a limited rate.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from jumper_warp.evaluation.log import EvaluationLog, finite
+from jumper_warp.evaluation.scripts import ScriptStep
+from jumper_warp.evaluation.velocities import AXES, SKIP, body_velocity
+from jumper_warp.policies.skills import JUMP_TO, JUMP_UP, WALK
+from jumper_warp.tasks.switching import FALLS
+from jumper_warp.utils.errors import InputError
+
+SKILL_OF = {"walk": WALK, "stand": WALK, "jump_up": JUMP_UP, "jump_to": JUMP_TO}
+SLEW = 1.25
+"""[m/s^2], [rad/s^2] How fast a velocity is taken from one command to the next."""
+NUDGE_AFTER, NUDGE_FOR = 2.5, 0.5
+"""[s] Without a jump after which a robot walks on, and how long, so that it plants its paws anew."""
+NUDGE = (0.25, 0.0, 0.0)
+"""[m/s], [rad/s] How it does."""
+PATIENCE = 15.0
+"""[s] After which a jump that is not over has failed."""
+STUCK, DONE = len(FALLS), len(FALLS) + 1
+OUTCOMES = (*(term.name for term in FALLS), "stuck", "done")
+SETTLED, LANDED_PHASE = 0.1, 2
+"""[m] Error up to which a jump is on its goal; the jump's phase after touchdown."""
+
+
+@dataclass
+class Course(EvaluationLog):
+    """What became of every robot's course; nothing of a robot counts after its end."""
+
+    scripts: Sequence[Sequence[ScriptStep]]
+    """One a robot, all of as many commands."""
+    headings: np.ndarray | float = 0.0
+    """[rad] (robots,) At the start."""
+    end: np.ndarray = field(init=False)
+    """(robots,) Index in OUTCOMES, -1 while under way."""
+    current: np.ndarray = field(init=False)
+    """(robots,) Number of the command under way; that of all commands after the last."""
+    began: np.ndarray = field(init=False)
+    """(robots, commands) Policy step in which each command came, -1: it did not."""
+    switched: np.ndarray = field(init=False)
+    """(robots, commands) Policy step in which the jump skill took over."""
+    takeoff: np.ndarray = field(init=False)
+    """(robots, commands) Policy step of the takeoff."""
+    over: np.ndarray = field(init=False)
+    """(robots, commands) Policy step in which the command was over."""
+    apex: np.ndarray = field(init=False)
+    """[m] (robots, commands) Largest base height of the jump."""
+    offset: np.ndarray = field(init=False)
+    """[m] (robots, commands, 2) From the jump's goal to the base as walking takes over, world axes."""
+    velocity: list[np.ndarray] = field(default_factory=list, init=False)
+    """(robots, 3) After every policy step: ahead, left [m/s], about z [rad/s]; not a number after the end."""
+    wanted: list[np.ndarray] = field(default_factory=list, init=False)
+    """(robots, 3) Velocity that the policy was commanded; not a number while walking is not active."""
+    counts: list[np.ndarray] = field(default_factory=list, init=False)
+    """(robots,) Whether the step counts for the tracking error: walking, SKIP seconds after a command."""
+    skills: list[np.ndarray] = field(default_factory=list, init=False)
+    """(robots,) Active skill."""
+    height: list[np.ndarray] = field(default_factory=list, init=False)
+    """[m] (robots,) Of the base."""
+    force: list[np.ndarray] = field(default_factory=list, init=False)
+    """[N] (robots, 4) On each paw."""
+
+    row = "robot"
+    spacing = 2.0
+
+    def __post_init__(self) -> None:
+        """Begin with nothing done. Raises InputError: scripts of different lengths."""
+        lengths = {len(script) for script in self.scripts}
+        if len(lengths) != 1 or 0 in lengths:
+            raise InputError(f"a course needs scripts of one length, got {sorted(lengths)} commands")
+        n, k = len(self.scripts), lengths.pop()
+        self.target = np.array([[SKILL_OF[step.kind] for step in script] for script in self.scripts])
+        self.goal = np.array([[step.goal for step in script] for script in self.scripts])
+        self.lasts = np.array([[step.seconds for step in script] for script in self.scripts])
+        self.end, self.current, self.step_dt = np.full(n, -1), np.zeros(n, dtype=int), 1.0 / 60.0
+        self.began, self.switched, self.takeoff, self.over = (np.full((n, k), -1) for _ in range(4))
+        self.began[:, 0] = 0
+        self.apex, self.offset = np.full((n, k), np.nan), np.full((n, k, 2), np.nan)
+        self._skill, self._aim, self._told = np.zeros(n, dtype=int), np.zeros((n, 3)), np.zeros((n, 3))
+
+    @property
+    def seconds(self) -> float:
+        """[s] In which every course has ended."""
+        return float((self.lasts.sum(axis=1) + PATIENCE * (self.target != WALK).sum(axis=1)).max()) + 1.0
+
+    def begin(self, env: Any) -> None:
+        """Stand every robot in the default pose with its first command."""
+        self.step_dt = env.step_dt
+        first = np.where(self.target[:, :1] == WALK, self.goal[:, 0], 0.0)
+        self._aim = first
+        env.evaluation_reset(self._told, self.headings)
+        self._ask(env, np.full(len(self.end), True))
+
+    def look(self, env: Any) -> dict[str, np.ndarray]:
+        """Return what is to be known of every robot, and of its last jump of each kind."""
+        q, qd = env.sim.joint_q(), env.sim.joint_qd()
+        seen = {
+            "base_pos": q[:, :3].copy(), "base_quat": q[:, 3:7].copy(), "base_ang_vel": qd[:, 3:6].copy(),
+            "base_vel": env.sim.base_velocity(), "skill": env.worlds.skill.numpy().copy(),
+            "ending": env.worlds.ending.numpy().copy(),
+            "force": np.linalg.norm(env.sim.paw_force.numpy(), axis=2).T,
+        }  # fmt: skip
+        rows = np.arange(len(q))
+        kind = self.target[rows, np.minimum(self.current, self.target.shape[1] - 1)]
+        for name in ("max_height", "goal", "took_off", "phase"):
+            of_kind = [env.skills[skill].states.numpy()[name] for skill in (JUMP_UP, JUMP_TO)]
+            seen[f"jump_{name}"] = np.array(of_kind)[np.where(kind == JUMP_TO, 1, 0), rows]
+        return seen
+
+    def follow(self, env: Any) -> bool:
+        """Look at the environment after a policy step, and command and ask for what is due."""
+        before, was = self.current.copy(), self._skill
+        ended = super().follow(env)
+        rows, running = np.arange(len(before)), self.end < 0
+        at = np.minimum(self.current, self.target.shape[1] - 1)
+        fresh, jumping = running & (self.current > before), self.target[rows, at] != WALK
+        self._aim[fresh] = np.where(jumping[fresh, None], 0.0, self.goal[rows, at][fresh])
+        waited = (len(self.skills) - self.began[rows, at]) * self.step_dt
+        late = running & jumping & (self._skill == WALK) & (waited >= NUDGE_AFTER)
+        nudged = np.where((np.mod(waited, NUDGE_AFTER) < NUDGE_FOR)[:, None], NUDGE, 0.0)
+        self._aim[late] = nudged[late]
+        told = self._told + np.clip(self._aim - self._told, -SLEW * self.step_dt, SLEW * self.step_dt)
+        told[self._skill != WALK] = 0.0
+        changed = (self._skill == WALK) & ((told != self._told).any(axis=1) | (was != WALK))
+        self._told = told
+        if changed.any():
+            env.command(told, changed)
+        self._ask(env, fresh)
+        return ended
+
+    def _ask(self, env: Any, worlds: np.ndarray) -> None:
+        """Ask for the jumps that are the commands of some robots."""
+        rows, at = np.arange(len(worlds)), np.minimum(self.current, self.target.shape[1] - 1)
+        for skill in (JUMP_UP, JUMP_TO):
+            asked = worlds & (self.target[rows, at] == skill)
+            if asked.any():
+                env.request(skill, asked, self.goal[rows, at])
+
+    def update(self, arrays: dict[str, np.ndarray], step_dt: float) -> bool:
+        """Take in a policy step; return whether all courses have ended."""
+        self.step_dt, last = step_dt, self.target.shape[1] - 1
+        skill, was, step = arrays["skill"], self._skill, len(self.skills) + 1
+        running = self.end < 0
+        self._keep(arrays, running, was, step)
+        fell = running & (arrays["ending"] >= 0)
+        self.end[fell] = arrays["ending"][fell]
+        row = np.flatnonzero(running & ~fell)
+        at = (row, self.current[row])
+        kind, since = self.target[at], step - self.began[at]
+        jumps = kind != WALK
+        entered = jumps & (skill[row] == kind) & (was[row] != kind)
+        self.switched[row[entered], self.current[row[entered]]] = step
+        left = jumps & (skill[row] != kind) & (was[row] == kind)
+        took_off = jumps & (was[row] == kind) & (arrays["jump_took_off"][row] == 1)
+        self.takeoff[row[took_off], self.current[row[took_off]]] = step
+        for name, values in (
+            ("apex", arrays["jump_max_height"]),
+            ("offset", arrays["base_pos"][:, :2] - arrays["jump_goal"][:, :2]),
+        ):
+            getattr(self, name)[row[left], self.current[row[left]]] = values[row[left]]
+        walked = ~jumps & (since >= np.round(self.lasts[at] / step_dt))
+        finished = walked | left
+        no_jump = left & (self.takeoff[at] < 0)
+        stuck = jumps & ~left & (since >= round(PATIENCE / step_dt))
+        self.over[row[finished], self.current[row[finished]]] = step
+        self.end[row[stuck | no_jump]] = STUCK
+        self.end[row[finished & ~no_jump & (self.current[row] == last)]] = DONE
+        self.current[row[finished]] += 1
+        fresh = row[finished & (self.current[row] <= last)]
+        self.began[fresh, self.current[fresh]] = step
+        self._skill = skill
+        return bool((self.end >= 0).all())
+
+    def _keep(self, arrays: dict[str, np.ndarray], running: np.ndarray, was: np.ndarray, step: int) -> None:
+        """Keep the histories of a policy step, in which the skills of before it were active."""
+        rows = np.arange(len(running))
+        at = np.minimum(self.current, self.target.shape[1] - 1)
+        alive, walking = running[:, None], (was == WALK)[:, None]
+        self.velocity.append(np.where(alive, body_velocity(arrays), np.nan).astype(np.float32))
+        self.wanted.append(np.where(alive & walking, self._told, np.nan).astype(np.float32))
+        settled = step - self.began[rows, at] > round(SKIP / self.step_dt)
+        self.counts.append(running & walking[:, 0] & settled & (self.target[rows, at] == WALK))
+        self.skills.append(was.copy())
+        self.height.append(arrays["base_pos"][:, 2].copy())
+        self.force.append(arrays["force"].astype(np.float32))
+
+    @property
+    def fallen(self) -> np.ndarray:
+        """Whether each robot fell."""
+        return (self.end >= 0) & (self.end < STUCK)
+
+    @property
+    def outcomes(self) -> np.ndarray:
+        """What became of each robot."""
+        return np.array([*OUTCOMES, "under_way"])[self.end]
+
+    @property
+    def apex_error(self) -> np.ndarray:
+        """[m] (robots, commands) Apex less commanded height; not a number for what is no jump up, or was not made."""
+        return np.where(self.target == JUMP_UP, self.apex - self.goal[..., 2], np.nan)
+
+    @property
+    def landing_error(self) -> np.ndarray:
+        """[m] (robots, commands) Distance from the goal as walking takes over; not a number for other commands."""
+        return np.where(self.target == JUMP_TO, np.linalg.norm(self.offset, axis=-1), np.nan)
+
+    @property
+    def on_goal(self) -> np.ndarray:
+        """(robots, commands) Whether a command was carried out, jumps within SETTLED of their goal."""
+        off = np.where(self.target == JUMP_UP, np.abs(self.apex_error), self.landing_error)
+        return (self.over >= 0) & ((self.target == WALK) | (np.nan_to_num(off, nan=np.inf) <= SETTLED))
+
+    def columns(self) -> dict[str, list]:
+        """Return for each robot how it ended, how many commands it carried out, and its errors."""
+        apex, landing = (np.abs(each) for each in (self.apex_error, self.landing_error))
+        worst = {"apex_error_m": _worst(apex), "landing_error_m": _worst(landing)}
+        done = {"end": self.outcomes.tolist(), "commands_done": (self.over >= 0).sum(axis=1).tolist()}
+        return done | {name: finite(values) for name, values in worst.items()}
+
+    def series(self, worlds: Sequence[int]) -> dict[str, float]:
+        """Return velocity and command, height and active skill."""
+        series = {}
+        for world in worlds:
+            for i, (axis, unit) in enumerate(zip(AXES, ("m/s", "m/s", "rad/s"), strict=True)):
+                series[f"{axis}/robot {world} [{unit}]"] = float(self.velocity[-1][world, i])
+                series[f"{axis}/command of {world} [{unit}]"] = float(np.nan_to_num(self.wanted[-1][world, i]))
+            series[f"height/base of {world} [m]"] = float(self.height[-1][world])
+            series[f"skill/of {world} [1]"] = float(self.skills[-1][world])
+        return series
+
+    def notes(self, worlds: Sequence[int]) -> dict[str, Any]:
+        """Return the scripts."""
+        return {"scripts": [[[step.kind, *step.values] for step in self.scripts[world]] for world in worlds]}
+
+
+def _worst(values: np.ndarray) -> np.ndarray:
+    """Return the largest number of each row, not a number where there is none."""
+    known = np.isfinite(values)
+    return np.where(known.any(axis=1), np.where(known, values, -np.inf).max(axis=1), np.nan)

@@ -1,0 +1,113 @@
+"""What a robot is to do, one command after the other, and how it is written in a file.
+
+A script is a JSON list of commands: `{"walk": [vx, vy, yaw_rate], "seconds": s}` ([m/s], [rad/s], [s]),
+`{"stand": seconds}`, `{"jump_up": height}` (of the base at the apex [m]) and `{"jump_to": [ahead, left]}` ([m]).
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from jumper_warp.utils.errors import InputError
+
+KINDS = {"walk": 3, "stand": 1, "jump_up": 1, "jump_to": 2}
+"""Commands, and how many numbers each takes."""
+LIMITS = {"walk": 10.0, "stand": 600.0, "jump_up": 2.0, "jump_to": 5.0}
+"""Largest number of each."""
+LONGEST = 600.0
+"""[s] Of walking and standing in one script."""
+MOST_COMMANDS = 1000
+MAX_BYTES = 2**20
+
+
+@dataclass(frozen=True)
+class ScriptStep:
+    """One command."""
+
+    kind: str
+    """Of `KINDS`."""
+    values: tuple[float, ...] = (0.0, 0.0, 0.0)
+    """walk: velocity ahead, to the left [m/s], about z [rad/s]; jump_up: height [m]; jump_to: place ahead, left [m]."""
+    seconds: float = 0.0
+    """[s] How long to walk or stand."""
+
+    @property
+    def jumps(self) -> bool:
+        """Whether this is a jump."""
+        return self.kind.startswith("jump")
+
+    @property
+    def goal(self) -> tuple[float, float, float]:
+        """What the environment is commanded: a velocity, or a jump's place and height."""
+        if self.kind == "jump_up":
+            return (0.0, 0.0, self.values[0])
+        return (*self.values, *(3 - len(self.values)) * (0.0,))
+
+
+def read_script(path: Path) -> tuple[ScriptStep, ...]:
+    """Return the commands of a file. Raises InputError: it cannot be read, or a command is malformed."""
+    try:
+        size = path.stat().st_size
+        if size > MAX_BYTES:
+            raise InputError(f"{path}: larger than {MAX_BYTES >> 20} MiB")
+        content = json.loads(path.read_bytes())
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror})") from error
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"{path}: not JSON ({error!s:.100})") from error
+    try:
+        return parse_script(content)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error
+
+
+def parse_script(content: Any) -> tuple[ScriptStep, ...]:
+    """Return the commands of a script as JSON holds it. Raises InputError: one of them is malformed."""
+    if not isinstance(content, list) or not 1 <= len(content) <= MOST_COMMANDS:
+        raise InputError(f"a script is a list of 1 to {MOST_COMMANDS} commands, such as {{'walk': [0.5, 0, 0.3]}}")
+    steps = tuple(_step(i, item) for i, item in enumerate(content))
+    total = sum(step.seconds for step in steps)
+    if not total <= LONGEST:
+        raise InputError(f"walking and standing take {total:g} s, at most {LONGEST:g} are allowed")
+    return steps
+
+
+def _step(index: int, item: Any) -> ScriptStep:
+    where = f"command {index + 1}"
+    kinds = [key for key in item if key in KINDS] if isinstance(item, dict) else []
+    if len(kinds) != 1:
+        raise InputError(f"{where} must have one of {', '.join(KINDS)}, got {item!s:.60}")
+    kind = kinds[0]
+    unknown = set(item) - {kind} - ({"seconds"} if kind == "walk" else set())
+    if unknown:
+        raise InputError(f"{where}: {kind} has no {sorted(map(str, unknown))[0]!r:.40}")
+    given = item[kind]
+    values = _numbers(f"{where}: {kind}", given if isinstance(given, list) else [given], KINDS[kind], LIMITS[kind])
+    if kind == "stand":
+        return ScriptStep("stand", seconds=_seconds(where, values[0]))
+    if kind == "walk":
+        return ScriptStep("walk", values, _seconds(where, item.get("seconds", 2.0)))
+    if kind == "jump_up" and not values[0] > 0.0:
+        raise InputError(f"{where}: jump_up needs a positive height [m], got {values[0]:g}")
+    return ScriptStep(kind, values)
+
+
+def _seconds(where: str, value: Any) -> float:
+    (seconds,) = _numbers(f"{where}: seconds", [value], 1, LONGEST)
+    if not seconds > 0.0:
+        raise InputError(f"{where}: seconds must be positive, got {seconds:g}")
+    return seconds
+
+
+def _numbers(where: str, values: Sequence[Any], count: int, most: float) -> tuple[float, ...]:
+    good = len(values) == count and all(
+        isinstance(v, int | float) and not isinstance(v, bool) and math.isfinite(v) and abs(v) <= most for v in values
+    )
+    if not good:
+        raise InputError(f"{where} takes {count} number{'s' * (count > 1)} within {most:g}, got {values!s:.60}")
+    return tuple(float(v) for v in values)

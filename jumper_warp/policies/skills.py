@@ -1,0 +1,80 @@
+"""Several policies on one robot: walking and jumps."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import torch
+
+from jumper_warp.policies.policy import Policy
+from jumper_warp.policies.restore import Conditions, open_policy, restored_task
+from jumper_warp.policies.spec import PolicyError
+from jumper_warp.tasks.cfg import TaskCfg
+from jumper_warp.tasks.switching import skills_and_handovers
+from jumper_warp.utils.errors import InputError
+
+if TYPE_CHECKING:
+    from jumper_warp.envs.env import Env
+
+WALK, JUMP_UP, JUMP_TO = range(3)
+"""Indices of the skills in the environment."""
+
+
+@dataclass(frozen=True)
+class SkillNames:
+    """Policies of one robot, by name or folder."""
+
+    walk: str = "walking_flat"
+    """Follows velocities."""
+    jump_up: str = "vertical_jump"
+    """Jumps to a height."""
+    jump_to: str = "horizontal_jump"
+    """Jumps to a place."""
+
+
+class SkillPolicies:
+    """Opens the policies of one robot, makes its environment, and acts in it."""
+
+    def __init__(self, names: SkillNames | None = None) -> None:
+        """Open policies. Raises PolicyError or CheckpointError: one cannot be used, or is of another kind of task."""
+        self.names = SkillNames() if names is None else names
+        sources = (self.names.walk, self.names.jump_up, self.names.jump_to)
+        self.policies = [open_policy(source) for source in sources]
+        self.tasks = [self._task(policy, source) for policy, source in zip(self.policies, sources, strict=True)]
+        for task, kinds in zip(self.tasks, (("velocity",), ("height",), ("place", "around")), strict=True):
+            if task.evaluation not in kinds:
+                raise PolicyError(
+                    f"this needs a policy that is evaluated by {' or '.join(kinds)}, got one of {task.name}"
+                )
+        try:
+            self.skills, self.handovers = skills_and_handovers(self.tasks[0], tuple(self.tasks[1:]))
+        except InputError as error:
+            raise PolicyError(str(error)) from error
+
+    @staticmethod
+    def _task(policy: Policy, source: str | Path) -> TaskCfg:
+        task = restored_task(policy.config)
+        if task.observation_names != policy.interface.observation_names:
+            raise PolicyError(f"{source}: its observation is not the one that this version of its task gives")
+        return task
+
+    def env(self, count: int, conditions: Conditions, **scene: Any) -> Env:
+        """Return an environment of robots that walk first; scene: more settings of `Env`. Raises as `Env`."""
+        from jumper_warp.envs.env import Env
+
+        env = Env(
+            self.skills, count, seed=conditions.seed, device=conditions.device, solver=conditions.solver,
+            randomize=conditions.randomize, noise=conditions.noise, auto_reset=False, threads=conditions.threads,
+            skill=WALK, handovers=self.handovers, **scene,
+        )  # fmt: skip
+        for policy in self.policies:
+            policy.to(env.device)
+        return env
+
+    def act(self, env: Env) -> torch.Tensor:
+        """Return every skill's actions for its observations, (skills, num_envs, 12); nothing waits for the device."""
+        return torch.stack(
+            [policy.act(skill.obs["policy"]) for policy, skill in zip(self.policies, env.skills, strict=True)]
+        )

@@ -1,0 +1,77 @@
+"""When walking and jumping follow each other, and how each begins; the robot itself is left as it is."""
+
+import warp as wp
+
+from ..jump.state import LANDED, STANCE, JumpState
+from ..mdp.view import RobotView, tilt, yaw_of
+from ..velocity.state import VelocityState
+
+wp.set_module_options({"enable_backward": False})
+
+REST_SPEED = wp.constant(0.10)  # [m/s] of a base at rest
+REST_SPIN = wp.constant(0.30)  # [rad/s]
+LEVEL = wp.constant(0.14)  # [rad] tilt of a base that stands
+NEAR = wp.constant(0.44)  # [rad] motors farther from the default pose are not near it
+PLANTED = wp.constant(0.3)  # [s] that a paw has been down
+FALLING = wp.constant(0.35)  # [rad] tilt at which walking takes over from a landing
+LANDED_STEPS = wp.constant(18)  # policy steps after touchdown before which a landing is not over
+RECOVER_STEPS = wp.constant(60)  # policy steps after touchdown after which walking takes over
+NO_JUMP_STEPS = wp.constant(150)  # policy steps without a takeoff after which it does
+NEVER = wp.constant(1_000_000)  # policy step of a command that has not come
+
+
+@wp.func
+def at_rest(view: RobotView) -> bool:
+    """Return whether a robot stands: on four paws for a while, the base level, slow and not turning."""
+    return (
+        view.contacts == 4
+        and wp.min(view.contact_time) > PLANTED
+        and wp.length(view.lin_vel) < REST_SPEED
+        and wp.length(view.ang_vel) < REST_SPIN
+        and tilt(view) < LEVEL
+    )
+
+
+@wp.func
+def near_default(view: RobotView) -> bool:
+    """Return whether all motors are near the default pose."""
+    most = float(0.0)
+    for m in range(12):
+        most = wp.max(most, wp.abs(view.angle[m] - view.default_angle[m]))
+    return most < NEAR
+
+
+@wp.func
+def come_to_a_stop(view: RobotView, task: VelocityState, requested: bool) -> bool:
+    """Walking to a jump: asked for, commanded to stand, at rest, and near the default pose."""
+    return requested and task.standing == 1 and at_rest(view) and near_default(view)
+
+
+@wp.func
+def landed_or_lost(view: RobotView, task: JumpState, requested: bool) -> bool:
+    """A jump to walking: landed and at rest; or as recovery, landed badly, not at rest in time or not taken off."""
+    if task.phase == LANDED:
+        over = at_rest(view) or tilt(view) > FALLING or task.phase_steps >= RECOVER_STEPS
+        return task.phase_steps >= LANDED_STEPS and over
+    return task.phase == STANCE and task.steps >= NO_JUMP_STEPS
+
+
+@wp.func
+def begin_walk(view: RobotView, task: JumpState) -> VelocityState:
+    """Return the state of walking, commanded to stand."""
+    new = VelocityState()
+    new.standing = 1
+    return new
+
+
+@wp.func
+def begin_jump(view: RobotView, task: VelocityState) -> JumpState:
+    """Return the state of a jump whose command has not come; that of the request is given at once."""
+    new = JumpState()
+    new.heading = yaw_of(view.quat)
+    new.start = view.pos
+    new.goal = view.pos
+    new.goal_ground = view.pos[2] - view.height
+    new.max_height = view.pos[2]
+    new.command_step = NEVER
+    return new

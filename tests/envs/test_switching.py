@@ -1,0 +1,165 @@
+"""The shipped policies on one robot: which skill follows which, and that a switch touches nothing but the skill."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+import warp as wp
+
+from jumper_warp.envs.env import Env
+from jumper_warp.evaluation.courses import Course
+from jumper_warp.evaluation.scripts import parse_script
+from jumper_warp.policies.restore import Conditions
+from jumper_warp.policies.skills import JUMP_TO, JUMP_UP, WALK, SkillNames, SkillPolicies
+from jumper_warp.policies.spec import PolicyError
+
+N = 2
+SCRIPTS = [
+    parse_script([{"walk": [0.5, 0.0, 0.3], "seconds": 0.6}, {"jump_up": 0.75}, {"stand": 0.2}, {"jump_to": [0.6, 0.1]},
+                  {"stand": 0.2}]),
+    parse_script([{"stand": 0.4}, {"jump_to": [0.7, 0.0]}, {"walk": [0.0, 0.3, 0.0], "seconds": 0.5}, {"jump_up": 0.6},
+                  {"stand": 0.2}]),
+]  # fmt: skip
+
+
+def coordinates(env) -> np.ndarray:
+    return np.concatenate([env.sim.joint_q(), env.sim.joint_qd()], axis=1)
+
+
+def motors(env, world: int) -> np.ndarray:
+    return np.array([getattr(env.sim.motors, name).numpy()[:, world] for name in ("kp", "kd", "saturation")])
+
+
+class Switch:
+    """What there was of a world at a switch."""
+
+    def __init__(self, env: Env, world: int, before: dict, source: int) -> None:
+        self.world, self.source, self.target = world, source, int(env.worlds.skill.numpy()[world])
+        self.before, self.after = before["q"][world], coordinates(env)[world]
+        self.safe = before["safe"][:, world]
+        self.action, self.motors = env.robot.action.numpy()[:, world].copy(), motors(env, world)
+        self.obs = env.skills[self.target].obs["policy"][world].clone()
+        self.state = env.skills[self.target].states.numpy()[world].copy()
+        self.next_target = self.next_action = self.next_safe = None
+
+
+@pytest.fixture(scope="module")
+def followed():
+    """Return policies, environment, course and all switches of a nominal run whose stages are launched one by one."""
+    policies = SkillPolicies()
+    env = policies.env(N, Conditions(device="cpu", threads=1))
+    course, switches, fresh = Course(SCRIPTS), [], []
+    course.begin(env)
+    for _ in range(round(course.seconds / env.step_dt)):
+        env.actions.copy_(policies.act(env))
+        for name, stage in env.stages().items():
+            if name == "reset":
+                before = {"q": coordinates(env).copy(), "safe": env.robot.safe_target.numpy().copy()}
+                was = env.worlds.skill.numpy().copy()
+            stage()
+            if name == "action":
+                for each in fresh:
+                    each.next_action = env.robot.action.numpy()[:, each.world].copy()
+                    each.next_target = env.robot.target.numpy()[:, each.world].copy()
+                    each.next_safe = env.robot.safe_target.numpy()[:, each.world].copy()
+        fresh = [Switch(env, w, before, was[w]) for w in np.flatnonzero(env.worlds.skill.numpy() != was)]
+        switches += fresh
+        if course.follow(env):
+            break
+    return policies, env, course, switches
+
+
+def test_skills_follow_each_other_as_the_scripts_say(followed):
+    _, _, course, switches = followed
+    order = [[s.target for s in switches if s.world == w] for w in range(N)]
+    assert order == [[JUMP_UP, WALK, JUMP_TO, WALK], [JUMP_TO, WALK, JUMP_UP, WALK]]
+    assert (course.outcomes == "done").all() and course.on_goal.all()
+    assert abs(course.apex_error[0, 1]) < 0.02 and np.nanmax(course.landing_error) < 0.05
+
+
+def test_a_switch_leaves_the_robot_as_it_is_and_its_first_action_holds_the_targets(followed):
+    policies, env, _, switches = followed
+    for s in switches:
+        np.testing.assert_array_equal(s.after, s.before)
+        scale = np.array(policies.skills[s.target].action_scale)[[0, 1, 1] * 4] * np.pi / 180.0
+        held = (s.safe - env.robot.default_angle.numpy()) / scale
+        np.testing.assert_allclose(s.action, np.clip(held, -1.0, 1.0), atol=1e-6)
+
+
+def test_gains_limits_and_scales_are_those_of_the_active_skill(followed):
+    policies, env, _, switches = followed
+    default = env.robot.default_angle.numpy()
+    for s in switches:
+        task = policies.skills[s.target]
+        for row, name in zip(s.motors, ("kp", "kd", "saturation"), strict=True):
+            each = [getattr(getattr(task.motors, kind), name) for kind in ("lateral", "transversal", "transversal")]
+            np.testing.assert_allclose(row, 4 * each, rtol=1e-6)
+        scale = np.array(task.action_scale)[[0, 1, 1] * 4] * np.pi / 180.0
+        np.testing.assert_allclose(s.next_target, default + scale * s.next_action, atol=1e-6)
+    kd = {s.target: s.motors[1, 0] for s in switches}
+    assert kd[WALK] != kd[JUMP_UP]  # or nothing would be seen of a switch
+
+
+def test_after_a_switch_observation_and_filter_are_those_of_a_fresh_environment_in_the_same_state(followed):
+    policies, _, _, switches = followed
+    for target in (WALK, JUMP_UP, JUMP_TO):
+        cases = [s for s in switches if s.target == target]
+        alone = Env(policies.skills[target], N, device="cpu", randomize=False, noise=False, auto_reset=False, threads=1)
+        alone.evaluation_reset(np.zeros((N, 3)))
+        for s in cases:
+            q, qd, action = (
+                a.numpy().copy() for a in (alone.sim.state.joint_q, alone.sim.state.joint_qd, alone.robot.action)
+            )
+            split = len(q) // N
+            q[:split], qd[: len(qd) // N], action[:, 0] = s.after[:split], s.after[split:], s.action
+            for array, values in (
+                (alone.sim.state.joint_q, q),
+                (alone.sim.state.joint_qd, qd),
+                (alone.robot.action, action),
+            ):
+                array.assign(values)
+            states = alone.skills[0].states.numpy().copy()
+            states[0] = s.state
+            alone.skills[0].states.assign(wp.array(states, dtype=alone.task.state, device="cpu"))
+            alone.worlds.fresh.fill_(1)
+            alone._observe(alone._part(), beginning=1)
+            assert torch.equal(alone.obs[0], s.obs), (target, alone.obs[0] - s.obs)
+            alone.action[0] = torch.from_numpy(s.next_action)
+            alone.stages()["action"]()
+            np.testing.assert_array_equal(alone.robot.safe_target.numpy()[:, 0], s.next_safe)
+
+
+def test_jumps_are_commanded_as_they_take_over_and_walking_stands_first(followed):
+    _, _, _, switches = followed
+    for s in switches:
+        if s.target == WALK:
+            assert s.state["standing"] == 1 and not s.state["command"].any() and s.state["steps"] == 0
+        else:
+            assert s.state["command_step"] == 0 == s.state["steps"]
+    first = switches[[s.target for s in switches].index(JUMP_TO)]
+    way = first.state["goal"][:2] - first.after[:2]
+    assert np.linalg.norm(way) == pytest.approx(0.7 if first.world else np.hypot(0.6, 0.1), abs=1e-5)
+
+
+def test_policies_of_other_tasks_are_refused():
+    with pytest.raises(PolicyError, match=r"evaluated by velocity, got one of vertical-jump"):
+        SkillPolicies(SkillNames(walk="vertical_jump"))
+    with pytest.raises(PolicyError, match=r"evaluated by place or around, got one of velocity-flat"):
+        SkillPolicies(SkillNames(jump_to="walking_flat"))
+
+
+def test_configuration_names_all_tasks_and_handovers(followed):
+    policies, env, _, _ = followed
+    config = env.config()
+    assert [task["name"] for task in config["tasks"]] == [task.name for task in policies.skills]
+    assert config["handovers"][0] == {
+        "source": "velocity-flat", "target": "vertical-jump",
+        "when": "kernels.skills.handovers:come_to_a_stop", "begin": "kernels.skills.handovers:begin_jump",
+    }  # fmt: skip
+    assert len(config["handovers"]) == 4 and "tasks" not in Env(env.tasks[0], 1, device="cpu").config()
+    assert dataclasses.asdict(policies.names) == {
+        "walk": "walking_flat",
+        "jump_up": "vertical_jump",
+        "jump_to": "horizontal_jump",
+    }

@@ -1,0 +1,139 @@
+"""Following courses whose robots are made up: what is asked for, and what is told of it."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from jumper_warp.evaluation.course_metrics import active_spans, course_metrics
+from jumper_warp.evaluation.courses import PATIENCE, Course
+from jumper_warp.evaluation.scripts import ScriptStep
+from jumper_warp.policies.skills import JUMP_TO, JUMP_UP, STAND, WALK
+from jumper_warp.utils.errors import InputError
+
+DT = 1.0 / 60.0
+SCRIPT = (
+    ScriptStep("walk", (0.5, 0.1, -0.2), 2.0),
+    ScriptStep("jump_up", (0.75,)),
+    ScriptStep("walk", (0.3, 0, 0), 1.5),
+)
+
+
+class MadeUp:
+    """Robots that stop 20 steps after they are asked to, stand for 30, take off 25 later and are done 40 after that."""
+
+    def __init__(self, n: int, error=(0.1, 0.0, 0.0), falls_at=None, never_stops=False):
+        self.n, self.error, self.falls_at, self.never_stops = n, np.array(error), falls_at, never_stops
+        self.skill, self.wanted, self.since, self.command_values = np.zeros(n, int), np.full(n, -1), np.zeros(n), None
+        self.step_dt, self.steps, self.velocity, self.asked = DT, 0, np.zeros((n, 3)), []
+
+    def evaluation_reset(self, commands, headings):
+        self.velocity = np.array(commands, dtype=float)
+
+    def command(self, values, worlds):
+        walking = worlds & (self.skill == WALK)
+        self.velocity[walking] = values[walking]
+        self.command_values = values.copy()
+
+    def request(self, skill, worlds):
+        self.asked += [(self.steps, skill, int(w)) for w in np.flatnonzero(worlds)]
+        self.wanted[worlds] = skill
+        self.since[worlds] = 0
+
+    def step(self):
+        """Return what is seen after a policy step."""
+        self.steps += 1
+        self.since += 1
+        took_off = (self.skill >= JUMP_UP) & (self.since == 25)
+        for w in range(self.n):
+            if self.skill[w] == WALK and self.wanted[w] == STAND and self.since[w] >= 20 and not self.never_stops:
+                self.skill[w], self.wanted[w], self.since[w] = STAND, -1, 0
+            elif self.skill[w] == STAND and self.wanted[w] >= JUMP_UP and self.since[w] >= 30:
+                self.skill[w], self.wanted[w], self.since[w] = self.wanted[w], -1, 0
+            elif self.skill[w] >= JUMP_UP and self.since[w] >= 65:
+                self.skill[w], self.since[w] = WALK, 0
+        ending = np.where(self.falls_at == self.steps, 1, -1) * np.ones(self.n, int)
+        return {
+            "base_pos": np.tile([0.05, 0.0, 0.4], (self.n, 1)), "base_quat": np.tile([0.0, 0.0, 0.0, 1.0], (self.n, 1)),
+            "base_vel": self.velocity * [1, 1, 0] + self.error * [1, 1, 0],
+            "base_ang_vel": (self.velocity + self.error)[:, 2:] * [0.0, 0.0, 1.0],
+            "skill": self.skill.copy(), "ending": ending,
+            "force": np.tile([30.0, 31.0, 32.0, 33.0], (self.n, 1)) + (self.steps % 2),
+            "jump_max_height": np.full(self.n, 0.78), "jump_goal": np.zeros((self.n, 3)),
+            "jump_took_off": took_off.astype(int), "jump_phase": np.zeros(self.n, int),
+        }  # fmt: skip
+
+
+def followed(script=SCRIPT, n=2, **made_up) -> tuple[Course, MadeUp]:
+    course, env = Course([script] * n), MadeUp(n, **made_up)
+    course.look = lambda env: env.step()
+    course.begin(env)
+    for _ in range(round(course.seconds / DT)):
+        if course.follow(env):
+            break
+    return course, env
+
+
+def test_jump_is_asked_for_after_stopping_and_walking_goes_on_after_it():
+    course, env = followed()
+    assert env.asked[0::2] == [(120, STAND, 0), (140, JUMP_UP, 0)] and env.asked[1::2] == [
+        (120, STAND, 1),
+        (140, JUMP_UP, 1),
+    ]
+    assert [skill for skill, *_ in active_spans(course, 0)] == [WALK, STAND, JUMP_UP, WALK]
+    np.testing.assert_array_equal(course.began[0], [0, 120, 235])
+    np.testing.assert_array_equal(course.over[0], [120, 235, 325])
+    assert course.switched[0, 1] == 170 and course.takeoff[0, 1] == 195
+    assert (course.outcomes == "done").all() and not course.fallen.any() and course.on_goal.all()
+    wanted = np.array(course.wanted)[:, 0]
+    np.testing.assert_allclose(wanted[[0, 119, 121, 139]], [[0.5, 0.1, -0.2]] * 2 + [[0.0, 0.0, 0.0]] * 2)
+    assert np.isnan(wanted[141:234]).all() and wanted[240] == pytest.approx([0.3, 0.0, 0.0])
+    assert env.command_values[0] == pytest.approx([0.3, 0.0, 0.0])
+
+
+def test_figures_of_a_course():
+    course, _ = followed(error=(0.1, -0.2, 0.05))
+    figures = course_metrics(course)
+    assert figures["rmse_vx_m_s"] == pytest.approx(0.1) and figures["rmse_vy_m_s"] == pytest.approx(0.2)
+    assert figures["rmse_yaw_rate_rad_s"] == pytest.approx(0.05, rel=1e-5)
+    assert sum(np.array(course.counts)[:, 0]) == 60 + 30  # the first second of each command does not count
+    assert figures["apex_error_m"] == pytest.approx(0.03) and figures["landing_error_m"] is None
+    assert figures["command_to_takeoff_s"] == pytest.approx(75 * DT)
+    assert figures["command_to_jump_skill_s"] == pytest.approx(50 * DT)
+    assert (figures["success_rate"], figures["on_goal_rate"], figures["jumps_made"], figures["robots"]) == (1, 1, 2, 2)
+    assert figures["handover_force_ripple_n"] == pytest.approx(1.0) == figures["handover_force_step_n"]
+
+
+def test_landing_is_measured_from_the_goal_and_may_miss_it():
+    course, _ = followed((ScriptStep("jump_to", (0.8, 0.0)), ScriptStep("stand", seconds=0.2)), n=1)
+    assert course_metrics(course)["landing_error_m"] == pytest.approx(0.05) and course.switched[0, 0] > 0
+    course.offset[0, 0] = 0.2
+    assert course_metrics(course)["on_goal_rate"] == 0.0 and course_metrics(course)["success_rate"] == 1.0
+    assert [skill for skill, *_ in active_spans(course, 0)] == [WALK, STAND, JUMP_TO, WALK]
+
+
+def test_a_fall_ends_a_course():
+    course, _ = followed(falls_at=np.array([60, -1]))
+    figures = course_metrics(course)
+    assert course.outcomes.tolist() == ["collided", "done"] and figures["failed_by_collided"] == 1
+    assert (figures["success_rate"], figures["fall_rate"]) == (0.5, 0.5)
+    assert np.isnan(np.array(course.velocity)[60:, 0]).all() and not np.array(course.counts)[60:, 0].any()
+
+
+def test_robot_that_never_stops_is_stuck():
+    course, env = followed(never_stops=True)
+    assert course.outcomes.tolist() == ["stuck", "stuck"] and course_metrics(course)["stuck_rate"] == 1.0
+    assert env.steps == 120 + round(PATIENCE / DT) and course_metrics(course)["command_to_takeoff_s"] is None
+
+
+def test_scripts_of_different_lengths_are_refused():
+    with pytest.raises(InputError, match="one length"):
+        Course([SCRIPT, SCRIPT[:1]])
+
+
+def test_series_and_columns_tell_of_the_robot():
+    course, _ = followed()
+    series = course.series([1])
+    assert series["vx/robot 1 [m/s]"] == pytest.approx(0.4) and series["vx/command of 1 [m/s]"] == pytest.approx(0.3)
+    assert series["skill/of 1 [1]"] == WALK and course.columns()["commands_done"] == [3, 3]
+    assert SimpleNamespace(**course.notes([0])).scripts[0][1] == ["jump_up", 0.75]

@@ -1,0 +1,49 @@
+"""The experiment of walking and jumping with the shipped policies, at a tiny size."""
+
+import json
+
+import numpy as np
+import pytest
+
+from experiments import walk_jump_walk
+from jumper_warp.policies.spec import PolicyError
+from jumper_warp.utils.errors import InputError
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+KEYS = (
+    "success_rate", "rmse_vx_m_s", "rmse_vy_m_s", "rmse_yaw_rate_rad_s", "apex_error_m", "landing_error_m",
+    "command_to_takeoff_s", "robots",
+)  # fmt: skip
+
+
+def test_two_robots_do_the_papers_test(tmp_path, monkeypatch):
+    monkeypatch.setattr(walk_jump_walk, "WALKS", (1, 1, 1))
+    monkeypatch.setattr(walk_jump_walk, "EACH", 1.5)
+    values = walk_jump_walk.main(walk_jump_walk.Args(robots=2, record=1, out=tmp_path, device="cpu"))
+    figures = json.loads((tmp_path / "figures.json").read_text())
+    assert figures == values and set(KEYS) <= set(figures)
+    assert (figures["success_rate"], figures["robots"], figures["jumps_made"]) == (1.0, 2, 4)
+    assert figures["apex_error_m"] < 0.05 and figures["landing_error_m"] < 0.05
+    assert 0.0 < figures["rmse_vx_m_s"] < 0.2 and 0.2 < figures["command_to_takeoff_s"] < 2.5
+    assert (tmp_path / "course.png").is_file() and (tmp_path / "walk_jump_walk.rrd").stat().st_size > 10_000
+
+
+def test_scripts_are_those_of_the_test():
+    rng = np.random.default_rng(3)
+    paper = walk_jump_walk.paper_script(rng)
+    assert [step.kind for step in paper] == 3 * ["walk"] + ["jump_up"] + 3 * ["walk"] + ["jump_to"] + 2 * ["walk"]
+    assert (paper[3].goal, paper[7].goal) == ((0.0, 0.0, 0.75), (0.85, 0.0, 0.0))
+    for _ in range(20):
+        script = walk_jump_walk.random_script(rng)
+        kinds = [step.kind for step in script]
+        assert len(script) == 10 and {"jump_up", "jump_to"} <= set(kinds)
+        assert all(np.abs(step.values).max() <= 0.8 for step in script if step.kind == "walk")
+    args = walk_jump_walk.Args(robots=3, course=True, seed=5)
+    assert walk_jump_walk.scripts(args) == walk_jump_walk.scripts(args)
+
+
+def test_what_cannot_be_is_refused(tmp_path):
+    with pytest.raises(InputError, match="robots"):
+        walk_jump_walk.Args(robots=0)
+    with pytest.raises(PolicyError, match="evaluated by velocity"):
+        walk_jump_walk.main(walk_jump_walk.Args(policy="vertical_jump", out=tmp_path, device="cpu"))
