@@ -63,8 +63,8 @@ CASES = {
     "randomised": ((JUMP,), {}, 12),
     # events in every step
     "pushed": ((WALKING,), {}, 13),
-    # of the second skill: events in every step, step, 2 to observe; then events, packing, reset, 2 to observe
-    "two skills": ((JUMP, HOLD), {}, 21),
+    # of the second skill: events in every step, step, 2 to observe; then home, events, packing, reset, 2 to observe
+    "two skills": ((JUMP, HOLD), {}, 22),
 }
 """Tasks, settings and number of launches."""
 

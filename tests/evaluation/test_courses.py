@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from jumper_warp.evaluation.course_metrics import active_spans, course_metrics
-from jumper_warp.evaluation.courses import PATIENCE, Course
+from jumper_warp.evaluation.courses import PATIENCE, SLEW, Course
 from jumper_warp.evaluation.scripts import ScriptStep
-from jumper_warp.policies.skills import JUMP_TO, JUMP_UP, STAND, WALK
+from jumper_warp.policies.skills import JUMP_TO, JUMP_UP, WALK
 from jumper_warp.utils.errors import InputError
 
 DT = 1.0 / 60.0
@@ -20,7 +20,7 @@ SCRIPT = (
 
 
 class MadeUp:
-    """Robots that stop 20 steps after they are asked to, stand for 30, take off 25 later and are done 40 after that."""
+    """Robots that stop 50 steps after they are asked to jump, take off 25 later and are done 40 after that."""
 
     def __init__(self, n: int, error=(0.1, 0.0, 0.0), falls_at=None, never_stops=False):
         self.n, self.error, self.falls_at, self.never_stops = n, np.array(error), falls_at, never_stops
@@ -35,7 +35,8 @@ class MadeUp:
         self.velocity[walking] = values[walking]
         self.command_values = values.copy()
 
-    def request(self, skill, worlds):
+    def request(self, skill, worlds, commands):
+        self.goals = commands.copy()
         self.asked += [(self.steps, skill, int(w)) for w in np.flatnonzero(worlds)]
         self.wanted[worlds] = skill
         self.since[worlds] = 0
@@ -46,9 +47,7 @@ class MadeUp:
         self.since += 1
         took_off = (self.skill >= JUMP_UP) & (self.since == 25)
         for w in range(self.n):
-            if self.skill[w] == WALK and self.wanted[w] == STAND and self.since[w] >= 20 and not self.never_stops:
-                self.skill[w], self.wanted[w], self.since[w] = STAND, -1, 0
-            elif self.skill[w] == STAND and self.wanted[w] >= JUMP_UP and self.since[w] >= 30:
+            if self.skill[w] == WALK and self.wanted[w] >= 0 and self.since[w] >= 50 and not self.never_stops:
                 self.skill[w], self.wanted[w], self.since[w] = self.wanted[w], -1, 0
             elif self.skill[w] >= JUMP_UP and self.since[w] >= 65:
                 self.skill[w], self.since[w] = WALK, 0
@@ -76,18 +75,17 @@ def followed(script=SCRIPT, n=2, **made_up) -> tuple[Course, MadeUp]:
 
 def test_jump_is_asked_for_after_stopping_and_walking_goes_on_after_it():
     course, env = followed()
-    assert env.asked[0::2] == [(120, STAND, 0), (140, JUMP_UP, 0)] and env.asked[1::2] == [
-        (120, STAND, 1),
-        (140, JUMP_UP, 1),
-    ]
-    assert [skill for skill, *_ in active_spans(course, 0)] == [WALK, STAND, JUMP_UP, WALK]
+    assert env.asked == [(120, JUMP_UP, 0), (120, JUMP_UP, 1)]
+    np.testing.assert_allclose(env.goals, [[0.0, 0.0, 0.75]] * 2)
+    assert [skill for skill, *_ in active_spans(course, 0)] == [WALK, JUMP_UP, WALK]
     np.testing.assert_array_equal(course.began[0], [0, 120, 235])
     np.testing.assert_array_equal(course.over[0], [120, 235, 325])
     assert course.switched[0, 1] == 170 and course.takeoff[0, 1] == 195
     assert (course.outcomes == "done").all() and not course.fallen.any() and course.on_goal.all()
     wanted = np.array(course.wanted)[:, 0]
-    np.testing.assert_allclose(wanted[[0, 119, 121, 139]], [[0.5, 0.1, -0.2]] * 2 + [[0.0, 0.0, 0.0]] * 2)
-    assert np.isnan(wanted[141:234]).all() and wanted[240] == pytest.approx([0.3, 0.0, 0.0])
+    np.testing.assert_allclose(wanted[[0, 119, 150]], [[0, 0, 0], [0.5, 0.1, -0.2], [0, 0, 0]])
+    np.testing.assert_allclose(wanted[121], [0.5 - 2 * SLEW * DT, 0.1 - 2 * SLEW * DT, 2 * SLEW * DT - 0.2], rtol=1e-5)
+    assert np.isnan(wanted[171:234]).all() and wanted[300] == pytest.approx([0.3, 0.0, 0.0])
     assert env.command_values[0] == pytest.approx([0.3, 0.0, 0.0])
 
 
@@ -109,7 +107,7 @@ def test_landing_is_measured_from_the_goal_and_may_miss_it():
     assert course_metrics(course)["landing_error_m"] == pytest.approx(0.05) and course.switched[0, 0] > 0
     course.offset[0, 0] = 0.2
     assert course_metrics(course)["on_goal_rate"] == 0.0 and course_metrics(course)["success_rate"] == 1.0
-    assert [skill for skill, *_ in active_spans(course, 0)] == [WALK, STAND, JUMP_TO, WALK]
+    assert [skill for skill, *_ in active_spans(course, 0)] == [WALK, JUMP_TO, WALK]
 
 
 def test_a_fall_ends_a_course():
