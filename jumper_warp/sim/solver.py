@@ -114,14 +114,14 @@ def _acceleration_kernel(
 class SolverJumper(SolverBase):
     """Exact 18-coordinate dynamics of the Jumper with rigid paw contact.
 
-    The five-bar loops hold by construction. Semi-implicit Euler; contact by block Gauss-Seidel on the four paws to
-    `tolerance`. Per-world masses, inertias, armature, motor friction, damping, joint stops, paw friction and gravity
+    The five-bar loops hold by construction. Semi-implicit Euler; contact paw by paw to
+    `tolerance`, on a CPU in turn (Gauss-Seidel), on a GPU the one first whose velocity would change most. Per-world masses, inertias, armature, motor friction, damping, joint stops, paw friction and gravity
     are read from the model: write the model's arrays, then call `notify_model_changed`.
 
     Reads base and motor coordinates of `joint_q`/`joint_qd`, `control.joint_f` of base and motors (world wrench [N],
     [N m] at the base's com; motor torques [N m]) and `state.body_f` of the base. Writes every joint, loop joint and
-    body. Forces on other bodies and passive joints are not read. One thread owns one world and nothing is
-    accumulated across threads, so results repeat bit for bit on a device.
+    body. Forces on other bodies and passive joints are not read. On a CPU a thread owns a world, on a GPU four
+    threads share one and add up in a fixed order, so results repeat bit for bit on a device.
 
     Where the states carry gradients (`finalize(requires_grad=True)`) `step` runs kernel by kernel so that `wp.Tape` can
     run it backwards, with a state of its own for every step. Record `dynamics.pack_masses()` or `pack_joints()` on the

@@ -1,4 +1,4 @@
-"""The kernel that advances every world by several steps in one launch."""
+"""The kernel that advances every world by several steps in one launch, a thread a world: the CPU's."""
 
 import warp as wp
 

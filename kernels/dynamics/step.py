@@ -1,8 +1,6 @@
-"""The time step: motors, dynamics, contact and integration of one world, many steps in one launch.
+"""The parts of a time step that `advance` and `advance_legs` put together: a leg's terms, a paw's contact, the base.
 
-One thread advances one world; everything between the first load and the last store stays in registers and the first
-cache level. Semi-implicit Euler: forces and Jacobians at the start of the step, positions moved with the velocities
-at its end.
+Semi-implicit Euler: forces and Jacobians at the start of the step, positions moved with the velocities at its end.
 """
 
 import warp as wp
