@@ -115,9 +115,9 @@ class SolverJumper(SolverBase):
     """Exact 18-coordinate dynamics of the Jumper with rigid paw contact.
 
     The five-bar loops hold by construction. Semi-implicit Euler; contact paw by paw to `tolerance`, on a CPU in turn
-    (Gauss-Seidel), on a GPU the one first whose velocity would change most. Per-world masses, inertias, armature, motor
-    friction, damping, joint stops, paw friction and gravity are read from the model: write the model's arrays, then call
-    `notify_model_changed`.
+    (Gauss-Seidel), on a GPU the one first whose velocity would change most. Per-world masses, inertias, armature,
+    motor friction, damping, joint stops, paw friction and gravity are read from the model: write the model's arrays,
+    then call `notify_model_changed`.
 
     Reads base and motor coordinates of `joint_q`/`joint_qd`, `control.joint_f` of base and motors (world wrench [N],
     [N m] at the base's com; motor torques [N m]) and `state.body_f` of the base. Writes every joint, loop joint and
