@@ -6,6 +6,7 @@ Experiments and the commands `jumper evaluate` and `jumper play` share it.
 from __future__ import annotations
 
 import time
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -69,7 +70,7 @@ def conditions_of(args: EvaluationArgs) -> Conditions:
     return Conditions(args.solver, args.randomize, args.randomize, args.seed, args.device, args.threads)
 
 
-class Run:
+class Run(ABC):
     """Follows robots as often as wanted, films some, and reports. Those who inherit say who acts."""
 
     folder: Path
@@ -80,9 +81,9 @@ class Run:
         self.conditions, self.record = Conditions(), 0
         self.told: dict[str, Any] = {}
 
+    @abstractmethod
     def actor(self, env: Env) -> Callable[[torch.Tensor], torch.Tensor]:
         """Return what gives actions for the environment's observations, as `run_evaluation` takes it."""
-        raise NotImplementedError
 
     def prepare(self, name: str, conditions: Conditions, out: Path | None = None, *, record: int = 0) -> None:
         """Take up the conditions, look for the device and make the folder, before anything is simulated.
