@@ -67,6 +67,7 @@ def kernel_inputs(r: dict) -> tuple[list, list]:
     motors = ("angle", "rate", "rate_change", "torque", "action", "old_action")
     for i in range(len(r["pos"])):
         base = {"pos": r["pos"][i], "quat": r["quat"][i], "lin_vel": r["vel"][i], "lin_acc": r["acc"][i]}
+        base |= {"old_lin_vel": r["vel"][i] - DT * r["acc"][i]}
         base |= {"ang_vel": r["spin"][i], "gravity": gravity[i], "paw_force": r["force"][:, i]}
         base |= {"contacts": int(np.count_nonzero(r["force"][:, i] > CONTACT_FORCE))}
         views.append(make_view(**base, **{name: r[name][:, i] for name in motors}, clipped=float(r["clipped"][i])))
@@ -153,9 +154,11 @@ def estimated_error(r, height):
 
 
 def deceleration(r):
-    """Acceleration against the direction of motion [m/s^2], 0 where it speeds up."""
-    speed = norm(r["vel"])
-    return np.where(speed > 1e-6, np.maximum(-np.sum(r["acc"] * r["vel"], axis=1) / np.maximum(speed, 1e-9), 0.0), 0.0)
+    """Speed of the step before that was lost over the step [m/s^2]: all of it where the motion turned round."""
+    before = r["vel"] - DT * r["acc"]
+    speed = norm(before)
+    kept = np.sum(r["vel"] * before, axis=1) / np.maximum(speed, 1e-9)
+    return np.where(speed > 1e-6, np.maximum(speed - np.maximum(kept, 0.0), 0.0) / DT, 0.0)
 
 
 def symmetry(r, p):
