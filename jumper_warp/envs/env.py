@@ -80,8 +80,8 @@ class Env(Stages):
         ground, block: as in `Simulation`; by default the terrain of the first task that has one, or what tasks draw, if
         randomised on SolverJumper, else a plane. skill: index of the task that each world begins in, (num_envs,) or one
         for all. handovers: between tasks. threads: of a CPU, as in `Simulation`.
-        Raises ValueError: no task, two of one name, motors that cannot be those of one robot, a handover between other
-        tasks, less than one environment, or as `Simulation`.
+        Raises ValueError: no task, two of one name, motors that cannot be those of one robot, different gravities, a
+        handover between other tasks, less than one environment, or as `Simulation`.
         """
         tasks = checked_tasks(task, handovers)
         self.task, self.tasks, self.num_envs, self.seed, self.auto_reset = tasks[0], tasks, num_envs, seed, auto_reset
@@ -93,7 +93,8 @@ class Env(Stages):
         self.sim = Simulation(
             num_envs, solver=solver, motors=self.task.motors, visuals=visuals, device=device and str(device),
             ground=ground, block=BlockCfg((0.0, 0.0)) if self._draws_ground else block, tolerance=CONTACT_TOLERANCE,
-            friction=0.85 if self.task.randomization.dynamic_friction else 0.9, threads=threads,
+            friction=0.85 if self.task.randomization.dynamic_friction else 0.9, gravity=self.task.gravity,
+            threads=threads,
         )  # fmt: skip
         self.wp_device = self.sim.device
         self.device = torch.device(wp.device_to_torch(self.wp_device))

@@ -57,6 +57,8 @@ class EvaluationArgs:
     """Warp device."""
     threads: int | None = None
     """CPU threads that share the worlds (default: all cores); they change no result."""
+    gravity: float | None = None
+    """[m/s^2] Downward (default: that of the policy's task)."""
 
     def __post_init__(self) -> None:
         """Check the values."""
@@ -67,7 +69,7 @@ class EvaluationArgs:
 
 def conditions_of(args: EvaluationArgs) -> Conditions:
     """Return the conditions that an experiment's flags ask for."""
-    return Conditions(args.solver, args.randomize, args.randomize, args.seed, args.device, args.threads)
+    return Conditions(args.solver, args.randomize, args.randomize, args.seed, args.device, args.threads, args.gravity)
 
 
 class Run(ABC):
@@ -215,6 +217,7 @@ class EvaluationRun(Run):
         change = change or self.evaluation.for_evaluation
         env = env_of_policy(self.policy, count, self.conditions, change=change, modules=self.modules, **scene)
         self.policy.to(env.device)
+        self.told["gravity_m_s2"] = env.task.gravity
         self.told["torque_limit_nm"] = env.task.motors.transversal.saturation
         return env
 

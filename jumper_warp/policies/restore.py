@@ -27,6 +27,7 @@ from jumper_warp.rl.checkpoint import (
     one_line,
 )
 from jumper_warp.rl.networks import EPS, NORMALISED_LIMIT
+from jumper_warp.robot.model import check_gravity
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.tasks.interface import interface
 from jumper_warp.tasks.saving import OPTIONAL, TaskError, task_from_json
@@ -54,6 +55,17 @@ class Conditions:
     """Warp device (default: a GPU if there is one)."""
     threads: int | None = None
     """CPU threads that share the worlds (default: all cores); they change no result."""
+    gravity: float | None = None
+    """[m/s^2] Downward (default: that of the task)."""
+
+    def __post_init__(self) -> None:
+        """Raises InputError: a gravity that is none."""
+        if self.gravity is not None:
+            check_gravity(self.gravity)
+
+    def applied(self, task: TaskCfg) -> TaskCfg:
+        """Return a task under these conditions, as far as they are the task's."""
+        return task if self.gravity is None else dataclasses.replace(task, gravity=self.gravity)
 
 
 def is_run(source: str | Path) -> bool:
@@ -179,7 +191,7 @@ def env_of_policy(
     if task.observation_names != policy.interface.observation_names:
         raise PolicyError("the policy's observation is not the one that this version of its task gives")
     return Env(
-        task if change is None else change(task),
+        conditions.applied(task if change is None else change(task)),
         num_envs,
         seed=conditions.seed,
         device=conditions.device,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -64,10 +64,16 @@ class SkillPolicies:
         """Return an environment of robots that walk first; scene: more settings of `Env`. Raises as `Env`."""
         from jumper_warp.envs.env import Env
 
+        skills, handovers = self.skills, self.handovers
+        if conditions.gravity is not None:
+            skills = [conditions.applied(task) for task in skills]
+            handovers = [
+                replace(h, source=conditions.applied(h.source), target=conditions.applied(h.target)) for h in handovers
+            ]
         env = Env(
-            self.skills, count, seed=conditions.seed, device=conditions.device, solver=conditions.solver,
+            skills, count, seed=conditions.seed, device=conditions.device, solver=conditions.solver,
             randomize=conditions.randomize, noise=conditions.noise, auto_reset=False, threads=conditions.threads,
-            skill=WALK, handovers=self.handovers, **scene,
+            skill=WALK, handovers=handovers, **scene,
         )  # fmt: skip
         for policy in self.policies:
             policy.to(env.device)
