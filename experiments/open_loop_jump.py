@@ -21,7 +21,8 @@ from rich.table import Table
 from jumper_warp.cli.main import run_command
 from jumper_warp.evaluation.open_loop import Trace, follow_jump, jump_metrics
 from jumper_warp.evaluation.plots import drawn
-from jumper_warp.robot.model import GRAVITY, LEGS, MOTOR_JOINTS, build_model
+from jumper_warp.robot.gravity import EARTH
+from jumper_warp.robot.model import LEGS, MOTOR_JOINTS, build_model
 from jumper_warp.robot.motors import jumping_motors, loose_filter, vertical_jump_filter
 from jumper_warp.sim.simulation import Simulation
 from jumper_warp.utils.output import output_dir, write_figures
@@ -46,7 +47,7 @@ class Args:
     """[N m] Torque saturation of the motors; lateral motors give 18 at most."""
     kp: float = 17.0
     """[N m/rad] Position gain of the transversal motors."""
-    gravity: float = GRAVITY
+    gravity: float = EARTH
     """[m/s^2] Downward."""
     loose: bool = False
     """A looser filter, as for the paper's 1.42 m."""
@@ -105,7 +106,7 @@ def main(args: Args) -> dict:
     trace, recorder, frames = follow_jump(sim, variant)
     draw_filmstrip(frames, folder / "jump_strip.png")
     values: dict[str, Any] = {**variant, **jump_metrics(trace), "hardware_apex_height_m": None}
-    if args.torque == 18.0 and args.gravity == GRAVITY and not args.loose:
+    if args.torque == 18.0 and args.gravity == EARTH and not args.loose:
         values["hardware_apex_height_m"] = HARDWARE_APEX
     title = f"Open-loop jump, {args.solver}, {args.torque:g} N m"
     write_figures(folder, values)

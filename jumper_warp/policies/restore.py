@@ -27,7 +27,7 @@ from jumper_warp.rl.checkpoint import (
     one_line,
 )
 from jumper_warp.rl.networks import EPS, NORMALISED_LIMIT
-from jumper_warp.robot.model import check_gravity
+from jumper_warp.robot.gravity import check_gravity
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.tasks.interface import interface
 from jumper_warp.tasks.saving import OPTIONAL, TaskError, task_from_json

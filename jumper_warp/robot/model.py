@@ -27,6 +27,7 @@ from jumper_warp.robot.description import (
     leg_dimensions,
     load_description,
 )
+from jumper_warp.robot.gravity import EARTH, check_gravity
 from jumper_warp.robot.pinocchio_model import PinocchioRobot, build_pinocchio
 from jumper_warp.utils.errors import InputError
 
@@ -41,10 +42,6 @@ __all__ = [
     "standing_configuration",
 ]
 
-GRAVITY = 9.81
-"""[m/s^2] On Earth, downward."""
-MOST_GRAVITY = 100.0
-"""[m/s^2] Four times that of Jupiter."""
 PHYSICS_DT = 1.0 / 480.0
 """Physics step [s] that contacts and loops are tuned for."""
 
@@ -80,7 +77,7 @@ def build_model(
     description: RobotDescription | None = None,
     ground: str | newton.Heightfield | None = "plane",
     friction: float = 0.9,
-    gravity: float = GRAVITY,
+    gravity: float = EARTH,
     device: wp.DeviceLike = None,
     requires_grad: bool = False,
     visuals: bool = True,
@@ -121,12 +118,6 @@ def build_model(
     builder.replicate(robot, num_worlds, label_prefixes=[f"world_{i}" for i in range(num_worlds)])
     _add_ground(builder, ground)
     return builder.finalize(device=device, requires_grad=requires_grad)
-
-
-def check_gravity(gravity: float) -> None:
-    """Raises ValueError: a gravity [m/s^2] is not in 0 to MOST_GRAVITY."""
-    if not 0.0 <= gravity <= MOST_GRAVITY:
-        raise InputError(f"gravity must lie in 0 to {MOST_GRAVITY:g} m/s^2, downward, got {gravity}")
 
 
 def other_colliders(model: newton.Model) -> np.ndarray:

@@ -9,8 +9,9 @@ import newton
 import numpy as np
 import warp as wp
 
+from jumper_warp.robot.gravity import EARTH
 from jumper_warp.robot.grounds import BlockCfg
-from jumper_warp.robot.model import GRAVITY, PHYSICS_DT, Extras, build_model
+from jumper_warp.robot.model import PHYSICS_DT, Extras, build_model
 from jumper_warp.robot.motors import FilterCfg, MotorCfg, filter_params, jumping_motors, motor_arrays
 from jumper_warp.sim.physics import JumperPhysics, MujocoPhysics, Physics
 from jumper_warp.sim.slices import SlicedGraph, Worlds, slices_of
@@ -48,7 +49,7 @@ class Simulation:
         ground: str | newton.Heightfield | None = "plane",
         block: BlockCfg | None = None,
         friction: float = 0.9,
-        gravity: float = GRAVITY,
+        gravity: float = EARTH,
         dt: float = PHYSICS_DT,
         substeps: int = SUBSTEPS,
         tolerance: float = TOLERANCE,

@@ -9,7 +9,7 @@ from typing import Any
 
 import warp as wp
 
-from jumper_warp.robot.model import GRAVITY, check_gravity
+from jumper_warp.robot.gravity import EARTH, check_gravity
 from jumper_warp.robot.motors import FilterCfg, MotorCfg
 from jumper_warp.tasks.randomization import RandomizationCfg
 from jumper_warp.tasks.terms import (
@@ -88,7 +88,7 @@ class TaskCfg:
     events: tuple[EventTerm, ...] = ()
     """Besides those of `randomization`."""
     randomization: RandomizationCfg = field(default_factory=RandomizationCfg)
-    gravity: float = GRAVITY
+    gravity: float = EARTH
     """[m/s^2] Downward, of every world; all estimates of flights take it from there."""
     contact_force: float = 0.1
     """[N] Above it a paw counts as in contact."""

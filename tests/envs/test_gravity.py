@@ -13,10 +13,10 @@ from jumper_warp.envs.env import Env
 from jumper_warp.evaluation.run import EvaluationArgs, conditions_of
 from jumper_warp.policies.restore import Conditions
 from jumper_warp.registry import make_task
+from jumper_warp.robot.gravity import MARS
 from jumper_warp.sim.simulation import Simulation
 from jumper_warp.utils.errors import InputError
 
-MARS = 3.71  # [m/s^2]
 UP = 2.0  # [m/s]
 VERTICAL = dataclasses.replace(make_task("vertical-jump"), gravity=MARS)
 HORIZONTAL = dataclasses.replace(make_task("horizontal-jump"), gravity=MARS)
