@@ -193,13 +193,14 @@ class Env(Stages):
         self._observe(self._part(), beginning=1)
 
     def command(self, commands: Any, worlds: Any = None) -> None:
-        """Give worlds a command within their episode; the policy sees it after the next step.
+        """Give worlds a command within their episode; `obs` shows it at once.
 
         commands: (num_envs, up to 4), relative to base and yaw as they are; worlds: (num_envs,) bool, by default all.
         Raises ValueError: values of another shape, or not finite.
         """
         mask = self._array(checked_mask(worlds, self.num_envs))
         self._give(mask, 0, checked_commands(commands, self.num_envs), self._all)
+        self._observe(self._part(), beginning=1)
 
     def request(self, skill: int, worlds: Any = None, commands: Any = None) -> None:
         """Ask worlds to hand over to another skill as soon as a handover allows it.
