@@ -30,9 +30,9 @@ from jumper_warp.utils.output import output_dir, write_figures
 from jumper_warp.utils.runtime import announce
 from jumper_warp.utils.threads import checked_threads
 
-HEIGHTS = ("height",)
+HEIGHTS = ("height", "height-mars")
 """Evaluations of policies that jump to heights."""
-PLACES = ("place", "around")
+PLACES = ("place", "around", "place-mars")
 """Of those that jump to places."""
 Log = TypeVar("Log", bound=EvaluationLog)
 
