@@ -27,6 +27,7 @@ from jumper_warp.tasks.cfg import Handover, TaskCfg
 from jumper_warp.tasks.interface import interface
 from jumper_warp.tasks.saving import handover_to_json, task_to_json
 from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.kernels import load_kernels
 from kernels.mdp.reset import stand_kernel
 
 CONTACT_TOLERANCE = 1.0e-4
@@ -102,7 +103,7 @@ class Env(Stages):
         if self._draws_ground:
             self.sim.physics.dynamics.robot.ground.blocks.zero_()  # until `reset` draws them
         self.physics_dt, self.step_dt = self.sim.dt, self.sim.dt * self.sim.substeps
-        self._ends_episodes, self._started, self._graphs = True, False, {}
+        self._ends_episodes, self._started, self._compiled, self._graphs = True, False, False, {}
         self._allocate(run, skill, handovers)
         self._show()
 
@@ -128,10 +129,17 @@ class Env(Stages):
         if seed is not None:
             self._start_over(seed)
         self._ends_episodes = True
+        self.compile()
         self._tick(self._all)
         self._begin(self._part(), self._all)
         self._observe(self._part(), beginning=0)
         return self._step.obs, {}
+
+    def compile(self) -> None:
+        """Compile all kernels of `reset` and `step`, side by side; the first `reset` does so itself."""
+        if not self._compiled:
+            load_kernels(self.kernels(), self.wp_device)
+            self._compiled = True
 
     def _start_over(self, seed: int) -> None:
         self.seed = self.worlds.seed = seed
@@ -180,6 +188,8 @@ class Env(Stages):
         headings = self._array(checked_values(headings, (n,), "headings"))
         mask = self._array(checked_mask(worlds, n))
         self._ends_episodes = False
+        if not self._started:
+            load_kernels(self.kernels(draws=False), self.wp_device)
         if self._draws_ground:
             self._scene.ground.blocks.zero_()
         self._tick(mask)
