@@ -25,6 +25,7 @@ from jumper_warp.sim.simulation import Simulation, SolverName
 from jumper_warp.sim.slices import SlicedGraph
 from jumper_warp.tasks.cfg import Handover, TaskCfg
 from jumper_warp.tasks.interface import interface
+from jumper_warp.tasks.mirror import Mirror, mirror_of, mirror_of_action
 from jumper_warp.tasks.saving import handover_to_json, task_to_json
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.kernels import load_kernels
@@ -253,6 +254,13 @@ class Env(Stages):
             figures |= {f"{skill.task.name}/{name}": value for name, value in skill.metrics().items()}
         levels = np.bincount(self.worlds.level.numpy(), minlength=len(self.task.levels) + 1)
         return figures | {f"Curriculum/level_{i}": float(count) / self.num_envs for i, count in enumerate(levels)}
+
+    def mirror(self, what: str) -> Mirror:
+        """Return order and signs of the left-right mirror image of the first task's "observation", or of an "action".
+
+        Raises ValueError: the mirror image of a term is not known.
+        """
+        return mirror_of_action() if what == "action" else mirror_of(self.task, "policy")
 
     def config(self) -> dict:
         """Return everything that defines the environment, as JSON can hold it.

@@ -9,8 +9,8 @@ from velocity_helpers import edit, states_of, walking_env
 
 from jumper_warp.registry import make_task
 from jumper_warp.robot.terrain import TerrainCfg, single_tile
+from jumper_warp.tasks.mirror import LEGS, MOTORS, mirror_of, mirror_of_action
 from jumper_warp.tasks.terms import ObservationTerm
-from jumper_warp.tasks.velocity.mirror import LEGS, MOTORS, mirror_of, mirror_of_action
 from jumper_warp.utils.errors import InputError
 from kernels.mdp import observations as obs
 from kernels.velocity import observations as velocity
