@@ -35,6 +35,7 @@ WALKING = PAPER | {
 """Table V, walking; the text adds that its latency applies to observations too."""
 BEYOND = {
     "observation_latency": None, "push_interval": None, "push_share": 1.0, "push_in_flight": False, "redraw": "reset",
+    "no_latency": 0.0,
 }  # fmt: skip
 """What the table does not tell, for jumping."""
 ALL = PAPER | {"observation_latency": (0.0, 16.0)}
