@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from typing import Any, Literal
 
@@ -16,8 +16,14 @@ from kernels.mdp import parameters
 Range = tuple[float, float] | None
 NOMINAL_FRICTION = 0.9
 """[1] Of the paws, where it is not drawn."""
+MEAN_FRICTION = 0.85
+"""[1] Of the paws in nominal tests of what was trained with friction that is drawn."""
 LONGEST_LATENCY = 100.0
-"""[ms] What the ring of past targets and observations holds."""
+"""[ms] What the ring of past targets and observations holds: 48 physics steps, six policy steps."""
+PUSH_INTERVAL = (0.2, 0.5)
+"""[s] After which a push comes, stays or goes (authors' configuration)."""
+PUSH_SHARE = 0.25
+"""[1] Share of these intervals in which there is a push (authors' configuration)."""
 
 
 @cache
@@ -67,16 +73,16 @@ class RandomizationCfg:
     joint_offset: Range = (-2.0, 2.0)
     """[deg] Constant error of each motor's position sensor."""
     latency: Range = (0.0, 16.0)
-    """[ms] From action to motor, rounded down to whole physics steps."""
+    """[ms] From action to motor, rounded to the nearest physics step."""
     observation_latency: Range = None
-    """[ms] From sensor to policy, rounded down to whole physics steps."""
+    """[ms] From sensor to policy, rounded to the nearest physics step."""
     force: Range = (-5.0, 5.0)
     """[N] On the base, along each world axis, while a paw is on the ground."""
     torque: Range = (-3.0, 3.0)
     """[N m] On the base, about each world axis, while a paw is on the ground."""
-    push_interval: Range = None
-    """[s] Between two pushes; None: one for the whole episode."""
-    push_share: float = 1.0
+    push_interval: Range = PUSH_INTERVAL
+    """[s] Between two draws of the push; None: one for the whole episode."""
+    push_share: float = PUSH_SHARE
     """[1] Share of the intervals in which there is a push."""
     push_in_flight: bool = False
     """Whether pushes act in the air too."""
@@ -106,7 +112,7 @@ class RandomizationCfg:
     def off(cls) -> RandomizationCfg:
         """Return a configuration with every row off."""
         rows = [name for name, field in cls.__dataclass_fields__.items() if "Range" in str(field.type)]
-        return cls(**dict.fromkeys(rows))
+        return cls(**dict.fromkeys(rows), push_share=1.0)
 
     @classmethod
     def walking(cls) -> RandomizationCfg:
@@ -120,10 +126,28 @@ class RandomizationCfg:
             latency=(0.0, 32.0),
             observation_latency=(0.0, 32.0),
             force=(-10.0, 10.0),
-            push_interval=(0.2, 0.5),
-            push_share=0.25,
             push_in_flight=True,
         )
+
+    @property
+    def nominal_friction(self) -> float:
+        """Return the paws' coefficient [1] of robots of which nothing is drawn."""
+        return MEAN_FRICTION if self.dynamic_friction else NOMINAL_FRICTION
+
+    def in_tests(self) -> RandomizationCfg:
+        """Return the same ranges, drawn at every reset, with pushes that come and go, however the training had it."""
+        timing = {} if self.push_interval else {"push_interval": PUSH_INTERVAL, "push_share": PUSH_SHARE}
+        return replace(self, redraw="reset", **timing)
+
+    def with_fixed(
+        self, *, latency: float | None = None, gains: float | None = None, friction: float | None = None
+    ) -> RandomizationCfg:
+        """Return the same with rows that have one value: latency [ms], scale of gains [1], friction of the paws [1].
+
+        Raises ValueError: a value out of range.
+        """
+        rows = {"latency": latency, "gains": gains, "dynamic_friction": friction, "static_friction": friction}
+        return replace(self, **{name: (value, value) for name, value in rows.items() if value is not None})
 
     def events(self) -> tuple[EventTerm, ...]:
         """Return the rows that are on as events."""

@@ -186,8 +186,8 @@ def friction(
 
 @wp.func
 def physics_steps(robot: RobotParameters, seconds: float) -> int:
-    """Return whole physics steps of a time, rounded down; a whole step stays one despite rounding errors."""
-    return int(wp.floor(seconds / robot.physics_dt + 1.0e-4))
+    """Return the number of physics steps that is nearest to a time; latencies are whole steps."""
+    return int(wp.round(seconds / robot.physics_dt))
 
 
 @wp.func
