@@ -1,7 +1,7 @@
 """The paper's test of the vertical jump: a policy jumps to heights spread evenly over 0.5 to 1.2 m, each once.
 
     python experiments/vertical_jump_sweep.py --policy vertical_jump --jumps 200 --out outputs/sweep
-    python experiments/vertical_jump_sweep.py --gains 0.6 --heights 0.55 1.05   # weak motors
+    python experiments/vertical_jump_sweep.py --gains 0.6 1 --heights 0.55 1.05   # weak motors
 
 Every robot stands in the default pose and is told to jump after half a second. A jump succeeds if the highest base
 height is within 0.1 m of the commanded one. A landing is good if nothing but the paws touched anything, the base

@@ -53,8 +53,8 @@ class EvaluationArgs:
     """Randomised pushes act in flight too, and not only while a paw is down."""
     latency: float | None = None
     """[ms] From action to motor, to the nearest physics step (default: none, or drawn if randomised)."""
-    gains: float | None = None
-    """[1] Scales kp and kd of all motors (default: 1, or drawn if randomised)."""
+    gains: tuple[float, float] | None = None
+    """[1] Scales of kp and kd of all motors (default: 1, or drawn if randomised)."""
     friction: float | None = None
     """[1] Of the paws, static and dynamic (default: nominal, or drawn if randomised)."""
     seed: int = 0
@@ -115,7 +115,8 @@ class Run(ABC):
         words = [conditions.solver, "randomised" if conditions.randomize else "nominal"]
         if conditions.latency is not None and self._latency:
             words.append(f"latency {latency_text(self._latency[0], PHYSICS_DT)}")
-        words += [f"{name} {conditions.fixed[name]:g}" for name in ("gains", "friction") if name in conditions.fixed]
+        words += [] if conditions.gains is None else ["kp x {:g}, kd x {:g}".format(*conditions.gains)]
+        words += [] if conditions.friction is None else [f"friction {conditions.friction:g}"]
         return ", ".join(words + (["pushed in flight too"] if conditions.push_in_flight else []))
 
     @property
@@ -125,7 +126,8 @@ class Run(ABC):
         values |= {name: getattr(conditions, name) for name in ("solver", "randomize", "seed")}
         if conditions.randomize:
             values["push_in_flight"] = conditions.push_in_flight
-        values |= {name: conditions.fixed[name] for name in ("gains", "friction") if name in conditions.fixed}
+        values |= {} if conditions.gains is None else {"gains": list(conditions.gains)}
+        values |= {} if conditions.friction is None else {"friction": conditions.friction}
         if self._latency:
             values |= latency_metrics(np.concatenate(self._latency), PHYSICS_DT, conditions.latency)
         return values

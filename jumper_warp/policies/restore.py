@@ -60,8 +60,8 @@ class Conditions:
     """Pushes of a randomised test act in flight too, and not only while a paw is down."""
     latency: float | None = None
     """[ms] From action to motor, to the nearest physics step (default: none, or drawn if randomised)."""
-    gains: float | None = None
-    """[1] Scales kp and kd of all motors (default: 1, or drawn if randomised)."""
+    gains: tuple[float, float] | None = None
+    """[1] Scales of kp and kd of all motors (default: 1, or drawn if randomised)."""
     friction: float | None = None
     """[1] Of the paws, static and dynamic (default: nominal, or drawn if randomised)."""
 
@@ -72,7 +72,7 @@ class Conditions:
             raise InputError("push_in_flight needs randomize: without it there are no pushes")
 
     @property
-    def fixed(self) -> dict[str, float]:
+    def fixed(self) -> dict[str, Any]:
         """Parameters that are neither nominal nor drawn."""
         given = {name: getattr(self, name) for name in ("latency", "gains", "friction")}
         return {name: value for name, value in given.items() if value is not None}

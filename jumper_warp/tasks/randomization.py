@@ -36,7 +36,7 @@ def _least(name: str) -> tuple[float, bool]:
     """Return the least value of a row, and whether the row must stay above it."""
     if name == "base_mass":
         return -_base_mass(), True
-    if name in ("link_mass", "gains", "no_load_speed", "cutoff_speed", "armature", "push_interval"):
+    if name in ("link_mass", "gains", "damping_gains", "no_load_speed", "cutoff_speed", "armature", "push_interval"):
         return 0.0, True
     if name in ("static_friction", "dynamic_friction", "motor_friction", "latency", "observation_latency"):
         return 0.0, False
@@ -61,7 +61,7 @@ class RandomizationCfg:
     com_shift: Range = (-0.03, 0.03)
     """[m] Of the base, along each axis."""
     gains: Range = (0.6, 1.4)
-    """[1] Scales kp and kd of each motor."""
+    """[1] Scales kp of each motor, and kd unless `damping_gains` says otherwise."""
     no_load_speed: Range = (0.8, 1.2)
     """[1] Scales each motor's."""
     cutoff_speed: Range = (0.8, 1.4)
@@ -86,6 +86,8 @@ class RandomizationCfg:
     """[1] Share of the intervals in which there is a push."""
     push_in_flight: bool = False
     """Whether pushes act in the air too."""
+    damping_gains: Range = None
+    """[1] Scales kd of each motor; None: drawn from `gains`."""
     redraw: Literal["startup", "reset"] = "reset"
     """When all but the pushes is drawn: once, or at every reset of a world."""
 
@@ -140,13 +142,19 @@ class RandomizationCfg:
         return replace(self, redraw="reset", **timing)
 
     def with_fixed(
-        self, *, latency: float | None = None, gains: float | None = None, friction: float | None = None
+        self,
+        *,
+        latency: float | None = None,
+        gains: tuple[float, float] | None = None,
+        friction: float | None = None,
     ) -> RandomizationCfg:
-        """Return the same with rows that have one value: latency [ms], scale of gains [1], friction of the paws [1].
+        """Return the same with rows of one value: latency [ms], scales of kp and kd [1], friction of the paws [1].
 
         Raises ValueError: a value out of range.
         """
-        rows = {"latency": latency, "gains": gains, "dynamic_friction": friction, "static_friction": friction}
+        kp, kd = gains or (None, None)
+        rows = {"latency": latency, "gains": kp, "damping_gains": kd, "dynamic_friction": friction,
+                "static_friction": friction}  # fmt: skip
         return replace(self, **{name: (value, value) for name, value in rows.items() if value is not None})
 
     def events(self) -> tuple[EventTerm, ...]:
@@ -163,7 +171,13 @@ class RandomizationCfg:
         add(parameters.com_shift, self.com_shift)
         add(parameters.armature, self.armature, spread=True)
         add(parameters.motor_friction, self.motor_friction, spread=True)
-        add(parameters.gains, self.gains, spread=True)
+        if self.gains or self.damping_gains:
+            kp = self.gains or (1.0, 1.0)
+            kd = self.damping_gains or kp
+            found.append(
+                EventTerm(parameters.gains, mode=self.redraw, spread=True, kp_lower=kp[0], kp_upper=kp[1],
+                          kd_lower=kd[0], kd_upper=kd[1])
+            )  # fmt: skip
         if self.no_load_speed or self.cutoff_speed:
             low, high = self.no_load_speed or (1.0, 1.0), self.cutoff_speed or (1.0, 1.0)
             found.append(
