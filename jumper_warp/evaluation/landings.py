@@ -185,6 +185,14 @@ class Landings(EvaluationLog):
         return bool((self.current >= count).all())
 
     @property
+    def offset(self) -> np.ndarray:
+        """[m] (..., 2) From goal to base at the end, ahead and to the left of the jump's heading."""
+        turn = -self.heading[..., None]
+        x, y = np.moveaxis(self.place - self.target, -1, 0)
+        cos, sin = np.cos(turn[..., 0]), np.sin(turn[..., 0])
+        return np.stack([cos * x - sin * y, sin * x + cos * y], axis=-1)
+
+    @property
     def landing(self) -> np.ndarray:
         """[m] (..., 2) Base at the end, where the goals are measured."""
         return self.goals + self.offset
