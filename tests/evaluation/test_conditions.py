@@ -125,6 +125,7 @@ def test_a_fixed_parameter_that_is_nominal_changes_no_bit():
         for step in range(20):
             env.step(torch.full((2, 12), 0.02 * step))
     assert torch.equal(pair[0].obs, pair[1].obs)
+    np.testing.assert_array_equal(*(env.sim.physics.dynamics.robot.table.numpy() for env in pair))
     np.testing.assert_array_equal(*(env.sim.joint_q() for env in pair))
 
 
