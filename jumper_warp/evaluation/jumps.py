@@ -21,7 +21,7 @@ from jumper_warp.evaluation.log import (
     success_index,
     termination_names,
 )
-from jumper_warp.evaluation.paws import Paws, paws_down, stepped
+from jumper_warp.evaluation.paws import Paws, paw_arrays, stepped
 
 STANCE, LANDED = 0, 2
 """Values of the jump's phase before takeoff and after touchdown."""
@@ -96,8 +96,8 @@ class Jumps(EvaluationLog):
         env.evaluation_reset(jump_commands(goals, DELAY, env.step_dt))
 
     def look(self, env: EvaluationEnv) -> dict[str, np.ndarray]:
-        """Return the state of every world's episode, and which of its paws are on the ground."""
-        return env.task_arrays() | {"paws_down": paws_down(env)}
+        """Return the state of every world's episode, which of its paws are on the ground, and how fast it rises."""
+        return env.task_arrays() | paw_arrays(env)
 
     def update(self, arrays: dict[str, np.ndarray], step_dt: float) -> bool:
         """Take in a policy step; return whether all jumps have ended."""
@@ -119,8 +119,7 @@ class Jumps(EvaluationLog):
 
     def _follow_paws(self, arrays: dict[str, np.ndarray], row: np.ndarray, landed: np.ndarray, step_dt: float) -> None:
         """Take in what the paws of some worlds do after touchdown."""
-        up = arrays["base_vel"][row, 2]
-        lifted = self._paws.update(row, landed[row], arrays["paws_down"][row], up, step_dt)
+        lifted = self._paws.update(row, landed[row], arrays["paws_down"][row], arrays["up"][row], step_dt)
         self.lift_time[row] = np.maximum(self.lift_time[row], lifted.paw)
         self.takeoffs[row] += lifted.takeoff
 

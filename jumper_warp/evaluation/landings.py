@@ -25,7 +25,7 @@ from jumper_warp.evaluation.log import (
     success_index,
     with_ends,
 )
-from jumper_warp.evaluation.paws import TAKEOFF_SPEED, Paws, hopped, paws_down, stepped
+from jumper_warp.evaluation.paws import TAKEOFF_SPEED, Paws, hopped, paw_arrays, stepped
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.tasks.terms import TerminationTerm
 from jumper_warp.utils.errors import InputError
@@ -142,8 +142,8 @@ class Landings(EvaluationLog):
         env.evaluation_reset(jump_commands(goals, self.delay, env.step_dt), self.headings)
 
     def look(self, env: EvaluationEnv) -> dict[str, np.ndarray]:
-        """Return the state of every world's episode, and which of its paws are on the ground."""
-        return env.task_arrays() | {"paws_down": paws_down(env)}
+        """Return the state of every world's episode, which of its paws are on the ground, and how fast it rises."""
+        return env.task_arrays() | paw_arrays(env)
 
     def follow(self, env: EvaluationEnv) -> bool:
         """Look at the environment after a policy step, and command the jumps that are due."""
@@ -171,7 +171,7 @@ class Landings(EvaluationLog):
         first, soon = landed & (now["touched_down"] == 1), landed & (now["phase_steps"] == round(SOON / step_dt))
         self.touchdown[row[first], self.current[row[first]]] = now["base_pos"][first, :2]
         self.place_soon[row[soon], self.current[row[soon]]] = now["base_pos"][soon, :2]
-        lifted = self._paws.update(row, landed, now["paws_down"], now["base_vel"][:, 2], step_dt)
+        lifted = self._paws.update(row, landed, now["paws_down"], now["up"], step_dt)
         self.air_time[at] = np.maximum(self.air_time[at], lifted.aloft)
         self.lift_time[at] = np.maximum(self.lift_time[at], lifted.paw)
         self.takeoffs[at] += lifted.takeoff

@@ -55,10 +55,10 @@ class Paws:
         return Lifted(self._aloft[row], self._lifted[row].max(axis=1), takeoff)
 
 
-def paws_down(env: EvaluationEnv) -> np.ndarray:
-    """Return which paws of an environment's robots are on the ground, (num_envs, 4)."""
+def paw_arrays(env: EvaluationEnv) -> dict[str, np.ndarray]:
+    """Return what `Paws` follows: which paws are on the ground, (num_envs, 4), and the base's upward speed [m/s]."""
     force = np.linalg.norm(env.sim.paw_force.numpy(), axis=2)
-    return (force > env.task.contact_force).T
+    return {"paws_down": (force > env.task.contact_force).T, "up": env.sim.base_velocity()[:, 2]}
 
 
 def stepped(lift_time: np.ndarray) -> np.ndarray:

@@ -48,7 +48,7 @@ class SkillPolicies:
                 raise PolicyError(
                     f"this needs a policy that is evaluated by {' or '.join(kinds)}, got one of {task.name}"
                 )
-        self._skills(Conditions())
+        self.skills, self.handovers = self._in(Conditions())
 
     @staticmethod
     def _task(policy: Policy, source: str | Path) -> TaskCfg:
@@ -57,7 +57,7 @@ class SkillPolicies:
             raise PolicyError(f"{source}: its observation is not the one that this version of its task gives")
         return task
 
-    def _skills(self, conditions: Conditions) -> tuple[list[TaskCfg], list[Handover]]:
+    def _in(self, conditions: Conditions) -> tuple[list[TaskCfg], list[Handover]]:
         """Return the tasks in some conditions and their handovers. Raises PolicyError: these are no such tasks."""
         walk, *jumps = (conditions.applied(task) for task in self.tasks)
         try:
@@ -69,11 +69,11 @@ class SkillPolicies:
         """Return an environment of robots that walk first; scene: more settings of `Env`. Raises as `Env`."""
         from jumper_warp.envs.env import Env
 
-        skills, handovers = self._skills(conditions)
+        self.skills, self.handovers = self._in(conditions)
         env = Env(
-            skills, count, seed=conditions.seed, device=conditions.device, solver=conditions.solver,
+            self.skills, count, seed=conditions.seed, device=conditions.device, solver=conditions.solver,
             randomize=conditions.draws, noise=conditions.noise, auto_reset=False, threads=conditions.threads,
-            skill=WALK, handovers=handovers, **scene,
+            skill=WALK, handovers=self.handovers, **scene,
         )  # fmt: skip
         for policy in self.policies:
             policy.to(env.device)

@@ -23,7 +23,7 @@ from randomization_helpers import (
     within,
 )
 
-from jumper_warp.evaluation.paws import paws_down
+from jumper_warp.evaluation.paws import paw_arrays
 from jumper_warp.sim.simulation import Simulation
 from jumper_warp.tasks.randomization import RandomizationCfg
 from kernels.jump.state import LANDED
@@ -114,7 +114,7 @@ def test_pushes_come_and_go(cfg, newton):
     for _ in range(300):
         env.step(torch.zeros((48, 12)))
         pushes.append(env.parameters.push.numpy().copy())
-        down = (paws_down(env).any(axis=1) | cfg.push_in_flight)[:, None]
+        down = (paw_arrays(env)["paws_down"].any(axis=1) | cfg.push_in_flight)[:, None]
         acting.append(env.sim.state.body_f.numpy().reshape(48, 21, 6)[:, 0])
         np.testing.assert_array_equal(acting[-1], np.where(was_down, pushes[-2:][0], 0.0))
         was_down = down

@@ -14,7 +14,7 @@ def step_of(jumps, **changes):
         "max_height": np.zeros(count), "peak_tilt": np.zeros(count), "base_vel": np.zeros((count, 3)),
         "steps": np.full(count, 40), "command_step": np.full(count, 30), "base_pos": np.zeros((count, 3)),
         "base_quat": np.tile([0.0, 0.0, 0.0, 1.0], (count, 1)), "start": np.zeros((count, 3)),
-        "heading": np.zeros(count), "paws_down": np.ones((count, 4), dtype=bool),
+        "heading": np.zeros(count), "up": np.zeros(count), "paws_down": np.ones((count, 4), dtype=bool),
     }  # fmt: skip
     return arrays | {name: np.array(value) for name, value in changes.items()}
 
@@ -99,9 +99,8 @@ def test_landing_is_still_if_no_paw_is_lifted_again_for_long(lifted, still):
 def test_second_takeoff_is_counted():
     jumps = Jumps(np.array([0.5, 0.6]), ("success",))
     for up in (0.3, 0.3, 0.0):
-        speed = [[0.0, 0.0, up], [0.0, 0.0, 0.2]]
         paws = np.zeros((2, 4), dtype=bool)
-        jumps.update(step_of(jumps, phase=[2, 2], base_vel=speed, paws_down=paws), 1.0 / 60.0)
+        jumps.update(step_of(jumps, phase=[2, 2], up=[up, 0.2], paws_down=paws), 1.0 / 60.0)
     assert jumps.update(step_of(jumps, phase=[2, 2], phase_steps=[60, 60]), 1.0 / 60.0)
     assert jumps.takeoffs.tolist() == [1, 0]
     assert jump_metrics(jumps, (0.5, 1.1))["second_takeoff_rate"] == 0.5

@@ -26,7 +26,8 @@ class Stub:
     def __init__(self, count):
         self.num_envs, self.step_dt, self.commanded = count, DT, []
         self.task = SimpleNamespace(contact_force=0.1)
-        self.sim = SimpleNamespace(paw_force=wp.full((4, count), wp.vec3(0.0, 0.0, 9.0), dtype=wp.vec3, device="cpu"))
+        force = wp.full((4, count), wp.vec3(0.0, 0.0, 9.0), dtype=wp.vec3, device="cpu")
+        self.sim = SimpleNamespace(paw_force=force, base_velocity=lambda: self.arrays["base_vel"])
         self.arrays = {
             "base_pos": np.zeros((count, 3)), "base_quat": np.tile([0.0, 0.0, 0.0, 1.0], (count, 1)),
             "base_vel": np.zeros((count, 3)), "goal": np.zeros((count, 3)), "heading": np.zeros(count),
