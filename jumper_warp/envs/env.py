@@ -95,7 +95,7 @@ class Env(Stages):
         self.sim = Simulation(
             num_envs, solver=solver, motors=self.task.motors, visuals=visuals, device=device and str(device),
             ground=ground, block=BlockCfg((0.0, 0.0)) if self._draws_ground else block, tolerance=CONTACT_TOLERANCE,
-            friction=0.85 if self.task.randomization.dynamic_friction else 0.9, threads=threads,
+            friction=self.task.randomization.nominal_friction, threads=threads,
         )  # fmt: skip
         self.wp_device = self.sim.device
         self.device = torch.device(wp.device_to_torch(self.wp_device))
