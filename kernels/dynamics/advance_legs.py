@@ -7,7 +7,7 @@ most takes it, until none would change by more than the tolerance.
 
 import warp as wp
 
-from ..actuation.stops import MAX_SETS, ONE_BY_ONE, SLACK, change_one, pressed_stops
+from ..actuation.stops import MAX_SETS, ONE_BY_ONE, SLACK, StopRows, change_one, pressed_stops, stop_rows
 from ..layout import GRAVITY
 from ..scalar import real, vec3
 from ..state import BaseState, base_com, leg_coord, leg_dof, load_base, load_motors, store_base, store_motors
@@ -103,13 +103,13 @@ class LegEnd:
 @wp.func
 def solve_leg(
     robot: Robot, settings: StepSettings, own: LegParams, world: int, leg: int, old: LegState, torque: vec3,
-    wrench: wp.spatial_vector, block: BlockLaw, pressed: int,
+    wrench: wp.spatial_vector, block: BlockLaw, rows: StopRows, pressed: int,
 ) -> LegEnd:  # fmt: skip
     """Solve a step with given sets of pressed stops."""
     dt = settings.dt
     base = old.base
     g = wp.quat_rotate_inv(base.quat, load_vec3(robot.table, GRAVITY, world))
-    terms = leg_terms(own, old.angles, old.rates, torque, pressed, base.ang, g, dt)
+    terms = leg_terms(own, old.angles, old.rates, torque, rows, pressed, base.ang, g, dt)
     force = vec3(real(wrench[0]), real(wrench[1]), real(wrench[2]))
     moment = vec3(real(wrench[3]), real(wrench[4]), real(wrench[5]))
     share = add_leg(BaseSystem(), terms.dynamics, terms.solve)
@@ -146,15 +146,15 @@ def settle_leg(
 
     A world that is done repeats its last solution while others of its warp go on.
     """
-    stops = own.joints.stops
-    pressed = pressed_stops(stops, old.angles, old.rates, settings.dt, real(0.0), 0)
+    rows = stop_rows(own.stops, old.angles, settings.dt)
+    pressed = pressed_stops(rows, old.rates, real(0.0), 0)
     end = LegEnd()
     sets = int(0)
     working = bool(True)
     while any_world(working):
-        end = solve_leg(robot, settings, own, world, leg, old, torque, wrench, block, pressed)
+        end = solve_leg(robot, settings, own, world, leg, old, torque, wrench, block, rows, pressed)
         sets += 1
-        wanted = pressed_stops(stops, old.angles, end.rates, settings.dt, SLACK * settings.tolerance, pressed)
+        wanted = pressed_stops(rows, end.rates, SLACK * settings.tolerance, pressed)
         differs = wanted != pressed
         first = first_leg(differs)
         working = working and sets < MAX_SETS and from_leg(wp.where(differs, real(1.0), real(0.0)), first) > real(0.0)

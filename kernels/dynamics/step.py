@@ -6,6 +6,7 @@ Semi-implicit Euler: forces and Jacobians at the start of the step, positions mo
 import warp as wp
 
 from ..actuation.joint_forces import JointParams, joint_forces
+from ..actuation.stops import StopParams, StopRows
 from ..kinematics.geometry import LegGeometry
 from ..layout import BASE, GRAVITY, LEG_ROWS, MU_DYNAMIC, MU_STATIC
 from ..scalar import real, vec3
@@ -30,7 +31,7 @@ from .contact import (
     target_normal_velocity,
 )
 from .leg_dynamics import LegDynamics, LegMasses, PawKinematics, leg_dynamics, leg_pose, paw_kinematics
-from .parameters import load_joint_params, load_masses, load_moments
+from .parameters import load_joint_params, load_masses, load_moments, load_stops
 
 wp.set_module_options({"enable_backward": False})
 
@@ -62,6 +63,7 @@ class LegParams:
     geometry: LegGeometry
     masses: LegMasses
     joints: JointParams
+    stops: StopParams
 
 
 @wp.struct
@@ -80,19 +82,21 @@ def load_leg(robot: Robot, world: int, k: int) -> LegParams:
     params.geometry = robot.geometry[k]
     params.masses = load_masses(robot.table, k, world)
     params.joints = load_joint_params(robot.table, k, world)
+    params.stops = load_stops(robot.table, k, world)
     return params
 
 
 @wp.func
 def leg_terms(
-    params: LegParams, angles: vec3, rates: vec3, torque: vec3, pressed: int, omega: vec3, g: vec3, dt: real
-) -> LegTerms:
+    params: LegParams, angles: vec3, rates: vec3, torque: vec3, rows: StopRows, pressed: int, omega: vec3, g: vec3,
+    dt: real,
+) -> LegTerms:  # fmt: skip
     """Return a leg's dynamics, its elimination with the pressed stops, and its paw."""
     geo = params.geometry
     joints = params.joints
     pose = leg_pose(geo, angles)
     dynamics = leg_dynamics(geo, params.masses, pose, rates, omega, g)
-    passive = joint_forces(joints, pose.loop, geo.front, angles, rates, pressed, dt)
+    passive = joint_forces(joints, pose.loop, geo.front, rates, rows, pressed, dt)
     terms = LegTerms()
     terms.dynamics = dynamics
     terms.solve = eliminate_leg(dynamics, passive.inertia + wp.diag(joints.armature), torque + passive.torque)
