@@ -157,7 +157,8 @@ def settle_leg(
         wanted = pressed_stops(rows, end.rates, SLACK * settings.tolerance, pressed)
         differs = wanted != pressed
         first = first_leg(differs)
-        working = working and sets < MAX_SETS and from_leg(wp.where(differs, real(1.0), real(0.0)), first) > real(0.0)
+        revises = from_leg(wp.where(differs, real(1.0), real(0.0)), first) > real(0.0)
+        working = working and sets < MAX_SETS and revises
         if working and sets < ONE_BY_ONE:
             pressed = wanted
         elif working and leg == first:
