@@ -102,6 +102,8 @@ def pressed_stops(rows: StopRows, rates: vec3, slack: real, pressed: int) -> int
     pressed: the set that led to the rates; its stops are released, and others pressed, only beyond the slack [rad/s].
     """
     rate = vec4(rates[0], rates[1], rates[2], rates[1] + rates[2])
+    if pressed == 0 and not wp.max(wp.max(rows.lower - rate, rate - rows.upper)) > slack:
+        return 0
     found = int(0)
     for i in range(ROWS):
         side = row_side(pressed, i)

@@ -6,7 +6,7 @@ Semi-implicit Euler: forces and Jacobians at the start of the step, positions mo
 import warp as wp
 
 from ..actuation.joint_forces import JointParams, joint_forces
-from ..actuation.stops import StopParams, StopRows
+from ..actuation.stops import StopRows
 from ..kinematics.geometry import LegGeometry
 from ..layout import BASE, GRAVITY, LEG_ROWS, MU_DYNAMIC, MU_STATIC
 from ..scalar import real, vec3
@@ -31,7 +31,7 @@ from .contact import (
     target_normal_velocity,
 )
 from .leg_dynamics import LegDynamics, LegMasses, PawKinematics, leg_dynamics, leg_pose, paw_kinematics
-from .parameters import load_joint_params, load_masses, load_moments, load_stops
+from .parameters import load_joint_params, load_masses, load_moments
 
 wp.set_module_options({"enable_backward": False})
 
@@ -63,7 +63,6 @@ class LegParams:
     geometry: LegGeometry
     masses: LegMasses
     joints: JointParams
-    stops: StopParams
 
 
 @wp.struct
@@ -82,7 +81,6 @@ def load_leg(robot: Robot, world: int, k: int) -> LegParams:
     params.geometry = robot.geometry[k]
     params.masses = load_masses(robot.table, k, world)
     params.joints = load_joint_params(robot.table, k, world)
-    params.stops = load_stops(robot.table, k, world)
     return params
 
 
