@@ -28,10 +28,10 @@ from jumper_warp.rl.checkpoint import (
 )
 from jumper_warp.rl.mirror import Symmetry, image, plain_layers
 from jumper_warp.rl.networks import EPS, NORMALISED_LIMIT
-from jumper_warp.tasks.cfg import TaskCfg
+from jumper_warp.tasks.cfg import Handover, TaskCfg
 from jumper_warp.tasks.interface import interface
 from jumper_warp.tasks.randomization import RandomizationCfg
-from jumper_warp.tasks.saving import OPTIONAL, TaskError, task_from_json
+from jumper_warp.tasks.saving import OPTIONAL, TaskError, handover_from_json, task_from_json
 from jumper_warp.utils.errors import InputError
 
 if TYPE_CHECKING:
@@ -200,6 +200,21 @@ def restored_task(
         return task_from_json(saved, modules, leave_out=leave_out)
     except TaskError as error:
         raise PolicyError(f"task in the configuration: {error}") from error
+
+
+def restored_skills(config: dict[str, Any], modules: Iterable[ModuleType] = ()) -> tuple[list[TaskCfg], list[Handover]]:
+    """Return all tasks and handovers of an environment's saved configuration (`Env.config`).
+
+    modules: that the user has named. Raises PolicyError: it is not of tasks and functions that are known here.
+    """
+    modules = list(modules)
+    try:
+        tasks = [task_from_json(saved, modules) for saved in config.get("tasks", [config["task"]])]
+        return tasks, [handover_from_json(saved, tasks, modules) for saved in config.get("handovers", [])]
+    except TaskError as error:
+        raise PolicyError(f"tasks in the configuration: {error}") from error
+    except (LookupError, TypeError, AttributeError) as error:
+        raise PolicyError(f"no tasks in the configuration ({type(error).__name__}: {error})") from error
 
 
 def env_of_policy(
