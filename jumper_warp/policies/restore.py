@@ -26,6 +26,7 @@ from jumper_warp.rl.checkpoint import (
     load_checkpoint,
     one_line,
 )
+from jumper_warp.rl.mirror import Symmetry, image, plain_layers
 from jumper_warp.rl.networks import EPS, NORMALISED_LIMIT
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.tasks.interface import interface
@@ -34,6 +35,8 @@ from jumper_warp.tasks.saving import OPTIONAL, TaskError, task_from_json
 from jumper_warp.utils.errors import InputError
 
 if TYPE_CHECKING:
+    import torch
+
     from jumper_warp.envs.env import Env
 
 CHECKPOINTS = "checkpoints"
@@ -137,6 +140,8 @@ def _policy_of_checkpoint(path: Path, state: dict[str, Any]) -> Policy:
         std = (model["obs_moments.var"] + EPS).sqrt().float()
         times = {"policy_dt": env["policy_dt_s"], "physics_dt": env["physics_dt_s"]}
         shape = {"hidden": tuple(ppo["hidden"]), "activation": ppo["activation"]}
+        if symmetry := _symmetry(model):
+            layers, shape["hidden"] = plain_layers(layers, symmetry), tuple(2 * width for width in ppo["hidden"])
         commit = config.get("commit") or {"hash": None, "dirty": None}
         config |= {"commit": commit["hash"], "dirty": commit["dirty"], "iteration": state["iteration"]}
     except DAMAGE as error:
@@ -150,6 +155,14 @@ def _policy_of_checkpoint(path: Path, state: dict[str, Any]) -> Policy:
         raise PolicyError(f"{path}: {error}") from error
     except DAMAGE as error:
         raise _no_training(path, error) from error
+
+
+def _symmetry(model: dict[str, torch.Tensor]) -> Symmetry | None:
+    """Return the symmetry of a checkpoint's actor, if it has one by its form."""
+    if not any(name.startswith("mirror_") for name in model):
+        return None
+    parts = ((model[f"mirror_{name}_order"], model[f"mirror_{name}_signs"], name) for name in Symmetry._fields)
+    return Symmetry(*(image(*part) for part in parts))
 
 
 def _no_training(path: Path, error: Exception) -> CheckpointError:

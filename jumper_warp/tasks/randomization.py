@@ -76,6 +76,9 @@ class RandomizationCfg:
     """[ms] From action to motor, rounded to the nearest physics step."""
     observation_latency: Range = None
     """[ms] From sensor to policy, rounded to the nearest physics step."""
+    no_latency: float = 0.0
+    """[1] Share of draws of either latency that give none. Else no latency on both sides, the nominal case, has next to
+    no weight in training, and a policy may chatter there."""
     force: Range = (-5.0, 5.0)
     """[N] On the base, along each world axis, while a paw is on the ground."""
     torque: Range = (-3.0, 3.0)
@@ -107,8 +110,9 @@ class RandomizationCfg:
             value = getattr(self, name)
             if value is not None and not 0.0 <= value[0] <= value[1] <= LONGEST_LATENCY:
                 raise InputError(f"randomisation range {name} must be in 0 to {LONGEST_LATENCY:g} ms, got {value}")
-        if not 0.0 <= self.push_share <= 1.0:
-            raise InputError(f"randomisation push_share must be in [0, 1], got {self.push_share}")
+        for name in ("push_share", "no_latency"):
+            if not 0.0 <= getattr(self, name) <= 1.0:
+                raise InputError(f"randomisation {name} must be in [0, 1], got {getattr(self, name)}")
 
     @classmethod
     def off(cls) -> RandomizationCfg:
@@ -118,7 +122,7 @@ class RandomizationCfg:
 
     @classmethod
     def walking(cls) -> RandomizationCfg:
-        """Return the paper's ranges for walking."""
+        """Return the paper's ranges for walking, and either latency left out in a share of worlds."""
         return cls(
             static_friction=(0.8, 0.95),
             dynamic_friction=(0.7, 0.8),
@@ -127,6 +131,7 @@ class RandomizationCfg:
             motor_friction=(0.0, 0.04),
             latency=(0.0, 32.0),
             observation_latency=(0.0, 32.0),
+            no_latency=0.2,
             force=(-10.0, 10.0),
             push_in_flight=True,
         )
@@ -161,10 +166,10 @@ class RandomizationCfg:
         """Return the rows that are on as events."""
         found = []
 
-        def add(func: Any, pair: Range, scale: float = 1.0, spread: bool = False) -> None:
+        def add(func: Any, pair: Range, scale: float = 1.0, spread: bool = False, **more: float) -> None:
             if pair is not None:
                 lower, upper = scale * pair[0], scale * pair[1]
-                found.append(EventTerm(func, mode=self.redraw, spread=spread, lower=lower, upper=upper))
+                found.append(EventTerm(func, mode=self.redraw, spread=spread, lower=lower, upper=upper, **more))
 
         add(parameters.base_mass, self.base_mass)
         add(parameters.link_mass, self.link_mass, spread=True)
@@ -192,8 +197,8 @@ class RandomizationCfg:
                 EventTerm(parameters.friction, mode=self.redraw, dynamic_lower=dynamic[0], dynamic_upper=dynamic[1],
                           static_lower=static[0], static_upper=static[1])
             )  # fmt: skip
-        add(parameters.action_latency, self.latency, 1.0e-3)
-        add(parameters.observation_latency, self.observation_latency, 1.0e-3)
+        add(parameters.action_latency, self.latency, 1.0e-3, none=self.no_latency)
+        add(parameters.observation_latency, self.observation_latency, 1.0e-3, none=self.no_latency)
         if self.force or self.torque:
             force, torque = self.force or (0.0, 0.0), self.torque or (0.0, 0.0)
             timing: dict[str, Any] = {"mode": "reset", "repack": False}

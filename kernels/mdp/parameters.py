@@ -193,15 +193,23 @@ def physics_steps(robot: RobotParameters, seconds: float) -> int:
 
 
 @wp.func
-def action_latency(robot: RobotParameters, draw: Draw, lower: float, upper: float):
-    """Delay actions [s]."""
-    robot.latency[draw.world] = physics_steps(robot, between(draw, 0, lower, upper))
+def drawn_delay(robot: RobotParameters, draw: Draw, lower: float, upper: float, none: float) -> int:
+    """Return a drawn delay [physics steps], none in a share of draws."""
+    if between(draw, 1, 0.0, 1.0) < none:
+        return 0
+    return physics_steps(robot, between(draw, 0, lower, upper))
 
 
 @wp.func
-def observation_latency(robot: RobotParameters, draw: Draw, lower: float, upper: float):
-    """Delay what the policy reads of its sensors [s]."""
-    robot.observation_latency[draw.world] = physics_steps(robot, between(draw, 0, lower, upper))
+def action_latency(robot: RobotParameters, draw: Draw, lower: float, upper: float, none: float = 0.0):
+    """Delay actions [s], but not in a share of worlds."""
+    robot.latency[draw.world] = drawn_delay(robot, draw, lower, upper, none)
+
+
+@wp.func
+def observation_latency(robot: RobotParameters, draw: Draw, lower: float, upper: float, none: float = 0.0):
+    """Delay what the policy reads of its sensors [s], but not in a share of worlds."""
+    robot.observation_latency[draw.world] = drawn_delay(robot, draw, lower, upper, none)
 
 
 @wp.func

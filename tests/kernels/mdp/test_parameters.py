@@ -233,11 +233,13 @@ def test_paws_have_one_dynamic_coefficient_and_a_static_one_that_is_not_below_it
 @pytest.mark.parametrize("name", ["action_latency", "observation_latency"])
 def test_a_latency_is_the_nearest_number_of_physics_steps(made, drawn, name):
     array_of = {"action_latency": "latency", "observation_latency": "observation_latency"}[name]
-    found = getattr(drawn(name, 0.0, 0.016, only=(array_of,)), array_of)
+    found = getattr(drawn(name, 0.0, 0.016, 0.0, only=(array_of,)), array_of)
     # 0 to 16 ms are 0 to 7.68 steps of 1/480 s: half of the first step counts as 0, 0.18 of the last as 8
     shares = np.bincount(found, minlength=9) / N
     expected = np.array([0.5, *[1.0] * 7, 0.18]) / 7.68
     assert len(shares) == 9 and np.abs(shares - expected).max() < 4.5 * np.sqrt(0.13 * 0.87 / N)
+    some = getattr(drawn(name, 0.004, 0.016, 0.3, only=(array_of,)), array_of)  # 1.92 steps at least, unless none
+    assert np.mean(some == 0) == pytest.approx(0.3, abs=4.5 * np.sqrt(0.3 * 0.7 / N)) and some[some > 0].max() == 8
 
 
 @pytest.mark.parametrize("name", ["action_latency", "observation_latency"])
@@ -245,9 +247,9 @@ def test_a_latency_of_whole_steps_stays_so_many(made, drawn, name):
     array_of = {"action_latency": "latency", "observation_latency": "observation_latency"}[name]
     for steps in range(49):
         seconds = float(np.float32(steps / 480.0))
-        assert (getattr(drawn(name, seconds, seconds, only=(array_of,)), array_of) == steps).all(), steps
+        assert (getattr(drawn(name, seconds, seconds, 0.0, only=(array_of,)), array_of) == steps).all(), steps
     for seconds, steps in ((0.008, 4), (0.001, 0), (0.0011, 1), (0.0167, 8), (0.1, 48)):
-        assert (getattr(drawn(name, seconds, seconds, only=(array_of,)), array_of) == steps).all(), steps
+        assert (getattr(drawn(name, seconds, seconds, 0.0, only=(array_of,)), array_of) == steps).all(), steps
 
 
 def test_a_push_comes_in_its_share_of_draws_and_else_there_is_none(drawn):
