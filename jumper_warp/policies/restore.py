@@ -28,6 +28,7 @@ from jumper_warp.rl.checkpoint import (
 )
 from jumper_warp.rl.mirror import Symmetry, image, plain_layers
 from jumper_warp.rl.networks import EPS, NORMALISED_LIMIT
+from jumper_warp.robot.gravity import check_gravity
 from jumper_warp.tasks.cfg import Handover, TaskCfg
 from jumper_warp.tasks.interface import interface
 from jumper_warp.tasks.randomization import RandomizationCfg
@@ -67,9 +68,13 @@ class Conditions:
     """[1] Scales of kp and kd of all motors (default: 1, or drawn if randomised)."""
     friction: float | None = None
     """[1] Of the paws, static and dynamic (default: nominal, or drawn if randomised)."""
+    gravity: float | None = None
+    """[m/s^2] Downward (default: that of the task)."""
 
     def __post_init__(self) -> None:
         """Raises InputError: a value out of range, or pushes in flight where there are none."""
+        if self.gravity is not None:
+            check_gravity(self.gravity)
         self._with_fixed(RandomizationCfg.off())
         if self.push_in_flight and not self.randomize:
             raise InputError("push_in_flight needs randomize: without it there are no pushes")
@@ -90,6 +95,7 @@ class Conditions:
 
     def applied(self, task: TaskCfg) -> TaskCfg:
         """Return a task as it is tried in these conditions; pushes come and go, however its training had it."""
+        task = task if self.gravity is None else replace(task, gravity=self.gravity)
         trained = task.randomization
         if self.randomize:
             in_flight = trained.push_in_flight or self.push_in_flight

@@ -1,9 +1,9 @@
 """Reference state initialisation: episodes begin at the stages of a jump (paper, Section V-D).
 
-Standing or squatting on given paw positions, the default pose, in flight on a projectile to the goal, just before
-touchdown, and just landed. Joint angles come from the closed-form inverse kinematics and joint rates from the leg's
-Jacobian, so every state satisfies the loops. A draw whose paws cannot be reached within limits, whose links touch, or
-whose paws are below the ground is drawn again; the default pose stands in after the last attempt.
+Standing or squatting on given paw positions, the default pose, pushing off, in flight on a projectile to the goal, just
+before touchdown, and just landed. Joint angles come from the closed-form inverse kinematics and joint rates from the
+leg's Jacobian, so every state satisfies the loops. A draw whose paws cannot be reached within limits, whose links
+touch, or whose paws are below the ground is drawn again; the default pose stands in after the last attempt.
 """
 
 import warp as wp
@@ -24,6 +24,7 @@ from .reset_draws import (
     AFTER_LANDING,
     DEFAULT,
     IN_FLIGHT,
+    PUSHING,
     STANDING,
     TOUCHDOWN,
     BaseDraw,
@@ -32,6 +33,8 @@ from .reset_draws import (
     draw_box,
     draw_paw,
     draw_scheme,
+    rounded,
+    time_spent,
 )
 from .state import FLIGHT, LANDED, STANCE, JumpState
 
@@ -54,6 +57,7 @@ class JumpLevel:
     goal_upper: wp.vec3
     base_height: wp.vec2  # [m] of standing starts
     jump_again: float  # share of landed robots that get another goal
+    round: int  # 1: goals are drawn from the ellipse inside the box
 
 
 @wp.func
@@ -84,7 +88,7 @@ def draw_leg(
             here = surface(ground, spot[0], spot[1])
             paw[2] = here[0] + geo.paw_radius - d.pos[2] - lift
         found = leg_to(geo, limits, wp.quat_rotate_inv(d.quat, paw))
-        if scheme == AFTER_LANDING:
+        if scheme == AFTER_LANDING or scheme == PUSHING:
             # the paw rests on the ground while the base moves, so the joints move too
             found = leg_over_ground(geo, found, -wp.quat_rotate_inv(d.quat, d.lin_vel))
     else:
@@ -135,6 +139,15 @@ def draw_until_taken(
 
 
 @wp.func
+def draw_goal(draw: Draw, level: JumpLevel) -> wp.vec3:
+    """Return a goal of a level relative to start and heading."""
+    goal = draw_box(draw, 50, level.goal_lower, level.goal_upper)
+    if level.round != 0:
+        goal = rounded(goal, level.goal_lower, level.goal_upper)
+    return goal
+
+
+@wp.func
 def draw_again(draw: Draw, delay: wp.vec2, share: float) -> int:
     """Return how many policy steps after touchdown another goal comes; 0: none, in all but a share of draws.
 
@@ -157,6 +170,10 @@ def begin_task(
     task.command_step = int(between(draw, 9, 0.0, float(ranges.command_delay) + 0.999))
     task.again_delay = ranges.again_delay
     task.again_step = draw_again(draw, ranges.again_delay, jump_again)
+    if scheme == PUSHING or (scheme == STANDING and ranges.lean > 0.0):
+        task.start = wp.vec3(0.0, 0.0, pos[2])
+    if scheme == PUSHING:
+        task.command_step = 0
     if scheme == IN_FLIGHT or scheme == TOUCHDOWN:
         task.phase = FLIGHT
         task.command_step = 0
@@ -187,6 +204,7 @@ def begin_next_jump(old: JumpState, ground: Ground, goal: wp.vec3, pos: wp.vec3,
     task.idle_steps = 0
     task.max_height = pos[2]
     task.peak_tilt = 0.0
+    task.paws_landed = 0
     task.again_step = 0
     task.jumps = old.jumps + 1
     return task
@@ -217,9 +235,10 @@ def reset_jump(
     world = draw.world
     ranges = settings.states
     g = -robot.gravity[world][2]
-    scheme = draw_scheme(draw, ranges)
+    spent = time_spent(old)
+    scheme = draw_scheme(draw, ranges, spent)
     heading = between(draw, 13, -ranges.heading, ranges.heading)
-    goal = turned(draw_box(draw, 50, level.goal_lower, level.goal_upper), heading)
+    goal = turned(draw_goal(draw, level), heading)
     here = place_ground(scene.ground, world, draw, ranges, settings.grounds, scheme, heading, goal)
     taken = draw_until_taken(
         scene.geometry, here, leg_limits(skill.command_filter), ranges, draw, scheme, heading, level.base_height,
@@ -231,6 +250,7 @@ def reset_jump(
     pos = base_pos(robot, world)
     task = begin_task(draw, ranges, scheme, goal, pos, robot.joint_qd[world * DOFS + 2], level.jump_again)
     task.heading = heading
+    task.spent = spent
     task.goal_ground = surface(here, goal[0], goal[1])[0]
     return task
 
@@ -244,7 +264,7 @@ def another_jump_due(task: JumpState) -> bool:
 @wp.func
 def draw_next_jump(view: RobotView, scene: Scene, task: JumpState, level: JumpLevel, draw: Draw) -> JumpState:
     """Return the state of an episode that goes on with another jump, to a drawn goal."""
-    goal = draw_box(draw, 50, level.goal_lower, level.goal_upper)
+    goal = draw_goal(draw, level)
     new = begin_next_jump(task, world_ground(scene.ground, view.world), goal, view.pos, yaw_of(view.quat))
     new.again_step = draw_again(draw, task.again_delay, level.jump_again)
     return new
