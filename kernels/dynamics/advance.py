@@ -28,8 +28,8 @@ def advance_once(
     last = step == settings.substeps - 1
     g = wp.quat_rotate_inv(base.quat, load_vec3(robot.table, GRAVITY, world))
     wrench = base_wrench(drive, world)
-    force = vec3(real(wrench[0]), real(wrench[1]), real(wrench[2]))
-    moment = vec3(real(wrench[3]), real(wrench[4]), real(wrench[5]))
+    force = vec3(wrench[0], wrench[1], wrench[2])
+    moment = vec3(wrench[3], wrench[4], wrench[5])
     system = base_system(robot, world, base, g, force, moment)
     for k in range(legs.shape[0]):
         torque = applied_torque(load_leg_drive(drive, world, k), step, angles[k], rates[k])
