@@ -72,7 +72,7 @@ def replay_step(
     base = record.base[world, i]
     g = wp.quat_rotate_inv(base.quat, load_vec3(robot.table, GRAVITY, world))
     system = base_system(robot, world, base, g, force, moment)
-    for k in range(4):
+    for k in range(record.legs.shape[2]):
         torque = row_vec3(torques, step, 3 * k, world)
         terms = leg_terms(
             load_leg(robot, world, k), record.angles[world, i, k], record.rates[world, i, k], torque, base.ang, g, dt
@@ -84,7 +84,7 @@ def replay_step(
     record.inverse[world, i] = inverse
     force_impulse = dt * system.force
     moment_impulse = dt * system.moment
-    for k in range(4):
+    for k in range(record.legs.shape[2]):
         impulse = wp.quat_rotate_inv(base.quat, impulses[step, k, world])
         if wp.dot(impulse, impulse) > real(0.0):
             solve = record.legs[world, i, k]
@@ -99,7 +99,7 @@ def replay_step(
             record.legs[world, i, k] = solve
     lin = solve_lin(inverse, force_impulse, moment_impulse)
     ang = solve_ang(inverse, force_impulse, moment_impulse)
-    for k in range(4):
+    for k in range(record.legs.shape[2]):
         rates = record.rates[world, i, k] + dt * motor_acceleration(record.legs[world, i, k], lin / dt, ang / dt)
         record.rates[world, i + 1, k] = rates
         record.angles[world, i + 1, k] = record.angles[world, i, k] + dt * rates
@@ -130,7 +130,7 @@ def reverse_step(
     # integration of the coordinates
     new_velocity = adj.lin + dt * adj.pos
     quat_adj, ang_seed, _dt, _seed = wp.grad(turned)(base.quat, ang, dt, adj.quat)
-    for k in range(4):
+    for k in range(laws.shape[0]):
         rate_adj[k] = rate_adj[k] + dt * angle_adj[k]
     m = solve_system(
         inverse, wp.quat_rotate_inv(base.quat, new_velocity), ang_seed + adj.ang, record.legs, world, i, rate_adj,
@@ -139,7 +139,7 @@ def reverse_step(
     # contact
     pushed_by = seeds.impulse.shape[0] > 0
     touching = bool(False)
-    for k in range(4):
+    for k in range(laws.shape[0]):
         laws[k] = PawLaw()
         impulse = wp.quat_rotate_inv(base.quat, impulses[step, k, world])
         if wp.dot(impulse, impulse) > real(0.0):
@@ -163,7 +163,7 @@ def reverse_step(
         solve_laws(contacts, laws, paw_seeds, matrix, vector)
         more_lin = vec3(real(0.0))
         more_ang = vec3(real(0.0))
-        for k in range(4):
+        for k in range(laws.shape[0]):
             if laws[k].mode != SEPARATE:
                 c = contacts[k]
                 y = wp.transpose(laws[k].by_velocity) * paw_seeds[k]
@@ -176,7 +176,7 @@ def reverse_step(
                 virtual[k] = virtual[k] + record.legs[world, i, k].inverse * joint
         m.lin += more_lin
         m.ang += more_ang
-        for k in range(4):
+        for k in range(laws.shape[0]):
             solve = record.legs[world, i, k]
             virtual[k] = virtual[k] - solve.to_lin * more_lin - solve.to_ang * more_ang
     # the equations of motion
@@ -194,7 +194,7 @@ def reverse_step(
     out.quat = quat_adj
     out.ang = m.ang_seed
     g_adj = vec3(real(0.0))
-    for k in range(4):
+    for k in range(laws.shape[0]):
         params = load_leg(robot, world, k)
         old_rates = record.rates[world, i, k]
         leg = LegFactors()
@@ -421,7 +421,7 @@ def reverse_kernel(
     vector = wp.zeros(shape=(12,), dtype=real)
     last = timing.steps * timing.substeps / timing.every
     entries = add_row_seeds(RowSeeds(), seeds, last, world)
-    for k in range(4):
+    for k in range(laws.shape[0]):
         if seeds.q.shape[0] > 0:
             angle_adj[k] = row_vec3(seeds.q, last, 7 + 3 * k, world)
         if seeds.qd.shape[0] > 0:
@@ -434,7 +434,7 @@ def reverse_kernel(
         force = wrench_part(commands, t, 0, world)
         moment = wrench_part(commands, t, 3, world)
         record.base[world, 0] = load_row_base(rows, row, world, com)
-        for k in range(4):
+        for k in range(laws.shape[0]):
             record.angles[world, 0, k] = row_vec3(rows.q, row, 7 + 3 * k, world)
             record.rates[world, 0, k] = row_vec3(rows.qd, row, 6 + 3 * k, world)
         for i in range(timing.every):
@@ -446,12 +446,12 @@ def reverse_kernel(
                 robot, dt, world, force, moment, rows.impulse, seeds, first + i, i, record, adj, angle_adj, rate_adj,
                 torque_adj, contacts, laws, paw_seeds, matrix, vector, virtual, gradients, t,
             )  # fmt: skip
-            for k in range(4):
+            for k in range(laws.shape[0]):
                 angles = record.angles[world, i, k]
                 rates = record.rates[world, i, k]
                 angle_sum = angle_adj[k]
                 rate_sum = rate_adj[k]
-                for c in range(3):
+                for c in range(wp.static(3)):
                     seed = torque_adj[k][c]
                     if seeds.torque.shape[0] > 0:
                         seed += seeds.torque[first + i, 3 * k + c, world]
@@ -464,7 +464,7 @@ def reverse_kernel(
                 angle_adj[k] = angle_sum
                 rate_adj[k] = rate_sum
         entries = add_row_seeds(leave_row(rows, robot, row, world, adj, gradients), seeds, row, world)
-        for k in range(4):
+        for k in range(laws.shape[0]):
             if first == t * timing.substeps:
                 by_leg = reverse_filter(
                     commands, actuation, t, k, world, record.angles[world, 0, k], record.rates[world, 0, k], gradients

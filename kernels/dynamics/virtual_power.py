@@ -13,7 +13,7 @@ import warp as wp
 from ..actuation.joint_forces import JointParams, joint_forces
 from ..kinematics.five_bar import five_bar_bias
 from ..kinematics.geometry import LegGeometry
-from ..scalar import quat, real, vec2, vec3
+from ..scalar import quat, real, vec2, vec3, vec6
 from ..terrain.ground import Ground, floor_distance, floor_normal
 from .base_motion import exp_rotation
 from .contact import SEPARATE, contact_jacobian, target_normal_velocity
@@ -59,6 +59,37 @@ class FrameMotion:
 
 
 @wp.func
+def add(a: FrameMotion, b: FrameMotion) -> FrameMotion:
+    """Return a + b, for the adjoints below."""
+    c = FrameMotion()
+    c.virtual_lin = a.virtual_lin + b.virtual_lin
+    c.virtual_ang = a.virtual_ang + b.virtual_ang
+    c.acc = a.acc + b.acc
+    c.ang = a.ang + b.ang
+    c.ang_acc = a.ang_acc + b.ang_acc
+    return c
+
+
+@wp.func
+def add(a: MassMoments, b: MassMoments) -> MassMoments:  # noqa: F811
+    """Return a + b."""
+    c = MassMoments()
+    c.mass = a.mass + b.mass
+    c.first = a.first + b.first
+    c.second = a.second + b.second
+    return c
+
+
+@wp.func
+def mixed(a: vec3, b: vec3) -> vec6:
+    """Return the derivative of a^T S b by packed second moments S."""
+    return vec6(
+        a[0] * b[0], a[1] * b[1], a[2] * b[2],
+        a[0] * b[1] + a[1] * b[0], a[0] * b[2] + a[2] * b[0], a[1] * b[2] + a[2] * b[1],
+    )  # fmt: skip
+
+
+@wp.func
 def inertia_power(body: MassMoments, frame: FrameMotion) -> real:
     """Return the virtual power [W] of a rigid body's inertia and weight; moments about the frame, in its axes."""
     acc, ang, ang_acc = frame.acc, frame.ang, frame.ang_acc
@@ -71,10 +102,55 @@ def inertia_power(body: MassMoments, frame: FrameMotion) -> real:
     return wp.dot(frame.virtual_lin, force) + wp.dot(frame.virtual_ang, moment)
 
 
+@wp.func_grad(inertia_power)
+def adj_inertia_power(body: MassMoments, frame: FrameMotion, adj_ret: real):
+    """Add the gradient of `inertia_power`."""
+    acc, ang, ang_acc = frame.acc, frame.ang, frame.ang_acc
+    lin_v, ang_v, first = frame.virtual_lin, frame.virtual_ang, body.first
+    swing = wp.cross(ang, first)
+    spin = inertia_mul(body.second, ang)
+    by_swing = wp.cross(lin_v, ang)
+    by_spin = wp.cross(ang_v, ang)
+    by_frame = FrameMotion()
+    by_frame.virtual_lin = adj_ret * (body.mass * acc + wp.cross(ang_acc, first) + wp.cross(ang, swing))
+    by_frame.virtual_ang = adj_ret * (
+        wp.cross(first, acc) + inertia_mul(body.second, ang_acc) + wp.cross(ang, spin)
+    )
+    by_frame.acc = adj_ret * (body.mass * lin_v + wp.cross(ang_v, first))
+    by_frame.ang_acc = adj_ret * (wp.cross(first, lin_v) + inertia_mul(body.second, ang_v))
+    by_frame.ang = adj_ret * (
+        wp.cross(swing, lin_v)
+        + wp.cross(first, by_swing)
+        + wp.cross(spin, ang_v)
+        + inertia_mul(body.second, by_spin)
+    )
+    by_body = MassMoments()
+    by_body.mass = adj_ret * wp.dot(lin_v, acc)
+    by_body.first = adj_ret * (wp.cross(lin_v, ang_acc) + wp.cross(by_swing, ang) + wp.cross(acc, ang_v))
+    turn = wp.dot(ang_v, ang_acc) + wp.dot(by_spin, ang)
+    by_body.second = adj_ret * (
+        vec6(turn, turn, turn, real(0.0), real(0.0), real(0.0)) - mixed(ang_v, ang_acc) - mixed(by_spin, ang)
+    )
+    wp.adjoint[body] += by_body
+    wp.adjoint[frame] += by_frame
+
+
 @wp.func
 def planar(v: vec2) -> vec3:
     """Return (x, 0, z)."""
     return vec3(v[0], real(0.0), v[1])
+
+
+@wp.func
+def planar_dot(a: vec3, b: vec3) -> real:
+    """Return a_x b_x + a_z b_z."""
+    return a[0] * b[0] + a[2] * b[2]
+
+
+@wp.func
+def planar_cross(a: vec3, b: vec3) -> real:
+    """Return a_z b_x - a_x b_z."""
+    return a[2] * b[0] - a[0] * b[2]
 
 
 @wp.func
@@ -103,6 +179,52 @@ def link_motion(
     link.ang = rotate_y(w, cosine, -sine) + vec3(real(0.0), turn[0], real(0.0))
     link.ang_acc = rotate_y(housing.ang_acc + vec3(-w[2] * turn[0], turn[1], w[0] * turn[0]), cosine, -sine)
     return link
+
+
+@wp.func_grad(link_motion)
+def adj_link_motion(
+    housing: FrameMotion, origin: vec3, vel: vec2, acc: vec2, virtual: vec2, turn: vec3, cosine: real, sine: real,
+    adj_ret: FrameMotion,
+):  # fmt: skip
+    """Add the gradient of `link_motion`."""
+    w = housing.ang
+    # values before they are turned into the link's axes
+    swing = wp.cross(w, origin) + real(2.0) * planar(vel)
+    lin_v = housing.virtual_lin + wp.cross(housing.virtual_ang, origin) + planar(virtual)
+    whole_acc = housing.acc + wp.cross(housing.ang_acc, origin) + wp.cross(w, swing) + planar(acc)
+    whole_ang_acc = housing.ang_acc + vec3(-w[2] * turn[0], turn[1], w[0] * turn[0])
+    by_lin_v = rotate_y(adj_ret.virtual_lin, cosine, sine)
+    by_ang_v = rotate_y(adj_ret.virtual_ang, cosine, sine)
+    by_acc = rotate_y(adj_ret.acc, cosine, sine)
+    by_ang = rotate_y(adj_ret.ang, cosine, sine)
+    by_ang_acc = rotate_y(adj_ret.ang_acc, cosine, sine)
+    by_swing = wp.cross(by_acc, w)
+    by_housing = FrameMotion()
+    by_housing.virtual_lin = by_lin_v
+    by_housing.virtual_ang = by_ang_v + wp.cross(origin, by_lin_v)
+    by_housing.acc = by_acc
+    by_housing.ang_acc = by_ang_acc + wp.cross(origin, by_acc)
+    by_housing.ang = (
+        by_ang
+        + wp.cross(swing, by_acc)
+        + wp.cross(origin, by_swing)
+        + turn[0] * vec3(by_ang_acc[2], real(0.0), -by_ang_acc[0])
+    )
+    wp.adjoint[housing] += by_housing
+    wp.adjoint[origin] += wp.cross(by_lin_v, housing.virtual_ang) + wp.cross(by_acc, housing.ang_acc) + wp.cross(by_swing, w)
+    wp.adjoint[vel] += real(2.0) * vec2(by_swing[0], by_swing[2])
+    wp.adjoint[acc] += vec2(by_acc[0], by_acc[2])
+    wp.adjoint[virtual] += vec2(by_lin_v[0], by_lin_v[2])
+    wp.adjoint[turn] += vec3(
+        adj_ret.ang[1] + by_ang_acc[2] * w[0] - by_ang_acc[0] * w[2], by_ang_acc[1], adj_ret.virtual_ang[1]
+    )
+    along = planar_dot(adj_ret.virtual_lin, lin_v) + planar_dot(adj_ret.virtual_ang, housing.virtual_ang)
+    along += planar_dot(adj_ret.acc, whole_acc) + planar_dot(adj_ret.ang, w) + planar_dot(adj_ret.ang_acc, whole_ang_acc)
+    across = planar_cross(adj_ret.virtual_lin, lin_v) + planar_cross(adj_ret.virtual_ang, housing.virtual_ang)
+    across += planar_cross(adj_ret.acc, whole_acc) + planar_cross(adj_ret.ang, w)
+    across += planar_cross(adj_ret.ang_acc, whole_ang_acc)
+    wp.adjoint[cosine] += along
+    wp.adjoint[sine] += across
 
 
 @wp.func
