@@ -8,7 +8,7 @@ import warp as wp
 
 from ..actuation.command_filter import FilterParams, Limits, filter_leg
 from ..actuation.motors import MotorArrays, MotorParams, load_motor, motor_torque
-from ..layout import BODIES, DOFS
+from ..layout import DOFS
 from ..scalar import quat, real, vec3
 from ..state import BaseState, base_com, leg_dof
 from .advance import advance_once
@@ -189,9 +189,7 @@ def commanded(safe: wp.array3d(dtype=real), before: wp.array2d(dtype=real), step
 
 
 @wp.func
-def arrived_target(
-    commands: Commands, safe: wp.array3d(dtype=real), arrived: Arrival, motor: int, world: int
-) -> real:
+def arrived_target(commands: Commands, safe: wp.array3d(dtype=real), arrived: Arrival, motor: int, world: int) -> real:
     """Return the target [rad] that a motor follows in a physics step."""
     newer = commanded(safe, commands.before, arrived.newer, motor, world)
     if arrived.weight == real(1.0):

@@ -7,7 +7,7 @@ then run backwards one by one (`step_adjoint`, `virtual_power`).
 import warp as wp
 
 from ..actuation.command_filter import FilterParams, filter_leg
-from ..actuation.motors import motor_torque
+from ..actuation.motors import MotorParams, motor_torque
 from ..layout import BASE, GRAVITY
 from ..scalar import quat, real, vec2, vec3
 from ..state import BaseState, base_com
@@ -15,6 +15,9 @@ from .base_dynamics import add_leg, invert, motor_acceleration, solve_ang, solve
 from .base_motion import moved_base
 from .contact import SEPARATE, PawContact
 from .gradients import (
+    GRADIENT_ROWS,
+    LATENCY_GRADIENT,
+    MOTOR_GRADIENT,
     Gradients,
     add_com,
     add_entry,
@@ -42,7 +45,7 @@ from .rollout import (
     row_vec3,
     store_row_vec3,
 )
-from .step import Robot, StepSettings, base_system, leg_terms, load_leg
+from .step import LegParams, Robot, StepSettings, base_system, leg_terms, load_leg
 from .step_adjoint import (
     PawLaw,
     StepRecord,
@@ -65,7 +68,7 @@ def wrench_part(commands: Commands, t: int, first: int, world: int) -> vec3:
 
 @wp.func
 def replay_step(
-    robot: Robot, dt: real, world: int, force: vec3, moment: vec3, torques: wp.array3d(dtype=real),
+    robot: Robot, params: wp.array(dtype=LegParams), dt: real, world: int, force: vec3, moment: vec3, torques: wp.array3d(dtype=real),
     impulses: wp.array3d(dtype=vec3), step: int, i: int, record: StepRecord,
 ):  # fmt: skip
     """Make a step again from entry i of the record, with known torques and impulses; writes the record."""
@@ -74,9 +77,7 @@ def replay_step(
     system = base_system(robot, world, base, g, force, moment)
     for k in range(record.legs.shape[2]):
         torque = row_vec3(torques, step, 3 * k, world)
-        terms = leg_terms(
-            load_leg(robot, world, k), record.angles[world, i, k], record.rates[world, i, k], torque, base.ang, g, dt
-        )
+        terms = leg_terms(params[k], record.angles[world, i, k], record.rates[world, i, k], torque, base.ang, g, dt)
         record.legs[world, i, k] = terms.solve
         record.paws[world, i, k] = terms.paw
         system = add_leg(system, terms.dynamics, terms.solve)
@@ -103,18 +104,16 @@ def replay_step(
         rates = record.rates[world, i, k] + dt * motor_acceleration(record.legs[world, i, k], lin / dt, ang / dt)
         record.rates[world, i + 1, k] = rates
         record.angles[world, i + 1, k] = record.angles[world, i, k] + dt * rates
-    record.base[world, i + 1] = moved_base(
-        base, wp.quat_rotate_inv(base.quat, base.lin) + lin, base.ang + ang, dt
-    )
+    record.base[world, i + 1] = moved_base(base, wp.quat_rotate_inv(base.quat, base.lin) + lin, base.ang + ang, dt)
 
 
 @wp.func
 def reverse_step(
-    robot: Robot, dt: real, world: int, force: vec3, moment: vec3, impulses: wp.array3d(dtype=vec3), seeds: Rows,
+    robot: Robot, all_params: wp.array(dtype=LegParams), dt: real, world: int, force: vec3, moment: vec3, impulses: wp.array3d(dtype=vec3), seeds: Rows,
     step: int, i: int, record: StepRecord, adj: BaseState, angle_adj: wp.array(dtype=vec3),
     rate_adj: wp.array(dtype=vec3), torque_adj: wp.array(dtype=vec3), contacts: wp.array(dtype=PawContact),
     laws: wp.array(dtype=PawLaw), paw_seeds: wp.array(dtype=vec3), matrix: wp.array2d(dtype=real),
-    vector: wp.array(dtype=real), virtual: wp.array(dtype=vec3), gradients: Gradients, t: int,
+    vector: wp.array(dtype=real), virtual: wp.array(dtype=vec3), sums: wp.array(dtype=real), gradients: Gradients, t: int,
 ) -> BaseState:  # fmt: skip
     """Run a step backwards: from the gradient by the state at its end to that by the state at its start.
 
@@ -195,7 +194,7 @@ def reverse_step(
     out.ang = m.ang_seed
     g_adj = vec3(real(0.0))
     for k in range(laws.shape[0]):
-        params = load_leg(robot, world, k)
+        params = all_params[k]
         old_rates = record.rates[world, i, k]
         leg = LegFactors()
         leg.virtual_rates = virtual[k]
@@ -213,11 +212,11 @@ def reverse_step(
             leg_action
         )(params.geometry, params.masses, params.joints, robot.ground, mu, base.pos, base.quat, base.ang, g,
           record.angles[world, i, k], old_rates, held, leg, dt)  # fmt: skip
-        add_geometry(gradients.geometry, k, world, geo)
-        add_masses(gradients.table, k, world, masses)
-        add_joints(gradients.table, k, world, joints)
+        add_geometry(sums, k, geo)
+        add_masses(sums, k, masses)
+        add_joints(sums, k, joints)
         if leg.mode != SEPARATE:
-            add_entry(gradients.table, laws[k].mu_row, world, mu_adj)
+            add_entry(sums, laws[k].mu_row, mu_adj)
         out.pos += pos
         out.quat += turn
         out.ang += omega
@@ -233,9 +232,9 @@ def reverse_step(
         load_moments(robot.table, BASE, world), base_com(robot.table, world), gravity, force, moment, base.quat,
         base.lin, base.ang, held, base_seeds, dt,
     )  # fmt: skip
-    add_moments(gradients.table, BASE, world, body)
-    add_com(gradients.table, world, robot.table[BASE, world], base_com(robot.table, world), com)
-    add_vec3(gradients.table, GRAVITY, world, weight)
+    add_moments(sums, BASE, body)
+    add_com(sums, robot.table[BASE, world], base_com(robot.table, world), com)
+    add_vec3(sums, GRAVITY, weight)
     store_row_vec3(gradients.wrench, t, 0, world, row_vec3(gradients.wrench, t, 0, world) + force_adj)
     store_row_vec3(gradients.wrench, t, 3, world, row_vec3(gradients.wrench, t, 3, world) + moment_adj)
     out.quat += turn
@@ -256,18 +255,19 @@ class FilterSeeds:
 def add_target(gradients: Gradients, step: int, motor: int, world: int, x: real):
     """Add to the gradient by a motor's filtered target of a policy step, or by what it followed before the first."""
     if step < 0:
-        add_entry(gradients.before, motor, world, x)
+        gradients.before[motor, world] = gradients.before[motor, world] + x
     else:
         gradients.safe[step, motor, world] = gradients.safe[step, motor, world] + x
 
 
 @wp.func
 def reverse_motor(
-    actuation: Actuation, commands: Commands, safe: wp.array3d(dtype=real), timing: Timing, dt: real, step: int,
-    motor: int, world: int, angle: real, rate: real, seed: real, gradients: Gradients,
+    params: MotorParams, late: real, commands: Commands, safe: wp.array3d(dtype=real), timing: Timing, dt: real, step: int,
+    motor: int, world: int, angle: real, rate: real, seed: real, sums: wp.array(dtype=real),
+    gradients: Gradients,
 ) -> vec2:  # fmt: skip
     """Add a motor's gradients for that of its torque, `seed`; return those by its angle and rate."""
-    arrived = arrival(step, timing.substeps, actuation.latency[world] / dt)
+    arrived = arrival(step, timing.substeps, late)
     newer = commanded(safe, commands.before, arrived.newer, motor, world)
     older = newer
     target = newer
@@ -275,13 +275,12 @@ def reverse_motor(
         older = commanded(safe, commands.before, arrived.older, motor, world)
         if arrived.weight != real(1.0):
             target = older + arrived.weight * (newer - older)
-    params = load_world_motor(actuation, motor, world)
     by_target, by_angle, by_rate, by_motor = wp.grad(motor_torque)(target, angle, rate, params)
-    add_motor(gradients, motor, world, seed, by_motor)
+    add_motor(sums, motor, seed, by_motor)
     add_target(gradients, arrived.newer, motor, world, seed * arrived.weight * by_target)
     if arrived.newer > arrived.older:
         add_target(gradients, arrived.older, motor, world, seed * (real(1.0) - arrived.weight) * by_target)
-        gradients.latency[world] = gradients.latency[world] - seed * by_target * (newer - older) / dt
+        add_entry(sums, LATENCY_GRADIENT, -seed * by_target * (newer - older) / dt)
     return vec2(seed * by_angle, seed * by_rate)
 
 
@@ -294,7 +293,7 @@ def weighed_filter(target: vec3, angles: vec3, rates: vec3, params: FilterParams
 @wp.func
 def reverse_filter(
     commands: Commands, actuation: Actuation, step: int, leg: int, world: int, angles: vec3, rates: vec3,
-    gradients: Gradients,
+    sums: wp.array(dtype=real), gradients: Gradients,
 ) -> FilterSeeds:  # fmt: skip
     """Carry the gradient by a leg's filtered targets on to its targets; return those by its motor angles and rates."""
     m = 3 * leg
@@ -310,27 +309,26 @@ def reverse_filter(
         )
         found.angles = by_angles
         found.rates = by_rates
-        add_vec3(gradients.motors.offset, m, world, by_angles)
-        add_filter(gradients.limits, world, by_params)
+        add_vec3(sums, MOTOR_GRADIENT + 72 + m, by_angles)
+        add_filter(sums, by_params)
     store_row_vec3(gradients.target, step, m, world, by_target)
     return found
 
 
 @wp.func
-def weighed_row(
-    pos: vec3, orientation: quat, com_lin: vec3, ang: vec3, com: vec3, seed: BaseState
-) -> real:
+def weighed_row(pos: vec3, orientation: quat, com_lin: vec3, ang: vec3, com: vec3, seed: BaseState) -> real:
     """Return the weighed state of the base that a row holds."""
     base = row_base(pos, orientation, com_lin, ang, com)
     return (
-        wp.dot(seed.pos, base.pos) + wp.dot(seed.quat, base.quat) + wp.dot(seed.lin, base.lin) + wp.dot(seed.ang, base.ang)
+        wp.dot(seed.pos, base.pos)
+        + wp.dot(seed.quat, base.quat)
+        + wp.dot(seed.lin, base.lin)
+        + wp.dot(seed.ang, base.ang)
     )
 
 
 @wp.func
-def weighed_store(
-    orientation: quat, lin: vec3, omega: vec3, com: vec3, lin_seed: vec3, ang_seed: vec3
-) -> real:
+def weighed_store(orientation: quat, lin: vec3, omega: vec3, com: vec3, lin_seed: vec3, ang_seed: vec3) -> real:
     """Return the weighed velocities that a row holds of a state of the base."""
     ang = wp.quat_rotate(orientation, omega)
     return wp.dot(ang_seed, ang) + wp.dot(lin_seed, lin + wp.cross(ang, wp.quat_rotate(orientation, com)))
@@ -347,14 +345,14 @@ class RowSeeds:
 
 
 @wp.func
-def leave_row(rows: Rows, robot: Robot, row: int, world: int, adj: BaseState, gradients: Gradients) -> RowSeeds:
+def leave_row(rows: Rows, robot: Robot, row: int, world: int, adj: BaseState, sums: wp.array(dtype=real)) -> RowSeeds:
     """Return the gradient by a row's entries for that by the base's state which is read from it."""
     com = base_com(robot.table, world)
     pos, orientation, lin, ang, com_adj, _seed = wp.grad(weighed_row)(
         row_vec3(rows.q, row, 0, world), row_quat(rows.q, row, 3, world), row_vec3(rows.qd, row, 0, world),
         row_vec3(rows.qd, row, 3, world), com, adj,
     )  # fmt: skip
-    add_com(gradients.table, world, robot.table[BASE, world], com, com_adj)
+    add_com(sums, robot.table[BASE, world], com, com_adj)
     seeds = RowSeeds()
     seeds.pos = pos
     seeds.quat = orientation
@@ -377,13 +375,13 @@ def add_row_seeds(into: RowSeeds, seeds: Rows, row: int, world: int) -> RowSeeds
 
 
 @wp.func
-def enter_row(robot: Robot, world: int, base: BaseState, seeds: RowSeeds, gradients: Gradients) -> BaseState:
+def enter_row(robot: Robot, world: int, base: BaseState, seeds: RowSeeds, sums: wp.array(dtype=real)) -> BaseState:
     """Return the gradient by the base's state which a row was written from, for that by the row's entries."""
     com = base_com(robot.table, world)
     orientation, lin, ang, com_adj, _lin, _ang = wp.grad(weighed_store)(
         base.quat, base.lin, base.ang, com, seeds.lin, seeds.ang
     )
-    add_com(gradients.table, world, robot.table[BASE, world], com, com_adj)
+    add_com(sums, robot.table[BASE, world], com, com_adj)
     adj = BaseState()
     adj.pos = seeds.pos
     adj.quat = seeds.quat + orientation
@@ -419,6 +417,14 @@ def reverse_kernel(
     laws = wp.zeros(shape=(4,), dtype=PawLaw)
     matrix = wp.zeros(shape=(12, 12), dtype=real)
     vector = wp.zeros(shape=(12,), dtype=real)
+    sums = wp.zeros(shape=(GRADIENT_ROWS,), dtype=real)
+    params = wp.zeros(shape=(4,), dtype=LegParams)
+    motors = wp.zeros(shape=(12,), dtype=MotorParams)
+    for k in range(params.shape[0]):
+        params[k] = load_leg(robot, world, k)
+    for i in range(motors.shape[0]):
+        motors[i] = load_world_motor(actuation, i, world)
+    late = actuation.latency[world] / dt
     last = timing.steps * timing.substeps / timing.every
     entries = add_row_seeds(RowSeeds(), seeds, last, world)
     for k in range(laws.shape[0]):
@@ -438,13 +444,13 @@ def reverse_kernel(
             record.angles[world, 0, k] = row_vec3(rows.q, row, 7 + 3 * k, world)
             record.rates[world, 0, k] = row_vec3(rows.qd, row, 6 + 3 * k, world)
         for i in range(timing.every):
-            replay_step(robot, dt, world, force, moment, rows.torque, rows.impulse, first + i, i, record)
-        adj = enter_row(robot, world, record.base[world, timing.every], entries, gradients)
+            replay_step(robot, params, dt, world, force, moment, rows.torque, rows.impulse, first + i, i, record)
+        adj = enter_row(robot, world, record.base[world, timing.every], entries, sums)
         for j in range(timing.every):
             i = timing.every - 1 - j
             adj = reverse_step(
-                robot, dt, world, force, moment, rows.impulse, seeds, first + i, i, record, adj, angle_adj, rate_adj,
-                torque_adj, contacts, laws, paw_seeds, matrix, vector, virtual, gradients, t,
+                robot, params, dt, world, force, moment, rows.impulse, seeds, first + i, i, record, adj, angle_adj, rate_adj,
+                torque_adj, contacts, laws, paw_seeds, matrix, vector, virtual, sums, gradients, t,
             )  # fmt: skip
             for k in range(laws.shape[0]):
                 angles = record.angles[world, i, k]
@@ -456,18 +462,26 @@ def reverse_kernel(
                     if seeds.torque.shape[0] > 0:
                         seed += seeds.torque[first + i, 3 * k + c, world]
                     by_state = reverse_motor(
-                        actuation, commands, safe, timing, dt, first + i, 3 * k + c, world, angles[c], rates[c], seed,
-                        gradients,
+                        motors[3 * k + c], late, commands, safe, timing, dt, first + i, 3 * k + c, world, angles[c],
+                        rates[c], seed, sums, gradients,
                     )  # fmt: skip
                     angle_sum[c] += by_state[0]
                     rate_sum[c] += by_state[1]
                 angle_adj[k] = angle_sum
                 rate_adj[k] = rate_sum
-        entries = add_row_seeds(leave_row(rows, robot, row, world, adj, gradients), seeds, row, world)
+        entries = add_row_seeds(leave_row(rows, robot, row, world, adj, sums), seeds, row, world)
         for k in range(laws.shape[0]):
             if first == t * timing.substeps:
                 by_leg = reverse_filter(
-                    commands, actuation, t, k, world, record.angles[world, 0, k], record.rates[world, 0, k], gradients
+                    commands,
+                    actuation,
+                    t,
+                    k,
+                    world,
+                    record.angles[world, 0, k],
+                    record.rates[world, 0, k],
+                    sums,
+                    gradients,
                 )
                 angle_adj[k] = angle_adj[k] + by_leg.angles
                 rate_adj[k] = rate_adj[k] + by_leg.rates
@@ -475,6 +489,8 @@ def reverse_kernel(
                 angle_adj[k] = angle_adj[k] + row_vec3(seeds.q, row, 7 + 3 * k, world)
             if seeds.qd.shape[0] > 0:
                 rate_adj[k] = rate_adj[k] + row_vec3(seeds.qd, row, 6 + 3 * k, world)
+    for i in range(sums.shape[0]):
+        gradients.parameters[i, world] = sums[i]
     for i in range(3):
         gradients.q[i, world] = entries.pos[i]
         gradients.qd[i, world] = entries.lin[i]
@@ -502,9 +518,7 @@ def adjoints_kernel(
     q = row_quat(numbers.q, 0, 3, world)
     x = numbers.q[0, 0, world]
     sums[world] = (
-        leg_action(
-            params.geometry, params.masses, params.joints, robot.ground, x, v, q, v, v, v, v, base, factors, x
-        )
+        leg_action(params.geometry, params.masses, params.joints, robot.ground, x, v, q, v, v, v, v, base, factors, x)
         + base_action(load_moments(robot.table, BASE, world), v, v, v, v, q, v, v, base, base_seeds, x)
         + turned(q, v, x, q)
         + motor_torque(x, x, x, load_world_motor(actuation, 0, world))

@@ -13,7 +13,7 @@ which the forward pass found.
 
 import warp as wp
 
-from ..scalar import mat33, quat, real, vec3
+from ..scalar import mat33, real, vec3
 from ..state import BaseState
 from ..terrain.ground import floor_normal
 from .base_dynamics import BaseInverse, LegSolve, solve_ang, solve_lin

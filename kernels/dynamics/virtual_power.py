@@ -113,16 +113,11 @@ def adj_inertia_power(body: MassMoments, frame: FrameMotion, adj_ret: real):
     by_spin = wp.cross(ang_v, ang)
     by_frame = FrameMotion()
     by_frame.virtual_lin = adj_ret * (body.mass * acc + wp.cross(ang_acc, first) + wp.cross(ang, swing))
-    by_frame.virtual_ang = adj_ret * (
-        wp.cross(first, acc) + inertia_mul(body.second, ang_acc) + wp.cross(ang, spin)
-    )
+    by_frame.virtual_ang = adj_ret * (wp.cross(first, acc) + inertia_mul(body.second, ang_acc) + wp.cross(ang, spin))
     by_frame.acc = adj_ret * (body.mass * lin_v + wp.cross(ang_v, first))
     by_frame.ang_acc = adj_ret * (wp.cross(first, lin_v) + inertia_mul(body.second, ang_v))
     by_frame.ang = adj_ret * (
-        wp.cross(swing, lin_v)
-        + wp.cross(first, by_swing)
-        + wp.cross(spin, ang_v)
-        + inertia_mul(body.second, by_spin)
+        wp.cross(swing, lin_v) + wp.cross(first, by_swing) + wp.cross(spin, ang_v) + inertia_mul(body.second, by_spin)
     )
     by_body = MassMoments()
     by_body.mass = adj_ret * wp.dot(lin_v, acc)
@@ -211,7 +206,9 @@ def adj_link_motion(
         + turn[0] * vec3(by_ang_acc[2], real(0.0), -by_ang_acc[0])
     )
     wp.adjoint[housing] += by_housing
-    wp.adjoint[origin] += wp.cross(by_lin_v, housing.virtual_ang) + wp.cross(by_acc, housing.ang_acc) + wp.cross(by_swing, w)
+    wp.adjoint[origin] += (
+        wp.cross(by_lin_v, housing.virtual_ang) + wp.cross(by_acc, housing.ang_acc) + wp.cross(by_swing, w)
+    )
     wp.adjoint[vel] += real(2.0) * vec2(by_swing[0], by_swing[2])
     wp.adjoint[acc] += vec2(by_acc[0], by_acc[2])
     wp.adjoint[virtual] += vec2(by_lin_v[0], by_lin_v[2])
@@ -219,7 +216,9 @@ def adj_link_motion(
         adj_ret.ang[1] + by_ang_acc[2] * w[0] - by_ang_acc[0] * w[2], by_ang_acc[1], adj_ret.virtual_ang[1]
     )
     along = planar_dot(adj_ret.virtual_lin, lin_v) + planar_dot(adj_ret.virtual_ang, housing.virtual_ang)
-    along += planar_dot(adj_ret.acc, whole_acc) + planar_dot(adj_ret.ang, w) + planar_dot(adj_ret.ang_acc, whole_ang_acc)
+    along += (
+        planar_dot(adj_ret.acc, whole_acc) + planar_dot(adj_ret.ang, w) + planar_dot(adj_ret.ang_acc, whole_ang_acc)
+    )
     across = planar_cross(adj_ret.virtual_lin, lin_v) + planar_cross(adj_ret.virtual_ang, housing.virtual_ang)
     across += planar_cross(adj_ret.acc, whole_acc) + planar_cross(adj_ret.ang, w)
     across += planar_cross(adj_ret.ang_acc, whole_ang_acc)
