@@ -12,7 +12,17 @@ from .contact import ContactState, PawContact, block_velocity, push_on_block, so
 from .drive import Drive, Workspace, applied_torque, base_wrench, load_leg_drive, park
 from .leg_dynamics import PawKinematics
 from .parameters import load_vec3
-from .step import Robot, StepSettings, base_system, block_law, finite_base, leg_terms, load_leg, paw_contact
+from .step import (
+    Robot,
+    StepSettings,
+    base_system,
+    block_law,
+    finite_base,
+    hold_base,
+    leg_terms,
+    load_leg,
+    paw_contact,
+)
 
 wp.set_module_options({"enable_backward": False})
 
@@ -40,7 +50,7 @@ def advance_once(
         legs[k] = terms.solve
         paws[k] = terms.paw
         system = add_leg(system, terms.dynamics, terms.solve)
-    inverse = invert(system)
+    inverse = hold_base(robot, world, invert(system))
     lin_acc = solve_lin(inverse, system.force, system.moment)
     ang_acc = solve_ang(inverse, system.force, system.moment)
     lin = wp.quat_rotate_inv(base.quat, base.lin) + dt * lin_acc

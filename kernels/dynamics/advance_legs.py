@@ -17,7 +17,18 @@ from .contact import BlockLaw, PawContact, block_velocity, local_impulse
 from .drive import Drive, LegDrive, Workspace, applied_torque, base_wrench, load_leg_drive, park
 from .lanes import any_world, first_leg, max_legs, meet, sum_legs, sum_systems, sum_vec, vec_from_leg
 from .parameters import load_vec3
-from .step import LegParams, Robot, StepSettings, base_system, block_law, finite_base, leg_terms, load_leg, paw_contact
+from .step import (
+    LegParams,
+    Robot,
+    StepSettings,
+    base_system,
+    block_law,
+    finite_base,
+    hold_base,
+    leg_terms,
+    load_leg,
+    paw_contact,
+)
 
 # division and roots are rounded to 2 units in the last place, as a third of the code
 wp.set_module_options({"enable_backward": False, "fast_math": True})
@@ -105,7 +116,7 @@ def advance_leg(
     moment = vec3(wrench[3], wrench[4], wrench[5])
     share = add_leg(BaseSystem(), terms.dynamics, terms.solve)
     system = sum_systems(base_system(robot, world, base, g, force, moment), share)
-    inverse = invert(system)
+    inverse = hold_base(robot, world, invert(system))
     lin_acc = solve_lin(inverse, system.force, system.moment)
     ang_acc = solve_ang(inverse, system.force, system.moment)
     lin = wp.quat_rotate_inv(base.quat, base.lin) + dt * lin_acc

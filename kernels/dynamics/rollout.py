@@ -58,6 +58,7 @@ class Commands:
     target: wp.array3d(dtype=real)  # [rad], (T, 12, num_worlds)
     before: wp.array2d(dtype=real)  # [rad], (12, num_worlds): what the motors follow until the first target arrives
     wrench: wp.array3d(dtype=real)  # [N], [N m] at the base's com, world axes, (T, 6, num_worlds)
+    impulse: wp.array2d(dtype=vec3)  # [N s] of each paw in the step before the first, world axes, (4, num_worlds)
 
 
 @wp.struct
@@ -167,7 +168,7 @@ class Arrival:
 def arrival(step: int, substeps: int, late: real) -> Arrival:
     """Return what arrives during a physics step; late: latency in physics steps, any fraction.
 
-    A target that arrives just as the step begins counts as the newer one: the weight's derivative is that of more latency.
+    Where a target arrives just as the step begins it has weight 1, whose derivative is that of more latency.
     """
     begin = real(step) - late
     size = real(substeps)
@@ -228,7 +229,7 @@ def rollout_kernel(
     safe: wp.array3d(dtype=real),
     rows: Rows,
 ):
-    """Run a rollout from the state in row 0, which knows no contact; one thread per world.
+    """Run a rollout from the state in row 0; one thread per world.
 
     settings.substeps is 1; drive.joint_f and drive.wrench are overwritten. safe [rad], (T, 12, num_worlds): filtered
     targets.
@@ -243,7 +244,7 @@ def rollout_kernel(
     peaks = wp.zeros(shape=(4,), dtype=real)
     late = actuation.latency[world] / settings.dt
     for k in range(angles.shape[0]):
-        work.impulse[k, world] = vec3(real(0.0))
+        work.impulse[k, world] = commands.impulse[k, world]
     base = BaseState()
     for step in range(timing.steps * timing.substeps):
         t = step / timing.substeps

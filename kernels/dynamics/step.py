@@ -42,6 +42,7 @@ class Robot:
     geometry: wp.array(dtype=LegGeometry)  # (4,)
     table: wp.array2d(dtype=real)  # parameters, see `parameters`
     ground: Ground
+    held: wp.array(dtype=int)  # (num_worlds,), not 0: the base stays as it is, hung up; empty: none
 
 
 @wp.struct
@@ -196,6 +197,15 @@ def base_system(robot: Robot, world: int, base: BaseState, g: vec3, force: vec3,
     """Return the base link's own equations; force [N] and moment [N m] from outside at its com, world axes."""
     wrench = external_wrench(base, base_com(robot.table, world), force, moment)
     return base_alone(load_moments(robot.table, BASE, world), base.ang, g, wrench.force, wrench.moment)
+
+
+@wp.func
+def hold_base(robot: Robot, world: int, inverse: BaseInverse) -> BaseInverse:
+    """Return the inverse of a world's base system, zero where the base is held: nothing accelerates it."""
+    if robot.held.shape[0] > 0:
+        if robot.held[world] != 0:
+            return BaseInverse()
+    return inverse
 
 
 @wp.func

@@ -13,13 +13,21 @@ which the forward pass found.
 
 import warp as wp
 
-from ..scalar import mat33, real, vec3
-from ..state import BaseState
-from ..terrain.ground import floor_normal
-from .base_dynamics import BaseInverse, LegSolve, solve_ang, solve_lin
-from .contact import SEPARATE, SLIDE, PawContact, contact_jacobian, contact_mode, couple_contact
+from ..layout import BASE, GRAVITY
+from ..scalar import real, vec3
+from ..state import BaseState, base_com
+from .base_dynamics import BaseInverse, LegSolve, add_leg, invert, motor_acceleration, solve_ang, solve_lin
+from .base_motion import moved_base
+from .contact import SEPARATE, PawContact
+from .contact_laws import PawLaw, contact_at, contact_point, paw_law, solve_laws
+from .gradients import add_com, add_entry, add_geometry, add_joints, add_masses, add_moments, add_vec3
 from .leg_dynamics import PawKinematics
-from .step import Robot, friction_row
+from .parameters import load_moments, load_vec3
+from .rollout import Rows, row_vec3, store_row_vec3
+from .step import LegParams, Robot, base_system, hold_base, leg_terms
+from .virtual_power import BaseFactors, BaseSeeds, LegFactors, base_action, leg_action, turned
+
+wp.set_module_options({"enable_backward": False})
 
 
 @wp.struct
@@ -32,133 +40,6 @@ class StepRecord:
     inverse: wp.array2d(dtype=BaseInverse)  # (num_worlds, steps)
     legs: wp.array3d(dtype=LegSolve)  # (num_worlds, steps, 4)
     paws: wp.array3d(dtype=PawKinematics)  # likewise
-
-
-@wp.struct
-class PawLaw:
-    """A paw's contact law at the solution: its derivatives by velocity and impulse, 0 where separated."""
-
-    mode: int  # SEPARATE, STICK or SLIDE
-    mu_row: int  # row of the friction coefficient in the parameter table
-    mu: real
-    by_velocity: mat33
-    by_impulse: mat33  # at fixed velocity
-
-
-@wp.func
-def contact_at(
-    robot: Robot, k: int, base: BaseState, paw: PawKinematics, leg: LegSolve, inverse: BaseInverse, impulse: vec3
-) -> PawContact:
-    """Return paw k's response to impulses; impulse [N s]: in body axes."""
-    contact = PawContact()
-    contact.active = 1
-    contact.impulse = impulse
-    centre = base.pos + wp.quat_rotate(base.quat, paw.position)
-    contact.normal = wp.quat_rotate_inv(base.quat, floor_normal(robot.ground, centre))
-    arm = -robot.geometry[k].paw_radius * contact.normal
-    contact.jacobian = contact_jacobian(paw, arm)
-    return couple_contact(contact, paw.position + arm, leg, inverse)
-
-
-@wp.func
-def contact_point(robot: Robot, k: int, paw: PawKinematics, contact: PawContact) -> vec3:
-    """Return where paw k touches [m], body axes, from the base's origin."""
-    return paw.position - robot.geometry[k].paw_radius * contact.normal
-
-
-@wp.func
-def paw_law(
-    robot: Robot, world: int, k: int, contact: PawContact, before: vec3, velocity: vec3, old_impulse: vec3
-) -> PawLaw:
-    """Return the contact law of paw k.
-
-    before, velocity [m/s]: of the contact point at the start and the end of the step; old_impulse [N s]: of the step
-    before; body axes.
-    """
-    law = PawLaw()
-    p, n = contact.impulse, contact.normal
-    law.mu_row = friction_row(k, before, old_impulse, n)
-    law.mu = robot.table[law.mu_row, world]
-    law.mode = contact_mode(p, n, law.mu)
-    if law.mode == SEPARATE:
-        return law
-    eye = wp.identity(n=3, dtype=real)
-    law.by_velocity = eye
-    if law.mode == SLIDE:
-        flat = eye - wp.outer(n, n)
-        tangential = flat * velocity
-        size = wp.dot(p, n)
-        law.by_velocity = wp.outer(n, n) + wp.outer(flat * p, wp.normalize(tangential)) + law.mu * size * flat
-        law.by_impulse = wp.length(tangential) * flat + law.mu * wp.outer(tangential, n)
-    return law
-
-
-@wp.func
-def solve_linear(a: wp.array2d(dtype=real), b: wp.array(dtype=real), n: int):
-    """Replace the first n of b by the solution x of a x = b; Gaussian elimination with row pivots, a is overwritten."""
-    for col in range(n):
-        best = col
-        for row in range(col + 1, n):
-            if wp.abs(a[row, col]) > wp.abs(a[best, col]):
-                best = row
-        if best != col:
-            for i in range(col, n):
-                swap = a[col, i]
-                a[col, i] = a[best, i]
-                a[best, i] = swap
-            swap_b = b[col]
-            b[col] = b[best]
-            b[best] = swap_b
-        scale = real(1.0) / a[col, col]
-        for row in range(col + 1, n):
-            factor = scale * a[row, col]
-            if factor != real(0.0):
-                for i in range(col + 1, n):
-                    a[row, i] = a[row, i] - factor * a[col, i]
-                b[row] = b[row] - factor * b[col]
-    for back in range(n):
-        row = n - 1 - back
-        total = b[row]
-        for i in range(row + 1, n):
-            total -= a[row, i] * b[i]
-        b[row] = total / a[row, row]
-
-
-@wp.func
-def solve_laws(
-    contacts: wp.array(dtype=PawContact), laws: wp.array(dtype=PawLaw), seeds: wp.array(dtype=vec3),
-    matrix: wp.array2d(dtype=real), vector: wp.array(dtype=real),
-):  # fmt: skip
-    """Replace the gradients of the paws' impulses in `seeds` by the multipliers of their laws; shapes (4,).
-
-    matrix, vector: of shape (12, 12) and (12,), overwritten.
-    """
-    row = int(0)
-    for k in range(seeds.shape[0]):
-        if laws[k].mode != SEPARATE:
-            col = int(0)
-            for j in range(seeds.shape[0]):
-                if laws[j].mode != SEPARATE:
-                    block = contacts[k].from_lin * contacts[j].to_lin + contacts[k].from_ang * contacts[j].to_ang
-                    if k == j:
-                        block = contacts[k].total
-                    block = block * wp.transpose(laws[j].by_velocity)
-                    if k == j:
-                        block = block + wp.transpose(laws[k].by_impulse)
-                    for r in range(3):
-                        for s in range(3):
-                            matrix[row + r, col + s] = block[r, s]
-                    col += 3
-            for r in range(3):
-                vector[row + r] = -seeds[k][r]
-            row += 3
-    solve_linear(matrix, vector, row)
-    row = int(0)
-    for k in range(seeds.shape[0]):
-        seeds[k] = vec3(real(0.0))
-        if laws[k].mode != SEPARATE:
-            seeds[k] = vec3(vector[row], vector[row + 1], vector[row + 2])
-            row += 3
 
 
 @wp.struct
@@ -192,3 +73,183 @@ def solve_system(
         solve = legs[world, step, k]
         rates[k] = solve.inverse * rate_seeds[k] - solve.to_lin * m.lin - solve.to_ang * m.ang
     return m
+
+
+@wp.func
+def replay_step(
+    robot: Robot, params: wp.array(dtype=LegParams), dt: real, world: int, force: vec3, moment: vec3, rows: Rows,
+    step: int, i: int, record: StepRecord,
+):  # fmt: skip
+    """Make a step again from entry i of the record, with known torques and impulses; writes the record."""
+    base = record.base[world, i]
+    g = wp.quat_rotate_inv(base.quat, load_vec3(robot.table, GRAVITY, world))
+    system = base_system(robot, world, base, g, force, moment)
+    for k in range(record.legs.shape[2]):
+        torque = row_vec3(rows.torque, step, 3 * k, world)
+        terms = leg_terms(params[k], record.angles[world, i, k], record.rates[world, i, k], torque, base.ang, g, dt)
+        record.legs[world, i, k] = terms.solve
+        record.paws[world, i, k] = terms.paw
+        system = add_leg(system, terms.dynamics, terms.solve)
+    inverse = hold_base(robot, world, invert(system))
+    record.inverse[world, i] = inverse
+    force_impulse = dt * system.force
+    moment_impulse = dt * system.moment
+    for k in range(record.legs.shape[2]):
+        impulse = wp.quat_rotate_inv(base.quat, rows.impulse[step, k, world])
+        if wp.dot(impulse, impulse) > real(0.0):
+            solve = record.legs[world, i, k]
+            paw = record.paws[world, i, k]
+            contact = contact_at(robot, k, base, paw, solve, inverse, impulse)
+            joint = wp.transpose(contact.jacobian) * impulse
+            force_impulse += impulse - wp.transpose(solve.to_lin) * joint
+            moment_impulse += (
+                wp.cross(contact_point(robot, k, paw, contact), impulse) - wp.transpose(solve.to_ang) * joint
+            )
+            solve.free += solve.inverse * (joint / dt)
+            record.legs[world, i, k] = solve
+    lin = solve_lin(inverse, force_impulse, moment_impulse)
+    ang = solve_ang(inverse, force_impulse, moment_impulse)
+    for k in range(record.legs.shape[2]):
+        rates = record.rates[world, i, k] + dt * motor_acceleration(record.legs[world, i, k], lin / dt, ang / dt)
+        record.rates[world, i + 1, k] = rates
+        record.angles[world, i + 1, k] = record.angles[world, i, k] + dt * rates
+    record.base[world, i + 1] = moved_base(base, wp.quat_rotate_inv(base.quat, base.lin) + lin, base.ang + ang, dt)
+
+
+@wp.func
+def reverse_step(
+    robot: Robot, all_params: wp.array(dtype=LegParams), dt: real, world: int, t: int, force: vec3, moment: vec3,
+    first_impulse: wp.array2d(dtype=vec3), rows: Rows, seeds: Rows, step: int, i: int, record: StepRecord,
+    adj: BaseState, angle_adj: wp.array(dtype=vec3), rate_adj: wp.array(dtype=vec3), torque_adj: wp.array(dtype=vec3),
+    contacts: wp.array(dtype=PawContact), laws: wp.array(dtype=PawLaw), paw_seeds: wp.array(dtype=vec3),
+    matrix: wp.array2d(dtype=real), vector: wp.array(dtype=real), virtual: wp.array(dtype=vec3),
+    sums: wp.array(dtype=real), wrench_adj: wp.array3d(dtype=real),
+) -> BaseState:  # fmt: skip
+    """Run a step backwards: from the gradient by the state at its end to that by the state at its start.
+
+    adj, angle_adj, rate_adj: gradient by the base's state and the motors'; the latter are replaced in place.
+    torque_adj (4,): gradient by the motors' torques, which is written.
+    """
+    base = record.base[world, i]
+    ahead = record.base[world, i + 1]
+    inverse = record.inverse[world, i]
+    lin = wp.quat_rotate_inv(base.quat, ahead.lin)
+    ang = ahead.ang
+    old_lin = wp.quat_rotate_inv(base.quat, base.lin)
+    # integration of the coordinates
+    new_velocity = adj.lin + dt * adj.pos
+    quat_adj, ang_seed, _dt, _seed = wp.grad(turned)(base.quat, ang, dt, adj.quat)
+    for k in range(laws.shape[0]):
+        rate_adj[k] = rate_adj[k] + dt * angle_adj[k]
+    m = solve_system(
+        inverse, wp.quat_rotate_inv(base.quat, new_velocity), ang_seed + adj.ang, record.legs, world, i, rate_adj,
+        virtual,
+    )  # fmt: skip
+    # contact
+    pushed_by = seeds.impulse.shape[0] > 0
+    touching = bool(False)
+    for k in range(laws.shape[0]):
+        laws[k] = PawLaw()
+        impulse = wp.quat_rotate_inv(base.quat, rows.impulse[step, k, world])
+        if wp.dot(impulse, impulse) > real(0.0):
+            paw = record.paws[world, i, k]
+            c = contact_at(robot, k, base, paw, record.legs[world, i, k], inverse, impulse)
+            point = contact_point(robot, k, paw, c)
+            before = old_lin + wp.cross(base.ang, point) + c.jacobian * record.rates[world, i, k]
+            velocity = lin + wp.cross(ang, point) + c.jacobian * record.rates[world, i + 1, k]
+            old_impulse = first_impulse[k, world]
+            if step > 0:
+                old_impulse = rows.impulse[step - 1, k, world]
+            old_impulse = wp.quat_rotate_inv(base.quat, old_impulse)
+            law = paw_law(robot, world, k, c, before, velocity, old_impulse)
+            seed = m.lin + wp.cross(m.ang, point) + c.jacobian * virtual[k]
+            if pushed_by:
+                seed += wp.quat_rotate_inv(base.quat, seeds.impulse[step, k, world])
+            contacts[k] = c
+            laws[k] = law
+            paw_seeds[k] = seed
+            touching = touching or law.mode != SEPARATE
+    if touching:
+        solve_laws(contacts, laws, paw_seeds, matrix, vector)
+        more_lin = vec3(real(0.0))
+        more_ang = vec3(real(0.0))
+        for k in range(laws.shape[0]):
+            if laws[k].mode != SEPARATE:
+                c = contacts[k]
+                y = wp.transpose(laws[k].by_velocity) * paw_seeds[k]
+                joint = wp.transpose(c.jacobian) * y
+                more_lin += c.to_lin * y
+                more_ang += c.to_ang * y
+                m.lin_seed += y
+                m.ang_seed += wp.cross(contact_point(robot, k, record.paws[world, i, k], c), y)
+                rate_adj[k] = rate_adj[k] + joint
+                virtual[k] = virtual[k] + record.legs[world, i, k].inverse * joint
+        m.lin += more_lin
+        m.ang += more_ang
+        for k in range(laws.shape[0]):
+            solve = record.legs[world, i, k]
+            virtual[k] = virtual[k] - solve.to_lin * more_lin - solve.to_ang * more_ang
+    # the equations of motion
+    held = BaseFactors()
+    held.virtual_lin = m.lin
+    held.virtual_ang = m.ang
+    held.lin_acc = (lin - old_lin) / dt
+    held.ang_acc = (ang - base.ang) / dt
+    held.lin = lin
+    held.ang = ang
+    gravity = load_vec3(robot.table, GRAVITY, world)
+    g = wp.quat_rotate_inv(base.quat, gravity)
+    out = BaseState()
+    out.pos = adj.pos
+    out.quat = quat_adj
+    out.ang = m.ang_seed
+    g_adj = vec3(real(0.0))
+    for k in range(laws.shape[0]):
+        params = all_params[k]
+        old_rates = record.rates[world, i, k]
+        leg = LegFactors()
+        leg.virtual_rates = virtual[k]
+        leg.rates = record.rates[world, i + 1, k]
+        leg.acc = (leg.rates - old_rates) / dt
+        leg.mode = laws[k].mode
+        mu = real(0.0)
+        if leg.mode != SEPARATE:
+            leg.impulse = contacts[k].impulse
+            leg.law = paw_seeds[k]
+            mu = laws[k].mu
+            if pushed_by:
+                leg.push = seeds.impulse[step, k, world]
+        geo, masses, joints, _ground, mu_adj, pos, turn, omega, g_part, angles, rates, _held, _leg, _step = wp.grad(
+            leg_action
+        )(params.geometry, params.masses, params.joints, robot.ground, mu, base.pos, base.quat, base.ang, g,
+          record.angles[world, i, k], old_rates, held, leg, dt)  # fmt: skip
+        add_geometry(sums, k, geo)
+        add_masses(sums, k, masses)
+        add_joints(sums, k, joints)
+        if leg.mode != SEPARATE:
+            add_entry(sums, laws[k].mu_row, mu_adj)
+        out.pos += pos
+        out.quat += turn
+        out.ang += omega
+        g_adj += g_part
+        angle_adj[k] = angle_adj[k] + angles
+        rate_adj[k] = rate_adj[k] + rates
+        torque_adj[k] = dt * virtual[k]
+    base_seeds = BaseSeeds()
+    base_seeds.velocity = m.lin_seed
+    base_seeds.new_velocity = new_velocity
+    base_seeds.gravity = g_adj
+    body, com, weight, force_adj, moment_adj, turn, lin_adj, omega, _base, _seeds, _dt_base = wp.grad(
+        base_action
+    )(load_moments(robot.table, BASE, world), base_com(robot.table, world), gravity, force, moment, base.quat,
+        base.lin, base.ang, held, base_seeds, dt,
+    )  # fmt: skip
+    add_moments(sums, BASE, body)
+    add_com(sums, robot.table[BASE, world], base_com(robot.table, world), com)
+    add_vec3(sums, GRAVITY, weight)
+    store_row_vec3(wrench_adj, t, 0, world, row_vec3(wrench_adj, t, 0, world) + force_adj)
+    store_row_vec3(wrench_adj, t, 3, world, row_vec3(wrench_adj, t, 3, world) + moment_adj)
+    out.quat += turn
+    out.lin = lin_adj
+    out.ang += omega
+    return out
