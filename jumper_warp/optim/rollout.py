@@ -314,7 +314,7 @@ class Rollout:
 
 
 def compact(joint_q: np.ndarray, joint_qd: np.ndarray, num_worlds: int = 1) -> tuple[np.ndarray, np.ndarray]:
-    """Return q (19, num_worlds) and qd (18, num_worlds) of (43,) coordinates and (38,) rates a world as Newton has them."""
+    """Return q (19, num_worlds) and qd (18, num_worlds) of (43,) coordinates and (38,) rates of Newton a world."""
     joint_q, joint_qd = np.reshape(joint_q, (num_worlds, 43)), np.reshape(joint_qd, (num_worlds, 38))
     q = np.concatenate([joint_q[:, :7], motor_values(joint_q[:, 7:])], axis=1)
     return q.T, np.concatenate([joint_qd[:, :6], motor_values(joint_qd[:, 6:])], axis=1).T
