@@ -54,6 +54,8 @@ class Trajectory:
     """(T S, 12, num_worlds) [N m] Of the motors, in each physics step."""
     impulse: wp.array
     """(T S, 4, num_worlds) vec3 [N s] Of the ground on each paw, world frame, in each physics step."""
+    pressed: wp.array
+    """(T S, 4, num_worlds) Sets of the legs' pressed hard stops, see `kernels.actuation.stops`."""
     safe: wp.array
     """(T, 12, num_worlds) [rad] Targets that the filter let through."""
     commands: Any
@@ -191,7 +193,7 @@ class Rollout:
         safe = self._zeros(count, 12, self.num_worlds)
         inputs = [self._timing(count), self._actuation, commands, self._drive]
         self._launch(self.dynamics.modules.rollout.rollout_kernel, inputs, [self.dynamics.work, safe, rows])
-        return Trajectory(rows.q, rows.qd, rows.torque, rows.impulse, safe, commands)
+        return Trajectory(rows.q, rows.qd, rows.torque, rows.impulse, rows.pressed, safe, commands)
 
     def backward(
         self,
@@ -221,8 +223,9 @@ class Rollout:
                 raise InputError(f"the gradient by {name} must be like it, {like.shape}, got {array.shape}")
             empty = wp.zeros((0,) * like.ndim, dtype=like.dtype, device=self.device)
             setattr(seeds, name, empty if array is None else array)
+        seeds.pressed = wp.zeros((0, 0, 0), dtype=wp.uint8, device=self.device)
         rows = modules.rollout.Rows()
-        for name in ("q", "qd", "torque", "impulse"):
+        for name in ("q", "qd", "torque", "impulse", "pressed"):
             setattr(rows, name, getattr(trajectory, name))
         gradients = modules.gradients.Gradients()
         shapes = {"q": (19,), "qd": (18,), "target": (count, 12), "before": (12,), "wrench": (count, 6),
@@ -257,6 +260,7 @@ class Rollout:
         rows.q, rows.qd = (self._empty(steps // self.every + 1, size, n) for size in (19, 18))
         rows.torque = self._empty(steps, 12, n)
         rows.impulse = self._empty(steps, 4, n, dtype=self.dynamics.modules.scalar.vec3)
+        rows.pressed = self._empty(steps, 4, n, dtype=wp.uint8)
         return rows
 
     def _step_record(self) -> Any:

@@ -69,6 +69,7 @@ class Rows:
     qd: wp.array3d(dtype=real)  # [m/s], [rad/s], (K + 1, ROW_RATES, num_worlds)
     torque: wp.array3d(dtype=real)  # [N m], (T S, 12, num_worlds)
     impulse: wp.array3d(dtype=vec3)  # [N s] on each paw, world axes, (T S, 4, num_worlds)
+    pressed: wp.array3d(dtype=wp.uint8)  # sets of pressed stops, see `stops`, (T S, 4, num_worlds)
 
 
 @wp.func
@@ -241,6 +242,9 @@ def rollout_kernel(
     legs = wp.zeros(shape=(4,), dtype=LegSolve)
     paws = wp.zeros(shape=(4,), dtype=PawKinematics)
     contacts = wp.zeros(shape=(4,), dtype=PawContact)
+    torques = wp.zeros(shape=(4,), dtype=vec3)
+    pressed = wp.zeros(shape=(4,), dtype=int)
+    ends = wp.zeros(shape=(4,), dtype=vec3)
     peaks = wp.zeros(shape=(4,), dtype=real)
     late = actuation.latency[world] / settings.dt
     for k in range(angles.shape[0]):
@@ -268,9 +272,13 @@ def rollout_kernel(
                 torque = motor_torque(target, angles[k][j], rates[k][j], load_world_motor(actuation, motor, world))
                 rows.torque[step, motor, world] = torque
                 drive.joint_f[dof + j + j / 2] = torque
-        base = advance_once(robot, settings, drive, work, world, 0, base, angles, rates, legs, paws, contacts, peaks)
+        base = advance_once(
+            robot, settings, drive, work, world, 0, base, angles, rates, torques, pressed, legs, paws, contacts, ends,
+            peaks,
+        )  # fmt: skip
         for k in range(angles.shape[0]):
             rows.impulse[step, k, world] = work.impulse[k, world]
+            rows.pressed[step, k, world] = wp.uint8(pressed[k])
         if step + 1 == (row + 1) * timing.every:
             store_row_base(rows, row + 1, world, com, base)
             for k in range(angles.shape[0]):

@@ -86,7 +86,10 @@ def replay_step(
     system = base_system(robot, world, base, g, force, moment)
     for k in range(record.legs.shape[2]):
         torque = row_vec3(rows.torque, step, 3 * k, world)
-        terms = leg_terms(params[k], record.angles[world, i, k], record.rates[world, i, k], torque, base.ang, g, dt)
+        pressed = int(rows.pressed[step, k, world])
+        terms = leg_terms(
+            params[k], record.angles[world, i, k], record.rates[world, i, k], torque, pressed, base.ang, g, dt
+        )
         record.legs[world, i, k] = terms.solve
         record.paws[world, i, k] = terms.paw
         system = add_leg(system, terms.dynamics, terms.solve)
@@ -212,6 +215,7 @@ def reverse_step(
         leg.rates = record.rates[world, i + 1, k]
         leg.acc = (leg.rates - old_rates) / dt
         leg.mode = laws[k].mode
+        leg.pressed = int(rows.pressed[step, k, world])
         mu = real(0.0)
         if leg.mode != SEPARATE:
             leg.impulse = contacts[k].impulse

@@ -42,6 +42,7 @@ class LegFactors:
     acc: vec3  # [rad/s^2] over the step, contact included
     rates: vec3  # [rad/s] at the end of the step
     mode: int  # SEPARATE, STICK or SLIDE
+    pressed: int  # set of hard stops
     impulse: vec3  # [N s] on the paw, body axes
     law: vec3  # multiplier of the contact law
     push: vec3  # weight of the impulse, world axes
@@ -295,7 +296,7 @@ def leg_action(
         + inertia_power(masses.outer_shank, outer_shank)
         + inertia_power(masses.inner_shank, inner_shank)
     )
-    passive = joint_forces(joints, loop, f, angles, rates, dt)
+    passive = joint_forces(joints, loop, f, angles, rates, leg.pressed, dt)
     implicit = passive.inertia * leg.acc + wp.cw_mul(joints.armature, leg.acc)
     action = dt * (wp.dot(leg.virtual_rates, passive.torque - implicit) - power)
 
@@ -309,7 +310,7 @@ def leg_action(
         jacobian = contact_jacobian(paw, arm)
         virtual = base.virtual_lin + wp.cross(base.virtual_ang, point) + jacobian * leg.virtual_rates
         velocity = base.lin + wp.cross(base.ang, point) + jacobian * leg.rates
-        goal = target_normal_velocity(gap, dt)
+        goal = target_normal_velocity(gap, leg.pressed, dt)
         residual = contact_residual(leg.impulse, velocity, normal, goal, mu, leg.mode)
         action += wp.dot(leg.impulse, virtual) + wp.dot(leg.law, residual)
         action += wp.dot(leg.push, wp.quat_rotate(orientation, leg.impulse))
