@@ -118,10 +118,10 @@ class Rollout:
         cfg = motors or jumping_motors()
         self._actuation = modules.rollout.Actuation()
         self._actuation.motors = motor_arrays(cfg, n, module=modules.motors, device=self.device)
-        self._actuation.fade = self._array([[cfg.fade_start] * n, [cfg.fade_end] * n])
+        self._actuation.fade = self.array([[cfg.fade_start] * n, [cfg.fade_end] * n])
         self._actuation.latency = self._zeros(n)
         self._actuation.filtered = int(command_filter is not None)
-        self._actuation.limits = self._array(np.repeat(filter_rows(command_filter)[:, None], n, axis=1))
+        self._actuation.limits = self.array(np.repeat(filter_rows(command_filter)[:, None], n, axis=1))
         self.parameters: dict[str, wp.array] = {
             "table": self.dynamics.robot.table,
             **{name: getattr(self._actuation.motors, name) for name in MOTOR_CONSTANTS},
@@ -148,6 +148,21 @@ class Rollout:
         """
         held = np.broadcast_to(np.asarray(worlds, dtype=np.int32), self.num_worlds)
         self.dynamics.robot.held = wp.array(held, dtype=int, device=self.device)
+
+    def geometry(self) -> np.ndarray:
+        """Return the legs' lengths [m], (4, 10), see `GEOMETRY_NAMES`; all worlds have the same."""
+        legs = self.dynamics.robot.geometry.numpy()
+        return np.column_stack([legs["hip"], *(legs[name] for name in GEOMETRY_NAMES[3:])]).astype(np.float64)
+
+    def set_geometry(self, lengths: np.ndarray) -> None:
+        """Write the legs' lengths [m], (4, 10). Raises InputError for another shape."""
+        if np.shape(lengths) != (4, len(GEOMETRY_NAMES)):
+            raise InputError(f"geometry must have shape (4, {len(GEOMETRY_NAMES)}), got {np.shape(lengths)}")
+        legs = self.dynamics.robot.geometry.numpy().copy()
+        legs["hip"] = lengths[:, :3]
+        for name, column in zip(GEOMETRY_NAMES[3:], lengths.T[3:], strict=True):
+            legs[name] = column
+        self.dynamics.robot.geometry.assign(legs)
 
     def run(
         self,
@@ -305,10 +320,15 @@ class Rollout:
             values = np.repeat(values[..., None], self.num_worlds, axis=-1)
         if values.shape != full:
             raise InputError(f"{name} must have shape {full} or {shape}, got {values.shape}")
-        return self._array(values)
+        return self.array(values)
 
-    def _array(self, values: Any) -> wp.array:
+    def array(self, values: Any) -> wp.array:
+        """Return values as an array of the rollout's precision on its device."""
         return wp.array(values, dtype=self.real, device=self.device)
+
+    def vectors(self, values: Any) -> wp.array:
+        """Return vectors (..., 3) as an array of the kernels' vec3."""
+        return wp.array(np.ascontiguousarray(values), dtype=self.dynamics.modules.scalar.vec3, device=self.device)
 
     def _zeros(self, *shape: int, dtype: Any = None) -> wp.array:
         return wp.zeros(shape, dtype=dtype or self.real, device=self.device)
