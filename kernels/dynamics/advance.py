@@ -34,8 +34,8 @@ def advance_once(
             for j in range(3):
                 work.torque[3 * k + j, world] = torques[k][j]
     wrench = base_wrench(drive, world)
-    force = vec3(real(wrench[0]), real(wrench[1]), real(wrench[2]))
-    moment = vec3(real(wrench[3]), real(wrench[4]), real(wrench[5]))
+    force = vec3(wrench[0], wrench[1], wrench[2])
+    moment = vec3(wrench[3], wrench[4], wrench[5])
     block = block_law(robot, world, base, dt)
     solved = solve_step(
         robot, settings, world, base, force, moment, block, work.impulse, angles, rates, torques, rows, pressed, legs,

@@ -19,7 +19,18 @@ from .contact import BlockLaw, PawContact, block_velocity, local_impulse
 from .drive import Drive, LegDrive, Workspace, applied_torque, base_wrench, load_leg_drive, park
 from .lanes import any_world, first_leg, from_leg, max_legs, meet, sum_legs, sum_systems, sum_vec, vec_from_leg
 from .parameters import load_stops, load_vec3
-from .step import LegParams, Robot, StepSettings, base_system, block_law, finite_base, leg_terms, load_leg, paw_contact
+from .step import (
+    LegParams,
+    Robot,
+    StepSettings,
+    base_system,
+    block_law,
+    finite_base,
+    hold_base,
+    leg_terms,
+    load_leg,
+    paw_contact,
+)
 
 # division and roots are rounded to 2 units in the last place, as a third of the code
 wp.set_module_options({"enable_backward": False, "fast_math": True})
@@ -113,11 +124,11 @@ def advance_leg(
         pressed = pressed_stops(rows, old.rates, real(0.0), 0)
     terms = leg_terms(own, old.angles, old.rates, torque, rows, pressed, base.ang, g, dt)
     wrench = base_wrench(drive, world)
-    force = vec3(real(wrench[0]), real(wrench[1]), real(wrench[2]))
-    moment = vec3(real(wrench[3]), real(wrench[4]), real(wrench[5]))
+    force = vec3(wrench[0], wrench[1], wrench[2])
+    moment = vec3(wrench[3], wrench[4], wrench[5])
     share = add_leg(BaseSystem(), terms.dynamics, terms.solve)
     system = sum_systems(base_system(robot, world, base, g, force, moment), share)
-    inverse = invert(system)
+    inverse = hold_base(robot, world, invert(system))
     lin_acc = solve_lin(inverse, system.force, system.moment)
     ang_acc = solve_ang(inverse, system.force, system.moment)
     lin = wp.quat_rotate_inv(base.quat, base.lin) + dt * lin_acc

@@ -10,7 +10,7 @@ from .base_dynamics import LegSolve, add_leg, invert, motor_acceleration, solve_
 from .contact import BlockLaw, ContactState, PawContact, solve_contacts
 from .leg_dynamics import PawKinematics
 from .parameters import load_stops, load_vec3
-from .step import Robot, StepSettings, base_system, leg_terms, load_leg, paw_contact
+from .step import Robot, StepSettings, base_system, hold_base, leg_terms, load_leg, paw_contact
 
 wp.set_module_options({"enable_backward": False})
 
@@ -43,7 +43,7 @@ def solve_with_stops(
         legs[k] = terms.solve
         paws[k] = terms.paw
         system = add_leg(system, terms.dynamics, terms.solve)
-    inverse = invert(system)
+    inverse = hold_base(robot, world, invert(system))
     lin_acc = solve_lin(inverse, system.force, system.moment)
     ang_acc = solve_ang(inverse, system.force, system.moment)
     lin = wp.quat_rotate_inv(base.quat, base.lin) + dt * lin_acc
