@@ -122,6 +122,8 @@ class Rollout:
         self._actuation.latency = self._zeros(n)
         self._actuation.filtered = int(command_filter is not None)
         self._actuation.limits = self.array(np.repeat(filter_rows(command_filter)[:, None], n, axis=1))
+        self.motors = self._actuation.motors
+        """The kernels' `MotorArrays`, whose arrays are among the parameters."""
         self.parameters: dict[str, wp.array] = {
             "table": self.dynamics.robot.table,
             **{name: getattr(self._actuation.motors, name) for name in MOTOR_CONSTANTS},
