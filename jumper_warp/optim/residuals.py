@@ -10,9 +10,9 @@ import numpy as np
 
 from jumper_warp.optim.motions import Motion
 from jumper_warp.optim.parameters import BASE_ONLY, ParameterSet, RobotValues
-from jumper_warp.optim.replay import Record, Replay, Starts, grid_steps
+from jumper_warp.optim.replay import Record, Replay, Starts, grid_steps, rotate
+from jumper_warp.optim.stance import stance
 from jumper_warp.robot.description import RobotDescription
-from jumper_warp.robot.model import standing_configuration
 from jumper_warp.utils.checks import check_positive
 from jumper_warp.utils.errors import InputError
 
@@ -20,6 +20,10 @@ LONGEST_GAP = 0.1
 """[s] Between two rows of a motion."""
 LONGEST_LATENCY = 0.05
 """[s] Targets that long before the first row matter."""
+SETTLING = 0.02
+"""[s] From the start on, in which rows of a motion on the ground do not count: paws that do not stand on it exactly
+strike it, and when each does is a matter of micrometres."""
+DEGREE = math.pi / 180.0
 HANGING_HEIGHT = 1.0
 """[m] Of a held base whose position is not told."""
 DIFFERENCE = 1.0e-4
@@ -129,6 +133,8 @@ class MotionResiduals:
             first += width
         self.measured = np.concatenate(columns, axis=1) if columns else np.zeros((len(motion.time), 0))
         self.valid = np.isfinite(self.measured)
+        if self.free:
+            self.valid[motion.time < motion.time[0] + SETTLING] = False
         if not self.valid.any():
             raise InputError(f"motion {motion.name}: nothing is measured that a replay could be compared to")
         self.sigma, self._leg = np.array(sigma), np.array(legs)
@@ -140,27 +146,44 @@ class MotionResiduals:
         rate, rate_prior = first_values(motion.rate, None, 0.5, 1.0)
         if motion.rate is None and motion.angle is not None:
             rate, rate_prior = slope(motion.time[:rows], motion.angle[:rows]), np.full(12, 1.0)
-        height = standing_configuration(self.description, angle)[2] if self.free else HANGING_HEIGHT
-        place = np.array([0.0, 0.0, height])
-        position, position_prior = first_values(motion.position if self.free else None, place, 0.02, 0.05)
-        quaternion, _ = first_values(motion.quaternion, np.array([0.0, 0.0, 0.0, 1.0]), 0.0, 0.0)
-        tilt_prior = math.radians(2.0 if motion.quaternion is not None else 5.0)
-        velocity = np.zeros(3)
-        if self.free and motion.position is not None:
-            velocity = slope(motion.time[:rows], motion.position[:rows])
-        self._guess = Starts(*(np.atleast_2d(x) for x in (
-            position, quaternion / np.linalg.norm(quaternion), velocity, np.zeros(3), angle, rate
-        )))  # fmt: skip
-        base = [position_prior, np.full(3, 0.3), np.full(3, 1.0)] if self.free else []
-        self._start_prior = np.concatenate([angle_prior, rate_prior, np.full(3, tilt_prior), *base])
+        level, place = np.array([0.0, 0.0, 0.0, 1.0]), np.array([0.0, 0.0, HANGING_HEIGHT])
+        quaternion, _ = first_values(motion.quaternion, level, 0.0, 0.0)
+        quaternion = quaternion / np.linalg.norm(quaternion)
+        tilt = np.full(3, math.radians(2.0 if motion.quaternion is not None else 5.0))
+        velocity, base = np.zeros(3), []
+        self.standing = False
+        if self.free:
+            ground = stance(self.description, angle[None], rate[None])
+            place[2] = ground.height[0]
+            place, place_prior = first_values(motion.position, place, 0.02, 0.05)
+            up = rotate(quaternion * np.array([-1.0, -1.0, -1.0, 1.0]), np.array([0.0, 0.0, 1.0]))
+            near = abs(place[2] - ground.height[0]) < 0.03 and float(up @ ground.up[0]) > math.cos(math.radians(6.0))
+            self.standing = near and ground.gap[0] < 0.02
+            if motion.position is not None:
+                velocity = slope(motion.time[:rows], motion.position[:rows])
+            base = [place_prior, np.full(3, 0.3), np.full(3, 1.0)]
+            if self.standing:  # the ground says more than sensors
+                tilt = np.array([0.2 * DEGREE, 0.2 * DEGREE, tilt[2]])
+                base = [np.array([0.02, 0.02, 0.001]), np.full(3, 0.05), np.full(3, 0.3)]
+        self._guess = Starts(*(x[None] for x in (place, quaternion, velocity, np.zeros(3), angle, rate)))
+        self._start_prior = np.concatenate([angle_prior, rate_prior, tilt, *base])
 
     def starts(self, z: np.ndarray, robots: RobotValues) -> Starts:
-        """Return the starts of normalised coordinates (N, I); true angles are readings less the robots' offsets."""
+        """Return the starts of normalised coordinates (N, I); true angles are readings less the robots' offsets.
+
+        All paws of a robot that stands begin on the ground, but for what the coordinates add to that.
+        """
         guess, d = self._guess, z * self._start_prior
-        count = len(z)
-        start = Starts(*(np.repeat(getattr(guess, name), count, axis=0) for name in vars(guess)))
+        start = Starts(*(np.repeat(getattr(guess, name), len(z), axis=0) for name in vars(guess)))
         start.angle = start.angle + d[:, :12] - robots.offset
         start.rate = start.rate + d[:, 12:24]
+        if self.standing:
+            ground = stance(self.description, start.angle, start.rate)
+            turned = rotate(start.quaternion, ground.up)  # to be brought to the vertical, about a level axis
+            half = np.stack([turned[:, 1], -turned[:, 0], np.zeros(len(z)), 1.0 + turned[:, 2]], axis=1)
+            start.quaternion = multiply(half / np.linalg.norm(half, axis=1, keepdims=True), start.quaternion)
+            start.position[:, 2] = ground.height
+            start.velocity, start.spin = (rotate(start.quaternion, v) for v in (ground.velocity, ground.spin))
         start.quaternion = multiply(from_vector(d[:, 24:27]), start.quaternion)
         if self.free:
             start.position = start.position + d[:, 27:30]

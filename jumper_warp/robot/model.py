@@ -145,13 +145,12 @@ def leg_geometry_array(
     return wp.array(legs, dtype=geometry_module.LegGeometry, device=device)
 
 
-def standing_configuration(description: RobotDescription, pose: str | np.ndarray = "default") -> np.ndarray:
-    """Return one world's `joint_q`, shape (43,): level base above the origin, the lowest paw touching z = 0.
+def standing_configuration(description: RobotDescription, pose: str = "default") -> np.ndarray:
+    """Return one world's `joint_q`, shape (43,): level base at the origin, paws touching z = 0, in a named pose.
 
-    pose: a named one, or 12 motor angles [rad]. Raises KeyError for an unknown name, ValueError for angles that the
-    legs cannot have.
+    Raises KeyError for an unknown pose.
     """
-    angles = (description.pose(pose) if isinstance(pose, str) else np.asarray(pose)).reshape(4, 3)
+    angles = description.pose(pose).reshape(4, 3)
     joints, loops, depths = [], [], []
     for name, (lateral, outer, inner) in zip(LEGS, angles, strict=True):
         leg = leg_dimensions(description, name)
