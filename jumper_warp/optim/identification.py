@@ -30,8 +30,8 @@ PIECES = (0.25,)
 """[s] Lengths of the pieces of the stages before the last."""
 WORTH_A_STEP = 0.1
 """Relative decrease of the cost below which a stage ends, unless it is the last."""
-CONVERGED = 0.3
-"""Decrease of the cost, in mean squared residuals, below which the last stage ends: 1 is what a deviation costs."""
+CONVERGED = 1.0
+"""Decrease of the cost, in mean squared residuals, below which the last stage ends: what one deviation costs."""
 MOST_STEPS = (5, 25)
 """Of each stage but the last, and of the last."""
 CONFIDENCE = 1.959964
@@ -178,7 +178,6 @@ def identify(
 
     whole = [MotionResiduals(motion, parameters, noise, robot, dt) for motion in motions]
     z = np.zeros(len(parameters))
-    starts = [np.zeros(motion.start_size) for motion in whole]
     for stage, length in enumerate(PIECES):
         pieces = [pieces_of(motion, parameters, noise, robot, dt, length) for motion in motions]
         problem = LeastSquares(parameters, [piece for each in pieces for piece in each], replay, knowledge)
@@ -189,13 +188,10 @@ def identify(
             note(stage, problem, cost, damping)
             if normal.cost - cost < WORTH_A_STEP * normal.cost:
                 break
-        z, place = point.z, 0
-        for i, each in enumerate(pieces):
-            starts[i] = point.starts[place]
-            place += len(each)
+        z = point.z
     problem = LeastSquares(parameters, whole, replay, knowledge)
     nominal = channel_fits(problem, problem.expected())
-    point, normal = Point(z, starts), None
+    point, normal = Point(z, problem.expected().starts), None
     for _ in range(MOST_STEPS[1]):
         normal = problem.normal(point)
         point, cost, damping = problem.step(point, normal)

@@ -10,12 +10,14 @@ import numpy as np
 
 from jumper_warp.optim.parameters import ParameterSet, RobotValues
 from jumper_warp.optim.replay import Replay
-from jumper_warp.optim.residuals import DIFFERENCE, MotionResiduals
+from jumper_warp.optim.residuals import DIFFERENCE, Linearised, MotionResiduals
 from jumper_warp.utils.errors import InputError
 
-DAMPINGS = np.concatenate([[0.0], np.logspace(-5.0, 2.0, 15)])
+DAMPINGS = np.array([0.0, 1.0e-5, 1.0e-4, 3.0e-4, 1.0e-3, 3.0e-3, 1.0e-2, 1.0e-1, 1.0, 10.0])
 """Relative to the diagonal of the normal matrix; all are tried in each step."""
-CHANGE = 0.1
+PROBE = 0.3
+"""Share of a step after which its curvature is measured."""
+CHANGE = 0.3
 """Step of a difference, in deviations that the data alone would leave to the unknown, the others known: small against
 what matters, large against the kinks of friction and contact."""
 LARGEST_CHANGE = 0.1
@@ -61,6 +63,8 @@ class Normal:
     """(I, I) each, with the prior's identity."""
     mixed: list[np.ndarray]
     """(P, I) each."""
+    linearised: list[Linearised]
+    """Of each motion."""
 
     def information(self) -> np.ndarray:
         """Return what data and knowledge say of the parameters, the starts unknown: (P, P), prior deviations."""
@@ -69,19 +73,21 @@ class Normal:
             found -= mixed @ np.linalg.solve(own, mixed.T)
         return 0.5 * (found + found.T)
 
-    def step(self, damping: float, free: np.ndarray) -> tuple[np.ndarray, list[np.ndarray]]:
-        """Return the damped Gauss-Newton step of parameters (those of index `free`) and starts."""
+    def solve(
+        self, damping: float, free: np.ndarray, gradient: np.ndarray, start_gradients: Sequence[np.ndarray]
+    ) -> tuple[np.ndarray, list[np.ndarray]]:
+        """Return the damped step of parameters (those of index `free`) and starts for a gradient."""
         matrix = self.matrix[np.ix_(free, free)] + np.eye(len(free))
         matrix += damping * np.diag(np.diag(matrix))
-        slope = self.gradient[free].copy()
+        slope = gradient[free].copy()
         solved = []
-        for gradient, own, mixed in zip(self.start_gradients, self.start_matrices, self.mixed, strict=True):
+        for of_start, own, mixed in zip(start_gradients, self.start_matrices, self.mixed, strict=True):
             own = own + damping * np.diag(np.diag(own))
-            both = np.linalg.solve(own, np.column_stack([mixed[free].T, gradient]))
+            both = np.linalg.solve(own, np.column_stack([mixed[free].T, of_start]))
             matrix -= mixed[free] @ both[:, :-1]
             slope -= mixed[free] @ both[:, -1]
             solved.append(both)
-        move = np.zeros(len(self.gradient))
+        move = np.zeros(len(gradient))
         move[free] = -np.linalg.solve(matrix, slope)
         return move, [-both[:, -1] - both[:, :-1] @ move[free] for both in solved]
 
@@ -111,7 +117,7 @@ class LeastSquares:
         """Return the normal equations at a point. Raises InputError if it cannot be simulated."""
         size = len(self.parameters)
         eye = float(point.z @ point.z) + sum(float(start @ start) for start in point.starts)
-        normal = Normal(eye, 0.0, point.z.copy(), np.zeros((size, size)), [], [], [])
+        normal = Normal(eye, 0.0, point.z.copy(), np.zeros((size, size)), [], [], [], [])
         for motion, start, change in zip(self.motions, point.starts, self._change, strict=True):
             found = motion.linearise(self.replay, point.z, start, change)
             if not np.isfinite(found.residual).all() or not np.isfinite(found.jacobian).all():
@@ -121,6 +127,7 @@ class LeastSquares:
             normal.data_cost += float(found.residual @ found.residual)
             normal.matrix += square[:size, :size]
             normal.gradient += slope[:size]
+            normal.linearised.append(found)
             normal.mixed.append(square[:size, size:])
             normal.start_matrices.append(square[size:, size:] + np.eye(len(start)))
             normal.start_gradients.append(slope[size:] + start)
@@ -156,15 +163,47 @@ class LeastSquares:
     def step(self, point: Point, normal: Normal) -> tuple[Point, float, float]:
         """Return the best of the points that the dampings lead to, its cost and its damping.
 
-        The point stays, with an infinite damping, if none is better.
+        Each step is tried as it is and bent along the curvature of the residuals (geodesic acceleration). The point
+        stays, with an infinite damping, if none is better.
         """
         stuck = (point.z <= self._low) & (normal.gradient > 0.0) | (point.z >= self._high) & (normal.gradient < 0.0)
         free = np.flatnonzero(~stuck)
-        moves = [normal.step(damping, free) for damping in DAMPINGS]
+        plain = [normal.solve(damping, free, normal.gradient, normal.start_gradients) for damping in DAMPINGS]
+        moves = plain + self._bent(point, normal, free, plain)
         z = np.clip(point.z + np.array([move for move, _ in moves]), self._low, self._high)
         starts = [start + np.array([move[i] for _, move in moves]) for i, start in enumerate(point.starts)]
         costs = self.costs(z, starts)
         best = int(np.argmin(costs))
         if not costs[best] < normal.cost:
             return point, normal.cost, math.inf
-        return Point(z[best], [start[best] for start in starts]), float(costs[best]), float(DAMPINGS[best])
+        damping = float(DAMPINGS[best % len(DAMPINGS)])
+        return Point(z[best], [start[best] for start in starts]), float(costs[best]), damping
+
+    def _bent(
+        self, point: Point, normal: Normal, free: np.ndarray, plain: list[tuple[np.ndarray, list[np.ndarray]]]
+    ) -> list[tuple[np.ndarray, list[np.ndarray]]]:
+        """Return the steps that follow the curvature of the residuals, which many worlds a part of the way measure.
+
+        Steps that would bend more than they go are left out.
+        """
+        size = len(point.z)
+        ahead = np.clip(point.z + PROBE * np.array([move for move, _ in plain]), self._low, self._high)
+        gradient, of_starts = np.zeros((size, len(plain))), []
+        for i, (motion, linear) in enumerate(zip(self.motions, normal.linearised, strict=True)):
+            move = np.array([start[i] for _, start in plain])
+            found = motion.residuals(self.replay, ahead, point.starts[i] + PROBE * move)
+            both = np.concatenate([ahead - point.z, PROBE * move], axis=1)
+            with np.errstate(invalid="ignore", over="ignore"):
+                curvature = (found - linear.residual[:, None] - linear.jacobian @ both.T) / PROBE**2
+                slope = linear.jacobian.T @ curvature
+            gradient += slope[:size]
+            of_starts.append(slope[size:])
+        bent = []
+        for k, (move, starts) in enumerate(plain):
+            slopes = [slope[:, k] for slope in of_starts]
+            if np.isfinite(gradient[:, k]).all() and all(np.isfinite(slope).all() for slope in slopes):
+                more, more_starts = normal.solve(DAMPINGS[k], free, gradient[:, k], slopes)
+                if np.linalg.norm(more) < np.linalg.norm(move):
+                    move, starts = move + more, [a + b for a, b in zip(starts, more_starts, strict=True)]
+            bent.append((move, starts))
+        return bent
