@@ -79,7 +79,8 @@ def plot(values: dict[str, Any], run: EvaluationRun) -> None:
 
 def show(values: dict[str, Any]) -> None:
     """Print each bin, published distances beside ours, and what ours are."""
-    bins = Table("distance [m]", "success [%]", "without a second hop", "without a step", "base at touchdown [m]")
+    bins = Table("distance [m]", "success [%]", "without a second hop", "without a step", "falls [%]", "misses [%]",
+                 "base at touchdown [m]")  # fmt: skip
     for i in range(len(values["bin_m"])):
         bins.add_row(*row_of(values, i))
     works = Table("work", "jump [m]")

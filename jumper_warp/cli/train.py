@@ -118,6 +118,14 @@ def check_saving(task: TaskCfg) -> None:
         raise InputError(f"{task.name} would not come back as it is from what is saved with its policies")
 
 
+def check_symmetry(task: TaskCfg, cfg: TrainCfg) -> None:
+    """Raise InputError if symmetry is asked for and the mirror image of what the policy sees is not known."""
+    from jumper_warp.tasks.mirror import mirror_of
+
+    if cfg.ppo.symmetry != "off":
+        mirror_of(task, "policy")
+
+
 def check_resume(cfg: TrainCfg) -> None:
     """Raise CheckpointError if the checkpoint to resume is of a run from before tasks had a version."""
     from jumper_warp.rl.checkpoint import CheckpointError
@@ -142,6 +150,7 @@ def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> TrainResult:
     from jumper_warp.utils.runtime import announce
 
     check_saving(task)
+    check_symmetry(task, parsed.cfg)
     if parsed.cfg.resume:
         check_resume(parsed.cfg)
     first = os.environ.get("RANK", "0") == "0"

@@ -25,8 +25,10 @@ from jumper_warp.sim.simulation import Simulation, SolverName
 from jumper_warp.sim.slices import SlicedGraph
 from jumper_warp.tasks.cfg import Handover, TaskCfg
 from jumper_warp.tasks.interface import interface
+from jumper_warp.tasks.mirror import Mirror, mirror_of, mirror_of_action
 from jumper_warp.tasks.saving import handover_to_json, task_to_json
 from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.kernels import load_kernels
 from kernels.mdp.reset import stand_kernel
 
 CONTACT_TOLERANCE = 1.0e-4
@@ -93,7 +95,7 @@ class Env(Stages):
         self.sim = Simulation(
             num_envs, solver=solver, motors=self.task.motors, visuals=visuals, device=device and str(device),
             ground=ground, block=BlockCfg((0.0, 0.0)) if self._draws_ground else block, tolerance=CONTACT_TOLERANCE,
-            friction=0.85 if self.task.randomization.dynamic_friction else 0.9, threads=threads,
+            friction=self.task.randomization.nominal_friction, threads=threads,
         )  # fmt: skip
         self.wp_device = self.sim.device
         self.device = torch.device(wp.device_to_torch(self.wp_device))
@@ -102,7 +104,7 @@ class Env(Stages):
         if self._draws_ground:
             self.sim.physics.dynamics.robot.ground.blocks.zero_()  # until `reset` draws them
         self.physics_dt, self.step_dt = self.sim.dt, self.sim.dt * self.sim.substeps
-        self._ends_episodes, self._started, self._graphs = True, False, {}
+        self._ends_episodes, self._started, self._compiled, self._graphs = True, False, False, {}
         self._allocate(run, skill, handovers)
         self._show()
 
@@ -128,10 +130,17 @@ class Env(Stages):
         if seed is not None:
             self._start_over(seed)
         self._ends_episodes = True
+        self.compile()
         self._tick(self._all)
         self._begin(self._part(), self._all)
         self._observe(self._part(), beginning=0)
         return self._step.obs, {}
+
+    def compile(self) -> None:
+        """Compile all kernels of `reset` and `step`, side by side; the first `reset` does so itself."""
+        if not self._compiled:
+            load_kernels(self.kernels(), self.wp_device)
+            self._compiled = True
 
     def _start_over(self, seed: int) -> None:
         self.seed = self.worlds.seed = seed
@@ -180,6 +189,8 @@ class Env(Stages):
         headings = self._array(checked_values(headings, (n,), "headings"))
         mask = self._array(checked_mask(worlds, n))
         self._ends_episodes = False
+        if not self._started:
+            load_kernels(self.kernels(draws=False), self.wp_device)
         if self._draws_ground:
             self._scene.ground.blocks.zero_()
         self._tick(mask)
@@ -243,6 +254,13 @@ class Env(Stages):
             figures |= {f"{skill.task.name}/{name}": value for name, value in skill.metrics().items()}
         levels = np.bincount(self.worlds.level.numpy(), minlength=len(self.task.levels) + 1)
         return figures | {f"Curriculum/level_{i}": float(count) / self.num_envs for i, count in enumerate(levels)}
+
+    def mirror(self, what: str) -> Mirror:
+        """Return order and signs of the left-right mirror image of the first task's "observation", or of an "action".
+
+        Raises ValueError: the mirror image of a term is not known.
+        """
+        return mirror_of_action() if what == "action" else mirror_of(self.task, "policy")
 
     def config(self) -> dict:
         """Return everything that defines the environment, as JSON can hold it.

@@ -8,7 +8,7 @@ from __future__ import annotations
 import dataclasses
 import json
 from collections.abc import Callable, Collection, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any, Literal
@@ -26,12 +26,17 @@ from jumper_warp.rl.checkpoint import (
     load_checkpoint,
     one_line,
 )
+from jumper_warp.rl.mirror import Symmetry, image, plain_layers
 from jumper_warp.rl.networks import EPS, NORMALISED_LIMIT
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.tasks.interface import interface
+from jumper_warp.tasks.randomization import RandomizationCfg
 from jumper_warp.tasks.saving import OPTIONAL, TaskError, task_from_json
+from jumper_warp.utils.errors import InputError
 
 if TYPE_CHECKING:
+    import torch
+
     from jumper_warp.envs.env import Env
 
 CHECKPOINTS = "checkpoints"
@@ -54,6 +59,46 @@ class Conditions:
     """Warp device (default: a GPU if there is one)."""
     threads: int | None = None
     """CPU threads that share the worlds (default: all cores); they change no result."""
+    push_in_flight: bool = False
+    """Pushes of a randomised test act in flight too, and not only while a paw is down."""
+    latency: float | None = None
+    """[ms] From action to motor, to the nearest physics step (default: none, or drawn if randomised)."""
+    gains: tuple[float, float] | None = None
+    """[1] Scales of kp and kd of all motors (default: 1, or drawn if randomised)."""
+    friction: float | None = None
+    """[1] Of the paws, static and dynamic (default: nominal, or drawn if randomised)."""
+
+    def __post_init__(self) -> None:
+        """Raises InputError: a value out of range, or pushes in flight where there are none."""
+        self._with_fixed(RandomizationCfg.off())
+        if self.push_in_flight and not self.randomize:
+            raise InputError("push_in_flight needs randomize: without it there are no pushes")
+
+    @property
+    def fixed(self) -> dict[str, Any]:
+        """Parameters that are neither nominal nor drawn."""
+        given = {name: getattr(self, name) for name in ("latency", "gains", "friction")}
+        return {name: value for name, value in given.items() if value is not None}
+
+    @property
+    def draws(self) -> bool:
+        """Whether the environment sets parameters at resets."""
+        return self.randomize or bool(self.fixed)
+
+    def _with_fixed(self, ranges: RandomizationCfg) -> RandomizationCfg:
+        return ranges.with_fixed(**self.fixed)
+
+    def applied(self, task: TaskCfg) -> TaskCfg:
+        """Return a task as it is tried in these conditions; pushes come and go, however its training had it."""
+        trained = task.randomization
+        if self.randomize:
+            in_flight = trained.push_in_flight or self.push_in_flight
+            drawn = replace(self._with_fixed(trained.in_tests()), push_in_flight=in_flight)
+            return replace(task, randomization=drawn)
+        if not self.fixed:
+            return task
+        nominal = RandomizationCfg.off().with_fixed(friction=trained.nominal_friction)
+        return replace(task, randomization=self._with_fixed(nominal), events=()).on_level_ground()
 
 
 def is_run(source: str | Path) -> bool:
@@ -95,6 +140,8 @@ def _policy_of_checkpoint(path: Path, state: dict[str, Any]) -> Policy:
         std = (model["obs_moments.var"] + EPS).sqrt().float()
         times = {"policy_dt": env["policy_dt_s"], "physics_dt": env["physics_dt_s"]}
         shape = {"hidden": tuple(ppo["hidden"]), "activation": ppo["activation"]}
+        if symmetry := _symmetry(model):
+            layers, shape["hidden"] = plain_layers(layers, symmetry), tuple(2 * width for width in ppo["hidden"])
         commit = config.get("commit") or {"hash": None, "dirty": None}
         config |= {"commit": commit["hash"], "dirty": commit["dirty"], "iteration": state["iteration"]}
     except DAMAGE as error:
@@ -108,6 +155,14 @@ def _policy_of_checkpoint(path: Path, state: dict[str, Any]) -> Policy:
         raise PolicyError(f"{path}: {error}") from error
     except DAMAGE as error:
         raise _no_training(path, error) from error
+
+
+def _symmetry(model: dict[str, torch.Tensor]) -> Symmetry | None:
+    """Return the symmetry of a checkpoint's actor, if it has one by its form."""
+    if not any(name.startswith("mirror_") for name in model):
+        return None
+    parts = ((model[f"mirror_{name}_order"], model[f"mirror_{name}_signs"], name) for name in Symmetry._fields)
+    return Symmetry(*(image(*part) for part in parts))
 
 
 def _no_training(path: Path, error: Exception) -> CheckpointError:
@@ -179,12 +234,12 @@ def env_of_policy(
     if task.observation_names != policy.interface.observation_names:
         raise PolicyError("the policy's observation is not the one that this version of its task gives")
     return Env(
-        task if change is None else change(task),
+        conditions.applied(task if change is None else change(task)),
         num_envs,
         seed=conditions.seed,
         device=conditions.device,
         solver=conditions.solver,
-        randomize=conditions.randomize,
+        randomize=conditions.draws,
         noise=conditions.noise,
         auto_reset=False,
         **scene,

@@ -286,6 +286,12 @@ class JumperDynamics:
             drive.previous, drive.delay = previous, delay
         return drive
 
+    def advance_kernel(self, by_legs: bool | None = None) -> tuple[wp.Kernel, int]:
+        """Return the kernel that `advance` launches, and its block size."""
+        if self.device.is_cuda if by_legs is None else by_legs:
+            return self.modules.advance_legs.advance_legs_kernel, 32 if self.device.is_cuda else 4
+        return self.modules.advance.advance_kernel, 32
+
     def advance(
         self, settings: Any, drive: Any, q: wp.array, qd: wp.array, q_out: wp.array, qd_out: wp.array,
         worlds: Worlds | None = None, by_legs: bool | None = None,
@@ -297,17 +303,9 @@ class JumperDynamics:
         """
         settings.first, count = worlds or (0, self.num_worlds)
         inputs, outputs = [self.robot, settings, drive, q, qd, self.work], [q_out, qd_out]
-        if by_legs is None:
-            by_legs = self.device.is_cuda
-        if by_legs:
-            kernel, dim, inputs = (
-                self.modules.advance_legs.advance_legs_kernel,
-                (-(-count // 8) * 8, 4),
-                [count, *inputs],
-            )
-            block = 32 if self.device.is_cuda else 4
-        else:
-            kernel, dim, block = self.modules.advance.advance_kernel, count, 32
+        by_legs = self.device.is_cuda if by_legs is None else by_legs
+        kernel, block = self.advance_kernel(by_legs)
+        dim, inputs = ((-(-count // 8) * 8, 4), [count, *inputs]) if by_legs else (count, inputs)
         wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device, block_dim=block)
 
     def full_state(

@@ -85,6 +85,9 @@ class Physics(Protocol):
     def write_bodies(self) -> None:
         """Bring the state's passive joints and bodies up to date."""
 
+    def kernels(self) -> list[tuple[wp.Kernel, int]]:
+        """Return what a policy step launches and can be compiled before, each with its block size."""
+
     def carried(self) -> dict[str, wp.array]:
         """Return what the next step depends on besides coordinates and impulses, by name."""
 
@@ -139,6 +142,10 @@ class JumperPhysics:
         """See `Physics.write_bodies`."""
         state = self._sim.state
         self.dynamics.full_state(state.joint_q, state.joint_qd, state.body_q, state.body_qd)
+
+    def kernels(self) -> list[tuple[wp.Kernel, int]]:
+        """See `Physics.kernels`."""
+        return [self.dynamics.advance_kernel()]
 
     def carried(self) -> dict[str, wp.array]:
         """See `Physics.carried`."""
@@ -228,6 +235,10 @@ class MujocoPhysics:
         """See `Physics.write_bodies`."""
         state = self._sim.state
         self.dynamics.full_state(state.joint_q, state.joint_qd, state.body_q, state.body_qd)
+
+    def kernels(self) -> list[tuple[wp.Kernel, int]]:
+        """See `Physics.kernels`; Newton's solver compiles its own at their first launches."""
+        return []
 
     def carried(self) -> dict[str, wp.array]:
         """See `Physics.carried`."""

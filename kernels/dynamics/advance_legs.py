@@ -7,6 +7,7 @@ most takes it, until none would change by more than the tolerance.
 
 import warp as wp
 
+from ..actuation.stops import MAX_SETS, ONE_BY_ONE, SLACK, change_one, pressed_stops
 from ..layout import GRAVITY
 from ..scalar import real, vec3
 from ..state import BaseState, base_com, leg_coord, leg_dof, load_base, load_motors, store_base, store_motors
@@ -15,7 +16,7 @@ from .base_dynamics import BaseSystem, add_leg, invert, motor_acceleration, solv
 from .base_motion import moved_base
 from .contact import BlockLaw, PawContact, block_velocity, local_impulse
 from .drive import Drive, LegDrive, Workspace, applied_torque, base_wrench, load_leg_drive, park
-from .lanes import any_world, first_leg, max_legs, meet, sum_legs, sum_systems, sum_vec, vec_from_leg
+from .lanes import any_world, first_leg, from_leg, max_legs, meet, sum_legs, sum_systems, sum_vec, vec_from_leg
 from .parameters import load_vec3
 from .step import LegParams, Robot, StepSettings, base_system, block_law, finite_base, leg_terms, load_leg, paw_contact
 
@@ -88,19 +89,27 @@ def solve_paws(
     return s
 
 
+@wp.struct
+class LegEnd:
+    """The end of a step as one leg sees it."""
+
+    rates: vec3  # [rad/s] of its motors
+    lin: vec3  # of the base [m/s], body axes of the start
+    ang: vec3  # [rad/s]
+    paw: PawSolution
+    on_block: int  # 1: its paw touches the block
+
+
 @wp.func
-def advance_leg(
-    robot: Robot, settings: StepSettings, drive: Drive, own: LegParams, motors: LegDrive, world: int, leg: int,
-    step: int, old: LegState, writes: bool,
-) -> LegState:  # fmt: skip
-    """Return the thread's state after one step; writes: whether the thread is the one that moves its world's block."""
+def solve_leg(
+    robot: Robot, settings: StepSettings, own: LegParams, world: int, leg: int, old: LegState, torque: vec3,
+    wrench: wp.spatial_vector, block: BlockLaw, pressed: int,
+) -> LegEnd:  # fmt: skip
+    """Solve a step with given sets of pressed stops."""
     dt = settings.dt
-    blocks = robot.ground.blocks.shape[0] > 0
     base = old.base
     g = wp.quat_rotate_inv(base.quat, load_vec3(robot.table, GRAVITY, world))
-    torque = applied_torque(motors, step, old.angles, old.rates)
-    terms = leg_terms(own, old.angles, old.rates, torque, base.ang, g, dt)
-    wrench = base_wrench(drive, world)
+    terms = leg_terms(own, old.angles, old.rates, torque, pressed, base.ang, g, dt)
     force = vec3(real(wrench[0]), real(wrench[1]), real(wrench[2]))
     moment = vec3(real(wrench[3]), real(wrench[4]), real(wrench[5]))
     share = add_leg(BaseSystem(), terms.dynamics, terms.solve)
@@ -110,31 +119,80 @@ def advance_leg(
     ang_acc = solve_ang(inverse, system.force, system.moment)
     lin = wp.quat_rotate_inv(base.quat, base.lin) + dt * lin_acc
     ang = base.ang + dt * ang_acc
-    rates = old.rates + dt * motor_acceleration(terms.solve, lin_acc, ang_acc)
-    block = block_law(robot, world, base, dt)
+    solve = terms.solve
+    rates = old.rates + dt * motor_acceleration(solve, lin_acc, ang_acc)
     contact = paw_contact(
-        robot, world, leg, base, lin, ang, rates, old.rates, old.impulse, terms.paw, terms.solve, inverse, block, dt
+        robot, world, leg, base, lin, ang, rates, old.rates, old.impulse, pressed, terms.paw, solve, inverse, block, dt
     )
+    blocks = robot.ground.blocks.shape[0] > 0
     solved = solve_paws(contact, blocks, block, leg, 4 * settings.max_sweeps, settings.tolerance)
-    if blocks:
-        push = sum_vec(wp.where(contact.on_block != 0, -solved.impulse, vec3(real(0.0))))
+    rates += solve.inverse * (wp.transpose(contact.jacobian) * solved.impulse)
+    rates -= solve.to_lin * solved.lin + solve.to_ang * solved.ang
+    end = LegEnd()
+    end.rates = rates
+    end.lin = lin + solved.lin
+    end.ang = ang + solved.ang
+    end.paw = solved
+    end.on_block = contact.on_block
+    return end
+
+
+@wp.func
+def settle_leg(
+    robot: Robot, settings: StepSettings, own: LegParams, world: int, leg: int, old: LegState, torque: vec3,
+    wrench: wp.spatial_vector, block: BlockLaw,
+) -> LegEnd:  # fmt: skip
+    """Solve a step together with the stops, which are revised as in `world_step`.
+
+    A world that is done repeats its last solution while others of its warp go on.
+    """
+    stops = own.joints.stops
+    pressed = pressed_stops(stops, old.angles, old.rates, settings.dt, real(0.0), 0)
+    end = LegEnd()
+    sets = int(0)
+    working = bool(True)
+    while any_world(working):
+        end = solve_leg(robot, settings, own, world, leg, old, torque, wrench, block, pressed)
+        sets += 1
+        wanted = pressed_stops(stops, old.angles, end.rates, settings.dt, SLACK * settings.tolerance, pressed)
+        differs = wanted != pressed
+        first = first_leg(differs)
+        working = working and sets < MAX_SETS and from_leg(wp.where(differs, real(1.0), real(0.0)), first) > real(0.0)
+        if working and sets < ONE_BY_ONE:
+            pressed = wanted
+        elif working and leg == first:
+            pressed = change_one(pressed, wanted)
+    return end
+
+
+@wp.func
+def advance_leg(
+    robot: Robot, settings: StepSettings, drive: Drive, own: LegParams, motors: LegDrive, world: int, leg: int,
+    step: int, old: LegState, writes: bool,
+) -> LegState:  # fmt: skip
+    """Return the thread's state after one step; writes: whether the thread is the one that moves its world's block."""
+    dt = settings.dt
+    base = old.base
+    torque = applied_torque(motors, step, old.angles, old.rates)
+    block = block_law(robot, world, base, dt)
+    end = settle_leg(robot, settings, own, world, leg, old, torque, base_wrench(drive, world), block)
+    impulse = end.paw.impulse
+    if robot.ground.blocks.shape[0] > 0:
+        push = sum_vec(wp.where(end.on_block != 0, -impulse, vec3(real(0.0))))
         if writes and robot.ground.blocks[world].exists != 0:
             move_block(robot.ground, world, wp.quat_rotate(base.quat, block_velocity(block, push)), dt)
         meet()
-    solve = terms.solve
-    rates += solve.inverse * (wp.transpose(contact.jacobian) * solved.impulse)
-    rates -= solve.to_lin * solved.lin + solve.to_ang * solved.ang
-    total = sum_vec(solved.impulse)
+    total = sum_vec(impulse)
     new = LegState()
-    new.base = moved_base(base, lin + solved.lin, ang + solved.ang, dt)
-    new.angles = old.angles + dt * rates
-    new.rates = rates
+    new.base = moved_base(base, end.lin, end.ang, dt)
+    new.angles = old.angles + dt * end.rates
+    new.rates = end.rates
     new.torque = torque
-    new.impulse = wp.quat_rotate(base.quat, solved.impulse)
-    new.peak_sq = wp.max(old.peak_sq, wp.dot(solved.impulse, solved.impulse))
+    new.impulse = wp.quat_rotate(base.quat, impulse)
+    new.peak_sq = wp.max(old.peak_sq, wp.dot(impulse, impulse))
     new.total_sq = wp.max(old.total_sq, wp.dot(total, total))
-    new.residual = wp.max(old.residual, solved.residual)
-    new.updates = wp.max(old.updates, solved.updates)
+    new.residual = wp.max(old.residual, end.paw.residual)
+    new.updates = wp.max(old.updates, end.paw.updates)
     return new
 
 

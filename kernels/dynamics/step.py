@@ -84,13 +84,15 @@ def load_leg(robot: Robot, world: int, k: int) -> LegParams:
 
 
 @wp.func
-def leg_terms(params: LegParams, angles: vec3, rates: vec3, torque: vec3, omega: vec3, g: vec3, dt: real) -> LegTerms:
-    """Return a leg's dynamics, its elimination and its paw."""
+def leg_terms(
+    params: LegParams, angles: vec3, rates: vec3, torque: vec3, pressed: int, omega: vec3, g: vec3, dt: real
+) -> LegTerms:
+    """Return a leg's dynamics, its elimination with the pressed stops, and its paw."""
     geo = params.geometry
     joints = params.joints
     pose = leg_pose(geo, angles)
     dynamics = leg_dynamics(geo, params.masses, pose, rates, omega, g)
-    passive = joint_forces(joints, pose.loop, geo.front, angles, rates, dt)
+    passive = joint_forces(joints, pose.loop, geo.front, angles, rates, pressed, dt)
     terms = LegTerms()
     terms.dynamics = dynamics
     terms.solve = eliminate_leg(dynamics, passive.inertia + wp.diag(joints.armature), torque + passive.torque)
@@ -146,12 +148,12 @@ def touch_block(robot: Robot, world: int, k: int, base: BaseState, paw: PawKinem
 @wp.func
 def paw_contact(
     robot: Robot, world: int, k: int, base: BaseState, lin: vec3, ang: vec3, rates: vec3, old_rates: vec3,
-    impulse: vec3, paw: PawKinematics, leg: LegSolve, inverse: BaseInverse, block: BlockLaw, dt: real,
+    impulse: vec3, pressed: int, paw: PawKinematics, leg: LegSolve, inverse: BaseInverse, block: BlockLaw, dt: real,
 ) -> PawContact:  # fmt: skip
     """Return paw k's contact problem with floor or block, whichever is nearer.
 
     lin, ang, rates: base twist (body axes) and motor rates at the end of the step without contact; old_rates and
-    `base`: at its start; impulse: first guess [N s], world frame.
+    `base`: at its start; impulse: first guess [N s], world frame; pressed: the leg's hard stops.
     """
     contact = PawContact()
     touch = touch_floor(robot, k, base, paw)
@@ -171,7 +173,7 @@ def paw_contact(
     if gap + dt * wp.min(wp.dot(contact.free - touch.velocity, normal), real(0.0)) > CONTACT_MARGIN:
         return contact
     contact.active = 1
-    contact.goal = target_normal_velocity(gap, dt)
+    contact.goal = target_normal_velocity(gap, pressed, dt)
     contact.impulse = wp.quat_rotate_inv(base.quat, impulse)
     before = wp.quat_rotate_inv(base.quat, base.lin) + wp.cross(base.ang, point) + contact.jacobian * old_rates
     slip = before - touch.velocity

@@ -42,6 +42,12 @@ def turned_touchdown(view: RobotView, task: JumpState, rotation: float, yaw: flo
 
 
 @wp.func
+def second_takeoff(view: RobotView, task: JumpState, speed: float) -> bool:
+    """Off the ground again after touchdown, with no paw down, and upward faster than a speed [m/s]."""
+    return task.phase == LANDED and view.contacts == 0 and view.lin_vel[2] > speed
+
+
+@wp.func
 def low_touchdown(view: RobotView, task: JumpState, height: float) -> bool:
     """Base less than a height [m] above the ground at touchdown."""
     return task.touched_down == 1 and view.height < height
