@@ -8,6 +8,7 @@ parameters, and then taken as wholes.
 
 from __future__ import annotations
 
+import itertools
 import math
 import time
 from collections.abc import Sequence
@@ -18,11 +19,12 @@ import warp as wp
 
 from jumper_warp.optim.least_squares import DAMPINGS, Knowledge, LeastSquares, Normal, Point
 from jumper_warp.optim.motions import Motion
-from jumper_warp.optim.parameters import LINK_KINDS, ParameterSet, RobotValues
+from jumper_warp.optim.parameters import ParameterSet
 from jumper_warp.optim.replay import Replay
 from jumper_warp.optim.residuals import MotionResiduals, NoiseLevels
 from jumper_warp.optim.uncertainty import Direction, mismatch_factor, weak_directions
 from jumper_warp.robot.description import RobotDescription, load_description
+from jumper_warp.robot.values import LINK_KINDS, RobotValues
 from jumper_warp.utils.checks import check_positive
 from jumper_warp.utils.errors import InputError
 
@@ -213,7 +215,7 @@ def pieces_of(
     rows = len(motion.time)
     number = max(1, min(round(motion.duration / length), rows // 4))
     edges = [round(rows * i / number) for i in range(number + 1)]
-    spans = zip(edges, edges[1:], strict=False)
+    spans = itertools.pairwise(edges)
     return [MotionResiduals(motion, parameters, noise, description, dt, span) for span in spans]
 
 

@@ -8,9 +8,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from jumper_warp.optim.parameters import ParameterSet, RobotValues
+from jumper_warp.optim.parameters import ParameterSet
 from jumper_warp.optim.replay import Replay
 from jumper_warp.optim.residuals import DIFFERENCE, Linearised, MotionResiduals
+from jumper_warp.robot.values import RobotValues
 from jumper_warp.utils.errors import InputError
 
 DAMPINGS = np.array([0.0, 1.0e-5, 1.0e-4, 3.0e-4, 1.0e-3, 3.0e-3, 1.0e-2, 1.0e-1, 1.0, 10.0])

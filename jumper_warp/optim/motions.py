@@ -34,7 +34,9 @@ UNITS = {
 """Factor to the first unit of each quantity, which is the default."""
 LARGEST = {"target": 13.0, "angle": 13.0, "rate": 300.0, "torque": 1000.0, "position": 100.0}
 """More than that is not of this robot [rad, rad/s, N m, m]: probably of another unit."""
-EXAMPLE = "such as time, target/FL_outer, angle/FL_outer [deg], rate/FL_outer, torque/FL_outer, position/x, quaternion/w"
+EXAMPLE = (
+    "such as time, target/FL_outer, angle/FL_outer [deg], rate/FL_outer, torque/FL_outer, position/x, quaternion/w"
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,7 +118,12 @@ class Motion:
         """Write it as npz, as `load_motion` reads it. Raises OSError."""
         import io
 
-        settings = {"base": self.base, "gains": self.gains, "torque_limit": self.torque_limit, "notes": dict(self.notes)}
+        settings = {
+            "base": self.base,
+            "gains": self.gains,
+            "torque_limit": self.torque_limit,
+            "notes": dict(self.notes),
+        }
         arrays = {f.name: getattr(self, f.name) for f in fields(self) if isinstance(getattr(self, f.name), np.ndarray)}
         data = io.BytesIO()
         np.savez_compressed(data, settings=np.array(json.dumps(settings)), **arrays)
@@ -235,7 +242,9 @@ def read_parquet(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         import pyarrow
         import pyarrow.parquet
     except ImportError:
-        raise InputError(f"{path}: reading Parquet needs pyarrow, which is not installed: pip install pyarrow") from None
+        raise InputError(
+            f"{path}: reading Parquet needs pyarrow, which is not installed: pip install pyarrow"
+        ) from None
     try:
         table = pyarrow.parquet.read_table(path)
     except pyarrow.ArrowException as error:
@@ -257,7 +266,7 @@ def channels_of(path: Path, names: list[str], table: np.ndarray) -> dict[str, np
     """Return channels from the columns of a table, (n, columns), in SI units. Raises InputError."""
     parts = {
         "time": [""], "position": list("xyz"), "quaternion": list("xyzw"),
-        **dict.fromkeys((*PER_MOTOR, "current"), list(MOTOR_JOINTS)),
+        **{channel: list(MOTOR_JOINTS) for channel in (*PER_MOTOR, "current")},
     }  # fmt: skip
     channels: dict[str, np.ndarray] = {}
     for i, name in enumerate(names):

@@ -1,4 +1,4 @@
-"""What is unknown of a robot: parameters with a prior and bounds, sets of them, and the values that they give a batch."""
+"""What is unknown of a robot: parameters with a prior and bounds, sets of them, and the robots that they make."""
 
 from __future__ import annotations
 
@@ -11,10 +11,9 @@ from typing import Literal
 import numpy as np
 
 from jumper_warp.robot.description import MOTOR_JOINTS, RobotDescription, load_description
+from jumper_warp.robot.values import LINK_KINDS, MOTOR_QUANTITIES, PAW_FRICTION, RobotValues
 from jumper_warp.utils.errors import InputError
 
-LINK_KINDS = ("housing", "outer_thigh", "outer_shank", "inner_thigh", "inner_shank")
-"""Links of a leg; those of one kind share their mass ratio."""
 GROUPS = ("motors", "masses", "friction", "latency", "offsets")
 LATERAL = tuple(range(0, 12, 3))
 TRANSVERSAL = tuple(motor for motor in range(12) if motor % 3)
@@ -78,73 +77,6 @@ class Parameter:
         return deviation * self.prior * (float(self.value(np.array(z))) if self.scale == "ratio" else 1.0)
 
 
-@dataclass
-class RobotValues:
-    """Values of N robots; the first axis of every array has length N."""
-
-    base_mass: np.ndarray
-    """(N, 1) [kg]"""
-    base_com: np.ndarray
-    """(N, 3) [m], base frame."""
-    base_inertia: np.ndarray
-    """(N, 1) [1] Ratio to the described inertia about the centre of mass, besides that of the mass."""
-    link_mass: np.ndarray
-    """(N, 5) [1] Ratio of mass and inertia by `LINK_KINDS`."""
-    armature: np.ndarray
-    """(N, 12) [kg m^2]"""
-    motor_friction: np.ndarray
-    """(N, 12) [N m]"""
-    kp: np.ndarray
-    """(N, 12) [1] Ratio to the gain of the motion or task."""
-    kd: np.ndarray
-    """(N, 12) [1] Likewise."""
-    saturation: np.ndarray
-    """(N, 12) [1] Ratio to the torque limit of the motion or task."""
-    no_load_speed: np.ndarray
-    """(N, 12) [rad/s]"""
-    cutoff_speed: np.ndarray
-    """(N, 12) [rad/s]"""
-    offset: np.ndarray
-    """(N, 12) [rad] What a position sensor reads above the true angle."""
-    knee_damping: np.ndarray
-    """(N, 1) [N m s/rad]"""
-    paw_friction: np.ndarray
-    """(N, 1) [1]"""
-    latency: np.ndarray
-    """(N, 1) [s] From target to motor."""
-
-    @classmethod
-    def nominal(cls, count: int, description: RobotDescription | None = None) -> RobotValues:
-        """Return the described robot, `count` times."""
-        robot = load_description() if description is None else description
-        motors, base = robot.motors, robot.links[0]
-        one = cls(
-            base_mass=np.array([base.mass]),
-            base_com=np.array(base.com),
-            base_inertia=np.ones(1),
-            link_mass=np.ones(len(LINK_KINDS)),
-            armature=np.array([motor.armature for motor in motors]),
-            motor_friction=np.array([motor.coulomb_friction for motor in motors]),
-            kp=np.ones(12),
-            kd=np.ones(12),
-            saturation=np.ones(12),
-            no_load_speed=np.array([motor.no_load_speed for motor in motors]),
-            cutoff_speed=np.array([motor.cutoff_speed for motor in motors]),
-            offset=np.zeros(12),
-            knee_damping=np.array([robot.knee_damping]),
-            paw_friction=np.array([PAW_FRICTION]),
-            latency=np.zeros(1),
-        )
-        return cls(**{name: np.tile(value, (count, 1)) for name, value in vars(one).items()})
-
-
-PAW_FRICTION = 0.9
-"""[1] Of the described robot, as in `Simulation`."""
-MOTOR_QUANTITIES = (
-    "armature", "motor_friction", "kp", "kd", "saturation", "no_load_speed", "cutoff_speed", "offset",
-)  # fmt: skip
-
-
 @dataclass(frozen=True)
 class ParameterSet:
     """The unknowns of an identification, in order."""
@@ -162,7 +94,7 @@ class ParameterSet:
     def __len__(self) -> int:
         return len(self.parameters)
 
-    def __iter__(self):  # noqa: ANN204
+    def __iter__(self):
         return iter(self.parameters)
 
     @property
@@ -207,9 +139,7 @@ class ParameterSet:
         return ParameterSet(tuple(dataclasses.replace(p, **changes.get(p.name, {})) for p in self.parameters))
 
 
-def jumper_parameters(
-    groups: Sequence[str] = GROUPS, description: RobotDescription | None = None
-) -> ParameterSet:
+def jumper_parameters(groups: Sequence[str] = GROUPS, description: RobotDescription | None = None) -> ParameterSet:
     """Return the robot's parameters of some groups, 79 with all.
 
     motors: gains and armature of each motor, torque limit, cutoff and no-load speed by kind; masses: of the base, its
@@ -233,7 +163,9 @@ def jumper_parameters(
     return ParameterSet(tuple(parameter for parameter in every if parameter.group in groups))
 
 
-def ratio(name: str, quantity: str, places: Sequence[int], unit: str, nominal: float, prior: float, group: str) -> Parameter:
+def ratio(
+    name: str, quantity: str, places: Sequence[int], unit: str, nominal: float, prior: float, group: str
+) -> Parameter:
     """Return a positive parameter known to a factor of exp(prior); its bounds are five deviations, at most tenfold."""
     wide = math.exp(min(5.0 * prior, math.log(10.0)))
     return Parameter(name, quantity, tuple(places), unit, nominal, prior, (nominal / wide, nominal * wide), group=group)
@@ -243,7 +175,9 @@ def motor_parameters(robot: RobotDescription) -> tuple[Parameter, ...]:
     """Return gains, armature, and limits of the motors."""
     found = []
     for quantity, prior in (("kp", 0.2), ("kd", 0.2)):
-        found += [ratio(f"{quantity}/{j}", quantity, (i,), "1", 1.0, prior, "motors") for i, j in enumerate(MOTOR_JOINTS)]
+        found += [
+            ratio(f"{quantity}/{j}", quantity, (i,), "1", 1.0, prior, "motors") for i, j in enumerate(MOTOR_JOINTS)
+        ]
     for i, joint in enumerate(MOTOR_JOINTS):
         found.append(ratio(f"armature/{joint}", "armature", (i,), "kg m^2", robot.motors[i].armature, 0.25, "motors"))
     for kind, places in (("lateral", LATERAL), ("transversal", TRANSVERSAL)):
@@ -262,16 +196,22 @@ def mass_parameters(robot: RobotDescription) -> tuple[Parameter, ...]:
     found = [ratio("base_mass", "base_mass", (0,), "kg", base.mass, 0.15, "masses")]
     for i, axis in enumerate("xyz"):
         c = float(base.com[i])
-        found.append(Parameter(f"base_com/{axis}", "base_com", (i,), "m", c, 0.02, (c - 0.1, c + 0.1), "absolute", "masses"))
+        found.append(
+            Parameter(f"base_com/{axis}", "base_com", (i,), "m", c, 0.02, (c - 0.1, c + 0.1), "absolute", "masses")
+        )
     found.append(ratio("base_inertia", "base_inertia", (0,), "1", 1.0, 0.2, "masses"))
-    found += [ratio(f"link_mass/{kind}", "link_mass", (i,), "1", 1.0, 0.15, "masses") for i, kind in enumerate(LINK_KINDS)]
+    found += [
+        ratio(f"link_mass/{kind}", "link_mass", (i,), "1", 1.0, 0.15, "masses") for i, kind in enumerate(LINK_KINDS)
+    ]
     return tuple(found)
 
 
 def friction_parameters(robot: RobotDescription) -> tuple[Parameter, ...]:
     """Return friction of motors, knees and paws."""
     found = [
-        ratio(f"motor_friction/{joint}", "motor_friction", (i,), "N m", robot.motors[i].coulomb_friction, 0.6, "friction")
+        ratio(
+            f"motor_friction/{joint}", "motor_friction", (i,), "N m", robot.motors[i].coulomb_friction, 0.6, "friction"
+        )
         for i, joint in enumerate(MOTOR_JOINTS)
     ]
     found.append(ratio("knee_damping", "knee_damping", (0,), "N m s/rad", robot.knee_damping, 0.4, "friction"))

@@ -1,8 +1,9 @@
-"""Recorded targets replayed in many worlds at once, each with parameters and a start of its own, in double precision."""
+"""Recorded targets replayed in many worlds, each with parameters and a start of its own, in double precision."""
 
 from __future__ import annotations
 
 import importlib
+import itertools
 import math
 import threading
 from dataclasses import dataclass
@@ -12,10 +13,10 @@ from typing import Any, Literal
 import numpy as np
 import warp as wp
 
-from jumper_warp.optim.parameters import LINK_KINDS, RobotValues
 from jumper_warp.robot.description import RobotDescription, load_description
 from jumper_warp.robot.model import build_model
 from jumper_warp.robot.motors import OVERSPEED_END, OVERSPEED_START, MotorCfg
+from jumper_warp.robot.values import LINK_KINDS, RobotValues
 from jumper_warp.sim.dynamics import JumperDynamics
 from jumper_warp.sim.precision import float64_kernels
 from jumper_warp.sim.simulation import motor_values
@@ -294,7 +295,7 @@ def balanced(count: int, threads: int) -> list[Worlds]:
     """Return the worlds in slices of about the same size, one a thread."""
     parts = max(1, min(threads, count // 4))
     edges = [round(count * i / parts) for i in range(parts + 1)]
-    return [Worlds(a, b - a) for a, b in zip(edges, edges[1:], strict=False)]
+    return [Worlds(a, b - a) for a, b in itertools.pairwise(edges)]
 
 
 def rotate(quaternion: np.ndarray, vector: np.ndarray) -> np.ndarray:

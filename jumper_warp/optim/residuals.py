@@ -1,4 +1,4 @@
-"""One recorded motion against its replay: weighed residuals, and their Jacobian by worlds that differ in one unknown."""
+"""One recorded motion against its replay: weighed residuals, and their Jacobian by worlds that differ a little."""
 
 from __future__ import annotations
 
@@ -9,10 +9,11 @@ from typing import NamedTuple
 import numpy as np
 
 from jumper_warp.optim.motions import Motion
-from jumper_warp.optim.parameters import BASE_ONLY, ParameterSet, RobotValues
+from jumper_warp.optim.parameters import BASE_ONLY, ParameterSet
 from jumper_warp.optim.replay import Record, Replay, Starts, grid_steps, rotate
 from jumper_warp.optim.stance import stance
 from jumper_warp.robot.description import RobotDescription
+from jumper_warp.robot.values import RobotValues
 from jumper_warp.utils.checks import check_positive
 from jumper_warp.utils.errors import InputError
 
@@ -99,7 +100,9 @@ class MotionResiduals:
             row = int(np.argmax(gaps)) + 1
             raise InputError(f"motion {motion.name}: {gaps.max():.3g} s pass before row {row}: split it there")
         period = float(np.median(gaps))
-        uniform = bool(np.abs(motion.time - motion.time[0] - period * np.arange(len(motion.time))).max() < 0.01 * period)
+        uniform = bool(
+            np.abs(motion.time - motion.time[0] - period * np.arange(len(motion.time))).max() < 0.01 * period
+        )
         self.stride, self.dt = grid_steps(period, dt) if uniform else (1, grid_steps(1.0, dt)[1])
         self._place = np.arange(len(motion.time), dtype=float)
         if not uniform:
@@ -196,8 +199,8 @@ class MotionResiduals:
         robots = self.parameters.robots(z, self.description)
         motion = self.motion
         record = replay.run(
-            robots, self.starts(start, robots), self.target, rows=self.rows, stride=self.stride, dt=self.dt, lead=self.lead,
-            base=motion.base, gains=motion.gains, torque_limit=motion.torque_limit,
+            robots, self.starts(start, robots), self.target, rows=self.rows, stride=self.stride, dt=self.dt,
+            lead=self.lead, base=motion.base, gains=motion.gains, torque_limit=motion.torque_limit,
         )  # fmt: skip
         return record, robots
 

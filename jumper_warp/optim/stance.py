@@ -52,7 +52,9 @@ def paw_positions(description: RobotDescription, angle: np.ndarray) -> np.ndarra
 def stance(description: RobotDescription, angle: np.ndarray, rate: np.ndarray) -> Stance:
     """Return the base over paws that rest on a level ground, at motor angles [rad] and rates [rad/s], (N, 12)."""
     paws = paw_positions(description, angle)
-    motion = (paw_positions(description, angle + STEP * rate) - paw_positions(description, angle - STEP * rate)) / (2 * STEP)
+    motion = (paw_positions(description, angle + STEP * rate) - paw_positions(description, angle - STEP * rate)) / (
+        2 * STEP
+    )
     radius = leg_dimensions(description, LEGS[0]).paw_radius
     design = np.concatenate([paws[..., :2], np.ones((*paws.shape[:2], 1))], axis=2)
     plane = np.linalg.solve(np.swapaxes(design, 1, 2) @ design, np.swapaxes(design, 1, 2) @ paws[..., 2:])[..., 0]

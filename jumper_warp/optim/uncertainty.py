@@ -31,7 +31,7 @@ ADVICE = {
     "kd": "damping by the motors and other losses are not told apart: add torques",
     "kp": "gains are not told apart from what the legs carry: add a weighed mass or torques",
     "latency": "the targets hardly change: add steps or a faster motion",
-    "offset": "the pull of gravity does not tell the sensors' zeros: add the pose of the base, or another pose of the legs",
+    "offset": "the motions do not tell the sensors' zeros: add the pose of the base, or another pose of the legs",
 }
 
 
@@ -113,12 +113,15 @@ def in_words(parameters: ParameterSet, vector: np.ndarray) -> str:
 
 def members(parameters: Sequence[Parameter], vector: np.ndarray, quantity: str) -> str:
     """Return which parameters of a quantity a direction is about, in brackets; nothing if there is only one."""
-    of_it = [(abs(c), p.name.partition("/")[2]) for p, c in zip(parameters, vector, strict=True) if p.quantity == quantity]
+    of_it = [
+        (abs(c), p.name.partition("/")[2]) for p, c in zip(parameters, vector, strict=True) if p.quantity == quantity
+    ]
     names = [name for size, name in sorted(of_it, reverse=True) if size > 0.3 and name]
     return f" ({', '.join(names[:4])})" if names and len(of_it) > 1 else ""
 
 
 def plain(quantity: str) -> str:
     """Return a quantity's name in words."""
-    return {"kp": "proportional gain", "kd": "derivative gain", "base_com": "centre of mass of the base",
-            "offset": "sensor offset", "saturation": "torque limit"}.get(quantity, quantity.replace("_", " "))  # fmt: skip
+    words = {"kp": "proportional gain", "kd": "derivative gain", "base_com": "centre of mass of the base",
+             "offset": "sensor offset", "saturation": "torque limit"}  # fmt: skip
+    return words.get(quantity, quantity.replace("_", " "))

@@ -57,7 +57,7 @@ def record_motion_kernel(
     # out
     record: wp.array3d(dtype=real),
 ):
-    """Write row `(clock[slot] - lead) / stride` of the record, (rows, RECORD_ROWS, num_worlds); a thread a world from `first`.
+    """Write row `(clock[slot] - lead) / stride` of the record, (rows, RECORD_ROWS, num_worlds); launch over worlds.
 
     The torques are those that the motors give at this state towards `target`.
     """
