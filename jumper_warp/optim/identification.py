@@ -24,6 +24,7 @@ from jumper_warp.optim.replay import Replay
 from jumper_warp.optim.residuals import MotionResiduals, NoiseLevels
 from jumper_warp.optim.uncertainty import Direction, mismatch_factor, weak_directions
 from jumper_warp.robot.description import RobotDescription, load_description
+from jumper_warp.robot.overlay import RobotOverlay, overlay_of
 from jumper_warp.robot.values import LINK_KINDS, RobotValues
 from jumper_warp.utils.checks import check_positive
 from jumper_warp.utils.errors import InputError
@@ -36,6 +37,11 @@ CONVERGED = 1.0
 """Decrease of the cost, in mean squared residuals, below which the last stage ends: what one deviation costs."""
 MOST_STEPS = (5, 25)
 """Of each stage but the last, and of the last."""
+RATIO_ROWS = {
+    "link_mass": "link_mass", "kp": "gains", "kd": "damping_gains", "armature": "armature",
+    "no_load_speed": "no_load_speed", "cutoff_speed": "cutoff_speed",
+}  # fmt: skip
+"""Row of `RandomizationCfg` that scales a quantity."""
 CONFIDENCE = 1.959964
 """Deviations on either side of a 95 % interval."""
 
@@ -119,9 +125,42 @@ class Identification:
         """Whether the data at least halves what the prior leaves open, (P,) bool."""
         return self.deviations < 0.5
 
+    def overlay(self, source: str = "") -> RobotOverlay:
+        """Return the identified robot as an overlay, with the intervals as ranges of randomisation."""
+        quantities = tuple(dict.fromkeys(parameter.quantity for parameter in self.parameters))
+        return overlay_of(self.robots(), quantities, randomization=randomization_ranges(self), source=source)
+
     def robots(self, count: int = 1) -> RobotValues:
         """Return the identified robot, `count` times."""
         return self.parameters.robots(np.repeat(self.z[None], count, axis=0))
+
+
+def randomization_ranges(found: Identification) -> dict[str, tuple[float, float]]:
+    """Return rows of `RandomizationCfg` that hold all intervals, relative to the identified values."""
+    rows: dict[str, tuple[float, float]] = {}
+
+    def widen(row: str, low: float, high: float) -> None:
+        old = rows.get(row, (low, high))
+        rows[row] = (min(low, old[0]), max(high, old[1]))
+
+    for parameter, value, (low, high) in zip(found.parameters, found.values, found.intervals, strict=True):
+        quantity, value, low, high = parameter.quantity, float(value), float(low), float(high)
+        if quantity in RATIO_ROWS:
+            widen(RATIO_ROWS[quantity], low / value, high / value)
+        elif quantity == "base_mass":
+            widen("base_mass", low - value, high - value)
+        elif quantity == "base_com":
+            widen("com_shift", low - value, high - value)
+        elif quantity == "offset":
+            widen("joint_offset", math.degrees(low - value), math.degrees(high - value))
+        elif quantity == "motor_friction":
+            widen("motor_friction", low, high)
+        elif quantity == "paw_friction":
+            widen("dynamic_friction", low, high)
+            widen("static_friction", low, high)
+        elif quantity == "latency":
+            widen("latency", 1.0e3 * low, 1.0e3 * high)
+    return rows
 
 
 def total_mass(robots: RobotValues, description: RobotDescription | None = None) -> np.ndarray:
