@@ -222,7 +222,7 @@ def identify(
     for stage, length in enumerate(PIECES):
         pieces = [pieces_of(motion, parameters, noise, robot, dt, length) for motion in motions]
         problem = LeastSquares(parameters, [piece for each in pieces for piece in each], replay, knowledge)
-        point = Point(z, problem.expected().starts)
+        point, problem.robust = Point(z, problem.expected().starts), True
         for _ in range(MOST_STEPS[0]):
             normal = problem.normal(point)
             point, cost, damping = problem.step(point, normal)
@@ -233,12 +233,14 @@ def identify(
     problem = LeastSquares(parameters, whole, replay, knowledge)
     nominal = channel_fits(problem, problem.expected())
     point, normal = Point(z, problem.expected().starts), None
-    for _ in range(MOST_STEPS[1]):
-        normal = problem.normal(point)
-        point, cost, damping = problem.step(point, normal)
-        note(len(PIECES), problem, cost, damping)
-        if normal.cost - cost < CONVERGED * cost / problem.count:
-            break
+    for stage, (robust, least) in enumerate(((True, 10.0 * CONVERGED), (False, CONVERGED)), len(PIECES)):
+        problem.robust = robust
+        for _ in range(MOST_STEPS[1]):
+            normal = problem.normal(point)
+            point, cost, damping = problem.step(point, normal)
+            note(stage, problem, cost, damping)
+            if normal.cost - cost < least * cost / problem.count:
+                break
     return result(problem, point, normal, nominal, steps, (started, cpu, before))
 
 

@@ -16,6 +16,8 @@ from jumper_warp.utils.errors import InputError
 
 DAMPINGS = np.array([0.0, 1.0e-5, 1.0e-4, 3.0e-4, 1.0e-3, 3.0e-3, 1.0e-2, 1.0e-1, 1.0, 10.0])
 """Relative to the diagonal of the normal matrix; all are tried in each step."""
+ROBUST = 3.0
+"""Residuals beyond so many times the typical one count less and less while the optimisation is robust (Cauchy)."""
 PROBE = 0.3
 """Share of a step after which its curvature is measured."""
 CHANGE = 0.3
@@ -66,6 +68,8 @@ class Normal:
     """(P, I) each."""
     linearised: list[Linearised]
     """Of each motion."""
+    weights: list[np.ndarray]
+    """(m,) of the residuals of each motion."""
 
     def information(self) -> np.ndarray:
         """Return what data and knowledge say of the parameters, the starts unknown: (P, P), prior deviations."""
@@ -105,6 +109,9 @@ class LeastSquares:
     ):
         """Lay out the unknowns."""
         self.parameters, self.motions, self.replay, self.knowledge = parameters, motions, replay, knowledge
+        self.robust = False
+        """Whether residuals that stand out count less: where a paw strikes a moment too late, all are wrong."""
+        self._typical = math.inf
         self.count = sum(int(motion.valid.sum()) for motion in motions)
         """Number of measured values."""
         self._low, self._high = parameters.bounds()
@@ -118,17 +125,23 @@ class LeastSquares:
         """Return the normal equations at a point. Raises InputError if it cannot be simulated."""
         size = len(self.parameters)
         eye = float(point.z @ point.z) + sum(float(start @ start) for start in point.starts)
-        normal = Normal(eye, 0.0, point.z.copy(), np.zeros((size, size)), [], [], [], [])
+        normal = Normal(eye, 0.0, point.z.copy(), np.zeros((size, size)), [], [], [], [], [])
         for motion, start, change in zip(self.motions, point.starts, self._change, strict=True):
             found = motion.linearise(self.replay, point.z, start, change)
             if not np.isfinite(found.residual).all() or not np.isfinite(found.jacobian).all():
                 raise InputError(f"motion {motion.motion.name}: the model breaks in it; check targets, units and base")
-            square, slope = found.jacobian.T @ found.jacobian, found.jacobian.T @ found.residual
+            normal.linearised.append(found)
+        if self.robust:
+            every = np.concatenate([found.residual for found in normal.linearised])
+            self._typical = max(1.0, float(np.median(np.abs(every))) / 0.6745)
+        for found, start, change in zip(normal.linearised, point.starts, self._change, strict=True):
+            weight = self._weight(found.residual)
+            square, slope = found.jacobian.T * weight @ found.jacobian, found.jacobian.T @ (weight * found.residual)
+            normal.weights.append(weight)
             change[:] = np.clip(CHANGE / np.sqrt(1.0 + np.diag(square)), DIFFERENCE, LARGEST_CHANGE)
-            normal.data_cost += float(found.residual @ found.residual)
+            normal.data_cost += float(np.sum(self._loss(found.residual)))
             normal.matrix += square[:size, :size]
             normal.gradient += slope[:size]
-            normal.linearised.append(found)
             normal.mixed.append(square[:size, size:])
             normal.start_matrices.append(square[size:, size:] + np.eye(len(start)))
             normal.start_gradients.append(slope[size:] + start)
@@ -138,6 +151,17 @@ class LeastSquares:
             normal.cost += residual**2
         normal.cost += normal.data_cost
         return normal
+
+    def _weight(self, residual: np.ndarray) -> np.ndarray:
+        """Return the weights of residuals."""
+        return 1.0 / (1.0 + (residual / (ROBUST * self._typical)) ** 2) if self.robust else np.ones_like(residual)
+
+    def _loss(self, residual: np.ndarray) -> np.ndarray:
+        """Return what residuals cost: their squares, or less if they stand out."""
+        if not self.robust:
+            return residual**2
+        limit = ROBUST * self._typical
+        return limit**2 * np.log1p((residual / limit) ** 2)
 
     def _known(self, z: np.ndarray) -> list[tuple[float, np.ndarray]]:
         """Return residual and slope (P,) of each piece of knowledge."""
@@ -158,7 +182,7 @@ class LeastSquares:
         for motion, start in zip(self.motions, starts, strict=True):
             found = motion.residuals(self.replay, z, start)
             with np.errstate(over="ignore", invalid="ignore"):
-                cost += np.einsum("mk,mk->k", found, found)
+                cost += np.sum(self._loss(found), axis=0)
         return np.where(np.isfinite(cost), cost, math.inf)
 
     def step(self, point: Point, normal: Normal) -> tuple[Point, float, float]:
@@ -190,13 +214,15 @@ class LeastSquares:
         size = len(point.z)
         ahead = np.clip(point.z + PROBE * np.array([move for move, _ in plain]), self._low, self._high)
         gradient, of_starts = np.zeros((size, len(plain))), []
-        for i, (motion, linear) in enumerate(zip(self.motions, normal.linearised, strict=True)):
+        for i, (motion, linear, weight) in enumerate(
+            zip(self.motions, normal.linearised, normal.weights, strict=True)
+        ):
             move = np.array([start[i] for _, start in plain])
             found = motion.residuals(self.replay, ahead, point.starts[i] + PROBE * move)
             both = np.concatenate([ahead - point.z, PROBE * move], axis=1)
             with np.errstate(invalid="ignore", over="ignore"):
                 curvature = (found - linear.residual[:, None] - linear.jacobian @ both.T) / PROBE**2
-                slope = linear.jacobian.T @ curvature
+                slope = linear.jacobian.T @ (weight[:, None] * curvature)
             gradient += slope[:size]
             of_starts.append(slope[size:])
         bent = []
