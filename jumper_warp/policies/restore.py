@@ -29,6 +29,7 @@ from jumper_warp.rl.checkpoint import (
 from jumper_warp.rl.mirror import Symmetry, image, plain_layers
 from jumper_warp.rl.networks import EPS, NORMALISED_LIMIT
 from jumper_warp.robot.gravity import check_gravity
+from jumper_warp.robot.overlay import RobotOverlay, load_overlay
 from jumper_warp.tasks.cfg import Handover, TaskCfg
 from jumper_warp.tasks.interface import interface
 from jumper_warp.tasks.randomization import RandomizationCfg
@@ -60,6 +61,8 @@ class Conditions:
     """Warp device (default: a GPU if there is one)."""
     threads: int | None = None
     """CPU threads that share the worlds (default: all cores); they change no result."""
+    robot: Path | None = None
+    """Robot overlay, as `jumper sysid` writes it (default: that of the training, if it had one)."""
     push_in_flight: bool = False
     """Pushes of a randomised test act in flight too, and not only while a paw is down."""
     latency: float | None = None
@@ -84,6 +87,16 @@ class Conditions:
         """Parameters that are neither nominal nor drawn."""
         given = {name: getattr(self, name) for name in ("latency", "gains", "friction")}
         return {name: value for name, value in given.items() if value is not None}
+
+    def overlay(self, config: dict[str, Any]) -> RobotOverlay | None:
+        """Return the robot that a policy of this configuration is tried on; None: as described.
+
+        Raises InputError or OSError: the overlay cannot be used.
+        """
+        if self.robot is not None:
+            return load_overlay(self.robot)
+        saved = config.get("env", {}).get("robot")
+        return None if saved is None else RobotOverlay.from_json(saved)
 
     @property
     def draws(self) -> bool:
@@ -263,5 +276,6 @@ def env_of_policy(
         randomize=conditions.draws,
         noise=conditions.noise,
         auto_reset=False,
+        robot=conditions.overlay(policy.config),
         **scene,
     )
