@@ -23,7 +23,7 @@ from jumper_warp.robot.description import load_description
 from jumper_warp.robot.model import build_model, standing_configuration
 from jumper_warp.robot.motors import jumping_motors, vertical_jump_filter
 from jumper_warp.sim.differentiable import DifferentiableStep
-from kernels.layout import BASE, LEG_ROWS, MU_DYNAMIC, MU_STATIC
+from kernels.layout import BASE, LEG_ROWS, MU_DYNAMIC, MU_STATIC, STOP_KD, STOP_KE, SUM_UPPER
 
 DT = 1.0 / 240.0
 SUBSTEPS = 4
@@ -53,6 +53,10 @@ def final_height(rollout: Trajectory):
 
 def final_forward_speed(rollout: Trajectory):
     return rollout.joint_qd[-1], 0
+
+
+def final_outer_angle(rollout: Trajectory):
+    return rollout.joint_q[-1], MOTOR_COORDS[1]
 
 
 def jump_inputs() -> dict[str, np.ndarray]:
@@ -256,6 +260,57 @@ def test_single_precision_gradients_are_those_of_double_precision(name):
     """Worst seen: 1.1e-4 of the largest entry."""
     single, double = (gradients(jump(double=precision), apex)[name] for precision in (False, True))
     np.testing.assert_allclose(single, double, rtol=0.0, atol=5.0e-4 * np.abs(double).max())
+
+
+PRESSED = 8
+"""Policy steps in which the legs press their stops."""
+
+
+def on_the_stops(pushes: bool) -> dict[str, np.ndarray]:
+    """The robot in its squat at 120 degrees, motors pressing every leg on its stop; then it stays, or jumps."""
+    squat = dataclasses.replace(load_description(), poses={"squat": (0.0, math.radians(120.0))})
+    q, qd = standing_configuration(squat, "squat"), np.zeros(38)
+    q[2] -= 1.0e-4
+    q[[coord for coord in MOTOR_COORDS if coord % 5 != 2]] += 3.0e-4
+    qd[:6] = [0.1, 0.05, -0.2, 0.02, -0.03, 0.1]
+    press = np.radians([[1.0, 126.0, 128.0], [-1.0, 130.0, 127.0], [2.0, 129.0, 133.0], [0.0, 127.0, 126.0]])
+    targets = np.concatenate([np.tile(press.ravel(), (PRESSED, 1)), jump().values["targets"][2:]])
+    return {"targets": targets if pushes else targets[:PRESSED], "q": q, "qd": qd}
+
+
+# by input: entries to check, step of the difference; rows: stops of the sums, mass, a housing's mass, armature
+ON_STOPS = {
+    "targets": ([(t, m) for t in (0, 2, 5) for m in (0, 1, 5, 11)], 2.0e-6),
+    "q": ([2, 3, 4, 5, *MOTOR_COORDS], 1.0e-7),
+    "qd": ([*range(6), *MOTOR_DOFS], 1.0e-6),
+    "table": ([*(leg * int(LEG_ROWS) + int(SUM_UPPER) for leg in range(4)), BASE_ROW, 0, 51], 1.0e-7),
+}
+
+
+@pytest.mark.parametrize("loss", [final_height, final_forward_speed])
+@pytest.mark.parametrize("name", ON_STOPS)
+def test_gradients_of_a_robot_on_its_stops_match_differences(name, loss):
+    entries, h = ON_STOPS[name]
+    inputs = on_the_stops(pushes=False)
+    gradient = gradients(jump(), loss, inputs)[name]
+    assert (jump().dynamics.work.contact_force.numpy()[:, 0, 2] > 10.0).all()
+    assert_matches([gradient[entry] for entry in entries], loss, name, unit(gradient.shape, entries), h, inputs)
+
+
+def test_gradient_with_respect_to_a_stops_strength_matches_differences():
+    rows, inputs = [int(STOP_KE), int(STOP_KD)], on_the_stops(pushes=False)
+    scale = np.array([1.0e4, 1.0e2])  # [N m/rad], [N m s/rad]
+    found = scale * gradients(jump(), final_outer_angle, inputs)["table"][rows]
+    directions = scale[:, None] * unit(jump().values["table"].shape, rows)
+    assert_matches(found, final_outer_angle, "table", directions, 1.0e-3, inputs)
+
+
+@pytest.mark.parametrize("name", ["targets", "table"])
+def test_gradient_of_a_jump_off_the_stops_matches_differences(name):
+    entries, h = ON_STOPS[name]
+    inputs = on_the_stops(pushes=True)
+    gradient = gradients(jump(), apex, inputs)[name]
+    assert_matches([gradient[entry] for entry in entries], apex, name, unit(gradient.shape, entries), h, inputs)
 
 
 def airborne(height: float, speed: float) -> dict[str, np.ndarray]:
