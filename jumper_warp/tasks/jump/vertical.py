@@ -20,6 +20,9 @@ from kernels.mdp import terminations as mdp_terminations
 PATIENCE = 0.1
 """Share that the always-paid terms keep while a commanded jump has not begun."""
 
+TAKEOFF_SPEED = 0.75
+"""[m/s] Upward, that a takeoff needs, the first or, what ends an episode, a second."""
+
 QUIET = (
     RewardTerm(rewards.resting_action_rate, -2.0),
     RewardTerm(rewards.torque_ripple, -0.01),
@@ -63,7 +66,7 @@ TERMINATIONS = (
     TerminationTerm(terminations.slanted_takeoff, speed=0.75),
     TerminationTerm(mdp_terminations.tilted, angle=25.0 * DEG),
     TerminationTerm(terminations.hard_impact, stance=2.5 * G, flight=5.0 * G),
-    TerminationTerm(terminations.second_takeoff, speed=0.25),
+    TerminationTerm(terminations.second_takeoff, speed=TAKEOFF_SPEED),
     TerminationTerm(terminations.no_jump, steps=3.0 * SECOND, idle_steps=1.0 * SECOND),
     TerminationTerm(mdp_terminations.collided),
     TerminationTerm(mdp_terminations.too_long, steps=20.0 * SECOND, time_out=True),
@@ -86,7 +89,7 @@ def vertical_jump() -> TaskCfg:
     return TaskCfg(
         name="vertical-jump",
         state=JumpState,
-        advance=Advance(phase.advance_jump, takeoff_speed=0.75),
+        advance=Advance(phase.advance_jump, takeoff_speed=TAKEOFF_SPEED),
         reset=Reset(reset.reset_jump, RESET, side_by_side=True),
         command=Command(reset.give_jump, reset.another_jump_due, reset.draw_next_jump),
         curriculum=Curriculum(errors.height_error, tolerance=0.05, counts=reset.from_standing),
