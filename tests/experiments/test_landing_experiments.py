@@ -304,7 +304,8 @@ def test_nothing_of_viewer_and_meshes_is_needed_without_a_recording(policy, tmp_
 
 
 def test_policy_of_another_task_is_refused_in_one_line(tmp_path):
-    message = "needs a policy that is evaluated by place or around or place-mars, vertical_jump is of vertical-jump, by height"
+    needed = "needs a policy that is evaluated by place or around or place-mars"
+    message = f"{needed}, vertical_jump is of vertical-jump, by height"
     with pytest.raises(PolicyError, match=message):
         EvaluationRun.of("test", EvaluationArgs(policy="vertical_jump", out=tmp_path, device="cpu"))
 
