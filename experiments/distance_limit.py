@@ -292,7 +292,7 @@ def caught(run: EvaluationRun, best: np.ndarray) -> dict[str, Any]:
     """Return how the policy lands a jump if it takes over at takeoff, told each of POLICY_GOALS."""
     goals = np.outer(POLICY_GOALS, [1.0, 0.0, 0.0])
     takeoffs = fly_best(run.env(len(goals)), best, run.policy.act, goals)
-    landed = (takeoffs.end == 0).tolist()
+    landed = takeoffs.landed.tolist()
     told = ", ".join(f"{goal:g} m: {'yes' if good else 'no'}" for goal, good in zip(POLICY_GOALS, landed, strict=True))
     print(f"the policy takes over the nominal jump at takeoff and lands it, told a goal of {told}")
     return {"caught_goal_m": list(POLICY_GOALS), "caught": landed}

@@ -44,6 +44,8 @@ BLOCK_BEYOND, BLOCK_WIDTH = 0.40, 0.8
 AHEAD, ASIDE = (0.8, 1.4), (-0.15, 0.15)
 """[m] Goals: off the platform, or on the block, with all paws; as far as the paper's simulation always succeeds."""
 SCENES = ("platform", "uneven", "block")
+MEANS = ("mean_error_m", "success_rate", "fall_rate", "miss_rate", "still_landing_rate")
+"""Figures of which the mean of all scenes is told."""
 
 
 @dataclass(frozen=True)
@@ -106,8 +108,10 @@ def main(args: Args) -> dict:
     with drawn(run.folder / "landings.png", 1, len(done), figsize=(5.0 * len(done), 4.0), squeeze=False) as axes:
         for axis, (name, landings) in zip(axes[0], done.items(), strict=True):
             draw_landings(axis, landings, f"{name}, {run.title}")
-    summary = {name: mean([values[f"{scene}_{name}"] for scene in done]) for name in ("mean_error_m", "success_rate")}
+    summary = {name: mean([values[f"{scene}_{name}"] for scene in done]) for name in MEANS}
     summary["success_rate_in_range"] = summary["success_rate"]
+    tilts = [values[f"{scene}_max_landing_tilt_deg"] for scene in done]
+    summary["max_landing_tilt_deg"] = max((tilt for tilt in tilts if tilt is not None), default=None)
     return run.report({"jumps": args.jumps * len(done), "edge_m": args.edge, **summary, **values}, {})
 
 

@@ -14,7 +14,7 @@ import numpy as np
 import tyro
 
 from jumper_warp.cli.main import run_command
-from jumper_warp.evaluation.landings import Landings
+from jumper_warp.evaluation.landings import FALLS, MISSED, Landings
 from jumper_warp.evaluation.log import termination_names
 from jumper_warp.evaluation.places import landing_metrics, random_headings
 from jumper_warp.evaluation.plots import draw_landings, drawn
@@ -52,11 +52,16 @@ def sectors(goals: np.ndarray) -> np.ndarray:
 
 
 def metrics(landings: Landings) -> dict:
-    """Return the metrics of the ring, with the success of each quarter."""
+    """Return the metrics of the ring, with successes, falls and misses of each quarter."""
     values = landing_metrics(landings)
     sector = sectors(landings.goals)
     for index, name in enumerate(SECTORS):
-        values[f"success_rate_{name}"] = float(landings.success[sector == index].mean())
+        for rate, counts in {
+            "success_rate": landings.success,
+            "fall_rate": np.isin(landings.ends, FALLS),
+            "miss_rate": landings.outcomes == MISSED,
+        }.items():
+            values[f"{rate}_{name}"] = float(counts[sector == index].mean())
     return values
 
 

@@ -21,12 +21,15 @@ from jumper_warp.envs.arrays import (
 from jumper_warp.envs.stages import Stages
 from jumper_warp.envs.state import load_state, save_state
 from jumper_warp.robot.grounds import BlockCfg
+from jumper_warp.robot.overlay import RobotOverlay
 from jumper_warp.sim.simulation import Simulation, SolverName
 from jumper_warp.sim.slices import SlicedGraph
 from jumper_warp.tasks.cfg import Handover, TaskCfg
 from jumper_warp.tasks.interface import interface
+from jumper_warp.tasks.mirror import Mirror, mirror_of, mirror_of_action
 from jumper_warp.tasks.saving import handover_to_json, task_to_json
 from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.kernels import load_kernels
 from kernels.mdp.reset import stand_kernel
 
 CONTACT_TOLERANCE = 1.0e-4
@@ -73,19 +76,21 @@ class Env(Stages):
         block: BlockCfg | None = None,
         skill: np.ndarray | int = 0,
         handovers: Sequence[Handover] = (),
+        robot: RobotOverlay | None = None,
         threads: int | None = None,
     ):
         """Build everything; call `reset` before the first step.
 
         ground, block: as in `Simulation`; by default the terrain of the first task that has one, or what tasks draw, if
         randomised on SolverJumper, else a plane. skill: index of the task that each world begins in, (num_envs,) or one
-        for all. handovers: between tasks. threads: of a CPU, as in `Simulation`.
+        for all. handovers: between tasks. robot: what differs from the description, latency included. threads: of a
+        CPU, as in `Simulation`.
         Raises ValueError: no task, two of one name, motors that cannot be those of one robot, different gravities, a
         handover between other tasks, less than one environment, or as `Simulation`.
         """
         tasks = checked_tasks(task, handovers)
         self.task, self.tasks, self.num_envs, self.seed, self.auto_reset = tasks[0], tasks, num_envs, seed, auto_reset
-        self.handovers = tuple(handovers)
+        self.handovers, self._overlay = tuple(handovers), robot
         may_vary = solver == "jumper" and isinstance(ground, str) and ground == "plane" and block is None
         run, self._draws_ground = prepared(tasks, randomize, noise, may_vary)
         terrains = [terrain for each in run if (terrain := each.terrain) is not None]
@@ -93,8 +98,7 @@ class Env(Stages):
         self.sim = Simulation(
             num_envs, solver=solver, motors=self.task.motors, visuals=visuals, device=device and str(device),
             ground=ground, block=BlockCfg((0.0, 0.0)) if self._draws_ground else block, tolerance=CONTACT_TOLERANCE,
-            friction=0.85 if self.task.randomization.dynamic_friction else 0.9, gravity=self.task.gravity,
-            threads=threads,
+            friction=self.task.randomization.nominal_friction, gravity=self.task.gravity, robot=robot, threads=threads,
         )  # fmt: skip
         self.wp_device = self.sim.device
         self.device = torch.device(wp.device_to_torch(self.wp_device))
@@ -103,7 +107,7 @@ class Env(Stages):
         if self._draws_ground:
             self.sim.physics.dynamics.robot.ground.blocks.zero_()  # until `reset` draws them
         self.physics_dt, self.step_dt = self.sim.dt, self.sim.dt * self.sim.substeps
-        self._ends_episodes, self._started, self._graphs = True, False, {}
+        self._ends_episodes, self._started, self._compiled, self._graphs = True, False, False, {}
         self._allocate(run, skill, handovers)
         self._show()
 
@@ -129,10 +133,17 @@ class Env(Stages):
         if seed is not None:
             self._start_over(seed)
         self._ends_episodes = True
+        self.compile()
         self._tick(self._all)
         self._begin(self._part(), self._all)
         self._observe(self._part(), beginning=0)
         return self._step.obs, {}
+
+    def compile(self) -> None:
+        """Compile all kernels of `reset` and `step`, side by side; the first `reset` does so itself."""
+        if not self._compiled:
+            load_kernels(self.kernels(), self.wp_device)
+            self._compiled = True
 
     def _start_over(self, seed: int) -> None:
         self.seed = self.worlds.seed = seed
@@ -181,6 +192,8 @@ class Env(Stages):
         headings = self._array(checked_values(headings, (n,), "headings"))
         mask = self._array(checked_mask(worlds, n))
         self._ends_episodes = False
+        if not self._started:
+            load_kernels(self.kernels(draws=False), self.wp_device)
         if self._draws_ground:
             self._scene.ground.blocks.zero_()
         self._tick(mask)
@@ -246,27 +259,40 @@ class Env(Stages):
         levels = np.bincount(self.worlds.level.numpy(), minlength=len(self.task.levels) + 1)
         return figures | {f"Curriculum/level_{i}": float(count) / self.num_envs for i, count in enumerate(levels)}
 
+    def mirror(self, what: str) -> Mirror:
+        """Return order and signs of the left-right mirror image of the first task's "observation", or of an "action".
+
+        Raises ValueError: the mirror image of a term is not known.
+        """
+        return mirror_of_action() if what == "action" else mirror_of(self.task, "policy")
+
     def config(self) -> dict:
         """Return everything that defines the environment, as JSON can hold it.
 
         `task` and `interface` are of the first task; several have `tasks`, and `handovers` as their functions' names.
+        `robot` is there if an overlay was given.
         """
         several = {
             "tasks": [task_to_json(task) for task in self.tasks],
             "first_skill": self._first_skill.tolist(),
             "handovers": [handover_to_json(handover) for handover in self.handovers],
         }
-        return (several if len(self.tasks) > 1 else {}) | {
-            "task": task_to_json(self.task),
-            "interface": interface(self.task),
-            "num_envs": self.num_envs,
-            "seed": self.seed,
-            "physics_dt_s": self.physics_dt,
-            "policy_dt_s": self.step_dt,
-            "contact_tolerance_m_s": CONTACT_TOLERANCE,
-            "solver": type(self.sim.solver).__name__,
-            "quaternion_order": "xyzw",
-        }
+        overlay = {} if self._overlay is None else {"robot": self._overlay.to_json()}
+        return (
+            (several if len(self.tasks) > 1 else {})
+            | overlay
+            | {
+                "task": task_to_json(self.task),
+                "interface": interface(self.task),
+                "num_envs": self.num_envs,
+                "seed": self.seed,
+                "physics_dt_s": self.physics_dt,
+                "policy_dt_s": self.step_dt,
+                "contact_tolerance_m_s": CONTACT_TOLERANCE,
+                "solver": type(self.sim.solver).__name__,
+                "quaternion_order": "xyzw",
+            }
+        )
 
     def state_dict(self) -> dict[str, torch.Tensor]:
         """Return everything that the next step depends on, as `jumper_warp.envs.state.save_state`."""

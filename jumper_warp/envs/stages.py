@@ -24,6 +24,12 @@ from kernels.mdp.parameters import motors_kernel
 from kernels.mdp.reset import forget_kernel, tick_kernel
 from kernels.mdp.track import track_kernel
 
+BLOCK = 32
+"""Threads of a block: small ones spread a few thousand heavy threads over all multiprocessors."""
+BLOCKS = {"reset": 128, "event": 256}
+"""Of kernels of a task that are not launched so, by name."""
+CONDITION_BLOCK = 256
+
 
 class Part(NamedTuple):
     """The worlds that a stage is launched for."""
@@ -71,9 +77,21 @@ class Stages:
         ]
 
     def restored(self) -> None:
-        """Let the solver read parameters that were put back."""
+        """Let the solver and the terms read what was put back."""
         self._started = bool((self.worlds.clock.numpy() > FIRST_CLOCK).all())
+        for skill in self.skills:
+            skill.restore_numbers()
         self.sim.physics.parameters_changed()
+
+    def kernels(self, draws: bool = True) -> list[tuple[wp.Kernel, int]]:
+        """Return what `reset` and `step` launch, each with its block size; draws: the draw of starts too."""
+        shared = [action_kernel, motors_kernel, forget_kernel, tick_kernel, track_kernel]
+        shared += [home_kernel] if len(self.skills) > 1 else []
+        shared += [kernel for kernel, _, _ in self._handovers]
+        names = [name for name in self.skills[0].kernels if draws or name != "reset"]
+        found = [(skill.kernels[name], BLOCKS.get(name, BLOCK)) for skill in self.skills for name in names]
+        found += [(condition_kernel, CONDITION_BLOCK), *((kernel, BLOCK) for kernel in shared)]
+        return found + self.sim.physics.kernels()
 
     def _part(self, worlds: Worlds | None = None) -> Part:
         """Return some of the worlds as stages are launched for them, by default all."""
@@ -148,7 +166,7 @@ class Stages:
             self._launch(
                 skill.kernels["reset"], (part.count, lanes),
                 [skill.index, lanes, mask, self._scene, self._settings, skill.settings, skill.levels, part.env,
-                 skill.states, self.robot], block_dim=128,
+                 skill.states, self.robot], BLOCKS["reset"],
             )  # fmt: skip
         self._forget(part, mask)
 
@@ -174,7 +192,7 @@ class Stages:
                 self._launch(
                     skill.kernels["event"], (skill.num_events, lanes, part.count),
                     [skill.index, stage, lanes, mask, self.step_dt, part.env, skill.numbers, skill.timer,
-                     self.parameters], block_dim=256,
+                     self.parameters], BLOCKS["event"],
                 )  # fmt: skip
             if any(term.options["repack"] for term in due):
                 self.sim.physics.parameters_changed(mask, Worlds(part.first, part.count))
@@ -196,11 +214,10 @@ class Stages:
                  skill.numbers, beginning, arrays.raw],
             )  # fmt: skip
             inputs = [skill.index, part.env, skill.columns, skill.numbers, beginning, arrays]
-            wp.launch(condition_kernel, (part.count, int(LANES)), inputs, device=self.wp_device)
+            self._launch(condition_kernel, (part.count, int(LANES)), inputs, CONDITION_BLOCK)
 
-    def _launch(self, kernel: wp.Kernel, dim: int | tuple[int, ...], inputs: list, block_dim: int = 32) -> None:
-        # small blocks spread a few thousand heavy threads over all multiprocessors
-        wp.launch(kernel, dim=dim, inputs=inputs, device=self.wp_device, block_dim=block_dim)
+    def _launch(self, kernel: wp.Kernel, dim: int | tuple[int, ...], inputs: list, block: int = BLOCK) -> None:
+        wp.launch(kernel, dim=dim, inputs=inputs, device=self.wp_device, block_dim=block)
 
     def _give(self, mask: wp.array, begins: int, values: np.ndarray, headings: wp.array) -> None:
         values = wp.array(values, dtype=wp.vec4, device=self.wp_device)

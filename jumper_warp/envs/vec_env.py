@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any, Protocol
+from collections.abc import Sequence
+from typing import Any, Protocol, runtime_checkable
 
 import torch
 
@@ -66,6 +67,17 @@ class VecEnv(Protocol):
         """Take up what `state_dict` gave; the next step, without a `reset`, is the one that would have followed.
 
         Raises ValueError: the state does not fit this environment.
+        """
+
+
+@runtime_checkable
+class MirroredVecEnv(Protocol):
+    """What PPO asks besides of an environment whose policy is to be symmetric."""
+
+    def mirror(self, what: str) -> tuple[Sequence[int], Sequence[float]]:
+        """Return order and signs of the mirror image `signs * x[order]` of x, an "observation" or an "action".
+
+        Raises ValueError: there is none.
         """
 
 

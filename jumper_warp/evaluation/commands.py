@@ -53,7 +53,8 @@ def evaluate(run: EvaluationRun, cfg: EvaluateCfg) -> dict[str, Any]:
     log = run.follow(env, cfg.flags.log(env.task, cfg.conditions.seed))
     figures = {
         "task": run.policy.interface.task,
-        **{name: getattr(cfg.conditions, name) for name in ("solver", "randomize", "noise", "seed")},
+        **run.tried_in,
+        "noise": cfg.conditions.noise,
         **cfg.flags.metrics(log),
     }
     write_figures(run.folder, figures)

@@ -21,6 +21,9 @@ EACH = (
     "mean_error_at_touchdown_m",
     "mean_error_0_3_s_after_touchdown_m",
     "fall_rate",
+    "miss_rate",
+    "still_landing_rate",
+    "max_landing_tilt_deg",
 )
 """Figures with an entry a bin."""
 PUBLISHED = {
@@ -45,12 +48,14 @@ def distance_metrics(bins: dict[float, Landings], in_range: tuple[float, float])
         "jumps": sum(values["jumps"] for values in each),
         "mean_error_m": mean(lists["mean_error_m"]),
         "success_rate_in_range": mean(np.concatenate(inside)),
-        **{rate: mean(lists[rate]) for rate in KINDS.values()},
+        **{rate: mean(lists[rate]) for rate in (*KINDS.values(), "fall_rate", "miss_rate", "still_landing_rate")},
+        "max_landing_tilt_deg": max((tilt for tilt in lists["max_landing_tilt_deg"] if tilt is not None), default=None),
     }
     for kind, rate in KINDS.items():
         bad = next((i for i, share in enumerate(lists[rate]) if share < RELIABLE), len(bins))
         values[f"largest_reliable{kind}_m"] = list(bins)[bad - 1] if bad else None
         values[f"base_at_touchdown{kind}_m"] = flown[bad - 1] if bad else None
+    values["hop_free_distance_m"] = values["largest_reliable_without_hop_m"]
     values["farthest_success_m"] = largest(np.concatenate(landed))
     values |= {"bin_m": list(bins), "bin_base_at_touchdown_m": flown}
     return values | {f"bin_{name}": column for name, column in lists.items()}
@@ -62,17 +67,18 @@ def base_at_touchdown(landings: Landings) -> float | None:
 
 
 def row_of(values: dict[str, Any], i: int) -> list[str]:
-    """Return a bin's distance, success, success without a hop and without a step, and base at touchdown, as text."""
+    """Return a bin's distance, success, success without a hop and a step, falls, misses, base at touchdown, as text."""
     flown = values["bin_base_at_touchdown_m"][i]
-    shares = [f"{100.0 * values[f'bin_{rate}'][i]:.1f}" for rate in KINDS.values()]
+    shares = [f"{100.0 * values[f'bin_{rate}'][i]:.1f}" for rate in (*KINDS.values(), "fall_rate", "miss_rate")]
     return [f"{values['bin_m'][i]:.1f}", *shares, "" if flown is None else f"{flown:.2f}"]
 
 
 def progress(values: dict[str, Any]) -> str:
     """Return a line on a single bin."""
-    distance, success, single, free, flown = row_of(values, 0)
+    distance, success, single, free, falls, misses, flown = row_of(values, 0)
     hops = f"{single} % without a second hop, {free} % without a step"
-    return f"{distance} m: {success} % success, {hops}, base at touchdown {flown or '-'} m"
+    lost = f"{falls} % falls, {misses} % misses"
+    return f"{distance} m: {success} % success, {hops}, {lost}, base at touchdown {flown or '-'} m"
 
 
 def verdict(values: dict[str, Any]) -> str:

@@ -11,11 +11,13 @@ from jumper_warp.evaluation.jumps import REST_SPEED, Jumps
 from jumper_warp.evaluation.log import (
     CAME_APART,
     COLLIDED,
+    SUCCESS,
     Metrics,
     failures,
     largest,
     mean,
     termination_names,
+    with_ends,
     within,
 )
 from jumper_warp.tasks.cfg import TaskCfg
@@ -26,8 +28,18 @@ SUCCESS_TOLERANCE = 0.1
 LEVEL = 10.0
 """[deg] A good landing tilts the base less."""
 FALLS = ("low_base", "tilted")
+WRONG_HEIGHT = "wrong_height"
+"""Outcome of a jump that came down from another height."""
+DRIFT, TURN = 0.2, 25.0
+"""[m], [deg] Of the base, beyond which the authors' configuration ends an episode."""
 MAX_ROBOTS = 64
 """In one recording."""
+
+
+def for_evaluation(task: TaskCfg) -> TaskCfg:
+    """Return a task whose success is judged last, so that it hides no fall."""
+    names = [term.name for term in task.terminations if term.name != SUCCESS]
+    return with_ends(task, (*names, SUCCESS))
 
 
 def jump_metrics(jumps: Jumps, in_range: tuple[float, float]) -> Metrics:
@@ -38,6 +50,7 @@ def jump_metrics(jumps: Jumps, in_range: tuple[float, float]) -> Metrics:
     """
     inside = within(jumps.target, in_range)
     error, success = np.abs(jumps.error), jumps.success
+    outcomes = jumps.outcomes
     metrics: Metrics = {
         "jumps": len(jumps.target),
         "mean_abs_error_m": mean(error),
@@ -50,10 +63,30 @@ def jump_metrics(jumps: Jumps, in_range: tuple[float, float]) -> Metrics:
         "at_rest_within_1_s_rate": mean((jumps.rest_speed < REST_SPEED)[success]),
         "mean_landing_tilt_deg": mean(np.degrees(jumps.tilt[success])),
         "max_landing_tilt_deg": largest(np.degrees(jumps.tilt[success])),
-        "collision_rate": float((jumps.outcomes == COLLIDED).mean()),
+        **landing_metrics(jumps),
+        "collision_rate": float((outcomes == COLLIDED).mean()),
+        "fall_rate": float(np.isin(outcomes, (*FALLS, COLLIDED, CAME_APART)).mean()),
+        "miss_rate": float((outcomes == WRONG_HEIGHT).mean()),
         CAME_APART: int(np.isnan(jumps.error).sum()),
     }
-    return metrics | failures(jumps.outcomes[~success])
+    return metrics | failures(outcomes[~success])
+
+
+def landing_metrics(jumps: Jumps) -> Metrics:
+    """Return what became of the robots that landed: still paws, second takeoffs, drift in the plane and turn.
+
+    `still_landing_rate` is of all jumps, the others of the landed ones.
+    """
+    landed, turn = jumps.success, np.degrees(np.abs(jumps.yaw))
+    return {
+        "still_landing_rate": float(jumps.still.mean()),
+        "second_takeoff_rate": mean((jumps.takeoffs > 0)[landed]),
+        "mean_drift_m": mean(jumps.drift[landed]),
+        "max_drift_m": largest(jumps.drift[landed]),
+        "mean_turn_deg": mean(turn[landed]),
+        "max_turn_deg": largest(turn[landed]),
+        "beyond_authors_drift_or_turn_rate": mean(((jumps.drift > DRIFT) | (turn > TURN))[landed]),
+    }
 
 
 def reached(jumps: Jumps) -> np.ndarray:
@@ -64,6 +97,8 @@ def reached(jumps: Jumps) -> np.ndarray:
 def sweep_metrics(jumps: Jumps, in_range: tuple[float, float]) -> Metrics:
     """Return the metrics of jumps of which one succeeds that comes near its height, however it is landed.
 
+    `miss_rate` is the share that began on command and landed, but came to another height; falls and collisions after
+    the apex are told apart from it, and from the success.
     in_range [m]: targets that `success_rate_in_range` counts.
     """
     target, error, near = jumps.target, np.abs(jumps.error), reached(jumps)
@@ -80,8 +115,11 @@ def sweep_metrics(jumps: Jumps, in_range: tuple[float, float]) -> Metrics:
         "success_rate_0_6_1_1": mean(near[within(target, (0.6, 1.1))]),
         "largest_reached_m": largest(jumps.error + target),
         "landing_rate": float(landed.mean()),
+        "max_landing_tilt_deg": largest(np.degrees(jumps.tilt[jumps.success])),
+        **landing_metrics(jumps),
         "collision_rate": float((jumps.outcomes == COLLIDED).mean()),
         "fall_rate": float(np.isin(jumps.outcomes, FALLS).mean()),
+        "miss_rate": float((jumps.success & ~jumps.early & ~near).mean()),
         "no_jump_rate": float((jumps.outcomes == "no_jump").mean()),
         "early_rate": float(jumps.early.mean()),
         "at_rest_within_1_s_rate": float((jumps.rest_speed < REST_SPEED).mean()),

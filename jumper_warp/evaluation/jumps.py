@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from jumper_warp.evaluation.angles import wrapped, yaw_of
 from jumper_warp.evaluation.film import Film, Strip, moments
 from jumper_warp.evaluation.log import (
     CAME_APART,
@@ -17,8 +18,10 @@ from jumper_warp.evaluation.log import (
     EvaluationLog,
     finite,
     run_evaluation,
+    success_index,
     termination_names,
 )
+from jumper_warp.evaluation.paws import Paws, paw_arrays, stepped
 
 STANCE, LANDED = 0, 2
 """Values of the jump's phase before takeoff and after touchdown."""
@@ -49,7 +52,9 @@ class Jumps(EvaluationLog):
     target: np.ndarray
     """[m] Commanded base height."""
     terminations: tuple[str, ...]
-    """Names of the ends of an episode; the first is the success."""
+    """Names of the ends of an episode, SUCCESS among them."""
+    rest: float = REST_TIME
+    """[s] From touchdown until the jump is over, at least REST_TIME."""
     end: np.ndarray = field(init=False)
     """Index of the end in `terminations`, -1 before it."""
     apex: np.ndarray = field(init=False)
@@ -60,8 +65,14 @@ class Jumps(EvaluationLog):
     """[m/s] Of the base REST_TIME after touchdown; infinite before."""
     early: np.ndarray = field(init=False)
     """Whether the jump began before the command."""
-
-    seconds = 8.0
+    drift: np.ndarray = field(init=False)
+    """[m] Of the base in the plane, from the start to the end."""
+    yaw: np.ndarray = field(init=False)
+    """[rad] Of the base at the end, from the jump's heading."""
+    lift_time: np.ndarray = field(init=False)
+    """[s] Longest that any paw was off the ground again after its own first contact since touchdown."""
+    takeoffs: np.ndarray = field(init=False)
+    """Number of times that the robot took off again after touchdown."""
 
     def __post_init__(self) -> None:
         """Begin with no jump ended."""
@@ -69,12 +80,24 @@ class Jumps(EvaluationLog):
         self.end = np.full(count, -1)
         self.apex, self.tilt = np.zeros(count), np.zeros(count)
         self.rest_speed, self.early = np.full(count, np.inf), np.zeros(count, dtype=bool)
+        self.drift, self.yaw, self.lift_time = (np.zeros(count) for _ in range(3))
+        self.takeoffs, self._paws = np.zeros(count, dtype=int), Paws(count)
+        self._success = success_index(self.terminations)
+
+    @property
+    def seconds(self) -> float:
+        """[s] In which a jump has ended."""
+        return 7.0 + self.rest
 
     def begin(self, env: EvaluationEnv) -> None:
         """Stand every world in the default pose with its height to reach."""
         goals = np.zeros((env.num_envs, 3))
         goals[:, 2] = self.target
         env.evaluation_reset(jump_commands(goals, DELAY, env.step_dt))
+
+    def look(self, env: EvaluationEnv) -> dict[str, np.ndarray]:
+        """Return the state of every world's episode, which of its paws are on the ground, and how fast it rises."""
+        return env.task_arrays() | paw_arrays(env)
 
     def update(self, arrays: dict[str, np.ndarray], step_dt: float) -> bool:
         """Take in a policy step; return whether all jumps have ended."""
@@ -83,11 +106,22 @@ class Jumps(EvaluationLog):
         running = self.end < 0
         self.apex[running] = arrays["max_height"][running]
         self.tilt[running] = arrays["peak_tilt"][running]
-        due = running & (arrays["phase"] == LANDED) & (arrays["phase_steps"] == round(REST_TIME / step_dt))
+        self.drift[running] = np.linalg.norm((arrays["base_pos"] - arrays["start"])[running, :2], axis=1)
+        self.yaw[running] = wrapped(yaw_of(arrays["base_quat"]) - arrays["heading"])[running]
+        landed = arrays["phase"] == LANDED
+        self._follow_paws(arrays, np.flatnonzero(running), landed, step_dt)
+        due = running & landed & (arrays["phase_steps"] == round(REST_TIME / step_dt))
         self.rest_speed[due] = np.linalg.norm(arrays["base_vel"][due], axis=1)
-        ended = running & (arrays["ending"] >= 0)
-        self.end[ended] = arrays["ending"][ended]
+        failed = running & (arrays["ending"] >= 0) & (arrays["ending"] != self._success)
+        rested = running & ~failed & landed & (arrays["phase_steps"] >= round(self.rest / step_dt))
+        self.end[failed], self.end[rested] = arrays["ending"][failed], self._success
         return bool((self.end >= 0).all())
+
+    def _follow_paws(self, arrays: dict[str, np.ndarray], row: np.ndarray, landed: np.ndarray, step_dt: float) -> None:
+        """Take in what the paws of some worlds do after touchdown."""
+        lifted = self._paws.update(row, landed[row], arrays["paws_down"][row], arrays["up"][row], step_dt)
+        self.lift_time[row] = np.maximum(self.lift_time[row], lifted.paw)
+        self.takeoffs[row] += lifted.takeoff
 
     @property
     def error(self) -> np.ndarray:
@@ -97,8 +131,13 @@ class Jumps(EvaluationLog):
 
     @property
     def success(self) -> np.ndarray:
-        """Whether the jump met its height within the task's limit and was landed."""
-        return self.end == 0
+        """Whether the jump met its height within the task's limit, if it has one, and was landed."""
+        return self.end == self._success
+
+    @property
+    def still(self) -> np.ndarray:
+        """Whether the robot landed, and lifted no paw again for `jumper_warp.evaluation.paws.HOP_TIME` or longer."""
+        return self.success & ~stepped(self.lift_time)
 
     @property
     def outcomes(self) -> np.ndarray:

@@ -12,29 +12,32 @@ from typing import Any
 
 import numpy as np
 
+from jumper_warp.evaluation.angles import wrapped, yaw_of
 from jumper_warp.evaluation.film import Film, Strip, moments
 from jumper_warp.evaluation.jumps import LANDED, REST_TIME, jump_commands
 from jumper_warp.evaluation.log import (
     CAME_APART,
     NO_END,
+    SUCCESS,
     EvaluationEnv,
     EvaluationLog,
     finite,
+    success_index,
+    with_ends,
 )
+from jumper_warp.evaluation.paws import TAKEOFF_SPEED, Paws, hopped, paw_arrays, stepped
 from jumper_warp.tasks.cfg import TaskCfg
+from jumper_warp.tasks.terms import TerminationTerm
 from jumper_warp.utils.errors import InputError
+from kernels.jump import terminations
 
 SUCCESS_TOLERANCE = 0.1
 """[m] A landed jump that ends this close to its goal succeeds."""
-HOP_TIME = 0.05
-"""[s] A robot that is off the ground for longer after touchdown has jumped again; one that lifts a paw, which had come
-down, for as long has stepped."""
 SOON = 0.3
 """[s] After touchdown, when the base is looked at as well."""
-TIME_EPS = 1.0e-6
-"""[s] Rounding of sums of steps."""
-ENDS = ("success", "came_apart", "low_base", "collided", "no_jump")
-"""Terminations of the task that end a jump here; the others only shape the training."""
+ENDS = ("came_apart", "low_base", "collided", "no_jump", SUCCESS)
+"""Terminations of the task that end a jump here, in this order, so that no success hides a fall; the others only shape
+the training."""
 SHOWN_DISTANCE = 1.0
 """[m] The filmstrip shows the jump nearest to this."""
 EYE_DISTANCE = 2.4
@@ -52,7 +55,14 @@ NOT_BEGUN = "not_begun"
 
 def for_evaluation(task: TaskCfg) -> TaskCfg:
     """Return a task with the terminations that count in an evaluation."""
-    return replace(task, terminations=tuple(term for term in task.terminations if term.name in ENDS))
+    return with_ends(task, ENDS)
+
+
+def ended_by_takeoff(task: TaskCfg) -> TaskCfg:
+    """Return the same, and a second takeoff after landing ends the jump, as in the authors' configuration."""
+    task = for_evaluation(task)
+    takeoff = TerminationTerm(terminations.second_takeoff, speed=TAKEOFF_SPEED)
+    return replace(task, terminations=(*task.terminations[:-1], takeoff, task.terminations[-1]))
 
 
 @dataclass
@@ -66,7 +76,7 @@ class Landings(EvaluationLog):
     goals: np.ndarray
     """[m] (num_envs, jumps in a row, 2), ahead and to the left."""
     terminations: tuple[str, ...]
-    """Names of the ends of an episode; the first is the success."""
+    """Names of the ends of an episode, SUCCESS among them."""
     headings: np.ndarray | float = 0.0
     """[rad] (num_envs,) or one for all."""
     delay: np.ndarray | float = 0.5
@@ -97,6 +107,8 @@ class Landings(EvaluationLog):
     """[s] Longest that no paw was on the ground after touchdown."""
     lift_time: np.ndarray = field(init=False)
     """[s] Longest that any paw was off the ground again after its own first contact since touchdown."""
+    takeoffs: np.ndarray = field(init=False)
+    """Number of times that the robot took off again after touchdown."""
     place_soon: np.ndarray = field(init=False)
     """[m] (..., 2) Base SOON after touchdown, world; not a number if the jump was over before."""
     early: np.ndarray = field(init=False)
@@ -112,9 +124,9 @@ class Landings(EvaluationLog):
         shape = self.goals.shape[:2]
         self.current, self.end = np.zeros(shape[0], dtype=int), np.full(shape, -1)
         self.place, self.target, self.touchdown, self.place_soon = (np.full((*shape, 2), np.nan) for _ in range(4))
-        self.air_time, self._aloft = np.zeros(shape), np.zeros(shape[0])
-        self.lift_time, self._lifted = np.zeros(shape), np.zeros((shape[0], 4))
-        self._came_down = np.zeros((shape[0], 4), dtype=bool)
+        self.air_time, self.lift_time = np.zeros(shape), np.zeros(shape)
+        self.takeoffs, self._paws = np.zeros(shape, dtype=int), Paws(shape[0])
+        self._success = success_index(self.terminations)
         self.yaw, self.heading, self.apex, self.tilt = (np.full(shape, np.nan) for _ in range(4))
         self.rest_speed, self.early = np.full(shape, np.inf), np.zeros(shape, dtype=bool)
 
@@ -130,9 +142,8 @@ class Landings(EvaluationLog):
         env.evaluation_reset(jump_commands(goals, self.delay, env.step_dt), self.headings)
 
     def look(self, env: EvaluationEnv) -> dict[str, np.ndarray]:
-        """Return the state of every world's episode, and which of its paws are on the ground."""
-        force = np.linalg.norm(env.sim.paw_force.numpy(), axis=2)
-        return env.task_arrays() | {"paws_down": (force > env.task.contact_force).T}
+        """Return the state of every world's episode, which of its paws are on the ground, and how fast it rises."""
+        return env.task_arrays() | paw_arrays(env)
 
     def follow(self, env: EvaluationEnv) -> bool:
         """Look at the environment after a policy step, and command the jumps that are due."""
@@ -160,24 +171,18 @@ class Landings(EvaluationLog):
         first, soon = landed & (now["touched_down"] == 1), landed & (now["phase_steps"] == round(SOON / step_dt))
         self.touchdown[row[first], self.current[row[first]]] = now["base_pos"][first, :2]
         self.place_soon[row[soon], self.current[row[soon]]] = now["base_pos"][soon, :2]
-        self._update_paws(row, landed[:, None] & now["paws_down"], landed, step_dt)
-        failed = now["ending"] > 0
+        lifted = self._paws.update(row, landed, now["paws_down"], now["up"], step_dt)
+        self.air_time[at] = np.maximum(self.air_time[at], lifted.aloft)
+        self.lift_time[at] = np.maximum(self.lift_time[at], lifted.paw)
+        self.takeoffs[at] += lifted.takeoff
+        failed = (now["ending"] >= 0) & (now["ending"] != self._success)
         rested = ~failed & landed & (now["phase_steps"] >= round(self.rest / step_dt))
         speed = np.linalg.norm(now["base_vel"], axis=1)
         self.rest_speed[at] = np.where(rested, speed, np.inf)
-        self.end[at] = np.where(failed, now["ending"], np.where(rested, 0, -1))
+        self.end[at] = np.where(failed, now["ending"], np.where(rested, self._success, -1))
         self.current[row[rested]] += 1
         self.current[row[failed]] = count
         return bool((self.current >= count).all())
-
-    def _update_paws(self, row: np.ndarray, down: np.ndarray, landed: np.ndarray, step_dt: float) -> None:
-        """Take in which paws (rows, 4) are on the ground, of robots (rows,) after touchdown and before it."""
-        at = (row, self.current[row])
-        self._aloft[row] = np.where(landed & ~down.any(axis=1), self._aloft[row] + step_dt, 0.0)
-        self.air_time[at] = np.maximum(self.air_time[at], self._aloft[row])
-        self._came_down[row] = landed[:, None] & (self._came_down[row] | down)
-        self._lifted[row] = np.where(self._came_down[row] & ~down, self._lifted[row] + step_dt, 0.0)
-        self.lift_time[at] = np.maximum(self.lift_time[at], self._lifted[row].max(axis=1))
 
     @property
     def offset(self) -> np.ndarray:
@@ -207,7 +212,7 @@ class Landings(EvaluationLog):
     @property
     def landed(self) -> np.ndarray:
         """Whether the robot came down on its paws and stayed there, wherever it was."""
-        return self.end == 0
+        return self.end == self._success
 
     @property
     def success(self) -> np.ndarray:
@@ -223,7 +228,7 @@ class Landings(EvaluationLog):
     @property
     def hopped(self) -> np.ndarray:
         """Whether the robot jumped again after touchdown."""
-        return self.air_time > HOP_TIME + TIME_EPS
+        return hopped(self.air_time)
 
     @property
     def step_free(self) -> np.ndarray:
@@ -233,7 +238,22 @@ class Landings(EvaluationLog):
     @property
     def stepped(self) -> np.ndarray:
         """Whether any paw that had come down was off the ground again for HOP_TIME or longer."""
-        return self.lift_time > HOP_TIME - TIME_EPS
+        return stepped(self.lift_time)
+
+    @property
+    def touched_down(self) -> np.ndarray:
+        """Whether a paw came down after the takeoff."""
+        return np.isfinite(self.touchdown).all(axis=-1)
+
+    @property
+    def still(self) -> np.ndarray:
+        """Whether the robot landed, wherever it was, and lifted no paw again for HOP_TIME or longer."""
+        return self.landed & ~self.stepped
+
+    @property
+    def took_off_again(self) -> np.ndarray:
+        """Whether the robot took off again after touchdown: upward at TAKEOFF_SPEED with no paw down."""
+        return self.takeoffs > 0
 
     @property
     def touchdown_error(self) -> np.ndarray:
@@ -249,7 +269,7 @@ class Landings(EvaluationLog):
     def outcomes(self) -> np.ndarray:
         """Name of each jump's end."""
         missed = np.where(self.landed & ~self.success, np.where(self.early, EARLY, MISSED), self.ends)
-        return np.where(self.success, self.terminations[0], missed)
+        return np.where(self.success, SUCCESS, missed)
 
     def columns(self) -> dict[str, list]:
         """Return goals, headings, landings and errors, and the ends; row after row."""
@@ -312,14 +332,3 @@ def beside(start: np.ndarray, end: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     middle = np.append(start + 0.5 * way, 0.4)
     back = EYE_DISTANCE * max(1.0, length / 1.5)
     return middle + np.array([back * ahead[1], -back * ahead[0], 0.35]), middle
-
-
-def yaw_of(quat: np.ndarray) -> np.ndarray:
-    """Return the yaw [rad] of orientations (..., 4), xyzw: the heading of body x in the world plane."""
-    x, y, z, w = np.moveaxis(quat, -1, 0)
-    return np.arctan2(2.0 * (x * y + w * z), 1.0 - 2.0 * (y * y + z * z))
-
-
-def wrapped(angle: np.ndarray) -> np.ndarray:
-    """Return angles [rad] within -pi..pi."""
-    return np.arctan2(np.sin(angle), np.cos(angle))

@@ -10,7 +10,6 @@ import torch
 import warp as wp
 
 from jumper_warp.envs.env import Env
-from jumper_warp.envs.vec_env import sanitise
 from jumper_warp.evaluation.jumps import run_jumps
 from jumper_warp.rl.ppo import Ppo
 
@@ -36,11 +35,7 @@ class Curve:
 def success(ppo: Ppo, judge: Env) -> float:
     """Return the share of jumps to heights of 0.5 to 1.1 m that succeed, one a world."""
 
-    @torch.no_grad()
-    def act(obs: torch.Tensor) -> torch.Tensor:
-        return ppo.model.actor(ppo.model.features(sanitise(obs))).clamp(-1.0, 1.0)
-
-    return float(run_jumps(act, judge, np.linspace(*TESTED, judge.num_envs)).success.mean())
+    return float(run_jumps(ppo.model.act, judge, np.linspace(*TESTED, judge.num_envs)).success.mean())
 
 
 def warm_up(env: Env, ppo: Ppo) -> None:

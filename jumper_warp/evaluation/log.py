@@ -7,16 +7,19 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 import torch
 
 from jumper_warp.tasks.cfg import TaskCfg
+from jumper_warp.utils.errors import InputError
 
 if TYPE_CHECKING:
     from jumper_warp.evaluation.film import Film, Strip
 
+SUCCESS = "success"
 CAME_APART = "came_apart"
 COLLIDED = "collided"
 NO_END = "no_end"
@@ -128,6 +131,19 @@ def run_evaluation(
             watch()
         if ended and stop:
             return
+
+
+def success_index(terminations: Sequence[str]) -> int:
+    """Return the place of SUCCESS among the names of terminations. Raises InputError: it is not there."""
+    if SUCCESS not in terminations:
+        raise InputError(f"this evaluation needs a termination {SUCCESS!r}, the task has {', '.join(terminations)}")
+    return list(terminations).index(SUCCESS)
+
+
+def with_ends(task: TaskCfg, names: Sequence[str]) -> TaskCfg:
+    """Return a task of whose terminations those with some names are left, judged in the order of the names."""
+    terms = {term.name: term for term in task.terminations}
+    return replace(task, terminations=tuple(terms[name] for name in names if name in terms))
 
 
 def termination_names(task: TaskCfg) -> tuple[str, ...]:

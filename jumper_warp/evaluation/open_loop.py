@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from jumper_warp.robot.model import LEGS, MOTOR_JOINTS
 from jumper_warp.sim.simulation import Simulation, motor_values
-from jumper_warp.viz.recorder import Recorder
+
+if TYPE_CHECKING:
+    from jumper_warp.viz.recorder import Recorder
 
 STAND, RAMP, HOLD, EXTEND, LAND = 60, 25, 50, 40, 60
 """Ticks of 1/60 s: default pose, ramp into the squat, squat, full extension, default pose again."""
@@ -43,6 +45,8 @@ class Trace:
 
 def follow_jump(sim: Simulation, notes: Mapping[str, Any]) -> tuple[Trace, Recorder, list[np.ndarray]]:
     """Simulate the jump in one world; also return a recording at 60 Hz with notes, and the body poses of every tick."""
+    from jumper_warp.viz.recorder import Recorder
+
     recorder = Recorder(sim.model, notes=notes)
     rows, frames = [], []
     total = STAND + RAMP + HOLD + EXTEND + LAND

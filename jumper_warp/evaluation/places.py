@@ -10,8 +10,8 @@ import numpy as np
 import tyro
 
 from jumper_warp.evaluation.heights import MAX_ROBOTS, HeightGoals, check_jumps
-from jumper_warp.evaluation.jumps import REST_SPEED
-from jumper_warp.evaluation.landings import FALLS, NOT_BEGUN, Landings
+from jumper_warp.evaluation.jumps import REST_SPEED, REST_TIME
+from jumper_warp.evaluation.landings import FALLS, MISSED, NOT_BEGUN, Landings
 from jumper_warp.evaluation.log import (
     CAME_APART,
     COLLIDED,
@@ -26,6 +26,8 @@ from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.utils.errors import InputError
 
 Place = tuple[float, float]
+AT_END = "below_0_1_m_s_at_the_end_rate"
+"""Name of the share of landed jumps whose base was at rest (`REST_SPEED`) when the jump was over."""
 SECONDS_MORE = 2.5
 """[s] Of a recording for each further jump."""
 
@@ -128,7 +130,8 @@ def landing_metrics(landings: Landings, inside: np.ndarray | None = None) -> Met
 
     Errors are over all jumps, failed ones included, but those whose simulation came apart, which `came_apart` counts,
     and those that were not begun. `ahead` and `left` are signed. Tilts, turns, hops and steps are those of the landed
-    jumps.
+    jumps. `still_landing_rate` is of all jumps, `second_takeoff_rate` of those that came down. `fall_rate` and
+    `miss_rate` share no jump: one that misses has landed on its paws, but elsewhere.
 
     inside: which jumps the metrics in range count, shaped like `landings.end`; without it there are none.
     """
@@ -136,6 +139,7 @@ def landing_metrics(landings: Landings, inside: np.ndarray | None = None) -> Met
     error, success, landed = landings.error, landings.success, landings.landed
     offset = np.where(np.isnan(error)[..., None], np.nan, landings.offset)
     tilt, yaw = np.degrees(landings.tilt), np.degrees(landings.yaw)
+    at_rest = "at_rest_within_1_s_rate" if landings.rest == REST_TIME else AT_END
     metrics: Metrics = {
         "jumps": int(begun.sum()),
         "mean_error_m": mean(error),
@@ -152,19 +156,26 @@ def landing_metrics(landings: Landings, inside: np.ndarray | None = None) -> Met
         "step_rate": mean(landings.stepped[landed]),
         "mean_error_at_touchdown_m": mean(landings.touchdown_error[landed]),
         "mean_error_0_3_s_after_touchdown_m": mean(landings.error_soon[landed]),
-        "at_rest_within_1_s_rate": mean((landings.rest_speed < REST_SPEED)[landed]),
+        "still_landing_rate": mean(landings.still[begun]),
+        "second_takeoff_rate": mean(landings.took_off_again[landings.touched_down]),
+        at_rest: mean((landings.rest_speed < REST_SPEED)[landed]),
         "mean_landing_tilt_deg": mean(tilt[landed]),
         "max_landing_tilt_deg": largest(tilt[landed]),
         "mean_turn_deg": mean(np.abs(yaw[landed])),
         "max_turn_deg": largest(np.abs(yaw[landed])),
         "collision_rate": mean((landings.ends == COLLIDED)[begun]),
         "fall_rate": mean(np.isin(landings.ends, FALLS)[begun]),
+        "miss_rate": mean((landings.outcomes == MISSED)[begun]),
         "early_rate": mean(landings.early[begun]),
         CAME_APART: int((landings.ends == CAME_APART).sum()),
     }
     if inside is not None:
         inside = begun & inside
-        metrics |= {"mean_error_in_range_m": mean(error[inside]), "success_rate_in_range": mean(success[inside])}
+        metrics |= {
+            "mean_error_in_range_m": mean(error[inside]),
+            "success_rate_in_range": mean(success[inside]),
+            "still_landing_rate_in_range": mean(landings.still[inside]),
+        }
     return metrics | failures(landings.outcomes[begun & ~success])
 
 

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Protocol
 
-from jumper_warp.evaluation import landings
+from jumper_warp.evaluation import heights, landings
 from jumper_warp.evaluation.episodes import EpisodeFlags, EpisodeGoals
 from jumper_warp.evaluation.heights import HeightFlags, HeightGoals, MarsHeightGoals
 from jumper_warp.evaluation.log import EvaluationLog, Metrics
@@ -59,7 +59,7 @@ class Evaluation:
 
 
 EVALUATIONS: dict[str, Evaluation] = {
-    "height": Evaluation(HeightFlags(), HeightGoals()),
+    "height": Evaluation(HeightFlags(), HeightGoals(), heights.for_evaluation),
     "place": Evaluation(PlaceFlags(), PlaceGoals(), landings.for_evaluation),
     "around": Evaluation(
         PlaceFlags(x=(-0.7, 0.7), y=(-0.7, 0.7), in_range=(0.0, 0.7)),

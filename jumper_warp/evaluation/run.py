@@ -20,10 +20,12 @@ from rich.table import Table
 
 from jumper_warp.envs.env import Env
 from jumper_warp.evaluation.film import Film
+from jumper_warp.evaluation.latency import latency_metrics, latency_text
 from jumper_warp.evaluation.log import EvaluationLog, run_evaluation
 from jumper_warp.evaluation.registry import evaluation_of
 from jumper_warp.policies.restore import Conditions, env_of_policy, open_policy, restored_task
 from jumper_warp.policies.spec import PolicyError
+from jumper_warp.robot.model import PHYSICS_DT
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.output import output_dir, write_figures
@@ -47,8 +49,16 @@ class EvaluationArgs:
     """Physics: the dedicated solver, or Newton's SolverMuJoCo."""
     randomize: bool = False
     """Randomisation, observation noise, latency and pushes as in training."""
+    push_in_flight: bool = False
+    """Randomised pushes act in flight too, and not only while a paw is down."""
+    latency: float | None = None
+    """[ms] From action to motor, to the nearest physics step (default: none, or drawn if randomised)."""
+    gains: tuple[float, float] | None = None
+    """[1] Scales of kp and kd of all motors (default: 1, or drawn if randomised)."""
+    friction: float | None = None
+    """[1] Of the paws, static and dynamic (default: nominal, or drawn if randomised)."""
     seed: int = 0
-    """Of these, and of whatever else is drawn."""
+    """Of what is drawn."""
     record: int = 1
     """Number of jumps to record for the Rerun viewer and, one of them, as a filmstrip; 0: none."""
     out: Path | None = None
@@ -65,11 +75,15 @@ class EvaluationArgs:
         if self.record < 0:
             raise InputError(f"record must not be negative, got {self.record}")
         checked_threads(self.threads)
+        conditions_of(self)
 
 
 def conditions_of(args: EvaluationArgs) -> Conditions:
-    """Return the conditions that an experiment's flags ask for."""
-    return Conditions(args.solver, args.randomize, args.randomize, args.seed, args.device, args.threads, args.gravity)
+    """Return the conditions that an experiment's flags ask for. Raises InputError: one is out of range."""
+    same = (
+        "solver", "randomize", "seed", "device", "threads", "gravity", "push_in_flight", "latency", "gains", "friction",
+    )  # fmt: skip
+    return Conditions(noise=args.randomize, **{name: getattr(args, name) for name in same})
 
 
 class Run(ABC):
@@ -82,6 +96,7 @@ class Run(ABC):
         self.started = time.perf_counter()
         self.conditions, self.record = Conditions(), 0
         self.told: dict[str, Any] = {}
+        self._latency: list[np.ndarray] = []
 
     @abstractmethod
     def actor(self, env: Env) -> Callable[[torch.Tensor], torch.Tensor]:
@@ -100,7 +115,26 @@ class Run(ABC):
     @property
     def title(self) -> str:
         """What the policy is tried in."""
-        return f"{self.conditions.solver}, {'randomised' if self.conditions.randomize else 'nominal'}"
+        conditions = self.conditions
+        words = [conditions.solver, "randomised" if conditions.randomize else "nominal"]
+        if conditions.latency is not None and self._latency:
+            words.append(f"latency {latency_text(self._latency[0], PHYSICS_DT)}")
+        words += [] if conditions.gains is None else ["kp x {:g}, kd x {:g}".format(*conditions.gains)]
+        words += [] if conditions.friction is None else [f"friction {conditions.friction:g}"]
+        return ", ".join(words + (["pushed in flight too"] if conditions.push_in_flight else []))
+
+    @property
+    def tried_in(self) -> dict[str, Any]:
+        """The conditions as they are reported, latency as it was simulated in all that was followed."""
+        conditions, values = self.conditions, {**self.told}
+        values |= {name: getattr(conditions, name) for name in ("solver", "randomize", "seed")}
+        if conditions.randomize:
+            values["push_in_flight"] = conditions.push_in_flight
+        values |= {} if conditions.gains is None else {"gains": list(conditions.gains)}
+        values |= {} if conditions.friction is None else {"friction": conditions.friction}
+        if self._latency:
+            values |= latency_metrics(np.concatenate(self._latency), PHYSICS_DT, conditions.latency)
+        return values
 
     def follow(
         self,
@@ -129,6 +163,7 @@ class Run(ABC):
                 pictures()
 
         run_evaluation(self.actor(env), env, log, watch=look)
+        self._latency.append(env.parameters.latency.numpy().copy())
         if pictures is not None:
             self._develop(pictures, film)
         return log
@@ -149,8 +184,7 @@ class Run(ABC):
 
     def report(self, metrics: Mapping[str, Any], paper: Mapping[str, float]) -> dict[str, Any]:
         """Write and print metrics beside the paper's, conditions before them; return all."""
-        values = {name: getattr(self.conditions, name) for name in ("solver", "randomize", "seed")}
-        values = self.told | values | dict(metrics)
+        values = self.tried_in | dict(metrics)
         write_figures(self.folder, values)
         table = Table("figure", self.title, "paper")
         for name, value in values.items():
@@ -208,14 +242,26 @@ class EvaluationRun(Run):
         """Return the policy's action."""
         return self.policy.act
 
-    def env(self, count: int, change: Callable[[TaskCfg], TaskCfg] | None = None, **scene: Any) -> Env:
+    def env(
+        self,
+        count: int,
+        change: Callable[[TaskCfg], TaskCfg] | None = None,
+        conditions: Conditions | None = None,
+        **scene: Any,
+    ) -> Env:
         """Return the policy's environment.
 
-        change: returns the task with the terminations that count, by default as its evaluation says; scene: more
-        settings of `Env`. Raises PolicyError as `env_of_policy`.
+        Args:
+            count: Number of worlds.
+            change: Returns the task with the terminations that count (default: as its evaluation says).
+            conditions: Other ones than the run's.
+            scene: More settings of `Env`.
+
+        Raises:
+            PolicyError: As `env_of_policy`.
         """
-        change = change or self.evaluation.for_evaluation
-        env = env_of_policy(self.policy, count, self.conditions, change=change, modules=self.modules, **scene)
+        change, conditions = change or self.evaluation.for_evaluation, conditions or self.conditions
+        env = env_of_policy(self.policy, count, conditions, change=change, modules=self.modules, **scene)
         self.policy.to(env.device)
         self.told["gravity_m_s2"] = env.task.gravity
         self.told["torque_limit_nm"] = env.task.motors.transversal.saturation

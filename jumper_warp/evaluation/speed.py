@@ -18,7 +18,7 @@ from jumper_warp.rl.logger import Stopwatch
 from jumper_warp.rl.ppo import Ppo
 from jumper_warp.sim.simulation import Simulation
 from jumper_warp.sim.slices import SlicedGraph, Worlds
-from jumper_warp.utils.timing import median_time, wall_time
+from jumper_warp.utils.timing import device_memory, median_time, wall_time
 
 SQUAT, DEFAULT, EXTEND = 110.0, 45.0, -10.0
 """[deg] Commanded transversal angles of the scripted jump."""
@@ -134,8 +134,8 @@ def time_stages(envs: int, device: str | None, repeats: int) -> dict[str, float]
 def time_ppo(envs: int, cfg: PpoCfg, iterations: int, device: str | None) -> dict[str, float]:
     """Return figures of training with this package's PPO; the policy must have changed and stayed finite.
 
-    With overlap, `ppo_update_s` is what the update takes longer than the rollout beside it. `ppo_ready_s`: compilation
-    and the first iterations, until all graphs are captured.
+    `ppo_device_memory_gib`: in use on a GPU, by whatever. With overlap, `ppo_update_s` is what the update takes longer
+    than the rollout beside it. `ppo_ready_s`: compilation and the first iterations, until all graphs are captured.
     """
     env, _ = stepping_env(envs, device)
     begin = time.perf_counter()
@@ -156,8 +156,10 @@ def time_ppo(envs: int, cfg: PpoCfg, iterations: int, device: str | None) -> dic
     after = ppo.model.log_std.detach()
     if not bool(after.isfinite().all()) or torch.equal(after, before):
         raise RuntimeError("the policy did not learn")
-    rate = {"ppo_steps_per_s": cfg.num_steps * envs / wall, "ppo_iteration_s": wall}
-    return {**rate, "ppo_collect_s": collect, "ppo_update_s": update, "ppo_ready_s": ready}
+    figures = {"ppo_steps_per_s": cfg.num_steps * envs / wall, "ppo_iteration_s": wall, "ppo_ready_s": ready}
+    if memory := device_memory(wp.get_device(device)):
+        figures["ppo_device_memory_gib"] = memory / 2**30
+    return {**figures, "ppo_collect_s": collect, "ppo_update_s": update}
 
 
 def time_rsl_rl(envs: int, num_steps: int, iterations: int, device: str | None) -> dict[str, float]:

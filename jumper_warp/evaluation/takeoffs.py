@@ -20,6 +20,7 @@ from jumper_warp.envs.env import Env
 from jumper_warp.evaluation.film import ankles
 from jumper_warp.evaluation.jumps import LANDED, jump_commands
 from jumper_warp.evaluation.links import Links
+from jumper_warp.evaluation.log import success_index, termination_names
 from jumper_warp.robot.description import load_description
 from jumper_warp.robot.model import leg_geometry
 from jumper_warp.robot.motors import FilterCfg
@@ -73,7 +74,7 @@ class Takeoffs:
     apex: np.ndarray = field(init=False)
     """[m] Largest base height up to then."""
     end: np.ndarray = field(init=False)
-    """Index of the termination that ended the jump after takeoff, 0 for a success, -1 before."""
+    """Index of the termination that ended the jump after takeoff, -1 before."""
     start: np.ndarray = field(init=False)
     """[m] (..., 3) Centre of mass at the start."""
     landing_height: np.ndarray = field(init=False)
@@ -91,7 +92,7 @@ class Takeoffs:
         self.com, self.com_vel = np.zeros((n, 3)), np.zeros((n, 3))
         self.pitch, self.spin, self.back, self.touchdown = (np.zeros(n) for _ in range(4))
         self.touchdown_pitch, self.paws_ahead, self.apex = (np.zeros(n) for _ in range(3))
-        self.end = np.full(n, -1)
+        self.end, self._success = np.full(n, -1), success_index(termination_names(self.env.task))
         self.gravity = -self.env.sim.model.gravity.numpy()[:n, 2].astype(float)
         self._links = Links(self.env).read
         pose, twist = self._links()
@@ -114,6 +115,11 @@ class Takeoffs:
         inertia = row[..., 1] + mass * (arm[..., 0] ** 2 + arm[..., 2] ** 2)
         return com, vel, momentum.sum(axis=1), inertia.sum(axis=1)
 
+    @property
+    def landed(self) -> np.ndarray:
+        """Whether the jump was landed."""
+        return self.end == self._success
+
     def look(self) -> None:
         """Take in a policy step."""
         task, (pose, twist) = self.env.task_arrays(), self._links()
@@ -124,7 +130,8 @@ class Takeoffs:
         back = self._base_start[:, 0] - pose[:, 0, 0]
         self.back = np.where(self.off, self.back, np.maximum(self.back, back))
         early = self._since <= CLEAR
-        self.bad |= (~self.off & stepped) | (early & (task["ending"] > 0))
+        failed = (task["ending"] >= 0) & (task["ending"] != self._success)
+        self.bad |= (~self.off & stepped) | (early & failed)
         self.bad |= early & self.off & (task["phase"] == LANDED)
         self.end = np.where((self.end < 0) & self.off, task["ending"], self.end)
         new = np.flatnonzero((task["took_off"] == 1) & ~self.off)

@@ -21,6 +21,8 @@ SETTLED = 0.1
 """[m/s] Error of a robot that has settled on a new command."""
 SMOOTHING = 0.2
 """[s] Over which velocities are averaged to tell whether it has."""
+HOLD = 0.5
+"""[s] For which a robot stays within that error that has settled in spite of pushes."""
 MOST_ROBOTS = 20_000
 
 
@@ -200,10 +202,12 @@ def steps_of(rng: np.random.Generator, robots: int, reach: float, step: float) -
     return commands
 
 
-def settling_times(walks: Walks) -> np.ndarray:
+def settling_times(walks: Walks, hold: float | None = None) -> np.ndarray:
     """Return how long after the last command each robot's velocity in the plane stays within SETTLED of it [s].
 
     Velocities are means of the last SMOOTHING seconds. Infinite where it never does, or the robot falls.
+
+    hold: Seconds for which it stays; None: to the end, so that a push seconds later counts too.
     """
     window, first = round(SMOOTHING / walks.step_dt), round(walks.times[-1] / walks.step_dt)
     velocity = walks.history()[..., :2]
@@ -212,6 +216,10 @@ def settling_times(walks: Walks) -> np.ndarray:
     smooth[window:] = (total[window:] - total[:-window]) / window
     off = np.linalg.norm(smooth[first:] - walks.wanted()[first:, :, :2], axis=2)
     outside = ~(off <= SETTLED)
+    if hold is not None:
+        steps = min(round(hold / walks.step_dt), len(off))
+        held = ~np.lib.stride_tricks.sliding_window_view(outside, steps, axis=0).any(axis=-1)
+        return np.where(held.any(axis=0), held.argmax(axis=0) * walks.step_dt, np.inf)
     last = np.where(outside.any(axis=0), len(off) - np.argmax(outside[::-1], axis=0), 0)
     return np.where(last == len(off), np.inf, last * walks.step_dt)
 

@@ -32,6 +32,8 @@ DEFAULTS: dict[str, Any] = {
     "contact_force": 0.1, "near": 0.10, "games": 5,
 }  # fmt: skip
 """Of the settings that a configuration could lack; those of PPO are not the task's any more."""
+PUSHES = {"push_interval": None, "push_share": 1.0}
+"""Timing of pushes then: one wrench for the whole episode."""
 NOISE = {"lin_vel": ("lin_vel", 1.0), "ang_vel": ("ang_vel", 1.0), "gravity": ("gravity", 1.0),
          "angle": ("angle", math.pi / 180.0), "rate": ("rate", math.pi / 180.0), "goal": ("position", 1.0),
          "height": ("position", 1.0)}  # fmt: skip
@@ -68,7 +70,7 @@ def _content(today: dict[str, Any], saved: dict[str, Any]) -> dict[str, Any]:
     today["curriculum"] |= {"tolerance": saved["near"], "promote_after": saved["games"]}
     today["rewards"] = _rows(saved, "terms", (rewards, mdp_rewards))
     today["terminations"] = _rows(saved, "rules", (terminations, mdp_terminations))
-    today["randomization"] = {**saved["randomization"], "redraw": "startup"}
+    today["randomization"] = {**PUSHES, **saved["randomization"], "redraw": "startup"}
     states = {**saved["reset"]}
     again = states.pop("jump_again", 0.0)
     today["reset"]["settings"] = {

@@ -8,7 +8,7 @@ from __future__ import annotations
 import dataclasses
 import json
 from collections.abc import Callable, Collection, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any, Literal
@@ -26,13 +26,19 @@ from jumper_warp.rl.checkpoint import (
     load_checkpoint,
     one_line,
 )
+from jumper_warp.rl.mirror import Symmetry, image, plain_layers
 from jumper_warp.rl.networks import EPS, NORMALISED_LIMIT
 from jumper_warp.robot.gravity import check_gravity
-from jumper_warp.tasks.cfg import TaskCfg
+from jumper_warp.robot.overlay import RobotOverlay, load_overlay
+from jumper_warp.tasks.cfg import Handover, TaskCfg
 from jumper_warp.tasks.interface import interface
-from jumper_warp.tasks.saving import OPTIONAL, TaskError, task_from_json
+from jumper_warp.tasks.randomization import RandomizationCfg
+from jumper_warp.tasks.saving import OPTIONAL, TaskError, handover_from_json, task_from_json
+from jumper_warp.utils.errors import InputError
 
 if TYPE_CHECKING:
+    import torch
+
     from jumper_warp.envs.env import Env
 
 CHECKPOINTS = "checkpoints"
@@ -55,17 +61,63 @@ class Conditions:
     """Warp device (default: a GPU if there is one)."""
     threads: int | None = None
     """CPU threads that share the worlds (default: all cores); they change no result."""
+    robot: Path | None = None
+    """Robot overlay, as `jumper sysid` writes it (default: that of the training, if it had one)."""
+    push_in_flight: bool = False
+    """Pushes of a randomised test act in flight too, and not only while a paw is down."""
+    latency: float | None = None
+    """[ms] From action to motor, to the nearest physics step (default: none, or drawn if randomised)."""
+    gains: tuple[float, float] | None = None
+    """[1] Scales of kp and kd of all motors (default: 1, or drawn if randomised)."""
+    friction: float | None = None
+    """[1] Of the paws, static and dynamic (default: nominal, or drawn if randomised)."""
     gravity: float | None = None
     """[m/s^2] Downward (default: that of the task)."""
 
     def __post_init__(self) -> None:
-        """Raises InputError: a gravity that is none."""
+        """Raises InputError: a value out of range, or pushes in flight where there are none."""
         if self.gravity is not None:
             check_gravity(self.gravity)
+        self._with_fixed(RandomizationCfg.off())
+        if self.push_in_flight and not self.randomize:
+            raise InputError("push_in_flight needs randomize: without it there are no pushes")
+
+    @property
+    def fixed(self) -> dict[str, Any]:
+        """Parameters that are neither nominal nor drawn."""
+        given = {name: getattr(self, name) for name in ("latency", "gains", "friction")}
+        return {name: value for name, value in given.items() if value is not None}
+
+    def overlay(self, config: dict[str, Any]) -> RobotOverlay | None:
+        """Return the robot that a policy of this configuration is tried on; None: as described.
+
+        Raises InputError or OSError: the overlay cannot be used.
+        """
+        if self.robot is not None:
+            return load_overlay(self.robot)
+        saved = config.get("env", {}).get("robot")
+        return None if saved is None else RobotOverlay.from_json(saved)
+
+    @property
+    def draws(self) -> bool:
+        """Whether the environment sets parameters at resets."""
+        return self.randomize or bool(self.fixed)
+
+    def _with_fixed(self, ranges: RandomizationCfg) -> RandomizationCfg:
+        return ranges.with_fixed(**self.fixed)
 
     def applied(self, task: TaskCfg) -> TaskCfg:
-        """Return a task under these conditions, as far as they are the task's."""
-        return task if self.gravity is None else dataclasses.replace(task, gravity=self.gravity)
+        """Return a task as it is tried in these conditions; pushes come and go, however its training had it."""
+        task = task if self.gravity is None else replace(task, gravity=self.gravity)
+        trained = task.randomization
+        if self.randomize:
+            in_flight = trained.push_in_flight or self.push_in_flight
+            drawn = replace(self._with_fixed(trained.in_tests()), push_in_flight=in_flight)
+            return replace(task, randomization=drawn)
+        if not self.fixed:
+            return task
+        nominal = RandomizationCfg.off().with_fixed(friction=trained.nominal_friction)
+        return replace(task, randomization=self._with_fixed(nominal), events=()).on_level_ground()
 
 
 def is_run(source: str | Path) -> bool:
@@ -107,6 +159,8 @@ def _policy_of_checkpoint(path: Path, state: dict[str, Any]) -> Policy:
         std = (model["obs_moments.var"] + EPS).sqrt().float()
         times = {"policy_dt": env["policy_dt_s"], "physics_dt": env["physics_dt_s"]}
         shape = {"hidden": tuple(ppo["hidden"]), "activation": ppo["activation"]}
+        if symmetry := _symmetry(model):
+            layers, shape["hidden"] = plain_layers(layers, symmetry), tuple(2 * width for width in ppo["hidden"])
         commit = config.get("commit") or {"hash": None, "dirty": None}
         config |= {"commit": commit["hash"], "dirty": commit["dirty"], "iteration": state["iteration"]}
     except DAMAGE as error:
@@ -120,6 +174,14 @@ def _policy_of_checkpoint(path: Path, state: dict[str, Any]) -> Policy:
         raise PolicyError(f"{path}: {error}") from error
     except DAMAGE as error:
         raise _no_training(path, error) from error
+
+
+def _symmetry(model: dict[str, torch.Tensor]) -> Symmetry | None:
+    """Return the symmetry of a checkpoint's actor, if it has one by its form."""
+    if not any(name.startswith("mirror_") for name in model):
+        return None
+    parts = ((model[f"mirror_{name}_order"], model[f"mirror_{name}_signs"], name) for name in Symmetry._fields)
+    return Symmetry(*(image(*part) for part in parts))
 
 
 def _no_training(path: Path, error: Exception) -> CheckpointError:
@@ -159,6 +221,21 @@ def restored_task(
         raise PolicyError(f"task in the configuration: {error}") from error
 
 
+def restored_skills(config: dict[str, Any], modules: Iterable[ModuleType] = ()) -> tuple[list[TaskCfg], list[Handover]]:
+    """Return all tasks and handovers of an environment's saved configuration (`Env.config`).
+
+    modules: that the user has named. Raises PolicyError: it is not of tasks and functions that are known here.
+    """
+    modules = list(modules)
+    try:
+        tasks = [task_from_json(saved, modules) for saved in config.get("tasks", [config["task"]])]
+        return tasks, [handover_from_json(saved, tasks, modules) for saved in config.get("handovers", [])]
+    except TaskError as error:
+        raise PolicyError(f"tasks in the configuration: {error}") from error
+    except (LookupError, TypeError, AttributeError) as error:
+        raise PolicyError(f"no tasks in the configuration ({type(error).__name__}: {error})") from error
+
+
 def env_of_policy(
     policy: Policy,
     num_envs: int,
@@ -196,8 +273,9 @@ def env_of_policy(
         seed=conditions.seed,
         device=conditions.device,
         solver=conditions.solver,
-        randomize=conditions.randomize,
+        randomize=conditions.draws,
         noise=conditions.noise,
         auto_reset=False,
+        robot=conditions.overlay(policy.config),
         **scene,
     )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,7 +11,7 @@ import torch
 from jumper_warp.policies.policy import Policy
 from jumper_warp.policies.restore import Conditions, open_policy, restored_task
 from jumper_warp.policies.spec import PolicyError
-from jumper_warp.tasks.cfg import TaskCfg
+from jumper_warp.tasks.cfg import Handover, TaskCfg
 from jumper_warp.tasks.switching import skills_and_handovers
 from jumper_warp.utils.errors import InputError
 
@@ -48,10 +48,7 @@ class SkillPolicies:
                 raise PolicyError(
                     f"this needs a policy that is evaluated by {' or '.join(kinds)}, got one of {task.name}"
                 )
-        try:
-            self.skills, self.handovers = skills_and_handovers(self.tasks[0], tuple(self.tasks[1:]))
-        except InputError as error:
-            raise PolicyError(str(error)) from error
+        self.skills, self.handovers = self._in(Conditions())
 
     @staticmethod
     def _task(policy: Policy, source: str | Path) -> TaskCfg:
@@ -60,20 +57,23 @@ class SkillPolicies:
             raise PolicyError(f"{source}: its observation is not the one that this version of its task gives")
         return task
 
+    def _in(self, conditions: Conditions) -> tuple[list[TaskCfg], list[Handover]]:
+        """Return the tasks in some conditions and their handovers. Raises PolicyError: these are no such tasks."""
+        walk, *jumps = (conditions.applied(task) for task in self.tasks)
+        try:
+            return skills_and_handovers(walk, tuple(jumps))
+        except InputError as error:
+            raise PolicyError(str(error)) from error
+
     def env(self, count: int, conditions: Conditions, **scene: Any) -> Env:
         """Return an environment of robots that walk first; scene: more settings of `Env`. Raises as `Env`."""
         from jumper_warp.envs.env import Env
 
-        skills, handovers = self.skills, self.handovers
-        if conditions.gravity is not None:
-            skills = [conditions.applied(task) for task in skills]
-            handovers = [
-                replace(h, source=conditions.applied(h.source), target=conditions.applied(h.target)) for h in handovers
-            ]
+        self.skills, self.handovers = self._in(conditions)
         env = Env(
-            skills, count, seed=conditions.seed, device=conditions.device, solver=conditions.solver,
-            randomize=conditions.randomize, noise=conditions.noise, auto_reset=False, threads=conditions.threads,
-            skill=WALK, handovers=handovers, **scene,
+            self.skills, count, seed=conditions.seed, device=conditions.device, solver=conditions.solver,
+            randomize=conditions.draws, noise=conditions.noise, auto_reset=False, threads=conditions.threads,
+            skill=WALK, handovers=self.handovers, robot=conditions.overlay({}), **scene,
         )  # fmt: skip
         for policy in self.policies:
             policy.to(env.device)

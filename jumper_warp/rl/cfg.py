@@ -60,6 +60,11 @@ class PpoCfg:
     """Widths of the hidden layers."""
     activation: str = "elu"
     """elu, relu or tanh."""
+    symmetry: Literal["off", "actor", "loss"] = "off"
+    """Left-right symmetry of the policy: actor by its form, which answers mirrored observations by mirrored actions
+    whatever the weights; loss by a part of the loss. For tasks whose observation has a known mirror image."""
+    symmetry_coef: float = 1.0
+    """Weight of the mean squared difference between mirrored answers, with symmetry loss."""
     tf32: bool = True
     """Whether matrix products on a GPU may round their factors to 10 mantissa bits."""
     precision: Literal["float32", "bfloat16"] = "float32"
@@ -78,7 +83,7 @@ class PpoCfg:
         """Raises ValueError: a setting is out of range."""
         for name in ("num_steps", "epochs", "minibatches", "lr", "max_grad_norm", "init_std", "clip", "reward_scale"):
             check_positive(name, getattr(self, name))
-        for name in ("value_coef", "entropy_coef", "desired_kl", "final_kl"):
+        for name in ("value_coef", "entropy_coef", "desired_kl", "final_kl", "symmetry_coef"):
             check_not_negative(name, getattr(self, name))
         for name in ("gamma", "lam"):
             if not 0.0 <= getattr(self, name) <= 1.0:
@@ -86,6 +91,8 @@ class PpoCfg:
         check_finite("max_lr", self.max_lr)
         if not 0.0 < self.min_lr <= self.lr <= self.max_lr:
             raise InputError(f"need 0 < min_lr <= lr <= max_lr, got {self.min_lr}, {self.lr}, {self.max_lr}")
+        if self.symmetry not in ("off", "actor", "loss"):
+            raise InputError(f"symmetry must be off, actor or loss, got {self.symmetry!r:.40}")
         if not self.hidden or min(self.hidden) < 1:
             raise InputError(f"hidden must name at least one positive width, got {self.hidden}")
         if self.activation not in ACTIVATIONS:
@@ -158,3 +165,5 @@ class TrainCfg:
             raise InputError(f"seed must be in 0 .. {2**31 - 1}, got {self.seed}")
         if self.trainer == "rsl-rl" and self.resume:
             raise InputError("resume is not offered with trainer rsl-rl")
+        if self.trainer == "rsl-rl" and self.ppo.symmetry != "off":
+            raise InputError("symmetry is not offered with trainer rsl-rl")

@@ -11,8 +11,9 @@ import torch
 
 from jumper_warp.rl.cfg import PpoCfg
 from jumper_warp.rl.flat import Layers, joined
+from jumper_warp.rl.mirror import Symmetry
 from jumper_warp.rl.networks import gaussian_kl, gaussian_log_prob
-from jumper_warp.rl.passes import DTYPES, backward, forward
+from jumper_warp.rl.passes import DTYPES, backward, backward_both, forward, forward_both
 from jumper_warp.rl.samples import RowLayout
 
 
@@ -23,27 +24,46 @@ def actor_gradient(
     log_std: torch.Tensor,
     old_log_std: torch.Tensor,
     cfg: PpoCfg,
+    symmetry: Symmetry | None,
     out: torch.Tensor,
-) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Write the gradient of surrogate and entropy bonus to `out`; return surrogate, entropy and KL(old ‖ new).
+) -> tuple[torch.Tensor, ...]:
+    """Write the gradient of surrogate, entropy bonus and asymmetry to `out`.
 
     The clipped surrogate of Schulman et al. 2017, eq. 7, as a loss: -E[min(r A, clip(r) A)] with r = π(a) / π_old(a).
     Where r A is the smaller, ∂/∂log π = -r A / batch, else 0.
 
-    rows: (batch, columns) as `layout`; out: the vector's part of actor and noise.
+    rows: (batch, columns) as `layout`; symmetry: of the policy or its loss, as `cfg` says; out: the vector's part of
+    actor and noise.
+
+    Returns:
+        Surrogate, entropy, mean squared asymmetry (0 without symmetry) and KL(old ‖ new).
     """
     batch, dtype = layout.split(rows), DTYPES[cfg.precision]
-    mean, seen = forward(actor, layout.features(rows), dtype)
+    difference = None
+    if symmetry is None:
+        mean, seen = forward(actor, layout.features(rows), dtype)
+    else:
+        mean, image, seen = forward_both(actor, layout.features(rows), symmetry, dtype)
+        difference = mean - image
+        if cfg.symmetry == "actor":
+            mean = 0.5 * (mean + image)
     ratio = torch.exp(gaussian_log_prob(batch.action, mean, log_std) - batch.log_prob)
     gain = batch.advantage * ratio
     clipped = batch.advantage * ratio.clamp(1.0 - cfg.clip, 1.0 + cfg.clip)
     slope = torch.where(gain > clipped, 0.0, gain)[:, None] / -rows.shape[0]
     deviation = (batch.action - mean) * torch.exp(-log_std)
     noise = (slope * (deviation.square() - 1.0)).sum(0) - cfg.entropy_coef
-    out.copy_(joined([*backward(actor, seen, slope * deviation * torch.exp(-log_std), dtype), noise]))
+    slope = slope * deviation * torch.exp(-log_std)
+    if difference is None:
+        gradients, asymmetry = backward(actor, seen, slope, dtype), torch.zeros_like(gain[0])
+    else:
+        pull = difference * (2.0 * cfg.symmetry_coef / difference.numel())
+        slopes = (0.5 * slope, 0.5 * slope) if cfg.symmetry == "actor" else (slope + pull, -pull)
+        gradients, asymmetry = backward_both(actor, seen, slopes, symmetry, dtype), difference.square().mean()
+    out.copy_(joined([*gradients, noise]))
     entropy = (log_std + 0.5 * math.log(2.0 * math.pi * math.e)).sum()
     kl = gaussian_kl(batch.mean, old_log_std, mean, log_std).mean()
-    return -torch.minimum(gain, clipped).mean(), entropy, kl
+    return -torch.minimum(gain, clipped).mean(), entropy, asymmetry, kl
 
 
 def critic_gradient(

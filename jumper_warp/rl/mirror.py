@@ -1,88 +1,107 @@
-"""An actor whose answer to a mirrored observation is the mirrored action, whatever its weights."""
+"""Left-right symmetry of the actor: by its form, or as a part of its loss.
+
+The mirror image of a vector x is `signs * x[order]`, and twice mirrored is as before. Let M be the image of an
+observation, N that of an action, and f the network. With `symmetry actor` the policy's mean is
+(f(x) + N f(M x)) / 2, so that it answers M x by the image of its answer to x whatever the weights. With `symmetry loss`
+it is f(x), and the mean square of f(x) - N f(M x) is added to the loss (Yu, Turk and Liu 2018).
+
+Both need f at x and at M x: the passes run once over twice the rows. As N is a permutation with signs and its own
+inverse, the slope of a loss with respect to f(M x) is N of that with respect to N f(M x).
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import torch
-from torch import nn
 
+from jumper_warp.envs.vec_env import MirroredVecEnv, VecEnv
 from jumper_warp.utils.errors import InputError
 
 
-class MirrorActor(nn.Module):
-    """The mean of a network's action and the mirror image of its action on the mirrored observation.
+class Image(NamedTuple):
+    """The mirror image of vectors (..., n)."""
 
-    Observations are normalised before they come here: for exact symmetry their statistics must be symmetric too, which
-    `symmetrised` makes them.
+    order: torch.Tensor
+    """(n,) int64"""
+    signs: torch.Tensor
+    """(n,) float32, 1 or -1"""
+
+    def of(self, x: torch.Tensor) -> torch.Tensor:
+        """Return the image of x (..., n)."""
+        return self.signs * x[..., self.order]
+
+    def moments(self, mean: torch.Tensor, var: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return mean and population variance (n,) of samples that come with their images, from those of the samples.
+
+        They are their own images to the last bit.
+        """
+        image = self.signs.to(mean.dtype) * mean[self.order]
+        return 0.5 * (mean + image), 0.5 * (var + var[self.order]) + 0.25 * (mean - image).square()
+
+    def padded(self, columns: int) -> Image:
+        """Return the image of vectors that are filled up to so many columns, which stay where they are."""
+        more = torch.arange(len(self.order), columns, device=self.order.device)
+        return Image(torch.cat([self.order, more]), torch.cat([self.signs, torch.ones_like(more, dtype=torch.float32)]))
+
+    def matrix(self) -> torch.Tensor:
+        """Return the image as a matrix (n, n)."""
+        return self.signs[:, None] * torch.eye(len(self.order), device=self.signs.device)[self.order]
+
+
+class Symmetry(NamedTuple):
+    """Mirror images of what the actor sees and does."""
+
+    obs: Image
+    action: Image
+
+    def padded(self, columns: int) -> Symmetry:
+        """Return the same for observations that are filled up to so many columns."""
+        return Symmetry(self.obs.padded(columns), self.action)
+
+
+def image(order: Sequence[int], signs: Sequence[float], name: str, device: Any = None) -> Image:
+    """Return the image of vectors called `name`. Raises ValueError: mirroring twice does not give back what was."""
+    places = torch.as_tensor(order, dtype=torch.int64, device=device)
+    flips = torch.as_tensor(signs, dtype=torch.float32, device=device)
+    fits = places.ndim == 1 and places.shape == flips.shape and bool(((places >= 0) & (places < len(places))).all())
+    each = torch.arange(len(places), device=device) if fits else None
+    if not (fits and bool((places[places] == each).all()) and bool((flips * flips[places] == 1.0).all())):
+        raise InputError(f"the mirror image of {name} is not its own inverse")
+    return Image(places, flips)
+
+
+def symmetry_of(env: VecEnv) -> Symmetry:
+    """Return the mirror images of an environment, on its device.
+
+    Raises ValueError: it tells none, or one that is not its own inverse or of other vectors.
     """
-
-    obs_order: torch.Tensor
-    obs_signs: torch.Tensor
-    action_order: torch.Tensor
-    action_signs: torch.Tensor
-
-    def __init__(
-        self,
-        network: nn.Module,
-        obs: tuple[Sequence[int], Sequence[float]],
-        action: tuple[Sequence[int], Sequence[float]],
-    ) -> None:
-        """Args:
-
-        network: Observations (..., num_obs) to actions (..., num_actions).
-        obs: Order and signs of a mirrored observation, as of `jumper_warp.tasks.velocity.mirror.mirror_of`.
-        action: Likewise of an action.
-
-        Raises:
-            ValueError: Mirroring twice does not give back what was mirrored.
-        """
-        super().__init__()
-        self.network = network
-        for name, (order, signs) in (("obs", obs), ("action", action)):
-            places = torch.as_tensor(order, dtype=torch.long)
-            flips = torch.as_tensor(signs, dtype=torch.float32)
-            twice = places.shape == flips.shape and bool((places[places] == torch.arange(len(places))).all())
-            if not (twice and bool((flips * flips[places] == 1.0).all())):
-                raise InputError(f"the mirror image of {name} is not its own inverse")
-            self.register_buffer(f"{name}_order", places, persistent=False)
-            self.register_buffer(f"{name}_signs", flips, persistent=False)
-
-    def forward(self, obs: torch.Tensor) -> torch.Tensor:
-        """Return actions (..., num_actions) for observations (..., num_obs)."""
-        other = self.network(self.obs_signs * obs[..., self.obs_order])
-        return 0.5 * (self.network(obs) + self.action_signs * other[..., self.action_order])
-
-    def symmetrised(self, mean: torch.Tensor, var: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return mean and variance (num_obs,) of observations that come with their mirror images, one for one."""
-        mirrored = self.obs_signs * mean[self.obs_order]
-        middle = 0.5 * (mean + mirrored)
-        spread = 0.5 * (var + var[self.obs_order]) + 0.25 * (mean - mirrored).square()
-        return middle, spread
-
-    def layers(self) -> list[tuple[torch.Tensor, torch.Tensor]]:
-        """Return weights and biases of a plain network that answers alike, twice as wide, activations between as here.
-
-        With them a mirrored policy is saved and exported as any other. The network must be linear layers in a row with
-        activations between.
-        """
-        linear = [layer for layer in self.network if isinstance(layer, nn.Linear)]
-        obs, action = _matrix(self.obs_order, self.obs_signs), _matrix(self.action_order, self.action_signs)
-        found = []
-        for index, layer in enumerate(linear):
-            weight, bias = layer.weight.detach(), layer.bias.detach()
-            if len(linear) == 1:
-                weight, bias = 0.5 * (weight + action @ weight @ obs), 0.5 * (bias + action @ bias)
-            elif index == 0:
-                weight, bias = torch.cat([weight, weight @ obs]), torch.cat([bias, bias])
-            elif index < len(linear) - 1:
-                weight, bias = torch.block_diag(weight, weight), torch.cat([bias, bias])
-            else:
-                weight, bias = 0.5 * torch.cat([weight, action @ weight], dim=1), 0.5 * (bias + action @ bias)
-            found.append((weight, bias))
-        return found
+    if not isinstance(env, MirroredVecEnv):
+        raise InputError("symmetry needs an environment that tells mirror images of observation and action")
+    obs, action = (image(*env.mirror(name), name, env.device) for name in ("observation", "action"))
+    if (len(obs.order), len(action.order)) != (env.num_obs, env.num_actions):
+        raise InputError("the mirror images are not of this environment's observation and action")
+    return Symmetry(obs, action)
 
 
-def _matrix(order: torch.Tensor, signs: torch.Tensor) -> torch.Tensor:
-    """Return the matrix of a mirror image."""
-    return signs[:, None] * torch.eye(len(order), device=signs.device)[order]
+def plain_layers(
+    layers: Sequence[tuple[torch.Tensor, torch.Tensor]], symmetry: Symmetry
+) -> list[tuple[torch.Tensor, torch.Tensor]]:
+    """Return weights and biases of a plain network that answers as the symmetric actor, of twice the widths.
+
+    layers: those of f, with activations between. So a symmetric policy is saved and exported as any other.
+    """
+    obs, action = symmetry.obs.matrix(), symmetry.action.matrix()
+    found = []
+    for index, (weight, bias) in enumerate(layers):
+        if len(layers) == 1:
+            weight, bias = 0.5 * (weight + action @ weight @ obs), 0.5 * (bias + action @ bias)
+        elif index == 0:
+            weight, bias = torch.cat([weight, weight @ obs]), torch.cat([bias, bias])
+        elif index < len(layers) - 1:
+            weight, bias = torch.block_diag(weight, weight), torch.cat([bias, bias])
+        else:
+            weight, bias = 0.5 * torch.cat([weight, action @ weight], dim=1), 0.5 * (bias + action @ bias)
+        found.append((weight, bias))
+    return found

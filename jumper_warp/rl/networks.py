@@ -9,6 +9,7 @@ from torch import nn
 
 from jumper_warp.envs.vec_env import sanitise
 from jumper_warp.rl.distributed import average_over_ranks, world_size
+from jumper_warp.rl.mirror import Image, Symmetry
 
 NORMALISED_LIMIT = 10.0
 """The networks see observations within plus and minus this many standard deviations."""
@@ -127,6 +128,7 @@ class ActorCritic(nn.Module):
         activation: str = "elu",
         init_std: float = 1.0,
         num_critic_obs: int | None = None,
+        symmetry: Symmetry | None = None,
     ) -> None:
         """Args:
 
@@ -136,6 +138,7 @@ class ActorCritic(nn.Module):
         activation: A key of ACTIVATIONS.
         init_std: Standard deviation of the noise on every action at the start.
         num_critic_obs: Entries of the critic's observation (default: num_obs).
+        symmetry: Of the policy, see `jumper_warp.rl.mirror`; its images are saved with the weights.
         """
         super().__init__()
         num_critic_obs = num_obs if num_critic_obs is None else num_critic_obs
@@ -145,6 +148,26 @@ class ActorCritic(nn.Module):
         self.obs_moments = RunningMoments((num_obs,))
         self.critic_moments = RunningMoments((num_critic_obs,))
         self.value_moments = RunningMoments()
+        self._symmetric = symmetry is not None
+        for name, image in symmetry._asdict().items() if symmetry is not None else ():
+            self.register_buffer(f"mirror_{name}_order", image.order)
+            self.register_buffer(f"mirror_{name}_signs", image.signs)
+
+    @property
+    def symmetry(self) -> Symmetry | None:
+        """Symmetry of the policy, on the device of the weights."""
+        if not self._symmetric:
+            return None
+        parts = [
+            Image(*(getattr(self, f"mirror_{name}_{part}") for part in Image._fields)) for name in Symmetry._fields
+        ]
+        return Symmetry(*parts)
+
+    def mean(self, features: torch.Tensor) -> torch.Tensor:
+        """Return the policy's mean, (..., num_actions), for what the actor sees (..., num_obs)."""
+        if (symmetry := self.symmetry) is None:
+            return self.actor(features)
+        return 0.5 * (self.actor(features) + symmetry.action.of(self.actor(symmetry.obs.of(features))))
 
     def features(self, obs: torch.Tensor) -> torch.Tensor:
         """Return what the actor sees of raw observations (..., num_obs): finite, scaled, within ±NORMALISED_LIMIT."""
@@ -165,7 +188,7 @@ class ActorCritic(nn.Module):
     @torch.no_grad()
     def act(self, obs: torch.Tensor) -> torch.Tensor:
         """Return the mean action clipped to ±1, (..., num_actions), for raw observations (..., num_obs)."""
-        return self.actor(self.features(obs)).clamp(-1.0, 1.0)
+        return self.mean(self.features(obs)).clamp(-1.0, 1.0)
 
 
 def _features(obs: torch.Tensor, moments: RunningMoments) -> torch.Tensor:

@@ -11,6 +11,7 @@ import torch
 from torch.nn import functional
 
 from jumper_warp.rl.flat import Layers
+from jumper_warp.rl.mirror import Symmetry
 
 DTYPES = {"float32": torch.float32, "bfloat16": torch.bfloat16}
 """What the hidden layers compute in, by `PpoCfg.precision`."""
@@ -43,6 +44,23 @@ def backward(layers: Layers, seen: list[torch.Tensor], slope: torch.Tensor, dtyp
         if index > 0:
             slope = _through(layers.activation, slope @ layers.weights[index].to(x.dtype), x).to(dtype)
     return found
+
+
+def forward_both(
+    layers: Layers, x: torch.Tensor, symmetry: Symmetry, dtype: torch.dtype
+) -> tuple[torch.Tensor, torch.Tensor, list[torch.Tensor]]:
+    """Return f(x) and N f(M x), (batch, actions) each, and what `backward_both` needs; as `passes.forward`."""
+    output, seen = forward(layers, torch.cat([x, symmetry.obs.of(x)]), dtype)
+    own, other = output.chunk(2)
+    return own, symmetry.action.of(other), seen
+
+
+def backward_both(
+    layers: Layers, seen: list[torch.Tensor], slopes: tuple[torch.Tensor, torch.Tensor], symmetry: Symmetry,
+    dtype: torch.dtype,
+) -> list[torch.Tensor]:  # fmt: skip
+    """Return the gradients of weights and biases; slopes: of the loss with respect to what `forward_both` returned."""
+    return backward(layers, seen, torch.cat([slopes[0], symmetry.action.of(slopes[1])]), dtype)
 
 
 def _through(activation: str, slope: torch.Tensor, output: torch.Tensor) -> torch.Tensor:

@@ -25,13 +25,15 @@ from jumper_warp.rl.distributed import average_over_ranks
 from jumper_warp.rl.flat import FlatParameters
 from jumper_warp.rl.graphs import Beside, Captured
 from jumper_warp.rl.losses import actor_gradient, critic_gradient
+from jumper_warp.rl.mirror import symmetry_of
 from jumper_warp.rl.networks import ActorCritic
 from jumper_warp.rl.rollout import Collector
 from jumper_warp.rl.samples import Batch, Sampler
 from jumper_warp.rl.state_checks import check_ppo
 
-STATISTICS = ("surrogate", "value", "entropy", "kl", "gradient_actor", "gradient_critic", "skipped")
-"""What `Ppo.statistics` averages over minibatches; skipped is the share of steps with a non-finite gradient."""
+STATISTICS = ("surrogate", "value", "entropy", "asymmetry", "kl", "gradient_actor", "gradient_critic", "skipped")
+"""What `Ppo.statistics` averages over minibatches; skipped is the share of steps with a non-finite gradient,
+asymmetry the mean square of f(x) - N f(M x), see `jumper_warp.rl.mirror`, 0 without symmetry."""
 
 FIGURES = (
     *(f"Loss/{name}" for name in STATISTICS), "Loss/learning_rate", "Policy/mean_std", "Train/mean_return",
@@ -47,7 +49,7 @@ class Ppo:
         """Build networks and buffers on the environment's device; the weights follow torch's CPU seed.
 
         Raises:
-            ValueError: As `PpoCfg.batch_size`.
+            ValueError: As `PpoCfg.batch_size`, or as `symmetry_of` if symmetry is asked for.
         """
         self.batch_size = cfg.batch_size(env.num_envs)
         self.env, self.cfg = env, cfg
@@ -55,18 +57,21 @@ class Ppo:
         if cuda:
             torch.set_float32_matmul_precision("high" if cfg.tf32 else "highest")
         num_critic_obs = env.num_critic_obs if cfg.asymmetric else env.num_obs
+        symmetry = None if cfg.symmetry == "off" else symmetry_of(env)
         self.model = ActorCritic(
-            env.num_obs, env.num_actions, cfg.hidden, cfg.activation, cfg.init_std, num_critic_obs
-        ).to(env.device)
+            env.num_obs, env.num_actions, cfg.hidden, cfg.activation, cfg.init_std, num_critic_obs,
+            symmetry if cfg.symmetry == "actor" else None,
+        ).to(env.device)  # fmt: skip
         self.flat = FlatParameters(self.model, cfg.activation)
         self._parts = (self.flat.actor(self.flat.value), self.flat.critic(), self.flat.gradients())
+        self._symmetry = symmetry and symmetry.padded(self._parts[0][0].weights[0].shape[1])
         self.optimiser = FlatAdam(self.flat, cfg.lr)
         self.lr = self.optimiser.lr
         self._desired_kl = torch.full((), cfg.desired_kl, device=env.device)
         self.compiler = compiler = Compiler(cfg.compile == "on" or (cfg.compile == "auto" and cuda))
         self.collector = Collector(env, cfg, self.model, self.flat, compiler)
         self.rollout = self.collector.rollout
-        self.sampler = Sampler(self.rollout, cfg, self.model, self.flat, compiler)
+        self.sampler = Sampler(self.rollout, cfg, self.model, self.flat, compiler, symmetry and symmetry.obs)
         self._minibatch = self.sampler.rows.new_zeros(self.batch_size // cfg.minibatches, self.sampler.rows.shape[1])
         self._orders = torch.zeros(cfg.epochs, self.batch_size, dtype=torch.int64, device=env.device)
         counts = {"dtype": torch.float64, "device": env.device}  # float32 counts to 2^24 only
@@ -155,15 +160,16 @@ class Ppo:
 
     @torch.no_grad()
     def _differentiate(self, rows: torch.Tensor) -> tuple[torch.Tensor, ...]:
-        """Fill the gradient; return surrogate, value loss and entropy."""
+        """Fill the gradient; return surrogate, value loss, entropy and asymmetry."""
         (actor, log_std), critic, (to_actor, to_critic) = self._parts
         layout, cfg, old_log_std = self.sampler.layout, self.cfg, self.sampler.old_log_std
         with self._critic_stream():
             value_loss = self._critic_gradient(rows, layout, critic, cfg, to_critic)
-        surrogate, entropy, kl = self._actor_gradient(rows, layout, actor, log_std, old_log_std, cfg, to_actor)
+        found = self._actor_gradient(rows, layout, actor, log_std, old_log_std, cfg, self._symmetry, to_actor)
+        surrogate, entropy, asymmetry, kl = found
         self._critic_stream.join()
         self.flat.gradient[-1] = kl
-        return surrogate, value_loss, entropy
+        return surrogate, value_loss, entropy, asymmetry
 
     @torch.no_grad()
     def _step(self, found: tuple[torch.Tensor, ...]) -> None:
@@ -228,7 +234,7 @@ def _finish(
     vectors: AdamVectors, actor_size: int, desired_kl: torch.Tensor, cfg: PpoCfg, found: tuple[torch.Tensor, ...],
     sums: torch.Tensor,
 ) -> None:  # fmt: skip
-    """Make the optimiser step and count its figures; found: surrogate, value loss and entropy of the minibatch."""
+    """Make the optimiser step and count its figures; found: as `Ppo._differentiate` returned it."""
     kl, norms = descend(vectors, actor_size, desired_kl, cfg)
     skipped = 1.0 - norms.isfinite().all().float()
     terms = torch.stack([*found, kl, *norms, skipped, torch.ones_like(kl)])

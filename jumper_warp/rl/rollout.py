@@ -9,8 +9,9 @@ from jumper_warp.envs.vec_env import VecEnv, sanitise
 from jumper_warp.rl.cfg import PpoCfg
 from jumper_warp.rl.compiling import Compiler
 from jumper_warp.rl.flat import FlatParameters, Layers
+from jumper_warp.rl.mirror import Symmetry
 from jumper_warp.rl.networks import NORMALISED_LIMIT, ActorCritic
-from jumper_warp.rl.passes import DTYPES, forward
+from jumper_warp.rl.passes import DTYPES, forward, forward_both
 
 
 class RolloutBuffer:
@@ -46,6 +47,7 @@ class Collector:
         self._moments, self._source = model.obs_moments, flat.value[: flat.actor_size]
         self._policy = torch.zeros_like(self._source)
         self._actor, self._log_std = flat.actor(self._policy)
+        self._symmetry = model.symmetry and model.symmetry.padded(self._actor.weights[0].shape[1])
         self._scaling = torch.zeros(2, env.num_obs, device=env.device)
         counts = {"dtype": torch.float64, "device": env.device}  # float32 counts to 2^24 only
         self.episode = torch.zeros(2, env.num_envs, **counts)
@@ -83,7 +85,7 @@ class Collector:
         rollout, dtype = self.rollout, DTYPES[self.cfg.precision]
         seen, kept = (self.env.obs, self._critic_obs), (rollout.obs[step], rollout.critic_obs[step])
         decided = (rollout.mean[step], rollout.action[step])
-        self._act(seen, kept, decided, self._actor, self._log_std, self._scaling, dtype)
+        self._act(seen, kept, decided, self._actor, self._log_std, self._scaling, dtype, self._symmetry)
 
     def _remember(self, step: int) -> None:
         env, rollout = self.env, self.rollout
@@ -106,13 +108,17 @@ def normalised(obs: torch.Tensor, scaling: torch.Tensor | Pair, columns: int) ->
 
 def _act(
     seen: Pair, kept: Pair, decided: Pair, actor: Layers, log_std: torch.Tensor, scaling: torch.Tensor,
-    dtype: torch.dtype,
+    dtype: torch.dtype, symmetry: Symmetry | None,
 ) -> None:  # fmt: skip
     """Keep what actor and critic see, and decide: mean and action, which holds standard normal noise before."""
     for raw, place in zip(seen, kept, strict=True):
         place.copy_(sanitise(raw))
     features = normalised(sanitise(seen[0]), scaling, actor.weights[0].shape[1])
-    mean, _ = forward(actor, features, dtype)
+    if symmetry is None:
+        mean, _ = forward(actor, features, dtype)
+    else:
+        own, image, _ = forward_both(actor, features, symmetry, dtype)
+        mean = 0.5 * (own + image)
     decided[0].copy_(mean)
     decided[1].mul_(log_std.exp()).add_(mean)
 

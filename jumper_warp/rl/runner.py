@@ -9,6 +9,7 @@ import signal
 import sys
 import time
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from datetime import datetime
 from pathlib import Path
 from types import FrameType
@@ -186,7 +187,10 @@ class Run:
     def iterate(self, stop: Stop) -> TrainResult:
         """Iterate until the end, the time limit or a wish to stop; log and save on the way."""
         cfg, ppo = self.cfg, self.ppo
-        one_rank_first(ppo.prepare)
+        with ThreadPoolExecutor(1) as pool:
+            kernels = pool.submit(getattr(self.env, "compile", lambda: None))  # not every `VecEnv` has something to
+            one_rank_first(ppo.prepare)
+            kernels.result()
         if self.iteration == 0:
             self.env.reset()
         start, first = time.perf_counter(), self.iteration + 1

@@ -11,6 +11,7 @@ from jumper_warp.envs.vec_env import sanitise
 from jumper_warp.rl.cfg import PpoCfg
 from jumper_warp.rl.compiling import Compiler
 from jumper_warp.rl.flat import ROW_ALIGNMENT, FlatParameters, Layers, aligned
+from jumper_warp.rl.mirror import Image
 from jumper_warp.rl.networks import ActorCritic, gaussian_log_prob, joint_moments, own_moments
 from jumper_warp.rl.passes import DTYPES, forward
 from jumper_warp.rl.rollout import Pair, RolloutBuffer, normalised
@@ -113,9 +114,11 @@ class Sampler:
     """Turns a rollout into rows to learn from."""
 
     def __init__(
-        self, rollout: RolloutBuffer, cfg: PpoCfg, model: ActorCritic, flat: FlatParameters, compiler: Compiler
-    ) -> None:
-        """flat: the parameters of `model`."""
+        self, rollout: RolloutBuffer, cfg: PpoCfg, model: ActorCritic, flat: FlatParameters, compiler: Compiler,
+        obs_image: Image | None = None,
+    ) -> None:  # fmt: skip
+        """flat: the parameters of `model`; obs_image: of observations whose statistics are to be symmetric."""
+        self._obs_image = obs_image
         self._rollout, self._cfg, self._model, self._critic = rollout, cfg, model, flat.critic()
         steps, worlds, num_actions = rollout.action.shape
         self.layout = RowLayout(rollout.obs.shape[2], rollout.critic_obs.shape[2], num_actions)
@@ -132,6 +135,8 @@ class Sampler:
         scaling = model.obs_moments.scaling()  # with which the policy acted
         estimates, own = self._estimates()
         of_advantage, of_target, of_obs, of_critic_obs = joint_moments(own, self.rows.shape[0])
+        if self._obs_image is not None:
+            of_obs = (*self._obs_image.moments(*of_obs[:2]), of_obs[2])
         model.obs_moments.take(of_obs)
         model.critic_moments.take(of_critic_obs)
         if self._cfg.normalise_value:

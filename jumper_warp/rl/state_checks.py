@@ -8,6 +8,7 @@ from typing import Any
 
 import torch
 
+from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.state_checks import check_parts, check_tensor, check_values
 
 
@@ -27,6 +28,8 @@ def check_ppo(
     for name, like in model.items():
         found, where = state["model"][name], f"ppo.model.{name}"
         check_tensor(found, like, where)
+        if name.startswith("mirror_") and not torch.equal(found, like.to(found.device)):
+            raise InputError(f"{where} is of another observation or action")
         check_values(found, where, 0.0 if name.endswith((".var", ".count")) else -math.inf)
     check_parts(state["optimiser"], range(len(params)), "ppo.optimiser")
     for index, param in enumerate(params):

@@ -12,15 +12,17 @@ import numpy as np
 from jumper_warp.utils.errors import InputError
 
 KINDS = ("flat", "uneven", "waves", "slope", "bowl", "stairs", "pit", "blocks")
-"""Of tiles, in the order of the columns."""
+"""Of tiles."""
 
 
 @dataclass(frozen=True)
 class TerrainCfg:
-    """A map: rows of growing difficulty, a column for each kind of ground."""
+    """A map: rows of growing difficulty, a column for each kind of ground, or several."""
 
     rows: int = 10
     """Levels of difficulty, from a tenth of the heights and slopes below to all of them; 0: no map."""
+    kinds: tuple[str, ...] = KINDS
+    """Of the columns."""
     tile: float = 8.0
     """[m] Edge of a tile. Its middle is level, for the start; its rim is at z = 0."""
     uneven: float = 0.05
@@ -44,6 +46,8 @@ class TerrainCfg:
         """Raises ValueError: a length or a slope is out of range."""
         if self.rows < 0 or self.seed < 0:
             raise InputError(f"terrain rows and seed must not be negative, got {self.rows}, {self.seed}")
+        for kind in self.kinds or ("",):
+            check_kind(kind)
         for name in ("tile", "cell", "start", "rim", "border"):
             if not 0.0 < getattr(self, name) < math.inf:
                 raise InputError(f"terrain {name} must be positive and finite, got {getattr(self, name)}")
@@ -63,8 +67,8 @@ class TerrainCfg:
 
     @property
     def cols(self) -> int:
-        """Number of kinds, 0 without a map."""
-        return len(KINDS) if self.rows else 0
+        """Number of columns, 0 without a map."""
+        return len(self.kinds) if self.rows else 0
 
 
 def terrain_map(cfg: TerrainCfg) -> newton.Heightfield:
@@ -80,7 +84,7 @@ def terrain_map(cfg: TerrainCfg) -> newton.Heightfield:
     edge = math.ceil(cfg.border / cell)
     heights = np.zeros((cfg.cols * nodes + 1 + 2 * edge, cfg.rows * nodes + 1 + 2 * edge), dtype=np.float32)
     for i in range(cfg.rows):
-        for j, kind in enumerate(KINDS):
+        for j, kind in enumerate(cfg.kinds):
             y, x = edge + j * nodes, edge + i * nodes
             rng = np.random.default_rng([cfg.seed, i, j])
             heights[y : y + nodes + 1, x : x + nodes + 1] = tile_heights(cfg, kind, (i + 1) / cfg.rows, rng)
@@ -90,11 +94,16 @@ def terrain_map(cfg: TerrainCfg) -> newton.Heightfield:
 
 def single_tile(cfg: TerrainCfg, kind: str) -> newton.Heightfield:
     """Return one tile of full difficulty as a heightfield centred on the origin. Raises ValueError for another kind."""
-    if kind not in KINDS:
-        raise InputError(f"terrain must be one of {', '.join(KINDS)}, got {kind!r:.40}")
+    check_kind(kind)
     heights = tile_heights(cfg, kind, 1.0, np.random.default_rng(cfg.seed)).astype(np.float32)
     half = 0.5 * cfg.tile
     return newton.Heightfield(data=heights, nrow=len(heights), ncol=len(heights), hx=half, hy=half)
+
+
+def check_kind(kind: str) -> None:
+    """Raise InputError unless there are such tiles."""
+    if kind not in KINDS:
+        raise InputError(f"terrain must be one of {', '.join(KINDS)}, got {kind!r:.40}")
 
 
 def tile_heights(cfg: TerrainCfg, kind: str, difficulty: float, rng: np.random.Generator) -> np.ndarray:

@@ -14,7 +14,7 @@ class DifferentiableStep:
     """Launches the step kernel by kernel so that `wp.Tape` can run it backwards; each call makes its own buffers.
 
     Gradients flow to the state, the joint forces, the external wrench and the parameter table. At given contact modes
-    they are exact; see `kernels.dynamics.differentiable` for what happens where a mode changes.
+    and pressed stops they are exact; see `kernels.dynamics.differentiable` for what happens where one changes.
     """
 
     def __init__(self, dynamics: JumperDynamics, max_sweeps: int, tolerance: float):
@@ -64,16 +64,17 @@ class DifferentiableStep:
         legs = self._fields(kernels.LegArrays, (4, n))
         base = self._fields(kernels.BaseArrays, n)
         common = [robot.geometry, robot.ground, robot.table, q, qd, legs]
-        self._launch(kernels.legs_kernel, (4, n), [robot.geometry, robot.table, q, qd, joint_f, dt], [legs])
+        solution = self._settle(q, qd, joint_f, body_f, dt)
+        motors = [robot.geometry, robot.table, q, qd, joint_f, solution.pressed, dt]
+        self._launch(kernels.legs_kernel, (4, n), motors, [legs])
         self._launch(kernels.base_kernel, n, [robot.table, q, qd, joint_f, body_f, legs], [base])
-        solution = self._solve_contacts(q, qd, legs, base, dt)
         ahead, velocities = self._velocities(), self._velocities()
         residual = self._zeros((4, n), dyn.modules.scalar.vec3)
         self._launch(kernels.velocity_kernel, n, [*common, base, solution.impulse, dt], [ahead])
         self._launch(
             kernels.residual_kernel,
             (4, n),
-            [*common, ahead, solution.impulse, solution.mode, solution.mu_row, dt],
+            [*common, ahead, solution.impulse, solution.mode, solution.mu_row, solution.pressed, dt],
             [residual],
         )
         tape = wp._src.context.runtime.tape
@@ -91,17 +92,17 @@ class DifferentiableStep:
         self._launch(kernels.velocity_kernel, n, [*common, base, solution.impulse, dt], [velocities])
         self._launch(kernels.integrate_kernel, n, [robot.table, q, qd, velocities, dt], [q_out, qd_out])
 
-    def _solve_contacts(self, q: wp.array, qd: wp.array, legs: Any, base: Any, dt: float) -> Any:
-        """Return the solved contacts; not on the tape."""
+    def _settle(self, q: wp.array, qd: wp.array, joint_f: wp.array, body_f: wp.array, dt: float) -> Any:
+        """Return the solved contacts and stops; not on the tape."""
         dyn, n = self._dynamics, self._dynamics.num_worlds
         solution = dyn.modules.contact_adjoint.Solution()
         solution.impulse = self._zeros((4, n), dyn.modules.scalar.vec3)
-        solution.mode = self._zeros((4, n), wp.int32, grad=False)
-        solution.mu_row = self._zeros((4, n), wp.int32, grad=False)
+        for name in ("mode", "mu_row", "pressed"):
+            setattr(solution, name, self._zeros((4, n), wp.int32, grad=False))
         self._launch(
-            dyn.modules.contact_adjoint.contact_kernel,
+            dyn.modules.contact_adjoint.settle_kernel,
             n,
-            [dyn.robot, q, qd, legs, base, dt, self._max_sweeps, self._tolerance],
+            [dyn.robot, dyn.settings(dt, 1, self._max_sweeps, self._tolerance), q, qd, joint_f, body_f],
             [dyn.work.impulse, solution, dyn.work.contact_force],
             record=False,
         )

@@ -21,7 +21,8 @@ LINKS = ("housing", "outer_thigh", "outer_shank", "inner_thigh", "inner_shank")
 JOINTS = ("lateral", "outer", "outer_knee", "inner", "inner_knee")
 KERNEL_MODULES = (
     "actuation.command_filter", "actuation.motors", "dynamics.advance", "dynamics.advance_legs", "dynamics.contact",
-    "dynamics.contact_adjoint", "dynamics.differentiable", "dynamics.drive", "dynamics.parameters", "dynamics.step",
+    "dynamics.contact_adjoint", "dynamics.differentiable", "dynamics.drive", "dynamics.gradients",
+    "dynamics.parameters", "dynamics.rollout", "dynamics.rollout_adjoint", "dynamics.step", "dynamics.step_adjoint",
     "kinematics.full_state", "kinematics.geometry", "layout", "scalar", "state", "terrain.ground",
 )  # fmt: skip
 
@@ -180,6 +181,7 @@ class JumperDynamics:
         )
         self.robot.ground = ground_struct(model, self._ground_shape, self.modules.ground)
         self.robot.ground.blocks = block_array(block, self.num_worlds, self.modules, self.device)
+        self.robot.held = wp.zeros(0, dtype=int, device=self.device)
         self.work = self._workspace()
         self.pack()
 
@@ -286,6 +288,12 @@ class JumperDynamics:
             drive.previous, drive.delay = previous, delay
         return drive
 
+    def advance_kernel(self, by_legs: bool | None = None) -> tuple[wp.Kernel, int]:
+        """Return the kernel that `advance` launches, and its block size."""
+        if self.device.is_cuda if by_legs is None else by_legs:
+            return self.modules.advance_legs.advance_legs_kernel, 32 if self.device.is_cuda else 4
+        return self.modules.advance.advance_kernel, 32
+
     def advance(
         self, settings: Any, drive: Any, q: wp.array, qd: wp.array, q_out: wp.array, qd_out: wp.array,
         worlds: Worlds | None = None, by_legs: bool | None = None,
@@ -297,17 +305,9 @@ class JumperDynamics:
         """
         settings.first, count = worlds or (0, self.num_worlds)
         inputs, outputs = [self.robot, settings, drive, q, qd, self.work], [q_out, qd_out]
-        if by_legs is None:
-            by_legs = self.device.is_cuda
-        if by_legs:
-            kernel, dim, inputs = (
-                self.modules.advance_legs.advance_legs_kernel,
-                (-(-count // 8) * 8, 4),
-                [count, *inputs],
-            )
-            block = 32 if self.device.is_cuda else 4
-        else:
-            kernel, dim, block = self.modules.advance.advance_kernel, count, 32
+        by_legs = self.device.is_cuda if by_legs is None else by_legs
+        kernel, block = self.advance_kernel(by_legs)
+        dim, inputs = ((-(-count // 8) * 8, 4), [count, *inputs]) if by_legs else (count, inputs)
         wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device, block_dim=block)
 
     def full_state(

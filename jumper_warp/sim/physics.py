@@ -85,6 +85,9 @@ class Physics(Protocol):
     def write_bodies(self) -> None:
         """Bring the state's passive joints and bodies up to date."""
 
+    def kernels(self) -> list[tuple[wp.Kernel, int]]:
+        """Return what a policy step launches and can be compiled before, each with its block size."""
+
     def carried(self) -> dict[str, wp.array]:
         """Return what the next step depends on besides coordinates and impulses, by name."""
 
@@ -140,6 +143,10 @@ class JumperPhysics:
         state = self._sim.state
         self.dynamics.full_state(state.joint_q, state.joint_qd, state.body_q, state.body_qd)
 
+    def kernels(self) -> list[tuple[wp.Kernel, int]]:
+        """See `Physics.kernels`."""
+        return [self.dynamics.advance_kernel()]
+
     def carried(self) -> dict[str, wp.array]:
         """See `Physics.carried`."""
         return {}
@@ -155,11 +162,12 @@ class MujocoPhysics:
         self._sim, n, device, model = sim, sim.num_worlds, sim.device, sim.model
         self.dynamics = JumperDynamics(model)  # refuses another robot
         damping = model.joint_damping.numpy().reshape(n, -1)
+        knee_damping = float(damping[0, KNEE_DOFS[0]])
         damping[:, KNEE_DOFS] = 0.0
         model.joint_damping.assign(damping.ravel())
         self.solver = mujoco_solver(model, dt=sim.dt)
         robot = load_description()
-        self._passive = [robot.knee_damping, robot.knee_damping_limit, *robot.transversal_sum, *EXPLICIT_STOP]
+        self._passive = [knee_damping, robot.knee_damping_limit, *robot.transversal_sum, *EXPLICIT_STOP]
         self.invalid = wp.zeros(n, dtype=int, device=device)
         self.impulse = wp.zeros((4, n), dtype=wp.vec3, device=device)
         self.torque = wp.zeros((12, n), dtype=float, device=device)
@@ -228,6 +236,10 @@ class MujocoPhysics:
         """See `Physics.write_bodies`."""
         state = self._sim.state
         self.dynamics.full_state(state.joint_q, state.joint_qd, state.body_q, state.body_qd)
+
+    def kernels(self) -> list[tuple[wp.Kernel, int]]:
+        """See `Physics.kernels`; Newton's solver compiles its own at their first launches."""
+        return []
 
     def carried(self) -> dict[str, wp.array]:
         """See `Physics.carried`."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from typing import Any, Literal
 
@@ -16,8 +16,14 @@ from kernels.mdp import parameters
 Range = tuple[float, float] | None
 NOMINAL_FRICTION = 0.9
 """[1] Of the paws, where it is not drawn."""
+MEAN_FRICTION = 0.85
+"""[1] Of the paws in nominal tests of what was trained with friction that is drawn."""
 LONGEST_LATENCY = 100.0
-"""[ms] What the ring of past targets and observations holds."""
+"""[ms] What the ring of past targets and observations holds: 48 physics steps, six policy steps."""
+PUSH_INTERVAL = (0.2, 0.5)
+"""[s] After which a push comes, stays or goes (authors' configuration)."""
+PUSH_SHARE = 0.25
+"""[1] Share of these intervals in which there is a push (authors' configuration)."""
 
 
 @cache
@@ -30,7 +36,7 @@ def _least(name: str) -> tuple[float, bool]:
     """Return the least value of a row, and whether the row must stay above it."""
     if name == "base_mass":
         return -_base_mass(), True
-    if name in ("link_mass", "gains", "no_load_speed", "cutoff_speed", "armature", "push_interval"):
+    if name in ("link_mass", "gains", "damping_gains", "no_load_speed", "cutoff_speed", "armature", "push_interval"):
         return 0.0, True
     if name in ("static_friction", "dynamic_friction", "motor_friction", "latency", "observation_latency"):
         return 0.0, False
@@ -55,7 +61,7 @@ class RandomizationCfg:
     com_shift: Range = (-0.03, 0.03)
     """[m] Of the base, along each axis."""
     gains: Range = (0.6, 1.4)
-    """[1] Scales kp and kd of each motor."""
+    """[1] Scales kp of each motor, and kd unless `damping_gains` says otherwise."""
     no_load_speed: Range = (0.8, 1.2)
     """[1] Scales each motor's."""
     cutoff_speed: Range = (0.8, 1.4)
@@ -67,19 +73,24 @@ class RandomizationCfg:
     joint_offset: Range = (-2.0, 2.0)
     """[deg] Constant error of each motor's position sensor."""
     latency: Range = (0.0, 16.0)
-    """[ms] From action to motor, rounded down to whole physics steps."""
+    """[ms] From action to motor, rounded to the nearest physics step."""
     observation_latency: Range = None
-    """[ms] From sensor to policy, rounded down to whole physics steps."""
+    """[ms] From sensor to policy, rounded to the nearest physics step."""
+    no_latency: float = 0.0
+    """[1] Share of draws of either latency that give none. Else no latency on both sides, the nominal case, has next to
+    no weight in training, and a policy may chatter there."""
     force: Range = (-5.0, 5.0)
     """[N] On the base, along each world axis, while a paw is on the ground."""
     torque: Range = (-3.0, 3.0)
     """[N m] On the base, about each world axis, while a paw is on the ground."""
-    push_interval: Range = None
-    """[s] Between two pushes; None: one for the whole episode."""
-    push_share: float = 1.0
+    push_interval: Range = PUSH_INTERVAL
+    """[s] Between two draws of the push; None: one for the whole episode."""
+    push_share: float = PUSH_SHARE
     """[1] Share of the intervals in which there is a push."""
     push_in_flight: bool = False
     """Whether pushes act in the air too."""
+    damping_gains: Range = None
+    """[1] Scales kd of each motor; None: drawn from `gains`."""
     redraw: Literal["startup", "reset"] = "reset"
     """When all but the pushes is drawn: once, or at every reset of a world."""
 
@@ -99,18 +110,19 @@ class RandomizationCfg:
             value = getattr(self, name)
             if value is not None and not 0.0 <= value[0] <= value[1] <= LONGEST_LATENCY:
                 raise InputError(f"randomisation range {name} must be in 0 to {LONGEST_LATENCY:g} ms, got {value}")
-        if not 0.0 <= self.push_share <= 1.0:
-            raise InputError(f"randomisation push_share must be in [0, 1], got {self.push_share}")
+        for name in ("push_share", "no_latency"):
+            if not 0.0 <= getattr(self, name) <= 1.0:
+                raise InputError(f"randomisation {name} must be in [0, 1], got {getattr(self, name)}")
 
     @classmethod
     def off(cls) -> RandomizationCfg:
         """Return a configuration with every row off."""
         rows = [name for name, field in cls.__dataclass_fields__.items() if "Range" in str(field.type)]
-        return cls(**dict.fromkeys(rows))
+        return cls(**dict.fromkeys(rows), push_share=1.0)
 
     @classmethod
     def walking(cls) -> RandomizationCfg:
-        """Return the paper's ranges for walking."""
+        """Return the paper's ranges for walking, and either latency left out in a share of worlds."""
         return cls(
             static_friction=(0.8, 0.95),
             dynamic_friction=(0.7, 0.8),
@@ -119,27 +131,58 @@ class RandomizationCfg:
             motor_friction=(0.0, 0.04),
             latency=(0.0, 32.0),
             observation_latency=(0.0, 32.0),
+            no_latency=0.2,
             force=(-10.0, 10.0),
-            push_interval=(0.2, 0.5),
-            push_share=0.25,
             push_in_flight=True,
         )
+
+    @property
+    def nominal_friction(self) -> float:
+        """Return the paws' coefficient [1] of robots of which nothing is drawn."""
+        return MEAN_FRICTION if self.dynamic_friction else NOMINAL_FRICTION
+
+    def in_tests(self) -> RandomizationCfg:
+        """Return the same ranges, drawn at every reset, with pushes that come and go, however the training had it."""
+        timing = {} if self.push_interval else {"push_interval": PUSH_INTERVAL, "push_share": PUSH_SHARE}
+        return replace(self, redraw="reset", **timing)
+
+    def with_fixed(
+        self,
+        *,
+        latency: float | None = None,
+        gains: tuple[float, float] | None = None,
+        friction: float | None = None,
+    ) -> RandomizationCfg:
+        """Return the same with rows of one value: latency [ms], scales of kp and kd [1], friction of the paws [1].
+
+        Raises ValueError: a value out of range.
+        """
+        kp, kd = gains or (None, None)
+        rows = {"latency": latency, "gains": kp, "damping_gains": kd, "dynamic_friction": friction,
+                "static_friction": friction}  # fmt: skip
+        return replace(self, **{name: (value, value) for name, value in rows.items() if value is not None})
 
     def events(self) -> tuple[EventTerm, ...]:
         """Return the rows that are on as events."""
         found = []
 
-        def add(func: Any, pair: Range, scale: float = 1.0, spread: bool = False) -> None:
+        def add(func: Any, pair: Range, scale: float = 1.0, spread: bool = False, **more: float) -> None:
             if pair is not None:
                 lower, upper = scale * pair[0], scale * pair[1]
-                found.append(EventTerm(func, mode=self.redraw, spread=spread, lower=lower, upper=upper))
+                found.append(EventTerm(func, mode=self.redraw, spread=spread, lower=lower, upper=upper, **more))
 
         add(parameters.base_mass, self.base_mass)
         add(parameters.link_mass, self.link_mass, spread=True)
         add(parameters.com_shift, self.com_shift)
         add(parameters.armature, self.armature, spread=True)
         add(parameters.motor_friction, self.motor_friction, spread=True)
-        add(parameters.gains, self.gains, spread=True)
+        if self.gains or self.damping_gains:
+            kp = self.gains or (1.0, 1.0)
+            kd = self.damping_gains or kp
+            found.append(
+                EventTerm(parameters.gains, mode=self.redraw, spread=True, kp_lower=kp[0], kp_upper=kp[1],
+                          kd_lower=kd[0], kd_upper=kd[1])
+            )  # fmt: skip
         if self.no_load_speed or self.cutoff_speed:
             low, high = self.no_load_speed or (1.0, 1.0), self.cutoff_speed or (1.0, 1.0)
             found.append(
@@ -154,8 +197,8 @@ class RandomizationCfg:
                 EventTerm(parameters.friction, mode=self.redraw, dynamic_lower=dynamic[0], dynamic_upper=dynamic[1],
                           static_lower=static[0], static_upper=static[1])
             )  # fmt: skip
-        add(parameters.action_latency, self.latency, 1.0e-3)
-        add(parameters.observation_latency, self.observation_latency, 1.0e-3)
+        add(parameters.action_latency, self.latency, 1.0e-3, none=self.no_latency)
+        add(parameters.observation_latency, self.observation_latency, 1.0e-3, none=self.no_latency)
         if self.force or self.torque:
             force, torque = self.force or (0.0, 0.0), self.torque or (0.0, 0.0)
             timing: dict[str, Any] = {"mode": "reset", "repack": False}

@@ -61,7 +61,8 @@ def over_baseline(checkout: Path | None, script: str, args: Any, figures: Mappin
         raise InputError(f"no {script} in {checkout}")
     with tempfile.TemporaryDirectory() as folder:
         command = [sys.executable, script, *flags_of(args), "--out", folder]
-        env = os.environ | {"PYTHONPATH": str(checkout.resolve())}
+        found = [str(checkout.resolve()), *filter(None, [os.environ.get("PYTHONPATH")])]
+        env = os.environ | {"PYTHONPATH": os.pathsep.join(found)}
         done = subprocess.run(command, cwd=checkout, env=env, capture_output=True, text=True, check=False)
         if done.returncode:
             raise InputError(f"{script} of {checkout} fails: {done.stderr.strip().splitlines()[-1:]}")

@@ -1,4 +1,4 @@
-"""Passive forces in motor space: friction, damping and hard stops, implicit in the end-of-step rates.
+"""Passive forces in motor space: friction, damping and pressed hard stops, implicit in the end-of-step rates.
 
 Each force is linear in the rates after the step, tau = b - C q'(t + dt), so that it adds dt C to the inertia and
 b - C q'(t) to the torque: stiff stops stay stable at any step size.
@@ -8,6 +8,7 @@ import warp as wp
 
 from ..kinematics.five_bar import FiveBar
 from ..scalar import mat33, real, vec3
+from .stops import StopRows, stop_forces
 
 # below this rate [rad/s] Coulomb friction falls linearly to zero
 FRICTION_SPEED = wp.constant(real(0.01))
@@ -24,12 +25,6 @@ class JointParams:
     knee_damping_inner: real
     knee_limit_outer: real  # [N m] largest torque of the knee damping
     knee_limit_inner: real
-    lower: vec3  # [rad]
-    upper: vec3
-    sum_lower: real  # [rad]
-    sum_upper: real
-    stop_ke: real  # [N m/rad]
-    stop_kd: real  # [N m s/rad]
 
 
 @wp.struct
@@ -38,28 +33,6 @@ class JointForces:
 
     torque: vec3
     inertia: mat33
-
-
-@wp.func
-def stop_inertia(angle: real, rate: real, lower: real, upper: real, ke: real, kd: real, dt: real) -> real:
-    """Return dt C [kg m^2] of a pair of hard stops; zero while the joint stays inside through the step."""
-    ahead = angle + dt * rate
-    if ahead < lower:
-        return dt * (dt * ke + wp.where(rate < real(0.0), kd, real(0.0)))
-    if ahead > upper:
-        return dt * (dt * ke + wp.where(rate > real(0.0), kd, real(0.0)))
-    return real(0.0)
-
-
-@wp.func
-def stop_torque(angle: real, rate: real, lower: real, upper: real, ke: real, kd: real, dt: real) -> real:
-    """Return the torque [N m] of a pair of hard stops at the current rate: a stiff spring, damped while approaching."""
-    ahead = angle + dt * rate
-    if ahead < lower:
-        return ke * (lower - ahead) - wp.where(rate < real(0.0), kd * rate, real(0.0))
-    if ahead > upper:
-        return ke * (upper - ahead) - wp.where(rate > real(0.0), kd * rate, real(0.0))
-    return real(0.0)
 
 
 @wp.func
@@ -91,30 +64,16 @@ def knee_damping(p: JointParams, loop: FiveBar, front: real, rates: vec3) -> mat
 
 
 @wp.func
-def joint_forces(p: JointParams, loop: FiveBar, front: real, angles: vec3, rates: vec3, dt: real) -> JointForces:
-    """Return friction, knee damping and hard stops of one leg.
+def joint_forces(
+    p: JointParams, loop: FiveBar, front: real, rates: vec3, rows: StopRows, pressed: int, dt: real
+) -> JointForces:
+    """Return friction, knee damping and pressed hard stops of one leg.
 
-    angles, rates: lateral, outer, inner [rad], [rad/s]; dt: step [s].
+    rates: lateral, outer, inner [rad/s]; rows, pressed: the leg's stops, see `stops`; dt: step [s].
     """
-    zero = real(0.0)
     damping = knee_damping(p, loop, front, rates) + wp.diag(joint_friction(p, rates))
-    fold = angles[1] + angles[2]
-    fold_rate = rates[1] + rates[2]
-    stops = vec3(
-        stop_torque(angles[0], rates[0], p.lower[0], p.upper[0], p.stop_ke, p.stop_kd, dt),
-        stop_torque(angles[1], rates[1], p.lower[1], p.upper[1], p.stop_ke, p.stop_kd, dt),
-        stop_torque(angles[2], rates[2], p.lower[2], p.upper[2], p.stop_ke, p.stop_kd, dt),
-    )
-    fold_stop = stop_torque(fold, fold_rate, p.sum_lower, p.sum_upper, p.stop_ke, p.stop_kd, dt)
-    stops_inertia = vec3(
-        stop_inertia(angles[0], rates[0], p.lower[0], p.upper[0], p.stop_ke, p.stop_kd, dt),
-        stop_inertia(angles[1], rates[1], p.lower[1], p.upper[1], p.stop_ke, p.stop_kd, dt),
-        stop_inertia(angles[2], rates[2], p.lower[2], p.upper[2], p.stop_ke, p.stop_kd, dt),
-    )
-    both = vec3(zero, real(1.0), real(1.0))
-    fold_inertia = stop_inertia(fold, fold_rate, p.sum_lower, p.sum_upper, p.stop_ke, p.stop_kd, dt)
-
+    stops = stop_forces(rows, rates, pressed, dt)
     forces = JointForces()
-    forces.torque = stops + fold_stop * both - damping * rates
-    forces.inertia = dt * damping + wp.diag(stops_inertia) + fold_inertia * wp.outer(both, both)
+    forces.torque = stops.torque - damping * rates
+    forces.inertia = stops.inertia + dt * damping
     return forces

@@ -1,15 +1,25 @@
 """Passive joint forces that general solvers lack, as explicit torques: damped knees with a cap, stops of the fold.
 
-`SolverJumper` has both built in, implicitly (`joint_forces`).
+`SolverJumper` has both built in, implicitly (`joint_forces`, `stops`).
 """
 
 import warp as wp
 
 from ..layout import COORDS, DOFS
 from ..scalar import real
-from .joint_forces import capped_damping, stop_torque
+from .joint_forces import capped_damping
 
 wp.set_module_options({"enable_backward": False})
+
+
+@wp.func
+def stop_torque(angle: real, rate: real, lower: real, upper: real, ke: real, kd: real) -> real:
+    """Return the torque [N m] of a pair of hard stops: a spring, damped while the angle goes further in."""
+    if angle < lower:
+        return ke * (lower - angle) - wp.where(rate < real(0.0), kd * rate, real(0.0))
+    if angle > upper:
+        return ke * (upper - angle) - wp.where(rate > real(0.0), kd * rate, real(0.0))
+    return real(0.0)
 
 
 @wp.kernel
@@ -40,6 +50,6 @@ def passive_torque_kernel(
     joint_f[d + 4] = -capped_damping(knee_damping, inner_rate, knee_limit) * inner_rate
     fold = joint_q[q + 1] + joint_q[q + 3]
     fold_rate = joint_qd[d + 1] + joint_qd[d + 3]
-    stop = stop_torque(fold, fold_rate, sum_lower, sum_upper, stop_ke, stop_kd, real(0.0))
+    stop = stop_torque(fold, fold_rate, sum_lower, sum_upper, stop_ke, stop_kd)
     joint_f[d + 1] = joint_f[d + 1] + stop
     joint_f[d + 3] = joint_f[d + 3] + stop

@@ -2,17 +2,17 @@
 
 import warp as wp
 
-from ..layout import GRAVITY
+from ..actuation.stops import StopRows
 from ..scalar import real, vec3
 from ..state import BaseState, base_com, leg_coord, leg_dof, load_base, load_motors, store_base, store_motors
 from ..terrain.ground import has_block, move_block
-from .base_dynamics import LegSolve, add_leg, invert, motor_acceleration, solve_ang, solve_lin
+from .base_dynamics import LegSolve
 from .base_motion import moved_base
-from .contact import ContactState, PawContact, block_velocity, push_on_block, solve_contacts
+from .contact import ContactState, PawContact, block_velocity, push_on_block
 from .drive import Drive, Workspace, applied_torque, base_wrench, load_leg_drive, park
 from .leg_dynamics import PawKinematics
-from .parameters import load_vec3
-from .step import Robot, StepSettings, base_system, block_law, finite_base, leg_terms, load_leg, paw_contact
+from .step import Robot, StepSettings, block_law, finite_base
+from .world_step import solve_step
 
 wp.set_module_options({"enable_backward": False})
 
@@ -20,47 +20,34 @@ wp.set_module_options({"enable_backward": False})
 @wp.func
 def advance_once(
     robot: Robot, settings: StepSettings, drive: Drive, work: Workspace, world: int, step: int, base: BaseState,
-    angles: wp.array(dtype=vec3), rates: wp.array(dtype=vec3), legs: wp.array(dtype=LegSolve),
-    paws: wp.array(dtype=PawKinematics), contacts: wp.array(dtype=PawContact), peaks: wp.array(dtype=real),
+    angles: wp.array(dtype=vec3), rates: wp.array(dtype=vec3), torques: wp.array(dtype=vec3),
+    rows: wp.array(dtype=StopRows), pressed: wp.array(dtype=int), legs: wp.array(dtype=LegSolve),
+    paws: wp.array(dtype=PawKinematics), contacts: wp.array(dtype=PawContact), ends: wp.array(dtype=vec3),
+    peaks: wp.array(dtype=real),
 ) -> BaseState:  # fmt: skip
     """Advance one world by one step; angles and rates of the legs' motors are updated in place."""
     dt = settings.dt
     last = step == settings.substeps - 1
-    g = wp.quat_rotate_inv(base.quat, load_vec3(robot.table, GRAVITY, world))
-    wrench = base_wrench(drive, world)
-    force = vec3(real(wrench[0]), real(wrench[1]), real(wrench[2]))
-    moment = vec3(real(wrench[3]), real(wrench[4]), real(wrench[5]))
-    system = base_system(robot, world, base, g, force, moment)
-    for k in range(legs.shape[0]):
-        torque = applied_torque(load_leg_drive(drive, world, k), step, angles[k], rates[k])
+    for k in range(torques.shape[0]):
+        torques[k] = applied_torque(load_leg_drive(drive, world, k), step, angles[k], rates[k])
         if last:
             for j in range(3):
-                work.torque[3 * k + j, world] = torque[j]
-        terms = leg_terms(load_leg(robot, world, k), angles[k], rates[k], torque, base.ang, g, dt)
-        legs[k] = terms.solve
-        paws[k] = terms.paw
-        system = add_leg(system, terms.dynamics, terms.solve)
-    inverse = invert(system)
-    lin_acc = solve_lin(inverse, system.force, system.moment)
-    ang_acc = solve_ang(inverse, system.force, system.moment)
-    lin = wp.quat_rotate_inv(base.quat, base.lin) + dt * lin_acc
-    ang = base.ang + dt * ang_acc
+                work.torque[3 * k + j, world] = torques[k][j]
+    wrench = base_wrench(drive, world)
+    force = vec3(wrench[0], wrench[1], wrench[2])
+    moment = vec3(wrench[3], wrench[4], wrench[5])
     block = block_law(robot, world, base, dt)
-    for k in range(legs.shape[0]):
-        old = rates[k]
-        rates[k] = old + dt * motor_acceleration(legs[k], lin_acc, ang_acc)
-        contacts[k] = paw_contact(
-            robot, world, k, base, lin, ang, rates[k], old, work.impulse[k, world], paws[k], legs[k], inverse, block, dt
-        )
-    change = solve_contacts(contacts, block, settings.max_sweeps, settings.tolerance)
+    solved = solve_step(
+        robot, settings, world, base, force, moment, block, work.impulse, angles, rates, torques, rows, pressed, legs,
+        paws, contacts, ends,
+    )  # fmt: skip
     if has_block(robot.ground, world):
         move_block(robot.ground, world, wp.quat_rotate(base.quat, block_velocity(block, push_on_block(contacts))), dt)
-    record_contacts(work, world, base, contacts, change, dt, last, peaks)
-    for k in range(legs.shape[0]):
-        push = legs[k].inverse * (wp.transpose(contacts[k].jacobian) * contacts[k].impulse)
-        rates[k] += push - legs[k].to_lin * change.lin - legs[k].to_ang * change.ang
-        angles[k] += dt * rates[k]
-    return moved_base(base, lin + change.lin, ang + change.ang, dt)
+    record_contacts(work, world, base, contacts, solved.contact, dt, last, peaks)
+    for k in range(angles.shape[0]):
+        rates[k] = ends[k]
+        angles[k] += dt * ends[k]
+    return moved_base(base, solved.lin, solved.ang, dt)
 
 
 @wp.func
@@ -112,6 +99,10 @@ def advance_kernel(
     for k in range(angles.shape[0]):
         angles[k] = load_motors(joint_q, leg_coord(world, k))
         rates[k] = load_motors(joint_qd, leg_dof(world, k))
+    torques = wp.zeros(shape=(4,), dtype=vec3)
+    ends = wp.zeros(shape=(4,), dtype=vec3)
+    rows = wp.zeros(shape=(4,), dtype=StopRows)
+    pressed = wp.zeros(shape=(4,), dtype=int)
     legs = wp.zeros(shape=(4,), dtype=LegSolve)
     paws = wp.zeros(shape=(4,), dtype=PawKinematics)
     contacts = wp.zeros(shape=(4,), dtype=PawContact)
@@ -120,7 +111,10 @@ def advance_kernel(
     work.peak_force[world] = real(0.0)
     peaks = wp.zeros(shape=(4,), dtype=real)
     for step in range(settings.substeps):
-        base = advance_once(robot, settings, drive, work, world, step, base, angles, rates, legs, paws, contacts, peaks)
+        base = advance_once(
+            robot, settings, drive, work, world, step, base, angles, rates, torques, rows, pressed, legs, paws,
+            contacts, ends, peaks,
+        )  # fmt: skip
     total = real(0.0)
     for k in range(angles.shape[0]):
         work.peak_paw_force[k, world] = wp.sqrt(peaks[k]) / settings.dt

@@ -2,11 +2,13 @@
 
 A thread holds one leg and a copy of the base; the base's equations are sums over the four threads. The contact law is
 that of `contact`; here all paws propose their next impulse at once and the one whose contact velocity would change
-most takes it, until none would change by more than the tolerance.
+most takes it, until none would change by more than the tolerance. A step whose stops turn out wrong (see `world_step`)
+is made again by its world, while the others of a warp go on.
 """
 
 import warp as wp
 
+from ..actuation.stops import MAX_SETS, ONE_BY_ONE, SLACK, change_one, pressed_stops, stop_rows
 from ..layout import GRAVITY
 from ..scalar import real, vec3
 from ..state import BaseState, base_com, leg_coord, leg_dof, load_base, load_motors, store_base, store_motors
@@ -15,9 +17,20 @@ from .base_dynamics import BaseSystem, add_leg, invert, motor_acceleration, solv
 from .base_motion import moved_base
 from .contact import BlockLaw, PawContact, block_velocity, local_impulse
 from .drive import Drive, LegDrive, Workspace, applied_torque, base_wrench, load_leg_drive, park
-from .lanes import any_world, first_leg, max_legs, meet, sum_legs, sum_systems, sum_vec, vec_from_leg
-from .parameters import load_vec3
-from .step import LegParams, Robot, StepSettings, base_system, block_law, finite_base, leg_terms, load_leg, paw_contact
+from .lanes import any_world, first_leg, from_leg, max_legs, meet, sum_legs, sum_systems, sum_vec, vec_from_leg
+from .parameters import load_stops, load_vec3
+from .step import (
+    LegParams,
+    Robot,
+    StepSettings,
+    base_system,
+    block_law,
+    finite_base,
+    hold_base,
+    leg_terms,
+    load_leg,
+    paw_contact,
+)
 
 # division and roots are rounded to 2 units in the last place, as a third of the code
 wp.set_module_options({"enable_backward": False, "fast_math": True})
@@ -36,6 +49,9 @@ class LegState:
     total_sq: real  # [N^2 s^2] largest sum of the impulses, squared
     residual: real  # [m/s] of the contact iteration, largest
     updates: int  # of paw impulses, most of a step
+    step: int  # steps made in this launch
+    sets: int  # sets of pressed stops tried for the present step without agreement
+    pressed: int  # the leg's next one
 
 
 @wp.struct
@@ -91,21 +107,28 @@ def solve_paws(
 @wp.func
 def advance_leg(
     robot: Robot, settings: StepSettings, drive: Drive, own: LegParams, motors: LegDrive, world: int, leg: int,
-    step: int, old: LegState, writes: bool,
+    old: LegState, writes: bool,
 ) -> LegState:  # fmt: skip
-    """Return the thread's state after one step; writes: whether the thread is the one that moves its world's block."""
+    """Return the thread's state after a step, or the old one with another set of stops to try for the same step.
+
+    writes: whether the thread is the one that moves its world's block. A world that has made its steps stays.
+    """
     dt = settings.dt
     blocks = robot.ground.blocks.shape[0] > 0
     base = old.base
     g = wp.quat_rotate_inv(base.quat, load_vec3(robot.table, GRAVITY, world))
-    torque = applied_torque(motors, step, old.angles, old.rates)
-    terms = leg_terms(own, old.angles, old.rates, torque, base.ang, g, dt)
+    torque = applied_torque(motors, old.step, old.angles, old.rates)
+    rows = stop_rows(load_stops(robot.table, leg, world), old.angles, dt)
+    pressed = old.pressed
+    if old.sets == 0:
+        pressed = pressed_stops(rows, old.rates, real(0.0), 0)
+    terms = leg_terms(own, old.angles, old.rates, torque, rows, pressed, base.ang, g, dt)
     wrench = base_wrench(drive, world)
-    force = vec3(real(wrench[0]), real(wrench[1]), real(wrench[2]))
-    moment = vec3(real(wrench[3]), real(wrench[4]), real(wrench[5]))
+    force = vec3(wrench[0], wrench[1], wrench[2])
+    moment = vec3(wrench[3], wrench[4], wrench[5])
     share = add_leg(BaseSystem(), terms.dynamics, terms.solve)
     system = sum_systems(base_system(robot, world, base, g, force, moment), share)
-    inverse = invert(system)
+    inverse = hold_base(robot, world, invert(system))
     lin_acc = solve_lin(inverse, system.force, system.moment)
     ang_acc = solve_ang(inverse, system.force, system.moment)
     lin = wp.quat_rotate_inv(base.quat, base.lin) + dt * lin_acc
@@ -113,28 +136,43 @@ def advance_leg(
     rates = old.rates + dt * motor_acceleration(terms.solve, lin_acc, ang_acc)
     block = block_law(robot, world, base, dt)
     contact = paw_contact(
-        robot, world, leg, base, lin, ang, rates, old.rates, old.impulse, terms.paw, terms.solve, inverse, block, dt
-    )
+        robot, world, leg, base, lin, ang, rates, old.rates, old.impulse, pressed, terms.paw, terms.solve, inverse,
+        block, dt,
+    )  # fmt: skip
     solved = solve_paws(contact, blocks, block, leg, 4 * settings.max_sweeps, settings.tolerance)
-    if blocks:
-        push = sum_vec(wp.where(contact.on_block != 0, -solved.impulse, vec3(real(0.0))))
-        if writes and robot.ground.blocks[world].exists != 0:
-            move_block(robot.ground, world, wp.quat_rotate(base.quat, block_velocity(block, push)), dt)
-        meet()
     solve = terms.solve
     rates += solve.inverse * (wp.transpose(contact.jacobian) * solved.impulse)
     rates -= solve.to_lin * solved.lin + solve.to_ang * solved.ang
     total = sum_vec(solved.impulse)
-    new = LegState()
-    new.base = moved_base(base, lin + solved.lin, ang + solved.ang, dt)
-    new.angles = old.angles + dt * rates
-    new.rates = rates
-    new.torque = torque
-    new.impulse = wp.quat_rotate(base.quat, solved.impulse)
-    new.peak_sq = wp.max(old.peak_sq, wp.dot(solved.impulse, solved.impulse))
-    new.total_sq = wp.max(old.total_sq, wp.dot(total, total))
-    new.residual = wp.max(old.residual, solved.residual)
-    new.updates = wp.max(old.updates, solved.updates)
+    wanted = pressed_stops(rows, rates, SLACK * settings.tolerance, pressed)
+    first = first_leg(wanted != pressed)
+    agreed = from_leg(wp.where(wanted != pressed, real(1.0), real(0.0)), first) == real(0.0)
+    done = old.step < settings.substeps and (agreed or old.sets + 1 >= MAX_SETS)
+    if blocks:
+        push = sum_vec(wp.where(contact.on_block != 0, -solved.impulse, vec3(real(0.0))))
+        if writes and done and robot.ground.blocks[world].exists != 0:
+            move_block(robot.ground, world, wp.quat_rotate(base.quat, block_velocity(block, push)), dt)
+        meet()
+    new = old
+    if done:
+        new.base = moved_base(base, lin + solved.lin, ang + solved.ang, dt)
+        new.angles = old.angles + dt * rates
+        new.rates = rates
+        new.torque = torque
+        new.impulse = wp.quat_rotate(base.quat, solved.impulse)
+        new.peak_sq = wp.max(old.peak_sq, wp.dot(solved.impulse, solved.impulse))
+        new.total_sq = wp.max(old.total_sq, wp.dot(total, total))
+        new.residual = wp.max(old.residual, solved.residual)
+        new.updates = wp.max(old.updates, solved.updates)
+        new.step = old.step + 1
+        new.sets = 0
+    else:
+        new.sets = old.sets + 1
+        new.pressed = pressed
+        if new.sets < ONE_BY_ONE:
+            new.pressed = wanted
+        elif leg == first:
+            new.pressed = change_one(pressed, wanted)
     return new
 
 
@@ -169,8 +207,8 @@ def advance_legs_kernel(
     s.impulse = work.impulse[leg, world]
     own = load_leg(robot, world, leg)
     motors = load_leg_drive(drive, world, leg)
-    for step in range(settings.substeps):
-        s = advance_leg(robot, settings, drive, own, motors, world, leg, step, s, leg == 0 and place < count)
+    while any_world(s.step < settings.substeps):
+        s = advance_leg(robot, settings, drive, own, motors, world, leg, s, leg == 0 and place < count)
     total = sum_legs(wp.dot(s.angles, s.angles) + wp.dot(s.rates, s.rates))
     broken = work.invalid[world] != 0 or not (finite_base(s.base) and wp.isfinite(total))
     if place >= count:

@@ -28,6 +28,8 @@ PUSH_OUT = wp.constant(real(0.2))
 PUSH_OUT_SPEED = wp.constant(real(1.0))
 # paws that could close this much [m] more than their free motion are solved for
 CONTACT_MARGIN = wp.constant(real(0.02))
+# gaps [m], either way, that a paw of a leg on a hard stop keeps
+STIFF_BAND = wp.constant(real(2.0e-6))
 # slower contacts [m/s] start the step with static friction
 STICK_SPEED = wp.constant(real(0.01))
 
@@ -76,11 +78,18 @@ def contact_jacobian(paw: PawKinematics, arm: vec3) -> mat33:
 
 
 @wp.func
-def target_normal_velocity(gap: real, dt: real) -> real:
-    """Return the smallest admissible normal velocity [m/s] for a gap [m]: close it exactly, push penetration out."""
-    if gap > real(0.0):
-        return -gap / dt
-    return wp.min(-PUSH_OUT * gap / dt, PUSH_OUT_SPEED)
+def target_normal_velocity(gap: real, pressed: int, dt: real) -> real:
+    """Return the smallest admissible normal velocity [m/s] for a gap [m]: close it exactly, push penetration out.
+
+    pressed: the leg's pressed hard stops. On stops four legs carry the body as a table, and what rounding adds to a
+    gap would shift load between them: then gaps within `STIFF_BAND` stay as they are.
+    """
+    beyond = gap
+    if pressed != 0:
+        beyond = gap - wp.clamp(gap, -STIFF_BAND, STIFF_BAND)
+    if beyond > real(0.0):
+        return -beyond / dt
+    return wp.min(-PUSH_OUT * beyond / dt, PUSH_OUT_SPEED)
 
 
 @wp.func

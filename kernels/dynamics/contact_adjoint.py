@@ -1,31 +1,36 @@
-"""The contact solve of the differentiable step, and its implicit derivative."""
+"""The solution of contacts and stops for the differentiable step, and the implicit derivative of contact."""
 
 import warp as wp
 
+from ..actuation.stops import StopRows
 from ..scalar import mat33, real, vec3
-from ..state import base_com, leg_dof, load_base, load_motors
-from .contact import SEPARATE, SLIDE, BlockLaw, PawContact, contact_mode, solve_contacts
-from .differentiable import BaseArrays, LegArrays, Velocities, load_inverse, load_paw, load_solve
-from .step import Robot, paw_contact
+from ..state import base_com, leg_coord, leg_dof, load_base, load_motors
+from .base_dynamics import LegSolve
+from .contact import SEPARATE, SLIDE, BlockLaw, PawContact, contact_mode
+from .differentiable import BaseArrays, LegArrays, Velocities, base_load, load_inverse, load_paw, load_solve
+from .leg_dynamics import PawKinematics
+from .step import Robot, StepSettings, paw_contact
+from .world_step import solve_step
 
 wp.set_module_options({"enable_backward": False})
 
 
 @wp.struct
 class Solution:
-    """A solved contact problem, arrays of shape (4, num_worlds)."""
+    """Solved contacts and stops, arrays of shape (4, num_worlds)."""
 
     impulse: wp.array2d(dtype=vec3)  # [N s], body axes
     mode: wp.array2d(dtype=int)  # SEPARATE, STICK, SLIDE
     mu_row: wp.array2d(dtype=int)  # row of the friction coefficient in the parameter table
+    pressed: wp.array2d(dtype=int)  # set of hard stops
 
 
 @wp.func
 def load_contacts(
     robot: Robot, world: int, joint_q: wp.array(dtype=real), joint_qd: wp.array(dtype=real), legs: LegArrays,
-    base_eqs: BaseArrays, guess: wp.array2d(dtype=vec3), dt: real, contacts: wp.array(dtype=PawContact),
+    base_eqs: BaseArrays, solution: Solution, dt: real, contacts: wp.array(dtype=PawContact),
 ):  # fmt: skip
-    """Write a world's contact problem to `contacts`; guess: impulses [N s], world frame."""
+    """Write a solved world's contact problem to `contacts`."""
     base = load_base(joint_q, joint_qd, base_com(robot.table, world), world)
     lin = wp.quat_rotate_inv(base.quat, base.lin) + dt * base_eqs.lin_acc[world]
     ang = base.ang + dt * base_eqs.ang_acc[world]
@@ -38,42 +43,59 @@ def load_contacts(
         )
         paw = load_paw(legs, k, world)
         contacts[k] = paw_contact(
-            robot, world, k, base, lin, ang, rates, old, guess[k, world], paw, solve, inverse,
-            BlockLaw(), dt,
+            robot, world, k, base, lin, ang, rates, old, solution.impulse[k, world], solution.pressed[k, world], paw,
+            solve, inverse, BlockLaw(), dt,
         )  # fmt: skip
 
 
 @wp.kernel
-def contact_kernel(
+def settle_kernel(
     # in
     robot: Robot,
+    settings: StepSettings,
     joint_q: wp.array(dtype=real),
     joint_qd: wp.array(dtype=real),
-    legs: LegArrays,
-    base_eqs: BaseArrays,
-    dt: real,
-    max_sweeps: int,
-    tolerance: real,
+    joint_f: wp.array(dtype=real),
+    body_f: wp.array(dtype=wp.spatial_vector),
     # in, out
     guess: wp.array2d(dtype=vec3),
     # out
     solution: Solution,
     contact_force: wp.array2d(dtype=vec3),
 ):
-    """Solve every world's contacts; `guess` receives the impulses [N s] in the world frame for the next step."""
+    """Solve every world's contacts and stops; `guess` receives the impulses [N s] in the world frame for the next step.
+
+    One thread per world.
+    """
     world = wp.tid()
-    contacts = wp.zeros(shape=(4,), dtype=PawContact)
-    load_contacts(robot, world, joint_q, joint_qd, legs, base_eqs, guess, dt, contacts)
-    solve_contacts(contacts, BlockLaw(), max_sweeps, tolerance)
     base = load_base(joint_q, joint_qd, base_com(robot.table, world), world)
+    outside = base_load(joint_f, body_f, world)
+    angles = wp.zeros(shape=(4,), dtype=vec3)
+    rates = wp.zeros(shape=(4,), dtype=vec3)
+    torques = wp.zeros(shape=(4,), dtype=vec3)
+    for k in range(angles.shape[0]):
+        angles[k] = load_motors(joint_q, leg_coord(world, k))
+        rates[k] = load_motors(joint_qd, leg_dof(world, k))
+        torques[k] = load_motors(joint_f, leg_dof(world, k))
+    rows = wp.zeros(shape=(4,), dtype=StopRows)
+    pressed = wp.zeros(shape=(4,), dtype=int)
+    legs = wp.zeros(shape=(4,), dtype=LegSolve)
+    paws = wp.zeros(shape=(4,), dtype=PawKinematics)
+    contacts = wp.zeros(shape=(4,), dtype=PawContact)
+    ends = wp.zeros(shape=(4,), dtype=vec3)
+    solve_step(
+        robot, settings, world, base, outside.force, outside.moment, BlockLaw(), guess, angles, rates, torques, rows,
+        pressed, legs, paws, contacts, ends,
+    )  # fmt: skip
     for k in range(contacts.shape[0]):
         c = contacts[k]
         solution.impulse[k, world] = c.impulse
         solution.mu_row[k, world] = c.mu_row
         solution.mode[k, world] = contact_mode(c.impulse, c.normal, c.mu)
+        solution.pressed[k, world] = pressed[k]
         in_world = wp.quat_rotate(base.quat, c.impulse)
         guess[k, world] = in_world
-        contact_force[k, world] = in_world / dt
+        contact_force[k, world] = in_world / settings.dt
 
 
 @wp.func
@@ -156,7 +178,7 @@ def implicit_kernel(
     """Turn the gradient of the impulses into that of the residual, -(dR/dp)^-T times it, and clear it."""
     world = wp.tid()
     contacts = wp.zeros(shape=(4,), dtype=PawContact)
-    load_contacts(robot, world, joint_q, joint_qd, legs, base_eqs, solution.impulse, dt, contacts)
+    load_contacts(robot, world, joint_q, joint_qd, legs, base_eqs, solution, dt, contacts)
     a = wp.zeros(shape=(12, 12), dtype=real)
     b = wp.zeros(shape=(12,), dtype=real)
     for k in range(4):

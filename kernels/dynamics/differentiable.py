@@ -2,16 +2,18 @@
 
     legs -> velocities (a) -> contact residual | implicit solve | velocities (b) -> integration
 
-The contact impulses p come from the iteration of `contact`, which is not differentiated. They solve
+The pressed hard stops and the contact impulses p come from `world_step`, which is not differentiated. Pressed stops
+are part of the legs (`joint_forces`), differentiated with their set held. The impulses solve
 R(p, x) = 0 (see `contact_residual`), so with the contact modes (separated, sticking, sliding) held,
 dp/dx = -(dR/dp)^-1 dR/dx: going backwards, `implicit_kernel` turns the gradient of p that (b) left behind into the
-gradient of R, and the adjoints of the residual and of (a) carry it on to x. Where a mode changes the solution has a
-kink; the gradient is that of the mode the forward pass found.
+gradient of R, and the adjoints of the residual and of (a) carry it on to x. Where a mode or a set changes the solution
+has a kink; the gradient is that of the mode the forward pass found.
 """
 
 import warp as wp
 
 from ..actuation.joint_forces import joint_forces
+from ..actuation.stops import stop_rows
 from ..kinematics.geometry import LegGeometry
 from ..layout import BASE, BODIES, DOFS, GRAVITY
 from ..scalar import mat33, real, vec3
@@ -32,7 +34,7 @@ from .base_motion import external_wrench, moved_base
 from .contact import SEPARATE, SLIDE, contact_jacobian, target_normal_velocity
 from .inertia import inertia_matrix, skew
 from .leg_dynamics import PawKinematics, leg_dynamics, leg_pose, paw_kinematics
-from .parameters import load_joint_params, load_masses, load_moments, load_vec3
+from .parameters import load_joint_params, load_masses, load_moments, load_stops, load_vec3
 
 
 @wp.struct
@@ -112,11 +114,12 @@ def legs_kernel(
     joint_q: wp.array(dtype=real),
     joint_qd: wp.array(dtype=real),
     joint_f: wp.array(dtype=real),
+    pressed: wp.array2d(dtype=int),
     dt: real,
     # out
     legs: LegArrays,
 ):
-    """Eliminate every leg; one thread per (leg, world)."""
+    """Eliminate every leg with its pressed stops, (4, num_worlds); one thread per (leg, world)."""
     k, world = wp.tid()
     geo = geometry[k]
     base = load_base(joint_q, joint_qd, base_com(table, world), world)
@@ -126,7 +129,8 @@ def legs_kernel(
     pose = leg_pose(geo, angles)
     leg = leg_dynamics(geo, load_masses(table, k, world), pose, rates, base.ang, g)
     params = load_joint_params(table, k, world)
-    passive = joint_forces(params, pose.loop, geo.front, angles, rates, dt)
+    rows = stop_rows(load_stops(table, k, world), angles, dt)
+    passive = joint_forces(params, pose.loop, geo.front, rates, rows, pressed[k, world], dt)
     torque = load_motors(joint_f, leg_dof(world, k)) + passive.torque
     solve = eliminate_leg(leg, passive.inertia + wp.diag(params.armature), torque)
     paw = paw_kinematics(geo, pose)
@@ -142,6 +146,27 @@ def legs_kernel(
     legs.position[k, world] = paw.position
     legs.jacobian[k, world] = paw.jacobian
     legs.spin[k, world] = paw.spin
+
+
+@wp.struct
+class BaseLoad:
+    """What acts on the base from outside, at its com, world axes."""
+
+    force: vec3  # [N]
+    moment: vec3  # [N m]
+
+
+@wp.func
+def base_load(
+    joint_f: wp.array(dtype=real), body_f: wp.array(dtype=wp.spatial_vector), world: int
+) -> BaseLoad:  # fmt: skip
+    """Return the sum of the base's joint forces and the wrench on its body."""
+    w = body_f[world * BODIES]
+    i = world * DOFS
+    load = BaseLoad()
+    load.force = vec3(real(w[0]) + joint_f[i], real(w[1]) + joint_f[i + 1], real(w[2]) + joint_f[i + 2])
+    load.moment = vec3(real(w[3]) + joint_f[i + 3], real(w[4]) + joint_f[i + 4], real(w[5]) + joint_f[i + 5])
+    return load
 
 
 @wp.kernel
@@ -161,11 +186,8 @@ def base_kernel(
     com = base_com(table, world)
     base = load_base(joint_q, joint_qd, com, world)
     g = wp.quat_rotate_inv(base.quat, load_vec3(table, GRAVITY, world))
-    w = body_f[world * BODIES]
-    i = world * DOFS
-    force = vec3(real(w[0]) + joint_f[i], real(w[1]) + joint_f[i + 1], real(w[2]) + joint_f[i + 2])
-    moment = vec3(real(w[3]) + joint_f[i + 3], real(w[4]) + joint_f[i + 4], real(w[5]) + joint_f[i + 5])
-    wrench = external_wrench(base, com, force, moment)
+    outside = base_load(joint_f, body_f, world)
+    wrench = external_wrench(base, com, outside.force, outside.moment)
     alone = base_alone(load_moments(table, BASE, world), base.ang, g, wrench.force, wrench.moment)
     system = BaseSystem()
     system.lin = alone.lin + legs.lin[0, world] + legs.lin[1, world] + legs.lin[2, world] + legs.lin[3, world]
@@ -288,6 +310,7 @@ def residual_kernel(
     impulse: wp.array2d(dtype=vec3),
     mode: wp.array2d(dtype=int),
     mu_row: wp.array2d(dtype=int),
+    pressed: wp.array2d(dtype=int),
     dt: real,
     # out
     residual: wp.array2d(dtype=vec3),
@@ -306,9 +329,8 @@ def residual_kernel(
         + contact_jacobian(paw, arm) * velocities.rates[k, world]
     )
     mu = table[mu_row[k, world], world]
-    residual[k, world] = contact_residual(
-        impulse[k, world], velocity, normal, target_normal_velocity(gap, dt), mu, mode[k, world]
-    )
+    goal = target_normal_velocity(gap, pressed[k, world], dt)
+    residual[k, world] = contact_residual(impulse[k, world], velocity, normal, goal, mu, mode[k, world])
 
 
 @wp.kernel

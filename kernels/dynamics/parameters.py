@@ -3,6 +3,7 @@
 import warp as wp
 
 from ..actuation.joint_forces import JointParams
+from ..actuation.stops import StopParams
 from ..layout import (
     ARMATURE,
     BASE,
@@ -73,6 +74,20 @@ def load_masses(table: wp.array2d(dtype=real), leg: int, world: int) -> LegMasse
 
 
 @wp.func
+def load_stops(table: wp.array2d(dtype=real), leg: int, world: int) -> StopParams:
+    """Return the hard stops of a leg."""
+    row = leg * LEG_ROWS
+    p = StopParams()
+    p.lower = load_vec3(table, row + LOWER, world)
+    p.upper = load_vec3(table, row + UPPER, world)
+    p.sum_lower = table[row + SUM_LOWER, world]
+    p.sum_upper = table[row + SUM_UPPER, world]
+    p.ke = table[row + STOP_KE, world]
+    p.kd = table[row + STOP_KD, world]
+    return p
+
+
+@wp.func
 def load_joint_params(table: wp.array2d(dtype=real), leg: int, world: int) -> JointParams:
     """Return the joint-space parameters of a leg."""
     row = leg * LEG_ROWS
@@ -84,12 +99,6 @@ def load_joint_params(table: wp.array2d(dtype=real), leg: int, world: int) -> Jo
     p.knee_damping_inner = table[row + KNEE_DAMPING + 1, world]
     p.knee_limit_outer = table[row + KNEE_LIMIT, world]
     p.knee_limit_inner = table[row + KNEE_LIMIT + 1, world]
-    p.lower = load_vec3(table, row + LOWER, world)
-    p.upper = load_vec3(table, row + UPPER, world)
-    p.sum_lower = table[row + SUM_LOWER, world]
-    p.sum_upper = table[row + SUM_UPPER, world]
-    p.stop_ke = table[row + STOP_KE, world]
-    p.stop_kd = table[row + STOP_KD, world]
     return p
 
 

@@ -7,6 +7,7 @@ wanted at the apex; where none is wanted, the takeoff angle is drawn.
 import warp as wp
 
 from ..mdp.random import Draw, between, within
+from ..mdp.starts import place_beside, turn_of
 from ..mdp.view import turned
 from .phase import time_to_height
 from .state import SCHEMES, JumpState, vec_schemes
@@ -97,11 +98,7 @@ def draw_quat(draw: Draw, ranges: ResetRanges, heading: float, pitch: float) -> 
     yaw = heading + between(draw, 10, -ranges.tilt, ranges.tilt)
     tip = pitch + between(draw, 11, -ranges.tilt, ranges.tilt)
     roll = between(draw, 12, -ranges.tilt, ranges.tilt)
-    return (
-        wp.quat_from_axis_angle(wp.vec3(0.0, 0.0, 1.0), yaw)
-        * wp.quat_from_axis_angle(wp.vec3(0.0, 1.0, 0.0), tip)
-        * wp.quat_from_axis_angle(wp.vec3(1.0, 0.0, 0.0), roll)
-    )
+    return turn_of(yaw, tip, roll)
 
 
 @wp.func
@@ -153,14 +150,8 @@ def draw_scheme(draw: Draw, ranges: ResetRanges, spent: vec_schemes) -> int:
 @wp.func
 def draw_paw(draw: Draw, ranges: ResetRanges, leg: int, heading: float) -> wp.vec3:
     """Return a paw's place [m] relative to the spot that they surround, world axes, z = 0."""
-    x = within(draw, 20 + leg, ranges.front_x)
-    y = within(draw, 24 + leg, ranges.front_y)
-    if leg >= 2:
-        x = -within(draw, 20 + leg, ranges.back_x)
-        y = within(draw, 24 + leg, ranges.back_y)
-    if leg % 2 == 1:
-        y = -y
-    return turned(wp.vec3(x, y, 0.0), heading)
+    place = place_beside(draw, leg, ranges.front_x, ranges.front_y, ranges.back_x, ranges.back_y)
+    return turned(place, heading)
 
 
 @wp.func

@@ -42,6 +42,12 @@ def turned_touchdown(view: RobotView, task: JumpState, rotation: float, yaw: flo
 
 
 @wp.func
+def second_takeoff(view: RobotView, task: JumpState, speed: float) -> bool:
+    """Off the ground again after touchdown, with no paw down, and upward faster than a speed [m/s]."""
+    return task.phase == LANDED and view.contacts == 0 and view.lin_vel[2] > speed
+
+
+@wp.func
 def low_touchdown(view: RobotView, task: JumpState, height: float) -> bool:
     """Base less than a height [m] above the ground at touchdown."""
     return task.touched_down == 1 and view.height < height
@@ -82,9 +88,3 @@ def no_jump(view: RobotView, task: JumpState, steps: float, idle_steps: float) -
 def early_takeoff(view: RobotView, task: JumpState) -> bool:
     """Jumped before the jump was commanded."""
     return task.took_off == 1 and task.steps < task.command_step
-
-
-@wp.func
-def second_takeoff(view: RobotView, task: JumpState, speed: float) -> bool:
-    """Off the ground again after touchdown, rising with more than a speed [m/s]."""
-    return task.phase == LANDED and view.contacts == 0 and view.lin_vel[2] > speed

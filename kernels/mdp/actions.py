@@ -65,6 +65,7 @@ def action_kernel(
             asked = 0.0
             env.bad_action[world] = 1
         action = wp.clamp(asked, -1.0, 1.0)
+        robot.older_action[m, world] = robot.old_action[m, world]
         robot.old_action[m, world] = robot.action[m, world]
         robot.action[m, world] = action
         robot.old_rate[m, world] = rates[j]

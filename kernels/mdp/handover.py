@@ -28,6 +28,7 @@ def hand_over(
         action = wp.clamp(off / skills[target].action_scale[m], -1.0, 1.0)
         robot.action[m, world] = action
         robot.old_action[m, world] = action
+        robot.older_action[m, world] = action
         set_motor(parameters, world, m)
 
 

@@ -46,6 +46,7 @@ class RobotParameters:
     nominal_no_load: wp.array2d(dtype=float)  # [rad/s]
     nominal_cutoff: wp.array2d(dtype=float)  # [rad/s]
     nominal_saturation: wp.array2d(dtype=float)  # [N m]
+    nominal_offset: wp.array(dtype=float)  # [rad] (12,) of the position sensors
     skill: wp.array(dtype=int)  # (num_worlds,) the active one
 
 
@@ -141,10 +142,12 @@ def motors_kernel(
 
 
 @wp.func
-def gains(robot: RobotParameters, draw: Draw, lower: float, upper: float):
+def gains(
+    robot: RobotParameters, draw: Draw, kp_lower: float, kp_upper: float, kd_lower: float, kd_upper: float
+):  # fmt: skip
     """Scale kp and kd of each motor."""
     for m in range(draw.lane, 12, draw.lanes):
-        ratio = wp.vec2(between(draw, m, lower, upper), between(draw, 12 + m, lower, upper))
+        ratio = wp.vec2(between(draw, m, kp_lower, kp_upper), between(draw, 12 + m, kd_lower, kd_upper))
         robot.gain_ratio[m, draw.world] = ratio
         set_gains(robot, draw.world, m, ratio)
 
@@ -165,9 +168,9 @@ def speed_limits(
 
 @wp.func
 def joint_offset(robot: RobotParameters, draw: Draw, lower: float, upper: float):
-    """Give each motor's position sensor a constant error [rad]."""
+    """Give each motor's position sensor a constant error [rad] besides its nominal one."""
     for m in range(draw.lane, 12, draw.lanes):
-        robot.motors.offset[m, draw.world] = between(draw, m, lower, upper)
+        robot.motors.offset[m, draw.world] = robot.nominal_offset[m] + between(draw, m, lower, upper)
 
 
 @wp.func
@@ -186,20 +189,28 @@ def friction(
 
 @wp.func
 def physics_steps(robot: RobotParameters, seconds: float) -> int:
-    """Return whole physics steps of a time, rounded down; a whole step stays one despite rounding errors."""
-    return int(wp.floor(seconds / robot.physics_dt + 1.0e-4))
+    """Return the number of physics steps that is nearest to a time; latencies are whole steps."""
+    return int(wp.round(seconds / robot.physics_dt))
 
 
 @wp.func
-def action_latency(robot: RobotParameters, draw: Draw, lower: float, upper: float):
-    """Delay actions [s]."""
-    robot.latency[draw.world] = physics_steps(robot, between(draw, 0, lower, upper))
+def drawn_delay(robot: RobotParameters, draw: Draw, lower: float, upper: float, none: float) -> int:
+    """Return a drawn delay [physics steps], none in a share of draws."""
+    if between(draw, 1, 0.0, 1.0) < none:
+        return 0
+    return physics_steps(robot, between(draw, 0, lower, upper))
 
 
 @wp.func
-def observation_latency(robot: RobotParameters, draw: Draw, lower: float, upper: float):
-    """Delay what the policy reads of its sensors [s]."""
-    robot.observation_latency[draw.world] = physics_steps(robot, between(draw, 0, lower, upper))
+def action_latency(robot: RobotParameters, draw: Draw, lower: float, upper: float, none: float = 0.0):
+    """Delay actions [s], but not in a share of worlds."""
+    robot.latency[draw.world] = drawn_delay(robot, draw, lower, upper, none)
+
+
+@wp.func
+def observation_latency(robot: RobotParameters, draw: Draw, lower: float, upper: float, none: float = 0.0):
+    """Delay what the policy reads of its sensors [s], but not in a share of worlds."""
+    robot.observation_latency[draw.world] = drawn_delay(robot, draw, lower, upper, none)
 
 
 @wp.func

@@ -206,6 +206,7 @@ def forget_kernel(
     robot.old_torque[m, world] = 0.0
     robot.action[m, world] = 0.0
     robot.old_action[m, world] = 0.0
+    robot.older_action[m, world] = 0.0
     robot.target[m, world] = angle
     robot.safe_target[m, world] = angle
     robot.old_rate[m, world] = robot.joint_qd[world * DOFS + 6 + slot]

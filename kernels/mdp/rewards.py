@@ -68,3 +68,15 @@ def joint_acceleration(view: RobotView, task: Any) -> float:
 def action_rate(view: RobotView, task: Any) -> float:
     """Action rate: sum of squared changes of the action."""
     return square_sum(view.action - view.old_action)
+
+
+@wp.func
+def action_acceleration(view: RobotView, task: Any) -> float:
+    """Action acceleration: sum of squared second differences of the action."""
+    return square_sum(view.action - 2.0 * view.old_action + view.older_action)
+
+
+@wp.func
+def collision(view: RobotView, task: Any) -> float:
+    """Collision: 1 if anything but a paw touched the ground, or links touched each other."""
+    return wp.where(view.collisions != 0, 1.0, 0.0)

@@ -31,6 +31,7 @@ class RobotView:
     old_torque: vec12  # [N m] last physics step of the policy step before
     action: vec12  # [1] within -1..1
     old_action: vec12
+    older_action: vec12  # two policy steps before
     clipped: float  # [rad^2] squared distance that the command filter moved the targets
     default_angle: vec12  # [rad]
     contacts: int  # number of paws on the ground
@@ -70,6 +71,7 @@ class RobotArrays:
     old_torque: wp.array2d(dtype=float)
     action: wp.array2d(dtype=float)
     old_action: wp.array2d(dtype=float)
+    older_action: wp.array2d(dtype=float)
     target: wp.array2d(dtype=float)  # [rad] before the filter
     safe_target: wp.array2d(dtype=float)  # [rad] after it
     old_rate: wp.array2d(dtype=float)
@@ -161,6 +163,7 @@ def load_view(robot: RobotArrays, ground: Ground, world: int) -> RobotView:
         view.old_torque[m] = robot.old_torque[m, world]
         view.action[m] = robot.action[m, world]
         view.old_action[m] = robot.old_action[m, world]
+        view.older_action[m] = robot.older_action[m, world]
         view.default_angle[m] = robot.default_angle[m]
         off = robot.target[m, world] - robot.safe_target[m, world]
         clipped += off * off

@@ -158,3 +158,29 @@ def trot_schedule(view: RobotView, task: VelocityState, duty: float) -> float:
         wanted = wp.where(phase < duty, 1.0, 0.0)
         total += 0.25 * (1.0 - wp.abs(wanted - view.contact[k]))
     return total * moving(task)
+
+
+@wp.func
+def shank_lean(view: RobotView, task: VelocityState, free: float, hip: float, thigh: float, shank: float) -> float:
+    """Shank lean: sum over both shanks of paws on the ground of squared angles from vertical beyond `free` [rad].
+
+    A shank that leans far over its paw hits the edge of a step beside it. The angles are those in the leg's plane, with
+    the pitch of the base. hip: half the distance of the transversal axes [m]; thigh, shank: lengths [m].
+    """
+    down = wp.vec2(view.gravity[0], view.gravity[2])
+    total = float(0.0)
+    for k in range(4):
+        front = wp.where(k < 2, 1.0, -1.0)
+        outer, inner = view.angle[3 * k + 1], view.angle[3 * k + 2]
+        knee = wp.vec2(front * (hip + thigh * wp.sin(outer)), -thigh * wp.cos(outer))
+        twin = wp.vec2(-front * (hip + thigh * wp.sin(inner)), -thigh * wp.cos(inner))
+        apart = wp.length(knee - twin)
+        along = wp.vec2(-(knee - twin)[1], (knee - twin)[0]) * (-front / wp.max(apart, 1.0e-6))
+        reach = wp.sqrt(wp.max(shank * shank - 0.25 * apart * apart, 0.0))
+        ankle = 0.5 * (knee + twin) + reach * along
+        for j in range(2):
+            way = ankle - wp.where(j == 0, knee, twin)
+            lean = wp.acos(wp.clamp(wp.dot(way, down) / (shank * wp.max(wp.length(down), 1.0e-6)), -1.0, 1.0))
+            excess = wp.max(lean - free, 0.0)
+            total += view.contact[k] * excess * excess
+    return total

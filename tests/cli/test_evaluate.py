@@ -31,14 +31,14 @@ def policies(tmp_path_factory):
     return folder
 
 
-def test_every_task_is_measured_by_a_success_that_comes_first():
+def test_every_task_is_measured_by_a_success_that_comes_after_all_falls():
     kinds = {name: evaluation_of(make_task(name)) for name in TASKS if name.endswith("-jump")}
     assert [kinds[name] is EVALUATIONS[key] for name, key in (
         ("vertical-jump", "height"), ("horizontal-jump", "place"), ("omnidirectional-jump", "around"),
     )] == [True] * 3  # fmt: skip
     for name, kind in kinds.items():
         ends = [term.name for term in kind.for_evaluation(make_task(name)).terminations]
-        assert ends[0] == "success" and (name == "vertical-jump" or set(ends) == set(ENDS))
+        assert ends[-1] == "success" and (name == "vertical-jump" or set(ends) == set(ENDS))
 
 
 def test_task_with_an_unknown_evaluation_is_refused():
@@ -113,7 +113,7 @@ def test_range_of_places_counts_distances():
     landings.goals[:, 0] = goals
     landings.place[:, 0], landings.target[:, 0] = goals, goals
     landings.heading[:], landings.yaw[:], landings.tilt[:] = 0.0, 0.0, 0.0
-    landings.end[:, 0] = [0, 0, 2]
+    landings.end[:, 0] = [*[ENDS.index("success")] * 2, ENDS.index("low_base")]
     metrics = flags.metrics(landings)
     assert (metrics["success_rate_in_range"], metrics["success_rate"]) == (1.0, pytest.approx(2 / 3))
     assert (metrics["range_lower_m"], metrics["range_upper_m"]) == (0.3, 0.5)

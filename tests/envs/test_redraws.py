@@ -9,6 +9,7 @@ import warp as wp
 from jump_helpers import DEG, edit_coordinates, edit_episodes, make_env, only, random_actions, resetting
 from randomization_helpers import (
     ALL,
+    HELD,
     MOTOR_DOFS,
     OFF,
     PAPER,
@@ -22,6 +23,7 @@ from randomization_helpers import (
     within,
 )
 
+from jumper_warp.evaluation.paws import paw_arrays
 from jumper_warp.sim.simulation import Simulation
 from jumper_warp.tasks.randomization import RandomizationCfg
 from kernels.jump.state import LANDED
@@ -38,7 +40,7 @@ def nominal():
 
 
 def test_drawing_again_begins_with_the_nominal_values(nominal):
-    env = randomized(RandomizationCfg(**ALL))
+    env = randomized(RandomizationCfg(**ALL, **HELD))
     before = read(env)
     for _ in range(3):
         env.reset()
@@ -52,7 +54,7 @@ def test_drawing_again_begins_with_the_nominal_values(nominal):
 @pytest.mark.parametrize("solver", ["jumper", "mujoco"])
 def test_a_world_draws_anew_at_its_reset_and_at_no_other_time(solver):
     """Over 30 steps of random actions, in which some worlds end by themselves."""
-    env = randomized(RandomizationCfg(**ALL), 12, solver=solver)
+    env = randomized(RandomizationCfg(**ALL, **HELD), 12, solver=solver)
     ended = np.zeros(12, dtype=bool)
     for step, action in enumerate(random_actions(12, 30)):
         before, of_solver = seen(env), own_model(env)
@@ -74,7 +76,7 @@ def test_a_world_draws_anew_at_its_reset_and_at_no_other_time(solver):
 
 @pytest.mark.parametrize("solver", ["jumper", "mujoco"])
 def test_drawn_at_the_start_stays(solver):
-    env = randomized(RandomizationCfg(**ALL, redraw="startup"), 4, solver=solver)
+    env = randomized(RandomizationCfg(**ALL, **HELD, redraw="startup"), 4, solver=solver)
     first, of_solver = seen(env), own_model(env)
     assert len(np.unique(env.sim.model.body_mass.numpy())) == 84
     for action in random_actions(4, 3):
@@ -93,7 +95,7 @@ def test_drawn_at_the_start_stays(solver):
 
 
 def test_an_evaluation_draws_for_its_worlds_only():
-    env = randomized(RandomizationCfg(**ALL), 6)
+    env = randomized(RandomizationCfg(**ALL, **HELD), 6)
     before, chosen = read(env), np.arange(6) % 2 == 0
     env.evaluation_reset(np.zeros((6, 4)), worlds=chosen)
     after = read(env)
@@ -102,16 +104,20 @@ def test_an_evaluation_draws_for_its_worlds_only():
         np.testing.assert_array_equal(changed, chosen, err_msg=name)
 
 
-def test_pushes_of_walking_come_and_go():
-    """In a quarter of the intervals, of 0.2 to 0.5 s each, in flight too."""
-    task = dataclasses.replace(TASK, randomization=RandomizationCfg.walking())
+@pytest.mark.parametrize(("cfg", "newton"), [(RandomizationCfg.walking(), 10.0), (RandomizationCfg(), 5.0)])
+def test_pushes_come_and_go(cfg, newton):
+    """In a quarter of the intervals, of 0.2 to 0.5 s each; of walking in flight too, of jumps on the ground."""
+    task = dataclasses.replace(TASK, randomization=cfg)
     env = make_env(48, task=resetting(task, only("default")), randomize=True)
     env.auto_reset = False
-    pushes = []
+    pushes, acting, was_down = [], [], np.full((48, 1), cfg.push_in_flight)
     for _ in range(300):
         env.step(torch.zeros((48, 12)))
         pushes.append(env.parameters.push.numpy().copy())
-        np.testing.assert_array_equal(env.sim.state.body_f.numpy().reshape(48, 21, 6)[:, 0], pushes[-2:][0])
+        down = (paw_arrays(env)["paws_down"].any(axis=1) | cfg.push_in_flight)[:, None]
+        acting.append(env.sim.state.body_f.numpy().reshape(48, 21, 6)[:, 0])
+        np.testing.assert_array_equal(acting[-1], np.where(was_down, pushes[-2:][0], 0.0))
+        was_down = down
     pushes = np.array(pushes)
     on = pushes.any(axis=2)
     assert 0.2 < on.mean() < 0.3
@@ -124,7 +130,7 @@ def test_pushes_of_walking_come_and_go():
         longest, changes = max([longest, *lasted]), changes + len(edges)
     assert longest <= 30 and changes > 200
     found = pushes[on]
-    assert fills(found[:, :3], -10.0, 10.0) and fills(found[:, 3:], -3.0, 3.0)
+    assert fills(found[:, :3], -newton, newton) and fills(found[:, 3:], -3.0, 3.0)
 
 
 def test_a_push_begins_with_an_episode_and_is_what_the_critic_sees():

@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 import warp as wp
 
-from jumper_warp.evaluation.landings import Landings, for_evaluation, longest, wrapped, yaw_of
+from jumper_warp.evaluation.angles import wrapped, yaw_of
+from jumper_warp.evaluation.landings import Landings, ended_by_takeoff, for_evaluation, longest
 from jumper_warp.evaluation.places import landing_metrics, trained_range
 from jumper_warp.registry import make_task
 
@@ -25,7 +26,8 @@ class Stub:
     def __init__(self, count):
         self.num_envs, self.step_dt, self.commanded = count, DT, []
         self.task = SimpleNamespace(contact_force=0.1)
-        self.sim = SimpleNamespace(paw_force=wp.full((4, count), wp.vec3(0.0, 0.0, 9.0), dtype=wp.vec3, device="cpu"))
+        force = wp.full((4, count), wp.vec3(0.0, 0.0, 9.0), dtype=wp.vec3, device="cpu")
+        self.sim = SimpleNamespace(paw_force=force, base_velocity=lambda: self.arrays["base_vel"])
         self.arrays = {
             "base_pos": np.zeros((count, 3)), "base_quat": np.tile([0.0, 0.0, 0.0, 1.0], (count, 1)),
             "base_vel": np.zeros((count, 3)), "goal": np.zeros((count, 3)), "heading": np.zeros(count),
@@ -114,6 +116,9 @@ def test_metrics_by_hand():
         "step_rate": 0.0,
         "mean_error_at_touchdown_m": (math.hypot(0.05, 0.1) + 0.2) / 2,
         "mean_error_0_3_s_after_touchdown_m": (math.hypot(0.05, 0.07) + 0.1) / 2,
+        "still_landing_rate": 2 / 5,
+        "still_landing_rate_in_range": 2 / 3,
+        "second_takeoff_rate": 0.0,
         "at_rest_within_1_s_rate": 1 / 2,
         "mean_landing_tilt_deg": math.degrees(0.15),
         "max_landing_tilt_deg": math.degrees(0.2),
@@ -121,6 +126,7 @@ def test_metrics_by_hand():
         "max_turn_deg": math.degrees(0.3),
         "collision_rate": 1 / 5,
         "fall_rate": 2 / 5,
+        "miss_rate": 1 / 5,
         "early_rate": 0.0,
         "came_apart": 1,
         "failed_by_missed": 1,
@@ -195,6 +201,54 @@ def test_paw_lifted_again_after_its_own_contact_is_a_step(contacts, stepped):
     assert (metrics["step_rate"], metrics["step_free_success_rate"]) == (float(stepped), float(not stepped))
 
 
+@pytest.mark.parametrize(
+    ("moments", "takeoffs"),
+    [
+        ([((), 0.3, 1)], 1),
+        ([((), 0.2, 5)], 0),  # too slow
+        ([((0,), 0.6, 5)], 0),  # a paw is down
+        ([((), 0.2, 2), ((), 0.3, 2), ((), -0.5, 3)], 1),  # one takeoff, however long it flies
+        ([((), 0.3, 2), ((0, 1, 2, 3), 0.0, 2), ((), 0.5, 1)], 2),
+    ],
+)
+def test_second_takeoffs_are_upward_with_no_paw_down(moments, takeoffs):
+    landings, env = Landings(np.zeros((1, 1, 2)), TERMINATIONS), Stub(1)
+    landings.begin(env)
+    env.stand_on()
+    env.now(phase=1, base_vel=[0.0, 0.0, 3.0])  # the jump's own takeoff is none
+    assert not landings.follow(env)
+    env.now(phase=2, touched_down=1, base_vel=[0.0, 0.0, 0.0])
+    env.stand_on(0, 1, 2, 3)
+    assert not landings.follow(env)
+    env.now(touched_down=0)
+    for down, up, count in moments:
+        env.stand_on(*down)
+        env.now(base_vel=[0.0, 0.0, up])
+        for _ in range(count):
+            assert not landings.follow(env)
+    env.now(phase_steps=60, base_vel=0.0)
+    env.stand_on(0, 1, 2, 3)
+    assert landings.follow(env)
+    assert landings.takeoffs[0, 0] == takeoffs
+    metrics = landing_metrics(landings)
+    assert (metrics["success_rate"], metrics["second_takeoff_rate"]) == (1.0, float(takeoffs > 0))
+
+
+def test_fall_after_the_first_second_counts_where_the_jump_is_followed_for_longer():
+    landings, env = Landings(np.zeros((2, 1, 2)), TERMINATIONS, rest=3.0), Stub(2)
+    landings.begin(env)
+    env.now(phase=2, phase_steps=60, ending=0)
+    assert not landings.follow(env)
+    env.now(phase_steps=120, ending=[0, 2])
+    assert not landings.follow(env)
+    env.now(phase_steps=180, ending=0)
+    assert landings.follow(env)
+    assert landings.outcomes[:, 0].tolist() == ["success", "low_base"]
+    metrics = landing_metrics(landings)
+    assert (metrics["success_rate"], metrics["fall_rate"], metrics["miss_rate"]) == (0.5, 0.5, 0.0)
+    assert "at_rest_within_1_s_rate" not in metrics and metrics["below_0_1_m_s_at_the_end_rate"] == 1.0
+
+
 def test_flight_of_the_next_jump_is_no_step():
     landings, env = Landings(np.zeros((1, 2, 2)), TERMINATIONS), Stub(1)
     landings.begin(env)
@@ -260,7 +314,9 @@ def test_columns_have_a_row_a_jump_and_none_for_jumps_that_were_not_begun():
 
 def test_terminations_of_an_evaluation_leave_the_shaping_out():
     terms = for_evaluation(make_task("horizontal-jump")).terminations
-    assert {term.name for term in terms} == set(TERMINATIONS) and terms[0].name == "success"
+    assert [term.name for term in terms] == ["came_apart", "low_base", "collided", "no_jump", "success"]
+    terms = ended_by_takeoff(make_task("horizontal-jump")).terminations
+    assert [term.name for term in terms][-2:] == ["second_takeoff", "success"]
 
 
 @pytest.mark.parametrize(("task", "range_m"), [("horizontal-jump", [0.2, 2.4]), ("omnidirectional-jump", [0.0, 1.4])])

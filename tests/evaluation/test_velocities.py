@@ -81,6 +81,22 @@ def test_settling_is_when_the_mean_velocity_stays_near_the_last_command():
     assert settling[1] == pytest.approx(0.2 * 7.0 / 8.0, abs=1.5 * DT) and np.isinf(settling[2])
 
 
+def test_settling_for_a_while_is_not_spoilt_by_a_later_push():
+    commands = np.zeros((ROBOTS, 2, 3))
+    commands[:, 1, 0] = 0.8
+
+    def velocity(t):
+        v = np.zeros((ROBOTS, 3))
+        v[:, 0] = 0.8 * (t - 1.0 > 1e-6) - 0.5 * (abs(t - 2.5) < 0.2)  # pushed 1.3 s after the command
+        v[1, 0] = 0.8 * (int(10.0 * t) % 4 > 0)  # never for half a second
+        return v
+
+    walks = followed(velocity, seconds=4.0, commands=commands, times=(0.0, 1.0))
+    assert velocities.settling_times(walks)[0] > 1.7
+    held = velocities.settling_times(walks, 0.5)
+    assert held[0] == pytest.approx(0.2 * 7.0 / 8.0, abs=1.5 * DT) and np.isinf(held[1])
+
+
 def test_commands_count_from_the_step_after_they_came():
     commands = np.zeros((ROBOTS, 2, 3))
     commands[:, 1, 0] = 1.0

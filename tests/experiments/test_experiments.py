@@ -1,3 +1,4 @@
+import dataclasses
 import json
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -19,8 +20,9 @@ from experiments import (
 from jumper_warp.evaluation.heights import sweep_metrics
 from jumper_warp.evaluation.jumps import Jumps, run_jumps
 from jumper_warp.evaluation.learning import Curve
+from jumper_warp.evaluation.limits import limit_metrics
 from jumper_warp.evaluation.run import HEIGHTS, EvaluationRun
-from jumper_warp.evaluation.soak import SoakArgs
+from jumper_warp.evaluation.soak import SoakArgs, hardest
 from jumper_warp.policies.folder import save_policy
 from jumper_warp.registry import make_task
 from jumper_warp.rl.cfg import PpoCfg
@@ -92,14 +94,25 @@ def test_sweep_figures_against_hand_numbers():
     assert figures["largest_tilt_deg"] == pytest.approx(20.0)
     assert (figures["collision_rate"], figures["fall_rate"], figures["early_rate"]) == (1 / 8, 1 / 8, 1 / 8)
     assert list(figures).index("success_and_landing_rate") == list(figures).index("success_rate") + 1
+    assert figures["max_landing_tilt_deg"] == pytest.approx(11.0)
+    assert figures["miss_rate"] == 2 / 8  # of 1.00 m and 1.20 m; the early jump is none
     expected = {
         "open_loop_limit_m": 1.0748,
+        "lowest_open_loop_limit_m": 1.0748,
         "open_loop_mean_abs_error_m": (0.0252 + 0.0752 + 0.1052 + 0.1252) / 8,
         "mean_abs_error_up_to_limit_m": 0.29 / 4,
         "success_rate_reachable": 5 / 6,
         "reachable_share": 6 / 8,
+        "success_rate_beyond_limit": 0.0,
+        "success_rate_reachable_0_6_1_1": 3 / 4,
+        "reachable_share_0_6_1_1": 1.0,
     }
-    assert vertical_jump_sweep.limit_metrics(jumps) == pytest.approx(expected)
+    assert limit_metrics(jumps, np.full(8, 1.0748)) == pytest.approx(expected)
+    weak = limit_metrics(jumps, np.array([1.0, 0.49, 1.0, 1.0, 0.97, 1.0, 1.0, 1.05]))
+    assert weak["reachable_share"] == pytest.approx(3 / 8)  # 0.50, 0.80, 1.00
+    assert weak["success_rate_reachable"] == pytest.approx(2 / 3)
+    assert weak["success_rate_beyond_limit"] == pytest.approx(3 / 5)  # 0.60, 1.10, 1.15
+    assert (weak["lowest_open_loop_limit_m"], weak["reachable_share_0_6_1_1"]) == (0.49, 2 / 4)
 
 
 def test_a_world_that_came_apart_is_no_success_and_no_error():
@@ -129,14 +142,14 @@ def sweep_env(tmp_path_factory):
     folder = tmp_path_factory.mktemp("sweep")
     save_policy(folder / "still", still_policy("vertical-jump"))
     args = vertical_jump_sweep.Args(policy=str(folder / "still"), jumps=3, record=0, out=folder, device="cpu")
-    return vertical_jump_sweep.make_env(EvaluationRun.of("sweep", args, HEIGHTS), args)
+    return EvaluationRun.of("sweep", args, HEIGHTS).env(3, vertical_jump_sweep.for_sweep)
 
 
 @pytest.mark.parametrize(("begin", "early"), [(31, False), (-45, True)])
 def test_scripted_jump_reaches_the_open_loop_height_and_lands(sweep_env, begin, early):
     targets = np.array([0.5, 0.7, 1.05])
     figures = sweep_metrics(run_jumps(Script(begin).act, sweep_env, targets), vertical_jump_sweep.IN_RANGE)
-    assert figures["largest_reached_m"] == pytest.approx(vertical_jump_sweep.OPEN_LOOP_LIMIT, abs=0.02)
+    assert figures["largest_reached_m"] == pytest.approx(vertical_jump_sweep.OPEN_LOOP_APEX, abs=0.02)
     assert figures["landing_rate"] == 1.0
     assert figures["early_rate"] == (1.0 if early else 0.0)
     assert figures["success_rate"] == pytest.approx(0.0 if early else 1 / 3)
@@ -157,8 +170,10 @@ def test_sweep_of_a_run_leaves_figures_plot_recording_and_filmstrip(trained, tmp
         "jumps",
     } <= saved.keys()
     assert {"landing_rate", "largest_tilt_deg", "largest_reached_m"} <= saved.keys()
-    of_the_nominal_robot = vertical_jump_sweep.limit_metrics(Jumps(np.array([0.6]), SWEEP_ENDS))
-    assert not saved.keys() & of_the_nominal_robot.keys()
+    assert {"still_landing_rate", "max_drift_m", "max_turn_deg", "miss_rate", "max_landing_tilt_deg"} <= saved.keys()
+    assert {"reachable_share", "success_rate_reachable", "pushed_in_flight_success_rate"} <= saved.keys()
+    assert 0.7 < saved["lowest_open_loop_limit_m"] < saved["open_loop_limit_m"] < 1.3
+    assert saved["latency"].endswith(" ms") and 0.0 < saved["latency_ms"] < 17.0
     assert (saved["jumps"], saved["torque_limit_nm"], saved["randomize"]) == (3, 18.0, True)
     for name in ("sweep.png", "jumps.rrd", "jump_1.20_m.png"):
         assert (tmp_path / name).stat().st_size > 1000, name
@@ -260,15 +275,35 @@ def test_soak_of_a_simulation_and_of_an_environment_finds_finite_worlds(tmp_path
         values = soak_test.main(args)
         saved = json.loads((tmp_path / "figures.json").read_text())
         assert saved == values | {"envs": 8, "filter": False, "seed": 0}
-        assert (values["steps"], values["non_finite_worlds"]) == (320, 0)
+        assert (values["steps"], values["non_finite_worlds"], values["non_finite_rows"]) == (320, 0, 0)
         assert 0.01 < values["largest_speed_m_s"] < 10.0 and values["largest_joint_speed_rad_s"] > 1.0
 
 
 def test_worlds_that_come_apart_in_a_soaked_environment_are_counted(tmp_path, monkeypatch):
     step = soak_test.Env.step
     monkeypatch.setattr(soak_test.Env, "step", lambda env, action: step(env, torch.full_like(action, torch.nan)))
-    args = SoakArgs(envs=4, steps=5, episode=100, task="vertical-jump", out=tmp_path, device="cpu")
+    args = SoakArgs(envs=4, steps=5, hold=5, episode=100, task="vertical-jump", out=tmp_path, device="cpu")
     assert soak_test.main(args)["non_finite_worlds"] == 20
+
+
+def test_row_that_is_not_finite_ends_a_soak(tmp_path, monkeypatch):
+    step = soak_test.Env.step
+
+    def spoilt(env, action):
+        step(env, action)
+        env.reward[2] = torch.nan
+
+    monkeypatch.setattr(soak_test.Env, "step", spoilt)
+    args = SoakArgs(envs=4, steps=40, episode=20, task="vertical-jump", out=tmp_path, device="cpu")
+    with pytest.raises(RuntimeError, match="20 rows hold values that are not finite, by step 20"):
+        soak_test.main(args)
+
+
+def test_soak_is_on_the_hardest_row_of_a_map_and_leaves_other_tasks_alone():
+    terrain = hardest(make_task("velocity-rough")).reset.settings.terrain
+    assert terrain == dataclasses.replace(make_task("velocity-rough").reset.settings.terrain, rows=1)
+    for name in ("velocity-flat", "vertical-jump"):
+        assert hardest(make_task(name)) == make_task(name)
 
 
 def test_rates_are_told_over_those_of_a_baseline(tmp_path):

@@ -17,7 +17,7 @@ from experiments import (
     max_jump,
     platform_jump,
 )
-from experiments.vertical_jump_sweep import OPEN_LOOP_LIMIT
+from experiments.vertical_jump_sweep import OPEN_LOOP_APEX
 from jumper_warp.evaluation.distances import distance_metrics, row_of, verdict
 from jumper_warp.evaluation.landings import ENDS, Landings, beside
 from jumper_warp.evaluation.log import run_evaluation, termination_names
@@ -28,7 +28,7 @@ from jumper_warp.policies.restore import Conditions, env_of_policy
 from jumper_warp.policies.spec import PolicyError
 from jumper_warp.utils.errors import InputError
 
-COLLIDED, NO_JUMP = ENDS.index("collided"), ENDS.index("no_jump")
+COLLIDED, NO_JUMP, LANDED = (ENDS.index(name) for name in ("collided", "no_jump", "success"))
 SHARED = {"mean_error_m", "success_rate", "success_rate_in_range", "jumps", "solver", "randomize", "seed"}
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -61,7 +61,7 @@ def ahead(distances):
 
 def test_sweep_counts_ranges_by_distance():
     goals = ahead([0.3, 0.7, 1.0, 1.4, 1.5])
-    landings = ended(goals, goals + [[[0.02, 0.0]], [[0.0, 0.04]], [[0.0, 0.2]], [[0.03, 0.0]], [[-0.5, 0.0]]], 0)
+    landings = ended(goals, goals + [[[0.02, 0.0]], [[0.0, 0.04]], [[0.0, 0.2]], [[0.03, 0.0]], [[-0.5, 0.0]]], LANDED)
     figures = horizontal_jump_sweep.metrics(landings)
     assert figures["mean_error_m"] == pytest.approx(0.79 / 5)
     assert figures["success_rate"] == pytest.approx(3 / 5)
@@ -80,8 +80,9 @@ def test_grid_has_every_goal_as_often_as_wanted():
 def test_consecutive_figures_by_hand():
     goals = [[[0.8, 0.2], [0.75, -0.2]], [[0.8, 0.0], [0.8, 0.0]]]
     off = [[[0.01, 0.0], [0.0, 0.03]], [[0.05, 0.0], [0.2, 0.0]]]
-    pairs = ended(goals, np.add(goals, off), 0)
-    row = ended(np.ones((2, 3, 2)), np.ones((2, 3, 2)) + [0.0, 0.04], [[0, 0, 0], [0, COLLIDED, -1]])
+    pairs = ended(goals, np.add(goals, off), LANDED)
+    ends = [[LANDED] * 3, [LANDED, COLLIDED, -1]]
+    row = ended(np.ones((2, 3, 2)), np.ones((2, 3, 2)) + [0.0, 0.04], ends)
     row.heading[1, 2] = row.place[1, 2] = np.nan
     row.rest_speed[:] = [[0.05, 0.2, 0.05], [0.05, np.inf, np.inf]]
     figures = consecutive_jumps.metrics(pairs, row)
@@ -102,6 +103,10 @@ def test_consecutive_figures_by_hand():
         "mean_jumps_until_the_end": 2.0,
         "mean_error_ten_m": 0.04,
         "success_rate_ten": 4 / 5,
+        "fall_rate": 0.0,
+        "miss_rate": 1 / 4,
+        "fall_rate_ten": 1 / 5,
+        "miss_rate_ten": 0.0,
     }
     assert {name: figures[name] for name in expected} == pytest.approx(expected)
     assert figures["mean_error_by_number_m"] == pytest.approx([0.04, 0.04, 0.04])
@@ -111,7 +116,7 @@ def test_consecutive_figures_by_hand():
 def test_row_without_a_fall_may_miss_its_goals():
     off = np.ones((2, 3, 2)) + [[[0.0, 0.0]] * 3, [[0.0, 0.0], [0.3, 0.0], [0.0, 0.0]]]
     pairs = np.ones((2, 2, 2))
-    figures = consecutive_jumps.metrics(ended(pairs, pairs, 0), ended(np.ones((2, 3, 2)), off, 0))
+    figures = consecutive_jumps.metrics(ended(pairs, pairs, LANDED), ended(np.ones((2, 3, 2)), off, LANDED))
     assert (figures["ten_in_a_row_rate"], figures["row_all_on_goal_rate"]) == (1.0, 0.5)
 
 
@@ -133,7 +138,7 @@ def of(middle, *, clean, stepped=0, hopped=0):
     goals, good = ahead([middle] * 20), clean + stepped + hopped
     air = [[0.0]] * (clean + stepped) + [[0.1]] * (20 - clean - stepped)
     lift = [[0.0]] * clean + [[0.1]] * (20 - clean)
-    end = [[0]] * good + [[COLLIDED]] * (20 - good)
+    end = [[LANDED]] * good + [[COLLIDED]] * (20 - good)
     return ended(goals, goals + [0.01, 0.0], end, air_time=air, lift_time=lift, touchdown=goals - [0.2, 0.0])
 
 
@@ -149,6 +154,8 @@ def test_reliable_distance_is_the_last_bin_before_the_first_that_is_not():
     expected = {
         "largest_reliable_m": 1.4, "largest_reliable_without_hop_m": 1.3, "largest_reliable_without_step_m": 1.2,
         "base_at_touchdown_m": 1.2, "base_at_touchdown_without_hop_m": 1.1, "base_at_touchdown_without_step_m": 1.0,
+        "hop_free_distance_m": 1.3, "fall_rate": 0.04, "miss_rate": 0.0, "still_landing_rate": 0.69,
+        "max_landing_tilt_deg": 0.0,
         "success_rate": 0.96, "single_jump_success_rate": 0.87, "step_free_success_rate": 0.69,
         "success_rate_in_range": 58 / 60, "farthest_success_m": 1.61, "jumps": 100, "mean_error_m": 0.01,
     }  # fmt: skip
@@ -167,7 +174,8 @@ def test_distance_without_any_reliable_bin_is_none():
     figures = distance_metrics(bins, max_jump.IN_RANGE)
     assert figures["largest_reliable_m"] is None and figures["farthest_success_m"] is None
     assert figures["bin_base_at_touchdown_m"] == [None]
-    assert row_of(figures, 0) == ["1.0", "0.0", "0.0", "0.0", ""]
+    assert figures["hop_free_distance_m"] is None and figures["max_landing_tilt_deg"] is None
+    assert row_of(figures, 0) == ["1.0", "0.0", "0.0", "0.0", "0.0", "0.0", ""]
 
 
 def test_figures_are_printed_with_four_digits_in_lists_too():
@@ -238,7 +246,7 @@ def hops():
 
 def test_hop_on_the_spot_lands_near_its_start_and_off_its_goal(hops):
     assert hops.landed.all() and not hops.early.any() and not hops.hopped.any()
-    assert ((hops.apex > 0.9) & (hops.apex < OPEN_LOOP_LIMIT)).all()
+    assert ((hops.apex > 0.9) & (hops.apex < OPEN_LOOP_APEX)).all()
     assert hops.landing[:, 0] == pytest.approx(np.zeros((3, 2)), abs=0.06)
     assert hops.outcomes[:, 0].tolist() == ["success", "success", "missed"]
     assert hops.error[2, 0] == pytest.approx(math.hypot(0.5, 0.2), abs=0.06)
@@ -296,7 +304,8 @@ def test_nothing_of_viewer_and_meshes_is_needed_without_a_recording(policy, tmp_
 
 
 def test_policy_of_another_task_is_refused_in_one_line(tmp_path):
-    message = "evaluated by place or around or place-mars, vertical_jump is of vertical-jump, by height"
+    needed = "needs a policy that is evaluated by place or around or place-mars"
+    message = f"{needed}, vertical_jump is of vertical-jump, by height"
     with pytest.raises(PolicyError, match=message):
         EvaluationRun.of("test", EvaluationArgs(policy="vertical_jump", out=tmp_path, device="cpu"))
 

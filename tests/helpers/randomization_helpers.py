@@ -34,9 +34,12 @@ WALKING = PAPER | {
 }  # fmt: skip
 """Table V, walking; the text adds that its latency applies to observations too."""
 BEYOND = {
-    "observation_latency": None, "push_interval": None, "push_share": 1.0, "push_in_flight": False, "redraw": "reset",
+    "observation_latency": None, "push_interval": (0.2, 0.5), "push_share": 0.25, "push_in_flight": False,
+    "damping_gains": None, "redraw": "reset", "no_latency": 0.0,
 }  # fmt: skip
 """What the table does not tell, for jumping."""
+HELD = {"push_interval": None, "push_share": 1.0}
+"""A push in every episode, from its beginning to its end."""
 ALL = PAPER | {"observation_latency": (0.0, 16.0)}
 """Every row."""
 

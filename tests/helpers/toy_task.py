@@ -55,6 +55,10 @@ class PushTask:
         self.age *= 1.0 - self.done
         self.show_critic(self.critic_obs, self.obs)
 
+    def mirror(self, what: str) -> tuple[list[int], list[float]]:
+        """Left and right: the mirror image of position, velocity and acceleration is the negative."""
+        return ([0, 1], [-1.0, -1.0]) if what == "observation" else ([0], [-1.0])
+
     def metrics(self) -> dict[str, float]:
         return {"Metrics/success": float(self.obs[:, 0].abs().lt(0.1).float().mean())}
 
@@ -84,7 +88,7 @@ def fill(ppo: Ppo, worlds: slice, num_worlds: int) -> None:
     rollout.done.copy_((draw(steps) > 1.0).float())
     rollout.timeout.copy_(rollout.done * (draw(steps) > 0.0).float())
     with torch.no_grad():
-        rollout.mean.copy_(ppo.model.actor(ppo.model.features(rollout.obs[:-1])))
+        rollout.mean.copy_(ppo.model.mean(ppo.model.features(rollout.obs[:-1])))
         rollout.log_std.copy_(ppo.model.log_std)
     rollout.action.copy_(rollout.mean + draw(steps, 1))
 

@@ -20,8 +20,11 @@ WORLDS = 16
 
 
 def reference_losses(model, part, old_log_std, cfg):
-    """Surrogate, value loss, entropy and divergence, by torch.distributions and as the papers write them."""
-    policy = torch.distributions.Normal(model.actor(part["features"]), model.log_std.exp())
+    """Surrogate, value loss, entropy, asymmetry and divergence, by torch.distributions and as the papers write them."""
+    own, image = model.actor(part["features"]), -model.actor(-part["features"])  # of the task's mirror image
+    mean = 0.5 * (own + image) if cfg.symmetry == "actor" else own
+    asymmetry = torch.nn.functional.mse_loss(own, image) if cfg.symmetry != "off" else torch.zeros(())
+    policy = torch.distributions.Normal(mean, model.log_std.exp())
     old = torch.distributions.Normal(part["mean"], old_log_std.exp())
     ratio = (policy.log_prob(part["action"]) - old.log_prob(part["action"])).sum(-1).exp()
     clipped = ratio.clamp(1 - cfg.clip, 1 + cfg.clip)
@@ -33,7 +36,7 @@ def reference_losses(model, part, old_log_std, cfg):
         loss = torch.max(loss, (near - part["target"]) ** 2)
     entropy = policy.entropy()[0].sum()
     kl = torch.distributions.kl_divergence(old, policy).sum(-1).mean()
-    return surrogate, loss.mean(), entropy, kl.detach()
+    return surrogate, loss.mean(), entropy, asymmetry, kl.detach()
 
 
 def reference_update(model, batch, old_log_std, orders, cfg):
@@ -44,9 +47,11 @@ def reference_update(model, batch, old_log_std, orders, cfg):
     for order in orders:
         for samples in order.chunk(cfg.minibatches):
             part = {name: value[samples] for name, value in batch.items()}
-            surrogate, value, entropy, kl = reference_losses(model, part, old_log_std, cfg)
+            surrogate, value, entropy, asymmetry, kl = reference_losses(model, part, old_log_std, cfg)
             optimiser.zero_grad()
-            (surrogate + cfg.value_coef * value - cfg.entropy_coef * entropy).backward()
+            weight = cfg.symmetry_coef if cfg.symmetry == "loss" else 0.0
+            loss = surrogate + cfg.value_coef * value - cfg.entropy_coef * entropy + weight * asymmetry
+            loss.backward()
             norms = [torch.nn.utils.clip_grad_norm_(each, cfg.max_grad_norm) for each in (actor, critic)]
             group = optimiser.param_groups[0]
             if kl > 2 * cfg.desired_kl:
@@ -54,7 +59,7 @@ def reference_update(model, batch, old_log_std, orders, cfg):
             elif 0 < kl < cfg.desired_kl / 2:
                 group["lr"] = min(group["lr"] * 1.5, cfg.max_lr)
             optimiser.step()
-            history.append([float(x.detach()) for x in (surrogate, value, entropy, kl, *norms)])
+            history.append([float(x.detach()) for x in (surrogate, value, entropy, asymmetry, kl, *norms)])
     return optimiser, history
 
 
@@ -65,7 +70,7 @@ def learnt(cfg, device="cpu"):
     fill(ppo, slice(None), WORLDS)
     torch.manual_seed(1)
     ppo.batch()  # running statistics other than the identity
-    before = ActorCritic(2, 1, cfg.hidden, cfg.activation, num_critic_obs=3)
+    before = ActorCritic(2, 1, cfg.hidden, cfg.activation, num_critic_obs=3, symmetry=ppo.model.symmetry)
     before.load_state_dict(ppo.state_dict()["model"])
     torch.manual_seed(1)
     ppo.update()
@@ -74,7 +79,16 @@ def learnt(cfg, device="cpu"):
 
 
 @pytest.mark.parametrize(
-    "change", [{}, {"clip_value": False}, {"activation": "relu"}, {"activation": "tanh"}, {"clip": 0.02}]
+    "change",
+    [
+        {},
+        {"clip_value": False},
+        {"activation": "relu"},
+        {"activation": "tanh"},
+        {"clip": 0.02},
+        {"symmetry": "actor"},
+        {"symmetry": "loss", "symmetry_coef": 3.0},
+    ],
 )
 def test_an_update_equals_autograd_and_adam(change):
     cfg = dataclasses.replace(CFG, **change)
@@ -85,11 +99,11 @@ def test_an_update_equals_autograd_and_adam(change):
         torch.testing.assert_close(ours[name], param, atol=2e-5, rtol=1e-4, msg=name)
     figures = ppo.statistics()
     means = torch.tensor(history).mean(0).tolist()
-    names = ("surrogate", "value", "entropy", "kl", "gradient_actor", "gradient_critic")
+    names = ("surrogate", "value", "entropy", "asymmetry", "kl", "gradient_actor", "gradient_critic")
     for name, mean in zip(names, means, strict=True):
         assert figures[f"Loss/{name}"] == pytest.approx(mean, rel=1e-3, abs=1e-5), name
     assert figures["Loss/learning_rate"] == pytest.approx(optimiser.param_groups[0]["lr"])
-    assert max(row[4] for row in history) > cfg.max_grad_norm  # some were clipped
+    assert max(row[5] for row in history) > cfg.max_grad_norm  # some were clipped
     their_state = optimiser.state_dict()["state"]
     for index, state in ppo.optimiser.state_dict().items():
         for name in ("step", "exp_avg", "exp_avg_sq"):

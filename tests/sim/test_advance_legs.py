@@ -36,6 +36,18 @@ def states(model, height, seed=0):
     return q, qd, force
 
 
+def squatting(model):
+    """Return states and forces of robots about their squat's stops, paws near the ground."""
+    q, qd, force = states(model, 0.14)
+    rng = np.random.default_rng(2)
+    half = np.radians(120.0) + rng.uniform(-0.01, 0.01, (N, 4))
+    aside = rng.uniform(-0.1, 0.1, (N, 4))
+    for leg in range(4):
+        q[:, 7 + 5 * leg] = rng.uniform(-0.05, 0.05, N)
+        q[:, 8 + 5 * leg], q[:, 10 + 5 * leg] = half[:, leg] + aside[:, leg], half[:, leg] - aside[:, leg]
+    return q, qd, force
+
+
 def advance(dynamics, q, qd, force, by_legs, substeps=4, tolerance=1.0e-12):
     """Return coordinates, rates and work arrays after some steps of 1/480 s."""
     real = dynamics.real
@@ -72,6 +84,22 @@ def test_equals_a_thread_a_world(kind):
         moved = [each.robot.ground.blocks.numpy()["center"] for each in (legs, world)]
         assert np.abs(moved[1] - [0.1, 0.0]).max() > 1.0e-6
         np.testing.assert_allclose(*moved, atol=1.0e-9)
+
+
+def test_stops_equal_a_thread_a_worlds():
+    model = build_model(N, friction=0.5)
+    q, qd, force = squatting(model)
+    legs, world = (JumperDynamics(model, double=True) for _ in range(2))
+    found = advance(legs, q, qd, force, by_legs=True)
+    expected = advance(world, q, qd, force, by_legs=False)
+    for a, b in zip(found, expected, strict=True):
+        np.testing.assert_allclose(a, b, atol=1.0e-8, rtol=1.0e-8)
+    angles = expected[0].reshape(N, 43)[:, 7:27].reshape(N, 4, 5)
+    pressed = angles[..., 1] + angles[..., 3] > np.radians(240.0)
+    paws = np.linalg.norm(expected[2], axis=2).T > 0.0
+    assert (pressed & paws).sum() > 5
+    assert (pressed & ~paws).any()
+    assert (~pressed & paws).any()
 
 
 def test_a_world_that_came_apart_is_parked():

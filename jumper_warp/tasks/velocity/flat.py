@@ -4,8 +4,9 @@ Forms and constants are the paper's and its authors' training configuration, exc
 second kernels, since the wide ones are flat where a few centimetres per second are to be decided; air time counts ten
 times, with which the robot trots by itself; rapid stepping grows in a straight line, since the clamped exponential has
 no slope where training begins; swings are to reach a height, paws not to slip and to come down softly; torques, joint
-accelerations and changes of the action cost, whose weights the configuration lists and overwrites with 0. Commands are
-redrawn every few seconds, so that transients are learnt, and reach farther as they are followed.
+accelerations and changes of the action cost, whose weights the configuration lists and overwrites with 0, and second
+differences of the action, which tell chatter from walking. Commands are redrawn every few seconds, so that transients
+are learnt, and reach farther as they are followed.
 """
 
 from __future__ import annotations
@@ -55,7 +56,7 @@ REWARDS = (
     RewardTerm(rewards.linear_velocity, 2.5, width=0.5),
     RewardTerm(rewards.linear_velocity, 1.0, name="linear_velocity_fine", width=0.1),
     RewardTerm(rewards.yaw_rate, 1.5, width=0.5),
-    RewardTerm(rewards.yaw_rate, 0.5, name="yaw_rate_fine", width=0.1),
+    RewardTerm(rewards.yaw_rate, 1.5, name="yaw_rate_fine", width=0.1),
     RewardTerm(rewards.vertical_velocity, -1.0),
     RewardTerm(rewards.lateral_stability, -0.03),
     RewardTerm(rewards.flat, -50.0),
@@ -72,6 +73,7 @@ REWARDS = (
     RewardTerm(mdp_rewards.motor_torque_sq, -1.0e-4),
     RewardTerm(mdp_rewards.joint_acceleration, -1.0e-7),
     RewardTerm(mdp_rewards.action_rate, -0.03),
+    RewardTerm(mdp_rewards.action_acceleration, -0.03),
     RewardTerm(rewards.jerk, -5.0e-3),
 )
 
@@ -101,7 +103,7 @@ def velocity_flat() -> TaskCfg:
         name="velocity-flat",
         state=VelocityState,
         advance=Advance(state.advance_velocity, settle=1.0 * SECOND),
-        reset=Reset(reset_velocity, VelocityResetCfg()),
+        reset=Reset(reset_velocity, VelocityResetCfg(), side_by_side=True),
         command=Command(commands.give_velocity, commands.command_due, commands.draw_command),
         curriculum=Curriculum(
             state.tracking_error, tolerance=0.18, promote_after=1_000_000, counts=state.every_episode, unit="m_s"

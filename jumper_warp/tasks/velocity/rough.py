@@ -1,22 +1,35 @@
 """Velocity tracking on uneven ground, slopes and steps, without seeing them; the critic sees the ground around.
 
 It is the task on a plane but for the map, on which every world climbs to harder tiles as it follows its commands and
-goes back where it falls, slower commands, higher swings, and less that a tilt or a rise costs.
+goes back where it falls, slower commands, higher swings, and less that a tilt or a rise costs. Where robots fail is at
+steps up, and there a shank of a planted paw hits the edge as the base moves on: so shanks are not to lean far over paws
+on the ground, a collision costs a second's rewards besides the end of the episode, and grounds with steps up have two
+columns each.
 """
 
 from __future__ import annotations
 
 from dataclasses import replace
 
-from jumper_warp.robot.terrain import TerrainCfg
+from jumper_warp.robot.terrain import KINDS, TerrainCfg
 from jumper_warp.tasks.cfg import TaskCfg
-from jumper_warp.tasks.terms import ObservationTerm
+from jumper_warp.tasks.terms import ObservationTerm, RewardTerm
+from jumper_warp.tasks.units import DEG
 from jumper_warp.tasks.velocity.cfg import CommandCfg
 from jumper_warp.tasks.velocity.flat import velocity_flat
+from kernels.mdp import rewards as mdp_rewards
 from kernels.velocity import observations as velocity
+from kernels.velocity import rewards
 
 COMMANDS = CommandCfg(narrow=(0.8, 0.6, 0.4, 0.8), wide=(0.8, 0.6, 0.4, 0.8), levels=0)
 """What is commanded on the map."""
+GROUNDS = (*KINDS, "pit", "blocks")
+"""Of the map's columns."""
+STEPS_UP = (
+    RewardTerm(rewards.shank_lean, -5.0, free=35.0 * DEG, hip=0.045, thigh=0.175, shank=0.3),
+    RewardTerm(mdp_rewards.collision, -4.0, once=True),
+)
+"""What keeps shanks off the edges of steps; without a floor of the total, below which a collision would not count."""
 
 
 def velocity_rough() -> TaskCfg:
@@ -25,10 +38,13 @@ def velocity_rough() -> TaskCfg:
     task = replace(
         flat,
         name="velocity-rough",
-        reset=replace(flat.reset, settings=replace(flat.reset.settings, terrain=TerrainCfg(), tolerance=0.25)),
+        reset=replace(
+            flat.reset, settings=replace(flat.reset.settings, terrain=TerrainCfg(kinds=GROUNDS), tolerance=0.25)
+        ),
         levels=(COMMANDS,),
         critic=(*flat.critic, ObservationTerm(velocity.ground_heights)),
     )
-    return task.with_terms(
+    task = task.with_terms(
         "rewards", flat={"weight": -5.0}, vertical_velocity={"weight": -0.3}, foot_clearance={"height": 0.10}
     )
+    return replace(task, rewards=(*task.rewards, *STEPS_UP), reward_floor=None)

@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 from jumper_warp.registry import make_task
 from kernels.jump import terminations
 
-holds = Table(functions(terminations, "missed_goal predicted_miss turned_touchdown left_stance"), bool)
+holds = Table(functions(terminations, "missed_goal predicted_miss turned_touchdown left_stance second_takeoff"), bool)
 PREDICTED = {"tolerance": 0.55, "steps": 6.0, "height": 0.3}
 HEADINGS = [0.0, 100.0, 175.0, 180.0, -175.0]
 
@@ -47,6 +47,18 @@ def test_a_termination_holds_where_it_should(name):
     expected = oracle(robots)
     assert 20 < np.count_nonzero(expected) < 2980
     np.testing.assert_array_equal(holds.all(name, *kernel_inputs(robots), **limits), expected)
+
+
+@pytest.mark.parametrize(
+    ("phase", "contacts", "up", "ends"),
+    [
+        (LANDED, 0, 0.26, True), (LANDED, 0, 0.24, False), (LANDED, 1, 2.0, False), (FLIGHT, 0, 2.0, False),
+        (STANCE, 0, 2.0, False),
+    ],
+)  # fmt: skip
+def test_second_takeoff_is_upward_after_touchdown_with_no_paw_down(phase, contacts, up, ends):
+    view = make_view(contacts=contacts, lin_vel=(3.0, 0.0, up))
+    assert holds("second_takeoff", view, make_episode(phase=phase), speed=0.25) is ends
 
 
 @pytest.mark.parametrize(("miss", "missed"), [(0.49, False), (0.51, True)])

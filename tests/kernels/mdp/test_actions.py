@@ -64,6 +64,9 @@ def test_an_action_is_clamped_and_scaled_about_the_default_pose():
     assert not commands.motors("old_action").any()
     commands.act(0.5 * action)
     np.testing.assert_array_equal(commands.motors("old_action"), clamped)
+    assert not commands.motors("older_action").any()
+    commands.act(0.2 * action)
+    np.testing.assert_array_equal(commands.motors("older_action"), clamped)
 
 
 def test_a_world_takes_the_action_and_the_scale_of_its_own_skill():

@@ -158,6 +158,12 @@ def test_the_bases_centre_of_mass_is_shifted_along_each_axis(made, drawn):
 # ---------------------------------------------------------------- motors
 
 
+def test_kp_and_kd_may_have_ranges_of_their_own(made, drawn):
+    found = drawn("gains", 0.6, 0.7, 1.0, 1.0, only=("gain_ratio", "motors.kp"))
+    assert uniform(found.kp / made.nominal["motors.kp"], 0.6, 0.7)
+    np.testing.assert_array_equal(found.kd, made.nominal["motors.kd"])
+
+
 def test_each_motors_armature_is_scaled_and_that_of_no_other_joint(made, drawn):
     found = drawn("armature", 0.6, 1.4, only=("joint_armature",))
     before, after = dofs(made.nominal["joint_armature"]), dofs(found.joint_armature)
@@ -178,7 +184,7 @@ def test_each_motor_has_a_friction(made, drawn):
 
 
 def test_gains_are_scaled_from_those_of_the_worlds_skill(made, drawn):
-    found = drawn("gains", 0.6, 1.4, only=("gain_ratio", "motors.kp", "motors.kd"))
+    found = drawn("gains", 0.6, 1.4, 0.6, 1.4, only=("gain_ratio", "motors.kp", "motors.kd"))
     ratio = np.concatenate([found.kp / made.nominal["motors.kp"], found.kd / made.nominal["motors.kd"]]).T
     assert uniform(ratio, 0.6, 1.4) and independent(ratio)
     np.testing.assert_allclose(ratio, np.concatenate([found.gain_ratio[..., 0], found.gain_ratio[..., 1]]).T, rtol=1e-6)
@@ -225,13 +231,15 @@ def test_paws_have_one_dynamic_coefficient_and_a_static_one_that_is_not_below_it
 
 
 @pytest.mark.parametrize("name", ["action_latency", "observation_latency"])
-def test_a_latency_is_whole_physics_steps_rounded_down(made, drawn, name):
+def test_a_latency_is_the_nearest_number_of_physics_steps(made, drawn, name):
     array_of = {"action_latency": "latency", "observation_latency": "observation_latency"}[name]
-    found = getattr(drawn(name, 0.0, 0.016, only=(array_of,)), array_of)
-    # 0 to 16 ms are 0 to 7.68 steps of 1/480 s
-    shares = np.bincount(found, minlength=8) / N
-    expected = np.array([1.0] * 7 + [0.68]) / 7.68
-    assert len(shares) == 8 and np.abs(shares - expected).max() < 4.5 * np.sqrt(0.13 * 0.87 / N)
+    found = getattr(drawn(name, 0.0, 0.016, 0.0, only=(array_of,)), array_of)
+    # 0 to 16 ms are 0 to 7.68 steps of 1/480 s: half of the first step counts as 0, 0.18 of the last as 8
+    shares = np.bincount(found, minlength=9) / N
+    expected = np.array([0.5, *[1.0] * 7, 0.18]) / 7.68
+    assert len(shares) == 9 and np.abs(shares - expected).max() < 4.5 * np.sqrt(0.13 * 0.87 / N)
+    some = getattr(drawn(name, 0.004, 0.016, 0.3, only=(array_of,)), array_of)  # 1.92 steps at least, unless none
+    assert np.mean(some == 0) == pytest.approx(0.3, abs=4.5 * np.sqrt(0.3 * 0.7 / N)) and some[some > 0].max() == 8
 
 
 @pytest.mark.parametrize("name", ["action_latency", "observation_latency"])
@@ -239,10 +247,9 @@ def test_a_latency_of_whole_steps_stays_so_many(made, drawn, name):
     array_of = {"action_latency": "latency", "observation_latency": "observation_latency"}[name]
     for steps in range(49):
         seconds = float(np.float32(steps / 480.0))
-        assert (getattr(drawn(name, seconds, seconds, only=(array_of,)), array_of) == steps).all(), steps
-    for steps in (1, 8, 47):  # a little less is one less
-        seconds = steps / 480.0 - 2e-5
-        assert (getattr(drawn(name, seconds, seconds, only=(array_of,)), array_of) == steps - 1).all(), steps
+        assert (getattr(drawn(name, seconds, seconds, 0.0, only=(array_of,)), array_of) == steps).all(), steps
+    for seconds, steps in ((0.008, 4), (0.001, 0), (0.0011, 1), (0.0167, 8), (0.1, 48)):
+        assert (getattr(drawn(name, seconds, seconds, 0.0, only=(array_of,)), array_of) == steps).all(), steps
 
 
 def test_a_push_comes_in_its_share_of_draws_and_else_there_is_none(drawn):
@@ -259,7 +266,7 @@ def test_a_push_comes_in_its_share_of_draws_and_else_there_is_none(drawn):
 
 
 def test_every_world_has_the_motors_of_its_skill_by_what_was_drawn(made, drawn):
-    drawn("gains", 0.6, 1.4, only=("gain_ratio", "motors.kp", "motors.kd"))
+    drawn("gains", 0.6, 1.4, 0.6, 1.4, only=("gain_ratio", "motors.kp", "motors.kd"))
     robot, ratio = made.robot, made.robot.gain_ratio.numpy()
     before = {name: getattr(robot.motors, name).numpy().copy() for name in MOTORS}
     robot.skill.assign(1 - np.arange(N) % 2)

@@ -279,8 +279,8 @@ def test_forgetting_touches_the_masked_worlds_only(stage):
     unchanged(before[0], after[0], SOME, but=FORGOTTEN)
 
 
-ZERO = ("torque", "old_torque", "action", "old_action", "impulse", "paw_force", "peak_force", "contact_time",
-        "air_time", "touchdown_speed", "paw_height", "invalid", "collisions")  # fmt: skip
+ZERO = ("torque", "old_torque", "action", "old_action", "older_action", "impulse", "paw_force", "peak_force",
+        "contact_time", "air_time", "touchdown_speed", "paw_height", "invalid", "collisions")  # fmt: skip
 FORGOTTEN = (*ZERO, "target", "safe_target", "old_rate", "old_lin_vel", "paw_pos", "paw_vel")
 
 

@@ -6,7 +6,7 @@ from jump_helpers import Table, functions, make_episode, make_view
 
 from kernels.mdp import rewards
 
-NAMES = "ground_force action_clip motor_torque_sq joint_acceleration action_rate"
+NAMES = "ground_force action_clip motor_torque_sq joint_acceleration action_rate action_acceleration collision"
 paid = Table(functions(rewards, NAMES), float)
 E = math.exp
 
@@ -27,9 +27,13 @@ def test_regularization_is_a_sum_of_squares_in_every_phase(phase):
         rate_change=2.0 * np.arange(12.0),
         action=np.full(12, 0.5),
         old_action=np.full(12, -0.5),
+        older_action=np.full(12, 0.25),
+        collisions=int(phase == 1) * 16,
     )
     assert paid("ground_force", view, task, weight_force=30.0) == pytest.approx(1.0)
     assert paid("action_clip", view, task) == pytest.approx(0.7)
     assert paid("motor_torque_sq", view, task) == pytest.approx(506.0)
     assert paid("joint_acceleration", view, task) == pytest.approx(2024.0)
     assert paid("action_rate", view, task) == pytest.approx(12.0)
+    assert paid("action_acceleration", view, task) == pytest.approx(12.0 * 1.75**2)
+    assert paid("collision", view, task) == float(phase == 1)

@@ -8,13 +8,14 @@ import warp as wp
 from jump_helpers import Table, functions, make_view
 from mdp_helpers import DEFAULT_ANGLE
 
-from jumper_warp.tasks.velocity.flat import velocity_flat, velocity_trot
+from jumper_warp.tasks.velocity.flat import velocity_trot
+from jumper_warp.tasks.velocity.rough import velocity_rough
 from kernels.mdp.view import mat43, vec12
 from kernels.velocity import rewards
 from kernels.velocity.state import VelocityState
 
 NAMES = """linear_velocity yaw_rate vertical_velocity lateral_stability flat stand lateral_position transversal_position
-air_time rapid_stepping restless_stand foot_clearance slip touchdown jerk trot_schedule"""
+air_time rapid_stepping restless_stand foot_clearance slip touchdown jerk trot_schedule shank_lean"""
 paid = Table(functions(rewards, NAMES), float, VelocityState)
 TRANSVERSAL = np.arange(12) % 3 != 0
 N = 16
@@ -67,6 +68,26 @@ def clearance(r, height):
     return np.sum((1.0 - r["contact"]) * (r["paw_height"] - height) ** 2 * speed)
 
 
+def shank_lean(r, free, hip, thigh, shank):
+    """Knees by the thighs' angles, ankles where circles about them meet below, angles between links and gravity."""
+    down, total = r["gravity"][[0, 2]] / np.linalg.norm(r["gravity"][[0, 2]]), 0.0
+    for leg, contact in enumerate(r["contact"]):
+        front = 1.0 if leg < 2 else -1.0
+        outer, inner = r["angle"][3 * leg + 1 : 3 * leg + 3]
+        knees = [np.array([front * side * (hip + thigh * np.sin(a)), -thigh * np.cos(a)])
+                 for side, a in ((1.0, outer), (-1.0, inner))]  # fmt: skip
+        links = []
+        for turn in (1.0, -1.0):  # by the law of cosines, at the first knee
+            between = knees[1] - knees[0]
+            angle = np.arctan2(between[1], between[0]) + turn * np.arccos(np.linalg.norm(between) / (2.0 * shank))
+            links.append(knees[0] + shank * np.array([np.cos(angle), np.sin(angle)]))
+        ankle = min(links, key=lambda p: p[1])
+        leans = [np.arccos(np.dot(ankle - knee, down) / shank) for knee in knees]
+        total += contact * sum(max(lean - free, 0.0) ** 2 for lean in leans)
+    return total
+
+
+LEG = {"free": 0.5, "hip": 0.045, "thigh": 0.175, "shank": 0.3}
 OFF = {"angle": lambda r: r["angle"] - DEFAULT_ANGLE}
 EXPECTED = {
     "linear_velocity": ({"width": 0.5}, lambda r: np.exp(-np.sum((r["vel"] - r["command"])[:2] ** 2) / 0.25)),
@@ -96,6 +117,7 @@ EXPECTED = {
     "slip": ({}, lambda r: np.sum(r["contact"] * np.sum(r["paw_vel"][:, :2] ** 2, axis=1))),
     "touchdown": ({}, lambda r: np.sum(r["first_contact"] * r["touchdown_speed"] ** 2)),
     "jerk": ({}, lambda r: np.sum(np.sign(r["torque"]) != np.sign(r["old_torque"]))),
+    "shank_lean": (LEG, lambda r: shank_lean(r, **LEG)),
     "trot_schedule": ({"duty": 0.55}, lambda r: trot(r, 0.55)),
 }  # fmt: skip
 
@@ -110,9 +132,17 @@ def test_reward_is_that_of_numpy(name):
 
 
 def test_every_reward_of_the_task_is_compared():
-    used = {term.func.func for task in (velocity_flat(), velocity_trot()) for term in task.rewards}
+    used = {term.func.func for task in (velocity_rough(), velocity_trot()) for term in task.rewards}
     own = {func for func in used if inspect.getmodule(func).__name__ == "kernels.velocity.rewards"}
     assert {func.__name__ for func in own} == set(EXPECTED)
+
+
+def test_shanks_lean_as_inverse_kinematics_has_them():
+    """In the default pose a shank is off vertical by asin of (0.045 + 0.175 sin 45 deg) / 0.3: 34.3 degrees."""
+    view = make_view(contact=np.ones(4), gravity=(0.0, 0.0, -1.0))
+    lean = np.arcsin((0.045 + 0.175 * np.sin(np.pi / 4.0)) / 0.3)
+    assert paid("shank_lean", view, make_state(), **(LEG | {"free": 0.0})) == pytest.approx(8.0 * lean**2, rel=1e-5)
+    assert paid("shank_lean", view, make_state(), **(LEG | {"free": lean + 0.01})) == 0.0
 
 
 def test_standing_robot_at_rest_gets_full_tracking():

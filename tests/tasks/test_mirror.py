@@ -9,8 +9,8 @@ from velocity_helpers import edit, states_of, walking_env
 
 from jumper_warp.registry import make_task
 from jumper_warp.robot.terrain import TerrainCfg, single_tile
+from jumper_warp.tasks.mirror import LEGS, MOTORS, mirror_of, mirror_of_action
 from jumper_warp.tasks.terms import ObservationTerm
-from jumper_warp.tasks.velocity.mirror import LEGS, MOTORS, mirror_of, mirror_of_action
 from jumper_warp.utils.errors import InputError
 from kernels.mdp import observations as obs
 from kernels.velocity import observations as velocity
@@ -69,7 +69,7 @@ def reflection():
     change(robot.body_com, (n, BODIES, 3), lambda c: c * FLIP)
     for name in ("contact_time", "air_time", "touchdown_speed", "peak_force", "paw_height", "paw_force"):
         change(getattr(robot, name), None, lambda x: x[:, LEGS], worlds_last=True)
-    for name in ("action", "old_action", "torque", "joint_offset"):
+    for name in ("action", "old_action", "older_action", "torque", "joint_offset"):
         change(getattr(robot, name), None, lambda x: x[:, MOTORS], worlds_last=True)
     for array in (parameters.gain_ratio, parameters.motors.no_load_speed):
         change(array, None, lambda x: x[:, MOTORS], worlds_last=True)

@@ -1,4 +1,4 @@
-"""The left-right mirror image of what policies of velocity tracking see and do, as permutations and signs.
+"""The left-right mirror image of what policies see and do, as permutations and signs.
 
 A robot that is mirrored about its x-z plane sees `signs * x[order]` of what it saw, and answers it by the mirror image
 of its action. Lateral angles are positive outward and transversal ones away from the twin on both sides, so that motors

@@ -1,0 +1,157 @@
+"""Hard stops of a leg: of each motor, and of the sum of outer and inner angle.
+
+A stop is a spring with a damper on the penetration x = max(0, -gap), taken at the end of the step, that never pulls:
+
+    torque = max(0, ke x(t + dt) + kd (x(t + dt) - x(t)) / dt).
+
+It gives back no more than the spring took. With s the speed away from the stop at the end of the step that is
+
+    0 <= torque  complementary to  s + torque / c - goal >= 0,    c = dt ke + kd,
+
+where goal = -gap / dt outside the stop (the gap closes exactly) and -gap ke / c inside. Where a stop is pressed,
+torque = c (goal - s) is linear in the rates, so that it joins the leg's inertia as damping does (`joint_forces`).
+
+Which stops are pressed is settled together with contact: a step is solved with a set of pressed stops, and again with
+another one until the set is the one that the resulting rates ask for (`pressed_stops`).
+"""
+
+import warp as wp
+
+from ..scalar import mat33, real, vec3, vec4
+
+# sets of a leg: two bits for each of lateral, outer, inner, and outer + inner
+LOWER_STOP = wp.constant(1)
+UPPER_STOP = wp.constant(2)
+ROW_BITS = wp.constant(2)
+ROW_MASK = wp.constant(3)
+ROWS = wp.constant(4)
+# sets tried in a step, and from which on they differ in one stop only, so as not to cycle
+MAX_SETS = wp.constant(12)
+ONE_BY_ONE = wp.constant(3)
+# slack of a stop's law [rad/s] for each [m/s] of the contact tolerance
+SLACK = wp.constant(real(10.0))
+
+
+@wp.struct
+class StopParams:
+    """The stops of one leg; vectors are lateral, outer, inner."""
+
+    lower: vec3  # [rad]
+    upper: vec3
+    sum_lower: real  # [rad]
+    sum_upper: real
+    ke: real  # [N m/rad]
+    kd: real  # [N m s/rad]
+
+
+@wp.struct
+class StopRows:
+    """The stops of one leg in a step; rows are lateral, outer, inner, outer + inner."""
+
+    lower: vec4  # [rad/s] rate at the end of the step above which the lower stop is free
+    upper: vec4  # [rad/s] rate below which the upper stop is free
+    damping: real  # c [N m s/rad]
+
+
+@wp.struct
+class StopForces:
+    """Pressed stops, implicit: torque [N m] at the current rates, and dt C [kg m^2] to add to the inertia."""
+
+    torque: vec3
+    inertia: mat33
+
+
+@wp.func
+def stop_rows(p: StopParams, angles: vec3, dt: real) -> StopRows:
+    """Return the stops in a step dt [s] from motor angles [rad]."""
+    damping = wp.max(dt * p.ke + p.kd, real(1.0e-9))
+    inside = p.ke / damping
+    outside = real(1.0) / dt
+    fold = angles[1] + angles[2]
+    below = p.lower - angles
+    above = p.upper - angles
+    below_fold = p.sum_lower - fold
+    above_fold = p.sum_upper - fold
+    rows = StopRows()
+    rows.damping = damping
+    rows.lower = vec4(
+        below[0] * wp.where(below[0] > real(0.0), inside, outside),
+        below[1] * wp.where(below[1] > real(0.0), inside, outside),
+        below[2] * wp.where(below[2] > real(0.0), inside, outside),
+        below_fold * wp.where(below_fold > real(0.0), inside, outside),
+    )
+    rows.upper = vec4(
+        above[0] * wp.where(above[0] < real(0.0), inside, outside),
+        above[1] * wp.where(above[1] < real(0.0), inside, outside),
+        above[2] * wp.where(above[2] < real(0.0), inside, outside),
+        above_fold * wp.where(above_fold < real(0.0), inside, outside),
+    )
+    return rows
+
+
+@wp.func
+def row_side(pressed: int, i: int) -> int:
+    """Return which stop of row i is pressed: 0, LOWER_STOP or UPPER_STOP."""
+    return (pressed >> (ROW_BITS * i)) & ROW_MASK
+
+
+@wp.func
+def pressed_stops(rows: StopRows, rates: vec3, slack: real, pressed: int) -> int:
+    """Return the set of stops that a leg presses which ends the step at `rates` [rad/s].
+
+    pressed: the set that led to the rates; its stops are released, and others pressed, only beyond the slack [rad/s].
+    """
+    rate = vec4(rates[0], rates[1], rates[2], rates[1] + rates[2])
+    if pressed == 0 and not wp.max(wp.max(rows.lower - rate, rate - rows.upper)) > slack:
+        return 0
+    found = int(0)
+    for i in range(ROWS):
+        side = row_side(pressed, i)
+        if rows.lower[i] - rate[i] > wp.where(side == LOWER_STOP, -slack, slack):
+            found += LOWER_STOP << (ROW_BITS * i)
+        elif rate[i] - rows.upper[i] > wp.where(side == UPPER_STOP, -slack, slack):
+            found += UPPER_STOP << (ROW_BITS * i)
+    return found
+
+
+@wp.func
+def change_one(pressed: int, wanted: int) -> int:
+    """Return `pressed` with the first row in which it differs from `wanted` changed."""
+    for i in range(ROWS):
+        bits = ROW_MASK << (ROW_BITS * i)
+        if (pressed ^ wanted) & bits != 0:
+            return (pressed & ~bits) | (wanted & bits)
+    return pressed
+
+
+@wp.func
+def row_torque(rows: StopRows, i: int, rate: real, pressed: int) -> real:
+    """Return the torque [N m] of row i at its current rate [rad/s]."""
+    side = row_side(pressed, i)
+    if side == 0:
+        return real(0.0)
+    return rows.damping * (wp.where(side == LOWER_STOP, rows.lower[i], rows.upper[i]) - rate)
+
+
+@wp.func
+def stop_forces(rows: StopRows, rates: vec3, pressed: int, dt: real) -> StopForces:
+    """Return the forces of a leg's pressed stops; rates [rad/s] at the start of the step."""
+    forces = StopForces()
+    if pressed == 0:
+        return forces
+    zero = real(0.0)
+    both = vec3(zero, real(1.0), real(1.0))
+    single = vec3(
+        row_torque(rows, 0, rates[0], pressed),
+        row_torque(rows, 1, rates[1], pressed),
+        row_torque(rows, 2, rates[2], pressed),
+    )
+    forces.torque = single + row_torque(rows, 3, rates[1] + rates[2], pressed) * both
+    c = dt * rows.damping
+    diagonal = vec3(
+        wp.where(row_side(pressed, 0) != 0, c, zero),
+        wp.where(row_side(pressed, 1) != 0, c, zero),
+        wp.where(row_side(pressed, 2) != 0, c, zero),
+    )
+    forces.inertia = wp.diag(diagonal) + wp.where(row_side(pressed, 3) != 0, c, zero) * wp.outer(both, both)
+    return forces

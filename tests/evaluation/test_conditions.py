@@ -1,0 +1,172 @@
+"""What policies are tried in: pushes, latency, weak motors, and ends that hide nothing."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+from jump_helpers import edit_coordinates, edit_episodes, ending_names, make_env
+from landing_helpers import still_policy
+
+from experiments.vertical_jump_sweep import for_sweep
+from jumper_warp.evaluation import heights, landings
+from jumper_warp.evaluation.latency import latency_metrics, latency_text
+from jumper_warp.evaluation.run import EvaluationArgs, EvaluationRun
+from jumper_warp.policies.folder import save_policy
+from jumper_warp.policies.restore import Conditions
+from jumper_warp.registry import make_task
+from jumper_warp.tasks.randomization import PUSH_INTERVAL, PUSH_SHARE, RandomizationCfg
+from kernels.jump.state import LANDED
+
+DT = 1.0 / 480.0
+JUMP = make_task("horizontal-jump")
+HELD = dataclasses.replace(
+    JUMP, randomization=RandomizationCfg(push_interval=None, push_share=1.0, redraw="startup", force=(-7.0, 7.0))
+)
+"""Trained with one wrench for the whole episode, drawn once."""
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+
+# ---------------------------------------------------------------- ends
+
+
+@pytest.mark.parametrize(
+    ("name", "change"),
+    [
+        ("horizontal-jump", landings.for_evaluation),
+        ("horizontal-jump", landings.ended_by_takeoff),
+        ("vertical-jump", heights.for_evaluation),
+        ("vertical-jump", for_sweep),
+    ],
+)
+def test_fall_two_seconds_after_a_landing_is_not_hidden_by_its_success(name, change):
+    env = make_env(2, task=change(make_task(name)), auto_reset=False)
+    env.evaluation_reset(np.zeros((2, 4)))
+    edit_episodes(env, phase=LANDED, phase_steps=119)
+    edit_coordinates(env, 1, q={2: 0.05})
+    env.step(torch.zeros((2, 12)))
+    assert ending_names(env) == ["success", "low_base"]
+
+
+def test_second_takeoff_ends_the_jump_where_that_is_asked_for():
+    names = {}
+    for change in (landings.for_evaluation, landings.ended_by_takeoff):
+        env = make_env(2, task=change(JUMP), auto_reset=False)
+        env.evaluation_reset(np.zeros((2, 4)))
+        edit_episodes(env, phase=LANDED, phase_steps=5)
+        for world, up in ((0, 0.5), (1, 0.2)):
+            edit_coordinates(env, world, q={2: 1.0}, qd={2: up + 9.81 / 60.0})
+        env.step(torch.zeros((2, 12)))
+        names[change.__name__] = ending_names(env)
+    assert names == {"for_evaluation": ["", ""], "ended_by_takeoff": ["second_takeoff", ""]}
+
+
+# ---------------------------------------------------------------- pushes
+
+
+def test_pushes_of_a_test_come_and_go_however_they_were_trained_with():
+    drawn = Conditions(randomize=True).applied(HELD).randomization
+    assert (drawn.push_interval, drawn.push_share, drawn.redraw) == (PUSH_INTERVAL, PUSH_SHARE, "reset")
+    assert (drawn.push_in_flight, drawn.force) == (False, (-7.0, 7.0))
+    own = dataclasses.replace(HELD, randomization=RandomizationCfg(push_interval=(1.0, 2.0), push_share=0.5))
+    drawn = Conditions(randomize=True).applied(own).randomization
+    assert (drawn.push_interval, drawn.push_share) == ((1.0, 2.0), 0.5)
+
+
+@pytest.mark.parametrize("in_flight", [False, True])
+def test_pushes_of_a_test_act_in_flight_where_that_is_asked_for(in_flight):
+    conditions = Conditions(randomize=True, push_in_flight=in_flight)
+    task = conditions.applied(dataclasses.replace(HELD, randomization=RandomizationCfg(push_share=1.0)))
+    env = make_env(2, task=landings.for_evaluation(task), randomize=True, auto_reset=False)
+    env.evaluation_reset(np.zeros((2, 4)))
+    edit_coordinates(env, 1, q={2: 1.0})
+    for _ in range(2):  # in the first, the paws of all were last seen in the air
+        push = env.parameters.push.numpy().copy()
+        env.step(torch.zeros((2, 12)))
+    wrench = env.sim.state.body_f.numpy().reshape(2, 21, 6)[:, 0]
+    assert push.any(axis=1).all()
+    np.testing.assert_array_equal(wrench, push * [[1.0], [float(in_flight)]])
+
+
+def test_walking_is_pushed_in_flight_in_any_case():
+    walking = make_task("velocity-flat")
+    assert Conditions(randomize=True).applied(walking).randomization == walking.randomization
+
+
+# ---------------------------------------------------------------- latency, gains, friction
+
+
+def test_nominal_conditions_leave_the_task_alone():
+    assert Conditions().applied(HELD) is HELD
+
+
+def test_fixed_parameters_are_all_that_changes_of_a_nominal_robot():
+    conditions = Conditions(latency=8.0, gains=(0.6, 1.0), friction=0.4)
+    task = landings.for_evaluation(JUMP)
+    nominal = make_env(2, task=task, auto_reset=False)
+    env = make_env(2, task=conditions.applied(task), randomize=conditions.draws, auto_reset=False)
+    assert env.parameters.latency.numpy().tolist() == [4, 4]  # 3.84
+    motors, others = env.sim.motors, nominal.sim.motors
+    np.testing.assert_allclose(motors.kp.numpy(), 0.6 * others.kp.numpy(), rtol=1e-6)
+    for name in ("kd", "no_load_speed", "cutoff_speed", "saturation", "offset"):
+        np.testing.assert_array_equal(getattr(motors, name).numpy(), getattr(others, name).numpy())
+    table, before = (each.sim.physics.dynamics.robot.table.numpy() for each in (env, nominal))
+    changed = (table != before).any(axis=1)
+    assert changed.sum() == 8 and (table[changed] == np.float32(0.4)).all()  # static and dynamic, of four legs
+    assert not env.parameters.push.numpy().any()
+
+
+def test_a_fixed_parameter_that_is_nominal_changes_no_bit():
+    conditions, task = Conditions(latency=0.0), landings.for_evaluation(JUMP)
+    pair = [make_env(2, task=task), make_env(2, task=conditions.applied(task), randomize=conditions.draws)]
+    for env in pair:
+        env.auto_reset = False
+        env.evaluation_reset(np.array([[0.5, 0.0, 0.0, 30.0]] * 2))
+        for step in range(20):
+            env.step(torch.full((2, 12), 0.02 * step))
+    assert torch.equal(pair[0].obs, pair[1].obs)
+    np.testing.assert_array_equal(*(env.sim.physics.dynamics.robot.table.numpy() for env in pair))
+    np.testing.assert_array_equal(*(env.sim.joint_q() for env in pair))
+
+
+def test_randomised_conditions_draw_the_rest():
+    drawn = Conditions(randomize=True, gains=(0.6, 1.0), latency=50.0).applied(JUMP).randomization
+    assert (drawn.gains, drawn.damping_gains, drawn.latency) == ((0.6, 0.6), (1.0, 1.0), (50.0, 50.0))
+    assert drawn.base_mass == RandomizationCfg().base_mass
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: Conditions(latency=101.0), "latency must be in 0 to 100 ms"),
+        (lambda: EvaluationArgs(latency=-1.0), "latency must not be negative"),
+        (lambda: Conditions(gains=(0.0, 1.0)), "gains must be above 0"),
+        (lambda: EvaluationArgs(gains=(1.0, -1.0)), "damping_gains must be above 0"),
+        (lambda: Conditions(friction=-0.1), "friction must not be negative"),
+        (lambda: EvaluationArgs(push_in_flight=True), "push_in_flight needs randomize"),
+    ],
+)
+def test_impossible_conditions_are_refused(make, message):
+    with pytest.raises(ValueError, match=message):
+        make()
+
+
+def test_latency_is_told_as_it_was_simulated():
+    assert latency_text(np.array([4, 4]), DT) == "8.33 ms (4 physics steps)"
+    assert latency_text(np.array([1]), DT) == "2.08 ms (1 physics step)"
+    assert latency_text(np.array([0, 8, 4]), DT) == "0 to 16.7 ms (0 to 8 physics steps), mean 8.33 ms"
+    assert latency_metrics(np.array([3, 3]), DT) == {"latency_ms": 6.25, "latency": "6.25 ms (3 physics steps)"}
+    assert latency_metrics(np.array([4]), DT, 8.0)["latency_asked_ms"] == 8.0
+
+
+def test_run_tells_the_latency_it_simulated_over_several_policy_steps(tmp_path):
+    save_policy(tmp_path / "still", still_policy("horizontal-jump"))
+    args = EvaluationArgs(str(tmp_path / "still"), latency=40.0, record=0, out=tmp_path, device="cpu")
+    run = EvaluationRun.of("test", args)
+    env = run.env(2)
+    asked = landings.Landings(np.array([[[0.5, 0.0]]] * 2), tuple(term.name for term in env.task.terminations))
+    run.follow(env, asked)
+    values = run.report({}, {})
+    assert (values["latency_asked_ms"], values["latency"]) == (40.0, "39.6 ms (19 physics steps)")
+    assert values["latency_ms"] == pytest.approx(1000.0 * 19 / 480)
+    assert run.title == "jumper, nominal, latency 39.6 ms (19 physics steps)"

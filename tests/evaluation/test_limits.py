@@ -1,0 +1,70 @@
+"""How high the open-loop jump takes each robot."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from jump_helpers import make_env
+from randomization_helpers import read
+
+from experiments.vertical_jump_sweep import OPEN_LOOP_APEX, for_sweep
+from jumper_warp.evaluation.jumps import jump_commands
+from jumper_warp.evaluation.limits import open_loop_limits
+from jumper_warp.evaluation.open_loop import EXTEND, HOLD, RAMP, STAND, transversal_command
+from jumper_warp.policies.restore import Conditions
+from jumper_warp.registry import make_task
+from jumper_warp.robot.motors import vertical_jump_filter
+from jumper_warp.sim.simulation import Simulation
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+
+def begun(conditions, worlds):
+    """Return an environment that has begun no episode yet, and its state."""
+    task = conditions.applied(for_sweep(make_task("vertical-jump")))
+    env = make_env(worlds, task=task, randomize=conditions.draws, auto_reset=False)
+    return env, env.state_dict()
+
+
+def simulated_apex(kp, kd):
+    """Return the apex of the paper's open-loop jump with scaled gains, from a simulation without an environment."""
+    motors = make_task("vertical-jump").motors
+    lateral, transversal = (replace(m, kp=kp * m.kp, kd=kd * m.kd) for m in (motors.lateral, motors.transversal))
+    motors = replace(motors, lateral=lateral, transversal=transversal)
+    sim = Simulation(1, motors=motors, command_filter=vertical_jump_filter(), visuals=False, device="cpu")
+    heights = []
+    for tick in range(STAND + RAMP + HOLD + EXTEND):
+        sim.target.assign((np.tile([0.0, 1.0, 1.0], 4) * transversal_command(tick))[:, None].astype(np.float32))
+        sim.step()
+        heights.append(sim.joint_q()[0, 2])
+    return max(heights[STAND + RAMP + HOLD :])
+
+
+@pytest.mark.parametrize(
+    ("gains", "about"), [(None, OPEN_LOOP_APEX), ((0.6, 1.0), 0.757)], ids=["nominal", "weak"]
+)  # 0.757 m was found from outside
+def test_limit_is_the_apex_of_the_open_loop_jump(gains, about):
+    found = open_loop_limits(*begun(Conditions(gains=gains), 2))
+    assert found == pytest.approx([simulated_apex(*(gains or (1.0, 1.0)))] * 2, abs=0.002)
+    assert found == pytest.approx([about] * 2, abs=0.005)
+
+
+def test_limits_are_of_the_very_robots_that_jumped_before():
+    env, fresh = begun(Conditions(randomize=True), 8)
+    command = jump_commands(np.tile([0.0, 0.0, 0.8], (8, 1)), 0.5, env.step_dt)
+    env.evaluation_reset(command)
+    drawn, skill = read(env), env.skills[0]
+    for _ in range(30):
+        env.step(torch.zeros((8, 12)))
+    numbers = skill.numbers.numpy().copy()
+    limits = open_loop_limits(env, fresh)
+    found = read(env)
+    for name in drawn:
+        if name in ("force", "torque"):
+            assert not found[name].any()
+        else:
+            np.testing.assert_array_equal(found[name], drawn[name], err_msg=name)
+    np.testing.assert_array_equal(skill.numbers.numpy(), numbers)
+    assert 0.75 < limits.min() < limits.max() - 0.05 < 1.3
+    np.testing.assert_array_equal(open_loop_limits(env, fresh), limits)

@@ -1,0 +1,199 @@
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+import torch
+from toy_task import PushTask, fill
+
+from jumper_warp.cli.main import main
+from jumper_warp.policies.restore import open_policy
+from jumper_warp.registry import make_task
+from jumper_warp.rl import compiling
+from jumper_warp.rl.cfg import PpoCfg, TrainCfg
+from jumper_warp.rl.checkpoint import save_checkpoint
+from jumper_warp.rl.flat import FlatParameters
+from jumper_warp.rl.mirror import Symmetry, image, plain_layers
+from jumper_warp.rl.networks import ActorCritic
+from jumper_warp.rl.passes import backward_both, forward_both
+from jumper_warp.rl.ppo import Ppo
+from jumper_warp.tasks.interface import interface
+from jumper_warp.tasks.mirror import mirror_of, mirror_of_action
+from jumper_warp.utils.errors import InputError
+
+OBS, ACTION = mirror_of(make_task("velocity-flat"), "policy"), mirror_of_action()
+WALKING = Symmetry(image(*OBS, "observation"), image(*ACTION, "action"))
+NUM_OBS = len(OBS.order)
+CFG = PpoCfg(num_steps=8, epochs=2, minibatches=2, hidden=(16, 9), symmetry="actor")
+
+
+def mirrored(x, mirror):
+    return torch.from_numpy(mirror.signs) * x[..., torch.from_numpy(mirror.order)]
+
+
+def walker(hidden=(32, 24)):
+    """A network with answers as large as its inputs."""
+    torch.manual_seed(3)
+    model = ActorCritic(NUM_OBS, 12, hidden, symmetry=WALKING)
+    with torch.no_grad():
+        model.actor[-1].weight.mul_(100.0)
+        model.actor[-1].bias.normal_()
+    return model
+
+
+def test_mirrored_observation_gives_the_mirrored_action():
+    model, x = walker(), torch.randn(64, NUM_OBS)
+    torch.testing.assert_close(model.mean(mirrored(x, OBS)), mirrored(model.mean(x), ACTION), atol=1e-5, rtol=1e-5)
+    assert (model.actor(mirrored(x, OBS)) - mirrored(model.actor(x), ACTION)).abs().max() > 0.1
+
+
+def test_no_sideways_answer_to_a_symmetric_observation():
+    model, x = walker(), torch.randn(64, NUM_OBS)
+    action = model.mean(0.5 * (x + mirrored(x, OBS)))
+    torch.testing.assert_close(action[:, :3], action[:, 3:6], atol=1e-5, rtol=1e-5)
+
+
+def test_passes_over_both_images_equal_autograd():
+    model, x = walker(), torch.randn(40, NUM_OBS)
+    flat = FlatParameters(model, "elu")
+    layers, _ = flat.actor(flat.value)
+    slopes = (torch.randn(40, 12), torch.randn(40, 12))
+    own, other = model.actor(x), mirrored(model.actor(mirrored(x, OBS)), ACTION)
+    expected = torch.autograd.grad((own, other), list(model.actor.parameters()), slopes)
+    *outputs, seen = forward_both(layers, x, WALKING, torch.float32)
+    for found, right in zip(outputs, (own, other), strict=True):
+        torch.testing.assert_close(found, right, atol=1e-5, rtol=1e-5)
+    for found, right in zip(backward_both(layers, seen, slopes, WALKING, torch.float32), expected, strict=True):
+        torch.testing.assert_close(found, right, atol=1e-4, rtol=1e-4)
+
+
+@pytest.mark.parametrize("hidden", [(), (16,), (32, 24)])
+def test_plain_network_answers_alike(hidden):
+    model, x = walker(hidden), torch.randn(16, NUM_OBS)
+    linear = [layer for layer in model.actor if isinstance(layer, torch.nn.Linear)]
+    expected = model.mean(x)
+    layers = plain_layers([(layer.weight, layer.bias) for layer in linear], WALKING)
+    for index, (weight, bias) in enumerate(layers):
+        x = torch.nn.functional.linear(x, weight, bias)
+        x = torch.nn.functional.elu(x) if index < len(layers) - 1 else x
+    assert [weight.shape[0] for weight, _ in layers] == [*(2 * width for width in hidden), 12]
+    torch.testing.assert_close(x, expected, atol=1e-5, rtol=1e-5)
+
+
+def test_symmetric_statistics_are_those_of_both_images():
+    x = torch.randn(5000, NUM_OBS) * 0.7 + torch.linspace(-1.0, 1.0, NUM_OBS)
+    mean, var = WALKING.obs.moments(x.mean(0), x.var(0, correction=0))
+    both = torch.cat([x, mirrored(x, OBS)])
+    torch.testing.assert_close(mean, both.mean(0), atol=1e-5, rtol=1e-5)
+    torch.testing.assert_close(var, both.var(0, correction=0), atol=1e-5, rtol=1e-5)
+    assert torch.equal(mean, mirrored(mean, OBS))
+    assert torch.equal(var, var[torch.from_numpy(OBS.order)])
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [(np.array([1, 2, 0]), np.ones(3)), (np.array([1, 0]), np.array([1.0, -1.0])), (np.arange(2), np.ones(3)),
+     (np.array([0, 7]), np.ones(2))],
+)  # fmt: skip
+def test_image_that_is_not_its_own_inverse_is_refused(wrong):
+    with pytest.raises(InputError, match="mirror image of action is not its own inverse"):
+        image(*wrong, "action")
+
+
+# ---------------------------------------------------------------- training
+
+
+def test_symmetric_actor_acts_and_stays_symmetric_in_training():
+    torch.manual_seed(0)
+    ppo = Ppo(PushTask(32), CFG)
+    ppo.env.reset()
+    for _ in range(3):
+        ppo.iterate()
+    ppo.collect()
+    rollout, model = ppo.rollout, ppo.model
+    torch.testing.assert_close(rollout.mean, model.mean(model.features(rollout.obs[:-1])), atol=1e-5, rtol=1e-4)
+    assert not model.obs_moments.mean.any() and model.obs_moments.count > 0
+    obs = torch.randn(50, 2)
+    assert torch.equal(model.act(-obs), -model.act(obs))
+    assert model.act(obs).abs().max() > 0.0
+
+
+def test_asymmetry_falls_where_it_costs():
+    def asymmetry(**change):
+        torch.manual_seed(0)
+        ppo = Ppo(PushTask(32), dataclasses.replace(CFG, symmetry="loss", **change))
+        torch.nn.init.constant_(ppo.model.actor[-1].bias, 0.3)
+        ppo.env.reset()
+        for _ in range(8):
+            ppo.iterate()
+        return ppo.statistics()["Loss/asymmetry"]
+
+    assert asymmetry(symmetry_coef=3.0) < 0.5 * asymmetry(symmetry_coef=0.0)
+
+
+@pytest.mark.parametrize("mode", ["actor", "loss"])
+def test_symmetric_update_traces_into_one_graph(mode, monkeypatch):
+    monkeypatch.setattr(compiling, "BACKEND", "eager")
+    cfg = dataclasses.replace(CFG, symmetry=mode)
+    found = []
+    for compiled in ("off", "on"):
+        torch.manual_seed(0)
+        ppo = Ppo(PushTask(16), dataclasses.replace(cfg, compile=compiled))
+        fill(ppo, slice(None), 16)
+        torch.manual_seed(1)
+        ppo.update()
+        ppo.env.reset()
+        ppo.collect()
+        assert ppo.compiler.enabled == (compiled == "on")
+        found.append((ppo.flat.value.clone(), ppo.rollout.mean.clone()))
+    for off, on in zip(*found, strict=True):
+        torch.testing.assert_close(on, off)
+
+
+def test_checkpoint_of_a_symmetric_actor_resumes_and_becomes_a_plain_policy(tmp_path):
+    task, cfg = make_task("velocity-flat"), dataclasses.replace(CFG, hidden=(8, 6))
+    model = walker(cfg.hidden)
+    model.obs_moments.update(torch.randn(100, NUM_OBS))
+    env = {"interface": interface(task), "policy_dt_s": 1 / 60, "physics_dt_s": 1 / 480}
+    config = {"env": env, "train": dataclasses.asdict(dataclasses.replace(TrainCfg(), ppo=cfg)), "commit": None}
+    state = {"ppo": {"model": model.state_dict()}, "iteration": 3, "env": {}, "rng": {}}
+    state["config"] = json.dumps(config, default=str)
+    policy = open_policy(save_checkpoint(tmp_path, state, None, 3))
+    obs = torch.randn(30, NUM_OBS)
+    torch.testing.assert_close(policy.act(obs), model.act(obs), atol=1e-5, rtol=1e-5)
+    assert policy.interface.sizes == (NUM_OBS, 16, 12, 12)
+
+    first, second = Ppo(PushTask(8), CFG), Ppo(PushTask(8), CFG)
+    second.load_state_dict(first.state_dict())
+    assert torch.equal(first.flat.value, second.flat.value)
+    wrong = first.state_dict()
+    wrong["model"]["mirror_obs_order"] = wrong["model"]["mirror_obs_order"].flip(0)
+    with pytest.raises(InputError, match="mirror_obs_order is of another observation"):
+        second.load_state_dict(wrong)
+    with pytest.raises(InputError, match=r"has mirror_\w+, mirror_\w+, mirror_\w+ and 1 more besides"):
+        Ppo(PushTask(8), dataclasses.replace(CFG, symmetry="off")).load_state_dict(first.state_dict())
+
+
+def test_task_without_mirror_image_is_refused_in_one_line(capsys):
+    with pytest.raises(SystemExit):
+        main(["train", "vertical-jump", "--ppo.symmetry", "actor"])
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) == 1 and "vertical-jump policy: the mirror image of" in lines[0]
+
+
+def test_environment_without_mirror_image_is_refused():
+    class Plain(PushTask):
+        mirror = None
+
+    class Other(PushTask):
+        def mirror(self, what):
+            return [0], [1.0]
+
+    for env in (Plain, Other):
+        with pytest.raises(InputError, match="mirror image"):
+            Ppo(env(4), CFG)
+
+
+def test_no_symmetry_with_another_trainer():
+    with pytest.raises(InputError, match="symmetry is not offered with trainer rsl-rl"):
+        TrainCfg(trainer="rsl-rl", ppo=CFG)

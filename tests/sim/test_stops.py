@@ -1,0 +1,222 @@
+"""Hard stops: robots that rest on them, their law against a quadratic program, and the energy they take."""
+
+import math
+
+import newton
+import numpy as np
+import pytest
+import warp as wp
+from newton import ModelFlags
+from scipy.optimize import nnls
+from scipy.spatial.transform import Rotation
+from simulation_helpers import PAW_RADIUS, WEIGHT, command, paw_centres, paw_forces, simulation, write_state
+from solver_helpers import BODIES, DOFS, MOTOR_V, Reference, States, random_states
+
+from jumper_warp.robot.model import LIMIT_DAMPING, LIMIT_STIFFNESS, build_model
+from jumper_warp.robot.motors import vertical_jump_filter
+from jumper_warp.sim.dynamics import JumperDynamics
+from kernels import layout
+
+DT = 1.0 / 480.0
+BOUNDED = np.vstack([np.eye(12), np.kron(np.eye(4), [0.0, 1.0, 1.0])])
+"""What stops bound: the motors, and each leg's outer + inner."""
+LOWER = np.radians([-50.0, -30.0, -30.0] * 4 + [0.0] * 4).astype(np.float32).astype(float)
+UPPER = np.radians([110.0, 140.0, 140.0] * 4 + [240.0] * 4).astype(np.float32).astype(float)
+STRENGTH = DT * LIMIT_STIFFNESS + LIMIT_DAMPING
+"""[N m s/rad]"""
+SQUATS = [2.05, 2.1, 2.4, 2.6]
+"""[rad] Targets of the transversal motors; their stop is at 2.09 rad."""
+
+
+def slope(degrees):
+    x = np.linspace(-20.0, 20.0, 41)
+    heights = np.tile(math.tan(math.radians(degrees)) * x, (41, 1))
+    return newton.Heightfield(data=heights.astype(np.float32), nrow=41, ncol=41, hx=20.0, hy=20.0)
+
+
+def tilt(sim, degrees):
+    """Put standing robots on a slope, the base parallel to it."""
+    q, turn = sim.joint_q().copy(), Rotation.from_euler("y", -degrees, degrees=True)
+    q[:, :3], q[:, 3:7] = turn.apply([0.0, 0.0, q[0, 2]]), turn.as_quat()
+    write_state(sim, q)
+
+
+def randomise(sim, seed):
+    """Draw masses, armatures, motor friction and gains in the ranges of the jumps."""
+    rng, n, model = np.random.default_rng(seed), sim.num_worlds, sim.model
+    shares = rng.uniform(0.8, 1.2, (n, BODIES))
+    shares[:, 0] = 1.0 + rng.uniform(-0.1, 0.2, n)
+    shares = shares.ravel()
+    model.body_mass.assign((model.body_mass.numpy() * shares).astype(np.float32))
+    model.body_inertia.assign((model.body_inertia.numpy() * shares[:, None, None]).astype(np.float32))
+    com = model.body_com.numpy().reshape(n, BODIES, 3)
+    com[:, 0] += rng.uniform(-0.03, 0.03, (n, 3))
+    model.body_com.assign(com.reshape(-1, 3))
+    for array in (model.joint_armature, model.joint_friction):
+        array.assign((array.numpy() * np.repeat(rng.uniform(0.6, 1.4, n), DOFS)).astype(np.float32))
+    sim.solver.notify_model_changed(ModelFlags.ALL)
+    for array in (sim.motors.kp, sim.motors.kd):
+        array.assign((array.numpy() * rng.uniform(0.6, 1.4, n)).astype(np.float32))
+
+
+def ripple(sim, transversal, ramp=25, settle=60, steps=240):
+    """Command a squat or straight legs [rad], wait a second, and return what the paw forces then do.
+
+    Peak to peak of each paw over `steps` [N], (num_worlds, 4), and the share of paw-steps without contact.
+    """
+    start = sim.target.numpy().T.copy()
+    goal = np.outer(transversal, [0.0, 1.0, 1.0] * 4)
+    for tick in range(ramp + settle):
+        command(sim, start + min(1.0, (tick + 1) / ramp) * (goal - start))
+        sim.step()
+    forces = []
+    for tick in range(steps):
+        if tick % sim.substeps == 0:
+            sim.filter_targets()
+        sim.physics_step()
+        forces.append(np.linalg.norm(paw_forces(sim), axis=2))
+    forces = np.array(forces)
+    assert forces.sum(axis=2).min() > 0.9 * WEIGHT  # they stand
+    return np.ptp(forces, axis=0), (forces <= 0.0).mean()
+
+
+@pytest.mark.parametrize("filtered", [False, True])
+def test_robot_rests_on_the_stops(filtered):
+    targets = np.array([*SQUATS, -0.4, -0.7])
+    sim = simulation(len(targets), command_filter=vertical_jump_filter() if filtered else None)
+    peak_to_peak, lost = ripple(sim, targets)
+    assert peak_to_peak.max() < 0.01 * WEIGHT
+    assert lost == 0.0
+
+
+def test_robots_of_all_kinds_rest_on_the_stops_of_the_squat():
+    targets = np.repeat(SQUATS, 6)
+    sim = simulation(len(targets))
+    randomise(sim, 1)
+    peak_to_peak, lost = ripple(sim, targets)
+    assert peak_to_peak.max() < 0.01 * WEIGHT
+    assert lost == 0.0
+
+
+def test_robot_rests_on_the_stops_on_a_slope():
+    sim = simulation(len(SQUATS), ground=slope(10.0))
+    tilt(sim, 10.0)
+    peak_to_peak, lost = ripple(sim, np.array(SQUATS))
+    assert peak_to_peak.max() < 0.01 * WEIGHT
+    assert lost == 0.0
+
+
+def at_the_stops(n, seed, joint_rate=8.0):
+    """Random states, half of the bounded quantities within 1 degree of a stop, on either side of it."""
+    rng, states = np.random.default_rng(seed), random_states(n, seed, joint_rate=joint_rate)
+    for angles in states.angles:
+        for i in rng.permutation(16)[:8]:
+            bound = (LOWER, UPPER)[rng.integers(2)][i] + math.radians(rng.uniform(-1.0, 1.0))
+            row = BOUNDED[i]
+            angles += row * (bound - row @ angles) / (row @ row)
+    return states
+
+
+class Steps:
+    """Single steps in double precision, with the stops or with none."""
+
+    def __init__(self, num_worlds, *, stops):
+        self.n, self.model = num_worlds, build_model(num_worlds, visuals=False, device="cpu")
+        self.dynamics = JumperDynamics(self.model, double=True)
+        if not stops:
+            table = self.dynamics.robot.table.numpy()
+            for leg in range(4):
+                row = leg * int(layout.LEG_ROWS)
+                table[row + int(layout.STOP_KE)] = table[row + int(layout.STOP_KD)] = 0.0
+            self.dynamics.robot.table.assign(table)
+
+    def bounds(self):
+        """Return the stops of all bounded quantities [rad], lower and upper, to the last bit."""
+        table = self.dynamics.robot.table.numpy()[:, 0]
+        legs = np.arange(4)[:, None] * int(layout.LEG_ROWS)
+        single = (table[legs + int(row) + np.arange(3)].ravel() for row in (layout.LOWER, layout.UPPER))
+        sums = (table[legs[:, 0] + int(row)] for row in (layout.SUM_LOWER, layout.SUM_UPPER))
+        return [np.append(*pair) for pair in zip(single, sums, strict=True)]
+
+    def run(self, states, torque=0.0):
+        """Return the velocities at the end of a step, in the pose of its start; torque [N m] (n, 12)."""
+        joint_f = np.zeros((self.n, DOFS))
+        joint_f[:, MOTOR_V] = torque
+        q, qd, force = (wp.array(v, dtype=wp.float64) for v in (states.joint_q(), states.joint_qd(), joint_f.ravel()))
+        self.dynamics.work.impulse.zero_()
+        drive = self.dynamics.drive(force, wp.zeros(self.n * BODIES, dtype=wp.spatial_vector))
+        self.dynamics.advance(self.dynamics.settings(DT, 1, 5000, 1.0e-9), drive, q, qd, q, qd)
+        new = States.read(q.numpy(), qd.numpy())
+        com = self.model.body_com.numpy()[::BODIES].astype(float)
+        before, after = Rotation.from_quat(states.quat), Rotation.from_quat(new.quat)
+        origin = new.com_vel - np.cross(new.ang_vel, after.apply(com))
+        ang = before.apply(after.inv().apply(new.ang_vel))
+        return States(
+            states.pos.copy(), states.quat, origin + np.cross(ang, before.apply(com)), ang, states.angles, new.rates
+        )
+
+
+def repeated(states, times):
+    return States(*(np.repeat(values, times, axis=0) for values in vars(states).values()))
+
+
+def test_stops_are_the_solution_of_a_quadratic_program():
+    """In flight the rates are affine in the torques, so that stops without contact are a least-squares problem.
+
+    With torques f >= 0 of both stops of each quantity, speeds s = s_free + J A J' f away from them and the law
+    0 <= f, s + f / c >= goal, complementary: minimise f' (J A J' + 1 / c) f / 2 + f' (s_free - goal).
+    """
+    n = 40
+    states = at_the_stops(n, 21)
+    states.pos[:, 2] = 3.0
+    stopping = Steps(n, stops=True)
+    found, (lower, upper) = stopping.run(states).rates, stopping.bounds()
+    units = np.tile(np.vstack([np.zeros(12), np.eye(12)]), (n, 1))
+    free = Steps(13 * n, stops=False).run(repeated(states, 13), units).rates.reshape(n, 13, 12)
+    toward = np.vstack([BOUNDED, -BOUNDED])
+    several = surprised = 0
+    for i in range(n):
+        response = (free[i, 1:] - free[i, 0]).T
+        gaps = toward @ states.angles[i] - np.append(lower, -upper)
+        goal = np.where(gaps > 0.0, -gaps / DT, -gaps * LIMIT_STIFFNESS / STRENGTH)
+        matrix = toward @ response @ toward.T
+        factor = np.linalg.cholesky(0.5 * (matrix + matrix.T) + np.eye(32) / STRENGTH)
+        torque, _ = nnls(factor.T, np.linalg.solve(factor, goal - toward @ free[i, 0]))
+        np.testing.assert_allclose(found[i], free[i, 0] + response @ toward.T @ torque, rtol=0.0, atol=1.0e-6)
+        pressed = torque > 0.0
+        several += pressed.reshape(2, 16)[:, :12].sum() > 2
+        surprised += (pressed != (toward @ states.rates[i] < goal)).any()
+    assert several > n // 2
+    assert surprised > 5  # where the rates at the start press other stops
+
+
+@pytest.mark.parametrize("falling", [False, True])
+def test_stops_give_back_no_more_energy_than_they_hold(falling):
+    """One step with stops and contact leaves no more kinetic and spring energy than the same one without them."""
+    n = 64
+    states = at_the_stops(n, 22, joint_rate=15.0)
+    states.pos[:, 2] = 3.0
+    if falling:  # level, the lowest paw 0.1 mm above the ground, legs anyhow
+        states.quat[:] = [0.0, 0.0, 0.0, 1.0]
+        states.com_vel += [0.0, 0.0, -3.0]
+        sim = simulation(n)
+        write_state(sim, states.joint_q().reshape(n, -1))
+        states.pos[:, 2] += PAW_RADIUS + 1.0e-4 - paw_centres(sim)[..., 2].min(axis=1)
+    stopping = Steps(n, stops=True)
+    ended = stopping.run(states)
+    states.pos[:, 2] += 3.0
+    freely = Steps(n, stops=False).run(states)
+    freely.pos[:] = ended.pos
+    reference = Reference(stopping.model)
+
+    def spring(angles):
+        bounded = angles @ BOUNDED.T
+        inside = np.maximum(np.maximum(LOWER - bounded, bounded - UPPER), 0.0)
+        return 0.5 * LIMIT_STIFFNESS * (inside**2).sum(axis=1)
+
+    held = spring(states.angles + DT * ended.rates) - spring(states.angles)
+    gained = np.array([reference.energy(ended, i) - reference.energy(freely, i) for i in range(n)]) + held
+    landed = stopping.dynamics.work.impulse.numpy()[..., 2].max(axis=0) > 0.0
+    assert landed.mean() > 0.8 if falling else not landed.any()
+    assert gained.max() < 1.0e-6
+    assert np.median(gained) < -0.1
