@@ -25,6 +25,8 @@ SETTLING = 0.02
 """[s] From the start on, in which rows of a motion on the ground do not count: paws that do not stand on it exactly
 strike it, and when each does is a matter of micrometres."""
 DEGREE = math.pi / 180.0
+TRUST = 3.0
+"""Deviations of the noise by which a start may differ from what is measured there, so that it hardly counts twice."""
 HANGING_HEIGHT = 1.0
 """[m] Of a held base whose position is not told."""
 DIFFERENCE = 1.0e-4
@@ -115,7 +117,7 @@ class MotionResiduals:
         self.free = motion.base == "free"
         self.start_size = 36 if self.free else 27
         self._measure(noise)
-        self._guess_start()
+        self._guess_start(noise.of_channels)
         self.plan = self._plan()
 
     def _measure(self, noise: NoiseLevels) -> None:
@@ -142,11 +144,11 @@ class MotionResiduals:
             raise InputError(f"motion {motion.name}: nothing is measured that a replay could be compared to")
         self.sigma, self._leg = np.array(sigma), np.array(legs)
 
-    def _guess_start(self) -> None:
+    def _guess_start(self, noise: dict[str, tuple[float, int]]) -> None:
         """Set what the first rows say of the start, and how well."""
         motion, rows = self.motion, min(8, len(self.motion.time))
-        angle, angle_prior = first_values(motion.angle, motion.target[0], math.radians(1.0), math.radians(10.0))
-        rate, rate_prior = first_values(motion.rate, None, 0.5, 1.0)
+        angle, angle_prior = first_values(motion.angle, motion.target[0], TRUST * noise["angle"][0], 10.0 * DEGREE)
+        rate, rate_prior = first_values(motion.rate, None, TRUST * noise["rate"][0], 1.0)
         if motion.rate is None and motion.angle is not None:
             rate, rate_prior = slope(motion.time[:rows], motion.angle[:rows]), np.full(12, 1.0)
         level, place = np.array([0.0, 0.0, 0.0, 1.0]), np.array([0.0, 0.0, HANGING_HEIGHT])
