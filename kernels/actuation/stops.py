@@ -12,7 +12,8 @@ where goal = -gap / dt outside the stop (the gap closes exactly) and -gap ke / c
 torque = c (goal - s) is linear in the rates, so that it joins the leg's inertia as damping does (`joint_forces`).
 
 Which stops are pressed is settled together with contact: a step is solved with a set of pressed stops, and again with
-another one until the set is the one that the resulting rates ask for (`pressed_stops`).
+another one until the set is the one that the resulting rates ask for (`pressed_stops`). Most steps need one set, few
+three. Friction can make sets cycle, in a violent impact on jammed legs: stops are then pressed and no more released.
 """
 
 import warp as wp
@@ -25,9 +26,11 @@ UPPER_STOP = wp.constant(2)
 ROW_BITS = wp.constant(2)
 ROW_MASK = wp.constant(3)
 ROWS = wp.constant(4)
-# sets tried in a step, and from which on they differ in one stop only, so as not to cycle
-MAX_SETS = wp.constant(12)
+# after so many sets of a step only one stop changes at a time, which alone cannot cycle without friction; after so many
+# none is released; and after so many the last set stands
 ONE_BY_ONE = wp.constant(3)
+PRESS_ONLY = wp.constant(8)
+MAX_SETS = wp.constant(12)
 # slack of a stop's law [rad/s] for each [m/s] of the contact tolerance
 SLACK = wp.constant(real(10.0))
 
@@ -112,6 +115,25 @@ def pressed_stops(rows: StopRows, rates: vec3, slack: real, pressed: int) -> int
         elif rate[i] - rows.upper[i] > wp.where(side == UPPER_STOP, -slack, slack):
             found += UPPER_STOP << (ROW_BITS * i)
     return found
+
+
+@wp.func
+def revised_stops(rows: StopRows, rates: vec3, slack: real, pressed: int, sets: int) -> int:
+    """Return the set to try after `sets` sets of a step, the last of which, `pressed`, led to `rates` [rad/s]."""
+    wanted = pressed_stops(rows, rates, slack, pressed)
+    if wanted == pressed or sets < PRESS_ONLY:
+        return wanted
+    found = pressed
+    for i in range(ROWS):
+        if row_side(pressed, i) == 0:
+            found += wanted & (ROW_MASK << (ROW_BITS * i))
+    return found
+
+
+@wp.func
+def one_by_one(sets: int) -> bool:
+    """Return whether the set after `sets` sets of a step differs in one stop of a world only."""
+    return sets >= ONE_BY_ONE and sets < PRESS_ONLY
 
 
 @wp.func

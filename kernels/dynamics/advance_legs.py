@@ -8,7 +8,7 @@ is made again by its world, while the others of a warp go on.
 
 import warp as wp
 
-from ..actuation.stops import MAX_SETS, ONE_BY_ONE, SLACK, change_one, pressed_stops, stop_rows
+from ..actuation.stops import MAX_SETS, SLACK, change_one, one_by_one, pressed_stops, revised_stops, stop_rows
 from ..layout import GRAVITY
 from ..scalar import real, vec3
 from ..state import BaseState, base_com, leg_coord, leg_dof, load_base, load_motors, store_base, store_motors
@@ -144,10 +144,11 @@ def advance_leg(
     rates += solve.inverse * (wp.transpose(contact.jacobian) * solved.impulse)
     rates -= solve.to_lin * solved.lin + solve.to_ang * solved.ang
     total = sum_vec(solved.impulse)
-    wanted = pressed_stops(rows, rates, SLACK * settings.tolerance, pressed)
+    sets = old.sets + 1
+    wanted = revised_stops(rows, rates, SLACK * settings.tolerance, pressed, sets)
     first = first_leg(wanted != pressed)
     agreed = from_leg(wp.where(wanted != pressed, real(1.0), real(0.0)), first) == real(0.0)
-    done = old.step < settings.substeps and (agreed or old.sets + 1 >= MAX_SETS)
+    done = old.step < settings.substeps and (agreed or sets >= MAX_SETS)
     if blocks:
         push = sum_vec(wp.where(contact.on_block != 0, -solved.impulse, vec3(real(0.0))))
         if writes and done and robot.ground.blocks[world].exists != 0:
@@ -167,9 +168,9 @@ def advance_leg(
         new.step = old.step + 1
         new.sets = 0
     else:
-        new.sets = old.sets + 1
+        new.sets = sets
         new.pressed = pressed
-        if new.sets < ONE_BY_ONE:
+        if not one_by_one(sets):
             new.pressed = wanted
         elif leg == first:
             new.pressed = change_one(pressed, wanted)

@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from ..actuation.stops import MAX_SETS, ONE_BY_ONE, SLACK, StopRows, change_one, pressed_stops, stop_rows
+from ..actuation.stops import MAX_SETS, SLACK, StopRows, change_one, one_by_one, pressed_stops, revised_stops, stop_rows
 from ..layout import GRAVITY
 from ..scalar import real, vec3
 from ..state import BaseState
@@ -67,15 +67,14 @@ def solve_with_stops(
 
 @wp.func
 def revise_stops(
-    rows: wp.array(dtype=StopRows), ends: wp.array(dtype=vec3), slack: real, all_at_once: bool,
-    pressed: wp.array(dtype=int),
-) -> bool:  # fmt: skip
-    """Change the sets of pressed stops, all of them or the first one, to what the new rates ask for, if they do."""
+    rows: wp.array(dtype=StopRows), ends: wp.array(dtype=vec3), slack: real, sets: int, pressed: wp.array(dtype=int)
+) -> bool:
+    """Change the sets of pressed stops to what the rates that they led to ask for; returns whether they changed."""
     changed = bool(False)
     for k in range(pressed.shape[0]):
-        wanted = pressed_stops(rows[k], ends[k], slack, pressed[k])
-        if wanted != pressed[k] and (all_at_once or not changed):
-            if not all_at_once:
+        wanted = revised_stops(rows[k], ends[k], slack, pressed[k], sets)
+        if wanted != pressed[k] and not (changed and one_by_one(sets)):
+            if one_by_one(sets):
                 wanted = change_one(pressed[k], wanted)
             pressed[k] = wanted
             changed = True
@@ -112,6 +111,6 @@ def solve_step(
             paws, contacts, ends,
         )  # fmt: skip
         sets += 1
-        working = sets < MAX_SETS and revise_stops(rows, ends, slack, sets < ONE_BY_ONE, pressed)
+        working = sets < MAX_SETS and revise_stops(rows, ends, slack, sets, pressed)
     solution.sets = sets
     return solution
