@@ -214,9 +214,7 @@ class LeastSquares:
         size = len(point.z)
         ahead = np.clip(point.z + PROBE * np.array([move for move, _ in plain]), self._low, self._high)
         gradient, of_starts = np.zeros((size, len(plain))), []
-        for i, (motion, linear, weight) in enumerate(
-            zip(self.motions, normal.linearised, normal.weights, strict=True)
-        ):
+        for i, (motion, linear, weight) in enumerate(zip(self.motions, normal.linearised, normal.weights, strict=True)):
             move = np.array([start[i] for _, start in plain])
             found = motion.residuals(self.replay, ahead, point.starts[i] + PROBE * move)
             both = np.concatenate([ahead - point.z, PROBE * move], axis=1)
