@@ -33,8 +33,9 @@ PIECES = (0.25,)
 """[s] Lengths of the pieces of the stages before the last."""
 WORTH_A_STEP = 0.1
 """Relative decrease of the cost below which a stage ends, unless it is the last."""
-CONVERGED = 1.0
-"""Decrease of the cost, in mean squared residuals, below which the last stage ends: what one deviation costs."""
+WHOLE = ((True, 10.0), (False, 1.0), (False, 1.0))
+"""Stages of whole motions: whether they are robust, and the decrease of the cost, in mean squared residuals, below which
+they end: 1 is what one deviation costs."""
 MOST_STEPS = (5, 25)
 """Of each stage but the last, and of the last."""
 RATIO_ROWS = {
@@ -232,8 +233,9 @@ def identify(
         z = point.z
     problem = LeastSquares(parameters, whole, replay, knowledge)
     nominal = channel_fits(problem, problem.expected())
-    point, normal = Point(z, problem.expected().starts), None
-    for stage, (robust, least) in enumerate(((True, 10.0 * CONVERGED), (False, CONVERGED)), len(PIECES)):
+    best: tuple[float, Point, Normal] | None = None
+    point = Point(z, problem.expected().starts)
+    for stage, (robust, least) in enumerate(WHOLE, len(PIECES)):
         problem.robust = robust
         for _ in range(MOST_STEPS[1]):
             normal = problem.normal(point)
@@ -241,6 +243,11 @@ def identify(
             note(stage, problem, cost, damping)
             if normal.cost - cost < least * cost / problem.count:
                 break
+        if not robust and (best is None or cost < best[0]):
+            best = (cost, point, normal)
+        if not robust:  # what friction at rest makes of a start is full of small minima: try again from outside
+            point = Point(point.z, problem.expected().starts)
+    _, point, normal = best
     return result(problem, point, normal, nominal, steps, (started, cpu, before))
 
 
