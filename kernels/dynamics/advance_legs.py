@@ -44,6 +44,7 @@ class LegState:
     rates: vec3  # [rad/s]
     torque: vec3  # [N m] of its motors in the last step
     impulse: vec3  # [N s] of its paw, world frame
+    pressed: int  # set of its hard stops in the last step
     peak_sq: real  # [N^2 s^2] largest impulse on the paw, squared
     total_sq: real  # [N^2 s^2] largest sum of the impulses, squared
     residual: real  # [m/s] of the contact iteration, largest
@@ -109,6 +110,7 @@ class LegEnd:
     ang: vec3  # [rad/s]
     paw: PawSolution
     on_block: int  # 1: its paw touches the block
+    pressed: int  # set of its hard stops
 
 
 @wp.func
@@ -164,6 +166,7 @@ def settle_leg(
     working = bool(True)
     while any_world(working):
         end = solve_leg(robot, settings, own, world, leg, old, torque, wrench, block, pressed)
+        end.pressed = pressed
         sets += 1
         wanted = pressed_stops(stops, old.angles, end.rates, settings.dt, SLACK * settings.tolerance, pressed)
         differs = wanted != pressed
@@ -199,6 +202,7 @@ def advance_leg(
     new.angles = old.angles + dt * end.rates
     new.rates = end.rates
     new.torque = torque
+    new.pressed = end.pressed
     new.impulse = wp.quat_rotate(base.quat, impulse)
     new.peak_sq = wp.max(old.peak_sq, wp.dot(impulse, impulse))
     new.total_sq = wp.max(old.total_sq, wp.dot(total, total))
