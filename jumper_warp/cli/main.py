@@ -1,4 +1,4 @@
-"""The command `jumper`: train, play, evaluate, export, list. `jumper COMMAND --help` shows the flags.
+"""The command `jumper`: train, play, evaluate, export, sysid, list. `jumper COMMAND --help` shows the flags.
 
 Only what a command needs is imported, so that help and mistakes answer at once.
 """
@@ -21,6 +21,7 @@ COMMANDS = {
     "play": "Record a policy for the Rerun viewer.",
     "evaluate": "Measure a policy over many trials.",
     "export": "Make a policy's folder of a training run, or one ONNX file of a policy.",
+    "sysid": "Identify the robot's parameters from recorded motions.",
     "list": "Show the tasks and the project's policies.",
 }
 """Each is a module of `jumper_warp.cli` with run(args, modules)."""

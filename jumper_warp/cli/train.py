@@ -9,6 +9,7 @@ import shlex
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
 
     from jumper_warp.envs.env import Env
     from jumper_warp.rl.runner import MakeEnv, TrainResult
+    from jumper_warp.robot.overlay import RobotOverlay
     from jumper_warp.tasks.cfg import TaskCfg
 
 
@@ -38,6 +40,8 @@ class TrainArgs:
     """Draw masses, friction, motors, latency and pushes for each world; single rows are under --env.randomization."""
     noise: bool = True
     """Add noise to observations."""
+    robot: Path | None = None
+    """Robot overlay, as `jumper sysid` writes it; its ranges of randomisation replace the task's, and flags both."""
 
 
 def parse_train(args: Sequence[str]) -> tuple[TrainArgs, TaskCfg]:
@@ -56,7 +60,7 @@ def parse_train(args: Sequence[str]) -> tuple[TrainArgs, TaskCfg]:
     if args[0].startswith("-"):
         raise UsageError(f"the task comes first: jumper train TASK [flags]; tasks: {names}")
     name, entry = find_task(args[0])
-    task = make_task(name)
+    task = for_robot(make_task(name), overlay_in(args[1:]))
     parsed = parse_settings(task, TrainArgs(TrainCfg(task=name, ppo=entry.ppo, best_by=entry.best_by)), args[1:])
     if parsed.cfg.task != name:
         raise UsageError(f"give the task once, got {name} and --task {parsed.cfg.task}")
@@ -77,10 +81,34 @@ def parse_settings(task: TaskCfg, default: TrainArgs, args: Sequence[str]) -> An
     return parse(kind, f"train {task.name}", args, default=kind(**given), description=about)
 
 
+def overlay_in(args: Sequence[str]) -> RobotOverlay | None:
+    """Return the overlay that the flag --robot names; None without. Raises InputError or OSError: it cannot be used."""
+    for i, arg in enumerate(args):
+        flag, equals, path = arg.partition("=")
+        if flag == "--robot" and (equals or i + 1 < len(args)):
+            from jumper_warp.robot.overlay import load_overlay
+
+            return load_overlay(Path(path if equals else args[i + 1]))
+    return None
+
+
+def for_robot(task: TaskCfg, overlay: RobotOverlay | None) -> TaskCfg:
+    """Return the task with an overlay's ranges of randomisation. Raises InputError: there is no such range."""
+    if overlay is None:
+        return task
+    unknown = set(overlay.randomization) - set(vars(task.randomization))
+    if unknown:
+        raise InputError(f"robot overlay: no range of randomisation {min(unknown)!r:.60}")
+    return dataclasses.replace(task, randomization=dataclasses.replace(task.randomization, **overlay.randomization))
+
+
 def env_maker(task: TaskCfg, args: TrainArgs) -> MakeEnv:
     """Return what makes the environment of a training."""
     from jumper_warp.cli.training_memory import check_memory
     from jumper_warp.envs.env import Env
+    from jumper_warp.robot.overlay import load_overlay
+
+    overlay = None if args.robot is None else load_overlay(args.robot)
 
     def make(num_envs: int, seed: int, device: torch.device) -> Env:
         check_memory(task, args.cfg.ppo, args.solver, num_envs, device)
@@ -92,6 +120,7 @@ def env_maker(task: TaskCfg, args: TrainArgs) -> MakeEnv:
             solver=args.solver,
             randomize=args.randomize,
             noise=args.noise,
+            robot=overlay,
         )
 
     return make

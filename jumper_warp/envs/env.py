@@ -21,6 +21,7 @@ from jumper_warp.envs.arrays import (
 from jumper_warp.envs.stages import Stages
 from jumper_warp.envs.state import load_state, save_state
 from jumper_warp.robot.grounds import BlockCfg
+from jumper_warp.robot.overlay import RobotOverlay
 from jumper_warp.sim.simulation import Simulation, SolverName
 from jumper_warp.sim.slices import SlicedGraph
 from jumper_warp.tasks.cfg import Handover, TaskCfg
@@ -75,19 +76,21 @@ class Env(Stages):
         block: BlockCfg | None = None,
         skill: np.ndarray | int = 0,
         handovers: Sequence[Handover] = (),
+        robot: RobotOverlay | None = None,
         threads: int | None = None,
     ):
         """Build everything; call `reset` before the first step.
 
         ground, block: as in `Simulation`; by default the terrain of the first task that has one, or what tasks draw, if
         randomised on SolverJumper, else a plane. skill: index of the task that each world begins in, (num_envs,) or one
-        for all. handovers: between tasks. threads: of a CPU, as in `Simulation`.
-        Raises ValueError: no task, two of one name, motors that cannot be those of one robot, a handover between other
-        tasks, less than one environment, or as `Simulation`.
+        for all. handovers: between tasks. robot: what differs from the description, latency included. threads: of a
+        CPU, as in `Simulation`.
+        Raises ValueError: no task, two of one name, motors that cannot be those of one robot, different gravities, a
+        handover between other tasks, less than one environment, or as `Simulation`.
         """
         tasks = checked_tasks(task, handovers)
         self.task, self.tasks, self.num_envs, self.seed, self.auto_reset = tasks[0], tasks, num_envs, seed, auto_reset
-        self.handovers = tuple(handovers)
+        self.handovers, self._overlay = tuple(handovers), robot
         may_vary = solver == "jumper" and isinstance(ground, str) and ground == "plane" and block is None
         run, self._draws_ground = prepared(tasks, randomize, noise, may_vary)
         terrains = [terrain for each in run if (terrain := each.terrain) is not None]
@@ -95,7 +98,7 @@ class Env(Stages):
         self.sim = Simulation(
             num_envs, solver=solver, motors=self.task.motors, visuals=visuals, device=device and str(device),
             ground=ground, block=BlockCfg((0.0, 0.0)) if self._draws_ground else block, tolerance=CONTACT_TOLERANCE,
-            friction=self.task.randomization.nominal_friction, threads=threads,
+            friction=self.task.randomization.nominal_friction, gravity=self.task.gravity, robot=robot, threads=threads,
         )  # fmt: skip
         self.wp_device = self.sim.device
         self.device = torch.device(wp.device_to_torch(self.wp_device))
@@ -203,13 +206,14 @@ class Env(Stages):
         self._observe(self._part(), beginning=1)
 
     def command(self, commands: Any, worlds: Any = None) -> None:
-        """Give worlds a command within their episode; the policy sees it after the next step.
+        """Give worlds a command within their episode; `obs` shows it at once.
 
         commands: (num_envs, up to 4), relative to base and yaw as they are; worlds: (num_envs,) bool, by default all.
         Raises ValueError: values of another shape, or not finite.
         """
         mask = self._array(checked_mask(worlds, self.num_envs))
         self._give(mask, 0, checked_commands(commands, self.num_envs), self._all)
+        self._observe(self._part(), beginning=1)
 
     def request(self, skill: int, worlds: Any = None, commands: Any = None) -> None:
         """Ask worlds to hand over to another skill as soon as a handover allows it.
@@ -266,23 +270,29 @@ class Env(Stages):
         """Return everything that defines the environment, as JSON can hold it.
 
         `task` and `interface` are of the first task; several have `tasks`, and `handovers` as their functions' names.
+        `robot` is there if an overlay was given.
         """
         several = {
             "tasks": [task_to_json(task) for task in self.tasks],
             "first_skill": self._first_skill.tolist(),
             "handovers": [handover_to_json(handover) for handover in self.handovers],
         }
-        return (several if len(self.tasks) > 1 else {}) | {
-            "task": task_to_json(self.task),
-            "interface": interface(self.task),
-            "num_envs": self.num_envs,
-            "seed": self.seed,
-            "physics_dt_s": self.physics_dt,
-            "policy_dt_s": self.step_dt,
-            "contact_tolerance_m_s": CONTACT_TOLERANCE,
-            "solver": type(self.sim.solver).__name__,
-            "quaternion_order": "xyzw",
-        }
+        overlay = {} if self._overlay is None else {"robot": self._overlay.to_json()}
+        return (
+            (several if len(self.tasks) > 1 else {})
+            | overlay
+            | {
+                "task": task_to_json(self.task),
+                "interface": interface(self.task),
+                "num_envs": self.num_envs,
+                "seed": self.seed,
+                "physics_dt_s": self.physics_dt,
+                "policy_dt_s": self.step_dt,
+                "contact_tolerance_m_s": CONTACT_TOLERANCE,
+                "solver": type(self.sim.solver).__name__,
+                "quaternion_order": "xyzw",
+            }
+        )
 
     def state_dict(self) -> dict[str, torch.Tensor]:
         """Return everything that the next step depends on, as `jumper_warp.envs.state.save_state`."""

@@ -41,7 +41,9 @@ def robot_parameters(sim: Simulation, tasks: tuple[TaskCfg, ...], skill: wp.arra
     robot.paw_shapes = wp.array(find_paws(model).flatten(), dtype=int, device=device)
     robot.static_ratio = sim.physics.dynamics.static_friction_ratio
     robot.motors, robot.physics_dt, robot.skill = sim.motors, sim.dt, skill
-    robot.latency = wp.zeros(n, dtype=int, device=device)
+    values = sim.robot
+    late = 0 if values is None else round(float(values.latency[0, 0]) / sim.dt)
+    robot.latency = wp.full(n, late, dtype=int, device=device)
     robot.observation_latency = wp.zeros(n, dtype=int, device=device)
     robot.push = wp.zeros(n, dtype=wp.spatial_vector, device=device)
     for name in ("gain_ratio", "speed_ratio"):
@@ -52,6 +54,12 @@ def robot_parameters(sim: Simulation, tasks: tuple[TaskCfg, ...], skill: wp.arra
         rows = []
         for task in tasks:
             lateral, transversal = getattr(task.motors.lateral, attribute), getattr(task.motors.transversal, attribute)
-            rows.append(4 * [lateral, transversal, transversal])
+            row = np.array(4 * [lateral, transversal, transversal])
+            if values is not None:
+                of_robot = getattr(values, attribute)[0]
+                row = of_robot if attribute.endswith("speed") else row * of_robot
+            rows.append(row)
         setattr(robot, f"nominal_{name}", wp.array(np.array(rows, dtype=np.float32), dtype=float, device=device))
+    offset = np.zeros(12) if values is None else values.offset[0]
+    robot.nominal_offset = wp.array(offset, dtype=float, device=device)
     return robot

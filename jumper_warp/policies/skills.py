@@ -73,7 +73,7 @@ class SkillPolicies:
         env = Env(
             self.skills, count, seed=conditions.seed, device=conditions.device, solver=conditions.solver,
             randomize=conditions.draws, noise=conditions.noise, auto_reset=False, threads=conditions.threads,
-            skill=WALK, handovers=self.handovers, **scene,
+            skill=WALK, handovers=self.handovers, robot=conditions.overlay({}), **scene,
         )  # fmt: skip
         for policy in self.policies:
             policy.to(env.device)

@@ -162,11 +162,12 @@ class MujocoPhysics:
         self._sim, n, device, model = sim, sim.num_worlds, sim.device, sim.model
         self.dynamics = JumperDynamics(model)  # refuses another robot
         damping = model.joint_damping.numpy().reshape(n, -1)
+        knee_damping = float(damping[0, KNEE_DOFS[0]])
         damping[:, KNEE_DOFS] = 0.0
         model.joint_damping.assign(damping.ravel())
         self.solver = mujoco_solver(model, dt=sim.dt)
         robot = load_description()
-        self._passive = [robot.knee_damping, robot.knee_damping_limit, *robot.transversal_sum, *EXPLICIT_STOP]
+        self._passive = [knee_damping, robot.knee_damping_limit, *robot.transversal_sum, *EXPLICIT_STOP]
         self.invalid = wp.zeros(n, dtype=int, device=device)
         self.impulse = wp.zeros((4, n), dtype=wp.vec3, device=device)
         self.torque = wp.zeros((12, n), dtype=float, device=device)

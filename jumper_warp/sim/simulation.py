@@ -9,9 +9,13 @@ import newton
 import numpy as np
 import warp as wp
 
+from jumper_warp.robot.gravity import EARTH
 from jumper_warp.robot.grounds import BlockCfg
 from jumper_warp.robot.model import PHYSICS_DT, Extras, build_model
 from jumper_warp.robot.motors import FilterCfg, MotorCfg, filter_params, jumping_motors, motor_arrays
+from jumper_warp.robot.overlay import RobotOverlay
+from jumper_warp.robot.values import RobotValues
+from jumper_warp.sim.overlay import write_model, write_motors
 from jumper_warp.sim.physics import JumperPhysics, MujocoPhysics, Physics
 from jumper_warp.sim.slices import SlicedGraph, Worlds, slices_of
 from jumper_warp.sim.solver import TOLERANCE, check_step, check_tolerance
@@ -48,12 +52,14 @@ class Simulation:
         ground: str | newton.Heightfield | None = "plane",
         block: BlockCfg | None = None,
         friction: float = 0.9,
+        gravity: float = EARTH,
         dt: float = PHYSICS_DT,
         substeps: int = SUBSTEPS,
         tolerance: float = TOLERANCE,
         observe_forces: bool = True,
         visuals: bool = True,
         extras: Extras | None = None,
+        robot: RobotOverlay | RobotValues | None = None,
         device: wp.DeviceLike = None,
         threads: int | None = None,
     ):
@@ -67,12 +73,15 @@ class Simulation:
             ground: As in `build_model`.
             block: A block in each world that slides when the robot pushes it; on SolverJumper only.
             friction: Of the paws [1].
+            gravity: Downward, of every world [m/s^2].
             dt: Physics step [s].
             substeps: Physics steps in a policy step.
             tolerance: Of SolverJumper's contact iteration [m/s].
             observe_forces: Whether to measure paw forces on MuJoCo, which costs time; SolverJumper always has them.
             visuals: Whether to add shapes that only viewers see.
             extras: Adds the caller's own sites and shapes to every world, as in `build_model`.
+            robot: What differs from the description: an overlay, or values of one robot or of one a world. Their
+                latency is the caller's to apply.
             device: Warp device.
             threads: Of a CPU, which share the worlds out and change no bit; by default what
                 `jumper_warp.utils.threads.set_threads` chose, or all cores. SolverMuJoCo and few worlds use one.
@@ -90,14 +99,22 @@ class Simulation:
         check_tolerance(tolerance)
         threads = checked_threads(threads)
         self.model = build_model(
-            num_worlds, ground=ground, friction=friction, visuals=visuals, extras=extras, device=device
-        )
+            num_worlds, ground=ground, friction=friction, gravity=gravity, visuals=visuals, extras=extras,
+            device=device,
+        )  # fmt: skip
+        values = robot.robots() if isinstance(robot, RobotOverlay) else robot
+        if values is not None:
+            given = isinstance(robot, RobotValues) or "paw_friction" in robot.values
+            write_model(self.model, values, paws=given)
+        self.robot = values
         self.device = self.model.device
         self.num_worlds = num_worlds
         self.block = block
         self.dt = dt
         self.substeps = substeps
         self.motors = motor_arrays(motors or jumping_motors(), num_worlds, device=self.device)
+        if values is not None:
+            write_motors(self.motors, values)
         self._filter = None if command_filter is None else filter_params(command_filter)
         self.state = self.model.state()
         self.control = self.model.control()

@@ -5,6 +5,7 @@ import warp as wp
 from ..actuation.command_filter import FilterParams, Limits
 from ..actuation.joint_forces import JointParams
 from ..actuation.motors import MotorParams
+from ..actuation.stops import StopParams
 from ..kinematics.geometry import LegGeometry
 from ..layout import (
     ARMATURE,
@@ -103,12 +104,18 @@ def add_joints(sums: wp.array(dtype=real), leg: int, p: JointParams):
     add_entry(sums, row + KNEE_DAMPING + 1, p.knee_damping_inner)
     add_entry(sums, row + KNEE_LIMIT, p.knee_limit_outer)
     add_entry(sums, row + KNEE_LIMIT + 1, p.knee_limit_inner)
-    add_vec3(sums, row + LOWER, p.stops.lower)
-    add_vec3(sums, row + UPPER, p.stops.upper)
-    add_entry(sums, row + SUM_LOWER, p.stops.sum_lower)
-    add_entry(sums, row + SUM_UPPER, p.stops.sum_upper)
-    add_entry(sums, row + STOP_KE, p.stops.ke)
-    add_entry(sums, row + STOP_KD, p.stops.kd)
+
+
+@wp.func
+def add_stops(sums: wp.array(dtype=real), leg: int, p: StopParams):
+    """Add the gradient by the hard stops of a leg."""
+    row = leg * LEG_ROWS
+    add_vec3(sums, row + LOWER, p.lower)
+    add_vec3(sums, row + UPPER, p.upper)
+    add_entry(sums, row + SUM_LOWER, p.sum_lower)
+    add_entry(sums, row + SUM_UPPER, p.sum_upper)
+    add_entry(sums, row + STOP_KE, p.ke)
+    add_entry(sums, row + STOP_KD, p.kd)
 
 
 @wp.func

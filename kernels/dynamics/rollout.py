@@ -8,6 +8,7 @@ import warp as wp
 
 from ..actuation.command_filter import FilterParams, Limits, filter_leg
 from ..actuation.motors import MotorArrays, MotorParams, load_motor, motor_torque
+from ..actuation.stops import StopRows
 from ..layout import DOFS
 from ..scalar import quat, real, vec3
 from ..state import BaseState, base_com, leg_dof
@@ -243,6 +244,7 @@ def rollout_kernel(
     paws = wp.zeros(shape=(4,), dtype=PawKinematics)
     contacts = wp.zeros(shape=(4,), dtype=PawContact)
     torques = wp.zeros(shape=(4,), dtype=vec3)
+    stops = wp.zeros(shape=(4,), dtype=StopRows)
     pressed = wp.zeros(shape=(4,), dtype=int)
     ends = wp.zeros(shape=(4,), dtype=vec3)
     peaks = wp.zeros(shape=(4,), dtype=real)
@@ -273,8 +275,8 @@ def rollout_kernel(
                 rows.torque[step, motor, world] = torque
                 drive.joint_f[dof + j + j / 2] = torque
         base = advance_once(
-            robot, settings, drive, work, world, 0, base, angles, rates, torques, pressed, legs, paws, contacts, ends,
-            peaks,
+            robot, settings, drive, work, world, 0, base, angles, rates, torques, stops, pressed, legs, paws, contacts,
+            ends, peaks,
         )  # fmt: skip
         for k in range(angles.shape[0]):
             rows.impulse[step, k, world] = work.impulse[k, world]

@@ -8,7 +8,7 @@ from ..scalar import real, vec3
 from ..state import base_com
 from .advance_legs import LegState, advance_leg
 from .drive import Drive, LegDrive
-from .lanes import meet
+from .lanes import any_world, meet
 from .rollout import (
     Actuation,
     Commands,
@@ -74,10 +74,13 @@ def rollout_legs_kernel(
             target = arrived_target(commands, safe, arrived, motor, world)
             torque[j] = motor_torque(target, s.angles[j], s.rates[j], load_world_motor(actuation, motor, world))
         motors.extra = torque
-        s = advance_leg(robot, settings, drive, own, motors, world, leg, 0, s, False)
+        s.step = 0
+        s.sets = 0
+        while any_world(s.step == 0):
+            s = advance_leg(robot, settings, drive, own, motors, world, leg, s, False)
         store_row_vec3(rows.torque, step, 3 * leg, world, torque)
         rows.impulse[step, leg, world] = s.impulse
-        rows.pressed[step, leg, world] = wp.uint8(s.pressed)
+        rows.pressed[step, leg, world] = wp.uint8(s.used)
         if step + 1 == (row + 1) * timing.every:
             if leg == 0:
                 store_row_base(rows, row + 1, world, com, s.base)

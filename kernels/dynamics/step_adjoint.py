@@ -13,6 +13,7 @@ which the forward pass found.
 
 import warp as wp
 
+from ..actuation.stops import stop_rows
 from ..layout import BASE, GRAVITY
 from ..scalar import real, vec3
 from ..state import BaseState, base_com
@@ -20,9 +21,9 @@ from .base_dynamics import BaseInverse, LegSolve, add_leg, invert, motor_acceler
 from .base_motion import moved_base
 from .contact import SEPARATE, PawContact
 from .contact_laws import PawLaw, contact_at, contact_point, paw_law, solve_laws
-from .gradients import add_com, add_entry, add_geometry, add_joints, add_masses, add_moments, add_vec3
+from .gradients import add_com, add_entry, add_geometry, add_joints, add_masses, add_moments, add_stops, add_vec3
 from .leg_dynamics import PawKinematics
-from .parameters import load_moments, load_vec3
+from .parameters import load_moments, load_stops, load_vec3
 from .rollout import Rows, row_vec3, store_row_vec3
 from .step import LegParams, Robot, base_system, hold_base, leg_terms
 from .virtual_power import BaseFactors, BaseSeeds, LegFactors, base_action, leg_action, turned
@@ -87,9 +88,9 @@ def replay_step(
     for k in range(record.legs.shape[2]):
         torque = row_vec3(rows.torque, step, 3 * k, world)
         pressed = int(rows.pressed[step, k, world])
-        terms = leg_terms(
-            params[k], record.angles[world, i, k], record.rates[world, i, k], torque, pressed, base.ang, g, dt
-        )
+        angles = record.angles[world, i, k]
+        stops = stop_rows(load_stops(robot.table, k, world), angles, dt)
+        terms = leg_terms(params[k], angles, record.rates[world, i, k], torque, stops, pressed, base.ang, g, dt)
         record.legs[world, i, k] = terms.solve
         record.paws[world, i, k] = terms.paw
         system = add_leg(system, terms.dynamics, terms.solve)
@@ -223,13 +224,16 @@ def reverse_step(
             mu = laws[k].mu
             if pushed_by:
                 leg.push = seeds.impulse[step, k, world]
-        geo, masses, joints, _ground, mu_adj, pos, turn, omega, g_part, angles, rates, _held, _leg, _step = wp.grad(
-            leg_action
-        )(params.geometry, params.masses, params.joints, robot.ground, mu, base.pos, base.quat, base.ang, g,
-          record.angles[world, i, k], old_rates, held, leg, dt)  # fmt: skip
+        geo, masses, joints, stops, _ground, mu_adj, pos, turn, omega, g_part, angles, rates, _held, _leg, _step = (
+            wp.grad(leg_action)(
+                params.geometry, params.masses, params.joints, load_stops(robot.table, k, world), robot.ground, mu,
+                base.pos, base.quat, base.ang, g, record.angles[world, i, k], old_rates, held, leg, dt,
+            )
+        )  # fmt: skip
         add_geometry(sums, k, geo)
         add_masses(sums, k, masses)
         add_joints(sums, k, joints)
+        add_stops(sums, k, stops)
         if leg.mode != SEPARATE:
             add_entry(sums, laws[k].mu_row, mu_adj)
         out.pos += pos

@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from ..actuation.stops import MAX_SETS, ONE_BY_ONE, SLACK, change_one, pressed_stops
+from ..actuation.stops import MAX_SETS, ONE_BY_ONE, SLACK, StopRows, change_one, pressed_stops, stop_rows
 from ..layout import GRAVITY
 from ..scalar import real, vec3
 from ..state import BaseState
@@ -29,15 +29,17 @@ class StepSolution:
 def solve_with_stops(
     robot: Robot, settings: StepSettings, world: int, base: BaseState, force: vec3, moment: vec3, block: BlockLaw,
     impulse: wp.array2d(dtype=vec3), angles: wp.array(dtype=vec3), rates: wp.array(dtype=vec3),
-    torques: wp.array(dtype=vec3), pressed: wp.array(dtype=int), legs: wp.array(dtype=LegSolve),
-    paws: wp.array(dtype=PawKinematics), contacts: wp.array(dtype=PawContact), ends: wp.array(dtype=vec3),
+    torques: wp.array(dtype=vec3), rows: wp.array(dtype=StopRows), pressed: wp.array(dtype=int),
+    legs: wp.array(dtype=LegSolve), paws: wp.array(dtype=PawKinematics), contacts: wp.array(dtype=PawContact),
+    ends: wp.array(dtype=vec3),
 ) -> StepSolution:  # fmt: skip
     """Solve a step with given sets of pressed stops; see `solve_step`."""
     dt = settings.dt
     g = wp.quat_rotate_inv(base.quat, load_vec3(robot.table, GRAVITY, world))
     system = base_system(robot, world, base, g, force, moment)
     for k in range(legs.shape[0]):
-        terms = leg_terms(load_leg(robot, world, k), angles[k], rates[k], torques[k], pressed[k], base.ang, g, dt)
+        own = load_leg(robot, world, k)
+        terms = leg_terms(own, angles[k], rates[k], torques[k], rows[k], pressed[k], base.ang, g, dt)
         legs[k] = terms.solve
         paws[k] = terms.paw
         system = add_leg(system, terms.dynamics, terms.solve)
@@ -65,13 +67,13 @@ def solve_with_stops(
 
 @wp.func
 def revise_stops(
-    robot: Robot, world: int, angles: wp.array(dtype=vec3), ends: wp.array(dtype=vec3), dt: real, slack: real,
-    all_at_once: bool, pressed: wp.array(dtype=int),
+    rows: wp.array(dtype=StopRows), ends: wp.array(dtype=vec3), slack: real, all_at_once: bool,
+    pressed: wp.array(dtype=int),
 ) -> bool:  # fmt: skip
     """Change the sets of pressed stops, all of them or the first one, to what the new rates ask for, if they do."""
     changed = bool(False)
     for k in range(pressed.shape[0]):
-        wanted = pressed_stops(load_stops(robot.table, k, world), angles[k], ends[k], dt, slack, pressed[k])
+        wanted = pressed_stops(rows[k], ends[k], slack, pressed[k])
         if wanted != pressed[k] and (all_at_once or not changed):
             if not all_at_once:
                 wanted = change_one(pressed[k], wanted)
@@ -84,30 +86,32 @@ def revise_stops(
 def solve_step(
     robot: Robot, settings: StepSettings, world: int, base: BaseState, force: vec3, moment: vec3, block: BlockLaw,
     impulse: wp.array2d(dtype=vec3), angles: wp.array(dtype=vec3), rates: wp.array(dtype=vec3),
-    torques: wp.array(dtype=vec3), pressed: wp.array(dtype=int), legs: wp.array(dtype=LegSolve),
-    paws: wp.array(dtype=PawKinematics), contacts: wp.array(dtype=PawContact), ends: wp.array(dtype=vec3),
+    torques: wp.array(dtype=vec3), rows: wp.array(dtype=StopRows), pressed: wp.array(dtype=int),
+    legs: wp.array(dtype=LegSolve), paws: wp.array(dtype=PawKinematics), contacts: wp.array(dtype=PawContact),
+    ends: wp.array(dtype=vec3),
 ) -> StepSolution:  # fmt: skip
     """Solve a step of one world, and write every leg's pressed stops, contact and motor rates at the end of the step.
 
     force [N], moment [N m]: from outside at the base's com, world axes. impulse: first guess [N s], world frame,
     (4, num_worlds). angles, rates, torques: of the motors at the start [rad], [rad/s], [N m]. Arrays of legs have
-    shape (4,); legs and paws are written too.
+    shape (4,); rows, legs and paws are written too.
 
     The stops that the rates at the start would press are tried first.
     """
     dt = settings.dt
     for k in range(pressed.shape[0]):
-        pressed[k] = pressed_stops(load_stops(robot.table, k, world), angles[k], rates[k], dt, real(0.0), 0)
+        rows[k] = stop_rows(load_stops(robot.table, k, world), angles[k], dt)
+        pressed[k] = pressed_stops(rows[k], rates[k], real(0.0), 0)
     slack = SLACK * settings.tolerance
     solution = StepSolution()
     sets = int(0)
     working = bool(True)
     while working:
         solution = solve_with_stops(
-            robot, settings, world, base, force, moment, block, impulse, angles, rates, torques, pressed, legs, paws,
-            contacts, ends,
+            robot, settings, world, base, force, moment, block, impulse, angles, rates, torques, rows, pressed, legs,
+            paws, contacts, ends,
         )  # fmt: skip
         sets += 1
-        working = sets < MAX_SETS and revise_stops(robot, world, angles, ends, dt, slack, sets < ONE_BY_ONE, pressed)
+        working = sets < MAX_SETS and revise_stops(rows, ends, slack, sets < ONE_BY_ONE, pressed)
     solution.sets = sets
     return solution

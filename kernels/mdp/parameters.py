@@ -46,6 +46,7 @@ class RobotParameters:
     nominal_no_load: wp.array2d(dtype=float)  # [rad/s]
     nominal_cutoff: wp.array2d(dtype=float)  # [rad/s]
     nominal_saturation: wp.array2d(dtype=float)  # [N m]
+    nominal_offset: wp.array(dtype=float)  # [rad] (12,) of the position sensors
     skill: wp.array(dtype=int)  # (num_worlds,) the active one
 
 
@@ -167,9 +168,9 @@ def speed_limits(
 
 @wp.func
 def joint_offset(robot: RobotParameters, draw: Draw, lower: float, upper: float):
-    """Give each motor's position sensor a constant error [rad]."""
+    """Give each motor's position sensor a constant error [rad] besides its nominal one."""
     for m in range(draw.lane, 12, draw.lanes):
-        robot.motors.offset[m, draw.world] = between(draw, m, lower, upper)
+        robot.motors.offset[m, draw.world] = robot.nominal_offset[m] + between(draw, m, lower, upper)
 
 
 @wp.func

@@ -1,0 +1,293 @@
+"""Recorded motions: motor targets and what was measured, from npz, CSV or Parquet files."""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from jumper_warp.robot.description import MOTOR_JOINTS
+from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.files import write_whole
+
+PER_MOTOR = ("target", "angle", "rate", "torque")
+CHANNELS = ("angle", "rate", "torque", "position", "quaternion")
+"""What may be measured."""
+DEGREES = math.pi / 180.0
+UNITS = {
+    "time": {"s": 1.0, "ms": 1.0e-3},
+    "target": {"rad": 1.0, "deg": DEGREES},
+    "angle": {"rad": 1.0, "deg": DEGREES},
+    "rate": {"rad/s": 1.0, "deg/s": DEGREES},
+    "torque": {"N m": 1.0, "Nm": 1.0},
+    "current": {"A": 1.0},
+    "position": {"m": 1.0, "mm": 1.0e-3},
+    "quaternion": {"": 1.0, "1": 1.0},
+}
+"""Factor to the first unit of each quantity, which is the default."""
+LARGEST = {"target": 13.0, "angle": 13.0, "rate": 300.0, "torque": 1000.0, "position": 100.0}
+"""More than that is not of this robot [rad, rad/s, N m, m]: probably of another unit."""
+EXAMPLE = (
+    "such as time, target/FL_outer, angle/FL_outer [deg], rate/FL_outer, torque/FL_outer, position/x, quaternion/w"
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """What was commanded and measured in one motion. NaN marks what a row does not measure; None a missing channel."""
+
+    name: str
+    time: np.ndarray
+    """(n,) [s], rising."""
+    target: np.ndarray
+    """(n, 12) [rad] Sent to the motors (behind the command filter), each held until the next row."""
+    angle: np.ndarray | None = None
+    """(n, 12) [rad] As the sensors read."""
+    rate: np.ndarray | None = None
+    """(n, 12) [rad/s]"""
+    torque: np.ndarray | None = None
+    """(n, 12) [N m] At the joints: measured, or current times torque constant times gear ratio."""
+    position: np.ndarray | None = None
+    """(n, 3) [m] Of the base link's origin, world frame, the ground at z = 0."""
+    quaternion: np.ndarray | None = None
+    """(n, 4) xyzw, base to world."""
+    base: Literal["free", "fixed"] = "free"
+    """Whether the robot stands or jumps on the ground, or hangs from a stand with its paws in the air."""
+    gains: Literal["jumping", "walking"] = "jumping"
+    """Gains of the description that the controllers were set to."""
+    torque_limit: float = 18.0
+    """[N m] That the controllers were set to."""
+    notes: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        """Raises InputError: a channel of another shape, not finite, or out of range."""
+        n, what = len(self.time), f"motion {self.name}"
+        if n < 3 or self.time.ndim != 1:
+            raise InputError(f"{what}: time must be one column of at least 3 rows, got shape {self.time.shape}")
+        if not np.isfinite(self.time).all() or not (np.diff(self.time) > 0.0).all():
+            row = int(np.argmin(np.concatenate([[1.0], np.nan_to_num(np.diff(self.time), nan=-1.0)]) > 0.0))
+            raise InputError(f"{what}: time must be finite and rise, it does not in row {row}")
+        for name, width in (*((name, 12) for name in PER_MOTOR), ("position", 3), ("quaternion", 4)):
+            values = getattr(self, name)
+            if values is None:
+                continue
+            if values.shape != (n, width):
+                raise InputError(f"{what}: {name} must have shape ({n}, {width}), got {values.shape}")
+            if np.isinf(values).any() or (name == "target" and np.isnan(values).any()):
+                row = int(np.argwhere(~np.isfinite(values) if name == "target" else np.isinf(values))[0][0])
+                raise InputError(f"{what}: {name} is not finite in row {row}")
+            largest = np.nanmax(np.abs(values)) if not np.isnan(values).all() else 0.0
+            if largest > LARGEST.get(name, math.inf):
+                unit = next(iter(UNITS[name]))
+                raise InputError(f"{what}: {name} reaches {largest:.4g} {unit}: is its unit given in the name?")
+        self._check_settings()
+
+    def _check_settings(self) -> None:
+        what = f"motion {self.name}"
+        if self.quaternion is not None:
+            size = np.linalg.norm(self.quaternion, axis=1)
+            if (np.abs(size[np.isfinite(size)] - 1.0) > 1.0e-2).any():
+                raise InputError(f"{what}: quaternions must have length 1")
+        if all(getattr(self, name) is None for name in CHANNELS):
+            raise InputError(f"{what}: nothing is measured; expected one of {', '.join(CHANNELS)}")
+        if self.base not in ("free", "fixed") or self.gains not in ("jumping", "walking"):
+            raise InputError(f"{what}: base must be free or fixed and gains jumping or walking")
+        if not 0.1 <= self.torque_limit <= 1000.0:
+            raise InputError(f"{what}: torque_limit must lie in 0.1 to 1000 N m, got {self.torque_limit}")
+
+    @property
+    def duration(self) -> float:
+        """Time from the first row to the last [s]."""
+        return float(self.time[-1] - self.time[0])
+
+    def cut(self, first: int, end: int) -> Motion:
+        """Return the rows from `first` to `end` - 1."""
+        if (first, end) == (0, len(self.time)):
+            return self
+        arrays = {f.name: getattr(self, f.name) for f in fields(self) if isinstance(getattr(self, f.name), np.ndarray)}
+        return replace(self, **{name: values[first:end] for name, values in arrays.items()})
+
+    def save(self, path: Path) -> None:
+        """Write it as npz, as `load_motion` reads it. Raises OSError."""
+        import io
+
+        settings = {
+            "base": self.base,
+            "gains": self.gains,
+            "torque_limit": self.torque_limit,
+            "notes": dict(self.notes),
+        }
+        arrays = {f.name: getattr(self, f.name) for f in fields(self) if isinstance(getattr(self, f.name), np.ndarray)}
+        data = io.BytesIO()
+        np.savez_compressed(data, settings=np.array(json.dumps(settings)), **arrays)
+        write_whole(path, data.getvalue())
+
+
+def load_motion(
+    path: Path, *, base: str = "", gains: str = "", torque_limit: float = 0.0, torque_constant: float = 0.0
+) -> Motion:
+    """Return the motion of a file.
+
+    npz: arrays named as the fields of `Motion`, and its settings as JSON in `settings`. CSV and Parquet: columns named
+    `time`, `target/FL_lateral`, `position/x`, `quaternion/w` and so on, each with its unit in brackets if it is not the
+    default: `angle/FL_outer [deg]`. Settings of a table lie in a JSON file beside it of the same name, or are given.
+
+    Args:
+        path: The file.
+        base: As in `Motion`; overrides the file, as the next ones do.
+        gains: As in `Motion`.
+        torque_limit: As in `Motion` [N m].
+        torque_constant: [N m/A] Of the joint's torque per current, for tables with `current` instead of `torque`.
+
+    Raises:
+        InputError: what is missing, of another shape or unit, or not finite; the message names it.
+        OSError: the file cannot be read.
+    """
+    path = Path(path)
+    readers = {".npz": read_npz, ".csv": read_csv, ".parquet": read_parquet}
+    if path.suffix not in readers:
+        raise InputError(f"{path}: expected a file of {', '.join(readers)}")
+    channels, settings = readers[path.suffix](path)
+    for name, value in (("base", base), ("gains", gains), ("torque_limit", torque_limit)):
+        if value:
+            settings[name] = value
+    if "current" in channels:
+        if not torque_constant > 0.0:
+            raise InputError(f"{path}: current needs the torque constant of the joint [N m/A]")
+        channels["torque"] = torque_constant * channels.pop("current")
+    known = {f.name for f in fields(Motion)} - {"name", *channels}
+    unknown = set(settings) - known
+    if unknown:
+        raise InputError(f"{path}: no setting {min(unknown)!r:.60} of a motion; there are {', '.join(sorted(known))}")
+    try:
+        return Motion(name=path.stem, **channels, **settings)
+    except (InputError, TypeError) as error:
+        raise InputError(f"{path}: {error}") from None
+
+
+def read_npz(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    """Return channels and settings of an npz file. Raises InputError or OSError."""
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            arrays = {name: file[name] for name in file.files}
+    except OSError as error:
+        error.filename = error.filename or str(path)
+        raise
+    except Exception as error:  # zip and header errors are of many kinds
+        raise InputError(f"{path}: not an npz file of plain arrays ({type(error).__name__})") from None
+    settings = parse_settings(path, str(arrays.pop("settings", "{}")))
+    known = ("time", *PER_MOTOR, "current", "position", "quaternion")
+    for name in arrays:
+        if name not in known:
+            raise InputError(f"{path}: no channel {name!r:.60}; there are {', '.join(known)}")
+    for name in ("time", "target"):
+        if name not in arrays:
+            raise InputError(f"{path}: array {name} is missing")
+    if any(values.dtype.kind not in "fiu" for values in arrays.values()):
+        raise InputError(f"{path}: all arrays must hold numbers")
+    return {name: values.astype(np.float64) for name, values in arrays.items()}, settings
+
+
+def parse_settings(path: Path, text: str) -> dict[str, Any]:
+    """Return settings from JSON. Raises InputError."""
+    try:
+        settings = json.loads(text)
+    except json.JSONDecodeError as error:
+        raise InputError(f"{path}: settings must be JSON ({error.msg})") from None
+    if not isinstance(settings, dict):
+        raise InputError(f"{path}: settings must be a JSON object")
+    return settings
+
+
+def read_csv(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    """Return channels and settings of a CSV file. Raises InputError or OSError."""
+    try:
+        with path.open(newline="", encoding="utf-8") as file:
+            rows = list(csv.reader(file))
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise InputError(f"{path}: expected CSV text ({error})") from None
+    if len(rows) < 2:
+        raise InputError(f"{path}: expected a line of names and rows of numbers")
+    names, columns = [name.strip() for name in rows[0]], []
+    for number, row in enumerate(rows[1:], 2):
+        if len(row) != len(names):
+            raise InputError(f"{path} line {number}: expected {len(names)} values, found {len(row)}")
+        try:
+            columns.append([float(cell) if cell.strip() else math.nan for cell in row])
+        except ValueError:
+            raise InputError(f"{path} line {number}: expected numbers, found {next_word(row)!r:.40}") from None
+    return channels_of(path, names, np.array(columns)), beside(path)
+
+
+def next_word(row: list[str]) -> str:
+    """Return the first cell that is no number."""
+    for cell in row:
+        try:
+            float(cell or "nan")
+        except ValueError:
+            return cell
+    return ""
+
+
+def read_parquet(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    """Return channels and settings of a Parquet file. Raises InputError, also without pyarrow, or OSError."""
+    try:
+        import pyarrow
+        import pyarrow.parquet
+    except ImportError:
+        raise InputError(
+            f"{path}: reading Parquet needs pyarrow, which is not installed: pip install pyarrow"
+        ) from None
+    try:
+        table = pyarrow.parquet.read_table(path)
+    except pyarrow.ArrowException as error:
+        raise InputError(f"{path}: not a Parquet file ({error})") from None
+    try:
+        columns = [column.to_numpy(zero_copy_only=False).astype(np.float64) for column in table.columns]
+    except (TypeError, ValueError):
+        raise InputError(f"{path}: all columns must hold numbers") from None
+    return channels_of(path, list(table.column_names), np.stack(columns, axis=1)), beside(path)
+
+
+def beside(path: Path) -> dict[str, Any]:
+    """Return the settings in the JSON file beside a table; none without one. Raises InputError or OSError."""
+    file = path.with_suffix(".json")
+    return parse_settings(file, file.read_text(encoding="utf-8")) if file.exists() else {}
+
+
+def channels_of(path: Path, names: list[str], table: np.ndarray) -> dict[str, np.ndarray]:
+    """Return channels from the columns of a table, (n, columns), in SI units. Raises InputError."""
+    parts = {
+        "time": [""], "position": list("xyz"), "quaternion": list("xyzw"),
+        **{channel: list(MOTOR_JOINTS) for channel in (*PER_MOTOR, "current")},
+    }  # fmt: skip
+    channels: dict[str, np.ndarray] = {}
+    for i, name in enumerate(names):
+        match = re.fullmatch(r"(\w+)(?:/(\w+))?\s*(?:\[([^\]]*)\])?", name)
+        channel, part, unit = match.groups() if match else ("", None, None)
+        if channel not in parts or (part or "") not in parts[channel]:
+            raise InputError(f"{path}: unknown column {name!r:.60}; expected names {EXAMPLE}")
+        factors = UNITS[channel]
+        unit = next(iter(factors)) if unit is None else unit
+        if unit not in factors:
+            raise InputError(f"{path}: column {name!r:.60}: expected a unit of {', '.join(factors)}")
+        values = channels.setdefault(channel, np.full((len(table), len(parts[channel])), math.nan))
+        at = parts[channel].index(part or "")
+        if not np.isnan(values[:, at]).all():
+            raise InputError(f"{path}: column {channel}/{part} occurs twice")
+        values[:, at] = factors[unit] * table[:, i]
+    for name in ("time", "target"):
+        if name not in channels:
+            raise InputError(f"{path}: column {name} is missing; expected names {EXAMPLE}")
+    for i, joint in enumerate(MOTOR_JOINTS):
+        if np.isnan(channels["target"][:, i]).any():
+            raise InputError(f"{path}: column target/{joint} is missing or has gaps")
+    channels["time"] = channels["time"][:, 0]
+    return channels

@@ -1,0 +1,219 @@
+"""What is unknown of a robot: parameters with a prior and bounds, sets of them, and the robots that they make."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from jumper_warp.robot.description import MOTOR_JOINTS, RobotDescription, load_description
+from jumper_warp.robot.values import LINK_KINDS, MOTOR_QUANTITIES, PAW_FRICTION, RobotValues
+from jumper_warp.utils.errors import InputError
+
+GROUPS = ("motors", "masses", "friction", "latency", "offsets")
+LATERAL = tuple(range(0, 12, 3))
+TRANSVERSAL = tuple(motor for motor in range(12) if motor % 3)
+BASE_ONLY = ("base_mass", "base_com", "base_inertia", "paw_friction")
+"""Quantities that do not matter while the base is held and the paws hang free."""
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """One unknown. It acts on some places of a quantity of `RobotValues`.
+
+    The optimiser sees z = (value - nominal) / prior, or for a ratio z = ln(value / nominal) / prior, whose prior is a
+    normal distribution of mean 0 and deviation 1.
+    """
+
+    name: str
+    quantity: str
+    """A field of `RobotValues`."""
+    places: tuple[int, ...]
+    """Indices of the quantity that take this value."""
+    unit: str
+    nominal: float
+    """[unit] Mean of the prior."""
+    prior: float
+    """[unit], or of the logarithm for a ratio: standard deviation of what is known beforehand."""
+    bounds: tuple[float, float]
+    """[unit]"""
+    scale: Literal["ratio", "absolute"] = "ratio"
+    """Whether the prior is one of ln(value / nominal) or of the value."""
+    group: str = ""
+
+    def __post_init__(self) -> None:
+        """Raises InputError: bounds that do not hold the nominal value, or a prior that is not positive."""
+        low, high = self.bounds
+        if not (math.isfinite(low) and math.isfinite(high) and low <= self.nominal <= high and low < high):
+            raise InputError(f"parameter {self.name}: bounds {self.bounds} must be finite and hold {self.nominal}")
+        if not 0.0 < self.prior < math.inf:
+            raise InputError(f"parameter {self.name}: prior must be positive and finite, got {self.prior}")
+        if self.scale == "ratio" and not low > 0.0:
+            raise InputError(f"parameter {self.name}: a ratio needs a lower bound above 0, got {low}")
+
+    @property
+    def leg(self) -> int | None:
+        """The leg whose motor alone it acts on; None if it acts on more."""
+        return self.places[0] // 3 if self.quantity in MOTOR_QUANTITIES and len(self.places) == 1 else None
+
+    def value(self, z: np.ndarray) -> np.ndarray:
+        """Return the value [unit] of normalised coordinates."""
+        if self.scale == "ratio":
+            return self.nominal * np.exp(self.prior * z)
+        return self.nominal + self.prior * z
+
+    def normalised(self, value: np.ndarray | float) -> np.ndarray:
+        """Return the normalised coordinate of a value [unit]."""
+        if self.scale == "ratio":
+            return np.log(np.asarray(value) / self.nominal) / self.prior
+        return (np.asarray(value) - self.nominal) / self.prior
+
+    def deviation(self, z: float, deviation: float) -> float:
+        """Return the standard deviation [unit] of the value, from that of z."""
+        return deviation * self.prior * (float(self.value(np.array(z))) if self.scale == "ratio" else 1.0)
+
+
+@dataclass(frozen=True)
+class ParameterSet:
+    """The unknowns of an identification, in order."""
+
+    parameters: tuple[Parameter, ...]
+
+    def __post_init__(self) -> None:
+        """Raises InputError: none, or two of one name."""
+        names = self.names
+        if not names:
+            raise InputError("there must be at least one parameter")
+        if len(set(names)) < len(names):
+            raise InputError(f"every parameter needs a name of its own, got {max(names, key=names.count)!r} twice")
+
+    def __len__(self) -> int:
+        return len(self.parameters)
+
+    def __iter__(self):
+        return iter(self.parameters)
+
+    @property
+    def names(self) -> list[str]:
+        """Names in order."""
+        return [parameter.name for parameter in self.parameters]
+
+    def bounds(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return the bounds in normalised coordinates, (P,) each."""
+        low, high = ([float(p.normalised(p.bounds[i])) for p in self.parameters] for i in (0, 1))
+        return np.array(low), np.array(high)
+
+    def values(self, z: np.ndarray) -> np.ndarray:
+        """Return values [unit] of normalised coordinates, (..., P) to (..., P)."""
+        return np.stack([p.value(z[..., i]) for i, p in enumerate(self.parameters)], axis=-1)
+
+    def normalised(self, values: np.ndarray) -> np.ndarray:
+        """Return normalised coordinates of values [unit], (..., P) to (..., P)."""
+        return np.stack([p.normalised(values[..., i]) for i, p in enumerate(self.parameters)], axis=-1)
+
+    def robots(self, z: np.ndarray, description: RobotDescription | None = None) -> RobotValues:
+        """Return the robots of normalised coordinates (N, P); what is no parameter is as described."""
+        z = np.atleast_2d(z)
+        robots, values = RobotValues.nominal(len(z), description), self.values(z)
+        for i, parameter in enumerate(self.parameters):
+            getattr(robots, parameter.quantity)[:, parameter.places] = values[:, i, None]
+        return robots
+
+    def without(self, names: Iterable[str]) -> ParameterSet:
+        """Return the set without some parameters, or without all of a group."""
+        left_out = set(names)
+        return ParameterSet(tuple(p for p in self.parameters if p.name not in left_out and p.group not in left_out))
+
+    def changed(self, **changes: dict) -> ParameterSet:
+        """Return the set with other fields in some parameters, by name, such as a tighter prior.
+
+        Raises InputError for an unknown name.
+        """
+        unknown = set(changes) - set(self.names)
+        if unknown:
+            raise InputError(f"no parameter {min(unknown)!r}; there are {', '.join(self.names)}")
+        return ParameterSet(tuple(dataclasses.replace(p, **changes.get(p.name, {})) for p in self.parameters))
+
+
+def jumper_parameters(groups: Sequence[str] = GROUPS, description: RobotDescription | None = None) -> ParameterSet:
+    """Return the robot's parameters of some groups, 79 with all.
+
+    motors: gains and armature of each motor, torque limit, cutoff and no-load speed by kind; masses: of the base, its
+    com and inertia, ratios by kind of link; friction: of each motor, knees and paws; latency; offsets: of each sensor.
+    Raises InputError for an unknown group.
+    """
+    unknown = [group for group in groups if group not in GROUPS]
+    if unknown or not groups:
+        what = f"unknown group of parameters {unknown[0]!r:.60}" if unknown else "no group of parameters"
+        raise InputError(f"{what}; there are {', '.join(GROUPS)}")
+    robot = load_description() if description is None else description
+    every = (*motor_parameters(robot), *mass_parameters(robot), *friction_parameters(robot))
+    every += (
+        Parameter("latency", "latency", (0,), "s", 0.0, 0.005, (0.0, 0.04), "absolute", "latency"),
+        *(
+            Parameter(f"offset/{joint}", "offset", (i,), "rad", 0.0, math.radians(2.0),
+                      (-math.radians(10.0), math.radians(10.0)), "absolute", "offsets")
+            for i, joint in enumerate(MOTOR_JOINTS)
+        ),
+    )  # fmt: skip
+    return ParameterSet(tuple(parameter for parameter in every if parameter.group in groups))
+
+
+def ratio(
+    name: str, quantity: str, places: Sequence[int], unit: str, nominal: float, prior: float, group: str
+) -> Parameter:
+    """Return a positive parameter known to a factor of exp(prior); its bounds are five deviations, at most tenfold."""
+    wide = math.exp(min(5.0 * prior, math.log(10.0)))
+    return Parameter(name, quantity, tuple(places), unit, nominal, prior, (nominal / wide, nominal * wide), group=group)
+
+
+def motor_parameters(robot: RobotDescription) -> tuple[Parameter, ...]:
+    """Return gains, armature, and limits of the motors."""
+    found = []
+    for quantity, prior in (("kp", 0.2), ("kd", 0.2)):
+        found += [
+            ratio(f"{quantity}/{j}", quantity, (i,), "1", 1.0, prior, "motors") for i, j in enumerate(MOTOR_JOINTS)
+        ]
+    for i, joint in enumerate(MOTOR_JOINTS):
+        found.append(ratio(f"armature/{joint}", "armature", (i,), "kg m^2", robot.motors[i].armature, 0.25, "motors"))
+    for kind, places in (("lateral", LATERAL), ("transversal", TRANSVERSAL)):
+        motor = robot.motors[places[0]]
+        found += [
+            ratio(f"saturation/{kind}", "saturation", places, "1", 1.0, 0.1, "motors"),
+            ratio(f"cutoff_speed/{kind}", "cutoff_speed", places, "rad/s", motor.cutoff_speed, 0.1, "motors"),
+            ratio(f"no_load_speed/{kind}", "no_load_speed", places, "rad/s", motor.no_load_speed, 0.1, "motors"),
+        ]
+    return tuple(found)
+
+
+def mass_parameters(robot: RobotDescription) -> tuple[Parameter, ...]:
+    """Return masses, centre of mass and inertia."""
+    base = robot.links[0]
+    found = [ratio("base_mass", "base_mass", (0,), "kg", base.mass, 0.15, "masses")]
+    for i, axis in enumerate("xyz"):
+        c = float(base.com[i])
+        found.append(
+            Parameter(f"base_com/{axis}", "base_com", (i,), "m", c, 0.02, (c - 0.1, c + 0.1), "absolute", "masses")
+        )
+    found.append(ratio("base_inertia", "base_inertia", (0,), "1", 1.0, 0.2, "masses"))
+    found += [
+        ratio(f"link_mass/{kind}", "link_mass", (i,), "1", 1.0, 0.15, "masses") for i, kind in enumerate(LINK_KINDS)
+    ]
+    return tuple(found)
+
+
+def friction_parameters(robot: RobotDescription) -> tuple[Parameter, ...]:
+    """Return friction of motors, knees and paws."""
+    found = [
+        ratio(
+            f"motor_friction/{joint}", "motor_friction", (i,), "N m", robot.motors[i].coulomb_friction, 0.6, "friction"
+        )
+        for i, joint in enumerate(MOTOR_JOINTS)
+    ]
+    found.append(ratio("knee_damping", "knee_damping", (0,), "N m s/rad", robot.knee_damping, 0.4, "friction"))
+    found.append(ratio("paw_friction", "paw_friction", (0,), "1", PAW_FRICTION, 0.2, "friction"))
+    return tuple(found)

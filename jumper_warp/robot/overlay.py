@@ -1,0 +1,134 @@
+"""A robot overlay: values that replace those of the description, and ranges for randomisation around them, as JSON."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from jumper_warp.robot import bounds
+from jumper_warp.robot.bounds import Range
+from jumper_warp.robot.description import RobotDescription
+from jumper_warp.robot.values import RobotValues
+from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.files import write_whole
+
+SCHEMA = "jumper-warp robot overlay 1"
+RATIO = Range(0.05, 20.0, "")
+RANGES = {
+    "base_mass": bounds.LINK_MASS,
+    "base_com": bounds.PLACE,
+    "base_inertia": RATIO,
+    "link_mass": RATIO,
+    "armature": bounds.ARMATURE,
+    "motor_friction": bounds.MOTOR_FRICTION,
+    "kp": RATIO,
+    "kd": RATIO,
+    "saturation": RATIO,
+    "no_load_speed": bounds.MOTOR_SPEED,
+    "cutoff_speed": bounds.MOTOR_SPEED,
+    "offset": Range(-0.5, 0.5, "rad"),
+    "knee_damping": bounds.KNEE_DAMPING,
+    "paw_friction": Range(0.0, 10.0, ""),
+    "latency": Range(0.0, 0.1, "s"),
+}
+"""What the values of each quantity may be."""
+
+
+@dataclass(frozen=True, eq=False)
+class RobotOverlay:
+    """What is known of one robot better than its description says."""
+
+    values: Mapping[str, tuple[float, ...]]
+    """Fields of `RobotValues` that differ from the description, of one robot."""
+    randomization: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    """Rows of `RandomizationCfg`, relative to these values."""
+    source: str = ""
+    """Where it comes from."""
+
+    def __post_init__(self) -> None:
+        """Raises InputError: an unknown quantity, a wrong number of values, or one out of range."""
+        nominal = vars(RobotValues.nominal(1))
+        for name, values in self.values.items():
+            if name not in RANGES:
+                raise InputError(f"robot overlay: no quantity {name!r:.60}; there are {', '.join(RANGES)}")
+            if len(values) != nominal[name].shape[1]:
+                raise InputError(f"robot overlay: {name} needs {nominal[name].shape[1]} values, got {len(values)}")
+            low, high, unit = RANGES[name]
+            for value in values:
+                if not low <= value <= high:
+                    raise InputError(f"robot overlay: {name} must be in {low:g} to {high:g} {unit}, got {value:.6g}")
+        robot = self.robots()
+        if not (robot.cutoff_speed < robot.no_load_speed).all():
+            raise InputError("robot overlay: each cutoff_speed must be below the no_load_speed")
+
+    def robots(self, description: RobotDescription | None = None) -> RobotValues:
+        """Return the values of the robot, N = 1."""
+        robot = RobotValues.nominal(1, description)
+        for name, values in self.values.items():
+            getattr(robot, name)[0] = values
+        return robot
+
+    @property
+    def latency(self) -> float | None:
+        """From target to motor [s], if it is known."""
+        return self.values["latency"][0] if "latency" in self.values else None
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the overlay as JSON can hold it."""
+        return {
+            "schema": SCHEMA,
+            "source": self.source,
+            "values": {name: list(values) for name, values in self.values.items()},
+            "randomization": {name: list(pair) for name, pair in self.randomization.items()},
+        }
+
+    @classmethod
+    def from_json(cls, saved: Any) -> RobotOverlay:
+        """Return the overlay of `to_json`. Raises InputError for anything else."""
+        if not isinstance(saved, dict) or saved.get("schema") != SCHEMA:
+            raise InputError(f"not a robot overlay: expected an object with schema {SCHEMA!r}")
+        sections = {}
+        for section in ("values", "randomization"):
+            table = saved.get(section, {})
+            if not isinstance(table, dict):
+                raise InputError(f"robot overlay: {section} must be an object")
+            sections[section] = {name: numbers(f"{section} {name}", values) for name, values in table.items()}
+        for name, pair in sections["randomization"].items():
+            if len(pair) != 2 or pair[0] > pair[1]:
+                raise InputError(f"robot overlay: randomization {name!r:.60} must be two rising numbers, got {pair}")
+        return cls(**sections, source=str(saved.get("source", "")))
+
+    def save(self, path: Path) -> None:
+        """Write it as a JSON file. Raises OSError."""
+        write_whole(path, (json.dumps(self.to_json(), indent=2, allow_nan=False) + "\n").encode())
+
+
+def numbers(name: str, values: Any) -> tuple[float, ...]:
+    """Return finite numbers. Raises InputError."""
+    if not isinstance(values, list) or any(isinstance(x, bool) or not isinstance(x, int | float) for x in values):
+        raise InputError(f"robot overlay: {name!r:.60} must be a list of numbers")
+    if not all(math.isfinite(x) for x in values):
+        raise InputError(f"robot overlay: {name!r:.60} must be finite")
+    return tuple(float(x) for x in values)
+
+
+def load_overlay(path: Path) -> RobotOverlay:
+    """Return the overlay of a file. Raises InputError: it is none, or OSError: it cannot be read."""
+    try:
+        return RobotOverlay.from_json(json.loads(Path(path).read_text(encoding="utf-8")))
+    except (UnicodeDecodeError, json.JSONDecodeError, RecursionError) as error:
+        raise InputError(f"{path}: expected JSON ({type(error).__name__})") from None
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+
+
+def overlay_of(values: RobotValues, quantities: tuple[str, ...], **more: Any) -> RobotOverlay:
+    """Return the overlay that sets some quantities to the values of the first of N robots; more: its other fields."""
+    chosen = {name: tuple(float(x) for x in np.asarray(getattr(values, name))[0]) for name in quantities}
+    return RobotOverlay(chosen, **more)

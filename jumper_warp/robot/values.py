@@ -1,0 +1,77 @@
+"""Values of the robot that may differ from its description: what identification finds and an overlay sets."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from jumper_warp.robot.description import RobotDescription, load_description
+
+LINK_KINDS = ("housing", "outer_thigh", "outer_shank", "inner_thigh", "inner_shank")
+"""Links of a leg; those of one kind share their mass ratio."""
+PAW_FRICTION = 0.9
+"""[1] Of the described robot, as in `Simulation`."""
+MOTOR_QUANTITIES = (
+    "armature", "motor_friction", "kp", "kd", "saturation", "no_load_speed", "cutoff_speed", "offset",
+)  # fmt: skip
+
+
+@dataclass
+class RobotValues:
+    """Values of N robots; the first axis of every array has length N."""
+
+    base_mass: np.ndarray
+    """(N, 1) [kg]"""
+    base_com: np.ndarray
+    """(N, 3) [m], base frame."""
+    base_inertia: np.ndarray
+    """(N, 1) [1] Ratio to the described inertia about the centre of mass, besides that of the mass."""
+    link_mass: np.ndarray
+    """(N, 5) [1] Ratio of mass and inertia by `LINK_KINDS`."""
+    armature: np.ndarray
+    """(N, 12) [kg m^2]"""
+    motor_friction: np.ndarray
+    """(N, 12) [N m]"""
+    kp: np.ndarray
+    """(N, 12) [1] Ratio to the gain of the motion or task."""
+    kd: np.ndarray
+    """(N, 12) [1] Likewise."""
+    saturation: np.ndarray
+    """(N, 12) [1] Ratio to the torque limit of the motion or task."""
+    no_load_speed: np.ndarray
+    """(N, 12) [rad/s]"""
+    cutoff_speed: np.ndarray
+    """(N, 12) [rad/s]"""
+    offset: np.ndarray
+    """(N, 12) [rad] What a position sensor reads above the true angle."""
+    knee_damping: np.ndarray
+    """(N, 1) [N m s/rad]"""
+    paw_friction: np.ndarray
+    """(N, 1) [1]"""
+    latency: np.ndarray
+    """(N, 1) [s] From target to motor."""
+
+    @classmethod
+    def nominal(cls, count: int, description: RobotDescription | None = None) -> RobotValues:
+        """Return the described robot, `count` times."""
+        robot = load_description() if description is None else description
+        motors, base = robot.motors, robot.links[0]
+        one = cls(
+            base_mass=np.array([base.mass]),
+            base_com=np.array(base.com),
+            base_inertia=np.ones(1),
+            link_mass=np.ones(len(LINK_KINDS)),
+            armature=np.array([motor.armature for motor in motors]),
+            motor_friction=np.array([motor.coulomb_friction for motor in motors]),
+            kp=np.ones(12),
+            kd=np.ones(12),
+            saturation=np.ones(12),
+            no_load_speed=np.array([motor.no_load_speed for motor in motors]),
+            cutoff_speed=np.array([motor.cutoff_speed for motor in motors]),
+            offset=np.zeros(12),
+            knee_damping=np.array([robot.knee_damping]),
+            paw_friction=np.array([PAW_FRICTION]),
+            latency=np.zeros(1),
+        )
+        return cls(**{name: np.tile(value, (count, 1)) for name, value in vars(one).items()})

@@ -1,0 +1,67 @@
+"""Values of robots written into Newton's model and into the motors of a simulation."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import newton
+import numpy as np
+import warp as wp
+
+from jumper_warp.robot.model import KNEE_DOFS
+from jumper_warp.robot.values import LINK_KINDS, RobotValues
+from jumper_warp.sim.dynamics import find_paws
+from kernels.layout import BODIES, DOFS
+
+MOTOR_DOFS = [6 + 5 * leg + joint for leg in range(4) for joint in (0, 1, 3)]
+"""A world's motors in `joint_qd`."""
+
+
+def write_model(model: newton.Model, robots: RobotValues, *, paws: bool = True) -> None:
+    """Write masses, joints and the paws' friction into a model that is as described, before a solver reads it.
+
+    robots: one for all worlds, or one a world. paws: whether to write their friction.
+    """
+    n = model.world_count
+    mass = model.body_mass.numpy().reshape(n, -1)
+    com = model.body_com.numpy().reshape(n, int(BODIES), 3)
+    inertia = model.body_inertia.numpy().reshape(n, int(BODIES), 3, 3)
+    scale = np.tile(robots.link_mass, (1, 4)) * np.ones((n, 4 * len(LINK_KINDS)))
+    of_base = robots.base_mass[:, 0] / mass[:, 0]
+    inertia[:, 0] *= (of_base * robots.base_inertia[:, 0])[:, None, None]
+    inertia[:, 1:] *= scale[:, :, None, None]
+    mass[:, 0], com[:, 0] = robots.base_mass[:, 0], robots.base_com
+    mass[:, 1:] *= scale
+    for array, values in (
+        (model.body_mass, mass),
+        (model.body_inv_mass, 1.0 / mass),
+        (model.body_com, com),
+        (model.body_inertia, inertia),
+        (model.body_inv_inertia, np.linalg.inv(inertia.astype(np.float64))),
+    ):
+        array.assign(np.ascontiguousarray(values, dtype=np.float32).reshape(array.numpy().shape))
+    for array, dofs, values in (
+        (model.joint_armature, MOTOR_DOFS, robots.armature),
+        (model.joint_friction, MOTOR_DOFS, robots.motor_friction),
+        (model.joint_damping, KNEE_DOFS, robots.knee_damping),
+    ):
+        table = array.numpy().reshape(n, int(DOFS))
+        table[:, dofs] = values
+        array.assign(table.ravel())
+    if paws:
+        friction = model.shape_material_mu.numpy()
+        friction[find_paws(model)] = robots.paw_friction
+        model.shape_material_mu.assign(friction)
+
+
+def write_motors(motors: Any, robots: RobotValues) -> None:
+    """Write the motors' constants into `MotorArrays` that hold those of the description.
+
+    robots: one for all worlds, or one a world.
+    """
+    for name in ("kp", "kd", "saturation"):
+        array: wp.array = getattr(motors, name)
+        array.assign((array.numpy() * getattr(robots, name).T).astype(np.float32))
+    for name in ("no_load_speed", "cutoff_speed", "offset"):
+        array = getattr(motors, name)
+        array.assign((np.zeros(array.shape) + getattr(robots, name).T).astype(np.float32))

@@ -1,0 +1,172 @@
+"""Identification against robots whose parameters are known."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from jumper_warp.optim.excitation import KINDS, Scorer, draw_plan
+from jumper_warp.optim.identification import identify, total_mass, weighed
+from jumper_warp.optim.parameters import Parameter, ParameterSet, jumper_parameters
+from jumper_warp.optim.recording import measured, replay_plan, simulate_plan
+from jumper_warp.optim.replay import Replay
+from jumper_warp.optim.residuals import MotionResiduals, NoiseLevels
+from jumper_warp.optim.stance import paw_positions, stance
+from jumper_warp.optim.uncertainty import weak_directions
+from jumper_warp.robot.description import load_description
+from jumper_warp.robot.model import standing_configuration
+from jumper_warp.utils.errors import InputError
+
+DEGREE = math.pi / 180.0
+
+
+@pytest.fixture(scope="module")
+def replay():
+    return Replay(40, threads=2)
+
+
+def some_truth(parameters, seed=0):
+    """Return normalised coordinates drawn from the priors, (P,)."""
+    z = np.clip(0.7 * np.random.default_rng(seed).normal(size=len(parameters)), -1.5, 1.5)
+    if "latency" in parameters.names:
+        z[parameters.names.index("latency")] = 0.9
+    return z
+
+
+@pytest.mark.parametrize("kind", dict.fromkeys(KINDS))
+def test_a_replay_moves_as_the_simulation_does_with_all_parameters_changed(replay, kind):
+    parameters = jumper_parameters()
+    robots = parameters.robots(some_truth(parameters))
+    plan = draw_plan(kind, np.random.default_rng(1), seconds=0.6)
+    ours, theirs = replay_plan(replay, plan, robots), simulate_plan(plan, robots=robots)
+    assert ours.valid.all() and np.ptp(ours.angle[:, 1, 0]) > 2.0 * DEGREE
+    np.testing.assert_allclose(ours.angle, theirs.angle, atol=0.01 * DEGREE)
+    np.testing.assert_allclose(ours.rate, theirs.rate, atol=0.02)
+    np.testing.assert_allclose(ours.position, theirs.position, atol=2.0e-5)
+    np.testing.assert_allclose(ours.torque, theirs.torque, atol=0.02)
+
+
+def test_a_target_arrives_late_by_parts_of_a_step(replay):
+    parameters = jumper_parameters(["latency"])
+    plan = draw_plan("hung chirp", np.random.default_rng(0), seconds=0.5)
+    second_tick = []
+    for steps in (0.0, 0.25, 0.5, 1.0):
+        robots = parameters.robots(parameters.normalised(np.array([[steps / 480.0]])))
+        second_tick.append(replay_plan(replay, plan, robots).torque[4, 1, 0])
+    punctual, quarter, half, late = second_tick
+    assert abs(punctual - late) > 0.01
+    assert punctual - quarter == pytest.approx(0.25 * (punctual - late), rel=1e-6)
+    assert punctual - half == pytest.approx(0.5 * (punctual - late), rel=1e-6)
+
+
+def test_paws_are_where_the_model_has_them():
+    robot = load_description()
+    height = stance(robot, robot.pose("nominal")[None], np.zeros((1, 12))).height[0]
+    assert height == pytest.approx(standing_configuration(robot, "nominal")[2], abs=1e-9)
+    angle = robot.pose("nominal")[None] + 0.2 * np.random.default_rng(0).normal(size=(1, 12))
+    rate = np.random.default_rng(1).normal(size=(1, 12))
+    base = stance(robot, angle, rate)
+    # paws of a base that moves so as they rest: as little as the legs' differences allow
+    paws = paw_positions(robot, angle) - 0.025 * base.up[:, None]
+    speed = (paw_positions(robot, angle + 1e-6 * rate) - paw_positions(robot, angle - 1e-6 * rate)) / 2e-6
+    left = base.velocity[:, None] + np.cross(base.spin[:, None], paws) + speed
+    assert np.linalg.norm(left) < np.linalg.norm(speed)
+    other = base.velocity[:, None] + 0.01 + np.cross(base.spin[:, None], paws) + speed
+    assert np.linalg.norm(left) < np.linalg.norm(other)
+
+
+def few_parameters():
+    """Return parameters of one leg's motors, and some that all legs share."""
+    wanted = {f"{name}/{joint}" for name in ("kp", "kd", "offset") for joint in ("FL_lateral", "FL_outer", "FL_inner")}
+    wanted |= {"base_mass", "latency", "knee_damping"}
+    return ParameterSet(tuple(p for p in jumper_parameters() if p.name in wanted))
+
+
+@pytest.fixture(scope="module")
+def found(replay):
+    """Return an identification of two short motions, the truth, and the plans."""
+    parameters, rng = few_parameters(), np.random.default_rng(5)
+    truth = some_truth(parameters, seed=2)
+    robots = parameters.robots(truth)
+    small = Replay(len(parameters) + 37, threads=2)
+    plans = [draw_plan(kind, rng, seconds=0.6) for kind in ("hung chirp", "standing chirp")]
+    motions = [measured(plan, f"m{i}", replay_plan(small, plan, robots), robots, rng) for i, plan in enumerate(plans)]
+    mass = weighed(float(total_mass(robots)[0]))
+    return identify(motions, parameters, knowledge=[mass], replay=small), truth, motions
+
+
+def test_known_parameters_are_found_within_their_intervals(found):
+    result, truth, _ = found
+    assert result.nominal_chi2 > 20.0
+    assert 0.93 < result.chi2 < 1.05
+    assert result.mismatch == 1.0
+    error = np.abs(result.z - truth) / np.sqrt(np.diag(result.covariance))
+    assert np.sqrt(np.mean(error**2)) < 1.6 and error.max() < 4.0
+    values, true = result.values, result.parameters.values(truth)
+    for i, parameter in enumerate(result.parameters):
+        if parameter.quantity in ("kp", "kd"):
+            assert values[i] == pytest.approx(true[i], rel=0.02)
+    assert result.identified.sum() >= len(truth) - 1
+
+
+def test_the_jacobian_is_that_of_single_changes_and_legs_share_worlds_in_the_air(replay):
+    parameters, rng = jumper_parameters(["motors"]), np.random.default_rng(3)
+    plan = draw_plan("hung chirp", rng, seconds=0.5)
+    robots = parameters.robots(some_truth(parameters))
+    motion = measured(plan, "hung", replay_plan(replay, plan, robots), robots, rng)
+    problem = MotionResiduals(motion, parameters, NoiseLevels(), replay.description)
+    assert len(problem.plan) < 0.6 * (len(parameters) + problem.start_size)
+    z, start = np.zeros(len(parameters)), np.zeros(problem.start_size)
+    found = problem.linearise(replay, z, start)
+    for name in ("kp/FL_outer", "kd/BR_inner", "armature/FR_lateral"):
+        column = parameters.names.index(name)
+        change = 1.0e-3 * np.eye(len(z))[column]
+        both = problem.residuals(replay, np.stack([z + change, z - change]), np.stack([start, start]))
+        difference = (both[:, 0] - both[:, 1]) / 2.0e-3
+        assert np.linalg.norm(difference) > 1.0
+        error = np.linalg.norm(found.jacobian[:, column] - difference)
+        assert error < 0.01 * np.linalg.norm(difference)
+
+
+def test_a_model_that_cannot_be_right_widens_its_intervals(found, replay):
+    _, _, motions = found
+    # an encoder of another scale is no parameter
+    parameters = few_parameters().without(["latency"])
+    bent = [replace(motion, angle=1.02 * motion.angle) for motion in motions if motion.base == "fixed"]
+    small = Replay(len(parameters) + 37, threads=2)
+    result = identify(bent, parameters, replay=small)
+    assert result.mismatch > 2.0
+
+
+def test_masses_and_gains_that_share_a_scale_are_named(replay):
+    wanted = ("kp", "kd", "link_mass", "armature", "motor_friction", "knee_damping")
+    parameters = ParameterSet(tuple(p for p in jumper_parameters() if p.quantity in wanted))
+    scorer = Scorer(parameters, replay=Replay(len(parameters) + 37, threads=2))
+    plan = draw_plan("hung chirp", np.random.default_rng(0), seconds=0.6)
+    information = scorer.information(plan, scorer.record(plan))
+    words = [direction.words for direction in weak_directions(parameters, information)]
+    assert any("share a scale: add a weighed mass" in line for line in words), words
+
+
+def test_parameters_and_sets_refuse_what_makes_no_sense():
+    good = dict(name="a", quantity="kp", places=(0,), unit="1", nominal=1.0, prior=0.1, bounds=(0.5, 2.0))
+    Parameter(**good)
+    for change in ({"bounds": (2.0, 3.0)}, {"prior": 0.0}, {"bounds": (-1.0, 2.0)}, {"bounds": (0.5, math.nan)}):
+        with pytest.raises(InputError, match="parameter a"):
+            Parameter(**(good | change))
+    with pytest.raises(InputError, match="name of its own"):
+        ParameterSet((Parameter(**good), Parameter(**good)))
+    with pytest.raises(InputError, match="unknown group of parameters 'gears'"):
+        jumper_parameters(["gears"])
+    with pytest.raises(InputError, match="at least one motion"):
+        identify([], jumper_parameters())
+
+
+def test_values_and_normalised_coordinates_belong_together():
+    parameters = jumper_parameters()
+    assert len(parameters) == 79
+    z = np.random.default_rng(0).normal(size=(3, 79))
+    np.testing.assert_allclose(parameters.normalised(parameters.values(z)), z, atol=1e-9)
+    robots = parameters.robots(np.zeros((2, 79)))
+    assert total_mass(robots) == pytest.approx([load_description().mass] * 2)
