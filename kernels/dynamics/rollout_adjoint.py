@@ -243,7 +243,7 @@ def everything(
     return (
         leg_action(
             params.geometry, params.masses, params.joints, stops, robot.ground, x, v, q, v, v, v, v, base, factors, x
-        )  # fmt: skip
+        )
         + base_action(load_moments(robot.table, BASE, world), v, v, v, v, q, v, v, base, base_seeds, x)
         + turned(q, v, x, q)
         + motor_torque(x, x, x, load_world_motor(actuation, 0, world))
