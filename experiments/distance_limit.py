@@ -48,7 +48,6 @@ from jumper_warp.robot.model import KNEE_DOFS
 from jumper_warp.robot.motors import horizontal_jump_filter, jumping_motors, loose_filter, vertical_jump_filter
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.tasks.jump.horizontal import LANDING_HEIGHT
-from jumper_warp.tasks.units import G
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.output import write_figures
 
@@ -178,6 +177,8 @@ class Args:
     """Warp device."""
     threads: int | None = None
     """CPU threads that share the worlds (default: all cores); they change no result."""
+    gravity: float | None = None
+    """[m/s^2] Downward (default: that of the task)."""
 
     def __post_init__(self) -> None:
         """Check the values."""
@@ -200,6 +201,7 @@ def cma_package() -> ModuleType:
 def env_of_limit(limit: Limit, args: Args) -> Env:
     """Return nominal robots on the task, one limit changed, with the ends that a search needs."""
     task = limit.task(make_task("horizontal-jump"))
+    task = task if args.gravity is None else replace(task, gravity=args.gravity)
     names = {*ENDS, "left_stance"} - {"no_jump"} if limit.stance else {*ENDS} - {"no_jump"}
     task = replace(task, terminations=tuple(term for term in task.terminations if term.name in names))
     env = Env(task, args.population, device=args.device, randomize=False, noise=False, auto_reset=False)
@@ -209,7 +211,7 @@ def env_of_limit(limit: Limit, args: Args) -> Env:
 
 def score(takeoffs: Takeoffs, limit: Limit) -> np.ndarray:
     """Return what the search is for [m], less penalties; (num_envs,)."""
-    apex = takeoffs.com[:, 2] + takeoffs.com_vel[:, 2] ** 2 / (2.0 * G)
+    apex = takeoffs.com[:, 2] + takeoffs.com_vel[:, 2] ** 2 / (2.0 * takeoffs.gravity)
     value = (apex if limit.apex else takeoffs.flight) - BAD * takeoffs.bad
     value -= PITCH * np.maximum(np.degrees(np.abs(takeoffs.landing_pitch)) - limit.pitch, 0.0)
     value -= BACK * np.maximum(takeoffs.back - limit.back, 0.0)
@@ -373,7 +375,8 @@ def plot(rows: Rows, path: Path) -> None:
 def main(args: Args) -> dict[str, Any]:
     """Search, and return the figures."""
     cma_package()  # that it is missing is said before anything else
-    evaluation = EvaluationArgs(args.policy, record=0, out=args.out, device=args.device, threads=args.threads)
+    evaluation = EvaluationArgs(args.policy, record=0, out=args.out, device=args.device, threads=args.threads,
+                                gravity=args.gravity)  # fmt: skip
     run = EvaluationRun.of("distance_limit", evaluation)
     flown, landings, actions = fly_policy(run)
     begin, values = nominal_best(actions, args)

@@ -19,7 +19,7 @@ from rich.console import Console
 from rich.table import Table
 
 from jumper_warp.cli.main import run_command
-from jumper_warp.evaluation.gradients import INNER, OUTER, TICKS, GradientJump, check, schedule
+from jumper_warp.evaluation.gradients import INNER, OUTER, TICKS, GradientJump, apex, check, schedule
 from jumper_warp.evaluation.plots import drawn
 from jumper_warp.utils.output import output_dir, write_figures
 from jumper_warp.utils.runtime import announce
@@ -56,9 +56,9 @@ def ascend(device: str | None) -> Ascent:
     targets, heights = schedule(WEAK_PUSH), []
     for _ in range(ASCENT_STEPS):
         rollout, grads = jump.gradients({"targets": targets})
-        heights.append(float(rollout.apex.numpy()[0]))
+        heights.append(float(apex(rollout)[0]))
         targets = targets + ASCENT_CHANGE * grads["targets"] / np.abs(grads["targets"]).max()
-    heights.append(float(jump.run({"targets": targets})[1].apex.numpy()[0]))
+    heights.append(float(apex(jump.run({"targets": targets}))[0]))
     return Ascent(heights, schedule(WEAK_PUSH), targets)
 
 
@@ -72,9 +72,10 @@ def plot(rollout: Any, actions: tuple[np.ndarray, np.ndarray], ascent: Ascent, p
             axes[0].plot(
                 ticks, 100.0 * differenced[i], "o", mfc="none", color=line.get_color(), label="central difference"
             )
-        height = rollout.height.numpy()[:, 0]
+        height = rollout.q.numpy()[:, 2, 0]
+        pushed = np.flatnonzero(rollout.impulse.numpy()[: height.argmax(), :, 0].any(axis=(1, 2)))
         axes[1].plot(np.arange(len(height)) / 480.0, height)
-        axes[1].axvline(rollout.takeoff_row.numpy()[0] / 480.0, color="0.6", linestyle="--", label="takeoff")
+        axes[1].axvline((pushed[-1] + 1) / 480.0, color="0.6", linestyle="--", label="takeoff")
         axes[2].plot(range(ASCENT_STEPS + 1), ascent.apex, "o-")
         for motor, name in ((OUTER, "outer"), (INNER, "inner")):
             (line,) = axes[3].plot(ticks, np.degrees(ascent.before[:, motor]), "--", label=f"FL {name}, before")
@@ -100,7 +101,7 @@ def main(args: Args) -> dict:
         for name, (found, differenced) in checks.items()
     }
     values |= {
-        "jump_apex_m": float(rollout.apex.numpy()[0]),
+        "jump_apex_m": float(apex(rollout)[0]),
         "apex_before_m": ascent.apex[0],
         "apex_after_m": ascent.apex[-1],
         "seconds": time.perf_counter() - start,

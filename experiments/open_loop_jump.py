@@ -21,6 +21,7 @@ from rich.table import Table
 from jumper_warp.cli.main import run_command
 from jumper_warp.evaluation.open_loop import Trace, follow_jump, jump_metrics
 from jumper_warp.evaluation.plots import drawn
+from jumper_warp.robot.gravity import EARTH
 from jumper_warp.robot.model import LEGS, MOTOR_JOINTS, build_model
 from jumper_warp.robot.motors import jumping_motors, loose_filter, vertical_jump_filter
 from jumper_warp.sim.simulation import Simulation
@@ -46,6 +47,8 @@ class Args:
     """[N m] Torque saturation of the motors; lateral motors give 18 at most."""
     kp: float = 17.0
     """[N m/rad] Position gain of the transversal motors."""
+    gravity: float = EARTH
+    """[m/s^2] Downward."""
     loose: bool = False
     """A looser filter, as for the paper's 1.42 m."""
     out: Path | None = None
@@ -92,15 +95,18 @@ def main(args: Args) -> dict:
     start = time.perf_counter()
     announce(args.device)
     folder = output_dir("open_loop_jump", args.out)
-    variant = {"solver": args.solver, "torque_limit_nm": args.torque, "kp_nm_rad": args.kp, "loose_filter": args.loose}
+    variant = {"solver": args.solver, "gravity_m_s2": args.gravity, "torque_limit_nm": args.torque,
+               "kp_nm_rad": args.kp, "loose_filter": args.loose}  # fmt: skip
     motors = jumping_motors(args.torque)
     motors = replace(motors, transversal=replace(motors.transversal, kp=args.kp))
     command_filter = loose_filter() if args.loose else vertical_jump_filter()
-    sim = Simulation(1, solver=args.solver, motors=motors, command_filter=command_filter, device=args.device)
+    sim = Simulation(
+        1, solver=args.solver, motors=motors, command_filter=command_filter, gravity=args.gravity, device=args.device
+    )
     trace, recorder, frames = follow_jump(sim, variant)
     draw_filmstrip(frames, folder / "jump_strip.png")
     values: dict[str, Any] = {**variant, **jump_metrics(trace), "hardware_apex_height_m": None}
-    if args.torque == 18.0 and not args.loose:
+    if args.torque == 18.0 and args.gravity == EARTH and not args.loose:
         values["hardware_apex_height_m"] = HARDWARE_APEX
     title = f"Open-loop jump, {args.solver}, {args.torque:g} N m"
     write_figures(folder, values)

@@ -1,11 +1,12 @@
 """Random actions for a long time: does any world ever become non-finite?
 
     python experiments/soak_test.py --envs 4096 --steps 2500 --out outputs/soak
-    python experiments/soak_test.py --envs 4096 --steps 2500 --task horizontal-jump   # whole environments
+    python experiments/soak_test.py --envs 16384 --steps 61036 --task velocity-rough   # a billion, whole environments
 
 An action is a target angle for every motor, drawn anew at random within the limits of the jump. Worlds start again
 after `episode` steps, the legs' masses and the paws' friction differ from world to world. With `--task` it is a whole
-environment, randomised, that takes random actions: its episodes end and begin on their own.
+environment of any task, randomised, that takes random actions: its episodes end and begin on their own. A map of
+grounds has its hardest row alone. On a GPU the steps for which an action is held are one graph.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ import tyro
 
 from jumper_warp.cli.main import run_command
 from jumper_warp.envs.env import Env
-from jumper_warp.evaluation.soak import SoakArgs, env_steps, simulation_steps, soak
+from jumper_warp.evaluation.soak import SoakArgs, hardest, soak_env, soak_simulation
 from jumper_warp.registry import make_task
 from jumper_warp.robot.motors import vertical_jump_filter
 from jumper_warp.sim.simulation import Simulation
@@ -31,10 +32,10 @@ def main(args: SoakArgs) -> dict:
     if args.task is None:
         command_filter = vertical_jump_filter() if args.filter else None
         sim = Simulation(args.envs, command_filter=command_filter, visuals=False, device=args.device)
-        figures = soak(sim, simulation_steps(sim, args), args)
+        figures = soak_simulation(sim, args)
     else:
-        env = Env(make_task(args.task), args.envs, seed=args.seed, device=args.device)
-        figures = soak(env.sim, env_steps(env, args), args) | {"task": args.task}
+        env = Env(hardest(make_task(args.task)), args.envs, seed=args.seed, device=args.device, threads=args.threads)
+        figures = soak_env(env, args) | {"task": args.task}
     write_figures(folder, figures | {"envs": args.envs, "filter": args.filter, "seed": args.seed})
     for name, value in figures.items():
         print(f"{name:34s} {value if isinstance(value, str) else f'{value:,.6g}'}")

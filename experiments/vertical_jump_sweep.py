@@ -99,6 +99,7 @@ def main(args: Args) -> dict:
     with drawn(run.folder / "sweep.png", figsize=(6, 5.5)) as axis:
         axis.scatter(jumps.target, limit, s=5, color="0.6", label="open-loop jump of the same robot")
         draw_sweep(axis, jumps.target, jumps.apex, reached(jumps), SUCCESS_TOLERANCE, ("reached", "missed"))
+        axis.legend(loc="lower right")
         axis.set(xlabel="commanded base height [m]", ylabel="highest base height [m]")
         axis.set_title(f"{args.jumps} jumps, {run.title}", wrap=True)
     if args.randomize and not args.push_in_flight:

@@ -63,6 +63,8 @@ class TaskEntry:
 
 WALKING = PpoCfg(num_steps=24, gamma=0.985, entropy_coef=0.0025, init_std=0.4)
 """How velocity tracking is trained."""
+PLACES = PpoCfg(gamma=0.99, entropy_coef=0.0003)
+"""How jumps to places are trained."""
 
 TASKS: dict[str, TaskEntry] = {
     "vertical-jump": TaskEntry(
@@ -70,12 +72,19 @@ TASKS: dict[str, TaskEntry] = {
     ),
     "horizontal-jump": TaskEntry(
         "jumper_warp.tasks.jump.horizontal:horizontal_jump",
-        PpoCfg(gamma=0.99, entropy_coef=0.0003),
+        PLACES,
         aliases=("Olympus-Horizontal-Jump",),
     ),
-    "omnidirectional-jump": TaskEntry(
-        "jumper_warp.tasks.jump.horizontal:omnidirectional_jump", PpoCfg(gamma=0.99, entropy_coef=0.0003)
+    "horizontal-jump-sighted": TaskEntry("jumper_warp.tasks.jump.horizontal:horizontal_jump_sighted", PLACES),
+    "omnidirectional-jump": TaskEntry("jumper_warp.tasks.jump.horizontal:omnidirectional_jump", PLACES),
+    "vertical-jump-mars": TaskEntry(
+        "jumper_warp.tasks.jump.mars:vertical_jump_mars", PpoCfg(gamma=0.99), aliases=("Olympus-Vertical-Jump-Mars",)
     ),
+    "vertical-jump-mars-loose": TaskEntry("jumper_warp.tasks.jump.mars:vertical_jump_mars_loose", PpoCfg(gamma=0.99)),
+    "horizontal-jump-mars": TaskEntry(
+        "jumper_warp.tasks.jump.mars:horizontal_jump_mars", PLACES, aliases=("Olympus-Jump-Mars",)
+    ),
+    "horizontal-jump-mars-loose": TaskEntry("jumper_warp.tasks.jump.mars:horizontal_jump_mars_loose", PLACES),
     "velocity-flat": TaskEntry(
         "jumper_warp.tasks.velocity.flat:velocity_flat", WALKING, ("Olympus-Walk",), "Metrics/score"
     ),

@@ -11,6 +11,7 @@ real = wp.float64 if __package__ == "kernels_float64" else wp.float32
 
 vec2 = wp.types.vector(length=2, dtype=real)
 vec3 = wp.types.vector(length=3, dtype=real)
+vec4 = wp.types.vector(length=4, dtype=real)
 vec5 = wp.types.vector(length=5, dtype=real)
 vec6 = wp.types.vector(length=6, dtype=real)
 quat = wp.types.quaternion(dtype=real)

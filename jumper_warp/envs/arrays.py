@@ -79,8 +79,8 @@ def scene_of(sim: Simulation) -> Any:
 def checked_tasks(task: Any, handovers: Sequence[Handover]) -> tuple[TaskCfg, ...]:
     """Return the tasks of an environment, given as one or several.
 
-    Raises ValueError: not a task, none, two of one name, motors that cannot be those of one robot, or a handover
-    between others.
+    Raises ValueError: not a task, none, two of one name, motors that cannot be those of one robot, different
+    gravities, or a handover between others.
     """
     tasks = (task,) if isinstance(task, TaskCfg | str) or not isinstance(task, Iterable) else tuple(task)
     for each in tasks:
@@ -95,6 +95,9 @@ def checked_tasks(task: Any, handovers: Sequence[Handover]) -> tuple[TaskCfg, ..
         same = (each.motors.fade_start, each.motors.fade_end) == (first.fade_start, first.fade_end)
         if not (same and all(one.peak == other.peak for one, other in pairs)):
             raise InputError(f"{each.name} needs the peak torque and the over-speed protection of {names[0]}'s motors")
+    for each in tasks[1:]:
+        if each.gravity != tasks[0].gravity:
+            raise InputError(f"{each.name} has a gravity of {each.gravity} m/s^2, {names[0]} of {tasks[0].gravity}")
     for each in handovers:
         if each.source not in tasks or each.target not in tasks:
             raise InputError(f"a handover needs two of the tasks {names}, got {each.source.name} to {each.target.name}")

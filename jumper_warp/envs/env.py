@@ -85,8 +85,8 @@ class Env(Stages):
         randomised on SolverJumper, else a plane. skill: index of the task that each world begins in, (num_envs,) or one
         for all. handovers: between tasks. robot: what differs from the description, latency included. threads: of a
         CPU, as in `Simulation`.
-        Raises ValueError: no task, two of one name, motors that cannot be those of one robot, a handover between other
-        tasks, less than one environment, or as `Simulation`.
+        Raises ValueError: no task, two of one name, motors that cannot be those of one robot, different gravities, a
+        handover between other tasks, less than one environment, or as `Simulation`.
         """
         tasks = checked_tasks(task, handovers)
         self.task, self.tasks, self.num_envs, self.seed, self.auto_reset = tasks[0], tasks, num_envs, seed, auto_reset
@@ -98,7 +98,7 @@ class Env(Stages):
         self.sim = Simulation(
             num_envs, solver=solver, motors=self.task.motors, visuals=visuals, device=device and str(device),
             ground=ground, block=BlockCfg((0.0, 0.0)) if self._draws_ground else block, tolerance=CONTACT_TOLERANCE,
-            friction=self.task.randomization.nominal_friction, robot=robot, threads=threads,
+            friction=self.task.randomization.nominal_friction, gravity=self.task.gravity, robot=robot, threads=threads,
         )  # fmt: skip
         self.wp_device = self.sim.device
         self.device = torch.device(wp.device_to_torch(self.wp_device))
@@ -206,13 +206,14 @@ class Env(Stages):
         self._observe(self._part(), beginning=1)
 
     def command(self, commands: Any, worlds: Any = None) -> None:
-        """Give worlds a command within their episode; the policy sees it after the next step.
+        """Give worlds a command within their episode; `obs` shows it at once.
 
         commands: (num_envs, up to 4), relative to base and yaw as they are; worlds: (num_envs,) bool, by default all.
         Raises ValueError: values of another shape, or not finite.
         """
         mask = self._array(checked_mask(worlds, self.num_envs))
         self._give(mask, 0, checked_commands(commands, self.num_envs), self._all)
+        self._observe(self._part(), beginning=1)
 
     def request(self, skill: int, worlds: Any = None, commands: Any = None) -> None:
         """Ask worlds to hand over to another skill as soon as a handover allows it.

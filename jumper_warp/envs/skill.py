@@ -32,6 +32,8 @@ class Skill:
         self.task, self.index, self.num_envs, self.device = task, index, num_envs, device
         self.kernels = kernels_of(task)
         self.numbers = wp.array(task.numbers, dtype=float, device=device)
+        self.changed = wp.full(len(task.numbers), math.inf, dtype=float, device=device)
+        """Of `numbers`, those that `set` has changed; infinite where it has not."""
         self.states = wp.zeros(num_envs, dtype=task.state, device=device)
         self.num_events = len(task.rows["events"])
         self.timer = wp.zeros((max(self.num_events, 1), num_envs), dtype=int, device=device)
@@ -107,7 +109,13 @@ class Skill:
             if not math.isfinite(value):
                 raise InputError(f"{section} {name}: {key} must be finite, got {value}")
             i = self.task.place(section, name, key)
-            self.numbers[i : i + 1].fill_(value)
+            for array in (self.numbers, self.changed):
+                array[i : i + 1].fill_(value)
+
+    def restore_numbers(self) -> None:
+        """Take the task's numbers but for those in `changed` (waits for the device)."""
+        changed = self.changed.numpy()
+        self.numbers.assign(np.where(np.isinf(changed), np.array(self.task.numbers, dtype=np.float32), changed))
 
     def metrics(self) -> dict[str, float]:
         """Return means since the last call, and clear the counters (waits for the device)."""

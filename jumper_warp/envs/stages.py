@@ -77,8 +77,10 @@ class Stages:
         ]
 
     def restored(self) -> None:
-        """Let the solver read parameters that were put back."""
+        """Let the solver and the terms read what was put back."""
         self._started = bool((self.worlds.clock.numpy() > FIRST_CLOCK).all())
+        for skill in self.skills:
+            skill.restore_numbers()
         self.sim.physics.parameters_changed()
 
     def kernels(self, draws: bool = True) -> list[tuple[wp.Kernel, int]]:

@@ -11,9 +11,6 @@ from jumper_warp.evaluation.log import Metrics
 from jumper_warp.robot.model import LEGS
 from kernels.layout import BODIES
 
-GRAVITY = 9.81
-"""[m/s^2]"""
-
 
 @dataclass
 class Gait:
@@ -57,19 +54,21 @@ class Gait:
         """Return what robots do that have not fallen, nothing if there are none; standing: (robots,) bool."""
         if not standing.any():
             return {}
-        mass = self.env.sim.model.body_mass.numpy().reshape(-1, int(BODIES)).sum(axis=1)[standing]
+        model = self.env.sim.model
+        mass = model.body_mass.numpy().reshape(-1, int(BODIES)).sum(axis=1)
+        weight = (mass * np.linalg.norm(model.gravity.numpy()[: len(mass)], axis=1))[standing]
         return gait_metrics(
             np.array(self.contact)[:, standing], np.array(self.paw_height)[:, standing],
             np.array(self.force)[:, standing], np.array(self.torque)[:, standing], np.array(self.power)[:, standing],
-            np.array(self.speed)[:, standing], mass, self.env.step_dt,
+            np.array(self.speed)[:, standing], weight, self.env.step_dt,
         )  # fmt: skip
 
 
 def gait_metrics(
     contact: np.ndarray, paw_height: np.ndarray, force: np.ndarray, torque: np.ndarray, power: np.ndarray,
-    speed: np.ndarray, mass: np.ndarray, step_dt: float,
+    speed: np.ndarray, weight: np.ndarray, step_dt: float,
 ) -> Metrics:  # fmt: skip
-    """Return the figures of a gait from samples (steps, robots, ...), as `Gait` has them; mass [kg]: (robots,).
+    """Return the figures of a gait from samples (steps, robots, ...), as `Gait` has them; weight [N]: (robots,).
 
     The cost of transport is the mean power over that of lifting the weight at the mean speed; None if a robot does not
     come on. Contact patterns have the names of the paws on the ground.
@@ -78,13 +77,11 @@ def gait_metrics(
                                            for i in range(contact.shape[1]) for k in range(4))])  # fmt: skip
     seconds, robots = len(contact) * step_dt, max(contact.shape[1], 1)
     touchdowns = int((contact[1:] & ~contact[:-1]).sum())
-    load, pace = force.sum(axis=2) / (mass * GRAVITY), speed.mean(axis=0)
+    load, pace = force.sum(axis=2) / weight, speed.mean(axis=0)
     metrics: Metrics = {
         "steps_hz": touchdowns / (4.0 * robots * seconds),
         "median_swing_apex_m": float(np.median(apexes)) if len(apexes) else None,
-        "cost_of_transport": float(np.mean(power.mean(axis=0) / (mass * GRAVITY * pace)))
-        if pace.min() > 0.05
-        else None,
+        "cost_of_transport": float(np.mean(power.mean(axis=0) / (weight * pace))) if pace.min() > 0.05 else None,
         "mean_speed_m_s": float(speed.mean()),
         "largest_torque_nm": float(np.abs(torque).max()),
         "rms_torque_nm": float(np.sqrt(np.mean(torque**2))),

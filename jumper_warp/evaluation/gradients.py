@@ -10,13 +10,13 @@ import dataclasses
 import math
 
 import numpy as np
-import warp as wp
 
-from jumper_warp.optim.rollout import DifferentiableRollout, Trajectory
+from jumper_warp.optim.bodies import body_gradients, moment_rows
+from jumper_warp.optim.rollout import Rollout, Trajectory, compact
 from jumper_warp.robot.description import load_description
 from jumper_warp.robot.model import build_model, standing_configuration
 from jumper_warp.robot.motors import jumping_motors, vertical_jump_filter
-from kernels.layout import BASE, LEG_ROWS, MOMENT_ROWS, MU_DYNAMIC, MU_STATIC
+from kernels.layout import BODIES, LEG_ROWS, MU_DYNAMIC, MU_STATIC
 
 TICKS = 36
 """Policy steps of 1/60 s."""
@@ -28,6 +28,7 @@ SLIP_SPEED = 1.5
 SLIP_FRICTION = 0.25
 OUTER, INNER = 1, 2
 """Motors of the front left leg in the plot."""
+PARAMETERS = ("table", "saturation")
 
 
 def schedule(push: tuple[float, float]) -> np.ndarray:
@@ -39,45 +40,42 @@ def schedule(push: tuple[float, float]) -> np.ndarray:
 
 
 class GradientJump:
-    """Jumps from NumPy inputs, by name: targets (TICKS, 12), q (43,), qd (38,), table (rows,), saturation (12,)."""
+    """Jumps from NumPy inputs, by name: targets (TICKS, 12), q (19,), qd (18,), table (rows,), saturation (12,)."""
 
     def __init__(self, num_worlds: int, double: bool, device: str | None):
         self.num_worlds = num_worlds
-        self.model = build_model(num_worlds, visuals=False, requires_grad=True, device=device)
-        self.rollout = DifferentiableRollout(self.model, jumping_motors(), vertical_jump_filter(), double=double)
-        self._parameters = {
-            "table": self.rollout.dynamics.robot.table, "saturation": self.rollout.motors.saturation,
-        }  # fmt: skip
+        model = build_model(num_worlds, visuals=False, device=device)
+        self.rollout = Rollout(model, jumping_motors(), vertical_jump_filter(), double=double, every=1)
         squat = dataclasses.replace(load_description(), poses={"squat": (0.0, SQUAT)})
-        q = standing_configuration(squat, "squat")
+        q, qd = (row[:, 0] for row in compact(standing_configuration(squat, "squat"), np.zeros(38)))
         q[2] -= 1.0e-4  # in the ground, where no contact is about to switch
-        self.values = {"targets": schedule(PUSH), "q": q, "qd": np.zeros(38)}
-        self.values |= {name: array.numpy()[:, 0].astype(float) for name, array in self._parameters.items()}
+        self.values = {"targets": schedule(PUSH), "q": q, "qd": qd}
+        self.values |= {name: self.rollout.parameters[name].numpy()[:, 0].astype(float) for name in PARAMETERS}
 
-    def run(self, inputs: dict[str, np.ndarray], pack: bool = False) -> tuple[dict[str, wp.array], Trajectory]:
-        """Simulate. Inputs have the world as first axis where they differ; pack: read masses from the model first."""
+    def run(self, inputs: dict[str, np.ndarray]) -> Trajectory:
+        """Simulate. Inputs have the world as first axis where they differ."""
         full = {}
         for name, value in (self.values | inputs).items():
-            full[name] = np.broadcast_to(value, (self.num_worlds, *value.shape[-self.values[name].ndim :]))
-        arrays = dict(self._parameters)
-        for name, array in arrays.items():
-            array.assign(full[name].T)
-        setup = {"dtype": self.rollout.real, "device": self.model.device, "requires_grad": True}
-        arrays["targets"] = wp.array(np.moveaxis(full["targets"], 0, -1), **setup)
-        arrays["q"], arrays["qd"] = (wp.array(full[name].flatten(), **setup) for name in ("q", "qd"))
-        if pack:
-            self.rollout.dynamics.pack_masses()
-        return arrays, self.rollout.run(arrays["targets"], arrays["q"], arrays["qd"])
+            whole = np.broadcast_to(value, (self.num_worlds, *value.shape[-self.values[name].ndim :]))
+            full[name] = np.moveaxis(whole, 0, -1)
+        for name in PARAMETERS:
+            self.rollout.parameters[name].assign(np.ascontiguousarray(full[name]))
+        return self.rollout.run(full["targets"], full["q"], full["qd"])
 
-    def gradients(self, inputs: dict[str, np.ndarray], pack: bool = False) -> tuple[Trajectory, dict[str, np.ndarray]]:
-        """Return a jump in one world and the gradients of its apex; with `pack` also that of the bodies' mass."""
-        with wp.Tape() as tape:
-            arrays, rollout = self.run(inputs, pack)
-        tape.backward(grads={rollout.apex: wp.ones_like(rollout.apex)})
-        arrays["mass"] = self.model.body_mass
-        grads = {name: array.grad.numpy().astype(float) for name, array in arrays.items()}
-        tape.zero()
-        return rollout, {name: grad[..., 0] if grad.ndim > 1 else grad for name, grad in grads.items()}
+    def gradients(self, inputs: dict[str, np.ndarray]) -> tuple[Trajectory, dict[str, np.ndarray]]:
+        """Return a jump in one world and the gradients of its apex, by each body's mass too."""
+        jump = self.run(inputs)
+        seed = np.zeros(jump.q.shape)
+        seed[jump.q.numpy()[:, 2, 0].argmax(), 2, 0] = 1.0
+        found = {name: array.numpy()[..., 0].astype(float) for name, array in
+                 self.rollout.backward(jump, q=self.rollout.array(seed)).items()}  # fmt: skip
+        found["mass"] = body_gradients(self.rollout.parameters["table"].numpy(), found["table"][:, None])["mass"][:, 0]
+        return jump, found
+
+
+def apex(jump: Trajectory) -> np.ndarray:
+    """Return the largest base height [m] of every world."""
+    return jump.q.numpy()[:, 2].max(axis=0)
 
 
 def differences(
@@ -87,7 +85,7 @@ def differences(
     batch = GradientJump(2 * len(directions), double=True, device=device)
     middle = inputs.get(name, batch.values[name])
     ends = np.concatenate([middle + step * directions, middle - step * directions])
-    ahead, behind = np.split(batch.run(inputs | {name: ends})[1].apex.numpy(), 2)
+    ahead, behind = np.split(apex(batch.run(inputs | {name: ends})), 2)
     return (ahead - behind) / (2.0 * step)
 
 
@@ -99,14 +97,13 @@ def entries(shape: tuple[int, ...], chosen: list) -> np.ndarray:
     return directions
 
 
-def mass_directions(jump: GradientJump) -> np.ndarray:
+def mass_directions(table: np.ndarray) -> np.ndarray:
     """Return what 1 kg more of each body, its com and the inertia about it held, adds to the parameter table."""
-    directions = np.zeros((21, len(jump.values["table"])))
+    directions = np.zeros((int(BODIES), len(table)))
     for body, direction in enumerate(directions):
-        leg, link = divmod(body - 1, 5)
-        row = int(BASE) if body == 0 else leg * int(LEG_ROWS) + link * MOMENT_ROWS
-        c = jump.model.body_com.numpy()[body].astype(float)
-        direction[row : row + MOMENT_ROWS] = [1.0, *c, *(c * c), c[0] * c[1], c[0] * c[2], c[1] * c[2]]
+        moments = table[moment_rows(body)]
+        c = moments[1:4] / moments[0]
+        direction[moment_rows(body)] = [1.0, *c, *(c * c), c[0] * c[1], c[0] * c[2], c[1] * c[2]]
     return directions
 
 
@@ -114,10 +111,8 @@ def check(device: str | None) -> tuple[Trajectory, dict[str, tuple[np.ndarray, n
     """Return the jump, and by input the gradient of its apex beside the differences."""
     jump = GradientJump(1, double=True, device=device)
     rollout, grads = jump.gradients({})
-    masses = jump.gradients({}, pack=True)[1]["mass"]
     motors = [(t, m) for m in (OUTER, INNER) for t in range(TICKS)]
-    joints = [5 * leg + j for leg in range(4) for j in (0, 1, 3)]
-    coords, rates = [2, 3, 4, 5, *(7 + j for j in joints)], [*range(6), *(6 + j for j in joints)]
+    coords, rates = [2, 3, 4, 5, *range(7, 19)], list(range(18))
 
     def pair(found: np.ndarray, name: str, directions: np.ndarray, step: float, inputs: dict) -> tuple:
         return found, differences(inputs, name, directions, step, device)
@@ -135,7 +130,7 @@ def check(device: str | None) -> tuple[Trajectory, dict[str, tuple[np.ndarray, n
     speed = chosen("qd", rates, 1.0e-6, grads["qd"], {})
     return rollout, {
         "actions": chosen("targets", motors, 2.0e-6, grads["targets"], {}),
-        "mass": pair(masses, "table", mass_directions(jump), 1.0e-6, {}),
+        "mass": pair(grads["mass"], "table", mass_directions(jump.values["table"]), 1.0e-6, {}),
         "torque_limit": chosen("saturation", list(range(12)), 1.0e-5, grads["saturation"], {}),
         "friction": chosen("table", friction_rows, 1.0e-6, slip_grad, slip),
         "initial_state": tuple(np.concatenate(parts) for parts in zip(position, speed, strict=True)),

@@ -197,3 +197,10 @@ class HeightGoals:
     def log(self, task: TaskCfg) -> Jumps:
         """Return one jump a robot."""
         return Jumps(np.array(self.height), termination_names(task))
+
+
+@dataclass(frozen=True)
+class MarsHeightGoals(HeightGoals):
+    """Jumps to heights that are recorded, with flights of up to 2.7 s."""
+
+    seconds = 6.0

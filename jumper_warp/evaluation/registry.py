@@ -8,7 +8,7 @@ from typing import Any, Protocol
 
 from jumper_warp.evaluation import heights, landings
 from jumper_warp.evaluation.episodes import EpisodeFlags, EpisodeGoals
-from jumper_warp.evaluation.heights import HeightFlags, HeightGoals
+from jumper_warp.evaluation.heights import HeightFlags, HeightGoals, MarsHeightGoals
 from jumper_warp.evaluation.log import EvaluationLog, Metrics
 from jumper_warp.evaluation.places import PlaceFlags, PlaceGoals
 from jumper_warp.evaluation.velocities import VelocityFlags, VelocityGoals
@@ -64,6 +64,14 @@ EVALUATIONS: dict[str, Evaluation] = {
     "around": Evaluation(
         PlaceFlags(x=(-0.7, 0.7), y=(-0.7, 0.7), in_range=(0.0, 0.7)),
         PlaceGoals(unless_told=((0.5, 0.0), (0.0, 0.5), (-0.5, 0.0))),
+        landings.for_evaluation,
+    ),
+    "height-mars": Evaluation(
+        HeightFlags(lower=1.0, upper=3.3, in_range=(1.0, 2.9)), MarsHeightGoals(height=(1.5, 2.3, 3.0))
+    ),
+    "place-mars": Evaluation(
+        PlaceFlags(x=(0.5, 4.2), in_range=(0.5, 3.9)),
+        PlaceGoals(unless_told=((1.0, 0.0), (2.5, 0.0), (3.9, 0.0))),
         landings.for_evaluation,
     ),
     "velocity": Evaluation(VelocityFlags(), VelocityGoals(), TaskCfg.on_level_ground),

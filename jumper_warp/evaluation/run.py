@@ -32,9 +32,9 @@ from jumper_warp.utils.output import output_dir, write_figures
 from jumper_warp.utils.runtime import announce
 from jumper_warp.utils.threads import checked_threads
 
-HEIGHTS = ("height",)
+HEIGHTS = ("height", "height-mars")
 """Evaluations of policies that jump to heights."""
-PLACES = ("place", "around")
+PLACES = ("place", "around", "place-mars")
 """Of those that jump to places."""
 Log = TypeVar("Log", bound=EvaluationLog)
 
@@ -67,6 +67,8 @@ class EvaluationArgs:
     """Warp device."""
     threads: int | None = None
     """CPU threads that share the worlds (default: all cores); they change no result."""
+    gravity: float | None = None
+    """[m/s^2] Downward (default: that of the policy's task)."""
 
     def __post_init__(self) -> None:
         """Check the values."""
@@ -78,7 +80,9 @@ class EvaluationArgs:
 
 def conditions_of(args: EvaluationArgs) -> Conditions:
     """Return the conditions that an experiment's flags ask for. Raises InputError: one is out of range."""
-    same = ("solver", "randomize", "seed", "device", "threads", "push_in_flight", "latency", "gains", "friction")
+    same = (
+        "solver", "randomize", "seed", "device", "threads", "gravity", "push_in_flight", "latency", "gains", "friction",
+    )  # fmt: skip
     return Conditions(noise=args.randomize, **{name: getattr(args, name) for name in same})
 
 
@@ -259,6 +263,7 @@ class EvaluationRun(Run):
         change, conditions = change or self.evaluation.for_evaluation, conditions or self.conditions
         env = env_of_policy(self.policy, count, conditions, change=change, modules=self.modules, **scene)
         self.policy.to(env.device)
+        self.told["gravity_m_s2"] = env.task.gravity
         self.told["torque_limit_nm"] = env.task.motors.transversal.saturation
         return env
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +12,9 @@ import torch
 import warp as wp
 
 from jumper_warp.envs.env import Env
+from jumper_warp.rl.graphs import Captured
 from jumper_warp.sim.simulation import Simulation
+from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.utils.errors import InputError
 
 
@@ -27,7 +29,7 @@ class SoakArgs:
     hold: int = 10
     """Policy steps for which an action is held."""
     episode: int = 300
-    """Policy steps after which all worlds start again; of whole environments, after which they are looked at."""
+    """Policy steps after which all worlds start again; of whole environments, after which the host looks at them."""
     lateral: float = 15.0
     """[deg] Largest lateral target."""
     transversal: tuple[float, float] = (-30.0, 140.0)
@@ -85,39 +87,88 @@ def simulation_steps(sim: Simulation, args: SoakArgs) -> Iterator[torch.Tensor]:
             sim.reset()
 
 
-def env_steps(env: Env, args: SoakArgs) -> Iterator[torch.Tensor]:
-    """Make all steps of an environment under random actions; after each, give which worlds came apart in it."""
+def hardest(task: TaskCfg) -> TaskCfg:
+    """Return a task whose map, if it has one, has the last row alone, since robots that fall go back to the first."""
+    settings = task.reset.settings
+    terrain = getattr(settings, "terrain", None)
+    if terrain is None or terrain.rows == 0:
+        return task
+    return replace(task, reset=replace(task.reset, settings=replace(settings, terrain=replace(terrain, rows=1))))
+
+
+class Totals:
+    """What is counted of worlds while they are soaked, on the device."""
+
+    def __init__(self, sim: Simulation) -> None:
+        self._rates = wp.to_torch(sim.state.joint_qd).view(sim.num_worlds, -1)
+        self._state = wp.to_torch(sim.state.joint_q).view(sim.num_worlds, -1)
+        self._residual, self._tolerance = wp.to_torch(sim.solver.residual), sim.solver.tolerance
+        self._speeds = self._rates.new_zeros(2)  # [m/s] of a base, [rad/s] of a joint
+        self._counts = torch.zeros(3, dtype=torch.int64, device=self._rates.device)
+        self._fast = self._rates.new_zeros(2)
+
+    def take(self, bad: torch.Tensor, *rows: torch.Tensor) -> None:
+        """Take in a policy step. bad: (num_worlds,) bool, flagged; rows: (num_worlds, ...) that should be finite."""
+        self._fast[0] = self._rates[:, :3].square().sum(dim=1).max().sqrt()
+        self._fast[1] = self._rates[:, 6:26].abs().max()
+        torch.maximum(self._speeds, self._fast, out=self._speeds)
+        finite = self._rates.isfinite().all(dim=1) & self._state.isfinite().all(dim=1)
+        for each in rows:
+            finite &= each.view(len(finite), -1).isfinite().all(dim=1)
+        self._counts += torch.stack([bad.sum(), (self._residual > self._tolerance).sum(), (~finite).sum()])
+
+    def read(self) -> tuple[int, int, int, float, float]:
+        """Return flagged worlds, steps with a contact unsolved, rows not finite, and the largest speeds."""
+        flagged, unsolved, rows = self._counts.tolist()
+        return flagged, unsolved, rows, *self._speeds.tolist()
+
+
+def soak_simulation(sim: Simulation, args: SoakArgs) -> dict:
+    """Make all steps of a simulation under random targets, and return the figures."""
+    totals, start = Totals(sim), time.perf_counter()
+    for step, bad in enumerate(simulation_steps(sim, args)):
+        totals.take(bad)
+        if (step + 1) % args.episode == 0 and totals.read()[2]:
+            raise RuntimeError(f"a world holds values that are not finite but was not flagged, step {step}")
+    return figures_of(totals, args.steps * sim.num_worlds, time.perf_counter() - start)
+
+
+def soak_env(env: Env, args: SoakArgs) -> dict:
+    """Make all steps of an environment under random actions, `hold` of them as one graph, and return the figures.
+
+    Flagged are worlds that came apart. Not finite may be no row of the coordinates, rates, rewards and observations,
+    those of the next episode where one has ended.
+    """
     env.reset()
     apart = [term.name for term in env.task.terminations].index("came_apart")
-    ending = wp.to_torch(env.worlds.ending)
-    for step in range(args.steps):
-        if step % args.hold == 0:
-            action = 2.0 * torch.rand_like(env.action) - 1.0
-        env.step(action)
-        yield ending == apart
+    ending, totals, action = wp.to_torch(env.worlds.ending), Totals(env.sim), torch.zeros_like(env.action)
 
+    def some() -> None:
+        action.uniform_(-1.0, 1.0)
+        for _ in range(args.hold):
+            env.step(action)
+            totals.take(ending == apart, env.obs, env.critic_obs, env.reward)
 
-def soak(sim: Simulation, steps: Iterator[torch.Tensor], args: SoakArgs) -> dict:
-    """Make all steps and return the figures."""
-    rates = wp.to_torch(sim.state.joint_qd).view(sim.num_worlds, -1)
-    residual = wp.to_torch(sim.solver.residual)
-    speed, joint_speed = (rates.new_zeros(()) for _ in range(2))
-    unsolved, flagged = (torch.zeros((), dtype=torch.int64, device=rates.device) for _ in range(2))
+    run, rounds = Captured(some, env.device.type == "cuda"), -(-args.steps // args.hold)
+    looks = max(args.episode // args.hold, 1)
     start = time.perf_counter()
-    for step, bad in enumerate(steps):
-        speed = torch.maximum(speed, rates[:, :3].norm(dim=1).max())
-        joint_speed = torch.maximum(joint_speed, rates[:, 6:26].abs().max())
-        unsolved += (residual > sim.solver.tolerance).sum()
-        flagged += bad.sum()
-        if (step + 1) % args.episode == 0 and not bool(rates.isfinite().all()):
-            raise RuntimeError(f"a world holds values that are not finite but was not flagged, step {step}")
-    wall, count = time.perf_counter() - start, args.steps * sim.num_worlds
+    for i in range(rounds):
+        run()
+        if (i + 1) % looks == 0 and (rows := totals.read()[2]):
+            raise RuntimeError(f"{rows} rows hold values that are not finite, by step {(i + 1) * args.hold}")
+    return figures_of(totals, rounds * args.hold * env.num_envs, time.perf_counter() - start)
+
+
+def figures_of(totals: Totals, count: int, wall: float) -> dict:
+    """Return the figures of so many steps of worlds, made in a time [s]; waits for the device."""
+    flagged, unsolved, rows, speed, joint_speed = totals.read()
     return {
         "steps": count,
-        "non_finite_worlds": int(flagged),
-        "largest_speed_m_s": float(speed),
-        "largest_joint_speed_rad_s": float(joint_speed),
-        "share_of_steps_contact_unsolved": float(unsolved) / count,
+        "non_finite_worlds": flagged,
+        "non_finite_rows": rows,
+        "largest_speed_m_s": speed,
+        "largest_joint_speed_rad_s": joint_speed,
+        "share_of_steps_contact_unsolved": unsolved / count,
         "wall_s": wall,
         "steps_per_s": count / wall,
     }

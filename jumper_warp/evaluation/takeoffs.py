@@ -25,7 +25,6 @@ from jumper_warp.robot.description import load_description
 from jumper_warp.robot.model import leg_geometry
 from jumper_warp.robot.motors import FilterCfg
 from jumper_warp.tasks.jump.horizontal import LANDING_HEIGHT
-from jumper_warp.tasks.units import G
 from kernels.kinematics import geometry
 from kernels.kinematics import inverse as inverse_kinematics
 from kernels.kinematics.leg import leg_forward_kinematics
@@ -80,6 +79,8 @@ class Takeoffs:
     """[m] (..., 3) Centre of mass at the start."""
     landing_height: np.ndarray = field(init=False)
     """[m] Of the centre of mass, at which a flight ends."""
+    gravity: np.ndarray = field(init=False)
+    """[m/s^2] Of each world, downward."""
 
     def __post_init__(self) -> None:
         """Read where all stand and what the links weigh."""
@@ -92,6 +93,7 @@ class Takeoffs:
         self.pitch, self.spin, self.back, self.touchdown = (np.zeros(n) for _ in range(4))
         self.touchdown_pitch, self.paws_ahead, self.apex = (np.zeros(n) for _ in range(3))
         self.end, self._success = np.full(n, -1), success_index(termination_names(self.env.task))
+        self.gravity = -self.env.sim.model.gravity.numpy()[:n, 2].astype(float)
         self._links = Links(self.env).read
         pose, twist = self._links()
         self.start, _, _, self._standing = self._whole(np.arange(n), pose, twist)
@@ -153,8 +155,8 @@ class Takeoffs:
     def air_time(self) -> np.ndarray:
         """[s] Until the centre of mass falls through its landing height; to its apex, if it never reaches that."""
         up = self.com_vel[:, 2]
-        root = up**2 + 2.0 * G * (self.com[:, 2] - self.landing_height)
-        return (up + np.sqrt(np.maximum(root, 0.0))) / G
+        root = up**2 + 2.0 * self.gravity * (self.com[:, 2] - self.landing_height)
+        return (up + np.sqrt(np.maximum(root, 0.0))) / self.gravity
 
     @property
     def flight(self) -> np.ndarray:
@@ -244,29 +246,32 @@ class Flight:
     @classmethod
     def of(cls, takeoffs: Takeoffs, world: int, friction: float) -> Flight:
         """Return the jump of a world that was followed to its touchdown; friction [1] of paws on the ground."""
-        vel = takeoffs.com_vel[world]
-        down = G * takeoffs.air_time[world] - vel[2]
+        vel, g = takeoffs.com_vel[world], takeoffs.gravity[world]
+        down = g * takeoffs.air_time[world] - vel[2]
         values = (
             np.linalg.norm(vel), math.degrees(math.atan2(vel[2], vel[0])), takeoffs.flight[world],
             takeoffs.touchdown[world], math.degrees(takeoffs.touchdown_pitch[world]), takeoffs.apex[world],
             takeoffs.back[world], vel[0], down, takeoffs.paws_ahead[world],
-            capture_distance(vel[0], takeoffs.landing_height[world]), stopping_time(vel[0], down, friction),
+            capture_distance(vel[0], takeoffs.landing_height[world], g), stopping_time(vel[0], down, friction, g),
         )  # fmt: skip
         return cls(*map(float, values))
 
 
-def capture_distance(forward: float, height: float) -> float:
+def capture_distance(forward: float, height: float, g: float) -> float:
     """Return how far ahead [m] of the centre of mass a pendulum on the front paws must begin to stop above them.
 
-    forward: speed [m/s]; height [m] of the centre of mass, which stays. Stopping the fall, which helps, and further
-    steps are left out.
+    forward: speed [m/s]; height [m] of the centre of mass, which stays; g [m/s^2]: gravity. Stopping the fall, which
+    helps, and further steps are left out.
     """
-    return forward * math.sqrt(height / G)
+    return forward * math.sqrt(height / g)
 
 
-def stopping_time(forward: float, down: float, friction: float) -> float:
-    """Return the least time [s] in which friction takes the forward speed, on paws that also stop the fall [m/s]."""
-    return max(0.0, (forward / friction - down) / G)
+def stopping_time(forward: float, down: float, friction: float, g: float) -> float:
+    """Return the least time [s] in which friction takes the forward speed, on paws that also stop the fall [m/s].
+
+    g [m/s^2]: gravity.
+    """
+    return max(0.0, (forward / friction - down) / g)
 
 
 def reach(command_filter: FilterCfg, base_height: float) -> float:

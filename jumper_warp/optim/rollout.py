@@ -1,20 +1,30 @@
-"""Rollouts on Warp's tape: policy steps of filter, motors and physics, and the height that a jump reaches."""
+"""Batches of rollouts with gradients: policy steps of filter, latency, motors and physics, forwards and backwards.
+
+A rollout of all worlds is one launch, and so is its reverse pass, on a CPU one for each thread. Nothing but a row of
+the state every few physics steps and the paws' impulses is kept in between; see `kernels.dynamics.step_adjoint`.
+"""
 
 from __future__ import annotations
 
+import copy
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import newton
+import numpy as np
 import warp as wp
 
+from jumper_warp.optim.actuation import MOTOR_CONSTANTS, filter_rows
 from jumper_warp.robot.model import PHYSICS_DT
-from jumper_warp.robot.motors import FilterCfg, MotorCfg, filter_params, jumping_motors, motor_arrays
-from jumper_warp.sim.differentiable import DifferentiableStep
+from jumper_warp.robot.motors import FilterCfg, MotorCfg, jumping_motors, motor_arrays
 from jumper_warp.sim.dynamics import JumperDynamics
-from jumper_warp.sim.simulation import SUBSTEPS
+from jumper_warp.sim.simulation import SUBSTEPS, motor_values
+from jumper_warp.sim.slices import Worlds, slices_of
+from jumper_warp.sim.solver import check_step
 from jumper_warp.utils.errors import InputError
-from kernels.layout import COORDS, DOFS, GRAVITY
+from jumper_warp.utils.threads import checked_threads, run_side_by_side
 
 MAX_SWEEPS = 200
 """Most sweeps of the contact iteration in a step."""
@@ -22,130 +32,47 @@ TOLERANCE = 1.0e-6
 """[m/s] Of the contact iteration in single precision. Gradients inherit its error."""
 TOLERANCE_DOUBLE = 1.0e-13
 """[m/s] The same in double precision."""
-
-
-@wp.kernel
-def _base_motion_kernel(
-    # in
-    joint_q: wp.array(dtype=Any),
-    joint_qd: wp.array(dtype=Any),
-    row: int,
-    # out
-    height: wp.array2d(dtype=Any),
-    speed: wp.array2d(dtype=Any),
-):
-    """Store the height [m] of the base and the vertical speed [m/s] of its centre of mass in a row."""
-    world = wp.tid()
-    height[row, world] = joint_q[COORDS * world + 2]
-    speed[row, world] = joint_qd[DOFS * world + 2]
-
-
-@wp.kernel(enable_backward=False)
-def _touch_kernel(
-    # in
-    impulse: wp.array2d(dtype=Any),
-    row: int,
-    # out
-    touching: wp.array2d(dtype=int),
-):
-    """Store whether any paw pushed on the ground in a step, 0 or 1."""
-    world = wp.tid()
-    touching[row, world] = 0
-    for k in range(4):
-        if wp.length_sq(impulse[k, world]) > impulse.dtype.dtype(0.0):
-            touching[row, world] = 1
-
-
-@wp.kernel(enable_backward=False)
-def _find_apex_kernel(
-    # in
-    height: wp.array2d(dtype=Any),
-    touching: wp.array2d(dtype=int),
-    # out
-    apex_row: wp.array(dtype=int),
-    takeoff_row: wp.array(dtype=int),
-):
-    """Find the row of the largest height, and the last row up to there that ends a step with a paw on the ground."""
-    world = wp.tid()
-    apex = wp.int32(0)
-    for row in range(1, height.shape[0]):
-        if height[row, world] > height[apex, world]:
-            apex = row
-    takeoff = wp.int32(apex)
-    while takeoff > 0 and touching[takeoff, world] == 0:
-        takeoff -= 1
-    apex_row[world] = apex
-    takeoff_row[world] = takeoff
-
-
-@wp.kernel
-def _gather_kernel(
-    # in
-    values: wp.array2d(dtype=Any),
-    row: wp.array(dtype=int),
-    # out
-    picked: wp.array(dtype=Any),
-):
-    """Pick one row per world."""
-    world = wp.tid()
-    picked[world] = values[row[world], world]
-
-
-@wp.kernel
-def _ballistic_kernel(
-    # in
-    height: wp.array2d(dtype=Any),
-    speed: wp.array2d(dtype=Any),
-    row: wp.array(dtype=int),
-    table: wp.array2d(dtype=Any),
-    # out
-    apex: wp.array(dtype=Any),
-):
-    """Height [m] that free flight from a row leads to."""
-    world = wp.tid()
-    fall = -table[GRAVITY + 2, world]
-    up = wp.max(speed[row[world], world], speed.dtype(0.0))
-    apex[world] = height[row[world], world] + up * up / (fall + fall)
+GEOMETRY_NAMES = (
+    "hip_x", "hip_y", "hip_z", "outer_x", "inner_x", "plane_y", "knee_y", "thigh", "shank", "paw_radius",
+)  # fmt: skip
+"""Rows of the gradient by a leg's geometry [m], see `kernels.kinematics.geometry`."""
 
 
 @dataclass(frozen=True)
 class Trajectory:
-    """What a rollout of K physics steps left behind; all arrays but the integer ones carry gradients."""
+    """What a rollout left behind: T policy steps of S physics steps, rows every `every` of these, K = T S / every.
 
-    joint_q: list[wp.array]
-    """Coordinates before each step and at the end, K + 1 arrays of shape (43 num_worlds,); passive joints stay 0."""
-    joint_qd: list[wp.array]
-    """Rates, K + 1 arrays of shape (38 num_worlds,)."""
-    height: wp.array
-    """[m] Of the base, world frame, shape (K + 1, num_worlds)."""
-    speed: wp.array
-    """[m/s] Vertical, of the base's centre of mass, shape (K + 1, num_worlds)."""
-    touching: wp.array
-    """1 where a paw pushed on the ground in the step that ends here, shape (K + 1, num_worlds); row 0 is 0."""
-    apex_row: wp.array
-    """Row of the largest height, shape (num_worlds,)."""
-    takeoff_row: wp.array
-    """End of the last step with contact up to the apex, shape (num_worlds,); 0 without one."""
-    apex: wp.array
-    """[m] Largest base height, shape (num_worlds,): the height at `apex_row`.
-
-    Its gradient is that of the height at this fixed row, which is the gradient of the maximum except where two rows
-    tie. It is zero for what happens after that row.
-    """
-    ballistic_apex: wp.array
-    """[m] z + vz^2 / 2g of the base at `takeoff_row` (z alone while it falls), shape (num_worlds,).
-
-    It needs no flight to be simulated and leaves out what the legs do in it. The takeoff row is held like the apex's.
+    Arrays of the rollout's precision, worlds last; a gradient by a trajectory has the same shapes.
     """
 
+    q: wp.array
+    """(K + 1, 19, num_worlds): position [m] and orientation (xyzw) of the base, motor angles [rad]; row 0 the start."""
+    qd: wp.array
+    """(K + 1, 18, num_worlds): velocity of the base's centre of mass [m/s], its angular velocity [rad/s], world frame,
+    motor rates [rad/s]."""
+    torque: wp.array
+    """(T S, 12, num_worlds) [N m] Of the motors, in each physics step."""
+    impulse: wp.array
+    """(T S, 4, num_worlds) vec3 [N s] Of the ground on each paw, world frame, in each physics step."""
+    pressed: wp.array
+    """(T S, 4, num_worlds) Sets of the legs' pressed hard stops, see `kernels.actuation.stops`."""
+    safe: wp.array
+    """(T, 12, num_worlds) [rad] Targets that the filter let through."""
+    commands: Any
+    """The kernels' `Commands` that led to it."""
 
-class DifferentiableRollout:
-    """Runs policy steps on an active `wp.Tape`: the filter once, then `substeps` times motors and physics.
+    def end(self) -> dict[str, wp.array]:
+        """Return what a rollout that goes on from here is given: q, qd, before, impulse."""
+        last = self.impulse.shape[0] - 1
+        return {"q": self.q[-1], "qd": self.qd[-1], "before": self.safe[-1], "impulse": self.impulse[last]}
 
-    Gradients reach the targets, the initial state, the motor constants in `motors` (such as `motors.saturation.grad`)
-    and the parameter table `dynamics.robot.table`. To carry them on to the model's masses or friction coefficients,
-    record `dynamics.pack_masses()` or `dynamics.pack_friction()` on the tape, before `run`. At given contact modes and
-    branches of filter and motors they are exact; see `kernels.dynamics.differentiable` for contacts.
+
+class Rollout:
+    """Simulates worlds over policy steps, and runs the simulation backwards; in single or double precision.
+
+    Gradients are those of the contact modes and of the branches of filter and motors that the rollout went through:
+    exact where no mode changes (`kernels.dynamics.step_adjoint`). The worlds' parameters are in `parameters`, which may
+    be written at any time between a reverse pass and the next rollout.
     """
 
     def __init__(
@@ -157,117 +84,263 @@ class DifferentiableRollout:
         double: bool = False,
         dt: float = PHYSICS_DT,
         substeps: int = SUBSTEPS,
+        every: int | None = None,
+        tolerance: float | None = None,
+        threads: int | None = None,
     ):
-        """Prepare for a model of `jumper_warp.robot.model.build_model` with `requires_grad`.
+        """Prepare for a model of `jumper_warp.robot.model.build_model`.
 
         Args:
-            model: The robot's worlds.
+            model: The robot's worlds, without moving blocks.
             motors: By default the jumping gains at 18 N m.
             command_filter: None leaves the targets as they are.
             double: Whether to compute in double precision.
             dt: Physics step [s].
             substeps: Physics steps in a policy step.
+            every: Physics steps from one row of a trajectory to the next, a divisor of `substeps`; by default all.
+            tolerance: Of the contact iteration [m/s], by default `TOLERANCE` or `TOLERANCE_DOUBLE`.
+            threads: Of a CPU, which share the worlds out and change no bit; as in `Simulation`.
 
         Raises:
             NotThisRobotError: the model is another robot's.
-            ValueError: dt not positive, substeps below 1, or a model without gradients.
+            InputError: dt not finite and positive, substeps no whole number above 0, or `every` no divisor of it.
         """
-        if not dt > 0.0 or substeps < 1:
-            raise InputError(f"dt must be > 0 and substeps >= 1, got {dt}, {substeps}")
-        if not model.requires_grad:
-            raise InputError("the model carries no gradients: build it with requires_grad=True")
+        check_step(dt, substeps)
+        every = substeps if every is None else every
+        if every not in range(1, substeps + 1) or substeps % every != 0:
+            raise InputError(f"every must be a divisor of substeps = {substeps}, got {every!r}")
         self.dynamics = JumperDynamics(model, double=double)
-        self.num_worlds = model.world_count
-        self.real = self.dynamics.real
-        self.dt = dt
-        self.substeps = substeps
-        modules = self.dynamics.modules
-        self.motors = motor_arrays(
-            motors or jumping_motors(),
-            self.num_worlds,
-            module=modules.motors,
-            device=model.device,
-            requires_grad=True,
-        )
-        self._filter = command_filter and filter_params(command_filter, module=modules.command_filter)
-        self._step = DifferentiableStep(self.dynamics, MAX_SWEEPS, TOLERANCE_DOUBLE if double else TOLERANCE)
-        self._no_body_f = wp.zeros(model.body_count, dtype=wp.spatial_vector, device=model.device, requires_grad=True)
+        self.num_worlds, self.device, self.real = model.world_count, model.device, self.dynamics.real
+        self.dt, self.substeps, self.every = dt, substeps, every
+        modules, n = self.dynamics.modules, self.num_worlds
+        tolerance = tolerance or (TOLERANCE_DOUBLE if double else TOLERANCE)
+        self._settings = self.dynamics.settings(dt, 1, MAX_SWEEPS, tolerance)
+        cfg = motors or jumping_motors()
+        self._actuation = modules.rollout.Actuation()
+        self._actuation.motors = motor_arrays(cfg, n, module=modules.motors, device=self.device)
+        self._actuation.fade = self.array([[cfg.fade_start] * n, [cfg.fade_end] * n])
+        self._actuation.latency = self._zeros(n)
+        self._actuation.filtered = int(command_filter is not None)
+        self._actuation.limits = self.array(np.repeat(filter_rows(command_filter)[:, None], n, axis=1))
+        self.motors = self._actuation.motors
+        """The kernels' `MotorArrays`, whose arrays are among the parameters."""
+        self.parameters: dict[str, wp.array] = {
+            "table": self.dynamics.robot.table,
+            **{name: getattr(self._actuation.motors, name) for name in MOTOR_CONSTANTS},
+            "fade": self._actuation.fade,
+            "latency": self._actuation.latency,
+            "filter": self._actuation.limits,
+        }
+        """By name, worlds last: the parameter table of `kernels.layout` (313, n), motor constants (12, n) as in
+        `MotorKindCfg` and the sensors' `offset` [rad], `fade` [rad/s] (2, n), `latency` [s] (n,), and the filter's
+        constants (14, n), rows as in `jumper_warp.optim.actuation.FILTER_NAMES`, in rad."""
+        self.slices = slices_of(n, 1 if self.device.is_cuda else checked_threads(threads))
+        wrench = wp.zeros(model.body_count, dtype=wp.spatial_vector, device=self.device)
+        self._drive = self.dynamics.drive(self._zeros(model.joint_dof_count), wrench)
+        self._record: Any = None
 
-    def run(self, targets: wp.array, joint_q: wp.array, joint_qd: wp.array) -> Trajectory:
-        """Simulate, starting without contact history.
+    def standing(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return q (19, num_worlds) and qd (18, num_worlds) of the model's pose, at rest."""
+        return compact(self.dynamics.model.joint_q.numpy(), np.zeros(38 * self.num_worlds), self.num_worlds)
+
+    def hold(self, worlds: Any = True) -> None:
+        """Hang up the bases of some worlds: they keep the position and the velocity that they start with.
+
+        worlds: bool, (num_worlds,) or one for all.
+        """
+        held = np.broadcast_to(np.asarray(worlds, dtype=np.int32), self.num_worlds)
+        self.dynamics.robot.held = wp.array(held, dtype=int, device=self.device)
+
+    def geometry(self) -> np.ndarray:
+        """Return the legs' lengths [m], (4, 10), see `GEOMETRY_NAMES`; all worlds have the same."""
+        legs = self.dynamics.robot.geometry.numpy()
+        return np.column_stack([legs["hip"], *(legs[name] for name in GEOMETRY_NAMES[3:])]).astype(np.float64)
+
+    def set_geometry(self, lengths: np.ndarray) -> None:
+        """Write the legs' lengths [m], (4, 10). Raises InputError for another shape."""
+        if np.shape(lengths) != (4, len(GEOMETRY_NAMES)):
+            raise InputError(f"geometry must have shape (4, {len(GEOMETRY_NAMES)}), got {np.shape(lengths)}")
+        legs = self.dynamics.robot.geometry.numpy().copy()
+        legs["hip"] = lengths[:, :3]
+        for name, column in zip(GEOMETRY_NAMES[3:], lengths.T[3:], strict=True):
+            legs[name] = column
+        self.dynamics.robot.geometry.assign(legs)
+
+    def run(
+        self,
+        targets: Any,
+        q: Any,
+        qd: Any,
+        *,
+        before: Any = None,
+        wrench: Any = None,
+        impulse: wp.array | None = None,
+    ) -> Trajectory:
+        """Simulate. Arrays of Warp or NumPy, of the shapes below or without worlds, which then are alike.
 
         Args:
-            targets: Raw motor targets [rad] of T policy steps, `real`, shape (T, 12, num_worlds).
-            joint_q: Initial coordinates, `real`, shape (43 num_worlds,), laid out as Newton's.
-            joint_qd: Initial rates, `real`, shape (38 num_worlds,).
+            targets: Raw motor targets [rad] of T policy steps, (T, 12, num_worlds).
+            q: First row, (19, num_worlds), as in `Trajectory.q`.
+            qd: First row, (18, num_worlds).
+            before: What the motors follow [rad] until the first target arrives, (12, num_worlds), by default the angles
+                that they start at. Only `parameters["latency"]` makes it matter.
+            wrench: Force [N] and moment [N m] on the base at its com, world axes, in each policy step,
+                (T, 6, num_worlds).
+            impulse: What pushed the paws in the step before, as in `Trajectory.impulse`, (4, num_worlds) vec3; zero
+                by default. Contact is found from there, and paws that pushed and hardly slip have static friction.
 
         Raises:
-            ValueError: an array of another shape or type.
+            InputError: an array of another shape or type.
         """
-        self._check(targets, joint_q, joint_qd)
-        work = self.dynamics.work
-        work.impulse.zero_()
-        steps = targets.shape[0] * self.substeps
-        height, speed = (self._zeros((steps + 1, self.num_worlds)) for _ in range(2))
-        touching = wp.zeros((steps + 1, self.num_worlds), dtype=int, device=self.dynamics.device)
-        q, qd = [joint_q], [joint_qd]
-        self._launch(_base_motion_kernel, self.num_worlds, [joint_q, joint_qd, 0], [height, speed])
-        for step in range(steps):
-            if step % self.substeps == 0:
-                target = self._filtered(targets[step // self.substeps], q[-1], qd[-1])
-            new_q, new_qd = self._zeros(joint_q.shape), self._zeros(joint_qd.shape)
-            self._physics(target, q[-1], qd[-1], new_q, new_qd)
-            q.append(new_q)
-            qd.append(new_qd)
-            self._launch(_base_motion_kernel, self.num_worlds, [new_q, new_qd, step + 1], [height, speed])
-            self._launch(_touch_kernel, self.num_worlds, [work.impulse, step + 1], [touching], record=False)
-        return Trajectory(q, qd, height, speed, touching, *self._apexes(height, speed, touching))
+        vec3 = self.dynamics.modules.scalar.vec3
+        count = len(targets) if hasattr(targets, "__len__") else 0
+        commands = self.dynamics.modules.rollout.Commands()
+        commands.target = self._input("targets", targets, (count, 12))
+        q, qd = self._input("q", q, (19,)), self._input("qd", qd, (18,))
+        commands.before = q[7:] if before is None else self._input("before", before, (12,))
+        commands.wrench = self._zeros(count, 6, self.num_worlds) if wrench is None else (
+            self._input("wrench", wrench, (count, 6))
+        )  # fmt: skip
+        commands.impulse = self._zeros(4, self.num_worlds, dtype=vec3) if impulse is None else impulse
+        if count < 1:
+            raise InputError("a rollout needs at least one policy step of targets")
+        rows = self._rows(count)
+        wp.copy(rows.q[0], q)
+        wp.copy(rows.qd[0], qd)
+        safe = self._zeros(count, 12, self.num_worlds)
+        inputs = [self._timing(count), self._actuation, commands, self._drive]
+        self._launch(self.dynamics.modules.rollout.rollout_kernel, inputs, [self.dynamics.work, safe, rows])
+        return Trajectory(rows.q, rows.qd, rows.torque, rows.impulse, rows.pressed, safe, commands)
 
-    def _check(self, targets: wp.array, joint_q: wp.array, joint_qd: wp.array) -> None:
-        """Raise ValueError unless the arguments of `run` fit."""
-        n = self.num_worlds
-        if targets.ndim != 3 or targets.shape[0] < 1 or targets.shape[1:] != (12, n):
-            raise InputError(f"targets must have shape (T, 12, {n}) with T >= 1, got {targets.shape}")
-        for name, array, count in (("joint_q", joint_q, int(COORDS)), ("joint_qd", joint_qd, int(DOFS))):
-            if array.shape != (count * n,):
-                raise InputError(f"{name} must have shape ({count * n},), got {array.shape}")
-        for name, array in (("targets", targets), ("joint_q", joint_q), ("joint_qd", joint_qd)):
-            if array.dtype != self.real:
-                raise InputError(f"{name} must be of {self.real.__name__}, got {array.dtype.__name__}")
+    def backward(
+        self,
+        trajectory: Trajectory,
+        *,
+        q: wp.array | None = None,
+        qd: wp.array | None = None,
+        torque: wp.array | None = None,
+        impulse: wp.array | None = None,
+    ) -> dict[str, wp.array]:
+        """Return the gradient of one number a world, given its gradient by the trajectory.
 
-    def _filtered(self, target: wp.array, q: wp.array, qd: wp.array) -> wp.array:
-        """Return the targets [rad] that the filter lets through, shape (12, num_worlds)."""
-        if self._filter is None:
-            return target
-        safe = self._zeros(target.shape)
-        kernel = self.dynamics.modules.command_filter.command_filter_kernel
-        self._launch(
-            kernel, (4, self.num_worlds), [0, target, q, qd, COORDS, DOFS, self.motors.offset, self._filter], [safe]
-        )
-        return safe
+        q, qd, torque, impulse: that gradient, of the shapes and types of `Trajectory`; None is zero. The parameters
+        must be those of the rollout.
 
-    def _physics(self, target: wp.array, q: wp.array, qd: wp.array, q_out: wp.array, qd_out: wp.array) -> None:
-        """Advance one physics step."""
-        joint_f = self._zeros(qd.shape)
-        kernel = self.dynamics.modules.motors.motor_torque_kernel
-        self._launch(kernel, (12, self.num_worlds), [target, q, qd, COORDS, DOFS, self.motors], [joint_f])
-        self._step.step(q, qd, joint_f, self._no_body_f, q_out, qd_out, self.dt)
+        Returned by name, worlds last: targets, q, qd (of the first row), before, wrench, the entries of `parameters`,
+        and `geometry` (4, 10, num_worlds) by the legs' lengths [m], see `GEOMETRY_NAMES`. The gradient by the first
+        row's quaternion is that of a function which normalises it.
+        """
+        n, modules = self.num_worlds, self.dynamics.modules
+        commands = trajectory.commands
+        count = commands.target.shape[0]
+        seeds = modules.rollout.Rows()
+        for name, array in (("q", q), ("qd", qd), ("torque", torque), ("impulse", impulse)):
+            like = getattr(trajectory, name)
+            if array is not None and (array.shape != like.shape or array.dtype != like.dtype):
+                raise InputError(f"the gradient by {name} must be like it, {like.shape}, got {array.shape}")
+            empty = wp.zeros((0,) * like.ndim, dtype=like.dtype, device=self.device)
+            setattr(seeds, name, empty if array is None else array)
+        seeds.pressed = wp.zeros((0, 0, 0), dtype=wp.uint8, device=self.device)
+        rows = modules.rollout.Rows()
+        for name in ("q", "qd", "torque", "impulse", "pressed"):
+            setattr(rows, name, getattr(trajectory, name))
+        gradients = modules.gradients.Gradients()
+        shapes = {"q": (19,), "qd": (18,), "target": (count, 12), "before": (12,), "wrench": (count, 6),
+                  "safe": (count, 12), "parameters": (int(modules.gradients.GRADIENT_ROWS),)}  # fmt: skip
+        for name, shape in shapes.items():
+            setattr(gradients, name, self._zeros(*shape, n))
+        if self._record is None:
+            self._record = self._step_record()
+        inputs = [self._timing(count), self._actuation, commands, trajectory.safe, rows, seeds]
+        self._launch(modules.rollout_adjoint.reverse_kernel, inputs, [self._record, gradients])
+        found = {"targets": gradients.target, "q": gradients.q, "qd": gradients.qd, "before": gradients.before}
+        return found | {"wrench": gradients.wrench} | self._named(gradients.parameters)
 
-    def _apexes(self, height: wp.array, speed: wp.array, touching: wp.array) -> tuple[wp.array, ...]:
-        """Return the last four fields of `Trajectory`."""
-        n, device = self.num_worlds, self.dynamics.device
-        apex_row, takeoff_row = (wp.zeros(n, dtype=int, device=device) for _ in range(2))
-        self._launch(_find_apex_kernel, n, [height, touching], [apex_row, takeoff_row], record=False)
-        apex, ballistic = self._zeros(n), self._zeros(n)
-        self._launch(_gather_kernel, n, [height, apex_row], [apex])
-        table = self.dynamics.robot.table
-        self._launch(_ballistic_kernel, n, [height, speed, takeoff_row, table], [ballistic])
-        return apex_row, takeoff_row, apex, ballistic
+    def _named(self, gradient: wp.array) -> dict[str, wp.array]:
+        """Return the rows of a gradient by name."""
+        names, first = {}, 0
+        for name, array in self.parameters.items():
+            count = 1 if array.ndim == 1 else array.shape[0]
+            names[name] = gradient[first : first + count] if array.ndim > 1 else gradient[first]
+            first += count
+        return names | {"geometry": gradient[first:].reshape((4, len(GEOMETRY_NAMES), self.num_worlds))}
 
-    def _zeros(self, shape: int | tuple[int, ...]) -> wp.array:
-        return wp.zeros(shape, dtype=self.real, device=self.dynamics.device, requires_grad=True)
+    def _timing(self, count: int) -> Any:
+        timing = self.dynamics.modules.rollout.Timing()
+        timing.steps, timing.substeps, timing.every = count, self.substeps, self.every
+        return timing
 
-    def _launch(
-        self, kernel: wp.Kernel, dim: int | tuple[int, ...], inputs: list, outputs: list, record: bool = True
-    ) -> None:
-        wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.dynamics.device, record_tape=record)
+    def _rows(self, count: int) -> Any:
+        """Return an empty trajectory."""
+        steps, n = count * self.substeps, self.num_worlds
+        rows = self.dynamics.modules.rollout.Rows()
+        rows.q, rows.qd = (self._empty(steps // self.every + 1, size, n) for size in (19, 18))
+        rows.torque = self._empty(steps, 12, n)
+        rows.impulse = self._empty(steps, 4, n, dtype=self.dynamics.modules.scalar.vec3)
+        rows.pressed = self._empty(steps, 4, n, dtype=wp.uint8)
+        return rows
+
+    def _step_record(self) -> Any:
+        """Return room for the steps between two rows."""
+        record, n, steps = self.dynamics.modules.step_adjoint.StepRecord(), self.num_worlds, self.every
+        types = {name: var.type.dtype for name, var in record._cls.vars.items()}
+        for name in types:
+            shape = (n, steps + (name in ("base", "angles", "rates")))
+            shape += () if name in ("base", "inverse") else (4,)
+            setattr(record, name, self._zeros(*shape, dtype=types[name]))
+        return record
+
+    def _launch(self, kernel: wp.Kernel, inputs: list, outputs: list) -> None:
+        """Launch a kernel over all worlds, on a CPU in slices side by side."""
+
+        def launch(worlds: Worlds) -> None:
+            settings = copy.copy(self._settings)
+            settings.first = worlds.first
+            wp.launch(
+                kernel, dim=worlds.count, inputs=[self.dynamics.robot, settings, *inputs], outputs=outputs,
+                device=self.device, block_dim=32,
+            )  # fmt: skip
+
+        jobs: list[Callable[[], None]] = [partial(launch, worlds) for worlds in self.slices]
+        if len(jobs) == 1:
+            jobs[0]()
+        else:
+            wp.load_module(kernel.module, device=self.device, block_dim=32)
+            run_side_by_side(jobs, len(jobs))
+
+    def _input(self, name: str, values: Any, shape: tuple[int, ...]) -> wp.array:
+        """Return values as an array (*shape, num_worlds). Raises InputError for another shape or type."""
+        full = (*shape, self.num_worlds)
+        if isinstance(values, wp.array):
+            if values.shape != full or values.dtype != self.real:
+                raise InputError(
+                    f"{name} must be {self.real.__name__} of shape {full}, got {values.dtype.__name__} {values.shape}"
+                )
+            return values
+        values = np.asarray(values, dtype=np.float64)
+        if values.shape == shape:
+            values = np.repeat(values[..., None], self.num_worlds, axis=-1)
+        if values.shape != full:
+            raise InputError(f"{name} must have shape {full} or {shape}, got {values.shape}")
+        return self.array(values)
+
+    def array(self, values: Any) -> wp.array:
+        """Return values as an array of the rollout's precision on its device."""
+        return wp.array(values, dtype=self.real, device=self.device)
+
+    def vectors(self, values: Any) -> wp.array:
+        """Return vectors (..., 3) as an array of the kernels' vec3."""
+        return wp.array(np.ascontiguousarray(values), dtype=self.dynamics.modules.scalar.vec3, device=self.device)
+
+    def _zeros(self, *shape: int, dtype: Any = None) -> wp.array:
+        return wp.zeros(shape, dtype=dtype or self.real, device=self.device)
+
+    def _empty(self, *shape: int, dtype: Any = None) -> wp.array:
+        return wp.empty(shape, dtype=dtype or self.real, device=self.device)
+
+
+def compact(joint_q: np.ndarray, joint_qd: np.ndarray, num_worlds: int = 1) -> tuple[np.ndarray, np.ndarray]:
+    """Return q (19, num_worlds) and qd (18, num_worlds) of (43,) coordinates and (38,) rates of Newton a world."""
+    joint_q, joint_qd = np.reshape(joint_q, (num_worlds, 43)), np.reshape(joint_qd, (num_worlds, 38))
+    q = np.concatenate([joint_q[:, :7], motor_values(joint_q[:, 7:])], axis=1)
+    return q.T, np.concatenate([joint_qd[:, :6], motor_values(joint_qd[:, 6:])], axis=1).T

@@ -28,11 +28,12 @@ from jumper_warp.rl.checkpoint import (
 )
 from jumper_warp.rl.mirror import Symmetry, image, plain_layers
 from jumper_warp.rl.networks import EPS, NORMALISED_LIMIT
+from jumper_warp.robot.gravity import check_gravity
 from jumper_warp.robot.overlay import RobotOverlay, load_overlay
-from jumper_warp.tasks.cfg import TaskCfg
+from jumper_warp.tasks.cfg import Handover, TaskCfg
 from jumper_warp.tasks.interface import interface
 from jumper_warp.tasks.randomization import RandomizationCfg
-from jumper_warp.tasks.saving import OPTIONAL, TaskError, task_from_json
+from jumper_warp.tasks.saving import OPTIONAL, TaskError, handover_from_json, task_from_json
 from jumper_warp.utils.errors import InputError
 
 if TYPE_CHECKING:
@@ -70,9 +71,13 @@ class Conditions:
     """[1] Scales of kp and kd of all motors (default: 1, or drawn if randomised)."""
     friction: float | None = None
     """[1] Of the paws, static and dynamic (default: nominal, or drawn if randomised)."""
+    gravity: float | None = None
+    """[m/s^2] Downward (default: that of the task)."""
 
     def __post_init__(self) -> None:
         """Raises InputError: a value out of range, or pushes in flight where there are none."""
+        if self.gravity is not None:
+            check_gravity(self.gravity)
         self._with_fixed(RandomizationCfg.off())
         if self.push_in_flight and not self.randomize:
             raise InputError("push_in_flight needs randomize: without it there are no pushes")
@@ -103,6 +108,7 @@ class Conditions:
 
     def applied(self, task: TaskCfg) -> TaskCfg:
         """Return a task as it is tried in these conditions; pushes come and go, however its training had it."""
+        task = task if self.gravity is None else replace(task, gravity=self.gravity)
         trained = task.randomization
         if self.randomize:
             in_flight = trained.push_in_flight or self.push_in_flight
@@ -213,6 +219,21 @@ def restored_task(
         return task_from_json(saved, modules, leave_out=leave_out)
     except TaskError as error:
         raise PolicyError(f"task in the configuration: {error}") from error
+
+
+def restored_skills(config: dict[str, Any], modules: Iterable[ModuleType] = ()) -> tuple[list[TaskCfg], list[Handover]]:
+    """Return all tasks and handovers of an environment's saved configuration (`Env.config`).
+
+    modules: that the user has named. Raises PolicyError: it is not of tasks and functions that are known here.
+    """
+    modules = list(modules)
+    try:
+        tasks = [task_from_json(saved, modules) for saved in config.get("tasks", [config["task"]])]
+        return tasks, [handover_from_json(saved, tasks, modules) for saved in config.get("handovers", [])]
+    except TaskError as error:
+        raise PolicyError(f"tasks in the configuration: {error}") from error
+    except (LookupError, TypeError, AttributeError) as error:
+        raise PolicyError(f"no tasks in the configuration ({type(error).__name__}: {error})") from error
 
 
 def env_of_policy(

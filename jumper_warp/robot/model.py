@@ -27,6 +27,7 @@ from jumper_warp.robot.description import (
     leg_dimensions,
     load_description,
 )
+from jumper_warp.robot.gravity import EARTH, check_gravity
 from jumper_warp.robot.pinocchio_model import PinocchioRobot, build_pinocchio
 from jumper_warp.utils.errors import InputError
 
@@ -76,6 +77,7 @@ def build_model(
     description: RobotDescription | None = None,
     ground: str | newton.Heightfield | None = "plane",
     friction: float = 0.9,
+    gravity: float = EARTH,
     device: wp.DeviceLike = None,
     requires_grad: bool = False,
     visuals: bool = True,
@@ -88,6 +90,7 @@ def build_model(
         description: The robot; by default the project's own.
         ground: "plane" (z = 0), a heightfield, or None for free flight.
         friction: Coulomb friction coefficient of the paws [1].
+        gravity: Downward, of every world [m/s^2]; `model.gravity` holds that of each.
         device: Warp device.
         requires_grad: Whether the model's arrays carry gradients.
         visuals: Whether to add shapes that only viewers see. Without them large batches build faster.
@@ -98,17 +101,18 @@ def build_model(
             a warning, and refuses bodies, joints and particles.
 
     Raises:
-        ValueError: `num_worlds` below 1, `friction` not in 0 to 10, or an unknown `ground`.
+        ValueError: `num_worlds` below 1, `friction` not in 0 to 10, `gravity` not in 0 to 100, or an unknown `ground`.
         RobotDescriptionError: the default description cannot be read.
     """
     if num_worlds < 1:
         raise InputError(f"num_worlds must be at least 1, got {num_worlds}")
     if not 0.0 <= friction <= MAX_FRICTION:
         raise InputError(f"friction must lie in 0 to {MAX_FRICTION:g}, got {friction}")
+    check_gravity(gravity)
     description = load_description() if description is None else description
-    builder = newton.ModelBuilder()
+    builder = newton.ModelBuilder(gravity=(0.0, 0.0, -gravity))
     newton.solvers.SolverMuJoCo.register_custom_attributes(builder)
-    robot = _robot_builder(description, friction, visuals)
+    robot = _robot_builder(description, friction, gravity, visuals)
     if extras is not None:
         extras(robot)
     builder.replicate(robot, num_worlds, label_prefixes=[f"world_{i}" for i in range(num_worlds)])
@@ -170,9 +174,11 @@ def _paw_depth(leg: LegDimensions, lateral: float, ankle_z: float) -> float:
     return leg.paw_radius - math.cos(lateral) * ankle_z - leg.side * math.sin(lateral) * ankle_y
 
 
-def _robot_builder(description: RobotDescription, friction: float, visuals: bool) -> newton.ModelBuilder:
-    """Return the builder of one robot."""
-    builder = newton.ModelBuilder()
+def _robot_builder(
+    description: RobotDescription, friction: float, gravity: float, visuals: bool
+) -> newton.ModelBuilder:
+    """Return the builder of one robot, whose gravity [m/s^2] is that of its world."""
+    builder = newton.ModelBuilder(gravity=(0.0, 0.0, -gravity))
     newton.solvers.SolverMuJoCo.register_custom_attributes(builder)
     bodies = {}
     for link in description.links:

@@ -21,7 +21,8 @@ LINKS = ("housing", "outer_thigh", "outer_shank", "inner_thigh", "inner_shank")
 JOINTS = ("lateral", "outer", "outer_knee", "inner", "inner_knee")
 KERNEL_MODULES = (
     "actuation.command_filter", "actuation.motors", "dynamics.advance", "dynamics.advance_legs", "dynamics.contact",
-    "dynamics.contact_adjoint", "dynamics.differentiable", "dynamics.drive", "dynamics.parameters", "dynamics.step",
+    "dynamics.contact_adjoint", "dynamics.differentiable", "dynamics.drive", "dynamics.gradients",
+    "dynamics.parameters", "dynamics.rollout", "dynamics.rollout_adjoint", "dynamics.step", "dynamics.step_adjoint",
     "kinematics.full_state", "kinematics.geometry", "layout", "scalar", "state", "terrain.ground",
 )  # fmt: skip
 
@@ -180,6 +181,7 @@ class JumperDynamics:
         )
         self.robot.ground = ground_struct(model, self._ground_shape, self.modules.ground)
         self.robot.ground.blocks = block_array(block, self.num_worlds, self.modules, self.device)
+        self.robot.held = wp.zeros(0, dtype=int, device=self.device)
         self.work = self._workspace()
         self.pack()
 

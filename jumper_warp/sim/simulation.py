@@ -9,6 +9,7 @@ import newton
 import numpy as np
 import warp as wp
 
+from jumper_warp.robot.gravity import EARTH
 from jumper_warp.robot.grounds import BlockCfg
 from jumper_warp.robot.model import PHYSICS_DT, Extras, build_model
 from jumper_warp.robot.motors import FilterCfg, MotorCfg, filter_params, jumping_motors, motor_arrays
@@ -51,6 +52,7 @@ class Simulation:
         ground: str | newton.Heightfield | None = "plane",
         block: BlockCfg | None = None,
         friction: float = 0.9,
+        gravity: float = EARTH,
         dt: float = PHYSICS_DT,
         substeps: int = SUBSTEPS,
         tolerance: float = TOLERANCE,
@@ -71,6 +73,7 @@ class Simulation:
             ground: As in `build_model`.
             block: A block in each world that slides when the robot pushes it; on SolverJumper only.
             friction: Of the paws [1].
+            gravity: Downward, of every world [m/s^2].
             dt: Physics step [s].
             substeps: Physics steps in a policy step.
             tolerance: Of SolverJumper's contact iteration [m/s].
@@ -96,8 +99,9 @@ class Simulation:
         check_tolerance(tolerance)
         threads = checked_threads(threads)
         self.model = build_model(
-            num_worlds, ground=ground, friction=friction, visuals=visuals, extras=extras, device=device
-        )
+            num_worlds, ground=ground, friction=friction, gravity=gravity, visuals=visuals, extras=extras,
+            device=device,
+        )  # fmt: skip
         values = robot.robots() if isinstance(robot, RobotOverlay) else robot
         if values is not None:
             given = isinstance(robot, RobotValues) or "paw_friction" in robot.values

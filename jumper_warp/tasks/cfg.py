@@ -9,6 +9,7 @@ from typing import Any
 
 import warp as wp
 
+from jumper_warp.robot.gravity import EARTH, check_gravity
 from jumper_warp.robot.motors import FilterCfg, MotorCfg
 from jumper_warp.tasks.randomization import RandomizationCfg
 from jumper_warp.tasks.terms import (
@@ -87,6 +88,8 @@ class TaskCfg:
     events: tuple[EventTerm, ...] = ()
     """Besides those of `randomization`."""
     randomization: RandomizationCfg = field(default_factory=RandomizationCfg)
+    gravity: float = EARTH
+    """[m/s^2] Downward, of every world; all estimates of flights take it from there."""
     contact_force: float = 0.1
     """[N] Above it a paw counts as in contact."""
     reward_floor: float | None = 0.0
@@ -119,6 +122,7 @@ class TaskCfg:
         for metric in self.metrics:
             for field_name in {metric.field, metric.per or metric.field} - set(self.state.vars):
                 raise InputError(f"{self.name}: metric {metric.name} needs {field_name!r}, which its state has not")
+        check_gravity(self.gravity)
         if not 0.0 <= self.contact_force < math.inf:
             raise InputError(f"{self.name}: contact_force must be finite and >= 0, got {self.contact_force}")
         if self.reward_floor is not None and not math.isfinite(self.reward_floor):

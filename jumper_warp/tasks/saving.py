@@ -92,6 +92,24 @@ def handover_to_json(handover: Handover) -> dict[str, Any]:
     return {**tasks, "when": name_of(handover.when), "begin": name_of(handover.begin)}
 
 
+def handover_from_json(saved: Any, tasks: Iterable[TaskCfg], modules: Iterable[ModuleType] = ()) -> Handover:
+    """Return a saved handover between some tasks.
+
+    modules: that the user has named. Raises TaskError: a task or function is not among them, or it is no handover.
+    """
+    named, find = {task.name: task for task in tasks}, Finder(modules)
+    if not isinstance(saved, dict) or set(saved) != {"source", "target", "when", "begin"}:
+        raise TaskError(f"a handover has source, target, when and begin, got {shown(saved)}")
+    for end in ("source", "target"):
+        if not isinstance(saved[end], str) or saved[end] not in named:
+            raise TaskError(f"handover {end}: no task {shown(saved[end])} here")
+    found = {name: find(saved[name], f"handover {name}") for name in ("when", "begin")}
+    for name, func in found.items():
+        if not isinstance(func, wp.Function):
+            raise TaskError(f"handover {name}: {saved[name]!r:.80} is not a @wp.func")
+    return Handover(named[saved["source"]], named[saved["target"]], found["when"], found["begin"])
+
+
 def shown(value: Any) -> str:
     """Return a short word on a value, however deep or long it is."""
     if value is None or isinstance(value, bool | int | float | str):

@@ -8,7 +8,7 @@ import warp as wp
 
 from ..kinematics.five_bar import FiveBar
 from ..scalar import mat33, real, vec3
-from .stops import StopParams, stop_forces
+from .stops import StopRows, stop_forces
 
 # below this rate [rad/s] Coulomb friction falls linearly to zero
 FRICTION_SPEED = wp.constant(real(0.01))
@@ -25,7 +25,6 @@ class JointParams:
     knee_damping_inner: real
     knee_limit_outer: real  # [N m] largest torque of the knee damping
     knee_limit_inner: real
-    stops: StopParams
 
 
 @wp.struct
@@ -66,14 +65,14 @@ def knee_damping(p: JointParams, loop: FiveBar, front: real, rates: vec3) -> mat
 
 @wp.func
 def joint_forces(
-    p: JointParams, loop: FiveBar, front: real, angles: vec3, rates: vec3, pressed: int, dt: real
+    p: JointParams, loop: FiveBar, front: real, rates: vec3, rows: StopRows, pressed: int, dt: real
 ) -> JointForces:
     """Return friction, knee damping and pressed hard stops of one leg.
 
-    angles, rates: lateral, outer, inner [rad], [rad/s]; pressed: set of stops, see `stops`; dt: step [s].
+    rates: lateral, outer, inner [rad/s]; rows, pressed: the leg's stops, see `stops`; dt: step [s].
     """
     damping = knee_damping(p, loop, front, rates) + wp.diag(joint_friction(p, rates))
-    stops = stop_forces(p.stops, angles, rates, pressed, dt)
+    stops = stop_forces(rows, rates, pressed, dt)
     forces = JointForces()
     forces.torque = stops.torque - damping * rates
     forces.inertia = stops.inertia + dt * damping

@@ -12,12 +12,13 @@ where goal = -gap / dt outside the stop (the gap closes exactly) and -gap ke / c
 torque = c (goal - s) is linear in the rates, so that it joins the leg's inertia as damping does (`joint_forces`).
 
 Which stops are pressed is settled together with contact: a step is solved with a set of pressed stops, and again with
-another one until the set is the one that the resulting rates ask for (`pressed_stops`).
+another one until the set is the one that the resulting rates ask for (`pressed_stops`). Most steps need one set, few
+three. Friction can make sets cycle, in a violent impact on jammed legs: stops are then pressed and no more released.
 """
 
 import warp as wp
 
-from ..scalar import mat33, real, vec2, vec3
+from ..scalar import mat33, real, vec3, vec4
 
 # sets of a leg: two bits for each of lateral, outer, inner, and outer + inner
 LOWER_STOP = wp.constant(1)
@@ -25,9 +26,11 @@ UPPER_STOP = wp.constant(2)
 ROW_BITS = wp.constant(2)
 ROW_MASK = wp.constant(3)
 ROWS = wp.constant(4)
-# sets tried in a step, and from which on they differ in one stop only, so as not to cycle
-MAX_SETS = wp.constant(12)
+# after so many sets of a step only one stop changes at a time, which alone cannot cycle without friction; after so many
+# none is released; and after so many the last set stands
 ONE_BY_ONE = wp.constant(3)
+PRESS_ONLY = wp.constant(8)
+MAX_SETS = wp.constant(12)
 # slack of a stop's law [rad/s] for each [m/s] of the contact tolerance
 SLACK = wp.constant(real(10.0))
 
@@ -45,6 +48,15 @@ class StopParams:
 
 
 @wp.struct
+class StopRows:
+    """The stops of one leg in a step; rows are lateral, outer, inner, outer + inner."""
+
+    lower: vec4  # [rad/s] rate at the end of the step above which the lower stop is free
+    upper: vec4  # [rad/s] rate below which the upper stop is free
+    damping: real  # c [N m s/rad]
+
+
+@wp.struct
 class StopForces:
     """Pressed stops, implicit: torque [N m] at the current rates, and dt C [kg m^2] to add to the inertia."""
 
@@ -53,91 +65,115 @@ class StopForces:
 
 
 @wp.func
-def row_side(pressed: int, row: int) -> int:
-    """Return which stop of a row is pressed: 0, LOWER_STOP or UPPER_STOP."""
-    return (pressed >> (ROW_BITS * row)) & ROW_MASK
+def stop_rows(p: StopParams, angles: vec3, dt: real) -> StopRows:
+    """Return the stops in a step dt [s] from motor angles [rad]."""
+    damping = wp.max(dt * p.ke + p.kd, real(1.0e-9))
+    inside = p.ke / damping
+    outside = real(1.0) / dt
+    fold = angles[1] + angles[2]
+    below = p.lower - angles
+    above = p.upper - angles
+    below_fold = p.sum_lower - fold
+    above_fold = p.sum_upper - fold
+    rows = StopRows()
+    rows.damping = damping
+    rows.lower = vec4(
+        below[0] * wp.where(below[0] > real(0.0), inside, outside),
+        below[1] * wp.where(below[1] > real(0.0), inside, outside),
+        below[2] * wp.where(below[2] > real(0.0), inside, outside),
+        below_fold * wp.where(below_fold > real(0.0), inside, outside),
+    )
+    rows.upper = vec4(
+        above[0] * wp.where(above[0] < real(0.0), inside, outside),
+        above[1] * wp.where(above[1] < real(0.0), inside, outside),
+        above[2] * wp.where(above[2] < real(0.0), inside, outside),
+        above_fold * wp.where(above_fold < real(0.0), inside, outside),
+    )
+    return rows
 
 
 @wp.func
-def stiffness(p: StopParams, dt: real) -> vec2:
-    """Return c [N m s/rad], and ke / c [1/s], the share of a penetration that is pushed out per second."""
-    c = wp.max(dt * p.ke + p.kd, real(1.0e-9))
-    return vec2(c, p.ke / c)
+def row_side(pressed: int, i: int) -> int:
+    """Return which stop of row i is pressed: 0, LOWER_STOP or UPPER_STOP."""
+    return (pressed >> (ROW_BITS * i)) & ROW_MASK
 
 
 @wp.func
-def rate_at_stop(distance: real, side: int, push_out: real, dt: real) -> real:
-    """Return the rate [rad/s] of an angle at which a stop's torque is zero; distance [rad]: stop minus angle."""
-    inside = distance > real(0.0)
-    if side == UPPER_STOP:
-        inside = distance < real(0.0)
-    return wp.where(inside, push_out * distance, distance / dt)
-
-
-@wp.func
-def pressed_row(
-    angle: real, rate: real, lower: real, upper: real, push_out: real, dt: real, slack: real, side: int
-) -> int:
-    """Return which of two stops an angle presses that ends the step at `rate`; side: which it was solved with."""
-    if rate_at_stop(lower - angle, LOWER_STOP, push_out, dt) - rate > wp.where(side == LOWER_STOP, -slack, slack):
-        return LOWER_STOP
-    if rate - rate_at_stop(upper - angle, UPPER_STOP, push_out, dt) > wp.where(side == UPPER_STOP, -slack, slack):
-        return UPPER_STOP
-    return 0
-
-
-@wp.func
-def pressed_stops(p: StopParams, angles: vec3, rates: vec3, dt: real, slack: real, pressed: int) -> int:
+def pressed_stops(rows: StopRows, rates: vec3, slack: real, pressed: int) -> int:
     """Return the set of stops that a leg presses which ends the step at `rates` [rad/s].
 
-    angles [rad]: at the start of the step. pressed: the set that led to the rates; its stops are released, and others
-    pressed, only beyond the slack [rad/s].
+    pressed: the set that led to the rates; its stops are released, and others pressed, only beyond the slack [rad/s].
     """
-    push_out = stiffness(p, dt)[1]
+    rate = vec4(rates[0], rates[1], rates[2], rates[1] + rates[2])
+    if pressed == 0 and not wp.max(wp.max(rows.lower - rate, rate - rows.upper)) > slack:
+        return 0
     found = int(0)
-    for j in range(3):
-        found += pressed_row(
-            angles[j], rates[j], p.lower[j], p.upper[j], push_out, dt, slack, row_side(pressed, j)
-        ) << (ROW_BITS * j)  # fmt: skip
-    found += pressed_row(
-        angles[1] + angles[2], rates[1] + rates[2], p.sum_lower, p.sum_upper, push_out, dt, slack, row_side(pressed, 3)
-    ) << (ROW_BITS * 3)  # fmt: skip
+    for i in range(ROWS):
+        side = row_side(pressed, i)
+        if rows.lower[i] - rate[i] > wp.where(side == LOWER_STOP, -slack, slack):
+            found += LOWER_STOP << (ROW_BITS * i)
+        elif rate[i] - rows.upper[i] > wp.where(side == UPPER_STOP, -slack, slack):
+            found += UPPER_STOP << (ROW_BITS * i)
     return found
+
+
+@wp.func
+def revised_stops(rows: StopRows, rates: vec3, slack: real, pressed: int, sets: int) -> int:
+    """Return the set to try after `sets` sets of a step, the last of which, `pressed`, led to `rates` [rad/s]."""
+    wanted = pressed_stops(rows, rates, slack, pressed)
+    if wanted == pressed or sets < PRESS_ONLY:
+        return wanted
+    found = pressed
+    for i in range(ROWS):
+        if row_side(pressed, i) == 0:
+            found += wanted & (ROW_MASK << (ROW_BITS * i))
+    return found
+
+
+@wp.func
+def one_by_one(sets: int) -> bool:
+    """Return whether the set after `sets` sets of a step differs in one stop of a world only."""
+    return sets >= ONE_BY_ONE and sets < PRESS_ONLY
 
 
 @wp.func
 def change_one(pressed: int, wanted: int) -> int:
     """Return `pressed` with the first row in which it differs from `wanted` changed."""
-    for row in range(ROWS):
-        bits = ROW_MASK << (ROW_BITS * row)
+    for i in range(ROWS):
+        bits = ROW_MASK << (ROW_BITS * i)
         if (pressed ^ wanted) & bits != 0:
             return (pressed & ~bits) | (wanted & bits)
     return pressed
 
 
 @wp.func
-def row_torque(angle: real, rate: real, lower: real, upper: real, side: int, law: vec2, dt: real) -> vec2:
-    """Return torque [N m] and c [N m s/rad] of a row, zero where no stop is pressed."""
+def row_torque(rows: StopRows, i: int, rate: real, pressed: int) -> real:
+    """Return the torque [N m] of row i at its current rate [rad/s]."""
+    side = row_side(pressed, i)
     if side == 0:
-        return vec2()
-    distance = wp.where(side == LOWER_STOP, lower, upper) - angle
-    return vec2(law[0] * (rate_at_stop(distance, side, law[1], dt) - rate), law[0])
+        return real(0.0)
+    return rows.damping * (wp.where(side == LOWER_STOP, rows.lower[i], rows.upper[i]) - rate)
 
 
 @wp.func
-def stop_forces(p: StopParams, angles: vec3, rates: vec3, pressed: int, dt: real) -> StopForces:
-    """Return the forces of a leg's pressed stops; angles [rad] and rates [rad/s] at the start of the step."""
+def stop_forces(rows: StopRows, rates: vec3, pressed: int, dt: real) -> StopForces:
+    """Return the forces of a leg's pressed stops; rates [rad/s] at the start of the step."""
     forces = StopForces()
     if pressed == 0:
         return forces
-    law = stiffness(p, dt)
-    lateral = row_torque(angles[0], rates[0], p.lower[0], p.upper[0], row_side(pressed, 0), law, dt)
-    outer = row_torque(angles[1], rates[1], p.lower[1], p.upper[1], row_side(pressed, 1), law, dt)
-    inner = row_torque(angles[2], rates[2], p.lower[2], p.upper[2], row_side(pressed, 2), law, dt)
-    fold = row_torque(
-        angles[1] + angles[2], rates[1] + rates[2], p.sum_lower, p.sum_upper, row_side(pressed, 3), law, dt
+    zero = real(0.0)
+    both = vec3(zero, real(1.0), real(1.0))
+    single = vec3(
+        row_torque(rows, 0, rates[0], pressed),
+        row_torque(rows, 1, rates[1], pressed),
+        row_torque(rows, 2, rates[2], pressed),
     )
-    both = vec3(real(0.0), real(1.0), real(1.0))
-    forces.torque = vec3(lateral[0], outer[0], inner[0]) + fold[0] * both
-    forces.inertia = wp.diag(dt * vec3(lateral[1], outer[1], inner[1])) + dt * fold[1] * wp.outer(both, both)
+    forces.torque = single + row_torque(rows, 3, rates[1] + rates[2], pressed) * both
+    c = dt * rows.damping
+    diagonal = vec3(
+        wp.where(row_side(pressed, 0) != 0, c, zero),
+        wp.where(row_side(pressed, 1) != 0, c, zero),
+        wp.where(row_side(pressed, 2) != 0, c, zero),
+    )
+    forces.inertia = wp.diag(diagonal) + wp.where(row_side(pressed, 3) != 0, c, zero) * wp.outer(both, both)
     return forces

@@ -2,6 +2,7 @@
 
 import warp as wp
 
+from ..actuation.stops import StopRows
 from ..scalar import real, vec3
 from ..state import BaseState, base_com, leg_coord, leg_dof, load_base, load_motors, store_base, store_motors
 from ..terrain.ground import has_block, move_block
@@ -20,8 +21,9 @@ wp.set_module_options({"enable_backward": False})
 def advance_once(
     robot: Robot, settings: StepSettings, drive: Drive, work: Workspace, world: int, step: int, base: BaseState,
     angles: wp.array(dtype=vec3), rates: wp.array(dtype=vec3), torques: wp.array(dtype=vec3),
-    pressed: wp.array(dtype=int), legs: wp.array(dtype=LegSolve), paws: wp.array(dtype=PawKinematics),
-    contacts: wp.array(dtype=PawContact), ends: wp.array(dtype=vec3), peaks: wp.array(dtype=real),
+    rows: wp.array(dtype=StopRows), pressed: wp.array(dtype=int), legs: wp.array(dtype=LegSolve),
+    paws: wp.array(dtype=PawKinematics), contacts: wp.array(dtype=PawContact), ends: wp.array(dtype=vec3),
+    peaks: wp.array(dtype=real),
 ) -> BaseState:  # fmt: skip
     """Advance one world by one step; angles and rates of the legs' motors are updated in place."""
     dt = settings.dt
@@ -32,12 +34,12 @@ def advance_once(
             for j in range(3):
                 work.torque[3 * k + j, world] = torques[k][j]
     wrench = base_wrench(drive, world)
-    force = vec3(real(wrench[0]), real(wrench[1]), real(wrench[2]))
-    moment = vec3(real(wrench[3]), real(wrench[4]), real(wrench[5]))
+    force = vec3(wrench[0], wrench[1], wrench[2])
+    moment = vec3(wrench[3], wrench[4], wrench[5])
     block = block_law(robot, world, base, dt)
     solved = solve_step(
-        robot, settings, world, base, force, moment, block, work.impulse, angles, rates, torques, pressed, legs, paws,
-        contacts, ends,
+        robot, settings, world, base, force, moment, block, work.impulse, angles, rates, torques, rows, pressed, legs,
+        paws, contacts, ends,
     )  # fmt: skip
     if has_block(robot.ground, world):
         move_block(robot.ground, world, wp.quat_rotate(base.quat, block_velocity(block, push_on_block(contacts))), dt)
@@ -99,6 +101,7 @@ def advance_kernel(
         rates[k] = load_motors(joint_qd, leg_dof(world, k))
     torques = wp.zeros(shape=(4,), dtype=vec3)
     ends = wp.zeros(shape=(4,), dtype=vec3)
+    rows = wp.zeros(shape=(4,), dtype=StopRows)
     pressed = wp.zeros(shape=(4,), dtype=int)
     legs = wp.zeros(shape=(4,), dtype=LegSolve)
     paws = wp.zeros(shape=(4,), dtype=PawKinematics)
@@ -109,8 +112,8 @@ def advance_kernel(
     peaks = wp.zeros(shape=(4,), dtype=real)
     for step in range(settings.substeps):
         base = advance_once(
-            robot, settings, drive, work, world, step, base, angles, rates, torques, pressed, legs, paws, contacts,
-            ends, peaks,
+            robot, settings, drive, work, world, step, base, angles, rates, torques, rows, pressed, legs, paws,
+            contacts, ends, peaks,
         )  # fmt: skip
     total = real(0.0)
     for k in range(angles.shape[0]):

@@ -2,12 +2,13 @@
 
 A thread holds one leg and a copy of the base; the base's equations are sums over the four threads. The contact law is
 that of `contact`; here all paws propose their next impulse at once and the one whose contact velocity would change
-most takes it, until none would change by more than the tolerance.
+most takes it, until none would change by more than the tolerance. A step whose stops turn out wrong (see `world_step`)
+is made again by its world, while the others of a warp go on.
 """
 
 import warp as wp
 
-from ..actuation.stops import MAX_SETS, ONE_BY_ONE, SLACK, change_one, pressed_stops
+from ..actuation.stops import MAX_SETS, SLACK, change_one, one_by_one, pressed_stops, revised_stops, stop_rows
 from ..layout import GRAVITY
 from ..scalar import real, vec3
 from ..state import BaseState, base_com, leg_coord, leg_dof, load_base, load_motors, store_base, store_motors
@@ -17,8 +18,19 @@ from .base_motion import moved_base
 from .contact import BlockLaw, PawContact, block_velocity, local_impulse
 from .drive import Drive, LegDrive, Workspace, applied_torque, base_wrench, load_leg_drive, park
 from .lanes import any_world, first_leg, from_leg, max_legs, meet, sum_legs, sum_systems, sum_vec, vec_from_leg
-from .parameters import load_vec3
-from .step import LegParams, Robot, StepSettings, base_system, block_law, finite_base, leg_terms, load_leg, paw_contact
+from .parameters import load_stops, load_vec3
+from .step import (
+    LegParams,
+    Robot,
+    StepSettings,
+    base_system,
+    block_law,
+    finite_base,
+    hold_base,
+    leg_terms,
+    load_leg,
+    paw_contact,
+)
 
 # division and roots are rounded to 2 units in the last place, as a third of the code
 wp.set_module_options({"enable_backward": False, "fast_math": True})
@@ -37,6 +49,9 @@ class LegState:
     total_sq: real  # [N^2 s^2] largest sum of the impulses, squared
     residual: real  # [m/s] of the contact iteration, largest
     updates: int  # of paw impulses, most of a step
+    step: int  # steps made in this launch
+    sets: int  # sets of pressed stops tried for the present step without agreement
+    pressed: int  # the leg's next one
 
 
 @wp.struct
@@ -89,110 +104,76 @@ def solve_paws(
     return s
 
 
-@wp.struct
-class LegEnd:
-    """The end of a step as one leg sees it."""
-
-    rates: vec3  # [rad/s] of its motors
-    lin: vec3  # of the base [m/s], body axes of the start
-    ang: vec3  # [rad/s]
-    paw: PawSolution
-    on_block: int  # 1: its paw touches the block
-
-
 @wp.func
-def solve_leg(
-    robot: Robot, settings: StepSettings, own: LegParams, world: int, leg: int, old: LegState, torque: vec3,
-    wrench: wp.spatial_vector, block: BlockLaw, pressed: int,
-) -> LegEnd:  # fmt: skip
-    """Solve a step with given sets of pressed stops."""
+def advance_leg(
+    robot: Robot, settings: StepSettings, drive: Drive, own: LegParams, motors: LegDrive, world: int, leg: int,
+    old: LegState, writes: bool,
+) -> LegState:  # fmt: skip
+    """Return the thread's state after a step, or the old one with another set of stops to try for the same step.
+
+    writes: whether the thread is the one that moves its world's block. A world that has made its steps stays.
+    """
     dt = settings.dt
+    blocks = robot.ground.blocks.shape[0] > 0
     base = old.base
     g = wp.quat_rotate_inv(base.quat, load_vec3(robot.table, GRAVITY, world))
-    terms = leg_terms(own, old.angles, old.rates, torque, pressed, base.ang, g, dt)
-    force = vec3(real(wrench[0]), real(wrench[1]), real(wrench[2]))
-    moment = vec3(real(wrench[3]), real(wrench[4]), real(wrench[5]))
+    torque = applied_torque(motors, old.step, old.angles, old.rates)
+    rows = stop_rows(load_stops(robot.table, leg, world), old.angles, dt)
+    pressed = old.pressed
+    if old.sets == 0:
+        pressed = pressed_stops(rows, old.rates, real(0.0), 0)
+    terms = leg_terms(own, old.angles, old.rates, torque, rows, pressed, base.ang, g, dt)
+    wrench = base_wrench(drive, world)
+    force = vec3(wrench[0], wrench[1], wrench[2])
+    moment = vec3(wrench[3], wrench[4], wrench[5])
     share = add_leg(BaseSystem(), terms.dynamics, terms.solve)
     system = sum_systems(base_system(robot, world, base, g, force, moment), share)
-    inverse = invert(system)
+    inverse = hold_base(robot, world, invert(system))
     lin_acc = solve_lin(inverse, system.force, system.moment)
     ang_acc = solve_ang(inverse, system.force, system.moment)
     lin = wp.quat_rotate_inv(base.quat, base.lin) + dt * lin_acc
     ang = base.ang + dt * ang_acc
-    solve = terms.solve
-    rates = old.rates + dt * motor_acceleration(solve, lin_acc, ang_acc)
+    rates = old.rates + dt * motor_acceleration(terms.solve, lin_acc, ang_acc)
+    block = block_law(robot, world, base, dt)
     contact = paw_contact(
-        robot, world, leg, base, lin, ang, rates, old.rates, old.impulse, pressed, terms.paw, solve, inverse, block, dt
-    )
-    blocks = robot.ground.blocks.shape[0] > 0
+        robot, world, leg, base, lin, ang, rates, old.rates, old.impulse, pressed, terms.paw, terms.solve, inverse,
+        block, dt,
+    )  # fmt: skip
     solved = solve_paws(contact, blocks, block, leg, 4 * settings.max_sweeps, settings.tolerance)
+    solve = terms.solve
     rates += solve.inverse * (wp.transpose(contact.jacobian) * solved.impulse)
     rates -= solve.to_lin * solved.lin + solve.to_ang * solved.ang
-    end = LegEnd()
-    end.rates = rates
-    end.lin = lin + solved.lin
-    end.ang = ang + solved.ang
-    end.paw = solved
-    end.on_block = contact.on_block
-    return end
-
-
-@wp.func
-def settle_leg(
-    robot: Robot, settings: StepSettings, own: LegParams, world: int, leg: int, old: LegState, torque: vec3,
-    wrench: wp.spatial_vector, block: BlockLaw,
-) -> LegEnd:  # fmt: skip
-    """Solve a step together with the stops, which are revised as in `world_step`.
-
-    A world that is done repeats its last solution while others of its warp go on.
-    """
-    stops = own.joints.stops
-    pressed = pressed_stops(stops, old.angles, old.rates, settings.dt, real(0.0), 0)
-    end = LegEnd()
-    sets = int(0)
-    working = bool(True)
-    while any_world(working):
-        end = solve_leg(robot, settings, own, world, leg, old, torque, wrench, block, pressed)
-        sets += 1
-        wanted = pressed_stops(stops, old.angles, end.rates, settings.dt, SLACK * settings.tolerance, pressed)
-        differs = wanted != pressed
-        first = first_leg(differs)
-        working = working and sets < MAX_SETS and from_leg(wp.where(differs, real(1.0), real(0.0)), first) > real(0.0)
-        if working and sets < ONE_BY_ONE:
-            pressed = wanted
-        elif working and leg == first:
-            pressed = change_one(pressed, wanted)
-    return end
-
-
-@wp.func
-def advance_leg(
-    robot: Robot, settings: StepSettings, drive: Drive, own: LegParams, motors: LegDrive, world: int, leg: int,
-    step: int, old: LegState, writes: bool,
-) -> LegState:  # fmt: skip
-    """Return the thread's state after one step; writes: whether the thread is the one that moves its world's block."""
-    dt = settings.dt
-    base = old.base
-    torque = applied_torque(motors, step, old.angles, old.rates)
-    block = block_law(robot, world, base, dt)
-    end = settle_leg(robot, settings, own, world, leg, old, torque, base_wrench(drive, world), block)
-    impulse = end.paw.impulse
-    if robot.ground.blocks.shape[0] > 0:
-        push = sum_vec(wp.where(end.on_block != 0, -impulse, vec3(real(0.0))))
-        if writes and robot.ground.blocks[world].exists != 0:
+    total = sum_vec(solved.impulse)
+    sets = old.sets + 1
+    wanted = revised_stops(rows, rates, SLACK * settings.tolerance, pressed, sets)
+    first = first_leg(wanted != pressed)
+    agreed = from_leg(wp.where(wanted != pressed, real(1.0), real(0.0)), first) == real(0.0)
+    done = old.step < settings.substeps and (agreed or sets >= MAX_SETS)
+    if blocks:
+        push = sum_vec(wp.where(contact.on_block != 0, -solved.impulse, vec3(real(0.0))))
+        if writes and done and robot.ground.blocks[world].exists != 0:
             move_block(robot.ground, world, wp.quat_rotate(base.quat, block_velocity(block, push)), dt)
         meet()
-    total = sum_vec(impulse)
-    new = LegState()
-    new.base = moved_base(base, end.lin, end.ang, dt)
-    new.angles = old.angles + dt * end.rates
-    new.rates = end.rates
-    new.torque = torque
-    new.impulse = wp.quat_rotate(base.quat, impulse)
-    new.peak_sq = wp.max(old.peak_sq, wp.dot(impulse, impulse))
-    new.total_sq = wp.max(old.total_sq, wp.dot(total, total))
-    new.residual = wp.max(old.residual, end.paw.residual)
-    new.updates = wp.max(old.updates, end.paw.updates)
+    new = old
+    if done:
+        new.base = moved_base(base, lin + solved.lin, ang + solved.ang, dt)
+        new.angles = old.angles + dt * rates
+        new.rates = rates
+        new.torque = torque
+        new.impulse = wp.quat_rotate(base.quat, solved.impulse)
+        new.peak_sq = wp.max(old.peak_sq, wp.dot(solved.impulse, solved.impulse))
+        new.total_sq = wp.max(old.total_sq, wp.dot(total, total))
+        new.residual = wp.max(old.residual, solved.residual)
+        new.updates = wp.max(old.updates, solved.updates)
+        new.step = old.step + 1
+        new.sets = 0
+    else:
+        new.sets = sets
+        new.pressed = pressed
+        if not one_by_one(sets):
+            new.pressed = wanted
+        elif leg == first:
+            new.pressed = change_one(pressed, wanted)
     return new
 
 
@@ -227,8 +208,8 @@ def advance_legs_kernel(
     s.impulse = work.impulse[leg, world]
     own = load_leg(robot, world, leg)
     motors = load_leg_drive(drive, world, leg)
-    for step in range(settings.substeps):
-        s = advance_leg(robot, settings, drive, own, motors, world, leg, step, s, leg == 0 and place < count)
+    while any_world(s.step < settings.substeps):
+        s = advance_leg(robot, settings, drive, own, motors, world, leg, s, leg == 0 and place < count)
     total = sum_legs(wp.dot(s.angles, s.angles) + wp.dot(s.rates, s.rates))
     broken = work.invalid[world] != 0 or not (finite_base(s.base) and wp.isfinite(total))
     if place >= count:

@@ -2,6 +2,7 @@
 
 import warp as wp
 
+from ..actuation.stops import StopRows
 from ..scalar import mat33, real, vec3
 from ..state import base_com, leg_coord, leg_dof, load_base, load_motors
 from .base_dynamics import LegSolve
@@ -76,13 +77,14 @@ def settle_kernel(
         angles[k] = load_motors(joint_q, leg_coord(world, k))
         rates[k] = load_motors(joint_qd, leg_dof(world, k))
         torques[k] = load_motors(joint_f, leg_dof(world, k))
+    rows = wp.zeros(shape=(4,), dtype=StopRows)
     pressed = wp.zeros(shape=(4,), dtype=int)
     legs = wp.zeros(shape=(4,), dtype=LegSolve)
     paws = wp.zeros(shape=(4,), dtype=PawKinematics)
     contacts = wp.zeros(shape=(4,), dtype=PawContact)
     ends = wp.zeros(shape=(4,), dtype=vec3)
     solve_step(
-        robot, settings, world, base, outside.force, outside.moment, BlockLaw(), guess, angles, rates, torques,
+        robot, settings, world, base, outside.force, outside.moment, BlockLaw(), guess, angles, rates, torques, rows,
         pressed, legs, paws, contacts, ends,
     )  # fmt: skip
     for k in range(contacts.shape[0]):

@@ -13,6 +13,7 @@ has a kink; the gradient is that of the mode the forward pass found.
 import warp as wp
 
 from ..actuation.joint_forces import joint_forces
+from ..actuation.stops import stop_rows
 from ..kinematics.geometry import LegGeometry
 from ..layout import BASE, BODIES, DOFS, GRAVITY
 from ..scalar import mat33, real, vec3
@@ -33,7 +34,7 @@ from .base_motion import external_wrench, moved_base
 from .contact import SEPARATE, SLIDE, contact_jacobian, target_normal_velocity
 from .inertia import inertia_matrix, skew
 from .leg_dynamics import PawKinematics, leg_dynamics, leg_pose, paw_kinematics
-from .parameters import load_joint_params, load_masses, load_moments, load_vec3
+from .parameters import load_joint_params, load_masses, load_moments, load_stops, load_vec3
 
 
 @wp.struct
@@ -128,7 +129,8 @@ def legs_kernel(
     pose = leg_pose(geo, angles)
     leg = leg_dynamics(geo, load_masses(table, k, world), pose, rates, base.ang, g)
     params = load_joint_params(table, k, world)
-    passive = joint_forces(params, pose.loop, geo.front, angles, rates, pressed[k, world], dt)
+    rows = stop_rows(load_stops(table, k, world), angles, dt)
+    passive = joint_forces(params, pose.loop, geo.front, rates, rows, pressed[k, world], dt)
     torque = load_motors(joint_f, leg_dof(world, k)) + passive.torque
     solve = eliminate_leg(leg, passive.inertia + wp.diag(params.armature), torque)
     paw = paw_kinematics(geo, pose)

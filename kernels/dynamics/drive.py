@@ -4,7 +4,7 @@ import warp as wp
 
 from ..actuation.motors import MotorArrays, MotorParams, load_motor, motor_torque
 from ..layout import BODIES, COORDS, DOFS
-from ..scalar import real, vec3
+from ..scalar import real, vec3, vec6
 from ..state import leg_dof, load_motors
 from ..terrain.ground import rest_block
 from .step import Robot
@@ -103,11 +103,15 @@ def applied_torque(leg: LegDrive, step: int, angles: vec3, rates: vec3) -> vec3:
 
 
 @wp.func
-def base_wrench(drive: Drive, world: int) -> wp.spatial_vector:
+def base_wrench(drive: Drive, world: int) -> vec6:
     """Return the external wrench on the base at its com, world axes (force [N], moment [N m])."""
     w = drive.body_f[world * BODIES]
     i = world * DOFS
-    return w + wp.spatial_vector(
-        float(drive.joint_f[i]), float(drive.joint_f[i + 1]), float(drive.joint_f[i + 2]),
-        float(drive.joint_f[i + 3]), float(drive.joint_f[i + 4]), float(drive.joint_f[i + 5]),
-    )  # fmt: skip
+    return vec6(
+        real(w[0]) + drive.joint_f[i],
+        real(w[1]) + drive.joint_f[i + 1],
+        real(w[2]) + drive.joint_f[i + 2],
+        real(w[3]) + drive.joint_f[i + 3],
+        real(w[4]) + drive.joint_f[i + 4],
+        real(w[5]) + drive.joint_f[i + 5],
+    )

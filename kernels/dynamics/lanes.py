@@ -1,6 +1,7 @@
 """Exchange between the four threads that share a world, a thread a leg.
 
-Threads of a world are neighbours, leg fastest, and all threads of a warp must reach every call together. On the CPU,
+Threads of a world are neighbours, leg fastest, and all threads of a warp must reach every call together: none may stand
+behind an `and` or `or`, which leave out what no longer matters, or in a branch that not all take. On the CPU,
 where these functions serve tests, a block is the four threads of one world (launch with `block_dim=4`).
 """
 

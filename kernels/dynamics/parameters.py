@@ -99,7 +99,6 @@ def load_joint_params(table: wp.array2d(dtype=real), leg: int, world: int) -> Jo
     p.knee_damping_inner = table[row + KNEE_DAMPING + 1, world]
     p.knee_limit_outer = table[row + KNEE_LIMIT, world]
     p.knee_limit_inner = table[row + KNEE_LIMIT + 1, world]
-    p.stops = load_stops(table, leg, world)
     return p
 
 

@@ -6,6 +6,7 @@ Semi-implicit Euler: forces and Jacobians at the start of the step, positions mo
 import warp as wp
 
 from ..actuation.joint_forces import JointParams, joint_forces
+from ..actuation.stops import StopRows
 from ..kinematics.geometry import LegGeometry
 from ..layout import BASE, GRAVITY, LEG_ROWS, MU_DYNAMIC, MU_STATIC
 from ..scalar import real, vec3
@@ -42,6 +43,7 @@ class Robot:
     geometry: wp.array(dtype=LegGeometry)  # (4,)
     table: wp.array2d(dtype=real)  # parameters, see `parameters`
     ground: Ground
+    held: wp.array(dtype=int)  # (num_worlds,), not 0: the base stays as it is, hung up; empty: none
 
 
 @wp.struct
@@ -85,14 +87,15 @@ def load_leg(robot: Robot, world: int, k: int) -> LegParams:
 
 @wp.func
 def leg_terms(
-    params: LegParams, angles: vec3, rates: vec3, torque: vec3, pressed: int, omega: vec3, g: vec3, dt: real
-) -> LegTerms:
+    params: LegParams, angles: vec3, rates: vec3, torque: vec3, rows: StopRows, pressed: int, omega: vec3, g: vec3,
+    dt: real,
+) -> LegTerms:  # fmt: skip
     """Return a leg's dynamics, its elimination with the pressed stops, and its paw."""
     geo = params.geometry
     joints = params.joints
     pose = leg_pose(geo, angles)
     dynamics = leg_dynamics(geo, params.masses, pose, rates, omega, g)
-    passive = joint_forces(joints, pose.loop, geo.front, angles, rates, pressed, dt)
+    passive = joint_forces(joints, pose.loop, geo.front, rates, rows, pressed, dt)
     terms = LegTerms()
     terms.dynamics = dynamics
     terms.solve = eliminate_leg(dynamics, passive.inertia + wp.diag(joints.armature), torque + passive.torque)
@@ -146,6 +149,15 @@ def touch_block(robot: Robot, world: int, k: int, base: BaseState, paw: PawKinem
 
 
 @wp.func
+def friction_row(k: int, velocity: vec3, impulse: vec3, normal: vec3) -> int:
+    """Return the row of paw k's friction: static where it hardly slipped [m/s] and pushed [N s] before the step."""
+    slip = velocity - wp.dot(velocity, normal) * normal
+    if wp.dot(slip, slip) < STICK_SPEED * STICK_SPEED and wp.dot(impulse, normal) > real(0.0):
+        return k * LEG_ROWS + MU_STATIC
+    return k * LEG_ROWS + MU_DYNAMIC
+
+
+@wp.func
 def paw_contact(
     robot: Robot, world: int, k: int, base: BaseState, lin: vec3, ang: vec3, rates: vec3, old_rates: vec3,
     impulse: vec3, pressed: int, paw: PawKinematics, leg: LegSolve, inverse: BaseInverse, block: BlockLaw, dt: real,
@@ -176,11 +188,7 @@ def paw_contact(
     contact.goal = target_normal_velocity(gap, pressed, dt)
     contact.impulse = wp.quat_rotate_inv(base.quat, impulse)
     before = wp.quat_rotate_inv(base.quat, base.lin) + wp.cross(base.ang, point) + contact.jacobian * old_rates
-    slip = before - touch.velocity
-    slip -= wp.dot(slip, normal) * normal
-    contact.mu_row = k * LEG_ROWS + MU_DYNAMIC
-    if wp.dot(slip, slip) < STICK_SPEED * STICK_SPEED and wp.dot(contact.impulse, normal) > real(0.0):
-        contact.mu_row = k * LEG_ROWS + MU_STATIC
+    contact.mu_row = friction_row(k, before - touch.velocity, contact.impulse, normal)
     contact.mu = robot.table[contact.mu_row, world]
     contact = couple_contact(contact, point, leg, inverse)
     if on_block:
@@ -193,6 +201,15 @@ def base_system(robot: Robot, world: int, base: BaseState, g: vec3, force: vec3,
     """Return the base link's own equations; force [N] and moment [N m] from outside at its com, world axes."""
     wrench = external_wrench(base, base_com(robot.table, world), force, moment)
     return base_alone(load_moments(robot.table, BASE, world), base.ang, g, wrench.force, wrench.moment)
+
+
+@wp.func
+def hold_base(robot: Robot, world: int, inverse: BaseInverse) -> BaseInverse:
+    """Return the inverse of a world's base system, zero where the base is held: nothing accelerates it."""
+    if robot.held.shape[0] > 0:
+        if robot.held[world] != 0:
+            return BaseInverse()
+    return inverse
 
 
 @wp.func

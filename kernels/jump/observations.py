@@ -2,10 +2,13 @@
 
 import warp as wp
 
-from ..mdp.view import RobotView, turned, yaw_of
+from ..mdp.view import RobotArrays, RobotView, base_pos, base_quat, turned, yaw_of
+from ..terrain.ground import Block, Ground, floor_surface, world_ground
 from .phase import estimated_apex, estimated_landing
 from .state import JumpState, commanded, goal_offset
 
+SIGHT = wp.constant(2.0)  # [m] how far blocks are seen
+vec7 = wp.types.vector(length=7, dtype=wp.float32)
 LANDING_HEIGHT = wp.constant(0.3)  # [m] of the base above the ground at the goal, where the critic's estimate ends
 
 
@@ -67,3 +70,45 @@ def way(view: RobotView, task: JumpState) -> wp.vec2:
     """Way to the goal [m] ahead and to the left, before the command too."""
     offset = turned(goal_offset(view, task), -yaw_of(view.quat))
     return wp.vec2(offset[0], offset[1])
+
+
+@wp.func
+def span_of_ray(offset: float, half: float, direction: float) -> wp.vec2:
+    """Return where [m] along a ray a slab of a half width [m] begins and ends, its middle `offset` [m] ahead."""
+    if wp.abs(direction) < 1.0e-6:
+        return wp.where(wp.abs(offset) <= half, wp.vec2(-1.0e6, 1.0e6), wp.vec2(1.0e6, -1.0e6))
+    near = (offset - half) / direction
+    far = (offset + half) / direction
+    return wp.vec2(wp.min(near, far), wp.max(near, far))
+
+
+@wp.func
+def edges_of_block(block: Block, from_x: float, from_y: float, heading: float) -> wp.vec2:
+    """Return where [m] a ray enters and leaves a block, seen from -SIGHT to SIGHT; both SIGHT if it passes by."""
+    along_x = span_of_ray(float(block.center[0]) - from_x, float(block.half[0]), wp.cos(heading))
+    along_y = span_of_ray(float(block.center[1]) - from_y, float(block.half[1]), wp.sin(heading))
+    enter = wp.max(along_x[0], along_y[0])
+    leave = wp.min(along_x[1], along_y[1])
+    if block.exists == 0 or enter >= leave or enter > SIGHT:
+        return wp.vec2(SIGHT, SIGHT)
+    return wp.vec2(wp.max(enter, -SIGHT), wp.min(leave, SIGHT))
+
+
+@wp.func
+def block_ahead(robot: RobotArrays, ground: Ground, world: int) -> vec7:
+    """What the block ahead is like: where it begins and ends [m] ahead of the base, and its height above the floor [m].
+
+    Along three rays in the base's heading, 0.2 m to its left, through it and to its right; 2 m where there is none.
+    """
+    block = world_ground(ground, world).block
+    pos = base_pos(robot, world)
+    heading = yaw_of(base_quat(robot, world))
+    seen = vec7()
+    for i in range(3):
+        aside = turned(wp.vec3(0.0, 0.2 * float(1 - i), 0.0), heading)
+        edges = edges_of_block(block, pos[0] + aside[0], pos[1] + aside[1], heading)
+        seen[2 * i] = edges[0]
+        seen[2 * i + 1] = edges[1]
+    if block.exists != 0:
+        seen[6] = float(block.height) - float(floor_surface(ground, block.center[0], block.center[1])[0])
+    return seen

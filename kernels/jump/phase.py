@@ -66,8 +66,12 @@ def advance_jump(view: RobotView, task: JumpState, takeoff_speed: float) -> Jump
     if t.touched_down == 1:
         t.touchdown_vel = view.old_lin_vel
         t.peak_tilt = 0.0
+        t.paws_landed = 0
     if phase == LANDED:
         t.peak_tilt = wp.max(t.peak_tilt, tilt(view))
+        for k in range(4):
+            if view.contact[k] > 0.0:
+                t.paws_landed = t.paws_landed | (1 << k)
     t.idle_steps = 0
     if phase == STANCE and t.steps >= t.command_step and wp.length(view.lin_vel) < 0.1:
         t.idle_steps = task.idle_steps + 1

@@ -1,40 +1,30 @@
 """Reference state initialisation: episodes begin at the stages of a jump (paper, Section V-D).
 
-Standing or squatting on given paw positions, the default pose, in flight on a projectile to the goal, just before
-touchdown, and just landed. Joint angles come from the closed-form inverse kinematics and joint rates from the leg's
-Jacobian, so every state satisfies the loops. A draw whose paws cannot be reached within limits, whose links touch, or
-whose paws are below the ground is drawn again; the default pose stands in after the last attempt.
+Standing or squatting on given paw positions, the default pose, pushing off, in flight on a projectile to the goal, just
+before touchdown, and just landed. Joint angles come from the closed-form inverse kinematics and joint rates from the
+leg's Jacobian, so every state satisfies the loops. A draw whose paws cannot be reached within limits, whose links
+touch, or whose paws are below the ground is drawn again; the default pose stands in after the last attempt.
 """
 
 import warp as wp
 
-from ..collision.robot import leg_collisions
 from ..kinematics.geometry import LegGeometry
-from ..kinematics.inverse import LegLimits, clamped_closed_form
-from ..kinematics.leg import leg_forward_kinematics, leg_inverse_velocity
+from ..kinematics.inverse import LegLimits
+from ..kinematics.leg import leg_forward_kinematics
 from ..layout import COORDS, DOFS
-from ..mdp.attempts import (
-    ATTEMPTS,
-    all_legs,
-    attempt_step,
-    first_attempt,
-    first_leg,
-    leg_step,
-    meet_attempts,
-    of_leg,
-    taken_first,
-)
+from ..mdp.attempts import ATTEMPTS, attempt_step, first_attempt, first_leg, leg_step
 from ..mdp.env import Scene, SkillSettings
 from ..mdp.random import Draw, between, branch, within
 from ..mdp.reset import leg_limits, store_pose
+from ..mdp.starts import LegDraw, keep_first, leg_over_ground, leg_to, legs_fit, store_base, store_leg
 from ..mdp.view import RobotArrays, RobotView, base_pos, turned, yaw_of
-from ..state import leg_coord, leg_dof, load_motors, store_motors
 from ..terrain.ground import Block, Ground, rest_block, surface, world_ground
 from .ground_draws import GroundRanges, draw_ground, footprint
 from .reset_draws import (
     AFTER_LANDING,
     DEFAULT,
     IN_FLIGHT,
+    PUSHING,
     STANDING,
     TOUCHDOWN,
     BaseDraw,
@@ -43,6 +33,8 @@ from .reset_draws import (
     draw_box,
     draw_paw,
     draw_scheme,
+    rounded,
+    time_spent,
 )
 from .state import FLIGHT, LANDED, STANCE, JumpState
 
@@ -65,6 +57,7 @@ class JumpLevel:
     goal_upper: wp.vec3
     base_height: wp.vec2  # [m] of standing starts
     jump_again: float  # share of landed robots that get another goal
+    round: int  # 1: goals are drawn from the ellipse inside the box
 
 
 @wp.func
@@ -78,15 +71,6 @@ def draw_leg_in_flight(draw: Draw, ranges: ResetRanges, leg: int, lateral: float
     return wp.vec3(lateral + between(draw, 38 + leg, -0.03, 0.03), outer, inner)
 
 
-@wp.struct
-class LegDraw:
-    """A drawn leg."""
-
-    angles: wp.vec3  # [rad] of the motors
-    rates: wp.vec3  # [rad/s]
-    possible: bool  # whether it can be so
-
-
 @wp.func
 def draw_leg(
     geo: LegGeometry, ground: Ground, limits: LegLimits, ranges: ResetRanges, draw: Draw, leg: int, scheme: int,
@@ -94,7 +78,6 @@ def draw_leg(
 ) -> LegDraw:  # fmt: skip
     """Return a leg of a drawn state: on its paw's place, or in flight. lift [m]: ground height under the base."""
     found = LegDraw()
-    found.possible = bool(True)
     if d.use_paws != 0:
         spot = d.spot + draw_paw(draw, ranges, leg, heading)
         paw = spot - d.pos
@@ -104,15 +87,10 @@ def draw_leg(
         else:
             here = surface(ground, spot[0], spot[1])
             paw[2] = here[0] + geo.paw_radius - d.pos[2] - lift
-        ankle = wp.quat_rotate_inv(d.quat, paw)
-        angles = clamped_closed_form(geo, limits, ankle - geo.hip)
-        found.angles = angles
-        reached = leg_forward_kinematics(geo, angles[0], angles[1], angles[2])
-        found.possible = wp.length(reached - ankle) <= 1.0e-4
-        if scheme == AFTER_LANDING:
+        found = leg_to(geo, limits, wp.quat_rotate_inv(d.quat, paw))
+        if scheme == AFTER_LANDING or scheme == PUSHING:
             # the paw rests on the ground while the base moves, so the joints move too
-            found.rates = leg_inverse_velocity(geo, angles, -wp.quat_rotate_inv(d.quat, d.lin_vel))
-            found.possible = found.possible and wp.length(found.rates) <= 30.0
+            found = leg_over_ground(geo, found, -wp.quat_rotate_inv(d.quat, d.lin_vel))
     else:
         angles = draw_leg_in_flight(draw, ranges, leg, d.lateral)
         found.angles = angles
@@ -128,30 +106,14 @@ def store_draw(
     joint_q: wp.array(dtype=float), joint_qd: wp.array(dtype=float),
 ) -> bool:  # fmt: skip
     """Write a drawn state of one world, and return whether it can be taken; lift [m]: ground height under the base."""
-    for j in range(3):
-        joint_q[j] = d.pos[j]
-        joint_qd[j] = d.lin_vel[j]
-        joint_qd[3 + j] = 0.0
-    joint_q[2] = d.pos[2] + lift
-    for j in range(4):
-        joint_q[3 + j] = d.quat[j]
+    store_base(d.pos + wp.vec3(0.0, 0.0, lift), d.quat, d.lin_vel, wp.vec3(0.0), joint_q, joint_qd)
     possible = bool(True)
     own = LegDraw()
     for leg in range(first_leg(draw), geometry.shape[0], leg_step(draw)):
         own = draw_leg(geometry[leg], ground, limits, ranges, draw, leg, scheme, d, heading, lift)
         possible = possible and own.possible
-        store_motors(joint_q, leg_coord(0, leg), own.angles)
-        store_motors(joint_qd, leg_dof(0, leg), own.rates)
-    if not all_legs(draw, possible):
-        return False
-    if draw.lanes > 1:
-        for leg in range(geometry.shape[0]):
-            store_motors(joint_q, leg_coord(0, leg), of_leg(draw, own.angles, leg))
-            store_motors(joint_qd, leg_dof(0, leg), of_leg(draw, own.rates, leg))
-    flags = int(0)
-    for turn in range(first_leg(draw), geometry.shape[0], leg_step(draw)):
-        flags = flags | leg_collisions(geometry, ground, joint_q, 0, turn)
-    return all_legs(draw, flags == 0)
+        store_leg(leg, own, joint_q, joint_qd)
+    return legs_fit(geometry, ground, draw, own, possible, joint_q, joint_qd)
 
 
 @wp.func
@@ -173,17 +135,16 @@ def draw_until_taken(
             d = draw_base(fresh, ranges, scheme, heading, height, goal, g)
             if store_draw(geometry, ground, limits, ranges, fresh, scheme, d, heading, here[0], own_q, own_qd):
                 taken = attempt
-    first = taken_first(draw, taken)
-    if taken == first and first < ATTEMPTS and first_leg(draw) == 0:
-        for i in range(7):
-            joint_q[draw.world * COORDS + i] = own_q[i]
-        for i in range(6):
-            joint_qd[draw.world * DOFS + i] = own_qd[i]
-        for leg in range(geometry.shape[0]):
-            store_motors(joint_q, leg_coord(draw.world, leg), load_motors(own_q, leg_coord(0, leg)))
-            store_motors(joint_qd, leg_dof(draw.world, leg), load_motors(own_qd, leg_dof(0, leg)))
-    meet_attempts(draw)
-    return first < ATTEMPTS
+    return keep_first(geometry, draw, taken, own_q, own_qd, joint_q, joint_qd)
+
+
+@wp.func
+def draw_goal(draw: Draw, level: JumpLevel) -> wp.vec3:
+    """Return a goal of a level relative to start and heading."""
+    goal = draw_box(draw, 50, level.goal_lower, level.goal_upper)
+    if level.round != 0:
+        goal = rounded(goal, level.goal_lower, level.goal_upper)
+    return goal
 
 
 @wp.func
@@ -209,6 +170,10 @@ def begin_task(
     task.command_step = int(between(draw, 9, 0.0, float(ranges.command_delay) + 0.999))
     task.again_delay = ranges.again_delay
     task.again_step = draw_again(draw, ranges.again_delay, jump_again)
+    if scheme == PUSHING or (scheme == STANDING and ranges.lean > 0.0):
+        task.start = wp.vec3(0.0, 0.0, pos[2])
+    if scheme == PUSHING:
+        task.command_step = 0
     if scheme == IN_FLIGHT or scheme == TOUCHDOWN:
         task.phase = FLIGHT
         task.command_step = 0
@@ -239,6 +204,7 @@ def begin_next_jump(old: JumpState, ground: Ground, goal: wp.vec3, pos: wp.vec3,
     task.idle_steps = 0
     task.max_height = pos[2]
     task.peak_tilt = 0.0
+    task.paws_landed = 0
     task.again_step = 0
     task.jumps = old.jumps + 1
     return task
@@ -269,9 +235,10 @@ def reset_jump(
     world = draw.world
     ranges = settings.states
     g = -robot.gravity[world][2]
-    scheme = draw_scheme(draw, ranges)
+    spent = time_spent(old)
+    scheme = draw_scheme(draw, ranges, spent)
     heading = between(draw, 13, -ranges.heading, ranges.heading)
-    goal = turned(draw_box(draw, 50, level.goal_lower, level.goal_upper), heading)
+    goal = turned(draw_goal(draw, level), heading)
     here = place_ground(scene.ground, world, draw, ranges, settings.grounds, scheme, heading, goal)
     taken = draw_until_taken(
         scene.geometry, here, leg_limits(skill.command_filter), ranges, draw, scheme, heading, level.base_height,
@@ -283,6 +250,7 @@ def reset_jump(
     pos = base_pos(robot, world)
     task = begin_task(draw, ranges, scheme, goal, pos, robot.joint_qd[world * DOFS + 2], level.jump_again)
     task.heading = heading
+    task.spent = spent
     task.goal_ground = surface(here, goal[0], goal[1])[0]
     return task
 
@@ -296,7 +264,7 @@ def another_jump_due(task: JumpState) -> bool:
 @wp.func
 def draw_next_jump(view: RobotView, scene: Scene, task: JumpState, level: JumpLevel, draw: Draw) -> JumpState:
     """Return the state of an episode that goes on with another jump, to a drawn goal."""
-    goal = draw_box(draw, 50, level.goal_lower, level.goal_upper)
+    goal = draw_goal(draw, level)
     new = begin_next_jump(task, world_ground(scene.ground, view.world), goal, view.pos, yaw_of(view.quat))
     new.again_step = draw_again(draw, task.again_delay, level.jump_again)
     return new

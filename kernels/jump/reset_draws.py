@@ -1,4 +1,4 @@
-"""Draws of the base for reference state initialisation: standing, on the projectile of a jump, just landed.
+"""Draws of the base for reference state initialisation: standing, pushing off, on a jump's projectile, just landed.
 
 A jump goes from above the origin to `goal`: x, y [m] of the landing and, for a vertical jump, the base height [m]
 wanted at the apex; where none is wanted, the takeoff angle is drawn.
@@ -7,8 +7,10 @@ wanted at the apex; where none is wanted, the takeoff angle is drawn.
 import warp as wp
 
 from ..mdp.random import Draw, between, within
+from ..mdp.starts import place_beside, turn_of
 from ..mdp.view import turned
 from .phase import time_to_height
+from .state import SCHEMES, JumpState, vec_schemes
 
 wp.set_module_options({"enable_backward": False})
 
@@ -17,16 +19,19 @@ DEFAULT = wp.constant(1)
 IN_FLIGHT = wp.constant(2)
 TOUCHDOWN = wp.constant(3)
 AFTER_LANDING = wp.constant(4)
+PUSHING = wp.constant(5)
 
 
 @wp.struct
 class ResetRanges:
     """Ranges of the drawn states; pairs are (lower, upper), angles [rad], lengths [m]."""
 
-    shares: wp.vec4  # cumulative shares of standing, default, in flight, touchdown; the rest has landed
+    shares: vec_schemes  # of standing, default, in flight, touchdown, just landed, pushing off
+    of_time: int  # 1: shares are of the time that a world spends in episodes, 0: of its resets
     base_xy: float  # half width
     tilt: float  # half width of roll, pitch; of yaw too around the heading
     forward_pitch: float  # largest mean pitch of standing states
+    lean: float  # base of the deepest squats behind the middle of the paws, at most; straight above it at the highest
     heading: float  # half width of the heading
     front_x: wp.vec2  # paw ahead of the base
     front_y: wp.vec2  # paw beside the base, absolute
@@ -34,6 +39,9 @@ class ResetRanges:
     back_y: wp.vec2
     takeoff_height: wp.vec2
     takeoff_ahead: wp.vec2  # base ahead of its start, towards the goal
+    takeoff_pitch: wp.vec2  # nose down, of states in flight and pushing off
+    push_length: wp.vec2  # of the way to the takeoff, straight along its velocity
+    push_acceleration: wp.vec2  # [m/s^2] along it
     takeoff_angle: wp.vec2  # above the horizon, where no apex is wanted
     highest_apex: float  # of jumps with a drawn angle
     landing_height: float  # of the base, where the projectile ends
@@ -73,40 +81,77 @@ def draw_box(draw: Draw, column: int, lower: wp.vec3, upper: wp.vec3) -> wp.vec3
 
 
 @wp.func
+def rounded(goal: wp.vec3, lower: wp.vec3, upper: wp.vec3) -> wp.vec3:
+    """Return a goal of a box around the start moved into the ellipse that touches the box's sides, its height kept.
+
+    Each quarter has its own half axes, so that reaches ahead, back and to either side can differ.
+    """
+    x = goal[0] / wp.max(wp.where(goal[0] < 0.0, -lower[0], upper[0]), 1.0e-6)
+    y = goal[1] / wp.max(wp.where(goal[1] < 0.0, -lower[1], upper[1]), 1.0e-6)
+    shrink = wp.max(wp.abs(x), wp.abs(y)) / wp.max(wp.length(wp.vec2(x, y)), 1.0e-6)
+    return wp.vec3(shrink * goal[0], shrink * goal[1], goal[2])
+
+
+@wp.func
 def draw_quat(draw: Draw, ranges: ResetRanges, heading: float, pitch: float) -> wp.quat:
     """Return an orientation (xyzw) around a heading and a pitch [rad]."""
     yaw = heading + between(draw, 10, -ranges.tilt, ranges.tilt)
     tip = pitch + between(draw, 11, -ranges.tilt, ranges.tilt)
     roll = between(draw, 12, -ranges.tilt, ranges.tilt)
-    return (
-        wp.quat_from_axis_angle(wp.vec3(0.0, 0.0, 1.0), yaw)
-        * wp.quat_from_axis_angle(wp.vec3(0.0, 1.0, 0.0), tip)
-        * wp.quat_from_axis_angle(wp.vec3(1.0, 0.0, 0.0), roll)
-    )
+    return turn_of(yaw, tip, roll)
 
 
 @wp.func
-def draw_scheme(draw: Draw, ranges: ResetRanges) -> int:
-    """Return a reset scheme by the shares."""
-    u = between(draw, 1, 0.0, 1.0)
-    scheme = int(AFTER_LANDING)
-    for i in range(4):
-        if u < ranges.shares[3 - i]:
-            scheme = 3 - i
+def scheme_of_shares(shares: vec_schemes, u: float) -> int:
+    """Return the scheme at u in [0, 1) of the shares one after the other."""
+    scheme = int(0)
+    rest = u
+    for i in range(SCHEMES):
+        if rest >= 0.0 and shares[i] > 0.0:
+            scheme = i
+        rest -= shares[i]
     return scheme
+
+
+@wp.func
+def most_lacking(shares: vec_schemes, spent: vec_schemes) -> int:
+    """Return the scheme that is farthest behind its share of what was spent, in policy steps."""
+    total = float(0.0)
+    for i in range(SCHEMES):
+        total += spent[i]
+    scheme = int(0)
+    most = float(-3.0e38)
+    for i in range(SCHEMES):
+        lack = shares[i] * total - spent[i]
+        if shares[i] > 0.0 and lack > most:
+            scheme = i
+            most = lack
+    return scheme
+
+
+@wp.func
+def time_spent(old: JumpState) -> vec_schemes:
+    """Return how many policy steps [1] a world has spent in episodes of each scheme, an ended one included."""
+    spent = old.spent
+    for i in range(SCHEMES):
+        if i == old.scheme:
+            spent[i] += float(old.steps)
+    return spent
+
+
+@wp.func
+def draw_scheme(draw: Draw, ranges: ResetRanges, spent: vec_schemes) -> int:
+    """Return the scheme of a new episode; shares of time are drawn once, and then what lacks most comes next."""
+    if ranges.of_time != 0 and wp.length_sq(spent) > 0.0:
+        return most_lacking(ranges.shares, spent)
+    return scheme_of_shares(ranges.shares, between(draw, 1, 0.0, 1.0))
 
 
 @wp.func
 def draw_paw(draw: Draw, ranges: ResetRanges, leg: int, heading: float) -> wp.vec3:
     """Return a paw's place [m] relative to the spot that they surround, world axes, z = 0."""
-    x = within(draw, 20 + leg, ranges.front_x)
-    y = within(draw, 24 + leg, ranges.front_y)
-    if leg >= 2:
-        x = -within(draw, 20 + leg, ranges.back_x)
-        y = within(draw, 24 + leg, ranges.back_y)
-    if leg % 2 == 1:
-        y = -y
-    return turned(wp.vec3(x, y, 0.0), heading)
+    place = place_beside(draw, leg, ranges.front_x, ranges.front_y, ranges.back_x, ranges.back_y)
+    return turned(place, heading)
 
 
 @wp.func
@@ -122,6 +167,21 @@ def takeoff_speed(draw: Draw, ranges: ResetRanges, height: float, distance: floa
 
 
 @wp.func
+def push_off(draw: Draw, ranges: ResetRanges, takeoff: BaseDraw) -> BaseDraw:
+    """Return a state before a takeoff, its paws still around the start: on a straight line, evenly accelerated."""
+    d = takeoff
+    back = within(draw, 54, ranges.push_length)
+    speed = wp.length(takeoff.lin_vel)
+    before = speed * speed - 2.0 * back * within(draw, 55, ranges.push_acceleration)
+    way = wp.normalize(takeoff.lin_vel)
+    d.pos = takeoff.pos - back * way
+    d.lin_vel = wp.sqrt(wp.max(before, 0.0)) * way
+    d.spot = wp.vec3(0.0)
+    d.use_paws = 1
+    return d
+
+
+@wp.func
 def draw_airborne(
     draw: Draw,
     ranges: ResetRanges,
@@ -131,9 +191,9 @@ def draw_airborne(
     along: wp.vec3,
     g: float,
 ) -> BaseDraw:
-    """Return a state on the projectile to the goal; along: unit vector towards it."""
+    """Return a state on the projectile to the goal, or on the way to its takeoff; along: unit vector towards it."""
     d = BaseDraw()
-    d.quat = draw_quat(draw, ranges, heading, 0.0)
+    d.quat = draw_quat(draw, ranges, heading, within(draw, 56, ranges.takeoff_pitch))
     height = within(draw, 4, ranges.takeoff_height)
     way = wp.length(wp.vec3(goal[0], goal[1], 0.0))
     ahead = wp.min(within(draw, 14, ranges.takeoff_ahead), way)
@@ -143,12 +203,16 @@ def draw_airborne(
     t = whole * within(draw, 5, ranges.flight_time)
     if scheme == TOUCHDOWN:
         t = wp.max(whole - within(draw, 5, ranges.touchdown_time), 0.0)
+    if scheme == PUSHING:
+        t = float(0.0)
     forward = distance / whole
     off = wp.vec3(
         between(draw, 2, -ranges.base_xy, ranges.base_xy), between(draw, 3, -ranges.base_xy, ranges.base_xy), 0.0
     )
     d.pos = off + (ahead + forward * t) * along + wp.vec3(0.0, 0.0, height + up * t - 0.5 * g * t * t)
     d.lin_vel = forward * along + wp.vec3(0.0, 0.0, up - g * t)
+    if scheme == PUSHING:
+        return push_off(draw, ranges, d)
     d.spot = wp.vec3(d.pos[0], d.pos[1], 0.0)
     if scheme == TOUCHDOWN:
         d.use_paws = 1
@@ -173,7 +237,7 @@ def draw_base(
     along = turned(wp.vec3(1.0, 0.0, 0.0), heading)
     if wp.length(to_goal) > 1.0e-3:
         along = wp.normalize(to_goal)
-    if scheme == IN_FLIGHT or scheme == TOUCHDOWN:
+    if scheme == IN_FLIGHT or scheme == TOUCHDOWN or scheme == PUSHING:
         return draw_airborne(draw, ranges, scheme, heading, goal, along, g)
     d = BaseDraw()
     d.use_paws = 1
@@ -181,7 +245,9 @@ def draw_base(
         between(draw, 2, -ranges.base_xy, ranges.base_xy), between(draw, 3, -ranges.base_xy, ranges.base_xy), 0.0
     )
     d.quat = draw_quat(draw, ranges, heading, between(draw, 17, 0.0, ranges.forward_pitch))
-    d.pos = off + wp.vec3(0.0, 0.0, within(draw, 4, height))
+    low = (height[1] - within(draw, 4, height)) / wp.max(height[1] - height[0], 1.0e-6)
+    lean = low * between(draw, 53, 0.0, ranges.lean)
+    d.pos = off + wp.vec3(0.0, 0.0, within(draw, 4, height)) - lean * along
     if scheme == AFTER_LANDING:
         d.quat = draw_quat(draw, ranges, heading, 0.0)
         d.spot = to_goal

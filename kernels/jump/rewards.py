@@ -5,7 +5,7 @@ Times are counted in policy steps of 1/60 s.
 
 import warp as wp
 
-from ..mdp.rewards import phi, posture_offset, psi
+from ..mdp.rewards import phi, posture_offset, psi, square_sum
 from ..mdp.view import RobotView, braking, rotation_from
 from .phase import estimated_apex, landing_error_estimate
 from .state import FLIGHT, LANDED, STANCE, JumpState, commanded, goal_offset, waiting
@@ -245,3 +245,59 @@ def lifted_paws(view: RobotView, task: JumpState, steps: float) -> float:
     if task.phase != LANDED or task.phase_steps <= int(steps):
         return 0.0
     return float(4 - view.contacts)
+
+
+@wp.func
+def lifted_again(view: RobotView, task: JumpState, free: float) -> float:
+    """Still landing: paws off the ground again for more than `free` [s] after their own first contact, 0 to 4."""
+    count = float(0.0)
+    if task.phase == LANDED:
+        for k in range(4):
+            if (task.paws_landed >> k) & 1 == 1 and view.contact[k] == 0.0 and view.air_time[k] > free:
+                count += 1.0
+    return count
+
+
+@wp.func
+def capture_point(view: RobotView, task: JumpState, width: float) -> float:
+    """Bracing: phi_width of the way from the middle of the paws to where a pendulum of the base's height would stop.
+
+    After touchdown. The pendulum that moves with the base comes to rest over p + v sqrt(h / g).
+    """
+    if task.phase != LANDED:
+        return 0.0
+    reach = wp.sqrt(wp.max(view.height, 0.0) / view.fall_acc)
+    x = view.pos[0] + reach * view.lin_vel[0]
+    y = view.pos[1] + reach * view.lin_vel[1]
+    for k in range(4):
+        x -= 0.25 * view.paw_pos[k, 0]
+        y -= 0.25 * view.paw_pos[k, 1]
+    return phi(wp.length(wp.vec2(x, y)), width)
+
+
+# ---------------------------------------------------------------- standing quietly
+
+
+@wp.func
+def resting_action_rate(view: RobotView, task: JumpState) -> float:
+    """Quiet actions: sum of squared changes of the action, while the robot should rest."""
+    if not should_rest(task):
+        return 0.0
+    return square_sum(view.action - view.old_action)
+
+
+@wp.func
+def torque_ripple(view: RobotView, task: JumpState) -> float:
+    """Torque ripple: sum of squared changes of the motor torques over the step [N^2 m^2], while it should rest."""
+    if not should_rest(task):
+        return 0.0
+    return square_sum(view.torque - view.old_torque)
+
+
+@wp.func
+def force_ripple(view: RobotView, task: JumpState, weight_force: float) -> float:
+    """Force ripple: sum over paws of squares of the step's peak less its last force over the weight's [N], at rest."""
+    if not should_rest(task):
+        return 0.0
+    off = view.peak_force - view.paw_force
+    return wp.dot(off, off) / (weight_force * weight_force)

@@ -9,6 +9,10 @@ FLIGHT = wp.constant(1)
 LANDED = wp.constant(2)
 
 
+SCHEMES = wp.constant(6)  # ways in which an episode begins, see `reset_draws`
+vec_schemes = wp.types.vector(length=6, dtype=wp.float32)
+
+
 @wp.struct
 class JumpState:
     """State of one world's episode."""
@@ -33,6 +37,8 @@ class JumpState:
     again_step: int  # policy steps after touchdown at which another goal comes, 0: never
     again_delay: wp.vec2  # policy steps between which that of yet another goal is drawn
     jumps: int  # jumps that were followed by another in this episode
+    paws_landed: int  # bits of the paws that have come down since touchdown
+    spent: vec_schemes  # policy steps that the world has spent in episodes of each scheme, before this one
 
 
 @wp.func

@@ -1,7 +1,8 @@
 """Attempts at a draw of a robot's state: in turn in one thread, or on a GPU by a warp, 8 attempts of 4 legs each.
 
-On a GPU the 32 threads of a world differ in `Draw.lane` alone. They take the same branches but for those that depend on
-their attempt, which the four threads of an attempt take together.
+On a GPU the 32 threads of a world differ in `Draw.lane` alone, and reach every exchange together. On the CPU, where
+several threads serve tests, they are a block (launch with `block_dim=32`) and take turns: each leaves its value in a
+box, waits, and reads.
 """
 
 import warp as wp
@@ -19,6 +20,17 @@ _FIRST = """
 #if defined(__CUDA_ARCH__)
     if (lanes > 1)
         return static_cast<int>(__reduce_min_sync(0xffffffffu, static_cast<unsigned int>(attempt)));
+#else
+    if (lanes > 1) {
+        static int box[32];
+        box[WP_TILE_THREAD_IDX % 32] = attempt;
+        WP_TILE_SYNC();
+        int smallest = box[0];
+        for (int i = 1; i < 32; ++i)
+            smallest = wp::min(smallest, box[i]);
+        WP_TILE_SYNC();
+        return smallest;
+    }
 #endif
     return attempt;
 """
@@ -26,6 +38,16 @@ _ALL = """
 #if defined(__CUDA_ARCH__)
     if (lanes > 1)
         return __all_sync(0xfu << (threadIdx.x & 28u), flag);
+#else
+    if (lanes > 1) {
+        static bool box[32];
+        box[WP_TILE_THREAD_IDX % 32] = flag;
+        WP_TILE_SYNC();
+        const int first = WP_TILE_THREAD_IDX % 32 / 4 * 4;
+        const bool all = box[first] && box[first + 1] && box[first + 2] && box[first + 3];
+        WP_TILE_SYNC();
+        return all;
+    }
 #endif
     return flag;
 """
@@ -33,6 +55,15 @@ _FROM = """
 #if defined(__CUDA_ARCH__)
     if (lanes > 1)
         return __shfl_sync(0xfu << (threadIdx.x & 28u), x, leg, 4);
+#else
+    if (lanes > 1) {
+        static float box[32];
+        box[WP_TILE_THREAD_IDX % 32] = x;
+        WP_TILE_SYNC();
+        const float value = box[WP_TILE_THREAD_IDX % 32 / 4 * 4 + leg];
+        WP_TILE_SYNC();
+        return value;
+    }
 #endif
     return x;
 """
@@ -40,6 +71,9 @@ _MEET = """
 #if defined(__CUDA_ARCH__)
     if (lanes > 1)
         __syncwarp();
+#else
+    if (lanes > 1)
+        WP_TILE_SYNC();
 #endif
 """
 

@@ -7,6 +7,9 @@ from ..kinematics.geometry import LegGeometry
 from ..terrain.ground import Ground
 from .view import vec12
 
+BEGUN = wp.constant(1)
+COMMANDED = wp.constant(2)
+
 
 @wp.struct
 class Scene:
@@ -35,7 +38,7 @@ class EnvArrays:
     request: wp.array(dtype=int)  # skill that is asked for, -1: none
     wanted: wp.array(dtype=wp.vec4)  # command that the skill is given when it takes over
     told: wp.array(dtype=int)  # 1: there is one
-    fresh: wp.array(dtype=int)  # 1: an episode or a skill begins; observations have no past
+    fresh: wp.array(dtype=int)  # BEGUN: an episode or a skill, observations have no past; COMMANDED: within an episode
     reward: wp.array(dtype=float)
     done: wp.array(dtype=float)  # 1: the episode ended
     timeout: wp.array(dtype=float)  # 1: it ended without failure

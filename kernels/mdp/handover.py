@@ -4,7 +4,7 @@ from typing import Any
 
 import warp as wp
 
-from .env import EnvArrays, Scene, SkillSettings
+from .env import BEGUN, EnvArrays, Scene, SkillSettings
 from .parameters import RobotParameters, set_motor
 from .view import RobotArrays, load_view, yaw_of
 
@@ -22,7 +22,7 @@ def hand_over(
     env.skill[world] = target
     env.request[world] = NONE
     env.told[world] = 0
-    env.fresh[world] = 1
+    env.fresh[world] = BEGUN
     for m in range(12):
         off = robot.safe_target[m, world] - robot.default_angle[m]
         action = wp.clamp(off / skills[target].action_scale[m], -1.0, 1.0)

@@ -5,7 +5,7 @@ from typing import Any
 import warp as wp
 
 from ..terrain.ground import Ground
-from .env import EnvArrays
+from .env import BEGUN, COMMANDED, EnvArrays
 from .options import FAST
 from .parameters import RobotParameters
 from .random import OBSERVATION, cut_gaussian, make_draw
@@ -84,7 +84,7 @@ def make_observe_kernel(task: Any) -> wp.Kernel:
     ):
         """Write what the terms give; one thread per (chunk of terms, world).
 
-        beginning 1: only where an episode or the skill has just begun.
+        beginning 1: only where an episode or the skill has just begun, or another command came.
         """
         chunk, world = wp.tid()
         world += env.first
@@ -125,7 +125,7 @@ def or_zero(value: float, broken: bool) -> float:
 def late(arrays: ObservationArrays, clock: int, world: int, column: int, value: float, fresh: int) -> float:
     """Return what a sensor gave as long ago as its latency says, between policy steps a straight line."""
     depth = arrays.past.shape[0]
-    if fresh != 0:
+    if fresh == BEGUN:
         for i in range(depth):
             arrays.past[i, world, column] = value
     arrays.past[clock % depth, world, column] = value
@@ -152,9 +152,10 @@ def condition(
         value += noise * cut_gaussian(draw, column.oldest)
     value = or_zero(p[column.first + 1] * wp.clamp(value, -p[column.first + 2], p[column.first + 2]), broken)
     i = column.start + world * column.stride + column.oldest
+    again = beginning != 0 and env.fresh[world] == COMMANDED
     for _ in range(column.history - 1):
-        frame = arrays.now[i + column.width]
-        if broken or env.fresh[world] != 0:
+        frame = arrays.now[i + wp.where(again, 0, column.width)]
+        if broken or env.fresh[world] == BEGUN:
             frame = value
         arrays.now[i] = frame
         if beginning == 0:
@@ -179,7 +180,8 @@ def condition_kernel(
     """Turn raw values into observations; launch over (num_worlds, LANES).
 
     Rows of worlds that came apart are 0, history and all, and so is what else is not finite.
-    beginning 1: only where an episode or the skill has just begun, and `final` stays.
+    beginning 1: only where an episode or the skill has just begun, or another command came; then frames of before
+    stay, and so does `final`.
     """
     world, lane = wp.tid()
     world += env.first

@@ -10,7 +10,7 @@ from ..kinematics.inverse import LegLimits
 from ..layout import COORDS, DOFS, motor_slot
 from ..terrain.ground import rest_block, surface, world_ground
 from .attempts import meet_attempts
-from .env import Delays, EnvArrays, Scene, SkillSettings
+from .env import BEGUN, COMMANDED, Delays, EnvArrays, Scene, SkillSettings
 from .options import FAST
 from .random import COMMAND, RESET, between, make_draw
 from .track import follow_paw
@@ -74,13 +74,14 @@ def make_reset_kernel(task: Any) -> wp.Kernel:
             meet_attempts(draw)
             if lane == 0:
                 states[world] = state
-                env.fresh[world] = 1
+                env.fresh[world] = BEGUN
                 env.broken[world] = 0
         elif wp.static(command is not None):
             if lane == 0:
                 view = load_view(robot, scene.ground, world)
                 fresh = make_draw(env.seed, world, env.clock[world], COMMAND)
                 states[world] = wp.static(command)(view, scene, states[world], levels[level], fresh)
+                env.fresh[world] = COMMANDED
 
     return reset_kernel
 
@@ -114,10 +115,12 @@ def make_give_kernel(task: Any) -> wp.Kernel:
         if begins != 0:
             fresh = task.state()
             states[world] = wp.static(give)(view, scene, fresh, values[world], headings[world])
-            env.fresh[world] = 1
+            env.fresh[world] = BEGUN
             env.broken[world] = 0
         else:
             states[world] = wp.static(give)(view, scene, states[world], values[world], yaw_of(view.quat))
+            if env.fresh[world] != BEGUN:
+                env.fresh[world] = COMMANDED
 
     return give_kernel
 

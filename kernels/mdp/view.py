@@ -214,8 +214,16 @@ def tilt(view: RobotView) -> float:
 
 @wp.func
 def braking(view: RobotView) -> float:
-    """Return the base's acceleration along its motion where it slows down [m/s^2], <= 0."""
-    speed = wp.length(view.lin_vel)
+    """Return what the base lost of its speed of the step before, over the step [m/s^2], <= 0.
+
+    Speed that it gained against that motion, as in a rebound, does not count: a fall that ends within the step has lost
+    all of its speed.
+    """
+    speed = wp.length(view.old_lin_vel)
     if speed < 1.0e-6:
         return 0.0
-    return wp.min(wp.dot(view.lin_acc, view.lin_vel) / speed, 0.0)
+    kept = wp.dot(view.lin_vel, view.old_lin_vel) / speed
+    rate = wp.dot(view.lin_acc, view.old_lin_vel) / speed
+    if kept < 0.0:
+        rate = rate * speed / (speed - kept)
+    return wp.min(rate, 0.0)

@@ -7,17 +7,25 @@ drawn again; the default pose stands in after the last attempt.
 
 import warp as wp
 
-from ..collision.robot import world_collisions
 from ..kinematics.geometry import LegGeometry
-from ..kinematics.inverse import LegLimits, clamped_closed_form
-from ..kinematics.leg import leg_forward_kinematics, leg_inverse_velocity
+from ..kinematics.inverse import LegLimits
 from ..layout import BODIES, COORDS, DOFS
+from ..mdp.attempts import ATTEMPTS, attempt_step, first_attempt, first_leg, leg_step, meet_attempts
 from ..mdp.env import Scene, SkillSettings
 from ..mdp.random import Draw, between, branch, within
 from ..mdp.reset import leg_limits, store_pose
+from ..mdp.starts import (
+    LegDraw,
+    keep_first,
+    leg_over_ground,
+    leg_to,
+    legs_fit,
+    place_beside,
+    store_base,
+    store_leg,
+    turn_of,
+)
 from ..mdp.view import RobotArrays, base_pos, turned
-from ..scalar import real
-from ..state import leg_coord, leg_dof, store_motors
 from ..terrain.ground import Ground, rest_block, surface, world_ground
 from .commands import CommandRanges, draw_velocity, with_command
 from .state import VelocityState, mean_error
@@ -25,7 +33,6 @@ from .terminations import off_map
 
 wp.set_module_options({"enable_backward": False})
 
-ATTEMPTS = wp.constant(6)
 FALL = wp.constant(60.0)  # [m/s] what a fall takes from the score, as much as a second at 1 m/s gives
 
 
@@ -79,11 +86,7 @@ def draw_base(draw: Draw, settings: VelocitySettings, ground: Ground, spot: wp.v
     d.heading = heading
     roll = between(draw, 10, -settings.tilt, settings.tilt)
     pitch = between(draw, 11, -settings.tilt, settings.tilt)
-    d.quat = (
-        wp.quat_from_axis_angle(wp.vec3(0.0, 0.0, 1.0), heading)
-        * wp.quat_from_axis_angle(wp.vec3(0.0, 1.0, 0.0), pitch)
-        * wp.quat_from_axis_angle(wp.vec3(1.0, 0.0, 0.0), roll)
-    )
+    d.quat = turn_of(heading, pitch, roll)
     x = spot[0] + between(draw, 2, -settings.base_xy, settings.base_xy)
     y = spot[1] + between(draw, 3, -settings.base_xy, settings.base_xy)
     d.pos = wp.vec3(x, y, surface(ground, x, y)[0] + within(draw, 4, settings.height))
@@ -97,14 +100,8 @@ def draw_base(draw: Draw, settings: VelocitySettings, ground: Ground, spot: wp.v
 @wp.func
 def draw_paw(draw: Draw, settings: VelocitySettings, ground: Ground, d: BaseDraw, leg: int, radius: float) -> wp.vec4:
     """Return the place of a paw's centre [m], world, and 1 if it is in the air."""
-    x = within(draw, 20 + leg, settings.front_x)
-    y = within(draw, 24 + leg, settings.front_y)
-    if leg >= 2:
-        x = -within(draw, 20 + leg, settings.back_x)
-        y = within(draw, 24 + leg, settings.back_y)
-    if leg % 2 == 1:
-        y = -y
-    paw = d.pos + turned(wp.vec3(x, y, 0.0), d.heading)
+    beside = place_beside(draw, leg, settings.front_x, settings.front_y, settings.back_x, settings.back_y)
+    paw = d.pos + turned(beside, d.heading)
     up = float(0.0)
     lifted = float(0.0)
     if between(draw, 28 + leg, 0.0, 1.0) < settings.lifted_share:
@@ -114,62 +111,53 @@ def draw_paw(draw: Draw, settings: VelocitySettings, ground: Ground, d: BaseDraw
 
 
 @wp.func
-def store_leg(
-    geo: LegGeometry, limits: LegLimits, world: int, leg: int, d: BaseDraw, paw: wp.vec4,
-    joint_q: wp.array(dtype=float), joint_qd: wp.array(dtype=float),
-) -> int:  # fmt: skip
-    """Write a leg's motor angles and rates; returns 0 if its paw is out of reach. A paw on the ground rests there."""
+def draw_leg(
+    geo: LegGeometry, ground: Ground, limits: LegLimits, settings: VelocitySettings, draw: Draw, leg: int, d: BaseDraw
+) -> LegDraw:  # fmt: skip
+    """Return a leg of a drawn state; a paw on the ground rests there."""
+    paw = draw_paw(draw, settings, ground, d, leg, geo.paw_radius)
     ankle = wp.quat_rotate_inv(d.quat, wp.vec3(paw[0], paw[1], paw[2]) - d.pos)
-    angles = clamped_closed_form(geo, limits, ankle - geo.hip)
-    if wp.length(leg_forward_kinematics(geo, angles[0], angles[1], angles[2]) - ankle) > 1.0e-4:
-        return 0
-    rates = wp.vec3(0.0)
+    found = leg_to(geo, limits, ankle)
     if paw[3] == 0.0:
-        rates = leg_inverse_velocity(geo, angles, -wp.quat_rotate_inv(d.quat, d.lin_vel) - wp.cross(d.ang_vel, ankle))
-        if wp.length(rates) > 30.0:
-            return 0
-    store_motors(joint_q, leg_coord(world, leg), angles)
-    store_motors(joint_qd, leg_dof(world, leg), rates)
-    return 1
+        return leg_over_ground(geo, found, -wp.quat_rotate_inv(d.quat, d.lin_vel) - wp.cross(d.ang_vel, ankle))
+    return found
 
 
 @wp.func
 def store_draw(
-    robot: RobotArrays, geometry: wp.array(dtype=LegGeometry), ground: Ground, limits: LegLimits,
-    settings: VelocitySettings, draw: Draw, world: int, d: BaseDraw,
-) -> int:  # fmt: skip
-    """Write a drawn state; returns 0 if it cannot be taken."""
-    q = world * COORDS
+    geometry: wp.array(dtype=LegGeometry), com: wp.vec3, ground: Ground, limits: LegLimits,
+    settings: VelocitySettings, draw: Draw, d: BaseDraw, joint_q: wp.array(dtype=float),
+    joint_qd: wp.array(dtype=float),
+) -> bool:  # fmt: skip
+    """Write a drawn state of one world, and return whether it can be taken; com [m]: of the base, body axes."""
     spin = wp.quat_rotate(d.quat, d.ang_vel)
-    com_vel = d.lin_vel + wp.cross(spin, wp.quat_rotate(d.quat, robot.body_com[world * BODIES]))
-    for j in range(3):
-        robot.joint_q[q + j] = d.pos[j]
-        robot.joint_qd[world * DOFS + j] = com_vel[j]
-        robot.joint_qd[world * DOFS + 3 + j] = spin[j]
-    for j in range(4):
-        robot.joint_q[q + 3 + j] = d.quat[j]
-    for leg in range(geometry.shape[0]):
-        geo = geometry[leg]
-        paw = draw_paw(draw, settings, ground, d, leg, geo.paw_radius)
-        if store_leg(geo, limits, world, leg, d, paw, robot.joint_q, robot.joint_qd) == 0:
-            return 0
-    if world_collisions(geometry, ground, robot.joint_q, q, real(0.0)).flags != 0:
-        return 0
-    return 1
+    store_base(d.pos, d.quat, d.lin_vel + wp.cross(spin, wp.quat_rotate(d.quat, com)), spin, joint_q, joint_qd)
+    possible = bool(True)
+    own = LegDraw()
+    for leg in range(first_leg(draw), geometry.shape[0], leg_step(draw)):
+        own = draw_leg(geometry[leg], ground, limits, settings, draw, leg, d)
+        possible = possible and own.possible
+        store_leg(leg, own, joint_q, joint_qd)
+    return legs_fit(geometry, ground, draw, own, possible, joint_q, joint_qd)
 
 
 @wp.func
 def draw_until_taken(
     robot: RobotArrays, scene: Scene, ground: Ground, limits: LegLimits, settings: VelocitySettings, draw: Draw,
     spot: wp.vec2, heading: float,
-) -> int:  # fmt: skip
-    """Draw states until one can be taken; returns 0 if none of the attempts could."""
-    for attempt in range(int(ATTEMPTS)):
-        fresh = branch(draw, attempt)
-        d = draw_base(fresh, settings, ground, spot, heading)
-        if store_draw(robot, scene.geometry, ground, limits, settings, fresh, draw.world, d) != 0:
-            return 1
-    return 0
+) -> bool:  # fmt: skip
+    """Draw states until one can be taken, and write it; returns whether one of the attempts could."""
+    com = robot.body_com[draw.world * BODIES]
+    own_q = wp.zeros(shape=(COORDS,), dtype=float)
+    own_qd = wp.zeros(shape=(DOFS,), dtype=float)
+    taken = int(ATTEMPTS)
+    for attempt in range(first_attempt(draw), ATTEMPTS, attempt_step(draw)):
+        if taken == ATTEMPTS:
+            fresh = branch(draw, attempt)
+            d = draw_base(fresh, settings, ground, spot, heading)
+            if store_draw(scene.geometry, com, ground, limits, settings, fresh, d, own_q, own_qd):
+                taken = attempt
+    return keep_first(scene.geometry, draw, taken, own_q, own_qd, robot.joint_q, robot.joint_qd)
 
 
 @wp.func
@@ -236,12 +224,13 @@ def reset_velocity(
     here = world_ground(scene.ground, world)
     spot = draw_spot(draw, settings.map, new.terrain_level)
     heading = between(draw, 12, -settings.heading, settings.heading)
-    taken = int(0)
+    taken = bool(False)
+    meet_attempts(draw)  # all have read where the base was
     if between(draw, 1, 0.0, 1.0) >= settings.default_share:
         taken = draw_until_taken(
             robot, scene, here, leg_limits(skill.command_filter), settings, draw, spot, heading
         )  # fmt: skip
-    if taken == 0:
+    if not taken:
         store_pose(robot, scene, world, heading, surface(here, spot[0], spot[1])[0])
         robot.joint_q[world * COORDS] = spot[0]
         robot.joint_q[world * COORDS + 1] = spot[1]

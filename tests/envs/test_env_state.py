@@ -255,6 +255,24 @@ def test_an_environment_goes_on_with_late_observations_and_history_bit_for_bit()
     assert len(list(go_on_alike(saved, fresh))) == 25
 
 
+def test_numbers_that_were_set_come_back_and_the_others_are_the_tasks():
+    env, other = (make_env(4, **settings) for settings in ({}, {"task": make_task("vertical-jump").with_terms(
+        "rewards", orientation={"weight": 3.5})}))  # fmt: skip
+    env.skills[0].set("rewards", "jump_height", weight=7.0, fine=0.2)
+    state = env.state_dict()
+    other.skills[0].set("rewards", "jump_height", wide=0.9)
+    other.load_state_dict(state)
+    numbers = other.skills[0].numbers.numpy()
+    task = other.skills[0].task
+    expected = np.array(task.numbers, dtype=np.float32)
+    for key, value in (("weight", 7.0), ("fine", 0.2)):
+        expected[task.place("rewards", "jump_height", key)] = value
+    np.testing.assert_array_equal(numbers, expected)
+    state["vertical-jump/changed"][0] = np.nan
+    with pytest.raises(ValueError, match="changed is not a number"):
+        other.load_state_dict(state)
+
+
 def test_a_state_of_before_the_first_reset_begins_as_a_new_environment_does():
     task = dataclasses.replace(make_task("vertical-jump"), randomization=RandomizationCfg(redraw="startup"))
     saved, fresh = (Env(task, 2, seed=1, device="cpu") for _ in range(2))

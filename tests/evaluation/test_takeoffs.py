@@ -127,9 +127,9 @@ def test_rows_of_actions_go_to_both_sides():
 
 def test_landing_estimate_against_hand_numbers():
     """Forward 2 m/s at a height of 0.25 m: a pendulum asks for 2 x sqrt(0.25 / 9.81) = 0.319 m."""
-    assert capture_distance(2.0, 0.25) == pytest.approx(0.3193, abs=1e-4)
+    assert capture_distance(2.0, 0.25, 9.81) == pytest.approx(0.3193, abs=1e-4)
     # friction 0.5 takes 2 m/s with an impulse of 4 m/s: 1 of the fall, 3 of 3 / 9.81 s of weight
-    assert stopping_time(2.0, 1.0, 0.5) == pytest.approx(0.3058, abs=1e-4)
-    assert stopping_time(2.0, 1.0, 3.0) == 0.0
+    assert stopping_time(2.0, 1.0, 0.5, 9.81) == pytest.approx(0.3058, abs=1e-4)
+    assert stopping_time(2.0, 1.0, 3.0, 9.81) == 0.0
     # outer thigh level, inner one 30 degrees beyond its twin: 0.24 m to the middle of the hips and 0.32 m of leg
     assert reach(horizontal_jump_filter(), 0.30) == pytest.approx(0.56, abs=0.01)

@@ -162,8 +162,8 @@ def test_gait_of_a_made_up_trot():
     force = contact * 0.5 * 14.0 * 9.81
     torque = np.zeros((steps, n, 12))
     torque[:, 0, 0], torque[7, 1, 3] = 2.0, -9.0
-    power, speed, mass = np.full((steps, n), 30.0), np.full((steps, n), 0.5), np.full(n, 14.0)
-    metrics = gaits.gait_metrics(contact, height, force, torque, power, speed, mass, DT)
+    power, speed, weight = np.full((steps, n), 30.0), np.full((steps, n), 0.5), np.full(n, 14.0 * 9.81)
+    metrics = gaits.gait_metrics(contact, height, force, torque, power, speed, weight, DT)
     assert metrics["cost_of_transport"] == pytest.approx(30.0 / (14.0 * 9.81 * 0.5))
     assert metrics["share_down_FL_BR"] == metrics["share_down_FR_BL"] == pytest.approx(0.5)
     assert metrics["largest_torque_nm"] == 9.0 and metrics["paw_force_ripple"] == pytest.approx(0.0, abs=1e-9)

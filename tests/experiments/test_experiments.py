@@ -1,3 +1,4 @@
+import dataclasses
 import json
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -21,7 +22,7 @@ from jumper_warp.evaluation.jumps import Jumps, run_jumps
 from jumper_warp.evaluation.learning import Curve
 from jumper_warp.evaluation.limits import limit_metrics
 from jumper_warp.evaluation.run import HEIGHTS, EvaluationRun
-from jumper_warp.evaluation.soak import SoakArgs
+from jumper_warp.evaluation.soak import SoakArgs, hardest
 from jumper_warp.policies.folder import save_policy
 from jumper_warp.registry import make_task
 from jumper_warp.rl.cfg import PpoCfg
@@ -274,15 +275,35 @@ def test_soak_of_a_simulation_and_of_an_environment_finds_finite_worlds(tmp_path
         values = soak_test.main(args)
         saved = json.loads((tmp_path / "figures.json").read_text())
         assert saved == values | {"envs": 8, "filter": False, "seed": 0}
-        assert (values["steps"], values["non_finite_worlds"]) == (320, 0)
+        assert (values["steps"], values["non_finite_worlds"], values["non_finite_rows"]) == (320, 0, 0)
         assert 0.01 < values["largest_speed_m_s"] < 10.0 and values["largest_joint_speed_rad_s"] > 1.0
 
 
 def test_worlds_that_come_apart_in_a_soaked_environment_are_counted(tmp_path, monkeypatch):
     step = soak_test.Env.step
     monkeypatch.setattr(soak_test.Env, "step", lambda env, action: step(env, torch.full_like(action, torch.nan)))
-    args = SoakArgs(envs=4, steps=5, episode=100, task="vertical-jump", out=tmp_path, device="cpu")
+    args = SoakArgs(envs=4, steps=5, hold=5, episode=100, task="vertical-jump", out=tmp_path, device="cpu")
     assert soak_test.main(args)["non_finite_worlds"] == 20
+
+
+def test_row_that_is_not_finite_ends_a_soak(tmp_path, monkeypatch):
+    step = soak_test.Env.step
+
+    def spoilt(env, action):
+        step(env, action)
+        env.reward[2] = torch.nan
+
+    monkeypatch.setattr(soak_test.Env, "step", spoilt)
+    args = SoakArgs(envs=4, steps=40, episode=20, task="vertical-jump", out=tmp_path, device="cpu")
+    with pytest.raises(RuntimeError, match="20 rows hold values that are not finite, by step 20"):
+        soak_test.main(args)
+
+
+def test_soak_is_on_the_hardest_row_of_a_map_and_leaves_other_tasks_alone():
+    terrain = hardest(make_task("velocity-rough")).reset.settings.terrain
+    assert terrain == dataclasses.replace(make_task("velocity-rough").reset.settings.terrain, rows=1)
+    for name in ("velocity-flat", "vertical-jump"):
+        assert hardest(make_task(name)) == make_task(name)
 
 
 def test_rates_are_told_over_those_of_a_baseline(tmp_path):

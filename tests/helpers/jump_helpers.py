@@ -12,7 +12,7 @@ from jumper_warp.envs.env import Env
 from jumper_warp.envs.skill import Skill
 from jumper_warp.registry import make_task
 from jumper_warp.tasks.cfg import TaskCfg
-from jumper_warp.tasks.jump.cfg import Level, ResetCfg
+from jumper_warp.tasks.jump.cfg import SHARES, Level, ResetCfg
 from jumper_warp.tasks.jump.observations import EPISODE
 from jumper_warp.tasks.observations import exact
 from kernels.jump.reset import JumpLevel, JumpSettings
@@ -22,7 +22,7 @@ from kernels.mdp.view import RobotView, vec12
 from kernels.terrain.ground import Ground
 
 DEG = np.pi / 180.0
-SCHEMES = ("standing", "default", "in_flight", "touchdown", "landed")
+SCHEMES = ("standing", "default", "in_flight", "touchdown", "landed", "pushing")
 OF_WORLD = ("level", "streak")
 """What a world keeps from episode to episode."""
 
@@ -145,7 +145,7 @@ def tilted_by(angle: float, axis=(1.0, 0.0, 0.0)) -> dict:
 
 def only(scheme: str, reset: ResetCfg | None = None, **ranges) -> ResetCfg:
     """Return resets that all follow one scheme, otherwise as `reset`."""
-    shares = dict.fromkeys(SCHEMES[:4], 0.0) | ({} if scheme == "landed" else {scheme: 1.0})
+    shares = dict.fromkeys(SHARES, 0.0) | ({} if scheme == "landed" else {scheme: 1.0})
     return dataclasses.replace(ResetCfg() if reset is None else reset, **shares, **ranges)
 
 

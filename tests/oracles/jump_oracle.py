@@ -11,7 +11,7 @@ SLOTS = np.array([5 * leg + joint for leg in range(4) for joint in (0, 1, 3)])
 T = np.arange(12) % 3 != 0
 STANCE, FLIGHT, LANDED = 0, 1, 2
 EPISODE = """goal heading start phase phase_steps steps command_step took_off touched_down at_apex apex_passed
-max_height""".split()
+max_height paws_landed""".split()
 
 
 def robot_of(env) -> dict[str, np.ndarray]:
@@ -30,6 +30,10 @@ def robot_of(env) -> dict[str, np.ndarray]:
         "torque": views.torque.numpy().astype(float),
         "action": views.action.numpy().astype(float),
         "force": np.linalg.norm(views.paw_force.numpy().astype(float), axis=2),
+        "old_torque": views.old_torque.numpy().astype(float),
+        "peak": views.peak_force.numpy().astype(float),
+        "paws": views.paw_pos.numpy().astype(float),
+        "air_time": views.air_time.numpy().astype(float),
         "clipped": np.sum((views.target.numpy().astype(float) - views.safe_target.numpy()) ** 2, axis=0),
     }
     return robot | {name: tasks[name].copy() for name in EPISODE}
@@ -53,6 +57,9 @@ def random_robots(n: int, seed: int) -> dict[str, np.ndarray]:
         "torque": 9.0 * rng.normal(size=(12, n)), "action": rng.uniform(-1.0, 1.0, (12, n)),
         "old_action": rng.uniform(-1.0, 1.0, (12, n)), "force": 100.0 * rng.uniform(-0.5, 1.0, (4, n)).clip(0.0),
         "clipped": rng.random(n),
+        "old_torque": 9.0 * rng.normal(size=(12, n)), "peak": 150.0 * rng.random((4, n)),
+        "paws": pos + 0.3 * rng.normal(size=(4, n, 3)), "air_time": rng.uniform(0.0, 0.2, (4, n)),
+        "paws_landed": rng.integers(0, 16, n),
         "goal": goal, "heading": heading, "start": pos + near * rng.normal(size=(n, 3)), "phase": rng.integers(0, 3, n),
         "phase_steps": rng.integers(0, 60, n), "steps": rng.integers(0, 60, n), "command_step": rng.integers(0, 60, n),
         "took_off": rng.integers(0, 2, n), "touched_down": rng.integers(0, 2, n), "at_apex": rng.integers(0, 2, n),
@@ -64,10 +71,13 @@ def kernel_inputs(r: dict) -> tuple[list, list]:
     """Return the `RobotView` and the `JumpState` of each of some robots."""
     views, tasks = [], []
     gravity = Rotation.from_quat(r["quat"]).inv().apply([0.0, 0.0, -1.0])
-    motors = ("angle", "rate", "rate_change", "torque", "action", "old_action")
+    motors = ("angle", "rate", "rate_change", "torque", "old_torque", "action", "old_action")
     for i in range(len(r["pos"])):
         base = {"pos": r["pos"][i], "quat": r["quat"][i], "lin_vel": r["vel"][i], "lin_acc": r["acc"][i]}
+        base |= {"old_lin_vel": r["vel"][i] - DT * r["acc"][i]}
         base |= {"ang_vel": r["spin"][i], "gravity": gravity[i], "paw_force": r["force"][:, i]}
+        base |= {"peak_force": r["peak"][:, i], "air_time": r["air_time"][:, i], "paw_pos": r["paws"][:, i].ravel()}
+        base |= {"contact": (r["force"][:, i] > CONTACT_FORCE).astype(float)}
         base |= {"contacts": int(np.count_nonzero(r["force"][:, i] > CONTACT_FORCE))}
         views.append(make_view(**base, **{name: r[name][:, i] for name in motors}, clipped=float(r["clipped"][i])))
         tasks.append(make_episode(**{name: r[name][i] if r[name].ndim > 1 else r[name][i].item() for name in EPISODE}))
@@ -153,9 +163,17 @@ def estimated_error(r, height):
 
 
 def deceleration(r):
-    """Acceleration against the direction of motion [m/s^2], 0 where it speeds up."""
-    speed = norm(r["vel"])
-    return np.where(speed > 1e-6, np.maximum(-np.sum(r["acc"] * r["vel"], axis=1) / np.maximum(speed, 1e-9), 0.0), 0.0)
+    """Speed of the step before that was lost over the step [m/s^2]: all of it where the motion turned round."""
+    before = r["vel"] - DT * r["acc"]
+    speed = norm(before)
+    kept = np.sum(r["vel"] * before, axis=1) / np.maximum(speed, 1e-9)
+    return np.where(speed > 1e-6, np.maximum(speed - np.maximum(kept, 0.0), 0.0) / DT, 0.0)
+
+
+def capture_offset(r):
+    """Where a pendulum of the base's height, moving as it does, comes to rest, from the middle of the paws [m]."""
+    omega = np.sqrt(G / r["pos"][:, 2])
+    return (r["pos"] + r["vel"] / omega[:, None] - r["paws"].mean(axis=0))[:, :2]
 
 
 def symmetry(r, p):
@@ -212,6 +230,19 @@ TERMS = {
         ((r["phase"] == LANDED) & (r["phase_steps"] > p["steps"]))
         * np.count_nonzero(r["force"] <= CONTACT_FORCE, axis=0)
     ),
+    "lifted_again": lambda r, p: (
+        (r["phase"] == LANDED)
+        * np.sum(
+            (r["paws_landed"][None] >> np.arange(4)[:, None] & 1 == 1)
+            & (r["force"] <= CONTACT_FORCE)
+            & (r["air_time"] > p["free"]),
+            axis=0,
+        )
+    ),
+    "capture_point": lambda r, p: (r["phase"] == LANDED) * phi(norm(capture_offset(r)), p["width"]),
+    "resting_action_rate": lambda r, p: at_ease(r) * np.sum((r["action"] - r["old_action"]) ** 2, axis=0),
+    "torque_ripple": lambda r, p: at_ease(r) * np.sum((r["torque"] - r["old_torque"]) ** 2, axis=0),
+    "force_ripple": lambda r, p: at_ease(r) * np.sum(((r["peak"] - r["force"]) / p["weight_force"]) ** 2, axis=0),
     "soft_impact": lambda r, p: soon(r) * np.maximum(1.0 - deceleration(r) / p["limit"], 0.0),
     "stance_impact": lambda r, p: -1.0 * (r["phase"] == STANCE) * np.minimum(deceleration(r) / p["limit"], 1.0),
     "catch_landing": lambda r, p: soon(r) * np.clip(-r["vel"][:, 2], 0.0, 1.0),

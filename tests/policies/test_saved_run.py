@@ -92,7 +92,7 @@ def test_setting_that_is_not_saved_keeps_its_default(saved):
 def test_unknown_reward_is_refused_unless_rewards_are_not_wanted(saved):
     _, config = saved
     config["env"]["task"]["rewards"].append({"type": "jumper_warp.tasks.terms:RewardTerm", "func": "mine:my_own"})
-    with pytest.raises(PolicyError, match=r"task.rewards\[19\] needs 'mine:my_own': name the file"):
+    with pytest.raises(PolicyError, match=r"task.rewards\[23\] needs 'mine:my_own': name the file"):
         whole(config)
     assert restored_task(config).name == "vertical-jump"
 

@@ -256,20 +256,20 @@ def test_stops_hold_constant_torque(ground):
     for world, (outer, inner) in enumerate(((1, 1), (-1, -1), (1, -1), (-1, 1)), start=24):
         torque[world, 1::3], torque[world, 2::3] = 24.8 * outer, 24.8 * inner
     motors, sums = push(simulation(28, ground=ground), lambda _: torque, 480)
-    assert motors < 3.0
-    assert sums < 5.0
+    assert motors < 0.3
+    assert sums < 0.1
 
 
-# an impact can carry a motor on for one step, 4.8 degrees at its no-load speed, before its stop acts
-@pytest.mark.parametrize(("ground", "step"), [("plane", 4.8), (None, 0.0)])
-def test_stops_hold_random_torque(ground, step):
+# 1 degree: impacts of several kN on jammed legs
+@pytest.mark.parametrize(("ground", "most"), [("plane", 1.0), (None, 0.3)])
+def test_stops_hold_random_torque(ground, most):
     sim = simulation(64, ground=ground)
     for seed in range(14, 18):
         thrown(sim, seed)
         torques = np.repeat(np.random.default_rng(seed).uniform(-24.8, 24.8, (12, 64, 12)), 20, axis=0)
         motors, sums = push(sim, lambda i, torques=torques: torques[i], 240)
-        assert motors < 3.0 + step
-        assert sums < 5.0 + 2.0 * step
+        assert motors < most
+        assert sums < most
 
 
 def test_stops_hold_in_drops_from_two_metres_on_stiff_legs():
@@ -283,8 +283,8 @@ def test_stops_hold_in_drops_from_two_metres_on_stiff_legs():
         worst = np.maximum(worst, worst_excess(sim, counts)) if counts.any() else worst
     assert landed.sum() > 40
     assert not sim.solver.invalid.numpy().any()
-    assert worst[0] < 3.0
-    assert worst[1] < 5.0
+    assert worst[0] < 1.0
+    assert worst[1] < 0.3
 
 
 def test_thousand_policy_steps_of_random_targets_stay_finite():

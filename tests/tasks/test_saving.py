@@ -144,7 +144,7 @@ def test_setting_that_would_not_come_back_is_not_saved(value):
         (lambda t: t["advance"].update(func="kernels.mdp.view:load_view"), "must be annotated RobotView"),
         (lambda t: t.update(state="kernels.mdp.env:Nothing"), "not a struct that counts steps"),
         (lambda t: t["levels"].append({"type": "jumper_warp.robot.motors:LimitsCfg", "lower": 0.0, "upper": 1.0}),
-         r"task.levels\[3\]: .* needs struct and values"),
+         r"task.levels\[6\]: .* needs struct and values"),
         (lambda t: t.update(levels=t["levels"] * MAX_ENTRIES), f"expected at most {MAX_ENTRIES} entries"),
         (lambda t: t["reset"].update(settings={"type": "jumper_warp.robot.motors:LimitsCfg", "lower": 0, "upper": 1}),
          "needs struct and values"),
@@ -162,7 +162,7 @@ def test_what_is_no_task_is_refused(change, message):
 
 def test_setting_that_is_not_saved_keeps_its_default():
     content = saved(make_task("vertical-jump"))
-    del content["contact_force"], content["curriculum"]["promote_after"], content["reset"]["settings"]["standing"]
+    del content["contact_force"], content["curriculum"]["promote_after"], content["reset"]["settings"]["tilt"]
     assert task_from_json(content) == make_task("vertical-jump")
 
 

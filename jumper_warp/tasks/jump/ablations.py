@@ -18,7 +18,7 @@ def without_estimate(task: TaskCfg) -> TaskCfg:
 
 def without_reference_states(task: TaskCfg) -> TaskCfg:
     """Return the task whose episodes all begin standing: none in flight, at touchdown or landed."""
-    settings = replace(task.reset.settings, standing=0.8, default=0.2, in_flight=0.0, touchdown=0.0)
+    settings = replace(task.reset.settings, standing=0.8, default=0.2, in_flight=0.0, touchdown=0.0, pushing=0.0)
     return replace(task, reset=replace(task.reset, settings=settings))
 
 

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from itertools import accumulate
-from typing import Any
+from itertools import product
+from typing import Any, Literal
 
 import warp as wp
 
@@ -14,8 +15,11 @@ from jumper_warp.utils.errors import InputError
 from kernels.jump.ground_draws import EVERY_SIDE, GroundRanges
 from kernels.jump.reset import JumpLevel, JumpSettings
 from kernels.jump.reset_draws import ResetRanges
+from kernels.jump.state import vec_schemes
 
 Pair = tuple[float, float]
+SHARES = ("standing", "default", "in_flight", "touchdown", "pushing")
+"""Of the ways in which an episode begins; the rest begins just landed."""
 
 
 @dataclass(frozen=True)
@@ -78,6 +82,8 @@ class Level:
     """[m] Of standing starts; low ones are deep squats."""
     jump_again: float = 0.0
     """[1] Share of the episodes in which a landed robot gets another goal."""
+    round: bool = False
+    """Whether goals lie in the ellipse inside the box alone, whose half axes are the reaches each way."""
 
     struct = JumpLevel
     """What the kernels read."""
@@ -96,7 +102,16 @@ class Level:
         level = JumpLevel()
         level.goal_lower, level.goal_upper = wp.vec3(*self.goal_lower), wp.vec3(*self.goal_upper)
         level.base_height, level.jump_again = wp.vec2(*self.base_height), self.jump_again
+        level.round = int(self.round)
         return level
+
+
+def ladder(goals: Sequence[Level], starts: Sequence[Pair]) -> tuple[Level, ...]:
+    """Return the levels of two curricula: for each level of goals all ranges of standing starts [m], easiest first.
+
+    So the starts have their own curriculum, which begins anew with every level of goals, as the authors have it.
+    """
+    return tuple(replace(goal, base_height=start) for goal, start in product(goals, starts))
 
 
 @dataclass(frozen=True)
@@ -107,13 +122,18 @@ class ResetCfg:
     default: float = 0.15
     in_flight: float = 0.20
     touchdown: float = 0.0
+    pushing: float = 0.0
     """Shares; what is left begins just landed."""
+    shares_of: Literal["resets", "time"] = "resets"
+    """Whether shares are of resets, or of the time spent in episodes, which a world evens out from reset to reset."""
     base_xy: float = 0.05
     """[m]"""
     tilt: float = 5.0
     """[deg] Roll, pitch and yaw."""
     forward_pitch: float = 0.0
     """[deg] Largest mean pitch of standing states."""
+    lean: float = 0.0
+    """[m] Farthest that the base of the deepest squats is behind the middle of the paws, away from the goal."""
     heading: float = 0.0
     """[deg] Half width of the heading."""
     front_x: Pair = (0.20, 0.22)
@@ -128,6 +148,12 @@ class ResetCfg:
     """[m]"""
     takeoff_ahead: Pair = (0.0, 0.0)
     """[m] Base ahead of its start, towards the goal."""
+    takeoff_pitch: Pair = (0.0, 0.0)
+    """[deg] Mean pitch, nose down, in flight and pushing off."""
+    push_length: Pair = (0.0, 0.4)
+    """[m] Of the straight way to the takeoff, on which the base of those that push off is."""
+    push_acceleration: Pair = (10.0, 20.0)
+    """[m/s^2] On it."""
     takeoff_angle: Pair = (50.0, 75.0)
     """[deg] Above the horizon, where the goal names no apex."""
     highest_apex: float = 1.0
@@ -165,16 +191,20 @@ class ResetCfg:
         if not min(shares) >= 0.0 or sum(shares) > 1.0 + 1e-9:
             raise InputError(f"reset shares must be >= 0 and add up to at most 1, got {shares}")
         for name, value in vars(self).items():
-            if name != "ground":
+            if name not in ("ground", "shares_of"):
                 check_finite(f"reset {name}", *(value if isinstance(value, tuple) else (value,)))
             if isinstance(value, tuple) and not value[0] <= value[1]:
                 raise InputError(f"reset {name} must be (lower, upper), got {value}")
-        for name, least in (("command_delay", self.command_delay), ("again_delay", self.again_delay[0])):
+        for name in ("command_delay", "again_delay", "lean", "push_length", "push_acceleration"):
+            value = getattr(self, name)
+            least = value[0] if isinstance(value, tuple) else value
             if not least >= 0.0:
                 raise InputError(f"reset {name} must not be negative, got {least}")
+        if self.shares_of not in ("resets", "time"):
+            raise InputError(f"reset shares_of must be resets or time, got {self.shares_of!r:.40}")
 
     def _shares(self) -> tuple[float, ...]:
-        return (self.standing, self.default, self.in_flight, self.touchdown)
+        return tuple(getattr(self, name) for name in SHARES)
 
     struct = JumpSettings
     """What the kernels read."""
@@ -196,9 +226,15 @@ class ResetCfg:
 
     def _ranges(self, step_dt: float) -> Any:
         ranges = ResetRanges()
-        ranges.shares = wp.vec4(*accumulate(self._shares()))
-        degrees = ("tilt", "forward_pitch", "heading", "takeoff_angle", "flight_lateral", "flight_transversal")
-        apart = ("standing", "default", "in_flight", "touchdown", "command_delay", "again_delay", "ground")
+        *others, pushing = self._shares()
+        landed = 1.0 - sum(self._shares())
+        ranges.shares = vec_schemes(*others, landed if landed > 1.0e-6 else 0.0, pushing)
+        ranges.of_time = int(self.shares_of == "time")
+        degrees = (
+            "tilt", "forward_pitch", "heading", "takeoff_angle", "takeoff_pitch", "flight_lateral",
+            "flight_transversal",
+        )  # fmt: skip
+        apart = (*SHARES, "shares_of", "command_delay", "again_delay", "ground")
         for name, value in vars(self).items():
             if name in apart:
                 continue

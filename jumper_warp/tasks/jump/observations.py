@@ -13,6 +13,12 @@ VERTICAL = (ObservationTerm(jump.wanted_height), ObservationTerm(jump.jump_comma
 HORIZONTAL = (ObservationTerm(jump.goal, noise=POSITION_NOISE), HEIGHT, *ROBOT)
 """Of jumps to places."""
 
+SIGHT = ObservationTerm(jump.block_ahead)
+"""Of the block ahead, exact, for critics."""
+
+SIGHTED = (*HORIZONTAL, SIGHT.replace(noise=0.01))
+"""Of jumps to places by robots that see the edges ahead to a centimetre."""
+
 EPISODE = (
     ObservationTerm(jump.phase),
     ObservationTerm(jump.phase_times),
@@ -24,6 +30,6 @@ EPISODE = (
 """What only a simulation knows of a jump."""
 
 
-def critic(policy: tuple[ObservationTerm, ...]) -> tuple[ObservationTerm, ...]:
-    """Return the critic's terms: the policy's without noise, the episode's, and the drawn parameters."""
-    return (*exact(policy), *EPISODE, *DRAWN)
+def critic(policy: tuple[ObservationTerm, ...], *more: ObservationTerm) -> tuple[ObservationTerm, ...]:
+    """Return the critic's terms: the policy's without noise, the episode's, more of them, and the drawn parameters."""
+    return (*exact(policy), *EPISODE, *DRAWN, *more)

@@ -149,6 +149,30 @@ def test_the_second_jump_is_commanded_at_once(second):
     np.testing.assert_array_equal(after["command_step"][AGAIN], after["steps"][AGAIN])
 
 
+def shown(arrays):
+    """Return the way to the goal [m] ahead and to the left, as it is observed."""
+    return in_yaw_frame((arrays["goal"] - arrays["base_pos"]) * [1.0, 1.0, 0.0], yaw_of(arrays))[:, :2]
+
+
+def test_the_second_goal_is_seen_at_once(env):
+    land(env)
+    edit_episodes(env, AGAIN, again_step=13)
+    env.step(REST)
+    after = env.task_arrays()
+    assert (after["jumps"][AGAIN] == np.arange(N)[AGAIN] % 3 + 1).all()
+    np.testing.assert_allclose(env.obs[:, :2].numpy(), shown(after), atol=1e-5)
+
+
+def test_a_goal_from_outside_is_seen_at_once(env):
+    land(env)
+    env.step(REST)
+    before = env.obs.clone()
+    chosen = np.arange(N) % 2 == 0
+    env.command(np.tile([0.7, -0.2, 0.0], (N, 1)), chosen)
+    np.testing.assert_allclose(env.obs[chosen, :2].numpy(), np.tile([0.7, -0.2], (N // 2, 1)), atol=1e-5)
+    assert torch.equal(env.obs[~chosen], before[~chosen])
+
+
 def test_the_second_goal_is_in_the_levels_box_before_the_robot(env):
     ahead, level = [], []
     for _ in range(8):

@@ -2,7 +2,7 @@ import math
 
 import numpy as np
 import pytest
-from jump_helpers import DEG, MOTOR_SLOTS, Robots, make_env, make_episode, only
+from jump_helpers import DEG, MOTOR_SLOTS, Robots, edit_episodes, make_env, make_episode, only
 from mdp_helpers import array
 from scipy.spatial.transform import Rotation
 
@@ -11,7 +11,8 @@ from kernels.jump.state import FLIGHT, LANDED, STANCE
 
 HORIZONTAL, VERTICAL = make_task("horizontal-jump"), make_task("vertical-jump")
 NAMES = HORIZONTAL.observation_names
-ROBOT, EPISODE = 48, 15  # columns
+ROBOT, EPISODE, BLOCK = 48, 15, 7  # columns
+DRAWN = slice(ROBOT + EPISODE, -BLOCK)
 N = 200
 
 
@@ -218,12 +219,53 @@ def test_the_environment_shows_the_critic_what_was_drawn(env):
         env.parameters.static_ratio.numpy()[:, None] - 1.0, motors.offset.numpy().T / 0.035,
         push[:, :3] / 5.0, push[:, 3:] / 3.0,
     ]  # fmt: skip
-    np.testing.assert_allclose(env.critic_obs[:, ROBOT + EPISODE :], np.concatenate(columns, axis=1), atol=1e-4)
+    np.testing.assert_allclose(env.critic_obs[:, DRAWN], np.concatenate(columns, axis=1), atol=1e-4)
 
 
 def test_drawn_parameters_are_of_order_one_and_zero_without_randomisation(env):
-    shown = env.critic_obs[:, ROBOT + EPISODE :].numpy()
-    assert shown.shape[1] == env.num_critic_obs - ROBOT - EPISODE
+    shown = env.critic_obs[:, DRAWN].numpy()
+    assert shown.shape[1] == env.num_critic_obs - ROBOT - EPISODE - BLOCK
     assert np.abs(shown).max() < 3.0 and (np.abs(shown).max(axis=0) > 0.04).all()
     nominal = make_env(16, task=HORIZONTAL, reset=only("default"))
-    assert not nominal.critic_obs[:, ROBOT + EPISODE :].any()
+    assert not nominal.critic_obs[:, DRAWN].any()
+
+
+# ---------------------------------------------------------------- the block ahead
+
+
+def edges(block, base, heading):
+    """Return where a ray is first and last above a block [m], by looking every half a millimetre; 2 m if it is not."""
+    at = np.arange(-2.0, 2.0, 5e-4)
+    off = np.abs(base[:, None] + np.outer([np.cos(heading), np.sin(heading)], at) - block["center"][:, None])
+    over = at[(off <= block["half"][:, None]).all(axis=0)]
+    return (over[0], over[-1]) if len(over) and block["exists"] else (2.0, 2.0)
+
+
+def test_the_block_ahead_is_seen_along_three_rays():
+    task = make_task("horizontal-jump-sighted")
+    assert len(task.observation_names) == ROBOT + BLOCK and task.observation_names[:ROBOT] == NAMES
+    env = make_env(256, task=task, reset=only("standing", task.reset.settings), randomize=True, seed=5)
+    edit_episodes(env, level=7)
+    env.reset()
+    blocks = env.sim.physics.dynamics.robot.ground.blocks.numpy()
+    exists = blocks["exists"] == 1
+    assert 40 < exists.sum() < 216
+    seen = env.obs[:, ROBOT:].numpy()
+    np.testing.assert_array_equal(env.critic_obs[:, ROBOT : ROBOT + BLOCK], seen)
+    q = env.sim.joint_q()
+    yaw = np.arctan2(*Rotation.from_quat(q[:, 3:7]).apply([1.0, 0.0, 0.0])[:, 1::-1].T)
+    sides = [(0, 0.2), (1, 0.0), (2, -0.2)]
+    for world in range(256):
+        for ray, aside in sides:
+            base = q[world, :2] + aside * np.array([-np.sin(yaw[world]), np.cos(yaw[world])])
+            expected = edges(blocks[world], base, yaw[world])
+            np.testing.assert_allclose(seen[world, 2 * ray : 2 * ray + 2], expected, atol=2e-3)
+    np.testing.assert_allclose(seen[:, 6], np.where(exists, blocks["height"], 0.0), atol=1e-6)
+    ahead = exists & (seen[:, 2] > 0.0) & (seen[:, 2] < 2.0)
+    under = exists & (seen[:, 2] < 0.0)
+    assert ahead.sum() > 20 and under.sum() > 20
+
+
+def test_without_blocks_nothing_is_ahead():
+    env = make_env(2, task=make_task("horizontal-jump-sighted"))
+    np.testing.assert_array_equal(env.obs[:, ROBOT:], np.tile([2.0] * 6 + [0.0], (2, 1)))

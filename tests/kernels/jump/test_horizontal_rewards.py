@@ -196,3 +196,36 @@ def test_a_term_is_logged_as_computed_by_hand(rollout, index):
     logged, expected = (values[:, index] for values in rollout)
     assert expected.any()
     np.testing.assert_allclose(logged, expected, rtol=2e-3, atol=2e-4 * np.abs(expected).max())
+
+
+def test_paws_cost_that_are_off_again_after_their_own_first_contact():
+    """Of FL, FR, BL, BR: down; up for 0.1 s after it was down; up for 0.02 s; still to come down."""
+    view = make_view(contact=(1.0, 0.0, 0.0, 0.0), air_time=(0.0, 0.1, 0.02, 0.4))
+    landed = make_episode(phase=LANDED, paws_landed=0b0111)
+    assert paid("lifted_again", view, landed, free=0.05) == 1.0
+    assert paid("lifted_again", view, landed, free=0.0) == 2.0
+    assert paid("lifted_again", view, make_episode(phase=FLIGHT, paws_landed=0b0111), free=0.0) == 0.0
+
+
+def test_bracing_is_paid_where_a_pendulum_stops_over_the_paws():
+    # 0.2453 m high on Earth: sqrt(h / g) = 0.1581 s; at 2 m/s it stops 0.3162 m ahead
+    paws = np.tile([0.3162, 0.0, 0.0], (4, 1))
+    view = make_view(pos=(0.0, 0.0, 0.24525), lin_vel=(2.0, 0.0, -3.0), paw_pos=paws.ravel())
+    landed = make_episode(phase=LANDED)
+    assert paid("capture_point", view, landed, width=0.1) == pytest.approx(1.0, abs=1e-4)
+    view.fall_acc = 9.81 / 4.0  # twice as far
+    assert paid("capture_point", view, landed, width=0.3162) == pytest.approx(E(-1.0), rel=1e-3)
+    assert paid("capture_point", view, make_episode(phase=FLIGHT), width=0.1) == 0.0
+
+
+def test_ripple_costs_while_the_robot_should_rest_only():
+    view = make_view(
+        torque=np.arange(12.0), old_torque=np.arange(12.0) - 0.5, paw_force=(30.0, 30.0, 30.0, 30.0),
+        peak_force=(30.0, 40.0, 30.0, 30.0), action=np.full(12, 0.1), old_action=np.zeros(12),
+    )  # fmt: skip
+    resting = (make_episode(steps=3, command_step=9), make_episode(phase=LANDED, phase_steps=30))
+    moving = (make_episode(steps=9, command_step=9), make_episode(phase=FLIGHT), make_episode(phase=LANDED))
+    for name, value, numbers in (("torque_ripple", 3.0, {}), ("resting_action_rate", 0.12, {}),
+                                 ("force_ripple", 0.01, {"weight_force": 100.0})):  # fmt: skip
+        assert all(paid(name, view, task, **numbers) == pytest.approx(value, rel=1e-4) for task in resting), name
+        assert not any(paid(name, view, task, **numbers) for task in moving), name

@@ -163,3 +163,12 @@ def test_a_projectile_that_never_reaches_a_height_lands_nowhere_else():
     found = jump_phase.estimated_landing(wp.vec3(0.5, 0.6, 0.2), wp.vec3(1.0, 1.0, -0.5), 0.3, G)
     np.testing.assert_allclose(list(found), [0.5, 0.6], atol=1e-6)
     assert jump_phase.estimated_apex(wp.vec3(0.0, 0.0, 0.2), wp.vec3(0.0, 0.0, -5.0), G) == pytest.approx(0.2)
+
+
+def test_paws_count_as_landed_from_their_own_first_contact_after_the_touchdown():
+    down = [(0, 0, 0, 0), (1, 0, 0, 0), (1, 1, 0, 0), (0, 1, 0, 0), (0, 1, 1, 1)]
+    views = [stand(sum(paws), contact=np.array(paws, dtype=float)) for paws in down]
+    flying = make_episode(phase=FLIGHT, apex_passed=1, paws_landed=15)
+    states, _, _ = advance(views, flying)
+    assert states["phase"].tolist() == [int(FLIGHT)] + 4 * [int(LANDED)]
+    assert states["paws_landed"][1:].tolist() == [1, 3, 3, 15]

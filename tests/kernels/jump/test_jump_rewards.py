@@ -123,19 +123,22 @@ def test_landing_terms_are_paid_for_three_tenths_of_a_second(term, view, p, expe
     assert paid(term, view, make_episode(phase=FLIGHT), **p) == 0.0
 
 
-@pytest.mark.parametrize(
-    ("vel", "acc", "soft", "stance"),
-    [
-        ((0.0, 0.0, -2.0), (0.0, 0.0, 10.0), 0.8, -0.4),  # falling, slowed down by 10 m/s^2
-        ((0.0, 0.0, -2.0), (0.0, 0.0, 80.0), 0.0, -1.0),  # beyond both limits
-        ((0.0, 0.0, -2.0), (0.0, 0.0, -9.81), 1.0, 0.0),  # speeding up
-        ((0.0, 0.0, 2.0), (0.0, 0.0, 30.0), 1.0, 0.0),  # taking off
-        ((3.0, 0.0, -4.0), (-5.0, 0.0, 10.0), 0.78, -0.44),  # (-5 * 3 - 10 * 4) / 5 = -11
-        ((0.0, 0.0, 0.0), (0.0, 0.0, 30.0), 1.0, 0.0),  # no direction of motion
-    ],
-)
-def test_impacts_count_deceleration_along_the_motion(vel, acc, soft, stance):
-    view = make_view(lin_vel=vel, lin_acc=acc)
+IMPACTS = [
+    ((0.0, 0.0, -2.0), (0.0, 0.0, 10.0), 0.8, -0.4),  # falling, slowed down by 10 m/s^2
+    ((0.0, 0.0, -2.0), (0.0, 0.0, 80.0), 0.0, -1.0),  # beyond both limits
+    ((0.0, 0.0, -2.0), (0.0, 0.0, -9.81), 1.0, 0.0),  # speeding up
+    ((0.0, 0.0, 2.0), (0.0, 0.0, 30.0), 1.0, 0.0),  # taking off
+    ((3.0, 0.0, -4.0), (-5.0, 0.0, 10.0), 0.78, -0.44),  # (-5 * 3 - 10 * 4) / 5 = -11
+    ((0.0, 0.0, 0.0), (0.0, 0.0, 30.0), 1.0, 0.0),  # no direction of motion
+    ((0.0, 0.0, -3.0), (0.0, 0.0, 180.0), 0.0, -1.0),  # a landing within the step
+    ((0.0, 0.0, -3.0), (0.0, 0.0, 240.0), 0.0, -1.0),  # the same with a rebound of 1 m/s
+    ((0.0, 0.0, -0.05), (0.0, 0.0, 40.0), 0.94, -0.12),  # pushing off while sinking: 0.05 m/s were lost, 3 m/s^2
+]  # (velocity before the step, mean acceleration, soft impact, stance impact)
+
+
+@pytest.mark.parametrize(("vel", "acc", "soft", "stance"), IMPACTS)
+def test_impacts_count_what_was_lost_of_the_speed_before(vel, acc, soft, stance):
+    view = make_view(old_lin_vel=vel, lin_acc=acc, lin_vel=np.array(vel) + np.array(acc) / 60.0)
     assert paid("soft_impact", view, make_episode(phase=LANDED), limit=50.0) == pytest.approx(soft)
     assert paid("stance_impact", view, make_episode(phase=STANCE), limit=25.0) == pytest.approx(stance)
     for phase in (FLIGHT, LANDED):

@@ -4,7 +4,7 @@ from jump_helpers import Table, functions, make_episode, make_view
 from kernels.jump import terminations
 from kernels.jump.state import FLIGHT, LANDED, STANCE
 
-NAMES = "success wrong_height low_touchdown moved_away slanted_takeoff hard_impact no_jump early_takeoff"
+NAMES = "success wrong_height low_touchdown moved_away slanted_takeoff hard_impact no_jump early_takeoff second_takeoff"
 holds = Table(functions(terminations, NAMES), bool)
 
 
@@ -52,8 +52,16 @@ def test_slanted_takeoff():
 def test_hard_impact_has_a_limit_for_stance_and_one_for_the_rest(phase, limit):
     task = make_episode(phase=phase)
     for acc, hard in ((limit - 0.1, False), (limit + 0.1, True), (-limit - 0.1, False)):
-        falling = make_view(lin_vel=(0.0, 0.0, -1.0), lin_acc=(0.0, 0.0, acc))
+        falling = make_view(
+            old_lin_vel=(0.0, 0.0, -1.0), lin_acc=(0.0, 0.0, acc), lin_vel=(0.0, 0.0, -1.0 + acc / 60.0)
+        )
         assert holds("hard_impact", falling, task, stance=25.0, flight=50.0) is hard
+
+
+def test_a_landing_that_stops_within_a_step_is_a_hard_impact():
+    # 3 m/s lost in 1/60 s: 180 m/s^2
+    stopped = make_view(old_lin_vel=(0.0, 0.0, -3.0), lin_acc=(0.0, 0.0, 180.0))
+    assert holds("hard_impact", stopped, make_episode(phase=LANDED, touched_down=1), stance=25.0, flight=50.0)
 
 
 def test_no_jump_within_the_time_or_at_rest_for_too_long():
@@ -72,3 +80,10 @@ def test_early_takeoff():
     assert holds("early_takeoff", make_view(), make_episode(took_off=1, steps=29, **jumped))
     assert not holds("early_takeoff", make_view(), make_episode(took_off=1, steps=30, **jumped))
     assert not holds("early_takeoff", make_view(), make_episode(took_off=0, steps=29, **jumped))
+
+
+def test_second_takeoff_is_off_all_paws_rising_after_the_landing():
+    for contacts, vz, phase, again in ((0, 0.3, LANDED, True), (0, 0.2, LANDED, False), (1, 0.3, LANDED, False),
+                                       (0, 0.3, FLIGHT, False), (0, 0.3, STANCE, False)):  # fmt: skip
+        view = make_view(contacts=contacts, lin_vel=(0.0, 0.0, vz))
+        assert holds("second_takeoff", view, make_episode(phase=phase), speed=0.25) is again

@@ -3,6 +3,8 @@ import pytest
 from mdp_helpers import write
 from probe_task import Probe
 
+from kernels.mdp.env import COMMANDED
+
 N = 49
 POLICY = {"value": [0], "both": [1, 2, 3, 4, 5, 6], "late": [7, 8]}
 """Columns of the policy's terms: one frame, three frames of two, and one delayed frame of two."""
@@ -170,6 +172,31 @@ def test_a_new_episode_sees_nothing_of_the_old_one_however_late(probe):
     policy, _ = play(probe, *sequence(DEPTH - 2, seed=1))
     np.testing.assert_array_equal(policy[..., 7], 3.25)
     np.testing.assert_array_equal(policy[..., 8], 4.25)
+
+
+def test_a_command_within_an_episode_renews_the_newest_frame_and_keeps_those_before(probe):
+    """The terms of commanded worlds are seen again, as if the step had given them; the others stay as they are."""
+    probe.latency.fill_(0)
+    values, others = sequence(5)
+    policy, critic = play(probe, values, others)
+    probe.worlds.clock.assign(probe.worlds.clock.numpy() - 1)  # as after the last step
+    some, rest = np.arange(0, N, 4), np.setdiff1d(np.arange(N), np.arange(0, N, 4))
+    probe.worlds.fresh.assign(np.isin(np.arange(N), some) * int(COMMANDED))
+    probe.write(value=7.5, other=-7.5)
+    for _ in range(2):  # a second time changes nothing
+        probe.observe(beginning=1)
+        now, final = probe.obs("policy"), probe.obs("policy", final=True)
+        np.testing.assert_array_equal(final, policy[-1])
+        np.testing.assert_array_equal(now[rest], policy[-1, rest])
+        np.testing.assert_array_equal(now[some][:, [1, 2, 3, 4]], policy[-1, some][:, [1, 2, 3, 4]])
+        np.testing.assert_array_equal(now[some][:, [5, 6, 7, 8]], np.tile([7.5, -7.5], (len(some), 2)))
+        np.testing.assert_array_equal(probe.obs("critic")[some][:, 2], critic[-1, some][:, 2])
+    probe.next_clock()
+    probe.worlds.fresh.zero_()
+    probe.latency.fill_(8)
+    again, _ = play(probe, values[:1], others[:1])
+    np.testing.assert_array_equal(again[0][some][:, [3, 4, 7, 8]], np.tile([7.5, -7.5], (len(some), 2)))
+    np.testing.assert_array_equal(again[0][some][:, [1, 2]], policy[-1, some][:, [3, 4]])
 
 
 # ---------------------------------------------------------------- broken worlds, other skills

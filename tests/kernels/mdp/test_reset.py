@@ -10,7 +10,7 @@ from scipy.stats import kstest
 
 from jumper_warp.robot.grounds import BlockCfg
 from jumper_warp.sim.simulation import Simulation
-from kernels.mdp.env import Delays, EnvArrays, Scene, SkillSettings
+from kernels.mdp.env import BEGUN, COMMANDED, Delays, EnvArrays, Scene, SkillSettings
 from kernels.mdp.reset import forget_kernel, stand_kernel, tick_kernel
 from kernels.mdp.track import track_kernel
 from kernels.mdp.view import RobotArrays
@@ -177,7 +177,7 @@ def test_a_command_that_is_due_is_drawn_and_moves_nothing(stage):
     before = values_of(stage.robot, RobotArrays)
     stage.reset(0.0)
     unchanged(before, values_of(stage.robot, RobotArrays), np.ones(N, dtype=bool))
-    assert not stage.world("fresh").any()
+    np.testing.assert_array_equal(stage.world("fresh"), np.where(due, COMMANDED, 0))
     np.testing.assert_array_equal(stage.read("counts"), np.where(due, 12, 0))
     other = stage.read("other")
     assert (other[~due] == -1.0).all() and other[due].min() >= 0.0 and len(np.unique(other[due])) == due.sum()
@@ -222,7 +222,14 @@ def test_a_command_from_outside_within_an_episode_comes_in_the_robots_heading(st
     np.testing.assert_array_equal(stage.read("value"), np.where(SOME, 4.25, 1.5))
     expected = np.where(SOME, np.arctan2(yaw[:, 1], yaw[:, 0]), 3.0)
     np.testing.assert_allclose(stage.read("other"), expected, atol=1e-5)
-    assert (stage.read("steps") == 9).all() and not stage.world("fresh").any()
+    assert (stage.read("steps") == 9).all()
+    np.testing.assert_array_equal(stage.world("fresh"), np.where(SOME, COMMANDED, 0))
+
+
+def test_a_command_before_the_first_step_leaves_a_beginning_one(stage):
+    stage.worlds.fresh.fill_(BEGUN)
+    stage.give(SOME, 0, np.zeros((N, 4)), np.zeros(N))
+    assert (stage.world("fresh") == BEGUN).all()
 
 
 # ---------------------------------------------------------------- standing up, the clock

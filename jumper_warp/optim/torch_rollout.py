@@ -1,0 +1,140 @@
+"""Rollouts as a function of PyTorch tensors, whose gradients come from the reverse pass of `Rollout`."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+import warp as wp
+
+from jumper_warp.optim.rollout import Rollout, Trajectory
+from jumper_warp.utils.errors import InputError
+
+COMMANDS = ("targets", "q", "qd", "before", "wrench")
+OUTPUTS = ("q", "qd", "torque", "impulse")
+
+
+class TorchTrajectory(NamedTuple):
+    """A trajectory as tensors, see `Trajectory`; all but `safe` carry gradients."""
+
+    q: torch.Tensor
+    """(K + 1, 19, num_worlds)"""
+    qd: torch.Tensor
+    """(K + 1, 18, num_worlds)"""
+    torque: torch.Tensor
+    """(T S, 12, num_worlds) [N m]"""
+    impulse: torch.Tensor
+    """(T S, 4, num_worlds, 3) [N s]; divide by the physics step for the force."""
+    safe: torch.Tensor
+    """(T, 12, num_worlds) [rad]"""
+
+    def end(self) -> dict[str, torch.Tensor]:
+        """Return what `simulate` is given to go on from here, `before` and `impulse` without gradients."""
+        return {"q": self.q[-1], "qd": self.qd[-1], "before": self.safe[-1], "impulse": self.impulse[-1].detach()}
+
+
+def simulate(
+    rollout: Rollout,
+    targets: torch.Tensor,
+    q: torch.Tensor,
+    qd: torch.Tensor,
+    *,
+    before: torch.Tensor | None = None,
+    wrench: torch.Tensor | None = None,
+    impulse: torch.Tensor | None = None,
+    **parameters: torch.Tensor,
+) -> TorchTrajectory:
+    """Run a rollout; gradients reach all tensors but `impulse`.
+
+    Shapes as in `Rollout.run`, with worlds or without them. parameters: entries of `Rollout.parameters`, which are
+    written to the rollout and stay there, or `geometry` (4, 10) [m], the legs' lengths of all worlds.
+
+    A policy that sees the state runs one policy step a call, each from `end()` of the one before. Raises InputError for
+    a parameter of another name or an array of another shape.
+    """
+    named = {"targets": targets, "q": q, "qd": qd, "before": before, "wrench": wrench} | parameters
+    shapes = {"targets": (len(targets), 12), "q": (19,), "qd": (18,), "before": (12,), "wrench": (len(targets), 6)}
+    shapes |= {name: array.shape[:-1] for name, array in rollout.parameters.items()}
+    unknown = next((name for name in parameters if name not in rollout.parameters and name != "geometry"), None)
+    if unknown is not None:
+        raise InputError(
+            f"a rollout has no parameter {unknown!r:.60}; it has {', '.join(rollout.parameters)}, geometry"
+        )
+    real = torch.float64 if rollout.real is wp.float64 else torch.float32
+    given = {}
+    for name, tensor in named.items():
+        if tensor is None:
+            continue
+        full = (4, 10) if name == "geometry" else (*shapes[name], rollout.num_worlds)
+        if name != "geometry" and tuple(tensor.shape) == tuple(shapes[name]):
+            tensor = tensor.unsqueeze(-1).expand(full)
+        if tuple(tensor.shape) != full:
+            raise InputError(f"{name} must have shape {full}, got {tuple(tensor.shape)}")
+        given[name] = tensor.to(dtype=real).contiguous()
+    return TorchTrajectory(*_Simulate.apply(rollout, tuple(given), impulse, *given.values()))
+
+
+class _Simulate(torch.autograd.Function):
+    """`Rollout.run` and `Rollout.backward`."""
+
+    @staticmethod
+    def forward(ctx: Any, rollout: Rollout, names: tuple[str, ...], impulse: Any, *tensors: torch.Tensor) -> tuple:
+        """Run the rollout."""
+        with _stream(rollout):
+            given = dict(zip(names, tensors, strict=True))
+            _write_parameters(rollout, given)
+            commands = {name: wp.from_torch(given[name].detach()) for name in COMMANDS if name in given}
+            if impulse is not None:
+                vec3 = rollout.dynamics.modules.scalar.vec3
+                commands["impulse"] = wp.from_torch(impulse.detach().contiguous(), dtype=vec3)
+            trajectory = rollout.run(**commands)
+        ctx.rollout, ctx.names, ctx.trajectory = rollout, names, trajectory
+        ctx.save_for_backward(*tensors)
+        outputs = [wp.to_torch(getattr(trajectory, name)) for name in (*OUTPUTS, "safe")]
+        ctx.mark_non_differentiable(outputs[-1])
+        ctx.set_materialize_grads(False)
+        return tuple(outputs)
+
+    @staticmethod
+    def backward(ctx: Any, *grads: torch.Tensor | None) -> tuple:
+        """Run it backwards, with the parameters that it had."""
+        rollout, trajectory = ctx.rollout, ctx.trajectory
+        given = dict(zip(ctx.names, ctx.saved_tensors, strict=True))
+        with _stream(rollout):
+            _write_parameters(rollout, given)
+            seeds = {name: _seed(trajectory, name, grad) for name, grad in zip(OUTPUTS, grads, strict=False)}
+            found = rollout.backward(trajectory, **seeds)
+            sums = []
+            for name in ctx.names:
+                grad = wp.to_torch(found[name].contiguous())
+                sums.append(grad.sum(-1) if name == "geometry" else grad)
+        return (None, None, None, *sums)
+
+
+def _seed(trajectory: Trajectory, name: str, grad: torch.Tensor | None) -> wp.array | None:
+    """Return a gradient by an output of the trajectory as Warp sees it."""
+    if grad is None:
+        return None
+    return wp.from_torch(grad.contiguous(), dtype=getattr(trajectory, name).dtype)
+
+
+def _write_parameters(rollout: Rollout, given: dict[str, torch.Tensor]) -> None:
+    """Write what is given of the parameters to the rollout."""
+    for name, tensor in given.items():
+        if name in rollout.parameters:
+            wp.copy(rollout.parameters[name], wp.from_torch(tensor.detach()))
+        elif name == "geometry":
+            rollout.set_geometry(tensor.detach().cpu().numpy().astype(np.float64))
+
+
+@contextlib.contextmanager
+def _stream(rollout: Rollout) -> Iterator[None]:
+    """Let Warp work on PyTorch's stream."""
+    if not rollout.device.is_cuda:
+        yield
+        return
+    with wp.ScopedStream(wp.stream_from_torch(torch.cuda.current_stream()), sync_enter=False):
+        yield

@@ -1,0 +1,84 @@
+"""Jumps on Mars: 3.71 m/s^2, 24.8 N m and a transversal kp of 20 N m/rad, as the authors' sequel has them, no springs.
+
+The open-loop jump reaches 2.96 m through the filter of the jumps on Earth, 3.70 m through a loose one: each has a task.
+Weights of the vertical jump are those of the sequel's configuration; its levels begin at 1.8 m, here lower and with
+steps in between. Flights take up to 2.7 s. Limits on impacts are those on Earth, since they protect the same robot;
+those on misses grow with the distance.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from jumper_warp.robot.gravity import MARS
+from jumper_warp.robot.motors import MotorCfg, jumping_motors, loose_filter
+from jumper_warp.tasks.cfg import TaskCfg
+from jumper_warp.tasks.jump.cfg import GroundCfg, ladder
+from jumper_warp.tasks.jump.horizontal import NEAREST, horizontal_jump, level
+from jumper_warp.tasks.jump.vertical import STARTS, heights, vertical_jump
+
+TORQUE, KP = 24.8, 20.0
+"""[N m], [N m/rad] Of the transversal motors."""
+
+
+def mars_motors(lateral_torque: float) -> MotorCfg:
+    """Return the motors with all that they can give; lateral_torque [N m]: limit of the lateral ones."""
+    motors = jumping_motors(TORQUE, lateral_torque=lateral_torque)
+    return replace(motors, transversal=replace(motors.transversal, kp=KP))
+
+
+def vertical_jump_mars() -> TaskCfg:
+    """Return the vertical jump on Mars through the filter of the jumps on Earth."""
+    task = vertical_jump()
+    task = replace(
+        task,
+        name="vertical-jump-mars",
+        gravity=MARS,
+        motors=mars_motors(10.0),
+        levels=heights((0.7, 1.3), (1.0, 1.8), (1.5, 2.4), (2.0, 3.1)),
+        evaluation="height-mars",
+    )
+    task = task.with_terms("terminations", moved_away={"distance": 0.5})
+    return task.with_terms(
+        "rewards",
+        jump_height={"wide": 0.8},
+        estimated_jump_height={"weight": 30.0, "wide": 0.8},
+        air_posture={"weight": 70.0},
+        ground_posture={"weight": 20.0},
+        joint_symmetry={"weight": 15.0},
+    )
+
+
+def vertical_jump_mars_loose() -> TaskCfg:
+    """Return the same through a loose filter, to greater heights."""
+    return replace(
+        vertical_jump_mars(),
+        name="vertical-jump-mars-loose",
+        command_filter=loose_filter(),
+        levels=heights((0.7, 1.3), (1.0, 1.8), (1.5, 2.4), (2.0, 3.1), (2.8, 3.8)),
+    )
+
+
+def horizontal_jump_mars() -> TaskCfg:
+    """Return the jump to places on Mars through the filter of the jumps on Earth, on level ground."""
+    task = horizontal_jump()
+    settings = replace(task.reset.settings, highest_apex=2.5, takeoff_angle=(35.0, 70.0), ground=GroundCfg())
+    task = replace(
+        task,
+        name="horizontal-jump-mars",
+        gravity=MARS,
+        motors=mars_motors(12.0),
+        levels=ladder(
+            (NEAREST, level((0.5, 1.3), 0.1), level((1.0, 1.85), 0.2), level((1.4, 2.6), 0.3), level((2.0, 3.75), 0.3),
+             level((3.0, 4.75), 0.3)), STARTS,
+        ),
+        reset=replace(task.reset, settings=settings),
+        evaluation="place-mars",
+    )  # fmt: skip
+    task = task.with_terms("terminations", predicted_miss={"tolerance": 1.0}, missed_goal={"tolerance": 0.8})
+    return task.with_terms("rewards", estimated_tracking={"middle": 0.5, "wide": 1.2, "fine": 0.15})
+
+
+def horizontal_jump_mars_loose() -> TaskCfg:
+    """Return the same through a loose filter."""
+    return replace(horizontal_jump_mars(), name="horizontal-jump-mars-loose", command_filter=loose_filter())

@@ -1,0 +1,80 @@
+"""Gravity is the world's: in both solvers, in what a task draws and estimates, and from every command line."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import tyro
+from jump_helpers import DEG, episodes_of, make_env, only
+from jump_starts import Starts
+
+from jumper_warp.cli.train import parse_train
+from jumper_warp.envs.env import Env
+from jumper_warp.evaluation.run import EvaluationArgs, conditions_of
+from jumper_warp.policies.restore import Conditions
+from jumper_warp.registry import make_task
+from jumper_warp.robot.gravity import MARS
+from jumper_warp.sim.simulation import Simulation
+from jumper_warp.utils.errors import InputError
+
+UP = 2.0  # [m/s]
+VERTICAL = dataclasses.replace(make_task("vertical-jump"), gravity=MARS)
+HORIZONTAL = dataclasses.replace(make_task("horizontal-jump"), gravity=MARS)
+
+
+@pytest.mark.parametrize("solver", ["jumper", "mujoco"])
+def test_a_thrown_robot_falls_as_its_gravity_says(solver):
+    sim = Simulation(1, solver=solver, ground=None, gravity=MARS, visuals=False, device="cpu")
+    sim.state.joint_qd.assign(np.eye(38)[2].astype(np.float32) * UP)
+    sim.physics.write_bodies()
+    mass = sim.model.body_mass.numpy()
+
+    def com() -> float:
+        return float((mass * sim.state.body_q.numpy()[:, 2]).sum() / mass.sum())
+
+    before = com()
+    for _ in range(15):  # 0.25 s
+        sim.step()
+    assert com() - before == pytest.approx(0.25 * UP - 0.5 * MARS * 0.25**2, abs=2e-3)
+
+
+def test_a_simulation_refuses_what_is_no_gravity():
+    for bad in (-1.0, 200.0, float("nan")):
+        with pytest.raises(InputError, match="gravity must lie in 0 to 100"):
+            Simulation(1, gravity=bad, device="cpu")
+        with pytest.raises(InputError, match="gravity must lie in 0 to 100"):
+            Conditions(gravity=bad)
+    with pytest.raises(InputError, match=r"horizontal-jump has a gravity of 9.81 m/s\^2, vertical-jump of 3.71"):
+        Env((VERTICAL, make_task("horizontal-jump")), 1, device="cpu")
+
+
+def test_starts_in_flight_reach_their_apex_in_each_worlds_own_gravity():
+    env = make_env(6, task=VERTICAL, reset=only("in_flight", base_xy=0.0, flight_time=(0.01, 0.3)))
+    own = np.array([1.62, 3.71, 3.71, 8.87, 9.81, 24.8])
+    env.sim.model.gravity.assign(np.pad(np.outer(own, [0.0, 0.0, -1.0]), ((0, 1), (0, 0))).astype(np.float32))
+    env.sim.physics.parameters_changed()
+    env.reset()
+    q, qd, goals = env.sim.joint_q(), env.sim.joint_qd(), episodes_of(env)["goal"][:, 2]
+    np.testing.assert_allclose(q[:, 2] + qd[:, 2] ** 2 / (2.0 * own), goals, atol=1e-4)
+    errors = env.task.layout("critic")["height_errors"][0]
+    np.testing.assert_allclose(env.critic_obs[:, errors + 1].numpy(), 0.0, atol=1e-4)
+
+
+def test_starts_in_flight_come_down_at_their_goal_on_mars():
+    env = make_env(64, task=HORIZONTAL)
+    found = Starts(env, "in_flight", exact=True, takeoff_angle=(45.0, 45.0))
+    up = found.vel[:, 2]
+    time = (up + np.sqrt(up**2 + 2.0 * MARS * (found.pos[:, 2] - 0.30))) / MARS
+    place = found.pos[:, :2] + time[:, None] * found.vel[:, :2]
+    far = found.distance > 0.1
+    np.testing.assert_allclose(place[far], found.goal[far, :2], atol=2e-3)
+    slope = np.arctan2(found.vel[:, 2], np.linalg.norm(found.vel[:, :2], axis=1)) / DEG
+    assert slope.max() < 45.0
+
+
+def test_gravity_is_a_flag_of_trainings_evaluations_and_experiments():
+    assert parse_train(["vertical-jump", "--env.gravity", "3.71"])[1].gravity == MARS
+    assert tyro.cli(Conditions, args=["--gravity", "3.71"]).gravity == MARS
+    assert conditions_of(tyro.cli(EvaluationArgs, args=["--gravity", "3.71"])).gravity == MARS
+    assert Conditions(gravity=MARS).applied(make_task("velocity-flat")).gravity == MARS
+    assert Conditions().applied(VERTICAL).gravity == MARS

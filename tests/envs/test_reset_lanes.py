@@ -1,0 +1,36 @@
+"""Attempts side by side (for GPUs) give what attempts in turn give; on the CPU blocks of 32 threads take turns."""
+
+import numpy as np
+import pytest
+import warp as wp
+
+from jumper_warp.envs.env import Env
+from jumper_warp.registry import make_task
+from kernels.mdp.attempts import LANES
+
+N = 96
+
+
+def reset_by(env, lanes):
+    """Return coordinates, rates and states of the worlds after a reset with so many threads a world."""
+    skill = env.skills[0]
+    env.sim.state.joint_q.assign(np.tile(env.sim.model.joint_q.numpy()[:43], N))
+    skill.states.zero_()
+    inputs = [skill.index, lanes, env._all, env._scene, env._settings, skill.settings, skill.levels, env.worlds,
+              skill.states, env.robot]  # fmt: skip
+    wp.launch(skill.kernels["reset"], (N, lanes), inputs, device="cpu", block_dim=max(lanes, 1))
+    return env.sim.joint_q(), env.sim.joint_qd(), skill.states.numpy().copy()
+
+
+@pytest.mark.parametrize("name", ["velocity-rough", "horizontal-jump"])
+def test_threads_of_a_world_find_what_one_finds(name, monkeypatch):
+    env = Env(make_task(name), N, seed=3, device="cpu", randomize=False, noise=False)
+    env.reset()
+    alone = reset_by(env, 1)
+    monkeypatch.setattr(wp.config, "enable_cpu_blocks", True)
+    shared = reset_by(env, LANES)
+    for found, expected in zip(shared[:2], alone[:2], strict=True):
+        np.testing.assert_array_equal(found, expected)
+    for field in shared[2].dtype.names:
+        np.testing.assert_array_equal(shared[2][field], alone[2][field], err_msg=field)
+    assert (np.abs(alone[1]).max(axis=1) > 0.0).sum() > N // 4  # drawn, not the default pose

@@ -1,0 +1,194 @@
+"""Rollouts forwards: as the simulation, in double precision, on threads; as functions of PyTorch tensors; refusals."""
+
+import numpy as np
+import pytest
+import torch
+import warp as wp
+
+from jumper_warp.optim.jacobians import step_jacobians
+from jumper_warp.optim.rollout import Rollout, compact
+from jumper_warp.optim.torch_rollout import simulate
+from jumper_warp.robot.model import build_model
+from jumper_warp.robot.motors import jumping_motors, vertical_jump_filter
+from jumper_warp.sim.simulation import Simulation
+from tests.helpers.rollout_helpers import DT, SUBSTEPS, TICKS, defaults, push_off, rollout, run, squat
+
+
+def test_a_rollout_is_what_the_simulation_does_bit_for_bit():
+    settings = {"command_filter": vertical_jump_filter(), "tolerance": 1.0e-5}
+    simulation = Simulation(2, motors=jumping_motors(), visuals=False, **settings)
+    model = build_model(2, visuals=False)
+    of = Rollout(model, jumping_motors(), **settings)
+    targets = np.random.default_rng(0).uniform(0.2, 1.0, (12, 12, 2)).astype(np.float32)
+    trajectory = of.run(targets, *of.standing())
+    for target in targets:
+        simulation.target.assign(target)
+        simulation.step()
+    q, qd = compact(simulation.joint_q(), simulation.joint_qd(), 2)
+    np.testing.assert_array_equal(trajectory.q.numpy()[-1], q)
+    np.testing.assert_array_equal(trajectory.qd.numpy()[-1], qd)
+    np.testing.assert_array_equal(trajectory.torque.numpy()[-1], simulation.torque.numpy())
+    np.testing.assert_allclose(trajectory.impulse.numpy()[-1] * 480, simulation.paw_force.numpy(), rtol=1.0e-6)
+
+
+def test_threads_change_no_bit():
+    model = build_model(40, visuals=False)
+    found = []
+    for threads in (1, 2):
+        of = Rollout(model, command_filter=vertical_jump_filter(), double=True, dt=DT, substeps=4, threads=threads)
+        assert len(of.slices) == threads
+        q, qd = (np.repeat(row[:, None], 40, axis=1) for row in squat())
+        q[2] += np.linspace(0.0, 0.1, 40)
+        trajectory = of.run(push_off(6), q, qd)
+        gradients = of.backward(trajectory, qd=wp.full_like(trajectory.qd, 1.0))
+        found.append({"q": trajectory.q.numpy()} | {f"by {name}": array.numpy() for name, array in gradients.items()})
+    for name, values in found[0].items():
+        np.testing.assert_array_equal(found[1][name], values, err_msg=name)
+
+
+def test_rollouts_go_on_where_they_ended():
+    whole = run(rollout(), defaults())
+    first = rollout().run(push_off()[:5], *squat())
+    rest = rollout().run(push_off()[5:], **first.end())
+    np.testing.assert_array_equal(rest.q.numpy()[-1], whole.q.numpy()[-1])
+
+
+def test_a_wrench_acts_in_double_precision():
+    """A robot in the air, its motors idle: twice a force of 0.1 uN, twice the speed that it adds to that of falling."""
+    q, qd = squat()
+    q[2] = 1.0
+    of = rollout()
+    run(of, defaults() | {"kp": np.zeros(12), "kd": np.zeros(12)})  # writes the parameters
+    speeds = []
+    for force in (0.0, 1.0e-7, 2.0e-7):
+        wrench = np.tile([force, 0.0, 0.0, 0.0, 0.0, 0.0], (2, 1))
+        speeds.append(of.run(np.zeros((2, 12)), q, 0.0 * qd, wrench=wrench).qd.numpy()[-1, 0, 0])
+    added = np.diff(speeds)
+    assert added[1] == pytest.approx(added[0], rel=1.0e-5)
+    # at least the speed of a robot of 14.5 kg that is rigid; less of the legs follow at once
+    assert 1.0e-7 * 2 * SUBSTEPS * DT / 14.6 < added[0] < 1.0e-7 * 2 * SUBSTEPS * DT / 4.0
+
+
+def test_what_is_kept_of_a_policy_step_is_below_two_kilobytes():
+    trajectory = rollout().run(push_off(8), *squat())
+    usual = Rollout(rollout().dynamics.model, double=True).run(push_off(8), *squat())
+    for made, steps in ((trajectory, 8), (usual, 8)):
+        arrays = (made.q, made.qd, made.torque, made.impulse, made.pressed, made.safe)
+        per_step = sum(array.size * wp.types.type_size_in_bytes(array.dtype) for array in arrays) / (steps + 1)
+        assert per_step <= 2000.0
+
+
+def tensors():
+    q, qd = squat()
+    return torch.tensor(q), torch.tensor(qd)
+
+
+def losses(trajectory):
+    return 1.0e-3 * trajectory.torque.square().sum() + 0.01 * trajectory.impulse[..., 2].sum()
+
+
+def test_torch_gives_the_gradients_of_differences():
+    of, (q, qd) = rollout(2), tensors()
+    targets = torch.tensor(push_off(10)).requires_grad_()
+    kp = torch.full((12,), 70.0, dtype=torch.float64, requires_grad=True)
+    lengths = torch.tensor(of.geometry()).requires_grad_()
+
+    def loss(targets, kp, lengths):
+        trajectory = simulate(of, targets, q, qd, kp=kp, geometry=lengths)
+        return losses(trajectory) + trajectory.q[-1, 2].sum()
+
+    loss(targets, kp, lengths).backward()
+    for tensor, entry, h in ((targets, (4, 1), 1.0e-6), (kp, (1,), 1.0e-4), (lengths, (0, 7), 1.0e-7)):
+        ends = []
+        for side in (h, -h):
+            moved = [t.detach().clone() for t in (targets, kp, lengths)]
+            next(m for m, t in zip(moved, (targets, kp, lengths), strict=True) if t is tensor)[entry] += side
+            ends.append(loss(*moved).item())
+        simulate(of, targets.detach(), q, qd, geometry=lengths.detach())
+        assert tensor.grad[entry].item() == pytest.approx((ends[0] - ends[1]) / (2.0 * h), rel=1.0e-5)
+
+
+def test_torch_step_by_step_gives_the_gradients_of_the_whole():
+    """As with a policy between the steps; a later run with other parameters does not disturb an earlier one's pass."""
+    of, (q, qd) = rollout(), tensors()
+    found = []
+    for stepwise in (False, True):
+        targets = torch.tensor(push_off(8)).requires_grad_()
+        kp = torch.full((12,), 70.0, dtype=torch.float64, requires_grad=True)
+        if stepwise:
+            state, total = {"q": q, "qd": qd}, 0.0
+            for step in range(8):
+                made = simulate(of, targets[step : step + 1], **state, kp=kp)
+                state, total = made.end(), total + losses(made)
+            total = total + state["q"][2].sum()
+            simulate(of, targets.detach(), q, qd, kp=torch.full((12,), 20.0))
+        else:
+            made = simulate(of, targets, q, qd, kp=kp)
+            total = losses(made) + made.q[-1, 2].sum()
+        total.backward()
+        found.append((total.item(), targets.grad.numpy(), kp.grad.numpy()))
+    for whole, stepped in zip(*found, strict=True):
+        np.testing.assert_allclose(stepped, whole, rtol=0.0, atol=1.0e-12 * np.abs(whole).max())
+
+
+def test_jacobians_of_steps_chain_to_the_whole_gradient():
+    of, steps = rollout(), rollout(TICKS)
+    values = defaults()
+    trajectory = run(of, values)
+    run(steps, values | {"wrench": np.zeros((TICKS, 6))})  # the same parameters
+    found = step_jacobians(steps, trajectory, by=("q", "qd", "targets", "kp"))
+    seed = np.zeros(trajectory.q.shape)
+    seed[-1, 2] = 1.0
+    expected = of.backward(trajectory, q=of.array(seed))
+    adjoint, by_kp = np.eye(37)[2], np.zeros(12)
+    for step in reversed(range(TICKS)):
+        by_target = adjoint @ found["targets"][step, :, 0]
+        np.testing.assert_allclose(by_target, expected["targets"].numpy()[step, :, 0], rtol=0.0, atol=1.0e-12)
+        by_kp += adjoint @ found["kp"][step]
+        adjoint = adjoint @ np.concatenate([found["q"][step], found["qd"][step]], axis=-1)
+    np.testing.assert_allclose(by_kp, expected["kp"].numpy()[:, 0], rtol=0.0, atol=1.0e-12)
+    np.testing.assert_allclose(adjoint[:19], expected["q"].numpy()[:, 0], rtol=0.0, atol=1.0e-12)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"targets": np.zeros((2, 11))}, "targets must have shape"),
+        ({"targets": np.zeros((0, 12))}, "at least one policy step"),
+        ({"q": np.zeros(18)}, "q must have shape"),
+        ({"qd": np.zeros((18, 2))}, "qd must have shape"),
+        ({"wrench": np.zeros((3, 6))}, "wrench must have shape"),
+    ],
+)
+def test_run_refuses_other_shapes(changes, message):
+    q, qd = squat()
+    with pytest.raises(ValueError, match=message):
+        rollout().run(**({"targets": push_off(2), "q": q, "qd": qd} | changes))
+
+
+def test_run_refuses_the_other_precision():
+    with pytest.raises(ValueError, match="q must be float64"):
+        rollout().run(push_off(2), wp.zeros((19, 1), dtype=wp.float32), squat()[1])
+
+
+def test_backward_refuses_other_shapes():
+    trajectory = rollout().run(push_off(2), *squat())
+    with pytest.raises(ValueError, match="gradient by qd"):
+        rollout().backward(trajectory, qd=trajectory.q)
+
+
+@pytest.mark.parametrize("setting", [{"dt": 0.0}, {"dt": float("nan")}, {"substeps": 0}, {"every": 3}, {"every": 0}])
+def test_rollout_refuses_bad_settings(setting):
+    with pytest.raises(ValueError, match=next(iter(setting))):
+        Rollout(rollout().dynamics.model, **setting)
+
+
+def test_simulate_refuses_unknown_parameters():
+    with pytest.raises(ValueError, match="no parameter 'colour'"):
+        simulate(rollout(), torch.zeros(2, 12), *tensors(), colour=torch.zeros(1))
+
+
+def test_jacobians_need_a_world_for_each_step():
+    trajectory = rollout().run(push_off(2), *squat())
+    with pytest.raises(ValueError, match="2 policy steps need as many worlds"):
+        step_jacobians(rollout(), trajectory)

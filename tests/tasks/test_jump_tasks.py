@@ -1,0 +1,93 @@
+"""The jump tasks as data: curricula of goals and of starts, the tasks on Mars, and what each departure is undone by."""
+
+import dataclasses
+import re
+from pathlib import Path
+
+import pytest
+
+from jumper_warp.cli.task_flags import flags_of
+from jumper_warp.cli.train import parse_train
+from jumper_warp.registry import make_task
+from jumper_warp.robot.motors import loose_filter, vertical_jump_filter
+from jumper_warp.tasks.jump.cfg import Level, ladder
+
+GOALS = (Level((0.0, 0.0, 0.5), (0.0, 0.0, 0.6), (0.3, 0.3)), Level((0.0, 0.0, 0.6), (0.0, 0.0, 0.9), (0.3, 0.3)))
+STARTS = ((0.22, 0.35), (0.22, 0.45))
+
+
+def test_starts_have_a_curriculum_of_their_own_within_each_level_of_goals():
+    levels = ladder(GOALS, STARTS)
+    assert [level.goal_upper[2] for level in levels] == [0.6, 0.6, 0.9, 0.9]
+    assert [level.base_height for level in levels] == [*STARTS, *STARTS]
+
+
+@pytest.mark.parametrize("name", ["vertical-jump", "horizontal-jump", "omnidirectional-jump", "vertical-jump-mars"])
+def test_goals_grow_only_when_all_starts_are_mastered(name):
+    levels = make_task(name).levels
+    for easier, harder in zip(levels[0::2], levels[1::2], strict=True):
+        assert dataclasses.replace(easier, base_height=STARTS[1]) == harder and easier.base_height == STARTS[0]
+
+
+def test_tolerances_of_the_curricula_are_the_papers():
+    assert make_task("vertical-jump").curriculum.numbers["tolerance"] == 0.05
+    assert make_task("horizontal-jump").curriculum.numbers["tolerance"] == 0.10
+
+
+def test_reaches_grow_at_their_own_rates_all_around():
+    task = make_task("omnidirectional-jump")
+    reaches = [(level.goal_upper[0], level.goal_upper[1], -level.goal_lower[0]) for level in task.levels[2::2]]
+    assert all(level.round for level in task.levels[2:])
+    assert reaches == sorted(reaches) and all(
+        reach > wanted for reach, wanted in zip(reaches[-1], (1.2, 0.8, 0.8), strict=True)
+    )
+
+
+@pytest.mark.parametrize("name", ["vertical-jump-mars", "horizontal-jump-mars"])
+def test_mars_has_its_gravity_and_all_of_the_motors(name):
+    task, loose = make_task(name), make_task(f"{name}-loose")
+    kind = task.motors.transversal
+    assert (task.gravity, kind.saturation, kind.kp) == (3.71, 24.8, 20.0)
+    assert task.command_filter.horizon == vertical_jump_filter().horizon and loose.command_filter == loose_filter()
+    beaten = 3.1 if name.startswith("vertical") else 3.9
+    axis = 2 if name.startswith("vertical") else 0
+    assert loose.levels[-1].goal_upper[axis] > beaten
+
+
+UNDOING = """--env.curriculum.tolerance 0.1 --env.reset.shares-of resets --env.reset.pushing 0 --env.reset.standing 0.45
+--env.reset.in-flight 0.175 --env.reset.touchdown 0.175 --env.reset.lean 0 --env.reset.takeoff-ahead 0 0.1
+--env.reset.takeoff-pitch 0 0 --env.reset.takeoff-angle 50 75 --env.reset.heading 0 --env.reset.ground.platform 0
+--env.reset.ground.block 0 --env.rewards.lifted-again.weight 0 --env.rewards.capture-point.weight 0
+--env.rewards.resting-action-rate.weight 0 --env.rewards.torque-ripple.weight 0 --env.rewards.force-ripple.weight 0
+--env.rewards.rest.weight 0 --env.rewards.landing-tilt.weight 0 --env.rewards.orientation.weight 0
+--env.rewards.ground-force.weight 0 --env.rewards.tracking.fine-share 0 --env.rewards.action-rate.weight -0.03
+--env.rewards.left-right-symmetry.share 1 --env.terminations.missed-goal.tolerance 0.2
+--env.terminations.predicted-miss.tolerance 0.45 --env.terminations.low-touchdown.height 0.3
+--env.terminations.second-takeoff.speed 100 --ppo.entropy-coef 0.001"""
+
+
+def test_departures_are_undone_from_the_command_line():
+    task = parse_train(["horizontal-jump", *UNDOING.split()])[1]
+    assert task.reset.settings.shares_of == "resets" and task.reset.settings.lean == 0.0
+    ends = {term.name: term.numbers for term in task.terminations}
+    assert ends["second_takeoff"]["speed"] == 100.0 and ends["missed_goal"]["tolerance"] == 0.2
+    assert not any(
+        term.weight for term in task.rewards if term.name in ("lifted_again", "capture_point", "torque_ripple")
+    )
+
+
+def flags(group, before="--env"):
+    """Return the names of all flags of a task's settings."""
+    for spec in dataclasses.fields(group):
+        name, value = f"{before}.{spec.metadata['flag']}", getattr(group, spec.name)
+        yield from flags(value, name) if dataclasses.is_dataclass(value) else (name,)
+
+
+def test_the_table_of_departures_names_flags_that_there_are():
+    tasks = ("vertical-jump", "horizontal-jump", "omnidirectional-jump")
+    known = {flag for name in tasks for flag in flags(flags_of(make_task(name)))}
+    table = (Path(__file__).parents[2] / "docs" / "tasks.md").read_text()
+    named = [name for name in re.findall(r"--env\.[a-z0-9.-]*[a-z0-9]", table) if "rewards.TERM" not in name]
+    named = [name for name in named if name not in ("--env.rewards", "--env.terminations", "--env.levels")]
+    assert len(named) > 25
+    assert not sorted(set(named) - known)
