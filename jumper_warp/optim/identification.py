@@ -34,8 +34,8 @@ PIECES = (0.25,)
 WORTH_A_STEP = 0.1
 """Relative decrease of the cost below which a stage ends, unless it is the last."""
 WHOLE = ((True, 10.0), (False, 1.0), (False, 1.0))
-"""Stages of whole motions: whether they are robust, and the decrease of the cost, in mean squared residuals, below which
-they end: 1 is what one deviation costs."""
+"""Stages of whole motions: whether they are robust, and the decrease of the cost, in mean squared residuals, that ends
+them: 1 is what one deviation costs."""
 MOST_STEPS = (5, 25)
 """Of each stage but the last, and of the last."""
 RATIO_ROWS = {

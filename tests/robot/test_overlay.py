@@ -1,0 +1,95 @@
+"""Robot overlays: as files, in simulations on both solvers, and in environments."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from jumper_warp.cli.train import for_robot, overlay_in
+from jumper_warp.envs.env import Env
+from jumper_warp.registry import make_task
+from jumper_warp.robot.overlay import RobotOverlay, load_overlay
+from jumper_warp.sim.simulation import Simulation
+from jumper_warp.utils.errors import InputError
+from kernels.layout import BODIES, DOFS
+
+VALUES = {
+    "base_mass": (7.0,), "base_com": (0.01, 0.0, 0.02), "link_mass": (1.1, 1.0, 1.0, 1.0, 0.9),
+    "kp": (1.2,) + 11 * (0.9,),
+    "offset": (0.02,) + 11 * (-0.01,), "armature": 12 * (0.005,), "knee_damping": (0.2,), "paw_friction": (0.7,),
+    "latency": (0.0042,), "no_load_speed": 12 * (44.0,),
+}  # fmt: skip
+RANGES = {"base_mass": (-0.1, 0.1), "joint_offset": (-0.2, 0.2), "latency": (3.0, 5.0)}
+
+
+def test_an_overlay_comes_back_from_its_file(tmp_path):
+    overlay = RobotOverlay(VALUES, RANGES, "a bench")
+    overlay.save(tmp_path / "robot.json")
+    found = load_overlay(tmp_path / "robot.json")
+    assert found.to_json() == overlay.to_json()
+    assert found.robots().kp[0, 0] == 1.2 and found.robots().kd[0, 0] == 1.0
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"schema": "other"}, "not a robot overlay"),
+        ({"values": {"colour": [1.0]}}, "no quantity 'colour'"),
+        ({"values": {"kp": [1.0]}}, "kp needs 12 values, got 1"),
+        ({"values": {"base_mass": [7000.0]}}, "base_mass must be in 0.001 to 100 kg"),
+        ({"values": {"base_mass": ["7"]}}, "must be a list of numbers"),
+        ({"values": {"cutoff_speed": 12 * [60.0]}}, "below the no_load_speed"),
+        ({"randomization": {"gains": [1.1, 0.9]}}, "two rising numbers"),
+    ],
+)
+def test_a_bad_overlay_is_refused_in_one_line(tmp_path, change, words):
+    file = tmp_path / "robot.json"
+    file.write_text(json.dumps(RobotOverlay(VALUES).to_json() | change))
+    with pytest.raises(InputError, match=words):
+        load_overlay(file)
+
+
+@pytest.mark.parametrize("solver", ["jumper", "mujoco"])
+def test_a_simulation_is_of_the_overlay(solver):
+    sim = Simulation(2, solver=solver, visuals=False, robot=RobotOverlay(VALUES))
+    plain = Simulation(2, visuals=False)
+    mass, old = (s.model.body_mass.numpy().reshape(2, int(BODIES)) for s in (sim, plain))
+    assert mass[:, 0] == pytest.approx([7.0, 7.0])
+    np.testing.assert_allclose(mass[:, 1:6] / old[:, 1:6], [[1.1, 1.0, 1.0, 1.0, 0.9]] * 2, rtol=1e-6)
+    inertia, old = (s.model.body_inertia.numpy()[1] for s in (sim, plain))
+    np.testing.assert_allclose(inertia, 1.1 * old, rtol=1e-5)
+    scale = sim.motors.kp.numpy() / plain.motors.kp.numpy()
+    np.testing.assert_allclose(scale, np.repeat(np.array(VALUES["kp"])[:, None], 2, axis=1), rtol=1e-6)
+    np.testing.assert_allclose(sim.motors.offset.numpy()[:, 0], VALUES["offset"], rtol=1e-6)
+    assert sim.model.joint_armature.numpy().reshape(2, int(DOFS))[1, 6] == pytest.approx(0.005)
+    if solver == "jumper":
+        table = sim.physics.dynamics.robot.table.numpy()
+        assert table[:, 0] == pytest.approx(table[:, 1])
+        assert np.isclose(table, 0.7).sum() >= 16  # both coefficients of four paws in two worlds
+
+
+def test_an_environment_draws_around_the_overlay_and_saves_it():
+    overlay = RobotOverlay(VALUES, RANGES)
+    task = for_robot(make_task("vertical-jump"), overlay)
+    assert task.randomization.base_mass == (-0.1, 0.1)
+    still = Env(task, 2, randomize=False, noise=False, robot=overlay, device="cpu")
+    assert still.parameters.latency.numpy().tolist() == [2, 2]
+    assert still.parameters.nominal_kp.numpy()[0, 0] == pytest.approx(1.2 * task.motors.lateral.kp)
+    assert RobotOverlay.from_json(still.config()["robot"]).values["kp"] == VALUES["kp"]
+    env = Env(task, 16, noise=False, robot=overlay, device="cpu")
+    env.reset()
+    mass = env.sim.model.body_mass.numpy().reshape(16, -1)[:, 0]
+    assert 6.9 <= mass.min() < mass.max() <= 7.1
+    offset = np.degrees(env.sim.motors.offset.numpy() - np.array(VALUES["offset"])[:, None])
+    assert np.abs(offset).max() <= 0.2 + 1e-5 and np.ptp(offset) > 0.2
+    assert set(env.parameters.latency.numpy()) <= {1, 2}
+
+
+def test_the_training_reads_the_overlay_before_its_flags(tmp_path):
+    RobotOverlay(VALUES, RANGES).save(tmp_path / "robot.json")
+    assert overlay_in(["--seed", "1"]) is None
+    assert overlay_in(["--robot", str(tmp_path / "robot.json")]).values["base_mass"] == (7.0,)
+    assert overlay_in([f"--robot={tmp_path / 'robot.json'}"]).randomization == RANGES
+    with pytest.raises(InputError, match="no range of randomisation 'colour'"):
+        for_robot(make_task("vertical-jump"), replace(RobotOverlay(VALUES), randomization={"colour": (0.0, 1.0)}))
