@@ -28,7 +28,8 @@ from jumper_warp.evaluation.log import run_evaluation, termination_names
 from jumper_warp.evaluation.plots import drawn
 from jumper_warp.optim.evolution import identify_by_evolution
 from jumper_warp.optim.excitation import KINDS, Plan, draw_plan, unsafe
-from jumper_warp.optim.identification import Identification, identify, total_mass, weighed
+from jumper_warp.optim.findings import Identification
+from jumper_warp.optim.identification import identify, total_mass, weighed
 from jumper_warp.optim.least_squares import Knowledge, LeastSquares
 from jumper_warp.optim.motions import Motion
 from jumper_warp.optim.parameters import ParameterSet, jumper_parameters
