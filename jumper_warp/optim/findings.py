@@ -60,8 +60,8 @@ class Identification:
     mismatch: float
     """[1] Factor by which the model's errors widen all intervals at least, from 1."""
     systematic: np.ndarray
-    """(P,) Standard deviations, normalised, from how channels of motions contradict each other; 0 where the model explains
-    the data."""
+    """(P,) Standard deviations, normalised, from how channels of motions contradict each other; 0 if the model explains
+    them."""
     spread: np.ndarray
     """(P,) Differences, normalised, of two ends of the optimisation, begun from different starts."""
     chi2: float

@@ -8,6 +8,7 @@ parameters, and then taken as wholes.
 
 from __future__ import annotations
 
+import functools
 import itertools
 import math
 import time
@@ -123,14 +124,18 @@ def identify(
     rough = whole if rough_dt == dt else [MotionResiduals(m, parameters, noise, robot, rough_dt) for m in motions]
     problem = LeastSquares(parameters, rough, replay, knowledge, robust=True)
     stage = len(PIECES)
-    end = descend(
-        problem, Point(z, problem.expected().starts), stage, lambda _, new: 10.0 * CONVERGED * new / final.count
-    )
-    ends = [descend(final, end.point, stage + 1, lambda _, new: CONVERGED * new / final.count)]
+    nearly, enough = (functools.partial(gained, share=share / final.count) for share in (10.0, 1.0))
+    end = descend(problem, Point(z, problem.expected().starts), stage, nearly)
+    ends = [descend(final, end.point, stage + 1, enough)]
     # what friction at rest makes of a start is full of small minima: try again from outside
     again = Point(ends[0].point.z, final.expected().starts)
     ends.append(descend(final, again, stage + 2, enough))
     return result(final, ends, nominal, steps, (started, cpu, before))
+
+
+def gained(_: float, cost: float, share: float) -> float:
+    """Return the decrease that a step must bring, a share of the cost after it."""
+    return CONVERGED * share * cost
 
 
 def pieces_of(
