@@ -134,6 +134,8 @@ class Rollout:
         """By name, worlds last: the parameter table of `kernels.layout` (313, n), motor constants (12, n) as in
         `MotorKindCfg` and the sensors' `offset` [rad], `fade` [rad/s] (2, n), `latency` [s] (n,), and the filter's
         constants (14, n), rows as in `jumper_warp.optim.actuation.FILTER_NAMES`, in rad."""
+        self.by_legs = self.device.is_cuda
+        """Whether a thread has a leg or a world, by default a leg on a GPU and a world on a CPU."""
         self.slices = slices_of(n, 1 if self.device.is_cuda else checked_threads(threads))
         wrench = wp.zeros(model.body_count, dtype=wp.spatial_vector, device=self.device)
         self._drive = self.dynamics.drive(self._zeros(model.joint_dof_count), wrench)
@@ -209,7 +211,11 @@ class Rollout:
         wp.copy(rows.qd[0], qd)
         safe = self._zeros(count, 12, self.num_worlds)
         inputs = [self._timing(count), self._actuation, commands, self._drive]
-        self._launch(self.dynamics.modules.rollout.rollout_kernel, inputs, [self.dynamics.work, safe, rows])
+        modules = self.dynamics.modules
+        if self.by_legs:
+            self._launch_legs(modules.rollout_legs.rollout_legs_kernel, inputs, [safe, rows])
+        else:
+            self._launch(modules.rollout.rollout_kernel, inputs, [self.dynamics.work, safe, rows])
         return Trajectory(rows.q, rows.qd, rows.torque, rows.impulse, rows.pressed, safe, commands)
 
     def backward(
@@ -252,7 +258,10 @@ class Rollout:
         if self._record is None:
             self._record = self._step_record()
         inputs = [self._timing(count), self._actuation, commands, trajectory.safe, rows, seeds]
-        self._launch(modules.rollout_adjoint.reverse_kernel, inputs, [self._record, gradients])
+        if self.by_legs:
+            self._launch_legs(modules.rollout_legs_adjoint.reverse_legs_kernel, inputs, [self._record, gradients])
+        else:
+            self._launch(modules.rollout_adjoint.reverse_kernel, inputs, [self._record, gradients])
         found = {"targets": gradients.target, "q": gradients.q, "qd": gradients.qd, "before": gradients.before}
         return found | {"wrench": gradients.wrench} | self._named(gradients.parameters)
 
@@ -289,6 +298,14 @@ class Rollout:
             shape += () if name in ("base", "inverse") else (4,)
             setattr(record, name, self._zeros(*shape, dtype=types[name]))
         return record
+
+    def _launch_legs(self, kernel: wp.Kernel, inputs: list, outputs: list) -> None:
+        """Launch a kernel over all worlds, a thread a leg."""
+        n = self.num_worlds
+        wp.launch(
+            kernel, dim=(-(-n // 8) * 8, 4), inputs=[n, self.dynamics.robot, self._settings, *inputs], outputs=outputs,
+            device=self.device, block_dim=32 if self.device.is_cuda else 4,
+        )  # fmt: skip
 
     def _launch(self, kernel: wp.Kernel, inputs: list, outputs: list) -> None:
         """Launch a kernel over all worlds, on a CPU in slices side by side."""

@@ -22,7 +22,8 @@ JOINTS = ("lateral", "outer", "outer_knee", "inner", "inner_knee")
 KERNEL_MODULES = (
     "actuation.command_filter", "actuation.motors", "dynamics.advance", "dynamics.advance_legs", "dynamics.contact",
     "dynamics.contact_adjoint", "dynamics.differentiable", "dynamics.drive", "dynamics.gradients",
-    "dynamics.parameters", "dynamics.rollout", "dynamics.rollout_adjoint", "dynamics.step", "dynamics.step_adjoint",
+    "dynamics.parameters", "dynamics.rollout", "dynamics.rollout_adjoint", "dynamics.rollout_legs",
+    "dynamics.rollout_legs_adjoint", "dynamics.step", "dynamics.step_adjoint",
     "kinematics.full_state", "kinematics.geometry", "layout", "scalar", "state", "terrain.ground",
 )  # fmt: skip
 

@@ -52,6 +52,7 @@ class LegState:
     step: int  # steps made in this launch
     sets: int  # sets of pressed stops tried for the present step without agreement
     pressed: int  # the leg's next one
+    used: int  # the leg's set of pressed stops in the last step
 
 
 @wp.struct
@@ -166,6 +167,7 @@ def advance_leg(
         new.residual = wp.max(old.residual, solved.residual)
         new.updates = wp.max(old.updates, solved.updates)
         new.step = old.step + 1
+        new.used = pressed
         new.sets = 0
     else:
         new.sets = sets

@@ -81,12 +81,13 @@ def contact_jacobian(paw: PawKinematics, arm: vec3) -> mat33:
 def target_normal_velocity(gap: real, pressed: int, dt: real) -> real:
     """Return the smallest admissible normal velocity [m/s] for a gap [m]: close it exactly, push penetration out.
 
-    pressed: the leg's pressed hard stops. On stops four legs carry the body as a table, and what rounding adds to a
-    gap would shift load between them: then gaps within `STIFF_BAND` stay as they are.
+    pressed: the leg's pressed hard stops. On stops the legs carry the body as those of a table, and what rounding adds
+    to a gap would shift load between them: then gaps within `STIFF_BAND` stay, and close gently at first beyond it.
     """
     beyond = gap
     if pressed != 0:
         beyond = gap - wp.clamp(gap, -STIFF_BAND, STIFF_BAND)
+        beyond = wp.where(beyond > real(0.0), wp.max(PUSH_OUT * beyond, beyond - STIFF_BAND), beyond)
     if beyond > real(0.0):
         return -beyond / dt
     return wp.min(-PUSH_OUT * beyond / dt, PUSH_OUT_SPEED)

@@ -7,7 +7,7 @@ where these functions serve tests, a block is the four threads of one world (lau
 
 import warp as wp
 
-from ..scalar import mat33, real, vec3
+from ..scalar import mat33, quat, real, vec3
 from .base_dynamics import BaseSystem
 
 # On the CPU threads of a block take turns: each leaves its value in a box, waits, and reads.
@@ -124,6 +124,22 @@ def sum_vec(v: vec3) -> vec3:
 def vec_from_leg(v: vec3, leg: int) -> vec3:
     """Return the vector of one leg."""
     return vec3(from_leg(v[0], leg), from_leg(v[1], leg), from_leg(v[2], leg))
+
+
+@wp.func
+def mat_from_leg(m: mat33, leg: int) -> mat33:
+    """Return the matrix of one leg."""
+    return mat33(
+        from_leg(m[0, 0], leg), from_leg(m[0, 1], leg), from_leg(m[0, 2], leg),
+        from_leg(m[1, 0], leg), from_leg(m[1, 1], leg), from_leg(m[1, 2], leg),
+        from_leg(m[2, 0], leg), from_leg(m[2, 1], leg), from_leg(m[2, 2], leg),
+    )  # fmt: skip
+
+
+@wp.func
+def sum_quat(q: quat) -> quat:
+    """Return the sum of the entries of quaternions over the legs."""
+    return quat(sum_legs(q[0]), sum_legs(q[1]), sum_legs(q[2]), sum_legs(q[3]))
 
 
 @wp.func

@@ -229,6 +229,30 @@ def reverse_kernel(
             gradients.qd[6 + 3 * k + i, world] = rate_adj[k][i]
 
 
+@wp.func
+def everything(
+    factors: LegFactors, base: BaseFactors, base_seeds: BaseSeeds, robot: Robot, actuation: Actuation, numbers: Rows,
+    state: BaseState, world: int,
+) -> real:  # fmt: skip
+    """Return the sum of all functions whose gradients the reverse pass takes; see `adjoints_kernel`."""
+    params = load_leg(robot, world, 0)
+    v = row_vec3(numbers.q, 0, 0, world)
+    q = row_quat(numbers.q, 0, 3, world)
+    x = numbers.q[0, 0, world]
+    stops = load_stops(robot.table, 0, world)
+    return (
+        leg_action(
+            params.geometry, params.masses, params.joints, stops, robot.ground, x, v, q, v, v, v, v, base, factors, x
+        )
+        + base_action(load_moments(robot.table, BASE, world), v, v, v, v, q, v, v, base, base_seeds, x)
+        + turned(q, v, x, q)
+        + motor_torque(x, x, x, load_world_motor(actuation, 0, world))
+        + weighed_filter(v, v, v, load_filter(actuation.limits, world), v)
+        + weighed_row(v, q, v, v, v, state)
+        + weighed_store(q, v, v, v, v, v)
+    )
+
+
 @wp.kernel(enable_backward=True)
 def adjoints_kernel(
     factors: LegFactors, base: BaseFactors, base_seeds: BaseSeeds, robot: Robot, actuation: Actuation, numbers: Rows,
@@ -239,32 +263,4 @@ def adjoints_kernel(
     `wp.grad` alone leaves out those of functions which something else called first.
     """
     world = wp.tid()
-    params = load_leg(robot, world, 0)
-    v = row_vec3(numbers.q, 0, 0, world)
-    q = row_quat(numbers.q, 0, 3, world)
-    x = numbers.q[0, 0, world]
-    sums[world] = (
-        leg_action(
-            params.geometry,
-            params.masses,
-            params.joints,
-            load_stops(robot.table, 0, world),
-            robot.ground,
-            x,
-            v,
-            q,
-            v,
-            v,
-            v,
-            v,
-            base,
-            factors,
-            x,
-        )
-        + base_action(load_moments(robot.table, BASE, world), v, v, v, v, q, v, v, base, base_seeds, x)
-        + turned(q, v, x, q)
-        + motor_torque(x, x, x, load_world_motor(actuation, 0, world))
-        + weighed_filter(v, v, v, load_filter(actuation.limits, world), v)
-        + weighed_row(v, q, v, v, v, state)
-        + weighed_store(q, v, v, v, v, v)
-    )
+    sums[world] = everything(factors, base, base_seeds, robot, actuation, numbers, state, world)

@@ -12,6 +12,7 @@ from experiments import (
     ablations,
     benchmark_solver,
     benchmark_training,
+    gradient_cost,
     learning_curves,
     new_reward,
     soak_test,
@@ -358,3 +359,13 @@ def test_benchmark_of_solvers_compares_numbers_of_threads(tmp_path):
         ratios.append(two / one)
         assert values[f"thread_speedup_{what}"] == pytest.approx(ratios[-1])
     assert values["thread_speedup"] == pytest.approx(min(ratios)) and values["jumper_apex_m"] > 0.8
+
+
+def test_gradient_cost_checks_the_gradient_and_what_is_kept(tmp_path):
+    values = gradient_cost.main(gradient_cost.Args(worlds=2, repeats=1, out=tmp_path, device="cpu"))
+    assert values == json.loads((tmp_path / "figures.json").read_text())
+    assert values["height_difference_m"] == 0.0 and values["kept_bytes_a_policy_step"] <= 2000.0
+    expected = values["gradient_us_a_step"] / values["plain_us_a_step"]
+    assert values["cpu_ratio"] == pytest.approx(expected)
+    for name in ("targets", "q", "qd", "table", "saturation"):
+        assert 0.0 < values[f"error_{name}"] < 0.02

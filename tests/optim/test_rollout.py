@@ -192,3 +192,35 @@ def test_jacobians_need_a_world_for_each_step():
     trajectory = rollout().run(push_off(2), *squat())
     with pytest.raises(ValueError, match="2 policy steps need as many worlds"):
         step_jacobians(rollout(), trajectory)
+
+
+@pytest.fixture
+def blocks_of_threads():
+    """Let the CPU run blocks of several threads."""
+    wp.config.enable_cpu_blocks = True
+    yield
+    wp.config.enable_cpu_blocks = False
+
+
+@pytest.mark.usefixtures("blocks_of_threads")
+def test_a_thread_a_leg_does_what_a_thread_a_world_does():
+    """As on a GPU; with latency, fading motors, a wrench and worlds in the air, 11 of them, no multiple of 8."""
+    count = 11
+    of = rollout(count)
+    values = defaults() | {"latency": np.array(0.0061), "fade": np.array([4.0, 60.0])}
+    values["wrench"][5:15] = [3.0, -2.0, 4.0, 0.1, -0.2, 0.3]
+    values["q"] = np.repeat(values["q"][:, None], count, axis=1)
+    values["q"][2] += np.linspace(0.0, 0.05, count)
+    found = []
+    for of.by_legs in (True, False):
+        trajectory = run(of, values)
+        names, rng = ("q", "qd", "torque", "impulse"), np.random.default_rng(0)
+        seeds = {name: rng.normal(size=getattr(trajectory, name).numpy().shape) for name in names}
+        gradients = of.backward(
+            trajectory, **{name: (of.vectors if name == "impulse" else of.array)(s) for name, s in seeds.items()}
+        )
+        made = {name: getattr(trajectory, name).numpy().copy() for name in names}
+        found.append(made | {f"by {name}": array.numpy().copy() for name, array in gradients.items()})
+    for name, values in found[1].items():
+        scale = np.abs(values).max()
+        np.testing.assert_allclose(found[0][name], values, rtol=0.0, atol=1.0e-9 * scale, err_msg=name)
