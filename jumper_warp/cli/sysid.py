@@ -15,7 +15,7 @@ from jumper_warp.cli.main import TASK_MODULE_HELP, UsageError, parse
 from jumper_warp.utils.errors import InputError
 
 if TYPE_CHECKING:
-    from jumper_warp.optim.identification import Identification
+    from jumper_warp.optim.findings import Identification
     from jumper_warp.optim.motions import Motion
     from jumper_warp.optim.parameters import ParameterSet
     from jumper_warp.optim.residuals import NoiseLevels

@@ -8,7 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from jumper_warp.optim.identification import Identification, Step, channel_fits, result
+from jumper_warp.optim.findings import Identification, Step
+from jumper_warp.optim.identification import End, channel_fits, result
 from jumper_warp.optim.least_squares import Knowledge, LeastSquares, Point
 from jumper_warp.optim.motions import Motion
 from jumper_warp.optim.parameters import ParameterSet
@@ -66,4 +67,4 @@ def identify_by_evolution(
         spent = time.perf_counter() - started
         steps.append(Step(0, cost / problem.count, 0.0, replay.world_steps, spent))
     point = Point(np.clip(best, low, high), point.starts)
-    return result(problem, point, problem.normal(point), nominal, steps, (started, cpu, 0))
+    return result(problem, [End(cost, point, problem.normal(point))], nominal, steps, (started, cpu, 0))

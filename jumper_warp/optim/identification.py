@@ -8,23 +8,24 @@ parameters, and then taken as wholes.
 
 from __future__ import annotations
 
+import functools
 import itertools
 import math
 import time
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
 import numpy as np
 import warp as wp
 
-from jumper_warp.optim.least_squares import DAMPINGS, Knowledge, LeastSquares, Normal, Point
+from jumper_warp.optim.findings import Fit, Identification, Step
+from jumper_warp.optim.least_squares import Knowledge, LeastSquares, Normal, Point
 from jumper_warp.optim.motions import Motion
 from jumper_warp.optim.parameters import ParameterSet
 from jumper_warp.optim.replay import Replay
-from jumper_warp.optim.residuals import MotionResiduals, NoiseLevels
-from jumper_warp.optim.uncertainty import Direction, mismatch_factor, weak_directions
+from jumper_warp.optim.residuals import MotionResiduals, NoiseLevels, NothingMeasured
+from jumper_warp.optim.uncertainty import mismatch_factor, systematic_deviations, weak_directions
 from jumper_warp.robot.description import RobotDescription, load_description
-from jumper_warp.robot.overlay import RobotOverlay, overlay_of
 from jumper_warp.robot.values import LINK_KINDS, RobotValues
 from jumper_warp.utils.checks import check_positive
 from jumper_warp.utils.errors import InputError
@@ -32,136 +33,22 @@ from jumper_warp.utils.errors import InputError
 PIECES = (0.25,)
 """[s] Lengths of the pieces of the stages before the last."""
 WORTH_A_STEP = 0.1
-"""Relative decrease of the cost below which a stage ends, unless it is the last."""
-WHOLE = ((True, 10.0), (False, 1.0), (False, 1.0))
-"""Stages of whole motions: whether they are robust, and the decrease of the cost, in mean squared residuals, that ends
-them: 1 is what one deviation costs."""
+"""Relative decrease of the cost below which the steps on pieces end."""
+CONVERGED = 1.0
+"""Decrease of the cost, in mean squared residuals, below which the optimisation ends: 1 is what one deviation costs."""
+COARSE = 1.0 / 480.0
+"""[s] Physics step of all stages but the last ones, where a finer one is asked for."""
 MOST_STEPS = (5, 25)
-"""Of each stage but the last, and of the last."""
-RATIO_ROWS = {
-    "link_mass": "link_mass", "kp": "gains", "kd": "damping_gains", "armature": "armature",
-    "no_load_speed": "no_load_speed", "cutoff_speed": "cutoff_speed",
-}  # fmt: skip
-"""Row of `RandomizationCfg` that scales a quantity."""
-CONFIDENCE = 1.959964
-"""Deviations on either side of a 95 % interval."""
+"""On pieces, and in each stage of whole motions."""
 
 
-@dataclass(frozen=True)
-class Step:
-    """One step of the optimisation."""
+class End(NamedTuple):
+    """Where steps ended."""
 
-    stage: int
-    chi2: float
-    """Mean squared weighed residual, with knowledge and priors."""
-    damping: float
-    world_steps: int
-    """Physics steps of all worlds up to here."""
-    seconds: float
-
-
-@dataclass(frozen=True)
-class Fit:
-    """How well one channel of one motion is explained."""
-
-    motion: str
-    channel: str
-    chi2: float
-    nominal_chi2: float
-    """Of the described robot from the expected start."""
-    rms: float
-    """[SI unit of the channel]"""
-
-
-@dataclass(frozen=True)
-class Identification:
-    """What was found."""
-
-    parameters: ParameterSet
-    z: np.ndarray
-    """(P,) normalised."""
-    covariance: np.ndarray
-    """(P, P) normalised, from noise and priors alone."""
-    mismatch: float
-    """[1] Factor by which all intervals are wider than noise alone makes them, at least 1."""
-    chi2: float
-    """Mean squared weighed residual of the data."""
-    nominal_chi2: float
-    """Of the described robot from the expected starts."""
-    count: int
-    """Number of measured values."""
-    fits: tuple[Fit, ...]
-    directions: tuple[Direction, ...]
-    """Combinations of parameters of which the data says little."""
-    steps: tuple[Step, ...]
-    dt: float
-    """[s] Physics step."""
-    seconds: float
-    cpu_seconds: float
-    world_steps: int
-    """Physics steps of all worlds."""
-    motions: tuple[MotionResiduals, ...]
-    starts: tuple[np.ndarray, ...]
-
-    @property
-    def values(self) -> np.ndarray:
-        """Values [unit of each parameter], (P,)."""
-        return self.parameters.values(self.z)
-
-    @property
-    def deviations(self) -> np.ndarray:
-        """Standard deviations in deviations of the prior, mismatch included, at most 1, (P,)."""
-        return np.minimum(self.mismatch * np.sqrt(np.diag(self.covariance)), 1.0)
-
-    @property
-    def intervals(self) -> np.ndarray:
-        """95 % intervals [unit of each parameter], within the bounds, (P, 2)."""
-        low, high = self.parameters.bounds()
-        reach = CONFIDENCE * self.deviations
-        edges = (np.clip(self.z - reach, low, high), np.clip(self.z + reach, low, high))
-        return np.stack([self.parameters.values(edge) for edge in edges], axis=1)
-
-    @property
-    def identified(self) -> np.ndarray:
-        """Whether the data at least halves what the prior leaves open, (P,) bool."""
-        return self.deviations < 0.5
-
-    def overlay(self, source: str = "") -> RobotOverlay:
-        """Return the identified robot as an overlay, with the intervals as ranges of randomisation."""
-        quantities = tuple(dict.fromkeys(parameter.quantity for parameter in self.parameters))
-        return overlay_of(self.robots(), quantities, randomization=randomization_ranges(self), source=source)
-
-    def robots(self, count: int = 1) -> RobotValues:
-        """Return the identified robot, `count` times."""
-        return self.parameters.robots(np.repeat(self.z[None], count, axis=0))
-
-
-def randomization_ranges(found: Identification) -> dict[str, tuple[float, float]]:
-    """Return rows of `RandomizationCfg` that hold all intervals, relative to the identified values."""
-    rows: dict[str, tuple[float, float]] = {}
-
-    def widen(row: str, low: float, high: float) -> None:
-        old = rows.get(row, (low, high))
-        rows[row] = (min(low, old[0]), max(high, old[1]))
-
-    for parameter, value, (low, high) in zip(found.parameters, found.values, found.intervals, strict=True):
-        quantity, value, low, high = parameter.quantity, float(value), float(low), float(high)
-        if quantity in RATIO_ROWS:
-            widen(RATIO_ROWS[quantity], low / value, high / value)
-        elif quantity == "base_mass":
-            widen("base_mass", low - value, high - value)
-        elif quantity == "base_com":
-            widen("com_shift", low - value, high - value)
-        elif quantity == "offset":
-            widen("joint_offset", math.degrees(low - value), math.degrees(high - value))
-        elif quantity == "motor_friction":
-            widen("motor_friction", low, high)
-        elif quantity == "paw_friction":
-            widen("dynamic_friction", low, high)
-            widen("static_friction", low, high)
-        elif quantity == "latency":
-            widen("latency", 1.0e3 * low, 1.0e3 * high)
-    return rows
+    cost: float
+    point: Point
+    normal: Normal
+    """Close to it, before the last step."""
 
 
 def total_mass(robots: RobotValues, description: RobotDescription | None = None) -> np.ndarray:
@@ -212,43 +99,43 @@ def identify(
     if replay is None:
         replay = Replay(len(parameters) + 37, description=description, device=device, threads=threads)
     before, steps = replay.world_steps, []
-    robot = replay.description
+    robot, rough_dt = replay.description, None if dt is None else max(dt, COARSE)
 
-    def note(stage: int, problem: LeastSquares, cost: float, damping: float) -> None:
-        count = replay.world_steps - before
-        steps.append(Step(stage, cost / problem.count, damping, count, time.perf_counter() - started))
+    def descend(problem: LeastSquares, point: Point, stage: int, least: Callable[[float, float], float]) -> End:
+        """Take steps until one gains less than least(cost before, cost after)."""
+        for _ in range(MOST_STEPS[0 if stage < len(PIECES) else 1]):
+            normal = problem.normal(point)
+            point, cost, damping = problem.step(point, normal)
+            seconds, count = time.perf_counter() - started, replay.world_steps - before
+            steps.append(Step(stage, cost / problem.count, damping, count, seconds))
+            if normal.cost - cost < least(normal.cost, cost):
+                break
+        return End(cost, point, normal)
 
     whole = [MotionResiduals(motion, parameters, noise, robot, dt) for motion in motions]
+    final = LeastSquares(parameters, whole, replay, knowledge)
+    nominal = channel_fits(final, final.expected())
     z = np.zeros(len(parameters))
     for stage, length in enumerate(PIECES):
-        pieces = [pieces_of(motion, parameters, noise, robot, dt, length) for motion in motions]
-        problem = LeastSquares(parameters, [piece for each in pieces for piece in each], replay, knowledge)
-        point, problem.robust = Point(z, problem.expected().starts), True
-        for _ in range(MOST_STEPS[0]):
-            normal = problem.normal(point)
-            point, cost, damping = problem.step(point, normal)
-            note(stage, problem, cost, damping)
-            if normal.cost - cost < WORTH_A_STEP * normal.cost:
-                break
-        z = point.z
-    problem = LeastSquares(parameters, whole, replay, knowledge)
-    nominal = channel_fits(problem, problem.expected())
-    best: tuple[float, Point, Normal] | None = None
-    point = Point(z, problem.expected().starts)
-    for stage, (robust, least) in enumerate(WHOLE, len(PIECES)):
-        problem.robust = robust
-        for _ in range(MOST_STEPS[1]):
-            normal = problem.normal(point)
-            point, cost, damping = problem.step(point, normal)
-            note(stage, problem, cost, damping)
-            if normal.cost - cost < least * cost / problem.count:
-                break
-        if not robust and (best is None or cost < best[0]):
-            best = (cost, point, normal)
-        if not robust:  # what friction at rest makes of a start is full of small minima: try again from outside
-            point = Point(point.z, problem.expected().starts)
-    _, point, normal = best
-    return result(problem, point, normal, nominal, steps, (started, cpu, before))
+        pieces = [piece for each in motions for piece in pieces_of(each, parameters, noise, robot, rough_dt, length)]
+        problem = LeastSquares(parameters, pieces, replay, knowledge, robust=True)
+        end = descend(problem, Point(z, problem.expected().starts), stage, lambda old, _: WORTH_A_STEP * old)
+        z = end.point.z
+    rough = whole if rough_dt == dt else [MotionResiduals(m, parameters, noise, robot, rough_dt) for m in motions]
+    problem = LeastSquares(parameters, rough, replay, knowledge, robust=True)
+    stage = len(PIECES)
+    nearly, enough = (functools.partial(gained, share=share / final.count) for share in (10.0, 1.0))
+    end = descend(problem, Point(z, problem.expected().starts), stage, nearly)
+    ends = [descend(final, end.point, stage + 1, enough)]
+    # what friction at rest makes of a start is full of small minima: try again from outside
+    again = Point(ends[0].point.z, final.expected().starts)
+    ends.append(descend(final, again, stage + 2, enough))
+    return result(final, ends, nominal, steps, (started, cpu, before))
+
+
+def gained(_: float, cost: float, share: float) -> float:
+    """Return the decrease that a step must bring, a share of the cost after it."""
+    return CONVERGED * share * cost
 
 
 def pieces_of(
@@ -263,8 +150,13 @@ def pieces_of(
     rows = len(motion.time)
     number = max(1, min(round(motion.duration / length), rows // 4))
     edges = [round(rows * i / number) for i in range(number + 1)]
-    spans = itertools.pairwise(edges)
-    return [MotionResiduals(motion, parameters, noise, description, dt, span) for span in spans]
+    found = []
+    for span in itertools.pairwise(edges):
+        try:
+            found.append(MotionResiduals(motion, parameters, noise, description, dt, span))
+        except NothingMeasured:
+            continue
+    return found
 
 
 def channel_fits(problem: LeastSquares, point: Point) -> list[tuple[str, str, float, int, float]]:
@@ -282,10 +174,11 @@ def channel_fits(problem: LeastSquares, point: Point) -> list[tuple[str, str, fl
 
 
 def result(
-    problem: LeastSquares, point: Point, normal: Normal, nominal: list, steps: list[Step], begun: tuple
+    problem: LeastSquares, ends: Sequence[End], nominal: list, steps: list[Step], begun: tuple
 ) -> Identification:
-    """Return what is reported of an optimisation that ended at a point, close to which the normal equations are."""
+    """Return what is reported of an optimisation; ends: of each try."""
     started, cpu, before = begun
+    _, point, normal = min(ends, key=lambda end: end.cost)
     fits = channel_fits(problem, point)
     rows = [
         Fit(motion, channel, cost / count, old / count, rms)
@@ -298,11 +191,17 @@ def result(
         table = np.full(motion.valid.shape, math.nan)
         table[motion.valid] = motion.residuals(problem.replay, point.z[None], start[None])[:, 0]
         tables.append(table)
+    covariance = np.linalg.inv(information + np.eye(len(information)))
+    mismatch = mismatch_factor(tables)
+    columns = [np.nonzero(motion.valid)[1] for motion in problem.motions]
+    systematic = systematic_deviations(normal, columns, covariance) if mismatch > 1.0 else np.zeros(len(point.z))
     return Identification(
         parameters=problem.parameters,
         z=point.z,
-        covariance=np.linalg.inv(information + np.eye(len(information))),
-        mismatch=mismatch_factor(tables),
+        covariance=covariance,
+        mismatch=mismatch,
+        systematic=systematic,
+        spread=np.ptp([end.point.z for end in ends], axis=0),
         chi2=chi2,
         nominal_chi2=sum(cost for _, _, cost, _, _ in nominal) / problem.count,
         count=problem.count,
@@ -318,4 +217,4 @@ def result(
     )
 
 
-__all__ = ["DAMPINGS", "Identification", "identify", "total_mass", "weighed"]
+__all__ = ["Identification", "identify", "total_mass", "weighed"]

@@ -106,11 +106,14 @@ class LeastSquares:
         motions: Sequence[MotionResiduals],
         replay: Replay,
         knowledge: Sequence[Knowledge] = (),
+        robust: bool = False,
     ):
-        """Lay out the unknowns."""
+        """Lay out the unknowns.
+
+        robust: residuals that stand out count less: where a paw strikes a moment too late, all are wrong.
+        """
         self.parameters, self.motions, self.replay, self.knowledge = parameters, motions, replay, knowledge
-        self.robust = False
-        """Whether residuals that stand out count less: where a paw strikes a moment too late, all are wrong."""
+        self.robust = robust
         self._typical = math.inf
         self.count = sum(int(motion.valid.sum()) for motion in motions)
         """Number of measured values."""

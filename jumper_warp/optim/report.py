@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from jumper_warp.optim.identification import Identification
+from jumper_warp.optim.findings import Identification
 from jumper_warp.optim.residuals import MotionResiduals
 from jumper_warp.robot.description import MOTOR_JOINTS
 from jumper_warp.utils.files import write_whole

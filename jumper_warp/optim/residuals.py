@@ -65,6 +65,10 @@ class NoiseLevels:
         }
 
 
+class NothingMeasured(InputError):
+    """A motion in which no row says anything that a replay could be compared to."""
+
+
 class Linearised(NamedTuple):
     """Residuals and Jacobian of one motion."""
 
@@ -141,7 +145,7 @@ class MotionResiduals:
         if self.free:
             self.valid[motion.time < motion.time[0] + SETTLING] = False
         if not self.valid.any():
-            raise InputError(f"motion {motion.name}: nothing is measured that a replay could be compared to")
+            raise NothingMeasured(f"motion {motion.name}: nothing is measured that a replay could be compared to")
         self.sigma, self._leg = np.array(sigma), np.array(legs)
 
     def _guess_start(self, noise: dict[str, tuple[float, int]]) -> None:

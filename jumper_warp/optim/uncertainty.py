@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from jumper_warp.optim.least_squares import Normal
 from jumper_warp.optim.parameters import Parameter, ParameterSet
 
 WEAK = 3.0
@@ -73,6 +74,21 @@ def mismatch_factor(tables: Sequence[np.ndarray]) -> float:
     excess = max(chi2, 1.0) * max(tau, 1.0)
     # as far as chance alone may go, noise is all there is
     return float(np.sqrt(excess)) if excess > 1.0 + 6.0 * np.sqrt(2.0 / len(squares)) else 1.0
+
+
+def systematic_deviations(normal: Normal, columns: Sequence[np.ndarray], covariance: np.ndarray) -> np.ndarray:
+    """Return standard deviations (P,) from how far single channels of the motions pull the parameters apart.
+
+    Each channel of each motion (a motor's angle, say) is taken as one independent voice, whatever its errors are
+    (the cluster-robust sandwich estimate). columns: of each motion's residuals, (m,).
+    """
+    size, scores = len(covariance), []
+    for found, own, mixed, column in zip(normal.linearised, normal.start_matrices, normal.mixed, columns, strict=True):
+        alone = found.jacobian[:, :size] - found.jacobian[:, size:] @ np.linalg.solve(own, mixed.T)
+        score = alone * found.residual[:, None]
+        scores += [score[column == i].sum(axis=0) for i in np.unique(column)]
+    pulls = covariance @ np.array(scores).T
+    return np.sqrt(np.sum(pulls**2, axis=1))
 
 
 def weak_directions(parameters: ParameterSet, information: np.ndarray) -> tuple[Direction, ...]:
