@@ -52,14 +52,14 @@ class ScriptStep:
 def read_script(path: Path) -> tuple[ScriptStep, ...]:
     """Return the commands of a file. Raises InputError: it cannot be read, or a command is malformed."""
     try:
-        size = path.stat().st_size
-        if size > MAX_BYTES:
-            raise InputError(f"{path}: larger than {MAX_BYTES >> 20} MiB")
-        content = json.loads(path.read_bytes())
+        too_large = path.stat().st_size > MAX_BYTES
+        content = None if too_large else json.loads(path.read_bytes())
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror})") from error
     except (ValueError, RecursionError) as error:
         raise InputError(f"{path}: not JSON ({error!s:.100})") from error
+    if too_large:
+        raise InputError(f"{path}: larger than {MAX_BYTES >> 20} MiB")
     try:
         return parse_script(content)
     except InputError as error:

@@ -58,13 +58,12 @@ WALKING = dataclasses.replace(JUMP, randomization=RandomizationCfg.walking())
 CASES = {
     # action, physics, track, step, 2 to observe; then reset, forget, 2 to observe what has begun
     "nominal": ((JUMP,), {"randomize": False, "noise": False}, 10),
-    "measured": ((JUMP,), {"auto_reset": False}, 6),
-    # events, and packing what they drew
-    "randomised": ((JUMP,), {}, 12),
-    # events in every step
+    "measured": ((JUMP,), {"auto_reset": False}, 7),
+    # events, in every step too, and packing what they drew
+    "randomised": ((JUMP,), {}, 13),
     "pushed": ((WALKING,), {}, 13),
     # of the second skill: events in every step, step, 2 to observe; then home, events, packing, reset, 2 to observe
-    "two skills": ((JUMP, HOLD), {}, 22),
+    "two skills": ((JUMP, HOLD), {}, 23),
 }
 """Tasks, settings and number of launches."""
 
