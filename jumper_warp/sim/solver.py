@@ -115,7 +115,8 @@ class SolverJumper(SolverBase):
     """Exact 18-coordinate dynamics of the Jumper with rigid paw contact.
 
     The five-bar loops hold by construction. Semi-implicit Euler; contact paw by paw to `tolerance`, on a CPU in turn
-    (Gauss-Seidel), on a GPU the one first whose velocity would change most. Per-world masses, inertias, armature,
+    (Gauss-Seidel), on a GPU the one first whose velocity would change most. Hard stops, of motors and of a leg's
+    outer + inner, are settled together with contact (`kernels.actuation.stops`). Per-world masses, inertias, armature,
     motor friction, damping, joint stops, paw friction and gravity are read from the model: write the model's arrays,
     then call `notify_model_changed`.
 

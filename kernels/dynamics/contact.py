@@ -10,6 +10,7 @@ v_free = -gap / dt lets an open gap close exactly. The four paws are coupled thr
     v_k = v_k0 + A_k p_k + G_k (change of base twist),   change of base twist = S^-1 sum_k G_k^T p_k,
 
 so block Gauss-Seidel over the paws, each solved exactly as a 3x3 problem, converges quickly. Vectors are in body axes.
+Pressed hard stops are part of A and S (see `world_step`).
 
 Velocities of paws that touch a sliding block are relative to it. The block obeys friction with the floor exactly, at
 every stage of the iteration: its velocity is a function of the impulses (`block_velocity`), so that paws and block
