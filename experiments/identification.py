@@ -27,14 +27,16 @@ from jumper_warp.evaluation.jumps import Jumps
 from jumper_warp.evaluation.log import run_evaluation, termination_names
 from jumper_warp.evaluation.plots import drawn
 from jumper_warp.optim.evolution import identify_by_evolution
-from jumper_warp.optim.excitation import KINDS, Plan, draw_plan, unsafe
+from jumper_warp.optim.excitation import unsafe
 from jumper_warp.optim.findings import Identification
 from jumper_warp.optim.identification import identify, total_mass, weighed
 from jumper_warp.optim.least_squares import Knowledge, LeastSquares
 from jumper_warp.optim.motions import Motion
 from jumper_warp.optim.parameters import ParameterSet, jumper_parameters
+from jumper_warp.optim.plans import KINDS, Plan, draw_plan
 from jumper_warp.optim.recording import measured, replay_plan, simulate_plan
 from jumper_warp.optim.replay import Record, Replay
+from jumper_warp.optim.residuals import MotionResiduals, NoiseLevels
 from jumper_warp.policies.restore import Conditions, env_of_policy, open_policy
 from jumper_warp.robot.overlay import overlay_of
 from jumper_warp.robot.values import RobotValues
@@ -172,8 +174,6 @@ def run_case(
 
 def scipy_fit(parameters: ParameterSet, case: Case, replay: Replay, seconds: float) -> np.ndarray:
     """Return what SciPy's trust region finds in so many seconds from differences over the same parallel worlds."""
-    from jumper_warp.optim.residuals import MotionResiduals, NoiseLevels
-
     whole = [MotionResiduals(motion, parameters, NoiseLevels(), replay.description) for motion in case.motions]
     problem = LeastSquares(parameters, whole, replay, [case.mass])
     point, size, ends = problem.expected(), len(parameters), time.perf_counter() + seconds
@@ -209,7 +209,7 @@ def scipy_fit(parameters: ParameterSet, case: Case, replay: Replay, seconds: flo
             table[row : row + len(found), :size] = found[:, :size]
             table[row : row + len(found), edges[i] : edges[i + 1]] = found[:, size:]
             row += len(found)
-        slopes = problem._known(z)
+        slopes = problem.known(z)
         table[row, :size] = slopes[0][1]
         table[row + 1 :] = np.eye(len(x))
         return table
@@ -239,8 +239,6 @@ def compare_methods(parameters: ParameterSet, case: Case, replay: Replay, ours: 
 
 def chi2_at(parameters: ParameterSet, case: Case, replay: Replay, z: np.ndarray) -> float:
     """Return the mean squared weighed residual at parameters, the starts as the first rows say."""
-    from jumper_warp.optim.residuals import MotionResiduals, NoiseLevels
-
     whole = [MotionResiduals(motion, parameters, NoiseLevels(), replay.description) for motion in case.motions]
     problem = LeastSquares(parameters, whole, replay)
     starts = [start[None] for start in problem.expected().starts]

@@ -239,7 +239,8 @@ def excite(cfg: ExciteCfg) -> list[Motion]:
     """Plan, record and write motions; raises as `run`."""
     import numpy as np
 
-    from jumper_warp.optim.excitation import KINDS, Scorer, choose
+    from jumper_warp.optim.excitation import Scorer, choose
+    from jumper_warp.optim.plans import KINDS
     from jumper_warp.optim.recording import measured, simulate_plan
     from jumper_warp.optim.replay import Replay
     from jumper_warp.robot.overlay import load_overlay

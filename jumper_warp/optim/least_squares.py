@@ -148,7 +148,7 @@ class LeastSquares:
             normal.mixed.append(square[:size, size:])
             normal.start_matrices.append(square[size:, size:] + np.eye(len(start)))
             normal.start_gradients.append(slope[size:] + start)
-        for residual, slope in self._known(point.z):
+        for residual, slope in self.known(point.z):
             normal.matrix += np.outer(slope, slope)
             normal.gradient += slope * residual
             normal.cost += residual**2
@@ -166,7 +166,7 @@ class LeastSquares:
         limit = ROBUST * self._typical
         return limit**2 * np.log1p((residual / limit) ** 2)
 
-    def _known(self, z: np.ndarray) -> list[tuple[float, np.ndarray]]:
+    def known(self, z: np.ndarray) -> list[tuple[float, np.ndarray]]:
         """Return residual and slope (P,) of each piece of knowledge."""
         step = 1.0e-6
         robots = self.parameters.robots(np.concatenate([z[None], z + step * np.eye(len(z))]), self.replay.description)

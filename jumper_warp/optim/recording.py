@@ -7,10 +7,11 @@ import math
 import numpy as np
 import warp as wp
 
-from jumper_warp.optim.excitation import SAMPLES, TICK, Plan
 from jumper_warp.optim.motions import Motion
+from jumper_warp.optim.plans import SAMPLES, TICK, Plan
 from jumper_warp.optim.replay import Record, Replay, Starts
-from jumper_warp.optim.residuals import HANGING_HEIGHT, NoiseLevels, from_vector, multiply
+from jumper_warp.optim.residuals import HANGING_HEIGHT, NoiseLevels
+from jumper_warp.optim.rotations import from_vector, multiply
 from jumper_warp.optim.stance import stance
 from jumper_warp.robot.description import load_description
 from jumper_warp.robot.motors import MotorCfg

@@ -13,6 +13,7 @@ from typing import Any, Literal
 import numpy as np
 import warp as wp
 
+from jumper_warp.optim.rotations import rotate
 from jumper_warp.robot.description import RobotDescription, load_description
 from jumper_warp.robot.model import build_model
 from jumper_warp.robot.motors import OVERSPEED_END, OVERSPEED_START, MotorCfg
@@ -44,7 +45,7 @@ TOLERANCE = 1.0e-10
 HELD_MASS = 2.0**30
 """[kg], [kg m^2] Of a base that is held: its weight is exact in single precision, so that a wrench cancels it."""
 _capturing = threading.Lock()
-LATERAL_FIRST = np.tile([0, 1, 1], 4)
+KIND_OF_MOTOR = np.tile([0, 1, 1], 4)
 """Kind of each motor."""
 
 
@@ -230,7 +231,7 @@ class Replay:
         """Write the constants of the motors, and the latency."""
         kinds = [motors.lateral, motors.transversal]
         values = {
-            name: np.array([getattr(kinds[kind], name) for kind in LATERAL_FIRST])
+            name: np.array([getattr(kinds[kind], name) for kind in KIND_OF_MOTOR])
             for name in ("kp", "kd", "saturation", "peak")
         }
         for name in ("kp", "kd", "saturation"):
@@ -296,12 +297,6 @@ def balanced(count: int, threads: int) -> list[Worlds]:
     parts = max(1, min(threads, count // 4))
     edges = [round(count * i / parts) for i in range(parts + 1)]
     return [Worlds(a, b - a) for a, b in itertools.pairwise(edges)]
-
-
-def rotate(quaternion: np.ndarray, vector: np.ndarray) -> np.ndarray:
-    """Return vectors (..., 3) turned by quaternions xyzw (..., 4)."""
-    axis, w = quaternion[..., :3], quaternion[..., 3:]
-    return vector + 2.0 * np.cross(axis, np.cross(axis, vector) + w * vector)
 
 
 def grid_steps(period: float, dt: float | None) -> tuple[int, float]:

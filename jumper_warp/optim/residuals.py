@@ -10,7 +10,8 @@ import numpy as np
 
 from jumper_warp.optim.motions import Motion
 from jumper_warp.optim.parameters import BASE_ONLY, ParameterSet
-from jumper_warp.optim.replay import Record, Replay, Starts, grid_steps, rotate
+from jumper_warp.optim.replay import Record, Replay, Starts, grid_steps
+from jumper_warp.optim.rotations import from_vector, multiply, rotate, to_vector
 from jumper_warp.optim.stance import stance
 from jumper_warp.robot.description import RobotDescription
 from jumper_warp.robot.values import RobotValues
@@ -312,24 +313,3 @@ def slope(time: np.ndarray, values: np.ndarray) -> np.ndarray:
         if known.sum() >= 3:
             found[i] = np.polyfit(time[known] - time[0], values[known, i], 1)[0]
     return found
-
-
-def multiply(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Return the product of quaternions xyzw (..., 4)."""
-    vector = a[..., 3:] * b[..., :3] + b[..., 3:] * a[..., :3] + np.cross(a[..., :3], b[..., :3])
-    scalar = a[..., 3:] * b[..., 3:] - np.sum(a[..., :3] * b[..., :3], axis=-1, keepdims=True)
-    return np.concatenate([vector, scalar], axis=-1)
-
-
-def from_vector(vector: np.ndarray) -> np.ndarray:
-    """Return the quaternions xyzw (..., 4) of rotation vectors (..., 3) [rad]."""
-    angle = np.linalg.norm(vector, axis=-1, keepdims=True)
-    return np.concatenate([0.5 * np.sinc(0.5 * angle / np.pi) * vector, np.cos(0.5 * angle)], axis=-1)
-
-
-def to_vector(quaternion: np.ndarray) -> np.ndarray:
-    """Return the rotation vectors (..., 3) [rad] of quaternions xyzw (..., 4), at most half a turn."""
-    quaternion = quaternion * np.where(quaternion[..., 3:] < 0.0, -1.0, 1.0)
-    size = np.linalg.norm(quaternion[..., :3], axis=-1, keepdims=True)
-    angle = 2.0 * np.arctan2(size, quaternion[..., 3:])
-    return quaternion[..., :3] * np.where(size > 1.0e-12, angle / np.maximum(size, 1.0e-12), 2.0)

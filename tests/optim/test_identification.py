@@ -6,9 +6,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from jumper_warp.optim.excitation import KINDS, Scorer, draw_plan
+from jumper_warp.optim.excitation import Scorer
 from jumper_warp.optim.identification import identify, total_mass, weighed
 from jumper_warp.optim.parameters import Parameter, ParameterSet, jumper_parameters
+from jumper_warp.optim.plans import KINDS, draw_plan
 from jumper_warp.optim.recording import measured, replay_plan, simulate_plan
 from jumper_warp.optim.replay import Replay
 from jumper_warp.optim.residuals import MotionResiduals, NoiseLevels

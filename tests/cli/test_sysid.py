@@ -1,0 +1,88 @@
+"""The command `jumper sysid`, from planned motions to an overlay that the other commands take."""
+
+import json
+import re
+
+import numpy as np
+import pytest
+
+from jumper_warp.cli.main import main
+from jumper_warp.optim.actuators import COLUMNS, described_constants, synthetic_bench
+from jumper_warp.optim.motions import load_motion
+from jumper_warp.robot.overlay import RobotOverlay, load_overlay
+
+PARAMS = ["--params", "latency,offsets"]
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory):
+    """Return the folder of short motions of a robot whose sensors are off and whose targets come late."""
+    folder = tmp_path_factory.mktemp("sysid")
+    truth = RobotOverlay({"offset": tuple(np.radians(np.linspace(-1.0, 1.0, 12))), "latency": (0.003,)})
+    truth.save(folder / "truth.json")
+    flags = ["--candidates", "1", "--seconds", "0.5", "--robot", str(folder / "truth.json")]
+    main(["sysid", "excite", *PARAMS, *flags, "--out", str(folder / "motions")])
+    return folder
+
+
+def test_excite_records_motions_and_tells_what_to_expect(recorded):
+    files = sorted((recorded / "motions").glob("*.npz"))
+    assert [file.stem for file in files] == ["0_hung_chirp", "1_hung_chirp", "2_standing_chirp", "3_small_jump"]
+    assert [load_motion(file).base for file in files] == ["fixed", "fixed", "free", "free"]
+    told = json.loads((recorded / "motions" / "excite.json").read_text())
+    assert np.all(np.diff(told["gain_nat"]) > 0.0)
+    assert told["parameters"]["latency"]["expected_deviation"] < 2.0e-4
+    assert told["parameters"]["offset/FL_outer"]["of_prior"] < 0.2
+
+
+def test_sysid_writes_an_overlay_and_a_report_that_needs_nothing_else(recorded, capsys):
+    out = recorded / "found"
+    main(["sysid", str(recorded / "motions"), *PARAMS, "--out", str(out)])
+    found, truth = load_overlay(out / "identified.json"), load_overlay(recorded / "truth.json")
+    assert found.values["latency"][0] == pytest.approx(0.003, abs=1.0e-4)
+    np.testing.assert_allclose(found.values["offset"], truth.values["offset"], atol=np.radians(0.25))
+    low, high = found.randomization["latency"]
+    assert 2.8 < low < 3.0 < high < 3.2
+    report = json.loads((out / "report.json").read_text())
+    assert 0.9 < report["chi2"] < 1.1 and report["nominal_chi2"] > 10.0
+    page = (out / "report.html").read_text()
+    assert page.count("data:image/png;base64,") == 6 and "offset/BR_inner" in page
+    assert not re.search(r"(src|href)=\"?(?!data:)", page) and "<script" not in page
+    assert "χ²" in capsys.readouterr().out
+
+
+def test_evolution_is_the_other_method(recorded):
+    pytest.importorskip("cma")
+    out = recorded / "evolved"
+    more = ["--method", "cma", "--max-seconds", "3", "--without", "offsets"]
+    main(["sysid", str(recorded / "motions" / "0_hung_chirp.npz"), *PARAMS, *more, "--out", str(out)])
+    assert load_overlay(out / "identified.json").values["latency"][0] == pytest.approx(0.003, abs=1.0e-3)
+
+
+def test_a_motor_is_characterised_from_a_bench(tmp_path):
+    bench = synthetic_bench(described_constants("transversal") | {"friction": 0.3}, np.random.default_rng(0))
+    rows = zip(*(getattr(bench, name) for name in COLUMNS), strict=True)
+    (tmp_path / "bench.csv").write_text("\n".join([",".join(COLUMNS), *(",".join(map(str, row)) for row in rows)]))
+    main(["sysid", "actuator", str(tmp_path / "bench.csv"), "--out", str(tmp_path)])
+    found = json.loads((tmp_path / "actuator.json").read_text())["constants"]["friction"]
+    assert found["value"] == pytest.approx(0.3, abs=0.02) and found["identified"]
+
+
+@pytest.mark.parametrize(
+    ("args", "words"),
+    [
+        ([], "data comes first"),
+        (["nowhere.npz"], "nowhere.npz"),
+        (["."], "no npz, csv or parquet file"),
+        (["x.npz", "--params", "gears"], "unknown group of parameters 'gears'"),
+        (["x.npz", "--without", "kq"], "no parameter 'kq' to leave out"),
+        (["x.npz", "--noise.angle", "0"], "noise angle must be positive"),
+    ],
+)
+def test_mistakes_are_told_in_one_line(args, words, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit) as end:
+        main(["sysid", *args])
+    assert end.value.code == 2
+    error = capsys.readouterr().err.strip()
+    assert words in error and len(error.splitlines()) == 1
