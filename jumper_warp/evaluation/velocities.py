@@ -9,6 +9,8 @@ from typing import Any
 import numpy as np
 import tyro
 
+from jumper_warp.evaluation.film import Film, Strip
+from jumper_warp.evaluation.landings import PICTURE, beside
 from jumper_warp.evaluation.log import EvaluationEnv, EvaluationLog, Metrics, finite
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.utils.errors import InputError
@@ -23,6 +25,10 @@ SMOOTHING = 0.2
 """[s] Over which velocities are averaged to tell whether it has."""
 HOLD = 0.5
 """[s] For which a robot stays within that error that has settled in spite of pushes."""
+SHOWN_TIME = 0.6
+"""[s] At the end of a walk, that its filmstrip shows: more than a stride."""
+PICTURES = 9
+"""Of the filmstrip."""
 MOST_ROBOTS = 20_000
 
 
@@ -147,6 +153,15 @@ class Walks(EvaluationLog):
     def notes(self, worlds: Sequence[int]) -> dict[str, Any]:
         """Return the commands."""
         return {"commands": self.commands[list(worlds)].tolist(), "times_s": self.times.tolist()}
+
+    def strip(self, film: Film) -> Strip:
+        """Return pictures of the last stride of the first filmed robot."""
+        base = film.base(0)
+        first = max(0, len(base) - 1 - round(SHOWN_TIME / film.env.step_dt))
+        frames = np.linspace(first, len(base) - 1, PICTURES).round().astype(int).tolist()
+        eye, target = beside(base[first, :2], base[-1, :2])
+        captions = [f"{(frame + 1) * film.env.step_dt:.2f} s" for frame in frames]
+        return Strip(0, frames, captions, eye + [0.0, 0.0, base[-1, 2] - 0.3], target, PICTURE)
 
 
 def body_velocity(arrays: dict[str, np.ndarray]) -> np.ndarray:

@@ -44,7 +44,7 @@ def test_robots_that_stand_still_come_nowhere_on_any_ground(policies, tmp_path):
     figures = walking_terrain.main(args)
     assert figures["success_rate_flat"] < 0.02 and figures["success_rate_stairs"] < 0.02
     assert figures["fall_rate_flat"] == 0.0 and (tmp_path / "terrain.png").is_file()
-    assert (tmp_path / "stairs.rrd").stat().st_size > 10_000
+    assert (tmp_path / "stairs.rrd").stat().st_size > 10_000 and (tmp_path / "flat.png").stat().st_size > 10_000
 
 
 def test_kicks_and_speeds_are_those_of_the_test():
