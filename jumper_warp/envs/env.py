@@ -199,7 +199,8 @@ class Env(Stages):
         self._tick(mask)
         self._go_home(self._part(), mask)
         self._draw(self._part(), mask)
-        self._launch(stand_kernel, n, [mask, headings, self._scene, self.robot])
+        inputs = [mask, headings, self._scene, self._settings, self.worlds.skill, self.robot]
+        self._launch(stand_kernel, n, inputs)
         self._forget(self._part(), mask)
         self._give(mask, 1, values, headings)
         self.worlds.done.zero_()
