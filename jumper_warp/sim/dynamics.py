@@ -171,6 +171,9 @@ class JumperDynamics:
         self._ground_shape = find_ground(model)
         self.static_friction_ratio = wp.full(self.num_worlds, 1.0, dtype=float, device=self.device)
         """Static over dynamic friction coefficient [1], shape (num_worlds,); call `pack_friction` after a change."""
+        self.leg_springs = wp.zeros(self.num_worlds, dtype=wp.vec2, device=self.device)
+        """Stiffness [N/m], 0: none, and rest length [m] of the springs between the knees, shape (num_worlds,); call
+        `pack_springs` after a change."""
 
         self.robot = self.modules.step.Robot()
         self.robot.geometry = leg_geometry_array(self.description, self.modules.geometry, self.device)
@@ -202,11 +205,12 @@ class JumperDynamics:
         return work
 
     def pack(self) -> None:
-        """Read masses, joints, friction and gravity of every world from the model."""
+        """Read masses, joints, friction and gravity of every world from the model, and its springs."""
         self.pack_masses()
         self.pack_joints()
         self.pack_friction()
         self.pack_gravity()
+        self.pack_springs()
 
     def pack_masses(self) -> None:
         """Read masses, centres of mass and inertias."""
@@ -257,6 +261,10 @@ class JumperDynamics:
     def pack_gravity(self) -> None:
         """Read gravity."""
         self._launch(self.modules.parameters.pack_gravity_kernel, self.num_worlds, [self.model.gravity])
+
+    def pack_springs(self) -> None:
+        """Read `leg_springs`."""
+        self._launch(self.modules.parameters.pack_springs_kernel, (self.num_worlds, 4), [self.leg_springs])
 
     def _launch(self, kernel: wp.Kernel, dim: int | tuple[int, ...], inputs: list) -> None:
         wp.launch(kernel, dim=dim, inputs=inputs, outputs=[self.robot.table], device=self.device)

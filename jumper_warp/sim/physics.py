@@ -167,7 +167,8 @@ class MujocoPhysics:
         model.joint_damping.assign(damping.ravel())
         self.solver = mujoco_solver(model, dt=sim.dt)
         robot = load_description()
-        self._passive = [knee_damping, robot.knee_damping_limit, *robot.transversal_sum, *EXPLICIT_STOP]
+        self._passive = [knee_damping, robot.knee_damping_limit, *robot.transversal_sum, *EXPLICIT_STOP,
+                         self.dynamics.robot.geometry, self.dynamics.leg_springs]  # fmt: skip
         self.invalid = wp.zeros(n, dtype=int, device=device)
         self.impulse = wp.zeros((4, n), dtype=wp.vec3, device=device)
         self.torque = wp.zeros((12, n), dtype=float, device=device)

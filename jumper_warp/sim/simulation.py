@@ -15,7 +15,7 @@ from jumper_warp.robot.model import PHYSICS_DT, Extras, build_model
 from jumper_warp.robot.motors import FilterCfg, MotorCfg, filter_params, jumping_motors, motor_arrays
 from jumper_warp.robot.overlay import RobotOverlay
 from jumper_warp.robot.values import RobotValues
-from jumper_warp.sim.overlay import write_model, write_motors
+from jumper_warp.sim.overlay import write_model, write_motors, write_springs
 from jumper_warp.sim.physics import JumperPhysics, MujocoPhysics, Physics
 from jumper_warp.sim.slices import SlicedGraph, Worlds, slices_of
 from jumper_warp.sim.solver import TOLERANCE, check_step, check_tolerance
@@ -127,6 +127,8 @@ class Simulation:
         self.physics: Physics = (
             JumperPhysics(self, block, tolerance) if solver == "jumper" else MujocoPhysics(self, observe_forces)
         )
+        if values is not None:
+            write_springs(self.physics.dynamics, values)
         shared = self.physics.sliced and not self.device.is_cuda
         self.slices = slices_of(num_worlds, threads if shared else 1)
         self.solver = self.physics.solver
