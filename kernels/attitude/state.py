@@ -18,6 +18,10 @@ class AttitudeState:
     old_error: float  # [rad] one policy step before
     inside: int  # policy steps in a row with an error within tolerance, up to now
     collisions: int  # policy steps in which anything but paws touched something, or links touched each other
+    jump_start: wp.vec3  # [m] where the jump began whose flight this is, if it is one
+    jump_goal: wp.vec3  # [m] where it is to land, base x, y; and its wanted height at the apex
+    goal_ground: float  # [m] height of the ground there
+    max_height: float  # [m] of the base since takeoff
     episodes: float  # that were followed to an end, counted
     sum_error: float  # [rad] of their errors at the end
     settled: float  # of these, how many ended within tolerance
@@ -58,6 +62,7 @@ def advance_attitude(view: RobotView, task: AttitudeState, tolerance: float) -> 
     t.old_error = task.error
     t.error = angle_between(view.quat, task.goal)
     t.inside = wp.where(t.error <= tolerance, task.inside + 1, 0)
+    t.max_height = wp.max(task.max_height, view.pos[2])
     if view.collisions != 0:
         t.collisions = task.collisions + 1
     return t
