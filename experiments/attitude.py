@@ -7,8 +7,8 @@ Robots float at rest in the default pose, in zero gravity, and are told to turn 
 error stays within a tolerance until the end; it succeeds if it is, and nothing has touched anything. The authors' robot
 turned by 90 degrees in 2.6 s. Nothing but its own legs turns the robot, so that its angular momentum should stay 0:
 what the solver makes of it is told, as the largest of all robots at any time, and as the angle by which it alone turns
-a robot: its integral over the moment of inertia in the default pose. `--solver mujoco` is a check against physics that
-the policy was not trained on.
+a robot: its integral over the moment of inertia in the default pose. `--refine 4` turns the same robots with a physics
+step of a quarter, where less of it is left, and `--solver mujoco` with physics that the policy was not trained on.
 """
 
 from __future__ import annotations
@@ -45,6 +45,8 @@ class Args(EvaluationArgs):
     """[deg] Error up to which a robot is at its goal."""
     seconds: float = 5.0
     """[s] Of which every turn is followed."""
+    refine: int = 1
+    """How many times finer the physics step is than that of the training."""
     record: int = 6
     """Number of turns to record for the Rerun viewer and, the first of them, as a filmstrip; 0: none."""
 
@@ -106,7 +108,8 @@ def plot(run: EvaluationRun, turns: Turns, title: str) -> None:
 def main(args: Args) -> dict:
     """Run the test and return its figures."""
     run = EvaluationRun.of("attitude", args, ("attitude",))
-    env = run.env(args.turns)
+    env = run.env(args.turns, refine=args.refine)
+    run.told["physics_step_s"] = env.physics_dt
     turns, watch = args.flags().log(run.task, args.seed), MomentumWatch(env)
     inertia = rotational_inertia(env.sim)
     run.follow(env, turns, film="turns", watch=watch)

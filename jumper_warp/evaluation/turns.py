@@ -156,7 +156,7 @@ class Turns(EvaluationLog):
         captions = [f"{(i + 1) * self.step_dt:.2f} s, {np.degrees(self.errors[i][world]):.0f} deg" for i in frames]
         height = float(film.base(0)[0, 2])
         view = {"eye": (1.2, 1.5, height + 0.5), "target": (0.0, 0.0, height - 0.05), "size": (320, 320)}
-        return Strip(0, frames, captions, **view)
+        return Strip(0, frames, captions, **view, name="turn_strip")
 
 
 def turn_metrics(turns: Turns) -> Metrics:
