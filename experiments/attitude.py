@@ -7,13 +7,14 @@ Robots float at rest in the default pose, in zero gravity, and are told to turn 
 error stays within a tolerance until the end; it succeeds if it is, and nothing has touched anything. The authors' robot
 turned by 90 degrees in 2.6 s. Nothing but its own legs turns the robot, so that its angular momentum should stay 0:
 what the solver makes of it is told, as the largest of all robots at any time, and as the angle by which it alone turns
-a robot: its integral over the moment of inertia in the default pose. `--refine 4` turns the same robots with a physics
-step of a quarter, where less of it is left, and `--solver mujoco` with physics that the policy was not trained on.
+a robot: its integral over the moment of inertia in the default pose. By default the momentum is kept (`Simulation`);
+`--no-keep-momentum` tells what the solver alone would do, `--refine 4` turns the same robots with a physics step of a
+quarter, and `--solver mujoco` with physics that the policy was not trained on and that keep no momentum.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -45,6 +46,8 @@ class Args(EvaluationArgs):
     """[deg] Error up to which a robot is at its goal."""
     seconds: float = 5.0
     """[s] Of which every turn is followed."""
+    keep_momentum: bool = True
+    """Whether the momentum of free flight is kept exactly, whatever the training had."""
     refine: int = 1
     """How many times finer the physics step is than that of the training."""
     record: int = 6
@@ -108,8 +111,8 @@ def plot(run: EvaluationRun, turns: Turns, title: str) -> None:
 def main(args: Args) -> dict:
     """Run the test and return its figures."""
     run = EvaluationRun.of("attitude", args, ("attitude",))
-    env = run.env(args.turns, refine=args.refine)
-    run.told["physics_step_s"] = env.physics_dt
+    env = run.env(args.turns, lambda task: replace(task, keep_momentum=args.keep_momentum), refine=args.refine)
+    run.told |= {"physics_step_s": env.physics_dt, "keep_momentum": args.keep_momentum}
     turns, watch = args.flags().log(run.task, args.seed), MomentumWatch(env)
     inertia = rotational_inertia(env.sim)
     run.follow(env, turns, film="turns", watch=watch)

@@ -104,7 +104,7 @@ class Env(Stages):
             num_envs, solver=solver, motors=self.task.motors, visuals=visuals, device=device and str(device),
             ground=ground, block=BlockCfg((0.0, 0.0)) if self._draws_ground else block, tolerance=CONTACT_TOLERANCE,
             friction=self.task.randomization.nominal_friction, gravity=self.task.gravity, robot=robot, threads=threads,
-            dt=PHYSICS_DT / refine, substeps=SUBSTEPS * refine,
+            dt=PHYSICS_DT / refine, substeps=SUBSTEPS * refine, keep_momentum=any(each.keep_momentum for each in tasks),
         )  # fmt: skip
         self.wp_device = self.sim.device
         self.device = torch.device(wp.device_to_torch(self.wp_device))

@@ -22,7 +22,7 @@ JOINTS = ("lateral", "outer", "outer_knee", "inner", "inner_knee")
 KERNEL_MODULES = (
     "actuation.command_filter", "actuation.motors", "dynamics.advance", "dynamics.advance_legs", "dynamics.contact",
     "dynamics.contact_adjoint", "dynamics.differentiable", "dynamics.drive", "dynamics.gradients",
-    "dynamics.parameters", "dynamics.rollout", "dynamics.rollout_adjoint", "dynamics.rollout_legs",
+    "dynamics.momentum", "dynamics.parameters", "dynamics.rollout", "dynamics.rollout_adjoint", "dynamics.rollout_legs",
     "dynamics.rollout_legs_adjoint", "dynamics.step", "dynamics.step_adjoint",
     "kinematics.full_state", "kinematics.geometry", "layout", "scalar", "state", "terrain.ground",
 )  # fmt: skip
@@ -318,6 +318,30 @@ class JumperDynamics:
         kernel, block = self.advance_kernel(by_legs)
         dim, inputs = ((-(-count // 8) * 8, 4), [count, *inputs]) if by_legs else (count, inputs)
         wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device, block_dim=block)
+
+    def momenta(self) -> Any:
+        """Return the kernels' `Momenta`, not yet written."""
+        found = self.modules.momentum.Momenta()
+        for name in ("lin", "ang"):
+            setattr(found, name, wp.zeros(self.num_worlds, dtype=self.modules.scalar.vec3, device=self.device))
+        return found
+
+    def read_momenta(self, q: wp.array, qd: wp.array, momenta: Any, worlds: Worlds | None = None) -> None:
+        """Write the momenta of robots, world axes; worlds: whose, by default all."""
+        first, count = worlds or (0, self.num_worlds)
+        inputs = [first, self.robot, q, qd, momenta]
+        wp.launch(self.modules.momentum.momentum_kernel, count, inputs, device=self.device, block_dim=32)
+
+    def keep_momenta(
+        self, q: wp.array, qd: wp.array, momenta: Any, body_f: wp.array, time: float, worlds: Worlds | None = None
+    ) -> None:
+        """Correct the base's velocities where a robot flew freely in the last call of `advance`, which took a time [s].
+
+        momenta: of before it. body_f: the wrenches in it. worlds: which are corrected, by default all.
+        """
+        first, count = worlds or (0, self.num_worlds)
+        inputs = [first, self.robot, momenta, body_f, self.work.peak_force, self.work.invalid, time, q, qd]
+        wp.launch(self.modules.momentum.keep_momentum_kernel, count, inputs, device=self.device, block_dim=32)
 
     def full_state(
         self, q: wp.array, qd: wp.array, body_q: wp.array, body_qd: wp.array, worlds: Worlds | None = None

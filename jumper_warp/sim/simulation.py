@@ -56,6 +56,7 @@ class Simulation:
         dt: float = PHYSICS_DT,
         substeps: int = SUBSTEPS,
         tolerance: float = TOLERANCE,
+        keep_momentum: bool = False,
         observe_forces: bool = True,
         visuals: bool = True,
         extras: Extras | None = None,
@@ -77,6 +78,8 @@ class Simulation:
             dt: Physics step [s].
             substeps: Physics steps in a policy step.
             tolerance: Of SolverJumper's contact iteration [m/s].
+            keep_momentum: Whether robots that fly freely keep their momentum from policy step to policy step exactly,
+                by a correction of the base's velocity; on SolverJumper only.
             observe_forces: Whether to measure paw forces on MuJoCo, which costs time; SolverJumper always has them.
             visuals: Whether to add shapes that only viewers see.
             extras: Adds the caller's own sites and shapes to every world, as in `build_model`.
@@ -125,7 +128,9 @@ class Simulation:
         self._base_velocity = wp.zeros(num_worlds, dtype=wp.vec3, device=self.device)
         self._graphs: dict[str, SlicedGraph | None] = {}
         self.physics: Physics = (
-            JumperPhysics(self, block, tolerance) if solver == "jumper" else MujocoPhysics(self, observe_forces)
+            JumperPhysics(self, block, tolerance, keep_momentum)
+            if solver == "jumper"
+            else MujocoPhysics(self, observe_forces)
         )
         if values is not None:
             write_springs(self.physics.dynamics, values)

@@ -90,6 +90,8 @@ class TaskCfg:
     randomization: RandomizationCfg = field(default_factory=RandomizationCfg)
     gravity: float = EARTH
     """[m/s^2] Downward, of every world; all estimates of flights take it from there."""
+    keep_momentum: bool = False
+    """Whether robots in free flight keep their momentum exactly, as in `Simulation`."""
     lift: float = 0.0
     """[m] Above standing, at which robots begin whose policy is measured."""
     contact_force: float = 0.1

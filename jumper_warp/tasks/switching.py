@@ -54,14 +54,17 @@ def for_switching(
 def flight_skills(jump: TaskCfg, turning: TaskCfg) -> tuple[list[TaskCfg], list[Handover]]:
     """Return the tasks of a robot that turns in the flight of a jump, the jump first, and their handovers.
 
-    Gravity and randomisation are the jump's. Raises InputError: a task is no jump, or not one of turning.
+    Gravity and randomisation are the jump's; the momentum of free flight is kept.
+    Raises InputError: a task is no jump, or not one of turning.
     """
     for task, state in ((jump, JumpState), (turning, AttitudeState)):
         if task.state is not state:
             raise InputError(f"turning in flight needs a task of {state.key} here, got {task.name}")
     randomization = replace(jump.randomization, redraw="reset")
     jump, turning = (
-        for_switching(replace(task, gravity=jump.gravity, lift=jump.lift), randomization, FALLS_FROM_FLIGHT)
+        for_switching(
+            replace(task, gravity=jump.gravity, lift=jump.lift, keep_momentum=True), randomization, FALLS_FROM_FLIGHT
+        )
         for task in (jump, turning)
     )
     return [jump, turning], [

@@ -94,6 +94,7 @@ def attitude_in_flight() -> TaskCfg:
         action_scale=(90.0, 90.0),
         randomization=RandomizationCfg(force=None, torque=None),
         gravity=0.0,
+        keep_momentum=True,
         lift=2.0,
         reward_floor=None,
         metrics=METRICS,
