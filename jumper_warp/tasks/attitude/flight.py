@@ -50,7 +50,7 @@ REWARDS = (
     RewardTerm(rewards.attitude, 1.5, name="attitude_narrow", width=10.0 * DEG),
     RewardTerm(rewards.attitude, 1.0, name="attitude_fine", width=3.0 * DEG),
     RewardTerm(rewards.hold, 2.0, width=10.0 * DEG, spin=0.5),
-    RewardTerm(rewards.landing_posture, 1.0, width=15.0 * DEG, posture=30.0 * DEG),
+    RewardTerm(rewards.landing_posture, 2.0, width=15.0 * DEG, posture=30.0 * DEG),
     RewardTerm(rewards.spin, -0.01),
     RewardTerm(mdp_rewards.collision, -60.0),
     RewardTerm(mdp_rewards.action_clip, -0.1),
