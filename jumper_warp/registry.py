@@ -61,11 +61,11 @@ class TaskEntry:
         return task
 
 
-WALKING = PpoCfg(num_steps=24, gamma=0.985, entropy_coef=0.0025, init_std=0.4)
+WALKING = PpoCfg(num_steps=24, gamma=0.985, entropy_coef=0.0025, init_std=0.4, symmetry="actor")
 """How velocity tracking is trained."""
 PLACES = PpoCfg(gamma=0.99, entropy_coef=0.0003)
 """How jumps to places are trained."""
-TURNS = PpoCfg(gamma=0.99, lam=0.97, entropy_coef=0.001, init_std=0.5)
+TURNS = PpoCfg(gamma=0.99, entropy_coef=0.001, init_std=0.5)
 """How turning in flight is trained."""
 
 TASKS: dict[str, TaskEntry] = {

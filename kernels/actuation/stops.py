@@ -93,6 +93,16 @@ def stop_rows(p: StopParams, angles: vec3, dt: real) -> StopRows:
 
 
 @wp.func
+def beyond_stops(p: StopParams, angles: vec3) -> bool:
+    """Return whether motor angles [rad] are beyond a stop; a stop is not pressed by a step that ends within all."""
+    fold = angles[1] + angles[2]
+    past = wp.max(p.sum_lower - fold, fold - p.sum_upper)
+    for j in range(3):
+        past = wp.max(past, wp.max(p.lower[j] - angles[j], angles[j] - p.upper[j]))
+    return not past <= real(0.0)  # NaN too
+
+
+@wp.func
 def row_side(pressed: int, i: int) -> int:
     """Return which stop of row i is pressed: 0, LOWER_STOP or UPPER_STOP."""
     return (pressed >> (ROW_BITS * i)) & ROW_MASK

@@ -8,7 +8,17 @@ is made again by its world, while the others of a warp go on.
 
 import warp as wp
 
-from ..actuation.stops import MAX_SETS, SLACK, change_one, one_by_one, pressed_stops, revised_stops, stop_rows
+from ..actuation.stops import (
+    MAX_SETS,
+    SLACK,
+    StopRows,
+    beyond_stops,
+    change_one,
+    one_by_one,
+    pressed_stops,
+    revised_stops,
+    stop_rows,
+)
 from ..layout import GRAVITY
 from ..scalar import real, vec3
 from ..state import BaseState, base_com, leg_coord, leg_dof, load_base, load_motors, store_base, store_motors
@@ -119,10 +129,14 @@ def advance_leg(
     base = old.base
     g = wp.quat_rotate_inv(base.quat, load_vec3(robot.table, GRAVITY, world))
     torque = applied_torque(motors, old.step, old.angles, old.rates)
-    rows = stop_rows(load_stops(robot.table, leg, world), old.angles, dt)
+    rows = StopRows()
     pressed = old.pressed
-    if old.sets == 0:
-        pressed = pressed_stops(rows, old.rates, real(0.0), 0)
+    if pressed != 0 or old.sets == 0:
+        stops = load_stops(robot.table, leg, world)
+        if pressed != 0 or beyond_stops(stops, old.angles + dt * old.rates):
+            rows = stop_rows(stops, old.angles, dt)
+            if old.sets == 0:
+                pressed = pressed_stops(rows, old.rates, real(0.0), 0)
     spring = load_spring(robot.table, leg, world)
     terms = leg_terms(own, spring, old.angles, old.rates, torque, rows, pressed, base.ang, g, dt)
     wrench = base_wrench(drive, world)
@@ -147,7 +161,10 @@ def advance_leg(
     rates -= solve.to_lin * solved.lin + solve.to_ang * solved.ang
     total = sum_vec(solved.impulse)
     sets = old.sets + 1
-    wanted = revised_stops(rows, rates, SLACK * settings.tolerance, pressed, sets)
+    limits = load_stops(robot.table, leg, world)  # and rows, once more: they would fill registers all the while
+    wanted = int(0)
+    if pressed != 0 or beyond_stops(limits, old.angles + dt * rates):
+        wanted = revised_stops(stop_rows(limits, old.angles, dt), rates, SLACK * settings.tolerance, pressed, sets)
     first = first_leg(wanted != pressed)
     agreed = from_leg(wp.where(wanted != pressed, real(1.0), real(0.0)), first) == real(0.0)
     done = old.step < settings.substeps and (agreed or sets >= MAX_SETS)
@@ -170,6 +187,7 @@ def advance_leg(
         new.step = old.step + 1
         new.used = pressed
         new.sets = 0
+        new.pressed = 0
     else:
         new.sets = sets
         new.pressed = pressed

@@ -60,10 +60,13 @@ def test_passes_over_both_images_equal_autograd():
     slopes = (torch.randn(40, 12), torch.randn(40, 12))
     own, other = model.actor(x), mirrored(model.actor(mirrored(x, OBS)), ACTION)
     expected = torch.autograd.grad((own, other), list(model.actor.parameters()), slopes)
-    *outputs, seen = forward_both(layers, x, WALKING, torch.float32)
+    columns = layers.weights[0].shape[1]
+    both, wide = WALKING.padded(columns), torch.nn.functional.pad(x, (0, columns - NUM_OBS))
+    *outputs, seen = forward_both(layers, wide, both, torch.float32)
     for found, right in zip(outputs, (own, other), strict=True):
         torch.testing.assert_close(found, right, atol=1e-5, rtol=1e-5)
-    for found, right in zip(backward_both(layers, seen, slopes, WALKING, torch.float32), expected, strict=True):
+    first, *others = backward_both(layers, seen, slopes, both, torch.float32)
+    for found, right in zip((first[:, :NUM_OBS], *others), expected, strict=True):
         torch.testing.assert_close(found, right, atol=1e-4, rtol=1e-4)
 
 

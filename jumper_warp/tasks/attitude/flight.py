@@ -50,9 +50,9 @@ REWARDS = (
     RewardTerm(rewards.attitude, 1.5, name="attitude_narrow", width=10.0 * DEG),
     RewardTerm(rewards.attitude, 1.0, name="attitude_fine", width=3.0 * DEG),
     RewardTerm(rewards.hold, 2.0, width=10.0 * DEG, spin=0.5),
-    RewardTerm(rewards.landing_posture, 2.0, width=15.0 * DEG, posture=30.0 * DEG),
+    RewardTerm(rewards.landing_posture, 1.0, width=15.0 * DEG, posture=30.0 * DEG),
     RewardTerm(rewards.spin, -0.01),
-    RewardTerm(mdp_rewards.collision, -60.0),
+    RewardTerm(mdp_rewards.collision, -20.0),
     RewardTerm(mdp_rewards.action_clip, -0.1),
     RewardTerm(mdp_rewards.motor_torque_sq, -5.0e-4),
     RewardTerm(mdp_rewards.joint_acceleration, -1.0e-7),
@@ -82,7 +82,7 @@ def attitude_in_flight() -> TaskCfg:
         reset=Reset(reset_attitude, AttitudeResetCfg(), side_by_side=True),
         command=Command(give_turn),
         curriculum=Curriculum(
-            state.attitude_error, tolerance=10.0 * DEG, promote_after=3, counts=state.every_episode, unit="rad"
+            state.attitude_error, tolerance=10.0 * DEG, promote_after=5, counts=state.every_episode, unit="rad"
         ),
         levels=(TurnCfg((5.0, 40.0)), TurnCfg((10.0, 70.0)), TurnCfg((20.0, 100.0)), TurnCfg((20.0, 140.0))),
         rewards=REWARDS,

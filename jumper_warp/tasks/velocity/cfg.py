@@ -25,11 +25,11 @@ class CommandCfg:
 
     narrow: Reach = (0.8, 0.8, 0.8, 0.8)
     """At the first level."""
-    wide: Reach = (2.8, 1.8, 1.2, 2.0)
+    wide: Reach = (2.2, 1.6, 1.0, 1.4)
     """At the last level. From the second on, going fast along x leaves less room for going sideways and turning."""
     levels: int = 10
     """Steps from the first level to the last; 0: all commands are of the first."""
-    narrow_share: float = 0.3
+    narrow_share: float = 0.5
     """[1] Share of commands of the first level on all others."""
     stand: float = 0.12
     """[1] Share of commands to stand."""

@@ -16,7 +16,7 @@ from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.tasks.terms import ObservationTerm, RewardTerm
 from jumper_warp.tasks.units import DEG
 from jumper_warp.tasks.velocity.cfg import CommandCfg
-from jumper_warp.tasks.velocity.flat import velocity_flat
+from jumper_warp.tasks.velocity.flat import WITHOUT_HISTORY, velocity_flat
 from kernels.mdp import rewards as mdp_rewards
 from kernels.velocity import observations as velocity
 from kernels.velocity import rewards
@@ -42,9 +42,17 @@ def velocity_rough() -> TaskCfg:
             flat.reset, settings=replace(flat.reset.settings, terrain=TerrainCfg(kinds=GROUNDS), tolerance=0.25)
         ),
         levels=(COMMANDS,),
+        policy=WITHOUT_HISTORY,
         critic=(*flat.critic, ObservationTerm(velocity.ground_heights)),
     )
     task = task.with_terms(
-        "rewards", flat={"weight": -5.0}, vertical_velocity={"weight": -0.3}, foot_clearance={"height": 0.10}
+        "rewards",
+        flat={"weight": -5.0},
+        vertical_velocity={"weight": -0.3},
+        linear_velocity_fine={"weight": 1.5},
+        yaw_rate_fine={"weight": 2.5},
+        air_time={"weight": 5.0},
+        rapid_stepping={"weight": -0.1},
+        foot_clearance={"weight": -30.0, "height": 0.10},
     )
     return replace(task, rewards=(*task.rewards, *STEPS_UP), reward_floor=None)
