@@ -65,6 +65,8 @@ WALKING = PpoCfg(num_steps=24, gamma=0.985, entropy_coef=0.0025, init_std=0.4, s
 """How velocity tracking is trained."""
 PLACES = PpoCfg(gamma=0.99, entropy_coef=0.0003)
 """How jumps to places are trained."""
+TURNS = PpoCfg(gamma=0.99, entropy_coef=0.001, init_std=0.5)
+"""How turning in flight is trained."""
 
 TASKS: dict[str, TaskEntry] = {
     "vertical-jump": TaskEntry(
@@ -90,6 +92,7 @@ TASKS: dict[str, TaskEntry] = {
     ),
     "velocity-rough": TaskEntry("jumper_warp.tasks.velocity.rough:velocity_rough", WALKING, best_by="Metrics/score"),
     "velocity-trot": TaskEntry("jumper_warp.tasks.velocity.flat:velocity_trot", WALKING, best_by="Metrics/score"),
+    "attitude": TaskEntry("jumper_warp.tasks.attitude.flight:attitude_in_flight", TURNS, best_by="Metrics/settled"),
 }  # fmt: skip
 """The project's tasks, and those that were registered or asked for."""
 

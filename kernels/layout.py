@@ -27,7 +27,8 @@ STOP_KD = wp.constant(70)  # [N m s/rad]
 MU_DYNAMIC = wp.constant(71)
 MU_STATIC = wp.constant(72)
 KNEE_LIMIT = wp.constant(73)  # 2: outer, inner: largest torque of the knee damping [N m]
-LEG_ROWS = wp.constant(75)
+SPRING = wp.constant(75)  # 2: stiffness [N/m] of the spring between the knees, 0: none; its rest length [m]
+LEG_ROWS = wp.constant(77)
 
 # rows of the base block
 BASE = wp.constant(4 * LEG_ROWS)

@@ -24,7 +24,7 @@ from jumper_warp.utils.errors import InputError
 
 OWN = ("vertical-jump", "horizontal-jump", "horizontal-jump-sighted", "omnidirectional-jump", "vertical-jump-mars",
        "vertical-jump-mars-loose", "horizontal-jump-mars", "horizontal-jump-mars-loose", "velocity-flat",
-       "velocity-rough", "velocity-trot")  # fmt: skip
+       "velocity-rough", "velocity-trot", "attitude")  # fmt: skip
 TASK_FILE = """\
 from dataclasses import replace
 

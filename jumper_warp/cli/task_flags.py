@@ -14,9 +14,10 @@ import inspect
 import itertools
 import re
 import textwrap
-from typing import Annotated, Any, NamedTuple, get_type_hints
+from typing import Annotated, Any, NamedTuple, get_args, get_type_hints
 
 import tyro
+import warp as wp
 
 from jumper_warp.tasks.cfg import Reset, TaskCfg
 from jumper_warp.tasks.terms import Term
@@ -161,7 +162,9 @@ def _is_number(value: Any, hint: Any) -> bool:
         return hint is not str
     if isinstance(value, tuple):
         return bool(value) and all(_is_number(v, Any) for v in value)
-    return (value is None and hint is not Any) or isinstance(value, bool | int | float)
+    if value is None:
+        return hint is not Any and wp.Function not in get_args(hint)
+    return isinstance(value, bool | int | float)
 
 
 def _first_paragraph(doc: str | None) -> str | None:

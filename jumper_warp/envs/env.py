@@ -21,8 +21,9 @@ from jumper_warp.envs.arrays import (
 from jumper_warp.envs.stages import Stages
 from jumper_warp.envs.state import load_state, save_state
 from jumper_warp.robot.grounds import BlockCfg
+from jumper_warp.robot.model import PHYSICS_DT
 from jumper_warp.robot.overlay import RobotOverlay
-from jumper_warp.sim.simulation import Simulation, SolverName
+from jumper_warp.sim.simulation import SUBSTEPS, Simulation, SolverName
 from jumper_warp.sim.slices import SlicedGraph
 from jumper_warp.tasks.cfg import Handover, TaskCfg
 from jumper_warp.tasks.interface import interface
@@ -78,16 +79,20 @@ class Env(Stages):
         handovers: Sequence[Handover] = (),
         robot: RobotOverlay | None = None,
         threads: int | None = None,
+        refine: int = 1,
     ):
         """Build everything; call `reset` before the first step.
 
         ground, block: as in `Simulation`; by default the terrain of the first task that has one, or what tasks draw, if
         randomised on SolverJumper, else a plane. skill: index of the task that each world begins in, (num_envs,) or one
         for all. handovers: between tasks. robot: what differs from the description, latency included. threads: of a
-        CPU, as in `Simulation`.
+        CPU, as in `Simulation`. refine: how many times finer the physics step is than that of trainings.
         Raises ValueError: no task, two of one name, motors that cannot be those of one robot, different gravities, a
-        handover between other tasks, less than one environment, or as `Simulation`.
+        handover between other tasks, less than one environment, a refine that is no whole number of at least 1, or as
+        `Simulation`.
         """
+        if not isinstance(refine, int) or refine < 1:
+            raise InputError(f"refine must be a whole number of at least 1, got {refine!r:.40}")
         tasks = checked_tasks(task, handovers)
         self.task, self.tasks, self.num_envs, self.seed, self.auto_reset = tasks[0], tasks, num_envs, seed, auto_reset
         self.handovers, self._overlay = tuple(handovers), robot
@@ -99,6 +104,7 @@ class Env(Stages):
             num_envs, solver=solver, motors=self.task.motors, visuals=visuals, device=device and str(device),
             ground=ground, block=BlockCfg((0.0, 0.0)) if self._draws_ground else block, tolerance=CONTACT_TOLERANCE,
             friction=self.task.randomization.nominal_friction, gravity=self.task.gravity, robot=robot, threads=threads,
+            dt=PHYSICS_DT / refine, substeps=SUBSTEPS * refine, keep_momentum=any(each.keep_momentum for each in tasks),
         )  # fmt: skip
         self.wp_device = self.sim.device
         self.device = torch.device(wp.device_to_torch(self.wp_device))
@@ -199,7 +205,8 @@ class Env(Stages):
         self._tick(mask)
         self._go_home(self._part(), mask)
         self._draw(self._part(), mask)
-        self._launch(stand_kernel, n, [mask, headings, self._scene, self.robot])
+        inputs = [mask, headings, self._scene, self._settings, self.worlds.skill, self.robot]
+        self._launch(stand_kernel, n, inputs)
         self._forget(self._part(), mask)
         self._give(mask, 1, values, headings)
         self.worlds.done.zero_()

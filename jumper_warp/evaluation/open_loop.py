@@ -18,10 +18,14 @@ STAND, RAMP, HOLD, EXTEND, LAND = 60, 25, 50, 40, 60
 """Ticks of 1/60 s: default pose, ramp into the squat, squat, full extension, default pose again."""
 
 
-def transversal_command(tick: int) -> float:
-    """Return the commanded transversal angle [rad] at a tick."""
+SQUAT = 135.0
+"""[deg] Transversal angle commanded for the squat; the filter holds it back."""
+
+
+def transversal_command(tick: int, squat: float = SQUAT) -> float:
+    """Return the commanded transversal angle [rad] at a tick; squat [deg]: that of the squat."""
     ramp = np.clip((tick - STAND) / RAMP, 0.0, 1.0)
-    degrees = 45.0 + 90.0 * ramp
+    degrees = 45.0 + (squat - 45.0) * ramp
     if tick >= STAND + RAMP + HOLD:
         degrees = -45.0
     if tick >= STAND + RAMP + HOLD + EXTEND:
@@ -43,15 +47,20 @@ class Trace:
     gap: np.ndarray  # (n,) [m]
 
 
-def follow_jump(sim: Simulation, notes: Mapping[str, Any]) -> tuple[Trace, Recorder, list[np.ndarray]]:
-    """Simulate the jump in one world; also return a recording at 60 Hz with notes, and the body poses of every tick."""
+def follow_jump(
+    sim: Simulation, notes: Mapping[str, Any], squat: float = SQUAT
+) -> tuple[Trace, Recorder, list[np.ndarray]]:
+    """Simulate the jump in one world; also return a recording at 60 Hz with notes, and the body poses of every tick.
+
+    squat [deg]: transversal angle commanded for the squat.
+    """
     from jumper_warp.viz.recorder import Recorder
 
     recorder = Recorder(sim.model, notes=notes)
     rows, frames = [], []
     total = STAND + RAMP + HOLD + EXTEND + LAND
     for tick in range(total):
-        target = np.tile([0.0, 1.0, 1.0], 4) * transversal_command(tick)
+        target = np.tile([0.0, 1.0, 1.0], 4) * transversal_command(tick, squat)
         sim.target.assign(target[:, None].astype(np.float32))
         sim.filter_targets()
         for _ in range(sim.substeps):

@@ -11,6 +11,7 @@ from jumper_warp.evaluation.episodes import EpisodeFlags, EpisodeGoals
 from jumper_warp.evaluation.heights import HeightFlags, HeightGoals, MarsHeightGoals
 from jumper_warp.evaluation.log import EvaluationLog, Metrics
 from jumper_warp.evaluation.places import PlaceFlags, PlaceGoals
+from jumper_warp.evaluation.turns import TurnFlags, TurnGoals
 from jumper_warp.evaluation.velocities import VelocityFlags, VelocityGoals
 from jumper_warp.policies.spec import PolicyError
 from jumper_warp.tasks.cfg import TaskCfg
@@ -75,6 +76,7 @@ EVALUATIONS: dict[str, Evaluation] = {
         landings.for_evaluation,
     ),
     "velocity": Evaluation(VelocityFlags(), VelocityGoals(), TaskCfg.on_level_ground),
+    "attitude": Evaluation(TurnFlags(), TurnGoals()),
     "episode": Evaluation(EpisodeFlags(), EpisodeGoals()),
 }
 """A user's module may add its own."""

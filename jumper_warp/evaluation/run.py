@@ -97,6 +97,7 @@ class Run(ABC):
         self.conditions, self.record = Conditions(), 0
         self.told: dict[str, Any] = {}
         self._latency: list[np.ndarray] = []
+        self._physics_dt = PHYSICS_DT
 
     @abstractmethod
     def actor(self, env: Env) -> Callable[[torch.Tensor], torch.Tensor]:
@@ -118,7 +119,7 @@ class Run(ABC):
         conditions = self.conditions
         words = [conditions.solver, "randomised" if conditions.randomize else "nominal"]
         if conditions.latency is not None and self._latency:
-            words.append(f"latency {latency_text(self._latency[0], PHYSICS_DT)}")
+            words.append(f"latency {latency_text(self._latency[0], self._physics_dt)}")
         words += [] if conditions.gains is None else ["kp x {:g}, kd x {:g}".format(*conditions.gains)]
         words += [] if conditions.friction is None else [f"friction {conditions.friction:g}"]
         return ", ".join(words + (["pushed in flight too"] if conditions.push_in_flight else []))
@@ -133,7 +134,7 @@ class Run(ABC):
         values |= {} if conditions.gains is None else {"gains": list(conditions.gains)}
         values |= {} if conditions.friction is None else {"friction": conditions.friction}
         if self._latency:
-            values |= latency_metrics(np.concatenate(self._latency), PHYSICS_DT, conditions.latency)
+            values |= latency_metrics(np.concatenate(self._latency), self._physics_dt, conditions.latency)
         return values
 
     def follow(
@@ -164,6 +165,7 @@ class Run(ABC):
 
         run_evaluation(self.actor(env), env, log, watch=look)
         self._latency.append(env.parameters.latency.numpy().copy())
+        self._physics_dt = env.physics_dt
         if pictures is not None:
             self._develop(pictures, film)
         return log

@@ -20,7 +20,7 @@ def moment_rows(body: int) -> slice:
 def body_gradients(table: np.ndarray, gradient: np.ndarray) -> dict[str, np.ndarray]:
     """Return gradients by each body's mass [kg], com [m] and inertia about it [kg m^2] in the axes of its link.
 
-    table, gradient: parameter table and gradient by it, (313, num_worlds). With first moments m c and second moments
+    table, gradient: parameter table and gradient by it, (321, num_worlds). With first moments m c and second moments
     S = 1/2 tr(I) 1 - I + m c c^T (parallel axes). Returned: mass (21, num_worlds), com (21, 3, num_worlds), inertia
     (21, 6, num_worlds): xx, yy, zz, and by an xy, xz and yz that are entries of both halves.
     """

@@ -37,6 +37,7 @@ from kernels.layout import (
     MOMENT_ROWS,
     MU_DYNAMIC,
     MU_STATIC,
+    SPRING,
 )
 
 MAX_SWEEPS = 60
@@ -266,6 +267,7 @@ class Replay:
             table[row + FRICTION : row + FRICTION + 3] = robots.motor_friction[:, 3 * leg : 3 * leg + 3].T
             table[row + KNEE_DAMPING : row + KNEE_DAMPING + 2] = robots.knee_damping[:, 0]
             table[[row + MU_DYNAMIC, row + MU_STATIC]] = robots.paw_friction[:, 0]
+            table[row + SPRING], table[row + SPRING + 1] = robots.spring_stiffness[:, 0], robots.spring_length[:, 0]
         self._assign(self.dynamics.robot.table, table)
         self._wrench.assign(wrench.reshape(-1, 6))
 

@@ -131,7 +131,7 @@ class Rollout:
             "latency": self._actuation.latency,
             "filter": self._actuation.limits,
         }
-        """By name, worlds last: the parameter table of `kernels.layout` (313, n), motor constants (12, n) as in
+        """By name, worlds last: the parameter table of `kernels.layout` (321, n), motor constants (12, n) as in
         `MotorKindCfg` and the sensors' `offset` [rad], `fade` [rad/s] (2, n), `latency` [s] (n,), and the filter's
         constants (14, n), rows as in `jumper_warp.optim.actuation.FILTER_NAMES`, in rad."""
         self.by_legs = self.device.is_cuda

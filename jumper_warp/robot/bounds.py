@@ -57,6 +57,9 @@ PROPORTIONAL_GAIN = Range(0.1, 1.0e4, "N m/rad")
 DERIVATIVE_GAIN = Range(1.0e-2, 1.0e2, "N m s/rad")
 KNEE_DAMPING = Range(1.0e-6, 10.0, "N m s/rad")
 KNEE_DAMPING_LIMIT = Range(1.0e-3, 1.0e3, "N m")
+SPRING_STIFFNESS = Range(0.0, 1.0e4, "N/m")
+"""Ten times that of the authors' springs, a third of the swing that the step of 1/480 s follows."""
+SPRING_LENGTH = Range(0.0, 1.0, "m")
 COLOR = Range(0.0, 1.0, "")
 
 

@@ -36,6 +36,8 @@ RANGES = {
     "knee_damping": bounds.KNEE_DAMPING,
     "paw_friction": Range(0.0, 10.0, ""),
     "latency": Range(0.0, 0.1, "s"),
+    "spring_stiffness": bounds.SPRING_STIFFNESS,
+    "spring_length": bounds.SPRING_LENGTH,
 }
 """What the values of each quantity may be."""
 
@@ -116,6 +118,14 @@ def numbers(name: str, values: Any) -> tuple[float, ...]:
     if not all(math.isfinite(x) for x in values):
         raise InputError(f"robot overlay: {name!r:.60} must be finite")
     return tuple(float(x) for x in values)
+
+
+def with_springs(stiffness: float, length: float) -> RobotOverlay:
+    """Return the robot with springs between the knees of each leg, of a stiffness [N/m] and a rest length [m].
+
+    Raises InputError: one of them is out of range.
+    """
+    return RobotOverlay({"spring_stiffness": (float(stiffness),), "spring_length": (float(length),)}, source="springs")
 
 
 def load_overlay(path: Path) -> RobotOverlay:

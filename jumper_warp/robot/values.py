@@ -51,6 +51,10 @@ class RobotValues:
     """(N, 1) [1]"""
     latency: np.ndarray
     """(N, 1) [s] From target to motor."""
+    spring_stiffness: np.ndarray
+    """(N, 1) [N/m] Of the springs between the knees of each leg; 0: none."""
+    spring_length: np.ndarray
+    """(N, 1) [m] Of these springs at rest."""
 
     @classmethod
     def nominal(cls, count: int, description: RobotDescription | None = None) -> RobotValues:
@@ -73,5 +77,7 @@ class RobotValues:
             knee_damping=np.array([robot.knee_damping]),
             paw_friction=np.array([PAW_FRICTION]),
             latency=np.zeros(1),
+            spring_stiffness=np.zeros(1),
+            spring_length=np.zeros(1),
         )
         return cls(**{name: np.tile(value, (count, 1)) for name, value in vars(one).items()})

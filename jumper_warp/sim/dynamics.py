@@ -22,7 +22,7 @@ JOINTS = ("lateral", "outer", "outer_knee", "inner", "inner_knee")
 KERNEL_MODULES = (
     "actuation.command_filter", "actuation.motors", "dynamics.advance", "dynamics.advance_legs", "dynamics.contact",
     "dynamics.contact_adjoint", "dynamics.differentiable", "dynamics.drive", "dynamics.gradients",
-    "dynamics.parameters", "dynamics.rollout", "dynamics.rollout_adjoint", "dynamics.rollout_legs",
+    "dynamics.momentum", "dynamics.parameters", "dynamics.rollout", "dynamics.rollout_adjoint", "dynamics.rollout_legs",
     "dynamics.rollout_legs_adjoint", "dynamics.step", "dynamics.step_adjoint",
     "kinematics.full_state", "kinematics.geometry", "layout", "scalar", "state", "terrain.ground",
 )  # fmt: skip
@@ -171,6 +171,9 @@ class JumperDynamics:
         self._ground_shape = find_ground(model)
         self.static_friction_ratio = wp.full(self.num_worlds, 1.0, dtype=float, device=self.device)
         """Static over dynamic friction coefficient [1], shape (num_worlds,); call `pack_friction` after a change."""
+        self.leg_springs = wp.zeros(self.num_worlds, dtype=wp.vec2, device=self.device)
+        """Stiffness [N/m], 0: none, and rest length [m] of the springs between the knees, shape (num_worlds,); call
+        `pack_springs` after a change."""
 
         self.robot = self.modules.step.Robot()
         self.robot.geometry = leg_geometry_array(self.description, self.modules.geometry, self.device)
@@ -202,11 +205,12 @@ class JumperDynamics:
         return work
 
     def pack(self) -> None:
-        """Read masses, joints, friction and gravity of every world from the model."""
+        """Read masses, joints, friction and gravity of every world from the model, and its springs."""
         self.pack_masses()
         self.pack_joints()
         self.pack_friction()
         self.pack_gravity()
+        self.pack_springs()
 
     def pack_masses(self) -> None:
         """Read masses, centres of mass and inertias."""
@@ -257,6 +261,10 @@ class JumperDynamics:
     def pack_gravity(self) -> None:
         """Read gravity."""
         self._launch(self.modules.parameters.pack_gravity_kernel, self.num_worlds, [self.model.gravity])
+
+    def pack_springs(self) -> None:
+        """Read `leg_springs`."""
+        self._launch(self.modules.parameters.pack_springs_kernel, (self.num_worlds, 4), [self.leg_springs])
 
     def _launch(self, kernel: wp.Kernel, dim: int | tuple[int, ...], inputs: list) -> None:
         wp.launch(kernel, dim=dim, inputs=inputs, outputs=[self.robot.table], device=self.device)
@@ -310,6 +318,30 @@ class JumperDynamics:
         kernel, block = self.advance_kernel(by_legs)
         dim, inputs = ((-(-count // 8) * 8, 4), [count, *inputs]) if by_legs else (count, inputs)
         wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device, block_dim=block)
+
+    def momenta(self) -> Any:
+        """Return the kernels' `Momenta`, not yet written."""
+        found = self.modules.momentum.Momenta()
+        for name in ("lin", "ang"):
+            setattr(found, name, wp.zeros(self.num_worlds, dtype=self.modules.scalar.vec3, device=self.device))
+        return found
+
+    def read_momenta(self, q: wp.array, qd: wp.array, momenta: Any, worlds: Worlds | None = None) -> None:
+        """Write the momenta of robots, world axes; worlds: whose, by default all."""
+        first, count = worlds or (0, self.num_worlds)
+        inputs = [first, self.robot, q, qd, momenta]
+        wp.launch(self.modules.momentum.momentum_kernel, count, inputs, device=self.device, block_dim=32)
+
+    def keep_momenta(
+        self, q: wp.array, qd: wp.array, momenta: Any, body_f: wp.array, time: float, worlds: Worlds | None = None
+    ) -> None:
+        """Correct the base's velocities where a robot flew freely in the last call of `advance`, which took a time [s].
+
+        momenta: of before it. body_f: the wrenches in it. worlds: which are corrected, by default all.
+        """
+        first, count = worlds or (0, self.num_worlds)
+        inputs = [first, self.robot, momenta, body_f, self.work.peak_force, self.work.invalid, time, q, qd]
+        wp.launch(self.modules.momentum.keep_momentum_kernel, count, inputs, device=self.device, block_dim=32)
 
     def full_state(
         self, q: wp.array, qd: wp.array, body_q: wp.array, body_qd: wp.array, worlds: Worlds | None = None

@@ -10,7 +10,7 @@ import warp as wp
 
 from jumper_warp.robot.model import KNEE_DOFS
 from jumper_warp.robot.values import LINK_KINDS, RobotValues
-from jumper_warp.sim.dynamics import find_paws
+from jumper_warp.sim.dynamics import JumperDynamics, find_paws
 from kernels.layout import BODIES, DOFS
 
 MOTOR_DOFS = [6 + 5 * leg + joint for leg in range(4) for joint in (0, 1, 3)]
@@ -52,6 +52,13 @@ def write_model(model: newton.Model, robots: RobotValues, *, paws: bool = True) 
         friction = model.shape_material_mu.numpy()
         friction[find_paws(model)] = robots.paw_friction
         model.shape_material_mu.assign(friction)
+
+
+def write_springs(dynamics: JumperDynamics, robots: RobotValues) -> None:
+    """Write the springs between the knees; robots: one for all worlds, or one a world."""
+    values = np.hstack([robots.spring_stiffness, robots.spring_length])
+    dynamics.leg_springs.assign(np.broadcast_to(values, (dynamics.num_worlds, 2)).astype(np.float32))
+    dynamics.pack_springs()
 
 
 def write_motors(motors: Any, robots: RobotValues) -> None:

@@ -97,7 +97,7 @@ class JumperPhysics:
 
     sliced = True
 
-    def __init__(self, sim: Any, block: BlockCfg | None, tolerance: float) -> None:
+    def __init__(self, sim: Any, block: BlockCfg | None, tolerance: float, keep_momentum: bool) -> None:
         """Make the solver for a simulation's model; raises ValueError as `SolverJumper`."""
         self._sim = sim
         self.solver = SolverJumper(sim.model, block=block, tolerance=tolerance)
@@ -105,6 +105,7 @@ class JumperPhysics:
         work = self.dynamics.work
         self.invalid, self.impulse, self.torque = work.invalid, work.impulse, work.torque
         self.paw_force, self.peak_force, self.peak_paw_force = work.contact_force, work.peak_force, work.peak_paw_force
+        self._momenta = self.dynamics.momenta() if keep_momentum else None
 
     def advance(
         self,
@@ -117,10 +118,17 @@ class JumperPhysics:
     ) -> None:
         """See `Physics.advance`."""
         state, sim = self._sim.state, self._sim
+        q, qd, momenta = state.joint_q, state.joint_qd, self._momenta
+        if momenta is not None:
+            self.dynamics.read_momenta(q, qd, momenta, worlds)
         self.solver.step_motors(
-            state, state, sim.motors, target, sim.dt, substeps, previous=previous, delay=delay, bodies=bodies,
-            worlds=worlds,
+            state, state, sim.motors, target, sim.dt, substeps, previous=previous, delay=delay,
+            bodies=bodies and momenta is None, worlds=worlds,
         )  # fmt: skip
+        if momenta is not None:
+            self.dynamics.keep_momenta(q, qd, momenta, state.body_f, sim.dt * substeps, worlds)
+            if bodies:
+                self.dynamics.full_state(q, qd, state.body_q, state.body_qd, worlds)
 
     def parameters_changed(self, mask: wp.array | None = None, worlds: Worlds | None = None) -> None:
         """See `Physics.parameters_changed`."""
@@ -145,7 +153,9 @@ class JumperPhysics:
 
     def kernels(self) -> list[tuple[wp.Kernel, int]]:
         """See `Physics.kernels`."""
-        return [self.dynamics.advance_kernel()]
+        momentum = self.dynamics.modules.momentum
+        kept = [(momentum.momentum_kernel, 32), (momentum.keep_momentum_kernel, 32)]
+        return [self.dynamics.advance_kernel(), *(kept if self._momenta is not None else [])]
 
     def carried(self) -> dict[str, wp.array]:
         """See `Physics.carried`."""
@@ -167,7 +177,8 @@ class MujocoPhysics:
         model.joint_damping.assign(damping.ravel())
         self.solver = mujoco_solver(model, dt=sim.dt)
         robot = load_description()
-        self._passive = [knee_damping, robot.knee_damping_limit, *robot.transversal_sum, *EXPLICIT_STOP]
+        self._passive = [knee_damping, robot.knee_damping_limit, *robot.transversal_sum, *EXPLICIT_STOP,
+                         self.dynamics.robot.geometry, self.dynamics.leg_springs]  # fmt: skip
         self.invalid = wp.zeros(n, dtype=int, device=device)
         self.impulse = wp.zeros((4, n), dtype=wp.vec3, device=device)
         self.torque = wp.zeros((12, n), dtype=float, device=device)

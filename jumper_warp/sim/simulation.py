@@ -15,7 +15,7 @@ from jumper_warp.robot.model import PHYSICS_DT, Extras, build_model
 from jumper_warp.robot.motors import FilterCfg, MotorCfg, filter_params, jumping_motors, motor_arrays
 from jumper_warp.robot.overlay import RobotOverlay
 from jumper_warp.robot.values import RobotValues
-from jumper_warp.sim.overlay import write_model, write_motors
+from jumper_warp.sim.overlay import write_model, write_motors, write_springs
 from jumper_warp.sim.physics import JumperPhysics, MujocoPhysics, Physics
 from jumper_warp.sim.slices import SlicedGraph, Worlds, slices_of
 from jumper_warp.sim.solver import TOLERANCE, check_step, check_tolerance
@@ -56,6 +56,7 @@ class Simulation:
         dt: float = PHYSICS_DT,
         substeps: int = SUBSTEPS,
         tolerance: float = TOLERANCE,
+        keep_momentum: bool = False,
         observe_forces: bool = True,
         visuals: bool = True,
         extras: Extras | None = None,
@@ -77,6 +78,8 @@ class Simulation:
             dt: Physics step [s].
             substeps: Physics steps in a policy step.
             tolerance: Of SolverJumper's contact iteration [m/s].
+            keep_momentum: Whether robots that fly freely keep their momentum from policy step to policy step exactly,
+                by a correction of the base's velocity; on SolverJumper only.
             observe_forces: Whether to measure paw forces on MuJoCo, which costs time; SolverJumper always has them.
             visuals: Whether to add shapes that only viewers see.
             extras: Adds the caller's own sites and shapes to every world, as in `build_model`.
@@ -125,8 +128,12 @@ class Simulation:
         self._base_velocity = wp.zeros(num_worlds, dtype=wp.vec3, device=self.device)
         self._graphs: dict[str, SlicedGraph | None] = {}
         self.physics: Physics = (
-            JumperPhysics(self, block, tolerance) if solver == "jumper" else MujocoPhysics(self, observe_forces)
+            JumperPhysics(self, block, tolerance, keep_momentum)
+            if solver == "jumper"
+            else MujocoPhysics(self, observe_forces)
         )
+        if values is not None:
+            write_springs(self.physics.dynamics, values)
         shared = self.physics.sliced and not self.device.is_cuda
         self.slices = slices_of(num_worlds, threads if shared else 1)
         self.solver = self.physics.solver

@@ -90,6 +90,10 @@ class TaskCfg:
     randomization: RandomizationCfg = field(default_factory=RandomizationCfg)
     gravity: float = EARTH
     """[m/s^2] Downward, of every world; all estimates of flights take it from there."""
+    keep_momentum: bool = False
+    """Whether robots in free flight keep their momentum exactly, as in `Simulation`."""
+    lift: float = 0.0
+    """[m] Above standing, at which robots begin whose policy is measured."""
     contact_force: float = 0.1
     """[N] Above it a paw counts as in contact."""
     reward_floor: float | None = 0.0
@@ -123,6 +127,8 @@ class TaskCfg:
             for field_name in {metric.field, metric.per or metric.field} - set(self.state.vars):
                 raise InputError(f"{self.name}: metric {metric.name} needs {field_name!r}, which its state has not")
         check_gravity(self.gravity)
+        if not 0.0 <= self.lift < math.inf:
+            raise InputError(f"{self.name}: lift must be finite and >= 0, got {self.lift}")
         if not 0.0 <= self.contact_force < math.inf:
             raise InputError(f"{self.name}: contact_force must be finite and >= 0, got {self.contact_force}")
         if self.reward_floor is not None and not math.isfinite(self.reward_floor):

@@ -13,6 +13,7 @@ import numpy as np
 
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.utils.errors import InputError
+from kernels.attitude import observations as attitude
 from kernels.mdp import observations as obs
 from kernels.velocity import observations as velocity
 
@@ -38,6 +39,7 @@ VECTOR, AXIAL = (1, -1, 1), (-1, 1, -1)
 _PLAIN: dict[Any, tuple[int, ...]] = {
     obs.lin_vel: VECTOR, obs.ang_vel: AXIAL, obs.gravity: VECTOR, velocity.command: (1, -1, -1),
     velocity.clock: (-1, -1), velocity.command_age: (1,), velocity.push: VECTOR + AXIAL, obs.height: (1,),
+    attitude.turn_left: (*AXIAL, 1), attitude.time_left: (1,), attitude.in_collision: (1,),
     obs.drawn_mass: (1, 1), obs.drawn_com: VECTOR, obs.drawn_latency: (1,), obs.drawn_friction: (1, 1),
 }  # fmt: skip
 """Signs of terms whose columns stay where they are."""

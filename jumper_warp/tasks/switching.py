@@ -1,9 +1,12 @@
-"""One robot with several skills, walking and jumps, and the handovers between them.
+"""One robot with several skills, walking, jumps and turning in flight, and the handovers between them.
 
 A jump begins only from where its training did: at rest on four paws near the default pose, to which walking brings the
 robot when it is commanded to stand. The jump is commanded as soon as it takes over, since walking stands more quietly
 than the jump policies hold a squat. Once landed and at rest, or if a landing went wrong, walking takes over. Each skill
 has its own observation, action scale, gains, torque limits and command filter.
+
+In a long flight a jump hands over to turning when it is asked to, which brings the base level, in the jump's heading,
+and hands back shortly before the landing.
 """
 
 from __future__ import annotations
@@ -15,6 +18,7 @@ from jumper_warp.tasks.randomization import RandomizationCfg
 from jumper_warp.tasks.terms import TerminationTerm
 from jumper_warp.tasks.units import DEG
 from jumper_warp.utils.errors import InputError
+from kernels.attitude.state import AttitudeState
 from kernels.jump.state import JumpState
 from kernels.mdp import terminations
 from kernels.skills import handovers
@@ -27,15 +31,46 @@ FALLS = (
     TerminationTerm(terminations.low_base, height=0.10),
 )
 """What ends the episode of a robot that switches, whatever its skill."""
+FALLS_FROM_FLIGHT = (
+    TerminationTerm(terminations.came_apart),
+    TerminationTerm(terminations.collided),
+    TerminationTerm(terminations.fallen, angle=60.0 * DEG),
+    TerminationTerm(terminations.low_base, height=0.10),
+)
+"""Of one that turns in flight: there any tilt will do."""
 
 
-def for_switching(task: TaskCfg, randomization: RandomizationCfg) -> TaskCfg:
+def for_switching(
+    task: TaskCfg, randomization: RandomizationCfg, falls: tuple[TerminationTerm, ...] = FALLS
+) -> TaskCfg:
     """Return a task of which only a fall ends an episode, on level ground, without what a training needs.
 
     randomization: of the robot, which all its skills share.
     """
-    task = replace(task, terminations=FALLS, randomization=randomization, events=(), rewards=(), critic=(), metrics=())
+    task = replace(task, terminations=falls, randomization=randomization, events=(), rewards=(), critic=(), metrics=())
     return task.on_level_ground()
+
+
+def flight_skills(jump: TaskCfg, turning: TaskCfg) -> tuple[list[TaskCfg], list[Handover]]:
+    """Return the tasks of a robot that turns in the flight of a jump, the jump first, and their handovers.
+
+    Gravity and randomisation are the jump's; the momentum of free flight is kept.
+    Raises InputError: a task is no jump, or not one of turning.
+    """
+    for task, state in ((jump, JumpState), (turning, AttitudeState)):
+        if task.state is not state:
+            raise InputError(f"turning in flight needs a task of {state.key} here, got {task.name}")
+    randomization = replace(jump.randomization, redraw="reset")
+    jump, turning = (
+        for_switching(
+            replace(task, gravity=jump.gravity, lift=jump.lift, keep_momentum=True), randomization, FALLS_FROM_FLIGHT
+        )
+        for task in (jump, turning)
+    )
+    return [jump, turning], [
+        Handover(jump, turning, handovers.in_flight, handovers.begin_turn),
+        Handover(turning, jump, handovers.about_to_land, handovers.begin_landing),
+    ]
 
 
 def skills_and_handovers(walking: TaskCfg, jumps: tuple[TaskCfg, ...]) -> tuple[list[TaskCfg], list[Handover]]:

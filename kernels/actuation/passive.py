@@ -1,13 +1,16 @@
-"""Passive joint forces that general solvers lack, as explicit torques: damped knees with a cap, stops of the fold.
+"""Passive forces that general solvers lack, as explicit torques: damped knees with a cap, stops of the fold, springs.
 
-`SolverJumper` has both built in, implicitly (`joint_forces`, `stops`).
+`SolverJumper` has them built in, damping and stops implicitly (`joint_forces`, `stops`, `springs`).
 """
 
 import warp as wp
 
+from ..kinematics.five_bar import five_bar
+from ..kinematics.geometry import LegGeometry
 from ..layout import COORDS, DOFS
 from ..scalar import real
 from .joint_forces import capped_damping
+from .springs import LegSpring, spring_torque
 
 wp.set_module_options({"enable_backward": False})
 
@@ -33,13 +36,15 @@ def passive_torque_kernel(
     sum_upper: real,
     stop_ke: real,
     stop_kd: real,
+    geometry: wp.array(dtype=LegGeometry),
+    springs: wp.array(dtype=wp.vec2),
     # in, out
     joint_f: wp.array(dtype=real),
 ):
-    """Write the knees' torques and add the stops of outer + inner [N m]; one thread per (world, leg).
+    """Write the knees' torques, add stops of outer + inner and the legs' springs [N m]; one thread per (world, leg).
 
     knee_damping [N m s/rad] acts up to knee_limit [N m]; stop_ke [N m/rad], stop_kd [N m s/rad] must be soft enough
-    for explicit integration.
+    for explicit integration. springs: stiffness [N/m] and rest length [m], (num_worlds,).
     """
     world, leg = wp.tid()
     q = world * COORDS + 7 + 5 * leg
@@ -53,3 +58,10 @@ def passive_torque_kernel(
     stop = stop_torque(fold, fold_rate, sum_lower, sum_upper, stop_ke, stop_kd)
     joint_f[d + 1] = joint_f[d + 1] + stop
     joint_f[d + 3] = joint_f[d + 3] + stop
+    if springs[world][0] != 0.0:
+        spring = LegSpring()
+        spring.stiffness = real(springs[world][0])
+        spring.length = real(springs[world][1])
+        pull = spring_torque(spring, five_bar(geometry[leg], joint_q[q + 1], joint_q[q + 3]))
+        joint_f[d + 1] = joint_f[d + 1] + pull[1]
+        joint_f[d + 3] = joint_f[d + 3] + pull[2]

@@ -28,7 +28,7 @@ from .base_motion import moved_base
 from .contact import BlockLaw, PawContact, block_velocity, local_impulse
 from .drive import Drive, LegDrive, Workspace, applied_torque, base_wrench, load_leg_drive, park
 from .lanes import any_world, first_leg, from_leg, max_legs, meet, sum_legs, sum_systems, sum_vec, vec_from_leg
-from .parameters import load_stops, load_vec3
+from .parameters import load_spring, load_stops, load_vec3
 from .step import (
     LegParams,
     Robot,
@@ -137,7 +137,8 @@ def advance_leg(
             rows = stop_rows(stops, old.angles, dt)
             if old.sets == 0:
                 pressed = pressed_stops(rows, old.rates, real(0.0), 0)
-    terms = leg_terms(own, old.angles, old.rates, torque, rows, pressed, base.ang, g, dt)
+    spring = load_spring(robot.table, leg, world)
+    terms = leg_terms(own, spring, old.angles, old.rates, torque, rows, pressed, base.ang, g, dt)
     wrench = base_wrench(drive, world)
     force = vec3(wrench[0], wrench[1], wrench[2])
     moment = vec3(wrench[3], wrench[4], wrench[5])

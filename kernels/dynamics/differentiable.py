@@ -13,6 +13,7 @@ has a kink; the gradient is that of the mode the forward pass found.
 import warp as wp
 
 from ..actuation.joint_forces import joint_forces
+from ..actuation.springs import spring_torque
 from ..actuation.stops import stop_rows
 from ..kinematics.geometry import LegGeometry
 from ..layout import BASE, BODIES, DOFS, GRAVITY
@@ -34,7 +35,7 @@ from .base_motion import external_wrench, moved_base
 from .contact import SEPARATE, SLIDE, contact_jacobian, target_normal_velocity
 from .inertia import inertia_matrix, skew
 from .leg_dynamics import PawKinematics, leg_dynamics, leg_pose, paw_kinematics
-from .parameters import load_joint_params, load_masses, load_moments, load_stops, load_vec3
+from .parameters import load_joint_params, load_masses, load_moments, load_spring, load_stops, load_vec3
 
 
 @wp.struct
@@ -132,6 +133,9 @@ def legs_kernel(
     rows = stop_rows(load_stops(table, k, world), angles, dt)
     passive = joint_forces(params, pose.loop, geo.front, rates, rows, pressed[k, world], dt)
     torque = load_motors(joint_f, leg_dof(world, k)) + passive.torque
+    spring = load_spring(table, k, world)
+    if spring.stiffness != real(0.0):
+        torque += spring_torque(spring, pose.loop)
     solve = eliminate_leg(leg, passive.inertia + wp.diag(params.armature), torque)
     paw = paw_kinematics(geo, pose)
     legs.inverse[k, world] = solve.inverse

@@ -5,6 +5,7 @@ import warp as wp
 from ..actuation.command_filter import FilterParams, Limits
 from ..actuation.joint_forces import JointParams
 from ..actuation.motors import MotorParams
+from ..actuation.springs import LegSpring
 from ..actuation.stops import StopParams
 from ..kinematics.geometry import LegGeometry
 from ..layout import (
@@ -22,6 +23,7 @@ from ..layout import (
     OUTER_SHANK,
     OUTER_THIGH,
     PARAMETER_ROWS,
+    SPRING,
     STOP_KD,
     STOP_KE,
     SUM_LOWER,
@@ -104,6 +106,14 @@ def add_joints(sums: wp.array(dtype=real), leg: int, p: JointParams):
     add_entry(sums, row + KNEE_DAMPING + 1, p.knee_damping_inner)
     add_entry(sums, row + KNEE_LIMIT, p.knee_limit_outer)
     add_entry(sums, row + KNEE_LIMIT + 1, p.knee_limit_inner)
+
+
+@wp.func
+def add_spring(sums: wp.array(dtype=real), leg: int, p: LegSpring):
+    """Add the gradient by the spring of a leg."""
+    row = leg * LEG_ROWS + SPRING
+    add_entry(sums, row, p.stiffness)
+    add_entry(sums, row + 1, p.length)
 
 
 @wp.func

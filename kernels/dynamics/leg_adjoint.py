@@ -10,9 +10,19 @@ from .base_dynamics import BaseSystem, add_leg, invert, motor_acceleration, solv
 from .base_motion import moved_base
 from .contact import SEPARATE, PawContact
 from .contact_laws import PawLaw, contact_at, contact_point, paw_law
-from .gradients import add_com, add_entry, add_geometry, add_joints, add_masses, add_moments, add_stops, add_vec3
+from .gradients import (
+    add_com,
+    add_entry,
+    add_geometry,
+    add_joints,
+    add_masses,
+    add_moments,
+    add_spring,
+    add_stops,
+    add_vec3,
+)
 from .lanes import any_world, mat_from_leg, sum_legs, sum_quat, sum_systems, sum_vec, vec_from_leg
-from .parameters import load_moments, load_stops, load_vec3
+from .parameters import load_moments, load_spring, load_stops, load_vec3
 from .rollout import Rows, row_vec3
 from .step import LegParams, Robot, base_system, hold_base, leg_terms
 from .step_adjoint import StepRecord
@@ -45,7 +55,8 @@ def replay_leg(
     g = wp.quat_rotate_inv(base.quat, load_vec3(robot.table, GRAVITY, world))
     torque = row_vec3(rows.torque, step, 3 * leg, world)
     stops = stop_rows(load_stops(robot.table, leg, world), angles, dt)
-    terms = leg_terms(own, angles, rates, torque, stops, int(rows.pressed[step, leg, world]), base.ang, g, dt)
+    spring = load_spring(robot.table, leg, world)
+    terms = leg_terms(own, spring, angles, rates, torque, stops, int(rows.pressed[step, leg, world]), base.ang, g, dt)
     share = add_leg(BaseSystem(), terms.dynamics, terms.solve)
     system = sum_systems(base_system(robot, world, base, g, force, moment), share)
     inverse = hold_base(robot, world, invert(system))
@@ -210,15 +221,18 @@ def reverse_leg(
         factors.push = pushed
     gravity = load_vec3(robot.table, GRAVITY, world)
     g = wp.quat_rotate_inv(base.quat, gravity)
-    geo, masses, joints, stops, _ground, mu_adj, pos, turn, omega, g_adj, angle_adj, rate_adj, _held, _leg, _step = (
+    (geo, masses, joints, spring, stops, _ground, mu_adj, pos, turn, omega, g_adj, angle_adj, rate_adj, _held, _leg,
+     _step) = (
         wp.grad(leg_action)(
-            own.geometry, own.masses, own.joints, load_stops(robot.table, leg, world), robot.ground, law.mu, base.pos,
-            base.quat, base.ang, g, record.angles[world, i, leg], old_rates, held, factors, dt,
+            own.geometry, own.masses, own.joints, load_spring(robot.table, leg, world),
+            load_stops(robot.table, leg, world), robot.ground, law.mu, base.pos, base.quat, base.ang, g,
+            record.angles[world, i, leg], old_rates, held, factors, dt,
         )
     )  # fmt: skip
     add_geometry(sums, leg, geo)
     add_masses(sums, leg, masses)
     add_joints(sums, leg, joints)
+    add_spring(sums, leg, spring)
     add_stops(sums, leg, stops)
     if law.mode != SEPARATE:
         add_entry(sums, law.mu_row, mu_adj)

@@ -3,6 +3,7 @@
 import warp as wp
 
 from ..actuation.joint_forces import JointParams
+from ..actuation.springs import LegSpring
 from ..actuation.stops import StopParams
 from ..layout import (
     ARMATURE,
@@ -25,6 +26,7 @@ from ..layout import (
     MU_STATIC,
     OUTER_SHANK,
     OUTER_THIGH,
+    SPRING,
     STOP_KD,
     STOP_KE,
     SUM_LOWER,
@@ -100,6 +102,16 @@ def load_joint_params(table: wp.array2d(dtype=real), leg: int, world: int) -> Jo
     p.knee_limit_outer = table[row + KNEE_LIMIT, world]
     p.knee_limit_inner = table[row + KNEE_LIMIT + 1, world]
     return p
+
+
+@wp.func
+def load_spring(table: wp.array2d(dtype=real), leg: int, world: int) -> LegSpring:
+    """Return the spring of a leg."""
+    row = leg * LEG_ROWS + SPRING
+    spring = LegSpring()
+    spring.stiffness = table[row, world]
+    spring.length = table[row + 1, world]
+    return spring
 
 
 @wp.func
@@ -254,6 +266,19 @@ def repack_kernel(
         table[leg * LEG_ROWS + ARMATURE + j, world] = real(armature[dof])
         table[leg * LEG_ROWS + FRICTION + j, world] = real(friction[dof])
     store_friction(table, leg, world, paw_friction(paw_shapes, ground_shape, shape_mu, world, leg), static_ratio[world])
+
+
+@wp.kernel
+def pack_springs_kernel(
+    # in
+    springs: wp.array(dtype=wp.vec2),
+    # out
+    table: wp.array2d(dtype=real),
+):
+    """Write stiffness [N/m] and rest length [m] of the springs of every leg; one thread per (world, leg)."""
+    world, leg = wp.tid()
+    for j in range(2):
+        table[leg * LEG_ROWS + SPRING + j, world] = real(springs[world][j])
 
 
 @wp.kernel

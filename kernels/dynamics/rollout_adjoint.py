@@ -14,7 +14,7 @@ from .command_adjoint import reverse_filter, reverse_motor, weighed_filter
 from .contact import PawContact
 from .contact_laws import PawLaw
 from .gradients import GRADIENT_ROWS, Gradients, add_com
-from .parameters import load_moments, load_stops
+from .parameters import load_moments, load_spring, load_stops
 from .rollout import (
     Actuation,
     Commands,
@@ -239,11 +239,14 @@ def everything(
     v = row_vec3(numbers.q, 0, 0, world)
     q = row_quat(numbers.q, 0, 3, world)
     x = numbers.q[0, 0, world]
+    spring = load_spring(robot.table, 0, world)
     stops = load_stops(robot.table, 0, world)
+    leg = leg_action(
+        params.geometry, params.masses, params.joints, spring, stops, robot.ground, x, v, q, v, v, v, v, base, factors,
+        x,
+    )  # fmt: skip
     return (
-        leg_action(
-            params.geometry, params.masses, params.joints, stops, robot.ground, x, v, q, v, v, v, v, base, factors, x
-        )
+        leg
         + base_action(load_moments(robot.table, BASE, world), v, v, v, v, q, v, v, base, base_seeds, x)
         + turned(q, v, x, q)
         + motor_torque(x, x, x, load_world_motor(actuation, 0, world))

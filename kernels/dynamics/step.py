@@ -6,6 +6,7 @@ Semi-implicit Euler: forces and Jacobians at the start of the step, positions mo
 import warp as wp
 
 from ..actuation.joint_forces import JointParams, joint_forces
+from ..actuation.springs import LegSpring, spring_torque
 from ..actuation.stops import StopRows
 from ..kinematics.geometry import LegGeometry
 from ..layout import BASE, GRAVITY, LEG_ROWS, MU_DYNAMIC, MU_STATIC
@@ -87,8 +88,8 @@ def load_leg(robot: Robot, world: int, k: int) -> LegParams:
 
 @wp.func
 def leg_terms(
-    params: LegParams, angles: vec3, rates: vec3, torque: vec3, rows: StopRows, pressed: int, omega: vec3, g: vec3,
-    dt: real,
+    params: LegParams, spring: LegSpring, angles: vec3, rates: vec3, torque: vec3, rows: StopRows, pressed: int,
+    omega: vec3, g: vec3, dt: real,
 ) -> LegTerms:  # fmt: skip
     """Return a leg's dynamics, its elimination with the pressed stops, and its paw."""
     geo = params.geometry
@@ -96,9 +97,12 @@ def leg_terms(
     pose = leg_pose(geo, angles)
     dynamics = leg_dynamics(geo, params.masses, pose, rates, omega, g)
     passive = joint_forces(joints, pose.loop, geo.front, rates, rows, pressed, dt)
+    total = torque + passive.torque
+    if spring.stiffness != real(0.0):
+        total += spring_torque(spring, pose.loop)
     terms = LegTerms()
     terms.dynamics = dynamics
-    terms.solve = eliminate_leg(dynamics, passive.inertia + wp.diag(joints.armature), torque + passive.torque)
+    terms.solve = eliminate_leg(dynamics, passive.inertia + wp.diag(joints.armature), total)
     terms.paw = paw_kinematics(geo, pose)
     return terms
 

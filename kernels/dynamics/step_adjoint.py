@@ -21,9 +21,19 @@ from .base_dynamics import BaseInverse, LegSolve, add_leg, invert, motor_acceler
 from .base_motion import moved_base
 from .contact import SEPARATE, PawContact
 from .contact_laws import PawLaw, contact_at, contact_point, paw_law, solve_laws
-from .gradients import add_com, add_entry, add_geometry, add_joints, add_masses, add_moments, add_stops, add_vec3
+from .gradients import (
+    add_com,
+    add_entry,
+    add_geometry,
+    add_joints,
+    add_masses,
+    add_moments,
+    add_spring,
+    add_stops,
+    add_vec3,
+)
 from .leg_dynamics import PawKinematics
-from .parameters import load_moments, load_stops, load_vec3
+from .parameters import load_moments, load_spring, load_stops, load_vec3
 from .rollout import Rows, row_vec3, store_row_vec3
 from .step import LegParams, Robot, base_system, hold_base, leg_terms
 from .virtual_power import BaseFactors, BaseSeeds, LegFactors, base_action, leg_action, turned
@@ -90,7 +100,9 @@ def replay_step(
         pressed = int(rows.pressed[step, k, world])
         angles = record.angles[world, i, k]
         stops = stop_rows(load_stops(robot.table, k, world), angles, dt)
-        terms = leg_terms(params[k], angles, record.rates[world, i, k], torque, stops, pressed, base.ang, g, dt)
+        spring = load_spring(robot.table, k, world)
+        rates = record.rates[world, i, k]
+        terms = leg_terms(params[k], spring, angles, rates, torque, stops, pressed, base.ang, g, dt)
         record.legs[world, i, k] = terms.solve
         record.paws[world, i, k] = terms.paw
         system = add_leg(system, terms.dynamics, terms.solve)
@@ -224,15 +236,18 @@ def reverse_step(
             mu = laws[k].mu
             if pushed_by:
                 leg.push = seeds.impulse[step, k, world]
-        geo, masses, joints, stops, _ground, mu_adj, pos, turn, omega, g_part, angles, rates, _held, _leg, _step = (
+        (geo, masses, joints, spring, stops, _ground, mu_adj, pos, turn, omega, g_part, angles, rates, _held, _leg,
+         _step) = (
             wp.grad(leg_action)(
-                params.geometry, params.masses, params.joints, load_stops(robot.table, k, world), robot.ground, mu,
-                base.pos, base.quat, base.ang, g, record.angles[world, i, k], old_rates, held, leg, dt,
+                params.geometry, params.masses, params.joints, load_spring(robot.table, k, world),
+                load_stops(robot.table, k, world), robot.ground, mu, base.pos, base.quat, base.ang, g,
+                record.angles[world, i, k], old_rates, held, leg, dt,
             )
         )  # fmt: skip
         add_geometry(sums, k, geo)
         add_masses(sums, k, masses)
         add_joints(sums, k, joints)
+        add_spring(sums, k, spring)
         add_stops(sums, k, stops)
         if leg.mode != SEPARATE:
             add_entry(sums, laws[k].mu_row, mu_adj)

@@ -11,6 +11,7 @@ at the accelerations of the step on the virtual velocities m, so no matrix is fo
 import warp as wp
 
 from ..actuation.joint_forces import JointParams, joint_forces
+from ..actuation.springs import LegSpring, spring_torque
 from ..actuation.stops import StopParams, stop_rows
 from ..kinematics.five_bar import five_bar_bias
 from ..kinematics.geometry import LegGeometry
@@ -230,8 +231,9 @@ def adj_link_motion(
 
 @wp.func
 def leg_action(
-    geo: LegGeometry, masses: LegMasses, joints: JointParams, stops: StopParams, ground: Ground, mu: real, pos: vec3,
-    orientation: quat, omega: vec3, g: vec3, angles: vec3, rates: vec3, base: BaseFactors, leg: LegFactors, dt: real,
+    geo: LegGeometry, masses: LegMasses, joints: JointParams, spring: LegSpring, stops: StopParams, ground: Ground,
+    mu: real, pos: vec3, orientation: quat, omega: vec3, g: vec3, angles: vec3, rates: vec3, base: BaseFactors,
+    leg: LegFactors, dt: real,
 ) -> real:  # fmt: skip
     """Return a leg's part of the weighed equations, its paw's contact included, motor torques left out.
 
@@ -300,6 +302,8 @@ def leg_action(
     passive = joint_forces(joints, loop, f, rates, stop_rows(stops, angles, dt), leg.pressed, dt)
     implicit = passive.inertia * leg.acc + wp.cw_mul(joints.armature, leg.acc)
     action = dt * (wp.dot(leg.virtual_rates, passive.torque - implicit) - power)
+    if spring.stiffness != zero:
+        action += dt * wp.dot(leg.virtual_rates, spring_torque(spring, loop))
 
     if leg.mode != SEPARATE:
         paw = paw_kinematics(geo, pose)

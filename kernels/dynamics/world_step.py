@@ -9,7 +9,7 @@ from ..state import BaseState
 from .base_dynamics import LegSolve, add_leg, invert, motor_acceleration, solve_ang, solve_lin
 from .contact import BlockLaw, ContactState, PawContact, solve_contacts
 from .leg_dynamics import PawKinematics
-from .parameters import load_stops, load_vec3
+from .parameters import load_spring, load_stops, load_vec3
 from .step import Robot, StepSettings, base_system, hold_base, leg_terms, load_leg, paw_contact
 
 wp.set_module_options({"enable_backward": False})
@@ -39,7 +39,8 @@ def solve_with_stops(
     system = base_system(robot, world, base, g, force, moment)
     for k in range(legs.shape[0]):
         own = load_leg(robot, world, k)
-        terms = leg_terms(own, angles[k], rates[k], torques[k], rows[k], pressed[k], base.ang, g, dt)
+        spring = load_spring(robot.table, k, world)
+        terms = leg_terms(own, spring, angles[k], rates[k], torques[k], rows[k], pressed[k], base.ang, g, dt)
         legs[k] = terms.solve
         paws[k] = terms.paw
         system = add_leg(system, terms.dynamics, terms.solve)

@@ -71,6 +71,7 @@ class SkillSettings:
     command_filter: FilterParams
     contact_force: float  # [N] above it a paw is in contact
     push_in_flight: int  # 1: pushes act in the air too
+    lift: float  # [m] above standing, at which robots begin whose policy is measured
 
 
 @wp.struct

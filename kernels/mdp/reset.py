@@ -158,14 +158,19 @@ def stand_kernel(
     mask: wp.array(dtype=float),
     headings: wp.array(dtype=float),
     scene: Scene,
+    skills: wp.array(dtype=SkillSettings),
+    skill: wp.array(dtype=int),
     # in, out
     robot: RobotArrays,
 ):
-    """Stand robots in the default pose with a heading [rad] where mask is not 0, blocks at their starts."""
+    """Stand robots in the default pose with a heading [rad] where mask is not 0, blocks at their starts.
+
+    They are lifted off the ground as the skill says that each world is in.
+    """
     world = wp.tid()
     if mask[world] != 0.0:
         rest_block(scene.ground, world)
-        lift = surface(world_ground(scene.ground, world), 0.0, 0.0)[0]
+        lift = surface(world_ground(scene.ground, world), 0.0, 0.0)[0] + skills[skill[world]].lift
         store_pose(robot, scene, world, headings[world], lift)
 
 

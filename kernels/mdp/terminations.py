@@ -35,6 +35,12 @@ def tilted(view: RobotView, task: Any, angle: float) -> bool:
 
 
 @wp.func
+def fallen(view: RobotView, task: Any, angle: float) -> bool:
+    """Body z more than an angle [rad] from vertical while a paw is on the ground."""
+    return view.contacts > 0 and tilt(view) > angle
+
+
+@wp.func
 def collided(view: RobotView, task: Any) -> bool:
     """Anything but a paw touched the ground, or links touched each other."""
     return view.collisions != 0

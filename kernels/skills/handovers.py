@@ -1,8 +1,10 @@
-"""When walking and jumping follow each other, and how each begins; the robot itself is left as it is."""
+"""When walking, jumping and turning in flight follow each other, and how each begins; the robot is left as it is."""
 
 import warp as wp
 
-from ..jump.state import LANDED, STANCE, JumpState
+from ..attitude.state import AttitudeState, with_goal
+from ..jump.phase import time_to_height
+from ..jump.state import FLIGHT, LANDED, STANCE, JumpState
 from ..mdp.view import RobotView, tilt, yaw_of
 from ..velocity.state import VelocityState
 
@@ -17,6 +19,9 @@ FALLING = wp.constant(0.35)  # [rad] tilt at which walking takes over from a lan
 LANDED_STEPS = wp.constant(18)  # policy steps after touchdown before which a landing is not over
 RECOVER_STEPS = wp.constant(60)  # policy steps after touchdown after which walking takes over
 NO_JUMP_STEPS = wp.constant(150)  # policy steps without a takeoff after which it does
+FREE_STEPS = wp.constant(2)  # policy steps after a takeoff after which turning takes over
+LANDING_TIME = wp.constant(0.35)  # [s] before a base falls through LANDING_HEIGHT, in which the jump lands
+LANDING_HEIGHT = wp.constant(0.45)  # [m] of the base above the ground
 NEVER = wp.constant(1_000_000)  # policy step of a command that has not come
 
 
@@ -74,4 +79,47 @@ def begin_jump(view: RobotView, task: VelocityState) -> JumpState:
     new.goal_ground = view.pos[2] - view.height
     new.max_height = view.pos[2]
     new.command_step = NEVER
+    return new
+
+
+@wp.func
+def in_flight(view: RobotView, task: JumpState, requested: bool) -> bool:
+    """A jump to turning: asked for, and in flight."""
+    return requested and task.phase == FLIGHT and task.phase_steps >= FREE_STEPS
+
+
+@wp.func
+def about_to_land(view: RobotView, task: AttitudeState, requested: bool) -> bool:
+    """Turning to the jump: down soon, or down."""
+    if view.contacts > 0:
+        return True
+    if view.fall_acc <= 0.0 or view.lin_vel[2] > 0.0:
+        return False
+    left = time_to_height(view.height, view.lin_vel[2], LANDING_HEIGHT, view.fall_acc)
+    return left < LANDING_TIME or view.height < LANDING_HEIGHT
+
+
+@wp.func
+def begin_turn(view: RobotView, task: JumpState) -> AttitudeState:
+    """Return the state of a turn that brings the robot level, in the heading of its jump."""
+    new = AttitudeState()
+    new.jump_start = task.start
+    new.jump_goal = task.goal
+    new.goal_ground = task.goal_ground
+    new.max_height = task.max_height
+    return with_goal(new, view.quat, wp.quat_from_axis_angle(wp.vec3(0.0, 0.0, 1.0), task.heading))
+
+
+@wp.func
+def begin_landing(view: RobotView, task: AttitudeState) -> JumpState:
+    """Return the state of the jump that turning was part of, in flight past its apex."""
+    new = JumpState()
+    new.phase = FLIGHT
+    new.start = task.jump_start
+    new.goal = task.jump_goal
+    new.goal_ground = task.goal_ground
+    new.heading = yaw_of(task.goal)
+    new.max_height = task.max_height
+    new.apex_passed = 1
+    new.steps = 1
     return new

@@ -27,6 +27,7 @@ from kernels.layout import (
     MU_DYNAMIC,
     MU_STATIC,
     OUTER_THIGH,
+    SPRING,
     STOP_KD,
     STOP_KE,
 )
@@ -76,6 +77,14 @@ def folding() -> dict[str, np.ndarray]:
     return values
 
 
+def sprung() -> dict[str, np.ndarray]:
+    """Return a jump with springs between the knees, no two alike."""
+    values = jump()
+    for leg in range(4):
+        values["table"][leg * LEG + int(SPRING) : leg * LEG + int(SPRING) + 2] = [300.0 + 40.0 * leg, 0.17 + 0.01 * leg]
+    return values
+
+
 CASES = {
     "targets": (jump, "targets", [(0, 1), (3, 0), (4, 4), (8, 7), (20, 8)], 2.0e-6),
     "position": (jump, "q", [0, 2, 3, 4, 5, 7, 8, 12, 18], 1.0e-7),
@@ -94,6 +103,8 @@ CASES = {
     "fade": (jump, "fade", [0, 1], 1.0e-4),
     "friction": (sliding, "table", MU_ROWS, 1.0e-6),
     "sliding": (sliding, "qd", [0, 1, 5], 1.0e-6),
+    "springs": (sprung, "table", [int(SPRING) + LEG, int(SPRING) + 1, int(SPRING) + 1 + 2 * LEG], 1.0e-5),
+    "sprung": (sprung, "targets", [(0, 1), (3, 0), (4, 4), (8, 7)], 2.0e-6),
     "stops": (folding, "table", [int(LOWER) + 1, int(STOP_KE), int(STOP_KD) + LEG], 1.0e-6),
     "pressed": (folding, "targets", [(4, 4), (8, 7)], 1.0e-6),
 }
@@ -180,7 +191,7 @@ def test_gradients_are_those_of_warps_tape():
 def test_gradients_by_bodies_match_differences_of_their_moments():
     """Mass at fixed inertia about the com, com, and inertia of a shank, by hand through the parallel axis theorem."""
     rng = np.random.default_rng(2)
-    gradient = rng.normal(size=(313, 1))
+    gradient = rng.normal(size=(int(GRAVITY) + 3, 1))
     table = rollout().parameters["table"].numpy()[:, :1].astype(float)
     body = 5
 

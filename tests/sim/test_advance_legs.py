@@ -66,6 +66,7 @@ GROUNDS = {
     "plane": {"ground": "plane"},
     "heightfield": {"ground": uneven(0.03, seed=3, flat_radius=0.0)},
     "block": {"ground": "plane", "block": BlockCfg((0.1, 0.0), half=(0.3, 0.2), height=0.02, mass=3.0)},
+    "springs": {"ground": "plane"},
 }
 
 
@@ -74,12 +75,19 @@ def test_equals_a_thread_a_world(kind):
     model = build_model(N, ground=GROUNDS[kind]["ground"], friction=0.5)
     q, qd, force = states(model, 0.34)
     legs, world = (JumperDynamics(model, double=True, block=GROUNDS[kind].get("block")) for _ in range(2))
+    if kind == "springs":
+        for each in (legs, world):
+            each.leg_springs.fill_(wp.vec2(1000.0, 0.17))
+            each.pack_springs()
     found = advance(legs, q, qd, force, by_legs=True)
     expected = advance(world, q, qd, force, by_legs=False)
     paws = expected[2]
     assert (np.abs(paws).max(axis=(1, 2)) > 0.0).sum() >= 3  # legs that push
     for a, b in zip(found, expected, strict=True):
         np.testing.assert_allclose(a, b, atol=1.0e-8, rtol=1.0e-8)
+    if kind == "springs":
+        rates = advance(JumperDynamics(model, double=True), q, qd, force, by_legs=False)[1]
+        assert np.abs(found[1] - rates).max() > 1.0
     if kind == "block":
         moved = [each.robot.ground.blocks.numpy()["center"] for each in (legs, world)]
         assert np.abs(moved[1] - [0.1, 0.0]).max() > 1.0e-6

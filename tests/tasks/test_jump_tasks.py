@@ -84,7 +84,7 @@ def flags(group, before="--env"):
 
 
 def test_the_table_of_departures_names_flags_that_there_are():
-    tasks = ("vertical-jump", "horizontal-jump", "omnidirectional-jump")
+    tasks = ("vertical-jump", "horizontal-jump", "omnidirectional-jump", "attitude")
     known = {flag for name in tasks for flag in flags(flags_of(make_task(name)))}
     table = (Path(__file__).parents[2] / "docs" / "tasks.md").read_text()
     named = [name for name in re.findall(r"--env\.[a-z0-9.-]*[a-z0-9]", table) if "rewards.TERM" not in name]

@@ -53,7 +53,8 @@ class Stage(Probe):
 
     def stand(self, chosen, headings):
         """Launch what stands robots up."""
-        wp.launch(stand_kernel, self.n, [self.mask(chosen), array(headings), self.scene, self.robot], device="cpu")
+        inputs = [self.mask(chosen), array(headings), self.scene, self.settings, self.worlds.skill, self.robot]
+        wp.launch(stand_kernel, self.n, inputs, device="cpu")
 
     def scramble(self, seed=0):
         """Give the robots random states and pasts."""

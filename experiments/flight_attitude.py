@@ -1,0 +1,138 @@
+"""Turning upright in a long flight on Mars: tilted takeoffs, with and without turning, and how they are landed.
+
+    python experiments/flight_attitude.py --policy attitude --flights 100 --out outputs/flight
+    python experiments/flight_attitude.py --policy logs/attitude/<run> --landing vertical_jump_mars --late 20
+
+Robots squat and extend their legs (24.8 N m, kp 20, 3.71 m/s^2), some a few milliseconds later than others, which
+throws them up tilting and turning. In flight the policy that was trained to turn in zero gravity takes over, with the
+level orientation as its goal; 0.35 s before the landing the jump takes over again: by the policy `--landing`, or with
+the legs held in the default pose. A landing is good if nothing but paws touched anything and the base is within 30
+degrees of level 1.5 s later. The same takeoffs without turning stand beside it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+import tyro
+
+from jumper_warp.cli.main import run_command
+from jumper_warp.envs.env import Env
+from jumper_warp.evaluation.flights import Flights, flight_actor, flight_metrics
+from jumper_warp.evaluation.log import EvaluationLog
+from jumper_warp.evaluation.plots import drawn
+from jumper_warp.evaluation.run import EvaluationArgs, Run, conditions_of
+from jumper_warp.policies.policy import Policy
+from jumper_warp.policies.restore import open_policy, restored_task
+from jumper_warp.policies.spec import PolicyError
+from jumper_warp.registry import make_task
+from jumper_warp.tasks.switching import flight_skills
+from jumper_warp.utils.errors import InputError
+
+
+@dataclass(frozen=True)
+class Args(EvaluationArgs):
+    """Flags."""
+
+    policy: str = "attitude"
+    """Name or folder of the policy that turns, a run's folder, or a checkpoint."""
+    landing: str = ""
+    """The same of a policy that jumps to heights and lands (default: none, the default pose)."""
+    jump: str = "vertical-jump-mars"
+    """Task that takes off and lands, unless `landing` is given."""
+    flights: int = 60
+    """Number of flights."""
+    late: float = 15.0
+    """[ms] Most by which the legs of one end, or side, extend later than the others."""
+    apex: float = 2.5
+    """[m] Height that the landing policy is told."""
+
+    def __post_init__(self) -> None:
+        """Check the values."""
+        super().__post_init__()
+        if self.flights < 1 or not 0.0 <= self.late <= 100.0:
+            raise InputError(f"need at least one flight, and late in 0 to 100 ms, got {self.flights}, {self.late}")
+        if not 0.3 <= self.apex <= 10.0:
+            raise InputError(f"apex must be in 0.3 to 10 m, got {self.apex}")
+
+
+class FlightRun(Run):
+    """Follows flights of a jump and a policy that turns."""
+
+    def __init__(self, args: Args) -> None:
+        """Open policies. Raises PolicyError or CheckpointError: one cannot be used, or is of another kind of task."""
+        super().__init__()
+        self.turn: Policy = open_policy(args.policy)
+        self.landing: Policy | None = open_policy(args.landing) if args.landing else None
+        turning = restored_task(self.turn.config)
+        if turning.evaluation != "attitude":
+            raise PolicyError(f"this needs a policy that turns in flight, {args.policy} is of {turning.name}")
+        jump = make_task(args.jump) if self.landing is None else restored_task(self.landing.config)
+        if jump.evaluation not in ("height", "height-mars"):
+            raise PolicyError(f"this needs a jump to heights, got {jump.name}")
+        self.tasks = jump, turning
+        self.flights: Flights | None = None
+        self.prepare("flight_attitude", conditions_of(args), args.out, record=args.record)
+
+    def actor(self, env: Env) -> Callable[[torch.Tensor], torch.Tensor]:
+        """Return the actions of both skills."""
+        return flight_actor(env, self.flights, self.turn, self.landing)
+
+    def env(self, count: int) -> Env:
+        """Return the environment of robots that jump and turn."""
+        conditions = self.conditions
+        tasks, handovers = flight_skills(*(conditions.applied(task) for task in self.tasks))
+        env = Env(
+            tasks, count, seed=conditions.seed, device=conditions.device, solver=conditions.solver,
+            randomize=conditions.draws, noise=conditions.noise, auto_reset=False, threads=conditions.threads,
+            handovers=handovers,
+        )  # fmt: skip
+        for policy in (self.turn, self.landing):
+            if policy is not None:
+                policy.to(env.device)
+        self.told["gravity_m_s2"] = env.task.gravity
+        return env
+
+    def fly(self, env: Env, flights: Flights, film: str) -> Flights:
+        """Follow flights, and return them."""
+        self.flights = flights
+        self.follow(env, flights, film=film)
+        return flights
+
+
+def delays(count: int, most: float, seed: int) -> np.ndarray:
+    """Return by how much later front and left legs extend, (count, 2): from half of the most to it, to any side."""
+    rng = np.random.default_rng(seed)
+    size, angle = rng.uniform(0.5 * most, most, count), rng.uniform(0.0, 2.0 * np.pi, count)
+    return np.stack([size * np.cos(angle), size * np.sin(angle)], axis=1)
+
+
+def plot(run: Run, found: dict[str, EvaluationLog]) -> None:
+    """Draw tilt and height of all flights over time."""
+    with drawn(run.folder / "flights.png", 2, len(found), figsize=(11, 6), sharex=True, sharey="row") as axes:
+        for column, (name, flights) in zip(axes.T, found.items(), strict=True):
+            time = np.arange(len(flights.tilts)) * flights.step_dt
+            column[0].plot(time, np.degrees(np.array(flights.tilts)), linewidth=0.6, alpha=0.5, color="tab:red")
+            column[1].plot(time, np.array(flights.heights), linewidth=0.6, alpha=0.5, color="tab:blue")
+            column[0].set(ylabel="tilt [deg]", title=f"{name}: {flights.success.mean():.0%} landed upright")
+            column[1].set(xlabel="time [s]", ylabel="base height [m]")
+
+
+def main(args: Args) -> dict:
+    """Run the test and return its figures."""
+    run = FlightRun(args)
+    env, late = run.env(args.flights), delays(args.flights, 1.0e-3 * args.late, args.seed)
+    found = {
+        name: run.fly(env, Flights(late, args.apex, turns=name == "turning"), name) for name in ("turning", "without")
+    }
+    plot(run, found)
+    values = {"late_ms": args.late, "landing": args.landing or "default pose"} | flight_metrics(found["turning"])
+    values |= {f"without_turning_{name}": value for name, value in flight_metrics(found["without"]).items()}
+    return run.report(values, {})
+
+
+if __name__ == "__main__":
+    run_command(lambda: main(tyro.cli(Args)))

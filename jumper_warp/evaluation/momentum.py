@@ -1,0 +1,52 @@
+"""Momentum of the robot, from its links."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+BACK = np.array([-1.0, -1.0, -1.0, 1.0])
+"""Signs of the inverse of a quaternion, xyzw."""
+
+
+def rotated(quat: np.ndarray, v: np.ndarray) -> np.ndarray:
+    """Return vectors (..., 3) turned by orientations (..., 4), xyzw."""
+    axis, w = quat[..., :3], quat[..., 3:]
+    across = 2.0 * np.cross(axis, v)
+    return v + w * across + np.cross(axis, across)
+
+
+def momentum(sim: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Return the links' linear [kg m/s] and angular momentum [kg m^2/s] about the robot's com, (num_worlds, 3) each.
+
+    World axes. What the rotors spin at besides their links is left out: no link turns in answer to it.
+    """
+    mass, inertia, quat, arm, twist = _links(sim)
+    linear = mass * twist[..., :3]
+    own = np.einsum("nbij,nbj->nbi", inertia, rotated(quat * BACK, twist[..., 3:]))
+    return linear.sum(axis=1), (np.cross(arm, linear) + rotated(quat, own)).sum(axis=1)
+
+
+def rotational_inertia(sim: Any) -> np.ndarray:
+    """Return the inertia [kg m^2] of the robot with locked joints about its com, world axes, (num_worlds, 3, 3)."""
+    mass, inertia, quat, arm, _ = _links(sim)
+    columns = []
+    for axis in np.eye(3):
+        own = np.einsum("nbij,nbj->nbi", inertia, rotated(quat * BACK, np.broadcast_to(axis, arm.shape)))
+        spin = np.cross(arm, mass * np.cross(axis, arm)) + rotated(quat, own)
+        columns.append(spin.sum(axis=1))
+    return np.stack(columns, axis=-1)
+
+
+def _links(sim: Any) -> tuple[np.ndarray, ...]:
+    """Return of all links mass [kg], inertia [kg m^2], orientation (xyzw), arm [m] from the robot's com, and twist."""
+    model, n = sim.model, sim.num_worlds
+    sim.physics.write_bodies()
+    frame = sim.state.body_q.numpy().reshape(n, -1, 7).astype(float)
+    twist = sim.state.body_qd.numpy().reshape(n, -1, 6).astype(float)
+    mass = model.body_mass.numpy().reshape(n, -1, 1).astype(float)
+    inertia = model.body_inertia.numpy().reshape(n, -1, 3, 3).astype(float)
+    com = frame[..., :3] + rotated(frame[..., 3:], model.body_com.numpy().reshape(n, -1, 3).astype(float))
+    arm = com - (mass * com).sum(axis=1, keepdims=True) / mass.sum(axis=1, keepdims=True)
+    return mass, inertia, frame[..., 3:], arm, twist

@@ -1,0 +1,85 @@
+"""How robots begin to turn in free flight, and how far: starts and turns, as data."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import warp as wp
+
+from jumper_warp.utils.checks import check_finite, check_not_negative, check_positive
+from jumper_warp.utils.errors import InputError
+from kernels.attitude.commands import TurnRanges
+from kernels.attitude.reset import AttitudeSettings
+
+Pair = tuple[float, float]
+
+
+@dataclass(frozen=True)
+class TurnCfg:
+    """Drawn turns: one level of the curriculum."""
+
+    angle: Pair
+    """[deg] Smallest and largest."""
+    axis_share: float = 0.5
+    """[1] Share of turns about x, y or z of the body; the others are about any axis."""
+
+    struct = TurnRanges
+    """What the kernels read."""
+
+    def __post_init__(self) -> None:
+        """Raises ValueError: a range or a share is not one."""
+        if not 0.0 <= self.angle[0] <= self.angle[1] <= 180.0:
+            raise InputError(f"turn angle must be (lower, upper) within 0 to 180 degrees, got {self.angle}")
+        if not 0.0 <= self.axis_share <= 1.0:
+            raise InputError(f"turn axis_share must be in [0, 1], got {self.axis_share}")
+
+    def values(self) -> Any:
+        """Return the kernels' `TurnRanges`."""
+        ranges = TurnRanges()
+        ranges.angle = wp.vec2(*(math.radians(angle) for angle in self.angle))
+        ranges.axis_share = self.axis_share
+        return ranges
+
+
+@dataclass(frozen=True)
+class AttitudeResetCfg:
+    """How episodes begin, in any orientation; angles in degrees."""
+
+    episode: Pair = (2.0, 4.0)
+    """[s] Length of an episode; drawn, so that not all worlds are at the same stage of theirs."""
+    height: float = 2.0
+    """[m] Of the base above the ground."""
+    default_share: float = 0.3
+    """[1] Share of episodes that begin in the default pose."""
+    lateral: Pair = (-20.0, 80.0)
+    """[deg] Of the other legs' motors."""
+    transversal: Pair = (0.0, 105.0)
+    """[deg]"""
+    spin: float = 0.0
+    """[rad/s] Half width of the angular velocity about each axis; with any, the robot has a momentum that stays."""
+
+    struct = AttitudeSettings
+    """What the kernels read."""
+
+    def __post_init__(self) -> None:
+        """Raises ValueError: a pair is reversed, a number not finite or out of range."""
+        for name, value in vars(self).items():
+            check_finite(f"reset {name}", *(value if isinstance(value, tuple) else (value,)))
+            if isinstance(value, tuple) and not value[0] <= value[1]:
+                raise InputError(f"reset {name} must be (lower, upper), got {value}")
+        check_positive("reset episode", *self.episode)
+        check_positive("reset height", self.height)
+        check_not_negative("reset spin", self.spin)
+        if not 0.0 <= self.default_share <= 1.0:
+            raise InputError(f"reset default_share must be in [0, 1], got {self.default_share}")
+
+    def values(self, step_dt: float) -> Any:
+        """Return the kernels' `AttitudeSettings`: angles in radians, times in policy steps of step_dt [s]."""
+        settings = AttitudeSettings()
+        settings.episode_steps = wp.vec2(*(seconds / step_dt for seconds in self.episode))
+        settings.height, settings.default_share, settings.spin = self.height, self.default_share, self.spin
+        for name in ("lateral", "transversal"):
+            setattr(settings, name, wp.vec2(*(math.radians(angle) for angle in getattr(self, name))))
+        return settings

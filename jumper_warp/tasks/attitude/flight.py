@@ -1,0 +1,102 @@
+"""Turning in free flight: the robot floats, and moves its legs so that its base takes a commanded orientation.
+
+Nothing pushes on it, so that its angular momentum stays zero: the base turns while legs move, and stays turned when
+they have gone round and come back another way, stretched in one direction and folded in the other. Weights and limits
+are of the order of the authors' sequel (attitude wide and narrow 2.5 and 1.5, collision -100, 8 N m); their forms were
+not published. `approach` pays every degree once, so that strokes are worth their while far from the goal, where the
+kernels are flat. What touches while turning costs, and fails the episode at its end, but does not cut it short: early
+on, legs meet in every one.
+"""
+
+from __future__ import annotations
+
+from jumper_warp.robot.motors import jumping_motors, walking_filter
+from jumper_warp.tasks.attitude.cfg import AttitudeResetCfg, TurnCfg
+from jumper_warp.tasks.cfg import Command, Reset, TaskCfg
+from jumper_warp.tasks.observations import DRAWN, ROBOT, exact
+from jumper_warp.tasks.randomization import RandomizationCfg
+from jumper_warp.tasks.terms import Advance, Curriculum, ObservationTerm, RewardTerm, StateMetric, TerminationTerm
+from jumper_warp.tasks.units import DEG
+from kernels.attitude import observations as attitude
+from kernels.attitude import rewards, state, terminations
+from kernels.attitude.commands import give_turn
+from kernels.attitude.reset import reset_attitude
+from kernels.attitude.state import AttitudeState
+from kernels.mdp import rewards as mdp_rewards
+from kernels.mdp import terminations as mdp_terminations
+
+TORQUE = 8.0
+"""[N m] Of all motors."""
+TOLERANCE = 5.0
+"""[deg] Of the goal."""
+
+POLICY = (
+    ObservationTerm(attitude.turn_left, noise=0.02),
+    *(term for term in ROBOT if term.name not in ("lin_vel", "gravity")),
+)
+"""The rotation to the goal, angular velocity, motors and last action."""
+
+CRITIC = (
+    *exact(POLICY),
+    ObservationTerm(attitude.time_left),
+    ObservationTerm(attitude.in_collision),
+    *(term for term in DRAWN if term.name not in ("drawn_friction", "drawn_push")),
+)
+"""What only a simulation knows besides."""
+
+REWARDS = (
+    RewardTerm(rewards.approach, 15.0),
+    RewardTerm(rewards.attitude, 2.5, name="attitude_wide", width=60.0 * DEG),
+    RewardTerm(rewards.attitude, 1.5, name="attitude_narrow", width=10.0 * DEG),
+    RewardTerm(rewards.attitude, 1.0, name="attitude_fine", width=3.0 * DEG),
+    RewardTerm(rewards.hold, 2.0, width=10.0 * DEG, spin=0.5),
+    RewardTerm(rewards.landing_posture, 1.0, width=15.0 * DEG, posture=30.0 * DEG),
+    RewardTerm(rewards.spin, -0.01),
+    RewardTerm(mdp_rewards.collision, -20.0),
+    RewardTerm(mdp_rewards.action_clip, -0.1),
+    RewardTerm(mdp_rewards.motor_torque_sq, -5.0e-4),
+    RewardTerm(mdp_rewards.joint_acceleration, -1.0e-7),
+    RewardTerm(mdp_rewards.action_rate, -0.02),
+)
+
+TERMINATIONS = (
+    TerminationTerm(mdp_terminations.came_apart),
+    TerminationTerm(terminations.ended_clear, time_out=True, success=True),
+    TerminationTerm(terminations.ended, time_out=True),
+)
+
+METRICS = (
+    StateMetric("Metrics/error_at_end_rad", "sum_error", "episodes"),
+    StateMetric("Metrics/settled", "settled", "episodes"),
+    StateMetric("Metrics/settling_s", "sum_settling", "settled"),
+    StateMetric("Metrics/in_collision_s", "sum_collisions", "episodes"),
+)
+
+
+def attitude_in_flight() -> TaskCfg:
+    """Return the task in zero gravity, with 8 N m and all the room that the hard stops leave to the legs."""
+    return TaskCfg(
+        name="attitude",
+        state=AttitudeState,
+        advance=Advance(state.advance_attitude, tolerance=TOLERANCE * DEG),
+        reset=Reset(reset_attitude, AttitudeResetCfg(), side_by_side=True),
+        command=Command(give_turn),
+        curriculum=Curriculum(
+            state.attitude_error, tolerance=10.0 * DEG, promote_after=5, counts=state.every_episode, unit="rad"
+        ),
+        levels=(TurnCfg((5.0, 40.0)), TurnCfg((10.0, 70.0)), TurnCfg((20.0, 100.0)), TurnCfg((20.0, 140.0))),
+        rewards=REWARDS,
+        terminations=TERMINATIONS,
+        policy=POLICY,
+        critic=CRITIC,
+        motors=jumping_motors(TORQUE),
+        command_filter=walking_filter(),
+        action_scale=(90.0, 90.0),
+        randomization=RandomizationCfg(force=None, torque=None),
+        gravity=0.0,
+        keep_momentum=True,
+        lift=2.0,
+        reward_floor=None,
+        metrics=METRICS,
+        evaluation="attitude",
+    )

@@ -1,0 +1,59 @@
+"""Commands to turn: how they are drawn and given from outside."""
+
+import warp as wp
+
+from ..mdp.env import Scene
+from ..mdp.random import Draw, between, branch, within
+from ..mdp.view import RobotView
+from .state import AttitudeState, with_goal
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.struct
+class TurnRanges:
+    """Ranges of drawn turns."""
+
+    angle: wp.vec2  # [rad] smallest and largest
+    axis_share: float  # share of turns about x, y or z of the body; the others are about any axis
+
+
+@wp.func
+def draw_unit_quat(draw: Draw) -> wp.quat:
+    """Return a random orientation (xyzw), uniform over all (Shoemake 1992)."""
+    a = between(draw, 0, 0.0, 1.0)
+    b = between(draw, 1, 0.0, 2.0 * wp.pi)
+    c = between(draw, 2, 0.0, 2.0 * wp.pi)
+    s = wp.sqrt(1.0 - a)
+    r = wp.sqrt(a)
+    return wp.quat(s * wp.sin(b), s * wp.cos(b), r * wp.sin(c), r * wp.cos(c))
+
+
+@wp.func
+def draw_axis(draw: Draw, axis_share: float) -> wp.vec3:
+    """Return a unit vector: one of the body's axes in a share of draws, else any, uniform over the sphere."""
+    sign = wp.where(between(draw, 5, 0.0, 1.0) < 0.5, -1.0, 1.0)
+    if between(draw, 3, 0.0, 1.0) < axis_share:
+        axis = wp.vec3(0.0)
+        axis[wp.min(int(between(draw, 4, 0.0, 3.0)), 2)] = sign
+        return axis
+    z = between(draw, 6, -1.0, 1.0)
+    around = between(draw, 7, 0.0, 2.0 * wp.pi)
+    r = wp.sqrt(1.0 - z * z)
+    return wp.vec3(r * wp.cos(around), r * wp.sin(around), z)
+
+
+@wp.func
+def draw_turn(draw: Draw, ranges: TurnRanges) -> wp.quat:
+    """Return a drawn turn (xyzw), body axes."""
+    axis = draw_axis(branch(draw, 100), ranges.axis_share)
+    return wp.quat_from_axis_angle(axis, within(draw, 8, ranges.angle))
+
+
+@wp.func
+def give_turn(view: RobotView, scene: Scene, task: AttitudeState, values: wp.vec4, heading: float) -> AttitudeState:
+    """Command a turn (quaternion xyzw, of any length but 0) from the orientation that the robot has; 0: none."""
+    turn = wp.quat(values[0], values[1], values[2], values[3])
+    if wp.length(values) == 0.0:
+        turn = wp.quat(0.0, 0.0, 0.0, 1.0)
+    return with_goal(task, view.quat, view.quat * wp.normalize(turn))

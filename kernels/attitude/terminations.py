@@ -1,0 +1,18 @@
+"""Why an episode of turning in free flight ends, besides what ends any task's."""
+
+import warp as wp
+
+from ..mdp.view import RobotView
+from .state import AttitudeState
+
+
+@wp.func
+def ended_clear(view: RobotView, task: AttitudeState) -> bool:
+    """The episode has lasted as long as it should, and nothing has touched anything."""
+    return task.episode_steps > 0 and task.steps >= task.episode_steps and task.collisions == 0
+
+
+@wp.func
+def ended(view: RobotView, task: AttitudeState) -> bool:
+    """The episode has lasted as long as it should."""
+    return task.episode_steps > 0 and task.steps >= task.episode_steps

@@ -1,0 +1,83 @@
+"""Turning as a skill in the flight of a jump: when it takes over, what it is to do, and when it hands back."""
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from jumper_warp.envs.env import Env
+from jumper_warp.evaluation.flights import JUMP, TURN, Flights, flight_metrics
+from jumper_warp.policies.restore import restored_skills
+from jumper_warp.registry import make_task
+from jumper_warp.tasks.switching import flight_skills
+from jumper_warp.utils.errors import InputError
+
+N = 4
+LATE = np.array([[0.01, 0.0], [-0.01, 0.0], [0.0, 0.01], [0.0, 0.0]])
+MARS = 3.71
+
+
+@pytest.fixture(scope="module")
+def flown():
+    """Robots that jump tilted and do nothing in flight: the environment, the flights, and their skills over time."""
+    tasks, handovers = flight_skills(make_task("vertical-jump-mars"), make_task("attitude"))
+    env = Env(tasks, N, device="cpu", randomize=False, noise=False, auto_reset=False, handovers=handovers)
+    flights, seen = Flights(LATE, apex=2.5), []
+    flights.begin(env)
+    for _ in range(round(flights.seconds / env.step_dt)):
+        action = torch.tensor(flights.action(90.0, None), dtype=torch.float32)
+        env.step(torch.stack([action, torch.zeros(N, 12)]))
+        turn, jump = (env.skills[skill].states.numpy().copy() for skill in (TURN, JUMP))
+        height, rise = env.sim.joint_q()[:, 2].copy(), env.sim.joint_qd()[:, 2].copy()
+        seen.append((env.worlds.skill.numpy().copy(), turn, jump, height, rise))
+        if flights.follow(env):
+            break
+    return env, flights, seen
+
+
+def test_turning_takes_over_in_flight_and_hands_back_before_the_landing(flown):
+    _, flights, seen = flown
+    skills = np.array([skill for skill, *_ in seen])
+    for world in range(N):
+        changes = np.flatnonzero(np.diff(skills[:, world])) + 1
+        assert [skills[change, world] for change in changes] == [TURN, JUMP]
+        up, down = changes
+        assert seen[up][4][world] > 2.0 and seen[down][4][world] < -2.0
+        # from there it falls to 0.45 m in a little less than 0.35 s
+        height, rise = seen[down][3][world], seen[down][4][world]
+        under_root = rise**2 + 2.0 * MARS * (height - 0.45)
+        assert 0.30 < (rise + np.sqrt(under_root)) / MARS <= 0.35
+    assert (skills[-1] == JUMP).all() and flights.flight_time.min() > 2.0
+
+
+def test_the_goal_is_level_in_the_jumps_heading_and_the_jump_goes_on(flown):
+    _, _, seen = flown
+    turning = next(turn for skill, turn, *_ in seen if (skill == TURN).all())
+    euler = Rotation.from_quat(turning["goal"]).as_euler("ZYX")
+    np.testing.assert_allclose(euler, 0.0, atol=1e-6)
+    np.testing.assert_allclose(turning["jump_goal"][:, 2], 2.5)
+    landing = next(jump for i, (skill, _, jump, *_) in enumerate(seen) if i > 100 and (skill == JUMP).all())
+    np.testing.assert_allclose(landing["goal"], turning["jump_goal"])
+    assert (landing["phase"] >= 1).all() and (landing["max_height"] > 2.0).all()
+
+
+def test_legs_that_push_later_tilt_the_robot(flown):
+    _, flights, _ = flown
+    assert flights.takeoff_spin[:3].min() > 0.2 > flights.takeoff_spin[3]
+    assert np.degrees(flights.touchdown_tilt[:3]).min() > 5.0 > np.degrees(flights.touchdown_tilt[3])
+    metrics = flight_metrics(flights)
+    assert metrics["flights"] == N and 2.5 < metrics["mean_apex_m"] < 3.2
+    assert metrics["max_angular_momentum_change_in_flight_nm_s"] < 1.0e-4 < 0.1 * flights.takeoff_momentum.max()
+
+
+def test_handovers_are_read_back(flown):
+    tasks, handovers = restored_skills(flown[0].config())
+    assert [task.name for task in tasks] == ["vertical-jump-mars", "attitude"]
+    assert [h.when.key for h in handovers] == [h.when.key for h in flown[0].handovers]
+
+
+def test_other_tasks_are_refused():
+    with pytest.raises(InputError, match="needs a task of JumpState"):
+        flight_skills(make_task("attitude"), make_task("attitude"))
+    with pytest.raises(InputError, match="needs a task of AttitudeState"):
+        flight_skills(make_task("vertical-jump-mars"), make_task("velocity-flat"))

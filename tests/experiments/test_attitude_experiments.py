@@ -1,0 +1,52 @@
+"""The experiments of turning in flight, at a tiny size, with a policy that is hardly trained."""
+
+import json
+
+import pytest
+
+from experiments import attitude, flight_attitude
+from jumper_warp.cli.main import main as cli
+from jumper_warp.policies.spec import PolicyError
+from jumper_warp.utils.errors import InputError
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    """A run of one iteration."""
+    root = tmp_path_factory.mktemp("logs")
+    args = "--num-envs 8 --iterations 1 --ppo.num-steps 4 --ppo.minibatches 1 --ppo.hidden 8 --device cpu --log-root"
+    cli(["train", "attitude", *args.split(), str(root)])
+    return next((root / "attitude").iterdir())
+
+
+def test_turns_about_all_axes_are_measured(run, tmp_path):
+    args = attitude.Args(policy=str(run), turns=6, seconds=0.2, record=1, refine=2, out=tmp_path, device="cpu")
+    values = attitude.main(args)
+    assert json.loads((tmp_path / "figures.json").read_text()) == values
+    assert values["physics_step_s"] == pytest.approx(1.0 / 960.0)
+    assert values["success_rate"] == 0.0 and 80.0 < values["mean_error_at_end_deg"] < 100.0
+    assert 0.0 < values["max_angular_momentum_nm_s"] < 1.0e-5
+    assert (tmp_path / "turns.png").is_file() and (tmp_path / "turns.rrd").stat().st_size > 10_000
+
+
+def test_flights_are_flown_with_turning_and_without(run, tmp_path):
+    args = flight_attitude.Args(policy=str(run), flights=2, late=10.0, record=1, out=tmp_path, device="cpu")
+    values = flight_attitude.main(args)
+    assert json.loads((tmp_path / "figures.json").read_text()) == values
+    assert values["mean_apex_m"] > 2.5 and values["mean_takeoff_spin_rad_s"] > 0.1
+    takeoff = "mean_takeoff_spin_rad_s"
+    assert values[f"without_turning_{takeoff}"] == pytest.approx(values[takeoff])
+    assert (tmp_path / "flights.png").is_file() and (tmp_path / "turning.rrd").stat().st_size > 10_000
+
+
+def test_what_cannot_be_is_refused(tmp_path):
+    with pytest.raises(InputError, match="turns must be at least 6"):
+        attitude.Args(turns=3)
+    with pytest.raises(InputError, match="late in 0 to 100 ms"):
+        flight_attitude.Args(late=200.0)
+    with pytest.raises(PolicyError, match="evaluated by attitude"):
+        attitude.main(attitude.Args(policy="vertical_jump", out=tmp_path, device="cpu"))
+    with pytest.raises(PolicyError, match="needs a policy that turns in flight"):
+        flight_attitude.main(flight_attitude.Args(policy="vertical_jump", out=tmp_path, device="cpu"))

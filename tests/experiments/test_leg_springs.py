@@ -1,0 +1,32 @@
+"""The experiment with springs between the knees, at a tiny size."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from experiments import leg_springs
+from jumper_warp.robot.overlay import load_overlay
+from jumper_warp.utils.errors import InputError
+
+
+def test_springs_let_the_robot_jump_higher(tmp_path):
+    args = leg_springs.Args(stiffness=(0.0, 500.0), squats=(120.0,), filter="stock", out=tmp_path, device="cpu")
+    values = leg_springs.main(args)
+    assert json.loads((tmp_path / "figures.json").read_text()) == values
+    without, with_springs = values["stock_apex_m"]
+    assert without == pytest.approx(1.075, abs=0.01) and with_springs == pytest.approx(1.243, abs=0.01)
+    assert values["stock_highest_apex_height_m"] == pytest.approx(with_springs, abs=0.005)
+    assert (tmp_path / "springs.png").is_file() and (tmp_path / "jump_stock.rrd").stat().st_size > 10_000
+
+
+def test_the_springs_of_the_sequel_are_an_overlay():
+    values = load_overlay(Path(__file__).parents[2] / "assets/jumper/leg_springs.json").values
+    assert values == {"spring_stiffness": (1000.0,), "spring_length": (0.17,)}
+
+
+def test_what_cannot_be_is_refused():
+    with pytest.raises(InputError, match="spring_stiffness must be in"):
+        leg_springs.Args(stiffness=(-1.0,))
+    with pytest.raises(InputError, match="at least one"):
+        leg_springs.Args(squats=())

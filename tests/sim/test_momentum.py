@@ -1,0 +1,64 @@
+"""Momentum that is kept: exactly in free flight, and left alone where something pushes on the robot."""
+
+import numpy as np
+import pytest
+
+from jumper_warp.evaluation.momentum import momentum
+from jumper_warp.robot.gravity import MARS
+from jumper_warp.robot.motors import jumping_motors
+from jumper_warp.sim.simulation import Simulation
+
+N = 2
+STEPS = 45
+
+
+def moving_legs(keep: bool, *, height: float, push: float = 0.0, reach: float = 0.4) -> tuple[Simulation, list]:
+    """Return robots after leg motions for 0.75 s, begun with a spin, and their momenta after every policy step."""
+    sim = Simulation(N, motors=jumping_motors(), gravity=MARS, keep_momentum=keep, visuals=False, device="cpu")
+    q, qd = sim.joint_q().copy(), sim.joint_qd().copy()
+    q[:, 2] += height
+    if height:
+        qd[:, 3:6] = [0.5, -0.3, 0.2]
+    sim.state.joint_q.assign(q.ravel())
+    sim.state.joint_qd.assign(qd.ravel())
+    wrench = np.zeros((N, 21, 6), dtype=np.float32)
+    wrench[:, 0, 3] = push
+    sim.state.body_f.assign(wrench.reshape(-1, 6))
+    found = [momentum(sim)]
+    for i in range(STEPS):
+        swing = reach * np.sin(0.3 * i + np.arange(12))
+        sim.target.assign(np.tile((np.tile([0.0, 0.8, 0.8], 4) + swing)[:, None], (1, N)).astype(np.float32))
+        sim.step()
+        found.append(momentum(sim))
+    return sim, found
+
+
+@pytest.fixture(scope="module")
+def flights():
+    return {keep: moving_legs(keep, height=5.0) for keep in (False, True)}
+
+
+def test_momentum_stays_or_grows_by_gravity_alone(flights):
+    sim, kept = flights[True]
+    mass = sim.model.body_mass.numpy()[:21].sum()
+    time = np.arange(STEPS + 1) / 60.0
+    linear, angular = (np.array([each[i] for each in kept]) for i in (0, 1))
+    np.testing.assert_allclose(linear[:, :, 2] - linear[0, :, 2], np.outer(-mass * MARS * time, np.ones(N)), atol=1e-3)
+    np.testing.assert_allclose(linear[:, :, :2], np.tile(linear[0, :, :2], (STEPS + 1, 1, 1)), atol=1e-4)
+    np.testing.assert_allclose(angular, np.tile(angular[0], (STEPS + 1, 1, 1)), atol=2e-5)
+    drift = np.abs(np.array([each[1] for each in flights[False][1]]) - angular[0]).max()
+    assert np.abs(angular).max() > 0.2 and drift > 1e-3
+
+
+def test_bodies_are_those_of_the_corrected_coordinates(flights):
+    sim = flights[True][0]
+    written = sim.state.body_qd.numpy().copy()
+    sim.physics.write_bodies()
+    np.testing.assert_array_equal(sim.state.body_qd.numpy(), written)
+
+
+@pytest.mark.parametrize("where", [{"height": 0.0, "reach": 0.03}, {"height": 5.0, "push": 0.5}])
+def test_nothing_is_corrected_where_something_pushes(where):
+    found = [moving_legs(keep, **where)[0].joint_qd() for keep in (False, True)]
+    assert np.abs(found[0][:, 6:]).max() > 0.1
+    np.testing.assert_array_equal(*found)
