@@ -112,6 +112,16 @@ def stays(most: float, speed: float = 0.25) -> Term:
     return term
 
 
+def drifts(most: float) -> Term:
+    """Keep the base within `most` [m] of its start in the plane, in all rows."""
+
+    def term(motion: Motion) -> torch.Tensor:
+        way = motion.q[..., :2] - motion.q[0, :, :2]
+        return (way.square().sum(-1) + 1.0e-12).sqrt() - most
+
+    return term
+
+
 def clear(margin: float = MARGIN, speed: float | None = None) -> Term:
     """Keep housings, thighs, knees and shanks off the ground by a margin [m], in stance or always (speed None)."""
 
@@ -155,3 +165,46 @@ def upright(most: float, at_end: bool = True) -> Term:
         return sine - 2.0 * math.sin(0.5 * most)
 
     return term
+
+
+def reaches(height: float) -> Term:
+    """Ask for an apex of the base of at least `height` [m]."""
+    return lambda motion: height + highest()(motion)
+
+
+def touchdowns(motion: Motion, speed: float = 0.25) -> torch.Tensor:
+    """Return from which row each paw has come down after the takeoff, bool (steps + 1, 4, num)."""
+    row, _ = motion.takeoff(speed)
+    later = torch.arange(motion.q.shape[0], device=row.device)[:, None, None] > row
+    down = torch.cat([torch.zeros_like(motion.down[:1]), motion.down])
+    return (down & later).int().cummax(0).values.bool()
+
+
+def lifted(free: float = 0.001) -> Term:
+    """Return how far and how long paws are off the ground again after their touchdown [10 mm s], (num,).
+
+    Heights below `free` [m] do not count, those of paws that never come down count from the motion's end.
+    """
+
+    def term(motion: Motion) -> torch.Tensor:
+        height = (motion.ankles[..., 2] - motion.body.paw_radius - free).clamp_min(0.0).movedim(2, 1)
+        counts = touchdowns(motion)
+        step = motion.substeps * motion.dt
+        return 100.0 * (step * torch.where(counts, height, 0.0).sum((0, 1)) + height[-1].sum(0))
+
+    return term
+
+
+def rest() -> Term:
+    """Return the squared speed [m^2/s^2] and a tenth of the squared angular velocity [rad^2/s^2] at the end, (num,)."""
+
+    def term(motion: Motion) -> torch.Tensor:
+        last = motion.qd[-1]
+        return last[:, :3].square().sum(-1) + 0.1 * last[:, 3:6].square().sum(-1)
+
+    return term
+
+
+def still(free: float = 0.001) -> Term:
+    """Return `lifted` and half of `rest`, (num,)."""
+    return lambda motion: lifted(free)(motion) + 0.5 * rest()(motion)

@@ -22,8 +22,9 @@ from jumper_warp.optim.rollout import Rollout
 from jumper_warp.optim.torch_rollout import TorchTrajectory, simulate
 from jumper_warp.optim.whole_body import Momentum, WholeBody
 from jumper_warp.robot.gravity import EARTH
-from jumper_warp.robot.model import build_model
+from jumper_warp.robot.model import PHYSICS_DT, build_model
 from jumper_warp.robot.motors import FilterCfg, MotorCfg, jumping_motors
+from jumper_warp.sim.simulation import SUBSTEPS
 from jumper_warp.utils.errors import InputError
 
 CONTACT_FORCE = 0.1
@@ -187,6 +188,8 @@ class Problem:
     """[1] Of the paws."""
     gravity: float = EARTH
     """[m/s^2] Downward."""
+    substeps: int = SUBSTEPS
+    """Physics steps in a policy step; fewer are faster and coarser."""
     double: bool = True
     """Whether to compute in double precision."""
     tolerance: float | None = 1.0e-9
@@ -213,7 +216,7 @@ class Problem:
             )
             rollout = Rollout(
                 model, self.motors, self.command_filter, double=self.double, tolerance=self.tolerance,
-                threads=self.threads,
+                dt=PHYSICS_DT * SUBSTEPS / self.substeps, substeps=self.substeps, threads=self.threads,
             )  # fmt: skip
             self._rollouts[num_worlds] = rollout, WholeBody(rollout)
         return self._rollouts[num_worlds]
