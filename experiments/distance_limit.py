@@ -35,25 +35,24 @@ from rich.table import Column, Table
 
 from jumper_warp.cli.main import run_command
 from jumper_warp.envs.env import Env
-from jumper_warp.evaluation.jumps import jump_commands
-from jumper_warp.evaluation.landings import Landings
-from jumper_warp.evaluation.log import termination_names
 from jumper_warp.evaluation.plots import drawn
 from jumper_warp.evaluation.run import EvaluationArgs, EvaluationRun
 from jumper_warp.evaluation.takeoff_search import (
     FURTHER_SIGMA,
     NOMINAL,
+    POLICY_GOALS,
     SIGMA,
     Limit,
     actions_of,
     cma_package,
     env_of_limit,
     fly_best,
+    fly_policy,
     knots_of,
     random_squat,
     search,
 )
-from jumper_warp.evaluation.takeoffs import Flight, Takeoffs, mean_of_sides, reach
+from jumper_warp.evaluation.takeoffs import Flight, reach
 from jumper_warp.robot.model import KNEE_DOFS
 from jumper_warp.robot.motors import horizontal_jump_filter, jumping_motors, loose_filter, vertical_jump_filter
 from jumper_warp.tasks.cfg import TaskCfg
@@ -65,10 +64,6 @@ FRICTION = 0.85
 """[1] Of the paws of nominal robots on this task."""
 STRETCHED = -1.0
 """[1] Of the transversal motors after takeoff for the highest apex: all that the filter lets."""
-POLICY_GOALS = (1.5, 2.0, 2.5)
-"""[m]"""
-SEED_GOAL = 2.0
-"""[m] The policy's actions for this goal begin the search."""
 OPEN_LOOP_APEX = 1.0748
 """[m] Base, experiments/open_loop_jump.py."""
 
@@ -163,22 +158,6 @@ class Args:
             raise InputError(f"no limit {unknown[0]!r:.40}; there are {', '.join(LIMITS)}")
         if self.population < 8 or min(self.generations, self.further) < 1 or self.squats < 0:
             raise InputError("need a population of at least 8, a generation in each search, and no negative squats")
-
-
-def fly_policy(run: EvaluationRun) -> tuple[Takeoffs, Landings, np.ndarray]:
-    """Let the policy jump to POLICY_GOALS; return the jumps, and its actions up to takeoff for SEED_GOAL (steps, 4)."""
-    env, seed = run.env(len(POLICY_GOALS)), POLICY_GOALS.index(SEED_GOAL)
-    env.evaluation_reset(jump_commands(np.zeros((env.num_envs, 3)), 0.0, env.step_dt))
-    takeoffs, actions = Takeoffs(env), []
-
-    def watch(_: Landings) -> None:
-        if not takeoffs.off[seed]:
-            actions.append(mean_of_sides(env.action[seed].cpu().numpy())[0])
-        takeoffs.look()
-
-    goals = np.outer(POLICY_GOALS, [1.0, 0.0])[:, None]
-    landings = run.follow(env, Landings(goals, termination_names(env.task)), watch=watch)
-    return takeoffs, landings, np.array(actions)
 
 
 def caught(run: EvaluationRun, best: np.ndarray) -> dict[str, Any]:

@@ -8,7 +8,8 @@ begins with random squats in parallel worlds, goes on along smoothed gradients (
 with fewer physics steps, and ends with limited-memory BFGS inside an augmented Lagrangian
 (`jumper_warp.optim.descent`). What is told is not the optimiser's own figure: the targets are replayed in the
 simulation that trains policies, at every physics step, and collisions of all links are looked for; the farthest flight
-is scored as in `experiments/distance_limit.py`, whose constraints it has.
+is scored as in `experiments/distance_limit.py`, whose constraints it has. Of each jump a JSON file is written that can
+be put into `assets/motions`, for episodes that begin along it (`--env.reset.reference.motion`).
 
 Constraints of vertical jumps: no link but the paws touches the ground, tilt at most 8 degrees and base at most 0.15 m
 from its start at all times. Work is what the motors put in until takeoff, braking apart.
@@ -21,6 +22,7 @@ passes, each of which costs about three simulated ones.
 
 from __future__ import annotations
 
+import json
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -35,8 +37,10 @@ from rich.table import Table
 
 from jumper_warp.cli.main import run_command
 from jumper_warp.evaluation import takeoff_search
-from jumper_warp.evaluation.optimized_jumps import JUMPS, Jump, Replay, optimise, squats
+from jumper_warp.evaluation.motion_replay import Replay
+from jumper_warp.evaluation.optimized_jumps import JUMPS, Jump, optimise, squats
 from jumper_warp.evaluation.plots import drawn
+from jumper_warp.evaluation.run import EvaluationArgs, EvaluationRun
 from jumper_warp.optim.smoothing import BATCH, penalised
 from jumper_warp.optim.trajectory import Problem
 from jumper_warp.sim.simulation import SUBSTEPS
@@ -60,6 +64,8 @@ class Args:
 
     jumps: tuple[str, ...] = tuple(JUMPS)
     """What is optimised."""
+    policy: str | None = "horizontal_jump"
+    """Whose actions begin the search for the farthest flight too, as in `distance_limit.py`; None: random squats."""
     baseline: Literal["none", "cma"] = "none"
     """Whether evolution strategies run beside it."""
     generations: int = 480
@@ -116,6 +122,14 @@ def flight_of(x: np.ndarray) -> float:
     env = takeoff_search.env_of_limit(takeoff_search.NOMINAL, 1, "cpu")
     actions = takeoff_search.actions_of(x[None])
     return float(takeoff_search.score(takeoff_search.fly(env, actions), takeoff_search.NOMINAL)[0])
+
+
+def policy_actions(args: Args, steps: int) -> np.ndarray:
+    """Return the actions up to takeoff of the policy's jump over 2 m, the last ones held, (steps, 4)."""
+    evaluation = EvaluationArgs(args.policy, record=0, out=args.out, device=args.device, threads=args.threads)
+    actions = takeoff_search.fly_policy(EvaluationRun.of("trajectory_optimization", evaluation))[2]
+    actions = actions[-takeoff_search.TICKS :]
+    return np.concatenate([actions, np.repeat(actions[-1:], max(0, steps - len(actions)), axis=0)])[:steps]
 
 
 def evolve(problem: Problem, begin: np.ndarray, seconds: float, seed: int) -> np.ndarray:
@@ -180,6 +194,8 @@ def run_jump(
     knots = jump.make(substeps=SUBSTEPS, **settings).knots
     rng = np.random.default_rng(args.seed)
     begin = squats(knots, args.samples or jump.samples, rng, PUSH.get(name, 32))
+    if name == "farthest" and args.policy is not None:
+        begin = np.concatenate([begin, around(knots.nearest(policy_actions(args, knots.steps)), knots, rng)])
     if jump.after in seeds:
         begin = np.concatenate([begin, around(seeds[jump.after], knots, rng)])
     scaled = jump.scaled(args.effort)
@@ -188,7 +204,7 @@ def run_jump(
     seeds[name] = x
     targets = knots.targets(torch.as_tensor(x[None]))[..., 0].numpy()
     rows = {"gradients": clock() | counted(problems)}
-    replay = Replay(jump, targets, notes={"jump": jump.label})
+    replay = jump.replay(targets, device=args.device, notes={"jump": jump.label})
     rows["gradients"] |= {"value": value_of(name, jump, x, replay), "violation": float(found.violation[found.best])}
     np.savez(folder / f"{name}.npz", targets=targets, knots=x.reshape(len(knots.at), -1), at=np.array(knots.at))
     if args.baseline == "cma":
@@ -198,7 +214,7 @@ def run_jump(
             Clock(),
         )
         other = evolve(fine, begin, seconds, args.seed)
-        again = Replay(jump, knots.targets(torch.as_tensor(other[None]))[..., 0].numpy())
+        again = jump.replay(knots.targets(torch.as_tensor(other[None]))[..., 0].numpy(), device=args.device)
         rows["cma"] = clock() | counted([fine]) | {"value": value_of(name, jump, other, again)}
         if name == "farthest":
             rows["cma_as_published"] = search_as_published(args)
@@ -210,7 +226,8 @@ def around(x: np.ndarray, knots: Any, rng: np.random.Generator) -> np.ndarray:
     known = x.reshape(-1, 4)
     rest = np.zeros((len(knots.at) - len(known), 4))
     whole = np.concatenate([known, rest]).ravel()
-    return np.clip(whole + 0.05 * rng.normal(size=(64, len(whole))) * (np.arange(64) > 0)[:, None], -1.0, 1.0)
+    spread = np.linspace(0.0, 0.2, 64)[:, None]
+    return np.clip(whole + spread * rng.normal(size=(64, len(whole))), -1.0, 1.0)
 
 
 def value_of(name: str, jump: Jump, x: np.ndarray, replay: Replay) -> float:
@@ -271,6 +288,8 @@ def main(args: Args) -> dict[str, Any]:
         values |= {f"{name}_{key}": value for key, value in replay.metrics().items()}
         if name == "still":
             values |= {"still_longest_lift_s": replay.longest_lift, "still_highest_lift_m": replay.highest_lift}
+        reach = rows[name]["gradients"]["value"] if name == "farthest" else 0.0
+        (folder / f"{name}.json").write_text(json.dumps(replay.reference(reach)) + "\n")
         replay.save_rrd(folder / f"{name}.rrd")
         replay.save_strip(folder / f"{name}_strip.png")
         write_figures(folder, values)

@@ -14,8 +14,11 @@ from types import ModuleType
 import numpy as np
 
 from jumper_warp.envs.env import Env
-from jumper_warp.evaluation.landings import ENDS
-from jumper_warp.evaluation.takeoffs import LANDING_ACTION, Act, Takeoffs, fly
+from jumper_warp.evaluation.jumps import jump_commands
+from jumper_warp.evaluation.landings import ENDS, Landings
+from jumper_warp.evaluation.log import termination_names
+from jumper_warp.evaluation.run import EvaluationRun
+from jumper_warp.evaluation.takeoffs import LANDING_ACTION, Act, Takeoffs, fly, mean_of_sides
 from jumper_warp.registry import make_task
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.utils.errors import InputError
@@ -34,6 +37,10 @@ BAD, PITCH, BACK, OUTSIDE = 1.0, 0.05, 5.0, 0.05
 """Costs of a jump that ended [m], pitch beyond the limit [m/deg], leaning back beyond it [1], wild knots [m]."""
 NO_TAKEOFF = -3.0
 """[m] What a jump counts that does not leave the ground."""
+POLICY_GOALS = (1.5, 2.0, 2.5)
+"""[m]"""
+SEED_GOAL = 2.0
+"""[m] The policy's actions for this goal begin the search."""
 EVERY = 120
 """Generations between two lines of progress."""
 
@@ -139,3 +146,19 @@ def fly_best(
 ) -> Takeoffs:
     """Return jumps of the same candidate in every world, to their rest; after, goals: as of `fly`."""
     return fly(env, actions_of(np.tile(best, (env.num_envs, 1))), after, goals=goals, to_rest=True)
+
+
+def fly_policy(run: EvaluationRun) -> tuple[Takeoffs, Landings, np.ndarray]:
+    """Let the policy jump to POLICY_GOALS; return the jumps, and its actions up to takeoff for SEED_GOAL (steps, 4)."""
+    env, seed = run.env(len(POLICY_GOALS)), POLICY_GOALS.index(SEED_GOAL)
+    env.evaluation_reset(jump_commands(np.zeros((env.num_envs, 3)), 0.0, env.step_dt))
+    takeoffs, actions = Takeoffs(env), []
+
+    def watch(_: Landings) -> None:
+        if not takeoffs.off[seed]:
+            actions.append(mean_of_sides(env.action[seed].cpu().numpy())[0])
+        takeoffs.look()
+
+    goals = np.outer(POLICY_GOALS, [1.0, 0.0])[:, None]
+    landings = run.follow(env, Landings(goals, termination_names(env.task)), watch=watch)
+    return takeoffs, landings, np.array(actions)

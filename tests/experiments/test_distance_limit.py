@@ -45,7 +45,7 @@ def test_score_against_hand_numbers(env):
 def test_policy_takes_off_as_its_own_touchdown_says(tmp_path):
     """The flight told for the policy is where its base comes down, but for posture and height."""
     run = EvaluationRun.of("distance_limit", EvaluationArgs(record=0, out=tmp_path, device="cpu"))
-    takeoffs, landings, actions = limit.fly_policy(run)
+    takeoffs, landings, actions = jumps.fly_policy(run)
     assert (takeoffs.flight > 1.2).all() and landings.success.all()
     assert takeoffs.touchdown == pytest.approx(takeoffs.flight, abs=0.15)
     assert takeoffs.touchdown == pytest.approx(landings.touchdown[:, 0, 0], abs=1e-6)
@@ -122,7 +122,7 @@ def test_experiment_reports_policy_nominal_and_changed_limit(tmp_path):
     assert values["torque_24_8_gain_m"] == pytest.approx(values["torque_24_8_flight_m"] - values["nominal_flight_m"])
     assert values["policy_2_gain_m"] == pytest.approx(values["policy_2_flight_m"] - values["nominal_flight_m"])
     assert "nominal_landing_capture_m" in values and "torque_24_8_landing_capture_m" not in values
-    assert len(values["caught"]) == len(limit.POLICY_GOALS)
+    assert len(values["caught"]) == len(jumps.POLICY_GOALS)
     assert np.load(tmp_path / "actions.npy").shape == (jumps.TICKS, 4)
     assert (tmp_path / "distance_limit.png").stat().st_size > 1000
 
