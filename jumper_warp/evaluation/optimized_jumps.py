@@ -117,9 +117,9 @@ JUMPS = {
     "farthest": Jump(
         "farthest flight, 18 N m", "m", _far,
         (
-            (COARSE, Stage(48, 40, rate=0.05, noise=0.05, fall=False)),
-            (SUBSTEPS, Stage(16, 150, rate=0.05, noise=0.05)),
-            (SUBSTEPS, Stage(6, 200, rate=0.03, noise=0.03, penalty=100.0)),
+            (SUBSTEPS, Stage(24, 60, rate=0.05, noise=0.05, fall=False)),
+            (SUBSTEPS, Stage(10, 200, rate=0.05, noise=0.05)),
+            (SUBSTEPS, Stage(5, 200, rate=0.03, noise=0.03, penalty=50.0)),
         ),
         lambda replay: None, lateral_torque=12.0, command_filter=horizontal_jump_filter,
     ),
