@@ -24,10 +24,8 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -35,15 +33,26 @@ import tyro
 from rich.console import Console
 from rich.table import Column, Table
 
-from jumper_warp.cli.main import UsageError, run_command
+from jumper_warp.cli.main import run_command
 from jumper_warp.envs.env import Env
-from jumper_warp.evaluation.jumps import jump_commands
-from jumper_warp.evaluation.landings import ENDS, Landings
-from jumper_warp.evaluation.log import termination_names
 from jumper_warp.evaluation.plots import drawn
 from jumper_warp.evaluation.run import EvaluationArgs, EvaluationRun
-from jumper_warp.evaluation.takeoffs import LANDING_ACTION, Act, Flight, Takeoffs, fly, mean_of_sides, reach
-from jumper_warp.registry import make_task
+from jumper_warp.evaluation.takeoff_search import (
+    FURTHER_SIGMA,
+    NOMINAL,
+    POLICY_GOALS,
+    SIGMA,
+    Limit,
+    actions_of,
+    cma_package,
+    env_of_limit,
+    fly_best,
+    fly_policy,
+    knots_of,
+    random_squat,
+    search,
+)
+from jumper_warp.evaluation.takeoffs import Flight, reach
 from jumper_warp.robot.model import KNEE_DOFS
 from jumper_warp.robot.motors import horizontal_jump_filter, jumping_motors, loose_filter, vertical_jump_filter
 from jumper_warp.tasks.cfg import TaskCfg
@@ -51,49 +60,12 @@ from jumper_warp.tasks.jump.horizontal import LANDING_HEIGHT
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.output import write_figures
 
-TICKS = 48
-"""Policy steps that are searched; the last action is held until takeoff."""
-KNOTS = np.array([0, 8, 16, *range(24, TICKS)], dtype=float)
-"""Policy steps at which actions are chosen; in between they are interpolated."""
-WEIGHTS = np.stack([np.interp(np.arange(TICKS), KNOTS, unit) for unit in np.eye(len(KNOTS))], axis=1)
-"""What each knot contributes to each policy step, (TICKS, knots)."""
-SIGMA, FURTHER_SIGMA = 0.3, 0.1
-"""[1] Standard deviation of the actions where a search begins, and where it goes on after a change."""
-MOST_PITCH = 30.0
-"""[deg] At landing, either way."""
-BAD, PITCH, BACK, OUTSIDE = 1.0, 0.05, 5.0, 0.05
-"""Costs of a jump that ended [m], pitch beyond the limit [m/deg], leaning back beyond it [1], wild knots [m]."""
-NO_TAKEOFF = -3.0
-"""[m] What a jump counts that does not leave the ground."""
 FRICTION = 0.85
 """[1] Of the paws of nominal robots on this task."""
 STRETCHED = -1.0
 """[1] Of the transversal motors after takeoff for the highest apex: all that the filter lets."""
-POLICY_GOALS = (1.5, 2.0, 2.5)
-"""[m]"""
-SEED_GOAL = 2.0
-"""[m] The policy's actions for this goal begin the search."""
 OPEN_LOOP_APEX = 1.0748
 """[m] Base, experiments/open_loop_jump.py."""
-EVERY = 120
-"""Generations between two lines of progress."""
-
-
-@dataclass(frozen=True)
-class Limit:
-    """Something that may limit the jump, as it is changed."""
-
-    label: str
-    task: Callable[[TaskCfg], TaskCfg] = lambda task: task
-    model: Callable[[Env], None] = lambda env: None
-    stance: bool = True
-    """Whether the base stays within 0.3 m of its start while standing."""
-    pitch: float = MOST_PITCH
-    """[deg] Most at landing."""
-    back: float = math.inf
-    """[m] Farthest that the base may go back before takeoff."""
-    apex: bool = False
-    """Whether to search for the highest apex instead of the farthest landing."""
 
 
 Rows = dict[str, tuple[str, Flight]]
@@ -136,7 +108,6 @@ def free_knees(env: Env) -> None:
     env.sim.physics.parameters_changed()
 
 
-NOMINAL = Limit("nominal")
 APEX = Limit("highest apex", lambda task: replace(task, command_filter=vertical_jump_filter()), apex=True)
 LIMITS = {
     "torque_x_1_1": Limit("torque 18 → 19.8 N m", lambda task: with_torque(task, 19.8)),
@@ -189,105 +160,6 @@ class Args:
             raise InputError("need a population of at least 8, a generation in each search, and no negative squats")
 
 
-def cma_package() -> ModuleType:
-    """Return the package `cma`. Raises UsageError if it is not installed."""
-    try:
-        import cma
-    except ImportError as error:
-        raise UsageError('this experiment needs the package cma: pip install "cma>=4"') from error
-    return cma
-
-
-def env_of_limit(limit: Limit, args: Args) -> Env:
-    """Return nominal robots on the task, one limit changed, with the ends that a search needs."""
-    task = limit.task(make_task("horizontal-jump"))
-    task = task if args.gravity is None else replace(task, gravity=args.gravity)
-    names = {*ENDS, "left_stance"} - {"no_jump"} if limit.stance else {*ENDS} - {"no_jump"}
-    task = replace(task, terminations=tuple(term for term in task.terminations if term.name in names))
-    env = Env(task, args.population, device=args.device, randomize=False, noise=False, auto_reset=False)
-    limit.model(env)
-    return env
-
-
-def score(takeoffs: Takeoffs, limit: Limit) -> np.ndarray:
-    """Return what the search is for [m], less penalties; (num_envs,)."""
-    apex = takeoffs.com[:, 2] + takeoffs.com_vel[:, 2] ** 2 / (2.0 * takeoffs.gravity)
-    value = (apex if limit.apex else takeoffs.flight) - BAD * takeoffs.bad
-    value -= PITCH * np.maximum(np.degrees(np.abs(takeoffs.landing_pitch)) - limit.pitch, 0.0)
-    value -= BACK * np.maximum(takeoffs.back - limit.back, 0.0)
-    return np.where(takeoffs.off & np.isfinite(value), value, NO_TAKEOFF)
-
-
-def actions_of(knots: np.ndarray) -> np.ndarray:
-    """Return actions (n, TICKS, 4) of candidates (n, 4 x knots)."""
-    return np.einsum("tk,nkm->ntm", WEIGHTS, np.clip(knots, -1.0, 1.0).reshape(len(knots), len(KNOTS), 4))
-
-
-def knots_of(actions: np.ndarray) -> np.ndarray:
-    """Return the candidate whose actions are nearest to some (policy steps, 4), the last of which come last."""
-    rows = actions[-TICKS:]
-    rows = np.concatenate([np.repeat(rows[:1], TICKS - len(rows), axis=0), rows])
-    return np.clip(np.linalg.lstsq(WEIGHTS, rows, rcond=None)[0], -1.0, 1.0).ravel()
-
-
-def random_squat(env: Env, limit: Limit, seed: int) -> np.ndarray:
-    """Return the best (n,) of 32 generations: two postures, then stretched legs, front and hind at their times."""
-    rng, found, shape = np.random.default_rng(seed), [], (env.num_envs, 1, 4)
-    for _ in range(32):
-        first, second = rng.uniform(-1.0, 1.0, shape), rng.uniform(-0.2, 1.0, shape)
-        change = rng.uniform(8.0, 32.0, (env.num_envs, 1, 1))
-        stretch = np.repeat(rng.uniform(28.0, 44.0, (env.num_envs, 1, 2)), 2, axis=2)
-        now = KNOTS[None, :, None]
-        drawn = np.where(now < stretch, np.where(now < change, first, second), -1.0).reshape(env.num_envs, -1)
-        scores = score(fly(env, actions_of(drawn)), limit)
-        found.append((scores.max(), drawn[scores.argmax()]))
-    return max(found, key=lambda pair: pair[0])[1]
-
-
-def search(
-    env: Env, limit: Limit, begin: np.ndarray, sigma: float, generations: int, seed: int
-) -> tuple[np.ndarray, float]:
-    """Return the best candidate (n,) found around `begin`, which is one of the first generation, and its score [m]."""
-    settings = {"popsize": env.num_envs, "seed": seed + 1, "verbose": -9}
-    evolution = cma_package().CMAEvolutionStrategy(begin, sigma, settings)
-    evolution.inject([begin], force=True)
-    best, best_score, started = begin, -math.inf, time.perf_counter()
-    for number in range(1, generations + 1):
-        drawn = np.array(evolution.ask())
-        inside = np.clip(drawn, -1.0, 1.0)
-        scores = score(fly(env, actions_of(inside)), limit)
-        if scores.max() > best_score:
-            best, best_score = inside[scores.argmax()], float(scores.max())
-        evolution.tell(list(drawn), list(OUTSIDE * ((drawn - inside) ** 2).sum(axis=1) - scores))
-        if number % EVERY == 0 or number == generations:
-            seconds = time.perf_counter() - started
-            print(f"{limit.label}: generation {number}, best {best_score:.3f} m, {seconds:.0f} s", flush=True)
-    return best, best_score
-
-
-def fly_best(
-    env: Env, best: np.ndarray, after: float | Act = LANDING_ACTION, goals: np.ndarray | None = None
-) -> Takeoffs:
-    """Return jumps of the same candidate in every world, to their rest; after, goals: as of `fly`."""
-    return fly(env, actions_of(np.tile(best, (env.num_envs, 1))), after, goals=goals, to_rest=True)
-
-
-def fly_policy(run: EvaluationRun) -> tuple[Takeoffs, Landings, np.ndarray]:
-    """Let the policy jump to POLICY_GOALS; return the jumps, and its actions up to takeoff for SEED_GOAL (steps, 4)."""
-    env, seed = run.env(len(POLICY_GOALS)), POLICY_GOALS.index(SEED_GOAL)
-    env.evaluation_reset(jump_commands(np.zeros((env.num_envs, 3)), 0.0, env.step_dt))
-    takeoffs, actions = Takeoffs(env), []
-
-    def watch(_: Landings) -> None:
-        if not takeoffs.off[seed]:
-            actions.append(mean_of_sides(env.action[seed].cpu().numpy())[0])
-        takeoffs.look()
-
-    goals = np.outer(POLICY_GOALS, [1.0, 0.0])[:, None]
-    landings = run.follow(env, Landings(goals, termination_names(env.task)), watch=watch)
-    return takeoffs, landings, np.array(actions)
-
-
 def caught(run: EvaluationRun, best: np.ndarray) -> dict[str, Any]:
     """Return how the policy lands a jump if it takes over at takeoff, told each of POLICY_GOALS."""
     goals = np.outer(POLICY_GOALS, [1.0, 0.0, 0.0])
@@ -300,7 +172,7 @@ def caught(run: EvaluationRun, best: np.ndarray) -> dict[str, Any]:
 
 def nominal_best(actions: np.ndarray, args: Args) -> tuple[np.ndarray, dict[str, Any]]:
     """Return the best of several searches, from the policy's actions and without them, and how far each flew."""
-    env = env_of_limit(NOMINAL, args)
+    env = env_of_limit(NOMINAL, args.population, args.device, args.gravity)
     squats = [random_squat(env, NOMINAL, args.seed + number) for number in range(args.squats)]
     found = []
     for number, begin in enumerate([knots_of(actions), *squats]):
@@ -313,7 +185,7 @@ def nominal_best(actions: np.ndarray, args: Args) -> tuple[np.ndarray, dict[str,
 
 def highest(args: Args) -> dict[str, float]:
     """Return the highest apex found [m], of the base with its legs stretched, beside that of the open-loop jump."""
-    env = env_of_limit(APEX, args)
+    env = env_of_limit(APEX, args.population, args.device, args.gravity)
     best, _ = search(env, APEX, random_squat(env, APEX, args.seed), SIGMA, args.generations, args.seed)
     apex = float(fly_best(env, best, STRETCHED).apex[0])
     print(f"highest apex {apex:.3f} m, open-loop jump {OPEN_LOOP_APEX:.3f} m")
@@ -386,7 +258,7 @@ def main(args: Args) -> dict[str, Any]:
         values[f"policy_{goal:g}_steps_after_landing"] = bool(landings.stepped[i, 0])
     for name in ("nominal", *args.limits):
         limit = LIMITS.get(name, NOMINAL)
-        env = env_of_limit(limit, args)
+        env = env_of_limit(limit, args.population, args.device, args.gravity)
         best, _ = search(env, limit, begin, FURTHER_SIGMA, args.further, args.seed)
         rows[name] = (limit.label, Flight.of(fly_best(env, best), 0, FRICTION))
         if name == "nominal":

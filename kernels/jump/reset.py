@@ -11,7 +11,7 @@ import warp as wp
 from ..kinematics.geometry import LegGeometry
 from ..kinematics.inverse import LegLimits
 from ..kinematics.leg import leg_forward_kinematics
-from ..layout import COORDS, DOFS
+from ..layout import BODIES, COORDS, DOFS
 from ..mdp.attempts import ATTEMPTS, attempt_step, first_attempt, first_leg, leg_step
 from ..mdp.env import Scene, SkillSettings
 from ..mdp.random import Draw, between, branch, within
@@ -25,6 +25,7 @@ from .reset_draws import (
     DEFAULT,
     IN_FLIGHT,
     PUSHING,
+    REFERENCE,
     STANDING,
     TOUCHDOWN,
     BaseDraw,
@@ -33,6 +34,8 @@ from .reset_draws import (
     draw_box,
     draw_paw,
     draw_scheme,
+    follows_reference,
+    reference_goal,
     rounded,
     time_spent,
 )
@@ -88,9 +91,10 @@ def draw_leg(
             here = surface(ground, spot[0], spot[1])
             paw[2] = here[0] + geo.paw_radius - d.pos[2] - lift
         found = leg_to(geo, limits, wp.quat_rotate_inv(d.quat, paw))
-        if scheme == AFTER_LANDING or scheme == PUSHING:
+        if scheme == AFTER_LANDING or scheme == PUSHING or scheme == REFERENCE:
             # the paw rests on the ground while the base moves, so the joints move too
-            found = leg_over_ground(geo, found, -wp.quat_rotate_inv(d.quat, d.lin_vel))
+            moving = d.lin_vel + wp.cross(d.ang_vel, paw)
+            found = leg_over_ground(geo, found, -wp.quat_rotate_inv(d.quat, moving))
     else:
         angles = draw_leg_in_flight(draw, ranges, leg, d.lateral)
         found.angles = angles
@@ -102,11 +106,15 @@ def draw_leg(
 @wp.func
 def store_draw(
     geometry: wp.array(dtype=LegGeometry), ground: Ground, limits: LegLimits, ranges: ResetRanges, draw: Draw,
-    scheme: int, d: BaseDraw, heading: float, lift: float,
+    scheme: int, d: BaseDraw, heading: float, lift: float, com: wp.vec3,
     joint_q: wp.array(dtype=float), joint_qd: wp.array(dtype=float),
 ) -> bool:  # fmt: skip
-    """Write a drawn state of one world, and return whether it can be taken; lift [m]: ground height under the base."""
-    store_base(d.pos + wp.vec3(0.0, 0.0, lift), d.quat, d.lin_vel, wp.vec3(0.0), joint_q, joint_qd)
+    """Write a drawn state of one world, and return whether it can be taken.
+
+    lift [m]: ground height under the base; com [m]: its centre of mass, body axes.
+    """
+    com_vel = d.lin_vel + wp.cross(d.ang_vel, wp.quat_rotate(d.quat, com))
+    store_base(d.pos + wp.vec3(0.0, 0.0, lift), d.quat, com_vel, d.ang_vel, joint_q, joint_qd)
     possible = bool(True)
     own = LegDraw()
     for leg in range(first_leg(draw), geometry.shape[0], leg_step(draw)):
@@ -119,7 +127,7 @@ def store_draw(
 @wp.func
 def draw_until_taken(
     geometry: wp.array(dtype=LegGeometry), ground: Ground, limits: LegLimits, ranges: ResetRanges, draw: Draw,
-    scheme: int, heading: float, height: wp.vec2, goal: wp.vec3, g: float,
+    scheme: int, heading: float, height: wp.vec2, goal: wp.vec3, g: float, com: wp.vec3,
     joint_q: wp.array(dtype=float), joint_qd: wp.array(dtype=float),
 ) -> bool:  # fmt: skip
     """Draw states of a scheme until one can be taken, and write it; returns whether one of the attempts could."""
@@ -133,7 +141,7 @@ def draw_until_taken(
         if taken == ATTEMPTS:
             fresh = branch(draw, attempt)
             d = draw_base(fresh, ranges, scheme, heading, height, goal, g)
-            if store_draw(geometry, ground, limits, ranges, fresh, scheme, d, heading, here[0], own_q, own_qd):
+            if store_draw(geometry, ground, limits, ranges, fresh, scheme, d, heading, here[0], com, own_q, own_qd):
                 taken = attempt
     return keep_first(geometry, draw, taken, own_q, own_qd, joint_q, joint_qd)
 
@@ -238,11 +246,15 @@ def reset_jump(
     spent = time_spent(old)
     scheme = draw_scheme(draw, ranges, spent)
     heading = between(draw, 13, -ranges.heading, ranges.heading)
-    goal = turned(draw_goal(draw, level), heading)
+    wanted = draw_goal(draw, level)
+    drawn = follows_reference(draw, ranges, scheme)
+    if drawn == REFERENCE:
+        wanted = reference_goal(draw, ranges, wanted)
+    goal = turned(wanted, heading)
     here = place_ground(scene.ground, world, draw, ranges, settings.grounds, scheme, heading, goal)
     taken = draw_until_taken(
-        scene.geometry, here, leg_limits(skill.command_filter), ranges, draw, scheme, heading, level.base_height,
-        goal, g, robot.joint_q, robot.joint_qd,
+        scene.geometry, here, leg_limits(skill.command_filter), ranges, draw, drawn, heading, level.base_height,
+        goal, g, robot.body_com[world * BODIES], robot.joint_q, robot.joint_qd,
     )  # fmt: skip
     if not taken:
         scheme = int(DEFAULT)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from experiments import distance_limit as limit
+from jumper_warp.evaluation.takeoff_search import NOMINAL, env_of_limit
 from jumper_warp.evaluation.takeoffs import (
     LANDING_ACTION,
     Flight,
@@ -24,7 +24,7 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 
 @pytest.fixture(scope="module")
 def env():
-    return limit.env_of_limit(limit.NOMINAL, limit.Args(population=8, device="cpu"))
+    return env_of_limit(NOMINAL, 8, "cpu")
 
 
 @pytest.fixture

@@ -1,0 +1,49 @@
+import json
+
+import numpy as np
+import pytest
+import torch
+
+from experiments import trajectory_optimization as experiment
+from jumper_warp.cli.main import run_command
+from jumper_warp.evaluation.optimized_jumps import JUMPS
+from jumper_warp.tasks.jump.references import COLUMNS, ROWS
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+
+def test_experiment_tells_what_its_targets_do(tmp_path):
+    """A short search: the figures are those of a replay of the targets that it wrote."""
+    args = experiment.Args(
+        jumps=("highest",), samples=48, effort=0.01, polish=1, baseline="cma", longer=0.1, out=tmp_path, device="cpu"
+    )
+    values = experiment.main(args)
+    saved = np.load(tmp_path / "highest.npz", allow_pickle=False)
+    replay = JUMPS["highest"].replay(saved["targets"])
+    assert values["highest_apex_m"] == pytest.approx(replay.apex, abs=1e-6) and replay.apex > 0.4
+    assert values["highest_gradients_value"] == values["highest_apex_m"]
+    assert values["highest_gradients_reverse_steps"] > 0.0 and values["highest_cma_simulated_steps"] > 0.0
+    reference = json.loads((tmp_path / "highest.json").read_text())
+    assert reference["columns"] == list(COLUMNS) and np.shape(reference["rows"]) == (ROWS, len(COLUMNS))
+    assert {"highest.rrd", "highest_strip.png", "trajectories.png"} <= {path.name for path in tmp_path.iterdir()}
+
+
+def test_replay_sees_paws_that_are_lifted_again():
+    """A jump, a landing, a squat; and, in the second motion, another jump."""
+    jump = JUMPS["still"]
+    knots = jump.make(substeps=8, device="cpu").knots
+    x = np.zeros((2, len(knots.at), 4))
+    x[:, 2:10], x[:, 10:20], x[:, -12:] = 0.5, -0.4, 0.5
+    x[1, -2:] = -0.4
+    targets = knots.targets(torch.as_tensor(x.reshape(2, -1))).numpy()
+    once, twice = (jump.replay(targets[..., i], device="cpu") for i in range(2))
+    assert once.touched == twice.touched == 4 and once.takeoff == twice.takeoff
+    assert once.longest_lift < 0.1 < twice.longest_lift and once.highest_lift + 0.02 < twice.highest_lift
+    assert once.work == twice.work > 20.0 and once.apex > 0.5
+
+
+@pytest.mark.parametrize("flags", [{"jumps": ("wings",)}, {"effort": 0.0}, {"samples": 3}, {"longer": -1.0}])
+def test_flags_that_cannot_be_are_told_in_a_line(flags, capsys):
+    with pytest.raises(SystemExit):
+        run_command(lambda: experiment.Args(**flags))
+    assert capsys.readouterr().err.count("\n") == 1
