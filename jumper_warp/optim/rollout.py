@@ -307,8 +307,9 @@ class Rollout:
     def _launch_legs(self, kernel: wp.Kernel, inputs: list, outputs: list) -> None:
         """Launch a kernel over all worlds, a thread a leg."""
         n = self.num_worlds
+        inputs = [n, self.dynamics.robot, self._new_settings(), *inputs]
         wp.launch(
-            kernel, dim=(-(-n // 8) * 8, 4), inputs=[n, self.dynamics.robot, self._new_settings(), *inputs], outputs=outputs,
+            kernel, dim=(-(-n // 8) * 8, 4), inputs=inputs, outputs=outputs,
             device=self.device, block_dim=32 if self.device.is_cuda else 4,
         )  # fmt: skip
 
