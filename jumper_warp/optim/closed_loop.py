@@ -117,7 +117,9 @@ class ClosedLoop:
         self.draws = bool(task.rows["events"])
         """Whether resets draw other robots."""
         self.layout = task.layout("policy")
-        self._terms = {term.name: term for term in task.policy}
+        self._columns = {
+            group: [(term, *task.layout(group)[term.name]) for term in getattr(task, group)] for group in task.groups
+        }
         lateral, transversal = (math.radians(scale) for scale in task.action_scale)
         like = {"dtype": self.dtype, "device": env.device}
         self.scale = torch.tensor(4 * [lateral, transversal, transversal], **like)
@@ -184,14 +186,13 @@ class ClosedLoop:
         gravity = rotated_back(quat, q.new_tensor(DOWN).expand(len(q), 3))
         return Motion(q[:, :3], quat, lin_vel, rotated_back(quat, ang), gravity, q[:, 7:], qd[:, 6:])
 
-    def observe(self, state: LoopState, told: torch.Tensor) -> torch.Tensor:
-        """Return what the policy sees of a state, (num_worlds, num_obs), without noise.
+    def observe(self, state: LoopState, told: torch.Tensor, group: str = "policy") -> torch.Tensor:
+        """Return what the policy, or the critic, sees of a state, (num_worlds, columns), without noise.
 
-        told: (num_worlds, num_obs), of which the columns that are not the robot's, such as commands, are taken.
+        told: (num_worlds, columns), of which those that are not of the robot's state, such as commands, are taken.
         """
         motion, columns = self.motion(state), []
-        for name, (first, end) in self.layout.items():
-            term = self._terms[name]
+        for term, first, end in self._columns[group]:
             value = told[:, first:end].to(self.dtype)
             if term.func.key in SEEN:
                 options = term.numbers
@@ -238,8 +239,15 @@ def _way(loop: ClosedLoop, motion: Motion, state: LoopState, told: torch.Tensor)
     return torch.where((told == 0.0).all(1, keepdim=True), told, way)
 
 
+def _height_errors(loop: ClosedLoop, motion: Motion, state: LoopState, told: torch.Tensor) -> torch.Tensor:
+    """Return the misses of height as told, the ballistic one with its derivatives."""
+    apex = motion.pos[:, 2] + motion.lin_vel[:, 2].clamp(min=0.0).square() / (2.0 * loop.env.task.gravity)
+    return torch.stack([told[:, 0], anchored(told[:, 1], apex)], 1)
+
+
 SEEN: dict[str, Callable[..., torch.Tensor]] = {
     "goal": _way,
+    "height_errors": _height_errors,
     "height": lambda loop, motion, state, told: motion.pos[:, 2:],
     "lin_vel": lambda loop, motion, state, told: rotated_back(motion.quat, motion.lin_vel),
     "ang_vel": lambda loop, motion, state, told: motion.ang_vel,
