@@ -1,4 +1,4 @@
-"""The command `jumper`: train, play, evaluate, export, sysid, list. `jumper COMMAND --help` shows the flags.
+"""The command `jumper`: train, finetune, play, evaluate, export, sysid, list. `jumper COMMAND --help` shows the flags.
 
 Only what a command needs is imported, so that help and mistakes answer at once.
 """
@@ -18,6 +18,7 @@ INTERRUPTED = 130
 """Exit code after Ctrl-C."""
 COMMANDS = {
     "train": "Train a policy: jumper train TASK.",
+    "finetune": "Halve a jumping policy's error by gradients through the physics.",
     "play": "Record a policy for the Rerun viewer.",
     "evaluate": "Measure a policy over many trials.",
     "export": "Make a policy's folder of a training run, or one ONNX file of a policy.",

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     import torch
 
     from jumper_warp.envs.env import Env
+    from jumper_warp.optim.differentiable_env import DifferentiableEnv
     from jumper_warp.rl.runner import MakeEnv, TrainResult
     from jumper_warp.robot.overlay import RobotOverlay
     from jumper_warp.tasks.cfg import TaskCfg
@@ -110,9 +111,9 @@ def env_maker(task: TaskCfg, args: TrainArgs) -> MakeEnv:
 
     overlay = None if args.robot is None else load_overlay(args.robot)
 
-    def make(num_envs: int, seed: int, device: torch.device) -> Env:
+    def make(num_envs: int, seed: int, device: torch.device) -> Env | DifferentiableEnv:
         check_memory(task, args.cfg.ppo, args.solver, num_envs, device)
-        return Env(
+        env = Env(
             task,
             num_envs,
             seed=seed,
@@ -122,6 +123,11 @@ def env_maker(task: TaskCfg, args: TrainArgs) -> MakeEnv:
             noise=args.noise,
             robot=overlay,
         )
+        if args.cfg.trainer != "shac":
+            return env
+        from jumper_warp.optim.differentiable_env import DifferentiableEnv
+
+        return DifferentiableEnv(env)
 
     return make
 

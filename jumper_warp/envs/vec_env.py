@@ -81,6 +81,26 @@ class MirroredVecEnv(Protocol):
         """
 
 
+class DifferentiableVecEnv(VecEnv, Protocol):
+    """What SHAC asks of an environment: steps whose observations and rewards carry derivatives by the actions before.
+
+    Its values are those of `obs`, `critic_obs`, `final_obs`, `final_critic_obs` and `reward`. What it returns is new in
+    every call.
+    """
+
+    def begin_window(self) -> None:
+        """Forget what the present depends on."""
+
+    def observe(self) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return `obs` and `critic_obs` with derivatives; a world whose episode has just begun has none."""
+
+    def observe_final(self) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return `final_obs` and `final_critic_obs` of the last step with derivatives."""
+
+    def step_with_gradient(self, action: torch.Tensor) -> torch.Tensor:
+        """Advance as `step`; return the reward (num_envs,) with derivatives as far as it has any."""
+
+
 def sanitise(obs: torch.Tensor, out: torch.Tensor | None = None) -> torch.Tensor:
     """Return a copy of observations, in `out` if given: non-finite entries 0, the rest clamped to ±RAW_LIMIT."""
     return torch.nan_to_num(obs, nan=0.0, posinf=0.0, neginf=0.0, out=out).clamp_(-RAW_LIMIT, RAW_LIMIT)

@@ -12,6 +12,7 @@ import warp as wp
 from jumper_warp.envs.env import Env
 from jumper_warp.evaluation.jumps import run_jumps
 from jumper_warp.rl.ppo import Ppo
+from jumper_warp.rl.shac import Shac
 
 TESTED = (0.5, 1.1)
 """[m] Heights of the test's jumps."""
@@ -32,13 +33,13 @@ class Curve:
         return next((t for t, success in zip(self.seconds, self.success, strict=True) if success >= rate), None)
 
 
-def success(ppo: Ppo, judge: Env) -> float:
+def success(ppo: Ppo | Shac, judge: Env) -> float:
     """Return the share of jumps to heights of 0.5 to 1.1 m that succeed, one a world."""
 
     return float(run_jumps(ppo.model.act, judge, np.linspace(*TESTED, judge.num_envs)).success.mean())
 
 
-def warm_up(env: Env, ppo: Ppo) -> None:
+def warm_up(env: Env, ppo: Ppo | Shac) -> None:
     """Compile the environment's kernels and the trainer's functions, and begin all episodes anew."""
     env.reset()
     env.step(torch.zeros(env.num_envs, env.num_actions, device=env.device))
@@ -47,7 +48,7 @@ def warm_up(env: Env, ppo: Ppo) -> None:
     env.metrics()
 
 
-def learning_curve(env: Env, ppo: Ppo, judge: Env, seconds: float, every: float) -> Curve:
+def learning_curve(env: Env, ppo: Ppo | Shac, judge: Env, seconds: float, every: float) -> Curve:
     """Train for a time [s] and return the curve; the test's jumps are made off the clock.
 
     What is compiled is compiled before, see `warm_up`.

@@ -6,7 +6,6 @@ the state every few physics steps and the paws' impulses is kept in between; see
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
@@ -114,7 +113,7 @@ class Rollout:
         self.dt, self.substeps, self.every = dt, substeps, every
         modules, n = self.dynamics.modules, self.num_worlds
         tolerance = tolerance or (TOLERANCE_DOUBLE if double else TOLERANCE)
-        self._settings = self.dynamics.settings(dt, 1, MAX_SWEEPS, tolerance)
+        self._new_settings = partial(self.dynamics.settings, dt, 1, MAX_SWEEPS, tolerance)
         cfg = motors or jumping_motors()
         self._actuation = modules.rollout.Actuation()
         self._actuation.motors = motor_arrays(cfg, n, module=modules.motors, device=self.device)
@@ -226,11 +225,12 @@ class Rollout:
         qd: wp.array | None = None,
         torque: wp.array | None = None,
         impulse: wp.array | None = None,
+        safe: wp.array | None = None,
     ) -> dict[str, wp.array]:
         """Return the gradient of one number a world, given its gradient by the trajectory.
 
-        q, qd, torque, impulse: that gradient, of the shapes and types of `Trajectory`; None is zero. The parameters
-        must be those of the rollout.
+        q, qd, torque, impulse, safe: that gradient, of the shapes and types of `Trajectory`; None is zero. The
+        parameters must be those of the rollout.
 
         Returned by name, worlds last: targets, q, qd (of the first row), before, wrench, the entries of `parameters`,
         and `geometry` (4, 10, num_worlds) by the legs' lengths [m], see `GEOMETRY_NAMES`. The gradient by the first
@@ -240,10 +240,13 @@ class Rollout:
         commands = trajectory.commands
         count = commands.target.shape[0]
         seeds = modules.rollout.Rows()
-        for name, array in (("q", q), ("qd", qd), ("torque", torque), ("impulse", impulse)):
+        given = {"q": q, "qd": qd, "torque": torque, "impulse": impulse, "safe": safe}
+        for name, array in given.items():
             like = getattr(trajectory, name)
             if array is not None and (array.shape != like.shape or array.dtype != like.dtype):
                 raise InputError(f"the gradient by {name} must be like it, {like.shape}, got {array.shape}")
+            if name == "safe":
+                continue
             empty = wp.zeros((0,) * like.ndim, dtype=like.dtype, device=self.device)
             setattr(seeds, name, empty if array is None else array)
         seeds.pressed = wp.zeros((0, 0, 0), dtype=wp.uint8, device=self.device)
@@ -255,6 +258,8 @@ class Rollout:
                   "safe": (count, 12), "parameters": (int(modules.gradients.GRADIENT_ROWS),)}  # fmt: skip
         for name, shape in shapes.items():
             setattr(gradients, name, self._zeros(*shape, n))
+        if safe is not None:
+            wp.copy(gradients.safe, safe)  # which the reverse pass adds to
         if self._record is None:
             self._record = self._step_record()
         inputs = [self._timing(count), self._actuation, commands, trajectory.safe, rows, seeds]
@@ -302,8 +307,9 @@ class Rollout:
     def _launch_legs(self, kernel: wp.Kernel, inputs: list, outputs: list) -> None:
         """Launch a kernel over all worlds, a thread a leg."""
         n = self.num_worlds
+        inputs = [n, self.dynamics.robot, self._new_settings(), *inputs]
         wp.launch(
-            kernel, dim=(-(-n // 8) * 8, 4), inputs=[n, self.dynamics.robot, self._settings, *inputs], outputs=outputs,
+            kernel, dim=(-(-n // 8) * 8, 4), inputs=inputs, outputs=outputs,
             device=self.device, block_dim=32 if self.device.is_cuda else 4,
         )  # fmt: skip
 
@@ -311,7 +317,7 @@ class Rollout:
         """Launch a kernel over all worlds, on a CPU in slices side by side."""
 
         def launch(worlds: Worlds) -> None:
-            settings = copy.copy(self._settings)
+            settings = self._new_settings()  # a copy of a Warp struct shares its memory, and slices run side by side
             settings.first = worlds.first
             wp.launch(
                 kernel, dim=worlds.count, inputs=[self.dynamics.robot, settings, *inputs], outputs=outputs,

@@ -14,11 +14,11 @@ from jumper_warp.optim.rollout import Rollout, Trajectory
 from jumper_warp.utils.errors import InputError
 
 COMMANDS = ("targets", "q", "qd", "before", "wrench")
-OUTPUTS = ("q", "qd", "torque", "impulse")
+OUTPUTS = ("q", "qd", "torque", "impulse", "safe")
 
 
 class TorchTrajectory(NamedTuple):
-    """A trajectory as tensors, see `Trajectory`; all but `safe` carry gradients."""
+    """A trajectory as tensors, see `Trajectory`; all carry gradients."""
 
     q: torch.Tensor
     """(K + 1, 19, num_worlds)"""
@@ -32,7 +32,7 @@ class TorchTrajectory(NamedTuple):
     """(T, 12, num_worlds) [rad]"""
 
     def end(self) -> dict[str, torch.Tensor]:
-        """Return what `simulate` is given to go on from here, `before` and `impulse` without gradients."""
+        """Return what `simulate` is given to go on from here, `impulse` without gradients."""
         return {"q": self.q[-1], "qd": self.qd[-1], "before": self.safe[-1], "impulse": self.impulse[-1].detach()}
 
 
@@ -93,8 +93,7 @@ class _Simulate(torch.autograd.Function):
             trajectory = rollout.run(**commands)
         ctx.rollout, ctx.names, ctx.trajectory = rollout, names, trajectory
         ctx.save_for_backward(*tensors)
-        outputs = [wp.to_torch(getattr(trajectory, name)) for name in (*OUTPUTS, "safe")]
-        ctx.mark_non_differentiable(outputs[-1])
+        outputs = [wp.to_torch(getattr(trajectory, name)) for name in OUTPUTS]
         ctx.set_materialize_grads(False)
         return tuple(outputs)
 

@@ -113,6 +113,34 @@ class PpoCfg:
 
 
 @dataclass(frozen=True)
+class ShacCfg:
+    """Settings of SHAC; steps of a window, discount, lambda, networks, reward scale and noise are those of PPO."""
+
+    lr: float = 1.0e-3
+    """Adam's step size of the actor, which falls to a tenth in a straight line."""
+    critic_lr: float = 1.0e-3
+    """The same of the critic."""
+    max_grad_norm: float = 1.0
+    """The actor's gradient is shortened to this norm."""
+    target_rate: float = 0.2
+    """Share by which the target critic follows the critic in an iteration."""
+    critic_epochs: int = 8
+    """Passes of the critic over a window."""
+    critic_minibatches: int = 4
+    """Optimiser steps per pass."""
+    entropy_coef: float = 0.0
+    """Weight of the entropy bonus, per policy step."""
+
+    def __post_init__(self) -> None:
+        """Raises ValueError: a setting is out of range."""
+        for name in ("lr", "critic_lr", "max_grad_norm", "critic_epochs", "critic_minibatches"):
+            check_positive(name, getattr(self, name))
+        check_not_negative("entropy_coef", self.entropy_coef)
+        if not 0.0 < self.target_rate <= 1.0:
+            raise InputError(f"target_rate must be in (0, 1], got {self.target_rate}")
+
+
+@dataclass(frozen=True)
 class TrainCfg:
     """Settings of a training."""
 
@@ -144,14 +172,16 @@ class TrainCfg:
     """The logged figure that makes a checkpoint the best; higher is better."""
     resume: str | None = None
     """A checkpoint, a run's folder, or `latest` for the task's latest run."""
-    trainer: Literal["ppo", "rsl-rl"] = "ppo"
-    """This package's PPO, or that of rsl-rl-lib for comparison."""
+    trainer: Literal["ppo", "shac", "rsl-rl"] = "ppo"
+    """This package's PPO; SHAC, which learns by gradients through the physics; or rsl-rl-lib's PPO for comparison."""
     tensorboard: bool = True
     """Write TensorBoard events, if TensorBoard is installed."""
     wandb: bool = False
     """Upload to Weights & Biases."""
     ppo: PpoCfg = field(default_factory=PpoCfg)
     """Settings of the algorithm."""
+    shac: ShacCfg = field(default_factory=ShacCfg)
+    """Settings of SHAC besides."""
 
     def __post_init__(self) -> None:
         """Raises ValueError: a setting is out of range."""
@@ -165,5 +195,5 @@ class TrainCfg:
             raise InputError(f"seed must be in 0 .. {2**31 - 1}, got {self.seed}")
         if self.trainer == "rsl-rl" and self.resume:
             raise InputError("resume is not offered with trainer rsl-rl")
-        if self.trainer == "rsl-rl" and self.ppo.symmetry != "off":
-            raise InputError("symmetry is not offered with trainer rsl-rl")
+        if self.trainer != "ppo" and self.ppo.symmetry != "off":
+            raise InputError(f"symmetry is not offered with trainer {self.trainer}")

@@ -25,6 +25,8 @@ from jumper_warp.rl.elastic import mark_run, own_run
 from jumper_warp.rl.logger import Pace, Stopwatch, TrainingLog
 from jumper_warp.rl.ppo import FIGURES, Ppo
 from jumper_warp.rl.resume import CHECKPOINTS, find_checkpoint, own_part, random_state, set_random_state, spent_seconds
+from jumper_warp.rl.shac import FIGURES as SHAC_FIGURES
+from jumper_warp.rl.shac import Shac
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.files import write_whole
 from jumper_warp.utils.runtime import git_commit, versions
@@ -113,8 +115,8 @@ def train(
 
 def _check_processes(cfg: TrainCfg, rank: Rank, adapted: bool) -> None:
     """Raises ValueError: the trainer cannot be had, or worlds or samples do not divide."""
-    if cfg.trainer == "rsl-rl" and rank.size > 1:
-        raise InputError("trainer rsl-rl is offered for one process only")
+    if cfg.trainer != "ppo" and rank.size > 1:
+        raise InputError(f"trainer {cfg.trainer} is offered for one process only")
     if cfg.trainer == "rsl-rl" and not adapted:
         raise InputError("trainer rsl-rl needs as_rsl_rl, which adapts the environment")
     if cfg.num_envs % rank.size:
@@ -156,8 +158,9 @@ class Run:
         """
         self.cfg, self.env, self.rank = cfg, env, rank
         self._command = command or f"jumper train {cfg.task}"
-        self.ppo = Ppo(env, cfg.ppo)
-        _check_best_by(cfg.best_by, {*env.metrics(), *FIGURES, *PERF})
+        by_gradients = cfg.trainer == "shac"
+        self.ppo = Shac(env, cfg.ppo, cfg.shac) if by_gradients else Ppo(env, cfg.ppo)
+        _check_best_by(cfg.best_by, {*env.metrics(), *(SHAC_FIGURES if by_gradients else FIGURES), *PERF})
         self.config = full_config(cfg, env, rank)
         self.iteration, self.seconds = 0, 0.0  # that the run had before this process
         self._begin: float | None = None  # on the clock, as if all seconds that count were of this process

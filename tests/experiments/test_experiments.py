@@ -15,6 +15,7 @@ from experiments import (
     gradient_cost,
     learning_curves,
     new_reward,
+    shac,
     soak_test,
     vertical_jump_sweep,
 )
@@ -369,3 +370,20 @@ def test_gradient_cost_checks_the_gradient_and_what_is_kept(tmp_path):
     assert values["cpu_ratio"] == pytest.approx(expected)
     for name in ("targets", "q", "qd", "table", "saturation"):
         assert 0.0 < values[f"error_{name}"] < 0.02
+
+
+def test_shac_is_compared_with_ppo_and_gradients_are_measured(tmp_path):
+    args = shac.Args(
+        seconds=0.1, every=0.1, seeds=(0,), envs=8, window=2, hidden=(8,), jumps=3, horizons=(1, 2), worlds=4,
+        out=tmp_path, device="cpu",
+    )  # fmt: skip
+    values = shac.main(args)
+    assert values == json.loads((tmp_path / "figures.json").read_text())
+    for who in ("new", "trained"):
+        for name in ("physics", "score"):
+            assert all(x > 0.0 for x in values[f"deviation_{name}_{who}"])
+    assert values["curve_steps_shac_0"][-1] % (2 * 8) == 0
+    assert values["steps_to_50_percent_ppo_0"] is None
+    assert (tmp_path / "variance.png").is_file() and (tmp_path / "curves.png").is_file()
+    with pytest.raises(InputError, match="positive times and horizons"):
+        replace(args, horizons=(0,))

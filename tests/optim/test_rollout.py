@@ -46,6 +46,13 @@ def test_threads_change_no_bit():
         np.testing.assert_array_equal(found[1][name], values, err_msg=name)
 
 
+def test_slices_that_run_side_by_side_have_settings_of_their_own(monkeypatch):
+    of, given = Rollout(build_model(40, visuals=False), threads=2), []
+    monkeypatch.setattr(wp, "launch", lambda kernel, **call: given.append(call["inputs"][1]))
+    of.run(push_off(1), *of.standing())
+    assert sorted(settings._ctype.first for settings in given) == [worlds.first for worlds in of.slices] != [0, 0]
+
+
 def test_rollouts_go_on_where_they_ended():
     whole = run(rollout(), defaults())
     first = rollout().run(push_off()[:5], *squat())
@@ -108,25 +115,30 @@ def test_torch_gives_the_gradients_of_differences():
         assert tensor.grad[entry].item() == pytest.approx((ends[0] - ends[1]) / (2.0 * h), rel=1.0e-5)
 
 
-def test_torch_step_by_step_gives_the_gradients_of_the_whole():
-    """As with a policy between the steps; a later run with other parameters does not disturb an earlier one's pass."""
+@pytest.mark.parametrize("late", [0.0, 0.011])
+def test_torch_step_by_step_gives_the_gradients_of_the_whole(late):
+    """As with a policy between the steps; a later run with other parameters does not disturb an earlier one's pass.
+
+    What arrives late [s] acts in the next call, through what the motors followed before.
+    """
     of, (q, qd) = rollout(), tensors()
-    found = []
+    found, latency = [], torch.full((1,), late, dtype=torch.float64)
     for stepwise in (False, True):
         targets = torch.tensor(push_off(8)).requires_grad_()
         kp = torch.full((12,), 70.0, dtype=torch.float64, requires_grad=True)
         if stepwise:
             state, total = {"q": q, "qd": qd}, 0.0
             for step in range(8):
-                made = simulate(of, targets[step : step + 1], **state, kp=kp)
+                made = simulate(of, targets[step : step + 1], **state, kp=kp, latency=latency)
                 state, total = made.end(), total + losses(made)
             total = total + state["q"][2].sum()
             simulate(of, targets.detach(), q, qd, kp=torch.full((12,), 20.0))
         else:
-            made = simulate(of, targets, q, qd, kp=kp)
+            made = simulate(of, targets, q, qd, kp=kp, latency=latency)
             total = losses(made) + made.q[-1, 2].sum()
         total.backward()
         found.append((total.item(), targets.grad.numpy(), kp.grad.numpy()))
+    simulate(of, targets.detach(), q, qd, latency=0.0 * latency)
     for whole, stepped in zip(*found, strict=True):
         np.testing.assert_allclose(stepped, whole, rtol=0.0, atol=1.0e-12 * np.abs(whole).max())
 

@@ -1,0 +1,36 @@
+"""`jumper finetune POLICY`: a jumping policy's misses are made smaller by gradients through physics and network."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from types import ModuleType
+
+from jumper_warp.cli.evaluate import policy_of
+from jumper_warp.cli.main import parse
+
+ABOUT = "Make a jumping policy miss its heights or places by less, by gradients through physics, motors and network."
+
+
+def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> None:
+    """Fine-tune as the arguments say; modules: that the user has named, for tasks that are not the project's.
+
+    Raises UsageError, InputError or OSError with one line: the policy or a flag cannot be used.
+    """
+    name = policy_of("finetune", ABOUT, args)
+    from jumper_warp.evaluation.finetuning import FinetuneArgs, finetune
+    from jumper_warp.policies.folder import save_policy
+    from jumper_warp.policies.restore import open_policy
+    from jumper_warp.policies.spec import PolicyError
+    from jumper_warp.utils.runtime import announce
+
+    parsed: FinetuneArgs = parse(FinetuneArgs, f"finetune {name}", args[1:])
+    out = parsed.out or Path(f"{Path(name).name}_finetuned")
+    if out.exists() and not parsed.overwrite:
+        raise PolicyError(f"{out} exists")
+    policy = open_policy(name)
+    announce(parsed.device, parsed.threads)
+    policy, record = finetune(policy, parsed, modules)
+    files = {"finetuning.json": (json.dumps(record, indent=1) + "\n").encode()}
+    print(save_policy(out, policy, files=files, overwrite=parsed.overwrite))

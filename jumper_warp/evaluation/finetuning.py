@@ -1,0 +1,187 @@
+"""Fine-tuning of a jumping policy by gradients of its miss: apex against commanded height, or landing place.
+
+Gauss-Newton on the misses of many jumps, of the nominal robot and of drawn ones, held near the policy as it came.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import time
+from collections.abc import Callable, Iterable
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+import torch
+
+from jumper_warp.evaluation.jump_misses import Group, Misses, follow
+from jumper_warp.evaluation.jumps import LANDED, jump_commands
+from jumper_warp.evaluation.registry import evaluation_of
+from jumper_warp.optim.gauss_newton import Anchor, Network, gauss_newton_step
+from jumper_warp.policies.policy import Policy
+from jumper_warp.policies.restore import Conditions, env_of_policy
+from jumper_warp.tasks.cfg import TaskCfg
+from jumper_warp.tasks.randomization import RandomizationCfg
+from jumper_warp.utils.checks import check_positive
+from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.runtime import git_commit
+
+DELAYS = (0.3, 0.7)
+"""[s] Between which jumps are commanded."""
+ANCHOR_SECONDS = 3.5
+ANCHOR_ROWS = 4096
+DAMPING = 1.0e-2
+"""Of the first step."""
+
+
+@dataclass(frozen=True)
+class FinetuneCfg:
+    """How a policy is fine-tuned."""
+
+    goals: int = 64
+    """Jumps of the nominal robot, spread evenly over the goals."""
+    late: int = 32
+    """Jumps of the nominal robot with latencies that are drawn over those of the training."""
+    randomized: int = 64
+    """Jumps of robots as drawn in the training, with noise, latency and pushes."""
+    heights: tuple[float, float] = (0.5, 1.075)
+    """[m] Lowest and highest commanded base height, of jumps to heights."""
+    distances: tuple[float, float] = (0.3, 1.4)
+    """[m] Nearest and farthest goal straight ahead, of jumps to places."""
+    iterations: int = 6
+    """Gauss-Newton steps."""
+    miss_std: float = 0.001
+    """[m] Miss of the nominal robot that costs as much as a change of the actions by `action_std`."""
+    late_std: float = 0.003
+    """[m] The same with latencies."""
+    randomized_std: float = 0.01
+    """[m] The same of drawn robots."""
+    action_std: float = 0.02
+    """[1] Change of the actions, root of the sum of squares over the motors, from the policy as it came."""
+    landing_std: float = 0.005
+    """[1] The same after touchdown."""
+    seed: int = 0
+    """Of commands, latencies and robots."""
+    device: str | None = None
+    """Warp device (default: a GPU if there is one)."""
+    threads: int | None = None
+    """CPU threads that share the worlds (default: all cores); they change no result."""
+
+    def __post_init__(self) -> None:
+        """Raises InputError: a setting is out of range."""
+        if self.goals < 2 or min(self.late, self.randomized) < 0 or self.iterations < 1:
+            raise InputError("fine-tuning needs at least 2 goals, 1 iteration, and no negative number of jumps")
+        for name in ("miss_std", "late_std", "randomized_std", "action_std", "landing_std"):
+            check_positive(name, getattr(self, name))
+        for name in ("heights", "distances"):
+            low, high = getattr(self, name)
+            if not 0.0 < low < high < 10.0:
+                raise InputError(f"{name} must be in (0, 10) m and rise, got {low}, {high}")
+
+
+@dataclass(frozen=True)
+class FinetuneArgs(FinetuneCfg):
+    """Make a jumping policy miss its heights or places by less, by gradients through physics, motors and network."""
+
+    out: Path | None = None
+    """Folder of the new policy (default: <policy>_finetuned)."""
+    overwrite: bool = False
+    """Replace a policy that is there already."""
+
+
+def make_groups(policy: Policy, cfg: FinetuneCfg, modules: Iterable[ModuleType] = ()) -> list[Group]:
+    """Return the groups of jumps that have any."""
+    rng, groups = np.random.default_rng(cfg.seed), []
+
+    def level(task: TaskCfg) -> TaskCfg:
+        return evaluation_of(task).for_evaluation(task).on_level_ground()
+
+    def latencies(task: TaskCfg) -> TaskCfg:
+        ranges = RandomizationCfg.off().with_fixed(friction=task.randomization.nominal_friction)
+        return replace(level(task), randomization=replace(ranges, latency=task.randomization.latency), events=())
+
+    kinds: tuple[tuple[str, int, float, bool, Callable[[TaskCfg], TaskCfg]], ...] = (
+        ("nominal", cfg.goals, cfg.miss_std, False, level),
+        ("late", cfg.late, cfg.late_std, True, latencies),
+        ("randomized", cfg.randomized, cfg.randomized_std, True, level),
+    )
+    for name, count, std, draws, change in kinds:
+        if count:
+            conditions = Conditions(
+                randomize=draws, noise=name == "randomized", seed=cfg.seed, device=cfg.device, threads=cfg.threads
+            )
+            env = env_of_policy(policy, count, conditions, change=change, modules=modules)
+            if env.task.evaluation not in ("height", "place"):
+                raise InputError(f"fine-tuning is for jumps to heights and places, not for {env.task.name}")
+            goals, to_height = np.zeros((count, 3)), env.task.evaluation == "height"
+            goals[:, 2 if to_height else 0] = np.linspace(*(cfg.heights if to_height else cfg.distances), count)
+            delays = rng.uniform(*DELAYS, count)
+            groups.append(Group(name, env, std, jump_commands(goals, delays, env.step_dt)))
+    return groups
+
+
+def make_anchor(groups: list[Group], network: Network, cfg: FinetuneCfg) -> Anchor:
+    """Return what holds the network over observations of whole jumps of all groups, from standing to rest."""
+    seen, landed = [], []
+    for group in groups:
+        group.begin()
+        with torch.no_grad():
+            for _ in range(round(ANCHOR_SECONDS / group.env.step_dt)):
+                seen.append(group.env.obs.clone())
+                landed.append(group.env.task_arrays()["phase"] == LANDED)
+                group.env.step(network.act(group.env.obs))
+    stds = np.where(np.concatenate(landed), cfg.landing_std, cfg.action_std).astype(np.float32)
+    chosen = np.random.default_rng(cfg.seed).permutation(len(stds))[:ANCHOR_ROWS]
+    obs = torch.cat(seen)[torch.as_tensor(chosen, device=seen[0].device)]
+    return Anchor(network, obs, torch.as_tensor(stds[chosen], device=obs.device))
+
+
+def finetune(
+    policy: Policy,
+    cfg: FinetuneCfg,
+    modules: Iterable[ModuleType] = (),
+    say: Callable[[str], object] = print,
+) -> tuple[Policy, dict]:
+    """Return the fine-tuned policy, and what was done: settings, and misses [m] by group before and after each step.
+
+    modules: that the user has named. say: is told every step. Raises InputError as `ClosedLoop` and `make_groups`.
+    """
+    begin = time.perf_counter()
+    groups = make_groups(policy, cfg, modules)
+    network = Network(policy, device=groups[0].env.device)
+    anchor = make_anchor(groups, network, cfg)
+
+    def measure() -> tuple[float, list[Misses]]:
+        found = [follow(group, network, derivatives=True) for group in groups]
+        pairs = zip(groups, found, strict=True)
+        total = sum(float((0.5 * group.importance(m) * m.value.square()).sum()) for group, m in pairs)
+        return total + anchor.cost(network.weights), found
+
+    cost, found = measure()
+    damping, history = DAMPING, []
+    for step in range(cfg.iterations + 1):
+        means = {group.name: float(m.value[m.valid].abs().mean()) for group, m in zip(groups, found, strict=True)}
+        moved = anchor.change(network.weights)
+        told = {"cost": cost, "action_change": moved, "seconds": time.perf_counter() - begin}
+        history.append({"step": step, "mean_abs_miss_m": means, **told})
+        words = ", ".join(f"{name} {1000.0 * miss:.2f} mm" for name, miss in means.items())
+        say(
+            f"step {step}: cost {cost:.4g}, {words}, actions moved {told['action_change']:.4f}, {told['seconds']:.0f} s"
+        )
+        if step == cfg.iterations:
+            break
+        kept = network.weights
+        importance = [group.importance(m) for group, m in zip(groups, found, strict=True)]
+        rows, values = [m.rows for m in found], [m.value for m in found]
+        network.weights = kept + gauss_newton_step(kept, rows, values, importance, anchor, damping)
+        new_cost, new = measure()
+        if math.isfinite(new_cost) and new_cost < cost:
+            cost, found, damping = new_cost, new, damping / 3.0
+        else:
+            network.weights, damping = kept, 10.0 * damping
+    layers = network.layers(network.weights)
+    record = {"settings": json.loads(json.dumps(asdict(cfg), default=str)), "steps": history}
+    config = policy.config | {"finetuned": record | {"commit": (commit := git_commit()) and commit.hash}}
+    return Policy(layers, policy.mean, policy.std, policy.interface, config), record

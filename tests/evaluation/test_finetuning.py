@@ -1,0 +1,76 @@
+"""Fine-tuning: misses as an evaluation measures them, made smaller by gradients, and the command around it."""
+
+import json
+
+import numpy as np
+import pytest
+import torch
+
+from jumper_warp.cli.main import main
+from jumper_warp.evaluation.finetuning import FinetuneCfg, finetune, make_groups
+from jumper_warp.evaluation.jump_misses import follow
+from jumper_warp.optim.gauss_newton import Network
+from jumper_warp.policies.restore import open_policy
+from jumper_warp.utils.errors import InputError
+
+FEW = {"goals": 4, "late": 0, "randomized": 0, "heights": (0.6, 1.05), "iterations": 1, "device": "cpu"}
+
+
+@pytest.fixture(scope="module")
+def tuned():
+    """The policy, fine-tuned by one step, and what was done."""
+    return finetune(open_policy("vertical_jump"), FinetuneCfg(**FEW), say=lambda line: None)
+
+
+def test_misses_are_those_of_the_policy_in_its_environment_and_gradients_change_no_bit():
+    policy = open_policy("vertical_jump")
+    (group,) = make_groups(policy, FinetuneCfg(**FEW))
+    network = Network(policy)
+    found, plain = follow(group, network, derivatives=True), follow(group, network, derivatives=False)
+    assert torch.equal(found.value, plain.value)
+    assert found.rows.shape == (4, len(network.weights)) and found.valid.all()
+    group.begin()
+    for _ in range(120):
+        group.env.step(policy.act(group.env.obs))
+    misses = group.env.task_arrays()["max_height"] - np.linspace(0.6, 1.05, 4)
+    np.testing.assert_allclose(found.value.numpy(), misses, rtol=0.0, atol=1.0e-4)
+
+
+def test_one_step_halves_the_misses(tuned):
+    _, record = tuned
+    before, after = (step["mean_abs_miss_m"]["nominal"] for step in record["steps"])
+    assert before > 0.003
+    assert after < 0.5 * before
+    assert 0.0 < record["steps"][1]["action_change"] < 0.01
+
+
+def test_the_same_seed_gives_the_same_bits(tuned):
+    again, _ = finetune(open_policy("vertical_jump"), FinetuneCfg(**FEW), say=lambda line: None)
+    for name, tensor in tuned[0].tensors().items():
+        assert torch.equal(tensor, again.tensors()[name]), name
+
+
+def test_command_writes_a_policy_that_can_be_opened(tmp_path, capsys):
+    out = tmp_path / "tuned"
+    flags = "--goals 2 --late 0 --randomized 0 --iterations 1 --device cpu".split()
+    main(["finetune", "vertical_jump", *flags, "--out", str(out)])
+    assert capsys.readouterr().out.splitlines()[-1] == str(out)
+    policy = open_policy(out)
+    assert not torch.equal(policy.layers[0][0], open_policy("vertical_jump").layers[0][0])
+    assert policy.config["finetuned"]["settings"]["goals"] == 2
+    assert len(json.loads((out / "finetuning.json").read_text())["steps"]) == 2
+    with pytest.raises(SystemExit) as end:
+        main(["finetune", "vertical_jump", "--out", str(out)])
+    assert end.value.code == 2
+    assert capsys.readouterr().err == f"jumper: {out} exists\n"
+
+
+@pytest.mark.parametrize("change", [{"goals": 1}, {"late": -1}, {"heights": (0.9, 0.5)}, {"action_std": 0.0}])
+def test_impossible_settings_are_refused(change):
+    with pytest.raises(InputError):
+        FinetuneCfg(**(FEW | change))
+
+
+def test_policies_that_do_not_jump_are_refused():
+    with pytest.raises(InputError, match="not for velocity-flat"):
+        make_groups(open_policy("walking_flat"), FinetuneCfg(**FEW))

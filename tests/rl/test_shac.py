@@ -1,0 +1,113 @@
+"""SHAC on a mass on a line: its gradient against differences, learning, saving, refusals."""
+
+import dataclasses
+
+import pytest
+import torch
+from toy_task import SMALL, PushTask
+
+from jumper_warp.rl.cfg import ShacCfg, TrainCfg
+from jumper_warp.rl.runner import train
+from jumper_warp.rl.shac import Shac
+from jumper_warp.utils.errors import InputError
+
+CFG = dataclasses.replace(SMALL, init_std=0.3, num_steps=8)
+
+
+class SmoothPushTask(PushTask):
+    """The same with derivatives."""
+
+    def begin_window(self) -> None:
+        self.present = self.obs.clone()
+
+    def observe(self):
+        return self.present, torch.cat([self.present, self.present[:, :1].abs()], 1)
+
+    def observe_final(self):
+        return self.last, torch.cat([self.last, self.last[:, :1].abs()], 1)
+
+    def step_with_gradient(self, action):
+        present = self.present
+        velocity = present[:, 1] + 0.2 * action[:, 0].clamp(-1.0, 1.0)
+        position = present[:, 0] + 0.2 * velocity
+        reward = torch.exp(-position.square() - 0.1 * velocity.square())
+        self.step(action.detach())
+        self.last = torch.stack([position, velocity], 1)
+        self.present = torch.where(self.done[:, None] > 0.0, self.obs, self.last)
+        return reward
+
+
+def shac(num_envs=32, seed=0, **changes):
+    torch.manual_seed(seed)
+    env = SmoothPushTask(num_envs, episode_length=11)
+    env.reset()
+    return Shac(env, dataclasses.replace(CFG, **changes), ShacCfg())
+
+
+def test_the_gradient_is_that_of_the_windows_rewards_and_values():
+    """Episodes end within the window; the first window has made the target critic one that says something."""
+    algorithm = shac(num_envs=8)
+    algorithm.iterate()
+    start, noise = algorithm.env.state_dict(), torch.get_rng_state()
+
+    def loss():
+        algorithm.env.load_state_dict(start)
+        torch.set_rng_state(noise)
+        return algorithm.window()["loss"]
+
+    weights = [*algorithm.model.actor.parameters(), algorithm.model.log_std]
+    found = torch.autograd.grad(loss(), weights)
+    length = torch.stack([gradient.norm() for gradient in found]).norm()
+    ends = []
+    for change in (1.0e-2, -2.0e-2):
+        with torch.no_grad():
+            for weight, gradient in zip(weights, found, strict=True):
+                weight += change * gradient / length
+            ends.append(float(loss()))
+    assert (ends[0] - ends[1]) / 2.0e-2 == pytest.approx(float(length), rel=0.01)
+
+
+def test_it_learns_to_push_to_the_origin():
+    algorithm = shac(init_std=0.1)
+    for _ in range(40):
+        algorithm.iterate()
+    torch.manual_seed(1)
+    algorithm.env.reset()
+    for _ in range(10):
+        algorithm.env.step(algorithm.model.act(algorithm.env.obs))
+    assert algorithm.env.obs[:, 0].abs().max() < 0.3  # from up to 1.0, moving away at up to 0.5 a second
+
+
+def test_a_saved_training_goes_on_in_the_same_bits_and_the_same_seed_repeats_them():
+    first, second = shac(), shac()
+    for algorithm in (first, second):
+        torch.manual_seed(3)
+        algorithm.iterate()
+    state, env = first.state_dict(), first.env.state_dict()
+    for name, value in second.state_dict()["model"].items():
+        assert torch.equal(value, state["model"][name]), name
+    fresh = shac(seed=9)
+    fresh.env.load_state_dict(env)
+    fresh.load_state_dict(state)
+    for algorithm in (first, fresh):
+        torch.manual_seed(4)
+        algorithm.iterate()
+    after, again = first.state_dict(), fresh.state_dict()
+    for name, value in [*after["model"].items(), *((n, v) for n, v in after.items() if n != "model")]:
+        assert torch.equal(value, again["model"].get(name, again.get(name))), name
+    with pytest.raises(ValueError, match="lacks lr"):
+        fresh.load_state_dict({name: value for name, value in state.items() if name != "lr"})
+
+
+def test_a_run_trains_with_it(tmp_path):
+    cfg = TrainCfg(
+        task="push", num_envs=16, iterations=3, device="cpu", log_root=tmp_path, log_interval=1, tensorboard=False,
+        trainer="shac", ppo=CFG,
+    )  # fmt: skip
+    result = train(cfg, lambda n, seed, device: SmoothPushTask(n, seed, device, episode_length=8))
+    assert result.iteration == 3
+    assert result.figures["Train/mean_length"] == 8.0
+    resumed = dataclasses.replace(cfg, iterations=4, resume=str(result.folder))
+    assert train(resumed, lambda n, seed, device: SmoothPushTask(n, seed, device, episode_length=8)).iteration == 4
+    with pytest.raises(InputError, match="an environment with gradients"):
+        train(cfg, PushTask)
