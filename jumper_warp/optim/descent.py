@@ -1,0 +1,165 @@
+"""The way from the described robot to the minimum: motions one after another, few Jacobians, and a look around."""
+
+from __future__ import annotations
+
+import itertools
+import time
+from collections.abc import Sequence
+
+import numpy as np
+
+from jumper_warp.optim.findings import Step
+from jumper_warp.optim.least_squares import Knowledge, LeastSquares, Linearised, Normal, Point, Trial
+from jumper_warp.optim.motions import Motion
+from jumper_warp.optim.parameters import ParameterSet
+from jumper_warp.optim.replay import Replay
+from jumper_warp.optim.residuals import MotionResiduals, NoiseLevels, NothingMeasured
+from jumper_warp.robot.description import RobotDescription
+
+PIECE = 0.25
+"""[s] Length of the pieces that motions without a held base are first cut into."""
+WORTH_A_STEP = 0.02
+"""Relative decrease of the cost below which the steps of all stages but the last end."""
+CONVERGED = 0.5
+"""Decrease of the cost, in mean squared residuals, below which the optimisation ends: 1 is what one deviation costs."""
+AS_PROMISED = 0.3
+"""Share of the promised decrease with which a step is good enough for another one with the same Jacobian."""
+MOST_STEPS = 40
+"""In one stage."""
+AROUND = 16
+"""Points around the minimum from which a better one is looked for."""
+ROUNDS = 3
+"""Of looking around, at most."""
+
+
+class Descent:
+    """An optimisation: the steps that it took, and what they cost."""
+
+    def __init__(self, replay: Replay):
+        """Start the clocks."""
+        self.replay, self.steps = replay, []
+        self._begun = (time.perf_counter(), time.process_time(), replay.world_steps)
+
+    def spent(self) -> tuple[float, float, int]:
+        """Return wall time [s], CPU time [s] and physics steps of all worlds."""
+        seconds, cpu, steps = self._begun
+        return time.perf_counter() - seconds, time.process_time() - cpu, self.replay.world_steps - steps
+
+    def note(self, stage: int, problem: LeastSquares, trial: Trial) -> None:
+        """Record a step."""
+        seconds, _, count = self.spent()
+        self.steps.append(Step(stage, trial.cost / problem.count, trial.damping, count, seconds))
+
+    def steps_down(
+        self, problem: LeastSquares, point: Point, normal: Normal, stage: int, worth: float = 0.0
+    ) -> tuple[Point, Normal]:
+        """Take steps until one gains less than a share `worth` of the cost, or than `CONVERGED`.
+
+        A Jacobian serves for as many steps as go nearly as it promises; each corrects it by what it saw (Broyden).
+        """
+        fresh = True
+        for _ in range(MOST_STEPS):
+            least = max(worth * normal.cost, CONVERGED * max(1.0, normal.data_cost / problem.count))
+            trial = problem.step(point, normal, bend=fresh)
+            self.note(stage, problem, trial)
+            gain = normal.cost - trial.cost
+            if gain < least and (fresh or trial.promise < least):
+                return trial.point, problem.secant(normal, point, trial)
+            fresh = gain < max(least, AS_PROMISED * trial.promise)
+            normal = problem.normal(trial.point) if fresh else problem.secant(normal, point, trial)
+            point = trial.point
+        return point, normal
+
+    def look_around(
+        self, problem: LeastSquares, point: Point, normal: Normal, stage: int, rng: np.random.Generator
+    ) -> tuple[Point, Normal]:
+        """Go on from points around a minimum as long as one step from one of them leads below it.
+
+        A paw that strikes one step earlier or later makes minima of its own, about as wide as the noise lets a
+        parameter vary.
+        """
+        for _ in range(ROUNDS):
+            trial = problem.step_from(problem.likely(point, normal, AROUND, rng), normal)
+            self.note(stage, problem, trial)
+            if normal.cost - trial.cost < CONVERGED:
+                break
+            again = problem.assemble(trial.point, problem.known_at(trial.residuals, normal.linearised))
+            point, normal = self.steps_down(problem, trial.point, again, stage)
+        return point, normal
+
+
+def descend(
+    descent: Descent,
+    parameters: ParameterSet,
+    motions: Sequence[Sequence[MotionResiduals]],
+    pieces: Sequence[MotionResiduals],
+    knowledge: Sequence[Knowledge],
+) -> tuple[LeastSquares, Point, Normal]:
+    """Return the minimum, and the normal equations there.
+
+    Motions with a held base come first: their legs do not feel each other. The others follow, next the one that is
+    explained best by then; residuals that stand out count less (a paw that strikes 1 ms late is all wrong for a
+    moment). At last all residuals count fully.
+
+    Args:
+        descent: To record the steps.
+        parameters: What is unknown.
+        motions: All, as the first stages and as the last ones take them: the physics steps may differ.
+        pieces: Motions in short pieces for a first stage; none: without.
+        knowledge: Of the robot besides the motions.
+
+    Raises:
+        InputError: the model cannot follow a motion.
+    """
+    replay, (rough, whole) = descent.replay, motions
+    z = np.zeros(len(parameters))
+    if pieces:
+        problem = LeastSquares(parameters, pieces, replay, knowledge, robust=True)
+        begin = problem.expected()
+        z = descent.steps_down(problem, begin, problem.normal(begin), 0, worth=0.1)[0].z
+    point, normal, taken = Point(z, []), None, []
+    for stage in itertools.count(1):
+        left = [i for i in range(len(rough)) if i not in taken]
+        if not left:
+            break
+        held = [i for i in left if not rough[i].free]
+        new = held or [min(left, key=lambda i: misfit(rough[i], replay, point.z))]
+        taken += new
+        problem = LeastSquares(parameters, [rough[i] for i in taken], replay, knowledge, robust=True)
+        point = Point(point.z, point.starts + [np.zeros(rough[i].start_size) for i in new])
+        normal = problem.normal(point, normal.linearised if normal else ())
+        point, normal = descent.steps_down(problem, point, normal, stage, WORTH_A_STEP)
+    order = np.argsort(taken)
+    point = Point(point.z, [point.starts[i] for i in order])
+    final = LeastSquares(parameters, whole, replay, knowledge)
+    linearised = [normal.linearised[i] for i in order]
+    if whole is not rough:
+        linearised = final.known_at(final.residuals(point), linearised)
+    point, normal = descent.steps_down(final, point, final.assemble(point, linearised), stage)
+    return final, *descent.look_around(final, point, normal, stage + 1, np.random.default_rng(0))
+
+
+def misfit(motion: MotionResiduals, replay: Replay, z: np.ndarray) -> float:
+    """Return the mean of ln(1 + r^2) of a motion's residuals from its expected start."""
+    found = motion.residuals(replay, z[None], np.zeros((1, motion.start_size)))
+    with np.errstate(over="ignore"):
+        return float(np.mean(np.log1p(np.nan_to_num(found, posinf=1.0e100) ** 2)))
+
+
+def pieces_of(
+    motion: Motion, parameters: ParameterSet, noise: NoiseLevels, description: RobotDescription, dt: float | None
+) -> list[MotionResiduals]:
+    """Return a motion in pieces of about `PIECE`, those without measurements left out."""
+    rows = len(motion.time)
+    number = max(1, min(round(motion.duration / PIECE), rows // 4))
+    edges = [round(rows * i / number) for i in range(number + 1)]
+    found = []
+    for span in itertools.pairwise(edges):
+        try:
+            found.append(MotionResiduals(motion, parameters, noise, description, dt, span))
+        except NothingMeasured:
+            continue
+    return found
+
+
+__all__ = ["Descent", "Linearised", "descend", "pieces_of"]
