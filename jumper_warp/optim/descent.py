@@ -1,4 +1,4 @@
-"""The way from the described robot to the minimum: motions one after another, few Jacobians, and a look around."""
+"""The way from the described robot to the minimum: motions one after another, and few Jacobians."""
 
 from __future__ import annotations
 
@@ -24,12 +24,10 @@ CONVERGED = 0.5
 """Decrease of the cost, in mean squared residuals, below which the optimisation ends: 1 is what one deviation costs."""
 AS_PROMISED = 0.3
 """Share of the promised decrease with which a step is good enough for another one with the same Jacobian."""
+HORIZONS = (0.4, 0.7, 1.0)
+"""Shares of a motion on the ground that are taken one after another: what a paw's stroke does depends on all before."""
 MOST_STEPS = 40
 """In one stage."""
-AROUND = 16
-"""Points around the minimum from which a better one is looked for."""
-ROUNDS = 3
-"""Of looking around, at most."""
 
 
 class Descent:
@@ -51,40 +49,23 @@ class Descent:
         self.steps.append(Step(stage, trial.cost / problem.count, trial.damping, count, seconds))
 
     def steps_down(
-        self, problem: LeastSquares, point: Point, normal: Normal, stage: int, worth: float = 0.0
+        self, problem: LeastSquares, point: Point, normal: Normal, stage: int, worth: float | None = None
     ) -> tuple[Point, Normal]:
-        """Take steps until one gains less than a share `worth` of the cost, or than `CONVERGED`.
+        """Take steps until one gains less than a share `worth` of the cost; None: until a new Jacobian gains nothing.
 
         A Jacobian serves for as many steps as go nearly as it promises; each corrects it by what it saw (Broyden).
         """
-        fresh = True
+        fresh = worth is not None
         for _ in range(MOST_STEPS):
-            least = max(worth * normal.cost, CONVERGED * max(1.0, normal.data_cost / problem.count))
+            least = max((worth or 0.0) * normal.cost, CONVERGED * max(1.0, normal.data_cost / problem.count))
             trial = problem.step(point, normal, bend=fresh)
             self.note(stage, problem, trial)
             gain = normal.cost - trial.cost
-            if gain < least and (fresh or trial.promise < least):
-                return trial.point, problem.secant(normal, point, trial)
+            if gain < least and (fresh or (worth is not None and trial.promise < least)):
+                return trial.point, problem.assemble(trial.point, problem.known_at(trial.residuals, normal.linearised))
             fresh = gain < max(least, AS_PROMISED * trial.promise)
             normal = problem.normal(trial.point) if fresh else problem.secant(normal, point, trial)
             point = trial.point
-        return point, normal
-
-    def look_around(
-        self, problem: LeastSquares, point: Point, normal: Normal, stage: int, rng: np.random.Generator
-    ) -> tuple[Point, Normal]:
-        """Go on from points around a minimum as long as one step from one of them leads below it.
-
-        A paw that strikes one step earlier or later makes minima of its own, about as wide as the noise lets a
-        parameter vary.
-        """
-        for _ in range(ROUNDS):
-            trial = problem.step_from(problem.likely(point, normal, AROUND, rng), normal)
-            self.note(stage, problem, trial)
-            if normal.cost - trial.cost < CONVERGED:
-                break
-            again = problem.assemble(trial.point, problem.known_at(trial.residuals, normal.linearised))
-            point, normal = self.steps_down(problem, trial.point, again, stage)
         return point, normal
 
 
@@ -117,26 +98,27 @@ def descend(
         problem = LeastSquares(parameters, pieces, replay, knowledge, robust=True)
         begin = problem.expected()
         z = descent.steps_down(problem, begin, problem.normal(begin), 0, worth=0.1)[0].z
-    point, normal, taken = Point(z, []), None, []
-    for stage in itertools.count(1):
+    point, normal, taken, stage = Point(z, []), None, [], 0
+    while len(taken) < len(rough):
         left = [i for i in range(len(rough)) if i not in taken]
-        if not left:
-            break
         held = [i for i in left if not rough[i].free]
         new = held or [min(left, key=lambda i: misfit(rough[i], replay, point.z))]
-        taken += new
-        problem = LeastSquares(parameters, [rough[i] for i in taken], replay, knowledge, robust=True)
         point = Point(point.z, point.starts + [np.zeros(rough[i].start_size) for i in new])
-        normal = problem.normal(point, normal.linearised if normal else ())
-        point, normal = descent.steps_down(problem, point, normal, stage, WORTH_A_STEP)
+        for part in (1.0,) if held else HORIZONS:
+            stage += 1
+            begun = [rough[i].until(part) for i in new]
+            problem = LeastSquares(parameters, [rough[i] for i in taken] + begun, replay, knowledge, robust=True)
+            normal = problem.normal(point, normal.linearised[: len(taken)] if normal else ())
+            point, normal = descent.steps_down(problem, point, normal, stage, WORTH_A_STEP)
+        taken += new
+    stage += 1
     order = np.argsort(taken)
     point = Point(point.z, [point.starts[i] for i in order])
     final = LeastSquares(parameters, whole, replay, knowledge)
     linearised = [normal.linearised[i] for i in order]
     if whole is not rough:
         linearised = final.known_at(final.residuals(point), linearised)
-    point, normal = descent.steps_down(final, point, final.assemble(point, linearised), stage)
-    return final, *descent.look_around(final, point, normal, stage + 1, np.random.default_rng(0))
+    return final, *descent.steps_down(final, point, final.assemble(point, linearised), stage)
 
 
 def misfit(motion: MotionResiduals, replay: Replay, z: np.ndarray) -> float:

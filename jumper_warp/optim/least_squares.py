@@ -286,39 +286,6 @@ class LeastSquares:
         damping = float(DAMPINGS[best % len(DAMPINGS)])
         return Trial(moved, float(costs[best]), damping, promise, [found[:, best] for found in residuals])
 
-    def likely(self, point: Point, normal: Normal, count: int, rng: np.random.Generator) -> list[Point]:
-        """Return random points around a minimum, as far as noise lets it lie elsewhere."""
-        information = normal.information() + np.eye(len(point.z))
-        moves = np.linalg.solve(np.linalg.cholesky(information).T, rng.normal(size=(len(point.z), count))).T
-        found = []
-        for z in np.clip(point.z + moves, self._low, self._high):
-            starts = []
-            for start, own, mixed in zip(point.starts, normal.start_matrices, normal.mixed, strict=True):
-                along = np.linalg.solve(own, mixed.T @ (z - point.z))
-                apart = np.linalg.solve(np.linalg.cholesky(own).T, rng.normal(size=len(start)))
-                starts.append(start - along + apart)
-            found.append(Point(z, starts))
-        return found
-
-    def step_from(self, points: Sequence[Point], normal: Normal) -> Trial:
-        """Return the best of the points that one undamped step leads to from others near the normal equations' own."""
-        z = np.array([point.z for point in points])
-        starts = [np.array([point.starts[i] for point in points]) for i in range(len(self.motions))]
-        _, residuals = self._costs(z, starts)
-        slopes = [
-            gram(linear.jacobian, weight[:, None] * np.nan_to_num(found, posinf=0.0))
-            for linear, weight, found in zip(normal.linearised, normal.weights, residuals, strict=True)
-        ]
-        size, moved = len(normal.gradient), []
-        for k, point in enumerate(points):
-            gradient = point.z + sum(slope[:size, k] for slope in slopes)
-            for residual, slope in self.known(point.z):
-                gradient = gradient + slope * residual
-            of_starts = [slope[size:, k] + start for slope, start in zip(slopes, point.starts, strict=True)]
-            moved.append(normal.solve(0.0, self._free(point.z, gradient), gradient, of_starts))
-        z = np.clip(z + np.array([move for move, _ in moved]), self._low, self._high)
-        return self._best(z, [start + np.array([m[i] for _, m in moved]) for i, start in enumerate(starts)], 0.0)
-
     def _bent(
         self, point: Point, normal: Normal, free: np.ndarray, plain: list[tuple[np.ndarray, list[np.ndarray]]]
     ) -> list[tuple[np.ndarray, list[np.ndarray]]]:

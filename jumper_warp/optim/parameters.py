@@ -60,6 +60,11 @@ class Parameter:
         """The leg whose motor alone it acts on; None if it acts on more."""
         return self.places[0] // 3 if self.quantity in MOTOR_QUANTITIES and len(self.places) == 1 else None
 
+    @property
+    def growth(self) -> float:
+        """Change of the normalised coordinate per relative change of the nominal value."""
+        return (1.0 if self.scale == "ratio" else self.nominal) / self.prior
+
     def value(self, z: np.ndarray) -> np.ndarray:
         """Return the value [unit] of normalised coordinates."""
         if self.scale == "ratio":

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -182,6 +183,17 @@ class MotionResiduals:
                 self._levelling = levelling(self.description, angle)
         self._guess = Starts(*(x[None] for x in (place, quaternion, velocity, np.zeros(3), angle, rate)))
         self._start_prior = np.concatenate([angle_prior, rate_prior, tilt, *base])
+
+    def until(self, part: float) -> MotionResiduals:
+        """Return the first part of it, a share of its rows; the start is the same."""
+        if part >= 1.0:
+            return self
+        found = copy.copy(self)
+        end = max(3, round(part * len(self.motion.time)))
+        found.motion, found._place = self.motion.cut(0, end), self._place[:end]
+        found.rows = int(math.ceil(found._place[-1] - 1.0e-9)) + 1
+        found.measured, found.valid = self.measured[:end], self.valid[:end]
+        return found
 
     def starts(self, z: np.ndarray, robots: RobotValues) -> Starts:
         """Return the starts of normalised coordinates (N, I); true angles are readings less the robots' offsets.
