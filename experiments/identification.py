@@ -52,8 +52,8 @@ REFINE = 16
 """Steps of the finer truth in a step of the model."""
 SCALE = 0.02
 """[kg] Deviation of the scale."""
-PARTS = ("same", "fine", "mujoco", "methods", "policy")
-Part = Literal["same", "fine", "mujoco", "methods", "policy"]
+PARTS = ("same", "fine", "rough", "mujoco", "methods", "policy")
+Part = Literal["same", "fine", "rough", "mujoco", "methods", "policy"]
 
 
 @dataclass(frozen=True)
@@ -64,8 +64,8 @@ class Args:
     """Robots that are identified on the simulator that recorded them."""
     parts: tuple[Part, ...] = PARTS
     """What is run."""
-    fine_dt: float = 1.0 / 480.0
-    """[s] Physics step of the model that identifies the robot recorded at a sixteenth of 1/480 s."""
+    fine_dt: float = 1.0 / 3840.0
+    """[s] Physics step of the model that identifies the robot recorded at a sixteenth of 1/480 s; "rough": 1/480."""
     policy: str = "vertical_jump"
     """Policy whose jumps the identified robot is to predict."""
     jumps: int = 64
@@ -281,6 +281,9 @@ def main(args: Args) -> dict[str, Any]:
     def finely(plan: Plan, robots: RobotValues) -> Record:
         return replay_plan(replay_one, plan, robots, REFINE)
 
+    def as_fine_model(plan: Plan, robots: RobotValues) -> Record:
+        return replay_plan(replay_one, plan, robots, max(1, round(1.0 / 480.0 / args.fine_dt)))
+
     def by_mujoco(plan: Plan, robots: RobotValues) -> Record:
         return simulate_plan(plan, solver="mujoco", robots=robots)
 
@@ -297,10 +300,14 @@ def main(args: Args) -> dict[str, Any]:
         values |= {name: float(np.median([row[name] for row in rows])) for name in rows[0]}
         values["coverage"] = float(np.mean([row["coverage"] for row in rows]))
         values |= {f"{name}_of_seeds": [row[name] for row in rows] for name in ("chi2", "wall_s", "coverage")}
-    for part, carry, dt in (("fine", finely, args.fine_dt), ("mujoco", by_mujoco, None)):
+    for part, carry, model, dt in (
+        ("fine", finely, as_fine_model, args.fine_dt),
+        ("rough", finely, ours, None),
+        ("mujoco", by_mujoco, ours, None),
+    ):
         if part in args.parts:
             case = make_case(parameters, 100, carry, replay)
-            figures, found = run_case(parameters, case, replay, ours, dt)
+            figures, found = run_case(parameters, case, replay, model, dt)
             values |= {f"{part}_{name}": value for name, value in figures.items()}
             print(part, {name: round(value, 4) for name, value in figures.items()}, flush=True)
     if "methods" in args.parts and last:

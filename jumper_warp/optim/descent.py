@@ -26,6 +26,10 @@ AS_PROMISED = 0.3
 """Share of the promised decrease with which a step is good enough for another one with the same Jacobian."""
 HORIZONS = (0.4, 0.7, 1.0)
 """Shares of a motion on the ground that are taken one after another: what a paw's stroke does depends on all before."""
+ATTEMPTS = 2
+STUCK = 20.0
+"""Decrease of the cost that the last steps promise but do not bring where kinks of contact hold them: the motions are
+then taken one after another again, from there."""
 MOST_STEPS = 40
 """In one stage."""
 
@@ -35,7 +39,9 @@ class Descent:
 
     def __init__(self, replay: Replay):
         """Start the clocks."""
-        self.replay, self.steps = replay, []
+        self.replay, self.steps, self.stage = replay, [], 0
+        self.promised = 0.0
+        """Decrease of the cost that the last steps promised when they ended, but did not bring."""
         self._begun = (time.perf_counter(), time.process_time(), replay.world_steps)
 
     def spent(self) -> tuple[float, float, int]:
@@ -43,24 +49,25 @@ class Descent:
         seconds, cpu, steps = self._begun
         return time.perf_counter() - seconds, time.process_time() - cpu, self.replay.world_steps - steps
 
-    def note(self, stage: int, problem: LeastSquares, trial: Trial) -> None:
+    def note(self, problem: LeastSquares, trial: Trial) -> None:
         """Record a step."""
         seconds, _, count = self.spent()
-        self.steps.append(Step(stage, trial.cost / problem.count, trial.damping, count, seconds))
+        self.steps.append(Step(self.stage, trial.cost / problem.count, trial.damping, count, seconds))
 
     def steps_down(
-        self, problem: LeastSquares, point: Point, normal: Normal, stage: int, worth: float | None = None
+        self, problem: LeastSquares, point: Point, normal: Normal, worth: float | None = None
     ) -> tuple[Point, Normal]:
         """Take steps until one gains less than a share `worth` of the cost; None: until a new Jacobian gains nothing.
 
         A Jacobian serves for as many steps as go nearly as it promises; each corrects it by what it saw (Broyden).
         """
-        fresh = worth is not None
+        fresh, self.stage = worth is not None, self.stage + 1
         for _ in range(MOST_STEPS):
             least = max((worth or 0.0) * normal.cost, CONVERGED * max(1.0, normal.data_cost / problem.count))
             trial = problem.step(point, normal, bend=fresh)
-            self.note(stage, problem, trial)
+            self.note(problem, trial)
             gain = normal.cost - trial.cost
+            self.promised = trial.promise - gain
             if gain < least and (fresh or (worth is not None and trial.promise < least)):
                 return trial.point, problem.assemble(trial.point, problem.known_at(trial.residuals, normal.linearised))
             fresh = gain < max(least, AS_PROMISED * trial.promise)
@@ -97,28 +104,44 @@ def descend(
     if pieces:
         problem = LeastSquares(parameters, pieces, replay, knowledge, robust=True)
         begin = problem.expected()
-        z = descent.steps_down(problem, begin, problem.normal(begin), 0, worth=0.1)[0].z
-    point, normal, taken, stage = Point(z, []), None, [], 0
-    while len(taken) < len(rough):
-        left = [i for i in range(len(rough)) if i not in taken]
-        held = [i for i in left if not rough[i].free]
-        new = held or [min(left, key=lambda i: misfit(rough[i], replay, point.z))]
-        point = Point(point.z, point.starts + [np.zeros(rough[i].start_size) for i in new])
+        z = descent.steps_down(problem, begin, problem.normal(begin), worth=0.1)[0].z
+    best = None
+    for _ in range(ATTEMPTS):
+        point, linearised = one_after_another(descent, parameters, rough, knowledge, z)
+        final = LeastSquares(parameters, whole, replay, knowledge)
+        if whole is not rough:
+            linearised = final.known_at(final.residuals(point), linearised)
+        point, normal = descent.steps_down(final, point, final.assemble(point, linearised))
+        if best is None or normal.cost < best[2].cost:
+            best = final, point, normal
+        if descent.promised < STUCK * max(1.0, normal.data_cost / final.count):
+            break
+        z = point.z
+    return best
+
+
+def one_after_another(
+    descent: Descent,
+    parameters: ParameterSet,
+    motions: Sequence[MotionResiduals],
+    knowledge: Sequence[Knowledge],
+    z: np.ndarray,
+) -> tuple[Point, list[Linearised]]:
+    """Return where all motions together lead, taken one after another from parameters z, and their Jacobians there."""
+    point, normal, taken = Point(z, []), None, []
+    while len(taken) < len(motions):
+        left = [i for i in range(len(motions)) if i not in taken]
+        held = [i for i in left if not motions[i].free]
+        new = held or [min(left, key=lambda i: misfit(motions[i], descent.replay, point.z))]
+        point = Point(point.z, point.starts + [np.zeros(motions[i].start_size) for i in new])
         for part in (1.0,) if held else HORIZONS:
-            stage += 1
-            begun = [rough[i].until(part) for i in new]
-            problem = LeastSquares(parameters, [rough[i] for i in taken] + begun, replay, knowledge, robust=True)
+            begun = [motions[i] for i in taken] + [motions[i].until(part) for i in new]
+            problem = LeastSquares(parameters, begun, descent.replay, knowledge, robust=True)
             normal = problem.normal(point, normal.linearised[: len(taken)] if normal else ())
-            point, normal = descent.steps_down(problem, point, normal, stage, WORTH_A_STEP)
+            point, normal = descent.steps_down(problem, point, normal, WORTH_A_STEP)
         taken += new
-    stage += 1
     order = np.argsort(taken)
-    point = Point(point.z, [point.starts[i] for i in order])
-    final = LeastSquares(parameters, whole, replay, knowledge)
-    linearised = [normal.linearised[i] for i in order]
-    if whole is not rough:
-        linearised = final.known_at(final.residuals(point), linearised)
-    return final, *descent.steps_down(final, point, final.assemble(point, linearised), stage)
+    return Point(point.z, [point.starts[i] for i in order]), [normal.linearised[i] for i in order]
 
 
 def misfit(motion: MotionResiduals, replay: Replay, z: np.ndarray) -> float:
