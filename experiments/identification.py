@@ -30,7 +30,7 @@ from jumper_warp.optim.evolution import identify_by_evolution
 from jumper_warp.optim.excitation import unsafe
 from jumper_warp.optim.findings import Identification
 from jumper_warp.optim.identification import identify, total_mass, weighed
-from jumper_warp.optim.least_squares import Knowledge, LeastSquares
+from jumper_warp.optim.least_squares import Knowledge, LeastSquares, Point
 from jumper_warp.optim.motions import Motion
 from jumper_warp.optim.parameters import ParameterSet, jumper_parameters
 from jumper_warp.optim.plans import KINDS, Plan, draw_plan
@@ -52,8 +52,8 @@ REFINE = 16
 """Steps of the finer truth in a step of the model."""
 SCALE = 0.02
 """[kg] Deviation of the scale."""
-PARTS = ("same", "fine", "mujoco", "methods", "policy")
-Part = Literal["same", "fine", "mujoco", "methods", "policy"]
+PARTS = ("same", "fine", "rough", "mujoco", "methods", "policy")
+Part = Literal["same", "fine", "rough", "mujoco", "methods", "policy"]
 
 
 @dataclass(frozen=True)
@@ -64,8 +64,8 @@ class Args:
     """Robots that are identified on the simulator that recorded them."""
     parts: tuple[Part, ...] = PARTS
     """What is run."""
-    fine_dt: float = 1.0 / 480.0
-    """[s] Physics step of the model that identifies the robot recorded at a sixteenth of 1/480 s."""
+    fine_dt: float = 1.0 / 3840.0
+    """[s] Physics step of the model that identifies the robot recorded at a sixteenth of 1/480 s; "rough": 1/480."""
     policy: str = "vertical_jump"
     """Policy whose jumps the identified robot is to predict."""
     jumps: int = 64
@@ -172,8 +172,8 @@ def run_case(
     return figures, found
 
 
-def scipy_fit(parameters: ParameterSet, case: Case, replay: Replay, seconds: float) -> np.ndarray:
-    """Return what SciPy's trust region finds in so many seconds from differences over the same parallel worlds."""
+def scipy_fit(parameters: ParameterSet, case: Case, replay: Replay, seconds: float) -> Point:
+    """Return where SciPy's trust region comes in so many seconds, by differences over the same parallel worlds."""
     whole = [MotionResiduals(motion, parameters, NoiseLevels(), replay.description) for motion in case.motions]
     problem = LeastSquares(parameters, whole, replay, [case.mass])
     point, size, ends = problem.expected(), len(parameters), time.perf_counter() + seconds
@@ -182,7 +182,7 @@ def scipy_fit(parameters: ParameterSet, case: Case, replay: Replay, seconds: flo
     class OutOfTime(Exception):
         pass
 
-    best = (np.inf, point.z)
+    best = (np.inf, point)
 
     def split(x: np.ndarray) -> list[np.ndarray]:
         return np.split(x, edges[:-1])
@@ -195,7 +195,7 @@ def scipy_fit(parameters: ParameterSet, case: Case, replay: Replay, seconds: flo
         found = np.concatenate([*rows, mass, x])
         cost = float(found @ found)
         if cost < best[0]:
-            best = (cost, z.copy())
+            best = (cost, Point(z.copy(), [start.copy() for start in starts]))
         if time.perf_counter() > ends:
             raise OutOfTime
         return np.nan_to_num(found, posinf=1.0e6)
@@ -217,8 +217,10 @@ def scipy_fit(parameters: ParameterSet, case: Case, replay: Replay, seconds: flo
     low, high = parameters.bounds()
     wide = np.full(edges[-1] - size, np.inf)
     limits = (np.concatenate([low, -wide]), np.concatenate([high, wide]))
+    begin = np.concatenate([point.z, *point.starts])
+    begin[:size] += 0.2 * (begin[:size] <= low)  # its trust region shrinks at bounds
     try:
-        least_squares(residuals, np.concatenate([point.z, *point.starts]), jacobian, limits, x_scale="jac")
+        least_squares(residuals, begin, jacobian, limits)
     except OutOfTime:
         pass
     return best[1]
@@ -229,20 +231,19 @@ def compare_methods(parameters: ParameterSet, case: Case, replay: Replay, ours: 
     evolved = identify_by_evolution(case.motions, parameters, knowledge=[case.mass], max_seconds=seconds)
     trusted = scipy_fit(parameters, case, replay, seconds)
     figures = {}
-    for name, z in (("cma", evolved.z), ("scipy", trusted)):
-        robots = parameters.robots(z[None])
+    for name, point in (("cma", Point(evolved.z, list(evolved.starts))), ("scipy", trusted)):
+        robots = parameters.robots(point.z[None])
         angle, height = prediction_errors(case, robots, ours)
         figures |= {f"{name}_held_out_deg": angle, f"{name}_held_out_mm": height}
-        figures[f"{name}_chi2"] = chi2_at(parameters, case, replay, z)
+        figures[f"{name}_chi2"] = chi2_at(parameters, case, replay, point)
     return figures | {"methods_wall_s": seconds, "cma_million_world_steps": evolved.world_steps / 1.0e6}
 
 
-def chi2_at(parameters: ParameterSet, case: Case, replay: Replay, z: np.ndarray) -> float:
-    """Return the mean squared weighed residual at parameters, the starts as the first rows say."""
+def chi2_at(parameters: ParameterSet, case: Case, replay: Replay, point: Point) -> float:
+    """Return the mean squared weighed residual at a point."""
     whole = [MotionResiduals(motion, parameters, NoiseLevels(), replay.description) for motion in case.motions]
     problem = LeastSquares(parameters, whole, replay)
-    starts = [start[None] for start in problem.expected().starts]
-    return float(problem.costs(z[None], starts)[0] - z @ z) / problem.count
+    return sum(float(found @ found) for found in problem.residuals(point)) / problem.count
 
 
 def policy_errors(args: Args, case: Case, found: Identification, folder: Path) -> dict[str, float]:
@@ -281,6 +282,9 @@ def main(args: Args) -> dict[str, Any]:
     def finely(plan: Plan, robots: RobotValues) -> Record:
         return replay_plan(replay_one, plan, robots, REFINE)
 
+    def as_fine_model(plan: Plan, robots: RobotValues) -> Record:
+        return replay_plan(replay_one, plan, robots, max(1, round(1.0 / 480.0 / args.fine_dt)))
+
     def by_mujoco(plan: Plan, robots: RobotValues) -> Record:
         return simulate_plan(plan, solver="mujoco", robots=robots)
 
@@ -296,11 +300,15 @@ def main(args: Args) -> dict[str, Any]:
     if rows:
         values |= {name: float(np.median([row[name] for row in rows])) for name in rows[0]}
         values["coverage"] = float(np.mean([row["coverage"] for row in rows]))
-        values |= {f"{name}_of_seeds": [row[name] for row in rows] for name in ("chi2", "wall_s", "coverage")}
-    for part, carry, dt in (("fine", finely, args.fine_dt), ("mujoco", by_mujoco, None)):
+        values |= {f"{name}_of_seeds": [row[name] for row in rows] for name in ("chi2", "wall_s", "cpu_s", "coverage")}
+    for part, carry, model, dt in (
+        ("fine", finely, as_fine_model, args.fine_dt),
+        ("rough", finely, ours, None),
+        ("mujoco", by_mujoco, ours, None),
+    ):
         if part in args.parts:
             case = make_case(parameters, 100, carry, replay)
-            figures, found = run_case(parameters, case, replay, ours, dt)
+            figures, found = run_case(parameters, case, replay, model, dt)
             values |= {f"{part}_{name}": value for name, value in figures.items()}
             print(part, {name: round(value, 4) for name, value in figures.items()}, flush=True)
     if "methods" in args.parts and last:
@@ -318,21 +326,28 @@ def main(args: Args) -> dict[str, Any]:
 
 
 def plot(rows: list[dict[str, float]], path: Path) -> None:
-    """Draw χ², coverage and held-out errors of all seeds."""
+    """Draw χ², coverage, held-out errors and time of all seeds."""
     if not rows:
         return
-    with drawn(path, 1, 3, figsize=(11, 3.2)) as axes:
+    with drawn(path, 1, 4, figsize=(14, 3.2)) as axes:
         seeds = np.arange(len(rows))
         axes[0].plot(seeds, [row["chi2"] for row in rows], "o")
         axes[0].axhline(1.02, color="0.6", linestyle="--")
         axes[0].set(xlabel="seed", ylabel="χ² per value")
         axes[1].plot(seeds, [100.0 * row["coverage"] for row in rows], "o")
+        axes[1].axhline(100.0 * float(np.mean([row["coverage"] for row in rows])), color="C0", lw=1, label="mean")
         axes[1].axhspan(90.0, 98.0, color="0.92")
         axes[1].set(xlabel="seed", ylabel="within 95 % interval [%]")
+        axes[1].legend()
         for name, label in (("held_out_nominal_deg", "described"), ("held_out_deg", "identified")):
             axes[2].semilogy(seeds, [row[name] for row in rows], "o", label=label)
         axes[2].set(xlabel="seed", ylabel="held-out angle error [deg]")
+        for name, label in (("wall_s", "wall"), ("cpu_s", "CPU")):
+            axes[3].plot(seeds, [row[name] for row in rows], "o", label=label)
+        axes[3].axhline(10.0, color="0.6", linestyle="--")
+        axes[3].set(xlabel="seed", ylabel="time [s]", ylim=(0.0, None))
         axes[2].legend()
+        axes[3].legend()
 
 
 if __name__ == "__main__":

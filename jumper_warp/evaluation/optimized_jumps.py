@@ -12,7 +12,7 @@ import numpy as np
 from jumper_warp.evaluation.motion_replay import SPEED, Replay
 from jumper_warp.evaluation.takeoff_search import KNOTS, TICKS
 from jumper_warp.optim import jumps
-from jumper_warp.optim.descent import Progress, minimise
+from jumper_warp.optim.augmented_lagrangian import Progress, minimise
 from jumper_warp.optim.smoothing import Stage, smoothed
 from jumper_warp.optim.trajectory import Knots, Problem, Term
 from jumper_warp.robot.motors import FilterCfg, horizontal_jump_filter, jumping_motors, vertical_jump_filter

@@ -57,6 +57,8 @@ class EvaluationArgs:
     """[1] Scales of kp and kd of all motors (default: 1, or drawn if randomised)."""
     friction: float | None = None
     """[1] Of the paws, static and dynamic (default: nominal, or drawn if randomised)."""
+    robot: Path | None = None
+    """Robot overlay, as `jumper sysid` writes it (default: that of the training, if it had one)."""
     seed: int = 0
     """Of what is drawn."""
     record: int = 1
@@ -82,6 +84,7 @@ def conditions_of(args: EvaluationArgs) -> Conditions:
     """Return the conditions that an experiment's flags ask for. Raises InputError: one is out of range."""
     same = (
         "solver", "randomize", "seed", "device", "threads", "gravity", "push_in_flight", "latency", "gains", "friction",
+        "robot",
     )  # fmt: skip
     return Conditions(noise=args.randomize, **{name: getattr(args, name) for name in same})
 
@@ -122,6 +125,7 @@ class Run(ABC):
             words.append(f"latency {latency_text(self._latency[0], self._physics_dt)}")
         words += [] if conditions.gains is None else ["kp x {:g}, kd x {:g}".format(*conditions.gains)]
         words += [] if conditions.friction is None else [f"friction {conditions.friction:g}"]
+        words += [] if conditions.robot is None else [f"robot of {conditions.robot.name}"]
         return ", ".join(words + (["pushed in flight too"] if conditions.push_in_flight else []))
 
     @property
@@ -133,6 +137,7 @@ class Run(ABC):
             values["push_in_flight"] = conditions.push_in_flight
         values |= {} if conditions.gains is None else {"gains": list(conditions.gains)}
         values |= {} if conditions.friction is None else {"friction": conditions.friction}
+        values |= {} if conditions.robot is None else {"robot": str(conditions.robot)}
         if self._latency:
             values |= latency_metrics(np.concatenate(self._latency), self._physics_dt, conditions.latency)
         return values

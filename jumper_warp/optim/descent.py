@@ -1,220 +1,170 @@
-"""Descent of many starts at once: limited-memory BFGS in a box, inside an augmented Lagrangian.
-
-Every start keeps its own curvature, step length and multipliers. Step lengths are tried side by side, as worlds of one
-rollout, with a few random steps among them, which lead over the kinks that contacts make. Nocedal and Wright, Numerical
-Optimization, 2nd edition: algorithm 7.4 (two loops) and section 17.4 (augmented Lagrangian).
-"""
+"""The way from the described robot to the minimum: motions one after another, and few Jacobians."""
 
 from __future__ import annotations
 
+import itertools
 import time
-from collections.abc import Callable
-from dataclasses import dataclass, field
+from collections.abc import Sequence
 
 import numpy as np
-import torch
 
-from jumper_warp.optim.trajectory import Problem, Values
-from jumper_warp.utils.errors import InputError
+from jumper_warp.optim.findings import Step
+from jumper_warp.optim.least_squares import Knowledge, LeastSquares, Linearised, Normal, Point, Trial
+from jumper_warp.optim.motions import Motion
+from jumper_warp.optim.parameters import ParameterSet
+from jumper_warp.optim.replay import Replay
+from jumper_warp.optim.residuals import MotionResiduals, NoiseLevels, NothingMeasured
+from jumper_warp.robot.description import RobotDescription
 
-LENGTHS = (2.0, 1.0, 0.5, 0.2, 0.06, 0.02)
-"""[1] Of the direction's step, tried side by side."""
-RANDOM = 2
-"""Random steps beside them."""
-MEMORY = 8
-"""Pairs of steps and changes of the gradient that a start remembers."""
-LARGEST, SMALLEST = 0.5, 1.0e-3
-"""[1] Bounds of the largest entry of a step of length 1."""
-OUTER = 15
-"""Iterations from one update of the multipliers to the next."""
-PENALTY, GROWTH, MOST_PENALTY = 20.0, 2.0, 2.0e4
-"""[1] Of squared constraints at the beginning, its growth where they do not shrink, its bound."""
-FEASIBLE = 1.0e-3
-"""[1] Constraints up to here are satisfied."""
-
-
-@dataclass
-class Progress:
-    """What a descent found."""
-
-    x: np.ndarray
-    """(starts, n) Best feasible candidate of each start; where there is none, the least infeasible."""
-    objective: np.ndarray
-    """(starts,) Infinite where no candidate was feasible."""
-    violation: np.ndarray
-    """(starts,) Largest constraint, at least 0."""
-    history: list[dict[str, float]] = field(default_factory=list)
-    """By iteration: seconds, simulated and reverse policy steps, best feasible objective."""
-
-    @property
-    def best(self) -> int:
-        """Return the index of the best start."""
-        return int(np.argmin(np.where(np.isfinite(self.objective), self.objective, 1.0e12 + self.violation)))
+PIECE = 0.25
+"""[s] Length of the pieces that motions without a held base are first cut into."""
+WORTH_A_STEP = 0.02
+"""Relative decrease of the cost below which the steps of all stages but the last end."""
+CONVERGED = 0.5
+"""Decrease of the cost, in mean squared residuals, below which the optimisation ends: 1 is what one deviation costs."""
+AS_PROMISED = 0.3
+"""Share of the promised decrease with which a step is good enough for another one with the same Jacobian."""
+HORIZONS = (0.4, 0.7, 1.0)
+"""Shares of a motion on the ground that are taken one after another: what a paw's stroke does depends on all before."""
+ATTEMPTS = 2
+STUCK = 20.0
+"""Decrease of the cost that the last steps promise but do not bring where kinks of contact hold them: the motions are
+then taken one after another again, from there."""
+MOST_STEPS = 40
+"""In one stage."""
 
 
-def minimise(
-    problem: Problem,
-    begin: np.ndarray,
-    *,
-    iterations: int = 100,
-    lower: float = -1.0,
-    upper: float = 1.0,
-    step: float = 0.1,
-    seed: int = 0,
-    enough: Callable[[Progress], bool] | None = None,
-) -> Progress:
-    """Return what was found from some starts.
+class Descent:
+    """An optimisation: the steps that it took, and what they cost."""
+
+    def __init__(self, replay: Replay):
+        """Start the clocks."""
+        self.replay, self.steps, self.stage = replay, [], 0
+        self.promised = 0.0
+        """Decrease of the cost that the last steps promised when they ended, but did not bring."""
+        self._begun = (time.perf_counter(), time.process_time(), replay.world_steps)
+
+    def spent(self) -> tuple[float, float, int]:
+        """Return wall time [s], CPU time [s] and physics steps of all worlds."""
+        seconds, cpu, steps = self._begun
+        return time.perf_counter() - seconds, time.process_time() - cpu, self.replay.world_steps - steps
+
+    def note(self, problem: LeastSquares, trial: Trial) -> None:
+        """Record a step."""
+        seconds, _, count = self.spent()
+        self.steps.append(Step(self.stage, trial.cost / problem.count, trial.damping, count, seconds))
+
+    def steps_down(
+        self, problem: LeastSquares, point: Point, normal: Normal, worth: float | None = None
+    ) -> tuple[Point, Normal]:
+        """Take steps until one gains less than a share `worth` of the cost; None: until a new Jacobian gains nothing.
+
+        A Jacobian serves for as many steps as go nearly as it promises; each corrects it by what it saw (Broyden).
+        """
+        fresh, self.stage = worth is not None, self.stage + 1
+        for _ in range(MOST_STEPS):
+            least = max((worth or 0.0) * normal.cost, CONVERGED * max(1.0, normal.data_cost / problem.count))
+            trial = problem.step(point, normal, bend=fresh)
+            self.note(problem, trial)
+            gain = normal.cost - trial.cost
+            self.promised = trial.promise - gain
+            if gain < least and (fresh or (worth is not None and trial.promise < least)):
+                return trial.point, problem.assemble(trial.point, problem.known_at(trial.residuals, normal.linearised))
+            fresh = gain < max(least, AS_PROMISED * trial.promise)
+            normal = problem.normal(trial.point) if fresh else problem.secant(normal, point, trial)
+            point = trial.point
+        return point, normal
+
+
+def descend(
+    descent: Descent,
+    parameters: ParameterSet,
+    motions: Sequence[Sequence[MotionResiduals]],
+    pieces: Sequence[MotionResiduals],
+    knowledge: Sequence[Knowledge],
+) -> tuple[LeastSquares, Point, Normal]:
+    """Return the minimum, and the normal equations there.
+
+    Motions with a held base come first: their legs do not feel each other. The others follow, next the one that is
+    explained best by then; residuals that stand out count less (a paw that strikes 1 ms late is all wrong for a
+    moment). At last all residuals count fully.
 
     Args:
-        problem: What is minimised.
-        begin: Candidates (starts, n).
-        iterations: Each of one gradient and `len(LENGTHS) + RANDOM` simulations a start.
-        lower, upper: Bounds of all entries.
-        step: [1] Largest entry of the first steps.
-        seed: Of the random steps.
-        enough: Ends the descent when it is true of what was found so far.
+        descent: To record the steps.
+        parameters: What is unknown.
+        motions: All, as the first stages and as the last ones take them: the physics steps may differ.
+        pieces: Motions in short pieces for a first stage; none: without.
+        knowledge: Of the robot besides the motions.
 
-    Raises InputError for starts of another shape.
+    Raises:
+        InputError: the model cannot follow a motion.
     """
-    if begin.ndim != 2 or begin.shape[1] != len(problem.knots) or len(begin) < 1:
-        raise InputError(f"starts must have shape (starts, {len(problem.knots)}), got {begin.shape}")
-    descent = _Descent(problem, begin, lower, upper, step, seed)
-    started = time.perf_counter()
-    for number in range(iterations):
-        descent.iterate(number)
-        progress = descent.progress
-        progress.history.append(
-            {
-                "seconds": time.perf_counter() - started,
-                "world_steps": float(problem.world_steps),
-                "reverse_steps": float(problem.reverse_steps),
-                "objective": float(progress.objective.min()),
-            }
-        )
-        if enough is not None and enough(progress):
+    replay, (rough, whole) = descent.replay, motions
+    z = np.zeros(len(parameters))
+    if pieces:
+        problem = LeastSquares(parameters, pieces, replay, knowledge, robust=True)
+        begin = problem.expected()
+        z = descent.steps_down(problem, begin, problem.normal(begin), worth=0.1)[0].z
+    best = None
+    for _ in range(ATTEMPTS):
+        point, linearised = one_after_another(descent, parameters, rough, knowledge, z)
+        final = LeastSquares(parameters, whole, replay, knowledge)
+        if whole is not rough:
+            linearised = final.known_at(final.residuals(point), linearised)
+        point, normal = descent.steps_down(final, point, final.assemble(point, linearised))
+        if best is None or normal.cost < best[2].cost:
+            best = final, point, normal
+        if descent.promised < STUCK * max(1.0, normal.data_cost / final.count):
             break
-    return descent.progress
+        z = point.z
+    return best
 
 
-class _Descent:
-    """The state of all starts; tensors (starts, ...)."""
+def one_after_another(
+    descent: Descent,
+    parameters: ParameterSet,
+    motions: Sequence[MotionResiduals],
+    knowledge: Sequence[Knowledge],
+    z: np.ndarray,
+) -> tuple[Point, list[Linearised]]:
+    """Return where all motions together lead, taken one after another from parameters z, and their Jacobians there."""
+    point, normal, taken = Point(z, []), None, []
+    while len(taken) < len(motions):
+        left = [i for i in range(len(motions)) if i not in taken]
+        held = [i for i in left if not motions[i].free]
+        new = held or [min(left, key=lambda i: misfit(motions[i], descent.replay, point.z))]
+        point = Point(point.z, point.starts + [np.zeros(motions[i].start_size) for i in new])
+        for part in (1.0,) if held else HORIZONS:
+            begun = [motions[i] for i in taken] + [motions[i].until(part) for i in new]
+            problem = LeastSquares(parameters, begun, descent.replay, knowledge, robust=True)
+            normal = problem.normal(point, normal.linearised[: len(taken)] if normal else ())
+            point, normal = descent.steps_down(problem, point, normal, WORTH_A_STEP)
+        taken += new
+    order = np.argsort(taken)
+    return Point(point.z, [point.starts[i] for i in order]), [normal.linearised[i] for i in order]
 
-    def __init__(self, problem: Problem, begin: np.ndarray, lower: float, upper: float, step: float, seed: int):
-        real = torch.float64 if problem.double else torch.float32
-        self.problem, self.lower, self.upper = problem, lower, upper
-        device = str(problem.rollout(len(begin)).device)
-        self.x = torch.as_tensor(begin, dtype=real, device=device).clamp(lower, upper)
-        self.step = torch.full((len(begin),), step, dtype=real, device=device)
-        self.rng = np.random.default_rng(seed)
-        self.pairs: list[tuple[torch.Tensor, torch.Tensor, torch.Tensor]] = []
-        self.multipliers: torch.Tensor | None = None
-        self.penalty = self.x.new_full((len(begin),), PENALTY)
-        self.violation = self.x.new_full((len(begin),), torch.inf)
-        self.old: tuple[torch.Tensor, torch.Tensor] | None = None
-        self.progress = Progress(begin.copy(), np.full(len(begin), np.inf), np.full(len(begin), np.inf))
 
-    def merit(self, values: Values, repeat: int = 1) -> torch.Tensor:
-        """Return the augmented Lagrangian of candidates, `repeat` of each start."""
-        if self.multipliers is None:
-            self.multipliers = self.x.new_zeros(len(self.x), values.constraints.shape[1])
-        penalty = self.penalty[:, None].repeat_interleave(repeat, 0)
-        shift = self.multipliers.repeat_interleave(repeat, 0) / penalty
-        pressed = (values.constraints + shift).clamp_min(0.0)
-        return values.objective + 0.5 * (penalty * (pressed.square() - shift.square())).sum(1)
+def misfit(motion: MotionResiduals, replay: Replay, z: np.ndarray) -> float:
+    """Return the mean of ln(1 + r^2) of a motion's residuals from its expected start."""
+    found = motion.residuals(replay, z[None], np.zeros((1, motion.start_size)))
+    with np.errstate(over="ignore"):
+        return float(np.mean(np.log1p(np.nan_to_num(found, posinf=1.0e100) ** 2)))
 
-    def iterate(self, number: int) -> None:
-        """Make a step of every start."""
-        values, gradient = self.problem.gradient(self.x, self.merit)
-        self._note(self.x, values, 1)
-        if number and number % OUTER == 0:
-            self._update_multipliers(values)
-            values, gradient = self.problem.gradient(self.x, self.merit)
-            self.old = None
-        self._remember(gradient)
-        direction = self._direction(gradient)
-        size = direction.abs().amax(1).clamp_min(1.0e-12)
-        direction *= torch.minimum(torch.ones_like(size), self.step / size)[:, None]
-        lengths = self.x.new_tensor(LENGTHS)
-        drawn = self.rng.normal(size=(len(self.x), RANDOM, self.x.shape[1]))
-        noise = torch.as_tensor(drawn, dtype=self.x.dtype, device=self.x.device)
-        steps = torch.cat(
-            [lengths[None, :, None] * direction[:, None], 0.3 * self.step[:, None, None] * noise + direction[:, None]],
-            1,
-        )
-        count = steps.shape[1]
-        tried = (self.x[:, None] + steps).clamp(self.lower, self.upper)
-        flat = tried.flatten(0, 1)
-        with torch.no_grad():
-            found = self.problem.evaluate(flat)
-        self._note(flat, found, count)
-        merits = self.merit(found, count).unflatten(0, (-1, count))
-        merits = torch.where(merits.isnan(), torch.inf, merits)
-        best, chosen = merits.min(1)
-        better = best < self.merit(values)
-        worlds = torch.arange(len(self.x), device=self.x.device)
-        self.old = (self.x, gradient)
-        self.x = torch.where(better[:, None], tried[worlds, chosen], self.x)
-        factor = torch.where(chosen == 0, 2.0, torch.where(chosen <= 2, 1.0, 0.6))
-        factor = torch.where(chosen >= len(LENGTHS), 0.9, factor)
-        self.step = (self.step * torch.where(better, factor, 0.3)).clamp(SMALLEST, LARGEST)
 
-    def _remember(self, gradient: torch.Tensor) -> None:
-        """Keep the last step and the change of the gradient, where the curvature along it was positive."""
-        if self.old is None:
-            return
-        moved, change = self.x - self.old[0], gradient - self.old[1]
-        product = (moved * change).sum(1)
-        good = product > 1.0e-9 * moved.norm(dim=1) * change.norm(dim=1)
-        self.pairs = [*self.pairs[1 - MEMORY :], (moved, change, torch.where(good, 1.0 / product, 0.0))]
+def pieces_of(
+    motion: Motion, parameters: ParameterSet, noise: NoiseLevels, description: RobotDescription, dt: float | None
+) -> list[MotionResiduals]:
+    """Return a motion in pieces of about `PIECE`, those without measurements left out."""
+    rows = len(motion.time)
+    number = max(1, min(round(motion.duration / PIECE), rows // 4))
+    edges = [round(rows * i / number) for i in range(number + 1)]
+    found = []
+    for span in itertools.pairwise(edges):
+        try:
+            found.append(MotionResiduals(motion, parameters, noise, description, dt, span))
+        except NothingMeasured:
+            continue
+    return found
 
-    def _direction(self, gradient: torch.Tensor) -> torch.Tensor:
-        """Return descent directions; entries that would leave the box stay."""
-        out = ((self.x <= self.lower) & (gradient > 0.0)) | ((self.x >= self.upper) & (gradient < 0.0))
-        free = torch.where(out, 0.0, gradient)
-        d, kept = free, []
-        for moved, change, inverse in reversed(self.pairs):
-            share = inverse * (moved * d).sum(1)
-            d = d - share[:, None] * change
-            kept.append(share)
-        scale = torch.ones_like(self.step)
-        for moved, change, inverse in self.pairs:
-            scale = torch.where(inverse > 0.0, (moved * change).sum(1) / change.square().sum(1).clamp_min(1e-30), scale)
-        d = scale[:, None] * d
-        for (moved, change, inverse), share in zip(self.pairs, reversed(kept), strict=True):
-            d = d + (share - inverse * (change * d).sum(1))[:, None] * moved
-        d = torch.where(out, 0.0, -d)
-        uphill = (d * free).sum(1) >= 0.0
-        d = torch.where(uphill[:, None], -free, d)
-        # without curvature a gradient says nothing of the length: the step's
-        plain = uphill | (torch.stack([pair[2] for pair in self.pairs]).sum(0) == 0.0 if self.pairs else uphill | True)
-        largest = d.abs().amax(1).clamp_min(1.0e-12)
-        return torch.where(plain[:, None], d * (self.step / largest)[:, None], d)
 
-    def _update_multipliers(self, values: Values) -> None:
-        """Update multipliers, and penalties where constraints did not shrink."""
-        assert self.multipliers is not None
-        worst = values.constraints.clamp_min(0.0).amax(1) if values.constraints.shape[1] else self.violation * 0.0
-        self.multipliers = (self.multipliers + self.penalty[:, None] * values.constraints).clamp_min(0.0)
-        slow = (worst > 0.5 * self.violation) & (worst > FEASIBLE)
-        self.penalty = torch.where(slow, GROWTH * self.penalty, self.penalty).clamp_max(MOST_PENALTY)
-        self.violation = worst
-
-    def _note(self, x: torch.Tensor, values: Values, count: int) -> None:
-        """Keep the best candidates; `count` of each start."""
-        objective = values.objective.cpu().numpy().reshape(-1, count)
-        found = values.constraints.cpu().numpy()
-        worst = (found.max(axis=1, initial=0.0)).reshape(-1, count)
-        candidates = x.detach().cpu().numpy().reshape(len(objective), count, -1)
-        bad = ~np.isfinite(objective)
-        feasible = np.where(bad | (worst > FEASIBLE), np.inf, objective)
-        here, progress, starts = feasible.argmin(1), self.progress, np.arange(len(objective))
-        least = np.where(bad, np.inf, worst).argmin(1)
-        for start in starts:
-            if feasible[start, here[start]] < progress.objective[start]:
-                progress.objective[start] = feasible[start, here[start]]
-                progress.violation[start] = worst[start, here[start]]
-                progress.x[start] = candidates[start, here[start]]
-            elif not np.isfinite(progress.objective[start]):
-                i = least[start]
-                if not bad[start, i] and worst[start, i] < progress.violation[start]:
-                    progress.violation[start], progress.x[start] = worst[start, i], candidates[start, i]
+__all__ = ["Descent", "Linearised", "descend", "pieces_of"]

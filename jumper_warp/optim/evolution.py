@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
+from jumper_warp.optim.descent import Descent
 from jumper_warp.optim.findings import Identification, Step
-from jumper_warp.optim.identification import End, channel_fits, result
+from jumper_warp.optim.identification import result
 from jumper_warp.optim.least_squares import Knowledge, LeastSquares, Point
 from jumper_warp.optim.motions import Motion
 from jumper_warp.optim.parameters import ParameterSet
@@ -47,24 +47,22 @@ def identify_by_evolution(
         raise InputError("CMA-ES needs the package cma, which is not installed: pip install cma") from None
     if not motions or not max_seconds > 0.0 or population < 4:
         raise InputError("evolution needs motions, a time above 0 s and a population of at least 4")
-    started, cpu = time.perf_counter(), time.process_time()
     replay = Replay(max(population, len(parameters) + 37), description=description, device=device, threads=threads)
     whole = [MotionResiduals(motion, parameters, noise or NoiseLevels(), replay.description, dt) for motion in motions]
     problem = LeastSquares(parameters, whole, replay, knowledge)
-    point, steps = problem.expected(), []
-    nominal = channel_fits(problem, point)
+    point, descent = problem.expected(), Descent(replay)
     low, high = parameters.bounds()
     options = {"popsize": population, "seed": seed + 1, "verbose": -9, "bounds": [low, high]}
     search = cma.CMAEvolutionStrategy(point.z, BEGIN, options)
     starts = [np.repeat(start[None], population, axis=0) for start in point.starts]
     best, cost = point.z, np.inf
-    while time.perf_counter() - started < max_seconds and not search.stop():
+    while descent.spent()[0] < max_seconds and not search.stop():
         candidates = np.array(search.ask())
         costs = problem.costs(candidates, starts)
         search.tell(list(candidates), list(np.where(np.isfinite(costs), costs, 1.0e12)))
         if costs.min() < cost:
             best, cost = candidates[int(np.argmin(costs))], float(costs.min())
-        spent = time.perf_counter() - started
-        steps.append(Step(0, cost / problem.count, 0.0, replay.world_steps, spent))
+        seconds, _, count = descent.spent()
+        descent.steps.append(Step(0, cost / problem.count, 0.0, count, seconds))
     point = Point(np.clip(best, low, high), point.starts)
-    return result(problem, [End(cost, point, problem.normal(point))], nominal, steps, (started, cpu, 0))
+    return result(problem, point, problem.normal(point), descent)

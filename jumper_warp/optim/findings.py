@@ -62,8 +62,6 @@ class Identification:
     systematic: np.ndarray
     """(P,) Standard deviations, normalised, from how channels of motions contradict each other; 0 if the model explains
     them."""
-    spread: np.ndarray
-    """(P,) Differences, normalised, of two ends of the optimisation, begun from different starts."""
     chi2: float
     """Mean squared weighed residual of the data."""
     nominal_chi2: float
@@ -90,9 +88,9 @@ class Identification:
 
     @property
     def deviations(self) -> np.ndarray:
-        """Standard deviations in deviations of the prior, errors of model and optimiser included, at most 1, (P,)."""
+        """Standard deviations in deviations of the prior, errors of the model included, at most 1, (P,)."""
         noise = self.mismatch * np.sqrt(np.diag(self.covariance))
-        return np.minimum(np.hypot(np.maximum(noise, self.systematic), self.spread), 1.0)
+        return np.minimum(np.maximum(noise, self.systematic), 1.0)
 
     @property
     def intervals(self) -> np.ndarray:

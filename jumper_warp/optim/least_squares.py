@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -14,16 +15,18 @@ from jumper_warp.optim.residuals import DIFFERENCE, Linearised, MotionResiduals
 from jumper_warp.robot.values import RobotValues
 from jumper_warp.utils.errors import InputError
 
-DAMPINGS = np.array([0.0, 1.0e-5, 1.0e-4, 3.0e-4, 1.0e-3, 3.0e-3, 1.0e-2, 1.0e-1, 1.0, 10.0])
+DAMPINGS = np.array([0.0, 1.0e-3, 1.0e-2, 1.0e-1, 1.0])
 """Relative to the diagonal of the normal matrix; all are tried in each step."""
 ROBUST = 3.0
 """Residuals beyond so many times the typical one count less and less while the optimisation is robust (Cauchy)."""
 PROBE = 0.3
 """Share of a step after which its curvature is measured."""
-CHANGE = 0.3
+BLOCK = 16
+"""Rows of a block of a sum of products."""
+CHANGE = 0.01
 """Step of a difference, in deviations that the data alone would leave to the unknown, the others known: small against
 what matters, large against the kinks of friction and contact."""
-LARGEST_CHANGE = 0.1
+LARGEST_CHANGE = 0.01
 """The same at most, in deviations of the prior."""
 
 
@@ -97,6 +100,30 @@ class Normal:
         return move, [-both[:, -1] - both[:, :-1] @ move[free] for both in solved]
 
 
+def gram(left: np.ndarray, right: np.ndarray) -> np.ndarray:
+    """Return left.T @ right of tall arrays, (m, a) and (m, b), summed in blocks.
+
+    The bits depend on no number of threads, and blocks this small take one, which need not wait for another.
+    """
+    found = np.zeros((left.shape[1], right.shape[1]))
+    for row in range(0, len(left), BLOCK):
+        found += left[row : row + BLOCK].T @ right[row : row + BLOCK]
+    return found
+
+
+class Trial(NamedTuple):
+    """Where a step leads."""
+
+    point: Point
+    cost: float
+    damping: float
+    """Infinite if the point stays."""
+    promise: float
+    """Decrease of the cost that the undamped step would bring if everything were linear."""
+    residuals: list[np.ndarray]
+    """(m,) of each motion."""
+
+
 class LeastSquares:
     """The problem: motions, parameters with priors, further knowledge, and the worlds that evaluate them."""
 
@@ -124,22 +151,31 @@ class LeastSquares:
         """Return the point where all unknowns are as expected."""
         return Point(np.zeros(len(self.parameters)), [np.zeros(motion.start_size) for motion in self.motions])
 
-    def normal(self, point: Point) -> Normal:
-        """Return the normal equations at a point. Raises InputError if it cannot be simulated."""
-        size = len(self.parameters)
-        eye = float(point.z @ point.z) + sum(float(start @ start) for start in point.starts)
-        normal = Normal(eye, 0.0, point.z.copy(), np.zeros((size, size)), [], [], [], [], [])
-        for motion, start, change in zip(self.motions, point.starts, self._change, strict=True):
+    def normal(self, point: Point, known: Sequence[Linearised] = ()) -> Normal:
+        """Return the normal equations at a point; known: what the first motions have there already.
+
+        Raises InputError if it cannot be simulated.
+        """
+        linearised = list(known)
+        for motion, start, change in list(zip(self.motions, point.starts, self._change, strict=True))[len(known) :]:
             found = motion.linearise(self.replay, point.z, start, change)
             if not np.isfinite(found.residual).all() or not np.isfinite(found.jacobian).all():
                 raise InputError(f"motion {motion.motion.name}: the model breaks in it; check targets, units and base")
-            normal.linearised.append(found)
+            linearised.append(found)
+        return self.assemble(point, linearised)
+
+    def assemble(self, point: Point, linearised: Sequence[Linearised]) -> Normal:
+        """Return the normal equations of residuals and Jacobians of all motions at a point."""
+        size = len(self.parameters)
+        eye = float(point.z @ point.z) + sum(float(start @ start) for start in point.starts)
+        normal = Normal(eye, 0.0, point.z.copy(), np.zeros((size, size)), [], [], [], list(linearised), [])
         if self.robust:
-            every = np.concatenate([found.residual for found in normal.linearised])
+            every = np.concatenate([found.residual for found in linearised])
             self._typical = max(1.0, float(np.median(np.abs(every))) / 0.6745)
-        for found, start, change in zip(normal.linearised, point.starts, self._change, strict=True):
+        for found, start, change in zip(linearised, point.starts, self._change, strict=True):
             weight = self._weight(found.residual)
-            square, slope = found.jacobian.T * weight @ found.jacobian, found.jacobian.T @ (weight * found.residual)
+            square = gram(weight[:, None] * found.jacobian, found.jacobian)
+            slope = np.einsum("mi,m->i", found.jacobian, weight * found.residual)
             normal.weights.append(weight)
             change[:] = np.clip(CHANGE / np.sqrt(1.0 + np.diag(square)), DIFFERENCE, LARGEST_CHANGE)
             normal.data_cost += float(np.sum(self._loss(found.residual)))
@@ -154,6 +190,31 @@ class LeastSquares:
             normal.cost += residual**2
         normal.cost += normal.data_cost
         return normal
+
+    def secant(self, normal: Normal, old: Point, trial: Trial) -> Normal:
+        """Return the normal equations where a step led, with Jacobians that explain what residuals did (Broyden).
+
+        Unknowns count by their curvature.
+        """
+        linearised, new = [], trial.point
+        parts = zip(normal.linearised, trial.residuals, old.starts, new.starts, normal.start_matrices, strict=True)
+        for found, residual, before, after, own in parts:
+            move = np.concatenate([new.z - old.z, after - before])
+            along = np.concatenate([np.diag(normal.matrix) + 1.0, np.diag(own)]) * move
+            along /= max(float(move @ along), 1.0e-300)
+            surprise = residual - found.residual - np.einsum("mi,i->m", found.jacobian, move)
+            linearised.append(Linearised(residual, found.jacobian + surprise[:, None] * along))
+        return self.assemble(new, linearised)
+
+    @staticmethod
+    def known_at(residuals: Sequence[np.ndarray], known: Sequence[Linearised]) -> list[Linearised]:
+        """Return residuals (m,) of each motion with the Jacobians of another point, or of another physics step."""
+        return [Linearised(residual, old.jacobian) for residual, old in zip(residuals, known, strict=True)]
+
+    def residuals(self, point: Point) -> list[np.ndarray]:
+        """Return the residuals (m,) of each motion."""
+        starts = [start[None] for start in point.starts]
+        return [found[:, 0] for found in self._costs(point.z[None], starts)[1]]
 
     def _weight(self, residual: np.ndarray) -> np.ndarray:
         """Return the weights of residuals."""
@@ -178,34 +239,52 @@ class LeastSquares:
 
     def costs(self, z: np.ndarray, starts: Sequence[np.ndarray]) -> np.ndarray:
         """Return the cost of K points, (K, P) and (K, I) of each motion; infinite where a world broke."""
+        return self._costs(z, starts)[0]
+
+    def _costs(self, z: np.ndarray, starts: Sequence[np.ndarray]) -> tuple[np.ndarray, list[np.ndarray]]:
+        """Return the cost of K points, and the residuals of each motion, (m, K)."""
         cost = np.sum(z**2, axis=1) + sum(np.sum(start**2, axis=1) for start in starts)
-        robots = self.parameters.robots(z, self.replay.description)
+        robots, residuals = self.parameters.robots(z, self.replay.description), []
         for piece in self.knowledge:
             cost += ((piece.measure(robots) - piece.value) / piece.deviation) ** 2
         for motion, start in zip(self.motions, starts, strict=True):
             found = motion.residuals(self.replay, z, start)
             with np.errstate(over="ignore", invalid="ignore"):
                 cost += np.sum(self._loss(found), axis=0)
-        return np.where(np.isfinite(cost), cost, math.inf)
+            residuals.append(found)
+        return np.where(np.isfinite(cost), cost, math.inf), residuals
 
-    def step(self, point: Point, normal: Normal) -> tuple[Point, float, float]:
-        """Return the best of the points that the dampings lead to, its cost and its damping.
+    def step(self, point: Point, normal: Normal, bend: bool = True) -> Trial:
+        """Return the best of the points that the dampings lead to.
 
-        Each step is tried as it is and bent along the curvature of the residuals (geodesic acceleration). The point
-        stays, with an infinite damping, if none is better.
+        Each step is tried as it is and, if wanted, bent along the curvature of the residuals (geodesic acceleration).
+        The point stays, with an infinite damping, if none is better.
         """
-        stuck = (point.z <= self._low) & (normal.gradient > 0.0) | (point.z >= self._high) & (normal.gradient < 0.0)
-        free = np.flatnonzero(~stuck)
-        plain = [normal.solve(damping, free, normal.gradient, normal.start_gradients) for damping in DAMPINGS]
-        moves = plain + self._bent(point, normal, free, plain)
+        free = self._free(point.z, normal.gradient)
+        moves = [normal.solve(damping, free, normal.gradient, normal.start_gradients) for damping in DAMPINGS]
+        move, starts = moves[0]
+        promise = -float(normal.gradient[free] @ move[free])
+        promise -= sum(float(g @ s) for g, s in zip(normal.start_gradients, starts, strict=True))
+        if bend:
+            moves = moves + self._bent(point, normal, free, moves)
         z = np.clip(point.z + np.array([move for move, _ in moves]), self._low, self._high)
         starts = [start + np.array([move[i] for _, move in moves]) for i, start in enumerate(point.starts)]
-        costs = self.costs(z, starts)
+        trial = self._best(z, starts, promise)
+        if not trial.cost < normal.cost:
+            return Trial(point, normal.cost, math.inf, promise, [found.residual for found in normal.linearised])
+        return trial
+
+    def _free(self, z: np.ndarray, gradient: np.ndarray) -> np.ndarray:
+        """Return the indices of the parameters that no bound stops."""
+        return np.flatnonzero(~((z <= self._low) & (gradient > 0.0) | (z >= self._high) & (gradient < 0.0)))
+
+    def _best(self, z: np.ndarray, starts: list[np.ndarray], promise: float) -> Trial:
+        """Return the best of K points."""
+        costs, residuals = self._costs(z, starts)
         best = int(np.argmin(costs))
-        if not costs[best] < normal.cost:
-            return point, normal.cost, math.inf
+        moved = Point(z[best], [start[best] for start in starts])
         damping = float(DAMPINGS[best % len(DAMPINGS)])
-        return Point(z[best], [start[best] for start in starts]), float(costs[best]), damping
+        return Trial(moved, float(costs[best]), damping, promise, [found[:, best] for found in residuals])
 
     def _bent(
         self, point: Point, normal: Normal, free: np.ndarray, plain: list[tuple[np.ndarray, list[np.ndarray]]]
@@ -222,8 +301,9 @@ class LeastSquares:
             found = motion.residuals(self.replay, ahead, point.starts[i] + PROBE * move)
             both = np.concatenate([ahead - point.z, PROBE * move], axis=1)
             with np.errstate(invalid="ignore", over="ignore"):
-                curvature = (found - linear.residual[:, None] - linear.jacobian @ both.T) / PROBE**2
-                slope = linear.jacobian.T @ (weight[:, None] * curvature)
+                straight = np.einsum("mi,ki->mk", linear.jacobian, both)
+                curvature = (found - linear.residual[:, None] - straight) / PROBE**2
+                slope = gram(linear.jacobian, weight[:, None] * curvature)
             gradient += slope[:size]
             of_starts.append(slope[size:])
         bent = []

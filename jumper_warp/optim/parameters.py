@@ -60,6 +60,11 @@ class Parameter:
         """The leg whose motor alone it acts on; None if it acts on more."""
         return self.places[0] // 3 if self.quantity in MOTOR_QUANTITIES and len(self.places) == 1 else None
 
+    @property
+    def growth(self) -> float:
+        """Change of the normalised coordinate per relative change of the nominal value."""
+        return (1.0 if self.scale == "ratio" else self.nominal) / self.prior
+
     def value(self, z: np.ndarray) -> np.ndarray:
         """Return the value [unit] of normalised coordinates."""
         if self.scale == "ratio":
@@ -171,21 +176,33 @@ def ratio(
     return Parameter(name, quantity, tuple(places), unit, nominal, prior, (nominal / wide, nominal * wide), group=group)
 
 
+def share(
+    name: str, quantity: str, places: Sequence[int], unit: str, nominal: float, prior: float, group: str
+) -> Parameter:
+    """Return a positive parameter known to a share `prior` of its value; its bounds are five deviations.
+
+    Equations of motion are linear in masses, gains and armature: combinations that the motions do not tell apart lie
+    along straight lines, which steps of the optimiser follow.
+    """
+    low, high = nominal * max(1.0 - 5.0 * prior, 0.1), nominal * (1.0 + 5.0 * prior)
+    return Parameter(name, quantity, tuple(places), unit, nominal, prior * nominal, (low, high), "absolute", group)
+
+
 def motor_parameters(robot: RobotDescription) -> tuple[Parameter, ...]:
     """Return gains, armature, and limits of the motors."""
     found = []
     for quantity, prior in (("kp", 0.2), ("kd", 0.2)):
         found += [
-            ratio(f"{quantity}/{j}", quantity, (i,), "1", 1.0, prior, "motors") for i, j in enumerate(MOTOR_JOINTS)
+            share(f"{quantity}/{j}", quantity, (i,), "1", 1.0, prior, "motors") for i, j in enumerate(MOTOR_JOINTS)
         ]
     for i, joint in enumerate(MOTOR_JOINTS):
-        found.append(ratio(f"armature/{joint}", "armature", (i,), "kg m^2", robot.motors[i].armature, 0.25, "motors"))
+        found.append(share(f"armature/{joint}", "armature", (i,), "kg m^2", robot.motors[i].armature, 0.25, "motors"))
     for kind, places in (("lateral", LATERAL), ("transversal", TRANSVERSAL)):
         motor = robot.motors[places[0]]
         found += [
-            ratio(f"saturation/{kind}", "saturation", places, "1", 1.0, 0.1, "motors"),
-            ratio(f"cutoff_speed/{kind}", "cutoff_speed", places, "rad/s", motor.cutoff_speed, 0.1, "motors"),
-            ratio(f"no_load_speed/{kind}", "no_load_speed", places, "rad/s", motor.no_load_speed, 0.1, "motors"),
+            share(f"saturation/{kind}", "saturation", places, "1", 1.0, 0.1, "motors"),
+            share(f"cutoff_speed/{kind}", "cutoff_speed", places, "rad/s", motor.cutoff_speed, 0.1, "motors"),
+            share(f"no_load_speed/{kind}", "no_load_speed", places, "rad/s", motor.no_load_speed, 0.1, "motors"),
         ]
     return tuple(found)
 
@@ -193,15 +210,15 @@ def motor_parameters(robot: RobotDescription) -> tuple[Parameter, ...]:
 def mass_parameters(robot: RobotDescription) -> tuple[Parameter, ...]:
     """Return masses, centre of mass and inertia."""
     base = robot.links[0]
-    found = [ratio("base_mass", "base_mass", (0,), "kg", base.mass, 0.15, "masses")]
+    found = [share("base_mass", "base_mass", (0,), "kg", base.mass, 0.15, "masses")]
     for i, axis in enumerate("xyz"):
         c = float(base.com[i])
         found.append(
             Parameter(f"base_com/{axis}", "base_com", (i,), "m", c, 0.02, (c - 0.1, c + 0.1), "absolute", "masses")
         )
-    found.append(ratio("base_inertia", "base_inertia", (0,), "1", 1.0, 0.2, "masses"))
+    found.append(share("base_inertia", "base_inertia", (0,), "1", 1.0, 0.2, "masses"))
     found += [
-        ratio(f"link_mass/{kind}", "link_mass", (i,), "1", 1.0, 0.15, "masses") for i, kind in enumerate(LINK_KINDS)
+        share(f"link_mass/{kind}", "link_mass", (i,), "1", 1.0, 0.15, "masses") for i, kind in enumerate(LINK_KINDS)
     ]
     return tuple(found)
 

@@ -43,6 +43,8 @@ from kernels.layout import (
 MAX_SWEEPS = 60
 TOLERANCE = 1.0e-10
 """[m/s] Of the contact iteration, whose error differences inherit."""
+STEPS_A_GRAPH = 12
+"""Physics steps that one launch of a captured graph takes."""
 HELD_MASS = 2.0**30
 """[kg], [kg m^2] Of a base that is held: its weight is exact in single precision, so that a wrench cancels it."""
 _capturing = threading.Lock()
@@ -121,7 +123,7 @@ class Replay:
         self._motors.fade_start, self._motors.fade_end = OVERSPEED_START, OVERSPEED_END
         self._record = wp.zeros((0, 0, 0), dtype=real, device=self.device)
         self._schedule = wp.zeros((0, 0), dtype=real, device=self.device)
-        self._graphs: dict[tuple, tuple[Any, Any]] = {}
+        self._graphs: dict[tuple, list[tuple[int, Any]]] = {}
         self._load_kernels()
         self._no_force = wp.zeros(int(DOFS) * n, dtype=real, device=self.device)
         self._drive = self.dynamics.drive(self._no_force, self._wrench, self._motors, self._target)
@@ -193,17 +195,23 @@ class Replay:
             self._graphs.clear()
 
     def _replay(self, slot: int, worlds: Worlds, rows: int, stride: int, dt: float, lead: int) -> None:
-        """Run some of the worlds through all rows; a captured graph takes them from one row to the next."""
+        """Run some of the worlds through all rows; captured graphs take them through many rows, one row, the last."""
         key = (slot, worlds, stride, dt, lead)
         if key not in self._graphs:
             with _capturing:
-                with wp.ScopedCapture(device=self.device) as capture:
-                    self._next_row(slot, worlds, stride, dt, lead)
-                with wp.ScopedCapture(device=self.device) as last:
-                    self._note(slot, worlds, stride, lead)
-            self._graphs[key] = (capture.graph, last.graph)
-        onward, last = self._graphs[key]
-        for _ in range(rows - 1):
+                graphs = []
+                for count in (max(1, STEPS_A_GRAPH // stride), 1, 0):
+                    with wp.ScopedCapture(device=self.device) as capture:
+                        for _ in range(count):
+                            self._next_row(slot, worlds, stride, dt, lead)
+                        if not count:
+                            self._note(slot, worlds, stride, lead)
+                    graphs.append((max(count, 1), capture.graph))
+            self._graphs[key] = graphs
+        (many, run), (_, onward), (_, last) = self._graphs[key]
+        for _ in range((rows - 1) // many):
+            wp.capture_launch(run)
+        for _ in range((rows - 1) % many):
             wp.capture_launch(onward)
         wp.capture_launch(last)
 

@@ -174,7 +174,7 @@ def progress_plot(found: Identification) -> Any:
     axis = figure.subplots()
     for stage in sorted({step.stage for step in found.steps}):
         steps = [step for step in found.steps if step.stage == stage]
-        label = "whole motions" if stage == found.steps[-1].stage else "pieces"
+        label = "all, to the end" if stage == found.steps[-1].stage else f"stage {stage}"
         axis.semilogy([s.world_steps / 1e6 for s in steps], [s.chi2 for s in steps], "o-", label=label)
     axis.set(xlabel="million physics steps of all worlds", ylabel="χ² per value")
     axis.legend(fontsize=8)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -12,7 +13,7 @@ from jumper_warp.optim.motions import Motion
 from jumper_warp.optim.parameters import BASE_ONLY, ParameterSet
 from jumper_warp.optim.replay import Record, Replay, Starts, grid_steps
 from jumper_warp.optim.rotations import from_vector, multiply, rotate, to_vector
-from jumper_warp.optim.stance import stance
+from jumper_warp.optim.stance import levelled, levelling, stance
 from jumper_warp.robot.description import RobotDescription
 from jumper_warp.robot.values import RobotValues
 from jumper_warp.utils.checks import check_positive
@@ -25,12 +26,15 @@ LONGEST_LATENCY = 0.05
 SETTLING = 0.02
 """[s] From the start on, in which rows of a motion on the ground do not count: paws that do not stand on it exactly
 strike it, and when each does is a matter of micrometres."""
+QUIET_ROWS = 2
+QUIET = 0.2
+"""[rad/s] Mean rate over the first rows of a motion below which a robot that stands has all paws on the ground."""
 DEGREE = math.pi / 180.0
 TRUST = 3.0
 """Deviations of the noise by which a start may differ from what is measured there, so that it hardly counts twice."""
 HANGING_HEIGHT = 1.0
 """[m] Of a held base whose position is not told."""
-DIFFERENCE = 1.0e-4
+DIFFERENCE = 1.0e-5
 """Change of an unknown for its column of the Jacobian, in deviations of its prior."""
 
 
@@ -123,6 +127,10 @@ class MotionResiduals:
         self.start_size = 36 if self.free else 27
         self._measure(noise)
         self._guess_start(noise.of_channels)
+        if self.free and not self.resting:
+            self.valid[motion.time < motion.time[0] + SETTLING] = False
+        if not self.valid.any():
+            raise NothingMeasured(f"motion {motion.name}: nothing is measured that a replay could be compared to")
         self.plan = self._plan()
 
     def _measure(self, noise: NoiseLevels) -> None:
@@ -143,10 +151,6 @@ class MotionResiduals:
             first += width
         self.measured = np.concatenate(columns, axis=1) if columns else np.zeros((len(motion.time), 0))
         self.valid = np.isfinite(self.measured)
-        if self.free:
-            self.valid[motion.time < motion.time[0] + SETTLING] = False
-        if not self.valid.any():
-            raise NothingMeasured(f"motion {motion.name}: nothing is measured that a replay could be compared to")
         self.sigma, self._leg = np.array(sigma), np.array(legs)
 
     def _guess_start(self, noise: dict[str, tuple[float, int]]) -> None:
@@ -161,7 +165,7 @@ class MotionResiduals:
         quaternion = quaternion / np.linalg.norm(quaternion)
         tilt = np.full(3, math.radians(2.0 if motion.quaternion is not None else 5.0))
         velocity, base = np.zeros(3), []
-        self.standing = False
+        self.standing = self.resting = False
         if self.free:
             ground = stance(self.description, angle[None], rate[None])
             place[2] = ground.height[0]
@@ -175,8 +179,21 @@ class MotionResiduals:
             if self.standing:  # the ground says more than sensors
                 tilt = np.array([0.2 * DEGREE, 0.2 * DEGREE, tilt[2]])
                 base = [np.array([0.02, 0.02, 0.001]), np.full(3, 0.05), np.full(3, 0.3)]
+                self.resting = quiet(motion.rate)
+                self._levelling = levelling(self.description, angle)
         self._guess = Starts(*(x[None] for x in (place, quaternion, velocity, np.zeros(3), angle, rate)))
         self._start_prior = np.concatenate([angle_prior, rate_prior, tilt, *base])
+
+    def until(self, part: float) -> MotionResiduals:
+        """Return the first part of it, a share of its rows; the start is the same."""
+        if part >= 1.0:
+            return self
+        found = copy.copy(self)
+        end = max(3, round(part * len(self.motion.time)))
+        found.motion, found._place = self.motion.cut(0, end), self._place[:end]
+        found.rows = int(math.ceil(found._place[-1] - 1.0e-9)) + 1
+        found.measured, found.valid = self.measured[:end], self.valid[:end]
+        return found
 
     def starts(self, z: np.ndarray, robots: RobotValues) -> Starts:
         """Return the starts of normalised coordinates (N, I); true angles are readings less the robots' offsets.
@@ -187,6 +204,8 @@ class MotionResiduals:
         start = Starts(*(np.repeat(getattr(guess, name), len(z), axis=0) for name in vars(guess)))
         start.angle = start.angle + d[:, :12] - robots.offset
         start.rate = start.rate + d[:, 12:24]
+        if self.resting:
+            start.angle, start.rate = levelled(self.description, start.angle, start.rate, self._levelling)
         if self.standing:
             ground = stance(self.description, start.angle, start.rate)
             turned = rotate(start.quaternion, ground.up)  # to be brought to the vertical, about a level axis
@@ -274,6 +293,7 @@ class MotionResiduals:
         While the base is held the legs do not feel each other: unknowns of four legs share a world.
         """
         size, single, shared = len(self.parameters), [], {}
+        known = (24, 25, 29, 32, 33, 34) if self.resting else ()
         for i, parameter in enumerate(self.parameters):
             if self.free:
                 single.append([(i, None)])
@@ -283,11 +303,20 @@ class MotionResiduals:
                 else:
                     shared.setdefault((parameter.quantity, parameter.places[0] % 3), []).append((i, parameter.leg))
         for i in range(self.start_size):
+            if i in known:
+                continue
             if self.free or i >= 24:
                 single.append([(size + i, None)])
             else:
                 shared.setdefault(("start", i // 12, i % 3), []).append((size + i, i % 12 // 3))
         return [*single, *shared.values()]
+
+
+def quiet(rate: np.ndarray | None) -> bool:
+    """Return whether the joints hardly move in the first rows [rad/s]."""
+    if rate is None or np.isnan(rate[:QUIET_ROWS]).all(axis=0).any():
+        return False
+    return bool((np.abs(np.nanmean(rate[:QUIET_ROWS], axis=0)) < QUIET).all())
 
 
 def first_values(

@@ -10,6 +10,10 @@ from jumper_warp.robot.description import LEGS, RobotDescription, leg_dimensions
 
 STEP = 1.0e-6
 """[rad] Of differences of paw positions."""
+NORMAL_WEIGHT = 1.0e3
+"""Of the paws' velocities off the ground against those along it."""
+LEVELLING_STEPS = 6
+"""After which paws lie in one plane to rounding."""
 
 
 class Stance(NamedTuple):
@@ -67,6 +71,38 @@ def stance(description: RobotDescription, angle: np.ndarray, rate: np.ndarray) -
     # v + spin x p: columns of the spin are axis x p
     for i in range(3):
         cross[..., 3 + i] = np.cross(np.eye(3)[i], points)
+    # that no paw leaves the ground counts most
+    frame = np.eye(3) + NORMAL_WEIGHT * up[:, :, None] * up[:, None]
+    cross, motion = frame[:, None] @ cross, np.einsum("nij,nkj->nki", frame, motion)
     rows, target = cross.reshape(len(paws), 12, 6), -motion.reshape(len(paws), 12, 1)
     twist = np.linalg.solve(np.swapaxes(rows, 1, 2) @ rows, np.swapaxes(rows, 1, 2) @ target)[..., 0]
     return Stance(radius - plane[:, 2] / size, up, np.abs(off).max(axis=1), twist[:, :3], twist[:, 3:])
+
+
+def unevenness(description: RobotDescription, angle: np.ndarray) -> np.ndarray:
+    """Return how far the fourth paw is from the plane of the others [m], (N,), at motor angles (N, 12) [rad]."""
+    paws = paw_positions(description, angle)
+    across, along, other = (paws[:, k] - paws[:, 0] for k in (1, 2, 3))
+    normal = np.cross(across, along)
+    return np.einsum("ni,ni->n", other, normal) / np.linalg.norm(normal, axis=1)
+
+
+def levelling(description: RobotDescription, angle: np.ndarray) -> np.ndarray:
+    """Return the least change of motor angles, (12,) [rad/m], that lowers the unevenness at angles (12,) [rad]."""
+    ahead, behind = (unevenness(description, angle + sign * STEP * np.eye(12)) for sign in (1.0, -1.0))
+    slope = (ahead - behind) / (2.0 * STEP)
+    return slope / (slope @ slope)
+
+
+def levelled(
+    description: RobotDescription, angle: np.ndarray, rate: np.ndarray, change: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return motor angles [rad] and rates [rad/s], (N, 12), at which all paws lie and stay in one plane.
+
+    change: that the angles and rates take to get there, (12,) [rad/m].
+    """
+    for _ in range(LEVELLING_STEPS):
+        angle = angle - unevenness(description, angle)[:, None] * change
+    ahead, behind = (unevenness(description, angle + sign * STEP * rate) for sign in (1.0, -1.0))
+    slope = (unevenness(description, angle + STEP * change) - unevenness(description, angle - STEP * change)) / 2.0
+    return angle, rate - (0.5 * (ahead - behind) / slope)[:, None] * change

@@ -112,7 +112,7 @@ def weak_directions(parameters: ParameterSet, information: np.ndarray) -> tuple[
 
 def in_words(parameters: ParameterSet, vector: np.ndarray) -> str:
     """Return what a direction that the data leaves open means, and what would help."""
-    scale = np.array([1.0 / p.prior if p.quantity in TORQUE_SCALE else 0.0 for p in parameters])
+    scale = np.array([p.growth if p.quantity in TORQUE_SCALE else 0.0 for p in parameters])
     size = np.linalg.norm(scale)
     if np.count_nonzero(scale) > 1 and size > 0.0 and abs(scale @ vector) / size > 0.6:
         parts = sorted({p.quantity for p in parameters if p.quantity in TORQUE_SCALE}, key=TORQUE_SCALE.index)

@@ -8,12 +8,13 @@ import pytest
 
 from jumper_warp.optim.excitation import Scorer
 from jumper_warp.optim.identification import identify, total_mass, weighed
+from jumper_warp.optim.least_squares import gram
 from jumper_warp.optim.parameters import Parameter, ParameterSet, jumper_parameters
 from jumper_warp.optim.plans import KINDS, draw_plan
 from jumper_warp.optim.recording import measured, replay_plan, simulate_plan
 from jumper_warp.optim.replay import Replay
 from jumper_warp.optim.residuals import MotionResiduals, NoiseLevels
-from jumper_warp.optim.stance import paw_positions, stance
+from jumper_warp.optim.stance import paw_positions, stance, unevenness
 from jumper_warp.optim.uncertainty import weak_directions
 from jumper_warp.robot.description import load_description
 from jumper_warp.robot.model import standing_configuration
@@ -24,7 +25,7 @@ DEGREE = math.pi / 180.0
 
 @pytest.fixture(scope="module")
 def replay():
-    return Replay(40, threads=2)
+    return Replay(48, threads=2)
 
 
 def some_truth(parameters, seed=0):
@@ -75,6 +76,66 @@ def test_paws_are_where_the_model_has_them():
     assert np.linalg.norm(left) < np.linalg.norm(speed)
     other = base.velocity[:, None] + 0.01 + np.cross(base.spin[:, None], paws) + speed
     assert np.linalg.norm(left) < np.linalg.norm(other)
+
+
+@pytest.fixture(scope="module")
+def standing(replay):
+    """Return a short recorded chirp on the ground, of all parameters, and the truth."""
+    parameters, rng = jumper_parameters(["offsets"]), np.random.default_rng(4)
+    truth = some_truth(parameters)
+    robots = parameters.robots(truth)
+    plan = draw_plan("standing chirp", rng, seconds=0.5)
+    motion = measured(plan, "standing", replay_plan(replay, plan, robots), robots, rng)
+    return MotionResiduals(motion, parameters, NoiseLevels(), replay.description), truth
+
+
+def test_all_paws_touch_the_ground_at_every_start_of_a_standing_robot(standing, replay):
+    problem, truth = standing
+    rng = np.random.default_rng(0)
+    z = truth + 0.1 * rng.normal(size=(5, len(truth)))
+    starts = problem.starts(rng.normal(size=(5, problem.start_size)), problem.parameters.robots(z))
+    robot = replay.description
+    assert problem.resting
+    for later in (0.0, 1.0e-4):  # and none of them leaves it at once
+        angle = starts.angle + later * starts.rate
+        assert np.abs(unevenness(robot, angle)).max() < (1e-12 if not later else 1e-9)
+    still = np.zeros((1, 12))
+    readings = problem.motion.angle[:1]
+    assert np.abs(unevenness(robot, readings)).max() > 1.0e-4
+    assert stance(robot, starts.angle, np.repeat(still, 5, axis=0)).gap.max() < 1e-12
+
+
+def test_residuals_of_a_standing_robot_are_straight_in_its_start(standing, replay):
+    problem, truth = standing
+    size, start = len(truth), np.zeros(problem.start_size)
+    for _ in range(2):  # to the start that the measurements tell
+        found = problem.linearise(replay, truth, start, 1.0e-4)
+        slope = found.jacobian[:, size:]
+        square = slope.T @ slope + np.eye(len(start))
+        start = start - np.linalg.solve(square, slope.T @ found.residual + start)
+    unknown = sorted({column - size for world in problem.plan for column, _ in world if column >= size})
+    move = np.zeros(len(start))  # as far as the noise lets it lie elsewhere
+    lower = np.linalg.cholesky(square[np.ix_(unknown, unknown)])
+    move[unknown] = np.linalg.solve(lower.T, np.random.default_rng(1).normal(size=len(unknown)))
+    both = problem.residuals(replay, np.repeat(truth[None], 2, axis=0), np.stack([start, start + move]))
+    change, expected = both[:, 1] - both[:, 0], slope @ move
+    assert np.linalg.norm(expected) > 1.0
+    assert np.linalg.norm(change - expected) < 0.05 * np.linalg.norm(expected)
+
+
+def test_the_beginning_of_a_motion_has_the_residuals_that_the_whole_has_there(standing, replay):
+    problem, truth = standing
+    begun = problem.until(0.5)
+    zero = np.zeros((1, problem.start_size))
+    whole, part = (p.residuals(replay, truth[None], zero)[:, 0] for p in (problem, begun))
+    assert len(part) == begun.valid.sum() < 0.6 * len(whole)
+    np.testing.assert_array_equal(part, whole[: len(part)])
+
+
+def test_products_of_tall_arrays_are_those_of_numpy():
+    rng = np.random.default_rng(0)
+    left, right = rng.normal(size=(101, 7)), rng.normal(size=(101, 3))
+    np.testing.assert_allclose(gram(left, right), left.T @ right, atol=1e-12)
 
 
 def few_parameters():

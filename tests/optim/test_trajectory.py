@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from jumper_warp.optim import jumps
-from jumper_warp.optim.descent import minimise
+from jumper_warp.optim.augmented_lagrangian import minimise
 from jumper_warp.optim.rollout import Rollout
 from jumper_warp.optim.smoothing import Stage, smoothed
 from jumper_warp.optim.trajectory import Knots, Problem, Values

@@ -1,0 +1,69 @@
+"""The flag --robot: training, evaluation and play are of the robot that an overlay tells."""
+
+import json
+
+import numpy as np
+import pytest
+import torch
+import tyro
+
+from jumper_warp.cli.main import main
+from jumper_warp.cli.train import TrainArgs, env_maker, for_robot, overlay_in
+from jumper_warp.evaluation.run import EvaluationArgs, conditions_of
+from jumper_warp.policies.restore import env_of_policy, open_policy
+from jumper_warp.registry import make_task
+from jumper_warp.robot.overlay import RobotOverlay
+
+HEAVY = 3.0
+"""[kg] Added to the base."""
+
+
+def base_mass(env):
+    return float(env.sim.model.body_mass.numpy()[0])
+
+
+@pytest.fixture(scope="module")
+def overlay(tmp_path_factory):
+    """Return the file of a robot with a heavier base and weaker motors."""
+    file = tmp_path_factory.mktemp("robot") / "identified.json"
+    values = {"base_mass": (float(RobotOverlay({}).robots().base_mass[0, 0]) + HEAVY,), "kp": 12 * (0.8,)}
+    RobotOverlay(values, {"base_mass": (-0.1, 0.1)}).save(file)
+    return file
+
+
+@pytest.mark.parametrize("command", ["evaluate", "play"])
+def test_a_policy_jumps_less_high_with_the_heavier_robot(overlay, tmp_path, command):
+    count = ["--jumps", "3", "--lower", "0.7"] if command == "evaluate" else ["--height", "0.8"]
+    found, apex = {}, {}
+    for name, flags in (("described", []), ("identified", ["--robot", str(overlay)])):
+        main([command, "vertical_jump", *count, *flags, "--out", str(tmp_path / name), "--device", "cpu"])
+        found[name] = json.loads((tmp_path / name / "figures.json").read_text())
+        if command == "play":
+            apex[name] = np.ravel(found[name]["apex_m"])[0]
+        else:
+            table = np.genfromtxt(
+                tmp_path / name / "jumps.csv", delimiter=",", names=True, dtype=None, encoding="utf-8"
+            )
+            apex[name] = np.mean(table["apex_m"])
+    assert apex["identified"] < apex["described"] - 0.02
+    if command == "evaluate":
+        assert found["identified"]["robot"] == str(overlay) and "robot" not in found["described"]
+
+
+def test_experiments_take_the_flag_too(overlay):
+    args = tyro.cli(EvaluationArgs, args=["--robot", str(overlay), "--policy", "vertical_jump", "--device", "cpu"])
+    masses = [
+        base_mass(env_of_policy(open_policy(args.policy), 1, conditions_of(a)))
+        for a in (args, EvaluationArgs(device="cpu"))
+    ]
+    assert masses[0] - masses[1] == pytest.approx(HEAVY, abs=1e-5)
+
+
+def test_a_training_is_of_the_robot_and_says_so_in_its_configuration(overlay):
+    flags = ["--robot", str(overlay)]
+    task = for_robot(make_task("vertical-jump"), overlay_in(flags))
+    args = tyro.cli(TrainArgs, args=[*flags, "--no-randomize"])
+    env = env_maker(task, args)(2, 0, torch.device("cpu"))
+    saved = RobotOverlay.from_json(json.loads(json.dumps(env.config()))["robot"])
+    assert base_mass(env) == pytest.approx(saved.values["base_mass"][0]) and saved.values["kp"][0] == 0.8
+    assert task.randomization.base_mass == (-0.1, 0.1)
