@@ -5,7 +5,7 @@ Targets are knots over time, interpolated to policy steps. Every start is a worl
     minimise f(x)  subject to  c(x) <= 0,  lower <= x <= upper,
 
 with f and c functions of the motion that the targets lead to (`jumper_warp.optim.jumps` has those of jumps). It is
-solved by `jumper_warp.optim.descent.minimise`.
+solved by `jumper_warp.optim.augmented_lagrangian.minimise`.
 """
 
 from __future__ import annotations
