@@ -4,19 +4,19 @@
     python experiments/trajectory_optimization.py --jumps farthest --baseline cma --out outputs/trajectories
 
 Motor targets, equal left and right, through the command filter and motors of the tasks, from standing still. A search
-begins with random squats in parallel worlds, goes on along smoothed gradients (`jumper_warp.optim.smoothing`), at first
-with fewer physics steps, and ends with limited-memory BFGS inside an augmented Lagrangian
-(`jumper_warp.optim.augmented_lagrangian`). What is told is not the optimiser's own figure: the targets are replayed in
-the simulation that trains policies, at every physics step, and collisions of all links are looked for; the farthest
-flight is scored as in `experiments/distance_limit.py`, whose constraints it has. Of each jump a JSON file is written that can
-be put into `assets/motions`, for episodes that begin along it (`--env.reset.reference.motion`).
+begins with random squats in parallel worlds, goes on along smoothed gradients (`jumper_warp.optim.smoothing`), at
+first with fewer physics steps, and ends with limited-memory BFGS inside an augmented Lagrangian
+(`jumper_warp.optim.augmented_lagrangian`). What is told is not the optimiser's own figure: the targets are replayed
+in the simulation that trains policies, at every physics step, and collisions of all links are looked for; the
+farthest flight is scored as in `experiments/distance_limit.py`, whose constraints it has. Of each jump a JSON file is
+written that can be put into `assets/motions`, for episodes that begin along it (`--env.reset.reference.motion`).
 
 Constraints of vertical jumps: no link but the paws touches the ground, tilt at most 8 degrees and base at most 0.15 m
 from its start at all times. Work is what the motors put in until takeoff, braking apart.
 
 `--baseline cma` runs evolution strategies beside it, in the same process: for the farthest flight the search of
-`distance_limit.py` (four searches, and on from the best), and for every jump CMA-ES on the same rollouts with the same
-penalised objective, for `--longer` times as long. Policy steps are counted: simulated ones, and those of reverse
+`distance_limit.py` (four searches, and on from the best), and for every jump CMA-ES on the same rollouts with the
+same penalised objective, for `--longer` times as long. Policy steps are counted: simulated ones, and those of reverse
 passes, each of which costs about three simulated ones.
 """
 
