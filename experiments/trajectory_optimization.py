@@ -132,8 +132,11 @@ def policy_actions(args: Args, steps: int) -> np.ndarray:
     return np.concatenate([actions, np.repeat(actions[-1:], max(0, steps - len(actions)), axis=0)])[:steps]
 
 
-def evolve(problem: Problem, begin: np.ndarray, seconds: float, seed: int) -> np.ndarray:
-    """Return what CMA-ES finds on the same rollouts in so much processor time, from the best of some candidates."""
+def evolve(problem: Problem, begin: np.ndarray, seconds: float, seed: int) -> np.ndarray | None:
+    """Return what CMA-ES finds on the same rollouts in so much processor time, from the best of some candidates.
+
+    None where no candidate satisfied the constraints.
+    """
     cma = takeoff_search.cma_package()
     clock, real = Clock(), torch.float64 if problem.double else torch.float32
     device = str(problem.rollout(POPULATION).device)
@@ -160,7 +163,7 @@ def evolve(problem: Problem, begin: np.ndarray, seconds: float, seed: int) -> np
             best, value = inside[feasible.argmin()], float(feasible.min())
         outside = takeoff_search.OUTSIDE * ((drawn_ones - inside) ** 2).sum(axis=1)
         search.tell(list(drawn_ones), list(cost + outside))
-    return best
+    return best if np.isfinite(value) else None
 
 
 def search_as_published(args: Args) -> dict[str, float]:
@@ -187,7 +190,7 @@ def search_as_published(args: Args) -> dict[str, float]:
 
 def run_jump(
     name: str, args: Args, folder: Path, seeds: dict[str, np.ndarray], tell: Callable[[str], None]
-) -> tuple[dict[str, dict[str, float]], Replay]:
+) -> tuple[dict[str, dict[str, Any]], Replay]:
     """Optimise one jump, with its baselines; returns rows of figures by method, and the replay."""
     jump, clock = JUMPS[name], Clock()
     settings: dict[str, Any] = {"device": args.device, "threads": args.threads}
@@ -208,14 +211,12 @@ def run_jump(
     rows["gradients"] |= {"value": value_of(name, jump, x, replay), "violation": float(found.violation[found.best])}
     np.savez(folder / f"{name}.npz", targets=targets, knots=x.reshape(len(knots.at), -1), at=np.array(knots.at))
     if args.baseline == "cma":
-        seconds, fine, clock = (
-            args.longer * rows["gradients"]["cpu_s"],
-            jump.make(substeps=SUBSTEPS, **settings),
-            Clock(),
-        )
-        other = evolve(fine, begin, seconds, args.seed)
-        again = jump.replay(knots.targets(torch.as_tensor(other[None]))[..., 0].numpy(), device=args.device)
-        rows["cma"] = clock() | counted([fine]) | {"value": value_of(name, jump, other, again)}
+        fine, clock = jump.make(substeps=SUBSTEPS, **settings), Clock()
+        other = evolve(fine, begin, args.longer * rows["gradients"]["cpu_s"], args.seed)
+        rows["cma"] = clock() | counted([fine]) | {"value": None}
+        if other is not None:
+            moved = knots.targets(torch.as_tensor(other[None]))[..., 0].numpy()
+            rows["cma"]["value"] = value_of(name, jump, other, jump.replay(moved, device=args.device))
         if name == "farthest":
             rows["cma_as_published"] = search_as_published(args)
     return rows, replay
@@ -258,13 +259,14 @@ def plot(replays: dict[str, Replay], path: Path) -> None:
         axes[3, 0].legend(fontsize=8)
 
 
-def show(rows: dict[str, dict[str, dict[str, float]]]) -> None:
+def show(rows: dict[str, dict[str, dict[str, Any]]]) -> None:
     """Print the table."""
     table = Table("jump", "method", "reached", "simulated steps", "reverse steps", "processor [s]", "wall [s]")
     for name, methods in rows.items():
         for method, row in methods.items():
             table.add_row(
-                JUMPS[name].label, method.replace("_", " "), f"{row['value']:.3f} {JUMPS[name].unit}",
+                JUMPS[name].label, method.replace("_", " "),
+                "none" if row["value"] is None else f"{row['value']:.3f} {JUMPS[name].unit}",
                 f"{row['simulated_steps'] / 1e6:.2f} M", f"{row['reverse_steps'] / 1e6:.2f} M", f"{row['cpu_s']:.0f}",
                 f"{row['wall_s']:.0f}",
             )  # fmt: skip
@@ -278,7 +280,7 @@ def main(args: Args) -> dict[str, Any]:
     announce(args.device, args.threads)
     torch.set_num_threads(1)  # its arrays are small, and the worlds have the cores
     folder, seeds = output_dir("trajectory_optimization", args.out), {}
-    rows: dict[str, dict[str, dict[str, float]]] = {}
+    rows: dict[str, dict[str, dict[str, Any]]] = {}
     replays: dict[str, Replay] = {}
     values: dict[str, Any] = {}
     for name in args.jumps:

@@ -21,6 +21,8 @@ CONTACT_FORCE = 0.1
 """[N] Above it a paw is in contact."""
 SPEED = 0.25
 """[m/s] Of the base upward, with which a jump takes off."""
+LONGEST_PUSH = 0.15
+"""[s] From the deepest squat until the first paw lifts, at most."""
 FRICTION, PAW_RADIUS = 0.85, 0.025
 """[1] Of the paws, [m]."""
 
@@ -129,15 +131,13 @@ class Replay:
                 self.touched += 1
 
     def reference(self, distance: float) -> dict[str, Any]:
-        """Return the motion of the base from the deepest squat until a paw lifts, as `assets/motions` holds it.
+        """Return the base's motion from the deepest squat until a paw lifts for good, as `assets/motions` holds it.
 
         distance: [m] that the jump flies, from its start.
         """
         first = self.takeoff * self.sim.substeps
-        lifted = np.flatnonzero(~(self.force[:first] > CONTACT_FORCE).all(axis=1))
-        pushes = np.flatnonzero((self.force[:first] > CONTACT_FORCE).all(axis=1))
-        end = int(pushes[-1])
-        begin = int(lifted[lifted < end].max(initial=-1)) + 1
+        end = int(np.flatnonzero((self.force[:first] > CONTACT_FORCE).all(axis=1))[-1])
+        begin = max(0, end - round(LONGEST_PUSH / self.sim.dt))
         begin += int(np.argmin(self.height[begin : end + 1]))
         places = np.linspace(begin, end, ROWS)
         moments = np.arange(len(self.base))

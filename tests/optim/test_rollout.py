@@ -236,3 +236,14 @@ def test_a_thread_a_leg_does_what_a_thread_a_world_does():
     for name, values in found[1].items():
         scale = np.abs(values).max()
         np.testing.assert_allclose(found[0][name], values, rtol=0.0, atol=1.0e-9 * scale, err_msg=name)
+
+
+def test_first_run_of_several_threads_is_whole():
+    """The kernel's module is loaded anew: no thread may begin before it is there."""
+    model, targets = build_model(64, visuals=False), np.full((4, 12), 0.8)
+    heights = []
+    for threads in (1, 2):
+        of = Rollout(model, double=True, threads=threads)
+        of.dynamics.modules.rollout.rollout_kernel.module.unload()
+        heights.append(of.run(targets, *of.standing()).q.numpy()[-1, 2])
+    assert np.array_equal(*heights)
