@@ -10,6 +10,7 @@ import numpy as np
 import warp as wp
 
 from jumper_warp.evaluation.film import ankles
+from jumper_warp.robot.gravity import EARTH
 from jumper_warp.robot.model import MOTOR_JOINTS, build_model
 from jumper_warp.robot.motors import FilterCfg, MotorCfg
 from jumper_warp.sim.simulation import Simulation, motor_values
@@ -117,8 +118,12 @@ class Replay:
         first = self.takeoff * self.sim.substeps
         self.work = float(self.sim.dt * self.power[:first].sum())
         """[J] Positive, of the motors until takeoff."""
-        self.apex = float(self.height[first - 1 :].max())
-        """[m] Highest base."""
+        landing = np.flatnonzero(down[first:].any(axis=1))
+        self.apex = float(self.height[first - 1 : first + landing[0] if len(landing) else None].max())
+        """[m] Highest base before a paw comes down."""
+        ups = np.diff(self.up[ticks][max(self.takeoff - 1, 0) :], prepend=self.up[ticks][max(self.takeoff - 1, 0)])
+        self.hardest = float(ups.max() / (self.sim.substeps * self.sim.dt * EARTH))
+        """[g] Largest upward acceleration of the base over a policy step after takeoff."""
         self.longest_lift, self.highest_lift, self.touched = 0.0, 0.0, 0
         """[s] and [m] Of a paw that had come down after the flight; how many have."""
         for leg in range(4):
@@ -156,7 +161,8 @@ class Replay:
     def metrics(self) -> dict[str, Any]:
         """Return what is told of every jump."""
         return {
-            "apex_m": self.apex, "takeoff_s": float(self.takeoff / 60.0), "work_j": self.work,
+            "apex_m": self.apex, "takeoff_s": float(self.takeoff / 60.0), "landing_g": self.hardest,
+            "work_j": self.work,
             "largest_tilt_deg": math.degrees(float(self.tilt.max())), "collisions": self.flags,
             "deepest_paw_mm": float(-1000.0 * self.gap.min()), "peak_torque_nm": float(np.abs(self.torque).max()),
         }  # fmt: skip

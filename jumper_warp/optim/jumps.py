@@ -40,16 +40,18 @@ def farthest(speed: float = 0.25, height: float = 0.30) -> Term:
 
 
 def highest() -> Term:
-    """Return minus the largest base height [m] after takeoff, by full simulation.
+    """Return minus the largest base height [m] between takeoff and the first paw that comes down, by full simulation.
 
-    The apex lies between two rows: it is that of the parabola through the highest row's position and velocity.
+    A second hop does not count. The apex lies between two rows: it is that of the parabola through the highest
+    row's position and velocity.
     """
 
     def term(motion: Motion) -> torch.Tensor:
         height, up = motion.q[..., 2], motion.base_velocity[..., 2]
         row, _ = motion.takeoff(0.25)
         later = torch.arange(len(height), device=row.device)[:, None] >= row
-        top = torch.where(later, height.detach(), -torch.inf).argmax(0)
+        flying = later & ~touchdowns(motion).any(dim=1)
+        top = torch.where(flying, height.detach(), -torch.inf).argmax(0)
         worlds = torch.arange(motion.num, device=row.device)
         z, v = height[top, worlds], up[top, worlds]
         return -(z + v.abs() * v / (2.0 * motion.gravity)).where(v.detach() > 0.0, z)
@@ -178,6 +180,18 @@ def touchdowns(motion: Motion, speed: float = 0.25) -> torch.Tensor:
     later = torch.arange(motion.q.shape[0], device=row.device)[:, None, None] > row
     down = torch.cat([torch.zeros_like(motion.down[:1]), motion.down])
     return (down & later).int().cummax(0).values.bool()
+
+
+def soft(most: float, speed: float = 0.25) -> Term:
+    """Keep upward accelerations [g] of the base over policy steps after takeoff below `most`; in units of 10 g."""
+
+    def term(motion: Motion) -> torch.Tensor:
+        up = motion.base_velocity[..., 2]
+        gained = (up[1:] - up[:-1]) / (motion.substeps * motion.dt * motion.gravity)
+        later = torch.arange(len(up), device=up.device)[1:, None] > motion.takeoff(speed)[0]
+        return torch.where(later, 0.1 * (gained - most), -1.0)
+
+    return term
 
 
 def lifted(free: float = 0.001) -> Term:

@@ -113,6 +113,20 @@ def test_work_is_that_of_every_physics_step(jump):
     assert float(motion.copper[-1, 0]) == pytest.approx(fine.dt * (torque**2).sum(), rel=1e-9)
 
 
+def test_a_second_hop_is_not_the_apex():
+    """A small hop, a squat in the air, and a jump: the apex is that of the hop."""
+    made = problem()
+    made.knots = Knots((0.0, 7.0, 8.0, 30.0, 31.0), steps=56)
+    x = torch.full((1, 5, 4), -1.0, dtype=torch.float64)
+    x[:, 2:4], x[:, 4] = 0.5, -0.5
+    with torch.no_grad():
+        motion = made.motion(x.reshape(1, -1))
+    height, row = motion.q[:, 0, 2].numpy(), int(motion.takeoff(0.25)[0])
+    again = row + int(motion.down[row:, :, 0].any(dim=1).int().argmax())
+    assert row < 15 and height[again:].max() > height[:again].max() + 0.05
+    assert -float(jumps.highest()(motion)) == pytest.approx(height[:again].max(), abs=5e-3)
+
+
 TERMS = {
     "farthest": jumps.farthest(),
     "highest": jumps.highest(),
@@ -120,6 +134,7 @@ TERMS = {
     "landing_pitch": lambda motion: jumps.landing_pitch(0.5)(motion)[0],
     "stays": lambda motion: jumps.stays(0.3)(motion).sum(0),
     "clear": lambda motion: jumps.clear()(motion).sum(0),
+    "soft": lambda motion: jumps.soft(0.0, 0.25)(motion).sum(0),
     "upright": lambda motion: jumps.upright(0.2)(motion)[0],
 }
 
