@@ -121,7 +121,7 @@ def test_every_command_has_help(capsys, command):
 @pytest.mark.parametrize(
     ("args", "message"),
     [
-        (["fly"], "no command 'fly'; there are train, play, evaluate, export, sysid, list"),
+        (["fly"], "no command 'fly'; there are train, finetune, play, evaluate, export, sysid, list"),
         (["train", "swim"], "unknown task 'swim'; there are vertical-jump"),
         (["train", "--iterations", "3"], "the task comes first"),
         ([*TRAIN, "--task", "other"], "give the task once"),
