@@ -9,7 +9,7 @@ first with fewer physics steps, and ends with limited-memory BFGS inside an augm
 (`jumper_warp.optim.augmented_lagrangian`). What is told is not the optimiser's own figure: the targets are replayed
 in the simulation that trains policies, at every physics step, and collisions of all links are looked for; the
 farthest flight is scored as in `experiments/distance_limit.py`, whose constraints it has. Of each jump a JSON file is
-written that can be put into `assets/motions`, for episodes that begin along it (`--env.reset.reference.motion`).
+written that can take the place of one in `assets/motions`, for episodes that begin along it.
 
 Constraints of vertical jumps: no link but the paws touches the ground, tilt at most 8 degrees and base at most 0.15 m
 from its start at all times. Work is what the motors put in until takeoff, braking apart.

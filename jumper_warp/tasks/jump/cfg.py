@@ -121,7 +121,7 @@ class ReferenceCfg:
 
     share: float = 0.0
     """[1] Of those that push off (`pushing`); the others are on straight lines."""
-    motion: str = "farthest"
+    motion: Literal["farthest", "highest"] = "farthest"
     """Which, a file of assets/motions."""
     reach: Pair = (0.8, 1.0)
     """[1] Goals, shares of the distance that it flies or of its apex; the level's do not count."""
