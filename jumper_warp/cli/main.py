@@ -18,7 +18,7 @@ INTERRUPTED = 130
 """Exit code after Ctrl-C."""
 COMMANDS = {
     "train": "Train a policy: jumper train TASK.",
-    "finetune": "Halve a jumping policy's error by gradients through the physics.",
+    "finetune": "Make a jumping policy miss by less, by gradients through the physics.",
     "play": "Record a policy for the Rerun viewer.",
     "evaluate": "Measure a policy over many trials.",
     "export": "Make a policy's folder of a training run, or one ONNX file of a policy.",

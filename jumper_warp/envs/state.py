@@ -112,9 +112,7 @@ def nominal_fingerprint(env: Stages) -> torch.Tensor:
     digest = hashlib.sha256()
     for name in RobotParameters.vars:
         if name.startswith("nominal_"):
-            values = getattr(env.parameters, name).numpy()
-            if name != "nominal_offset" or values.any():  # runs from before there were such do not know it
-                digest.update(values.tobytes())
+            digest.update(getattr(env.parameters, name).numpy().tobytes())
     return torch.frombuffer(bytearray(digest.digest()), dtype=torch.uint8)
 
 

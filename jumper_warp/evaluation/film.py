@@ -14,6 +14,7 @@ import numpy as np
 
 from jumper_warp.evaluation.links import Links
 from jumper_warp.robot.model import LEGS, build_model
+from jumper_warp.utils.rotations import rotate
 
 if TYPE_CHECKING:
     from jumper_warp.envs.env import Env
@@ -138,9 +139,7 @@ class Film:
 def ankles(poses: np.ndarray) -> np.ndarray:
     """Return the ankles [m], world frame, (num_worlds, 4, 3), from the poses (num_worlds, 21, 7) of all links."""
     shanks = poses[:, 5 * np.arange(1, len(LEGS) + 1)]
-    x, y, z, w = np.moveaxis(shanks[..., 3:], -1, 0)
-    axis = np.stack([2.0 * (x * z + w * y), 2.0 * (y * z - w * x), 1.0 - 2.0 * (x * x + y * y)], axis=-1)
-    return shanks[..., :3] - SHANK_LENGTH * axis
+    return shanks[..., :3] + rotate(shanks[..., 3:], np.array([0.0, 0.0, -SHANK_LENGTH]))
 
 
 def moments(height: np.ndarray, command: int) -> list[int]:

@@ -6,15 +6,7 @@ from typing import Any
 
 import numpy as np
 
-BACK = np.array([-1.0, -1.0, -1.0, 1.0])
-"""Signs of the inverse of a quaternion, xyzw."""
-
-
-def rotated(quat: np.ndarray, v: np.ndarray) -> np.ndarray:
-    """Return vectors (..., 3) turned by orientations (..., 4), xyzw."""
-    axis, w = quat[..., :3], quat[..., 3:]
-    across = 2.0 * np.cross(axis, v)
-    return v + w * across + np.cross(axis, across)
+from jumper_warp.utils.rotations import INVERSE, rotate
 
 
 def momentum(sim: Any) -> tuple[np.ndarray, np.ndarray]:
@@ -24,8 +16,8 @@ def momentum(sim: Any) -> tuple[np.ndarray, np.ndarray]:
     """
     mass, inertia, quat, arm, twist = _links(sim)
     linear = mass * twist[..., :3]
-    own = np.einsum("nbij,nbj->nbi", inertia, rotated(quat * BACK, twist[..., 3:]))
-    return linear.sum(axis=1), (np.cross(arm, linear) + rotated(quat, own)).sum(axis=1)
+    own = np.einsum("nbij,nbj->nbi", inertia, rotate(quat * INVERSE, twist[..., 3:]))
+    return linear.sum(axis=1), (np.cross(arm, linear) + rotate(quat, own)).sum(axis=1)
 
 
 def rotational_inertia(sim: Any) -> np.ndarray:
@@ -33,8 +25,8 @@ def rotational_inertia(sim: Any) -> np.ndarray:
     mass, inertia, quat, arm, _ = _links(sim)
     columns = []
     for axis in np.eye(3):
-        own = np.einsum("nbij,nbj->nbi", inertia, rotated(quat * BACK, np.broadcast_to(axis, arm.shape)))
-        spin = np.cross(arm, mass * np.cross(axis, arm)) + rotated(quat, own)
+        own = np.einsum("nbij,nbj->nbi", inertia, rotate(quat * INVERSE, np.broadcast_to(axis, arm.shape)))
+        spin = np.cross(arm, mass * np.cross(axis, arm)) + rotate(quat, own)
         columns.append(spin.sum(axis=1))
     return np.stack(columns, axis=-1)
 
@@ -47,6 +39,6 @@ def _links(sim: Any) -> tuple[np.ndarray, ...]:
     twist = sim.state.body_qd.numpy().reshape(n, -1, 6).astype(float)
     mass = model.body_mass.numpy().reshape(n, -1, 1).astype(float)
     inertia = model.body_inertia.numpy().reshape(n, -1, 3, 3).astype(float)
-    com = frame[..., :3] + rotated(frame[..., 3:], model.body_com.numpy().reshape(n, -1, 3).astype(float))
+    com = frame[..., :3] + rotate(frame[..., 3:], model.body_com.numpy().reshape(n, -1, 3).astype(float))
     arm = com - (mass * com).sum(axis=1, keepdims=True) / mass.sum(axis=1, keepdims=True)
     return mass, inertia, frame[..., 3:], arm, twist

@@ -14,6 +14,7 @@ from jumper_warp.evaluation.landings import PICTURE, beside
 from jumper_warp.evaluation.log import EvaluationEnv, EvaluationLog, Metrics, finite
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.rotations import INVERSE, rotate
 
 Velocity = tuple[float, float, float]
 AXES = ("vx", "vy", "yaw_rate")
@@ -166,16 +167,9 @@ class Walks(EvaluationLog):
 
 def body_velocity(arrays: dict[str, np.ndarray]) -> np.ndarray:
     """Return the velocity ahead and to the left [m/s] and the yaw rate [rad/s], body axes, (robots, 3)."""
-    x, y, z, w = arrays["base_quat"].T.astype(float)
-    rows = np.array(
-        [
-            [1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y + z * w), 2.0 * (x * z - y * w)],
-            [2.0 * (x * y - z * w), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z + x * w)],
-            [2.0 * (x * z + y * w), 2.0 * (y * z - x * w), 1.0 - 2.0 * (x * x + y * y)],
-        ]
-    )  # of the rotation world to body
-    vel = np.einsum("ijn,nj->ni", rows, arrays["base_vel"])
-    ang = np.einsum("ijn,nj->ni", rows, arrays["base_ang_vel"])
+    back = arrays["base_quat"].astype(float) * INVERSE
+    vel = rotate(back, arrays["base_vel"].astype(float))
+    ang = rotate(back, arrays["base_ang_vel"].astype(float))
     return np.stack([vel[:, 0], vel[:, 1], ang[:, 2]], axis=1)
 
 

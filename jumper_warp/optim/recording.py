@@ -11,13 +11,13 @@ from jumper_warp.optim.motions import Motion
 from jumper_warp.optim.plans import SAMPLES, TICK, Plan
 from jumper_warp.optim.replay import Record, Replay, Starts
 from jumper_warp.optim.residuals import HANGING_HEIGHT, NoiseLevels
-from jumper_warp.optim.rotations import from_vector, multiply
 from jumper_warp.optim.stance import stance
 from jumper_warp.robot.description import load_description
 from jumper_warp.robot.motors import MotorCfg
 from jumper_warp.robot.values import RobotValues
 from jumper_warp.sim.simulation import Simulation, SolverName, motor_values
 from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.rotations import from_vector, multiply
 
 REST = 0.75
 """[s] In which a robot comes to rest in the first pose before a motion is recorded."""

@@ -13,7 +13,6 @@ from typing import Any, Literal
 import numpy as np
 import warp as wp
 
-from jumper_warp.optim.rotations import rotate
 from jumper_warp.robot.description import RobotDescription, load_description
 from jumper_warp.robot.model import build_model
 from jumper_warp.robot.motors import OVERSPEED_END, OVERSPEED_START, MotorCfg
@@ -23,6 +22,7 @@ from jumper_warp.sim.precision import float64_kernels
 from jumper_warp.sim.simulation import motor_values
 from jumper_warp.sim.slices import Worlds
 from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.rotations import rotate
 from jumper_warp.utils.threads import checked_threads, run_side_by_side
 from kernels.layout import (
     ARMATURE,

@@ -12,12 +12,12 @@ import numpy as np
 from jumper_warp.optim.motions import Motion
 from jumper_warp.optim.parameters import BASE_ONLY, ParameterSet
 from jumper_warp.optim.replay import Record, Replay, Starts, grid_steps
-from jumper_warp.optim.rotations import from_vector, multiply, rotate, to_vector
 from jumper_warp.optim.stance import levelled, levelling, stance
 from jumper_warp.robot.description import RobotDescription
 from jumper_warp.robot.values import RobotValues
 from jumper_warp.utils.checks import check_positive
 from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.rotations import INVERSE, from_vector, multiply, rotate, to_vector
 
 LONGEST_GAP = 0.1
 """[s] Between two rows of a motion."""
@@ -170,7 +170,7 @@ class MotionResiduals:
             ground = stance(self.description, angle[None], rate[None])
             place[2] = ground.height[0]
             place, place_prior = first_values(motion.position, place, 0.02, 0.05)
-            up = rotate(quaternion * np.array([-1.0, -1.0, -1.0, 1.0]), np.array([0.0, 0.0, 1.0]))
+            up = rotate(quaternion * INVERSE, np.array([0.0, 0.0, 1.0]))
             near = abs(place[2] - ground.height[0]) < 0.03 and float(up @ ground.up[0]) > math.cos(math.radians(6.0))
             self.standing = near and ground.gap[0] < 0.02
             if motion.position is not None:
@@ -245,7 +245,7 @@ class MotionResiduals:
                 found = np.moveaxis(at_rows(record.quaternion), 1, 2)
                 found = found / np.linalg.norm(found, axis=-1, keepdims=True)
                 known = np.nan_to_num(self.motion.quaternion) + np.array([0.0, 0.0, 0.0, 1.0e-12])
-                known = known / np.linalg.norm(known, axis=-1, keepdims=True) * np.array([-1.0, -1.0, -1.0, 1.0])
+                known = known / np.linalg.norm(known, axis=-1, keepdims=True) * INVERSE
                 columns.append(np.moveaxis(to_vector(multiply(found, known[:, None])), 1, 2))
             else:
                 values = at_rows(getattr(record, name))

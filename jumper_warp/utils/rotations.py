@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+INVERSE = np.array([-1.0, -1.0, -1.0, 1.0])
+"""Signs of the inverse of a quaternion."""
+
 
 def rotate(quaternion: np.ndarray, vector: np.ndarray) -> np.ndarray:
     """Return vectors (..., 3) turned by quaternions xyzw (..., 4)."""
