@@ -91,7 +91,7 @@ class PlainJump:
         run()
         with wp.ScopedCapture(device=rollout.device) as capture:
             run()
-        self._graph = capture.graph
+        self._graph, self._arrays = capture.graph, (drive, safe, wrench)  # a graph on a GPU keeps no arrays alive
 
     def run(self) -> None:
         """Simulate."""

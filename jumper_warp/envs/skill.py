@@ -98,7 +98,7 @@ class Skill:
         settings.command_filter = filter_params(self.task.command_filter)
         settings.contact_force = self.task.contact_force
         settings.push_in_flight = int(self.task.randomization.push_in_flight)
-        settings.lift = self.task.lift
+        settings.lift, settings.link_margin = self.task.lift, self.task.link_margin
         return settings
 
     def set(self, section: str, name: str, **numbers: float) -> None:

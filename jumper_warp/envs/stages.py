@@ -186,15 +186,16 @@ class Stages:
     def _events(self, part: Part, stage: int, mask: wp.array) -> None:
         """Run the events of a stage, and let the solver read what they changed."""
         for skill in self.skills:
-            due = [row.term for row in skill.task.rows["events"] if row.term.due_at(stage)]
+            due = {i: row.term for i, row in enumerate(skill.task.rows["events"]) if row.term.due_at(stage)}
             if due:
-                lanes = events.LANES if self.wp_device.is_cuda else 1
+                spread = self.wp_device.is_cuda and any(term.options["spread"] for term in due.values())
+                first, lanes = min(due), events.LANES if spread else 1
                 self._launch(
-                    skill.kernels["event"], (skill.num_events, lanes, part.count),
-                    [skill.index, stage, lanes, mask, self.step_dt, part.env, skill.numbers, skill.timer,
+                    skill.kernels["event"], (max(due) - first + 1, lanes, part.count),
+                    [skill.index, stage, first, lanes, mask, self.step_dt, part.env, skill.numbers, skill.timer,
                      self.parameters], BLOCKS["event"],
                 )  # fmt: skip
-            if any(term.options["repack"] for term in due):
+            if any(term.options["repack"] for term in due.values()):
                 self.sim.physics.parameters_changed(mask, Worlds(part.first, part.count))
 
     def _forget(self, part: Part, mask: wp.array) -> None:

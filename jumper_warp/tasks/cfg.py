@@ -25,6 +25,7 @@ from jumper_warp.tasks.terms import (
 )
 from jumper_warp.utils.errors import InputError
 from kernels.mdp.env import Nothing
+from kernels.mdp.starts import APART
 from kernels.mdp.terminations import came_apart
 
 Pair = tuple[float, float]
@@ -96,6 +97,8 @@ class TaskCfg:
     """[m] Above standing, at which robots begin whose policy is measured."""
     contact_force: float = 0.1
     """[N] Above it a paw counts as in contact."""
+    link_margin: float = 0.0
+    """[m] Links closer to one another than this count as touching, in training; in tests of policies links touch."""
     reward_floor: float | None = 0.0
     """Least total reward of a step; None: no floor."""
     metrics: tuple[StateMetric, ...] = ()
@@ -131,6 +134,8 @@ class TaskCfg:
             raise InputError(f"{self.name}: lift must be finite and >= 0, got {self.lift}")
         if not 0.0 <= self.contact_force < math.inf:
             raise InputError(f"{self.name}: contact_force must be finite and >= 0, got {self.contact_force}")
+        if not 0.0 <= self.link_margin <= APART:
+            raise InputError(f"{self.name}: link_margin must be in [0, {APART:g}], got {self.link_margin}")
         if self.reward_floor is not None and not math.isfinite(self.reward_floor):
             raise InputError(f"{self.name}: reward_floor must be finite or None, got {self.reward_floor}")
 

@@ -14,6 +14,7 @@ import numpy as np
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.utils.errors import InputError
 from kernels.attitude import observations as attitude
+from kernels.jump import observations as jump
 from kernels.mdp import observations as obs
 from kernels.velocity import observations as velocity
 
@@ -33,6 +34,8 @@ MOTORS = tuple(3 * leg + j for leg in LEGS for j in range(3))
 """Motors with sides swapped."""
 ROWS = tuple(3 * (i // 3) + 2 - i % 3 for i in range(15))
 """Points of `ground_heights` with sides swapped."""
+RAYS = (4, 5, 2, 3, 0, 1, 6)
+"""Columns of `block_ahead` with sides swapped."""
 VECTOR, AXIAL = (1, -1, 1), (-1, 1, -1)
 """Signs of a vector's components in body axes, and of those of a vector of rotation."""
 
@@ -40,13 +43,16 @@ _PLAIN: dict[Any, tuple[int, ...]] = {
     obs.lin_vel: VECTOR, obs.ang_vel: AXIAL, obs.gravity: VECTOR, velocity.command: (1, -1, -1),
     velocity.clock: (-1, -1), velocity.command_age: (1,), velocity.push: VECTOR + AXIAL, obs.height: (1,),
     attitude.turn_left: (*AXIAL, 1), attitude.time_left: (1,), attitude.in_collision: (1,),
+    jump.wanted_height: (1,), jump.jump_command: (1,), jump.goal: (1, -1), jump.phase: (1, 1, 1),
+    jump.phase_times: (1, 1), jump.height_errors: (1, 1), jump.landing_miss: (1, -1), jump.way: (1, -1),
     obs.drawn_mass: (1, 1), obs.drawn_com: VECTOR, obs.drawn_latency: (1,), obs.drawn_friction: (1, 1),
 }  # fmt: skip
 """Signs of terms whose columns stay where they are."""
 _SWAPPED: dict[Any, tuple[int, ...]] = {
     obs.angle: MOTORS, obs.rate: MOTORS, obs.last_action: MOTORS, obs.contacts: LEGS, obs.air_times: LEGS,
     obs.paw_forces: LEGS, velocity.contact_times: LEGS, velocity.paw_heights: LEGS, velocity.recent_steps: LEGS,
-    velocity.ground_heights: ROWS, obs.drawn_gains: MOTORS, obs.drawn_speed_limits: MOTORS, obs.drawn_offset: MOTORS,
+    velocity.ground_heights: ROWS, jump.block_ahead: RAYS, obs.drawn_gains: MOTORS,
+    obs.drawn_speed_limits: MOTORS, obs.drawn_offset: MOTORS,
 }  # fmt: skip
 """Orders of terms that keep their signs."""
 

@@ -226,10 +226,10 @@ def leg_ground_distances(ground: Ground, capsules: LegCapsules, pos: vec3, rotat
 
 
 @wp.func
-def record(found: Collisions, distance: real, flag: int) -> Collisions:
-    """Return the result with one more distance [m] taken into account: below zero it raises `flag`."""
+def record(found: Collisions, distance: real, least: real, flag: int) -> Collisions:
+    """Return the result with one more distance [m] taken into account: below `least` it raises `flag`."""
     result = Collisions()
-    result.flags = found.flags | wp.where(distance < real(0.0), flag, 0)
+    result.flags = found.flags | wp.where(distance < least, flag, 0)
     result.clearance = wp.min(found.clearance, distance)
     return result
 
@@ -251,18 +251,23 @@ def next_leg(turn: int) -> int:
 
 @wp.func
 def add_leg(
-    found: Collisions, ground: Ground, leg: LegCapsules, neighbour: LegCapsules, pos: vec3, rotation: mat33
-) -> Collisions:
-    """Return the result with one leg taken into account: with the ground, itself, the shell and the next leg."""
+    found: Collisions, ground: Ground, leg: LegCapsules, neighbour: LegCapsules, pos: vec3, rotation: mat33,
+    apart: real,
+) -> Collisions:  # fmt: skip
+    """Return the result with one leg taken into account: with the ground, itself, the shell and the next leg.
+
+    apart: links closer to one another than this [m] count as touching.
+    """
+    zero = real(0.0)
     over_ground = leg_ground_distances(ground, leg, pos, rotation)
-    result = record(found, over_ground[0], HOUSING_GROUND)
-    result = record(result, over_ground[1], THIGH_GROUND)
-    result = record(result, over_ground[2], KNEE_GROUND)
-    result = record(result, over_ground[3], SHANK_GROUND)
-    bound = wp.max(result.clearance, real(0.0))
-    result = record(result, leg_self_distance(leg, bound), LEG_SELF)
-    result = record(result, leg_shell_distance(leg, bound), LEG_SHELL)
-    return record(result, leg_leg_distance(leg, neighbour, bound), LEG_LEG)
+    result = record(found, over_ground[0], zero, HOUSING_GROUND)
+    result = record(result, over_ground[1], zero, THIGH_GROUND)
+    result = record(result, over_ground[2], zero, KNEE_GROUND)
+    result = record(result, over_ground[3], zero, SHANK_GROUND)
+    bound = wp.max(result.clearance, apart)
+    result = record(result, leg_self_distance(leg, bound), apart, LEG_SELF)
+    result = record(result, leg_shell_distance(leg, bound), apart, LEG_SHELL)
+    return record(result, leg_leg_distance(leg, neighbour, bound), apart, LEG_LEG)
 
 
 @wp.func
@@ -286,31 +291,35 @@ def world_collisions(
     )
     found = Collisions()
     found.clearance = margin
-    found = record(found, body_ground_distance(ground, pos, rotation), BODY_GROUND)
+    found = record(found, body_ground_distance(ground, pos, rotation), real(0.0), BODY_GROUND)
     leg = load_leg(geometry, joint_q, start, 0)
     count = wp.int32(4)
     for turn in range(count):
         neighbour = load_leg(geometry, joint_q, start, next_leg(turn + 1))
-        found = add_leg(found, ground, leg, neighbour, pos, rotation)
+        found = add_leg(found, ground, leg, neighbour, pos, rotation, real(0.0))
         leg = neighbour
     return found
 
 
 @wp.func
 def leg_collisions(
-    geometry: wp.array(dtype=LegGeometry), ground: Ground, joint_q: wp.array(dtype=wp.float32), start: int, turn: int
-) -> int:
-    """Return the flags of one leg, counted around the body; together the four give those of `world_collisions`."""
+    geometry: wp.array(dtype=LegGeometry), ground: Ground, joint_q: wp.array(dtype=wp.float32), start: int, turn: int,
+    apart: real,
+) -> int:  # fmt: skip
+    """Return the flags of one leg, counted around the body; together the four give those of `world_collisions`.
+
+    apart: links closer to one another than this [m] count as touching; `world_collisions` has 0.
+    """
     pos = vec3(real(joint_q[start]), real(joint_q[start + 1]), real(joint_q[start + 2]))
     rotation = wp.quat_to_matrix(
         quat(real(joint_q[start + 3]), real(joint_q[start + 4]), real(joint_q[start + 5]), real(joint_q[start + 6]))
     )
     found = Collisions()
     if turn == 0:
-        found = record(found, body_ground_distance(ground, pos, rotation), BODY_GROUND)
+        found = record(found, body_ground_distance(ground, pos, rotation), real(0.0), BODY_GROUND)
     leg = load_leg(geometry, joint_q, start, next_leg(turn))
     neighbour = load_leg(geometry, joint_q, start, next_leg(turn + 1))
-    return add_leg(found, ground, leg, neighbour, pos, rotation).flags
+    return add_leg(found, ground, leg, neighbour, pos, rotation, apart).flags
 
 
 @wp.kernel

@@ -31,10 +31,13 @@ def add_target(gradients: Gradients, step: int, motor: int, world: int, x: real)
 @wp.func
 def reverse_motor(
     params: MotorParams, late: real, commands: Commands, safe: wp.array3d(dtype=real), timing: Timing, dt: real,
-    step: int, motor: int, world: int, angle: real, rate: real, seed: real, sums: wp.array(dtype=real),
+    step: int, motor: int, world: int, angle: real, rate: real, seed: real, place: int, sums: wp.array(dtype=real),
     gradients: Gradients,
 ) -> vec2:  # fmt: skip
-    """Add a motor's gradients for that of its torque, `seed`; return those by its angle and rate."""
+    """Add a motor's gradients for that of its torque, `seed`; return those by its angle and rate.
+
+    place: of the motor among those of `sums`.
+    """
     arrived = arrival(step, timing.substeps, late)
     newer = commanded(safe, commands.before, arrived.newer, motor, world)
     older = newer
@@ -44,7 +47,7 @@ def reverse_motor(
         if arrived.weight != real(1.0):
             target = older + arrived.weight * (newer - older)
     by_target, by_angle, by_rate, by_motor = wp.grad(motor_torque)(target, angle, rate, params)
-    add_motor(sums, motor, seed, by_motor)
+    add_motor(sums, place, seed, by_motor)
     add_target(gradients, arrived.newer, motor, world, seed * arrived.weight * by_target)
     if arrived.newer > arrived.older:
         add_target(gradients, arrived.older, motor, world, seed * (real(1.0) - arrived.weight) * by_target)
@@ -61,9 +64,12 @@ def weighed_filter(target: vec3, angles: vec3, rates: vec3, params: FilterParams
 @wp.func
 def reverse_filter(
     commands: Commands, actuation: Actuation, step: int, leg: int, world: int, angles: vec3, rates: vec3,
-    sums: wp.array(dtype=real), gradients: Gradients,
+    place: int, sums: wp.array(dtype=real), gradients: Gradients,
 ) -> FilterSeeds:  # fmt: skip
-    """Carry the gradient by a leg's filtered targets on to its targets; return those by its motor angles and rates."""
+    """Carry the gradient by a leg's filtered targets on to its targets; return those by its motor angles and rates.
+
+    place: of the leg among those of `sums`.
+    """
     m = 3 * leg
     seed = row_vec3(gradients.safe, step, m, world)
     found = FilterSeeds()
@@ -77,7 +83,7 @@ def reverse_filter(
         )
         found.angles = by_angles
         found.rates = by_rates
-        add_vec3(sums, MOTOR_GRADIENT + 72 + m, by_angles)
+        add_vec3(sums, MOTOR_GRADIENT + 72 + 3 * place, by_angles)
         add_filter(sums, by_params)
     store_row_vec3(gradients.target, step, m, world, by_target)
     return found

@@ -3,7 +3,7 @@
 import warp as wp
 
 from ..actuation.stops import stop_rows
-from ..layout import BASE, GRAVITY
+from ..layout import BASE, GRAVITY, LEG_ROWS
 from ..scalar import mat33, real, vec3
 from ..state import BaseState, base_com
 from .base_dynamics import BaseSystem, add_leg, invert, motor_acceleration, solve_ang, solve_lin
@@ -146,7 +146,7 @@ def reverse_leg(
     first_impulse: wp.array2d(dtype=vec3), rows: Rows, seeds: Rows, step: int, i: int, record: StepRecord,
     adj: LegAdjoint, sums: wp.array(dtype=real),
 ) -> LegAdjoint:  # fmt: skip
-    """Run a step backwards, see `reverse_step`; `sums`: of this leg, and of the base the same in each thread."""
+    """Run a step backwards, see `reverse_step`; `sums`: of this leg, as if it were the first, and of the base."""
     base = record.base[world, i]
     ahead = record.base[world, i + 1]
     inverse = record.inverse[world, i]
@@ -229,13 +229,13 @@ def reverse_leg(
             record.angles[world, i, leg], old_rates, held, factors, dt,
         )
     )  # fmt: skip
-    add_geometry(sums, leg, geo)
-    add_masses(sums, leg, masses)
-    add_joints(sums, leg, joints)
-    add_spring(sums, leg, spring)
-    add_stops(sums, leg, stops)
+    add_geometry(sums, 0, geo)
+    add_masses(sums, 0, masses)
+    add_joints(sums, 0, joints)
+    add_spring(sums, 0, spring)
+    add_stops(sums, 0, stops)
     if law.mode != SEPARATE:
-        add_entry(sums, law.mu_row, mu_adj)
+        add_entry(sums, law.mu_row - leg * LEG_ROWS, mu_adj)
     base_seeds = BaseSeeds()
     base_seeds.velocity = lin_seed
     base_seeds.new_velocity = new_velocity

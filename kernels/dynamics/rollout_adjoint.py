@@ -189,7 +189,7 @@ def reverse_kernel(
                         seed += seeds.torque[first + i, 3 * k + c, world]
                     by_state = reverse_motor(
                         motors[3 * k + c], late, commands, safe, timing, dt, first + i, 3 * k + c, world, angles[c],
-                        rates[c], seed, sums, gradients,
+                        rates[c], seed, 3 * k + c, sums, gradients,
                     )  # fmt: skip
                     angle_sum[c] += by_state[0]
                     rate_sum[c] += by_state[1]
@@ -206,6 +206,7 @@ def reverse_kernel(
                     world,
                     record.angles[world, 0, k],
                     record.rates[world, 0, k],
+                    k,
                     sums,
                     gradients,
                 )

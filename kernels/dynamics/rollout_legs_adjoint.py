@@ -21,16 +21,19 @@ wp.set_module_options({"enable_backward": False, "fast_math": True})
 
 @wp.func
 def store_sums(sums: wp.array(dtype=real), leg: int, world: int, parameters: wp.array2d(dtype=real)):
-    """Write the gradients by parameters: a leg's by its thread, the base's by the first, the others summed up."""
+    """Write the gradients by parameters: a leg's by its thread, the base's by the first, the others summed up.
+
+    sums: rows of the first leg for all: so the threads of a warp add to the same rows, which lie side by side.
+    """
     for i in range(LEG_ROWS):
-        parameters[leg * LEG_ROWS + i, world] = sums[leg * LEG_ROWS + i]
+        parameters[leg * LEG_ROWS + i, world] = sums[i]
     for i in range(7):
         for j in range(3):
-            row = MOTOR_GRADIENT + 12 * i + 3 * leg + j
-            parameters[row, world] = sums[row]
+            row = MOTOR_GRADIENT + 12 * i + j
+            parameters[row + 3 * leg, world] = sums[row]
     for i in range(GEOMETRY_ROWS):
-        row = GEOMETRY_GRADIENT + leg * GEOMETRY_ROWS + i
-        parameters[row, world] = sums[row]
+        row = GEOMETRY_GRADIENT + i
+        parameters[row + leg * GEOMETRY_ROWS, world] = sums[row]
     if leg == 0:
         for i in range(int(BASE), int(GRAVITY) + 3):
             parameters[i, world] = sums[i]
@@ -106,7 +109,7 @@ def reverse_legs_kernel(
                         seed += seeds.torque[step, motor, world]
                     by_state = reverse_motor(
                         motors[c], late, commands, safe, timing, dt, step, motor, world, angles[c], rates[c], seed,
-                        sums, gradients,
+                        c, sums, gradients,
                     )  # fmt: skip
                     angle_sum[c] += by_state[0]
                     rate_sum[c] += by_state[1]
@@ -115,8 +118,8 @@ def reverse_legs_kernel(
         entries = add_row_seeds(leave_row(rows, robot, row, world, adj.base, sums), seeds, row, world)
         if place < count and first == t * timing.substeps:
             by_leg = reverse_filter(
-                commands, actuation, t, leg, world, record.angles[world, 0, leg], record.rates[world, 0, leg], sums,
-                gradients,
+                commands, actuation, t, leg, world, record.angles[world, 0, leg], record.rates[world, 0, leg], 0,
+                sums, gradients,
             )  # fmt: skip
             adj.angles += by_leg.angles
             adj.rates += by_leg.rates

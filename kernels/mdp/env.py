@@ -72,6 +72,7 @@ class SkillSettings:
     contact_force: float  # [N] above it a paw is in contact
     push_in_flight: int  # 1: pushes act in the air too
     lift: float  # [m] above standing, at which robots begin whose policy is measured
+    link_margin: float  # [m] links closer to one another than this count as touching
 
 
 @wp.struct

@@ -29,6 +29,7 @@ def make_event_kernel(rows: list) -> wp.Kernel:
         # in
         skill: int,
         stage: int,
+        first: int,
         lanes: int,
         mask: wp.array(dtype=float),
         step_dt: float,
@@ -38,7 +39,7 @@ def make_event_kernel(rows: list) -> wp.Kernel:
         timer: wp.array2d(dtype=int),
         robot: RobotParameters,
     ):
-        """Run what is due at a stage where mask is not 0; launch over (events, lanes, num_worlds).
+        """Run what is due at a stage where mask is not 0; launch over (events from `first` on, lanes, num_worlds).
 
         The lanes share the loops of events that are `spread`; of the others the first lane is all.
 
@@ -46,6 +47,7 @@ def make_event_kernel(rows: list) -> wp.Kernel:
         event is due at a reset as well.
         """
         row, lane, world = wp.tid()
+        row += first
         world += env.first
         if env.skill[world] != skill or mask[world] == 0.0:
             return

@@ -19,6 +19,7 @@ wp.set_module_options({"enable_backward": False})
 
 MISS = wp.constant(1.0e-4)  # [m] by which a paw may miss its place
 FASTEST = wp.constant(30.0)  # [rad/s] norm of a leg's motor rates
+APART = wp.constant(0.005)  # [m] least between links
 
 
 @wp.struct
@@ -115,7 +116,7 @@ def legs_fit(
             store_leg(leg, other, joint_q, joint_qd)
     flags = int(0)
     for turn in range(first_leg(draw), geometry.shape[0], leg_step(draw)):
-        flags = flags | leg_collisions(geometry, ground, joint_q, 0, turn)
+        flags = flags | leg_collisions(geometry, ground, joint_q, 0, turn, APART)
     return all_legs(draw, fits and flags == 0)
 
 

@@ -66,10 +66,11 @@ def track_kernel(
     """Follow every paw, and find what must not touch; one thread per (leg, world)."""
     leg, world = wp.tid()
     world += env.first
-    down = wp.length(robot.paw_force[leg, world]) > skills[env.skill[world]].contact_force
+    skill = skills[env.skill[world]]
+    down = wp.length(robot.paw_force[leg, world]) > skill.contact_force
     time_contact(robot, world, leg, down)  # before the velocity of the step before is written over
     follow_paw(robot, geometry[leg], world, leg)
     robot.paw_height[leg, world] = height_of_paw(robot, geometry[leg], ground, world, leg)
     robot.collisions[leg, world] = leg_collisions(
-        geometry, world_ground(ground, world), robot.joint_q, world * COORDS, leg
+        geometry, world_ground(ground, world), robot.joint_q, world * COORDS, leg, skill.link_margin
     )

@@ -123,14 +123,15 @@ def horizontal_jump() -> TaskCfg:
                 level((0.25, 0.8), 0.15),
                 level((0.3, 1.1), 0.3),
                 level((0.3, 1.5), 0.35),
-                level((1.0, 2.2), 0.35),
-                level((1.6, 2.4), 0.2),
+                level((0.3, 1.9), 0.35),
+                level((0.3, 2.2), 0.35),
             ),
             STARTS,
         ),
         motors=jumping_motors(18.0, lateral_torque=12.0),
         command_filter=horizontal_jump_filter(),
         action_scale=(15.0, 90.0),
+        link_margin=0.005,
         evaluation="place",
     )
 

@@ -101,5 +101,6 @@ def vertical_jump() -> TaskCfg:
         motors=jumping_motors(18.0, lateral_torque=10.0),
         command_filter=vertical_jump_filter(),
         action_scale=(15.0, 90.0),
+        link_margin=0.005,
         evaluation="height",
     )
