@@ -20,12 +20,12 @@ N = 64
 WEIGHT = 142.0  # [N]
 
 
-def contact_force(force):
+def contact_force(force, link_margin=0.0):
     """Return the settings of skills with a least contact force [N] each."""
     settings = []
     for least in np.atleast_1d(force):
         found = Skill(make_task("vertical-jump"), 0, 1, STEP_DT, 8, "cpu").settings_of_skill()
-        found.contact_force = float(least)
+        found.contact_force, found.link_margin = float(least), link_margin
         settings.append(found)
     return wp.array(settings, dtype=SkillSettings, device="cpu")
 
@@ -207,3 +207,20 @@ def test_the_flags_of_the_legs_together_are_those_of_the_robot(sim, poses, kind)
         assert 0.005 < share < 0.995, bit
     assert 0.05 < np.mean(expected == 0) < 0.95 or "block" in kind
     assert (np.count_nonzero(by_leg, axis=0) < 4).mean() > 0.2  # legs differ
+
+
+def test_links_closer_than_the_margin_count_as_touching(sim, poses):
+    n, margin = 4000, 0.02
+    high = poses.numpy().reshape(n, -1)
+    high[:, 2] += 10.0  # nothing is near the ground
+    robot = standing_robots(n)
+    robot.joint_q = array(high)
+    track(robot, sim, settings=contact_force(0.1, margin))
+    flags, clearance = (wp.zeros(n, dtype=dtype, device="cpu") for dtype in (int, float))
+    made = sim.physics.dynamics.robot
+    inputs = [made.geometry, made.ground, robot.joint_q, 43, 2.0 * margin]
+    wp.launch(collision_kernel, n, inputs, [flags, clearance], device="cpu")
+    near, far = clearance.numpy() < margin - 1e-5, clearance.numpy() > margin + 1e-5
+    found = np.bitwise_or.reduce(robot.collisions.numpy(), axis=0) != 0
+    assert found[near].all() and not found[far].any()
+    assert (near & (flags.numpy() == 0)).sum() > 20  # the margin tells some that do not touch
