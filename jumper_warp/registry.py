@@ -63,14 +63,14 @@ class TaskEntry:
 
 WALKING = PpoCfg(num_steps=24, gamma=0.985, entropy_coef=0.0025, init_std=0.4, symmetry="actor")
 """How velocity tracking is trained."""
-PLACES = PpoCfg(gamma=0.99, entropy_coef=0.0003)
+PLACES = PpoCfg(gamma=0.99, entropy_coef=0.0003, symmetry="actor")
 """How jumps to places are trained."""
 TURNS = PpoCfg(gamma=0.99, entropy_coef=0.001, init_std=0.5)
 """How turning in flight is trained."""
 
 TASKS: dict[str, TaskEntry] = {
     "vertical-jump": TaskEntry(
-        "jumper_warp.tasks.jump.vertical:vertical_jump", aliases=("Olympus-Vertical-Jump",)
+        "jumper_warp.tasks.jump.vertical:vertical_jump", PpoCfg(gamma=0.99), aliases=("Olympus-Vertical-Jump",)
     ),
     "horizontal-jump": TaskEntry(
         "jumper_warp.tasks.jump.horizontal:horizontal_jump",

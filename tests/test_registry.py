@@ -75,9 +75,9 @@ def test_unknown_task_is_refused_with_those_that_there_are():
 
 
 def test_trainer_settings_are_those_of_the_task():
-    assert trainer_settings("vertical-jump") == PpoCfg()
-    assert trainer_settings("Olympus-Horizontal-Jump") == PpoCfg(gamma=0.99, entropy_coef=0.0003)
-    assert trainer_settings("omnidirectional-jump") == PpoCfg(gamma=0.99, entropy_coef=0.0003)
+    assert trainer_settings("vertical-jump") == PpoCfg(gamma=0.99)
+    assert trainer_settings("Olympus-Horizontal-Jump") == PpoCfg(gamma=0.99, entropy_coef=0.0003, symmetry="actor")
+    assert trainer_settings("omnidirectional-jump") == PpoCfg(gamma=0.99, entropy_coef=0.0003, symmetry="actor")
 
 
 def test_registered_task_is_made_and_trained_as_told():
@@ -262,7 +262,7 @@ def test_package_takes_no_name_of_the_project(install):
     with pytest.raises(InputError, match="there is a task 'vertical-jump' already"):
         registry.load_installed(point)
     assert TASKS["vertical-jump"] == TaskEntry(
-        "jumper_warp.tasks.jump.vertical:vertical_jump", aliases=("Olympus-Vertical-Jump",)
+        "jumper_warp.tasks.jump.vertical:vertical_jump", PpoCfg(gamma=0.99), aliases=("Olympus-Vertical-Jump",)
     )
 
 

@@ -66,6 +66,7 @@ def upgraded(saved: dict[str, Any]) -> dict[str, Any]:
 def _content(today: dict[str, Any], saved: dict[str, Any]) -> dict[str, Any]:
     """Return today's JSON of the same task with the saved settings."""
     today |= {name: saved[name] for name in ("motors", "command_filter", "action_scale", "contact_force")}
+    today["policy"] = [row | {"history": 1} for row in today["policy"]]
     today["advance"]["takeoff_speed"] = saved["takeoff_speed"]
     today["curriculum"] |= {"tolerance": saved["near"], "promote_after": saved["games"]}
     today["rewards"] = _rows(saved, "terms", (rewards, mdp_rewards))

@@ -16,7 +16,7 @@ ACTIVATIONS = ("elu", "relu", "tanh")
 
 @dataclass(frozen=True)
 class PpoCfg:
-    """Settings of the algorithm; the defaults are those of the vertical jump."""
+    """Settings of the algorithm; a task may have others as its defaults (`registry.TASKS`)."""
 
     num_steps: int = 32
     """Policy steps of each world per iteration."""

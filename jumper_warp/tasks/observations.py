@@ -30,6 +30,15 @@ DRAWN = (
 """What was drawn for the world and matters most, for the critic."""
 
 
+REMEMBERED = ("lin_vel", "ang_vel", "gravity", "angle", "last_action")
+"""Observations of which policies see the last steps too."""
+
+
+def remembered(terms: tuple[ObservationTerm, ...], steps: int = 4) -> tuple[ObservationTerm, ...]:
+    """Return terms of which some span several policy steps, from which noise, latency and motors can be told."""
+    return tuple(term.replace(history=steps) if term.name in REMEMBERED else term for term in terms)
+
+
 def exact(terms: tuple[ObservationTerm, ...]) -> tuple[ObservationTerm, ...]:
     """Return terms without noise and without delay."""
     return tuple(term.replace(noise=0.0, delayed=False) for term in terms)

@@ -377,4 +377,4 @@ def test_the_configuration_names_its_functions(env):
     config = env.config()
     assert isinstance(env.task, TaskCfg) and config["task"]["rewards"][0]["func"].endswith(":jump_height")
     assert config["policy_dt_s"] == pytest.approx(1.0 / 60.0)
-    assert len(config["interface"]["observation_names"]) == env.num_obs == 48
+    assert len(config["interface"]["observation_names"]) == env.num_obs == 147

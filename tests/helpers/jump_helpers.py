@@ -97,8 +97,9 @@ def make_episode(**fields) -> JumpState:
 
 
 def without_draws(task: TaskCfg) -> TaskCfg:
-    """Return a jump whose critic does not see what was drawn for the world: 48 columns as the actor, 15 of its own."""
-    return dataclasses.replace(task, critic=(*exact(task.policy), *EPISODE))
+    """Return a jump without history whose critic sees nothing drawn: 48 columns as the actor, 15 of its own."""
+    policy = tuple(term.replace(history=1) for term in task.policy)
+    return dataclasses.replace(task, policy=policy, critic=(*exact(policy), *EPISODE))
 
 
 class Robots:

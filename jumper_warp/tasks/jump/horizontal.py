@@ -13,6 +13,7 @@ from jumper_warp.tasks.cfg import Command, Reset, TaskCfg
 from jumper_warp.tasks.jump.cfg import GroundCfg, Level, ResetCfg, ladder
 from jumper_warp.tasks.jump.observations import HORIZONTAL, SIGHT, SIGHTED, critic
 from jumper_warp.tasks.jump.vertical import QUIET, STARTS
+from jumper_warp.tasks.observations import remembered
 from jumper_warp.tasks.terms import Advance, Curriculum, RewardTerm, TerminationTerm
 from jumper_warp.tasks.units import DEG, SECOND, G
 from kernels.jump import errors, phase, reset, rewards, terminations
@@ -32,7 +33,7 @@ REWARDS = (
     RewardTerm(rewards.left_right_symmetry, 20.0, width=0.5, share=0.1),
     RewardTerm(rewards.standing_posture, 50.0, width=20.0 * DEG, shift=25.0 * DEG),
     RewardTerm(rewards.rest, 40.0, speed=0.1, spin=0.5),
-    RewardTerm(rewards.landing_tilt, -20.0, width=10.0 * DEG),
+    RewardTerm(rewards.landing_tilt, -60.0, width=10.0 * DEG),
     RewardTerm(rewards.lifted_again, -30.0, free=0.0),
     RewardTerm(rewards.capture_point, 20.0, width=0.10),
     RewardTerm(rewards.soft_impact, 20.0, limit=5.0 * G),
@@ -115,7 +116,7 @@ def horizontal_jump() -> TaskCfg:
         curriculum=Curriculum(errors.landing_error, tolerance=0.10, counts=reset.from_standing),
         rewards=REWARDS,
         terminations=TERMINATIONS,
-        policy=HORIZONTAL,
+        policy=remembered(HORIZONTAL),
         critic=critic(HORIZONTAL, SIGHT),
         levels=ladder(
             (
@@ -142,7 +143,7 @@ def horizontal_jump_sighted() -> TaskCfg:
     return replace(
         task,
         name="horizontal-jump-sighted",
-        policy=SIGHTED,
+        policy=remembered(SIGHTED),
         critic=critic(SIGHTED),
         reset=replace(task.reset, settings=replace(RESET, ground=ground)),
     )

@@ -16,6 +16,7 @@ from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.tasks.jump.cfg import GroundCfg, ladder
 from jumper_warp.tasks.jump.horizontal import NEAREST, horizontal_jump, level
 from jumper_warp.tasks.jump.vertical import STARTS, heights, vertical_jump
+from kernels.jump import terminations
 
 TORQUE, KP = 24.8, 20.0
 """[N m], [N m/rad] Of the transversal motors."""
@@ -39,6 +40,8 @@ def vertical_jump_mars() -> TaskCfg:
         evaluation="height-mars",
     )
     task = task.with_terms("terminations", moved_away={"distance": 0.5})
+    ends = tuple(term for term in task.terminations if term.func is not terminations.second_takeoff)
+    task = replace(task, terminations=ends)  # robots that only learn to land bounce, and must live to learn not to
     return task.with_terms(
         "rewards",
         jump_height={"wide": 0.8},

@@ -10,6 +10,7 @@ from jumper_warp.robot.motors import jumping_motors, vertical_jump_filter
 from jumper_warp.tasks.cfg import Command, Reset, TaskCfg
 from jumper_warp.tasks.jump.cfg import Level, ResetCfg, ladder
 from jumper_warp.tasks.jump.observations import VERTICAL, critic
+from jumper_warp.tasks.observations import remembered
 from jumper_warp.tasks.terms import Advance, Curriculum, RewardTerm, TerminationTerm
 from jumper_warp.tasks.units import DEG, SECOND, G
 from kernels.jump import errors, phase, reset, rewards, terminations
@@ -37,7 +38,7 @@ REWARDS = (
     RewardTerm(rewards.orientation, 15.0, width=0.1, share=PATIENCE),
     RewardTerm(rewards.angular_velocity, 2.0, width=2.0, share=PATIENCE),
     RewardTerm(rewards.joint_symmetry, 35.0, variance=0.05, lateral=0.35, share=PATIENCE),
-    RewardTerm(rewards.ground_posture, 30.0, width=10.0 * DEG, shift=35.0 * DEG, share=PATIENCE),
+    RewardTerm(rewards.ground_posture, 10.0, width=10.0 * DEG, shift=35.0 * DEG, share=PATIENCE),
     RewardTerm(rewards.air_posture, 80.0, width=15.0 * DEG),
     RewardTerm(rewards.retract, 10.0, width=15.0 * DEG, shift=15.0 * DEG),
     RewardTerm(rewards.rest, 20.0, speed=0.1, spin=0.5),
@@ -95,7 +96,7 @@ def vertical_jump() -> TaskCfg:
         curriculum=Curriculum(errors.height_error, tolerance=0.05, counts=reset.from_standing),
         rewards=REWARDS,
         terminations=TERMINATIONS,
-        policy=VERTICAL,
+        policy=remembered(VERTICAL),
         critic=critic(VERTICAL),
         levels=heights((0.5, 0.7), (0.45, 0.95), (0.45, 1.15)),
         motors=jumping_motors(18.0, lateral_torque=10.0),

@@ -2,14 +2,16 @@ import math
 
 import numpy as np
 import pytest
-from jump_helpers import DEG, MOTOR_SLOTS, Robots, edit_episodes, make_env, make_episode, only
+import warp as wp
+from jump_helpers import DEG, MOTOR_SLOTS, Robots, edit_episodes, make_env, make_episode, only, without_draws
 from mdp_helpers import array
 from scipy.spatial.transform import Rotation
 
 from jumper_warp.registry import make_task
+from jumper_warp.tasks.mirror import LEGS, mirror_of
 from kernels.jump.state import FLIGHT, LANDED, STANCE
 
-HORIZONTAL, VERTICAL = make_task("horizontal-jump"), make_task("vertical-jump")
+HORIZONTAL, VERTICAL = (without_draws(make_task(name)) for name in ("horizontal-jump", "vertical-jump"))
 NAMES = HORIZONTAL.observation_names
 ROBOT, EPISODE, BLOCK = 48, 15, 7  # columns
 DRAWN = slice(ROBOT + EPISODE, -BLOCK)
@@ -201,12 +203,12 @@ def test_what_is_not_finite_is_seen_as_zero_by_both():
 
 @pytest.fixture(scope="module")
 def env():
-    return make_env(256, task=HORIZONTAL, reset=only("default"), randomize=True, noise=True, seed=8)
+    return make_env(256, task=make_task("horizontal-jump"), reset=only("default"), randomize=True, noise=True, seed=8)
 
 
 def test_the_environment_shows_the_critic_what_was_drawn(env):
     model, motors = env.sim.model, env.sim.motors
-    nominal = make_env(1, task=HORIZONTAL, reset=only("default")).sim
+    nominal = make_env(1, task=make_task("horizontal-jump"), reset=only("default")).sim
     mass, com = model.body_mass.numpy().reshape(256, -1), model.body_com.numpy().reshape(256, -1, 3)
     mass = mass - nominal.model.body_mass.numpy()
     friction = model.shape_material_mu.numpy()[model.shape_world.numpy() >= 0].reshape(256, -1)
@@ -226,7 +228,7 @@ def test_drawn_parameters_are_of_order_one_and_zero_without_randomisation(env):
     shown = env.critic_obs[:, DRAWN].numpy()
     assert shown.shape[1] == env.num_critic_obs - ROBOT - EPISODE - BLOCK
     assert np.abs(shown).max() < 3.0 and (np.abs(shown).max(axis=0) > 0.04).all()
-    nominal = make_env(16, task=HORIZONTAL, reset=only("default"))
+    nominal = make_env(16, task=make_task("horizontal-jump"), reset=only("default"))
     assert not nominal.critic_obs[:, DRAWN].any()
 
 
@@ -243,14 +245,14 @@ def edges(block, base, heading):
 
 def test_the_block_ahead_is_seen_along_three_rays():
     task = make_task("horizontal-jump-sighted")
-    assert len(task.observation_names) == ROBOT + BLOCK and task.observation_names[:ROBOT] == NAMES
+    assert list(task.layout("policy"))[-1] == "block_ahead"
     env = make_env(256, task=task, reset=only("standing", task.reset.settings), randomize=True, seed=5)
     edit_episodes(env, level=7)
     env.reset()
     blocks = env.sim.physics.dynamics.robot.ground.blocks.numpy()
     exists = blocks["exists"] == 1
     assert 40 < exists.sum() < 216
-    seen = env.obs[:, ROBOT:].numpy()
+    seen = env.obs[:, -BLOCK:].numpy()
     np.testing.assert_array_equal(env.critic_obs[:, ROBOT : ROBOT + BLOCK], seen)
     q = env.sim.joint_q()
     yaw = np.arctan2(*Rotation.from_quat(q[:, 3:7]).apply([1.0, 0.0, 0.0])[:, 1::-1].T)
@@ -268,4 +270,31 @@ def test_the_block_ahead_is_seen_along_three_rays():
 
 def test_without_blocks_nothing_is_ahead():
     env = make_env(2, task=make_task("horizontal-jump-sighted"))
-    np.testing.assert_array_equal(env.obs[:, ROBOT:], np.tile([2.0] * 6 + [0.0], (2, 1)))
+    np.testing.assert_array_equal(env.obs[:, -BLOCK:], np.tile([2.0] * 6 + [0.0], (2, 1)))
+
+
+# ---------------------------------------------------------------- mirror image
+
+
+@pytest.mark.parametrize("task", [HORIZONTAL, VERTICAL], ids=["horizontal", "vertical"])
+def test_a_mirrored_robot_sees_the_mirror_image(task):
+    robots = random_robots(task)
+    first = robots.both()
+    flip, spin = np.array([1.0, -1.0, 1.0]), np.array([-1.0, 1.0, -1.0])
+    joints = [5 * leg + j for leg in LEGS for j in range(5)]
+    motors = [3 * leg + j for leg in LEGS for j in range(3)]
+    robots.q[:, :3] *= flip
+    robots.q[:, 3:7] *= [-1.0, 1.0, -1.0, 1.0]
+    robots.q[:, 7:27] = robots.q[:, 7:27][:, joints]
+    robots.qd[:, :3], robots.qd[:, 3:6] = robots.qd[:, :3] * flip, robots.qd[:, 3:6] * spin
+    robots.qd[:, 6:26] = robots.qd[:, 6:26][:, joints]
+    robots.com = robots.com * flip
+    robots.action, robots.offset = robots.action[motors], robots.offset[motors]
+    robots.force = robots.force[list(LEGS)] * flip
+    for episode in robots.tasks:
+        episode.goal = wp.vec3(episode.goal[0], -episode.goal[1], episode.goal[2])
+    second, seen = robots.both(), robots.skill.task
+    for group, a, b in zip(("policy", "critic"), first, second, strict=True):
+        mirror = mirror_of(seen, group)
+        np.testing.assert_allclose(b, mirror.signs * a[:, mirror.order], atol=1e-5)
+        assert np.abs(b - a).max() > 0.5

@@ -2,12 +2,12 @@ import math
 
 import numpy as np
 import pytest
-from jump_helpers import DEFAULT_ANGLE, DEG, MOTOR_SLOTS, Robots, make_episode
+from jump_helpers import DEFAULT_ANGLE, DEG, MOTOR_SLOTS, Robots, make_episode, without_draws
 
 from jumper_warp.registry import make_task
 from kernels.jump.state import FLIGHT, LANDED, STANCE
 
-TASK = make_task("vertical-jump")
+TASK = without_draws(make_task("vertical-jump"))
 NAMES = TASK.observation_names
 COLUMN = {name: i for i, name in enumerate(NAMES)}
 MOTORS = [f"{leg}_{motor}" for leg in ("FL", "FR", "BL", "BR") for motor in ("lateral", "outer", "inner")]

@@ -211,10 +211,10 @@ def test_the_flags_of_the_legs_together_are_those_of_the_robot(sim, poses, kind)
 
 def test_links_closer_than_the_margin_count_as_touching(sim, poses):
     n, margin = 4000, 0.02
-    high = poses.numpy().reshape(n, -1)
+    high = poses.numpy().copy().reshape(n, -1)
     high[:, 2] += 10.0  # nothing is near the ground
     robot = standing_robots(n)
-    robot.joint_q = array(high)
+    robot.joint_q = array(high.ravel())
     track(robot, sim, settings=contact_force(0.1, margin))
     flags, clearance = (wp.zeros(n, dtype=dtype, device="cpu") for dtype in (int, float))
     made = sim.physics.dynamics.robot
