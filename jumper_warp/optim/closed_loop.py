@@ -22,6 +22,7 @@ from jumper_warp.utils.errors import InputError
 
 if TYPE_CHECKING:
     from jumper_warp.envs.env import Env
+    from jumper_warp.tasks.terms import ObservationTerm
 
 DOWN = (0.0, 0.0, -1.0)
 
@@ -41,6 +42,8 @@ class LoopState(NamedTuple):
     """(12, num_worlds) Of the step before, within ±1."""
     torque: torch.Tensor
     """(12, num_worlds) [N m] Of the last physics step."""
+    past: torch.Tensor
+    """(earlier columns, num_worlds) What the policy saw in the steps before, of terms with a history, oldest first."""
 
     def detach(self) -> LoopState:
         """Return the same without gradients."""
@@ -99,16 +102,19 @@ class ClosedLoop:
     def __init__(self, env: Env, *, double: bool = False) -> None:
         """Take the robots of an environment as they are; see `read_parameters`.
 
-        Raises InputError: several tasks, another solver, drawn blocks, or sensors that are late or give more than one
-        frame.
+        Raises InputError: several tasks, another solver, drawn blocks, late sensors, or a history of what is not the
+        robot's state alone.
         """
         task = env.skills[0].task
         if len(env.skills) > 1 or not hasattr(env.sim.physics, "dynamics") or env.config()["solver"] != "SolverJumper":
             raise InputError("gradients need an environment of one task on SolverJumper")
         if env.sim.physics.dynamics.robot.ground.blocks.shape[0]:
             raise InputError("gradients need a ground without moving blocks: train with level ground")
-        if task.randomization.observation_latency or any(term.options["history"] > 1 for term in task.policy):
-            raise InputError(f"{task.name}: gradients need observations without latency and history")
+        if task.randomization.observation_latency:
+            raise InputError(f"{task.name}: gradients need observations without latency")
+        for term in (*task.policy, *task.critic):
+            if term.options["history"] > 1 and (term.func.key not in OWN or term not in task.policy):
+                raise InputError(f"{task.name}: gradients of a history need one of the robot's state, not {term.name}")
         self.env, self.num_worlds = env, env.num_envs
         self.rollout = Rollout(
             env.sim.model, task.motors, task.command_filter, double=double, dt=env.sim.dt, substeps=env.sim.substeps
@@ -120,6 +126,7 @@ class ClosedLoop:
         self._columns = {
             group: [(term, *task.layout(group)[term.name]) for term in getattr(task, group)] for group in task.groups
         }
+        self._remembered = [entry for entry in self._columns["policy"] if entry[0].options["history"] > 1]
         lateral, transversal = (math.radians(scale) for scale in task.action_scale)
         like = {"dtype": self.dtype, "device": env.device}
         self.scale = torch.tensor(4 * [lateral, transversal, transversal], **like)
@@ -152,8 +159,31 @@ class ClosedLoop:
         parts = (
             torch.cat([q[:, :7], q[:, 7 + self._motors]], 1).T, torch.cat([qd[:, :6], qd[:, 6 + self._motors]], 1).T,
             before, wp.to_torch(env.robot.impulse), wp.to_torch(env.robot.action), wp.to_torch(env.robot.torque),
+            self._earlier(env.obs),
         )  # fmt: skip
         return LoopState(*(part.to(self.dtype, copy=True).contiguous() for part in parts))
+
+    def _earlier(self, obs: torch.Tensor) -> torch.Tensor:
+        """Return the frames before the last of all terms that have some, as `LoopState.past`."""
+        ends = [(first, end - term.width) for term, first, end in self._remembered]
+        return torch.cat([obs[:, first:last] for first, last in ends] or [obs[:, :0]], 1).T
+
+    def _pasts(self, state: LoopState) -> list[torch.Tensor]:
+        """Return the earlier frames of each term that has some, (num_worlds, columns)."""
+        counts = [end - first - term.width for term, first, end in self._remembered]
+        return list(state.past.T.split(counts, 1)) if counts else []
+
+    def _aged(self, state: LoopState) -> torch.Tensor:
+        """Return the earlier frames of the state that follows: those of this state without the oldest, and its own."""
+        motion, found = self.motion(state), []
+        for (term, _, _), past in zip(self._remembered, self._pasts(state), strict=True):
+            found += [past[:, term.width :], self._frame(term, motion, state, past[:, : term.width])]
+        return torch.cat(found, 1).T if found else state.past
+
+    def _frame(self, term: ObservationTerm, motion: Motion, state: LoopState, told: torch.Tensor) -> torch.Tensor:
+        """Return what a term shows of a state; told: as the environment shows it."""
+        scale, clip = term.numbers["scale"], term.numbers["clip"]
+        return scale * SEEN[term.func.key](self, motion, state, told / scale).clamp(-clip, clip)
 
     def advance(
         self,
@@ -175,7 +205,7 @@ class ClosedLoop:
             wrench=None if wrench is None else wrench[None], **(parameters or {}),
         )  # fmt: skip
         impulse = made.impulse[-1].detach()
-        return LoopState(made.q[-1], made.qd[-1], made.safe[-1], impulse, clamped, made.torque[-1])
+        return LoopState(made.q[-1], made.qd[-1], made.safe[-1], impulse, clamped, made.torque[-1], self._aged(state))
 
     def motion(self, state: LoopState) -> Motion:
         """Return base and motors of a state."""
@@ -191,14 +221,13 @@ class ClosedLoop:
 
         told: (num_worlds, columns), of which those that are not of the robot's state, such as commands, are taken.
         """
-        motion, columns = self.motion(state), []
+        motion, columns, pasts = self.motion(state), [], iter(self._pasts(state))
         for term, first, end in self._columns[group]:
             value = told[:, first:end].to(self.dtype)
-            if term.func.key in SEEN:
-                options = term.numbers
-                seen = SEEN[term.func.key](self, motion, state, value / options["scale"])
-                value = options["scale"] * seen.clamp(-options["clip"], options["clip"])
-            columns.append(value)
+            if term.options["history"] > 1:
+                columns.append(next(pasts))
+                value = value[:, -term.width :]
+            columns.append(self._frame(term, motion, state, value) if term.func.key in SEEN else value)
         return torch.cat(columns, 1)
 
     def step(self, state: LoopState, action: torch.Tensor) -> tuple[LoopState, LoopState]:
@@ -257,3 +286,5 @@ SEEN: dict[str, Callable[..., torch.Tensor]] = {
     "last_action": lambda loop, motion, state, told: state.action.T,
 }
 """Observation terms of the robot's state, by name; the height is that above level ground."""
+OWN = frozenset(SEEN) - {"goal", "height_errors"}
+"""Those of the robot's state alone."""

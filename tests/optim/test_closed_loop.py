@@ -109,7 +109,7 @@ def test_what_gives_no_gradients_is_refused():
     late = dataclasses.replace(
         task, randomization=dataclasses.replace(task.randomization, observation_latency=(0.0, 8))
     )
-    with pytest.raises(InputError, match="without latency and history"):
+    with pytest.raises(InputError, match="without latency"):
         ClosedLoop(Env(late, 1, device="cpu"))
     with pytest.raises(InputError, match="on SolverJumper"):
         ClosedLoop(Env(task, 1, solver="mujoco", device="cpu"))
