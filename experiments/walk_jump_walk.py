@@ -4,10 +4,11 @@
 
 Every robot walks after commands of its own, redrawn every two seconds within 0.8 m/s and 0.8 rad/s, jumps to 0.75 m,
 walks, jumps 0.85 m ahead, and walks. `--course` gives every robot ten commands of its own instead: to walk, to turn,
-to jump up and to jump to a place, drawn at random. A jump is commanded while the robot walks: it comes to a stop,
-stands, jumps, and walks again. `success_rate` is the share of robots that carried out every command without a fall.
-`--randomize` adds the jumps' randomisation, noise, latency and pushes; `--solver mujoco` is a check against physics
-that the policies were not trained on, for which fewer robots will do.
+to jump up, to jump to a place and to jump onto a sliding block of 0.05 m, drawn at random (no block on SolverMuJoCo).
+The block lies under the goal from when the jump takes over, and stays where it then slides. A jump is commanded while
+the robot walks: it comes to a stop, stands, jumps, and walks again. `success_rate` is the share of robots that carried
+out every command without a fall. `--randomize` adds the jumps' randomisation, noise, latency and pushes;
+`--solver mujoco` is a check against physics that the policies were not trained on, for which fewer robots will do.
 """
 
 from __future__ import annotations
@@ -37,8 +38,9 @@ WALKS = (3, 3, 2)
 """Commands before, between and after the jumps."""
 COMMANDS = 10
 """In a course."""
-PROBABILITIES = (0.4, 0.2, 0.2, 0.2)
-"""Of walking, turning, jumping up and jumping to a place."""
+JUMPS = ("jump_up", "jump_to", "jump_onto")
+PROBABILITIES = (0.35, 0.2, 0.15, 0.15, 0.15)
+"""Of walking, turning and each of the jumps."""
 PAPER = {"rmse_vx_m_s": 0.17, "rmse_vy_m_s": 0.05, "rmse_yaw_rate_rad_s": 0.12}
 """The paper's figures, one test on the robot."""
 
@@ -57,6 +59,8 @@ class Args(EvaluationArgs):
     """Number of robots, each with commands of its own."""
     course: bool = False
     """Ten random commands a robot instead of the paper's test."""
+    blocks: bool = True
+    """Whether courses have blocks to jump onto; SolverMuJoCo has none."""
 
     def __post_init__(self) -> None:
         """Check the values."""
@@ -77,11 +81,11 @@ def paper_script(rng: np.random.Generator) -> list[ScriptStep]:
     return [*before, up, *between, ahead, *after]
 
 
-def random_script(rng: np.random.Generator) -> list[ScriptStep]:
-    """Return ten commands: a jump of each kind, the others drawn."""
-    kinds = ["jump_up", "jump_to", *rng.choice(["walk", "turn", "jump_up", "jump_to"], COMMANDS - 2, p=PROBABILITIES)]
+def random_script(rng: np.random.Generator, blocks: bool = True) -> list[ScriptStep]:
+    """Return ten commands: a jump of each kind, the others drawn; blocks: whether there are any to jump onto."""
+    drawn_kinds = rng.choice(["walk", "turn", *JUMPS], COMMANDS - len(JUMPS), p=PROBABILITIES)
     script = []
-    for kind in rng.permutation(kinds):
+    for kind in rng.permutation([*JUMPS, *drawn_kinds]):
         if kind == "walk":
             script += walks(rng, 1)
         elif kind == "turn":
@@ -89,8 +93,10 @@ def random_script(rng: np.random.Generator) -> list[ScriptStep]:
             script.append(ScriptStep("walk", (0.0, 0.0, rate), EACH))
         elif kind == "jump_up":
             script.append(ScriptStep("jump_up", (float(rng.uniform(0.55, 0.95)),)))
-        else:
+        elif kind == "jump_to" or not blocks:
             script.append(ScriptStep("jump_to", (float(rng.uniform(0.4, 1.1)), float(rng.uniform(-0.2, 0.2)))))
+        else:  # so far that no corner of the block is under the robot, whatever its heading
+            script.append(ScriptStep("jump_onto", (float(rng.uniform(1.2, 1.5)), float(rng.uniform(-0.1, 0.1)))))
     return script
 
 
@@ -104,16 +110,17 @@ def plot(run: SkillRun, course: Course, world: int) -> None:
 def scripts(args: Args) -> Sequence[Sequence[ScriptStep]]:
     """Return what every robot is to do."""
     rng = np.random.default_rng(args.seed)
-    make = random_script if args.course else paper_script
-    return [make(rng) for _ in range(args.robots)]
+    if args.course:
+        return [random_script(rng, args.blocks and args.solver == "jumper") for _ in range(args.robots)]
+    return [paper_script(rng) for _ in range(args.robots)]
 
 
 def main(args: Args) -> dict:
     """Run the test and return its figures."""
     names = SkillNames(args.policy, args.jump_up, args.jump_to)
     run = SkillRun.of("course" if args.course else "walk_jump_walk", args, names)
-    env = run.env(args.robots)
     course = Course(scripts(args), random_headings(args.robots, args.seed))
+    env = run.env(args.robots, block=course.block)
     run.follow(env, course, film="course" if args.course else "walk_jump_walk")
     plot(run, course, 0)
     return run.report(course_metrics(course), {} if args.course else PAPER)

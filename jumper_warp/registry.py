@@ -65,7 +65,7 @@ WALKING = PpoCfg(num_steps=24, gamma=0.985, entropy_coef=0.0025, init_std=0.4, s
 """How velocity tracking is trained."""
 PLACES = PpoCfg(gamma=0.99, entropy_coef=0.0003, symmetry="actor")
 """How jumps to places are trained."""
-TURNS = PpoCfg(gamma=0.99, entropy_coef=0.001, init_std=0.5)
+TURNS = PpoCfg(gamma=0.99, entropy_coef=0.001, init_std=0.5, symmetry="actor")
 """How turning in flight is trained."""
 
 TASKS: dict[str, TaskEntry] = {

@@ -17,10 +17,13 @@ from jumper_warp.evaluation.log import EvaluationLog, finite
 from jumper_warp.evaluation.scripts import ScriptStep
 from jumper_warp.evaluation.velocities import AXES, SKIP, body_velocity
 from jumper_warp.policies.skills import JUMP_TO, JUMP_UP, WALK
+from jumper_warp.robot.grounds import BlockCfg
 from jumper_warp.tasks.switching import FALLS
 from jumper_warp.utils.errors import InputError
 
-SKILL_OF = {"walk": WALK, "stand": WALK, "jump_up": JUMP_UP, "jump_to": JUMP_TO}
+SKILL_OF = {"walk": WALK, "stand": WALK, "jump_up": JUMP_UP, "jump_to": JUMP_TO, "jump_onto": JUMP_TO}
+BLOCK = BlockCfg(center=(1.0e3, 1.0e3), half=(0.55, 0.55), height=0.05, mass=10.0, friction=0.4)
+"""What robots jump onto: far away until then, under the goal from when the jump takes over."""
 SLEW = 1.25
 """[m/s^2], [rad/s^2] How fast a velocity is taken from one command to the next."""
 NUDGE_AFTER, NUDGE_FOR = 1.2, 0.5
@@ -81,6 +84,7 @@ class Course(EvaluationLog):
         if len(lengths) != 1 or 0 in lengths:
             raise InputError(f"a course needs scripts of one length, got {sorted(lengths)} commands")
         n, k = len(self.scripts), lengths.pop()
+        self.onto = np.array([[step.kind == "jump_onto" for step in script] for script in self.scripts])
         self.target = np.array([[SKILL_OF[step.kind] for step in script] for script in self.scripts])
         self.goal = np.array([[step.goal for step in script] for script in self.scripts])
         self.lasts = np.array([[step.seconds for step in script] for script in self.scripts])
@@ -89,6 +93,11 @@ class Course(EvaluationLog):
         self.began[:, 0] = 0
         self.apex, self.offset = np.full((n, k), np.nan), np.full((n, k, 2), np.nan)
         self._skill, self._aim, self._told = np.zeros(n, dtype=int), np.zeros((n, 3)), np.zeros((n, 3))
+
+    @property
+    def block(self) -> BlockCfg | None:
+        """What `Env(block=...)` needs for these scripts."""
+        return BLOCK if self.onto.any() else None
 
     @property
     def seconds(self) -> float:
@@ -138,7 +147,16 @@ class Course(EvaluationLog):
         if changed.any():
             env.command(told, changed)
         self._ask(env, fresh)
+        if self.onto.any():
+            self._place_blocks(env)
         return ended
+
+    def _place_blocks(self, env: Any) -> None:
+        """Put a block under the goal of every robot that begins to jump onto one."""
+        begins = np.flatnonzero((self.onto & (self.switched == len(self.skills))).any(axis=1))
+        if len(begins):
+            goals = env.skills[JUMP_TO].states.numpy()["goal"][begins, :2]
+            env.sim.solver.place_blocks(goals, begins.tolist())
 
     def _ask(self, env: Any, worlds: np.ndarray) -> None:
         """Ask for the jumps that are the commands of some robots."""

@@ -182,6 +182,7 @@ def finetune(
         else:
             network.weights, damping = kept, 10.0 * damping
     layers = network.layers(network.weights)
-    record = {"settings": json.loads(json.dumps(asdict(cfg), default=str)), "steps": history}
+    settings = {name: value for name, value in asdict(cfg).items() if name not in ("out", "overwrite")}
+    record = {"settings": json.loads(json.dumps(settings, default=str)), "steps": history}
     config = policy.config | {"finetuned": record | {"commit": (commit := git_commit()) and commit.hash}}
     return Policy(layers, policy.mean, policy.std, policy.interface, config), record

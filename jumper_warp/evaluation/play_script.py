@@ -27,8 +27,9 @@ from jumper_warp.utils.output import write_figures
 class ScriptCfg:
     """Let one robot walk and jump with several policies, as a script says, and record it.
 
-    A script is a JSON list of {"walk": [vx, vy, yaw_rate], "seconds": s}, {"stand": s}, {"jump_up": height} and
-    {"jump_to": [ahead, left]}; SI units, as in assets/scripts/walk_jump_walk.json.
+    A script is a JSON list of {"walk": [vx, vy, yaw_rate], "seconds": s}, {"stand": s}, {"jump_up": height},
+    {"jump_to": [ahead, left]} and {"jump_onto": [ahead, left]} (a block); SI units, as in
+    assets/scripts/walk_jump_walk.json.
     """
 
     script: Path
@@ -54,7 +55,8 @@ def play_script(cfg: ScriptCfg) -> Path:
     script = read_script(cfg.script)
     run = SkillRun(cfg.policies)
     run.prepare("play", cfg.conditions, cfg.out)
-    env, course = run.env(1), Course([script])
+    course = Course([script])
+    env = run.env(1, block=course.block)
     film = Film(env, course, [0], notes={**course.notes([0]), "solver": cfg.conditions.solver})
     run_evaluation(run.actor(env), env, course, watch=film)
     path = film.save_rrd(run.folder / "course.rrd")

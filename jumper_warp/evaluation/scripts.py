@@ -1,7 +1,8 @@
 """What a robot is to do, one command after the other, and how it is written in a file.
 
 A script is a JSON list of commands: `{"walk": [vx, vy, yaw_rate], "seconds": s}` ([m/s], [rad/s], [s]),
-`{"stand": seconds}`, `{"jump_up": height}` (of the base at the apex [m]) and `{"jump_to": [ahead, left]}` ([m]).
+`{"stand": seconds}`, `{"jump_up": height}` (of the base at the apex [m]), `{"jump_to": [ahead, left]}` ([m]), and
+`{"jump_onto": [ahead, left]}` ([m]), where a block then lies.
 """
 
 from __future__ import annotations
@@ -15,9 +16,9 @@ from typing import Any
 
 from jumper_warp.utils.errors import InputError
 
-KINDS = {"walk": 3, "stand": 1, "jump_up": 1, "jump_to": 2}
+KINDS = {"walk": 3, "stand": 1, "jump_up": 1, "jump_to": 2, "jump_onto": 2}
 """Commands, and how many numbers each takes."""
-LIMITS = {"walk": 10.0, "stand": 600.0, "jump_up": 2.0, "jump_to": 5.0}
+LIMITS = {"walk": 10.0, "stand": 600.0, "jump_up": 2.0, "jump_to": 5.0, "jump_onto": 5.0}
 """Largest number of each."""
 LONGEST = 600.0
 """[s] Of walking and standing in one script."""
@@ -32,7 +33,8 @@ class ScriptStep:
     kind: str
     """Of `KINDS`."""
     values: tuple[float, ...] = (0.0, 0.0, 0.0)
-    """walk: velocity ahead, to the left [m/s], about z [rad/s]; jump_up: height [m]; jump_to: place ahead, left [m]."""
+    """walk: velocity ahead, to the left [m/s], about z [rad/s]; jump_up: height [m]; jump_to, jump_onto: place
+    ahead, left [m]."""
     seconds: float = 0.0
     """[s] How long to walk or stand."""
 

@@ -305,15 +305,15 @@ class SolverJumper(SolverBase):
         """Return the velocities of the blocks [m/s], world frame, (num_worlds, 2). Raises ValueError without blocks."""
         return self._blocks().numpy()["velocity"].copy()
 
-    def place_blocks(self, center: np.ndarray) -> None:
-        """Put all blocks at rest to new starts [m], world frame, (2,) or (num_worlds, 2).
+    def place_blocks(self, center: np.ndarray, worlds: Sequence[int] | None = None) -> None:
+        """Put the blocks of some worlds, by default all, at rest to new starts [m], world frame, (2,) or (worlds, 2).
 
         Raises ValueError without blocks.
         """
         values = self._blocks().numpy()
-        values["start"] = center
+        values["start"][slice(None) if worlds is None else list(worlds)] = center
         self._blocks().assign(values)
-        self.reset_blocks()
+        self.reset_blocks(worlds)
 
     def reset_blocks(self, worlds: Sequence[int] | wp.array | None = None) -> None:
         """Put the blocks of some worlds, by default all, back to their starts, at rest.

@@ -26,6 +26,12 @@ class MadeUp:
         self.n, self.error, self.falls_at, self.never_stops = n, np.array(error), falls_at, never_stops
         self.skill, self.wanted, self.since, self.command_values = np.zeros(n, int), np.full(n, -1), np.zeros(n), None
         self.step_dt, self.steps, self.velocity, self.asked = DT, 0, np.zeros((n, 3)), []
+        goals = np.zeros(n, dtype=[("goal", float, 3)])
+        goals["goal"] = np.arange(3 * n).reshape(n, 3)
+        self.skills = 3 * [SimpleNamespace(states=SimpleNamespace(numpy=lambda: goals))]
+        self.placed = []
+        place = lambda center, worlds: self.placed.append((self.steps, center.tolist(), worlds))  # noqa: E731
+        self.sim = SimpleNamespace(solver=SimpleNamespace(place_blocks=place))
 
     def evaluation_reset(self, commands, headings):
         self.velocity = np.array(commands, dtype=float)
@@ -108,6 +114,17 @@ def test_landing_is_measured_from_the_goal_and_may_miss_it():
     course.offset[0, 0] = 0.2
     assert course_metrics(course)["on_goal_rate"] == 0.0 and course_metrics(course)["success_rate"] == 1.0
     assert [skill for skill, *_ in active_spans(course, 0)] == [WALK, JUMP_TO, WALK]
+
+
+def test_a_block_is_put_under_the_goal_when_the_jump_onto_it_takes_over():
+    plain, onto = (ScriptStep(kind, (1.3, 0.1)) for kind in ("jump_to", "jump_onto"))
+    course, env = Course([(plain, plain), (plain, onto)]), MadeUp(2)
+    assert course.block is not None and Course([(plain, plain)]).block is None
+    course.look = lambda env: env.step()
+    course.begin(env)
+    while not course.follow(env):
+        pass
+    assert env.placed == [(course.switched[1, 1], [[3.0, 4.0]], [1])] and course.switched[1, 1] > course.over[1, 0]
 
 
 def test_a_fall_ends_a_course():

@@ -14,16 +14,18 @@ EXAMPLE = Path(__file__).parents[2] / "assets" / "scripts" / "walk_jump_walk.jso
 def test_every_command_is_understood():
     script = parse_script(
         [{"walk": [0.5, 0, 0.3]}, {"walk": [0, 1, 0], "seconds": 4}, {"stand": 1.5}, {"jump_up": 0.75},
-         {"jump_to": [0.85, -0.1]}]
+         {"jump_to": [0.85, -0.1]}, {"jump_onto": [1.3, 0.1]}]
     )  # fmt: skip
     assert script == (
         ScriptStep("walk", (0.5, 0.0, 0.3), 2.0), ScriptStep("walk", (0.0, 1.0, 0.0), 4.0),
         ScriptStep("stand", seconds=1.5), ScriptStep("jump_up", (0.75,)), ScriptStep("jump_to", (0.85, -0.1)),
+        ScriptStep("jump_onto", (1.3, 0.1)),
     )  # fmt: skip
     assert [step.goal for step in script] == [
-        (0.5, 0.0, 0.3), (0.0, 1.0, 0.0), (0.0, 0.0, 0.0), (0.0, 0.0, 0.75), (0.85, -0.1, 0.0)
+        (0.5, 0.0, 0.3), (0.0, 1.0, 0.0), (0.0, 0.0, 0.0), (0.0, 0.0, 0.75), (0.85, -0.1, 0.0),
+        (1.3, 0.1, 0.0),
     ]  # fmt: skip
-    assert [step.jumps for step in script] == [False, False, False, True, True]
+    assert [step.jumps for step in script] == [False, False, False, True, True, True]
 
 
 def test_the_example_walks_and_jumps():
@@ -36,7 +38,7 @@ def test_the_example_walks_and_jumps():
     [
         ({"walk": [1, 0, 0]}, "a script is a list"),
         ([], "a script is a list"),
-        (["walk"], "command 1 must have one of walk, stand, jump_up, jump_to, got walk"),
+        (["walk"], "command 1 must have one of walk, stand, jump_up, jump_to, jump_onto, got walk"),
         ([{"fly": 1}], "command 1 must have one of"),
         ([{"stand": 1}, {"walk": [0, 0, 0], "stand": 1}], "command 2 must have one of"),
         ([{"walk": [0, 0]}], "command 1: walk takes 3 numbers within 10, got"),

@@ -286,6 +286,9 @@ def test_blocks_return_to_their_starts():
     assert not sim.solver.block_velocity()[1].any()
     sim.solver.reset_blocks(wp.array([True, False, False], dtype=wp.bool, device="cpu"))
     assert np.array_equal(sim.solver.block_position(), [starts[0], starts[1], moved[2]])
+    sim.solver.place_blocks([[0.4, 0.4]], [2])
+    assert np.array_equal(sim.solver.block_position(), [starts[0], starts[1], np.float32([0.4, 0.4])])
+    sim.solver.place_blocks(starts[2:], [2])
     sim.solver.reset(sim.state)
     assert np.array_equal(sim.solver.block_position(), starts)
 
