@@ -2,7 +2,20 @@ import pytest
 import torch
 import warp as wp
 
+from jumper_warp.envs.env import Env
+from jumper_warp.registry import make_task
+
 wp.config.log_level = wp.LOG_WARNING
+SHARED = ("vertical-jump", "horizontal-jump", "velocity-flat", "velocity-rough", "attitude")
+"""Tasks whose kernels many files need."""
+
+
+def pytest_sessionstart(session):
+    """Compile what most files need before workers begin, who else would compile the same kernels at the same time."""
+    options = session.config.option
+    if (getattr(options, "numprocesses", None) or 0) > 1 and not options.file_or_dir:
+        for name in SHARED:
+            Env(make_task(name), 2, device="cpu").compile()
 
 
 @pytest.fixture(scope="module")

@@ -24,6 +24,8 @@ from jumper_warp.utils.errors import InputError
 SKILL_OF = {"walk": WALK, "stand": WALK, "jump_up": JUMP_UP, "jump_to": JUMP_TO, "jump_onto": JUMP_TO}
 BLOCK = BlockCfg(center=(1.0e3, 1.0e3), half=(0.55, 0.55), height=0.05, mass=10.0, friction=0.4)
 """What robots jump onto: far away until then, under the goal from when the jump takes over."""
+SQUAT = 0.5
+"""[s] From when a jump takes over, and squats as it does at the start of its episodes, to its command."""
 SLEW = 1.25
 """[m/s^2], [rad/s^2] How fast a velocity is taken from one command to the next."""
 NUDGE_AFTER, NUDGE_FOR = 1.2, 0.5
@@ -164,7 +166,8 @@ class Course(EvaluationLog):
         for skill in (JUMP_UP, JUMP_TO):
             asked = worlds & (self.target[rows, at] == skill)
             if asked.any():
-                env.request(skill, asked, self.goal[rows, at])
+                delay = np.full((len(rows), 1), round(SQUAT / self.step_dt))
+                env.request(skill, asked, np.concatenate([self.goal[rows, at], delay], axis=1))
 
     def update(self, arrays: dict[str, np.ndarray], step_dt: float) -> bool:
         """Take in a policy step; return whether all courses have ended."""

@@ -82,7 +82,7 @@ def followed(script=SCRIPT, n=2, **made_up) -> tuple[Course, MadeUp]:
 def test_jump_is_asked_for_after_stopping_and_walking_goes_on_after_it():
     course, env = followed()
     assert env.asked == [(120, JUMP_UP, 0), (120, JUMP_UP, 1)]
-    np.testing.assert_allclose(env.goals, [[0.0, 0.0, 0.75]] * 2)
+    np.testing.assert_allclose(env.goals, [[0.0, 0.0, 0.75, 30.0]] * 2)
     assert [skill for skill, *_ in active_spans(course, 0)] == [WALK, JUMP_UP, WALK]
     np.testing.assert_array_equal(course.began[0], [0, 120, 235])
     np.testing.assert_array_equal(course.over[0], [120, 235, 325])
