@@ -108,7 +108,8 @@ class Conditions:
 
     def applied(self, task: TaskCfg) -> TaskCfg:
         """Return a task as it is tried in these conditions; pushes come and go, however its training had it."""
-        task = replace(task, link_margin=0.0, gravity=task.gravity if self.gravity is None else self.gravity)
+        task = task if self.gravity is None else replace(task, gravity=self.gravity)
+        task = replace(task, link_margin=0.0) if task.link_margin else task
         trained = task.randomization
         if self.randomize:
             in_flight = trained.push_in_flight or self.push_in_flight

@@ -314,9 +314,9 @@ def test_flags_reach_the_arrays_that_kernels_read():
 @pytest.mark.parametrize(
     ("name", "ppo"),
     [
-        ("vertical-jump", PpoCfg()),
-        ("horizontal-jump", PpoCfg(gamma=0.99, entropy_coef=0.0003)),
-        ("omnidirectional-jump", PpoCfg(gamma=0.99, entropy_coef=0.0003)),
+        ("vertical-jump", PpoCfg(gamma=0.99)),
+        ("horizontal-jump", PpoCfg(gamma=0.99, entropy_coef=0.0003, symmetry="actor")),
+        ("omnidirectional-jump", PpoCfg(gamma=0.99, entropy_coef=0.0003, symmetry="actor")),
         ("velocity-flat", WALKING),
     ],
 )
@@ -365,7 +365,7 @@ def test_impossible_settings_are_refused(make, message):
 
 def test_exported_policy_is_that_of_the_run(trained_run):
     policy, same = load_policy(trained_run / "policy"), open_policy(trained_run)
-    assert policy.interface == same.interface and policy.interface.sizes == (48, 16, 8, 12)
+    assert policy.interface == same.interface and policy.interface.sizes == (147, 16, 8, 12)
     assert all(np.array_equal(policy.tensors()[name], tensor) for name, tensor in same.tensors().items())
     assert restored_task(policy.config).curriculum.numbers["promote_after"] == 2
     assert policy.config["train"]["num_envs"] == 16 and policy.config["iteration"] == 2
