@@ -1,6 +1,7 @@
 import dataclasses
 import json
 
+import hold_height
 import numpy as np
 import pytest
 import torch
@@ -179,9 +180,9 @@ def test_checkpoint_of_a_symmetric_actor_resumes_and_becomes_a_plain_policy(tmp_
 
 def test_task_without_mirror_image_is_refused_in_one_line(capsys):
     with pytest.raises(SystemExit):
-        main(["train", "vertical-jump", "--ppo.symmetry", "actor"])
+        main(["train", "hold-height", "--task-module", hold_height.__file__, "--ppo.symmetry", "actor"])
     lines = capsys.readouterr().err.splitlines()
-    assert len(lines) == 1 and "vertical-jump policy: the mirror image of" in lines[0]
+    assert len(lines) == 1 and "hold-height policy: the mirror image of" in lines[0]
 
 
 def test_environment_without_mirror_image_is_refused():
