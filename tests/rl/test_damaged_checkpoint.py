@@ -159,7 +159,7 @@ WRONG = [
     (("ppo",), [], "ppo must be dict, got list"),
     (("ppo", "optimiser"), {}, "ppo.optimiser lacks 0, 1, 10 and 10 more, has nothing besides"),
     (("ppo", "optimiser", 0, "step"), NEVER, "ppo.optimiser.0 lacks step, has nothing besides"),
-    (("ppo", "optimiser", 0, "exp_avg"), torch.zeros(2), "ppo.optimiser.0.exp_avg has shape (2,), expected (8, 48)"),
+    (("ppo", "optimiser", 0, "exp_avg"), torch.zeros(2), "ppo.optimiser.0.exp_avg has shape (2,), expected (8, 147)"),
     (("ppo", "optimiser", 1, "exp_avg_sq"), torch.full((8,), -1.0), "ppo.optimiser.1.exp_avg_sq must not be below 0"),
     (("ppo", "model", "actor.0.bias"), torch.full((8,), float("nan")), "ppo.model.actor.0.bias is not finite"),
     (("ppo", "model", "log_std"), "x", "ppo.model.log_std must be a tensor, got str"),

@@ -1,7 +1,6 @@
 import dataclasses
 import json
 
-import hold_height
 import numpy as np
 import pytest
 import torch
@@ -9,7 +8,7 @@ from toy_task import PushTask, fill
 
 from jumper_warp.cli.main import main
 from jumper_warp.policies.restore import open_policy
-from jumper_warp.registry import make_task
+from jumper_warp.registry import TASKS, TaskEntry, make_task
 from jumper_warp.rl import compiling
 from jumper_warp.rl.cfg import PpoCfg, TrainCfg
 from jumper_warp.rl.checkpoint import save_checkpoint
@@ -178,9 +177,10 @@ def test_checkpoint_of_a_symmetric_actor_resumes_and_becomes_a_plain_policy(tmp_
         Ppo(PushTask(8), dataclasses.replace(CFG, symmetry="off")).load_state_dict(first.state_dict())
 
 
-def test_task_without_mirror_image_is_refused_in_one_line(capsys):
+def test_task_without_mirror_image_is_refused_in_one_line(capsys, monkeypatch):
+    monkeypatch.setitem(TASKS, "hold-height", TaskEntry("hold_height:hold_height"))
     with pytest.raises(SystemExit):
-        main(["train", "hold-height", "--task-module", hold_height.__file__, "--ppo.symmetry", "actor"])
+        main(["train", "hold-height", "--ppo.symmetry", "actor", "--num-envs", "8", "--iterations", "1"])
     lines = capsys.readouterr().err.splitlines()
     assert len(lines) == 1 and "hold-height policy: the mirror image of" in lines[0]
 
