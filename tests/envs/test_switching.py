@@ -9,7 +9,7 @@ import torch
 import warp as wp
 
 from jumper_warp.envs.env import Env
-from jumper_warp.evaluation.courses import Course
+from jumper_warp.evaluation.courses import SQUAT, Course
 from jumper_warp.evaluation.scripts import parse_script
 from jumper_warp.policies.restore import Conditions, restored_skills
 from jumper_warp.policies.skills import JUMP_TO, JUMP_UP, WALK, SkillNames, SkillPolicies
@@ -131,13 +131,16 @@ def test_after_a_switch_observation_and_filter_are_those_of_a_fresh_environment_
             np.testing.assert_array_equal(alone.robot.safe_target.numpy()[:, 0], s.next_safe)
 
 
-def test_jumps_are_commanded_as_they_take_over_and_walking_stands_first(followed):
-    _, _, _, switches = followed
+def test_jumps_are_commanded_from_the_squat_after_they_took_over_and_walking_stands_first(followed):
+    _, env, course, switches = followed
     for s in switches:
         if s.target == WALK:
             assert s.state["standing"] == 1 and not s.state["command"].any() and s.state["steps"] == 0
         else:
-            assert s.state["command_step"] == 0 == s.state["steps"]
+            assert s.state["command_step"] == round(SQUAT / env.step_dt) and s.state["steps"] == 0
+    jumps = course.switched >= 0
+    assert jumps.sum() == 4
+    assert ((course.takeoff - course.switched)[jumps] * env.step_dt > SQUAT).all()
     first = switches[[s.target for s in switches].index(JUMP_TO)]
     way = first.state["goal"][:2] - first.after[:2]
     assert np.linalg.norm(way) == pytest.approx(0.7 if first.world else np.hypot(0.6, 0.1), abs=1e-5)

@@ -14,12 +14,12 @@ from jumper_warp.policies.policy import Policy
 from jumper_warp.policies.restore import open_policy
 from jumper_warp.utils.errors import InputError
 
-FEW = {"goals": 4, "late": 0, "randomized": 0, "heights": (0.6, 1.05), "iterations": 2, "device": "cpu"}
+FEW = {"goals": 4, "late": 0, "randomized": 0, "heights": (0.8, 1.05), "iterations": 1, "device": "cpu"}
 
 
 @pytest.fixture(scope="module")
 def tuned():
-    """A policy that aims 8 mm too high, fine-tuned by two steps, and what was done."""
+    """A policy that aims 8 mm too high, fine-tuned by one step, and what was done."""
     return finetune(aiming_high(), FinetuneCfg(**FEW), say=lambda line: None)
 
 
@@ -27,9 +27,9 @@ def aiming_high():
     """Return the shipped policy with goals that look 8 mm higher than they are."""
     policy = open_policy("vertical_jump")
     tensors = policy.tensors()
-    mean = torch.tensor(tensors["normaliser.mean"])
+    mean = tensors["normaliser.mean"].clone()
     mean[policy.interface.observation_names.index("wanted_height")] -= 0.008
-    return Policy(policy.layers, mean, torch.tensor(tensors["normaliser.std"]), policy.interface, policy.config)
+    return Policy(policy.layers, mean, tensors["normaliser.std"], policy.interface, policy.config)
 
 
 def test_misses_are_those_of_the_policy_in_its_environment_and_gradients_change_no_bit():
@@ -42,15 +42,15 @@ def test_misses_are_those_of_the_policy_in_its_environment_and_gradients_change_
     group.begin()
     for _ in range(120):
         group.env.step(policy.act(group.env.obs))
-    misses = group.env.task_arrays()["max_height"] - np.linspace(0.6, 1.05, 4)
+    misses = group.env.task_arrays()["max_height"] - np.linspace(0.8, 1.05, 4)
     np.testing.assert_allclose(found.value.numpy(), misses, rtol=0.0, atol=1.0e-4)
 
 
-def test_two_steps_lower_the_misses_of_a_policy_that_aims_high(tuned):
+def test_one_step_halves_the_misses_of_a_policy_that_aims_high(tuned):
     _, record = tuned
-    before, _, after = (step["mean_abs_miss_m"]["nominal"] for step in record["steps"])
+    before, after = (step["mean_abs_miss_m"]["nominal"] for step in record["steps"])
     assert before > 0.003
-    assert after < 0.65 * before
+    assert after < 0.5 * before
     assert 0.0 < record["steps"][1]["action_change"] < 0.01
 
 
