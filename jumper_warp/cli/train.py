@@ -41,6 +41,9 @@ class TrainArgs:
     """Draw masses, friction, motors, latency and pushes for each world; single rows are under --env.randomization."""
     noise: bool = True
     """Add noise to observations."""
+    history: int | None = None
+    """Policy steps of which the policy sees the velocities, gravity, angles and actions (default: as the task says).
+    1 is a third of the numbers, learns sooner on few worlds, and is enough where nothing is drawn and noise is off."""
     robot: Path | None = None
     """Robot overlay, as `jumper sysid` writes it; its ranges of randomisation replace the task's, and flags both."""
 
@@ -66,8 +69,12 @@ def parse_train(args: Sequence[str]) -> tuple[TrainArgs, TaskCfg]:
     if parsed.cfg.task != name:
         raise UsageError(f"give the task once, got {name} and --task {parsed.cfg.task}")
     from jumper_warp.cli.task_flags import with_flags
+    from jumper_warp.tasks.observations import remembered
 
-    return parsed, with_flags(task, parsed.env)
+    task = with_flags(task, parsed.env)
+    if parsed.history is not None:
+        task = dataclasses.replace(task, policy=remembered(task.policy, parsed.history))
+    return parsed, task
 
 
 def parse_settings(task: TaskCfg, default: TrainArgs, args: Sequence[str]) -> Any:

@@ -1,6 +1,7 @@
-"""Fine-tuning of a jumping policy by gradients of its miss: apex against commanded height, or landing place.
+"""Fine-tuning of a jumping policy by its misses: apex against commanded height, or landing place.
 
-Gauss-Newton on the misses of many jumps, of the nominal robot and of drawn ones, held near the policy as it came.
+Gauss-Newton on the misses of many jumps, of the nominal robot and of drawn ones, held near the policy as it came. A
+policy for places first gets its aim right: what it sees of a goal is shifted and stretched by what its robots missed.
 """
 
 from __future__ import annotations
@@ -28,12 +29,16 @@ from jumper_warp.utils.checks import check_positive
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.runtime import git_commit
 
+AHEAD = "goal_x"
+"""Observation of jumps to places: way to the goal ahead [m]."""
 DELAYS = (0.3, 0.7)
 """[s] Between which jumps are commanded."""
 ANCHOR_SECONDS = 3.5
 ANCHOR_ROWS = 4096
 DAMPING = 1.0e-2
 """Of the first step."""
+AIM_ROUNDS = 3
+"""Corrections of the aim, at most: where robots come to rest follows the goal that they see, by and large."""
 
 
 @dataclass(frozen=True)
@@ -51,7 +56,7 @@ class FinetuneCfg:
     distances: tuple[float, float] = (0.3, 1.4)
     """[m] Nearest and farthest goal straight ahead, of jumps to places."""
     iterations: int = 6
-    """Gauss-Newton steps."""
+    """Gauss-Newton steps; 0 for places: the aim alone."""
     miss_std: float = 0.001
     """[m] Miss of the nominal robot that costs as much as a change of the actions by `action_std`."""
     late_std: float = 0.003
@@ -71,8 +76,8 @@ class FinetuneCfg:
 
     def __post_init__(self) -> None:
         """Raises InputError: a setting is out of range."""
-        if self.goals < 2 or min(self.late, self.randomized) < 0 or self.iterations < 1:
-            raise InputError("fine-tuning needs at least 2 goals, 1 iteration, and no negative number of jumps")
+        if self.goals < 2 or min(self.late, self.randomized, self.iterations) < 0:
+            raise InputError("fine-tuning needs at least 2 goals, and no negative number of jumps or steps")
         for name in ("miss_std", "late_std", "randomized_std", "action_std", "landing_std"):
             check_positive(name, getattr(self, name))
         for name in ("heights", "distances"):
@@ -138,6 +143,58 @@ def make_anchor(groups: list[Group], network: Network, cfg: FinetuneCfg) -> Anch
     return Anchor(network, obs, torch.as_tensor(stds[chosen], device=obs.device))
 
 
+def with_aim(policy: Policy, shift: float, stretch: float) -> Policy:
+    """Return the policy that sees (1 + stretch) x + shift [m] instead of a way to the goal x ahead.
+
+    Way and correction lie in the observation's normaliser, (x - mean) / std, so that nothing is computed more.
+    """
+    mean, std = policy.mean.clone(), policy.std.clone()
+    ahead = policy.interface.observation_names.index(AHEAD)
+    mean[ahead], std[ahead] = (mean[ahead] - shift) / (1.0 + stretch), std[ahead] / (1.0 + stretch)
+    return Policy(policy.layers, mean, std, policy.interface, policy.config)
+
+
+def take_aim(
+    policy: Policy, groups: list[Group], say: Callable[[str], object]
+) -> tuple[Policy, list[dict[str, dict[str, float]]]]:
+    """Return the policy with its aim at goals straight ahead corrected, and the misses [m] by group on the way.
+
+    Every round fits a straight line over the distance to what the robots missed, as the groups weigh it, and takes it
+    off the goal that they see; one that does not lower the cost is taken back, and the last.
+    """
+
+    def measure(policy: Policy) -> tuple[float, list[Misses], dict[str, dict[str, float]]]:
+        network = Network(policy, device=groups[0].env.device)
+        found = [follow(group, network, derivatives=False) for group in groups]
+        pairs = list(zip(groups, found, strict=True))
+        cost = sum(float((group.importance(m) * m.value.square()).sum()) for group, m in pairs)
+        ahead = {g.name: m.value[: len(g.commands)][m.valid[: len(g.commands)]] for g, m in pairs}
+        means = {"ahead": {name: float(value.mean()) for name, value in ahead.items()}}
+        means["mean_abs_miss_m"] = {g.name: float(m.value[m.valid].abs().mean()) for g, m in pairs}
+        words = ", ".join(f"{name} {1000.0 * miss:+.2f} mm" for name, miss in means["ahead"].items())
+        say(f"aim: cost {cost:.4g}, robots end ahead of their goals by {words}")
+        return cost, found, means
+
+    cost, found, means = measure(policy)
+    told = [means]
+    for _ in range(AIM_ROUNDS):
+        lines, values, weights = [], [], []
+        for group, misses in zip(groups, found, strict=True):
+            n = len(group.commands)
+            lines.append(np.stack([np.ones(n), group.commands[:, 0]], axis=1))
+            values.append(misses.value[:n].cpu().numpy())
+            weights.append(group.importance(misses)[:n].cpu().numpy())
+        line, root = np.concatenate(lines), np.sqrt(np.concatenate(weights))
+        shift, stretch = np.linalg.lstsq(root[:, None] * line, root * np.concatenate(values), rcond=None)[0]
+        aimed = with_aim(policy, -float(shift), -float(stretch))
+        new_cost, new, means = measure(aimed)
+        if not new_cost < cost:
+            break
+        policy, cost, found = aimed, new_cost, new
+        told.append(means)
+    return policy, told
+
+
 def finetune(
     policy: Policy,
     cfg: FinetuneCfg,
@@ -150,6 +207,9 @@ def finetune(
     """
     begin = time.perf_counter()
     groups = make_groups(policy, cfg, modules)
+    aims = []
+    if groups[0].env.task.evaluation == "place":
+        policy, aims = take_aim(policy, groups, say)
     network = Network(policy, device=groups[0].env.device)
     anchor = make_anchor(groups, network, cfg)
 
@@ -183,6 +243,6 @@ def finetune(
             network.weights, damping = kept, 10.0 * damping
     layers = network.layers(network.weights)
     settings = {name: value for name, value in asdict(cfg).items() if name not in ("out", "overwrite")}
-    record = {"settings": json.loads(json.dumps(settings, default=str)), "steps": history}
+    record = {"settings": json.loads(json.dumps(settings, default=str)), "aims": aims, "steps": history}
     config = policy.config | {"finetuned": record | {"commit": (commit := git_commit()) and commit.hash}}
     return Policy(layers, policy.mean, policy.std, policy.interface, config), record

@@ -15,7 +15,7 @@ from jumper_warp.rl.ppo import Ppo
 from jumper_warp.rl.shac import Shac
 
 TESTED = (0.5, 1.1)
-"""[m] Heights of the test's jumps."""
+"""[m] Heights of the test's jumps, unless others are asked for."""
 
 
 @dataclass
@@ -33,10 +33,10 @@ class Curve:
         return next((t for t, success in zip(self.seconds, self.success, strict=True) if success >= rate), None)
 
 
-def success(ppo: Ppo | Shac, judge: Env) -> float:
-    """Return the share of jumps to heights of 0.5 to 1.1 m that succeed, one a world."""
+def success(ppo: Ppo | Shac, judge: Env, heights: tuple[float, float] = TESTED) -> float:
+    """Return the share of jumps to heights [m] from the first to the second that succeed, one a world."""
 
-    return float(run_jumps(ppo.model.act, judge, np.linspace(*TESTED, judge.num_envs)).success.mean())
+    return float(run_jumps(ppo.model.act, judge, np.linspace(*heights, judge.num_envs)).success.mean())
 
 
 def warm_up(env: Env, ppo: Ppo | Shac) -> None:
@@ -48,12 +48,15 @@ def warm_up(env: Env, ppo: Ppo | Shac) -> None:
     env.metrics()
 
 
-def learning_curve(env: Env, ppo: Ppo | Shac, judge: Env, seconds: float, every: float) -> Curve:
-    """Train for a time [s] and return the curve; the test's jumps are made off the clock.
+def learning_curve(
+    env: Env, ppo: Ppo | Shac, judge: Env, seconds: float, every: float, heights: tuple[float, float] = TESTED
+) -> Curve:
+    """Train for a time [s] as `jumper train --max-seconds` does, and return the curve; the test is off the clock.
 
     What is compiled is compiled before, see `warm_up`.
 
-    env: of the training, not yet reset; judge: one world a jump; every [s]: training time between two evaluations.
+    env: of the training, not yet reset; judge: one world a jump; every [s]: training time between two evaluations;
+    heights [m]: of the test's jumps.
     """
     warm_up(env, ppo)
     curve, trained = Curve(), 0.0
@@ -61,12 +64,13 @@ def learning_curve(env: Env, ppo: Ppo | Shac, judge: Env, seconds: float, every:
         wp.synchronize_device(env.wp_device)
         start = time.perf_counter()
         until = min(trained + every, seconds)
-        while trained + time.perf_counter() - start < until:
+        while (spent := trained + time.perf_counter() - start) < until:
+            ppo.set_progress(spent / seconds)
             ppo.iterate()
             curve.iterations += 1
             wp.synchronize_device(env.wp_device)
         trained += time.perf_counter() - start
         curve.seconds.append(trained)
         curve.steps.append(curve.iterations * ppo.batch_size)
-        curve.success.append(success(ppo, judge))
+        curve.success.append(success(ppo, judge, heights))
     return curve

@@ -295,6 +295,16 @@ def test_flags_change_training_and_task():
     assert (args.solver, args.noise, args.randomize) == ("mujoco", False, True)
 
 
+def test_history_is_how_many_steps_of_what_noise_blurs_the_policy_sees():
+    _, task = parse_train(["vertical-jump", "--history", "2"])
+    steps = {term.name: term.options["history"] for term in task.policy}
+    assert [steps[name] for name in ("lin_vel", "ang_vel", "gravity", "angle", "last_action")] == [2] * 5
+    assert steps["wanted_height"] == steps["rate"] == 1
+    assert task.critic == make_task("vertical-jump").critic
+    with pytest.raises(InputError, match="history must be at least 1"):
+        parse_train(["vertical-jump", "--history", "0"])
+
+
 def test_flags_reach_the_arrays_that_kernels_read():
     flags = "--env.rewards.jump-height.weight 25 --env.terminations.tilted.angle 0.4 --env.policy.lin-vel.noise 0.3"
     flags += " --env.reset.tilt 9 --env.levels.0.base-height 0.3 0.31 --env.contact-force 0.7 --env.action-scale 10 80"

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from jumper_warp.cli.main import main
-from jumper_warp.evaluation.finetuning import FinetuneCfg, finetune, make_groups
+from jumper_warp.evaluation.finetuning import FinetuneCfg, finetune, make_groups, with_aim
 from jumper_warp.evaluation.jump_misses import follow
 from jumper_warp.optim.gauss_newton import Network
 from jumper_warp.policies.policy import Policy
@@ -75,7 +75,31 @@ def test_command_writes_a_policy_that_can_be_opened(tmp_path, capsys):
     assert capsys.readouterr().err == f"jumper: {out} exists\n"
 
 
-@pytest.mark.parametrize("change", [{"goals": 1}, {"late": -1}, {"heights": (0.9, 0.5)}, {"action_std": 0.0}])
+def test_a_policy_sees_its_goals_shifted_and_stretched():
+    policy, obs = open_policy("horizontal_jump"), 0.3 * torch.randn((5, 147), generator=torch.manual_seed(3))
+    moved = obs.clone()
+    moved[:, policy.interface.observation_names.index("goal_x")] *= 1.05
+    moved[:, policy.interface.observation_names.index("goal_x")] += 0.02
+    torch.testing.assert_close(with_aim(policy, 0.02, 0.05).act(obs), policy.act(moved), rtol=0.0, atol=1.0e-5)
+    assert (policy.act(moved) - policy.act(obs)).abs().max() > 1.0e-3
+
+
+def test_aim_brings_a_policy_that_jumps_too_far_back_to_its_goals():
+    """The shipped policy, made to see its goals 40 mm and 3 % farther away."""
+    policy, cfg = open_policy("horizontal_jump"), FinetuneCfg(**FEW | {"goals": 8, "iterations": 0})
+    own = follow(make_groups(policy, cfg)[0], Network(policy), derivatives=False).value
+    aimed, record = finetune(with_aim(policy, 0.04, 0.03), cfg, say=lambda line: None)
+    first, *_, last = record["aims"]
+    assert first["ahead"]["nominal"] > 0.025 and abs(last["ahead"]["nominal"]) < 0.005
+    assert last["mean_abs_miss_m"]["nominal"] < float(own.abs().mean()) and len(record["steps"]) == 1
+    for mine, theirs in zip(aimed.layers, policy.layers, strict=True):
+        assert torch.equal(mine[0], theirs[0]) and torch.equal(mine[1], theirs[1])
+    assert not torch.equal(aimed.mean, policy.mean)
+
+
+@pytest.mark.parametrize(
+    "change", [{"goals": 1}, {"late": -1}, {"iterations": -1}, {"heights": (0.9, 0.5)}, {"action_std": 0.0}]
+)
 def test_impossible_settings_are_refused(change):
     with pytest.raises(InputError):
         FinetuneCfg(**(FEW | change))

@@ -236,8 +236,9 @@ def test_learning_curves_tell_when_each_training_was_good_enough(tmp_path, monke
 
     monkeypatch.setattr(learning_curves, "in_process", in_process)
     args = learning_curves.Args(
-        seconds=0.3, every=0.2, seeds=(0, 1), variants=("eager_float32",), envs=8, jumps=2, out=tmp_path, device="cpu"
-    )
+        seconds=0.3, every=0.2, seeds=(0, 1), variants=("eager_float32",), envs=8, jumps=2, history=1,
+        heights=(0.5, 0.9), out=tmp_path, device="cpu",
+    )  # fmt: skip
     values = learning_curves.main(args)
     assert values == json.loads((tmp_path / "figures.json").read_text())
     assert values["trained_to_95_percent_s_eager_float32_0"] is None
@@ -245,6 +246,8 @@ def test_learning_curves_tell_when_each_training_was_good_enough(tmp_path, monke
     assert values["trained_to_95_percent_s_eager_float32_1"] == 4.0
     assert values["from_start_to_95_percent_s_eager_float32_1"] == 7.0
     assert values["steps_to_95_percent_eager_float32_1"] == 20
+    assert values["trained_to_100_percent_s_eager_float32_1"] is None
+    assert values["history"] == 1 and values["heights_m"] == [0.5, 0.9]
     assert (tmp_path / "learning_curves.png").is_file()
     assert "eager_float32" in (tmp_path / "learning_curves.txt").read_text()
     with pytest.raises(InputError, match=r"variants are default, .*, got 'faster'"):
