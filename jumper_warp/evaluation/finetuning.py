@@ -1,7 +1,7 @@
 """Fine-tuning of a jumping policy by its misses: apex against commanded height, or landing place.
 
 Gauss-Newton on the misses of many jumps, of the nominal robot and of drawn ones, held near the policy as it came. A
-policy for places first gets its aim right: what it sees of a goal is shifted and stretched by what its robots missed.
+policy for places first gets its aim right: the goal that it sees is shifted by what its robots missed.
 """
 
 from __future__ import annotations
@@ -143,15 +143,11 @@ def make_anchor(groups: list[Group], network: Network, cfg: FinetuneCfg) -> Anch
     return Anchor(network, obs, torch.as_tensor(stds[chosen], device=obs.device))
 
 
-def with_aim(policy: Policy, shift: float, stretch: float) -> Policy:
-    """Return the policy that sees (1 + stretch) x + shift [m] instead of a way to the goal x ahead.
-
-    Way and correction lie in the observation's normaliser, (x - mean) / std, so that nothing is computed more.
-    """
-    mean, std = policy.mean.clone(), policy.std.clone()
-    ahead = policy.interface.observation_names.index(AHEAD)
-    mean[ahead], std[ahead] = (mean[ahead] - shift) / (1.0 + stretch), std[ahead] / (1.0 + stretch)
-    return Policy(policy.layers, mean, std, policy.interface, policy.config)
+def with_aim(policy: Policy, shift: float) -> Policy:
+    """Return the policy that sees its goals so much [m] farther ahead; the observation's normaliser does it."""
+    mean = policy.mean.clone()
+    mean[policy.interface.observation_names.index(AHEAD)] -= shift
+    return Policy(policy.layers, mean, policy.std, policy.interface, policy.config)
 
 
 def take_aim(
@@ -159,8 +155,9 @@ def take_aim(
 ) -> tuple[Policy, list[dict[str, dict[str, float]]]]:
     """Return the policy with its aim at goals straight ahead corrected, and the misses [m] by group on the way.
 
-    Every round fits a straight line over the distance to what the robots missed, as the groups weigh it, and takes it
-    off the goal that they see; one that does not lower the cost is taken back, and the last.
+    Every round takes the mean of what the robots missed, as the groups weigh it, off the goal that they see; one that
+    does not lower the cost is taken back, and the last. A stretch would do little: the way to the goal that a robot
+    sees is short by the time that it lands.
     """
 
     def measure(policy: Policy) -> tuple[float, list[Misses], dict[str, dict[str, float]]]:
@@ -178,15 +175,9 @@ def take_aim(
     cost, found, means = measure(policy)
     told = [means]
     for _ in range(AIM_ROUNDS):
-        lines, values, weights = [], [], []
-        for group, misses in zip(groups, found, strict=True):
-            n = len(group.commands)
-            lines.append(np.stack([np.ones(n), group.commands[:, 0]], axis=1))
-            values.append(misses.value[:n].cpu().numpy())
-            weights.append(group.importance(misses)[:n].cpu().numpy())
-        line, root = np.concatenate(lines), np.sqrt(np.concatenate(weights))
-        shift, stretch = np.linalg.lstsq(root[:, None] * line, root * np.concatenate(values), rcond=None)[0]
-        aimed = with_aim(policy, -float(shift), -float(stretch))
+        ahead = [m.value[: len(g.commands)] for g, m in zip(groups, found, strict=True)]
+        weight = [g.importance(m)[: len(g.commands)] for g, m in zip(groups, found, strict=True)]
+        aimed = with_aim(policy, -float((torch.cat(weight) * torch.cat(ahead)).sum() / torch.cat(weight).sum()))
         new_cost, new, means = measure(aimed)
         if not new_cost < cost:
             break
@@ -213,13 +204,13 @@ def finetune(
     network = Network(policy, device=groups[0].env.device)
     anchor = make_anchor(groups, network, cfg)
 
-    def measure() -> tuple[float, list[Misses]]:
-        found = [follow(group, network, derivatives=True) for group in groups]
+    def measure(derivatives: bool) -> tuple[float, list[Misses]]:
+        found = [follow(group, network, derivatives=derivatives) for group in groups]
         pairs = zip(groups, found, strict=True)
         total = sum(float((0.5 * group.importance(m) * m.value.square()).sum()) for group, m in pairs)
         return total + anchor.cost(network.weights), found
 
-    cost, found = measure()
+    cost, found = measure(cfg.iterations > 0)
     damping, history = DAMPING, []
     for step in range(cfg.iterations + 1):
         means = {group.name: float(m.value[m.valid].abs().mean()) for group, m in zip(groups, found, strict=True)}
@@ -236,7 +227,7 @@ def finetune(
         importance = [group.importance(m) for group, m in zip(groups, found, strict=True)]
         rows, values = [m.rows for m in found], [m.value for m in found]
         network.weights = kept + gauss_newton_step(kept, rows, values, importance, anchor, damping)
-        new_cost, new = measure()
+        new_cost, new = measure(step + 1 < cfg.iterations)
         if math.isfinite(new_cost) and new_cost < cost:
             cost, found, damping = new_cost, new, damping / 3.0
         else:
