@@ -194,13 +194,16 @@ def finetune(
 ) -> tuple[Policy, dict]:
     """Return the fine-tuned policy, and what was done: settings, and misses [m] by group before and after each step.
 
-    modules: that the user has named. say: is told every step. Raises InputError as `ClosedLoop` and `make_groups`.
+    modules: that the user has named. say: is told every step. Raises InputError as `ClosedLoop` and `make_groups`,
+    and if there is nothing to do.
     """
     begin = time.perf_counter()
     groups = make_groups(policy, cfg, modules)
     aims = []
     if groups[0].env.task.evaluation == "place":
         policy, aims = take_aim(policy, groups, say)
+    elif cfg.iterations == 0:
+        raise InputError("a policy for heights has no aim to be taken apart: fine-tuning it needs an iteration")
     network = Network(policy, device=groups[0].env.device)
     anchor = make_anchor(groups, network, cfg)
 

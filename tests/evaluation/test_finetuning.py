@@ -107,3 +107,8 @@ def test_impossible_settings_are_refused(change):
 def test_policies_that_do_not_jump_are_refused():
     with pytest.raises(InputError, match="not for velocity-flat"):
         make_groups(open_policy("walking_flat"), FinetuneCfg(**FEW))
+
+
+def test_no_step_is_refused_where_there_is_no_aim():
+    with pytest.raises(InputError, match="needs an iteration"):
+        finetune(open_policy("vertical_jump"), FinetuneCfg(**FEW | {"iterations": 0}))
