@@ -1,7 +1,7 @@
 """SHAC against PPO on the nominal vertical jump, and how noisy gradients through contact are.
 
     python experiments/shac.py --envs 4096 --seconds 120 --out outputs/shac          # on a GPU
-    python experiments/shac.py --envs 128 --seconds 300 --hidden 64 64 --seeds 0     # on a CPU
+    python experiments/shac.py --envs 128 --seconds 300 --hidden 64 64 --history 1 --seeds 0     # on a CPU
 
 First the spread of the policy's gradient between worlds is measured against the length of the window, through the
 physics and by the score function that PPO uses: of a policy with new weights and of the trained one. Then both are
@@ -36,6 +36,7 @@ from jumper_warp.rl.cfg import ShacCfg
 from jumper_warp.rl.networks import ActorCritic
 from jumper_warp.rl.ppo import Ppo
 from jumper_warp.rl.shac import Shac
+from jumper_warp.tasks.observations import remembered
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.output import output_dir, write_figures
 from jumper_warp.utils.runtime import announce
@@ -67,6 +68,8 @@ class Args:
     """Exploration noise at the start, of SHAC; PPO's is that of the task."""
     hidden: tuple[int, ...] = (256, 128, 128)
     """Widths of the hidden layers of both."""
+    history: int | None = None
+    """Policy steps that the policies of trainings see, as `jumper train --history` (default: as the task says)."""
     jumps: int = 200
     """Jumps of an evaluation."""
     horizons: tuple[int, ...] = (1, 2, 4, 8, 16, 32, 64)
@@ -84,9 +87,12 @@ class Args:
             raise InputError("need seeds, trainers, at least 2 worlds, and positive times and horizons")
 
 
-def make_env(args: Args, num_envs: int, seed: int) -> Env:
-    """Return the nominal task."""
-    return Env(make_task(TASK), num_envs, seed=seed, device=args.device, randomize=False, noise=False)
+def make_env(args: Args, num_envs: int, seed: int = 0, *, history: int | None = None, auto_reset: bool = True) -> Env:
+    """Return the nominal task; history: policy steps that the policy sees."""
+    task = make_task(TASK)
+    if history is not None:
+        task = replace(task, policy=remembered(task.policy, history))
+    return Env(task, num_envs, seed=seed, device=args.device, randomize=False, noise=False, auto_reset=auto_reset)
 
 
 def policies() -> dict[str, Policy]:
@@ -104,7 +110,7 @@ def variances(args: Args, path: Path) -> dict[str, Any]:
     table = Table("policy", "steps", *(f"{name}: {what}" for name in ESTIMATORS for what in ("deviation", "worlds")))
     with drawn(path, 1, 2, figsize=(11, 4.5)) as axes:
         for i, (who, policy) in enumerate(policies().items()):
-            env = DifferentiableEnv(make_env(args, args.worlds, 0), world_norm=math.inf)
+            env = DifferentiableEnv(make_env(args, args.worlds), world_norm=math.inf)
             network, found = Network(policy, device=env.device), []
             for horizon in args.horizons:
                 torch.manual_seed(1)
@@ -132,8 +138,9 @@ def variances(args: Args, path: Path) -> dict[str, Any]:
 def train(args: Args, trainer: str, seed: int) -> Curve:
     """Train once and return the curve."""
     torch.manual_seed(seed)
-    env, settings = make_env(args, args.envs, seed), replace(trainer_settings(TASK), hidden=args.hidden)
-    judge = Env(make_task(TASK), args.jumps, device=args.device, randomize=False, noise=False, auto_reset=False)
+    env, settings = make_env(args, args.envs, seed, history=args.history), trainer_settings(TASK)
+    judge = make_env(args, args.jumps, history=args.history, auto_reset=False)
+    settings = replace(settings, hidden=args.hidden)
     if trainer == "shac":
         env = DifferentiableEnv(env)
         settings = replace(settings, num_steps=args.window, init_std=args.init_std)
