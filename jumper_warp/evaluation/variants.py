@@ -23,7 +23,7 @@ VARIANTS: dict[str, dict[str, Any]] = {
     },
     "one_stream": {"streams": False},
     "four_minibatches": {"minibatches": 4},
-    "small": {"hidden": (128, 64, 64)},
+    "small": {"hidden": (128, 64, 64), "final_kl": 0.005},
 }
 """What each changes of `PpoCfg`."""
 
