@@ -18,7 +18,7 @@ from rich.table import Table
 
 from jumper_warp.cli.main import run_command
 from jumper_warp.envs.env import Env
-from jumper_warp.evaluation.learning import Curve, learning_curve
+from jumper_warp.evaluation.learning import Curve, learning_curve, make_judge
 from jumper_warp.evaluation.plots import drawn
 from jumper_warp.registry import make_task
 from jumper_warp.rl.cfg import PpoCfg
@@ -91,7 +91,7 @@ def main(args: Args) -> dict:
     announce(args.device, args.threads)
     folder = output_dir("ablations", args.out)
     task = make_task("vertical-jump")
-    judge = Env(task, args.jumps, device=args.device, randomize=False, noise=False, auto_reset=False)
+    judge = make_judge(task, args.jumps, args.device)
     table = Table("variant", "success", f"seconds to {100 * GOOD:g} %", "iterations")
     curves: dict[str, Curve] = {}
     values: dict = {"seconds": args.seconds, "envs": args.envs, "randomize": args.randomize, "seed": args.seed}

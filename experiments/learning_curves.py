@@ -30,7 +30,7 @@ from rich.table import Table
 
 from jumper_warp.cli.main import run_command
 from jumper_warp.envs.env import Env
-from jumper_warp.evaluation.learning import TESTED, Curve, learning_curve, success, warm_up
+from jumper_warp.evaluation.learning import TESTED, Curve, learning_curve, make_judge, success, warm_up
 from jumper_warp.evaluation.plots import drawn
 from jumper_warp.evaluation.variants import DEFAULT, variant
 from jumper_warp.registry import make_task, trainer_settings
@@ -101,9 +101,7 @@ def train_one(args: Args) -> dict:
     ppo = Ppo(env, variant(trainer_settings(TASK), args.variants[0]))
     warm_up(env, ppo)
     ready = process_age()
-    judge = Env(
-        replace(task, link_margin=0.0), args.jumps, device=args.device, randomize=False, noise=False, auto_reset=False
-    )
+    judge = make_judge(task, args.jumps, args.device)
     success(ppo, judge)
     curve = learning_curve(env, ppo, judge, args.seconds, args.every, args.heights)
     return {"ready": ready, "seconds": curve.seconds, "steps": curve.steps, "success": curve.success}

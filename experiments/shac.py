@@ -25,7 +25,7 @@ from rich.table import Table
 from jumper_warp.cli.main import run_command
 from jumper_warp.envs.env import Env
 from jumper_warp.evaluation.gradient_variance import gradients, spread_of
-from jumper_warp.evaluation.learning import Curve, learning_curve
+from jumper_warp.evaluation.learning import Curve, learning_curve, make_judge
 from jumper_warp.evaluation.plots import drawn
 from jumper_warp.optim.differentiable_env import DifferentiableEnv
 from jumper_warp.optim.gauss_newton import Network
@@ -87,12 +87,12 @@ class Args:
             raise InputError("need seeds, trainers, at least 2 worlds, and positive times and horizons")
 
 
-def make_env(args: Args, num_envs: int, seed: int = 0, *, history: int | None = None, auto_reset: bool = True) -> Env:
+def make_env(args: Args, num_envs: int, seed: int = 0, *, history: int | None = None) -> Env:
     """Return the nominal task; history: policy steps that the policy sees."""
     task = make_task(TASK)
     if history is not None:
         task = replace(task, policy=remembered(task.policy, history))
-    return Env(task, num_envs, seed=seed, device=args.device, randomize=False, noise=False, auto_reset=auto_reset)
+    return Env(task, num_envs, seed=seed, device=args.device, randomize=False, noise=False)
 
 
 def policies() -> dict[str, Policy]:
@@ -139,7 +139,7 @@ def train(args: Args, trainer: str, seed: int) -> Curve:
     """Train once and return the curve."""
     torch.manual_seed(seed)
     env, settings = make_env(args, args.envs, seed, history=args.history), trainer_settings(TASK)
-    judge = make_env(args, args.jumps, history=args.history, auto_reset=False)
+    judge = make_judge(env.tasks[0], args.jumps, args.device)
     settings = replace(settings, hidden=args.hidden)
     if trainer == "shac":
         env = DifferentiableEnv(env)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
@@ -13,6 +13,7 @@ from jumper_warp.envs.env import Env
 from jumper_warp.evaluation.jumps import run_jumps
 from jumper_warp.rl.ppo import Ppo
 from jumper_warp.rl.shac import Shac
+from jumper_warp.tasks.cfg import TaskCfg
 
 TESTED = (0.5, 1.1)
 """[m] Heights of the test's jumps, unless others are asked for."""
@@ -31,6 +32,12 @@ class Curve:
     def seconds_to(self, rate: float) -> float | None:
         """Return the first training time [s] at which an evaluation had at least this success rate, if any."""
         return next((t for t, success in zip(self.seconds, self.success, strict=True) if success >= rate), None)
+
+
+def make_judge(task: TaskCfg, jumps: int, device: str | None) -> Env:
+    """Return where policies of a task are tested: nominal, without noise, and links may come near one another."""
+    task = replace(task, link_margin=0.0)
+    return Env(task, jumps, device=device, randomize=False, noise=False, auto_reset=False)
 
 
 def success(ppo: Ppo | Shac, judge: Env, heights: tuple[float, float] = TESTED) -> float:
