@@ -18,7 +18,7 @@ import os
 import subprocess
 import sys
 import time
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -35,7 +35,7 @@ from jumper_warp.evaluation.plots import drawn
 from jumper_warp.evaluation.variants import DEFAULT, variant
 from jumper_warp.registry import make_task, trainer_settings
 from jumper_warp.rl.ppo import Ppo
-from jumper_warp.tasks.observations import remembered
+from jumper_warp.tasks.observations import with_history
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.output import output_dir, write_figures
 from jumper_warp.utils.runtime import announce
@@ -93,9 +93,7 @@ def process_age() -> float:
 def train_one(args: Args) -> dict:
     """Train once, and return curve and the seconds from the start of the process until training began."""
     wp.config.log_level = wp.LOG_WARNING
-    task = make_task(TASK)
-    if args.history is not None:
-        task = replace(task, policy=remembered(task.policy, args.history))
+    task = with_history(make_task(TASK), args.history)
     torch.manual_seed(args.seeds[0])
     env = Env(task, args.envs, seed=args.seeds[0], device=args.device, randomize=args.randomize, noise=args.randomize)
     ppo = Ppo(env, variant(trainer_settings(TASK), args.variants[0]))

@@ -40,7 +40,8 @@ class Args:
 
 
 def array_bytes() -> int:
-    """Return the bytes of all Warp arrays that own their memory."""
+    """Return the bytes of all Warp arrays that own their memory and that something still refers to."""
+    gc.collect()
     arrays = [each for each in gc.get_objects() if type(each) is wp.array and each.ptr and each.deleter is not None]
     return sum({array.ptr: array.capacity for array in arrays}.values())
 

@@ -36,7 +36,7 @@ from jumper_warp.rl.cfg import ShacCfg
 from jumper_warp.rl.networks import ActorCritic
 from jumper_warp.rl.ppo import Ppo
 from jumper_warp.rl.shac import Shac
-from jumper_warp.tasks.observations import remembered
+from jumper_warp.tasks.observations import with_history
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.output import output_dir, write_figures
 from jumper_warp.utils.runtime import announce
@@ -89,9 +89,7 @@ class Args:
 
 def make_env(args: Args, num_envs: int, seed: int = 0, *, history: int | None = None) -> Env:
     """Return the nominal task; history: policy steps that the policy sees."""
-    task = make_task(TASK)
-    if history is not None:
-        task = replace(task, policy=remembered(task.policy, history))
+    task = with_history(make_task(TASK), history)
     return Env(task, num_envs, seed=seed, device=args.device, randomize=False, noise=False)
 
 

@@ -69,12 +69,9 @@ def parse_train(args: Sequence[str]) -> tuple[TrainArgs, TaskCfg]:
     if parsed.cfg.task != name:
         raise UsageError(f"give the task once, got {name} and --task {parsed.cfg.task}")
     from jumper_warp.cli.task_flags import with_flags
-    from jumper_warp.tasks.observations import remembered
+    from jumper_warp.tasks.observations import with_history
 
-    task = with_flags(task, parsed.env)
-    if parsed.history is not None:
-        task = dataclasses.replace(task, policy=remembered(task.policy, parsed.history))
-    return parsed, task
+    return parsed, with_history(with_flags(task, parsed.env), parsed.history)
 
 
 def parse_settings(task: TaskCfg, default: TrainArgs, args: Sequence[str]) -> Any:

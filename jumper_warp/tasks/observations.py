@@ -1,5 +1,8 @@
 """Observation terms that the tasks share, with the noise of the paper's Table VI."""
 
+from dataclasses import replace
+
+from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.tasks.terms import ObservationTerm
 from jumper_warp.tasks.units import DEG
 from kernels.mdp import observations as obs
@@ -37,6 +40,11 @@ REMEMBERED = ("lin_vel", "ang_vel", "gravity", "angle", "last_action")
 def remembered(terms: tuple[ObservationTerm, ...], steps: int = 4) -> tuple[ObservationTerm, ...]:
     """Return terms of which some span several policy steps, from which noise, latency and motors can be told."""
     return tuple(term.replace(history=steps) if term.name in REMEMBERED else term for term in terms)
+
+
+def with_history(task: TaskCfg, steps: int | None) -> TaskCfg:
+    """Return the task whose policy sees so many policy steps; None: as it is."""
+    return task if steps is None else replace(task, policy=remembered(task.policy, steps))
 
 
 def exact(terms: tuple[ObservationTerm, ...]) -> tuple[ObservationTerm, ...]:

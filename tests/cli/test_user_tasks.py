@@ -16,6 +16,7 @@ from jumper_warp.policies.restore import open_policy, restored_task
 from jumper_warp.policies.spec import PolicyError
 from jumper_warp.registry import TASKS, load_task_module, make_task
 from jumper_warp.rl.checkpoint import save_checkpoint
+from jumper_warp.tasks.observations import with_history
 from jumper_warp.tasks.saving import TaskError
 from kernels.jump import rewards
 
@@ -279,6 +280,7 @@ def test_run_of_version_1_is_exported_and_played(capsys, old_run, tmp_path):
     assert (code, err) == (0, [])
     policy, original = load_policy(tmp_path / "policy"), load_policy("omnidirectional_jump")
     assert policy.interface.sizes == original.interface.sizes and policy.interface.task == "vertical-jump"
+    assert policy.interface.observation_names == with_history(make_task("vertical-jump"), 1).observation_names
     assert np.array_equal(policy.tensors()["actor.0.weight"], original.tensors()["actor.0.weight"])
     code, _, err = run(capsys, *play(old_run, "--out", str(tmp_path / "played")))
     assert code == 0, err

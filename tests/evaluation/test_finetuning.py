@@ -84,13 +84,15 @@ def test_a_policy_sees_its_goals_shifted():
 
 
 def test_aim_brings_a_policy_that_jumps_too_far_back_to_its_goals():
-    """The shipped policy, made to see its goals 40 mm farther away, ends as near its goals as before, to 0.5 mm."""
-    policy, cfg = open_policy("horizontal_jump"), FinetuneCfg(**FEW | {"goals": 8, "iterations": 0})
+    """The shipped policy, with its goals 40 mm farther away than in training, ends nearer to them than it did then."""
+    shipped, cfg = open_policy("horizontal_jump"), FinetuneCfg(**FEW | {"goals": 8, "iterations": 0})
+    missed = shipped.config["finetuned"]["aims"][0]["ahead"]["nominal"]  # before its aim was taken
+    policy = with_aim(shipped, missed)
     own = follow(make_groups(policy, cfg)[0], Network(policy), derivatives=False).value
     aimed, record = finetune(with_aim(policy, 0.04), cfg, say=lambda line: None)
     first, *_, last = record["aims"]
     assert first["ahead"]["nominal"] > 0.025 and abs(last["ahead"]["nominal"]) < 0.005
-    assert last["mean_abs_miss_m"]["nominal"] < float(own.abs().mean()) + 0.0005 and len(record["steps"]) == 1
+    assert last["mean_abs_miss_m"]["nominal"] < float(own.abs().mean()) and len(record["steps"]) == 1
     for mine, theirs in zip(aimed.layers, policy.layers, strict=True):
         assert torch.equal(mine[0], theirs[0]) and torch.equal(mine[1], theirs[1])
     assert not torch.equal(aimed.mean, policy.mean)

@@ -1,5 +1,4 @@
 import dataclasses
-import gc
 import os
 
 import pytest
@@ -27,7 +26,6 @@ def envs():
     """Environments of 8 and 40 worlds, each with the bytes of all arrays that it added."""
     found = []
     for count in (8, 40):
-        gc.collect()  # environments of other tests must not go while this one comes
         before = array_bytes()
         found.append((make_env(count, task=TASK, randomize=True), array_bytes() - before))
     return found
