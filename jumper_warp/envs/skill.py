@@ -12,15 +12,13 @@ import warp as wp
 from jumper_warp.robot.motors import filter_params
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.utils.errors import InputError
-from kernels.mdp.env import Counters, Nothing, SkillSettings
+from kernels.mdp.env import RING, Counters, Nothing, SkillSettings
 from kernels.mdp.events import make_event_kernel
-from kernels.mdp.observe import CHUNK, Column, ObservationArrays, make_observe_kernel
+from kernels.mdp.observe import CHUNK, ObservationArrays, make_observe_kernel
 from kernels.mdp.reset import make_give_kernel, make_reset_kernel
 from kernels.mdp.step import make_step_kernel
 from kernels.mdp.view import vec12
 
-RING = 8
-"""Policy steps that the rings of past targets and observations hold."""
 _KERNELS: dict[tuple, dict[str, wp.Kernel]] = {}
 
 
@@ -71,7 +69,7 @@ class Skill:
                                     term.options["history"], delayed, past))  # fmt: skip
                     past += delayed
             start += n * widths[group]
-        self.columns = wp.array(np.array(columns, dtype=Column.numpy_dtype()), dtype=Column, device=self.device)
+        self.columns = wp.array(np.array(columns, dtype=np.int32).T, dtype=int, device=self.device)
         self.num_chunks = -(-sum(len(task.rows[group]) for group in task.groups) // CHUNK)
         arrays = ObservationArrays()
         arrays.raw = wp.zeros((len(columns), n), dtype=float, device=self.device)

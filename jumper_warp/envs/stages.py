@@ -29,6 +29,8 @@ BLOCK = 32
 BLOCKS = {"reset": 128, "event": 256}
 """Of kernels of a task that are not launched so, by name."""
 CONDITION_BLOCK = 256
+EVENT_BLOCKS = 264
+"""Most blocks of events: of their many threads few have something to do, and a new block costs more than a turn."""
 
 
 class Part(NamedTuple):
@@ -119,7 +121,7 @@ class Stages:
 
     def _act(self, part: Part) -> None:
         inputs = [self._action, self._settings, self.parameters.push, self.robot, part.env, self.delays]
-        self._launch(action_kernel, (part.count, 4), inputs)
+        self._launch(action_kernel, (4, part.count), inputs)
         self._events(part, AT_STEP, self._all)
 
     def _advance(self, part: Part) -> None:
@@ -129,7 +131,7 @@ class Stages:
             worlds=Worlds(part.first, part.count),
         )  # fmt: skip
         inputs = [scene.geometry, scene.ground, self._settings, part.env, self.robot]
-        self._launch(track_kernel, (4, part.count), inputs)
+        self._launch(track_kernel, (8, part.count), inputs)
 
     def _judge(self, part: Part) -> None:
         for skill in self.skills:
@@ -193,7 +195,7 @@ class Stages:
                 self._launch(
                     skill.kernels["event"], (max(due) - first + 1, lanes, part.count),
                     [skill.index, stage, first, lanes, mask, self.step_dt, part.env, skill.numbers, skill.timer,
-                     self.parameters], BLOCKS["event"],
+                     self.parameters], BLOCKS["event"], EVENT_BLOCKS,
                 )  # fmt: skip
             if any(term.options["repack"] for term in due.values()):
                 self.sim.physics.parameters_changed(mask, Worlds(part.first, part.count))
@@ -217,8 +219,11 @@ class Stages:
             inputs = [skill.index, part.env, skill.columns, skill.numbers, beginning, arrays]
             self._launch(condition_kernel, (part.count, int(LANES)), inputs, CONDITION_BLOCK)
 
-    def _launch(self, kernel: wp.Kernel, dim: int | tuple[int, ...], inputs: list, block: int = BLOCK) -> None:
-        wp.launch(kernel, dim=dim, inputs=inputs, device=self.wp_device, block_dim=block)
+    def _launch(
+        self, kernel: wp.Kernel, dim: int | tuple[int, ...], inputs: list, block: int = BLOCK, blocks: int = 0
+    ) -> None:
+        """Launch; blocks: most blocks of a GPU, whose threads take turns (0: as many as there are threads)."""
+        wp.launch(kernel, dim=dim, inputs=inputs, device=self.wp_device, block_dim=block, max_blocks=blocks)
 
     def _give(self, mask: wp.array, begins: int, values: np.ndarray, headings: wp.array) -> None:
         values = wp.array(values, dtype=wp.vec4, device=self.wp_device)

@@ -11,10 +11,9 @@ import torch
 import warp as wp
 
 from jumper_warp.envs.arrays import FIRST_CLOCK
-from jumper_warp.envs.skill import RING
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.state_checks import check_tensor, check_values
-from kernels.mdp.env import Delays, EnvArrays
+from kernels.mdp.env import RING, Delays, EnvArrays
 from kernels.mdp.parameters import RobotParameters
 from kernels.mdp.view import RobotArrays
 

@@ -40,6 +40,9 @@ class PpoCfg:
     """Whether the critic predicts the return in its running standard deviations."""
     entropy_coef: float = 0.0015
     """Weight of the entropy bonus."""
+    final_entropy: float | None = None
+    """What entropy_coef becomes, in a straight line over the second half of a training; None: it stays. Much noise
+    finds the way, little the finer policy."""
     lr: float = 1.0e-3
     """Adam's step size at the start."""
     min_lr: float = 1.0e-6
@@ -85,6 +88,8 @@ class PpoCfg:
             check_positive(name, getattr(self, name))
         for name in ("value_coef", "entropy_coef", "desired_kl", "final_kl", "symmetry_coef"):
             check_not_negative(name, getattr(self, name))
+        if self.final_entropy is not None:
+            check_not_negative("final_entropy", self.final_entropy)
         for name in ("gamma", "lam"):
             if not 0.0 <= getattr(self, name) <= 1.0:
                 raise InputError(f"{name} must be in [0, 1], got {getattr(self, name)}")

@@ -23,6 +23,7 @@ def actor_gradient(
     actor: Layers,
     log_std: torch.Tensor,
     old_log_std: torch.Tensor,
+    entropy_coef: torch.Tensor,
     cfg: PpoCfg,
     symmetry: Symmetry | None,
     out: torch.Tensor,
@@ -32,8 +33,8 @@ def actor_gradient(
     The clipped surrogate of Schulman et al. 2017, eq. 7, as a loss: -E[min(r A, clip(r) A)] with r = π(a) / π_old(a).
     Where r A is the smaller, ∂/∂log π = -r A / batch, else 0.
 
-    rows: (batch, columns) as `layout`; symmetry: of the policy or its loss, as `cfg` says; out: the vector's part of
-    actor and noise.
+    rows: (batch, columns) as `layout`; entropy_coef: (); symmetry: of the policy or its loss, as `cfg` says; out: the
+    vector's part of actor and noise.
 
     Returns:
         Surrogate, entropy, mean squared asymmetry (0 without symmetry) and KL(old ‖ new).
@@ -52,7 +53,7 @@ def actor_gradient(
     clipped = batch.advantage * ratio.clamp(1.0 - cfg.clip, 1.0 + cfg.clip)
     slope = torch.where(gain > clipped, 0.0, gain)[:, None] / -rows.shape[0]
     deviation = (batch.action - mean) * torch.exp(-log_std)
-    noise = (slope * (deviation.square() - 1.0)).sum(0) - cfg.entropy_coef
+    noise = (slope * (deviation.square() - 1.0)).sum(0) - entropy_coef
     slope = slope * deviation * torch.exp(-log_std)
     if difference is None:
         gradients, asymmetry = backward(actor, seen, slope, dtype), torch.zeros_like(gain[0])

@@ -68,6 +68,7 @@ class Ppo:
         self.optimiser = FlatAdam(self.flat, cfg.lr)
         self.lr = self.optimiser.lr
         self._desired_kl = torch.full((), cfg.desired_kl, device=env.device)
+        self._entropy_coef = torch.full((), cfg.entropy_coef, device=env.device)
         self.compiler = compiler = Compiler(cfg.compile == "on" or (cfg.compile == "auto" and cuda))
         self.collector = Collector(env, cfg, self.model, self.flat, compiler)
         self.rollout = self.collector.rollout
@@ -165,7 +166,9 @@ class Ppo:
         layout, cfg, old_log_std = self.sampler.layout, self.cfg, self.sampler.old_log_std
         with self._critic_stream():
             value_loss = self._critic_gradient(rows, layout, critic, cfg, to_critic)
-        found = self._actor_gradient(rows, layout, actor, log_std, old_log_std, cfg, self._symmetry, to_actor)
+        found = self._actor_gradient(
+            rows, layout, actor, log_std, old_log_std, self._entropy_coef, cfg, self._symmetry, to_actor
+        )
         surrogate, entropy, asymmetry, kl = found
         self._critic_stream.join()
         self.flat.gradient[-1] = kl
@@ -178,8 +181,10 @@ class Ppo:
 
     def set_progress(self, progress: float) -> None:
         """Tell how much of the training is over, from 0 to 1; does not wait for the device."""
-        late = min(max(2.0 * progress - 1.0, 0.0), 1.0)
-        self._desired_kl.fill_((1.0 - late) * self.cfg.desired_kl + late * min(self.cfg.final_kl, self.cfg.desired_kl))
+        cfg, late = self.cfg, min(max(2.0 * progress - 1.0, 0.0), 1.0)
+        self._desired_kl.fill_((1.0 - late) * cfg.desired_kl + late * min(cfg.final_kl, cfg.desired_kl))
+        final = cfg.entropy_coef if cfg.final_entropy is None else cfg.final_entropy
+        self._entropy_coef.fill_((1.0 - late) * cfg.entropy_coef + late * final)
 
     def statistics(self) -> dict[str, float]:
         """Return averages since the last call, of losses and of finished episodes; waits for the device."""

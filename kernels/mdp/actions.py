@@ -4,7 +4,7 @@ import warp as wp
 
 from ..actuation.command_filter import filter_leg
 from ..layout import BODIES, COORDS, DOFS
-from .env import Delays, EnvArrays, SkillSettings
+from .env import RING, Delays, EnvArrays, SkillSettings
 from .view import RobotArrays, base_quat, base_velocity
 
 wp.set_module_options({"enable_backward": False})
@@ -27,10 +27,9 @@ def remember(robot: RobotArrays, push: wp.array(dtype=wp.spatial_vector), push_i
 @wp.func
 def delayed(delays: Delays, clock: int, world: int, m: int):
     """Choose what a motor follows: the target of as many physics steps ago as the latency asks for."""
-    depth = delays.past_target.shape[0]
     whole = delays.steps[world] // delays.substeps
-    delays.late_target[m, world] = delays.past_target[(clock - whole) % depth, m, world]
-    delays.earlier_target[m, world] = delays.past_target[(clock - whole - 1) % depth, m, world]
+    delays.late_target[m, world] = delays.past_target[(clock - whole) % RING, m, world]
+    delays.earlier_target[m, world] = delays.past_target[(clock - whole - 1) % RING, m, world]
     if m == 0:
         delays.late_steps[world] = delays.steps[world] - whole * delays.substeps
 
@@ -46,11 +45,11 @@ def action_kernel(
     env: EnvArrays,
     delays: Delays,
 ):
-    """Clamp, scale and filter the action (skills, num_worlds, 12) of each world's skill; one thread per (world, leg).
+    """Clamp, scale and filter the action (skills, num_worlds, 12) of each world's skill; one thread per (leg, world).
 
     An action that is not finite counts as 0, and its world as broken.
     """
-    world, leg = wp.tid()
+    leg, world = wp.tid()
     world += env.first
     skill = skills[env.skill[world]]
     q = world * COORDS + 7 + 5 * leg
@@ -78,7 +77,7 @@ def action_kernel(
         m = 3 * leg + j
         robot.target[m, world] = target[j]
         robot.safe_target[m, world] = safe[j]
-        delays.past_target[clock % delays.past_target.shape[0], m, world] = safe[j]
+        delays.past_target[clock % RING, m, world] = safe[j]
         delayed(delays, clock, world, m)
     if leg == 0:
         remember(robot, push, skill.push_in_flight, world)

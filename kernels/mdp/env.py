@@ -9,6 +9,8 @@ from .view import vec12
 
 BEGUN = wp.constant(1)
 COMMANDED = wp.constant(2)
+RING = wp.constant(8)
+"""Policy steps that the rings of past targets and observations hold; known to the compiler, which divides by it."""
 
 
 @wp.struct
@@ -79,7 +81,7 @@ class SkillSettings:
 class Delays:
     """Latency: what was commanded lately, and which of it the motors follow."""
 
-    past_target: wp.array3d(dtype=float)  # [rad] (depth, 12, num_worlds) filtered targets, a ring over policy steps
+    past_target: wp.array3d(dtype=float)  # [rad] (RING, 12, num_worlds) filtered targets, a ring over policy steps
     steps: wp.array(dtype=int)  # [physics steps] (num_worlds,) from action to motor
     substeps: int  # physics steps in a policy step
     late_steps: wp.array(dtype=int)  # [physics steps] (num_worlds,) what is left of the latency in a policy step

@@ -5,13 +5,13 @@ from typing import Any
 import warp as wp
 
 from ..terrain.ground import Ground
-from .env import BEGUN, COMMANDED, EnvArrays
+from .env import BEGUN, COMMANDED, RING, EnvArrays
 from .options import FAST
 from .parameters import RobotParameters
-from .random import OBSERVATION, cut_gaussian, make_draw
+from .random import OBSERVATION, cut_gaussian, draw_at, moment_of
 from .view import RobotArrays, load_view
 
-wp.set_module_options({"enable_backward": False})
+wp.set_module_options(FAST)
 
 CHUNK = 12
 """Terms that one thread evaluates: each chunk loads the robot once, and chunks run side by side."""
@@ -42,9 +42,26 @@ class ObservationArrays:
     raw: wp.array2d(dtype=float)  # (components, num_worlds) what the terms gave
     now: wp.array(dtype=float)  # of the next step; an ended episode has begun anew
     final: wp.array(dtype=float)  # the same before that new beginning
-    past: wp.array3d(dtype=float)  # (depth, num_worlds, columns) what sensors gave, a ring over policy steps
+    past: wp.array3d(dtype=float)  # (RING, num_worlds, columns) what sensors gave, a ring over policy steps
     latency: wp.array(dtype=int)  # [physics steps] (num_worlds,)
     substeps: int
+
+
+@wp.func
+def load_column(columns: wp.array2d(dtype=int), component: int) -> Column:
+    """Return a component's row; columns: (fields, components), so that neighbouring threads read neighbours."""
+    column = Column()
+    column.raw = columns[0, component]
+    column.group = columns[1, component]
+    column.start = columns[2, component]
+    column.stride = columns[3, component]
+    column.first = columns[4, component]
+    column.oldest = columns[5, component]
+    column.width = columns[6, component]
+    column.history = columns[7, component]
+    column.delayed = columns[8, component]
+    column.past = columns[9, component]
+    return column
 
 
 @wp.func
@@ -121,41 +138,67 @@ def or_zero(value: float, broken: bool) -> float:
     return value
 
 
+@wp.struct
+class Moment:
+    """What all components of a world have in common in a step."""
+
+    world: int
+    draws: wp.uint32  # see `moment_of`
+    fresh: int  # as in `EnvArrays`
+    broken: bool
+    now: int  # place in the rings of past values
+    newer: int  # place of the value that a sensor's latency has passed
+    older: int  # place of the one before
+    share: float  # [1] way from the newer to the older one
+
+
 @wp.func
-def late(arrays: ObservationArrays, clock: int, world: int, column: int, value: float, fresh: int) -> float:
-    """Return what a sensor gave as long ago as its latency says, between policy steps a straight line."""
-    depth = arrays.past.shape[0]
-    if fresh == BEGUN:
-        for i in range(depth):
-            arrays.past[i, world, column] = value
-    arrays.past[clock % depth, world, column] = value
+def moment(env: EnvArrays, arrays: ObservationArrays, world: int) -> Moment:
+    """Return what a world's components have in common."""
+    clock = env.clock[world]
     whole = arrays.latency[world] // arrays.substeps
-    share = float(arrays.latency[world] - whole * arrays.substeps) / float(arrays.substeps)
-    newer = arrays.past[(clock - whole) % depth, world, column]
-    if share == 0.0:
+    m = Moment()
+    m.world = world
+    m.draws = moment_of(env.seed, world, clock)
+    m.fresh = env.fresh[world]
+    m.broken = env.broken[world] != 0
+    m.now = clock % RING
+    m.newer = (clock - whole) % RING
+    m.older = (clock - whole - 1) % RING
+    m.share = float(arrays.latency[world] - whole * arrays.substeps) / float(arrays.substeps)
+    return m
+
+
+@wp.func
+def late(arrays: ObservationArrays, m: Moment, column: int, value: float) -> float:
+    """Return what a sensor gave as long ago as its latency says, between policy steps a straight line."""
+    if m.fresh == BEGUN:
+        for i in range(RING):
+            arrays.past[i, m.world, column] = value
+    arrays.past[m.now, m.world, column] = value
+    newer = arrays.past[m.newer, m.world, column]
+    if m.share == 0.0:
         return newer
-    return newer + share * (arrays.past[(clock - whole - 1) % depth, world, column] - newer)
+    return newer + m.share * (arrays.past[m.older, m.world, column] - newer)
 
 
 @wp.func
 def condition(
-    env: EnvArrays, arrays: ObservationArrays, column: Column, p: wp.array(dtype=float), world: int, broken: bool,
-    beginning: int,
+    arrays: ObservationArrays, column: Column, p: wp.array(dtype=float), m: Moment, beginning: int
 ):  # fmt: skip
     """Turn a component's raw value into an observation, behind the frames before."""
-    value = or_zero(arrays.raw[column.raw, world], broken)
+    value = or_zero(arrays.raw[column.raw, m.world], m.broken)
     if column.delayed != 0:
-        value = late(arrays, env.clock[world], world, column.past, value, env.fresh[world])
+        value = late(arrays, m, column.past, value)
     noise = p[column.first]
     if noise > 0.0:
-        draw = make_draw(env.seed, world, env.clock[world], OBSERVATION + column.group)
-        value += noise * cut_gaussian(draw, column.oldest)
-    value = or_zero(p[column.first + 1] * wp.clamp(value, -p[column.first + 2], p[column.first + 2]), broken)
-    i = column.start + world * column.stride + column.oldest
-    again = beginning != 0 and env.fresh[world] == COMMANDED
+        value += noise * cut_gaussian(draw_at(m.draws, m.world, OBSERVATION + column.group), column.oldest)
+    value = or_zero(p[column.first + 1] * wp.clamp(value, -p[column.first + 2], p[column.first + 2]), m.broken)
+    i = column.start + m.world * column.stride + column.oldest
+    again = beginning != 0 and m.fresh == COMMANDED
     for _ in range(column.history - 1):
         frame = arrays.now[i + wp.where(again, 0, column.width)]
-        if broken or env.fresh[world] == BEGUN:
+        if m.broken or m.fresh == BEGUN:
             frame = value
         arrays.now[i] = frame
         if beginning == 0:
@@ -171,7 +214,7 @@ def condition_kernel(
     # in
     skill: int,
     env: EnvArrays,
-    columns: wp.array(dtype=Column),
+    columns: wp.array2d(dtype=int),
     p: wp.array(dtype=float),
     beginning: int,
     # in, out
@@ -187,6 +230,6 @@ def condition_kernel(
     world += env.first
     if env.skill[world] != skill or (beginning != 0 and env.fresh[world] == 0):
         return
-    broken = env.broken[world] != 0
-    for component in range(lane, columns.shape[0], LANES):
-        condition(env, arrays, columns[component], p, world, broken, beginning)
+    m = moment(env, arrays, world)
+    for component in range(lane, columns.shape[1], LANES):
+        condition(arrays, load_column(columns, component), p, m, beginning)

@@ -10,7 +10,7 @@ from ..kinematics.inverse import LegLimits
 from ..layout import COORDS, DOFS, motor_slot
 from ..terrain.ground import rest_block, surface, world_ground
 from .attempts import meet_attempts
-from .env import BEGUN, COMMANDED, Delays, EnvArrays, Scene, SkillSettings
+from .env import BEGUN, COMMANDED, RING, Delays, EnvArrays, Scene, SkillSettings
 from .options import FAST
 from .random import COMMAND, RESET, between, make_draw
 from .track import follow_paw
@@ -215,7 +215,7 @@ def forget_kernel(
     robot.target[m, world] = angle
     robot.safe_target[m, world] = angle
     robot.old_rate[m, world] = robot.joint_qd[world * DOFS + 6 + slot]
-    for i in range(delays.past_target.shape[0]):
+    for i in range(RING):
         delays.past_target[i, m, world] = angle
     if m < 4:
         robot.impulse[m, world] = wp.vec3(0.0)
@@ -226,6 +226,7 @@ def forget_kernel(
         robot.touchdown_speed[m, world] = 0.0
         robot.paw_height[m, world] = 0.0
         robot.collisions[m, world] = 0
+        robot.collisions[m + 4, world] = 0
         follow_paw(robot, geometry[m], world, m)
     if m == 0:
         robot.invalid[world] = 0

@@ -369,6 +369,26 @@ def test_an_old_checkpoints_episodes_in_single_precision_are_taken_up():
     assert torch.equal(other.collector.episode, old["episode"].double())
 
 
+def noise_gradient(ppo, progress):
+    """Return the gradient by the noise's logarithms at a progress of the training, on the same samples."""
+    ppo.set_progress(progress)
+    ppo._differentiate(ppo.sampler.rows)
+    return ppo.model.log_std.grad.clone()
+
+
+@pytest.mark.parametrize(("final", "late"), [(0.004, 0.012), (None, 0.02)])
+def test_the_entropy_bonus_falls_over_the_second_half(final, late):
+    torch.manual_seed(0)
+    ppo = Ppo(PushTask(16), dataclasses.replace(PLAIN, entropy_coef=0.02, final_entropy=final))
+    fill(ppo, slice(None), 16)
+    ppo.batch()
+    first, half = noise_gradient(ppo, 0.0), noise_gradient(ppo, 0.5)
+    torch.testing.assert_close(half, first, atol=0.0, rtol=0.0)
+    for progress, coefficient in ((0.75, late), (1.0, 0.02 if final is None else final)):
+        expected = first + 0.02 - coefficient  # the bonus's own gradient is -coefficient
+        torch.testing.assert_close(noise_gradient(ppo, progress), expected, atol=1e-6, rtol=0.0)
+
+
 def test_state_is_taken_up_exactly():
     ppo, _ = trained(2)
     torch.manual_seed(99)
@@ -397,6 +417,7 @@ def test_state_is_taken_up_exactly():
         ({"entropy_coef": float("nan")}, "entropy_coef must be finite and not negative, got nan"),
         ({"value_coef": float("inf")}, "value_coef must be finite"),
         ({"desired_kl": float("nan")}, "desired_kl must be finite"),
+        ({"final_entropy": -1.0}, "final_entropy must be finite and not negative, got -1.0"),
         ({"final_kl": -1.0}, "final_kl must be finite and not negative"),
         ({"max_lr": float("inf")}, "max_lr must be finite"),
         ({"lr": float("nan")}, "lr must be positive"),

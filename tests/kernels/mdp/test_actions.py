@@ -40,7 +40,7 @@ class Commands:
         """Begin a step with an action, (n, 12) or (skills, n, 12)."""
         action = array(np.reshape(action, (-1, self.n, 12)))
         inputs = [action, self.settings, self.push, self.robot, self.worlds, self.delays]
-        wp.launch(action_kernel, (self.n, 4), inputs, device="cpu")
+        wp.launch(action_kernel, (4, self.n), inputs, device="cpu")
         wp.launch(tick_kernel, self.n, [array(np.ones(self.n)), self.worlds], device="cpu")
 
     def motors(self, name):
