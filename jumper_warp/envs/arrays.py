@@ -32,7 +32,7 @@ def robot_arrays(sim: Simulation, step_dt: float) -> Any:
         setattr(robot, name, wp.zeros((4, n), dtype=wp.vec3, device=device))
     for name in ("contact_time", "air_time", "touchdown_speed", "paw_height"):
         setattr(robot, name, wp.zeros((4, n), dtype=float, device=device))
-    robot.collisions = wp.zeros((8, n), dtype=int, device=device)
+    robot.collisions = wp.zeros((4, n), dtype=int, device=device)
     for name in ("old_torque", "action", "old_action", "older_action", "target", "safe_target", "old_rate"):
         setattr(robot, name, wp.zeros((12, n), dtype=float, device=device))
     robot.old_lin_vel = wp.zeros(n, dtype=wp.vec3, device=device)

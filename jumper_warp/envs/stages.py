@@ -131,7 +131,7 @@ class Stages:
             worlds=Worlds(part.first, part.count),
         )  # fmt: skip
         inputs = [scene.geometry, scene.ground, self._settings, part.env, self.robot]
-        self._launch(track_kernel, (8, part.count), inputs)
+        self._launch(track_kernel, (4, part.count), inputs)
 
     def _judge(self, part: Part) -> None:
         for skill in self.skills:

@@ -250,24 +250,22 @@ def next_leg(turn: int) -> int:
 
 
 @wp.func
-def add_leg_ground(found: Collisions, ground: Ground, leg: LegCapsules, pos: vec3, rotation: mat33) -> Collisions:
-    """Return the result with one leg over the ground taken into account."""
+def add_leg(
+    found: Collisions, ground: Ground, leg: LegCapsules, neighbour: LegCapsules, pos: vec3, rotation: mat33,
+    apart: real,
+) -> Collisions:  # fmt: skip
+    """Return the result with one leg taken into account: with the ground, itself, the shell and the next leg.
+
+    apart: links closer to one another than this [m] count as touching.
+    """
     zero = real(0.0)
     over_ground = leg_ground_distances(ground, leg, pos, rotation)
     result = record(found, over_ground[0], zero, HOUSING_GROUND)
     result = record(result, over_ground[1], zero, THIGH_GROUND)
     result = record(result, over_ground[2], zero, KNEE_GROUND)
-    return record(result, over_ground[3], zero, SHANK_GROUND)
-
-
-@wp.func
-def add_leg_links(found: Collisions, leg: LegCapsules, neighbour: LegCapsules, apart: real) -> Collisions:
-    """Return the result with one leg's links taken into account: with themselves, the shell and the next leg.
-
-    apart: links closer to one another than this [m] count as touching.
-    """
-    bound = wp.max(found.clearance, apart)
-    result = record(found, leg_self_distance(leg, bound), apart, LEG_SELF)
+    result = record(result, over_ground[3], zero, SHANK_GROUND)
+    bound = wp.max(result.clearance, apart)
+    result = record(result, leg_self_distance(leg, bound), apart, LEG_SELF)
     result = record(result, leg_shell_distance(leg, bound), apart, LEG_SHELL)
     return record(result, leg_leg_distance(leg, neighbour, bound), apart, LEG_LEG)
 
@@ -298,19 +296,19 @@ def world_collisions(
     count = wp.int32(4)
     for turn in range(count):
         neighbour = load_leg(geometry, joint_q, start, next_leg(turn + 1))
-        found = add_leg_ground(found, ground, leg, pos, rotation)
-        found = add_leg_links(found, leg, neighbour, real(0.0))
+        found = add_leg(found, ground, leg, neighbour, pos, rotation, real(0.0))
         leg = neighbour
     return found
 
 
 @wp.func
-def ground_collisions(
-    geometry: wp.array(dtype=LegGeometry), ground: Ground, joint_q: wp.array(dtype=wp.float32), start: int, turn: int
+def leg_collisions(
+    geometry: wp.array(dtype=LegGeometry), ground: Ground, joint_q: wp.array(dtype=wp.float32), start: int, turn: int,
+    apart: real,
 ) -> int:  # fmt: skip
-    """Return the flags of one leg with the ground, counted around the body; the first leg has the shell's too.
+    """Return the flags of one leg, counted around the body; together the four give those of `world_collisions`.
 
-    Those of the four legs and those of `link_collisions` are together those of `world_collisions`.
+    apart: links closer to one another than this [m] count as touching; `world_collisions` has 0.
     """
     pos = vec3(real(joint_q[start]), real(joint_q[start + 1]), real(joint_q[start + 2]))
     rotation = wp.quat_to_matrix(
@@ -320,31 +318,8 @@ def ground_collisions(
     if turn == 0:
         found = record(found, body_ground_distance(ground, pos, rotation), real(0.0), BODY_GROUND)
     leg = load_leg(geometry, joint_q, start, next_leg(turn))
-    return add_leg_ground(found, ground, leg, pos, rotation).flags
-
-
-@wp.func
-def link_collisions(
-    geometry: wp.array(dtype=LegGeometry), joint_q: wp.array(dtype=wp.float32), start: int, turn: int, apart: real
-) -> int:  # fmt: skip
-    """Return the flags of one leg's links with one another, the shell and the next leg, counted around the body.
-
-    apart: links closer to one another than this [m] count as touching; `world_collisions` has 0.
-    """
-    leg = load_leg(geometry, joint_q, start, next_leg(turn))
     neighbour = load_leg(geometry, joint_q, start, next_leg(turn + 1))
-    return add_leg_links(Collisions(), leg, neighbour, apart).flags
-
-
-@wp.func
-def leg_collisions(
-    geometry: wp.array(dtype=LegGeometry), ground: Ground, joint_q: wp.array(dtype=wp.float32), start: int, turn: int,
-    apart: real,
-) -> int:  # fmt: skip
-    """Return all flags of one leg, see `ground_collisions` and `link_collisions`."""
-    return ground_collisions(geometry, ground, joint_q, start, turn) | link_collisions(
-        geometry, joint_q, start, turn, apart
-    )
+    return add_leg(found, ground, leg, neighbour, pos, rotation, apart).flags
 
 
 @wp.kernel

@@ -226,7 +226,6 @@ def forget_kernel(
         robot.touchdown_speed[m, world] = 0.0
         robot.paw_height[m, world] = 0.0
         robot.collisions[m, world] = 0
-        robot.collisions[m + 4, world] = 0
         follow_paw(robot, geometry[m], world, m)
     if m == 0:
         robot.invalid[world] = 0

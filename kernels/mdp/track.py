@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from ..collision.robot import ground_collisions, link_collisions
+from ..collision.robot import leg_collisions
 from ..dynamics.leg_dynamics import leg_pose, paw_kinematics
 from ..kinematics.geometry import LegGeometry
 from ..layout import COORDS
@@ -63,21 +63,14 @@ def track_kernel(
     # in, out
     robot: RobotArrays,
 ):
-    """Follow every paw, and find what must not touch; launch over (8, num_worlds).
-
-    The first four threads of a world follow a paw and look at a leg over the ground, the others at a leg's links.
-    """
-    part, world = wp.tid()
+    """Follow every paw, and find what must not touch; one thread per (leg, world)."""
+    leg, world = wp.tid()
     world += env.first
     skill = skills[env.skill[world]]
-    leg = part % 4
-    if part >= 4:
-        robot.collisions[part, world] = link_collisions(geometry, robot.joint_q, world * COORDS, leg, skill.link_margin)
-        return
     down = wp.length(robot.paw_force[leg, world]) > skill.contact_force
     time_contact(robot, world, leg, down)  # before the velocity of the step before is written over
     follow_paw(robot, geometry[leg], world, leg)
     robot.paw_height[leg, world] = height_of_paw(robot, geometry[leg], ground, world, leg)
-    robot.collisions[leg, world] = ground_collisions(
-        geometry, world_ground(ground, world), robot.joint_q, world * COORDS, leg
+    robot.collisions[leg, world] = leg_collisions(
+        geometry, world_ground(ground, world), robot.joint_q, world * COORDS, leg, skill.link_margin
     )

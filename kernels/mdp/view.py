@@ -66,7 +66,7 @@ class RobotArrays:
     contact_time: wp.array2d(dtype=float)  # [s] 0 in the air
     air_time: wp.array2d(dtype=float)
     touchdown_speed: wp.array2d(dtype=float)
-    collisions: wp.array2d(dtype=int)  # (8, num_worlds) of the legs with the ground, then of their links
+    collisions: wp.array2d(dtype=int)
     torque: wp.array2d(dtype=float)  # (12, num_worlds), like all below
     old_torque: wp.array2d(dtype=float)
     action: wp.array2d(dtype=float)
@@ -136,7 +136,7 @@ def load_view(robot: RobotArrays, ground: Ground, world: int) -> RobotView:
         time = robot.contact_time[k, world]
         down = time > 0.0
         contacts += wp.where(down, 1, 0)
-        collisions = collisions | robot.collisions[k, world] | robot.collisions[k + 4, world]
+        collisions = collisions | robot.collisions[k, world]
         view.contact[k] = wp.where(down, 1.0, 0.0)
         view.first_contact[k] = wp.where(down and robot.air_time[k, world] > 0.0, 1.0, 0.0)
         view.contact_time[k] = time

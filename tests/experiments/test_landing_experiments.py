@@ -142,6 +142,15 @@ def of(middle, *, clean, stepped=0, hopped=0):
     return ended(goals, goals + [0.01, 0.0], end, air_time=air, lift_time=lift, touchdown=goals - [0.2, 0.0])
 
 
+@pytest.mark.parametrize(("direction", "unit"), [(0.0, (1.0, 0.0)), (90.0, (0.0, 1.0)), (180.0, (-1.0, 0.0))])
+def test_goals_of_a_bin_lie_in_a_direction(direction, unit):
+    args = max_jump.Args(jumps=5, direction=direction)
+    expected = np.array([0.75, 0.775, 0.8, 0.825, 0.85])[:, None, None] * np.array(unit)
+    np.testing.assert_allclose(max_jump.goals(args, 0.8), expected, atol=1e-12)
+    one = max_jump.goals(max_jump.Args(jumps=1, direction=direction), 0.8)
+    np.testing.assert_allclose(one, 0.8 * np.array(unit)[None, None], atol=1e-12)
+
+
 def test_reliable_distance_is_the_last_bin_before_the_first_that_is_not():
     bins = {
         1.2: of(1.2, clean=19),
@@ -335,6 +344,7 @@ def test_script_refuses_a_policy_of_another_task_in_one_line_with_code_2(policy)
         (lambda: platform_jump.Args(edge=0.2), "edge must be from 0.3 m to below 0.8 m"),
         (lambda: platform_jump.Args(scenes=("block",), solver="mujoco"), "SolverMuJoCo has no sliding block"),
         (lambda: max_jump.Args(jumps=0), "at least one jump"),
+        (lambda: max_jump.Args(direction=200.0), "direction must be in -180..180 deg, got 200"),
     ],
 )
 def test_impossible_settings_are_refused(make, message):

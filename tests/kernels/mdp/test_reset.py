@@ -310,7 +310,7 @@ def test_paws_are_known_where_they_are_at_a_beginning():
     stage.forget(SOME)
     place, speed = (getattr(stage.robot, name).numpy().copy() for name in ("paw_pos", "paw_vel"))
     inputs = [stage.scene.geometry, stage.scene.ground, stage.settings, stage.worlds, stage.robot]
-    wp.launch(track_kernel, (8, N), inputs, device="cpu")
+    wp.launch(track_kernel, (4, N), inputs, device="cpu")
     for before, after in ((place, stage.robot.paw_pos.numpy()), (speed, stage.robot.paw_vel.numpy())):
         np.testing.assert_array_equal(before[:, SOME], after[:, SOME])
         assert (before[:, ~SOME] != after[:, ~SOME]).all()
