@@ -246,11 +246,14 @@ def test_all_of_the_projects_tasks_can_be_trained():
 # ---------------------------------------------------------------------- runs of version 1
 
 
+VERSION_1 = Path(__file__).parents[1] / "policies" / "version_1"
+
+
 @pytest.fixture
 def old_run(tmp_path):
     """A run of vertical jumps whose checkpoint is of version 1, with some weights of its sizes."""
-    policy = load_policy("omnidirectional_jump")
-    saved = json.loads((Path(__file__).parents[1] / "policies" / "version_1" / "vertical_jump.json").read_text())
+    policy = load_policy(VERSION_1 / "omnidirectional_jump")
+    saved = json.loads((VERSION_1 / "vertical_jump.json").read_text())
     tensors, model = policy.tensors(), {}
     layers = len(policy.interface.sizes) - 1
     for i in range(layers):
@@ -278,7 +281,7 @@ def test_run_of_version_1_is_not_resumed(capsys, old_run, resume):
 def test_run_of_version_1_is_exported_and_played(capsys, old_run, tmp_path):
     code, _, err = run(capsys, "export", str(old_run), "--out", str(tmp_path / "policy"))
     assert (code, err) == (0, [])
-    policy, original = load_policy(tmp_path / "policy"), load_policy("omnidirectional_jump")
+    policy, original = load_policy(tmp_path / "policy"), load_policy(VERSION_1 / "omnidirectional_jump")
     assert policy.interface.sizes == original.interface.sizes and policy.interface.task == "vertical-jump"
     assert policy.interface.observation_names == with_history(make_task("vertical-jump"), 1).observation_names
     assert np.array_equal(policy.tensors()["actor.0.weight"], original.tensors()["actor.0.weight"])

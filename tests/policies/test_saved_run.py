@@ -172,10 +172,13 @@ def test_configuration_without_a_task_is_refused(config):
 # ---------------------------------------------------------------------- policies of version 1
 
 
-@pytest.fixture(params=["vertical_jump", "horizontal_jump", "omnidirectional_jump"])
+VERSION_1 = Path(__file__).parent / "version_1"
+
+
+@pytest.fixture(params=["vertical_jump.json", "horizontal_jump.json", "omnidirectional_jump/config.json"])
 def old(request):
     """Configuration of a policy that was trained when there was one environment for jumps only."""
-    return json.loads((Path(__file__).parent / "version_1" / f"{request.param}.json").read_text())
+    return json.loads((VERSION_1 / request.param).read_text())
 
 
 def test_task_of_version_1_is_todays_with_its_own_numbers(old):
@@ -210,7 +213,7 @@ def test_setting_that_version_1_did_not_save_is_what_it_was_then(old):
 
 
 def test_policy_of_version_1_gets_its_environment():
-    policy = load_policy("omnidirectional_jump")
+    policy = load_policy(VERSION_1 / "omnidirectional_jump")
     env = env_of_policy(policy, 2, Conditions(device="cpu"))
     assert env.num_obs == len(policy.interface.observation_names)
     assert env.task.rewards == () and env.task.name == policy.interface.task
