@@ -114,6 +114,16 @@ def stays(most: float, speed: float = 0.25) -> Term:
     return term
 
 
+def leans_back(most: float, speed: float = 0.25) -> Term:
+    """Return minus how far back of its start the base comes in stance [m], up to `most` [m], (num,)."""
+
+    def term(motion: Motion) -> torch.Tensor:
+        back = motion.q[0, :, 0] - motion.q[..., 0]
+        return -torch.where(before_takeoff(motion, speed), back, 0.0).amax(0).clamp_max(most)
+
+    return term
+
+
 def drifts(most: float) -> Term:
     """Keep the base within `most` [m] of its start in the plane, in all rows."""
 
