@@ -4,8 +4,9 @@
     python experiments/trajectory_optimization.py --jumps farthest --baseline cma --out outputs/trajectories
 
 Motor targets, equal left and right, through the command filter and motors of the tasks, from standing still. A search
-begins with random squats in parallel worlds, goes on along smoothed gradients (`jumper_warp.optim.smoothing`), at
-first with fewer physics steps, and ends with limited-memory BFGS inside an augmented Lagrangian
+begins with random squats in parallel worlds, for the farthest flight with run-ups in place, goes on along smoothed
+gradients (`jumper_warp.optim.smoothing`), at first with fewer physics steps or in single precision, for the farthest
+flight also from crossings of the best, and ends with limited-memory BFGS inside an augmented Lagrangian
 (`jumper_warp.optim.augmented_lagrangian`). What is told is not the optimiser's own figure: the targets are replayed
 in the simulation that trains policies, at every physics step, and collisions of all links are looked for; the
 farthest flight is scored as in `experiments/distance_limit.py`, whose constraints it has. Of each jump a JSON file is
@@ -38,7 +39,7 @@ from jumper_warp.cli.main import run_command
 from jumper_warp.evaluation import takeoff_search
 from jumper_warp.evaluation.evolved_jumps import Clock, evolve, search_as_published
 from jumper_warp.evaluation.motion_replay import Replay
-from jumper_warp.evaluation.optimized_jumps import JUMPS, Jump, optimise, squats
+from jumper_warp.evaluation.optimized_jumps import JUMPS, Jump, optimise
 from jumper_warp.evaluation.plots import drawn
 from jumper_warp.evaluation.run import EvaluationArgs, EvaluationRun
 from jumper_warp.optim.trajectory import Problem
@@ -47,9 +48,6 @@ from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.output import output_dir, write_figures
 from jumper_warp.utils.runtime import announce
 
-PUSH = {"farthest": 36, "still": 30}
-"""Policy step around which random squats push off; 32 elsewhere."""
-
 
 @dataclass(frozen=True)
 class Args:
@@ -57,8 +55,8 @@ class Args:
 
     jumps: tuple[str, ...] = tuple(JUMPS)
     """What is optimised."""
-    policy: str | None = "horizontal_jump"
-    """Whose actions begin the search for the farthest flight too, as in `distance_limit.py`; None: random squats."""
+    policy: str | None = None
+    """Whose actions begin the search for the farthest flight too, as in `distance_limit.py`; None: random ones."""
     baseline: Literal["none", "cma"] = "none"
     """Whether evolution strategies run beside it."""
     generations: int = 480
@@ -66,13 +64,13 @@ class Args:
     longer: float = 1.0
     """[1] Time of CMA-ES on the same rollouts over that of the gradients."""
     samples: int | None = None
-    """Random squats (default: those of each jump)."""
+    """Random candidates (default: those of each jump)."""
     effort: float = 1.0
     """[1] Scales the iterations."""
-    polish: int = 30
+    polish: int = 40
     """Iterations of the last descent."""
     seed: int = 0
-    """Of random squats and displacements."""
+    """Of random candidates and displacements."""
     out: Path | None = None
     """Folder for figures, plots, targets and recordings (default: outputs/trajectory_optimization/<time>)."""
     device: str | None = None
@@ -122,7 +120,7 @@ def run_jump(
     settings: dict[str, Any] = {"device": args.device, "threads": args.threads}
     knots = jump.make(substeps=SUBSTEPS, **settings).knots
     rng = np.random.default_rng(args.seed)
-    begin = squats(knots, args.samples or jump.samples, rng, PUSH.get(name, 32))
+    begin = jump.draw(knots, args.samples or jump.samples, rng)
     if name == "farthest" and args.policy is not None:
         begin = np.concatenate([begin, around(knots.nearest(policy_actions(args, knots.steps)), knots, rng)])
     if jump.after in seeds:

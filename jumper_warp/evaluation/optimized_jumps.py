@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
+import torch
 
 from jumper_warp.evaluation.motion_replay import SPEED, Replay
 from jumper_warp.evaluation.takeoff_search import KNOTS, TICKS
@@ -33,45 +35,15 @@ SOFT = 4.5
 """[g] Most acceleration of the base over a policy step of its landing; the tasks end an episode at 5."""
 ESTIMATE = 61
 """Policy steps of a motion up to the apex."""
+BACK, LEAN = 0.28, 1.0
+"""[m], [1] How far back the base is drawn in the first parts of the search for the farthest flight, and its weight."""
+POSTURES = np.array([[-0.2, -0.7, 0.7, -0.3], [0.6, 0.0, 0.3, 0.8], [0.9, 0.5, 0.9, 0.5]])
+"""[1] Actions of a run-up in place: base behind the paws, hind legs drawn in under it, crouch."""
+SCATTER = 0.35
+"""[1] Standard deviation of these postures."""
 
 
-@dataclass(frozen=True)
-class Jump:
-    """What is optimised."""
-
-    label: str
-    unit: str
-    """Of what `told` returns."""
-    make: Callable[..., Problem]
-    """Returns the problem, given substeps, device and threads."""
-    stages: tuple[tuple[int, Stage], ...]
-    """Parts of the search: physics steps in a policy step, and the part."""
-    told: Callable[[Replay], float | None]
-    """What is told of the replay."""
-    torque: float = 18.0
-    """[N m] Limit of the transversal motors."""
-    lateral_torque: float = 18.0
-    """[N m]"""
-    command_filter: Callable[[], FilterCfg] = vertical_jump_filter
-    samples: int = 2048
-    """Random squats, among which the search begins."""
-    after: str = ""
-    """Name of the jump whose best motion is a start too."""
-
-    def replay(self, targets: np.ndarray, **settings: Any) -> Replay:
-        """Return a motion of these targets [rad] (steps, 12); settings: as of `Replay`."""
-        motors = jumping_motors(self.torque, lateral_torque=self.lateral_torque)
-        return Replay(targets, motors, self.command_filter(), **settings)
-
-    def scaled(self, effort: float) -> Jump:
-        """Return the same with other numbers of iterations."""
-        stages = tuple(
-            (n, replace(part, iterations=max(1, round(effort * part.iterations)))) for n, part in self.stages
-        )
-        return replace(self, stages=stages)
-
-
-def squats(knots: Knots, count: int, rng: np.random.Generator, push: int) -> np.ndarray:
+def squats(knots: Knots, count: int, rng: np.random.Generator, push: int = 32) -> np.ndarray:
     """Return random candidates: two postures, then stretched legs, front and hind at their times, around step `push`.
 
     Shape (count, len(knots)), equal left and right.
@@ -83,16 +55,73 @@ def squats(knots: Knots, count: int, rng: np.random.Generator, push: int) -> np.
     return np.where(now < stretch, np.where(now < change, first, second), -1.0).reshape(count, -1)
 
 
-def _far(**settings: Any) -> Problem:
+def run_ups(knots: Knots, count: int, rng: np.random.Generator, push: int = 40) -> np.ndarray:
+    """Return random candidates that lean back, fall forward into a crouch, and stretch the hind legs, then the front.
+
+    Postures scatter around POSTURES, times are random; the hind legs push around step `push`. Shape (count,
+    len(knots)), equal left and right.
+    """
+    now, each = np.array(knots.at)[None, :, None], (count, 1, 1)
+    lean, fall, crouch = np.clip(POSTURES[:, None, None] + SCATTER * rng.normal(size=(3, count, 1, 4)), -1.0, 1.0)
+    hind = rng.uniform(push - 5.0, push + 3.0, each)
+    front = hind + rng.uniform(0.0, 4.0, each)
+    crouching = hind - rng.uniform(2.0, 8.0, each)
+    falling = crouching - rng.uniform(4.0, 10.0, each)
+    before = np.where(now < falling, lean, np.where(now < crouching, fall, crouch))
+    stretch = np.concatenate([front, front, hind, hind], axis=2)
+    return np.where(now < stretch, before, -1.0).reshape(count, -1)
+
+
+@dataclass(frozen=True)
+class Jump:
+    """What is optimised."""
+
+    label: str
+    unit: str
+    """Of what `told` returns."""
+    make: Callable[..., Problem]
+    """Returns the problem, given a part's settings, device and threads."""
+    stages: tuple[tuple[Mapping[str, Any], Stage], ...]
+    """Parts of the search: settings of `make`, and the part."""
+    told: Callable[[Replay], float | None]
+    """What is told of the replay."""
+    torque: float = 18.0
+    """[N m] Limit of the transversal motors."""
+    lateral_torque: float = 18.0
+    """[N m]"""
+    command_filter: Callable[[], FilterCfg] = vertical_jump_filter
+    draw: Callable[[Knots, int, np.random.Generator], np.ndarray] = squats
+    """Returns so many random candidates."""
+    samples: int = 2048
+    """Random candidates, among which the search begins."""
+    after: str = ""
+    """Name of the jump whose best motion is a start too."""
+
+    def replay(self, targets: np.ndarray, **settings: Any) -> Replay:
+        """Return a motion of these targets [rad] (steps, 12); settings: as of `Replay`."""
+        motors = jumping_motors(self.torque, lateral_torque=self.lateral_torque)
+        return Replay(targets, motors, self.command_filter(), **settings)
+
+    def scaled(self, effort: float) -> Jump:
+        """Return the same with other numbers of iterations."""
+        stages = tuple(
+            (how, replace(part, iterations=max(1, round(effort * part.iterations)))) for how, part in self.stages
+        )
+        return replace(self, stages=stages)
+
+
+def _far(lean: float = 0.0, **settings: Any) -> Problem:
+    """Return the farthest flight; lean: [1] weight of how far back the base goes before it, up to BACK."""
     knots = Knots(tuple(map(float, KNOTS)), steps=TICKS + 5)
     constraints = (
         jumps.landing_pitch(PITCH), jumps.stays(AWAY, SPEED), jumps.clear(speed=SPEED), jumps.no_run_up(AHEAD),
         jumps.takes_off(SPEED),
     )  # fmt: skip
+    far, back = jumps.farthest(SPEED), jumps.leans_back(BACK, SPEED)
+    objective = (lambda motion: far(motion) + lean * back(motion)) if lean else far
     return Problem(
-        knots, jumps.farthest(SPEED), constraints, jumping_motors(18.0, lateral_torque=12.0), horizontal_jump_filter(),
-        **settings,
-    )  # fmt: skip
+        knots, objective, constraints, jumping_motors(18.0, lateral_torque=12.0), horizontal_jump_filter(), **settings
+    )
 
 
 UP = Knots((0.0, 6.0, 12.0, 18.0, 22.0, *map(float, range(24, 44, 1))), steps=ESTIMATE)
@@ -108,22 +137,31 @@ def _vertical(
     return Problem(knots, objective, constraints, jumping_motors(torque), vertical_jump_filter(), **settings)
 
 
-COARSE = 4
-"""Physics steps in a policy step of the first parts of a search."""
+FINE: dict[str, Any] = {"substeps": SUBSTEPS}
+COARSE = FINE | {"substeps": 4}
+"""Fewer physics steps in a policy step, for the first parts of a search."""
+QUICK = FINE | {"double": False, "tolerance": None}
+"""Single precision, and its tolerance of the contact iteration."""
 UPWARD = (
-    (COARSE, Stage(32, 40, rate=0.05, noise=0.05, fall=False)),
+    (COARSE, Stage(32, 40, rate=0.05, noise=0.05, least=1.0)),
     (COARSE, Stage(12, 100, rate=0.04, noise=0.04)),
-    (SUBSTEPS, Stage(4, 100, rate=0.02, noise=0.02, penalty=100.0)),
+    (FINE, Stage(4, 100, rate=0.02, noise=0.02, penalty=100.0)),
+)
+FORWARD = (
+    (QUICK | {"lean": LEAN}, Stage(40, 40, rate=0.05, noise=0.05, least=1.0, slack=0.1)),
+    (QUICK | {"lean": LEAN}, Stage(16, 40, rate=0.05, noise=0.05, least=1.0, slack=0.1)),
+    (QUICK, Stage(10, 60, rate=0.04, noise=0.03, least=0.5, slack=0.1)),
+    *(
+        (QUICK, Stage(keep, 80, rate=0.03, noise=0.03, least=0.2, penalty=40.0, slack=0.1, crossings=40))
+        for keep in (10, 8, 6, 5)
+    ),
+    (FINE, Stage(4, 80, rate=0.03, noise=0.03, least=0.3, penalty=40.0, dual=2.0, slack=0.05)),
+    (FINE, Stage(2, 120, rate=0.02, noise=0.02, penalty=100.0, dual=4.0, slack=0.03)),
 )
 JUMPS = {
     "farthest": Jump(
-        "farthest flight, 18 N m", "m", _far,
-        (
-            (SUBSTEPS, Stage(24, 60, rate=0.05, noise=0.05, fall=False)),
-            (SUBSTEPS, Stage(10, 200, rate=0.05, noise=0.05)),
-            (SUBSTEPS, Stage(5, 200, rate=0.03, noise=0.03, penalty=50.0)),
-        ),
-        lambda replay: None, lateral_torque=12.0, command_filter=horizontal_jump_filter,
+        "farthest flight, 18 N m", "m", _far, FORWARD, lambda replay: None, lateral_torque=12.0,
+        command_filter=horizontal_jump_filter, draw=run_ups, samples=768,
     ),
     "highest": Jump(
         "highest jump, 18 N m", "m", lambda **s: _vertical(jumps.highest(), jumps.takes_off(), **s), UPWARD,
@@ -143,10 +181,10 @@ JUMPS = {
         f"still landing from {STILL_HEIGHT:g} m", "s",
         lambda **s: _vertical(jumps.still(), jumps.reaches(STILL_HEIGHT), jumps.soft(SOFT), knots=LANDING, **s),
         (
-            (SUBSTEPS, Stage(16, 60, rate=0.05, noise=0.05, fall=False)),
-            (SUBSTEPS, Stage(6, 100, rate=0.03, noise=0.03)),
+            (FINE, Stage(16, 60, rate=0.05, noise=0.05, least=1.0)),
+            (FINE, Stage(6, 100, rate=0.03, noise=0.03)),
         ),
-        lambda replay: replay.longest_lift, samples=1024, after="least_work",
+        lambda replay: replay.longest_lift, draw=partial(squats, push=30), samples=1024, after="least_work",
     ),
 }  # fmt: skip
 
@@ -155,9 +193,12 @@ def optimise(
     jump: Jump, begin: np.ndarray, *, seed: int, polish: int, tell: Callable[[str], None], **settings: Any
 ) -> tuple[Progress, list[Problem]]:
     """Return what was found from candidates, and the problems that counted the steps; settings: device, threads."""
-    problems = {n: jump.make(substeps=n, **settings) for n in sorted({SUBSTEPS, *(n for n, _ in jump.stages)})}
-    fine, found = problems[SUBSTEPS], begin
-    for number, (substeps, stage) in enumerate(jump.stages):
-        found = smoothed(problems[substeps], found, stages=(stage,), seed=seed + number)
-        tell(f"part {number + 1}: {len(found)} starts")
-    return minimise(fine, found, iterations=polish, step=0.01, seed=seed), list(problems.values())
+    problems = {str(how): jump.make(**how, **settings) for how in (FINE, *(how for how, _ in jump.stages))}
+    merits: list[torch.Tensor] = []
+    found = begin
+    for number, (how, stage) in enumerate(jump.stages):
+        found = smoothed(
+            problems[str(how)], found, stages=(stage,), seed=seed + number, tell=lambda _, last: merits.append(last)
+        )
+        tell(f"part {number + 1}: {len(found)} starts, objective with penalties {float(merits[-1][0]):.3f}")
+    return minimise(problems[str(FINE)], found, iterations=polish, step=0.01, seed=seed), list(problems.values())

@@ -6,7 +6,7 @@ import torch
 
 from experiments import trajectory_optimization as experiment
 from jumper_warp.cli.main import run_command
-from jumper_warp.evaluation.optimized_jumps import JUMPS
+from jumper_warp.evaluation.optimized_jumps import JUMPS, run_ups
 from jumper_warp.tasks.jump.references import COLUMNS, ROWS
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -40,6 +40,18 @@ def test_replay_sees_paws_that_are_lifted_again():
     assert once.touched == twice.touched == 4 and once.takeoff == twice.takeoff
     assert once.longest_lift < 0.1 < twice.longest_lift and once.highest_lift + 0.02 < twice.highest_lift
     assert once.work == twice.work > 20.0 and once.apex > 0.5
+
+
+def test_run_ups_lean_back_before_they_push():
+    made = JUMPS["farthest"].make(device="cpu", threads=1)
+    x = run_ups(made.knots, 32, np.random.default_rng(0))
+    rows = x.reshape(32, -1, 4)
+    assert np.abs(x).max() <= 1.0 and (rows[:, -1] == -1.0).all() and np.ptp(rows[:, 0], axis=0).min() > 0.3
+    with torch.no_grad():
+        motion = made.motion(torch.as_tensor(x))
+    back = -motion.q[:30, :, 0].amin(0).numpy()
+    assert np.median(back) > 0.1
+    assert motion.takeoff(0.25)[1].float().mean() > 0.5
 
 
 @pytest.mark.parametrize("flags", [{"jumps": ("wings",)}, {"effort": 0.0}, {"samples": 3}, {"longer": -1.0}])

@@ -7,7 +7,7 @@ import torch
 from jumper_warp.optim import jumps
 from jumper_warp.optim.augmented_lagrangian import minimise
 from jumper_warp.optim.rollout import Rollout
-from jumper_warp.optim.smoothing import Stage, smoothed
+from jumper_warp.optim.smoothing import SHIFT, Stage, crossed, descend, smoothed
 from jumper_warp.optim.trajectory import Knots, Problem, Values
 from jumper_warp.robot.model import build_model
 from jumper_warp.robot.motors import jumping_motors, vertical_jump_filter
@@ -133,6 +133,7 @@ TERMS = {
     "positive_work": jumps.positive_work(),
     "landing_pitch": lambda motion: jumps.landing_pitch(0.5)(motion)[0],
     "stays": lambda motion: jumps.stays(0.3)(motion).sum(0),
+    "leans_back": jumps.leans_back(1.0),
     "clear": lambda motion: jumps.clear()(motion).sum(0),
     "soft": lambda motion: jumps.soft(0.0, 0.25)(motion).sum(0),
     "upright": lambda motion: jumps.upright(0.2)(motion)[0],
@@ -205,9 +206,76 @@ def test_descent_stays_in_the_box():
 
 def test_smoothed_descent_comes_near_from_afar():
     begin = np.random.default_rng(0).uniform(-1.0, 1.0, (64, 2))
-    stages = (Stage(8, 60, 0.05, 0.05, fall=False), Stage(2, 100, 0.03, 0.03, penalty=100.0))
+    stages = (Stage(8, 60, 0.05, 0.05, least=1.0), Stage(2, 100, 0.03, 0.03, penalty=100.0))
     found = smoothed(Bowl(), begin, stages=stages)
     assert found.shape == (2, 2) and found == pytest.approx(np.tile(NEAREST, (2, 1)), abs=0.03)
+
+
+def test_multipliers_keep_a_smoothed_descent_within_its_constraints():
+    begin = torch.tensor([[0.5, 0.3]], dtype=torch.float64)
+    violation = {}
+    for dual in (0.0, 0.5):
+        stage = Stage(1, 300, 0.02, 0.02, penalty=1.0, dual=dual)
+        violation[dual] = float(descend(Bowl(), begin, stage, np.random.default_rng(0)).sum() - 0.5)
+    assert violation[0.0] > 0.1 and abs(violation[0.5]) < 0.02
+
+
+def test_starts_with_multipliers_end_at_their_best_within_the_constraints():
+    begin = torch.tensor([[0.5, 0.3]], dtype=torch.float64)
+    stage = Stage(1, 300, 0.02, 0.02, penalty=1.0, dual=0.5, slack=0.5)
+    found = descend(Bowl(), begin, stage, np.random.default_rng(0))
+    assert float(found.sum() - 0.5) < 5e-3
+    assert found[0].numpy() == pytest.approx(NEAREST, abs=0.05)
+
+
+class Edge(Bowl):
+    """The valley ends at 0.45: beyond it everything is bad and nothing says where to go."""
+
+    def evaluate(self, x):
+        values = super().evaluate(x)
+        return Values(torch.where(x[:, 0] > 0.45, 5.0, values.objective), values.constraints - 1.0)
+
+
+def test_starts_that_fell_off_an_edge_go_back():
+    begin = torch.tensor([[0.3, 0.4], [-0.5, 0.3]], dtype=torch.float64)
+    ends = {}
+    for slack in (math.inf, 0.1):
+        stage = Stage(2, 120, 0.05, 0.01, least=1.0, slack=slack)
+        ends[slack] = Edge().evaluate(descend(Edge(), begin, stage, np.random.default_rng(0))).objective
+    assert (ends[math.inf] == 5.0).any()
+    first = Edge().evaluate(begin).objective
+    assert (ends[0.1] <= first).all() and ends[0.1][1] < first[1] - 1.0
+
+
+def test_crossings_have_the_beginning_of_one_and_the_end_of_another():
+    knots = Knots(tuple(map(float, range(12))), steps=12)
+    rows = torch.arange(12.0)[:, None] + torch.tensor([0.0, 100.0, 200.0])[:, None, None]  # knot + 100 x parent
+    whole = crossed(knots, rows.expand(3, 12, 4).flatten(1), 66, np.random.default_rng(0)).reshape(198, 12, 4)
+    assert (whole == whole[..., :1]).all()
+    parent, knot = torch.div(whole[..., 0], 100.0, rounding_mode="floor"), whole[..., 0] % 100.0
+    assert (parent[:, 0] == torch.arange(3.0).repeat(66)).all()
+    assert (parent[:, 0] != parent[:, -1]).all()  # of two, never of one
+    assert ((parent.diff(dim=1) != 0.0).sum(1) == 1).all()
+    own = parent == parent[:, :1]
+    assert (knot[own] == torch.arange(12.0).expand(198, 12)[own]).all()
+    assert 0 < (knot - torch.arange(12.0)).abs().max() <= SHIFT
+
+
+def test_search_crosses_its_starts():
+    begin = np.array([[0.0, 0.0, 0.0, 0.0, 0.9, 0.9, 0.9, 0.9], [0.9, 0.9, 0.9, 0.9, 0.0, 0.0, 0.0, 0.0]])
+
+    class Ends(Bowl):
+        """Best where all knots are 0, which are one's beginning and the other's end."""
+
+        knots = Knots((0.0, 1.0), steps=2)
+
+        def evaluate(self, x):
+            return Values(x.square().sum(1), x.new_zeros(len(x), 0))
+
+    bowl = Ends()
+    bowl.knots = Ends.knots
+    found = smoothed(bowl, begin, stages=(Stage(1, 1, 1e-6, 1e-6, crossings=16),))
+    assert np.abs(found).max() < 1e-3
 
 
 def test_a_jump_gets_higher_within_its_constraints():
