@@ -76,6 +76,7 @@ class Skill:
         arrays.now = wp.zeros(start, dtype=float, device=self.device)
         arrays.final = wp.zeros(start, dtype=float, device=self.device)
         arrays.past = wp.zeros((RING, n, max(past, 1)), dtype=float, device=self.device)
+        arrays.latency = wp.zeros(n, dtype=int, device=self.device)
         arrays.substeps = substeps
         self.observations = arrays
         self.obs, self.final_obs = (self._views(a, widths) for a in (arrays.now, arrays.final))
