@@ -183,9 +183,7 @@ def late(arrays: ObservationArrays, m: Moment, column: int, value: float) -> flo
 
 
 @wp.func
-def condition(
-    arrays: ObservationArrays, column: Column, p: wp.array(dtype=float), m: Moment, beginning: int
-):  # fmt: skip
+def condition(arrays: ObservationArrays, column: Column, p: wp.array(dtype=float), m: Moment, beginning: int):
     """Turn a component's raw value into an observation, behind the frames before."""
     value = or_zero(arrays.raw[column.raw, m.world], m.broken)
     if column.delayed != 0:

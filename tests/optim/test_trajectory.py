@@ -267,13 +267,11 @@ def test_search_crosses_its_starts():
     class Ends(Bowl):
         """Best where all knots are 0, which are one's beginning and the other's end."""
 
-        knots = Knots((0.0, 1.0), steps=2)
-
         def evaluate(self, x):
             return Values(x.square().sum(1), x.new_zeros(len(x), 0))
 
     bowl = Ends()
-    bowl.knots = Ends.knots
+    bowl.knots = Knots((0.0, 1.0), steps=2)
     found = smoothed(bowl, begin, stages=(Stage(1, 1, 1e-6, 1e-6, crossings=16),))
     assert np.abs(found).max() < 1e-3
 
