@@ -131,8 +131,13 @@ def _write_parameters(rollout: Rollout, given: dict[str, torch.Tensor]) -> None:
 
 @contextlib.contextmanager
 def _stream(rollout: Rollout) -> Iterator[None]:
-    """Let Warp work on PyTorch's stream."""
-    if not rollout.device.is_cuda:
+    """Let Warp work on PyTorch's stream.
+
+    Warp forgets a stream when a `wp.Stream` that wraps it is deleted, its own too, and captures no graph on it any more:
+    where PyTorch works on Warp's stream, as it does beside an environment, nothing is wrapped.
+    """
+    device = rollout.device
+    if not device.is_cuda or torch.cuda.current_stream().cuda_stream == wp.get_stream(device).cuda_stream:
         yield
         return
     with wp.ScopedStream(wp.stream_from_torch(torch.cuda.current_stream()), sync_enter=False):

@@ -68,7 +68,8 @@ def draw_platform(draw: Draw, ranges: GroundRanges, foot: wp.vec2, goal: wp.vec3
 def draw_block(draw: Draw, ranges: GroundRanges, foot: wp.vec2, goal: wp.vec3) -> Block:
     """Return a block under the goal; none without room for its near side between the paws before and after the jump.
 
-    The near side is anywhere there, across the axis along which the goal is farther.
+    The near side is anywhere there, more often near than far (a third within a ninth of the room), across the axis
+    along which the goal is farther.
     """
     along = wp.where(wp.abs(goal[0]) >= wp.abs(goal[1]), 0, 1)
     way = wp.abs(goal[along])
@@ -76,7 +77,8 @@ def draw_block(draw: Draw, ranges: GroundRanges, foot: wp.vec2, goal: wp.vec3) -
     farthest = way - foot[along] - ranges.clearance
     if nearest > farthest:
         return Block()
-    near = between(draw, 61, nearest, farthest)
+    u = between(draw, 61, 0.0, 1.0)
+    near = nearest + u * u * (farthest - nearest)
     far = way + foot[along] + between(draw, 62, EVERY_SIDE, ranges.room)
     center = wp.vec2(goal[0], goal[1])
     center[along] = wp.sign(goal[along]) * 0.5 * (near + far)

@@ -240,6 +240,15 @@ def landing_tilt(view: RobotView, task: JumpState, width: float) -> float:
 
 
 @wp.func
+def descent_tilt(view: RobotView, task: JumpState, width: float) -> float:
+    """Tilt while the base falls in flight: squared sine as in `landing_tilt`, with the same width [rad]."""
+    if task.phase != FLIGHT or view.lin_vel[2] > 0.0:
+        return 0.0
+    sine = wp.length(wp.vec2(view.gravity[0], view.gravity[1])) / wp.sin(width)
+    return sine * sine
+
+
+@wp.func
 def lifted_paws(view: RobotView, task: JumpState, steps: float) -> float:
     """Steps after landing: paws off the ground later than steps policy steps after touchdown, 0 to 4."""
     if task.phase != LANDED or task.phase_steps <= int(steps):

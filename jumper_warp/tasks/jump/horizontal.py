@@ -34,6 +34,7 @@ REWARDS = (
     RewardTerm(rewards.standing_posture, 50.0, width=20.0 * DEG, shift=25.0 * DEG),
     RewardTerm(rewards.rest, 40.0, speed=0.1, spin=0.5),
     RewardTerm(rewards.landing_tilt, -60.0, width=10.0 * DEG),
+    RewardTerm(rewards.descent_tilt, -60.0, width=10.0 * DEG),
     RewardTerm(rewards.lifted_again, -30.0, free=0.0),
     RewardTerm(rewards.capture_point, 20.0, width=0.10),
     RewardTerm(rewards.soft_impact, 20.0, limit=5.0 * G),

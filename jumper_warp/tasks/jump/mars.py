@@ -3,23 +3,26 @@
 The open-loop jump reaches 2.96 m through the filter of the jumps on Earth, 3.70 m through a loose one: each has a task.
 Weights of the vertical jump are those of the sequel's configuration; its levels begin at 1.8 m, here lower and with
 steps in between. Flights take up to 2.7 s. Limits on impacts are those on Earth, since they protect the same robot;
-those on misses grow with the distance.
+those on misses grow with the distance: the same error of the takeoff carries a robot FARTHER times as far off.
 """
 
 from __future__ import annotations
 
 from dataclasses import replace
 
-from jumper_warp.robot.gravity import MARS
+from jumper_warp.robot.gravity import EARTH, MARS
 from jumper_warp.robot.motors import MotorCfg, jumping_motors, loose_filter
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.tasks.jump.cfg import GroundCfg, ladder
 from jumper_warp.tasks.jump.horizontal import NEAREST, horizontal_jump, level
 from jumper_warp.tasks.jump.vertical import STARTS, heights, vertical_jump
+from jumper_warp.tasks.units import DEG
 from kernels.jump import terminations
 
 TORQUE, KP = 24.8, 20.0
 """[N m], [N m/rad] Of the transversal motors."""
+FARTHER = EARTH / MARS
+"""[1] By which the same takeoff goes higher and farther."""
 
 
 def mars_motors(lateral_torque: float) -> MotorCfg:
@@ -39,7 +42,11 @@ def vertical_jump_mars() -> TaskCfg:
         levels=heights((0.7, 1.3), (1.0, 1.8), (1.5, 2.4), (2.0, 3.1)),
         evaluation="height-mars",
     )
-    task = task.with_terms("terminations", moved_away={"distance": 0.5})
+    task = replace(task, curriculum=task.curriculum.replace(tolerance=0.05 * FARTHER))
+    task = task.with_terms(
+        "terminations", moved_away={"distance": 0.30 * FARTHER}, wrong_height={"tolerance": 0.10 * FARTHER},
+        tilted={"angle": 40.0 * DEG},
+    )  # fmt: skip
     ends = tuple(term for term in task.terminations if term.func is not terminations.second_takeoff)
     task = replace(task, terminations=ends)  # robots that only learn to land bounce, and must live to learn not to
     return task.with_terms(
@@ -78,8 +85,14 @@ def horizontal_jump_mars() -> TaskCfg:
         reset=replace(task.reset, settings=settings),
         evaluation="place-mars",
     )  # fmt: skip
-    task = task.with_terms("terminations", predicted_miss={"tolerance": 1.0}, missed_goal={"tolerance": 0.8})
-    return task.with_terms("rewards", estimated_tracking={"middle": 0.5, "wide": 1.2, "fine": 0.15})
+    task = replace(task, curriculum=task.curriculum.replace(tolerance=0.10 * FARTHER))
+    task = task.with_terms(
+        "terminations", predicted_miss={"tolerance": 0.55 * FARTHER}, missed_goal={"tolerance": 0.50 * FARTHER},
+        turned_touchdown={"rotation": 40.0 * DEG, "yaw": 20.0 * DEG},
+    )  # fmt: skip
+    return task.with_terms(
+        "rewards", estimated_tracking={"middle": 0.5, "wide": 1.2, "fine": 0.15}, tracking={"wide": 0.4, "fine": 0.05}
+    )
 
 
 def horizontal_jump_mars_loose() -> TaskCfg:

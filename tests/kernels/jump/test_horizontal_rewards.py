@@ -173,6 +173,17 @@ def test_landing_tilt_is_1_at_its_limit_and_counts_after_touchdown(axis):
         assert paid("landing_tilt", view, make_episode(phase=phase), width=10.0 * DEG) == 0.0
 
 
+@pytest.mark.parametrize("axis", [(1.0, 0.0, 0.0), (0.6, -0.8, 0.0)])
+def test_descent_tilt_counts_in_flight_while_the_base_falls(axis):
+    view = make_view(**tilted_by(20.0 * DEG, axis), lin_vel=(1.0, 0.0, -0.1))
+    share = (math.sin(20.0 * DEG) / math.sin(10.0 * DEG)) ** 2
+    assert paid("descent_tilt", view, make_episode(phase=FLIGHT), width=10.0 * DEG) == pytest.approx(share, rel=1e-4)
+    rising = make_view(**tilted_by(20.0 * DEG, axis), lin_vel=(1.0, 0.0, 0.1))
+    assert paid("descent_tilt", rising, make_episode(phase=FLIGHT), width=10.0 * DEG) == 0.0
+    for phase in (STANCE, LANDED):
+        assert paid("descent_tilt", view, make_episode(phase=phase), width=10.0 * DEG) == 0.0
+
+
 @pytest.fixture(scope="module")
 def rollout():
     """Logged and expected terms of jumps from all starts, (steps, terms, worlds)."""
