@@ -137,11 +137,17 @@ def env_maker(task: TaskCfg, args: TrainArgs) -> MakeEnv:
 
 
 def command_line(args: Sequence[str], modules: Sequence[ModuleType]) -> str:
-    """Return what was typed, without `--resume`; modules are named by their file, those of a package by their name."""
-    kept = [arg for arg in args if not arg.startswith("--resume=")]
-    while "--resume" in kept:
-        at = kept.index("--resume")
-        del kept[at : at + 2]
+    """Return what was typed, without `--resume` and `--start-from`, to which one more `--resume` can be added.
+
+    Modules are named by their file, those of a package by their name.
+    """
+    kept, given = [], iter(args)
+    for arg in given:
+        flag, equals, _ = arg.partition("=")
+        if flag.replace("_", "-") not in ("--resume", "--start-from"):
+            kept.append(arg)
+        elif not equals:
+            next(given, None)
     for module in modules:
         name = module.__name__ if "." in module.__name__ or not module.__file__ else module.__file__
         kept += [TASK_MODULE, name]
@@ -182,7 +188,7 @@ def check_resume(cfg: TrainCfg) -> None:
 def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> TrainResult:
     """Train as the arguments say; modules: that the user has named, whose tasks are registered by now.
 
-    Raises as `parse_train` and `jumper_warp.rl.runner.train`.
+    Raises as `parse_train`, `jumper_warp.policies.start.start_from` and `jumper_warp.rl.runner.train`.
     """
     parsed, task = parse_train(args)
     from jumper_warp.rl.runner import train
@@ -192,13 +198,18 @@ def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> TrainResult:
     check_symmetry(task, parsed.cfg)
     if parsed.cfg.resume:
         check_resume(parsed.cfg)
+    start = None
+    if parsed.cfg.start_from:
+        from jumper_warp.policies.start import start_from
+
+        start = start_from(parsed.cfg.start_from, task, parsed.cfg.ppo)
     first = os.environ.get("RANK", "0") == "0"
     if first:
         announce(parsed.cfg.device, parsed.cfg.threads)
     as_rsl_rl = None
     if parsed.cfg.trainer == "rsl-rl":
         from jumper_warp.envs.rsl_rl import RslRlVecEnv as as_rsl_rl
-    result = train(parsed.cfg, env_maker(task, parsed), command_line(args, modules), as_rsl_rl)
+    result = train(parsed.cfg, env_maker(task, parsed), command_line(args, modules), as_rsl_rl, start)
     if first:
         print(result.folder)
     return result

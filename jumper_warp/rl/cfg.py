@@ -177,6 +177,9 @@ class TrainCfg:
     """The logged figure that makes a checkpoint the best; higher is better."""
     resume: str | None = None
     """A checkpoint, a run's folder, or `latest` for the task's latest run."""
+    start_from: str | None = None
+    """A policy's name or folder, a run's folder (its best checkpoint) or a checkpoint: a new training begins with that
+    policy's actor, its weights and its statistics of observations. The critic, the optimiser and the noise are new."""
     trainer: Literal["ppo", "shac", "rsl-rl"] = "ppo"
     """This package's PPO; SHAC, which learns by gradients through the physics; or rsl-rl-lib's PPO for comparison."""
     tensorboard: bool = True
@@ -200,5 +203,9 @@ class TrainCfg:
             raise InputError(f"seed must be in 0 .. {2**31 - 1}, got {self.seed}")
         if self.trainer == "rsl-rl" and self.resume:
             raise InputError("resume is not offered with trainer rsl-rl")
+        if self.trainer == "rsl-rl" and self.start_from:
+            raise InputError("start_from is not offered with trainer rsl-rl")
+        if self.resume and self.start_from:
+            raise InputError("give resume, which goes on with a training, or start_from, which begins one, not both")
         if self.trainer != "ppo" and self.ppo.symmetry != "off":
             raise InputError(f"symmetry is not offered with trainer {self.trainer}")

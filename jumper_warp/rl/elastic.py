@@ -28,8 +28,9 @@ LONGEST = 4096
 def own_run(cfg: TrainCfg, rank: Rank) -> tuple[TrainCfg, Path | None]:
     """Return the settings with which a process begins, and the folder of its run; None: there is none yet.
 
-    After a restart it is the folder that the run had before. The settings resume its newest checkpoint, and are left
-    alone where none was saved since the run began. All processes must call this, and see the same folders.
+    After a restart it is the folder that the run had before. The settings resume its newest checkpoint, whatever the
+    run began with, and are left alone where none was saved since. All processes must call this, and see the same
+    folders.
     """
     if "TORCHELASTIC_RUN_ID" not in os.environ:
         return cfg, None
@@ -42,7 +43,7 @@ def own_run(cfg: TrainCfg, rank: Rank) -> tuple[TrainCfg, Path | None]:
         return cfg, None
     folder = Path(name)
     if newest_checksum(folder / CHECKPOINTS) != json.loads((folder / MARK).read_text())["newest"]:
-        cfg = dataclasses.replace(cfg, resume=name)
+        cfg = dataclasses.replace(cfg, resume=name, start_from=None)
     return cfg, folder
 
 

@@ -105,3 +105,29 @@ def plain_layers(
             weight, bias = 0.5 * torch.cat([weight, action @ weight], dim=1), 0.5 * (bias + action @ bias)
         found.append((weight, bias))
     return found
+
+
+def symmetric_layers(
+    layers: Sequence[tuple[torch.Tensor, torch.Tensor]], symmetry: Symmetry
+) -> list[tuple[torch.Tensor, torch.Tensor]]:
+    """Return weights and biases of f, of half the widths, from those that `plain_layers` made of them; copies.
+
+    Of f's last bias only the symmetric part is left, which answers alike. Raises InputError: the layers are not of that
+    form.
+    """
+    found = []
+    for index, (weight, bias) in enumerate(layers):
+        rows, columns = weight.shape
+        first, last = index == 0, index == len(layers) - 1
+        rows, columns = rows if last else rows // 2, columns if first else columns // 2
+        factor = 2.0 if last and not first else 1.0
+        found.append((factor * weight[:rows, :columns], bias[:rows].clone()))
+    sizes = (layers[0][0].shape[1], layers[-1][0].shape[0])
+    again = plain_layers(found, symmetry) if sizes == (len(symmetry.obs.order), len(symmetry.action.order)) else []
+    if len(again) != len(layers) or not all(
+        one.shape == other.shape and torch.allclose(one, other, rtol=1e-6, atol=1e-6)
+        for own, made in zip(layers, again, strict=True)
+        for one, other in zip(own, made, strict=True)
+    ):
+        raise InputError("the layers are not those of a mirror-symmetric actor")
+    return found

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -54,6 +55,15 @@ def own_part(state: dict[str, Any], rank: Rank) -> dict[str, Any]:
     own = others[rank.index - 1]
     check_parts(own, ("ppo", "env", "rng"), f"others.{rank.index - 1}")
     return own
+
+
+def started_from(state: dict[str, Any]) -> str | None:
+    """Return the policy that the run of a checkpoint began with; None: with random weights, or it is not told."""
+    try:
+        settings = json.loads(state["config"])["train"]
+        return str(settings["start_from"]) if settings.get("start_from") else None
+    except (LookupError, TypeError, ValueError, AttributeError):
+        return None
 
 
 def spent_seconds(state: dict[str, Any]) -> float:

@@ -24,9 +24,18 @@ from jumper_warp.rl.distributed import Rank, gather, join_ranks, one_rank_first,
 from jumper_warp.rl.elastic import mark_run, own_run
 from jumper_warp.rl.logger import Pace, Stopwatch, TrainingLog
 from jumper_warp.rl.ppo import FIGURES, Ppo
-from jumper_warp.rl.resume import CHECKPOINTS, find_checkpoint, own_part, random_state, set_random_state, spent_seconds
+from jumper_warp.rl.resume import (
+    CHECKPOINTS,
+    find_checkpoint,
+    own_part,
+    random_state,
+    set_random_state,
+    spent_seconds,
+    started_from,
+)
 from jumper_warp.rl.shac import FIGURES as SHAC_FIGURES
 from jumper_warp.rl.shac import Shac
+from jumper_warp.rl.start import Start, begin_with
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.files import write_whole
 from jumper_warp.utils.runtime import git_commit, versions
@@ -78,11 +87,13 @@ class Stop:
 
 
 def train(
-    cfg: TrainCfg, make_env: MakeEnv, command: str | None = None, as_rsl_rl: AsRslRl | None = None
-) -> TrainResult:
+    cfg: TrainCfg, make_env: MakeEnv, command: str | None = None, as_rsl_rl: AsRslRl | None = None,
+    start: Start | None = None,
+) -> TrainResult:  # fmt: skip
     """Train to the last iteration or the time limit, and save.
 
-    command: What the user would type to train so, without `--resume`; by default `jumper train TASK`.
+    command: What the user would type to go on, without `--resume`; by default `jumper train TASK`.
+    as_rsl_rl: Needed with trainer rsl-rl. start: The policy that cfg.start_from names, needed with it.
 
     Raises:
         ValueError: A setting does not fit the environment or the machine.
@@ -94,12 +105,14 @@ def train(
     run: Run | None = None
     try:
         _check_processes(cfg, rank, as_rsl_rl is not None)
+        if bool(cfg.start_from) != (start is not None):
+            raise InputError("start_from and start, the policy that it names, need each other")
         env = make_env(cfg.num_envs // rank.size, cfg.seed + 1000 * rank.index, rank.device)
         if cfg.trainer == "rsl-rl":
             return _train_rsl_rl(cfg, env, as_rsl_rl, rank)
         torch.manual_seed(cfg.seed)  # the same weights in all processes
         cfg, folder = own_run(cfg, rank)
-        run = Run(cfg, env, rank, command, folder)
+        run = Run(cfg, env, rank, command, folder, start)
         with Stop() as stop:
             result = run.iterate(stop)
         wait_for_ranks()
@@ -150,11 +163,12 @@ class Run:
     """A training under way in this process."""
 
     def __init__(
-        self, cfg: TrainCfg, env: VecEnv, rank: Rank, command: str | None = None, folder: Path | None = None
-    ) -> None:
-        """Build the algorithm, and take up a checkpoint if the configuration names one.
+        self, cfg: TrainCfg, env: VecEnv, rank: Rank, command: str | None = None, folder: Path | None = None,
+        start: Start | None = None,
+    ) -> None:  # fmt: skip
+        """Build the algorithm, and take up a checkpoint if the configuration names one, or else begin with a policy.
 
-        command: as in `train`. folder: of the run, if it has begun before.
+        command and start: as in `train`. folder: of the run, if it has begun before.
         """
         self.cfg, self.env, self.rank = cfg, env, rank
         self._command = command or f"jumper train {cfg.task}"
@@ -166,6 +180,9 @@ class Run:
         self._begin: float | None = None  # on the clock, as if all seconds that count were of this process
         self.figures: dict[str, float] = {}
         self.notes: list[str] = []
+        if start is not None and not cfg.resume:
+            begin_with(start, self.ppo.model, cfg.num_envs * cfg.ppo.num_steps)
+            self.notes.append(f"starts from {cfg.start_from}")
         torch.manual_seed(cfg.seed + 1 + rank.index)
         self.folder = self._resume() if cfg.resume else folder or new_folder(cfg, rank)
         if folder is None:
@@ -185,6 +202,7 @@ class Run:
         except DAMAGE as error:
             raise CheckpointError(f"{path}: does not fit these settings: {one_line(error)}") from error
         self.iteration = state["iteration"]
+        self.config["train"]["start_from"] = started_from(state)
         return path.parent.parent
 
     def iterate(self, stop: Stop) -> TrainResult:

@@ -1,0 +1,111 @@
+"""Beginning a training with the actor of a policy instead of random weights."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import NamedTuple
+
+import torch
+from torch import nn
+
+from jumper_warp.rl.cfg import PpoCfg
+from jumper_warp.rl.mirror import Symmetry, symmetric_layers
+from jumper_warp.rl.networks import EPS, ActorCritic
+from jumper_warp.utils.errors import InputError
+
+KNOWN_ITERATIONS = 100
+"""The policy's statistics of observations weigh as much as the samples of so many iterations: the mean and variance of
+what the robot sees now replace them slowly, so that the actor need not follow a jump of its inputs."""
+
+
+class Start(NamedTuple):
+    """What an `ActorCritic` begins with."""
+
+    layers: list[tuple[torch.Tensor, torch.Tensor]]
+    """Weight (out, in) and bias (out,) of each layer of the actor."""
+    mean: torch.Tensor
+    """(num_obs,) of the raw observations."""
+    std: torch.Tensor
+    """(num_obs,) what observations are divided by."""
+
+
+def make_start(
+    layers: Sequence[tuple[torch.Tensor, torch.Tensor]], mean: torch.Tensor, std: torch.Tensor, activation: str,
+    cfg: PpoCfg, symmetry: Symmetry | None = None,
+) -> Start:  # fmt: skip
+    """Return what a training with these settings begins with to act as a policy does.
+
+    Args:
+        layers: Of the policy as a plain network; weight (out, in) and bias (out,) each.
+        mean: (num_obs,) of its raw observations.
+        std: (num_obs,) what it divides observations by.
+        activation: Between its layers.
+        cfg: Settings of the training.
+        symmetry: The mirror images, if the training is with symmetry actor.
+
+    Raises:
+        InputError: The settings make other hidden layers or another activation, the policy is not symmetric and the
+            training is, or a deviation is smaller than what is added to variances.
+    """
+    if activation != cfg.activation:
+        raise InputError(
+            f"start_from: the policy has activation {activation}, these settings make {cfg.activation}: "
+            f"give --ppo.activation {activation}"
+        )
+    has = [len(bias) for _, bias in layers[:-1]]
+    own = list(layers) if symmetry is None else _half(layers, mean, std, symmetry)
+    wanted = [len(bias) for _, bias in own[:-1]]
+    if wanted != list(cfg.hidden):
+        made = [width if symmetry is None else 2 * width for width in cfg.hidden]
+        raise InputError(
+            f"start_from: the policy has hidden layers {_words(has)}, these settings make {_words(made)}: "
+            f"give --ppo.hidden {_words(wanted, ' ')}"
+        )
+    if not (std.double().square() > 0.999 * EPS).all():
+        raise InputError(f"start_from: the policy divides an observation by {std.min():.3g}, least is {EPS**0.5:.3g}")
+    return Start(own, mean, std)
+
+
+@torch.no_grad()
+def begin_with(start: Start, model: ActorCritic, samples: int) -> None:
+    """Put the weights and the statistics of observations into a model, in place; its noise and its critic stay.
+
+    samples: of all worlds in an iteration.
+
+    Raises:
+        InputError: The model's observation, action or layers are of other sizes; nothing is changed.
+    """
+    linear = [module for module in model.actor if isinstance(module, nn.Linear)]
+    has = [tuple(weight.shape) for weight, _ in start.layers]
+    made = [tuple(layer.weight.shape) for layer in linear]
+    if has != made:
+        raise InputError(f"start_from: the policy's weights are of shapes {_words(has)}, the training's {_words(made)}")
+    for layer, (weight, bias) in zip(linear, start.layers, strict=True):
+        layer.weight.copy_(weight)
+        layer.bias.copy_(bias)
+    moments = model.obs_moments
+    moments.mean.copy_(start.mean)
+    moments.var.copy_((start.std.double().square() - EPS).clamp(min=0.0))
+    moments.count.fill_(KNOWN_ITERATIONS * samples)
+
+
+def _half(
+    layers: Sequence[tuple[torch.Tensor, torch.Tensor]], mean: torch.Tensor, std: torch.Tensor, symmetry: Symmetry
+) -> list[tuple[torch.Tensor, torch.Tensor]]:
+    """Return the layers of f, see `symmetric_layers`. Raises InputError: they or the statistics are not symmetric."""
+    try:
+        if not (
+            torch.allclose(symmetry.obs.of(mean), mean, atol=1e-5) and torch.allclose(std[symmetry.obs.order], std)
+        ):
+            raise InputError("the statistics are not their own mirror images")
+        return symmetric_layers(layers, symmetry)
+    except InputError as error:
+        hidden = _words((len(bias) for _, bias in layers[:-1]), " ")
+        raise InputError(
+            f"start_from: the policy is not mirror-symmetric, symmetry actor needs that: "
+            f"give --ppo.symmetry off --ppo.hidden {hidden}"
+        ) from error
+
+
+def _words(values: Iterable[object], between: str = ", ") -> str:
+    return between.join(map(str, values))

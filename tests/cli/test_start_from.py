@@ -1,0 +1,67 @@
+"""`jumper train --start-from`."""
+
+import json
+
+import pytest
+import torch
+
+from jumper_warp.cli import main as cli
+from jumper_warp.cli.train import command_line
+from jumper_warp.policies.restore import open_policy
+from jumper_warp.rl.checkpoint import load_checkpoint
+
+TRAIN = ["train", "horizontal-jump-mars", "--num-envs", "4", "--iterations", "1", "--device", "cpu", "--no-tensorboard"]
+TRAIN += ["--ppo.num-steps", "2", "--ppo.minibatches", "1", "--ppo.epochs", "1", "--ppo.init-std", "0.3"]
+TRAIN += [part for name in ("lr", "min-lr", "max-lr") for part in (f"--ppo.{name}", "1e-9")]
+
+
+@pytest.fixture(scope="module")
+def begun(tmp_path_factory):
+    """Folder of a training of one iteration without a step that counts, which began with a shipped policy."""
+    root = tmp_path_factory.mktemp("logs")
+    cli.main([*TRAIN, "--start-from", "horizontal_jump", "--log-root", str(root)])
+    (folder,) = (root / "horizontal-jump-mars").iterdir()
+    return folder
+
+
+def test_training_begins_with_the_policy(begun):
+    policy, found = open_policy("horizontal_jump"), open_policy(begun)
+    for (weight, bias), (same_weight, same_bias) in zip(policy.layers, found.layers, strict=True):
+        torch.testing.assert_close(same_weight, weight, atol=1e-6, rtol=0.0)
+        torch.testing.assert_close(same_bias, bias, atol=1e-6, rtol=0.0)
+    drift = (found.mean - policy.mean).abs() / policy.std
+    assert 0.0 < drift.max() < 0.2
+    assert found.config["train"]["start_from"] == "horizontal_jump"
+    assert found.config["train"]["ppo"]["init_std"] == 0.3
+    log_std = load_checkpoint(begun / "checkpoints" / "iteration_000001.pt")["ppo"]["model"]["log_std"]
+    torch.testing.assert_close(log_std.exp(), torch.full((12,), 0.3), atol=1e-6, rtol=0.0)
+
+
+def test_training_begins_with_a_run(begun, tmp_path, capsys):
+    cli.main([*TRAIN, "--start-from", str(begun), "--log-root", str(tmp_path)])
+    assert f"starts from {begun}" in capsys.readouterr().err.splitlines()
+    (folder,) = (tmp_path / "horizontal-jump-mars").iterdir()
+    assert json.loads((folder / "config.json").read_text())["train"]["start_from"] == str(begun)
+
+
+@pytest.mark.parametrize(
+    ("more", "message"),
+    [
+        (["--start-from", "vertical_jump"], "start_from: observation "),
+        (["--start-from", "horizontal_jump", "--ppo.symmetry", "off"], "give --ppo.hidden 512 256 256"),
+        (["--start-from", "no_jump"], "no_jump"),
+        (["--start-from", "horizontal_jump", "--resume", "latest"], "not both"),
+        (["--start-from", "horizontal_jump", "--trainer", "rsl-rl", "--ppo.symmetry", "off"], "not offered"),
+    ],
+)
+def test_what_cannot_be_started_from_is_told_in_one_line(more, message, capsys, tmp_path):
+    with pytest.raises(SystemExit) as caught:
+        cli.main([*TRAIN, *more, "--log-root", str(tmp_path)])
+    told = capsys.readouterr().err.splitlines()
+    assert caught.value.code == 2 and message in " ".join(told)
+    assert not list(tmp_path.iterdir())
+
+
+def test_command_that_goes_on_does_not_start_again():
+    args = ["push", "--start-from", "pusher", "--seed", "3", "--start_from=x", "--resume", "latest"]
+    assert command_line(args, []) == "jumper train push --seed 3"
