@@ -118,12 +118,13 @@ def make_groups(policy: Policy, cfg: FinetuneCfg, modules: Iterable[ModuleType] 
                 randomize=draws, noise=name == "randomized", seed=cfg.seed, device=cfg.device, threads=cfg.threads
             )
             env = env_of_policy(policy, count, conditions, change=change, modules=modules)
-            if env.task.evaluation not in ("height", "place"):
+            misses = evaluation_of(env.task).misses
+            if misses is None:
                 raise InputError(f"fine-tuning is for jumps to heights and places, not for {env.task.name}")
-            goals, to_height = np.zeros((count, 3)), env.task.evaluation == "height"
+            goals, to_height = np.zeros((count, 3)), misses == "height"
             goals[:, 2 if to_height else 0] = np.linspace(*(cfg.heights if to_height else cfg.distances), count)
             delays = rng.uniform(*DELAYS, count)
-            groups.append(Group(name, env, std, jump_commands(goals, delays, env.step_dt)))
+            groups.append(Group(name, env, std, jump_commands(goals, delays, env.step_dt), to_height))
     return groups
 
 
@@ -200,7 +201,7 @@ def finetune(
     begin = time.perf_counter()
     groups = make_groups(policy, cfg, modules)
     aims = []
-    if groups[0].env.task.evaluation == "place":
+    if not groups[0].to_height:
         policy, aims = take_aim(policy, groups, say)
     elif cfg.iterations == 0:
         raise InputError("a policy for heights has no aim to be taken apart: fine-tuning it needs an iteration")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, Literal, Protocol
 
 from jumper_warp.evaluation import heights, landings
 from jumper_warp.evaluation.episodes import EpisodeFlags, EpisodeGoals
@@ -57,23 +57,28 @@ class Evaluation:
     """What is played, unless told otherwise."""
     for_evaluation: Callable[[TaskCfg], TaskCfg] = lambda task: task
     """Returns the task with the terminations that count here."""
+    misses: Literal["height", "place"] | None = None
+    """What `jumper finetune` makes its jumps miss by less; None: it does not know how."""
 
 
 EVALUATIONS: dict[str, Evaluation] = {
-    "height": Evaluation(HeightFlags(), HeightGoals(), heights.for_evaluation),
-    "place": Evaluation(PlaceFlags(), PlaceGoals(), landings.for_evaluation),
+    "height": Evaluation(HeightFlags(), HeightGoals(), heights.for_evaluation, "height"),
+    "place": Evaluation(PlaceFlags(), PlaceGoals(), landings.for_evaluation, "place"),
     "around": Evaluation(
         PlaceFlags(x=(-0.7, 0.7), y=(-0.7, 0.7), in_range=(0.0, 0.7)),
         PlaceGoals(unless_told=((0.5, 0.0), (0.0, 0.5), (-0.5, 0.0))),
         landings.for_evaluation,
     ),
     "height-mars": Evaluation(
-        HeightFlags(lower=1.0, upper=3.3, in_range=(1.0, 2.9)), MarsHeightGoals(height=(1.5, 2.3, 3.0))
+        HeightFlags(lower=1.0, upper=3.3, in_range=(1.0, 2.9)),
+        MarsHeightGoals(height=(1.5, 2.3, 3.0)),
+        misses="height",
     ),
     "place-mars": Evaluation(
         PlaceFlags(x=(0.5, 4.2), in_range=(0.5, 3.9)),
         PlaceGoals(unless_told=((1.0, 0.0), (2.5, 0.0), (3.9, 0.0))),
         landings.for_evaluation,
+        "place",
     ),
     "velocity": Evaluation(VelocityFlags(), VelocityGoals(), TaskCfg.on_level_ground),
     "attitude": Evaluation(TurnFlags(), TurnGoals()),

@@ -54,7 +54,7 @@ TERMINATIONS = (
     TerminationTerm(terminations.early_takeoff),
     TerminationTerm(terminations.predicted_miss, tolerance=0.55, steps=0.1 * SECOND, height=LANDING_HEIGHT),
     TerminationTerm(terminations.missed_goal, tolerance=0.50),
-    TerminationTerm(terminations.turned_touchdown, rotation=30.0 * DEG, yaw=10.0 * DEG),
+    TerminationTerm(terminations.turned_touchdown, rotation=20.0 * DEG, yaw=10.0 * DEG),
     TerminationTerm(terminations.low_touchdown, height=0.25),
     TerminationTerm(mdp_terminations.low_base, height=0.10),
     TerminationTerm(terminations.left_stance, distance=0.30),
@@ -136,6 +136,13 @@ def horizontal_jump() -> TaskCfg:
         link_margin=0.005,
         evaluation="place",
     )
+
+
+def horizontal_jump_slippery() -> TaskCfg:
+    """Return the same task on ground of unknown grip: friction of the paws from slippery to what the paper draws."""
+    task = horizontal_jump()
+    drawn = replace(task.randomization, static_friction=(0.4, 1.2), dynamic_friction=(0.35, 0.9))
+    return replace(task, name="horizontal-jump-slippery", randomization=drawn)
 
 
 def horizontal_jump_sighted() -> TaskCfg:
