@@ -6,11 +6,11 @@
 Motor targets, equal left and right, through the command filter and motors of the tasks, from standing still. A search
 begins with random squats in parallel worlds, for the farthest flight with run-ups in place, goes on along smoothed
 gradients (`jumper_warp.optim.smoothing`), at first with fewer physics steps or in single precision, for the farthest
-flight also from crossings of the best, and ends with limited-memory BFGS inside an augmented Lagrangian
-(`jumper_warp.optim.augmented_lagrangian`). What is told is not the optimiser's own figure: the targets are replayed
-in the simulation that trains policies, at every physics step, and collisions of all links are looked for; the
-farthest flight is scored as in `experiments/distance_limit.py`, whose constraints it has. Of each jump a JSON file is
-written that can take the place of one in `assets/motions`, for episodes that begin along it.
+flight also from crossings of the best, with multipliers and ever smaller displacements, and ends with limited-memory
+BFGS inside an augmented Lagrangian (`jumper_warp.optim.augmented_lagrangian`). What is told is not the optimiser's own
+figure: the targets are replayed in the simulation that trains policies, at every physics step, and collisions of all
+links are looked for; the farthest flight is scored as in `experiments/distance_limit.py`, whose constraints it has. Of
+each jump a JSON file is written that can take the place of one in `assets/motions`, for episodes that begin along it.
 
 Constraints of vertical jumps: no link but the paws touches the ground, tilt at most 8 degrees and base at most 0.15 m
 from its start at all times. Work is what the motors put in until takeoff, braking apart.
@@ -67,8 +67,8 @@ class Args:
     """Random candidates (default: those of each jump)."""
     effort: float = 1.0
     """[1] Scales the iterations."""
-    polish: int = 40
-    """Iterations of the last descent."""
+    polish: int | None = None
+    """Iterations of the last descent (default: those of each jump)."""
     seed: int = 0
     """Of random candidates and displacements."""
     out: Path | None = None
@@ -83,7 +83,8 @@ class Args:
         unknown = [name for name in self.jumps if name not in JUMPS]
         if unknown or not self.jumps:
             raise InputError(f"no jump {(unknown or [''])[0]!r:.40}; there are {', '.join(JUMPS)}")
-        if self.generations < 1 or not (self.longer > 0.0 and self.effort > 0.0) or self.polish < 1:
+        polish = 1 if self.polish is None else self.polish
+        if self.generations < 1 or not (self.longer > 0.0 and self.effort > 0.0) or polish < 1:
             raise InputError("need a generation, an iteration of the last descent, and longer and effort above 0")
         if self.samples is not None and self.samples < 48:
             raise InputError(f"need at least 48 samples, got {self.samples}")
@@ -126,7 +127,7 @@ def run_jump(
     if jump.after in seeds:
         begin = np.concatenate([begin, around(seeds[jump.after], knots, rng)])
     scaled = jump.scaled(args.effort)
-    found, problems = optimise(scaled, begin, seed=args.seed, polish=args.polish, tell=tell, **settings)
+    found, problems = optimise(scaled, begin, seed=args.seed, polish=args.polish or jump.polish, tell=tell, **settings)
     x = found.x[found.best]
     seeds[name] = x
     targets = knots.targets(torch.as_tensor(x[None]))[..., 0].numpy()

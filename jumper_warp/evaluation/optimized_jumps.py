@@ -94,6 +94,8 @@ class Jump:
     """Returns so many random candidates."""
     samples: int = 2048
     """Random candidates, among which the search begins."""
+    polish: int = 40
+    """Iterations of the last descent."""
     after: str = ""
     """Name of the jump whose best motion is a start too."""
 
@@ -147,21 +149,23 @@ UPWARD = (
     (COARSE, Stage(12, 100, rate=0.04, noise=0.04)),
     (FINE, Stage(4, 100, rate=0.02, noise=0.02, penalty=100.0)),
 )
+CALM: dict[str, Any] = {"slack": 0.03, "look": 5, "calmer": 0.7}
+"""Starts that go back often, and on with smaller steps."""
 FORWARD = (
     (QUICK | {"lean": LEAN}, Stage(40, 40, rate=0.05, noise=0.05, least=1.0, slack=0.1)),
     (QUICK | {"lean": LEAN}, Stage(16, 40, rate=0.05, noise=0.05, least=1.0, slack=0.1)),
     (QUICK, Stage(10, 60, rate=0.04, noise=0.03, least=0.5, slack=0.1)),
-    *(
-        (QUICK, Stage(keep, 80, rate=0.03, noise=0.03, least=0.2, penalty=40.0, slack=0.1, crossings=40))
-        for keep in (10, 8, 6, 5)
-    ),
-    (FINE, Stage(4, 80, rate=0.03, noise=0.03, least=0.3, penalty=40.0, dual=2.0, slack=0.05)),
-    (FINE, Stage(2, 120, rate=0.02, noise=0.02, penalty=100.0, dual=4.0, slack=0.03)),
+    (QUICK, Stage(10, 80, rate=0.02, noise=0.015, least=0.2, penalty=40.0, dual=2.0, crossings=40, **CALM)),
+    (QUICK, Stage(8, 80, rate=0.02, noise=0.015, least=0.2, penalty=40.0, dual=2.0, crossings=40, **CALM)),
+    (QUICK, Stage(6, 80, rate=0.02, noise=0.01, least=0.2, penalty=40.0, dual=2.0, crossings=40, **CALM)),
+    (QUICK, Stage(4, 100, rate=0.015, noise=0.006, least=0.1, penalty=40.0, dual=2.0, crossings=40, **CALM)),
+    (QUICK, Stage(3, 150, rate=0.01, noise=0.003, least=0.1, penalty=100.0, dual=4.0, **(CALM | {"slack": 0.02}))),
 )
 JUMPS = {
     "farthest": Jump(
         "farthest flight, 18 N m", "m", _far, FORWARD, lambda replay: None, lateral_torque=12.0,
         command_filter=horizontal_jump_filter, draw=run_ups, samples=768,
+        polish=5,
     ),
     "highest": Jump(
         "highest jump, 18 N m", "m", lambda **s: _vertical(jumps.highest(), jumps.takes_off(), **s), UPWARD,

@@ -26,8 +26,6 @@ LEAST_SCATTER = 1.0e-3
 """[1] Of a gradient's entry."""
 BATCH = 256
 """Candidates that are simulated at once."""
-LOOK = 20
-"""Iterations between two looks at what undisplaced starts count, where they can go back."""
 SHIFT = 2
 """Knots by which the end of a crossing comes earlier or later, at most."""
 EXACT = 3.0
@@ -56,8 +54,16 @@ class Stage:
     slack: float = inf
     """[1] A start that counts so much less than it did goes back to its best, which the stage ends with too; infinite:
     all end where they are."""
+    look: int = 20
+    """Iterations between two looks at what undisplaced starts count, where they can go back."""
+    calmer: float = 1.0
+    """[1] Factor of the later steps and displacements of a start each time that it goes back."""
     crossings: int = 0
     """Candidates of each start that are tried in its place before the stage begins, see `crossed`."""
+
+    def merit(self, values: Values) -> torch.Tensor:
+        """Return what undisplaced candidates count, (n,): with multipliers what `exact` returns, else `penalised`."""
+        return exact(values) if self.dual else penalised(values, self.penalty)
 
 
 STAGES = (
@@ -68,7 +74,7 @@ STAGES = (
 """For about a hundred knots."""
 
 
-def penalised(values: Values, penalty: float) -> torch.Tensor:
+def penalised(values: Values, penalty: float = 20.0) -> torch.Tensor:
     """Return objectives with squared violations, (n,)."""
     return values.objective + penalty * values.constraints.clamp_min(0.0).square().sum(1)
 
@@ -78,11 +84,19 @@ def exact(values: Values) -> torch.Tensor:
     return values.objective + EXACT * values.constraints.clamp_min(0.0).amax(1)
 
 
-def ranked(problem: Problem, x: torch.Tensor, penalty: float = 20.0) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return candidates (n, len(problem.knots)) from the best to the worst, and what they count, (n,)."""
+def counted(problem: Problem, x: torch.Tensor, merit: Callable[[Values], torch.Tensor]) -> torch.Tensor:
+    """Return the merit of candidates (n, len(problem.knots)), (n,); what is not a number is infinite."""
     with torch.no_grad():
-        merits = torch.cat([penalised(problem.evaluate(part), penalty) for part in x.split(BATCH)])
-    order = torch.argsort(torch.nan_to_num(merits, torch.inf), stable=True)
+        merits = torch.cat([merit(problem.evaluate(part)) for part in x.split(BATCH)])
+    return torch.nan_to_num(merits, torch.inf)
+
+
+def ranked(
+    problem: Problem, x: torch.Tensor, merit: Callable[[Values], torch.Tensor] = penalised
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return candidates (n, len(problem.knots)) from the best to the worst, and their merit, (n,)."""
+    merits = counted(problem, x, merit)
+    order = torch.argsort(merits, stable=True)
     return x[order], merits[order]
 
 
@@ -108,9 +122,7 @@ def crossed(knots: Knots, x: torch.Tensor, each: int, rng: np.random.Generator) 
 def _best_crossed(problem: Problem, x: torch.Tensor, stage: Stage, rng: np.random.Generator) -> torch.Tensor:
     """Return starts, each replaced by its best crossing where that is better, from the best to the worst."""
     tried = torch.cat([x[None], crossed(problem.knots, x, stage.crossings, rng)])
-    with torch.no_grad():
-        parts = [penalised(problem.evaluate(part), stage.penalty) for part in tried.flatten(0, 1).split(BATCH)]
-    merits = torch.nan_to_num(torch.cat(parts), torch.inf).unflatten(0, tried.shape[:2])
+    merits = counted(problem, tried.flatten(0, 1), stage.merit).unflatten(0, tried.shape[:2])
     best, chosen = merits.min(0)
     return tried[chosen, torch.arange(len(x), device=x.device)][best.argsort(stable=True)]
 
@@ -128,17 +140,11 @@ class _Best:
 
     def __init__(self, problem: Problem, x: torch.Tensor, stage: Stage):
         self.problem, self.stage = problem, stage
-        self.x, self.merit = x, self._merit(x)
-
-    def _merit(self, x: torch.Tensor) -> torch.Tensor:
-        with torch.no_grad():
-            values = self.problem.evaluate(x)
-        merit = exact(values) if self.stage.dual else penalised(values, self.stage.penalty)
-        return torch.nan_to_num(merit, torch.inf)
+        self.x, self.merit = x, counted(problem, x, stage.merit)
 
     def look(self, x: torch.Tensor, slack: float) -> torch.Tensor:
         """Remember the starts that are better than ever; returns which are worse by more than `slack`, (n, 1)."""
-        merit = self._merit(x)
+        merit = counted(self.problem, x, self.stage.merit)
         better = merit < self.merit
         self.x, self.merit = torch.where(better[:, None], x, self.x), torch.where(better, merit, self.merit)
         return (merit > self.merit + slack)[:, None]
@@ -148,21 +154,22 @@ def descend(problem: Problem, x: torch.Tensor, stage: Stage, rng: np.random.Gene
     """Return candidates after one stage."""
     mean, square = torch.zeros_like(x), torch.zeros_like(x)
     best = _Best(problem, x, stage) if stage.slack < inf else None
-    multipliers = _first_multipliers(problem, x, stage)
+    multipliers, calm = _first_multipliers(problem, x, stage), x.new_ones(len(x), 1)
     for number in range(stage.iterations):
         left = max(stage.least, 1.0 - number / stage.iterations)
         away = torch.as_tensor(rng.normal(size=tuple(x.shape)), dtype=x.dtype, device=x.device)
-        at = (x + left * stage.noise * away).clamp(-1.0, 1.0)
+        at = (x + left * calm * stage.noise * away).clamp(-1.0, 1.0)
         values, gradient = problem.gradient(at, lambda found, y=multipliers: lagrangian(found, y, stage.penalty))
         multipliers = (multipliers + stage.dual * values.constraints.clamp(-VIOLATION, VIOLATION)).clamp_min(0.0)
         gradient *= (LARGEST_GRADIENT / gradient.norm(dim=1, keepdim=True).clamp_min(1.0e-9)).clamp_max(1.0)
         mean = FIRST * mean + (1.0 - FIRST) * gradient
         square = SECOND * square + (1.0 - SECOND) * gradient.square()
         now, scatter = mean / (1.0 - FIRST ** (number + 1)), (square / (1.0 - SECOND ** (number + 1))).sqrt()
-        x = (x - left * stage.rate * now / (scatter + LEAST_SCATTER)).clamp(-1.0, 1.0)
-        if best is not None and (number + 1) % LOOK == 0:
+        x = (x - left * calm * stage.rate * now / (scatter + LEAST_SCATTER)).clamp(-1.0, 1.0)
+        if best is not None and (number + 1) % stage.look == 0:
             lost = best.look(x, stage.slack)
             x, mean = torch.where(lost, best.x, x), torch.where(lost, 0.0, mean)
+            calm = torch.where(lost, stage.calmer * calm, calm)
     if best is None:
         return x
     best.look(x, stage.slack)
@@ -190,7 +197,7 @@ def smoothed(
         if stage.crossings:
             x = _best_crossed(problem, x, stage, rng)
         x = descend(problem, x[: stage.keep], stage, rng)
-        x, merits = ranked(problem, x, stage.penalty)
+        x, merits = ranked(problem, x, stage.merit)
         if tell is not None:
             tell(number, merits)
     return x.cpu().numpy()

@@ -247,6 +247,14 @@ def test_starts_that_fell_off_an_edge_go_back():
     assert (ends[0.1] <= first).all() and ends[0.1][1] < first[1] - 1.0
 
 
+def test_starts_that_go_back_go_on_with_smaller_steps():
+    begin, merit = torch.tensor([[0.2, 0.3]], dtype=torch.float64), {}
+    for calmer in (1.0, 0.5):
+        stage = Stage(1, 100, 0.3, 0.01, least=1.0, slack=0.001, look=2, calmer=calmer)
+        merit[calmer] = float(Edge().evaluate(descend(Edge(), begin, stage, np.random.default_rng(0))).objective)
+    assert merit[0.5] < 0.0226 < 0.1 < merit[1.0]  # (0.6 - 0.45)^2
+
+
 def test_crossings_have_the_beginning_of_one_and_the_end_of_another():
     knots = Knots(tuple(map(float, range(12))), steps=12)
     rows = torch.arange(12.0)[:, None] + torch.tensor([0.0, 100.0, 200.0])[:, None, None]  # knot + 100 x parent
