@@ -40,7 +40,9 @@ BIN = 0.1
 FIRST = 1.0
 """[m] Middle of the first bin."""
 LAST = 2.5
-"""[m] No bin beyond."""
+"""[m] No bin beyond, unless asked for."""
+LIMIT = 6.0
+"""[m] Of both."""
 IN_RANGE = (1.0, 1.4)
 """[m]"""
 GIVEN_UP = 0.5
@@ -58,14 +60,19 @@ class Args(EvaluationArgs):
     """Number of jumps in each bin."""
     first: float = FIRST
     """[m] Middle of the first bin."""
+    last: float = LAST
+    """[m] No bin beyond."""
     direction: float = 0.0
     """[deg] Of the goals from the robot: 0 ahead, 90 to the left, 180 back."""
 
     def __post_init__(self) -> None:
         """Check the values."""
         super().__post_init__()
-        if self.jumps < 1 or not 0.1 <= self.first <= LAST:
-            raise InputError(f"need at least one jump, and first in 0.1..{LAST:g} m, got {self.jumps}, {self.first}")
+        if self.jumps < 1 or not 0.1 <= self.first <= self.last <= LIMIT:
+            raise InputError(
+                f"need at least one jump, and 0.1 <= first <= last <= {LIMIT:g} m, "
+                f"got {self.jumps}, {self.first} and {self.last}"
+            )
         if not -180.0 <= self.direction <= 180.0:
             raise InputError(f"direction must be in -180..180 deg, got {self.direction}")
 
@@ -116,7 +123,7 @@ def main(args: Args) -> dict:
     run = EvaluationRun.of("max_jump", args)
     env, headings = run.env(args.jumps), random_headings(args.jumps, args.seed)
     bins: dict[float, Landings] = {}
-    for number in range(round((LAST - args.first) / BIN) + 1):
+    for number in range(round((args.last - args.first) / BIN) + 1):
         middle = round(args.first + number * BIN, 6)
         asked = Landings(goals(args, middle), termination_names(env.task), headings)
         bins[middle] = run.follow(env, asked, film=f"jump_{middle:.1f}_m")

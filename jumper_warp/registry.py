@@ -12,7 +12,7 @@ import keyword
 import sys
 import traceback
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from types import ModuleType
@@ -89,10 +89,7 @@ TASKS: dict[str, TaskEntry] = {
     ),
     "horizontal-jump-mars-loose": TaskEntry("jumper_warp.tasks.jump.mars:horizontal_jump_mars_loose", PLACES),
     "velocity-flat": TaskEntry(
-        "jumper_warp.tasks.velocity.flat:velocity_flat",
-        replace(WALKING, final_entropy=0.001),
-        ("Olympus-Walk",),
-        "Metrics/score",
+        "jumper_warp.tasks.velocity.flat:velocity_flat", WALKING, ("Olympus-Walk",), "Metrics/score"
     ),
     "velocity-rough": TaskEntry("jumper_warp.tasks.velocity.rough:velocity_rough", WALKING, best_by="Metrics/score"),
     "velocity-trot": TaskEntry("jumper_warp.tasks.velocity.flat:velocity_trot", WALKING, best_by="Metrics/score"),

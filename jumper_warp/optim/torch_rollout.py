@@ -133,8 +133,8 @@ def _write_parameters(rollout: Rollout, given: dict[str, torch.Tensor]) -> None:
 def _stream(rollout: Rollout) -> Iterator[None]:
     """Let Warp work on PyTorch's stream.
 
-    Warp forgets a stream when a `wp.Stream` that wraps it is deleted, its own too, and captures no graph on it any more:
-    where PyTorch works on Warp's stream, as it does beside an environment, nothing is wrapped.
+    Warp forgets a stream, its own too, when a `wp.Stream` that wraps it is deleted, and captures no graph on it any
+    more: where PyTorch works on Warp's stream, as it does beside an environment, nothing is wrapped.
     """
     device = rollout.device
     if not device.is_cuda or torch.cuda.current_stream().cuda_stream == wp.get_stream(device).cuda_stream:

@@ -75,6 +75,16 @@ def test_command_writes_a_policy_that_can_be_opened(tmp_path, capsys):
     assert capsys.readouterr().err == f"jumper: {out} exists\n"
 
 
+def test_misses_on_mars_are_those_of_robots_at_rest():
+    policy = open_policy("mars_horizontal_jump")
+    (group,) = make_groups(policy, FinetuneCfg(**FEW | {"distances": (1.0, 4.0)}))
+    assert not group.to_height
+    found = follow(group, Network(policy), derivatives=False)
+    arrays = group.env.task_arrays()
+    assert found.valid.all() and (arrays["phase_steps"] >= 60).all()  # a second after touchdown
+    assert found.value.abs().max() < 0.05
+
+
 def test_a_policy_sees_its_goals_shifted():
     policy, obs = open_policy("horizontal_jump"), 0.3 * torch.randn((5, 147), generator=torch.manual_seed(3))
     moved = obs.clone()

@@ -1,6 +1,6 @@
 """Shipped policies for jumps to places do what their pages tell, on a few nominal jumps."""
 
-from experiments import platform_jump, ring_jump
+from experiments import horizontal_jump_sweep, platform_jump, ring_jump
 
 
 def test_the_omnidirectional_policy_jumps_all_around(tmp_path):
@@ -16,3 +16,20 @@ def test_sight_brings_the_robot_onto_a_block_that_a_blind_one_touches(tmp_path):
     blind = platform_jump.main(platform_jump.Args(policy="horizontal_jump", out=tmp_path / "blind", **flags))
     assert sighted["block_success_rate"] == 1.0 and sighted["platform_success_rate"] == 1.0
     assert blind["block_success_rate"] < 0.7
+
+
+def test_the_slippery_policy_stands_where_another_falls(tmp_path):
+    flags = {"jumps": 12, "friction": 0.3, "record": 0, "device": "cpu"}
+    ready, other = (
+        horizontal_jump_sweep.main(horizontal_jump_sweep.Args(policy=name, out=tmp_path / name, **flags))
+        for name in ("slippery_jump", "horizontal_jump")
+    )
+    assert ready["success_rate"] == 1.0 and ready["mean_error_m"] < 0.015  # 0.0074 m of 500 jumps
+    assert other["success_rate"] < 0.8
+
+
+def test_the_martian_policy_jumps_far_and_stays_there(tmp_path):
+    args = {"policy": "mars_horizontal_jump", "jumps": 8, "distances": (0.5, 5.0), "record": 0, "device": "cpu"}
+    values = horizontal_jump_sweep.main(horizontal_jump_sweep.Args(out=tmp_path, **args))
+    assert values["success_rate"] == 1.0 and values["step_free_success_rate"] == 1.0
+    assert values["mean_error_m"] < 0.02 and values["gravity_m_s2"] == 3.71

@@ -59,7 +59,7 @@ REWARDS = (
     RewardTerm(rewards.linear_velocity, 2.5, width=0.5),
     RewardTerm(rewards.linear_velocity, 2.0, name="linear_velocity_fine", width=0.1),
     RewardTerm(rewards.yaw_rate, 1.5, width=0.5),
-    RewardTerm(rewards.yaw_rate, 4.7, name="yaw_rate_fine", width=0.1),
+    RewardTerm(rewards.yaw_rate, 4.3, name="yaw_rate_fine", width=0.1),
     RewardTerm(rewards.vertical_velocity, -1.0),
     RewardTerm(rewards.lateral_stability, -0.1),
     RewardTerm(rewards.flat, -50.0),
