@@ -231,12 +231,18 @@ def rest(view: RobotView, task: JumpState, speed: float, spin: float) -> float:
 
 
 @wp.func
+def tilt_over(view: RobotView, width: float) -> float:
+    """Return the squared sine of the angle between body z and world z over that of width [rad]."""
+    sine = wp.length(wp.vec2(view.gravity[0], view.gravity[1])) / wp.sin(width)
+    return sine * sine
+
+
+@wp.func
 def landing_tilt(view: RobotView, task: JumpState, width: float) -> float:
     """Tilt after touchdown: squared sine of the angle between body z and world z over that of width [rad]."""
     if task.phase != LANDED:
         return 0.0
-    sine = wp.length(wp.vec2(view.gravity[0], view.gravity[1])) / wp.sin(width)
-    return sine * sine
+    return tilt_over(view, width)
 
 
 @wp.func
@@ -244,8 +250,7 @@ def descent_tilt(view: RobotView, task: JumpState, width: float) -> float:
     """Tilt while the base falls in flight: squared sine as in `landing_tilt`, with the same width [rad]."""
     if task.phase != FLIGHT or view.lin_vel[2] > 0.0:
         return 0.0
-    sine = wp.length(wp.vec2(view.gravity[0], view.gravity[1])) / wp.sin(width)
-    return sine * sine
+    return tilt_over(view, width)
 
 
 @wp.func
