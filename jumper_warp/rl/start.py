@@ -27,6 +27,8 @@ class Start(NamedTuple):
     """(num_obs,) of the raw observations."""
     std: torch.Tensor
     """(num_obs,) what observations are divided by."""
+    averaged: bool = False
+    """Whether the policy is not mirror-symmetric and the training is: its answers are averaged with their images."""
 
 
 def make_start(
@@ -34,6 +36,9 @@ def make_start(
     cfg: PpoCfg, symmetry: Symmetry | None = None,
 ) -> Start:  # fmt: skip
     """Return what a training with these settings begins with to act as a policy does.
+
+    A policy g that is not mirror-symmetric begins a training with symmetry actor as (g(x) + N g(M x)) / 2, in the
+    notation of `jumper_warp.rl.mirror`.
 
     Args:
         layers: Of the policy as a plain network; weight (out, in) and bias (out,) each.
@@ -44,8 +49,8 @@ def make_start(
         symmetry: The mirror images, if the training is with symmetry actor.
 
     Raises:
-        InputError: The settings make other hidden layers or another activation, the policy is not symmetric and the
-            training is, or a deviation is smaller than what is added to variances.
+        InputError: The settings make other hidden layers or another activation, or a deviation is smaller than what is
+            added to variances.
     """
     if activation != cfg.activation:
         raise InputError(
@@ -53,17 +58,19 @@ def make_start(
             f"give --ppo.activation {activation}"
         )
     has = [len(bias) for _, bias in layers[:-1]]
-    own = list(layers) if symmetry is None else _half(layers, mean, std, symmetry)
-    wanted = [len(bias) for _, bias in own[:-1]]
+    half = None if symmetry is None else _half(layers, mean, std, symmetry)
+    wanted = [len(bias) for _, bias in (half or layers)[:-1]]
     if wanted != list(cfg.hidden):
-        made = [width if symmetry is None else 2 * width for width in cfg.hidden]
+        made = [width if half is None else 2 * width for width in cfg.hidden]
         raise InputError(
             f"start_from: the policy has hidden layers {_words(has)}, these settings make {_words(made)}: "
             f"give --ppo.hidden {_words(wanted, ' ')}"
         )
     if not (std.double().square() > 0.999 * EPS).all():
         raise InputError(f"start_from: the policy divides an observation by {std.min():.3g}, least is {EPS**0.5:.3g}")
-    return Start(own, mean, std)
+    if symmetry is None or half is not None:
+        return Start(half or list(layers), mean, std)
+    return _averaged(layers, mean, std, symmetry)
 
 
 @torch.no_grad()
@@ -91,20 +98,28 @@ def begin_with(start: Start, model: ActorCritic, samples: int) -> None:
 
 def _half(
     layers: Sequence[tuple[torch.Tensor, torch.Tensor]], mean: torch.Tensor, std: torch.Tensor, symmetry: Symmetry
-) -> list[tuple[torch.Tensor, torch.Tensor]]:
-    """Return the layers of f, see `symmetric_layers`. Raises InputError: they or the statistics are not symmetric."""
+) -> list[tuple[torch.Tensor, torch.Tensor]] | None:
+    """Return the layers of f, see `symmetric_layers`, or None: they or the statistics are not symmetric."""
+    if not (torch.allclose(symmetry.obs.of(mean), mean, atol=1e-5) and torch.allclose(std[symmetry.obs.order], std)):
+        return None
     try:
-        if not (
-            torch.allclose(symmetry.obs.of(mean), mean, atol=1e-5) and torch.allclose(std[symmetry.obs.order], std)
-        ):
-            raise InputError("the statistics are not their own mirror images")
         return symmetric_layers(layers, symmetry)
-    except InputError as error:
-        hidden = _words((len(bias) for _, bias in layers[:-1]), " ")
-        raise InputError(
-            f"start_from: the policy is not mirror-symmetric, symmetry actor needs that: "
-            f"give --ppo.symmetry off --ppo.hidden {hidden}"
-        ) from error
+    except InputError:
+        return None
+
+
+def _averaged(
+    layers: Sequence[tuple[torch.Tensor, torch.Tensor]], mean: torch.Tensor, std: torch.Tensor, symmetry: Symmetry
+) -> Start:
+    """Return g as the network f of a symmetric actor, and the statistics of its samples and their images.
+
+    The first layer makes up for the change of the statistics: W (x - mean) / std stays the same for all x within the
+    limits.
+    """
+    middle, var = symmetry.obs.moments(mean.double(), std.double().square())
+    (weight, bias), *others = layers
+    first = (weight * (var.sqrt() / std).to(weight.dtype), bias + weight @ ((middle - mean) / std).to(weight.dtype))
+    return Start([first, *others], middle.to(mean.dtype), var.sqrt().to(std.dtype), averaged=True)
 
 
 def _words(values: Iterable[object], between: str = ", ") -> str:

@@ -123,7 +123,7 @@ def test_a_training_begins_as_the_policy_acts(given, symmetry, hidden):
         (False, {"hidden": (16, 8)}, "has hidden layers 32, 32, these settings make 16, 8: give --ppo.hidden 32 32"),
         (True, {}, "has hidden layers 64, 64, these settings make 32, 32: give --ppo.hidden 64 64"),
         (True, {"symmetry": "actor", "hidden": (9,)}, "layers 64, 64, these settings make 18: give --ppo.hidden 32 32"),
-        (False, {"symmetry": "actor"}, "not mirror-symmetric.*: give --ppo.symmetry off --ppo.hidden 32 32"),
+        (False, {"symmetry": "actor", "hidden": (9,)}, "layers 32, 32, these settings make 9: give --ppo.hidden 32 32"),
         (False, {"activation": "tanh"}, "has activation elu, these settings make tanh: give --ppo.activation elu"),
     ],
 )
@@ -133,11 +133,30 @@ def test_settings_of_another_network_are_refused_in_one_line(symmetric, change, 
     assert "\n" not in str(caught.value)
 
 
-def test_statistics_that_are_not_symmetric_are_refused():
+def averaged(act, obs):
+    """Return what a policy answers, averaged with the image of what it answers to the image."""
+    return 0.5 * (act(obs) + SYMMETRY.action.of(act(SYMMETRY.obs.of(obs))))
+
+
+def test_a_symmetric_training_begins_with_the_average_of_a_policys_answers_and_their_images():
+    model, ppo = actor(), Ppo(PushTask(8), SYMMETRIC)
+    start = start_of(model, SYMMETRIC)
+    begin_with(start, ppo.model, samples=128)
+    mean, std = model.obs_moments.scaling()
+    obs = 0.5 * OBS  # within the limits of both statistics
+    expected = averaged(lambda obs: model.actor((obs - mean) / std), obs).clamp(-1.0, 1.0)
+    assert start.averaged and (expected - model.act(obs)).abs().max() > 0.1
+    torch.testing.assert_close(ppo.model.act(obs), expected, atol=1e-5, rtol=0.0)
+    mean, std = ppo.model.obs_moments.scaling()
+    torch.testing.assert_close(SYMMETRY.obs.of(mean), mean)
+    torch.testing.assert_close(std[SYMMETRY.obs.order], std)
+
+
+def test_statistics_that_are_not_symmetric_make_a_policy_that_is_not():
     model = actor(symmetry=SYMMETRY)
     model.obs_moments.mean[1] = 0.1
-    with pytest.raises(InputError, match="not mirror-symmetric"):
-        start_of(model, SYMMETRIC)
+    start = start_of(model, dataclasses.replace(SYMMETRIC, hidden=(64, 64)))
+    assert start.averaged and not start_of(actor(symmetry=SYMMETRY), SYMMETRIC).averaged
 
 
 def test_a_deviation_that_statistics_cannot_have_is_refused():

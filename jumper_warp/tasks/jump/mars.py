@@ -1,9 +1,10 @@
 """Jumps on Mars: 3.71 m/s^2, 24.8 N m and a transversal kp of 20 N m/rad, as the authors' sequel has them, no springs.
 
 The open-loop jump reaches 2.96 m through the filter of the jumps on Earth, 3.70 m through a loose one: each has a task.
-Weights of the vertical jump are those of the sequel's configuration; its levels begin at 1.8 m, here lower and with
-steps in between. Flights take up to 2.7 s. Limits on impacts are those on Earth, since they protect the same robot;
-those on misses grow with the distance: the same error of the takeoff carries a robot FARTHER times as far off.
+Weights of the vertical jump are those of the sequel's configuration but for that of the angular velocity, as flights
+take up to 2.7 s; its levels begin at 1.8 m, here lower, with steps in between, and low jumps stay in all of them.
+Limits on impacts are those on Earth, since they protect the same robot; those on misses grow with the distance: the
+same error of the takeoff carries a robot FARTHER times as far off.
 """
 
 from __future__ import annotations
@@ -39,7 +40,7 @@ def vertical_jump_mars() -> TaskCfg:
         name="vertical-jump-mars",
         gravity=MARS,
         motors=mars_motors(10.0),
-        levels=heights((0.7, 1.3), (1.0, 1.8), (1.5, 2.4), (2.0, 3.1)),
+        levels=heights((0.7, 1.3), (0.7, 1.8), (0.7, 2.4), (0.7, 3.1)),
         evaluation="height-mars",
     )
     task = replace(task, curriculum=task.curriculum.replace(tolerance=0.05 * FARTHER))
@@ -53,6 +54,7 @@ def vertical_jump_mars() -> TaskCfg:
         "rewards",
         jump_height={"wide": 0.8},
         estimated_jump_height={"weight": 30.0, "wide": 0.8},
+        angular_velocity={"weight": 10.0, "width": 0.5},
         air_posture={"weight": 70.0},
         ground_posture={"weight": 20.0},
         joint_symmetry={"weight": 15.0},
@@ -65,7 +67,7 @@ def vertical_jump_mars_loose() -> TaskCfg:
         vertical_jump_mars(),
         name="vertical-jump-mars-loose",
         command_filter=loose_filter(),
-        levels=heights((0.7, 1.3), (1.0, 1.8), (1.5, 2.4), (2.0, 3.1), (2.8, 3.8)),
+        levels=heights((0.7, 1.3), (0.7, 1.8), (0.7, 2.4), (0.7, 3.1), (0.7, 3.6)),
     )
 
 
