@@ -24,6 +24,9 @@ class ExportCfg:
     """Of a run, take the newest checkpoint, not the best."""
     overwrite: bool = False
     """Replace a policy that is there already, figures and README included."""
+    blend: tuple[str, float] | None = None
+    """Another policy and its share, 0 to 1, of the mean of both networks' weights; useful where one was trained on from
+    the other."""
 
 
 def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> None:
@@ -35,9 +38,11 @@ def export(cfg: ExportCfg) -> Path:
     """Write what the configuration asks for, print where, and return the path.
 
     Raises:
-        PolicyError: The source cannot be used, or the folder exists and is not to be overwritten.
+        PolicyError: The source cannot be used, two policies cannot be blended, or the folder exists and is not to be
+            overwritten.
         CheckpointError: The checkpoint cannot be used.
     """
+    from jumper_warp.policies.blend import blend
     from jumper_warp.policies.folder import save_policy
     from jumper_warp.policies.onnx import export_onnx
     from jumper_warp.policies.restore import is_run, learning_curve, open_policy
@@ -45,6 +50,8 @@ def export(cfg: ExportCfg) -> Path:
     source = Path(cfg.source)
     trained = is_run(source)
     policy = open_policy(cfg.source, newest=cfg.newest)
+    if cfg.blend is not None:
+        policy = blend(policy, open_policy(cfg.blend[0]), cfg.blend[1])
     out = cfg.out
     if out is None:
         run = source.parents[1] if source.suffix == ".pt" else source

@@ -72,7 +72,8 @@ EVALUATIONS: dict[str, Evaluation] = {
     "height-mars": Evaluation(
         HeightFlags(lower=1.0, upper=3.3, in_range=(1.0, 2.9)),
         MarsHeightGoals(height=(1.5, 2.3, 3.0)),
-        misses="height",
+        heights.for_evaluation,
+        "height",
     ),
     "place-mars": Evaluation(
         PlaceFlags(x=(0.5, 4.2), in_range=(0.5, 3.9)),

@@ -107,6 +107,29 @@ def plain_layers(
     return found
 
 
+def nearest_plain_layers(
+    layers: Sequence[tuple[torch.Tensor, torch.Tensor]], symmetry: Symmetry
+) -> list[tuple[torch.Tensor, torch.Tensor]]:
+    """Return the layers of the form of `plain_layers` that are nearest to these, of the same shapes.
+
+    layers: at least two, hidden ones of even widths. The nearest by the sum of squared differences: what must be equal
+    is the mean, what must be 0 is dropped.
+    """
+    obs, action = symmetry.obs.matrix().to(layers[0][0]), symmetry.action.matrix().to(layers[0][0])
+    halves = []
+    for index, (weight, bias) in enumerate(layers):
+        rows, columns = weight.shape[0] // 2, weight.shape[1] // 2
+        if index == len(layers) - 1:
+            halves.append((weight[:, :columns] + action @ weight[:, columns:], bias))
+            continue
+        if index == 0:
+            half = weight[:rows] + weight[rows:] @ obs
+        else:
+            half = weight[:rows, :columns] + weight[rows:, columns:]
+        halves.append((0.5 * half, 0.5 * (bias[:rows] + bias[rows:])))
+    return plain_layers(halves, symmetry)
+
+
 def symmetric_layers(
     layers: Sequence[tuple[torch.Tensor, torch.Tensor]], symmetry: Symmetry
 ) -> list[tuple[torch.Tensor, torch.Tensor]]:

@@ -182,8 +182,7 @@ class Run:
         self.notes: list[str] = []
         if start is not None and not cfg.resume:
             begin_with(start, self.ppo.model, cfg.num_envs * cfg.ppo.num_steps)
-            averaged = ", its answers averaged with their mirror images" if start.averaged else ""
-            self.notes.append(f"starts from {cfg.start_from}{averaged}")
+            self.notes.append(", ".join(filter(None, (f"starts from {cfg.start_from}", start.change))))
         torch.manual_seed(cfg.seed + 1 + rank.index)
         self.folder = self._resume() if cfg.resume else folder or new_folder(cfg, rank)
         if folder is None:

@@ -9,13 +9,16 @@ import torch
 from torch import nn
 
 from jumper_warp.rl.cfg import PpoCfg
-from jumper_warp.rl.mirror import Symmetry, symmetric_layers
+from jumper_warp.rl.mirror import Symmetry, nearest_plain_layers, symmetric_layers
 from jumper_warp.rl.networks import EPS, ActorCritic
 from jumper_warp.utils.errors import InputError
 
 KNOWN_ITERATIONS = 100
 """The policy's statistics of observations weigh as much as the samples of so many iterations: the mean and variance of
 what the robot sees now replace them slowly, so that the actor need not follow a jump of its inputs."""
+
+NEARLY = 0.05
+"""Of the norm of each layer's weights, that fine-tuning may have taken from the form of a mirror-symmetric actor."""
 
 
 class Start(NamedTuple):
@@ -27,8 +30,8 @@ class Start(NamedTuple):
     """(num_obs,) of the raw observations."""
     std: torch.Tensor
     """(num_obs,) what observations are divided by."""
-    averaged: bool = False
-    """Whether the policy is not mirror-symmetric and the training is: its answers are averaged with their images."""
+    change: str = ""
+    """What had to be done to a policy that is not mirror-symmetric for a training that is."""
 
 
 def make_start(
@@ -38,7 +41,7 @@ def make_start(
     """Return what a training with these settings begins with to act as a policy does.
 
     A policy g that is not mirror-symmetric begins a training with symmetry actor as (g(x) + N g(M x)) / 2, in the
-    notation of `jumper_warp.rl.mirror`.
+    notation of `jumper_warp.rl.mirror`; one that was, but for small changes of its weights, as the nearest that is.
 
     Args:
         layers: Of the policy as a plain network; weight (out, in) and bias (out,) each.
@@ -68,8 +71,10 @@ def make_start(
         )
     if not (std.double().square() > 0.999 * EPS).all():
         raise InputError(f"start_from: the policy divides an observation by {std.min():.3g}, least is {EPS**0.5:.3g}")
-    if symmetry is None or half is not None:
-        return Start(half or list(layers), mean, std)
+    if half is not None and symmetry is not None:
+        return Start(half, mean, std, "" if _is_symmetric(layers, symmetry) else "made mirror-symmetric")
+    if symmetry is None:
+        return Start(list(layers), mean, std)
     return _averaged(layers, mean, std, symmetry)
 
 
@@ -99,13 +104,24 @@ def begin_with(start: Start, model: ActorCritic, samples: int) -> None:
 def _half(
     layers: Sequence[tuple[torch.Tensor, torch.Tensor]], mean: torch.Tensor, std: torch.Tensor, symmetry: Symmetry
 ) -> list[tuple[torch.Tensor, torch.Tensor]] | None:
-    """Return the layers of f, see `symmetric_layers`, or None: they or the statistics are not symmetric."""
-    if not (torch.allclose(symmetry.obs.of(mean), mean, atol=1e-5) and torch.allclose(std[symmetry.obs.order], std)):
+    """Return the layers of f, see `symmetric_layers`, or None: they or the statistics are not nearly symmetric."""
+    widths = [len(bias) for _, bias in layers[:-1]]
+    symmetric = torch.allclose(symmetry.obs.of(mean), mean, atol=1e-5) and torch.allclose(std[symmetry.obs.order], std)
+    if not symmetric or not widths or any(width % 2 for width in widths):
         return None
+    nearest = nearest_plain_layers(layers, symmetry)
+    near = all(
+        (one - other).norm() <= NEARLY * one.norm() for (one, _), (other, _) in zip(layers, nearest, strict=True)
+    )
+    return symmetric_layers(nearest, symmetry) if near else None
+
+
+def _is_symmetric(layers: Sequence[tuple[torch.Tensor, torch.Tensor]], symmetry: Symmetry) -> bool:
     try:
-        return symmetric_layers(layers, symmetry)
+        symmetric_layers(layers, symmetry)
     except InputError:
-        return None
+        return False
+    return True
 
 
 def _averaged(
@@ -119,7 +135,8 @@ def _averaged(
     middle, var = symmetry.obs.moments(mean.double(), std.double().square())
     (weight, bias), *others = layers
     first = (weight * (var.sqrt() / std).to(weight.dtype), bias + weight @ ((middle - mean) / std).to(weight.dtype))
-    return Start([first, *others], middle.to(mean.dtype), var.sqrt().to(std.dtype), averaged=True)
+    change = "its answers averaged with their mirror images"
+    return Start([first, *others], middle.to(mean.dtype), var.sqrt().to(std.dtype), change)
 
 
 def _words(values: Iterable[object], between: str = ", ") -> str:

@@ -19,19 +19,19 @@ TRAIN += [part for name in ("lr", "min-lr", "max-lr") for part in (f"--ppo.{name
 def begun(tmp_path_factory):
     """Folder of a training of one iteration without a step that counts, which began with a shipped policy."""
     root = tmp_path_factory.mktemp("logs")
-    cli.main([*TRAIN, "--start-from", "horizontal_jump", "--log-root", str(root)])
+    cli.main([*TRAIN, "--start-from", "slippery_jump", "--log-root", str(root)])
     (folder,) = (root / "horizontal-jump-mars").iterdir()
     return folder
 
 
 def test_training_begins_with_the_policy(begun):
-    policy, found = open_policy("horizontal_jump"), open_policy(begun)
+    policy, found = open_policy("slippery_jump"), open_policy(begun)
     for (weight, bias), (same_weight, same_bias) in zip(policy.layers, found.layers, strict=True):
         torch.testing.assert_close(same_weight, weight, atol=1e-6, rtol=0.0)
         torch.testing.assert_close(same_bias, bias, atol=1e-6, rtol=0.0)
     drift = (found.mean - policy.mean).abs() / policy.std
     assert 0.0 < drift.max() < 0.2
-    assert found.config["train"]["start_from"] == "horizontal_jump"
+    assert found.config["train"]["start_from"] == "slippery_jump"
     assert found.config["train"]["ppo"]["init_std"] == 0.3
     log_std = load_checkpoint(begun / "checkpoints" / "iteration_000001.pt")["ppo"]["model"]["log_std"]
     torch.testing.assert_close(log_std.exp(), torch.full((12,), 0.3), atol=1e-6, rtol=0.0)
@@ -48,10 +48,10 @@ def test_training_begins_with_a_run(begun, tmp_path, capsys):
     ("more", "message"),
     [
         (["--start-from", "vertical_jump"], "start_from: observation "),
-        (["--start-from", "horizontal_jump", "--ppo.symmetry", "off"], "give --ppo.hidden 512 256 256"),
+        (["--start-from", "slippery_jump", "--ppo.symmetry", "off"], "give --ppo.hidden 512 256 256"),
         (["--start-from", "no_jump"], "no_jump"),
-        (["--start-from", "horizontal_jump", "--resume", "latest"], "not both"),
-        (["--start-from", "horizontal_jump", "--trainer", "rsl-rl", "--ppo.symmetry", "off"], "not offered"),
+        (["--start-from", "slippery_jump", "--resume", "latest"], "not both"),
+        (["--start-from", "slippery_jump", "--trainer", "rsl-rl", "--ppo.symmetry", "off"], "not offered"),
     ],
 )
 def test_what_cannot_be_started_from_is_told_in_one_line(more, message, capsys, tmp_path):

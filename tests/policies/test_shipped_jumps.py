@@ -1,6 +1,6 @@
 """Shipped policies for jumps to places do what their pages tell, on a few nominal jumps."""
 
-from experiments import horizontal_jump_sweep, platform_jump, ring_jump
+from experiments import horizontal_jump_sweep, platform_jump, ring_jump, vertical_jump_sweep
 
 
 def test_the_omnidirectional_policy_jumps_all_around(tmp_path):
@@ -33,3 +33,10 @@ def test_the_martian_policy_jumps_far_and_stays_there(tmp_path):
     values = horizontal_jump_sweep.main(horizontal_jump_sweep.Args(out=tmp_path, **args))
     assert values["success_rate"] == 1.0 and values["step_free_success_rate"] == 1.0
     assert values["mean_error_m"] < 0.02 and values["gravity_m_s2"] == 3.71
+
+
+def test_the_martian_policy_jumps_high_and_keeps_its_heading(tmp_path):
+    args = {"policy": "mars_vertical_jump", "jumps": 8, "heights": (0.9, 3.6), "record": 0, "device": "cpu"}
+    values = vertical_jump_sweep.main(vertical_jump_sweep.Args(out=tmp_path, **args))
+    assert values["success_rate"] == 1.0 and values["largest_reached_m"] > 3.5
+    assert values["mean_abs_error_m"] < 0.02 and values["mean_turn_deg"] < 15.0  # 0.011 m, 4.6 degrees of 200 jumps

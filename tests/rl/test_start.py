@@ -10,7 +10,7 @@ from toy_task import SMALL, PushTask
 
 from jumper_warp.rl.cfg import TrainCfg
 from jumper_warp.rl.checkpoint import load_checkpoint, save_checkpoint
-from jumper_warp.rl.mirror import plain_layers, symmetric_layers, symmetry_of
+from jumper_warp.rl.mirror import nearest_plain_layers, plain_layers, symmetric_layers, symmetry_of
 from jumper_warp.rl.networks import EPS, ActorCritic
 from jumper_warp.rl.ppo import Ppo
 from jumper_warp.rl.runner import CHECKPOINTS, CONFIG, train
@@ -95,6 +95,25 @@ def test_layers_of_sizes_that_no_symmetric_actor_has_are_refused(sizes):
         symmetric_layers(layers, SYMMETRY)
 
 
+@pytest.mark.parametrize("hidden", [(16,), (32, 24), (8, 6, 4)])
+def test_the_nearest_symmetric_layers_answer_mirrored_and_leave_symmetric_ones_alone(hidden):
+    exact = plain_layers(layers_of(actor(hidden, SYMMETRY)), SYMMETRY)
+    for own, made in zip(exact, nearest_plain_layers(exact, SYMMETRY), strict=True):
+        torch.testing.assert_close(made, own)
+    torch.manual_seed(1)
+    bent = [tuple(tensor + 0.1 * torch.randn_like(tensor) for tensor in layer) for layer in exact]
+    near = nearest_plain_layers(bent, SYMMETRY)
+    symmetric_layers(near, SYMMETRY)  # raises if they are not
+    rest = torch.cat(
+        [(b - n).flatten() for own, made in zip(bent, near, strict=True) for b, n in zip(own, made, strict=True)]
+    )
+    other = plain_layers(layers_of(actor(hidden, SYMMETRY)), SYMMETRY)
+    along = torch.cat(
+        [(o - n).flatten() for own, made in zip(other, near, strict=True) for o, n in zip(own, made, strict=True)]
+    )
+    assert abs(torch.dot(rest, along)) < 1e-4 * rest.norm() * along.norm()  # a foot of the perpendicular
+
+
 # ---------------------------------------------------------------- beginning
 
 
@@ -145,7 +164,7 @@ def test_a_symmetric_training_begins_with_the_average_of_a_policys_answers_and_t
     mean, std = model.obs_moments.scaling()
     obs = 0.5 * OBS  # within the limits of both statistics
     expected = averaged(lambda obs: model.actor((obs - mean) / std), obs).clamp(-1.0, 1.0)
-    assert start.averaged and (expected - model.act(obs)).abs().max() > 0.1
+    assert "averaged" in start.change and (expected - model.act(obs)).abs().max() > 0.1
     torch.testing.assert_close(ppo.model.act(obs), expected, atol=1e-5, rtol=0.0)
     mean, std = ppo.model.obs_moments.scaling()
     torch.testing.assert_close(SYMMETRY.obs.of(mean), mean)
@@ -156,7 +175,23 @@ def test_statistics_that_are_not_symmetric_make_a_policy_that_is_not():
     model = actor(symmetry=SYMMETRY)
     model.obs_moments.mean[1] = 0.1
     start = start_of(model, dataclasses.replace(SYMMETRIC, hidden=(64, 64)))
-    assert start.averaged and not start_of(actor(symmetry=SYMMETRY), SYMMETRIC).averaged
+    assert "averaged" in start.change and not start_of(actor(symmetry=SYMMETRY), SYMMETRIC).change
+
+
+def test_a_policy_that_fine_tuning_has_bent_begins_as_the_nearest_symmetric_one():
+    exact = plain_layers(layers_of(actor(symmetry=SYMMETRY)), SYMMETRY)
+    scaling = actor(symmetry=SYMMETRY).obs_moments.scaling()
+    torch.manual_seed(2)
+    for share, change in ((0.01, "made mirror-symmetric"), (0.5, None)):
+        bent = [(w + share * w.std() * torch.randn_like(w), b) for w, b in exact]
+        if change is None:  # too far: averaged, which needs all of its widths
+            with pytest.raises(InputError, match=r"give --ppo\.hidden 64 64"):
+                make_start(bent, *scaling, "elu", SYMMETRIC, SYMMETRY)
+            continue
+        start = make_start(bent, *scaling, "elu", SYMMETRIC, SYMMETRY)
+        assert start.change == change
+        for own, made in zip(nearest_plain_layers(bent, SYMMETRY), plain_layers(start.layers, SYMMETRY), strict=True):
+            torch.testing.assert_close(made, own)
 
 
 def test_a_deviation_that_statistics_cannot_have_is_refused():

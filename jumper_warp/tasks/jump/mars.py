@@ -17,8 +17,9 @@ from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.tasks.jump.cfg import GroundCfg, ladder
 from jumper_warp.tasks.jump.horizontal import NEAREST, horizontal_jump, level
 from jumper_warp.tasks.jump.vertical import STARTS, heights, vertical_jump
+from jumper_warp.tasks.terms import RewardTerm
 from jumper_warp.tasks.units import DEG
-from kernels.jump import terminations
+from kernels.jump import rewards, terminations
 
 TORQUE, KP = 24.8, 20.0
 """[N m], [N m/rad] Of the transversal motors."""
@@ -50,6 +51,8 @@ def vertical_jump_mars() -> TaskCfg:
     )  # fmt: skip
     ends = tuple(term for term in task.terminations if term.func is not terminations.second_takeoff)
     task = replace(task, terminations=ends)  # robots that only learn to land bounce, and must live to learn not to
+    falling = RewardTerm(rewards.descent_tilt, -60.0, width=10.0 * DEG)  # a long flight turns a robot that tips slowly
+    task = replace(task, rewards=(*task.rewards, falling))
     return task.with_terms(
         "rewards",
         jump_height={"wide": 0.8},

@@ -1,0 +1,64 @@
+"""The mean of two policies' weights."""
+
+import dataclasses
+
+import pytest
+import torch
+
+from jumper_warp.cli.main import main
+from jumper_warp.policies.blend import blend
+from jumper_warp.policies.folder import save_policy
+from jumper_warp.policies.policy import Policy
+from jumper_warp.policies.restore import open_policy
+from jumper_warp.policies.spec import PolicyError
+
+HORIZONTAL = open_policy("horizontal_jump")
+
+
+@pytest.fixture(scope="module")
+def other():
+    """The policy changed in all layers, with another normaliser."""
+    torch.manual_seed(3)
+    layers = [(weight + 0.05 * torch.randn_like(weight), bias + 0.1) for weight, bias in HORIZONTAL.layers]
+    mean, std = HORIZONTAL.mean + 0.2 * HORIZONTAL.std, 1.5 * HORIZONTAL.std
+    return Policy(layers, mean, std, HORIZONTAL.interface, HORIZONTAL.config)
+
+
+@pytest.fixture(scope="module")
+def obs():
+    return HORIZONTAL.mean + HORIZONTAL.std * torch.randn(200, 147, generator=torch.manual_seed(1)).clamp(-5.0, 5.0)
+
+
+def test_a_blend_is_one_policy_at_its_ends(other, obs):
+    assert (HORIZONTAL.act(obs) - other.act(obs)).abs().mean() > 0.1
+    torch.testing.assert_close(blend(HORIZONTAL, other, 0.0).act(obs), HORIZONTAL.act(obs), atol=1e-5, rtol=0.0)
+    torch.testing.assert_close(blend(HORIZONTAL, other, 1.0).act(obs), other.act(obs), atol=1e-4, rtol=0.0)
+
+
+def test_weights_are_the_mean_by_the_share(other):
+    same = Policy(other.layers, HORIZONTAL.mean, HORIZONTAL.std, other.interface)
+    for found, own, its in zip(blend(HORIZONTAL, same, 0.3).layers, HORIZONTAL.layers, same.layers, strict=True):
+        for tensor, one, two in zip(found, own, its, strict=True):
+            torch.testing.assert_close(tensor, 0.7 * one + 0.3 * two)
+
+
+def test_what_cannot_be_blended_is_refused(other):
+    with pytest.raises(PolicyError, match=r"share of a blend must be from 0 to 1, got 1\.1"):
+        blend(HORIZONTAL, other, 1.1)
+    for policy in (open_policy("vertical_jump"), open_policy("walking_flat")):
+        with pytest.raises(PolicyError, match="must read and drive the same"):
+            blend(HORIZONTAL, policy, 0.5)
+    interface = dataclasses.replace(HORIZONTAL.interface, action_scale=tuple(1.0 for _ in range(12)))
+    scaled = Policy(other.layers, other.mean, other.std, interface)
+    with pytest.raises(PolicyError, match="must read and drive the same"):
+        blend(HORIZONTAL, scaled, 0.5)
+
+
+def test_the_command_writes_a_blend(other, obs, tmp_path, capsys):
+    save_policy(tmp_path / "other", other)
+    main(["export", "horizontal_jump", "--blend", str(tmp_path / "other"), "0.25", "--out", str(tmp_path / "blend")])
+    expected = blend(HORIZONTAL, other, 0.25).act(obs)
+    torch.testing.assert_close(open_policy(tmp_path / "blend").act(obs), expected, atol=1e-6, rtol=0.0)
+    with pytest.raises(SystemExit, match="2"):
+        main(["export", "horizontal_jump", "--blend", "walking_flat", "0.5", "--out", str(tmp_path / "no")])
+    assert "must read and drive the same" in capsys.readouterr().err and not (tmp_path / "no").exists()
