@@ -6,17 +6,16 @@ what one does better and the other worse can be weighed (Wortsman et al. 2022, R
 
 from __future__ import annotations
 
-import torch
-
-from jumper_warp.policies.policy import Layers, Policy
+from jumper_warp.policies.policy import Policy
 from jumper_warp.policies.spec import PolicyError
+from jumper_warp.rl.start import scaled_by
 
 
 def blend(policy: Policy, other: Policy, share: float) -> Policy:
     """Return (1 - share) policy + share other, weight by weight, with the normaliser and the configuration of policy.
 
-    The other's first layer is written for that normaliser before: W (x - mean) / std stays the same for all x within
-    the limits.
+    The other's first layer is written for that normaliser before. The configuration tells the share, and commit and
+    iteration of the other, as `blended`.
 
     Args:
         policy: What the blend is with share 0.
@@ -30,18 +29,10 @@ def blend(policy: Policy, other: Policy, share: float) -> Policy:
         raise PolicyError(f"the share of a blend must be from 0 to 1, got {share}")
     if policy.interface != other.interface:
         raise PolicyError("policies of a blend must read and drive the same by networks of the same form")
-    mean, std = policy.mean.double(), policy.std.double()
-    pairs = zip(_double(policy.layers), _written_for(other, mean, std), strict=True)
-    layers = [((1.0 - share) * w + share * v, (1.0 - share) * b + share * c) for (w, b), (v, c) in pairs]
-    return Policy(layers, policy.mean, policy.std, policy.interface, policy.config)
-
-
-def _double(layers: Layers) -> list[tuple[torch.Tensor, torch.Tensor]]:
-    return [(weight.double(), bias.double()) for weight, bias in layers]
-
-
-def _written_for(policy: Policy, mean: torch.Tensor, std: torch.Tensor) -> list[tuple[torch.Tensor, torch.Tensor]]:
-    """Return the layers of a policy for observations that another normaliser (num_obs,) made."""
-    (weight, bias), *others = _double(policy.layers)
-    own_mean, own_std = policy.mean.double(), policy.std.double()
-    return [(weight * (std / own_std), bias + weight @ ((mean - own_mean) / own_std)), *others]
+    its = scaled_by(other.layers, other.mean, other.std, policy.mean, policy.std)
+    pairs = zip(policy.layers, its, strict=True)
+    layers = [
+        ((1.0 - share) * w.double() + share * v, (1.0 - share) * b.double() + share * c) for (w, b), (v, c) in pairs
+    ]
+    of = {"share": share, **{key: other.config[key] for key in ("commit", "iteration") if key in other.config}}
+    return Policy(layers, policy.mean, policy.std, policy.interface, policy.config | {"blended": of})

@@ -127,16 +127,28 @@ def _is_symmetric(layers: Sequence[tuple[torch.Tensor, torch.Tensor]], symmetry:
 def _averaged(
     layers: Sequence[tuple[torch.Tensor, torch.Tensor]], mean: torch.Tensor, std: torch.Tensor, symmetry: Symmetry
 ) -> Start:
-    """Return g as the network f of a symmetric actor, and the statistics of its samples and their images.
-
-    The first layer makes up for the change of the statistics: W (x - mean) / std stays the same for all x within the
-    limits.
-    """
+    """Return g as the network f of a symmetric actor, and the statistics of its samples and their images."""
     middle, var = symmetry.obs.moments(mean.double(), std.double().square())
-    (weight, bias), *others = layers
-    first = (weight * (var.sqrt() / std).to(weight.dtype), bias + weight @ ((middle - mean) / std).to(weight.dtype))
+    own = [
+        (weight.to(mean.dtype), bias.to(mean.dtype))
+        for weight, bias in scaled_by(layers, mean, std, middle, var.sqrt())
+    ]
     change = "its answers averaged with their mirror images"
-    return Start([first, *others], middle.to(mean.dtype), var.sqrt().to(std.dtype), change)
+    return Start(own, middle.to(mean.dtype), var.sqrt().to(std.dtype), change)
+
+
+def scaled_by(
+    layers: Sequence[tuple[torch.Tensor, torch.Tensor]], mean: torch.Tensor, std: torch.Tensor,
+    other_mean: torch.Tensor, other_std: torch.Tensor,
+) -> list[tuple[torch.Tensor, torch.Tensor]]:  # fmt: skip
+    """Return the layers, float64, for observations scaled by other statistics (num_obs,) than by mean and std.
+
+    The first makes up for the change: W (x - mean) / std stays the same for all x within the limits.
+    """
+    (weight, bias), *others = ((weight.double(), bias.double()) for weight, bias in layers)
+    mean, std = mean.double(), std.double()
+    first = weight * (other_std.double() / std), bias + weight @ ((other_mean.double() - mean) / std)
+    return [first, *others]
 
 
 def _words(values: Iterable[object], between: str = ", ") -> str:

@@ -42,6 +42,11 @@ def test_weights_are_the_mean_by_the_share(other):
             torch.testing.assert_close(tensor, 0.7 * one + 0.3 * two)
 
 
+def test_its_configuration_tells_what_was_blended(other):
+    told = blend(HORIZONTAL, other, 0.3).config["blended"]
+    assert told == {"share": 0.3, "commit": other.config["commit"], "iteration": other.config["iteration"]}
+
+
 def test_what_cannot_be_blended_is_refused(other):
     with pytest.raises(PolicyError, match=r"share of a blend must be from 0 to 1, got 1\.1"):
         blend(HORIZONTAL, other, 1.1)
