@@ -115,10 +115,10 @@ class SolverJumper(SolverBase):
     """Exact 18-coordinate dynamics of the Jumper with rigid paw contact.
 
     The five-bar loops hold by construction. Semi-implicit Euler; contact paw by paw to `tolerance`, on a CPU in turn
-    (Gauss-Seidel), on a GPU the one first whose velocity would change most. Hard stops, of motors and of a leg's
-    outer + inner, are settled together with contact (`kernels.actuation.stops`). Per-world masses, inertias, armature,
-    motor friction, damping, joint stops, paw friction and gravity are read from the model: write the model's arrays,
-    then call `notify_model_changed`.
+    (Gauss-Seidel), on a GPU all at once, or one at a time where that does not converge. Hard stops, of motors and of a
+    leg's outer + inner, are settled together with contact (`kernels.actuation.stops`). Per-world masses, inertias,
+    armature, motor friction, damping, joint stops, paw friction and gravity are read from the model: write the model's
+    arrays, then call `notify_model_changed`.
 
     Reads base and motor coordinates of `joint_q`/`joint_qd`, `control.joint_f` of base and motors (world wrench [N],
     [N m] at the base's com; motor torques [N m]) and `state.body_f` of the base. Writes every joint, loop joint and
@@ -192,7 +192,7 @@ class SolverJumper(SolverBase):
 
     @property
     def sweeps(self) -> wp.array:
-        """Most contact sweeps of a step in the last call, shape (num_worlds,)."""
+        """Most contact sweeps of a step in the last call, on a GPU rounds of all paws at once, shape (num_worlds,)."""
         return self.dynamics.work.sweeps
 
     @property

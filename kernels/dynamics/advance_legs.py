@@ -1,9 +1,10 @@
 """`advance` for GPUs: four threads a world, a thread a leg, which exchange what the base and the contacts need.
 
 A thread holds one leg and a copy of the base; the base's equations are sums over the four threads. The contact law is
-that of `contact`; here all paws propose their next impulse at once and the one whose contact velocity would change
-most takes it, until none would change by more than the tolerance. A step whose stops turn out wrong (see `world_step`)
-is made again by its world, while the others of a warp go on.
+that of `contact`; here all paws propose their next impulse at once, until none would change its contact velocity by
+more than the tolerance. All take it, since paws are coupled through the heavy base only; should the largest change not
+shrink so, the paw that would change most takes its own alone from then on. A step whose stops turn out wrong (see
+`world_step`) is made again by its world, while the others of a warp go on.
 """
 
 import warp as wp
@@ -27,7 +28,7 @@ from .base_dynamics import BaseSystem, add_leg, invert, motor_acceleration, solv
 from .base_motion import moved_base
 from .contact import BlockLaw, PawContact, block_velocity, local_impulse
 from .drive import Drive, LegDrive, Workspace, applied_torque, base_wrench, load_leg_drive, park
-from .lanes import any_world, first_leg, from_leg, max_legs, meet, sum_legs, sum_systems, sum_vec, vec_from_leg
+from .lanes import any_world, first_leg, from_leg, max_legs, meet, sum_legs, sum_systems, sum_vec
 from .parameters import load_spring, load_stops, load_vec3
 from .step import (
     LegParams,
@@ -41,6 +42,11 @@ from .step import (
     load_leg,
     paw_contact,
 )
+
+# largest change of a contact velocity, by that of the time before, with which all paws go on taking theirs at once
+SHRINKING = wp.constant(real(0.9))
+# [m^2/s^2] square of a change that no proposal reaches
+ANY_CHANGE = wp.constant(real(1.0e12))
 
 # division and roots are rounded to 2 units in the last place, as a third of the code
 wp.set_module_options({"enable_backward": False, "fast_math": True})
@@ -58,7 +64,7 @@ class LegState:
     peak_sq: real  # [N^2 s^2] largest impulse on the paw, squared
     total_sq: real  # [N^2 s^2] largest sum of the impulses, squared
     residual: real  # [m/s] of the contact iteration, largest
-    updates: int  # of paw impulses, most of a step
+    rounds: int  # of the contact iteration, most of a step
     step: int  # steps made in this launch
     sets: int  # sets of pressed stops tried for the present step without agreement
     pressed: int  # the leg's next one
@@ -73,19 +79,18 @@ class PawSolution:
     lin: vec3  # change of the base's linear velocity [m/s]
     ang: vec3  # change of its angular velocity [rad/s]
     residual: real  # [m/s]
-    updates: int
+    rounds: int
 
 
 @wp.func
-def solve_paws(
-    c: PawContact, blocks: bool, block: BlockLaw, leg: int, max_updates: int, tolerance: real
-) -> PawSolution:
+def solve_paws(c: PawContact, blocks: bool, block: BlockLaw, leg: int, max_rounds: int, tolerance: real) -> PawSolution:
     """Solve the contact problem; `blocks`: whether any world has a block."""
     s = PawSolution()
     s.impulse = c.impulse
     s.lin = sum_vec(c.to_lin * c.impulse)
     s.ang = sum_vec(c.to_ang * c.impulse)
-    working = bool(True)
+    working, together = bool(True), bool(True)
+    before = real(ANY_CHANGE)
     while any_world(working):
         velocity = c.free + c.from_lin * s.lin + c.from_ang * s.ang + c.own * s.impulse
         if blocks:
@@ -98,20 +103,23 @@ def solve_paws(
         across = c.total * step
         change = wp.dot(across, across)
         if not change > real(0.0):  # NaN too
-            change = real(0.0)
+            change, step = real(0.0), vec3(real(0.0))
         most = max_legs(change)
+        chosen = first_leg(change == most)
         if working:
             s.residual = wp.sqrt(most)
-        working = working and s.residual > tolerance and s.updates < max_updates
-        chosen = first_leg(change == most)
-        lin = vec_from_leg(c.to_lin * step, chosen)
-        ang = vec_from_leg(c.to_ang * step, chosen)
+        working = working and s.residual > tolerance and s.rounds < max_rounds
+        together = together and most <= SHRINKING * SHRINKING * before
+        before = most
+        if leg != chosen and not together:
+            step = vec3(real(0.0))
+        lin = sum_vec(c.to_lin * step)
+        ang = sum_vec(c.to_ang * step)
         if working:
-            s.updates += 1
+            s.rounds += 1
             s.lin += lin
             s.ang += ang
-            if leg == chosen:
-                s.impulse += step
+            s.impulse += step
     return s
 
 
@@ -183,7 +191,7 @@ def advance_leg(
         new.peak_sq = wp.max(old.peak_sq, wp.dot(solved.impulse, solved.impulse))
         new.total_sq = wp.max(old.total_sq, wp.dot(total, total))
         new.residual = wp.max(old.residual, solved.residual)
-        new.updates = wp.max(old.updates, solved.updates)
+        new.rounds = wp.max(old.rounds, solved.rounds)
         new.step = old.step + 1
         new.used = pressed
         new.sets = 0
@@ -251,4 +259,4 @@ def advance_legs_kernel(
         store_base(joint_q_out, joint_qd_out, com, world, s.base)
         work.peak_force[world] = wp.sqrt(s.total_sq) / settings.dt
         work.residual[world] = s.residual
-        work.sweeps[world] = (s.updates + 3) // 4
+        work.sweeps[world] = s.rounds

@@ -33,6 +33,8 @@ CONTACT_MARGIN = wp.constant(real(0.02))
 STIFF_BAND = wp.constant(real(2.0e-6))
 # slower contacts [m/s] start the step with static friction
 STICK_SPEED = wp.constant(real(0.01))
+# scale of a sliding paw's next friction, by the sum of its responses to friction along the ground
+FRICTION_STEP = wp.constant(real(0.6))
 
 SEPARATE = wp.constant(0)
 STICK = wp.constant(1)
@@ -117,12 +119,13 @@ def sliding_impulse(c: PawContact, impulse: vec3, velocity: vec3) -> vec3:
     """Return the next impulse of a sliding paw, meeting the normal condition, from the present impulse and velocity.
 
     Its friction is (present friction - slip / scale), cut at the cone. At the fixed point that is the cone's edge,
-    opposite to the slip; cutting only, never stretching, keeps friction along the slip from being one too.
+    opposite to the slip; cutting only, never stretching, keeps friction along the slip from being one too. Such
+    steps converge where scale is above half the largest response to friction, and fastest at half of their sum.
     """
     n = c.normal
     across = c.total * n
     normal_response = wp.dot(n, across)
-    scale = (c.total[0, 0] + c.total[1, 1] + c.total[2, 2]) - normal_response
+    scale = FRICTION_STEP * ((c.total[0, 0] + c.total[1, 1] + c.total[2, 2]) - normal_response)
     pull = impulse - velocity / scale
     pull = pull - wp.dot(pull, n) * n
     edge = n + c.mu * wp.normalize(pull)
