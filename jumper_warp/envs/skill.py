@@ -98,6 +98,7 @@ class Skill:
         settings.contact_force = self.task.contact_force
         settings.push_in_flight = int(self.task.randomization.push_in_flight)
         settings.lift, settings.link_margin = self.task.lift, self.task.link_margin
+        settings.block_margin = self.task.block_margin
         return settings
 
     def set(self, section: str, name: str, **numbers: float) -> None:

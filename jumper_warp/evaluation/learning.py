@@ -36,7 +36,7 @@ class Curve:
 
 def make_judge(task: TaskCfg, jumps: int, device: str | None) -> Env:
     """Return where policies of a task are tested: nominal, without noise, and links may come near one another."""
-    task = replace(task, link_margin=0.0)
+    task = replace(task, link_margin=0.0, block_margin=0.0)
     return Env(task, jumps, device=device, randomize=False, noise=False, auto_reset=False)
 
 

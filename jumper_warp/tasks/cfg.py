@@ -99,6 +99,8 @@ class TaskCfg:
     """[N] Above it a paw counts as in contact."""
     link_margin: float = 0.0
     """[m] Links closer to one another than this count as touching, in training; in tests of policies links touch."""
+    block_margin: float = 0.0
+    """[m] By which blocks are wider and higher for links that must not touch them, in training, not in tests either."""
     reward_floor: float | None = 0.0
     """Least total reward of a step; None: no floor."""
     metrics: tuple[StateMetric, ...] = ()
@@ -136,6 +138,8 @@ class TaskCfg:
             raise InputError(f"{self.name}: contact_force must be finite and >= 0, got {self.contact_force}")
         if not 0.0 <= self.link_margin <= APART:
             raise InputError(f"{self.name}: link_margin must be in [0, {APART:g}], got {self.link_margin}")
+        if not 0.0 <= self.block_margin < math.inf:
+            raise InputError(f"{self.name}: block_margin must be finite and >= 0, got {self.block_margin}")
         if self.reward_floor is not None and not math.isfinite(self.reward_floor):
             raise InputError(f"{self.name}: reward_floor must be finite or None, got {self.reward_floor}")
 

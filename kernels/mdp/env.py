@@ -75,6 +75,7 @@ class SkillSettings:
     push_in_flight: int  # 1: pushes act in the air too
     lift: float  # [m] above standing, at which robots begin whose policy is measured
     link_margin: float  # [m] links closer to one another than this count as touching
+    block_margin: float  # [m] by which blocks are wider and higher for what must not touch them
 
 
 @wp.struct

@@ -7,7 +7,7 @@ from ..dynamics.leg_dynamics import leg_pose, paw_kinematics
 from ..kinematics.geometry import LegGeometry
 from ..layout import COORDS
 from ..state import leg_coord, leg_dof, load_motors
-from ..terrain.ground import Ground, surface, world_ground
+from ..terrain.ground import Ground, grown_block, surface, world_ground
 from .env import EnvArrays, SkillSettings
 from .view import RobotArrays, base_pos, base_quat, base_velocity
 
@@ -71,6 +71,5 @@ def track_kernel(
     time_contact(robot, world, leg, down)  # before the velocity of the step before is written over
     follow_paw(robot, geometry[leg], world, leg)
     robot.paw_height[leg, world] = height_of_paw(robot, geometry[leg], ground, world, leg)
-    robot.collisions[leg, world] = leg_collisions(
-        geometry, world_ground(ground, world), robot.joint_q, world * COORDS, leg, skill.link_margin
-    )
+    here = grown_block(world_ground(ground, world), skill.block_margin)
+    robot.collisions[leg, world] = leg_collisions(geometry, here, robot.joint_q, world * COORDS, leg, skill.link_margin)

@@ -50,6 +50,15 @@ def world_ground(ground: Ground, world: int) -> Ground:
 
 
 @wp.func
+def grown_block(ground: Ground, margin: float) -> Ground:
+    """Return the ground of one world with its block wider on every side, and higher, by a margin [m]."""
+    here = ground
+    here.block.half += vec2(real(margin), real(margin))
+    here.block.height += real(margin)
+    return here
+
+
+@wp.func
 def has_block(ground: Ground, world: int) -> bool:
     """Return whether there is a block in a world."""
     if ground.blocks.shape[0] == 0:

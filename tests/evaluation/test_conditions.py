@@ -96,9 +96,10 @@ def test_walking_is_pushed_in_flight_in_any_case():
 # ---------------------------------------------------------------- latency, gains, friction
 
 
-def test_nominal_conditions_leave_the_task_alone_but_for_the_margin_between_links():
+def test_nominal_conditions_leave_the_task_alone_but_for_margins():
     assert HELD.link_margin > 0.0
-    assert Conditions().applied(HELD) == dataclasses.replace(HELD, link_margin=0.0)
+    wary = dataclasses.replace(HELD, block_margin=0.01)
+    assert Conditions().applied(wary) == dataclasses.replace(HELD, link_margin=0.0)
 
 
 def test_fixed_parameters_are_all_that_changes_of_a_nominal_robot():

@@ -20,12 +20,12 @@ N = 64
 WEIGHT = 142.0  # [N]
 
 
-def contact_force(force, link_margin=0.0):
+def contact_force(force, link_margin=0.0, block_margin=0.0):
     """Return the settings of skills with a least contact force [N] each."""
     settings = []
     for least in np.atleast_1d(force):
         found = Skill(make_task("vertical-jump"), 0, 1, STEP_DT, 8, "cpu").settings_of_skill()
-        found.contact_force, found.link_margin = float(least), link_margin
+        found.contact_force, found.link_margin, found.block_margin = float(least), link_margin, block_margin
         settings.append(found)
     return wp.array(settings, dtype=SkillSettings, device="cpu")
 
@@ -181,6 +181,16 @@ def poses():
     return array(states.joint_q())
 
 
+def blocks(n, margin=0.0):
+    """Return a block for each of n worlds, wider on every side and higher by a margin [m]."""
+    few = Simulation(8, block=BlockCfg((0.3, -0.2)), visuals=False, device="cpu").physics.dynamics.robot.ground
+    records = np.tile(few.blocks.numpy(), n // 8)
+    records["center"] = np.random.default_rng(8).uniform(-0.6, 0.6, (n, 2))
+    records["height"] = np.random.default_rng(9).uniform(0.05, 0.4, n) + margin
+    records["half"] += margin
+    return wp.array(records, dtype=few.blocks.dtype, device="cpu")
+
+
 @pytest.mark.parametrize("kind", ["plane", "hills", "block", "hills and blocks"])
 def test_the_flags_of_the_legs_together_are_those_of_the_robot(sim, poses, kind):
     n = 4000
@@ -188,11 +198,7 @@ def test_the_flags_of_the_legs_together_are_those_of_the_robot(sim, poses, kind)
     if ground.rows == 0:
         ground.heights = array(np.zeros((1, 1)))
     if "block" in kind:
-        few = Simulation(8, block=BlockCfg((0.3, -0.2)), visuals=False, device="cpu").physics.dynamics.robot.ground
-        records = np.tile(few.blocks.numpy(), n // 8)
-        records["center"] = np.random.default_rng(8).uniform(-0.6, 0.6, (n, 2))
-        records["height"] = np.random.default_rng(9).uniform(0.05, 0.4, n)
-        ground.blocks = wp.array(records, dtype=few.blocks.dtype, device="cpu")
+        ground.blocks = blocks(n)
     robot = standing_robots(n)
     robot.joint_q = poses
     track(robot, sim, ground=ground)
@@ -224,3 +230,17 @@ def test_links_closer_than_the_margin_count_as_touching(sim, poses):
     found = np.bitwise_or.reduce(robot.collisions.numpy(), axis=0) != 0
     assert found[near].all() and not found[far].any()
     assert (near & (flags.numpy() == 0)).sum() > 20  # the margin tells some that do not touch
+
+
+def test_blocks_are_larger_by_their_margin_for_links_but_not_for_paws(sim, poses):
+    n, margin = 4000, 0.03
+    found = []
+    for drawn, settings in ((0.0, margin), (margin, 0.0), (0.0, 0.0)):
+        ground, robot = hills(), standing_robots(n)
+        ground.blocks, robot.joint_q = blocks(n, drawn), poses
+        track(robot, sim, ground=ground, settings=contact_force(0.1, block_margin=settings))
+        found.append((robot.collisions.numpy().copy(), robot.paw_height.numpy().copy()))
+    (flags, heights), (grown, _), (plain, level) = found
+    np.testing.assert_array_equal(flags, grown)
+    assert (flags & plain == plain).all() and (flags != plain).any(axis=0).sum() > 20
+    np.testing.assert_array_equal(heights, level)
