@@ -135,3 +135,13 @@ def test_stops_at_the_tolerance_and_tells_it():
     residual, sweeps = dynamics.work.residual.numpy(), dynamics.work.sweeps.numpy()
     assert 0.0 < residual.max() <= 1.0e-5
     assert 0 < sweeps.max() < 500
+
+
+@pytest.mark.parametrize("friction", [0.2, 0.5, 1.0])
+def test_sliding_paws_converge_in_few_rounds(friction):
+    """Friction in steps of the summed responses takes 10 to 13 rounds, and one paw at a time more than 9 too."""
+    model = build_model(N, friction=friction)
+    dynamics = JumperDynamics(model, double=True)
+    found = advance(dynamics, *states(model, 0.34), by_legs=True, tolerance=1.0e-5)
+    assert (np.abs(found[2]).max(axis=(1, 2)) > 0.0).sum() >= 3  # legs that push
+    assert 0 < dynamics.work.sweeps.numpy().max() <= 9
