@@ -28,7 +28,7 @@ SQUAT = 0.5
 """[s] From when a jump takes over, and squats as it does at the start of its episodes, to its command."""
 SLEW = 1.25
 """[m/s^2], [rad/s^2] How fast a velocity is taken from one command to the next."""
-NUDGE_AFTER, NUDGE_FOR = 1.2, 0.5
+NUDGE_AFTER, NUDGE_FOR = 2.0, 0.5
 """[s] Without a jump after which a robot walks on, and how long, so that it plants its paws anew."""
 NUDGE = (0.25, 0.0, 0.0)
 """[m/s], [rad/s] How it does."""
