@@ -357,6 +357,8 @@ def test_a_term_of_ones_own_is_compiled_and_logged():
         (lambda: TASK.curriculum.replace(promote_after=0), "promote_after at least 1"),
         (lambda: TASK.advance.replace(takeoff_speed=math.nan), "'takeoff_speed' must be a finite number"),
         (lambda: dataclasses.replace(TASK, contact_force=-1.0), "contact_force must be finite and >= 0"),
+        (lambda: dataclasses.replace(TASK, link_margin=1.0), "link_margin must be in"),
+        (lambda: dataclasses.replace(TASK, block_margin=-0.01), "block_margin must be finite and >= 0"),
         (lambda: dataclasses.replace(TASK.motors.lateral, kp=1e39), "motor kp must be finite"),
         (lambda: TASK.policy[2].replace(noise=math.nan), "'noise' must be a finite number, got nan"),
         (lambda: TASK.policy[2].replace(noise=-1.0), "noise must not be negative"),
