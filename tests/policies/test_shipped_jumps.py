@@ -40,3 +40,10 @@ def test_the_martian_policy_jumps_high_and_keeps_its_heading(tmp_path):
     values = vertical_jump_sweep.main(vertical_jump_sweep.Args(out=tmp_path, **args))
     assert values["success_rate"] == 1.0 and values["largest_reached_m"] > 3.5
     assert values["mean_abs_error_m"] < 0.02 and values["mean_turn_deg"] < 15.0  # 0.011 m, 4.6 degrees of 200 jumps
+
+
+def test_the_martian_policy_for_the_stock_filter_reaches_its_heights_and_stands(tmp_path):
+    args = {"policy": "mars_vertical_jump_stock", "jumps": 8, "heights": (0.8, 2.9), "record": 0, "device": "cpu"}
+    values = vertical_jump_sweep.main(vertical_jump_sweep.Args(out=tmp_path, **args))
+    assert values["success_rate"] == 1.0 and values["mean_abs_error_m"] < 0.015  # 0.0055 m of 200 jumps
+    assert values["fall_rate"] == 0.0 and values["at_rest_within_1_s_rate"] == 1.0
