@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 import torch
@@ -36,8 +36,7 @@ class Curve:
 
 def make_judge(task: TaskCfg, jumps: int, device: str | None) -> Env:
     """Return where policies of a task are tested: nominal, without noise, and links may come near one another."""
-    task = replace(task, link_margin=0.0, block_margin=0.0)
-    return Env(task, jumps, device=device, randomize=False, noise=False, auto_reset=False)
+    return Env(task.without_margins(), jumps, device=device, randomize=False, noise=False, auto_reset=False)
 
 
 def success(ppo: Ppo | Shac, judge: Env, heights: tuple[float, float] = TESTED) -> float:

@@ -108,8 +108,7 @@ class Conditions:
 
     def applied(self, task: TaskCfg) -> TaskCfg:
         """Return a task as it is tried in these conditions; pushes come and go, however its training had it."""
-        task = task if self.gravity is None else replace(task, gravity=self.gravity)
-        task = replace(task, link_margin=0.0, block_margin=0.0)
+        task = (task if self.gravity is None else replace(task, gravity=self.gravity)).without_margins()
         trained = task.randomization
         if self.randomize:
             in_flight = trained.push_in_flight or self.push_in_flight

@@ -143,6 +143,10 @@ class TaskCfg:
         if self.reward_floor is not None and not math.isfinite(self.reward_floor):
             raise InputError(f"{self.name}: reward_floor must be finite or None, got {self.reward_floor}")
 
+    def without_margins(self) -> TaskCfg:
+        """Return the task as policies are tested on it: links touch where they do."""
+        return replace(self, link_margin=0.0, block_margin=0.0)
+
     def _check_functions(self) -> None:
         """Raises ValueError: a function outside the tables takes other structs than those of this task."""
         if len({level.struct for level in self.levels}) > 1:
