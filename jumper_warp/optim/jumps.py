@@ -21,17 +21,20 @@ def air_time(up: torch.Tensor, drop: torch.Tensor, gravity: float) -> torch.Tens
     return (up + root.clamp_min(1.0e-4).sqrt()) / gravity
 
 
-def flight(motion: Motion, speed: float, height: float) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Return distance [m] and air time [s] of the centre of mass' parabola from the takeoff on, and the takeoff's row.
+def flight(motion: Motion, speed: float, height: float) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return distance [m] and air time [s] of the centre of mass' parabola from the takeoff on, each (num,).
 
     From where it stood to where it falls through what it has with the base at `height` [m] in the posture of the start.
-    speed [m/s]: least upward at takeoff. Shapes (num,).
+    speed [m/s]: least upward at takeoff.
     """
-    row, _ = motion.takeoff(speed)
-    now, start = motion.momentum_at(row), motion.start
-    landing = height + start.com[:, 2] - motion.q[0, :, 2]
-    time = air_time(now.vel[:, 2], now.com[:, 2] - landing, motion.gravity)
-    return now.com[:, 0] - start.com[:, 0] + time * now.vel[:, 0], time, row
+
+    def found() -> tuple[torch.Tensor, torch.Tensor]:
+        now, start = motion.momentum_at_takeoff(speed), motion.start
+        landing = height + start.com[:, 2] - motion.q[0, :, 2]
+        time = air_time(now.vel[:, 2], now.com[:, 2] - landing, motion.gravity)
+        return now.com[:, 0] - start.com[:, 0] + time * now.vel[:, 0], time
+
+    return motion.once(("flight", speed, height), found)
 
 
 def farthest(speed: float = 0.25, height: float = 0.30) -> Term:
@@ -63,7 +66,7 @@ def estimated_apex(speed: float = 0.25) -> Term:
     """Return the height [m] of the centre of mass at the apex of its parabola from takeoff on, (num,)."""
 
     def term(motion: Motion) -> torch.Tensor:
-        now = motion.momentum_at(motion.takeoff(speed)[0])
+        now = motion.momentum_at_takeoff(speed)
         return now.com[:, 2] + now.vel[:, 2].clamp_min(0.0).square() / (2.0 * motion.gravity)
 
     return term
@@ -94,8 +97,7 @@ def landing_pitch(most: float, speed: float = 0.25, height: float = 0.30) -> Ter
     """Keep the pitch that the base would have at the end of the flight, posture of the start, within `most` [rad]."""
 
     def term(motion: Motion) -> torch.Tensor:
-        _, time, row = flight(motion, speed, height)
-        now = motion.momentum_at(row)
+        now, time, row = motion.momentum_at_takeoff(speed), flight(motion, speed, height)[1], motion.takeoff(speed)[0]
         spin = now.spin[:, 1] / motion.start.inertia[:, 1, 1]
         pitch = pitch_of(motion.q[row, torch.arange(motion.num, device=row.device), 3:7]) + spin * time
         return torch.stack([pitch - most, -most - pitch])

@@ -1,7 +1,8 @@
 """Batches of rollouts with gradients: policy steps of filter, latency, motors and physics, forwards and backwards.
 
-A rollout of all worlds is one launch, and so is its reverse pass, on a CPU one for each thread. Nothing but a row of
-the state every few physics steps and the paws' impulses is kept in between; see `kernels.dynamics.step_adjoint`.
+A rollout of all worlds is one launch, and so is its reverse pass, on a CPU one for each thread; on a GPU the reverse
+pass is three launches for every few policy steps (`reverse_legs`). Nothing but a row of the state every few physics
+steps and the paws' impulses is kept in between; see `kernels.dynamics.step_adjoint`.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ import numpy as np
 import warp as wp
 
 from jumper_warp.optim.actuation import MOTOR_CONSTANTS, filter_rows
+from jumper_warp.optim.reverse_legs import LegReverse
 from jumper_warp.robot.model import PHYSICS_DT
 from jumper_warp.robot.motors import FilterCfg, MotorCfg, jumping_motors, motor_arrays
 from jumper_warp.sim.dynamics import JumperDynamics
@@ -139,6 +141,7 @@ class Rollout:
         wrench = wp.zeros(model.body_count, dtype=wp.spatial_vector, device=self.device)
         self._drive = self.dynamics.drive(self._zeros(model.joint_dof_count), wrench)
         self._record: Any = None
+        self._legs: LegReverse | None = None
         self._launched: set[str] = set()
 
     def standing(self) -> tuple[np.ndarray, np.ndarray]:
@@ -261,13 +264,18 @@ class Rollout:
             setattr(gradients, name, self._zeros(*shape, n))
         if safe is not None:
             wp.copy(gradients.safe, safe)  # which the reverse pass adds to
-        if self._record is None:
-            self._record = self._step_record()
-        inputs = [self._timing(count), self._actuation, commands, trajectory.safe, rows, seeds]
+        motion = [self._timing(count), self._actuation, commands, trajectory.safe, rows]
         if self.by_legs:
-            self._launch_legs(modules.rollout_legs_adjoint.reverse_legs_kernel, inputs, [self._record, gradients])
+            for into, seed in ((gradients.q, q), (gradients.qd, qd)):
+                if seed is not None:
+                    wp.copy(into, seed[-1])
+            if self._legs is None:
+                self._legs = LegReverse(self.dynamics, self.every)
+            self._legs.run(self._new_settings(), motion, seeds, gradients)
         else:
-            self._launch(modules.rollout_adjoint.reverse_kernel, inputs, [self._record, gradients])
+            if self._record is None:
+                self._record = self._step_record()
+            self._launch(modules.rollout_adjoint.reverse_kernel, [*motion, seeds], [self._record, gradients])
         found = {"targets": gradients.target, "q": gradients.q, "qd": gradients.qd, "before": gradients.before}
         return found | {"wrench": gradients.wrench} | self._named(gradients.parameters)
 

@@ -88,13 +88,20 @@ class Knots:
 class Motion:
     """What targets lead to, in `num` worlds; coordinates last, rows every policy step, row 0 the start."""
 
-    def __init__(self, trajectory: TorchTrajectory, body: WholeBody, rollout: Rollout, gravity: float):
-        self.trajectory, self.body, self.gravity = trajectory, body, gravity
-        """gravity: [m/s^2] downward."""
+    def __init__(self, trajectory: TorchTrajectory, body: WholeBody, rollout: Rollout, gravity: float, start: Momentum):
+        self.trajectory, self.body, self.gravity, self.start = trajectory, body, gravity, start
+        """gravity: [m/s^2] downward; start: momenta of the start, without gradients."""
+        self._known: dict[Any, Any] = {}
         self.dt, self.substeps = rollout.dt, rollout.substeps
         self.q, self.qd = trajectory.q.movedim(1, -1), trajectory.qd.movedim(1, -1)
         """(steps + 1, num, 19) and (steps + 1, num, 18), see `Trajectory`."""
         self.num = self.q.shape[1]
+
+    def once(self, key: Any, make: Callable[[], Any]) -> Any:
+        """Return what several terms need of this motion, which is made when it is first asked for."""
+        if key not in self._known:
+            self._known[key] = make()
+        return self._known[key]
 
     @cached_property
     def points(self) -> tuple[torch.Tensor, torch.Tensor]:
@@ -141,6 +148,9 @@ class Motion:
 
         As the jumps' tasks see it: no paw down at the end of a policy step, base upward faster than `speed` [m/s].
         """
+        return self.once(("takeoff", speed), lambda: self._takeoff(speed))
+
+    def _takeoff(self, speed: float) -> tuple[torch.Tensor, torch.Tensor]:
         free = ~self.down.any(dim=1) & (self.base_velocity[1:, :, 2].detach() > speed)
         steps = free.shape[0]
         row = torch.where(free.any(0), free.int().argmax(0) + 1, steps)
@@ -156,10 +166,9 @@ class Motion:
         worlds = torch.arange(self.num, device=row.device)
         return self.body.momentum(self.q[row, worlds], self.qd[row, worlds])
 
-    @cached_property
-    def start(self) -> Momentum:
-        """Return momenta of the start."""
-        return self.body.momentum(self.q[0].detach(), self.qd[0].detach())
+    def momentum_at_takeoff(self, speed: float) -> Momentum:
+        """Return momenta of the row of takeoff."""
+        return self.once(("momentum", speed), lambda: self.momentum_at(self.takeoff(speed)[0]))
 
 
 Term = Callable[[Motion], torch.Tensor]
@@ -173,6 +182,18 @@ class Values(NamedTuple):
     """(n,)"""
     constraints: torch.Tensor
     """(n, m), satisfied where <= 0."""
+
+
+class _Worlds(NamedTuple):
+    """What is made once for a number of candidates."""
+
+    rollout: Rollout
+    body: WholeBody
+    q: torch.Tensor
+    """(19, n) The start, standing."""
+    qd: torch.Tensor
+    """(18, n)"""
+    start: Momentum
 
 
 @dataclass
@@ -203,14 +224,14 @@ class Problem:
 
     def __post_init__(self) -> None:
         """Prepare."""
-        self._rollouts: dict[int, tuple[Rollout, WholeBody]] = {}
+        self._worlds: dict[int, _Worlds] = {}
 
     def rollout(self, num_worlds: int) -> Rollout:
         """Return the rollout of so many worlds, which is made once."""
-        return self._prepared(num_worlds)[0]
+        return self._prepared(num_worlds).rollout
 
-    def _prepared(self, num_worlds: int) -> tuple[Rollout, WholeBody]:
-        if num_worlds not in self._rollouts:
+    def _prepared(self, num_worlds: int) -> _Worlds:
+        if num_worlds not in self._worlds:
             model = build_model(
                 num_worlds, visuals=False, friction=self.friction, gravity=self.gravity, device=self.device
             )
@@ -218,16 +239,17 @@ class Problem:
                 model, self.motors, self.command_filter, double=self.double, tolerance=self.tolerance,
                 dt=PHYSICS_DT * SUBSTEPS / self.substeps, substeps=self.substeps, threads=self.threads,
             )  # fmt: skip
-            self._rollouts[num_worlds] = rollout, WholeBody(rollout)
-        return self._rollouts[num_worlds]
+            body, real = WholeBody(rollout), torch.float64 if self.double else torch.float32
+            q, qd = (torch.as_tensor(array, dtype=real, device=str(rollout.device)) for array in rollout.standing())
+            self._worlds[num_worlds] = _Worlds(rollout, body, q, qd, body.momentum(q.T, qd.T))
+        return self._worlds[num_worlds]
 
     def motion(self, x: torch.Tensor) -> Motion:
         """Return the motion of candidates (n, len(knots)), with gradients where x has them."""
-        rollout, body = self._prepared(len(x))
-        q, qd = (torch.as_tensor(array, dtype=x.dtype, device=x.device) for array in rollout.standing())
+        rollout, body, q, qd, start = self._prepared(len(x))
         targets = self.knots.targets(x)
         self.world_steps += targets.shape[0] * len(x)
-        return Motion(simulate(rollout, targets, q, qd), body, rollout, self.gravity)
+        return Motion(simulate(rollout, targets, q, qd), body, rollout, self.gravity, start)
 
     def evaluate(self, x: torch.Tensor) -> Values:
         """Return objective and constraints of candidates (n, len(knots)); what is not finite is infinite."""

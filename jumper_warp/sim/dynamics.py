@@ -20,11 +20,12 @@ from jumper_warp.utils.errors import InputError
 LINKS = ("housing", "outer_thigh", "outer_shank", "inner_thigh", "inner_shank")
 JOINTS = ("lateral", "outer", "outer_knee", "inner", "inner_knee")
 KERNEL_MODULES = (
-    "actuation.command_filter", "actuation.motors", "dynamics.advance", "dynamics.advance_legs", "dynamics.contact",
-    "dynamics.contact_adjoint", "dynamics.differentiable", "dynamics.drive", "dynamics.gradients",
-    "dynamics.momentum", "dynamics.parameters", "dynamics.rollout", "dynamics.rollout_adjoint", "dynamics.rollout_legs",
-    "dynamics.rollout_legs_adjoint", "dynamics.step", "dynamics.step_adjoint",
-    "kinematics.full_state", "kinematics.geometry", "layout", "scalar", "state", "terrain.ground",
+    "actuation.command_filter", "actuation.motors", "dynamics.advance", "dynamics.advance_legs",
+    "dynamics.constants_adjoint", "dynamics.contact", "dynamics.contact_adjoint", "dynamics.differentiable",
+    "dynamics.drive", "dynamics.gradients", "dynamics.leg_record", "dynamics.momentum", "dynamics.parameters",
+    "dynamics.rollout", "dynamics.rollout_adjoint", "dynamics.rollout_legs", "dynamics.rollout_legs_adjoint",
+    "dynamics.step", "dynamics.step_adjoint", "kinematics.full_state", "kinematics.geometry", "layout", "scalar",
+    "state", "terrain.ground",
 )  # fmt: skip
 
 

@@ -1,5 +1,7 @@
 """Where the reverse pass of a rollout adds up its gradients."""
 
+from typing import Any
+
 import warp as wp
 
 from ..actuation.command_filter import FilterParams, Limits
@@ -32,6 +34,7 @@ from ..layout import (
 )
 from ..scalar import real, vec3
 from .inertia import MassMoments
+from .lanes import sum_legs, sum_turns
 from .leg_dynamics import LegMasses
 from .rollout import FILTER_HORIZON, FILTER_ROWS, FILTER_SPEED
 
@@ -62,30 +65,54 @@ class Gradients:
     parameters: wp.array2d(dtype=real)  # (GRADIENT_ROWS, num_worlds)
 
 
+@wp.struct
+class ThreadSums:
+    """Where the threads of a warp add what each of them found."""
+
+    parameters: wp.array2d(dtype=real)  # (GRADIENT_ROWS, num_worlds)
+    world: int
+    weight: real  # of what this thread found
+    adds: bool  # whether it adds the sum of what all of them found
+    turns: bool  # over those that have other steps of the same leg
+    legs: bool  # over those that have other legs
+
+
 @wp.func
 def add_entry(sums: wp.array(dtype=real), row: int, x: real):
-    """Add a number."""
+    """Add a number to a row."""
     sums[row] = sums[row] + x
 
 
 @wp.func
-def add_vec3(sums: wp.array(dtype=real), row: int, v: vec3):
-    """Add a vector to three rows."""
-    for i in range(3):
-        sums[row + i] = sums[row + i] + v[i]
+def add_entry(sums: ThreadSums, row: int, x: real):  # noqa: F811
+    """Add what some threads found to a row of their world. Only one of them adds, and does not wait for it."""
+    total = sums.weight * x
+    if sums.turns:
+        total = sum_turns(total)
+    if sums.legs:
+        total = sum_legs(total)
+    if sums.adds:
+        wp.atomic_add(sums.parameters, row, sums.world, total)
 
 
 @wp.func
-def add_moments(sums: wp.array(dtype=real), row: int, m: MassMoments):
+def add_vec3(sums: Any, row: int, v: vec3):
+    """Add a vector to three rows."""
+    for i in range(3):
+        add_entry(sums, row + i, v[i])
+
+
+@wp.func
+def add_moments(sums: Any, row: int, m: MassMoments):
     """Add the gradient by a link's mass moments."""
     add_entry(sums, row, m.mass)
     add_vec3(sums, row + 1, m.first)
     for i in range(6):
-        sums[row + 4 + i] = sums[row + 4 + i] + m.second[i]
+        add_entry(sums, row + 4 + i, m.second[i])
 
 
 @wp.func
-def add_masses(sums: wp.array(dtype=real), leg: int, masses: LegMasses):
+def add_masses(sums: Any, leg: int, masses: LegMasses):
     """Add the gradient by the mass moments of a leg."""
     row = leg * LEG_ROWS
     add_moments(sums, row + HOUSING, masses.housing)
@@ -96,7 +123,7 @@ def add_masses(sums: wp.array(dtype=real), leg: int, masses: LegMasses):
 
 
 @wp.func
-def add_joints(sums: wp.array(dtype=real), leg: int, p: JointParams):
+def add_joints(sums: Any, leg: int, p: JointParams):
     """Add the gradient by the joint-space parameters of a leg."""
     row = leg * LEG_ROWS
     add_vec3(sums, row + ARMATURE, p.armature)
@@ -109,7 +136,7 @@ def add_joints(sums: wp.array(dtype=real), leg: int, p: JointParams):
 
 
 @wp.func
-def add_spring(sums: wp.array(dtype=real), leg: int, p: LegSpring):
+def add_spring(sums: Any, leg: int, p: LegSpring):
     """Add the gradient by the spring of a leg."""
     row = leg * LEG_ROWS + SPRING
     add_entry(sums, row, p.stiffness)
@@ -117,7 +144,7 @@ def add_spring(sums: wp.array(dtype=real), leg: int, p: LegSpring):
 
 
 @wp.func
-def add_stops(sums: wp.array(dtype=real), leg: int, p: StopParams):
+def add_stops(sums: Any, leg: int, p: StopParams):
     """Add the gradient by the hard stops of a leg."""
     row = leg * LEG_ROWS
     add_vec3(sums, row + LOWER, p.lower)
@@ -129,7 +156,7 @@ def add_stops(sums: wp.array(dtype=real), leg: int, p: StopParams):
 
 
 @wp.func
-def add_geometry(sums: wp.array(dtype=real), leg: int, geo: LegGeometry):
+def add_geometry(sums: Any, leg: int, geo: LegGeometry):
     """Add the gradient by a leg's lengths."""
     row = GEOMETRY_GRADIENT + leg * GEOMETRY_ROWS
     add_vec3(sums, row, geo.hip)
@@ -143,15 +170,15 @@ def add_geometry(sums: wp.array(dtype=real), leg: int, geo: LegGeometry):
 
 
 @wp.func
-def add_com(sums: wp.array(dtype=real), mass: real, com: vec3, gradient: vec3):
+def add_com(sums: Any, mass: real, com: vec3, gradient: vec3):
     """Add a gradient by the base's centre of mass [m], the ratio of its first moment and its mass [kg]."""
     add_entry(sums, BASE, -wp.dot(gradient, com) / mass)
     add_vec3(sums, BASE + 1, gradient / mass)
 
 
 @wp.func
-def add_motor(sums: wp.array(dtype=real), motor: int, scale: real, p: MotorParams):
-    """Add `scale` times a gradient by a motor's constants."""
+def add_motor(sums: Any, shared: Any, motor: int, scale: real, p: MotorParams):
+    """Add `scale` times a gradient by a motor's constants, to `shared` what all motors have in common."""
     row = MOTOR_GRADIENT + motor
     add_entry(sums, row, scale * p.kp)
     add_entry(sums, row + 12, scale * p.kd)
@@ -160,19 +187,19 @@ def add_motor(sums: wp.array(dtype=real), motor: int, scale: real, p: MotorParam
     add_entry(sums, row + 48, scale * p.cutoff_speed)
     add_entry(sums, row + 60, scale * p.no_load_speed)
     add_entry(sums, row + 72, scale * p.offset)
-    add_entry(sums, FADE_GRADIENT, scale * p.fade_start)
-    add_entry(sums, FADE_GRADIENT + 1, scale * p.fade_end)
+    add_entry(shared, FADE_GRADIENT, scale * p.fade_start)
+    add_entry(shared, FADE_GRADIENT + 1, scale * p.fade_end)
 
 
 @wp.func
-def add_limits(sums: wp.array(dtype=real), row: int, limits: Limits):
+def add_limits(sums: Any, row: int, limits: Limits):
     """Add the gradient by one quantity's limits; hard zones only switch."""
     add_entry(sums, row, limits.lower)
     add_entry(sums, row + 1, limits.upper)
 
 
 @wp.func
-def add_filter(sums: wp.array(dtype=real), p: FilterParams):
+def add_filter(sums: Any, p: FilterParams):
     """Add the gradient by the filter's constants."""
     add_limits(sums, FILTER_GRADIENT, p.lateral)
     add_limits(sums, FILTER_GRADIENT + 4, p.transversal)

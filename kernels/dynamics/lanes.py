@@ -62,6 +62,14 @@ _FIRST = """
     return first;
 #endif
 """
+_TURNS = """
+#if defined(__CUDA_ARCH__)
+    x += __shfl_xor_sync(0xffffffffu, x, 4);
+    x += __shfl_xor_sync(0xffffffffu, x, 8);
+    x += __shfl_xor_sync(0xffffffffu, x, 16);
+#endif
+    return x;
+"""
 _ANY = """
 #if defined(__CUDA_ARCH__)
     return __any_sync(0xffffffffu, flag);
@@ -81,6 +89,12 @@ _MEET = """
 @wp.func_native(_SUM)
 def sum_legs(x: real) -> real:
     """Return the sum over the legs of a world, the same bits in each thread."""
+    ...
+
+
+@wp.func_native(_TURNS)
+def sum_turns(x: real) -> real:
+    """Return the sum over threads of a leg where a warp has one world, its threads being (8, 4); itself on a CPU."""
     ...
 
 

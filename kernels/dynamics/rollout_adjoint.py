@@ -10,22 +10,31 @@ from ..actuation.motors import MotorParams, motor_torque
 from ..layout import BASE
 from ..scalar import quat, real, vec3
 from ..state import BaseState, base_com
-from .command_adjoint import reverse_filter, reverse_motor, weighed_filter
+from .command_adjoint import (
+    add_motor_constants,
+    add_offsets,
+    add_targets,
+    filter_gradient,
+    motor_gradient,
+    weighed_filter,
+)
 from .contact import PawContact
 from .contact_laws import PawLaw
-from .gradients import GRADIENT_ROWS, Gradients, add_com
+from .gradients import GRADIENT_ROWS, Gradients, add_com, add_filter
 from .parameters import load_moments, load_spring, load_stops
 from .rollout import (
     Actuation,
     Commands,
     Rows,
     Timing,
+    arrival,
     load_filter,
     load_row_base,
     load_world_motor,
     row_base,
     row_quat,
     row_vec3,
+    store_row_vec3,
 )
 from .step import LegParams, Robot, StepSettings, load_leg
 from .step_adjoint import StepRecord, replay_step, reverse_step
@@ -67,22 +76,23 @@ class RowSeeds:
     quat: quat
     lin: vec3
     ang: vec3
+    com: vec3  # by the base's centre of mass, of all rows that were passed
 
 
 @wp.func
-def leave_row(rows: Rows, robot: Robot, row: int, world: int, adj: BaseState, sums: wp.array(dtype=real)) -> RowSeeds:
+def leave_row(rows: Rows, robot: Robot, row: int, world: int, adj: BaseState, com_before: vec3) -> RowSeeds:
     """Return the gradient by a row's entries for that by the base's state which is read from it."""
     com = base_com(robot.table, world)
     pos, orientation, lin, ang, com_adj, _seed = wp.grad(weighed_row)(
         row_vec3(rows.q, row, 0, world), row_quat(rows.q, row, 3, world), row_vec3(rows.qd, row, 0, world),
         row_vec3(rows.qd, row, 3, world), com, adj,
     )  # fmt: skip
-    add_com(sums, robot.table[BASE, world], com, com_adj)
     seeds = RowSeeds()
     seeds.pos = pos
     seeds.quat = orientation
     seeds.lin = lin
     seeds.ang = ang
+    seeds.com = com_before + com_adj
     return seeds
 
 
@@ -99,19 +109,27 @@ def add_row_seeds(into: RowSeeds, seeds: Rows, row: int, world: int) -> RowSeeds
     return s
 
 
+@wp.struct
+class RowState:
+    """Gradient by the base's state which a row was written from."""
+
+    base: BaseState
+    com: vec3  # by the base's centre of mass, of all rows that were passed
+
+
 @wp.func
-def enter_row(robot: Robot, world: int, base: BaseState, seeds: RowSeeds, sums: wp.array(dtype=real)) -> BaseState:
+def enter_row(robot: Robot, world: int, base: BaseState, seeds: RowSeeds) -> RowState:
     """Return the gradient by the base's state which a row was written from, for that by the row's entries."""
     com = base_com(robot.table, world)
     orientation, lin, ang, com_adj, _lin, _ang = wp.grad(weighed_store)(
         base.quat, base.lin, base.ang, com, seeds.lin, seeds.ang
     )
-    add_com(sums, robot.table[BASE, world], com, com_adj)
-    adj = BaseState()
-    adj.pos = seeds.pos
-    adj.quat = seeds.quat + orientation
-    adj.lin = lin
-    adj.ang = ang
+    adj = RowState()
+    adj.base.pos = seeds.pos
+    adj.base.quat = seeds.quat + orientation
+    adj.base.lin = lin
+    adj.base.ang = ang
+    adj.com = seeds.com + com_adj
     return adj
 
 
@@ -170,7 +188,8 @@ def reverse_kernel(
             record.rates[world, 0, k] = row_vec3(rows.qd, row, 6 + 3 * k, world)
         for i in range(timing.every):
             replay_step(robot, params, dt, world, force, moment, rows, first + i, i, record)
-        adj = enter_row(robot, world, record.base[world, timing.every], entries, sums)
+        end = enter_row(robot, world, record.base[world, timing.every], entries)
+        adj = end.base
         for j in range(timing.every):
             i = timing.every - 1 - j
             adj = reverse_step(
@@ -187,35 +206,33 @@ def reverse_kernel(
                     seed = torque_adj[k][c]
                     if seeds.torque.shape[0] > 0:
                         seed += seeds.torque[first + i, 3 * k + c, world]
-                    by_state = reverse_motor(
+                    by_motor = motor_gradient(
                         motors[3 * k + c], late, commands, safe, timing, dt, first + i, 3 * k + c, world, angles[c],
-                        rates[c], seed, 3 * k + c, sums, gradients,
+                        rates[c],
                     )  # fmt: skip
-                    angle_sum[c] += by_state[0]
-                    rate_sum[c] += by_state[1]
+                    arrived = arrival(first + i, timing.substeps, late)
+                    add_targets(gradients, arrived, 3 * k + c, world, seed * by_motor.target)
+                    add_motor_constants(sums, sums, 3 * k + c, seed, by_motor)
+                    angle_sum[c] += seed * by_motor.angle
+                    rate_sum[c] += seed * by_motor.rate
                 angle_adj[k] = angle_sum
                 rate_adj[k] = rate_sum
-        entries = add_row_seeds(leave_row(rows, robot, row, world, adj, sums), seeds, row, world)
+        entries = add_row_seeds(leave_row(rows, robot, row, world, adj, end.com), seeds, row, world)
         for k in range(laws.shape[0]):
             if first == t * timing.substeps:
-                by_leg = reverse_filter(
-                    commands,
-                    actuation,
-                    t,
-                    k,
-                    world,
-                    record.angles[world, 0, k],
-                    record.rates[world, 0, k],
-                    k,
-                    sums,
-                    gradients,
+                by_leg = filter_gradient(
+                    commands, actuation, t, k, world, record.angles[world, 0, k], record.rates[world, 0, k], gradients
                 )
+                store_row_vec3(gradients.target, t, 3 * k, world, by_leg.target)
+                add_offsets(sums, k, by_leg.angles)
+                add_filter(sums, by_leg.constants)
                 angle_adj[k] = angle_adj[k] + by_leg.angles
                 rate_adj[k] = rate_adj[k] + by_leg.rates
             if seeds.q.shape[0] > 0:
                 angle_adj[k] = angle_adj[k] + row_vec3(seeds.q, row, 7 + 3 * k, world)
             if seeds.qd.shape[0] > 0:
                 rate_adj[k] = rate_adj[k] + row_vec3(seeds.qd, row, 6 + 3 * k, world)
+    add_com(sums, robot.table[BASE, world], com, entries.com)
     for i in range(sums.shape[0]):
         gradients.parameters[i, world] = sums[i]
     for i in range(3):

@@ -1,42 +1,115 @@
-"""`rollout_adjoint` for GPUs: four threads a world, a thread a leg."""
+"""`rollout_adjoint` for GPUs: four threads a world, a thread a leg; a few rows at a time, from the last to the first.
+
+Three launches take the steps between these rows: they are made again, each row by threads of its own, run backwards one
+by one, and then once more side by side for the gradients by parameters (`constants_adjoint`).
+"""
 
 import warp as wp
 
 from ..actuation.motors import MotorParams
-from ..layout import BASE, GRAVITY, LEG_ROWS
-from ..scalar import real
+from ..layout import BASE, GRAVITY
+from ..scalar import quat, real, vec3
 from ..state import BaseState, base_com
-from .command_adjoint import reverse_filter, reverse_motor
-from .gradients import FADE_GRADIENT, GEOMETRY_GRADIENT, GEOMETRY_ROWS, GRADIENT_ROWS, MOTOR_GRADIENT, Gradients
-from .lanes import sum_legs
+from .command_adjoint import add_targets, filter_gradient, motor_gradient
+from .gradients import Gradients, ThreadSums, add_com, add_filter, add_moments, add_vec3
+from .lanes import meet
 from .leg_adjoint import LegAdjoint, replay_leg, reverse_leg
-from .rollout import Actuation, Commands, Rows, Timing, load_row_base, load_world_motor, row_vec3, store_row_vec3
-from .rollout_adjoint import RowSeeds, add_row_seeds, enter_row, everything, leave_row
+from .leg_record import (
+    ANGLES,
+    FILTER,
+    RATES,
+    LegRecord,
+    MotorSlopes,
+    get_base,
+    get_slopes,
+    get_vec,
+    put_base,
+    put_slopes,
+    put_vec,
+)
+from .rollout import (
+    Actuation,
+    Commands,
+    Rows,
+    Timing,
+    arrival,
+    load_row_base,
+    load_world_motor,
+    row_vec3,
+    store_row_vec3,
+)
+from .rollout_adjoint import RowSeeds, add_row_seeds, enter_row, everything, leave_row, wrench_part
 from .step import Robot, StepSettings, load_leg
-from .step_adjoint import StepRecord
 from .virtual_power import BaseFactors, BaseSeeds, LegFactors
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
 
 
-@wp.func
-def store_sums(sums: wp.array(dtype=real), leg: int, world: int, parameters: wp.array2d(dtype=real)):
-    """Write the gradients by parameters: a leg's by its thread, the base's by the first, the others summed up.
+@wp.struct
+class Span:
+    """The rows whose steps a launch takes."""
 
-    sums: rows of the first leg for all: so the threads of a warp add to the same rows, which lie side by side.
+    begin: int
+    end: int  # excluded
+
+
+@wp.func
+def first_entry(timing: Timing, span: Span, row: int) -> int:
+    """Return the record's entry of the first step after a row; that of its end follows the last one."""
+    return (row - span.begin) * (timing.every + 1)
+
+
+@wp.kernel
+def replay_legs_kernel(
+    # in
+    count: int,
+    robot: Robot,
+    settings: StepSettings,
+    timing: Timing,
+    actuation: Actuation,
+    commands: Commands,
+    safe: wp.array3d(dtype=real),
+    rows: Rows,
+    span: Span,
+    # out
+    record: LegRecord,
+):
+    """Make the steps after each row again; launch over (rows of the span, count rounded up to a multiple of 8, 4).
+
+    Threads beyond the last world repeat it, and write the same bits.
     """
-    for i in range(LEG_ROWS):
-        parameters[leg * LEG_ROWS + i, world] = sums[i]
-    for i in range(7):
-        for j in range(3):
-            row = MOTOR_GRADIENT + 12 * i + j
-            parameters[row + 3 * leg, world] = sums[row]
-    for i in range(GEOMETRY_ROWS):
-        row = GEOMETRY_GRADIENT + i
-        parameters[row + leg * GEOMETRY_ROWS, world] = sums[row]
-    if leg == 0:
-        for i in range(int(BASE), int(GRAVITY) + 3):
-            parameters[i, world] = sums[i]
+    offset, place, leg = wp.tid()
+    world = settings.first + wp.min(place, count - 1)
+    row = span.begin + offset
+    at = first_entry(timing, span, row)
+    first = row * timing.every
+    t = first / timing.substeps
+    own = load_leg(robot, world, leg)
+    force = wrench_part(commands, t, 0, world)
+    moment = wrench_part(commands, t, 3, world)
+    put_base(record, at, world, load_row_base(rows, row, world, base_com(robot.table, world)))
+    put_vec(record, at, ANGLES, world, leg, row_vec3(rows.q, row, 7 + 3 * leg, world))
+    put_vec(record, at, RATES, world, leg, row_vec3(rows.qd, row, 6 + 3 * leg, world))
+    meet()
+    motors = wp.zeros(shape=(3,), dtype=MotorParams)
+    for c in range(motors.shape[0]):
+        motors[c] = load_world_motor(actuation, 3 * leg + c, world)
+    late = actuation.latency[world] / settings.dt
+    for i in range(timing.every):
+        step = first + i
+        replay_leg(robot, own, settings.dt, world, leg, force, moment, commands.impulse, rows, step, at + i, record)
+        meet()
+        angles = get_vec(record, at + i, ANGLES, world, leg)
+        rates = get_vec(record, at + i, RATES, world, leg)
+        slopes = MotorSlopes()
+        for c in range(motors.shape[0]):
+            by_motor = motor_gradient(
+                motors[c], late, commands, safe, timing, settings.dt, step, 3 * leg + c, world, angles[c], rates[c]
+            )
+            slopes.target[c] = by_motor.target
+            slopes.angle[c] = by_motor.angle
+            slopes.rate[c] = by_motor.rate
+        put_slopes(record, at + i, world, leg, slopes)
 
 
 @wp.kernel
@@ -51,93 +124,92 @@ def reverse_legs_kernel(
     safe: wp.array3d(dtype=real),
     rows: Rows,
     seeds: Rows,
-    # out
-    record: StepRecord,
+    span: Span,
+    # in, out
+    record: LegRecord,
     gradients: Gradients,
 ):
-    """Do what `reverse_kernel` does; launch over (count rounded up to a multiple of 8, 4).
+    """Run the steps of a span backwards; launch over (count rounded up to a multiple of 8, 4).
 
-    Threads beyond the last world repeat it, and write only what it writes to the record, the same bits.
+    gradients.q and qd hold the gradient by the row after the span, and then that by its first row. Of the gradients
+    by parameters those of the base and the filter are added. Threads beyond the last world repeat
+    it, and write nothing.
     """
     place, leg = wp.tid()
     world = settings.first + wp.min(place, count - 1)
     dt = settings.dt
     own = load_leg(robot, world, leg)
-    motors = wp.zeros(shape=(3,), dtype=MotorParams)
-    for j in range(motors.shape[0]):
-        motors[j] = load_world_motor(actuation, 3 * leg + j, world)
-    sums = wp.zeros(shape=(GRADIENT_ROWS,), dtype=real)
     late = actuation.latency[world] / dt
-    last = timing.steps * timing.substeps / timing.every
-    entries = add_row_seeds(RowSeeds(), seeds, last, world)
+    entries = RowSeeds()
+    entries.pos = vec3(gradients.q[0, world], gradients.q[1, world], gradients.q[2, world])
+    entries.quat = quat(gradients.q[3, world], gradients.q[4, world], gradients.q[5, world], gradients.q[6, world])
+    entries.lin = vec3(gradients.qd[0, world], gradients.qd[1, world], gradients.qd[2, world])
+    entries.ang = vec3(gradients.qd[3, world], gradients.qd[4, world], gradients.qd[5, world])
     adj = LegAdjoint()
-    if seeds.q.shape[0] > 0:
-        adj.angles = row_vec3(seeds.q, last, 7 + 3 * leg, world)
-    if seeds.qd.shape[0] > 0:
-        adj.rates = row_vec3(seeds.qd, last, 6 + 3 * leg, world)
-    com = base_com(robot.table, world)
-    for back in range(last):
-        row = last - 1 - back
+    m = 3 * leg
+    adj.angles = vec3(gradients.q[7 + m, world], gradients.q[8 + m, world], gradients.q[9 + m, world])
+    adj.rates = vec3(gradients.qd[6 + m, world], gradients.qd[7 + m, world], gradients.qd[8 + m, world])
+    of_leg = ThreadSums()
+    of_leg.parameters = gradients.parameters
+    of_leg.world = world
+    of_leg.weight = real(1.0)
+    of_leg.adds = place < count
+    of_legs = of_leg
+    of_legs.adds = place < count and leg == 0
+    of_legs.legs = True
+    for back in range(span.end - span.begin):
+        row = span.end - 1 - back
+        at = first_entry(timing, span, row)
         first = row * timing.every
         t = first / timing.substeps
-        force = row_vec3(commands.wrench, t, 0, world)
-        moment = row_vec3(commands.wrench, t, 3, world)
-        record.base[world, 0] = load_row_base(rows, row, world, com)
-        record.angles[world, 0, leg] = row_vec3(rows.q, row, 7 + 3 * leg, world)
-        record.rates[world, 0, leg] = row_vec3(rows.qd, row, 6 + 3 * leg, world)
-        for i in range(timing.every):
-            replay_leg(robot, own, dt, world, leg, force, moment, rows, first + i, i, record)
-        adj.base = enter_row(robot, world, record.base[world, timing.every], entries, sums)
+        force = wrench_part(commands, t, 0, world)
+        moment = wrench_part(commands, t, 3, world)
+        end = enter_row(robot, world, get_base(record, at + timing.every, world), entries)
+        adj.base = end.base
+        adj.force = vec3(real(0.0))
+        adj.moment = vec3(real(0.0))
         for j in range(timing.every):
             i = timing.every - 1 - j
             step = first + i
             adj = reverse_leg(
-                robot, own, dt, world, leg, force, moment, commands.impulse, rows, seeds, step, i, record, adj, sums
+                robot, own, dt, world, leg, force, moment, rows, seeds, step, at + i, record, adj, place < count
             )
+            seed = adj.torque
+            if seeds.torque.shape[0] > 0:
+                seed += row_vec3(seeds.torque, step, m, world)
+            slopes = get_slopes(record, at + i, world, leg)
+            adj.angles += wp.cw_mul(seed, slopes.angle)
+            adj.rates += wp.cw_mul(seed, slopes.rate)
             if place < count:
-                if leg == 0:
-                    store_row_vec3(gradients.wrench, t, 0, world, row_vec3(gradients.wrench, t, 0, world) + adj.force)
-                    store_row_vec3(gradients.wrench, t, 3, world, row_vec3(gradients.wrench, t, 3, world) + adj.moment)
-                angles = record.angles[world, i, leg]
-                rates = record.rates[world, i, leg]
-                angle_sum = adj.angles
-                rate_sum = adj.rates
-                for c in range(motors.shape[0]):
-                    motor = 3 * leg + c
-                    seed = adj.torque[c]
-                    if seeds.torque.shape[0] > 0:
-                        seed += seeds.torque[step, motor, world]
-                    by_state = reverse_motor(
-                        motors[c], late, commands, safe, timing, dt, step, motor, world, angles[c], rates[c], seed,
-                        c, sums, gradients,
-                    )  # fmt: skip
-                    angle_sum[c] += by_state[0]
-                    rate_sum[c] += by_state[1]
-                adj.angles = angle_sum
-                adj.rates = rate_sum
-        entries = add_row_seeds(leave_row(rows, robot, row, world, adj.base, sums), seeds, row, world)
-        if place < count and first == t * timing.substeps:
-            by_leg = reverse_filter(
-                commands, actuation, t, leg, world, record.angles[world, 0, leg], record.rates[world, 0, leg], 0,
-                sums, gradients,
+                by_target = wp.cw_mul(seed, slopes.target)
+                arrived = arrival(step, timing.substeps, late)
+                for c in range(wp.static(3)):
+                    add_targets(gradients, arrived, m + c, world, by_target[c])
+        entries = add_row_seeds(leave_row(rows, robot, row, world, adj.base, end.com), seeds, row, world)
+        if place < count:
+            if leg == 0:
+                store_row_vec3(gradients.wrench, t, 0, world, row_vec3(gradients.wrench, t, 0, world) + adj.force)
+                store_row_vec3(gradients.wrench, t, 3, world, row_vec3(gradients.wrench, t, 3, world) + adj.moment)
+        if first == t * timing.substeps:
+            by_filter = filter_gradient(
+                commands, actuation, t, leg, world, get_vec(record, at, ANGLES, world, leg),
+                get_vec(record, at, RATES, world, leg), gradients,
             )  # fmt: skip
-            adj.angles += by_leg.angles
-            adj.rates += by_leg.rates
+            add_filter(of_legs, by_filter.constants)
+            if place < count:
+                put_vec(record, at, FILTER, world, leg, by_filter.angles)
+                store_row_vec3(gradients.target, t, m, world, by_filter.target)
+            adj.angles += by_filter.angles
+            adj.rates += by_filter.rates
         if seeds.q.shape[0] > 0:
-            adj.angles += row_vec3(seeds.q, row, 7 + 3 * leg, world)
+            adj.angles += row_vec3(seeds.q, row, 7 + m, world)
         if seeds.qd.shape[0] > 0:
-            adj.rates += row_vec3(seeds.qd, row, 6 + 3 * leg, world)
-    shared = GEOMETRY_GRADIENT - FADE_GRADIENT
-    for i in range(shared):  # over-speed protection, latency and filter: all legs add to them
-        total = sum_legs(sums[FADE_GRADIENT + i])
-        if leg == 0 and place < count:
-            gradients.parameters[FADE_GRADIENT + i, world] = total
+            adj.rates += row_vec3(seeds.qd, row, 6 + m, world)
     if place >= count:
         return
-    store_sums(sums, leg, world, gradients.parameters)
     for i in range(3):
-        gradients.q[7 + 3 * leg + i, world] = adj.angles[i]
-        gradients.qd[6 + 3 * leg + i, world] = adj.rates[i]
+        gradients.q[7 + m + i, world] = adj.angles[i]
+        gradients.qd[6 + m + i, world] = adj.rates[i]
         if leg == 0:
             gradients.q[i, world] = entries.pos[i]
             gradients.qd[i, world] = entries.lin[i]
@@ -145,6 +217,9 @@ def reverse_legs_kernel(
     if leg == 0:
         for i in range(4):
             gradients.q[3 + i, world] = entries.quat[i]
+        add_moments(of_leg, BASE, adj.body)
+        add_com(of_leg, robot.table[BASE, world], base_com(robot.table, world), adj.com + entries.com)
+        add_vec3(of_leg, GRAVITY, adj.gravity)
 
 
 @wp.kernel(enable_backward=True)
