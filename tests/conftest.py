@@ -1,3 +1,7 @@
+import os
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")  # workers share the cores; before torch reads it
+
 import pytest
 import torch
 import warp as wp

@@ -164,7 +164,7 @@ class TrainCfg:
     """A torch device; default: a GPU if there is one."""
     threads: int | None = None
     """CPU threads of each process that share its worlds (default: all cores, shared out to the processes of a machine).
-    They change no result; those of torch do, half the cores unless OMP_NUM_THREADS says otherwise."""
+    They change no result; those of torch do, half the cores but at least two unless OMP_NUM_THREADS says otherwise."""
     log_root: Path = Path("logs")
     """A run is written to log_root/task/time of its start."""
     log_interval: int = 10

@@ -87,9 +87,10 @@ def join_ranks(device: str | None = None) -> Rank:
     if kind.type == "cuda":
         torch.cuda.set_device(kind)
     elif "OMP_NUM_THREADS" not in os.environ:
-        # small networks lose more to waiting threads than they gain, far more on a busy machine; what the simulation's
-        # threads are does not matter here: torch's sums depend on the number of its threads
-        torch.set_num_threads(max(1, available_threads() // 2))
+        # small networks gain little from many threads, and lose where these wait on a busy machine; what those of the
+        # simulation are does not matter here: torch's sums depend on the number of its threads
+        cores = available_threads()
+        torch.set_num_threads(min(cores, max(2, cores // 2)))
     if size > 1 and not torch.distributed.is_initialized():
         for name, value in NCCL.items():
             os.environ.setdefault(name, value)
