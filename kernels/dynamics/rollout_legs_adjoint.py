@@ -131,9 +131,8 @@ def reverse_legs_kernel(
 ):
     """Run the steps of a span backwards; launch over (count rounded up to a multiple of 8, 4).
 
-    gradients.q and qd hold the gradient by the row after the span, and then that by its first row. Of the gradients
-    by parameters those of the base and the filter are added. Threads beyond the last world repeat
-    it, and write nothing.
+    gradients.q and qd hold the gradient by the row after the span, and then that by its first row. Of those by
+    parameters the base's and the filter's are added. Threads beyond the last world repeat it, and write nothing.
     """
     place, leg = wp.tid()
     world = settings.first + wp.min(place, count - 1)

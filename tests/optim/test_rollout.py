@@ -215,10 +215,11 @@ def blocks_of_threads():
 
 
 @pytest.mark.usefixtures("blocks_of_threads")
-def test_a_thread_a_leg_does_what_a_thread_a_world_does():
+@pytest.mark.parametrize("every", [4, 2])
+def test_a_thread_a_leg_does_what_a_thread_a_world_does(every):
     """As on a GPU; with latency, fading motors, a wrench and worlds in the air, 11 of them, no multiple of 8."""
     count = 11
-    of = rollout(count)
+    of = rollout(count, every=every)
     values = defaults() | {"latency": np.array(0.0061), "fade": np.array([4.0, 60.0])}
     values["wrench"][5:15] = [3.0, -2.0, 4.0, 0.1, -0.2, 0.3]
     values["q"] = np.repeat(values["q"][:, None], count, axis=1)
