@@ -50,21 +50,23 @@ class LegReverse:
         threads = -(-self._num // 8) * 8
         kernels = self._modules.rollout_legs_adjoint
 
-        def launch(kernel: wp.Kernel, dim: tuple[int, ...], first: int, number: int, *arrays: Any) -> None:
-            inputs = [first, self._dynamics.robot, settings, *motion, *arrays[:-1], spans[number]]
-            outputs = [self._records[number % RECORDS], *arrays[-1]]
+        constants_kernel = self._modules.constants_adjoint.constants_kernel
+
+        def launch(kernel: wp.Kernel, dim: tuple[int, ...], inputs: list[Any], outputs: list[Any]) -> None:
+            inputs = [inputs[0], self._dynamics.robot, settings, *motion, *inputs[1:]]
             wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self._device, block_dim=4 * turns)
 
         def replay(number: int) -> None:
-            rows = spans[number].end - spans[number].begin
-            launch(kernels.replay_legs_kernel, (rows, threads, 4), self._num, number, ())
+            span, record = spans[number], self._records[number % RECORDS]
+            launch(kernels.replay_legs_kernel, (span.end - span.begin, threads, 4), [self._num, span], [record])
 
         def reverse(number: int) -> None:
-            launch(kernels.reverse_legs_kernel, (threads, 4), self._num, number, seeds, (gradients,))
+            outputs = [self._records[number % RECORDS], gradients]
+            launch(kernels.reverse_legs_kernel, (threads, 4), [self._num, seeds, spans[number]], outputs)
 
         def add_constants(number: int) -> None:
-            kernel = self._modules.constants_adjoint.constants_kernel
-            launch(kernel, (self._num, turns, 4), turns, number, seeds, (gradients,))
+            outputs = [self._records[number % RECORDS], gradients]
+            launch(constants_kernel, (self._num, turns, 4), [turns, seeds, spans[number]], outputs)
 
         if self._ahead is None:
             for number in range(len(spans)):

@@ -7,8 +7,8 @@ from ..scalar import real, vec3
 from ..state import BaseState
 from .command_adjoint import add_motor_constants, add_offsets, motor_gradient
 from .gradients import Gradients, ThreadSums
-from .leg_adjoint import leg_constants
-from .leg_record import ANGLES, FILTER, RATES, LegRecord, get_leg_weights, get_vec
+from .leg_adjoint import add_leg_constants, held_base, leg_gradient
+from .leg_record import ANGLES, FILTER, RATES, LegRecord, get_base, get_base_weights, get_law, get_leg_weights, get_vec
 from .rollout import Actuation, Commands, Rows, Timing, load_world_motor, row_vec3
 from .rollout_adjoint import everything
 from .rollout_legs_adjoint import Span, first_entry
@@ -64,10 +64,15 @@ def constants_kernel(
         step = wp.min(step, end - 1)
         row = step / timing.every
         i = first_entry(timing, span, row) + step - row * timing.every
-        leg_constants(robot, own, dt, world, leg, rows, seeds, step, i, record, of_leg)
+        base = get_base(record, i, world)
+        law = get_law(record, i, world, leg)
+        held = held_base(record, world, i, dt, base, get_base_weights(record, i, world))
+        weights = get_leg_weights(record, i, world, leg)
+        found = leg_gradient(robot, own, dt, world, leg, rows, seeds, step, i, record, base, law, held, weights)
+        add_leg_constants(of_leg, leg, law, found)
         angles = get_vec(record, i, ANGLES, world, leg)
         rates = get_vec(record, i, RATES, world, leg)
-        torque = dt * get_leg_weights(record, i, world, leg).rates
+        torque = dt * weights.rates
         if seeds.torque.shape[0] > 0:
             torque += row_vec3(seeds.torque, step, 3 * leg, world)
         for c in range(motors.shape[0]):

@@ -2,14 +2,17 @@
 
 What depends on the motion alone is made for many steps side by side (`replay_leg`), the inverse of the system of
 the contact laws' multipliers too. Only what must go from step to step backwards does so (`reverse_leg`). It leaves the
-multipliers, from which the gradients by parameters follow, again for many steps side by side (`leg_constants`).
+multipliers, from which the gradients by parameters follow, again for many steps side by side (`add_leg_constants`).
 """
 
 import warp as wp
 
-from ..actuation.stops import stop_rows
+from ..actuation.joint_forces import JointParams
+from ..actuation.springs import LegSpring
+from ..actuation.stops import StopParams, stop_rows
+from ..kinematics.geometry import LegGeometry
 from ..layout import BASE, GRAVITY, LEG_ROWS, MU_DYNAMIC, MU_STATIC
-from ..scalar import mat33, real, vec3
+from ..scalar import mat33, quat, real, vec3
 from ..state import BaseState, base_com
 from .base_dynamics import BaseSystem, add_leg, invert, motor_acceleration, solve_ang, solve_lin
 from .base_motion import moved_base
@@ -26,6 +29,7 @@ from .gradients import (
 )
 from .inertia import MassMoments
 from .lanes import any_world, mat_from_leg, sum_legs, sum_quat, sum_systems, sum_vec, vec_from_leg
+from .leg_dynamics import LegMasses
 from .leg_record import (
     ANGLES,
     RATES,
@@ -35,11 +39,9 @@ from .leg_record import (
     LegRecord,
     LegWeights,
     get_base,
-    get_base_weights,
     get_inverse,
     get_law,
     get_law_row,
-    get_leg_weights,
     get_solve,
     get_vec,
     put_base,
@@ -242,6 +244,58 @@ def held_leg(
     return held
 
 
+@wp.struct
+class LegGradient:
+    """Gradient of a leg's part of the weighed equations."""
+
+    geometry: LegGeometry
+    masses: LegMasses
+    joints: JointParams
+    spring: LegSpring
+    stops: StopParams
+    mu: real
+    pos: vec3  # by the base's state
+    turn: quat
+    omega: vec3
+    gravity: vec3  # body axes
+    angles: vec3
+    rates: vec3
+
+
+@wp.func
+def leg_gradient(
+    robot: Robot, own: LegParams, dt: real, world: int, leg: int, rows: Rows, seeds: Rows, step: int, i: int,
+    record: LegRecord, base: BaseState, law: LegLaw, held: BaseFactors, weights: LegWeights,
+) -> LegGradient:  # fmt: skip
+    """Return the gradient of `leg_action` in a step."""
+    factors = held_leg(record, rows, seeds, world, step, i, leg, dt, law, weights)
+    g = wp.quat_rotate_inv(base.quat, load_vec3(robot.table, GRAVITY, world))
+    angles = get_vec(record, i, ANGLES, world, leg)
+    rates = get_vec(record, i, RATES, world, leg)
+    (geo, masses, joints, spring, stops, _ground, mu, pos, turn, omega, g_adj, angle_adj, rate_adj, _held, _leg,
+     _step) = (
+        wp.grad(leg_action)(
+            own.geometry, own.masses, own.joints, load_spring(robot.table, leg, world),
+            load_stops(robot.table, leg, world), robot.ground, law.mu, base.pos, base.quat, base.ang, g, angles, rates,
+            held, factors, dt,
+        )
+    )  # fmt: skip
+    found = LegGradient()
+    found.geometry = geo
+    found.masses = masses
+    found.joints = joints
+    found.spring = spring
+    found.stops = stops
+    found.mu = mu
+    found.pos = pos
+    found.turn = turn
+    found.omega = omega
+    found.gravity = g_adj
+    found.angles = angle_adj
+    found.rates = rate_adj
+    return found
+
+
 @wp.func
 def reverse_leg(
     robot: Robot, own: LegParams, dt: real, world: int, leg: int, force: vec3, moment: vec3, rows: Rows, seeds: Rows,
@@ -289,22 +343,11 @@ def reverse_leg(
         by_base.ang += more_ang
     # the equations of motion
     held = held_base(record, world, i, dt, base, by_base)
-    factors = held_leg(record, rows, seeds, world, step, i, leg, dt, law, by_leg)
-    angles = get_vec(record, i, ANGLES, world, leg)
-    rates = get_vec(record, i, RATES, world, leg)
-    gravity = load_vec3(robot.table, GRAVITY, world)
-    (_geo, _masses, _joints, _spring, _stops, _ground, _mu, pos, turn, omega, g_adj, angle_adj, rate_adj, _held, _leg,
-     _step) = (
-        wp.grad(leg_action)(
-            own.geometry, own.masses, own.joints, load_spring(robot.table, leg, world),
-            load_stops(robot.table, leg, world), robot.ground, law.mu, base.pos, base.quat, base.ang,
-            wp.quat_rotate_inv(base.quat, gravity), angles, rates, held,
-            factors, dt,
-        )
-    )  # fmt: skip
+    found = leg_gradient(robot, own, dt, world, leg, rows, seeds, step, i, record, base, law, held, by_leg)
     by_base.seeds.velocity = lin_seed
     by_base.seeds.new_velocity = new_velocity
-    by_base.seeds.gravity = sum_vec(g_adj)
+    by_base.seeds.gravity = sum_vec(found.gravity)
+    gravity = load_vec3(robot.table, GRAVITY, world)
     body, com, weight, force_adj, moment_adj, base_turn, lin_adj, base_omega, _base, _seeds, _base_step = wp.grad(
         base_action
     )(load_moments(robot.table, BASE, world), base_com(robot.table, world), gravity, force, moment, base.quat,
@@ -313,12 +356,12 @@ def reverse_leg(
         put_base_weights(record, i, world, by_base)
         put_leg_weights(record, i, world, leg, by_leg)
     out = LegAdjoint()
-    out.base.pos = adj.base.pos + sum_vec(pos)
-    out.base.quat = quat_adj + base_turn + sum_quat(turn)
+    out.base.pos = adj.base.pos + sum_vec(found.pos)
+    out.base.quat = quat_adj + base_turn + sum_quat(found.turn)
     out.base.lin = lin_adj
-    out.base.ang = ang_seed + base_omega + sum_vec(omega)
-    out.angles = adj.angles + angle_adj
-    out.rates = rate_seed + rate_adj
+    out.base.ang = ang_seed + base_omega + sum_vec(found.omega)
+    out.angles = adj.angles + found.angles
+    out.rates = rate_seed + found.rates
     out.torque = dt * by_leg.rates
     out.force = adj.force + force_adj
     out.moment = adj.moment + moment_adj
@@ -329,32 +372,13 @@ def reverse_leg(
 
 
 @wp.func
-def leg_constants(
-    robot: Robot, own: LegParams, dt: real, world: int, leg: int, rows: Rows, seeds: Rows, step: int, i: int,
-    record: LegRecord, sums: ThreadSums,
-):  # fmt: skip
+def add_leg_constants(sums: ThreadSums, leg: int, law: LegLaw, found: LegGradient):
     """Add a step's gradients by the parameters of a leg."""
-    base = get_base(record, i, world)
-    law = get_law(record, i, world, leg)
-    by_base = get_base_weights(record, i, world)
-    held = held_base(record, world, i, dt, base, by_base)
-    factors = held_leg(record, rows, seeds, world, step, i, leg, dt, law, get_leg_weights(record, i, world, leg))
-    angles = get_vec(record, i, ANGLES, world, leg)
-    rates = get_vec(record, i, RATES, world, leg)
-    gravity = load_vec3(robot.table, GRAVITY, world)
-    (geo, masses, joints, spring, stops, _ground, mu, _pos, _turn, _omega, _g, _angles, _rates, _held, _leg, _step) = (
-        wp.grad(leg_action)(
-            own.geometry, own.masses, own.joints, load_spring(robot.table, leg, world),
-            load_stops(robot.table, leg, world), robot.ground, law.mu, base.pos, base.quat, base.ang,
-            wp.quat_rotate_inv(base.quat, gravity), angles, rates, held,
-            factors, dt,
-        )
-    )  # fmt: skip
-    add_geometry(sums, leg, geo)
-    add_masses(sums, leg, masses)
-    add_joints(sums, leg, joints)
-    add_spring(sums, leg, spring)
-    add_stops(sums, leg, stops)
+    add_geometry(sums, leg, found.geometry)
+    add_masses(sums, leg, found.masses)
+    add_joints(sums, leg, found.joints)
+    add_spring(sums, leg, found.spring)
+    add_stops(sums, leg, found.stops)
     for row in range(2):  # one of the two coefficients
         mu_row = leg * LEG_ROWS + wp.where(row == 0, int(MU_STATIC), int(MU_DYNAMIC))
-        add_entry(sums, mu_row, wp.where(law.mode != SEPARATE and law.mu_row == mu_row, mu, real(0.0)))
+        add_entry(sums, mu_row, wp.where(law.mode != SEPARATE and law.mu_row == mu_row, found.mu, real(0.0)))
