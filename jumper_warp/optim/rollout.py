@@ -1,7 +1,7 @@
 """Batches of rollouts with gradients: policy steps of filter, latency, motors and physics, forwards and backwards.
 
 A rollout of all worlds is one launch, and so is its reverse pass, on a CPU one for each thread; on a GPU the reverse
-pass is three launches for every few policy steps (`reverse_legs`). Nothing but a row of the state every few physics
+pass is four launches for every few policy steps (`reverse_legs`). Nothing but a row of the state every few physics
 steps and the paws' impulses is kept in between; see `kernels.dynamics.step_adjoint`.
 """
 

@@ -18,16 +18,41 @@ from .virtual_power import BaseFactors, BaseSeeds, LegFactors
 wp.set_module_options({"enable_backward": False, "fast_math": True})
 
 
+@wp.struct
+class Turn:
+    """A step of a span that one of the threads of a leg takes."""
+
+    step: int
+    entry: int  # of the record
+    weight: real  # 0 where a thread repeats the last step, as there are none left
+
+
+@wp.func
+def turns_of(timing: Timing, span: Span, turns: int) -> int:
+    """Return how many steps each of `turns` threads takes, one after the other."""
+    return ((span.end - span.begin) * timing.every + turns - 1) / turns
+
+
+@wp.func
+def turn_at(timing: Timing, span: Span, number: int) -> Turn:
+    """Return step `number` of a span."""
+    found = Turn()
+    end = span.end * timing.every
+    found.step = span.begin * timing.every + number
+    found.weight = wp.where(found.step < end, real(1.0), real(0.0))
+    found.step = wp.min(found.step, end - 1)
+    row = found.step / timing.every
+    found.entry = first_entry(timing, span, row) + found.step - row * timing.every
+    return found
+
+
 @wp.kernel
-def constants_kernel(
+def leg_constants_kernel(
     # in
     turns: int,
     robot: Robot,
     settings: StepSettings,
     timing: Timing,
-    actuation: Actuation,
-    commands: Commands,
-    safe: wp.array3d(dtype=real),
     rows: Rows,
     seeds: Rows,
     span: Span,
@@ -35,7 +60,7 @@ def constants_kernel(
     # in, out
     gradients: Gradients,
 ):
-    """Add the gradients by constants of legs and motors of the steps of a span; launch over (worlds, turns, 4).
+    """Add the gradients by constants of legs of the steps of a span; launch over (worlds, turns, 4).
 
     turns: threads that share the steps of a leg, 8 on a GPU, with a warp a world, and 1 on a CPU.
     """
@@ -43,10 +68,48 @@ def constants_kernel(
     world = settings.first + place
     dt = settings.dt
     own = load_leg(robot, world, leg)
+    sums = ThreadSums()
+    sums.parameters = gradients.parameters
+    sums.world = world
+    sums.adds = turn == 0
+    sums.turns = True
+    for number in range(turns_of(timing, span, turns)):
+        at = turn_at(timing, span, number * turns + turn)
+        sums.weight = at.weight
+        i = at.entry
+        base = get_base(record, i, world)
+        law = get_law(record, i, world, leg)
+        held = held_base(record, world, i, dt, base, get_base_weights(record, i, world))
+        weights = get_leg_weights(record, i, world, leg)
+        found = leg_gradient(robot, own, dt, world, leg, rows, seeds, at.step, i, record, base, law, held, weights)
+        add_leg_constants(sums, leg, law, found)
+
+
+@wp.kernel
+def motor_constants_kernel(
+    # in
+    turns: int,
+    settings: StepSettings,
+    timing: Timing,
+    actuation: Actuation,
+    commands: Commands,
+    safe: wp.array3d(dtype=real),
+    seeds: Rows,
+    span: Span,
+    record: LegRecord,
+    # in, out
+    gradients: Gradients,
+):
+    """Add those by constants of motors, launched likewise.
+
+    With those of the legs in one kernel, a GPU's threads would keep more at a time than its first cache holds.
+    """
+    place, turn, leg = wp.tid()
+    world = settings.first + place
     motors = wp.zeros(shape=(3,), dtype=MotorParams)
     for j in range(motors.shape[0]):
         motors[j] = load_world_motor(actuation, 3 * leg + j, world)
-    late = actuation.latency[world] / dt
+    late = actuation.latency[world] / settings.dt
     of_leg = ThreadSums()
     of_leg.parameters = gradients.parameters
     of_leg.world = world
@@ -55,34 +118,23 @@ def constants_kernel(
     of_legs = of_leg
     of_legs.adds = turn == 0 and leg == 0
     of_legs.legs = True
-    begin = span.begin * timing.every
-    end = span.end * timing.every
-    for number in range((end - begin + turns - 1) / turns):
-        step = begin + number * turns + turn
-        of_leg.weight = wp.where(step < end, real(1.0), real(0.0))
-        of_legs.weight = of_leg.weight
-        step = wp.min(step, end - 1)
-        row = step / timing.every
-        i = first_entry(timing, span, row) + step - row * timing.every
-        base = get_base(record, i, world)
-        law = get_law(record, i, world, leg)
-        held = held_base(record, world, i, dt, base, get_base_weights(record, i, world))
-        weights = get_leg_weights(record, i, world, leg)
-        found = leg_gradient(robot, own, dt, world, leg, rows, seeds, step, i, record, base, law, held, weights)
-        add_leg_constants(of_leg, leg, law, found)
-        angles = get_vec(record, i, ANGLES, world, leg)
-        rates = get_vec(record, i, RATES, world, leg)
-        torque = dt * weights.rates
+    for number in range(turns_of(timing, span, turns)):
+        at = turn_at(timing, span, number * turns + turn)
+        of_leg.weight = at.weight
+        of_legs.weight = at.weight
+        angles = get_vec(record, at.entry, ANGLES, world, leg)
+        rates = get_vec(record, at.entry, RATES, world, leg)
+        torque = settings.dt * get_leg_weights(record, at.entry, world, leg).rates
         if seeds.torque.shape[0] > 0:
-            torque += row_vec3(seeds.torque, step, 3 * leg, world)
+            torque += row_vec3(seeds.torque, at.step, 3 * leg, world)
         for c in range(motors.shape[0]):
             by_motor = motor_gradient(
-                motors[c], late, commands, safe, timing, dt, step, 3 * leg + c, world, angles[c], rates[c]
+                motors[c], late, commands, safe, timing, settings.dt, at.step, 3 * leg + c, world, angles[c], rates[c]
             )
             add_motor_constants(of_leg, of_legs, 3 * leg + c, torque[c], by_motor)
         by_filter = vec3(real(0.0))
-        if actuation.filtered != 0 and step - (step / timing.substeps) * timing.substeps == 0:
-            by_filter = get_vec(record, i, FILTER, world, leg)
+        if actuation.filtered != 0 and at.step - (at.step / timing.substeps) * timing.substeps == 0:
+            by_filter = get_vec(record, at.entry, FILTER, world, leg)
         add_offsets(of_leg, leg, by_filter)
 
 

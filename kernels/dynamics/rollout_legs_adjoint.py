@@ -1,7 +1,7 @@
 """`rollout_adjoint` for GPUs: four threads a world, a thread a leg; a few rows at a time, from the last to the first.
 
-Three launches take the steps between these rows: they are made again, each row by threads of its own, run backwards one
-by one, and then once more side by side for the gradients by parameters (`constants_adjoint`).
+Four launches take the steps between these rows: they are made again, each row by threads of its own, run backwards one
+by one, and then twice more side by side for the gradients by parameters (`constants_adjoint`).
 """
 
 import warp as wp
