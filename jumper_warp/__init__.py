@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import os
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -23,6 +24,12 @@ _PLACES = {
 }
 """Modules of the names below; each is imported when a name of it is first used."""
 __all__ = list(_PLACES)
+
+
+# On a CPU torch's threads stay awake for milliseconds after each operation, on cores that the simulation's need next.
+# libgomp reads this when torch is loaded; 20,000 rounds are some 0.1 ms.
+if "OMP_WAIT_POLICY" not in os.environ:
+    os.environ.setdefault("GOMP_SPINCOUNT", "20000")
 
 
 def __getattr__(name: str) -> Any:

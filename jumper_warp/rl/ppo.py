@@ -30,6 +30,7 @@ from jumper_warp.rl.networks import ActorCritic
 from jumper_warp.rl.rollout import Collector
 from jumper_warp.rl.samples import Batch, Sampler
 from jumper_warp.rl.state_checks import check_ppo
+from jumper_warp.utils.allocator import keep_freed_memory
 
 STATISTICS = ("surrogate", "value", "entropy", "asymmetry", "kl", "gradient_actor", "gradient_critic", "skipped")
 """What `Ppo.statistics` averages over minibatches; skipped is the share of steps with a non-finite gradient,
@@ -56,6 +57,8 @@ class Ppo:
         cuda = env.device.type == "cuda"
         if cuda:
             torch.set_float32_matmul_precision("high" if cfg.tf32 else "highest")
+        else:
+            keep_freed_memory()
         num_critic_obs = env.num_critic_obs if cfg.asymmetric else env.num_obs
         symmetry = None if cfg.symmetry == "off" else symmetry_of(env)
         self.model = ActorCritic(

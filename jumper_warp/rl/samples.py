@@ -16,6 +16,9 @@ from jumper_warp.rl.networks import ActorCritic, gaussian_log_prob, joint_moment
 from jumper_warp.rl.passes import DTYPES, forward
 from jumper_warp.rl.rollout import Pair, RolloutBuffer, normalised
 
+CPU_ROWS = 4096
+"""Samples that a CPU takes at a time, so that what is made of them stays in its caches."""
+
 
 class Batch(NamedTuple):
     """Samples to learn from; first axis: sample."""
@@ -126,14 +129,15 @@ class Sampler:
         """(steps · worlds, columns of `layout`), time-major."""
         self.old_log_std = torch.zeros_like(rollout.log_std)
         """Of the policy that acted."""
+        self._rows = CPU_ROWS if self.rows.device.type == "cpu" else None
         self._estimate, self._pack = compiler(_estimate), compiler(_pack)
 
     @torch.no_grad()
     def pack(self) -> None:
         """Write the rollout to `rows` and take it into the running statistics."""
         model = self._model
-        scaling = model.obs_moments.scaling()  # with which the policy acted
-        estimates, own = self._estimates()
+        scalings = self._scalings()  # with which actor and critic acted
+        estimates, own = self._estimates(scalings[1])
         of_advantage, of_target, of_obs, of_critic_obs = joint_moments(own, self.rows.shape[0])
         if self._obs_image is not None:
             of_obs = (*self._obs_image.moments(*of_obs[:2]), of_obs[2])
@@ -142,71 +146,80 @@ class Sampler:
         if self._cfg.normalise_value:
             model.value_moments.take(of_target)
         mean, var, count = of_advantage
-        self._write(scaling, estimates, (mean.float(), ((var * count / (count - 1)).sqrt() + 1.0e-8).float()))
+        self._write(scalings, estimates, (mean.float(), ((var * count / (count - 1)).sqrt() + 1.0e-8).float()))
         self.old_log_std.copy_(self._rollout.log_std)
 
     @torch.no_grad()
     def rehearse(self) -> None:
         """Compile, as if a rollout were packed; spoils `rows`."""
-        scaling = self._model.obs_moments.scaling()
-        self._write(scaling, self._estimates()[0], self._model.value_moments.scaling())
+        scalings = self._scalings()
+        self._write(scalings, self._estimates(scalings[1])[0], self._model.value_moments.scaling())
 
-    def _estimates(self) -> tuple[tuple[torch.Tensor, ...], list[Pair]]:
-        rollout, model = self._rollout, self._model
+    def _scalings(self) -> tuple[Pair, Pair]:
+        return self._model.obs_moments.scaling(), self._model.critic_moments.scaling()
+
+    def _estimates(self, critic_scaling: Pair) -> tuple[tuple[torch.Tensor, ...], list[Pair]]:
+        rollout, of_value = self._rollout, self._model.value_moments.scaling()
         experience = (rollout.critic_obs, rollout.final_critic_obs, rollout.reward, rollout.done, rollout.timeout)
-        scalings = (model.critic_moments.scaling(), model.value_moments.scaling())
-        return self._estimate(experience, rollout.obs, self._critic, *scalings, self._cfg)
+        return self._estimate(experience, rollout.obs, self._critic, critic_scaling, of_value, self._cfg, self._rows)
 
-    def _write(self, scaling: Pair, estimates: tuple[torch.Tensor, ...], advantage_scaling: Pair) -> None:
+    def _write(self, scalings: tuple[Pair, Pair], estimates: tuple[torch.Tensor, ...], advantage_scaling: Pair) -> None:
         rollout = self._rollout
-        acted = (rollout.obs, rollout.action, rollout.mean, rollout.log_std)
+        acted = (rollout.obs, rollout.critic_obs, rollout.action, rollout.mean, rollout.log_std)
         target_scaling = self._model.value_moments.scaling() if self._cfg.normalise_value else None
-        self._pack(self.rows, self.layout, acted, scaling, estimates, advantage_scaling, target_scaling)
+        self._pack(self.rows, self.layout, acted, scalings, estimates, advantage_scaling, target_scaling, self._rows)
 
 
 def _estimate(
     experience: tuple[torch.Tensor, ...], obs: torch.Tensor, critic: Layers, critic_scaling: Pair, value_scaling: Pair,
-    cfg: PpoCfg,
+    cfg: PpoCfg, rows: int | None,
 ) -> tuple[tuple[torch.Tensor, ...], list[Pair]]:  # fmt: skip
     """Return what the critic makes of a rollout, and moments of it.
 
-    experience: critic_obs, final_critic_obs, reward, done and timeout of a `RolloutBuffer`.
+    experience: critic_obs, final_critic_obs, reward, done and timeout of a `RolloutBuffer`; rows: at a time.
 
     Returns:
-        The critic's features (samples, columns), its output, advantages and returns (samples,); and mean and variance
-        of advantages, returns, observations and the critic's observations.
+        The critic's output, advantages and returns (samples,); and mean and variance of advantages, returns,
+        observations and the critic's observations.
     """
     critic_obs, final_critic_obs, reward, done, timeout = experience
     columns, dtype = critic.weights[0].shape[1], DTYPES[cfg.precision]
 
-    def head(raw: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        features = normalised(sanitise(raw.flatten(0, 1)), critic_scaling, columns)
-        return features, forward(critic, features, dtype)[0].view(raw.shape[:2])
+    def head(raw: torch.Tensor) -> torch.Tensor:
+        parts = _parts(raw.flatten(0, 1), rows)
+        found = [forward(critic, normalised(sanitise(part), critic_scaling, columns), dtype)[0] for part in parts]
+        return torch.cat(found).view(raw.shape[:2])
 
-    features, now = head(critic_obs)
-    _, final = head(final_critic_obs)
+    now, final = head(critic_obs), head(final_critic_obs)
     now_value, final_value = (x * value_scaling[1] + value_scaling[0] for x in (now, final))
     advantage, target = gae(reward + cfg.gamma * timeout * final_value, done, now_value, cfg.gamma, cfg.lam)
-    samples = reward.numel()
-    own = [
-        own_moments(x) for x in (advantage.flatten(), target.flatten(), obs[:-1].flatten(0, 1),
-                                 critic_obs[:-1].flatten(0, 1))
-    ]  # fmt: skip
-    return (features[:samples], now[:-1].flatten(), advantage.flatten(), target.flatten()), own
+    seen = (obs[:-1].flatten(0, 1), critic_obs[:-1].flatten(0, 1))
+    own = [own_moments(x, rows) for x in (advantage.flatten(), target.flatten(), *seen)]
+    return (now[:-1].flatten(), advantage.flatten(), target.flatten()), own
 
 
 def _pack(
-    rows: torch.Tensor, layout: RowLayout, acted: tuple[torch.Tensor, ...], scaling: Pair,
-    estimates: tuple[torch.Tensor, ...], advantage_scaling: Pair, target_scaling: Pair | None,
+    rows: torch.Tensor, layout: RowLayout, acted: tuple[torch.Tensor, ...], scalings: tuple[Pair, Pair],
+    estimates: tuple[torch.Tensor, ...], advantage_scaling: Pair, target_scaling: Pair | None, count: int | None,
 ) -> None:  # fmt: skip
-    """Write samples to rows; acted: obs, action, mean and log_std of a `RolloutBuffer`, estimates: of `_estimate`."""
-    obs, action, mean, log_std = acted
-    critic_features, value, advantage, target = estimates
+    """Write samples to rows, so many at a time.
+
+    acted: obs, critic_obs, action, mean and log_std of a `RolloutBuffer`; estimates: of `_estimate`.
+    """
+    obs, critic_obs, action, mean, log_std = acted
+    value, advantage, target = estimates
     if target_scaling is not None:
         target = (target - target_scaling[0]) / target_scaling[1]
-    log_prob = gaussian_log_prob(action, mean, log_std).flatten()
-    features = normalised(obs[:-1].flatten(0, 1), scaling, layout.num_obs)
     advantage = (advantage - advantage_scaling[0]) / advantage_scaling[1]
-    critic_features = critic_features[:, : layout.num_critic_obs]
-    acting = (action.flatten(0, 1), mean.flatten(0, 1), log_prob)
-    rows.copy_(layout.pack(Batch(features, critic_features, *acting, value, advantage, target)))
+    pieces = [x.flatten(0, 1) for x in (obs[:-1], critic_obs[:-1], action, mean)] + [value, advantage, target]
+    for into, *part in zip(_parts(rows, count), *(_parts(x, count) for x in pieces), strict=True):
+        seen, critic_seen, acting, meant, worth, gain, goal = part
+        features = normalised(seen, scalings[0], layout.num_obs)
+        critic_features = normalised(critic_seen, scalings[1], layout.num_critic_obs)
+        log_prob = gaussian_log_prob(acting, meant, log_std)
+        into.copy_(layout.pack(Batch(features, critic_features, acting, meant, log_prob, worth, gain, goal)))
+
+
+def _parts(x: torch.Tensor, rows: int | None) -> tuple[torch.Tensor, ...]:
+    """Return views of so many rows each, or of all."""
+    return x.split(rows or x.shape[0])

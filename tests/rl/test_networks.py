@@ -1,8 +1,9 @@
 import numpy as np
+import pytest
 import torch
 
 from jumper_warp.envs.vec_env import sanitise
-from jumper_warp.rl.networks import ActorCritic, RunningMoments, gaussian_kl, gaussian_log_prob
+from jumper_warp.rl.networks import ActorCritic, RunningMoments, gaussian_kl, gaussian_log_prob, own_moments
 
 
 def test_log_density_and_divergence_equal_torch():
@@ -27,6 +28,14 @@ def test_moments_equal_numpy_over_all_batches():
     scaled = moments.normalise(torch.from_numpy(batches[1]))
     np.testing.assert_allclose(scaled, (batches[1] - everything.mean(0)) / np.sqrt(everything.var(0) + 1e-5), atol=1e-4)
     np.testing.assert_allclose(moments.restore(scaled), batches[1], rtol=1e-5)
+
+
+@pytest.mark.parametrize("rows", [None, 1, 64, 200, 1000])
+def test_moments_of_a_batch_do_not_depend_on_the_rows_at_a_time(rows):
+    batch = np.random.default_rng(0).normal(50.0, (1.0, 5.0), (200, 2)).astype(np.float32)
+    mean, var = own_moments(torch.from_numpy(batch), rows)
+    np.testing.assert_allclose(mean, batch.astype(float).mean(0), rtol=1e-6)
+    np.testing.assert_allclose(var, batch.astype(float).var(0), rtol=1e-5)
 
 
 def test_moments_start_as_identity():

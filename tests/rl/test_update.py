@@ -78,6 +78,22 @@ def learnt(cfg, device="cpu"):
     return ppo, before, batch, ppo._orders.clone()
 
 
+@pytest.mark.parametrize("rows", [1, 7, None])
+def test_samples_do_not_depend_on_how_many_are_taken_at_a_time(rows):
+    torch.manual_seed(0)
+    ppo = Ppo(PushTask(WORLDS), CFG)
+    fill(ppo, slice(None), WORLDS)
+    fresh = {name: value.clone() for name, value in ppo.model.state_dict().items()}
+    ppo.batch()
+    at_once = ppo.sampler.rows.clone()
+    ppo.model.load_state_dict(fresh)
+    ppo.sampler.rows.zero_()
+    ppo.sampler._rows = rows
+    ppo.batch()
+    torch.testing.assert_close(ppo.sampler.rows, at_once, atol=1e-5, rtol=1e-5)
+    assert at_once.abs().max() > 0.5
+
+
 @pytest.mark.parametrize(
     "change",
     [
