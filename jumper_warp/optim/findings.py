@@ -60,8 +60,8 @@ class Identification:
     mismatch: float
     """[1] Factor by which the model's errors widen all intervals at least, from 1."""
     systematic: np.ndarray
-    """(P,) Standard deviations, normalised, from how channels of motions contradict each other; 0 if the model explains
-    them."""
+    """(P,) Standard deviations, normalised, from how channels and motions contradict each other; 0 if the model
+    explains them."""
     chi2: float
     """Mean squared weighed residual of the data."""
     nominal_chi2: float
@@ -90,7 +90,7 @@ class Identification:
     def deviations(self) -> np.ndarray:
         """Standard deviations in deviations of the prior, errors of the model included, at most 1, (P,)."""
         noise = self.mismatch * np.sqrt(np.diag(self.covariance))
-        return np.minimum(np.maximum(noise, self.systematic), 1.0)
+        return np.minimum(np.hypot(noise, self.systematic), 1.0)
 
     @property
     def intervals(self) -> np.ndarray:

@@ -77,18 +77,36 @@ def mismatch_factor(tables: Sequence[np.ndarray]) -> float:
 
 
 def systematic_deviations(normal: Normal, columns: Sequence[np.ndarray], covariance: np.ndarray) -> np.ndarray:
-    """Return standard deviations (P,) from how far single channels of the motions pull the parameters apart.
+    """Return standard deviations (P,) from how far single channels, and single motions, pull the parameters.
 
-    Each channel of each motion (a motor's angle, say) is taken as one independent voice, whatever its errors are
-    (the cluster-robust sandwich estimate). columns: of each motion's residuals, (m,).
+    An error of the model is no noise: it pulls again in each row. So each channel of each motion (a motor's angle, say)
+    is one voice, and each motion is another; what leaving one out would change, to first order, adds up to the
+    jackknife's estimate, as the cluster-robust one of regression (CR3: Bell & McCaffrey 2002). The two are added, as
+    an error may be alike in all channels of a motion.
+
+    columns: of each motion's residuals, (m,).
     """
-    size, scores = len(covariance), []
-    for found, own, mixed, column in zip(normal.linearised, normal.start_matrices, normal.mixed, columns, strict=True):
+    size, known = len(covariance), np.linalg.inv(covariance)
+    channels: list[np.ndarray] = []
+    motions: list[np.ndarray] = []
+    parts = zip(normal.linearised, normal.weights, normal.start_matrices, normal.mixed, columns, strict=True)
+    for found, weight, own, mixed, column in parts:
+        root = np.sqrt(weight)
         alone = found.jacobian[:, :size] - found.jacobian[:, size:] @ np.linalg.solve(own, mixed.T)
-        score = alone * found.residual[:, None]
-        scores += [score[column == i].sum(axis=0) for i in np.unique(column)]
-    pulls = covariance @ np.array(scores).T
-    return np.sqrt(np.sum(pulls**2, axis=1))
+        alone, residual = root[:, None] * alone, root * found.residual
+        channels += [_pull(known, alone[column == i], residual[column == i]) for i in np.unique(column)]
+        motions.append(_pull(known, alone, residual))
+    return np.sqrt(_jackknife(channels) + _jackknife(motions))
+
+
+def _pull(known: np.ndarray, jacobian: np.ndarray, residual: np.ndarray) -> np.ndarray:
+    """Return by how much (P,) parameters would change without some residuals; known: information of all, (P, P)."""
+    return np.linalg.solve(known - jacobian.T @ jacobian, jacobian.T @ residual)
+
+
+def _jackknife(pulls: Sequence[np.ndarray]) -> np.ndarray:
+    """Return the variance (P,) of what each of some groups pulls at; 0 for a single one."""
+    return (len(pulls) - 1.0) / len(pulls) * np.sum(np.square(pulls), axis=0)
 
 
 def weak_directions(parameters: ParameterSet, information: np.ndarray) -> tuple[Direction, ...]:
