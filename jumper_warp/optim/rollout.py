@@ -330,7 +330,7 @@ class Rollout:
             settings.first = worlds.first
             wp.launch(
                 kernel, dim=worlds.count, inputs=[self.dynamics.robot, settings, *inputs], outputs=outputs,
-                device=self.device, block_dim=32,
+                device=self.device, block_dim=32 if self.device.is_cuda else 1,
             )  # fmt: skip
 
         jobs: list[Callable[[], None]] = [partial(launch, worlds) for worlds in self.slices]

@@ -302,7 +302,7 @@ class JumperDynamics:
         """Return the kernel that `advance` launches, and its block size."""
         if self.device.is_cuda if by_legs is None else by_legs:
             return self.modules.advance_legs.advance_legs_kernel, 32 if self.device.is_cuda else 4
-        return self.modules.advance.advance_kernel, 32
+        return self.modules.advance.advance_kernel, 32 if self.device.is_cuda else 1
 
     def advance(
         self, settings: Any, drive: Any, q: wp.array, qd: wp.array, q_out: wp.array, qd_out: wp.array,
