@@ -212,7 +212,7 @@ def _pack(
         target = (target - target_scaling[0]) / target_scaling[1]
     advantage = (advantage - advantage_scaling[0]) / advantage_scaling[1]
     pieces = [x.flatten(0, 1) for x in (obs[:-1], critic_obs[:-1], action, mean)] + [value, advantage, target]
-    for into, *part in zip(_parts(rows, count), *(_parts(x, count) for x in pieces), strict=True):
+    for into, *part in zip(_parts(rows, count), *[_parts(x, count) for x in pieces], strict=True):
         seen, critic_seen, acting, meant, worth, gain, goal = part
         features = normalised(seen, scalings[0], layout.num_obs)
         critic_features = normalised(critic_seen, scalings[1], layout.num_critic_obs)
