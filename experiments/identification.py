@@ -49,6 +49,8 @@ class Args:
 
     seeds: int = 20
     """Robots that are identified on the simulator that recorded them."""
+    others: int = 1
+    """Robots of each part whose truth is not that of the model: fine, rough, mujoco. Figures are of the first."""
     parts: tuple[Part, ...] = PARTS
     """What is run."""
     fine_dt: float = 1.0 / 3840.0
@@ -64,8 +66,10 @@ class Args:
 
     def __post_init__(self) -> None:
         """Check the values."""
-        if self.seeds < 1 or self.jumps < 3:
-            raise InputError(f"need at least 1 seed and 3 jumps, got {self.seeds}, {self.jumps}")
+        if self.seeds < 1 or self.others < 1 or self.jumps < 3:
+            raise InputError(
+                f"need at least 1 seed, 1 other and 3 jumps, got {self.seeds}, {self.others}, {self.jumps}"
+            )
 
 
 def policy_errors(args: Args, case: Case, found: Identification, folder: Path) -> dict[str, float]:
@@ -129,10 +133,14 @@ def main(args: Args) -> dict[str, Any]:
         ("mujoco", by_mujoco, ours, None),
     ):
         if part in args.parts:
-            case = make_case(parameters, 100, carry, replay)
-            figures, found = run_case(parameters, case, replay, model, dt)
-            values |= {f"{part}_{name}": value for name, value in figures.items()}
-            print(part, {name: round(value, 4) for name, value in figures.items()}, flush=True)
+            found_of = []
+            for seed in range(100, 100 + args.others):
+                figures, _ = run_case(parameters, make_case(parameters, seed, carry, replay), replay, model, dt)
+                found_of.append(figures)
+                print(part, {name: round(value, 4) for name, value in figures.items()}, flush=True)
+            values |= {f"{part}_{name}": value for name, value in found_of[0].items()}
+            for name in ("coverage", "identified"):
+                values[f"{part}_{name}_of_seeds"] = [figures[name] for figures in found_of]
     if "methods" in args.parts and last:
         values |= compare_methods(parameters, last[0], replay, ours, last[1].seconds)
     if "policy" in args.parts and last:

@@ -27,7 +27,7 @@ __all__ = list(_PLACES)
 
 
 # On a CPU torch's threads stay awake for milliseconds after each operation, on cores that the simulation's need next.
-# libgomp reads this when torch is loaded; 20,000 rounds are some 0.1 ms.
+# libgomp reads this when torch is loaded; its own count of rounds is 300,000.
 if "OMP_WAIT_POLICY" not in os.environ:
     os.environ.setdefault("GOMP_SPINCOUNT", "20000")
 
