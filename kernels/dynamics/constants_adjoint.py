@@ -145,4 +145,6 @@ def adjoints_kernel(
 ):  # fmt: skip
     """Never launched: a kernel with a backward pass makes Warp generate the adjoints of all that it calls."""
     world = wp.tid()
-    sums[world] = everything(factors, base, base_seeds, robot, actuation, numbers, state, world)
+    launched = int(0)  # Warp makes the adjoints anyway, and the compiler drops this kernel's own code
+    if launched > 0:
+        sums[world] = everything(factors, base, base_seeds, robot, actuation, numbers, state, world)
