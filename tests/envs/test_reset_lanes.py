@@ -5,6 +5,7 @@ import pytest
 import warp as wp
 
 from jumper_warp.envs.env import Env
+from jumper_warp.evaluation.soak import hardest
 from jumper_warp.registry import make_task
 from kernels.mdp.attempts import LANES
 
@@ -24,7 +25,7 @@ def reset_by(env, lanes):
 
 @pytest.mark.parametrize("name", ["velocity-rough", "horizontal-jump"])
 def test_threads_of_a_world_find_what_one_finds(name, monkeypatch):
-    env = Env(make_task(name), N, seed=3, device="cpu", randomize=False, noise=False)
+    env = Env(hardest(make_task(name)), N, seed=3, device="cpu", randomize=False, noise=False)
     env.reset()
     alone = reset_by(env, 1)
     monkeypatch.setattr(wp.config, "enable_cpu_blocks", True)
