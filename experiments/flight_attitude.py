@@ -1,7 +1,7 @@
 """Turning upright in a long flight on Mars: tilted takeoffs, with and without turning, and how they are landed.
 
     python experiments/flight_attitude.py --policy attitude --flights 100 --out outputs/flight
-    python experiments/flight_attitude.py --policy logs/attitude/<run> --landing vertical_jump_mars --late 20
+    python experiments/flight_attitude.py --takeoff policy --landing mars_vertical_jump --randomize
 
 Robots squat and extend their legs (24.8 N m, kp 20, 3.71 m/s^2), some a few milliseconds later than others, which
 throws them up tilting and turning. In flight the policy that was trained to turn in zero gravity takes over, with the
@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 import torch
@@ -47,16 +48,20 @@ class Args(EvaluationArgs):
     """Number of flights."""
     late: float = 15.0
     """[ms] Most by which the legs of one end, or side, extend later than the others."""
-    apex: float = 2.5
-    """[m] Height that the landing policy is told."""
+    takeoff: Literal["open-loop", "policy"] = "open-loop"
+    """How robots take off: with legs that extend unequally, or by the policy that lands."""
+    heights: tuple[float, float] = (2.5, 2.5)
+    """[m] Lowest and highest that the policy which lands is told."""
 
     def __post_init__(self) -> None:
         """Check the values."""
         super().__post_init__()
         if self.flights < 1 or not 0.0 <= self.late <= 100.0:
             raise InputError(f"need at least one flight, and late in 0 to 100 ms, got {self.flights}, {self.late}")
-        if not 0.3 <= self.apex <= 10.0:
-            raise InputError(f"apex must be in 0.3 to 10 m, got {self.apex}")
+        if not 0.3 <= self.heights[0] <= self.heights[1] <= 10.0:
+            raise InputError(f"heights must be in 0.3 to 10 m and rise, got {self.heights}")
+        if self.takeoff == "policy" and not self.landing:
+            raise InputError("takeoff by a policy needs one: --landing")
 
 
 class FlightRun(Run):
@@ -124,12 +129,14 @@ def plot(run: Run, found: dict[str, EvaluationLog]) -> None:
 def main(args: Args) -> dict:
     """Run the test and return its figures."""
     run = FlightRun(args)
-    env, late = run.env(args.flights), delays(args.flights, 1.0e-3 * args.late, args.seed)
+    env, heights = run.env(args.flights), np.linspace(*args.heights, args.flights)
+    late = delays(args.flights, 1.0e-3 * args.late, args.seed) if args.takeoff == "open-loop" else None
     found = {
-        name: run.fly(env, Flights(late, args.apex, turns=name == "turning"), name) for name in ("turning", "without")
+        name: run.fly(env, Flights(heights, late, turns=name == "turning"), name) for name in ("turning", "without")
     }
     plot(run, found)
-    values = {"late_ms": args.late, "landing": args.landing or "default pose"} | flight_metrics(found["turning"])
+    told = {"takeoff": args.takeoff, "landing": args.landing or "default pose"}
+    values = told | ({} if late is None else {"late_ms": args.late}) | flight_metrics(found["turning"])
     values |= {f"without_turning_{name}": value for name, value in flight_metrics(found["without"]).items()}
     return run.report(values, {})
 

@@ -31,6 +31,8 @@ REST_TIME = 1.0
 """[s] After touchdown, when it should be."""
 DELAY = 0.5
 """[s] Until the jump is commanded."""
+LOWEST, HIGHEST, ABOVE = -0.37, 1.47, 0.45
+"""[m] What pictures of a jump show at least, from the ground before it up, and what they leave above the base."""
 SHOWN_HEIGHT = 1.0
 """[m] The filmstrip shows the jump nearest to this."""
 
@@ -168,8 +170,15 @@ class Jumps(EvaluationLog):
         height = film.base(index)[:, 2]
         frames = moments(height, round(DELAY / film.env.step_dt) - 1)
         captions = [f"{(frame + 1) * film.env.step_dt:.2f} s, {height[frame]:.2f} m" for frame in frames]
-        view = {"eye": (1.5, 2.0, 0.9), "target": (0.0, 0.0, 0.55), "size": (320, 420)}
-        return Strip(index, frames, captions, **view, name=f"jump_{targets[index]:.2f}_m")
+        eye, target, size = view_of(float(height[frames].max()))
+        return Strip(index, frames, captions, eye, target, size, name=f"jump_{targets[index]:.2f}_m")
+
+
+def view_of(apex: float) -> tuple[tuple[float, float, float], tuple[float, float, float], tuple[int, int]]:
+    """Return eye and target [m] and size [px] of pictures of a jump to an apex [m], as tall as it needs, one scale."""
+    taller = max(1.0, (apex + ABOVE - LOWEST) / (HIGHEST - LOWEST))
+    middle = 0.5 * (LOWEST + LOWEST + taller * (HIGHEST - LOWEST))
+    return (1.5 * taller, 2.0 * taller, middle + 0.35 * taller), (0.0, 0.0, middle), (320, round(420 * taller))
 
 
 def run_jumps(

@@ -22,7 +22,7 @@ def flown():
     """Robots that jump tilted and do nothing in flight: the environment, the flights, and their skills over time."""
     tasks, handovers = flight_skills(make_task("vertical-jump-mars"), make_task("attitude"))
     env = Env(tasks, N, device="cpu", randomize=False, noise=False, auto_reset=False, handovers=handovers)
-    flights, seen = Flights(LATE, apex=2.5), []
+    flights, seen = Flights(np.full(len(LATE), 2.5), LATE), []
     flights.begin(env)
     for _ in range(round(flights.seconds / env.step_dt)):
         action = torch.tensor(flights.action(90.0, None), dtype=torch.float32)

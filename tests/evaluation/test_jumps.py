@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from jumper_warp.evaluation.heights import jump_metrics
-from jumper_warp.evaluation.jumps import Jumps
+from jumper_warp.evaluation.jumps import Jumps, view_of
+from jumper_warp.viz.snapshot import FIELD_OF_VIEW
 
 
 def step_of(jumps, **changes):
@@ -111,3 +112,17 @@ def test_a_jump_to_another_height_is_a_miss_and_no_fall():
     jumps.update(step_of(jumps, ending=[0, 1, -1], phase=[2, 2, 2], phase_steps=[0, 3, 60]), 1.0 / 60.0)
     metrics = jump_metrics(jumps, (0.5, 1.1))
     assert [metrics[name] for name in ("success_rate", "fall_rate", "miss_rate")] == pytest.approx([1 / 3] * 3)
+
+
+@pytest.mark.parametrize("apex", [0.5, 1.0, 3.6])
+def test_pictures_show_a_jump_from_the_ground_to_its_apex(apex):
+    eye, target, (width, height) = view_of(apex)
+    axis = np.subtract(target, eye) / np.linalg.norm(np.subtract(target, eye))
+    for z in (0.0, apex + 0.2):
+        ray = np.subtract((0.0, 0.0, z), eye)
+        assert np.arccos(axis @ ray / np.linalg.norm(ray)) < 0.5 * FIELD_OF_VIEW
+    # the same pixels a metre
+    assert np.linalg.norm(np.subtract(target, eye)) / height == pytest.approx(
+        np.linalg.norm([1.5, 2.0, 0.35]) / 420, rel=1e-3
+    )
+    assert width == 320 and (apex > 1.02 or height == 420)

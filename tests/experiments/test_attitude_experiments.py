@@ -41,11 +41,34 @@ def test_flights_are_flown_with_turning_and_without(run, tmp_path):
     assert (tmp_path / "flights.png").is_file() and (tmp_path / "turning.rrd").stat().st_size > 10_000
 
 
+def test_a_policy_takes_off_to_its_heights_and_lands(run, tmp_path):
+    args = flight_attitude.Args(
+        policy=str(run), takeoff="policy", landing="mars_vertical_jump", heights=(1.5, 2.0), flights=2, record=0,
+        out=tmp_path, device="cpu",
+    )  # fmt: skip
+    values = flight_attitude.main(args)
+    assert (
+        values["without_turning_landed_upright_rate"] == 1.0 and values["without_turning_mean_abs_height_error_m"] < 0.1
+    )
+    assert values["mean_apex_m"] == pytest.approx(1.75, abs=0.2) and "late_ms" not in values
+    assert values["max_angular_momentum_change_in_flight_nm_s"] < 1.0e-4
+    assert (
+        0.0
+        < values["without_turning_mean_touchdown_turn_deg"]
+        <= values["without_turning_max_touchdown_turn_deg"]
+        < 20.0
+    )
+
+
 def test_what_cannot_be_is_refused(tmp_path):
     with pytest.raises(InputError, match="turns must be at least 6"):
         attitude.Args(turns=3)
     with pytest.raises(InputError, match="late in 0 to 100 ms"):
         flight_attitude.Args(late=200.0)
+    with pytest.raises(InputError, match="takeoff by a policy needs one"):
+        flight_attitude.Args(takeoff="policy")
+    with pytest.raises(InputError, match="heights must be in"):
+        flight_attitude.Args(heights=(2.0, 1.0))
     with pytest.raises(PolicyError, match="evaluated by attitude"):
         attitude.main(attitude.Args(policy="vertical_jump", out=tmp_path, device="cpu"))
     with pytest.raises(PolicyError, match="needs a policy that turns in flight"):
