@@ -1,0 +1,58 @@
+"""How quietly squats are held: figures by hand, and the experiment at a tiny size."""
+
+import json
+
+import numpy as np
+import pytest
+
+from experiments import squat_hold
+from jumper_warp.evaluation.holds import Holds, hold_metrics
+from jumper_warp.utils.errors import InputError
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+
+def held(steps, **changes):
+    """Return three robots, the last of which ends; steps: forces (4,) of the first two in turn; torques are 0 and 2."""
+    holds = Holds(np.zeros((3, 3)), hold=1.5, window=2.0 / 60.0)
+    for step, force in enumerate(steps):
+        arrays = {
+            "force": np.tile(force, (3, 1)), "peak": np.tile(force, (3, 1)) + [[1.0], [2.0], [900.0]],
+            "torque": np.full((3, 12), 2.0 * (step % 2)), "ending": np.array([-1, -1, step - 2]),
+        }  # fmt: skip
+        holds.update(arrays | changes, 1.0 / 60.0)
+    return holds
+
+
+def test_figures_against_hand_numbers():
+    holds = held([np.full(4, 500.0), np.full(4, 40.0), np.array([40.0, 43.0, 40.0, 0.0])])
+    np.testing.assert_array_equal(holds.over, [False, False, True])
+    # the last two steps: the fourth paw between its peak of 40 + 1 or 2 and 0
+    np.testing.assert_allclose(holds.force_range, [41.0, 42.0])
+    np.testing.assert_allclose(holds.torque_ripple, 1.0)
+    metrics = hold_metrics(holds)
+    assert metrics["holding_rate"] == pytest.approx(2.0 / 3.0) and metrics["lost_paw_share"] == 1.0 / 8.0
+    assert (metrics["mean_paw_force_range_n"], metrics["max_paw_force_range_n"]) == (41.5, 42.0)
+
+
+def test_robots_that_do_not_hold_have_no_forces():
+    metrics = hold_metrics(held([np.ones(4)] * 2, ending=np.zeros(3)))
+    assert metrics["holding_rate"] == 0.0
+    assert all(value is None for name, value in metrics.items() if name not in ("squats", "holding_rate"))
+
+
+@pytest.mark.parametrize("policy", ["vertical_jump", "horizontal_jump"])
+def test_shipped_policies_hold_their_squats(policy, tmp_path):
+    args = squat_hold.Args(policy=policy, squats=2, record=0, out=tmp_path, device="cpu")
+    values = squat_hold.main(args)
+    assert values == json.loads((tmp_path / "figures.json").read_text())
+    assert values["holding_rate"] == 1.0 and values["lost_paw_share"] == 0.0
+    assert 0.0 < values["max_paw_force_range_n"] < 1.0
+    assert (tmp_path / "hold.png").is_file()
+
+
+def test_what_cannot_be_is_refused():
+    with pytest.raises(InputError, match="need at least one squat"):
+        squat_hold.Args(hold=0.5)
+    with pytest.raises(InputError, match="height must be in"):
+        squat_hold.Args(height=(1.0, 0.5))
