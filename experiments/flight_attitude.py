@@ -7,7 +7,8 @@ Robots squat and extend their legs (24.8 N m, kp 20, 3.71 m/s^2), some a few mil
 throws them up tilting and turning. In flight the policy that was trained to turn in zero gravity takes over, with the
 level orientation as its goal; 0.35 s before the landing the jump takes over again: by the policy `--landing`, or with
 the legs held in the default pose. A landing is good if nothing but paws touched anything and the base is within 30
-degrees of level 1.5 s later. The same takeoffs without turning stand beside it.
+degrees of level 1.5 s later. The same takeoffs without turning stand beside it. With `--takeoff policy` the policy that
+lands takes off too, half a second after the start.
 """
 
 from __future__ import annotations
