@@ -226,6 +226,7 @@ def flight_metrics(flights: Flights) -> Metrics:
         "mean_touchdown_turn_deg": mean(np.degrees(flights.touchdown_turn)),
         "max_touchdown_turn_deg": largest(np.degrees(flights.touchdown_turn)),
         **failures(flights.outcomes[~flights.success]),
+        "failed_before_touchdown": int((~flights.success & np.isnan(flights.flight_time)).sum()),
     }
 
 

@@ -177,7 +177,7 @@ class Jumps(EvaluationLog):
 def view_of(apex: float) -> tuple[tuple[float, float, float], tuple[float, float, float], tuple[int, int]]:
     """Return eye and target [m] and size [px] of pictures of a jump to an apex [m], as tall as it needs, one scale."""
     taller = max(1.0, (apex + ABOVE - LOWEST) / (HIGHEST - LOWEST))
-    middle = 0.5 * (LOWEST + LOWEST + taller * (HIGHEST - LOWEST))
+    middle = LOWEST + 0.5 * taller * (HIGHEST - LOWEST)
     return (1.5 * taller, 2.0 * taller, middle + 0.35 * taller), (0.0, 0.0, middle), (320, round(420 * taller))
 
 

@@ -6,7 +6,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from jumper_warp.envs.env import Env
-from jumper_warp.evaluation.flights import JUMP, TURN, Flights, flight_metrics
+from jumper_warp.evaluation.flights import JUMP, OUTCOMES, TURN, Flights, flight_metrics
 from jumper_warp.policies.restore import restored_skills
 from jumper_warp.registry import make_task
 from jumper_warp.tasks.switching import flight_skills
@@ -68,6 +68,14 @@ def test_legs_that_push_later_tilt_the_robot(flown):
     metrics = flight_metrics(flights)
     assert metrics["flights"] == N and 2.5 < metrics["mean_apex_m"] < 3.2
     assert metrics["max_angular_momentum_change_in_flight_nm_s"] < 1.0e-4 < 0.1 * flights.takeoff_momentum.max()
+
+
+def test_failures_in_flight_are_told_from_those_after_it():
+    flights = Flights(np.full(4, 2.5))
+    flights.end[:] = [OUTCOMES.index(name) for name in ("collided", "collided", "landed", "tilted")]
+    flights.flight_time[1:] = 2.0
+    metrics = flight_metrics(flights)
+    assert metrics["failed_by_collided"] == 2 and metrics["failed_before_touchdown"] == 1
 
 
 def test_handovers_are_read_back(flown):
