@@ -1,0 +1,84 @@
+"""Departures of the jumps from the paper: each is undone as it says, and the experiment at a tiny size."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from experiments import departures
+from jumper_warp.cli.train import parse_train
+from jumper_warp.tasks.jump.departures import DEPARTURES, HORIZONTAL, VERTICAL
+from jumper_warp.tasks.saving import task_from_json, task_to_json
+from jumper_warp.utils.errors import InputError
+
+
+def undone(task, name):
+    """Return the settings of a training without a departure, and its task."""
+    parsed, changed = parse_train(departures.Args(task=task).command(DEPARTURES[task][name], 1, Path("logs")))
+    return parsed, DEPARTURES[task][name].change(changed)
+
+
+@pytest.mark.parametrize("task", DEPARTURES)
+def test_all_flags_are_those_of_the_task_and_change_it(task):
+    plain = parse_train([task])[1]
+    flags = " ".join(each.flags for each in DEPARTURES[task].values())
+    parsed, changed = parse_train([task, *flags.split()])
+    assert task_from_json(json.loads(json.dumps(task_to_json(changed)))) == changed
+    assert {"reset", "rewards", "terminations"} <= {
+        key for key, part in vars(changed).items() if part != vars(plain)[key]
+    }
+    for name, each in DEPARTURES[task].items():
+        assert bool(each.flags) != (each.change(plain) != plain), name
+    given = [word for word in flags.split() if word.startswith("--")]
+    assert len(set(given)) == len(given) and parsed.cfg.task == task
+
+
+def test_what_is_undone_in_python():
+    plain, changed = parse_train(["vertical-jump"])[1], undone("vertical-jump", "jumping_early")[1]
+    names = [term.name for term in plain.terminations]
+    assert [term.name for term in changed.terminations] == [name for name in names if name != "early_takeoff"]
+    assert replace(changed, terminations=plain.terminations) == plain
+    heights = undone("vertical-jump", "goals")[1].levels
+    assert [(level.goal_lower[2], level.goal_upper[2]) for level in heights] == [(0.6, 0.75), (0.6, 0.9), (0.6, 1.1)]
+    assert {level.base_height for level in heights} == {(0.22, 0.45)}
+    places = undone("horizontal-jump", "goals")[1].levels
+    assert [level.goal_upper for level in places[::2]] == [(0.55, 0, 0), (0.7, 0.1, 0), (0.85, 0.2, 0), (1.0, 0.3, 0)]
+    assert [level.base_height for level in places] == 4 * [(0.22, 0.35), (0.22, 0.45)]
+    assert {level.goal_lower[0] for level in places} == {0.4}
+    again = undone("horizontal-jump", "another_goal")[1].levels
+    assert {level.jump_again for level in again} == {0.0}
+
+
+def test_the_table_of_departures_tells_how_these_are_undone():
+    table = (Path(__file__).parents[2] / "docs" / "tasks.md").read_text()
+    for name, each in (VERTICAL | HORIZONTAL).items():
+        assert not each.flags or f"`{each.flags}`" in table, name
+
+
+def test_figures_of_each_training(tmp_path, capsys):
+    args = departures.Args(
+        only=("kept", "drift"), kept_seeds=(2,), iterations=1, envs=4, jumps=(2, 3), squats=2, out=tmp_path,
+        train="--ppo.compile off --ppo.num-steps 8 --ppo.minibatches 1", device="cpu", threads=1,
+    )  # fmt: skip
+    values = departures.main(args)
+    assert values == json.loads((tmp_path / "figures.json").read_text())
+    assert values["flags_drift"] == "--env.terminations.moved-away.distance 0.2" and values["flags_kept"] == ""
+    for name in ("nominal_success_rate_kept_2", "randomized_success_rate_drift_1"):
+        assert values[name] == 0.0
+    assert 0.0 < values["randomized_error_m_drift_1"] < 2.0
+    config = next((tmp_path / "drift_1").rglob("config.json")).read_text()
+    ends = {term["name"]: term for term in json.loads(config)["env"]["task"]["terminations"]}
+    assert ends["moved_away"]["distance"] == 0.2
+    assert "error [mm]" in capsys.readouterr().out
+    assert {"departures.png", "departures.txt"} <= {path.name for path in tmp_path.iterdir()}
+
+
+def test_what_cannot_be_is_refused_before_any_training(tmp_path):
+    with pytest.raises(InputError, match="not bracing"):
+        departures.Args(only=("bracing",))
+    with pytest.raises(InputError, match="at least 1"):
+        departures.Args(iterations=0)
+    with pytest.raises(SystemExit):
+        departures.main(departures.Args(train="--no-such-flag 1", out=tmp_path / "none"))
+    assert not (tmp_path / "none").exists()
