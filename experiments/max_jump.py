@@ -41,7 +41,7 @@ FIRST = 1.0
 """[m] Middle of the first bin."""
 LAST = 2.5
 """[m] No bin beyond, unless asked for."""
-LIMIT = 6.0
+LIMIT = 9.0
 """[m] Of both."""
 IN_RANGE = (1.0, 1.4)
 """[m]"""

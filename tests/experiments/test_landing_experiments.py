@@ -344,7 +344,7 @@ def test_script_refuses_a_policy_of_another_task_in_one_line_with_code_2(policy)
         (lambda: platform_jump.Args(edge=0.2), "edge must be from 0.3 m to below 0.8 m"),
         (lambda: platform_jump.Args(scenes=("block",), solver="mujoco"), "SolverMuJoCo has no sliding block"),
         (lambda: max_jump.Args(jumps=0), "at least one jump"),
-        (lambda: max_jump.Args(first=3.0), "0.1 <= first <= last <= 6 m, got 100, 3.0 and 2.5"),
+        (lambda: max_jump.Args(first=3.0), "0.1 <= first <= last <= 9 m, got 100, 3.0 and 2.5"),
         (lambda: max_jump.Args(direction=200.0), "direction must be in -180..180 deg, got 200"),
     ],
 )

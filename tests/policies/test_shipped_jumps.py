@@ -19,12 +19,13 @@ def test_sight_brings_the_robot_onto_a_block_that_a_blind_one_touches(tmp_path):
 
 
 def test_the_slippery_policy_stands_where_another_falls(tmp_path):
-    flags = {"jumps": 12, "friction": 0.3, "record": 0, "device": "cpu"}
-    ready, other = (
-        horizontal_jump_sweep.main(horizontal_jump_sweep.Args(policy=name, out=tmp_path / name, **flags))
-        for name in ("slippery_jump", "horizontal_jump")
-    )
-    assert ready["success_rate"] == 1.0 and ready["mean_error_m"] < 0.015  # 0.0074 m of 500 jumps
+    def jumps(name, friction):
+        flags = {"jumps": 12, "friction": friction, "record": 0, "device": "cpu"}
+        return horizontal_jump_sweep.main(horizontal_jump_sweep.Args(policy=name, out=tmp_path / name, **flags))
+
+    ready, worse, other = jumps("slippery_jump", 0.4), jumps("slippery_jump", 0.3), jumps("horizontal_jump", 0.3)
+    assert ready["success_rate"] == 1.0 and ready["mean_error_m"] < 0.015  # 0.0087 m of 1000 jumps
+    assert worse["success_rate"] == 1.0  # 99.6 % of 500
     assert other["success_rate"] < 0.8
 
 
@@ -33,6 +34,13 @@ def test_the_martian_policy_jumps_far_and_stays_there(tmp_path):
     values = horizontal_jump_sweep.main(horizontal_jump_sweep.Args(out=tmp_path, **args))
     assert values["success_rate"] == 1.0 and values["step_free_success_rate"] == 1.0
     assert values["mean_error_m"] < 0.02 and values["gravity_m_s2"] == 3.71
+
+
+def test_the_martian_policy_with_springs_jumps_farther(tmp_path):
+    args = {"policy": "mars_springs_jump", "jumps": 8, "distances": (0.5, 6.0), "record": 0, "device": "cpu"}
+    values = horizontal_jump_sweep.main(horizontal_jump_sweep.Args(out=tmp_path, **args))
+    assert values["success_rate"] == 1.0 and values["single_jump_success_rate"] == 1.0
+    assert values["mean_error_m"] < 0.025  # 0.014 m of 200 jumps
 
 
 def test_the_martian_policy_jumps_high_and_keeps_its_heading(tmp_path):
