@@ -166,6 +166,16 @@ def draw_again(draw: Draw, delay: wp.vec2, share: float) -> int:
 
 
 @wp.func
+def draw_command(draw: Draw, ranges: ResetRanges) -> int:
+    """Return at which policy step the jump is commanded: uniform, a share of the draws in the longer of two ranges."""
+    u = between(draw, 9, 0.0, 1.0)
+    share = ranges.long_wait_share
+    soon = (u - share) / wp.max(1.0 - share, 1.0e-6) * (float(ranges.command_delay) + 0.999)
+    later = u / wp.max(share, 1.0e-6) * (float(ranges.long_wait) + 0.999)
+    return int(wp.where(u < share, later, soon))
+
+
+@wp.func
 def begin_task(
     draw: Draw, ranges: ResetRanges, scheme: int, goal: wp.vec3, pos: wp.vec3, vz: float, jump_again: float
 ) -> JumpState:
@@ -175,7 +185,7 @@ def begin_task(
     task.goal = goal
     task.start = pos
     task.max_height = pos[2]
-    task.command_step = int(between(draw, 9, 0.0, float(ranges.command_delay) + 0.999))
+    task.command_step = draw_command(draw, ranges)
     task.again_delay = ranges.again_delay
     task.again_step = draw_again(draw, ranges.again_delay, jump_again)
     if scheme == PUSHING or (scheme == STANDING and ranges.lean > 0.0):

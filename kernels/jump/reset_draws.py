@@ -63,6 +63,8 @@ class ResetRanges:
     landed_ahead: wp.vec2  # base ahead of the goal
     landed_speed: wp.vec2  # [m/s] downward
     command_delay: int  # most policy steps until the jump is commanded
+    long_wait_share: float  # of the draws in which it may be `long_wait`
+    long_wait: int
     again_delay: wp.vec2  # policy steps after touchdown
 
 

@@ -212,6 +212,10 @@ class ResetCfg:
     """What standing starts stand on or jump to."""
     command_delay: float = 0.5
     """[s] Longest time until the jump is commanded."""
+    long_wait_share: float = 0.0
+    """[1] Share of the episodes in which it is `long_wait`: a policy learns to wait, and most episodes stay short."""
+    long_wait: float = 2.5
+    """[s]"""
     again_delay: Pair = (0.2, 0.7)
     """[s] From touchdown to the other goal."""
 
@@ -225,7 +229,9 @@ class ResetCfg:
                 check_finite(f"reset {name}", *(value if isinstance(value, tuple) else (value,)))
             if isinstance(value, tuple) and not value[0] <= value[1]:
                 raise InputError(f"reset {name} must be (lower, upper), got {value}")
-        for name in ("command_delay", "again_delay", "lean", "push_length", "push_acceleration"):
+        if not 0.0 <= self.long_wait_share <= 1.0:
+            raise InputError(f"reset long_wait_share must be in [0, 1], got {self.long_wait_share}")
+        for name in ("command_delay", "long_wait", "again_delay", "lean", "push_length", "push_acceleration"):
             value = getattr(self, name)
             least = value[0] if isinstance(value, tuple) else value
             if not least >= 0.0:
@@ -264,7 +270,7 @@ class ResetCfg:
             "tilt", "forward_pitch", "heading", "takeoff_angle", "takeoff_pitch", "flight_lateral",
             "flight_transversal",
         )  # fmt: skip
-        apart = (*SHARES, "shares_of", "command_delay", "again_delay", "ground", "reference")
+        apart = (*SHARES, "shares_of", "command_delay", "long_wait", "again_delay", "ground", "reference")
         for name, value in vars(self).items():
             if name in apart:
                 continue
@@ -275,5 +281,6 @@ class ResetCfg:
                 setattr(ranges, name, scale * value)
         self.reference.write(ranges)
         ranges.command_delay = round(self.command_delay / step_dt)
+        ranges.long_wait = round(self.long_wait / step_dt)
         ranges.again_delay = wp.vec2(*(delay / step_dt for delay in self.again_delay))
         return ranges

@@ -125,6 +125,17 @@ def test_base_place_and_attitude_cover_their_ranges(drawn, scheme):
     assert not qd[worlds, :2].any() and not qd[worlds, 3:6].any()
 
 
+@pytest.mark.parametrize("share", [0.0, 0.25, 1.0])
+def test_a_share_of_the_commands_comes_after_a_long_wait(begun, share):
+    reset = only("default", command_delay=0.5, long_wait_share=share, long_wait=2.0)
+    found = episodes_of(begun(reset))["command_step"]
+    # 31 and 121 steps, each as likely as the others of its range
+    expected = (1.0 - share) * (np.arange(121) < 31) / 31.0 + share / 121.0
+    counts = np.bincount(found, minlength=121)
+    assert len(counts) == 121
+    assert np.abs(np.cumsum(counts) / N - np.cumsum(expected)).max() < 1.95 / np.sqrt(N)  # Kolmogorov, 1 in 1000
+
+
 @pytest.mark.parametrize("scheme", ["standing", "default", "landed"])
 def test_robots_on_their_feet_have_their_paws_at_rest_on_the_ground(drawn, scheme):
     env, episodes, _, _ = drawn
@@ -269,6 +280,8 @@ def test_impossible_shares_are_refused(shares):
         ({"landed_speed": (0.0, math.inf)}, "landed_speed must be finite, got inf"),
         ({"base_xy": math.nan}, "base_xy must be finite, got nan"),
         ({"command_delay": -0.1}, "command_delay must not be negative, got -0.1"),
+        ({"long_wait": -0.1}, "long_wait must not be negative, got -0.1"),
+        ({"long_wait_share": 1.1}, r"long_wait_share must be in \[0, 1\], got 1.1"),
         ({"again_delay": (-0.1, 0.2)}, "again_delay must not be negative"),
         ({"lean": -0.1}, "lean must not be negative, got -0.1"),
         ({"push_length": (-0.1, 0.2)}, "push_length must not be negative"),
@@ -291,13 +304,15 @@ def test_impossible_shares_of_another_jump_are_refused(share):
 
 def test_settings_reach_the_kernels_by_name_in_radians_and_steps():
     cfg = ResetCfg(standing=0.5, default=0.25, in_flight=0.125, tilt=180.0, paw_depth=(0.25, 0.5))
-    ranges = dataclasses.replace(cfg, command_delay=0.25, again_delay=(0.5, 1.0)).values(1.0 / 60.0).states
+    delays = {"command_delay": 0.25, "long_wait": 1.5, "long_wait_share": 0.25, "again_delay": (0.5, 1.0)}
+    ranges = dataclasses.replace(cfg, **delays).values(1.0 / 60.0).states
     assert list(ranges.shares) == [0.5, 0.25, 0.125, 0.0, 0.125, 0.0] and ranges.of_time == 0
     timed = dataclasses.replace(cfg, pushing=0.125, shares_of="time").values(1.0 / 60.0).states
     assert list(timed.shares) == [0.5, 0.25, 0.125, 0.0, 0.0, 0.125] and timed.of_time == 1
     assert ranges.tilt == pytest.approx(math.pi) and list(ranges.takeoff_angle) == pytest.approx([0.872665, 1.308997])
     assert list(ranges.paw_depth) == [0.25, 0.5]
-    assert ranges.command_delay == 15 and list(ranges.again_delay) == pytest.approx([30.0, 60.0])
+    assert (ranges.command_delay, ranges.long_wait, ranges.long_wait_share) == (15, 90, 0.25)
+    assert list(ranges.again_delay) == pytest.approx([30.0, 60.0])
 
 
 def test_a_levels_numbers_reach_the_kernels():
