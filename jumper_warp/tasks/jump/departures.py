@@ -57,6 +57,11 @@ def places_of_paper(task: TaskCfg) -> TaskCfg:
     return with_goals(task, goals, starts=2)
 
 
+def without_another_goal(task: TaskCfg) -> TaskCfg:
+    """Return the task in which no landed robot gets another goal."""
+    return replace(task, levels=tuple(replace(level, jump_again=0.0) for level in task.levels))
+
+
 VERTICAL: dict[str, Undone] = {
     "standing_still_and_level": Undone("--env.rewards.rest.weight 0 --env.rewards.landing-tilt.weight 0"),
     "paws_lifted_again": Undone("--env.rewards.lifted-again.weight 0"),
@@ -96,15 +101,10 @@ HORIZONTAL: dict[str, Undone] = {
     "level_squats": Undone("--env.reset.lean 0"),
     "takeoffs": Undone("--env.reset.takeoff-angle 50 75 --env.reset.takeoff-ahead 0 0.1 --env.reset.takeoff-pitch 0 0"),
     "touchdowns": Undone("--env.reset.touchdown-behind 0 0"),
-    "another_goal": Undone(change=lambda task: with_again(task, 0.0)),
+    "another_goal": Undone(change=without_another_goal),
     "level_ground": Undone("--env.reset.ground.platform 0 --env.reset.ground.block 0"),
 }
 """Of the horizontal jump alone."""
 
 DEPARTURES: dict[str, dict[str, Undone]] = {"vertical-jump": VERTICAL, "horizontal-jump": HORIZONTAL}
 """By task and name."""
-
-
-def with_again(task: TaskCfg, share: float) -> TaskCfg:
-    """Return the task in which a share of the landed robots gets another goal, at every level."""
-    return replace(task, levels=tuple(replace(level, jump_again=share) for level in task.levels))
