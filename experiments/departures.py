@@ -25,7 +25,7 @@ from rich.table import Table
 
 from jumper_warp.cli.main import run_command
 from jumper_warp.cli.train import env_maker, parse_train
-from jumper_warp.evaluation.holds import Holds, hold_metrics
+from jumper_warp.evaluation.holds import Holds, hold_goals, hold_metrics
 from jumper_warp.evaluation.plots import drawn
 from jumper_warp.evaluation.run import HEIGHTS, EvaluationRun
 from jumper_warp.policies.restore import CHECKPOINTS, Conditions
@@ -131,8 +131,7 @@ def measured(checkpoint: Path, args: Args, folder: Path) -> dict[str, dict[str, 
         env = run.env(count, conditions=conditions)
         values = flags.metrics(run.follow(env, flags.log(env.task, 0)))
         values["error_m"] = values.get("mean_abs_error_m", values.get("mean_error_m"))
-        goals = np.zeros((args.squats, 3))
-        goals[:, 2 if run.task.evaluation in HEIGHTS else 0] = np.linspace(*SQUATS[args.task], args.squats)
+        goals = hold_goals(args.squats, SQUATS[args.task], up=run.task.evaluation in HEIGHTS)
         values |= hold_metrics(run.follow(run.env(args.squats, conditions=conditions), Holds(goals, HOLD)))
         tests[test] = {name: values[name] for name, _ in COLUMNS.values()}
     return tests

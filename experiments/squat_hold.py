@@ -16,7 +16,7 @@ import numpy as np
 import tyro
 
 from jumper_warp.cli.main import run_command
-from jumper_warp.evaluation.holds import Holds, hold_metrics
+from jumper_warp.evaluation.holds import Holds, hold_goals, hold_metrics
 from jumper_warp.evaluation.plots import drawn
 from jumper_warp.evaluation.run import HEIGHTS, PLACES, EvaluationArgs, EvaluationRun
 from jumper_warp.utils.errors import InputError
@@ -48,13 +48,6 @@ class Args(EvaluationArgs):
                 raise InputError(f"{name} must be in (0, 10) m and rise, got {low}, {high}")
 
 
-def goals(args: Args, up: bool) -> np.ndarray:
-    """Return goals [m], (squats, 3); up: to heights."""
-    found = np.zeros((args.squats, 3))
-    found[:, 2 if up else 0] = np.linspace(*(args.height if up else args.distance), args.squats)
-    return found
-
-
 def plot(run: EvaluationRun, holds: Holds) -> None:
     """Draw forces and torques of the robot whose forces vary most, and the ranges of all."""
     time = (np.arange(len(holds.forces)) + 1) * holds.step_dt
@@ -72,7 +65,9 @@ def main(args: Args) -> dict:
     """Hold squats and return the figures."""
     run = EvaluationRun.of("squat_hold", args, (*HEIGHTS, *PLACES))
     env = run.env(args.squats)
-    holds = run.follow(env, Holds(goals(args, run.task.evaluation in HEIGHTS), args.hold), film="holds")
+    up = run.task.evaluation in HEIGHTS
+    goals = hold_goals(args.squats, args.height if up else args.distance, up=up)
+    holds = run.follow(env, Holds(goals, args.hold), film="holds")
     if not holds.over.all():
         plot(run, holds)
     return run.report({"hold_s": args.hold} | hold_metrics(holds), {})
