@@ -41,7 +41,7 @@ def test_robots_that_do_not_hold_have_no_forces():
     assert all(value is None for name, value in metrics.items() if name not in ("squats", "holding_rate"))
 
 
-@pytest.mark.parametrize("policy", ["vertical_jump", "horizontal_jump", "slippery_jump"])
+@pytest.mark.parametrize("policy", ["vertical_jump", "horizontal_jump", "slippery_waiting_jump"])
 def test_shipped_policies_hold_their_squats(policy, tmp_path):
     args = squat_hold.Args(policy=policy, squats=2, record=0, out=tmp_path, device="cpu")
     values = squat_hold.main(args)
