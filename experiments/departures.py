@@ -6,14 +6,19 @@
 Trainings are alike but for what is undone (`jumper_warp.tasks.jump.departures`): from nothing, randomised, as many
 iterations. The task as it is, `kept`, is trained with every seed of `--kept-seeds`, which tells how much seeds differ.
 Each policy then makes 200 nominal and 1000 randomised jumps as `jumper evaluate` has them, a fall or a touch after the
-landing being a failure, and 100 robots of each kind wait in their squats for 3 s.
+landing being a failure, and 100 robots of each kind wait in their squats for 3 s. What ends a jump is that of the task
+as it is, whatever the training had.
+
+A training that `--out` holds already is not made again, so that what was interrupted goes on where it was, and
+`--no-measure` may train on one machine what another measures.
 """
 
 from __future__ import annotations
 
+import json
 import shlex
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -29,12 +34,16 @@ from jumper_warp.evaluation.holds import Holds, hold_goals, hold_metrics
 from jumper_warp.evaluation.plots import drawn
 from jumper_warp.evaluation.run import HEIGHTS, EvaluationRun
 from jumper_warp.policies.restore import CHECKPOINTS, Conditions
-from jumper_warp.rl.runner import train
+from jumper_warp.registry import make_task
+from jumper_warp.rl.runner import CONFIG, train
 from jumper_warp.tasks.jump.departures import DEPARTURES, Undone
+from jumper_warp.tasks.saving import task_to_json
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.output import output_dir, write_figures
 from jumper_warp.utils.runtime import announce
 
+ELSEWHERE = {"log_root", "device", "threads"}
+"""Settings that a training need not share with one that is there already."""
 KEPT = "kept"
 """Name of the task as it is."""
 GOALS = {"vertical-jump": {"lower": 0.5, "upper": 1.05}, "horizontal-jump": {"x": (0.3, 1.5)}}
@@ -49,6 +58,7 @@ COLUMNS = {
     "success [%]": ("success_rate", 100.0),
     "falls [%]": ("fall_rate", 100.0),
     "still [%]": ("still_landing_rate", 100.0),
+    "hops again [%]": ("second_takeoff_rate", 100.0),
     "at rest [%]": ("at_rest_within_1_s_rate", 100.0),
     "largest tilt [deg]": ("max_landing_tilt_deg", 1.0),
     "waits [%]": ("holding_rate", 100.0),
@@ -82,6 +92,8 @@ class Args:
     """Robots that wait."""
     train: str = ""
     """More flags of `jumper train`, for all trainings."""
+    measure: bool = True
+    """Make the jumps after each training."""
     out: Path | None = None
     """Folder for runs, figures, table and plot (default: outputs/departures/<time>)."""
     device: str | None = None
@@ -113,27 +125,35 @@ class Args:
 
 
 def trained(undone: Undone, arguments: list[str]) -> Path:
-    """Train, and return the last checkpoint."""
+    """Return the last checkpoint of a training, made unless it is there. Raises InputError: it has other settings."""
     parsed, task = parse_train(arguments)
-    result = train(parsed.cfg, env_maker(undone.change(task), parsed), shlex.join(["jumper", "train", *arguments]))
-    return result.folder / CHECKPOINTS / f"iteration_{result.iteration:06d}.pt"
+    task, name = undone.change(task), f"iteration_{parsed.cfg.iterations:06d}.pt"
+    if found := sorted(Path(parsed.cfg.log_root).glob(f"*/*/{CHECKPOINTS}/{name}")):
+        config = json.loads((found[-1].parents[1] / CONFIG).read_text())
+        asked = json.loads(json.dumps(asdict(parsed.cfg), default=str))
+        other = {key for key in asked.keys() - ELSEWHERE if asked[key] != config["train"].get(key)}
+        if other or config["env"]["task"] != task_to_json(task):
+            raise InputError(f"{found[-1].parents[1]} was trained with other settings: choose another --out")
+        return found[-1]
+    result = train(parsed.cfg, env_maker(task, parsed), shlex.join(["jumper", "train", *arguments]))
+    return result.folder / CHECKPOINTS / name
 
 
 def measured(checkpoint: Path, args: Args, folder: Path) -> dict[str, dict[str, Any]]:
     """Return figures of a policy's jumps, and of how it waits, by test."""
-    run = EvaluationRun(checkpoint)
+    run, ends = EvaluationRun(checkpoint), make_task(args.task).terminations
     run.prepare("departures", Conditions(device=args.device, threads=args.threads), folder)
     tests = {}
     for test, count in zip(TESTS, args.jumps, strict=True):
         drawn_robots = test == "randomized"
         conditions = replace(run.conditions, randomize=drawn_robots, noise=drawn_robots)
         flags = replace(run.evaluation.flags, jumps=count, **GOALS[args.task])
-        env = run.env(count, conditions=conditions)
+        env = run.env(count, lambda task: run.evaluation.for_evaluation(replace(task, terminations=ends)), conditions)
         values = flags.metrics(run.follow(env, flags.log(env.task, 0)))
         values["error_m"] = values.get("mean_abs_error_m", values.get("mean_error_m"))
         goals = hold_goals(args.squats, SQUATS[args.task], up=run.task.evaluation in HEIGHTS)
         values |= hold_metrics(run.follow(run.env(args.squats, conditions=conditions), Holds(goals, HOLD)))
-        tests[test] = {name: values[name] for name, _ in COLUMNS.values()}
+        tests[test] = {name: value for name, value in values.items() if isinstance(value, bool | int | float | None)}
     return tests
 
 
@@ -171,6 +191,8 @@ def main(args: Args) -> dict[str, Any]:
     found: dict[tuple[str, int], dict[str, dict]] = {}
     for name, seed, undone in args.trainings():
         checkpoint = trained(undone, args.command(undone, seed, folder / f"{name}_{seed}"))
+        if not args.measure:
+            continue
         tests = found[name, seed] = measured(checkpoint, args, folder)
         values[f"flags_{name}"] = undone.flags
         values |= {f"{test}_{key}_{name}_{seed}": tests[test][key] for test in TESTS for key in tests[test]}
@@ -179,8 +201,9 @@ def main(args: Args) -> dict[str, Any]:
         plot(found, folder / "departures.png")
         with (folder / "departures.txt").open("w") as file:
             Console(file=file, width=WIDTH).print(table)
-    Console(width=WIDTH).print(table)
-    print(f"figures, table, plot and runs in {folder}")
+    if found:
+        Console(width=WIDTH).print(table)
+    print(f"{'figures, table, plot and ' if found else ''}runs in {folder}")
     return values
 
 

@@ -71,7 +71,31 @@ def test_figures_of_each_training(tmp_path, capsys):
     ends = {term["name"]: term for term in json.loads(config)["env"]["task"]["terminations"]}
     assert ends["moved_away"]["distance"] == 0.2
     assert "error [mm]" in capsys.readouterr().out
+    assert values["nominal_second_takeoff_rate_drift_1"] is None and values["nominal_squats_drift_1"] == 2
     assert {"departures.png", "departures.txt"} <= {path.name for path in tmp_path.iterdir()}
+
+
+def test_trainings_that_are_there_are_measured_by_the_ends_of_the_task_as_it_is(tmp_path, monkeypatch):
+    args = departures.Args(
+        only=("jumping_early",), iterations=1, envs=4, jumps=(2, 3), squats=2, out=tmp_path, measure=False,
+        train="--ppo.compile off --ppo.num-steps 8 --ppo.minibatches 1", device="cpu", threads=1,
+    )  # fmt: skip
+    assert set(departures.main(args)) == {"task", "iterations", "envs"}
+    assert not (tmp_path / "figures.json").exists()
+    monkeypatch.setattr(departures, "train", None)
+    ends = []
+    follow = departures.EvaluationRun.follow
+    monkeypatch.setattr(
+        departures.EvaluationRun, "follow",
+        lambda run, env, log: ends.append([term.name for term in env.task.terminations]) or follow(run, env, log),
+    )  # fmt: skip
+    values = departures.main(replace(args, measure=True, threads=2))
+    assert values["nominal_jumps_jumping_early_1"] == 2 and len(ends) == 4
+    assert all("early_takeoff" in names for names in ends[::2])
+    with pytest.raises(InputError, match="other settings"):
+        departures.main(replace(args, train=args.train + " --ppo.gamma 0.9"))
+    with pytest.raises(InputError, match="other settings"):
+        departures.main(replace(args, train=args.train + " --env.link-margin 0.001"))
 
 
 def test_what_cannot_be_is_refused_before_any_training(tmp_path):
