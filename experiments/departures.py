@@ -1,6 +1,6 @@
 """What departures of a jump from the paper and its authors' configuration change: trained without each, one at a time.
 
-    python experiments/departures.py --task vertical-jump --iterations 800 --out outputs/departures
+    python experiments/departures.py --task vertical-jump --out outputs/departures
     python experiments/departures.py --task horizontal-jump --only bracing goals --seeds 1 2
 
 Trainings are alike but for what is undone (`jumper_warp.tasks.jump.departures`): from nothing, randomised, as many
@@ -46,6 +46,8 @@ ELSEWHERE = {"log_root", "device", "threads"}
 """Settings that a training need not share with one that is there already."""
 KEPT = "kept"
 """Name of the task as it is."""
+LENGTHS = {"vertical-jump": 1400, "horizontal-jump": 800}
+"""Iterations of each training."""
 GOALS = {"vertical-jump": {"lower": 0.5, "upper": 1.05}, "horizontal-jump": {"x": (0.3, 1.5)}}
 """[m] Of the jumps that are measured."""
 SQUATS = {"vertical-jump": (0.6, 1.05), "horizontal-jump": (0.3, 1.5)}
@@ -78,8 +80,8 @@ class Args:
     """Whose departures."""
     only: tuple[str, ...] = ()
     """Names of those that are undone (default: all)."""
-    iterations: int = 800
-    """Of each training."""
+    iterations: int | None = None
+    """Of each training (default: 1400 of heights, 800 of places, when the task as it is has learned)."""
     envs: int = 8192
     """Number of environments."""
     seeds: tuple[int, ...] = (1,)
@@ -106,8 +108,13 @@ class Args:
         unknown = set(self.only) - {KEPT, *DEPARTURES[self.task]}
         if unknown:
             raise InputError(f"departures of {self.task} are {', '.join(DEPARTURES[self.task])}, not {min(unknown)}")
-        if self.iterations < 1 or self.envs < 1 or min(self.jumps) < 1 or self.squats < 1:
+        if self.length < 1 or self.envs < 1 or min(self.jumps) < 1 or self.squats < 1:
             raise InputError("iterations, envs, jumps and squats must be at least 1")
+
+    @property
+    def length(self) -> int:
+        """Iterations of each training."""
+        return LENGTHS[self.task] if self.iterations is None else self.iterations
 
     def trainings(self) -> Iterator[tuple[str, int, Undone]]:
         """Yield name, seed, and what is undone."""
@@ -118,7 +125,7 @@ class Args:
 
     def command(self, undone: Undone, seed: int, folder: Path) -> list[str]:
         """Return the arguments of `jumper train`."""
-        flags = f"--num-envs {self.envs} --iterations {self.iterations} --seed {seed} --no-tensorboard"
+        flags = f"--num-envs {self.envs} --iterations {self.length} --seed {seed} --no-tensorboard"
         flags += "" if self.device is None else f" --device {self.device}"
         flags += "" if self.threads is None else f" --threads {self.threads}"
         return [self.task, *shlex.split(f"{flags} {self.train} {undone.flags}"), "--log-root", str(folder)]
@@ -186,8 +193,8 @@ def main(args: Args) -> dict[str, Any]:
         undone.change(parse_train(args.command(undone, seed, Path(name)))[1])
     announce(args.device, args.threads)
     folder = output_dir("departures", args.out)
-    table = Table("undone, seed", *map(escape, COLUMNS), title=f"{args.task}, {args.iterations} iterations")
-    values: dict[str, Any] = {"task": args.task, "iterations": args.iterations, "envs": args.envs}
+    table = Table("undone, seed", *map(escape, COLUMNS), title=f"{args.task}, {args.length} iterations")
+    values: dict[str, Any] = {"task": args.task, "iterations": args.length, "envs": args.envs}
     found: dict[tuple[str, int], dict[str, dict]] = {}
     for name, seed, undone in args.trainings():
         checkpoint = trained(undone, args.command(undone, seed, folder / f"{name}_{seed}"))
