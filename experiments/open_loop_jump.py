@@ -5,7 +5,7 @@
 The hardware reached 1.075 m at 18 N m with the gains and filter of the policies. With 24.8 N m, stiffer gains and a
 looser filter, neither of which it states, the paper's simulation gives 1.42 m: `--torque 24.8 --loose --kp 20`. Springs
 between the knees of each leg, as in the authors' sequel, are `--spring 1000 0.17`. Beyond 90 degrees they pull the legs
-farther in: `--squat` says how deep.
+farther in: `--squat` says how deep. `--robot` takes a robot of other parameters, for example with a load on its base.
 """
 
 from __future__ import annotations
@@ -26,8 +26,9 @@ from jumper_warp.evaluation.plots import drawn
 from jumper_warp.robot.gravity import EARTH
 from jumper_warp.robot.model import LEGS, MOTOR_JOINTS, build_model
 from jumper_warp.robot.motors import jumping_motors, loose_filter, vertical_jump_filter
-from jumper_warp.robot.overlay import with_springs
+from jumper_warp.robot.overlay import load_overlay, with_springs
 from jumper_warp.sim.simulation import Simulation
+from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.output import output_dir, write_figures
 from jumper_warp.utils.runtime import announce
 from jumper_warp.viz.snapshot import Camera, contact_sheet
@@ -58,10 +59,17 @@ class Args:
     """[deg] Transversal angle commanded for the squat."""
     spring: tuple[float, float] | None = None
     """[N/m] [m] Stiffness and rest length of springs between the knees of each leg (default: none)."""
+    robot: Path | None = None
+    """Robot overlay, as `jumper sysid` writes it, in place of springs."""
     out: Path | None = None
     """Folder for figures, plot and recording (default: outputs/open_loop_jump/<time>)."""
     device: str | None = None
     """Warp device."""
+
+    def __post_init__(self) -> None:
+        """Check the values."""
+        if self.spring is not None and self.robot is not None:
+            raise InputError("give springs or a robot, which may have springs")
 
 
 def draw_filmstrip(frames: list[np.ndarray], path: Path) -> None:
@@ -104,20 +112,23 @@ def main(args: Args) -> dict:
     folder = output_dir("open_loop_jump", args.out)
     variant = {"solver": args.solver, "gravity_m_s2": args.gravity, "torque_limit_nm": args.torque,
                "kp_nm_rad": args.kp, "loose_filter": args.loose, "squat_command_deg": args.squat}  # fmt: skip
-    springs = None if args.spring is None else with_springs(*args.spring)
+    robot = None if args.robot is None else load_overlay(args.robot)
     if args.spring is not None:
+        robot = with_springs(*args.spring)
         variant |= {"spring_stiffness_n_m": args.spring[0], "spring_length_m": args.spring[1]}
+    if args.robot is not None:
+        variant["robot"] = str(args.robot)
     motors = jumping_motors(args.torque)
     motors = replace(motors, transversal=replace(motors.transversal, kp=args.kp))
     command_filter = loose_filter() if args.loose else vertical_jump_filter()
     sim = Simulation(
-        1, solver=args.solver, motors=motors, command_filter=command_filter, gravity=args.gravity, robot=springs,
+        1, solver=args.solver, motors=motors, command_filter=command_filter, gravity=args.gravity, robot=robot,
         device=args.device,
     )  # fmt: skip
     trace, recorder, frames = follow_jump(sim, variant, args.squat)
     draw_filmstrip(frames, folder / "jump_strip.png")
     values: dict[str, Any] = {**variant, **jump_metrics(trace), "hardware_apex_height_m": None}
-    if args.torque == 18.0 and args.gravity == EARTH and not args.loose and args.spring is None:
+    if args.torque == 18.0 and args.gravity == EARTH and not args.loose and robot is None:
         values["hardware_apex_height_m"] = HARDWARE_APEX
     title = f"Open-loop jump, {args.solver}, {args.torque:g} N m"
     write_figures(folder, values)

@@ -31,6 +31,18 @@ def test_examples_of_the_readme_run_and_the_robot_squats(tmp_path, monkeypatch):
     assert names["gradient"].shape == (10, 12) and abs(names["gradient"]).max() > 1.0e-4
 
 
+def test_the_example_of_gradients_runs_and_stiffer_motors_stand_higher():
+    text = (README.parent / "docs" / "gradients.md").read_text(encoding="utf-8")
+    names = {}
+    exec(re.search(r"```python\n(.*?)```", text, re.DOTALL)[1], names)
+    assert names["by_stiffness"].shape == (12, 64)
+    heights = names["jump"].q.numpy()[-1, 2]
+    rollout = names["rollout"]
+    rollout.parameters["kp"].assign(rollout.parameters["kp"].numpy() + 1.0e-4)
+    higher = rollout.run(names["targets"], *rollout.standing()).q.numpy()[-1, 2]
+    assert (higher - heights) / 1.0e-4 == pytest.approx(names["by_stiffness"].sum(axis=0), rel=1.0e-3)
+
+
 def test_the_task_of_the_readme_pays_a_standing_robot_for_a_level_base(tmp_path, monkeypatch):
     text = README.read_text(encoding="utf-8")
     (tmp_path / "my_task.py").write_text(re.search(r"```python\n(# my_task\.py.*?)```", text, re.DOTALL)[1])

@@ -1,5 +1,6 @@
 import dataclasses
 import json
+import os
 import subprocess
 import sys
 import tomllib
@@ -534,3 +535,13 @@ def test_policy_of_another_observation_is_not_played(trained_run, tmp_path):
 def test_viewer_listens_on_loopback_only(tmp_path):
     command = viewer_command(tmp_path / "jump.rrd")
     assert command[-2:] == ["--bind", "127.0.0.1"]
+
+
+@pytest.mark.parametrize("args", [["list"], ["evaluate", "vertical_jump", "--help"]])
+def test_a_reader_that_is_gone_is_no_fault(args):
+    reader, writer = os.pipe()
+    os.close(reader)
+    code = f"from jumper_warp.cli.main import main; main({args})"
+    ended = subprocess.run([sys.executable, "-c", code], stdout=writer, stderr=subprocess.PIPE, text=True)
+    os.close(writer)
+    assert ended.returncode == 0 and ended.stderr == ""

@@ -1,6 +1,7 @@
 """A task of one's own, in a file that nothing of the package knows, from training to a recording."""
 
 import json
+import re
 import shutil
 import sys
 from pathlib import Path
@@ -287,3 +288,43 @@ def test_run_of_version_1_is_exported_and_played(capsys, old_run, tmp_path):
     assert np.array_equal(policy.tensors()["actor.0.weight"], original.tensors()["actor.0.weight"])
     code, _, err = run(capsys, *play(old_run, "--out", str(tmp_path / "played")))
     assert code == 0, err
+
+
+@pytest.mark.parametrize(
+    ("right", "wrong", "told"),
+    [
+        ("import warp as wp\n", "import warp as wp\nimport not_there\n", "own_faults.py:6: ModuleNotFoundError"),
+        ("weight=2.0, ", "", "own_faults.py:{line}: TypeError: RewardTerm.__init__() missing"),
+        ("view.quat,", "view.quad,", "own_faults.py, function level: `quad` is not an attribute of 'view'"),
+    ],
+)
+def test_a_mistake_in_a_users_file_is_told_in_one_line(right, wrong, told, tmp_path, monkeypatch, capsys):
+    text = (Path(__file__).parents[2] / "README.md").read_text(encoding="utf-8")
+    text = re.search(r"```python\n(# my_task\.py.*?)```", text, re.DOTALL)[1].replace("level-jump", "own-faults")
+    assert right in text
+    path = tmp_path / "own_faults.py"
+    path.write_text(text.replace(right, wrong, 1))
+    line = next(i for i, row in enumerate(text.splitlines(), 1) if "RewardTerm(level" in row)
+    monkeypatch.delitem(sys.modules, "own_faults", raising=False)
+    before = dict(TASKS)
+    args = [
+        "train",
+        "own-faults",
+        "--task-module",
+        str(path),
+        "--device",
+        "cpu",
+        "--num-envs",
+        "4",
+        "--iterations",
+        "1",
+    ]
+    try:
+        with pytest.raises(SystemExit) as stopped:
+            cli.main([*args, "--log-root", str(tmp_path)])
+    finally:
+        TASKS.clear()
+        TASKS.update(before)
+        sys.modules.pop("own_faults", None)
+    lines = [row for row in capsys.readouterr().err.splitlines() if row.startswith("jumper:")]
+    assert stopped.value.code == 2 and len(lines) == 1 and told.format(line=line) in lines[0]
