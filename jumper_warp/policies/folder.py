@@ -25,10 +25,11 @@ from safetensors import SafetensorError
 from jumper_warp.policies.onnx import onnx_bytes
 from jumper_warp.policies.policy import Policy, check_tensors
 from jumper_warp.policies.spec import PolicyError, PolicyInterface
+from jumper_warp.utils.assets import ASSETS
 from jumper_warp.utils.files import write_whole
 from jumper_warp.utils.runtime import git_commit, versions
 
-POLICIES = Path(__file__).resolve().parents[2] / "assets" / "policies"
+POLICIES = ASSETS / "policies"
 """Where the project's own policies lie."""
 FORMAT = "jumper-warp policy"
 SCHEMA_VERSION = 1
