@@ -38,16 +38,18 @@ def export(cfg: ExportCfg) -> Path:
     """Write what the configuration asks for, print where, and return the path.
 
     Raises:
-        PolicyError: The source cannot be used, two policies cannot be blended, or the folder exists and is not to be
-            overwritten.
+        PolicyError: The source cannot be used, two policies cannot be blended, the folder has a file's name, or it
+            exists and is not to be overwritten.
         CheckpointError: The checkpoint cannot be used.
     """
     from jumper_warp.policies.blend import blend
-    from jumper_warp.policies.folder import save_policy
+    from jumper_warp.policies.folder import checked_folder, save_policy
     from jumper_warp.policies.onnx import export_onnx
     from jumper_warp.policies.restore import is_run, learning_curve, open_policy
 
     source = Path(cfg.source)
+    if cfg.out is not None and cfg.out.suffix != ".onnx":
+        checked_folder(cfg.out)
     trained = is_run(source)
     policy = open_policy(cfg.source, newest=cfg.newest)
     if cfg.blend is not None:

@@ -20,13 +20,13 @@ def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> None:
     """
     name = policy_of("finetune", ABOUT, args)
     from jumper_warp.evaluation.finetuning import FinetuneArgs, finetune
-    from jumper_warp.policies.folder import save_policy
+    from jumper_warp.policies.folder import checked_folder, save_policy
     from jumper_warp.policies.restore import open_policy
     from jumper_warp.policies.spec import PolicyError
     from jumper_warp.utils.runtime import announce
 
     parsed: FinetuneArgs = parse(FinetuneArgs, f"finetune {name}", args[1:])
-    out = parsed.out or Path(f"{Path(name).name}_finetuned")
+    out = checked_folder(parsed.out or Path(f"{Path(name).name}_finetuned"))
     if out.exists() and not parsed.overwrite:
         raise PolicyError(f"{out} exists")
     policy = open_policy(name)

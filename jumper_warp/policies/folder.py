@@ -25,10 +25,11 @@ from safetensors import SafetensorError
 from jumper_warp.policies.onnx import onnx_bytes
 from jumper_warp.policies.policy import Policy, check_tensors
 from jumper_warp.policies.spec import PolicyError, PolicyInterface
+from jumper_warp.utils.assets import ASSETS
 from jumper_warp.utils.files import write_whole
 from jumper_warp.utils.runtime import git_commit, versions
 
-POLICIES = Path(__file__).resolve().parents[2] / "assets" / "policies"
+POLICIES = ASSETS / "policies"
 """Where the project's own policies lie."""
 FORMAT = "jumper-warp policy"
 SCHEMA_VERSION = 1
@@ -40,6 +41,8 @@ README = "README.md"
 MAX_BYTES = 256 * 2**20
 """Larger files are refused unread."""
 FILE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
+NO_FOLDERS = (".pt", ".pth", ".onnx", ".safetensors")
+"""Ends of names that files have."""
 
 
 def save_policy(
@@ -62,7 +65,7 @@ def save_policy(
     Raises:
         PolicyError: The folder exists and is not to be overwritten, or is no policy's; or a name is malformed.
     """
-    folder = Path(folder)
+    folder = checked_folder(folder)
     if folder.exists() and not (overwrite and (folder / MANIFEST).is_file()):
         raise PolicyError(f"{folder} exists" + ("" if not overwrite else " and is no policy's"))
     commit = git_commit()
@@ -87,6 +90,14 @@ def save_policy(
     finally:
         shutil.rmtree(aside, ignore_errors=True)
         shutil.rmtree(old, ignore_errors=True)
+    return folder
+
+
+def checked_folder(folder: Path) -> Path:
+    """Return where a policy is to be saved. Raises PolicyError: the name is that of a file."""
+    folder = Path(folder)
+    if folder.suffix.lower() in NO_FOLDERS:
+        raise PolicyError(f"a policy is saved as a folder, whose name cannot end in {folder.suffix}: got {folder}")
     return folder
 
 

@@ -18,7 +18,8 @@ OPSET = 18
 IR_VERSION = 9
 INPUT, OUTPUT = "obs", "actions"
 OPERATORS = {"elu": "Elu", "relu": "Relu", "tanh": "Tanh"}
-METADATA_VERSION = 1
+METADATA_VERSION = 2
+"""2 lacks the entry observation_history, which was 1 even where terms hold frames of the past."""
 
 
 class _Graph:
@@ -81,12 +82,13 @@ def metadata(policy: Policy, origin: Mapping[str, Any] | None = None) -> dict[st
     """Return the entries of the model's metadata.
 
     `jumper_warp` is JSON with the whole `PolicyInterface`; the others repeat parts of it, comma-separated and
-    unrounded, under the names that common deployment tools read.
+    unrounded, under the names that common deployment tools read. What the observation holds of the past is told by its
+    `observation_layout`: the network itself remembers nothing.
     """
     face = policy.interface
     joints = ("joint_names", "joint_stiffness", "joint_damping", "default_joint_pos", "action_scale")
     lists = {name: getattr(face, name) for name in (*joints, "observation_names")}
-    full = {**(origin or {}), "schema_version": METADATA_VERSION, "observation_history": 1, **face.to_json()}
+    full = {**(origin or {}), "schema_version": METADATA_VERSION, **face.to_json()}
     entries = {name: ",".join(map(str, values)) for name, values in lists.items()}
     return entries | {"jumper_warp": json.dumps(full, ensure_ascii=False, allow_nan=False)}
 

@@ -92,17 +92,22 @@ class Policy(nn.Module):
 
     @torch.no_grad()
     def act(self, obs: torch.Tensor) -> torch.Tensor:
-        """Return the mean action clipped to ±1, (..., num_actions), for raw observations (..., num_obs).
+        """Return the mean action clipped to ±1, (..., num_actions) in single precision, for raw observations.
 
         Entries of an observation that are not finite count as 0. Nothing waits for the device.
 
+        obs: (..., num_obs), a tensor on the policy's device, of any kind of numbers.
+
         Raises:
-            ValueError: The last axis has another size than the policy's observation.
+            ValueError: No tensor, or the last axis has another size than the policy's observation.
         """
-        if obs.shape[-1] != len(self.mean):
-            raise InputError(f"the policy reads {len(self.mean)} numbers, got observations of {obs.shape[-1]}")
+        if not isinstance(obs, torch.Tensor):
+            raise InputError(f"the policy reads a torch tensor, got {type(obs).__name__}: torch.as_tensor makes one")
+        if not obs.dim() or obs.shape[-1] != len(self.mean):
+            got = f"observations of {obs.shape[-1]}" if obs.dim() else "a single number"
+            raise InputError(f"the policy reads {len(self.mean)} numbers, got {got}")
         limit = self.interface.observation_limit
-        finite = torch.nan_to_num(obs, nan=0.0, posinf=0.0, neginf=0.0).clamp(-limit, limit)
+        finite = torch.nan_to_num(obs, nan=0.0, posinf=0.0, neginf=0.0).clamp(-limit, limit).to(self.mean.dtype)
         limit = self.interface.normalised_limit
         features = ((finite - self.mean) / self.std).clamp(-limit, limit)
         return self.actor(features).clamp(-1.0, 1.0)

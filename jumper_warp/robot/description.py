@@ -28,6 +28,7 @@ from jumper_warp.robot.parts import (
     TriangleMesh,
 )
 from jumper_warp.robot.urdf import UrdfReader, file_inside, read_text
+from jumper_warp.utils.assets import ASSETS
 
 __all__ = [
     "DEFAULT_DESCRIPTION",
@@ -48,7 +49,7 @@ __all__ = [
     "load_description",
 ]
 
-DEFAULT_DESCRIPTION = Path(__file__).resolve().parents[2] / "assets" / "jumper" / "jumper.json"
+DEFAULT_DESCRIPTION = ASSETS / "jumper" / "jumper.json"
 
 RAD_PER_S_PER_RPM = 2.0 * math.pi / 60.0
 

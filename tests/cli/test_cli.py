@@ -140,6 +140,9 @@ def test_every_command_has_help(capsys, command):
         (["play", "missing"], "no policy 'missing'"),
         (["evaluate", "missing"], "no policy 'missing'"),
         (["export", "missing/model.pt"], "missing/manifest.json: No such file or directory"),
+        (["export", "vertical_jump", "--out", "x.pt"], "saved as a folder, whose name cannot end in .pt: got x.pt"),
+        (["export", "vertical_jump", "--out", "x.safetensors"], "whose name cannot end in .safetensors"),
+        (["finetune", "vertical_jump", "--out", "x.onnx"], "whose name cannot end in .onnx"),
     ],
 )
 def test_unusable_input_is_one_line_and_code_2(capsys, tmp_path, monkeypatch, args, message):

@@ -52,6 +52,12 @@ def test_gymnasium_knows_every_task_by_name(task):
     assert (spec.kwargs, spec.vector_entry_point) == ({"task": task}, "jumper_warp.gym:make_vector_env")
 
 
+@pytest.mark.parametrize("make", [gymnasium.make, lambda name: gymnasium.make_vec(name, vectorization_mode="sync")])
+def test_a_single_environment_is_refused_with_what_there_is_instead(make):
+    with pytest.raises(ValueError, match=r"gymnasium\.make_vec\('jumper_warp/VerticalJump-v0', num_envs=1\)"):
+        make("jumper_warp/VerticalJump-v0")
+
+
 def test_names_are_registered_once():
     before = dict(gymnasium.registry)
     register_envs()

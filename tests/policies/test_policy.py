@@ -12,7 +12,7 @@ import safetensors.torch
 import torch
 
 from jumper_warp.policies import folder as folder_module
-from jumper_warp.policies.folder import add_files, list_policies, load_policy, save_policy
+from jumper_warp.policies.folder import add_files, find_policy, list_policies, load_policy, save_policy
 from jumper_warp.policies.onnx import export_onnx, onnx_bytes
 from jumper_warp.policies.policy import Policy
 from jumper_warp.policies.spec import PolicyError, PolicyInterface
@@ -125,6 +125,27 @@ def test_observation_of_another_size_is_refused():
         scalar_policy().act(torch.zeros(3, 2))
 
 
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float16, torch.int64])
+def test_observations_of_any_kind_of_numbers_are_read(dtype):
+    policy = scalar_policy(0.1)
+    action = policy.act(torch.tensor([[3.0]], dtype=dtype))
+    assert action.dtype == torch.float32 and action == policy.act(torch.tensor([[3.0]]))
+
+
+def test_large_numbers_of_double_precision_are_limited_first():
+    policy = scalar_policy(0.1)
+    assert policy.act(torch.tensor([1.0e300], dtype=torch.float64)) == policy.act(torch.tensor([100.0]))
+
+
+@pytest.mark.parametrize(
+    ("obs", "message"),
+    [(np.zeros((1, 1)), "reads a torch tensor, got ndarray"), (torch.tensor(1.0), "got a single number")],
+)
+def test_what_is_no_observation_is_refused(obs, message):
+    with pytest.raises(ValueError, match=message):
+        scalar_policy().act(obs)
+
+
 # ---------------------------------------------------------------------- saving and loading
 
 
@@ -152,6 +173,13 @@ def test_folder_that_is_no_policy_is_never_replaced(tmp_path, trained):
     with pytest.raises(PolicyError, match="no policy's"):
         save_policy(tmp_path, trained, overwrite=True)
     assert (tmp_path / "mine.txt").exists()
+
+
+@pytest.mark.parametrize("name", ["x.pt", "x.pth", "x.onnx", "x.safetensors", "X.PT"])
+def test_folder_with_the_name_of_a_file_is_refused(tmp_path, trained, name):
+    with pytest.raises(PolicyError, match=r"saved as a folder, whose name cannot end in \."):
+        save_policy(tmp_path / name, trained)
+    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize("name", ["../evil", "manifest.json", ".hidden", ""])
@@ -347,6 +375,17 @@ def test_onnx_metadata_tells_the_interface_in_full_precision(folder, trained):
     assert entries["joint_names"].split(",") == list(trained.interface.joint_names)
     assert [float(text) for text in entries["joint_stiffness"].split(",")] == full["joint_stiffness"]
     assert len(entries["observation_names"].split(",")) == 48
+
+
+@pytest.mark.parametrize("name", list_policies())
+def test_shipped_onnx_tells_the_interface_and_nothing_that_contradicts_it(name):
+    (entry,) = (
+        entry for entry in onnx.load(find_policy(name) / "policy.onnx").metadata_props if entry.key == "jumper_warp"
+    )
+    full = json.loads(entry.value)
+    face = json.loads(json.dumps(load_policy(name).interface.to_json()))
+    assert {key: full[key] for key in face} == face and face["observation_layout"]
+    assert set(full) - set(face) == {"commit", "dirty", "schema_version"}
 
 
 def test_onnx_is_one_file_and_reproducible(folder, trained):

@@ -6,15 +6,15 @@ import functools
 import json
 import re
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
+from jumper_warp.utils.assets import ASSETS
 from jumper_warp.utils.errors import InputError
 
 ROWS, COLUMNS = 16, ("x_m", "z_m", "pitch_rad", "forward_m_s", "up_m_s", "pitch_rate_rad_s")
 """Moments from the deepest squat until a paw lifts, evenly spaced, and what is known of the base at each."""
-FOLDER = Path(__file__).resolve().parents[3] / "assets" / "motions"
+FOLDER = ASSETS / "motions"
 NAME = re.compile(r"[a-z0-9_]{1,40}")
 LARGEST = 20.0
 """[SI] No entry is beyond."""
