@@ -62,7 +62,8 @@ class SysidCfg:
     without: str = ""
     """Parameters, or groups of them, that are left as described, separated by commas."""
     mass: float | None = None
-    """[kg] What the whole robot weighs on a scale: without it or torques, masses and gains share a scale."""
+    """[kg] What the whole robot weighs on a scale: without it or torques, masses and gains share a factor. Of motions
+    that `excite` recorded it tells the mass."""
     mass_deviation: float = 0.02
     """[kg] Of the scale."""
     dt: float | None = None
@@ -129,7 +130,7 @@ class ActuatorCfg:
     """Fit limits, friction and latency of one motor to data of a test bench: writes actuator.json."""
 
     bench: Annotated[Path, tyro.conf.Positional]
-    """CSV or npz with test, time, command, speed and torque; see `jumper_warp.optim.actuators`."""
+    """CSV file with columns test, time [s], command [N m], speed [rad/s], torque [N m]; see docs/identification.md."""
     motor: Literal["lateral", "transversal"] = "transversal"
     """Kind of motor, whose described constants are the prior."""
     torque_noise: float = 0.1
@@ -202,9 +203,9 @@ def sysid(cfg: SysidCfg) -> Identification:
     from jumper_warp.utils.runtime import announce
 
     parameters, noise = parameters_of(cfg.params, cfg.without), noise_of(cfg.noise)
+    knowledge = [] if cfg.mass is None else [weighed(cfg.mass, cfg.mass_deviation)]
     given = {name: getattr(cfg, name) for name in ("base", "gains", "torque_limit", "torque_constant")}
     motions = [load_motion(file, **given) for file in motion_files(cfg.data)]
-    knowledge = [] if cfg.mass is None else [weighed(cfg.mass, cfg.mass_deviation)]
     announce(cfg.device, cfg.threads)
     settings = dict(noise=noise, knowledge=knowledge, dt=cfg.dt, device=cfg.device, threads=cfg.threads)
     if cfg.method == "cma":
@@ -231,6 +232,8 @@ def sysid(cfg: SysidCfg) -> Identification:
     )
     for words in dict.fromkeys(direction.words for direction in found.directions):
         print(f"open: {words}")
+    for line in found.doubts:
+        print(f"misfit: {line}")
     print(folder / "report.html")
     return found
 
@@ -240,6 +243,7 @@ def excite(cfg: ExciteCfg) -> list[Motion]:
     import numpy as np
 
     from jumper_warp.optim.excitation import Scorer, choose
+    from jumper_warp.optim.identification import total_mass
     from jumper_warp.optim.plans import KINDS
     from jumper_warp.optim.recording import measured, simulate_plan
     from jumper_warp.optim.replay import Replay
@@ -266,10 +270,12 @@ def excite(cfg: ExciteCfg) -> list[Motion]:
         p.name: {"unit": p.unit, "expected_deviation": p.deviation(0.0, float(d)), "of_prior": float(d)}
         for p, d in zip(parameters, chosen.deviations, strict=True)
     }
-    told = {"gain_nat": list(chosen.gain), "refused": list(chosen.refused), "parameters": expected}
+    mass = float(total_mass(robots)[0])
+    told = {"mass_kg": mass, "gain_nat": list(chosen.gain), "refused": list(chosen.refused), "parameters": expected}
     write_whole(folder / "excite.json", (json.dumps(told, indent=2) + "\n").encode())
     sure = int((chosen.deviations < 0.5).sum())
     print(f"{sure} of {len(parameters)} parameters are expected to be identified; motions in {folder}")
+    print(f"the recorded robot weighs {mass:.3f} kg: jumper sysid {folder} --mass {mass:.3f}")
     return motions
 
 

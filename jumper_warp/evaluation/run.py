@@ -23,6 +23,7 @@ from jumper_warp.evaluation.film import Film
 from jumper_warp.evaluation.latency import latency_metrics, latency_text
 from jumper_warp.evaluation.log import EvaluationLog, run_evaluation
 from jumper_warp.evaluation.registry import evaluation_of
+from jumper_warp.optim.parameters import TRANSVERSAL
 from jumper_warp.policies.restore import Conditions, env_of_policy, open_policy, restored_task
 from jumper_warp.policies.spec import PolicyError
 from jumper_warp.robot.model import PHYSICS_DT
@@ -271,8 +272,14 @@ class EvaluationRun(Run):
         env = env_of_policy(self.policy, count, conditions, change=change, modules=self.modules, **scene)
         self.policy.to(env.device)
         self.told["gravity_m_s2"] = env.task.gravity
-        self.told["torque_limit_nm"] = env.task.motors.transversal.saturation
+        self.told["torque_limit_nm"] = torque_limit(env)
         return env
+
+
+def torque_limit(env: Env) -> float:
+    """Return the least torque limit of the thighs' motors [N m]: the task's, as an overlay scales it."""
+    limit = env.task.motors.transversal.saturation
+    return limit if env.sim.robot is None else limit * float(env.sim.robot.saturation[:, TRANSVERSAL].min())
 
 
 def shown(value: Any) -> str:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from jumper_warp.optim.least_squares import Knowledge
 from jumper_warp.optim.parameters import ParameterSet
 from jumper_warp.optim.residuals import MotionResiduals
 from jumper_warp.optim.uncertainty import Direction
@@ -20,6 +21,10 @@ RATIO_ROWS = {
 """Row of `RandomizationCfg` that scales a quantity."""
 CONFIDENCE = 1.959964
 """Deviations on either side of a 95 % interval."""
+FAR = 10.0
+"""χ² above which the found values are not to be trusted: other physics, where base and units are right, make 3 to 5."""
+APART = 3.0
+"""Deviations between what is known of the robot and what is found, above which one of both is wrong."""
 
 
 @dataclass(frozen=True)
@@ -78,6 +83,8 @@ class Identification:
     cpu_seconds: float
     world_steps: int
     """Physics steps of all worlds."""
+    knowledge: tuple[Knowledge, ...]
+    """Of the robot besides the motions."""
     motions: tuple[MotionResiduals, ...]
     starts: tuple[np.ndarray, ...]
 
@@ -104,6 +111,32 @@ class Identification:
     def identified(self) -> np.ndarray:
         """Whether the data at least halves what the prior leaves open, (P,) bool."""
         return self.deviations < 0.5
+
+    @property
+    def doubts(self) -> tuple[str, ...]:
+        """One line for each thing that does not fit, with what to look at; none if motions and knowledge agree."""
+        lines = []
+        if not self.chi2 <= FAR:
+            worst = max(self.fits, key=lambda fit: fit.chi2)
+            base = next(motion.motion.base for motion in self.motions if motion.motion.name == worst.motion)
+            other = {
+                "free": "free on the ground; if the robot hung from a stand: --base fixed",
+                "fixed": "fixed; if the robot was on the ground: --base free",
+            }[base]
+            lines.append(
+                f"χ² {self.chi2:.4g} is far above 1, do not trust what was found: {worst.motion} fits worst "
+                f"({worst.channel} {worst.chi2:.4g}), its base is taken as {other}; else check signs, units, gains and "
+                "torque limit"
+            )
+        for known in self.knowledge:
+            found = float(known.measure(self.robots())[0])
+            apart = abs(found - known.value) / known.deviation
+            if apart > APART:
+                lines.append(
+                    f"{known.name} is given as {known.value:.5g} ± {known.deviation:.2g} but found as {found:.5g}, "
+                    f"{apart:.1f} deviations apart: check it, intervals do not hold if it is wrong"
+                )
+        return tuple(lines)
 
     def overlay(self, source: str = "") -> RobotOverlay:
         """Return the identified robot as an overlay, with the intervals as ranges of randomisation."""

@@ -51,8 +51,17 @@ def described_masses() -> np.ndarray:
 
 
 def weighed(mass: float, deviation: float = 0.02) -> Knowledge:
-    """Return what a scale says [kg]. Raises InputError for a mass or deviation that is not positive."""
-    check_positive("weighed mass and its deviation", mass, deviation)
+    """Return what a scale says [kg].
+
+    Raises InputError: a deviation that is not positive, or a mass that is not within 0.5 to 2 times the described one.
+    """
+    described = float(total_mass(RobotValues.nominal(1))[0])
+    if not 0.5 * described <= mass <= 2.0 * described:
+        raise InputError(
+            f"weighed mass must be in {0.5 * described:.4g} to {2.0 * described:.4g} kg (the robot is described with "
+            f"{described:.4g} kg), got {mass:.6g} kg"
+        )
+    check_positive("deviation of the weighed mass", deviation)
     return Knowledge("total mass", total_mass, mass, deviation)
 
 
@@ -148,6 +157,7 @@ def result(problem: LeastSquares, point: Point, normal: Normal, descent: Descent
         seconds=seconds,
         cpu_seconds=cpu_seconds,
         world_steps=world_steps,
+        knowledge=tuple(problem.knowledge),
         motions=tuple(problem.motions),
         starts=tuple(point.starts),
     )

@@ -160,7 +160,9 @@ class LeastSquares:
         for motion, start, change in list(zip(self.motions, point.starts, self._change, strict=True))[len(known) :]:
             found = motion.linearise(self.replay, point.z, start, change)
             if not np.isfinite(found.residual).all() or not np.isfinite(found.jacobian).all():
-                raise InputError(f"motion {motion.motion.name}: the model breaks in it; check targets, units and base")
+                raise InputError(
+                    f"motion {motion.motion.name}: the model breaks in it; check targets, units, signs and base"
+                )
             linearised.append(found)
         return self.assemble(point, linearised)
 

@@ -50,6 +50,7 @@ def to_json(found: Identification) -> dict[str, Any]:
         "chi2": found.chi2,
         "nominal_chi2": found.nominal_chi2,
         "mismatch": found.mismatch,
+        "doubts": list(found.doubts),
         "count": found.count,
         "dt_s": found.dt,
         "wall_s": found.seconds,
@@ -98,7 +99,8 @@ def summary(found: Identification) -> str:
             f"</p><p class=note>The model does not explain the data to its noise: intervals are "
             f"{found.mismatch:.3g} times as wide as noise alone would make them."
         )
-    return f"<p>{text}</p>"
+    notes = "".join(f"<p class=note>{html.escape(line)}</p>" for line in found.doubts)
+    return f"<p>{text}</p>{notes}"
 
 
 def open_directions(found: Identification) -> str:

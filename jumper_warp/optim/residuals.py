@@ -265,8 +265,8 @@ class MotionResiduals:
     ) -> Linearised:
         """Return residuals and Jacobian at one point, (P,) and (I,), by one-sided differences in parallel worlds.
 
-        change: of each unknown, (P + I,). An exact Jacobian (one-step adjoints over the recorded steps) would replace
-        this method alone.
+        change: of each unknown, (P + I,). Where a world broke, the Jacobian is not a number. An exact
+        Jacobian (one-step adjoints over the recorded steps) would replace this method alone.
         """
         change = np.broadcast_to(change, len(z) + len(start))
         many_z, many_start = (np.repeat(x[None], len(self.plan) + 1, axis=0) for x in (z, start))
@@ -278,6 +278,8 @@ class MotionResiduals:
                 else:
                     many_start[world, column - size] += change[column]
         found = self.residuals(replay, many_z, many_start)
+        if not np.isfinite(found).all():
+            return Linearised(found[:, 0], np.full((len(found), size + self.start_size), math.nan))
         differences = found[:, 1:] - found[:, :1]
         leg = np.broadcast_to(self._leg, self.measured.shape)[self.valid]
         jacobian = np.zeros((len(found), size + self.start_size))

@@ -19,7 +19,7 @@ from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.files import write_whole
 
 SCHEMA = "jumper-warp robot overlay 1"
-RATIO = Range(0.05, 20.0, "")
+RATIO = Range(0.05, 3.0, "times the described value")
 RANGES = {
     "base_mass": bounds.LINK_MASS,
     "base_com": bounds.PLACE,
@@ -40,6 +40,13 @@ RANGES = {
     "spring_length": bounds.SPRING_LENGTH,
 }
 """What the values of each quantity may be."""
+SECTIONS = ("schema", "source", "values", "randomization")
+RANDOMIZED = (
+    "static_friction", "dynamic_friction", "base_mass", "link_mass", "com_shift", "gains", "damping_gains",
+    "no_load_speed", "cutoff_speed", "motor_friction", "armature", "joint_offset", "latency", "observation_latency",
+    "force", "torque", "push_interval",
+)  # fmt: skip
+"""Ranges that may be given: the rows of `RandomizationCfg`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,17 +61,18 @@ class RobotOverlay:
     """Where it comes from."""
 
     def __post_init__(self) -> None:
-        """Raises InputError: an unknown quantity, a wrong number of values, or one out of range."""
+        """Raises InputError: an unknown quantity or range, a wrong number of values, or one out of range."""
         nominal = vars(RobotValues.nominal(1))
         for name, values in self.values.items():
             if name not in RANGES:
                 raise InputError(f"robot overlay: no quantity {name!r:.60}; there are {', '.join(RANGES)}")
             if len(values) != nominal[name].shape[1]:
                 raise InputError(f"robot overlay: {name} needs {nominal[name].shape[1]} values, got {len(values)}")
-            low, high, unit = RANGES[name]
-            for value in values:
-                if not low <= value <= high:
-                    raise InputError(f"robot overlay: {name} must be in {low:g} to {high:g} {unit}, got {value:.6g}")
+            check_range(name, values)
+        for name in self.randomization:
+            if name not in RANDOMIZED:
+                there = ", ".join(RANDOMIZED)
+                raise InputError(f"robot overlay: no range of randomisation {name!r:.60}; there are {there}")
         robot = self.robots()
         if not (robot.cutoff_speed < robot.no_load_speed).all():
             raise InputError("robot overlay: each cutoff_speed must be below the no_load_speed")
@@ -95,6 +103,9 @@ class RobotOverlay:
         """Return the overlay of `to_json`. Raises InputError for anything else."""
         if not isinstance(saved, dict) or saved.get("schema") != SCHEMA:
             raise InputError(f"not a robot overlay: expected an object with schema {SCHEMA!r}")
+        for section in saved:
+            if section not in SECTIONS:
+                raise InputError(f"robot overlay: no section {section!r:.60}; there are {', '.join(SECTIONS)}")
         sections = {}
         for section in ("values", "randomization"):
             table = saved.get(section, {})
@@ -109,6 +120,16 @@ class RobotOverlay:
     def save(self, path: Path) -> None:
         """Write it as a JSON file. Raises OSError."""
         write_whole(path, (json.dumps(self.to_json(), indent=2, allow_nan=False) + "\n").encode())
+
+
+def check_range(name: str, values: tuple[float, ...]) -> None:
+    """Raise InputError for a value that a quantity cannot have."""
+    low, high, unit = RANGES[name]
+    hint = " (a ratio: 1 is as described)" if RANGES[name] is RATIO else ""
+    for value in values:
+        if not low <= value <= high:
+            limits = f"{low:g} to {high:g}{unit and ' '}{unit}{hint}"
+            raise InputError(f"robot overlay: {name} must be in {limits}, got {value:.6g}")
 
 
 def numbers(name: str, values: Any) -> tuple[float, ...]:

@@ -9,7 +9,7 @@ import tyro
 
 from jumper_warp.cli.main import main
 from jumper_warp.cli.train import TrainArgs, env_maker, for_robot, overlay_in
-from jumper_warp.evaluation.run import EvaluationArgs, conditions_of
+from jumper_warp.evaluation.run import EvaluationArgs, conditions_of, torque_limit
 from jumper_warp.policies.restore import env_of_policy, open_policy
 from jumper_warp.registry import make_task
 from jumper_warp.robot.overlay import RobotOverlay
@@ -57,6 +57,25 @@ def test_experiments_take_the_flag_too(overlay):
         for a in (args, EvaluationArgs(device="cpu"))
     ]
     assert masses[0] - masses[1] == pytest.approx(HEAVY, abs=1e-5)
+
+
+def test_the_torque_limit_that_is_reported_is_the_overlays(tmp_path):
+    RobotOverlay({"saturation": 4 * (0.5, 0.9, 0.9)}).save(tmp_path / "weak.json")
+    args = EvaluationArgs(robot=tmp_path / "weak.json", device="cpu")
+    policy = open_policy("vertical_jump")
+    nominal, weak = (torque_limit(env_of_policy(policy, 1, conditions_of(a))) for a in (EvaluationArgs(), args))
+    assert nominal == 18.0 and weak == pytest.approx(16.2)
+
+
+@pytest.mark.parametrize("command", [("evaluate", "vertical_jump"), ("train", "vertical-jump")])
+@pytest.mark.parametrize("change", [{"value": {"kp": 12 * [1.1]}}, {"randomization": {"gain": [0.9, 1.1]}}])
+def test_a_misspelt_overlay_is_refused_in_one_line_that_names_the_file(command, change, tmp_path, capsys):
+    file = tmp_path / "robot.json"
+    file.write_text(json.dumps(RobotOverlay({}).to_json() | change))
+    with pytest.raises(SystemExit) as end:
+        main([*command, "--robot", str(file), "--device", "cpu"])
+    error = capsys.readouterr().err.strip().splitlines()[-1]
+    assert end.value.code == 2 and str(file) in error and ("'value'" in error or "'gain'" in error)
 
 
 def test_a_training_is_of_the_robot_and_says_so_in_its_configuration(overlay):

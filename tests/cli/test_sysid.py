@@ -1,17 +1,32 @@
 """The command `jumper sysid`, from planned motions to an overlay that the other commands take."""
 
+import csv
 import json
 import re
+import warnings
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from jumper_warp.cli.main import main
 from jumper_warp.optim.actuators import COLUMNS, described_constants, synthetic_bench
+from jumper_warp.optim.identification import total_mass
 from jumper_warp.optim.motions import load_motion
+from jumper_warp.robot.description import MOTOR_JOINTS
 from jumper_warp.robot.overlay import RobotOverlay, load_overlay
+from jumper_warp.robot.values import RobotValues
 
 PARAMS = ["--params", "latency,offsets"]
+
+
+def write_table(path, motion, sign=1.0):
+    """Write targets and angles, times a sign, as a table without settings."""
+    names = [f"{channel}/{joint}" for channel in ("target", "angle") for joint in MOTOR_JOINTS]
+    with path.open("w", newline="") as file:
+        csv.writer(file).writerows(
+            [["time", *names], *np.column_stack([motion.time, motion.target, sign * motion.angle]).tolist()]
+        )
 
 
 @pytest.fixture(scope="module")
@@ -31,6 +46,7 @@ def test_excite_records_motions_and_tells_what_to_expect(recorded):
     assert [load_motion(file).base for file in files] == ["fixed", "fixed", "free", "free"]
     told = json.loads((recorded / "motions" / "excite.json").read_text())
     assert np.all(np.diff(told["gain_nat"]) > 0.0)
+    assert told["mass_kg"] == pytest.approx(14.5)
     assert told["parameters"]["latency"]["expected_deviation"] < 2.0e-4
     assert told["parameters"]["offset/FL_outer"]["of_prior"] < 0.2
 
@@ -49,7 +65,37 @@ def test_sysid_writes_an_overlay_and_a_report_that_needs_nothing_else(recorded, 
     assert page.count("data:image/png;base64,") == 6 and "offset/BR_inner" in page
     links = re.findall(r"(?:src|href)\s*=\s*[\"']?([^\"'\s>]*)", page)
     assert links and all(link.startswith("data:") for link in links) and "<script" not in page
-    assert "χ²" in capsys.readouterr().out
+    told = capsys.readouterr().out
+    assert "χ²" in told and "misfit" not in told and report["doubts"] == []
+
+
+def test_the_walk_through_weighs_the_robot_that_it_records():
+    page = (Path(__file__).parents[2] / "docs" / "identification.md").read_text()
+    described = float(total_mass(RobotValues.nominal(1))[0])
+    given = [float(mass) for mass in re.findall(r"--mass ([0-9.]+)", page)]
+    assert given and all(mass == pytest.approx(described, abs=0.002) for mass in given)
+
+
+def test_a_mass_that_the_motions_contradict_is_told(recorded, capsys):
+    args = ["--params", "masses", "--mass", "20", "--mass-deviation", "0.5", "--out", str(recorded / "heavy")]
+    main(["sysid", str(recorded / "motions" / "2_standing_chirp.npz"), *args])
+    assert "misfit: total mass is given as 20 ± 0.5 but found as" in capsys.readouterr().out
+
+
+def test_a_hung_robot_that_is_taken_as_free_is_told_of_its_base(recorded, capsys):
+    write_table(recorded / "hung.csv", load_motion(recorded / "motions" / "0_hung_chirp.npz"))
+    main(["sysid", str(recorded / "hung.csv"), *PARAMS, "--out", str(recorded / "as_free")])
+    told = [line for line in capsys.readouterr().out.splitlines() if line.startswith("misfit")]
+    assert len(told) == 1 and "hung fits worst" in told[0] and "--base fixed" in told[0]
+    assert "--base fixed" in (recorded / "as_free" / "report.html").read_text()
+
+
+def test_angles_of_the_other_sign_are_refused_without_warnings(recorded, capsys):
+    write_table(recorded / "flipped.csv", load_motion(recorded / "motions" / "2_standing_chirp.npz"), -1.0)
+    with warnings.catch_warnings(), pytest.raises(SystemExit):
+        warnings.simplefilter("error")
+        main(["sysid", str(recorded / "flipped.csv"), *PARAMS])
+    assert "check targets, units, signs and base" in capsys.readouterr().err
 
 
 def test_evolution_is_the_other_method(recorded):
@@ -77,6 +123,7 @@ def test_a_motor_is_characterised_from_a_bench(tmp_path):
         (["."], "no npz, csv or parquet file"),
         (["x.npz", "--params", "gears"], "unknown group of parameters 'gears'"),
         (["x.npz", "--without", "kq"], "no parameter 'kq' to leave out"),
+        (["x.npz", "--mass", "14500"], "must be in 7.25 to 29 kg (the robot is described with 14.5 kg), got 14500 kg"),
         (["x.npz", "--noise.angle", "0"], "noise angle must be positive"),
     ],
 )

@@ -1,7 +1,6 @@
 """Robot overlays: as files, in simulations on both solvers, and in environments."""
 
 import json
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,8 +8,9 @@ import pytest
 from jumper_warp.cli.train import for_robot, overlay_in
 from jumper_warp.envs.env import Env
 from jumper_warp.registry import make_task
-from jumper_warp.robot.overlay import RobotOverlay, load_overlay
+from jumper_warp.robot.overlay import RANDOMIZED, RobotOverlay, load_overlay
 from jumper_warp.sim.simulation import Simulation
+from jumper_warp.tasks.randomization import RandomizationCfg
 from jumper_warp.utils.errors import InputError
 from kernels.layout import BODIES, DOFS
 
@@ -38,6 +38,13 @@ def test_an_overlay_comes_back_from_its_file(tmp_path):
         ({"values": {"colour": [1.0]}}, "no quantity 'colour'"),
         ({"values": {"kp": [1.0]}}, "kp needs 12 values, got 1"),
         ({"values": {"base_mass": [7000.0]}}, "base_mass must be in 0.001 to 100 kg"),
+        (
+            {"values": {"kp": 12 * [20.0]}},
+            r"kp must be in 0.05 to 3 times the described value \(a ratio: .*\), got 20$",
+        ),
+        ({"values": {"paw_friction": [30.0]}}, "paw_friction must be in 0 to 10, got 30"),
+        ({"value": {"kp": 12 * [1.1]}}, "no section 'value'; there are schema, source, values, randomization"),
+        ({"randomization": {"gain": [0.9, 1.1]}}, "no range of randomisation 'gain'; there are static_friction"),
         ({"values": {"base_mass": ["7"]}}, "must be a list of numbers"),
         ({"values": {"cutoff_speed": 12 * [60.0]}}, "below the no_load_speed"),
         ({"randomization": {"gains": [1.1, 0.9]}}, "two rising numbers"),
@@ -46,8 +53,13 @@ def test_an_overlay_comes_back_from_its_file(tmp_path):
 def test_a_bad_overlay_is_refused_in_one_line(tmp_path, change, words):
     file = tmp_path / "robot.json"
     file.write_text(json.dumps(RobotOverlay(VALUES).to_json() | change))
-    with pytest.raises(InputError, match=words):
+    with pytest.raises(InputError, match=words) as told:
         load_overlay(file)
+    assert str(told.value).startswith(str(file)) and "\n" not in str(told.value)
+
+
+def test_an_overlay_may_give_every_range_of_randomisation():
+    assert set(RANDOMIZED) == {name for name, value in vars(RandomizationCfg.off()).items() if value is None}
 
 
 @pytest.mark.parametrize("solver", ["jumper", "mujoco"])
@@ -91,5 +103,3 @@ def test_the_training_reads_the_overlay_before_its_flags(tmp_path):
     assert overlay_in(["--seed", "1"]) is None
     assert overlay_in(["--robot", str(tmp_path / "robot.json")]).values["base_mass"] == (7.0,)
     assert overlay_in([f"--robot={tmp_path / 'robot.json'}"]).randomization == RANGES
-    with pytest.raises(InputError, match="no range of randomisation 'colour'"):
-        for_robot(make_task("vertical-jump"), replace(RobotOverlay(VALUES), randomization={"colour": (0.0, 1.0)}))
