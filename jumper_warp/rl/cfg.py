@@ -163,8 +163,9 @@ class TrainCfg:
     device: str | None = None
     """A torch device; default: a GPU if there is one."""
     threads: int | None = None
-    """CPU threads of each process that share its worlds (default: all cores, shared out to the processes of a machine).
-    They change no result; those of torch do, half the cores but at least two unless OMP_NUM_THREADS says otherwise."""
+    """CPU threads of each process that share its worlds (default: all cores, shared out to the processes of a machine),
+    and of torch (default: half the cores but at least two), whose number OMP_NUM_THREADS overrides. Those of the worlds
+    change no result; torch's do in the last digits."""
     log_root: Path = Path("logs")
     """A run is written to log_root/task/time of its start."""
     log_interval: int = 10

@@ -101,7 +101,7 @@ def train(
         SystemExit: With code INTERRUPTED, after Ctrl-C or SIGTERM ended the iteration and it was saved.
     """
     set_threads(cfg.threads)
-    rank = join_ranks(cfg.device)
+    rank = join_ranks(cfg.device, cfg.threads)
     run: Run | None = None
     try:
         _check_processes(cfg, rank, as_rsl_rl is not None)
