@@ -177,7 +177,8 @@ class TrainCfg:
     best_by: str = "Metrics/success"
     """The logged figure that makes a checkpoint the best; higher is better."""
     resume: str | None = None
-    """A checkpoint, a run's folder, or `latest` for the task's latest run."""
+    """A checkpoint, a run's folder, or `latest` for the task's latest run. `jumper train` goes on with the settings of
+    that run, and flags change them. Not kept are device, threads, log_root, tensorboard and wandb."""
     start_from: str | None = None
     """A policy's name or folder, a run's folder (its best checkpoint) or a checkpoint: a new training begins with that
     policy's actor, its weights and its statistics of observations. The critic, the optimiser and the noise are new."""
