@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import json
 import os
 import shlex
@@ -10,7 +11,6 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from types import ModuleType
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
@@ -21,6 +21,8 @@ from jumper_warp.rl.cfg import TrainCfg
 from jumper_warp.utils.errors import InputError
 
 if TYPE_CHECKING:
+    from types import ModuleType
+
     import torch
 
     from jumper_warp.envs.env import Env
@@ -46,13 +48,17 @@ class TrainArgs:
     1 is a third of the numbers, learns sooner on few worlds, and is enough where nothing is drawn and noise is off."""
     robot: Path | None = None
     """Robot overlay, as `jumper sysid` writes it; its ranges of randomisation replace the task's, and flags both."""
+    robot_of_run: Annotated[Any, tyro.conf.Suppress] = None
+    """Robot overlay of the run that is resumed."""
 
 
 def parse_train(args: Sequence[str]) -> tuple[TrainArgs, TaskCfg]:
     """Return the settings, and the task with its settings; exits after help or usage, and where tyro does.
 
+    Those of a run that is resumed are its own, where no flag changes them.
+
     Raises:
-        InputError: The task is missing, unknown or given twice, or a setting is out of range.
+        InputError: The task is missing, unknown or given twice, a setting is out of range, or there is no such run.
     """
     names = ", ".join(task_names())
     if not args:
@@ -64,8 +70,13 @@ def parse_train(args: Sequence[str]) -> tuple[TrainArgs, TaskCfg]:
     if args[0].startswith("-"):
         raise UsageError(f"the task comes first: jumper train TASK [flags]; tasks: {names}")
     name, entry = find_task(args[0])
-    task = for_robot(make_task(name), overlay_in(args[1:]))
-    parsed = parse_settings(task, TrainArgs(TrainCfg(task=name, ppo=entry.ppo, best_by=entry.best_by)), args[1:])
+    default, task = TrainArgs(TrainCfg(task=name, ppo=entry.ppo, best_by=entry.best_by)), make_task(name)
+    given = {name: value_of(f"--{name.replace('_', '-')}", args[1:]) for name in ("resume", "log_root", "start_from")}
+    if given["resume"]:
+        from jumper_warp.cli.resumed import with_run
+
+        default, task = with_run(default, dataclasses.replace(default.cfg, **{k: v for k, v in given.items() if v}))
+    parsed = parse_settings(for_robot(task, overlay_in(args[1:])), default, args[1:])
     if parsed.cfg.task != name:
         raise UsageError(f"give the task once, got {name} and --task {parsed.cfg.task}")
     from jumper_warp.cli.task_flags import with_flags
@@ -86,15 +97,24 @@ def parse_settings(task: TaskCfg, default: TrainArgs, args: Sequence[str]) -> An
     return parse(kind, f"train {task.name}", args, default=kind(**given), description=about)
 
 
+def value_of(name: str, args: Sequence[str]) -> str | None:
+    """Return the value of a flag before the flags are parsed, the last one that is given; None: there is none."""
+    found = None
+    for arg, following in itertools.zip_longest(args, args[1:]):
+        flag, equals, value = arg.partition("=")
+        if flag.replace("_", "-") == name:
+            found = value if equals else following
+    return found
+
+
 def overlay_in(args: Sequence[str]) -> RobotOverlay | None:
     """Return the overlay that the flag --robot names; None without. Raises InputError or OSError: it cannot be used."""
-    for i, arg in enumerate(args):
-        flag, equals, path = arg.partition("=")
-        if flag == "--robot" and (equals or i + 1 < len(args)):
-            from jumper_warp.robot.overlay import load_overlay
+    path = value_of("--robot", args)
+    if path is None:
+        return None
+    from jumper_warp.robot.overlay import load_overlay
 
-            return load_overlay(Path(path if equals else args[i + 1]))
-    return None
+    return load_overlay(Path(path))
 
 
 def for_robot(task: TaskCfg, overlay: RobotOverlay | None) -> TaskCfg:
@@ -110,7 +130,7 @@ def env_maker(task: TaskCfg, args: TrainArgs) -> MakeEnv:
     from jumper_warp.envs.env import Env
     from jumper_warp.robot.overlay import load_overlay
 
-    overlay = None if args.robot is None else load_overlay(args.robot)
+    overlay = args.robot_of_run if args.robot is None else load_overlay(args.robot)
 
     def make(num_envs: int, seed: int, device: torch.device) -> Env | DifferentiableEnv:
         check_memory(task, args.cfg.ppo, args.solver, num_envs, device)
@@ -153,10 +173,10 @@ def command_line(args: Sequence[str], modules: Sequence[ModuleType]) -> str:
 
 def check_saving(task: TaskCfg) -> None:
     """Raise InputError unless the task could be read back from what is saved with its policies."""
+    from jumper_warp.cli.resumed import loaded_modules
     from jumper_warp.tasks.saving import task_from_json, task_to_json
 
-    saved = json.loads(json.dumps(task_to_json(task)))
-    if task_from_json(saved, [module for module in sys.modules.values() if isinstance(module, ModuleType)]) != task:
+    if task_from_json(json.loads(json.dumps(task_to_json(task))), loaded_modules()) != task:
         raise InputError(f"{task.name} would not come back as it is from what is saved with its policies")
 
 
@@ -166,20 +186,6 @@ def check_symmetry(task: TaskCfg, cfg: TrainCfg) -> None:
 
     if cfg.ppo.symmetry != "off":
         mirror_of(task, "policy")
-
-
-def check_resume(cfg: TrainCfg) -> None:
-    """Raise CheckpointError if the checkpoint to resume is of a run from before tasks had a version."""
-    from jumper_warp.rl.checkpoint import CheckpointError
-    from jumper_warp.rl.resume import find_checkpoint
-
-    path, state, _ = find_checkpoint(cfg)
-    try:
-        older = "version" not in json.loads(state["config"])["env"]["task"]
-    except (KeyError, TypeError, ValueError) as error:
-        raise CheckpointError(f"{path}: no task in its configuration ({type(error).__name__}: {error})") from error
-    if older:
-        raise CheckpointError(f"{path}: of a run of version 1, which can be exported and played but not resumed")
 
 
 def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> TrainResult:
@@ -193,8 +199,6 @@ def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> TrainResult:
 
     check_saving(task)
     check_symmetry(task, parsed.cfg)
-    if parsed.cfg.resume:
-        check_resume(parsed.cfg)
     start = None
     if parsed.cfg.start_from:
         from jumper_warp.policies.start import start_from

@@ -95,7 +95,7 @@ class Env(Stages):
             raise InputError(f"refine must be a whole number of at least 1, got {refine!r:.40}")
         tasks = checked_tasks(task, handovers)
         self.task, self.tasks, self.num_envs, self.seed, self.auto_reset = tasks[0], tasks, num_envs, seed, auto_reset
-        self.handovers, self._overlay = tuple(handovers), robot
+        self.handovers, self._overlay, self._conditions = tuple(handovers), robot, (randomize, noise)
         may_vary = solver == "jumper" and isinstance(ground, str) and ground == "plane" and block is None
         run, self._draws_ground = prepared(tasks, randomize, noise, may_vary)
         terrains = [terrain for each in run if (terrain := each.terrain) is not None]
@@ -297,6 +297,8 @@ class Env(Stages):
                 "policy_dt_s": self.step_dt,
                 "contact_tolerance_m_s": CONTACT_TOLERANCE,
                 "solver": type(self.sim.solver).__name__,
+                "randomize": self._conditions[0],
+                "noise": self._conditions[1],
                 "quaternion_order": "xyzw",
             }
         )

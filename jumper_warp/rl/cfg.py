@@ -163,8 +163,9 @@ class TrainCfg:
     device: str | None = None
     """A torch device; default: a GPU if there is one."""
     threads: int | None = None
-    """CPU threads of each process that share its worlds (default: all cores, shared out to the processes of a machine).
-    They change no result; those of torch do, half the cores but at least two unless OMP_NUM_THREADS says otherwise."""
+    """CPU threads of each process that share its worlds (default: all cores, shared out to the processes of a machine),
+    and of torch (default: half the cores but at least two), whose number OMP_NUM_THREADS overrides. Those of the worlds
+    change no result; torch's do in the last digits."""
     log_root: Path = Path("logs")
     """A run is written to log_root/task/time of its start."""
     log_interval: int = 10
@@ -176,7 +177,8 @@ class TrainCfg:
     best_by: str = "Metrics/success"
     """The logged figure that makes a checkpoint the best; higher is better."""
     resume: str | None = None
-    """A checkpoint, a run's folder, or `latest` for the task's latest run."""
+    """A checkpoint, a run's folder, or `latest` for the task's latest run. `jumper train` goes on with the settings of
+    that run, and flags change them. Not kept are device, threads, log_root, tensorboard and wandb."""
     start_from: str | None = None
     """A policy's name or folder, a run's folder (its best checkpoint) or a checkpoint: a new training begins with that
     policy's actor, its weights and its statistics of observations. The critic, the optimiser and the noise are new."""

@@ -70,8 +70,10 @@ class Rank(NamedTuple):
     device: torch.device
 
 
-def join_ranks(device: str | None = None) -> Rank:
+def join_ranks(device: str | None = None, threads: int | None = None) -> Rank:
     """Return this process's place; under torchrun (RANK, LOCAL_RANK, WORLD_SIZE), join the other processes.
+
+    threads: of torch on a CPU, unless OMP_NUM_THREADS is set.
 
     Raises:
         ValueError: There is no such device.
@@ -87,10 +89,9 @@ def join_ranks(device: str | None = None) -> Rank:
     if kind.type == "cuda":
         torch.cuda.set_device(kind)
     elif "OMP_NUM_THREADS" not in os.environ:
-        # small networks gain little from many threads, and lose where these wait on a busy machine; what those of the
-        # simulation are does not matter here: torch's sums depend on the number of its threads
+        # small networks gain little from many threads, and lose where these wait on a busy machine
         cores = available_threads()
-        torch.set_num_threads(min(cores, max(2, cores // 2)))
+        torch.set_num_threads(threads or min(cores, max(2, cores // 2)))
     if size > 1 and not torch.distributed.is_initialized():
         for name, value in NCCL.items():
             os.environ.setdefault(name, value)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
-from jumper_warp.rl.checkpoint import CheckpointError, latest_checkpoint, load_checkpoint
+from jumper_warp.rl.checkpoint import DAMAGE, MANIFEST, CheckpointError, latest_checkpoint, load_checkpoint
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.state_checks import check_parts, check_tensor
 
@@ -19,6 +19,10 @@ if TYPE_CHECKING:
 
 CHECKPOINTS = "checkpoints"
 """Folder of a run that holds its checkpoints."""
+SESSION = ("device", "threads", "log_root", "resume", "start_from", "tensorboard", "wandb")
+"""Settings of a training that are not kept when its run is resumed."""
+DERIVED = ("interface", "num_envs", "seed")
+"""What an environment tells of itself that other settings say."""
 
 
 def find_checkpoint(cfg: TrainCfg) -> tuple[Path, dict[str, Any], list[str]]:
@@ -34,9 +38,10 @@ def find_checkpoint(cfg: TrainCfg) -> tuple[Path, dict[str, Any], list[str]]:
             raise CheckpointError(f"{runs}: no run to resume")
         return latest_checkpoint(folders[-1])
     path = Path(cfg.resume or "")
-    if path.suffix == ".pt":
-        return path, load_checkpoint(path), []
-    return latest_checkpoint(path if path.name == CHECKPOINTS else path / CHECKPOINTS)
+    folder = path.parent if path.suffix == ".pt" else path if path.name == CHECKPOINTS else path / CHECKPOINTS
+    if not (folder / MANIFEST).is_file():
+        raise CheckpointError(f"{path}: no run to resume; give a run's folder, one of its checkpoints, or latest")
+    return (path, load_checkpoint(path), []) if path.suffix == ".pt" else latest_checkpoint(folder)
 
 
 def own_part(state: dict[str, Any], rank: Rank) -> dict[str, Any]:
@@ -64,6 +69,36 @@ def started_from(state: dict[str, Any]) -> str | None:
         return str(settings["start_from"]) if settings.get("start_from") else None
     except (LookupError, TypeError, ValueError, AttributeError):
         return None
+
+
+def changes(state: dict[str, Any], config: dict[str, Any]) -> list[str]:
+    """Return what a configuration changes against that of a checkpoint, a line for each setting; none if it has none.
+
+    Settings are called as their flags are.
+    """
+    try:
+        old, new = _settings(json.loads(state["config"])), _settings(config)
+    except DAMAGE:
+        return []
+    differ = [name for name in {**old, **new} if old.get(name) != new.get(name)]
+    return [f"{name} {old.get(name)!s:.80} -> {new.get(name)!s:.80}" for name in differ]
+
+
+def _settings(config: dict[str, Any]) -> dict[str, Any]:
+    """Return the settings of a run by name."""
+    train = {name: value for name, value in config["train"].items() if name not in (*SESSION, "task")}
+    env = {name: value for name, value in config["env"].items() if name not in (*DERIVED, "task")}
+    return _flat(train) | _flat(env) | _flat(config["env"].get("task"), "env")
+
+
+def _flat(value: Any, name: str = "") -> dict[str, Any]:
+    """Return all that is in nested objects by a name of dots; terms in lists by their names."""
+    if isinstance(value, list) and any(isinstance(part, dict) for part in value):
+        value = {part.get("name", str(i)): part for i, part in enumerate(value)}
+    if not isinstance(value, dict):
+        return {name: value}
+    parts = [_flat(part, f"{name}.{key}".strip(".").replace("_", "-")) for key, part in value.items()]
+    return {key: leaf for part in parts for key, leaf in part.items()}
 
 
 def spent_seconds(state: dict[str, Any]) -> float:

@@ -26,6 +26,7 @@ from jumper_warp.rl.logger import Pace, Stopwatch, TrainingLog
 from jumper_warp.rl.ppo import FIGURES, Ppo
 from jumper_warp.rl.resume import (
     CHECKPOINTS,
+    changes,
     find_checkpoint,
     own_part,
     random_state,
@@ -101,7 +102,7 @@ def train(
         SystemExit: With code INTERRUPTED, after Ctrl-C or SIGTERM ended the iteration and it was saved.
     """
     set_threads(cfg.threads)
-    rank = join_ranks(cfg.device)
+    rank = join_ranks(cfg.device, cfg.threads)
     run: Run | None = None
     try:
         _check_processes(cfg, rank, as_rsl_rl is not None)
@@ -192,7 +193,8 @@ class Run:
 
     def _resume(self) -> Path:
         path, state, refusals = find_checkpoint(self.cfg)
-        self.notes += [f"passed over: {refusal}" for refusal in refusals] + [f"resumed {path}"]
+        changed = changes(state, self.config)
+        self.notes += [*(f"passed over: {refusal}" for refusal in refusals), f"resumed {path}", *changed]
         try:
             own = own_part(state, self.rank)
             self.ppo.load_state_dict({**state["ppo"], **own["ppo"]})
@@ -200,7 +202,8 @@ class Run:
             self.seconds = spent_seconds(state)
             set_random_state(own["rng"])
         except DAMAGE as error:
-            raise CheckpointError(f"{path}: does not fit these settings: {one_line(error)}") from error
+            told = f" ({', '.join(changed)})" if changed else ""
+            raise CheckpointError(f"{path}: does not fit these settings: {one_line(error)}{told}") from error
         self.iteration = state["iteration"]
         self.config["train"]["start_from"] = started_from(state)
         return path.parent.parent
@@ -221,7 +224,9 @@ class Run:
                 log.say(note)
             ending = self.iteration >= cfg.iterations or 0.0 < cfg.max_seconds <= self.seconds
             if ending:
-                log.say(f"nothing is left to train after iteration {self.iteration}")
+                seconds = f"--max-seconds {cfg.max_seconds:g}"
+                limit = f"--iterations {cfg.iterations}" if self.iteration >= cfg.iterations else seconds
+                log.say(f"nothing is left to train after iteration {self.iteration}: give more than {limit}")
             drain = False
             while not ending:
                 watch.start()

@@ -221,9 +221,12 @@ def test_command_that_goes_on_names_the_module(path):
 def test_training_is_resumed(capsys, runs, path, tmp_path):
     folder = tmp_path / "tame-jump" / "run"
     shutil.copytree(runs["tame-jump"], folder)
-    args = [*TRAIN, "--iterations", "2", "--resume", str(folder)]
+    args = ["--device", "cpu", "--iterations", "2", "--resume", str(folder)]
     code, _, err = run(capsys, "train", "tame-jump", "--task-module", path, *args)
     assert code == 0, err
+    assert "iterations 1 -> 2" in err and sum(" -> " in line for line in err) == 1
+    config = json.loads((folder / "config.json").read_text())
+    assert config["env"]["task"]["rewards"][0]["height"] == 0.4 and config["train"]["num_envs"] == 4
     assert (folder / "checkpoints" / "iteration_000002.pt").is_file()
 
 

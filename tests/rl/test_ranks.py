@@ -1,7 +1,13 @@
+import dataclasses
+
 import pytest
 import torch
+from toy_task import SMALL, PushTask
 
 from jumper_warp.rl import distributed
+from jumper_warp.rl.cfg import TrainCfg
+from jumper_warp.rl.runner import train
+from jumper_warp.utils.threads import set_threads
 
 
 @pytest.mark.parametrize(("cores", "threads"), [(1, 1), (2, 2), (3, 2), (4, 2), (16, 8)])
@@ -17,3 +23,14 @@ def test_torchs_threads_stay_where_the_environment_names_them(one_thread, monkey
     torch.set_num_threads(1)
     distributed.join_ranks("cpu")
     assert torch.get_num_threads() == 1
+
+
+def test_torch_has_as_many_threads_as_a_training_asks_for(one_thread, monkeypatch, tmp_path):
+    monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
+    cfg = TrainCfg(
+        task="push", num_envs=32, iterations=1, device="cpu", log_root=tmp_path, tensorboard=False, ppo=SMALL
+    )
+    for threads in (1, 3):
+        train(dataclasses.replace(cfg, threads=threads), PushTask)
+        assert torch.get_num_threads() == threads
+    set_threads(None)
