@@ -190,13 +190,15 @@ class Env(Stages):
 
         They are in their first skill, and asked for no other.
 
-        commands: (num_envs, up to 4), what the task's command takes; headings [rad]: (num_envs,) or one for all;
-        worlds: (num_envs,) bool, by default all.
-        Raises ValueError: values of another shape, or not finite.
+        commands: one row a world or one for all, of what the task's command takes
+        (`jumper_warp.tasks.commands.layout_of`); headings [rad]: (num_envs,) or one for all; worlds: (num_envs,) bool,
+        by default all.
+        Raises ValueError: values of another shape, out of bounds or not finite.
         """
-        values, n = checked_commands(commands, self.num_envs), self.num_envs
+        n, chosen = self.num_envs, checked_mask(worlds, self.num_envs)
+        values = checked_commands(commands, chosen, [self.tasks[i] for i in np.unique(self._first_skill)])
         headings = self._array(checked_values(headings, (n,), "headings"))
-        mask = self._array(checked_mask(worlds, n))
+        mask = self._array(chosen)
         self._ends_episodes = False
         if not self._started:
             load_kernels(self.kernels(draws=False), self.wp_device)
@@ -215,24 +217,27 @@ class Env(Stages):
     def command(self, commands: Any, worlds: Any = None) -> None:
         """Give worlds a command within their episode; `obs` shows it at once.
 
-        commands: (num_envs, up to 4), relative to base and yaw as they are; worlds: (num_envs,) bool, by default all.
-        Raises ValueError: values of another shape, or not finite.
+        commands: as of `evaluation_reset`, relative to base and yaw as they are; worlds: (num_envs,) bool, by default
+        all.
+        Raises ValueError: values of another shape, out of bounds or not finite.
         """
-        mask = self._array(checked_mask(worlds, self.num_envs))
-        self._give(mask, 0, checked_commands(commands, self.num_envs), self._all)
+        chosen = checked_mask(worlds, self.num_envs)
+        self._give(self._array(chosen), 0, checked_commands(commands, chosen, self.tasks), self._all)
         self._observe(self._part(), beginning=1)
 
     def request(self, skill: int, worlds: Any = None, commands: Any = None) -> None:
         """Ask worlds to hand over to another skill as soon as a handover allows it.
 
-        worlds: (num_envs,) bool, by default all. commands: (num_envs, up to 4), what the skill's command takes, given
-        as it takes over, relative to base and yaw as they are then; by default the skill begins as the handover says.
-        Raises ValueError: no such skill, or commands of another shape or not finite.
+        worlds: (num_envs,) bool, by default all. commands: rows of what the skill's command takes, given as it takes
+        over, relative to base and yaw as they are then; by default the skill begins as the handover says.
+        Raises ValueError: no such skill, or commands of another shape, out of bounds or not finite.
         """
         if not 0 <= skill < len(self.skills):
             raise InputError(f"skill must be an index below {len(self.skills)}, got {skill}")
-        mask, n = checked_mask(worlds, self.num_envs) > 0.0, self.num_envs
-        values = np.zeros((n, 4), dtype=np.float32) if commands is None else checked_commands(commands, n)
+        mask, values = checked_mask(worlds, self.num_envs), np.zeros((self.num_envs, 4), dtype=np.float32)
+        if commands is not None:
+            values = checked_commands(commands, mask, [self.tasks[skill]])
+        mask = mask > 0.0
         for array, new in ((self.worlds.request, skill), (self.worlds.told, int(commands is not None)),
                            (self.worlds.wanted, values[mask])):  # fmt: skip
             kept = array.numpy()

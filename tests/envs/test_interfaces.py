@@ -111,13 +111,17 @@ def test_a_step_gives_the_tensors_of_the_environment():
 # ---------------------------------------------------------------- commands
 
 WRONG_COMMANDS = [
-    (np.zeros((3, 4)), r"commands must have shape \(8, 1 to 4\), got \(3, 4\)"),
-    (np.zeros(N), r"got \(8,\)"),
-    (np.zeros((N, 5)), r"got \(8, 5\)"),
-    (np.zeros((N, 0)), r"got \(8, 0\)"),
-    (np.zeros((1, N, 3)), r"got \(1, 8, 3\)"),
-    (0.5, r"got \(\)"),
-    (torch.zeros((3, 3)), r"got \(3, 3\)"),
+    (np.zeros((3, 4)), r"x \[m\], y \[m\], height \[m\], .*, 8 rows or one for all, got shape \(3, 4\)"),
+    (np.zeros(N), r"got shape \(8,\)"),
+    (np.zeros((N, 5)), r"got shape \(8, 5\)"),
+    (np.zeros((N, 0)), r"got shape \(8, 0\)"),
+    (np.zeros((1, N, 3)), r"got shape \(1, 8, 3\)"),
+    (0.5, r"got shape \(\)"),
+    (torch.zeros((3, 3)), r"got shape \(3, 3\)"),
+    (np.full((N, 1), 0.9), r"commands of vertical-jump are x \[m\], y \[m\], height \[m\], .* got shape \(8, 1\)"),
+    (np.full((N, 2), 0.9), r"got shape \(8, 2\)"),
+    (np.tile([0.0, 0.0, -5.0], (N, 1)), r"height \[m\] must be at least 0, got -5"),
+    (np.tile([0.0, 0.0, 0.9, -1.0], (N, 1)), "policy step of the command .* must be at least 0, got -1"),
     (np.full((N, 3), NAN), "commands must be finite"),
     (torch.full((N, 3), INF), "commands must be finite"),
     ([[0.0], [0.0, 1.0]], "commands must be an array of numbers, got list"),
@@ -180,6 +184,26 @@ def test_commands_may_come_in_any_container(kind):
     np.testing.assert_allclose(found["heading"][chosen], headings[chosen], rtol=1e-6)
     np.testing.assert_array_equal(found["command_step"][chosen], np.arange(N)[chosen])
     assert (found["goal"][~chosen, 2] != heights[~chosen]).all()
+
+
+def test_one_command_is_for_all_worlds(env):
+    env.evaluation_reset([0.0, 0.0, 0.7])
+    np.testing.assert_allclose(env.task_arrays()["goal"], np.tile([0.0, 0.0, 0.7], (N, 1)), rtol=1e-6)
+
+
+def test_numbers_of_other_worlds_may_be_anything_finite(env):
+    commands = np.tile([0.0, 0.0, 0.7], (N, 1))
+    commands[0, 2] = -1.0
+    env.evaluation_reset(commands, worlds=np.arange(N) > 0)
+
+
+def test_turns_are_quaternions_of_some_length():
+    env = Env(make_task("attitude"), 2, randomize=False, noise=False)
+    env.evaluation_reset([0.0, 0.0, 0.0, 1.0])
+    env.command([0.0, 0.0, 3.0, 3.0])
+    np.testing.assert_allclose(env.task_arrays()["goal"], [[0.0, 0.0, 0.5**0.5, 0.5**0.5]] * 2, atol=1e-6)
+    refused(env, "commands of attitude are quaternion x .*: not all may be 0", env.command, np.zeros((2, 4)))
+    refused(env, r"quaternion w \[1\], 2 rows or one for all, got shape \(2, 1\)", env.command, [[0.1], [0.1]])
 
 
 # ---------------------------------------------------------------- evaluation and training
