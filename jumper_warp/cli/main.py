@@ -6,8 +6,11 @@ Only what a command needs is imported, so that help and mistakes answer at once.
 from __future__ import annotations
 
 import importlib
+import os
+import re
 import sys
-from collections.abc import Callable, Sequence
+import traceback
+from collections.abc import Callable, Collection, Sequence
 from typing import Any
 
 from jumper_warp.utils.errors import InputError
@@ -26,6 +29,8 @@ COMMANDS = {
     "list": "Show the tasks and the project's policies.",
 }
 """Each is a module of `jumper_warp.cli` with run(args, modules)."""
+CODEGEN = re.compile(r'Error while parsing function "(\w+)" at (.+):\d+:')
+"""Names a function, and its file, in what Warp says of a kernel that it cannot compile; the last one is at fault."""
 TASK_MODULE = "--task-module"
 TASK_MODULE_HELP = f"""\
 Every command takes {TASK_MODULE} FILE_OR_MODULE, any number of times: a FILE.py or an installed module
@@ -62,11 +67,29 @@ def dispatch(args: Sequence[str]) -> None:
         raise UsageError(f"no command {name!r:.60}; there are {', '.join(COMMANDS)}")
     rest, files = split_task_modules(args[1:])
     modules = []
-    if files:
-        from jumper_warp.registry import load_task_module
+    try:
+        if files:
+            from jumper_warp.registry import load_task_module
 
-        modules = [load_task_module(file) for file in files]
-    importlib.import_module(f"jumper_warp.cli.{name}").run(rest, modules)
+            modules += (load_task_module(file) for file in files)
+        importlib.import_module(f"jumper_warp.cli.{name}").run(rest, modules)
+    except Exception as error:
+        own = {os.path.abspath(path) for path in (*files, *(module.__file__ for module in modules)) if path}
+        if fault := fault_in(own, error):
+            raise InputError(fault) from error
+        raise
+
+
+def fault_in(files: Collection[str], error: Exception) -> str | None:
+    """Return what is wrong in a user's own files in one line, or None if an exception comes from elsewhere."""
+    functions = CODEGEN.findall(str(error))
+    if functions and os.path.abspath(functions[-1][1]) in files:
+        name, path = functions[-1]
+        return f"{os.path.basename(path)}, function {name}: {str(error).rsplit(';Error', 1)[-1].strip(' ,')}"
+    frames = [(frame.f_code.co_filename, line) for frame, line in traceback.walk_tb(error.__traceback__)]
+    if isinstance(error, InputError) or not frames or os.path.abspath(frames[-1][0]) not in files:
+        return None
+    return f"{os.path.basename(frames[-1][0])}:{frames[-1][1]}: {type(error).__name__}: {error}"
 
 
 def split_task_modules(args: Sequence[str]) -> tuple[list[str], list[str]]:
@@ -107,8 +130,11 @@ def run_command(command: Callable[[], object]) -> None:
     """
     try:
         command()
+        sys.stdout.flush()
     except KeyboardInterrupt:
         raise SystemExit(INTERRUPTED) from None
+    except BrokenPipeError:  # who reads has seen enough, as `head` has
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     except (InputError, OSError) as error:
         if isinstance(error, OSError) and error.filename is None:
             raise
