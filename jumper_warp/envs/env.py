@@ -29,6 +29,7 @@ from jumper_warp.tasks.cfg import Handover, TaskCfg
 from jumper_warp.tasks.interface import interface
 from jumper_warp.tasks.mirror import Mirror, mirror_of, mirror_of_action
 from jumper_warp.tasks.saving import handover_to_json, task_to_json
+from jumper_warp.utils.checks import check_count, check_seed
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.kernels import load_kernels
 from kernels.mdp.reset import stand_kernel
@@ -88,11 +89,12 @@ class Env(Stages):
         for all. handovers: between tasks. robot: what differs from the description, latency included. threads: of a
         CPU, as in `Simulation`. refine: how many times finer the physics step is than that of trainings.
         Raises ValueError: no task, two of one name, motors that cannot be those of one robot, different gravities, a
-        handover between other tasks, less than one environment, a refine that is no whole number of at least 1, or as
-        `Simulation`.
+        handover between other tasks, num_envs or refine no whole number of at least 1, a seed not in 0 to 2^31 - 1, or
+        as `Simulation`.
         """
-        if not isinstance(refine, int) or refine < 1:
-            raise InputError(f"refine must be a whole number of at least 1, got {refine!r:.40}")
+        check_count("num_envs", num_envs)
+        check_count("refine", refine)
+        check_seed(seed)
         tasks = checked_tasks(task, handovers)
         self.task, self.tasks, self.num_envs, self.seed, self.auto_reset = tasks[0], tasks, num_envs, seed, auto_reset
         self.handovers, self._overlay = tuple(handovers), robot
@@ -137,6 +139,7 @@ class Env(Stages):
         outside keep the old one.
         """
         if seed is not None:
+            check_seed(seed)
             self._start_over(seed)
         self._ends_episodes = True
         self.compile()
