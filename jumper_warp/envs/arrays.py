@@ -173,6 +173,19 @@ def checked_mask(worlds: Any, num_envs: int) -> np.ndarray:
     return array.astype(np.float32)
 
 
+def checked_worlds(worlds: Any, num_envs: int) -> np.ndarray:
+    """Return the mask of worlds, given as bool or as indices. Raises ValueError: neither, twice the same or none."""
+    array = worlds.detach().cpu().numpy() if isinstance(worlds, torch.Tensor) else np.asarray(worlds)
+    if array.dtype.kind not in "iu":
+        return checked_mask(array, num_envs)
+    fits = array.ndim == 1 and bool(((array >= 0) & (array < num_envs)).all())
+    if not fits or len(np.unique(array)) < len(array):
+        raise InputError(f"worlds must be {num_envs} bools, or different indices below {num_envs}, got {worlds!r:.60}")
+    mask = np.zeros(num_envs, dtype=np.float32)
+    mask[array] = 1.0
+    return mask
+
+
 def checked_commands(commands: Any, mask: np.ndarray, tasks: Sequence[TaskCfg]) -> np.ndarray:
     """Return commands as (num_envs, 4), for worlds with mask not 0, which are on one of the tasks.
 

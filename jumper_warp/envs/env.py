@@ -16,6 +16,7 @@ from jumper_warp.envs.arrays import (
     checked_mask,
     checked_tasks,
     checked_values,
+    checked_worlds,
     prepared,
 )
 from jumper_warp.envs.stages import Stages
@@ -132,12 +133,16 @@ class Env(Stages):
 
     # ------------------------------------------------------------------ stepping
 
-    def reset(self, seed: int | None = None) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
+    def reset(self, seed: int | None = None, *, worlds: Any = None) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
         """Begin a new episode in every world; return observations by group, and extras.
 
         seed: draw and begin as a new environment of this seed does, its curriculum included; graphs that were captured
-        outside keep the old one.
+        outside keep the old one. worlds: begin anew in these only, (num_envs,) bool or indices; the others go on, with
+        new commands where they are due. After `evaluation_reset` episodes end again when all worlds have begun anew.
+        Raises ValueError: not a seed, not worlds, or both. RuntimeError: worlds before the first reset of all.
         """
+        if worlds is not None:
+            return self._reset_some(checked_worlds(worlds, self.num_envs), seed)
         if seed is not None:
             check_seed(seed)
             self._start_over(seed)
@@ -146,6 +151,19 @@ class Env(Stages):
         self._tick(self._all)
         self._begin(self._part(), self._all)
         self._observe(self._part(), beginning=0)
+        return self._step.obs, {}
+
+    def _reset_some(self, mask: np.ndarray, seed: int | None) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
+        """Begin new episodes where mask is not 0."""
+        if seed is not None:
+            raise InputError("a seed is for all worlds: reset(seed), or reset(worlds=...) without one")
+        if not self._started:
+            raise RuntimeError("call reset of all worlds before the first of some")
+        self.compile()  # an evaluation compiles no draws
+        chosen = self._array(mask)
+        self._tick(chosen)
+        self._begin(self._part(), chosen)
+        self._observe(self._part(), beginning=1)
         return self._step.obs, {}
 
     def compile(self) -> None:
@@ -166,7 +184,7 @@ class Env(Stages):
             skill.states.zero_()
 
     def step(self, action: torch.Tensor) -> Step:
-        """Advance one policy step.
+        """Advance one policy step; the tensors that it returns are the same each time, and overwritten by the next step.
 
         action: (num_envs, 12), clamped to -1..1; with several tasks (tasks, num_envs, 12), of which each world takes
         its own. A world whose action is not finite ends as one that came apart.

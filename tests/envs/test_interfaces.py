@@ -322,3 +322,52 @@ def test_a_number_that_is_none_is_refused(env, section, name, numbers, message):
     with pytest.raises(ValueError, match=message):
         env.skills[0].set(section, name, **numbers)
     np.testing.assert_array_equal(env.skills[0].numbers.numpy(), before)
+
+
+# ---------------------------------------------------------------- worlds that begin anew
+
+
+@pytest.mark.parametrize("worlds", [[1, 5], torch.tensor([5, 1]), np.isin(np.arange(N), (1, 5))])
+def test_some_worlds_may_begin_anew(worlds):
+    env, chosen = make_env(N, noise=True, randomize=True, seed=3), np.isin(np.arange(N), (1, 5))
+    env.reset()
+    env.worlds.level.fill_(2)
+    for action in 0.1 * random_actions(N, 4):
+        env.step(action)
+    before, motions, kept = env.task_arrays(), env.sim.joint_q().copy(), env.obs.clone()
+    obs, extras = env.reset(worlds=worlds)
+    found = env.task_arrays()
+    assert obs["policy"] is env.obs and extras == {} and (found["level"] == 2).all()
+    assert (found["steps"][chosen] == 0).all()
+    changed = (env.sim.joint_q() != motions).any(axis=1)
+    assert changed.tolist() == chosen.tolist() == (env.obs != kept).any(dim=1).tolist()
+    assert all(np.array_equal(found[name][~chosen], before[name][~chosen], equal_nan=True) for name in before)
+    env.step(REST)
+    assert (env.task_arrays()["steps"][~chosen] == before["steps"][~chosen] + 1).all()
+    states = env.sim.joint_q()[chosen]
+    env.reset(worlds=worlds)
+    assert (env.sim.joint_q()[chosen] != states).any(axis=1).all()  # drawn anew
+
+
+def test_an_environment_without_new_beginnings_of_its_own_can_be_given_them():
+    env = make_env(N, reset=only("default"), auto_reset=False)
+    edit_episodes(env, 0, phase=LANDED, phase_steps=59)
+    done = env.step(REST).terminated | env.step(REST).truncated
+    env.reset(worlds=done)
+    assert env.task_arrays()["steps"].tolist() == [0] + [2] * (N - 1)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"worlds": [0, 0]}, r"8 bools, or different indices below 8, got \[0, 0\]"),
+        ({"worlds": [N]}, "different indices below 8"),
+        ({"worlds": np.zeros(N)}, "worlds must be bool of shape"),
+        ({"worlds": [0], "seed": 1}, "a seed is for all worlds"),
+        ({"seed": torch.zeros(N, dtype=torch.bool)}, "seed must be in 0"),
+    ],
+)
+def test_worlds_that_cannot_begin_anew_are_refused(env, arguments, message):
+    refused(env, message, lambda: env.reset(**arguments))
+    with pytest.raises(RuntimeError, match="reset of all worlds"):
+        Env(TASK, 1, device="cpu").reset(worlds=[0])
