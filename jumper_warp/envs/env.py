@@ -184,7 +184,7 @@ class Env(Stages):
             skill.states.zero_()
 
     def step(self, action: torch.Tensor) -> Step:
-        """Advance one policy step; the tensors that it returns are the same each time, and overwritten by the next step.
+        """Advance one policy step; the next one overwrites the tensors that this one returns, so clone what is kept.
 
         action: (num_envs, 12), clamped to -1..1; with several tasks (tasks, num_envs, 12), of which each world takes
         its own. A world whose action is not finite ends as one that came apart.
