@@ -60,6 +60,7 @@ class Env(Stages):
     Attributes, tensors on the device, rewritten in place by `reset` and `step`, of the first task:
         obs, critic_obs: (num_envs, columns), of the next step; an ended episode has begun anew.
         final_obs, final_critic_obs: the same before that new beginning.
+        reward_terms: (num_envs,) by the name of each reward, weight and step applied, of worlds on that task.
         reward, done, timeout: (num_envs,); done 1 where an episode ended, timeout 1 where it did without failure.
     """
 
@@ -127,6 +128,8 @@ class Env(Stages):
         self.obs, self.critic_obs = first.obs["policy"], first.obs["critic"]
         self.final_obs, self.final_critic_obs = first.final_obs["policy"], first.final_obs["critic"]
         self.num_obs, self.num_critic_obs = self.obs.shape[1], self.critic_obs.shape[1]
+        terms = wp.to_torch(first.term_value)
+        self.reward_terms = {term.name: terms[i] for i, term in enumerate(first.task.rewards)}
         names = ("reward", "done", "timeout", "terminated", "truncated")
         self.reward, self.done, self.timeout, ended, cut = (wp.to_torch(getattr(self.worlds, name)) for name in names)
         self._step = Step(first.obs, self.reward, ended, cut, {"final_obs": first.final_obs, "time_outs": self.timeout})

@@ -108,6 +108,17 @@ def test_a_step_gives_the_tensors_of_the_environment():
     assert (ends > 5).all()
 
 
+def test_the_reward_of_a_step_is_told_by_term():
+    env = make_env(N)
+    terms = env.reward_terms
+    for action in random_actions(N, 5):
+        reward = env.step(action).reward
+    assert list(terms) == [term.name for term in env.task.rewards] and terms is env.reward_terms
+    total = torch.stack(list(terms.values())).sum(dim=0).clamp(min=0.0)
+    torch.testing.assert_close(reward, total)
+    assert any(value.any() for value in terms.values())
+
+
 # ---------------------------------------------------------------- commands
 
 WRONG_COMMANDS = [
