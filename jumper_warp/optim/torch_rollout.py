@@ -53,7 +53,7 @@ def simulate(
 
     Shapes as in `Rollout.run`, with worlds or without them. parameters: entries of `Rollout.parameters`, which are
     written to the rollout and stay there, or `geometry` (4, 10) [m], the legs' lengths of all worlds. trusted: do not
-    look at the numbers, for which a GPU is waited.
+    look at the numbers; of those on a GPU a latency alone is looked at, and waited for, as in `Rollout.run`.
 
     A policy that sees the state runs one policy step a call, each from `end()` of the one before. Raises InputError for
     a parameter of another name, what is no tensor of the shape or not finite, or a latency outside of `LATENCY_RANGE`.
@@ -84,14 +84,13 @@ def simulate(
 
 
 def _check_numbers(given: dict[str, torch.Tensor]) -> None:
-    """Raise InputError for what is not finite, of parameters for NaN, or for a latency that is none."""
+    """Raise InputError for a latency that is none, on a CPU for what is not finite, of parameters for NaN."""
     if "latency" in given:
         check_within("latency [s]", given["latency"].detach().cpu().numpy(), LATENCY_RANGE)
-    checked = {name: tensor.detach().isfinite() if name in COMMANDS else ~tensor.detach().isnan()
-               for name, tensor in given.items()}  # fmt: skip
-    fit = torch.stack([each.all() for each in checked.values()]).tolist()
-    if not all(fit):
-        raise InputError(f"{list(given)[fit.index(False)]} must be finite")
+    for name, tensor in given.items():
+        fits = tensor.is_cuda or (tensor.isfinite() if name in COMMANDS else ~tensor.isnan()).all()
+        if not fits:
+            raise InputError(f"{name} must be finite")
 
 
 class _Simulate(torch.autograd.Function):
