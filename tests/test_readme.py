@@ -56,7 +56,7 @@ def test_the_task_of_the_readme_pays_a_standing_robot_for_a_level_base(tmp_path,
         TASKS.update(before)
         sys.modules.pop("my_task", None)
     env = Env(task, 4, randomize=False, noise=False, device="cpu")
-    env.evaluation_reset(np.full((4, 1), 0.9))
+    env.evaluation_reset([0.0, 0.0, 0.9])
     env.step(torch.zeros(4, 12))
     row = [term.name for term in task.rewards].index("level")
     # e^0 = 1 of weight 2 over a step of 1/60 s

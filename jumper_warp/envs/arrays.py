@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
@@ -12,6 +12,7 @@ import warp as wp
 from jumper_warp.robot.description import load_description
 from jumper_warp.sim.simulation import Simulation
 from jumper_warp.tasks.cfg import Handover, TaskCfg
+from jumper_warp.tasks.commands import check_commands
 from jumper_warp.utils.errors import InputError
 from kernels.mdp.env import RING, Delays, EnvArrays, Scene
 from kernels.mdp.view import RobotArrays
@@ -172,9 +173,31 @@ def checked_mask(worlds: Any, num_envs: int) -> np.ndarray:
     return array.astype(np.float32)
 
 
-def checked_commands(commands: Mapping[str, Any] | Any, num_envs: int) -> np.ndarray:
-    """Return commands, up to four numbers a world, as (num_envs, 4); raises ValueError: another shape, not finite."""
-    array = as_numbers(commands, "commands")
-    if array.ndim != 2 or array.shape[0] != num_envs or not 1 <= array.shape[1] <= 4:
-        raise InputError(f"commands must have shape ({num_envs}, 1 to 4), got {array.shape}")
-    return checked_values(np.pad(array, ((0, 0), (0, 4 - array.shape[1]))), (num_envs, 4), "commands")
+def checked_worlds(worlds: Any, num_envs: int) -> np.ndarray:
+    """Return the mask of worlds, given as bool or as indices. Raises ValueError: neither, twice the same or none."""
+    array = worlds.detach().cpu().numpy() if isinstance(worlds, torch.Tensor) else np.asarray(worlds)
+    if array.dtype.kind not in "iu":
+        return checked_mask(array, num_envs)
+    fits = array.ndim == 1 and bool(((array >= 0) & (array < num_envs)).all())
+    if not fits or len(np.unique(array)) < len(array):
+        raise InputError(f"worlds must be {num_envs} bools, or different indices below {num_envs}, got {worlds!r:.60}")
+    mask = np.zeros(num_envs, dtype=np.float32)
+    mask[array] = 1.0
+    return mask
+
+
+def checked_commands(commands: Any, mask: np.ndarray, tasks: Sequence[TaskCfg]) -> np.ndarray:
+    """Return commands as (num_envs, 4), for worlds with mask not 0, which are on one of the tasks.
+
+    Raises ValueError: not what the command of any of these tasks takes.
+    """
+    array, n, refusals = as_numbers(commands, "commands"), len(mask), []
+    for task in tasks:
+        try:
+            check_commands(array, task, n, mask > 0.0)
+        except InputError as error:
+            refusals.append(error)
+    if len(refusals) == len(tasks):
+        raise refusals[0]
+    filled = np.pad(np.atleast_2d(array), ((0, 0), (0, 4 - array.shape[-1])))
+    return np.ascontiguousarray(np.broadcast_to(filled, (n, 4)))

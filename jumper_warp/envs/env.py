@@ -16,6 +16,7 @@ from jumper_warp.envs.arrays import (
     checked_mask,
     checked_tasks,
     checked_values,
+    checked_worlds,
     prepared,
 )
 from jumper_warp.envs.stages import Stages
@@ -29,6 +30,7 @@ from jumper_warp.tasks.cfg import Handover, TaskCfg
 from jumper_warp.tasks.interface import interface
 from jumper_warp.tasks.mirror import Mirror, mirror_of, mirror_of_action
 from jumper_warp.tasks.saving import handover_to_json, task_to_json
+from jumper_warp.utils.checks import check_count, check_seed
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.kernels import load_kernels
 from kernels.mdp.reset import stand_kernel
@@ -58,6 +60,7 @@ class Env(Stages):
     Attributes, tensors on the device, rewritten in place by `reset` and `step`, of the first task:
         obs, critic_obs: (num_envs, columns), of the next step; an ended episode has begun anew.
         final_obs, final_critic_obs: the same before that new beginning.
+        reward_terms: (num_envs,) by the name of each reward, weight and step applied, of worlds on that task.
         reward, done, timeout: (num_envs,); done 1 where an episode ended, timeout 1 where it did without failure.
     """
 
@@ -88,11 +91,12 @@ class Env(Stages):
         for all. handovers: between tasks. robot: what differs from the description, latency included. threads: of a
         CPU, as in `Simulation`. refine: how many times finer the physics step is than that of trainings.
         Raises ValueError: no task, two of one name, motors that cannot be those of one robot, different gravities, a
-        handover between other tasks, less than one environment, a refine that is no whole number of at least 1, or as
-        `Simulation`.
+        handover between other tasks, num_envs or refine no whole number of at least 1, a seed not in 0 to 2^31 - 1, or
+        as `Simulation`.
         """
-        if not isinstance(refine, int) or refine < 1:
-            raise InputError(f"refine must be a whole number of at least 1, got {refine!r:.40}")
+        check_count("num_envs", num_envs)
+        check_count("refine", refine)
+        check_seed(seed)
         tasks = checked_tasks(task, handovers)
         self.task, self.tasks, self.num_envs, self.seed, self.auto_reset = tasks[0], tasks, num_envs, seed, auto_reset
         self.handovers, self._overlay, self._conditions = tuple(handovers), robot, (randomize, noise)
@@ -124,25 +128,45 @@ class Env(Stages):
         self.obs, self.critic_obs = first.obs["policy"], first.obs["critic"]
         self.final_obs, self.final_critic_obs = first.final_obs["policy"], first.final_obs["critic"]
         self.num_obs, self.num_critic_obs = self.obs.shape[1], self.critic_obs.shape[1]
+        terms = wp.to_torch(first.term_value)
+        self.reward_terms = {term.name: terms[i] for i, term in enumerate(first.task.rewards)}
         names = ("reward", "done", "timeout", "terminated", "truncated")
         self.reward, self.done, self.timeout, ended, cut = (wp.to_torch(getattr(self.worlds, name)) for name in names)
         self._step = Step(first.obs, self.reward, ended, cut, {"final_obs": first.final_obs, "time_outs": self.timeout})
 
     # ------------------------------------------------------------------ stepping
 
-    def reset(self, seed: int | None = None) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
+    def reset(self, seed: int | None = None, *, worlds: Any = None) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
         """Begin a new episode in every world; return observations by group, and extras.
 
         seed: draw and begin as a new environment of this seed does, its curriculum included; graphs that were captured
-        outside keep the old one.
+        outside keep the old one. worlds: begin anew in these only, (num_envs,) bool or indices; the others go on, with
+        new commands where they are due. After `evaluation_reset` episodes end again when all worlds have begun anew.
+        Raises ValueError: not a seed, not worlds, or both. RuntimeError: worlds before the first reset of all.
         """
+        if worlds is not None:
+            return self._reset_some(checked_worlds(worlds, self.num_envs), seed)
         if seed is not None:
+            check_seed(seed)
             self._start_over(seed)
         self._ends_episodes = True
         self.compile()
         self._tick(self._all)
         self._begin(self._part(), self._all)
         self._observe(self._part(), beginning=0)
+        return self._step.obs, {}
+
+    def _reset_some(self, mask: np.ndarray, seed: int | None) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
+        """Begin new episodes where mask is not 0."""
+        if seed is not None:
+            raise InputError("a seed is for all worlds: reset(seed), or reset(worlds=...) without one")
+        if not self._started:
+            raise RuntimeError("call reset of all worlds before the first of some")
+        self.compile()  # an evaluation compiles no draws
+        chosen = self._array(mask)
+        self._tick(chosen)
+        self._begin(self._part(), chosen)
+        self._observe(self._part(), beginning=1)
         return self._step.obs, {}
 
     def compile(self) -> None:
@@ -163,7 +187,7 @@ class Env(Stages):
             skill.states.zero_()
 
     def step(self, action: torch.Tensor) -> Step:
-        """Advance one policy step.
+        """Advance one policy step; the next one overwrites the tensors that this one returns, so clone what is kept.
 
         action: (num_envs, 12), clamped to -1..1; with several tasks (tasks, num_envs, 12), of which each world takes
         its own. A world whose action is not finite ends as one that came apart.
@@ -190,13 +214,15 @@ class Env(Stages):
 
         They are in their first skill, and asked for no other.
 
-        commands: (num_envs, up to 4), what the task's command takes; headings [rad]: (num_envs,) or one for all;
-        worlds: (num_envs,) bool, by default all.
-        Raises ValueError: values of another shape, or not finite.
+        commands: one row a world or one for all, of what the task's command takes
+        (`jumper_warp.tasks.commands.layout_of`); headings [rad]: (num_envs,) or one for all; worlds: (num_envs,) bool,
+        by default all.
+        Raises ValueError: values of another shape, out of bounds or not finite.
         """
-        values, n = checked_commands(commands, self.num_envs), self.num_envs
+        n, chosen = self.num_envs, checked_mask(worlds, self.num_envs)
+        values = checked_commands(commands, chosen, [self.tasks[i] for i in np.unique(self._first_skill)])
         headings = self._array(checked_values(headings, (n,), "headings"))
-        mask = self._array(checked_mask(worlds, n))
+        mask = self._array(chosen)
         self._ends_episodes = False
         if not self._started:
             load_kernels(self.kernels(draws=False), self.wp_device)
@@ -215,24 +241,27 @@ class Env(Stages):
     def command(self, commands: Any, worlds: Any = None) -> None:
         """Give worlds a command within their episode; `obs` shows it at once.
 
-        commands: (num_envs, up to 4), relative to base and yaw as they are; worlds: (num_envs,) bool, by default all.
-        Raises ValueError: values of another shape, or not finite.
+        commands: as of `evaluation_reset`, relative to base and yaw as they are; worlds: (num_envs,) bool, by default
+        all.
+        Raises ValueError: values of another shape, out of bounds or not finite.
         """
-        mask = self._array(checked_mask(worlds, self.num_envs))
-        self._give(mask, 0, checked_commands(commands, self.num_envs), self._all)
+        chosen = checked_mask(worlds, self.num_envs)
+        self._give(self._array(chosen), 0, checked_commands(commands, chosen, self.tasks), self._all)
         self._observe(self._part(), beginning=1)
 
     def request(self, skill: int, worlds: Any = None, commands: Any = None) -> None:
         """Ask worlds to hand over to another skill as soon as a handover allows it.
 
-        worlds: (num_envs,) bool, by default all. commands: (num_envs, up to 4), what the skill's command takes, given
-        as it takes over, relative to base and yaw as they are then; by default the skill begins as the handover says.
-        Raises ValueError: no such skill, or commands of another shape or not finite.
+        worlds: (num_envs,) bool, by default all. commands: rows of what the skill's command takes, given as it takes
+        over, relative to base and yaw as they are then; by default the skill begins as the handover says.
+        Raises ValueError: no such skill, or commands of another shape, out of bounds or not finite.
         """
         if not 0 <= skill < len(self.skills):
             raise InputError(f"skill must be an index below {len(self.skills)}, got {skill}")
-        mask, n = checked_mask(worlds, self.num_envs) > 0.0, self.num_envs
-        values = np.zeros((n, 4), dtype=np.float32) if commands is None else checked_commands(commands, n)
+        mask, values = checked_mask(worlds, self.num_envs), np.zeros((self.num_envs, 4), dtype=np.float32)
+        if commands is not None:
+            values = checked_commands(commands, mask, [self.tasks[skill]])
+        mask = mask > 0.0
         for array, new in ((self.worlds.request, skill), (self.worlds.told, int(commands is not None)),
                            (self.worlds.wanted, values[mask])):  # fmt: skip
             kept = array.numpy()

@@ -13,6 +13,7 @@ from gymnasium.vector.utils import batch_space
 
 from jumper_warp.envs.env import Env
 from jumper_warp.envs.vec_env import RAW_LIMIT, sanitise
+from jumper_warp.utils.checks import MOST_SEED
 from jumper_warp.utils.errors import InputError
 
 Obs = Any
@@ -58,7 +59,7 @@ class GymVectorEnv(gymnasium.vector.VectorEnv):
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Obs, dict[str, Any]]:
         """Begin a new episode in every world; return observations, and infos (none).
 
-        seed: all goes as in a new environment of this seed (modulo 2**32); None: the draws go on. options: none exist.
+        seed: all goes as in a new environment of this seed (modulo 2**31); None: the draws go on. options: none exist.
         Raises ValueError: there are options. gymnasium.error.Error: not a seed.
         """
         self._check_open()
@@ -66,7 +67,7 @@ class GymVectorEnv(gymnasium.vector.VectorEnv):
             raise InputError(f"reset takes no options, got {', '.join(map(repr, options))}")
         super().reset(seed=seed)
         if seed is not None:
-            seed = (seed + 2**31) % 2**32 - 2**31  # 32 bits with a sign
+            seed %= MOST_SEED + 1
         obs, _ = self.env.reset(seed)
         self._began = True
         return self._shown(obs), {}

@@ -11,6 +11,7 @@ import numpy as np
 
 from jumper_warp.evaluation.log import NO_END, EvaluationEnv, EvaluationLog, Metrics, finite, mean
 from jumper_warp.tasks.cfg import TaskCfg
+from jumper_warp.tasks.commands import layout_of
 from jumper_warp.utils.errors import InputError
 
 SPACING = 2.0
@@ -25,7 +26,7 @@ class Episodes(EvaluationLog):
     """What became of one episode per world; each array has shape (num_envs, ...). Nothing changes after its end."""
 
     commands: np.ndarray
-    """(num_envs, up to 4), what the task's command takes."""
+    """One row a world, of what the task's command takes."""
     task: TaskCfg
     seconds: float = 10.0
     """Simulated time at most."""
@@ -133,9 +134,10 @@ def check_episodes(count: int, command: tuple[float, ...], seconds: float) -> No
         raise InputError(f"seconds must be in (0, {MOST_SECONDS:g}], got {seconds}")
 
 
-def filled(command: tuple[float, ...], count: int) -> np.ndarray:
-    """Return the commands (count, 4) of worlds that are all asked for the same; numbers that are left out are 0."""
-    return np.tile(np.pad(np.array(command, dtype=float), (0, MOST_NUMBERS - len(command))), (count, 1))
+def filled(command: tuple[float, ...], count: int, task: TaskCfg) -> np.ndarray:
+    """Return commands of worlds that are all asked for the same, one a row; numbers that are left out are 0."""
+    missing = max(layout_of(task).counts[-1] - len(command), 0)
+    return np.tile(np.pad(np.array(command, dtype=float), (0, missing)), (count, 1))
 
 
 @dataclass(frozen=True)
@@ -160,7 +162,7 @@ class EpisodeFlags:
 
     def log(self, task: TaskCfg, seed: int) -> Episodes:
         """Return episodes with this command."""
-        return Episodes(filled(self.command, self.episodes), task, self.seconds)
+        return Episodes(filled(self.command, self.episodes, task), task, self.seconds)
 
     def metrics(self, log: Episodes) -> Metrics:
         """Return `episode_metrics`."""
@@ -189,4 +191,4 @@ class EpisodeGoals:
 
     def log(self, task: TaskCfg) -> Episodes:
         """Return one robot's episode."""
-        return Episodes(filled(self.command, self.count), task, self.seconds)
+        return Episodes(filled(self.command, self.count, task), task, self.seconds)

@@ -53,7 +53,7 @@ class Replay:
         self.poses: list[np.ndarray] = []
         self.flags, self.work = 0, 0.0
         for target in targets:
-            self.sim.target.assign(target[:, None].astype(np.float32))
+            self.sim.set_targets(target)
             self.sim.filter_targets()
             for _ in range(self.sim.substeps):
                 rows.append(self._physics_step(len(rows)))

@@ -61,7 +61,7 @@ def follow_jump(
     total = STAND + RAMP + HOLD + EXTEND + LAND
     for tick in range(total):
         target = np.tile([0.0, 1.0, 1.0], 4) * transversal_command(tick, squat)
-        sim.target.assign(target[:, None].astype(np.float32))
+        sim.set_targets(target)
         sim.filter_targets()
         for _ in range(sim.substeps):
             sim.physics_step()

@@ -202,7 +202,7 @@ class ClosedLoop:
         targets = clamped * self.scale[:, None] + self.default[:, None]
         made = simulate(
             self.rollout, targets[None], state.q, state.qd, before=state.before, impulse=state.impulse,
-            wrench=None if wrench is None else wrench[None], **(parameters or {}),
+            wrench=None if wrench is None else wrench[None], trusted=True, **(parameters or {}),
         )  # fmt: skip
         impulse = made.impulse[-1].detach()
         return LoopState(made.q[-1], made.qd[-1], made.safe[-1], impulse, clamped, made.torque[-1], self._aged(state))

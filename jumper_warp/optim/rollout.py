@@ -24,6 +24,7 @@ from jumper_warp.sim.dynamics import JumperDynamics
 from jumper_warp.sim.simulation import SUBSTEPS, motor_values
 from jumper_warp.sim.slices import Worlds, slices_of
 from jumper_warp.sim.solver import check_step
+from jumper_warp.utils.checks import check_within
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.threads import checked_threads, run_side_by_side
 
@@ -33,6 +34,8 @@ TOLERANCE = 1.0e-6
 """[m/s] Of the contact iteration in single precision. Gradients inherit its error."""
 TOLERANCE_DOUBLE = 1.0e-13
 """[m/s] The same in double precision."""
+LATENCY_RANGE = (0.0, 0.1)
+"""[s] Of `Rollout.parameters`, as long as an environment's may be."""
 GEOMETRY_NAMES = (
     "hip_x", "hip_y", "hip_z", "outer_x", "inner_x", "plane_y", "knee_y", "thigh", "shank", "paw_radius",
 )  # fmt: skip
@@ -195,8 +198,12 @@ class Rollout:
                 by default. Contact is found from there, and paws that pushed and hardly slip have static friction.
 
         Raises:
-            InputError: an array of another shape or type.
+            InputError: an array of another shape or type, numbers of NumPy that are not finite, or, on a CPU, a latency
+                outside of `LATENCY_RANGE`. What is on a GPU is not waited for: a world of NaN ends as NaN, and no
+                target arrives before it is sent.
         """
+        if not self.device.is_cuda:
+            check_within("latency [s]", self.parameters["latency"].numpy(), LATENCY_RANGE)
         vec3 = self.dynamics.modules.scalar.vec3
         count = len(targets) if hasattr(targets, "__len__") else 0
         commands = self.dynamics.modules.rollout.Commands()
@@ -339,7 +346,7 @@ class Rollout:
         self._launched.add(kernel.key)
 
     def _input(self, name: str, values: Any, shape: tuple[int, ...]) -> wp.array:
-        """Return values as an array (*shape, num_worlds). Raises InputError for another shape or type."""
+        """Return values as an array (*shape, num_worlds). Raises InputError: another shape or type, or not finite."""
         full = (*shape, self.num_worlds)
         if isinstance(values, wp.array):
             if values.shape != full or values.dtype != self.real:
@@ -352,6 +359,8 @@ class Rollout:
             values = np.repeat(values[..., None], self.num_worlds, axis=-1)
         if values.shape != full:
             raise InputError(f"{name} must have shape {full} or {shape}, got {values.shape}")
+        if not np.isfinite(values).all():
+            raise InputError(f"{name} must be finite")
         return self.array(values)
 
     def array(self, values: Any) -> wp.array:

@@ -10,7 +10,8 @@ import numpy as np
 import torch
 import warp as wp
 
-from jumper_warp.optim.rollout import Rollout, Trajectory
+from jumper_warp.optim.rollout import LATENCY_RANGE, Rollout, Trajectory
+from jumper_warp.utils.checks import check_within
 from jumper_warp.utils.errors import InputError
 
 COMMANDS = ("targets", "q", "qd", "before", "wrench")
@@ -45,36 +46,51 @@ def simulate(
     before: torch.Tensor | None = None,
     wrench: torch.Tensor | None = None,
     impulse: torch.Tensor | None = None,
+    trusted: bool = False,
     **parameters: torch.Tensor,
 ) -> TorchTrajectory:
     """Run a rollout; gradients reach all tensors but `impulse`.
 
     Shapes as in `Rollout.run`, with worlds or without them. parameters: entries of `Rollout.parameters`, which are
-    written to the rollout and stay there, or `geometry` (4, 10) [m], the legs' lengths of all worlds.
+    written to the rollout and stay there, or `geometry` (4, 10) [m], the legs' lengths of all worlds. trusted: do not
+    look at the numbers; of those on a GPU a latency alone is looked at, and waited for, as in `Rollout.run`.
 
     A policy that sees the state runs one policy step a call, each from `end()` of the one before. Raises InputError for
-    a parameter of another name or an array of another shape.
+    a parameter of another name, what is no tensor of the shape or not finite, or a latency outside of `LATENCY_RANGE`.
     """
     named = {"targets": targets, "q": q, "qd": qd, "before": before, "wrench": wrench} | parameters
-    shapes = {"targets": (len(targets), 12), "q": (19,), "qd": (18,), "before": (12,), "wrench": (len(targets), 6)}
-    shapes |= {name: array.shape[:-1] for name, array in rollout.parameters.items()}
+    given = {name: tensor for name, tensor in named.items() if tensor is not None}
+    for name, tensor in given.items():
+        if not isinstance(tensor, torch.Tensor):
+            raise InputError(f"{name} must be a torch tensor, got {type(tensor).__name__}")
     unknown = next((name for name in parameters if name not in rollout.parameters and name != "geometry"), None)
     if unknown is not None:
         raise InputError(
             f"a rollout has no parameter {unknown!r:.60}; it has {', '.join(rollout.parameters)}, geometry"
         )
+    shapes = {"targets": (len(targets), 12), "q": (19,), "qd": (18,), "before": (12,), "wrench": (len(targets), 6)}
+    shapes |= {name: array.shape[:-1] for name, array in rollout.parameters.items()}
     real = torch.float64 if rollout.real is wp.float64 else torch.float32
-    given = {}
-    for name, tensor in named.items():
-        if tensor is None:
-            continue
+    for name, tensor in given.items():
         full = (4, 10) if name == "geometry" else (*shapes[name], rollout.num_worlds)
         if name != "geometry" and tuple(tensor.shape) == tuple(shapes[name]):
             tensor = tensor.unsqueeze(-1).expand(full)
         if tuple(tensor.shape) != full:
             raise InputError(f"{name} must have shape {full}, got {tuple(tensor.shape)}")
         given[name] = tensor.to(dtype=real).contiguous()
+    if not trusted:
+        _check_numbers(given)
     return TorchTrajectory(*_Simulate.apply(rollout, tuple(given), impulse, *given.values()))
+
+
+def _check_numbers(given: dict[str, torch.Tensor]) -> None:
+    """Raise InputError for a latency that is none, on a CPU for what is not finite, of parameters for NaN."""
+    if "latency" in given:
+        check_within("latency [s]", given["latency"].detach().cpu().numpy(), LATENCY_RANGE)
+    for name, tensor in given.items():
+        fits = tensor.is_cuda or (tensor.isfinite() if name in COMMANDS else ~tensor.isnan()).all()
+        if not fits:
+            raise InputError(f"{name} must be finite")
 
 
 class _Simulate(torch.autograd.Function):

@@ -249,7 +249,7 @@ class Problem:
         rollout, body, q, qd, start = self._prepared(len(x))
         targets = self.knots.targets(x)
         self.world_steps += targets.shape[0] * len(x)
-        return Motion(simulate(rollout, targets, q, qd), body, rollout, self.gravity, start)
+        return Motion(simulate(rollout, targets, q, qd, trusted=True), body, rollout, self.gravity, start)
 
     def evaluate(self, x: torch.Tensor) -> Values:
         """Return objective and constraints of candidates (n, len(knots)); what is not finite is infinite."""

@@ -29,11 +29,13 @@ from jumper_warp.rl.checkpoint import (
 from jumper_warp.rl.mirror import Symmetry, image, plain_layers
 from jumper_warp.rl.networks import EPS, NORMALISED_LIMIT
 from jumper_warp.robot.gravity import check_gravity
+from jumper_warp.robot.model import PHYSICS_DT
 from jumper_warp.robot.overlay import RobotOverlay, load_overlay
 from jumper_warp.tasks.cfg import Handover, TaskCfg
 from jumper_warp.tasks.interface import interface
 from jumper_warp.tasks.randomization import RandomizationCfg
 from jumper_warp.tasks.saving import OPTIONAL, TaskError, handover_from_json, task_from_json
+from jumper_warp.utils.checks import check_seed
 from jumper_warp.utils.errors import InputError
 
 if TYPE_CHECKING:
@@ -43,6 +45,8 @@ if TYPE_CHECKING:
 
 CHECKPOINTS = "checkpoints"
 METRICS = "metrics.jsonl"
+SHORTEST_LATENCY = 500.0 * PHYSICS_DT
+"""[ms] A shorter one would become none."""
 
 
 @dataclass(frozen=True)
@@ -56,7 +60,7 @@ class Conditions:
     noise: bool = False
     """Add the training's observation noise."""
     seed: int = 0
-    """Of randomisation and noise."""
+    """Of randomisation and noise, 0 to 2147483647."""
     device: str | None = None
     """Warp device (default: a GPU if there is one)."""
     threads: int | None = None
@@ -75,7 +79,11 @@ class Conditions:
     """[m/s^2] Downward (default: that of the task)."""
 
     def __post_init__(self) -> None:
-        """Raises InputError: a value out of range, or pushes in flight where there are none."""
+        """Raises InputError: a value out of range, a latency of no step, or pushes in flight where there are none."""
+        check_seed(self.seed)
+        if self.latency is not None and 0.0 < self.latency < SHORTEST_LATENCY:
+            least = f"{SHORTEST_LATENCY:.3g} ms, half a physics step"
+            raise InputError(f"latency must be 0 or at least {least}, got {self.latency:g} ms")
         if self.gravity is not None:
             check_gravity(self.gravity)
         self._with_fixed(RandomizationCfg.off())

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
-from jumper_warp.utils.checks import check_finite, check_not_negative, check_positive
+from jumper_warp.utils.checks import check_finite, check_not_negative, check_positive, check_seed
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.threads import checked_threads
 
@@ -201,8 +201,7 @@ class TrainCfg:
                 raise InputError(f"{name} must be at least 1, got {getattr(self, name)}")
         check_not_negative("max_seconds", self.max_seconds)
         checked_threads(self.threads)
-        if not 0 <= self.seed < 2**31:
-            raise InputError(f"seed must be in 0 .. {2**31 - 1}, got {self.seed}")
+        check_seed(self.seed)
         if self.trainer == "rsl-rl" and self.resume:
             raise InputError("resume is not offered with trainer rsl-rl")
         if self.trainer == "rsl-rl" and self.start_from:

@@ -68,8 +68,9 @@ class FiguresFile(WholeRecords):
         super().__init__(path)
 
     def add(self, iteration: int, figures: dict[str, float]) -> None:
-        """Append the figures of an iteration. Raises OSError as `append`."""
-        self.append(json.dumps({"iteration": iteration, **figures}).encode() + b"\n")
+        """Append the figures of an iteration, null for those that are not finite. Raises OSError as `append`."""
+        values = {name: value if math.isfinite(value) else None for name, value in figures.items()}
+        self.append(json.dumps({"iteration": iteration, **values}, allow_nan=False).encode() + b"\n")
 
 
 class EventFile(WholeRecords):

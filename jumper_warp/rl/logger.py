@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from contextlib import suppress
 from itertools import pairwise
@@ -18,6 +19,8 @@ from jumper_warp.utils.errors import InputError
 
 FIGURES = "metrics.jsonl"
 """In a run's folder: one JSON object per logged iteration."""
+REWARDS = "Episode_Reward/"
+"""In the names of reward terms' means."""
 
 
 class Stopwatch:
@@ -147,6 +150,8 @@ class TrainingLog:
         self._progress.update(self._task, completed=iteration, description=summary)
         if not self._console.is_terminal:
             self.say(f"iteration {iteration}/{self._total}: {summary}, {_duration(left)} left")
+        for name in _broken_terms(figures):
+            self.say(f"reward term {name} was not a finite number in some steps, where it counts as 0: mend it")
 
 
 class _LastingConsole(Console):
@@ -164,6 +169,13 @@ def _summary(figures: dict[str, float]) -> str:
     if "Metrics/success" in figures:
         parts.append(f"success {100.0 * figures['Metrics/success']:.1f} %")
     return ", ".join(parts)
+
+
+def _broken_terms(figures: dict[str, float]) -> list[str]:
+    """Return the names of reward terms whose means are not finite."""
+    return [
+        name.replace(REWARDS, "") for name, value in figures.items() if REWARDS in name and not math.isfinite(value)
+    ]
 
 
 def _duration(seconds: float) -> str:

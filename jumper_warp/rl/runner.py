@@ -108,7 +108,7 @@ def train(
         _check_processes(cfg, rank, as_rsl_rl is not None)
         if bool(cfg.start_from) != (start is not None):
             raise InputError("start_from and start, the policy that it names, need each other")
-        env = make_env(cfg.num_envs // rank.size, cfg.seed + 1000 * rank.index, rank.device)
+        env = make_env(cfg.num_envs // rank.size, (cfg.seed + 1000 * rank.index) % 2**31, rank.device)
         if cfg.trainer == "rsl-rl":
             return _train_rsl_rl(cfg, env, as_rsl_rl, rank)
         torch.manual_seed(cfg.seed)  # the same weights in all processes

@@ -29,6 +29,7 @@ from jumper_warp.robot.description import (
 )
 from jumper_warp.robot.gravity import EARTH, check_gravity
 from jumper_warp.robot.pinocchio_model import PinocchioRobot, build_pinocchio
+from jumper_warp.utils.checks import check_count
 from jumper_warp.utils.errors import InputError
 
 __all__ = [
@@ -101,11 +102,11 @@ def build_model(
             a warning, and refuses bodies, joints and particles.
 
     Raises:
-        ValueError: `num_worlds` below 1, `friction` not in 0 to 10, `gravity` not in 0 to 100, or an unknown `ground`.
+        ValueError: `num_worlds` no whole number above 0, `friction` not in 0 to 10, `gravity` not in 0 to 100, or an
+            unknown `ground`.
         RobotDescriptionError: the default description cannot be read.
     """
-    if num_worlds < 1:
-        raise InputError(f"num_worlds must be at least 1, got {num_worlds}")
+    check_count("num_worlds", num_worlds)
     if not 0.0 <= friction <= MAX_FRICTION:
         raise InputError(f"friction must lie in 0 to {MAX_FRICTION:g}, got {friction}")
     check_gravity(gravity)

@@ -12,7 +12,7 @@ import warp as wp
 
 from jumper_warp.robot.description import RobotDescription, load_description
 from jumper_warp.robot.parts import Motor
-from jumper_warp.utils.checks import check_not_negative
+from jumper_warp.utils.checks import check_count, check_not_negative
 from jumper_warp.utils.errors import InputError
 from kernels.actuation import command_filter
 from kernels.actuation import motors as actuator
@@ -121,8 +121,7 @@ def motor_arrays(
 
     module: `actuator` in either precision. Raises ValueError for less than one world.
     """
-    if num_worlds < 1:
-        raise InputError(f"num_worlds must be >= 1, got {num_worlds}")
+    check_count("num_worlds", num_worlds)
 
     def spread(lateral: float, transversal: float) -> wp.array:
         column = np.tile([lateral, transversal, transversal], 4)[:, None]

@@ -38,8 +38,9 @@ SolverName = Literal["jumper", "mujoco"]
 class Simulation:
     """Worlds of the robot under position targets, on either solver.
 
-    Write raw motor targets [rad] to `target`, shape (12, num_worlds), then call `step` for one policy step: the filter
-    once, then `substeps` times motors and physics. Everything is on the device; nothing waits for it.
+    Give raw motor targets [rad] to `set_targets`, or write them on the device to `target`, (12, num_worlds), where
+    nothing checks them; then call `step` for one policy step: the filter once, then `substeps` times motors and
+    physics. Everything is on the device; nothing waits for it.
     """
 
     def __init__(
@@ -98,6 +99,8 @@ class Simulation:
             raise InputError(f"solver must be 'jumper' or 'mujoco', got {solver!r}")
         if solver == "mujoco" and block is not None:
             raise InputError("a moving block needs solver='jumper', got 'mujoco'")
+        if not isinstance(robot, RobotOverlay | RobotValues | None):
+            raise InputError(f"robot must be a RobotOverlay, as load_overlay reads a file, got {robot!r:.60}")
         check_step(dt, substeps)
         check_tolerance(tolerance)
         threads = checked_threads(threads)
@@ -143,6 +146,18 @@ class Simulation:
         start = self.model.state()
         start.assign(self.state)
         self._start = state_arrays(start)
+
+    def set_targets(self, angles: np.ndarray | torch.Tensor | Sequence) -> None:
+        """Write raw motor targets [rad], (12, num_worlds), or (12,) for all worlds, to `target`.
+
+        Raises ValueError: another shape, or not finite.
+        """
+        values = np.asarray(angles.detach().cpu() if hasattr(angles, "detach") else angles, dtype=np.float32)
+        if values.shape not in ((12,), (12, self.num_worlds)):
+            raise InputError(f"targets must have shape (12, {self.num_worlds}) or (12,), got {values.shape}")
+        if not np.isfinite(values).all():
+            raise InputError("targets must be finite")
+        self.target.assign(np.broadcast_to(values.reshape(12, -1), (12, self.num_worlds)))
 
     def step(self) -> None:
         """Advance one policy step towards `target`."""

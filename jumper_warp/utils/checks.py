@@ -2,10 +2,17 @@
 
 from __future__ import annotations
 
+from numbers import Integral
+from typing import Any
+
+import numpy as np
+
 from jumper_warp.utils.errors import InputError
 
 FLOAT32_MAX = 3.4028234e38
 """Beyond it, single precision is infinite, which all settings become on their way to a device."""
+MOST_SEED = 2**31 - 1
+"""Of the kernels' draws."""
 
 
 def check_finite(name: str, *values: float) -> None:
@@ -27,3 +34,22 @@ def check_not_negative(name: str, *values: float) -> None:
     for value in values:
         if not 0.0 <= value <= FLOAT32_MAX:
             raise InputError(f"{name} must be finite and not negative, got {value}")
+
+
+def check_within(name: str, values: np.ndarray, bounds: tuple[float, float]) -> None:
+    """Raises ValueError: one of the values is not within the bounds, or NaN."""
+    outside = ~((values >= bounds[0]) & (values <= bounds[1]))
+    if outside.any():
+        raise InputError(f"{name} must be in [{bounds[0]:g}, {bounds[1]:g}], got {values[outside][0]:g}")
+
+
+def check_count(name: str, value: Any) -> None:
+    """Raises ValueError: the value is no whole number of at least 1."""
+    if isinstance(value, bool) or not isinstance(value, Integral) or value < 1:
+        raise InputError(f"{name} must be a whole number of at least 1, got {value!r:.40}")
+
+
+def check_seed(value: Any) -> None:
+    """Raises ValueError: the value is no whole number that the kernels' draws take as a seed."""
+    if isinstance(value, bool) or not isinstance(value, Integral) or not 0 <= value <= MOST_SEED:
+        raise InputError(f"seed must be in 0 .. {MOST_SEED}, got {value!r:.40}")

@@ -170,13 +170,14 @@ class Arrival:
 def arrival(step: int, substeps: int, late: real) -> Arrival:
     """Return what arrives during a physics step; late: latency in physics steps, any fraction.
 
-    Where a target arrives just as the step begins it has weight 1, whose derivative is that of more latency.
+    Where a target arrives just as the step begins it has weight 1, whose derivative is that of more latency. No target
+    arrives before it is sent, whatever the latency.
     """
     begin = real(step) - late
     size = real(substeps)
     a = Arrival()
-    a.older = wp.max(int(wp.ceil(begin / size)) - 1, -1)
-    a.newer = wp.max(int(wp.ceil((begin + real(1.0)) / size)) - 1, -1)
+    a.older = wp.clamp(int(wp.ceil(begin / size)) - 1, -1, step / substeps)
+    a.newer = wp.clamp(int(wp.ceil((begin + real(1.0)) / size)) - 1, -1, step / substeps)
     a.weight = real(1.0)
     if a.newer > a.older:
         a.weight = begin + real(1.0) - real(a.newer) * size

@@ -57,7 +57,7 @@ def make_step_kernel(task: Any) -> wp.Kernel:
     ):
         """Move every world of the skill on by one policy step; one thread per world.
 
-        term_value: rewards of this step, weights applied, (rewards, num_worlds).
+        term_value: rewards of this step, weights applied, (rewards, num_worlds). Those that are not finite count 0.
         """
         world = env.first + wp.tid()
         if env.skill[world] != skill:
@@ -100,7 +100,8 @@ def make_step_kernel(task: Any) -> wp.Kernel:
                 value = float(0.0)
             term_value[i, world] = value
             counters.term_sum[i, world] = counters.term_sum[i, world] + wp.float64(value)
-            total += value
+            if wp.isfinite(value):
+                total += value
         if not wp.isfinite(total):
             total = float(0.0)
         if wp.static(floor is not None):

@@ -125,7 +125,7 @@ def stroke(seconds, hertz=2.0, reach=0.35):
 
 
 def test_leg_motions_turn_the_robot_but_give_it_no_momentum(env):
-    env.evaluation_reset(np.zeros((N, 4)))
+    env.evaluation_reset([0.0, 0.0, 0.0, 1.0])
     start, drift = env.task_arrays()["base_quat"], []
     backward = np.where(np.arange(N) % 2 == 0, 1.0, -1.0)
     for i in range(120):

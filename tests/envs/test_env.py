@@ -366,7 +366,10 @@ def test_a_term_of_ones_own_is_compiled_and_logged():
         (lambda: dataclasses.replace(TASK.levels[0], goal_upper=(0.0, 0.0, 0.1)), "must be finite and rise"),
         (lambda: dataclasses.replace(TASK.levels[0], base_height=(0.0, 0.3)), "base_height of a level must be pos"),
         (lambda: make_task("vertical-jumpp"), "unknown task 'vertical-jumpp'"),
-        (lambda: Env(TASK, 0, device="cpu"), "at least 1"),
+        (lambda: Env(TASK, 0, device="cpu"), "num_envs must be a whole number of at least 1, got 0"),
+        (lambda: Env(TASK, 16.0, device="cpu"), "num_envs must be a whole number of at least 1, got 16.0"),
+        (lambda: Env(TASK, 1, device="cpu", seed=-1), r"seed must be in 0 \.\. 2147483647, got -1"),
+        (lambda: Env(TASK, 1, device="cpu", robot="robot.json"), "robot must be a RobotOverlay, .* got 'robot.json'"),
         (lambda: Env(TASK, 1, device="cpu", solver="bullet"), "solver must be"),
     ],
 )

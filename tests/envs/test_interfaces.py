@@ -108,16 +108,31 @@ def test_a_step_gives_the_tensors_of_the_environment():
     assert (ends > 5).all()
 
 
+def test_the_reward_of_a_step_is_told_by_term():
+    env = make_env(N)
+    terms = env.reward_terms
+    for action in random_actions(N, 5):
+        reward = env.step(action).reward
+    assert list(terms) == [term.name for term in env.task.rewards] and terms is env.reward_terms
+    total = torch.stack(list(terms.values())).sum(dim=0).clamp(min=0.0)
+    torch.testing.assert_close(reward, total)
+    assert any(value.any() for value in terms.values())
+
+
 # ---------------------------------------------------------------- commands
 
 WRONG_COMMANDS = [
-    (np.zeros((3, 4)), r"commands must have shape \(8, 1 to 4\), got \(3, 4\)"),
-    (np.zeros(N), r"got \(8,\)"),
-    (np.zeros((N, 5)), r"got \(8, 5\)"),
-    (np.zeros((N, 0)), r"got \(8, 0\)"),
-    (np.zeros((1, N, 3)), r"got \(1, 8, 3\)"),
-    (0.5, r"got \(\)"),
-    (torch.zeros((3, 3)), r"got \(3, 3\)"),
+    (np.zeros((3, 4)), r"x \[m\], y \[m\], height \[m\], .*, 8 rows or one for all, got shape \(3, 4\)"),
+    (np.zeros(N), r"got shape \(8,\)"),
+    (np.zeros((N, 5)), r"got shape \(8, 5\)"),
+    (np.zeros((N, 0)), r"got shape \(8, 0\)"),
+    (np.zeros((1, N, 3)), r"got shape \(1, 8, 3\)"),
+    (0.5, r"got shape \(\)"),
+    (torch.zeros((3, 3)), r"got shape \(3, 3\)"),
+    (np.full((N, 1), 0.9), r"commands of vertical-jump are x \[m\], y \[m\], height \[m\], .* got shape \(8, 1\)"),
+    (np.full((N, 2), 0.9), r"got shape \(8, 2\)"),
+    (np.tile([0.0, 0.0, -5.0], (N, 1)), r"height \[m\] must be at least 0, got -5"),
+    (np.tile([0.0, 0.0, 0.9, -1.0], (N, 1)), "policy step of the command .* must be at least 0, got -1"),
     (np.full((N, 3), NAN), "commands must be finite"),
     (torch.full((N, 3), INF), "commands must be finite"),
     ([[0.0], [0.0, 1.0]], "commands must be an array of numbers, got list"),
@@ -180,6 +195,26 @@ def test_commands_may_come_in_any_container(kind):
     np.testing.assert_allclose(found["heading"][chosen], headings[chosen], rtol=1e-6)
     np.testing.assert_array_equal(found["command_step"][chosen], np.arange(N)[chosen])
     assert (found["goal"][~chosen, 2] != heights[~chosen]).all()
+
+
+def test_one_command_is_for_all_worlds(env):
+    env.evaluation_reset([0.0, 0.0, 0.7])
+    np.testing.assert_allclose(env.task_arrays()["goal"], np.tile([0.0, 0.0, 0.7], (N, 1)), rtol=1e-6)
+
+
+def test_numbers_of_other_worlds_may_be_anything_finite(env):
+    commands = np.tile([0.0, 0.0, 0.7], (N, 1))
+    commands[0, 2] = -1.0
+    env.evaluation_reset(commands, worlds=np.arange(N) > 0)
+
+
+def test_turns_are_quaternions_of_some_length():
+    env = Env(make_task("attitude"), 2, randomize=False, noise=False)
+    env.evaluation_reset([0.0, 0.0, 0.0, 1.0])
+    env.command([0.0, 0.0, 3.0, 3.0])
+    np.testing.assert_allclose(env.task_arrays()["goal"], [[0.0, 0.0, 0.5**0.5, 0.5**0.5]] * 2, atol=1e-6)
+    refused(env, "commands of attitude are quaternion x .*: not all may be 0", env.command, np.zeros((2, 4)))
+    refused(env, r"quaternion w \[1\], 2 rows or one for all, got shape \(2, 1\)", env.command, [[0.1], [0.1]])
 
 
 # ---------------------------------------------------------------- evaluation and training
@@ -298,3 +333,52 @@ def test_a_number_that_is_none_is_refused(env, section, name, numbers, message):
     with pytest.raises(ValueError, match=message):
         env.skills[0].set(section, name, **numbers)
     np.testing.assert_array_equal(env.skills[0].numbers.numpy(), before)
+
+
+# ---------------------------------------------------------------- worlds that begin anew
+
+
+@pytest.mark.parametrize("worlds", [[1, 5], torch.tensor([5, 1]), np.isin(np.arange(N), (1, 5))])
+def test_some_worlds_may_begin_anew(worlds):
+    env, chosen = make_env(N, noise=True, randomize=True, seed=3), np.isin(np.arange(N), (1, 5))
+    env.reset()
+    env.worlds.level.fill_(2)
+    for action in 0.1 * random_actions(N, 4):
+        env.step(action)
+    before, motions, kept = env.task_arrays(), env.sim.joint_q().copy(), env.obs.clone()
+    obs, extras = env.reset(worlds=worlds)
+    found = env.task_arrays()
+    assert obs["policy"] is env.obs and extras == {} and (found["level"] == 2).all()
+    assert (found["steps"][chosen] == 0).all()
+    changed = (env.sim.joint_q() != motions).any(axis=1)
+    assert changed.tolist() == chosen.tolist() == (env.obs != kept).any(dim=1).tolist()
+    assert all(np.array_equal(found[name][~chosen], before[name][~chosen], equal_nan=True) for name in before)
+    env.step(REST)
+    assert (env.task_arrays()["steps"][~chosen] == before["steps"][~chosen] + 1).all()
+    states = env.sim.joint_q()[chosen]
+    env.reset(worlds=worlds)
+    assert (env.sim.joint_q()[chosen] != states).any(axis=1).all()  # drawn anew
+
+
+def test_an_environment_without_new_beginnings_of_its_own_can_be_given_them():
+    env = make_env(N, reset=only("default"), auto_reset=False)
+    edit_episodes(env, 0, phase=LANDED, phase_steps=59)
+    done = env.step(REST).terminated | env.step(REST).truncated
+    env.reset(worlds=done)
+    assert env.task_arrays()["steps"].tolist() == [0] + [2] * (N - 1)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"worlds": [0, 0]}, r"8 bools, or different indices below 8, got \[0, 0\]"),
+        ({"worlds": [N]}, "different indices below 8"),
+        ({"worlds": np.zeros(N)}, "worlds must be bool of shape"),
+        ({"worlds": [0], "seed": 1}, "a seed is for all worlds"),
+        ({"seed": torch.zeros(N, dtype=torch.bool)}, "seed must be in 0"),
+    ],
+)
+def test_worlds_that_cannot_begin_anew_are_refused(env, arguments, message):
+    refused(env, message, lambda: env.reset(**arguments))
+    with pytest.raises(RuntimeError, match="reset of all worlds"):
+        Env(TASK, 1, device="cpu").reset(worlds=[0])

@@ -141,6 +141,11 @@ def test_randomised_conditions_draw_the_rest():
     ("make", "message"),
     [
         (lambda: Conditions(latency=101.0), "latency must be in 0 to 100 ms"),
+        (
+            lambda: Conditions(latency=0.008),
+            r"latency must be 0 or at least 1\.04 ms, half a physics step, got 0\.008 ms",
+        ),
+        (lambda: Conditions(seed=-1), r"seed must be in 0 \.\. 2147483647, got -1"),
         (lambda: EvaluationArgs(latency=-1.0), "latency must not be negative"),
         (lambda: Conditions(gains=(0.0, 1.0)), "gains must be above 0"),
         (lambda: EvaluationArgs(gains=(1.0, -1.0)), "damping_gains must be above 0"),

@@ -1,5 +1,7 @@
 """Rollouts forwards: as the simulation, in double precision, on threads; as functions of PyTorch tensors; refusals."""
 
+import math
+
 import numpy as np
 import pytest
 import torch
@@ -198,6 +200,50 @@ def test_rollout_refuses_bad_settings(setting):
 def test_simulate_refuses_unknown_parameters():
     with pytest.raises(ValueError, match="no parameter 'colour'"):
         simulate(rollout(), torch.zeros(2, 12), *tensors(), colour=torch.zeros(1))
+
+
+@pytest.mark.parametrize("late", [-0.05, 5.0, float("nan")])
+def test_latencies_that_are_none_are_refused(late):
+    message = r"latency \[s\] must be in \[0, 0.1\], got "
+    of = Rollout(build_model(2, visuals=False))
+    with pytest.raises(ValueError, match=message):
+        simulate(of, torch.zeros(2, 12), *(torch.as_tensor(row) for row in of.standing()), latency=torch.tensor(late))
+    of.parameters["latency"].fill_(late)
+    with pytest.raises(ValueError, match=message):
+        of.run(np.zeros((2, 12)), *of.standing())
+
+
+@pytest.mark.parametrize("late", [-0.05, -0.001, float("-inf"), float("nan")])
+def test_no_target_arrives_before_it_is_sent(late, monkeypatch):
+    """Where nothing looks at latencies, as on a GPU."""
+    monkeypatch.setattr("jumper_warp.optim.rollout.check_within", lambda *_: None)
+    of, targets, ends = Rollout(build_model(4, visuals=False)), np.full((3, 12), 0.4), []
+    for latency in (0.0, late):
+        of.parameters["latency"].fill_(latency)
+        trajectory = of.run(targets, *of.standing())
+        gradients = of.backward(trajectory, qd=wp.full_like(trajectory.qd, 1.0))
+        ends.append((trajectory.q.numpy()[-1], gradients["targets"].numpy()))
+    if math.isfinite(late):
+        np.testing.assert_array_equal(ends[1][0], ends[0][0])
+        np.testing.assert_array_equal(ends[1][1], ends[0][1])
+    for values in ends[1]:
+        np.testing.assert_array_equal(values, np.repeat(values[..., :1], 4, axis=-1))
+
+
+@pytest.mark.parametrize("name", ["targets", "q", "wrench", "kp"])
+def test_simulate_refuses_what_is_not_a_number(name):
+    q, qd = tensors()
+    given = {"targets": torch.zeros(2, 12), "q": q, "qd": qd, "wrench": torch.zeros(2, 6), "kp": torch.ones(12)}
+    given[name] = torch.full_like(given[name], float("nan"))
+    with pytest.raises(ValueError, match=f"{name} must be finite"):
+        simulate(rollout(), **given)
+    with pytest.raises(ValueError, match="targets must be finite"):
+        rollout().run(np.full((2, 12), np.nan), *squat())
+
+
+def test_simulate_refuses_what_is_no_tensor():
+    with pytest.raises(ValueError, match="kp must be a torch tensor, got float"):
+        simulate(rollout(), torch.zeros(2, 12), *tensors(), kp=80.0)
 
 
 def test_jacobians_need_a_world_for_each_step():

@@ -86,6 +86,29 @@ def test_a_disk_that_is_full_for_a_while_loses_no_figure_and_is_told_once(cfg, c
         assert steps(result.folder) == [1, 2, 3, 4, 5, 6]
 
 
+def test_a_reward_term_that_is_no_number_is_told_and_kept_as_json(tmp_path, capsys):
+    figures = NUMBERS | {
+        "Episode_Reward/tilt": float("nan"),
+        "hop/Episode_Reward/fall": float("inf"),
+        "Loss/value": 1.0,
+    }
+    with TrainingLog(tmp_path, {}, 10, tensorboard=False) as log:
+        log.log(1, NUMBERS | {"Episode_Reward/tilt": 0.5}, 5.0)
+        assert "reward term" not in capsys.readouterr().err
+        for iteration in (2, 3):
+            log.log(iteration, figures, 5.0)
+            told = capsys.readouterr().err
+            assert "reward term tilt was not a finite number in some steps, where it counts as 0" in told
+            assert "reward term hop/fall was not a finite number" in told and told.count("reward term") == 2
+
+    def refuse(text):
+        raise AssertionError(text)
+
+    saved = [json.loads(line, parse_constant=refuse) for line in (tmp_path / FIGURES).read_text().splitlines()]
+    assert [line["iteration"] for line in saved] == [1, 2, 3]
+    assert saved[1]["Episode_Reward/tilt"] is None and saved[1]["Loss/value"] == 1.0
+
+
 def test_a_terminal_that_is_gone_stops_nothing(tmp_path, monkeypatch):
     class Gone:
         def write(self, _):

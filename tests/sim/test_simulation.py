@@ -213,3 +213,19 @@ def test_base_velocity_in_a_captured_graph():
         seen.append(velocity.numpy().copy())
         assert np.array_equal(seen[-1], sim.base_velocity())
     assert np.abs(np.diff(seen, axis=0)).min(axis=(1, 2)).max() > 0.0
+
+
+def test_targets_are_checked_and_may_be_alike_for_all_worlds():
+    sim, angles = Simulation(3, visuals=False, device="cpu"), np.arange(36.0).reshape(12, 3) / 36.0
+    for given in (angles, torch.tensor(angles), angles.tolist()):
+        sim.set_targets(given)
+        np.testing.assert_array_equal(sim.target.numpy(), angles.astype(np.float32))
+    sim.set_targets(angles[:, 1])
+    np.testing.assert_array_equal(sim.target.numpy(), np.repeat(angles[:, 1:2], 3, axis=1).astype(np.float32))
+    for wrong, message in (
+        (angles.T, r"targets must have shape \(12, 3\) or \(12,\), got \(3, 12\)"),
+        (0.5, r"got \(\)"),
+        (np.full(12, np.nan), "targets must be finite"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            sim.set_targets(wrong)

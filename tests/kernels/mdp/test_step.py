@@ -67,12 +67,29 @@ def test_weights_and_parameters_change_while_it_runs(probe):
     np.testing.assert_allclose(probe.skill.term_value.numpy(), expected, rtol=1e-5, atol=1e-6)
 
 
+@pytest.mark.parametrize("number", [np.nan, np.inf])
+def test_a_term_that_is_not_finite_erases_no_other_and_is_seen(probe, number):
+    _, other, height = random_state(probe)
+    probe.write(value=np.where(np.arange(N) < 5, number, 1.0))
+    probe.step()
+    expected = weighted(np.full(N, 1.0 + GROWTH), other, height)
+    expected[:2, :5] = 0.0
+    np.testing.assert_allclose(probe.world("reward"), expected.sum(axis=0), rtol=1e-5, atol=1e-5)
+    seen = np.isfinite(probe.skill.term_value.numpy())
+    assert not seen[:2, :5].any() and seen[:2, 5:].all() and seen[2:].all()
+    means = probe.skill.metrics()
+    finite = [np.isfinite(means[f"Episode_Reward/{name}"]) for name in ("value", "offset_square", "other")]
+    assert finite == [False, False, True]
+
+
 def test_a_total_that_is_not_finite_is_no_reward(probe):
+    """Of terms that are: 3.396e38 and 0.055e38, where single precision ends at 3.403e38."""
     random_state(probe)
-    probe.write(value=np.where(np.arange(N) < 5, np.inf, 1.0))
+    probe.write(value=1.1 - GROWTH, other=np.where(np.arange(N) < 5, 8.49e37, 1.0))
+    probe.skill.set("rewards", "value", weight=3.0e38)
     probe.step()
     reward = probe.world("reward")
-    assert not reward[:5].any() and reward[5:].all()
+    assert np.isfinite(probe.skill.term_value.numpy()).all() and not reward[:5].any() and (reward[5:] > 5.0e36).all()
 
 
 def test_sums_count_on_where_single_precision_would_not(probe):

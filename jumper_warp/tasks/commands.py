@@ -1,0 +1,92 @@
+"""What the numbers of a task's command are, by the function that takes them, and checks of those from outside."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import warp as wp
+
+from jumper_warp.tasks.cfg import TaskCfg
+from jumper_warp.utils.errors import InputError
+from kernels.attitude.commands import give_turn
+from kernels.jump.reset import give_jump
+from kernels.velocity.commands import give_velocity
+
+
+@dataclass(frozen=True)
+class CommandValue:
+    """One number of a command."""
+
+    name: str
+    """With its unit, as `x [m]`."""
+    least: float = -math.inf
+    optional: bool = False
+    """Whether it may be left out, which is 0; only the last one."""
+
+
+@dataclass(frozen=True)
+class CommandLayout:
+    """The numbers of a command, at most four."""
+
+    values: tuple[CommandValue, ...]
+    nonzero: bool = False
+    """Whether not all of them may be 0."""
+
+    @property
+    def counts(self) -> tuple[int, ...]:
+        """How many numbers there may be."""
+        required = sum(not value.optional for value in self.values)
+        return tuple(range(required, len(self.values) + 1))
+
+    def __str__(self) -> str:
+        return ", ".join(f"{value.name}{' (optional)' if value.optional else ''}" for value in self.values)
+
+
+LAYOUTS: dict[wp.Function, CommandLayout] = {
+    give_jump: CommandLayout(
+        (
+            CommandValue("x [m]"),
+            CommandValue("y [m]"),
+            CommandValue("height [m]", least=0.0),
+            CommandValue("policy step of the command [1]", least=0.0, optional=True),
+        )
+    ),
+    give_velocity: CommandLayout(
+        (
+            CommandValue("forward [m/s]"),
+            CommandValue("left [m/s]"),
+            CommandValue("turning [rad/s]"),
+            CommandValue("gait [Hz]", least=0.0, optional=True),
+        )
+    ),
+    give_turn: CommandLayout(tuple(CommandValue(f"quaternion {axis} [1]") for axis in "xyzw"), nonzero=True),
+}
+"""By `Command.give`. Of another function a command is any one to four numbers."""
+
+ANY = CommandLayout((CommandValue("a number"), *(CommandValue("a number", optional=True) for _ in range(3))))
+
+
+def layout_of(task: TaskCfg) -> CommandLayout:
+    """Return what a task's command takes."""
+    return LAYOUTS.get(task.command.give, ANY)
+
+
+def check_commands(commands: np.ndarray, task: TaskCfg, num_envs: int, worlds: np.ndarray) -> None:
+    """Raise ValueError unless commands are one row a world, or one for all, that the task's command takes.
+
+    worlds: (num_envs,) bool, for which the numbers have to be within their bounds.
+    """
+    layout = layout_of(task)
+    what = f"commands of {task.name} are {layout}"
+    if commands.shape[:-1] not in ((num_envs,), ()) or commands.shape[-1:] not in [(n,) for n in layout.counts]:
+        raise InputError(f"{what}, {num_envs} rows or one for all, got shape {commands.shape}")
+    if not np.isfinite(commands).all():
+        raise InputError("commands must be finite")
+    rows = np.broadcast_to(commands, (num_envs, commands.shape[-1]))[worlds]
+    for value, column in zip(layout.values, rows.T, strict=False):
+        if (column < value.least).any():
+            raise InputError(f"{what}: {value.name} must be at least {value.least:g}, got {column.min():g}")
+    if layout.nonzero and (rows == 0.0).all(axis=1).any():
+        raise InputError(f"{what}: not all may be 0")
