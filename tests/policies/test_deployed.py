@@ -112,7 +112,7 @@ def jump(page, change=None, late=0, ticks=180):
         if change is not None:
             readings = change(policy, readings)
         given = {"wanted_height": 0.9, "jump_command": max(asked[-1 - late :])}
-        robot.target.assign(policy.targets(readings | given)[:, None])
+        robot.set_targets(policy.targets(readings | given))
         robot.step()
         began = not flying and down == 0 and up > 0.75
         flying, takeoffs = down == 0 and (flying or began), takeoffs + began
