@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -19,7 +20,7 @@ from kernels.mdp.reset import make_give_kernel, make_reset_kernel
 from kernels.mdp.step import make_step_kernel
 from kernels.mdp.view import vec12
 
-_KERNELS: dict[tuple, dict[str, wp.Kernel]] = {}
+_KERNELS: dict[tuple, wp.Kernel] = {}
 
 
 class Skill:
@@ -158,19 +159,24 @@ class Skill:
 
 
 def kernels_of(task: TaskCfg) -> dict[str, wp.Kernel]:
-    """Return a task's kernels; tasks that differ in numbers only share them."""
-    rows = tuple(
-        (section, row.func, row.first, row.lo, row.hi, tuple(row.term.options.items()))
+    """Return a task's kernels; tasks share each that reads the same of them, whatever their numbers."""
+    rows = {
+        section: tuple((row.func, row.first, row.lo, row.hi, tuple(row.term.options.items())) for row in section_rows)
         for section, section_rows in task.rows.items()
-        for row in section_rows
-    )
-    key = (task.state, task.settings_type, task.level_type, task.reset.func, task.command, task.reward_floor, rows)
-    if key not in _KERNELS:
-        _KERNELS[key] = {
-            "step": make_step_kernel(task),
-            "reset": make_reset_kernel(task),
-            "give": make_give_kernel(task),
-            "observe": make_observe_kernel(task),
-            "event": make_event_kernel(task.rows["events"]),
-        }
+    }
+    ends = tuple(rows[section] for section in ("advance", "curriculum", "rewards", "terminations"))
+    begins = (task.reset.func, task.settings_type, task.level_type, task.command.due, task.command.draw)
+    return {
+        "step": _kernel(make_step_kernel, task, task.state, ends, task.reward_floor),
+        "reset": _kernel(make_reset_kernel, task, task.state, begins),
+        "give": _kernel(make_give_kernel, task, task.state, task.command.give),
+        "observe": _kernel(make_observe_kernel, task, task.state, tuple(rows[group] for group in task.groups)),
+        "event": _kernel(make_event_kernel, task.rows["events"], rows["events"]),
+    }
+
+
+def _kernel(make: Callable[[Any], wp.Kernel], source: Any, *read: Any) -> wp.Kernel:
+    """Return what a function makes of a source, made once for all of which it reads the same."""
+    if (key := (make, *read)) not in _KERNELS:
+        _KERNELS[key] = make(source)
     return _KERNELS[key]

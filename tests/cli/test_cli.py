@@ -540,11 +540,10 @@ def test_viewer_listens_on_loopback_only(tmp_path):
     assert command[-2:] == ["--bind", "127.0.0.1"]
 
 
-@pytest.mark.parametrize("args", [["list"], ["evaluate", "vertical_jump", "--help"]])
-def test_a_reader_that_is_gone_is_no_fault(args):
+def test_a_reader_that_is_gone_is_no_fault():
     reader, writer = os.pipe()
     os.close(reader)
-    code = f"from jumper_warp.cli.main import main; main({args})"
+    code = "from jumper_warp.cli.main import main; main(['list'])"
     ended = subprocess.run([sys.executable, "-c", code], stdout=writer, stderr=subprocess.PIPE, text=True)
     os.close(writer)
     assert ended.returncode == 0 and ended.stderr == ""

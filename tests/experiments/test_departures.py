@@ -56,46 +56,40 @@ def test_the_table_of_departures_tells_how_these_are_undone():
         assert not each.flags or f"`{each.flags}`" in table, name
 
 
-def test_figures_of_each_training(tmp_path, capsys):
+def test_trainings_are_measured_by_the_ends_of_the_task_as_it_is_and_not_made_twice(tmp_path, capsys, monkeypatch):
     args = departures.Args(
-        only=("kept", "drift"), kept_seeds=(2,), iterations=1, envs=4, jumps=(2, 3), squats=2, out=tmp_path,
-        train="--ppo.compile off --ppo.num-steps 8 --ppo.minibatches 1", device="cpu", threads=1,
-    )  # fmt: skip
-    values = departures.main(args)
-    assert values == json.loads((tmp_path / "figures.json").read_text())
-    assert values["flags_drift"] == "--env.terminations.moved-away.distance 0.2" and values["flags_kept"] == ""
-    for name in ("nominal_success_rate_kept_2", "randomized_success_rate_drift_1"):
-        assert values[name] == 0.0
-    assert 0.0 < values["randomized_error_m_drift_1"] < 2.0
-    config = next((tmp_path / "drift_1").rglob("config.json")).read_text()
-    ends = {term["name"]: term for term in json.loads(config)["env"]["task"]["terminations"]}
-    assert ends["moved_away"]["distance"] == 0.2
-    assert "error [mm]" in capsys.readouterr().out
-    assert values["nominal_second_takeoff_rate_drift_1"] is None and values["nominal_squats_drift_1"] == 2
-    assert {"departures.png", "departures.txt"} <= {path.name for path in tmp_path.iterdir()}
-
-
-def test_trainings_that_are_there_are_measured_by_the_ends_of_the_task_as_it_is(tmp_path, monkeypatch):
-    args = departures.Args(
-        only=("jumping_early",), iterations=1, envs=4, jumps=(2, 3), squats=2, out=tmp_path, measure=False,
-        train="--ppo.compile off --ppo.num-steps 8 --ppo.minibatches 1", device="cpu", threads=1,
+        only=("jumping_early",), iterations=1, envs=4, jumps=(2, 3), squats=2, out=tmp_path,
+        measure=False, train="--ppo.compile off --ppo.num-steps 8 --ppo.minibatches 1", device="cpu", threads=1,
     )  # fmt: skip
     assert set(departures.main(args)) == {"task", "iterations", "envs"}
     assert not (tmp_path / "figures.json").exists()
+    config = next((tmp_path / "jumping_early_1").rglob("config.json")).read_text()
+    assert "early_takeoff" not in [term["name"] for term in json.loads(config)["env"]["task"]["terminations"]]
+    ends, follow = [], departures.EvaluationRun.follow
     monkeypatch.setattr(departures, "train", None)
-    ends = []
-    follow = departures.EvaluationRun.follow
     monkeypatch.setattr(
         departures.EvaluationRun, "follow",
         lambda run, env, log: ends.append([term.name for term in env.task.terminations]) or follow(run, env, log),
     )  # fmt: skip
     values = departures.main(replace(args, measure=True, threads=2))
-    assert values["nominal_jumps_jumping_early_1"] == 2 and len(ends) == 4
-    assert all("early_takeoff" in names for names in ends[::2])
+    assert len(ends) == 4 and all("early_takeoff" in names for names in ends[::2])
+    assert values == json.loads((tmp_path / "figures.json").read_text())
+    assert values["nominal_jumps_jumping_early_1"] == 2 and values["nominal_squats_jumping_early_1"] == 2
+    assert values["nominal_success_rate_jumping_early_1"] == 0.0
+    assert 0.0 < values["randomized_error_m_jumping_early_1"] < 2.0
+    assert "error [mm]" in capsys.readouterr().out
+    assert {"departures.png", "departures.txt"} <= {path.name for path in tmp_path.iterdir()}
     with pytest.raises(InputError, match="other settings"):
         departures.main(replace(args, train=args.train + " --ppo.gamma 0.9"))
     with pytest.raises(InputError, match="other settings"):
         departures.main(replace(args, train=args.train + " --env.link-margin 0.001"))
+
+
+def test_the_task_as_it_is_is_trained_with_seeds_of_its_own():
+    args = departures.Args(only=("kept", "drift"), seeds=(1,), kept_seeds=(2, 3))
+    flags = [(name, seed, undone.flags) for name, seed, undone in args.trainings()]
+    assert flags == [("kept", 2, ""), ("kept", 3, ""), ("drift", 1, DEPARTURES["vertical-jump"]["drift"].flags)]
+    assert len(list(departures.Args().trainings())) == 3 + len(DEPARTURES["vertical-jump"])
 
 
 def test_what_cannot_be_is_refused_before_any_training(tmp_path):
