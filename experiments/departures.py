@@ -134,8 +134,8 @@ class Args:
 def trained(undone: Undone, arguments: list[str]) -> Path:
     """Return the last checkpoint of a training, made unless it is there. Raises InputError: it has other settings."""
     parsed, task = parse_train(arguments)
-    task, name = undone.change(task), f"iteration_{parsed.cfg.iterations:06d}.pt"
-    if found := sorted(Path(parsed.cfg.log_root).glob(f"*/*/{CHECKPOINTS}/{name}")):
+    task, name = undone.change(task), f"{CHECKPOINTS}/iteration_{{:06d}}.pt"
+    if found := sorted(Path(parsed.cfg.log_root).glob(f"*/*/{name.format(parsed.cfg.iterations)}")):
         config = json.loads((found[-1].parents[1] / CONFIG).read_text())
         asked = json.loads(json.dumps(asdict(parsed.cfg), default=str))
         other = {key for key in asked.keys() - ELSEWHERE if asked[key] != config["train"].get(key)}
@@ -143,7 +143,7 @@ def trained(undone: Undone, arguments: list[str]) -> Path:
             raise InputError(f"{found[-1].parents[1]} was trained with other settings: choose another --out")
         return found[-1]
     result = train(parsed.cfg, env_maker(task, parsed), shlex.join(["jumper", "train", *arguments]))
-    return result.folder / CHECKPOINTS / name
+    return result.folder / name.format(result.iteration)
 
 
 def measured(checkpoint: Path, args: Args, folder: Path) -> dict[str, dict[str, Any]]:

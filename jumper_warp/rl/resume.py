@@ -88,7 +88,11 @@ def _settings(config: dict[str, Any]) -> dict[str, Any]:
     """Return the settings of a run by name."""
     train = {name: value for name, value in config["train"].items() if name not in (*SESSION, "task")}
     env = {name: value for name, value in config["env"].items() if name not in (*DERIVED, "task")}
-    return _flat(train) | _flat(env) | _flat(config["env"].get("task"), "env")
+    task = dict(config["env"].get("task", {}))
+    reset = dict(task.get("reset", {}))
+    settings = reset.pop("settings", None) or {}  # flags call them as if they were the reset's own
+    task["reset"] = reset | settings
+    return _flat(train) | _flat(env) | _flat(task, "env")
 
 
 def _flat(value: Any, name: str = "") -> dict[str, Any]:

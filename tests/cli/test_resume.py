@@ -69,10 +69,11 @@ def test_a_run_goes_on_with_its_own_settings(capsys, run, begun):
 
 def test_flags_change_the_settings_and_each_change_is_told(capsys, run):
     flags = ["--env.gravity", "9.81", "--env.rewards.rest.weight", "-0.25", "--ppo.gamma", "0.95", "--noise"]
+    flags += ["--env.reset.tilt", "2"]
     code, _, told = train(capsys, "--resume", str(run), "--iterations", "2", *flags)
     assert code == 0 and changed(told) == [
-        "iterations 1 -> 2", "ppo.gamma 0.9 -> 0.95", "noise False -> True", "env.rewards.rest.weight -0.5 -> -0.25",
-        "env.gravity 3.71 -> 9.81",
+        "iterations 1 -> 2", "ppo.gamma 0.9 -> 0.95", "noise False -> True", "env.reset.tilt 5.0 -> 2.0",
+        "env.rewards.rest.weight -0.5 -> -0.25", "env.gravity 3.71 -> 9.81",
     ]  # fmt: skip
     after = config(run)
     assert after["env"]["task"]["gravity"] == 9.81 and after["train"]["ppo"]["gamma"] == 0.95

@@ -8,7 +8,7 @@ import pytest
 
 from experiments import departures
 from jumper_warp.cli.train import parse_train
-from jumper_warp.tasks.jump.departures import DEPARTURES, HORIZONTAL, VERTICAL
+from jumper_warp.tasks.jump.departures import DEPARTURES, HORIZONTAL, VERTICAL, Undone
 from jumper_warp.tasks.saving import task_from_json, task_to_json
 from jumper_warp.utils.errors import InputError
 
@@ -83,6 +83,13 @@ def test_trainings_are_measured_by_the_ends_of_the_task_as_it_is_and_not_made_tw
         departures.main(replace(args, train=args.train + " --ppo.gamma 0.9"))
     with pytest.raises(InputError, match="other settings"):
         departures.main(replace(args, train=args.train + " --env.link-margin 0.001"))
+
+
+def test_a_training_may_end_by_the_clock(tmp_path):
+    flags = "--ppo.compile off --ppo.num-steps 8 --ppo.minibatches 1 --max-seconds 0.001"
+    args = departures.Args(only=("drift",), iterations=1000, envs=4, train=flags, device="cpu", threads=1)
+    checkpoint = departures.trained(Undone(), args.command(Undone(), 1, tmp_path))
+    assert checkpoint.is_file() and int(checkpoint.stem.removeprefix("iteration_")) < 1000
 
 
 def test_the_task_as_it_is_is_trained_with_seeds_of_its_own():
