@@ -46,7 +46,7 @@ ELSEWHERE = {"log_root", "device", "threads"}
 """Settings that a training need not share with one that is there already."""
 KEPT = "kept"
 """Name of the task as it is."""
-LENGTHS = {"vertical-jump": 1400, "horizontal-jump": 800}
+LENGTHS = {"vertical-jump": 1000, "horizontal-jump": 800}
 """Iterations of each training."""
 GOALS = {"vertical-jump": {"lower": 0.5, "upper": 1.05}, "horizontal-jump": {"x": (0.3, 1.5)}}
 """[m] Of the jumps that are measured."""
@@ -81,7 +81,7 @@ class Args:
     only: tuple[str, ...] = ()
     """Names of those that are undone (default: all)."""
     iterations: int | None = None
-    """Of each training (default: 1400 of heights, 800 of places, when the task as it is has learned)."""
+    """Of each training (default: 1000 of heights, 800 of places, when the task as it is has learned)."""
     envs: int = 8192
     """Number of environments."""
     seeds: tuple[int, ...] = (1,)

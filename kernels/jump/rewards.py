@@ -273,6 +273,14 @@ def lifted_again(view: RobotView, task: JumpState, free: float) -> float:
 
 
 @wp.func
+def paws_down(view: RobotView, task: JumpState) -> float:
+    """Still landing: paws on the ground after touchdown, 0 to 4."""
+    if task.phase != LANDED:
+        return 0.0
+    return float(view.contacts)
+
+
+@wp.func
 def capture_point(view: RobotView, task: JumpState, width: float) -> float:
     """Bracing: phi_width of the way from the middle of the paws to where a pendulum of the base's height would stop.
 

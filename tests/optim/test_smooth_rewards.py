@@ -59,7 +59,7 @@ def test_smooth_rewards_have_the_values_of_the_environments_terms():
         old = state
     assert paid == {term.name for term in TASK.rewards} - set(rough_rewards(TASK))
     assert set(rough_rewards(TASK)) == {
-        "lifted_again", "soft_impact", "stance_impact", "ground_force", "action_clip", "force_ripple",
+        "paws_down", "soft_impact", "stance_impact", "ground_force", "action_clip", "force_ripple",
     }  # fmt: skip
 
 

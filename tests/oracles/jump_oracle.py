@@ -240,6 +240,7 @@ TERMS = {
             axis=0,
         )
     ),
+    "paws_down": lambda r, p: (r["phase"] == LANDED) * np.count_nonzero(r["force"] > CONTACT_FORCE, axis=0),
     "capture_point": lambda r, p: (r["phase"] == LANDED) * phi(norm(capture_offset(r)), p["width"]),
     "resting_action_rate": lambda r, p: at_ease(r) * np.sum((r["action"] - r["old_action"]) ** 2, axis=0),
     "torque_ripple": lambda r, p: at_ease(r) * np.sum((r["torque"] - r["old_torque"]) ** 2, axis=0),

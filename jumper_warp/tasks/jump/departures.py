@@ -64,7 +64,7 @@ def without_another_goal(task: TaskCfg) -> TaskCfg:
 
 VERTICAL: dict[str, Undone] = {
     "standing_still_and_level": Undone("--env.rewards.rest.weight 0 --env.rewards.landing-tilt.weight 0"),
-    "paws_lifted_again": Undone("--env.rewards.lifted-again.weight 0"),
+    "paws_down": Undone("--env.rewards.paws-down.weight 0"),
     "second_takeoff": Undone("--env.terminations.second-takeoff.speed 100"),
     "quiet_standing": Undone(
         "--env.rewards.resting-action-rate.weight 0 --env.rewards.torque-ripple.weight 0 "

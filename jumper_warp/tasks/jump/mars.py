@@ -52,7 +52,9 @@ def vertical_jump_mars() -> TaskCfg:
     ends = tuple(term for term in task.terminations if term.func is not terminations.second_takeoff)
     task = replace(task, terminations=ends)  # robots that only learn to land bounce, and must live to learn not to
     falling = RewardTerm(rewards.descent_tilt, -60.0, width=10.0 * DEG)  # a long flight turns a robot that tips slowly
-    task = replace(task, rewards=(*task.rewards, falling))
+    landed = RewardTerm(rewards.lifted_again, -30.0, free=0.0)
+    kept = (landed if term.func is rewards.paws_down else term for term in task.rewards)
+    task = replace(task, rewards=(*kept, falling))
     return task.with_terms(
         "rewards",
         jump_height={"wide": 0.8},

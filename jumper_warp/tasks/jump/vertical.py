@@ -43,7 +43,7 @@ REWARDS = (
     RewardTerm(rewards.retract, 10.0, width=15.0 * DEG, shift=15.0 * DEG),
     RewardTerm(rewards.rest, 20.0, speed=0.1, spin=0.5),
     RewardTerm(rewards.landing_tilt, -120.0, width=10.0 * DEG),
-    RewardTerm(rewards.lifted_again, -30.0, free=0.0),
+    RewardTerm(rewards.paws_down, 30.0),
     RewardTerm(rewards.soft_impact, 5.0, limit=5.0 * G),
     RewardTerm(rewards.stance_impact, 100.0, limit=2.5 * G),
     RewardTerm(rewards.catch_landing, 3.0),

@@ -8,7 +8,7 @@ from kernels.jump import rewards
 from kernels.jump.state import FLIGHT, LANDED, STANCE
 
 NAMES = """jump_height estimated_jump_height horizontal_velocity orientation angular_velocity joint_symmetry
-ground_posture air_posture retract soft_impact stance_impact catch_landing damp_landing"""
+ground_posture air_posture retract paws_down soft_impact stance_impact catch_landing damp_landing"""
 paid = Table(functions(rewards, NAMES), float)
 E = math.exp
 PHASES = [int(STANCE), int(FLIGHT), int(LANDED)]
@@ -155,3 +155,10 @@ def test_damp_landing_is_the_mean_of_clamped_folding_rates():
     # per leg: lateral ignored, outer 3 -> 1, inner -2 -> 0
     view = make_view(rate=np.tile([9.0, 3.0, -2.0], 4))
     assert paid("damp_landing", view, make_episode(phase=LANDED)) == pytest.approx(0.5)
+
+
+def test_paws_are_paid_for_that_are_on_the_ground_after_touchdown():
+    view = make_view(contact=(1.0, 1.0, 0.0, 1.0), contacts=3)
+    assert paid("paws_down", view, make_episode(phase=LANDED)) == 3.0
+    for phase in (STANCE, FLIGHT):
+        assert paid("paws_down", view, make_episode(phase=phase)) == 0.0
