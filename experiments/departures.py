@@ -3,11 +3,11 @@
     python experiments/departures.py --task vertical-jump --out outputs/departures
     python experiments/departures.py --task horizontal-jump --only bracing goals --seeds 1 2
 
-Trainings are alike but for what is undone (`jumper_warp.tasks.jump.departures`): from nothing, randomised, as many
-iterations. The task as it is, `kept`, is trained with every seed of `--kept-seeds`, which tells how much seeds differ.
-Each policy then makes 200 nominal and 1000 randomised jumps as `jumper evaluate` has them, a fall or a touch after the
-landing being a failure, and 100 robots of each kind wait in their squats for 3 s. What ends a jump is that of the task
-as it is, whatever the training had.
+Trainings are alike but for what is undone (`jumper_warp.tasks.jump.departures`): from nothing (on Mars from the policy
+of Earth), randomised, as many iterations. The task as it is, `kept`, is trained with every seed of `--kept-seeds`,
+which tells how much seeds differ. Each policy then makes 200 nominal and 1000 randomised jumps as `jumper evaluate` has
+them, a fall or a touch after the landing being a failure, and 100 robots of each kind wait in their squats for 3 s.
+What ends a jump is that of the task as it is, whatever the training had.
 
 A training that `--out` holds already is not made again, so that what was interrupted goes on where it was, and
 `--no-measure` may train on one machine what another measures.
@@ -34,6 +34,7 @@ from jumper_warp.evaluation.holds import Holds, hold_goals, hold_metrics
 from jumper_warp.evaluation.plots import drawn
 from jumper_warp.evaluation.run import HEIGHTS, EvaluationRun
 from jumper_warp.policies.restore import CHECKPOINTS, Conditions
+from jumper_warp.policies.start import start_from
 from jumper_warp.registry import make_task
 from jumper_warp.rl.runner import CONFIG, train
 from jumper_warp.tasks.jump.departures import DEPARTURES, Undone
@@ -46,12 +47,31 @@ ELSEWHERE = {"log_root", "device", "threads"}
 """Settings that a training need not share with one that is there already."""
 KEPT = "kept"
 """Name of the task as it is."""
-LENGTHS = {"vertical-jump": 1000, "horizontal-jump": 800}
-"""Iterations of each training."""
-GOALS = {"vertical-jump": {"lower": 0.5, "upper": 1.05}, "horizontal-jump": {"x": (0.3, 1.5)}}
-"""[m] Of the jumps that are measured."""
-SQUATS = {"vertical-jump": (0.6, 1.05), "horizontal-jump": (0.3, 1.5)}
-"""[m] Goals for which robots wait."""
+
+
+@dataclass(frozen=True)
+class Jumps:
+    """How the departures of a task are measured."""
+
+    iterations: int
+    """Of each training."""
+    goals: dict[str, Any]
+    """[m] Of the jumps."""
+    squats: tuple[float, float]
+    """[m] Goals for which robots wait."""
+    begin: str = ""
+    """More flags of each training."""
+
+
+Jump = Literal["vertical-jump", "horizontal-jump", "omnidirectional-jump", "horizontal-jump-mars-loose"]
+JUMPS: dict[Jump, Jumps] = {
+    "vertical-jump": Jumps(1000, {"lower": 0.5, "upper": 1.05}, (0.6, 1.05)),
+    "horizontal-jump": Jumps(800, {"x": (0.3, 1.5)}, (0.3, 1.5)),
+    "omnidirectional-jump": Jumps(1000, {"x": (-0.8, 1.2), "y": (-0.8, 0.8)}, (0.3, 1.2)),
+    "horizontal-jump-mars-loose": Jumps(
+        1000, {"x": (0.5, 4.2)}, (0.5, 4.2), "--start-from horizontal_jump --ppo.init-std 0.3"
+    ),
+}
 HOLD = 3.0
 """[s]"""
 TESTS = ("nominal", "randomized")
@@ -76,12 +96,12 @@ WIDTH = 180
 class Args:
     """Flags."""
 
-    task: Literal["vertical-jump", "horizontal-jump"] = "vertical-jump"
+    task: Jump = "vertical-jump"
     """Whose departures."""
     only: tuple[str, ...] = ()
     """Names of those that are undone (default: all)."""
     iterations: int | None = None
-    """Of each training (default: 1000 of heights, 800 of places, when the task as it is has learned)."""
+    """Of each training (default: 800 or 1000, when the task as it is has learned)."""
     envs: int = 8192
     """Number of environments."""
     seeds: tuple[int, ...] = (1,)
@@ -114,7 +134,7 @@ class Args:
     @property
     def length(self) -> int:
         """Iterations of each training."""
-        return LENGTHS[self.task] if self.iterations is None else self.iterations
+        return JUMPS[self.task].iterations if self.iterations is None else self.iterations
 
     def trainings(self) -> Iterator[tuple[str, int, Undone]]:
         """Yield name, seed, and what is undone."""
@@ -128,7 +148,8 @@ class Args:
         flags = f"--num-envs {self.envs} --iterations {self.length} --seed {seed} --no-tensorboard"
         flags += "" if self.device is None else f" --device {self.device}"
         flags += "" if self.threads is None else f" --threads {self.threads}"
-        return [self.task, *shlex.split(f"{flags} {self.train} {undone.flags}"), "--log-root", str(folder)]
+        flags = f"{flags} {JUMPS[self.task].begin} {self.train} {undone.flags}"
+        return [self.task, *shlex.split(flags), "--log-root", str(folder)]
 
 
 def trained(undone: Undone, arguments: list[str]) -> Path:
@@ -142,7 +163,9 @@ def trained(undone: Undone, arguments: list[str]) -> Path:
         if other or config["env"]["task"] != task_to_json(task):
             raise InputError(f"{found[-1].parents[1]} was trained with other settings: choose another --out")
         return found[-1]
-    result = train(parsed.cfg, env_maker(task, parsed), shlex.join(["jumper", "train", *arguments]))
+    start = start_from(parsed.cfg.start_from, task, parsed.cfg.ppo) if parsed.cfg.start_from else None
+    typed = shlex.join(["jumper", "train", *arguments])
+    result = train(parsed.cfg, env_maker(task, parsed), typed, start=start)
     return result.folder / name.format(result.iteration)
 
 
@@ -154,11 +177,11 @@ def measured(checkpoint: Path, args: Args, folder: Path) -> dict[str, dict[str, 
     for test, count in zip(TESTS, args.jumps, strict=True):
         drawn_robots = test == "randomized"
         conditions = replace(run.conditions, randomize=drawn_robots, noise=drawn_robots)
-        flags = replace(run.evaluation.flags, jumps=count, **GOALS[args.task])
+        flags = replace(run.evaluation.flags, jumps=count, **JUMPS[args.task].goals)
         env = run.env(count, lambda task: run.evaluation.for_evaluation(replace(task, terminations=ends)), conditions)
         values = flags.metrics(run.follow(env, flags.log(env.task, 0)))
         values["error_m"] = values.get("mean_abs_error_m", values.get("mean_error_m"))
-        goals = hold_goals(args.squats, SQUATS[args.task], up=run.task.evaluation in HEIGHTS)
+        goals = hold_goals(args.squats, JUMPS[args.task].squats, up=run.task.evaluation in HEIGHTS)
         values |= hold_metrics(run.follow(run.env(args.squats, conditions=conditions), Holds(goals, HOLD)))
         tests[test] = {name: value for name, value in values.items() if isinstance(value, bool | int | float | None)}
     return tests

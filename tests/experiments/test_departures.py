@@ -8,7 +8,7 @@ import pytest
 
 from experiments import departures
 from jumper_warp.cli.train import parse_train
-from jumper_warp.tasks.jump.departures import DEPARTURES, HORIZONTAL, VERTICAL, Undone
+from jumper_warp.tasks.jump.departures import DEPARTURES, Undone
 from jumper_warp.tasks.saving import task_from_json, task_to_json
 from jumper_warp.utils.errors import InputError
 
@@ -20,6 +20,13 @@ def undone(task, name):
 
 
 @pytest.mark.parametrize("task", DEPARTURES)
+def test_what_is_undone_by_flags_is_not_changed_besides(task):
+    plain = parse_train([task])[1]
+    for name, each in DEPARTURES[task].items():
+        assert bool(each.flags) != (each.change(plain) != plain), name
+
+
+@pytest.mark.parametrize("task", ["vertical-jump", "horizontal-jump"])
 def test_all_flags_are_those_of_the_task_and_change_it(task):
     plain = parse_train([task])[1]
     flags = " ".join(each.flags for each in DEPARTURES[task].values())
@@ -28,8 +35,6 @@ def test_all_flags_are_those_of_the_task_and_change_it(task):
     assert {"reset", "rewards", "terminations"} <= {
         key for key, part in vars(changed).items() if part != vars(plain)[key]
     }
-    for name, each in DEPARTURES[task].items():
-        assert bool(each.flags) != (each.change(plain) != plain), name
     given = [word for word in flags.split() if word.startswith("--")]
     assert len(set(given)) == len(given) and parsed.cfg.task == task
 
@@ -50,9 +55,30 @@ def test_what_is_undone_in_python():
     assert {level.jump_again for level in again} == {0.0}
 
 
+def test_what_is_undone_elsewhere():
+    goals = undone("horizontal-jump-mars-loose", "goals")[1].levels
+    assert [(level.goal_lower[0], level.goal_upper[0]) for level in goals[::2]] == [
+        (1.4, 1.85), (1.6, 2.25), (2.0, 3.75), (3.0, 4.75),
+    ]  # fmt: skip
+    assert {(level.goal_lower[1], level.goal_upper[1]) for level in goals} == {(-0.3, 0.3)} and len(goals) == 8
+    parsed, limits = undone("horizontal-jump-mars-loose", "limits")
+    ends = {term.name: term.numbers for term in limits.terminations}
+    assert parsed.cfg.start_from == "horizontal_jump" and limits.curriculum.numbers["tolerance"] == 0.1
+    assert (ends["missed_goal"]["tolerance"], ends["predicted_miss"]["tolerance"]) == (0.5, 0.55)
+    earth = {term.name: term.numbers for term in parse_train(["horizontal-jump"])[1].terminations}
+    assert ends["turned_touchdown"] == pytest.approx(earth["turned_touchdown"], abs=1e-4)
+    kernels = undone("horizontal-jump-mars-loose", "wide_kernels")[1].rewards
+    earths = {term.name: term.numbers for term in parse_train(["horizontal-jump"])[1].rewards}
+    for term in kernels:
+        assert term.numbers == earths[term.name]
+    around = undone("omnidirectional-jump", "reaches")[1].levels
+    assert around[-1].goal_upper == (1.4, 1.4, 0.0) and around[-1].goal_lower == (-1.4, -1.4, 0.0)
+    assert around[0] == parse_train(["omnidirectional-jump"])[1].levels[0]
+
+
 def test_the_table_of_departures_tells_how_these_are_undone():
     table = (Path(__file__).parents[2] / "docs" / "tasks.md").read_text()
-    for name, each in (VERTICAL | HORIZONTAL).items():
+    for name, each in [one for jump in DEPARTURES.values() for one in jump.items()]:
         assert not each.flags or f"`{each.flags}`" in table, name
 
 

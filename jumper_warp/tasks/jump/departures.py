@@ -57,6 +57,25 @@ def places_of_paper(task: TaskCfg) -> TaskCfg:
     return with_goals(task, goals, starts=2)
 
 
+def places_of_sequel(task: TaskCfg) -> TaskCfg:
+    """Return the task on Mars with places 1.4 to 4.75 m ahead in the four steps of the sequel, two starts each."""
+    last, goals = task.levels[-1], []
+    for low, top in ((1.4, 1.85), (1.6, 2.25), (2.0, 3.75), (3.0, 4.75)):
+        lower, upper = (low, *last.goal_lower[1:]), (top, *last.goal_upper[1:])
+        goals.append(replace(last, goal_lower=lower, goal_upper=upper))
+    return with_goals(task, tuple(goals), starts=2)
+
+
+def alike_all_around(task: TaskCfg) -> TaskCfg:
+    """Return the task with goals that are as far aside and back as ahead."""
+
+    def circle(level: Level) -> Level:
+        reach = level.goal_upper[0]
+        return replace(level, goal_lower=(-reach, -reach, 0.0), goal_upper=(reach, reach, 0.0))
+
+    return replace(task, levels=tuple(circle(level) if level.round else level for level in task.levels))
+
+
 def without_another_goal(task: TaskCfg) -> TaskCfg:
     """Return the task in which no landed robot gets another goal."""
     return replace(task, levels=tuple(replace(level, jump_again=0.0) for level in task.levels))
@@ -106,5 +125,27 @@ HORIZONTAL: dict[str, Undone] = {
 }
 """Of the horizontal jump alone."""
 
-DEPARTURES: dict[str, dict[str, Undone]] = {"vertical-jump": VERTICAL, "horizontal-jump": HORIZONTAL}
+ALL_AROUND: dict[str, Undone] = {"reaches": Undone(change=alike_all_around)}
+"""Of the jump all around, besides."""
+
+ON_MARS: dict[str, Undone] = {
+    "goals": Undone(change=places_of_sequel),
+    "wide_kernels": Undone(
+        "--env.rewards.estimated-tracking.middle 0.3 --env.rewards.estimated-tracking.wide 0.5 "
+        "--env.rewards.estimated-tracking.fine 0.1 --env.rewards.tracking.wide 0.15 --env.rewards.tracking.fine 0.03"
+    ),
+    "limits": Undone(
+        "--env.terminations.predicted-miss.tolerance 0.55 --env.terminations.missed-goal.tolerance 0.5 "
+        "--env.terminations.turned-touchdown.rotation 0.3491 --env.terminations.turned-touchdown.yaw 0.1745 "
+        "--env.curriculum.tolerance 0.1"
+    ),
+}
+"""Of the horizontal jump on Mars from the authors' sequel."""
+
+DEPARTURES: dict[str, dict[str, Undone]] = {
+    "vertical-jump": VERTICAL,
+    "horizontal-jump": HORIZONTAL,
+    "omnidirectional-jump": ALL_AROUND,
+    "horizontal-jump-mars-loose": ON_MARS,
+}
 """By task and name."""
