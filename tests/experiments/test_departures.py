@@ -8,6 +8,7 @@ import pytest
 
 from experiments import departures
 from jumper_warp.cli.train import parse_train
+from jumper_warp.registry import make_task
 from jumper_warp.tasks.jump.departures import DEPARTURES, Undone
 from jumper_warp.tasks.saving import task_from_json, task_to_json
 from jumper_warp.utils.errors import InputError
@@ -56,7 +57,7 @@ def test_what_is_undone_in_python():
 
 
 def test_what_is_undone_elsewhere():
-    goals = undone("horizontal-jump-mars-loose", "goals")[1].levels
+    goals = DEPARTURES["horizontal-jump-mars-loose"]["goals"].change(make_task("horizontal-jump-mars-loose")).levels
     assert [(level.goal_lower[0], level.goal_upper[0]) for level in goals[::2]] == [
         (1.4, 1.85), (1.6, 2.25), (2.0, 3.75), (3.0, 4.75),
     ]  # fmt: skip
@@ -65,15 +66,13 @@ def test_what_is_undone_elsewhere():
     ends = {term.name: term.numbers for term in limits.terminations}
     assert parsed.cfg.start_from == "horizontal_jump" and limits.curriculum.numbers["tolerance"] == 0.1
     assert (ends["missed_goal"]["tolerance"], ends["predicted_miss"]["tolerance"]) == (0.5, 0.55)
-    earth = {term.name: term.numbers for term in parse_train(["horizontal-jump"])[1].terminations}
-    assert ends["turned_touchdown"] == pytest.approx(earth["turned_touchdown"], abs=1e-4)
-    kernels = undone("horizontal-jump-mars-loose", "wide_kernels")[1].rewards
-    earths = {term.name: term.numbers for term in parse_train(["horizontal-jump"])[1].rewards}
-    for term in kernels:
-        assert term.numbers == earths[term.name]
-    around = undone("omnidirectional-jump", "reaches")[1].levels
+    earth, plain = make_task("horizontal-jump"), make_task("omnidirectional-jump")
+    (touchdown,) = (term.numbers for term in earth.terminations if term.name == "turned_touchdown")
+    assert ends["turned_touchdown"] == pytest.approx(touchdown, abs=1e-4)
+    assert undone("horizontal-jump-mars-loose", "wide_kernels")[1].rewards == earth.rewards
+    around = DEPARTURES["omnidirectional-jump"]["reaches"].change(plain).levels
     assert around[-1].goal_upper == (1.4, 1.4, 0.0) and around[-1].goal_lower == (-1.4, -1.4, 0.0)
-    assert around[0] == parse_train(["omnidirectional-jump"])[1].levels[0]
+    assert around[0] == plain.levels[0]
 
 
 def test_the_table_of_departures_tells_how_these_are_undone():
