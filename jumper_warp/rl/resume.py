@@ -11,6 +11,7 @@ import torch
 
 from jumper_warp.rl.checkpoint import DAMAGE, MANIFEST, CheckpointError, latest_checkpoint, load_checkpoint
 from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.sources import changed_sources
 from jumper_warp.utils.state_checks import check_parts, check_tensor
 
 if TYPE_CHECKING:
@@ -82,6 +83,14 @@ def changes(state: dict[str, Any], config: dict[str, Any]) -> list[str]:
         return []
     differ = [name for name in {**old, **new} if old.get(name) != new.get(name)]
     return [f"{name} {old.get(name)!s:.80} -> {new.get(name)!s:.80}" for name in differ]
+
+
+def changed_files(state: dict[str, Any], config: dict[str, Any]) -> list[str]:
+    """Return a line on each of the user's files that is not what it was when the checkpoint was saved."""
+    try:
+        return changed_sources(json.loads(state["config"])["sources"], config["sources"])
+    except DAMAGE:
+        return []
 
 
 def _settings(config: dict[str, Any]) -> dict[str, Any]:

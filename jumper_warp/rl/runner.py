@@ -26,6 +26,7 @@ from jumper_warp.rl.logger import Pace, Stopwatch, TrainingLog
 from jumper_warp.rl.ppo import FIGURES, Ppo
 from jumper_warp.rl.resume import (
     CHECKPOINTS,
+    changed_files,
     changes,
     find_checkpoint,
     own_part,
@@ -40,6 +41,7 @@ from jumper_warp.rl.start import Start, begin_with
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.files import write_whole
 from jumper_warp.utils.runtime import git_commit, versions
+from jumper_warp.utils.sources import source_sums
 from jumper_warp.utils.threads import set_threads
 
 CONFIG = "config.json"
@@ -149,14 +151,15 @@ def _check_best_by(name: str, logged: set[str]) -> None:
 def full_config(cfg: TrainCfg, env: VecEnv, rank: Rank) -> dict[str, Any]:
     """Return all settings with versions and commit, ready for JSON."""
     settings = json.loads(json.dumps(dataclasses.asdict(cfg), default=str))
-    commit = git_commit()
+    commit, described = git_commit(), env.config()
     return {
         "train": settings,
-        "env": env.config(),
+        "env": described,
         "processes": rank.size,
         "device": str(rank.device),
         "versions": versions(),
         "commit": commit and commit._asdict(),
+        "sources": source_sums(described),
     }
 
 
@@ -195,6 +198,7 @@ class Run:
         path, state, refusals = find_checkpoint(self.cfg)
         changed = changes(state, self.config)
         self.notes += [*(f"passed over: {refusal}" for refusal in refusals), f"resumed {path}", *changed]
+        self.notes += changed_files(state, self.config)
         try:
             own = own_part(state, self.rank)
             self.ppo.load_state_dict({**state["ppo"], **own["ppo"]})

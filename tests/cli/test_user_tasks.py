@@ -1,5 +1,6 @@
 """A task of one's own, in a file that nothing of the package knows, from training to a recording."""
 
+import hashlib
 import json
 import re
 import shutil
@@ -225,9 +226,25 @@ def test_training_is_resumed(capsys, runs, path, tmp_path):
     code, _, err = run(capsys, "train", "tame-jump", "--task-module", path, *args)
     assert code == 0, err
     assert "iterations 1 -> 2" in err and sum(" -> " in line for line in err) == 1
+    assert not any("has changed since" in line for line in err)
     config = json.loads((folder / "config.json").read_text())
     assert config["env"]["task"]["rewards"][0]["height"] == 0.4 and config["train"]["num_envs"] == 4
     assert (folder / "checkpoints" / "iteration_000002.pt").is_file()
+
+
+def test_a_changed_file_is_told_and_settings_stay_those_of_the_run(capsys, runs, path, tmp_path):
+    folder, edited = tmp_path / "tame-jump" / "run", tmp_path / "edited" / "my_jumps.py"
+    shutil.copytree(runs["tame-jump"], folder)
+    edited.parent.mkdir()
+    edited.write_text(TASK.replace("view.height / height", "view.height / (2.0 * height)"))
+    args = ["--device", "cpu", "--iterations", "2", "--resume", str(folder)]
+    code, _, err = run(capsys, "train", "tame-jump", "--task-module", str(edited), *args)
+    assert code == 0, err
+    told = "my_jumps has changed since: its functions are those of now, settings those of the run"
+    assert err.count(told) == 1 and "iterations 1 -> 2" in err
+    config = json.loads((folder / "config.json").read_text())
+    assert config["sources"] == {"my_jumps": hashlib.sha256(edited.read_bytes()).hexdigest()}
+    assert config["env"]["task"]["rewards"][0]["height"] == 0.4
 
 
 def test_task_whose_functions_could_not_be_found_again_is_not_trained(capsys, tmp_path):
