@@ -113,7 +113,7 @@ class Args:
     squats: int = 100
     """Robots that wait."""
     train: str = ""
-    """More flags of `jumper train`, for all trainings."""
+    """More flags of `jumper train`, for all trainings: --train="--ppo.gamma 0.98"."""
     measure: bool = True
     """Make the jumps after each training."""
     out: Path | None = None

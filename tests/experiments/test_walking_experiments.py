@@ -38,16 +38,13 @@ def test_robots_that_stand_still_follow_nothing(policies, tmp_path):
 
 
 def test_robots_that_stand_still_come_nowhere_on_any_ground(policies, tmp_path):
-    figures = {}
-    for terrain, record in (("flat", 0), ("stairs", 1)):
-        args = walking_terrain.Args(
-            str(policies / "velocity-flat"), robots=3, terrains=(terrain,), record=record, out=tmp_path, device="cpu"
-        )
-        figures |= walking_terrain.main(args)
+    args = walking_terrain.Args(
+        str(policies / "velocity-flat"), robots=3, terrains=("flat", "stairs"), record=1, out=tmp_path, device="cpu"
+    )
+    figures = walking_terrain.main(args)
     assert figures["success_rate_flat"] < 0.02 and figures["success_rate_stairs"] < 0.02
     assert figures["fall_rate_flat"] == 0.0 and (tmp_path / "terrain.png").is_file()
-    assert (tmp_path / "stairs.rrd").stat().st_size > 10_000 and (tmp_path / "stairs.png").stat().st_size > 10_000
-    assert not (tmp_path / "flat.rrd").exists()
+    assert (tmp_path / "stairs.rrd").stat().st_size > 10_000 and (tmp_path / "flat.png").stat().st_size > 10_000
 
 
 def test_kicks_and_speeds_are_those_of_the_test():

@@ -87,6 +87,7 @@ def test_observations_actions_and_targets_are_those_of_the_environment(page, nam
         own = env.obs[0].numpy().copy()
         wrong = max(wrong, np.abs(velocity - own[12:15]).max())
         env.step(expected)
+        assert deployed.action is action  # what it will see as its last
         deployed.action = expected[0].numpy()  # in flight a policy may make more of what its last actions were off by
         theirs = env.robot.safe_target.numpy()[:, 0]
         pairs = ((seen, own), (action, expected[0].numpy()), (safe, theirs))

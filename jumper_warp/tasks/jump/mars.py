@@ -52,7 +52,7 @@ def vertical_jump_mars() -> TaskCfg:
     ends = tuple(term for term in task.terminations if term.func is not terminations.second_takeoff)
     task = replace(task, terminations=ends)  # robots that only learn to land bounce, and must live to learn not to
     falling = RewardTerm(rewards.descent_tilt, -60.0, width=10.0 * DEG)  # a long flight turns a robot that tips slowly
-    landed = RewardTerm(rewards.lifted_again, -30.0, free=0.0)
+    landed = RewardTerm(rewards.lifted_again, -30.0, free=0.0)  # what its policies were trained with
     kept = (landed if term.func is rewards.paws_down else term for term in task.rewards)
     task = replace(task, rewards=(*kept, falling))
     return task.with_terms(
