@@ -1,6 +1,7 @@
 """Departures of the jumps from the paper: each is undone as it says, and the experiment at a tiny size."""
 
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -73,6 +74,13 @@ def test_what_is_undone_elsewhere():
     around = DEPARTURES["omnidirectional-jump"]["reaches"].change(plain).levels
     assert around[-1].goal_upper == (1.4, 1.4, 0.0) and around[-1].goal_lower == (-1.4, -1.4, 0.0)
     assert around[0] == plain.levels[0]
+
+
+def test_paws_sink_less_than_a_millimetre_as_the_page_says():
+    text = (Path(__file__).parents[2] / "docs" / "departures.md").read_text()
+    names = {}
+    exec(re.search(r"```python\n(.*?)```", text, re.DOTALL)[1].replace("200", "20"), names)
+    assert (names["lowest"] > -0.001).all() and (names["lowest"] < -0.0003).all()
 
 
 def test_the_table_of_departures_tells_how_these_are_undone():
