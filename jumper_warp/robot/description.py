@@ -6,9 +6,11 @@ from its twin. Quaternions are xyzw.
 
 from __future__ import annotations
 
+import functools
 import json
 import math
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -26,6 +28,7 @@ from jumper_warp.robot.parts import (
     RobotDescriptionError,
     Shape,
     TriangleMesh,
+    make_read_only,
 )
 from jumper_warp.robot.urdf import UrdfReader, file_inside, read_text
 from jumper_warp.utils.assets import ASSETS
@@ -55,11 +58,15 @@ RAD_PER_S_PER_RPM = 2.0 * math.pi / 60.0
 
 
 def load_description(path: Path | None = None) -> RobotDescription:
-    """Return the checked robot description of a JSON file, by default the project's own.
+    """Return the checked robot description of a JSON file, by default the project's own, which is read once.
 
     Raises RobotDescriptionError for whatever is missing, malformed or impossible.
     """
-    path = DEFAULT_DESCRIPTION if path is None else Path(path)
+    return _own_description(DEFAULT_DESCRIPTION) if path is None else _read_description(Path(path))
+
+
+def _read_description(path: Path) -> RobotDescription:
+    """Return the checked robot description of a JSON file."""
     reader = JsonReader(path)
     urdf_file = file_inside(path, reader.text(reader.root, "urdf", ""), "urdf")
     urdf_text = read_text(urdf_file)
@@ -75,9 +82,13 @@ def load_description(path: Path | None = None) -> RobotDescription:
         knee_damping=reader.positive(reader.root, "knee_damping", ""),
         knee_damping_limit=reader.positive(reader.root, "knee_damping_limit", ""),
         transversal_sum=reader.range_deg("transversal_sum_deg"),
-        poses=reader.poses(),
+        poses=MappingProxyType(reader.poses()),
     )
+    make_read_only(description)
     return check_description(description)
+
+
+_own_description = functools.cache(_read_description)
 
 
 class JsonReader:

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, is_dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -135,7 +137,7 @@ class Motor:
 
 @dataclass(frozen=True, eq=False)
 class RobotDescription:
-    """Everything that is known of the robot before a simulator is chosen."""
+    """Everything that is known of the robot before a simulator is chosen; `dataclasses.replace` makes another."""
 
     path: Path
     """The description file."""
@@ -153,7 +155,7 @@ class RobotDescription:
     """[N m] Largest torque of a knee's damping."""
     transversal_sum: tuple[float, float]
     """[rad] Stops of outer plus inner angle of a leg."""
-    poses: dict[str, tuple[float, float]]
+    poses: Mapping[str, tuple[float, float]]
     """Named poses: lateral and transversal angle [rad], the same for every leg."""
 
     @property
@@ -173,3 +175,14 @@ class RobotDescription:
         """Return the 12 motor angles [rad] of a named pose. Raises KeyError."""
         lateral, transversal = self.poses[name]
         return np.tile([lateral, transversal, transversal], 4)
+
+
+def make_read_only(part: Any) -> None:
+    """Let nobody write into the arrays of a description, or of a part of one."""
+    if isinstance(part, np.ndarray):
+        part.setflags(write=False)
+    elif isinstance(part, tuple):
+        for each in part:
+            make_read_only(each)
+    elif is_dataclass(part):
+        make_read_only(tuple(vars(part).values()))

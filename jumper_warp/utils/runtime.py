@@ -1,5 +1,6 @@
 """What a result was made with: device, driver, package versions and commit."""
 
+import functools
 import subprocess
 from importlib import metadata
 from pathlib import Path
@@ -83,12 +84,22 @@ def announce(device: str | None, threads: int | None = None) -> DeviceInfo:
 
 
 def git_commit(folder: Path | None = None) -> Commit | None:
-    """Return the commit of the source tree in `folder` (default: this package's).
+    """Return the commit of the source tree in `folder` (default: this package's, as it was when first asked for).
 
     None without git, outside a git tree, in a tree without commits, and where the enclosing tree does not track
     the folder, as for a package installed inside another project.
     """
-    folder = Path(__file__).parent if folder is None else folder
+    return _own_commit() if folder is None else _commit_of(folder)
+
+
+@functools.cache
+def _own_commit() -> Commit | None:
+    """Return the commit of this package's source tree; what has been imported from it stays the same."""
+    return _commit_of(Path(__file__).parent)
+
+
+def _commit_of(folder: Path) -> Commit | None:
+    """Return the commit of the source tree in a folder, or None, as `git_commit`."""
     if not _git(folder, "ls-files"):
         return None
     commit = _git(folder, "rev-parse", "--verify", "HEAD")

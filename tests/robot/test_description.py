@@ -77,3 +77,14 @@ def test_stops(description):
 
 def test_default_pose(description):
     assert np.degrees(description.pose("default")) == pytest.approx([0.0, 45.0, 45.0] * 4)
+
+
+def test_the_projects_own_is_read_once_and_nobody_writes_into_it():
+    own = load_description()
+    assert load_description() is own and load_description(own.path) is not own
+    meshes = [shape.mesh for link in own.links for shape in link.visuals if shape.mesh]
+    for array in (own.links[0].inertia, own.joints[0].axis, own.loops[0].child_anchor, meshes[0].vertices):
+        with pytest.raises(ValueError, match="read-only"):
+            array[0] = 1.0
+    with pytest.raises(TypeError):
+        own.poses["default"] = (0.0, 0.0)
