@@ -27,6 +27,7 @@ from jumper_warp.robot.model import PHYSICS_DT, build_model, standing_configurat
 from jumper_warp.robot.motors import filter_params, jumping_motors, vertical_jump_filter
 from jumper_warp.sim.simulation import SUBSTEPS
 from jumper_warp.sim.solver import MAX_SWEEPS, TOLERANCE
+from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.output import output_dir, write_figures
 from jumper_warp.utils.runtime import announce
 from jumper_warp.utils.timing import device_memory, wall_time
@@ -50,6 +51,11 @@ class Args:
     """Folder for figures.json (default: outputs/gradient_cost/<time>)."""
     device: str | None = None
     """Warp device."""
+
+    def __post_init__(self) -> None:
+        """Check the values."""
+        if self.repeats < 1 or (self.worlds is not None and self.worlds < 1):
+            raise InputError("worlds and repeats must be at least 1")
 
 
 def start() -> tuple[np.ndarray, np.ndarray]:

@@ -26,11 +26,18 @@ def step_jacobians(
 
     Returns by name (T, 37, ...): derivatives of the 19 entries of q and the 18 of qd, each by the entries of the input
     at the step's start, without worlds; its cost does not grow with `by`. Raises InputError for other numbers of worlds
-    or rows.
+    or rows, a world that is not there, a latency of a policy step or more, or another name.
     """
     count = trajectory.safe.shape[0]
     if steps.num_worlds != count or trajectory.q.shape[0] != count + 1 or steps.every != steps.substeps:
         raise InputError(f"{count} policy steps need as many worlds and a row each, got {steps.num_worlds} worlds")
+    if not steps.parameters["latency"].numpy().max() < steps.substeps * steps.dt:
+        raise InputError(f"Jacobians of steps need a latency below a policy step, {steps.substeps * steps.dt:.4g} s")
+    if world not in range(trajectory.q.shape[2]):
+        raise InputError(f"world must be below {trajectory.q.shape[2]}, got {world!r:.20}")
+    inputs = {"targets", "q", "qd", "before", "wrench", "geometry", *steps.parameters}
+    if unknown := set(by) - inputs:
+        raise InputError(f"a rollout has no input {min(unknown)!r:.40}; it has {', '.join(sorted(inputs))}")
     q, qd = (getattr(trajectory, name).numpy()[:-1, :, world].T for name in STATE)
     targets = trajectory.commands.target.numpy()[:, :, world].T[None]
     wrench = trajectory.commands.wrench.numpy()[:, :, world].T[None]

@@ -7,6 +7,7 @@ steps and the paws' impulses is kept in between; see `kernels.dynamics.step_adjo
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
@@ -64,6 +65,8 @@ class Trajectory:
     """(T, 12, num_worlds) [rad] Targets that the filter let through."""
     commands: Any
     """The kernels' `Commands` that led to it."""
+    from_start: bool = False
+    """Whether the motors followed the angles that they started at, and not a `before` that was given."""
 
     def end(self) -> dict[str, wp.array]:
         """Return what a rollout that goes on from here is given: q, qd, before, impulse."""
@@ -107,12 +110,15 @@ class Rollout:
 
         Raises:
             NotThisRobotError: the model is another robot's.
-            InputError: dt not finite and positive, substeps no whole number above 0, or `every` no divisor of it.
+            InputError: dt or tolerance not finite and positive, substeps no whole number above 0, or `every` no divisor
+                of it.
         """
         check_step(dt, substeps)
         every = substeps if every is None else every
         if every not in range(1, substeps + 1) or substeps % every != 0:
             raise InputError(f"every must be a divisor of substeps = {substeps}, got {every!r}")
+        if tolerance is not None and not 0.0 < tolerance < math.inf:
+            raise InputError(f"tolerance must be finite and positive, got {tolerance!r:.40}")
         self.dynamics = JumperDynamics(model, double=double)
         self.num_worlds, self.device, self.real = model.world_count, model.device, self.dynamics.real
         self.dt, self.substeps, self.every = dt, substeps, every
@@ -138,6 +144,8 @@ class Rollout:
         """By name, worlds last: the parameter table of `kernels.layout` (321, n), motor constants (12, n) as in
         `MotorKindCfg` and the sensors' `offset` [rad], `fade` [rad/s] (2, n), `latency` [s] (n,), and the filter's
         constants (14, n), rows as in `jumper_warp.optim.actuation.FILTER_NAMES`, in rad."""
+        self.writes = dict.fromkeys([*self.parameters, "geometry"], 0)
+        """How often `simulate` has changed each of them."""
         self.by_legs = self.device.is_cuda
         """Whether a thread has a leg or a world, by default a leg on a GPU and a world on a CPU."""
         self.slices = slices_of(n, 1 if self.device.is_cuda else checked_threads(threads))
@@ -148,14 +156,16 @@ class Rollout:
         self._launched: set[str] = set()
 
     def standing(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return q (19, num_worlds) and qd (18, num_worlds) of the model's pose, at rest."""
+        """Return q (19, num_worlds) and qd (18, num_worlds) of the model's pose, at rest, in single precision."""
         return compact(self.dynamics.model.joint_q.numpy(), np.zeros(38 * self.num_worlds), self.num_worlds)
 
     def hold(self, worlds: Any = True) -> None:
         """Hang up the bases of some worlds: they keep the position and the velocity that they start with.
 
-        worlds: bool, (num_worlds,) or one for all.
+        worlds: bool, (num_worlds,) or one for all. Raises InputError for another shape.
         """
+        if np.shape(worlds) not in ((), (self.num_worlds,)):
+            raise InputError(f"worlds must be one bool, or ({self.num_worlds},), got {np.shape(worlds)}")
         held = np.broadcast_to(np.asarray(worlds, dtype=np.int32), self.num_worlds)
         self.dynamics.robot.held = wp.array(held, dtype=int, device=self.device)
 
@@ -165,9 +175,11 @@ class Rollout:
         return np.column_stack([legs["hip"], *(legs[name] for name in GEOMETRY_NAMES[3:])]).astype(np.float64)
 
     def set_geometry(self, lengths: np.ndarray) -> None:
-        """Write the legs' lengths [m], (4, 10). Raises InputError for another shape."""
+        """Write the legs' lengths [m], (4, 10). Raises InputError for another shape or what is not finite."""
         if np.shape(lengths) != (4, len(GEOMETRY_NAMES)):
             raise InputError(f"geometry must have shape (4, {len(GEOMETRY_NAMES)}), got {np.shape(lengths)}")
+        if not np.isfinite(lengths).all():
+            raise InputError("geometry must be finite")
         legs = self.dynamics.robot.geometry.numpy().copy()
         legs["hip"] = lengths[:, :3]
         for name, column in zip(GEOMETRY_NAMES[3:], lengths.T[3:], strict=True):
@@ -191,7 +203,7 @@ class Rollout:
             q: First row, (19, num_worlds), as in `Trajectory.q`.
             qd: First row, (18, num_worlds).
             before: What the motors follow [rad] until the first target arrives, (12, num_worlds), by default the angles
-                that they start at. Only `parameters["latency"]` makes it matter.
+                that they start at, by which the gradient by q has it too. Only `parameters["latency"]` makes it matter.
             wrench: Force [N] and moment [N m] on the base at its com, world axes, in each policy step,
                 (T, 6, num_worlds).
             impulse: What pushed the paws in the step before, as in `Trajectory.impulse`, (4, num_worlds) vec3; zero
@@ -213,7 +225,12 @@ class Rollout:
         commands.wrench = self._zeros(count, 6, self.num_worlds) if wrench is None else (
             self._input("wrench", wrench, (count, 6))
         )  # fmt: skip
-        commands.impulse = self._zeros(4, self.num_worlds, dtype=vec3) if impulse is None else impulse
+        pushes = (4, self.num_worlds)
+        if impulse is not None and not (
+            isinstance(impulse, wp.array) and impulse.shape == pushes and impulse.dtype == vec3
+        ):
+            raise InputError(f"impulse must be an array {pushes} of {vec3.__name__}, as in `Trajectory.impulse`")
+        commands.impulse = self._zeros(*pushes, dtype=vec3) if impulse is None else impulse
         if count < 1:
             raise InputError("a rollout needs at least one policy step of targets")
         rows = self._rows(count)
@@ -226,7 +243,7 @@ class Rollout:
             self._launch_legs(modules.rollout_legs.rollout_legs_kernel, inputs, [safe, rows])
         else:
             self._launch(modules.rollout.rollout_kernel, inputs, [self.dynamics.work, safe, rows])
-        return Trajectory(rows.q, rows.qd, rows.torque, rows.impulse, rows.pressed, safe, commands)
+        return Trajectory(rows.q, rows.qd, rows.torque, rows.impulse, rows.pressed, safe, commands, before is None)
 
     def backward(
         self,
@@ -250,12 +267,22 @@ class Rollout:
         n, modules = self.num_worlds, self.dynamics.modules
         commands = trajectory.commands
         count = commands.target.shape[0]
+        rows_of = (count * self.substeps // self.every + 1, 19, n)
+        if trajectory.q.shape != rows_of or trajectory.q.dtype != self.real:
+            raise InputError(f"this rollout makes trajectories {rows_of}, got {trajectory.q.shape}")
         seeds = modules.rollout.Rows()
         given = {"q": q, "qd": qd, "torque": torque, "impulse": impulse, "safe": safe}
         for name, array in given.items():
             like = getattr(trajectory, name)
-            if array is not None and (array.shape != like.shape or array.dtype != like.dtype):
-                raise InputError(f"the gradient by {name} must be like it, {like.shape}, got {array.shape}")
+            if array is None:
+                continue
+            if not isinstance(array, wp.array) or array.shape != like.shape or array.dtype != like.dtype:
+                got = f"{array.dtype.__name__} {array.shape}" if isinstance(array, wp.array) else type(array).__name__
+                raise InputError(
+                    f"the gradient by {name} must be like it, {like.dtype.__name__} {like.shape}, got {got}"
+                )
+        for name, array in given.items():
+            like = getattr(trajectory, name)
             if name == "safe":
                 continue
             empty = wp.zeros((0,) * like.ndim, dtype=like.dtype, device=self.device)
@@ -283,6 +310,8 @@ class Rollout:
             if self._record is None:
                 self._record = self._step_record()
             self._launch(modules.rollout_adjoint.reverse_kernel, [*motion, seeds], [self._record, gradients])
+        if trajectory.from_start:
+            wp.map(wp.add, gradients.q[7:], gradients.before, out=gradients.q[7:])
         found = {"targets": gradients.target, "q": gradients.q, "qd": gradients.qd, "before": gradients.before}
         return found | {"wrench": gradients.wrench} | self._named(gradients.parameters)
 

@@ -3,23 +3,24 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator
+from collections.abc import Container, Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 import warp as wp
+from torch.autograd.function import once_differentiable
 
 from jumper_warp.optim.rollout import LATENCY_RANGE, Rollout, Trajectory
 from jumper_warp.utils.checks import check_within
 from jumper_warp.utils.errors import InputError
 
-COMMANDS = ("targets", "q", "qd", "before", "wrench")
+COMMANDS = ("targets", "q", "qd", "before", "wrench", "impulse")
 OUTPUTS = ("q", "qd", "torque", "impulse", "safe")
 
 
 class TorchTrajectory(NamedTuple):
-    """A trajectory as tensors, see `Trajectory`; all carry gradients."""
+    """A trajectory as tensors, see `Trajectory`; all carry gradients, for which nobody may change them in place."""
 
     q: torch.Tensor
     """(K + 1, 19, num_worlds)"""
@@ -49,20 +50,26 @@ def simulate(
     trusted: bool = False,
     **parameters: torch.Tensor,
 ) -> TorchTrajectory:
-    """Run a rollout; gradients reach all tensors but `impulse`.
+    """Run a rollout; first derivatives reach all tensors but `impulse`.
 
     Shapes as in `Rollout.run`, with worlds or without them. parameters: entries of `Rollout.parameters`, which are
-    written to the rollout and stay there, or `geometry` (4, 10) [m], the legs' lengths of all worlds. trusted: do not
-    look at the numbers; of those on a GPU a latency alone is looked at, and waited for, as in `Rollout.run`.
+    written to the rollout and stay there, or `geometry` (4, 10) [m], the legs' lengths of all worlds; gradients by them
+    are of the calls that they are given to. trusted: do not look at the numbers; of those on a GPU a latency alone is
+    looked at, and waited for, as in `Rollout.run`.
 
     A policy that sees the state runs one policy step a call, each from `end()` of the one before. Raises InputError for
-    a parameter of another name, what is no tensor of the shape or not finite, or a latency outside of `LATENCY_RANGE`.
+    a parameter of another name, what is no tensor of the shape or not finite, or a latency outside of `LATENCY_RANGE`;
+    its reverse pass for a parameter that another call has changed meanwhile, and this one was not given.
     """
     named = {"targets": targets, "q": q, "qd": qd, "before": before, "wrench": wrench} | parameters
-    given = {name: tensor for name, tensor in named.items() if tensor is not None}
-    for name, tensor in given.items():
+    given = {name: tensor for name, tensor in named.items() if tensor is not None or name in COMMANDS[:3]}
+    for name, tensor in given.items() if impulse is None else [*given.items(), ("impulse", impulse)]:
         if not isinstance(tensor, torch.Tensor):
             raise InputError(f"{name} must be a torch tensor, got {type(tensor).__name__}")
+        if tensor.is_complex():
+            raise InputError(f"{name} must be of real numbers, got {tensor.dtype}")
+    if targets.dim() == 0:
+        raise InputError("targets must have shape (T, 12, num_worlds), got ()")
     unknown = next((name for name in parameters if name not in rollout.parameters and name != "geometry"), None)
     if unknown is not None:
         raise InputError(
@@ -78,8 +85,13 @@ def simulate(
         if tuple(tensor.shape) != full:
             raise InputError(f"{name} must have shape {full}, got {tuple(tensor.shape)}")
         given[name] = tensor.to(dtype=real).contiguous()
+    given.setdefault("before", given["q"][7:].contiguous())
+    if impulse is not None:
+        if tuple(impulse.shape) != (4, rollout.num_worlds, 3):
+            raise InputError(f"impulse must have shape {(4, rollout.num_worlds, 3)}, got {tuple(impulse.shape)}")
+        impulse = impulse.detach().to(dtype=real).contiguous()
     if not trusted:
-        _check_numbers(given)
+        _check_numbers(given if impulse is None else given | {"impulse": impulse})
     return TorchTrajectory(*_Simulate.apply(rollout, tuple(given), impulse, *given.values()))
 
 
@@ -104,22 +116,25 @@ class _Simulate(torch.autograd.Function):
             _write_parameters(rollout, given)
             commands = {name: wp.from_torch(given[name].detach()) for name in COMMANDS if name in given}
             if impulse is not None:
-                vec3 = rollout.dynamics.modules.scalar.vec3
-                commands["impulse"] = wp.from_torch(impulse.detach().contiguous(), dtype=vec3)
+                commands["impulse"] = wp.from_torch(impulse, dtype=rollout.dynamics.modules.scalar.vec3)
             trajectory = rollout.run(**commands)
-        ctx.rollout, ctx.names, ctx.trajectory = rollout, names, trajectory
-        ctx.save_for_backward(*tensors)
+        ctx.rollout, ctx.names, ctx.trajectory, ctx.writes = rollout, names, trajectory, dict(rollout.writes)
         outputs = [wp.to_torch(getattr(trajectory, name)) for name in OUTPUTS]
+        ctx.save_for_backward(*tensors, *outputs)  # the latter so that torch tells when they have been changed in place
         ctx.set_materialize_grads(False)
         return tuple(outputs)
 
     @staticmethod
+    @once_differentiable
     def backward(ctx: Any, *grads: torch.Tensor | None) -> tuple:
         """Run it backwards, with the parameters that it had."""
         rollout, trajectory = ctx.rollout, ctx.trajectory
-        given = dict(zip(ctx.names, ctx.saved_tensors, strict=True))
+        given = dict(zip(ctx.names, ctx.saved_tensors, strict=False))
+        changed = {name for name, count in rollout.writes.items() if ctx.writes[name] != count}
+        if lost := changed - given.keys():
+            raise InputError(f"{min(lost)} has been changed since this rollout: give it to each call of simulate")
         with _stream(rollout):
-            _write_parameters(rollout, given)
+            _write_parameters(rollout, given, changed)
             seeds = {name: _seed(trajectory, name, grad) for name, grad in zip(OUTPUTS, grads, strict=False)}
             found = rollout.backward(trajectory, **seeds)
             sums = []
@@ -133,12 +148,14 @@ def _seed(trajectory: Trajectory, name: str, grad: torch.Tensor | None) -> wp.ar
     """Return a gradient by an output of the trajectory as Warp sees it."""
     if grad is None:
         return None
-    return wp.from_torch(grad.contiguous(), dtype=getattr(trajectory, name).dtype)
+    return wp.from_torch(grad.detach().contiguous(), dtype=getattr(trajectory, name).dtype)
 
 
-def _write_parameters(rollout: Rollout, given: dict[str, torch.Tensor]) -> None:
-    """Write what is given of the parameters to the rollout."""
+def _write_parameters(rollout: Rollout, given: dict[str, torch.Tensor], new: Container[str] | None = None) -> None:
+    """Write what is given of the parameters to the rollout; new: those that it does not hold yet, by default all."""
     for name, tensor in given.items():
+        if name in rollout.writes and (new is None or name in new):
+            rollout.writes[name] += 1
         if name in rollout.parameters:
             wp.copy(rollout.parameters[name], wp.from_torch(tensor.detach()))
         elif name == "geometry":

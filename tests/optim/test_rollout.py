@@ -145,6 +145,51 @@ def test_torch_step_by_step_gives_the_gradients_of_the_whole(late):
         np.testing.assert_allclose(stepped, whole, rtol=0.0, atol=1.0e-12 * np.abs(whole).max())
 
 
+def test_what_is_late_at_first_makes_the_start_matter_twice():
+    """Motors follow the angles that they start at, unless told otherwise: the gradient by q has both."""
+    of, (q, qd) = rollout(), tensors()
+    targets, late, found = torch.tensor(push_off(6)), torch.tensor([0.006], dtype=torch.float64), []
+
+    def height(q, **before):
+        return simulate(of, targets, q, qd, latency=late, **before).q[-1, 2].sum()
+
+    for before in (False, True):
+        start = q.clone().requires_grad_()
+        height(start, **({"before": start[7:]} if before else {})).backward()
+        found.append(start.grad)
+    runs = [of.run(targets.numpy(), q.numpy(), qd.numpy(), before=start) for start in (None, q[7:].numpy())]
+    seed = np.zeros(runs[0].q.shape)
+    seed[-1, 2] = 1.0
+    with_start, without = (of.backward(made, q=of.array(seed))["q"].numpy() for made in runs)
+    found.append(with_start)
+    for entry in (8, 9):
+        step = torch.zeros_like(q)
+        step[entry] = 1.0e-8
+        expected = (height(q + step) - height(q - step)).item() / 2.0e-8
+        for gradient in found:
+            assert gradient[entry].item() == pytest.approx(expected, rel=1.0e-4)
+        assert without[entry].item() != pytest.approx(expected, rel=1.0e-2)
+    simulate(of, targets, q, qd, latency=0.0 * late)
+
+
+def test_what_a_reverse_pass_needs_cannot_be_lost_silently():
+    of, (q, qd) = rollout(), tensors()
+    targets = torch.tensor(push_off(2)).requires_grad_()
+    made = simulate(of, targets, q, qd)
+    made.torque.div_(18.0)
+    with pytest.raises(RuntimeError, match="inplace"):
+        losses(made).backward()
+    made = simulate(of, targets, q, qd)
+    for name, other in (("kp", torch.full((12,), 30.0)), ("geometry", torch.tensor(of.geometry()))):
+        simulate(of, targets, q, qd, **{name: other})
+        with pytest.raises(ValueError, match=f"{name} has been changed since this rollout"):
+            losses(made).backward(retain_graph=True)
+        made = simulate(of, targets, q, qd)
+    (gradient,) = torch.autograd.grad(losses(made), targets, create_graph=True)
+    with pytest.raises(RuntimeError, match="once_differentiable"):
+        gradient.square().sum().backward()
+
+
 def test_jacobians_of_steps_chain_to_the_whole_gradient():
     of, steps = rollout(), rollout(TICKS)
     values = defaults()
@@ -191,10 +236,29 @@ def test_backward_refuses_other_shapes():
         rollout().backward(trajectory, qd=trajectory.q)
 
 
-@pytest.mark.parametrize("setting", [{"dt": 0.0}, {"dt": float("nan")}, {"substeps": 0}, {"every": 3}, {"every": 0}])
+@pytest.mark.parametrize(
+    "setting",
+    [
+        {"dt": 0.0},
+        {"dt": math.nan},
+        {"substeps": 0},
+        {"every": 3},
+        {"every": 0},
+        {"tolerance": -1.0},
+        {"tolerance": math.nan},
+    ],
+)
 def test_rollout_refuses_bad_settings(setting):
     with pytest.raises(ValueError, match=next(iter(setting))):
         Rollout(rollout().dynamics.model, **setting)
+
+
+def test_rollout_refuses_bad_lengths_and_worlds_to_hold():
+    of = rollout()
+    with pytest.raises(ValueError, match="geometry must be finite"):
+        of.set_geometry(np.full((4, 10), np.nan))
+    with pytest.raises(ValueError, match=r"worlds must be one bool, or \(1,\)"):
+        of.hold([True, False, True])
 
 
 def test_simulate_refuses_unknown_parameters():
@@ -242,14 +306,54 @@ def test_simulate_refuses_what_is_not_a_number(name):
 
 
 def test_simulate_refuses_what_is_no_tensor():
+    q, qd = tensors()
     with pytest.raises(ValueError, match="kp must be a torch tensor, got float"):
-        simulate(rollout(), torch.zeros(2, 12), *tensors(), kp=80.0)
+        simulate(rollout(), torch.zeros(2, 12), q, qd, kp=80.0)
+    with pytest.raises(ValueError, match="q must be a torch tensor, got NoneType"):
+        simulate(rollout(), torch.zeros(2, 12), None, qd)
+    with pytest.raises(ValueError, match="impulse must be a torch tensor, got ndarray"):
+        simulate(rollout(), torch.zeros(2, 12), q, qd, impulse=np.zeros((4, 1, 3)))
+    with pytest.raises(ValueError, match="targets must be of real numbers"):
+        simulate(rollout(), torch.zeros(2, 12, dtype=torch.complex64), q, qd)
+    with pytest.raises(ValueError, match="targets must have shape"):
+        simulate(rollout(), torch.tensor(1.0), q, qd)
+
+
+@pytest.mark.parametrize("shape", [(1, 1, 3), (4, 2, 3), (4, 3)])
+def test_impulses_of_another_shape_are_refused(shape):
+    of, (q, qd) = rollout(), tensors()
+    with pytest.raises(ValueError, match=r"impulse must have shape \(4, 1, 3\)"):
+        simulate(of, torch.zeros(2, 12), q, qd, impulse=torch.zeros(shape))
+    for other in (np.zeros((4, 1, 3)), wp.zeros(shape[:2], dtype=wp.vec3, device="cpu")):
+        with pytest.raises(ValueError, match="impulse must be an array"):
+            of.run(push_off(2), *squat(), impulse=other)
+    with pytest.raises(ValueError, match="impulse must be finite"):
+        simulate(of, torch.zeros(2, 12), q, qd, impulse=torch.full((4, 1, 3), float("nan")))
+    single = simulate(of, torch.zeros(2, 12), q, qd, impulse=torch.zeros(4, 1, 3, dtype=torch.float32))
+    assert torch.equal(single.q, simulate(of, torch.zeros(2, 12), q, qd).q)
+
+
+def test_backward_refuses_a_trajectory_of_another_rollout():
+    trajectory = rollout().run(push_off(2), *squat())
+    with pytest.raises(ValueError, match="this rollout makes trajectories"):
+        rollout(2).backward(trajectory)
+    with pytest.raises(ValueError, match=r"must be like it, float64 .*, got float32"):
+        rollout().backward(trajectory, q=wp.zeros(trajectory.q.shape, dtype=wp.float32, device="cpu"))
+    with pytest.raises(ValueError, match="got ndarray"):
+        rollout().backward(trajectory, q=np.zeros(trajectory.q.shape))
 
 
 def test_jacobians_need_a_world_for_each_step():
-    trajectory = rollout().run(push_off(2), *squat())
+    trajectory, steps = rollout().run(push_off(2), *squat()), rollout(2)
     with pytest.raises(ValueError, match="2 policy steps need as many worlds"):
         step_jacobians(rollout(), trajectory)
+    with pytest.raises(ValueError, match="world must be below 1, got 5"):
+        step_jacobians(steps, trajectory, world=5)
+    with pytest.raises(ValueError, match="no input 'kpp'"):
+        step_jacobians(steps, trajectory, by=("q", "kpp"))
+    steps.parameters["latency"].fill_(DT * SUBSTEPS)
+    with pytest.raises(ValueError, match="latency below a policy step"):
+        step_jacobians(steps, trajectory)
 
 
 @pytest.fixture
