@@ -274,15 +274,12 @@ class Rollout:
         given = {"q": q, "qd": qd, "torque": torque, "impulse": impulse, "safe": safe}
         for name, array in given.items():
             like = getattr(trajectory, name)
-            if array is None:
-                continue
-            if not isinstance(array, wp.array) or array.shape != like.shape or array.dtype != like.dtype:
+            alike = isinstance(array, wp.array) and array.shape == like.shape and array.dtype == like.dtype
+            if array is not None and not alike:
                 got = f"{array.dtype.__name__} {array.shape}" if isinstance(array, wp.array) else type(array).__name__
                 raise InputError(
                     f"the gradient by {name} must be like it, {like.dtype.__name__} {like.shape}, got {got}"
                 )
-        for name, array in given.items():
-            like = getattr(trajectory, name)
             if name == "safe":
                 continue
             empty = wp.zeros((0,) * like.ndim, dtype=like.dtype, device=self.device)
