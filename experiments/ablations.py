@@ -18,16 +18,16 @@ from rich.table import Table
 
 from jumper_warp.cli.main import run_command
 from jumper_warp.envs.env import Env
-from jumper_warp.evaluation.learning import Curve, learning_curve, make_judge
 from jumper_warp.evaluation.plots import drawn
 from jumper_warp.registry import make_task
 from jumper_warp.rl.cfg import PpoCfg
 from jumper_warp.rl.ppo import Ppo
 from jumper_warp.tasks.cfg import TaskCfg
-from jumper_warp.tasks.jump.ablations import ABLATIONS
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.output import output_dir, write_figures
 from jumper_warp.utils.runtime import announce
+from support.ablations import ABLATIONS
+from support.learning import Curve, learning_curve, make_judge
 
 FULL = "full"
 """Name of the training that lacks nothing."""

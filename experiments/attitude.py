@@ -22,10 +22,10 @@ import tyro
 
 from jumper_warp.cli.main import run_command
 from jumper_warp.evaluation.log import Metrics
-from jumper_warp.evaluation.momentum import momentum, rotational_inertia
 from jumper_warp.evaluation.plots import drawn
 from jumper_warp.evaluation.run import EvaluationArgs, EvaluationRun
 from jumper_warp.evaluation.turns import DIRECTIONS, TurnFlags, Turns, axis_metrics, turn_metrics, turns_about_any
+from support.momentum import momentum, rotational_inertia
 
 HARDWARE = {"mean_settling_s": 2.6}
 """The authors' robot, 90 degrees."""

@@ -15,14 +15,14 @@ import tyro
 import warp as wp
 
 from jumper_warp.cli.main import run_command
+from jumper_warp.kernels.kinematics import geometry
+from jumper_warp.kernels.kinematics.inverse import LegLimits, inverse_kinematics_kernel
+from jumper_warp.kernels.kinematics.leg import leg_forward_kinematics
 from jumper_warp.robot.description import RobotDescription, load_description
 from jumper_warp.robot.model import MOTOR_JOINTS, leg_geometry_array
 from jumper_warp.utils.output import output_dir, write_figures
 from jumper_warp.utils.runtime import announce
-from jumper_warp.utils.timing import median_time
-from kernels.kinematics import geometry
-from kernels.kinematics.inverse import LegLimits, inverse_kinematics_kernel
-from kernels.kinematics.leg import leg_forward_kinematics
+from support.timing import median_time
 
 
 @dataclass(frozen=True)

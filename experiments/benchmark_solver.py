@@ -18,14 +18,14 @@ import tyro
 import warp as wp
 
 from jumper_warp.cli.main import run_command
-from jumper_warp.evaluation.speed import time_jump, time_standing, time_threads
 from jumper_warp.robot.model import build_model
 from jumper_warp.sim.simulation import Simulation, SolverName
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.output import output_dir, write_figures
 from jumper_warp.utils.runtime import announce
 from jumper_warp.utils.threads import checked_threads
-from jumper_warp.utils.timing import device_memory, over_baseline, wall_time
+from support.speed import time_jump, time_standing, time_threads
+from support.timing import device_memory, over_baseline, wall_time
 
 
 @dataclass(frozen=True)

@@ -20,13 +20,13 @@ from rich.console import Console
 from rich.table import Table
 
 from jumper_warp.cli.main import run_command
-from jumper_warp.evaluation.speed import standing_solver, stepping_env, time_ppo, time_rsl_rl, time_stages
-from jumper_warp.evaluation.variants import VARIANTS, variant
 from jumper_warp.rl.cfg import PpoCfg
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.output import output_dir, write_figures
 from jumper_warp.utils.runtime import announce
-from jumper_warp.utils.timing import median_time, over_baseline
+from support.speed import standing_solver, stepping_env, time_ppo, time_rsl_rl, time_stages
+from support.timing import median_time, over_baseline
+from support.variants import VARIANTS, variant
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,7 @@ class Args:
     num_steps: int = 32
     """Policy steps of each environment in an iteration."""
     variants: tuple[str, ...] = ()
-    """Variants of PPO that are timed too (`jumper_warp.evaluation.variants`), or all."""
+    """Variants of PPO that are timed too (`support.variants`), or all."""
     only_ppo: bool = False
     """Time PPO and its variants only."""
     baseline: Path | None = None

@@ -3,7 +3,7 @@
     python experiments/departures.py --task vertical-jump --out outputs/departures
     python experiments/departures.py --task horizontal-jump --only bracing goals --seeds 1 2
 
-Trainings are alike but for what is undone (`jumper_warp.tasks.jump.departures`): from nothing (on Mars from the policy
+Trainings are alike but for what is undone (`support.departures`): from nothing (on Mars from the policy
 of Earth), randomised, as many iterations. The task as it is, `kept`, is trained with every seed of `--kept-seeds`,
 which tells how much seeds differ. Each policy then makes 200 nominal and 1000 randomised jumps as `jumper evaluate` has
 them, a fall or a touch after the landing being a failure, and 100 robots of each kind wait in their squats for 3 s.
@@ -30,18 +30,18 @@ from rich.table import Table
 
 from jumper_warp.cli.main import run_command
 from jumper_warp.cli.train import env_maker, parse_train
-from jumper_warp.evaluation.holds import Holds, hold_goals, hold_metrics
 from jumper_warp.evaluation.plots import drawn
 from jumper_warp.evaluation.run import HEIGHTS, EvaluationRun
 from jumper_warp.policies.restore import CHECKPOINTS, Conditions
 from jumper_warp.policies.start import start_from
 from jumper_warp.registry import make_task
 from jumper_warp.rl.runner import CONFIG, train
-from jumper_warp.tasks.jump.departures import DEPARTURES, Undone
 from jumper_warp.tasks.saving import task_to_json
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.output import output_dir, write_figures
 from jumper_warp.utils.runtime import announce
+from support.departures import DEPARTURES, Undone
+from support.holds import Holds, hold_goals, hold_metrics
 
 ELSEWHERE = {"log_root", "device", "threads"}
 """Settings that a training need not share with one that is there already."""

@@ -3,7 +3,7 @@
     python experiments/distance_limit.py --out outputs/limit
 
 Actions as a policy gives them, but fixed in advance and equal left and right, are searched for the farthest flight of
-the centre of mass (`jumper_warp.evaluation.takeoffs`) from standing still: 60 Hz, within -1..1, through the command
+the centre of mass (`support.takeoffs`) from standing still: 60 Hz, within -1..1, through the command
 filter and motors of the task, lateral motors held. Penalties keep out jumps that collide, whose base leaves its start
 by more than 0.3 m while standing or lands beyond 30 degrees of level, as the task's training does, and those whose
 hind paws go forward on the ground, a run-up. The pitch at landing is taken from the angular momentum at takeoff and
@@ -37,7 +37,13 @@ from jumper_warp.cli.main import run_command
 from jumper_warp.envs.env import Env
 from jumper_warp.evaluation.plots import drawn
 from jumper_warp.evaluation.run import EvaluationArgs, EvaluationRun
-from jumper_warp.evaluation.takeoff_search import (
+from jumper_warp.robot.model import KNEE_DOFS
+from jumper_warp.robot.motors import horizontal_jump_filter, jumping_motors, loose_filter, vertical_jump_filter
+from jumper_warp.tasks.cfg import TaskCfg
+from jumper_warp.tasks.jump.horizontal import LANDING_HEIGHT
+from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.output import write_figures
+from support.takeoff_search import (
     FURTHER_SIGMA,
     NOMINAL,
     POLICY_GOALS,
@@ -52,13 +58,7 @@ from jumper_warp.evaluation.takeoff_search import (
     random_squat,
     search,
 )
-from jumper_warp.evaluation.takeoffs import Flight, reach
-from jumper_warp.robot.model import KNEE_DOFS
-from jumper_warp.robot.motors import horizontal_jump_filter, jumping_motors, loose_filter, vertical_jump_filter
-from jumper_warp.tasks.cfg import TaskCfg
-from jumper_warp.tasks.jump.horizontal import LANDING_HEIGHT
-from jumper_warp.utils.errors import InputError
-from jumper_warp.utils.output import write_figures
+from support.takeoffs import Flight, reach
 
 FRICTION = 0.85
 """[1] Of the paws of nominal robots on this task."""

@@ -23,7 +23,6 @@ import tyro
 
 from jumper_warp.cli.main import run_command
 from jumper_warp.envs.env import Env
-from jumper_warp.evaluation.flights import Flights, flight_actor, flight_metrics
 from jumper_warp.evaluation.log import EvaluationLog
 from jumper_warp.evaluation.plots import drawn
 from jumper_warp.evaluation.run import EvaluationArgs, Run, conditions_of
@@ -33,6 +32,7 @@ from jumper_warp.policies.spec import PolicyError
 from jumper_warp.registry import make_task
 from jumper_warp.tasks.switching import flight_skills
 from jumper_warp.utils.errors import InputError
+from support.flights import Flights, flight_actor, flight_metrics
 
 
 @dataclass(frozen=True)

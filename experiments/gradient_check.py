@@ -19,10 +19,10 @@ from rich.console import Console
 from rich.table import Table
 
 from jumper_warp.cli.main import run_command
-from jumper_warp.evaluation.gradients import INNER, OUTER, TICKS, GradientJump, apex, check, schedule
 from jumper_warp.evaluation.plots import drawn
 from jumper_warp.utils.output import output_dir, write_figures
 from jumper_warp.utils.runtime import announce
+from support.gradients import INNER, OUTER, TICKS, GradientJump, apex, check, schedule
 
 WEAK_PUSH = (20.0, 20.0)
 """[deg] The push-off that the ascent starts from."""

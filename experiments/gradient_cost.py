@@ -20,8 +20,8 @@ import tyro
 import warp as wp
 
 from jumper_warp.cli.main import run_command
-from jumper_warp.evaluation.gradients import SQUAT, TICKS, schedule
-from jumper_warp.optim.rollout import Rollout, Trajectory, compact
+from jumper_warp.diff.rollout import Rollout, Trajectory, compact
+from jumper_warp.kernels.layout import COORDS, DOFS
 from jumper_warp.robot.description import load_description
 from jumper_warp.robot.model import PHYSICS_DT, build_model, standing_configuration
 from jumper_warp.robot.motors import filter_params, jumping_motors, vertical_jump_filter
@@ -30,8 +30,8 @@ from jumper_warp.sim.solver import MAX_SWEEPS, TOLERANCE
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.output import output_dir, write_figures
 from jumper_warp.utils.runtime import announce
-from jumper_warp.utils.timing import device_memory, wall_time
-from kernels.layout import COORDS, DOFS
+from support.gradients import SQUAT, TICKS, schedule
+from support.timing import device_memory, wall_time
 
 PUSH = (-5.0, -8.0)
 """[deg] Outer and inner transversal command of the push-off."""

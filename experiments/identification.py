@@ -20,22 +20,22 @@ from rich.table import Table
 
 from jumper_warp.cli.main import run_command
 from jumper_warp.evaluation.heights import reached
-from jumper_warp.evaluation.identification_methods import compare_methods
 from jumper_warp.evaluation.jumps import Jumps
-from jumper_warp.evaluation.known_robots import Case, make_case, run_case
 from jumper_warp.evaluation.log import run_evaluation, termination_names
 from jumper_warp.evaluation.plots import drawn
-from jumper_warp.optim.findings import Identification
-from jumper_warp.optim.parameters import jumper_parameters
-from jumper_warp.optim.plans import KINDS, Plan
-from jumper_warp.optim.recording import replay_plan, simulate_plan
-from jumper_warp.optim.replay import Record, Replay
+from jumper_warp.identification.findings import Identification
+from jumper_warp.identification.parameters import jumper_parameters
+from jumper_warp.identification.plans import KINDS, Plan
+from jumper_warp.identification.recording import replay_plan, simulate_plan
+from jumper_warp.identification.replay import Record, Replay
 from jumper_warp.policies.restore import Conditions, env_of_policy, open_policy
 from jumper_warp.robot.overlay import overlay_of
 from jumper_warp.robot.values import RobotValues
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.output import output_dir, write_figures
 from jumper_warp.utils.runtime import announce
+from support.identification_methods import compare_methods
+from support.known_robots import Case, make_case, run_case
 
 REFINE = 16
 """Steps of the finer truth in a step of the model."""

@@ -7,7 +7,7 @@
 Each training is a process of its own, from nothing, one after the other. Every few seconds, off the clock, its policy
 makes the same jumps to heights of 0.5 to 1.1 m from standing. Two times are told to 95 % of success, and to all jumps:
 of training alone, which begins when all kernels and functions are compiled, and from the start of the process. Variants
-are those of `jumper_warp.evaluation.variants`; what a second process finds in the caches on disk it does not compile
+are those of `support.variants`; what a second process finds in the caches on disk it does not compile
 again.
 """
 
@@ -30,15 +30,15 @@ from rich.table import Table
 
 from jumper_warp.cli.main import run_command
 from jumper_warp.envs.env import Env
-from jumper_warp.evaluation.learning import TESTED, Curve, learning_curve, make_judge, success, warm_up
 from jumper_warp.evaluation.plots import drawn
-from jumper_warp.evaluation.variants import DEFAULT, variant
 from jumper_warp.registry import make_task, trainer_settings
 from jumper_warp.rl.ppo import Ppo
 from jumper_warp.tasks.observations import with_history
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.output import output_dir, write_figures
 from jumper_warp.utils.runtime import announce
+from support.learning import TESTED, Curve, learning_curve, make_judge, success, warm_up
+from support.variants import DEFAULT, variant
 
 TASK = "vertical-jump"
 GOOD = 0.95

@@ -23,7 +23,6 @@ from rich.console import Console
 from rich.table import Table
 
 from jumper_warp.cli.main import run_command
-from jumper_warp.evaluation.open_loop import EXTEND, HOLD, RAMP, STAND, follow_jump, jump_metrics, transversal_command
 from jumper_warp.evaluation.plots import drawn
 from jumper_warp.robot.gravity import EARTH, MARS
 from jumper_warp.robot.motors import MotorCfg, jumping_motors, loose_filter, vertical_jump_filter
@@ -33,6 +32,7 @@ from jumper_warp.sim.simulation import Simulation
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.output import output_dir, write_figures
 from jumper_warp.utils.runtime import announce
+from support.open_loop import EXTEND, HOLD, RAMP, STAND, follow_jump, jump_metrics, transversal_command
 
 FALLING = 60
 """Ticks after the extension in which a jump may still rise."""

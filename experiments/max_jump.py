@@ -27,13 +27,13 @@ from rich.console import Console
 from rich.table import Table
 
 from jumper_warp.cli.main import run_command
-from jumper_warp.evaluation.distances import KINDS, PUBLISHED, RELIABLE, distance_metrics, progress, row_of, verdict
 from jumper_warp.evaluation.landings import Landings
 from jumper_warp.evaluation.log import termination_names
 from jumper_warp.evaluation.places import random_headings, trained_range
 from jumper_warp.evaluation.plots import drawn
 from jumper_warp.evaluation.run import EvaluationArgs, EvaluationRun
 from jumper_warp.utils.errors import InputError
+from support.distances import KINDS, PUBLISHED, RELIABLE, distance_metrics, progress, row_of, verdict
 
 BIN = 0.1
 """[m]"""

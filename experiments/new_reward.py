@@ -2,10 +2,10 @@
 
     python experiments/new_reward.py --iterations 5
 
-A term is a pure Warp function of the robot (`kernels.mdp.view.RobotView`), the state of the task
-(`kernels.jump.state.JumpState`; `Any` for a term that every task can use) and numbers by name, and a line that gives
-it a weight and these numbers. It is compiled into the task's one step kernel and logged by its name; weight and numbers
-can be changed while a training runs: `env.skills[0].set("rewards", "even_load", weight=2.0)`.
+A term is a pure Warp function of the robot (`RobotView`), the state of the task (`JumpState`; `Any` for a term that
+every task can use) and numbers by name, and a line that gives it a weight and these numbers. It is compiled into the
+task's one step kernel and logged by its name; weight and numbers can be changed while a training runs:
+`env.skills[0].set("rewards", "even_load", weight=2.0)`.
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ import tyro
 import warp as wp
 
 from jumper_warp.envs.env import Env
+from jumper_warp.kernels.jump.state import FLIGHT, JumpState
+from jumper_warp.kernels.mdp.view import RobotView
 from jumper_warp.registry import make_task
 from jumper_warp.rl.cfg import PpoCfg, TrainCfg
 from jumper_warp.rl.runner import train
 from jumper_warp.tasks.terms import RewardTerm
 from jumper_warp.utils.output import output_dir, write_figures
-from kernels.jump.state import FLIGHT, JumpState
-from kernels.mdp.view import RobotView
 
 
 @wp.func

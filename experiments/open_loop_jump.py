@@ -21,7 +21,6 @@ from rich.console import Console
 from rich.table import Table
 
 from jumper_warp.cli.main import run_command
-from jumper_warp.evaluation.open_loop import SQUAT, Trace, follow_jump, jump_metrics
 from jumper_warp.evaluation.plots import drawn
 from jumper_warp.robot.gravity import EARTH
 from jumper_warp.robot.model import LEGS, MOTOR_JOINTS, build_model
@@ -32,6 +31,7 @@ from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.output import output_dir, write_figures
 from jumper_warp.utils.runtime import announce
 from jumper_warp.viz.snapshot import Camera, contact_sheet
+from support.open_loop import SQUAT, Trace, follow_jump, jump_metrics
 
 HARDWARE_APEX = 1.075
 """[m] Paper, open loop on the robot at 18 N m."""

@@ -23,12 +23,9 @@ from rich.console import Console
 from rich.table import Table
 
 from jumper_warp.cli.main import run_command
+from jumper_warp.diff.differentiable_env import DifferentiableEnv
 from jumper_warp.envs.env import Env
-from jumper_warp.evaluation.gradient_variance import gradients, spread_of
-from jumper_warp.evaluation.learning import Curve, learning_curve, make_judge
 from jumper_warp.evaluation.plots import drawn
-from jumper_warp.optim.differentiable_env import DifferentiableEnv
-from jumper_warp.optim.gauss_newton import Network
 from jumper_warp.policies.policy import Policy
 from jumper_warp.policies.restore import open_policy
 from jumper_warp.registry import make_task, trainer_settings
@@ -37,9 +34,12 @@ from jumper_warp.rl.networks import ActorCritic
 from jumper_warp.rl.ppo import Ppo
 from jumper_warp.rl.shac import Shac
 from jumper_warp.tasks.observations import with_history
+from jumper_warp.trajectory.gauss_newton import Network
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.output import output_dir, write_figures
 from jumper_warp.utils.runtime import announce
+from support.gradient_variance import gradients, spread_of
+from support.learning import Curve, learning_curve, make_judge
 
 TASK = "vertical-jump"
 RATES = (0.5, 0.9, 0.95)

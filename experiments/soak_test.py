@@ -16,12 +16,12 @@ import tyro
 
 from jumper_warp.cli.main import run_command
 from jumper_warp.envs.env import Env
-from jumper_warp.evaluation.soak import SoakArgs, hardest, soak_env, soak_simulation
 from jumper_warp.registry import make_task
 from jumper_warp.robot.motors import vertical_jump_filter
 from jumper_warp.sim.simulation import Simulation
 from jumper_warp.utils.output import output_dir, write_figures
 from jumper_warp.utils.runtime import announce
+from support.soak import SoakArgs, hardest, soak_env, soak_simulation
 
 
 def main(args: SoakArgs) -> dict:

@@ -16,10 +16,10 @@ import numpy as np
 import tyro
 
 from jumper_warp.cli.main import run_command
-from jumper_warp.evaluation.holds import Holds, hold_goals, hold_metrics
 from jumper_warp.evaluation.plots import drawn
 from jumper_warp.evaluation.run import HEIGHTS, PLACES, EvaluationArgs, EvaluationRun
 from jumper_warp.utils.errors import InputError
+from support.holds import Holds, hold_goals, hold_metrics
 
 
 @dataclass(frozen=True)

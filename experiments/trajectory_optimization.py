@@ -5,9 +5,9 @@
 
 Motor targets, equal left and right, through the command filter and motors of the tasks, from standing still. A search
 begins with random squats in parallel worlds, for the farthest flight with run-ups in place, goes on along smoothed
-gradients (`jumper_warp.optim.smoothing`), at first with fewer physics steps or in single precision, for the farthest
+gradients (`trajectory.smoothing`), at first with fewer physics steps or in single precision, for the farthest
 flight also from crossings of the best, with multipliers and ever smaller displacements, and ends with limited-memory
-BFGS inside an augmented Lagrangian (`jumper_warp.optim.augmented_lagrangian`). What is told is not the optimiser's own
+BFGS inside an augmented Lagrangian (`trajectory.augmented_lagrangian`). What is told is not the optimiser's own
 figure: the targets are replayed in the simulation that trains policies, at every physics step, and collisions of all
 links are looked for; the farthest flight is scored as in `experiments/distance_limit.py`, whose constraints it has. Of
 each jump a JSON file is written that can take the place of one in `assets/motions`, for episodes that begin along it.
@@ -36,17 +36,17 @@ from rich.console import Console
 from rich.table import Table
 
 from jumper_warp.cli.main import run_command
-from jumper_warp.evaluation import takeoff_search
-from jumper_warp.evaluation.evolved_jumps import Clock, evolve, search_as_published
-from jumper_warp.evaluation.motion_replay import Replay
-from jumper_warp.evaluation.optimized_jumps import JUMPS, Jump, optimise
 from jumper_warp.evaluation.plots import drawn
 from jumper_warp.evaluation.run import EvaluationArgs, EvaluationRun
-from jumper_warp.optim.trajectory import Problem
 from jumper_warp.sim.simulation import SUBSTEPS
+from jumper_warp.trajectory.problem import Problem
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.output import output_dir, write_figures
 from jumper_warp.utils.runtime import announce
+from support import takeoff_search
+from support.evolved_jumps import Clock, evolve, search_as_published
+from support.motion_replay import Replay
+from support.optimized_jumps import JUMPS, Jump, optimise
 
 
 @dataclass(frozen=True)

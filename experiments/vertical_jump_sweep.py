@@ -26,12 +26,12 @@ from jumper_warp.cli.main import run_command
 from jumper_warp.envs.env import Env
 from jumper_warp.evaluation.heights import SUCCESS_TOLERANCE, reached, sweep_metrics
 from jumper_warp.evaluation.jumps import REST_TIME, Jumps
-from jumper_warp.evaluation.limits import limit_metrics, open_loop_limits
 from jumper_warp.evaluation.log import termination_names, with_ends
 from jumper_warp.evaluation.plots import draw_sweep, drawn
 from jumper_warp.evaluation.run import HEIGHTS, EvaluationArgs, EvaluationRun
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.utils.errors import InputError
+from support.limits import limit_metrics, open_loop_limits
 
 IN_RANGE = (0.5, 1.1)
 """[m] Heights that the paper reaches always."""

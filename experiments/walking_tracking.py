@@ -20,7 +20,6 @@ import tyro
 
 from jumper_warp.cli.main import run_command
 from jumper_warp.envs.env import Env
-from jumper_warp.evaluation.gaits import Gait
 from jumper_warp.evaluation.plots import drawn
 from jumper_warp.evaluation.run import EvaluationArgs, EvaluationRun
 from jumper_warp.evaluation.velocities import (
@@ -36,6 +35,7 @@ from jumper_warp.evaluation.velocities import (
     tracking_metrics,
 )
 from jumper_warp.utils.errors import InputError
+from support.gaits import Gait
 
 REACH, STEP, KICK, GAIT_SPEED = 0.8, 0.8, 0.5, 0.8
 RAMP, KEEP, SHARE = 3.0, 5.0, 0.1

@@ -2,12 +2,12 @@
 
 Every function of the robot's physics is written in terms of `real`. The package is single precision;
 `jumper_warp.sim.precision.float64_kernels()` loads the same files a second time under the name
-`kernels_float64`, where `real` is double precision: the reference for rounding and for gradients.
+`jumper_warp.kernels_float64`, where `real` is double precision: the reference for rounding and for gradients.
 """
 
 import warp as wp
 
-real = wp.float64 if __package__ == "kernels_float64" else wp.float32
+real = wp.float64 if __package__ == "jumper_warp.kernels_float64" else wp.float32
 
 vec2 = wp.types.vector(length=2, dtype=real)
 vec3 = wp.types.vector(length=3, dtype=real)

@@ -7,8 +7,8 @@ import torch
 import warp as wp
 
 from jumper_warp.envs.env import Env
-from jumper_warp.evaluation.soak import hardest
 from jumper_warp.registry import make_task
+from support.soak import hardest
 
 wp.config.log_level = wp.LOG_WARNING
 SHARED = ("vertical-jump", "horizontal-jump", "velocity-flat", "velocity-rough", "attitude")

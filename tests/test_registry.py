@@ -174,7 +174,11 @@ def test_what_is_not_there_is_refused(tmp_path, monkeypatch, name, message):
 )
 def test_mistake_in_a_file_is_told_with_its_line_and_leaves_nothing(tmp_path, code, message):
     path = tmp_path / "my_tasks.py"
-    text = "from kernels.jump import rewards\nfrom jumper_warp.tasks.terms import RewardTerm\n" + TASK_FILE + REGISTER
+    text = (
+        "from jumper_warp.kernels.jump import rewards\nfrom jumper_warp.tasks.terms import RewardTerm\n"
+        + TASK_FILE
+        + REGISTER
+    )
     path.write_text(text + code + "\n")
     with pytest.raises(InputError, match=rf"my_tasks.py:{text.count(chr(10)) + 1}: .*{message}"):
         load_task_module(str(path))

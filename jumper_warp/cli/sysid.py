@@ -15,10 +15,10 @@ from jumper_warp.cli.main import TASK_MODULE_HELP, UsageError, parse
 from jumper_warp.utils.errors import InputError
 
 if TYPE_CHECKING:
-    from jumper_warp.optim.findings import Identification
-    from jumper_warp.optim.motions import Motion
-    from jumper_warp.optim.parameters import ParameterSet
-    from jumper_warp.optim.residuals import NoiseLevels
+    from jumper_warp.identification.findings import Identification
+    from jumper_warp.identification.motions import Motion
+    from jumper_warp.identification.parameters import ParameterSet
+    from jumper_warp.identification.residuals import NoiseLevels
 
 HELP = f"""\
 usage: jumper sysid DATA ... [flags]
@@ -159,7 +159,7 @@ def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> None:
 
 def parameters_of(groups: str, without: str = "") -> ParameterSet:
     """Return the parameters of groups, without some. Raises InputError for a name that is none."""
-    from jumper_warp.optim.parameters import GROUPS, jumper_parameters
+    from jumper_warp.identification.parameters import GROUPS, jumper_parameters
 
     found = jumper_parameters([name for name in groups.split(",") if name])
     left_out = [name for name in without.split(",") if name]
@@ -172,7 +172,7 @@ def parameters_of(groups: str, without: str = "") -> ParameterSet:
 
 def noise_of(noise: Noise) -> NoiseLevels:
     """Return noise levels. Raises InputError: one is not positive."""
-    from jumper_warp.optim.residuals import NoiseLevels
+    from jumper_warp.identification.residuals import NoiseLevels
 
     return NoiseLevels(**vars(noise))
 
@@ -195,9 +195,9 @@ def sysid(cfg: SysidCfg) -> Identification:
     from rich.console import Console
     from rich.table import Table
 
-    from jumper_warp.optim.identification import identify, weighed
-    from jumper_warp.optim.motions import load_motion
-    from jumper_warp.optim.report import to_json, write_report
+    from jumper_warp.identification.identify import identify, weighed
+    from jumper_warp.identification.motions import load_motion
+    from jumper_warp.identification.report import to_json, write_report
     from jumper_warp.utils.files import write_whole
     from jumper_warp.utils.output import output_dir
     from jumper_warp.utils.runtime import announce
@@ -209,7 +209,7 @@ def sysid(cfg: SysidCfg) -> Identification:
     announce(cfg.device, cfg.threads)
     settings = dict(noise=noise, knowledge=knowledge, dt=cfg.dt, device=cfg.device, threads=cfg.threads)
     if cfg.method == "cma":
-        from jumper_warp.optim.evolution import identify_by_evolution
+        from jumper_warp.identification.evolution import identify_by_evolution
 
         found = identify_by_evolution(motions, parameters, max_seconds=cfg.max_seconds, **settings)
     else:
@@ -242,11 +242,11 @@ def excite(cfg: ExciteCfg) -> list[Motion]:
     """Plan, record and write motions; raises as `run`."""
     import numpy as np
 
-    from jumper_warp.optim.excitation import Scorer, choose
-    from jumper_warp.optim.identification import total_mass
-    from jumper_warp.optim.plans import KINDS
-    from jumper_warp.optim.recording import measured, simulate_plan
-    from jumper_warp.optim.replay import Replay
+    from jumper_warp.identification.excitation import Scorer, choose
+    from jumper_warp.identification.identify import total_mass
+    from jumper_warp.identification.plans import KINDS
+    from jumper_warp.identification.recording import measured, simulate_plan
+    from jumper_warp.identification.replay import Replay
     from jumper_warp.robot.overlay import load_overlay
     from jumper_warp.robot.values import RobotValues
     from jumper_warp.utils.files import write_whole
@@ -281,7 +281,7 @@ def excite(cfg: ExciteCfg) -> list[Motion]:
 
 def characterise(cfg: ActuatorCfg) -> None:
     """Fit one motor and write the result; raises as `run`."""
-    from jumper_warp.optim.actuators import characterise_motor, load_bench
+    from jumper_warp.identification.actuators import characterise_motor, load_bench
     from jumper_warp.utils.files import write_whole
     from jumper_warp.utils.output import output_dir
 

@@ -25,8 +25,8 @@ if TYPE_CHECKING:
 
     import torch
 
+    from jumper_warp.diff.differentiable_env import DifferentiableEnv
     from jumper_warp.envs.env import Env
-    from jumper_warp.optim.differentiable_env import DifferentiableEnv
     from jumper_warp.rl.runner import MakeEnv, TrainResult
     from jumper_warp.robot.overlay import RobotOverlay
     from jumper_warp.tasks.cfg import TaskCfg
@@ -146,7 +146,7 @@ def env_maker(task: TaskCfg, args: TrainArgs) -> MakeEnv:
         )
         if args.cfg.trainer != "shac":
             return env
-        from jumper_warp.optim.differentiable_env import DifferentiableEnv
+        from jumper_warp.diff.differentiable_env import DifferentiableEnv
 
         return DifferentiableEnv(env)
 

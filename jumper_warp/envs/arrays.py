@@ -9,13 +9,13 @@ import numpy as np
 import torch
 import warp as wp
 
+from jumper_warp.kernels.mdp.env import RING, Delays, EnvArrays, Scene
+from jumper_warp.kernels.mdp.view import RobotArrays
 from jumper_warp.robot.description import load_description
 from jumper_warp.sim.simulation import Simulation
 from jumper_warp.tasks.cfg import Handover, TaskCfg
 from jumper_warp.tasks.commands import check_commands
 from jumper_warp.utils.errors import InputError
-from kernels.mdp.env import RING, Delays, EnvArrays, Scene
-from kernels.mdp.view import RobotArrays
 
 FIRST_CLOCK = 2 * RING
 """Of every world, so that rings can look back from the first step on."""

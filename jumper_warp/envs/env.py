@@ -21,6 +21,7 @@ from jumper_warp.envs.arrays import (
 )
 from jumper_warp.envs.stages import Stages
 from jumper_warp.envs.state import load_state, save_state
+from jumper_warp.kernels.mdp.reset import stand_kernel
 from jumper_warp.robot.grounds import BlockCfg
 from jumper_warp.robot.model import PHYSICS_DT
 from jumper_warp.robot.overlay import RobotOverlay
@@ -33,7 +34,6 @@ from jumper_warp.tasks.saving import handover_to_json, task_to_json
 from jumper_warp.utils.checks import check_count, check_seed
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.kernels import load_kernels
-from kernels.mdp.reset import stand_kernel
 
 CONTACT_TOLERANCE = 1.0e-4
 """[m/s] Of the contact iteration: a fifth fewer sweeps than the solver's default."""

@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from jumper_warp.kernels.layout import BODIES, DOFS
+from jumper_warp.kernels.mdp.parameters import RobotParameters
 from jumper_warp.sim.dynamics import find_paws
 from jumper_warp.sim.simulation import Simulation
 from jumper_warp.tasks.cfg import TaskCfg
-from kernels.layout import BODIES, DOFS
-from kernels.mdp.parameters import RobotParameters
 
 MODEL = (
     "body_mass", "body_inv_mass", "body_com", "body_inertia", "body_inv_inertia", "joint_armature", "joint_friction",

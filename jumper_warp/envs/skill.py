@@ -10,15 +10,15 @@ import numpy as np
 import torch
 import warp as wp
 
+from jumper_warp.kernels.mdp.env import RING, Counters, Nothing, SkillSettings
+from jumper_warp.kernels.mdp.events import make_event_kernel
+from jumper_warp.kernels.mdp.observe import CHUNK, ObservationArrays, make_observe_kernel
+from jumper_warp.kernels.mdp.reset import make_give_kernel, make_reset_kernel
+from jumper_warp.kernels.mdp.step import make_step_kernel
+from jumper_warp.kernels.mdp.view import vec12
 from jumper_warp.robot.motors import filter_params
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.utils.errors import InputError
-from kernels.mdp.env import RING, Counters, Nothing, SkillSettings
-from kernels.mdp.events import make_event_kernel
-from kernels.mdp.observe import CHUNK, ObservationArrays, make_observe_kernel
-from kernels.mdp.reset import make_give_kernel, make_reset_kernel
-from kernels.mdp.step import make_step_kernel
-from kernels.mdp.view import vec12
 
 _KERNELS: dict[tuple, wp.Kernel] = {}
 

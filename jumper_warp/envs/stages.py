@@ -11,18 +11,18 @@ import warp as wp
 from jumper_warp.envs.arrays import FIRST_CLOCK, checked_skill, delay_arrays, env_arrays, robot_arrays, scene_of
 from jumper_warp.envs.parameters import robot_parameters
 from jumper_warp.envs.skill import Skill
+from jumper_warp.kernels.mdp import attempts, events
+from jumper_warp.kernels.mdp.actions import action_kernel
+from jumper_warp.kernels.mdp.env import EnvArrays, SkillSettings
+from jumper_warp.kernels.mdp.events import AT_RESET, AT_STEP, STARTUP
+from jumper_warp.kernels.mdp.handover import home_kernel, make_handover_kernel
+from jumper_warp.kernels.mdp.observe import LANES, condition_kernel
+from jumper_warp.kernels.mdp.parameters import motors_kernel
+from jumper_warp.kernels.mdp.reset import forget_kernel, tick_kernel
+from jumper_warp.kernels.mdp.track import track_kernel
 from jumper_warp.sim.simulation import Simulation
 from jumper_warp.sim.slices import Worlds
 from jumper_warp.tasks.cfg import Handover, TaskCfg
-from kernels.mdp import attempts, events
-from kernels.mdp.actions import action_kernel
-from kernels.mdp.env import EnvArrays, SkillSettings
-from kernels.mdp.events import AT_RESET, AT_STEP, STARTUP
-from kernels.mdp.handover import home_kernel, make_handover_kernel
-from kernels.mdp.observe import LANES, condition_kernel
-from kernels.mdp.parameters import motors_kernel
-from kernels.mdp.reset import forget_kernel, tick_kernel
-from kernels.mdp.track import track_kernel
 
 BLOCK = 32
 """Threads of a block: small ones spread a few thousand heavy threads over all multiprocessors."""

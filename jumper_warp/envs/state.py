@@ -11,11 +11,11 @@ import torch
 import warp as wp
 
 from jumper_warp.envs.arrays import FIRST_CLOCK
+from jumper_warp.kernels.mdp.env import RING, Delays, EnvArrays
+from jumper_warp.kernels.mdp.parameters import RobotParameters
+from jumper_warp.kernels.mdp.view import RobotArrays
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.state_checks import check_tensor, check_values
-from kernels.mdp.env import RING, Delays, EnvArrays
-from kernels.mdp.parameters import RobotParameters
-from kernels.mdp.view import RobotArrays
 
 if TYPE_CHECKING:
     from jumper_warp.envs.stages import Stages

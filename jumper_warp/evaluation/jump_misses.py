@@ -13,10 +13,10 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
+from jumper_warp.diff.closed_loop import ClosedLoop, LoopState
 from jumper_warp.envs.env import Env
 from jumper_warp.evaluation.jumps import LANDED, REST_TIME
-from jumper_warp.optim.closed_loop import ClosedLoop, LoopState
-from jumper_warp.optim.gauss_newton import Network, Tape, world_rows
+from jumper_warp.trajectory.gauss_newton import Network, Tape, world_rows
 
 LANDING_HEIGHT = 0.30
 """[m] Of the base, where its projectile comes down."""

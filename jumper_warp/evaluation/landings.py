@@ -26,10 +26,10 @@ from jumper_warp.evaluation.log import (
     with_ends,
 )
 from jumper_warp.evaluation.paws import TAKEOFF_SPEED, Paws, hopped, paw_arrays, stepped
+from jumper_warp.kernels.jump import terminations
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.tasks.terms import TerminationTerm
 from jumper_warp.utils.errors import InputError
-from kernels.jump import terminations
 
 SUCCESS_TOLERANCE = 0.1
 """[m] A landed jump that ends this close to its goal succeeds."""

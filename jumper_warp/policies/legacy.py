@@ -9,13 +9,13 @@ from typing import Any, get_type_hints
 
 import warp as wp
 
+from jumper_warp.kernels.jump import rewards, terminations
+from jumper_warp.kernels.mdp import rewards as mdp_rewards
+from jumper_warp.kernels.mdp import terminations as mdp_terminations
 from jumper_warp.tasks.jump.horizontal import horizontal_jump, omnidirectional_jump
 from jumper_warp.tasks.jump.vertical import vertical_jump
 from jumper_warp.tasks.saving import MAX_ENTRIES, VERSION, TaskError, name_of, plain, shown
 from jumper_warp.tasks.terms import RewardTerm, TerminationTerm
-from kernels.jump import rewards, terminations
-from kernels.mdp import rewards as mdp_rewards
-from kernels.mdp import terminations as mdp_terminations
 
 PLACE = {"observe": "observe_horizontal", "columns": ["goal_x", "goal_y", "height"], "error": "landing_error"}
 HEIGHT = {"observe": "observe_vertical", "columns": ["wanted_height", "jump_command", "height"],

@@ -20,7 +20,7 @@ INERTIA_TOLERANCE = 1.0e-9
 
 @dataclass(frozen=True)
 class LegDimensions:
-    """Constants of one leg; the fields are those of `kernels.kinematics.geometry.LegGeometry`, which explains them."""
+    """Constants of one leg; `jumper_warp.kernels.kinematics.geometry.LegGeometry` explains the fields."""
 
     hip: tuple[float, float, float]
     front: float

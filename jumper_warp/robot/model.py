@@ -139,7 +139,7 @@ def leg_geometry_array(
 ) -> wp.array:
     """Return the four legs as a `wp.array` of the module's LegGeometry.
 
-    `geometry_module` is `kernels.kinematics.geometry` or its double-precision twin.
+    `geometry_module` is `jumper_warp.kernels.kinematics.geometry` or its double-precision twin.
     """
     legs = []
     for fields in leg_geometry(description):

@@ -10,12 +10,12 @@ from typing import Any, Literal
 import numpy as np
 import warp as wp
 
+from jumper_warp.kernels.actuation import command_filter
+from jumper_warp.kernels.actuation import motors as actuator
 from jumper_warp.robot.description import RobotDescription, load_description
 from jumper_warp.robot.parts import Motor
 from jumper_warp.utils.checks import check_count, check_not_negative
 from jumper_warp.utils.errors import InputError
-from kernels.actuation import command_filter
-from kernels.actuation import motors as actuator
 
 OVERSPEED_START = math.radians(2000.0)
 OVERSPEED_END = math.radians(2500.0)

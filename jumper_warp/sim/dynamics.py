@@ -20,12 +20,13 @@ from jumper_warp.utils.errors import InputError
 LINKS = ("housing", "outer_thigh", "outer_shank", "inner_thigh", "inner_shank")
 JOINTS = ("lateral", "outer", "outer_knee", "inner", "inner_knee")
 KERNEL_MODULES = (
-    "actuation.command_filter", "actuation.motors", "dynamics.advance", "dynamics.advance_legs",
-    "dynamics.constants_adjoint", "dynamics.contact", "dynamics.contact_adjoint", "dynamics.differentiable",
-    "dynamics.drive", "dynamics.gradients", "dynamics.leg_record", "dynamics.momentum", "dynamics.parameters",
-    "dynamics.rollout", "dynamics.rollout_adjoint", "dynamics.rollout_legs", "dynamics.rollout_legs_adjoint",
-    "dynamics.step", "dynamics.step_adjoint", "kinematics.full_state", "kinematics.geometry", "layout", "scalar",
-    "state", "terrain.ground",
+    "actuation.command_filter", "actuation.motors", "dynamics.adjoint.constants_adjoint",
+    "dynamics.adjoint.contact_adjoint", "dynamics.adjoint.differentiable", "dynamics.adjoint.gradients",
+    "dynamics.adjoint.leg_record", "dynamics.adjoint.rollout_adjoint", "dynamics.adjoint.rollout_legs_adjoint",
+    "dynamics.adjoint.step_adjoint", "dynamics.contact", "dynamics.drive", "dynamics.legs.advance_legs",
+    "dynamics.legs.rollout_legs", "dynamics.momentum", "dynamics.parameters", "dynamics.step",
+    "dynamics.world.advance", "dynamics.world.rollout", "kinematics.full_state", "kinematics.geometry",
+    "layout", "scalar", "state", "terrain.ground",
 )  # fmt: skip
 
 
@@ -38,7 +39,7 @@ class NotThisRobotError(InputError):
 
 def kernel_modules(double: bool = False) -> SimpleNamespace:
     """Return the kernel modules by the last part of their name, in single or double precision."""
-    package = float64_kernels().__name__ if double else "kernels"
+    package = float64_kernels().__name__ if double else "jumper_warp.kernels"
     return SimpleNamespace(
         **{name.split(".")[-1]: importlib.import_module(f"{package}.{name}") for name in KERNEL_MODULES}
     )

@@ -8,10 +8,10 @@ import newton
 import numpy as np
 import warp as wp
 
+from jumper_warp.kernels.layout import BODIES, DOFS
 from jumper_warp.robot.model import KNEE_DOFS
 from jumper_warp.robot.values import LINK_KINDS, RobotValues
 from jumper_warp.sim.dynamics import JumperDynamics, find_paws
-from kernels.layout import BODIES, DOFS
 
 MOTOR_DOFS = [6 + 5 * leg + joint for leg in range(4) for joint in (0, 1, 3)]
 """A world's motors in `joint_qd`."""

@@ -9,6 +9,11 @@ import warp as wp
 from newton import ModelFlags
 from newton.sensors import SensorContact
 
+from jumper_warp.kernels.actuation.motors import motor_torque_kernel
+from jumper_warp.kernels.actuation.passive import passive_torque_kernel
+from jumper_warp.kernels.actuation.readout import arrived_target_kernel, motor_values_kernel, paw_force_kernel
+from jumper_warp.kernels.dynamics.restore import mask_kernel, zero_worlds_kernel
+from jumper_warp.kernels.layout import COORDS, DOFS
 from jumper_warp.robot.description import load_description
 from jumper_warp.robot.grounds import BlockCfg
 from jumper_warp.robot.model import KNEE_DOFS
@@ -16,11 +21,6 @@ from jumper_warp.sim.dynamics import JumperDynamics
 from jumper_warp.sim.mujoco import mujoco_solver
 from jumper_warp.sim.slices import Worlds
 from jumper_warp.sim.solver import SolverJumper
-from kernels.actuation.motors import motor_torque_kernel
-from kernels.actuation.passive import passive_torque_kernel
-from kernels.actuation.readout import arrived_target_kernel, motor_values_kernel, paw_force_kernel
-from kernels.dynamics.restore import mask_kernel, zero_worlds_kernel
-from kernels.layout import COORDS, DOFS
 
 EXPLICIT_STOP = (1000.0, 2.0)
 """[N m/rad], [N m s/rad] Stops of the transversal sum on MuJoCo, explicit and therefore softer than SolverJumper's."""

@@ -4,15 +4,15 @@ import importlib.util
 import sys
 from types import ModuleType
 
-import kernels
+from jumper_warp import kernels
 
 
 def float64_kernels() -> ModuleType:
-    """Return the package `kernels_float64`: the files of `kernels`, loaded again with a float64 `real`.
+    """Return `jumper_warp.kernels_float64`: the files of `jumper_warp.kernels`, loaded again with a float64 `real`.
 
-    Import its modules as usual afterwards: `importlib.import_module("kernels_float64.kinematics.five_bar")`.
+    Import its modules as usual afterwards, with `importlib.import_module("jumper_warp.kernels_float64.layout")`.
     """
-    name = "kernels_float64"
+    name = "jumper_warp.kernels_float64"
     if name not in sys.modules:
         spec = importlib.util.spec_from_file_location(
             name, kernels.__file__, submodule_search_locations=list(kernels.__path__)

@@ -9,6 +9,10 @@ import newton
 import numpy as np
 import warp as wp
 
+from jumper_warp.kernels.actuation.command_filter import command_filter_kernel
+from jumper_warp.kernels.actuation.readout import base_velocity_kernel
+from jumper_warp.kernels.dynamics.restore import StateArrays, restore_motors_kernel, restore_state_kernel
+from jumper_warp.kernels.layout import COORDS, DOFS
 from jumper_warp.robot.gravity import EARTH
 from jumper_warp.robot.grounds import BlockCfg
 from jumper_warp.robot.model import PHYSICS_DT, Extras, build_model
@@ -21,10 +25,6 @@ from jumper_warp.sim.slices import SlicedGraph, Worlds, slices_of
 from jumper_warp.sim.solver import TOLERANCE, check_step, check_tolerance
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.threads import checked_threads
-from kernels.actuation.command_filter import command_filter_kernel
-from kernels.actuation.readout import base_velocity_kernel
-from kernels.dynamics.restore import StateArrays, restore_motors_kernel, restore_state_kernel
-from kernels.layout import COORDS, DOFS
 
 if TYPE_CHECKING:
     import torch

@@ -14,14 +14,14 @@ import warp as wp
 from newton import ModelFlags, StateFlags
 from newton.solvers import SolverBase
 
+from jumper_warp.kernels.terrain.ground import Ground, rest_block
 from jumper_warp.robot.description import RobotDescription
 from jumper_warp.robot.grounds import BlockCfg
 from jumper_warp.robot.model import other_colliders
-from jumper_warp.sim.differentiable import DifferentiableStep
 from jumper_warp.sim.dynamics import JumperDynamics
 from jumper_warp.sim.slices import Worlds
+from jumper_warp.sim.tape import DifferentiableStep
 from jumper_warp.utils.errors import InputError
-from kernels.terrain.ground import Ground, rest_block
 
 MAX_SWEEPS = 50
 """Most sweeps of the contact iteration in a step."""
@@ -239,7 +239,7 @@ class SolverJumper(SolverBase):
         Args:
             state_in: State before; may be `state_out`.
             state_out: State after.
-            motors: `kernels.actuation.motors.MotorArrays` (see `jumper_warp.robot.motors.motor_arrays`).
+            motors: `jumper_warp.kernels.actuation.motors.MotorArrays` (see `jumper_warp.robot.motors.motor_arrays`).
             target: Motor angles [rad], shape (12, num_worlds), held.
             dt: Physics step [s].
             substeps: Number of physics steps.
@@ -281,7 +281,7 @@ class SolverJumper(SolverBase):
         out = (state_out.joint_q, state_out.joint_qd)
         if state_out.joint_q.requires_grad:
             if drive.closed_loop or substeps != 1:
-                raise InputError("step_motors is not differentiable; see jumper_warp.optim.rollout")
+                raise InputError("step_motors is not differentiable; see jumper_warp.diff.rollout")
             self._differentiable.step(*coordinates, drive.joint_f, drive.body_f, *out, dt)
         else:
             settings = self.dynamics.settings(dt, substeps, self.max_sweeps, self.tolerance)

@@ -9,6 +9,9 @@ from typing import Any
 
 import warp as wp
 
+from jumper_warp.kernels.mdp.env import Nothing
+from jumper_warp.kernels.mdp.starts import APART
+from jumper_warp.kernels.mdp.terminations import came_apart
 from jumper_warp.robot.gravity import EARTH, check_gravity
 from jumper_warp.robot.motors import FilterCfg, MotorCfg
 from jumper_warp.tasks.randomization import RandomizationCfg
@@ -24,9 +27,6 @@ from jumper_warp.tasks.terms import (
     TerminationTerm,
 )
 from jumper_warp.utils.errors import InputError
-from kernels.mdp.env import Nothing
-from kernels.mdp.starts import APART
-from kernels.mdp.terminations import came_apart
 
 Pair = tuple[float, float]
 

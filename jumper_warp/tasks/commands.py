@@ -8,11 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
+from jumper_warp.kernels.attitude.commands import give_turn
+from jumper_warp.kernels.jump.reset import give_jump
+from jumper_warp.kernels.velocity.commands import give_velocity
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.utils.errors import InputError
-from kernels.attitude.commands import give_turn
-from kernels.jump.reset import give_jump
-from kernels.velocity.commands import give_velocity
 
 
 @dataclass(frozen=True)

@@ -11,12 +11,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from jumper_warp.kernels.attitude import observations as attitude
+from jumper_warp.kernels.jump import observations as jump
+from jumper_warp.kernels.mdp import observations as obs
+from jumper_warp.kernels.velocity import observations as velocity
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.utils.errors import InputError
-from kernels.attitude import observations as attitude
-from kernels.jump import observations as jump
-from kernels.mdp import observations as obs
-from kernels.velocity import observations as velocity
 
 
 class Mirror(NamedTuple):

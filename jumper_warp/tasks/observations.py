@@ -2,10 +2,10 @@
 
 from dataclasses import replace
 
+from jumper_warp.kernels.mdp import observations as obs
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.tasks.terms import ObservationTerm
 from jumper_warp.tasks.units import DEG
-from kernels.mdp import observations as obs
 
 POSITION_NOISE = 0.005
 """[m] Of the base's height and of the way to a goal."""

@@ -7,11 +7,11 @@ from dataclasses import dataclass, replace
 from functools import cache
 from typing import Any, Literal
 
+from jumper_warp.kernels.mdp import parameters
 from jumper_warp.robot.description import load_description
 from jumper_warp.tasks.terms import EventTerm
 from jumper_warp.utils.checks import check_finite
 from jumper_warp.utils.errors import InputError
-from kernels.mdp import parameters
 
 Range = tuple[float, float] | None
 NOMINAL_FRICTION = 0.9

@@ -20,14 +20,14 @@ from typing import Any, Union, get_args, get_origin, get_type_hints
 import warp as wp
 
 import jumper_warp.tasks
+from jumper_warp.kernels.mdp.env import Nothing
 from jumper_warp.tasks.cfg import Handover, TaskCfg
 from jumper_warp.tasks.terms import RewardTerm, Term
 from jumper_warp.utils.errors import InputError
-from kernels.mdp.env import Nothing
 
 VERSION = 2
 """Of the form in which tasks are saved."""
-OWN = ("jumper_warp.tasks.", "jumper_warp.robot.", "kernels.")
+OWN = ("jumper_warp.tasks.", "jumper_warp.robot.", "jumper_warp.kernels.")
 """Beginnings of the names of the project's modules that a task may name."""
 OPTIONAL = ("rewards", "critic", "events")
 """Sections that a policy needs for training only."""

@@ -13,16 +13,16 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+from jumper_warp.kernels.attitude.state import AttitudeState
+from jumper_warp.kernels.jump.state import JumpState
+from jumper_warp.kernels.mdp import terminations
+from jumper_warp.kernels.skills import handovers
+from jumper_warp.kernels.velocity.state import VelocityState
 from jumper_warp.tasks.cfg import Handover, TaskCfg
 from jumper_warp.tasks.randomization import RandomizationCfg
 from jumper_warp.tasks.terms import TerminationTerm
 from jumper_warp.tasks.units import DEG
 from jumper_warp.utils.errors import InputError
-from kernels.attitude.state import AttitudeState
-from kernels.jump.state import JumpState
-from kernels.mdp import terminations
-from kernels.skills import handovers
-from kernels.velocity.state import VelocityState
 
 FALLS = (
     TerminationTerm(terminations.came_apart),

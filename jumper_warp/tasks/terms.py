@@ -12,11 +12,11 @@ from typing import Any, ClassVar, NamedTuple, get_type_hints
 
 import warp as wp
 
+from jumper_warp.kernels.mdp.events import AT_RESET, AT_STEP, MODES
+from jumper_warp.kernels.mdp.parameters import RobotParameters
+from jumper_warp.kernels.mdp.view import RobotArrays, RobotView
 from jumper_warp.utils.checks import FLOAT32_MAX
 from jumper_warp.utils.errors import InputError
-from kernels.mdp.events import AT_RESET, AT_STEP, MODES
-from kernels.mdp.parameters import RobotParameters
-from kernels.mdp.view import RobotArrays, RobotView
 
 REQUIRED = inspect.Parameter.empty
 AXES = {2: ("x", "y"), 3: ("x", "y", "z")}
@@ -198,7 +198,7 @@ class EventTerm(Term):
             raise InputError(f"EventTerm {self.name}: an interval needs 0 < least <= most [s], got {least}, {most}")
 
     def due_at(self, stage: int) -> bool:
-        """Return whether it may be due at a stage of `kernels.mdp.events`."""
+        """Return whether it may be due at a stage of `jumper_warp.kernels.mdp.events`."""
         mode = MODES[self.options["mode"]]
         return stage == mode or (mode == AT_STEP and stage == AT_RESET)
 

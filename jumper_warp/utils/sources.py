@@ -8,8 +8,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-OWN = ("jumper_warp.", "kernels.")
-"""Beginnings of the names of the project's modules, which the commit tells of."""
+OWN = "jumper_warp."
+"""Beginning of the names of the project's modules; the commit identifies their content."""
 
 
 def source_sums(saved: Any) -> dict[str, str]:

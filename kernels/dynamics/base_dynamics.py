@@ -2,6 +2,7 @@
 
 import warp as wp
 
+from ..lanes import sum_matrix, sum_symmetric, sum_vec
 from ..scalar import mat33, vec3
 from .inertia import MassMoments, inertia_matrix, inertia_mul, inverse_symmetric, skew
 from .leg_dynamics import LegDynamics
@@ -107,3 +108,15 @@ def solve_ang(inverse: BaseInverse, force: vec3, moment: vec3) -> vec3:
 def motor_acceleration(solve: LegSolve, lin: vec3, ang: vec3) -> vec3:
     """Return the motor accelerations [rad/s^2] of a leg for base accelerations in body axes."""
     return solve.free - solve.to_lin * lin - solve.to_ang * ang
+
+
+@wp.func
+def sum_systems(base: BaseSystem, leg: BaseSystem) -> BaseSystem:
+    """Return the base's own system with those of all legs added."""
+    s = BaseSystem()
+    s.lin = base.lin + sum_symmetric(leg.lin)
+    s.cross = base.cross + sum_matrix(leg.cross)
+    s.ang = base.ang + sum_symmetric(leg.ang)
+    s.force = base.force + sum_vec(leg.force)
+    s.moment = base.moment + sum_vec(leg.moment)
+    return s

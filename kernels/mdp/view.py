@@ -35,7 +35,7 @@ class RobotView:
     clipped: float  # [rad^2] squared distance that the command filter moved the targets
     default_angle: vec12  # [rad]
     contacts: int  # number of paws on the ground
-    collisions: int  # bits of `kernels.collision.robot`
+    collisions: int  # bits of `jumper_warp.kernels.collision.robot`
     contact: wp.vec4  # [1] 1: the paw is on the ground
     first_contact: wp.vec4  # [1] 1: it came down in this step
     air_time: wp.vec4  # [s] since the paw left the ground; at its first contact how long it was off it, later 0

@@ -9,10 +9,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hold_height import hold_height
-from landing_helpers import still_policy
 from rerun.chunk import RrdReader
 
+from hold_height import hold_height
 from jumper_warp.cli import main as cli
 from jumper_warp.cli.task_flags import flag_name, flags_of, with_flags
 from jumper_warp.cli.train import TrainArgs, parse_settings, parse_train
@@ -28,6 +27,7 @@ from jumper_warp.rl.cfg import PpoCfg
 from jumper_warp.rl.checkpoint import CheckpointError
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.utils.errors import InputError
+from landing_helpers import still_policy
 
 TRAIN = ["train", "vertical-jump", "--num-envs", "16", "--iterations", "2", "--no-tensorboard", "--device", "cpu"]
 TRAIN += [

@@ -5,7 +5,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from landing_helpers import still_policy
 
 from jumper_warp.cli import evaluate, play
 from jumper_warp.evaluation.commands import csv_text
@@ -18,6 +17,7 @@ from jumper_warp.policies.folder import save_policy
 from jumper_warp.policies.spec import PolicyError
 from jumper_warp.registry import TASKS, make_task
 from jumper_warp.utils.errors import InputError
+from landing_helpers import still_policy
 
 TASK = EVALUATIONS["place"].for_evaluation(make_task("horizontal-jump"))
 

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from jumper_warp.cli.main import main
-from jumper_warp.optim.actuators import COLUMNS, described_constants, synthetic_bench
-from jumper_warp.optim.identification import total_mass
-from jumper_warp.optim.motions import load_motion
+from jumper_warp.identification.actuators import COLUMNS, described_constants, synthetic_bench
+from jumper_warp.identification.identify import total_mass
+from jumper_warp.identification.motions import load_motion
 from jumper_warp.robot.description import MOTOR_JOINTS
 from jumper_warp.robot.overlay import RobotOverlay, load_overlay
 from jumper_warp.robot.values import RobotValues

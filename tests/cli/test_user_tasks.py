@@ -13,6 +13,7 @@ import pytest
 from jumper_warp.cli import main as cli
 from jumper_warp.cli.main import split_task_modules
 from jumper_warp.cli.train import check_saving, command_line
+from jumper_warp.kernels.jump import rewards
 from jumper_warp.policies.folder import load_policy
 from jumper_warp.policies.restore import open_policy, restored_task
 from jumper_warp.policies.spec import PolicyError
@@ -20,7 +21,6 @@ from jumper_warp.registry import TASKS, load_task_module, make_task
 from jumper_warp.rl.checkpoint import save_checkpoint
 from jumper_warp.tasks.observations import with_history
 from jumper_warp.tasks.saving import TaskError
-from kernels.jump import rewards
 
 TASK = '''\
 """Two jumps with a `rest` that is not the project's."""
@@ -34,9 +34,9 @@ from jumper_warp.registry import register_task
 from jumper_warp.rl.cfg import PpoCfg
 from jumper_warp.tasks.jump.vertical import vertical_jump
 from jumper_warp.tasks.terms import EventTerm, ObservationTerm, RewardTerm, TerminationTerm
-from kernels.mdp.parameters import RobotParameters
-from kernels.mdp.random import Draw, between
-from kernels.mdp.view import RobotView
+from jumper_warp.kernels.mdp.parameters import RobotParameters
+from jumper_warp.kernels.mdp.random import Draw, between
+from jumper_warp.kernels.mdp.view import RobotView
 
 
 @wp.func

@@ -8,7 +8,6 @@ from gymnasium.utils import env_checker
 from gymnasium.wrappers.vector import NormalizeReward, RecordEpisodeStatistics
 from rsl_rl.runners import OnPolicyRunner
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
-from toy_task import SMALL
 
 from jumper_warp.envs.env import Env
 from jumper_warp.envs.gymnasium import GymVectorEnv
@@ -18,6 +17,7 @@ from jumper_warp.gym import env_id, register_envs
 from jumper_warp.registry import TASKS, make_task
 from jumper_warp.rl.rsl_rl import rsl_rl_config, train_rsl_rl
 from jumper_warp.tasks.randomization import RandomizationCfg
+from toy_task import SMALL
 
 N, STEPS = 8, 40
 TASK = make_task("vertical-jump")

@@ -8,18 +8,18 @@ import pytest
 import torch
 import warp as wp
 from scipy.spatial.transform import Rotation
-from solver_helpers import MOTOR_Q, MOTOR_V
 
 from jumper_warp.envs.env import Env
 from jumper_warp.evaluation.log import run_evaluation
-from jumper_warp.evaluation.momentum import momentum, rotational_inertia
 from jumper_warp.evaluation.turns import Turns, axis_metrics, turn_metrics, turns_about_axes
+from jumper_warp.kernels.attitude.state import AttitudeState
 from jumper_warp.registry import make_task
 from jumper_warp.robot.pinocchio_model import build_pinocchio
 from jumper_warp.tasks.attitude.cfg import AttitudeResetCfg, TurnCfg
 from jumper_warp.tasks.mirror import mirror_of
 from jumper_warp.utils.errors import InputError
-from kernels.attitude.state import AttitudeState
+from solver_helpers import MOTOR_Q, MOTOR_V
+from support.momentum import momentum, rotational_inertia
 
 N = 64
 DEG = np.pi / 180.0

@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 import torch
 import warp as wp
-from jump_helpers import edit_coordinates, edit_episodes, ending_names, make_env, only
 
+from jump_helpers import edit_coordinates, edit_episodes, ending_names, make_env, only
 from jumper_warp.envs.arrays import FIRST_CLOCK
+from jumper_warp.kernels.jump import rewards
+from jumper_warp.kernels.jump.state import LANDED, JumpState
+from jumper_warp.kernels.mdp.view import RobotView
 from jumper_warp.registry import make_task
 from jumper_warp.tasks.terms import RewardTerm
-from kernels.jump import rewards
-from kernels.jump.state import LANDED, JumpState
-from kernels.mdp.view import RobotView
 
 TASK = make_task("vertical-jump")
 N = 32

@@ -6,15 +6,15 @@ import math
 import numpy as np
 import pytest
 import torch
-from jump_helpers import edit_coordinates, edit_episodes, make_env, only, resets_of, resetting
-from simulation_helpers import PAW_RADIUS, paw_centres
 
+from jump_helpers import edit_coordinates, edit_episodes, make_env, only, resets_of, resetting
 from jumper_warp.envs.env import Env
+from jumper_warp.kernels.jump.state import LANDED, STANCE
 from jumper_warp.registry import make_task
 from jumper_warp.robot.grounds import BlockCfg, platform
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.tasks.jump.cfg import GroundCfg, ResetCfg
-from kernels.jump.state import LANDED, STANCE
+from simulation_helpers import PAW_RADIUS, paw_centres
 
 N = 16
 REST = torch.zeros((N, 12))

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 import torch
 import warp as wp
+
 from jump_helpers import (
     edit_coordinates,
     edit_episodes,
@@ -15,15 +16,14 @@ from jump_helpers import (
     random_actions,
 )  # fmt: skip
 from jump_oracle import expected_terms, robot_of
-
 from jumper_warp.envs.env import Env
 from jumper_warp.evaluation.jumps import jump_commands
+from jumper_warp.kernels.jump.state import FLIGHT, LANDED, STANCE, JumpState
+from jumper_warp.kernels.mdp import rewards, terminations
+from jumper_warp.kernels.mdp.view import RobotView
 from jumper_warp.registry import make_task
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.tasks.terms import RewardTerm, TerminationTerm
-from kernels.jump.state import FLIGHT, LANDED, STANCE, JumpState
-from kernels.mdp import rewards, terminations
-from kernels.mdp.view import RobotView
 
 TASK = make_task("vertical-jump")
 N = 32

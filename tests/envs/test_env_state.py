@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 import torch
 import warp as wp
+
 from hold_height import hold_height
 from jump_helpers import edit_episodes, make_env, random_actions, resetting
-from toy_task import SMALL, PushTask, join
-
 from jumper_warp.envs.env import Env
 from jumper_warp.envs.state import nominal_fingerprint
 from jumper_warp.registry import make_task
@@ -19,6 +18,7 @@ from jumper_warp.rl.runner import CHECKPOINTS, train
 from jumper_warp.robot.motors import jumping_motors
 from jumper_warp.tasks.jump.cfg import GroundCfg
 from jumper_warp.tasks.randomization import RandomizationCfg
+from toy_task import SMALL, PushTask, join
 
 N = 16
 PPO = PpoCfg(num_steps=8, hidden=(32, 32), minibatches=4)

@@ -6,11 +6,11 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from jumper_warp.envs.env import Env
-from jumper_warp.evaluation.flights import JUMP, OUTCOMES, TURN, Flights, flight_metrics
 from jumper_warp.policies.restore import restored_skills
 from jumper_warp.registry import make_task
 from jumper_warp.tasks.switching import flight_skills
 from jumper_warp.utils.errors import InputError
+from support.flights import JUMP, OUTCOMES, TURN, Flights, flight_metrics
 
 N = 4
 LATE = np.array([[0.01, 0.0], [-0.01, 0.0], [0.0, 0.01], [0.0, 0.0]])

@@ -5,9 +5,9 @@ import dataclasses
 import numpy as np
 import pytest
 import tyro
+
 from jump_helpers import DEG, episodes_of, make_env, only
 from jump_starts import Starts
-
 from jumper_warp.cli.train import parse_train
 from jumper_warp.envs.env import Env
 from jumper_warp.evaluation.run import EvaluationArgs, conditions_of

@@ -6,12 +6,12 @@ import math
 import numpy as np
 import pytest
 import torch
-from jump_helpers import edit_episodes, make_env, only, random_actions
 
+from jump_helpers import edit_episodes, make_env, only, random_actions
 from jumper_warp.envs.env import Env
 from jumper_warp.evaluation.jumps import jump_commands
+from jumper_warp.kernels.jump.state import LANDED, STANCE
 from jumper_warp.registry import make_task
-from kernels.jump.state import LANDED, STANCE
 
 N = 8
 TASK = make_task("vertical-jump")

@@ -4,17 +4,17 @@ import contextlib
 import dataclasses
 from collections import Counter
 
-import hold_height
 import pytest
 import torch
 import warp as wp
-from jump_helpers import edit_episodes, make_env, random_actions
 from warp._src.context import CpuDefaultAllocator
 
+import hold_height
+from jump_helpers import edit_episodes, make_env, random_actions
 from jumper_warp.envs.env import Env
+from jumper_warp.kernels.jump.state import LANDED
 from jumper_warp.registry import make_task
 from jumper_warp.tasks.randomization import RandomizationCfg
-from kernels.jump.state import LANDED
 
 N = 4
 

@@ -6,11 +6,11 @@ import subprocess
 import sys
 from pathlib import Path
 
-import hold_height
 import numpy as np
 import pytest
 import torch
 
+import hold_height
 from jumper_warp.envs.env import Env
 from jumper_warp.rl.cfg import PpoCfg
 from jumper_warp.rl.ppo import Ppo

@@ -5,6 +5,8 @@ import math
 
 import numpy as np
 import pytest
+
+from jumper_warp.tasks.randomization import RandomizationCfg
 from randomization_helpers import (
     ALL,
     BEYOND,
@@ -19,8 +21,6 @@ from randomization_helpers import (
     randomized,
     read,
 )
-
-from jumper_warp.tasks.randomization import RandomizationCfg
 
 
 @pytest.fixture(scope="module")

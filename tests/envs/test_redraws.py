@@ -6,7 +6,13 @@ import numpy as np
 import pytest
 import torch
 import warp as wp
+
 from jump_helpers import DEG, edit_coordinates, edit_episodes, make_env, only, random_actions, resetting
+from jumper_warp.evaluation.paws import paw_arrays
+from jumper_warp.kernels.jump.state import LANDED
+from jumper_warp.kernels.mdp.observations import drawn_push
+from jumper_warp.sim.simulation import Simulation
+from jumper_warp.tasks.randomization import RandomizationCfg
 from randomization_helpers import (
     ALL,
     HELD,
@@ -22,12 +28,6 @@ from randomization_helpers import (
     seen,
     within,
 )
-
-from jumper_warp.evaluation.paws import paw_arrays
-from jumper_warp.sim.simulation import Simulation
-from jumper_warp.tasks.randomization import RandomizationCfg
-from kernels.jump.state import LANDED
-from kernels.mdp.observations import drawn_push
 
 
 @pytest.fixture(scope="module")

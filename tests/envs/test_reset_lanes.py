@@ -5,9 +5,9 @@ import pytest
 import warp as wp
 
 from jumper_warp.envs.env import Env
-from jumper_warp.evaluation.soak import hardest
+from jumper_warp.kernels.mdp.attempts import LANES
 from jumper_warp.registry import make_task
-from kernels.mdp.attempts import LANES
+from support.soak import hardest
 
 N = 96
 

@@ -2,21 +2,21 @@
 
 import dataclasses
 
-import hold_height
 import numpy as np
 import pytest
 import torch
 import warp as wp
+
+import hold_height
 from hold_height import HoldState
 from jump_helpers import random_actions
-
 from jumper_warp.envs.env import Env
+from jumper_warp.kernels.jump.state import JumpState
+from jumper_warp.kernels.mdp.view import RobotView
 from jumper_warp.registry import make_task
 from jumper_warp.robot.motors import jumping_motors
 from jumper_warp.tasks.cfg import Handover
 from jumper_warp.tasks.randomization import RandomizationCfg
-from kernels.jump.state import JumpState
-from kernels.mdp.view import RobotView
 
 N = 16
 DEG = np.pi / 180.0

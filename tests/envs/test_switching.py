@@ -23,6 +23,8 @@ SCRIPTS = [
                   {"stand": 0.2}]),
 ]  # fmt: skip
 
+HANDOVERS = "jumper_warp.kernels.skills.handovers"
+
 
 def coordinates(env) -> np.ndarray:
     return np.concatenate([env.sim.joint_q(), env.sim.joint_qd()], axis=1)
@@ -159,7 +161,7 @@ def test_configuration_names_all_tasks_and_handovers(followed):
     assert [task["name"] for task in config["tasks"]] == [task.name for task in policies.skills]
     assert config["handovers"][0] == {
         "source": "velocity-flat", "target": "vertical-jump",
-        "when": "kernels.skills.handovers:come_to_a_stop", "begin": "kernels.skills.handovers:begin_jump",
+        "when": f"{HANDOVERS}:come_to_a_stop", "begin": f"{HANDOVERS}:begin_jump",
     }  # fmt: skip
     assert len(config["handovers"]) == 4 and "tasks" not in Env(env.tasks[0], 1, device="cpu").config()
     tasks, handovers = restored_skills(json.loads(json.dumps(config)))
@@ -174,7 +176,8 @@ def test_configuration_names_all_tasks_and_handovers(followed):
 @pytest.mark.parametrize(
     ("change", "message"),
     [({"when": "os:system"}, "handover when needs 'os:system'"),
-     ({"when": "kernels.jump.state:JumpState"}, "is not a @wp.func"), ({"source": "a walk"}, "no task 'a walk' here"),
+     ({"when": "jumper_warp.kernels.jump.state:JumpState"}, "is not a @wp.func"),
+     ({"source": "a walk"}, "no task 'a walk' here"),
      ({"extra": 1}, "a handover has source, target, when and begin")],
 )  # fmt: skip
 def test_handover_that_cannot_be_read_back_is_refused(followed, change, message):

@@ -6,16 +6,18 @@ import threading
 import time
 from functools import partial
 
-import hold_height
 import numpy as np
 import pytest
 import torch
 import warp as wp
+
+import hold_height
 from hold_height import HoldState
 from jump_helpers import random_actions
-
 from jumper_warp.cli.main import main
 from jumper_warp.envs.env import Env
+from jumper_warp.kernels.jump.state import JumpState
+from jumper_warp.kernels.mdp.view import RobotView
 from jumper_warp.registry import make_task
 from jumper_warp.rl.cfg import PpoCfg, TrainCfg
 from jumper_warp.rl.checkpoint import load_checkpoint
@@ -27,8 +29,6 @@ from jumper_warp.tasks.cfg import Handover
 from jumper_warp.tasks.randomization import RandomizationCfg
 from jumper_warp.utils import threads as pool
 from jumper_warp.utils.errors import InputError
-from kernels.jump.state import JumpState
-from kernels.mdp.view import RobotView
 
 N = 3 * LEAST + 2
 JUMP = dataclasses.replace(

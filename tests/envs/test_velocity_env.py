@@ -5,16 +5,16 @@ import dataclasses
 import numpy as np
 import pytest
 import torch
+
 from ground_helpers import heights
 from jump_helpers import edit_coordinates, ending_names, random_actions
-from velocity_helpers import edit, states_of, walking_env
-
+from jumper_warp.kernels.collision.robot import SHANK_GROUND
 from jumper_warp.registry import make_task
 from jumper_warp.robot.terrain import TerrainCfg, terrain_map
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.tasks.terms import StateMetric
 from jumper_warp.utils.errors import InputError
-from kernels.collision.robot import SHANK_GROUND
+from velocity_helpers import edit, states_of, walking_env
 
 N = 32
 MAP = TerrainCfg(rows=2, tile=4.0, cell=0.1, start=0.6, border=1.0)

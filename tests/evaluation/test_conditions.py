@@ -5,18 +5,18 @@ import dataclasses
 import numpy as np
 import pytest
 import torch
-from jump_helpers import edit_coordinates, edit_episodes, ending_names, make_env
-from landing_helpers import still_policy
 
 from experiments.vertical_jump_sweep import for_sweep
+from jump_helpers import edit_coordinates, edit_episodes, ending_names, make_env
 from jumper_warp.evaluation import heights, landings
 from jumper_warp.evaluation.latency import latency_metrics, latency_text
 from jumper_warp.evaluation.run import EvaluationArgs, EvaluationRun
+from jumper_warp.kernels.jump.state import LANDED
 from jumper_warp.policies.folder import save_policy
 from jumper_warp.policies.restore import Conditions
 from jumper_warp.registry import make_task
 from jumper_warp.tasks.randomization import PUSH_INTERVAL, PUSH_SHARE, RandomizationCfg
-from kernels.jump.state import LANDED
+from landing_helpers import still_policy
 
 DT = 1.0 / 480.0
 JUMP = make_task("horizontal-jump")

@@ -3,13 +3,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from landing_helpers import still_policy
 
 from jumper_warp.cli import evaluate, play
 from jumper_warp.evaluation.episodes import EpisodeFlags, EpisodeGoals, Episodes, episode_metrics
 from jumper_warp.policies.folder import save_policy
 from jumper_warp.registry import make_task
 from jumper_warp.tasks.saving import task_to_json
+from landing_helpers import still_policy
 
 DT = 0.5
 TASK = make_task("vertical-jump")

@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 
-from jumper_warp.evaluation.identification_methods import chi2_at
-from jumper_warp.evaluation.known_robots import MOST, make_case, prediction_errors
-from jumper_warp.optim.least_squares import LeastSquares
-from jumper_warp.optim.parameters import jumper_parameters
-from jumper_warp.optim.recording import replay_plan
-from jumper_warp.optim.replay import Replay
-from jumper_warp.optim.residuals import MotionResiduals, NoiseLevels
+from jumper_warp.identification.least_squares import LeastSquares
+from jumper_warp.identification.parameters import jumper_parameters
+from jumper_warp.identification.recording import replay_plan
+from jumper_warp.identification.replay import Replay
+from jumper_warp.identification.residuals import MotionResiduals, NoiseLevels
+from support.identification_methods import chi2_at
+from support.known_robots import MOST, make_case, prediction_errors
 
 
 @pytest.fixture(scope="module")

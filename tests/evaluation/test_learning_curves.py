@@ -6,8 +6,8 @@ from types import SimpleNamespace
 import torch
 import warp as wp
 
-from jumper_warp.evaluation import learning
-from jumper_warp.evaluation.learning import Curve, learning_curve
+from support import learning
+from support.learning import Curve, learning_curve
 
 
 class Trainer:

@@ -4,8 +4,10 @@ import numpy as np
 import pytest
 import torch
 
-from jumper_warp.evaluation.takeoff_search import NOMINAL, env_of_limit
-from jumper_warp.evaluation.takeoffs import (
+from jumper_warp.robot.motors import horizontal_jump_filter
+from jumper_warp.tasks.units import G
+from support.takeoff_search import NOMINAL, env_of_limit
+from support.takeoffs import (
     LANDING_ACTION,
     Flight,
     Takeoffs,
@@ -16,8 +18,6 @@ from jumper_warp.evaluation.takeoffs import (
     reach,
     stopping_time,
 )
-from jumper_warp.robot.motors import horizontal_jump_filter
-from jumper_warp.tasks.units import G
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 

@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from jumper_warp.evaluation import gaits, velocities
+from jumper_warp.evaluation import velocities
 from jumper_warp.evaluation.velocities import VelocityFlags, VelocityGoals, Walks
 from jumper_warp.registry import make_task
 from jumper_warp.utils.errors import InputError
+from support import gaits
 
 DT = 1.0 / 60.0
 TASK = make_task("velocity-flat")

@@ -10,9 +10,9 @@ import pytest
 from experiments import departures
 from jumper_warp.cli.train import parse_train
 from jumper_warp.registry import make_task
-from jumper_warp.tasks.jump.departures import DEPARTURES, Undone
 from jumper_warp.tasks.saving import task_from_json, task_to_json
 from jumper_warp.utils.errors import InputError
+from support.departures import DEPARTURES, Undone
 
 
 def undone(task, name):

@@ -7,11 +7,11 @@ import pytest
 
 from experiments import distance_limit as limit
 from jumper_warp.cli.main import run_command
-from jumper_warp.evaluation import takeoff_search as jumps
 from jumper_warp.evaluation.run import EvaluationArgs, EvaluationRun
-from jumper_warp.evaluation.takeoffs import Takeoffs
+from jumper_warp.kernels import layout
 from jumper_warp.registry import make_task
-from kernels import layout
+from support import takeoff_search as jumps
+from support.takeoffs import Takeoffs
 
 ARGS = limit.Args(population=8, device="cpu")
 pytestmark = pytest.mark.usefixtures("one_thread")

@@ -6,7 +6,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from landing_helpers import still_policy
 
 from experiments import (
     ablations,
@@ -21,22 +20,23 @@ from experiments import (
 )
 from jumper_warp.evaluation.heights import sweep_metrics
 from jumper_warp.evaluation.jumps import Jumps, run_jumps
-from jumper_warp.evaluation.learning import Curve
-from jumper_warp.evaluation.limits import limit_metrics
 from jumper_warp.evaluation.run import HEIGHTS, EvaluationRun
-from jumper_warp.evaluation.soak import SoakArgs, hardest
 from jumper_warp.policies.folder import save_policy
 from jumper_warp.registry import make_task
 from jumper_warp.rl.cfg import PpoCfg
-from jumper_warp.tasks.jump.ablations import (
+from jumper_warp.tasks.saving import plain
+from jumper_warp.utils.errors import InputError
+from landing_helpers import still_policy
+from support.ablations import (
     ABLATIONS,
     without_curriculum,
     without_estimate,
     without_reference_states,
 )
-from jumper_warp.tasks.saving import plain
-from jumper_warp.utils.errors import InputError
-from jumper_warp.utils.timing import flags_of, over_baseline
+from support.learning import Curve
+from support.limits import limit_metrics
+from support.soak import SoakArgs, hardest
+from support.timing import flags_of, over_baseline
 
 SWEEP_ENDS = ("success", "came_apart", "low_base", "tilted", "collided", "no_jump", "too_long")
 pytestmark = pytest.mark.usefixtures("one_thread")

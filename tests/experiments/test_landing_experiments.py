@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from landing_helpers import still_policy
 
 from experiments import (
     consecutive_jumps,
@@ -18,7 +17,6 @@ from experiments import (
     platform_jump,
 )
 from experiments.vertical_jump_sweep import OPEN_LOOP_APEX
-from jumper_warp.evaluation.distances import distance_metrics, row_of, verdict
 from jumper_warp.evaluation.landings import ENDS, Landings, beside
 from jumper_warp.evaluation.log import run_evaluation, termination_names
 from jumper_warp.evaluation.plots import Track
@@ -27,6 +25,8 @@ from jumper_warp.policies.folder import save_policy
 from jumper_warp.policies.restore import Conditions, env_of_policy
 from jumper_warp.policies.spec import PolicyError
 from jumper_warp.utils.errors import InputError
+from landing_helpers import still_policy
+from support.distances import distance_metrics, row_of, verdict
 
 COLLIDED, NO_JUMP, LANDED = (ENDS.index(name) for name in ("collided", "no_jump", "success"))
 SHARED = {"mean_error_m", "success_rate", "success_rate_in_range", "jumps", "solver", "randomize", "seed"}

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from experiments import squat_hold
-from jumper_warp.evaluation.holds import Holds, hold_metrics
 from jumper_warp.utils.errors import InputError
+from support.holds import Holds, hold_metrics
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 

@@ -6,8 +6,8 @@ import torch
 
 from experiments import trajectory_optimization as experiment
 from jumper_warp.cli.main import run_command
-from jumper_warp.evaluation.optimized_jumps import JUMPS, run_ups
 from jumper_warp.tasks.jump.references import COLUMNS, ROWS
+from support.optimized_jumps import JUMPS, run_ups
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 

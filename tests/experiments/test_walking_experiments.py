@@ -4,13 +4,13 @@ import json
 
 import numpy as np
 import pytest
-from landing_helpers import still_policy
 
 from experiments import walking_terrain, walking_tracking
 from jumper_warp.policies.folder import save_policy
 from jumper_warp.policies.spec import PolicyError
 from jumper_warp.registry import make_task
 from jumper_warp.utils.errors import InputError
+from landing_helpers import still_policy
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 

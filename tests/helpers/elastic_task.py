@@ -8,10 +8,9 @@ import signal
 import sys
 from pathlib import Path
 
-from toy_task import SMALL, PushTask
-
 from jumper_warp.rl.cfg import TrainCfg
 from jumper_warp.rl.runner import train
+from toy_task import SMALL, PushTask
 
 STEPS = SMALL.num_steps
 

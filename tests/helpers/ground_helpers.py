@@ -3,10 +3,10 @@
 import numpy as np
 import warp as wp
 
+from jumper_warp.kernels.terrain import ground as ground_module
+from jumper_warp.kernels.terrain.ground import Ground, surface
 from jumper_warp.robot.model import build_model
 from jumper_warp.sim.dynamics import find_ground, ground_struct
-from kernels.terrain import ground as ground_module
-from kernels.terrain.ground import Ground, surface
 
 wp.set_module_options({"enable_backward": False})
 

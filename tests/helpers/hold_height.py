@@ -7,18 +7,18 @@ from typing import Any
 
 import warp as wp
 
+from jumper_warp.kernels.mdp import observations as mdp_observations
+from jumper_warp.kernels.mdp import rewards as mdp_rewards
+from jumper_warp.kernels.mdp import terminations as mdp_terminations
+from jumper_warp.kernels.mdp.env import Scene, SkillSettings
+from jumper_warp.kernels.mdp.parameters import RobotParameters, set_torque_limit
+from jumper_warp.kernels.mdp.random import Draw, between, within
+from jumper_warp.kernels.mdp.reset import store_pose
+from jumper_warp.kernels.mdp.view import RobotArrays, RobotView
 from jumper_warp.robot.motors import walking_filter, walking_motors
 from jumper_warp.tasks.cfg import Command, Reset, TaskCfg
 from jumper_warp.tasks.randomization import RandomizationCfg
 from jumper_warp.tasks.terms import Advance, Curriculum, EventTerm, ObservationTerm, RewardTerm, TerminationTerm
-from kernels.mdp import observations as mdp_observations
-from kernels.mdp import rewards as mdp_rewards
-from kernels.mdp import terminations as mdp_terminations
-from kernels.mdp.env import Scene, SkillSettings
-from kernels.mdp.parameters import RobotParameters, set_torque_limit
-from kernels.mdp.random import Draw, between, within
-from kernels.mdp.reset import store_pose
-from kernels.mdp.view import RobotArrays, RobotView
 
 Pair = tuple[float, float]
 

@@ -6,20 +6,20 @@ import inspect
 import numpy as np
 import torch
 import warp as wp
-from mdp_helpers import DEFAULT_ANGLE, MOTOR_SLOTS, STEP_DT, SUBSTEPS, array, new_worlds, observe, standing_robots
 
 from jumper_warp.envs.env import Env
 from jumper_warp.envs.skill import Skill
+from jumper_warp.kernels.jump.reset import JumpLevel, JumpSettings
+from jumper_warp.kernels.jump.state import JumpState
+from jumper_warp.kernels.mdp.parameters import RobotParameters
+from jumper_warp.kernels.mdp.view import RobotView, vec12
+from jumper_warp.kernels.terrain.ground import Ground
 from jumper_warp.registry import make_task
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.tasks.jump.cfg import SHARES, Level, ResetCfg
 from jumper_warp.tasks.jump.observations import EPISODE
 from jumper_warp.tasks.observations import exact
-from kernels.jump.reset import JumpLevel, JumpSettings
-from kernels.jump.state import JumpState
-from kernels.mdp.parameters import RobotParameters
-from kernels.mdp.view import RobotView, vec12
-from kernels.terrain.ground import Ground
+from mdp_helpers import DEFAULT_ANGLE, MOTOR_SLOTS, STEP_DT, SUBSTEPS, array, new_worlds, observe, standing_robots
 
 DEG = np.pi / 180.0
 SCHEMES = ("standing", "default", "in_flight", "touchdown", "landed", "pushing")

@@ -3,12 +3,12 @@
 import numpy as np
 import pinocchio as pin
 import warp as wp
-from jump_helpers import SCHEMES, begin_by, edit_episodes, episodes_of, only, resets_of
 from scipy.spatial.transform import Rotation
-from solver_helpers import Reference, States, paw_joint
 
+from jump_helpers import SCHEMES, begin_by, edit_episodes, episodes_of, only, resets_of
 from jumper_warp.envs.env import Env
-from kernels.collision.robot import collision_kernel
+from jumper_warp.kernels.collision.robot import collision_kernel
+from solver_helpers import Reference, States, paw_joint
 
 PLACES = ("horizontal-jump", "omnidirectional-jump")
 """Names of the tasks of jumping to a place."""

@@ -6,9 +6,9 @@ import numpy as np
 import warp as wp
 
 from jumper_warp.envs.arrays import delay_arrays, env_arrays
-from kernels.layout import BODIES, COORDS, DOFS
-from kernels.mdp.observe import LANES, condition_kernel
-from kernels.mdp.view import RobotArrays
+from jumper_warp.kernels.layout import BODIES, COORDS, DOFS
+from jumper_warp.kernels.mdp.observe import LANES, condition_kernel
+from jumper_warp.kernels.mdp.view import RobotArrays
 
 STEP_DT = 1.0 / 60.0  # [s]
 SUBSTEPS = 8

@@ -5,20 +5,20 @@ from typing import Any
 
 import numpy as np
 import warp as wp
-from mdp_helpers import STEP_DT, SUBSTEPS, array, new_worlds, no_delays, observe, standing_robots
 
 from jumper_warp.envs.skill import Skill
+from jumper_warp.kernels.mdp import terminations
+from jumper_warp.kernels.mdp.env import Scene, SkillSettings
+from jumper_warp.kernels.mdp.parameters import RobotParameters
+from jumper_warp.kernels.mdp.random import Draw, between
+from jumper_warp.kernels.mdp.reset import store_pose
+from jumper_warp.kernels.mdp.view import RobotArrays, RobotView
+from jumper_warp.kernels.terrain.ground import Ground
 from jumper_warp.robot.motors import jumping_motors, vertical_jump_filter
 from jumper_warp.tasks.cfg import Command, Reset, TaskCfg
 from jumper_warp.tasks.randomization import RandomizationCfg
 from jumper_warp.tasks.terms import Advance, Curriculum, ObservationTerm, RewardTerm, TerminationTerm
-from kernels.mdp import terminations
-from kernels.mdp.env import Scene, SkillSettings
-from kernels.mdp.parameters import RobotParameters
-from kernels.mdp.random import Draw, between
-from kernels.mdp.reset import store_pose
-from kernels.mdp.view import RobotArrays, RobotView
-from kernels.terrain.ground import Ground
+from mdp_helpers import STEP_DT, SUBSTEPS, array, new_worlds, no_delays, observe, standing_robots
 
 
 @wp.struct

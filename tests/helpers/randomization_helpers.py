@@ -3,14 +3,14 @@
 import dataclasses
 
 import numpy as np
-from jump_helpers import DEG, make_env, only, resetting
 from newton.solvers import SolverMuJoCo
 
+from jump_helpers import DEG, make_env, only, resetting
 from jumper_warp.envs.env import Env
+from jumper_warp.kernels import layout
 from jumper_warp.registry import make_task
 from jumper_warp.sim.solver import SolverJumper
 from jumper_warp.tasks.randomization import RandomizationCfg
-from kernels import layout
 
 N = 64
 TASK = make_task("vertical-jump")

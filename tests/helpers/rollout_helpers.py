@@ -6,7 +6,7 @@ from functools import cache
 
 import numpy as np
 
-from jumper_warp.optim.rollout import Rollout, compact
+from jumper_warp.diff.rollout import Rollout, compact
 from jumper_warp.robot.description import load_description
 from jumper_warp.robot.grounds import uneven
 from jumper_warp.robot.model import build_model, standing_configuration

@@ -5,10 +5,10 @@ import dataclasses
 import numpy as np
 import warp as wp
 from scipy.spatial.transform import Rotation
-from solver_helpers import BODIES, SHANKS, random_states
 
 from jumper_warp.robot.motors import jumping_motors
 from jumper_warp.sim.simulation import Simulation
+from solver_helpers import BODIES, SHANKS, random_states
 
 WEIGHT = 14.5 * 9.81
 PAW_RADIUS = 0.025

@@ -4,8 +4,8 @@ import numpy as np
 import warp as wp
 
 from jumper_warp.envs.env import Env
+from jumper_warp.kernels.velocity.state import VelocityState
 from jumper_warp.registry import make_task
-from kernels.velocity.state import VelocityState
 
 FIELDS = tuple(VelocityState.vars)
 

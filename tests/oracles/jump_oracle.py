@@ -1,8 +1,9 @@
 """The jumps' reward terms once more, in NumPy, from the paper's formulas and the robot's arrays."""
 
 import numpy as np
-from jump_helpers import DEFAULT_ANGLE, make_episode, make_view
 from scipy.spatial.transform import Rotation
+
+from jump_helpers import DEFAULT_ANGLE, make_episode, make_view
 
 DT = 1.0 / 60.0
 CONTACT_FORCE = 0.1  # [N]

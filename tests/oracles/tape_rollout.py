@@ -3,10 +3,10 @@
 import numpy as np
 import warp as wp
 
-from jumper_warp.optim.rollout import MAX_SWEEPS, TOLERANCE_DOUBLE
+from jumper_warp.diff.rollout import MAX_SWEEPS, TOLERANCE_DOUBLE
 from jumper_warp.robot.motors import filter_params, motor_arrays
-from jumper_warp.sim.differentiable import DifferentiableStep
 from jumper_warp.sim.dynamics import JumperDynamics
+from jumper_warp.sim.tape import DifferentiableStep
 
 
 def tape_gradients(model, motors, command_filter, dt, substeps, targets, joint_q, joint_qd, weights):

@@ -6,9 +6,10 @@ import random
 import sys
 from pathlib import Path
 
-import hold_height
 import pytest
 
+import hold_height
+from jumper_warp.kernels.jump import rewards, terminations
 from jumper_warp.policies.folder import load_policy
 from jumper_warp.policies.restore import Conditions, env_of_policy, restored_task
 from jumper_warp.policies.spec import PolicyError, PolicyInterface, make_interface
@@ -18,7 +19,6 @@ from jumper_warp.tasks.interface import interface
 from jumper_warp.tasks.jump.cfg import GroundCfg
 from jumper_warp.tasks.saving import task_to_json
 from jumper_warp.tasks.terms import RewardTerm, TerminationTerm
-from kernels.jump import rewards, terminations
 
 SHAPE = {"policy_dt": 1 / 60, "physics_dt": 1 / 480, "hidden": (256, 128, 128)}
 
@@ -132,7 +132,7 @@ def test_drawn_grounds_come_back_and_default_to_none(saved):
 @pytest.mark.parametrize(
     "name", ["wp", "SOON", "__doc__", "landing_error_estimate", "", "cartwheel", "success:x", 3, None]
 )
-@pytest.mark.parametrize("prefix", ["", "kernels.jump.terminations:", "kernels.jump.phase:"])
+@pytest.mark.parametrize("prefix", ["", "jumper_warp.kernels.jump.terminations:", "jumper_warp.kernels.jump.phase:"])
 def test_a_termination_that_is_none_is_refused(saved, name, prefix):
     _, config = saved
     config["env"]["task"]["terminations"][1]["func"] = f"{prefix}{name}" if prefix else name

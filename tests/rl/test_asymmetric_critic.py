@@ -2,9 +2,9 @@ import dataclasses
 
 import pytest
 import torch
-from toy_task import SMALL, PushTask, fill
 
 from jumper_warp.rl.ppo import Ppo
+from toy_task import SMALL, PushTask, fill
 
 SHORT = dataclasses.replace(SMALL, num_steps=8)
 

@@ -8,8 +8,8 @@ import pytest
 import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from jump_helpers import make_env
 
+from jump_helpers import make_env
 from jumper_warp.policies.restore import open_policy
 from jumper_warp.policies.spec import PolicyError
 from jumper_warp.rl.cfg import PpoCfg, TrainCfg

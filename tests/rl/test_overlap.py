@@ -6,12 +6,12 @@ import signal
 
 import pytest
 import torch
-from toy_task import SMALL, PushTask
 
 from jumper_warp.rl.cfg import TrainCfg
 from jumper_warp.rl.checkpoint import load_checkpoint
 from jumper_warp.rl.ppo import Ppo
 from jumper_warp.rl.runner import CHECKPOINTS, train
+from toy_task import SMALL, PushTask
 
 OVERLAP = dataclasses.replace(SMALL, overlap=True, lr=3e-3)
 

@@ -8,7 +8,6 @@ from rsl_rl.models import MLPModel
 from rsl_rl.storage import RolloutStorage
 from tensordict import TensorDict
 from torch.utils._python_dispatch import TorchDispatchMode
-from toy_task import SMALL, PushTask, fill, local_order, update_half
 
 from jumper_warp.rl import networks
 from jumper_warp.rl import ppo as ppo_module
@@ -16,6 +15,7 @@ from jumper_warp.rl.adam import adapted_lr
 from jumper_warp.rl.cfg import PpoCfg
 from jumper_warp.rl.ppo import STATISTICS, Ppo
 from jumper_warp.rl.samples import Batch, gae
+from toy_task import SMALL, PushTask, fill, local_order, update_half
 
 PLAIN = PpoCfg(
     num_steps=8, epochs=1, minibatches=1, hidden=(16, 8), normalise_value=False, reward_scale=1.0, max_grad_norm=1e9

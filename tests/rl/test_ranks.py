@@ -2,12 +2,12 @@ import dataclasses
 
 import pytest
 import torch
-from toy_task import SMALL, PushTask
 
 from jumper_warp.rl import distributed
 from jumper_warp.rl.cfg import TrainCfg
 from jumper_warp.rl.runner import train
 from jumper_warp.utils.threads import set_threads
+from toy_task import SMALL, PushTask
 
 
 @pytest.mark.parametrize(("cores", "threads"), [(1, 1), (2, 2), (3, 2), (4, 2), (16, 8)])

@@ -4,12 +4,12 @@ import dataclasses
 
 import pytest
 import torch
-from toy_task import SMALL, PushTask
 
 from jumper_warp.rl.cfg import ShacCfg, TrainCfg
 from jumper_warp.rl.runner import train
 from jumper_warp.rl.shac import Shac
 from jumper_warp.utils.errors import InputError
+from toy_task import SMALL, PushTask
 
 CFG = dataclasses.replace(SMALL, init_std=0.3, num_steps=8)
 

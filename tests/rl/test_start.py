@@ -6,7 +6,6 @@ import json
 import pytest
 import torch
 from test_shac import SmoothPushTask
-from toy_task import SMALL, PushTask
 
 from jumper_warp.rl.cfg import TrainCfg
 from jumper_warp.rl.checkpoint import load_checkpoint, save_checkpoint
@@ -16,6 +15,7 @@ from jumper_warp.rl.ppo import Ppo
 from jumper_warp.rl.runner import CHECKPOINTS, CONFIG, train
 from jumper_warp.rl.start import KNOWN_ITERATIONS, begin_with, make_start
 from jumper_warp.utils.errors import InputError
+from toy_task import SMALL, PushTask
 
 SYMMETRY = symmetry_of(PushTask(1))
 SYMMETRIC = dataclasses.replace(SMALL, symmetry="actor")

@@ -4,7 +4,6 @@ import json
 import numpy as np
 import pytest
 import torch
-from toy_task import PushTask, fill
 
 from jumper_warp.cli.main import main
 from jumper_warp.policies.restore import open_policy
@@ -20,6 +19,7 @@ from jumper_warp.rl.ppo import Ppo
 from jumper_warp.tasks.interface import interface
 from jumper_warp.tasks.mirror import mirror_of, mirror_of_action
 from jumper_warp.utils.errors import InputError
+from toy_task import PushTask, fill
 
 OBS, ACTION = mirror_of(make_task("velocity-flat"), "policy"), mirror_of_action()
 WALKING = Symmetry(image(*OBS, "observation"), image(*ACTION, "action"))

@@ -9,10 +9,10 @@ import sys
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
-import elastic_task
 import pytest
 import torch
 
+import elastic_task
 from jumper_warp.rl.cfg import TrainCfg
 from jumper_warp.rl.checkpoint import load_checkpoint, save_checkpoint
 from jumper_warp.rl.distributed import Rank

@@ -10,7 +10,6 @@ import pytest
 import torch
 from rsl_rl.runners import OnPolicyRunner
 from tensordict import TensorDict
-from toy_task import SMALL, PushTask, train_rank
 
 from jumper_warp.envs.rsl_rl import RslRlVecEnv
 from jumper_warp.rl.cfg import PpoCfg, TrainCfg
@@ -19,6 +18,7 @@ from jumper_warp.rl.distributed import Rank
 from jumper_warp.rl.logger import FIGURES
 from jumper_warp.rl.rsl_rl import rsl_rl_config, train_rsl_rl
 from jumper_warp.rl.runner import CHECKPOINTS, CONFIG, Run, Stop, train
+from toy_task import SMALL, PushTask, train_rank
 
 
 def make_env(num_envs, seed, device):

@@ -4,11 +4,11 @@ import dataclasses
 import time
 
 import pytest
-from toy_task import SMALL, PushTask
 
 from jumper_warp.rl.cfg import TrainCfg
 from jumper_warp.rl.checkpoint import load_checkpoint
 from jumper_warp.rl.runner import CHECKPOINTS, train
+from toy_task import SMALL, PushTask
 
 
 @pytest.fixture

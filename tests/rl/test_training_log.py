@@ -5,12 +5,12 @@ import resource
 
 import pytest
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
-from toy_task import SMALL, PushTask
 
 from jumper_warp.rl.cfg import TrainCfg
 from jumper_warp.rl.figure_files import FiguresFile
 from jumper_warp.rl.logger import FIGURES, TrainingLog, _duration
 from jumper_warp.rl.runner import CHECKPOINTS, train
+from toy_task import SMALL, PushTask
 
 NUMBERS = {"Perf/fps": 1234.0, "Metrics/success": 0.5}
 

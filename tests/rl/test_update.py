@@ -5,7 +5,6 @@ import math
 
 import pytest
 import torch
-from toy_task import PushTask, fill
 
 from jumper_warp.rl import compiling
 from jumper_warp.rl.adam import FlatAdam, adam_step
@@ -14,6 +13,7 @@ from jumper_warp.rl.flat import FlatParameters
 from jumper_warp.rl.networks import ActorCritic, gaussian_log_prob
 from jumper_warp.rl.passes import backward, forward
 from jumper_warp.rl.ppo import Ppo
+from toy_task import PushTask, fill
 
 CFG = PpoCfg(num_steps=8, epochs=3, minibatches=4, hidden=(16, 9), max_grad_norm=0.3, lr=3e-3)
 WORLDS = 16

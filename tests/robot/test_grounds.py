@@ -1,9 +1,9 @@
 import numpy as np
 import pytest
-from ground_helpers import heights, probe
-from simulation_helpers import PAW_RADIUS, WEIGHT, paw_centres, paw_forces, simulation, thrown, write_state
 
+from ground_helpers import heights, probe
 from jumper_warp.robot import grounds
+from simulation_helpers import PAW_RADIUS, WEIGHT, paw_centres, paw_forces, simulation, thrown, write_state
 
 
 @pytest.mark.parametrize("height", [-0.15, 0.15])

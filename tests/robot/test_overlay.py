@@ -7,12 +7,12 @@ import pytest
 
 from jumper_warp.cli.train import for_robot, overlay_in
 from jumper_warp.envs.env import Env
+from jumper_warp.kernels.layout import BODIES, DOFS
 from jumper_warp.registry import make_task
 from jumper_warp.robot.overlay import RANDOMIZED, RobotOverlay, load_overlay
 from jumper_warp.sim.simulation import Simulation
 from jumper_warp.tasks.randomization import RandomizationCfg
 from jumper_warp.utils.errors import InputError
-from kernels.layout import BODIES, DOFS
 
 VALUES = {
     "base_mass": (7.0,), "base_com": (0.01, 0.0, 0.02), "link_mass": (1.1, 1.0, 1.0, 1.0, 0.9),

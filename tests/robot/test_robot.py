@@ -155,7 +155,7 @@ def test_leg_geometry_is_read_off_the_joint_origins(description):
     }  # fmt: skip
 
 
-@pytest.mark.parametrize(("package", "bits"), [("kernels", 32), ("kernels_float64", 64)])
+@pytest.mark.parametrize(("package", "bits"), [("jumper_warp.kernels", 32), ("jumper_warp.kernels_float64", 64)])
 def test_leg_geometry_array_in_both_precisions(description, package, bits):
     float64_kernels()
     module = importlib.import_module(f"{package}.kinematics.geometry")

@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
-from ground_helpers import heights, probe
 
+from ground_helpers import heights, probe
 from jumper_warp.robot.terrain import KINDS, TerrainCfg, single_tile, terrain_map, tile_heights
 from jumper_warp.utils.errors import InputError
 

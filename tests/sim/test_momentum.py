@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from jumper_warp.evaluation.momentum import momentum
 from jumper_warp.robot.gravity import MARS
 from jumper_warp.robot.motors import jumping_motors
 from jumper_warp.sim.simulation import Simulation
+from support.momentum import momentum
 
 N = 2
 STEPS = 45

@@ -1,6 +1,18 @@
 import numpy as np
 import pytest
 import warp as wp
+
+from jumper_warp.envs.env import Env
+from jumper_warp.kernels.collision.robot import SHANK_GROUND, collision_kernel
+from jumper_warp.kernels.dynamics.contact import BlockLaw, PawContact, block_velocity, push_on_block
+from jumper_warp.kernels.scalar import vec3
+from jumper_warp.kernels.terrain.ground import Ground, block_normal, ground_distance, surface, world_ground
+from jumper_warp.registry import make_task
+from jumper_warp.robot.grounds import BlockCfg
+from jumper_warp.robot.model import PHYSICS_DT, build_model
+from jumper_warp.sim.dynamics import JumperDynamics
+from jumper_warp.sim.simulation import SUBSTEPS
+from jumper_warp.sim.solver import TOLERANCE, SolverJumper
 from simulation_helpers import (
     PAW_RADIUS,
     WEIGHT,
@@ -13,18 +25,6 @@ from simulation_helpers import (
     write_state,
 )
 from solver_helpers import COORDS, MOTOR_V, Reference, States
-
-from jumper_warp.envs.env import Env
-from jumper_warp.registry import make_task
-from jumper_warp.robot.grounds import BlockCfg
-from jumper_warp.robot.model import PHYSICS_DT, build_model
-from jumper_warp.sim.dynamics import JumperDynamics
-from jumper_warp.sim.simulation import SUBSTEPS
-from jumper_warp.sim.solver import TOLERANCE, SolverJumper
-from kernels.collision.robot import SHANK_GROUND, collision_kernel
-from kernels.dynamics.contact import BlockLaw, PawContact, block_velocity, push_on_block
-from kernels.scalar import vec3
-from kernels.terrain.ground import Ground, block_normal, ground_distance, surface, world_ground
 
 wp.set_module_options({"enable_backward": False})
 

@@ -5,6 +5,8 @@ import newton
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+
+from jumper_warp.sim.solver import TOLERANCE
 from simulation_helpers import (
     WEIGHT,
     command,
@@ -17,8 +19,6 @@ from simulation_helpers import (
     write_state,
 )
 from solver_helpers import DOFS, MOTOR_Q, MOTOR_V
-
-from jumper_warp.sim.solver import TOLERANCE
 
 
 @pytest.fixture(scope="module")

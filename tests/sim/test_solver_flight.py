@@ -5,10 +5,10 @@ import pinocchio as pin
 import pytest
 import warp as wp
 from scipy.spatial.transform import Rotation
-from solver_helpers import DOFS, KNEE_V, MOTOR_V, Flight, Reference, bare_model, paw_joint, random_states
 
 from jumper_warp.robot.model import leg_geometry_array, load_description
 from jumper_warp.sim.dynamics import kernel_modules
+from solver_helpers import DOFS, KNEE_V, MOTOR_V, Flight, Reference, bare_model, paw_joint, random_states
 
 GRAVITY = 9.81
 

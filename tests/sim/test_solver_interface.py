@@ -5,12 +5,12 @@ import warp as wp
 from newton import ModelFlags, StateFlags
 from newton.sensors import SensorIMU
 from newton.solvers import SolverBase
-from solver_helpers import BODIES, COORDS, DOFS, KNEE_V, MOTOR_V
 
 from jumper_warp.robot.model import build_model
 from jumper_warp.sim.dynamics import NotThisRobotError
 from jumper_warp.sim.simulation import Simulation
 from jumper_warp.sim.solver import SolverJumper
+from solver_helpers import BODIES, COORDS, DOFS, KNEE_V, MOTOR_V
 
 DT = 1.0 / 480.0
 

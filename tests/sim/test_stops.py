@@ -9,13 +9,13 @@ import warp as wp
 from newton import ModelFlags
 from scipy.optimize import nnls
 from scipy.spatial.transform import Rotation
-from simulation_helpers import PAW_RADIUS, WEIGHT, command, paw_centres, paw_forces, simulation, write_state
-from solver_helpers import BODIES, DOFS, MOTOR_V, Reference, States, random_states
 
+from jumper_warp.kernels import layout
 from jumper_warp.robot.model import LIMIT_DAMPING, LIMIT_STIFFNESS, build_model
 from jumper_warp.robot.motors import vertical_jump_filter
 from jumper_warp.sim.dynamics import JumperDynamics
-from kernels import layout
+from simulation_helpers import PAW_RADIUS, WEIGHT, command, paw_centres, paw_forces, simulation, write_state
+from solver_helpers import BODIES, DOFS, MOTOR_V, Reference, States, random_states
 
 DT = 1.0 / 480.0
 BOUNDED = np.vstack([np.eye(12), np.kron(np.eye(4), [0.0, 1.0, 1.0])])

@@ -5,15 +5,15 @@ import dataclasses
 import numpy as np
 import pytest
 import torch
-from velocity_helpers import edit, states_of, walking_env
 
+from jumper_warp.kernels.mdp import observations as obs
+from jumper_warp.kernels.velocity import observations as velocity
 from jumper_warp.registry import make_task
 from jumper_warp.robot.terrain import TerrainCfg, single_tile
 from jumper_warp.tasks.mirror import LEGS, MOTORS, mirror_of, mirror_of_action
 from jumper_warp.tasks.terms import ObservationTerm
 from jumper_warp.utils.errors import InputError
-from kernels.mdp import observations as obs
-from kernels.velocity import observations as velocity
+from velocity_helpers import edit, states_of, walking_env
 
 HALF = 8
 BODIES = 21

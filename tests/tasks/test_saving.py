@@ -6,17 +6,19 @@ import random
 import sys
 from typing import Any
 
-import hold_height
 import pytest
 import warp as wp
 
+import hold_height
+from jumper_warp.kernels.jump import rewards
+from jumper_warp.kernels.jump.state import JumpState
+from jumper_warp.kernels.mdp.view import RobotView
 from jumper_warp.registry import TASKS, make_task
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.tasks.saving import MAX_ENTRIES, OPTIONAL, TaskError, name_of, plain, task_from_json, task_to_json
 from jumper_warp.tasks.terms import RewardTerm
-from kernels.jump import rewards
-from kernels.jump.state import JumpState
-from kernels.mdp.view import RobotView
+
+JUMP = "jumper_warp.kernels.jump"
 
 
 @wp.func
@@ -136,13 +138,13 @@ def test_setting_that_would_not_come_back_is_not_saved(value):
         (lambda t: t["rewards"][0].update(name="a\nb"), "a name is of letters"),
         (lambda t: t["rewards"][0].update(once="yes"), r"task.rewards\[0\].once: expected bool, got 'yes'"),
         (lambda t: t["rewards"][0].update(weight=10**400), r"weight: must be finite, got a huge integer"),
-        (lambda t: t["rewards"][0].update(func="kernels.jump.state:JumpState"), "is not a @wp.func"),
-        (lambda t: t["rewards"][0].update(func="kernels.jump.rewards:wp"), "there is no such one here"),
-        (lambda t: t["rewards"][0].update(func="kernels.jump.terminations:success", steps=1.0), "must return float"),
+        (lambda t: t["rewards"][0].update(func="jumper_warp.kernels.jump.state:JumpState"), "is not a @wp.func"),
+        (lambda t: t["rewards"][0].update(func="jumper_warp.kernels.jump.rewards:wp"), "there is no such one here"),
+        (lambda t: t["rewards"][0].update(func=f"{JUMP}.terminations:success", steps=1.0), "must return float"),
         (lambda t: t["rewards"][0].update(type="jumper_warp.tasks.terms:TerminationTerm"), "expected .* RewardTerm"),
         (lambda t: t["policy"][0].update(history=10**9), "history must be at most"),
-        (lambda t: t["advance"].update(func="kernels.mdp.view:load_view"), "must be annotated RobotView"),
-        (lambda t: t.update(state="kernels.mdp.env:Nothing"), "not a struct that counts steps"),
+        (lambda t: t["advance"].update(func="jumper_warp.kernels.mdp.view:load_view"), "must be annotated RobotView"),
+        (lambda t: t.update(state="jumper_warp.kernels.mdp.env:Nothing"), "not a struct that counts steps"),
         (lambda t: t["levels"].append({"type": "jumper_warp.robot.motors:LimitsCfg", "lower": 0.0, "upper": 1.0}),
          r"task.levels\[6\]: .* needs struct and values"),
         (lambda t: t.update(levels=t["levels"] * MAX_ENTRIES), f"expected at most {MAX_ENTRIES} entries"),
@@ -179,13 +181,13 @@ def deep(levels):
 
 VALUES = [
     None, True, False, 0, 1, -1, 2.5, -0.0, 1e308, -1e300, 1e-300, math.nan, math.inf, -math.inf, 10**30, 10**400,
-    "", "x", "rest", "a\nb", "\ud800", "os:system", "os.path:join", "trap:func", "kernels.jump.rewards:rest",
-    "kernels.jump.state:JumpState", "kernels.mdp.env:Nothing", "kernels.jump.rewards:wp", "kernels.jump.rewards:",
+    "", "x", "rest", "a\nb", "\ud800", "os:system", "os.path:join", "trap:func", f"{JUMP}.rewards:rest",
+    f"{JUMP}.state:JumpState", "jumper_warp.kernels.mdp.env:Nothing", f"{JUMP}.rewards:wp", f"{JUMP}.rewards:",
     ":rest", "a:b:c", "jumper_warp.tasks.cfg:TaskCfg", "jumper_warp.tasks.terms:Term", "jumper_warp.tasks.cfg:Reset",
     "jumper_warp.tasks.terms:EventTerm", "jumper_warp.robot.description:RobotDescription",
     "jumper_warp.robot.parts:Motor", "jumper_warp.tasks.jump.cfg:GroundCfg", "jumper_warp.tasks.saving:Finder",
     [], [1], [1.0, 2.0], [[1.0]], ["a"] * 3, [None] * 5000, [{}] * 5000, {}, {"type": None}, {"a": 1}, {"type": "os:x"},
-    {"type": "jumper_warp.tasks.jump.cfg:GroundCfg"}, {"func": "kernels.jump.rewards:rest"}, {"a\nb": [math.nan]},
+    {"type": "jumper_warp.tasks.jump.cfg:GroundCfg"}, {"func": f"{JUMP}.rewards:rest"}, {"a\nb": [math.nan]},
     deep(300), {"type": ["x"]}, {"type": {"type": "x"}},
 ]  # fmt: skip
 KEYS = ["extra", "", "a\nb", "\ud800", "type", "func", "name", "self", "weight", "history", "settings", "version"]
@@ -251,6 +253,6 @@ def test_what_is_no_object_is_refused(content):
 
 def test_state_of_another_task_is_refused():
     content = saved(hold_height.hold_height())
-    content["state"] = "kernels.jump.state:JumpState"
+    content["state"] = "jumper_warp.kernels.jump.state:JumpState"
     with pytest.raises(TaskError, match=f"is for .*HoldState, not .*{JumpState.key}"):
         task_from_json(content, [hold_height])

@@ -10,7 +10,11 @@ from jumper_warp.utils.sources import changed_sources, source_sums
 
 
 def test_files_outside_the_project_are_named_by_their_module():
-    saved = {"task": [{"func": "json.decoder:JSONDecoder"}, "kernels.jump.rewards:rest"], "say": "now: nothing", "n": 1}
+    saved = {
+        "task": [{"func": "json.decoder:JSONDecoder"}, "jumper_warp.kernels.jump.rewards:rest"],
+        "say": "now: nothing",
+        "n": 1,
+    }
     held = hashlib.sha256(Path(json.decoder.__file__).read_bytes()).hexdigest()
     assert source_sums(saved) == {"json.decoder": held}
     assert source_sums(["sys:path", "no.such.module:thing", None, 2.0]) == {}

@@ -8,10 +8,10 @@ from typing import Any
 
 import warp as wp
 
+from jumper_warp.kernels.attitude.commands import TurnRanges
+from jumper_warp.kernels.attitude.reset import AttitudeSettings
 from jumper_warp.utils.checks import check_finite, check_not_negative, check_positive
 from jumper_warp.utils.errors import InputError
-from kernels.attitude.commands import TurnRanges
-from kernels.attitude.reset import AttitudeSettings
 
 Pair = tuple[float, float]
 

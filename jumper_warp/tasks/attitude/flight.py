@@ -10,6 +10,13 @@ on, legs meet in every one.
 
 from __future__ import annotations
 
+from jumper_warp.kernels.attitude import observations as attitude
+from jumper_warp.kernels.attitude import rewards, state, terminations
+from jumper_warp.kernels.attitude.commands import give_turn
+from jumper_warp.kernels.attitude.reset import reset_attitude
+from jumper_warp.kernels.attitude.state import AttitudeState
+from jumper_warp.kernels.mdp import rewards as mdp_rewards
+from jumper_warp.kernels.mdp import terminations as mdp_terminations
 from jumper_warp.robot.motors import jumping_motors, walking_filter
 from jumper_warp.tasks.attitude.cfg import AttitudeResetCfg, TurnCfg
 from jumper_warp.tasks.cfg import Command, Reset, TaskCfg
@@ -17,13 +24,6 @@ from jumper_warp.tasks.observations import DRAWN, ROBOT, exact
 from jumper_warp.tasks.randomization import RandomizationCfg
 from jumper_warp.tasks.terms import Advance, Curriculum, ObservationTerm, RewardTerm, StateMetric, TerminationTerm
 from jumper_warp.tasks.units import DEG
-from kernels.attitude import observations as attitude
-from kernels.attitude import rewards, state, terminations
-from kernels.attitude.commands import give_turn
-from kernels.attitude.reset import reset_attitude
-from kernels.attitude.state import AttitudeState
-from kernels.mdp import rewards as mdp_rewards
-from kernels.mdp import terminations as mdp_terminations
 
 TORQUE = 8.0
 """[N m] Of all motors."""

@@ -10,13 +10,13 @@ from typing import Any, Literal
 
 import warp as wp
 
+from jumper_warp.kernels.jump.ground_draws import EVERY_SIDE, GroundRanges
+from jumper_warp.kernels.jump.reset import JumpLevel, JumpSettings
+from jumper_warp.kernels.jump.reset_draws import ResetRanges, mat_reference
+from jumper_warp.kernels.jump.state import vec_schemes
 from jumper_warp.tasks.jump.references import load_reference
 from jumper_warp.utils.checks import check_finite, check_positive
 from jumper_warp.utils.errors import InputError
-from kernels.jump.ground_draws import EVERY_SIDE, GroundRanges
-from kernels.jump.reset import JumpLevel, JumpSettings
-from kernels.jump.reset_draws import ResetRanges, mat_reference
-from kernels.jump.state import vec_schemes
 
 Pair = tuple[float, float]
 SHARES = ("standing", "default", "in_flight", "touchdown", "pushing")

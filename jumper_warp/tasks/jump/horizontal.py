@@ -8,6 +8,10 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+from jumper_warp.kernels.jump import errors, phase, reset, rewards, terminations
+from jumper_warp.kernels.jump.state import JumpState
+from jumper_warp.kernels.mdp import rewards as mdp_rewards
+from jumper_warp.kernels.mdp import terminations as mdp_terminations
 from jumper_warp.robot.motors import horizontal_jump_filter, jumping_motors
 from jumper_warp.tasks.cfg import Command, Reset, TaskCfg
 from jumper_warp.tasks.jump.cfg import GroundCfg, Level, ResetCfg, ladder
@@ -16,10 +20,6 @@ from jumper_warp.tasks.jump.vertical import QUIET, STARTS
 from jumper_warp.tasks.observations import remembered
 from jumper_warp.tasks.terms import Advance, Curriculum, RewardTerm, TerminationTerm
 from jumper_warp.tasks.units import DEG, SECOND, G
-from kernels.jump import errors, phase, reset, rewards, terminations
-from kernels.jump.state import JumpState
-from kernels.mdp import rewards as mdp_rewards
-from kernels.mdp import terminations as mdp_terminations
 
 LANDING_HEIGHT = 0.30
 """[m] Of the base, at which the ballistic estimate ends."""

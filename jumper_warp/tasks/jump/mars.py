@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+from jumper_warp.kernels.jump import rewards, terminations
 from jumper_warp.robot.gravity import EARTH, MARS
 from jumper_warp.robot.motors import MotorCfg, jumping_motors, loose_filter
 from jumper_warp.tasks.cfg import TaskCfg
@@ -19,7 +20,6 @@ from jumper_warp.tasks.jump.horizontal import NEAREST, horizontal_jump, level
 from jumper_warp.tasks.jump.vertical import STARTS, heights, vertical_jump
 from jumper_warp.tasks.terms import RewardTerm
 from jumper_warp.tasks.units import DEG
-from kernels.jump import rewards, terminations
 
 TORQUE, KP = 24.8, 20.0
 """[N m], [N m/rad] Of the transversal motors."""

@@ -1,9 +1,9 @@
 """What policies of the jump tasks see, and their critics."""
 
+from jumper_warp.kernels.jump import observations as jump
+from jumper_warp.kernels.mdp import observations as obs
 from jumper_warp.tasks.observations import DRAWN, POSITION_NOISE, ROBOT, exact
 from jumper_warp.tasks.terms import ObservationTerm
-from kernels.jump import observations as jump
-from kernels.mdp import observations as obs
 
 HEIGHT = ObservationTerm(obs.height, noise=POSITION_NOISE)
 

@@ -6,6 +6,10 @@ reason and how to undo it.
 
 from __future__ import annotations
 
+from jumper_warp.kernels.jump import errors, phase, reset, rewards, terminations
+from jumper_warp.kernels.jump.state import JumpState
+from jumper_warp.kernels.mdp import rewards as mdp_rewards
+from jumper_warp.kernels.mdp import terminations as mdp_terminations
 from jumper_warp.robot.motors import jumping_motors, vertical_jump_filter
 from jumper_warp.tasks.cfg import Command, Reset, TaskCfg
 from jumper_warp.tasks.jump.cfg import Level, ResetCfg, ladder
@@ -13,10 +17,6 @@ from jumper_warp.tasks.jump.observations import VERTICAL, critic
 from jumper_warp.tasks.observations import remembered
 from jumper_warp.tasks.terms import Advance, Curriculum, RewardTerm, TerminationTerm
 from jumper_warp.tasks.units import DEG, SECOND, G
-from kernels.jump import errors, phase, reset, rewards, terminations
-from kernels.jump.state import JumpState
-from kernels.mdp import rewards as mdp_rewards
-from kernels.mdp import terminations as mdp_terminations
 
 PATIENCE = 0.1
 """Share that the always-paid terms keep while a commanded jump has not begun."""

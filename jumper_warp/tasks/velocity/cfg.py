@@ -9,11 +9,11 @@ from typing import Any
 import newton
 import warp as wp
 
+from jumper_warp.kernels.velocity.commands import CommandRanges
+from jumper_warp.kernels.velocity.reset import Map, VelocitySettings
 from jumper_warp.robot.terrain import TerrainCfg, terrain_map
 from jumper_warp.utils.checks import check_finite, check_not_negative
 from jumper_warp.utils.errors import InputError
-from kernels.velocity.commands import CommandRanges
-from kernels.velocity.reset import Map, VelocitySettings
 
 Pair = tuple[float, float]
 Reach = tuple[float, float, float, float]

@@ -13,6 +13,13 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+from jumper_warp.kernels.mdp import observations as obs
+from jumper_warp.kernels.mdp import rewards as mdp_rewards
+from jumper_warp.kernels.mdp import terminations as mdp_terminations
+from jumper_warp.kernels.velocity import commands, rewards, state, terminations
+from jumper_warp.kernels.velocity import observations as velocity
+from jumper_warp.kernels.velocity.reset import reset_velocity
+from jumper_warp.kernels.velocity.state import VelocityState
 from jumper_warp.robot.motors import walking_filter, walking_motors
 from jumper_warp.tasks.cfg import Command, Reset, TaskCfg
 from jumper_warp.tasks.observations import DRAWN, ROBOT, exact, remembered
@@ -20,13 +27,6 @@ from jumper_warp.tasks.randomization import RandomizationCfg
 from jumper_warp.tasks.terms import Advance, Curriculum, ObservationTerm, RewardTerm, StateMetric, TerminationTerm
 from jumper_warp.tasks.units import DEG, SECOND
 from jumper_warp.tasks.velocity.cfg import CommandCfg, VelocityResetCfg
-from kernels.mdp import observations as obs
-from kernels.mdp import rewards as mdp_rewards
-from kernels.mdp import terminations as mdp_terminations
-from kernels.velocity import commands, rewards, state, terminations
-from kernels.velocity import observations as velocity
-from kernels.velocity.reset import reset_velocity
-from kernels.velocity.state import VelocityState
 
 SENSED = ("lin_vel", "ang_vel", "gravity", "angle", "rate")
 """Observations that come as late as the sensors do."""

@@ -11,15 +11,15 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+from jumper_warp.kernels.mdp import rewards as mdp_rewards
+from jumper_warp.kernels.velocity import observations as velocity
+from jumper_warp.kernels.velocity import rewards
 from jumper_warp.robot.terrain import KINDS, TerrainCfg
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.tasks.terms import ObservationTerm, RewardTerm
 from jumper_warp.tasks.units import DEG
 from jumper_warp.tasks.velocity.cfg import CommandCfg
 from jumper_warp.tasks.velocity.flat import WITHOUT_HISTORY, velocity_flat
-from kernels.mdp import rewards as mdp_rewards
-from kernels.velocity import observations as velocity
-from kernels.velocity import rewards
 
 COMMANDS = CommandCfg(narrow=(0.8, 0.6, 0.4, 0.8), wide=(0.8, 0.6, 0.4, 0.8), levels=0)
 """What is commanded on the map."""

@@ -9,12 +9,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from newton.actuators import ClampingDCMotor, DrivePD
 
+from jumper_warp.kernels.actuation import motors as actuator
 from jumper_warp.robot.motors import MotorCfg, MotorKindCfg, jumping_motors, motor_arrays, walking_motors
 from jumper_warp.sim.precision import float64_kernels
-from kernels.actuation import motors as actuator
 
 float64_kernels()
-actuator64 = importlib.import_module("kernels_float64.actuation.motors")
+actuator64 = importlib.import_module("jumper_warp.kernels_float64.actuation.motors")
 
 MOTOR_COORDS = [7, 8, 10, 12, 13, 15, 17, 18, 20, 22, 23, 25]
 MOTOR_DOFS = [6, 7, 9, 11, 12, 14, 16, 17, 19, 21, 22, 24]

@@ -7,6 +7,10 @@ import warp as wp
 from hypothesis import given
 from hypothesis import strategies as st
 
+from jumper_warp.kernels.actuation import command_filter
+from jumper_warp.kernels.actuation.command_filter import FilterParams, filter_leg
+from jumper_warp.kernels.actuation.motors import MotorArrays, load_motor, motor_torque
+from jumper_warp.kernels.scalar import real, vec3
 from jumper_warp.robot.motors import (
     FilterCfg,
     LimitsCfg,
@@ -18,13 +22,9 @@ from jumper_warp.robot.motors import (
     walking_filter,
 )
 from jumper_warp.sim.precision import float64_kernels
-from kernels.actuation import command_filter
-from kernels.actuation.command_filter import FilterParams, filter_leg
-from kernels.actuation.motors import MotorArrays, load_motor, motor_torque
-from kernels.scalar import real, vec3
 
 float64_kernels()
-filter64 = importlib.import_module("kernels_float64.actuation.command_filter")
+filter64 = importlib.import_module("jumper_warp.kernels_float64.actuation.command_filter")
 
 JUMP = filter_params(vertical_jump_filter())
 WALK = filter_params(walking_filter())

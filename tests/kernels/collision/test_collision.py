@@ -4,16 +4,16 @@ from functools import cache
 import numpy as np
 import pytest
 import warp as wp
-from coal_shapes import box, capsule, coal_distance
 from scipy.spatial.transform import Rotation
 
+from coal_shapes import box, capsule, coal_distance
+from jumper_warp.kernels.collision import robot as collision_module
+from jumper_warp.kernels.kinematics import geometry as geometry_module
+from jumper_warp.kernels.kinematics.geometry import LegGeometry
+from jumper_warp.kernels.scalar import quat, vec3
+from jumper_warp.kernels.terrain import ground
+from jumper_warp.kernels.terrain.ground import Ground
 from jumper_warp.sim.precision import float64_kernels
-from kernels.collision import robot as collision_module
-from kernels.kinematics import geometry as geometry_module
-from kernels.kinematics.geometry import LegGeometry
-from kernels.scalar import quat, vec3
-from kernels.terrain import ground
-from kernels.terrain.ground import Ground
 
 wp.set_module_options({"enable_backward": False})
 
@@ -247,7 +247,7 @@ def test_flags_and_clearance_agree_with_coal(margin):
 
 def test_double_precision_agrees():
     float64_kernels()
-    module = importlib.import_module("kernels_float64.collision.robot")
+    module = importlib.import_module("jumper_warp.kernels_float64.collision.robot")
     pos, quat_xyzw, motors = random_poses()
     single = collide(pos, quat_xyzw, np.degrees(motors))
     double = collide(pos, quat_xyzw, np.degrees(motors), module=module)

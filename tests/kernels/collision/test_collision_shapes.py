@@ -1,10 +1,10 @@
 import numpy as np
 import pytest
 import warp as wp
-from coal_shapes import box, capsule, coal_distance
 
-from kernels.collision import distances as collision_shapes
-from kernels.scalar import vec3
+from coal_shapes import box, capsule, coal_distance
+from jumper_warp.kernels.collision import distances as collision_shapes
+from jumper_warp.kernels.scalar import vec3
 
 wp.set_module_options({"enable_backward": False})
 

@@ -3,6 +3,8 @@ import dataclasses
 import numpy as np
 import pytest
 import torch
+from scipy.stats import kstest
+
 from jump_helpers import (
     DEFAULT_ANGLE,
     MOTOR_SLOTS,
@@ -15,13 +17,11 @@ from jump_helpers import (
     resetting,
 )
 from jump_starts import PAW_RADIUS, PLACES, Starts, collision_flags, covers
-from scipy.stats import kstest
-from simulation_helpers import WEIGHT, paw_centres, paw_forces
-
+from jumper_warp.kernels.jump.state import STANCE
 from jumper_warp.registry import make_task
 from jumper_warp.tasks.jump.cfg import GroundCfg, Level
 from jumper_warp.tasks.randomization import RandomizationCfg
-from kernels.jump.state import STANCE
+from simulation_helpers import WEIGHT, paw_centres, paw_forces
 
 N = 8192
 PAWS = np.array([0.24, 0.22])  # [m] ahead and beside, at most: the default pose reaches farther ahead, squats beside

@@ -4,6 +4,8 @@ import math
 import numpy as np
 import pytest
 import torch
+from scipy.spatial.transform import Rotation
+
 from jump_helpers import (
     DEG,
     edit_coordinates,
@@ -14,11 +16,9 @@ from jump_helpers import (
     only,
     random_actions,
 )
-from scipy.spatial.transform import Rotation
-
 from jumper_warp.evaluation.jumps import jump_commands
+from jumper_warp.kernels.jump.state import FLIGHT, LANDED, STANCE
 from jumper_warp.registry import make_task
-from kernels.jump.state import FLIGHT, LANDED, STANCE
 
 TASK = make_task("horizontal-jump")
 N = 64

@@ -3,13 +3,13 @@ import math
 import numpy as np
 import pytest
 import warp as wp
-from jump_helpers import DEG, MOTOR_SLOTS, Robots, edit_episodes, make_env, make_episode, only, without_draws
-from mdp_helpers import array
 from scipy.spatial.transform import Rotation
 
+from jump_helpers import DEG, MOTOR_SLOTS, Robots, edit_episodes, make_env, make_episode, only, without_draws
+from jumper_warp.kernels.jump.state import FLIGHT, LANDED, STANCE
 from jumper_warp.registry import make_task
 from jumper_warp.tasks.mirror import LEGS, mirror_of
-from kernels.jump.state import FLIGHT, LANDED, STANCE
+from mdp_helpers import array
 
 HORIZONTAL, VERTICAL = (without_draws(make_task(name)) for name in ("horizontal-jump", "vertical-jump"))
 NAMES = HORIZONTAL.observation_names

@@ -2,15 +2,15 @@ import dataclasses
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
+
 from jump_helpers import DEG, SCHEMES, begin_by, edit_episodes, episodes_of, make_env, only, resets_of, set_levels
 from jump_starts import PAW_RADIUS, PLACES, Starts, covers, paws_and_velocities
-from scipy.spatial.transform import Rotation
-from solver_helpers import MOTOR_Q, MOTOR_V
-
+from jumper_warp.kernels.jump.state import FLIGHT, LANDED, STANCE
 from jumper_warp.registry import make_task
 from jumper_warp.tasks.jump.cfg import ReferenceCfg
 from jumper_warp.tasks.jump.references import load_reference
-from kernels.jump.state import FLIGHT, LANDED, STANCE
+from solver_helpers import MOTOR_Q, MOTOR_V
 
 N = 4096
 G = 9.81

@@ -1,9 +1,11 @@
 import dataclasses
 import math
 
-import jump_oracle
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
+
+import jump_oracle
 from jump_helpers import (
     DEFAULT_ANGLE,
     DEG,
@@ -15,10 +17,8 @@ from jump_helpers import (
     tilted_by,
 )  # fmt: skip
 from jump_oracle import expected_terms, kernel_inputs, params_of, random_robots, robot_of
-from scipy.spatial.transform import Rotation
-
+from jumper_warp.kernels.jump.state import FLIGHT, LANDED, STANCE
 from jumper_warp.registry import make_task
-from kernels.jump.state import FLIGHT, LANDED, STANCE
 
 TASK = make_task("horizontal-jump")
 E = math.exp

@@ -1,5 +1,7 @@
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
+
 from jump_helpers import DEG, Table, functions, make_episode, make_view
 from jump_oracle import (
     FLIGHT,
@@ -13,10 +15,8 @@ from jump_oracle import (
     rotation_error,
     yaw_error,
 )
-from scipy.spatial.transform import Rotation
-
+from jumper_warp.kernels.jump import terminations
 from jumper_warp.registry import make_task
-from kernels.jump import terminations
 
 holds = Table(functions(terminations, "missed_goal predicted_miss turned_touchdown left_stance second_takeoff"), bool)
 PREDICTED = {"tolerance": 0.55, "steps": 6.0, "height": 0.3}

@@ -2,10 +2,10 @@ import math
 
 import numpy as np
 import pytest
-from jump_helpers import DEFAULT_ANGLE, DEG, MOTOR_SLOTS, Robots, make_episode, without_draws
 
+from jump_helpers import DEFAULT_ANGLE, DEG, MOTOR_SLOTS, Robots, make_episode, without_draws
+from jumper_warp.kernels.jump.state import FLIGHT, LANDED, STANCE
 from jumper_warp.registry import make_task
-from kernels.jump.state import FLIGHT, LANDED, STANCE
 
 TASK = without_draws(make_task("vertical-jump"))
 NAMES = TASK.observation_names

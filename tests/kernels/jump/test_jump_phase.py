@@ -4,13 +4,13 @@ import math
 import numpy as np
 import pytest
 import warp as wp
-from jump_helpers import make_episode, make_view, tilted_by
 
-from kernels.jump import phase as jump_phase
-from kernels.jump import rewards
-from kernels.jump.phase import advance_jump
-from kernels.jump.state import FLIGHT, LANDED, STANCE, JumpState
-from kernels.mdp.view import RobotView
+from jump_helpers import make_episode, make_view, tilted_by
+from jumper_warp.kernels.jump import phase as jump_phase
+from jumper_warp.kernels.jump import rewards
+from jumper_warp.kernels.jump.phase import advance_jump
+from jumper_warp.kernels.jump.state import FLIGHT, LANDED, STANCE, JumpState
+from jumper_warp.kernels.mdp.view import RobotView
 
 STEP = 1.0 / 60.0
 G = 9.81

@@ -4,6 +4,7 @@ import math
 import newton
 import numpy as np
 import pytest
+
 from jump_helpers import (
     DEFAULT_ANGLE,
     DEG,
@@ -16,11 +17,10 @@ from jump_helpers import (
     set_levels,
 )
 from jump_starts import PAW_RADIUS, collision_flags, paws_and_velocities
-from solver_helpers import MOTOR_Q, MOTOR_V
-
+from jumper_warp.kernels.jump.state import FLIGHT, LANDED, STANCE
 from jumper_warp.registry import make_task
 from jumper_warp.tasks.jump.cfg import Level, ResetCfg
-from kernels.jump.state import FLIGHT, LANDED, STANCE
+from solver_helpers import MOTOR_Q, MOTOR_V
 
 N = 4096
 TASK = make_task("vertical-jump")

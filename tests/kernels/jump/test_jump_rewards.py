@@ -2,10 +2,10 @@ import math
 
 import numpy as np
 import pytest
-from jump_helpers import DEFAULT_ANGLE, DEG, Table, functions, make_episode, make_view
 
-from kernels.jump import rewards
-from kernels.jump.state import FLIGHT, LANDED, STANCE
+from jump_helpers import DEFAULT_ANGLE, DEG, Table, functions, make_episode, make_view
+from jumper_warp.kernels.jump import rewards
+from jumper_warp.kernels.jump.state import FLIGHT, LANDED, STANCE
 
 NAMES = """jump_height estimated_jump_height horizontal_velocity orientation angular_velocity joint_symmetry
 ground_posture air_posture retract paws_down soft_impact stance_impact catch_landing damp_landing"""

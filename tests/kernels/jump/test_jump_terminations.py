@@ -1,8 +1,8 @@
 import pytest
-from jump_helpers import Table, functions, make_episode, make_view
 
-from kernels.jump import terminations
-from kernels.jump.state import FLIGHT, LANDED, STANCE
+from jump_helpers import Table, functions, make_episode, make_view
+from jumper_warp.kernels.jump import terminations
+from jumper_warp.kernels.jump.state import FLIGHT, LANDED, STANCE
 
 NAMES = "success wrong_height low_touchdown moved_away slanted_takeoff hard_impact no_jump early_takeoff second_takeoff"
 holds = Table(functions(terminations, NAMES), bool)

@@ -78,8 +78,8 @@ class Build:
         scalar = importlib.import_module(f"{package}.scalar")
         geometry = importlib.import_module(f"{package}.kinematics.geometry")
         self.real = scalar.real
-        self.numpy_real = np.float64 if package == "kernels_float64" else np.float32
-        self.tolerance = 1.0e-9 if package == "kernels_float64" else 1.0e-6
+        self.numpy_real = np.float64 if package == "jumper_warp.kernels_float64" else np.float32
+        self.tolerance = 1.0e-9 if package == "jumper_warp.kernels_float64" else 1.0e-6
         self.legs = leg_geometry_array(load_description(), geometry, "cpu")
         self.kernel = make_kernel(importlib.import_module(f"{package}.kinematics.five_bar"), geometry, scalar)
 
@@ -93,7 +93,7 @@ class Build:
         return fields | {name: table[:, 24 + i] for i, name in enumerate(SCALARS)}
 
 
-@pytest.fixture(scope="module", params=["kernels", "kernels_float64"])
+@pytest.fixture(scope="module", params=["jumper_warp.kernels", "jumper_warp.kernels_float64"])
 def build(request):
     return Build(request.param)
 

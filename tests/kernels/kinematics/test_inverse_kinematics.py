@@ -61,7 +61,7 @@ class Build:
         self.ik = importlib.import_module(f"{package}.kinematics.inverse")
         self.leg_module = importlib.import_module(f"{package}.kinematics.leg")
         self.scalar = importlib.import_module(f"{package}.scalar")
-        self.double = package == "kernels_float64"
+        self.double = package == "jumper_warp.kernels_float64"
         geometry = importlib.import_module(f"{package}.kinematics.geometry")
         self.legs = leg_geometry_array(load_description(), geometry, "cpu")
         self.leg_kernel = make_leg_kernel(package)
@@ -108,14 +108,14 @@ class Build:
         return [array.numpy() for array in out]
 
 
-@pytest.fixture(scope="module", params=["kernels", "kernels_float64"])
+@pytest.fixture(scope="module", params=["jumper_warp.kernels", "jumper_warp.kernels_float64"])
 def build(request):
     return Build(request.param)
 
 
 @pytest.fixture(scope="module")
 def double():
-    return Build("kernels_float64")
+    return Build("jumper_warp.kernels_float64")
 
 
 @pytest.fixture(scope="module")

@@ -4,19 +4,19 @@ import numpy as np
 import pytest
 import torch
 import warp as wp
-from jump_helpers import ending_names, make_env, only, random_actions
-from mdp_helpers import DEFAULT_ANGLE, MOTOR_SLOTS, STEP_DT, SUBSTEPS, array, new_worlds, no_delays, standing_robots
-from probe_task import probe_task
-from solver_helpers import MOTOR_Q, MOTOR_V
 
+from jump_helpers import ending_names, make_env, only, random_actions
 from jumper_warp.envs.skill import Skill
+from jumper_warp.kernels.mdp.actions import action_kernel
+from jumper_warp.kernels.mdp.env import SkillSettings
+from jumper_warp.kernels.mdp.parameters import action_latency
+from jumper_warp.kernels.mdp.reset import tick_kernel
 from jumper_warp.registry import make_task
 from jumper_warp.robot.motors import LimitsCfg, vertical_jump_filter
 from jumper_warp.tasks.randomization import RandomizationCfg
-from kernels.mdp.actions import action_kernel
-from kernels.mdp.env import SkillSettings
-from kernels.mdp.parameters import action_latency
-from kernels.mdp.reset import tick_kernel
+from mdp_helpers import DEFAULT_ANGLE, MOTOR_SLOTS, STEP_DT, SUBSTEPS, array, new_worlds, no_delays, standing_robots
+from probe_task import probe_task
+from solver_helpers import MOTOR_Q, MOTOR_V
 
 DEG = np.pi / 180.0
 SCALE = np.tile([15.0, 90.0, 90.0], 4) * DEG

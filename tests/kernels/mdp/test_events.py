@@ -4,16 +4,16 @@ import numpy as np
 import pytest
 import torch
 import warp as wp
-from jump_helpers import edit_episodes, make_env, random_actions
-from mdp_helpers import STEP_DT, array
-from probe_task import Probe, probe_task
 
+from jump_helpers import edit_episodes, make_env, random_actions
+from jumper_warp.kernels.mdp.events import AT_RESET, AT_STEP, STARTUP
+from jumper_warp.kernels.mdp.parameters import RobotParameters
+from jumper_warp.kernels.mdp.random import Draw, between
 from jumper_warp.registry import make_task
 from jumper_warp.tasks.randomization import RandomizationCfg
 from jumper_warp.tasks.terms import EventTerm
-from kernels.mdp.events import AT_RESET, AT_STEP, STARTUP
-from kernels.mdp.parameters import RobotParameters
-from kernels.mdp.random import Draw, between
+from mdp_helpers import STEP_DT, array
+from probe_task import Probe, probe_task
 
 N = 256
 

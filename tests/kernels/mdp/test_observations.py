@@ -1,9 +1,9 @@
 import numpy as np
+
+from jumper_warp.kernels.mdp import observations as obs
+from jumper_warp.tasks.terms import ObservationTerm
 from mdp_helpers import DEFAULT_ANGLE, write
 from probe_task import Probe, probe_task
-
-from jumper_warp.tasks.terms import ObservationTerm
-from kernels.mdp import observations as obs
 
 N = 16
 TERMS = (obs.contacts, obs.air_times, obs.paw_forces, obs.height, obs.angle)

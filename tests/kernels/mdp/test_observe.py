@@ -1,9 +1,9 @@
 import numpy as np
 import pytest
+
+from jumper_warp.kernels.mdp.env import COMMANDED
 from mdp_helpers import write
 from probe_task import Probe
-
-from kernels.mdp.env import COMMANDED
 
 N = 49
 POLICY = {"value": [0], "both": [1, 2, 3, 4, 5, 6], "late": [7, 8]}

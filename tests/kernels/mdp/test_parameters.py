@@ -4,16 +4,16 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import warp as wp
-from mdp_helpers import MOTOR_SLOTS, array
 from scipy.stats import kstest
 
 from jumper_warp.envs.parameters import robot_parameters
+from jumper_warp.kernels.mdp import parameters
+from jumper_warp.kernels.mdp.parameters import RobotParameters
+from jumper_warp.kernels.mdp.random import make_draw
 from jumper_warp.registry import make_task
 from jumper_warp.robot.motors import jumping_motors
 from jumper_warp.sim.simulation import Simulation
-from kernels.mdp import parameters
-from kernels.mdp.parameters import RobotParameters
-from kernels.mdp.random import make_draw
+from mdp_helpers import MOTOR_SLOTS, array
 
 N = 512
 NAMES = """base_mass link_mass com_shift armature motor_friction gains speed_limits joint_offset friction action_latency

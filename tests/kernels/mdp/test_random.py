@@ -3,10 +3,10 @@ import math
 import numpy as np
 import pytest
 import warp as wp
-from mdp_helpers import array
 from scipy.stats import kstest
 
-from kernels.mdp.random import between, branch, cut_gaussian, make_draw, within
+from jumper_warp.kernels.mdp.random import between, branch, cut_gaussian, make_draw, within
+from mdp_helpers import array
 
 WORLDS, COLUMNS = 4096, 8
 SIGMA_OF_CUT = math.sqrt(0.5161)

@@ -3,17 +3,17 @@ import dataclasses
 import numpy as np
 import pytest
 import warp as wp
-from mdp_helpers import DEFAULT_ANGLE, MOTOR_SLOTS, array, values_of, write
-from probe_task import Probe, probe_task
 from scipy.spatial.transform import Rotation
 from scipy.stats import kstest
 
+from jumper_warp.kernels.mdp.env import BEGUN, COMMANDED, Delays, EnvArrays, Scene, SkillSettings
+from jumper_warp.kernels.mdp.reset import forget_kernel, stand_kernel, tick_kernel
+from jumper_warp.kernels.mdp.track import track_kernel
+from jumper_warp.kernels.mdp.view import RobotArrays
 from jumper_warp.robot.grounds import BlockCfg
 from jumper_warp.sim.simulation import Simulation
-from kernels.mdp.env import BEGUN, COMMANDED, Delays, EnvArrays, Scene, SkillSettings
-from kernels.mdp.reset import forget_kernel, stand_kernel, tick_kernel
-from kernels.mdp.track import track_kernel
-from kernels.mdp.view import RobotArrays
+from mdp_helpers import DEFAULT_ANGLE, MOTOR_SLOTS, array, values_of, write
+from probe_task import Probe, probe_task
 
 N = 96
 SOME = np.arange(N) % 3 == 0

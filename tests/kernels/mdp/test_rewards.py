@@ -2,9 +2,9 @@ import math
 
 import numpy as np
 import pytest
-from jump_helpers import Table, functions, make_episode, make_view
 
-from kernels.mdp import rewards
+from jump_helpers import Table, functions, make_episode, make_view
+from jumper_warp.kernels.mdp import rewards
 
 NAMES = "ground_force action_clip motor_torque_sq joint_acceleration action_rate action_acceleration collision"
 paid = Table(functions(rewards, NAMES), float)

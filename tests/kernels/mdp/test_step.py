@@ -1,5 +1,6 @@
 import numpy as np
 import pytest
+
 from mdp_helpers import STEP_DT, write
 from probe_task import Probe, probe_task
 

@@ -2,9 +2,9 @@ import math
 
 import numpy as np
 import pytest
-from jump_helpers import DEG, Table, functions, make_episode, make_view, tilted_by
 
-from kernels.mdp import terminations
+from jump_helpers import DEG, Table, functions, make_episode, make_view, tilted_by
+from jumper_warp.kernels.mdp import terminations
 
 holds = Table(functions(terminations, "too_long came_apart low_base tilted collided"), bool)
 

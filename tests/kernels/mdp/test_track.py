@@ -2,19 +2,19 @@ import numpy as np
 import pinocchio as pin
 import pytest
 import warp as wp
-from jump_starts import ANKLE
-from mdp_helpers import STEP_DT, array, new_worlds, standing_robots, write
-from solver_helpers import BODIES, Reference, paw_joint, random_states
 
+from jump_starts import ANKLE
 from jumper_warp.envs.skill import Skill
+from jumper_warp.kernels.collision.robot import collision_kernel
+from jumper_warp.kernels.mdp.env import SkillSettings
+from jumper_warp.kernels.mdp.track import track_kernel
+from jumper_warp.kernels.mdp.view import RobotArrays, load_view
+from jumper_warp.kernels.terrain.ground import Ground
 from jumper_warp.registry import make_task
 from jumper_warp.robot.grounds import BlockCfg
 from jumper_warp.sim.simulation import Simulation
-from kernels.collision.robot import collision_kernel
-from kernels.mdp.env import SkillSettings
-from kernels.mdp.track import track_kernel
-from kernels.mdp.view import RobotArrays, load_view
-from kernels.terrain.ground import Ground
+from mdp_helpers import STEP_DT, array, new_worlds, standing_robots, write
+from solver_helpers import BODIES, Reference, paw_joint, random_states
 
 N = 64
 WEIGHT = 142.0  # [N]

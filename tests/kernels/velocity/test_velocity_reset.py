@@ -4,13 +4,13 @@ import dataclasses
 
 import numpy as np
 import pytest
-from jump_starts import PAW_RADIUS, collision_flags, paws_and_velocities
-from mdp_helpers import DEFAULT_ANGLE
 from scipy.spatial.transform import Rotation
+
+from jump_starts import PAW_RADIUS, collision_flags, paws_and_velocities
+from jumper_warp.registry import make_task
+from mdp_helpers import DEFAULT_ANGLE
 from solver_helpers import MOTOR_Q
 from velocity_helpers import edit, states_of, walking_env
-
-from jumper_warp.registry import make_task
 
 N = 1024
 TASK = make_task("velocity-flat")

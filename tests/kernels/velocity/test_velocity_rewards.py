@@ -5,14 +5,14 @@ import inspect
 import numpy as np
 import pytest
 import warp as wp
-from jump_helpers import Table, functions, make_view
-from mdp_helpers import DEFAULT_ANGLE
 
+from jump_helpers import Table, functions, make_view
+from jumper_warp.kernels.mdp.view import mat43, vec12
+from jumper_warp.kernels.velocity import rewards
+from jumper_warp.kernels.velocity.state import VelocityState
 from jumper_warp.tasks.velocity.flat import velocity_trot
 from jumper_warp.tasks.velocity.rough import velocity_rough
-from kernels.mdp.view import mat43, vec12
-from kernels.velocity import rewards
-from kernels.velocity.state import VelocityState
+from mdp_helpers import DEFAULT_ANGLE
 
 NAMES = """linear_velocity yaw_rate vertical_velocity lateral_stability flat stand lateral_position transversal_position
 air_time rapid_stepping restless_stand foot_clearance slip touchdown jerk trot_schedule shank_lean"""
@@ -133,7 +133,7 @@ def test_reward_is_that_of_numpy(name):
 
 def test_every_reward_of_the_task_is_compared():
     used = {term.func.func for task in (velocity_rough(), velocity_trot()) for term in task.rewards}
-    own = {func for func in used if inspect.getmodule(func).__name__ == "kernels.velocity.rewards"}
+    own = {func for func in used if inspect.getmodule(func).__name__ == "jumper_warp.kernels.velocity.rewards"}
     assert {func.__name__ for func in own} == set(EXPECTED)
 
 

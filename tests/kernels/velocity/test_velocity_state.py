@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 import warp as wp
-from jump_helpers import make_view
-from velocity_helpers import FIELDS
 
-from kernels.mdp.view import RobotView
-from kernels.velocity.state import VelocityState, advance_velocity
+from jump_helpers import make_view
+from jumper_warp.kernels.mdp.view import RobotView
+from jumper_warp.kernels.velocity.state import VelocityState, advance_velocity
+from velocity_helpers import FIELDS
 
 WORLDS, STEPS, SETTLE, DT = 6, 140, 30, 1.0 / 60.0
 

@@ -1,0 +1,245 @@
+"""Long flights and what becomes of them: takeoffs by a policy, or open-loop ones whose legs push off unequally.
+
+Open loop the robot squats, holds and extends as in `open_loop`, some legs a little later than others, which throws it
+up tilting and turning. In flight it is asked to turn level; shortly before the landing the jump takes over again, by a
+policy or with the legs held in the default pose.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import torch
+
+from jumper_warp.evaluation.angles import yaw_of
+from jumper_warp.evaluation.jumps import DELAY, jump_commands
+from jumper_warp.evaluation.log import NO_END, EvaluationLog, Metrics, failures, finite, largest, mean
+from jumper_warp.tasks.switching import FALLS_FROM_FLIGHT
+from support.momentum import momentum
+
+JUMP, TURN = 0, 1
+"""Indices of the skills in the environment."""
+RAMP, HOLD, EXTEND = 25, 35, 40
+"""Policy steps of the squat, of holding it, and of the extension at most."""
+SQUAT = 120.0
+"""[deg] Transversal angle of the squat."""
+STRETCHED = -45.0
+"""[deg] Commanded in the extension."""
+HIGH = 0.7
+"""[m] Of the base, from where no paw can touch level ground."""
+UPRIGHT = 30.0
+"""[deg] Tilt of a good landing."""
+CLEAR = 3
+"""Policy steps with all paws up that make a takeoff by a policy; open loop none comes down again, and one will do."""
+AFTER = 1.5
+"""[s] After touchdown, in which a robot must not fall."""
+OUTCOMES = (*(term.name for term in FALLS_FROM_FLIGHT), "landed", "tilted", "no_takeoff")
+ROWS = np.array([[1.0, 1.0], [1.0, -1.0], [-1.0, 1.0], [-1.0, -1.0]])
+"""Of the legs FL, FR, BL, BR: front and left."""
+
+
+@dataclass
+class Flights(EvaluationLog):
+    """What became of one jump per world; arrays have shape (num_envs,). Nothing changes after its end."""
+
+    apex: np.ndarray
+    """[m] (num_envs,) Heights that the jump's policy is told."""
+    late: np.ndarray | None = None
+    """[s] (num_envs, 2) By how much later the front legs, and the left ones, extend than the others; None: the jump's
+    policy takes off."""
+    turns: bool = True
+    """Whether the robots turn in flight."""
+    seconds: float = 9.0
+    end: np.ndarray = field(init=False)
+    """Index in OUTCOMES, -1 while under way."""
+    takeoff_tilt: np.ndarray = field(init=False)
+    """[rad]"""
+    takeoff_spin: np.ndarray = field(init=False)
+    """[rad/s]"""
+    takeoff_momentum: np.ndarray = field(init=False)
+    """[kg m^2/s] Angular, about the com."""
+    largest_tilt: np.ndarray = field(init=False)
+    """[rad] In flight."""
+    touchdown_tilt: np.ndarray = field(init=False)
+    """[rad] In the step before the touchdown."""
+    touchdown_turn: np.ndarray = field(init=False)
+    """[rad] Out of the heading that it began with, at that time."""
+    height: np.ndarray = field(init=False)
+    """[m] Largest of the base."""
+    flight_time: np.ndarray = field(init=False)
+    """[s]"""
+    drift: np.ndarray = field(init=False)
+    """[kg m^2/s] Largest change of the angular momentum high in flight, which only the solver can have made."""
+    tilts: list[np.ndarray] = field(default_factory=list, init=False)
+    """[rad] (num_envs,) After every policy step, until the end."""
+    heights: list[np.ndarray] = field(default_factory=list, init=False)
+    """[m] (num_envs,) Of the base."""
+
+    row = "flight"
+    spacing = 1.6
+
+    def __post_init__(self) -> None:
+        """Begin with nothing done."""
+        n = len(self.apex)
+        self.end, self.step_dt = np.full(n, -1), 1.0 / 60.0
+        self._left, self._down = np.full(n, -1), np.full(n, -1)
+        self._clear, self._turned, self._begun = np.zeros(n, dtype=int), np.zeros(n), np.zeros((n, 3))
+        names = ("takeoff_tilt", "takeoff_spin", "takeoff_momentum", "touchdown_tilt", "touchdown_turn", "flight_time")
+        for name in names:
+            setattr(self, name, np.full(n, np.nan))
+        self.largest_tilt, self.height, self.drift = (np.zeros(n) for _ in range(3))
+
+    def begin(self, env: Any) -> None:
+        """Stand every robot in the default pose."""
+        self.step_dt, goals = env.step_dt, np.zeros((len(self.apex), 3))
+        goals[:, 2] = self.apex
+        env.evaluation_reset(jump_commands(goals, DELAY if self.late is None else 0.0, env.step_dt))
+
+    def open_loop(self) -> np.ndarray:
+        """Return the transversal angles [deg] of the next policy step, (num_envs, 4)."""
+        step, n = len(self.tilts), len(self.apex)
+        squat = 45.0 + (SQUAT - 45.0) * min(step / RAMP, 1.0)
+        delay = self.late @ (0.5 * ROWS.T) / self.step_dt
+        share = np.clip(step + 1 - (RAMP + HOLD) - (delay - delay.min(axis=1, keepdims=True)), 0.0, 1.0)
+        if step < RAMP + HOLD + EXTEND:
+            return squat + (STRETCHED - squat) * share
+        return np.full((n, 4), 45.0)
+
+    def action(self, scale: float, policy: torch.Tensor | None) -> np.ndarray:
+        """Return the jump's action, (num_envs, 12): a policy's, or the default pose; open loop up to takeoff if asked.
+
+        scale [deg]: of the transversal motors' actions.
+        """
+        n = len(self.apex)
+        chosen = np.zeros((n, 12)) if policy is None else policy.cpu().numpy().copy()
+        if self.late is None:
+            return chosen
+        pushing = self._left < 0
+        legs = np.zeros((n, 4, 3))
+        legs[:, :, 1:] = ((self.open_loop() - 45.0) / scale)[:, :, None]
+        chosen[pushing] = legs.reshape(n, 12)[pushing]
+        return chosen
+
+    def look(self, env: Any) -> dict[str, np.ndarray]:
+        """Return what is to be known of every robot."""
+        q, qd = env.sim.joint_q(), env.sim.joint_qd()
+        quat = q[:, 3:7]
+        up = 1.0 - 2.0 * (quat[:, 0] ** 2 + quat[:, 1] ** 2)
+        forces = np.linalg.norm(env.sim.paw_force.numpy(), axis=2)
+        return {"base_pos": q[:, :3].copy(), "tilt": np.arccos(np.clip(up, -1.0, 1.0)), "turn": np.abs(yaw_of(quat)),
+                "rise": qd[:, 2].copy(), "spin": np.linalg.norm(qd[:, 3:6], axis=1), "down": (forces > 0.1).any(axis=0),
+                "ending": env.worlds.ending.numpy().copy(), "momentum": momentum(env.sim)[1]}  # fmt: skip
+
+    def follow(self, env: Any) -> bool:
+        """Look at the environment after a policy step, and ask for a turn where a flight has begun."""
+        before = self._left.copy()
+        ended = super().follow(env)
+        fresh = (self._left >= 0) & (before < 0)
+        if self.turns and fresh.any():
+            env.request(TURN, fresh)
+        return ended
+
+    def update(self, arrays: dict[str, np.ndarray], step_dt: float) -> bool:
+        """Take in a policy step; return whether all have ended."""
+        step, running = len(self.tilts), self.end < 0
+        self._clear = np.where(arrays["down"], 0, self._clear + 1)
+        earliest, needed = (0, CLEAR) if self.late is None else (RAMP + HOLD, 1)
+        left = running & (self._left < 0) & (self._clear >= needed) & (arrays["rise"] > 0.75) & (step >= earliest)
+        self._left[left] = step
+        for name, key in (("takeoff_tilt", "tilt"), ("takeoff_spin", "spin")):
+            getattr(self, name)[left] = arrays[key][left]
+        self.takeoff_momentum[left] = np.linalg.norm(arrays["momentum"][left], axis=1)
+        self._begun[left] = arrays["momentum"][left]
+        landed = running & (self._left >= 0) & (self._down < 0) & arrays["down"]
+        self._down[landed] = step
+        self.touchdown_tilt[landed] = self.tilts[-1][landed] if self.tilts else np.nan
+        self.touchdown_turn[landed] = self._turned[landed]
+        self._turned = arrays["turn"]
+        self.flight_time[landed] = (step - self._left[landed]) * step_dt
+        flying = running & (self._left >= 0) & (self._down < 0)
+        self.largest_tilt[flying] = np.maximum(self.largest_tilt, arrays["tilt"])[flying]
+        change = np.linalg.norm(arrays["momentum"] - self._begun, axis=1)
+        high = flying & (arrays["base_pos"][:, 2] > HIGH)
+        self.drift[high] = np.maximum(self.drift, change)[high]
+        self.height[running] = np.maximum(self.height, arrays["base_pos"][:, 2])[running]
+        for kept, now in ((self.tilts, arrays["tilt"]), (self.heights, arrays["base_pos"][:, 2])):
+            kept.append(np.where(running, now, kept[-1]) if kept else now)
+        fell = running & (arrays["ending"] >= 0)
+        self.end[fell] = arrays["ending"][fell]
+        over = running & ~fell & (self._down >= 0) & (step - self._down >= round(AFTER / step_dt))
+        good = np.degrees(arrays["tilt"]) < UPRIGHT
+        self.end[over] = np.where(good[over], OUTCOMES.index("landed"), OUTCOMES.index("tilted"))
+        late = running & (self._left < 0) & (step > RAMP + HOLD + EXTEND)
+        self.end[late] = OUTCOMES.index("no_takeoff")
+        return bool((self.end >= 0).all())
+
+    @property
+    def success(self) -> np.ndarray:
+        """Whether each robot landed, and stood upright AFTER seconds later."""
+        return self.end == OUTCOMES.index("landed")
+
+    @property
+    def outcomes(self) -> np.ndarray:
+        """Name of what became of each robot."""
+        return np.array([*OUTCOMES, NO_END])[self.end]
+
+    def columns(self) -> dict[str, list]:
+        """Return takeoffs, flights and landings."""
+        numbers = {
+            "takeoff_tilt_deg": np.degrees(self.takeoff_tilt), "takeoff_spin_rad_s": self.takeoff_spin,
+            "touchdown_tilt_deg": np.degrees(self.touchdown_tilt), "apex_m": self.height,
+        }  # fmt: skip
+        return {name: finite(values) for name, values in numbers.items()} | {"end": self.outcomes.tolist()}
+
+    def series(self, worlds: Sequence[int]) -> dict[str, float]:
+        """Return tilts and heights."""
+        series = {}
+        for world in worlds:
+            series[f"tilt/of {world} [deg]"] = float(np.degrees(self.tilts[-1][world]))
+            series[f"height/base of {world} [m]"] = float(self.heights[-1][world])
+        return series
+
+    def notes(self, worlds: Sequence[int]) -> dict[str, Any]:
+        """Return the heights that are asked for, and by how much later legs extend."""
+        told = {"asked_m": self.apex[list(worlds)].tolist()}
+        return told if self.late is None else told | {"late_ms": (1000.0 * self.late[list(worlds)]).tolist()}
+
+
+def flight_metrics(flights: Flights) -> Metrics:
+    """Return the metrics of flights; means are over all that took off, or touched down."""
+    return {
+        "flights": len(flights.end),
+        "landed_upright_rate": float(flights.success.mean()),
+        "mean_takeoff_tilt_deg": mean(np.degrees(flights.takeoff_tilt)),
+        "mean_takeoff_spin_rad_s": mean(flights.takeoff_spin),
+        "mean_takeoff_angular_momentum_nm_s": mean(flights.takeoff_momentum),
+        "max_angular_momentum_change_in_flight_nm_s": largest(flights.drift),
+        "mean_flight_s": mean(flights.flight_time),
+        "mean_apex_m": mean(flights.height),
+        **({"mean_abs_height_error_m": mean(np.abs(flights.height - flights.apex))} if flights.late is None else {}),
+        "mean_largest_tilt_deg": mean(np.degrees(flights.largest_tilt)),
+        "mean_touchdown_tilt_deg": mean(np.degrees(flights.touchdown_tilt)),
+        "max_touchdown_tilt_deg": largest(np.degrees(flights.touchdown_tilt)),
+        "mean_touchdown_turn_deg": mean(np.degrees(flights.touchdown_turn)),
+        "max_touchdown_turn_deg": largest(np.degrees(flights.touchdown_turn)),
+        **failures(flights.outcomes[~flights.success]),
+        "failed_before_touchdown": int((~flights.success & np.isnan(flights.flight_time)).sum()),
+    }
+
+
+def flight_actor(env: Any, flights: Flights, turn: Any, landing: Any | None) -> Callable[[torch.Tensor], torch.Tensor]:
+    """Return the actions of both skills, (2, num_envs, 12), as `run_evaluation` takes them.
+
+    turn: the policy that turns; landing: that of the jump, which acts after the takeoff, or None.
+    """
+    scale = env.skills[JUMP].task.action_scale[1]
+
+    def act(obs: torch.Tensor) -> torch.Tensor:
+        jump = None if landing is None else landing.act(env.skills[JUMP].obs["policy"])
+        action = torch.as_tensor(flights.action(scale, jump), dtype=torch.float32, device=env.device)
+        return torch.stack([action, turn.act(env.skills[TURN].obs["policy"])])
+
+    return act

@@ -1,0 +1,105 @@
+"""How a robot walks: steps, swings, contacts, torques and what it costs, from samples of every policy step."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from jumper_warp.evaluation.log import Metrics
+from jumper_warp.kernels.layout import BODIES
+from jumper_warp.robot.model import LEGS
+
+
+@dataclass
+class Gait:
+    """Samples of all worlds; call it after every policy step. All of them should walk with one command."""
+
+    env: Any
+    """`jumper_warp.envs.env.Env`"""
+    skip: float = 2.0
+    """[s] From the start that are not sampled."""
+    contact: list[np.ndarray] = field(default_factory=list)
+    """(robots, 4) Whether each paw is on the ground."""
+    paw_height: list[np.ndarray] = field(default_factory=list)
+    """[m] (robots, 4) Above the ground below it."""
+    force: list[np.ndarray] = field(default_factory=list)
+    """[N] (robots, 4) Upward, of the last physics step."""
+    torque: list[np.ndarray] = field(default_factory=list)
+    """[N m] (robots, 12)"""
+    power: list[np.ndarray] = field(default_factory=list)
+    """[W] (robots,) That the motors give, without what they take back."""
+    speed: list[np.ndarray] = field(default_factory=list)
+    """[m/s] (robots,) Of the base in the plane."""
+    steps: int = 0
+    """Policy steps seen."""
+
+    def __call__(self, *_: Any) -> None:
+        """Take a sample."""
+        self.steps += 1
+        if self.steps <= round(self.skip / self.env.step_dt):
+            return
+        robot, sim = self.env.robot, self.env.sim
+        torque = robot.torque.numpy().T.astype(float)
+        rate = sim.joint_qd()[:, [6 + 5 * leg + j for leg in range(4) for j in (0, 1, 3)]]
+        self.contact.append(robot.contact_time.numpy().T > 0.0)
+        self.paw_height.append(robot.paw_height.numpy().T.copy())
+        self.force.append(sim.paw_force.numpy()[..., 2].T.copy())
+        self.torque.append(torque)
+        self.power.append(np.maximum(torque * rate, 0.0).sum(axis=1))
+        self.speed.append(np.linalg.norm(sim.base_velocity()[:, :2], axis=1))
+
+    def metrics(self, standing: np.ndarray) -> Metrics:
+        """Return what robots do that have not fallen, nothing if there are none; standing: (robots,) bool."""
+        if not standing.any():
+            return {}
+        model = self.env.sim.model
+        mass = model.body_mass.numpy().reshape(-1, int(BODIES)).sum(axis=1)
+        weight = (mass * np.linalg.norm(model.gravity.numpy()[: len(mass)], axis=1))[standing]
+        return gait_metrics(
+            np.array(self.contact)[:, standing], np.array(self.paw_height)[:, standing],
+            np.array(self.force)[:, standing], np.array(self.torque)[:, standing], np.array(self.power)[:, standing],
+            np.array(self.speed)[:, standing], weight, self.env.step_dt,
+        )  # fmt: skip
+
+
+def gait_metrics(
+    contact: np.ndarray, paw_height: np.ndarray, force: np.ndarray, torque: np.ndarray, power: np.ndarray,
+    speed: np.ndarray, weight: np.ndarray, step_dt: float,
+) -> Metrics:  # fmt: skip
+    """Return the figures of a gait from samples (steps, robots, ...), as `Gait` has them; weight [N]: (robots,).
+
+    The cost of transport is the mean power over that of lifting the weight at the mean speed; None if a robot does not
+    come on. Contact patterns have the names of the paws on the ground.
+    """
+    apexes = np.concatenate([np.zeros(0), *(swing_apexes(contact[:, i, k], paw_height[:, i, k])
+                                           for i in range(contact.shape[1]) for k in range(4))])  # fmt: skip
+    seconds, robots = len(contact) * step_dt, max(contact.shape[1], 1)
+    touchdowns = int((contact[1:] & ~contact[:-1]).sum())
+    load, pace = force.sum(axis=2) / weight, speed.mean(axis=0)
+    metrics: Metrics = {
+        "steps_hz": touchdowns / (4.0 * robots * seconds),
+        "median_swing_apex_m": float(np.median(apexes)) if len(apexes) else None,
+        "cost_of_transport": float(np.mean(power.mean(axis=0) / (weight * pace))) if pace.min() > 0.05 else None,
+        "mean_speed_m_s": float(speed.mean()),
+        "largest_torque_nm": float(np.abs(torque).max()),
+        "rms_torque_nm": float(np.sqrt(np.mean(torque**2))),
+        "paw_force_ripple": float(load.std(axis=0).mean()),
+        "largest_paw_force_n": float(force.max()),
+    }
+    codes = (contact * [1, 2, 4, 8]).sum(axis=2)
+    shares = np.bincount(codes.ravel(), minlength=16) / codes.size
+    for code in np.argsort(-shares, kind="stable"):
+        if shares[code] >= 0.005:
+            paws = "_".join(leg for k, leg in enumerate(LEGS) if code >> k & 1) or "none"
+            metrics[f"share_down_{paws}"] = float(shares[code])
+    return metrics
+
+
+def swing_apexes(contact: np.ndarray, height: np.ndarray) -> np.ndarray:
+    """Return the highest point [m] of each swing of a paw that both begins and ends within the samples (steps,)."""
+    change = np.diff(contact.astype(int))
+    lifts, lands = np.flatnonzero(change == -1) + 1, np.flatnonzero(change == 1) + 1
+    lands = lands[lands > lifts[0]] if len(lifts) else lands[:0]
+    return np.array([height[a:b].max() for a, b in zip(lifts, lands, strict=False)])

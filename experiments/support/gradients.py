@@ -1,0 +1,137 @@
+"""Gradients of a jump's apex, beside central differences.
+
+The jump starts in a squat on the ground and goes through filter, motors, dynamics and contact, at the solver's usual
+step.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import numpy as np
+
+from jumper_warp.diff.bodies import body_gradients, moment_rows
+from jumper_warp.diff.rollout import Rollout, Trajectory, compact
+from jumper_warp.kernels.layout import BODIES, LEG_ROWS, MU_DYNAMIC, MU_STATIC
+from jumper_warp.robot.description import load_description
+from jumper_warp.robot.model import build_model, standing_configuration
+from jumper_warp.robot.motors import jumping_motors, vertical_jump_filter
+
+TICKS = 36
+"""Policy steps of 1/60 s."""
+SQUAT = math.radians(85.0)
+PUSH = (-5.0, -8.0)
+"""[deg] Outer and inner transversal command of the push-off; the filter binds, the motors saturate at first."""
+SLIP_SPEED = 1.5
+"""[m/s] Forward speed of the jump on slippery ground that friction is checked on."""
+SLIP_FRICTION = 0.25
+OUTER, INNER = 1, 2
+"""Motors of the front left leg in the plot."""
+PARAMETERS = ("table", "saturation")
+
+
+def schedule(push: tuple[float, float]) -> np.ndarray:
+    """Return the motor targets [rad] of a push-off [deg], shape (TICKS, 12)."""
+    targets = np.zeros((TICKS, 4, 3))
+    targets[:2, :, 1:] = SQUAT
+    targets[2:, :, 1:] = np.radians(push)
+    return targets.reshape(TICKS, 12)
+
+
+class GradientJump:
+    """Jumps from NumPy inputs, by name: targets (TICKS, 12), q (19,), qd (18,), table (rows,), saturation (12,)."""
+
+    def __init__(self, num_worlds: int, double: bool, device: str | None):
+        self.num_worlds = num_worlds
+        model = build_model(num_worlds, visuals=False, device=device)
+        self.rollout = Rollout(model, jumping_motors(), vertical_jump_filter(), double=double, every=1)
+        squat = dataclasses.replace(load_description(), poses={"squat": (0.0, SQUAT)})
+        q, qd = (row[:, 0] for row in compact(standing_configuration(squat, "squat"), np.zeros(38)))
+        q[2] -= 1.0e-4  # in the ground, where no contact is about to switch
+        self.values = {"targets": schedule(PUSH), "q": q, "qd": qd}
+        self.values |= {name: self.rollout.parameters[name].numpy()[:, 0].astype(float) for name in PARAMETERS}
+
+    def run(self, inputs: dict[str, np.ndarray]) -> Trajectory:
+        """Simulate. Inputs have the world as first axis where they differ."""
+        full = {}
+        for name, value in (self.values | inputs).items():
+            whole = np.broadcast_to(value, (self.num_worlds, *value.shape[-self.values[name].ndim :]))
+            full[name] = np.moveaxis(whole, 0, -1)
+        for name in PARAMETERS:
+            self.rollout.parameters[name].assign(np.ascontiguousarray(full[name]))
+        return self.rollout.run(full["targets"], full["q"], full["qd"])
+
+    def gradients(self, inputs: dict[str, np.ndarray]) -> tuple[Trajectory, dict[str, np.ndarray]]:
+        """Return a jump in one world and the gradients of its apex, by each body's mass too."""
+        jump = self.run(inputs)
+        seed = np.zeros(jump.q.shape)
+        seed[jump.q.numpy()[:, 2, 0].argmax(), 2, 0] = 1.0
+        found = {name: array.numpy()[..., 0].astype(float) for name, array in
+                 self.rollout.backward(jump, q=self.rollout.array(seed)).items()}  # fmt: skip
+        found["mass"] = body_gradients(self.rollout.parameters["table"].numpy(), found["table"][:, None])["mass"][:, 0]
+        return jump, found
+
+
+def apex(jump: Trajectory) -> np.ndarray:
+    """Return the largest base height [m] of every world."""
+    return jump.q.numpy()[:, 2].max(axis=0)
+
+
+def differences(
+    inputs: dict[str, np.ndarray], name: str, directions: np.ndarray, step: float, device: str | None
+) -> np.ndarray:
+    """Return central differences of the apex along directions (n, ...) of an input, each end in a world of its own."""
+    batch = GradientJump(2 * len(directions), double=True, device=device)
+    middle = inputs.get(name, batch.values[name])
+    ends = np.concatenate([middle + step * directions, middle - step * directions])
+    ahead, behind = np.split(apex(batch.run(inputs | {name: ends})), 2)
+    return (ahead - behind) / (2.0 * step)
+
+
+def entries(shape: tuple[int, ...], chosen: list) -> np.ndarray:
+    """Return unit directions along single entries of an input, (n, *shape)."""
+    directions = np.zeros((len(chosen), *shape))
+    for direction, entry in zip(directions, chosen, strict=True):
+        direction[entry] = 1.0
+    return directions
+
+
+def mass_directions(table: np.ndarray) -> np.ndarray:
+    """Return what 1 kg more of each body, its com and the inertia about it held, adds to the parameter table."""
+    directions = np.zeros((int(BODIES), len(table)))
+    for body, direction in enumerate(directions):
+        moments = table[moment_rows(body)]
+        c = moments[1:4] / moments[0]
+        direction[moment_rows(body)] = [1.0, *c, *(c * c), c[0] * c[1], c[0] * c[2], c[1] * c[2]]
+    return directions
+
+
+def check(device: str | None) -> tuple[Trajectory, dict[str, tuple[np.ndarray, np.ndarray]]]:
+    """Return the jump, and by input the gradient of its apex beside the differences."""
+    jump = GradientJump(1, double=True, device=device)
+    rollout, grads = jump.gradients({})
+    motors = [(t, m) for m in (OUTER, INNER) for t in range(TICKS)]
+    coords, rates = [2, 3, 4, 5, *range(7, 19)], list(range(18))
+
+    def pair(found: np.ndarray, name: str, directions: np.ndarray, step: float, inputs: dict) -> tuple:
+        return found, differences(inputs, name, directions, step, device)
+
+    def chosen(name: str, which: list, step: float, gradient: np.ndarray, inputs: dict) -> tuple:
+        found = np.array([gradient[entry] for entry in which])
+        return pair(found, name, entries(gradient.shape, which), step, inputs)
+
+    slip = {"table": jump.values["table"].copy(), "qd": jump.values["qd"].copy()}
+    friction_rows = [leg * int(LEG_ROWS) + int(row) for leg in range(4) for row in (MU_DYNAMIC, MU_STATIC)]
+    slip["table"][friction_rows] = [SLIP_FRICTION, 1.2 * SLIP_FRICTION] * 4
+    slip["qd"][0] = SLIP_SPEED
+    slip_grad = jump.gradients(slip)[1]["table"]
+    position = chosen("q", coords, 1.0e-7, grads["q"], {})
+    speed = chosen("qd", rates, 1.0e-6, grads["qd"], {})
+    return rollout, {
+        "actions": chosen("targets", motors, 2.0e-6, grads["targets"], {}),
+        "mass": pair(grads["mass"], "table", mass_directions(jump.values["table"]), 1.0e-6, {}),
+        "torque_limit": chosen("saturation", list(range(12)), 1.0e-5, grads["saturation"], {}),
+        "friction": chosen("table", friction_rows, 1.0e-6, slip_grad, slip),
+        "initial_state": tuple(np.concatenate(parts) for parts in zip(position, speed, strict=True)),
+    }

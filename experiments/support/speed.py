@@ -1,0 +1,175 @@
+"""What is timed of solver, environment and training; each is checked before."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import time
+from collections.abc import Callable, Sequence
+
+import numpy as np
+import torch
+import warp as wp
+
+from jumper_warp.envs.env import Env
+from jumper_warp.registry import make_task
+from jumper_warp.rl.cfg import PpoCfg
+from jumper_warp.rl.logger import Stopwatch
+from jumper_warp.rl.ppo import Ppo
+from jumper_warp.sim.simulation import Simulation
+from jumper_warp.sim.slices import SlicedGraph, Worlds
+from support.timing import device_memory, median_time, wall_time
+
+SQUAT, DEFAULT, EXTEND = 110.0, 45.0, -10.0
+"""[deg] Commanded transversal angles of the scripted jump."""
+JUMP_STEPS = 45
+"""Policy steps of the scripted jump that are timed: push-off, flight, landing."""
+CALLS = 3
+"""Of a part of a policy step in a repetition."""
+
+
+def command(sim: Simulation, degrees: float, steps: int) -> float:
+    """Command all transversal motors to an angle for some policy steps; return the wall time of one [s]."""
+    target = np.tile([0.0, 1.0, 1.0], 4) * np.radians(degrees)
+    sim.target.assign(np.repeat(target[:, None], sim.num_worlds, axis=1).astype(np.float32))
+    return wall_time(sim.step, sim.device, steps)
+
+
+def time_standing(sim: Simulation, steps: int, repeats: int) -> float:
+    """Return seconds a policy step while standing; every robot must stand."""
+    command(sim, DEFAULT, 90)
+    standing = sim.joint_q()[:, 2]
+    if not (np.all(standing > 0.33) and np.all(standing < 0.37)):
+        raise RuntimeError(f"the robots do not stand: heights {standing.min():.3f} to {standing.max():.3f} m")
+    return median_time(sim.step, sim.device, steps, repeats)
+
+
+def time_jump(sim: Simulation, repeats: int) -> tuple[float, float]:
+    """Return seconds a policy step during a jump, and the mean apex [m]; every robot must jump."""
+    times, apex, push = [], np.zeros(1), JUMP_STEPS // 3
+    for repeat in range(repeats + 1):
+        command(sim, DEFAULT, 60)
+        command(sim, SQUAT, 40)
+        first = push * command(sim, EXTEND, push)
+        if repeat > 0:
+            rest = JUMP_STEPS - push
+            times.append((first + rest * command(sim, DEFAULT, rest)) / JUMP_STEPS)
+            continue
+        for _ in range(JUMP_STEPS - push):  # the first jump only checks the outcome
+            command(sim, DEFAULT, 1)
+            apex = np.maximum(apex, sim.joint_q()[:, 2])
+        if not np.all(apex > 0.8):
+            raise RuntimeError(f"the robots do not jump: apex {apex.min():.3f} to {apex.max():.3f} m")
+    return float(np.median(times)), float(apex.mean())
+
+
+def standing_solver(envs: int, device: str | None) -> Callable[[], None]:
+    """Return what makes a policy step of motors and physics alone, as a graph; every robot must stand."""
+    task = make_task("vertical-jump")
+    sim = Simulation(envs, motors=task.motors, visuals=False, device=device)
+    for _ in range(60):
+        sim.step()
+    standing = sim.joint_q()[:, 2]
+    if not (np.all(standing > 0.33) and np.all(standing < 0.40)):
+        raise RuntimeError(f"the robots do not stand: heights {standing.min():.3f} to {standing.max():.3f} m")
+
+    def advance(worlds: Worlds) -> None:
+        sim.physics.advance(sim.substeps, sim.target, bodies=False, worlds=worlds)
+
+    kept = (sim, SlicedGraph(advance, sim.slices, sim.device))  # the graph works on the simulation's arrays
+    return lambda: kept[1].replay()
+
+
+def stepping_env(envs: int, device: str | None, threads: int | None = None) -> tuple[Env, Callable[[], None]]:
+    """Return an environment in the middle of its episodes, and what steps it with random actions."""
+    env = Env(make_task("vertical-jump"), envs, device=device, threads=threads)
+    actions = torch.rand(16, envs, env.num_actions, device=env.device) * 2.0 - 1.0
+    count = 0
+
+    def step() -> None:
+        nonlocal count
+        env.step(actions[count % len(actions)])
+        count += 1
+
+    env.reset()
+    for _ in range(100):
+        step()
+    figures = env.metrics()
+    if not bool(env.obs.isfinite().all()) or figures["Episode_Termination/came_apart"] > 0.01:
+        raise RuntimeError(f"{100 * figures['Episode_Termination/came_apart']:.1f} % of the episodes came apart")
+    return env, step
+
+
+def time_threads(envs: int, threads: Sequence[int], steps: int, repeats: int) -> dict[str, float]:
+    """Return policy steps a second on a CPU by numbers of threads, and how much faster the last is than the first.
+
+    Repetitions take turns and the best counts, as other work on the machine only slows them down. `thread_speedup` is
+    the smaller one of physics and environment.
+    """
+    bodies: dict[str, list[Callable[[], object]]] = {"physics": [], "env": []}
+    for n in threads:
+        sim = Simulation(envs, visuals=False, device="cpu", threads=n)
+        command(sim, DEFAULT, 90)
+        bodies["physics"].append(sim.step)
+        bodies["env"].append(stepping_env(envs, "cpu", n)[1])
+    figures = {}
+    for name, body in bodies.items():
+        times = np.array([[wall_time(each, "cpu", steps) for each in body] for _ in range(repeats)]).min(axis=0)
+        figures |= {f"{name}_steps_per_s_threads_{n}": envs / t for n, t in zip(threads, times, strict=True)}
+        figures[f"thread_speedup_{name}"] = float(times[0] / times[-1])
+    return figures | {"thread_speedup": min(figures[f"thread_speedup_{name}"] for name in bodies)}
+
+
+def time_stages(envs: int, device: str | None, repeats: int) -> dict[str, float]:
+    """Return seconds of each part of a policy step (`Env.stages`), launched again and again from the same state."""
+    env, _ = stepping_env(envs, device)
+    saved, parts = env.state_dict(), {}
+    for name in env.stages():
+        graph = SlicedGraph(lambda worlds, name=name: env.stages(worlds)[name](), env.sim.slices, env.wp_device)
+        parts[name] = median_time(graph.replay, device, CALLS, repeats)
+        env.load_state_dict(saved)
+    return parts
+
+
+def time_ppo(envs: int, cfg: PpoCfg, iterations: int, device: str | None) -> dict[str, float]:
+    """Return figures of training with this package's PPO; the policy must have changed and stayed finite.
+
+    `ppo_device_memory_gib`: in use on a GPU, by whatever. With overlap, `ppo_update_s` is what the update takes longer
+    than the rollout beside it. `ppo_ready_s`: compilation and the first iterations, until all graphs are captured.
+    """
+    env, _ = stepping_env(envs, device)
+    begin = time.perf_counter()
+    ppo = Ppo(env, cfg)
+    before = ppo.model.log_std.detach().clone()
+    ppo.prepare()
+    for _ in range(3):  # eager, capture, replay
+        ppo.iterate()
+    wp.synchronize_device(device)
+    ready, watch = time.perf_counter() - begin, Stopwatch(env.device)
+
+    def iterate() -> None:
+        watch.start()
+        ppo.iterate(mark=watch.mark)
+
+    wall = wall_time(iterate, device, iterations)
+    collect, update = watch.read()
+    after = ppo.model.log_std.detach()
+    if not bool(after.isfinite().all()) or torch.equal(after, before):
+        raise RuntimeError("the policy did not learn")
+    figures = {"ppo_steps_per_s": cfg.num_steps * envs / wall, "ppo_iteration_s": wall, "ppo_ready_s": ready}
+    if memory := device_memory(wp.get_device(device)):
+        figures["ppo_device_memory_gib"] = memory / 2**30
+    return {**figures, "ppo_collect_s": collect, "ppo_update_s": update}
+
+
+def time_rsl_rl(envs: int, num_steps: int, iterations: int, device: str | None) -> dict[str, float]:
+    """Return figures of training with rsl-rl-lib on the same environment, with the same settings."""
+    from jumper_warp.envs.rsl_rl import RslRlVecEnv
+    from jumper_warp.rl.rsl_rl import train_rsl_rl
+
+    env, _ = stepping_env(envs, device)
+    with contextlib.redirect_stdout(io.StringIO()):
+        cfg = PpoCfg(num_steps=num_steps)
+        runner = train_rsl_rl(RslRlVecEnv(env, num_steps), cfg, iterations=2, save_interval=10**6, seed=1)
+        wall = wall_time(lambda: runner.learn(iterations), device) / iterations
+    return {"rsl_rl_steps_per_s": num_steps * envs / wall, "rsl_rl_iteration_s": wall}

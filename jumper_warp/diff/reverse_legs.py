@@ -1,0 +1,55 @@
+"""The reverse pass of a rollout where a thread has a leg: a few rows at a time, in four launches."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import warp as wp
+
+from jumper_warp.sim.dynamics import JumperDynamics
+
+SPAN = 4
+"""Rows whose steps are taken at a time."""
+
+
+class LegReverse:
+    """Launches `jumper_warp.kernels.dynamics.adjoint.rollout_legs_adjoint` and `constants_adjoint`."""
+
+    def __init__(self, dynamics: JumperDynamics, every: int):
+        """Allocate; every: physics steps from row to row."""
+        self._dynamics, self._modules = dynamics, dynamics.modules
+        self._device, self._num = dynamics.model.device, dynamics.model.world_count
+        module, shape = self._modules.leg_record, {"dtype": dynamics.real, "device": self._device}
+        self._record = module.LegRecord()
+        entries = SPAN * (every + 1)
+        self._record.base = wp.zeros((entries, int(module.BASE_FIELDS), self._num), **shape)
+        self._record.legs = wp.zeros((entries, int(module.LEG_FIELDS), self._num, 4), **shape)
+
+    def run(self, settings: Any, motion: list[Any], seeds: Any, gradients: Any) -> None:
+        """Add to `gradients`, whose q and qd hold the seeds of the last row.
+
+        settings: `StepSettings`. motion: `Timing`, `Actuation`, `Commands`, filtered targets, `Rows` of the rollout.
+        seeds: gradient by these rows.
+        """
+        robot, record, num = self._dynamics.robot, self._record, self._num
+        legs, constants = self._modules.rollout_legs_adjoint, self._modules.constants_adjoint
+        timing, *actuated, rows = motion
+        turns = 8 if self._device.is_cuda else 1  # a warp of a GPU has eight worlds, or eight steps of one
+        threads = -(-num // 8) * 8
+
+        def launch(kernel: wp.Kernel, dim: tuple[int, ...], *inputs: Any) -> None:
+            wp.launch(kernel, dim=(*dim, 4), inputs=list(inputs), device=self._device, block_dim=4 * turns)
+
+        for end in range(rows.q.shape[0] - 1, 0, -SPAN):
+            span = legs.Span()
+            span.begin, span.end = max(0, end - SPAN), end
+            launch(legs.replay_legs_kernel, (end - span.begin, threads), num, robot, settings, *motion, span, record)
+            launch(legs.reverse_legs_kernel, (threads,), num, robot, settings, *motion, seeds, span, record, gradients)
+            launch(
+                constants.leg_constants_kernel, (num, turns),
+                turns, robot, settings, timing, rows, seeds, span, record, gradients,
+            )  # fmt: skip
+            launch(
+                constants.motor_constants_kernel, (num, turns),
+                turns, settings, timing, *actuated, seeds, span, record, gradients,
+            )  # fmt: skip

@@ -1,0 +1,155 @@
+"""Planned motions carried out by simulated robots, and measured: data as a robot would give it."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import warp as wp
+
+from jumper_warp.identification.motions import Motion
+from jumper_warp.identification.plans import SAMPLES, TICK, Plan
+from jumper_warp.identification.replay import Record, Replay, Starts
+from jumper_warp.identification.residuals import HANGING_HEIGHT, NoiseLevels
+from jumper_warp.identification.stance import stance
+from jumper_warp.robot.description import load_description
+from jumper_warp.robot.motors import MotorCfg
+from jumper_warp.robot.values import RobotValues
+from jumper_warp.sim.simulation import Simulation, SolverName, motor_values
+from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.rotations import from_vector, multiply
+
+REST = 0.75
+"""[s] In which a robot comes to rest in the first pose before a motion is recorded."""
+HELD = 1.0e4
+"""[kg] Of a base that is held in a simulation, which puts it back after each step."""
+
+
+def start_of(replay: Replay, plan: Plan, robots: RobotValues) -> Starts:
+    """Return the pose of the first targets, at rest, paws on the ground or the base held."""
+    angle, rest = plan.target[:1] - robots.offset, np.zeros((1, 12))
+    height, quaternion = HANGING_HEIGHT, np.array([[0.0, 0.0, 0.0, 1.0]])
+    if plan.base == "free":
+        height = stance(replay.description, angle, rest).height[0] + 1.0e-3
+    zero = np.zeros((1, 3))
+    return Starts(np.array([[0.0, 0.0, height]]), quaternion, zero, zero, angle, rest)
+
+
+def replay_plan(replay: Replay, plan: Plan, robots: RobotValues, refine: int = 1) -> Record:
+    """Return what a robot does in a plan after it came to rest, rows at 240 Hz; refine: steps in 1/480 s."""
+    period = TICK / SAMPLES
+    stride = 2 * refine
+    rest = round(REST / period)
+    rows = plan.rows
+    target = np.repeat(np.concatenate([np.repeat(rows[:1], rest, axis=0), rows]), stride, axis=0)
+    record = replay.run(
+        robots, start_of(replay, plan, robots), target, rows=rest + len(rows), stride=stride, dt=period / stride,
+        base=plan.base, torque_limit=plan.torque_limit,
+    )  # fmt: skip
+    return Record(*(getattr(record, name)[rest:].copy() for name in list(vars(record))[:-1]), record.valid)
+
+
+def simulate_plan(
+    plan: Plan, *, solver: SolverName = "jumper", robots: RobotValues | None = None, dt: float = 1.0 / 480.0
+) -> Record:
+    """Return what a robot does in a plan after it came to rest, rows at 240 Hz, on one of the two solvers.
+
+    Raises InputError: dt [s] does not divide 1/240 s.
+    """
+    period = TICK / SAMPLES
+    stride = round(period / dt)
+    if stride < 1 or abs(stride * dt - period) > 1.0e-6 * period:
+        raise InputError(f"dt must divide 1/240 s, got {dt}")
+    robots = RobotValues.nominal(1) if robots is None else robots
+    held = plan.base == "fixed"
+    sim = _simulation(plan, solver, robots, dt, held)
+    rows = plan.rows
+    rest = round(REST / period)
+    target = np.concatenate([np.repeat(rows[:1], rest, axis=0), rows])
+    late = float(robots.latency[0, 0]) / dt
+    wanted = wp.zeros((12, 1), dtype=float, device=sim.device)
+    found = []
+    begin = sim.joint_q()[0, :7].copy()
+    for row in range(len(target)):
+        for step in range(stride):
+            now = row * stride + step
+            whole = math.floor(late)
+            newer, older = (target[max(now - whole - i, 0) // stride] for i in (0, 1))
+            aim = (1.0 - (late - whole)) * newer + (late - whole) * older
+            wanted.assign(aim[:, None].astype(np.float32))
+            if step == 0:
+                q, qd = sim.joint_q()[0].copy(), sim.joint_qd()[0].copy()
+            sim.physics.advance(1, wanted)
+            if step == 0 and row >= rest:  # the torques are those that this step began with
+                torque = sim.torque.numpy()[:, 0]
+                found.append(np.concatenate([motor_values(q[7:27]), motor_values(qd[6:26]), torque, q[:7]]))
+            if held:
+                _put_back(sim, begin)
+    table = np.array(found)[:, :, None]
+    valid = np.array([bool(np.isfinite(table).all()) and sim.physics.invalid.numpy()[0] == 0])
+    return Record(table[:, :12], table[:, 12:24], table[:, 24:36], table[:, 36:39], table[:, 39:43], valid)
+
+
+def _simulation(plan: Plan, solver: SolverName, robots: RobotValues, dt: float, held: bool) -> Simulation:
+    """Return the simulation of one robot in the first pose of a plan."""
+    values = RobotValues(**{name: value[:1].copy() for name, value in vars(robots).items()})
+    if held:
+        values.base_mass[:], values.base_com[:] = HELD, 0.0
+    motors = MotorCfg.from_description(load_description(), "jumping", plan.torque_limit, plan.torque_limit)
+    sim = Simulation(1, solver=solver, motors=motors, dt=dt, visuals=False, robot=values, device="cpu", threads=1)
+    angle = plan.target[0] - values.offset[0]
+    q = sim.joint_q()[0].copy()
+    q[7 + motor_values(np.arange(20))] = angle
+    height = stance(load_description(), angle[None], np.zeros((1, 12))).height[0]
+    q[:3] = [0.0, 0.0, HANGING_HEIGHT if held else height + 1.0e-3]
+    sim.state.joint_q.assign(q.astype(np.float32))
+    sim.physics.write_bodies()
+    if held:
+        weight = np.zeros((sim.model.body_count, 6), dtype=np.float32)
+        weight[0, :3] = -HELD * sim.model.gravity.numpy().reshape(-1, 3)[0]
+        sim.state.body_f.assign(weight)
+    return sim
+
+
+def _put_back(sim: Simulation, pose: np.ndarray) -> None:
+    """Put the base back to a pose, at rest."""
+    q, qd = sim.state.joint_q.numpy(), sim.state.joint_qd.numpy()
+    q[:7], qd[:6] = pose, 0.0
+    sim.state.joint_q.assign(q)
+    sim.state.joint_qd.assign(qd)
+
+
+def measured(
+    plan: Plan,
+    name: str,
+    record: Record,
+    robots: RobotValues,
+    rng: np.random.Generator | None,
+    noise: NoiseLevels | None = None,
+    *,
+    torque: bool = False,
+) -> Motion:
+    """Return a record as sensors would read it: angles and rates at 240 Hz, the base in every other row.
+
+    rng: of the noise; None: without. torque: whether the motors report theirs.
+    """
+    levels = (noise or NoiseLevels()).of_channels
+    rows = len(plan.rows)
+    values = {
+        "angle": record.angle[:, :, 0] + robots.offset[:1],
+        "rate": record.rate[:, :, 0],
+        "torque": record.torque[:, :, 0],
+        "position": record.position[:, :, 0],
+    }
+    quaternion = record.quaternion[:, :, 0]
+    if rng is not None:
+        values = {key: x + levels[key][0] * rng.normal(size=x.shape) for key, x in values.items()}
+        quaternion = multiply(from_vector(levels["orientation"][0] * rng.normal(size=(rows, 3))), quaternion)
+    values["position"], quaternion = values["position"].copy(), quaternion.copy()
+    values["position"][1::2], quaternion[1::2] = math.nan, math.nan
+    if not torque:
+        del values["torque"]
+    return Motion(
+        name=name, time=TICK / SAMPLES * np.arange(rows), target=plan.rows, quaternion=quaternion, base=plan.base,
+        torque_limit=plan.torque_limit, notes={"kind": plan.kind}, **values,
+    )  # fmt: skip

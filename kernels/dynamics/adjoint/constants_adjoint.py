@@ -1,0 +1,150 @@
+"""Gradients of a rollout by constants of legs and motors, for GPUs: steps side by side, once run backwards."""
+
+import warp as wp
+
+from ...actuation.motors import MotorParams
+from ...scalar import real, vec3
+from ...state import BaseState
+from ..step import Robot, StepSettings, load_leg
+from ..world.rollout import Actuation, Commands, Rows, Timing, load_world_motor, row_vec3
+from .command_adjoint import add_motor_constants, add_offsets, motor_gradient
+from .gradients import Gradients, ThreadSums
+from .leg_adjoint import add_leg_constants, held_base, leg_gradient
+from .leg_record import ANGLES, FILTER, RATES, LegRecord, get_base, get_base_weights, get_law, get_leg_weights, get_vec
+from .rollout_adjoint import everything
+from .rollout_legs_adjoint import Span, first_entry
+from .virtual_power import BaseFactors, BaseSeeds, LegFactors
+
+wp.set_module_options({"enable_backward": False, "fast_math": True})
+
+
+@wp.struct
+class Turn:
+    """A step of a span that one of the threads of a leg takes."""
+
+    step: int
+    entry: int  # of the record
+    weight: real  # 0 where a thread repeats the last step, as there are none left
+
+
+@wp.func
+def turns_of(timing: Timing, span: Span, turns: int) -> int:
+    """Return how many steps each of `turns` threads takes, one after the other."""
+    return ((span.end - span.begin) * timing.every + turns - 1) / turns
+
+
+@wp.func
+def turn_at(timing: Timing, span: Span, number: int) -> Turn:
+    """Return step `number` of a span."""
+    found = Turn()
+    end = span.end * timing.every
+    found.step = span.begin * timing.every + number
+    found.weight = wp.where(found.step < end, real(1.0), real(0.0))
+    found.step = wp.min(found.step, end - 1)
+    row = found.step / timing.every
+    found.entry = first_entry(timing, span, row) + found.step - row * timing.every
+    return found
+
+
+@wp.kernel
+def leg_constants_kernel(
+    # in
+    turns: int,
+    robot: Robot,
+    settings: StepSettings,
+    timing: Timing,
+    rows: Rows,
+    seeds: Rows,
+    span: Span,
+    record: LegRecord,
+    # in, out
+    gradients: Gradients,
+):
+    """Add the gradients by constants of legs of the steps of a span; launch over (worlds, turns, 4).
+
+    turns: threads that share the steps of a leg, 8 on a GPU, with a warp a world, and 1 on a CPU.
+    """
+    place, turn, leg = wp.tid()
+    world = settings.first + place
+    dt = settings.dt
+    own = load_leg(robot, world, leg)
+    sums = ThreadSums()
+    sums.parameters = gradients.parameters
+    sums.world = world
+    sums.adds = turn == 0
+    sums.turns = True
+    for number in range(turns_of(timing, span, turns)):
+        at = turn_at(timing, span, number * turns + turn)
+        sums.weight = at.weight
+        i = at.entry
+        base = get_base(record, i, world)
+        law = get_law(record, i, world, leg)
+        held = held_base(record, world, i, dt, base, get_base_weights(record, i, world))
+        weights = get_leg_weights(record, i, world, leg)
+        found = leg_gradient(robot, own, dt, world, leg, rows, seeds, at.step, i, record, base, law, held, weights)
+        add_leg_constants(sums, leg, law, found)
+
+
+@wp.kernel
+def motor_constants_kernel(
+    # in
+    turns: int,
+    settings: StepSettings,
+    timing: Timing,
+    actuation: Actuation,
+    commands: Commands,
+    safe: wp.array3d(dtype=real),
+    seeds: Rows,
+    span: Span,
+    record: LegRecord,
+    # in, out
+    gradients: Gradients,
+):
+    """Add those by constants of motors, launched likewise.
+
+    With those of the legs in one kernel, a GPU's threads would keep more at a time than its first cache holds.
+    """
+    place, turn, leg = wp.tid()
+    world = settings.first + place
+    motors = wp.zeros(shape=(3,), dtype=MotorParams)
+    for j in range(motors.shape[0]):
+        motors[j] = load_world_motor(actuation, 3 * leg + j, world)
+    late = actuation.latency[world] / settings.dt
+    of_leg = ThreadSums()
+    of_leg.parameters = gradients.parameters
+    of_leg.world = world
+    of_leg.adds = turn == 0
+    of_leg.turns = True
+    of_legs = of_leg
+    of_legs.adds = turn == 0 and leg == 0
+    of_legs.legs = True
+    for number in range(turns_of(timing, span, turns)):
+        at = turn_at(timing, span, number * turns + turn)
+        of_leg.weight = at.weight
+        of_legs.weight = at.weight
+        angles = get_vec(record, at.entry, ANGLES, world, leg)
+        rates = get_vec(record, at.entry, RATES, world, leg)
+        torque = settings.dt * get_leg_weights(record, at.entry, world, leg).rates
+        if seeds.torque.shape[0] > 0:
+            torque += row_vec3(seeds.torque, at.step, 3 * leg, world)
+        for c in range(motors.shape[0]):
+            by_motor = motor_gradient(
+                motors[c], late, commands, safe, timing, settings.dt, at.step, 3 * leg + c, world, angles[c], rates[c]
+            )
+            add_motor_constants(of_leg, of_legs, 3 * leg + c, torque[c], by_motor)
+        by_filter = vec3(real(0.0))
+        if actuation.filtered != 0 and at.step - (at.step / timing.substeps) * timing.substeps == 0:
+            by_filter = get_vec(record, at.entry, FILTER, world, leg)
+        add_offsets(of_leg, leg, by_filter)
+
+
+@wp.kernel(enable_backward=True)
+def adjoints_kernel(
+    factors: LegFactors, base: BaseFactors, base_seeds: BaseSeeds, robot: Robot, actuation: Actuation, numbers: Rows,
+    state: BaseState, sums: wp.array(dtype=real),
+):  # fmt: skip
+    """Never launched: a kernel with a backward pass makes Warp generate the adjoints of all that it calls."""
+    world = wp.tid()
+    launched = int(0)  # Warp makes the adjoints anyway, and the compiler drops this kernel's own code
+    if launched > 0:
+        sums[world] = everything(factors, base, base_seeds, robot, actuation, numbers, state, world)

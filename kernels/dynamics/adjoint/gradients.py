@@ -1,0 +1,208 @@
+"""Where the reverse pass of a rollout adds up its gradients."""
+
+from typing import Any
+
+import warp as wp
+
+from ...actuation.command_filter import FilterParams, Limits
+from ...actuation.joint_forces import JointParams
+from ...actuation.motors import MotorParams
+from ...actuation.springs import LegSpring
+from ...actuation.stops import StopParams
+from ...kinematics.geometry import LegGeometry
+from ...lanes import sum_legs, sum_turns
+from ...layout import (
+    ARMATURE,
+    BASE,
+    DAMPING,
+    FRICTION,
+    HOUSING,
+    INNER_SHANK,
+    INNER_THIGH,
+    KNEE_DAMPING,
+    KNEE_LIMIT,
+    LEG_ROWS,
+    LOWER,
+    OUTER_SHANK,
+    OUTER_THIGH,
+    PARAMETER_ROWS,
+    SPRING,
+    STOP_KD,
+    STOP_KE,
+    SUM_LOWER,
+    SUM_UPPER,
+    UPPER,
+)
+from ...scalar import real, vec3
+from ..inertia import MassMoments
+from ..leg_dynamics import LegMasses
+from ..world.rollout import FILTER_HORIZON, FILTER_ROWS, FILTER_SPEED
+
+wp.set_module_options({"enable_backward": False})
+
+# rows of a leg's geometry: hip (3), then the lengths in the order of `LegGeometry`, its signs left out
+GEOMETRY_ROWS = wp.constant(10)
+
+# rows of the gradient by what a world has throughout: the parameter table, then 12 a motor constant, then
+MOTOR_GRADIENT = wp.constant(PARAMETER_ROWS)  # kp, kd, saturation, peak, cutoff_speed, no_load_speed, offset
+FADE_GRADIENT = wp.constant(MOTOR_GRADIENT + 84)  # 2: start and end
+LATENCY_GRADIENT = wp.constant(FADE_GRADIENT + 2)
+FILTER_GRADIENT = wp.constant(LATENCY_GRADIENT + 1)
+GEOMETRY_GRADIENT = wp.constant(FILTER_GRADIENT + FILTER_ROWS)  # GEOMETRY_ROWS a leg
+GRADIENT_ROWS = wp.constant(GEOMETRY_GRADIENT + 40)
+
+
+@wp.struct
+class Gradients:
+    """Gradients of one number by everything that a rollout read, per world."""
+
+    q: wp.array2d(dtype=real)  # of row 0, (ROW_COORDS, num_worlds)
+    qd: wp.array2d(dtype=real)  # (ROW_RATES, num_worlds)
+    target: wp.array3d(dtype=real)  # (T, 12, num_worlds)
+    before: wp.array2d(dtype=real)  # (12, num_worlds), to be zeroed first
+    wrench: wp.array3d(dtype=real)  # (T, 6, num_worlds), likewise
+    safe: wp.array3d(dtype=real)  # of the filtered targets, (T, 12, num_worlds), likewise
+    parameters: wp.array2d(dtype=real)  # (GRADIENT_ROWS, num_worlds)
+
+
+@wp.struct
+class ThreadSums:
+    """Where the threads of a warp add what each of them found."""
+
+    parameters: wp.array2d(dtype=real)  # (GRADIENT_ROWS, num_worlds)
+    world: int
+    weight: real  # of what this thread found
+    adds: bool  # whether it adds the sum of what all of them found
+    turns: bool  # over those that have other steps of the same leg
+    legs: bool  # over those that have other legs
+
+
+@wp.func
+def add_entry(sums: wp.array(dtype=real), row: int, x: real):
+    """Add a number to a row."""
+    sums[row] = sums[row] + x
+
+
+@wp.func
+def add_entry(sums: ThreadSums, row: int, x: real):  # noqa: F811
+    """Add what some threads found to a row of their world. Only one of them adds, and does not wait for it."""
+    total = sums.weight * x
+    if sums.turns:
+        total = sum_turns(total)
+    if sums.legs:
+        total = sum_legs(total)
+    if sums.adds:
+        wp.atomic_add(sums.parameters, row, sums.world, total)
+
+
+@wp.func
+def add_vec3(sums: Any, row: int, v: vec3):
+    """Add a vector to three rows."""
+    for i in range(3):
+        add_entry(sums, row + i, v[i])
+
+
+@wp.func
+def add_moments(sums: Any, row: int, m: MassMoments):
+    """Add the gradient by a link's mass moments."""
+    add_entry(sums, row, m.mass)
+    add_vec3(sums, row + 1, m.first)
+    for i in range(6):
+        add_entry(sums, row + 4 + i, m.second[i])
+
+
+@wp.func
+def add_masses(sums: Any, leg: int, masses: LegMasses):
+    """Add the gradient by the mass moments of a leg."""
+    row = leg * LEG_ROWS
+    add_moments(sums, row + HOUSING, masses.housing)
+    add_moments(sums, row + OUTER_THIGH, masses.outer_thigh)
+    add_moments(sums, row + OUTER_SHANK, masses.outer_shank)
+    add_moments(sums, row + INNER_THIGH, masses.inner_thigh)
+    add_moments(sums, row + INNER_SHANK, masses.inner_shank)
+
+
+@wp.func
+def add_joints(sums: Any, leg: int, p: JointParams):
+    """Add the gradient by the joint-space parameters of a leg."""
+    row = leg * LEG_ROWS
+    add_vec3(sums, row + ARMATURE, p.armature)
+    add_vec3(sums, row + FRICTION, p.friction)
+    add_vec3(sums, row + DAMPING, p.damping)
+    add_entry(sums, row + KNEE_DAMPING, p.knee_damping_outer)
+    add_entry(sums, row + KNEE_DAMPING + 1, p.knee_damping_inner)
+    add_entry(sums, row + KNEE_LIMIT, p.knee_limit_outer)
+    add_entry(sums, row + KNEE_LIMIT + 1, p.knee_limit_inner)
+
+
+@wp.func
+def add_spring(sums: Any, leg: int, p: LegSpring):
+    """Add the gradient by the spring of a leg."""
+    row = leg * LEG_ROWS + SPRING
+    add_entry(sums, row, p.stiffness)
+    add_entry(sums, row + 1, p.length)
+
+
+@wp.func
+def add_stops(sums: Any, leg: int, p: StopParams):
+    """Add the gradient by the hard stops of a leg."""
+    row = leg * LEG_ROWS
+    add_vec3(sums, row + LOWER, p.lower)
+    add_vec3(sums, row + UPPER, p.upper)
+    add_entry(sums, row + SUM_LOWER, p.sum_lower)
+    add_entry(sums, row + SUM_UPPER, p.sum_upper)
+    add_entry(sums, row + STOP_KE, p.ke)
+    add_entry(sums, row + STOP_KD, p.kd)
+
+
+@wp.func
+def add_geometry(sums: Any, leg: int, geo: LegGeometry):
+    """Add the gradient by a leg's lengths."""
+    row = GEOMETRY_GRADIENT + leg * GEOMETRY_ROWS
+    add_vec3(sums, row, geo.hip)
+    add_entry(sums, row + 3, geo.outer_x)
+    add_entry(sums, row + 4, geo.inner_x)
+    add_entry(sums, row + 5, geo.plane_y)
+    add_entry(sums, row + 6, geo.knee_y)
+    add_entry(sums, row + 7, geo.thigh)
+    add_entry(sums, row + 8, geo.shank)
+    add_entry(sums, row + 9, geo.paw_radius)
+
+
+@wp.func
+def add_com(sums: Any, mass: real, com: vec3, gradient: vec3):
+    """Add a gradient by the base's centre of mass [m], the ratio of its first moment and its mass [kg]."""
+    add_entry(sums, BASE, -wp.dot(gradient, com) / mass)
+    add_vec3(sums, BASE + 1, gradient / mass)
+
+
+@wp.func
+def add_motor(sums: Any, shared: Any, motor: int, scale: real, p: MotorParams):
+    """Add `scale` times a gradient by a motor's constants, to `shared` what all motors have in common."""
+    row = MOTOR_GRADIENT + motor
+    add_entry(sums, row, scale * p.kp)
+    add_entry(sums, row + 12, scale * p.kd)
+    add_entry(sums, row + 24, scale * p.saturation)
+    add_entry(sums, row + 36, scale * p.peak)
+    add_entry(sums, row + 48, scale * p.cutoff_speed)
+    add_entry(sums, row + 60, scale * p.no_load_speed)
+    add_entry(sums, row + 72, scale * p.offset)
+    add_entry(shared, FADE_GRADIENT, scale * p.fade_start)
+    add_entry(shared, FADE_GRADIENT + 1, scale * p.fade_end)
+
+
+@wp.func
+def add_limits(sums: Any, row: int, limits: Limits):
+    """Add the gradient by one quantity's limits; hard zones only switch."""
+    add_entry(sums, row, limits.lower)
+    add_entry(sums, row + 1, limits.upper)
+
+
+@wp.func
+def add_filter(sums: Any, p: FilterParams):
+    """Add the gradient by the filter's constants."""
+    add_limits(sums, FILTER_GRADIENT, p.lateral)
+    add_limits(sums, FILTER_GRADIENT + 4, p.transversal)
+    add_limits(sums, FILTER_GRADIENT + 8, p.sum)
+    add_entry(sums, FILTER_GRADIENT + FILTER_HORIZON, p.horizon)
+    add_entry(sums, FILTER_GRADIENT + FILTER_SPEED, p.speed_floor)

@@ -1,0 +1,384 @@
+"""`step_adjoint` for GPUs: a thread a leg, the base's part made by each of the four, in three parts.
+
+What depends on the motion alone is made for many steps side by side (`replay_leg`), the inverse of the system of
+the contact laws' multipliers too. Only what must go from step to step backwards does so (`reverse_leg`). It leaves the
+multipliers, from which the gradients by parameters follow, again for many steps side by side (`add_leg_constants`).
+"""
+
+import warp as wp
+
+from ...actuation.joint_forces import JointParams
+from ...actuation.springs import LegSpring
+from ...actuation.stops import StopParams, stop_rows
+from ...kinematics.geometry import LegGeometry
+from ...lanes import any_world, mat_from_leg, sum_legs, sum_quat, sum_vec, vec_from_leg
+from ...layout import BASE, GRAVITY, LEG_ROWS, MU_DYNAMIC, MU_STATIC
+from ...scalar import mat33, quat, real, vec3
+from ...state import BaseState, base_com
+from ..base_dynamics import BaseSystem, add_leg, invert, motor_acceleration, solve_ang, solve_lin, sum_systems
+from ..base_motion import moved_base
+from ..contact import SEPARATE, PawContact
+from ..contact_laws import PawLaw, contact_at, contact_point, paw_law
+from ..inertia import MassMoments
+from ..leg_dynamics import LegMasses
+from ..parameters import load_moments, load_spring, load_stops, load_vec3
+from ..step import LegParams, Robot, base_system, hold_base, leg_terms
+from ..world.rollout import Rows, row_vec3
+from .gradients import (
+    ThreadSums,
+    add_entry,
+    add_geometry,
+    add_joints,
+    add_masses,
+    add_spring,
+    add_stops,
+)
+from .leg_record import (
+    ANGLES,
+    RATES,
+    BaseWeights,
+    LawRow,
+    LegLaw,
+    LegRecord,
+    LegWeights,
+    get_base,
+    get_inverse,
+    get_law,
+    get_law_row,
+    get_solve,
+    get_vec,
+    put_base,
+    put_base_weights,
+    put_inverse,
+    put_law,
+    put_law_row,
+    put_leg_weights,
+    put_solve,
+    put_vec,
+)
+from .virtual_power import BaseFactors, LegFactors, add, base_action, leg_action, turned
+
+wp.set_module_options({"enable_backward": False, "fast_math": True})
+
+
+@wp.struct
+class LegAdjoint:
+    """Gradient by the state of a world as a leg's thread holds it, and what a step adds for its motors and the base."""
+
+    base: BaseState
+    angles: vec3
+    rates: vec3
+    torque: vec3  # by the motors' torques in the step
+    force: vec3  # by the wrench on the base, summed over steps as what follows
+    moment: vec3
+    body: MassMoments  # by the base link's
+    com: vec3  # by the base's centre of mass
+    gravity: vec3
+
+
+@wp.func
+def replay_leg(
+    robot: Robot, own: LegParams, dt: real, world: int, leg: int, force: vec3, moment: vec3,
+    first_impulse: wp.array2d(dtype=vec3), rows: Rows, step: int, i: int, record: LegRecord,
+):  # fmt: skip
+    """Make a step again from entry i of the record; see `replay_step`. All threads write the base, the same bits."""
+    base = get_base(record, i, world)
+    rates = get_vec(record, i, RATES, world, leg)
+    angles = get_vec(record, i, ANGLES, world, leg)
+    g = wp.quat_rotate_inv(base.quat, load_vec3(robot.table, GRAVITY, world))
+    torque = row_vec3(rows.torque, step, 3 * leg, world)
+    stops = stop_rows(load_stops(robot.table, leg, world), angles, dt)
+    spring = load_spring(robot.table, leg, world)
+    terms = leg_terms(own, spring, angles, rates, torque, stops, int(rows.pressed[step, leg, world]), base.ang, g, dt)
+    share = add_leg(BaseSystem(), terms.dynamics, terms.solve)
+    system = sum_systems(base_system(robot, world, base, g, force, moment), share)
+    inverse = hold_base(robot, world, invert(system))
+    solve = terms.solve
+    put_inverse(record, i, world, inverse)
+    solve = terms.solve
+    paw = terms.paw
+    c = PawContact()
+    push = vec3(real(0.0))
+    twist = vec3(real(0.0))
+    point = vec3(real(0.0))
+    impulse = wp.quat_rotate_inv(base.quat, rows.impulse[step, leg, world])
+    touches = wp.dot(impulse, impulse) > real(0.0)
+    if touches:
+        c = contact_at(robot, leg, base, paw, solve, inverse, impulse)
+        joint = wp.transpose(c.jacobian) * impulse
+        point = contact_point(robot, leg, paw, c)
+        push = impulse - wp.transpose(solve.to_lin) * joint
+        twist = wp.cross(point, impulse) - wp.transpose(solve.to_ang) * joint
+        solve.free += solve.inverse * (joint / dt)
+    put_solve(record, i, world, leg, solve)
+    push = dt * system.force + sum_vec(push)
+    twist = dt * system.moment + sum_vec(twist)
+    lin = solve_lin(inverse, push, twist)
+    ang = solve_ang(inverse, push, twist)
+    ahead = rates + dt * motor_acceleration(solve, lin / dt, ang / dt)
+    put_vec(record, i + 1, RATES, world, leg, ahead)
+    put_vec(record, i + 1, ANGLES, world, leg, angles + dt * ahead)
+    old_lin = wp.quat_rotate_inv(base.quat, base.lin)
+    put_base(record, i + 1, world, moved_base(base, old_lin + lin, base.ang + ang, dt))
+    law = PawLaw()
+    if touches:
+        before = old_lin + wp.cross(base.ang, point) + c.jacobian * rates
+        velocity = old_lin + lin + wp.cross(base.ang + ang, point) + c.jacobian * ahead
+        old_impulse = first_impulse[leg, world]
+        if step > 0:
+            old_impulse = rows.impulse[step - 1, leg, world]
+        law = paw_law(robot, world, leg, c, before, velocity, wp.quat_rotate_inv(base.quat, old_impulse))
+    if any_world(any_leg(law.mode != SEPARATE)):
+        put_law_row(record, i, world, leg, inverted_laws(c, law, leg))
+    found = LegLaw()
+    found.mode = law.mode
+    found.mu_row = law.mu_row
+    found.mu = law.mu
+    found.impulse = impulse
+    found.point = point
+    found.jacobian = c.jacobian
+    found.to_lin = c.to_lin
+    found.to_ang = c.to_ang
+    found.by_velocity = law.by_velocity
+    put_law(record, i, world, leg, found)
+
+
+@wp.func
+def any_leg(flag: bool) -> bool:
+    """Return whether a flag is set for any leg of the world."""
+    return sum_legs(wp.where(flag, real(1.0), real(0.0))) > real(0.0)
+
+
+@wp.func
+def law_block(c: PawContact, law: PawLaw, of: PawContact, of_law: PawLaw, leg: int, j: int) -> mat33:
+    """Return block (leg, j) of the system of the laws' multipliers; `of`, `of_law`: paw j, sent by its thread."""
+    to_lin = mat_from_leg(of.to_lin * wp.transpose(of_law.by_velocity), j)
+    to_ang = mat_from_leg(of.to_ang * wp.transpose(of_law.by_velocity), j)
+    if law.mode == SEPARATE:
+        return wp.where(leg == j, wp.identity(n=3, dtype=real), mat33(real(0.0)))
+    if leg == j:
+        return c.total * wp.transpose(law.by_velocity) + wp.transpose(law.by_impulse)
+    return c.from_lin * to_lin + c.from_ang * to_ang
+
+
+@wp.func
+def reduce_block(block: mat33, factor: mat33, pivot: mat33, j: int, leg: int) -> mat33:
+    """Return a block after elimination with row j, whose scaled block is `pivot` in its own thread."""
+    scaled = mat_from_leg(pivot, j)
+    if leg == j:
+        return scaled
+    return block - factor * scaled
+
+
+@wp.func
+def inverted_laws(c: PawContact, law: PawLaw, leg: int) -> LawRow:
+    """Return a row of the inverse of the multipliers' system: Gauss-Jordan by blocks in place, a row a thread."""
+    eye = wp.identity(n=3, dtype=real)
+    none = mat33(real(0.0))
+    a0 = law_block(c, law, c, law, leg, 0)
+    a1 = law_block(c, law, c, law, leg, 1)
+    a2 = law_block(c, law, c, law, leg, 2)
+    a3 = law_block(c, law, c, law, leg, 3)
+    scale = wp.inverse(wp.where(leg == 0, a0, eye))
+    a1 = reduce_block(a1, a0, scale * a1, 0, leg)
+    a2 = reduce_block(a2, a0, scale * a2, 0, leg)
+    a3 = reduce_block(a3, a0, scale * a3, 0, leg)
+    a0 = reduce_block(none, a0, scale, 0, leg)
+    scale = wp.inverse(wp.where(leg == 1, a1, eye))
+    a0 = reduce_block(a0, a1, scale * a0, 1, leg)
+    a2 = reduce_block(a2, a1, scale * a2, 1, leg)
+    a3 = reduce_block(a3, a1, scale * a3, 1, leg)
+    a1 = reduce_block(none, a1, scale, 1, leg)
+    scale = wp.inverse(wp.where(leg == 2, a2, eye))
+    a0 = reduce_block(a0, a2, scale * a0, 2, leg)
+    a1 = reduce_block(a1, a2, scale * a1, 2, leg)
+    a3 = reduce_block(a3, a2, scale * a3, 2, leg)
+    a2 = reduce_block(none, a2, scale, 2, leg)
+    scale = wp.inverse(wp.where(leg == 3, a3, eye))
+    found = LawRow()
+    found.a = reduce_block(a0, a3, scale * a0, 3, leg)
+    found.b = reduce_block(a1, a3, scale * a1, 3, leg)
+    found.c = reduce_block(a2, a3, scale * a2, 3, leg)
+    found.d = reduce_block(none, a3, scale, 3, leg)
+    return found
+
+
+@wp.func
+def multiplier(row: LawRow, seed: vec3) -> vec3:
+    """Return the multiplier of a paw's law for the gradients by all paws' impulses; seed: 0 where separated."""
+    found = row.a * vec_from_leg(seed, 0) + row.b * vec_from_leg(seed, 1)
+    return -(found + row.c * vec_from_leg(seed, 2) + row.d * vec_from_leg(seed, 3))
+
+
+@wp.func
+def held_base(record: LegRecord, world: int, i: int, dt: real, base: BaseState, weights: BaseWeights) -> BaseFactors:
+    """Return what is held of the base in a step."""
+    ahead = get_base(record, i + 1, world)
+    held = BaseFactors()
+    held.virtual_lin = weights.lin
+    held.virtual_ang = weights.ang
+    held.lin = wp.quat_rotate_inv(base.quat, ahead.lin)
+    held.ang = ahead.ang
+    held.lin_acc = (held.lin - wp.quat_rotate_inv(base.quat, base.lin)) / dt
+    held.ang_acc = (held.ang - base.ang) / dt
+    return held
+
+
+@wp.func
+def held_leg(
+    record: LegRecord, rows: Rows, seeds: Rows, world: int, step: int, i: int, leg: int, dt: real, law: LegLaw,
+    weights: LegWeights,
+) -> LegFactors:  # fmt: skip
+    """Return what is held of a leg in a step."""
+    held = LegFactors()
+    held.virtual_rates = weights.rates
+    held.rates = get_vec(record, i + 1, RATES, world, leg)
+    held.acc = (held.rates - get_vec(record, i, RATES, world, leg)) / dt
+    held.mode = law.mode
+    held.pressed = int(rows.pressed[step, leg, world])
+    if law.mode != SEPARATE:
+        held.impulse = law.impulse
+        held.law = weights.law
+        if seeds.impulse.shape[0] > 0:
+            held.push = seeds.impulse[step, leg, world]
+    return held
+
+
+@wp.struct
+class LegGradient:
+    """Gradient of a leg's part of the weighed equations."""
+
+    geometry: LegGeometry
+    masses: LegMasses
+    joints: JointParams
+    spring: LegSpring
+    stops: StopParams
+    mu: real
+    pos: vec3  # by the base's state
+    turn: quat
+    omega: vec3
+    gravity: vec3  # body axes
+    angles: vec3
+    rates: vec3
+
+
+@wp.func
+def leg_gradient(
+    robot: Robot, own: LegParams, dt: real, world: int, leg: int, rows: Rows, seeds: Rows, step: int, i: int,
+    record: LegRecord, base: BaseState, law: LegLaw, held: BaseFactors, weights: LegWeights,
+) -> LegGradient:  # fmt: skip
+    """Return the gradient of `leg_action` in a step."""
+    factors = held_leg(record, rows, seeds, world, step, i, leg, dt, law, weights)
+    g = wp.quat_rotate_inv(base.quat, load_vec3(robot.table, GRAVITY, world))
+    angles = get_vec(record, i, ANGLES, world, leg)
+    rates = get_vec(record, i, RATES, world, leg)
+    (geo, masses, joints, spring, stops, _ground, mu, pos, turn, omega, g_adj, angle_adj, rate_adj, _held, _leg,
+     _step) = (
+        wp.grad(leg_action)(
+            own.geometry, own.masses, own.joints, load_spring(robot.table, leg, world),
+            load_stops(robot.table, leg, world), robot.ground, law.mu, base.pos, base.quat, base.ang, g, angles, rates,
+            held, factors, dt,
+        )
+    )  # fmt: skip
+    found = LegGradient()
+    found.geometry = geo
+    found.masses = masses
+    found.joints = joints
+    found.spring = spring
+    found.stops = stops
+    found.mu = mu
+    found.pos = pos
+    found.turn = turn
+    found.omega = omega
+    found.gravity = g_adj
+    found.angles = angle_adj
+    found.rates = rate_adj
+    return found
+
+
+@wp.func
+def reverse_leg(
+    robot: Robot, own: LegParams, dt: real, world: int, leg: int, force: vec3, moment: vec3, rows: Rows, seeds: Rows,
+    step: int, i: int, record: LegRecord, adj: LegAdjoint, keeps: bool,
+) -> LegAdjoint:  # fmt: skip
+    """Run a step backwards, see `reverse_step`; if it `keeps`, it records what its equations are weighed with."""
+    base = get_base(record, i, world)
+    inverse = get_inverse(record, i, world)
+    solve = get_solve(record, i, world, leg)
+    law = get_law(record, i, world, leg)
+    new_velocity = adj.base.lin + dt * adj.base.pos
+    quat_adj, ang_seed, _dt, _seed = wp.grad(turned)(
+        base.quat, row_vec3(record.base, i + 1, 10, world), dt, adj.base.quat
+    )
+    rate_seed = adj.rates + dt * adj.angles
+    lin_seed = wp.quat_rotate_inv(base.quat, new_velocity)
+    ang_seed += adj.base.ang
+    push = lin_seed - sum_vec(wp.transpose(solve.to_lin) * rate_seed)
+    twist = ang_seed - sum_vec(wp.transpose(solve.to_ang) * rate_seed)
+    by_base = BaseWeights()
+    by_base.lin = solve_lin(inverse, push, twist)
+    by_base.ang = solve_ang(inverse, push, twist)
+    by_leg = LegWeights()
+    by_leg.rates = solve.inverse * rate_seed - solve.to_lin * by_base.lin - solve.to_ang * by_base.ang
+    # contact
+    touches = law.mode != SEPARATE
+    seed = vec3(real(0.0))
+    if touches:
+        seed = by_base.lin + wp.cross(by_base.ang, law.point) + law.jacobian * by_leg.rates
+        if seeds.impulse.shape[0] > 0:
+            seed += wp.quat_rotate_inv(base.quat, seeds.impulse[step, leg, world])
+    if any_world(any_leg(touches)):
+        y = vec3(real(0.0))
+        by_leg.law = multiplier(get_law_row(record, i, world, leg), seed)
+        if touches:
+            y = wp.transpose(law.by_velocity) * by_leg.law
+        joint = wp.transpose(law.jacobian) * y
+        more_lin = sum_vec(law.to_lin * y)
+        more_ang = sum_vec(law.to_ang * y)
+        lin_seed += sum_vec(y)
+        ang_seed += sum_vec(wp.cross(law.point, y))
+        rate_seed += joint
+        by_leg.rates += solve.inverse * joint - solve.to_lin * more_lin - solve.to_ang * more_ang
+        by_base.lin += more_lin
+        by_base.ang += more_ang
+    # the equations of motion
+    held = held_base(record, world, i, dt, base, by_base)
+    found = leg_gradient(robot, own, dt, world, leg, rows, seeds, step, i, record, base, law, held, by_leg)
+    by_base.seeds.velocity = lin_seed
+    by_base.seeds.new_velocity = new_velocity
+    by_base.seeds.gravity = sum_vec(found.gravity)
+    gravity = load_vec3(robot.table, GRAVITY, world)
+    body, com, weight, force_adj, moment_adj, base_turn, lin_adj, base_omega, _base, _seeds, _base_step = wp.grad(
+        base_action
+    )(load_moments(robot.table, BASE, world), base_com(robot.table, world), gravity, force, moment, base.quat,
+      base.lin, base.ang, held, by_base.seeds, dt)  # fmt: skip
+    if keeps:
+        put_base_weights(record, i, world, by_base)
+        put_leg_weights(record, i, world, leg, by_leg)
+    out = LegAdjoint()
+    out.base.pos = adj.base.pos + sum_vec(found.pos)
+    out.base.quat = quat_adj + base_turn + sum_quat(found.turn)
+    out.base.lin = lin_adj
+    out.base.ang = ang_seed + base_omega + sum_vec(found.omega)
+    out.angles = adj.angles + found.angles
+    out.rates = rate_seed + found.rates
+    out.torque = dt * by_leg.rates
+    out.force = adj.force + force_adj
+    out.moment = adj.moment + moment_adj
+    out.body = add(adj.body, body)
+    out.com = adj.com + com
+    out.gravity = adj.gravity + weight
+    return out
+
+
+@wp.func
+def add_leg_constants(sums: ThreadSums, leg: int, law: LegLaw, found: LegGradient):
+    """Add a step's gradients by the parameters of a leg."""
+    add_geometry(sums, leg, found.geometry)
+    add_masses(sums, leg, found.masses)
+    add_joints(sums, leg, found.joints)
+    add_spring(sums, leg, found.spring)
+    add_stops(sums, leg, found.stops)
+    for row in range(2):  # one of the two coefficients
+        mu_row = leg * LEG_ROWS + wp.where(row == 0, int(MU_STATIC), int(MU_DYNAMIC))
+        add_entry(sums, mu_row, wp.where(law.mode != SEPARATE and law.mu_row == mu_row, found.mu, real(0.0)))

@@ -1,0 +1,309 @@
+"""What the reverse pass keeps of some steps where a thread has a leg: by fields, so that a warp reads neighbours."""
+
+import warp as wp
+
+from ...scalar import mat33, real, vec3
+from ...state import BaseState
+from ..base_dynamics import BaseInverse, LegSolve
+from ..contact import SEPARATE
+from ..world.rollout import row_quat, row_vec3, store_row_vec3
+from .virtual_power import BaseSeeds
+
+wp.set_module_options({"enable_backward": False})
+
+# fields of the base: position, orientation, velocities as in `BaseState`, then
+BASE_INVERSE = wp.constant(13)  # three matrices
+BASE_WEIGHTS = wp.constant(40)  # five vectors
+BASE_FIELDS = wp.constant(55)
+
+# fields of a leg
+ANGLES = wp.constant(0)
+RATES = wp.constant(3)
+SOLVE = wp.constant(6)  # inverse, to_lin, to_ang
+SLOPES = wp.constant(33)  # three vectors
+MODE = wp.constant(42)
+MU_ROW = wp.constant(43)
+MU = wp.constant(44)
+LEG_WEIGHTS = wp.constant(45)  # two vectors
+PUSH = wp.constant(51)  # impulse, point
+PAW = wp.constant(57)  # jacobian, to_lin, to_ang, by_velocity
+LAWS = wp.constant(93)  # four matrices
+FILTER = wp.constant(129)  # gradient by the angles that the filter reads, where a policy step begins
+LEG_FIELDS = wp.constant(132)
+
+
+@wp.struct
+class LegRecord:
+    """Entries of steps; the last of a few steps has only the state at its end."""
+
+    base: wp.array3d(dtype=real)  # (entries, BASE_FIELDS, num_worlds)
+    legs: wp.array4d(dtype=real)  # (entries, LEG_FIELDS, num_worlds, 4)
+
+
+@wp.struct
+class BaseWeights:
+    """What the base's equations of motion in a step are weighed with, body axes."""
+
+    lin: vec3  # virtual velocity
+    ang: vec3
+    seeds: BaseSeeds
+
+
+@wp.struct
+class LegWeights:
+    """What a leg's equations of motion and its paw's law are weighed with."""
+
+    rates: vec3  # virtual rates of the motors
+    law: vec3
+
+
+@wp.struct
+class MotorSlopes:
+    """Derivatives of the torques of a leg's motors, one by one."""
+
+    target: vec3  # [N m/rad]
+    angle: vec3
+    rate: vec3  # [N m s/rad]
+
+
+@wp.struct
+class LegLaw:
+    """A paw's contact law at the solution."""
+
+    mode: int  # SEPARATE, STICK or SLIDE
+    mu_row: int  # row of the friction coefficient in the parameter table
+    mu: real
+    impulse: vec3  # [N s], body axes
+    point: vec3  # [m] where the paw touches, body axes, from the base's origin
+    jacobian: mat33  # contact velocity per motor rate [m/rad]
+    to_lin: mat33  # base twist per impulse
+    to_ang: mat33
+    by_velocity: mat33  # the law's derivative
+
+
+@wp.struct
+class LawRow:
+    """A paw's row of the inverse of the system of the laws' multipliers, a block for each paw."""
+
+    a: mat33
+    b: mat33
+    c: mat33
+    d: mat33
+
+
+@wp.func
+def get_vec(record: LegRecord, entry: int, field: int, world: int, leg: int) -> vec3:
+    """Return three fields of a leg."""
+    return vec3(
+        record.legs[entry, field, world, leg],
+        record.legs[entry, field + 1, world, leg],
+        record.legs[entry, field + 2, world, leg],
+    )
+
+
+@wp.func
+def put_vec(record: LegRecord, entry: int, field: int, world: int, leg: int, v: vec3):
+    """Write three fields of a leg."""
+    for i in range(3):
+        record.legs[entry, field + i, world, leg] = v[i]
+
+
+@wp.func
+def get_mat(record: LegRecord, entry: int, field: int, world: int, leg: int) -> mat33:
+    """Return nine fields of a leg."""
+    return wp.matrix_from_rows(
+        get_vec(record, entry, field, world, leg),
+        get_vec(record, entry, field + 3, world, leg),
+        get_vec(record, entry, field + 6, world, leg),
+    )
+
+
+@wp.func
+def put_mat(record: LegRecord, entry: int, field: int, world: int, leg: int, m: mat33):
+    """Write nine fields of a leg."""
+    for i in range(3):
+        for j in range(3):
+            record.legs[entry, field + 3 * i + j, world, leg] = m[i, j]
+
+
+@wp.func
+def get_base_mat(record: LegRecord, entry: int, field: int, world: int) -> mat33:
+    """Return nine fields of the base."""
+    return wp.matrix_from_rows(
+        row_vec3(record.base, entry, field, world),
+        row_vec3(record.base, entry, field + 3, world),
+        row_vec3(record.base, entry, field + 6, world),
+    )
+
+
+@wp.func
+def put_base_mat(record: LegRecord, entry: int, field: int, world: int, m: mat33):
+    """Write nine fields of the base."""
+    for i in range(3):
+        for j in range(3):
+            record.base[entry, field + 3 * i + j, world] = m[i, j]
+
+
+@wp.func
+def get_base(record: LegRecord, entry: int, world: int) -> BaseState:
+    """Return the base's state."""
+    base = BaseState()
+    base.pos = row_vec3(record.base, entry, 0, world)
+    base.quat = row_quat(record.base, entry, 3, world)
+    base.lin = row_vec3(record.base, entry, 7, world)
+    base.ang = row_vec3(record.base, entry, 10, world)
+    return base
+
+
+@wp.func
+def put_base(record: LegRecord, entry: int, world: int, base: BaseState):
+    """Write the base's state."""
+    store_row_vec3(record.base, entry, 0, world, base.pos)
+    for i in range(4):
+        record.base[entry, 3 + i, world] = base.quat[i]
+    store_row_vec3(record.base, entry, 7, world, base.lin)
+    store_row_vec3(record.base, entry, 10, world, base.ang)
+
+
+@wp.func
+def get_inverse(record: LegRecord, entry: int, world: int) -> BaseInverse:
+    """Return the inverse of the base's system."""
+    inverse = BaseInverse()
+    inverse.lin = get_base_mat(record, entry, BASE_INVERSE, world)
+    inverse.cross = get_base_mat(record, entry, BASE_INVERSE + 9, world)
+    inverse.ang = get_base_mat(record, entry, BASE_INVERSE + 18, world)
+    return inverse
+
+
+@wp.func
+def put_inverse(record: LegRecord, entry: int, world: int, inverse: BaseInverse):
+    """Write the inverse of the base's system."""
+    put_base_mat(record, entry, BASE_INVERSE, world, inverse.lin)
+    put_base_mat(record, entry, BASE_INVERSE + 9, world, inverse.cross)
+    put_base_mat(record, entry, BASE_INVERSE + 18, world, inverse.ang)
+
+
+@wp.func
+def get_solve(record: LegRecord, entry: int, world: int, leg: int) -> LegSolve:
+    """Return a leg's elimination, `free` left out."""
+    solve = LegSolve()
+    solve.inverse = get_mat(record, entry, SOLVE, world, leg)
+    solve.to_lin = get_mat(record, entry, SOLVE + 9, world, leg)
+    solve.to_ang = get_mat(record, entry, SOLVE + 18, world, leg)
+    return solve
+
+
+@wp.func
+def put_solve(record: LegRecord, entry: int, world: int, leg: int, solve: LegSolve):
+    """Write a leg's elimination, `free` left out."""
+    put_mat(record, entry, SOLVE, world, leg, solve.inverse)
+    put_mat(record, entry, SOLVE + 9, world, leg, solve.to_lin)
+    put_mat(record, entry, SOLVE + 18, world, leg, solve.to_ang)
+
+
+@wp.func
+def get_slopes(record: LegRecord, entry: int, world: int, leg: int) -> MotorSlopes:
+    """Return the derivatives of the motors' torques."""
+    slopes = MotorSlopes()
+    slopes.target = get_vec(record, entry, SLOPES, world, leg)
+    slopes.angle = get_vec(record, entry, SLOPES + 3, world, leg)
+    slopes.rate = get_vec(record, entry, SLOPES + 6, world, leg)
+    return slopes
+
+
+@wp.func
+def put_slopes(record: LegRecord, entry: int, world: int, leg: int, slopes: MotorSlopes):
+    """Write the derivatives of the motors' torques."""
+    put_vec(record, entry, SLOPES, world, leg, slopes.target)
+    put_vec(record, entry, SLOPES + 3, world, leg, slopes.angle)
+    put_vec(record, entry, SLOPES + 6, world, leg, slopes.rate)
+
+
+@wp.func
+def get_law(record: LegRecord, entry: int, world: int, leg: int) -> LegLaw:
+    """Return a paw's law; where it is separated all else is 0."""
+    law = LegLaw()
+    law.mode = int(record.legs[entry, MODE, world, leg])
+    if law.mode != SEPARATE:
+        law.mu_row = int(record.legs[entry, MU_ROW, world, leg])
+        law.mu = record.legs[entry, MU, world, leg]
+        law.impulse = get_vec(record, entry, PUSH, world, leg)
+        law.point = get_vec(record, entry, PUSH + 3, world, leg)
+        law.jacobian = get_mat(record, entry, PAW, world, leg)
+        law.to_lin = get_mat(record, entry, PAW + 9, world, leg)
+        law.to_ang = get_mat(record, entry, PAW + 18, world, leg)
+        law.by_velocity = get_mat(record, entry, PAW + 27, world, leg)
+    return law
+
+
+@wp.func
+def put_law(record: LegRecord, entry: int, world: int, leg: int, law: LegLaw):
+    """Write a paw's law."""
+    record.legs[entry, MODE, world, leg] = real(law.mode)
+    if law.mode != SEPARATE:
+        record.legs[entry, MU_ROW, world, leg] = real(law.mu_row)
+        record.legs[entry, MU, world, leg] = law.mu
+        put_vec(record, entry, PUSH, world, leg, law.impulse)
+        put_vec(record, entry, PUSH + 3, world, leg, law.point)
+        put_mat(record, entry, PAW, world, leg, law.jacobian)
+        put_mat(record, entry, PAW + 9, world, leg, law.to_lin)
+        put_mat(record, entry, PAW + 18, world, leg, law.to_ang)
+        put_mat(record, entry, PAW + 27, world, leg, law.by_velocity)
+
+
+@wp.func
+def get_law_row(record: LegRecord, entry: int, world: int, leg: int) -> LawRow:
+    """Return a row of the inverse of the multipliers' system; only where a paw of the world is not separated."""
+    row = LawRow()
+    row.a = get_mat(record, entry, LAWS, world, leg)
+    row.b = get_mat(record, entry, LAWS + 9, world, leg)
+    row.c = get_mat(record, entry, LAWS + 18, world, leg)
+    row.d = get_mat(record, entry, LAWS + 27, world, leg)
+    return row
+
+
+@wp.func
+def put_law_row(record: LegRecord, entry: int, world: int, leg: int, row: LawRow):
+    """Write a row of the inverse of the multipliers' system."""
+    put_mat(record, entry, LAWS, world, leg, row.a)
+    put_mat(record, entry, LAWS + 9, world, leg, row.b)
+    put_mat(record, entry, LAWS + 18, world, leg, row.c)
+    put_mat(record, entry, LAWS + 27, world, leg, row.d)
+
+
+@wp.func
+def get_leg_weights(record: LegRecord, entry: int, world: int, leg: int) -> LegWeights:
+    """Return a leg's weights."""
+    weights = LegWeights()
+    weights.rates = get_vec(record, entry, LEG_WEIGHTS, world, leg)
+    weights.law = get_vec(record, entry, LEG_WEIGHTS + 3, world, leg)
+    return weights
+
+
+@wp.func
+def put_leg_weights(record: LegRecord, entry: int, world: int, leg: int, weights: LegWeights):
+    """Write a leg's weights."""
+    put_vec(record, entry, LEG_WEIGHTS, world, leg, weights.rates)
+    put_vec(record, entry, LEG_WEIGHTS + 3, world, leg, weights.law)
+
+
+@wp.func
+def get_base_weights(record: LegRecord, entry: int, world: int) -> BaseWeights:
+    """Return the base's weights."""
+    weights = BaseWeights()
+    weights.lin = row_vec3(record.base, entry, BASE_WEIGHTS, world)
+    weights.ang = row_vec3(record.base, entry, BASE_WEIGHTS + 3, world)
+    weights.seeds.velocity = row_vec3(record.base, entry, BASE_WEIGHTS + 6, world)
+    weights.seeds.new_velocity = row_vec3(record.base, entry, BASE_WEIGHTS + 9, world)
+    weights.seeds.gravity = row_vec3(record.base, entry, BASE_WEIGHTS + 12, world)
+    return weights
+
+
+@wp.func
+def put_base_weights(record: LegRecord, entry: int, world: int, weights: BaseWeights):
+    """Write the base's weights."""
+    store_row_vec3(record.base, entry, BASE_WEIGHTS, world, weights.lin)
+    store_row_vec3(record.base, entry, BASE_WEIGHTS + 3, world, weights.ang)
+    store_row_vec3(record.base, entry, BASE_WEIGHTS + 6, world, weights.seeds.velocity)
+    store_row_vec3(record.base, entry, BASE_WEIGHTS + 9, world, weights.seeds.new_velocity)
+    store_row_vec3(record.base, entry, BASE_WEIGHTS + 12, world, weights.seeds.gravity)

@@ -1,0 +1,89 @@
+"""`rollout` for GPUs: four threads a world, a thread a leg."""
+
+import warp as wp
+
+from ...actuation.motors import motor_torque
+from ...lanes import any_world, meet
+from ...layout import DOFS
+from ...scalar import real, vec3
+from ...state import base_com
+from ..drive import Drive, LegDrive
+from ..step import Robot, StepSettings, load_leg
+from ..world.rollout import (
+    Actuation,
+    Commands,
+    Rows,
+    Timing,
+    arrival,
+    arrived_target,
+    filter_commands,
+    load_row_base,
+    load_world_motor,
+    row_vec3,
+    store_row_base,
+    store_row_vec3,
+)
+from .advance_legs import LegState, advance_leg
+
+wp.set_module_options({"enable_backward": False, "fast_math": True})
+
+
+@wp.kernel
+def rollout_legs_kernel(
+    # in
+    count: int,
+    robot: Robot,
+    settings: StepSettings,
+    timing: Timing,
+    actuation: Actuation,
+    commands: Commands,
+    drive: Drive,
+    # out
+    safe: wp.array3d(dtype=real),
+    rows: Rows,
+):
+    """Do what `rollout_kernel` does, to the contact tolerance; launch over (count rounded up to a multiple of 8, 4).
+
+    count: worlds, from `settings.first` on.
+    """
+    place, leg = wp.tid()
+    world = settings.first + wp.min(place, count - 1)  # threads beyond the last world repeat it
+    com = base_com(robot.table, world)
+    late = actuation.latency[world] / settings.dt
+    own = load_leg(robot, world, leg)
+    s = LegState()
+    s.impulse = commands.impulse[leg, world]
+    for step in range(timing.steps * timing.substeps):
+        t = step / timing.substeps
+        row = step / timing.every
+        if step == row * timing.every:
+            s.base = load_row_base(rows, row, world, com)
+            s.angles = row_vec3(rows.q, row, 7 + 3 * leg, world)
+            s.rates = row_vec3(rows.qd, row, 6 + 3 * leg, world)
+        if step == t * timing.substeps:
+            filter_commands(commands, actuation, t, leg, world, s.angles, s.rates, safe)
+            if leg == 0:
+                for i in range(6):
+                    drive.joint_f[world * DOFS + i] = commands.wrench[t, i, world]
+            meet()
+        arrived = arrival(step, timing.substeps, late)
+        motors = LegDrive()
+        torque = vec3(real(0.0))
+        for j in range(3):
+            motor = 3 * leg + j
+            target = arrived_target(commands, safe, arrived, motor, world)
+            torque[j] = motor_torque(target, s.angles[j], s.rates[j], load_world_motor(actuation, motor, world))
+        motors.extra = torque
+        s.step = 0
+        s.sets = 0
+        while any_world(s.step == 0):
+            s = advance_leg(robot, settings, drive, own, motors, world, leg, s, False)
+        store_row_vec3(rows.torque, step, 3 * leg, world, torque)
+        rows.impulse[step, leg, world] = s.impulse
+        rows.pressed[step, leg, world] = wp.uint8(s.used)
+        if step + 1 == (row + 1) * timing.every:
+            if leg == 0:
+                store_row_base(rows, row + 1, world, com, s.base)
+            store_row_vec3(rows.q, row + 1, 7 + 3 * leg, world, s.angles)
+            store_row_vec3(rows.qd, row + 1, 6 + 3 * leg, world, s.rates)
+            meet()

@@ -1,0 +1,126 @@
+"""The velocities at the end of a step of one world: legs eliminated, contacts and hard stops settled together."""
+
+import warp as wp
+
+from ...actuation.stops import (
+    MAX_SETS,
+    SLACK,
+    StopRows,
+    change_one,
+    one_by_one,
+    pressed_stops,
+    revised_stops,
+    stop_rows,
+)
+from ...layout import GRAVITY
+from ...scalar import real, vec3
+from ...state import BaseState
+from ..base_dynamics import LegSolve, add_leg, invert, motor_acceleration, solve_ang, solve_lin
+from ..contact import BlockLaw, ContactState, PawContact, solve_contacts
+from ..leg_dynamics import PawKinematics
+from ..parameters import load_spring, load_stops, load_vec3
+from ..step import Robot, StepSettings, base_system, hold_base, leg_terms, load_leg, paw_contact
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.struct
+class StepSolution:
+    """Velocities of the base at the end of a step, in the body axes of its start, and how contact came to them."""
+
+    lin: vec3  # [m/s]
+    ang: vec3  # [rad/s]
+    contact: ContactState
+    sets: int  # of pressed stops that were tried
+
+
+@wp.func
+def solve_with_stops(
+    robot: Robot, settings: StepSettings, world: int, base: BaseState, force: vec3, moment: vec3, block: BlockLaw,
+    impulse: wp.array2d(dtype=vec3), angles: wp.array(dtype=vec3), rates: wp.array(dtype=vec3),
+    torques: wp.array(dtype=vec3), rows: wp.array(dtype=StopRows), pressed: wp.array(dtype=int),
+    legs: wp.array(dtype=LegSolve), paws: wp.array(dtype=PawKinematics), contacts: wp.array(dtype=PawContact),
+    ends: wp.array(dtype=vec3),
+) -> StepSolution:  # fmt: skip
+    """Solve a step with given sets of pressed stops; see `solve_step`."""
+    dt = settings.dt
+    g = wp.quat_rotate_inv(base.quat, load_vec3(robot.table, GRAVITY, world))
+    system = base_system(robot, world, base, g, force, moment)
+    for k in range(legs.shape[0]):
+        own = load_leg(robot, world, k)
+        spring = load_spring(robot.table, k, world)
+        terms = leg_terms(own, spring, angles[k], rates[k], torques[k], rows[k], pressed[k], base.ang, g, dt)
+        legs[k] = terms.solve
+        paws[k] = terms.paw
+        system = add_leg(system, terms.dynamics, terms.solve)
+    inverse = hold_base(robot, world, invert(system))
+    lin_acc = solve_lin(inverse, system.force, system.moment)
+    ang_acc = solve_ang(inverse, system.force, system.moment)
+    lin = wp.quat_rotate_inv(base.quat, base.lin) + dt * lin_acc
+    ang = base.ang + dt * ang_acc
+    for k in range(legs.shape[0]):
+        ends[k] = rates[k] + dt * motor_acceleration(legs[k], lin_acc, ang_acc)
+        contacts[k] = paw_contact(
+            robot, world, k, base, lin, ang, ends[k], rates[k], impulse[k, world], pressed[k], paws[k], legs[k],
+            inverse, block, dt,
+        )  # fmt: skip
+    change = solve_contacts(contacts, block, settings.max_sweeps, settings.tolerance)
+    for k in range(legs.shape[0]):
+        push = legs[k].inverse * (wp.transpose(contacts[k].jacobian) * contacts[k].impulse)
+        ends[k] += push - legs[k].to_lin * change.lin - legs[k].to_ang * change.ang
+    solution = StepSolution()
+    solution.lin = lin + change.lin
+    solution.ang = ang + change.ang
+    solution.contact = change
+    return solution
+
+
+@wp.func
+def revise_stops(
+    rows: wp.array(dtype=StopRows), ends: wp.array(dtype=vec3), slack: real, sets: int, pressed: wp.array(dtype=int)
+) -> bool:
+    """Change the sets of pressed stops to what the rates that they led to ask for; returns whether they changed."""
+    changed = bool(False)
+    for k in range(pressed.shape[0]):
+        wanted = revised_stops(rows[k], ends[k], slack, pressed[k], sets)
+        if wanted != pressed[k] and not (changed and one_by_one(sets)):
+            if one_by_one(sets):
+                wanted = change_one(pressed[k], wanted)
+            pressed[k] = wanted
+            changed = True
+    return changed
+
+
+@wp.func
+def solve_step(
+    robot: Robot, settings: StepSettings, world: int, base: BaseState, force: vec3, moment: vec3, block: BlockLaw,
+    impulse: wp.array2d(dtype=vec3), angles: wp.array(dtype=vec3), rates: wp.array(dtype=vec3),
+    torques: wp.array(dtype=vec3), rows: wp.array(dtype=StopRows), pressed: wp.array(dtype=int),
+    legs: wp.array(dtype=LegSolve), paws: wp.array(dtype=PawKinematics), contacts: wp.array(dtype=PawContact),
+    ends: wp.array(dtype=vec3),
+) -> StepSolution:  # fmt: skip
+    """Solve a step of one world, and write every leg's pressed stops, contact and motor rates at the end of the step.
+
+    force [N], moment [N m]: from outside at the base's com, world axes. impulse: first guess [N s], world frame,
+    (4, num_worlds). angles, rates, torques: of the motors at the start [rad], [rad/s], [N m]. Arrays of legs have
+    shape (4,); rows, legs and paws are written too.
+
+    The stops that the rates at the start would press are tried first.
+    """
+    dt = settings.dt
+    for k in range(pressed.shape[0]):
+        rows[k] = stop_rows(load_stops(robot.table, k, world), angles[k], dt)
+        pressed[k] = pressed_stops(rows[k], rates[k], real(0.0), 0)
+    slack = SLACK * settings.tolerance
+    solution = StepSolution()
+    sets = int(0)
+    working = bool(True)
+    while working:
+        solution = solve_with_stops(
+            robot, settings, world, base, force, moment, block, impulse, angles, rates, torques, rows, pressed, legs,
+            paws, contacts, ends,
+        )  # fmt: skip
+        sets += 1
+        working = sets < MAX_SETS and revise_stops(rows, ends, slack, sets, pressed)
+    solution.sets = sets
+    return solution

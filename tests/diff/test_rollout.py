@@ -1,0 +1,399 @@
+"""Rollouts forwards: as the simulation, in double precision, on threads; as functions of PyTorch tensors; refusals."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+import warp as wp
+
+from jumper_warp.diff.jacobians import step_jacobians
+from jumper_warp.diff.rollout import Rollout, compact
+from jumper_warp.diff.torch_rollout import simulate
+from jumper_warp.robot.model import build_model
+from jumper_warp.robot.motors import jumping_motors, vertical_jump_filter
+from jumper_warp.sim.simulation import Simulation
+from tests.helpers.rollout_helpers import DT, SUBSTEPS, TICKS, defaults, push_off, rollout, run, squat
+
+
+def test_a_rollout_is_what_the_simulation_does_bit_for_bit():
+    settings = {"command_filter": vertical_jump_filter(), "tolerance": 1.0e-5}
+    simulation = Simulation(2, motors=jumping_motors(), visuals=False, **settings)
+    model = build_model(2, visuals=False)
+    of = Rollout(model, jumping_motors(), **settings)
+    targets = np.random.default_rng(0).uniform(0.2, 1.0, (12, 12, 2)).astype(np.float32)
+    trajectory = of.run(targets, *of.standing())
+    for target in targets:
+        simulation.target.assign(target)
+        simulation.step()
+    q, qd = compact(simulation.joint_q(), simulation.joint_qd(), 2)
+    np.testing.assert_array_equal(trajectory.q.numpy()[-1], q)
+    np.testing.assert_array_equal(trajectory.qd.numpy()[-1], qd)
+    np.testing.assert_array_equal(trajectory.torque.numpy()[-1], simulation.torque.numpy())
+    np.testing.assert_allclose(trajectory.impulse.numpy()[-1] * 480, simulation.paw_force.numpy(), rtol=1.0e-6)
+
+
+def test_threads_change_no_bit():
+    model = build_model(40, visuals=False)
+    found = []
+    for threads in (1, 2):
+        of = Rollout(model, command_filter=vertical_jump_filter(), double=True, dt=DT, substeps=4, threads=threads)
+        assert len(of.slices) == threads
+        q, qd = (np.repeat(row[:, None], 40, axis=1) for row in squat())
+        q[2] += np.linspace(0.0, 0.1, 40)
+        trajectory = of.run(push_off(6), q, qd)
+        gradients = of.backward(trajectory, qd=wp.full_like(trajectory.qd, 1.0))
+        found.append({"q": trajectory.q.numpy()} | {f"by {name}": array.numpy() for name, array in gradients.items()})
+    for name, values in found[0].items():
+        np.testing.assert_array_equal(found[1][name], values, err_msg=name)
+
+
+def test_slices_that_run_side_by_side_have_settings_of_their_own(monkeypatch):
+    of, given = Rollout(build_model(40, visuals=False), threads=2), []
+    monkeypatch.setattr(wp, "launch", lambda kernel, **call: given.append(call["inputs"][1]))
+    of.run(push_off(1), *of.standing())
+    assert sorted(settings._ctype.first for settings in given) == [worlds.first for worlds in of.slices] != [0, 0]
+
+
+def test_rollouts_go_on_where_they_ended():
+    whole = run(rollout(), defaults())
+    first = rollout().run(push_off()[:5], *squat())
+    rest = rollout().run(push_off()[5:], **first.end())
+    np.testing.assert_array_equal(rest.q.numpy()[-1], whole.q.numpy()[-1])
+
+
+def test_a_wrench_acts_in_double_precision():
+    """A robot in the air, its motors idle: twice a force of 0.1 uN, twice the speed that it adds to that of falling."""
+    q, qd = squat()
+    q[2] = 1.0
+    of = rollout()
+    run(of, defaults() | {"kp": np.zeros(12), "kd": np.zeros(12)})  # writes the parameters
+    speeds = []
+    for force in (0.0, 1.0e-7, 2.0e-7):
+        wrench = np.tile([force, 0.0, 0.0, 0.0, 0.0, 0.0], (2, 1))
+        speeds.append(of.run(np.zeros((2, 12)), q, 0.0 * qd, wrench=wrench).qd.numpy()[-1, 0, 0])
+    added = np.diff(speeds)
+    assert added[1] == pytest.approx(added[0], rel=1.0e-5)
+    # at least the speed of a robot of 14.5 kg that is rigid; less of the legs follow at once
+    assert 1.0e-7 * 2 * SUBSTEPS * DT / 14.6 < added[0] < 1.0e-7 * 2 * SUBSTEPS * DT / 4.0
+
+
+def test_what_is_kept_of_a_policy_step_is_below_two_kilobytes():
+    trajectory = rollout().run(push_off(8), *squat())
+    usual = Rollout(rollout().dynamics.model, double=True).run(push_off(8), *squat())
+    for made, steps in ((trajectory, 8), (usual, 8)):
+        arrays = (made.q, made.qd, made.torque, made.impulse, made.pressed, made.safe)
+        per_step = sum(array.size * wp.types.type_size_in_bytes(array.dtype) for array in arrays) / (steps + 1)
+        assert per_step <= 2000.0
+
+
+def tensors():
+    q, qd = squat()
+    return torch.tensor(q), torch.tensor(qd)
+
+
+def losses(trajectory):
+    return 1.0e-3 * trajectory.torque.square().sum() + 0.01 * trajectory.impulse[..., 2].sum()
+
+
+def test_torch_gives_the_gradients_of_differences():
+    of, (q, qd) = rollout(2), tensors()
+    targets = torch.tensor(push_off(10)).requires_grad_()
+    kp = torch.full((12,), 70.0, dtype=torch.float64, requires_grad=True)
+    lengths = torch.tensor(of.geometry()).requires_grad_()
+
+    def loss(targets, kp, lengths):
+        trajectory = simulate(of, targets, q, qd, kp=kp, geometry=lengths)
+        return losses(trajectory) + trajectory.q[-1, 2].sum()
+
+    loss(targets, kp, lengths).backward()
+    for tensor, entry, h in ((targets, (4, 1), 1.0e-6), (kp, (1,), 1.0e-4), (lengths, (0, 7), 1.0e-7)):
+        ends = []
+        for side in (h, -h):
+            moved = [t.detach().clone() for t in (targets, kp, lengths)]
+            next(m for m, t in zip(moved, (targets, kp, lengths), strict=True) if t is tensor)[entry] += side
+            ends.append(loss(*moved).item())
+        simulate(of, targets.detach(), q, qd, geometry=lengths.detach())
+        assert tensor.grad[entry].item() == pytest.approx((ends[0] - ends[1]) / (2.0 * h), rel=1.0e-5)
+
+
+@pytest.mark.parametrize("late", [0.0, 0.011])
+def test_torch_step_by_step_gives_the_gradients_of_the_whole(late):
+    """As with a policy between the steps; a later run with other parameters does not disturb an earlier one's pass.
+
+    What arrives late [s] acts in the next call, through what the motors followed before.
+    """
+    of, (q, qd) = rollout(), tensors()
+    found, latency = [], torch.full((1,), late, dtype=torch.float64)
+    for stepwise in (False, True):
+        targets = torch.tensor(push_off(8)).requires_grad_()
+        kp = torch.full((12,), 70.0, dtype=torch.float64, requires_grad=True)
+        if stepwise:
+            state, total = {"q": q, "qd": qd}, 0.0
+            for step in range(8):
+                made = simulate(of, targets[step : step + 1], **state, kp=kp, latency=latency)
+                state, total = made.end(), total + losses(made)
+            total = total + state["q"][2].sum()
+            simulate(of, targets.detach(), q, qd, kp=torch.full((12,), 20.0))
+        else:
+            made = simulate(of, targets, q, qd, kp=kp, latency=latency)
+            total = losses(made) + made.q[-1, 2].sum()
+        total.backward()
+        found.append((total.item(), targets.grad.numpy(), kp.grad.numpy()))
+    simulate(of, targets.detach(), q, qd, latency=0.0 * latency)
+    for whole, stepped in zip(*found, strict=True):
+        np.testing.assert_allclose(stepped, whole, rtol=0.0, atol=1.0e-12 * np.abs(whole).max())
+
+
+def test_what_is_late_at_first_makes_the_start_matter_twice():
+    """Motors follow the angles that they start at, unless told otherwise: the gradient by q has both."""
+    of, (q, qd) = rollout.__wrapped__(), tensors()  # whose parameters are its own
+    targets, late, found = torch.tensor(push_off(6)), torch.tensor([0.006], dtype=torch.float64), []
+
+    def height(q, **before):
+        return simulate(of, targets, q, qd, latency=late, **before).q[-1, 2].sum()
+
+    for before in (False, True):
+        start = q.clone().requires_grad_()
+        height(start, **({"before": start[7:]} if before else {})).backward()
+        found.append(start.grad)
+    runs = [of.run(targets.numpy(), q.numpy(), qd.numpy(), before=start) for start in (None, q[7:].numpy())]
+    seed = np.zeros(runs[0].q.shape)
+    seed[-1, 2] = 1.0
+    with_start, without = (of.backward(made, q=of.array(seed))["q"].numpy() for made in runs)
+    found.append(with_start)
+    for entry in (8, 9):
+        step = torch.zeros_like(q)
+        step[entry] = 1.0e-8
+        expected = (height(q + step) - height(q - step)).item() / 2.0e-8
+        for gradient in found:
+            assert gradient[entry].item() == pytest.approx(expected, rel=1.0e-4)
+        assert without[entry].item() != pytest.approx(expected, rel=1.0e-2)
+
+
+def test_what_a_reverse_pass_needs_cannot_be_lost_silently():
+    of, (q, qd) = rollout.__wrapped__(), tensors()  # whose parameters are its own
+    targets = torch.tensor(push_off(2)).requires_grad_()
+    made = simulate(of, targets, q, qd)
+    made.torque.div_(18.0)
+    with pytest.raises(RuntimeError, match="inplace"):
+        losses(made).backward()
+    made = simulate(of, targets, q, qd)
+    for name, other in (("kp", torch.full((12,), 30.0)), ("geometry", torch.tensor(of.geometry()))):
+        simulate(of, targets, q, qd, **{name: other})
+        with pytest.raises(ValueError, match=f"{name} has been changed since this rollout"):
+            losses(made).backward(retain_graph=True)
+        made = simulate(of, targets, q, qd)
+    (gradient,) = torch.autograd.grad(losses(made), targets, create_graph=True)
+    with pytest.raises(RuntimeError, match="once_differentiable"):
+        gradient.square().sum().backward()
+
+
+def test_jacobians_of_steps_chain_to_the_whole_gradient():
+    of, steps = rollout(), rollout(TICKS)
+    values = defaults()
+    trajectory = run(of, values)
+    run(steps, values | {"wrench": np.zeros((TICKS, 6))})  # the same parameters
+    found = step_jacobians(steps, trajectory, by=("q", "qd", "targets", "kp"))
+    seed = np.zeros(trajectory.q.shape)
+    seed[-1, 2] = 1.0
+    expected = of.backward(trajectory, q=of.array(seed))
+    adjoint, by_kp = np.eye(37)[2], np.zeros(12)
+    for step in reversed(range(TICKS)):
+        by_target = adjoint @ found["targets"][step, :, 0]
+        np.testing.assert_allclose(by_target, expected["targets"].numpy()[step, :, 0], rtol=0.0, atol=1.0e-12)
+        by_kp += adjoint @ found["kp"][step]
+        adjoint = adjoint @ np.concatenate([found["q"][step], found["qd"][step]], axis=-1)
+    np.testing.assert_allclose(by_kp, expected["kp"].numpy()[:, 0], rtol=0.0, atol=1.0e-12)
+    np.testing.assert_allclose(adjoint[:19], expected["q"].numpy()[:, 0], rtol=0.0, atol=1.0e-12)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"targets": np.zeros((2, 11))}, "targets must have shape"),
+        ({"targets": np.zeros((0, 12))}, "at least one policy step"),
+        ({"q": np.zeros(18)}, "q must have shape"),
+        ({"qd": np.zeros((18, 2))}, "qd must have shape"),
+        ({"wrench": np.zeros((3, 6))}, "wrench must have shape"),
+    ],
+)
+def test_run_refuses_other_shapes(changes, message):
+    q, qd = squat()
+    with pytest.raises(ValueError, match=message):
+        rollout().run(**({"targets": push_off(2), "q": q, "qd": qd} | changes))
+
+
+def test_run_refuses_the_other_precision():
+    with pytest.raises(ValueError, match="q must be float64"):
+        rollout().run(push_off(2), wp.zeros((19, 1), dtype=wp.float32), squat()[1])
+
+
+def test_backward_refuses_other_shapes():
+    trajectory = rollout().run(push_off(2), *squat())
+    with pytest.raises(ValueError, match="gradient by qd"):
+        rollout().backward(trajectory, qd=trajectory.q)
+
+
+@pytest.mark.parametrize(
+    "setting",
+    [
+        {"dt": 0.0},
+        {"dt": math.nan},
+        {"substeps": 0},
+        {"every": 3},
+        {"every": 0},
+        {"tolerance": -1.0},
+        {"tolerance": math.nan},
+    ],
+)
+def test_rollout_refuses_bad_settings(setting):
+    with pytest.raises(ValueError, match=next(iter(setting))):
+        Rollout(rollout().dynamics.model, **setting)
+
+
+def test_rollout_refuses_bad_lengths_and_worlds_to_hold():
+    of = rollout()
+    with pytest.raises(ValueError, match="geometry must be finite"):
+        of.set_geometry(np.full((4, 10), np.nan))
+    with pytest.raises(ValueError, match=r"worlds must be one bool, or \(1,\)"):
+        of.hold([True, False, True])
+
+
+def test_simulate_refuses_unknown_parameters():
+    with pytest.raises(ValueError, match="no parameter 'colour'"):
+        simulate(rollout(), torch.zeros(2, 12), *tensors(), colour=torch.zeros(1))
+
+
+@pytest.mark.parametrize("late", [-0.05, 5.0, float("nan")])
+def test_latencies_that_are_none_are_refused(late):
+    message = r"latency \[s\] must be in \[0, 0.1\], got "
+    of = Rollout(build_model(2, visuals=False))
+    with pytest.raises(ValueError, match=message):
+        simulate(of, torch.zeros(2, 12), *(torch.as_tensor(row) for row in of.standing()), latency=torch.tensor(late))
+    of.parameters["latency"].fill_(late)
+    with pytest.raises(ValueError, match=message):
+        of.run(np.zeros((2, 12)), *of.standing())
+
+
+@pytest.mark.parametrize("late", [-0.05, -0.001, float("-inf"), float("nan")])
+def test_no_target_arrives_before_it_is_sent(late, monkeypatch):
+    """Where nothing looks at latencies, as on a GPU."""
+    monkeypatch.setattr("jumper_warp.diff.rollout.check_within", lambda *_: None)
+    of, targets, ends = Rollout(build_model(4, visuals=False)), np.full((3, 12), 0.4), []
+    for latency in (0.0, late):
+        of.parameters["latency"].fill_(latency)
+        trajectory = of.run(targets, *of.standing())
+        gradients = of.backward(trajectory, qd=wp.full_like(trajectory.qd, 1.0))
+        ends.append((trajectory.q.numpy()[-1], gradients["targets"].numpy()))
+    if math.isfinite(late):
+        np.testing.assert_array_equal(ends[1][0], ends[0][0])
+        np.testing.assert_array_equal(ends[1][1], ends[0][1])
+    for values in ends[1]:
+        np.testing.assert_array_equal(values, np.repeat(values[..., :1], 4, axis=-1))
+
+
+@pytest.mark.parametrize("name", ["targets", "q", "wrench", "kp"])
+def test_simulate_refuses_what_is_not_a_number(name):
+    q, qd = tensors()
+    given = {"targets": torch.zeros(2, 12), "q": q, "qd": qd, "wrench": torch.zeros(2, 6), "kp": torch.ones(12)}
+    given[name] = torch.full_like(given[name], float("nan"))
+    with pytest.raises(ValueError, match=f"{name} must be finite"):
+        simulate(rollout(), **given)
+    with pytest.raises(ValueError, match="targets must be finite"):
+        rollout().run(np.full((2, 12), np.nan), *squat())
+
+
+def test_simulate_refuses_what_is_no_tensor():
+    q, qd = tensors()
+    with pytest.raises(ValueError, match="kp must be a torch tensor, got float"):
+        simulate(rollout(), torch.zeros(2, 12), q, qd, kp=80.0)
+    with pytest.raises(ValueError, match="q must be a torch tensor, got NoneType"):
+        simulate(rollout(), torch.zeros(2, 12), None, qd)
+    with pytest.raises(ValueError, match="impulse must be a torch tensor, got ndarray"):
+        simulate(rollout(), torch.zeros(2, 12), q, qd, impulse=np.zeros((4, 1, 3)))
+    with pytest.raises(ValueError, match="targets must be of real numbers"):
+        simulate(rollout(), torch.zeros(2, 12, dtype=torch.complex64), q, qd)
+    with pytest.raises(ValueError, match="targets must have shape"):
+        simulate(rollout(), torch.tensor(1.0), q, qd)
+
+
+@pytest.mark.parametrize("shape", [(1, 1, 3), (4, 2, 3), (4, 3)])
+def test_impulses_of_another_shape_are_refused(shape):
+    of, (q, qd) = rollout(), tensors()
+    with pytest.raises(ValueError, match=r"impulse must have shape \(4, 1, 3\)"):
+        simulate(of, torch.zeros(2, 12), q, qd, impulse=torch.zeros(shape))
+    for other in (np.zeros((4, 1, 3)), wp.zeros(shape[:2], dtype=wp.vec3, device="cpu")):
+        with pytest.raises(ValueError, match="impulse must be an array"):
+            of.run(push_off(2), *squat(), impulse=other)
+    with pytest.raises(ValueError, match="impulse must be finite"):
+        simulate(of, torch.zeros(2, 12), q, qd, impulse=torch.full((4, 1, 3), float("nan")))
+    single = simulate(of, torch.zeros(2, 12), q, qd, impulse=torch.zeros(4, 1, 3, dtype=torch.float32))
+    assert torch.equal(single.q, simulate(of, torch.zeros(2, 12), q, qd).q)
+
+
+def test_backward_refuses_a_trajectory_of_another_rollout():
+    trajectory = rollout().run(push_off(2), *squat())
+    with pytest.raises(ValueError, match="this rollout makes trajectories"):
+        rollout(2).backward(trajectory)
+    with pytest.raises(ValueError, match=r"must be like it, float64 .*, got float32"):
+        rollout().backward(trajectory, q=wp.zeros(trajectory.q.shape, dtype=wp.float32, device="cpu"))
+    with pytest.raises(ValueError, match="got ndarray"):
+        rollout().backward(trajectory, q=np.zeros(trajectory.q.shape))
+
+
+def test_jacobians_need_a_world_for_each_step():
+    trajectory, steps = rollout().run(push_off(2), *squat()), rollout.__wrapped__(2)
+    with pytest.raises(ValueError, match="2 policy steps need as many worlds"):
+        step_jacobians(rollout(), trajectory)
+    with pytest.raises(ValueError, match="world must be below 1, got 5"):
+        step_jacobians(steps, trajectory, world=5)
+    with pytest.raises(ValueError, match="no input 'kpp'"):
+        step_jacobians(steps, trajectory, by=("q", "kpp"))
+    steps.parameters["latency"].fill_(DT * SUBSTEPS)
+    with pytest.raises(ValueError, match="latency below a policy step"):
+        step_jacobians(steps, trajectory)
+
+
+@pytest.fixture
+def blocks_of_threads():
+    """Let the CPU run blocks of several threads."""
+    wp.config.enable_cpu_blocks = True
+    yield
+    wp.config.enable_cpu_blocks = False
+
+
+@pytest.mark.usefixtures("blocks_of_threads")
+@pytest.mark.parametrize("every", [4, 2])
+def test_a_thread_a_leg_does_what_a_thread_a_world_does(every):
+    """As on a GPU; with latency, fading motors, a wrench and worlds in the air, 11 of them, no multiple of 8."""
+    count = 11
+    of = rollout(count, every=every)
+    values = defaults() | {"latency": np.array(0.0061), "fade": np.array([4.0, 60.0])}
+    values["wrench"][5:15] = [3.0, -2.0, 4.0, 0.1, -0.2, 0.3]
+    values["q"] = np.repeat(values["q"][:, None], count, axis=1)
+    values["q"][2] += np.linspace(0.0, 0.05, count)
+    found = []
+    for of.by_legs in (True, False):
+        trajectory = run(of, values)
+        names, rng = ("q", "qd", "torque", "impulse"), np.random.default_rng(0)
+        seeds = {name: rng.normal(size=getattr(trajectory, name).numpy().shape) for name in names}
+        gradients = of.backward(
+            trajectory, **{name: (of.vectors if name == "impulse" else of.array)(s) for name, s in seeds.items()}
+        )
+        made = {name: getattr(trajectory, name).numpy().copy() for name in names}
+        found.append(made | {f"by {name}": array.numpy().copy() for name, array in gradients.items()})
+    for name, values in found[1].items():
+        scale = np.abs(values).max()
+        np.testing.assert_allclose(found[0][name], values, rtol=0.0, atol=1.0e-9 * scale, err_msg=name)
+
+
+def test_first_run_of_several_threads_is_whole():
+    """The kernel's module is loaded anew: no thread may begin before it is there."""
+    model, targets = build_model(64, visuals=False), np.full((4, 12), 0.8)
+    heights = []
+    for threads in (1, 2):
+        of = Rollout(model, double=True, threads=threads)
+        of.dynamics.modules.rollout.rollout_kernel.module.unload()
+        heights.append(of.run(targets, *of.standing()).q.numpy()[-1, 2])
+    assert np.array_equal(*heights)

@@ -1,0 +1,283 @@
+"""Gradients of a whole jump, through filter, latency, motors, dynamics, stops and contact, against differences.
+
+What is differentiated is a random sum over the states, the torques and the impulses of all times. A difference is
+wrong, not the gradient, where the perturbation makes a contact, a stop or a branch of filter and motors change sides:
+the motions are chosen so that none does.
+"""
+
+import numpy as np
+import pytest
+import warp as wp
+
+from jumper_warp.diff.bodies import body_gradients, moment_rows
+from jumper_warp.diff.rollout import GEOMETRY_NAMES
+from jumper_warp.kernels.layout import (
+    ARMATURE,
+    BASE,
+    DAMPING,
+    FRICTION,
+    GRAVITY,
+    INNER_SHANK,
+    KNEE_DAMPING,
+    LEG_ROWS,
+    LOWER,
+    MU_DYNAMIC,
+    MU_STATIC,
+    OUTER_THIGH,
+    SPRING,
+    STOP_KD,
+    STOP_KE,
+)
+from jumper_warp.robot.model import build_model
+from jumper_warp.robot.motors import jumping_motors, vertical_jump_filter
+from jumper_warp.sim.simulation import motor_values
+from tests.helpers.rollout_helpers import (
+    DT,
+    SUBSTEPS,
+    defaults,
+    differences,
+    gradients,
+    push_off,
+    rollout,
+    run,
+    squat,
+    weighed,
+    weights,
+)
+from tests.oracles.tape_rollout import tape_gradients
+
+LEG = int(LEG_ROWS)
+MU_ROWS = [leg * LEG + int(row) for leg in range(4) for row in (MU_DYNAMIC, MU_STATIC)]
+MASSES = [int(BASE), int(BASE) + 1, int(BASE) + 4, int(OUTER_THIGH) + LEG, int(INNER_SHANK) + 3, int(INNER_SHANK) + 6]
+JOINTS = [int(ARMATURE) + 1, int(FRICTION) + 1, int(DAMPING) + LEG, int(KNEE_DAMPING) + 2 * LEG]
+
+
+def jump(**changes) -> dict[str, np.ndarray]:
+    """Return what a jump reads, late by 6.1 ms, pulled sideways, with fading motors."""
+    values = defaults()
+    values["latency"] = np.array(0.0061)
+    values["wrench"][5:15] = [3.0, -2.0, 4.0, 0.1, -0.2, 0.3]
+    values["fade"] = np.array([4.0, 60.0])
+    return values | changes
+
+
+def sliding() -> dict[str, np.ndarray]:
+    """Return a jump from a forward speed on slippery ground."""
+    values = jump()
+    values["table"][MU_ROWS] = [0.25, 0.3] * 4
+    values["qd"][0] = 1.5
+    return values
+
+
+def folding() -> dict[str, np.ndarray]:
+    """Return a jump whose legs are pressed against stops that are narrower than the targets."""
+    values = jump()
+    for leg in range(4):
+        values["table"][leg * LEG + int(LOWER) : leg * LEG + int(LOWER) + 3] = [-0.6, 0.25, 0.3]
+    return values
+
+
+def sprung() -> dict[str, np.ndarray]:
+    """Return a jump with springs between the knees, no two alike."""
+    values = jump()
+    for leg in range(4):
+        values["table"][leg * LEG + int(SPRING) : leg * LEG + int(SPRING) + 2] = [300.0 + 40.0 * leg, 0.17 + 0.01 * leg]
+    return values
+
+
+CASES = {
+    "targets": (jump, "targets", [(0, 1), (3, 0), (4, 4), (8, 7), (20, 8)], 2.0e-6),
+    "position": (jump, "q", [0, 2, 3, 4, 5, 7, 8, 12, 18], 1.0e-7),
+    "velocity": (jump, "qd", [0, 2, 3, 5, 6, 7, 14], 2.0e-6),
+    "before": (jump, "before", [1, 5], 1.0e-5),
+    "wrench": (jump, "wrench", [(0, 2), (6, 0), (6, 5), (30, 1)], 1.0e-4),
+    "masses": (jump, "table", MASSES, 1.0e-6),
+    "joints": (jump, "table", JOINTS, 1.0e-6),
+    "gravity": (jump, "table", [int(GRAVITY), int(GRAVITY) + 2], 1.0e-5),
+    "latency": (jump, "latency", [()], 1.0e-8),
+    "filter": (jump, "filter", [8, 12], 1.0e-6),
+    "kp": (jump, "kp", [1, 8], 1.0e-4),
+    "kd": (jump, "kd", [1, 8], 1.0e-5),
+    "saturation": (jump, "saturation", [1, 8], 1.0e-4),
+    "offset": (jump, "offset", [1, 6], 1.0e-6),
+    "fade": (jump, "fade", [0, 1], 1.0e-4),
+    "friction": (sliding, "table", MU_ROWS, 1.0e-6),
+    "sliding": (sliding, "qd", [0, 1, 5], 1.0e-6),
+    "springs": (sprung, "table", [int(SPRING) + LEG, int(SPRING) + 1, int(SPRING) + 1 + 2 * LEG], 1.0e-5),
+    "sprung": (sprung, "targets", [(0, 1), (3, 0), (4, 4), (8, 7)], 2.0e-6),
+    "stops": (folding, "table", [int(LOWER) + 1, int(STOP_KE), int(STOP_KD) + LEG], 1.0e-6),
+    "pressed": (folding, "targets", [(4, 4), (8, 7)], 1.0e-6),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_gradient_matches_differences(case):
+    make, name, entries, h = CASES[case]
+    values = make()
+    by, found = gradients(rollout(), values)
+    expected = differences(values, by, name, entries, h)
+    scale = np.abs(expected).max()
+    assert scale > 1.0e-6, "the sum does not depend on this input: the comparison means nothing"
+    np.testing.assert_allclose([found[name][entry] for entry in entries], expected, rtol=0.0, atol=1.0e-6 * scale)
+
+
+def test_gradients_by_leg_lengths_match_differences():
+    values = jump()
+    by, found = gradients(rollout(), values)
+    lengths = rollout().geometry()
+    expected = np.zeros((2, 10))
+    for row, leg in enumerate((0, 3)):
+        for column in range(10):
+            for side in (-1.0, 1.0):
+                moved = lengths.copy()
+                moved[leg, column] += side * 1.0e-7
+                rollout().set_geometry(moved)
+                expected[row, column] += side * weighed(run(rollout(), values), by)[0] / 2.0e-7
+    rollout().set_geometry(lengths)
+    assert np.abs(expected[:, GEOMETRY_NAMES.index("thigh")]).min() > 1.0
+    np.testing.assert_allclose(found["geometry"][[0, 3]], expected, rtol=0.0, atol=2.0e-6 * np.abs(expected).max())
+
+
+def test_gradients_on_uneven_ground_match_differences():
+    values = jump()
+    values["q"] = values["q"].copy()
+    values["q"][2] += 0.012
+    of = rollout(ground="uneven")
+    by, found = gradients(of, values)
+    entries = [0, 1, 2, 3, 4, 8]
+    expected = differences(values, by, "q", entries, 1.0e-7, ground="uneven")
+    assert np.abs(expected[:2]).max() > 1.0e-2  # the place on the ground matters
+    np.testing.assert_allclose(found["q"][entries], expected, rtol=0.0, atol=2.0e-6 * np.abs(expected).max())
+
+
+def test_gradients_of_a_hung_robot_match_differences():
+    """A held base stays where it is, while the legs swing."""
+    values = jump()
+    values["q"][2], values["qd"][:6] = 1.0, 0.0
+    for of in (rollout(), rollout(8)):
+        of.hold()
+    try:
+        by, found = gradients(rollout(), values)
+        expected = differences(values, by, "kp", [1, 8], 1.0e-4)
+        held = run(rollout(), values)
+    finally:
+        for of in (rollout(), rollout(8)):
+            of.hold(False)
+    assert (held.q.numpy()[:, :7] == held.q.numpy()[0, :7]).all() and np.ptp(held.q.numpy()[:, 8]) > 0.5
+    np.testing.assert_allclose(found["kp"][[1, 8]], expected, rtol=1.0e-6)
+
+
+def test_gradients_are_those_of_warps_tape():
+    """Without latency, wrench and fading, which the tape's kernels do not know."""
+    q, qd = squat()
+    values = defaults() | {"latency": np.array(0.0)}
+    by = {"q": np.zeros((len(push_off()) + 1, 19, 1))}
+    by["q"][-1, :, 0] = np.random.default_rng(1).normal(size=19)
+    _, found = gradients(rollout(), values, by)
+    slots = [*range(7), *(7 + 5 * leg + j for leg in range(4) for j in (0, 1, 3))]
+    dofs = [*range(6), *(6 + 5 * leg + j for leg in range(4) for j in (0, 1, 3))]
+    joint_q, joint_qd, last = np.zeros(43), np.zeros(38), np.zeros(43)
+    joint_q[slots], joint_qd[dofs], last[slots] = q, qd, by["q"][-1, :, 0]
+    model = build_model(1, visuals=False, requires_grad=True)
+    expected, end = tape_gradients(
+        model, jumping_motors(), vertical_jump_filter(), DT, SUBSTEPS, push_off(), joint_q, joint_qd, last
+    )
+    assert motor_values(end[7:]) == pytest.approx(run(rollout(), values).q.numpy()[-1, 7:, 0], abs=1.0e-11)
+    expected["q"], expected["qd"] = expected["q"][slots], expected["qd"][dofs]
+    for name, gradient in expected.items():
+        np.testing.assert_allclose(found[name], gradient, rtol=0.0, atol=1.0e-9 * np.abs(gradient).max(), err_msg=name)
+
+
+def test_gradients_by_bodies_match_differences_of_their_moments():
+    """Mass at fixed inertia about the com, com, and inertia of a shank, by hand through the parallel axis theorem."""
+    rng = np.random.default_rng(2)
+    gradient = rng.normal(size=(int(GRAVITY) + 3, 1))
+    table = rollout().parameters["table"].numpy()[:, :1].astype(float)
+    body = 5
+
+    def moments(mass, c, inertia):
+        full = np.array([[inertia[0], inertia[3], inertia[4]], [inertia[3], inertia[1], inertia[5]],
+                         [inertia[4], inertia[5], inertia[2]]])  # fmt: skip
+        second = 0.5 * np.trace(full) * np.eye(3) - full + mass * np.outer(c, c)
+        return np.array([mass, *(mass * c), *second.diagonal(), second[0, 1], second[0, 2], second[1, 2]])
+
+    mass, c, inertia = 0.3, np.array([0.01, -0.02, -0.1]), np.array([3.0, 4.0, 2.0, 0.1, -0.2, 0.3]) * 1.0e-3
+    table[moment_rows(body), 0] = moments(mass, c, inertia)
+    found = body_gradients(table, gradient)
+    by = gradient[moment_rows(body), 0]
+    by_mass = (moments(mass + 1.0e-6, c, inertia) - moments(mass - 1.0e-6, c, inertia)) @ by / 2.0e-6
+    assert found["mass"][body, 0] == pytest.approx(by_mass, rel=1.0e-7)
+    for i in range(3):
+        d = 1.0e-6 * np.eye(3)[i]
+        by_com = (moments(mass, c + d, inertia) - moments(mass, c - d, inertia)) @ by / 2.0e-6
+        assert found["com"][body, i, 0] == pytest.approx(by_com, rel=1.0e-7)
+    for i in range(6):
+        d = 1.0e-6 * np.eye(6)[i]
+        by_inertia = (moments(mass, c, inertia + d) - moments(mass, c, inertia - d)) @ by / 2.0e-6
+        assert found["inertia"][body, i, 0] == pytest.approx(by_inertia, rel=1.0e-7)
+
+
+def test_single_precision_gradients_are_those_of_double_precision():
+    """Worst seen: 2.4e-4 of the largest entry, of the height in flight."""
+    values = defaults()
+    by = {"q": np.zeros((len(push_off()) + 1, 19, 1))}
+    by["q"][30, 2] = 1.0
+    _, double = gradients(rollout(), values, by)
+    _, single = gradients(rollout(double=False), values, by)
+    for name in ("targets", "q", "qd", "kp", "saturation", "table", "geometry"):
+        np.testing.assert_allclose(single[name], double[name], rtol=0.0, atol=1.0e-3 * np.abs(double[name]).max())
+
+
+def one_step(**changes) -> dict[str, np.ndarray]:
+    """Return a single policy step in the squat, at rest, with `height` [m] added, `speed` [m/s] and friction."""
+    values = defaults() | {"qd": np.zeros(18), "targets": np.tile(squat()[0][7:], (1, 1)), "wrench": np.zeros((1, 6))}
+    values["q"][2] += changes.get("height", 0.0)
+    values["qd"][0] = changes.get("speed", 0.0)
+    if "friction" in changes:
+        values["table"][MU_ROWS] = changes["friction"]
+    return values
+
+
+def by_end(name: str, entry: int) -> dict[str, np.ndarray]:
+    """Return the weights of one entry of the state at the end of a policy step."""
+    by = {name: np.zeros((2, {"q": 19, "qd": 18}[name], 1))}
+    by[name][1, entry] = 1.0
+    return by
+
+
+@pytest.mark.parametrize("touches", [False, True])
+def test_touchdown_has_the_gradient_of_its_side(touches):
+    """Falling for four steps from rest, by g dt^2 (1 + 2 + 3 + 4), a robot lands that was closer to the ground.
+
+    Not landing, the new height follows the old one exactly. Landing, the paws close the gap and hold the base back.
+    """
+    gap = 9.81 * DT * DT * 10.0 + 1.0e-4  # the squat starts 0.1 mm in the ground
+    height = gap - 2.0e-5 if touches else gap + 2.0e-5
+    values = one_step(height=height)
+    by, found = gradients(rollout(), values, by_end("q", 2))
+    expected = differences(values, by, "q", [2], 1.0e-6)[0]
+    assert found["q"][2] == pytest.approx(expected, rel=1.0e-6)
+    assert (found["q"][2] == pytest.approx(1.0, abs=1.0e-9)) != touches
+
+
+@pytest.mark.parametrize("slides", [False, True])
+def test_sliding_has_a_gradient_by_friction_and_sticking_has_none(slides):
+    values = one_step(speed=0.02, friction=0.05 if slides else 5.0)
+    _, found = gradients(rollout(), values, by_end("qd", 0))
+    by_friction = found["table"][MU_ROWS].sum()
+    assert by_friction < -1.0e-3 if slides else by_friction == 0.0  # more friction, less speed
+
+
+def test_more_rows_change_no_gradient():
+    """Steps made again from a row a policy step have the gradients of those from a row a step."""
+    values = jump()
+    by = weights(run(rollout(), values), ("torque", "impulse"))
+    (_, few), (_, many) = gradients(rollout(), values, by), gradients(rollout(every=1), values, by)
+    for name, gradient in few.items():
+        np.testing.assert_allclose(many[name], gradient, rtol=0.0, atol=1.0e-9 * np.abs(gradient).max() + 1.0e-30)
+
+
+def test_nothing_is_left_of_a_gradient_that_is_zero():
+    trajectory = run(rollout(), jump())
+    found = rollout().backward(trajectory, q=wp.zeros_like(trajectory.q))
+    assert not any(array.numpy().any() for array in found.values())

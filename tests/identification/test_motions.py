@@ -1,0 +1,111 @@
+"""Recorded motions as files, and what is refused of them."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+
+from jumper_warp.identification.motions import Motion, load_motion
+from jumper_warp.robot.description import MOTOR_JOINTS
+from jumper_warp.utils.errors import InputError
+
+ROWS = 12
+
+
+def some_motion():
+    rng = np.random.default_rng(0)
+    angle = rng.normal(size=(ROWS, 12))
+    angle[1::2] = math.nan
+    quaternion = rng.normal(size=(ROWS, 4))
+    return Motion(
+        name="walk",
+        time=np.arange(ROWS) / 240.0,
+        target=rng.normal(size=(ROWS, 12)),
+        angle=angle,
+        torque=rng.normal(size=(ROWS, 12)),
+        quaternion=quaternion / np.linalg.norm(quaternion, axis=1, keepdims=True),
+        base="fixed",
+        torque_limit=12.0,
+    )
+
+
+def table_of(motion):
+    """Return the names and columns of a table, angles in degrees, currents instead of torques."""
+    columns = {"time [ms]": 1000.0 * motion.time}
+    for i, joint in enumerate(MOTOR_JOINTS):
+        columns[f"target/{joint}"] = motion.target[:, i]
+        columns[f"angle/{joint} [deg]"] = np.degrees(motion.angle[:, i])
+        columns[f"current/{joint} [A]"] = motion.torque[:, i] / 1.5
+    for i, axis in enumerate("xyzw"):
+        columns[f"quaternion/{axis}"] = motion.quaternion[:, i]
+    return columns
+
+
+def write_csv(path, columns, settings=None):
+    rows = [",".join(columns)]
+    for row in zip(*columns.values(), strict=True):
+        rows.append(",".join("" if math.isnan(x) else repr(float(x)) for x in row))
+    path.write_text("\n".join(rows) + "\n")
+    if settings is not None:
+        path.with_suffix(".json").write_text(json.dumps(settings))
+
+
+def assert_same(found, motion):
+    for name in ("time", "target", "angle", "torque", "quaternion"):
+        np.testing.assert_allclose(getattr(found, name), getattr(motion, name), atol=1e-12)
+    assert found.rate is None and found.position is None
+    assert (found.name, found.base, found.torque_limit, found.gains) == ("walk", "fixed", 12.0, "jumping")
+
+
+def test_a_motion_comes_back_from_npz_csv_and_parquet(tmp_path):
+    motion = some_motion()
+    motion.save(tmp_path / "walk.npz")
+    assert_same(load_motion(tmp_path / "walk.npz"), motion)
+    columns = table_of(motion)
+    write_csv(tmp_path / "walk.csv", columns, {"base": "fixed", "torque_limit": 12.0})
+    assert_same(load_motion(tmp_path / "walk.csv", torque_constant=1.5), motion)
+    assert load_motion(tmp_path / "walk.csv", torque_constant=1.5, base="free").base == "free"
+    pyarrow = pytest.importorskip("pyarrow")
+    pyarrow.parquet = pytest.importorskip("pyarrow.parquet")
+    pyarrow.parquet.write_table(pyarrow.table(columns), tmp_path / "walk.parquet")
+    assert_same(load_motion(tmp_path / "walk.parquet", torque_constant=1.5), motion)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda c: c | {"angel/FL_outer": c["time [ms]"]}, "unknown column 'angel/FL_outer'"),
+        (lambda c: c | {"rate/FL_outer [rpm]": c["time [ms]"]}, "expected a unit of rad/s, deg/s"),
+        (lambda c: {k: v for k, v in c.items() if k != "target/BL_inner"}, "target/BL_inner is missing"),
+        (lambda c: {k: v for k, v in c.items() if "time" not in k}, "column time is missing"),
+        (lambda c: c | {"target/FL_outer": 40.0 + c["target/FL_outer"]}, "is its unit given in the name"),
+        (lambda c: c | {"time [ms]": c["time [ms]"][::-1]}, "time must be finite and rise, it does not in row 1"),
+        (lambda c: c | {"quaternion/w": 2.0 + c["quaternion/w"]}, "quaternions must have length 1"),
+        (lambda c: c | {"target/FL_outer": np.full(ROWS, math.inf)}, "target is not finite in row 0"),
+        (lambda c: {k: v for k, v in c.items() if k.startswith(("time", "target"))}, "nothing is measured"),
+    ],
+)
+def test_a_bad_table_is_refused_in_one_line(tmp_path, change, words):
+    write_csv(tmp_path / "walk.csv", change(table_of(some_motion())))
+    with pytest.raises(InputError, match=words) as error:
+        load_motion(tmp_path / "walk.csv", torque_constant=1.5)
+    assert "\n" not in str(error.value)
+
+
+def test_files_and_settings_that_cannot_be_read_are_refused(tmp_path):
+    columns = table_of(some_motion())
+    write_csv(tmp_path / "walk.csv", columns)
+    with pytest.raises(InputError, match="current needs the torque constant"):
+        load_motion(tmp_path / "walk.csv")
+    write_csv(tmp_path / "walk.csv", columns, {"stand": "high"})
+    with pytest.raises(InputError, match="no setting 'stand'"):
+        load_motion(tmp_path / "walk.csv", torque_constant=1.5)
+    (tmp_path / "walk.npz").write_bytes(b"PK nothing")
+    with pytest.raises(InputError, match="not an npz file"):
+        load_motion(tmp_path / "walk.npz")
+    np.savez(tmp_path / "walk.npz", time=np.zeros(3), goal=np.zeros((3, 12)))
+    with pytest.raises(InputError, match="no channel 'goal'"):
+        load_motion(tmp_path / "walk.npz")
+    with pytest.raises(InputError, match=r"expected a file of \.npz"):
+        load_motion(tmp_path / "walk.mat")

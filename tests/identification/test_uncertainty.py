@@ -1,0 +1,62 @@
+import numpy as np
+import pytest
+
+from jumper_warp.identification.least_squares import Normal
+from jumper_warp.identification.residuals import Linearised
+from jumper_warp.identification.uncertainty import systematic_deviations
+
+PARAMETERS, ROWS, CHANNELS, MOTIONS = 5, 60, 4, 3
+CHANNEL = np.arange(CHANNELS).repeat(ROWS // CHANNELS)
+
+
+class Refit:
+    """Linear motions, each with a start of its own, whose errors are alike in a channel; priors of deviation 1."""
+
+    def __init__(self, starts: int, rng: np.random.Generator):
+        self.starts = starts
+        self.jacobians = [rng.normal(size=(ROWS, PARAMETERS + starts)) for _ in range(MOTIONS)]
+        self.data = [rng.normal(size=ROWS) + rng.normal(size=CHANNELS)[CHANNEL] for _ in range(MOTIONS)]
+        self.weights = [rng.uniform(0.2, 1.0, ROWS) for _ in range(MOTIONS)]
+
+    def solve(self, kept):
+        """Return parameters (P,) and starts (MOTIONS, I) that fit the kept rows best; kept: bool (MOTIONS, ROWS)."""
+        matrix = np.eye(PARAMETERS + MOTIONS * self.starts)
+        slope = np.zeros(len(matrix))
+        for i in range(MOTIONS):
+            first = PARAMETERS + i * self.starts
+            place = [*range(PARAMETERS), *range(first, first + self.starts)]
+            weighed = (self.weights[i] * kept[i])[:, None] * self.jacobians[i]
+            matrix[np.ix_(place, place)] += weighed.T @ self.jacobians[i]
+            slope[place] += weighed.T @ self.data[i]
+        found = np.linalg.solve(matrix, slope)
+        return found[:PARAMETERS], found[PARAMETERS:].reshape(MOTIONS, self.starts)
+
+    def normal(self, z, starts):
+        """Return the normal equations at parameters and starts."""
+        matrix, mixed, own, linearised = np.zeros((PARAMETERS, PARAMETERS)), [], [], []
+        for jacobian, data, weight, start in zip(self.jacobians, self.data, self.weights, starts, strict=True):
+            square = jacobian.T @ (weight[:, None] * jacobian)
+            matrix += square[:PARAMETERS, :PARAMETERS]
+            mixed.append(square[:PARAMETERS, PARAMETERS:])
+            own.append(square[PARAMETERS:, PARAMETERS:] + np.eye(self.starts))
+            linearised.append(Linearised(jacobian @ np.concatenate([z, start]) - data, jacobian))
+        return Normal(0.0, 0.0, z, matrix, [], own, mixed, linearised, self.weights)
+
+
+@pytest.mark.parametrize(("starts", "close"), [(0, 1e-9), (3, 0.15)])  # starts stay as all data would have them
+def test_contradictions_are_what_refits_without_a_channel_or_a_motion_change(starts, close):
+    refit = Refit(starts, np.random.default_rng(0))
+    everything = np.ones((MOTIONS, ROWS), bool)
+    best, best_starts = refit.solve(everything)
+    normal = refit.normal(best, best_starts)
+    found = systematic_deviations(normal, [CHANNEL] * MOTIONS, np.linalg.inv(normal.information() + np.eye(PARAMETERS)))
+    variance = np.zeros(PARAMETERS)
+    for groups in ([CHANNEL == c for c in range(CHANNELS)], [np.ones(ROWS, bool)]):
+        changes = []
+        for motion in range(MOTIONS):
+            for rows in groups:
+                kept = everything.copy()
+                kept[motion] &= ~rows
+                changes.append(refit.solve(kept)[0] - best)
+        variance += (len(changes) - 1) / len(changes) * np.square(changes).sum(0)
+    np.testing.assert_allclose(found, np.sqrt(variance), rtol=close)

@@ -1,0 +1,56 @@
+"""Gauss-Newton on a network's weights against the same equation solved densely."""
+
+from itertools import pairwise
+
+import torch
+from torch.func import jacrev
+
+from jumper_warp.policies.policy import Policy
+from jumper_warp.trajectory.gauss_newton import Anchor, Network, Tape, gauss_newton_step, world_rows
+from tests.policies.test_policy import make_interface
+
+
+def small(num_obs=3, hidden=(4, 5), num_actions=2):
+    torch.manual_seed(0)
+    sizes = (num_obs, *hidden, num_actions)
+    layers = [(0.5 * torch.randn(b, a), 0.1 * torch.randn(b)) for a, b in pairwise(sizes)]
+    interface = make_interface(num_obs, num_actions, hidden, activation="elu")
+    policy = Policy(layers, torch.randn(num_obs), torch.rand(num_obs) + 0.5, interface)
+    return policy, Network(policy, dtype=torch.float64)
+
+
+def test_network_acts_as_the_policy():
+    policy, network = small()
+    obs = 5.0 * torch.randn(20, 3)
+    torch.testing.assert_close(network.act(obs.double()).float(), policy.act(obs))
+
+
+def test_rows_are_the_derivatives_of_each_world():
+    _, network = small()
+    obs, tape = torch.randn(4, 3, dtype=torch.float64), Tape()
+
+    def numbers(weights, tape=None):
+        first = network.act(obs, weights, tape)
+        again = network.act(obs + first.sum(1, keepdim=True), weights, tape)  # the second step sees the first
+        return (first * again).sum(1)
+
+    total = numbers(network.weights, tape).sum()
+    expected = jacrev(numbers)(network.weights)
+    torch.testing.assert_close(world_rows(total, tape), expected, rtol=1.0e-10, atol=1.0e-12)
+
+
+def test_step_solves_its_equation():
+    _, network = small()
+    weights, size = network.weights, len(network.weights)
+    anchor = Anchor(network, torch.randn(9, 3, dtype=torch.float64), torch.rand(9, dtype=torch.float64) + 0.1)
+    moved = weights + 0.05 * torch.randn(size, dtype=torch.float64)
+    rows, misses = torch.randn(6, size, dtype=torch.float64), torch.randn(6, dtype=torch.float64)
+    importance = torch.rand(6, dtype=torch.float64)
+    step = gauss_newton_step(moved, [rows[:2], rows[2:]], [misses[:2], misses[2:]], [importance[:2], importance[2:]],
+                             anchor, 0.5, 200, 1.0e-9)  # fmt: skip
+    off = anchor.off(moved).flatten()
+    change = jacrev(lambda w: anchor.off(w).flatten())(moved)
+    matrix = rows.T @ (importance[:, None] * rows) + change.T @ change + 0.5 * torch.eye(size, dtype=torch.float64)
+    right = -rows.T @ (importance * misses) - change.T @ off
+    torch.testing.assert_close(step, torch.linalg.solve(matrix, right), rtol=1.0e-6, atol=1.0e-6 * float(step.norm()))
+    assert anchor.cost(moved) > 0.0 == anchor.cost(weights)

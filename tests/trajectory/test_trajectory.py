@@ -1,0 +1,303 @@
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from jumper_warp.diff.rollout import Rollout
+from jumper_warp.robot.model import build_model
+from jumper_warp.robot.motors import jumping_motors, vertical_jump_filter
+from jumper_warp.sim.simulation import Simulation
+from jumper_warp.trajectory import jumps
+from jumper_warp.trajectory.augmented_lagrangian import minimise
+from jumper_warp.trajectory.problem import Knots, Problem, Values
+from jumper_warp.trajectory.smoothing import SHIFT, Stage, crossed, descend, smoothed
+from jumper_warp.utils.errors import InputError
+
+KNOTS = Knots((0.0, 8.0, 14.0, 18.0, 22.0), steps=36)
+SQUAT_AND_PUSH = np.array([[0.0] * 4, [0.5] * 4, [0.5, 0.5, 0.5, 0.5], [-0.4, -0.4, -0.5, -0.4], [-0.5] * 4])
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+
+def problem(objective=None, constraints=(), **settings) -> Problem:
+    """Return a jump from standing, squat and push-off."""
+    settings = {"command_filter": vertical_jump_filter(), "threads": 1} | settings
+    return Problem(KNOTS, objective or jumps.highest(), constraints, jumping_motors(18.0), **settings)
+
+
+@pytest.fixture(scope="module")
+def jump():
+    made = problem()
+    x = torch.as_tensor(SQUAT_AND_PUSH.reshape(1, -1))
+    with torch.no_grad():
+        return made, x, made.motion(x)
+
+
+# ---------------------------------------------------------------- knots
+
+
+def test_targets_are_interpolated_actions():
+    x = np.zeros((1, len(KNOTS)))
+    x[0, 4:8] = [1.0, -0.5, 0.25, 0.0]  # front outer, front inner, hind outer, hind inner at step 8
+    targets = KNOTS.targets(torch.as_tensor(x))[..., 0].numpy()
+    expected = np.array([0.0, 90.0, -45.0, 0.0, 90.0, -45.0, 0.0, 22.5, 0.0, 0.0, 22.5, 0.0])
+    rest = np.tile([0.0, 45.0, 45.0], 4)
+    assert np.degrees(targets[8]) == pytest.approx(rest + expected)
+    assert np.degrees(targets[4]) == pytest.approx(rest + 0.5 * expected)
+    assert np.degrees(targets[30]) == pytest.approx(rest)
+    actions = (KNOTS.weights @ x.reshape(-1, 4)).astype(float)
+    assert KNOTS.nearest(actions) == pytest.approx(x[0], abs=1e-12)
+
+
+def test_all_motors_can_be_free():
+    knots = Knots((0.0, 3.0), steps=5, symmetric=False)
+    x = np.random.default_rng(0).uniform(-1.0, 1.0, (2, len(knots)))
+    targets = knots.targets(torch.as_tensor(x)).numpy()
+    scale, middle = np.tile([15.0, 90.0, 90.0], 4), np.tile([0.0, 45.0, 45.0], 4)
+    assert np.degrees(targets[4, :, 1]) == pytest.approx(middle + scale * x[1, 12:])
+
+
+@pytest.mark.parametrize("at", [(1.0, 3.0), (0.0, 3.0, 3.0), (0.0, 5.0), (0.0,)])
+def test_knots_that_cannot_be_are_refused(at):
+    with pytest.raises(InputError, match="knots must rise"):
+        Knots(at, steps=5)
+
+
+# ---------------------------------------------------------------- jumps
+
+
+def test_air_time_is_that_of_a_projectile():
+    up, drop = torch.tensor([3.0, 0.0, -1.0], dtype=torch.float64), torch.tensor([0.2, 0.45, 0.3], dtype=torch.float64)
+    time = jumps.air_time(up, drop, 9.81)
+    assert (drop + up * time - 0.5 * 9.81 * time**2).numpy() == pytest.approx(0.0, abs=1e-12)
+
+
+def test_flight_of_a_jump_does_not_depend_on_the_row_after_takeoff(jump):
+    """The parabola through any row in the air is the same, but for the step's error."""
+    _, _, motion = jump
+    row, off = motion.takeoff(0.25)
+    assert off.all() and motion.q.shape[0] - int(row) > 6
+    now, later = motion.momentum_at(row), motion.momentum_at(row + 6)
+    time = 6 * motion.substeps * motion.dt
+    assert later.vel.numpy() == pytest.approx((now.vel - torch.tensor([0.0, 0.0, 9.81 * time])).numpy(), abs=0.015)
+    fallen = now.com + time * now.vel - torch.tensor([0.0, 0.0, 0.5 * 9.81 * time * (time + motion.dt)])
+    assert later.com.numpy() == pytest.approx(fallen.numpy(), abs=2e-3)
+    assert later.spin.numpy() == pytest.approx(now.spin.numpy(), abs=0.02)
+
+
+def test_simulation_that_is_given_the_targets_does_the_same(jump):
+    made, x, motion = jump
+    sim = Simulation(1, motors=made.motors, command_filter=made.command_filter, friction=made.friction, device="cpu")
+    targets, heights = made.knots.targets(x)[..., 0].numpy(), []
+    for target in targets:
+        sim.target.assign(target[:, None].astype(np.float32))
+        sim.step()
+        heights.append(sim.joint_q()[0, 2])
+    assert max(heights) > 0.6
+    assert heights == pytest.approx(motion.q[1:, 0, 2].numpy(), abs=1e-3)
+    assert -float(jumps.highest()(motion)) == pytest.approx(max(heights), abs=3e-3)
+
+
+def test_work_is_that_of_every_physics_step(jump):
+    made, x, motion = jump
+    fine = Rollout(
+        build_model(1, visuals=False, friction=made.friction), made.motors, made.command_filter, double=True,
+        tolerance=made.tolerance, every=1, threads=1,
+    )  # fmt: skip
+    exact = fine.run(made.knots.targets(x).numpy(), *fine.standing())
+    rate, torque = exact.qd.numpy()[:, 6:, 0], exact.torque.numpy()[:, :, 0]
+    power = torque * 0.5 * (rate[1:] + rate[:-1])
+    work = fine.dt * np.maximum(power, 0.0).sum()
+    assert work > 50.0
+    assert float(motion.positive_work[-1, 0]) == pytest.approx(work, rel=0.03)
+    assert float(motion.copper[-1, 0]) == pytest.approx(fine.dt * (torque**2).sum(), rel=1e-9)
+
+
+def test_a_second_hop_is_not_the_apex():
+    """A small hop, a squat in the air, and a jump: the apex is that of the hop."""
+    made = problem()
+    made.knots = Knots((0.0, 7.0, 8.0, 30.0, 31.0), steps=56)
+    x = torch.full((1, 5, 4), -1.0, dtype=torch.float64)
+    x[:, 2:4], x[:, 4] = 0.5, -0.5
+    with torch.no_grad():
+        motion = made.motion(x.reshape(1, -1))
+    height, row = motion.q[:, 0, 2].numpy(), int(motion.takeoff(0.25)[0])
+    again = row + int(motion.down[row:, :, 0].any(dim=1).int().argmax())
+    assert row < 15 and height[again:].max() > height[:again].max() + 0.05
+    assert -float(jumps.highest()(motion)) == pytest.approx(height[:again].max(), abs=5e-3)
+
+
+TERMS = {
+    "farthest": jumps.farthest(),
+    "highest": jumps.highest(),
+    "positive_work": jumps.positive_work(),
+    "landing_pitch": lambda motion: jumps.landing_pitch(0.5)(motion)[0],
+    "stays": lambda motion: jumps.stays(0.3)(motion).sum(0),
+    "leans_back": jumps.leans_back(1.0),
+    "clear": lambda motion: jumps.clear()(motion).sum(0),
+    "soft": lambda motion: jumps.soft(0.0, 0.25)(motion).sum(0),
+    "upright": lambda motion: jumps.upright(0.2)(motion)[0],
+}
+
+
+def test_gradients_are_those_of_central_differences():
+    rng, h = np.random.default_rng(1), 1.0e-6
+    x = SQUAT_AND_PUSH.reshape(1, -1) + 0.02 * rng.normal(size=(1, len(KNOTS)))
+    directions = rng.normal(size=(3, len(KNOTS)))
+    ends = torch.as_tensor(np.concatenate([x + h * directions, x - h * directions]))
+    whole = problem(TERMS["farthest"], list(TERMS.values()), tolerance=1e-13)
+    with torch.no_grad():
+        found = whole.evaluate(ends).constraints
+    ahead, behind = found.split(3)
+    expected = ((ahead - behind) / (2.0 * h)).numpy()
+    for i, name in enumerate(TERMS):
+        _, gradient = whole.gradient(torch.as_tensor(x), lambda values, i=i: values.constraints[:, i])
+        scale = np.abs(expected[:, i]).max()
+        assert scale > 1e-4, name
+        assert gradient.numpy()[0] @ directions.T == pytest.approx(expected[:, i], abs=1e-5 * scale), name
+
+
+# ---------------------------------------------------------------- descent
+
+
+class Bowl:
+    """A problem whose solution is known: the point of a half space that is nearest to a goal, in a narrow valley."""
+
+    def __init__(self):
+        self.knots, self.double, self.world_steps, self.reverse_steps = range(2), True, 0, 0
+        self.goal = torch.tensor([0.6, 0.4], dtype=torch.float64)
+        self.device = "cpu"
+
+    def rollout(self, _):
+        return self
+
+    def evaluate(self, x):
+        away = x - self.goal
+        self.world_steps += len(x)
+        return Values(away[:, 0] ** 2 + 20.0 * away[:, 1] ** 2, (x.sum(1) - 0.5)[:, None])
+
+    def gradient(self, x, merit):
+        x = x.detach().requires_grad_()
+        values = self.evaluate(x)
+        self.reverse_steps += len(x)
+        return Values(*(v.detach() for v in values)), torch.autograd.grad(merit(values).sum(), x)[0]
+
+
+# minimise (a - 0.6)^2 + 20 (b - 0.4)^2 with a + b = 0.5: a - 0.6 = 20 (b - 0.4)
+NEAREST = np.array([0.6 - 20.0 * 0.5 / 21.0, 0.4 - 0.5 / 21.0])
+
+
+def test_descent_finds_the_constrained_minimum():
+    begin = np.array([[-0.9, 0.9], [0.9, -0.9], [-0.5, -0.5]])
+    found = minimise(Bowl(), begin, iterations=120)
+    assert found.x == pytest.approx(np.tile(NEAREST, (3, 1)), abs=3e-3)
+    assert (found.violation <= 1e-3).all() and found.history[-1]["reverse_steps"] > 300
+    again = minimise(Bowl(), begin, iterations=120)
+    assert np.array_equal(found.x, again.x)
+
+
+def test_descent_stays_in_the_box():
+    bowl = Bowl()
+    bowl.goal = torch.tensor([3.0, -0.2], dtype=torch.float64)
+    bowl.evaluate = lambda x: Values((x - bowl.goal).square().sum(1), x.new_zeros(len(x), 0))
+    found = minimise(bowl, np.zeros((1, 2)), iterations=40)
+    assert found.x[0] == pytest.approx([1.0, -0.2], abs=1e-4)
+
+
+def test_smoothed_descent_comes_near_from_afar():
+    begin = np.random.default_rng(0).uniform(-1.0, 1.0, (64, 2))
+    stages = (Stage(8, 60, 0.05, 0.05, least=1.0), Stage(2, 100, 0.03, 0.03, penalty=100.0))
+    found = smoothed(Bowl(), begin, stages=stages)
+    assert found.shape == (2, 2) and found == pytest.approx(np.tile(NEAREST, (2, 1)), abs=0.03)
+
+
+def test_multipliers_keep_a_smoothed_descent_within_its_constraints():
+    begin = torch.tensor([[0.5, 0.3]], dtype=torch.float64)
+    violation = {}
+    for dual in (0.0, 0.5):
+        stage = Stage(1, 300, 0.02, 0.02, penalty=1.0, dual=dual)
+        violation[dual] = float(descend(Bowl(), begin, stage, np.random.default_rng(0)).sum() - 0.5)
+    assert violation[0.0] > 0.1 and abs(violation[0.5]) < 0.02
+
+
+def test_starts_with_multipliers_end_at_their_best_within_the_constraints():
+    begin = torch.tensor([[0.5, 0.3]], dtype=torch.float64)
+    stage = Stage(1, 300, 0.02, 0.02, penalty=1.0, dual=0.5, slack=0.5)
+    found = descend(Bowl(), begin, stage, np.random.default_rng(0))
+    assert float(found.sum() - 0.5) < 5e-3
+    assert found[0].numpy() == pytest.approx(NEAREST, abs=0.05)
+
+
+class Edge(Bowl):
+    """The valley ends at 0.45: beyond it everything is bad and nothing says where to go."""
+
+    def evaluate(self, x):
+        values = super().evaluate(x)
+        return Values(torch.where(x[:, 0] > 0.45, 5.0, values.objective), values.constraints - 1.0)
+
+
+def test_starts_that_fell_off_an_edge_go_back():
+    begin = torch.tensor([[0.3, 0.4], [-0.5, 0.3]], dtype=torch.float64)
+    ends = {}
+    for slack in (math.inf, 0.1):
+        stage = Stage(2, 120, 0.05, 0.01, least=1.0, slack=slack)
+        ends[slack] = Edge().evaluate(descend(Edge(), begin, stage, np.random.default_rng(0))).objective
+    assert (ends[math.inf] == 5.0).any()
+    first = Edge().evaluate(begin).objective
+    assert (ends[0.1] <= first).all() and ends[0.1][1] < first[1] - 1.0
+
+
+def test_starts_that_go_back_go_on_with_smaller_steps():
+    begin, merit = torch.tensor([[0.2, 0.3]], dtype=torch.float64), {}
+    for calmer in (1.0, 0.5):
+        stage = Stage(1, 100, 0.3, 0.01, least=1.0, slack=0.001, look=2, calmer=calmer)
+        merit[calmer] = float(Edge().evaluate(descend(Edge(), begin, stage, np.random.default_rng(0))).objective)
+    assert merit[0.5] < 0.0226 < 0.1 < merit[1.0]  # (0.6 - 0.45)^2
+
+
+def test_crossings_have_the_beginning_of_one_and_the_end_of_another():
+    knots = Knots(tuple(map(float, range(12))), steps=12)
+    rows = torch.arange(12.0)[:, None] + torch.tensor([0.0, 100.0, 200.0])[:, None, None]  # knot + 100 x parent
+    whole = crossed(knots, rows.expand(3, 12, 4).flatten(1), 66, np.random.default_rng(0)).reshape(198, 12, 4)
+    assert (whole == whole[..., :1]).all()
+    parent, knot = torch.div(whole[..., 0], 100.0, rounding_mode="floor"), whole[..., 0] % 100.0
+    assert (parent[:, 0] == torch.arange(3.0).repeat(66)).all()
+    assert (parent[:, 0] != parent[:, -1]).all()  # of two, never of one
+    assert ((parent.diff(dim=1) != 0.0).sum(1) == 1).all()
+    own = parent == parent[:, :1]
+    assert (knot[own] == torch.arange(12.0).expand(198, 12)[own]).all()
+    assert 0 < (knot - torch.arange(12.0)).abs().max() <= SHIFT
+
+
+def test_search_crosses_its_starts():
+    begin = np.array([[0.0, 0.0, 0.0, 0.0, 0.9, 0.9, 0.9, 0.9], [0.9, 0.9, 0.9, 0.9, 0.0, 0.0, 0.0, 0.0]])
+
+    class Ends(Bowl):
+        """Best where all knots are 0, which are one's beginning and the other's end."""
+
+        def evaluate(self, x):
+            return Values(x.square().sum(1), x.new_zeros(len(x), 0))
+
+    bowl = Ends()
+    bowl.knots = Knots((0.0, 1.0), steps=2)
+    found = smoothed(bowl, begin, stages=(Stage(1, 1, 1e-6, 1e-6, crossings=16),))
+    assert np.abs(found).max() < 1e-3
+
+
+def test_a_jump_gets_higher_within_its_constraints():
+    limit = math.radians(10.0)
+    made = problem(constraints=(jumps.clear(), jumps.upright(limit)))
+    begin = SQUAT_AND_PUSH.reshape(1, -1)
+    with torch.no_grad():
+        before = made.evaluate(torch.as_tensor(begin))
+    found = minimise(made, begin, iterations=6, step=0.05)
+    assert found.objective[0] < float(before.objective) - 0.02
+    with torch.no_grad():
+        after = made.evaluate(torch.as_tensor(found.x))
+    assert float(after.objective) == pytest.approx(found.objective[0], abs=1e-9)
+    assert float(after.constraints.max()) <= 1e-3
+
+
+def test_starts_of_another_shape_are_refused():
+    with pytest.raises(InputError, match="starts must have shape"):
+        minimise(problem(), np.zeros((2, 3)))

@@ -1,0 +1,86 @@
+"""Places and momenta of the links against those of the simulation's own links."""
+
+import numpy as np
+import pytest
+import torch
+import warp as wp
+from scipy.spatial.transform import Rotation
+
+from jumper_warp.diff.rollout import Rollout, compact
+from jumper_warp.kernels.collision import robot as collision
+from jumper_warp.kernels.layout import COORDS
+from jumper_warp.robot.model import build_model
+from jumper_warp.sim.dynamics import JumperDynamics
+from jumper_warp.trajectory.whole_body import WholeBody
+
+N = 6
+MOTORS = [5 * leg + joint for leg in range(4) for joint in (0, 1, 3)]
+
+
+@pytest.fixture(scope="module")
+def links():
+    """Return the robot, random states of it, and poses and twists of all links by the simulation's kernels."""
+    rng, model = np.random.default_rng(0), build_model(N, visuals=False)
+    joint_q, joint_qd = np.zeros((N, 43)), np.zeros((N, 38))
+    angles = rng.uniform(0.2, 1.5, (N, 4, 3)) * [0.2, 1.0, 1.0]
+    joint_q[:, :3] = [0.0, 0.0, 1.0] + rng.normal(size=(N, 3))
+    joint_q[:, 3:7] = Rotation.random(N, random_state=rng).as_quat()
+    joint_q[:, 7:][:, MOTORS] = angles.reshape(N, 12)
+    joint_qd[:, :6], joint_qd[:, 6:][:, MOTORS] = rng.normal(size=(N, 6)), 4.0 * rng.normal(size=(N, 12))
+    state = model.state()
+    state.joint_q.assign(joint_q.ravel().astype(np.float32))
+    state.joint_qd.assign(joint_qd.ravel().astype(np.float32))
+    JumperDynamics(model).full_state(state.joint_q, state.joint_qd, state.body_q, state.body_qd)
+    pose, twist = state.body_q.numpy().reshape(N, 21, 7), state.body_qd.numpy().reshape(N, 21, 6)
+    q, qd = (torch.as_tensor(rows.T) for rows in compact(joint_q, joint_qd, N))
+    return model, WholeBody(Rollout(model, double=True)), q, qd, pose, twist
+
+
+def test_links_are_where_the_simulation_has_them(links):
+    _, body, q, qd, pose, _ = links
+    frames = body.legs(q, qd)
+    turn = Rotation.from_quat(pose[:, 1:, 3:].reshape(-1, 4)).as_matrix().reshape(N, 20, 3, 3)
+    assert frames.pos.flatten(1, 2).numpy() == pytest.approx(pose[:, 1:, :3], abs=1e-6)
+    assert frames.turn.flatten(1, 2).numpy() == pytest.approx(turn, abs=1e-6)
+    places, ankles = body.points(q)
+    assert torch.allclose(places, frames.pos, atol=1e-12) and torch.allclose(ankles, frames.ankle, atol=1e-12)
+
+
+def test_momentum_is_the_sum_over_the_links(links):
+    model, body, q, qd, pose, twist = links
+    mass = model.body_mass.numpy().reshape(N, 21, 1).astype(float)
+    turn = Rotation.from_quat(pose[..., 3:].reshape(-1, 4)).as_matrix().reshape(N, 21, 3, 3)
+    center = pose[..., :3] + (turn @ model.body_com.numpy().reshape(N, 21, 3, 1))[..., 0]
+    com, vel = ((mass * x).sum(1) / mass.sum(1) for x in (center, twist[..., :3]))
+    inertia = turn @ model.body_inertia.numpy().reshape(N, 21, 3, 3) @ turn.swapaxes(-1, -2)
+    arm, moving = center - com[:, None], twist[..., :3] - vel[:, None]
+    spin = ((inertia @ twist[..., 3:, None])[..., 0] + mass * np.cross(arm, moving)).sum(1)
+    square = (arm**2).sum(-1)[..., None, None] * np.eye(3) - arm[..., None] * arm[..., None, :]
+    whole = (inertia + mass[..., None] * square).sum(1)
+    found = body.momentum(q, qd)
+    for mine, theirs in zip(found, (com, vel, spin, whole), strict=True):
+        assert mine.numpy() == pytest.approx(theirs, abs=1e-5)
+    assert body.base_velocity(q, qd).numpy() == pytest.approx(
+        twist[:, 0, :3] - np.cross(twist[:, 0, 3:], (turn[:, 0] @ model.body_com.numpy()[0])), abs=1e-5
+    )
+
+
+def test_clearance_says_what_the_collision_kernels_say(links):
+    """Lowered until a kind of link is 1 mm over the ground, the kernel sees no contact of it, 1 mm under it one."""
+    model, body, q, _, _, _ = links
+    flags = (collision.HOUSING_GROUND, collision.THIGH_GROUND, collision.KNEE_GROUND, collision.SHANK_GROUND)
+    gaps = body.clearance(q).amin(1).numpy()
+    dynamics = JumperDynamics(model)
+    for kind, flag in enumerate(flags):
+        for down, there in ((-0.001, False), (0.001, True)):
+            joint_q = np.zeros((N, int(COORDS)), dtype=np.float32)
+            joint_q[:, :7] = q[:, :7].numpy()
+            joint_q[:, 2] -= gaps[:, kind] + down
+            joint_q[:, 7:][:, MOTORS] = q[:, 7:].numpy()
+            found, distance = wp.zeros(N, dtype=int), wp.zeros(N, dtype=float)
+            wp.launch(
+                collision.collision_kernel, dim=N,
+                inputs=[dynamics.robot.geometry, dynamics.robot.ground, wp.array(joint_q.ravel()), int(COORDS), 0.0],
+                outputs=[found, distance],
+            )  # fmt: skip
+            assert ((found.numpy() & int(flag)) != 0).tolist() == [there] * N, (kind, down)
