@@ -24,7 +24,7 @@ from jumper_warp.rl.cfg import PpoCfg
 from jumper_warp.rl.ppo import Ppo
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.utils.errors import InputError
-from jumper_warp.utils.output import output_dir, write_figures
+from jumper_warp.utils.output import output_dir, write_metrics
 from jumper_warp.utils.runtime import announce
 from support.ablations import ABLATIONS
 from support.learning import Curve, learning_curve, make_judge
@@ -56,7 +56,7 @@ class Args:
     ppo: PpoCfg = field(default_factory=PpoCfg)
     """Settings of the algorithm."""
     out: Path | None = None
-    """Folder for figures.json and the plot (default: outputs/ablations/<time>)."""
+    """Folder for metrics.json and the plot (default: outputs/ablations/<time>)."""
     device: str | None = None
     """Warp device."""
     threads: int | None = None
@@ -107,7 +107,7 @@ def main(args: Args) -> dict:
         }
         never = "not reached" if reached is None else f"{reached:.1f}"
         table.add_row(name, f"{100.0 * curve.success[-1]:.1f} %", never, str(curve.iterations))
-        write_figures(folder, values)
+        write_metrics(folder, values)
         plot(curves, folder / "ablations.png")
     Console().print(table)
     print(f"figures and plot in {folder}")

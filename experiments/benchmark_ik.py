@@ -20,7 +20,7 @@ from jumper_warp.kernels.kinematics.inverse import LegLimits, inverse_kinematics
 from jumper_warp.kernels.kinematics.leg import leg_forward_kinematics
 from jumper_warp.robot.description import RobotDescription, load_description
 from jumper_warp.robot.model import MOTOR_JOINTS, leg_geometry_array
-from jumper_warp.utils.output import output_dir, write_figures
+from jumper_warp.utils.output import output_dir, write_metrics
 from jumper_warp.utils.runtime import announce
 from support.timing import median_time
 
@@ -37,7 +37,7 @@ class Args:
     """Half edge [m] of the cube around each paw's reachable position that the scattered targets fill."""
     seed: int = 0
     out: Path | None = None
-    """Folder for figures.json (default: outputs/benchmark_ik/<time>)."""
+    """Folder for metrics.json (default: outputs/benchmark_ik/<time>)."""
     device: str | None = None
     """Warp device."""
 
@@ -109,7 +109,7 @@ def main(args: Args) -> dict:
         "scattered_time [ms]": 1.0e3 * times[1],
         "scattered_reachable [%]": 100.0 * reachable.numpy().mean(),
     }
-    write_figures(folder, figures)
+    write_metrics(folder, figures)
     for name, value in figures.items():
         print(f"{name:28} {value if isinstance(value, str) else f'{value:.6g}'}")
     print(f"figures in {folder}")

@@ -21,7 +21,7 @@ from jumper_warp.cli.main import run_command
 from jumper_warp.robot.model import build_model
 from jumper_warp.sim.simulation import Simulation, SolverName
 from jumper_warp.utils.errors import InputError
-from jumper_warp.utils.output import output_dir, write_figures
+from jumper_warp.utils.output import output_dir, write_metrics
 from jumper_warp.utils.runtime import announce
 from jumper_warp.utils.threads import checked_threads
 from support.speed import time_jump, time_standing, time_threads
@@ -42,7 +42,7 @@ class Args:
     baseline: Path | None = None
     """Root of another checkout to compare with."""
     out: Path | None = None
-    """Folder for figures.json (default: outputs/benchmark_solver/<time>)."""
+    """Folder for metrics.json (default: outputs/benchmark_solver/<time>)."""
     device: str | None = None
     """Warp device."""
     threads: list[int] | None = None
@@ -94,7 +94,7 @@ def main(args: Args) -> dict:
         prefix = "" if len(args.envs) == 1 else f"envs_{envs}_"
         values |= {f"{prefix}{name}": value for name, value in figures.items()}
     values |= {"envs": args.envs, **over_baseline(args.baseline, "experiments/benchmark_solver.py", args, values)}
-    write_figures(folder, values)
+    write_metrics(folder, values)
     for name, value in values.items():
         print(f"{name:34} {value:,.3f}" if isinstance(value, float) else f"{name:34} {value}")
     print(f"figures in {folder}")

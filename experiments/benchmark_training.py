@@ -22,7 +22,7 @@ from rich.table import Table
 from jumper_warp.cli.main import run_command
 from jumper_warp.rl.cfg import PpoCfg
 from jumper_warp.utils.errors import InputError
-from jumper_warp.utils.output import output_dir, write_figures
+from jumper_warp.utils.output import output_dir, write_metrics
 from jumper_warp.utils.runtime import announce
 from support.speed import standing_solver, stepping_env, time_ppo, time_rsl_rl, time_stages
 from support.timing import median_time, over_baseline
@@ -54,7 +54,7 @@ class Args:
     baseline: Path | None = None
     """Root of another checkout to compare with."""
     out: Path | None = None
-    """Folder for figures.json (default: outputs/benchmark_training/<time>)."""
+    """Folder for metrics.json (default: outputs/benchmark_training/<time>)."""
     device: str | None = None
     """Warp device."""
     threads: int | None = None
@@ -102,14 +102,14 @@ def main(args: Args) -> dict:
     for name in args.names():
         figures = time_ppo(train_envs, variant(cfg, name), args.iterations, args.device)
         values |= {f"{figure}_{name}": value for figure, value in figures.items()}
-        write_figures(folder, values)
+        write_metrics(folder, values)
     if not args.only_ppo:
         values["collect_env_share"] = args.num_steps * 1.0e-6 * values["env_step_us"] / values["ppo_collect_s"]
     if args.rsl_rl and not args.only_ppo:
         values |= time_rsl_rl(train_envs, args.num_steps, args.iterations, args.device)
         values["ppo_over_rsl_rl"] = values["ppo_steps_per_s"] / values["rsl_rl_steps_per_s"]
     values |= over_baseline(args.baseline, "experiments/benchmark_training.py", args, values)
-    write_figures(folder, values)
+    write_metrics(folder, values)
     table = Table("figure", "value", title="Policy steps of 8 physics steps, motors included, graphs on")
     for name, value in values.items():
         large = isinstance(value, float) and value >= 1e3

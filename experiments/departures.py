@@ -38,7 +38,7 @@ from jumper_warp.registry import make_task
 from jumper_warp.rl.runner import CONFIG, train
 from jumper_warp.tasks.saving import task_to_json
 from jumper_warp.utils.errors import InputError
-from jumper_warp.utils.output import output_dir, write_figures
+from jumper_warp.utils.output import output_dir, write_metrics
 from jumper_warp.utils.runtime import announce
 from support.departures import DEPARTURES, Undone
 from support.holds import Holds, hold_goals, hold_metrics
@@ -227,7 +227,7 @@ def main(args: Args) -> dict[str, Any]:
         values[f"flags_{name}"] = undone.flags
         values |= {f"{test}_{key}_{name}_{seed}": tests[test][key] for test in TESTS for key in tests[test]}
         table.add_row(f"{name.replace('_', ' ')}, {seed}", *(cell(tests, *column) for column in COLUMNS.values()))
-        write_figures(folder, values)
+        write_metrics(folder, values)
         plot(found, folder / "departures.png")
         with (folder / "departures.txt").open("w") as file:
             Console(file=file, width=WIDTH).print(table)

@@ -42,7 +42,7 @@ from jumper_warp.robot.motors import horizontal_jump_filter, jumping_motors, loo
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.tasks.jump.horizontal import LANDING_HEIGHT
 from jumper_warp.utils.errors import InputError
-from jumper_warp.utils.output import write_figures
+from jumper_warp.utils.output import write_metrics
 from support.takeoff_search import (
     FURTHER_SIGMA,
     NOMINAL,
@@ -269,7 +269,7 @@ def main(args: Args) -> dict[str, Any]:
     show(rows, values["reach_ahead_of_base_m"])
     plot(rows, run.folder / "distance_limit.png")
     values["seconds"] = time.perf_counter() - run.started
-    write_figures(run.folder, values)
+    write_metrics(run.folder, values)
     print(f"{values['seconds']:.0f} s; figures, plot and the nominal robot's actions in {run.folder}")
     return values
 

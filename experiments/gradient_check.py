@@ -20,7 +20,7 @@ from rich.table import Table
 
 from jumper_warp.cli.main import run_command
 from jumper_warp.evaluation.plots import drawn
-from jumper_warp.utils.output import output_dir, write_figures
+from jumper_warp.utils.output import output_dir, write_metrics
 from jumper_warp.utils.runtime import announce
 from support.gradients import INNER, OUTER, TICKS, GradientJump, apex, check, schedule
 
@@ -106,7 +106,7 @@ def main(args: Args) -> dict:
         "apex_after_m": ascent.apex[-1],
         "seconds": time.perf_counter() - start,
     }
-    write_figures(folder, values)
+    write_metrics(folder, values)
     plot(rollout, checks["actions"], ascent, folder / "gradients.png")
     table = Table("figure", "value", title="Gradients of the apex; errors relative to the largest entry")
     for name, value in values.items():

@@ -28,7 +28,7 @@ from jumper_warp.robot.motors import filter_params, jumping_motors, vertical_jum
 from jumper_warp.sim.simulation import SUBSTEPS
 from jumper_warp.sim.solver import MAX_SWEEPS, TOLERANCE
 from jumper_warp.utils.errors import InputError
-from jumper_warp.utils.output import output_dir, write_figures
+from jumper_warp.utils.output import output_dir, write_metrics
 from jumper_warp.utils.runtime import announce
 from support.gradients import SQUAT, TICKS, schedule
 from support.timing import device_memory, wall_time
@@ -48,7 +48,7 @@ class Args:
     double: bool = False
     """Whether to compute in double precision."""
     out: Path | None = None
-    """Folder for figures.json (default: outputs/gradient_cost/<time>)."""
+    """Folder for metrics.json (default: outputs/gradient_cost/<time>)."""
     device: str | None = None
     """Warp device."""
 
@@ -169,7 +169,7 @@ def main(args: Args) -> dict:
     }
     if device.is_cuda:
         values["memory_kib_a_world"] = (device_memory(device) - before) / worlds / 1024.0
-    write_figures(folder, values)
+    write_metrics(folder, values)
     for key, value in values.items():
         print(f"{key:28} {value:.4g}" if isinstance(value, float) else f"{key:28} {value}")
     print(f"figures in {folder}")

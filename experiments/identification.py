@@ -32,7 +32,7 @@ from jumper_warp.policies.restore import Conditions, env_of_policy, open_policy
 from jumper_warp.robot.overlay import overlay_of
 from jumper_warp.robot.values import RobotValues
 from jumper_warp.utils.errors import InputError
-from jumper_warp.utils.output import output_dir, write_figures
+from jumper_warp.utils.output import output_dir, write_metrics
 from jumper_warp.utils.runtime import announce
 from support.identification_methods import compare_methods
 from support.known_robots import Case, make_case, run_case
@@ -145,7 +145,7 @@ def main(args: Args) -> dict[str, Any]:
         values |= compare_methods(parameters, last[0], replay, ours, last[1].seconds)
     if "policy" in args.parts and last:
         values |= policy_errors(args, *last, folder)
-    write_figures(folder, values)
+    write_metrics(folder, values)
     plot(rows, folder / "identification.png")
     table = Table("figure", "value", title="Identification of known robots")
     for name, value in values.items():

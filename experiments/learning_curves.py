@@ -35,7 +35,7 @@ from jumper_warp.registry import make_task, trainer_settings
 from jumper_warp.rl.ppo import Ppo
 from jumper_warp.tasks.observations import with_history
 from jumper_warp.utils.errors import InputError
-from jumper_warp.utils.output import output_dir, write_figures
+from jumper_warp.utils.output import output_dir, write_metrics
 from jumper_warp.utils.runtime import announce
 from support.learning import TESTED, Curve, learning_curve, make_judge, success, warm_up
 from support.variants import DEFAULT, variant
@@ -68,7 +68,7 @@ class Args:
     randomize: bool = False
     """Train with randomisation and noise."""
     out: Path | None = None
-    """Folder for figures.json, plot and table (default: outputs/learning_curves/<time>)."""
+    """Folder for metrics.json, plot and table (default: outputs/learning_curves/<time>)."""
     device: str | None = None
     """Warp device."""
     one: Path | None = field(default=None)
@@ -165,7 +165,7 @@ def main(args: Args) -> dict:
             told = [trained, total, steps and steps / 1e6, every_one]
             cells = ["never" if x is None else f"{x:.1f}" for x in told]
             table.add_row(name, str(seed), f"{100 * each['success'][-1]:.1f} %", f"{each['ready']:.1f}", *cells)
-            write_figures(folder, values)
+            write_metrics(folder, values)
             plot(found, folder / "learning_curves.png")
     Console().print(table)
     with (folder / "learning_curves.txt").open("w") as file:

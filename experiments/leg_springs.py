@@ -30,7 +30,7 @@ from jumper_warp.robot.overlay import with_springs
 from jumper_warp.robot.values import RobotValues
 from jumper_warp.sim.simulation import Simulation
 from jumper_warp.utils.errors import InputError
-from jumper_warp.utils.output import output_dir, write_figures
+from jumper_warp.utils.output import output_dir, write_metrics
 from jumper_warp.utils.runtime import announce
 from support.open_loop import EXTEND, HOLD, RAMP, STAND, follow_jump, jump_metrics, transversal_command
 
@@ -138,7 +138,7 @@ def main(args: Args) -> dict:
         axis.legend()
     for row in rows:
         table.add_row(*row)
-    write_figures(folder, values)
+    write_metrics(folder, values)
     Console().print(table)
     print(f"{time.perf_counter() - start:.1f} s; figures, plot and recordings in {folder}")
     return values

@@ -22,7 +22,7 @@ import warp as wp
 from jumper_warp.envs.env import Env
 from jumper_warp.registry import make_task
 from jumper_warp.sim.simulation import SolverName
-from jumper_warp.utils.output import output_dir, write_figures
+from jumper_warp.utils.output import output_dir, write_metrics
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,7 @@ class Args:
     envs: tuple[int, ...] = (256, 2048)
     """Numbers of worlds; a single one is measured in this process."""
     out: Path | None = None
-    """Folder for figures.json (default: outputs/measure_memory/<time>)."""
+    """Folder for metrics.json (default: outputs/measure_memory/<time>)."""
 
 
 def array_bytes() -> int:
@@ -68,7 +68,7 @@ def main(args: Args) -> dict[str, float]:
     runs = [subprocess.run([*common, str(n)], capture_output=True, text=True, check=True) for n in (few, many)]
     less, more = (json.loads(run.stdout.splitlines()[-1]) for run in runs)
     values = {f"{name}_bytes_per_world": (more[name] - less[name]) / (many - few) for name in less}
-    write_figures(output_dir("measure_memory", args.out), {**values, "solver": args.solver, "task": args.task})
+    write_metrics(output_dir("measure_memory", args.out), {**values, "solver": args.solver, "task": args.task})
     print(json.dumps(values))
     return values
 

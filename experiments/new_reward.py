@@ -24,7 +24,7 @@ from jumper_warp.registry import make_task
 from jumper_warp.rl.cfg import PpoCfg, TrainCfg
 from jumper_warp.rl.runner import train
 from jumper_warp.tasks.terms import RewardTerm
-from jumper_warp.utils.output import output_dir, write_figures
+from jumper_warp.utils.output import output_dir, write_metrics
 
 
 @wp.func
@@ -57,7 +57,7 @@ class Args:
     steps: int = 32
     """Policy steps of each environment in an iteration."""
     out: Path | None = None
-    """Folder for the run and figures.json (default: outputs/new_reward/<time>)."""
+    """Folder for the run and metrics.json (default: outputs/new_reward/<time>)."""
     device: str | None = None
     """Torch device."""
 
@@ -75,7 +75,7 @@ def main(args: Args) -> dict:
         "mean_return": result.figures.get("Train/mean_return"),
         "iterations": result.iteration,
     }
-    write_figures(folder, values)
+    write_metrics(folder, values)
     print(f"Episode_Reward/even_load {values['even_load_per_episode']:.4f}; run in {result.folder}")
     return values
 

@@ -28,7 +28,7 @@ from jumper_warp.robot.motors import jumping_motors, loose_filter, vertical_jump
 from jumper_warp.robot.overlay import load_overlay, with_springs
 from jumper_warp.sim.simulation import Simulation
 from jumper_warp.utils.errors import InputError
-from jumper_warp.utils.output import output_dir, write_figures
+from jumper_warp.utils.output import output_dir, write_metrics
 from jumper_warp.utils.runtime import announce
 from jumper_warp.viz.snapshot import Camera, contact_sheet
 from support.open_loop import SQUAT, Trace, follow_jump, jump_metrics
@@ -131,7 +131,7 @@ def main(args: Args) -> dict:
     if args.torque == 18.0 and args.gravity == EARTH and not args.loose and robot is None:
         values["hardware_apex_height_m"] = HARDWARE_APEX
     title = f"Open-loop jump, {args.solver}, {args.torque:g} N m"
-    write_figures(folder, values)
+    write_metrics(folder, values)
     plot(trace, folder / "jump.png", title)
     recorder.save_rrd(folder / "jump.rrd")
     table = Table("figure", "value", title=title)

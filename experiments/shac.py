@@ -36,7 +36,7 @@ from jumper_warp.rl.shac import Shac
 from jumper_warp.tasks.observations import with_history
 from jumper_warp.trajectory.gauss_newton import Network
 from jumper_warp.utils.errors import InputError
-from jumper_warp.utils.output import output_dir, write_figures
+from jumper_warp.utils.output import output_dir, write_metrics
 from jumper_warp.utils.runtime import announce
 from support.gradient_variance import gradients, spread_of
 from support.learning import Curve, learning_curve, make_judge
@@ -77,7 +77,7 @@ class Args:
     worlds: int = 256
     """Worlds of that."""
     out: Path | None = None
-    """Folder for figures.json and plots (default: outputs/shac/<time>)."""
+    """Folder for metrics.json and plots (default: outputs/shac/<time>)."""
     device: str | None = None
     """Warp device."""
 
@@ -167,7 +167,7 @@ def compare(args: Args, folder: Path) -> dict[str, Any]:
                 table.add_row(trainer, str(seed), f"{100 * curve.success[-1]:.1f} %", *cells, f"{pace:,.0f}")
                 for axis, x in zip(axes, (curve.seconds, np.array(curve.steps) / 1e6), strict=True):
                     axis.plot(x, curve.success, color=f"C{i}", label=trainer if seed == args.seeds[0] else None)
-                write_figures(folder, values)
+                write_metrics(folder, values)
         axes[0].set(xlabel="training time [s]", ylabel="success [1]")
         axes[1].set(xlabel="steps [million]")
         axes[0].legend()
@@ -182,7 +182,7 @@ def main(args: Args) -> dict[str, Any]:
     values = {"envs": args.envs, "window": args.window, "worlds": args.worlds}
     values |= variances(args, folder / "variance.png")
     values |= compare(args, folder) if args.seconds > 0.0 else {}
-    write_figures(folder, values)
+    write_metrics(folder, values)
     print(f"figures and plots in {folder}")
     return values
 

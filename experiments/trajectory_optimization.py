@@ -41,7 +41,7 @@ from jumper_warp.evaluation.run import EvaluationArgs, EvaluationRun
 from jumper_warp.sim.simulation import SUBSTEPS
 from jumper_warp.trajectory.problem import Problem
 from jumper_warp.utils.errors import InputError
-from jumper_warp.utils.output import output_dir, write_figures
+from jumper_warp.utils.output import output_dir, write_metrics
 from jumper_warp.utils.runtime import announce
 from support import takeoff_search
 from support.evolved_jumps import Clock, evolve, search_as_published
@@ -220,7 +220,7 @@ def main(args: Args) -> dict[str, Any]:
         (folder / f"{name}.json").write_text(json.dumps(replay.reference(reach)) + "\n")
         replay.save_rrd(folder / f"{name}.rrd")
         replay.save_strip(folder / f"{name}_strip.png")
-        write_figures(folder, values)
+        write_metrics(folder, values)
         show({name: rows[name]})
     plot(replays, folder / "trajectories.png")
     show(rows)

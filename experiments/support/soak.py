@@ -41,7 +41,7 @@ class SoakArgs:
     seed: int = 0
     """Of actions, masses and friction."""
     out: Path | None = None
-    """Folder for figures.json (default: outputs/soak_test/<time>)."""
+    """Folder for metrics.json (default: outputs/soak_test/<time>)."""
     device: str | None = None
     """Warp device."""
     threads: int | None = None

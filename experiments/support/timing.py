@@ -66,7 +66,7 @@ def over_baseline(checkout: Path | None, script: str, args: Any, figures: Mappin
         done = subprocess.run(command, cwd=checkout, env=env, capture_output=True, text=True, check=False)
         if done.returncode:
             raise InputError(f"{script} of {checkout} fails: {done.stderr.strip().splitlines()[-1:]}")
-        base = json.loads((Path(folder) / "figures.json").read_text())
+        base = json.loads((Path(folder) / "metrics.json").read_text())
     rates = [name for name, value in figures.items() if RATE in name and isinstance(value, float) and base.get(name)]
     return {f"{name}_over_baseline": figures[name] / base[name] for name in rates}
 

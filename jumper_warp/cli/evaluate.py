@@ -24,7 +24,7 @@ usage: jumper {command} POLICY [flags]
   POLICY    name or folder of a policy, a training run's folder, or a checkpoint; `jumper list` shows the project's
 
 Flags differ between tasks: jumper {command} POLICY --help shows those of one."""
-ABOUT = "Try a policy many times and report how well it did: figures.json, and a list of all that was tried."
+ABOUT = "Try a policy many times and report how well it did: metrics.json, and a list of all that was tried."
 
 
 def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> None:

@@ -20,7 +20,7 @@ from jumper_warp.policies.folder import add_files, find_policy
 from jumper_warp.policies.restore import Conditions, is_run
 from jumper_warp.policies.spec import PolicyError
 from jumper_warp.utils.errors import InputError
-from jumper_warp.utils.output import write_figures
+from jumper_warp.utils.output import write_metrics
 
 Flags = TypeVar("Flags")
 
@@ -34,13 +34,13 @@ class EvaluateCfg(Generic[Flags]):
     conditions: Annotated[Conditions, tyro.conf.arg(name="")] = field(default_factory=Conditions)
     """What the policy is tried in."""
     out: Path | None = None
-    """Folder for figures.json and a list of all that was tried (default: outputs/evaluate/<time>)."""
+    """Folder for metrics.json and a list of all that was tried (default: outputs/evaluate/<time>)."""
     keep: bool = False
     """Also put the figures into the policy's folder."""
 
 
 def evaluate(run: EvaluationRun, cfg: EvaluateCfg) -> dict[str, Any]:
-    """Evaluate, print a table, write `figures.json` and the rows of the log as CSV, and return the figures.
+    """Evaluate, print a table, write `metrics.json` and the rows of the log as CSV, and return the figures.
 
     Raises:
         PolicyError: The policy cannot be used or cannot keep figures.
@@ -57,14 +57,14 @@ def evaluate(run: EvaluationRun, cfg: EvaluateCfg) -> dict[str, Any]:
         "noise": cfg.conditions.noise,
         **cfg.flags.metrics(log),
     }
-    write_figures(run.folder, figures)
+    write_metrics(run.folder, figures)
     rows = f"{log.row}s.csv"
     (run.folder / rows).write_text(csv_text(log))
     if cfg.keep:
-        files = {name: (run.folder / name).read_bytes() for name in ("figures.json", "run.json", rows)}
+        files = {name: (run.folder / name).read_bytes() for name in ("metrics.json", "run.json", rows)}
         add_files(find_policy(run.source), files)
     print_figures(figures)
-    Console(stderr=True).print(f"{run.folder}/figures.json", highlight=False, soft_wrap=True)
+    Console(stderr=True).print(f"{run.folder}/metrics.json", highlight=False, soft_wrap=True)
     return figures
 
 
@@ -96,7 +96,7 @@ class PlayCfg(Generic[Flags]):
     conditions: Annotated[Conditions, tyro.conf.arg(name="")] = field(default_factory=Conditions)
     """What the policy is tried in."""
     out: Path | None = None
-    """Folder for the recording and figures.json (default: outputs/play/<time>)."""
+    """Folder for the recording and metrics.json (default: outputs/play/<time>)."""
     viewer: Literal["none", "rerun"] = "none"
     """Open the recording in Rerun's viewer, which then listens on this machine's loopback address only."""
 
@@ -107,7 +107,7 @@ class PlayCfg(Generic[Flags]):
 
 
 def play(run: EvaluationRun, cfg: PlayCfg) -> Path:
-    """Simulate, write a recording and `figures.json`, print a table; return the path of the recording.
+    """Simulate, write a recording and `metrics.json`, print a table; return the path of the recording.
 
     Raises:
         PolicyError: The policy cannot be used.
@@ -121,7 +121,7 @@ def play(run: EvaluationRun, cfg: PlayCfg) -> Path:
     film = Film(env, log, range(flags.count), spacing=flags.spacing, notes=notes, motors=True)
     run_evaluation(run.policy.act, env, log, seconds=cfg.seconds or flags.seconds, watch=film, stop=False)
     path = film.save_rrd(run.folder / f"{log.row}.rrd", log.marks(range(flags.count)))
-    write_figures(run.folder, log.columns())
+    write_metrics(run.folder, log.columns())
     print_rows(log)
     Console(stderr=True).print(str(path), highlight=False, soft_wrap=True)
     if cfg.viewer == "rerun":

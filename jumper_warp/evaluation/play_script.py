@@ -20,7 +20,7 @@ from jumper_warp.evaluation.scripts import read_script
 from jumper_warp.evaluation.skills import SkillRun
 from jumper_warp.policies.restore import Conditions
 from jumper_warp.policies.skills import SkillNames
-from jumper_warp.utils.output import write_figures
+from jumper_warp.utils.output import write_metrics
 
 
 @dataclass(frozen=True)
@@ -39,13 +39,13 @@ class ScriptCfg:
     conditions: Annotated[Conditions, tyro.conf.arg(name="")] = field(default_factory=Conditions)
     """What the policies are tried in."""
     out: Path | None = None
-    """Folder for the recording, a plot and figures.json (default: outputs/play/<time>)."""
+    """Folder for the recording, a plot and metrics.json (default: outputs/play/<time>)."""
     viewer: Literal["none", "rerun"] = "none"
     """Open the recording in Rerun's viewer, which then listens on this machine's loopback address only."""
 
 
 def play_script(cfg: ScriptCfg) -> Path:
-    """Simulate, write a recording, a plot and `figures.json`, print a table; return the path of the recording.
+    """Simulate, write a recording, a plot and `metrics.json`, print a table; return the path of the recording.
 
     Raises:
         InputError: The script cannot be used, or there is no such device.
@@ -63,7 +63,7 @@ def play_script(cfg: ScriptCfg) -> Path:
     with drawn(run.folder / "course.png", 5, 1, figsize=(10, 9), sharex=True) as axes:
         draw_course(axes, course, 0)
     figures = {"outcome": str(course.outcomes[0]), **course_metrics(course)}
-    write_figures(run.folder, figures)
+    write_metrics(run.folder, figures)
     print_figures(figures)
     Console(stderr=True).print(str(path), highlight=False, soft_wrap=True)
     if cfg.viewer == "rerun":

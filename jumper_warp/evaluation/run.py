@@ -29,7 +29,7 @@ from jumper_warp.policies.spec import PolicyError
 from jumper_warp.robot.model import PHYSICS_DT
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.utils.errors import InputError
-from jumper_warp.utils.output import output_dir, write_figures
+from jumper_warp.utils.output import output_dir, write_metrics
 from jumper_warp.utils.runtime import announce
 from jumper_warp.utils.threads import checked_threads
 
@@ -193,7 +193,7 @@ class Run(ABC):
     def report(self, metrics: Mapping[str, Any], paper: Mapping[str, float]) -> dict[str, Any]:
         """Write and print metrics beside the paper's, conditions before them; return all."""
         values = self.tried_in | dict(metrics)
-        write_figures(self.folder, values)
+        write_metrics(self.folder, values)
         table = Table("figure", self.title, "paper")
         for name, value in values.items():
             table.add_row(name, shown(value), str(paper.get(name, "")))

@@ -1,7 +1,7 @@
 """The folder that a policy is kept in.
 
 It holds `policy.safetensors` (weights and normaliser), `config.json` (interface, environment, training, commit,
-versions), `policy.onnx`, whatever is added (`figures.json`, a learning curve), and `manifest.json` with the SHA-256 of
+versions), `policy.onnx`, whatever is added (`metrics.json`, a learning curve), and `manifest.json` with the SHA-256 of
 each of these. A `README.md` beside them is prose and not in the manifest. The sums find damage and mix-ups; they are no
 signature. Nothing that is loaded can execute code.
 """

@@ -44,8 +44,8 @@ def output_dir(name: str, out: Path | None = None) -> Path:
     return folder
 
 
-def write_figures(folder: Path, figures: Mapping[str, Scalar | list[Scalar]]) -> Path:
-    """Write `figures.json`, and beside it `run.json` with what made them; return the path of `figures.json`.
+def write_metrics(folder: Path, figures: Mapping[str, Scalar | list[Scalar]]) -> Path:
+    """Write `metrics.json`, and beside it `run.json` with what made them; return the path of `metrics.json`.
 
     Each file is complete or absent: it is written aside and moved into place. `run.json` holds `commit`, `dirty`,
     `versions`, `device` and `command`; nothing of the environment.
@@ -68,7 +68,7 @@ def write_figures(folder: Path, figures: Mapping[str, Scalar | list[Scalar]]) ->
         "command": [Path(sys.argv[0]).name, *sys.argv[1:]],
     }
     _write_json(folder / "run.json", run)
-    return _write_json(folder / "figures.json", plain)
+    return _write_json(folder / "metrics.json", plain)
 
 
 def _plain(name: str, value: Any) -> Scalar | list[Scalar]:

@@ -389,12 +389,12 @@ def test_exported_policy_is_that_of_the_run(trained_run):
 def test_evaluation_reports_and_keeps_figures(trained_run, tmp_path, capsys):
     args = ["--jumps", "3", "--noise", "--device", "cpu", "--out", str(tmp_path), "--keep"]
     code, out, _ = run(capsys, "evaluate", str(trained_run / "policy"), *args)
-    figures = json.loads((tmp_path / "figures.json").read_text())
+    figures = json.loads((tmp_path / "metrics.json").read_text())
     assert code == 0 and "success_rate_in_range" in out
     assert (figures["jumps"], figures["noise"], figures["success_rate"]) == (3, True, 0.0)
     rows = (tmp_path / "jumps.csv").read_text().splitlines()
     assert [row.split(",")[0] for row in rows] == ["target_m", "0.500000", "0.850000", "1.200000"]
-    assert json.loads((trained_run / "policy" / "figures.json").read_text()) == figures
+    assert json.loads((trained_run / "policy" / "metrics.json").read_text()) == figures
     assert load_policy(trained_run / "policy")
 
 
@@ -416,7 +416,7 @@ def test_play_records_every_step_of_every_robot(trained_run, tmp_path, capsys):
 def test_evaluation_of_jumps_to_places(still, tmp_path, capsys):
     args = ["--jumps", "3", "--x", "0.4", "0.8", "--heading", "90", "--device", "cpu", "--out", str(tmp_path)]
     code, out, _ = run(capsys, "evaluate", still, *args)
-    figures = json.loads((tmp_path / "figures.json").read_text())
+    figures = json.loads((tmp_path / "metrics.json").read_text())
     assert code == 0 and "success_rate_in_range" in out
     assert (figures["jumps"], figures["task"], figures["failed_by_no_jump"]) == (3, "horizontal-jump", 3)
     assert figures["mean_error_m"] == pytest.approx(0.6, abs=0.02)
@@ -475,7 +475,7 @@ def test_play_of_a_script_records_what_the_robot_did(tmp_path, capsys):
     script.write_text('[{"walk": [0.5, 0, 0.3], "seconds": 0.2}, {"stand": 0.1}]')
     code, out, _ = run(capsys, "play", "--script", str(script), "--device", "cpu", "--out", str(tmp_path / "out"))
     assert code == 0 and "success_rate" in out
-    assert json.loads((tmp_path / "out" / "figures.json").read_text())["outcome"] == "done"
+    assert json.loads((tmp_path / "out" / "metrics.json").read_text())["outcome"] == "done"
     assert (tmp_path / "out" / "course.rrd").stat().st_size > 10_000 and (tmp_path / "out" / "course.png").is_file()
 
 

@@ -37,7 +37,7 @@ def test_a_policy_jumps_less_high_with_the_heavier_robot(overlay, tmp_path, comm
     found, apex = {}, {}
     for name, flags in (("described", []), ("identified", ["--robot", str(overlay)])):
         main([command, "vertical_jump", *count, *flags, "--out", str(tmp_path / name), "--device", "cpu"])
-        found[name] = json.loads((tmp_path / name / "figures.json").read_text())
+        found[name] = json.loads((tmp_path / name / "metrics.json").read_text())
         if command == "play":
             apex[name] = np.ravel(found[name]["apex_m"])[0]
         else:

@@ -114,7 +114,7 @@ def test_policy_of_any_task_is_evaluated(policy, tmp_path):
     evaluate.run(
         [policy, *"--episodes 3 --command 0.5 0 0 30 --seconds 4 --device cpu --out".split(), str(tmp_path)], []
     )
-    figures = json.loads((tmp_path / "figures.json").read_text())
+    figures = json.loads((tmp_path / "metrics.json").read_text())
     assert (figures["task"], figures["episodes"], figures["ended_by_no_jump"]) == ("any-task", 3, 3)
     assert figures["mean_base_height_m"] == pytest.approx(0.35, abs=0.02)
     assert figures["mean_episode_s"] < 4.0 and figures["failure_rate"] == 1.0
@@ -125,4 +125,4 @@ def test_policy_of_any_task_is_evaluated(policy, tmp_path):
 def test_policy_of_any_task_is_played(policy, tmp_path):
     play.run([policy, *"--seconds 0.25 --device cpu --out".split(), str(tmp_path)], [])
     assert (tmp_path / "episode.rrd").stat().st_size > 1000
-    assert json.loads((tmp_path / "figures.json").read_text())["end"] == ["no_end"]
+    assert json.loads((tmp_path / "metrics.json").read_text())["end"] == ["no_end"]

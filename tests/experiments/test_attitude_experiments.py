@@ -24,7 +24,7 @@ def run(tmp_path_factory):
 def test_turns_about_all_axes_are_measured(run, tmp_path):
     args = attitude.Args(policy=str(run), turns=6, seconds=0.2, record=1, refine=2, out=tmp_path, device="cpu")
     values = attitude.main(args)
-    assert json.loads((tmp_path / "figures.json").read_text()) == values
+    assert json.loads((tmp_path / "metrics.json").read_text()) == values
     assert values["physics_step_s"] == pytest.approx(1.0 / 960.0)
     assert values["success_rate"] == 0.0 and 80.0 < values["mean_error_at_end_deg"] < 100.0
     assert 0.0 < values["max_angular_momentum_nm_s"] < 1.0e-5
@@ -34,7 +34,7 @@ def test_turns_about_all_axes_are_measured(run, tmp_path):
 def test_flights_are_flown_with_turning_and_without(run, tmp_path):
     args = flight_attitude.Args(policy=str(run), flights=2, late=10.0, record=1, out=tmp_path, device="cpu")
     values = flight_attitude.main(args)
-    assert json.loads((tmp_path / "figures.json").read_text()) == values
+    assert json.loads((tmp_path / "metrics.json").read_text()) == values
     assert values["mean_apex_m"] > 2.5 and values["mean_takeoff_spin_rad_s"] > 0.1
     takeoff = "mean_takeoff_spin_rad_s"
     assert values[f"without_turning_{takeoff}"] == pytest.approx(values[takeoff])

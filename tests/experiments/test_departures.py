@@ -95,7 +95,7 @@ def test_trainings_are_measured_by_the_ends_of_the_task_as_it_is_and_not_made_tw
         measure=False, train="--ppo.compile off --ppo.num-steps 8 --ppo.minibatches 1", device="cpu", threads=1,
     )  # fmt: skip
     assert set(departures.main(args)) == {"task", "iterations", "envs"}
-    assert not (tmp_path / "figures.json").exists()
+    assert not (tmp_path / "metrics.json").exists()
     config = next((tmp_path / "jumping_early_1").rglob("config.json")).read_text()
     assert "early_takeoff" not in [term["name"] for term in json.loads(config)["env"]["task"]["terminations"]]
     ends, follow = [], departures.EvaluationRun.follow
@@ -106,7 +106,7 @@ def test_trainings_are_measured_by_the_ends_of_the_task_as_it_is_and_not_made_tw
     )  # fmt: skip
     values = departures.main(replace(args, measure=True, threads=2))
     assert len(ends) == 4 and all("early_takeoff" in names for names in ends[::2])
-    assert values == json.loads((tmp_path / "figures.json").read_text())
+    assert values == json.loads((tmp_path / "metrics.json").read_text())
     assert values["nominal_jumps_jumping_early_1"] == 2 and values["nominal_squats_jumping_early_1"] == 2
     assert values["nominal_success_rate_jumping_early_1"] == 0.0
     assert 0.0 < values["randomized_error_m_jumping_early_1"] < 2.0

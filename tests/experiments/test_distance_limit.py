@@ -117,7 +117,7 @@ def test_search_gets_farther_and_keeps_where_it_began(env):
 def test_experiment_reports_policy_nominal_and_changed_limit(tmp_path):
     args = replace(ARGS, limits=("torque_24_8",), generations=2, further=2, squats=1, out=tmp_path)
     values = limit.main(args)
-    assert values == json.loads((tmp_path / "figures.json").read_text())
+    assert values == json.loads((tmp_path / "metrics.json").read_text())
     assert values["nominal_flight_m"] > 0.8 and values["nominal_gain_m"] == 0.0
     assert values["torque_24_8_gain_m"] == pytest.approx(values["torque_24_8_flight_m"] - values["nominal_flight_m"])
     assert values["policy_2_gain_m"] == pytest.approx(values["policy_2_flight_m"] - values["nominal_flight_m"])

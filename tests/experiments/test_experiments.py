@@ -59,7 +59,7 @@ def test_new_reward_is_trained_with_and_logged_by_its_name(trained):
     line = json.loads((run / "metrics.jsonl").read_text().splitlines()[-1])
     assert values["even_load_per_episode"] == line["Episode_Reward/even_load"]
     assert values["even_load_per_episode"] > 0.0
-    assert json.loads((folder / "figures.json").read_text())["iterations"] == 2
+    assert json.loads((folder / "metrics.json").read_text())["iterations"] == 2
 
 
 # ---------------------------------------------------------------- the sweep
@@ -162,7 +162,7 @@ def test_sweep_of_a_run_leaves_figures_plot_recording_and_filmstrip(trained, tmp
         policy=str(trained[2]), jumps=3, record=2, randomize=True, out=tmp_path, device="cpu"
     )
     values = vertical_jump_sweep.main(args)
-    saved = json.loads((tmp_path / "figures.json").read_text())
+    saved = json.loads((tmp_path / "metrics.json").read_text())
     assert saved == values
     assert {
         "mean_abs_error_m",
@@ -218,7 +218,7 @@ def test_ablations_write_a_curve_per_variant(tmp_path):
         seconds=0.5, every=0.25, variants=names, envs=8, jumps=2, ppo=PpoCfg(num_steps=8), out=tmp_path, device="cpu"
     )
     values = ablations.main(args)
-    assert values == json.loads((tmp_path / "figures.json").read_text())
+    assert values == json.loads((tmp_path / "metrics.json").read_text())
     for name in names:
         assert values[f"curve_seconds_{name}"][-1] >= 0.5
         assert values[f"success_{name}"] == values[f"curve_success_{name}"][-1] == 0.0
@@ -240,7 +240,7 @@ def test_learning_curves_tell_when_each_training_was_good_enough(tmp_path, monke
         heights=(0.5, 0.9), out=tmp_path, device="cpu",
     )  # fmt: skip
     values = learning_curves.main(args)
-    assert values == json.loads((tmp_path / "figures.json").read_text())
+    assert values == json.loads((tmp_path / "metrics.json").read_text())
     assert values["trained_to_95_percent_s_eager_float32_0"] is None
     assert values["curve_steps_eager_float32_0"][-1] % (8 * 32) == 0
     assert values["trained_to_95_percent_s_eager_float32_1"] == 4.0
@@ -264,7 +264,7 @@ def test_benchmark_reports_solver_environment_and_both_trainers(tmp_path):
     )  # fmt: skip
     values = benchmark_training.main(args)
     assert values["ppo_steps_per_s_eager_bfloat16_overlap"] > 0.0
-    assert values == json.loads((tmp_path / "figures.json").read_text())
+    assert values == json.loads((tmp_path / "metrics.json").read_text())
     rates = [values[f"{what}_steps_per_s_{n}"] for what in ("solver", "env") for n in (8, 16)]
     rates += [values["ppo_steps_per_s"], values["rsl_rl_steps_per_s"]]
     assert min(rates) > 0.0
@@ -278,7 +278,7 @@ def test_soak_of_a_simulation_and_of_an_environment_finds_finite_worlds(tmp_path
     for task in (None, "horizontal-jump"):
         args = SoakArgs(envs=8, steps=40, episode=20, task=task, out=tmp_path, device="cpu")
         values = soak_test.main(args)
-        saved = json.loads((tmp_path / "figures.json").read_text())
+        saved = json.loads((tmp_path / "metrics.json").read_text())
         assert saved == values | {"envs": 8, "filter": False, "seed": 0}
         assert (values["steps"], values["non_finite_worlds"], values["non_finite_rows"]) == (320, 0, 0)
         assert 0.01 < values["largest_speed_m_s"] < 10.0 and values["largest_joint_speed_rad_s"] > 1.0
@@ -317,7 +317,7 @@ def test_rates_are_told_over_those_of_a_baseline(tmp_path):
     script.write_text(
         "import json, sys\n"
         "assert sys.argv[1:6] == ['--envs', '4', '8', '--no-noise', '--out'], sys.argv\n"
-        "json.dump({'steps_per_s_jump': 50.0, 'apex_m': 1.0}, open(sys.argv[6] + '/figures.json', 'w'))"
+        "json.dump({'steps_per_s_jump': 50.0, 'apex_m': 1.0}, open(sys.argv[6] + '/metrics.json', 'w'))"
     )
 
     @dataclass
@@ -345,7 +345,7 @@ def test_rates_are_told_over_those_of_a_baseline(tmp_path):
 def test_benchmark_of_solvers_tells_both_and_their_ratio(tmp_path):
     args = benchmark_solver.Args(envs=[2], repeats=1, steps=2, out=tmp_path, device="cpu")
     values = benchmark_solver.main(args)
-    assert values == json.loads((tmp_path / "figures.json").read_text())
+    assert values == json.loads((tmp_path / "metrics.json").read_text())
     for solver in ("jumper", "mujoco"):
         assert values[f"{solver}_apex_m"] > 0.8 and values[f"{solver}_steps_per_s_jump"] > 0.0
     expected = values["jumper_steps_per_s_standing"] / values["mujoco_steps_per_s_standing"]
@@ -367,7 +367,7 @@ def test_benchmark_of_solvers_compares_numbers_of_threads(tmp_path):
 
 def test_gradient_cost_checks_the_gradient_and_what_is_kept(tmp_path):
     values = gradient_cost.main(gradient_cost.Args(worlds=2, repeats=1, out=tmp_path, device="cpu"))
-    assert values == json.loads((tmp_path / "figures.json").read_text())
+    assert values == json.loads((tmp_path / "metrics.json").read_text())
     assert values["height_difference_m"] == 0.0 and values["kept_bytes_a_policy_step"] <= 2000.0
     expected = values["gradient_us_a_step"] / values["plain_us_a_step"]
     assert values["cpu_ratio"] == pytest.approx(expected)
@@ -381,7 +381,7 @@ def test_shac_is_compared_with_ppo_and_gradients_are_measured(tmp_path):
         out=tmp_path, device="cpu",
     )  # fmt: skip
     values = shac.main(args)
-    assert values == json.loads((tmp_path / "figures.json").read_text())
+    assert values == json.loads((tmp_path / "metrics.json").read_text())
     for who in ("new", "trained"):
         for name in ("physics", "score"):
             assert all(x > 0.0 for x in values[f"deviation_{name}_{who}"])

@@ -283,7 +283,7 @@ def test_second_hop_is_measured_from_where_the_first_one_ended(hops):
 def test_experiment_leaves_figures_plot_and_recording(experiment, settings, files, policy, tmp_path):
     args = experiment.Args(policy=policy, record=1, out=tmp_path, device="cpu", **settings)
     values = experiment.main(args)
-    saved = json.loads((tmp_path / "figures.json").read_text())
+    saved = json.loads((tmp_path / "metrics.json").read_text())
     assert saved == values and saved.keys() >= SHARED
     assert (saved["success_rate"], saved["torque_limit_nm"]) == (0.0, 18.0)
     for name in files:
@@ -309,7 +309,7 @@ def test_nothing_of_viewer_and_meshes_is_needed_without_a_recording(policy, tmp_
     )
     root = Path(__file__).parents[2]
     subprocess.run([sys.executable, "-c", code], cwd=root, check=True, capture_output=True)
-    assert {path.name for path in tmp_path.iterdir()} == {"figures.json", "run.json", "sweep.png"}
+    assert {path.name for path in tmp_path.iterdir()} == {"metrics.json", "run.json", "sweep.png"}
 
 
 def test_policy_of_another_task_is_refused_in_one_line(tmp_path):

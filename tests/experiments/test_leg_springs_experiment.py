@@ -13,7 +13,7 @@ from jumper_warp.utils.errors import InputError
 def test_springs_let_the_robot_jump_higher(tmp_path):
     args = leg_springs.Args(stiffness=(0.0, 500.0), squats=(120.0,), filter="stock", out=tmp_path, device="cpu")
     values = leg_springs.main(args)
-    assert json.loads((tmp_path / "figures.json").read_text()) == values
+    assert json.loads((tmp_path / "metrics.json").read_text()) == values
     without, with_springs = values["stock_apex_m"]
     assert without == pytest.approx(1.075, abs=0.01) and with_springs == pytest.approx(1.243, abs=0.01)
     assert values["stock_highest_apex_height_m"] == pytest.approx(with_springs, abs=0.005)

@@ -14,7 +14,7 @@ def test_a_heavier_robot_jumps_lower(tmp_path):
     overlay.save(tmp_path / "heavy.json")
     args = open_loop_jump.Args(robot=tmp_path / "heavy.json", out=tmp_path, device="cpu")
     values = open_loop_jump.main(args)
-    assert values == json.loads((tmp_path / "figures.json").read_text())
+    assert values == json.loads((tmp_path / "metrics.json").read_text())
     assert 0.9 < values["apex_height_m"] < 1.02  # 1.075 m without
     assert values["hardware_apex_height_m"] is None and values["robot"].endswith("heavy.json")
     assert (tmp_path / "jump_strip.png").stat().st_size > 10_000

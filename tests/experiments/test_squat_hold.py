@@ -45,7 +45,7 @@ def test_robots_that_do_not_hold_have_no_forces():
 def test_shipped_policies_hold_their_squats(policy, tmp_path):
     args = squat_hold.Args(policy=policy, squats=2, record=0, out=tmp_path, device="cpu")
     values = squat_hold.main(args)
-    assert values == json.loads((tmp_path / "figures.json").read_text())
+    assert values == json.loads((tmp_path / "metrics.json").read_text())
     assert values["holding_rate"] == 1.0 and values["lost_paw_share"] == 0.0
     assert 0.0 < values["max_paw_force_range_n"] < 1.0
     assert (tmp_path / "hold.png").is_file()

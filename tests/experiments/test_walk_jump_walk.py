@@ -20,7 +20,7 @@ def test_two_robots_do_the_papers_test(tmp_path, monkeypatch):
     monkeypatch.setattr(walk_jump_walk, "WALKS", (1, 1, 1))
     monkeypatch.setattr(walk_jump_walk, "EACH", 1.5)
     values = walk_jump_walk.main(walk_jump_walk.Args(robots=2, record=1, out=tmp_path, device="cpu"))
-    figures = json.loads((tmp_path / "figures.json").read_text())
+    figures = json.loads((tmp_path / "metrics.json").read_text())
     assert figures == values and set(KEYS) <= set(figures)
     assert (figures["success_rate"], figures["robots"], figures["jumps_made"]) == (1.0, 2, 4)
     assert figures["apex_error_m"] < 0.05 and figures["landing_error_m"] < 0.05

@@ -27,7 +27,7 @@ def policies(tmp_path_factory):
 def test_robots_that_stand_still_follow_nothing(policies, tmp_path):
     args = walking_tracking.Args(str(policies / "velocity-flat"), per_axis=2, record=0, out=tmp_path, device="cpu")
     values = walking_tracking.main(args)
-    figures = json.loads((tmp_path / "figures.json").read_text())
+    figures = json.loads((tmp_path / "metrics.json").read_text())
     assert figures == values and (tmp_path / "tracking.png").is_file()
     for name in ("rmse_vx_m_s", "rmse_vy_m_s", "rmse_yaw_rate_rad_s"):
         assert figures[name] == pytest.approx(0.8, abs=0.02)

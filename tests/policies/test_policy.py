@@ -190,9 +190,9 @@ def test_save_with_a_malformed_name_leaves_nothing(tmp_path, trained, name):
 
 
 def test_added_figures_are_in_the_manifest(folder):
-    add_files(folder, {"figures.json": b"{}", "README.md": b"how it was made"})
+    add_files(folder, {"metrics.json": b"{}", "README.md": b"how it was made"})
     assert load_policy(folder) and (folder / "README.md").read_bytes() == b"how it was made"
-    (folder / "figures.json").write_bytes(b"{ }")
+    (folder / "metrics.json").write_bytes(b"{ }")
     with pytest.raises(PolicyError, match=r"figures\.json: truncated or altered"):
         load_policy(folder)
 
@@ -202,7 +202,7 @@ def test_added_files_neither_replace_the_policy_nor_seal_an_altered_one(folder):
         add_files(folder, {"policy.onnx": b""})
     (folder / "config.json").write_text("{}")
     with pytest.raises(PolicyError, match="truncated or altered"):
-        add_files(folder, {"figures.json": b"{}"})
+        add_files(folder, {"metrics.json": b"{}"})
 
 
 def test_project_policies_are_found_by_name(tmp_path, trained, monkeypatch):

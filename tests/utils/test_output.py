@@ -44,13 +44,13 @@ def test_figures_come_back_as_written(tmp_path):
         "gap": None,
         "torques": [18.0, 1],
     }
-    path = figures.write_figures(tmp_path, given)
-    assert path == tmp_path / "figures.json"
+    path = figures.write_metrics(tmp_path, given)
+    assert path == tmp_path / "metrics.json"
     assert json.loads(path.read_text(encoding="utf-8")) == given
 
 
 def test_numpy_scalars_are_written_as_numbers(tmp_path):
-    path = figures.write_figures(tmp_path, {"a": np.float32(0.5), "b": [np.int64(3)], "c": np.bool_(True)})
+    path = figures.write_metrics(tmp_path, {"a": np.float32(0.5), "b": [np.int64(3)], "c": np.bool_(True)})
     assert json.loads(path.read_text()) == {"a": 0.5, "b": [3], "c": True}
 
 
@@ -58,33 +58,33 @@ def test_numpy_scalars_are_written_as_numbers(tmp_path):
 @pytest.mark.parametrize(("shape", "name"), [(lambda x: x, "'apex'"), (lambda x: [0.0, x], r"'apex\[1\]'")])
 def test_non_finite_figure_is_refused_by_name_and_nothing_is_written(tmp_path, bad, shape, name):
     with pytest.raises(ValueError, match=name):
-        figures.write_figures(tmp_path, {"fine": 1.0, "apex": shape(bad)})
+        figures.write_metrics(tmp_path, {"fine": 1.0, "apex": shape(bad)})
     assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize("nested", [{"x": 1}, [[1]], np.zeros(2), object()])
 def test_nested_figure_is_refused_by_name(tmp_path, nested):
     with pytest.raises(TypeError, match="apex"):
-        figures.write_figures(tmp_path, {"apex": nested})
+        figures.write_metrics(tmp_path, {"apex": nested})
 
 
 def test_old_figures_stay_whole_if_writing_fails(tmp_path, monkeypatch):
-    figures.write_figures(tmp_path, {"apex": 1.0})
+    figures.write_metrics(tmp_path, {"apex": 1.0})
 
     def full_disk(*_):
         raise OSError("no space left")
 
     monkeypatch.setattr(figures.os, "replace", full_disk)
     with pytest.raises(OSError, match="no space left"):
-        figures.write_figures(tmp_path, {"apex": 2.0})
-    assert json.loads((tmp_path / "figures.json").read_text()) == {"apex": 1.0}
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["figures.json", "run.json"]
+        figures.write_metrics(tmp_path, {"apex": 2.0})
+    assert json.loads((tmp_path / "metrics.json").read_text()) == {"apex": 1.0}
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["metrics.json", "run.json"]
 
 
 def test_run_says_what_made_the_figures_and_nothing_of_the_environment(tmp_path, monkeypatch):
     monkeypatch.setenv("SOME_TOKEN", "hush-4711")
     monkeypatch.setattr(sys, "argv", ["/home/someone/experiments/jump.py", "--torque", "18"])
-    figures.write_figures(tmp_path, {})
+    figures.write_metrics(tmp_path, {})
     text = (tmp_path / "run.json").read_text()
     run = json.loads(text)
     assert set(run) == {"commit", "dirty", "versions", "device", "command"}
