@@ -28,7 +28,8 @@ from jumper_warp.identification.parameters import jumper_parameters
 from jumper_warp.identification.plans import KINDS, Plan
 from jumper_warp.identification.recording import replay_plan, simulate_plan
 from jumper_warp.identification.replay import Record, Replay
-from jumper_warp.policies.restore import Conditions, env_of_policy, open_policy
+from jumper_warp.policies.conditions import Conditions, env_of_policy
+from jumper_warp.policies.runs import open_policy
 from jumper_warp.robot.overlay import overlay_of
 from jumper_warp.robot.values import RobotValues
 from jumper_warp.utils.errors import InputError

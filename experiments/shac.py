@@ -27,7 +27,7 @@ from jumper_warp.diff.differentiable_env import DifferentiableEnv
 from jumper_warp.envs.env import Env
 from jumper_warp.evaluation.plots import drawn
 from jumper_warp.policies.policy import Policy
-from jumper_warp.policies.restore import open_policy
+from jumper_warp.policies.runs import open_policy
 from jumper_warp.registry import make_task, trainer_settings
 from jumper_warp.rl.cfg import ShacCfg
 from jumper_warp.rl.networks import ActorCritic

@@ -20,8 +20,8 @@ import torch
 from jumper_warp.evaluation.jump_misses import Group, Misses, follow
 from jumper_warp.evaluation.jumps import LANDED, jump_commands
 from jumper_warp.evaluation.registry import evaluation_of
+from jumper_warp.policies.conditions import Conditions, env_of_policy
 from jumper_warp.policies.policy import Policy
-from jumper_warp.policies.restore import Conditions, env_of_policy
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.tasks.randomization import RandomizationCfg
 from jumper_warp.trajectory.gauss_newton import Anchor, Network, gauss_newton_step

@@ -8,7 +8,7 @@ from jumper_warp.diff.closed_loop import ClosedLoop
 from jumper_warp.diff.differentiable_env import DifferentiableEnv, limited
 from jumper_warp.diff.smooth_rewards import SMOOTH, make_moment, rough_rewards
 from jumper_warp.envs.env import Env
-from jumper_warp.policies.restore import open_policy
+from jumper_warp.policies.runs import open_policy
 from jumper_warp.registry import make_task
 from jumper_warp.trajectory.gauss_newton import Network
 

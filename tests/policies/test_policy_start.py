@@ -7,9 +7,9 @@ import torch
 
 from jumper_warp.policies.folder import save_policy
 from jumper_warp.policies.policy import Policy
-from jumper_warp.policies.restore import open_policy
+from jumper_warp.policies.runs import open_policy
 from jumper_warp.policies.spec import PolicyError
-from jumper_warp.policies.start import check_interface, start_from
+from jumper_warp.policies.warm_start import check_interface, start_from
 from jumper_warp.registry import TASKS, make_task
 from jumper_warp.rl.mirror import Symmetry, image
 from jumper_warp.rl.networks import ActorCritic

@@ -10,8 +10,9 @@ import pytest
 
 import hold_height
 from jumper_warp.kernels.jump import rewards, terminations
+from jumper_warp.policies.conditions import Conditions, env_of_policy
 from jumper_warp.policies.folder import load_policy
-from jumper_warp.policies.restore import Conditions, env_of_policy, restored_task
+from jumper_warp.policies.restore import restored_task
 from jumper_warp.policies.spec import PolicyError, PolicyInterface, make_interface
 from jumper_warp.registry import make_task
 from jumper_warp.tasks.cfg import TaskCfg

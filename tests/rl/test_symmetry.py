@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from jumper_warp.cli.main import main
-from jumper_warp.policies.restore import open_policy
+from jumper_warp.policies.runs import open_policy
 from jumper_warp.registry import TASKS, TaskEntry, make_task
 from jumper_warp.rl import compiling
 from jumper_warp.rl.cfg import PpoCfg, TrainCfg
