@@ -8,7 +8,6 @@ Nothing that is loaded can execute code.
 
 from __future__ import annotations
 
-
 import hashlib
 import json
 import os
