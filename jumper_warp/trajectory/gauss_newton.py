@@ -20,6 +20,8 @@ import torch
 from torch.func import jvp, vjp
 from torch.nn import functional
 
+from jumper_warp.utils.normalise import normalise
+
 if TYPE_CHECKING:
     from jumper_warp.policies.policy import Policy
 
@@ -54,7 +56,7 @@ class Network:
         weights: other ones than its own.
         """
         limit, normalised = self.limits
-        x = ((obs.clamp(-limit, limit) - self.mean) / self.std).clamp(-normalised, normalised)
+        x = normalise(obs.clamp(-limit, limit), self.mean, self.std, normalised)
         layers, rows = self.layers(self.weights if weights is None else weights), []
         for i, (weight, bias) in enumerate(layers):
             out = functional.linear(x, weight, bias)
