@@ -10,18 +10,13 @@ from jumper_warp.rl.cfg import PpoCfg
 from jumper_warp.utils.errors import InputError
 
 DEFAULT = "default"
-"""Name of the trainer as it is."""
+"""Name of the trainer with its default settings."""
 VARIANTS: dict[str, dict[str, Any]] = {
     DEFAULT: {},
     **{
-        "_".join([{"off": "eager", "on": "compiled"}[mode], precision, *(["overlap"] if overlap else [])]): {
-            "compile": mode,
-            "precision": precision,
-            "overlap": overlap,
-        }
-        for mode, precision, overlap in product(("off", "on"), ("float32", "bfloat16"), (False, True))
+        f"{'eager' if mode == 'off' else 'compiled'}_{precision}": {"compile": mode, "precision": precision}
+        for mode, precision in product(("off", "on"), ("float32", "bfloat16"))
     },
-    "one_stream": {"streams": False},
     "four_minibatches": {"minibatches": 4},
     "less_noise": {"init_std": 0.5},
     "less_noise_bfloat16": {"init_std": 0.5, "precision": "bfloat16"},
@@ -31,7 +26,7 @@ VARIANTS: dict[str, dict[str, Any]] = {
 
 
 def variant(cfg: PpoCfg, name: str) -> PpoCfg:
-    """Return settings changed as a variant says. Raises ValueError: there is no such variant."""
+    """Return settings changed as a variant says. Raises InputError: there is no such variant."""
     if name not in VARIANTS:
         raise InputError(f"variants are {', '.join(VARIANTS)}, got {name!r:.60}")
     return dataclasses.replace(cfg, **VARIANTS[name])
