@@ -26,7 +26,7 @@ from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.output import output_dir, write_metrics
 from jumper_warp.utils.runtime import announce
 from support.ablations import ABLATIONS
-from support.learning import Curve, learning_curve, make_judge, plot_curves
+from support.learning import Curve, draw_curves, learning_curve, make_judge
 
 FULL = "full"
 """Name of the training that lacks nothing."""
@@ -82,10 +82,11 @@ def main(args: Args) -> dict:
     task = make_task("vertical-jump")
     judge = make_judge(task, args.jumps, args.device)
     table = Table("variant", "success", f"seconds to {100 * GOOD:g} %", "iterations")
-    curves: dict[tuple[str, int], Curve] = {}
+    curves: dict[str, list[Curve]] = {}
     values: dict = {"seconds": args.seconds, "envs": args.envs, "randomize": args.randomize, "seed": args.seed}
     for name in args.variants:
-        curve = curves[name, args.seed] = train(ABLATIONS.get(name, lambda same: same)(task), judge, args)
+        curve = train(ABLATIONS.get(name, lambda same: same)(task), judge, args)
+        curves[name] = [curve]
         reached = curve.seconds_to(GOOD)
         values |= {
             f"success_{name}": curve.success[-1],
@@ -97,7 +98,7 @@ def main(args: Args) -> dict:
         never = "not reached" if reached is None else f"{reached:.1f}"
         table.add_row(name, f"{100.0 * curve.success[-1]:.1f} %", never, str(curve.iterations))
         write_metrics(folder, values)
-        plot_curves(curves, folder / "ablations.png")
+        draw_curves(curves, folder / "ablations.png")
     Console().print(table)
     print(f"metrics and plot in {folder}")
     return values

@@ -21,6 +21,7 @@ import warp as wp
 
 from jumper_warp.cli.main import run_command
 from jumper_warp.diff.rollout import Rollout, Trajectory, compact
+from jumper_warp.kernels.layout import COORDS, DOFS
 from jumper_warp.robot.description import load_description
 from jumper_warp.robot.model import PHYSICS_DT, build_model, standing_configuration
 from jumper_warp.robot.motors import filter_params, jumping_motors, vertical_jump_filter
@@ -78,7 +79,7 @@ class PlainJump:
         safe = rollout.array(np.zeros((12, n)))
         limits = filter_params(vertical_jump_filter(), module=modules.command_filter)
         wrench = wp.zeros(dynamics.model.body_count, dtype=wp.spatial_vector, device=rollout.device)
-        motors, layout = rollout.motors, modules.layout
+        motors = rollout.motors
         drive = dynamics.drive(rollout.array(np.zeros(38 * n)), wrench, motors, safe)
         settings = dynamics.settings(PHYSICS_DT, SUBSTEPS, MAX_SWEEPS, TOLERANCE)
 
@@ -89,8 +90,7 @@ class PlainJump:
             for target in (self._targets[step] for step in range(len(targets))):
                 wp.launch(
                     modules.command_filter.command_filter_kernel, dim=(4, n), device=rollout.device,
-                    inputs=[0, target, self._q, self._qd, layout.COORDS, layout.DOFS, motors.offset, limits],
-                    outputs=[safe],
+                    inputs=[0, target, self._q, self._qd, COORDS, DOFS, motors.offset, limits], outputs=[safe],
                 )  # fmt: skip
                 dynamics.advance(settings, drive, self._q, self._qd, self._q, self._qd)
 

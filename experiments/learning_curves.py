@@ -30,7 +30,8 @@ from jumper_warp.tasks.observations import with_history
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.output import output_dir, write_metrics
 from jumper_warp.utils.runtime import announce
-from support.learning import TESTED, Curve, curve_metrics, plot_curves, timed_training
+from support.learning import TESTED, Curve, draw_curves
+from support.timed_training import time_metrics, timed_training
 from support.variants import DEFAULT, variant
 
 TASK = "vertical-jump"
@@ -96,17 +97,18 @@ def main(args: Args) -> dict[str, Any]:
     table = Table("variant", "seed", "success", "ready [s]", *columns)
     values: dict[str, Any] = {"seconds": args.seconds, "envs": args.envs, "randomize": args.randomize}
     values |= {"seeds": list(args.seeds), "heights_m": list(args.heights), "history": args.history}
-    curves: dict[tuple[str, int], Curve] = {}
+    curves: dict[str, list[Curve]] = {name: [] for name in args.variants}
     for name, seed in itertools.product(args.variants, args.seeds):
-        curve = curves[name, seed] = train_in_process(args, name, seed)
-        found = curve_metrics(curve, f"{name}_{seed}", GOOD)
+        curve = train_in_process(args, name, seed)
+        curves[name].append(curve)
+        found = time_metrics(curve, f"{name}_{seed}", GOOD)
         values |= found
         rate, _, trained, total, steps, every_one = [*found.values()][:6]
         reached = [trained, total, steps and steps / 1e6, every_one]
         cells = ["never" if x is None else f"{x:.1f}" for x in reached]
         table.add_row(name, str(seed), f"{100 * rate:.1f} %", f"{curve.ready:.1f}", *cells)
         write_metrics(folder, values)
-        plot_curves(curves, folder / "learning_curves.png")
+        draw_curves(curves, folder / "learning_curves.png")
     Console().print(table)
     with (folder / "learning_curves.txt").open("w") as file:
         Console(file=file, width=120).print(table)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -14,12 +15,12 @@ import warp as wp
 from jumper_warp.envs.env import Env
 from jumper_warp.evaluation.jumps import run_jumps
 from jumper_warp.evaluation.plots import drawn
-from jumper_warp.rl.cfg import PpoCfg
 from jumper_warp.rl.ppo import Ppo
 from jumper_warp.rl.shac import Shac
 from jumper_warp.tasks.cfg import TaskCfg
-from support.timing import process_age
 
+RATES = (0.5, 0.9, 0.95)
+"""[1] Success rates whose first times are reported."""
 TESTED = (0.5, 1.1)
 """[m] Heights of the test's jumps, unless others are asked for."""
 
@@ -34,7 +35,7 @@ class Curve:
     """Policy steps of all worlds together, so far."""
     iterations: int = 0
     ready: float = 0.0
-    """[s] From the start of the process until training began."""
+    """[s] From the start of the process until training began, where it was measured."""
 
     def seconds_to(self, rate: float) -> float | None:
         """Return the first training time [s] at which an evaluation had at least this success rate, if any."""
@@ -48,6 +49,7 @@ def make_judge(task: TaskCfg, jumps: int, device: str | None) -> Env:
 
 def success(ppo: Ppo | Shac, judge: Env, heights: tuple[float, float] = TESTED) -> float:
     """Return the share of jumps to heights [m] from the first to the second that succeed, one a world."""
+
     return float(run_jumps(ppo.model.act, judge, np.linspace(*heights, judge.num_envs)).success.mean())
 
 
@@ -88,46 +90,27 @@ def learning_curve(
     return curve
 
 
-def timed_training(task: TaskCfg, cfg: PpoCfg, args: Any, seed: int) -> Curve:
-    """Train in a fresh process, and return the curve with the time until the training was ready.
-
-    args: envs, device, randomize, jumps, seconds, every and heights, as `experiments/learning_curves.py` has them.
-    """
-    torch.manual_seed(seed)
-    env = Env(task, args.envs, seed=seed, device=args.device, randomize=args.randomize, noise=args.randomize)
-    ppo = Ppo(env, cfg)
-    warm_up(env, ppo)
-    ready, judge = process_age(), make_judge(task, args.jumps, args.device)
-    success(ppo, judge)
-    curve = learning_curve(env, ppo, judge, args.seconds, args.every, args.heights)
-    curve.ready = ready
-    return curve
+def curve_metrics(curve: Curve, name: str) -> dict[str, Any]:
+    """Return the metrics of one training, and print when it reached each of RATES."""
+    pace = curve.steps[-1] / curve.seconds[-1]
+    values = {f"success_{name}": curve.success[-1], f"steps_per_s_{name}": pace}
+    values |= {f"curve_{series}_{name}": getattr(curve, series) for series in ("seconds", "steps", "success")}
+    for rate in RATES:
+        seconds, key = curve.seconds_to(rate), f"{100 * rate:g}_percent_{name}"
+        steps = None if seconds is None else curve.steps[curve.seconds.index(seconds)]
+        values |= {f"seconds_to_{key}": seconds, f"steps_to_{key}": steps}
+        print(f"{name}, {100 * rate:g} %: " + ("never" if steps is None else f"{seconds:.0f} s, {steps / 1e6:.2f} M"))
+    print(f"{name}: {100 * curve.success[-1]:.1f} % at the end, {pace:,.0f} steps a second", flush=True)
+    return values
 
 
-def curve_metrics(curve: Curve, name: str, good: float) -> dict[str, Any]:
-    """Return the metrics of a curve, their names ending in its own; good: success rate whose time is reported."""
-    reached, every_one, rate = curve.seconds_to(good), curve.seconds_to(1.0), f"{100.0 * good:g}_percent"
-    return {
-        f"success_{name}": curve.success[-1],
-        f"ready_s_{name}": curve.ready,
-        f"trained_to_{rate}_s_{name}": reached,
-        f"from_start_to_{rate}_s_{name}": None if reached is None else reached + curve.ready,
-        f"steps_to_{rate}_{name}": None if reached is None else curve.steps[curve.seconds.index(reached)],
-        f"trained_to_100_percent_s_{name}": every_one,
-        **{f"curve_{key}_{name}": getattr(curve, key) for key in ("seconds", "steps", "success")},
-    }
-
-
-def plot_curves(curves: dict[tuple[str, int], Curve], path: Path) -> None:
-    """Draw success over training time and over steps, one line a training (name, seed), one colour a name."""
-    colours = {name: f"C{i}" for i, name in enumerate(dict.fromkeys(name for name, _ in curves))}
+def draw_curves(curves: Mapping[str, Sequence[Curve]], path: Path) -> None:
+    """Draw success over time and steps, a color for each name."""
     with drawn(path, 1, 2, figsize=(11, 4.5), sharey=True) as axes:
-        for (name, seed), curve in curves.items():
-            label = name.replace("_", " ") if seed == next(s for n, s in curves if n == name) else None
-            for axis, x in zip(axes, (curve.seconds, np.divide(curve.steps, 1.0e6)), strict=True):
-                axis.plot([0.0, *x], [0.0, *(100.0 * s for s in curve.success)], color=colours[name], label=label)
-        axes[0].set(xlabel="training time [s]", ylabel="success [%]", ylim=(0.0, 102.0))
+        for i, (name, runs) in enumerate(curves.items()):
+            for number, curve in enumerate(runs):
+                for axis, x in zip(axes, (curve.seconds, np.array(curve.steps) / 1e6), strict=True):
+                    axis.plot(x, curve.success, color=f"C{i}", label=None if number else name)
+        axes[0].set(xlabel="training time [s]", ylabel="success [1]")
         axes[1].set(xlabel="steps [million]")
-        for axis in axes:
-            axis.grid(alpha=0.3)
-        axes[0].legend(loc="lower right")
+        axes[0].legend()

@@ -148,8 +148,8 @@ def time_parts(envs: Sequence[int], train_envs: int, steps: int, repeats: int, d
 def time_ppo(envs: int, cfg: PpoCfg, iterations: int, device: str | None) -> dict[str, float]:
     """Return figures of training with this package's PPO; the policy must have changed and stayed finite.
 
-    `ppo_device_memory_gib`: in use on a GPU by all processes. `ppo_ready_s`: compilation and the first iterations,
-    until all graphs are captured.
+    `ppo_device_memory_gib`: in use on a GPU, by whatever. `ppo_ready_s`: compilation and the first iterations, until
+    all graphs are captured.
     """
     env, _ = stepping_env(envs, device)
     begin = time.perf_counter()

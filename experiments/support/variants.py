@@ -10,12 +10,12 @@ from jumper_warp.rl.cfg import PpoCfg
 from jumper_warp.utils.errors import InputError
 
 DEFAULT = "default"
-"""Name of the trainer with its default settings."""
+"""Name of the trainer as it is."""
 VARIANTS: dict[str, dict[str, Any]] = {
     DEFAULT: {},
     **{
-        f"{'eager' if mode == 'off' else 'compiled'}_{precision}": {"compile": mode, "precision": precision}
-        for mode, precision in product(("off", "on"), ("float32", "bfloat16"))
+        f"{name}_{precision}": {"compile": mode, "precision": precision}
+        for (mode, name), precision in product((("off", "eager"), ("on", "compiled")), ("float32", "bfloat16"))
     },
     "four_minibatches": {"minibatches": 4},
     "less_noise": {"init_std": 0.5},
@@ -26,7 +26,7 @@ VARIANTS: dict[str, dict[str, Any]] = {
 
 
 def variant(cfg: PpoCfg, name: str) -> PpoCfg:
-    """Return settings changed as a variant says. Raises InputError: there is no such variant."""
+    """Return settings changed as a variant says. Raises ValueError: there is no such variant."""
     if name not in VARIANTS:
         raise InputError(f"variants are {', '.join(VARIANTS)}, got {name!r:.60}")
     return dataclasses.replace(cfg, **VARIANTS[name])
