@@ -99,8 +99,8 @@ def main(args: Args) -> dict[str, Any]:
     announce("cpu", args.threads)
     folder = output_dir("identification", args.out)
     parameters = jumper_parameters()
-    replay = Replay(len(parameters) + 37, device="cpu", threads=args.threads)
-    replay_one = Replay(1, device="cpu", threads=1)
+    replay = Replay(device="cpu", threads=args.threads)
+    replay_one = Replay(device="cpu", threads=1)
 
     def ours(plan: Plan, robots: RobotValues) -> Record:
         return replay_plan(replay_one, plan, robots)

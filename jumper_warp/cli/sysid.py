@@ -256,7 +256,7 @@ def excite(cfg: ExciteCfg) -> list[Motion]:
     parameters, noise = parameters_of(cfg.params), noise_of(cfg.noise)
     robots = RobotValues.nominal(1) if cfg.robot is None else load_overlay(cfg.robot).robots()
     announce("cpu", cfg.threads)
-    scorer = Scorer(parameters, noise, Replay(len(parameters) + 37, device="cpu", threads=cfg.threads))
+    scorer = Scorer(parameters, noise, Replay(device="cpu", threads=cfg.threads))
     chosen = choose(scorer, KINDS * cfg.sets, candidates=cfg.candidates, seconds=cfg.seconds, seed=cfg.seed)
     rng = None if cfg.exact else np.random.default_rng([cfg.seed, 1])
     folder, motions = output_dir("excite", cfg.out), []

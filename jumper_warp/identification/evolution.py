@@ -47,7 +47,7 @@ def identify_by_evolution(
         raise InputError("CMA-ES needs the package cma, which is not installed: pip install cma") from None
     if not motions or not max_seconds > 0.0 or population < 4:
         raise InputError("evolution needs motions, a time above 0 s and a population of at least 4")
-    replay = Replay(max(population, len(parameters) + 37), description=description, device=device, threads=threads)
+    replay = Replay(description=description, device=device, threads=threads)
     whole = [MotionResiduals(motion, parameters, noise or NoiseLevels(), replay.description, dt) for motion in motions]
     problem = LeastSquares(parameters, whole, replay, knowledge)
     point, descent = problem.expected(), Descent(replay)

@@ -79,7 +79,7 @@ class Scorer:
     def __init__(self, parameters: ParameterSet, noise: NoiseLevels | None = None, replay: Replay | None = None):
         """Prepare; replay: worlds to be used, whose description counts."""
         self.parameters, self.noise = parameters, noise or NoiseLevels()
-        self.replay = replay or Replay(len(parameters) + 37)
+        self.replay = replay or Replay()
 
     def record(self, plan: Plan) -> Record:
         """Return what the described robot does, from rest in the pose of the first targets."""

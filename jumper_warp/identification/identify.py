@@ -97,7 +97,7 @@ def identify(
         raise InputError("there must be at least one motion")
     noise = NoiseLevels() if noise is None else noise
     if replay is None:
-        replay = Replay(len(parameters) + 37, description=description, device=device, threads=threads)
+        replay = Replay(description=description, device=device, threads=threads)
     descent = Descent(replay)
     robot, rough_dt = replay.description, None if dt is None else max(dt, COARSE)
     whole = [MotionResiduals(motion, parameters, noise, robot, dt) for motion in motions]

@@ -189,7 +189,7 @@ def motion_plot(found: Identification, motion: MotionResiduals, start: np.ndarra
 
     figure = new_figure(10.0, 4.6)
     axes = figure.subplots(2, 3, sharex=True)
-    replay = Replay(1, description=motion.description, threads=1)
+    replay = Replay(description=motion.description, threads=1)
     record, robots = motion.run(replay, found.z[None], start[None])
     model = motion.predicted(record, robots)[..., 0]
     time = motion.motion.time - motion.motion.time[0]

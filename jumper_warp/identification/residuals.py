@@ -11,7 +11,7 @@ import numpy as np
 
 from jumper_warp.identification.motions import Motion
 from jumper_warp.identification.parameters import BASE_ONLY, ParameterSet
-from jumper_warp.identification.replay import Record, Replay, Starts, grid_steps
+from jumper_warp.identification.replay import Record, Replay, Starts
 from jumper_warp.identification.stance import levelled, levelling, stance
 from jumper_warp.robot.description import RobotDescription
 from jumper_warp.robot.values import RobotValues
@@ -26,6 +26,8 @@ LONGEST_LATENCY = 0.05
 SETTLING = 0.02
 """[s] From the start on, in which rows of a motion on the ground do not count: paws that do not stand on it exactly
 strike it, and when each does is a matter of micrometres."""
+FIRST_ROWS = 8
+"""Rows in which a motion's start is measured."""
 QUIET_ROWS = 2
 QUIET = 0.2
 """[rad/s] Mean rate over the first rows of a motion below which a robot that stands has all paws on the ground."""
@@ -155,7 +157,7 @@ class MotionResiduals:
 
     def _guess_start(self, noise: dict[str, tuple[float, int]]) -> None:
         """Set what the first rows say of the start, and how well."""
-        motion, rows = self.motion, min(8, len(self.motion.time))
+        motion, rows = self.motion, min(FIRST_ROWS, len(self.motion.time))
         angle, angle_prior = first_values(motion.angle, motion.target[0], TRUST * noise["angle"][0], 10.0 * DEGREE)
         rate, rate_prior = first_values(motion.rate, None, TRUST * noise["rate"][0], 1.0)
         if motion.rate is None and motion.angle is not None:
@@ -329,9 +331,9 @@ def first_values(
         default = np.zeros(12) if default is None else default
         return default.copy(), np.full(len(default), wide)
     found = np.zeros(values.shape[1]) if default is None else default.copy()
-    known = np.isfinite(values[: max(8, 1)]).any(axis=0)
+    known = np.isfinite(values[:FIRST_ROWS]).any(axis=0)
     for i in np.flatnonzero(known):
-        column = values[:8, i]
+        column = values[:FIRST_ROWS, i]
         found[i] = column[np.isfinite(column)][0]
     return found, np.where(known, prior, wide)
 
@@ -344,3 +346,12 @@ def slope(time: np.ndarray, values: np.ndarray) -> np.ndarray:
         if known.sum() >= 3:
             found[i] = np.polyfit(time[known] - time[0], values[known, i], 1)[0]
     return found
+
+
+def grid_steps(period: float, dt: float | None) -> tuple[int, float]:
+    """Return the physics steps in a sample period [s], and the step [s]: at most dt, by default 1/480 s."""
+    longest = 1.0 / 480.0 if dt is None else dt
+    if not 1.0e-6 <= longest <= 0.01:
+        raise InputError(f"dt must lie in 1e-6 to 0.01 s, got {dt}")
+    steps = max(1, math.ceil(period / longest - 1.0e-6))
+    return steps, period / steps

@@ -15,8 +15,8 @@ from support.known_robots import MOST, make_case, prediction_errors
 @pytest.fixture(scope="module")
 def drawn():
     """Parameters, one known robot, what replays, and what carries a plan out."""
-    parameters, one = jumper_parameters(), Replay(1, device="cpu", threads=1)
-    many = Replay(len(parameters) + 37, device="cpu", threads=1)
+    parameters, one = jumper_parameters(), Replay(device="cpu", threads=1)
+    many = Replay(device="cpu", threads=1)
 
     def carry(plan, robots):
         return replay_plan(one, plan, robots)
