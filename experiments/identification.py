@@ -25,8 +25,7 @@ from jumper_warp.evaluation.log import run_evaluation, termination_names
 from jumper_warp.evaluation.plots import drawn
 from jumper_warp.identification.findings import Identification
 from jumper_warp.identification.parameters import jumper_parameters
-from jumper_warp.identification.plans import KINDS, Plan
-from jumper_warp.identification.recording import replay_plan, simulate_plan
+from jumper_warp.identification.recording import KINDS, Plan, replay_plan, simulate_plan
 from jumper_warp.identification.replay import Record, Replay
 from jumper_warp.policies.restore import Conditions, env_of_policy, open_policy
 from jumper_warp.robot.overlay import overlay_of

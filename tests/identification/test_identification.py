@@ -9,11 +9,11 @@ import pytest
 from jumper_warp.identification.excitation import Scorer
 from jumper_warp.identification.identify import identify, total_mass, weighed
 from jumper_warp.identification.least_squares import gram
+from jumper_warp.identification.motions import NoiseLevels
 from jumper_warp.identification.parameters import Parameter, ParameterSet, jumper_parameters
-from jumper_warp.identification.plans import KINDS, draw_plan
-from jumper_warp.identification.recording import measured, replay_plan, simulate_plan
+from jumper_warp.identification.recording import KINDS, draw_plan, measured, replay_plan, simulate_plan
 from jumper_warp.identification.replay import Replay
-from jumper_warp.identification.residuals import MotionResiduals, NoiseLevels
+from jumper_warp.identification.residuals import MotionResiduals
 from jumper_warp.identification.stance import paw_positions, stance, unevenness
 from jumper_warp.identification.uncertainty import weak_directions
 from jumper_warp.robot.description import load_description

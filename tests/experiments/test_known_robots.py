@@ -4,10 +4,11 @@ import numpy as np
 import pytest
 
 from jumper_warp.identification.least_squares import LeastSquares
+from jumper_warp.identification.motions import NoiseLevels
 from jumper_warp.identification.parameters import jumper_parameters
 from jumper_warp.identification.recording import replay_plan
 from jumper_warp.identification.replay import Replay
-from jumper_warp.identification.residuals import MotionResiduals, NoiseLevels
+from jumper_warp.identification.residuals import MotionResiduals
 from support.identification_methods import chi2_at
 from support.known_robots import MOST, make_case, prediction_errors
 
