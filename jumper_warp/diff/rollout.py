@@ -19,6 +19,7 @@ import warp as wp
 
 from jumper_warp.diff.actuation import MOTOR_CONSTANTS, filter_rows
 from jumper_warp.diff.reverse_legs import LegReverse
+from jumper_warp.robot.description import RobotDescription
 from jumper_warp.robot.model import PHYSICS_DT
 from jumper_warp.robot.motors import FilterCfg, MotorCfg, jumping_motors, motor_arrays
 from jumper_warp.sim.dynamics import JumperDynamics
@@ -88,6 +89,7 @@ class Rollout:
         motors: MotorCfg | None = None,
         command_filter: FilterCfg | None = None,
         *,
+        description: RobotDescription | None = None,
         double: bool = False,
         dt: float = PHYSICS_DT,
         substeps: int = SUBSTEPS,
@@ -101,6 +103,7 @@ class Rollout:
             model: The robot's worlds, without moving blocks.
             motors: By default the jumping gains at 18 N m.
             command_filter: None leaves the targets as they are.
+            description: The model's, by default the project's.
             double: Whether to compute in double precision.
             dt: Physics step [s].
             substeps: Physics steps in a policy step.
@@ -119,7 +122,7 @@ class Rollout:
             raise InputError(f"every must be a divisor of substeps = {substeps}, got {every!r}")
         if tolerance is not None and not 0.0 < tolerance < math.inf:
             raise InputError(f"tolerance must be finite and positive, got {tolerance!r:.40}")
-        self.dynamics = JumperDynamics(model, double=double)
+        self.dynamics = JumperDynamics(model, description=description, double=double)
         self.num_worlds, self.device, self.real = model.world_count, model.device, self.dynamics.real
         self.dt, self.substeps, self.every = dt, substeps, every
         modules, n = self.dynamics.modules, self.num_worlds
