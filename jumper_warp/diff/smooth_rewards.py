@@ -144,8 +144,3 @@ def smooth_reward(task: Any, moment: Moment) -> torch.Tensor:
             time = 1.0 if term.options["once"] else moment.step_dt
             total = total + term.numbers["weight"] * time * SMOOTH[term.func.key](moment, term.numbers)
     return total
-
-
-def rough_rewards(task: Any) -> tuple[str, ...]:
-    """Return the names of the rewards without a derivative."""
-    return tuple(term.name for term in task.rewards if term.func.key not in SMOOTH)

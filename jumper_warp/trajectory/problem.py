@@ -137,12 +137,6 @@ class Motion:
         rate = ends[:-1, None] + share * (ends[1:] - ends[:-1])[:, None]
         return (self.dt * (torque * rate).clamp_min(0.0)).sum((1, 2)).cumsum(0)
 
-    @cached_property
-    def copper(self) -> torch.Tensor:
-        """Return the integral of squared torques [N^2 m^2 s] until each policy step, (steps, num)."""
-        torque = self.trajectory.torque.unflatten(0, (-1, self.substeps))
-        return (self.dt * torque.square()).sum((1, 2)).cumsum(0)
-
     def takeoff(self, speed: float) -> tuple[torch.Tensor, torch.Tensor]:
         """Return the row of takeoff (num,), the last where there is none, and whether there is one.
 
