@@ -61,7 +61,7 @@ def make_moment(loop: ClosedLoop, state: LoopState, old: LoopState, arrays: Mapp
     return Moment(
         loop.motion(state), loop.motion(old), state, old, at(phase), at((phase == STANCE) & asked),
         at((phase == LANDED) & (after < SOON)), at(resting), at(rising), at(arrays["at_apex"] == 1),
-        at(arrays["goal"][:, 2]), loop.default, loop.env.task.gravity, loop.env.step_dt,
+        at(arrays["goal"][:, 2]), loop.default, loop.task.gravity, loop.env.step_dt,
     )  # fmt: skip
 
 
