@@ -5,7 +5,7 @@ import warp as wp
 from ...actuation.motors import MotorParams
 from ...scalar import real, vec3
 from ..step import Robot, StepSettings, load_leg
-from ..world.rollout import Actuation, Commands, Rows, Timing, load_world_motor, row_vec3
+from ..trajectory import Actuation, Commands, Rows, Timing, load_world_motor, row_vec3
 from .command_adjoint import add_motor_constants, add_offsets, motor_gradient
 from .gradients import Gradients, ThreadSums
 from .leg_adjoint import add_leg_constants, held_base, leg_gradient

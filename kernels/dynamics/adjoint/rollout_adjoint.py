@@ -14,7 +14,7 @@ from ..contact import PawContact
 from ..contact_laws import PawLaw
 from ..parameters import load_moments, load_spring, load_stops
 from ..step import LegParams, Robot, StepSettings, load_leg
-from ..world.rollout import (
+from ..trajectory import (
     Actuation,
     Commands,
     Rows,
@@ -277,8 +277,8 @@ def everything(
 def generate_adjoints(module: str) -> wp.Kernel:
     """Make Warp generate, in a module of kernels, the adjoints of all functions that the reverse pass differentiates.
 
-    `wp.grad` alone leaves out those of functions which something else called first; a kernel with a backward pass, never
-    launched, has them all.
+    `wp.grad` alone leaves out those of functions which something else called first. A kernel with a backward pass has
+    them all; it is never launched.
     """
 
     @wp.kernel(enable_backward=True, module=wp.get_module(module))

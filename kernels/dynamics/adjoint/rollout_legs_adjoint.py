@@ -12,7 +12,7 @@ from ...layout import BASE, GRAVITY
 from ...scalar import quat, real, vec3
 from ...state import base_com
 from ..step import Robot, StepSettings, load_leg
-from ..world.rollout import (
+from ..trajectory import (
     Actuation,
     Commands,
     Rows,
