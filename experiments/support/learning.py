@@ -34,6 +34,8 @@ class Curve:
     steps: list[int] = field(default_factory=list)
     """Policy steps of all worlds together, so far."""
     iterations: int = 0
+    ready: float = 0.0
+    """[s] From the start of the process until training began, where it was measured."""
 
     def seconds_to(self, rate: float) -> float | None:
         """Return the first training time [s] at which an evaluation had at least this success rate, if any."""

@@ -11,7 +11,8 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from jumper_warp.robot.description import load_description
-from jumper_warp.robot.model import build_pinocchio, leg_geometry, leg_geometry_array
+from jumper_warp.robot.model import leg_geometry, leg_geometry_array
+from jumper_warp.robot.pinocchio_model import build_pinocchio
 from jumper_warp.sim.precision import float64_kernels
 
 LATERAL = (-50.0, 110.0)
