@@ -16,9 +16,10 @@ from rich.table import Table
 from jumper_warp.cli.train import env_maker, parse_train
 from jumper_warp.evaluation.plots import drawn
 from jumper_warp.evaluation.run import HEIGHTS, EvaluationRun
-from jumper_warp.policies.restore import CHECKPOINTS, Conditions
-from jumper_warp.policies.start import start_from
+from jumper_warp.policies.conditions import Conditions
+from jumper_warp.policies.warm_start import start_from
 from jumper_warp.registry import make_task
+from jumper_warp.rl.resume import CHECKPOINTS
 from jumper_warp.rl.runner import CONFIG, train
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.tasks.saving import task_to_json
