@@ -13,8 +13,6 @@ from pathlib import Path
 
 import torch
 import tyro
-from rich.console import Console
-from rich.table import Table
 
 from jumper_warp.cli.main import run_command
 from jumper_warp.envs.env import Env
@@ -26,12 +24,10 @@ from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.output import output_dir, write_metrics
 from jumper_warp.utils.runtime import announce
 from support.ablations import ABLATIONS
-from support.learning import Curve, draw_curves, learning_curve, make_judge
+from support.learning import Curve, curve_metrics, draw_curves, learning_curve, make_judge
 
 FULL = "full"
 """Name of the training that lacks nothing."""
-GOOD = 0.8
-"""Success rate whose time is reported."""
 
 
 @dataclass(frozen=True)
@@ -81,25 +77,14 @@ def main(args: Args) -> dict:
     folder = output_dir("ablations", args.out)
     task = make_task("vertical-jump")
     judge = make_judge(task, args.jumps, args.device)
-    table = Table("variant", "success", f"seconds to {100 * GOOD:g} %", "iterations")
     curves: dict[str, list[Curve]] = {}
     values: dict = {"seconds": args.seconds, "envs": args.envs, "randomize": args.randomize, "seed": args.seed}
     for name in args.variants:
         curve = train(ABLATIONS.get(name, lambda same: same)(task), judge, args)
         curves[name] = [curve]
-        reached = curve.seconds_to(GOOD)
-        values |= {
-            f"success_{name}": curve.success[-1],
-            f"seconds_to_80_percent_{name}": reached,
-            f"iterations_{name}": curve.iterations,
-            f"curve_seconds_{name}": curve.seconds,
-            f"curve_success_{name}": curve.success,
-        }
-        never = "not reached" if reached is None else f"{reached:.1f}"
-        table.add_row(name, f"{100.0 * curve.success[-1]:.1f} %", never, str(curve.iterations))
+        values |= curve_metrics(curve, name) | {f"iterations_{name}": curve.iterations}
         write_metrics(folder, values)
         draw_curves(curves, folder / "ablations.png")
-    Console().print(table)
     print(f"metrics and plot in {folder}")
     return values
 

@@ -19,7 +19,7 @@ from jumper_warp.rl.ppo import Ppo
 from jumper_warp.rl.shac import Shac
 from jumper_warp.tasks.cfg import TaskCfg
 
-RATES = (0.5, 0.9, 0.95)
+RATES = (0.5, 0.8, 0.9, 0.95, 1.0)
 """[1] Success rates whose first times are reported."""
 TESTED = (0.5, 1.1)
 """[m] Heights of the test's jumps, unless others are asked for."""

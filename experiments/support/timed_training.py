@@ -28,17 +28,3 @@ def timed_training(task: TaskCfg, cfg: PpoCfg, args: Any, seed: int) -> Curve:
     curve = learning_curve(env, ppo, judge, args.seconds, args.every, args.heights)
     curve.ready = ready
     return curve
-
-
-def time_metrics(curve: Curve, name: str, good: float) -> dict[str, Any]:
-    """Return the metrics of a timed training, their names ending in its own; good: success rate that is waited for."""
-    reached, rate = curve.seconds_to(good), f"{100.0 * good:g}_percent"
-    return {
-        f"success_{name}": curve.success[-1],
-        f"ready_s_{name}": curve.ready,
-        f"trained_to_{rate}_s_{name}": reached,
-        f"from_start_to_{rate}_s_{name}": None if reached is None else reached + curve.ready,
-        f"steps_to_{rate}_{name}": None if reached is None else curve.steps[curve.seconds.index(reached)],
-        f"trained_to_100_percent_s_{name}": curve.seconds_to(1.0),
-        **{f"curve_{key}_{name}": getattr(curve, key) for key in ("seconds", "steps", "success")},
-    }
