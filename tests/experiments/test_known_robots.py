@@ -4,10 +4,11 @@ import numpy as np
 import pytest
 
 from jumper_warp.identification.least_squares import LeastSquares
+from jumper_warp.identification.motions import NoiseLevels
 from jumper_warp.identification.parameters import jumper_parameters
 from jumper_warp.identification.recording import replay_plan
 from jumper_warp.identification.replay import Replay
-from jumper_warp.identification.residuals import MotionResiduals, NoiseLevels
+from jumper_warp.identification.residuals import MotionResiduals
 from support.identification_methods import chi2_at
 from support.known_robots import MOST, make_case, prediction_errors
 
@@ -15,8 +16,8 @@ from support.known_robots import MOST, make_case, prediction_errors
 @pytest.fixture(scope="module")
 def drawn():
     """Parameters, one known robot, what replays, and what carries a plan out."""
-    parameters, one = jumper_parameters(), Replay(1, device="cpu", threads=1)
-    many = Replay(len(parameters) + 37, device="cpu", threads=1)
+    parameters, one = jumper_parameters(), Replay(device="cpu", threads=1)
+    many = Replay(device="cpu", threads=1)
 
     def carry(plan, robots):
         return replay_plan(one, plan, robots)
