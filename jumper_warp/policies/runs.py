@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -80,15 +79,13 @@ def _policy_of_checkpoint(path: Path, state: dict[str, Any]) -> Policy:
             layers, shape["hidden"] = plain_layers(layers, symmetry), tuple(2 * width for width in ppo["hidden"])
         commit = config.get("commit") or {"hash": None, "dirty": None}
         config |= {"commit": commit["hash"], "dirty": commit["dirty"], "iteration": state["iteration"]}
-        described = env["interface"]
+        described = {**env["interface"], "observation_limit": RAW_LIMIT, "normalised_limit": NORMALISED_LIMIT}
     except TaskError as error:
         raise CheckpointError(f"{path}: {error}") from error
     except DAMAGE as error:
         raise _no_training(path, error) from error
     try:
-        face = make_interface(described, **times, **shape)
-        face = dataclasses.replace(face, observation_limit=RAW_LIMIT, normalised_limit=NORMALISED_LIMIT)
-        return Policy(layers, mean, std, face, config)
+        return Policy(layers, mean, std, make_interface(described, **times, **shape), config)
     except PolicyError as error:
         raise PolicyError(f"{path}: {error}") from error
     except DAMAGE as error:

@@ -177,12 +177,6 @@ def make_interface(
     Raises PolicyError: it does not fit together.
     """
     shape = {"policy_dt": policy_dt, "physics_dt": physics_dt, "hidden": list(hidden), "activation": activation}
-    optional = {name: value for name, value in defaults().items() if name not in shape}
-    return PolicyInterface.from_json(optional | described | shape)
-
-
-def defaults() -> dict[str, Any]:
-    """Return the fields that an interface need not name, as JSON holds them."""
     fields = dataclasses.fields(PolicyInterface)
-    values = {f.name: f.default for f in fields if f.default is not dataclasses.MISSING}
-    return values | {f.name: f.default_factory() for f in fields if f.default_factory is not dataclasses.MISSING}
+    optional = {spec.name: spec.default for spec in fields if spec.default is not dataclasses.MISSING}
+    return PolicyInterface.from_json({"observation_layout": {}} | optional | described | shape)
