@@ -28,7 +28,7 @@ IR_VERSION = 9
 INPUT, OUTPUT = "obs", "actions"
 OPERATORS = {"elu": "Elu", "relu": "Relu", "tanh": "Tanh"}
 METADATA_VERSION = 2
-"""2 lacks the entry observation_history, which was 1 even where terms hold frames of the past."""
+"""Of the metadata."""
 ORIGIN = ("commit", "dirty")
 """Entries of a policy's configuration that its metadata repeats."""
 STORED = {"mean": "normaliser.mean", "std": "normaliser.std"}

@@ -10,6 +10,7 @@ from torch import nn
 
 from jumper_warp.policies.spec import PolicyError, PolicyInterface
 from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.normalise import normalise
 
 ACTIVATION_MODULES = {"elu": nn.ELU, "relu": nn.ReLU, "tanh": nn.Tanh}
 
@@ -107,8 +108,7 @@ class Policy(nn.Module):
         limit = self.interface.observation_limit
         finite = torch.nan_to_num(obs, nan=0.0, posinf=0.0, neginf=0.0).clamp(-limit, limit).to(self.mean.dtype)
         limit = self.interface.normalised_limit
-        features = ((finite - self.mean) / self.std).clamp(-limit, limit)
-        return self.actor(features).clamp(-1.0, 1.0)
+        return self.actor(normalise(finite, self.mean, self.std, limit)).clamp(-1.0, 1.0)
 
 
 def check_tensors(tensors: Mapping[str, torch.Tensor], interface: PolicyInterface) -> None:

@@ -55,7 +55,7 @@ def _compared(face: PolicyInterface, described: dict[str, Any]) -> Iterator[tupl
         for column, pair in enumerate(zip_longest(getattr(face, name), described[name], fillvalue="none")):
             yield f"{what} {column}", *pair
     layout = described["observation_layout"]
-    for name, term in face.observation_layout.items():  # empty in policies of before it was kept
+    for name, term in face.observation_layout.items():  # none if they are not known
         for key, own in term.items():
             yield f"{key} of {name}", own, layout.get(name, {}).get(key, "none")
     for joint, *pair in zip(face.joint_names, face.default_joint_pos, described["default_joint_pos"], strict=True):

@@ -12,6 +12,7 @@ from jumper_warp.rl.flat import FlatParameters, Layers
 from jumper_warp.rl.mirror import Symmetry
 from jumper_warp.rl.networks import NORMALISED_LIMIT, ActorCritic
 from jumper_warp.rl.passes import DTYPES, forward, forward_both
+from jumper_warp.utils.normalise import normalise
 
 
 class RolloutBuffer:
@@ -102,7 +103,7 @@ def normalised(obs: torch.Tensor, scaling: torch.Tensor | Pair, columns: int) ->
 
     scaling: mean and standard deviation, (n,) each.
     """
-    features = ((obs - scaling[0]) / scaling[1]).clamp(-NORMALISED_LIMIT, NORMALISED_LIMIT)
+    features = normalise(obs, scaling[0], scaling[1], NORMALISED_LIMIT)
     return functional.pad(features, (0, columns - obs.shape[-1]))
 
 

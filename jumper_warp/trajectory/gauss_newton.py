@@ -20,6 +20,8 @@ import torch
 from torch.func import jvp, vjp
 from torch.nn import functional
 
+from jumper_warp.utils.normalise import normalise
+
 ACTIVATIONS = {"elu": functional.elu, "relu": functional.relu, "tanh": torch.tanh}
 
 Tape = list[list[tuple[torch.Tensor, torch.Tensor]]]
@@ -60,7 +62,7 @@ class Network:
         weights: other ones than its own.
         """
         limit, normalised = self.limits
-        x = ((obs.clamp(-limit, limit) - self.mean) / self.std).clamp(-normalised, normalised)
+        x = normalise(obs.clamp(-limit, limit), self.mean, self.std, normalised)
         layers, rows = self.layers(self.weights if weights is None else weights), []
         for i, (weight, bias) in enumerate(layers):
             out = functional.linear(x, weight, bias)
