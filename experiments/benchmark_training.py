@@ -5,7 +5,7 @@
 Steps are policy steps of 1/60 s, 8 physics steps each, of all environments together. The solver stands; environment
 and training see random or learned actions, with randomisation and noise. rsl-rl-lib trains on the same environment
 through the package's adapter. Before anything is timed, its outcome is checked.
-`--variants all` times PPO compiled or not, in either precision, with and without overlap; `--only-ppo` nothing else.
+`--variants all` times PPO compiled or not and in either precision; `--only-ppo` nothing else.
 `--baseline PATH` runs the same script of another checkout too, and tells how much faster this one is.
 """
 

@@ -134,8 +134,8 @@ def time_stages(envs: int, device: str | None, repeats: int) -> dict[str, float]
 def time_ppo(envs: int, cfg: PpoCfg, iterations: int, device: str | None) -> dict[str, float]:
     """Return figures of training with this package's PPO; the policy must have changed and stayed finite.
 
-    `ppo_device_memory_gib`: in use on a GPU, by whatever. With overlap, `ppo_update_s` is what the update takes longer
-    than the rollout beside it. `ppo_ready_s`: compilation and the first iterations, until all graphs are captured.
+    `ppo_device_memory_gib`: in use on a GPU, by whatever. `ppo_ready_s`: compilation and the first iterations, until
+    all graphs are captured.
     """
     env, _ = stepping_env(envs, device)
     begin = time.perf_counter()

@@ -63,11 +63,9 @@ class PpoCfg:
     """Widths of the hidden layers."""
     activation: str = "elu"
     """elu, relu or tanh."""
-    symmetry: Literal["off", "actor", "loss"] = "off"
-    """Left-right symmetry of the policy: actor by its form, which answers mirrored observations by mirrored actions
-    whatever the weights; loss by a part of the loss. For tasks whose observation has a known mirror image."""
-    symmetry_coef: float = 1.0
-    """Weight of the mean squared difference between mirrored answers, with symmetry loss."""
+    symmetry: Literal["off", "actor"] = "off"
+    """Left-right symmetry of the policy: an actor that answers mirrored observations by mirrored actions whatever the
+    weights. For tasks whose observation has a known mirror image."""
     tf32: bool = True
     """Whether matrix products on a GPU may round their factors to 10 mantissa bits."""
     precision: Literal["float32", "bfloat16"] = "float32"
@@ -77,16 +75,12 @@ class PpoCfg:
     Needs a C++ compiler; what was compiled is kept in Inductor's cache on disk."""
     graphs: bool = True
     """Whether a GPU replays captured graphs."""
-    overlap: bool = False
-    """Whether the next rollout runs beside the update, with the weights of one iteration before."""
-    streams: bool = True
-    """Whether a GPU computes the gradients of actor and critic beside each other."""
 
     def __post_init__(self) -> None:
         """Raises ValueError: a setting is out of range."""
         for name in ("num_steps", "epochs", "minibatches", "lr", "max_grad_norm", "init_std", "clip", "reward_scale"):
             check_positive(name, getattr(self, name))
-        for name in ("value_coef", "entropy_coef", "desired_kl", "final_kl", "symmetry_coef"):
+        for name in ("value_coef", "entropy_coef", "desired_kl", "final_kl"):
             check_not_negative(name, getattr(self, name))
         if self.final_entropy is not None:
             check_not_negative("final_entropy", self.final_entropy)
@@ -96,8 +90,8 @@ class PpoCfg:
         check_finite("max_lr", self.max_lr)
         if not 0.0 < self.min_lr <= self.lr <= self.max_lr:
             raise InputError(f"need 0 < min_lr <= lr <= max_lr, got {self.min_lr}, {self.lr}, {self.max_lr}")
-        if self.symmetry not in ("off", "actor", "loss"):
-            raise InputError(f"symmetry must be off, actor or loss, got {self.symmetry!r:.40}")
+        if self.symmetry not in ("off", "actor"):
+            raise InputError(f"symmetry must be off or actor, got {self.symmetry!r:.40}")
         if not self.hidden or min(self.hidden) < 1:
             raise InputError(f"hidden must name at least one positive width, got {self.hidden}")
         if self.activation not in ACTIVATIONS:
@@ -171,7 +165,7 @@ class TrainCfg:
     log_interval: int = 10
     """Iterations between two logged ones."""
     save_interval: int = 100
-    """Iterations between two checkpoints; with ppo.overlap, one that saves collects nothing ahead."""
+    """Iterations between two checkpoints."""
     keep: int = 3
     """How many of the newest checkpoints stay; the best stays anyway."""
     best_by: str = "Metrics/success"

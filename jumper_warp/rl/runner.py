@@ -231,29 +231,23 @@ class Run:
                 seconds = f"--max-seconds {cfg.max_seconds:g}"
                 limit = f"--iterations {cfg.iterations}" if self.iteration >= cfg.iterations else seconds
                 log.say(f"nothing is left to train after iteration {self.iteration}: give more than {limit}")
-            drain = False
             while not ending:
                 watch.start()
                 ppo.set_progress(self._progress())
-                ppo.iterate(drain or self._saves(self.iteration + 1), watch.mark)
+                ppo.iterate(watch.mark)
                 self.iteration += 1
                 if self.iteration == first:
                     self._begin_counting()
-                drain = drain or self._ending(stop)
-                ending = drain and not ppo.ahead  # else after the iteration that learns from the rollout ahead
+                ending = self._ending(stop)
                 if ending or self.iteration % cfg.log_interval == 0:
                     times, seconds = watch.read(), pace.lap(self.iteration)
                     self.figures = self._read(times, seconds)
                     log.log(self.iteration, self.figures, self._left(seconds))
                 elif self.iteration == first:  # its time tells nothing of the others
                     watch.read(), pace.lap(self.iteration)
-                if ending or self._saves(self.iteration):
+                if ending or self.iteration % cfg.save_interval == 0:
                     self._save(log, ending, stop)
         return TrainResult(self.folder, self.iteration, time.perf_counter() - start, self.figures)
-
-    def _saves(self, iteration: int) -> bool:
-        """Return whether it is known beforehand that an iteration ends with a checkpoint."""
-        return iteration % self.cfg.save_interval == 0 or iteration >= self.cfg.iterations
 
     def _log(self) -> TrainingLog | _Silent:
         if self.rank.index != 0:
