@@ -27,7 +27,8 @@ from jumper_warp.evaluation.log import EvaluationLog
 from jumper_warp.evaluation.plots import drawn
 from jumper_warp.evaluation.run import EvaluationArgs, Run, conditions_of
 from jumper_warp.policies.policy import Policy
-from jumper_warp.policies.restore import open_policy, restored_task
+from jumper_warp.policies.restore import restored_task
+from jumper_warp.policies.runs import open_policy
 from jumper_warp.policies.spec import PolicyError
 from jumper_warp.registry import make_task
 from jumper_warp.tasks.switching import flight_skills

@@ -26,7 +26,7 @@ from jumper_warp.evaluation.log import mean, termination_names, within
 from jumper_warp.evaluation.places import landing_metrics, random_headings, trained_range
 from jumper_warp.evaluation.plots import draw_sweep, drawn
 from jumper_warp.evaluation.run import EvaluationArgs, EvaluationRun
-from jumper_warp.policies.restore import Conditions
+from jumper_warp.policies.conditions import Conditions
 from jumper_warp.utils.errors import InputError
 
 LOWER, UPPER = 0.3, 1.5

@@ -16,8 +16,9 @@ from rich.table import Table
 from jumper_warp.evaluation.film import Film
 from jumper_warp.evaluation.log import EvaluationLog, run_evaluation
 from jumper_warp.evaluation.run import EvaluationRun
+from jumper_warp.policies.conditions import Conditions
 from jumper_warp.policies.folder import add_files, find_policy
-from jumper_warp.policies.restore import Conditions, is_run
+from jumper_warp.policies.runs import is_run
 from jumper_warp.policies.spec import PolicyError
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.output import write_metrics

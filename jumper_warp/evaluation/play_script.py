@@ -18,7 +18,7 @@ from jumper_warp.evaluation.log import run_evaluation
 from jumper_warp.evaluation.plots import drawn
 from jumper_warp.evaluation.scripts import read_script
 from jumper_warp.evaluation.skills import SkillRun
-from jumper_warp.policies.restore import Conditions
+from jumper_warp.policies.conditions import Conditions
 from jumper_warp.policies.skills import SkillNames
 from jumper_warp.utils.output import write_metrics
 

@@ -9,7 +9,7 @@ import torch
 from experiments.vertical_jump_sweep import OPEN_LOOP_APEX, for_sweep
 from jump_helpers import make_env
 from jumper_warp.evaluation.jumps import jump_commands
-from jumper_warp.policies.restore import Conditions
+from jumper_warp.policies.conditions import Conditions
 from jumper_warp.registry import make_task
 from jumper_warp.robot.motors import vertical_jump_filter
 from jumper_warp.sim.simulation import Simulation

@@ -21,8 +21,8 @@ from jumper_warp.evaluation.landings import ENDS, Landings, beside
 from jumper_warp.evaluation.log import run_evaluation, termination_names
 from jumper_warp.evaluation.plots import Track
 from jumper_warp.evaluation.run import EvaluationArgs, EvaluationRun, shown
+from jumper_warp.policies.conditions import Conditions, env_of_policy
 from jumper_warp.policies.folder import save_policy
-from jumper_warp.policies.restore import Conditions, env_of_policy
 from jumper_warp.policies.spec import PolicyError
 from jumper_warp.utils.errors import InputError
 from landing_helpers import still_policy
