@@ -12,6 +12,8 @@ from jumper_warp.utils.threads import checked_threads
 
 ACTIVATIONS = ("elu", "relu", "tanh")
 """Names of activations."""
+LATEST, LATEST_OR_NEW = "latest", "latest-or-new"
+"""Values of `TrainCfg.resume` that name no path."""
 
 
 @dataclass(frozen=True)
@@ -171,15 +173,16 @@ class TrainCfg:
     best_by: str = "Metrics/success"
     """The logged figure that makes a checkpoint the best; higher is better."""
     resume: str | None = None
-    """A checkpoint, a run's folder, or `latest` for the task's latest run. `jumper train` goes on with the settings of
-    that run, and flags change them. Not kept are device, threads, log_root, tensorboard and wandb."""
+    """A checkpoint, a run's folder, `latest` for the task's latest run with a checkpoint, or `latest-or-new`, which
+    begins a new run if there is none. `jumper train` resumes with the settings of that run; flags override them. Not
+    saved are device, threads, log_root, tensorboard and wandb."""
     start_from: str | None = None
     """A policy's name or folder, a run's folder (its best checkpoint) or a checkpoint: a new training begins with that
     policy's actor, its weights and its statistics of observations. The critic, the optimiser and the noise are new."""
     trainer: Literal["ppo", "shac", "rsl-rl"] = "ppo"
     """This package's PPO; SHAC, which learns by gradients through the physics; or rsl-rl-lib's PPO for comparison."""
     tensorboard: bool = True
-    """Write TensorBoard events, if TensorBoard is installed."""
+    """Write TensorBoard events."""
     wandb: bool = False
     """Upload to Weights & Biases."""
     ppo: PpoCfg = field(default_factory=PpoCfg)
@@ -200,7 +203,7 @@ class TrainCfg:
             raise InputError("resume is not offered with trainer rsl-rl")
         if self.trainer == "rsl-rl" and self.start_from:
             raise InputError("start_from is not offered with trainer rsl-rl")
-        if self.resume and self.start_from:
+        if self.resume and self.resume != LATEST_OR_NEW and self.start_from:
             raise InputError("give resume, which goes on with a training, or start_from, which begins one, not both")
         if self.trainer != "ppo" and self.ppo.symmetry != "off":
             raise InputError(f"symmetry is not offered with trainer {self.trainer}")

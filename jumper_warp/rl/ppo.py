@@ -6,6 +6,7 @@ Nothing between the first action and the last optimiser step waits for the host.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -23,8 +24,9 @@ from jumper_warp.rl.mirror import symmetry_of
 from jumper_warp.rl.networks import ActorCritic
 from jumper_warp.rl.rollout import Collector
 from jumper_warp.rl.samples import Batch, Sampler
-from jumper_warp.rl.state_checks import check_ppo
 from jumper_warp.utils.allocator import keep_freed_memory
+from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.state_checks import check_parts, check_tensor, check_values
 
 STATISTICS = ("surrogate", "value", "entropy", "asymmetry", "kl", "gradient_actor", "gradient_critic", "skipped")
 """What `Ppo.statistics` averages over minibatches; skipped is the share of steps with a non-finite gradient,
@@ -189,11 +191,35 @@ class Ppo:
         Raises:
             ValueError: A part is missing, unknown, of another shape or type, or not finite; nothing is changed.
         """
-        check_ppo(state, self.model.state_dict(), self.flat.params, self.lr, self.collector.episode)
+        self._check(state)
         self.model.load_state_dict(state["model"])
         self.optimiser.load_state_dict(state["optimiser"])
         self.lr.copy_(state["lr"])
         self.collector.episode.copy_(state["episode"])
+
+    def _check(self, state: Any) -> None:
+        """Raise InputError unless `load_state_dict` can take up a state: finite parts of the right shapes and types."""
+        check_parts(state, ("model", "optimiser", "lr", "episode"), "ppo")
+        model = self.model.state_dict()
+        check_parts(state["model"], model, "ppo.model")
+        for name, like in model.items():
+            found, where = state["model"][name], f"ppo.model.{name}"
+            check_tensor(found, like, where)
+            if name.startswith("mirror_") and not torch.equal(found, like.to(found.device)):
+                raise InputError(f"{where} is of another observation or action")
+            check_values(found, where, 0.0 if name.endswith((".var", ".count")) else -math.inf)
+        check_parts(state["optimiser"], range(len(self.flat.params)), "ppo.optimiser")
+        for index, param in enumerate(self.flat.params):
+            found, where = state["optimiser"][index], f"ppo.optimiser.{index}"
+            check_parts(found, ("step", "exp_avg", "exp_avg_sq"), where)
+            moments = (("step", self.lr, 0.0), ("exp_avg", param, -math.inf), ("exp_avg_sq", param, 0.0))
+            for name, like, least in moments:
+                check_tensor(found[name], like, f"{where}.{name}")
+                check_values(found[name], f"{where}.{name}", least)
+        check_tensor(state["lr"], self.lr, "ppo.lr")
+        check_values(state["lr"], "ppo.lr", 0.0)
+        check_tensor(state["episode"], self.collector.episode, "ppo.episode", (torch.float32,))  # of earlier versions
+        check_values(state["episode"], "ppo.episode")
 
     def close(self) -> None:
         """Drop all graphs; needed before the group of processes ends."""
