@@ -19,9 +19,7 @@ from rich.console import Console
 from rich.table import Table
 
 from jumper_warp.cli.main import run_command
-from jumper_warp.evaluation.heights import reached
-from jumper_warp.evaluation.jumps import Jumps
-from jumper_warp.evaluation.log import run_evaluation, termination_names
+from jumper_warp.evaluation.heights import run_jumps
 from jumper_warp.evaluation.plots import drawn
 from jumper_warp.identification.findings import Identification
 from jumper_warp.identification.parameters import jumper_parameters
@@ -83,9 +81,8 @@ def policy_errors(args: Args, case: Case, found: Identification, folder: Path) -
         conditions = Conditions(device="cpu", robot=None if robot is None else folder / robot)
         env = env_of_policy(policy, args.jumps, conditions)
         policy.to(env.device)
-        log = Jumps(np.linspace(0.5, 1.0, args.jumps), termination_names(env.task))
-        run_evaluation(policy.act, env, log)
-        apexes[name] = (log.apex.copy(), log.target, reached(log))
+        log = run_jumps(policy.act, env, np.linspace(0.5, 1.0, args.jumps))
+        apexes[name] = (log.apex, log.commanded, log.reached)
     true, target, _ = apexes["true"]
     figures = {"policy_error_on_true_m": float(np.mean(np.abs(true - target)))}
     for name in ("described", "identified"):

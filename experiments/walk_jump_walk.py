@@ -24,9 +24,8 @@ from jumper_warp.evaluation.course_metrics import course_metrics, draw_course
 from jumper_warp.evaluation.courses import Course
 from jumper_warp.evaluation.places import random_headings
 from jumper_warp.evaluation.plots import drawn
-from jumper_warp.evaluation.run import EvaluationArgs
+from jumper_warp.evaluation.run import EvaluationArgs, SkillRun
 from jumper_warp.evaluation.scripts import ScriptStep
-from jumper_warp.evaluation.skills import SkillRun
 from jumper_warp.policies.skills import SkillNames
 from jumper_warp.utils.errors import InputError
 

@@ -14,8 +14,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from jumper_warp.evaluation.angles import yaw_of
-from jumper_warp.evaluation.jumps import DELAY, jump_commands
+from jumper_warp.evaluation.jumps import DELAY, jump_commands, yaw_of
 from jumper_warp.evaluation.log import NO_END, EvaluationLog, Metrics, failures, finite, largest, mean
 from jumper_warp.tasks.switching import FALLS_FROM_FLIGHT
 from support.momentum import momentum

@@ -8,15 +8,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from jumper_warp.evaluation.limits import EXTEND, HOLD, RAMP
 from jumper_warp.robot.model import LEGS, MOTOR_JOINTS
 from jumper_warp.sim.simulation import Simulation, motor_values
 
 if TYPE_CHECKING:
     from jumper_warp.viz.recorder import Recorder
 
-STAND, RAMP, HOLD, EXTEND, LAND = 60, 25, 50, 40, 60
-"""Ticks of 1/60 s: default pose, ramp into the squat, squat, full extension, default pose again."""
-
+STAND, LAND = 60, 60
+"""Ticks of 1/60 s in the default pose, before and after the jump."""
 
 SQUAT = 135.0
 """[deg] Transversal angle commanded for the squat; the filter holds it back."""

@@ -15,8 +15,8 @@ import numpy as np
 
 from jumper_warp.envs.env import Env
 from jumper_warp.evaluation.jumps import jump_commands
-from jumper_warp.evaluation.landings import ENDS, Landings
 from jumper_warp.evaluation.log import termination_names
+from jumper_warp.evaluation.places import ENDS, PlaceLog
 from jumper_warp.evaluation.run import EvaluationRun
 from jumper_warp.registry import make_task
 from jumper_warp.tasks.cfg import TaskCfg
@@ -148,17 +148,17 @@ def fly_best(
     return fly(env, actions_of(np.tile(best, (env.num_envs, 1))), after, goals=goals, to_rest=True)
 
 
-def fly_policy(run: EvaluationRun) -> tuple[Takeoffs, Landings, np.ndarray]:
+def fly_policy(run: EvaluationRun) -> tuple[Takeoffs, PlaceLog, np.ndarray]:
     """Let the policy jump to POLICY_GOALS; return the jumps, and its actions up to takeoff for SEED_GOAL (steps, 4)."""
     env, seed = run.env(len(POLICY_GOALS)), POLICY_GOALS.index(SEED_GOAL)
     env.evaluation_reset(jump_commands(np.zeros((env.num_envs, 3)), 0.0, env.step_dt))
     takeoffs, actions = Takeoffs(env), []
 
-    def watch(_: Landings) -> None:
+    def watch(_: PlaceLog) -> None:
         if not takeoffs.off[seed]:
             actions.append(mean_of_sides(env.action[seed].cpu().numpy())[0])
         takeoffs.look()
 
     goals = np.outer(POLICY_GOALS, [1.0, 0.0])[:, None]
-    landings = run.follow(env, Landings(goals, termination_names(env.task)), watch=watch)
+    landings = run.follow(env, PlaceLog(goals, termination_names(env.task)), watch=watch)
     return takeoffs, landings, np.array(actions)

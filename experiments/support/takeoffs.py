@@ -17,9 +17,8 @@ import warp as wp
 from scipy.spatial.transform import Rotation
 
 from jumper_warp.envs.env import Env
-from jumper_warp.evaluation.film import ankles
+from jumper_warp.evaluation.film import Links, ankles
 from jumper_warp.evaluation.jumps import LANDED, jump_commands
-from jumper_warp.evaluation.links import Links
 from jumper_warp.evaluation.log import success_index, termination_names
 from jumper_warp.kernels.kinematics import geometry
 from jumper_warp.kernels.kinematics import inverse as inverse_kinematics

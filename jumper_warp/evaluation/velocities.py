@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 import tyro
 
-from jumper_warp.evaluation.film import Film, Strip
-from jumper_warp.evaluation.landings import PICTURE, beside
+from jumper_warp.evaluation.film import PICTURE, Film, Strip, beside
 from jumper_warp.evaluation.log import EvaluationEnv, EvaluationLog, Metrics, finite
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.utils.errors import InputError
@@ -310,7 +309,6 @@ class VelocityGoals:
     """[s] From command to command."""
 
     count = 1
-    spacing = Walks.spacing
 
     def __post_init__(self) -> None:
         """Raises InputError: a setting is out of range."""
@@ -325,11 +323,6 @@ class VelocityGoals:
     def seconds(self) -> float:
         """[s] Length of the recording."""
         return self.each * len(self.velocities)
-
-    @property
-    def notes(self) -> dict[str, Any]:
-        """What to save with the recording."""
-        return {"velocities_m_s_rad_s": self.velocities}
 
     def log(self, task: TaskCfg) -> Walks:
         """Return one robot's walk."""
