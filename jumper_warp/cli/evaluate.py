@@ -39,22 +39,23 @@ def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> None:
     from jumper_warp.evaluation.commands import EvaluateCfg, evaluate
 
     opened = open_run(policy, modules)
-    if args[1:2] == [SUITE]:
-        run_suite(opened, args[2:])
+    if SUITE in args:
+        run_suite(opened, args)
         return
     evaluate(opened, parse("evaluate", opened, args[1:], EvaluateCfg, lambda kind: kind.flags))
 
 
 def run_suite(opened: EvaluationRun, args: Sequence[str]) -> None:
-    """Run the suite that comes first in the arguments. Raises UsageError: the policy's task has none of that name."""
+    """Run the suite that the arguments name. Raises UsageError: the policy's task has none of that name."""
     from jumper_warp.evaluation.suites import suites_for
 
-    suites, name = suites_for(opened.task.evaluation), next(iter(args), "")
+    flag = args.index(SUITE)
+    suites, name = suites_for(opened.task.evaluation), "".join(args[flag + 1 : flag + 2])
     if name not in suites:
         there = ", ".join(suites) or "none"
         raise UsageError(f"no suite {name!r:.60} for policies of {opened.task.name}; there are {there}")
     command, default = f"evaluate {opened.source} {SUITE} {name}", suites[name](policy=str(opened.source))
-    parse_flags(suites[name], command, args[1:], default=default).run(opened.modules)
+    parse_flags(suites[name], command, [*args[1:flag], *args[flag + 2 :]], default=default).run(opened.modules)
 
 
 def policy_of(command: str, about: str, args: Sequence[str]) -> str:
