@@ -19,8 +19,7 @@ import numpy as np
 import tyro
 
 from jumper_warp.cli.main import run_command
-from jumper_warp.evaluation.course_metrics import course_metrics, draw_course
-from jumper_warp.evaluation.courses import Course
+from jumper_warp.evaluation.courses import Course, course_metrics, draw_course
 from jumper_warp.evaluation.places import random_headings
 from jumper_warp.evaluation.plots import drawn
 from jumper_warp.evaluation.run import EvaluationArgs, SkillRun

@@ -13,8 +13,7 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
-from jumper_warp.evaluation.course_metrics import course_metrics, draw_course
-from jumper_warp.evaluation.courses import Course
+from jumper_warp.evaluation.courses import Course, course_metrics, draw_course
 from jumper_warp.evaluation.film import Film
 from jumper_warp.evaluation.log import EvaluationLog, run_evaluation
 from jumper_warp.evaluation.plots import drawn

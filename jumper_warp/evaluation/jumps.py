@@ -7,7 +7,6 @@ from collections.abc import Sequence
 import numpy as np
 
 from jumper_warp.evaluation.log import CAME_APART, NO_END, EvaluationEnv, EvaluationLog, success_index
-from jumper_warp.evaluation.paws import Paws, hopped, paw_arrays, stepped
 from jumper_warp.utils.errors import InputError
 
 STANCE, LANDED = 0, 2
@@ -20,8 +19,21 @@ DELAY = 0.5
 """[s] Until the first jump is commanded."""
 SOON = 0.3
 """[s] After touchdown, when the base's place is recorded as well."""
+HOP_TIME = 0.05
+"""[s] A robot that is off the ground for longer after touchdown has jumped again; one that lifts a paw, which had come
+down, for as long has stepped."""
+TAKEOFF_SPEED = 0.25
+"""[m/s] Upward speed of the base, with no paw down, of a second takeoff (authors' configuration)."""
+TIME_EPS = 1.0e-6
+"""[s] Rounding of sums of steps."""
 NOT_BEGUN = "not_begun"
 """Outcome of a jump that was due after one that failed."""
+
+
+def paw_arrays(env: EvaluationEnv) -> dict[str, np.ndarray]:
+    """Return which paws are on the ground, (num_envs, 4), and the base's upward speed [m/s]."""
+    force = np.linalg.norm(env.sim.paw_force.numpy(), axis=2)
+    return {"paws_down": (force > env.task.contact_force).T, "up": env.sim.base_velocity()[:, 2]}
 
 
 def jump_commands(goals: np.ndarray, delay: np.ndarray | float, step_dt: float) -> np.ndarray:
@@ -84,7 +96,9 @@ class JumpLog(EvaluationLog):
         self.heading, self.yaw, self.drift, self.apex, self.tilt = (np.full(shape, np.nan) for _ in range(5))
         self.rest_speed, self.early = np.full(shape, np.inf), np.zeros(shape, dtype=bool)
         self.air_time, self.lift_time = np.zeros(shape), np.zeros(shape)
-        self.takeoffs, self._paws = np.zeros(shape, dtype=int), Paws(shape[0])
+        self.takeoffs = np.zeros(shape, dtype=int)
+        self._aloft, self._lifted = np.zeros(shape[0]), np.zeros((shape[0], 4))
+        self._came_down, self._flies = np.zeros((shape[0], 4), dtype=bool), np.zeros(shape[0], dtype=bool)
         self._success = success_index(terminations)
 
     @property
@@ -150,10 +164,16 @@ class JumpLog(EvaluationLog):
         ):
             due = landed & moment
             kept[row[due], number[due]] = values[due]
-        lifted = self._paws.update(row, landed, now["paws_down"], now["up"], step_dt)
-        self.air_time[at] = np.maximum(self.air_time[at], lifted.aloft)
-        self.lift_time[at] = np.maximum(self.lift_time[at], lifted.paw)
-        self.takeoffs[at] += lifted.takeoff
+        down = landed[:, None] & now["paws_down"]
+        aloft = landed & ~down.any(axis=1)
+        self._aloft[row] = np.where(aloft, self._aloft[row] + step_dt, 0.0)
+        self._came_down[row] = landed[:, None] & (self._came_down[row] | down)
+        self._lifted[row] = np.where(self._came_down[row] & ~down, self._lifted[row] + step_dt, 0.0)
+        flies = aloft & (self._flies[row] | (now["up"] > TAKEOFF_SPEED))
+        self.takeoffs[at] += flies & ~self._flies[row]
+        self._flies[row] = flies
+        self.air_time[at] = np.maximum(self.air_time[at], self._aloft[row])
+        self.lift_time[at] = np.maximum(self.lift_time[at], self._lifted[row].max(axis=1))
 
     @property
     def ends(self) -> np.ndarray:
@@ -174,12 +194,12 @@ class JumpLog(EvaluationLog):
     @property
     def hopped(self) -> np.ndarray:
         """Whether the robot jumped again after touchdown."""
-        return hopped(self.air_time)
+        return self.air_time > HOP_TIME + TIME_EPS
 
     @property
     def stepped(self) -> np.ndarray:
-        """Whether any paw that had come down was off the ground again for `jumper_warp.evaluation.paws.HOP_TIME`."""
-        return stepped(self.lift_time)
+        """Whether any paw that had come down was off the ground again for HOP_TIME or longer."""
+        return self.lift_time > HOP_TIME - TIME_EPS
 
     @property
     def still(self) -> np.ndarray:

@@ -16,7 +16,7 @@ import tyro
 
 from jumper_warp.evaluation.film import PICTURE, Film, Strip, beside, moments
 from jumper_warp.evaluation.heights import MAX_ROBOTS
-from jumper_warp.evaluation.jumps import DELAY, NOT_BEGUN, REST_SPEED, REST_TIME, JumpLog, check_jumps
+from jumper_warp.evaluation.jumps import DELAY, NOT_BEGUN, REST_SPEED, REST_TIME, TAKEOFF_SPEED, JumpLog, check_jumps
 from jumper_warp.evaluation.log import (
     CAME_APART,
     COLLIDED,
@@ -30,7 +30,6 @@ from jumper_warp.evaluation.log import (
     with_ends,
     within,
 )
-from jumper_warp.evaluation.paws import TAKEOFF_SPEED
 from jumper_warp.kernels.jump import terminations
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.tasks.terms import TerminationTerm

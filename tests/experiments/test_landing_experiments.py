@@ -10,13 +10,12 @@ import pytest
 import torch
 
 from experiments import paper_tests
-from jumper_warp.evaluation.distances import Farthest, distance_metrics
 from jumper_warp.evaluation.film import beside
 from jumper_warp.evaluation.log import run_evaluation, termination_names
 from jumper_warp.evaluation.places import ENDS, PlaceLog
 from jumper_warp.evaluation.plots import Track
 from jumper_warp.evaluation.run import EvaluationArgs, EvaluationRun, shown
-from jumper_warp.evaluation.suites import Consecutive, Grid, Platform, consecutive_metrics
+from jumper_warp.evaluation.suites import Consecutive, Farthest, Grid, Platform, consecutive_metrics, distance_metrics
 from jumper_warp.evaluation.sweeps import DistanceSweep
 from jumper_warp.policies.folder import save_policy
 from jumper_warp.policies.restore import Conditions, env_of_policy
