@@ -23,10 +23,10 @@ from jumper_warp.evaluation.heights import run_jumps
 from jumper_warp.evaluation.plots import drawn
 from jumper_warp.identification.findings import Identification
 from jumper_warp.identification.parameters import jumper_parameters
-from jumper_warp.identification.plans import KINDS, Plan
-from jumper_warp.identification.recording import replay_plan, simulate_plan
+from jumper_warp.identification.recording import KINDS, Plan, replay_plan, simulate_plan
 from jumper_warp.identification.replay import Record, Replay
-from jumper_warp.policies.restore import Conditions, env_of_policy, open_policy
+from jumper_warp.policies.conditions import Conditions, env_of_policy
+from jumper_warp.policies.runs import open_policy
 from jumper_warp.robot.overlay import overlay_of
 from jumper_warp.robot.values import RobotValues
 from jumper_warp.utils.errors import InputError
@@ -96,8 +96,8 @@ def main(args: Args) -> dict[str, Any]:
     announce("cpu", args.threads)
     folder = output_dir("identification", args.out)
     parameters = jumper_parameters()
-    replay = Replay(len(parameters) + 37, device="cpu", threads=args.threads)
-    replay_one = Replay(1, device="cpu", threads=1)
+    replay = Replay(device="cpu", threads=args.threads)
+    replay_one = Replay(device="cpu", threads=1)
 
     def ours(plan: Plan, robots: RobotValues) -> Record:
         return replay_plan(replay_one, plan, robots)

@@ -19,11 +19,10 @@ import jumper_warp
 from jumper_warp.cli.main import main
 from jumper_warp.policies.folder import list_policies, load_policy
 from jumper_warp.robot.description import load_description
-from jumper_warp.tasks.jump.references import load_reference
 
 print(jumper_warp.__file__)
 main(["list"])
-load_description(), load_reference("farthest")
+load_description()
 for name in list_policies():
     load_policy(name)  # checks every file
 """

@@ -19,7 +19,8 @@ from jumper_warp.evaluation.jumps import DELAY, jump_commands, yaw_of
 from jumper_warp.evaluation.log import NO_END, EvaluationLog, Metrics, failures, finite, largest, mean
 from jumper_warp.evaluation.run import HEIGHTS, EvaluationArgs, Run, conditions_of
 from jumper_warp.policies.policy import Policy
-from jumper_warp.policies.restore import open_policy, restored_task
+from jumper_warp.policies.restore import restored_task
+from jumper_warp.policies.runs import open_policy
 from jumper_warp.policies.spec import PolicyError
 from jumper_warp.registry import make_task
 from jumper_warp.tasks.switching import FALLS_FROM_FLIGHT, flight_skills

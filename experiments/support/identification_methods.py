@@ -7,11 +7,12 @@ import time
 import numpy as np
 from scipy.optimize import least_squares
 
-from jumper_warp.identification.evolution import identify_by_evolution
+from jumper_warp.identification.identify import identify_by_evolution
 from jumper_warp.identification.least_squares import LeastSquares, Point
+from jumper_warp.identification.motions import NoiseLevels
 from jumper_warp.identification.parameters import ParameterSet
 from jumper_warp.identification.replay import Replay
-from jumper_warp.identification.residuals import MotionResiduals, NoiseLevels
+from jumper_warp.identification.residuals import MotionResiduals
 from support.known_robots import Carry, Case, prediction_errors
 
 

@@ -13,8 +13,7 @@ from jumper_warp.identification.identify import identify, total_mass, weighed
 from jumper_warp.identification.least_squares import Knowledge
 from jumper_warp.identification.motions import Motion
 from jumper_warp.identification.parameters import ParameterSet
-from jumper_warp.identification.plans import KINDS, Plan, draw_plan
-from jumper_warp.identification.recording import measured, replay_plan
+from jumper_warp.identification.recording import KINDS, Plan, draw_plan, measured, replay_plan
 from jumper_warp.identification.replay import Record, Replay
 from jumper_warp.robot.values import RobotValues
 

@@ -131,11 +131,25 @@ def time_stages(envs: int, device: str | None, repeats: int) -> dict[str, float]
     return parts
 
 
+def time_parts(envs: Sequence[int], train_envs: int, steps: int, repeats: int, device: str | None) -> dict[str, float]:
+    """Return metrics of solver and environment by number of environments, and of the parts of a policy step."""
+    values: dict[str, float] = {}
+    for n in sorted({*envs, train_envs}):
+        bodies = standing_solver(n, device), stepping_env(n, device)[1]
+        solver, step = (median_time(body, device, steps, repeats) for body in bodies)
+        values |= {f"solver_steps_per_s_{n}": n / solver, f"env_steps_per_s_{n}": n / step}
+        if n == train_envs:
+            values["env_step_us"] = 1e6 * step
+    parts = time_stages(train_envs, device, repeats)
+    values |= {f"{part}_us": 1e6 * wall for part, wall in parts.items()}
+    return values | {f"{part}_share": wall / sum(parts.values()) for part, wall in parts.items()}
+
+
 def time_ppo(envs: int, cfg: PpoCfg, iterations: int, device: str | None) -> dict[str, float]:
     """Return figures of training with this package's PPO; the policy must have changed and stayed finite.
 
-    `ppo_device_memory_gib`: in use on a GPU, by whatever. With overlap, `ppo_update_s` is what the update takes longer
-    than the rollout beside it. `ppo_ready_s`: compilation and the first iterations, until all graphs are captured.
+    `ppo_device_memory_gib`: in use on a GPU, by whatever. `ppo_ready_s`: compilation and the first iterations, until
+    all graphs are captured.
     """
     env, _ = stepping_env(envs, device)
     begin = time.perf_counter()

@@ -12,6 +12,7 @@ from jumper_warp.policies.restore import restored_task
 from jumper_warp.rl.checkpoint import DAMAGE, CheckpointError, one_line
 from jumper_warp.rl.resume import SESSION, find_checkpoint
 from jumper_warp.robot.overlay import RobotOverlay
+from jumper_warp.tasks.saving import TaskError, check_version
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -32,7 +33,7 @@ def with_run(default: TrainArgs, cfg: TrainCfg) -> tuple[TrainArgs, TaskCfg]:
     default: For what the run does not tell, and for what is of the session, see SESSION.
 
     Raises:
-        InputError: There is no such run, it is of another task or of version 1, or its settings cannot be used.
+        InputError: There is no such run, it is of another task or version, or its settings cannot be used.
     """
     path, saved = saved_config(cfg)
     try:
@@ -54,16 +55,17 @@ def saved_config(cfg: TrainCfg) -> tuple[Path, dict[str, Any]]:
     """Return the checkpoint that is resumed and its configuration.
 
     Raises:
-        CheckpointError: There is none, or it is of another task or of a run from before tasks had a version.
+        CheckpointError: There is none, or it is of another task or version.
     """
     path, state, _ = find_checkpoint(cfg)
     try:
         saved = json.loads(state["config"])
-        name, older = saved["train"]["task"], "version" not in saved["env"]["task"]
+        name = saved["train"]["task"]
+        check_version(saved["env"]["task"])
+    except TaskError as error:
+        raise CheckpointError(f"{path}: {error}") from error
     except (KeyError, TypeError, ValueError) as error:
         raise CheckpointError(f"{path}: no task in its configuration ({type(error).__name__}: {error})") from error
-    if older:
-        raise CheckpointError(f"{path}: of a run of version 1, which can be exported and played but not resumed")
     if name != cfg.task:
         raise CheckpointError(f"{path}: of a run of {name!s:.60}, not of {cfg.task}")
     return path, saved

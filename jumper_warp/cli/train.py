@@ -191,7 +191,7 @@ def check_symmetry(task: TaskCfg, cfg: TrainCfg) -> None:
 def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> TrainResult:
     """Train as the arguments say; modules: that the user has named, whose tasks are registered by now.
 
-    Raises as `parse_train`, `jumper_warp.policies.start.start_from` and `jumper_warp.rl.runner.train`.
+    Raises as `parse_train`, `jumper_warp.policies.warm_start.start_from` and `jumper_warp.rl.runner.train`.
     """
     parsed, task = parse_train(args)
     from jumper_warp.rl.runner import train
@@ -201,7 +201,7 @@ def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> TrainResult:
     check_symmetry(task, parsed.cfg)
     start = None
     if parsed.cfg.start_from:
-        from jumper_warp.policies.start import start_from
+        from jumper_warp.policies.warm_start import start_from
 
         start = start_from(parsed.cfg.start_from, task, parsed.cfg.ppo)
     first = os.environ.get("RANK", "0") == "0"

@@ -24,7 +24,7 @@ from jumper_warp.evaluation.places import (
 )
 from jumper_warp.evaluation.plots import draw_sweep, drawn
 from jumper_warp.evaluation.run import HEIGHTS, PLACES, EvaluationArgs, EvaluationRun
-from jumper_warp.policies.restore import Conditions
+from jumper_warp.policies.conditions import Conditions
 from jumper_warp.utils.errors import InputError
 
 HEIGHTS_IN_RANGE, DISTANCES_IN_RANGE = (0.5, 1.1), (0.3, 1.4)

@@ -13,8 +13,6 @@ from jumper_warp.utils.errors import InputError
 
 ACTIVATION_MODULES = {"elu": nn.ELU, "relu": nn.ReLU, "tanh": nn.Tanh}
 
-DTYPES = (torch.float16, torch.bfloat16, torch.float32, torch.float64)
-"""Of weights that can be read; they are computed with in single precision."""
 LARGEST = 1.0e38
 """Below the largest number of single precision."""
 
@@ -126,8 +124,6 @@ def check_tensors(tensors: Mapping[str, torch.Tensor], interface: PolicyInterfac
         tensor = tensors[name]
         if tuple(tensor.shape) != shape:
             raise PolicyError(f"its configuration asks for {name} of shape {shape}, it has {tuple(tensor.shape)}")
-        if tensor.dtype not in DTYPES:
-            raise PolicyError(f"{name} must hold floating-point numbers of 16, 32 or 64 bits, found {tensor.dtype}")
         if not tensor.isfinite().all():
             raise PolicyError(f"{name} is not finite")
     if not (tensors["normaliser.std"] > 0.0).all():

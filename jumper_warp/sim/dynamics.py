@@ -24,7 +24,7 @@ KERNEL_MODULES = (
     "dynamics.adjoint.contact_adjoint", "dynamics.adjoint.differentiable", "dynamics.adjoint.gradients",
     "dynamics.adjoint.leg_record", "dynamics.adjoint.rollout_adjoint", "dynamics.adjoint.rollout_legs_adjoint",
     "dynamics.adjoint.step_adjoint", "dynamics.contact", "dynamics.drive", "dynamics.legs.advance_legs",
-    "dynamics.legs.rollout_legs", "dynamics.momentum", "dynamics.parameters", "dynamics.step",
+    "dynamics.legs.rollout_legs", "dynamics.momentum", "dynamics.parameters", "dynamics.step", "dynamics.trajectory",
     "dynamics.world.advance", "dynamics.world.rollout", "kinematics.full_state", "kinematics.geometry",
     "layout", "scalar", "state", "terrain.ground",
 )  # fmt: skip

@@ -10,8 +10,8 @@ from jump_helpers import edit_coordinates, edit_episodes, ending_names, make_env
 from jumper_warp.evaluation import heights, places
 from jumper_warp.evaluation.run import EvaluationArgs, EvaluationRun, latency_metrics, latency_text
 from jumper_warp.kernels.jump.state import LANDED
+from jumper_warp.policies.conditions import Conditions
 from jumper_warp.policies.folder import save_policy
-from jumper_warp.policies.restore import Conditions
 from jumper_warp.registry import make_task
 from jumper_warp.tasks.randomization import PUSH_INTERVAL, PUSH_SHARE, RandomizationCfg
 from landing_helpers import still_policy

@@ -20,7 +20,7 @@ from experiments import (
 from jumper_warp.evaluation.heights import HeightLog, for_sweep, run_jumps, sweep_metrics
 from jumper_warp.evaluation.limits import limit_metrics
 from jumper_warp.evaluation.sweeps import HEIGHTS_IN_RANGE, HeightSweep
-from jumper_warp.policies.restore import Conditions, env_of_policy
+from jumper_warp.policies.conditions import Conditions, env_of_policy
 from jumper_warp.registry import make_task
 from jumper_warp.rl.cfg import PpoCfg
 from jumper_warp.tasks.saving import plain
@@ -220,13 +220,12 @@ def test_ablations_write_a_curve_per_variant(tmp_path):
 
 
 def test_learning_curves_tell_when_each_training_was_good_enough(tmp_path, monkeypatch):
-    def in_process(args, name, seed, path):
+    def train(args, name, seed):
         if seed == 1:
-            return {"ready": 3.0, "seconds": [2.0, 4.0, 6.0], "steps": [10, 20, 30], "success": [0.5, 0.96, 0.9]}
-        learning_curves.main(replace(args, seeds=(seed,), variants=(name,), one=path))
-        return json.loads(path.read_text())
+            return Curve([2.0, 4.0, 6.0], [0.5, 0.96, 0.9], [10, 20, 30], ready=3.0)
+        return learning_curves.train(args, name, seed)
 
-    monkeypatch.setattr(learning_curves, "in_process", in_process)
+    monkeypatch.setattr(learning_curves, "train_in_process", train)
     args = learning_curves.Args(
         seconds=0.3, every=0.2, seeds=(0, 1), variants=("eager_float32",), envs=8, jumps=2, history=1,
         heights=(0.5, 0.9), out=tmp_path, device="cpu",
@@ -252,10 +251,10 @@ def test_learning_curves_tell_when_each_training_was_good_enough(tmp_path, monke
 def test_benchmark_reports_solver_environment_and_both_trainers(tmp_path):
     args = benchmark_training.Args(
         envs=(8,), train_envs=16, steps=4, repeats=1, iterations=1, num_steps=8, out=tmp_path, device="cpu",
-        variants=("eager_bfloat16_overlap",),
+        variants=("eager_bfloat16",),
     )  # fmt: skip
     values = benchmark_training.main(args)
-    assert values["ppo_steps_per_s_eager_bfloat16_overlap"] > 0.0
+    assert values["ppo_steps_per_s_eager_bfloat16"] > 0.0
     assert values == json.loads((tmp_path / "metrics.json").read_text())
     rates = [values[f"{what}_steps_per_s_{n}"] for what in ("solver", "env") for n in (8, 16)]
     rates += [values["ppo_steps_per_s"], values["rsl_rl_steps_per_s"]]

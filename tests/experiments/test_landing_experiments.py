@@ -17,8 +17,8 @@ from jumper_warp.evaluation.plots import Track
 from jumper_warp.evaluation.run import EvaluationArgs, EvaluationRun, shown
 from jumper_warp.evaluation.suites import Consecutive, Farthest, Grid, Platform, consecutive_metrics, distance_metrics
 from jumper_warp.evaluation.sweeps import DistanceSweep
+from jumper_warp.policies.conditions import Conditions, env_of_policy
 from jumper_warp.policies.folder import save_policy
-from jumper_warp.policies.restore import Conditions, env_of_policy
 from jumper_warp.policies.spec import PolicyError
 from jumper_warp.utils.errors import InputError
 from landing_helpers import OPEN_LOOP_APEX, still_policy

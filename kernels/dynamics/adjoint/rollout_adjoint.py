@@ -14,7 +14,7 @@ from ..contact import PawContact
 from ..contact_laws import PawLaw
 from ..parameters import load_moments, load_spring, load_stops
 from ..step import LegParams, Robot, StepSettings, load_leg
-from ..world.rollout import (
+from ..trajectory import (
     Actuation,
     Commands,
     Rows,
@@ -252,7 +252,7 @@ def everything(
     factors: LegFactors, base: BaseFactors, base_seeds: BaseSeeds, robot: Robot, actuation: Actuation, numbers: Rows,
     state: BaseState, world: int,
 ) -> real:  # fmt: skip
-    """Return the sum of all functions whose gradients the reverse pass takes; see `adjoints_kernel`."""
+    """Return the sum of all functions whose gradients the reverse pass takes; see `generate_adjoints`."""
     params = load_leg(robot, world, 0)
     v = row_vec3(numbers.q, 0, 0, world)
     q = row_quat(numbers.q, 0, 3, world)
@@ -274,16 +274,24 @@ def everything(
     )
 
 
-@wp.kernel(enable_backward=True)
-def adjoints_kernel(
-    factors: LegFactors, base: BaseFactors, base_seeds: BaseSeeds, robot: Robot, actuation: Actuation, numbers: Rows,
-    state: BaseState, sums: wp.array(dtype=real),
-):  # fmt: skip
-    """Never launched: a kernel with a backward pass makes Warp generate the adjoints of all that it calls.
+def generate_adjoints(module: str) -> wp.Kernel:
+    """Make Warp generate, in a module of kernels, the adjoints of all functions that the reverse pass differentiates.
 
-    `wp.grad` alone leaves out those of functions which something else called first.
+    `wp.grad` alone leaves out those of functions which something else called first. A kernel with a backward pass has
+    them all; it is never launched.
     """
-    world = wp.tid()
-    launched = int(0)  # Warp makes the adjoints anyway, and the compiler drops this kernel's own code
-    if launched > 0:
-        sums[world] = everything(factors, base, base_seeds, robot, actuation, numbers, state, world)
+
+    @wp.kernel(enable_backward=True, module=wp.get_module(module))
+    def adjoints_kernel(
+        factors: LegFactors, base: BaseFactors, base_seeds: BaseSeeds, robot: Robot, actuation: Actuation,
+        numbers: Rows, state: BaseState, sums: wp.array(dtype=real),
+    ):  # fmt: skip
+        world = wp.tid()
+        launched = int(0)  # Warp makes the adjoints anyway, and the compiler drops this kernel's own code
+        if launched > 0:
+            sums[world] = everything(factors, base, base_seeds, robot, actuation, numbers, state, world)
+
+    return adjoints_kernel
+
+
+ADJOINTS = generate_adjoints(__name__)

@@ -24,7 +24,7 @@ from ..contact_laws import PawLaw, contact_at, contact_point, paw_law, solve_law
 from ..leg_dynamics import PawKinematics
 from ..parameters import load_moments, load_spring, load_stops, load_vec3
 from ..step import LegParams, Robot, base_system, hold_base, leg_terms
-from ..world.rollout import Rows, row_vec3, store_row_vec3
+from ..trajectory import Rows, row_vec3, store_row_vec3
 from .gradients import (
     add_com,
     add_entry,

@@ -1,0 +1,44 @@
+"""The time that a training takes to a success, in a process of its own."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+
+from jumper_warp.envs.env import Env
+from jumper_warp.rl.cfg import PpoCfg
+from jumper_warp.rl.ppo import Ppo
+from jumper_warp.tasks.cfg import TaskCfg
+from support.learning import Curve, learning_curve, make_judge, success, warm_up
+from support.timing import process_age
+
+
+def timed_training(task: TaskCfg, cfg: PpoCfg, args: Any, seed: int) -> Curve:
+    """Train, and return the curve with the time from the start of this process until the training was ready.
+
+    args: envs, device, randomize, jumps, seconds, every and heights, as `experiments/learning_curves.py` has them.
+    """
+    torch.manual_seed(seed)
+    env = Env(task, args.envs, seed=seed, device=args.device, randomize=args.randomize, noise=args.randomize)
+    ppo = Ppo(env, cfg)
+    warm_up(env, ppo)
+    ready, judge = process_age(), make_judge(task, args.jumps, args.device)
+    success(ppo, judge)
+    curve = learning_curve(env, ppo, judge, args.seconds, args.every, args.heights)
+    curve.ready = ready
+    return curve
+
+
+def time_metrics(curve: Curve, name: str, good: float) -> dict[str, Any]:
+    """Return the metrics of a timed training, their names ending in its own; good: success rate that is waited for."""
+    reached, rate = curve.seconds_to(good), f"{100.0 * good:g}_percent"
+    return {
+        f"success_{name}": curve.success[-1],
+        f"ready_s_{name}": curve.ready,
+        f"trained_to_{rate}_s_{name}": reached,
+        f"from_start_to_{rate}_s_{name}": None if reached is None else reached + curve.ready,
+        f"steps_to_{rate}_{name}": None if reached is None else curve.steps[curve.seconds.index(reached)],
+        f"trained_to_100_percent_s_{name}": curve.seconds_to(1.0),
+        **{f"curve_{key}_{name}": getattr(curve, key) for key in ("seconds", "steps", "success")},
+    }
