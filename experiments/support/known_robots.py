@@ -8,9 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from jumper_warp.evaluation.heights import reached
-from jumper_warp.evaluation.jumps import Jumps
-from jumper_warp.evaluation.log import run_evaluation, termination_names
+from jumper_warp.evaluation.heights import run_jumps
 from jumper_warp.evaluation.plots import drawn
 from jumper_warp.identification.excitation import unsafe
 from jumper_warp.identification.findings import Identification
@@ -20,7 +18,8 @@ from jumper_warp.identification.motions import Motion
 from jumper_warp.identification.parameters import ParameterSet
 from jumper_warp.identification.recording import KINDS, Plan, draw_plan, measured, replay_plan
 from jumper_warp.identification.replay import Record, Replay
-from jumper_warp.policies.restore import Conditions, env_of_policy, open_policy
+from jumper_warp.policies.conditions import Conditions, env_of_policy
+from jumper_warp.policies.runs import open_policy
 from jumper_warp.robot.overlay import overlay_of
 from jumper_warp.robot.values import RobotValues
 
@@ -129,9 +128,8 @@ def policy_errors(name: str, jumps: int, case: Case, found: Identification, fold
         conditions = Conditions(device="cpu", robot=folder / f"{robot}.json" if robot in overlays else None)
         env = env_of_policy(policy, jumps, conditions)
         policy.to(env.device)
-        log = Jumps(np.linspace(0.5, 1.0, jumps), termination_names(env.task))
-        run_evaluation(policy.act, env, log)
-        apex[robot], success[f"policy_success_{robot}"] = log.apex.copy(), float(np.mean(reached(log)))
+        log = run_jumps(policy.act, env, np.linspace(0.5, 1.0, jumps))
+        apex[robot], success[f"policy_success_{robot}"] = log.apex.copy(), float(np.mean(log.reached))
     errors = {
         f"policy_apex_error_{robot}_m": float(np.mean(np.abs(apex[robot] - apex["true"])))
         for robot in ("described", "identified")
