@@ -134,7 +134,7 @@ def policy_errors(name: str, jumps: int, case: Case, found: Identification, fold
         f"policy_apex_error_{robot}_m": float(np.mean(np.abs(apex[robot] - apex["true"])))
         for robot in ("described", "identified")
     }
-    return {"policy_error_on_true_m": float(np.mean(np.abs(apex["true"] - log.target)))} | errors | success
+    return {"policy_error_on_true_m": float(np.mean(np.abs(apex["true"] - log.commanded)))} | errors | success
 
 
 def plot_cases(rows: list[dict[str, float]], path: Path) -> None:
