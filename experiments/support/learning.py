@@ -13,7 +13,7 @@ import torch
 import warp as wp
 
 from jumper_warp.envs.env import Env
-from jumper_warp.evaluation.jumps import run_jumps
+from jumper_warp.evaluation.heights import run_jumps
 from jumper_warp.evaluation.plots import drawn
 from jumper_warp.rl.ppo import Ppo
 from jumper_warp.rl.shac import Shac

@@ -308,7 +308,7 @@ class Rollout:
             self._legs.run(self._new_settings(), motion, seeds, gradients)
         else:
             if self._record is None:
-                self._record = self._step_record()
+                self._record = self.dynamics.step_record(self.every)
             self._launch(modules.rollout_adjoint.reverse_kernel, [*motion, seeds], [self._record, gradients])
         if trajectory.from_start:
             wp.map(wp.add, gradients.q[7:], gradients.before, out=gradients.q[7:])
@@ -338,16 +338,6 @@ class Rollout:
         rows.impulse = self._empty(steps, 4, n, dtype=self.dynamics.modules.scalar.vec3)
         rows.pressed = self._empty(steps, 4, n, dtype=wp.uint8)
         return rows
-
-    def _step_record(self) -> Any:
-        """Return room for the steps between two rows."""
-        record, n, steps = self.dynamics.modules.step_adjoint.StepRecord(), self.num_worlds, self.every
-        types = {name: var.type.dtype for name, var in record._cls.vars.items()}
-        for name in types:
-            shape = (n, steps + (name in ("base", "angles", "rates")))
-            shape += () if name in ("base", "inverse") else (4,)
-            setattr(record, name, self._zeros(*shape, dtype=types[name]))
-        return record
 
     def _launch_legs(self, kernel: wp.Kernel, inputs: list, outputs: list) -> None:
         """Launch a kernel over all worlds, a thread a leg."""

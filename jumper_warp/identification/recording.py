@@ -126,7 +126,7 @@ def replay_plan(replay: Replay, plan: Plan, robots: RobotValues, refine: int = 1
 
 
 def simulate_plan(
-    plan: Plan, *, solver: SolverName = "jumper", robots: RobotValues | None = None, dt: float = 1.0 / 480.0
+    plan: Plan, robots: RobotValues | None = None, *, solver: SolverName = "jumper", dt: float = 1.0 / 480.0
 ) -> Record:
     """Return what a robot does in a plan after it came to rest, rows at 240 Hz, on one of the two solvers.
 

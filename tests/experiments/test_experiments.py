@@ -16,17 +16,16 @@ from experiments import (
     new_reward,
     shac,
     soak_test,
-    vertical_jump_sweep,
 )
-from jumper_warp.evaluation.heights import sweep_metrics
-from jumper_warp.evaluation.jumps import Jumps, run_jumps
-from jumper_warp.evaluation.run import HEIGHTS, EvaluationRun
-from jumper_warp.policies.folder import save_policy
+from jumper_warp.evaluation.heights import HeightLog, for_sweep, run_jumps, sweep_metrics
+from jumper_warp.evaluation.limits import limit_metrics
+from jumper_warp.evaluation.sweeps import HEIGHTS_IN_RANGE, HeightSweep
+from jumper_warp.policies.conditions import Conditions, env_of_policy
 from jumper_warp.registry import make_task
 from jumper_warp.rl.cfg import PpoCfg
 from jumper_warp.tasks.saving import plain
 from jumper_warp.utils.errors import InputError
-from landing_helpers import still_policy
+from landing_helpers import OPEN_LOOP_APEX, still_policy
 from support.ablations import (
     ABLATIONS,
     without_curriculum,
@@ -34,7 +33,6 @@ from support.ablations import (
     without_reference_states,
 )
 from support.learning import Curve
-from support.limits import limit_metrics
 from support.soak import SoakArgs, hardest
 from support.timing import flags_of, over_baseline
 
@@ -66,10 +64,10 @@ def test_new_reward_is_trained_with_and_logged_by_its_name(trained):
 
 
 def jumps_of(target, apex, end, tilt_deg, rest_speed, early=False):
-    jumps = Jumps(np.array(target), SWEEP_ENDS)
-    jumps.apex, jumps.end = np.array(apex), np.array(end)
-    jumps.tilt, jumps.rest_speed = np.radians(tilt_deg), np.array(rest_speed)
-    jumps.early[:] = early
+    jumps = HeightLog(np.array(target), SWEEP_ENDS)
+    jumps.apex[:, 0], jumps.end[:, 0], jumps.early[:, 0] = apex, end, early
+    jumps.tilt[:, 0], jumps.rest_speed[:, 0] = np.radians(tilt_deg), rest_speed
+    jumps.yaw[:], jumps.drift[:], jumps.heading[:] = 0.0, 0.0, 0.0
     return jumps
 
 
@@ -82,7 +80,7 @@ def test_sweep_figures_against_hand_numbers():
         rest_speed=[0.01, 0.2, np.inf, 0.02, np.inf, 0.01, 0.01, 0.01],
         early=[False] * 6 + [True, False],
     )
-    figures = sweep_metrics(jumps, vertical_jump_sweep.IN_RANGE)
+    figures = sweep_metrics(jumps, HEIGHTS_IN_RANGE)
     # errors 0.09 0 0 -0.20 -0.02 -0.07 -0.09 -0.15
     assert figures["mean_abs_error_m"] == pytest.approx(0.62 / 8)
     assert figures["mean_abs_error_in_range_m"] == pytest.approx(0.31 / 5)
@@ -119,7 +117,7 @@ def test_sweep_figures_against_hand_numbers():
 
 def test_a_world_that_came_apart_is_no_success_and_no_error():
     jumps = jumps_of([0.6, 0.8, 1.0], [0.65, 1e6, np.nan], [0, 1, 1], [1.0] * 3, [0.0] * 3)
-    figures = sweep_metrics(jumps, vertical_jump_sweep.IN_RANGE)
+    figures = sweep_metrics(jumps, HEIGHTS_IN_RANGE)
     assert figures["mean_abs_error_m"] == pytest.approx(0.05)
     assert figures["success_rate"] == pytest.approx(1 / 3)
     assert figures["came_apart"] == 2
@@ -140,28 +138,22 @@ class Script:
 
 
 @pytest.fixture(scope="module")
-def sweep_env(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("sweep")
-    save_policy(folder / "still", still_policy("vertical-jump"))
-    args = vertical_jump_sweep.Args(policy=str(folder / "still"), jumps=3, record=0, out=folder, device="cpu")
-    return EvaluationRun.of("sweep", args, HEIGHTS).env(3, vertical_jump_sweep.for_sweep)
+def sweep_env():
+    return env_of_policy(still_policy("vertical-jump"), 3, Conditions(device="cpu"), change=for_sweep)
 
 
 @pytest.mark.parametrize(("begin", "early"), [(31, False), (-45, True)])
 def test_scripted_jump_reaches_the_open_loop_height_and_lands(sweep_env, begin, early):
     targets = np.array([0.5, 0.7, 1.05])
-    figures = sweep_metrics(run_jumps(Script(begin).act, sweep_env, targets), vertical_jump_sweep.IN_RANGE)
-    assert figures["largest_reached_m"] == pytest.approx(vertical_jump_sweep.OPEN_LOOP_APEX, abs=0.02)
+    figures = sweep_metrics(run_jumps(Script(begin).act, sweep_env, targets), HEIGHTS_IN_RANGE)
+    assert figures["largest_reached_m"] == pytest.approx(OPEN_LOOP_APEX, abs=0.02)
     assert figures["landing_rate"] == 1.0
     assert figures["early_rate"] == (1.0 if early else 0.0)
     assert figures["success_rate"] == pytest.approx(0.0 if early else 1 / 3)
 
 
 def test_sweep_of_a_run_leaves_figures_plot_recording_and_filmstrip(trained, tmp_path):
-    args = vertical_jump_sweep.Args(
-        policy=str(trained[2]), jumps=3, record=2, randomize=True, out=tmp_path, device="cpu"
-    )
-    values = vertical_jump_sweep.main(args)
+    values = HeightSweep(str(trained[2]), jumps=3, record=2, randomize=True, out=tmp_path, device="cpu").run()
     saved = json.loads((tmp_path / "metrics.json").read_text())
     assert saved == values
     assert {

@@ -3,13 +3,10 @@
 import numpy as np
 import pytest
 
-from jumper_warp.identification.least_squares import LeastSquares
-from jumper_warp.identification.motions import NoiseLevels
 from jumper_warp.identification.parameters import jumper_parameters
 from jumper_warp.identification.recording import replay_plan
 from jumper_warp.identification.replay import Replay
-from jumper_warp.identification.residuals import MotionResiduals
-from support.identification_methods import chi2_at
+from support.identification_methods import chi2_at, problem_of
 from support.known_robots import MOST, make_case, prediction_errors
 
 
@@ -42,8 +39,8 @@ def test_a_robot_predicts_itself_exactly_and_another_one_does_not(drawn):
 def test_the_truth_explains_what_was_measured_to_its_noise(drawn):
     """But for where the motions started, which is expected and not known here."""
     parameters, case, many, _ = drawn
-    whole = [MotionResiduals(motion, parameters, NoiseLevels(), many.description) for motion in case.motions]
-    point = LeastSquares(parameters, whole, many, [case.mass]).expected()
-    described = chi2_at(parameters, case, many, point)
+    problem = problem_of(parameters, case, many)
+    point = problem.expected()
+    described = chi2_at(problem, point)
     point.z[:] = case.truth
-    assert chi2_at(parameters, case, many, point) < 0.02 * described
+    assert chi2_at(problem, point) < 0.02 * described

@@ -39,7 +39,7 @@ from .leg_record import (
     put_slopes,
     put_vec,
 )
-from .rollout_adjoint import RowSeeds, add_row_seeds, enter_row, generate_adjoints, leave_row, wrench_part
+from .rollout_adjoint import RowSeeds, add_row_seeds, enter_row, generate_adjoints, leave_row
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
 
@@ -84,8 +84,8 @@ def replay_legs_kernel(
     first = row * timing.every
     t = first / timing.substeps
     own = load_leg(robot, world, leg)
-    force = wrench_part(commands, t, 0, world)
-    moment = wrench_part(commands, t, 3, world)
+    force = row_vec3(commands.wrench, t, 0, world)
+    moment = row_vec3(commands.wrench, t, 3, world)
     put_base(record, at, world, load_row_base(rows, row, world, base_com(robot.table, world)))
     put_vec(record, at, ANGLES, world, leg, row_vec3(rows.q, row, 7 + 3 * leg, world))
     put_vec(record, at, RATES, world, leg, row_vec3(rows.qd, row, 6 + 3 * leg, world))
@@ -160,8 +160,8 @@ def reverse_legs_kernel(
         at = first_entry(timing, span, row)
         first = row * timing.every
         t = first / timing.substeps
-        force = wrench_part(commands, t, 0, world)
-        moment = wrench_part(commands, t, 3, world)
+        force = row_vec3(commands.wrench, t, 0, world)
+        moment = row_vec3(commands.wrench, t, 3, world)
         end = enter_row(robot, world, get_base(record, at + timing.every, world), entries)
         adj.base = end.base
         adj.force = vec3(real(0.0))

@@ -35,7 +35,7 @@ def advance_once(
         if last:
             for j in range(3):
                 work.torque[3 * k + j, world] = torque[j]
-    wrench = base_wrench(drive, world)
+    wrench = base_wrench(drive.joint_f, drive.body_f, world)
     force = vec3(wrench[0], wrench[1], wrench[2])
     moment = vec3(wrench[3], wrench[4], wrench[5])
     block = block_law(robot, world, base, dt)

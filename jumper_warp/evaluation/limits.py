@@ -7,14 +7,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
-from jumper_warp.evaluation.heights import SUCCESS_TOLERANCE, reached
-from jumper_warp.evaluation.jumps import Jumps, jump_commands
+from jumper_warp.evaluation.heights import SUCCESS_TOLERANCE, HeightLog
+from jumper_warp.evaluation.jumps import jump_commands
 from jumper_warp.evaluation.log import Metrics, mean, within
-from support.open_loop import EXTEND, HOLD, RAMP
 
 if TYPE_CHECKING:
     from jumper_warp.envs.env import Env
 
+RAMP, HOLD, EXTEND = 25, 50, 40
+"""Policy steps of the ramp into the squat, the squat, and the full extension."""
 STAND = 31
 """Policy steps in the default pose, after which jumps are commanded."""
 MORE = 30
@@ -61,20 +62,19 @@ def open_loop_limits(env: Env, fresh: dict[str, Any]) -> np.ndarray:
     return np.where(broken, np.nan, highest)
 
 
-def limit_metrics(jumps: Jumps, limit: np.ndarray) -> Metrics:
+def limit_metrics(jumps: HeightLog, limit: np.ndarray) -> Metrics:
     """Return the metrics of jumps against the open-loop jump of the same robots, limit [m], (num_envs,).
 
     A height is reachable if the open-loop jump comes within the tolerance of it or higher. `success_rate_beyond_limit`
     is that of the others. `open_loop_mean_abs_error_m` is that of jumps which stop at the limit and are perfect below.
     """
-    target, near = jumps.target, reached(jumps)
-    reachable, below = target <= limit + SUCCESS_TOLERANCE, target <= limit
-    inner = within(target, INNER)
+    target, near = jumps.commanded[:, 0], jumps.reached[:, 0]
+    reachable, below, inner = target <= limit + SUCCESS_TOLERANCE, target <= limit, within(target, INNER)
     return {
         "open_loop_limit_m": mean(limit),
         "lowest_open_loop_limit_m": float(np.nanmin(limit)),
         "open_loop_mean_abs_error_m": mean(np.maximum(target - limit, 0.0)),
-        "mean_abs_error_up_to_limit_m": mean(np.abs(jumps.error)[below]),
+        "mean_abs_error_up_to_limit_m": mean(np.abs(jumps.error[:, 0])[below]),
         "success_rate_reachable": mean(near[reachable]),
         "reachable_share": mean(reachable),
         "success_rate_beyond_limit": mean(near[~reachable]),
