@@ -125,16 +125,9 @@ class Rollout:
         self.dynamics = JumperDynamics(model, description=description, double=double)
         self.num_worlds, self.device, self.real = model.world_count, model.device, self.dynamics.real
         self.dt, self.substeps, self.every = dt, substeps, every
-        modules, n = self.dynamics.modules, self.num_worlds
         tolerance = tolerance or (TOLERANCE_DOUBLE if double else TOLERANCE)
         self._new_settings = partial(self.dynamics.settings, dt, 1, MAX_SWEEPS, tolerance)
-        cfg = motors or jumping_motors()
-        self._actuation = modules.trajectory.Actuation()
-        self._actuation.motors = motor_arrays(cfg, n, module=modules.motors, device=self.device)
-        self._actuation.fade = self.array([[cfg.fade_start] * n, [cfg.fade_end] * n])
-        self._actuation.latency = self._zeros(n)
-        self._actuation.filtered = int(command_filter is not None)
-        self._actuation.limits = self.array(np.repeat(filter_rows(command_filter)[:, None], n, axis=1))
+        self._actuation = self._make_actuation(motors or jumping_motors(), command_filter)
         self.motors = self._actuation.motors
         """The kernels' `MotorArrays`, whose arrays are among the parameters."""
         self.parameters: dict[str, wp.array] = {
@@ -151,12 +144,23 @@ class Rollout:
         """How often `simulate` has changed each of them."""
         self.by_legs = self.device.is_cuda
         """Whether a thread has a leg or a world, by default a leg on a GPU and a world on a CPU."""
-        self.slices = slices_of(n, 1 if self.device.is_cuda else checked_threads(threads))
+        self.slices = slices_of(self.num_worlds, 1 if self.device.is_cuda else checked_threads(threads))
         wrench = wp.zeros(model.body_count, dtype=wp.spatial_vector, device=self.device)
         self._drive = self.dynamics.drive(self._zeros(model.joint_dof_count), wrench)
         self._record: Any = None
         self._legs: LegReverse | None = None
         self._launched: set[str] = set()
+
+    def _make_actuation(self, cfg: MotorCfg, command_filter: FilterCfg | None) -> Any:
+        """Return the kernels' `Actuation` of motors, without latency."""
+        modules, n = self.dynamics.modules, self.num_worlds
+        actuation = modules.trajectory.Actuation()
+        actuation.motors = motor_arrays(cfg, n, module=modules.motors, device=self.device)
+        actuation.fade = self.array([[cfg.fade_start] * n, [cfg.fade_end] * n])
+        actuation.latency = self._zeros(n)
+        actuation.filtered = int(command_filter is not None)
+        actuation.limits = self.array(np.repeat(filter_rows(command_filter)[:, None], n, axis=1))
+        return actuation
 
     def standing(self) -> tuple[np.ndarray, np.ndarray]:
         """Return q (19, num_worlds) and qd (18, num_worlds) of the model's pose, at rest, in single precision."""
@@ -273,21 +277,7 @@ class Rollout:
         rows_of = (count * self.substeps // self.every + 1, 19, n)
         if trajectory.q.shape != rows_of or trajectory.q.dtype != self.real:
             raise InputError(f"this rollout makes trajectories {rows_of}, got {trajectory.q.shape}")
-        seeds = modules.trajectory.Rows()
-        given = {"q": q, "qd": qd, "torque": torque, "impulse": impulse, "safe": safe}
-        for name, array in given.items():
-            like = getattr(trajectory, name)
-            alike = isinstance(array, wp.array) and array.shape == like.shape and array.dtype == like.dtype
-            if array is not None and not alike:
-                got = f"{array.dtype.__name__} {array.shape}" if isinstance(array, wp.array) else type(array).__name__
-                raise InputError(
-                    f"the gradient by {name} must be like it, {like.dtype.__name__} {like.shape}, got {got}"
-                )
-            if name == "safe":
-                continue
-            empty = wp.zeros((0,) * like.ndim, dtype=like.dtype, device=self.device)
-            setattr(seeds, name, empty if array is None else array)
-        seeds.pressed = wp.zeros((0, 0, 0), dtype=wp.uint8, device=self.device)
+        seeds = self._seeds(trajectory, {"q": q, "qd": qd, "torque": torque, "impulse": impulse, "safe": safe})
         rows = modules.trajectory.Rows()
         for name in ("q", "qd", "torque", "impulse", "pressed"):
             setattr(rows, name, getattr(trajectory, name))
@@ -314,6 +304,23 @@ class Rollout:
             wp.map(wp.add, gradients.q[7:], gradients.before, out=gradients.q[7:])
         found = {"targets": gradients.target, "q": gradients.q, "qd": gradients.qd, "before": gradients.before}
         return found | {"wrench": gradients.wrench} | self._named(gradients.parameters)
+
+    def _seeds(self, trajectory: Trajectory, given: dict[str, wp.array | None]) -> Any:
+        """Return the kernels' `Rows` of a gradient by a trajectory. Raises InputError: an array unlike it."""
+        seeds = self.dynamics.modules.trajectory.Rows()
+        for name, array in given.items():
+            like = getattr(trajectory, name)
+            alike = isinstance(array, wp.array) and array.shape == like.shape and array.dtype == like.dtype
+            if array is not None and not alike:
+                got = f"{array.dtype.__name__} {array.shape}" if isinstance(array, wp.array) else type(array).__name__
+                raise InputError(
+                    f"the gradient by {name} must be like it, {like.dtype.__name__} {like.shape}, got {got}"
+                )
+            if name != "safe":
+                empty = wp.zeros((0,) * like.ndim, dtype=like.dtype, device=self.device)
+                setattr(seeds, name, empty if array is None else array)
+        seeds.pressed = wp.zeros((0, 0, 0), dtype=wp.uint8, device=self.device)
+        return seeds
 
     def _named(self, gradient: wp.array) -> dict[str, wp.array]:
         """Return the rows of a gradient by name."""

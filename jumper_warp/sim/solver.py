@@ -125,8 +125,8 @@ class SolverJumper(SolverBase):
     body. Forces on other bodies and passive joints are not read. On a CPU a thread owns a world, on a GPU four
     threads share one and add up in a fixed order, so results repeat bit for bit on a device.
 
-    Where the states carry gradients (`finalize(requires_grad=True)`) `step` runs kernel by kernel so that `wp.Tape` can
-    run it backwards, with a state of its own for every step. Record `dynamics.pack_masses()` or `pack_joints()` on the
+    Where the states carry gradients (`finalize(requires_grad=True)`) `wp.Tape` can run `step` backwards, with a state
+    of its own for every step (see `jumper_warp.sim.tape`). Record `dynamics.pack_masses()` or `pack_joints()` on the
     tape for gradients with respect to the model's arrays.
 
     With `block`, each world has a block of its own that slides on the floor under the paws that push it. A paw touches

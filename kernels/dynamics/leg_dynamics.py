@@ -112,6 +112,45 @@ def centrifugal(second_j: vec5, w: vec3) -> real:
 
 
 @wp.func
+def leg_body(geo: LegGeometry, sums: LinkSums, cosine: real, sine: real) -> MassMoments:
+    """Return the mass moments of a leg about the base origin, body axes."""
+    first = rotate_x(sums.first, cosine, sine)
+    body = MassMoments()
+    body.mass = sums.mass
+    body.first = first + sums.mass * geo.hip
+    body.second = (
+        rotate_x_second(sums.second, cosine, sine)
+        + sym_outer(geo.hip, first)
+        + real(0.5) * sums.mass * sym_outer(geo.hip, geo.hip)
+    )
+    return body
+
+
+@wp.func
+def couple_leg(geo: LegGeometry, sums: LinkSums, cosine: real, sine: real) -> LegDynamics:
+    """Return a leg's dynamics with its inertia, and its coupling to the base in body axes about the base origin."""
+    leg = LegDynamics()
+    second = sums.second
+    lateral_ang = geo.side * vec3(second[1] + second[2], -second[3], -second[4])  # of a unit rate about x
+    lateral_lin = geo.side * vec3(real(0.0), -sums.first[2], sums.first[1])
+    lo = geo.side * sums.ang_o[0]
+    li = geo.side * sums.ang_i[0]
+    leg.inertia = mat33(
+        geo.side * lateral_ang[0], lo, li, lo, sums.inertia_oo, sums.inertia_oi, li, sums.inertia_oi, sums.inertia_ii
+    )
+    lin_l = rotate_x(lateral_lin, cosine, sine)
+    lin_o = rotate_x_plane(sums.lin_o, cosine, sine)
+    lin_i = rotate_x_plane(sums.lin_i, cosine, sine)
+    leg.coupling_lin = columns(lin_l, lin_o, lin_i)
+    leg.coupling_ang = columns(
+        rotate_x(lateral_ang, cosine, sine) + wp.cross(geo.hip, lin_l),
+        rotate_x(sums.ang_o, cosine, sine) + wp.cross(geo.hip, lin_o),
+        rotate_x(sums.ang_i, cosine, sine) + wp.cross(geo.hip, lin_i),
+    )
+    return leg
+
+
+@wp.func
 def assemble_leg(
     geo: LegGeometry, sums: LinkSums, cosine: real, sine: real, rates: vec3, omega: vec3, g: vec3
 ) -> LegDynamics:
@@ -146,11 +185,8 @@ def assemble_leg(
         + sums.ang_acc
     )
     swirl = w[1] * sums.coriolis
-    second = sums.second
-    lateral_ang = geo.side * vec3(second[1] + second[2], -second[3], -second[4])  # of a unit rate about x
-    lateral_lin = geo.side * vec3(zero, -sums.first[2], sums.first[1])
 
-    leg = LegDynamics()
+    leg = couple_leg(geo, sums, cosine, sine)
     leg.bias_torque = vec3(
         geo.side * moment[0],
         wp.dot(sums.lin_o, hip_plane)
@@ -164,33 +200,9 @@ def assemble_leg(
         - swirl * rates[1]
         + sums.bias_i,
     )
-    lo = geo.side * sums.ang_o[0]
-    li = geo.side * sums.ang_i[0]
-    leg.inertia = mat33(
-        geo.side * lateral_ang[0], lo, li, lo, sums.inertia_oo, sums.inertia_oi, li, sums.inertia_oi, sums.inertia_ii
-    )
-    # to body axes, about the base origin
-    lin_l = rotate_x(lateral_lin, cosine, sine)
-    lin_o = rotate_x_plane(sums.lin_o, cosine, sine)
-    lin_i = rotate_x_plane(sums.lin_i, cosine, sine)
-    leg.coupling_lin = columns(lin_l, lin_o, lin_i)
-    leg.coupling_ang = columns(
-        rotate_x(lateral_ang, cosine, sine) + wp.cross(geo.hip, lin_l),
-        rotate_x(sums.ang_o, cosine, sine) + wp.cross(geo.hip, lin_o),
-        rotate_x(sums.ang_i, cosine, sine) + wp.cross(geo.hip, lin_i),
-    )
     leg.bias_force = rotate_x(force, cosine, sine)
     leg.bias_moment = rotate_x(moment, cosine, sine) + wp.cross(geo.hip, leg.bias_force)
-    first = rotate_x(sums.first, cosine, sine)
-    body = MassMoments()
-    body.mass = sums.mass
-    body.first = first + sums.mass * geo.hip
-    body.second = (
-        rotate_x_second(sums.second, cosine, sine)
-        + sym_outer(geo.hip, first)
-        + real(0.5) * sums.mass * sym_outer(geo.hip, geo.hip)
-    )
-    leg.body = body
+    leg.body = leg_body(geo, sums, cosine, sine)
     return leg
 
 

@@ -3,7 +3,7 @@
 import warp as wp
 
 from ..actuation.command_filter import FilterParams, Limits, filter_leg
-from ..actuation.motors import MotorArrays, MotorParams, load_motor
+from ..actuation.motors import MotorArrays, MotorParams, load_motor, motor_torque
 from ..scalar import quat, real, vec3
 from ..state import BaseState
 
@@ -188,6 +188,20 @@ def arrived_target(commands: Commands, safe: wp.array3d(dtype=real), arrived: Ar
         return newer
     older = commanded(safe, commands.before, arrived.older, motor, world)
     return older + arrived.weight * (newer - older)
+
+
+@wp.func
+def leg_torque(
+    commands: Commands, actuation: Actuation, safe: wp.array3d(dtype=real), arrived: Arrival, leg: int, world: int,
+    angles: vec3, rates: vec3,
+) -> vec3:  # fmt: skip
+    """Return the torques [N m] of a leg's motors in a physics step."""
+    torque = vec3(real(0.0))
+    for j in range(3):
+        motor = 3 * leg + j
+        target = arrived_target(commands, safe, arrived, motor, world)
+        torque[j] = motor_torque(target, angles[j], rates[j], load_world_motor(actuation, motor, world))
+    return torque
 
 
 @wp.func

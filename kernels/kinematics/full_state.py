@@ -5,7 +5,7 @@ import warp as wp
 from ..layout import BODIES, LEG_BODIES
 from ..scalar import quat, real, vec2, vec3
 from ..state import BaseState, leg_coord, leg_dof, load_base, load_motors
-from .five_bar import five_bar, five_bar_bias, in_plane
+from .five_bar import FiveBarBias, five_bar, five_bar_bias, in_plane
 from .geometry import LegGeometry
 
 
@@ -85,6 +85,38 @@ def store_body(
     )
 
 
+@wp.func
+def base_frame(base: BaseState) -> Frame:
+    """Return the frame of the base link."""
+    frame = Frame()
+    frame.pos = base.pos
+    frame.quat = base.quat
+    frame.lin = base.lin
+    frame.ang = wp.quat_rotate(base.quat, base.ang)
+    return frame
+
+
+@wp.func
+def store_passive(
+    geo: LegGeometry, bias: FiveBarBias, outer: real, inner: real, outer_thigh: real, inner_thigh: real, k: int,
+    coord: int, dof: int, joint_q: wp.array(dtype=real), joint_qd: wp.array(dtype=real),
+):  # fmt: skip
+    """Write the knees and the loop joint of leg k; outer, inner [rad]: pitch of its shanks, and of its thighs."""
+    joint_q[coord + 2] = geo.front * (outer - outer_thigh)
+    joint_q[coord + 4] = -geo.front * (inner - inner_thigh)
+    joint_qd[dof + 2] = geo.front * (bias.outer_shank_rate - bias.outer_thigh_rate)
+    joint_qd[dof + 4] = -geo.front * (bias.inner_shank_rate - bias.inner_thigh_rate)
+    across = rotation_y(outer - inner)
+    # behind the 27 tree coordinates and 26 tree rates of the world
+    loop_coord = coord + 20 - k
+    loop_dof = dof + 20 - 2 * k
+    for i in range(4):
+        joint_q[loop_coord + i] = across[i]
+    joint_qd[loop_dof] = real(0.0)
+    joint_qd[loop_dof + 1] = bias.outer_shank_rate - bias.inner_shank_rate
+    joint_qd[loop_dof + 2] = real(0.0)
+
+
 @wp.kernel
 def full_state_kernel(
     # in
@@ -118,28 +150,9 @@ def full_state_kernel(
     inner = shank_angle(loop.inner_shank)
     outer_thigh = -geo.front * angles[1]
     inner_thigh = geo.front * angles[2]
-
-    joint_q[coord + 2] = geo.front * (outer - outer_thigh)
-    joint_q[coord + 4] = -geo.front * (inner - inner_thigh)
-    joint_qd[dof + 2] = geo.front * (bias.outer_shank_rate - bias.outer_thigh_rate)
-    joint_qd[dof + 4] = -geo.front * (bias.inner_shank_rate - bias.inner_thigh_rate)
-    across = rotation_y(outer - inner)
-    # behind the 27 tree coordinates and 26 tree rates of the world
-    loop_coord = coord + 20 - k
-    loop_dof = dof + 20 - 2 * k
-    for i in range(4):
-        joint_q[loop_coord + i] = across[i]
-    joint_qd[loop_dof] = zero
-    joint_qd[loop_dof + 1] = bias.outer_shank_rate - bias.inner_shank_rate
-    joint_qd[loop_dof + 2] = zero
-
+    store_passive(geo, bias, outer, inner, outer_thigh, inner_thigh, k, coord, dof, joint_q, joint_qd)
     if k == 0:
-        frame = Frame()
-        frame.pos = base.pos
-        frame.quat = base.quat
-        frame.lin = base.lin
-        frame.ang = wp.quat_rotate(base.quat, base.ang)
-        store_body(frame, world * BODIES, body_com, body_q, body_qd)
+        store_body(base_frame(base), world * BODIES, body_com, body_q, body_qd)
     y = geo.plane_y + geo.knee_y
     outer_axis = vec3(geo.outer_x, geo.plane_y, zero)
     inner_axis = vec3(geo.inner_x, geo.plane_y, zero)

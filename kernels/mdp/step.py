@@ -29,6 +29,24 @@ def count_episode(
         counters.error_sum[world] = counters.error_sum[world] + wp.float64(error)
 
 
+@wp.func
+def write_outcome(
+    env: EnvArrays, counters: Counters, world: int, total: float, ending: int, timeout: float, broken: bool
+):
+    """Write how a policy step of a world ended."""
+    env.reward[world] = total
+    env.ending[world] = ending
+    env.done[world] = wp.where(ending == NOT_ENDED, 0.0, 1.0)
+    env.timeout[world] = timeout
+    env.terminated[world] = ending != NOT_ENDED and timeout == 0.0
+    env.truncated[world] = timeout != 0.0
+    env.broken[world] = wp.where(broken, 1, 0)
+    counters.bad_actions[world] = counters.bad_actions[world] + env.bad_action[world]
+    env.bad_action[world] = 0
+    env.clock[world] = env.clock[world] + 1
+    env.fresh[world] = 0
+
+
 def make_step_kernel(task: Any) -> wp.Kernel:
     """Return the kernel that ends a policy step; task: see `jumper_warp.tasks.cfg.TaskCfg`."""
     (advance,), endings, rewards = (task.rows[name] for name in ("advance", "terminations", "rewards"))
@@ -106,17 +124,7 @@ def make_step_kernel(task: Any) -> wp.Kernel:
             total = float(0.0)
         if wp.static(floor is not None):
             total = wp.max(total, wp.static(0.0 if floor is None else float(floor)))
-        env.reward[world] = total
-        env.ending[world] = ending
-        env.done[world] = wp.where(ending == NOT_ENDED, 0.0, 1.0)
-        env.timeout[world] = timeout
-        env.terminated[world] = ending != NOT_ENDED and timeout == 0.0
-        env.truncated[world] = timeout != 0.0
-        env.broken[world] = wp.where(broken, 1, 0)
-        counters.bad_actions[world] = counters.bad_actions[world] + env.bad_action[world]
-        env.bad_action[world] = 0
-        env.clock[world] = env.clock[world] + 1
-        env.fresh[world] = 0
+        write_outcome(env, counters, world, total, ending, timeout, broken)
         states[world] = state
         if ending != NOT_ENDED:
             counters.ending_count[ending, world] = counters.ending_count[ending, world] + 1

@@ -7,7 +7,6 @@ from collections import Counter
 import pytest
 import torch
 import warp as wp
-from warp._src.context import CpuDefaultAllocator
 
 import hold_height
 from jump_helpers import edit_episodes, make_env, random_actions
@@ -36,7 +35,8 @@ def counted(monkeypatch):
             patch.setattr(wp, name, counting(name, getattr(wp, name)))
         for name in ("zero_", "fill_", "assign", "numpy"):
             patch.setattr(wp.array, name, counting(name, getattr(wp.array, name)))
-        patch.setattr(CpuDefaultAllocator, "allocate", counting("allocate", CpuDefaultAllocator.allocate))
+        allocator = type(wp.get_device("cpu").get_allocator())
+        patch.setattr(allocator, "allocate", counting("allocate", allocator.allocate))
         yield counts
 
 

@@ -7,7 +7,7 @@ from ...scalar import real, vec3
 from ..step import Robot, StepSettings, load_leg
 from ..trajectory import Actuation, Commands, Rows, Timing, load_world_motor, row_vec3
 from .command_adjoint import add_motor_constants, add_offsets, motor_gradient
-from .gradients import Gradients, ThreadSums
+from .gradients import Gradients, thread_sums
 from .leg_adjoint import add_leg_constants, held_base, leg_gradient
 from .leg_record import ANGLES, FILTER, RATES, LegRecord, get_base, get_base_weights, get_law, get_leg_weights, get_vec
 from .rollout_adjoint import generate_adjoints
@@ -66,11 +66,7 @@ def leg_constants_kernel(
     world = settings.first + place
     dt = settings.dt
     own = load_leg(robot, world, leg)
-    sums = ThreadSums()
-    sums.parameters = gradients.parameters
-    sums.world = world
-    sums.adds = turn == 0
-    sums.turns = True
+    sums = thread_sums(gradients, world, turn == 0, True, False)
     for number in range(turns_of(timing, span, turns)):
         at = turn_at(timing, span, number * turns + turn)
         sums.weight = at.weight
@@ -108,14 +104,8 @@ def motor_constants_kernel(
     for j in range(motors.shape[0]):
         motors[j] = load_world_motor(actuation, 3 * leg + j, world)
     late = actuation.latency[world] / settings.dt
-    of_leg = ThreadSums()
-    of_leg.parameters = gradients.parameters
-    of_leg.world = world
-    of_leg.adds = turn == 0
-    of_leg.turns = True
-    of_legs = of_leg
-    of_legs.adds = turn == 0 and leg == 0
-    of_legs.legs = True
+    of_leg = thread_sums(gradients, world, turn == 0, True, False)
+    of_legs = thread_sums(gradients, world, turn == 0 and leg == 0, True, True)
     for number in range(turns_of(timing, span, turns)):
         at = turn_at(timing, span, number * turns + turn)
         of_leg.weight = at.weight

@@ -78,6 +78,19 @@ class ThreadSums:
 
 
 @wp.func
+def thread_sums(gradients: Gradients, world: int, adds: bool, turns: bool, legs: bool) -> ThreadSums:
+    """Return where a thread adds, all that it finds counted; see `ThreadSums`."""
+    sums = ThreadSums()
+    sums.parameters = gradients.parameters
+    sums.world = world
+    sums.weight = real(1.0)
+    sums.adds = adds
+    sums.turns = turns
+    sums.legs = legs
+    return sums
+
+
+@wp.func
 def add_entry(sums: wp.array(dtype=real), row: int, x: real):
     """Add a number to a row."""
     sums[row] = sums[row] + x

@@ -77,6 +77,22 @@ class LegAdjoint:
 
 
 @wp.func
+def leg_law(c: PawContact, law: PawLaw, impulse: vec3, point: vec3) -> LegLaw:
+    """Return what is recorded of a paw's law; impulse [N s], point [m]: body axes."""
+    found = LegLaw()
+    found.mode = law.mode
+    found.mu_row = law.mu_row
+    found.mu = law.mu
+    found.impulse = impulse
+    found.point = point
+    found.jacobian = c.jacobian
+    found.to_lin = c.to_lin
+    found.to_ang = c.to_ang
+    found.by_velocity = law.by_velocity
+    return found
+
+
+@wp.func
 def replay_leg(
     robot: Robot, own: LegParams, dt: real, world: int, leg: int, force: vec3, moment: vec3,
     first_impulse: wp.array2d(dtype=vec3), rows: Rows, step: int, i: int, record: LegRecord,
@@ -95,7 +111,6 @@ def replay_leg(
     inverse = hold_base(robot, world, invert(system))
     solve = terms.solve
     put_inverse(record, i, world, inverse)
-    solve = terms.solve
     paw = terms.paw
     c = PawContact()
     push = vec3(real(0.0))
@@ -130,17 +145,7 @@ def replay_leg(
         law = paw_law(robot, world, leg, c, before, velocity, wp.quat_rotate_inv(base.quat, old_impulse))
     if any_world(any_leg(law.mode != SEPARATE)):
         put_law_row(record, i, world, leg, inverted_laws(c, law, leg))
-    found = LegLaw()
-    found.mode = law.mode
-    found.mu_row = law.mu_row
-    found.mu = law.mu
-    found.impulse = impulse
-    found.point = point
-    found.jacobian = c.jacobian
-    found.to_lin = c.to_lin
-    found.to_ang = c.to_ang
-    found.by_velocity = law.by_velocity
-    put_law(record, i, world, leg, found)
+    put_law(record, i, world, leg, leg_law(c, law, impulse, point))
 
 
 @wp.func
@@ -296,6 +301,57 @@ def leg_gradient(
     return found
 
 
+@wp.struct
+class StepWeights:
+    """What a step's equations are weighed with, and the gradients by the velocities at its start that this leaves."""
+
+    base: BaseWeights
+    leg: LegWeights
+    lin: vec3
+    ang: vec3
+    rates: vec3
+
+
+@wp.func
+def find_weights(
+    record: LegRecord, world: int, leg: int, seeds: Rows, step: int, i: int, base: BaseState, law: LegLaw,
+    lin_seed: vec3, ang_seed: vec3, rate_seed: vec3,
+) -> StepWeights:  # fmt: skip
+    """Return the multipliers of a step for the gradients by the velocities at its end; see `find_multipliers`."""
+    inverse = get_inverse(record, i, world)
+    solve = get_solve(record, i, world, leg)
+    found = StepWeights()
+    found.lin = lin_seed
+    found.ang = ang_seed
+    found.rates = rate_seed
+    push = lin_seed - sum_vec(wp.transpose(solve.to_lin) * rate_seed)
+    twist = ang_seed - sum_vec(wp.transpose(solve.to_ang) * rate_seed)
+    found.base.lin = solve_lin(inverse, push, twist)
+    found.base.ang = solve_ang(inverse, push, twist)
+    found.leg.rates = solve.inverse * rate_seed - solve.to_lin * found.base.lin - solve.to_ang * found.base.ang
+    touches = law.mode != SEPARATE
+    seed = vec3(real(0.0))
+    if touches:
+        seed = found.base.lin + wp.cross(found.base.ang, law.point) + law.jacobian * found.leg.rates
+        if seeds.impulse.shape[0] > 0:
+            seed += wp.quat_rotate_inv(base.quat, seeds.impulse[step, leg, world])
+    if any_world(any_leg(touches)):
+        y = vec3(real(0.0))
+        found.leg.law = multiplier(get_law_row(record, i, world, leg), seed)
+        if touches:
+            y = wp.transpose(law.by_velocity) * found.leg.law
+        joint = wp.transpose(law.jacobian) * y
+        more_lin = sum_vec(law.to_lin * y)
+        more_ang = sum_vec(law.to_ang * y)
+        found.lin += sum_vec(y)
+        found.ang += sum_vec(wp.cross(law.point, y))
+        found.rates += joint
+        found.leg.rates += solve.inverse * joint - solve.to_lin * more_lin - solve.to_ang * more_ang
+        found.base.lin += more_lin
+        found.base.ang += more_ang
+    return found
+
+
 @wp.func
 def reverse_leg(
     robot: Robot, own: LegParams, dt: real, world: int, leg: int, force: vec3, moment: vec3, rows: Rows, seeds: Rows,
@@ -303,48 +359,20 @@ def reverse_leg(
 ) -> LegAdjoint:  # fmt: skip
     """Run a step backwards, see `reverse_step`; if it `keeps`, it records what its equations are weighed with."""
     base = get_base(record, i, world)
-    inverse = get_inverse(record, i, world)
-    solve = get_solve(record, i, world, leg)
     law = get_law(record, i, world, leg)
     new_velocity = adj.base.lin + dt * adj.base.pos
     quat_adj, ang_seed, _dt, _seed = wp.grad(turned)(
         base.quat, row_vec3(record.base, i + 1, 10, world), dt, adj.base.quat
     )
-    rate_seed = adj.rates + dt * adj.angles
-    lin_seed = wp.quat_rotate_inv(base.quat, new_velocity)
-    ang_seed += adj.base.ang
-    push = lin_seed - sum_vec(wp.transpose(solve.to_lin) * rate_seed)
-    twist = ang_seed - sum_vec(wp.transpose(solve.to_ang) * rate_seed)
-    by_base = BaseWeights()
-    by_base.lin = solve_lin(inverse, push, twist)
-    by_base.ang = solve_ang(inverse, push, twist)
-    by_leg = LegWeights()
-    by_leg.rates = solve.inverse * rate_seed - solve.to_lin * by_base.lin - solve.to_ang * by_base.ang
-    # contact
-    touches = law.mode != SEPARATE
-    seed = vec3(real(0.0))
-    if touches:
-        seed = by_base.lin + wp.cross(by_base.ang, law.point) + law.jacobian * by_leg.rates
-        if seeds.impulse.shape[0] > 0:
-            seed += wp.quat_rotate_inv(base.quat, seeds.impulse[step, leg, world])
-    if any_world(any_leg(touches)):
-        y = vec3(real(0.0))
-        by_leg.law = multiplier(get_law_row(record, i, world, leg), seed)
-        if touches:
-            y = wp.transpose(law.by_velocity) * by_leg.law
-        joint = wp.transpose(law.jacobian) * y
-        more_lin = sum_vec(law.to_lin * y)
-        more_ang = sum_vec(law.to_ang * y)
-        lin_seed += sum_vec(y)
-        ang_seed += sum_vec(wp.cross(law.point, y))
-        rate_seed += joint
-        by_leg.rates += solve.inverse * joint - solve.to_lin * more_lin - solve.to_ang * more_ang
-        by_base.lin += more_lin
-        by_base.ang += more_ang
+    weights = find_weights(
+        record, world, leg, seeds, step, i, base, law, wp.quat_rotate_inv(base.quat, new_velocity),
+        ang_seed + adj.base.ang, adj.rates + dt * adj.angles,
+    )  # fmt: skip
+    by_base = weights.base
     # the equations of motion
     held = held_base(record, world, i, dt, base, by_base)
-    found = leg_gradient(robot, own, dt, world, leg, rows, seeds, step, i, record, base, law, held, by_leg)
-    by_base.seeds.velocity = lin_seed
+    found = leg_gradient(robot, own, dt, world, leg, rows, seeds, step, i, record, base, law, held, weights.leg)
+    by_base.seeds.velocity = weights.lin
     by_base.seeds.new_velocity = new_velocity
     by_base.seeds.gravity = sum_vec(found.gravity)
     gravity = load_vec3(robot.table, GRAVITY, world)
@@ -354,15 +382,15 @@ def reverse_leg(
       base.lin, base.ang, held, by_base.seeds, dt)  # fmt: skip
     if keeps:
         put_base_weights(record, i, world, by_base)
-        put_leg_weights(record, i, world, leg, by_leg)
+        put_leg_weights(record, i, world, leg, weights.leg)
     out = LegAdjoint()
     out.base.pos = adj.base.pos + sum_vec(found.pos)
     out.base.quat = quat_adj + base_turn + sum_quat(found.turn)
     out.base.lin = lin_adj
-    out.base.ang = ang_seed + base_omega + sum_vec(found.omega)
+    out.base.ang = weights.ang + base_omega + sum_vec(found.omega)
     out.angles = adj.angles + found.angles
-    out.rates = rate_seed + found.rates
-    out.torque = dt * by_leg.rates
+    out.rates = weights.rates + found.rates
+    out.torque = dt * weights.leg.rates
     out.force = adj.force + force_adj
     out.moment = adj.moment + moment_adj
     out.body = add(adj.body, body)

@@ -156,6 +156,17 @@ def load_parts(
 
 
 @wp.func
+def place_in(commands: Commands, t: int, dt: real, world: int) -> StepPlace:
+    """Return the place of the steps in a policy step, with the wrench on the base."""
+    at = StepPlace()
+    at.dt = dt
+    at.world = world
+    at.force = row_vec3(commands.wrench, t, 0, world)
+    at.moment = row_vec3(commands.wrench, t, 3, world)
+    return at
+
+
+@wp.func
 def replay_row(
     robot: Robot, params: wp.array(dtype=LegParams), place: StepPlace, rows: Rows, row: int, every: int, com: vec3,
     record: StepRecord,
@@ -214,8 +225,12 @@ def add_filter_adjoint(
 
 
 @wp.func
-def store_start(gradients: Gradients, world: int, entries: RowSeeds, legs: wp.array(dtype=LegReverse)):
-    """Write the gradient by the first row."""
+def store_start(
+    gradients: Gradients, world: int, entries: RowSeeds, legs: wp.array(dtype=LegReverse), sums: wp.array(dtype=real)
+):
+    """Write the gradients by the first row and by the parameters."""
+    for i in range(sums.shape[0]):
+        gradients.parameters[i, world] = sums[i]
     for i in range(3):
         gradients.q[i, world] = entries.pos[i]
         gradients.qd[i, world] = entries.lin[i]
@@ -260,14 +275,10 @@ def reverse_kernel(
     entries = add_row_seeds(RowSeeds(), seeds, last, world)
     add_motor_rows(legs, seeds, last, world)
     com = base_com(robot.table, world)
-    at = StepPlace()
-    at.dt = settings.dt
-    at.world = world
     for back in range(last):
         row = last - 1 - back
         t = row * timing.every / timing.substeps
-        at.force = row_vec3(commands.wrench, t, 0, world)
-        at.moment = row_vec3(commands.wrench, t, 3, world)
+        at = place_in(commands, t, settings.dt, world)
         replay_row(robot, params, at, rows, row, timing.every, com, record)
         end = enter_row(robot, world, record.base[world, timing.every], entries)
         adj = end.base
@@ -283,10 +294,8 @@ def reverse_kernel(
             for i in range(motors.shape[0]):
                 angle = record.angles[world, at.entry, i / 3][i % 3]
                 rate = record.rates[world, at.entry, i / 3][i % 3]
-                by_motor = motor_gradient(
-                    motors[i], late, commands, safe, timing, at.dt, at.step, i, world, angle, rate
-                )  # fmt: skip
-                add_motor_adjoint(by_motor, arrived, at, i, seeds, gradients, legs, sums)
+                found = motor_gradient(motors[i], late, commands, safe, timing, at.dt, at.step, i, world, angle, rate)
+                add_motor_adjoint(found, arrived, at, i, seeds, gradients, legs, sums)
         entries = add_row_seeds(leave_row(rows, robot, row, world, adj, end.com), seeds, row, world)
         if row * timing.every == t * timing.substeps:
             for k in range(legs.shape[0]):
@@ -296,9 +305,7 @@ def reverse_kernel(
                 add_filter_adjoint(by_filter, t, k, world, gradients, legs, sums)
         add_motor_rows(legs, seeds, row, world)
     add_com(sums, robot.table[BASE, world], com, entries.com)
-    for i in range(sums.shape[0]):
-        gradients.parameters[i, world] = sums[i]
-    store_start(gradients, world, entries, legs)
+    store_start(gradients, world, entries, legs, sums)
 
 
 @wp.func

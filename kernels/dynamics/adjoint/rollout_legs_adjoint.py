@@ -14,6 +14,7 @@ from ...state import base_com
 from ..step import Robot, StepSettings, load_leg
 from ..trajectory import (
     Actuation,
+    Arrival,
     Commands,
     Rows,
     Timing,
@@ -24,7 +25,7 @@ from ..trajectory import (
     store_row_vec3,
 )
 from .command_adjoint import add_targets, filter_gradient, motor_gradient
-from .gradients import Gradients, ThreadSums, add_com, add_filter, add_moments, add_vec3
+from .gradients import Gradients, add_com, add_filter, add_moments, add_vec3, thread_sums
 from .leg_adjoint import LegAdjoint, replay_leg, reverse_leg
 from .leg_record import (
     ANGLES,
@@ -39,7 +40,7 @@ from .leg_record import (
     put_slopes,
     put_vec,
 )
-from .rollout_adjoint import RowSeeds, add_row_seeds, enter_row, generate_adjoints, leave_row
+from .rollout_adjoint import RowSeeds, add_row_seeds, add_wrench, enter_row, generate_adjoints, leave_row
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
 
@@ -111,6 +112,61 @@ def replay_legs_kernel(
         put_slopes(record, at + i, world, leg, slopes)
 
 
+@wp.func
+def load_entries(gradients: Gradients, world: int) -> RowSeeds:
+    """Return the gradient by the base's entries of the row after a span."""
+    entries = RowSeeds()
+    entries.pos = vec3(gradients.q[0, world], gradients.q[1, world], gradients.q[2, world])
+    entries.quat = quat(gradients.q[3, world], gradients.q[4, world], gradients.q[5, world], gradients.q[6, world])
+    entries.lin = vec3(gradients.qd[0, world], gradients.qd[1, world], gradients.qd[2, world])
+    entries.ang = vec3(gradients.qd[3, world], gradients.qd[4, world], gradients.qd[5, world])
+    return entries
+
+
+@wp.func
+def store_entries(gradients: Gradients, world: int, leg: int, entries: RowSeeds, adj: LegAdjoint):
+    """Write the gradient by a span's first row; leg 0 writes the base's."""
+    for i in range(3):
+        gradients.q[7 + 3 * leg + i, world] = adj.angles[i]
+        gradients.qd[6 + 3 * leg + i, world] = adj.rates[i]
+        if leg == 0:
+            gradients.q[i, world] = entries.pos[i]
+            gradients.qd[i, world] = entries.lin[i]
+            gradients.qd[3 + i, world] = entries.ang[i]
+    if leg == 0:
+        for i in range(4):
+            gradients.q[3 + i, world] = entries.quat[i]
+
+
+@wp.func
+def load_motor_entries(gradients: Gradients, world: int, leg: int) -> LegAdjoint:
+    """Return the gradient by a leg's entries of the row after a span."""
+    m = 3 * leg
+    adj = LegAdjoint()
+    adj.angles = vec3(gradients.q[7 + m, world], gradients.q[8 + m, world], gradients.q[9 + m, world])
+    adj.rates = vec3(gradients.qd[6 + m, world], gradients.qd[7 + m, world], gradients.qd[8 + m, world])
+    return adj
+
+
+@wp.func
+def reverse_motors(
+    old: LegAdjoint, slopes: MotorSlopes, arrived: Arrival, seeds: Rows, step: int, leg: int, world: int,
+    gradients: Gradients, writes: bool,
+) -> LegAdjoint:  # fmt: skip
+    """Return the gradient with that by the motors' angles and rates; if it `writes`, add those by their targets."""
+    adj = old
+    seed = adj.torque
+    if seeds.torque.shape[0] > 0:
+        seed += row_vec3(seeds.torque, step, 3 * leg, world)
+    adj.angles += wp.cw_mul(seed, slopes.angle)
+    adj.rates += wp.cw_mul(seed, slopes.rate)
+    if writes:
+        by_target = wp.cw_mul(seed, slopes.target)
+        for c in range(wp.static(3)):
+            add_targets(gradients, arrived, 3 * leg + c, world, by_target[c])
+    return adj
+
+
 @wp.kernel
 def reverse_legs_kernel(
     # in
@@ -138,23 +194,10 @@ def reverse_legs_kernel(
     dt = settings.dt
     own = load_leg(robot, world, leg)
     late = actuation.latency[world] / dt
-    entries = RowSeeds()
-    entries.pos = vec3(gradients.q[0, world], gradients.q[1, world], gradients.q[2, world])
-    entries.quat = quat(gradients.q[3, world], gradients.q[4, world], gradients.q[5, world], gradients.q[6, world])
-    entries.lin = vec3(gradients.qd[0, world], gradients.qd[1, world], gradients.qd[2, world])
-    entries.ang = vec3(gradients.qd[3, world], gradients.qd[4, world], gradients.qd[5, world])
-    adj = LegAdjoint()
-    m = 3 * leg
-    adj.angles = vec3(gradients.q[7 + m, world], gradients.q[8 + m, world], gradients.q[9 + m, world])
-    adj.rates = vec3(gradients.qd[6 + m, world], gradients.qd[7 + m, world], gradients.qd[8 + m, world])
-    of_leg = ThreadSums()
-    of_leg.parameters = gradients.parameters
-    of_leg.world = world
-    of_leg.weight = real(1.0)
-    of_leg.adds = place < count
-    of_legs = of_leg
-    of_legs.adds = place < count and leg == 0
-    of_legs.legs = True
+    entries = load_entries(gradients, world)
+    adj = load_motor_entries(gradients, world, leg)
+    of_leg = thread_sums(gradients, world, place < count, False, False)
+    of_legs = thread_sums(gradients, world, place < count and leg == 0, False, True)
     for back in range(span.end - span.begin):
         row = span.end - 1 - back
         at = first_entry(timing, span, row)
@@ -172,22 +215,13 @@ def reverse_legs_kernel(
             adj = reverse_leg(
                 robot, own, dt, world, leg, force, moment, rows, seeds, step, at + i, record, adj, place < count
             )
-            seed = adj.torque
-            if seeds.torque.shape[0] > 0:
-                seed += row_vec3(seeds.torque, step, m, world)
+            arrived = arrival(step, timing.substeps, late)
             slopes = get_slopes(record, at + i, world, leg)
-            adj.angles += wp.cw_mul(seed, slopes.angle)
-            adj.rates += wp.cw_mul(seed, slopes.rate)
-            if place < count:
-                by_target = wp.cw_mul(seed, slopes.target)
-                arrived = arrival(step, timing.substeps, late)
-                for c in range(wp.static(3)):
-                    add_targets(gradients, arrived, m + c, world, by_target[c])
+            adj = reverse_motors(adj, slopes, arrived, seeds, step, leg, world, gradients, place < count)
         entries = add_row_seeds(leave_row(rows, robot, row, world, adj.base, end.com), seeds, row, world)
         if place < count:
             if leg == 0:
-                store_row_vec3(gradients.wrench, t, 0, world, row_vec3(gradients.wrench, t, 0, world) + adj.force)
-                store_row_vec3(gradients.wrench, t, 3, world, row_vec3(gradients.wrench, t, 3, world) + adj.moment)
+                add_wrench(gradients, t, world, adj.force, adj.moment)
         if first == t * timing.substeps:
             by_filter = filter_gradient(
                 commands, actuation, t, leg, world, get_vec(record, at, ANGLES, world, leg),
@@ -196,28 +230,19 @@ def reverse_legs_kernel(
             add_filter(of_legs, by_filter.constants)
             if place < count:
                 put_vec(record, at, FILTER, world, leg, by_filter.angles)
-                store_row_vec3(gradients.target, t, m, world, by_filter.target)
+                store_row_vec3(gradients.target, t, 3 * leg, world, by_filter.target)
             adj.angles += by_filter.angles
             adj.rates += by_filter.rates
         if seeds.q.shape[0] > 0:
-            adj.angles += row_vec3(seeds.q, row, 7 + m, world)
+            adj.angles += row_vec3(seeds.q, row, 7 + 3 * leg, world)
         if seeds.qd.shape[0] > 0:
-            adj.rates += row_vec3(seeds.qd, row, 6 + m, world)
-    if place >= count:
-        return
-    for i in range(3):
-        gradients.q[7 + m + i, world] = adj.angles[i]
-        gradients.qd[6 + m + i, world] = adj.rates[i]
+            adj.rates += row_vec3(seeds.qd, row, 6 + 3 * leg, world)
+    if place < count:
+        store_entries(gradients, world, leg, entries, adj)
         if leg == 0:
-            gradients.q[i, world] = entries.pos[i]
-            gradients.qd[i, world] = entries.lin[i]
-            gradients.qd[3 + i, world] = entries.ang[i]
-    if leg == 0:
-        for i in range(4):
-            gradients.q[3 + i, world] = entries.quat[i]
-        add_moments(of_leg, BASE, adj.body)
-        add_com(of_leg, robot.table[BASE, world], base_com(robot.table, world), adj.com + entries.com)
-        add_vec3(of_leg, GRAVITY, adj.gravity)
+            add_moments(of_leg, BASE, adj.body)
+            add_com(of_leg, robot.table[BASE, world], base_com(robot.table, world), adj.com + entries.com)
+            add_vec3(of_leg, GRAVITY, adj.gravity)
 
 
 ADJOINTS = generate_adjoints(__name__)

@@ -12,8 +12,8 @@ import warp as wp
 
 from ...actuation.joint_forces import JointParams, joint_forces
 from ...actuation.springs import LegSpring, spring_torque
-from ...actuation.stops import StopParams, stop_rows
-from ...kinematics.five_bar import five_bar_bias
+from ...actuation.stops import StopParams, StopRows, stop_rows
+from ...kinematics.five_bar import FiveBar, five_bar_bias
 from ...kinematics.geometry import LegGeometry
 from ...scalar import quat, real, vec2, vec3, vec6
 from ...terrain.ground import Ground, floor_distance, floor_normal
@@ -21,7 +21,7 @@ from ..base_motion import exp_rotation
 from ..contact import SEPARATE, contact_jacobian, target_normal_velocity
 from ..contact_laws import contact_residual
 from ..inertia import MassMoments, inertia_mul, rotate_x, rotate_y
-from ..leg_dynamics import LegMasses, leg_pose, paw_kinematics
+from ..leg_dynamics import LegMasses, PawKinematics, leg_pose, paw_kinematics
 
 
 @wp.struct
@@ -230,6 +230,57 @@ def adj_link_motion(
 
 
 @wp.func
+def housing_motion(
+    geo: LegGeometry, rate: real, omega: vec3, g: vec3, c: real, s: real, base: BaseFactors, leg: LegFactors
+) -> FrameMotion:
+    """Return the motion of a leg's housing; rate [rad/s]: of its lateral motor, c, s: cosine and sine of its turn."""
+    zero = real(0.0)
+    lateral_rate = geo.side * rate
+    base_ang = rotate_x(omega, c, -s)
+    housing = FrameMotion()
+    housing.virtual_lin = rotate_x(base.virtual_lin + wp.cross(base.virtual_ang, geo.hip), c, -s)
+    housing.virtual_ang = rotate_x(base.virtual_ang, c, -s) + vec3(geo.side * leg.virtual_rates[0], zero, zero)
+    housing.acc = rotate_x(
+        base.lin_acc - g + wp.cross(base.ang_acc, geo.hip) + wp.cross(omega, wp.cross(omega, geo.hip)), c, -s
+    )
+    housing.ang = base_ang + vec3(lateral_rate, zero, zero)
+    housing.ang_acc = rotate_x(base.ang_acc, c, -s) + vec3(
+        geo.side * leg.acc[0], base_ang[2] * lateral_rate, -base_ang[1] * lateral_rate
+    )
+    return housing
+
+
+@wp.func
+def passive_power(
+    joints: JointParams, loop: FiveBar, front: real, rates: vec3, rows: StopRows, leg: LegFactors, dt: real
+) -> real:
+    """Return the virtual power [W] of friction, damping, pressed stops and the motors' inertia."""
+    passive = joint_forces(joints, loop, front, rates, rows, leg.pressed, dt)
+    implicit = passive.inertia * leg.acc + wp.cw_mul(joints.armature, leg.acc)
+    return wp.dot(leg.virtual_rates, passive.torque - implicit)
+
+
+@wp.func
+def contact_action(
+    geo: LegGeometry, ground: Ground, mu: real, pos: vec3, orientation: quat, paw: PawKinematics, base: BaseFactors,
+    leg: LegFactors, dt: real,
+) -> real:  # fmt: skip
+    """Return the part of a paw's contact: its impulse's virtual power, its weighed law, and the weighed impulse."""
+    centre = pos + wp.quat_rotate(orientation, paw.position)
+    normal = wp.quat_rotate_inv(orientation, floor_normal(ground, centre))
+    gap = floor_distance(ground, centre) - geo.paw_radius
+    arm = -geo.paw_radius * normal
+    point = paw.position + arm
+    jacobian = contact_jacobian(paw, arm)
+    virtual = base.virtual_lin + wp.cross(base.virtual_ang, point) + jacobian * leg.virtual_rates
+    velocity = base.lin + wp.cross(base.ang, point) + jacobian * leg.rates
+    goal = target_normal_velocity(gap, leg.pressed, dt)
+    residual = contact_residual(leg.impulse, velocity, normal, goal, mu, leg.mode)
+    action = wp.dot(leg.impulse, virtual) + wp.dot(leg.law, residual)
+    return action + wp.dot(leg.push, wp.quat_rotate(orientation, leg.impulse))
+
+
+@wp.func
 def leg_action(
     geo: LegGeometry, masses: LegMasses, joints: JointParams, spring: LegSpring, stops: StopParams, ground: Ground,
     mu: real, pos: vec3, orientation: quat, omega: vec3, g: vec3, angles: vec3, rates: vec3, base: BaseFactors,
@@ -245,20 +296,7 @@ def leg_action(
     bias = five_bar_bias(geo, loop, rates[1], rates[2])
     outer_acc, inner_acc = leg.acc[1], leg.acc[2]
     outer_virtual, inner_virtual = leg.virtual_rates[1], leg.virtual_rates[2]
-
-    lateral_rate = geo.side * rates[0]
-    base_ang = rotate_x(omega, c, -s)
-    housing = FrameMotion()
-    housing.virtual_lin = rotate_x(base.virtual_lin + wp.cross(base.virtual_ang, geo.hip), c, -s)
-    housing.virtual_ang = rotate_x(base.virtual_ang, c, -s) + vec3(geo.side * leg.virtual_rates[0], zero, zero)
-    housing.acc = rotate_x(
-        base.lin_acc - g + wp.cross(base.ang_acc, geo.hip) + wp.cross(omega, wp.cross(omega, geo.hip)), c, -s
-    )
-    housing.ang = base_ang + vec3(lateral_rate, zero, zero)
-    housing.ang_acc = rotate_x(base.ang_acc, c, -s) + vec3(
-        geo.side * leg.acc[0], base_ang[2] * lateral_rate, -base_ang[1] * lateral_rate
-    )
-
+    housing = housing_motion(geo, rates[0], omega, g, c, s, base, leg)
     f = geo.front
     still = vec2(zero)
     outer_thigh = link_motion(
@@ -299,26 +337,11 @@ def leg_action(
         + inertia_power(masses.outer_shank, outer_shank)
         + inertia_power(masses.inner_shank, inner_shank)
     )
-    passive = joint_forces(joints, loop, f, rates, stop_rows(stops, angles, dt), leg.pressed, dt)
-    implicit = passive.inertia * leg.acc + wp.cw_mul(joints.armature, leg.acc)
-    action = dt * (wp.dot(leg.virtual_rates, passive.torque - implicit) - power)
+    action = dt * (passive_power(joints, loop, f, rates, stop_rows(stops, angles, dt), leg, dt) - power)
     if spring.stiffness != zero:
         action += dt * wp.dot(leg.virtual_rates, spring_torque(spring, loop))
-
     if leg.mode != SEPARATE:
-        paw = paw_kinematics(geo, pose)
-        centre = pos + wp.quat_rotate(orientation, paw.position)
-        normal = wp.quat_rotate_inv(orientation, floor_normal(ground, centre))
-        gap = floor_distance(ground, centre) - geo.paw_radius
-        arm = -geo.paw_radius * normal
-        point = paw.position + arm
-        jacobian = contact_jacobian(paw, arm)
-        virtual = base.virtual_lin + wp.cross(base.virtual_ang, point) + jacobian * leg.virtual_rates
-        velocity = base.lin + wp.cross(base.ang, point) + jacobian * leg.rates
-        goal = target_normal_velocity(gap, leg.pressed, dt)
-        residual = contact_residual(leg.impulse, velocity, normal, goal, mu, leg.mode)
-        action += wp.dot(leg.impulse, virtual) + wp.dot(leg.law, residual)
-        action += wp.dot(leg.push, wp.quat_rotate(orientation, leg.impulse))
+        action += contact_action(geo, ground, mu, pos, orientation, paw_kinematics(geo, pose), base, leg, dt)
     return action
 
 

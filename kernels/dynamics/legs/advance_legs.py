@@ -123,6 +123,77 @@ def solve_paws(c: PawContact, blocks: bool, block: BlockLaw, leg: int, max_round
     return s
 
 
+@wp.struct
+class StopTry:
+    """The set of pressed stops that a leg tries in a step."""
+
+    rows: StopRows
+    pressed: int
+
+
+@wp.func
+def next_try(robot: Robot, world: int, leg: int, old: LegState, dt: real) -> StopTry:
+    """Return the leg's stops for the present try."""
+    found = StopTry()
+    found.pressed = old.pressed
+    if found.pressed != 0 or old.sets == 0:
+        stops = load_stops(robot.table, leg, world)
+        if found.pressed != 0 or beyond_stops(stops, old.angles + dt * old.rates):
+            found.rows = stop_rows(stops, old.angles, dt)
+            if old.sets == 0:
+                found.pressed = pressed_stops(found.rows, old.rates, real(0.0), 0)
+    return found
+
+
+@wp.func
+def wanted_stops(
+    robot: Robot, settings: StepSettings, world: int, leg: int, angles: vec3, rates: vec3, pressed: int, sets: int
+) -> int:
+    """Return the set that the rates at the end of the step ask for; loads limits again, which would fill registers."""
+    limits = load_stops(robot.table, leg, world)
+    wanted = int(0)
+    if pressed != 0 or beyond_stops(limits, angles + settings.dt * rates):
+        rows = stop_rows(limits, angles, settings.dt)
+        wanted = revised_stops(rows, rates, SLACK * settings.tolerance, pressed, sets)
+    return wanted
+
+
+@wp.func
+def stepped(
+    old: LegState, base: BaseState, angles: vec3, rates: vec3, torque: vec3, solved: PawSolution, total: vec3,
+    pressed: int,
+) -> LegState:  # fmt: skip
+    """Return the state after a step; total [N s]: sum of the paws' impulses."""
+    new = old
+    new.base = base
+    new.angles = angles
+    new.rates = rates
+    new.torque = torque
+    new.impulse = wp.quat_rotate(old.base.quat, solved.impulse)
+    new.peak_sq = wp.max(old.peak_sq, wp.dot(solved.impulse, solved.impulse))
+    new.total_sq = wp.max(old.total_sq, wp.dot(total, total))
+    new.residual = wp.max(old.residual, solved.residual)
+    new.rounds = wp.max(old.rounds, solved.rounds)
+    new.step = old.step + 1
+    new.used = pressed
+    new.sets = 0
+    new.pressed = 0
+    return new
+
+
+@wp.func
+def tried(old: LegState, pressed: int, wanted: int, chosen: bool) -> LegState:
+    """Return the state with the next set to try for the same step; chosen: this leg's changes where only one may."""
+    new = old
+    new.sets = old.sets + 1
+    new.pressed = pressed
+    if not one_by_one(new.sets):
+        new.pressed = wanted
+    elif chosen:
+        new.pressed = change_one(pressed, wanted)
+    return new
+
+
 @wp.func
 def advance_leg(
     robot: Robot, settings: StepSettings, drive: Drive, own: LegParams, motors: LegDrive, world: int, leg: int,
@@ -137,16 +208,10 @@ def advance_leg(
     base = old.base
     g = wp.quat_rotate_inv(base.quat, load_vec3(robot.table, GRAVITY, world))
     torque = applied_torque(motors, old.step, old.angles, old.rates)
-    rows = StopRows()
-    pressed = old.pressed
-    if pressed != 0 or old.sets == 0:
-        stops = load_stops(robot.table, leg, world)
-        if pressed != 0 or beyond_stops(stops, old.angles + dt * old.rates):
-            rows = stop_rows(stops, old.angles, dt)
-            if old.sets == 0:
-                pressed = pressed_stops(rows, old.rates, real(0.0), 0)
+    stops = next_try(robot, world, leg, old, dt)
+    pressed = stops.pressed
     spring = load_spring(robot.table, leg, world)
-    terms = leg_terms(own, spring, old.angles, old.rates, torque, rows, pressed, base.ang, g, dt)
+    terms = leg_terms(own, spring, old.angles, old.rates, torque, stops.rows, pressed, base.ang, g, dt)
     wrench = base_wrench(drive.joint_f, drive.body_f, world)
     force = vec3(wrench[0], wrench[1], wrench[2])
     moment = vec3(wrench[3], wrench[4], wrench[5])
@@ -169,10 +234,7 @@ def advance_leg(
     rates -= solve.to_lin * solved.lin + solve.to_ang * solved.ang
     total = sum_vec(solved.impulse)
     sets = old.sets + 1
-    limits = load_stops(robot.table, leg, world)  # and rows, once more: they would fill registers all the while
-    wanted = int(0)
-    if pressed != 0 or beyond_stops(limits, old.angles + dt * rates):
-        wanted = revised_stops(stop_rows(limits, old.angles, dt), rates, SLACK * settings.tolerance, pressed, sets)
+    wanted = wanted_stops(robot, settings, world, leg, old.angles, rates, pressed, sets)
     first = first_leg(wanted != pressed)
     agreed = from_leg(wp.where(wanted != pressed, real(1.0), real(0.0)), first) == real(0.0)
     done = old.step < settings.substeps and (agreed or sets >= MAX_SETS)
@@ -181,29 +243,10 @@ def advance_leg(
         if writes and done and robot.ground.blocks[world].exists != 0:
             move_block(robot.ground, world, wp.quat_rotate(base.quat, block_velocity(block, push)), dt)
         meet()
-    new = old
     if done:
-        new.base = moved_base(base, lin + solved.lin, ang + solved.ang, dt)
-        new.angles = old.angles + dt * rates
-        new.rates = rates
-        new.torque = torque
-        new.impulse = wp.quat_rotate(base.quat, solved.impulse)
-        new.peak_sq = wp.max(old.peak_sq, wp.dot(solved.impulse, solved.impulse))
-        new.total_sq = wp.max(old.total_sq, wp.dot(total, total))
-        new.residual = wp.max(old.residual, solved.residual)
-        new.rounds = wp.max(old.rounds, solved.rounds)
-        new.step = old.step + 1
-        new.used = pressed
-        new.sets = 0
-        new.pressed = 0
-    else:
-        new.sets = sets
-        new.pressed = pressed
-        if not one_by_one(sets):
-            new.pressed = wanted
-        elif leg == first:
-            new.pressed = change_one(pressed, wanted)
-    return new
+        moved = moved_base(base, lin + solved.lin, ang + solved.ang, dt)
+        return stepped(old, moved, old.angles + dt * rates, rates, torque, solved, total, pressed)
+    return tried(old, pressed, wanted, leg == first)
 
 
 @wp.kernel

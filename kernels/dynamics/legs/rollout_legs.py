@@ -2,10 +2,9 @@
 
 import warp as wp
 
-from ...actuation.motors import motor_torque
 from ...lanes import any_world, meet
 from ...layout import DOFS
-from ...scalar import real, vec3
+from ...scalar import real
 from ...state import base_com
 from ..drive import Drive, LegDrive
 from ..step import Robot, StepSettings, load_leg
@@ -15,10 +14,9 @@ from ..trajectory import (
     Rows,
     Timing,
     arrival,
-    arrived_target,
     filter_commands,
+    leg_torque,
     load_row_base,
-    load_world_motor,
     row_vec3,
     store_row_base,
     store_row_vec3,
@@ -68,11 +66,7 @@ def rollout_legs_kernel(
             meet()
         arrived = arrival(step, timing.substeps, late)
         motors = LegDrive()
-        torque = vec3(real(0.0))
-        for j in range(3):
-            motor = 3 * leg + j
-            target = arrived_target(commands, safe, arrived, motor, world)
-            torque[j] = motor_torque(target, s.angles[j], s.rates[j], load_world_motor(actuation, motor, world))
+        torque = leg_torque(commands, actuation, safe, arrived, leg, world, s.angles, s.rates)
         motors.extra = torque
         s.step = 0
         s.sets = 0

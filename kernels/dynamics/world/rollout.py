@@ -6,10 +6,9 @@ A rollout has T policy steps of S physics steps. It keeps what the reverse pass 
 
 import warp as wp
 
-from ...actuation.motors import motor_torque
 from ...layout import DOFS
 from ...scalar import real
-from ...state import BaseState, base_com, leg_dof
+from ...state import BaseState, base_com, leg_dof, store_motors
 from ..contact import PawContact
 from ..drive import Drive, Workspace
 from ..step import Robot, StepSettings
@@ -19,10 +18,9 @@ from ..trajectory import (
     Rows,
     Timing,
     arrival,
-    arrived_target,
     filter_commands,
+    leg_torque,
     load_row_base,
-    load_world_motor,
     row_vec3,
     store_row_base,
     store_row_vec3,
@@ -77,15 +75,9 @@ def rollout_kernel(
                 drive.joint_f[world * DOFS + i] = commands.wrench[t, i, world]
         arrived = arrival(step, timing.substeps, late)
         for k in range(legs.shape[0]):
-            dof = leg_dof(world, k)
-            for j in range(3):
-                motor = 3 * k + j
-                target = arrived_target(commands, safe, arrived, motor, world)
-                torque = motor_torque(
-                    target, legs[k].angles[j], legs[k].rates[j], load_world_motor(actuation, motor, world)
-                )
-                rows.torque[step, motor, world] = torque
-                drive.joint_f[dof + j + j / 2] = torque
+            torque = leg_torque(commands, actuation, safe, arrived, k, world, legs[k].angles, legs[k].rates)
+            store_row_vec3(rows.torque, step, 3 * k, world, torque)
+            store_motors(drive.joint_f, leg_dof(world, k), torque)
         base = advance_once(robot, settings, drive, work, world, 0, base, legs, contacts, peaks)
         for k in range(legs.shape[0]):
             rows.impulse[step, k, world] = work.impulse[k, world]
