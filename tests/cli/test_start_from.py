@@ -44,6 +44,20 @@ def test_training_begins_with_a_run(begun, tmp_path, capsys):
     assert json.loads((folder / "config.json").read_text())["train"]["start_from"] == str(begun)
 
 
+def test_a_repeated_command_resumes_the_run_that_it_began(tmp_path, capsys):
+    told = []
+    for iterations in ("1", "2"):
+        flags = ["--start-from", "slippery_jump", "--resume", "latest-or-new", "--iterations", iterations]
+        cli.main([*TRAIN, *flags, "--log-root", str(tmp_path)])
+        told.append(capsys.readouterr().err)
+    (folder,) = (tmp_path / "horizontal-jump-mars").iterdir()
+    assert "starts from slippery_jump" in told[0] and "resumed" not in told[0]
+    assert f"resumed {folder / 'checkpoints' / 'iteration_000001.pt'}" in told[1] and "starts from" not in told[1]
+    config = json.loads((folder / "config.json").read_text())["train"]
+    assert (config["iterations"], config["start_from"]) == (2, "slippery_jump")
+    assert (folder / "checkpoints" / "iteration_000002.pt").is_file()
+
+
 @pytest.mark.parametrize(
     ("more", "message"),
     [
