@@ -1,4 +1,4 @@
-"""What each idea of the vertical jump's training is worth: success over training time without it.
+"""How much each idea of the vertical jump's training helps: success over training time without it.
 
     python experiments/ablations.py --seconds 120 --envs 8192 --out outputs/ablations
 
@@ -13,12 +13,9 @@ from pathlib import Path
 
 import torch
 import tyro
-from rich.console import Console
-from rich.table import Table
 
 from jumper_warp.cli.main import run_command
 from jumper_warp.envs.env import Env
-from jumper_warp.evaluation.plots import drawn
 from jumper_warp.registry import make_task
 from jumper_warp.rl.cfg import PpoCfg
 from jumper_warp.rl.ppo import Ppo
@@ -27,12 +24,10 @@ from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.output import output_dir, write_metrics
 from jumper_warp.utils.runtime import announce
 from support.ablations import ABLATIONS
-from support.learning import Curve, learning_curve, make_judge
+from support.learning import Curve, curve_metrics, draw_curves, learning_curve, make_judge
 
 FULL = "full"
 """Name of the training that lacks nothing."""
-GOOD = 0.8
-"""Success rate whose time is reported."""
 
 
 @dataclass(frozen=True)
@@ -69,48 +64,28 @@ class Args:
             raise InputError(f"variants are {', '.join((FULL, *ABLATIONS))}, got {self.variants}")
 
 
-def train_variant(task: TaskCfg, judge: Env, args: Args) -> Curve:
+def train(task: TaskCfg, judge: Env, args: Args) -> Curve:
     """Train from nothing for the given time and return the curve."""
     torch.manual_seed(args.seed)
     env = Env(task, args.envs, seed=args.seed, device=args.device, randomize=args.randomize, noise=args.randomize)
     return learning_curve(env, Ppo(env, args.ppo), judge, args.seconds, args.every)
 
 
-def plot(curves: dict[str, Curve], path: Path) -> None:
-    """Draw success over training time."""
-    with drawn(path, figsize=(7, 4.5)) as axis:
-        for name, curve in curves.items():
-            axis.plot([0.0, *curve.seconds], [0.0, *(100.0 * s for s in curve.success)], label=name.replace("_", " "))
-        axis.set(xlabel="training time [s]", ylabel="success [%]", ylim=(0.0, 102.0))
-        axis.grid(alpha=0.3)
-        axis.legend(loc="lower right")
-
-
 def main(args: Args) -> dict:
-    """Train all variants and return the figures."""
+    """Train all variants and return the metrics."""
     announce(args.device, args.threads)
     folder = output_dir("ablations", args.out)
     task = make_task("vertical-jump")
     judge = make_judge(task, args.jumps, args.device)
-    table = Table("variant", "success", f"seconds to {100 * GOOD:g} %", "iterations")
-    curves: dict[str, Curve] = {}
+    curves: dict[str, list[Curve]] = {}
     values: dict = {"seconds": args.seconds, "envs": args.envs, "randomize": args.randomize, "seed": args.seed}
     for name in args.variants:
-        curve = curves[name] = train_variant(ABLATIONS.get(name, lambda same: same)(task), judge, args)
-        reached = curve.seconds_to(GOOD)
-        values |= {
-            f"success_{name}": curve.success[-1],
-            f"seconds_to_80_percent_{name}": reached,
-            f"iterations_{name}": curve.iterations,
-            f"curve_seconds_{name}": curve.seconds,
-            f"curve_success_{name}": curve.success,
-        }
-        never = "not reached" if reached is None else f"{reached:.1f}"
-        table.add_row(name, f"{100.0 * curve.success[-1]:.1f} %", never, str(curve.iterations))
+        curve = train(ABLATIONS.get(name, lambda same: same)(task), judge, args)
+        curves[name] = [curve]
+        values |= curve_metrics(curve, name) | {f"iterations_{name}": curve.iterations}
         write_metrics(folder, values)
-        plot(curves, folder / "ablations.png")
-    Console().print(table)
-    print(f"figures and plot in {folder}")
+        draw_curves(curves, folder / "ablations.png")
+    print(f"metrics and plot in {folder}")
     return values
 
 

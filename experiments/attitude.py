@@ -14,18 +14,16 @@ quarter, and `--solver mujoco` with physics that the policy was not trained on a
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
-from typing import Any
+from dataclasses import dataclass, replace
 
 import numpy as np
 import tyro
 
 from jumper_warp.cli.main import run_command
-from jumper_warp.evaluation.log import Metrics
 from jumper_warp.evaluation.plots import drawn
 from jumper_warp.evaluation.run import EvaluationArgs, EvaluationRun
 from jumper_warp.evaluation.turns import DIRECTIONS, TurnFlags, Turns, axis_metrics, turn_metrics, turns_about_any
-from support.momentum import momentum, rotational_inertia
+from support.momentum import MomentumWatch, rotational_inertia
 
 HARDWARE = {"mean_settling_s": 2.6}
 """The authors' robot, 90 degrees."""
@@ -61,31 +59,6 @@ class Args(EvaluationArgs):
     def flags(self) -> TurnFlags:
         """Return what is asked for. Raises InputError: a setting is out of range."""
         return TurnFlags(self.turns, self.angle, self.tolerance, self.seconds)
-
-
-@dataclass
-class MomentumWatch:
-    """Follows the momentum of all robots; call it after every policy step."""
-
-    env: Any
-    angular: list[np.ndarray] = field(default_factory=list)
-    """[kg m^2/s] (num_envs, 3) after every policy step, world axes."""
-
-    def __call__(self, turns: Turns) -> None:
-        """Add the moment."""
-        self.angular.append(momentum(self.env.sim)[1])
-
-    def metrics(self, apart: np.ndarray, inertia: np.ndarray) -> Metrics:
-        """Return drifts of robots that did not come apart; inertia [kg m^2]: (num_envs, 3, 3) about the com."""
-        drift = np.array(self.angular)[:, ~apart]
-        turned = np.linalg.solve(inertia[~apart], drift.sum(axis=0)[..., None])[..., 0] * self.env.step_dt
-        size, by = np.linalg.norm(drift, axis=-1), np.degrees(np.linalg.norm(turned, axis=-1))
-        return {
-            "max_angular_momentum_nm_s": float(size.max()),
-            "mean_angular_momentum_at_end_nm_s": float(size[-1].mean()),
-            "mean_turn_by_drift_deg": float(by.mean()),
-            "max_turn_by_drift_deg": float(by.max()),
-        }
 
 
 def plot(run: EvaluationRun, turns: Turns, title: str) -> None:

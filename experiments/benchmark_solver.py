@@ -12,20 +12,18 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
 
 import tyro
 import warp as wp
 
 from jumper_warp.cli.main import run_command
-from jumper_warp.robot.model import build_model
-from jumper_warp.sim.simulation import Simulation, SolverName
+from jumper_warp.sim.simulation import SolverName
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.output import output_dir, write_metrics
 from jumper_warp.utils.runtime import announce
 from jumper_warp.utils.threads import checked_threads
-from support.speed import time_jump, time_standing, time_threads
-from support.timing import device_memory, over_baseline, wall_time
+from support.speed import time_solver, time_threads
+from support.timing import over_baseline
 
 
 @dataclass(frozen=True)
@@ -34,7 +32,7 @@ class Args:
 
     envs: list[int] = field(default_factory=lambda: [64])
     """Numbers of environments, one run for each."""
-    solvers: list[Literal["jumper", "mujoco"]] = field(default_factory=lambda: ["jumper", "mujoco"])
+    solvers: list[SolverName] = field(default_factory=lambda: ["jumper", "mujoco"])
     repeats: int = 5
     """Timed repetitions; the median counts."""
     steps: int = 100
@@ -54,38 +52,15 @@ class Args:
             checked_threads(threads)
 
 
-def measure(solver: SolverName, envs: int, args: Args) -> dict:
-    """Return the figures of one solver at one number of environments."""
-    build_model(1, device=args.device)  # Newton's own modules are not part of the figures
-    before, made = device_memory(wp.get_device(args.device)), []
-
-    def make() -> None:
-        made.append(Simulation(envs, solver=solver, observe_forces=False, visuals=False, device=args.device))
-        made[0].step()
-        made[0].step()
-
-    values = {"setup_s": wall_time(make, args.device)}
-    (sim,) = made
-    values["ms_per_step_standing"] = 1e3 * time_standing(sim, args.steps, args.repeats)
-    jump, values["apex_m"] = time_jump(sim, args.repeats)
-    values["ms_per_step_jump"] = 1e3 * jump
-    values |= {f"steps_per_s_{phase}": 1e3 * envs / values[f"ms_per_step_{phase}"] for phase in ("standing", "jump")}
-    if sim.device.is_cuda:
-        values["memory_kib_per_env"] = (device_memory(sim.device) - before) / envs / 1024.0
-    if solver == "jumper":
-        values["largest_residual_m_s"] = float(sim.solver.residual.numpy().max())
-        values["most_sweeps"] = int(sim.solver.sweeps.numpy().max())
-    return values
-
-
 def main(args: Args) -> dict:
-    """Run the benchmark and return its figures."""
+    """Run the benchmark and return its metrics."""
     values: dict = {"device": announce(args.device, args.threads[-1] if args.threads else None).name}
     if args.threads and wp.get_device(args.device).is_cuda:
         raise InputError("threads are compared on a CPU; add --device cpu")
     folder = output_dir("benchmark_solver", args.out)
+    sizes = args.steps, args.repeats, args.device
     for envs in args.envs:
-        figures = {f"{s}_{name}": value for s in args.solvers for name, value in measure(s, envs, args).items()}
+        figures = {f"{s}_{name}": value for s in args.solvers for name, value in time_solver(s, envs, *sizes).items()}
         for phase in ("standing", "jump") if len(set(args.solvers)) == 2 else ():
             rates = (figures[f"{solver}_steps_per_s_{phase}"] for solver in ("jumper", "mujoco"))
             figures[f"ratio_{phase}"] = next(rates) / next(rates)
@@ -97,7 +72,7 @@ def main(args: Args) -> dict:
     write_metrics(folder, values)
     for name, value in values.items():
         print(f"{name:34} {value:,.3f}" if isinstance(value, float) else f"{name:34} {value}")
-    print(f"figures in {folder}")
+    print(f"metrics in {folder}")
     return values
 
 

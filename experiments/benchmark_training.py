@@ -5,7 +5,7 @@
 Steps are policy steps of 1/60 s, 8 physics steps each, of all environments together. The solver stands; environment
 and training see random or learned actions, with randomisation and noise. rsl-rl-lib trains on the same environment
 through the package's adapter. Before anything is timed, its outcome is checked.
-`--variants all` times PPO compiled or not, in either precision, with and without overlap; `--only-ppo` nothing else.
+`--variants all` times PPO compiled or not and in either precision; `--only-ppo` nothing else.
 `--baseline PATH` runs the same script of another checkout too, and tells how much faster this one is.
 """
 
@@ -24,8 +24,8 @@ from jumper_warp.rl.cfg import PpoCfg
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.output import output_dir, write_metrics
 from jumper_warp.utils.runtime import announce
-from support.speed import standing_solver, stepping_env, time_ppo, time_rsl_rl, time_stages
-from support.timing import median_time, over_baseline
+from support.speed import time_parts, time_ppo, time_rsl_rl
+from support.timing import over_baseline
 from support.variants import VARIANTS, variant
 
 
@@ -73,20 +73,6 @@ class Args:
         return tuple(VARIANTS) if self.variants == ("all",) else self.variants
 
 
-def time_parts(args: Args, envs: tuple[int, ...], train_envs: int) -> dict[str, float]:
-    """Return figures of solver and environment."""
-    values: dict[str, float] = {}
-    for n in sorted({*envs, train_envs}):
-        bodies = standing_solver(n, args.device), stepping_env(n, args.device)[1]
-        solver, step = (median_time(body, args.device, args.steps, args.repeats) for body in bodies)
-        values |= {f"solver_steps_per_s_{n}": n / solver, f"env_steps_per_s_{n}": n / step}
-        if n == train_envs:
-            values["env_step_us"] = 1e6 * step
-    parts = time_stages(train_envs, args.device, args.repeats)
-    values |= {f"{part}_us": 1e6 * wall for part, wall in parts.items()}
-    return values | {f"{part}_share": wall / sum(parts.values()) for part, wall in parts.items()}
-
-
 def main(args: Args) -> dict:
     """Run the benchmark and return its figures."""
     info = announce(args.device, args.threads)
@@ -96,7 +82,7 @@ def main(args: Args) -> dict:
     train_envs = args.train_envs or (8192 if gpu else 64)
     values: dict = {"device": info.name, "envs": list(envs), "train_envs": train_envs, "num_steps": args.num_steps}
     if not args.only_ppo:
-        values |= time_parts(args, envs, train_envs)
+        values |= time_parts(envs, train_envs, args.steps, args.repeats, args.device)
     cfg = PpoCfg(num_steps=args.num_steps)
     values |= time_ppo(train_envs, cfg, args.iterations, args.device)
     for name in args.names():

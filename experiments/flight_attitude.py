@@ -13,26 +13,18 @@ lands takes off too, half a second after the start.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-import torch
 import tyro
 
 from jumper_warp.cli.main import run_command
-from jumper_warp.envs.env import Env
 from jumper_warp.evaluation.log import EvaluationLog
 from jumper_warp.evaluation.plots import drawn
-from jumper_warp.evaluation.run import EvaluationArgs, Run, conditions_of
-from jumper_warp.policies.policy import Policy
-from jumper_warp.policies.restore import open_policy, restored_task
-from jumper_warp.policies.spec import PolicyError
-from jumper_warp.registry import make_task
-from jumper_warp.tasks.switching import flight_skills
+from jumper_warp.evaluation.run import EvaluationArgs
 from jumper_warp.utils.errors import InputError
-from support.flights import Flights, flight_actor, flight_metrics
+from support.flights import FlightRun, Flights, flight_metrics
 
 
 @dataclass(frozen=True)
@@ -65,50 +57,6 @@ class Args(EvaluationArgs):
             raise InputError("takeoff by a policy needs one: --landing")
 
 
-class FlightRun(Run):
-    """Follows flights of a jump and a policy that turns."""
-
-    def __init__(self, args: Args) -> None:
-        """Open policies. Raises PolicyError or CheckpointError: one cannot be used, or is of another kind of task."""
-        super().__init__()
-        self.turn: Policy = open_policy(args.policy)
-        self.landing: Policy | None = open_policy(args.landing) if args.landing else None
-        turning = restored_task(self.turn.config)
-        if turning.evaluation != "attitude":
-            raise PolicyError(f"this needs a policy that turns in flight, {args.policy} is of {turning.name}")
-        jump = make_task(args.jump) if self.landing is None else restored_task(self.landing.config)
-        if jump.evaluation not in ("height", "height-mars"):
-            raise PolicyError(f"this needs a jump to heights, got {jump.name}")
-        self.tasks = jump, turning
-        self.flights: Flights | None = None
-        self.prepare("flight_attitude", conditions_of(args), args.out, record=args.record)
-
-    def actor(self, env: Env) -> Callable[[torch.Tensor], torch.Tensor]:
-        """Return the actions of both skills."""
-        return flight_actor(env, self.flights, self.turn, self.landing)
-
-    def env(self, count: int) -> Env:
-        """Return the environment of robots that jump and turn."""
-        conditions = self.conditions
-        tasks, handovers = flight_skills(*(conditions.applied(task) for task in self.tasks))
-        env = Env(
-            tasks, count, seed=conditions.seed, device=conditions.device, solver=conditions.solver,
-            randomize=conditions.draws, noise=conditions.noise, auto_reset=False, threads=conditions.threads,
-            handovers=handovers,
-        )  # fmt: skip
-        for policy in (self.turn, self.landing):
-            if policy is not None:
-                policy.to(env.device)
-        self.told["gravity_m_s2"] = env.task.gravity
-        return env
-
-    def fly(self, env: Env, flights: Flights, film: str) -> Flights:
-        """Follow flights, and return them."""
-        self.flights = flights
-        self.follow(env, flights, film=film)
-        return flights
-
-
 def delays(count: int, most: float, seed: int) -> np.ndarray:
     """Return by how much later front and left legs extend, (count, 2): from half of the most to it, to any side."""
     rng = np.random.default_rng(seed)
@@ -116,7 +64,7 @@ def delays(count: int, most: float, seed: int) -> np.ndarray:
     return np.stack([size * np.cos(angle), size * np.sin(angle)], axis=1)
 
 
-def plot(run: Run, found: dict[str, EvaluationLog]) -> None:
+def plot(run: FlightRun, found: dict[str, EvaluationLog]) -> None:
     """Draw tilt and height of all flights over time."""
     with drawn(run.folder / "flights.png", 2, len(found), figsize=(11, 6), sharex=True, sharey="row") as axes:
         for column, (name, flights) in zip(axes.T, found.items(), strict=True):
@@ -129,7 +77,7 @@ def plot(run: Run, found: dict[str, EvaluationLog]) -> None:
 
 def main(args: Args) -> dict:
     """Run the test and return its figures."""
-    run = FlightRun(args)
+    run = FlightRun(args, args.landing, args.jump)
     env, heights = run.env(args.flights), np.linspace(*args.heights, args.flights)
     late = delays(args.flights, 1.0e-3 * args.late, args.seed) if args.takeoff == "open-loop" else None
     found = {

@@ -17,7 +17,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
-import numpy as np
 import tyro
 from rich.console import Console
 from rich.table import Table
@@ -25,17 +24,12 @@ from rich.table import Table
 from jumper_warp.cli.main import run_command
 from jumper_warp.evaluation.plots import drawn
 from jumper_warp.robot.gravity import EARTH, MARS
-from jumper_warp.robot.motors import MotorCfg, jumping_motors, loose_filter, vertical_jump_filter
+from jumper_warp.robot.motors import jumping_motors
 from jumper_warp.robot.overlay import with_springs
-from jumper_warp.robot.values import RobotValues
-from jumper_warp.sim.simulation import Simulation
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.output import output_dir, write_metrics
 from jumper_warp.utils.runtime import announce
-from support.open_loop import EXTEND, HOLD, RAMP, STAND, follow_jump, jump_metrics, transversal_command
-
-FALLING = 60
-"""Ticks after the extension in which a jump may still rise."""
+from support.spring_jumps import FILTERS, SpringJumps
 
 
 @dataclass(frozen=True)
@@ -68,42 +62,11 @@ class Args:
         for stiffness in self.stiffness:
             with_springs(stiffness, self.length)
 
-    @property
-    def motors(self) -> MotorCfg:
-        """The motors."""
+    def jumps(self, name: str) -> SpringJumps:
+        """Return the jumps with a command filter of this name."""
         motors = jumping_motors(self.torque)
-        return replace(motors, transversal=replace(motors.transversal, kp=self.kp))
-
-
-def apexes(args: Args, loose: bool) -> np.ndarray:
-    """Return the highest base heights [m] of open-loop jumps, (springs, squats)."""
-    shape = (len(args.stiffness), len(args.squats))
-    count = shape[0] * shape[1]
-    robots = RobotValues.nominal(count)
-    robots.spring_stiffness[:, 0] = np.repeat(args.stiffness, shape[1])
-    robots.spring_length[:, 0] = args.length
-    sim = Simulation(
-        count, motors=args.motors, command_filter=loose_filter() if loose else vertical_jump_filter(),
-        gravity=args.gravity, robot=robots, visuals=False, device=args.device,
-    )  # fmt: skip
-    squats, highest, begun = np.tile(args.squats, shape[0]), np.zeros(count), STAND + RAMP + HOLD
-    for tick in range(begun + EXTEND + FALLING):
-        commands = [transversal_command(min(tick, begun + EXTEND - 1), squat) for squat in squats]
-        sim.target.assign(np.outer(np.tile([0.0, 1.0, 1.0], 4), commands).astype(np.float32))
-        sim.step()
-        if tick >= begun:
-            highest = np.maximum(highest, sim.joint_q()[:, 2])
-    return highest.reshape(shape)
-
-
-def record(args: Args, loose: bool, stiffness: float, squat: float, folder: Path) -> dict[str, float]:
-    """Write the recording of a jump, and return its metrics."""
-    command_filter = loose_filter() if loose else vertical_jump_filter()
-    sim = Simulation(1, motors=args.motors, command_filter=command_filter, gravity=args.gravity, device=args.device,
-                     robot=with_springs(stiffness, args.length))  # fmt: skip
-    trace, recorder, _ = follow_jump(sim, {"spring_stiffness_n_m": stiffness, "squat_command_deg": squat}, squat)
-    recorder.save_rrd(folder / f"jump_{'loose' if loose else 'stock'}.rrd")
-    return jump_metrics(trace)
+        motors = replace(motors, transversal=replace(motors.transversal, kp=self.kp))
+        return SpringJumps(motors, name, self.gravity, self.length, self.device)
 
 
 def main(args: Args) -> dict:
@@ -111,7 +74,6 @@ def main(args: Args) -> dict:
     start = time.perf_counter()
     announce(args.device)
     folder = output_dir("leg_springs", args.out)
-    kinds = {"stock": [False], "loose": [True], "both": [False, True]}[args.filter]
     values: dict[str, Any] = {"gravity_m_s2": args.gravity, "torque_limit_nm": args.torque, "kp_nm_rad": args.kp,
                               "spring_length_m": args.length, "stiffness_n_m": list(args.stiffness)}  # fmt: skip
     place = {EARTH: "Earth", MARS: "Mars"}.get(args.gravity, f"{args.gravity:g} m/s^2")
@@ -120,16 +82,15 @@ def main(args: Args) -> dict:
     )
     rows = [[f"{stiffness:g}"] for stiffness in args.stiffness]
     with drawn(folder / "springs.png", figsize=(7, 4.5)) as axis:
-        for loose in kinds:
-            name = "loose" if loose else "stock"
-            found = apexes(args, loose)
-            best = found.max(axis=1)
-            values[f"{name}_apex_m"] = best.tolist()
-            values[f"{name}_squat_command_deg"] = [args.squats[i] for i in found.argmax(axis=1)]
-            top = int(best.argmax())
-            chosen = args.stiffness[top], values[f"{name}_squat_command_deg"][top]
-            values[f"{name}_highest_stiffness_n_m"] = chosen[0]
-            values |= {f"{name}_highest_{key}": value for key, value in record(args, loose, *chosen, folder).items()}
+        for name in FILTERS if args.filter == "both" else (args.filter,):
+            jumps = args.jumps(name)
+            found = jumps.apexes(args.stiffness, args.squats)
+            best, top = found.max(axis=1), int(found.max(axis=1).argmax())
+            squats = [args.squats[i] for i in found.argmax(axis=1)]
+            values |= {f"{name}_apex_m": best.tolist(), f"{name}_squat_command_deg": squats,
+                       f"{name}_highest_stiffness_n_m": args.stiffness[top]}  # fmt: skip
+            recorded = jumps.record(args.stiffness[top], squats[top], folder)
+            values |= {f"{name}_highest_{key}": value for key, value in recorded.items()}
             axis.plot(args.stiffness, best, marker="o", label=f"{name} filter")
             table.add_column(f"{name} filter")
             for row, apex in zip(rows, best, strict=True):

@@ -2,9 +2,9 @@
 
     python experiments/new_reward.py --iterations 5
 
-A term is a pure Warp function of the robot (`RobotView`), the state of the task (`JumpState`; `Any` for a term that
-every task can use) and numbers by name, and a line that gives it a weight and these numbers. It is compiled into the
-task's one step kernel and logged by its name; weight and numbers can be changed while a training runs:
+A term is a pure Warp function of the robot (`mdp.RobotView`), the state of the task (`mdp.JumpState`; `Any` for a term
+that every task can use) and numbers by name, and a line that gives it a weight and these numbers. It is compiled into
+the task's one step kernel and logged by its name; weight and numbers can be changed while a training runs:
 `env.skills[0].set("rewards", "even_load", weight=2.0)`.
 """
 
@@ -17,28 +17,24 @@ import torch
 import tyro
 import warp as wp
 
-from jumper_warp.envs.env import Env
-from jumper_warp.kernels.jump.state import FLIGHT, JumpState
-from jumper_warp.kernels.mdp.view import RobotView
-from jumper_warp.registry import make_task
+from jumper_warp import Env, make_task, mdp
 from jumper_warp.rl.cfg import PpoCfg, TrainCfg
 from jumper_warp.rl.runner import train
-from jumper_warp.tasks.terms import RewardTerm
 from jumper_warp.utils.output import output_dir, write_metrics
 
 
 @wp.func
-def even_load(view: RobotView, task: JumpState, spread: float) -> float:
+def even_load(view: mdp.RobotView, task: mdp.JumpState, spread: float) -> float:
     """Even load: exp(-deviation / spread) of the paw forces [N] from their mean, on the ground."""
-    if task.phase == FLIGHT:
+    if task.phase == mdp.FLIGHT:
         return 0.0
-    mean = (view.paw_force[0] + view.paw_force[1] + view.paw_force[2] + view.paw_force[3]) / 4.0
-    off = view.paw_force - wp.vec4(mean, mean, mean, mean)
+    mean = wp.dot(view.paw_force, wp.vec4(0.25))
+    off = view.paw_force - wp.vec4(mean)
     return wp.exp(-wp.length(off) / spread)
 
 
 TASK = make_task("vertical-jump")
-TASK = replace(TASK, rewards=(*TASK.rewards, RewardTerm(even_load, weight=5.0, spread=50.0)))
+TASK = replace(TASK, rewards=(*TASK.rewards, mdp.RewardTerm(even_load, weight=5.0, spread=50.0)))
 
 
 def make_env(num_envs: int, seed: int, device: torch.device) -> Env:

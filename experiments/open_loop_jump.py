@@ -17,13 +17,11 @@ from typing import Any, Literal
 
 import numpy as np
 import tyro
-from rich.console import Console
-from rich.table import Table
 
 from jumper_warp.cli.main import run_command
-from jumper_warp.evaluation.plots import drawn
+from jumper_warp.evaluation.commands import print_figures
 from jumper_warp.robot.gravity import EARTH
-from jumper_warp.robot.model import LEGS, MOTOR_JOINTS, build_model
+from jumper_warp.robot.model import LEGS, build_model
 from jumper_warp.robot.motors import jumping_motors, loose_filter, vertical_jump_filter
 from jumper_warp.robot.overlay import load_overlay, with_springs
 from jumper_warp.sim.simulation import Simulation
@@ -31,7 +29,7 @@ from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.output import output_dir, write_metrics
 from jumper_warp.utils.runtime import announce
 from jumper_warp.viz.snapshot import Camera, contact_sheet
-from support.open_loop import SQUAT, Trace, follow_jump, jump_metrics
+from support.open_loop import SQUAT, draw_trace, follow_jump, jump_metrics
 
 HARDWARE_APEX = 1.075
 """[m] Paper, open loop on the robot at 18 N m."""
@@ -83,28 +81,6 @@ def draw_filmstrip(frames: list[np.ndarray], path: Path) -> None:
     contact_sheet(pictures, path, [f"{moment:.2f} s" for moment in MOMENTS])
 
 
-def plot(trace: Trace, path: Path, title: str) -> None:
-    """Draw height, vertical speed, angles, torques and paw forces over time."""
-    with drawn(path, 5, 1, figsize=(9, 12), sharex=True) as axes:
-        axes[0].plot(trace.time, trace.height)
-        axes[0].axhline(HARDWARE_APEX, color="0.6", linestyle="--", label="hardware, 18 N m")
-        axes[1].plot(trace.time, trace.speed)
-        for i, name in enumerate(MOTOR_JOINTS):
-            if name.endswith(("outer", "inner")) and name.startswith(("FL", "BL")):
-                axes[2].plot(trace.time, np.degrees(trace.angle[:, i]), label=name)
-                axes[3].plot(trace.time, trace.torque[:, i], label=name)
-        for i, leg in enumerate(LEGS):
-            axes[4].plot(trace.time, trace.force[:, i, 2], label=leg)
-        labels = ("base height [m]", "vertical speed [m/s]", "motor angle [deg]", "motor torque [N m]", "paw force [N]")
-        for axis, label in zip(axes, labels, strict=True):
-            axis.set_ylabel(label)
-            axis.grid(alpha=0.3)
-            if axis is not axes[1]:
-                axis.legend(ncols=4, fontsize=8, loc="upper left")
-        axes[-1].set_xlabel("time [s]")
-        axes[0].set_title(title)
-
-
 def main(args: Args) -> dict:
     """Run the experiment and return its figures."""
     start = time.perf_counter()
@@ -130,15 +106,10 @@ def main(args: Args) -> dict:
     values: dict[str, Any] = {**variant, **jump_metrics(trace), "hardware_apex_height_m": None}
     if args.torque == 18.0 and args.gravity == EARTH and not args.loose and robot is None:
         values["hardware_apex_height_m"] = HARDWARE_APEX
-    title = f"Open-loop jump, {args.solver}, {args.torque:g} N m"
     write_metrics(folder, values)
-    plot(trace, folder / "jump.png", title)
+    draw_trace(folder / "jump.png", trace, f"Open-loop jump, {args.solver}, {args.torque:g} N m", HARDWARE_APEX)
     recorder.save_rrd(folder / "jump.rrd")
-    table = Table("figure", "value", title=title)
-    for name, value in values.items():
-        if isinstance(value, float) and not name.startswith(PER_MOTOR):
-            table.add_row(name, f"{value:.4f}")
-    Console().print(table)
+    print_figures({name: value for name, value in values.items() if not name.startswith(PER_MOTOR)})
     print(f"{time.perf_counter() - start:.1f} s; figures, plot and recording (rerun {folder / 'jump.rrd'}) in {folder}")
     return values
 

@@ -13,20 +13,17 @@ out every command without a fall. `--randomize` adds the jumps' randomisation, n
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import tyro
 
 from jumper_warp.cli.main import run_command
-from jumper_warp.evaluation.course_metrics import course_metrics, draw_course
-from jumper_warp.evaluation.courses import Course
+from jumper_warp.evaluation.courses import Course, course_metrics, draw_course
 from jumper_warp.evaluation.places import random_headings
 from jumper_warp.evaluation.plots import drawn
-from jumper_warp.evaluation.run import EvaluationArgs
+from jumper_warp.evaluation.run import EvaluationArgs, SkillRun
 from jumper_warp.evaluation.scripts import ScriptStep
-from jumper_warp.evaluation.skills import SkillRun
 from jumper_warp.policies.skills import SkillNames
 from jumper_warp.utils.errors import InputError
 
@@ -100,29 +97,21 @@ def random_script(rng: np.random.Generator, blocks: bool = True) -> list[ScriptS
     return script
 
 
-def plot(run: SkillRun, course: Course, world: int) -> None:
-    """Draw what one robot was told and did."""
-    with drawn(run.folder / "course.png", 5, 1, figsize=(10, 9), sharex=True) as axes:
-        draw_course(axes, course, world)
-        axes[0].set_title(f"walk, jump, walk: robot {world} of {len(course.end)}, {run.title}")
-
-
-def scripts(args: Args) -> Sequence[Sequence[ScriptStep]]:
+def scripts(args: Args) -> list[list[ScriptStep]]:
     """Return what every robot is to do."""
-    rng = np.random.default_rng(args.seed)
-    if args.course:
-        return [random_script(rng, args.blocks and args.solver == "jumper") for _ in range(args.robots)]
-    return [paper_script(rng) for _ in range(args.robots)]
+    rng, blocks = np.random.default_rng(args.seed), args.blocks and args.solver == "jumper"
+    return [random_script(rng, blocks) if args.course else paper_script(rng) for _ in range(args.robots)]
 
 
 def main(args: Args) -> dict:
     """Run the test and return its figures."""
-    names = SkillNames(args.policy, args.jump_up, args.jump_to)
-    run = SkillRun.of("course" if args.course else "walk_jump_walk", args, names)
+    name = "course" if args.course else "walk_jump_walk"
+    run = SkillRun.of(name, args, SkillNames(args.policy, args.jump_up, args.jump_to))
     course = Course(scripts(args), random_headings(args.robots, args.seed))
-    env = run.env(args.robots, block=course.block)
-    run.follow(env, course, film="course" if args.course else "walk_jump_walk")
-    plot(run, course, 0)
+    run.follow(run.env(args.robots, block=course.block), course, film=name)
+    with drawn(run.folder / "course.png", 5, 1, figsize=(10, 9), sharex=True) as axes:
+        draw_course(axes, course, 0)
+        axes[0].set_title(f"walk, jump, walk: robot 0 of {len(course.end)}, {run.title}")
     return run.report(course_metrics(course), {} if args.course else PAPER)
 
 

@@ -19,9 +19,10 @@ from jumper_warp.cli.main import run_command
 from jumper_warp.evaluation.places import random_headings
 from jumper_warp.evaluation.plots import drawn
 from jumper_warp.evaluation.run import EvaluationArgs, EvaluationRun
-from jumper_warp.evaluation.velocities import Walks, check_walks, walked
+from jumper_warp.evaluation.velocities import Walks, check_walks
 from jumper_warp.robot.terrain import KINDS, TerrainCfg, single_tile
 from jumper_warp.utils.errors import InputError
+from support.walks import walked
 
 SECONDS = 10.0
 """[s] Of each walk."""
@@ -55,18 +56,14 @@ class Args(EvaluationArgs):
         if not 0.0 < self.speed <= 0.6:
             raise InputError(f"speed must be in (0, 0.6] m/s, so that the walk ends on the tile, got {self.speed}")
 
-    @property
-    def terrain(self) -> TerrainCfg:
-        """The tile."""
-        return TerrainCfg(tile=14.0, uneven=self.uneven, slope=self.slope, step=(self.step, self.step))
-
 
 def main(args: Args) -> dict:
     """Walk on every terrain and return the figures."""
     run = EvaluationRun.of("walking_terrain", args, ("velocity",))
     commands, figures, shares = np.tile([args.speed, 0.0, 0.0], (args.robots, 1, 1)), {}, {}
+    terrain = TerrainCfg(tile=14.0, uneven=args.uneven, slope=args.slope, step=(args.step, args.step))
     for kind in args.terrains:
-        ground = single_tile(args.terrain, kind)
+        ground = single_tile(terrain, kind)
         env = run.env(args.robots, ground=ground)
         asked = Walks(commands, env.task, SECONDS, headings=random_headings(args.robots, args.seed))
         walks = run.follow(env, asked, film=kind, drawn={"ground": ground})

@@ -19,28 +19,15 @@ import numpy as np
 import tyro
 
 from jumper_warp.cli.main import run_command
-from jumper_warp.envs.env import Env
 from jumper_warp.evaluation.plots import drawn
 from jumper_warp.evaluation.run import EvaluationArgs, EvaluationRun
-from jumper_warp.evaluation.velocities import (
-    AXES,
-    HOLD,
-    Walks,
-    check_walks,
-    grid,
-    kept_speeds,
-    settling_times,
-    steps_of,
-    top_speed,
-    tracking_metrics,
-)
+from jumper_warp.evaluation.velocities import AXES, Walks, check_walks, grid, tracking_metrics
 from jumper_warp.utils.errors import InputError
 from support.gaits import Gait
+from support.walks import HOLD, REACH, STEP, kicked, redirected, settling_times, sped_up, speed_metrics
 
-REACH, STEP, KICK, GAIT_SPEED = 0.8, 0.8, 0.5, 0.8
-RAMP, KEEP, SHARE = 3.0, 5.0, 0.1
-DIRECTIONS = {"ahead": (0, 1.0, 4.0), "back": (0, -1.0, 4.0), "sideways": (1, 1.0, 2.0), "turning": (2, 1.0, 4.0)}
-"""Axis, sign and highest command [m/s] or [rad/s] of the test of top speed."""
+GAIT_SPEED = 0.8
+"""[m/s] Of the straight walk whose gait is measured."""
 PAPER = {"rmse_vx_m_s": 0.17, "rmse_vy_m_s": 0.05, "rmse_yaw_rate_rad_s": 0.12}
 """The paper's figures, on hardware, with commands up to 0.8 that a person gave."""
 
@@ -62,41 +49,6 @@ class Args(EvaluationArgs):
         if self.per_axis < 2:
             raise InputError(f"per_axis must be at least 2, got {self.per_axis}")
         check_walks(self.per_axis**3, 10.0)
-
-
-def redirected(env: Env, rng: np.random.Generator) -> Walks:
-    """Return walks with another command after 3 s."""
-    commands = steps_of(rng, env.num_envs, REACH, STEP)
-    return Walks(commands, env.task, 7.0, times=np.array([0.0, 3.0]))
-
-
-def sped_up(env: Env) -> tuple[Walks, np.ndarray]:
-    """Return walks at ever higher speeds, and the index of each robot's direction."""
-    which = np.arange(env.num_envs) % len(DIRECTIONS)
-    commands = np.zeros((env.num_envs, 7, 3))
-    for i, (axis, sign, highest) in enumerate(DIRECTIONS.values()):
-        speeds = sign * np.linspace(0.3, highest, int((which == i).sum()))
-        commands[which == i, :, axis] = speeds[:, None] * np.linspace(1.0 / 7.0, 1.0, 7)
-    times = RAMP * np.arange(7) / 7.0
-    return Walks(commands, env.task, RAMP + 1.0 + KEEP, times=times), which
-
-
-def kicked(env: Env, rng: np.random.Generator) -> Walks:
-    """Return walks with drawn commands whose velocity jumps at a drawn moment."""
-    n = env.num_envs
-    commands, angle = rng.uniform(-REACH, REACH, (n, 1, 3)), rng.uniform(0.0, 2.0 * np.pi, n)
-    kick = KICK * np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    return Walks(commands, env.task, 7.0, kick_time=rng.uniform(2.0, 4.0, n), kick=kick)
-
-
-def speed_metrics(walks: Walks, which: np.ndarray) -> dict:
-    """Return the highest speed that was kept in each direction."""
-    found = {}
-    for i, (name, (axis, _, _)) in enumerate(DIRECTIONS.items()):
-        unit = "rad_s" if axis == 2 else "m_s"
-        kept = kept_speeds(walks, axis, KEEP, SHARE)[which == i]
-        found[f"top_{name}_{unit}"] = top_speed(np.abs(walks.commands[which == i, -1, axis]), kept)
-    return found
 
 
 def plot(run: EvaluationRun, walks: Walks, settling: np.ndarray) -> None:

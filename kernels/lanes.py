@@ -1,66 +1,55 @@
-"""Exchange between the four threads that share a world, a thread a leg.
+"""Exchange between the threads of a GPU's warp that share a world: four, a thread a leg, or 32, eight attempts of four.
 
-Threads of a world are neighbours, leg fastest, and all threads of a warp must reach every call together: none may stand
-behind an `and` or `or`, which leave out what no longer matters, or in a branch that not all take. On the CPU,
-where these functions serve tests, a block is the four threads of one world (launch with `block_dim=4`).
+Legs are neighbours, leg fastest, and all threads of a warp must reach every call together: none may stand behind an
+`and` or `or`, which leave out what no longer matters, or in a branch that not all take. On the CPU, where these
+functions serve tests, a block is the threads of one world (launch with `block_dim=4`, or 32).
 """
 
 import warp as wp
 
 from .scalar import mat33, quat, real, vec3
 
-# On the CPU threads of a block take turns: each leaves its value in a box, waits, and reads.
-_SUM = """
+
+def _exchange(gpu: str, sent: str, received: str, threads: int = 4) -> str:
+    """Return the code of an exchange. Threads of a CPU's block take turns: each fills its box, waits, and reads."""
+    return f"""
 #if defined(__CUDA_ARCH__)
-    x += __shfl_xor_sync(0xffffffffu, x, 1);
-    return x + __shfl_xor_sync(0xffffffffu, x, 2);
+    {gpu}
 #else
-    static decltype(x) box[4];
-    box[WP_TILE_THREAD_IDX % 4] = x;
+    static decltype({sent}) box[{threads}];
+    const int place = WP_TILE_THREAD_IDX % {threads};
+    box[place] = {sent};
     WP_TILE_SYNC();
-    const decltype(x) sum = (box[0] + box[1]) + (box[2] + box[3]);
+    const auto received = {received};
     WP_TILE_SYNC();
-    return sum;
+    return received;
 #endif
 """
-_MAX = """
-#if defined(__CUDA_ARCH__)
-    x = wp::max(x, __shfl_xor_sync(0xffffffffu, x, 1));
-    return wp::max(x, __shfl_xor_sync(0xffffffffu, x, 2));
-#else
-    static decltype(x) box[4];
-    box[WP_TILE_THREAD_IDX % 4] = x;
-    WP_TILE_SYNC();
-    const decltype(x) most = wp::max(wp::max(box[0], box[1]), wp::max(box[2], box[3]));
-    WP_TILE_SYNC();
-    return most;
-#endif
-"""
-_FROM = """
-#if defined(__CUDA_ARCH__)
-    return __shfl_sync(0xffffffffu, x, leg, 4);
-#else
-    static decltype(x) box[4];
-    box[WP_TILE_THREAD_IDX % 4] = x;
-    WP_TILE_SYNC();
-    const decltype(x) value = box[leg];
-    WP_TILE_SYNC();
-    return value;
-#endif
-"""
-_FIRST = """
-#if defined(__CUDA_ARCH__)
-    const unsigned int votes = __ballot_sync(0xffffffffu, flag);
-    return wp::max(__ffs((votes >> (threadIdx.x & 28u)) & 15u) - 1, 0);
-#else
-    static bool box[4];
-    box[WP_TILE_THREAD_IDX % 4] = flag;
-    WP_TILE_SYNC();
-    const int first = box[0] ? 0 : box[1] ? 1 : box[2] ? 2 : box[3] ? 3 : 0;
-    WP_TILE_SYNC();
-    return first;
-#endif
-"""
+
+
+_SUM = _exchange(
+    "x += __shfl_xor_sync(0xffffffffu, x, 1); return x + __shfl_xor_sync(0xffffffffu, x, 2);",
+    "x", "(box[0] + box[1]) + (box[2] + box[3])",
+)  # fmt: skip
+_MAX = _exchange(
+    "x = wp::max(x, __shfl_xor_sync(0xffffffffu, x, 1)); return wp::max(x, __shfl_xor_sync(0xffffffffu, x, 2));",
+    "x", "wp::max(wp::max(box[0], box[1]), wp::max(box[2], box[3]))",
+)  # fmt: skip
+_FROM = _exchange("return __shfl_sync(0xffffffffu, x, leg, 4);", "x", "box[leg]")
+_FIRST = _exchange(
+    "const unsigned int votes = __ballot_sync(0xffffffffu, flag);"
+    "return wp::max(__ffs((votes >> (threadIdx.x & 28u)) & 15u) - 1, 0);",
+    "flag", "box[0] ? 0 : box[1] ? 1 : box[2] ? 2 : box[3] ? 3 : 0",
+)  # fmt: skip
+_LEAST = _exchange(
+    "return static_cast<int>(__reduce_min_sync(0xffffffffu, static_cast<unsigned int>(x)));",
+    "x", "[&] { int least = box[0]; for (int y : box) least = wp::min(least, y); return least; }()", 32,
+)  # fmt: skip
+_ALL = _exchange(
+    "return __all_sync(0xfu << (threadIdx.x & 28u), flag);",
+    "flag", "box[place & 28] && box[place & 28 | 1] && box[place & 28 | 2] && box[place & 28 | 3]", 32,
+)  # fmt: skip
+_FROM_OWN = _exchange("return __shfl_sync(0xfu << (threadIdx.x & 28u), x, leg, 4);", "x", "box[place & 28 | leg]", 32)
 _TURNS = """
 #if defined(__CUDA_ARCH__)
     x += __shfl_xor_sync(0xffffffffu, x, 4);
@@ -112,6 +101,24 @@ def from_leg(x: real, leg: int) -> real:
 @wp.func_native(_FIRST)
 def first_leg(flag: bool) -> int:
     """Return the first leg of the world whose flag is set, 0 if none is."""
+    ...
+
+
+@wp.func_native(_LEAST)
+def least_of_attempts(x: int) -> int:
+    """Return the smallest number, >= 0, among the 32 threads of a world."""
+    ...
+
+
+@wp.func_native(_ALL)
+def all_of_attempt(flag: bool) -> bool:
+    """Return whether a flag is set in all four threads of an attempt, which reach this call together."""
+    ...
+
+
+@wp.func_native(_FROM_OWN)
+def from_leg_of_attempt(x: float, leg: int) -> float:
+    """Return the value of one leg of the attempt, whose four threads reach this call together."""
     ...
 
 

@@ -14,26 +14,36 @@ from jumper_warp.policies.folder import list_policies
 ROOT = Path(__file__).parents[1]
 SOURCES = ("jumper_warp", "kernels", "assets", "setup.py", "pyproject.toml", "README.md", "LICENSE")
 BUILD = "from setuptools.build_meta import build_wheel; print(build_wheel('.'))"
+INSTALL = ("-m", "pip", "install", "--no-deps", "--no-index", "--disable-pip-version-check", "--quiet")
 USE = """
 import jumper_warp
 from jumper_warp.cli.main import main
 from jumper_warp.policies.folder import list_policies, load_policy
 from jumper_warp.robot.description import load_description
-from jumper_warp.tasks.jump.references import load_reference
 
 print(jumper_warp.__file__)
 main(["list"])
-load_description(), load_reference("farthest")
+load_description()
 for name in list_policies():
     load_policy(name)  # checks every file
 """
+BOTH = """
+import kernels, jumper_warp.kernels.scalar
+print(kernels.OWNER, kernels.__file__, jumper_warp.kernels.scalar.__file__)
+"""
+
+
+def python(*args, folder, paths=()):
+    """Run Python in a folder, and return what it prints, by lines, and its errors."""
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(map(str, paths))}
+    done = subprocess.run([sys.executable, *args], cwd=folder, env=environment, capture_output=True, text=True)
+    return done.returncode, done.stdout.splitlines(), done.stderr
 
 
 def run(code, folder, *paths):
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(map(str, paths))}
-    done = subprocess.run([sys.executable, "-c", code], cwd=folder, env=environment, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
-    return done.stdout.splitlines()
+    returncode, printed, errors = python("-c", code, folder=folder, paths=paths)
+    assert returncode == 0, errors
+    return printed
 
 
 @pytest.fixture(scope="module")
@@ -46,6 +56,16 @@ def wheel(tmp_path_factory):
     return tree / run(BUILD, tree)[-1]
 
 
+@pytest.fixture(scope="module")
+def other_wheel(tmp_path_factory):
+    """Path of a wheel of another project, whose only package is `kernels`."""
+    tree = tmp_path_factory.mktemp("other")
+    (tree / "kernels").mkdir()
+    (tree / "kernels" / "__init__.py").write_text("OWNER = 'other'\n")
+    (tree / "pyproject.toml").write_text('[project]\nname = "kernels"\nversion = "1.0"\n')
+    return tree / run(BUILD, tree)[-1]
+
+
 def test_wheel_holds_one_package_and_all_assets(wheel):
     names = set(zipfile.ZipFile(wheel).namelist())
     for folder, inside in (("jumper_warp", ""), ("kernels", "jumper_warp/"), ("assets", "jumper_warp/")):
@@ -54,7 +74,7 @@ def test_wheel_holds_one_package_and_all_assets(wheel):
         assert files and files <= names, sorted(files - names)[:5]
     others = {name.split("/")[0] for name in names} - {"jumper_warp"}
     assert len(others) == 1 and others.pop().endswith(".dist-info")
-    assert wheel.stat().st_size < 40e6  # 22.8 MB
+    assert wheel.stat().st_size < 16e6
 
 
 def test_wheel_finds_its_assets_from_another_folder(wheel, tmp_path):
@@ -64,3 +84,20 @@ def test_wheel_finds_its_assets_from_another_folder(wheel, tmp_path):
     package, *listed = run(USE, elsewhere, site)
     assert Path(package).is_relative_to(site)
     assert [line.split()[1] for line in listed if line.startswith("policy")] == list(list_policies())
+
+
+@pytest.mark.parametrize("ours_first", [True, False])
+def test_another_package_named_kernels_is_installed_beside_ours(wheel, other_wheel, ours_first, tmp_path):
+    site = tmp_path / "site"
+    for path in (wheel, other_wheel) if ours_first else (other_wheel, wheel):
+        returncode, _, errors = python(*INSTALL, "--target", str(site), str(path), folder=tmp_path)
+        assert returncode == 0 and "already exists" not in errors, errors
+    (printed,) = run(BOTH, tmp_path, site)
+    inside = (str(site / "kernels" / "__init__.py"), str(site / "jumper_warp" / "kernels" / "scalar.py"))
+    assert printed == " ".join(("other", *inside))
+
+
+def test_folder_of_the_kernels_is_not_imported_under_its_own_name():
+    returncode, _, errors = python("-c", "import kernels", folder=ROOT)
+    assert returncode == 1
+    assert errors.splitlines()[-1].startswith("ImportError: import jumper_warp.kernels: the folder kernels/ is not")

@@ -14,10 +14,16 @@ from typing import Any
 import numpy as np
 import torch
 
-from jumper_warp.evaluation.angles import yaw_of
-from jumper_warp.evaluation.jumps import DELAY, jump_commands
+from jumper_warp.envs.env import Env
+from jumper_warp.evaluation.jumps import DELAY, jump_commands, yaw_of
 from jumper_warp.evaluation.log import NO_END, EvaluationLog, Metrics, failures, finite, largest, mean
-from jumper_warp.tasks.switching import FALLS_FROM_FLIGHT
+from jumper_warp.evaluation.run import HEIGHTS, EvaluationArgs, Run, conditions_of
+from jumper_warp.policies.policy import Policy
+from jumper_warp.policies.restore import restored_task
+from jumper_warp.policies.runs import open_policy
+from jumper_warp.policies.spec import PolicyError
+from jumper_warp.registry import make_task
+from jumper_warp.tasks.switching import FALLS_FROM_FLIGHT, flight_skills
 from support.momentum import momentum
 
 JUMP, TURN = 0, 1
@@ -230,16 +236,55 @@ def flight_metrics(flights: Flights) -> Metrics:
     }
 
 
-def flight_actor(env: Any, flights: Flights, turn: Any, landing: Any | None) -> Callable[[torch.Tensor], torch.Tensor]:
-    """Return the actions of both skills, (2, num_envs, 12), as `run_evaluation` takes them.
+class FlightRun(Run):
+    """Follows flights of a jump and a policy that turns."""
 
-    turn: the policy that turns; landing: that of the jump, which acts after the takeoff, or None.
-    """
-    scale = env.skills[JUMP].task.action_scale[1]
+    def __init__(self, args: EvaluationArgs, landing: str, jump: str) -> None:
+        """Open the policies that turn (args) and land (none if empty); jump: the task that takes off and lands then.
 
-    def act(obs: torch.Tensor) -> torch.Tensor:
-        jump = None if landing is None else landing.act(env.skills[JUMP].obs["policy"])
-        action = torch.as_tensor(flights.action(scale, jump), dtype=torch.float32, device=env.device)
-        return torch.stack([action, turn.act(env.skills[TURN].obs["policy"])])
+        Raises PolicyError or CheckpointError: one cannot be used, or is of another kind of task.
+        """
+        super().__init__()
+        self.turn: Policy = open_policy(args.policy)
+        self.landing: Policy | None = open_policy(landing) if landing else None
+        turning = restored_task(self.turn.config)
+        if turning.evaluation != "attitude":
+            raise PolicyError(f"this needs a policy that turns in flight, {args.policy} is of {turning.name}")
+        takes_off = make_task(jump) if self.landing is None else restored_task(self.landing.config)
+        if takes_off.evaluation not in HEIGHTS:
+            raise PolicyError(f"this needs a jump to heights, got {takes_off.name}")
+        self.tasks = takes_off, turning
+        self.flights: Flights | None = None
+        self.prepare("flight_attitude", conditions_of(args), args.out, record=args.record)
 
-    return act
+    def actor(self, env: Env) -> Callable[[torch.Tensor], torch.Tensor]:
+        """Return the actions of both skills, (2, num_envs, 12)."""
+        scale = env.skills[JUMP].task.action_scale[1]
+
+        def act(obs: torch.Tensor) -> torch.Tensor:
+            jump = None if self.landing is None else self.landing.act(env.skills[JUMP].obs["policy"])
+            action = torch.as_tensor(self.flights.action(scale, jump), dtype=torch.float32, device=env.device)
+            return torch.stack([action, self.turn.act(env.skills[TURN].obs["policy"])])
+
+        return act
+
+    def env(self, count: int) -> Env:
+        """Return the environment of robots that jump and turn."""
+        conditions = self.conditions
+        tasks, handovers = flight_skills(*(conditions.applied(task) for task in self.tasks))
+        env = Env(
+            tasks, count, seed=conditions.seed, device=conditions.device, solver=conditions.solver,
+            randomize=conditions.draws, noise=conditions.noise, auto_reset=False, threads=conditions.threads,
+            handovers=handovers,
+        )  # fmt: skip
+        for policy in (self.turn, self.landing):
+            if policy is not None:
+                policy.to(env.device)
+        self.told["gravity_m_s2"] = env.task.gravity
+        return env
+
+    def fly(self, env: Env, flights: Flights, film: str) -> Flights:
+        """Follow flights, and return them."""
+        self.flights = flights
+        self.follow(env, flights, film=film)
+        return flights

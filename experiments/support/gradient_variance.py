@@ -2,12 +2,27 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 import torch
+from rich.console import Console
+from rich.table import Table
 
 from jumper_warp.diff.differentiable_env import DifferentiableEnv
+from jumper_warp.envs.env import Env
+from jumper_warp.evaluation.plots import drawn
+from jumper_warp.policies.policy import Policy
+from jumper_warp.policies.runs import open_policy
+from jumper_warp.rl.networks import ActorCritic
 from jumper_warp.trajectory.gauss_newton import Network, Tape, world_rows
+
+NOISE = 0.2
+"""[1] Standard deviation of the actions in windows."""
+ESTIMATORS = ("physics", "score")
 
 
 @dataclass(frozen=True)
@@ -57,3 +72,49 @@ def gradients(env: DifferentiableEnv, network: Network, horizon: int, std: float
     left = torch.stack(rewards).detach().flip(0).cumsum(0).flip(0)
     advantage = left - left.mean(1, keepdim=True)
     return by_physics, world_rows((torch.stack(scores) * advantage).sum(), scored)
+
+
+def policies() -> dict[str, Policy]:
+    """Return the trained policy, and one with new weights and the same interface."""
+    trained = open_policy("vertical_jump")
+    face = trained.interface
+    torch.manual_seed(0)
+    new = ActorCritic(face.sizes[0], face.sizes[-1], face.hidden, face.activation)
+    return {"new": Policy.from_actor(new.actor, trained.mean, trained.std, face), "trained": trained}
+
+
+def spreads_of(policy: Policy, env: DifferentiableEnv, horizons: tuple[int, ...]) -> dict[str, list[Spread]]:
+    """Return the spreads of a policy's gradients over windows of these policy steps, by estimator."""
+    network, found = Network(policy, device=env.device), []
+    for horizon in horizons:
+        torch.manual_seed(1)
+        env.reset(seed=1)
+        found.append([spread_of(rows) for rows in gradients(env, network, horizon, NOISE)])
+    return dict(zip(ESTIMATORS, map(list, zip(*found, strict=True)), strict=True))
+
+
+def variances(make_env: Callable[[], Env], horizons: tuple[int, ...], path: Path) -> dict[str, Any]:
+    """Measure spreads over horizons, draw them, and return them."""
+    values: dict[str, Any] = {"horizons": list(horizons)}
+    table = Table("policy", "steps", *(f"{name}: {what}" for name in ESTIMATORS for what in ("deviation", "worlds")))
+    with drawn(path, 1, 2, figsize=(11, 4.5)) as axes:
+        for i, (who, policy) in enumerate(policies().items()):
+            found = spreads_of(policy, DifferentiableEnv(make_env(), world_norm=math.inf), horizons)
+            for horizon, *pair in zip(horizons, *found.values(), strict=True):
+                cells = [f"{x:.3g}" for spread in pair for x in (spread.deviation, spread.worlds_needed)]
+                table.add_row(who, str(horizon), *cells)
+            for name, spreads in found.items():
+                for what in ("deviation", "signal", "worlds_needed", "non_finite"):
+                    series = [getattr(spread, what) for spread in spreads]
+                    values[f"{what}_{name}_{who}"] = [x if math.isfinite(x) else None for x in series]
+                style = {"color": f"C{i}", "linestyle": "-" if name == "physics" else "--", "marker": "o"}
+                axes[0].plot(horizons, [s.deviation for s in spreads], label=f"{who}, {name}", **style)
+                axes[1].plot(horizons, [s.worlds_needed for s in spreads], **style)
+        axes[0].set(ylabel="deviation between worlds")
+        axes[1].set(ylabel="worlds until noise is as long as the signal")
+        for axis in axes:
+            axis.set(xscale="log", yscale="log", xlabel="policy steps of the window")
+            axis.grid(alpha=0.3)
+        axes[0].legend()
+    Console().print(table)
+    return values

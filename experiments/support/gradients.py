@@ -39,6 +39,14 @@ def schedule(push: tuple[float, float]) -> np.ndarray:
     return targets.reshape(TICKS, 12)
 
 
+def start() -> tuple[np.ndarray, np.ndarray]:
+    """Return coordinates (43,) and rates (38,) of the squat, in the ground, where no contact is about to switch."""
+    squat = dataclasses.replace(load_description(), poses={"squat": (0.0, SQUAT)})
+    q = standing_configuration(squat, "squat")
+    q[2] -= 1.0e-4
+    return q, np.zeros(38)
+
+
 class GradientJump:
     """Jumps from NumPy inputs, by name: targets (TICKS, 12), q (19,), qd (18,), table (rows,), saturation (12,)."""
 
@@ -46,9 +54,7 @@ class GradientJump:
         self.num_worlds = num_worlds
         model = build_model(num_worlds, visuals=False, device=device)
         self.rollout = Rollout(model, jumping_motors(), vertical_jump_filter(), double=double, every=1)
-        squat = dataclasses.replace(load_description(), poses={"squat": (0.0, SQUAT)})
-        q, qd = (row[:, 0] for row in compact(standing_configuration(squat, "squat"), np.zeros(38)))
-        q[2] -= 1.0e-4  # in the ground, where no contact is about to switch
+        q, qd = (row[:, 0] for row in compact(*start()))
         self.values = {"targets": schedule(PUSH), "q": q, "qd": qd}
         self.values |= {name: self.rollout.parameters[name].numpy()[:, 0].astype(float) for name in PARAMETERS}
 

@@ -4,18 +4,23 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
+from jumper_warp.evaluation.heights import run_jumps
+from jumper_warp.evaluation.plots import drawn
 from jumper_warp.identification.excitation import unsafe
 from jumper_warp.identification.findings import Identification
 from jumper_warp.identification.identify import identify, total_mass, weighed
 from jumper_warp.identification.least_squares import Knowledge
 from jumper_warp.identification.motions import Motion
 from jumper_warp.identification.parameters import ParameterSet
-from jumper_warp.identification.plans import KINDS, Plan, draw_plan
-from jumper_warp.identification.recording import measured, replay_plan
+from jumper_warp.identification.recording import KINDS, Plan, draw_plan, measured, replay_plan
 from jumper_warp.identification.replay import Record, Replay
+from jumper_warp.policies.conditions import Conditions, env_of_policy
+from jumper_warp.policies.runs import open_policy
+from jumper_warp.robot.overlay import overlay_of
 from jumper_warp.robot.values import RobotValues
 
 SPREAD, MOST = 0.7, 1.5
@@ -96,22 +101,55 @@ def accuracy(parameters: ParameterSet, case: Case, found: Identification) -> dic
 def run_case(
     parameters: ParameterSet, case: Case, replay: Replay, ours: Carry, dt: float | None = None
 ) -> tuple[dict[str, float], Identification]:
-    """Identify one robot and return its figures; ours: carries a plan out as the model does."""
+    """Identify one robot and return its metrics; ours: carries a plan out as the model does."""
     found = identify(case.motions, parameters, knowledge=[case.mass], replay=replay, dt=dt)
-    before = prediction_errors(case, parameters.robots(np.zeros((1, len(parameters)))), ours)
-    after = prediction_errors(case, found.robots(), ours)
-    figures = accuracy(parameters, case, found) | {
-        "chi2": found.chi2,
-        "nominal_chi2": found.nominal_chi2,
-        "identified": float(found.identified.sum()),
-        "wall_s": found.seconds,
-        "cpu_s": found.cpu_seconds,
-        "million_world_steps": found.world_steps / 1.0e6,
-        "held_out_nominal_deg": before[0],
-        "held_out_deg": after[0],
-        "held_out_ratio": before[0] / after[0],
-        "held_out_nominal_mm": before[1],
-        "held_out_mm": after[1],
-        "held_out_height_ratio": before[1] / after[1],
+    (nominal_deg, nominal_mm), (deg, mm) = (
+        prediction_errors(case, robots, ours)
+        for robots in (parameters.robots(np.zeros((1, len(parameters)))), found.robots())
+    )
+    metrics = accuracy(parameters, case, found) | {
+        "chi2": found.chi2, "nominal_chi2": found.nominal_chi2, "identified": float(found.identified.sum()),
+        "wall_s": found.seconds, "cpu_s": found.cpu_seconds, "million_world_steps": found.world_steps / 1.0e6,
+        "held_out_nominal_deg": nominal_deg, "held_out_deg": deg, "held_out_ratio": nominal_deg / deg,
+        "held_out_nominal_mm": nominal_mm, "held_out_mm": mm, "held_out_height_ratio": nominal_mm / mm,
+    }  # fmt: skip
+    return metrics, found
+
+
+def policy_errors(name: str, jumps: int, case: Case, found: Identification, folder: Path) -> dict[str, float]:
+    """Return how well the described and the identified robot predict a policy's jumps on the true one."""
+    quantities = tuple(dict.fromkeys(parameter.quantity for parameter in found.parameters))
+    overlays = {"true": overlay_of(case.robots, quantities, source="truth"), "identified": found.overlay("identified")}
+    apex, success = {}, {}
+    for robot in ("true", "identified", "described"):
+        if robot in overlays:
+            overlays[robot].save(folder / f"{robot}.json")
+        policy = open_policy(name)
+        conditions = Conditions(device="cpu", robot=folder / f"{robot}.json" if robot in overlays else None)
+        env = env_of_policy(policy, jumps, conditions)
+        policy.to(env.device)
+        log = run_jumps(policy.act, env, np.linspace(0.5, 1.0, jumps))
+        apex[robot], success[f"policy_success_{robot}"] = log.apex.copy(), float(np.mean(log.reached))
+    errors = {
+        f"policy_apex_error_{robot}_m": float(np.mean(np.abs(apex[robot] - apex["true"])))
+        for robot in ("described", "identified")
     }
-    return figures, found
+    return {"policy_error_on_true_m": float(np.mean(np.abs(apex["true"] - log.commanded)))} | errors | success
+
+
+def plot_cases(rows: list[dict[str, float]], path: Path) -> None:
+    """Draw χ², coverage, held-out errors and time of `run_case` over seeds."""
+    panels = (
+        ("χ² per value", {"": "chi2"}, {}),
+        ("share within 95 % interval", {"": "coverage"}, {"ylim": (0.0, 1.0)}),
+        ("held-out angle error [deg]", {"described": "held_out_nominal_deg", "identified": "held_out_deg"},
+         {"yscale": "log"}),
+        ("time [s]", {"wall": "wall_s", "CPU": "cpu_s"}, {"ylim": (0.0, None)}),
+    )  # fmt: skip
+    with drawn(path, 1, len(panels), figsize=(14, 3.2)) as axes:
+        for axis, (title, series, settings) in zip(axes, panels, strict=True):
+            for label, name in series.items():
+                axis.plot([row[name] for row in rows], "o", label=label)
+            axis.set(xlabel="seed", ylabel=title, **settings)
+            if len(series) > 1:
+                axis.legend()

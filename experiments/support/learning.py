@@ -3,18 +3,24 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 import warp as wp
 
 from jumper_warp.envs.env import Env
-from jumper_warp.evaluation.jumps import run_jumps
+from jumper_warp.evaluation.heights import run_jumps
+from jumper_warp.evaluation.plots import drawn
 from jumper_warp.rl.ppo import Ppo
 from jumper_warp.rl.shac import Shac
 from jumper_warp.tasks.cfg import TaskCfg
 
+RATES = (0.5, 0.8, 0.9, 0.95, 1.0)
+"""[1] Success rates whose first times are reported."""
 TESTED = (0.5, 1.1)
 """[m] Heights of the test's jumps, unless others are asked for."""
 
@@ -28,6 +34,8 @@ class Curve:
     steps: list[int] = field(default_factory=list)
     """Policy steps of all worlds together, so far."""
     iterations: int = 0
+    ready: float = 0.0
+    """[s] From the start of the process until training began, where it was measured."""
 
     def seconds_to(self, rate: float) -> float | None:
         """Return the first training time [s] at which an evaluation had at least this success rate, if any."""
@@ -80,3 +88,29 @@ def learning_curve(
         curve.steps.append(curve.iterations * ppo.batch_size)
         curve.success.append(success(ppo, judge, heights))
     return curve
+
+
+def curve_metrics(curve: Curve, name: str) -> dict[str, Any]:
+    """Return the metrics of one training, and print when it reached each of RATES."""
+    pace = curve.steps[-1] / curve.seconds[-1]
+    values = {f"success_{name}": curve.success[-1], f"steps_per_s_{name}": pace}
+    values |= {f"curve_{series}_{name}": getattr(curve, series) for series in ("seconds", "steps", "success")}
+    for rate in RATES:
+        seconds, key = curve.seconds_to(rate), f"{100 * rate:g}_percent_{name}"
+        steps = None if seconds is None else curve.steps[curve.seconds.index(seconds)]
+        values |= {f"seconds_to_{key}": seconds, f"steps_to_{key}": steps}
+        print(f"{name}, {100 * rate:g} %: " + ("never" if steps is None else f"{seconds:.0f} s, {steps / 1e6:.2f} M"))
+    print(f"{name}: {100 * curve.success[-1]:.1f} % at the end, {pace:,.0f} steps a second", flush=True)
+    return values
+
+
+def draw_curves(curves: Mapping[str, Sequence[Curve]], path: Path) -> None:
+    """Draw success over time and steps, a color for each name."""
+    with drawn(path, 1, 2, figsize=(11, 4.5), sharey=True) as axes:
+        for i, (name, runs) in enumerate(curves.items()):
+            for number, curve in enumerate(runs):
+                for axis, x in zip(axes, (curve.seconds, np.array(curve.steps) / 1e6), strict=True):
+                    axis.plot(x, curve.success, color=f"C{i}", label=None if number else name)
+        axes[0].set(xlabel="training time [s]", ylabel="success [1]")
+        axes[1].set(xlabel="steps [million]")
+        axes[0].legend()

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
+from jumper_warp.evaluation.log import Metrics
 from jumper_warp.utils.rotations import INVERSE, rotate
 
 
@@ -42,3 +44,28 @@ def _links(sim: Any) -> tuple[np.ndarray, ...]:
     com = frame[..., :3] + rotate(frame[..., 3:], model.body_com.numpy().reshape(n, -1, 3).astype(float))
     arm = com - (mass * com).sum(axis=1, keepdims=True) / mass.sum(axis=1, keepdims=True)
     return mass, inertia, frame[..., 3:], arm, twist
+
+
+@dataclass
+class MomentumWatch:
+    """Follows the momentum of all robots; call it after every policy step."""
+
+    env: Any
+    angular: list[np.ndarray] = field(default_factory=list)
+    """[kg m^2/s] (num_envs, 3) after every policy step, world axes."""
+
+    def __call__(self, *_: Any) -> None:
+        """Add the moment."""
+        self.angular.append(momentum(self.env.sim)[1])
+
+    def metrics(self, apart: np.ndarray, inertia: np.ndarray) -> Metrics:
+        """Return drifts of robots that did not come apart; inertia [kg m^2]: (num_envs, 3, 3) about the com."""
+        drift = np.array(self.angular)[:, ~apart]
+        turned = np.linalg.solve(inertia[~apart], drift.sum(axis=0)[..., None])[..., 0] * self.env.step_dt
+        size, by = np.linalg.norm(drift, axis=-1), np.degrees(np.linalg.norm(turned, axis=-1))
+        return {
+            "max_angular_momentum_nm_s": float(size.max()),
+            "mean_angular_momentum_at_end_nm_s": float(size[-1].mean()),
+            "mean_turn_by_drift_deg": float(by.mean()),
+            "max_turn_by_drift_deg": float(by.max()),
+        }

@@ -3,53 +3,47 @@
 from __future__ import annotations
 
 import math
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 import warp as wp
 
+from jumper_warp.diff.rollout import compact
+from jumper_warp.diff.torch_rollout import TorchTrajectory
 from jumper_warp.evaluation.film import ankles
+from jumper_warp.evaluation.plots import drawn
 from jumper_warp.kernels.collision.robot import collision_kernel
 from jumper_warp.kernels.layout import COORDS
 from jumper_warp.robot.gravity import EARTH
 from jumper_warp.robot.model import MOTOR_JOINTS, build_model
-from jumper_warp.robot.motors import FilterCfg, MotorCfg
 from jumper_warp.sim.simulation import Simulation, motor_values
-from jumper_warp.tasks.jump.references import COLUMNS, ROWS
+from jumper_warp.trajectory.problem import Motion, Problem
 
 CONTACT_FORCE = 0.1
 """[N] Above it a paw is in contact."""
 SPEED = 0.25
 """[m/s] Of the base upward, with which a jump takes off."""
-LONGEST_PUSH = 0.15
-"""[s] From the deepest squat until the first paw lifts, at most."""
-FRICTION, PAW_RADIUS = 0.85, 0.025
-"""[1] Of the paws, [m]."""
+PAW_RADIUS = 0.025
+"""[m]"""
 
 
 class Replay:
     """A motion in one world of the simulation that trains policies, in single precision, at every physics step."""
 
-    def __init__(
-        self,
-        targets: np.ndarray,
-        motors: MotorCfg,
-        command_filter: FilterCfg,
-        *,
-        friction: float = FRICTION,
-        device: str | None = None,
-        notes: dict[str, Any] | None = None,
-    ) -> None:
-        """Simulate targets [rad] (steps, 12) from standing."""
+    def __init__(self, targets: np.ndarray, problem: Problem, *, notes: dict[str, Any] | None = None) -> None:
+        """Simulate targets [rad] (steps, 12) from standing, with the robot of a problem."""
         from jumper_warp.viz.recorder import Recorder
 
-        self.sim = Simulation(
-            1, motors=motors, command_filter=command_filter, friction=friction, device=device
-        )  # fmt: skip
+        self.problem = problem
+        self.sim = Simulation(1, motors=problem.motors, command_filter=problem.command_filter,
+                              friction=problem.friction, gravity=problem.gravity, device=problem.device)  # fmt: skip
         self.targets, self.recorder = targets, Recorder(self.sim.model, notes=notes)
         rows: list[tuple] = []
-        self.states: list[tuple[np.ndarray, np.ndarray]] = []
+        self.states = [compact(self.sim.joint_q(), self.sim.joint_qd())]
+        self.impulses: list[np.ndarray] = []
         self.poses: list[np.ndarray] = []
         self.flags, self.work = 0, 0.0
         for target in targets:
@@ -58,18 +52,9 @@ class Replay:
             for _ in range(self.sim.substeps):
                 rows.append(self._physics_step(len(rows)))
             self._record(rows[-1])
-        (
-            self.time,
-            self.height,
-            self.up,
-            self.force,
-            self.gap,
-            self.tilt,
-            self.power,
-            self.angle,
-            self.torque,
-            self.base,
-        ) = (np.array(column) for column in zip(*rows, strict=True))
+        columns = (np.array(column) for column in zip(*rows, strict=True))
+        (self.time, self.height, self.up, self.force, self.gap, self.tilt, self.power, self.angle,
+         self.torque) = columns  # fmt: skip
         self._follow()
 
     def _physics_step(self, number: int) -> tuple:
@@ -79,23 +64,21 @@ class Replay:
         q, qd = sim.joint_q()[0], sim.joint_qd()[0]
         torque = sim.torque.numpy()[:, 0].copy()
         power = torque * 0.5 * (before + motor_values(qd[6:]))
+        self.impulses.append(sim.dt * sim.paw_force.numpy())
         force = np.linalg.norm(sim.paw_force.numpy()[:, 0], axis=1)
         pose = sim.state.body_q.numpy().copy()
         tilt = math.acos(min(1.0, 1.0 - 2.0 * (q[3] ** 2 + q[4] ** 2)))
         gap = ankles(pose[None])[0, :, 2] - PAW_RADIUS
-        velocity = sim.base_velocity()[0]
-        paws = ankles(pose[None])[0, :, 0].mean()
-        base = (q[0] - paws, q[2], 2.0 * math.atan2(q[4], q[6]), velocity[0], velocity[2], qd[4])
         return (
-            (number + 1) * sim.dt, q[2], velocity[2], force, gap, tilt, np.maximum(power, 0.0).sum(),
-            motor_values(q[7:]), torque, base,
+            (number + 1) * sim.dt, q[2], sim.base_velocity()[0, 2], force, gap, tilt, np.maximum(power, 0.0).sum(),
+            motor_values(q[7:]), torque,
         )  # fmt: skip
 
     def _record(self, row: tuple) -> None:
         sim = self.sim
         pose = sim.state.body_q.numpy().copy()
         self.poses.append(pose)
-        self.states.append((sim.joint_q()[0].copy(), sim.joint_qd()[0].copy()))
+        self.states.append(compact(sim.joint_q(), sim.joint_qd()))
         flags, clearance = wp.zeros(1, dtype=int, device=sim.device), wp.zeros(1, dtype=float, device=sim.device)
         robot = sim.physics.dynamics.robot
         wp.launch(
@@ -135,28 +118,20 @@ class Replay:
                 self.highest_lift = max(self.highest_lift, float((self.gap[first + later[0] :, leg] * off).max()))
                 self.touched += 1
 
-    def reference(self, distance: float) -> dict[str, Any]:
-        """Return the base's motion from the deepest squat until a paw lifts for good, as `assets/motions` holds it.
+    @cached_property
+    def motion(self) -> Motion:
+        """Return the replay as what objectives and constraints are functions of."""
+        q, qd = (np.stack(column) for column in zip(*self.states, strict=True))
+        parts = q, qd, self.torque[..., None], np.stack(self.impulses), self.targets[..., None]
+        device = str(self.problem.rollout(1).device)
+        return self.problem.recorded(TorchTrajectory(*(torch.as_tensor(x, dtype=torch.float64, device=device)
+                                                       for x in parts)))  # fmt: skip
 
-        distance: [m] that the jump flies, from its start.
-        """
-        first = self.takeoff * self.sim.substeps
-        end = int(np.flatnonzero((self.force[:first] > CONTACT_FORCE).all(axis=1))[-1])
-        begin = max(0, end - round(LONGEST_PUSH / self.sim.dt))
-        begin += int(np.argmin(self.height[begin : end + 1]))
-        places = np.linspace(begin, end, ROWS)
-        moments = np.arange(len(self.base))
-        rows = np.stack([np.interp(places, moments, column) for column in self.base.T], axis=1)
-        middle = float(np.interp(0.5 * (begin + end), moments, self._paws_x()))
-        return {
-            "columns": list(COLUMNS), "seconds": (end - begin) * self.sim.dt, "distance_m": round(distance - middle, 4),
-            "apex_m": round(self.apex, 4), "rows": [[round(float(x), 4) for x in row] for row in rows],
-        }  # fmt: skip
-
-    def _paws_x(self) -> np.ndarray:
-        """Return the middle of the paws along x [m], at every physics step."""
-        ticks = np.array([ankles(pose[None])[0, :, 0].mean() for pose in self.poses])
-        return np.repeat(ticks, self.sim.substeps)
+    @property
+    def violation(self) -> float:
+        """Return the largest constraint of the problem, at least 0."""
+        constraints = self.problem.values(self.motion).constraints
+        return max(0.0, float(constraints.max())) if constraints.shape[1] else 0.0
 
     def metrics(self) -> dict[str, Any]:
         """Return what is told of every jump."""
@@ -184,3 +159,25 @@ class Replay:
             state.body_q.assign(self.poses[moment])
             pictures.append(Camera(model, (x + 1.2, 2.0, 0.7), (x, 0.0, 0.5), (300, 400)).picture(state))
         contact_sheet(pictures, path, [f"{moment / 60:.2f} s" for moment in moments])
+
+
+def plot(replays: dict[str, Replay], path: Path) -> None:
+    """Draw height, angles of two legs, torques and paw forces over time, a column for each label."""
+    with drawn(path, 4, len(replays), figsize=(4.2 * len(replays), 10), sharex="col", squeeze=False) as axes:
+        for column, (label, replay) in zip(axes.T, replays.items(), strict=True):
+            column[0].plot(replay.time, replay.height)
+            column[0].axvline(replay.takeoff / 60.0, color="0.7", linestyle="--")
+            for i, motor in ((1, "FL outer"), (2, "FL inner"), (7, "BL outer"), (8, "BL inner")):
+                column[1].plot(replay.time, np.degrees(replay.angle[:, i]), label=motor)
+                column[2].plot(replay.time, replay.torque[:, i], label=motor)
+            column[3].plot(replay.time, replay.force[:, 0], label="FL")
+            column[3].plot(replay.time, replay.force[:, 2], label="BL")
+            column[0].set_title(label)
+            column[3].set_xlabel("time [s]")
+            for axis in column:
+                axis.grid(alpha=0.3)
+        labels = ("base height [m]", "motor angle [deg]", "motor torque [N m]", "paw force [N]")
+        for axis, label in zip(axes[:, 0], labels, strict=True):
+            axis.set_ylabel(label)
+        axes[1, 0].legend(fontsize=8)
+        axes[3, 0].legend(fontsize=8)

@@ -4,19 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from jumper_warp.evaluation.limits import EXTEND, HOLD, RAMP
+from jumper_warp.evaluation.plots import drawn
 from jumper_warp.robot.model import LEGS, MOTOR_JOINTS
 from jumper_warp.sim.simulation import Simulation, motor_values
 
 if TYPE_CHECKING:
     from jumper_warp.viz.recorder import Recorder
 
-STAND, RAMP, HOLD, EXTEND, LAND = 60, 25, 50, 40, 60
-"""Ticks of 1/60 s: default pose, ramp into the squat, squat, full extension, default pose again."""
-
+STAND, LAND = 60, 60
+"""Ticks of 1/60 s in the default pose, before and after the jump."""
 
 SQUAT = 135.0
 """[deg] Transversal angle commanded for the squat; the filter holds it back."""
@@ -116,3 +118,25 @@ def jump_metrics(trace: Trace) -> dict[str, float]:
         values[f"peak_torque_{name}_nm"] = np.abs(trace.torque[:, i]).max()
         values[f"peak_speed_{name}_rad_s"] = np.abs(trace.rate[:, i]).max()
     return {name: float(value) for name, value in values.items()}
+
+
+def draw_trace(path: Path, trace: Trace, title: str, hardware: float) -> None:
+    """Draw height, vertical speed, angles, torques and paw forces over time; hardware [m]: apex of the robot."""
+    with drawn(path, 5, 1, figsize=(9, 12), sharex=True) as axes:
+        axes[0].plot(trace.time, trace.height)
+        axes[0].axhline(hardware, color="0.6", linestyle="--", label="hardware, 18 N m")
+        axes[1].plot(trace.time, trace.speed)
+        for i, name in enumerate(MOTOR_JOINTS):
+            if name.endswith(("outer", "inner")) and name.startswith(("FL", "BL")):
+                axes[2].plot(trace.time, np.degrees(trace.angle[:, i]), label=name)
+                axes[3].plot(trace.time, trace.torque[:, i], label=name)
+        for i, leg in enumerate(LEGS):
+            axes[4].plot(trace.time, trace.force[:, i, 2], label=leg)
+        labels = ("base height [m]", "vertical speed [m/s]", "motor angle [deg]", "motor torque [N m]", "paw force [N]")
+        for axis, label in zip(axes, labels, strict=True):
+            axis.set_ylabel(label)
+            axis.grid(alpha=0.3)
+            if axis is not axes[1]:
+                axis.legend(ncols=4, fontsize=8, loc="upper left")
+        axes[-1].set_xlabel("time [s]")
+        axes[0].set_title(title)

@@ -11,18 +11,26 @@ from typing import Any
 import numpy as np
 import torch
 
-from jumper_warp.robot.motors import FilterCfg, horizontal_jump_filter, jumping_motors, vertical_jump_filter
+from jumper_warp.robot.motors import (
+    FilterCfg,
+    MotorCfg,
+    horizontal_jump_filter,
+    jumping_motors,
+    loose_filter,
+    vertical_jump_filter,
+)
 from jumper_warp.sim.simulation import SUBSTEPS
 from jumper_warp.trajectory import jumps
 from jumper_warp.trajectory.augmented_lagrangian import Progress, minimise
 from jumper_warp.trajectory.problem import Knots, Problem, Term
 from jumper_warp.trajectory.smoothing import Stage, smoothed
 from support.motion_replay import SPEED, Replay
-from support.takeoff_search import KNOTS, TICKS
 
 PITCH, AWAY, AHEAD = math.radians(29.8), 0.2985, 0.045
-"""[rad], [m], [m] Most pitch at landing, of the base from its start in stance, of hind paws on the ground; a little
-less than `support.takeoff_search` allows."""
+"""[rad], [m], [m] Largest pitch at landing, distance of the base from its start in stance, and distance of hind paws on
+the ground ahead of their start; slightly inside 30 degrees, 0.3 m (the task's limit) and 0.05 m."""
+FREE = 100.0
+"""[rad], [m] Limit that never binds."""
 TILT = math.radians(8.0)
 """[rad] Most of vertical jumps, at any time."""
 DRIFT = 0.15
@@ -72,24 +80,27 @@ def run_ups(knots: Knots, count: int, rng: np.random.Generator, push: int = 40) 
     return np.where(now < stretch, before, -1.0).reshape(count, -1)
 
 
+def around(x: np.ndarray, knots: Knots, rng: np.random.Generator) -> np.ndarray:
+    """Return a jump that may be shorter and variants of it, as candidates for other knots; its end is filled with 0."""
+    whole = np.zeros((len(knots.at), 4))
+    whole[: len(x) // 4] = x.reshape(-1, 4)
+    spread = np.linspace(0.0, 0.2, 64)[:, None]
+    return np.clip(whole.ravel() + spread * rng.normal(size=(64, whole.size)), -1.0, 1.0)
+
+
 @dataclass(frozen=True)
 class Jump:
     """What is optimised."""
 
     label: str
     unit: str
-    """Of what `told` returns."""
+    """Of `value`."""
     make: Callable[..., Problem]
     """Returns the problem, given a part's settings, device and threads."""
     stages: tuple[tuple[Mapping[str, Any], Stage], ...]
     """Parts of the search: settings of `make`, and the part."""
-    told: Callable[[Replay], float | None]
-    """What is told of the replay."""
-    torque: float = 18.0
-    """[N m] Limit of the transversal motors."""
-    lateral_torque: float = 18.0
-    """[N m]"""
-    command_filter: Callable[[], FilterCfg] = vertical_jump_filter
+    value: Callable[[Replay], float]
+    """Returns the reported value of a replay."""
     draw: Callable[[Knots, int, np.random.Generator], np.ndarray] = squats
     """Returns so many random candidates."""
     samples: int = 2048
@@ -99,10 +110,9 @@ class Jump:
     after: str = ""
     """Name of the jump whose best motion is a start too."""
 
-    def replay(self, targets: np.ndarray, **settings: Any) -> Replay:
-        """Return a motion of these targets [rad] (steps, 12); settings: as of `Replay`."""
-        motors = jumping_motors(self.torque, lateral_torque=self.lateral_torque)
-        return Replay(targets, motors, self.command_filter(), **settings)
+    def replay(self, targets: np.ndarray, device: str | None = None) -> Replay:
+        """Return the replay of targets [rad] (steps, 12)."""
+        return Replay(targets, self.make(**FINE, device=device, threads=1), notes={"jump": self.label})
 
     def scaled(self, effort: float) -> Jump:
         """Return the same with other numbers of iterations."""
@@ -112,18 +122,30 @@ class Jump:
         return replace(self, stages=stages)
 
 
-def _far(lean: float = 0.0, **settings: Any) -> Problem:
+FORWARD_KNOTS = Knots((0.0, 8.0, 16.0, *map(float, range(24, 48))), steps=53)
+"""Of the farthest flight."""
+
+
+def motors_of(torque: float, speed: float = 1.0) -> MotorCfg:
+    """Return motors with a torque limit [N m] of the transversal ones, and their speeds times `speed`."""
+    motors = jumping_motors(torque, lateral_torque=12.0)
+    kind = motors.transversal
+    faster = replace(kind, cutoff_speed=speed * kind.cutoff_speed, no_load_speed=speed * kind.no_load_speed)
+    return replace(motors, transversal=faster, fade_start=speed * motors.fade_start, fade_end=speed * motors.fade_end)
+
+
+def _far(
+    lean: float = 0.0, *, torque: float = 18.0, speed: float = 1.0, pitch: float = PITCH, away: float = AWAY,
+    command_filter: Callable[[], FilterCfg] = horizontal_jump_filter, **settings: Any,
+) -> Problem:  # fmt: skip
     """Return the farthest flight; lean: [1] weight of how far back the base goes before it, up to BACK."""
-    knots = Knots(tuple(map(float, KNOTS)), steps=TICKS + 5)
     constraints = (
-        jumps.landing_pitch(PITCH), jumps.stays(AWAY, SPEED), jumps.clear(speed=SPEED), jumps.no_run_up(AHEAD),
+        jumps.landing_pitch(pitch), jumps.stays(away, SPEED), jumps.clear(speed=SPEED), jumps.no_run_up(AHEAD),
         jumps.takes_off(SPEED),
     )  # fmt: skip
     far, back = jumps.farthest(SPEED), jumps.leans_back(BACK, SPEED)
     objective = (lambda motion: far(motion) + lean * back(motion)) if lean else far
-    return Problem(
-        knots, objective, constraints, jumping_motors(18.0, lateral_torque=12.0), horizontal_jump_filter(), **settings
-    )
+    return Problem(FORWARD_KNOTS, objective, constraints, motors_of(torque, speed), command_filter(), **settings)
 
 
 UP = Knots((0.0, 6.0, 12.0, 18.0, 22.0, *map(float, range(24, 44, 1))), steps=ESTIMATE)
@@ -163,9 +185,8 @@ FORWARD = (
 )
 JUMPS = {
     "farthest": Jump(
-        "farthest flight, 18 N m", "m", _far, FORWARD, lambda replay: None, lateral_torque=12.0,
-        command_filter=horizontal_jump_filter, draw=run_ups, samples=768,
-        polish=5,
+        "farthest flight, 18 N m", "m", _far, FORWARD, lambda replay: -float(jumps.farthest(SPEED)(replay.motion)),
+        draw=run_ups, samples=768, polish=5,
     ),
     "highest": Jump(
         "highest jump, 18 N m", "m", lambda **s: _vertical(jumps.highest(), jumps.takes_off(), **s), UPWARD,
@@ -174,7 +195,7 @@ JUMPS = {
     "highest_24_8": Jump(
         "highest jump, 24.8 N m", "m",
         lambda **s: _vertical(jumps.highest(), jumps.takes_off(), torque=24.8, **s), UPWARD,
-        lambda replay: replay.apex, torque=24.8,
+        lambda replay: replay.apex,
     ),
     "least_work": Jump(
         f"least work to {HEIGHT:g} m", "J",
@@ -191,12 +212,28 @@ JUMPS = {
         lambda replay: replay.longest_lift, draw=partial(squats, push=30), samples=1024, after="least_work",
     ),
 }  # fmt: skip
+LIMITS: dict[str, tuple[str, dict[str, Any]]] = {
+    "torque_24_8": ("24.8 N m", {"torque": 24.8}),
+    "speed": ("motor speeds × 1.5", {"speed": 1.5}),
+    "friction_1_5": ("friction 1.5", {"friction": 1.5}),
+    "friction_0_6": ("friction 0.6", {"friction": 0.6}),
+    "pitch": ("any pitch at landing", {"pitch": FREE}),
+    "stance": ("stance beyond 0.3 m", {"away": FREE}),
+    "filter": ("loose command filter", {"command_filter": loose_filter}),
+}
+"""What may limit the farthest flight: label, and the changed settings of its problem."""
+LIMITED = {
+    f"farthest_{name}": replace(
+        JUMPS["farthest"], label=f"farthest flight, {label}", make=partial(_far, **changed), after="farthest"
+    )
+    for name, (label, changed) in LIMITS.items()
+}
 
 
 def optimise(
-    jump: Jump, begin: np.ndarray, *, seed: int, polish: int, tell: Callable[[str], None], **settings: Any
-) -> tuple[Progress, list[Problem]]:
-    """Return what was found from candidates, and the problems that counted the steps; settings: device, threads."""
+    jump: Jump, begin: np.ndarray, seed: int, polish: int, **settings: Any
+) -> tuple[Progress, dict[str, float]]:
+    """Return what was found from candidates, and the simulated and reverse policy steps; settings: device, threads."""
     problems = {str(how): jump.make(**how, **settings) for how in (FINE, *(how for how, _ in jump.stages))}
     merits: list[torch.Tensor] = []
     found = begin
@@ -204,5 +241,10 @@ def optimise(
         found = smoothed(
             problems[str(how)], found, stages=(stage,), seed=seed + number, tell=lambda _, last: merits.append(last)
         )
-        tell(f"part {number + 1}: {len(found)} starts, objective with penalties {float(merits[-1][0]):.3f}")
-    return minimise(problems[str(FINE)], found, iterations=polish, step=0.01, seed=seed), list(problems.values())
+        best = float(merits[-1][0])
+        print(f"{jump.label}, part {number + 1}: {len(found)} starts, objective with penalties {best:.3f}", flush=True)
+    progress = minimise(problems[str(FINE)], found, iterations=polish, step=0.01, seed=seed)
+    return progress, {
+        "simulated_steps": float(sum(problem.world_steps for problem in problems.values())),
+        "reverse_steps": float(sum(problem.reverse_steps for problem in problems.values())),
+    }

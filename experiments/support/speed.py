@@ -16,7 +16,8 @@ from jumper_warp.registry import make_task
 from jumper_warp.rl.cfg import PpoCfg
 from jumper_warp.rl.logger import Stopwatch
 from jumper_warp.rl.ppo import Ppo
-from jumper_warp.sim.simulation import Simulation
+from jumper_warp.robot.model import build_model
+from jumper_warp.sim.simulation import Simulation, SolverName
 from jumper_warp.sim.slices import SlicedGraph, Worlds
 from support.timing import device_memory, median_time, wall_time
 
@@ -61,6 +62,30 @@ def time_jump(sim: Simulation, repeats: int) -> tuple[float, float]:
         if not np.all(apex > 0.8):
             raise RuntimeError(f"the robots do not jump: apex {apex.min():.3f} to {apex.max():.3f} m")
     return float(np.median(times)), float(apex.mean())
+
+
+def time_solver(solver: SolverName, envs: int, steps: int, repeats: int, device: str | None) -> dict[str, float]:
+    """Return the metrics of one solver at one number of environments; steps: in a repetition, standing."""
+    build_model(1, device=device)  # Newton's own modules are not part of the metrics
+    before, made = device_memory(wp.get_device(device)), []
+
+    def make() -> None:
+        made.append(Simulation(envs, solver=solver, observe_forces=False, visuals=False, device=device))
+        made[0].step()
+        made[0].step()
+
+    values = {"setup_s": wall_time(make, device)}
+    (sim,) = made
+    values["ms_per_step_standing"] = 1e3 * time_standing(sim, steps, repeats)
+    jump, values["apex_m"] = time_jump(sim, repeats)
+    values["ms_per_step_jump"] = 1e3 * jump
+    values |= {f"steps_per_s_{phase}": 1e3 * envs / values[f"ms_per_step_{phase}"] for phase in ("standing", "jump")}
+    if sim.device.is_cuda:
+        values["memory_kib_per_env"] = (device_memory(sim.device) - before) / envs / 1024.0
+    if solver == "jumper":
+        values["largest_residual_m_s"] = float(sim.solver.residual.numpy().max())
+        values["most_sweeps"] = int(sim.solver.sweeps.numpy().max())
+    return values
 
 
 def standing_solver(envs: int, device: str | None) -> Callable[[], None]:
@@ -131,11 +156,25 @@ def time_stages(envs: int, device: str | None, repeats: int) -> dict[str, float]
     return parts
 
 
+def time_parts(envs: Sequence[int], train_envs: int, steps: int, repeats: int, device: str | None) -> dict[str, float]:
+    """Return metrics of solver and environment by number of environments, and of the parts of a policy step."""
+    values: dict[str, float] = {}
+    for n in sorted({*envs, train_envs}):
+        bodies = standing_solver(n, device), stepping_env(n, device)[1]
+        solver, step = (median_time(body, device, steps, repeats) for body in bodies)
+        values |= {f"solver_steps_per_s_{n}": n / solver, f"env_steps_per_s_{n}": n / step}
+        if n == train_envs:
+            values["env_step_us"] = 1e6 * step
+    parts = time_stages(train_envs, device, repeats)
+    values |= {f"{part}_us": 1e6 * wall for part, wall in parts.items()}
+    return values | {f"{part}_share": wall / sum(parts.values()) for part, wall in parts.items()}
+
+
 def time_ppo(envs: int, cfg: PpoCfg, iterations: int, device: str | None) -> dict[str, float]:
     """Return figures of training with this package's PPO; the policy must have changed and stayed finite.
 
-    `ppo_device_memory_gib`: in use on a GPU, by whatever. With overlap, `ppo_update_s` is what the update takes longer
-    than the rollout beside it. `ppo_ready_s`: compilation and the first iterations, until all graphs are captured.
+    `ppo_device_memory_gib`: in use on a GPU, by whatever. `ppo_ready_s`: compilation and the first iterations, until
+    all graphs are captured.
     """
     env, _ = stepping_env(envs, device)
     begin = time.perf_counter()

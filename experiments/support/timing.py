@@ -37,6 +37,12 @@ def median_time(body: Callable[[], Any], device: wp.DeviceLike = None, calls: in
     return float(np.median([wall_time(body, device, calls) for _ in range(repeats)]))
 
 
+def process_age() -> float:
+    """Return the seconds since this process was started, by the system's clock."""
+    ticks = int(Path("/proc/self/stat").read_text().rsplit(")", 1)[1].split()[19])
+    return time.clock_gettime(time.CLOCK_BOOTTIME) - ticks / os.sysconf("SC_CLK_TCK")
+
+
 def device_memory(device: wp.Device) -> int:
     """Return bytes in use on a GPU, 0 on a CPU."""
     return device.total_memory - device.free_memory if device.is_cuda else 0

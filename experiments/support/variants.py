@@ -14,14 +14,9 @@ DEFAULT = "default"
 VARIANTS: dict[str, dict[str, Any]] = {
     DEFAULT: {},
     **{
-        "_".join([{"off": "eager", "on": "compiled"}[mode], precision, *(["overlap"] if overlap else [])]): {
-            "compile": mode,
-            "precision": precision,
-            "overlap": overlap,
-        }
-        for mode, precision, overlap in product(("off", "on"), ("float32", "bfloat16"), (False, True))
+        f"{name}_{precision}": {"compile": mode, "precision": precision}
+        for (mode, name), precision in product((("off", "eager"), ("on", "compiled")), ("float32", "bfloat16"))
     },
-    "one_stream": {"streams": False},
     "four_minibatches": {"minibatches": 4},
     "less_noise": {"init_std": 0.5},
     "less_noise_bfloat16": {"init_std": 0.5, "precision": "bfloat16"},

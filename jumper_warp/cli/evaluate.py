@@ -1,4 +1,4 @@
-"""`jumper evaluate POLICY`: a policy is tried many times, in the way that its task is evaluated.
+"""`jumper evaluate POLICY [--suite NAME]`: a policy is tried many times, in the way of its task, or of a suite.
 
 The policy comes first: what it is decides which flags there are.
 """
@@ -24,7 +24,10 @@ usage: jumper {command} POLICY [flags]
   POLICY    name or folder of a policy, a training run's folder, or a checkpoint; `jumper list` shows the project's
 
 Flags differ between tasks: jumper {command} POLICY --help shows those of one."""
-ABOUT = "Try a policy many times and report how well it did: metrics.json, and a list of all that was tried."
+ABOUT = """\
+Try a policy many times and report how well it did: metrics.json, and a list of all that was tried.
+jumper evaluate POLICY --suite NAME [flags] runs a test of jumps instead, such as sweep, grid, ring or max."""
+SUITE = "--suite"
 
 
 def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> None:
@@ -36,7 +39,23 @@ def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> None:
     from jumper_warp.evaluation.commands import EvaluateCfg, evaluate
 
     opened = open_run(policy, modules)
+    if SUITE in args:
+        run_suite(opened, args)
+        return
     evaluate(opened, parse("evaluate", opened, args[1:], EvaluateCfg, lambda kind: kind.flags))
+
+
+def run_suite(opened: EvaluationRun, args: Sequence[str]) -> None:
+    """Run the suite that the arguments name. Raises UsageError: the policy's task has none of that name."""
+    from jumper_warp.evaluation.suites import suites_for
+
+    flag = args.index(SUITE)
+    suites, name = suites_for(opened.task.evaluation), "".join(args[flag + 1 : flag + 2])
+    if name not in suites:
+        there = ", ".join(suites) or "none"
+        raise UsageError(f"no suite {name!r:.60} for policies of {opened.task.name}; there are {there}")
+    command, default = f"evaluate {opened.source} {SUITE} {name}", suites[name](policy=str(opened.source))
+    parse_flags(suites[name], command, [*args[1:flag], *args[flag + 2 :]], default=default).run(opened.modules)
 
 
 def policy_of(command: str, about: str, args: Sequence[str]) -> str:

@@ -45,7 +45,7 @@ def export(cfg: ExportCfg) -> Path:
     from jumper_warp.policies.blend import blend
     from jumper_warp.policies.folder import checked_folder, save_policy
     from jumper_warp.policies.onnx import export_onnx
-    from jumper_warp.policies.restore import is_run, learning_curve, open_policy
+    from jumper_warp.policies.runs import is_run, learning_curve, open_policy
 
     source = Path(cfg.source)
     if cfg.out is not None and cfg.out.suffix != ".onnx":

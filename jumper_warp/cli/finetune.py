@@ -21,7 +21,7 @@ def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> None:
     name = policy_of("finetune", ABOUT, args)
     from jumper_warp.evaluation.finetuning import FinetuneArgs, finetune
     from jumper_warp.policies.folder import checked_folder, save_policy
-    from jumper_warp.policies.restore import open_policy
+    from jumper_warp.policies.runs import open_policy
     from jumper_warp.policies.spec import PolicyError
     from jumper_warp.utils.runtime import announce
 

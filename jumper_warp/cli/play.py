@@ -23,7 +23,7 @@ def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> None:
     Raises UsageError or OSError with one line: the policy or a flag cannot be used. Exits where tyro does.
     """
     if args and args[0].startswith("-") and any(arg.partition("=")[0] == SCRIPT for arg in args):
-        from jumper_warp.evaluation.play_script import ScriptCfg, play_script
+        from jumper_warp.evaluation.commands import ScriptCfg, play_script
 
         play_script(parse_flags(ScriptCfg, f"play {SCRIPT} FILE", args))
         return

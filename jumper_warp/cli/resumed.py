@@ -1,4 +1,4 @@
-"""The settings of the run that `jumper train --resume` goes on with."""
+"""The settings of the run that `jumper train --resume` continues."""
 
 from __future__ import annotations
 
@@ -10,14 +10,13 @@ from typing import TYPE_CHECKING, Any
 
 from jumper_warp.policies.restore import restored_task
 from jumper_warp.rl.checkpoint import DAMAGE, CheckpointError, one_line
-from jumper_warp.rl.resume import SESSION, find_checkpoint
+from jumper_warp.rl.resume import SESSION
 from jumper_warp.robot.overlay import RobotOverlay
+from jumper_warp.tasks.saving import TaskError, check_version
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
-    from jumper_warp.cli.train import TrainArgs
     from jumper_warp.rl.cfg import TrainCfg
+    from jumper_warp.rl.checkpoint import Checkpoint
     from jumper_warp.tasks.cfg import TaskCfg
 
 
@@ -26,47 +25,40 @@ def loaded_modules() -> list[ModuleType]:
     return [module for module in sys.modules.values() if isinstance(module, ModuleType)]
 
 
-def with_run(default: TrainArgs, cfg: TrainCfg) -> tuple[TrainArgs, TaskCfg]:
-    """Return the settings of the run that `cfg.resume` names, and its task.
+def settings_of_run(checkpoint: Checkpoint, cfg: TrainCfg) -> tuple[dict[str, Any], TaskCfg]:
+    """Return the settings of a checkpoint's run, by the fields of `jumper_warp.cli.train.TrainArgs`, and its task.
 
-    default: For what the run does not tell, and for what is of the session, see SESSION.
+    cfg: Settings that the run does not have, and those of the session, see SESSION.
 
     Raises:
-        InputError: There is no such run, it is of another task or of version 1, or its settings cannot be used.
+        CheckpointError: The run is of another task or version, or its settings cannot be used.
     """
-    path, saved = saved_config(cfg)
+    saved = _config(checkpoint, cfg.task)
     try:
         env, train = saved["env"], {name: v for name, v in saved["train"].items() if name not in SESSION}
-        args = dataclasses.replace(
-            default,
-            cfg=with_saved(default.cfg, train),
-            solver="mujoco" if env.get("solver") == "SolverMuJoCo" else "jumper",
-            randomize=env.get("randomize", default.randomize),
-            noise=env.get("noise", default.noise),
-            robot_of_run=RobotOverlay.from_json(env["robot"]) if "robot" in env else None,
-        )
-        return args, restored_task(saved, loaded_modules(), leave_out=())
+        settings = {name: env[name] for name in ("randomize", "noise") if name in env}
+        settings |= {"cfg": with_saved(cfg, train), "checkpoint": checkpoint}
+        settings["solver"] = "mujoco" if env.get("solver") == "SolverMuJoCo" else "jumper"
+        settings["robot_of_run"] = RobotOverlay.from_json(env["robot"]) if "robot" in env else None
+        return settings, restored_task(saved, loaded_modules(), leave_out=())
     except DAMAGE as error:
-        raise CheckpointError(f"{path}: settings in its configuration: {one_line(error)}") from error
+        raise CheckpointError(f"{checkpoint.path}: settings in its configuration: {one_line(error)}") from error
 
 
-def saved_config(cfg: TrainCfg) -> tuple[Path, dict[str, Any]]:
-    """Return the checkpoint that is resumed and its configuration.
-
-    Raises:
-        CheckpointError: There is none, or it is of another task or of a run from before tasks had a version.
-    """
-    path, state, _ = find_checkpoint(cfg)
+def _config(checkpoint: Checkpoint, task: str) -> dict[str, Any]:
+    """Return a checkpoint's configuration. Raises CheckpointError: it is of another task or version."""
+    path = checkpoint.path
     try:
-        saved = json.loads(state["config"])
-        name, older = saved["train"]["task"], "version" not in saved["env"]["task"]
+        saved = json.loads(checkpoint.state["config"])
+        name = saved["train"]["task"]
+        check_version(saved["env"]["task"])
+    except TaskError as error:
+        raise CheckpointError(f"{path}: {error}") from error
     except (KeyError, TypeError, ValueError) as error:
         raise CheckpointError(f"{path}: no task in its configuration ({type(error).__name__}: {error})") from error
-    if older:
-        raise CheckpointError(f"{path}: of a run of version 1, which can be exported and played but not resumed")
-    if name != cfg.task:
-        raise CheckpointError(f"{path}: of a run of {name!s:.60}, not of {cfg.task}")
-    return path, saved
+    if name != task:
+        raise CheckpointError(f"{path}: of a run of {name!s:.60}, not of {task}")
+    return saved
 
 
 def with_saved(settings: Any, saved: dict[str, Any]) -> Any:

@@ -4,21 +4,18 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from types import ModuleType
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated, Literal
 
 import tyro
 
 from jumper_warp.cli.main import TASK_MODULE_HELP, UsageError, parse
+from jumper_warp.identification.motions import NoiseLevels, load_motions
+from jumper_warp.identification.parameters import jumper_parameters
 from jumper_warp.utils.errors import InputError
-
-if TYPE_CHECKING:
-    from jumper_warp.identification.findings import Identification
-    from jumper_warp.identification.motions import Motion
-    from jumper_warp.identification.parameters import ParameterSet
-    from jumper_warp.identification.residuals import NoiseLevels
+from jumper_warp.utils.files import write_whole
 
 HELP = f"""\
 usage: jumper sysid DATA ... [flags]
@@ -33,22 +30,6 @@ The result identified.json is for --robot of jumper train, evaluate and play.
 jumper sysid DATA --help shows the flags, and so do excite --help and actuator --help.
 
 {TASK_MODULE_HELP}"""
-
-
-@dataclass(frozen=True)
-class Noise:
-    """Standard deviations of the sensors' noise."""
-
-    angle: float = 0.05
-    """[deg]"""
-    rate: float = 1.0
-    """[deg/s]"""
-    torque: float = 0.3
-    """[N m]"""
-    position: float = 5.0
-    """[mm] Of the base."""
-    orientation: float = 0.5
-    """[deg] Of the base."""
 
 
 @dataclass(frozen=True)
@@ -72,7 +53,7 @@ class SysidCfg:
     """Staged Levenberg-Marquardt over parallel worlds, or CMA-ES."""
     max_seconds: float = 60.0
     """[s] Time that CMA-ES takes."""
-    noise: Noise = Noise()
+    noise: NoiseLevels = field(default_factory=NoiseLevels)
     """Of the sensors."""
     base: Literal["", "free", "fixed"] = ""
     """Whether the base was free or fixed in all motions (default: as their files say)."""
@@ -106,7 +87,7 @@ class ExciteCfg:
     """Physics of the robot that is recorded."""
     robot: Path | None = None
     """Overlay of the robot that is recorded (default: as described)."""
-    noise: Noise = Noise()
+    noise: NoiseLevels = field(default_factory=NoiseLevels)
     """Of the sensors."""
     exact: bool = False
     """Record without noise."""
@@ -157,68 +138,34 @@ def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> None:
         sysid(parse(SysidCfg, "sysid", args))
 
 
-def parameters_of(groups: str, without: str = "") -> ParameterSet:
-    """Return the parameters of groups, without some. Raises InputError for a name that is none."""
-    from jumper_warp.identification.parameters import GROUPS, jumper_parameters
-
-    found = jumper_parameters([name for name in groups.split(",") if name])
-    left_out = [name for name in without.split(",") if name]
-    quantities = {parameter.quantity for parameter in found}
-    for name in left_out:
-        if name not in (*GROUPS, *found.names, *quantities):
-            raise InputError(f"no parameter {name!r:.60} to leave out; there are {', '.join(found.names)}")
-    return found.without(left_out)
+def names(text: str) -> list[str]:
+    """Return names that commas separate."""
+    return [name for name in text.split(",") if name]
 
 
-def noise_of(noise: Noise) -> NoiseLevels:
-    """Return noise levels. Raises InputError: one is not positive."""
-    from jumper_warp.identification.residuals import NoiseLevels
-
-    return NoiseLevels(**vars(noise))
-
-
-def motion_files(data: Sequence[Path]) -> list[Path]:
-    """Return the files of motions, those of folders by name. Raises InputError: there is none."""
-    files = []
-    for path in data:
-        if path.is_dir():
-            files += sorted(file for file in path.iterdir() if file.suffix in (".npz", ".csv", ".parquet"))
-        else:
-            files.append(path)
-    if not files:
-        raise InputError(f"no npz, csv or parquet file in {', '.join(map(str, data))}")
-    return files
-
-
-def sysid(cfg: SysidCfg) -> Identification:
-    """Identify and write the results; raises as `run`."""
+def sysid(cfg: SysidCfg) -> None:
+    """Identify, write and print the results; raises as `run`."""
     from rich.console import Console
     from rich.table import Table
 
-    from jumper_warp.identification.identify import identify, weighed
-    from jumper_warp.identification.motions import load_motion
-    from jumper_warp.identification.report import to_json, write_report
-    from jumper_warp.utils.files import write_whole
+    from jumper_warp.identification.identify import identify, identify_by_evolution, weighed
+    from jumper_warp.identification.report import write_results
     from jumper_warp.utils.output import output_dir
     from jumper_warp.utils.runtime import announce
 
-    parameters, noise = parameters_of(cfg.params, cfg.without), noise_of(cfg.noise)
+    cfg.noise.check()
+    parameters = jumper_parameters(names(cfg.params)).without(names(cfg.without))
     knowledge = [] if cfg.mass is None else [weighed(cfg.mass, cfg.mass_deviation)]
     given = {name: getattr(cfg, name) for name in ("base", "gains", "torque_limit", "torque_constant")}
-    motions = [load_motion(file, **given) for file in motion_files(cfg.data)]
+    motions = load_motions(cfg.data, **given)
     announce(cfg.device, cfg.threads)
-    settings = dict(noise=noise, knowledge=knowledge, dt=cfg.dt, device=cfg.device, threads=cfg.threads)
+    settings = dict(noise=cfg.noise, knowledge=knowledge, dt=cfg.dt, device=cfg.device, threads=cfg.threads)
     if cfg.method == "cma":
-        from jumper_warp.identification.evolution import identify_by_evolution
-
         found = identify_by_evolution(motions, parameters, max_seconds=cfg.max_seconds, **settings)
     else:
         found = identify(motions, parameters, **settings)
     folder = output_dir("sysid", cfg.out)
-    names = ", ".join(motion.name for motion in motions)
-    found.overlay(f"jumper sysid of {names}").save(folder / "identified.json")
-    write_whole(folder / "report.json", (json.dumps(to_json(found), indent=2) + "\n").encode())
-    write_report(found, folder)
+    write_results(found, folder, f"jumper sysid of {', '.join(motion.name for motion in motions)}")
     table = Table("parameter", "unit", "described", "found", "95 %", box=None)
     for parameter, value, (low, high), sure in zip(
         found.parameters, found.values, found.intervals, found.identified, strict=True
@@ -226,63 +173,51 @@ def sysid(cfg: SysidCfg) -> Identification:
         row = (parameter.name, parameter.unit, f"{parameter.nominal:.5g}", f"{value:.5g}", f"{low:.5g} … {high:.5g}")
         table.add_row(*row, style=None if sure else "dim")
     Console().print(table)
-    told = f"χ² {found.chi2:.4g} (described {found.nominal_chi2:.4g}), {found.seconds:.1f} s"
-    print(
-        told if found.mismatch == 1.0 else f"{told}; intervals {found.mismatch:.3g} times wider for the model's errors"
-    )
+    wider = f"; intervals {found.mismatch:.3g} times wider for the model's errors" if found.mismatch != 1.0 else ""
+    print(f"χ² {found.chi2:.4g} (described {found.nominal_chi2:.4g}), {found.seconds:.1f} s{wider}")
     for words in dict.fromkeys(direction.words for direction in found.directions):
         print(f"open: {words}")
     for line in found.doubts:
         print(f"misfit: {line}")
     print(folder / "report.html")
-    return found
 
 
-def excite(cfg: ExciteCfg) -> list[Motion]:
+def excite(cfg: ExciteCfg) -> None:
     """Plan, record and write motions; raises as `run`."""
     import numpy as np
 
-    from jumper_warp.identification.excitation import Scorer, choose
+    from jumper_warp.identification.excitation import Scorer, choose, record
     from jumper_warp.identification.identify import total_mass
-    from jumper_warp.identification.plans import KINDS
-    from jumper_warp.identification.recording import measured, simulate_plan
+    from jumper_warp.identification.recording import KINDS
     from jumper_warp.identification.replay import Replay
     from jumper_warp.robot.overlay import load_overlay
     from jumper_warp.robot.values import RobotValues
-    from jumper_warp.utils.files import write_whole
     from jumper_warp.utils.output import output_dir
     from jumper_warp.utils.runtime import announce
 
-    parameters, noise = parameters_of(cfg.params), noise_of(cfg.noise)
+    cfg.noise.check()
+    parameters = jumper_parameters(names(cfg.params))
     robots = RobotValues.nominal(1) if cfg.robot is None else load_overlay(cfg.robot).robots()
     announce("cpu", cfg.threads)
-    scorer = Scorer(parameters, noise, Replay(len(parameters) + 37, device="cpu", threads=cfg.threads))
+    scorer = Scorer(parameters, cfg.noise, Replay(device="cpu", threads=cfg.threads))
     chosen = choose(scorer, KINDS * cfg.sets, candidates=cfg.candidates, seconds=cfg.seconds, seed=cfg.seed)
     rng = None if cfg.exact else np.random.default_rng([cfg.seed, 1])
-    folder, motions = output_dir("excite", cfg.out), []
-    for i, (plan, gain) in enumerate(zip(chosen.plans, chosen.gain, strict=True)):
-        record = simulate_plan(plan, solver=cfg.solver, robots=robots)
-        name = f"{i}_{plan.kind.replace(' ', '_')}"
-        motions.append(measured(plan, name, record, robots, rng, noise, torque=cfg.torque))
-        motions[-1].save(folder / f"{name}.npz")
-        print(f"{name}: {plan.target.shape[0] / 60.0:.2f} s, information up to here {gain:.1f} nat")
-    expected = {
-        p.name: {"unit": p.unit, "expected_deviation": p.deviation(0.0, float(d)), "of_prior": float(d)}
-        for p, d in zip(parameters, chosen.deviations, strict=True)
-    }
+    folder = output_dir("excite", cfg.out)
+    motions = record(
+        chosen, folder, robots=robots, noise=cfg.noise, solver=cfg.solver, rng=rng, torque=cfg.torque
+    )  # fmt: skip
+    for motion, gain in zip(motions, chosen.gain, strict=True):
+        print(f"{motion.name}: {len(motion.time) / 240.0:.2f} s, information up to here {gain:.1f} nat")
     mass = float(total_mass(robots)[0])
-    told = {"mass_kg": mass, "gain_nat": list(chosen.gain), "refused": list(chosen.refused), "parameters": expected}
-    write_whole(folder / "excite.json", (json.dumps(told, indent=2) + "\n").encode())
+    write_whole(folder / "excite.json", (json.dumps({"mass_kg": mass} | chosen.to_json(), indent=2) + "\n").encode())
     sure = int((chosen.deviations < 0.5).sum())
     print(f"{sure} of {len(parameters)} parameters are expected to be identified; motions in {folder}")
     print(f"the recorded robot weighs {mass:.3f} kg: jumper sysid {folder} --mass {mass:.3f}")
-    return motions
 
 
 def characterise(cfg: ActuatorCfg) -> None:
-    """Fit one motor and write the result; raises as `run`."""
+    """Fit one motor, write and print the result; raises as `run`."""
     from jumper_warp.identification.actuators import characterise_motor, load_bench
-    from jumper_warp.utils.files import write_whole
     from jumper_warp.utils.output import output_dir
 
     found = characterise_motor(load_bench(cfg.bench), cfg.motor, cfg.torque_noise)

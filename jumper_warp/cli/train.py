@@ -50,6 +50,8 @@ class TrainArgs:
     """Robot overlay, as `jumper sysid` writes it; its ranges of randomisation replace the task's, and flags both."""
     robot_of_run: Annotated[Any, tyro.conf.Suppress] = None
     """Robot overlay of the run that is resumed."""
+    checkpoint: Annotated[Any, tyro.conf.Suppress] = None
+    """Checkpoint that is resumed."""
 
 
 def parse_train(args: Sequence[str]) -> tuple[TrainArgs, TaskCfg]:
@@ -73,9 +75,13 @@ def parse_train(args: Sequence[str]) -> tuple[TrainArgs, TaskCfg]:
     default, task = TrainArgs(TrainCfg(task=name, ppo=entry.ppo, best_by=entry.best_by)), make_task(name)
     given = {name: value_of(f"--{name.replace('_', '-')}", args[1:]) for name in ("resume", "log_root", "start_from")}
     if given["resume"]:
-        from jumper_warp.cli.resumed import with_run
+        from jumper_warp.cli.resumed import settings_of_run
+        from jumper_warp.rl.resume import find_checkpoint
 
-        default, task = with_run(default, dataclasses.replace(default.cfg, **{k: v for k, v in given.items() if v}))
+        named = dataclasses.replace(default.cfg, **{k: v for k, v in given.items() if v})
+        if checkpoint := find_checkpoint(named):
+            settings, task = settings_of_run(checkpoint, default.cfg)
+            default = dataclasses.replace(default, **settings)
     parsed = parse_settings(for_robot(task, overlay_in(args[1:])), default, args[1:])
     if parsed.cfg.task != name:
         raise UsageError(f"give the task once, got {name} and --task {parsed.cfg.task}")
@@ -191,7 +197,7 @@ def check_symmetry(task: TaskCfg, cfg: TrainCfg) -> None:
 def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> TrainResult:
     """Train as the arguments say; modules: that the user has named, whose tasks are registered by now.
 
-    Raises as `parse_train`, `jumper_warp.policies.start.start_from` and `jumper_warp.rl.runner.train`.
+    Raises as `parse_train`, `jumper_warp.policies.warm_start.start_from` and `jumper_warp.rl.runner.train`.
     """
     parsed, task = parse_train(args)
     from jumper_warp.rl.runner import train
@@ -200,8 +206,8 @@ def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> TrainResult:
     check_saving(task)
     check_symmetry(task, parsed.cfg)
     start = None
-    if parsed.cfg.start_from:
-        from jumper_warp.policies.start import start_from
+    if parsed.cfg.start_from and not parsed.checkpoint:
+        from jumper_warp.policies.warm_start import start_from
 
         start = start_from(parsed.cfg.start_from, task, parsed.cfg.ppo)
     first = os.environ.get("RANK", "0") == "0"
@@ -210,7 +216,8 @@ def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> TrainResult:
     as_rsl_rl = None
     if parsed.cfg.trainer == "rsl-rl":
         from jumper_warp.envs.rsl_rl import RslRlVecEnv as as_rsl_rl
-    result = train(parsed.cfg, env_maker(task, parsed), command_line(args, modules), as_rsl_rl, start)
+    make_env = env_maker(task, parsed)
+    result = train(parsed.cfg, make_env, command_line(args, modules), as_rsl_rl, start, parsed.checkpoint)
     if first:
         print(result.folder)
     return result

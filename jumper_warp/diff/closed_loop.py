@@ -8,21 +8,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import TYPE_CHECKING, NamedTuple
+from typing import Any, NamedTuple
 
-import numpy as np
 import torch
 import warp as wp
 
-from jumper_warp.diff.actuation import MOTOR_CONSTANTS
 from jumper_warp.diff.rollout import Rollout
+from jumper_warp.diff.snapshot import Snapshot
 from jumper_warp.diff.torch_rollout import simulate
-from jumper_warp.sim.simulation import motor_values
 from jumper_warp.utils.errors import InputError
-
-if TYPE_CHECKING:
-    from jumper_warp.envs.env import Env
-    from jumper_warp.tasks.terms import ObservationTerm
 
 DOWN = (0.0, 0.0, -1.0)
 
@@ -99,16 +93,17 @@ class ClosedLoop:
     and gives its values with their derivatives.
     """
 
-    def __init__(self, env: Env, *, double: bool = False) -> None:
-        """Take the robots of an environment as they are; see `read_parameters`.
+    def __init__(self, env: Any, *, double: bool = False) -> None:
+        """Take the robots of a `jumper_warp.envs.env.Env` as they are; see `read_parameters`.
 
         Raises InputError: several tasks, another solver, drawn blocks, late sensors, or a history of what is not the
         robot's state alone.
         """
-        task = env.skills[0].task
-        if len(env.skills) > 1 or not hasattr(env.sim.physics, "dynamics") or env.config()["solver"] != "SolverJumper":
+        robots: Snapshot = env.snapshot()
+        self.task = task = robots.tasks[0]
+        if len(robots.tasks) > 1 or robots.solver != "SolverJumper":
             raise InputError("gradients need an environment of one task on SolverJumper")
-        if env.sim.physics.dynamics.robot.ground.blocks.shape[0]:
+        if robots.blocks:
             raise InputError("gradients need a ground without moving blocks: train with level ground")
         if task.randomization.observation_latency:
             raise InputError(f"{task.name}: gradients need observations without latency")
@@ -117,7 +112,7 @@ class ClosedLoop:
                 raise InputError(f"{task.name}: gradients of a history need one of the robot's state, not {term.name}")
         self.env, self.num_worlds = env, env.num_envs
         self.rollout = Rollout(
-            env.sim.model, task.motors, task.command_filter, double=double, dt=env.sim.dt, substeps=env.sim.substeps
+            robots.model, task.motors, task.command_filter, double=double, dt=robots.dt, substeps=robots.substeps
         )
         self.dtype = torch.float64 if double else torch.float32
         self.draws = bool(task.rows["events"])
@@ -131,36 +126,24 @@ class ClosedLoop:
         like = {"dtype": self.dtype, "device": env.device}
         self.scale = torch.tensor(4 * [lateral, transversal, transversal], **like)
         """(12,) [rad]"""
-        self.default = wp.to_torch(env.robot.default_angle).to(**like)
+        self.default = robots.default_angle.to(**like)
         """(12,) [rad]"""
-        self._motors = torch.as_tensor(motor_values(np.arange(36)), device=env.device)
         self.read_parameters()
 
     def read_parameters(self) -> dict[str, torch.Tensor]:
         """Take over masses, motors, friction and latency of the environment's robots; return them by name."""
-        env = self.env
-        found = {name: wp.to_torch(getattr(env.sim.motors, name)) for name in MOTOR_CONSTANTS}
-        found["table"] = wp.to_torch(env.sim.physics.dynamics.robot.table)
-        found["latency"] = wp.to_torch(env.parameters.latency) * env.sim.dt
-        found = {name: tensor.to(self.dtype, copy=True) for name, tensor in found.items()}
+        robots: Snapshot = self.env.snapshot()
+        found = {name: tensor.to(self.dtype, copy=True) for name, tensor in robots.parameters.items()}
         for name, tensor in found.items():
             wp.to_torch(self.rollout.parameters[name]).copy_(tensor)
-        self.com = wp.to_torch(env.sim.model.body_com).view(self.num_worlds, -1, 3)[:, 0].to(self.dtype, copy=True)
+        self.com = robots.com.to(self.dtype, copy=True)
         self.offset = found["offset"].T
         return found
 
     def state(self) -> LoopState:
         """Return the environment's state, without gradients."""
-        env, n = self.env, self.num_worlds
-        q = wp.to_torch(env.sim.state.joint_q).view(n, -1)
-        qd = wp.to_torch(env.sim.state.joint_qd).view(n, -1)
-        past, clock = wp.to_torch(env.delays.past_target), wp.to_torch(env.worlds.clock).long()
-        before = past[(clock - 1) % len(past), :, torch.arange(n, device=env.device)].T
-        parts = (
-            torch.cat([q[:, :7], q[:, 7 + self._motors]], 1).T, torch.cat([qd[:, :6], qd[:, 6 + self._motors]], 1).T,
-            before, wp.to_torch(env.robot.impulse), wp.to_torch(env.robot.action), wp.to_torch(env.robot.torque),
-            self._earlier(env.obs),
-        )  # fmt: skip
+        now: Snapshot = self.env.snapshot()
+        parts = (now.q, now.qd, now.before, now.impulse, now.action, now.torque, self._earlier(self.env.obs))
         return LoopState(*(part.to(self.dtype, copy=True).contiguous() for part in parts))
 
     def _earlier(self, obs: torch.Tensor) -> torch.Tensor:
@@ -180,7 +163,7 @@ class ClosedLoop:
             found += [past[:, term.width :], self._frame(term, motion, state, past[:, : term.width])]
         return torch.cat(found, 1).T if found else state.past
 
-    def _frame(self, term: ObservationTerm, motion: Motion, state: LoopState, told: torch.Tensor) -> torch.Tensor:
+    def _frame(self, term: Any, motion: Motion, state: LoopState, told: torch.Tensor) -> torch.Tensor:
         """Return what a term shows of a state; told: as the environment shows it."""
         scale, clip = term.numbers["scale"], term.numbers["clip"]
         return scale * SEEN[term.func.key](self, motion, state, told / scale).clamp(-clip, clip)
@@ -242,7 +225,7 @@ class ClosedLoop:
         env.step(action.detach())
         wrench = None
         if self.draws:
-            wrench = wp.to_torch(env.robot.body_f).view(self.num_worlds, -1, 6)[:, 0].T.to(self.dtype).contiguous()
+            wrench = env.snapshot().wrench.to(self.dtype).contiguous()
         made, now = self.advance(state, action, wrench, parameters), self.state()
         begun = env.done > 0.0 if env.auto_reset else torch.zeros_like(env.done, dtype=torch.bool)
         parts = []
@@ -270,7 +253,7 @@ def _way(loop: ClosedLoop, motion: Motion, state: LoopState, told: torch.Tensor)
 
 def _height_errors(loop: ClosedLoop, motion: Motion, state: LoopState, told: torch.Tensor) -> torch.Tensor:
     """Return the misses of height as told, the ballistic one with its derivatives."""
-    apex = motion.pos[:, 2] + motion.lin_vel[:, 2].clamp(min=0.0).square() / (2.0 * loop.env.task.gravity)
+    apex = motion.pos[:, 2] + motion.lin_vel[:, 2].clamp(min=0.0).square() / (2.0 * loop.task.gravity)
     return torch.stack([told[:, 0], anchored(told[:, 1], apex)], 1)
 
 

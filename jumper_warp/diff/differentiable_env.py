@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 
 from jumper_warp.diff.closed_loop import ClosedLoop, LoopState, anchored
 from jumper_warp.diff.smooth_rewards import SMOOTH, make_moment, smooth_reward
 from jumper_warp.utils.errors import InputError
-
-if TYPE_CHECKING:
-    from jumper_warp.envs.env import Env
 
 WORLD_NORM = 100.0
 """Longest gradient that a world's state passes on from a policy step to the one before."""
@@ -21,14 +18,15 @@ WORLD_NORM = 100.0
 class DifferentiableEnv:
     """An environment with all that it has, and gradients: see `jumper_warp.envs.vec_env.DifferentiableVecEnv`."""
 
-    def __init__(self, env: Env, world_norm: float = WORLD_NORM) -> None:
-        """world_norm: longest gradient by a world's positions, and by its velocities, that is passed on.
+    def __init__(self, env: Any, world_norm: float = WORLD_NORM) -> None:
+        """Wrap a `jumper_warp.envs.env.Env`.
 
+        world_norm: longest gradient by a world's positions, and by its velocities, that is passed on.
         Raises InputError: as `ClosedLoop`, or no reward has a derivative.
         """
         self.env, self.loop, self.world_norm = env, ClosedLoop(env), world_norm
-        if not any(term.func.key in SMOOTH for term in env.task.rewards):
-            raise InputError(f"{env.task.name}: no reward has a derivative")
+        if not any(term.func.key in SMOOTH for term in self.loop.task.rewards):
+            raise InputError(f"{self.loop.task.name}: no reward has a derivative")
         self._state: LoopState | None = None
         self._final: LoopState | None = None
 
@@ -64,7 +62,7 @@ class DifferentiableEnv:
         env, old = self.env, self._state
         state, made = self.loop.step(old, action)
         made = self._final = LoopState(*(self._kept(part) for part in made))
-        smooth = smooth_reward(env.task, make_moment(self.loop, made, old, env.task_arrays()))
+        smooth = smooth_reward(self.loop.task, make_moment(self.loop, made, old, env.task_arrays()))
         smooth = torch.where((env.done == 0.0) & smooth.isfinite(), smooth, 0.0)
         self._state = LoopState(*(self._kept(part) for part in state))
         return anchored(env.reward.clone(), smooth)

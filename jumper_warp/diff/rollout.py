@@ -19,6 +19,7 @@ import warp as wp
 
 from jumper_warp.diff.actuation import MOTOR_CONSTANTS, filter_rows
 from jumper_warp.diff.reverse_legs import LegReverse
+from jumper_warp.robot.description import RobotDescription
 from jumper_warp.robot.model import PHYSICS_DT
 from jumper_warp.robot.motors import FilterCfg, MotorCfg, jumping_motors, motor_arrays
 from jumper_warp.sim.dynamics import JumperDynamics
@@ -88,6 +89,7 @@ class Rollout:
         motors: MotorCfg | None = None,
         command_filter: FilterCfg | None = None,
         *,
+        description: RobotDescription | None = None,
         double: bool = False,
         dt: float = PHYSICS_DT,
         substeps: int = SUBSTEPS,
@@ -101,6 +103,7 @@ class Rollout:
             model: The robot's worlds, without moving blocks.
             motors: By default the jumping gains at 18 N m.
             command_filter: None leaves the targets as they are.
+            description: The model's, by default the project's.
             double: Whether to compute in double precision.
             dt: Physics step [s].
             substeps: Physics steps in a policy step.
@@ -119,14 +122,14 @@ class Rollout:
             raise InputError(f"every must be a divisor of substeps = {substeps}, got {every!r}")
         if tolerance is not None and not 0.0 < tolerance < math.inf:
             raise InputError(f"tolerance must be finite and positive, got {tolerance!r:.40}")
-        self.dynamics = JumperDynamics(model, double=double)
+        self.dynamics = JumperDynamics(model, description=description, double=double)
         self.num_worlds, self.device, self.real = model.world_count, model.device, self.dynamics.real
         self.dt, self.substeps, self.every = dt, substeps, every
         modules, n = self.dynamics.modules, self.num_worlds
         tolerance = tolerance or (TOLERANCE_DOUBLE if double else TOLERANCE)
         self._new_settings = partial(self.dynamics.settings, dt, 1, MAX_SWEEPS, tolerance)
         cfg = motors or jumping_motors()
-        self._actuation = modules.rollout.Actuation()
+        self._actuation = modules.trajectory.Actuation()
         self._actuation.motors = motor_arrays(cfg, n, module=modules.motors, device=self.device)
         self._actuation.fade = self.array([[cfg.fade_start] * n, [cfg.fade_end] * n])
         self._actuation.latency = self._zeros(n)
@@ -218,7 +221,7 @@ class Rollout:
             check_within("latency [s]", self.parameters["latency"].numpy(), LATENCY_RANGE)
         vec3 = self.dynamics.modules.scalar.vec3
         count = len(targets) if hasattr(targets, "__len__") else 0
-        commands = self.dynamics.modules.rollout.Commands()
+        commands = self.dynamics.modules.trajectory.Commands()
         commands.target = self._input("targets", targets, (count, 12))
         q, qd = self._input("q", q, (19,)), self._input("qd", qd, (18,))
         commands.before = q[7:] if before is None else self._input("before", before, (12,))
@@ -270,7 +273,7 @@ class Rollout:
         rows_of = (count * self.substeps // self.every + 1, 19, n)
         if trajectory.q.shape != rows_of or trajectory.q.dtype != self.real:
             raise InputError(f"this rollout makes trajectories {rows_of}, got {trajectory.q.shape}")
-        seeds = modules.rollout.Rows()
+        seeds = modules.trajectory.Rows()
         given = {"q": q, "qd": qd, "torque": torque, "impulse": impulse, "safe": safe}
         for name, array in given.items():
             like = getattr(trajectory, name)
@@ -285,7 +288,7 @@ class Rollout:
             empty = wp.zeros((0,) * like.ndim, dtype=like.dtype, device=self.device)
             setattr(seeds, name, empty if array is None else array)
         seeds.pressed = wp.zeros((0, 0, 0), dtype=wp.uint8, device=self.device)
-        rows = modules.rollout.Rows()
+        rows = modules.trajectory.Rows()
         for name in ("q", "qd", "torque", "impulse", "pressed"):
             setattr(rows, name, getattr(trajectory, name))
         gradients = modules.gradients.Gradients()
@@ -305,7 +308,7 @@ class Rollout:
             self._legs.run(self._new_settings(), motion, seeds, gradients)
         else:
             if self._record is None:
-                self._record = self._step_record()
+                self._record = self.dynamics.step_record(self.every)
             self._launch(modules.rollout_adjoint.reverse_kernel, [*motion, seeds], [self._record, gradients])
         if trajectory.from_start:
             wp.map(wp.add, gradients.q[7:], gradients.before, out=gradients.q[7:])
@@ -322,29 +325,19 @@ class Rollout:
         return names | {"geometry": gradient[first:].reshape((4, len(GEOMETRY_NAMES), self.num_worlds))}
 
     def _timing(self, count: int) -> Any:
-        timing = self.dynamics.modules.rollout.Timing()
+        timing = self.dynamics.modules.trajectory.Timing()
         timing.steps, timing.substeps, timing.every = count, self.substeps, self.every
         return timing
 
     def _rows(self, count: int) -> Any:
         """Return an empty trajectory."""
         steps, n = count * self.substeps, self.num_worlds
-        rows = self.dynamics.modules.rollout.Rows()
+        rows = self.dynamics.modules.trajectory.Rows()
         rows.q, rows.qd = (self._empty(steps // self.every + 1, size, n) for size in (19, 18))
         rows.torque = self._empty(steps, 12, n)
         rows.impulse = self._empty(steps, 4, n, dtype=self.dynamics.modules.scalar.vec3)
         rows.pressed = self._empty(steps, 4, n, dtype=wp.uint8)
         return rows
-
-    def _step_record(self) -> Any:
-        """Return room for the steps between two rows."""
-        record, n, steps = self.dynamics.modules.step_adjoint.StepRecord(), self.num_worlds, self.every
-        types = {name: var.type.dtype for name, var in record._cls.vars.items()}
-        for name in types:
-            shape = (n, steps + (name in ("base", "angles", "rates")))
-            shape += () if name in ("base", "inverse") else (4,)
-            setattr(record, name, self._zeros(*shape, dtype=types[name]))
-        return record
 
     def _launch_legs(self, kernel: wp.Kernel, inputs: list, outputs: list) -> None:
         """Launch a kernel over all worlds, a thread a leg."""

@@ -61,7 +61,7 @@ def make_moment(loop: ClosedLoop, state: LoopState, old: LoopState, arrays: Mapp
     return Moment(
         loop.motion(state), loop.motion(old), state, old, at(phase), at((phase == STANCE) & asked),
         at((phase == LANDED) & (after < SOON)), at(resting), at(rising), at(arrays["at_apex"] == 1),
-        at(arrays["goal"][:, 2]), loop.default, loop.env.task.gravity, loop.env.step_dt,
+        at(arrays["goal"][:, 2]), loop.default, loop.task.gravity, loop.env.step_dt,
     )  # fmt: skip
 
 
@@ -144,8 +144,3 @@ def smooth_reward(task: Any, moment: Moment) -> torch.Tensor:
             time = 1.0 if term.options["once"] else moment.step_dt
             total = total + term.numbers["weight"] * time * SMOOTH[term.func.key](moment, term.numbers)
     return total
-
-
-def rough_rewards(task: Any) -> tuple[str, ...]:
-    """Return the names of the rewards without a derivative."""
-    return tuple(term.name for term in task.rewards if term.func.key not in SMOOTH)

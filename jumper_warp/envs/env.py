@@ -9,6 +9,8 @@ import numpy as np
 import torch
 import warp as wp
 
+from jumper_warp.diff.actuation import MOTOR_CONSTANTS
+from jumper_warp.diff.snapshot import Snapshot, compact_columns
 from jumper_warp.envs.arrays import (
     FIRST_CLOCK,
     checked_action,
@@ -283,6 +285,32 @@ class Env(Stages):
         q, qd = self.sim.joint_q(), self.sim.joint_qd()
         arrays |= {"base_pos": q[:, :3].copy(), "base_quat": q[:, 3:7].copy(), "base_vel": qd[:, :3].copy()}
         return arrays | {name: getattr(self.worlds, name).numpy().copy() for name in ("done", "ending", "level")}
+
+    def snapshot(self) -> Snapshot:
+        """Return the robots, their parameters and their state, as gradients need them; waits for nothing."""
+        sim, n = self.sim, self.num_envs
+        past, clock = wp.to_torch(self.delays.past_target), wp.to_torch(self.worlds.clock).long()
+        parameters = {name: wp.to_torch(getattr(sim.motors, name)) for name in MOTOR_CONSTANTS}
+        dynamics = sim.physics.dynamics
+        return Snapshot(
+            tasks=tuple(skill.task for skill in self.skills),
+            solver=type(sim.solver).__name__,
+            blocks=dynamics.robot.ground.blocks.shape[0] > 0,
+            model=sim.model,
+            dt=sim.dt,
+            substeps=sim.substeps,
+            default_angle=wp.to_torch(self.robot.default_angle),
+            com=wp.to_torch(sim.model.body_com).view(n, -1, 3)[:, 0],
+            parameters=parameters
+            | {"table": wp.to_torch(dynamics.robot.table), "latency": wp.to_torch(self.parameters.latency) * sim.dt},
+            q=compact_columns(wp.to_torch(sim.state.joint_q).view(n, -1), 7),
+            qd=compact_columns(wp.to_torch(sim.state.joint_qd).view(n, -1), 6),
+            before=past[(clock - 1) % len(past), :, torch.arange(n, device=self.device)].T,
+            impulse=wp.to_torch(self.robot.impulse),
+            action=wp.to_torch(self.robot.action),
+            torque=wp.to_torch(self.robot.torque),
+            wrench=wp.to_torch(self.robot.body_f).view(n, -1, 6)[:, 0].T,
+        )
 
     def metrics(self) -> dict[str, float]:
         """Return means since the last call, and clear the counters (waits for the device).

@@ -13,11 +13,16 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
+from jumper_warp.evaluation.courses import Course, course_metrics, draw_course
 from jumper_warp.evaluation.film import Film
 from jumper_warp.evaluation.log import EvaluationLog, run_evaluation
-from jumper_warp.evaluation.run import EvaluationRun
+from jumper_warp.evaluation.plots import drawn
+from jumper_warp.evaluation.run import EvaluationRun, SkillRun
+from jumper_warp.evaluation.scripts import read_script
+from jumper_warp.policies.conditions import Conditions
 from jumper_warp.policies.folder import add_files, find_policy
-from jumper_warp.policies.restore import Conditions, is_run
+from jumper_warp.policies.runs import is_run
+from jumper_warp.policies.skills import SkillNames
 from jumper_warp.policies.spec import PolicyError
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.output import write_metrics
@@ -117,14 +122,65 @@ def play(run: EvaluationRun, cfg: PlayCfg) -> Path:
     run.prepare("play", cfg.conditions, cfg.out)
     env = run.env(flags.count)
     log = flags.log(env.task)
-    notes = {"task": name, **flags.notes, "solver": cfg.conditions.solver}
-    film = Film(env, log, range(flags.count), spacing=flags.spacing, notes=notes, motors=True)
+    worlds = range(flags.count)
+    notes = {"task": name, **log.notes(worlds), "solver": cfg.conditions.solver}
+    film = Film(env, log, worlds, spacing=log.spacing, notes=notes, motors=True)
     run_evaluation(run.policy.act, env, log, seconds=cfg.seconds or flags.seconds, watch=film, stop=False)
-    path = film.save_rrd(run.folder / f"{log.row}.rrd", log.marks(range(flags.count)))
+    path = film.save_rrd(run.folder / f"{log.row}.rrd", log.marks(worlds))
     write_metrics(run.folder, log.columns())
     print_rows(log)
+    return shown(path, cfg.viewer)
+
+
+@dataclass(frozen=True)
+class ScriptCfg:
+    """Let one robot walk and jump with several policies, as a script says, and record it.
+
+    A script is a JSON list of {"walk": [vx, vy, yaw_rate], "seconds": s}, {"stand": s}, {"jump_up": height},
+    {"jump_to": [ahead, left]} and {"jump_onto": [ahead, left]} (a block); SI units, as in
+    assets/scripts/walk_jump_walk.json.
+    """
+
+    script: Path
+    """File with the commands."""
+    policies: Annotated[SkillNames, tyro.conf.arg(name="")] = field(default_factory=SkillNames)
+    """Who carries them out."""
+    conditions: Annotated[Conditions, tyro.conf.arg(name="")] = field(default_factory=Conditions)
+    """What the policies are tried in."""
+    out: Path | None = None
+    """Folder for the recording, a plot and metrics.json (default: outputs/play/<time>)."""
+    viewer: Literal["none", "rerun"] = "none"
+    """Open the recording in Rerun's viewer, which then listens on this machine's loopback address only."""
+
+
+def play_script(cfg: ScriptCfg) -> Path:
+    """Simulate, write a recording, a plot and `metrics.json`, print a table; return the path of the recording.
+
+    Raises:
+        InputError: The script cannot be used, or there is no such device.
+        PolicyError: A policy cannot be used.
+        OSError: The folder cannot be made.
+    """
+    script = read_script(cfg.script)
+    run = SkillRun(cfg.policies)
+    run.prepare("play", cfg.conditions, cfg.out)
+    course = Course([script])
+    env = run.env(1, block=course.block)
+    film = Film(env, course, [0], notes={**course.notes([0]), "solver": cfg.conditions.solver})
+    run_evaluation(run.actor(env), env, course, watch=film)
+    path = film.save_rrd(run.folder / "course.rrd")
+    with drawn(run.folder / "course.png", 5, 1, figsize=(10, 9), sharex=True) as axes:
+        draw_course(axes, course, 0)
+    figures = {"outcome": str(course.outcomes[0]), **course_metrics(course)}
+    write_metrics(run.folder, figures)
+    print_figures(figures)
+    return shown(path, cfg.viewer)
+
+
+def shown(path: Path, viewer: str) -> Path:
+    """Print the path of a recording to standard error, open the viewer if there is one, and return the path."""
     Console(stderr=True).print(str(path), highlight=False, soft_wrap=True)
-    if cfg.viewer == "rerun":
+    if viewer == "rerun":
         subprocess.run(viewer_command(path), check=False)
     return path
 

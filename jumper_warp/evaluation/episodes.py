@@ -14,8 +14,6 @@ from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.tasks.commands import layout_of
 from jumper_warp.utils.errors import InputError
 
-SPACING = 2.0
-"""[m] Between robots in a picture."""
 MOST_SECONDS = 600.0
 MOST_NUMBERS = 4
 """In a command."""
@@ -40,7 +38,7 @@ class Episodes(EvaluationLog):
     """[m] (..., 3) Base at the end, world."""
 
     row = "episode"
-    spacing = SPACING
+    spacing = 2.0
 
     def __post_init__(self) -> None:
         """Begin with no episode ended."""
@@ -178,16 +176,10 @@ class EpisodeGoals:
 
     count = 1
     seconds = 10.0
-    spacing = SPACING
 
     def __post_init__(self) -> None:
         """Raises InputError: a setting is out of range."""
         check_episodes(self.count, self.command, self.seconds)
-
-    @property
-    def notes(self) -> dict[str, Any]:
-        """What to save with the recording."""
-        return {"command": self.command}
 
     def log(self, task: TaskCfg) -> Episodes:
         """Return one robot's episode."""

@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
+import warp as wp
 
-from jumper_warp.evaluation.links import Links
 from jumper_warp.robot.model import LEGS, build_model
 from jumper_warp.utils.rotations import rotate
 
@@ -20,8 +20,12 @@ if TYPE_CHECKING:
     from jumper_warp.envs.env import Env
     from jumper_warp.robot.grounds import BlockCfg
 
-SHANK_LENGTH = 0.3
-"""[m] From the knee to the ankle, along the shank's -z."""
+ANKLE = np.array([0.0, 0.0, -0.3])
+"""[m] In the shank's frame."""
+EYE_DISTANCE = 2.4
+"""[m] From the path to the eye of a picture."""
+PICTURE = (400, 320)
+"""[px] Of a robot that is seen from beside its path."""
 
 
 @dataclass(frozen=True)
@@ -40,6 +44,23 @@ class Strip:
     """[px] Width and height of a picture."""
     name: str = ""
     """Of the file (default: the film's)."""
+
+
+class Links:
+    """Reads all links, from base and motor coordinates; the simulation is left as it is."""
+
+    def __init__(self, env: Env) -> None:
+        """Allocate a state of the environment's model."""
+        self._sim, self._state = env.sim, env.sim.model.state()
+
+    def read(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return pose (num_envs, links, 7) and twist (num_envs, links, 6) of every link; waits for the device."""
+        here, there = self._state, self._sim.state
+        wp.copy(here.joint_q, there.joint_q)
+        wp.copy(here.joint_qd, there.joint_qd)
+        self._sim.physics.dynamics.full_state(here.joint_q, here.joint_qd, here.body_q, here.body_qd)
+        n = self._sim.num_worlds
+        return here.body_q.numpy().reshape(n, -1, 7), here.body_qd.numpy().reshape(n, -1, 6)
 
 
 class HasSeries(Protocol):
@@ -139,7 +160,7 @@ class Film:
 def ankles(poses: np.ndarray) -> np.ndarray:
     """Return the ankles [m], world frame, (num_worlds, 4, 3), from the poses (num_worlds, 21, 7) of all links."""
     shanks = poses[:, 5 * np.arange(1, len(LEGS) + 1)]
-    return shanks[..., :3] + rotate(shanks[..., 3:], np.array([0.0, 0.0, -SHANK_LENGTH]))
+    return shanks[..., :3] + rotate(shanks[..., 3:], ANKLE)
 
 
 def moments(height: np.ndarray, command: int) -> list[int]:
@@ -150,3 +171,13 @@ def moments(height: np.ndarray, command: int) -> list[int]:
     catch = apex + int(np.argmin(height[apex : apex + 60]))
     push = squat + int(np.argmax(height[squat : apex + 1] >= 0.5 * (height[squat] + height[apex])))
     return [command, squat, push, apex, (apex + catch) // 2, catch, len(height) - 1]
+
+
+def beside(start: np.ndarray, end: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return an eye beside the way from start to end (2,), and the point that it looks at, (3,); [m], world frame."""
+    way = end - start
+    length = float(np.linalg.norm(way))
+    ahead = way / length if length > 1.0e-3 else np.array([1.0, 0.0])
+    middle = np.append(start + 0.5 * way, 0.4)
+    back = EYE_DISTANCE * max(1.0, length / 1.5)
+    return middle + np.array([back * ahead[1], -back * ahead[0], 0.35]), middle

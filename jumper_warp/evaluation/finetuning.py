@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import numpy as np
 import torch
@@ -20,8 +21,8 @@ import torch
 from jumper_warp.evaluation.jump_misses import Group, Misses, follow
 from jumper_warp.evaluation.jumps import LANDED, jump_commands
 from jumper_warp.evaluation.registry import evaluation_of
+from jumper_warp.policies.conditions import Conditions, env_of_policy
 from jumper_warp.policies.policy import Policy
-from jumper_warp.policies.restore import Conditions, env_of_policy
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.tasks.randomization import RandomizationCfg
 from jumper_warp.trajectory.gauss_newton import Anchor, Network, gauss_newton_step
@@ -144,6 +145,11 @@ def make_anchor(groups: list[Group], network: Network, cfg: FinetuneCfg) -> Anch
     return Anchor(network, obs, torch.as_tensor(stds[chosen], device=obs.device))
 
 
+def mean_abs_misses(groups: list[Group], found: list[Misses]) -> dict[str, float]:
+    """Return the mean absolute miss [m] of each group."""
+    return {group.name: float(m.value[m.valid].abs().mean()) for group, m in zip(groups, found, strict=True)}
+
+
 def with_aim(policy: Policy, shift: float) -> Policy:
     """Return the policy that sees its goals so much [m] farther ahead; the observation's normaliser does it."""
     mean = policy.mean.clone()
@@ -168,7 +174,7 @@ def take_aim(
         cost = sum(float((group.importance(m) * m.value.square()).sum()) for group, m in pairs)
         ahead = {g.name: m.value[: len(g.commands)][m.valid[: len(g.commands)]] for g, m in pairs}
         means = {"ahead": {name: float(value.mean()) for name, value in ahead.items()}}
-        means["mean_abs_miss_m"] = {g.name: float(m.value[m.valid].abs().mean()) for g, m in pairs}
+        means["mean_abs_miss_m"] = mean_abs_misses(groups, found)
         words = ", ".join(f"{name} {1000.0 * miss:+.2f} mm" for name, miss in means["ahead"].items())
         say(f"aim: cost {cost:.4g}, robots end ahead of their goals by {words}")
         return cost, found, means
@@ -187,25 +193,13 @@ def take_aim(
     return policy, told
 
 
-def finetune(
-    policy: Policy,
-    cfg: FinetuneCfg,
-    modules: Iterable[ModuleType] = (),
-    say: Callable[[str], object] = print,
-) -> tuple[Policy, dict]:
-    """Return the fine-tuned policy, and what was done: settings, and misses [m] by group before and after each step.
+def tune_weights(
+    groups: list[Group], network: Network, cfg: FinetuneCfg, say: Callable[[str], object], begin: float
+) -> list[dict[str, Any]]:
+    """Take Gauss-Newton steps on the network's weights; return the misses [m] by group before and after each step.
 
-    modules: that the user has named. say: is told every step. Raises InputError as `ClosedLoop` and `make_groups`,
-    and if there is nothing to do.
+    begin: time from which the reported seconds count, by `time.perf_counter`.
     """
-    begin = time.perf_counter()
-    groups = make_groups(policy, cfg, modules)
-    aims = []
-    if not groups[0].to_height:
-        policy, aims = take_aim(policy, groups, say)
-    elif cfg.iterations == 0:
-        raise InputError("a policy for heights has no aim to be taken apart: fine-tuning it needs an iteration")
-    network = Network(policy, device=groups[0].env.device)
     anchor = make_anchor(groups, network, cfg)
 
     def measure(derivatives: bool) -> tuple[float, list[Misses]]:
@@ -217,14 +211,11 @@ def finetune(
     cost, found = measure(cfg.iterations > 0)
     damping, history = DAMPING, []
     for step in range(cfg.iterations + 1):
-        means = {group.name: float(m.value[m.valid].abs().mean()) for group, m in zip(groups, found, strict=True)}
-        moved = anchor.change(network.weights)
-        told = {"cost": cost, "action_change": moved, "seconds": time.perf_counter() - begin}
-        history.append({"step": step, "mean_abs_miss_m": means, **told})
-        words = ", ".join(f"{name} {1000.0 * miss:.2f} mm" for name, miss in means.items())
-        say(
-            f"step {step}: cost {cost:.4g}, {words}, actions moved {told['action_change']:.4f}, {told['seconds']:.0f} s"
-        )
+        row = {"step": step, "mean_abs_miss_m": mean_abs_misses(groups, found), "cost": cost,
+               "action_change": anchor.change(network.weights), "seconds": time.perf_counter() - begin}  # fmt: skip
+        history.append(row)
+        words = ", ".join(f"{name} {1000.0 * miss:.2f} mm" for name, miss in row["mean_abs_miss_m"].items())
+        say(f"step {step}: cost {cost:.4g}, {words}, actions moved {row['action_change']:.4f}, {row['seconds']:.0f} s")
         if step == cfg.iterations:
             break
         kept = network.weights
@@ -236,6 +227,29 @@ def finetune(
             cost, found, damping = new_cost, new, damping / 3.0
         else:
             network.weights, damping = kept, 10.0 * damping
+    return history
+
+
+def finetune(
+    policy: Policy,
+    cfg: FinetuneCfg,
+    modules: Iterable[ModuleType] = (),
+    say: Callable[[str], object] = print,
+) -> tuple[Policy, dict]:
+    """Return the fine-tuned policy, and its record: settings, and misses [m] by group before and after each step.
+
+    modules: that the user has named. say: prints a line. Raises InputError as `ClosedLoop` and `make_groups`,
+    and if there is nothing to do.
+    """
+    begin = time.perf_counter()
+    groups = make_groups(policy, cfg, modules)
+    aims = []
+    if not groups[0].to_height:
+        policy, aims = take_aim(policy, groups, say)
+    elif cfg.iterations == 0:
+        raise InputError("a policy for heights has no aim to be taken apart: fine-tuning it needs an iteration")
+    network = Network(policy, device=groups[0].env.device)
+    history = tune_weights(groups, network, cfg, say, begin)
     layers = network.layers(network.weights)
     settings = {name: value for name, value in asdict(cfg).items() if name not in ("out", "overwrite")}
     record = {"settings": json.loads(json.dumps(settings, default=str)), "aims": aims, "steps": history}

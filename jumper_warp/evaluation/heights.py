@@ -1,21 +1,28 @@
-"""Jumps to heights: what is asked for, and the metrics of what became of it."""
+"""Jumps to heights: their log, the metrics of it, and the flags that make it."""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import torch
+import tyro
 
-from jumper_warp.evaluation.jumps import REST_SPEED, Jumps
+from jumper_warp.evaluation.film import Film, Strip, moments
+from jumper_warp.evaluation.jumps import DELAY, REST_SPEED, REST_TIME, STANCE, JumpLog, check_jumps
 from jumper_warp.evaluation.log import (
     CAME_APART,
     COLLIDED,
     SUCCESS,
+    EvaluationEnv,
     Metrics,
     failures,
+    finite,
     largest,
     mean,
+    run_evaluation,
     termination_names,
     with_ends,
     within,
@@ -27,6 +34,8 @@ SUCCESS_TOLERANCE = 0.1
 """[m] A jump that comes this close reaches its height."""
 LEVEL = 10.0
 """[deg] A good landing tilts the base less."""
+SWEEP_ENDS = (CAME_APART, "low_base", "tilted", COLLIDED, "no_jump", "too_long", SUCCESS)
+"""Terminations that end a jump of a sweep, in this order; the others only shape the training."""
 FALLS = ("low_base", "tilted")
 WRONG_HEIGHT = "wrong_height"
 """Outcome of a jump that came down from another height."""
@@ -34,6 +43,10 @@ DRIFT, TURN = 0.2, 25.0
 """[m], [deg] Of the base, beyond which the authors' configuration ends an episode."""
 MAX_ROBOTS = 64
 """In one recording."""
+LOWEST, HIGHEST, ABOVE = -0.37, 1.47, 0.45
+"""[m] What pictures of a jump show at least, from the ground before it up, and what they leave above the base."""
+SHOWN_HEIGHT = 1.0
+"""[m] The filmstrip shows the jump nearest to this."""
 
 
 def for_evaluation(task: TaskCfg) -> TaskCfg:
@@ -42,44 +55,123 @@ def for_evaluation(task: TaskCfg) -> TaskCfg:
     return with_ends(task, (*names, SUCCESS))
 
 
-def jump_metrics(jumps: Jumps, in_range: tuple[float, float]) -> Metrics:
-    """Return the metrics of vertical jumps.
+def for_sweep(task: TaskCfg) -> TaskCfg:
+    """Return a task with the terminations that count in a sweep."""
+    return with_ends(task, SWEEP_ENDS)
+
+
+class HeightLog(JumpLog):
+    """One jump to a height per world. A jump that landed within the task's limit, if it has one, is a success."""
+
+    speed_time = REST_TIME
+    success, outcomes = JumpLog.landed, JumpLog.ends
+
+    def __init__(self, heights: np.ndarray, terminations: tuple[str, ...], rest: float = REST_TIME) -> None:
+        """heights: (num_envs,) [m] of the base; terminations, rest: as in `JumpLog`, rest at least REST_TIME."""
+        goals = np.zeros((len(heights), 1, 3))
+        goals[:, 0, 2] = heights
+        super().__init__(goals, terminations, rest=rest)
+
+    @property
+    def seconds(self) -> float:
+        """[s] In which a jump has ended."""
+        return 7.0 + self.rest
+
+    def _mark_early(self, arrays: dict[str, np.ndarray], at: tuple[np.ndarray, np.ndarray]) -> None:
+        """Mark the jumps that have begun when the command comes."""
+        commanded = arrays["steps"] == arrays["command_step"]
+        self.early[commanded] = (arrays["phase"] != STANCE)[commanded, None]
+
+    @property
+    def commanded(self) -> np.ndarray:
+        """[m] Base height."""
+        return self.goals[..., 2]
+
+    @property
+    def error(self) -> np.ndarray:
+        """[m] Apex minus commanded height; NaN where the simulation came apart."""
+        return np.where(self.broken | ~np.isfinite(self.apex), np.nan, self.apex - self.commanded)
+
+    @property
+    def reached(self) -> np.ndarray:
+        """Whether the jump, begun on command, came near its height."""
+        return (np.abs(self.error) <= SUCCESS_TOLERANCE) & ~self.early
+
+    def columns(self) -> dict[str, list]:
+        """Return commanded heights, apexes and errors [m] and the ends."""
+        numbers = {"target_m": self.commanded, "apex_m": self.apex, "error_m": self.error}
+        return {name: finite(values.ravel()) for name, values in numbers.items()} | {"end": self.ends.ravel().tolist()}
+
+    def series(self, worlds: Sequence[int]) -> dict[str, float]:
+        """Return the base's height and the commanded one [m]."""
+        return super().series(worlds) | {f"height/target of {i} [m]": self.commanded[i, 0] for i in worlds}
+
+    def notes(self, worlds: Sequence[int]) -> dict[str, Any]:
+        """Return the commanded heights [m]."""
+        return {"targets_m": self.commanded[list(worlds), 0].tolist()}
+
+    def strip(self, film: Film) -> Strip:
+        """Return pictures of the jump nearest to SHOWN_HEIGHT."""
+        heights = self.commanded[film.worlds, 0]
+        index = int(np.argmin(np.abs(heights - SHOWN_HEIGHT)))
+        height = film.base(index)[:, 2]
+        frames = moments(height, round(DELAY / film.env.step_dt) - 1)
+        captions = [f"{(frame + 1) * film.env.step_dt:.2f} s, {height[frame]:.2f} m" for frame in frames]
+        eye, target, size = view_of(float(height[frames].max()))
+        return Strip(index, frames, captions, eye, target, size, name=f"jump_{heights[index]:.2f}_m")
+
+
+def view_of(apex: float) -> tuple[tuple[float, float, float], tuple[float, float, float], tuple[int, int]]:
+    """Return eye and target [m] and size [px] of pictures of a jump to an apex [m], as tall as it needs, one scale."""
+    taller = max(1.0, (apex + ABOVE - LOWEST) / (HIGHEST - LOWEST))
+    middle = LOWEST + 0.5 * taller * (HIGHEST - LOWEST)
+    return (1.5 * taller, 2.0 * taller, middle + 0.35 * taller), (0.0, 0.0, middle), (320, round(420 * taller))
+
+
+def run_jumps(act: Callable[[torch.Tensor], torch.Tensor], env: EvaluationEnv, heights: np.ndarray) -> HeightLog:
+    """Let every world jump to its height (num_envs,) [m] once; act: as in `run_evaluation`."""
+    jumps = HeightLog(heights, termination_names(env.task))
+    run_evaluation(act, env, jumps)
+    return jumps
+
+
+def jump_metrics(jumps: HeightLog, in_range: tuple[float, float]) -> Metrics:
+    """Return the metrics of jumps to heights.
 
     Errors are over all jumps, failed ones included, but those whose simulation came apart, which `came_apart` counts.
-    What is told of landings is over the successful jumps. in_range [m]: targets that `success_rate_in_range` counts.
+    Metrics of landings are over the successful jumps. in_range [m]: heights that `success_rate_in_range` counts.
     """
-    inside = within(jumps.target, in_range)
-    error, success = np.abs(jumps.error), jumps.success
-    outcomes = jumps.outcomes
+    inside = within(jumps.commanded, in_range)
+    error, success, outcomes = np.abs(jumps.error), jumps.success, jumps.outcomes
     metrics: Metrics = {
-        "jumps": len(jumps.target),
+        "jumps": len(jumps.end),
         "mean_abs_error_m": mean(error),
         "mean_abs_error_in_range_m": mean(error[inside]),
         "max_abs_error_of_successes_m": largest(error[success]),
-        "success_rate": float(success.mean()),
+        "success_rate": mean(success),
         "success_rate_in_range": mean(success[inside]),
         "range_lower_m": in_range[0],
         "range_upper_m": in_range[1],
         "at_rest_within_1_s_rate": mean((jumps.rest_speed < REST_SPEED)[success]),
         "mean_landing_tilt_deg": mean(np.degrees(jumps.tilt[success])),
         "max_landing_tilt_deg": largest(np.degrees(jumps.tilt[success])),
-        **landing_metrics(jumps),
-        "collision_rate": float((outcomes == COLLIDED).mean()),
-        "fall_rate": float(np.isin(outcomes, (*FALLS, COLLIDED, CAME_APART)).mean()),
-        "miss_rate": float((outcomes == WRONG_HEIGHT).mean()),
+        **stance_metrics(jumps),
+        "collision_rate": mean(outcomes == COLLIDED),
+        "fall_rate": mean(np.isin(outcomes, (*FALLS, COLLIDED, CAME_APART))),
+        "miss_rate": mean(outcomes == WRONG_HEIGHT),
         CAME_APART: int(np.isnan(jumps.error).sum()),
     }
     return metrics | failures(outcomes[~success])
 
 
-def landing_metrics(jumps: Jumps) -> Metrics:
-    """Return what became of the robots that landed: still paws, second takeoffs, drift in the plane and turn.
+def stance_metrics(jumps: HeightLog) -> Metrics:
+    """Return metrics of the stance after landings: still paws, second takeoffs, drift in the plane and turn.
 
     `still_landing_rate` is of all jumps, the others of the landed ones.
     """
-    landed, turn = jumps.success, np.degrees(np.abs(jumps.yaw))
+    landed, turn = jumps.landed, np.degrees(np.abs(jumps.yaw))
     return {
-        "still_landing_rate": float(jumps.still.mean()),
+        "still_landing_rate": mean(jumps.still),
         "second_takeoff_rate": mean((jumps.takeoffs > 0)[landed]),
         "mean_drift_m": mean(jumps.drift[landed]),
         "max_drift_m": largest(jumps.drift[landed]),
@@ -89,42 +181,37 @@ def landing_metrics(jumps: Jumps) -> Metrics:
     }
 
 
-def reached(jumps: Jumps) -> np.ndarray:
-    """Return which jumps, begun on command, came near their height."""
-    return (np.abs(jumps.error) <= SUCCESS_TOLERANCE) & ~jumps.early
-
-
-def sweep_metrics(jumps: Jumps, in_range: tuple[float, float]) -> Metrics:
+def sweep_metrics(jumps: HeightLog, in_range: tuple[float, float]) -> Metrics:
     """Return the metrics of jumps of which one succeeds that comes near its height, however it is landed.
 
     `miss_rate` is the share that began on command and landed, but came to another height; falls and collisions after
-    the apex are told apart from it, and from the success.
-    in_range [m]: targets that `success_rate_in_range` counts.
+    the apex count neither there nor against the success.
+    in_range [m]: heights that `success_rate_in_range` counts.
     """
-    target, error, near = jumps.target, np.abs(jumps.error), reached(jumps)
-    tilt = np.where(np.isnan(error), 0.0, np.degrees(jumps.tilt))
-    landed = jumps.success & (tilt < LEVEL) & (jumps.rest_speed < REST_SPEED)
+    commanded, error, near = jumps.commanded, np.abs(jumps.error), jumps.reached
+    tilt, at_rest = np.where(np.isnan(error), 0.0, np.degrees(jumps.tilt)), jumps.rest_speed < REST_SPEED
+    landed = jumps.landed & (tilt < LEVEL) & at_rest
     return {
-        "jumps": len(target),
+        "jumps": len(jumps.end),
         "mean_abs_error_m": mean(error),
-        "mean_abs_error_in_range_m": mean(error[within(target, in_range)]),
+        "mean_abs_error_in_range_m": mean(error[within(commanded, in_range)]),
         "mean_error_m": mean(jumps.error),
-        "success_rate": float(near.mean()),
-        "success_and_landing_rate": float((near & landed).mean()),
-        "success_rate_in_range": mean(near[within(target, in_range)]),
-        "success_rate_0_6_1_1": mean(near[within(target, (0.6, 1.1))]),
-        "largest_reached_m": largest(jumps.error + target),
-        "landing_rate": float(landed.mean()),
-        "max_landing_tilt_deg": largest(np.degrees(jumps.tilt[jumps.success])),
-        **landing_metrics(jumps),
-        "collision_rate": float((jumps.outcomes == COLLIDED).mean()),
-        "fall_rate": float(np.isin(jumps.outcomes, FALLS).mean()),
-        "miss_rate": float((jumps.success & ~jumps.early & ~near).mean()),
-        "no_jump_rate": float((jumps.outcomes == "no_jump").mean()),
-        "early_rate": float(jumps.early.mean()),
-        "at_rest_within_1_s_rate": float((jumps.rest_speed < REST_SPEED).mean()),
-        "largest_tilt_deg": float(tilt.max()),
-        "came_apart": int(np.isnan(jumps.error).sum()),
+        "success_rate": mean(near),
+        "success_and_landing_rate": mean(near & landed),
+        "success_rate_in_range": mean(near[within(commanded, in_range)]),
+        "success_rate_0_6_1_1": mean(near[within(commanded, (0.6, 1.1))]),
+        "largest_reached_m": largest(jumps.error + commanded),
+        "landing_rate": mean(landed),
+        "max_landing_tilt_deg": largest(np.degrees(jumps.tilt[jumps.landed])),
+        **stance_metrics(jumps),
+        "collision_rate": mean(jumps.ends == COLLIDED),
+        "fall_rate": mean(np.isin(jumps.ends, FALLS)),
+        "miss_rate": mean(jumps.landed & ~jumps.early & ~near),
+        "no_jump_rate": mean(jumps.ends == "no_jump"),
+        "early_rate": mean(jumps.early),
+        "at_rest_within_1_s_rate": mean(at_rest),
+        "largest_tilt_deg": largest(tilt),
+        CAME_APART: int(np.isnan(jumps.error).sum()),
     }
 
 
@@ -152,21 +239,13 @@ class HeightFlags:
         """Number of worlds."""
         return self.jumps
 
-    def log(self, task: TaskCfg, seed: int) -> Jumps:
+    def log(self, task: TaskCfg, seed: int) -> HeightLog:
         """Return jumps to these heights."""
-        return Jumps(np.linspace(self.lower, self.upper, self.jumps), termination_names(task))
+        return HeightLog(np.linspace(self.lower, self.upper, self.jumps), termination_names(task))
 
-    def metrics(self, log: Jumps) -> Metrics:
+    def metrics(self, log: HeightLog) -> Metrics:
         """Return `jump_metrics`."""
         return jump_metrics(log, self.in_range)
-
-
-def check_jumps(jumps: int, in_range: tuple[float, float]) -> None:
-    """Raise InputError unless there is a jump and a range [m]."""
-    if jumps < 1:
-        raise InputError(f"jumps must be at least 1, got {jumps}")
-    if not 0.0 <= in_range[0] <= in_range[1] < 10.0:
-        raise InputError(f"in_range must be in [0, 10) m and rise, got {in_range[0]}, {in_range[1]}")
 
 
 @dataclass(frozen=True)
@@ -175,9 +254,8 @@ class HeightGoals:
 
     height: tuple[float, ...] = (0.6, 0.9, 1.1)
     """[m] Commanded base heights, one robot each."""
-
-    spacing = Jumps.spacing
-    seconds = 3.5
+    length: tyro.conf.Suppress[float] = 3.5
+    """[s] Of the recording, unless another is given."""
 
     def __post_init__(self) -> None:
         """Raises InputError: a height is out of range, or their number."""
@@ -190,17 +268,10 @@ class HeightGoals:
         return len(self.height)
 
     @property
-    def notes(self) -> dict[str, Any]:
-        """What to save with the recording."""
-        return {"heights_m": self.height}
+    def seconds(self) -> float:
+        """[s] Length of the recording."""
+        return self.length
 
-    def log(self, task: TaskCfg) -> Jumps:
+    def log(self, task: TaskCfg) -> HeightLog:
         """Return one jump a robot."""
-        return Jumps(np.array(self.height), termination_names(task))
-
-
-@dataclass(frozen=True)
-class MarsHeightGoals(HeightGoals):
-    """Jumps to heights that are recorded, with flights of up to 2.7 s."""
-
-    seconds = 6.0
+        return HeightLog(np.array(self.height), termination_names(task))

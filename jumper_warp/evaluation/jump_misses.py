@@ -82,7 +82,7 @@ def place_of(loop: ClosedLoop, states: list[LoopState], arrays: dict[str, np.nda
     pos, vel = (torch.stack([getattr(motion, name) for motion in motions]) for name in ("pos", "lin_vel"))
     worlds = torch.arange(len(row), device=row.device)
     pos, vel = pos[row, worlds], vel[row, worlds]
-    g = loop.env.task.gravity
+    g = loop.task.gravity
     fall = (vel[:, 2] + (vel[:, 2].square() + 2.0 * g * (pos[:, 2] - LANDING_HEIGHT).clamp(min=0.0)).sqrt()) / g
     return [pos[:, i] + fall * vel[:, i] for i in range(2)]
 

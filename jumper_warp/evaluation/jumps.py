@@ -1,27 +1,13 @@
-"""Jumps to heights: one in every world at once, from the command to the landing."""
+"""Log of jumps: one row of jumps in every world, each from its command to the rest after its landing."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
-from typing import Any
+from collections.abc import Sequence
 
 import numpy as np
-import torch
 
-from jumper_warp.evaluation.angles import wrapped, yaw_of
-from jumper_warp.evaluation.film import Film, Strip, moments
-from jumper_warp.evaluation.log import (
-    CAME_APART,
-    NO_END,
-    EvaluationEnv,
-    EvaluationLog,
-    finite,
-    run_evaluation,
-    success_index,
-    termination_names,
-)
-from jumper_warp.evaluation.paws import Paws, paw_arrays, stepped
+from jumper_warp.evaluation.log import CAME_APART, NO_END, EvaluationEnv, EvaluationLog, success_index
+from jumper_warp.utils.errors import InputError
 
 STANCE, LANDED = 0, 2
 """Values of the jump's phase before takeoff and after touchdown."""
@@ -30,11 +16,24 @@ REST_SPEED = 0.1
 REST_TIME = 1.0
 """[s] After touchdown, when it should be."""
 DELAY = 0.5
-"""[s] Until the jump is commanded."""
-LOWEST, HIGHEST, ABOVE = -0.37, 1.47, 0.45
-"""[m] What pictures of a jump show at least, from the ground before it up, and what they leave above the base."""
-SHOWN_HEIGHT = 1.0
-"""[m] The filmstrip shows the jump nearest to this."""
+"""[s] Until the first jump is commanded."""
+SOON = 0.3
+"""[s] After touchdown, when the base's place is recorded as well."""
+HOP_TIME = 0.05
+"""[s] A robot that is off the ground for longer after touchdown has jumped again; one that lifts a paw, which had come
+down, for as long has stepped."""
+TAKEOFF_SPEED = 0.25
+"""[m/s] Upward speed of the base, with no paw down, of a second takeoff (authors' configuration)."""
+TIME_EPS = 1.0e-6
+"""[s] Rounding of sums of steps."""
+NOT_BEGUN = "not_begun"
+"""Outcome of a jump that was due after one that failed."""
+
+
+def paw_arrays(env: EvaluationEnv) -> dict[str, np.ndarray]:
+    """Return which paws are on the ground, (num_envs, 4), and the base's upward speed [m/s]."""
+    force = np.linalg.norm(env.sim.paw_force.numpy(), axis=2)
+    return {"paws_down": (force > env.task.contact_force).T, "up": env.sim.base_velocity()[:, 2]}
 
 
 def jump_commands(goals: np.ndarray, delay: np.ndarray | float, step_dt: float) -> np.ndarray:
@@ -47,147 +46,185 @@ def jump_commands(goals: np.ndarray, delay: np.ndarray | float, step_dt: float) 
     return np.concatenate([goals, steps[:, None]], axis=1).astype(np.float32)
 
 
-@dataclass
-class Jumps(EvaluationLog):
-    """What became of one vertical jump per world; each array has shape (num_envs,). Nothing changes after its end."""
+class JumpLog(EvaluationLog):
+    """One row of jumps per world; arrays have shape (num_envs, jumps in a row), NaN before the jump.
 
-    target: np.ndarray
-    """[m] Commanded base height."""
-    terminations: tuple[str, ...]
-    """Names of the ends of an episode, SUCCESS among them."""
-    rest: float = REST_TIME
-    """[s] From touchdown until the jump is over, at least REST_TIME."""
-    end: np.ndarray = field(init=False)
-    """Index of the end in `terminations`, -1 before it."""
-    apex: np.ndarray = field(init=False)
-    """[m] Largest base height."""
-    tilt: np.ndarray = field(init=False)
-    """[rad] Largest since touchdown."""
-    rest_speed: np.ndarray = field(init=False)
-    """[m/s] Of the base REST_TIME after touchdown; infinite before."""
-    early: np.ndarray = field(init=False)
-    """Whether the jump began before the command."""
-    drift: np.ndarray = field(init=False)
-    """[m] Of the base in the plane, from the start to the end."""
-    yaw: np.ndarray = field(init=False)
-    """[rad] Of the base at the end, from the jump's heading."""
-    lift_time: np.ndarray = field(init=False)
-    """[s] Longest that any paw was off the ground again after its own first contact since touchdown."""
-    takeoffs: np.ndarray = field(init=False)
-    """Number of times that the robot took off again after touchdown."""
+    The first jump goes to a place relative to start and heading, each other one relative to the base's place and yaw
+    when it is commanded. Nothing of a jump changes after its end.
+    """
 
-    def __post_init__(self) -> None:
-        """Begin with no jump ended."""
-        count = len(self.target)
-        self.end = np.full(count, -1)
-        self.apex, self.tilt = np.zeros(count), np.zeros(count)
-        self.rest_speed, self.early = np.full(count, np.inf), np.zeros(count, dtype=bool)
-        self.drift, self.yaw, self.lift_time = (np.zeros(count) for _ in range(3))
-        self.takeoffs, self._paws = np.zeros(count, dtype=int), Paws(count)
-        self._success = success_index(self.terminations)
+    goals: np.ndarray  # [m] (..., 3) landing place ahead and to the left, base height at the apex, 0 if any will do
+    current: np.ndarray  # (num_envs,) number of the jump under way; that of jumps in a row after the end
+    end: np.ndarray  # index of the end in `terminations`, -1 before it
+    place: np.ndarray  # [m] (..., 2) base at the end, world
+    target: np.ndarray  # [m] (..., 2) where it should be, world
+    touchdown: np.ndarray  # [m] (..., 2) base at touchdown, world
+    place_soon: np.ndarray  # [m] (..., 2) base SOON after touchdown, world
+    heading: np.ndarray  # [rad] of the jump
+    yaw: np.ndarray  # [rad] of the base at the end, from the jump's heading
+    drift: np.ndarray  # [m] of the base in the plane, from the start to the end
+    apex: np.ndarray  # [m] largest base height
+    tilt: np.ndarray  # [rad] largest since touchdown
+    rest_speed: np.ndarray  # [m/s] of the base `speed_time` after touchdown; infinite before
+    early: np.ndarray  # whether the jump began before the command
+    air_time: np.ndarray  # [s] longest that no paw was on the ground after touchdown
+    lift_time: np.ndarray  # [s] longest that any paw was off the ground after its own first contact in the landing
+    takeoffs: np.ndarray  # number of takeoffs after touchdown: upward at TAKEOFF_SPEED with no paw down
+
+    def __init__(
+        self,
+        goals: np.ndarray,
+        terminations: tuple[str, ...],
+        headings: np.ndarray | float = 0.0,
+        delay: np.ndarray | float = DELAY,
+        rest: float = REST_TIME,
+    ) -> None:
+        """Begin with no jump ended.
+
+        Args:
+            goals: (num_envs, jumps in a row, 3) [m].
+            terminations: Names of the ends of an episode, SUCCESS among them.
+            headings: [rad] (num_envs,) or one for all.
+            delay: [s] Until the first jump is commanded; (num_envs,) or one for all.
+            rest: [s] From touchdown until the jump is over, and the next one commanded.
+        """
+        self.goals, self.terminations = goals, terminations
+        self.headings, self.delay, self.rest = headings, delay, rest
+        shape = goals.shape[:2]
+        self.current, self.end = np.zeros(shape[0], dtype=int), np.full(shape, -1)
+        self.place, self.target, self.touchdown, self.place_soon = (np.full((*shape, 2), np.nan) for _ in range(4))
+        self.heading, self.yaw, self.drift, self.apex, self.tilt = (np.full(shape, np.nan) for _ in range(5))
+        self.rest_speed, self.early = np.full(shape, np.inf), np.zeros(shape, dtype=bool)
+        self.air_time, self.lift_time = np.zeros(shape), np.zeros(shape)
+        self.takeoffs = np.zeros(shape, dtype=int)
+        self._aloft, self._lifted = np.zeros(shape[0]), np.zeros((shape[0], 4))
+        self._came_down, self._flies = np.zeros((shape[0], 4), dtype=bool), np.zeros(shape[0], dtype=bool)
+        self._success = success_index(terminations)
 
     @property
-    def seconds(self) -> float:
-        """[s] In which a jump has ended."""
-        return 7.0 + self.rest
+    def speed_time(self) -> float:
+        """[s] After touchdown, when the base's speed is recorded."""
+        return self.rest
 
     def begin(self, env: EvaluationEnv) -> None:
-        """Stand every world in the default pose with its height to reach."""
-        goals = np.zeros((env.num_envs, 3))
-        goals[:, 2] = self.target
-        env.evaluation_reset(jump_commands(goals, DELAY, env.step_dt))
+        """Stand every world in the default pose with its first goal."""
+        env.evaluation_reset(jump_commands(self.goals[:, 0], self.delay, env.step_dt), self.headings)
 
     def look(self, env: EvaluationEnv) -> dict[str, np.ndarray]:
         """Return the state of every world's episode, which of its paws are on the ground, and how fast it rises."""
         return env.task_arrays() | paw_arrays(env)
 
+    def follow(self, env: EvaluationEnv) -> bool:
+        """Look at the environment after a policy step, and command the jumps that are due."""
+        before = self.current.copy()
+        ended = super().follow(env)
+        due = (self.current > before) & (self.current < self.goals.shape[1])
+        if due.any():
+            goals = np.zeros((env.num_envs, 3), dtype=np.float32)
+            goals[due] = self.goals[due, self.current[due]]
+            env.command(goals, due)
+        return ended
+
     def update(self, arrays: dict[str, np.ndarray], step_dt: float) -> bool:
         """Take in a policy step; return whether all jumps have ended."""
-        commanded = arrays["steps"] == arrays["command_step"]
-        self.early[commanded] = arrays["phase"][commanded] != STANCE
-        running = self.end < 0
-        self.apex[running] = arrays["max_height"][running]
-        self.tilt[running] = arrays["peak_tilt"][running]
-        self.drift[running] = np.linalg.norm((arrays["base_pos"] - arrays["start"])[running, :2], axis=1)
-        self.yaw[running] = wrapped(yaw_of(arrays["base_quat"]) - arrays["heading"])[running]
-        landed = arrays["phase"] == LANDED
-        self._follow_paws(arrays, np.flatnonzero(running), landed, step_dt)
-        due = running & landed & (arrays["phase_steps"] == round(REST_TIME / step_dt))
-        self.rest_speed[due] = np.linalg.norm(arrays["base_vel"][due], axis=1)
-        failed = running & (arrays["ending"] >= 0) & (arrays["ending"] != self._success)
-        rested = running & ~failed & landed & (arrays["phase_steps"] >= round(self.rest / step_dt))
-        self.end[failed], self.end[rested] = arrays["ending"][failed], self._success
-        return bool((self.end >= 0).all())
+        count = self.goals.shape[1]
+        row = np.flatnonzero(self.current < count)
+        now = {name: values[row] for name, values in arrays.items()}
+        at = (row, self.current[row])
+        self._mark_early(arrays, at)
+        self.place[at], self.target[at] = now["base_pos"][:, :2], now["goal"][:, :2]
+        self.heading[at] = now["heading"]
+        self.yaw[at] = wrapped(yaw_of(now["base_quat"]) - now["heading"])
+        self.drift[at] = np.linalg.norm((now["base_pos"] - now["start"])[:, :2], axis=1)
+        self.apex[at], self.tilt[at] = now["max_height"], now["peak_tilt"]
+        landed = now["phase"] == LANDED
+        self._follow_landing(now, at, landed, step_dt)
+        failed = (now["ending"] >= 0) & (now["ending"] != self._success)
+        rested = ~failed & landed & (now["phase_steps"] >= round(self.rest / step_dt))
+        self.end[at] = np.where(failed, now["ending"], np.where(rested, self._success, -1))
+        self.current[row[rested]] += 1
+        self.current[row[failed]] = count
+        return bool((self.current >= count).all())
 
-    def _follow_paws(self, arrays: dict[str, np.ndarray], row: np.ndarray, landed: np.ndarray, step_dt: float) -> None:
-        """Take in what the paws of some worlds do after touchdown."""
-        lifted = self._paws.update(row, landed[row], arrays["paws_down"][row], arrays["up"][row], step_dt)
-        self.lift_time[row] = np.maximum(self.lift_time[row], lifted.paw)
-        self.takeoffs[row] += lifted.takeoff
+    def _mark_early(self, arrays: dict[str, np.ndarray], at: tuple[np.ndarray, np.ndarray]) -> None:
+        """Mark the jumps that take off before the command; at: worlds and numbers of the jumps under way."""
+        takes_off = (arrays["took_off"] == 1) & (arrays["steps"] < arrays["command_step"])
+        self.early[at] |= takes_off[at[0]]
+
+    def _follow_landing(
+        self, now: dict[str, np.ndarray], at: tuple[np.ndarray, np.ndarray], landed: np.ndarray, step_dt: float
+    ) -> None:
+        """Take in where the bases of the jumps under way are after touchdown, and what their paws do."""
+        row, number = at
+        steps, speed = now["phase_steps"], np.linalg.norm(now["base_vel"], axis=1)
+        for kept, moment, values in (
+            (self.touchdown, now["touched_down"] == 1, now["base_pos"][:, :2]),
+            (self.place_soon, steps == round(SOON / step_dt), now["base_pos"][:, :2]),
+            (self.rest_speed, steps == round(self.speed_time / step_dt), speed),
+        ):
+            due = landed & moment
+            kept[row[due], number[due]] = values[due]
+        down = landed[:, None] & now["paws_down"]
+        aloft = landed & ~down.any(axis=1)
+        self._aloft[row] = np.where(aloft, self._aloft[row] + step_dt, 0.0)
+        self._came_down[row] = landed[:, None] & (self._came_down[row] | down)
+        self._lifted[row] = np.where(self._came_down[row] & ~down, self._lifted[row] + step_dt, 0.0)
+        flies = aloft & (self._flies[row] | (now["up"] > TAKEOFF_SPEED))
+        self.takeoffs[at] += flies & ~self._flies[row]
+        self._flies[row] = flies
+        self.air_time[at] = np.maximum(self.air_time[at], self._aloft[row])
+        self.lift_time[at] = np.maximum(self.lift_time[at], self._lifted[row].max(axis=1))
 
     @property
-    def error(self) -> np.ndarray:
-        """[m] Apex minus target; not a number where the simulation came apart."""
-        broken = np.isin(self.outcomes, CAME_APART) | ~np.isfinite(self.apex)
-        return np.where(broken, np.nan, self.apex - self.target)
+    def ends(self) -> np.ndarray:
+        """Name of each jump's end, whether or not it met its goal."""
+        names = np.array([*self.terminations, NO_END], dtype=object)[self.end]
+        return np.where(np.isnan(self.heading), NOT_BEGUN, names)
 
     @property
-    def success(self) -> np.ndarray:
-        """Whether the jump met its height within the task's limit, if it has one, and was landed."""
+    def broken(self) -> np.ndarray:
+        """Whether the simulation came apart."""
+        return self.ends == CAME_APART
+
+    @property
+    def landed(self) -> np.ndarray:
+        """Whether the robot came down on its paws and stayed there, wherever it was."""
         return self.end == self._success
 
     @property
-    def still(self) -> np.ndarray:
-        """Whether the robot landed, and lifted no paw again for `jumper_warp.evaluation.paws.HOP_TIME` or longer."""
-        return self.success & ~stepped(self.lift_time)
+    def hopped(self) -> np.ndarray:
+        """Whether the robot jumped again after touchdown."""
+        return self.air_time > HOP_TIME + TIME_EPS
 
     @property
-    def outcomes(self) -> np.ndarray:
-        """Name of each jump's end."""
-        return np.array([*self.terminations, NO_END])[self.end]
+    def stepped(self) -> np.ndarray:
+        """Whether any paw that had come down was off the ground again for HOP_TIME or longer."""
+        return self.lift_time > HOP_TIME - TIME_EPS
 
-    def columns(self) -> dict[str, list]:
-        """Return targets, apexes and errors [m] and the ends."""
-        numbers = {"target_m": self.target, "apex_m": self.apex, "error_m": self.error}
-        return {name: finite(values) for name, values in numbers.items()} | {"end": self.outcomes.tolist()}
+    @property
+    def still(self) -> np.ndarray:
+        """Whether the robot landed, wherever it was, without a step."""
+        return self.landed & ~self.stepped
 
     def series(self, worlds: Sequence[int]) -> dict[str, float]:
-        """Return the base's height and the commanded one [m]."""
-        series = {}
-        for world in worlds:
-            series[f"height/base of {world} [m]"] = self.seen["base_pos"][world, 2]
-            series[f"height/target of {world} [m]"] = self.target[world]
-        return series
-
-    def notes(self, worlds: Sequence[int]) -> dict[str, Any]:
-        """Return the commanded heights [m]."""
-        return {"targets_m": self.target[list(worlds)].tolist()}
-
-    def strip(self, film: Film) -> Strip:
-        """Return pictures of the jump nearest to SHOWN_HEIGHT."""
-        targets = self.target[film.worlds]
-        index = int(np.argmin(np.abs(targets - SHOWN_HEIGHT)))
-        height = film.base(index)[:, 2]
-        frames = moments(height, round(DELAY / film.env.step_dt) - 1)
-        captions = [f"{(frame + 1) * film.env.step_dt:.2f} s, {height[frame]:.2f} m" for frame in frames]
-        eye, target, size = view_of(float(height[frames].max()))
-        return Strip(index, frames, captions, eye, target, size, name=f"jump_{targets[index]:.2f}_m")
+        """Return the base's height [m]."""
+        return {f"height/base of {world} [m]": self.seen["base_pos"][world, 2] for world in worlds}
 
 
-def view_of(apex: float) -> tuple[tuple[float, float, float], tuple[float, float, float], tuple[int, int]]:
-    """Return eye and target [m] and size [px] of pictures of a jump to an apex [m], as tall as it needs, one scale."""
-    taller = max(1.0, (apex + ABOVE - LOWEST) / (HIGHEST - LOWEST))
-    middle = LOWEST + 0.5 * taller * (HIGHEST - LOWEST)
-    return (1.5 * taller, 2.0 * taller, middle + 0.35 * taller), (0.0, 0.0, middle), (320, round(420 * taller))
+def check_jumps(jumps: int, in_range: tuple[float, float]) -> None:
+    """Raise InputError unless there is a jump and a range [m]."""
+    if jumps < 1:
+        raise InputError(f"jumps must be at least 1, got {jumps}")
+    if not 0.0 <= in_range[0] <= in_range[1] < 10.0:
+        raise InputError(f"in_range must be in [0, 10) m and rise, got {in_range[0]}, {in_range[1]}")
 
 
-def run_jumps(
-    act: Callable[[torch.Tensor], torch.Tensor],
-    env: EvaluationEnv,
-    heights: np.ndarray,
-    watch: Callable[[], object] | None = None,
-) -> Jumps:
-    """Let every world jump to its height (num_envs,) [m] once; act, watch: as of `run_evaluation`."""
-    jumps = Jumps(np.asarray(heights, dtype=float), termination_names(env.task))
-    run_evaluation(act, env, jumps, watch=watch)
-    return jumps
+def yaw_of(quat: np.ndarray) -> np.ndarray:
+    """Return the yaw [rad] of orientations (..., 4), xyzw: the heading of body x in the world plane."""
+    x, y, z, w = np.moveaxis(quat, -1, 0)
+    return np.arctan2(2.0 * (x * y + w * z), 1.0 - 2.0 * (y * y + z * z))
+
+
+def wrapped(angle: np.ndarray) -> np.ndarray:
+    """Return angles [rad] within -pi..pi."""
+    return np.arctan2(np.sin(angle), np.cos(angle))

@@ -1,35 +1,230 @@
-"""Jumps to places: what is asked for, and the metrics of what became of it."""
+"""Jumps to places in the plane: their log, the metrics of it, and the flags that make it.
+
+A jump is over once the robot has had a second to come to rest; the distance between base and goal then is its error. A
+jump that fails before is measured where it failed. Hops and steps on the way there are reported separately.
+"""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
 import tyro
 
-from jumper_warp.evaluation.heights import MAX_ROBOTS, HeightGoals, check_jumps
-from jumper_warp.evaluation.jumps import REST_SPEED, REST_TIME
-from jumper_warp.evaluation.landings import FALLS, MISSED, NOT_BEGUN, Landings
+from jumper_warp.evaluation.film import PICTURE, Film, Strip, beside, moments
+from jumper_warp.evaluation.heights import MAX_ROBOTS
+from jumper_warp.evaluation.jumps import DELAY, NOT_BEGUN, REST_SPEED, REST_TIME, TAKEOFF_SPEED, JumpLog, check_jumps
 from jumper_warp.evaluation.log import (
     CAME_APART,
     COLLIDED,
+    SUCCESS,
     Metrics,
     failures,
+    finite,
     largest,
     mean,
     termination_names,
+    with_ends,
     within,
 )
+from jumper_warp.kernels.jump import terminations
 from jumper_warp.tasks.cfg import TaskCfg
+from jumper_warp.tasks.terms import TerminationTerm
 from jumper_warp.utils.errors import InputError
 
 Place = tuple[float, float]
+SUCCESS_TOLERANCE = 0.1
+"""[m] A landed jump that ends this close to its goal succeeds."""
+ENDS = (CAME_APART, "low_base", COLLIDED, "no_jump", SUCCESS)
+"""Terminations of the task that end a jump here, in this order, so that no success hides a fall; the others only shape
+the training."""
+FALLS = (CAME_APART, "low_base", COLLIDED)
+MISSED = "missed"
+"""Outcome of a jump that landed well, but elsewhere."""
+EARLY = "early"
+"""Outcome of a jump that began before the command."""
 AT_END = "below_0_1_m_s_at_the_end_rate"
 """Name of the share of landed jumps whose base was at rest (`REST_SPEED`) when the jump was over."""
-SECONDS_MORE = 2.5
-"""[s] Of a recording for each further jump."""
+SECONDS, SECONDS_MORE = 3.5, 2.5
+"""[s] Of a recording, and for each further jump."""
+SHOWN_DISTANCE = 1.0
+"""[m] The filmstrip shows the jump nearest to this."""
+
+
+def for_evaluation(task: TaskCfg) -> TaskCfg:
+    """Return a task with the terminations that count in an evaluation."""
+    return with_ends(task, ENDS)
+
+
+def ended_by_takeoff(task: TaskCfg) -> TaskCfg:
+    """Return the same, and a second takeoff after landing ends the jump, as in the authors' configuration."""
+    task = for_evaluation(task)
+    takeoff = TerminationTerm(terminations.second_takeoff, speed=TAKEOFF_SPEED)
+    return replace(task, terminations=(*task.terminations[:-1], takeoff, task.terminations[-1]))
+
+
+class PlaceLog(JumpLog):
+    """Jumps to places in the plane. One that begins on command and lands within SUCCESS_TOLERANCE is a success."""
+
+    spacing = 3.0
+
+    def __init__(
+        self,
+        places: np.ndarray,
+        terminations: tuple[str, ...],
+        headings: np.ndarray | float = 0.0,
+        delay: np.ndarray | float = DELAY,
+        rest: float = REST_TIME,
+    ) -> None:
+        """places: (num_envs, jumps in a row, 2) [m]; the others as in `JumpLog`. Raises InputError: another shape."""
+        self.places = np.asarray(places, dtype=float)
+        if self.places.ndim != 3 or self.places.shape[2] != 2:
+            raise InputError(f"goals must have shape (num_envs, jumps, 2), got {self.places.shape}")
+        super().__init__(np.pad(self.places, ((0, 0), (0, 0), (0, 1))), terminations, headings, delay, rest)
+
+    @property
+    def seconds(self) -> float:
+        """[s] In which a row has ended: a jump waits, squats and flies for at most 3.5 s."""
+        return 1.0 + self.goals.shape[1] * (3.5 + self.rest) + float(np.max(self.delay))
+
+    @property
+    def offset(self) -> np.ndarray:
+        """[m] (..., 2) From goal to base at the end, ahead and to the left of the jump's heading."""
+        x, y = np.moveaxis(self.place - self.target, -1, 0)
+        cos, sin = np.cos(-self.heading), np.sin(-self.heading)
+        return np.stack([cos * x - sin * y, sin * x + cos * y], axis=-1)
+
+    @property
+    def landing(self) -> np.ndarray:
+        """[m] (..., 2) Base at the end, where the goals are measured."""
+        return self.places + self.offset
+
+    @property
+    def error(self) -> np.ndarray:
+        """[m] Distance of the base from the goal at the end; NaN where the simulation came apart."""
+        broken = self.broken | ~np.isfinite(self.place).all(axis=-1)
+        return np.where(broken, np.nan, self.distance(self.place))
+
+    def distance(self, place: np.ndarray) -> np.ndarray:
+        """Return the distance [m] of places (..., 2), world, from the goals."""
+        return np.linalg.norm(place - self.target, axis=-1)
+
+    @property
+    def success(self) -> np.ndarray:
+        """Whether the jump, begun on command, was landed near its goal."""
+        return self.landed & (np.nan_to_num(self.error, nan=np.inf) <= SUCCESS_TOLERANCE) & ~self.early
+
+    @property
+    def outcomes(self) -> np.ndarray:
+        """Name of each jump's end, MISSED or EARLY where it was landed without success."""
+        missed = np.where(self.landed & ~self.success, np.where(self.early, EARLY, MISSED), self.ends)
+        return np.where(self.success, SUCCESS, missed)
+
+    def columns(self) -> dict[str, list]:
+        """Return goals, headings, landings and errors, and the ends; row after row."""
+        numbers = {f"goal_{axis}_m": self.places[..., i] for i, axis in enumerate("xy")}
+        numbers |= {"heading_deg": np.degrees(self.heading)}
+        numbers |= {f"landing_{axis}_m": self.landing[..., i] for i, axis in enumerate("xy")}
+        numbers |= {"error_m": self.error}
+        ends = {"end": self.outcomes.ravel().tolist()}
+        return {name: finite(values.ravel()) for name, values in numbers.items()} | ends
+
+    def series(self, worlds: Sequence[int]) -> dict[str, float]:
+        """Return the base's height and its distance from the current goal [m]."""
+        way = np.linalg.norm((self.seen["base_pos"] - self.seen["goal"])[:, :2], axis=1)
+        return super().series(worlds) | {f"distance/goal of {world} [m]": way[world] for world in worlds}
+
+    def marks(self, worlds: Sequence[int]) -> np.ndarray:
+        """Return the goals that were commanded [m], world frame, (worlds, jumps in a row, 3), z = 0."""
+        target = self.target[list(worlds)]
+        return np.concatenate([target, np.zeros_like(target[..., :1])], axis=-1)
+
+    def notes(self, worlds: Sequence[int]) -> dict[str, Any]:
+        """Return the goals [m]."""
+        return {"goals_m": self.places[list(worlds)].tolist()}
+
+    def strip(self, film: Film) -> Strip:
+        """Return pictures of the jump, or row of jumps, that begins with about SHOWN_DISTANCE."""
+        distance = np.linalg.norm(self.places[film.worlds, 0], axis=1)
+        index = int(np.argmin(np.abs(distance - SHOWN_DISTANCE)))
+        base = film.base(index)
+        if self.places.shape[1] == 1:
+            delay = np.broadcast_to(self.delay, film.env.num_envs)[film.worlds[index]]
+            frames = moments(base[:, 2], round(delay / film.env.step_dt) - 1)
+        else:
+            frames = np.linspace(0, len(base) - 1, 9).round().astype(int).tolist()
+        ends = self.place[film.worlds[index]]
+        eye, target = beside(base[0, :2], ends[np.isfinite(ends[:, 0])][-1])
+        captions = [f"{(frame + 1) * film.env.step_dt:.2f} s" for frame in frames]
+        return Strip(index, frames, captions, eye, target, PICTURE)
+
+
+def landing_metrics(landings: PlaceLog, inside: np.ndarray | None = None) -> Metrics:
+    """Return the metrics of jumps to places, all rows together.
+
+    Errors are over all jumps, failed ones included, but those whose simulation came apart, which `came_apart` counts,
+    and those that were not begun. `ahead` and `left` are signed. Tilts, turns, hops and steps are those of the landed
+    jumps. `still_landing_rate` is of all jumps, `second_takeoff_rate` of those that came down. `fall_rate` and
+    `miss_rate` share no jump: one that misses has landed on its paws, but elsewhere.
+
+    inside: which jumps the metrics in range count, shaped like `landings.end`; without it there are none.
+    """
+    begun = landings.ends != NOT_BEGUN
+    error, success, landed = landings.error, landings.success, landings.landed
+    offset = np.where(np.isnan(error)[..., None], np.nan, landings.offset)
+    tilt, yaw = np.degrees(landings.tilt), np.degrees(np.abs(landings.yaw))
+    at_rest = "at_rest_within_1_s_rate" if landings.rest == REST_TIME else AT_END
+    metrics: Metrics = {
+        "jumps": int(begun.sum()),
+        "mean_error_m": mean(error),
+        "mean_error_of_successes_m": mean(error[success]),
+        "max_error_of_successes_m": largest(error[success]),
+        "max_error_m": largest(error),
+        "mean_error_ahead_m": mean(offset[..., 0]),
+        "mean_error_left_m": mean(offset[..., 1]),
+        "success_rate": mean(success[begun]),
+        "single_jump_success_rate": mean((success & ~landings.hopped)[begun]),
+        "step_free_success_rate": mean((success & ~landings.stepped)[begun]),
+        "landing_rate": mean(landed[begun]),
+        "second_hop_rate": mean(landings.hopped[landed]),
+        "step_rate": mean(landings.stepped[landed]),
+        "mean_error_at_touchdown_m": mean(landings.distance(landings.touchdown)[landed]),
+        "mean_error_0_3_s_after_touchdown_m": mean(landings.distance(landings.place_soon)[landed]),
+        "still_landing_rate": mean(landings.still[begun]),
+        "second_takeoff_rate": mean((landings.takeoffs > 0)[np.isfinite(landings.touchdown).all(axis=-1)]),
+        at_rest: mean((landings.rest_speed < REST_SPEED)[landed]),
+        "mean_landing_tilt_deg": mean(tilt[landed]),
+        "max_landing_tilt_deg": largest(tilt[landed]),
+        "mean_turn_deg": mean(yaw[landed]),
+        "max_turn_deg": largest(yaw[landed]),
+        "collision_rate": mean((landings.ends == COLLIDED)[begun]),
+        "fall_rate": mean(np.isin(landings.ends, FALLS)[begun]),
+        "miss_rate": mean((landings.outcomes == MISSED)[begun]),
+        "early_rate": mean(landings.early[begun]),
+        CAME_APART: int(landings.broken.sum()),
+    }
+    if inside is not None:
+        inside = begun & inside
+        metrics |= {
+            "mean_error_in_range_m": mean(error[inside]),
+            "success_rate_in_range": mean(success[inside]),
+            "still_landing_rate_in_range": mean(landings.still[inside]),
+        }
+    return metrics | failures(landings.outcomes[begun & ~success])
+
+
+def trained_range(task: TaskCfg) -> dict[str, float]:
+    """Return the distances straight ahead [m] that the levels of a task's training drew goals from."""
+    lower, upper = zip(*((level.goal_lower[0], level.goal_upper[0]) for level in task.levels), strict=True)
+    return {"trained_lower_m": max(min(lower), 0.0), "trained_upper_m": max(upper)}
+
+
+def random_headings(count: int, seed: int) -> np.ndarray:
+    """Return headings (count,) [rad] over the full circle."""
+    return np.random.default_rng(seed).uniform(-math.pi, math.pi, count)
 
 
 @dataclass(frozen=True)
@@ -62,16 +257,16 @@ class PlaceFlags:
         """Number of worlds."""
         return self.jumps
 
-    def log(self, task: TaskCfg, seed: int) -> Landings:
+    def log(self, task: TaskCfg, seed: int) -> PlaceLog:
         """Return single jumps with these goals and headings."""
         rng = np.random.default_rng(seed)
-        goals = np.stack([np.linspace(*self.x, self.jumps), rng.uniform(*self.y, self.jumps)], axis=1)
+        places = np.stack([np.linspace(*self.x, self.jumps), rng.uniform(*self.y, self.jumps)], axis=1)
         headings = random_headings(self.jumps, seed) if self.heading == "any" else math.radians(self.heading)
-        return Landings(goals[:, None], termination_names(task), headings)
+        return PlaceLog(places[:, None], termination_names(task), headings)
 
-    def metrics(self, log: Landings) -> Metrics:
+    def metrics(self, log: PlaceLog) -> Metrics:
         """Return `landing_metrics`, with the range."""
-        inside = within(np.linalg.norm(log.goals, axis=-1), self.in_range)
+        inside = within(np.linalg.norm(log.places, axis=-1), self.in_range)
         return landing_metrics(log, inside) | {"range_lower_m": self.in_range[0], "range_upper_m": self.in_range[1]}
 
 
@@ -85,8 +280,6 @@ class PlaceGoals:
     """[m] Where all robots jump next, a second after touchdown, from where they are by then; once for each jump."""
     unless_told: tyro.conf.Suppress[tuple[Place, ...]] = ((0.5, 0.0), (0.9, 0.0), (1.3, 0.0))
     """[m] Goals if there are none; flags that are given several times would be added to a default."""
-
-    spacing = 2.0
 
     def __post_init__(self) -> None:
         """Raises InputError: a place is out of range, or their number."""
@@ -108,78 +301,8 @@ class PlaceGoals:
     @property
     def seconds(self) -> float:
         """[s] Length of the recording."""
-        return HeightGoals.seconds + SECONDS_MORE * len(self.then)
+        return SECONDS + SECONDS_MORE * len(self.then)
 
-    @property
-    def notes(self) -> dict[str, Any]:
-        """What to save with the recording."""
-        return {"goals_m": self.goals, "then_m": self.then}
-
-    def log(self, task: TaskCfg) -> Landings:
+    def log(self, task: TaskCfg) -> PlaceLog:
         """Return one row of jumps a robot."""
-        return Landings(np.array([[goal, *self.then] for goal in self.goals]), termination_names(task))
-
-
-def random_headings(count: int, seed: int) -> np.ndarray:
-    """Return headings (count,) [rad] over the full circle."""
-    return np.random.default_rng(seed).uniform(-math.pi, math.pi, count)
-
-
-def landing_metrics(landings: Landings, inside: np.ndarray | None = None) -> Metrics:
-    """Return the metrics of jumps to places, all rows together.
-
-    Errors are over all jumps, failed ones included, but those whose simulation came apart, which `came_apart` counts,
-    and those that were not begun. `ahead` and `left` are signed. Tilts, turns, hops and steps are those of the landed
-    jumps. `still_landing_rate` is of all jumps, `second_takeoff_rate` of those that came down. `fall_rate` and
-    `miss_rate` share no jump: one that misses has landed on its paws, but elsewhere.
-
-    inside: which jumps the metrics in range count, shaped like `landings.end`; without it there are none.
-    """
-    begun = landings.ends != NOT_BEGUN
-    error, success, landed = landings.error, landings.success, landings.landed
-    offset = np.where(np.isnan(error)[..., None], np.nan, landings.offset)
-    tilt, yaw = np.degrees(landings.tilt), np.degrees(landings.yaw)
-    at_rest = "at_rest_within_1_s_rate" if landings.rest == REST_TIME else AT_END
-    metrics: Metrics = {
-        "jumps": int(begun.sum()),
-        "mean_error_m": mean(error),
-        "mean_error_of_successes_m": mean(error[success]),
-        "max_error_of_successes_m": largest(error[success]),
-        "max_error_m": largest(error),
-        "mean_error_ahead_m": mean(offset[..., 0]),
-        "mean_error_left_m": mean(offset[..., 1]),
-        "success_rate": mean(success[begun]),
-        "single_jump_success_rate": mean(landings.single[begun]),
-        "step_free_success_rate": mean(landings.step_free[begun]),
-        "landing_rate": mean(landed[begun]),
-        "second_hop_rate": mean(landings.hopped[landed]),
-        "step_rate": mean(landings.stepped[landed]),
-        "mean_error_at_touchdown_m": mean(landings.touchdown_error[landed]),
-        "mean_error_0_3_s_after_touchdown_m": mean(landings.error_soon[landed]),
-        "still_landing_rate": mean(landings.still[begun]),
-        "second_takeoff_rate": mean(landings.took_off_again[landings.touched_down]),
-        at_rest: mean((landings.rest_speed < REST_SPEED)[landed]),
-        "mean_landing_tilt_deg": mean(tilt[landed]),
-        "max_landing_tilt_deg": largest(tilt[landed]),
-        "mean_turn_deg": mean(np.abs(yaw[landed])),
-        "max_turn_deg": largest(np.abs(yaw[landed])),
-        "collision_rate": mean((landings.ends == COLLIDED)[begun]),
-        "fall_rate": mean(np.isin(landings.ends, FALLS)[begun]),
-        "miss_rate": mean((landings.outcomes == MISSED)[begun]),
-        "early_rate": mean(landings.early[begun]),
-        CAME_APART: int((landings.ends == CAME_APART).sum()),
-    }
-    if inside is not None:
-        inside = begun & inside
-        metrics |= {
-            "mean_error_in_range_m": mean(error[inside]),
-            "success_rate_in_range": mean(success[inside]),
-            "still_landing_rate_in_range": mean(landings.still[inside]),
-        }
-    return metrics | failures(landings.outcomes[begun & ~success])
-
-
-def trained_range(task: TaskCfg) -> dict[str, float]:
-    """Return the distances straight ahead [m] that the levels of a task's training drew goals from."""
-    lower, upper = zip(*((level.goal_lower[0], level.goal_upper[0]) for level in task.levels), strict=True)
-    return {"trained_lower_m": max(min(lower), 0.0), "trained_upper_m": max(upper)}
+        return PlaceLog(np.array([[goal, *self.then] for goal in self.goals]), termination_names(task))

@@ -10,7 +10,8 @@ from typing import Any
 import matplotlib
 import numpy as np
 
-from jumper_warp.evaluation.landings import Landings
+from jumper_warp.evaluation.jumps import JumpLog
+from jumper_warp.evaluation.places import PlaceLog
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
@@ -39,15 +40,16 @@ def draw_sweep(
     axis.legend(loc="upper left")
 
 
-def draw_landings(axis: Any, landings: Landings, title: str) -> None:
-    """Draw goals and landings of first jumps, seen from above with the start at the origin."""
-    good, goals, landing = landings.success[:, 0], landings.goals[:, 0], landings.landing[:, 0]
-    axis.plot(*np.stack([goals, landing]).transpose(2, 0, 1), color="0.7", linewidth=0.8)
-    axis.scatter(goals[:, 0], goals[:, 1], s=20, color="0.4", marker="x", linewidth=0.8, label="goal")
-    axis.scatter(landing[good, 0], landing[good, 1], s=12, color="tab:blue", label="landed there")
-    axis.scatter(landing[~good, 0], landing[~good, 1], s=14, color="tab:red", label="failed")
-    axis.set(xlabel="ahead [m]", ylabel="to the left [m]", title=title, aspect="equal")
-    if not axis.figure.legends:
+def draw_landings(path: Path, tests: dict[str, PlaceLog], size: tuple[float, float]) -> None:
+    """Draw goals and landings of first jumps from above, the start at the origin, a panel a test (title to jumps)."""
+    with drawn(path, 1, len(tests), figsize=size, squeeze=False) as axes:
+        for axis, (title, landings) in zip(axes[0], tests.items(), strict=True):
+            good, goals, landing = landings.success[:, 0], landings.places[:, 0], landings.landing[:, 0]
+            axis.plot(*np.stack([goals, landing]).transpose(2, 0, 1), color="0.7", linewidth=0.8)
+            axis.scatter(goals[:, 0], goals[:, 1], s=20, color="0.4", marker="x", linewidth=0.8, label="goal")
+            axis.scatter(landing[good, 0], landing[good, 1], s=12, color="tab:blue", label="landed there")
+            axis.scatter(landing[~good, 0], landing[~good, 1], s=14, color="tab:red", label="failed")
+            axis.set(xlabel="ahead [m]", ylabel="to the left [m]", title=title, aspect="equal")
         axis.figure.legend(*axis.get_legend_handles_labels(), loc="outside lower center", ncols=3)
 
 
@@ -57,7 +59,7 @@ class Track:
     def __init__(self) -> None:
         self.places: list[np.ndarray] = []
 
-    def __call__(self, landings: Landings) -> None:
+    def __call__(self, landings: JumpLog) -> None:
         """Add the moment; places of rows that have ended are not numbers."""
         running = landings.current < landings.goals.shape[1]
         self.places.append(np.where(running[:, None], landings.seen["base_pos"][:, :2], np.nan))

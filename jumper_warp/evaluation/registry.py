@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Any, Literal, Protocol
+from dataclasses import dataclass, replace
+from typing import Literal, Protocol
 
-from jumper_warp.evaluation import heights, landings
+from jumper_warp.evaluation import heights, places
 from jumper_warp.evaluation.episodes import EpisodeFlags, EpisodeGoals
-from jumper_warp.evaluation.heights import HeightFlags, HeightGoals, MarsHeightGoals
+from jumper_warp.evaluation.heights import HeightFlags, HeightGoals
 from jumper_warp.evaluation.log import EvaluationLog, Metrics
 from jumper_warp.evaluation.places import PlaceFlags, PlaceGoals
 from jumper_warp.evaluation.turns import TurnFlags, TurnGoals
@@ -38,10 +38,6 @@ class PlayFlags(Protocol):
     """Number of worlds."""
     seconds: float
     """[s] Length of the recording."""
-    spacing: float
-    """[m] Between robots in the picture."""
-    notes: dict[str, Any]
-    """What to save with the recording."""
 
     def log(self, task: TaskCfg) -> EvaluationLog:
         """Return what is asked for, one row a world."""
@@ -61,30 +57,26 @@ class Evaluation:
     """What `jumper finetune` makes its jumps miss by less; None: it does not know how."""
 
 
+HEIGHT = Evaluation(HeightFlags(), HeightGoals(), heights.for_evaluation, "height")
+PLACE = Evaluation(PlaceFlags(), PlaceGoals(), places.for_evaluation, "place")
 EVALUATIONS: dict[str, Evaluation] = {
-    "height": Evaluation(HeightFlags(), HeightGoals(), heights.for_evaluation, "height"),
-    "place": Evaluation(PlaceFlags(), PlaceGoals(), landings.for_evaluation, "place"),
-    "around": Evaluation(
-        PlaceFlags(x=(-0.7, 0.7), y=(-0.7, 0.7), in_range=(0.0, 0.7)),
-        PlaceGoals(unless_told=((0.5, 0.0), (0.0, 0.5), (-0.5, 0.0))),
-        landings.for_evaluation,
+    "height": HEIGHT,
+    "place": PLACE,
+    "height-mars": replace(
+        HEIGHT, flags=HeightFlags(lower=1.0, upper=3.3, in_range=(1.0, 2.9)), play=HeightGoals((1.5, 2.3, 3.0), 6.0)
     ),
-    "height-mars": Evaluation(
-        HeightFlags(lower=1.0, upper=3.3, in_range=(1.0, 2.9)),
-        MarsHeightGoals(height=(1.5, 2.3, 3.0)),
-        heights.for_evaluation,
-        "height",
+    "place-mars": replace(
+        PLACE, flags=PlaceFlags(x=(0.5, 4.2), in_range=(0.5, 3.9)),
+        play=PlaceGoals(unless_told=((1.0, 0.0), (2.5, 0.0), (3.9, 0.0))),
     ),
-    "place-mars": Evaluation(
-        PlaceFlags(x=(0.5, 4.2), in_range=(0.5, 3.9)),
-        PlaceGoals(unless_told=((1.0, 0.0), (2.5, 0.0), (3.9, 0.0))),
-        landings.for_evaluation,
-        "place",
+    "around": replace(
+        PLACE, flags=PlaceFlags(x=(-0.7, 0.7), y=(-0.7, 0.7), in_range=(0.0, 0.7)), misses=None,
+        play=PlaceGoals(unless_told=((0.5, 0.0), (0.0, 0.5), (-0.5, 0.0))),
     ),
     "velocity": Evaluation(VelocityFlags(), VelocityGoals(), TaskCfg.on_level_ground),
     "attitude": Evaluation(TurnFlags(), TurnGoals()),
     "episode": Evaluation(EpisodeFlags(), EpisodeGoals()),
-}
+}  # fmt: skip
 """A user's module may add its own."""
 
 

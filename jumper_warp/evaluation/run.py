@@ -20,11 +20,13 @@ from rich.table import Table
 
 from jumper_warp.envs.env import Env
 from jumper_warp.evaluation.film import Film
-from jumper_warp.evaluation.latency import latency_metrics, latency_text
 from jumper_warp.evaluation.log import EvaluationLog, run_evaluation
 from jumper_warp.evaluation.registry import evaluation_of
 from jumper_warp.identification.parameters import TRANSVERSAL
-from jumper_warp.policies.restore import Conditions, env_of_policy, open_policy, restored_task
+from jumper_warp.policies.conditions import Conditions, env_of_policy
+from jumper_warp.policies.restore import restored_task
+from jumper_warp.policies.runs import open_policy
+from jumper_warp.policies.skills import SkillNames, SkillPolicies
 from jumper_warp.policies.spec import PolicyError
 from jumper_warp.robot.model import PHYSICS_DT
 from jumper_warp.tasks.cfg import TaskCfg
@@ -223,20 +225,27 @@ class EvaluationRun(Run):
         self.evaluation = evaluation_of(self.task)
 
     @classmethod
-    def of(cls, name: str, args: EvaluationArgs, evaluations: Sequence[str] = PLACES) -> EvaluationRun:
+    def of(
+        cls,
+        name: str,
+        args: EvaluationArgs,
+        evaluations: Sequence[str] = PLACES,
+        modules: Iterable[ModuleType] = (),
+    ) -> EvaluationRun:
         """Return the run of an experiment, prepared.
 
         Args:
             name: Of the experiment and its folder.
             args: Flags.
             evaluations: Keys of `EVALUATIONS`, one of which the policy must have.
+            modules: That the user has named.
 
         Raises:
             PolicyError: The policy cannot be used, or is evaluated otherwise.
             CheckpointError: The checkpoint cannot be used.
             InputError: There is no such device.
         """
-        run = cls(args.policy)
+        run = cls(args.policy, modules)
         if run.task.evaluation not in evaluations:
             raise PolicyError(
                 f"this needs a policy that is evaluated by {' or '.join(evaluations)}, "
@@ -274,6 +283,50 @@ class EvaluationRun(Run):
         self.told["gravity_m_s2"] = env.task.gravity
         self.told["torque_limit_nm"] = torque_limit(env)
         return env
+
+
+class SkillRun(Run):
+    """Opens the policies of one robot, follows it as often as wanted, and reports."""
+
+    def __init__(self, names: SkillNames | None = None) -> None:
+        """Open policies; call `prepare` before anything else. Raises PolicyError or CheckpointError: see there."""
+        super().__init__()
+        self.skills = SkillPolicies(names)
+
+    @classmethod
+    def of(cls, name: str, args: EvaluationArgs, names: SkillNames) -> SkillRun:
+        """Return the run of an experiment, prepared. Raises PolicyError, CheckpointError, or InputError: no device."""
+        run = cls(names)
+        run.prepare(name, conditions_of(args), args.out, record=args.record)
+        return run
+
+    def actor(self, env: Env) -> Callable[[torch.Tensor], torch.Tensor]:
+        """Return the actions of all skills."""
+        return lambda obs: self.skills.act(env)
+
+    def env(self, count: int, **scene: Any) -> Env:
+        """Return the environment of the robot; scene: more settings of `Env`."""
+        return self.skills.env(count, self.conditions, **scene)
+
+
+def latency_metrics(steps: np.ndarray, physics_dt: float, asked: float | None = None) -> dict[str, Any]:
+    """Return the latency from action to motor as it was simulated.
+
+    steps: [physics steps] of all worlds; physics_dt [s]; asked [ms]: what was asked for, if anything.
+    `latency_ms` is the mean, `latency` all of it in words.
+    """
+    told: dict[str, Any] = {} if asked is None else {"latency_asked_ms": asked}
+    mean = 1000.0 * physics_dt * float(np.mean(steps))
+    return told | {"latency_ms": mean, "latency": latency_text(steps, physics_dt)}
+
+
+def latency_text(steps: np.ndarray, physics_dt: float) -> str:
+    """Return a latency in milliseconds and in physics steps, or the range and the mean of several."""
+    least, most = int(np.min(steps)), int(np.max(steps))
+    low, high, mean = (f"{1000.0 * physics_dt * float(value):.3g}" for value in (least, most, np.mean(steps)))
+    if least == most:
+        return f"{low} ms ({least} physics step{'' if least == 1 else 's'})"
+    return f"{low} to {high} ms ({least} to {most} physics steps), mean {mean} ms"
 
 
 def torque_limit(env: Env) -> float:

@@ -234,17 +234,11 @@ class TurnGoals:
 
     count = len(DIRECTIONS)
     seconds = 4.0
-    spacing = Turns.spacing
 
     def __post_init__(self) -> None:
         """Raises InputError: the angle is out of range."""
         if not 0.0 < self.angle <= 180.0:
             raise InputError(f"angle must be in (0, 180] degrees, got {self.angle}")
-
-    @property
-    def notes(self) -> dict[str, Any]:
-        """What to save with the recording."""
-        return {"angle_deg": self.angle}
 
     def log(self, task: TaskCfg) -> Turns:
         """Return one turn a robot."""

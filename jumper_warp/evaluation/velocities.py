@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 import tyro
 
-from jumper_warp.evaluation.film import Film, Strip
-from jumper_warp.evaluation.landings import PICTURE, beside
+from jumper_warp.evaluation.film import PICTURE, Film, Strip, beside
 from jumper_warp.evaluation.log import EvaluationEnv, EvaluationLog, Metrics, finite
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.utils.errors import InputError
@@ -20,12 +19,6 @@ Velocity = tuple[float, float, float]
 AXES = ("vx", "vy", "yaw_rate")
 SKIP = 1.0
 """[s] After a command that do not count for the error."""
-SETTLED = 0.1
-"""[m/s] Error of a robot that has settled on a new command."""
-SMOOTHING = 0.2
-"""[s] Over which velocities are averaged to tell whether it has."""
-HOLD = 0.5
-"""[s] For which a robot stays within that error that has settled in spite of pushes."""
 SHOWN_TIME = 0.6
 """[s] At the end of a walk, that its filmstrip shows: more than a stride."""
 PICTURES = 9
@@ -197,74 +190,6 @@ def grid(per_axis: int, reach: Sequence[float]) -> np.ndarray:
     return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 1, 3)
 
 
-def steps_of(rng: np.random.Generator, robots: int, reach: float, step: float) -> np.ndarray:
-    """Return two commands a robot whose velocities differ by `step` [m/s] in any direction, (robots, 2, 3)."""
-    commands = np.zeros((robots, 2, 3))
-    commands[..., 2] = rng.uniform(-reach, reach, robots)[:, None]
-    todo = np.arange(robots)
-    while len(todo):
-        first = rng.uniform(-reach, reach, (len(todo), 2))
-        angle = rng.uniform(0.0, 2.0 * np.pi, len(todo))
-        second = first + step * np.stack([np.cos(angle), np.sin(angle)], axis=1)
-        commands[todo, 0, :2], commands[todo, 1, :2] = first, second
-        todo = todo[np.abs(second).max(axis=1) > reach]
-    return commands
-
-
-def settling_times(walks: Walks, hold: float | None = None) -> np.ndarray:
-    """Return how long after the last command each robot's velocity in the plane stays within SETTLED of it [s].
-
-    Velocities are means of the last SMOOTHING seconds. Infinite where it never does, or the robot falls.
-
-    hold: Seconds for which it stays; None: to the end, so that a push seconds later counts too.
-    """
-    window, first = round(SMOOTHING / walks.step_dt), round(walks.times[-1] / walks.step_dt)
-    velocity = walks.history()[..., :2]
-    total = np.cumsum(velocity, axis=0)
-    smooth = velocity.copy()
-    smooth[window:] = (total[window:] - total[:-window]) / window
-    off = np.linalg.norm(smooth[first:] - walks.wanted()[first:, :, :2], axis=2)
-    outside = ~(off <= SETTLED)
-    if hold is not None:
-        steps = min(round(hold / walks.step_dt), len(off))
-        held = ~np.lib.stride_tricks.sliding_window_view(outside, steps, axis=0).any(axis=-1)
-        return np.where(held.any(axis=0), held.argmax(axis=0) * walks.step_dt, np.inf)
-    last = np.where(outside.any(axis=0), len(off) - np.argmax(outside[::-1], axis=0), 0)
-    return np.where(last == len(off), np.inf, last * walks.step_dt)
-
-
-def kept_speeds(walks: Walks, axis: int, seconds: float, share: float) -> np.ndarray:
-    """Return which robots kept their last command along an axis within a share of it over the last seconds on average.
-
-    The two other velocities are not judged.
-    """
-    last = walks.history()[-round(seconds / walks.step_dt) :, :, axis].mean(axis=0)
-    wanted = walks.commands[:, -1, axis]
-    return np.abs(last - wanted) <= share * np.abs(wanted)
-
-
-def walked(walks: Walks) -> np.ndarray:
-    """Return the share of the way that each robot went until it fell, at most 1, commanded to go straight ahead.
-
-    What it goes ahead counts, whatever its heading is then; the time of setting off, SKIP, is not asked for.
-    """
-    way = np.nansum(walks.history()[..., 0], axis=0) * walks.step_dt
-    return np.clip(way / (walks.commands[:, 0, 0] * (walks.seconds - SKIP)), 0.0, 1.0)
-
-
-def top_speed(commanded: np.ndarray, kept: np.ndarray, share: float = 0.9, width: float = 0.1) -> float:
-    """Return the highest speed that at least a share of the robots kept, of classes of a width; 0 if there is none.
-
-    commanded: (robots,) at least 0; kept: (robots,) bool. The result is the largest commanded one of its class.
-    """
-    classes, top = np.floor(commanded / width + 1.0e-9).astype(int), 0.0
-    for each in np.unique(classes):
-        inside = classes == each
-        if kept[inside].mean() >= share:
-            top = float(commanded[inside].max())
-    return top
-
-
 @dataclass(frozen=True)
 class VelocityFlags:
     """Constant commands on a grid of all three velocities at once."""
@@ -310,7 +235,6 @@ class VelocityGoals:
     """[s] From command to command."""
 
     count = 1
-    spacing = Walks.spacing
 
     def __post_init__(self) -> None:
         """Raises InputError: a setting is out of range."""
@@ -325,11 +249,6 @@ class VelocityGoals:
     def seconds(self) -> float:
         """[s] Length of the recording."""
         return self.each * len(self.velocities)
-
-    @property
-    def notes(self) -> dict[str, Any]:
-        """What to save with the recording."""
-        return {"velocities_m_s_rad_s": self.velocities}
 
     def log(self, task: TaskCfg) -> Walks:
         """Return one robot's walk."""

@@ -197,32 +197,3 @@ def characterise_motor(
     }
     unknown = tuple(name for name, d in zip(names, deviation, strict=True) if d > 0.5)
     return Actuator(kind, found, intervals, unknown, chi2)
-
-
-def synthetic_bench(
-    constants: Mapping[str, float],
-    rng: np.random.Generator | None = None,
-    torque_noise: float = 0.1,
-    rate: float = 2000.0,
-) -> Bench:
-    """Return what a bench would measure of a motor: torque against speed at two commands, and steps at standstill.
-
-    rng: of the sensor's noise; None: without. rate [Hz]: of the steps' rows.
-    """
-    columns: list[np.ndarray] = []
-    number = 0
-    for command in (0.3, 5.0, 40.0, -40.0):
-        speed = np.linspace(-1.2, 1.2, 121) * constants["fade_end"]
-        time = 0.1 * np.arange(len(speed))
-        columns.append(np.stack([np.full(len(speed), number), time, np.full(len(speed), command), speed, 0.0 * speed]))
-        number += 1
-    for size in (2.0, 8.0, -8.0):
-        time = np.arange(round(0.12 * rate)) / rate
-        command = np.where((time > 0.02) & (time < 0.07), size, 0.0)
-        columns.append(np.stack([np.full(len(time), number), time, command, 0.0 * time, 0.0 * time]))
-        number += 1
-    bench = Bench(*np.concatenate(columns, axis=1))
-    torque = response(constants, bench)
-    if rng is not None:
-        torque = torque + torque_noise * rng.normal(size=len(torque))
-    return Bench(bench.test, bench.time, bench.command, bench.speed, torque)

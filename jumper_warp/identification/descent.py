@@ -10,10 +10,10 @@ import numpy as np
 
 from jumper_warp.identification.findings import Step
 from jumper_warp.identification.least_squares import Knowledge, LeastSquares, Linearised, Normal, Point, Trial
-from jumper_warp.identification.motions import Motion
+from jumper_warp.identification.motions import Motion, NoiseLevels
 from jumper_warp.identification.parameters import ParameterSet
 from jumper_warp.identification.replay import Replay
-from jumper_warp.identification.residuals import MotionResiduals, NoiseLevels, NothingMeasured
+from jumper_warp.identification.residuals import MotionResiduals, NothingMeasured
 from jumper_warp.robot.description import RobotDescription
 
 PIECE = 0.25
@@ -165,6 +165,3 @@ def pieces_of(
         except NothingMeasured:
             continue
     return found
-
-
-__all__ = ["Descent", "Linearised", "descend", "pieces_of"]

@@ -5,16 +5,19 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from jumper_warp.identification.motions import Motion
+from jumper_warp.identification.motions import DEGREES, Motion, NoiseLevels
 from jumper_warp.identification.parameters import ParameterSet
-from jumper_warp.identification.plans import DEGREE, KINDS, SAMPLES, TICK, Kind, Plan, draw_plan
-from jumper_warp.identification.recording import replay_plan
+from jumper_warp.identification.recording import KINDS, Kind, Plan, draw_plan, measured, replay_plan, simulate_plan
 from jumper_warp.identification.replay import Record, Replay
-from jumper_warp.identification.residuals import MotionResiduals, NoiseLevels
+from jumper_warp.identification.residuals import MotionResiduals
 from jumper_warp.robot.motors import FilterCfg, walking_filter
+from jumper_warp.robot.values import RobotValues
+from jumper_warp.sim.simulation import SolverName
 from jumper_warp.utils.errors import InputError
 
 SHARPEST = 25.0
@@ -27,27 +30,10 @@ MARGIN = 5.0
 """[deg] Between a safe motion and the limits of its angles."""
 
 
-def expected_motion(plan: Plan, name: str, record: Record) -> Motion:
-    """Return the motion that a record of the rows of a plan would be measured as, without noise and torques."""
-    rows = len(plan.rows)
-    return Motion(
-        name=name,
-        time=TICK / SAMPLES * np.arange(rows),
-        target=plan.rows,
-        angle=record.angle[:rows, :, 0].copy(),
-        rate=record.rate[:rows, :, 0].copy(),
-        position=record.position[:rows, :, 0].copy(),
-        quaternion=record.quaternion[:rows, :, 0].copy(),
-        base=plan.base,
-        torque_limit=plan.torque_limit,
-        notes={"kind": plan.kind},
-    )
-
-
 def unsafe(plan: Plan, record: Record, limits: FilterCfg | None = None) -> str:
     """Return why a record of a plan is not safe; nothing if it is."""
     limits = walking_filter() if limits is None else limits
-    angle, rate = record.angle[..., 0] / DEGREE, np.abs(record.rate[..., 0]).max()
+    angle, rate = record.angle[..., 0] / DEGREES, np.abs(record.rate[..., 0]).max()
     legs = angle.reshape(-1, 4, 3)
     checks = (
         ("lateral angle", legs[..., 0], limits.lateral),
@@ -79,15 +65,16 @@ class Scorer:
     def __init__(self, parameters: ParameterSet, noise: NoiseLevels | None = None, replay: Replay | None = None):
         """Prepare; replay: worlds to be used, whose description counts."""
         self.parameters, self.noise = parameters, noise or NoiseLevels()
-        self.replay = replay or Replay(len(parameters) + 37)
+        self.replay = replay or Replay()
+        self._nominal = parameters.robots(np.zeros((1, len(parameters))))
 
     def record(self, plan: Plan) -> Record:
         """Return what the described robot does, from rest in the pose of the first targets."""
-        return replay_plan(self.replay, plan, self.parameters.robots(np.zeros((1, len(self.parameters)))))
+        return replay_plan(self.replay, plan, self._nominal)
 
     def information(self, plan: Plan, record: Record) -> np.ndarray:
         """Return what a motion says of the parameters, its start unknown: (P, P), in prior deviations."""
-        motion = expected_motion(plan, plan.kind, record)
+        motion = measured(plan, plan.kind, record, self._nominal, None, base_every=1)
         problem = MotionResiduals(motion, self.parameters, self.noise, self.replay.description)
         size = len(self.parameters)
         found = problem.linearise(self.replay, np.zeros(size), np.zeros(problem.start_size), 1.0e-3)
@@ -107,6 +94,15 @@ class Excitation:
     """(P,) Expected standard deviations after all, in prior deviations."""
     refused: tuple[str, ...]
     """Why candidates were left out."""
+    parameters: ParameterSet
+
+    def to_json(self) -> dict[str, Any]:
+        """Return everything but the motions, as JSON can hold it."""
+        expected = {
+            p.name: {"unit": p.unit, "expected_deviation": p.deviation(0.0, float(d)), "of_prior": float(d)}
+            for p, d in zip(self.parameters, self.deviations, strict=True)
+        }
+        return {"gain_nat": list(self.gain), "refused": list(self.refused), "parameters": expected}
 
 
 def choose(
@@ -137,4 +133,28 @@ def choose(
         plans.append(best[1])
         gains.append(best[0])
     deviations = np.sqrt(np.diag(np.linalg.inv(known)))
-    return Excitation(tuple(plans), tuple(gains), deviations, tuple(refused))
+    return Excitation(tuple(plans), tuple(gains), deviations, tuple(refused), scorer.parameters)
+
+
+def record(
+    chosen: Excitation,
+    folder: Path,
+    *,
+    robots: RobotValues,
+    noise: NoiseLevels,
+    solver: SolverName = "jumper",
+    rng: np.random.Generator | None = None,
+    torque: bool = False,
+) -> list[Motion]:
+    """Carry chosen motions out by a simulated robot, and write them as npz files, whose names say their kinds.
+
+    noise, rng, torque: as of `measured`. Raises OSError.
+    """
+    motions = []
+    for i, plan in enumerate(chosen.plans):
+        name = f"{i}_{plan.kind.replace(' ', '_')}"
+        motions.append(
+            measured(plan, name, simulate_plan(plan, solver=solver, robots=robots), robots, rng, noise, torque=torque)
+        )
+        motions[-1].save(folder / f"{name}.npz")
+    return motions

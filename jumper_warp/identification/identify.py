@@ -8,7 +8,6 @@ parameters, and then taken as wholes.
 
 from __future__ import annotations
 
-import functools
 import math
 from collections.abc import Sequence
 
@@ -16,12 +15,12 @@ import numpy as np
 import warp as wp
 
 from jumper_warp.identification.descent import Descent, descend, pieces_of
-from jumper_warp.identification.findings import Fit, Identification
+from jumper_warp.identification.findings import Fit, Identification, Step
 from jumper_warp.identification.least_squares import Knowledge, LeastSquares, Normal, Point
-from jumper_warp.identification.motions import Motion
+from jumper_warp.identification.motions import Motion, NoiseLevels
 from jumper_warp.identification.parameters import ParameterSet
 from jumper_warp.identification.replay import Replay
-from jumper_warp.identification.residuals import MotionResiduals, NoiseLevels
+from jumper_warp.identification.residuals import MotionResiduals
 from jumper_warp.identification.uncertainty import mismatch_factor, systematic_deviations, weak_directions
 from jumper_warp.robot.description import RobotDescription, load_description
 from jumper_warp.robot.values import LINK_KINDS, RobotValues
@@ -30,24 +29,16 @@ from jumper_warp.utils.errors import InputError
 
 COARSE = 1.0 / 480.0
 """[s] Physics step of all stages but the last ones, where a finer one is asked for."""
+POPULATION = 128
+"""Of the evolution strategy."""
+FIRST_DEVIATION = 0.3
+"""Of its search, in deviations of the priors."""
 
 
-def total_mass(robots: RobotValues, description: RobotDescription | None = None) -> np.ndarray:
+def total_mass(robots: RobotValues) -> np.ndarray:
     """Return the mass [kg] of N robots, (N,)."""
-    return robots.base_mass[:, 0] + 4.0 * robots.link_mass @ leg_masses(description)
-
-
-def leg_masses(description: RobotDescription | None = None) -> np.ndarray:
-    """Return the masses of one leg's links [kg], (5,); the project's description is read once."""
-    if description is None:
-        return described_masses()
-    return np.array([description.link(f"FL_{kind}").mass for kind in LINK_KINDS])
-
-
-@functools.cache
-def described_masses() -> np.ndarray:
-    """Return `leg_masses` of the project's description."""
-    return leg_masses(load_description())
+    leg = [load_description().link(f"FL_{kind}").mass for kind in LINK_KINDS]
+    return robots.base_mass[:, 0] + 4.0 * robots.link_mass @ np.array(leg)
 
 
 def weighed(mass: float, deviation: float = 0.02) -> Knowledge:
@@ -97,7 +88,7 @@ def identify(
         raise InputError("there must be at least one motion")
     noise = NoiseLevels() if noise is None else noise
     if replay is None:
-        replay = Replay(len(parameters) + 37, description=description, device=device, threads=threads)
+        replay = Replay(description=description, device=device, threads=threads)
     descent = Descent(replay)
     robot, rough_dt = replay.description, None if dt is None else max(dt, COARSE)
     whole = [MotionResiduals(motion, parameters, noise, robot, dt) for motion in motions]
@@ -107,6 +98,53 @@ def identify(
         pieces = [piece for motion in motions for piece in pieces_of(motion, parameters, noise, robot, rough_dt)]
     problem, point, normal = descend(descent, parameters, (rough, whole), pieces, knowledge)
     return result(problem, point, normal, descent)
+
+
+def identify_by_evolution(
+    motions: Sequence[Motion],
+    parameters: ParameterSet,
+    *,
+    noise: NoiseLevels | None = None,
+    knowledge: Sequence[Knowledge] = (),
+    dt: float | None = None,
+    description: RobotDescription | None = None,
+    max_seconds: float = 60.0,
+    population: int = POPULATION,
+    seed: int = 0,
+    device: wp.DeviceLike = None,
+    threads: int | None = None,
+) -> Identification:
+    """Return what CMA-ES finds in `max_seconds`; other arguments as of `identify`.
+
+    Motions start as their first rows say.
+
+    Raises InputError: as `identify`, or `cma` is not installed.
+    """
+    try:
+        import cma
+    except ImportError:
+        raise InputError("CMA-ES needs the package cma, which is not installed: pip install cma") from None
+    if not motions or not max_seconds > 0.0 or population < 4:
+        raise InputError("evolution needs motions, a time above 0 s and a population of at least 4")
+    replay = Replay(description=description, device=device, threads=threads)
+    whole = [MotionResiduals(motion, parameters, noise or NoiseLevels(), replay.description, dt) for motion in motions]
+    problem = LeastSquares(parameters, whole, replay, knowledge)
+    point, descent = problem.expected(), Descent(replay)
+    low, high = parameters.bounds()
+    options = {"popsize": population, "seed": seed + 1, "verbose": -9, "bounds": [low, high]}
+    search = cma.CMAEvolutionStrategy(point.z, FIRST_DEVIATION, options)
+    starts = [np.repeat(start[None], population, axis=0) for start in point.starts]
+    best, cost = point.z, np.inf
+    while descent.spent()[0] < max_seconds and not search.stop():
+        candidates = np.array(search.ask())
+        costs = problem.costs(candidates, starts)
+        search.tell(list(candidates), list(np.where(np.isfinite(costs), costs, 1.0e12)))
+        if costs.min() < cost:
+            best, cost = candidates[int(np.argmin(costs))], float(costs.min())
+        seconds, _, count = descent.spent()
+        descent.steps.append(Step(0, cost / problem.count, 0.0, count, seconds))
+    point = Point(np.clip(best, low, high), point.starts)
+    return result(problem, point, problem.normal(point), descent)
 
 
 def channel_fits(problem: LeastSquares, point: Point) -> list[tuple[str, str, float, int, float]]:
@@ -161,6 +199,3 @@ def result(problem: LeastSquares, point: Point, normal: Normal, descent: Descent
         motions=tuple(problem.motions),
         starts=tuple(point.starts),
     )
-
-
-__all__ = ["Identification", "identify", "total_mass", "weighed"]

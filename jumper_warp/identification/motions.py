@@ -1,12 +1,13 @@
-"""Recorded motions: motor targets and what was measured, from npz, CSV or Parquet files."""
+"""Recorded motions: motor targets, measurements and their noise, from npz, CSV or Parquet files."""
 
 from __future__ import annotations
 
 import csv
+import io
 import json
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -14,6 +15,7 @@ from typing import Any, Literal
 import numpy as np
 
 from jumper_warp.robot.description import MOTOR_JOINTS
+from jumper_warp.utils.checks import check_positive
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.files import write_whole
 
@@ -34,9 +36,43 @@ UNITS = {
 """Factor to the first unit of each quantity, which is the default."""
 LARGEST = {"target": 13.0, "angle": 13.0, "rate": 300.0, "torque": 1000.0, "position": 100.0}
 """More than that is not of this robot [rad, rad/s, N m, m]: probably of another unit."""
+FAR_APART = math.radians(20.0)
+"""[rad] Root mean square between angles and targets above which their signs are compared."""
 EXAMPLE = (
     "such as time, target/FL_outer, angle/FL_outer [deg], rate/FL_outer, torque/FL_outer, position/x, quaternion/w"
 )
+
+
+@dataclass(frozen=True)
+class NoiseLevels:
+    """Standard deviations of what is measured."""
+
+    angle: float = 0.05
+    """[deg] Of motor angles."""
+    rate: float = 1.0
+    """[deg/s] Of motor rates."""
+    torque: float = 0.3
+    """[N m] Of motor torques."""
+    position: float = 5.0
+    """[mm] Of the base."""
+    orientation: float = 0.5
+    """[deg] Of the base."""
+
+    def check(self) -> None:
+        """Raise InputError: a level is not positive and finite."""
+        for name, value in vars(self).items():
+            check_positive(f"noise {name}", value)
+
+    def of_channels(self) -> dict[str, tuple[float, int]]:
+        """Return deviation [SI] and number of columns by channel of the residuals. Raises InputError as `check`."""
+        self.check()
+        return {
+            "angle": (math.radians(self.angle), 12),
+            "rate": (math.radians(self.rate), 12),
+            "torque": (self.torque, 12),
+            "position": (1.0e-3 * self.position, 3),
+            "orientation": (math.radians(self.orientation), 3),
+        }
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,6 +138,24 @@ class Motion:
         if not 0.1 <= self.torque_limit <= 1000.0:
             raise InputError(f"{what}: torque_limit must lie in 0.1 to 1000 N m, got {self.torque_limit}")
 
+    def check_signs(self) -> None:
+        """Raise InputError: a motor's angles are far from its targets, and less than half as far from the negated ones.
+
+        In motions of `recording` they are more than four times as far with the right signs, and less than a quarter as
+        far with the wrong ones: rounding does not matter. Motors that stay near 0 pass.
+        """
+        if self.angle is None:
+            return
+        known = np.isfinite(self.angle)
+        errors = [np.where(known, self.angle - sign * self.target, 0.0) for sign in (1.0, -1.0)]
+        apart, negated = (np.sqrt(np.sum(e**2, axis=0) / np.maximum(known.sum(axis=0), 1)) for e in errors)
+        wrong = np.flatnonzero((apart > FAR_APART) & (negated < 0.5 * apart))
+        if len(wrong):
+            raise InputError(
+                f"motion {self.name}: angles of {', '.join(MOTOR_JOINTS[i] for i in wrong)} have the sign opposite to "
+                "their targets: negate angle, rate and torque, or target, of these motors"
+            )
+
     @property
     def duration(self) -> float:
         """Time from the first row to the last [s]."""
@@ -111,23 +165,32 @@ class Motion:
         """Return the rows from `first` to `end` - 1."""
         if (first, end) == (0, len(self.time)):
             return self
-        arrays = {f.name: getattr(self, f.name) for f in fields(self) if isinstance(getattr(self, f.name), np.ndarray)}
-        return replace(self, **{name: values[first:end] for name, values in arrays.items()})
+        return replace(self, **{name: values[first:end] for name, values in self._arrays().items()})
+
+    def _arrays(self) -> dict[str, np.ndarray]:
+        """Return all columns by name."""
+        return {f.name: getattr(self, f.name) for f in fields(self) if isinstance(getattr(self, f.name), np.ndarray)}
 
     def save(self, path: Path) -> None:
         """Write it as npz, as `load_motion` reads it. Raises OSError."""
-        import io
-
-        settings = {
-            "base": self.base,
-            "gains": self.gains,
-            "torque_limit": self.torque_limit,
-            "notes": dict(self.notes),
-        }
-        arrays = {f.name: getattr(self, f.name) for f in fields(self) if isinstance(getattr(self, f.name), np.ndarray)}
+        settings = {name: getattr(self, name) for name in ("base", "gains", "torque_limit")}
+        settings["notes"] = dict(self.notes)
         data = io.BytesIO()
-        np.savez_compressed(data, settings=np.array(json.dumps(settings)), **arrays)
+        np.savez_compressed(data, settings=np.array(json.dumps(settings)), **self._arrays())
         write_whole(path, data.getvalue())
+
+
+def load_motions(data: Sequence[Path], **settings: Any) -> list[Motion]:
+    """Return the motions of files, those of folders by name; settings: of `load_motion`, which says what it raises.
+
+    Raises InputError also if there is no file.
+    """
+    files: list[Path] = []
+    for path in data:
+        files += sorted(file for file in path.iterdir() if file.suffix in READERS) if path.is_dir() else [path]
+    if not files:
+        raise InputError(f"no npz, csv or parquet file in {', '.join(map(str, data))}")
+    return [load_motion(file, **settings) for file in files]
 
 
 def load_motion(
@@ -151,10 +214,9 @@ def load_motion(
         OSError: the file cannot be read.
     """
     path = Path(path)
-    readers = {".npz": read_npz, ".csv": read_csv, ".parquet": read_parquet}
-    if path.suffix not in readers:
-        raise InputError(f"{path}: expected a file of {', '.join(readers)}")
-    channels, settings = readers[path.suffix](path)
+    if path.suffix not in READERS:
+        raise InputError(f"{path}: expected a file of {', '.join(READERS)}")
+    channels, settings = READERS[path.suffix](path)
     for name, value in (("base", base), ("gains", gains), ("torque_limit", torque_limit)):
         if value:
             settings[name] = value
@@ -291,3 +353,7 @@ def channels_of(path: Path, names: list[str], table: np.ndarray) -> dict[str, np
             raise InputError(f"{path}: column target/{joint} is missing or has gaps")
     channels["time"] = channels["time"][:, 0]
     return channels
+
+
+READERS = {".npz": read_npz, ".csv": read_csv, ".parquet": read_parquet}
+"""Reader of each kind of file."""

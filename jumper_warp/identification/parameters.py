@@ -129,9 +129,16 @@ class ParameterSet:
         return robots
 
     def without(self, names: Iterable[str]) -> ParameterSet:
-        """Return the set without some parameters, or without all of a group."""
-        left_out = set(names)
-        return ParameterSet(tuple(p for p in self.parameters if p.name not in left_out and p.group not in left_out))
+        """Return the set without some parameters, or without all of a group or quantity.
+
+        Raises InputError: a name that is none of these.
+        """
+        left_out, known = set(names), {*GROUPS, *self.names, *(p.quantity for p in self.parameters)}
+        if left_out - known:
+            raise InputError(
+                f"no parameter {min(left_out - known)!r:.60} to leave out; there are {', '.join(self.names)}"
+            )
+        return ParameterSet(tuple(p for p in self.parameters if not left_out & {p.name, p.group, p.quantity}))
 
     def changed(self, **changes: dict) -> ParameterSet:
         """Return the set with other fields in some parameters, by name, such as a tighter prior.

@@ -1,17 +1,17 @@
-"""Planned motions carried out by simulated robots, and measured: data as a robot would give it."""
+"""Motions for identification: targets drawn at random, carried out by simulated robots, and measured with noise."""
 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 import warp as wp
 
-from jumper_warp.identification.motions import Motion
-from jumper_warp.identification.plans import SAMPLES, TICK, Plan
+from jumper_warp.identification.motions import DEGREES, Motion, NoiseLevels
 from jumper_warp.identification.replay import Record, Replay, Starts
-from jumper_warp.identification.residuals import HANGING_HEIGHT, NoiseLevels
-from jumper_warp.identification.stance import stance
+from jumper_warp.identification.stance import HANGING_HEIGHT, stance
 from jumper_warp.robot.description import load_description
 from jumper_warp.robot.motors import MotorCfg
 from jumper_warp.robot.values import RobotValues
@@ -19,10 +19,86 @@ from jumper_warp.sim.simulation import Simulation, SolverName, motor_values
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.rotations import from_vector, multiply
 
+Kind = Literal["hung chirp", "standing chirp", "small jump"]
+KINDS: tuple[Kind, ...] = ("hung chirp", "hung chirp", "standing chirp", "small jump")
+"""One set of motions."""
+TICK = 1.0 / 60.0
+"""[s] From target to target."""
+SAMPLES = 4
+"""Rows of a motion in a tick: 240 Hz."""
 REST = 0.75
 """[s] In which a robot comes to rest in the first pose before a motion is recorded."""
 HELD = 1.0e4
 """[kg] Of a base that is held in a simulation, which puts it back after each step."""
+
+
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """Targets for a motion."""
+
+    kind: Kind
+    target: np.ndarray
+    """(ticks, 12) [rad]"""
+    torque_limit: float
+    """[N m]"""
+
+    @property
+    def base(self) -> Literal["free", "fixed"]:
+        """Whether the robot stands, or hangs from a stand."""
+        return "fixed" if self.kind == "hung chirp" else "free"
+
+    @property
+    def rows(self) -> np.ndarray:
+        """Targets of the rows at 240 Hz, (SAMPLES ticks, 12)."""
+        return np.repeat(self.target, SAMPLES, axis=0)
+
+
+def draw_plan(kind: Kind, rng: np.random.Generator, seconds: float = 1.25, torque_limit: float = 12.0) -> Plan:
+    """Return a random plan of a kind."""
+    ticks = round(seconds / TICK)
+    if ticks < 30 or not seconds < 60.0:
+        raise InputError(f"a motion must take 0.5 to 60 s, got {seconds:g}")
+    if kind == "small jump":
+        target = jump_targets(ticks, rng)
+    elif kind in ("hung chirp", "standing chirp"):
+        target = chirp_targets(ticks, rng, hung=kind == "hung chirp")
+    else:
+        raise InputError(f"no kind of motion {kind!r:.60}; there are {', '.join(dict.fromkeys(KINDS))}")
+    return Plan(kind, target * DEGREES, torque_limit)
+
+
+def chirp_targets(ticks: int, rng: np.random.Generator, hung: bool) -> np.ndarray:
+    """Return targets [deg] that swing faster and faster, each motor in its own phase; paws on the ground keep still."""
+    time = TICK * np.arange(ticks)
+    slow, fast = rng.uniform(0.3, 0.8), rng.uniform(5.0, 9.0) if hung else rng.uniform(2.5, 4.5)
+    turns = slow * time + 0.5 * (fast - slow) * time**2 / time[-1]
+    middle = rng.uniform(40.0, 55.0) if hung else rng.uniform(45.0, 60.0)
+    target = np.zeros((ticks, 12))
+    begin = np.minimum(time / 0.1, 1.0)  # from rest
+    for motor in range(12):
+        lateral = motor % 3 == 0
+        size = (rng.uniform(6.0, 11.0) if lateral else rng.uniform(9.0, 15.0)) if hung else (
+            rng.uniform(2.0, 5.0) if lateral else rng.uniform(5.0, 10.0)
+        )  # fmt: skip
+        pace = rng.uniform(0.8, 1.2) if hung else 1.0
+        wave = np.sin(2.0 * math.pi * (pace * turns + rng.uniform()))
+        target[:, motor] = (0.0 if lateral else middle) + size * begin * wave
+    return target
+
+
+def jump_targets(ticks: int, rng: np.random.Generator) -> np.ndarray:
+    """Return targets [deg] of a squat, a push-off and a landing, each leg a little different."""
+    squat, push, land = rng.uniform(75.0, 95.0), rng.uniform(5.0, 25.0), rng.uniform(50.0, 65.0)
+    down, hold, up = 22, rng.integers(6, 12), rng.integers(9, 13)
+    target = np.zeros((ticks, 12))
+    for tick in range(ticks):
+        if tick < down + hold:
+            angle = 45.0 + (squat - 45.0) * min(1.0, tick / down)
+        else:
+            angle = push if tick < down + hold + up else land
+        target[tick] = np.tile([0.0, angle, angle], 4)
+    spread = rng.uniform(-3.0, 3.0, 12)
+    return target + spread * np.minimum(np.arange(ticks) / down, 1.0)[:, None]
 
 
 def start_of(replay: Replay, plan: Plan, robots: RobotValues) -> Starts:
@@ -50,7 +126,7 @@ def replay_plan(replay: Replay, plan: Plan, robots: RobotValues, refine: int = 1
 
 
 def simulate_plan(
-    plan: Plan, *, solver: SolverName = "jumper", robots: RobotValues | None = None, dt: float = 1.0 / 480.0
+    plan: Plan, robots: RobotValues | None = None, *, solver: SolverName = "jumper", dt: float = 1.0 / 480.0
 ) -> Record:
     """Return what a robot does in a plan after it came to rest, rows at 240 Hz, on one of the two solvers.
 
@@ -128,12 +204,14 @@ def measured(
     noise: NoiseLevels | None = None,
     *,
     torque: bool = False,
+    base_every: int = 2,
 ) -> Motion:
-    """Return a record as sensors would read it: angles and rates at 240 Hz, the base in every other row.
+    """Return a record as sensors would read it, angles and rates at 240 Hz.
 
-    rng: of the noise; None: without. torque: whether the motors report theirs.
+    rng: of the noise; None: without. torque: whether the motors report theirs. base_every: rows from one measurement of
+    the base to the next.
     """
-    levels = (noise or NoiseLevels()).of_channels
+    levels = (noise or NoiseLevels()).of_channels()
     rows = len(plan.rows)
     values = {
         "angle": record.angle[:, :, 0] + robots.offset[:1],
@@ -145,8 +223,8 @@ def measured(
     if rng is not None:
         values = {key: x + levels[key][0] * rng.normal(size=x.shape) for key, x in values.items()}
         quaternion = multiply(from_vector(levels["orientation"][0] * rng.normal(size=(rows, 3))), quaternion)
-    values["position"], quaternion = values["position"].copy(), quaternion.copy()
-    values["position"][1::2], quaternion[1::2] = math.nan, math.nan
+    between = (np.arange(rows) % base_every != 0)[:, None]
+    values["position"], quaternion = (np.where(between, math.nan, x) for x in (values["position"], quaternion))
     if not torque:
         del values["torque"]
     return Motion(

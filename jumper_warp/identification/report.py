@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import html
 import io
+import json
 import math
 from collections.abc import Sequence
 from pathlib import Path
@@ -13,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from jumper_warp.identification.findings import Identification
+from jumper_warp.identification.replay import Replay
 from jumper_warp.identification.residuals import MotionResiduals
 from jumper_warp.robot.description import MOTOR_JOINTS
 from jumper_warp.utils.files import write_whole
@@ -20,6 +22,7 @@ from jumper_warp.utils.files import write_whole
 UNITS = {"angle": ("deg", 180.0 / math.pi), "rate": ("rad/s", 1.0), "torque": ("N m", 1.0), "position": ("m", 1.0),
          "orientation": ("deg", 180.0 / math.pi)}  # fmt: skip
 """Unit that a channel is shown in, and its factor."""
+TITLE = "System identification"
 STYLE = """
 body { font: 15px/1.5 system-ui, sans-serif; max-width: 68rem; margin: 2rem auto; padding: 0 1rem; color: #222; }
 table { border-collapse: collapse; margin: 1rem 0; font-variant-numeric: tabular-nums; }
@@ -64,10 +67,17 @@ def to_json(found: Identification) -> dict[str, Any]:
     }
 
 
-def write_report(found: Identification, folder: Path, title: str = "System identification") -> Path:
-    """Write `report.html` and return its path. Raises OSError."""
+def write_results(found: Identification, folder: Path, source: str) -> None:
+    """Write the overlay `identified.json`, whose source is noted, `report.json` and `report.html`. Raises OSError."""
+    found.overlay(source).save(folder / "identified.json")
+    write_whole(folder / "report.json", (json.dumps(to_json(found), indent=2) + "\n").encode())
+    write_report(found, folder)
+
+
+def write_report(found: Identification, folder: Path) -> None:
+    """Write `report.html`. Raises OSError."""
     parts = [
-        f"<h1>{html.escape(title)}</h1>",
+        f"<h1>{TITLE}</h1>",
         summary(found),
         open_directions(found),
         "<h2>Parameters</h2>",
@@ -79,10 +89,8 @@ def write_report(found: Identification, folder: Path, title: str = "System ident
     ]
     for motion, start in zip(found.motions, found.starts, strict=True):
         parts.append(f"<h3>{html.escape(motion.motion.name)}</h3><p>{image(motion_plot(found, motion, start))}</p>")
-    page = f"<!doctype html><html lang=en><meta charset=utf-8><title>{html.escape(title)}</title><style>{STYLE}</style>"
-    path = folder / "report.html"
-    write_whole(path, (page + "\n".join(parts) + "</html>\n").encode())
-    return path
+    page = f"<!doctype html><html lang=en><meta charset=utf-8><title>{TITLE}</title><style>{STYLE}</style>"
+    write_whole(folder / "report.html", (page + "\n".join(parts) + "</html>\n").encode())
 
 
 def summary(found: Identification) -> str:
@@ -185,11 +193,9 @@ def progress_plot(found: Identification) -> Any:
 
 def motion_plot(found: Identification, motion: MotionResiduals, start: np.ndarray) -> Any:
     """Draw measurement and model of three motors, and all residuals, of one motion."""
-    from jumper_warp.identification.replay import Replay
-
     figure = new_figure(10.0, 4.6)
     axes = figure.subplots(2, 3, sharex=True)
-    replay = Replay(1, description=motion.description, threads=1)
+    replay = Replay(description=motion.description, threads=1)
     record, robots = motion.run(replay, found.z[None], start[None])
     model = motion.predicted(record, robots)[..., 0]
     time = motion.motion.time - motion.motion.time[0]

@@ -4,18 +4,16 @@ from __future__ import annotations
 
 import copy
 import math
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
-from jumper_warp.identification.motions import Motion
+from jumper_warp.identification.motions import DEGREES, Motion, NoiseLevels
 from jumper_warp.identification.parameters import BASE_ONLY, ParameterSet
-from jumper_warp.identification.replay import Record, Replay, Starts, grid_steps
-from jumper_warp.identification.stance import levelled, levelling, stance
+from jumper_warp.identification.replay import Record, Replay, Starts
+from jumper_warp.identification.stance import HANGING_HEIGHT, levelled, levelling, stance
 from jumper_warp.robot.description import RobotDescription
 from jumper_warp.robot.values import RobotValues
-from jumper_warp.utils.checks import check_positive
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.rotations import INVERSE, from_vector, multiply, rotate, to_vector
 
@@ -26,48 +24,15 @@ LONGEST_LATENCY = 0.05
 SETTLING = 0.02
 """[s] From the start on, in which rows of a motion on the ground do not count: paws that do not stand on it exactly
 strike it, and when each does is a matter of micrometres."""
+FIRST_ROWS = 8
+"""Rows in which a motion's start is measured."""
 QUIET_ROWS = 2
 QUIET = 0.2
 """[rad/s] Mean rate over the first rows of a motion below which a robot that stands has all paws on the ground."""
-DEGREE = math.pi / 180.0
 TRUST = 3.0
 """Deviations of the noise by which a start may differ from what is measured there, so that it hardly counts twice."""
-HANGING_HEIGHT = 1.0
-"""[m] Of a held base whose position is not told."""
 DIFFERENCE = 1.0e-5
 """Change of an unknown for its column of the Jacobian, in deviations of its prior."""
-
-
-@dataclass(frozen=True)
-class NoiseLevels:
-    """Standard deviations of what is measured."""
-
-    angle: float = 0.05
-    """[deg] Of motor angles."""
-    rate: float = 1.0
-    """[deg/s] Of motor rates."""
-    torque: float = 0.3
-    """[N m] Of motor torques."""
-    position: float = 5.0
-    """[mm] Of the base."""
-    orientation: float = 0.5
-    """[deg] Of the base."""
-
-    def __post_init__(self) -> None:
-        """Raises InputError: a level is not positive and finite."""
-        for name, value in vars(self).items():
-            check_positive(f"noise {name}", value)
-
-    @property
-    def of_channels(self) -> dict[str, tuple[float, int]]:
-        """Deviation in SI units and number of columns by channel of the residuals."""
-        return {
-            "angle": (math.radians(self.angle), 12),
-            "rate": (math.radians(self.rate), 12),
-            "torque": (self.torque, 12),
-            "position": (1.0e-3 * self.position, 3),
-            "orientation": (math.radians(self.orientation), 3),
-        }
 
 
 class NothingMeasured(InputError):
@@ -101,8 +66,9 @@ class MotionResiduals:
     ):
         """Prepare; dt [s]: largest physics step, by default 1/480; span: first row and one past the last, else all.
 
-        Raises InputError: gaps, or nothing to compare.
+        Raises InputError: angles of the wrong sign, gaps, or nothing to compare.
         """
+        motion.check_signs()
         whole, (first, end) = motion, span or (0, len(motion.time))
         motion = whole.cut(first, end)
         self.motion, self.parameters, self.description = motion, parameters, description
@@ -126,7 +92,7 @@ class MotionResiduals:
         self.free = motion.base == "free"
         self.start_size = 36 if self.free else 27
         self._measure(noise)
-        self._guess_start(noise.of_channels)
+        self._guess_start(noise.of_channels())
         if self.free and not self.resting:
             self.valid[motion.time < motion.time[0] + SETTLING] = False
         if not self.valid.any():
@@ -138,7 +104,7 @@ class MotionResiduals:
         motion, columns = self.motion, []
         self.channels: list[tuple[str, slice]] = []
         sigma, legs, first = [], [], 0
-        for name, (deviation, width) in noise.of_channels.items():
+        for name, (deviation, width) in noise.of_channels().items():
             source = motion.quaternion if name == "orientation" else getattr(motion, name)
             if source is None or (not self.free and name == "position"):
                 continue
@@ -155,8 +121,8 @@ class MotionResiduals:
 
     def _guess_start(self, noise: dict[str, tuple[float, int]]) -> None:
         """Set what the first rows say of the start, and how well."""
-        motion, rows = self.motion, min(8, len(self.motion.time))
-        angle, angle_prior = first_values(motion.angle, motion.target[0], TRUST * noise["angle"][0], 10.0 * DEGREE)
+        motion, rows = self.motion, min(FIRST_ROWS, len(self.motion.time))
+        angle, angle_prior = first_values(motion.angle, motion.target[0], TRUST * noise["angle"][0], 10.0 * DEGREES)
         rate, rate_prior = first_values(motion.rate, None, TRUST * noise["rate"][0], 1.0)
         if motion.rate is None and motion.angle is not None:
             rate, rate_prior = slope(motion.time[:rows], motion.angle[:rows]), np.full(12, 1.0)
@@ -177,7 +143,7 @@ class MotionResiduals:
                 velocity = slope(motion.time[:rows], motion.position[:rows])
             base = [place_prior, np.full(3, 0.3), np.full(3, 1.0)]
             if self.standing:  # the ground says more than sensors
-                tilt = np.array([0.2 * DEGREE, 0.2 * DEGREE, tilt[2]])
+                tilt = np.array([0.2 * DEGREES, 0.2 * DEGREES, tilt[2]])
                 base = [np.array([0.02, 0.02, 0.001]), np.full(3, 0.05), np.full(3, 0.3)]
                 self.resting = quiet(motion.rate)
                 self._levelling = levelling(self.description, angle)
@@ -329,9 +295,9 @@ def first_values(
         default = np.zeros(12) if default is None else default
         return default.copy(), np.full(len(default), wide)
     found = np.zeros(values.shape[1]) if default is None else default.copy()
-    known = np.isfinite(values[: max(8, 1)]).any(axis=0)
+    known = np.isfinite(values[:FIRST_ROWS]).any(axis=0)
     for i in np.flatnonzero(known):
-        column = values[:8, i]
+        column = values[:FIRST_ROWS, i]
         found[i] = column[np.isfinite(column)][0]
     return found, np.where(known, prior, wide)
 
@@ -344,3 +310,12 @@ def slope(time: np.ndarray, values: np.ndarray) -> np.ndarray:
         if known.sum() >= 3:
             found[i] = np.polyfit(time[known] - time[0], values[known, i], 1)[0]
     return found
+
+
+def grid_steps(period: float, dt: float | None) -> tuple[int, float]:
+    """Return the physics steps in a sample period [s], and the step [s]: at most dt, by default 1/480 s."""
+    longest = 1.0 / 480.0 if dt is None else dt
+    if not 1.0e-6 <= longest <= 0.01:
+        raise InputError(f"dt must lie in 1e-6 to 0.01 s, got {dt}")
+    steps = max(1, math.ceil(period / longest - 1.0e-6))
+    return steps, period / steps

@@ -8,6 +8,8 @@ import numpy as np
 
 from jumper_warp.robot.description import LEGS, RobotDescription, leg_dimensions
 
+HANGING_HEIGHT = 1.0
+"""[m] Of a held base whose position is not measured."""
 STEP = 1.0e-6
 """[rad] Of differences of paw positions."""
 NORMAL_WEIGHT = 1.0e3

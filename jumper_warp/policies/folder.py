@@ -1,9 +1,9 @@
 """The folder that a policy is kept in.
 
-It holds `policy.safetensors` (weights and normaliser), `config.json` (interface, environment, training, commit,
-versions), `policy.onnx`, whatever is added (`metrics.json`, a learning curve), and `manifest.json` with the SHA-256 of
-each of these. A `README.md` beside them is prose and not in the manifest. The sums find damage and mix-ups; they are no
-signature. Nothing that is loaded can execute code.
+It holds `policy.onnx` (weights, normaliser, interface), `config.json` (interface, environment, training, commit,
+versions), whatever is added (`metrics.json`, a learning curve), and `manifest.json` with the SHA-256 of each of these.
+A `README.md` beside them is prose and not in the manifest. The sums find damage and mix-ups; they are no signature.
+Nothing that is loaded can execute code.
 """
 
 from __future__ import annotations
@@ -18,23 +18,21 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import safetensors.torch
 import torch
-from safetensors import SafetensorError
 
-from jumper_warp.policies.onnx import onnx_bytes
-from jumper_warp.policies.policy import Policy, check_tensors
+from jumper_warp.policies.onnx import onnx_bytes, policy_of_onnx
+from jumper_warp.policies.policy import Policy
 from jumper_warp.policies.spec import PolicyError, PolicyInterface
 from jumper_warp.utils.assets import ASSETS
+from jumper_warp.utils.checks import version_refusal
 from jumper_warp.utils.files import write_whole
 from jumper_warp.utils.runtime import git_commit, versions
 
 POLICIES = ASSETS / "policies"
 """Where the project's own policies lie."""
 FORMAT = "jumper-warp policy"
-SCHEMA_VERSION = 1
+SCHEMA_VERSION = 2
 MANIFEST = "manifest.json"
-WEIGHTS = "policy.safetensors"
 CONFIG = "config.json"
 ONNX = "policy.onnx"
 README = "README.md"
@@ -74,9 +72,8 @@ def save_policy(
     config |= {"schema_version": SCHEMA_VERSION, "interface": policy.interface.to_json()}
     content = {
         **(files or {}),
-        WEIGHTS: safetensors.torch.save(policy.tensors()),
         CONFIG: _json_bytes(config),
-        ONNX: onnx_bytes(policy, {key: config[key] for key in origin}),
+        ONNX: onnx_bytes(policy, config),
         README: (readme or default_readme(policy)).encode(),
     }
     aside = folder.with_name(f".{folder.name}.{os.getpid()}")
@@ -109,7 +106,7 @@ def add_files(folder: Path, files: Mapping[str, bytes]) -> None:
     """
     folder = Path(folder)
     sums = _checked_sums(folder)
-    taken = sorted({WEIGHTS, CONFIG, ONNX, MANIFEST} & set(files))
+    taken = sorted({CONFIG, ONNX, MANIFEST} & set(files))
     if taken:
         raise PolicyError(f"{folder}: {taken[0]} is the policy itself")
     _write(folder, files, sums)
@@ -156,23 +153,13 @@ def load_policy(name: str | Path, device: str | torch.device = "cpu") -> Policy:
     folder = find_policy(name)
     sums = _checked_sums(folder)
     config = _json(folder / CONFIG, _checked_bytes(folder / CONFIG, sums[CONFIG]))
-    if config.get("schema_version") != SCHEMA_VERSION:
-        raise PolicyError(
-            f"{folder / CONFIG}: schema version {config.get('schema_version')!r:.20}, not {SCHEMA_VERSION}"
-        )
-    data = _checked_bytes(folder / WEIGHTS, sums[WEIGHTS])
-    try:
-        tensors = safetensors.torch.load(data)
-    except (SafetensorError, KeyError, ValueError, RuntimeError) as error:
-        raise PolicyError(f"{folder / WEIGHTS}: cannot be read ({type(error).__name__}: {error!s:.200})") from error
+    _check_version(folder / CONFIG, config)
+    data = _checked_bytes(folder / ONNX, sums[ONNX])
     try:
         interface = PolicyInterface.from_json(config.get("interface"))
-        check_tensors(tensors, interface)
-        layers = [(tensors[f"actor.{i}.weight"], tensors[f"actor.{i}.bias"]) for i in range(len(interface.sizes) - 1)]
-        policy = Policy(layers, tensors["normaliser.mean"], tensors["normaliser.std"], interface, config)
+        return policy_of_onnx(data, interface, config).to(device)
     except PolicyError as error:
         raise PolicyError(f"{folder}: {error}") from error
-    return policy.to(device)
 
 
 def _checked_sums(folder: Path) -> dict[str, str]:
@@ -183,8 +170,8 @@ def _checked_sums(folder: Path) -> dict[str, str]:
         raise PolicyError(f"{path}: not the manifest of a {FORMAT}")
     _check_version(path, manifest)
     sums = manifest.get("sha256")
-    if not isinstance(sums, dict) or not {WEIGHTS, CONFIG, ONNX} <= set(sums):
-        raise PolicyError(f"{path}: lacks the sums of {WEIGHTS}, {CONFIG} and {ONNX}")
+    if not isinstance(sums, dict) or not {CONFIG, ONNX} <= set(sums):
+        raise PolicyError(f"{path}: lacks the sums of {CONFIG} and {ONNX}")
     for name, digest in sums.items():
         if not FILE_NAME.fullmatch(name):
             raise PolicyError(f"{path}: names a file {name!r:.60}")
@@ -193,9 +180,8 @@ def _checked_sums(folder: Path) -> dict[str, str]:
 
 
 def _check_version(path: Path, content: Mapping[str, Any]) -> None:
-    found = content.get("schema_version")
-    if found != SCHEMA_VERSION:
-        raise PolicyError(f"{path}: schema version {found!r:.20} is unknown, this is version {SCHEMA_VERSION}")
+    if (found := content.get("schema_version")) != SCHEMA_VERSION:
+        raise PolicyError(f"{path}: {version_refusal(f'{found!r:.20}', SCHEMA_VERSION)}")
 
 
 def _checked_bytes(path: Path, digest: Any) -> bytes:
@@ -238,8 +224,7 @@ def default_readme(policy: Policy) -> str:
     return (
         f"# Policy for {face.task}\n\n"
         f"Reads {face.sizes[0]} numbers, drives {face.sizes[-1]} motors at {1.0 / face.policy_dt:.0f} Hz.\n"
-        f"`{WEIGHTS}` holds the weights, `{CONFIG}` everything that made them, `{ONNX}` the same policy with its\n"
-        "normaliser for use without PyTorch.\n\n"
+        f"`{ONNX}` holds the network with its normaliser, `{CONFIG}` everything that made it.\n\n"
         "    jumper play FOLDER\n"
         "    jumper evaluate FOLDER\n"
     )

@@ -10,11 +10,10 @@ from torch import nn
 
 from jumper_warp.policies.spec import PolicyError, PolicyInterface
 from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.normalise import normalise
 
 ACTIVATION_MODULES = {"elu": nn.ELU, "relu": nn.ReLU, "tanh": nn.Tanh}
 
-DTYPES = (torch.float16, torch.bfloat16, torch.float32, torch.float64)
-"""Of weights that can be read; they are computed with in single precision."""
 LARGEST = 1.0e38
 """Below the largest number of single precision."""
 
@@ -109,8 +108,7 @@ class Policy(nn.Module):
         limit = self.interface.observation_limit
         finite = torch.nan_to_num(obs, nan=0.0, posinf=0.0, neginf=0.0).clamp(-limit, limit).to(self.mean.dtype)
         limit = self.interface.normalised_limit
-        features = ((finite - self.mean) / self.std).clamp(-limit, limit)
-        return self.actor(features).clamp(-1.0, 1.0)
+        return self.actor(normalise(finite, self.mean, self.std, limit)).clamp(-1.0, 1.0)
 
 
 def check_tensors(tensors: Mapping[str, torch.Tensor], interface: PolicyInterface) -> None:
@@ -126,8 +124,6 @@ def check_tensors(tensors: Mapping[str, torch.Tensor], interface: PolicyInterfac
         tensor = tensors[name]
         if tuple(tensor.shape) != shape:
             raise PolicyError(f"its configuration asks for {name} of shape {shape}, it has {tuple(tensor.shape)}")
-        if tensor.dtype not in DTYPES:
-            raise PolicyError(f"{name} must hold floating-point numbers of 16, 32 or 64 bits, found {tensor.dtype}")
         if not tensor.isfinite().all():
             raise PolicyError(f"{name} is not finite")
     if not (tensors["normaliser.std"] > 0.0).all():

@@ -8,8 +8,10 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
+from jumper_warp.policies.conditions import Conditions
 from jumper_warp.policies.policy import Policy
-from jumper_warp.policies.restore import Conditions, open_policy, restored_task
+from jumper_warp.policies.restore import restored_task
+from jumper_warp.policies.runs import open_policy
 from jumper_warp.policies.spec import PolicyError
 from jumper_warp.tasks.cfg import Handover, TaskCfg
 from jumper_warp.tasks.switching import skills_and_handovers

@@ -73,7 +73,7 @@ class PolicyInterface:
     """Widths of the hidden layers."""
     activation: str = "elu"
     observation_layout: dict[str, Any] = field(default_factory=dict)
-    """Terms by name: first and end column, scale, clip and history; empty in policies of before it was kept."""
+    """Terms by name: first and end column, scale, clip and history. Empty: not known."""
     observation_limit: float = 100.0
     """Raw observations are clamped to plus and minus this; what is not finite counts as 0."""
     normalised_limit: float = 10.0
@@ -122,7 +122,6 @@ class PolicyInterface:
         if not isinstance(data, dict):
             raise PolicyError("the interface must be a JSON object")
         hints = get_type_hints(cls)
-        data = {**({"observation_layout": {}} if "observation_layout" not in data else {}), **data}
         different = sorted(set(data) ^ set(hints))
         if different:
             raise PolicyError(f"interface fields missing or unknown: {', '.join(different):.200}")

@@ -12,6 +12,8 @@ from jumper_warp.utils.threads import checked_threads
 
 ACTIVATIONS = ("elu", "relu", "tanh")
 """Names of activations."""
+LATEST, LATEST_OR_NEW = "latest", "latest-or-new"
+"""Values of `TrainCfg.resume` that name no path."""
 
 
 @dataclass(frozen=True)
@@ -63,11 +65,9 @@ class PpoCfg:
     """Widths of the hidden layers."""
     activation: str = "elu"
     """elu, relu or tanh."""
-    symmetry: Literal["off", "actor", "loss"] = "off"
-    """Left-right symmetry of the policy: actor by its form, which answers mirrored observations by mirrored actions
-    whatever the weights; loss by a part of the loss. For tasks whose observation has a known mirror image."""
-    symmetry_coef: float = 1.0
-    """Weight of the mean squared difference between mirrored answers, with symmetry loss."""
+    symmetry: Literal["off", "actor"] = "off"
+    """Left-right symmetry of the policy: an actor that answers mirrored observations by mirrored actions whatever the
+    weights. For tasks whose observation has a known mirror image."""
     tf32: bool = True
     """Whether matrix products on a GPU may round their factors to 10 mantissa bits."""
     precision: Literal["float32", "bfloat16"] = "float32"
@@ -77,16 +77,12 @@ class PpoCfg:
     Needs a C++ compiler; what was compiled is kept in Inductor's cache on disk."""
     graphs: bool = True
     """Whether a GPU replays captured graphs."""
-    overlap: bool = False
-    """Whether the next rollout runs beside the update, with the weights of one iteration before."""
-    streams: bool = True
-    """Whether a GPU computes the gradients of actor and critic beside each other."""
 
     def __post_init__(self) -> None:
         """Raises ValueError: a setting is out of range."""
         for name in ("num_steps", "epochs", "minibatches", "lr", "max_grad_norm", "init_std", "clip", "reward_scale"):
             check_positive(name, getattr(self, name))
-        for name in ("value_coef", "entropy_coef", "desired_kl", "final_kl", "symmetry_coef"):
+        for name in ("value_coef", "entropy_coef", "desired_kl", "final_kl"):
             check_not_negative(name, getattr(self, name))
         if self.final_entropy is not None:
             check_not_negative("final_entropy", self.final_entropy)
@@ -96,8 +92,8 @@ class PpoCfg:
         check_finite("max_lr", self.max_lr)
         if not 0.0 < self.min_lr <= self.lr <= self.max_lr:
             raise InputError(f"need 0 < min_lr <= lr <= max_lr, got {self.min_lr}, {self.lr}, {self.max_lr}")
-        if self.symmetry not in ("off", "actor", "loss"):
-            raise InputError(f"symmetry must be off, actor or loss, got {self.symmetry!r:.40}")
+        if self.symmetry not in ("off", "actor"):
+            raise InputError(f"symmetry must be off or actor, got {self.symmetry!r:.40}")
         if not self.hidden or min(self.hidden) < 1:
             raise InputError(f"hidden must name at least one positive width, got {self.hidden}")
         if self.activation not in ACTIVATIONS:
@@ -171,21 +167,22 @@ class TrainCfg:
     log_interval: int = 10
     """Iterations between two logged ones."""
     save_interval: int = 100
-    """Iterations between two checkpoints; with ppo.overlap, one that saves collects nothing ahead."""
+    """Iterations between two checkpoints."""
     keep: int = 3
     """How many of the newest checkpoints stay; the best stays anyway."""
     best_by: str = "Metrics/success"
     """The logged figure that makes a checkpoint the best; higher is better."""
     resume: str | None = None
-    """A checkpoint, a run's folder, or `latest` for the task's latest run. `jumper train` goes on with the settings of
-    that run, and flags change them. Not kept are device, threads, log_root, tensorboard and wandb."""
+    """A checkpoint, a run's folder, `latest` for the task's latest run with a checkpoint, or `latest-or-new`, which
+    begins a new run if there is none. `jumper train` resumes with the settings of that run; flags override them. Not
+    saved are device, threads, log_root, tensorboard and wandb."""
     start_from: str | None = None
     """A policy's name or folder, a run's folder (its best checkpoint) or a checkpoint: a new training begins with that
     policy's actor, its weights and its statistics of observations. The critic, the optimiser and the noise are new."""
     trainer: Literal["ppo", "shac", "rsl-rl"] = "ppo"
     """This package's PPO; SHAC, which learns by gradients through the physics; or rsl-rl-lib's PPO for comparison."""
     tensorboard: bool = True
-    """Write TensorBoard events, if TensorBoard is installed."""
+    """Write TensorBoard events."""
     wandb: bool = False
     """Upload to Weights & Biases."""
     ppo: PpoCfg = field(default_factory=PpoCfg)
@@ -206,7 +203,7 @@ class TrainCfg:
             raise InputError("resume is not offered with trainer rsl-rl")
         if self.trainer == "rsl-rl" and self.start_from:
             raise InputError("start_from is not offered with trainer rsl-rl")
-        if self.resume and self.start_from:
+        if self.resume and self.resume != LATEST_OR_NEW and self.start_from:
             raise InputError("give resume, which goes on with a training, or start_from, which begins one, not both")
         if self.trainer != "ppo" and self.ppo.symmetry != "off":
             raise InputError(f"symmetry is not offered with trainer {self.trainer}")

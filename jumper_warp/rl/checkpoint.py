@@ -7,7 +7,7 @@ import io
 import json
 import math
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 
@@ -24,6 +24,15 @@ DAMAGE = (LookupError, TypeError, ValueError, AttributeError, RuntimeError)
 
 class CheckpointError(InputError):
     """A checkpoint that cannot be used, said in one line."""
+
+
+class Checkpoint(NamedTuple):
+    """A checkpoint that was read."""
+
+    path: Path
+    state: dict[str, Any]
+    passed_over: list[str]
+    """Why newer ones cannot be used, a line each."""
 
 
 def save_checkpoint(folder: Path, state: dict[str, Any], score: float | None = None, keep: int = 3) -> Path:
@@ -100,8 +109,8 @@ def one_line(error: Exception) -> str:
     return " ".join(str(error).split())[:300] or type(error).__name__
 
 
-def latest_checkpoint(folder: Path) -> tuple[Path, dict[str, Any], list[str]]:
-    """Return path and content of the last saved usable checkpoint, and why each newer one was passed over.
+def latest_checkpoint(folder: Path) -> Checkpoint:
+    """Return the last saved usable checkpoint.
 
     Raises:
         CheckpointError: None is usable.
@@ -110,7 +119,7 @@ def latest_checkpoint(folder: Path) -> tuple[Path, dict[str, Any], list[str]]:
     refusals: list[str] = []
     for name in reversed(manifest):
         try:
-            return folder / name, load_checkpoint(folder / name), refusals
+            return Checkpoint(folder / name, load_checkpoint(folder / name), refusals)
         except CheckpointError as error:
             refusals.append(str(error))
     raise CheckpointError("; ".join([f"{folder}: no usable checkpoint", *refusals]))
@@ -126,16 +135,6 @@ def best_checkpoint(folder: Path) -> Path:
     if not manifest:
         raise CheckpointError(f"{folder}: no checkpoint")
     return folder / (_best(manifest) or list(manifest)[-1])
-
-
-def newest_checksum(folder: Path) -> str | None:
-    """Return the SHA-256 of the last saved checkpoint, usable or not; None: there is none.
-
-    Raises:
-        CheckpointError: The manifest is not readable.
-    """
-    manifest = _read_manifest(folder, missing_ok=True)
-    return manifest[list(manifest)[-1]]["sha256"] if manifest else None
 
 
 def _best(manifest: dict[str, dict[str, Any]]) -> str | None:

@@ -1,5 +1,6 @@
 """Several training processes, one a device."""
 
+import hashlib
 import io
 import os
 from collections.abc import Callable
@@ -7,7 +8,6 @@ from typing import Any, NamedTuple
 
 import torch
 
-from jumper_warp.rl.rendezvous import elastic_store
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.threads import available_threads
 
@@ -34,6 +34,16 @@ def all_ranks(agreed: bool) -> bool:
     vote = torch.tensor(float(agreed), device=_device())
     torch.distributed.all_reduce(vote, op=torch.distributed.ReduceOp.MIN)
     return vote.item() > 0.0
+
+
+def all_same(text: str) -> bool:
+    """Return whether all processes call this with the same text; each waits for the others."""
+    if world_size() == 1:
+        return True
+    number = int.from_bytes(hashlib.sha256(text.encode()).digest()[:7], "big")
+    ends = torch.tensor([number, -number], device=_device())
+    torch.distributed.all_reduce(ends, op=torch.distributed.ReduceOp.MAX)
+    return bool(ends[0] == -ends[1])
 
 
 def _device() -> torch.device:
@@ -95,9 +105,7 @@ def join_ranks(device: str | None = None, threads: int | None = None) -> Rank:
     if size > 1 and not torch.distributed.is_initialized():
         for name, value in NCCL.items():
             os.environ.setdefault(name, value)
-        backend, store = "nccl" if kind.type == "cuda" else "gloo", elastic_store()
-        rank = {} if store is None else {"rank": int(os.environ["RANK"]), "world_size": size, "store": store}
-        torch.distributed.init_process_group(backend, **rank)
+        torch.distributed.init_process_group("nccl" if kind.type == "cuda" else "gloo")
     return Rank(int(os.environ.get("RANK", "0")) if size > 1 else 0, size, kind)
 
 

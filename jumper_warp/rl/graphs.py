@@ -1,10 +1,9 @@
-"""Torch procedures as CUDA graphs, and work beside other work."""
+"""Torch procedures as CUDA graphs."""
 
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 
 import torch
 
@@ -55,26 +54,3 @@ class Captured:
             self._graph = graph
         else:
             print(f"not captured as a CUDA graph, training is slower{reason}", file=sys.stderr)
-
-
-class Beside:
-    """A second stream of a GPU for work that runs beside what follows; elsewhere it runs in its place."""
-
-    def __init__(self, enabled: bool) -> None:
-        """enabled: whether there is a second stream."""
-        self._stream = torch.cuda.Stream() if enabled else None
-
-    @contextmanager
-    def __call__(self) -> Iterator[None]:
-        """Put what is launched in this context on the second stream, after everything that was launched before."""
-        if self._stream is None:
-            yield
-            return
-        self._stream.wait_stream(torch.cuda.current_stream())
-        with torch.cuda.stream(self._stream):
-            yield
-
-    def join(self) -> None:
-        """Let what is launched from here on wait for the second stream."""
-        if self._stream is not None:
-            torch.cuda.current_stream().wait_stream(self._stream)

@@ -14,7 +14,7 @@ import torch
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-from jumper_warp.rl.figure_files import EventFile, FiguresFile
+from jumper_warp.rl.metrics_file import MetricsFile
 from jumper_warp.utils.errors import InputError
 
 FIGURES = "metrics.jsonl"
@@ -86,7 +86,7 @@ class TrainingLog:
         folder: The run's, exists.
         config: Everything that the run was started with, ready for JSON.
         total: Iterations that the run is to have at its end.
-        tensorboard: Write events, if TensorBoard is installed.
+        tensorboard: Write events.
         wandb: Upload to Weights & Biases.
         iteration: How many the run has had; what was logged of later ones is dropped.
 
@@ -95,9 +95,8 @@ class TrainingLog:
             OSError: The figures cannot be read or written.
         """
         self._console = _LastingConsole(stderr=True)
-        self._figures = FiguresFile(folder / FIGURES, iteration)
-        events = _event_file(folder, iteration) if tensorboard else None
-        self._files = [self._figures, events] if events else [self._figures]
+        self._figures = MetricsFile(folder / FIGURES, iteration)
+        self._events = _event_writer(folder, iteration) if tensorboard else None
         self._full = False
         self._total = total
         self._wandb = _wandb(folder, config) if wandb else None
@@ -124,9 +123,10 @@ class TrainingLog:
     ) -> None:
         """Close everything."""
         self._progress.stop()
-        for file in self._files:
+        for file in (self._figures, self._events):
             with suppress(OSError):
-                file.close()
+                if file:
+                    file.close()
         if self._wandb:
             self._wandb.finish()
 
@@ -137,13 +137,14 @@ class TrainingLog:
 
     def log(self, iteration: int, figures: dict[str, float], left: float) -> None:
         """Log figures under names such as `Loss/value`; `iteration` have been done, for the rest `left` [s] is left."""
-        for file in self._files:
-            try:
-                file.add(iteration, figures)
-            except OSError as error:
-                if not self._full:
-                    self.say(f"{file.path}: {error.strerror}; training goes on, its figures follow when there is room")
-                self._full = True
+        try:
+            self._figures.add(iteration, figures)
+        except OSError as error:
+            if not self._full:
+                path = self._figures.path
+                self.say(f"{path}: {error.strerror}; training continues, the metrics follow when there is room")
+            self._full = True
+        self._write_events(iteration, figures)
         if self._wandb:
             self._wandb.log(figures, step=iteration)
         summary = _summary(figures)
@@ -152,6 +153,20 @@ class TrainingLog:
             self.say(f"iteration {iteration}/{self._total}: {summary}, {_duration(left)} left")
         for name in _broken_terms(figures):
             self.say(f"reward term {name} was not a finite number in some steps, where it counts as 0: mend it")
+
+    def _write_events(self, iteration: int, figures: dict[str, float]) -> None:
+        """Write TensorBoard's events; after a failure none are written any more."""
+        if not self._events:
+            return
+        try:
+            for name, value in figures.items():
+                self._events.add_scalar(name, value, iteration)
+            self._events.flush()
+        except OSError as error:
+            self.say(f"no TensorBoard events from iteration {iteration} on: {error.strerror}; {FIGURES} has them all")
+            with suppress(OSError):
+                self._events.close()
+            self._events = None
 
 
 class _LastingConsole(Console):
@@ -186,11 +201,11 @@ def _duration(seconds: float) -> str:
     return f"{hours} h {minutes} min" if hours else f"{minutes} min"
 
 
-def _event_file(folder: Path, iteration: int) -> EventFile | None:
-    try:
-        return EventFile(folder, iteration)
-    except ImportError:
-        return None
+def _event_writer(folder: Path, iteration: int) -> Any:
+    """Return a writer of a new file of events, which hides events after `iteration` in older ones."""
+    from torch.utils.tensorboard import SummaryWriter
+
+    return SummaryWriter(str(folder), purge_step=iteration + 1 if iteration else None)
 
 
 def _wandb(folder: Path, config: dict[str, Any]) -> Any:

@@ -28,26 +28,23 @@ def actor_gradient(
     symmetry: Symmetry | None,
     out: torch.Tensor,
 ) -> tuple[torch.Tensor, ...]:
-    """Write the gradient of surrogate, entropy bonus and asymmetry to `out`.
+    """Write the gradient of surrogate and entropy bonus to `out`.
 
     The clipped surrogate of Schulman et al. 2017, eq. 7, as a loss: -E[min(r A, clip(r) A)] with r = π(a) / π_old(a).
     Where r A is the smaller, ∂/∂log π = -r A / batch, else 0.
 
-    rows: (batch, columns) as `layout`; entropy_coef: (); symmetry: of the policy or its loss, as `cfg` says; out: the
-    vector's part of actor and noise.
+    rows: (batch, columns) as `layout`; entropy_coef: (); symmetry: of the policy; out: the vector's part of actor and
+    noise.
 
     Returns:
         Surrogate, entropy, mean squared asymmetry (0 without symmetry) and KL(old ‖ new).
     """
     batch, dtype = layout.split(rows), DTYPES[cfg.precision]
-    difference = None
     if symmetry is None:
         mean, seen = forward(actor, layout.features(rows), dtype)
     else:
-        mean, image, seen = forward_both(actor, layout.features(rows), symmetry, dtype)
-        difference = mean - image
-        if cfg.symmetry == "actor":
-            mean = 0.5 * (mean + image)
+        own, image, seen = forward_both(actor, layout.features(rows), symmetry, dtype)
+        mean = 0.5 * (own + image)
     ratio = torch.exp(gaussian_log_prob(batch.action, mean, log_std) - batch.log_prob)
     gain = batch.advantage * ratio
     clipped = batch.advantage * ratio.clamp(1.0 - cfg.clip, 1.0 + cfg.clip)
@@ -55,12 +52,11 @@ def actor_gradient(
     deviation = (batch.action - mean) * torch.exp(-log_std)
     noise = (slope * (deviation.square() - 1.0)).sum(0) - entropy_coef
     slope = slope * deviation * torch.exp(-log_std)
-    if difference is None:
+    if symmetry is None:
         gradients, asymmetry = backward(actor, seen, slope, dtype), torch.zeros_like(gain[0])
     else:
-        pull = difference * (2.0 * cfg.symmetry_coef / difference.numel())
-        slopes = (0.5 * slope, 0.5 * slope) if cfg.symmetry == "actor" else (slope + pull, -pull)
-        gradients, asymmetry = backward_both(actor, seen, slopes, symmetry, dtype), difference.square().mean()
+        gradients = backward_both(actor, seen, (0.5 * slope, 0.5 * slope), symmetry, dtype)
+        asymmetry = (own - image).square().mean()
     out.copy_(joined([*gradients, noise]))
     entropy = (log_std + 0.5 * math.log(2.0 * math.pi * math.e)).sum()
     kl = gaussian_kl(batch.mean, old_log_std, mean, log_std).mean()

@@ -1,12 +1,11 @@
-"""Left-right symmetry of the actor: by its form, or as a part of its loss.
+"""Left-right symmetry of the actor.
 
 The mirror image of a vector x is `signs * x[order]`, and twice mirrored is as before. Let M be the image of an
-observation, N that of an action, and f the network. With `symmetry actor` the policy's mean is
-(f(x) + N f(M x)) / 2, so that it answers M x by the image of its answer to x whatever the weights. With `symmetry loss`
-it is f(x), and the mean square of f(x) - N f(M x) is added to the loss (Yu, Turk and Liu 2018).
+observation, N that of an action, and f the network. The policy's mean is (f(x) + N f(M x)) / 2, so that it answers M x
+by the image of its answer to x whatever the weights.
 
-Both need f at x and at M x: the passes run once over twice the rows. As N is a permutation with signs and its own
-inverse, the slope of a loss with respect to f(M x) is N of that with respect to N f(M x).
+The passes run once over twice the rows, x and M x. As N is a permutation with signs and its own inverse, the slope of a
+loss with respect to f(M x) is N of that with respect to N f(M x).
 """
 
 from __future__ import annotations

@@ -10,6 +10,7 @@ from torch import nn
 from jumper_warp.envs.vec_env import sanitise
 from jumper_warp.rl.distributed import average_over_ranks, world_size
 from jumper_warp.rl.mirror import Image, Symmetry
+from jumper_warp.utils.normalise import normalise
 
 NORMALISED_LIMIT = 10.0
 """The networks see observations within plus and minus this many standard deviations."""
@@ -198,4 +199,4 @@ class ActorCritic(nn.Module):
 
 
 def _features(obs: torch.Tensor, moments: RunningMoments) -> torch.Tensor:
-    return moments.normalise(sanitise(obs)).clamp(-NORMALISED_LIMIT, NORMALISED_LIMIT)
+    return normalise(sanitise(obs), *moments.scaling(), NORMALISED_LIMIT)

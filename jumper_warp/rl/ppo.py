@@ -2,16 +2,11 @@
 
 Nothing between the first action and the last optimiser step waits for the host. Schulman et al. 2017 for the surrogate,
 2016 for the advantage; observations, returns and advantages are normalised, the step size follows the KL divergence.
-
-With `PpoCfg.overlap` the next rollout runs beside the optimiser steps. Let θ[k] be the weights after iteration k, and
-R[k] the rollout that it learns from. Iteration k computes θ[k] from θ[k - 1] and R[k], while R[k + 1] is collected with
-θ[k - 1] and the statistics that R[k] is part of. The first rollout, and the first after an iteration that drained, is
-collected alone, with the newest weights. Neither reads memory that the other writes, and random numbers are drawn by
-the rollout and by `batch` alone, which never run at once: the same seed gives the same bits, whichever ends first.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -23,14 +18,15 @@ from jumper_warp.rl.cfg import PpoCfg
 from jumper_warp.rl.compiling import Compiler
 from jumper_warp.rl.distributed import average_over_ranks
 from jumper_warp.rl.flat import FlatParameters
-from jumper_warp.rl.graphs import Beside, Captured
+from jumper_warp.rl.graphs import Captured
 from jumper_warp.rl.losses import actor_gradient, critic_gradient
 from jumper_warp.rl.mirror import symmetry_of
 from jumper_warp.rl.networks import ActorCritic
 from jumper_warp.rl.rollout import Collector
 from jumper_warp.rl.samples import Batch, Sampler
-from jumper_warp.rl.state_checks import check_ppo
 from jumper_warp.utils.allocator import keep_freed_memory
+from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.state_checks import check_parts, check_tensor, check_values
 
 STATISTICS = ("surrogate", "value", "entropy", "asymmetry", "kl", "gradient_actor", "gradient_critic", "skipped")
 """What `Ppo.statistics` averages over minibatches; skipped is the share of steps with a non-finite gradient,
@@ -62,8 +58,7 @@ class Ppo:
         num_critic_obs = env.num_critic_obs if cfg.asymmetric else env.num_obs
         symmetry = None if cfg.symmetry == "off" else symmetry_of(env)
         self.model = ActorCritic(
-            env.num_obs, env.num_actions, cfg.hidden, cfg.activation, cfg.init_std, num_critic_obs,
-            symmetry if cfg.symmetry == "actor" else None,
+            env.num_obs, env.num_actions, cfg.hidden, cfg.activation, cfg.init_std, num_critic_obs, symmetry
         ).to(env.device)  # fmt: skip
         self.flat = FlatParameters(self.model, cfg.activation)
         self._parts = (self.flat.actor(self.flat.value), self.flat.critic(), self.flat.gradients())
@@ -80,41 +75,20 @@ class Ppo:
         self._orders = torch.zeros(cfg.epochs, self.batch_size, dtype=torch.int64, device=env.device)
         counts = {"dtype": torch.float64, "device": env.device}  # float32 counts to 2^24 only
         self._sums = torch.zeros(len(STATISTICS) + 1, **counts)  # and their number
-        self._critic_stream = Beside(cuda and cfg.streams)
         self._actor_gradient, self._critic_gradient = compiler(actor_gradient), compiler(critic_gradient)
         self._finish = compiler(_finish)
-        self._update_stream = Beside(cuda and cfg.overlap)
-        self.ahead = False
-        """Whether the next iteration's rollout is there already."""
         procedures = (self.collector.roll, self.batch, self._learn)
         self._roll, self._batch, self._optimise = (Captured(each, cuda and cfg.graphs) for each in procedures)
 
-    def iterate(self, drain: bool = False, mark: Callable[[], None] = lambda: None) -> None:
-        """Do one iteration.
-
-        drain: collect nothing ahead, so that the state can be saved; of no effect without overlap. mark: called when
-        the rollout, and when the rest of the iteration has been launched.
-        """
-        if not self.ahead:
-            self.collect()
-        if not self.cfg.overlap or drain:
-            mark()
-            self.update()
-            self.ahead = False
-        else:
-            self._batch()
-            self.collector.hand_over()
-            with self._update_stream():
-                self._optimise()
-            self._roll()
-            mark()
-            self._update_stream.join()
-            self.ahead = True
+    def iterate(self, mark: Callable[[], None] = lambda: None) -> None:
+        """Do one iteration; mark is called when the rollout, and when the update has been launched."""
+        self.collect()
+        mark()
+        self.update()
         mark()
 
     def collect(self) -> None:
         """Fill the rollout with the present policy."""
-        self.collector.hand_over()
         self._roll()
 
     def update(self) -> None:
@@ -167,13 +141,11 @@ class Ppo:
         """Fill the gradient; return surrogate, value loss, entropy and asymmetry."""
         (actor, log_std), critic, (to_actor, to_critic) = self._parts
         layout, cfg, old_log_std = self.sampler.layout, self.cfg, self.sampler.old_log_std
-        with self._critic_stream():
-            value_loss = self._critic_gradient(rows, layout, critic, cfg, to_critic)
+        value_loss = self._critic_gradient(rows, layout, critic, cfg, to_critic)
         found = self._actor_gradient(
             rows, layout, actor, log_std, old_log_std, self._entropy_coef, cfg, self._symmetry, to_actor
         )
         surrogate, entropy, asymmetry, kl = found
-        self._critic_stream.join()
         self.flat.gradient[-1] = kl
         return surrogate, value_loss, entropy, asymmetry
 
@@ -204,13 +176,7 @@ class Ppo:
         return result
 
     def state_dict(self) -> dict[str, Any]:
-        """Return networks, statistics and optimiser, tensors only.
-
-        Raises:
-            RuntimeError: A rollout has been collected ahead, which is no part of it: `iterate` with drain first.
-        """
-        if self.ahead:
-            raise RuntimeError("the state can be saved after an iteration that drained")
+        """Return networks, statistics and optimiser, tensors only."""
         model = self.model.state_dict()
         return {
             "model": {name: value.clone(memory_format=torch.contiguous_format) for name, value in model.items()},
@@ -225,12 +191,35 @@ class Ppo:
         Raises:
             ValueError: A part is missing, unknown, of another shape or type, or not finite; nothing is changed.
         """
-        check_ppo(state, self.model.state_dict(), self.flat.params, self.lr, self.collector.episode)
+        self._check(state)
         self.model.load_state_dict(state["model"])
         self.optimiser.load_state_dict(state["optimiser"])
         self.lr.copy_(state["lr"])
         self.collector.episode.copy_(state["episode"])
-        self.ahead = False
+
+    def _check(self, state: Any) -> None:
+        """Raise InputError unless `load_state_dict` can take up a state: finite parts of the right shapes and types."""
+        check_parts(state, ("model", "optimiser", "lr", "episode"), "ppo")
+        model = self.model.state_dict()
+        check_parts(state["model"], model, "ppo.model")
+        for name, like in model.items():
+            found, where = state["model"][name], f"ppo.model.{name}"
+            check_tensor(found, like, where)
+            if name.startswith("mirror_") and not torch.equal(found, like.to(found.device)):
+                raise InputError(f"{where} is of another observation or action")
+            check_values(found, where, 0.0 if name.endswith((".var", ".count")) else -math.inf)
+        check_parts(state["optimiser"], range(len(self.flat.params)), "ppo.optimiser")
+        for index, param in enumerate(self.flat.params):
+            found, where = state["optimiser"][index], f"ppo.optimiser.{index}"
+            check_parts(found, ("step", "exp_avg", "exp_avg_sq"), where)
+            moments = (("step", self.lr, 0.0), ("exp_avg", param, -math.inf), ("exp_avg_sq", param, 0.0))
+            for name, like, least in moments:
+                check_tensor(found[name], like, f"{where}.{name}")
+                check_values(found[name], f"{where}.{name}", least)
+        check_tensor(state["lr"], self.lr, "ppo.lr")
+        check_values(state["lr"], "ppo.lr", 0.0)
+        check_tensor(state["episode"], self.collector.episode, "ppo.episode", (torch.float32,))  # of earlier versions
+        check_values(state["episode"], "ppo.episode")
 
     def close(self) -> None:
         """Drop all graphs; needed before the group of processes ends."""

@@ -9,7 +9,15 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
-from jumper_warp.rl.checkpoint import DAMAGE, MANIFEST, CheckpointError, latest_checkpoint, load_checkpoint
+from jumper_warp.rl.cfg import LATEST, LATEST_OR_NEW
+from jumper_warp.rl.checkpoint import (
+    DAMAGE,
+    MANIFEST,
+    Checkpoint,
+    CheckpointError,
+    latest_checkpoint,
+    load_checkpoint,
+)
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.sources import changed_sources
 from jumper_warp.utils.state_checks import check_parts, check_tensor
@@ -26,23 +34,27 @@ DERIVED = ("interface", "num_envs", "seed")
 """What an environment tells of itself that other settings say."""
 
 
-def find_checkpoint(cfg: TrainCfg) -> tuple[Path, dict[str, Any], list[str]]:
-    """Return path and content of the checkpoint to resume, and why newer ones were passed over.
+def find_checkpoint(cfg: TrainCfg) -> Checkpoint | None:
+    """Return the checkpoint to resume; None: a new run begins.
 
     Raises:
         CheckpointError: There is none that can be used.
     """
-    if cfg.resume == "latest":
+    if not cfg.resume:
+        return None
+    if cfg.resume in (LATEST, LATEST_OR_NEW):
         runs = cfg.log_root / cfg.task
-        folders = sorted(path.parent for path in runs.glob(f"*/{CHECKPOINTS}/manifest.json"))
-        if not folders:
-            raise CheckpointError(f"{runs}: no run to resume")
-        return latest_checkpoint(folders[-1])
-    path = Path(cfg.resume or "")
+        folders = sorted(path.parent for path in runs.glob(f"*/{CHECKPOINTS}/{MANIFEST}"))
+        if folders:
+            return latest_checkpoint(folders[-1])
+        if cfg.resume == LATEST_OR_NEW:
+            return None
+        raise CheckpointError(f"{runs}: no run to resume")
+    path = Path(cfg.resume)
     folder = path.parent if path.suffix == ".pt" else path if path.name == CHECKPOINTS else path / CHECKPOINTS
     if not (folder / MANIFEST).is_file():
         raise CheckpointError(f"{path}: no run to resume; give a run's folder, one of its checkpoints, or latest")
-    return (path, load_checkpoint(path), []) if path.suffix == ".pt" else latest_checkpoint(folder)
+    return Checkpoint(path, load_checkpoint(path), []) if path.suffix == ".pt" else latest_checkpoint(folder)
 
 
 def own_part(state: dict[str, Any], rank: Rank) -> dict[str, Any]:

@@ -12,6 +12,7 @@ from jumper_warp.rl.flat import FlatParameters, Layers
 from jumper_warp.rl.mirror import Symmetry
 from jumper_warp.rl.networks import NORMALISED_LIMIT, ActorCritic
 from jumper_warp.rl.passes import DTYPES, forward, forward_both
+from jumper_warp.utils.normalise import normalise
 
 
 class RolloutBuffer:
@@ -36,7 +37,7 @@ class RolloutBuffer:
 
 
 class Collector:
-    """Fills a rollout with the policy that was handed over last, which the update meanwhile leaves alone."""
+    """Fills a rollout with the present policy."""
 
     def __init__(self, env: VecEnv, cfg: PpoCfg, model: ActorCritic, flat: FlatParameters, compiler: Compiler) -> None:
         """flat: the parameters of `model`."""
@@ -44,9 +45,8 @@ class Collector:
         self._critic_obs = env.critic_obs if cfg.asymmetric else env.obs
         self._final_critic_obs = env.final_critic_obs if cfg.asymmetric else env.final_obs
         self.rollout = RolloutBuffer(cfg.num_steps, env, self._critic_obs.shape[1])
-        self._moments, self._source = model.obs_moments, flat.value[: flat.actor_size]
-        self._policy = torch.zeros_like(self._source)
-        self._actor, self._log_std = flat.actor(self._policy)
+        self._moments = model.obs_moments
+        self._actor, self._log_std = flat.actor(flat.value)
         self._symmetry = model.symmetry and model.symmetry.padded(self._actor.weights[0].shape[1])
         self._scaling = torch.zeros(2, env.num_obs, device=env.device)
         counts = {"dtype": torch.float64, "device": env.device}  # float32 counts to 2^24 only
@@ -57,15 +57,10 @@ class Collector:
         self._act, self._keep = compiler(_act), compiler(_keep)
 
     @torch.no_grad()
-    def hand_over(self) -> None:
-        """Copy weights and statistics that the next rollouts act with."""
-        self._policy.copy_(self._source)
-        self._scaling.copy_(torch.stack(self._moments.scaling()))
-
-    @torch.no_grad()
     def roll(self) -> None:
         """Act for `num_steps` policy steps."""
         env, rollout = self.env, self.rollout
+        self._scaling.copy_(torch.stack(self._moments.scaling()))
         rollout.log_std.copy_(self._log_std)
         rollout.action.normal_()
         for step in range(self.cfg.num_steps):
@@ -102,7 +97,7 @@ def normalised(obs: torch.Tensor, scaling: torch.Tensor | Pair, columns: int) ->
 
     scaling: mean and standard deviation, (n,) each.
     """
-    features = ((obs - scaling[0]) / scaling[1]).clamp(-NORMALISED_LIMIT, NORMALISED_LIMIT)
+    features = normalise(obs, scaling[0], scaling[1], NORMALISED_LIMIT)
     return functional.pad(features, (0, columns - obs.shape[-1]))
 
 

@@ -19,9 +19,8 @@ import torch
 
 from jumper_warp.envs.vec_env import VecEnv
 from jumper_warp.rl.cfg import TrainCfg
-from jumper_warp.rl.checkpoint import DAMAGE, CheckpointError, one_line, save_checkpoint
-from jumper_warp.rl.distributed import Rank, gather, join_ranks, one_rank_first, wait_for_ranks, world_size
-from jumper_warp.rl.elastic import mark_run, own_run
+from jumper_warp.rl.checkpoint import DAMAGE, Checkpoint, CheckpointError, one_line, save_checkpoint
+from jumper_warp.rl.distributed import Rank, all_same, gather, join_ranks, one_rank_first, wait_for_ranks, world_size
 from jumper_warp.rl.logger import Pace, Stopwatch, TrainingLog
 from jumper_warp.rl.ppo import FIGURES, Ppo
 from jumper_warp.rl.resume import (
@@ -91,12 +90,13 @@ class Stop:
 
 def train(
     cfg: TrainCfg, make_env: MakeEnv, command: str | None = None, as_rsl_rl: AsRslRl | None = None,
-    start: Start | None = None,
+    start: Start | None = None, checkpoint: Checkpoint | None = None,
 ) -> TrainResult:  # fmt: skip
     """Train to the last iteration or the time limit, and save.
 
     command: What the user would type to go on, without `--resume`; by default `jumper train TASK`.
     as_rsl_rl: Needed with trainer rsl-rl. start: The policy that cfg.start_from names, needed with it.
+    checkpoint: The one that cfg.resume names, if it has been read.
 
     Raises:
         ValueError: A setting does not fit the environment or the machine.
@@ -108,14 +108,13 @@ def train(
     run: Run | None = None
     try:
         _check_processes(cfg, rank, as_rsl_rl is not None)
-        if bool(cfg.start_from) != (start is not None):
+        if checkpoint is None and bool(cfg.start_from) != (start is not None):
             raise InputError("start_from and start, the policy that it names, need each other")
         env = make_env(cfg.num_envs // rank.size, (cfg.seed + 1000 * rank.index) % 2**31, rank.device)
         if cfg.trainer == "rsl-rl":
             return _train_rsl_rl(cfg, env, as_rsl_rl, rank)
         torch.manual_seed(cfg.seed)  # the same weights in all processes
-        cfg, folder = own_run(cfg, rank)
-        run = Run(cfg, env, rank, command, folder, start)
+        run = Run(cfg, env, rank, command, start, checkpoint)
         with Stop() as stop:
             result = run.iterate(stop)
         wait_for_ranks()
@@ -167,12 +166,12 @@ class Run:
     """A training under way in this process."""
 
     def __init__(
-        self, cfg: TrainCfg, env: VecEnv, rank: Rank, command: str | None = None, folder: Path | None = None,
-        start: Start | None = None,
+        self, cfg: TrainCfg, env: VecEnv, rank: Rank, command: str | None = None, start: Start | None = None,
+        checkpoint: Checkpoint | None = None,
     ) -> None:  # fmt: skip
         """Build the algorithm, and take up a checkpoint if the configuration names one, or else begin with a policy.
 
-        command and start: as in `train`. folder: of the run, if it has begun before.
+        command, start and checkpoint: as in `train`.
         """
         self.cfg, self.env, self.rank = cfg, env, rank
         self._command = command or f"jumper train {cfg.task}"
@@ -184,18 +183,19 @@ class Run:
         self._begin: float | None = None  # on the clock, as if all seconds that count were of this process
         self.figures: dict[str, float] = {}
         self.notes: list[str] = []
-        if start is not None and not cfg.resume:
+        checkpoint = checkpoint or find_checkpoint(cfg)
+        if not all_same(str(checkpoint and (checkpoint.path, checkpoint.state["iteration"]))):
+            raise InputError("the processes found different checkpoints: log_root must be a folder that all can read")
+        if start is not None and checkpoint is None:
             begin_with(start, self.ppo.model, cfg.num_envs * cfg.ppo.num_steps)
             self.notes.append(", ".join(filter(None, (f"starts from {cfg.start_from}", start.change))))
         torch.manual_seed(cfg.seed + 1 + rank.index)
-        self.folder = self._resume() if cfg.resume else folder or new_folder(cfg, rank)
-        if folder is None:
-            mark_run(self.folder, rank)
+        self.folder = new_folder(cfg, rank) if checkpoint is None else self._resume(checkpoint)
         if rank.index == 0:
             write_whole(self.folder / CONFIG, json.dumps(self.config, indent=1).encode())
 
-    def _resume(self) -> Path:
-        path, state, refusals = find_checkpoint(self.cfg)
+    def _resume(self, checkpoint: Checkpoint) -> Path:
+        path, state, refusals = checkpoint
         changed = changes(state, self.config)
         self.notes += [*(f"passed over: {refusal}" for refusal in refusals), f"resumed {path}", *changed]
         self.notes += changed_files(state, self.config)
@@ -231,29 +231,23 @@ class Run:
                 seconds = f"--max-seconds {cfg.max_seconds:g}"
                 limit = f"--iterations {cfg.iterations}" if self.iteration >= cfg.iterations else seconds
                 log.say(f"nothing is left to train after iteration {self.iteration}: give more than {limit}")
-            drain = False
             while not ending:
                 watch.start()
                 ppo.set_progress(self._progress())
-                ppo.iterate(drain or self._saves(self.iteration + 1), watch.mark)
+                ppo.iterate(watch.mark)
                 self.iteration += 1
                 if self.iteration == first:
                     self._begin_counting()
-                drain = drain or self._ending(stop)
-                ending = drain and not ppo.ahead  # else after the iteration that learns from the rollout ahead
+                ending = self._ending(stop)
                 if ending or self.iteration % cfg.log_interval == 0:
                     times, seconds = watch.read(), pace.lap(self.iteration)
                     self.figures = self._read(times, seconds)
                     log.log(self.iteration, self.figures, self._left(seconds))
                 elif self.iteration == first:  # its time tells nothing of the others
                     watch.read(), pace.lap(self.iteration)
-                if ending or self._saves(self.iteration):
+                if ending or self.iteration % cfg.save_interval == 0:
                     self._save(log, ending, stop)
         return TrainResult(self.folder, self.iteration, time.perf_counter() - start, self.figures)
-
-    def _saves(self, iteration: int) -> bool:
-        """Return whether it is known beforehand that an iteration ends with a checkpoint."""
-        return iteration % self.cfg.save_interval == 0 or iteration >= self.cfg.iterations
 
     def _log(self) -> TrainingLog | _Silent:
         if self.rank.index != 0:

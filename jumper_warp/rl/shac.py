@@ -33,8 +33,6 @@ FIGURES = (
 class Shac:
     """The algorithm on one environment, with the interface of `Ppo` that a run uses."""
 
-    ahead = False
-
     def __init__(self, env: DifferentiableVecEnv, cfg: PpoCfg, shac: ShacCfg) -> None:
         """Build networks on the environment's device; the weights follow torch's CPU seed.
 
@@ -66,8 +64,8 @@ class Shac:
     def close(self) -> None:
         """Nothing is held."""
 
-    def iterate(self, drain: bool = False, mark: Callable[[], None] = lambda: None) -> None:
-        """Do one iteration; drain has no effect, mark is called after the actor's and the critic's part."""
+    def iterate(self, mark: Callable[[], None] = lambda: None) -> None:
+        """Do one iteration; mark is called after the actor's and the critic's part."""
         window = self.window()
         loss = window.pop("loss")
         for group in self.optimisers["actor"].param_groups:

@@ -141,12 +141,10 @@ def shape_corners(shape: Shape) -> np.ndarray:
     if shape.mesh is not None:
         low, high = shape.mesh.vertices.min(axis=0), shape.mesh.vertices.max(axis=0)
     else:
-        size = shape.size
-        high = {
-            "box": lambda: 0.5 * np.array(size),
-            "cylinder": lambda: np.array([size[0], size[0], 0.5 * size[1]]),
-            "sphere": lambda: np.full(3, size[0]),
-        }[shape.kind]()
+        radius, *length = shape.size
+        high = np.array([radius, radius, 0.5 * length[0] if length else radius])
+        if shape.kind == "box":
+            high = 0.5 * np.array(shape.size)
         low = -high
     corners = np.array(list(itertools.product(*zip(low, high, strict=True))))
     *axis, w = shape.rotation / np.linalg.norm(shape.rotation)

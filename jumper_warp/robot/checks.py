@@ -5,11 +5,12 @@ from __future__ import annotations
 import dataclasses
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from jumper_warp.robot.bounds import LENGTH, PAW_RADIUS, Reading, check_bounds, refuse_outside
-from jumper_warp.robot.parts import LEGS, MOTOR_JOINTS, Joint, Link, RobotDescription, RobotDescriptionError
+from jumper_warp.robot.parts import LEGS, MOTOR_JOINTS, Joint, RobotDescription, RobotDescriptionError, require
 from jumper_warp.utils.errors import InputError
 
 TOLERANCE = 1.0e-6
@@ -94,26 +95,20 @@ def in_tree_order(description: RobotDescription) -> RobotDescription:
     parent_joint: dict[str, Joint] = {}
     for joint in description.joints:
         for link in (joint.parent, joint.child):
-            if link not in links:
-                raise RobotDescriptionError(file, f"joint {joint.name}", f"unknown link {link!r:.60}")
-        if joint.child in parent_joint:
-            other = parent_joint[joint.child].name
-            raise RobotDescriptionError(
-                file, f"link {joint.child}", f"expected one parent joint, found {other}, {joint.name}"
-            )
-        parent_joint[joint.child] = joint
+            require(link in links, file, f"joint {joint.name}", f"unknown link {link!r:.60}")
+        other = parent_joint.setdefault(joint.child, joint).name
+        problem = f"expected one parent joint, found {other}, {joint.name}"
+        require(other == joint.name, file, f"link {joint.child}", problem)
     roots = [name for name in links if name not in parent_joint]
-    if roots != ["body"]:
-        raise RobotDescriptionError(file, "", f"expected the one root link body, found {', '.join(roots) or 'a cycle'}")
+    problem = f"expected the one root link body, found {', '.join(roots) or 'a cycle'}"
+    require(roots == ["body"], file, "", problem)
     expected = tree_layout()
-    for name, (parent, child) in expected.items():
-        if name not in joints:
-            raise RobotDescriptionError(file, f"joint {name}", "missing")
-        if (joints[name].parent, joints[name].child) != (parent, child):
-            raise RobotDescriptionError(file, f"joint {name}", f"expected to lead from {parent} to {child}")
-    unexpected = joints.keys() - expected.keys()
-    if unexpected:
-        raise RobotDescriptionError(file, f"joint {min(unexpected)}", "expected no joint of this name")
+    for name, ends in expected.items():
+        require(name in joints, file, f"joint {name}", "missing")
+        found = joints[name].parent, joints[name].child
+        require(found == ends, file, f"joint {name}", "expected to lead from {} to {}".format(*ends))
+    for name in sorted(joints.keys() - expected.keys()):
+        raise RobotDescriptionError(file, f"joint {name}", "expected no joint of this name")
     order = ["body", *(child for _, child in expected.values())]
     ordered_links = tuple(links[name] for name in order)
     return dataclasses.replace(description, links=ordered_links, joints=tuple(joints[name] for name in expected))
@@ -132,19 +127,22 @@ def tree_layout() -> dict[str, tuple[str, str]]:
 
 def check_loops(description: RobotDescription) -> None:
     """Refuse loops that name other links than a leg's shanks, or are anchored off their axis."""
-    links = {link.name for link in description.links}
+    file, links = description.path, {link.name for link in description.links}
     for leg, loop in zip(LEGS, description.loops, strict=True):
         part = f"loop {loop.name}"
         for link, expected in ((loop.parent, f"{leg}_inner_shank"), (loop.child, f"{leg}_outer_shank")):
-            if link not in links:
-                raise RobotDescriptionError(description.path, part, f"unknown link {link!r:.60}")
-            if link != expected:
-                raise RobotDescriptionError(description.path, part, f"expected link {expected}, found {link}")
+            require(link in links, file, part, f"unknown link {link!r:.60}")
+            require(link == expected, file, part, f"expected link {expected}, found {link}")
         length = -loop.parent_anchor[2]
         for anchor in (loop.parent_anchor, loop.child_anchor):
-            if length <= 0.0 or np.abs(anchor - (0.0, 0.0, -length)).max() > TOLERANCE:
-                problem = f"expected both anchors at the same place on the shanks' -z axes, found {anchor.tolist()}"
-                raise RobotDescriptionError(description.path, part, problem)
+            on_axis = length > 0.0 and alike(anchor, (0.0, 0.0, -length))
+            problem = f"expected both anchors at the same place on the shanks' -z axes, found {anchor.tolist()}"
+            require(on_axis, file, part, problem)
+
+
+def alike(found: Any, expected: Any, tolerance: float = TOLERANCE) -> bool:
+    """Return whether numbers deviate by no more than a tolerance."""
+    return bool(np.abs(np.asarray(found) - expected).max() <= tolerance)
 
 
 def check_leg(description: RobotDescription, leg: str) -> None:
@@ -156,114 +154,94 @@ def check_leg(description: RobotDescription, leg: str) -> None:
     axes = {lateral: (side, 0, 0), outer: (0, -front, 0), inner: (0, front, 0)}
     axes |= {outer_knee: (0, front, 0), inner_knee: (0, -front, 0)}
     for joint, axis in axes.items():
-        if np.abs(joint.axis - axis).max() > TOLERANCE:
-            raise RobotDescriptionError(
-                file, f"joint {joint.name}", f"expected axis {axis}, found {joint.axis.tolist()}"
-            )
-    if front * lateral.origin[0] <= 0.0 or side * lateral.origin[1] <= 0.0:
-        raise RobotDescriptionError(file, f"joint {lateral.name}", "expected the hip in its own quarter of the body")
-    if front * (outer.origin[0] - inner.origin[0]) <= 0.0:
-        raise RobotDescriptionError(file, f"joint {outer.name}", "expected farther from the body centre than its twin")
-    if abs(outer.origin[2]) > TOLERANCE or np.abs((outer.origin - inner.origin)[1:]).max() > TOLERANCE:
-        raise RobotDescriptionError(file, f"joint {inner.name}", "expected both transversal axes at one y and at z 0")
+        problem = f"expected axis {axis}, found {joint.axis.tolist()}"
+        require(alike(joint.axis, axis), file, f"joint {joint.name}", problem)
+    own_quarter = front * lateral.origin[0] > 0.0 and side * lateral.origin[1] > 0.0
+    farther = front * (outer.origin[0] - inner.origin[0]) > 0.0
+    planar = abs(outer.origin[2]) <= TOLERANCE and alike(outer.origin[1:], inner.origin[1:])
     knee = outer_knee.origin
-    if knee[2] >= 0.0 or abs(knee[0]) > TOLERANCE or np.abs(knee - inner_knee.origin).max() > TOLERANCE:
-        raise RobotDescriptionError(
-            file, f"joint {outer_knee.name}", "expected both knees alike, on the thighs' -z axes"
-        )
+    on_axis = knee[2] < 0.0 and abs(knee[0]) <= TOLERANCE and alike(knee, inner_knee.origin)
+    for joint, holds, problem in (
+        (lateral, own_quarter, "expected the hip in its own quarter of the body"),
+        (outer, farther, "expected farther from the body centre than its twin"),
+        (inner, planar, "expected both transversal axes at one y and at z 0"),
+        (outer_knee, on_axis, "expected both knees alike, on the thighs' -z axes"),
+    ):
+        require(holds, file, f"joint {joint.name}", problem)
     loop = description.loops[LEGS.index(leg)]
     for link in description.links:
-        expected = 1 if link.name == f"{leg}_inner_shank" else 0
-        if link.name.startswith(leg) and len(link.collisions) != expected:
-            raise RobotDescriptionError(file, f"link {link.name}", f"expected {expected} collision shape(s)")
+        count = 1 if link.name == f"{leg}_inner_shank" else 0
+        counted = not link.name.startswith(leg) or len(link.collisions) == count
+        require(counted, file, f"link {link.name}", f"expected {count} collision shape(s)")
     paw = description.link(loop.parent).collisions[0]
-    if paw.kind != "sphere" or np.abs(paw.position - loop.parent_anchor).max() > TOLERANCE:
-        raise RobotDescriptionError(file, f"link {loop.parent}", "expected its collision sphere, the paw, at the ankle")
-    if description.link("body").collisions:
-        raise RobotDescriptionError(file, "link body", "expected no collision shape")
+    at_ankle = paw.kind == "sphere" and alike(paw.position, loop.parent_anchor)
+    require(at_ankle, file, f"link {loop.parent}", "expected its collision sphere, the paw, at the ankle")
+    require(not description.link("body").collisions, file, "link body", "expected no collision shape")
 
 
 def check_lengths(description: RobotDescription, leg: str) -> None:
     """Refuse a leg of no size, in which what has to be divided by vanishes."""
-    dimensions = leg_dimensions(description, leg)
+    dimensions, urdf = leg_dimensions(description, leg), description.urdf_path
     axes = abs(dimensions.outer_x - dimensions.inner_x)
-    refuse_outside(
-        description.urdf_path,
-        f"joint {leg}_lateral",
-        [Reading(f"hip {axis}", abs(dimensions.hip[i]), LENGTH) for i, axis in enumerate("xy")],
-    )
-    refuse_outside(
-        description.urdf_path, f"joint {leg}_outer", [Reading("distance from its twin's axis", axes, LENGTH)]
-    )
-    refuse_outside(
-        description.urdf_path, f"joint {leg}_outer_knee", [Reading("thigh length", dimensions.thigh, LENGTH)]
-    )
-    refuse_outside(description.path, f"loop {leg}_ankle", [Reading("shank length", dimensions.shank, LENGTH)])
-    refuse_outside(
-        description.urdf_path,
-        f"link {leg}_inner_shank",
-        [Reading("paw radius", dimensions.paw_radius, PAW_RADIUS)],
-    )
+    for file, part, name, value, limits in (
+        (urdf, f"joint {leg}_lateral", "hip x", abs(dimensions.hip[0]), LENGTH),
+        (urdf, f"joint {leg}_lateral", "hip y", abs(dimensions.hip[1]), LENGTH),
+        (urdf, f"joint {leg}_outer", "distance from its twin's axis", axes, LENGTH),
+        (urdf, f"joint {leg}_outer_knee", "thigh length", dimensions.thigh, LENGTH),
+        (description.path, f"loop {leg}_ankle", "shank length", dimensions.shank, LENGTH),
+        (urdf, f"link {leg}_inner_shank", "paw radius", dimensions.paw_radius, PAW_RADIUS),
+    ):
+        refuse_outside(file, part, [Reading(name, value, limits)])
 
 
 def check_mirror(description: RobotDescription, leg: str) -> None:
     """Refuse a leg that does not mirror the front left one (hips may differ in y between front and back)."""
     flip = np.array([1.0 if leg[0] == "F" else -1.0, 1.0 if leg[1] == "L" else -1.0, 1.0])
     file = description.urdf_path
-
-    def differ(found: np.ndarray, expected: np.ndarray, tolerance: float = TOLERANCE) -> bool:
-        return bool(np.abs(np.asarray(found) - expected).max() > tolerance)
-
     for link in (link for link in description.links if link.name.startswith(leg)):
-        twin: Link = description.link(f"FL{link.name[2:]}")
-        moved = differ(link.mass, twin.mass) or differ(link.com, flip * twin.com)
-        if moved or differ(link.inertia, np.outer(flip, flip) * twin.inertia, INERTIA_TOLERANCE):
-            raise RobotDescriptionError(file, f"link {link.name}", f"expected mass, com, inertia to mirror {twin.name}")
+        twin = description.link(f"FL{link.name[2:]}")
+        mirrored = alike(link.mass, twin.mass) and alike(link.com, flip * twin.com)
+        mirrored &= alike(link.inertia, np.outer(flip, flip) * twin.inertia, INERTIA_TOLERANCE)
+        require(mirrored, file, f"link {link.name}", f"expected mass, com, inertia to mirror {twin.name}")
     for joint in (joint for joint in description.joints if joint.name.startswith(leg)):
-        twin_joint: Joint = description.joint(f"FL{joint.name[2:]}")
-        origin = twin_joint.origin.copy()
+        twin = description.joint(f"FL{joint.name[2:]}")
+        origin = twin.origin.copy()
         if joint.name.endswith("lateral"):
             origin[1] = description.joint(f"{leg[0]}L_lateral").origin[1]
-        stops, twin_stops = ([j.lower, j.upper, j.effort, j.velocity] for j in (joint, twin_joint))
-        if differ(joint.origin, flip * origin) or differ(stops, twin_stops):
-            raise RobotDescriptionError(file, f"joint {joint.name}", f"expected to mirror {twin_joint.name}")
+        stops, twin_stops = ([j.lower, j.upper, j.effort, j.velocity] for j in (joint, twin))
+        mirrored = alike(joint.origin, flip * origin) and alike(stops, twin_stops)
+        require(mirrored, file, f"joint {joint.name}", f"expected to mirror {twin.name}")
     found, expected = (leg_dimensions(description, name) for name in (leg, "FL"))
-    if differ([found.shank, found.paw_radius], [expected.shank, expected.paw_radius]):
-        raise RobotDescriptionError(file, f"link {leg}_inner_shank", "expected ankle and paw to mirror the FL leg")
+    mirrored = alike([found.shank, found.paw_radius], [expected.shank, expected.paw_radius])
+    require(mirrored, file, f"link {leg}_inner_shank", "expected ankle and paw to mirror the FL leg")
 
 
 def check_motors(description: RobotDescription) -> None:
     """Refuse motors that differ between legs, or from the effort and velocity limits of their joints."""
     for index, (name, motor) in enumerate(zip(MOTOR_JOINTS, description.motors, strict=True)):
-        if motor.type != description.motors[index % 3].type:
-            problem = f"expected {description.motors[index % 3].type} as on the FL leg, found {motor.type}"
-            raise RobotDescriptionError(description.path, f"motor {name}", problem)
+        kind = description.motors[index % 3].type
+        problem = f"expected {kind} as on the FL leg, found {motor.type}"
+        require(motor.type == kind, description.path, f"motor {name}", problem)
         joint = description.joint(name)
-        for word, limit, constant in (
-            ("effort", joint.effort, motor.peak_torque),
-            ("velocity", joint.velocity, motor.no_load_speed),
-        ):
-            if abs(limit - constant) > 1.0e-3 * constant:
-                problem = f"expected {word} {constant:.4g} as of motor {motor.type}, found {limit:.4g}"
-                raise RobotDescriptionError(description.urdf_path, f"joint {name}", problem)
+        limits = (("effort", joint.effort, motor.peak_torque), ("velocity", joint.velocity, motor.no_load_speed))
+        for word, limit, constant in limits:
+            problem = f"expected {word} {constant:.4g} as of motor {motor.type}, found {limit:.4g}"
+            require(abs(limit - constant) <= 1.0e-3 * constant, description.urdf_path, f"joint {name}", problem)
 
 
 def check_poses(description: RobotDescription) -> None:
     """Refuse poses outside the stops or where a loop cannot close, and a description without the default pose."""
-    if "default" not in description.poses:
-        raise RobotDescriptionError(description.path, "poses", "expected a pose named default")
-    leg = leg_dimensions(description, "FL")
+    file, leg = description.path, leg_dimensions(description, "FL")
+    require("default" in description.poses, file, "poses", "expected a pose named default")
     for name, (lateral, transversal) in description.poses.items():
         part = f"pose {name}"
         for joint, angle in (("FL_lateral", lateral), ("FL_outer", transversal), ("FL_inner", transversal)):
             stops = description.joint(joint)
-            if not stops.lower <= angle <= stops.upper:
-                raise RobotDescriptionError(
-                    description.path, part, f"expected {joint} within its stops, found {angle:.4f}"
-                )
-        if not description.transversal_sum[0] <= 2.0 * transversal <= description.transversal_sum[1]:
-            raise RobotDescriptionError(description.path, part, "expected the transversal sum within its stops")
+            inside = stops.lower <= angle <= stops.upper
+            require(inside, file, part, f"expected {joint} within its stops, found {angle:.4f}")
+        inside = description.transversal_sum[0] <= 2.0 * transversal <= description.transversal_sum[1]
+        require(inside, file, part, "expected the transversal sum within its stops")
         try:
             knee_angles(leg, transversal, transversal)
         except ValueError as err:
-            raise RobotDescriptionError(description.path, part, f"the loop FL_ankle cannot close: {err}") from err
+            raise RobotDescriptionError(file, part, f"the loop FL_ankle cannot close: {err}") from err

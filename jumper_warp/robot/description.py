@@ -9,26 +9,25 @@ from __future__ import annotations
 import functools
 import json
 import math
+from collections import Counter
+from collections.abc import Sequence
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 
-from jumper_warp.robot.checks import LegDimensions, check_description, knee_angles, leg_dimensions
+from jumper_warp.robot.checks import check_description, knee_angles, leg_dimensions
 from jumper_warp.robot.parts import (
     LEGS,
     MOTOR_JOINTS,
     Gains,
-    Joint,
-    Link,
     Loop,
     Motor,
     RobotDescription,
     RobotDescriptionError,
-    Shape,
-    TriangleMesh,
     make_read_only,
+    require,
 )
 from jumper_warp.robot.urdf import UrdfReader, file_inside, read_text
 from jumper_warp.utils.assets import ASSETS
@@ -37,16 +36,8 @@ __all__ = [
     "DEFAULT_DESCRIPTION",
     "LEGS",
     "MOTOR_JOINTS",
-    "Gains",
-    "Joint",
-    "LegDimensions",
-    "Link",
-    "Loop",
-    "Motor",
     "RobotDescription",
     "RobotDescriptionError",
-    "Shape",
-    "TriangleMesh",
     "knee_angles",
     "leg_dimensions",
     "load_description",
@@ -68,7 +59,7 @@ def load_description(path: Path | None = None) -> RobotDescription:
 def _read_description(path: Path) -> RobotDescription:
     """Return the checked robot description of a JSON file."""
     reader = JsonReader(path)
-    urdf_file = file_inside(path, reader.text(reader.root, "urdf", ""), "urdf")
+    urdf_file = file_inside(path, reader.get(reader.root, "urdf", "", str), "urdf")
     urdf_text = read_text(urdf_file)
     urdf = UrdfReader(urdf_file, urdf_text)
     description = RobotDescription(
@@ -106,15 +97,17 @@ class JsonReader:
             raise
         except (ValueError, RecursionError) as err:
             raise RobotDescriptionError(file, "", f"expected JSON ({type(err).__name__})") from err
-        if not isinstance(self.root, dict):
-            raise RobotDescriptionError(file, "", "expected a JSON object")
+        self.require(isinstance(self.root, dict), "", "expected a JSON object")
+
+    def require(self, holds: bool, part: str, problem: str) -> None:
+        """Refuse the file unless a condition holds."""
+        require(holds, self.file, part, problem)
 
     def unique_keys(self, pairs: list[tuple[str, Any]]) -> dict[str, Any]:
         """Build an object, refusing a key that occurs twice."""
         table = dict(pairs)
         if len(table) < len(pairs):
-            keys = [key for key, _ in pairs]
-            double = next(key for key in keys if keys.count(key) > 1)
+            double = Counter(key for key, _ in pairs).most_common(1)[0][0]
             raise RobotDescriptionError(self.file, double, "expected one entry, found it twice")
         return table
 
@@ -125,43 +118,32 @@ class JsonReader:
     def get(self, table: dict, key: str, part: str, kind: type) -> Any:
         """Return an entry of a given JSON type."""
         value = table.get(key)
-        if not isinstance(value, kind):
-            found = "nothing" if value is None else type(value).__name__
-            raise RobotDescriptionError(self.file, part, f"expected {key} to be a {kind.__name__}, found {found}")
+        found = "nothing" if value is None else type(value).__name__
+        self.require(isinstance(value, kind), part, f"expected {key} to be a {kind.__name__}, found {found}")
         return value
-
-    def text(self, table: dict, key: str, part: str) -> str:
-        """Return a string entry."""
-        return self.get(table, key, part, str)
 
     def number(self, value: Any, key: str, part: str) -> float:
         """Return a finite number."""
-        number = math.nan
-        if isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < 1.0e9:
-            number = float(value)
-        if not math.isfinite(number):
-            raise RobotDescriptionError(self.file, part, f"expected {key} to be a finite number, found {value!r:.60}")
-        return number
+        finite = isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < 1.0e9
+        self.require(finite, part, f"expected {key} to be a finite number, found {value!r:.60}")
+        return float(value)
 
     def positive(self, table: dict, key: str, part: str) -> float:
         """Return a number above zero."""
         number = self.number(table.get(key), key, part)
-        if number <= 0.0:
-            raise RobotDescriptionError(self.file, part, f"expected {key} > 0, found {number}")
+        self.require(number > 0.0, part, f"expected {key} > 0, found {number}")
         return number
 
     def vector(self, table: dict, key: str, count: int, part: str) -> list[float]:
         """Return a list of finite numbers."""
         values = self.get(table, key, part, list)
-        if len(values) != count:
-            raise RobotDescriptionError(self.file, part, f"expected {count} numbers in {key}, found {len(values)}")
+        self.require(len(values) == count, part, f"expected {count} numbers in {key}, found {len(values)}")
         return [self.number(value, key, part) for value in values]
 
     def range_deg(self, key: str) -> tuple[float, float]:
         """Return a (lower, upper) range given in degrees, in radians."""
         lower, upper = self.vector(self.root, key, 2, "")
-        if lower >= upper:
-            raise RobotDescriptionError(self.file, key, f"expected lower < upper, found {lower} and {upper}")
+        self.require(lower < upper, key, f"expected lower < upper, found {lower} and {upper}")
         return math.radians(lower), math.radians(upper)
 
     def motors(self) -> tuple[Motor, ...]:
@@ -170,17 +152,19 @@ class JsonReader:
             name: self.motor_type(name, self.get(self.root["motor_types"], name, "motor_types", dict))
             for name in self.get(self.root, "motor_types", "", dict)
         }
-        table = self.get(self.root, "motors", "", dict)
-        for joint in table:
-            if joint not in MOTOR_JOINTS:
-                raise RobotDescriptionError(self.file, f"motor {joint}", f"expected one of {', '.join(MOTOR_JOINTS)}")
-        motors = []
+        table, motors = self.named("motor", MOTOR_JOINTS), []
         for joint in MOTOR_JOINTS:
-            name = self.text(table, joint, "motors")
-            if name not in types:
-                raise RobotDescriptionError(self.file, f"motor {joint}", f"unknown motor type {name!r:.60}")
+            name = self.get(table, joint, "motors", str)
+            self.require(name in types, f"motor {joint}", f"unknown motor type {name!r:.60}")
             motors.append(types[name])
         return tuple(motors)
+
+    def named(self, what: str, names: Sequence[str]) -> dict:
+        """Return the object of all motors or loops, which are among some names."""
+        table = self.get(self.root, f"{what}s", "", dict)
+        for name in table:
+            self.require(name in names, f"{what} {name}", f"expected one of {', '.join(names)}")
+        return table
 
     def motor_type(self, name: str, table: dict) -> Motor:
         """Return the constants of one motor type."""
@@ -197,8 +181,8 @@ class JsonReader:
             jumping=self.gains(gains, "jumping", part),
             walking=self.gains(gains, "walking", part),
         )
-        if motor.cutoff_speed >= motor.no_load_speed:
-            raise RobotDescriptionError(self.file, part, "expected cutoff_speed_rpm < no_load_speed_rpm")
+        slower = motor.cutoff_speed < motor.no_load_speed
+        self.require(slower, part, "expected cutoff_speed_rpm < no_load_speed_rpm")
         return motor
 
     def gains(self, table: dict, use: str, part: str) -> Gains:
@@ -208,16 +192,12 @@ class JsonReader:
 
     def loops(self) -> tuple[Loop, ...]:
         """Return the loop joints in leg order."""
-        table = self.get(self.root, "loops", "", dict)
         names = [f"{leg}_ankle" for leg in LEGS]
-        for name in table:
-            if name not in names:
-                raise RobotDescriptionError(self.file, f"loop {name}", f"expected one of {', '.join(names)}")
-        loops = []
+        table, loops = self.named("loop", names), []
         for name in names:
             loop = self.get(table, name, "loops", dict)
             anchors = (np.array(self.vector(loop, f"{side}_anchor", 3, f"loop {name}")) for side in ("parent", "child"))
-            parent, child = (self.text(loop, side, f"loop {name}") for side in ("parent", "child"))
+            parent, child = (self.get(loop, side, f"loop {name}", str) for side in ("parent", "child"))
             loops.append(Loop(name, parent, child, *anchors))
         return tuple(loops)
 

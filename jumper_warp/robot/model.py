@@ -16,28 +16,17 @@ import newton
 import numpy as np
 import warp as wp
 
-from jumper_warp.robot.description import (
-    LEGS,
-    MOTOR_JOINTS,
-    LegDimensions,
-    Link,
-    RobotDescription,
-    Shape,
-    knee_angles,
-    leg_dimensions,
-    load_description,
-)
+from jumper_warp.robot.checks import LegDimensions, knee_angles, leg_dimensions
+from jumper_warp.robot.description import LEGS, MOTOR_JOINTS, RobotDescription, load_description
 from jumper_warp.robot.gravity import EARTH, check_gravity
-from jumper_warp.robot.pinocchio_model import PinocchioRobot, build_pinocchio
+from jumper_warp.robot.parts import Link, Shape
 from jumper_warp.utils.checks import check_count
 from jumper_warp.utils.errors import InputError
 
 __all__ = [
     "LEGS",
     "MOTOR_JOINTS",
-    "PinocchioRobot",
     "build_model",
-    "build_pinocchio",
     "leg_geometry",
     "leg_geometry_array",
     "standing_configuration",

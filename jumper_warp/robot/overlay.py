@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -62,17 +62,13 @@ class RobotOverlay:
 
     def __post_init__(self) -> None:
         """Raises InputError: an unknown quantity or range, a wrong number of values, or one out of range."""
+        check_names("quantity", self.values, RANGES)
+        check_names("range of randomisation", self.randomization, RANDOMIZED)
         nominal = vars(RobotValues.nominal(1))
         for name, values in self.values.items():
-            if name not in RANGES:
-                raise InputError(f"robot overlay: no quantity {name!r:.60}; there are {', '.join(RANGES)}")
             if len(values) != nominal[name].shape[1]:
                 raise InputError(f"robot overlay: {name} needs {nominal[name].shape[1]} values, got {len(values)}")
             check_range(name, values)
-        for name in self.randomization:
-            if name not in RANDOMIZED:
-                there = ", ".join(RANDOMIZED)
-                raise InputError(f"robot overlay: no range of randomisation {name!r:.60}; there are {there}")
         robot = self.robots()
         if not (robot.cutoff_speed < robot.no_load_speed).all():
             raise InputError("robot overlay: each cutoff_speed must be below the no_load_speed")
@@ -103,9 +99,7 @@ class RobotOverlay:
         """Return the overlay of `to_json`. Raises InputError for anything else."""
         if not isinstance(saved, dict) or saved.get("schema") != SCHEMA:
             raise InputError(f"not a robot overlay: expected an object with schema {SCHEMA!r}")
-        for section in saved:
-            if section not in SECTIONS:
-                raise InputError(f"robot overlay: no section {section!r:.60}; there are {', '.join(SECTIONS)}")
+        check_names("section", saved, SECTIONS)
         sections = {}
         for section in ("values", "randomization"):
             table = saved.get(section, {})
@@ -120,6 +114,13 @@ class RobotOverlay:
     def save(self, path: Path) -> None:
         """Write it as a JSON file. Raises OSError."""
         write_whole(path, (json.dumps(self.to_json(), indent=2, allow_nan=False) + "\n").encode())
+
+
+def check_names(what: str, names: Iterable[str], known: Iterable[str]) -> None:
+    """Raise InputError for a name that is not among those known; what: it names."""
+    for name in names:
+        if name not in known:
+            raise InputError(f"robot overlay: no {what} {name!r:.60}; there are {', '.join(known)}")
 
 
 def check_range(name: str, values: tuple[float, ...]) -> None:

@@ -27,6 +27,12 @@ class RobotDescriptionError(InputError):
         super().__init__(" ".join(f"{place}: {problem}".split()))
 
 
+def require(holds: bool, file: Path, part: str, problem: str) -> None:
+    """Raise RobotDescriptionError unless a condition holds."""
+    if not holds:
+        raise RobotDescriptionError(file, part, problem)
+
+
 @dataclass(frozen=True, eq=False)
 class TriangleMesh:
     """A triangle mesh: vertices [m] (n, 3) and indices (m, 3)."""

@@ -1,4 +1,8 @@
-"""The robot in Pinocchio: an independent reference for kinematics and rigid-body dynamics."""
+"""The robot in Pinocchio: an independent reference for kinematics and rigid-body dynamics.
+
+`build_pinocchio()` returns the described robot or that of an overlay, without ground, friction, knee damping and
+springs. `experiments/dynamics_agreement.py` compares the project's dynamics with it.
+"""
 
 from __future__ import annotations
 
@@ -9,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from jumper_warp.robot.description import LEGS, MOTOR_JOINTS, RobotDescription, load_description
+from jumper_warp.robot.values import LINK_KINDS, RobotValues
 from jumper_warp.utils.errors import InputError
 
 if TYPE_CHECKING:
@@ -82,6 +87,40 @@ class PinocchioRobot:
         ]
         return max(float(np.linalg.norm(a - b)) for a, b in anchors)
 
+    def paw_positions(self, q: np.ndarray) -> np.ndarray:
+        """Return the paws' centres [m], shape (4, 3), world frame, legs FL, FR, BL, BR, of a configuration (27,)."""
+        import pinocchio as pin
+
+        pin.forwardKinematics(self.model, self.data, q)
+        return np.array([self.data.oMi[c.joint1_id].act(c.joint1_placement.translation) for c in self.constraints])
+
+    def paw_velocities(self, q: np.ndarray, v: np.ndarray) -> np.ndarray:
+        """Return the velocities of the paws' centres [m/s], shape (4, 3), world frame, legs FL, FR, BL, BR.
+
+        Args:
+            q: Configuration, shape (27,).
+            v: Velocity, shape (26,), as `closed_velocity` returns it.
+        """
+        import pinocchio as pin
+
+        pin.forwardKinematics(self.model, self.data, q, v)
+        found = []
+        for c in self.constraints:
+            twist, turn = self.data.v[c.joint1_id], self.data.oMi[c.joint1_id].rotation
+            found.append(turn @ (twist.linear + np.cross(twist.angular, c.joint1_placement.translation)))
+        return np.array(found)
+
+    def paw_jacobians(self, q: np.ndarray) -> np.ndarray:
+        """Return the paws' Jacobians [m], shape (4, 3, 3): velocity, world frame, by the rates of the leg's own motors.
+
+        Legs FL, FR, BL, BR; motors lateral, outer, inner; the base does not move.
+        """
+        columns = []
+        for motor in range(3):
+            rates = np.tile(np.eye(3)[motor], 4)
+            columns.append(self.paw_velocities(q, self.closed_velocity(q, np.zeros(6), rates)))
+        return np.stack(columns, axis=2)
+
     def closed_velocity(self, q: np.ndarray, base_twist: np.ndarray, motor_rates: np.ndarray) -> np.ndarray:
         """Return v, shape (26,), with the knee rates that keep the loops closed.
 
@@ -103,9 +142,15 @@ class PinocchioRobot:
         return v
 
     def forward_dynamics(self, q: np.ndarray, v: np.ndarray, motor_torques: np.ndarray) -> np.ndarray:
-        """Return the acceleration, shape (26,), of the robot in free flight under gravity, loops rigid.
+        """Return the acceleration dv/dt, shape (26,), of the robot in free flight under gravity, loops rigid.
 
-        Motors carry their armature; friction and knee damping are left out. `motor_torques` [N m]: (12,), motor order.
+        The base's six are derivatives of its components in the body frame, which turns: the origin's own acceleration
+        is theirs plus omega x v.
+
+        Args:
+            q: Configuration with closed loops, shape (27,).
+            v: Velocity that keeps them closed, shape (26,).
+            motor_torques: [N m], shape (12,), motor order. Motors carry their armature, and no friction.
         """
         import pinocchio as pin
 
@@ -134,17 +179,24 @@ class PinocchioRobot:
         return outer + 0.5 * math.pi + slope - base, inner + 0.5 * math.pi - slope - base
 
 
-def build_pinocchio(description: RobotDescription | None = None) -> PinocchioRobot:
-    """Return the robot in Pinocchio, with a free-flying base. Raises ImportError where Pinocchio is not installed."""
+def build_pinocchio(description: RobotDescription | None = None, values: RobotValues | None = None) -> PinocchioRobot:
+    """Return the robot in Pinocchio, with a free-flying base.
+
+    Args:
+        description: The robot; by default the project's own.
+        values: Masses and armatures of a robot that differs from it, as `RobotOverlay.robots()` returns them; the
+            first robot counts, and nothing but its `base_mass`, `base_com`, `base_inertia`, `link_mass` and `armature`.
+    """
     import pinocchio as pin
 
     description = load_description() if description is None else description
+    values = RobotValues.nominal(1, description) if values is None else values
     model = pin.buildModelFromXML(description.urdf, pin.JointModelFreeFlyer())
+    _write_masses(model, description, values)
     joints = [model.joints[model.getJointId(name)] for name in MOTOR_JOINTS]
     knees = [model.joints[model.getJointId(f"{leg}_{bar}_knee")] for leg in LEGS for bar in ("outer", "inner")]
     armature = np.zeros(model.nv)
-    for joint, motor in zip(joints, description.motors, strict=True):
-        armature[joint.idx_v] = motor.armature
+    armature[[joint.idx_v for joint in joints]] = values.armature[0]
     model.armature = armature
     constraints = pin.StdVec_RigidConstraintModel()
     constraint_data = pin.StdVec_RigidConstraintData()
@@ -166,3 +218,17 @@ def build_pinocchio(description: RobotDescription | None = None) -> PinocchioRob
         knee_q=np.array([knee.idx_q for knee in knees]),
         knee_v=np.array([knee.idx_v for knee in knees]),
     )
+
+
+def _write_masses(model: pin.Model, description: RobotDescription, values: RobotValues) -> None:
+    """Give the links the masses, centres of mass and inertias of the first of some robots."""
+    import pinocchio as pin
+
+    base, ratio = description.links[0], values.base_mass[0, 0] / description.links[0].mass
+    inertia = ratio * values.base_inertia[0, 0] * base.inertia
+    model.inertias[1] = pin.Inertia(values.base_mass[0, 0], values.base_com[0], inertia)
+    ratios = dict(zip(LINK_KINDS, values.link_mass[0], strict=True))
+    for joint in description.joints:
+        link, scale = description.link(joint.child), ratios[joint.child[3:]]
+        own = pin.Inertia(scale * link.mass, link.com, scale * link.inertia)
+        model.inertias[model.getJointId(joint.name)] = own

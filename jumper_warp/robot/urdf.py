@@ -10,7 +10,7 @@ from xml.parsers import expat
 
 import numpy as np
 
-from jumper_warp.robot.parts import Joint, Link, RobotDescriptionError, Shape, TriangleMesh
+from jumper_warp.robot.parts import Joint, Link, RobotDescriptionError, Shape, TriangleMesh, require
 
 MAX_FILE_BYTES = 8_000_000
 SHAPE_SIZES = {"box": ("size", 3), "cylinder": ("radius length", 1), "sphere": ("radius", 1)}
@@ -60,13 +60,16 @@ class UrdfReader:
     def __init__(self, file: Path, text: str):
         self.file = file
         self.root = parse_xml(file, text)
-        if self.root.tag != "robot":
-            raise RobotDescriptionError(file, "", f"expected <robot>, found <{self.root.tag}>")
+        self.require(self.root.tag == "robot", "", f"expected <robot>, found <{self.root.tag}>")
         self.meshes: dict[str, TriangleMesh] = {}
         self.colors = {}
         for material in self.root.findall("material"):
             color = self.child(material, "color", "material")
             self.colors[material.get("name")] = tuple(self.numbers(color, "rgba", 4, "material")[:3])
+
+    def require(self, holds: bool, part: str, problem: str) -> None:
+        """Refuse the file unless a condition holds."""
+        require(holds, self.file, part, problem)
 
     def links(self) -> tuple[Link, ...]:
         """Return all links in file order."""
@@ -80,17 +83,14 @@ class UrdfReader:
         """Return the elements of one kind, each with its own name."""
         elements = self.root.findall(tag)
         for name, count in Counter(element.get("name") for element in elements).items():
-            if not name:
-                raise RobotDescriptionError(self.file, tag, "expected a name")
-            if count > 1:
-                raise RobotDescriptionError(self.file, f"{tag} {name}", f"expected one, found {count}")
+            self.require(bool(name), tag, "expected a name")
+            self.require(count == 1, f"{tag} {name}", f"expected one, found {count}")
         return elements
 
     def child(self, element: Element, tag: str, part: str) -> Element:
         """Return the only child element with a tag."""
         found = element.findall(tag)
-        if len(found) != 1:
-            raise RobotDescriptionError(self.file, part, f"expected one <{tag}>, found {len(found)}")
+        self.require(len(found) == 1, part, f"expected one <{tag}>, found {len(found)}")
         return found[0]
 
     def numbers(self, element: Element, attribute: str, count: int, part: str, default: str = "") -> list[float]:
@@ -100,9 +100,8 @@ class UrdfReader:
             values = [float(word) for word in text.split()]
         except ValueError:
             values = []
-        if len(values) != count or not all(map(math.isfinite, values)):
-            problem = f"expected {count} finite number(s) in {attribute} of <{element.tag}>, found {text[:60]!r}"
-            raise RobotDescriptionError(self.file, part, problem)
+        problem = f"expected {count} finite number(s) in {attribute} of <{element.tag}>, found {text[:60]!r}"
+        self.require(len(values) == count and all(map(math.isfinite, values)), part, problem)
         return values
 
     def placement(self, element: Element, part: str, turned: bool) -> tuple[np.ndarray, np.ndarray]:
@@ -111,12 +110,8 @@ class UrdfReader:
             return np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0])
         origin = self.child(element, "origin", part)
         angles = self.numbers(origin, "rpy", 3, part, default="0 0 0")
-        if any(angles) and not turned:
-            raise RobotDescriptionError(
-                self.file, part, "expected a frame parallel to its parent's, found rpy not zero"
-            )
-        if max(map(abs, angles)) > 2.0 * math.pi:
-            raise RobotDescriptionError(self.file, part, f"expected rpy within a turn, found {angles}")
+        self.require(turned or not any(angles), part, "expected a frame parallel to its parent's, found rpy not zero")
+        self.require(max(map(abs, angles)) <= 2.0 * math.pi, part, f"expected rpy within a turn, found {angles}")
         return np.array(self.numbers(origin, "xyz", 3, part, default="0 0 0")), quat_from_rpy(*angles)
 
     def link(self, element: Element) -> Link:
@@ -125,8 +120,7 @@ class UrdfReader:
         part = f"link {name}"
         inertial = self.child(element, "inertial", part)
         mass = self.numbers(self.child(inertial, "mass", part), "value", 1, part)[0]
-        if mass <= 0.0:
-            raise RobotDescriptionError(self.file, part, f"expected mass > 0, found {mass}")
+        self.require(mass > 0.0, part, f"expected mass > 0, found {mass}")
         moments = self.child(inertial, "inertia", part)
         keys = ("ixx", "iyy", "izz", "ixy", "ixz", "iyz")
         ixx, iyy, izz, ixy, ixz, iyz = (self.numbers(moments, key, 1, part)[0] for key in keys)
@@ -139,67 +133,53 @@ class UrdfReader:
 
     def check_inertia(self, inertia: np.ndarray, part: str) -> None:
         """Refuse an inertia tensor that no distribution of mass has."""
-        if np.abs(inertia).max() > 1.0e6:
-            raise RobotDescriptionError(self.file, part, "expected moments of inertia below 1e6 kg m^2")
+        self.require(np.abs(inertia).max() <= 1.0e6, part, "expected moments of inertia below 1e6 kg m^2")
         low, middle, high = np.linalg.eigvalsh(inertia)
-        if low <= 0.0:
-            raise RobotDescriptionError(self.file, part, f"expected a positive inertia, found a moment of {low:.3g}")
-        if low + middle < high * (1.0 - 1.0e-9):
-            problem = (
-                f"expected principal moments within the triangle inequality, found {low:.3g} {middle:.3g} {high:.3g}"
-            )
-            raise RobotDescriptionError(self.file, part, problem)
+        self.require(low > 0.0, part, f"expected a positive inertia, found a moment of {low:.3g}")
+        problem = f"expected principal moments within the triangle inequality, found {low:.3g} {middle:.3g} {high:.3g}"
+        self.require(low + middle >= high * (1.0 - 1.0e-9), part, problem)
 
     def joint(self, element: Element) -> Joint:
         """Return one joint, with its axis and limits checked."""
         name = element.get("name")
         part = f"joint {name}"
-        if element.get("type") != "revolute":
-            raise RobotDescriptionError(self.file, part, f"expected type revolute, found {element.get('type')}")
+        kind = element.get("type")
+        self.require(kind == "revolute", part, f"expected type revolute, found {kind}")
         parent, child = (self.child(element, tag, part).get("link") or "" for tag in ("parent", "child"))
         axis = np.array(self.numbers(self.child(element, "axis", part), "xyz", 3, part))
-        if not abs(np.linalg.norm(axis) - 1.0) < 1.0e-6:
-            raise RobotDescriptionError(self.file, part, f"expected an axis of length 1, found {axis.tolist()}")
+        length = np.linalg.norm(axis)
+        self.require(abs(length - 1.0) < 1.0e-6, part, f"expected an axis of length 1, found {axis.tolist()}")
         limit = self.child(element, "limit", part)
         keys = ("lower", "upper", "effort", "velocity")
         lower, upper, effort, velocity = (self.numbers(limit, key, 1, part)[0] for key in keys)
-        if lower >= upper:
-            raise RobotDescriptionError(self.file, part, f"expected lower < upper limit, found {lower} and {upper}")
-        if effort <= 0.0 or velocity <= 0.0:
-            raise RobotDescriptionError(
-                self.file, part, f"expected effort and velocity > 0, found {effort}, {velocity}"
-            )
+        self.require(lower < upper, part, f"expected lower < upper limit, found {lower} and {upper}")
         origin = self.placement(element, part, turned=False)[0]
         return Joint(name, parent, child, origin, axis, lower, upper, effort, velocity)
 
     def shape(self, element: Element, part: str) -> Shape:
         """Return one visual or collision shape."""
         geometry = self.child(element, "geometry", part)
-        if len(geometry) != 1 or geometry[0].tag not in (*SHAPE_SIZES, "mesh"):
-            raise RobotDescriptionError(self.file, part, "expected one box, cylinder, sphere or mesh in <geometry>")
+        known = len(geometry) == 1 and geometry[0].tag in (*SHAPE_SIZES, "mesh")
+        self.require(known, part, "expected one box, cylinder, sphere or mesh in <geometry>")
         kind, size, mesh = geometry[0].tag, [], None
         if kind == "mesh":
             mesh = self.mesh(geometry[0].get("filename", ""), part)
         else:
             keys, count = SHAPE_SIZES[kind]
             size = [value for key in keys.split() for value in self.numbers(geometry[0], key, count, part)]
-            if min(size) <= 0.0:
-                raise RobotDescriptionError(self.file, part, f"expected a {kind} of positive size, found {size}")
         position, rotation = self.placement(element, part, turned=True)
         material = element.find("material")
         color = None
         if material is not None:
-            color = self.colors.get(material.get("name"))
-            if color is None:
-                raise RobotDescriptionError(self.file, part, f"unknown material {material.get('name')}")
+            color = self.colors.get(name := material.get("name"))
+            self.require(color is not None, part, f"unknown material {name}")
         return Shape(kind, tuple(size), position, rotation, color, mesh)
 
     def mesh(self, name: str, part: str) -> TriangleMesh:
         """Return a mesh of the robot's folder."""
         if name not in self.meshes:
             file = file_inside(self.file, name, part)
-            if file.suffix != ".obj":
-                raise RobotDescriptionError(self.file, part, f"expected an .obj mesh, found {name!r}")
+            self.require(file.suffix == ".obj", part, f"expected an .obj mesh, found {name!r}")
             self.meshes[name] = read_obj(file)
         return self.meshes[name]
 
@@ -212,10 +192,9 @@ def file_inside(source: Path, name: str, part: str) -> Path:
         exists = file.is_file()
     except (OSError, ValueError, RuntimeError) as err:
         raise RobotDescriptionError(source, part, f"{name!r} is not a file name") from err
-    if ":" in name or not file.is_relative_to(folder):
-        raise RobotDescriptionError(source, part, f"expected a file inside {folder}, found {name!r}")
-    if not exists:
-        raise RobotDescriptionError(source, part, f"missing file {name!r}")
+    inside = ":" not in name and file.is_relative_to(folder)
+    require(inside, source, part, f"expected a file inside {folder}, found {name!r}")
+    require(exists, source, part, f"missing file {name!r}")
     return file
 
 
@@ -234,23 +213,15 @@ def read_obj(file: Path) -> TriangleMesh:
         except ValueError as err:
             raise RobotDescriptionError(file, f"line {number}", "expected 'v x y z' or 'f a b c'") from err
     flat = [index for triangle in triangles for index in triangle]
-    if not flat or min(flat) < 0 or max(flat) >= len(vertices):
-        raise RobotDescriptionError(file, "", f"expected triangles between the {len(vertices)} vertices")
+    between = bool(flat) and min(flat) >= 0 and max(flat) < len(vertices)
+    require(between, file, "", f"expected triangles between the {len(vertices)} vertices")
     points = np.array(vertices)
-    if not np.isfinite(points).all():
-        raise RobotDescriptionError(file, "", "expected finite vertices")
+    require(bool(np.isfinite(points).all()), file, "", "expected finite vertices")
     return TriangleMesh(points, np.array(triangles, dtype=np.int32))
 
 
 def quat_from_rpy(roll: float, pitch: float, yaw: float) -> np.ndarray:
     """Return the quaternion (xyzw) of a URDF's fixed-axis roll, pitch, yaw [rad]."""
-    cr, cp, cy = (math.cos(0.5 * angle) for angle in (roll, pitch, yaw))
-    sr, sp, sy = (math.sin(0.5 * angle) for angle in (roll, pitch, yaw))
-    return np.array(
-        [
-            sr * cp * cy - cr * sp * sy,
-            cr * sp * cy + sr * cp * sy,
-            cr * cp * sy - sr * sp * cy,
-            cr * cp * cy + sr * sp * sy,
-        ]
-    )
+    (cr, sr), (cp, sp), (cy, sy) = ((math.cos(0.5 * angle), math.sin(0.5 * angle)) for angle in (roll, pitch, yaw))
+    x, y = sr * cp * cy - cr * sp * sy, cr * sp * cy + sr * cp * sy
+    return np.array([x, y, cr * cp * sy - sr * sp * cy, cr * cp * cy + sr * sp * sy])

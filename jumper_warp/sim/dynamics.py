@@ -21,10 +21,10 @@ LINKS = ("housing", "outer_thigh", "outer_shank", "inner_thigh", "inner_shank")
 JOINTS = ("lateral", "outer", "outer_knee", "inner", "inner_knee")
 KERNEL_MODULES = (
     "actuation.command_filter", "actuation.motors", "dynamics.adjoint.constants_adjoint",
-    "dynamics.adjoint.contact_adjoint", "dynamics.adjoint.differentiable", "dynamics.adjoint.gradients",
-    "dynamics.adjoint.leg_record", "dynamics.adjoint.rollout_adjoint", "dynamics.adjoint.rollout_legs_adjoint",
-    "dynamics.adjoint.step_adjoint", "dynamics.contact", "dynamics.drive", "dynamics.legs.advance_legs",
-    "dynamics.legs.rollout_legs", "dynamics.momentum", "dynamics.parameters", "dynamics.step",
+    "dynamics.adjoint.gradients", "dynamics.adjoint.leg_record", "dynamics.adjoint.multipliers",
+    "dynamics.adjoint.rollout_adjoint", "dynamics.adjoint.rollout_legs_adjoint", "dynamics.adjoint.step_adjoint",
+    "dynamics.adjoint.tape_step", "dynamics.contact", "dynamics.drive", "dynamics.legs.advance_legs",
+    "dynamics.legs.rollout_legs", "dynamics.momentum", "dynamics.parameters", "dynamics.step", "dynamics.trajectory",
     "dynamics.world.advance", "dynamics.world.rollout", "kinematics.full_state", "kinematics.geometry",
     "layout", "scalar", "state", "terrain.ground",
 )  # fmt: skip
@@ -205,6 +205,15 @@ class JumperDynamics:
         work.invalid = wp.zeros(n, dtype=int, device=self.device)
         work.reference_q = wp.array(self.model.joint_q.numpy(), dtype=scalar.real, device=self.device)
         return work
+
+    def step_record(self, steps: int) -> Any:
+        """Return room for some steps that a reverse pass makes again."""
+        record, n = self.modules.multipliers.StepRecord(), self.num_worlds
+        for name, var in record._cls.vars.items():
+            shape = (n, steps + (name in ("base", "angles", "rates")))
+            shape += () if name in ("base", "inverse") else (4,)
+            setattr(record, name, wp.zeros(shape, dtype=var.type.dtype, device=self.device))
+        return record
 
     def pack(self) -> None:
         """Read masses, joints, friction and gravity of every world from the model, and its springs."""

@@ -23,9 +23,10 @@ import jumper_warp.tasks
 from jumper_warp.kernels.mdp.env import Nothing
 from jumper_warp.tasks.cfg import Handover, TaskCfg
 from jumper_warp.tasks.terms import RewardTerm, Term
+from jumper_warp.utils.checks import version_refusal
 from jumper_warp.utils.errors import InputError
 
-VERSION = 2
+VERSION = 3
 """Of the form in which tasks are saved."""
 OWN = ("jumper_warp.tasks.", "jumper_warp.robot.", "jumper_warp.kernels.")
 """Beginnings of the names of the project's modules that a task may name."""
@@ -154,6 +155,14 @@ class Finder:
         return found
 
 
+def check_version(saved: Any) -> None:
+    """Raise TaskError unless this is a saved task of today's version."""
+    if not isinstance(saved, dict):
+        raise TaskError(f"the task must be a JSON object, got {shown(saved)}")
+    if (found := saved.get("version")) != VERSION:
+        raise TaskError(f"the task {version_refusal(shown(found), VERSION)}")
+
+
 def task_from_json(saved: Any, modules: Iterable[ModuleType] = (), *, leave_out: Collection[str] = ()) -> TaskCfg:
     """Return a saved task; settings that it lacks have their defaults.
 
@@ -165,10 +174,7 @@ def task_from_json(saved: Any, modules: Iterable[ModuleType] = (), *, leave_out:
     Raises:
         TaskError: It is not a task of this version, or a function is in none of the modules.
     """
-    if not isinstance(saved, dict):
-        raise TaskError(f"the task must be a JSON object, got {shown(saved)}")
-    if saved.get("version") != VERSION:
-        raise TaskError(f"the task has version {shown(saved.get('version'))}, this is version {VERSION}")
+    check_version(saved)
     content = {key: value for key, value in saved.items() if key not in ("version", "type")}
     content |= {section: [] for section in OPTIONAL if section in leave_out}
     try:

@@ -8,7 +8,6 @@ Optimization, 2nd edition: algorithm 7.4 (two loops) and section 17.4 (augmented
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -61,7 +60,6 @@ def minimise(
     upper: float = 1.0,
     step: float = 0.1,
     seed: int = 0,
-    enough: Callable[[Progress], bool] | None = None,
 ) -> Progress:
     """Return what was found from some starts.
 
@@ -72,7 +70,6 @@ def minimise(
         lower, upper: Bounds of all entries.
         step: [1] Largest entry of the first steps.
         seed: Of the random steps.
-        enough: Ends the descent when it is true of what was found so far.
 
     Raises InputError for starts of another shape.
     """
@@ -91,8 +88,6 @@ def minimise(
                 "objective": float(progress.objective.min()),
             }
         )
-        if enough is not None and enough(progress):
-            break
     return descent.progress
 
 

@@ -14,14 +14,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING
+from typing import Any, Protocol
 
 import torch
 from torch.func import jvp, vjp
 from torch.nn import functional
 
-if TYPE_CHECKING:
-    from jumper_warp.policies.policy import Policy
+from jumper_warp.utils.normalise import normalise
 
 ACTIVATIONS = {"elu": functional.elu, "relu": functional.relu, "tanh": torch.tanh}
 
@@ -29,10 +28,19 @@ Tape = list[list[tuple[torch.Tensor, torch.Tensor]]]
 """Of every policy step and layer what went in, (worlds, in), and what came out before the activation, (worlds, out)."""
 
 
+class Actor(Protocol):
+    """A policy's weights, normaliser and interface, as `jumper_warp.policies.policy.Policy` has them."""
+
+    layers: Sequence[tuple[torch.Tensor, torch.Tensor]]
+    mean: torch.Tensor
+    std: torch.Tensor
+    interface: Any
+
+
 class Network:
     """A policy's network as a function of the vector of its weights."""
 
-    def __init__(self, policy: Policy, dtype: torch.dtype = torch.float32, device: torch.device | str = "cpu") -> None:
+    def __init__(self, policy: Actor, dtype: torch.dtype = torch.float32, device: torch.device | str = "cpu") -> None:
         """Take over weights and normaliser; they are not shared."""
         face = policy.interface
         self.limits = face.observation_limit, face.normalised_limit
@@ -54,7 +62,7 @@ class Network:
         weights: other ones than its own.
         """
         limit, normalised = self.limits
-        x = ((obs.clamp(-limit, limit) - self.mean) / self.std).clamp(-normalised, normalised)
+        x = normalise(obs.clamp(-limit, limit), self.mean, self.std, normalised)
         layers, rows = self.layers(self.weights if weights is None else weights), []
         for i, (weight, bias) in enumerate(layers):
             out = functional.linear(x, weight, bias)

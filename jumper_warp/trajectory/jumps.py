@@ -62,16 +62,6 @@ def highest() -> Term:
     return term
 
 
-def estimated_apex(speed: float = 0.25) -> Term:
-    """Return the height [m] of the centre of mass at the apex of its parabola from takeoff on, (num,)."""
-
-    def term(motion: Motion) -> torch.Tensor:
-        now = motion.momentum_at_takeoff(speed)
-        return now.com[:, 2] + now.vel[:, 2].clamp_min(0.0).square() / (2.0 * motion.gravity)
-
-    return term
-
-
 def positive_work() -> Term:
     """Return the motors' positive work [J] until takeoff, in units of 100 J."""
 

@@ -80,10 +80,6 @@ class Knots:
         )
         return middle + scale * actions
 
-    def nearest(self, actions: np.ndarray) -> np.ndarray:
-        """Return the candidate (len(self),) whose actions are nearest to some (steps, motors), clipped to -1..1."""
-        return np.clip(np.linalg.lstsq(self.weights, actions, rcond=None)[0], -1.0, 1.0).ravel()
-
 
 class Motion:
     """What targets lead to, in `num` worlds; coordinates last, rows every policy step, row 0 the start."""
@@ -136,12 +132,6 @@ class Motion:
         share = share.to(torque.dtype)[:, None, None]
         rate = ends[:-1, None] + share * (ends[1:] - ends[:-1])[:, None]
         return (self.dt * (torque * rate).clamp_min(0.0)).sum((1, 2)).cumsum(0)
-
-    @cached_property
-    def copper(self) -> torch.Tensor:
-        """Return the integral of squared torques [N^2 m^2 s] until each policy step, (steps, num)."""
-        torque = self.trajectory.torque.unflatten(0, (-1, self.substeps))
-        return (self.dt * torque.square()).sum((1, 2)).cumsum(0)
 
     def takeoff(self, speed: float) -> tuple[torch.Tensor, torch.Tensor]:
         """Return the row of takeoff (num,), the last where there is none, and whether there is one.
@@ -251,12 +241,20 @@ class Problem:
         self.world_steps += targets.shape[0] * len(x)
         return Motion(simulate(rollout, targets, q, qd, trusted=True), body, rollout, self.gravity, start)
 
+    def recorded(self, trajectory: TorchTrajectory) -> Motion:
+        """Return the motion of one world whose trajectory comes from another simulation of the same robot."""
+        rollout, body, _, _, start = self._prepared(1)
+        return Motion(trajectory, body, rollout, self.gravity, start)
+
     def evaluate(self, x: torch.Tensor) -> Values:
         """Return objective and constraints of candidates (n, len(knots)); what is not finite is infinite."""
-        motion = self.motion(x)
+        return self.values(self.motion(x))
+
+    def values(self, motion: Motion) -> Values:
+        """Return objective and constraints of a motion; infinite where one of them is not finite."""
         objective = self.objective(motion)
-        rows = [term(motion).reshape(-1, len(x)) for term in self.constraints]
-        constraints = torch.cat(rows).T if rows else objective.new_zeros(len(x), 0)
+        rows = [term(motion).reshape(-1, motion.num) for term in self.constraints]
+        constraints = torch.cat(rows).T if rows else objective.new_zeros(motion.num, 0)
         broken = ~(objective.isfinite() & constraints.isfinite().all(1))
         return Values(torch.where(broken, torch.inf, objective), torch.where(broken[:, None], 0.0, constraints))
 

@@ -12,6 +12,8 @@ FLOAT32_MAX = 3.4028234e38
 """Beyond it, single precision is infinite, which all settings become on their way to a device."""
 MOST_SEED = 2**31 - 1
 """Of the kernels' draws."""
+LAST_OF_OLDER_VERSIONS = "c88f715"
+"""The last commit that reads policies, tasks and runs of older versions than today's."""
 
 
 def check_finite(name: str, *values: float) -> None:
@@ -52,3 +54,8 @@ def check_seed(value: Any) -> None:
     """Raises ValueError: the value is no whole number that the kernels' draws take as a seed."""
     if isinstance(value, bool) or not isinstance(value, int | np.integer) or not 0 <= value <= MOST_SEED:
         raise InputError(f"seed must be in 0 .. {MOST_SEED}, got {value!r:.40}")
+
+
+def version_refusal(found: str, known: int) -> str:
+    """Return why a file of another version is refused, and which commit reads the older ones."""
+    return f"has version {found}, this is version {known}; commit {LAST_OF_OLDER_VERSIONS} reads older ones"

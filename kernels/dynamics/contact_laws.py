@@ -1,4 +1,4 @@
-"""The paws' contact laws at a solution, their derivatives, and the linear system of their multipliers."""
+"""The paws' contact laws at a solution, and their derivatives."""
 
 import warp as wp
 
@@ -73,68 +73,18 @@ def paw_law(
 
 
 @wp.func
-def solve_linear(a: wp.array2d(dtype=real), b: wp.array(dtype=real), n: int):
-    """Replace the first n of b by the solution x of a x = b; Gaussian elimination with row pivots, a is overwritten."""
-    for col in range(n):
-        best = col
-        for row in range(col + 1, n):
-            if wp.abs(a[row, col]) > wp.abs(a[best, col]):
-                best = row
-        if best != col:
-            for i in range(col, n):
-                swap = a[col, i]
-                a[col, i] = a[best, i]
-                a[best, i] = swap
-            swap_b = b[col]
-            b[col] = b[best]
-            b[best] = swap_b
-        scale = real(1.0) / a[col, col]
-        for row in range(col + 1, n):
-            factor = scale * a[row, col]
-            if factor != real(0.0):
-                for i in range(col + 1, n):
-                    a[row, i] = a[row, i] - factor * a[col, i]
-                b[row] = b[row] - factor * b[col]
-    for back in range(n):
-        row = n - 1 - back
-        total = b[row]
-        for i in range(row + 1, n):
-            total -= a[row, i] * b[i]
-        b[row] = total / a[row, row]
+def contact_residual(impulse: vec3, velocity: vec3, normal: vec3, goal: real, mu: real, mode: int) -> vec3:
+    """Return R, zero where an impulse [N s] and a contact velocity [m/s] satisfy the law of a mode.
 
-
-@wp.func
-def solve_laws(
-    contacts: wp.array(dtype=PawContact), laws: wp.array(dtype=PawLaw), seeds: wp.array(dtype=vec3),
-    matrix: wp.array2d(dtype=real), vector: wp.array(dtype=real),
-):  # fmt: skip
-    """Replace the gradients of the paws' impulses in `seeds` by the multipliers of their laws; shapes (4,).
-
-    matrix, vector: of shape (12, 12) and (12,), overwritten.
+    Separated: R = p. Sticking: R = v - goal n. Sliding: normal part v_n - goal, tangential part
+    |v_t| p_t + mu p_n v_t.
     """
-    row = int(0)
-    for k in range(seeds.shape[0]):
-        if laws[k].mode != SEPARATE:
-            col = int(0)
-            for j in range(seeds.shape[0]):
-                if laws[j].mode != SEPARATE:
-                    block = contacts[k].from_lin * contacts[j].to_lin + contacts[k].from_ang * contacts[j].to_ang
-                    if k == j:
-                        block = contacts[k].total
-                    block = block * wp.transpose(laws[j].by_velocity)
-                    if k == j:
-                        block = block + wp.transpose(laws[k].by_impulse)
-                    for r in range(3):
-                        for s in range(3):
-                            matrix[row + r, col + s] = block[r, s]
-                    col += 3
-            for r in range(3):
-                vector[row + r] = -seeds[k][r]
-            row += 3
-    solve_linear(matrix, vector, row)
-    row = int(0)
-    for k in range(seeds.shape[0]):
-        seeds[k] = vec3(real(0.0))
-        if laws[k].mode != SEPARATE:
-            seeds[k] = vec3(vector[row], vector[row + 1], vector[row + 2])
-            row += 3
+    if mode == SEPARATE:
+        return impulse
+    normal_velocity = wp.dot(velocity, normal)
+    tangential = velocity - normal_velocity * normal
+    if mode == SLIDE:
+        size = wp.dot(impulse, normal)
+        friction = impulse - size * normal
+        return (normal_velocity - goal) * normal + wp.length(tangential) * friction + mu * size * tangential
+    return velocity - goal * normal

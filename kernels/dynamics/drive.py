@@ -103,15 +103,15 @@ def applied_torque(leg: LegDrive, step: int, angles: vec3, rates: vec3) -> vec3:
 
 
 @wp.func
-def base_wrench(drive: Drive, world: int) -> vec6:
+def base_wrench(joint_f: wp.array(dtype=real), body_f: wp.array(dtype=wp.spatial_vector), world: int) -> vec6:
     """Return the external wrench on the base at its com, world axes (force [N], moment [N m])."""
-    w = drive.body_f[world * BODIES]
+    w = body_f[world * BODIES]
     i = world * DOFS
     return vec6(
-        real(w[0]) + drive.joint_f[i],
-        real(w[1]) + drive.joint_f[i + 1],
-        real(w[2]) + drive.joint_f[i + 2],
-        real(w[3]) + drive.joint_f[i + 3],
-        real(w[4]) + drive.joint_f[i + 4],
-        real(w[5]) + drive.joint_f[i + 5],
+        real(w[0]) + joint_f[i],
+        real(w[1]) + joint_f[i + 1],
+        real(w[2]) + joint_f[i + 2],
+        real(w[3]) + joint_f[i + 3],
+        real(w[4]) + joint_f[i + 4],
+        real(w[5]) + joint_f[i + 5],
     )

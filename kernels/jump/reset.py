@@ -25,7 +25,6 @@ from .reset_draws import (
     DEFAULT,
     IN_FLIGHT,
     PUSHING,
-    REFERENCE,
     STANDING,
     TOUCHDOWN,
     BaseDraw,
@@ -34,8 +33,6 @@ from .reset_draws import (
     draw_box,
     draw_paw,
     draw_scheme,
-    follows_reference,
-    reference_goal,
     rounded,
     time_spent,
 )
@@ -91,7 +88,7 @@ def draw_leg(
             here = surface(ground, spot[0], spot[1])
             paw[2] = here[0] + geo.paw_radius - d.pos[2] - lift
         found = leg_to(geo, limits, wp.quat_rotate_inv(d.quat, paw))
-        if scheme == AFTER_LANDING or scheme == PUSHING or scheme == REFERENCE:
+        if scheme == AFTER_LANDING or scheme == PUSHING:
             # the paw rests on the ground while the base moves, so the joints move too
             moving = d.lin_vel + wp.cross(d.ang_vel, paw)
             found = leg_over_ground(geo, found, -wp.quat_rotate_inv(d.quat, moving))
@@ -256,14 +253,10 @@ def reset_jump(
     spent = time_spent(old)
     scheme = draw_scheme(draw, ranges, spent)
     heading = between(draw, 13, -ranges.heading, ranges.heading)
-    wanted = draw_goal(draw, level)
-    drawn = follows_reference(draw, ranges, scheme)
-    if drawn == REFERENCE:
-        wanted = reference_goal(draw, ranges, wanted)
-    goal = turned(wanted, heading)
+    goal = turned(draw_goal(draw, level), heading)
     here = place_ground(scene.ground, world, draw, ranges, settings.grounds, scheme, heading, goal)
     taken = draw_until_taken(
-        scene.geometry, here, leg_limits(skill.command_filter), ranges, draw, drawn, heading, level.base_height,
+        scene.geometry, here, leg_limits(skill.command_filter), ranges, draw, scheme, heading, level.base_height,
         goal, g, robot.body_com[world * BODIES], robot.joint_q, robot.joint_qd,
     )  # fmt: skip
     if not taken:

@@ -20,10 +20,6 @@ IN_FLIGHT = wp.constant(2)
 TOUCHDOWN = wp.constant(3)
 AFTER_LANDING = wp.constant(4)
 PUSHING = wp.constant(5)
-REFERENCE = wp.constant(6)  # pushing off as a reference motion does; counts as PUSHING
-
-REFERENCE_ROWS = wp.constant(16)
-mat_reference = wp.types.matrix(shape=(16, 6), dtype=wp.float32)
 
 
 @wp.struct
@@ -46,10 +42,6 @@ class ResetRanges:
     takeoff_pitch: wp.vec2  # nose down, of states in flight and pushing off
     push_length: wp.vec2  # of the way to the takeoff, straight along its velocity
     push_acceleration: wp.vec2  # [m/s^2] along it
-    reference_share: float  # of those that push off: along the reference
-    reference: mat_reference  # base x, z [m], pitch [rad] and their rates, evenly spaced in time until a paw lifts
-    reference_goal: wp.vec2  # base x where it lands [m], and base height at its apex [m], 0: any
-    reference_reach: wp.vec2  # of goals, shares of these
     takeoff_angle: wp.vec2  # above the horizon, where no apex is wanted
     highest_apex: float  # of jumps with a drawn angle
     landing_height: float  # of the base, where the projectile ends
@@ -193,40 +185,6 @@ def push_off(draw: Draw, ranges: ResetRanges, takeoff: BaseDraw) -> BaseDraw:
 
 
 @wp.func
-def along_reference(draw: Draw, ranges: ResetRanges, heading: float, along: wp.vec3) -> BaseDraw:
-    """Return a state of the reference motion, its paws around the start; along: unit vector of its way."""
-    place = between(draw, 5, 0.0, float(REFERENCE_ROWS) - 1.0)
-    row = wp.min(int(place), REFERENCE_ROWS - 2)
-    share = place - float(row)
-    now = (1.0 - share) * ranges.reference[row] + share * ranges.reference[row + 1]
-    d = BaseDraw()
-    d.use_paws = 1
-    d.quat = draw_quat(draw, ranges, heading, now[2])
-    off = wp.vec3(
-        between(draw, 2, -ranges.base_xy, ranges.base_xy), between(draw, 3, -ranges.base_xy, ranges.base_xy), 0.0
-    )
-    d.pos = off + now[0] * along + wp.vec3(0.0, 0.0, now[1])
-    d.lin_vel = now[3] * along + wp.vec3(0.0, 0.0, now[4])
-    d.ang_vel = now[5] * wp.cross(wp.vec3(0.0, 0.0, 1.0), along)
-    return d
-
-
-@wp.func
-def reference_goal(draw: Draw, ranges: ResetRanges, goal: wp.vec3) -> wp.vec3:
-    """Return a goal that the reference motion can reach, relative to start and heading; goal: one of the level."""
-    share = within(draw, 14, ranges.reference_reach)
-    height = wp.where(goal[2] > 0.0, share * ranges.reference_goal[1], 0.0)
-    return wp.vec3(wp.where(goal[2] > 0.0, goal[0], share * ranges.reference_goal[0]), 0.0, height)
-
-
-@wp.func
-def follows_reference(draw: Draw, ranges: ResetRanges, scheme: int) -> int:
-    """Return REFERENCE for a share of those that push off, else the scheme."""
-    drawn = scheme == PUSHING and between(draw, 57, 0.0, 1.0) < ranges.reference_share
-    return wp.where(drawn, int(REFERENCE), scheme)
-
-
-@wp.func
 def draw_airborne(
     draw: Draw,
     ranges: ResetRanges,
@@ -284,8 +242,6 @@ def draw_base(
         along = wp.normalize(to_goal)
     if scheme == IN_FLIGHT or scheme == TOUCHDOWN or scheme == PUSHING:
         return draw_airborne(draw, ranges, scheme, heading, goal, along, g)
-    if scheme == REFERENCE:
-        return along_reference(draw, ranges, heading, along)
     d = BaseDraw()
     d.use_paws = 1
     off = wp.vec3(

@@ -16,14 +16,7 @@ import warp as wp
 from ..scalar import quat, real, vec2, vec3
 from .five_bar import five_bar
 from .geometry import LegGeometry
-from .leg import (
-    ankle_in_housing,
-    knee_angles,
-    knee_rates,
-    leg_forward_kinematics,
-    leg_inverse_velocity,
-    turn_lateral,
-)
+from .leg import ankle_in_housing, knee_angles, leg_forward_kinematics, turn_lateral
 
 wp.set_module_options({"enable_backward": False})
 
@@ -229,39 +222,3 @@ def inverse_kinematics_kernel(
     knees[2 * leg + 1, robot] = pose.knees[1]
     reachable[leg, robot] = pose.reachable
     residual[leg, robot] = pose.residual
-
-
-@wp.kernel
-def inverse_velocity_kernel(
-    # in
-    geometry: wp.array(dtype=LegGeometry),
-    base_quat: wp.array(dtype=quat),
-    base_lin_vel: wp.array(dtype=vec3),
-    base_ang_vel: wp.array(dtype=vec3),
-    motors: wp.array2d(dtype=real),
-    paw_vel: wp.array2d(dtype=vec3),
-    paws_in_world: int,
-    # out
-    motor_rates: wp.array2d(dtype=real),
-    knee_rate: wp.array2d(dtype=real),
-):
-    """Write motor and knee rates [rad/s] for wanted paw velocities [m/s]; one thread per (leg, robot) over (4, n).
-
-    geometry: 4 legs. motors [rad] (12, n). paw_vel (4, n): relative to the body and in its frame, or absolute in the
-    world frame if `paws_in_world` is 1; only then are base_quat (n,) xyzw, base_lin_vel [m/s] (n,) of the body origin
-    and base_ang_vel [rad/s] (n,), both in the world frame, read. motor_rates (12, n), knee_rate (8, n: outer, inner).
-    """
-    leg, robot = wp.tid()
-    geo = geometry[leg]
-    angles = vec3(motors[3 * leg, robot], motors[3 * leg + 1, robot], motors[3 * leg + 2, robot])
-    vel = paw_vel[leg, robot]
-    if paws_in_world == 1:
-        ang = wp.quat_rotate_inv(base_quat[robot], base_ang_vel[robot])
-        ankle = leg_forward_kinematics(geo, angles[0], angles[1], angles[2])
-        vel = wp.quat_rotate_inv(base_quat[robot], vel - base_lin_vel[robot]) - wp.cross(ang, ankle)
-    rates = leg_inverse_velocity(geo, angles, vel)
-    passive = knee_rates(geo, five_bar(geo, angles[1], angles[2]), rates[1], rates[2])
-    for joint in range(3):
-        motor_rates[3 * leg + joint, robot] = rates[joint]
-    knee_rate[2 * leg, robot] = passive[0]
-    knee_rate[2 * leg + 1, robot] = passive[1]

@@ -1,10 +1,7 @@
-"""One leg from motor angles to its paw and back again for velocities, and the constraint of its closed loop.
+"""One leg from motor angles to its paw, and back again for velocities.
 
 Motor angles and rates are ordered lateral, outer, inner. The ankle is the centre of the paw. A leg's housing turns
 about (side, 0, 0) through the hip, so that a positive lateral angle swings the paw outward.
-
-The loop is cut at the ankle for the constraint of the paper's Eq. 1 to 3. With joint angles that `five_bar` or the
-inverse kinematics returns, that constraint is met in closed form, up to rounding.
 """
 
 import warp as wp
@@ -12,9 +9,6 @@ import warp as wp
 from ..scalar import mat33, real, vec2, vec3
 from .five_bar import FiveBar, five_bar
 from .geometry import LegGeometry
-
-mat24 = wp.types.matrix(shape=(2, 4), dtype=real)
-vec5 = wp.types.vector(length=5, dtype=real)
 
 
 @wp.func
@@ -89,65 +83,3 @@ def knee_angles(geo: LegGeometry, loop: FiveBar, outer: real, inner: real) -> ve
     outer_shank = wp.atan2(-loop.outer_shank[0], -loop.outer_shank[1])
     inner_shank = wp.atan2(-loop.inner_shank[0], -loop.inner_shank[1])
     return vec2(outer + geo.front * outer_shank, inner - geo.front * inner_shank)
-
-
-@wp.func
-def knee_rates(geo: LegGeometry, loop: FiveBar, outer_rate: real, inner_rate: real) -> vec2:
-    """Return the passive outer and inner knee rate [rad/s] that keep the loop closed."""
-    outer_shank_rate = loop.outer_shank_do * outer_rate + loop.outer_shank_di * inner_rate
-    inner_shank_rate = loop.inner_shank_do * outer_rate + loop.inner_shank_di * inner_rate
-    return vec2(outer_rate + geo.front * outer_shank_rate, inner_rate - geo.front * inner_shank_rate)
-
-
-@wp.func
-def shank_end(geo: LegGeometry, axis_x: real, turn: real, motor: real, knee: real) -> vec2:
-    """Return the far end (x, z) [m] of an open thigh-shank chain in the housing frame.
-
-    axis_x [m]: transversal axis; turn: +1 or -1, sense of a positive motor angle [rad] in x; knee [rad].
-    """
-    reach_x = geo.thigh * wp.sin(motor) + geo.shank * wp.sin(motor - knee)
-    return vec2(axis_x + turn * reach_x, -geo.thigh * wp.cos(motor) - geo.shank * wp.cos(motor - knee))
-
-
-@wp.func
-def closure_residual(geo: LegGeometry, motors: vec3, knees: vec2) -> vec2:
-    """Return the gap of the cut loop, inner minus outer ankle (x, z) [m], in the housing frame (the paper's Eq. 1).
-
-    motors: lateral, outer, inner [rad]; knees: outer, inner [rad]. Along housing y there is never a gap.
-    """
-    inner_ankle = shank_end(geo, geo.inner_x, -geo.front, motors[2], knees[1])
-    outer_ankle = shank_end(geo, geo.outer_x, geo.front, motors[1], knees[0])
-    return inner_ankle - outer_ankle
-
-
-@wp.func
-def closure_jacobian(geo: LegGeometry, motors: vec3, knees: vec2) -> mat24:
-    """Return d gap / d (outer, outer knee, inner, inner knee) [m/rad] (the paper's Eq. 2).
-
-    The columns of the base and of the lateral motor are zero: the gap is seen from the housing.
-    """
-    f = geo.front
-    outer_dir = motors[1] - knees[0]
-    inner_dir = motors[2] - knees[1]
-    outer_x = geo.shank * wp.cos(outer_dir)
-    outer_z = geo.shank * wp.sin(outer_dir)
-    inner_x = geo.shank * wp.cos(inner_dir)
-    inner_z = geo.shank * wp.sin(inner_dir)
-    return mat24(
-        -f * (geo.thigh * wp.cos(motors[1]) + outer_x), f * outer_x,
-        -f * (geo.thigh * wp.cos(motors[2]) + inner_x), f * inner_x,
-        -(geo.thigh * wp.sin(motors[1]) + outer_z), outer_z,
-        geo.thigh * wp.sin(motors[2]) + inner_z, -inner_z,
-    )  # fmt: skip
-
-
-@wp.func
-def kinematic_constraint(geo: LegGeometry, motors: vec3, knees: vec2, paw_target: vec3) -> vec5:
-    """Return loop gap (2, housing frame) and paw minus target (3, body frame), all [m] (the paper's Eq. 3).
-
-    The paw hangs on the inner chain, as in the robot's model. paw_target [m]: body frame.
-    """
-    gap = closure_residual(geo, motors, knees)
-    paw = shank_end(geo, geo.inner_x, -geo.front, motors[2], knees[1])
-    miss = geo.hip + turn_lateral(geo, motors[0], vec3(paw[0], geo.plane_y + geo.knee_y, paw[1])) - paw_target
-    return vec5(gap[0], gap[1], miss[0], miss[1], miss[2])

@@ -20,7 +20,8 @@ from jumper_warp.evaluation.commands import PlayCfg, viewer_command
 from jumper_warp.evaluation.heights import HeightFlags, HeightGoals
 from jumper_warp.evaluation.places import PlaceFlags, PlaceGoals
 from jumper_warp.policies.folder import load_policy, save_policy
-from jumper_warp.policies.restore import open_policy, restored_task
+from jumper_warp.policies.restore import restored_task
+from jumper_warp.policies.runs import open_policy
 from jumper_warp.policies.spec import PolicyError
 from jumper_warp.registry import TASKS, WALKING, make_task
 from jumper_warp.rl.cfg import PpoCfg
@@ -526,7 +527,7 @@ def test_run_keeps_no_figures(trained_run, capsys):
 
 
 def test_policy_of_another_observation_is_not_played(trained_run, tmp_path):
-    from jumper_warp.policies.restore import Conditions, env_of_policy
+    from jumper_warp.policies.conditions import Conditions, env_of_policy
 
     policy = open_policy(trained_run)
     names = ("other", *policy.interface.observation_names[1:])

@@ -8,10 +8,8 @@ import pytest
 
 from jumper_warp.cli import evaluate, play
 from jumper_warp.evaluation.commands import csv_text
-from jumper_warp.evaluation.heights import HeightFlags
-from jumper_warp.evaluation.jumps import Jumps
-from jumper_warp.evaluation.landings import ENDS
-from jumper_warp.evaluation.places import PlaceFlags
+from jumper_warp.evaluation.heights import HeightFlags, HeightLog
+from jumper_warp.evaluation.places import ENDS, PlaceFlags
 from jumper_warp.evaluation.registry import EVALUATIONS, evaluation_of
 from jumper_warp.policies.folder import save_policy
 from jumper_warp.policies.spec import PolicyError
@@ -49,11 +47,11 @@ def test_task_with_an_unknown_evaluation_is_refused():
 def test_places_are_spread_ahead_and_drawn_aside_and_headings_too():
     flags = PlaceFlags(jumps=5, y=(-0.2, 0.1))
     log = flags.log(TASK, seed=3)
-    assert log.goals[:, 0, 0] == pytest.approx([0.3, 0.6, 0.9, 1.2, 1.5])
-    aside = log.goals[:, 0, 1]
+    assert log.places[:, 0, 0] == pytest.approx([0.3, 0.6, 0.9, 1.2, 1.5])
+    aside = log.places[:, 0, 1]
     assert -0.2 <= aside.min() < aside.max() <= 0.1
     assert len(set(log.headings)) == 5 and np.abs(log.headings).max() <= math.pi
-    assert np.array_equal(flags.log(TASK, seed=3).goals, log.goals)
+    assert np.array_equal(flags.log(TASK, seed=3).places, log.places)
     assert not np.array_equal(flags.log(TASK, seed=4).headings, log.headings)
 
 
@@ -73,6 +71,15 @@ def test_one_heading_is_that_of_all_in_radians():
 def test_flags_of_another_task_are_refused(policies, task, args, flag):
     with pytest.raises(InputError, match=f"{flag} is not for policies of {task}; jumper evaluate .* --help shows"):
         evaluate.run([str(policies / task), *args], [])
+
+
+@pytest.mark.parametrize(
+    ("task", "suite", "there"),
+    [("vertical-jump", ["grid"], "sweep"), ("horizontal-jump", [], "sweep, grid, ring, consecutive, platform, max")],
+)
+def test_suite_of_another_task_is_refused(policies, task, suite, there):
+    with pytest.raises(InputError, match=f"no suite '.*' for policies of {task}; there are {there}$"):
+        evaluate.run([str(policies / task), "--suite", *suite], [])
 
 
 @pytest.mark.parametrize("command", [evaluate, play])
@@ -110,7 +117,7 @@ def test_range_of_places_counts_distances():
     goals = [[0.3, 0.0], [0.0, -0.3], [0.6, 0.6]]
     flags = PlaceFlags(3, (0.0, 0.0), (0.0, 0.0), 0.0, in_range=(0.3, 0.5))
     landings = flags.log(TASK, 0)
-    landings.goals[:, 0] = goals
+    landings.places[:, 0] = goals
     landings.place[:, 0], landings.target[:, 0] = goals, goals
     landings.heading[:], landings.yaw[:], landings.tilt[:] = 0.0, 0.0, 0.0
     landings.end[:, 0] = [*[ENDS.index("success")] * 2, ENDS.index("low_base")]
@@ -120,12 +127,12 @@ def test_range_of_places_counts_distances():
 
 
 def test_heights_are_spread_evenly():
-    assert HeightFlags(3, 0.6, 1.0).log(TASK, 0).target == pytest.approx([0.6, 0.8, 1.0])
+    assert HeightFlags(3, 0.6, 1.0).log(TASK, 0).commanded[:, 0] == pytest.approx([0.6, 0.8, 1.0])
 
 
 def test_csv_has_a_line_a_jump_and_nothing_where_there_is_no_number():
-    jumps = Jumps(np.array([0.5, 0.8]), ("success", "came_apart", "low_base"))
-    jumps.end[:], jumps.apex[:] = [0, 1], [0.52, np.nan]
+    jumps = HeightLog(np.array([0.5, 0.8]), ("success", "came_apart", "low_base"))
+    jumps.end[:, 0], jumps.apex[:, 0], jumps.heading[:] = [0, 1], [0.52, np.nan], 0.0
     assert csv_text(jumps).splitlines() == [
         "target_m,apex_m,error_m,end",
         "0.500000,0.520000,0.020000,success",

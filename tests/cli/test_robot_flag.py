@@ -10,7 +10,8 @@ import tyro
 from jumper_warp.cli.main import main
 from jumper_warp.cli.train import TrainArgs, env_maker, for_robot, overlay_in
 from jumper_warp.evaluation.run import EvaluationArgs, conditions_of, torque_limit
-from jumper_warp.policies.restore import env_of_policy, open_policy
+from jumper_warp.policies.conditions import env_of_policy
+from jumper_warp.policies.runs import open_policy
 from jumper_warp.registry import make_task
 from jumper_warp.robot.overlay import RobotOverlay
 

@@ -7,7 +7,7 @@ import torch
 
 from jumper_warp.cli import main as cli
 from jumper_warp.cli.train import command_line
-from jumper_warp.policies.restore import open_policy
+from jumper_warp.policies.runs import open_policy
 from jumper_warp.rl.checkpoint import load_checkpoint
 
 TRAIN = ["train", "horizontal-jump-mars", "--num-envs", "4", "--iterations", "1", "--device", "cpu", "--no-tensorboard"]

@@ -10,12 +10,13 @@ import numpy as np
 import pytest
 
 from jumper_warp.cli.main import main
-from jumper_warp.identification.actuators import COLUMNS, described_constants, synthetic_bench
+from jumper_warp.identification.actuators import COLUMNS, described_constants
 from jumper_warp.identification.identify import total_mass
 from jumper_warp.identification.motions import load_motion
 from jumper_warp.robot.description import MOTOR_JOINTS
 from jumper_warp.robot.overlay import RobotOverlay, load_overlay
 from jumper_warp.robot.values import RobotValues
+from synthetic_bench import synthetic_bench
 
 PARAMS = ["--params", "latency,offsets"]
 
@@ -92,10 +93,12 @@ def test_a_hung_robot_that_is_taken_as_free_is_told_of_its_base(recorded, capsys
 
 def test_angles_of_the_other_sign_are_refused_without_warnings(recorded, capsys):
     write_table(recorded / "flipped.csv", load_motion(recorded / "motions" / "2_standing_chirp.npz"), -1.0)
-    with warnings.catch_warnings(), pytest.raises(SystemExit):
+    with warnings.catch_warnings(), pytest.raises(SystemExit) as end:
         warnings.simplefilter("error")
         main(["sysid", str(recorded / "flipped.csv"), *PARAMS])
-    assert "check targets, units, signs and base" in capsys.readouterr().err
+    assert end.value.code == 2
+    error = capsys.readouterr().err.splitlines()[-1]
+    assert "flipped: angles of FL_outer, FL_inner, FR_outer" in error and "negate angle" in error
 
 
 def test_evolution_is_the_other_method(recorded):
@@ -122,7 +125,7 @@ def test_a_motor_is_characterised_from_a_bench(tmp_path):
         (["nowhere.npz"], "nowhere.npz"),
         (["."], "no npz, csv or parquet file"),
         (["x.npz", "--params", "gears"], "unknown group of parameters 'gears'"),
-        (["x.npz", "--without", "kq"], "no parameter 'kq' to leave out"),
+        (["x.npz", "--without", "kd,kq"], "no parameter 'kq' to leave out"),
         (["x.npz", "--mass", "14500"], "must be in 7.25 to 29 kg (the robot is described with 14.5 kg), got 14500 kg"),
         (["x.npz", "--noise.angle", "0"], "noise angle must be positive"),
     ],

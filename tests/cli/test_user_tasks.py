@@ -7,7 +7,6 @@ import shutil
 import sys
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from jumper_warp.cli import main as cli
@@ -15,11 +14,11 @@ from jumper_warp.cli.main import split_task_modules
 from jumper_warp.cli.train import check_saving, command_line
 from jumper_warp.kernels.jump import rewards
 from jumper_warp.policies.folder import load_policy
-from jumper_warp.policies.restore import open_policy, restored_task
+from jumper_warp.policies.restore import restored_task
+from jumper_warp.policies.runs import open_policy
 from jumper_warp.policies.spec import PolicyError
 from jumper_warp.registry import TASKS, load_task_module, make_task
 from jumper_warp.rl.checkpoint import save_checkpoint
-from jumper_warp.tasks.observations import with_history
 from jumper_warp.tasks.saving import TaskError
 
 TASK = '''\
@@ -264,50 +263,16 @@ def test_all_of_the_projects_tasks_can_be_trained():
         check_saving(make_task("vertical-jump").with_terms("rewards", rest={"name": "a:b"}))
 
 
-# ---------------------------------------------------------------------- runs of version 1
-
-
-VERSION_1 = Path(__file__).parents[1] / "policies" / "version_1"
-
-
-@pytest.fixture
-def old_run(tmp_path):
-    """A run of vertical jumps whose checkpoint is of version 1, with some weights of its sizes."""
-    policy = load_policy(VERSION_1 / "omnidirectional_jump")
-    saved = json.loads((VERSION_1 / "vertical_jump.json").read_text())
-    tensors, model = policy.tensors(), {}
-    layers = len(policy.interface.sizes) - 1
-    for i in range(layers):
-        for part in ("weight", "bias"):
-            model[f"actor.{2 * i}.{part}"] = tensors[f"actor.{i}.{part}"]
-    model |= {"obs_moments.mean": tensors["normaliser.mean"].double(),
-              "obs_moments.var": tensors["normaliser.std"].double().square() - 1.0e-5}  # fmt: skip
-    config = {key: saved[key] for key in ("train", "env", "versions")}
-    config["commit"] = {"hash": saved["commit"], "dirty": False}
-    state = {"iteration": 7, "ppo": {"model": model}, "env": {}, "rng": {}, "others": [], "config": json.dumps(config)}
-    save_checkpoint(tmp_path / "logs" / "vertical-jump" / "run" / "checkpoints", state)
-    return tmp_path / "logs" / "vertical-jump" / "run"
-
-
-@pytest.mark.parametrize("resume", ["latest", "run", "checkpoints", "file"])
-def test_run_of_version_1_is_not_resumed(capsys, old_run, resume):
-    sources = {"latest": "latest", "run": str(old_run), "checkpoints": str(old_run / "checkpoints"),
-               "file": str(old_run / "checkpoints" / "iteration_000007.pt")}  # fmt: skip
-    args = ["--device", "cpu", "--num-envs", "4", "--log-root", str(old_run.parents[1]), "--resume", sources[resume]]
-    code, out, err = run(capsys, "train", "vertical-jump", *args)
+@pytest.mark.parametrize("task", [{"version": 2, "name": "vertical-jump"}, {"name": "vertical-jump", "terms": []}])
+@pytest.mark.parametrize("command", ["train", "export", "play"])
+def test_run_of_an_older_version_is_refused_with_the_commit_that_reads_it(capsys, tmp_path, task, command):
+    config = {"train": {"task": "vertical-jump", "ppo": {}}, "env": {"task": task}}
+    state = {"iteration": 7, "ppo": {}, "env": {}, "rng": {}, "others": [], "config": json.dumps(config)}
+    save_checkpoint(tmp_path / "run" / "checkpoints", state)
+    source = ["vertical-jump", "--resume"] if command == "train" else []
+    code, out, err = run(capsys, command, *source, str(tmp_path / "run"))
     assert (code, out) == (2, "") and len(err) == 1
-    assert "of a run of version 1, which can be exported and played but not resumed" in err[0]
-
-
-def test_run_of_version_1_is_exported_and_played(capsys, old_run, tmp_path):
-    code, _, err = run(capsys, "export", str(old_run), "--out", str(tmp_path / "policy"))
-    assert (code, err) == (0, [])
-    policy, original = load_policy(tmp_path / "policy"), load_policy(VERSION_1 / "omnidirectional_jump")
-    assert policy.interface.sizes == original.interface.sizes and policy.interface.task == "vertical-jump"
-    assert policy.interface.observation_names == with_history(make_task("vertical-jump"), 1).observation_names
-    assert np.array_equal(policy.tensors()["actor.0.weight"], original.tensors()["actor.0.weight"])
-    code, _, err = run(capsys, *play(old_run, "--out", str(tmp_path / "played")))
-    assert code == 0, err
+    assert f"the task has version {task.get('version')}, this is version 3; commit c88f715 reads older ones" in err[0]
 
 
 @pytest.mark.parametrize(

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from jumper_warp.deploy.policy import DeployedPolicy, JumpCommand
+from jumper_warp.policies.conditions import Conditions, env_of_policy
 from jumper_warp.policies.folder import find_policy, load_policy
-from jumper_warp.policies.restore import Conditions, env_of_policy
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 PAGE = Path(__file__).parents[2] / "docs" / "deployment.md"
@@ -176,7 +176,8 @@ def test_a_command_given_before_it_landed_ends_with_the_landing():
     assert [command.update(*step) for step in steps] == [1.0, 1.0, 1.0, 1.0, 1.0, 0.0, 0.0]
 
 
-def test_it_needs_neither_pytorch_nor_warp():
-    code = "import sys, jumper_warp.deploy.policy\nprint([m for m in ('torch', 'warp', 'newton') if m in sys.modules])"
+@pytest.mark.parametrize("module", ["deploy.policy", "policies.spec"])
+def test_it_needs_neither_pytorch_nor_warp(module):
+    code = f"import sys, jumper_warp.{module}\nprint([m for m in ('torch', 'warp', 'newton') if m in sys.modules])"
     answer = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert answer.stdout.strip() == "[]"

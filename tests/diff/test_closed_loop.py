@@ -10,7 +10,7 @@ import torch
 from jumper_warp.diff.closed_loop import ClosedLoop, heading_of
 from jumper_warp.envs.env import Env
 from jumper_warp.evaluation.finetuning import FinetuneCfg, make_groups
-from jumper_warp.policies.restore import open_policy
+from jumper_warp.policies.runs import open_policy
 from jumper_warp.registry import make_task
 from jumper_warp.trajectory.gauss_newton import Network, Tape, world_rows
 from jumper_warp.utils.errors import InputError

@@ -7,13 +7,12 @@ import pytest
 import torch
 import warp as wp
 
-from jumper_warp.diff.jacobians import step_jacobians
 from jumper_warp.diff.rollout import Rollout, compact
 from jumper_warp.diff.torch_rollout import simulate
 from jumper_warp.robot.model import build_model
 from jumper_warp.robot.motors import jumping_motors, vertical_jump_filter
 from jumper_warp.sim.simulation import Simulation
-from tests.helpers.rollout_helpers import DT, SUBSTEPS, TICKS, defaults, push_off, rollout, run, squat
+from tests.helpers.rollout_helpers import DT, SUBSTEPS, defaults, push_off, rollout, run, squat
 
 
 def test_a_rollout_is_what_the_simulation_does_bit_for_bit():
@@ -189,25 +188,6 @@ def test_what_a_reverse_pass_needs_cannot_be_lost_silently():
         gradient.square().sum().backward()
 
 
-def test_jacobians_of_steps_chain_to_the_whole_gradient():
-    of, steps = rollout(), rollout(TICKS)
-    values = defaults()
-    trajectory = run(of, values)
-    run(steps, values | {"wrench": np.zeros((TICKS, 6))})  # the same parameters
-    found = step_jacobians(steps, trajectory, by=("q", "qd", "targets", "kp"))
-    seed = np.zeros(trajectory.q.shape)
-    seed[-1, 2] = 1.0
-    expected = of.backward(trajectory, q=of.array(seed))
-    adjoint, by_kp = np.eye(37)[2], np.zeros(12)
-    for step in reversed(range(TICKS)):
-        by_target = adjoint @ found["targets"][step, :, 0]
-        np.testing.assert_allclose(by_target, expected["targets"].numpy()[step, :, 0], rtol=0.0, atol=1.0e-12)
-        by_kp += adjoint @ found["kp"][step]
-        adjoint = adjoint @ np.concatenate([found["q"][step], found["qd"][step]], axis=-1)
-    np.testing.assert_allclose(by_kp, expected["kp"].numpy()[:, 0], rtol=0.0, atol=1.0e-12)
-    np.testing.assert_allclose(adjoint[:19], expected["q"].numpy()[:, 0], rtol=0.0, atol=1.0e-12)
-
-
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
@@ -340,19 +320,6 @@ def test_backward_refuses_a_trajectory_of_another_rollout():
         rollout().backward(trajectory, q=wp.zeros(trajectory.q.shape, dtype=wp.float32, device="cpu"))
     with pytest.raises(ValueError, match="got ndarray"):
         rollout().backward(trajectory, q=np.zeros(trajectory.q.shape))
-
-
-def test_jacobians_need_a_world_for_each_step():
-    trajectory, steps = rollout().run(push_off(2), *squat()), rollout.__wrapped__(2)
-    with pytest.raises(ValueError, match="2 policy steps need as many worlds"):
-        step_jacobians(rollout(), trajectory)
-    with pytest.raises(ValueError, match="world must be below 1, got 5"):
-        step_jacobians(steps, trajectory, world=5)
-    with pytest.raises(ValueError, match="no input 'kpp'"):
-        step_jacobians(steps, trajectory, by=("q", "kpp"))
-    steps.parameters["latency"].fill_(DT * SUBSTEPS)
-    with pytest.raises(ValueError, match="latency below a policy step"):
-        step_jacobians(steps, trajectory)
 
 
 @pytest.fixture

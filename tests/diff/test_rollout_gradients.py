@@ -28,12 +28,8 @@ from jumper_warp.kernels.layout import (
     STOP_KD,
     STOP_KE,
 )
-from jumper_warp.robot.model import build_model
-from jumper_warp.robot.motors import jumping_motors, vertical_jump_filter
-from jumper_warp.sim.simulation import motor_values
 from tests.helpers.rollout_helpers import (
     DT,
-    SUBSTEPS,
     defaults,
     differences,
     gradients,
@@ -44,7 +40,6 @@ from tests.helpers.rollout_helpers import (
     weighed,
     weights,
 )
-from tests.oracles.tape_rollout import tape_gradients
 
 LEG = int(LEG_ROWS)
 MU_ROWS = [leg * LEG + int(row) for leg in range(4) for row in (MU_DYNAMIC, MU_STATIC)]
@@ -165,27 +160,6 @@ def test_gradients_of_a_hung_robot_match_differences():
             of.hold(False)
     assert (held.q.numpy()[:, :7] == held.q.numpy()[0, :7]).all() and np.ptp(held.q.numpy()[:, 8]) > 0.5
     np.testing.assert_allclose(found["kp"][[1, 8]], expected, rtol=1.0e-6)
-
-
-def test_gradients_are_those_of_warps_tape():
-    """Without latency, wrench and fading, which the tape's kernels do not know."""
-    q, qd = squat()
-    values = defaults() | {"latency": np.array(0.0)}
-    by = {"q": np.zeros((len(push_off()) + 1, 19, 1))}
-    by["q"][-1, :, 0] = np.random.default_rng(1).normal(size=19)
-    _, found = gradients(rollout(), values, by)
-    slots = [*range(7), *(7 + 5 * leg + j for leg in range(4) for j in (0, 1, 3))]
-    dofs = [*range(6), *(6 + 5 * leg + j for leg in range(4) for j in (0, 1, 3))]
-    joint_q, joint_qd, last = np.zeros(43), np.zeros(38), np.zeros(43)
-    joint_q[slots], joint_qd[dofs], last[slots] = q, qd, by["q"][-1, :, 0]
-    model = build_model(1, visuals=False, requires_grad=True)
-    expected, end = tape_gradients(
-        model, jumping_motors(), vertical_jump_filter(), DT, SUBSTEPS, push_off(), joint_q, joint_qd, last
-    )
-    assert motor_values(end[7:]) == pytest.approx(run(rollout(), values).q.numpy()[-1, 7:, 0], abs=1.0e-11)
-    expected["q"], expected["qd"] = expected["q"][slots], expected["qd"][dofs]
-    for name, gradient in expected.items():
-        np.testing.assert_allclose(found[name], gradient, rtol=0.0, atol=1.0e-9 * np.abs(gradient).max(), err_msg=name)
 
 
 def test_gradients_by_bodies_match_differences_of_their_moments():

@@ -11,7 +11,7 @@ from jump_starts import Starts
 from jumper_warp.cli.train import parse_train
 from jumper_warp.envs.env import Env
 from jumper_warp.evaluation.run import EvaluationArgs, conditions_of
-from jumper_warp.policies.restore import Conditions
+from jumper_warp.policies.conditions import Conditions
 from jumper_warp.registry import make_task
 from jumper_warp.robot.gravity import MARS
 from jumper_warp.sim.simulation import Simulation

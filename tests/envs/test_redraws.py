@@ -8,7 +8,7 @@ import torch
 import warp as wp
 
 from jump_helpers import DEG, edit_coordinates, edit_episodes, make_env, only, random_actions, resetting
-from jumper_warp.evaluation.paws import paw_arrays
+from jumper_warp.evaluation.jumps import paw_arrays
 from jumper_warp.kernels.jump.state import LANDED
 from jumper_warp.kernels.mdp.observations import drawn_push
 from jumper_warp.sim.simulation import Simulation

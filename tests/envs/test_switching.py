@@ -11,7 +11,8 @@ import warp as wp
 from jumper_warp.envs.env import Env
 from jumper_warp.evaluation.courses import SQUAT, Course
 from jumper_warp.evaluation.scripts import parse_script
-from jumper_warp.policies.restore import Conditions, restored_skills
+from jumper_warp.policies.conditions import Conditions
+from jumper_warp.policies.restore import restored_skills
 from jumper_warp.policies.skills import JUMP_TO, JUMP_UP, WALK, SkillNames, SkillPolicies
 from jumper_warp.policies.spec import PolicyError
 

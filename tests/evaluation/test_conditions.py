@@ -6,14 +6,12 @@ import numpy as np
 import pytest
 import torch
 
-from experiments.vertical_jump_sweep import for_sweep
 from jump_helpers import edit_coordinates, edit_episodes, ending_names, make_env
-from jumper_warp.evaluation import heights, landings
-from jumper_warp.evaluation.latency import latency_metrics, latency_text
-from jumper_warp.evaluation.run import EvaluationArgs, EvaluationRun
+from jumper_warp.evaluation import heights, places
+from jumper_warp.evaluation.run import EvaluationArgs, EvaluationRun, latency_metrics, latency_text
 from jumper_warp.kernels.jump.state import LANDED
+from jumper_warp.policies.conditions import Conditions
 from jumper_warp.policies.folder import save_policy
-from jumper_warp.policies.restore import Conditions
 from jumper_warp.registry import make_task
 from jumper_warp.tasks.randomization import PUSH_INTERVAL, PUSH_SHARE, RandomizationCfg
 from landing_helpers import still_policy
@@ -33,10 +31,10 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 @pytest.mark.parametrize(
     ("name", "change"),
     [
-        ("horizontal-jump", landings.for_evaluation),
-        ("horizontal-jump", landings.ended_by_takeoff),
+        ("horizontal-jump", places.for_evaluation),
+        ("horizontal-jump", places.ended_by_takeoff),
         ("vertical-jump", heights.for_evaluation),
-        ("vertical-jump", for_sweep),
+        ("vertical-jump", heights.for_sweep),
     ],
 )
 def test_fall_two_seconds_after_a_landing_is_not_hidden_by_its_success(name, change):
@@ -50,7 +48,7 @@ def test_fall_two_seconds_after_a_landing_is_not_hidden_by_its_success(name, cha
 
 def test_second_takeoff_ends_the_jump_where_that_is_asked_for():
     names = {}
-    for change in (landings.for_evaluation, landings.ended_by_takeoff):
+    for change in (places.for_evaluation, places.ended_by_takeoff):
         env = make_env(2, task=change(JUMP), auto_reset=False)
         env.evaluation_reset(np.zeros((2, 4)))
         edit_episodes(env, phase=LANDED, phase_steps=5)
@@ -77,7 +75,7 @@ def test_pushes_of_a_test_come_and_go_however_they_were_trained_with():
 def test_pushes_of_a_test_act_in_flight_where_that_is_asked_for(in_flight):
     conditions = Conditions(randomize=True, push_in_flight=in_flight)
     task = conditions.applied(dataclasses.replace(HELD, randomization=RandomizationCfg(push_share=1.0)))
-    env = make_env(2, task=landings.for_evaluation(task), randomize=True, auto_reset=False)
+    env = make_env(2, task=places.for_evaluation(task), randomize=True, auto_reset=False)
     env.evaluation_reset(np.zeros((2, 4)))
     edit_coordinates(env, 1, q={2: 1.0})
     for _ in range(2):  # in the first, the paws of all were last seen in the air
@@ -104,7 +102,7 @@ def test_nominal_conditions_leave_the_task_alone_but_for_margins():
 
 def test_fixed_parameters_are_all_that_changes_of_a_nominal_robot():
     conditions = Conditions(latency=8.0, gains=(0.6, 1.0), friction=0.4)
-    task = landings.for_evaluation(JUMP)
+    task = places.for_evaluation(JUMP)
     nominal = make_env(2, task=task, auto_reset=False)
     env = make_env(2, task=conditions.applied(task), randomize=conditions.draws, auto_reset=False)
     assert env.parameters.latency.numpy().tolist() == [4, 4]  # 3.84
@@ -119,7 +117,7 @@ def test_fixed_parameters_are_all_that_changes_of_a_nominal_robot():
 
 
 def test_a_fixed_parameter_that_is_nominal_changes_no_bit():
-    conditions, task = Conditions(latency=0.0), landings.for_evaluation(JUMP)
+    conditions, task = Conditions(latency=0.0), places.for_evaluation(JUMP)
     pair = [make_env(2, task=task), make_env(2, task=conditions.applied(task), randomize=conditions.draws)]
     for env in pair:
         env.auto_reset = False
@@ -171,7 +169,7 @@ def test_run_tells_the_latency_it_simulated_over_several_policy_steps(tmp_path):
     args = EvaluationArgs(str(tmp_path / "still"), latency=40.0, record=0, out=tmp_path, device="cpu")
     run = EvaluationRun.of("test", args)
     env = run.env(2)
-    asked = landings.Landings(np.array([[[0.5, 0.0]]] * 2), tuple(term.name for term in env.task.terminations))
+    asked = places.PlaceLog(np.array([[[0.5, 0.0]]] * 2), tuple(term.name for term in env.task.terminations))
     run.follow(env, asked)
     values = run.report({}, {})
     assert (values["latency_asked_ms"], values["latency"]) == (40.0, "39.6 ms (19 physics steps)")

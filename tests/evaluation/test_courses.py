@@ -5,8 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from jumper_warp.evaluation.course_metrics import active_spans, course_metrics
-from jumper_warp.evaluation.courses import PATIENCE, SLEW, Course
+from jumper_warp.evaluation.courses import PATIENCE, SLEW, Course, active_spans, course_metrics
 from jumper_warp.evaluation.scripts import ScriptStep
 from jumper_warp.policies.skills import JUMP_TO, JUMP_UP, WALK
 from jumper_warp.utils.errors import InputError

@@ -3,25 +3,25 @@ import math
 import numpy as np
 import pytest
 
-from jumper_warp.evaluation.heights import jump_metrics
-from jumper_warp.evaluation.jumps import Jumps, view_of
+from jumper_warp.evaluation.heights import HeightLog, jump_metrics, view_of
 from jumper_warp.viz.snapshot import FIELD_OF_VIEW
 
 
 def step_of(jumps, **changes):
-    count = len(jumps.target)
+    count = len(jumps.goals)
     arrays = {
         "phase": np.zeros(count, dtype=int), "phase_steps": np.zeros(count, dtype=int), "ending": np.full(count, -1),
         "max_height": np.zeros(count), "peak_tilt": np.zeros(count), "base_vel": np.zeros((count, 3)),
         "steps": np.full(count, 40), "command_step": np.full(count, 30), "base_pos": np.zeros((count, 3)),
         "base_quat": np.tile([0.0, 0.0, 0.0, 1.0], (count, 1)), "start": np.zeros((count, 3)),
-        "heading": np.zeros(count), "up": np.zeros(count), "paws_down": np.ones((count, 4), dtype=bool),
+        "heading": np.zeros(count), "goal": np.zeros((count, 3)), "touched_down": np.zeros(count, dtype=int),
+        "up": np.zeros(count), "paws_down": np.ones((count, 4), dtype=bool),
     }  # fmt: skip
     return arrays | {name: np.array(value) for name, value in changes.items()}
 
 
 def test_metrics_by_hand():
-    jumps = Jumps(np.array([0.5, 0.8, 1.1, 1.2]), ("success", "came_apart", "collided"))
+    jumps = HeightLog(np.array([0.5, 0.8, 1.1, 1.2]), ("success", "came_apart", "collided"))
     landed = {"phase": [2, 0, 2, 0], "phase_steps": [60, 0, 60, 0]}
     heights = {"max_height": [0.52, 1.0e13, 1.06, 0.4], "peak_tilt": [0.1, 3.0, 0.2, 0.0]}
     half = [math.radians(0.5 * angle) for angle in (10.0, 90.0, -26.0, 0.0)]
@@ -62,7 +62,7 @@ def test_metrics_by_hand():
 
 
 def test_jump_that_never_ends_is_a_failure():
-    jumps = Jumps(np.array([0.5]), ("success",))
+    jumps = HeightLog(np.array([0.5]), ("success",))
     assert not jumps.update(step_of(jumps), 1.0 / 60.0)
     metrics = jump_metrics(jumps, (0.5, 1.1))
     assert metrics["success_rate"] == 0.0 and metrics["failed_by_no_end"] == 1
@@ -70,7 +70,7 @@ def test_jump_that_never_ends_is_a_failure():
 
 
 def test_columns_have_a_row_a_jump_and_none_where_there_is_no_number():
-    jumps = Jumps(np.array([0.5, 0.8]), ("success", "came_apart"))
+    jumps = HeightLog(np.array([0.5, 0.8]), ("success", "came_apart"))
     landed = {"phase": [2, 0], "phase_steps": [60, 0]}
     jumps.update(step_of(jumps, ending=[0, 1], max_height=[0.52, np.nan], **landed), 1.0 / 60.0)
     assert jumps.columns() == {
@@ -80,35 +80,14 @@ def test_columns_have_a_row_a_jump_and_none_where_there_is_no_number():
 
 
 def test_jump_is_early_if_it_has_begun_when_the_command_comes():
-    jumps = Jumps(np.array([0.5, 0.8, 1.0]), ("success", "came_apart"))
+    jumps = HeightLog(np.array([0.5, 0.8, 1.0]), ("success", "came_apart"))
     for step, phase in ((29, [0, 1, 0]), (30, [0, 1, 0]), (31, [1, 2, 0])):
         jumps.update(step_of(jumps, steps=[step] * 3, phase=phase), 1.0 / 60.0)
-    assert jumps.early.tolist() == [False, True, False]
-
-
-@pytest.mark.parametrize(("lifted", "still"), [(2, True), (3, False)])
-def test_landing_is_still_if_no_paw_is_lifted_again_for_long(lifted, still):
-    jumps = Jumps(np.array([0.5]), ("collided", "success"))
-    down, up = np.ones((1, 4), dtype=bool), np.array([[True, True, False, True]])
-    for paws, steps in ((down, 2), (up, lifted), (down, 2)):
-        for _ in range(steps):
-            jumps.update(step_of(jumps, phase=[2], phase_steps=[5], paws_down=paws), 1.0 / 60.0)
-    assert jumps.update(step_of(jumps, phase=[2], phase_steps=[60]), 1.0 / 60.0)
-    assert jump_metrics(jumps, (0.5, 1.1))["still_landing_rate"] == float(still)
-
-
-def test_second_takeoff_is_counted():
-    jumps = Jumps(np.array([0.5, 0.6]), ("success",))
-    for up in (0.3, 0.3, 0.0):
-        paws = np.zeros((2, 4), dtype=bool)
-        jumps.update(step_of(jumps, phase=[2, 2], up=[up, 0.2], paws_down=paws), 1.0 / 60.0)
-    assert jumps.update(step_of(jumps, phase=[2, 2], phase_steps=[60, 60]), 1.0 / 60.0)
-    assert jumps.takeoffs.tolist() == [1, 0]
-    assert jump_metrics(jumps, (0.5, 1.1))["second_takeoff_rate"] == 0.5
+    assert jumps.early[:, 0].tolist() == [False, True, False]
 
 
 def test_a_jump_to_another_height_is_a_miss_and_no_fall():
-    jumps = Jumps(np.array([0.5, 0.6, 0.7]), ("wrong_height", "collided", "success"))
+    jumps = HeightLog(np.array([0.5, 0.6, 0.7]), ("wrong_height", "collided", "success"))
     jumps.update(step_of(jumps, ending=[0, 1, -1], phase=[2, 2, 2], phase_steps=[0, 3, 60]), 1.0 / 60.0)
     metrics = jump_metrics(jumps, (0.5, 1.1))
     assert [metrics[name] for name in ("success_rate", "fall_rate", "miss_rate")] == pytest.approx([1 / 3] * 3)

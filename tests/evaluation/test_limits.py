@@ -6,16 +6,17 @@ import numpy as np
 import pytest
 import torch
 
-from experiments.vertical_jump_sweep import OPEN_LOOP_APEX, for_sweep
 from jump_helpers import make_env
+from jumper_warp.evaluation.heights import for_sweep
 from jumper_warp.evaluation.jumps import jump_commands
-from jumper_warp.policies.restore import Conditions
+from jumper_warp.evaluation.limits import EXTEND, HOLD, RAMP, open_loop_limits
+from jumper_warp.policies.conditions import Conditions
 from jumper_warp.registry import make_task
 from jumper_warp.robot.motors import vertical_jump_filter
 from jumper_warp.sim.simulation import Simulation
+from landing_helpers import OPEN_LOOP_APEX
 from randomization_helpers import read
-from support.limits import open_loop_limits
-from support.open_loop import EXTEND, HOLD, RAMP, STAND, transversal_command
+from support.open_loop import STAND, transversal_command
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 

@@ -11,6 +11,7 @@ from jumper_warp.evaluation.velocities import VelocityFlags, VelocityGoals, Walk
 from jumper_warp.registry import make_task
 from jumper_warp.utils.errors import InputError
 from support import gaits
+from support.walks import kept_speeds, settling_times, steps_of, top_speed, walked
 
 DT = 1.0 / 60.0
 TASK = make_task("velocity-flat")
@@ -76,7 +77,7 @@ def test_settling_is_when_the_mean_velocity_stays_near_the_last_command():
         v[2, 0] = 0.5  # never
         return v
 
-    settling = velocities.settling_times(followed(velocity, seconds=3.0, commands=commands, times=(0.0, 1.0)))
+    settling = settling_times(followed(velocity, seconds=3.0, commands=commands, times=(0.0, 1.0)))
     # mean of a ramp over 0.2 s lags 0.1 s: within 0.1 of 0.8 from 0.4375 + about 0.08 s on
     assert settling[0] == pytest.approx(0.53, abs=0.03)
     assert settling[1] == pytest.approx(0.2 * 7.0 / 8.0, abs=1.5 * DT) and np.isinf(settling[2])
@@ -93,8 +94,8 @@ def test_settling_for_a_while_is_not_spoilt_by_a_later_push():
         return v
 
     walks = followed(velocity, seconds=4.0, commands=commands, times=(0.0, 1.0))
-    assert velocities.settling_times(walks)[0] > 1.7
-    held = velocities.settling_times(walks, 0.5)
+    assert settling_times(walks)[0] > 1.7
+    held = settling_times(walks, 0.5)
     assert held[0] == pytest.approx(0.2 * 7.0 / 8.0, abs=1.5 * DT) and np.isinf(held[1])
 
 
@@ -108,28 +109,28 @@ def test_commands_count_from_the_step_after_they_came():
 def test_share_of_the_way_stops_at_a_fall():
     commands = np.tile([0.5, 0.0, 0.0], (ROBOTS, 1, 1))
     walks = followed(lambda t: np.tile([0.3, 0.1, 0.0], (ROBOTS, 1)), seconds=3.0, commands=commands, falls={2: 91})
-    assert velocities.walked(walks) == pytest.approx([0.9, 0.9, 0.45], rel=1e-5)  # of the last two seconds
+    assert walked(walks) == pytest.approx([0.9, 0.9, 0.45], rel=1e-5)  # of the last two seconds
     fast = followed(lambda t: np.tile([0.9, 0.0, 0.0], (ROBOTS, 1)), commands=commands)
-    assert velocities.walked(fast) == pytest.approx([1.0] * 3)
+    assert walked(fast) == pytest.approx([1.0] * 3)
 
 
 def test_top_speed_is_that_of_the_highest_class_that_is_kept():
     commanded = np.array([0.31, 0.35, 0.42, 0.48, 0.55, 0.61, 0.66])
     kept = np.array([False, True, True, True, False, True, False])
-    assert velocities.top_speed(commanded, kept) == 0.48
-    assert velocities.top_speed(commanded, kept, share=0.5) == 0.66
-    assert velocities.top_speed(commanded, np.zeros(7, dtype=bool)) == 0.0
+    assert top_speed(commanded, kept) == 0.48
+    assert top_speed(commanded, kept, share=0.5) == 0.66
+    assert top_speed(commanded, np.zeros(7, dtype=bool)) == 0.0
 
 
 def test_kept_speed_is_the_mean_of_the_last_seconds():
     walks = followed(lambda t: np.array([[0.46, 0, 0], [0.44, 0, 0], [0.54, 0, 0]]) - (3.0 if t < 1.0 else 0.0))
-    np.testing.assert_array_equal(velocities.kept_speeds(walks, 0, 1.0, 0.1), [True, False, True])
+    np.testing.assert_array_equal(kept_speeds(walks, 0, 1.0, 0.1), [True, False, True])
 
 
 def test_grid_and_steps_are_where_they_should_be():
     commands = velocities.grid(3, (0.8, 0.6, 0.4))
     assert commands.shape == (27, 1, 3) and {tuple(c) for c in commands[:, 0]} >= {(0.8, -0.6, 0.4), (0.0, 0.0, 0.0)}
-    pairs = velocities.steps_of(np.random.default_rng(0), 200, 0.8, 0.8)
+    pairs = steps_of(np.random.default_rng(0), 200, 0.8, 0.8)
     np.testing.assert_allclose(np.linalg.norm((pairs[:, 1] - pairs[:, 0])[:, :2], axis=1), 0.8)
     assert np.abs(pairs).max() <= 0.8 and (pairs[:, 0, 2] == pairs[:, 1, 2]).all()
 

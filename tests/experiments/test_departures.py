@@ -12,26 +12,28 @@ from jumper_warp.cli.train import parse_train
 from jumper_warp.registry import make_task
 from jumper_warp.tasks.saving import task_from_json, task_to_json
 from jumper_warp.utils.errors import InputError
-from support.departures import DEPARTURES, Undone
+from support import departure_runs
+from support.departure_runs import settings, trained
+from support.departures import DEPARTURES, flags_of
 
 
 def undone(task, name):
     """Return the settings of a training without a departure, and its task."""
-    parsed, changed = parse_train(departures.Args(task=task).command(DEPARTURES[task][name], 1, Path("logs")))
-    return parsed, DEPARTURES[task][name].change(changed)
+    each = DEPARTURES[task][name]
+    return settings(each, departures.Args(task=task).command(each, 1, Path("logs")))
 
 
 @pytest.mark.parametrize("task", DEPARTURES)
-def test_what_is_undone_by_flags_is_not_changed_besides(task):
+def test_what_no_flag_undoes_changes_the_task(task):
     plain = parse_train([task])[1]
     for name, each in DEPARTURES[task].items():
-        assert bool(each.flags) != (each.change(plain) != plain), name
+        assert flags_of(each) or each(plain) != plain, name
 
 
 @pytest.mark.parametrize("task", ["vertical-jump", "horizontal-jump"])
 def test_all_flags_are_those_of_the_task_and_change_it(task):
     plain = parse_train([task])[1]
-    flags = " ".join(each.flags for each in DEPARTURES[task].values())
+    flags = " ".join(flags_of(each) for each in DEPARTURES[task].values())
     parsed, changed = parse_train([task, *flags.split()])
     assert task_from_json(json.loads(json.dumps(task_to_json(changed)))) == changed
     assert {"reset", "rewards", "terminations"} <= {
@@ -58,7 +60,7 @@ def test_what_is_undone_in_python():
 
 
 def test_what_is_undone_elsewhere():
-    goals = DEPARTURES["horizontal-jump-mars-loose"]["goals"].change(make_task("horizontal-jump-mars-loose")).levels
+    goals = DEPARTURES["horizontal-jump-mars-loose"]["goals"](make_task("horizontal-jump-mars-loose")).levels
     assert [(level.goal_lower[0], level.goal_upper[0]) for level in goals[::2]] == [
         (1.4, 1.85), (1.6, 2.25), (2.0, 3.75), (3.0, 4.75),
     ]  # fmt: skip
@@ -71,7 +73,7 @@ def test_what_is_undone_elsewhere():
     (touchdown,) = (term.numbers for term in earth.terminations if term.name == "turned_touchdown")
     assert ends["turned_touchdown"] == pytest.approx(touchdown, abs=1e-4)
     assert undone("horizontal-jump-mars-loose", "wide_kernels")[1].rewards == earth.rewards
-    around = DEPARTURES["omnidirectional-jump"]["reaches"].change(plain).levels
+    around = DEPARTURES["omnidirectional-jump"]["reaches"](plain).levels
     assert around[-1].goal_upper == (1.4, 1.4, 0.0) and around[-1].goal_lower == (-1.4, -1.4, 0.0)
     assert around[0] == plain.levels[0]
 
@@ -86,7 +88,7 @@ def test_paws_sink_less_than_a_millimetre_as_the_page_says():
 def test_the_table_of_departures_tells_how_these_are_undone():
     table = (Path(__file__).parents[2] / "docs" / "tasks.md").read_text()
     for name, each in [one for jump in DEPARTURES.values() for one in jump.items()]:
-        assert not each.flags or f"`{each.flags}`" in table, name
+        assert callable(each) or f"`{each}`" in table, name
 
 
 def test_trainings_are_measured_by_the_ends_of_the_task_as_it_is_and_not_made_twice(tmp_path, capsys, monkeypatch):
@@ -98,10 +100,10 @@ def test_trainings_are_measured_by_the_ends_of_the_task_as_it_is_and_not_made_tw
     assert not (tmp_path / "metrics.json").exists()
     config = next((tmp_path / "jumping_early_1").rglob("config.json")).read_text()
     assert "early_takeoff" not in [term["name"] for term in json.loads(config)["env"]["task"]["terminations"]]
-    ends, follow = [], departures.EvaluationRun.follow
-    monkeypatch.setattr(departures, "train", None)
+    ends, follow = [], departure_runs.EvaluationRun.follow
+    monkeypatch.setattr(departure_runs, "train", None)
     monkeypatch.setattr(
-        departures.EvaluationRun, "follow",
+        departure_runs.EvaluationRun, "follow",
         lambda run, env, log: ends.append([term.name for term in env.task.terminations]) or follow(run, env, log),
     )  # fmt: skip
     values = departures.main(replace(args, measure=True, threads=2))
@@ -121,14 +123,14 @@ def test_trainings_are_measured_by_the_ends_of_the_task_as_it_is_and_not_made_tw
 def test_a_training_may_end_by_the_clock(tmp_path):
     flags = "--ppo.compile off --ppo.num-steps 8 --ppo.minibatches 1 --max-seconds 0.001"
     args = departures.Args(only=("drift",), iterations=1000, envs=4, train=flags, device="cpu", threads=1)
-    checkpoint = departures.trained(Undone(), args.command(Undone(), 1, tmp_path))
+    checkpoint = trained("", args.command("", 1, tmp_path))
     assert checkpoint.is_file() and int(checkpoint.stem.removeprefix("iteration_")) < 1000
 
 
 def test_the_task_as_it_is_is_trained_with_seeds_of_its_own():
     args = departures.Args(only=("kept", "drift"), seeds=(1,), kept_seeds=(2, 3))
-    flags = [(name, seed, undone.flags) for name, seed, undone in args.trainings()]
-    assert flags == [("kept", 2, ""), ("kept", 3, ""), ("drift", 1, DEPARTURES["vertical-jump"]["drift"].flags)]
+    flags = [(name, seed, undone) for name, seed, undone in args.trainings()]
+    assert flags == [("kept", 2, ""), ("kept", 3, ""), ("drift", 1, DEPARTURES["vertical-jump"]["drift"])]
     assert len(list(departures.Args().trainings())) == 3 + len(DEPARTURES["vertical-jump"])
 
 

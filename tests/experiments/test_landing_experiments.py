@@ -9,24 +9,19 @@ import numpy as np
 import pytest
 import torch
 
-from experiments import (
-    consecutive_jumps,
-    diagonal_jump_grid,
-    horizontal_jump_sweep,
-    max_jump,
-    platform_jump,
-)
-from experiments.vertical_jump_sweep import OPEN_LOOP_APEX
-from jumper_warp.evaluation.landings import ENDS, Landings, beside
+from experiments import paper_tests
+from jumper_warp.evaluation.film import beside
 from jumper_warp.evaluation.log import run_evaluation, termination_names
+from jumper_warp.evaluation.places import ENDS, PlaceLog
 from jumper_warp.evaluation.plots import Track
 from jumper_warp.evaluation.run import EvaluationArgs, EvaluationRun, shown
+from jumper_warp.evaluation.suites import Consecutive, Farthest, Grid, Platform, consecutive_metrics, distance_metrics
+from jumper_warp.evaluation.sweeps import DistanceSweep
+from jumper_warp.policies.conditions import Conditions, env_of_policy
 from jumper_warp.policies.folder import save_policy
-from jumper_warp.policies.restore import Conditions, env_of_policy
 from jumper_warp.policies.spec import PolicyError
 from jumper_warp.utils.errors import InputError
-from landing_helpers import still_policy
-from support.distances import distance_metrics, row_of, verdict
+from landing_helpers import OPEN_LOOP_APEX, still_policy
 
 COLLIDED, NO_JUMP, LANDED = (ENDS.index(name) for name in ("collided", "no_jump", "success"))
 SHARED = {"mean_error_m", "success_rate", "success_rate_in_range", "jumps", "solver", "randomize", "seed"}
@@ -43,7 +38,7 @@ def policy(tmp_path_factory):
 
 def ended(goals, landing, end, **changes):
     """Return rows of jumps that ended as told; goals and landing [m], (rows, jumps, 2), heading 0."""
-    landings = Landings(np.array(goals, dtype=float), ENDS)
+    landings = PlaceLog(np.array(goals, dtype=float), ENDS)
     landings.end[:] = end
     landings.target[:], landings.place[:], landings.touchdown[:] = goals, landing, landing
     landings.heading[:], landings.yaw[:], landings.tilt[:] = 0.0, 0.0, 0.0
@@ -62,7 +57,7 @@ def ahead(distances):
 def test_sweep_counts_ranges_by_distance():
     goals = ahead([0.3, 0.7, 1.0, 1.4, 1.5])
     landings = ended(goals, goals + [[[0.02, 0.0]], [[0.0, 0.04]], [[0.0, 0.2]], [[0.03, 0.0]], [[-0.5, 0.0]]], LANDED)
-    figures = horizontal_jump_sweep.metrics(landings)
+    figures = DistanceSweep.metrics(landings)
     assert figures["mean_error_m"] == pytest.approx(0.79 / 5)
     assert figures["success_rate"] == pytest.approx(3 / 5)
     assert figures["success_rate_in_range"] == pytest.approx(3 / 4)
@@ -70,11 +65,11 @@ def test_sweep_counts_ranges_by_distance():
 
 
 def test_grid_has_every_goal_as_often_as_wanted():
-    goals = diagonal_jump_grid.grid(columns=3, rows=2, jumps=2)
+    goals = Grid(columns=3, rows=2, jumps=2).places
     assert goals.shape == (12, 1, 2)
     assert goals[:4, 0].tolist() == [[0.35, -0.35], [0.35, -0.35], [0.35, 0.35], [0.35, 0.35]]
     assert goals[-1, 0].tolist() == [1.4, 0.35]
-    assert len(diagonal_jump_grid.grid(22, 5, 2)) == 220
+    assert len(Grid().places) == 220
 
 
 def test_consecutive_figures_by_hand():
@@ -85,7 +80,7 @@ def test_consecutive_figures_by_hand():
     row = ended(np.ones((2, 3, 2)), np.ones((2, 3, 2)) + [0.0, 0.04], ends)
     row.heading[1, 2] = row.place[1, 2] = np.nan
     row.rest_speed[:] = [[0.05, 0.2, 0.05], [0.05, np.inf, np.inf]]
-    figures = consecutive_jumps.metrics(pairs, row)
+    figures = consecutive_metrics(pairs, row)
     expected = {
         "jumps": 4,
         "mean_error_m": 0.29 / 4,
@@ -116,13 +111,13 @@ def test_consecutive_figures_by_hand():
 def test_row_without_a_fall_may_miss_its_goals():
     off = np.ones((2, 3, 2)) + [[[0.0, 0.0]] * 3, [[0.0, 0.0], [0.3, 0.0], [0.0, 0.0]]]
     pairs = np.ones((2, 2, 2))
-    figures = consecutive_jumps.metrics(ended(pairs, pairs, LANDED), ended(np.ones((2, 3, 2)), off, LANDED))
+    figures = consecutive_metrics(ended(pairs, pairs, LANDED), ended(np.ones((2, 3, 2)), off, LANDED))
     assert (figures["ten_in_a_row_rate"], figures["row_all_on_goal_rate"]) == (1.0, 0.5)
 
 
 def test_paths_are_drawn_from_the_start_and_along_the_heading():
     track = Track()
-    landings = Landings(np.zeros((2, 1, 2)), ENDS)
+    landings = PlaceLog(np.zeros((2, 1, 2)), ENDS)
     for place in ([0.0, 0.0, 0.3], [0.0, 1.0, 0.3]):
         landings.seen = {"base_pos": np.array([place, place])}
         track(landings)
@@ -144,10 +139,9 @@ def of(middle, *, clean, stepped=0, hopped=0):
 
 @pytest.mark.parametrize(("direction", "unit"), [(0.0, (1.0, 0.0)), (90.0, (0.0, 1.0)), (180.0, (-1.0, 0.0))])
 def test_goals_of_a_bin_lie_in_a_direction(direction, unit):
-    args = max_jump.Args(jumps=5, direction=direction)
     expected = np.array([0.75, 0.775, 0.8, 0.825, 0.85])[:, None, None] * np.array(unit)
-    np.testing.assert_allclose(max_jump.goals(args, 0.8), expected, atol=1e-12)
-    one = max_jump.goals(max_jump.Args(jumps=1, direction=direction), 0.8)
+    np.testing.assert_allclose(Farthest(jumps=5, direction=direction).places(0.8), expected, atol=1e-12)
+    one = Farthest(jumps=1, direction=direction).places(0.8)
     np.testing.assert_allclose(one, 0.8 * np.array(unit)[None, None], atol=1e-12)
 
 
@@ -159,7 +153,7 @@ def test_reliable_distance_is_the_last_bin_before_the_first_that_is_not():
         1.5: of(1.5, clean=10, stepped=8),
         1.6: of(1.6, clean=20),
     }
-    figures = distance_metrics(bins, max_jump.IN_RANGE)
+    figures = distance_metrics(bins)
     expected = {
         "largest_reliable_m": 1.4, "largest_reliable_without_hop_m": 1.3, "largest_reliable_without_step_m": 1.2,
         "base_at_touchdown_m": 1.2, "base_at_touchdown_without_hop_m": 1.1, "base_at_touchdown_without_step_m": 1.0,
@@ -173,18 +167,15 @@ def test_reliable_distance_is_the_last_bin_before_the_first_that_is_not():
     assert figures["bin_single_jump_success_rate"] == pytest.approx([0.95, 1.0, 0.5, 0.9, 1.0])
     assert figures["bin_step_free_success_rate"] == pytest.approx([0.95, 0.5, 0.5, 0.5, 1.0])
     assert figures["bin_base_at_touchdown_m"] == pytest.approx([1.0, 1.1, 1.2, 1.3, 1.4])
-    assert "may go on with steps" in verdict(figures)
-    assert "Of 1.4 m the base itself flew to 1.20 m" in verdict(figures)
 
 
 def test_distance_without_any_reliable_bin_is_none():
     goals = ahead([1.0, 1.0])
     bins = {1.0: ended(goals, goals, [[NO_JUMP], [NO_JUMP]])}
-    figures = distance_metrics(bins, max_jump.IN_RANGE)
+    figures = distance_metrics(bins)
     assert figures["largest_reliable_m"] is None and figures["farthest_success_m"] is None
     assert figures["bin_base_at_touchdown_m"] == [None]
     assert figures["hop_free_distance_m"] is None and figures["max_landing_tilt_deg"] is None
-    assert row_of(figures, 0) == ["1.0", "0.0", "0.0", "0.0", "0.0", "0.0", ""]
 
 
 def test_figures_are_printed_with_four_digits_in_lists_too():
@@ -193,19 +184,18 @@ def test_figures_are_printed_with_four_digits_in_lists_too():
 
 def test_scenes_put_the_ground_where_it_is_said_to_be():
     rng, goals = np.random.default_rng(0), np.array([[0.8, 0.1], [1.0, -0.1]])
-    special, _ = platform_jump.scene("platform", goals, 0.46, rng)
-    ground = special["ground"]
+    scenes = {name: scene for name, *scene in Platform(edge=0.46).scenes(goals, rng)}
+    ground = scenes["platform"][0]["ground"]
     assert (ground.min_z, ground.max_z) == pytest.approx((-0.15, 0.0))
     x = np.linspace(-ground.hx, ground.hx, ground.ncol)
     heights = np.asarray(ground.data).reshape(ground.nrow, ground.ncol)
     assert x[heights[0] > 0.5].max() == pytest.approx(0.46) and (heights == heights[0]).all()
-    special, headings = platform_jump.scene("uneven", goals, 0.46, rng)
-    assert len(set(headings)) == 2
-    special, headings = platform_jump.scene("block", goals, 0.46, rng)
-    block = special["block"]
+    assert len(set(scenes["uneven"][1])) == 2
+    block, headings = scenes["block"][0]["block"], scenes["block"][1]
     near, far = (block.center[:, 0] + side * block.half[:, 0] for side in (-1.0, 1.0))
     assert near == pytest.approx(0.46) and far == pytest.approx(goals[:, 0] + 0.40)
     assert block.center[:, 1] == pytest.approx(goals[:, 1]) and not headings.any()
+    assert [name for name, *_ in Platform(solver="mujoco").scenes(goals, rng)] == ["platform", "uneven"]
 
 
 def test_eye_looks_across_the_path():
@@ -240,7 +230,7 @@ def hops():
 
     env = env_of_policy(policy, 3, Conditions(device="cpu"), change=change)
     goals = np.array([[[0.0, 0.0], [0.0, 0.05]], [[0.05, 0.0], [0.3, 0.0]], [[0.5, -0.2], [0.0, 0.0]]])
-    landings = Landings(
+    landings = PlaceLog(
         goals, termination_names(env.task), headings=np.array([0.0, 2.0, -1.5]), delay=np.array([0.5, 0.4, 0.3])
     )
     script = Hop()
@@ -267,22 +257,21 @@ def test_second_hop_is_measured_from_where_the_first_one_ended(hops):
     assert hops.outcomes[:, 1].tolist() == ["success", "missed", "success"]
 
 
-# ---------------------------------------------------------------- the scripts
+# ---------------------------------------------------------------- the suites
 
 
 @pytest.mark.parametrize(
-    ("experiment", "settings", "files"),
+    ("suite", "settings", "files"),
     [
-        (horizontal_jump_sweep, {"jumps": 3}, ("sweep.png", "jumps.rrd", "jumps.png")),
-        (diagonal_jump_grid, {"columns": 2, "rows": 2, "jumps": 1}, ("grid.png", "jumps.rrd")),
-        (consecutive_jumps, {"jumps": 1, "trials": 2, "row": 3}, ("paths.png", "pairs.rrd", "row.rrd")),
-        (platform_jump, {"jumps": 2}, ("landings.png", "platform.rrd", "uneven.png", "block.rrd")),
-        (max_jump, {"jumps": 3}, ("max_jump.png", "jump_1.0_m.rrd")),
+        (DistanceSweep, {"jumps": 3}, ("sweep.png", "jumps.rrd", "jumps.png")),
+        (Grid, {"columns": 2, "rows": 2, "jumps": 1}, ("grid.png", "jumps.rrd")),
+        (Consecutive, {"jumps": 1, "trials": 2, "row": 3}, ("paths.png", "pairs.rrd", "row.rrd")),
+        (Platform, {"jumps": 2}, ("landings.png", "platform.rrd", "uneven.png", "block.rrd")),
+        (Farthest, {"jumps": 3}, ("max_jump.png", "jump_1.0_m.rrd")),
     ],
 )
-def test_experiment_leaves_figures_plot_and_recording(experiment, settings, files, policy, tmp_path):
-    args = experiment.Args(policy=policy, record=1, out=tmp_path, device="cpu", **settings)
-    values = experiment.main(args)
+def test_suite_leaves_metrics_plot_and_recording(suite, settings, files, policy, tmp_path):
+    values = suite(policy, record=1, out=tmp_path, device="cpu", **settings).run()
     saved = json.loads((tmp_path / "metrics.json").read_text())
     assert saved == values and saved.keys() >= SHARED
     assert (saved["success_rate"], saved["torque_limit_nm"]) == (0.0, 18.0)
@@ -290,9 +279,17 @@ def test_experiment_leaves_figures_plot_and_recording(experiment, settings, file
         assert (tmp_path / name).stat().st_size > 1000, name
 
 
+def test_numbers_of_the_paper_stand_beside_those_of_a_policy(policy, tmp_path, monkeypatch):
+    small = dataclasses.make_dataclass("Small", [("columns", int, 1), ("rows", int, 1)], bases=(Grid,), frozen=True)
+    monkeypatch.setattr(paper_tests, "suites_for", lambda evaluation: {"grid": small})
+    values = paper_tests.main(paper_tests.Args(policies=(policy,), record=0, out=tmp_path, device="cpu"))
+    assert values == json.loads((tmp_path / "metrics.json").read_text())
+    assert set(values) == {f"still_grid_{name}" for name in Grid.paper} and values["still_grid_success_rate"] == 0.0
+    assert (tmp_path / "still_grid" / "grid.png").is_file()
+
+
 def test_randomised_robot_that_stands_still_is_off_by_the_whole_way(policy, tmp_path):
-    args = horizontal_jump_sweep.Args(policy=policy, jumps=4, record=0, randomize=True, out=tmp_path, device="cpu")
-    values = horizontal_jump_sweep.main(args)
+    values = DistanceSweep(policy, jumps=4, record=0, randomize=True, out=tmp_path, device="cpu").run()
     assert values["mean_error_m"] == pytest.approx(0.9, abs=0.05)
     assert values["randomize"] and values["landing_rate"] == 0.0
     assert (values["trained_lower_m"], values["trained_upper_m"]) == (0.2, 2.2)
@@ -302,10 +299,9 @@ def test_nothing_of_viewer_and_meshes_is_needed_without_a_recording(policy, tmp_
     code = (
         "import sys\n"
         "for name in ('rerun', 'trimesh', 'pin', 'pinocchio'): sys.modules[name] = None\n"
-        "from experiments import consecutive_jumps, diagonal_jump_grid, max_jump, platform_jump, vertical_jump_sweep\n"
-        "from experiments.horizontal_jump_sweep import Args, main\n"
-        "from pathlib import Path\n"
-        f"main(Args(policy={policy!r}, jumps=3, record=0, out=Path({str(tmp_path)!r}), device='cpu'))"
+        "from jumper_warp.cli.main import main\n"
+        "flags = '--suite sweep --jumps 3 --record 0 --device cpu --out'.split()\n"
+        f"main(['evaluate', {policy!r}, *flags, {str(tmp_path)!r}])"
     )
     root = Path(__file__).parents[2]
     subprocess.run([sys.executable, "-c", code], cwd=root, check=True, capture_output=True)
@@ -337,15 +333,13 @@ def test_script_refuses_a_policy_of_another_task_in_one_line_with_code_2(policy)
     ("make", "message"),
     [
         (lambda: EvaluationArgs(record=-1), "record must not be negative"),
-        (lambda: horizontal_jump_sweep.Args(jumps=2), "at least 3 jumps"),
-        (lambda: diagonal_jump_grid.Args(rows=0), "at least one jump, column and row"),
-        (lambda: consecutive_jumps.Args(rest=0.0), "rest must be in"),
-        (lambda: platform_jump.Args(scenes=("moon",)), "scenes are platform, uneven, block"),
-        (lambda: platform_jump.Args(edge=0.2), "edge must be from 0.3 m to below 0.8 m"),
-        (lambda: platform_jump.Args(scenes=("block",), solver="mujoco"), "SolverMuJoCo has no sliding block"),
-        (lambda: max_jump.Args(jumps=0), "at least one jump"),
-        (lambda: max_jump.Args(first=3.0), "0.1 <= first <= last <= 9 m, got 100, 3.0 and 2.5"),
-        (lambda: max_jump.Args(direction=200.0), "direction must be in -180..180 deg, got 200"),
+        (lambda: DistanceSweep(jumps=2), "at least 3 jumps"),
+        (lambda: Grid(rows=0), "at least one column and row"),
+        (lambda: Consecutive(rest=0.0), "rest must be in"),
+        (lambda: Platform(edge=0.2), "edge must be from 0.3 m to below 0.8 m"),
+        (lambda: Farthest(jumps=0), "at least 1 jump, got 0"),
+        (lambda: Farthest(first=3.0), "0.1 <= first <= last <= 9 m, got 3.0 and 2.5"),
+        (lambda: Farthest(direction=200.0), "direction must be in -180..180 deg, got 200"),
     ],
 )
 def test_impossible_settings_are_refused(make, message):

@@ -1,30 +1,24 @@
-import json
-
 import numpy as np
 import pytest
 import torch
 
 from experiments import trajectory_optimization as experiment
 from jumper_warp.cli.main import run_command
-from jumper_warp.tasks.jump.references import COLUMNS, ROWS
-from support.optimized_jumps import JUMPS, run_ups
+from jumper_warp.trajectory.smoothing import penalised
+from support.optimized_jumps import JUMPS, LIMITED, run_ups
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 def test_experiment_tells_what_its_targets_do(tmp_path):
     """A short search: the figures are those of a replay of the targets that it wrote."""
-    args = experiment.Args(
-        jumps=("highest",), samples=48, effort=0.01, polish=1, baseline="cma", longer=0.1, out=tmp_path, device="cpu"
-    )
+    args = experiment.Args(jumps=("highest",), samples=48, effort=0.01, polish=1, out=tmp_path, device="cpu")
     values = experiment.main(args)
     saved = np.load(tmp_path / "highest.npz", allow_pickle=False)
     replay = JUMPS["highest"].replay(saved["targets"])
     assert values["highest_apex_m"] == pytest.approx(replay.apex, abs=1e-6) and replay.apex > 0.4
     assert values["highest_gradients_value"] == values["highest_apex_m"]
-    assert values["highest_gradients_reverse_steps"] > 0.0 and values["highest_cma_simulated_steps"] > 0.0
-    reference = json.loads((tmp_path / "highest.json").read_text())
-    assert reference["columns"] == list(COLUMNS) and np.shape(reference["rows"]) == (ROWS, len(COLUMNS))
+    assert values["highest_gradients_reverse_steps"] > 0.0
     assert {"highest.rrd", "highest_strip.png", "trajectories.png"} <= {path.name for path in tmp_path.iterdir()}
 
 
@@ -42,6 +36,35 @@ def test_replay_sees_paws_that_are_lifted_again():
     assert once.work == twice.work > 20.0 and once.apex > 0.5
 
 
+def test_replay_flies_and_violates_what_the_problem_computes():
+    """Distance and constraints of a jump forward, in the simulation and in the rollout."""
+    jump = JUMPS["farthest"]
+    made = jump.make(device="cpu", threads=1)
+    x = torch.as_tensor(run_ups(made.knots, 32, np.random.default_rng(0)))
+    with torch.no_grad():
+        values = made.evaluate(x)
+    best = penalised(values).argsort()[:4]
+    replays = [jump.replay(made.knots.targets(x)[..., i].numpy(), "cpu") for i in best.tolist()]
+    flown, violations = -values.objective[best].numpy(), values.constraints[best].amax(1).clamp_min(0.0).numpy()
+    assert flown.max() > 1.0 and violations.max() > 0.01
+    assert [jump.value(replay) for replay in replays] == pytest.approx(flown, abs=1e-3)
+    assert [replay.violation for replay in replays] == pytest.approx(violations, abs=1e-3)
+
+
+def test_each_limit_changes_what_it_names():
+    made = {name: jump.make() for name, jump in LIMITED.items()}
+    nominal = JUMPS["farthest"].make()
+    kind, kinds = nominal.motors.transversal, {name: problem.motors.transversal for name, problem in made.items()}
+    assert kinds["farthest_torque_24_8"].saturation == pytest.approx(24.8)
+    assert kinds["farthest_speed"].cutoff_speed == pytest.approx(1.5 * kind.cutoff_speed)
+    assert kinds["farthest_speed"].no_load_speed == pytest.approx(1.5 * kind.no_load_speed)
+    assert made["farthest_speed"].motors.fade_end == pytest.approx(1.5 * nominal.motors.fade_end)
+    others = ("pitch", "stance", "filter", "friction_1_5", "friction_0_6")
+    assert {kinds[f"farthest_{name}"] for name in others} == {kind}
+    assert made["farthest_filter"].command_filter.horizon < nominal.command_filter.horizon
+    assert [made[f"farthest_friction_{name}"].friction for name in ("1_5", "0_6")] == [1.5, 0.6]
+
+
 def test_run_ups_lean_back_before_they_push():
     made = JUMPS["farthest"].make(device="cpu", threads=1)
     x = run_ups(made.knots, 32, np.random.default_rng(0))
@@ -54,7 +77,7 @@ def test_run_ups_lean_back_before_they_push():
     assert motion.takeoff(0.25)[1].float().mean() > 0.5
 
 
-@pytest.mark.parametrize("flags", [{"jumps": ("wings",)}, {"effort": 0.0}, {"samples": 3}, {"longer": -1.0}])
+@pytest.mark.parametrize("flags", [{"jumps": ("wings",)}, {"effort": 0.0}, {"samples": 3}, {"polish": 0}])
 def test_flags_that_cannot_be_are_told_in_a_line(flags, capsys):
     with pytest.raises(SystemExit):
         run_command(lambda: experiment.Args(**flags))

@@ -28,6 +28,7 @@ class Mortal(PushTask):
 
 if __name__ == "__main__":
     cfg = TrainCfg(
+        resume="latest-or-new",
         task="push", num_envs=32, iterations=6, device="cpu", log_root=Path(sys.argv[1]), log_interval=1,
         save_interval=2, keep=10, tensorboard=False, ppo=SMALL,
     )  # fmt: skip

@@ -7,18 +7,8 @@ from typing import Any
 
 import warp as wp
 
-from jumper_warp.kernels.mdp import observations as mdp_observations
-from jumper_warp.kernels.mdp import rewards as mdp_rewards
-from jumper_warp.kernels.mdp import terminations as mdp_terminations
-from jumper_warp.kernels.mdp.env import Scene, SkillSettings
-from jumper_warp.kernels.mdp.parameters import RobotParameters, set_torque_limit
-from jumper_warp.kernels.mdp.random import Draw, between, within
-from jumper_warp.kernels.mdp.reset import store_pose
-from jumper_warp.kernels.mdp.view import RobotArrays, RobotView
+from jumper_warp import mdp
 from jumper_warp.robot.motors import walking_filter, walking_motors
-from jumper_warp.tasks.cfg import Command, Reset, TaskCfg
-from jumper_warp.tasks.randomization import RandomizationCfg
-from jumper_warp.tasks.terms import Advance, Curriculum, EventTerm, ObservationTerm, RewardTerm, TerminationTerm
 
 Pair = tuple[float, float]
 
@@ -84,7 +74,7 @@ class HoldLevelCfg:
 
 
 @wp.func
-def advance_hold(view: RobotView, task: HoldState, tolerance: float) -> HoldState:
+def advance_hold(view: mdp.RobotView, task: HoldState, tolerance: float) -> HoldState:
     """Count steps, and those near the goal up to a tolerance [m]."""
     new = task
     new.steps = task.steps + 1
@@ -95,19 +85,19 @@ def advance_hold(view: RobotView, task: HoldState, tolerance: float) -> HoldStat
 
 @wp.func
 def reset_hold(
-    robot: RobotArrays, scene: Scene, skill: SkillSettings, old: HoldState, settings: HoldSettings, level: HoldLevel,
-    draw: Draw,
+    robot: mdp.RobotArrays, scene: mdp.Scene, skill: mdp.SkillSettings, old: HoldState, settings: HoldSettings,
+    level: HoldLevel, draw: mdp.Draw,
 ) -> HoldState:  # fmt: skip
     """Stand in the default pose with any heading."""
-    store_pose(robot, scene, draw.world, between(draw, 0, -settings.heading, settings.heading), 0.0)
+    mdp.store_pose(robot, scene, draw.world, mdp.between(draw, 0, -settings.heading, settings.heading), 0.0)
     new = HoldState()
-    new.goal = within(draw, 1, level.goal)
+    new.goal = mdp.within(draw, 1, level.goal)
     new.lasts = settings.lasts
     return new
 
 
 @wp.func
-def give_hold(view: RobotView, scene: Scene, task: HoldState, values: wp.vec4, heading: float) -> HoldState:
+def give_hold(view: mdp.RobotView, scene: mdp.Scene, task: HoldState, values: wp.vec4, heading: float) -> HoldState:
     """Command a height [m], the first of the values, until another comes."""
     new = task
     new.goal = values[0]
@@ -123,16 +113,16 @@ def another_goal_due(task: HoldState) -> bool:
 
 
 @wp.func
-def draw_goal(view: RobotView, scene: Scene, task: HoldState, level: HoldLevel, draw: Draw) -> HoldState:
+def draw_goal(view: mdp.RobotView, scene: mdp.Scene, task: HoldState, level: HoldLevel, draw: mdp.Draw) -> HoldState:
     """Command another height."""
     new = task
-    new.goal = within(draw, 1, level.goal)
+    new.goal = mdp.within(draw, 1, level.goal)
     new.age = 0
     return new
 
 
 @wp.func
-def height_error(view: RobotView, task: HoldState) -> float:
+def height_error(view: mdp.RobotView, task: HoldState) -> float:
     """Distance from the commanded height [m]."""
     return wp.abs(view.height - task.goal)
 
@@ -144,65 +134,65 @@ def every_episode(task: HoldState) -> bool:
 
 
 @wp.func
-def near_goal(view: RobotView, task: HoldState, width: float) -> float:
+def near_goal(view: mdp.RobotView, task: HoldState, width: float) -> float:
     """Closeness to the commanded height; width [m]: of the kernel."""
-    return mdp_rewards.psi(view.height - task.goal, width)
+    return mdp.rewards.psi(view.height - task.goal, width)
 
 
 @wp.func
-def held(view: RobotView, task: HoldState, steps: float) -> bool:
+def held(view: mdp.RobotView, task: HoldState, steps: float) -> bool:
     """Near the goal for so many policy steps in a row."""
     return task.near >= int(steps)
 
 
 @wp.func
-def wanted_height(view: RobotView, task: HoldState) -> float:
+def wanted_height(view: mdp.RobotView, task: HoldState) -> float:
     """The commanded height [m]."""
     return task.goal
 
 
 @wp.func
-def weak_motors(robot: RobotParameters, draw: Draw, lower: float, upper: float):
+def weak_motors(robot: mdp.RobotParameters, draw: mdp.Draw, lower: float, upper: float):
     """Scale the torque limit of each motor."""
     for m in range(12):
-        robot.torque_ratio[m, draw.world] = between(draw, m, lower, upper)
-        set_torque_limit(robot, draw.world, m)
+        robot.torque_ratio[m, draw.world] = mdp.between(draw, m, lower, upper)
+        mdp.events.set_torque_limit(robot, draw.world, m)
 
 
-def hold_height() -> TaskCfg:
+def hold_height() -> mdp.TaskCfg:
     """Return the task."""
     policy = (
-        ObservationTerm(wanted_height, scale=5.0),
-        ObservationTerm(mdp_observations.height, noise=0.002, scale=5.0, history=3, delayed=True),
-        ObservationTerm(mdp_observations.gravity, noise=0.02),
-        ObservationTerm(mdp_observations.angle, noise=0.01, delayed=True),
-        ObservationTerm(mdp_observations.last_action),
+        mdp.ObservationTerm(wanted_height, scale=5.0),
+        mdp.ObservationTerm(mdp.observations.height, noise=0.002, scale=5.0, history=3, delayed=True),
+        mdp.ObservationTerm(mdp.observations.gravity, noise=0.02),
+        mdp.ObservationTerm(mdp.observations.angle, noise=0.01, delayed=True),
+        mdp.ObservationTerm(mdp.observations.last_action),
     )
-    return TaskCfg(
+    return mdp.TaskCfg(
         name="hold-height",
         state=HoldState,
-        advance=Advance(advance_hold, tolerance=0.02),
-        reset=Reset(reset_hold, HoldResetCfg()),
-        command=Command(give_hold, another_goal_due, draw_goal),
-        curriculum=Curriculum(height_error, tolerance=0.03, promote_after=2, counts=every_episode),
+        advance=mdp.Advance(advance_hold, tolerance=0.02),
+        reset=mdp.Reset(reset_hold, HoldResetCfg()),
+        command=mdp.Command(give_hold, another_goal_due, draw_goal),
+        curriculum=mdp.Curriculum(height_error, tolerance=0.03, promote_after=2, counts=every_episode),
         rewards=(
-            RewardTerm(near_goal, 60.0, width=0.05),
-            RewardTerm(mdp_rewards.action_rate, -0.02),
+            mdp.RewardTerm(near_goal, 60.0, width=0.05),
+            mdp.RewardTerm(mdp.rewards.action_rate, -0.02),
         ),
         terminations=(
-            TerminationTerm(mdp_terminations.came_apart),
-            TerminationTerm(mdp_terminations.low_base, height=0.12),
-            TerminationTerm(mdp_terminations.tilted, angle=0.8),
-            TerminationTerm(held, steps=100.0, time_out=True, success=True),
-            TerminationTerm(mdp_terminations.too_long, steps=120.0, time_out=True),
+            mdp.TerminationTerm(mdp.terminations.came_apart),
+            mdp.TerminationTerm(mdp.terminations.low_base, height=0.12),
+            mdp.TerminationTerm(mdp.terminations.tilted, angle=0.8),
+            mdp.TerminationTerm(held, steps=100.0, time_out=True, success=True),
+            mdp.TerminationTerm(mdp.terminations.too_long, steps=120.0, time_out=True),
         ),
         policy=policy,
-        critic=(*policy, ObservationTerm(mdp_observations.drawn_latency)),
+        critic=(*policy, mdp.ObservationTerm(mdp.observations.drawn_latency)),
         levels=(HoldLevelCfg((0.22, 0.42)), HoldLevelCfg((0.20, 0.44))),
         motors=walking_motors(),
         command_filter=walking_filter(),
         action_scale=(10.0, 40.0),
-        events=(EventTerm(weak_motors, lower=0.8, upper=1.0),),
-        randomization=RandomizationCfg.walking(),
+        events=(mdp.EventTerm(weak_motors, lower=0.8, upper=1.0),),
+        randomization=mdp.RandomizationCfg.walking(),
         reward_floor=None,
     )

@@ -7,7 +7,9 @@ import pinocchio as pin
 import warp as wp
 from scipy.spatial.transform import Rotation
 
-from jumper_warp.robot.model import LEGS, build_model, build_pinocchio, load_description
+from jumper_warp.robot.description import LEGS, load_description
+from jumper_warp.robot.model import build_model
+from jumper_warp.robot.pinocchio_model import build_pinocchio
 from jumper_warp.sim.dynamics import JumperDynamics
 
 COORDS, DOFS, BODIES = 43, 38, 21

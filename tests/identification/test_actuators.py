@@ -11,11 +11,11 @@ from jumper_warp.identification.actuators import (
     characterise_motor,
     described_constants,
     load_bench,
-    synthetic_bench,
     torque_law,
 )
 from jumper_warp.kernels.actuation.motors import MotorParams, motor_torque
 from jumper_warp.utils.errors import InputError
+from synthetic_bench import synthetic_bench
 
 TRUTH = {
     "saturation": 15.0, "peak": 22.0, "cutoff_speed": 21.0, "no_load_speed": 37.0, "fade_start": 33.0, "fade_end": 42.0,

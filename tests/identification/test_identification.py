@@ -9,11 +9,11 @@ import pytest
 from jumper_warp.identification.excitation import Scorer
 from jumper_warp.identification.identify import identify, total_mass, weighed
 from jumper_warp.identification.least_squares import gram
+from jumper_warp.identification.motions import NoiseLevels
 from jumper_warp.identification.parameters import Parameter, ParameterSet, jumper_parameters
-from jumper_warp.identification.plans import KINDS, draw_plan
-from jumper_warp.identification.recording import measured, replay_plan, simulate_plan
+from jumper_warp.identification.recording import KINDS, draw_plan, measured, replay_plan, simulate_plan
 from jumper_warp.identification.replay import Replay
-from jumper_warp.identification.residuals import MotionResiduals, NoiseLevels
+from jumper_warp.identification.residuals import MotionResiduals
 from jumper_warp.identification.stance import paw_positions, stance, unevenness
 from jumper_warp.identification.uncertainty import weak_directions
 from jumper_warp.robot.description import load_description
@@ -25,7 +25,7 @@ DEGREE = math.pi / 180.0
 
 @pytest.fixture(scope="module")
 def replay():
-    return Replay(48, threads=2)
+    return Replay(threads=2)
 
 
 def some_truth(parameters, seed=0):
@@ -151,7 +151,7 @@ def found(replay):
     parameters, rng = few_parameters(), np.random.default_rng(5)
     truth = some_truth(parameters, seed=2)
     robots = parameters.robots(truth)
-    small = Replay(len(parameters) + 37, threads=2)
+    small = Replay(threads=2)
     plans = [draw_plan(kind, rng, seconds=0.6) for kind in ("hung chirp", "standing chirp")]
     motions = [measured(plan, f"m{i}", replay_plan(small, plan, robots), robots, rng) for i, plan in enumerate(plans)]
     mass = weighed(float(total_mass(robots)[0]))
@@ -196,7 +196,7 @@ def test_a_model_that_cannot_be_right_widens_its_intervals(found, replay):
     # an encoder of another scale is no parameter
     parameters = few_parameters().without(["latency"])
     bent = [replace(motion, angle=1.02 * motion.angle) for motion in motions if motion.base == "fixed"]
-    small = Replay(len(parameters) + 37, threads=2)
+    small = Replay(threads=2)
     result = identify(bent, parameters, replay=small)
     assert result.mismatch > 2.0
 
@@ -204,7 +204,7 @@ def test_a_model_that_cannot_be_right_widens_its_intervals(found, replay):
 def test_masses_and_gains_that_share_a_scale_are_named(replay):
     wanted = ("kp", "kd", "link_mass", "armature", "motor_friction", "knee_damping")
     parameters = ParameterSet(tuple(p for p in jumper_parameters() if p.quantity in wanted))
-    scorer = Scorer(parameters, replay=Replay(len(parameters) + 37, threads=2))
+    scorer = Scorer(parameters, replay=Replay(threads=2))
     plan = draw_plan("hung chirp", np.random.default_rng(0), seconds=0.6)
     information = scorer.information(plan, scorer.record(plan))
     words = [direction.words for direction in weak_directions(parameters, information)]

@@ -2,6 +2,7 @@
 
 import json
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -109,3 +110,19 @@ def test_files_and_settings_that_cannot_be_read_are_refused(tmp_path):
         load_motion(tmp_path / "walk.npz")
     with pytest.raises(InputError, match=r"expected a file of \.npz"):
         load_motion(tmp_path / "walk.mat")
+
+
+def test_motors_whose_angles_oppose_their_targets_are_named():
+    motion = some_motion()
+    target = np.tile([0.05, 0.8, 0.8], (ROWS, 4)) + 0.05 * motion.target
+    lag = np.tile([-0.1, 0.2, -0.2], 4)
+    gaps = np.where(np.isfinite(motion.angle), 0.0, math.nan)
+    angle = target + lag + gaps
+    right = replace(motion, target=target, angle=angle)
+    right.check_signs()
+    sign = np.ones(12)
+    sign[[1, 11]] = -1.0
+    for wrong in (replace(right, angle=sign * angle), replace(right, target=sign * target)):
+        with pytest.raises(InputError, match="motion walk: angles of FL_outer, BR_inner have the sign opposite"):
+            wrong.check_signs()
+    replace(right, angle=math.nan * angle).check_signs()

@@ -9,7 +9,7 @@ from jumper_warp.cli.main import main
 from jumper_warp.policies.blend import blend
 from jumper_warp.policies.folder import save_policy
 from jumper_warp.policies.policy import Policy
-from jumper_warp.policies.restore import open_policy
+from jumper_warp.policies.runs import open_policy
 from jumper_warp.policies.spec import PolicyError
 
 HORIZONTAL = open_policy("horizontal_jump")

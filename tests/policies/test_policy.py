@@ -8,7 +8,6 @@ import numpy as np
 import onnx
 import onnxruntime
 import pytest
-import safetensors.torch
 import torch
 
 from jumper_warp.policies import folder as folder_module
@@ -154,9 +153,7 @@ def test_policy_comes_back_bitwise(trained, folder, observations):
     assert loaded.interface == trained.interface
     assert loaded.config["env"] == {"seed": 5} and loaded.config["commit"] == "abc"
     assert torch.equal(loaded.act(observations), trained.act(observations))
-    assert {path.name for path in folder.iterdir()} == {
-        "policy.safetensors", "config.json", "policy.onnx", "manifest.json", "README.md",
-    }  # fmt: skip
+    assert {path.name for path in folder.iterdir()} == {"config.json", "policy.onnx", "manifest.json", "README.md"}
 
 
 def test_policy_that_is_there_is_replaced_only_on_request(folder, trained):
@@ -193,7 +190,7 @@ def test_added_figures_are_in_the_manifest(folder):
     add_files(folder, {"metrics.json": b"{}", "README.md": b"how it was made"})
     assert load_policy(folder) and (folder / "README.md").read_bytes() == b"how it was made"
     (folder / "metrics.json").write_bytes(b"{ }")
-    with pytest.raises(PolicyError, match=r"figures\.json: truncated or altered"):
+    with pytest.raises(PolicyError, match=r"metrics\.json: truncated or altered"):
         load_policy(folder)
 
 
@@ -225,20 +222,44 @@ class Payload:
 
 
 def flip_a_bit(folder):
-    data = bytearray((folder / "policy.safetensors").read_bytes())
+    data = bytearray((folder / "policy.onnx").read_bytes())
     data[-1] ^= 1
-    (folder / "policy.safetensors").write_bytes(data)
+    (folder / "policy.onnx").write_bytes(data)
+
+
+def change_model(change):
+    def damage(folder):
+        model = onnx.load(folder / "policy.onnx", load_external_data=False)
+        change(model)
+        reseal(folder, "policy.onnx", model.SerializeToString())
+
+    return damage
 
 
 def change_tensors(**changes):
-    def change(folder):
-        tensors = safetensors.torch.load((folder / "policy.safetensors").read_bytes())
-        tensors |= {name.replace("__", "."): value for name, value in changes.items()}
-        reseal(folder, "policy.safetensors", safetensors.torch.save(tensors))
+    """Replace initialisers by name, or add them."""
 
-    return change
+    def change(model):
+        for name, value in changes.items():
+            kept = [tensor for tensor in model.graph.initializer if tensor.name != name]
+            del model.graph.initializer[:]
+            model.graph.initializer.extend([*kept, onnx.numpy_helper.from_array(np.asarray(value), name)])
+
+    return change_model(change)
 
 
+def stored(model, name):
+    return next(tensor for tensor in model.graph.initializer if tensor.name == name)
+
+
+def keep_outside(model):
+    tensor = stored(model, "actor_0_weight")
+    tensor.data_location = onnx.TensorProto.EXTERNAL
+    tensor.external_data.add(key="location", value="/etc/passwd")
+
+
+F32 = np.float32
+NOT_OURS = "the graph or the metadata of the ONNX file is not what these weights and config.json make"
 REFUSALS = {
     "manifest missing": (lambda f: (f / "manifest.json").unlink(), "manifest.json: cannot be read"),
     "manifest not JSON": (lambda f: (f / "manifest.json").write_text("{"), "manifest.json: not JSON"),
@@ -255,12 +276,16 @@ REFUSALS = {
         "names a file",
     ),
     "manifest of the future": (
-        lambda f: edit_json(f, "manifest.json", lambda m: m.update(schema_version=2)),
-        "schema version 2",
+        lambda f: edit_json(f, "manifest.json", lambda m: m.update(schema_version=3)),
+        "manifest.json: has version 3, this is version 2",
     ),
     "config of the future": (
-        lambda f: edit_json(f, "config.json", lambda c: c.update(schema_version=2)),
-        "config.json: schema version 2",
+        lambda f: edit_json(f, "config.json", lambda c: c.update(schema_version=3)),
+        "config.json: has version 3, this is version 2",
+    ),
+    "older version": (
+        lambda f: edit_json(f, "manifest.json", lambda m: m.update(schema_version=1)),
+        "has version 1, this is version 2; commit c88f715 reads older ones",
     ),
     "folder in place of a file": (
         lambda f: ((f / "policy.onnx").unlink(), (f / "policy.onnx").mkdir()),
@@ -272,18 +297,41 @@ REFUSALS = {
     ),
     "file missing": (lambda f: (f / "policy.onnx").unlink(), "policy.onnx: cannot be read"),
     "truncated": (
-        lambda f: (f / "policy.safetensors").write_bytes((f / "policy.safetensors").read_bytes()[:-4]),
-        "policy.safetensors: truncated or altered",
+        lambda f: (f / "policy.onnx").write_bytes((f / "policy.onnx").read_bytes()[:-4]),
+        "policy.onnx: truncated or altered",
     ),
-    "one bit": (flip_a_bit, "policy.safetensors: truncated or altered"),
-    "empty but sealed": (lambda f: reseal(f, "policy.safetensors", b""), "policy.safetensors: cannot be read"),
+    "one bit": (flip_a_bit, "policy.onnx: truncated or altered"),
+    "empty but sealed": (lambda f: reseal(f, "policy.onnx", b""), "missing or unknown: actor.0.bias"),
+    "truncated but sealed": (
+        lambda f: reseal(f, "policy.onnx", (f / "policy.onnx").read_bytes()[:-4]),
+        "the ONNX file cannot be read",
+    ),
     "layer of another shape": (
-        change_tensors(actor__1__weight=torch.zeros(32, 65)),
+        change_tensors(actor_1_weight=np.zeros((32, 65), F32)),
         r"asks for actor.1.weight of shape \(32, 64\), it has \(32, 65\)",
     ),
-    "layer too many": (change_tensors(actor__3__weight=torch.zeros(12, 12)), "missing or unknown: actor.3.weight"),
-    "not finite": (change_tensors(actor__0__bias=torch.full((64,), math.nan)), "actor.0.bias is not finite"),
-    "no deviation": (change_tensors(normaliser__std=torch.zeros(48)), "std must be positive"),
+    "block that is no matrix": (
+        change_tensors(actor_1_block=np.zeros(3, F32)),
+        r"actor.1.block must be a matrix, it has shape \(3,\)",
+    ),
+    "layer too many": (change_tensors(actor_3_weight=np.zeros((12, 12), F32)), "missing or unknown: actor.3.weight"),
+    "not finite": (change_tensors(actor_0_bias=np.full(64, np.nan, F32)), "actor.0.bias is not finite"),
+    "no deviation": (change_tensors(std=np.zeros(48, F32)), "std must be positive"),
+    "double precision": (change_tensors(std=np.ones(48)), "normaliser.std must hold floating-point numbers of 32 bits"),
+    "fewer numbers than the shape": (
+        change_model(lambda m: stored(m, "actor_0_weight").dims.append(2)),
+        "actor.0.weight does not hold as many numbers as its shape needs",
+    ),
+    "weights in another file": (change_model(keep_outside), NOT_OURS),
+    "another opset": (change_model(lambda m: setattr(m.opset_import[0], "version", 17)), NOT_OURS),
+    "another operator": (change_model(lambda m: setattr(m.graph.node[8], "op_type", "Relu")), NOT_OURS),
+    "another limit": (change_tensors(actions_upper=np.asarray(2.0, F32)), NOT_OURS),
+    "constant too many": (change_tensors(more=np.zeros(1, F32)), NOT_OURS),
+    "metadata of another interface": (change_model(lambda m: m.metadata_props.pop()), NOT_OURS),
+    "config of another interface": (
+        lambda f: edit_json(f, "config.json", lambda c: c["interface"].update(policy_dt=0.02)),
+        NOT_OURS,
+    ),
     "other sizes in config": (
         lambda f: edit_json(f, "config.json", lambda c: c["interface"].update(hidden=[64, 32, 8])),
         "missing or unknown: actor.3",
@@ -311,7 +359,7 @@ def test_unusable_policy_is_refused_in_one_line(folder, case):
 
 def test_pickle_in_place_of_the_weights_is_not_executed(folder, tmp_path):
     trap = tmp_path / "executed"
-    reseal(folder, "policy.safetensors", pickle.dumps(Payload(trap)))
+    reseal(folder, "policy.onnx", pickle.dumps(Payload(trap)))
     with pytest.raises(PolicyError, match="cannot be read"):
         load_policy(folder)
     assert not trap.exists()
@@ -392,3 +440,22 @@ def test_onnx_is_one_file_and_reproducible(folder, trained):
     model = onnx.load(folder / "policy.onnx", load_external_data=False)
     assert all(tensor.data_location == onnx.TensorProto.DEFAULT for tensor in model.graph.initializer)
     assert onnx_bytes(trained) == onnx_bytes(trained)
+
+
+def test_a_block_that_comes_twice_on_the_diagonal_is_stored_once(tmp_path):
+    torch.manual_seed(0)
+    block = torch.randn(8, 16)
+    layers = [(torch.randn(32, 4), torch.randn(32)), (torch.block_diag(block, block), torch.randn(16)),
+              (torch.randn(2, 16), torch.randn(2))]  # fmt: skip
+    policy = Policy(layers, torch.randn(4), torch.rand(4) + 0.1, make_interface(4, 2, (32, 16)))
+    folder = save_policy(tmp_path / "symmetric", policy)
+    model = onnx.load(folder / "policy.onnx")
+    assert tuple(stored(model, "actor_1_block").dims) == (8, 16)
+    assert "actor_1_weight" not in {tensor.name for tensor in model.graph.initializer}
+    for (weight, bias), (own, its) in zip(load_policy(folder).layers, policy.layers, strict=True):
+        assert torch.equal(weight, own) and torch.equal(bias, its)
+    session, obs = onnxruntime.InferenceSession(str(folder / "policy.onnx")), torch.randn(5, 4)
+    np.testing.assert_allclose(session.run(None, {"obs": obs.numpy()})[0], policy.act(obs).numpy(), atol=1e-5)
+    layers[1][0][0, 16] = -0.0  # another bit than the zero that the graph pads with
+    odd = save_policy(tmp_path / "odd", Policy(layers, policy.mean, policy.std, policy.interface))
+    assert stored(onnx.load(odd / "policy.onnx"), "actor_1_weight").dims == [16, 32]

@@ -1,7 +1,7 @@
 import pytest
 
 from jumper_warp.rl import graphs
-from jumper_warp.rl.graphs import Beside, Captured
+from jumper_warp.rl.graphs import Captured
 
 
 @pytest.fixture
@@ -33,12 +33,3 @@ def test_what_cannot_be_captured_runs_eagerly_and_says_so_once(capsys):
     assert capsys.readouterr().err.splitlines() == [
         "not captured as a CUDA graph, training is slower: operation not permitted when stream is capturing"
     ]
-
-
-def test_without_a_second_stream_work_is_done_in_its_place():
-    done, beside = [], Beside(enabled=False)
-    with beside():
-        done.append("first")
-    done.append("second")
-    beside.join()
-    assert done == ["first", "second"]

@@ -49,8 +49,7 @@ def reference_update(model, batch, old_log_std, orders, cfg):
             part = {name: value[samples] for name, value in batch.items()}
             surrogate, value, entropy, asymmetry, kl = reference_losses(model, part, old_log_std, cfg)
             optimiser.zero_grad()
-            weight = cfg.symmetry_coef if cfg.symmetry == "loss" else 0.0
-            loss = surrogate + cfg.value_coef * value - cfg.entropy_coef * entropy + weight * asymmetry
+            loss = surrogate + cfg.value_coef * value - cfg.entropy_coef * entropy
             loss.backward()
             norms = [torch.nn.utils.clip_grad_norm_(each, cfg.max_grad_norm) for each in (actor, critic)]
             group = optimiser.param_groups[0]
@@ -103,7 +102,6 @@ def test_samples_do_not_depend_on_how_many_are_taken_at_a_time(rows):
         {"activation": "tanh"},
         {"clip": 0.02},
         {"symmetry": "actor"},
-        {"symmetry": "loss", "symmetry_coef": 3.0},
     ],
 )
 def test_an_update_equals_autograd_and_adam(change):

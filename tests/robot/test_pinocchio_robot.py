@@ -25,11 +25,6 @@ def moving(robot):
     return q, robot.closed_velocity(q, rng.normal(size=6), 4.0 * rng.normal(size=12))
 
 
-def paw_position(robot, q, leg):
-    pin.forwardKinematics(robot.model, robot.data, q)
-    return robot.data.oMi[robot.model.getJointId(f"{leg}_inner_knee")].act(np.array([0.0, 0.0, -0.3]))
-
-
 def test_mass_and_motor_indices(robot):
     assert pin.computeTotalMass(robot.model) == pytest.approx(14.5)
     names = [robot.model.names[joint] for joint in range(robot.model.njoints)]
@@ -42,14 +37,13 @@ def test_mass_and_motor_indices(robot):
 @pytest.mark.parametrize(("degrees", "depth"), [(0, 0.4716), (45, 0.3718)])
 def test_ankle_depth_below_the_hips(robot, degrees, depth):
     q = robot.configuration((0.0, 0.0, 0.0), LEVEL, np.tile(np.radians([0.0, degrees, degrees]), 4))
-    for leg in ("FL", "BR"):
-        assert -paw_position(robot, q, leg)[2] == pytest.approx(depth, abs=5e-5)
+    assert -robot.paw_positions(q)[:, 2] == pytest.approx(np.full(4, depth), abs=5e-5)
 
 
 def test_lateral_motor_swings_the_paw_outward(robot):
     # at 90 degrees the ankle lies level with the hip, 0.3718 m out, 0.0602 m above it
     q = robot.configuration((0.0, 0.0, 0.0), LEVEL, np.tile(np.radians([90.0, 45.0, 45.0]), 4))
-    assert paw_position(robot, q, "FR")[1:] == pytest.approx([-0.105 - 0.3718, 0.0602], abs=5e-5)
+    assert robot.paw_positions(q)[1, 1:] == pytest.approx([-0.105 - 0.3718, 0.0602], abs=5e-5)
 
 
 def test_configuration_closes_the_loops(moving, robot):
@@ -75,6 +69,16 @@ def test_closed_velocity_is_the_rate_of_the_configuration(moving, robot):
     )
     rates = (ahead - behind)[robot.knee_q] / (2.0 * step)
     assert v[robot.knee_v] == pytest.approx(rates, abs=1e-7)
+
+
+def test_paws_move_at_the_rate_of_their_positions(moving, robot):
+    q, v = moving
+    step = 1e-6
+    ahead, behind = (robot.paw_positions(pin.integrate(robot.model, q, sign * step * v)) for sign in (1, -1))
+    assert robot.paw_velocities(q, v) == pytest.approx((ahead - behind) / (2.0 * step), abs=1e-7)
+    still = robot.closed_velocity(q, np.zeros(6), v[robot.motor_v])
+    rates = np.einsum("kij,kj->ki", robot.paw_jacobians(q), v[robot.motor_v].reshape(4, 3))
+    assert rates == pytest.approx(robot.paw_velocities(q, still), abs=1e-12)
 
 
 def test_robot_at_rest_falls_freely(robot):

@@ -10,13 +10,8 @@ from scipy.optimize import minimize_scalar
 from scipy.spatial.transform import Rotation
 
 from jumper_warp.robot.description import load_description
-from jumper_warp.robot.model import (
-    build_model,
-    build_pinocchio,
-    leg_geometry,
-    leg_geometry_array,
-    standing_configuration,
-)
+from jumper_warp.robot.model import build_model, leg_geometry, leg_geometry_array, standing_configuration
+from jumper_warp.robot.pinocchio_model import build_pinocchio
 from jumper_warp.sim.mujoco import mujoco_solver
 from jumper_warp.sim.precision import float64_kernels
 

@@ -129,7 +129,8 @@ def test_setting_that_would_not_come_back_is_not_saved(value):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda t: t.update(version=1), "the task has version 1, this is version 2"),
+        (lambda t: t.update(version=2), "the task has version 2, this is version 3; commit c88f715 reads older ones"),
+        (lambda t: t.pop("version"), "the task has version None, this is version 3; commit c88f715"),
         (lambda t: t.pop("terminations"), "task.terminations is missing"),
         (lambda t: t.update(wings=2), "task: unknown setting 'wings'"),
         (lambda t: t["rewards"][3].pop("weight"), r"task.rewards\[3\]: a reward needs a weight"),
@@ -245,7 +246,7 @@ def test_mutated_task_is_a_task_or_refused_in_one_line_and_nothing_is_imported(n
     assert set(sys.modules) == loaded and 40 < refused < 200
 
 
-@pytest.mark.parametrize("content", [None, [], "task", 3, math.nan, {}, {"version": 2}, deep(200), {"version": [2]}])
+@pytest.mark.parametrize("content", [None, [], "task", 3, math.nan, {}, {"version": 3}, deep(200), {"version": [2]}])
 def test_what_is_no_object_is_refused(content):
     with pytest.raises(TaskError):
         task_from_json(content)

@@ -45,8 +45,6 @@ def test_targets_are_interpolated_actions():
     assert np.degrees(targets[8]) == pytest.approx(rest + expected)
     assert np.degrees(targets[4]) == pytest.approx(rest + 0.5 * expected)
     assert np.degrees(targets[30]) == pytest.approx(rest)
-    actions = (KNOTS.weights @ x.reshape(-1, 4)).astype(float)
-    assert KNOTS.nearest(actions) == pytest.approx(x[0], abs=1e-12)
 
 
 def test_all_motors_can_be_free():
@@ -110,7 +108,6 @@ def test_work_is_that_of_every_physics_step(jump):
     work = fine.dt * np.maximum(power, 0.0).sum()
     assert work > 50.0
     assert float(motion.positive_work[-1, 0]) == pytest.approx(work, rel=0.03)
-    assert float(motion.copper[-1, 0]) == pytest.approx(fine.dt * (torque**2).sum(), rel=1e-9)
 
 
 def test_a_second_hop_is_not_the_apex():

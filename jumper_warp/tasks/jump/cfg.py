@@ -12,9 +12,8 @@ import warp as wp
 
 from jumper_warp.kernels.jump.ground_draws import EVERY_SIDE, GroundRanges
 from jumper_warp.kernels.jump.reset import JumpLevel, JumpSettings
-from jumper_warp.kernels.jump.reset_draws import ResetRanges, mat_reference
+from jumper_warp.kernels.jump.reset_draws import ResetRanges
 from jumper_warp.kernels.jump.state import vec_schemes
-from jumper_warp.tasks.jump.references import load_reference
 from jumper_warp.utils.checks import check_finite, check_positive
 from jumper_warp.utils.errors import InputError
 
@@ -116,33 +115,6 @@ def ladder(goals: Sequence[Level], starts: Sequence[Pair]) -> tuple[Level, ...]:
 
 
 @dataclass(frozen=True)
-class ReferenceCfg:
-    """Starts along an optimised jump: the base is on its way while pushing off, the paws stand around the start."""
-
-    share: float = 0.0
-    """[1] Of those that push off (`pushing`); the others are on straight lines."""
-    motion: Literal["farthest", "highest"] = "farthest"
-    """Which, a file of assets/motions."""
-    reach: Pair = (0.8, 1.0)
-    """[1] Goals, shares of the distance that it flies or of its apex; the level's do not count."""
-
-    def __post_init__(self) -> None:
-        """Raises InputError: a share or reach out of range, or no such motion."""
-        if not (0.0 <= self.share <= 1.0 and 0.0 < self.reach[0] <= self.reach[1] <= 1.5):
-            raise InputError(f"reference share and reach must be in 0..1 and 0..1.5, got {self.share}, {self.reach}")
-        if self.share > 0.0:
-            load_reference(self.motion)
-
-    def write(self, ranges: Any) -> None:
-        """Write to the kernels' `ResetRanges`."""
-        ranges.reference_share, ranges.reference_reach = self.share, wp.vec2(*self.reach)
-        if self.share > 0.0:
-            motion = load_reference(self.motion)
-            ranges.reference = mat_reference(motion.rows.ravel().tolist())
-            ranges.reference_goal = wp.vec2(motion.distance, motion.apex)
-
-
-@dataclass(frozen=True)
 class ResetCfg:
     """Reference state initialisation: shares of the schemes and ranges of their states; angles in degrees."""
 
@@ -182,8 +154,6 @@ class ResetCfg:
     """[m] Of the straight way to the takeoff, on which the base of those that push off is."""
     push_acceleration: Pair = (10.0, 20.0)
     """[m/s^2] On it."""
-    reference: ReferenceCfg = field(default_factory=ReferenceCfg)
-    """Those that push off along an optimised jump."""
     takeoff_angle: Pair = (50.0, 75.0)
     """[deg] Above the horizon, where the goal names no apex."""
     highest_apex: float = 1.0
@@ -225,7 +195,7 @@ class ResetCfg:
         if not min(shares) >= 0.0 or sum(shares) > 1.0 + 1e-9:
             raise InputError(f"reset shares must be >= 0 and add up to at most 1, got {shares}")
         for name, value in vars(self).items():
-            if name not in ("ground", "shares_of", "reference"):
+            if name not in ("ground", "shares_of"):
                 check_finite(f"reset {name}", *(value if isinstance(value, tuple) else (value,)))
             if isinstance(value, tuple) and not value[0] <= value[1]:
                 raise InputError(f"reset {name} must be (lower, upper), got {value}")
@@ -270,7 +240,7 @@ class ResetCfg:
             "tilt", "forward_pitch", "heading", "takeoff_angle", "takeoff_pitch", "flight_lateral",
             "flight_transversal",
         )  # fmt: skip
-        apart = (*SHARES, "shares_of", "command_delay", "long_wait", "again_delay", "ground", "reference")
+        apart = (*SHARES, "shares_of", "command_delay", "long_wait", "again_delay", "ground")
         for name, value in vars(self).items():
             if name in apart:
                 continue
@@ -279,7 +249,6 @@ class ResetCfg:
                 setattr(ranges, name, wp.vec2(scale * value[0], scale * value[1]))
             else:
                 setattr(ranges, name, scale * value)
-        self.reference.write(ranges)
         ranges.command_delay = round(self.command_delay / step_dt)
         ranges.long_wait = round(self.long_wait / step_dt)
         ranges.again_delay = wp.vec2(*(delay / step_dt for delay in self.again_delay))

@@ -7,7 +7,7 @@ import warp as wp
 from ...actuation.command_filter import FilterParams, filter_leg
 from ...actuation.motors import MotorParams, motor_torque
 from ...scalar import real, vec3
-from ..world.rollout import Actuation, Arrival, Commands, Timing, arrival, commanded, load_filter, row_vec3
+from ..trajectory import Actuation, Arrival, Commands, Timing, arrival, commanded, load_filter, row_vec3
 from .gradients import LATENCY_GRADIENT, MOTOR_GRADIENT, Gradients, add_entry, add_motor, add_vec3
 
 wp.set_module_options({"enable_backward": False})

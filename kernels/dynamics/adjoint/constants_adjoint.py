@@ -4,16 +4,14 @@ import warp as wp
 
 from ...actuation.motors import MotorParams
 from ...scalar import real, vec3
-from ...state import BaseState
 from ..step import Robot, StepSettings, load_leg
-from ..world.rollout import Actuation, Commands, Rows, Timing, load_world_motor, row_vec3
+from ..trajectory import Actuation, Commands, Rows, Timing, load_world_motor, row_vec3
 from .command_adjoint import add_motor_constants, add_offsets, motor_gradient
 from .gradients import Gradients, ThreadSums
 from .leg_adjoint import add_leg_constants, held_base, leg_gradient
 from .leg_record import ANGLES, FILTER, RATES, LegRecord, get_base, get_base_weights, get_law, get_leg_weights, get_vec
-from .rollout_adjoint import everything
+from .rollout_adjoint import generate_adjoints
 from .rollout_legs_adjoint import Span, first_entry
-from .virtual_power import BaseFactors, BaseSeeds, LegFactors
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
 
@@ -138,13 +136,4 @@ def motor_constants_kernel(
         add_offsets(of_leg, leg, by_filter)
 
 
-@wp.kernel(enable_backward=True)
-def adjoints_kernel(
-    factors: LegFactors, base: BaseFactors, base_seeds: BaseSeeds, robot: Robot, actuation: Actuation, numbers: Rows,
-    state: BaseState, sums: wp.array(dtype=real),
-):  # fmt: skip
-    """Never launched: a kernel with a backward pass makes Warp generate the adjoints of all that it calls."""
-    world = wp.tid()
-    launched = int(0)  # Warp makes the adjoints anyway, and the compiler drops this kernel's own code
-    if launched > 0:
-        sums[world] = everything(factors, base, base_seeds, robot, actuation, numbers, state, world)
+ADJOINTS = generate_adjoints(__name__)

@@ -36,7 +36,7 @@ from ...layout import (
 from ...scalar import real, vec3
 from ..inertia import MassMoments
 from ..leg_dynamics import LegMasses
-from ..world.rollout import FILTER_HORIZON, FILTER_ROWS, FILTER_SPEED
+from ..trajectory import FILTER_HORIZON, FILTER_ROWS, FILTER_SPEED
 
 wp.set_module_options({"enable_backward": False})
 

@@ -23,7 +23,7 @@ from ..inertia import MassMoments
 from ..leg_dynamics import LegMasses
 from ..parameters import load_moments, load_spring, load_stops, load_vec3
 from ..step import LegParams, Robot, base_system, hold_base, leg_terms
-from ..world.rollout import Rows, row_vec3
+from ..trajectory import Rows, row_vec3
 from .gradients import (
     ThreadSums,
     add_entry,

@@ -6,7 +6,7 @@ from ...scalar import mat33, real, vec3
 from ...state import BaseState
 from ..base_dynamics import BaseInverse, LegSolve
 from ..contact import SEPARATE
-from ..world.rollout import row_quat, row_vec3, store_row_vec3
+from ..trajectory import row_quat, row_vec3, store_row_vec3
 from .virtual_power import BaseSeeds
 
 wp.set_module_options({"enable_backward": False})

@@ -11,11 +11,11 @@ from ...layout import BASE
 from ...scalar import quat, real, vec3
 from ...state import BaseState, base_com
 from ..contact import PawContact
-from ..contact_laws import PawLaw
 from ..parameters import load_moments, load_spring, load_stops
 from ..step import LegParams, Robot, StepSettings, load_leg
-from ..world.rollout import (
+from ..trajectory import (
     Actuation,
+    Arrival,
     Commands,
     Rows,
     Timing,
@@ -29,6 +29,8 @@ from ..world.rollout import (
     store_row_vec3,
 )
 from .command_adjoint import (
+    FilterAdjoint,
+    MotorAdjoint,
     add_motor_constants,
     add_offsets,
     add_targets,
@@ -37,16 +39,11 @@ from .command_adjoint import (
     weighed_filter,
 )
 from .gradients import GRADIENT_ROWS, Gradients, add_com, add_filter
-from .step_adjoint import StepRecord, replay_step, reverse_step
+from .multipliers import LegReverse, StepPlace, StepRecord, replay_step
+from .step_adjoint import reverse_step
 from .virtual_power import BaseFactors, BaseSeeds, LegFactors, base_action, leg_action, turned
 
 wp.set_module_options({"enable_backward": False})
-
-
-@wp.func
-def wrench_part(commands: Commands, t: int, first: int, world: int) -> vec3:
-    """Return force (first = 0) or moment (first = 3) on the base in a policy step, world axes."""
-    return row_vec3(commands.wrench, t, first, world)
 
 
 @wp.func
@@ -133,6 +130,106 @@ def enter_row(robot: Robot, world: int, base: BaseState, seeds: RowSeeds) -> Row
     return adj
 
 
+@wp.func
+def add_motor_rows(legs: wp.array(dtype=LegReverse), seeds: Rows, row: int, world: int):
+    """Add the gradient of the number itself by a row's angles and rates."""
+    for k in range(legs.shape[0]):
+        if seeds.q.shape[0] > 0:
+            legs[k].angles = legs[k].angles + row_vec3(seeds.q, row, 7 + 3 * k, world)
+        if seeds.qd.shape[0] > 0:
+            legs[k].rates = legs[k].rates + row_vec3(seeds.qd, row, 6 + 3 * k, world)
+
+
+@wp.func
+def load_parts(
+    robot: Robot,
+    actuation: Actuation,
+    world: int,
+    params: wp.array(dtype=LegParams),
+    motors: wp.array(dtype=MotorParams),
+):
+    """Write the parameters of a world's legs and motors."""
+    for k in range(params.shape[0]):
+        params[k] = load_leg(robot, world, k)
+    for i in range(motors.shape[0]):
+        motors[i] = load_world_motor(actuation, i, world)
+
+
+@wp.func
+def replay_row(
+    robot: Robot, params: wp.array(dtype=LegParams), place: StepPlace, rows: Rows, row: int, every: int, com: vec3,
+    record: StepRecord,
+):  # fmt: skip
+    """Make the steps from a row to the next one again."""
+    at = place
+    record.base[at.world, 0] = load_row_base(rows, row, at.world, com)
+    for k in range(record.angles.shape[2]):
+        record.angles[at.world, 0, k] = row_vec3(rows.q, row, 7 + 3 * k, at.world)
+        record.rates[at.world, 0, k] = row_vec3(rows.qd, row, 6 + 3 * k, at.world)
+    for i in range(every):
+        at.step = row * every + i
+        at.entry = i
+        replay_step(robot, params, at, rows, record)
+
+
+@wp.func
+def add_wrench(gradients: Gradients, t: int, world: int, force: vec3, moment: vec3):
+    """Add to the gradient by the wrench on the base in a policy step."""
+    store_row_vec3(gradients.wrench, t, 0, world, row_vec3(gradients.wrench, t, 0, world) + force)
+    store_row_vec3(gradients.wrench, t, 3, world, row_vec3(gradients.wrench, t, 3, world) + moment)
+
+
+@wp.func
+def add_motor_adjoint(
+    found: MotorAdjoint, arrived: Arrival, at: StepPlace, motor: int, seeds: Rows, gradients: Gradients,
+    legs: wp.array(dtype=LegReverse), sums: wp.array(dtype=real),
+):  # fmt: skip
+    """Add the gradients by what a motor's torque in a step depends on."""
+    k = motor / 3
+    c = motor - 3 * k
+    seed = legs[k].torque[c]
+    if seeds.torque.shape[0] > 0:
+        seed += seeds.torque[at.step, motor, at.world]
+    add_targets(gradients, arrived, motor, at.world, seed * found.target)
+    add_motor_constants(sums, sums, motor, seed, found)
+    angles = legs[k].angles
+    rates = legs[k].rates
+    angles[c] += seed * found.angle
+    rates[c] += seed * found.rate
+    legs[k].angles = angles
+    legs[k].rates = rates
+
+
+@wp.func
+def add_filter_adjoint(
+    found: FilterAdjoint, t: int, k: int, world: int, gradients: Gradients, legs: wp.array(dtype=LegReverse),
+    sums: wp.array(dtype=real),
+):  # fmt: skip
+    """Add the gradients by what a leg's filtered targets of a policy step depend on."""
+    store_row_vec3(gradients.target, t, 3 * k, world, found.target)
+    add_offsets(sums, k, found.angles)
+    add_filter(sums, found.constants)
+    legs[k].angles = legs[k].angles + found.angles
+    legs[k].rates = legs[k].rates + found.rates
+
+
+@wp.func
+def store_start(gradients: Gradients, world: int, entries: RowSeeds, legs: wp.array(dtype=LegReverse)):
+    """Write the gradient by the first row."""
+    for i in range(3):
+        gradients.q[i, world] = entries.pos[i]
+        gradients.qd[i, world] = entries.lin[i]
+        gradients.qd[3 + i, world] = entries.ang[i]
+    for i in range(4):
+        gradients.q[3 + i, world] = entries.quat[i]
+    for k in range(legs.shape[0]):
+        angles = legs[k].angles
+        rates = legs[k].rates
+        for i in range(3):
+            gradients.q[7 + 3 * k + i, world] = angles[i]
+            gradients.qd[6 + 3 * k + i, world] = rates[i]
+
+
 @wp.kernel
 def reverse_kernel(
     # in
@@ -150,101 +247,58 @@ def reverse_kernel(
 ):
     """Add the gradient of a number, given that by the trajectory in `seeds`, to `gradients`; one thread per world."""
     world = settings.first + wp.tid()
-    dt = settings.dt
-    angle_adj = wp.zeros(shape=(4,), dtype=vec3)
-    rate_adj = wp.zeros(shape=(4,), dtype=vec3)
-    torque_adj = wp.zeros(shape=(4,), dtype=vec3)
-    virtual = wp.zeros(shape=(4,), dtype=vec3)
-    paw_seeds = wp.zeros(shape=(4,), dtype=vec3)
+    legs = wp.zeros(shape=(4,), dtype=LegReverse)
     contacts = wp.zeros(shape=(4,), dtype=PawContact)
-    laws = wp.zeros(shape=(4,), dtype=PawLaw)
     matrix = wp.zeros(shape=(12, 12), dtype=real)
     vector = wp.zeros(shape=(12,), dtype=real)
     sums = wp.zeros(shape=(GRADIENT_ROWS,), dtype=real)
     params = wp.zeros(shape=(4,), dtype=LegParams)
     motors = wp.zeros(shape=(12,), dtype=MotorParams)
-    for k in range(params.shape[0]):
-        params[k] = load_leg(robot, world, k)
-    for i in range(motors.shape[0]):
-        motors[i] = load_world_motor(actuation, i, world)
-    late = actuation.latency[world] / dt
+    load_parts(robot, actuation, world, params, motors)
+    late = actuation.latency[world] / settings.dt
     last = timing.steps * timing.substeps / timing.every
     entries = add_row_seeds(RowSeeds(), seeds, last, world)
-    for k in range(laws.shape[0]):
-        if seeds.q.shape[0] > 0:
-            angle_adj[k] = row_vec3(seeds.q, last, 7 + 3 * k, world)
-        if seeds.qd.shape[0] > 0:
-            rate_adj[k] = row_vec3(seeds.qd, last, 6 + 3 * k, world)
+    add_motor_rows(legs, seeds, last, world)
     com = base_com(robot.table, world)
+    at = StepPlace()
+    at.dt = settings.dt
+    at.world = world
     for back in range(last):
         row = last - 1 - back
-        first = row * timing.every
-        t = first / timing.substeps
-        force = wrench_part(commands, t, 0, world)
-        moment = wrench_part(commands, t, 3, world)
-        record.base[world, 0] = load_row_base(rows, row, world, com)
-        for k in range(laws.shape[0]):
-            record.angles[world, 0, k] = row_vec3(rows.q, row, 7 + 3 * k, world)
-            record.rates[world, 0, k] = row_vec3(rows.qd, row, 6 + 3 * k, world)
-        for i in range(timing.every):
-            replay_step(robot, params, dt, world, force, moment, rows, first + i, i, record)
+        t = row * timing.every / timing.substeps
+        at.force = row_vec3(commands.wrench, t, 0, world)
+        at.moment = row_vec3(commands.wrench, t, 3, world)
+        replay_row(robot, params, at, rows, row, timing.every, com, record)
         end = enter_row(robot, world, record.base[world, timing.every], entries)
         adj = end.base
         for j in range(timing.every):
-            i = timing.every - 1 - j
-            adj = reverse_step(
-                robot, params, dt, world, t, force, moment, commands.impulse, rows, seeds, first + i, i, record, adj,
-                angle_adj, rate_adj, torque_adj, contacts, laws, paw_seeds, matrix, vector, virtual, sums,
-                gradients.wrench,
-            )  # fmt: skip
-            for k in range(laws.shape[0]):
-                angles = record.angles[world, i, k]
-                rates = record.rates[world, i, k]
-                angle_sum = angle_adj[k]
-                rate_sum = rate_adj[k]
-                for c in range(wp.static(3)):
-                    seed = torque_adj[k][c]
-                    if seeds.torque.shape[0] > 0:
-                        seed += seeds.torque[first + i, 3 * k + c, world]
-                    by_motor = motor_gradient(
-                        motors[3 * k + c], late, commands, safe, timing, dt, first + i, 3 * k + c, world, angles[c],
-                        rates[c],
-                    )  # fmt: skip
-                    arrived = arrival(first + i, timing.substeps, late)
-                    add_targets(gradients, arrived, 3 * k + c, world, seed * by_motor.target)
-                    add_motor_constants(sums, sums, 3 * k + c, seed, by_motor)
-                    angle_sum[c] += seed * by_motor.angle
-                    rate_sum[c] += seed * by_motor.rate
-                angle_adj[k] = angle_sum
-                rate_adj[k] = rate_sum
+            at.entry = timing.every - 1 - j
+            at.step = row * timing.every + at.entry
+            by_step = reverse_step(
+                robot, params, at, commands.impulse, rows, seeds, record, adj, legs, contacts, matrix, vector, sums
+            )
+            adj = by_step.base
+            add_wrench(gradients, t, world, by_step.force, by_step.moment)
+            arrived = arrival(at.step, timing.substeps, late)
+            for i in range(motors.shape[0]):
+                angle = record.angles[world, at.entry, i / 3][i % 3]
+                rate = record.rates[world, at.entry, i / 3][i % 3]
+                by_motor = motor_gradient(
+                    motors[i], late, commands, safe, timing, at.dt, at.step, i, world, angle, rate
+                )  # fmt: skip
+                add_motor_adjoint(by_motor, arrived, at, i, seeds, gradients, legs, sums)
         entries = add_row_seeds(leave_row(rows, robot, row, world, adj, end.com), seeds, row, world)
-        for k in range(laws.shape[0]):
-            if first == t * timing.substeps:
-                by_leg = filter_gradient(
+        if row * timing.every == t * timing.substeps:
+            for k in range(legs.shape[0]):
+                by_filter = filter_gradient(
                     commands, actuation, t, k, world, record.angles[world, 0, k], record.rates[world, 0, k], gradients
                 )
-                store_row_vec3(gradients.target, t, 3 * k, world, by_leg.target)
-                add_offsets(sums, k, by_leg.angles)
-                add_filter(sums, by_leg.constants)
-                angle_adj[k] = angle_adj[k] + by_leg.angles
-                rate_adj[k] = rate_adj[k] + by_leg.rates
-            if seeds.q.shape[0] > 0:
-                angle_adj[k] = angle_adj[k] + row_vec3(seeds.q, row, 7 + 3 * k, world)
-            if seeds.qd.shape[0] > 0:
-                rate_adj[k] = rate_adj[k] + row_vec3(seeds.qd, row, 6 + 3 * k, world)
+                add_filter_adjoint(by_filter, t, k, world, gradients, legs, sums)
+        add_motor_rows(legs, seeds, row, world)
     add_com(sums, robot.table[BASE, world], com, entries.com)
     for i in range(sums.shape[0]):
         gradients.parameters[i, world] = sums[i]
-    for i in range(3):
-        gradients.q[i, world] = entries.pos[i]
-        gradients.qd[i, world] = entries.lin[i]
-        gradients.qd[3 + i, world] = entries.ang[i]
-    for i in range(4):
-        gradients.q[3 + i, world] = entries.quat[i]
-    for k in range(4):
-        for i in range(3):
-            gradients.q[7 + 3 * k + i, world] = angle_adj[k][i]
-            gradients.qd[6 + 3 * k + i, world] = rate_adj[k][i]
+    store_start(gradients, world, entries, legs)
 
 
 @wp.func
@@ -252,7 +306,7 @@ def everything(
     factors: LegFactors, base: BaseFactors, base_seeds: BaseSeeds, robot: Robot, actuation: Actuation, numbers: Rows,
     state: BaseState, world: int,
 ) -> real:  # fmt: skip
-    """Return the sum of all functions whose gradients the reverse pass takes; see `adjoints_kernel`."""
+    """Return the sum of all functions whose gradients the reverse pass takes; see `generate_adjoints`."""
     params = load_leg(robot, world, 0)
     v = row_vec3(numbers.q, 0, 0, world)
     q = row_quat(numbers.q, 0, 3, world)
@@ -274,16 +328,24 @@ def everything(
     )
 
 
-@wp.kernel(enable_backward=True)
-def adjoints_kernel(
-    factors: LegFactors, base: BaseFactors, base_seeds: BaseSeeds, robot: Robot, actuation: Actuation, numbers: Rows,
-    state: BaseState, sums: wp.array(dtype=real),
-):  # fmt: skip
-    """Never launched: a kernel with a backward pass makes Warp generate the adjoints of all that it calls.
+def generate_adjoints(module: str) -> wp.Kernel:
+    """Make Warp generate, in a module of kernels, the adjoints of all functions that the reverse pass differentiates.
 
-    `wp.grad` alone leaves out those of functions which something else called first.
+    `wp.grad` alone leaves out those of functions which something else called first. A kernel with a backward pass has
+    them all; it is never launched.
     """
-    world = wp.tid()
-    launched = int(0)  # Warp makes the adjoints anyway, and the compiler drops this kernel's own code
-    if launched > 0:
-        sums[world] = everything(factors, base, base_seeds, robot, actuation, numbers, state, world)
+
+    @wp.kernel(enable_backward=True, module=wp.get_module(module))
+    def adjoints_kernel(
+        factors: LegFactors, base: BaseFactors, base_seeds: BaseSeeds, robot: Robot, actuation: Actuation,
+        numbers: Rows, state: BaseState, sums: wp.array(dtype=real),
+    ):  # fmt: skip
+        world = wp.tid()
+        launched = int(0)  # Warp makes the adjoints anyway, and the compiler drops this kernel's own code
+        if launched > 0:
+            sums[world] = everything(factors, base, base_seeds, robot, actuation, numbers, state, world)
+
+    return adjoints_kernel
+
+
+ADJOINTS = generate_adjoints(__name__)

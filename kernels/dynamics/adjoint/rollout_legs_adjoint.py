@@ -10,9 +10,9 @@ from ...actuation.motors import MotorParams
 from ...lanes import meet
 from ...layout import BASE, GRAVITY
 from ...scalar import quat, real, vec3
-from ...state import BaseState, base_com
+from ...state import base_com
 from ..step import Robot, StepSettings, load_leg
-from ..world.rollout import (
+from ..trajectory import (
     Actuation,
     Commands,
     Rows,
@@ -39,8 +39,7 @@ from .leg_record import (
     put_slopes,
     put_vec,
 )
-from .rollout_adjoint import RowSeeds, add_row_seeds, enter_row, everything, leave_row, wrench_part
-from .virtual_power import BaseFactors, BaseSeeds, LegFactors
+from .rollout_adjoint import RowSeeds, add_row_seeds, enter_row, generate_adjoints, leave_row
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
 
@@ -85,8 +84,8 @@ def replay_legs_kernel(
     first = row * timing.every
     t = first / timing.substeps
     own = load_leg(robot, world, leg)
-    force = wrench_part(commands, t, 0, world)
-    moment = wrench_part(commands, t, 3, world)
+    force = row_vec3(commands.wrench, t, 0, world)
+    moment = row_vec3(commands.wrench, t, 3, world)
     put_base(record, at, world, load_row_base(rows, row, world, base_com(robot.table, world)))
     put_vec(record, at, ANGLES, world, leg, row_vec3(rows.q, row, 7 + 3 * leg, world))
     put_vec(record, at, RATES, world, leg, row_vec3(rows.qd, row, 6 + 3 * leg, world))
@@ -161,8 +160,8 @@ def reverse_legs_kernel(
         at = first_entry(timing, span, row)
         first = row * timing.every
         t = first / timing.substeps
-        force = wrench_part(commands, t, 0, world)
-        moment = wrench_part(commands, t, 3, world)
+        force = row_vec3(commands.wrench, t, 0, world)
+        moment = row_vec3(commands.wrench, t, 3, world)
         end = enter_row(robot, world, get_base(record, at + timing.every, world), entries)
         adj.base = end.base
         adj.force = vec3(real(0.0))
@@ -221,13 +220,4 @@ def reverse_legs_kernel(
         add_vec3(of_leg, GRAVITY, adj.gravity)
 
 
-@wp.kernel(enable_backward=True)
-def adjoints_kernel(
-    factors: LegFactors, base: BaseFactors, base_seeds: BaseSeeds, robot: Robot, actuation: Actuation, numbers: Rows,
-    state: BaseState, sums: wp.array(dtype=real),
-):  # fmt: skip
-    """Never launched: a kernel with a backward pass makes Warp generate the adjoints of all that it calls."""
-    world = wp.tid()
-    launched = int(0)  # Warp makes the adjoints anyway, and the compiler drops this kernel's own code
-    if launched > 0:
-        sums[world] = everything(factors, base, base_seeds, robot, actuation, numbers, state, world)
+ADJOINTS = generate_adjoints(__name__)

@@ -19,9 +19,9 @@ from ...scalar import quat, real, vec2, vec3, vec6
 from ...terrain.ground import Ground, floor_distance, floor_normal
 from ..base_motion import exp_rotation
 from ..contact import SEPARATE, contact_jacobian, target_normal_velocity
+from ..contact_laws import contact_residual
 from ..inertia import MassMoments, inertia_mul, rotate_x, rotate_y
 from ..leg_dynamics import LegMasses, leg_pose, paw_kinematics
-from .differentiable import contact_residual
 
 
 @wp.struct

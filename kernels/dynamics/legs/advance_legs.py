@@ -147,7 +147,7 @@ def advance_leg(
                 pressed = pressed_stops(rows, old.rates, real(0.0), 0)
     spring = load_spring(robot.table, leg, world)
     terms = leg_terms(own, spring, old.angles, old.rates, torque, rows, pressed, base.ang, g, dt)
-    wrench = base_wrench(drive, world)
+    wrench = base_wrench(drive.joint_f, drive.body_f, world)
     force = vec3(wrench[0], wrench[1], wrench[2])
     moment = vec3(wrench[3], wrench[4], wrench[5])
     share = add_leg(BaseSystem(), terms.dynamics, terms.solve)

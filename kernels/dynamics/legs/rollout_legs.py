@@ -9,7 +9,7 @@ from ...scalar import real, vec3
 from ...state import base_com
 from ..drive import Drive, LegDrive
 from ..step import Robot, StepSettings, load_leg
-from ..world.rollout import (
+from ..trajectory import (
     Actuation,
     Commands,
     Rows,

@@ -25,6 +25,20 @@ wp.set_module_options({"enable_backward": False})
 
 
 @wp.struct
+class LegStep:
+    """A leg's motors (lateral, outer, inner), and what a step writes of the leg."""
+
+    angles: vec3  # [rad] at the start of the step
+    rates: vec3  # [rad/s]
+    torque: vec3  # [N m]
+    end: vec3  # [rad/s] at the end of the step
+    rows: StopRows
+    pressed: int  # set of hard stops
+    solve: LegSolve
+    paw: PawKinematics
+
+
+@wp.struct
 class StepSolution:
     """Velocities of the base at the end of a step, in the body axes of its start, and how contact came to them."""
 
@@ -37,10 +51,7 @@ class StepSolution:
 @wp.func
 def solve_with_stops(
     robot: Robot, settings: StepSettings, world: int, base: BaseState, force: vec3, moment: vec3, block: BlockLaw,
-    impulse: wp.array2d(dtype=vec3), angles: wp.array(dtype=vec3), rates: wp.array(dtype=vec3),
-    torques: wp.array(dtype=vec3), rows: wp.array(dtype=StopRows), pressed: wp.array(dtype=int),
-    legs: wp.array(dtype=LegSolve), paws: wp.array(dtype=PawKinematics), contacts: wp.array(dtype=PawContact),
-    ends: wp.array(dtype=vec3),
+    impulse: wp.array2d(dtype=vec3), legs: wp.array(dtype=LegStep), contacts: wp.array(dtype=PawContact),
 ) -> StepSolution:  # fmt: skip
     """Solve a step with given sets of pressed stops; see `solve_step`."""
     dt = settings.dt
@@ -49,9 +60,11 @@ def solve_with_stops(
     for k in range(legs.shape[0]):
         own = load_leg(robot, world, k)
         spring = load_spring(robot.table, k, world)
-        terms = leg_terms(own, spring, angles[k], rates[k], torques[k], rows[k], pressed[k], base.ang, g, dt)
-        legs[k] = terms.solve
-        paws[k] = terms.paw
+        terms = leg_terms(
+            own, spring, legs[k].angles, legs[k].rates, legs[k].torque, legs[k].rows, legs[k].pressed, base.ang, g, dt
+        )
+        legs[k].solve = terms.solve
+        legs[k].paw = terms.paw
         system = add_leg(system, terms.dynamics, terms.solve)
     inverse = hold_base(robot, world, invert(system))
     lin_acc = solve_lin(inverse, system.force, system.moment)
@@ -59,15 +72,17 @@ def solve_with_stops(
     lin = wp.quat_rotate_inv(base.quat, base.lin) + dt * lin_acc
     ang = base.ang + dt * ang_acc
     for k in range(legs.shape[0]):
-        ends[k] = rates[k] + dt * motor_acceleration(legs[k], lin_acc, ang_acc)
+        end = legs[k].rates + dt * motor_acceleration(legs[k].solve, lin_acc, ang_acc)
+        legs[k].end = end
         contacts[k] = paw_contact(
-            robot, world, k, base, lin, ang, ends[k], rates[k], impulse[k, world], pressed[k], paws[k], legs[k],
-            inverse, block, dt,
+            robot, world, k, base, lin, ang, end, legs[k].rates, impulse[k, world], legs[k].pressed, legs[k].paw,
+            legs[k].solve, inverse, block, dt,
         )  # fmt: skip
     change = solve_contacts(contacts, block, settings.max_sweeps, settings.tolerance)
     for k in range(legs.shape[0]):
-        push = legs[k].inverse * (wp.transpose(contacts[k].jacobian) * contacts[k].impulse)
-        ends[k] += push - legs[k].to_lin * change.lin - legs[k].to_ang * change.ang
+        solve = legs[k].solve
+        push = solve.inverse * (wp.transpose(contacts[k].jacobian) * contacts[k].impulse)
+        legs[k].end = legs[k].end + (push - solve.to_lin * change.lin - solve.to_ang * change.ang)
     solution = StepSolution()
     solution.lin = lin + change.lin
     solution.ang = ang + change.ang
@@ -76,17 +91,16 @@ def solve_with_stops(
 
 
 @wp.func
-def revise_stops(
-    rows: wp.array(dtype=StopRows), ends: wp.array(dtype=vec3), slack: real, sets: int, pressed: wp.array(dtype=int)
-) -> bool:
+def revise_stops(legs: wp.array(dtype=LegStep), slack: real, sets: int) -> bool:
     """Change the sets of pressed stops to what the rates that they led to ask for; returns whether they changed."""
     changed = bool(False)
-    for k in range(pressed.shape[0]):
-        wanted = revised_stops(rows[k], ends[k], slack, pressed[k], sets)
-        if wanted != pressed[k] and not (changed and one_by_one(sets)):
+    for k in range(legs.shape[0]):
+        pressed = legs[k].pressed
+        wanted = revised_stops(legs[k].rows, legs[k].end, slack, pressed, sets)
+        if wanted != pressed and not (changed and one_by_one(sets)):
             if one_by_one(sets):
-                wanted = change_one(pressed[k], wanted)
-            pressed[k] = wanted
+                wanted = change_one(pressed, wanted)
+            legs[k].pressed = wanted
             changed = True
     return changed
 
@@ -94,33 +108,28 @@ def revise_stops(
 @wp.func
 def solve_step(
     robot: Robot, settings: StepSettings, world: int, base: BaseState, force: vec3, moment: vec3, block: BlockLaw,
-    impulse: wp.array2d(dtype=vec3), angles: wp.array(dtype=vec3), rates: wp.array(dtype=vec3),
-    torques: wp.array(dtype=vec3), rows: wp.array(dtype=StopRows), pressed: wp.array(dtype=int),
-    legs: wp.array(dtype=LegSolve), paws: wp.array(dtype=PawKinematics), contacts: wp.array(dtype=PawContact),
-    ends: wp.array(dtype=vec3),
+    impulse: wp.array2d(dtype=vec3), legs: wp.array(dtype=LegStep), contacts: wp.array(dtype=PawContact),
 ) -> StepSolution:  # fmt: skip
     """Solve a step of one world, and write every leg's pressed stops, contact and motor rates at the end of the step.
 
     force [N], moment [N m]: from outside at the base's com, world axes. impulse: first guess [N s], world frame,
-    (4, num_worlds). angles, rates, torques: of the motors at the start [rad], [rad/s], [N m]. Arrays of legs have
-    shape (4,); rows, legs and paws are written too.
+    (4, num_worlds). legs, contacts: local to the thread, shape (4,); of the legs the motors' angles, rates and torques
+    are read, and all else is written.
 
     The stops that the rates at the start would press are tried first.
     """
     dt = settings.dt
-    for k in range(pressed.shape[0]):
-        rows[k] = stop_rows(load_stops(robot.table, k, world), angles[k], dt)
-        pressed[k] = pressed_stops(rows[k], rates[k], real(0.0), 0)
+    for k in range(legs.shape[0]):
+        rows = stop_rows(load_stops(robot.table, k, world), legs[k].angles, dt)
+        legs[k].rows = rows
+        legs[k].pressed = pressed_stops(rows, legs[k].rates, real(0.0), 0)
     slack = SLACK * settings.tolerance
     solution = StepSolution()
     sets = int(0)
     working = bool(True)
     while working:
-        solution = solve_with_stops(
-            robot, settings, world, base, force, moment, block, impulse, angles, rates, torques, rows, pressed, legs,
-            paws, contacts, ends,
-        )  # fmt: skip
+        solution = solve_with_stops(robot, settings, world, base, force, moment, block, impulse, legs, contacts)
         sets += 1
-        working = sets < MAX_SETS and revise_stops(rows, ends, slack, sets, pressed)
+        working = sets < MAX_SETS and revise_stops(legs, slack, sets)
     solution.sets = sets
     return solution

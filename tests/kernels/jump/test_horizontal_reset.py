@@ -8,8 +8,6 @@ from jump_helpers import DEG, SCHEMES, begin_by, edit_episodes, episodes_of, mak
 from jump_starts import PAW_RADIUS, PLACES, Starts, covers, paws_and_velocities
 from jumper_warp.kernels.jump.state import FLIGHT, LANDED, STANCE
 from jumper_warp.registry import make_task
-from jumper_warp.tasks.jump.cfg import ReferenceCfg
-from jumper_warp.tasks.jump.references import load_reference
 from solver_helpers import MOTOR_Q, MOTOR_V
 
 N = 4096
@@ -194,36 +192,6 @@ def test_joints_of_a_push_move_so_that_the_paws_do_not(env):
     worlds = np.flatnonzero(episodes_of(env)["scheme"] == SCHEMES.index("pushing"))[:40]
     _, velocities = paws_and_velocities(env, worlds)
     assert np.abs(velocities).max() < 1e-3 and np.abs(env.sim.joint_qd()[worlds, :3]).max() > 1.0
-
-
-def test_starts_along_a_reference_push_off_as_it_does(env):
-    """Base and velocity are on the reference, turned to the heading; paws rest on the ground; the goal is in reach."""
-    motion, cfg = load_reference("farthest"), ReferenceCfg(share=1.0, motion="farthest", reach=(0.9, 1.0))
-    found = Starts(env, "pushing", exact=True, reference=cfg, tilt=0.0)
-    assert found.fallbacks < 0.2
-    share = np.interp(found.pos[:, 2], motion.rows[:, 1], np.arange(len(motion.rows)))
-    expected = np.stack([np.interp(share, np.arange(len(motion.rows)), column) for column in motion.rows.T], axis=1)
-    assert np.ptp(share) > 5.0
-    ahead, aside = found.split(found.pos * [1.0, 1.0, 0.0])
-    np.testing.assert_allclose(ahead, expected[:, 0], atol=0.01)
-    np.testing.assert_allclose(aside, 0.0, atol=1e-5)
-    pitch = (found.heading.inv() * Rotation.from_quat(found.q[:, 3:7])).as_euler("ZYX")[:, 1]
-    np.testing.assert_allclose(pitch, expected[:, 2], atol=0.02)
-    np.testing.assert_allclose(found.distance / motion.distance, 0.95, atol=0.0501)
-    np.testing.assert_allclose(found.paws[..., 2], PAW_RADIUS, atol=2e-4)
-    worlds = np.flatnonzero(found.drawn)[:40]
-    _, velocities = paws_and_velocities(env, worlds)
-    assert np.abs(velocities).max() < 2e-3 and np.abs(env.sim.joint_qd()[worlds, 3:6]).max() > 1.0
-
-
-def test_a_reference_changes_no_start_while_its_share_is_zero(env):
-    states = []
-    for cfg in (ReferenceCfg(), ReferenceCfg(share=1e-9, motion="farthest")):
-        begin_by(env, only("pushing", resets_of(env), reference=cfg))
-        env.worlds.clock.fill_(7)
-        env.reset()
-        states.append(env.sim.joint_qd())
-    assert np.array_equal(*states)
 
 
 # ---------------------------------------------------------------- shares of time

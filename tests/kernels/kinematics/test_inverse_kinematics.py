@@ -11,7 +11,8 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from jumper_warp.robot.description import load_description
-from jumper_warp.robot.model import build_pinocchio, leg_geometry, leg_geometry_array
+from jumper_warp.robot.model import leg_geometry, leg_geometry_array
+from jumper_warp.robot.pinocchio_model import build_pinocchio
 from jumper_warp.sim.precision import float64_kernels
 
 LATERAL = (-50.0, 110.0)
@@ -22,7 +23,7 @@ ROBOTS = 200
 
 
 def make_leg_kernel(package):
-    """Return a kernel that evaluates the functions of one leg at given joint angles."""
+    """Return a kernel that evaluates the functions of one leg at given joint angles and ankle velocities."""
     names = ("kinematics.five_bar", "kinematics.geometry", "scalar", "kinematics.leg")
     five_bar, geometry, scalar, leg_kinematics = (importlib.import_module(f"{package}.{name}") for name in names)
     real, vec2, vec3 = scalar.real, scalar.vec2, scalar.vec3
@@ -31,24 +32,25 @@ def make_leg_kernel(package):
     def leg_kernel(
         legs: wp.array(dtype=geometry.LegGeometry),
         motors: wp.array2d(dtype=real),
-        knees: wp.array2d(dtype=real),
-        target: wp.array2d(dtype=vec3),
+        ankle_vel: wp.array2d(dtype=vec3),
         ankle: wp.array2d(dtype=vec3),
         jacobian: wp.array2d(dtype=scalar.mat33),
-        closed_knees: wp.array2d(dtype=vec2),
-        constraint: wp.array2d(dtype=leg_kinematics.vec5),
-        closure: wp.array2d(dtype=leg_kinematics.mat24),
+        knees: wp.array2d(dtype=vec2),
+        motor_rates: wp.array2d(dtype=vec3),
+        knee_rates: wp.array2d(dtype=vec2),
     ):
         k, i = wp.tid()
         geo = legs[k]
         angles = vec3(motors[3 * k, i], motors[3 * k + 1, i], motors[3 * k + 2, i])
-        passive = vec2(knees[2 * k, i], knees[2 * k + 1, i])
         ankle[k, i] = leg_kinematics.leg_forward_kinematics(geo, angles[0], angles[1], angles[2])
         jacobian[k, i] = leg_kinematics.leg_jacobian(geo, angles[0], angles[1], angles[2])
         loop = five_bar.five_bar(geo, angles[1], angles[2])
-        closed_knees[k, i] = leg_kinematics.knee_angles(geo, loop, angles[1], angles[2])
-        constraint[k, i] = leg_kinematics.kinematic_constraint(geo, angles, passive, target[k, i])
-        closure[k, i] = leg_kinematics.closure_jacobian(geo, angles, passive)
+        knees[k, i] = leg_kinematics.knee_angles(geo, loop, angles[1], angles[2])
+        rates = leg_kinematics.leg_inverse_velocity(geo, angles, ankle_vel[k, i])
+        motor_rates[k, i] = rates
+        outer_shank_rate = loop.outer_shank_do * rates[1] + loop.outer_shank_di * rates[2]
+        inner_shank_rate = loop.inner_shank_do * rates[1] + loop.inner_shank_di * rates[2]
+        knee_rates[k, i] = vec2(rates[1] + geo.front * outer_shank_rate, rates[2] - geo.front * inner_shank_rate)
 
     return leg_kernel
 
@@ -59,7 +61,6 @@ class Build:
     def __init__(self, package):
         float64_kernels()
         self.ik = importlib.import_module(f"{package}.kinematics.inverse")
-        self.leg_module = importlib.import_module(f"{package}.kinematics.leg")
         self.scalar = importlib.import_module(f"{package}.scalar")
         self.double = package == "jumper_warp.kernels_float64"
         geometry = importlib.import_module(f"{package}.kinematics.geometry")
@@ -87,23 +88,12 @@ class Build:
         wp.launch(self.ik.inverse_kinematics_kernel, (4, n), inputs, out, device="cpu")
         return [array.numpy() for array in out]
 
-    def velocities(self, motors, paw_vel, base=None):
-        """Return motor rates (12, n) and knee rates (8, n); base: quat, linear and angular velocity, world frame."""
-        n, vec3 = motors.shape[1], self.scalar.vec3
-        turn, lin, ang = base if base is not None else (np.zeros((n, 4)), np.zeros((n, 3)), np.zeros((n, 3)))
-        inputs = [self.legs, self.array(turn, self.scalar.quat), self.array(lin, vec3), self.array(ang, vec3)]
-        inputs += [self.array(motors, self.scalar.real), self.array(paw_vel, vec3), int(base is not None)]
-        out = [self.zeros(12, n), self.zeros(8, n)]
-        wp.launch(self.ik.inverse_velocity_kernel, (4, n), inputs, out, device="cpu")
-        return [array.numpy() for array in out]
-
-    def legs_at(self, motors, knees=None, target=None):
-        """Return ankle (4, n, 3), jacobian, closed-loop knees, constraint and closure jacobian for motors (12, n)."""
-        n, s, m = motors.shape[1], self.scalar, self.leg_module
+    def legs_at(self, motors, ankle_vel=None):
+        """Return ankle (4, n, 3), jacobian and knees for motors (12, n), and motor and knee rates for velocities."""
+        n, s = motors.shape[1], self.scalar
         inputs = [self.legs, self.array(motors, s.real)]
-        inputs.append(self.array(np.zeros((8, n)) if knees is None else knees, s.real))
-        inputs.append(self.array(np.zeros((4, n, 3)) if target is None else target, s.vec3))
-        out = [self.zeros(4, n, dtype) for dtype in (s.vec3, s.mat33, s.vec2, m.vec5, m.mat24)]
+        inputs.append(self.array(np.zeros((4, n, 3)) if ankle_vel is None else ankle_vel, s.vec3))
+        out = [self.zeros(4, n, dtype) for dtype in (s.vec3, s.mat33, s.vec2, s.vec3, s.vec2)]
         wp.launch(self.leg_kernel, (4, n), inputs, out, device="cpu")
         return [array.numpy() for array in out]
 
@@ -213,24 +203,6 @@ def test_angles_come_back_from_a_normal_stance(build):
     motors, knees, _, _ = build.solve(build.legs_at(want)[0])
     np.testing.assert_allclose(motors, want, atol=1.0e-11 if build.double else 2.0e-5)
     assert (knees > 0.0).all()
-
-
-def test_stacked_constraint_vanishes_at_the_pose_found(build):
-    paws = build.legs_at(random_motors(ROBOTS, seed=4))[0]
-    motors, knees, _, _ = build.solve(paws)
-    constraint = build.legs_at(motors, knees, paws)[3]
-    assert np.abs(constraint).max() < (1.0e-12 if build.double else 1.0e-6)
-
-
-def test_closure_jacobian_matches_central_differences_of_open_loops(double):
-    rng, h = np.random.default_rng(5), 1.0e-6
-    motors, knees = rng.uniform(-1.0, 2.0, (12, 50)), rng.uniform(-1.0, 2.0, (8, 50))
-    closure = double.legs_at(motors, knees)[4]
-    for column, (rows, start, stride) in enumerate([("m", 1, 3), ("k", 0, 2), ("m", 2, 3), ("k", 1, 2)]):
-        step_m, step_k = np.zeros((12, 1)), np.zeros((8, 1))
-        (step_m if rows == "m" else step_k)[start::stride] = h
-        gap = [double.legs_at(motors + sign * step_m, knees + sign * step_k)[3][:, :, :2] for sign in (1, -1)]
-        np.testing.assert_allclose(closure[:, :, :, column], (gap[0] - gap[1]) / (2.0 * h), atol=1.0e-9)
 
 
 # --- Position: targets out of reach ---
@@ -357,7 +329,7 @@ def test_inverse_velocity_undoes_the_jacobian(build):
     motors[2::3] = np.abs(motors[2::3])
     wanted = rng.uniform(-1.0, 1.0, (4, 500, 3))
     jacobian = build.legs_at(motors)[1]
-    rates = build.velocities(motors, wanted)[0].reshape(4, 3, 500).transpose(0, 2, 1)
+    rates = build.legs_at(motors, wanted)[3]
     reached = np.einsum("lnij,lnj->lni", jacobian, rates)
     np.testing.assert_allclose(reached, wanted, atol=1.0e-12 if build.double else 2.0e-5)
 
@@ -369,11 +341,11 @@ def test_inverse_velocity_of_a_stretched_leg_is_finite_and_damped(build):
     motors[1::3] = outer
     knees = build.legs_at(motors)[2][:, :, 0]
     assert knees.min() < -0.05 and knees.max() > 0.05
-    rates = build.velocities(motors, np.tile([0.0, 0.0, -1.0], (4, 2001, 1)))[0]
+    rates = build.legs_at(motors, np.tile([0.0, 0.0, -1.0], (4, 2001, 1)))[3]
     # at most 1 m/s over the 10 mm of lever at which damping sets in, and nothing in the straight pose itself
     assert np.isfinite(rates).all() and np.abs(rates).max() < 101.0
     straight = np.abs(knees).argmin(axis=1)
-    assert (np.abs(rates[1::3][np.arange(4), straight]) < 5.0).all()
+    assert (np.abs(rates[np.arange(4), straight, 1]) < 5.0).all()
 
 
 def test_rates_that_hold_the_paws_still_do_so_in_pinocchio(build, robot):
@@ -383,14 +355,15 @@ def test_rates_that_hold_the_paws_still_do_so_in_pinocchio(build, robot):
     base_pos, base_quat = random_bases(n)
     lin, ang = rng.uniform(-1.0, 1.0, (2, n, 3))
     motors = np.radians(rng.uniform(10.0, 100.0, (12, n)))
-    rates, knee_rates = build.velocities(motors, np.zeros((4, n, 3)), (base_quat, lin, ang))
+    to_body = Rotation.from_quat(base_quat).inv()
+    swept = to_body.apply(lin) + np.cross(to_body.apply(ang), build.legs_at(motors)[0])
+    rates, knee_rates = build.legs_at(motors, -swept)[3:]
     for i in range(n):
-        to_body = Rotation.from_quat(base_quat[i]).inv()
         q = robot.configuration(base_pos[i], base_quat[i], motors[:, i])
         v = np.zeros(robot.model.nv)
-        v[:6] = np.concatenate([to_body.apply(lin[i]), to_body.apply(ang[i])])
-        v[robot.motor_v] = rates[:, i]
-        v[robot.knee_v] = knee_rates[:, i]
+        v[:6] = np.concatenate([to_body[i].apply(lin[i]), to_body[i].apply(ang[i])])
+        v[robot.motor_v] = rates[:, i].ravel()
+        v[robot.knee_v] = knee_rates[:, i].ravel()
         pin.forwardKinematics(robot.model, robot.data, q, v)
         for c in robot.constraints:
             for joint, placement in ((c.joint1_id, c.joint1_placement), (c.joint2_id, c.joint2_placement)):

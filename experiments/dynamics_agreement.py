@@ -1,0 +1,82 @@
+"""Do our dynamics agree with Pinocchio's? Accelerations, paw positions and paw Jacobians of random states in flight.
+
+    python experiments/dynamics_agreement.py --robot assets/jumper/leg_springs.json --out outputs/dynamics_agreement
+
+Both robots have the masses and armatures of the description or of an overlay and random motor torques, but neither
+ground, friction, knee damping nor springs. Ours compute in double precision, with masses that Newton's model holds in
+single precision, which leaves seven digits. A relative difference is one over the largest value of the same state.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import tyro
+from rich.console import Console
+from rich.table import Table
+
+from jumper_warp.cli.main import run_command
+from jumper_warp.robot.overlay import load_overlay
+from jumper_warp.robot.values import RobotValues
+from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.output import output_dir, write_metrics
+from jumper_warp.utils.runtime import announce
+from support.agreement import ours, pinocchios, random_states
+
+UNITS = {
+    "base_acceleration": "m/s^2",
+    "base_angular_acceleration": "rad/s^2",
+    "joint_acceleration": "rad/s^2",
+    "paw_position": "m",
+    "paw_jacobian": "m",
+}
+
+
+@dataclass(frozen=True)
+class Args:
+    """Flags."""
+
+    robot: Path | None = None
+    """Robot overlay (docs/robot_overlays.md; default: the robot as described)."""
+    states: int = 200
+    """Random states."""
+    seed: int = 0
+    """Of the states."""
+    out: Path | None = None
+    """Folder for metrics.json (default: outputs/dynamics_agreement/<time>)."""
+
+    def __post_init__(self) -> None:
+        """Check the values."""
+        if self.states < 1:
+            raise InputError(f"states must be at least 1, got {self.states}")
+
+
+def differences(found: np.ndarray, expected: np.ndarray) -> tuple[float, float, float]:
+    """Return the largest value, the largest difference, and the largest one relative to its state's largest value."""
+    size, off = (np.abs(rows.reshape(len(rows), -1)).max(axis=1) for rows in (expected, found - expected))
+    return float(size.max()), float(off.max()), float((off / size).max())
+
+
+def main(args: Args) -> dict:
+    """Compare all quantities and return the metrics."""
+    announce("cpu")
+    folder = output_dir("dynamics_agreement", args.out)
+    values = RobotValues.nominal(1) if args.robot is None else load_overlay(args.robot).robots()
+    states = random_states(args.states, args.seed)
+    found, expected = ours(values, states), pinocchios(values, states)
+    table = Table("quantity", "largest", "largest difference", "relative", title=f"{args.states} random states")
+    metrics: dict = {"states": args.states, "robot": None if args.robot is None else str(args.robot)}
+    for name, unit in UNITS.items():
+        size, off, relative = differences(found[name], expected[name])
+        metrics |= {f"{name}_difference [{unit}]": off, f"{name}_relative_difference": relative}
+        table.add_row(name.replace("_", " "), f"{size:.4g} {unit}", f"{off:.1e} {unit}", f"{relative:.1e}")
+    write_metrics(folder, metrics)
+    Console().print(table)
+    print(f"metrics in {folder}")
+    return metrics
+
+
+if __name__ == "__main__":
+    run_command(lambda: main(tyro.cli(Args)))

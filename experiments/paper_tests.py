@@ -1,0 +1,54 @@
+"""The paper's tests of jumps, each with the paper's numbers beside those of given policies.
+
+    python experiments/paper_tests.py --out outputs/paper
+    python experiments/paper_tests.py --policies vertical_jump logs/horizontal-jump/RUN --randomize
+
+Every policy goes through all suites of its task that have numbers in the paper (`jumper_warp.evaluation.suites`). The
+folder has a folder for each of them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import tyro
+from rich.console import Console
+from rich.table import Table
+
+from jumper_warp.cli.main import run_command
+from jumper_warp.evaluation.run import EvaluationArgs, EvaluationRun, shown
+from jumper_warp.evaluation.suites import suites_for
+from jumper_warp.utils.output import output_dir, write_metrics
+
+
+@dataclass(frozen=True)
+class Args(EvaluationArgs):
+    """Flags."""
+
+    policy: tyro.conf.Suppress[str] = ""
+    policies: tuple[str, ...] = ("vertical_jump", "horizontal_jump")
+    """Names or folders of policies, runs' folders, or checkpoints."""
+
+
+def main(args: Args) -> dict:
+    """Run all tests and return the metrics that the paper has too."""
+    folder, values = output_dir("paper_tests", args.out), {}
+    table = Table("policy", "test", "metric", "here", "paper")
+    for policy in args.policies:
+        for name, suite in suites_for(EvaluationRun(policy).task.evaluation).items():
+            if not suite.paper:
+                continue
+            flags: dict[str, Any] = {key: value for key, value in asdict(args).items() if key != "policies"}
+            found = suite(**flags | {"policy": policy, "out": folder / f"{Path(policy).name}_{name}"}).run()
+            for metric, paper in suite.paper.items():
+                values[f"{Path(policy).name}_{name}_{metric}"] = found[metric]
+                table.add_row(policy, name, metric, shown(found[metric]), f"{paper:g}")
+    write_metrics(folder, values)
+    Console().print(table)
+    return values
+
+
+if __name__ == "__main__":
+    run_command(lambda: main(tyro.cli(Args)))

@@ -1,0 +1,112 @@
+"""The same random states by this project's dynamics and by Pinocchio, without ground, friction, damping and springs.
+
+Quantities, first axis states: acceleration of the body's origin [m/s^2] (3,) and its angular acceleration [rad/s^2]
+(3,), body axes; accelerations of the motors [rad/s^2] (12,); places of the paws' centres [m] (4, 3), body axes; their
+Jacobians [m] (4, 3, 3) by the rates of the leg's motors.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import warp as wp
+from scipy.spatial.transform import Rotation
+
+from jumper_warp.robot.description import LEGS, load_description
+from jumper_warp.robot.model import build_model
+from jumper_warp.robot.pinocchio_model import build_pinocchio
+from jumper_warp.robot.values import RobotValues
+from jumper_warp.sim.dynamics import JumperDynamics
+from jumper_warp.sim.overlay import MOTOR_DOFS, write_model
+from support.poses import random_motors
+
+MARGIN = 0.35
+"""[rad] From the stops: a stretched leg is singular."""
+DT = 1.0e-6
+"""[s] Step whose change of velocity is the acceleration."""
+States = dict[str, np.ndarray]
+Quantities = dict[str, np.ndarray]
+
+
+def random_states(n: int, seed: int) -> States:
+    """Return n states: base quat (xyzw), com_vel [m/s] and ang_vel [rad/s], world; angles, rates, torque of motors."""
+    rng = np.random.default_rng(seed)
+    quat = rng.normal(size=(n, 4))
+    return {
+        "quat": quat / np.linalg.norm(quat, axis=1, keepdims=True),
+        "com_vel": rng.normal(size=(n, 3)),
+        "ang_vel": 2.0 * rng.normal(size=(n, 3)),
+        "angles": random_motors(load_description(), n, rng, MARGIN).T,
+        "rates": 4.0 * rng.normal(size=(n, 12)),
+        "torque": rng.uniform(-18.0, 18.0, (n, 12)),
+    }
+
+
+def ours(values: RobotValues, states: States) -> Quantities:
+    """Return all quantities of a robot (the first of some values) by this project's dynamics."""
+    n = len(states["angles"])
+    model = build_model(n, ground=None, visuals=False, device="cpu")
+    write_model(model, values)
+    model.joint_friction.zero_()
+    model.joint_damping.zero_()
+    dynamics = JumperDynamics(model, double=True)
+    q, qd, force = (np.zeros((n, width)) for width in (43, 38, 38))
+    q[:, 3:7], q[:, [1 + dof for dof in MOTOR_DOFS]] = states["quat"], states["angles"]
+    qd[:, :3], qd[:, 3:6], qd[:, MOTOR_DOFS] = states["com_vel"], states["ang_vel"], states["rates"]
+    force[:, MOTOR_DOFS] = states["torque"]
+
+    def array(rows: np.ndarray) -> wp.array:
+        return wp.array(rows.ravel(), dtype=wp.float64, device="cpu")
+
+    def base(q: np.ndarray, qd: np.ndarray) -> tuple[Rotation, np.ndarray, np.ndarray]:
+        turn = Rotation.from_quat(q[:, 3:7])
+        origin = qd[:, :3] - np.cross(qd[:, 3:6], turn.apply(values.base_com[0].astype(np.float32)))
+        return turn, origin, turn.inv().apply(qd[:, 3:6])
+
+    after = array(q), array(qd)
+    drive = dynamics.drive(array(force), wp.zeros(21 * n, dtype=wp.spatial_vector, device="cpu"))
+    dynamics.advance(dynamics.settings(DT, 1, 50, 1.0e-5), drive, *after, *after)
+    new_q, new_qd = (rows.numpy().reshape(n, -1) for rows in after)
+    (turn, origin, spin), (_, new_origin, new_spin) = base(q, qd), base(new_q, new_qd)
+    found = {
+        "base_acceleration": turn.inv().apply(new_origin - origin) / DT,
+        "base_angular_acceleration": (new_spin - spin) / DT,
+        "joint_acceleration": (new_qd - qd)[:, MOTOR_DOFS] / DT,
+    }
+    return found | our_paws(dynamics, q)
+
+
+def our_paws(dynamics: JumperDynamics, q: np.ndarray) -> Quantities:
+    """Return the paws' places and Jacobians of coordinates (n, 43), the base level and at rest in the origin."""
+    n, model = len(q), dynamics.model
+    q[:, 3:7] = 0.0, 0.0, 0.0, 1.0
+    shanks = [model.body_label.index(f"world_0/{leg}_inner_shank") for leg in LEGS]
+    anchors = np.array([loop.parent_anchor for loop in dynamics.description.loops])
+    arms, columns = anchors - model.body_com.numpy()[shanks], []
+    for motor in range(3):
+        rates = np.zeros((n, 38))
+        rates[:, MOTOR_DOFS[motor::3]] = 1.0
+        arrays = [wp.array(rows.ravel(), dtype=wp.float64, device="cpu") for rows in (q, rates)]
+        state = model.state()
+        dynamics.full_state(*arrays, state.body_q, state.body_qd)
+        pose, twist = (rows.numpy().reshape(n, 21, -1)[:, shanks] for rows in (state.body_q, state.body_qd))
+        turn = Rotation.from_quat(pose[..., 3:].reshape(-1, 4))
+        out, arm = (turn.apply(np.tile(rows, (n, 1))).reshape(n, 4, 3) for rows in (anchors, arms))
+        columns.append(twist[..., :3] + np.cross(twist[..., 3:], arm))
+    return {"paw_position": pose[..., :3] + out, "paw_jacobian": np.stack(columns, axis=3)}
+
+
+def pinocchios(values: RobotValues, states: States) -> Quantities:
+    """Return all quantities of a robot (the first of some values) by Pinocchio."""
+    robot, rows = build_pinocchio(values=values), []
+    for quat, com_vel, ang_vel, angles, rates, torque in zip(*states.values(), strict=True):
+        turn = Rotation.from_quat(quat)
+        spin = turn.inv().apply(ang_vel)
+        twist = np.concatenate([turn.inv().apply(com_vel) - np.cross(spin, values.base_com[0]), spin])
+        q = robot.configuration(np.zeros(3), quat, angles)
+        v = robot.closed_velocity(q, twist, rates)
+        change = robot.forward_dynamics(q, v, torque)
+        level = robot.configuration(np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]), angles)
+        rows.append((change[:3] + np.cross(v[3:6], v[:3]), change[3:6], change[robot.motor_v],
+                     robot.paw_positions(level), robot.paw_jacobians(level)))  # fmt: skip
+    names = ("base_acceleration", "base_angular_acceleration", "joint_acceleration", "paw_position", "paw_jacobian")
+    return dict(zip(names, map(np.array, zip(*rows, strict=True)), strict=True))

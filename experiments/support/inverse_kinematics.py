@@ -1,0 +1,63 @@
+"""Poses of many robots from the places of their paws, in one launch. The kernels are imported: they have no facade."""
+
+from __future__ import annotations
+
+import numpy as np
+import warp as wp
+
+from jumper_warp.kernels.kinematics import geometry
+from jumper_warp.kernels.kinematics.inverse import LegLimits, inverse_kinematics_kernel
+from jumper_warp.kernels.kinematics.leg import leg_forward_kinematics
+from jumper_warp.robot.description import MOTOR_JOINTS, RobotDescription
+from jumper_warp.robot.model import leg_geometry_array
+
+
+@wp.kernel(enable_backward=False)
+def paws_kernel(
+    # in
+    legs: wp.array(dtype=geometry.LegGeometry),
+    motors: wp.array2d(dtype=float),
+    # out
+    paws: wp.array2d(dtype=wp.vec3),
+):
+    """Write paw positions [m] (4, n) in the body frame for motor angles [rad] (12, n)."""
+    leg, robot = wp.tid()
+    m = 3 * leg
+    paws[leg, robot] = leg_forward_kinematics(legs[leg], motors[m, robot], motors[m + 1, robot], motors[m + 2, robot])
+
+
+def leg_limits(description: RobotDescription) -> LegLimits:
+    """Return the hard stops of a leg."""
+    lateral, outer = (description.joint(name) for name in MOTOR_JOINTS[:2])
+    limits = LegLimits()
+    limits.lateral_lower, limits.lateral_upper = lateral.lower, lateral.upper
+    limits.transversal_lower, limits.transversal_upper = outer.lower, outer.upper
+    limits.sum_lower, limits.sum_upper = description.transversal_sum
+    return limits
+
+
+class InverseKinematics:
+    """Poses of n robots, four legs each."""
+
+    def __init__(self, description: RobotDescription, n: int, device: wp.Device) -> None:
+        self._legs, self._limits = leg_geometry_array(description, geometry, device), leg_limits(description)
+        self._base = [wp.zeros(n, dtype=kind, device=device) for kind in (wp.vec3, wp.quat)]
+        self._found = [wp.zeros((rows, n), dtype=float, device=device) for rows in (12, 8)]
+        self.reachable = wp.zeros((4, n), dtype=wp.int32, device=device)
+        """1: the last targets' paw is reached."""
+        self.residual = wp.zeros((4, n), dtype=float, device=device)
+        """[m] Distance left to them."""
+
+    def paws(self, motors: np.ndarray) -> wp.array:
+        """Return paw positions [m] (4, n), body frame, of motor angles [rad] (12, n)."""
+        device = self.residual.device
+        angles = wp.array(motors.astype(np.float32), dtype=float, device=device)
+        paws = wp.zeros(self.residual.shape, dtype=wp.vec3, device=device)
+        wp.launch(paws_kernel, paws.shape, [self._legs, angles], [paws], device=device)
+        return paws
+
+    def solve(self, targets: wp.array) -> None:
+        """Find the poses that put the paws at targets [m] (4, n), body frame."""
+        inputs = [self._legs, self._limits, *self._base, targets, 0]
+        outputs = [*self._found, self.reachable, self.residual]
+        wp.launch(inverse_kinematics_kernel, targets.shape, inputs, outputs, device=targets.device)

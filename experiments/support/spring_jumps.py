@@ -1,0 +1,64 @@
+"""Open-loop jumps of robots with springs between the knees of each leg."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from jumper_warp.robot.motors import MotorCfg, loose_filter, vertical_jump_filter
+from jumper_warp.robot.overlay import with_springs
+from jumper_warp.robot.values import RobotValues
+from jumper_warp.sim.simulation import Simulation
+from support.open_loop import EXTEND, HOLD, RAMP, STAND, follow_jump, jump_metrics, transversal_command
+
+FALLING = 60
+"""Ticks after the extension in which a jump may still rise."""
+FILTERS = {"stock": vertical_jump_filter, "loose": loose_filter}
+
+
+@dataclass(frozen=True)
+class SpringJumps:
+    """Jumps with one kind of motors, command filter and springs."""
+
+    motors: MotorCfg
+    filter: str
+    """One of FILTERS."""
+    gravity: float
+    """[m/s^2] Downward."""
+    length: float
+    """[m] Of the springs at rest."""
+    device: str | None
+
+    def simulation(self, count: int, robot: object, **settings: object) -> Simulation:
+        """Return the simulation of `count` robots."""
+        return Simulation(count, motors=self.motors, command_filter=FILTERS[self.filter](), gravity=self.gravity,
+                          robot=robot, device=self.device, **settings)  # fmt: skip
+
+    def apexes(self, stiffness: Sequence[float], squats: Sequence[float]) -> np.ndarray:
+        """Return the highest base heights [m] of jumps, (len(stiffness), len(squats)).
+
+        stiffness: [N/m]; squats: [deg] transversal angles that are commanded for the squat.
+        """
+        shape = (len(stiffness), len(squats))
+        robots = RobotValues.nominal(shape[0] * shape[1])
+        robots.spring_stiffness[:, 0] = np.repeat(stiffness, shape[1])
+        robots.spring_length[:, 0] = self.length
+        sim = self.simulation(shape[0] * shape[1], robots, visuals=False)
+        highest, begun = np.zeros(sim.num_worlds), STAND + RAMP + HOLD
+        for tick in range(begun + EXTEND + FALLING):
+            commands = [transversal_command(min(tick, begun + EXTEND - 1), squat) for squat in squats]
+            sim.target.assign(np.outer(np.tile([0.0, 1.0, 1.0], 4), np.tile(commands, shape[0])).astype(np.float32))
+            sim.step()
+            if tick >= begun:
+                highest = np.maximum(highest, sim.joint_q()[:, 2])
+        return highest.reshape(shape)
+
+    def record(self, stiffness: float, squat: float, folder: Path) -> dict[str, float]:
+        """Write the recording of a jump, and return its metrics."""
+        sim = self.simulation(1, with_springs(stiffness, self.length))
+        trace, recorder, _ = follow_jump(sim, {"spring_stiffness_n_m": stiffness, "squat_command_deg": squat}, squat)
+        recorder.save_rrd(folder / f"jump_{self.filter}.rrd")
+        return jump_metrics(trace)

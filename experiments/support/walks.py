@@ -1,0 +1,125 @@
+"""Tests of walking beside constant commands: redirected, sped up, kicked, and how far robots come."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from jumper_warp.envs.env import Env
+from jumper_warp.evaluation.log import Metrics
+from jumper_warp.evaluation.velocities import SKIP, Walks
+
+REACH, STEP, KICK = 0.8, 0.8, 0.5
+"""[m/s] and [rad/s] of the commands; [m/s] by which a command and a velocity jump."""
+RAMP, KEEP, SHARE = 3.0, 5.0, 0.1
+"""[s] In which the command rises, for which it is kept, and within which share."""
+DIRECTIONS = {"ahead": (0, 1.0, 4.0), "back": (0, -1.0, 4.0), "sideways": (1, 1.0, 2.0), "turning": (2, 1.0, 4.0)}
+"""Axis, sign and highest command [m/s] or [rad/s] of the test of top speed."""
+SETTLED = 0.1
+"""[m/s] Error of a robot that has settled on a new command."""
+SMOOTHING = 0.2
+"""[s] Over which velocities are averaged to tell whether it has."""
+HOLD = 0.5
+"""[s] For which a robot stays within that error that has settled in spite of pushes."""
+
+
+def redirected(env: Env, rng: np.random.Generator) -> Walks:
+    """Return walks with another command after 3 s."""
+    commands = steps_of(rng, env.num_envs, REACH, STEP)
+    return Walks(commands, env.task, 7.0, times=np.array([0.0, 3.0]))
+
+
+def sped_up(env: Env) -> tuple[Walks, np.ndarray]:
+    """Return walks at ever higher speeds, and the index of each robot's direction."""
+    which = np.arange(env.num_envs) % len(DIRECTIONS)
+    commands = np.zeros((env.num_envs, 7, 3))
+    for i, (axis, sign, highest) in enumerate(DIRECTIONS.values()):
+        speeds = sign * np.linspace(0.3, highest, int((which == i).sum()))
+        commands[which == i, :, axis] = speeds[:, None] * np.linspace(1.0 / 7.0, 1.0, 7)
+    times = RAMP * np.arange(7) / 7.0
+    return Walks(commands, env.task, RAMP + 1.0 + KEEP, times=times), which
+
+
+def kicked(env: Env, rng: np.random.Generator) -> Walks:
+    """Return walks with drawn commands whose velocity jumps at a drawn moment."""
+    n = env.num_envs
+    commands, angle = rng.uniform(-REACH, REACH, (n, 1, 3)), rng.uniform(0.0, 2.0 * np.pi, n)
+    kick = KICK * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    return Walks(commands, env.task, 7.0, kick_time=rng.uniform(2.0, 4.0, n), kick=kick)
+
+
+def speed_metrics(walks: Walks, which: np.ndarray) -> Metrics:
+    """Return the highest speed that was kept in each direction."""
+    found: Metrics = {}
+    for i, (name, (axis, _, _)) in enumerate(DIRECTIONS.items()):
+        unit = "rad_s" if axis == 2 else "m_s"
+        kept = kept_speeds(walks, axis, KEEP, SHARE)[which == i]
+        found[f"top_{name}_{unit}"] = top_speed(np.abs(walks.commands[which == i, -1, axis]), kept)
+    return found
+
+
+def steps_of(rng: np.random.Generator, robots: int, reach: float, step: float) -> np.ndarray:
+    """Return two commands a robot whose velocities differ by `step` [m/s] in any direction, (robots, 2, 3)."""
+    commands = np.zeros((robots, 2, 3))
+    commands[..., 2] = rng.uniform(-reach, reach, robots)[:, None]
+    todo = np.arange(robots)
+    while len(todo):
+        first = rng.uniform(-reach, reach, (len(todo), 2))
+        angle = rng.uniform(0.0, 2.0 * np.pi, len(todo))
+        second = first + step * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+        commands[todo, 0, :2], commands[todo, 1, :2] = first, second
+        todo = todo[np.abs(second).max(axis=1) > reach]
+    return commands
+
+
+def settling_times(walks: Walks, hold: float | None = None) -> np.ndarray:
+    """Return how long after the last command each robot's velocity in the plane stays within SETTLED of it [s].
+
+    Velocities are means of the last SMOOTHING seconds. Infinite where it never does, or the robot falls.
+
+    hold: Seconds for which it stays; None: to the end, so that a push seconds later counts too.
+    """
+    window, first = round(SMOOTHING / walks.step_dt), round(walks.times[-1] / walks.step_dt)
+    velocity = walks.history()[..., :2]
+    total = np.cumsum(velocity, axis=0)
+    smooth = velocity.copy()
+    smooth[window:] = (total[window:] - total[:-window]) / window
+    off = np.linalg.norm(smooth[first:] - walks.wanted()[first:, :, :2], axis=2)
+    outside = ~(off <= SETTLED)
+    if hold is not None:
+        steps = min(round(hold / walks.step_dt), len(off))
+        held = ~np.lib.stride_tricks.sliding_window_view(outside, steps, axis=0).any(axis=-1)
+        return np.where(held.any(axis=0), held.argmax(axis=0) * walks.step_dt, np.inf)
+    last = np.where(outside.any(axis=0), len(off) - np.argmax(outside[::-1], axis=0), 0)
+    return np.where(last == len(off), np.inf, last * walks.step_dt)
+
+
+def kept_speeds(walks: Walks, axis: int, seconds: float, share: float) -> np.ndarray:
+    """Return which robots kept their last command along an axis within a share of it over the last seconds on average.
+
+    The two other velocities are not judged.
+    """
+    last = walks.history()[-round(seconds / walks.step_dt) :, :, axis].mean(axis=0)
+    wanted = walks.commands[:, -1, axis]
+    return np.abs(last - wanted) <= share * np.abs(wanted)
+
+
+def walked(walks: Walks) -> np.ndarray:
+    """Return the share of the way that each robot went until it fell, at most 1, commanded to go straight ahead.
+
+    What it goes ahead counts, whatever its heading is then; the time of setting off, SKIP, is not asked for.
+    """
+    way = np.nansum(walks.history()[..., 0], axis=0) * walks.step_dt
+    return np.clip(way / (walks.commands[:, 0, 0] * (walks.seconds - SKIP)), 0.0, 1.0)
+
+
+def top_speed(commanded: np.ndarray, kept: np.ndarray, share: float = 0.9, width: float = 0.1) -> float:
+    """Return the highest speed that at least a share of the robots kept, of classes of a width; 0 if there is none.
+
+    commanded: (robots,) at least 0; kept: (robots,) bool. The result is the largest commanded one of its class.
+    """
+    classes, top = np.floor(commanded / width + 1.0e-9).astype(int), 0.0
+    for each in np.unique(classes):
+        inside = classes == each
+        if kept[inside].mean() >= share:
+            top = float(commanded[inside].max())
+    return top

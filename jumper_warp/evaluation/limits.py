@@ -1,0 +1,83 @@
+"""How high the open-loop jump takes each robot of an environment: squat, hold, full extension."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+
+from jumper_warp.evaluation.heights import SUCCESS_TOLERANCE, HeightLog
+from jumper_warp.evaluation.jumps import jump_commands
+from jumper_warp.evaluation.log import Metrics, mean, within
+
+if TYPE_CHECKING:
+    from jumper_warp.envs.env import Env
+
+RAMP, HOLD, EXTEND = 25, 50, 40
+"""Policy steps of the ramp into the squat, the squat, and the full extension."""
+STAND = 31
+"""Policy steps in the default pose, after which jumps are commanded."""
+MORE = 30
+"""Policy steps from the end of the extension on, in which the apex has passed."""
+INNER = (0.6, 1.1)
+"""[m] Heights that are told apart."""
+PUSH = "push"
+
+
+def open_loop_action(step: int) -> float:
+    """Return the action [1] of all transversal motors at a policy step: 1 is the squat, -1 full extension."""
+    since = step - STAND
+    if since >= RAMP + HOLD:
+        return -1.0 if since < RAMP + HOLD + EXTEND else 0.0
+    return min(max(since, 0) / RAMP, 1.0)
+
+
+def open_loop_limits(env: Env, fresh: dict[str, Any]) -> np.ndarray:
+    """Return the largest base height [m] of each robot in the open-loop jump, (num_envs,).
+
+    The robots have the parameters that their first `evaluation_reset` draws, latency included, but no pushes. Where the
+    simulation comes apart it is not a number.
+
+    env: a jump task, whose actions of one reach squat and full extension; it is left at the end of the jump.
+    fresh: `env.state_dict()` before its first `evaluation_reset`.
+    """
+    env.load_state_dict(fresh)
+    skill = env.skills[0]
+    pushes = {f"{what}_{end}": 0.0 for what in ("force", "torque") for end in ("lower", "upper")}
+    drawn = [row.term.numbers for row in skill.task.rows["events"] if row.term.name == PUSH]
+    if drawn:
+        skill.set("events", PUSH, **pushes)
+    env.evaluation_reset(jump_commands(np.zeros((env.num_envs, 3)), 0.0, env.step_dt))
+    highest, broken = np.zeros(env.num_envs), np.zeros(env.num_envs, dtype=bool)
+    for step in range(STAND + RAMP + HOLD + EXTEND + MORE):
+        level = open_loop_action(step)
+        env.step(torch.tensor([0.0, level, level] * 4, device=env.device).repeat(env.num_envs, 1))
+        arrays = env.task_arrays()
+        broken |= env.worlds.broken.numpy() != 0
+        if step >= STAND + RAMP + HOLD:
+            highest = np.fmax(highest, arrays["base_pos"][:, 2])
+    if drawn:
+        skill.set("events", PUSH, **{name: drawn[0][name] for name in pushes})
+    return np.where(broken, np.nan, highest)
+
+
+def limit_metrics(jumps: HeightLog, limit: np.ndarray) -> Metrics:
+    """Return the metrics of jumps against the open-loop jump of the same robots, limit [m], (num_envs,).
+
+    A height is reachable if the open-loop jump comes within the tolerance of it or higher. `success_rate_beyond_limit`
+    is that of the others. `open_loop_mean_abs_error_m` is that of jumps which stop at the limit and are perfect below.
+    """
+    target, near = jumps.commanded[:, 0], jumps.reached[:, 0]
+    reachable, below, inner = target <= limit + SUCCESS_TOLERANCE, target <= limit, within(target, INNER)
+    return {
+        "open_loop_limit_m": mean(limit),
+        "lowest_open_loop_limit_m": float(np.nanmin(limit)),
+        "open_loop_mean_abs_error_m": mean(np.maximum(target - limit, 0.0)),
+        "mean_abs_error_up_to_limit_m": mean(np.abs(jumps.error[:, 0])[below]),
+        "success_rate_reachable": mean(near[reachable]),
+        "reachable_share": mean(reachable),
+        "success_rate_beyond_limit": mean(near[~reachable]),
+        "success_rate_reachable_0_6_1_1": mean(near[reachable & inner]),
+        "reachable_share_0_6_1_1": mean(reachable[inner]),
+    }

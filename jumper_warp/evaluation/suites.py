@@ -1,0 +1,353 @@
+"""Suites of jumps to places beside the sweep, and the table of all suites.
+
+`jumper evaluate POLICY --suite NAME` runs one. Headings are drawn from the full circle; errors and success are those of
+the sweep.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+
+from jumper_warp.evaluation.log import largest, mean, within
+from jumper_warp.evaluation.places import AT_END, FALLS, MISSED, PlaceLog, landing_metrics, trained_range
+from jumper_warp.evaluation.plots import Track, draw_landings, draw_paths, drawn
+from jumper_warp.evaluation.run import EvaluationRun
+from jumper_warp.evaluation.sweeps import DistanceSweep, HeightSweep, Suite, check
+from jumper_warp.robot.grounds import BlockCfg, platform, uneven
+
+AHEAD, ASIDE = (0.35, 1.4), (-0.35, 0.35)
+"""[m] Goals of the grid."""
+SECTORS = ("ahead", "left", "back", "right")
+"""Quarters of a ring, each centred on its direction."""
+PAIRS = {"diagonal": ((0.8, 0.2), (0.75, -0.2)), "straight": ((0.8, 0.0), (0.8, 0.0))}
+"""[m] The paper's two jumps in a row."""
+ROW_LOWER, ROW_UPPER, DELAYS = (0.4, -0.2), (0.9, 0.2), (0.3, 1.0)
+"""[m] Goals of the jumps in a long row; [s] until the first command of any row."""
+OF_ROWS = (
+    "success_rate", "fall_rate", "miss_rate", "step_rate", "still_landing_rate", "second_takeoff_rate",
+    "max_landing_tilt_deg", AT_END,
+)  # fmt: skip
+"""Metrics that are reported of the long rows too."""
+GROUND_LOWER, GROUND_UPPER = (0.8, -0.15), (1.4, 0.15)
+"""[m] Goals off the platform, or on the block, with all paws; as far as the paper's simulation always succeeds."""
+DROP, AMPLITUDE, FLAT_RADIUS = 0.15, 0.05, 0.35
+"""[m] Height of the platform; of the uneven ground; radius of level ground around the start there."""
+BLOCK_HEIGHT, BLOCK_MASS, BLOCK_FRICTION, BLOCK_BEYOND, BLOCK_WIDTH = 0.05, 10.0, 0.4, 0.40, 0.8
+"""[m], [kg], [1] with the floor; [m] from the goal to the block's far side, and along y."""
+BIN, IN_RANGE, LIMIT = 0.1, (1.0, 1.4), 9.0
+"""[m] Width of a bin of distances; the upper part of what the paper reaches always; farthest bin."""
+GIVEN_UP, RELIABLE = 0.5, 0.95
+"""[1] Success below which no farther bin is tried; success of a distance that counts."""
+KINDS = {"": "success_rate", "_without_hop": "single_jump_success_rate", "_without_step": "step_free_success_rate"}
+"""Ends of the names of reliable distances, and the rate that each takes."""
+EACH = (
+    *KINDS.values(), "mean_error_m", "mean_error_of_successes_m", "mean_error_at_touchdown_m",
+    "mean_error_0_3_s_after_touchdown_m", "fall_rate", "miss_rate", "still_landing_rate", "max_landing_tilt_deg",
+)  # fmt: skip
+"""Metrics with an entry a bin."""
+PUBLISHED = {
+    "Barkour (Caluwaerts et al. 2023)": 0.5,
+    "Margolis et al. 2021": 0.66,
+    "Liu et al. 2023": 0.8,
+    "Cheng et al. 2024": 0.8,
+    "Atanassov et al. 2024": 0.9,
+    "Jumper, the paper's robot": 1.25,
+}
+"""[m] The paper's table of jump distances."""
+
+
+@dataclass(frozen=True)
+class Grid(Suite):
+    """Jumps to goals on a grid 0.35 to 1.4 m ahead and 0.35 m to either side, two each.
+
+    In range are goals less than 1.4 m ahead, where the paper's jumps all succeed.
+    """
+
+    jumps: int = 2
+    columns: int = 22
+    """Number of distances ahead."""
+    rows: int = 5
+    """Number of distances to the side."""
+
+    name: ClassVar = "grid"
+    paper: ClassVar = {"mean_error_m": 0.025, "success_rate": 0.968, "success_rate_in_range": 1.0}
+
+    def __post_init__(self) -> None:
+        """Check the values."""
+        super().__post_init__()
+        check(min(self.columns, self.rows) >= 1, f"need at least one column and row, got {self.columns}, {self.rows}")
+
+    @property
+    def places(self) -> np.ndarray:
+        """[m] Goals (columns * rows * jumps, 1, 2)."""
+        x, y = np.meshgrid(np.linspace(*AHEAD, self.columns), np.linspace(*ASIDE, self.rows), indexing="ij")
+        return np.repeat(np.stack([x.ravel(), y.ravel()], axis=1), self.jumps, axis=0)[:, None]
+
+    def measure(self, run: EvaluationRun) -> dict[str, Any]:
+        """Follow jumps, draw them, and return the metrics."""
+        landings = self.jump(run, self.places, film="jumps")
+        draw_landings(run.folder / "grid.png", {f"{len(landings.end)} jumps, {run.title}": landings}, (8.0, 5.0))
+        inside = landings.places[..., 0] < AHEAD[1] - 1.0e-6
+        return {"goals": self.columns * self.rows, **landing_metrics(landings, inside)}
+
+
+@dataclass(frozen=True)
+class Ring(Suite):
+    """Jumps to goals spread evenly over a ring around the start."""
+
+    policy: str = "omnidirectional_jump"
+    radius: float = 0.5
+    """[m] Of the ring."""
+
+    name: ClassVar = "ring"
+    least: ClassVar = (len(SECTORS), 0.1)
+
+    def __post_init__(self) -> None:
+        """Check the values."""
+        super().__post_init__()
+        check(0.0 < self.radius < 3.0, f"radius must be in (0, 3) m, got {self.radius}")
+
+    def measure(self, run: EvaluationRun) -> dict[str, Any]:
+        """Follow jumps, draw them, and return the metrics, also those of each quarter."""
+        angle = np.linspace(0.0, 2.0 * np.pi, self.jumps, endpoint=False)
+        places = self.radius * np.stack([np.cos(angle), np.sin(angle)], axis=-1)[:, None]
+        landings = self.jump(run, places, film="jumps")
+        title = f"{self.jumps} jumps over {self.radius:g} m, {run.title}"
+        draw_landings(run.folder / "landings.png", {title: landings}, (6.0, 6.5))
+        sector = np.round(np.arctan2(places[..., 1], places[..., 0]) / (0.5 * np.pi)).astype(int) % len(SECTORS)
+        fell, missed = np.isin(landings.ends, FALLS), landings.outcomes == MISSED
+        values = landing_metrics(landings)
+        for i, name in enumerate(SECTORS):
+            for rate, counts in (("success", landings.success), ("fall", fell), ("miss", missed)):
+                values[f"{rate}_rate_{name}"] = mean(counts[sector == i])
+        return values
+
+
+@dataclass(frozen=True)
+class Consecutive(Suite):
+    """Jumps in a row: the paper's pairs, and ten to drawn goals; the next is commanded a second after touchdown.
+
+    A goal is relative to the robot's place and heading when the jump is commanded. Robots differ in heading and in the
+    delay of the first command. The error of a jump is the distance of the base from its goal when the next one is
+    commanded; after a fall or a collision no further jump counts. `ten_in_a_row_rate` is the share of rows in which no
+    jump ended so, `row_all_on_goal_rate` that of rows in which every jump succeeded. The range of
+    `success_rate_in_range` is all goals.
+    """
+
+    jumps: int = 20
+    """Number of times that each pair is jumped."""
+    trials: int = 100
+    """Number of long rows."""
+    row: int = 10
+    """Number of jumps in one."""
+
+    name: ClassVar = "consecutive"
+    paper: ClassVar = {"mean_error_m": 0.0054}
+
+    def __post_init__(self) -> None:
+        """Check the values."""
+        super().__post_init__()
+        check(min(self.trials, self.row) >= 1, f"need at least one trial and row, got {self.trials}, {self.row}")
+
+    def measure(self, run: EvaluationRun) -> dict[str, Any]:
+        """Follow both tests, draw the paths, and return the metrics."""
+        rng = np.random.default_rng(self.seed)
+        pairs = np.repeat(np.array(list(PAIRS.values())), self.jumps, axis=0)
+        rows = rng.uniform(ROW_LOWER, ROW_UPPER, (self.trials, self.row, 2))
+        logs, paths = [], []
+        for name, places in (("pairs", pairs), ("row", rows)):
+            track, delay = Track(), rng.uniform(*DELAYS, len(places))
+            logs.append(self.jump(run, places, delay=delay, film=name, watch=track))
+            paths.append(track.in_start_frame(logs[-1].headings))
+        parts = dict(zip((*PAIRS, f"{self.row} in a row"), (*np.split(paths[0], 2), paths[1]), strict=True))
+        draw_paths(run.folder / "paths.png", parts, PAIRS, run.title)
+        return {"rest_s": self.rest} | consecutive_metrics(*logs)
+
+
+def consecutive_metrics(pairs: PlaceLog, row: PlaceLog) -> dict[str, Any]:
+    """Return the metrics of both tests of jumps in a row; the first half of the pairs are the diagonal ones."""
+    values, ten = (landing_metrics(landings) for landings in (pairs, row))
+    for part in (values, ten):
+        if "at_rest_within_1_s_rate" in part:
+            part[AT_END] = part.pop("at_rest_within_1_s_rate")
+    halves = zip(PAIRS, np.split(pairs.error, 2), strict=True)
+    return values | {
+        "success_rate_in_range": values["success_rate"],
+        **{f"mean_error_{name}_m": mean(error) for name, error in halves},
+        **{f"mean_error_jump_{i + 1}_m": mean(pairs.error[:, i]) for i in range(2)},
+        "both_landed_rate": mean(pairs.landed.all(axis=1)),
+        "row": row.goals.shape[1],
+        "trials": len(row.goals),
+        "ten_in_a_row_rate": mean(row.landed.all(axis=1)),
+        "row_all_on_goal_rate": mean(row.success.all(axis=1)),
+        "mean_jumps_until_the_end": mean(row.landed.sum(axis=1)),
+        "mean_error_ten_m": ten["mean_error_m"],
+        **{f"{name}_ten": ten[name] for name in OF_ROWS},
+        "mean_error_by_number_m": [mean(error) for error in row.error.T],
+    }
+
+
+@dataclass(frozen=True)
+class Platform(Suite):
+    """Jumps off a platform of 0.15 m, onto uneven ground, and onto a sliding block.
+
+    Most policies observe nothing of the ground but the base's height above the spot below it. Uneven ground has bumps
+    of up to 0.05 m around a level start, and every robot jumps in a direction of its own. The block, 10 kg and 0.05 m
+    high, reaches from before the goal to beyond it and slides when the robot lands on it; the goal stays. The range of
+    `success_rate_in_range` is all goals. SolverMuJoCo has no sliding block: with it that scene is left out.
+    """
+
+    jumps: int = 100
+    edge: float = 0.40
+    """[m] From the start to the platform's edge, moved back to a multiple of 0.02 m, and to the block's near side."""
+
+    name: ClassVar = "platform"
+
+    def __post_init__(self) -> None:
+        """Check the values."""
+        super().__post_init__()
+        low, high = 0.3, GROUND_LOWER[0]
+        check(low <= self.edge < high, f"edge must be from {low} m to below {high} m, got {self.edge}")
+
+    def scenes(self, goals: np.ndarray, rng: np.random.Generator) -> Iterator[tuple[str, dict[str, Any], np.ndarray]]:
+        """Yield the name of each scene, its settings of the environment, and headings; goals [m]: (num_envs, 2)."""
+        straight = np.zeros(len(goals))
+        yield "platform", {"ground": platform(-DROP, edge=self.edge)}, straight
+        bumps = uneven(AMPLITUDE, int(rng.integers(2**31)), flat_radius=FLAT_RADIUS)
+        yield "uneven", {"ground": bumps}, rng.uniform(-math.pi, math.pi, len(goals))
+        if self.solver != "mujoco":
+            far = goals[:, 0] + BLOCK_BEYOND
+            center = np.stack([0.5 * (self.edge + far), goals[:, 1]], axis=1)
+            half = np.stack([0.5 * (far - self.edge), np.full(len(goals), 0.5 * BLOCK_WIDTH)], axis=1)
+            yield "block", {"block": BlockCfg(center, half, BLOCK_HEIGHT, BLOCK_MASS, BLOCK_FRICTION)}, straight
+
+    def measure(self, run: EvaluationRun) -> dict[str, Any]:
+        """Follow the jumps of all scenes, draw them, and return each scene's metrics under its name, and their mean."""
+        rng = np.random.default_rng(self.seed)
+        goals, values = rng.uniform(GROUND_LOWER, GROUND_UPPER, (self.jumps, 2)), {}
+        done: dict[str, PlaceLog] = {}
+        for name, special, headings in self.scenes(goals, rng):
+            env = run.env(self.jumps, **special)
+            done[name] = self.jump(run, goals[:, None], env, headings=headings, film=name, drawn=special)
+            values |= {f"{name}_{metric}": value for metric, value in landing_metrics(done[name]).items()}
+            if "block" in special:
+                slide = np.linalg.norm(env.sim.solver.block_position() - special["block"].center, axis=1)
+                values |= {"block_mean_slide_m": float(slide.mean()), "block_max_slide_m": float(slide.max())}
+        titles = {f"{name}, {run.title}": landings for name, landings in done.items()}
+        draw_landings(run.folder / "landings.png", titles, (5.0 * len(done), 4.0))
+        names = ("mean_error_m", "success_rate", "fall_rate", "miss_rate", "still_landing_rate")
+        summary = {name: mean([values[f"{scene}_{name}"] for scene in done]) for name in names}
+        tilts = [values[f"{scene}_max_landing_tilt_deg"] for scene in done]
+        summary["success_rate_in_range"] = summary["success_rate"]
+        summary["max_landing_tilt_deg"] = max((tilt for tilt in tilts if tilt is not None), default=None)
+        return {"jumps": self.jumps * len(done), "edge_m": self.edge, **summary, **values}
+
+
+@dataclass(frozen=True)
+class Farthest(Suite):
+    """Jumps whose distance grows from 1 m by bins of 0.1 m, until fewer than half of a bin succeed.
+
+    Goals of a bin lie in one direction, within 0.05 m of its middle. A far goal may be reached by steps or a second hop
+    after the landing, so three distances are reported, each the largest middle of a bin up to which at least 95 % of
+    the jumps succeed: at all; without a second hop, in which all paws are off the ground again for more than 0.05 s;
+    without a step, in which any paw that had come down is off it again for 0.05 s. `base_at_touchdown` is the distance
+    of the base from its start at touchdown, the mean of a bin's successes. Published distances were jumped by robots;
+    the paper's 1.25 m compares with `hop_free_distance_m`.
+    """
+
+    jumps: int = 100
+    first: float = 1.0
+    """[m] Middle of the first bin."""
+    last: float = 2.5
+    """[m] No bin beyond."""
+    direction: float = 0.0
+    """[deg] Of the goals from the robot: 0 ahead, 90 to the left, 180 back."""
+
+    name: ClassVar = "max"
+    paper: ClassVar = {"hop_free_distance_m": 1.25}
+
+    def __post_init__(self) -> None:
+        """Check the values."""
+        super().__post_init__()
+        good, limits = 0.1 <= self.first <= self.last <= LIMIT, f"0.1 <= first <= last <= {LIMIT:g} m"
+        check(good, f"need {limits}, got {self.first} and {self.last}")
+        check(-180.0 <= self.direction <= 180.0, f"direction must be in -180..180 deg, got {self.direction}")
+
+    def places(self, middle: float) -> np.ndarray:
+        """Return the goals of the bin around a distance [m], (jumps, 1, 2) [m]."""
+        distance = middle + BIN * (np.linspace(0.0, 1.0, self.jumps) - 0.5 if self.jumps > 1 else np.zeros(1))
+        angle = math.radians(self.direction)
+        return distance[:, None, None] * np.array([math.cos(angle), math.sin(angle)])
+
+    def measure(self, run: EvaluationRun) -> dict[str, Any]:
+        """Follow jumps of growing distance, draw their success, and return the metrics."""
+        env, bins = run.env(self.jumps), {}
+        for number in range(round((self.last - self.first) / BIN) + 1):
+            middle = round(self.first + number * BIN, 6)
+            bins[middle] = self.jump(run, self.places(middle), env, film=f"jump_{middle:.1f}_m")
+            success = bins[middle].success.mean()
+            print(f"{middle:.1f} m: {success:.1%} success", flush=True)
+            if success < GIVEN_UP:
+                break
+        values = distance_metrics(bins) | trained_range(env.task) | {"direction_deg": self.direction}
+        draw_distances(run, values)
+        return values
+
+
+def draw_distances(run: EvaluationRun, values: dict[str, Any]) -> None:
+    """Draw success and error over the distance."""
+    with drawn(run.folder / "max_jump.png", 2, 1, figsize=(7, 6), sharex=True) as (top, bottom):
+        for kind, rate in KINDS.items():
+            label = f"success{kind.replace('_', ' ')}"
+            top.plot(values["bin_m"], [100.0 * share for share in values[f"bin_{rate}"]], marker="o", label=label)
+        top.axhline(100.0 * RELIABLE, color="0.5", linestyle="--", linewidth=1.0)
+        for work, distance in PUBLISHED.items():
+            if distance >= values["bin_m"][0]:
+                top.axvline(distance, color="tab:green", linewidth=1.0, label=f"{work}, {distance:g} m")
+        top.set(ylabel="success [%]", ylim=(0.0, 103.0), title=run.title)
+        top.legend(loc="lower left")
+        error = [np.nan if value is None else value for value in values["bin_mean_error_of_successes_m"]]
+        bottom.plot(values["bin_m"], error, marker="o")
+        bottom.set(xlabel="commanded distance [m]", ylabel="mean error of successes [m]", ylim=(0.0, None))
+
+
+def distance_metrics(bins: dict[float, PlaceLog]) -> dict[str, Any]:
+    """Return the metrics over all bins (middle [m] to jumps), and lists with an entry a bin."""
+    each = [landing_metrics(landings) for landings in bins.values()]
+    lists = {name: [values[name] for values in each] for name in EACH}
+    flown = [base_at_touchdown(landings) for landings in bins.values()]
+    landed = [landings.landing[landings.success][:, 0] for landings in bins.values()]
+    inside = [landings.success[within(landings.places[..., 0], IN_RANGE)] for landings in bins.values()]
+    values: dict[str, Any] = {
+        "jumps": sum(values["jumps"] for values in each),
+        "mean_error_m": mean(lists["mean_error_m"]),
+        "success_rate_in_range": mean(np.concatenate(inside)),
+        **{rate: mean(lists[rate]) for rate in (*KINDS.values(), "fall_rate", "miss_rate", "still_landing_rate")},
+        "max_landing_tilt_deg": max((tilt for tilt in lists["max_landing_tilt_deg"] if tilt is not None), default=None),
+    }
+    for kind, rate in KINDS.items():
+        bad = next((i for i, share in enumerate(lists[rate]) if share < RELIABLE), len(bins))
+        values[f"largest_reliable{kind}_m"] = list(bins)[bad - 1] if bad else None
+        values[f"base_at_touchdown{kind}_m"] = flown[bad - 1] if bad else None
+    values["hop_free_distance_m"] = values["largest_reliable_without_hop_m"]
+    values["farthest_success_m"] = largest(np.concatenate(landed))
+    values |= {"bin_m": list(bins), "bin_base_at_touchdown_m": flown}
+    return values | {f"bin_{name}": column for name, column in lists.items()}
+
+
+def base_at_touchdown(landings: PlaceLog) -> float | None:
+    """Return the mean distance [m] of the base from its start when the first paw comes down, over the successes."""
+    return mean(np.linalg.norm(landings.touchdown[landings.success], axis=-1))
+
+
+SUITES: tuple[type[Suite], ...] = (HeightSweep, DistanceSweep, Grid, Ring, Consecutive, Platform, Farthest)
+
+
+def suites_for(evaluation: str) -> dict[str, type[Suite]]:
+    """Return the suites of policies with a key of `EVALUATIONS`, by name."""
+    return {suite.name: suite for suite in SUITES if evaluation in suite.evaluations}

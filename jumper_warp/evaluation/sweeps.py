@@ -1,0 +1,216 @@
+"""Suites, which are tests of jumping policies, and those two that the paper has for each policy: the sweeps."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, replace
+from types import ModuleType
+from typing import Any, ClassVar
+
+import numpy as np
+
+from jumper_warp.envs.env import Env
+from jumper_warp.evaluation.heights import SUCCESS_TOLERANCE, HeightLog, for_sweep, sweep_metrics
+from jumper_warp.evaluation.jumps import DELAY, REST_TIME
+from jumper_warp.evaluation.limits import limit_metrics, open_loop_limits
+from jumper_warp.evaluation.log import Metrics, mean, termination_names, within
+from jumper_warp.evaluation.places import (
+    PlaceLog,
+    ended_by_takeoff,
+    for_evaluation,
+    landing_metrics,
+    random_headings,
+    trained_range,
+)
+from jumper_warp.evaluation.plots import draw_sweep, drawn
+from jumper_warp.evaluation.run import HEIGHTS, PLACES, EvaluationArgs, EvaluationRun
+from jumper_warp.policies.conditions import Conditions
+from jumper_warp.utils.errors import InputError
+
+HEIGHTS_IN_RANGE, DISTANCES_IN_RANGE = (0.5, 1.1), (0.3, 1.4)
+"""[m] That the paper reaches always."""
+TRAINED = (0.4, 1.0)
+"""[m] Distances of the paper's training."""
+
+
+def check(good: bool, message: str) -> None:
+    """Raise InputError with a message unless settings are good."""
+    if not good:
+        raise InputError(message)
+
+
+@dataclass(frozen=True)
+class Suite(EvaluationArgs):
+    """Flags of a suite, and its measurement."""
+
+    jumps: int = 200
+    """Number of jumps (where there are several scenes, bins or goals on a grid, of each)."""
+    rest: float = REST_TIME
+    """[s] From touchdown until a jump is over."""
+
+    name: ClassVar[str]
+    evaluations: ClassVar[tuple[str, ...]] = PLACES
+    """Keys of `EVALUATIONS` of the policies that it takes."""
+    paper: ClassVar[dict[str, float]] = {}
+    """Metrics in the paper, of its simulation or its robot."""
+    least: ClassVar[tuple[int, float]] = (1, 0.1)
+    """Jumps and rest [s] at least."""
+
+    def __post_init__(self) -> None:
+        """Check the values."""
+        super().__post_init__()
+        jumps, rest = self.least
+        check(self.jumps >= jumps, f"need at least {jumps} jump{'s' * (jumps > 1)}, got {self.jumps}")
+        check(rest <= self.rest <= 10.0, f"rest must be in [{rest:g}, 10] s, got {self.rest}")
+
+    def measure(self, run: EvaluationRun) -> dict[str, Any]:
+        """Follow jumps, draw them, and return the metrics."""
+        raise NotImplementedError
+
+    def run(self, modules: Iterable[ModuleType] = ()) -> dict[str, Any]:
+        """Measure the policy, report and return the metrics; modules: that the user has named.
+
+        Raises PolicyError, CheckpointError or InputError as `EvaluationRun.of`.
+        """
+        run = EvaluationRun.of(self.name, self, self.evaluations, modules)
+        return run.report(self.measure(run), self.paper)
+
+    def jump(
+        self,
+        run: EvaluationRun,
+        places: np.ndarray,
+        env: Env | None = None,
+        *,
+        headings: np.ndarray | None = None,
+        delay: np.ndarray | float = DELAY,
+        **follow: Any,
+    ) -> PlaceLog:
+        """Return jumps to places [m], (num_envs, jumps in a row, 2).
+
+        env, headings: made and drawn unless given; delay: as in `PlaceLog`; follow: as in `EvaluationRun.follow`.
+        """
+        env = run.env(len(places)) if env is None else env
+        headings = random_headings(len(places), self.seed) if headings is None else headings
+        return run.follow(env, PlaceLog(places, termination_names(env.task), headings, delay, self.rest), **follow)
+
+    def pushed_in_flight(self, run: EvaluationRun, measure: Callable[[Conditions], Metrics], *names: str) -> Metrics:
+        """Return some metrics of a randomised test in which robots are pushed in flight too."""
+        if not self.randomize or self.push_in_flight:
+            return {}
+        values = measure(replace(run.conditions, push_in_flight=True))
+        return {f"pushed_in_flight_{name}": values[name] for name in names}
+
+
+@dataclass(frozen=True)
+class HeightSweep(Suite):
+    """Jumps to heights spread evenly over 0.5 to 1.2 m, each once.
+
+    Every robot stands in the default pose and is commanded to jump after half a second. A jump succeeds if the highest
+    base height is within 0.1 m of the commanded one. A landing is good if nothing but the paws touched anything, the
+    base stayed within 10 degrees of level and was at rest a second after touchdown. A fall or a collision ends a jump:
+    its apex until then counts. Randomised robots are pushed while a paw is down; a second test pushes them in flight
+    too. The open-loop jump of the same robots (squat, hold, full extension) shows the height that each can reach.
+    """
+
+    policy: str = "vertical_jump"
+    heights: tuple[float, float] = (0.5, 1.2)
+    """[m] Lowest and highest commanded base height."""
+    record: int = 5
+
+    name: ClassVar = "sweep"
+    evaluations: ClassVar = HEIGHTS
+    paper: ClassVar = {"mean_abs_error_m": 0.04, "success_rate": 0.91, "success_rate_in_range": 1.0}
+    least: ClassVar = (3, REST_TIME)
+
+    def __post_init__(self) -> None:
+        """Check the values."""
+        super().__post_init__()
+        check(0.0 < self.heights[0] <= self.heights[1] < 10.0, f"heights must be in (0, 10) m, got {self.heights}")
+
+    def follow(self, run: EvaluationRun, env: Env, film: str = "") -> HeightLog:
+        """Return the jumps."""
+        heights = np.linspace(*self.heights, self.jumps)
+        return run.follow(env, HeightLog(heights, termination_names(env.task), self.rest), film=film)
+
+    def measure(self, run: EvaluationRun) -> dict[str, Any]:
+        """Follow jumps and open-loop jumps, draw them, and return the metrics."""
+        env = run.env(self.jumps, for_sweep)
+        fresh = env.state_dict()
+        jumps = self.follow(run, env, "jumps")
+        limit = open_loop_limits(env, fresh)
+        with drawn(run.folder / "sweep.png", figsize=(6, 5.5)) as axis:
+            axis.scatter(jumps.commanded, limit, s=5, color="0.6", label="open-loop jump of the same robot")
+            draw_sweep(axis, jumps.commanded, jumps.apex, jumps.reached, SUCCESS_TOLERANCE, ("reached", "missed"))
+            axis.legend(loc="lower right")
+            axis.set(xlabel="commanded base height [m]", ylabel="highest base height [m]")
+            axis.set_title(f"{self.jumps} jumps, {run.title}", wrap=True)
+
+        def pushed(conditions: Conditions) -> Metrics:
+            return sweep_metrics(self.follow(run, run.env(self.jumps, for_sweep, conditions)), HEIGHTS_IN_RANGE)
+
+        names = ("mean_abs_error_m", "success_rate", "success_rate_in_range", "fall_rate", "miss_rate", "landing_rate")
+        values = sweep_metrics(jumps, HEIGHTS_IN_RANGE) | limit_metrics(jumps, limit)
+        return {"rest_s": self.rest} | values | self.pushed_in_flight(run, pushed, *names)
+
+
+@dataclass(frozen=True)
+class DistanceSweep(Suite):
+    """Jumps 0.3 to 1.5 m straight ahead, spread evenly, each once.
+
+    Every robot stands in the default pose, with a heading of its own drawn from the full circle, and is commanded to
+    jump after half a second. The error is the distance of the base from its goal in the plane a second after touchdown,
+    or where the jump failed before. A jump succeeds if it was begun on command, ends within 0.1 m of its goal, and
+    nothing but the paws touched anything. Steps, second hops and second takeoffs (upward at 0.25 m/s with no paw down)
+    in a landing are reported separately. Randomised robots are pushed while a paw is down; a second test pushes them in
+    flight too.
+    """
+
+    distances: tuple[float, float] = (0.3, 1.5)
+    """[m] Of the nearest and the farthest goal."""
+    aside: float = 0.0
+    """[m] Goals lie up to this far to either side, drawn."""
+    end_at_second_takeoff: bool = False
+    """A second takeoff after landing ends a jump, as a failure, as in the authors' configuration."""
+    record: int = 5
+
+    name: ClassVar = "sweep"
+    paper: ClassVar = {"mean_error_m": 0.026, "success_rate": 0.97, "success_rate_in_range": 1.0}
+    least: ClassVar = (3, 0.1)
+
+    def __post_init__(self) -> None:
+        """Check the values."""
+        super().__post_init__()
+        (near, far), goals = self.distances, f"{self.distances}, {self.aside} aside"
+        check(0.0 < near < far < 10.0 and 0.0 <= self.aside < 10.0, f"goals must be within 10 m and rise, got {goals}")
+
+    def follow(self, run: EvaluationRun, conditions: Conditions, film: str = "") -> PlaceLog:
+        """Return the jumps in some conditions."""
+        aside = np.random.default_rng(self.seed + 1).uniform(-self.aside, self.aside, self.jumps)
+        places = np.stack([np.linspace(*self.distances, self.jumps), aside], axis=1)[:, None]
+        env = run.env(self.jumps, ended_by_takeoff if self.end_at_second_takeoff else for_evaluation, conditions)
+        return self.jump(run, places, env, film=film)
+
+    @staticmethod
+    def metrics(landings: PlaceLog) -> Metrics:
+        """Return the metrics of the sweep."""
+        distance = landings.places[..., 0]
+        values = landing_metrics(landings, within(distance, DISTANCES_IN_RANGE))
+        return values | {"success_rate_0_4_1_0": mean(landings.success[within(distance, TRAINED)])}
+
+    def measure(self, run: EvaluationRun) -> dict[str, Any]:
+        """Follow jumps, draw them, and return the metrics."""
+        landings, trained = self.follow(run, run.conditions, "jumps"), trained_range(run.task)
+        with drawn(run.folder / "sweep.png", figsize=(6, 5.5)) as axis:
+            axis.axvspan(*TRAINED, color="0.5", alpha=0.08, label="training of the paper")
+            axis.axvspan(*trained.values(), color="tab:orange", alpha=0.06, label="training of this policy")
+            commanded, reached = landings.places[..., 0], landings.landing[..., 0]
+            draw_sweep(axis, commanded, reached, landings.success, SUCCESS_TOLERANCE, ("landed there", "failed"))
+            axis.set(xlabel="commanded distance [m]", ylabel="distance of the base at the end [m]")
+            axis.set(xlim=(self.distances[0] - 0.05, self.distances[1] + 0.05))
+            axis.set_title(f"{self.jumps} jumps, {run.title}", wrap=True)
+        values = {"rest_s": self.rest, "end_at_second_takeoff": self.end_at_second_takeoff, **self.metrics(landings)}
+        pushed = self.pushed_in_flight(
+            run, lambda conditions: self.metrics(self.follow(run, conditions)), "mean_error_m", "success_rate",
+            "success_rate_in_range", "fall_rate", "miss_rate", "still_landing_rate", "max_landing_tilt_deg",
+        )  # fmt: skip
+        return values | trained | pushed

@@ -1,0 +1,83 @@
+"""The one import of whoever writes a reward, an observation or a whole task.
+
+    from dataclasses import replace
+    import warp as wp
+    from jumper_warp import make_task, mdp
+
+    @wp.func
+    def level(view: mdp.RobotView, task: mdp.JumpState, scale: float) -> float:
+        return wp.where(task.phase == mdp.FLIGHT, mdp.rewards.psi(mdp.tilt(view), scale), 0.0)
+
+    jump = make_task("vertical-jump")
+    jump = replace(jump, rewards=(*jump.rewards, mdp.RewardTerm(level, weight=2.0, scale=0.1)))
+
+Stock terms lie in the namespaces `rewards`, `terminations`, `observations` and `events`; the latter also holds what an
+event writes a world's parameters with. Motors and command filters of a task are those of `jumper_warp.robot.motors`.
+"""
+
+from jumper_warp.kernels.attitude.state import AttitudeState
+from jumper_warp.kernels.jump.state import FLIGHT, LANDED, STANCE, JumpState, commanded, waiting
+from jumper_warp.kernels.mdp import observations, rewards, terminations
+from jumper_warp.kernels.mdp import parameters as events
+from jumper_warp.kernels.mdp.env import Scene, SkillSettings
+from jumper_warp.kernels.mdp.parameters import RobotParameters
+from jumper_warp.kernels.mdp.random import Draw, between, branch, cut_gaussian, within
+from jumper_warp.kernels.mdp.reset import store_pose
+from jumper_warp.kernels.mdp.view import RobotArrays, RobotView, tilt, vec12, yaw_of
+from jumper_warp.kernels.terrain.ground import Ground, surface, world_ground
+from jumper_warp.kernels.velocity.state import VelocityState
+from jumper_warp.tasks.cfg import Command, Handover, Reset, TaskCfg
+from jumper_warp.tasks.randomization import RandomizationCfg
+from jumper_warp.tasks.terms import (
+    Advance,
+    Curriculum,
+    EventTerm,
+    ObservationTerm,
+    RewardTerm,
+    StateMetric,
+    TerminationTerm,
+)
+
+__all__ = [
+    "FLIGHT",
+    "LANDED",
+    "STANCE",
+    "Advance",
+    "AttitudeState",
+    "Command",
+    "Curriculum",
+    "Draw",
+    "EventTerm",
+    "Ground",
+    "Handover",
+    "JumpState",
+    "ObservationTerm",
+    "RandomizationCfg",
+    "Reset",
+    "RewardTerm",
+    "RobotArrays",
+    "RobotParameters",
+    "RobotView",
+    "Scene",
+    "SkillSettings",
+    "StateMetric",
+    "TaskCfg",
+    "TerminationTerm",
+    "VelocityState",
+    "between",
+    "branch",
+    "commanded",
+    "cut_gaussian",
+    "events",
+    "observations",
+    "rewards",
+    "store_pose",
+    "surface",
+    "terminations",
+    "tilt",
+    "vec12",
+    "waiting",
+    "within",
+    "world_ground",
+    "yaw_of",
+]

@@ -1,0 +1,319 @@
+"""A step made again, and the multipliers of its equations of motion and contact laws; see `step_adjoint`."""
+
+import warp as wp
+
+from ...actuation.stops import stop_rows
+from ...layout import GRAVITY
+from ...scalar import real, vec3
+from ...state import BaseState
+from ..base_dynamics import BaseInverse, LegSolve, add_leg, invert, motor_acceleration, solve_ang, solve_lin
+from ..base_motion import moved_base
+from ..contact import SEPARATE, PawContact
+from ..contact_laws import PawLaw, contact_at, contact_point, paw_law
+from ..leg_dynamics import PawKinematics
+from ..parameters import load_spring, load_stops, load_vec3
+from ..step import LegParams, Robot, base_system, hold_base, leg_terms
+from ..trajectory import Rows, row_vec3
+from .virtual_power import BaseFactors, LegFactors
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.struct
+class StepRecord:
+    """What the reverse pass needs of the steps between two rows of a rollout, by world, step and leg."""
+
+    base: wp.array2d(dtype=BaseState)  # (num_worlds, steps + 1)
+    angles: wp.array3d(dtype=vec3)  # [rad], (num_worlds, steps + 1, 4)
+    rates: wp.array3d(dtype=vec3)  # [rad/s], likewise
+    inverse: wp.array2d(dtype=BaseInverse)  # (num_worlds, steps)
+    legs: wp.array3d(dtype=LegSolve)  # (num_worlds, steps, 4)
+    paws: wp.array3d(dtype=PawKinematics)  # likewise
+
+
+@wp.struct
+class StepPlace:
+    """A step that is made again and run backwards, and what acts on the base in it."""
+
+    dt: real  # [s]
+    world: int
+    step: int  # of the rollout
+    entry: int  # of the record
+    force: vec3  # [N] at the base's com, world axes
+    moment: vec3  # [N m]
+
+
+@wp.struct
+class LegReverse:
+    """Gradients by a leg's motors in a step, and its multipliers."""
+
+    angles: vec3  # by the angles at the end of the step, then at its start
+    rates: vec3
+    torque: vec3  # by the torques
+    virtual_rates: vec3  # multipliers of the motors' equations
+    law: PawLaw
+    seed: vec3  # by the paw's impulse, then the multiplier of its law
+
+
+@wp.struct
+class Multipliers:
+    """Gradients of the base's velocities at the end of a step, and what solving M for them gives; body axes."""
+
+    lin_seed: vec3
+    ang_seed: vec3
+    lin: vec3
+    ang: vec3
+
+
+@wp.func
+def solve_system(
+    record: StepRecord, at: StepPlace, lin_seed: vec3, ang_seed: vec3, legs: wp.array(dtype=LegReverse)
+) -> Multipliers:
+    """Solve M m = seeds, for the motors those by their rates; their m is written to `virtual_rates`."""
+    m = Multipliers()
+    m.lin_seed = lin_seed
+    m.ang_seed = ang_seed
+    force = lin_seed
+    moment = ang_seed
+    for k in range(legs.shape[0]):
+        solve = record.legs[at.world, at.entry, k]
+        force -= wp.transpose(solve.to_lin) * legs[k].rates
+        moment -= wp.transpose(solve.to_ang) * legs[k].rates
+    inverse = record.inverse[at.world, at.entry]
+    m.lin = solve_lin(inverse, force, moment)
+    m.ang = solve_ang(inverse, force, moment)
+    for k in range(legs.shape[0]):
+        solve = record.legs[at.world, at.entry, k]
+        legs[k].virtual_rates = solve.inverse * legs[k].rates - solve.to_lin * m.lin - solve.to_ang * m.ang
+    return m
+
+
+@wp.func
+def replay_step(
+    robot: Robot, params: wp.array(dtype=LegParams), at: StepPlace, rows: Rows, record: StepRecord
+):  # fmt: skip
+    """Make a step again from its entry of the record, with known torques and impulses; writes the record."""
+    dt, world, step, i = at.dt, at.world, at.step, at.entry
+    base = record.base[world, i]
+    g = wp.quat_rotate_inv(base.quat, load_vec3(robot.table, GRAVITY, world))
+    system = base_system(robot, world, base, g, at.force, at.moment)
+    for k in range(record.legs.shape[2]):
+        torque = row_vec3(rows.torque, step, 3 * k, world)
+        pressed = int(rows.pressed[step, k, world])
+        angles = record.angles[world, i, k]
+        stops = stop_rows(load_stops(robot.table, k, world), angles, dt)
+        spring = load_spring(robot.table, k, world)
+        rates = record.rates[world, i, k]
+        terms = leg_terms(params[k], spring, angles, rates, torque, stops, pressed, base.ang, g, dt)
+        record.legs[world, i, k] = terms.solve
+        record.paws[world, i, k] = terms.paw
+        system = add_leg(system, terms.dynamics, terms.solve)
+    inverse = hold_base(robot, world, invert(system))
+    record.inverse[world, i] = inverse
+    force_impulse = dt * system.force
+    moment_impulse = dt * system.moment
+    for k in range(record.legs.shape[2]):
+        impulse = wp.quat_rotate_inv(base.quat, rows.impulse[step, k, world])
+        if wp.dot(impulse, impulse) > real(0.0):
+            solve = record.legs[world, i, k]
+            paw = record.paws[world, i, k]
+            contact = contact_at(robot, k, base, paw, solve, inverse, impulse)
+            joint = wp.transpose(contact.jacobian) * impulse
+            force_impulse += impulse - wp.transpose(solve.to_lin) * joint
+            moment_impulse += (
+                wp.cross(contact_point(robot, k, paw, contact), impulse) - wp.transpose(solve.to_ang) * joint
+            )
+            solve.free += solve.inverse * (joint / dt)
+            record.legs[world, i, k] = solve
+    lin = solve_lin(inverse, force_impulse, moment_impulse)
+    ang = solve_ang(inverse, force_impulse, moment_impulse)
+    for k in range(record.legs.shape[2]):
+        rates = record.rates[world, i, k] + dt * motor_acceleration(record.legs[world, i, k], lin / dt, ang / dt)
+        record.rates[world, i + 1, k] = rates
+        record.angles[world, i + 1, k] = record.angles[world, i, k] + dt * rates
+    record.base[world, i + 1] = moved_base(base, wp.quat_rotate_inv(base.quat, base.lin) + lin, base.ang + ang, dt)
+
+
+@wp.func
+def solve_linear(a: wp.array2d(dtype=real), b: wp.array(dtype=real), n: int):
+    """Replace the first n of b by the solution x of a x = b; Gaussian elimination with row pivots, a is overwritten."""
+    for col in range(n):
+        best = col
+        for row in range(col + 1, n):
+            if wp.abs(a[row, col]) > wp.abs(a[best, col]):
+                best = row
+        if best != col:
+            for i in range(col, n):
+                swap = a[col, i]
+                a[col, i] = a[best, i]
+                a[best, i] = swap
+            swap_b = b[col]
+            b[col] = b[best]
+            b[best] = swap_b
+        scale = real(1.0) / a[col, col]
+        for row in range(col + 1, n):
+            factor = scale * a[row, col]
+            if factor != real(0.0):
+                for i in range(col + 1, n):
+                    a[row, i] = a[row, i] - factor * a[col, i]
+                b[row] = b[row] - factor * b[col]
+    for back in range(n):
+        row = n - 1 - back
+        total = b[row]
+        for i in range(row + 1, n):
+            total -= a[row, i] * b[i]
+        b[row] = total / a[row, row]
+
+
+@wp.func
+def solve_laws(
+    contacts: wp.array(dtype=PawContact), legs: wp.array(dtype=LegReverse), matrix: wp.array2d(dtype=real),
+    vector: wp.array(dtype=real),
+):  # fmt: skip
+    """Replace the gradients of the paws' impulses in `seed` by the multipliers of their laws.
+
+    matrix, vector: of shape (12, 12) and (12,), overwritten.
+    """
+    row = int(0)
+    for k in range(legs.shape[0]):
+        if legs[k].law.mode != SEPARATE:
+            col = int(0)
+            for j in range(legs.shape[0]):
+                if legs[j].law.mode != SEPARATE:
+                    block = contacts[k].from_lin * contacts[j].to_lin + contacts[k].from_ang * contacts[j].to_ang
+                    if k == j:
+                        block = contacts[k].total
+                    block = block * wp.transpose(legs[j].law.by_velocity)
+                    if k == j:
+                        block = block + wp.transpose(legs[k].law.by_impulse)
+                    for r in range(3):
+                        for s in range(3):
+                            matrix[row + r, col + s] = block[r, s]
+                    col += 3
+            for r in range(3):
+                vector[row + r] = -legs[k].seed[r]
+            row += 3
+    solve_linear(matrix, vector, row)
+    row = int(0)
+    for k in range(legs.shape[0]):
+        legs[k].seed = vec3(real(0.0))
+        if legs[k].law.mode != SEPARATE:
+            legs[k].seed = vec3(vector[row], vector[row + 1], vector[row + 2])
+            row += 3
+
+
+@wp.func
+def load_laws(
+    robot: Robot, at: StepPlace, first_impulse: wp.array2d(dtype=vec3), rows: Rows, record: StepRecord, m: Multipliers,
+    seeds: Rows, legs: wp.array(dtype=LegReverse), contacts: wp.array(dtype=PawContact),
+) -> bool:  # fmt: skip
+    """Write the paws' laws at the solution, and the gradients by their impulses; returns whether any touches."""
+    world, i = at.world, at.entry
+    base = record.base[world, i]
+    ahead = record.base[world, i + 1]
+    lin = wp.quat_rotate_inv(base.quat, ahead.lin)
+    ang = ahead.ang
+    old_lin = wp.quat_rotate_inv(base.quat, base.lin)
+    touching = bool(False)
+    for k in range(legs.shape[0]):
+        legs[k].law = PawLaw()
+        impulse = wp.quat_rotate_inv(base.quat, rows.impulse[at.step, k, world])
+        if wp.dot(impulse, impulse) > real(0.0):
+            paw = record.paws[world, i, k]
+            c = contact_at(robot, k, base, paw, record.legs[world, i, k], record.inverse[world, i], impulse)
+            point = contact_point(robot, k, paw, c)
+            before = old_lin + wp.cross(base.ang, point) + c.jacobian * record.rates[world, i, k]
+            velocity = lin + wp.cross(ang, point) + c.jacobian * record.rates[world, i + 1, k]
+            old_impulse = first_impulse[k, world]
+            if at.step > 0:
+                old_impulse = rows.impulse[at.step - 1, k, world]
+            old_impulse = wp.quat_rotate_inv(base.quat, old_impulse)
+            law = paw_law(robot, world, k, c, before, velocity, old_impulse)
+            seed = m.lin + wp.cross(m.ang, point) + c.jacobian * legs[k].virtual_rates
+            if seeds.impulse.shape[0] > 0:
+                seed += wp.quat_rotate_inv(base.quat, seeds.impulse[at.step, k, world])
+            contacts[k] = c
+            legs[k].law = law
+            legs[k].seed = seed
+            touching = touching or law.mode != SEPARATE
+    return touching
+
+
+@wp.func
+def add_laws(
+    robot: Robot, at: StepPlace, record: StepRecord, before: Multipliers, legs: wp.array(dtype=LegReverse),
+    contacts: wp.array(dtype=PawContact),
+) -> Multipliers:  # fmt: skip
+    """Return the multipliers with the share of the contact laws, whose own are known; the legs' are replaced."""
+    m = before
+    more_lin = vec3(real(0.0))
+    more_ang = vec3(real(0.0))
+    for k in range(legs.shape[0]):
+        if legs[k].law.mode != SEPARATE:
+            c = contacts[k]
+            y = wp.transpose(legs[k].law.by_velocity) * legs[k].seed
+            joint = wp.transpose(c.jacobian) * y
+            more_lin += c.to_lin * y
+            more_ang += c.to_ang * y
+            m.lin_seed += y
+            m.ang_seed += wp.cross(contact_point(robot, k, record.paws[at.world, at.entry, k], c), y)
+            legs[k].rates = legs[k].rates + joint
+            legs[k].virtual_rates = legs[k].virtual_rates + record.legs[at.world, at.entry, k].inverse * joint
+    m.lin += more_lin
+    m.ang += more_ang
+    for k in range(legs.shape[0]):
+        solve = record.legs[at.world, at.entry, k]
+        legs[k].virtual_rates = legs[k].virtual_rates - solve.to_lin * more_lin - solve.to_ang * more_ang
+    return m
+
+
+@wp.func
+def find_multipliers(
+    robot: Robot, at: StepPlace, first_impulse: wp.array2d(dtype=vec3), rows: Rows, seeds: Rows, record: StepRecord,
+    lin_seed: vec3, ang_seed: vec3, legs: wp.array(dtype=LegReverse), contacts: wp.array(dtype=PawContact),
+    matrix: wp.array2d(dtype=real), vector: wp.array(dtype=real),
+) -> Multipliers:  # fmt: skip
+    """Return the multipliers of a step's equations for the gradients by the velocities at its end, body axes.
+
+    legs: `rates` are those of the motors; to them the share of the contact laws is added.
+    """
+    m = solve_system(record, at, lin_seed, ang_seed, legs)
+    if load_laws(robot, at, first_impulse, rows, record, m, seeds, legs, contacts):
+        solve_laws(contacts, legs, matrix, vector)
+        m = add_laws(robot, at, record, m, legs, contacts)
+    return m
+
+
+@wp.func
+def held_base(at: StepPlace, record: StepRecord, m: Multipliers) -> BaseFactors:
+    """Return what is held of the base."""
+    base = record.base[at.world, at.entry]
+    ahead = record.base[at.world, at.entry + 1]
+    held = BaseFactors()
+    held.virtual_lin = m.lin
+    held.virtual_ang = m.ang
+    held.lin = wp.quat_rotate_inv(base.quat, ahead.lin)
+    held.ang = ahead.ang
+    held.lin_acc = (held.lin - wp.quat_rotate_inv(base.quat, base.lin)) / at.dt
+    held.ang_acc = (held.ang - base.ang) / at.dt
+    return held
+
+
+@wp.func
+def held_leg(
+    at: StepPlace, k: int, rows: Rows, seeds: Rows, record: StepRecord, legs: wp.array(dtype=LegReverse),
+    contacts: wp.array(dtype=PawContact),
+) -> LegFactors:  # fmt: skip
+    """Return what is held of a leg."""
+    held = LegFactors()
+    held.virtual_rates = legs[k].virtual_rates
+    held.rates = record.rates[at.world, at.entry + 1, k]
+    held.acc = (held.rates - record.rates[at.world, at.entry, k]) / at.dt
+    held.mode = legs[k].law.mode
+    held.pressed = int(rows.pressed[at.step, k, at.world])
+    if held.mode != SEPARATE:
+        held.impulse = contacts[k].impulse
+        held.law = legs[k].seed
+        if seeds.impulse.shape[0] > 0:
+            held.push = seeds.impulse[at.step, k, at.world]
+    return held

@@ -1,0 +1,215 @@
+"""The step of `advance` for Warp's tape: solved once, then two launches that the tape runs backwards.
+
+    solve_kernel (not recorded) -> power_kernel -> integrate_kernel
+
+Backwards, `integrate_kernel` hands the gradient by the velocities at the end of the step to `find_multipliers`, and
+`power_kernel` is the scalar whose derivatives by all that the step read are those of the step: the virtual power of its
+equations of motion, weighed with these multipliers (see `step_adjoint`).
+"""
+
+import warp as wp
+
+from ...layout import BASE, GRAVITY
+from ...scalar import mat43, real, vec3
+from ...state import base_com, leg_coord, leg_dof, load_base, load_motors, store_base, store_motors
+from ..base_motion import moved_base
+from ..contact import BlockLaw, PawContact
+from ..drive import Drive, Workspace, base_wrench
+from ..parameters import load_joint_params, load_masses, load_moments, load_spring, load_stops, load_vec3
+from ..step import LegParams, Robot, StepSettings, load_leg
+from ..trajectory import Rows, store_row_vec3
+from ..world.world_step import LegStep, solve_step
+from .multipliers import LegReverse, StepPlace, StepRecord, find_multipliers, held_base, held_leg, replay_step
+from .virtual_power import BaseFactors, BaseSeeds, LegFactors, base_action, leg_action
+
+
+@wp.struct
+class SolvedStep:
+    """A step on the tape, arrays by world or by (leg, world): its solution, and what the reverse pass finds of it."""
+
+    rows: Rows  # torques, impulses and pressed stops, shape (1, ..., num_worlds)
+    before: wp.array2d(dtype=vec3)  # [N s] on each paw in the step before, world axes
+    lin: wp.array(dtype=vec3)  # [m/s] of the base at the end of the step, in the body axes of its start
+    ang: wp.array(dtype=vec3)  # [rad/s]
+    rates: wp.array2d(dtype=vec3)  # [rad/s] of the motors
+    base: wp.array(dtype=BaseFactors)
+    seeds: wp.array(dtype=BaseSeeds)
+    ang_seed: wp.array(dtype=vec3)  # weight of the base's angular velocity at the start
+    legs: wp.array2d(dtype=LegFactors)
+    rate_seed: wp.array2d(dtype=vec3)  # weight of the motors' rates at the start
+    mu_row: wp.array2d(dtype=int)  # row of the friction coefficient in the parameter table
+
+
+@wp.kernel(enable_backward=False)
+def solve_kernel(
+    # in
+    robot: Robot,
+    settings: StepSettings,
+    drive: Drive,
+    joint_q: wp.array(dtype=real),
+    joint_qd: wp.array(dtype=real),
+    # in, out
+    work: Workspace,
+    # out
+    solved: SolvedStep,
+):
+    """Solve every world's contacts and stops; one thread per world."""
+    world = wp.tid()
+    base = load_base(joint_q, joint_qd, base_com(robot.table, world), world)
+    legs = wp.zeros(shape=(4,), dtype=LegStep)
+    contacts = wp.zeros(shape=(4,), dtype=PawContact)
+    for k in range(legs.shape[0]):
+        torque = load_motors(drive.joint_f, leg_dof(world, k))
+        legs[k].angles = load_motors(joint_q, leg_coord(world, k))
+        legs[k].rates = load_motors(joint_qd, leg_dof(world, k))
+        legs[k].torque = torque
+        store_row_vec3(solved.rows.torque, 0, 3 * k, world, torque)
+        solved.before[k, world] = work.impulse[k, world]
+    wrench = base_wrench(drive.joint_f, drive.body_f, world)
+    force = vec3(wrench[0], wrench[1], wrench[2])
+    moment = vec3(wrench[3], wrench[4], wrench[5])
+    found = solve_step(robot, settings, world, base, force, moment, BlockLaw(), work.impulse, legs, contacts)
+    solved.lin[world] = found.lin
+    solved.ang[world] = found.ang
+    for k in range(legs.shape[0]):
+        impulse = wp.quat_rotate(base.quat, contacts[k].impulse)
+        solved.rates[k, world] = legs[k].end
+        solved.rows.impulse[0, k, world] = impulse
+        solved.rows.pressed[0, k, world] = wp.uint8(legs[k].pressed)
+        work.impulse[k, world] = impulse
+        work.contact_force[k, world] = impulse / settings.dt
+
+
+@wp.kernel
+def power_kernel(
+    # in
+    robot: Robot,
+    dt: real,
+    joint_q: wp.array(dtype=real),
+    joint_qd: wp.array(dtype=real),
+    joint_f: wp.array(dtype=real),
+    body_f: wp.array(dtype=wp.spatial_vector),
+    solved: SolvedStep,
+    # out
+    power: wp.array2d(dtype=real),
+):
+    """Weigh the equations of motion, (4, num_worlds), those of the base with leg 0's; one thread per (leg, world)."""
+    k, world = wp.tid()
+    com = base_com(robot.table, world)
+    base = load_base(joint_q, joint_qd, com, world)
+    gravity = load_vec3(robot.table, GRAVITY, world)
+    g = wp.quat_rotate_inv(base.quat, gravity)
+    held = solved.base[world]
+    leg = solved.legs[k, world]
+    rates = load_motors(joint_qd, leg_dof(world, k))
+    total = leg_action(
+        robot.geometry[k], load_masses(robot.table, k, world), load_joint_params(robot.table, k, world),
+        load_spring(robot.table, k, world), load_stops(robot.table, k, world), robot.ground,
+        robot.table[solved.mu_row[k, world], world], base.pos, base.quat, base.ang, g,
+        load_motors(joint_q, leg_coord(world, k)), rates, held, leg, dt,
+    )  # fmt: skip
+    total += wp.dot(solved.rate_seed[k, world], rates)
+    total += dt * wp.dot(leg.virtual_rates, load_motors(joint_f, leg_dof(world, k)))
+    if k == 0:
+        wrench = base_wrench(joint_f, body_f, world)
+        force = vec3(wrench[0], wrench[1], wrench[2])
+        moment = vec3(wrench[3], wrench[4], wrench[5])
+        total += base_action(
+            load_moments(robot.table, BASE, world), com, gravity, force, moment, base.quat, base.lin, base.ang, held,
+            solved.seeds[world], dt,
+        )  # fmt: skip
+        total += wp.dot(solved.ang_seed[world], base.ang)
+    power[k, world] = total
+
+
+@wp.struct
+class EndVelocities:
+    """Velocities at the end of a step: of the base in the body axes of its start, and of the motors of each leg."""
+
+    lin: vec3  # [m/s]
+    ang: vec3  # [rad/s]
+    rates: mat43  # [rad/s]
+
+
+@wp.func
+def end_velocities(
+    robot: Robot, dt: real, joint_q: wp.array(dtype=real), joint_qd: wp.array(dtype=real),
+    joint_f: wp.array(dtype=real), body_f: wp.array(dtype=wp.spatial_vector), solved: SolvedStep, record: StepRecord,
+    power: wp.array2d(dtype=real), world: int,
+) -> EndVelocities:  # fmt: skip
+    """Return the velocities that were solved for."""
+    end = EndVelocities()
+    end.lin = solved.lin[world]
+    end.ang = solved.ang[world]
+    for k in range(4):
+        end.rates[k] = solved.rates[k, world]
+    return end
+
+
+@wp.func_grad(end_velocities)
+def adj_end_velocities(
+    robot: Robot, dt: real, joint_q: wp.array(dtype=real), joint_qd: wp.array(dtype=real),
+    joint_f: wp.array(dtype=real), body_f: wp.array(dtype=wp.spatial_vector), solved: SolvedStep, record: StepRecord,
+    power: wp.array2d(dtype=real), world: int, adj_ret: EndVelocities,
+):  # fmt: skip
+    """Write what `power_kernel` weighs the equations of motion with, and set its gradient to 1."""
+    params = wp.zeros(shape=(4,), dtype=LegParams)
+    legs = wp.zeros(shape=(4,), dtype=LegReverse)
+    contacts = wp.zeros(shape=(4,), dtype=PawContact)
+    matrix = wp.zeros(shape=(12, 12), dtype=real)
+    vector = wp.zeros(shape=(12,), dtype=real)
+    wrench = base_wrench(joint_f, body_f, world)
+    at = StepPlace()
+    at.dt = dt
+    at.world = world
+    at.force = vec3(wrench[0], wrench[1], wrench[2])
+    at.moment = vec3(wrench[3], wrench[4], wrench[5])
+    record.base[world, 0] = load_base(joint_q, joint_qd, base_com(robot.table, world), world)
+    for k in range(legs.shape[0]):
+        params[k] = load_leg(robot, world, k)
+        record.angles[world, 0, k] = load_motors(joint_q, leg_coord(world, k))
+        record.rates[world, 0, k] = load_motors(joint_qd, leg_dof(world, k))
+        legs[k].rates = vec3(adj_ret.rates[k, 0], adj_ret.rates[k, 1], adj_ret.rates[k, 2])
+    replay_step(robot, params, at, solved.rows, record)
+    m = find_multipliers(
+        robot, at, solved.before, solved.rows, Rows(), record, adj_ret.lin, adj_ret.ang, legs, contacts, matrix, vector
+    )
+    seeds = BaseSeeds()
+    seeds.velocity = m.lin_seed
+    solved.base[world] = held_base(at, record, m)
+    solved.seeds[world] = seeds
+    solved.ang_seed[world] = m.ang_seed
+    for k in range(legs.shape[0]):
+        solved.legs[k, world] = held_leg(at, k, solved.rows, Rows(), record, legs, contacts)
+        solved.rate_seed[k, world] = legs[k].rates
+        solved.mu_row[k, world] = legs[k].law.mu_row
+        wp.adjoint[power][k, world] += real(1.0)
+
+
+@wp.kernel
+def integrate_kernel(
+    # in
+    robot: Robot,
+    dt: real,
+    joint_q: wp.array(dtype=real),
+    joint_qd: wp.array(dtype=real),
+    joint_f: wp.array(dtype=real),
+    body_f: wp.array(dtype=wp.spatial_vector),
+    solved: SolvedStep,
+    record: StepRecord,
+    power: wp.array2d(dtype=real),
+    # out
+    joint_q_out: wp.array(dtype=real),
+    joint_qd_out: wp.array(dtype=real),
+):
+    """Move the coordinates with the velocities at the end of the step; one thread per world."""
+    world = wp.tid()
+    com = base_com(robot.table, world)
+    base = load_base(joint_q, joint_qd, com, world)
+    end = end_velocities(robot, dt, joint_q, joint_qd, joint_f, body_f, solved, record, power, world)
+    store_base(joint_q_out, joint_qd_out, com, world, moved_base(base, end.lin, end.ang, dt))
+    for k in range(4):
+        rates = vec3(end.rates[k, 0], end.rates[k, 1], end.rates[k, 2])
+        angles = load_motors(joint_q, leg_coord(world, k)) + dt * rates
+        store_motors(joint_q_out, leg_coord(world, k), angles)
+        store_motors(joint_qd_out, leg_dof(world, k), rates)

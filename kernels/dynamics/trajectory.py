@@ -1,0 +1,205 @@
+"""What the kernels of rollouts share: their commands, rows of the state, and the targets that motors follow."""
+
+import warp as wp
+
+from ..actuation.command_filter import FilterParams, Limits, filter_leg
+from ..actuation.motors import MotorArrays, MotorParams, load_motor
+from ..scalar import quat, real, vec3
+from ..state import BaseState
+
+wp.set_module_options({"enable_backward": False})
+
+# rows of a state: position and orientation (xyzw) of the base, motor angles
+ROW_COORDS = wp.constant(19)
+# velocity of its com and angular velocity, both world frame, motor rates
+ROW_RATES = wp.constant(18)
+
+# rows of the filter's constants: lower, upper, lower and upper zone of lateral, transversal, sum, then
+FILTER_HORIZON = wp.constant(12)
+FILTER_SPEED = wp.constant(13)
+FILTER_ROWS = wp.constant(14)
+
+
+@wp.struct
+class Timing:
+    """Lengths of a rollout."""
+
+    steps: int  # T, policy steps
+    substeps: int  # S, physics steps in a policy step
+    every: int  # physics steps from row to row, a divisor of S
+
+
+@wp.struct
+class Actuation:
+    """What lies between targets and torques, per world."""
+
+    motors: MotorArrays  # fades aside
+    fade: wp.array2d(dtype=real)  # [rad/s], (2, num_worlds): start and end of the over-speed protection
+    latency: wp.array(dtype=real)  # [s], (num_worlds,)
+    filtered: int  # 0: the targets pass as they are
+    limits: wp.array2d(dtype=real)  # constants of the filter, (FILTER_ROWS, num_worlds)
+
+
+@wp.struct
+class Commands:
+    """What a rollout is told; K = T S / every."""
+
+    target: wp.array3d(dtype=real)  # [rad], (T, 12, num_worlds)
+    before: wp.array2d(dtype=real)  # [rad], (12, num_worlds): what the motors follow until the first target arrives
+    wrench: wp.array3d(dtype=real)  # [N], [N m] at the base's com, world axes, (T, 6, num_worlds)
+    impulse: wp.array2d(dtype=vec3)  # [N s] of each paw in the step before the first, world axes, (4, num_worlds)
+
+
+@wp.struct
+class Rows:
+    """A trajectory, or the gradient of a number by it; an empty array is one of zeros."""
+
+    q: wp.array3d(dtype=real)  # [m], [rad], (K + 1, ROW_COORDS, num_worlds)
+    qd: wp.array3d(dtype=real)  # [m/s], [rad/s], (K + 1, ROW_RATES, num_worlds)
+    torque: wp.array3d(dtype=real)  # [N m], (T S, 12, num_worlds)
+    impulse: wp.array3d(dtype=vec3)  # [N s] on each paw, world axes, (T S, 4, num_worlds)
+    pressed: wp.array3d(dtype=wp.uint8)  # sets of pressed stops, see `stops`, (T S, 4, num_worlds)
+
+
+@wp.func
+def row_base(pos: vec3, orientation: quat, com_lin: vec3, ang: vec3, com: vec3) -> BaseState:
+    """Return the base's state; com_lin [m/s]: velocity of its com [m], ang [rad/s]: angular velocity, world axes."""
+    base = BaseState()
+    base.pos = pos
+    base.quat = wp.normalize(orientation)
+    base.lin = com_lin - wp.cross(ang, wp.quat_rotate(base.quat, com))
+    base.ang = wp.quat_rotate_inv(base.quat, ang)
+    return base
+
+
+@wp.func
+def row_vec3(rows: wp.array3d(dtype=real), row: int, first: int, world: int) -> vec3:
+    """Return three entries of a row."""
+    return vec3(rows[row, first, world], rows[row, first + 1, world], rows[row, first + 2, world])
+
+
+@wp.func
+def row_quat(rows: wp.array3d(dtype=real), row: int, first: int, world: int) -> quat:
+    """Return four entries of a row."""
+    return quat(
+        rows[row, first, world], rows[row, first + 1, world], rows[row, first + 2, world], rows[row, first + 3, world]
+    )
+
+
+@wp.func
+def store_row_vec3(rows: wp.array3d(dtype=real), row: int, first: int, world: int, v: vec3):
+    """Write three entries of a row."""
+    for i in range(3):
+        rows[row, first + i, world] = v[i]
+
+
+@wp.func
+def load_row_base(rows: Rows, row: int, world: int, com: vec3) -> BaseState:
+    """Return the base's state in a row."""
+    return row_base(
+        row_vec3(rows.q, row, 0, world), row_quat(rows.q, row, 3, world),
+        row_vec3(rows.qd, row, 0, world), row_vec3(rows.qd, row, 3, world), com,
+    )  # fmt: skip
+
+
+@wp.func
+def store_row_base(rows: Rows, row: int, world: int, com: vec3, base: BaseState):
+    """Write the base's state to a row."""
+    ang = wp.quat_rotate(base.quat, base.ang)
+    store_row_vec3(rows.q, row, 0, world, base.pos)
+    for i in range(4):
+        rows.q[row, 3 + i, world] = base.quat[i]
+    store_row_vec3(rows.qd, row, 0, world, base.lin + wp.cross(ang, wp.quat_rotate(base.quat, com)))
+    store_row_vec3(rows.qd, row, 3, world, ang)
+
+
+@wp.func
+def load_limits(table: wp.array2d(dtype=real), row: int, world: int) -> Limits:
+    """Return the filter's limits of one quantity, its rows beginning at `row`."""
+    limits = Limits()
+    limits.lower = table[row, world]
+    limits.upper = table[row + 1, world]
+    limits.lower_zone = table[row + 2, world]
+    limits.upper_zone = table[row + 3, world]
+    return limits
+
+
+@wp.func
+def load_filter(table: wp.array2d(dtype=real), world: int) -> FilterParams:
+    """Return the filter's constants."""
+    params = FilterParams()
+    params.lateral = load_limits(table, 0, world)
+    params.transversal = load_limits(table, 4, world)
+    params.sum = load_limits(table, 8, world)
+    params.horizon = table[FILTER_HORIZON, world]
+    params.speed_floor = table[FILTER_SPEED, world]
+    return params
+
+
+@wp.func
+def load_world_motor(actuation: Actuation, motor: int, world: int) -> MotorParams:
+    """Return the constants of one motor of one world."""
+    params = load_motor(actuation.motors, motor, world)
+    params.fade_start = actuation.fade[0, world]
+    params.fade_end = actuation.fade[1, world]
+    return params
+
+
+@wp.struct
+class Arrival:
+    """Which targets a motor follows in a physics step, late by the latency: the mean over the step of what arrived."""
+
+    older: int  # policy step of the target at the start of the physics step; -1: `Commands.before`
+    newer: int  # and at its end
+    weight: real  # of the newer one
+
+
+@wp.func
+def arrival(step: int, substeps: int, late: real) -> Arrival:
+    """Return what arrives during a physics step; late: latency in physics steps, any fraction.
+
+    Where a target arrives just as the step begins it has weight 1, whose derivative is that of more latency. No target
+    arrives before it is sent, whatever the latency.
+    """
+    begin = real(step) - late
+    size = real(substeps)
+    a = Arrival()
+    a.older = wp.clamp(int(wp.ceil(begin / size)) - 1, -1, step / substeps)
+    a.newer = wp.clamp(int(wp.ceil((begin + real(1.0)) / size)) - 1, -1, step / substeps)
+    a.weight = real(1.0)
+    if a.newer > a.older:
+        a.weight = begin + real(1.0) - real(a.newer) * size
+    return a
+
+
+@wp.func
+def commanded(safe: wp.array3d(dtype=real), before: wp.array2d(dtype=real), step: int, motor: int, world: int) -> real:
+    """Return a motor's target [rad] of a policy step, before the first one what it followed until then."""
+    if step < 0:
+        return before[motor, world]
+    return safe[step, motor, world]
+
+
+@wp.func
+def arrived_target(commands: Commands, safe: wp.array3d(dtype=real), arrived: Arrival, motor: int, world: int) -> real:
+    """Return the target [rad] that a motor follows in a physics step."""
+    newer = commanded(safe, commands.before, arrived.newer, motor, world)
+    if arrived.weight == real(1.0):
+        return newer
+    older = commanded(safe, commands.before, arrived.older, motor, world)
+    return older + arrived.weight * (newer - older)
+
+
+@wp.func
+def filter_commands(
+    commands: Commands, actuation: Actuation, step: int, leg: int, world: int, angles: vec3, rates: vec3,
+    safe: wp.array3d(dtype=real),
+):  # fmt: skip
+    """Write what the filter lets through of a leg's targets at the start of a policy step."""
+    m = 3 * leg
+    target = row_vec3(commands.target, step, m, world)
+    if actuation.filtered != 0:
+        offset = actuation.motors.offset
+        read = angles + vec3(offset[m, world], offset[m + 1, world], offset[m + 2, world])
+        target = filter_leg(target, read, rates, load_filter(actuation.limits, world))
+    store_row_vec3(safe, step, m, world, target)

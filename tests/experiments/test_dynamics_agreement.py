@@ -1,0 +1,38 @@
+"""The comparison with Pinocchio: it agrees for the described robot and an overlay, and sees a wrong mass."""
+
+import json
+
+import numpy as np
+import pytest
+
+from experiments import dynamics_agreement
+from jumper_warp.robot.overlay import RobotOverlay
+from support.agreement import ours, pinocchios, random_states
+
+OVERLAY = RobotOverlay(
+    {
+        "base_mass": (8.43,), "base_com": (0.02, -0.01, 0.03), "base_inertia": (1.4,),
+        "link_mass": (1.2, 0.7, 1.3, 0.9, 1.1), "armature": tuple(np.linspace(0.003, 0.006, 12)),
+    }
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("overlay", [None, OVERLAY], ids=["described", "overlay"])
+def test_all_quantities_agree_to_single_precision_of_the_masses(tmp_path, overlay):
+    path = None
+    if overlay is not None:
+        path = tmp_path / "robot.json"
+        overlay.save(path)
+    values = dynamics_agreement.main(dynamics_agreement.Args(robot=path, states=8, out=tmp_path))
+    assert values == json.loads((tmp_path / "metrics.json").read_text())
+    relative = {name: value for name, value in values.items() if name.endswith("relative_difference")}
+    assert len(relative) == 5 and max(relative.values()) < 1.0e-6
+
+
+def test_a_mass_that_is_wrong_by_a_hundredth_is_seen():
+    right, wrong, states = OVERLAY.robots(), OVERLAY.robots(), random_states(4, 1)
+    wrong.base_mass *= 1.01
+    found, expected = ours(right, states), pinocchios(wrong, states)
+    relative = dynamics_agreement.differences(found["joint_acceleration"], expected["joint_acceleration"])[2]
+    assert 1.0e-4 < relative < 1.0e-1
+    assert dynamics_agreement.differences(found["paw_jacobian"], expected["paw_jacobian"])[2] < 1.0e-6

@@ -1,0 +1,139 @@
+"""Trainings that begin with a shipped policy."""
+
+import dataclasses
+
+import pytest
+import torch
+
+from jumper_warp.policies.folder import save_policy
+from jumper_warp.policies.policy import Policy
+from jumper_warp.policies.runs import open_policy
+from jumper_warp.policies.spec import PolicyError
+from jumper_warp.policies.warm_start import check_interface, start_from
+from jumper_warp.registry import TASKS, make_task
+from jumper_warp.rl.mirror import Symmetry, image
+from jumper_warp.rl.networks import ActorCritic
+from jumper_warp.rl.start import begin_with
+from jumper_warp.tasks.interface import interface
+from jumper_warp.tasks.mirror import mirror_of, mirror_of_action
+from jumper_warp.tasks.observations import with_history
+from jumper_warp.utils.errors import InputError
+
+WIDE = {"symmetry": "off", "hidden": (512, 256, 256)}
+
+
+@pytest.mark.parametrize(
+    ("name", "task", "change"),
+    [
+        ("slippery_jump", "horizontal-jump-mars", {}),
+        ("slippery_jump", "horizontal-jump-mars", WIDE),
+        ("vertical_jump", "vertical-jump-mars", {"symmetry": "off"}),
+        ("walking_flat", "velocity-flat", {"symmetry": "loss", "hidden": (512, 256, 256)}),
+    ],
+)
+def test_a_training_begins_as_a_shipped_policy_acts(name, task, change):
+    policy, cfg, task = open_policy(name), dataclasses.replace(TASKS[task].ppo, **change), make_task(task)
+    symmetry = Symmetry(image(*mirror_of(task, "policy"), "observation"), image(*mirror_of_action(), "action"))
+    symmetry = symmetry if cfg.symmetry == "actor" else None
+    assert (symmetry is not None) == (name == "slippery_jump" and not change)
+    torch.manual_seed(0)
+    sizes = policy.interface.sizes
+    model = ActorCritic(sizes[0], sizes[-1], cfg.hidden, cfg.activation, cfg.init_std, symmetry=symmetry)
+    begin_with(start_from(name, task, cfg), model, samples=1000)
+    obs = policy.mean + 2.0 * policy.std * torch.randn(500, sizes[0])
+    acted = policy.act(obs)
+    assert acted.std() > 0.1
+    torch.testing.assert_close(model.act(obs), acted, atol=1e-5, rtol=0.0)
+
+
+@pytest.mark.parametrize(
+    ("name", "task", "change", "message"),
+    [
+        ("horizontal_jump", "horizontal-jump", {"symmetry": "off"},
+         "hidden layers 512, 256, 256, these settings make 256, 128, 128: give --ppo.hidden 512 256 256"),
+        ("vertical_jump", "horizontal-jump", {}, r"observation \d+: the policy has \w+, the task \w+"),
+        ("horizontal_jump", "horizontal-jump-sighted", {}, r"observation 147: the policy has none, the task block_\w+"),
+    ],
+)  # fmt: skip
+def test_what_does_not_fit_is_refused_in_one_line(name, task, change, message):
+    with pytest.raises(InputError, match=f"start_from: .*{message}") as caught:
+        start_from(name, make_task(task), dataclasses.replace(TASKS[task].ppo, **change))
+    assert "\n" not in str(caught.value)
+
+
+def test_no_such_policy_is_told():
+    with pytest.raises(PolicyError, match="no_jump"):
+        start_from("no_jump", make_task("horizontal-jump"), TASKS["horizontal-jump"].ppo)
+
+
+def test_another_history_is_refused():
+    with pytest.raises(InputError, match=r"start_from: observation \d+: the policy has \w+"):
+        start_from("horizontal_jump", with_history(make_task("horizontal-jump"), 1), TASKS["horizontal-jump"].ppo)
+
+
+def test_a_symmetric_training_begins_with_the_nearest_symmetric_form_of_a_fine_tuned_policy():
+    policy, task, cfg = open_policy("horizontal_jump"), make_task("horizontal-jump"), TASKS["horizontal-jump"].ppo
+    symmetry = Symmetry(image(*mirror_of(task, "policy"), "observation"), image(*mirror_of_action(), "action"))
+    start = start_from("horizontal_jump", task, cfg)
+    model = ActorCritic(147, 12, cfg.hidden, cfg.activation, cfg.init_std, symmetry=symmetry)
+    begin_with(start, model, samples=1000)
+    obs = policy.mean + policy.std * torch.randn(500, 147, generator=torch.manual_seed(2))
+    assert start.change == "made mirror-symmetric"
+    assert 0.0 < (model.act(obs) - policy.act(obs)).abs().mean() < 0.01
+
+
+def test_a_symmetric_training_begins_with_the_answers_of_a_policy_averaged_with_their_images():
+    policy, task = open_policy("vertical_jump"), make_task("vertical-jump-mars")
+    cfg = TASKS["vertical-jump-mars"].ppo
+    symmetry = Symmetry(image(*mirror_of(task, "policy"), "observation"), image(*mirror_of_action(), "action"))
+    model = ActorCritic(147, 12, cfg.hidden, cfg.activation, cfg.init_std, symmetry=symmetry)
+    begin_with(start_from("vertical_jump", task, cfg), model, samples=1000)
+    middle, var = symmetry.obs.moments(policy.mean, policy.std.square())
+    obs = middle + var.sqrt() * torch.randn(500, 147)
+    answers = policy.actor((obs - policy.mean) / policy.std)
+    images = symmetry.action.of(policy.actor((symmetry.obs.of(obs) - policy.mean) / policy.std))
+    torch.testing.assert_close(model.act(obs), (0.5 * (answers + images)).clamp(-1.0, 1.0), atol=1e-4, rtol=0.0)
+
+
+def test_a_folder_with_a_network_that_lost_its_symmetry_needs_all_its_widths(tmp_path):
+    policy = open_policy("horizontal_jump")
+    torch.manual_seed(0)
+    layers = [(weight + 0.3 * weight.std() * torch.randn_like(weight), bias) for weight, bias in policy.layers]
+    save_policy(tmp_path / "bent", Policy(layers, policy.mean, policy.std, policy.interface, policy.config))
+    with pytest.raises(InputError, match=r"these settings make 256, 128, 128: give --ppo\.hidden 512 256 256"):
+        start_from(tmp_path / "bent", make_task("horizontal-jump"), TASKS["horizontal-jump"].ppo)
+
+
+def changed_layout(face):
+    layout = {name: dict(term) for name, term in face.observation_layout.items()}
+    next(iter(layout.values()))["scale"] = 7.0
+    return {"observation_layout": layout}
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (changed_layout, r"scale of \w+: the policy has 7.0, the task 1.0"),
+        (
+            lambda face: {"joint_names": face.joint_names[1:] + face.joint_names[:1]},
+            r"action 0: the policy has FL_outer, the task FL_lateral",
+        ),
+        (
+            lambda face: {"default_joint_pos": (1.0, *face.default_joint_pos[1:])},
+            "default angle .*: the policy has 1.0",
+        ),
+        (lambda face: {"observation_limit": 5.0}, "limit of observations: the policy has 5.0, the task 100.0"),
+        (lambda face: {"normalised_limit": 5.0}, "in standard deviations: the policy has 5.0, the task 10.0"),
+    ],
+)
+def test_the_first_difference_of_the_interface_is_named(change, message):
+    face = open_policy("horizontal_jump").interface
+    with pytest.raises(InputError, match=message):
+        check_interface(dataclasses.replace(face, **change(face)), interface(make_task("horizontal-jump")))
+
+
+def test_scales_gains_and_a_layout_that_was_not_kept_may_differ():
+    face = open_policy("horizontal_jump").interface
+    numbers = {name: tuple(1.5 for _ in face.joint_names) for name in ("action_scale", "joint_stiffness")}
+    other = dataclasses.replace(face, **numbers, observation_layout={}, policy_dt=0.05)
+    check_interface(other, interface(make_task("horizontal-jump-mars")))

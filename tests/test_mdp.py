@@ -1,0 +1,24 @@
+"""The public import of tasks: its names, and who may import the kernels behind it."""
+
+import re
+from pathlib import Path
+
+import warp as wp
+
+from jumper_warp import mdp
+
+ROOT = Path(__file__).parents[1]
+
+
+def test_every_public_name_resolves_and_namespaces_hold_stock_functions():
+    assert len(mdp.__all__) == len(set(mdp.__all__))
+    assert all(getattr(mdp, name) is not None for name in mdp.__all__)
+    for term in (mdp.rewards.action_rate, mdp.terminations.tilted, mdp.observations.angle, mdp.events.base_mass):
+        assert isinstance(term, wp.Function)
+
+
+def test_scripts_and_examples_import_no_kernels():
+    files = [*(ROOT / "experiments").glob("*.py"), ROOT / "tests/helpers/hold_height.py"]
+    files += [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *(ROOT / "docs").glob("*.md")]
+    found = [file.name for file in files if re.search(r"(from|import) jumper_warp\.kernels", file.read_text())]
+    assert len(files) > 20 and found == []
