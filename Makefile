@@ -1,7 +1,7 @@
 # make demo   the open-loop jump, then 200 vertical and 200 horizontal jumps of the shipped policies: figures, plots and
 #             recordings in outputs/demo
 # make test   all tests, and the import rules
-# make lint   style, format and import rules
+# make lint   style, format, import rules and types
 # Each makes .venv/ first if it is missing or older than pyproject.toml or constraints.txt.
 
 PYTHON ?= python3
@@ -24,6 +24,7 @@ lint: $(STAMP)
 	$(VENV)/bin/ruff check .
 	$(VENV)/bin/ruff format --check .
 	$(VENV)/bin/lint-imports --no-logo
+	$(VENV)/bin/basedpyright --pythonpath $(VENV)/bin/python
 
 clean:
 	rm -rf $(VENV)

@@ -23,7 +23,7 @@ _PLACES = {
     "make_task": "jumper_warp.registry",
 }
 """Modules of the names below; each is imported when a name of it is first used."""
-__all__ = list(_PLACES)
+__all__ = ["Env", "Simulation", "SolverJumper", "build_model", "load_policy", "make_task"]
 
 
 # On a CPU torch's threads stay awake for milliseconds after each operation, on cores that the simulation's need next.

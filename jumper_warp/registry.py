@@ -16,7 +16,7 @@ from dataclasses import dataclass, field, replace
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from types import ModuleType
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from jumper_warp.rl.cfg import PpoCfg
 from jumper_warp.utils.errors import InputError
@@ -167,7 +167,7 @@ def load_installed(point: EntryPoint) -> None:
     """
     where = f"task {point.name!r:.60} of package {package_of(point)}"
     try:
-        make = point.load()
+        make: Callable[..., Any] = point.load()
     except (ImportError, AttributeError) as error:
         raise InputError(f"{where} cannot be loaded: {type(error).__name__}: {error}") from error
     if not callable(make):
@@ -211,6 +211,8 @@ def _load_file(path: Path) -> ModuleType:
     if known is not None or name in sys.stdlib_module_names or _is_elsewhere(name, path):
         raise InputError(f"{path.name}: {name!r} is the name of another module; give the file another name")
     spec = importlib.util.spec_from_file_location(name, path)
+    if spec is None or spec.loader is None:
+        raise InputError(f"{path.name}: the name of a task's file must end in .py")
     module = importlib.util.module_from_spec(spec)
     sys.modules[name] = module
     try:

@@ -153,6 +153,12 @@ def test_file_that_python_cannot_name_is_refused(tmp_path, name):
         load_task_module(str(tmp_path / name))
 
 
+def test_file_without_the_ending_of_python_is_refused(tmp_path):
+    (tmp_path / "my_hops.txt").touch()
+    with pytest.raises(InputError, match=r"my_hops\.txt: the name of a task's file must end in \.py"):
+        load_task_module(str(tmp_path / "my_hops.txt"))
+
+
 @pytest.mark.parametrize(
     ("name", "message"),
     [("missing.py", "no file 'missing.py'"), ("missing/tasks", "no file"), ("no_such", "no module 'no_such'"),

@@ -93,7 +93,7 @@ def _flag_of_dataclass(value: Any, where: str) -> Flag | None:
 
 def _flag_of_term(term: Term, where: str) -> Flag | None:
     """Return the flags of a term's numbers, and of the options that are whole numbers."""
-    settings = term.settings | term.options
+    settings = {**term.settings, **term.options}
     numbers = term.numbers | {key: option for key, option in term.options.items() if type(option) is int}
     flags = {key: Flag(int if type(settings.get(key)) is int else float, value) for key, value in numbers.items()}
     return _group(_first_paragraph(inspect.getdoc(term.func.func)), flags, where) if flags else None
@@ -123,7 +123,7 @@ def _changed(value: Any, flags: Any) -> Any:
     """Return a part of a task with the values of its flags."""
     if isinstance(value, Term):
         given = _members(flags)
-        known = value.numbers | value.options
+        known = {**value.numbers, **value.options}
         new = {key: given[flag_name(key)] for key in known if flag_name(key) in given}
         return value.replace(**{key: number for key, number in new.items() if number != known[key]})
     if isinstance(value, Reset):

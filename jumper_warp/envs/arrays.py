@@ -82,7 +82,8 @@ def checked_tasks(task: Any, handovers: Sequence[Handover]) -> tuple[TaskCfg, ..
     Raises ValueError: not a task, none, two of one name, motors that cannot be those of one robot, different
     gravities, or a handover between others.
     """
-    tasks = (task,) if isinstance(task, TaskCfg | str) or not isinstance(task, Iterable) else tuple(task)
+    several = isinstance(task, Iterable) and not isinstance(task, str)
+    tasks: tuple[Any, ...] = tuple(task) if several else (task,)
     for each in tasks:
         if not isinstance(each, TaskCfg):
             raise InputError(f"a task must be a TaskCfg, as make_task returns for a name, got {each!r:.60}")

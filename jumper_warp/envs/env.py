@@ -35,7 +35,7 @@ from jumper_warp.tasks.mirror import Mirror, mirror_of, mirror_of_action
 from jumper_warp.tasks.saving import handover_to_json, task_to_json
 from jumper_warp.utils.checks import check_count, check_seed
 from jumper_warp.utils.errors import InputError
-from jumper_warp.utils.kernels import load_kernels
+from jumper_warp.utils.kernels import load_kernels, records
 
 CONTACT_TOLERANCE = 1.0e-4
 """[m/s] Of the contact iteration: a fifth fewer sweeps than the solver's default."""
@@ -280,8 +280,8 @@ class Env(Stages):
 
         Besides the fields of the task's state: base_pos [m], base_vel [m/s], base_quat (xyzw), done, ending, level.
         """
-        records = self.skills[skill].states.numpy()
-        arrays = {name: np.array(records[name]) for name in records.dtype.names}
+        state = records(self.skills[skill].states)
+        arrays = {name: np.array(state[name]) for name in state.dtype.names or ()}
         q, qd = self.sim.joint_q(), self.sim.joint_qd()
         arrays |= {"base_pos": q[:, :3].copy(), "base_quat": q[:, 3:7].copy(), "base_vel": qd[:, :3].copy()}
         return arrays | {name: getattr(self.worlds, name).numpy().copy() for name in ("done", "ending", "level")}

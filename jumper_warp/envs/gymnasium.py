@@ -51,7 +51,7 @@ class GymVectorEnv(gymnasium.vector.VectorEnv):
         self._ending = wp.to_torch(env.worlds.ending)
         widths = {"policy": env.num_obs, "critic": env.num_critic_obs}
         boxes = {group: Box(-RAW_LIMIT, RAW_LIMIT, (width,)) for group, width in widths.items()}
-        self.single_observation_space = Dict(boxes) if all_groups else boxes["policy"]
+        self.single_observation_space = Dict([*boxes.items()]) if all_groups else boxes["policy"]
         self.single_action_space = Box(-1.0, 1.0, (env.num_actions,))
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)

@@ -45,7 +45,7 @@ def robot_parameters(sim: Simulation, tasks: tuple[TaskCfg, ...], skill: wp.arra
     late = 0 if values is None else round(float(values.latency[0, 0]) / sim.dt)
     robot.latency = wp.full(n, late, dtype=int, device=device)
     robot.observation_latency = wp.zeros(n, dtype=int, device=device)
-    robot.push = wp.zeros(n, dtype=wp.spatial_vector, device=device)
+    robot.push = wp.zeros(n, dtype=wp.spatial_vectorf, device=device)
     for name in ("gain_ratio", "speed_ratio"):
         setattr(robot, name, wp.full((12, n), wp.vec2(1.0, 1.0), dtype=wp.vec2, device=device))
     robot.torque_ratio = wp.full((12, n), 1.0, dtype=float, device=device)

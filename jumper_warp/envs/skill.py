@@ -19,8 +19,9 @@ from jumper_warp.kernels.mdp.view import vec12
 from jumper_warp.robot.motors import filter_params
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.kernels import Kernel, records
 
-_KERNELS: dict[tuple, wp.Kernel] = {}
+_KERNELS: dict[tuple, Kernel] = {}
 
 
 class Skill:
@@ -143,22 +144,22 @@ class Skill:
         metrics, figures = self.task.metrics, {}
         if not metrics:
             return figures
-        records = self.states.numpy().copy()
+        states = records(self.states).copy()
         for metric in metrics:
-            values = records[metric.field].astype(np.float64)
+            values = states[metric.field].astype(np.float64)
             if metric.per is None:
                 figures[metric.name] = float(values.mean())
             else:
-                total = float(records[metric.per].astype(np.float64).sum())
+                total = float(states[metric.per].astype(np.float64).sum())
                 figures[metric.name] = float(values.sum()) / total if total else 0.0
         for metric in metrics:
             if metric.per is not None:
-                records[metric.field] = records[metric.per] = 0.0
-        self.states.assign(wp.array(records, dtype=self.task.state, device=self.device))
+                states[metric.field] = states[metric.per] = 0.0
+        self.states.assign(wp.array(states, dtype=self.task.state, device=self.device))
         return figures
 
 
-def kernels_of(task: TaskCfg) -> dict[str, wp.Kernel]:
+def kernels_of(task: TaskCfg) -> dict[str, Kernel]:
     """Return a task's kernels; tasks share each that reads the same of them, whatever their numbers."""
     rows = {
         section: tuple((row.func, row.first, row.lo, row.hi, tuple(row.term.options.items())) for row in section_rows)
@@ -175,7 +176,7 @@ def kernels_of(task: TaskCfg) -> dict[str, wp.Kernel]:
     }
 
 
-def _kernel(make: Callable[[Any], wp.Kernel], source: Any, *read: Any) -> wp.Kernel:
+def _kernel(make: Callable[[Any], Kernel], source: Any, *read: Any) -> Kernel:
     """Return what a function makes of a source, made once for all of which it reads the same."""
     if (key := (make, *read)) not in _KERNELS:
         _KERNELS[key] = make(source)

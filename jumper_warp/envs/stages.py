@@ -23,6 +23,7 @@ from jumper_warp.kernels.mdp.track import track_kernel
 from jumper_warp.sim.simulation import Simulation
 from jumper_warp.sim.slices import Worlds
 from jumper_warp.tasks.cfg import Handover, TaskCfg
+from jumper_warp.utils.kernels import Kernel
 
 BLOCK = 32
 """Threads of a block: small ones spread a few thousand heavy threads over all multiprocessors."""
@@ -85,7 +86,7 @@ class Stages:
             skill.restore_numbers()
         self.sim.physics.parameters_changed()
 
-    def kernels(self, draws: bool = True) -> list[tuple[wp.Kernel, int]]:
+    def kernels(self, draws: bool = True) -> list[tuple[Kernel, int]]:
         """Return what `reset` and `step` launch, each with its block size; draws: the draw of starts too."""
         shared = [action_kernel, motors_kernel, forget_kernel, tick_kernel, track_kernel]
         shared += [home_kernel] if len(self.skills) > 1 else []
@@ -220,15 +221,15 @@ class Stages:
             self._launch(condition_kernel, (part.count, int(LANES)), inputs, CONDITION_BLOCK)
 
     def _launch(
-        self, kernel: wp.Kernel, dim: int | tuple[int, ...], inputs: list, block: int = BLOCK, blocks: int = 0
+        self, kernel: Kernel, dim: int | tuple[int, ...], inputs: list, block: int = BLOCK, blocks: int = 0
     ) -> None:
         """Launch; blocks: most blocks of a GPU, whose threads take turns (0: as many as there are threads)."""
         wp.launch(kernel, dim=dim, inputs=inputs, device=self.wp_device, block_dim=block, max_blocks=blocks)
 
     def _give(self, mask: wp.array, begins: int, values: np.ndarray, headings: wp.array) -> None:
-        values = wp.array(values, dtype=wp.vec4, device=self.wp_device)
+        commands = wp.array(values, dtype=wp.vec4, device=self.wp_device)
         for skill in self.skills:
             self._launch(
                 skill.kernels["give"], self.num_envs,
-                [skill.index, mask, begins, values, headings, self._scene, self.robot, self.worlds, skill.states],
+                [skill.index, mask, begins, commands, headings, self._scene, self.robot, self.worlds, skill.states],
             )  # fmt: skip

@@ -15,6 +15,7 @@ from jumper_warp.kernels.mdp.env import RING, Delays, EnvArrays
 from jumper_warp.kernels.mdp.parameters import RobotParameters
 from jumper_warp.kernels.mdp.view import RobotArrays
 from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.kernels import records
 from jumper_warp.utils.state_checks import check_tensor, check_values
 
 if TYPE_CHECKING:
@@ -37,8 +38,8 @@ def save_state(env: Stages) -> dict[str, torch.Tensor]:
     """
     state = {name: tensor.to("cpu", copy=True) for name, tensor in _tensors(env).items()}
     for prefix, array in _records(env).items():
-        records = array.numpy()
-        state |= {prefix + name: torch.from_numpy(np.array(records[name])) for name in records.dtype.names}
+        found = records(array)
+        state |= {prefix + name: torch.from_numpy(np.array(found[name])) for name in found.dtype.names or ()}
     return state | {FINGERPRINT: nominal_fingerprint(env), SEED: torch.tensor(env.seed)}
 
 
@@ -50,8 +51,8 @@ def load_state(env: Stages, state: dict[str, torch.Tensor]) -> None:
     """
     if not isinstance(state, dict):
         raise InputError(f"a saved environment must be a dictionary, got {type(state).__name__}")
-    tensors, records = _tensors(env), {prefix: array.numpy().copy() for prefix, array in _records(env).items()}
-    fields = {prefix + name: (prefix, name) for prefix, values in records.items() for name in values.dtype.names}
+    tensors, saved = _tensors(env), {prefix: records(array).copy() for prefix, array in _records(env).items()}
+    fields = {prefix + name: (prefix, name) for prefix, values in saved.items() for name in values.dtype.names or ()}
     names = {*tensors, *fields, FINGERPRINT, SEED}
     if names != state.keys():
         raise InputError(
@@ -73,7 +74,7 @@ def load_state(env: Stages, state: dict[str, torch.Tensor]) -> None:
     for name, tensor in tensors.items():
         check_tensor(state[name], tensor, f"saved {name}")
     for field, (prefix, name) in fields.items():
-        check_tensor(state[field], torch.from_numpy(records[prefix][name].copy()), f"saved {field}")
+        check_tensor(state[field], torch.from_numpy(saved[prefix][name].copy()), f"saved {field}")
     _check_indices(env, state)
     check_tensor(state[FINGERPRINT], nominal_fingerprint(env), f"saved {FINGERPRINT}")
     if not torch.equal(state[FINGERPRINT], nominal_fingerprint(env)):
@@ -82,9 +83,9 @@ def load_state(env: Stages, state: dict[str, torch.Tensor]) -> None:
     if int(state[SEED]) != env.seed:
         raise InputError(f"saved with seed {int(state[SEED])}, this environment draws with seed {env.seed}")
     for field, (prefix, name) in fields.items():
-        records[prefix][name] = state[field].numpy()
+        saved[prefix][name] = state[field].numpy()
     for prefix, array in _records(env).items():
-        array.assign(wp.array(records[prefix], dtype=array.dtype, device=env.wp_device))
+        array.assign(wp.array(saved[prefix], dtype=array.dtype, device=env.wp_device))
     for name, tensor in tensors.items():
         tensor.copy_(state[name])
     env.restored()

@@ -56,12 +56,15 @@ class VecEnv(Protocol):
 
     def metrics(self) -> dict[str, float]:
         """Return what to log of the episodes that ended since the last call, by name (waits for the device)."""
+        ...
 
     def config(self) -> dict[str, Any]:
         """Return all settings that define the environment, ready for JSON."""
+        ...
 
     def state_dict(self) -> dict[str, Any]:
         """Return all that the next step depends on, tensors only; later steps do not change them."""
+        ...
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Take up what `state_dict` gave; the next step, without a `reset`, is the one that would have followed.
@@ -79,6 +82,7 @@ class MirroredVecEnv(Protocol):
 
         Raises ValueError: there is none.
         """
+        ...
 
 
 class DifferentiableVecEnv(VecEnv, Protocol):
@@ -93,12 +97,15 @@ class DifferentiableVecEnv(VecEnv, Protocol):
 
     def observe(self) -> tuple[torch.Tensor, torch.Tensor]:
         """Return `obs` and `critic_obs` with derivatives; a world whose episode has just begun has none."""
+        ...
 
     def observe_final(self) -> tuple[torch.Tensor, torch.Tensor]:
         """Return `final_obs` and `final_critic_obs` of the last step with derivatives."""
+        ...
 
     def step_with_gradient(self, action: torch.Tensor) -> torch.Tensor:
         """Advance as `step`; return the reward (num_envs,) with derivatives as far as it has any."""
+        ...
 
 
 def sanitise(obs: torch.Tensor, out: torch.Tensor | None = None) -> torch.Tensor:

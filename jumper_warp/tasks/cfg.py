@@ -7,8 +7,6 @@ import math
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-import warp as wp
-
 from jumper_warp.kernels.mdp.env import Nothing
 from jumper_warp.kernels.mdp.starts import APART
 from jumper_warp.kernels.mdp.terminations import came_apart
@@ -27,6 +25,7 @@ from jumper_warp.tasks.terms import (
     TerminationTerm,
 )
 from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.kernels import Function
 
 Pair = tuple[float, float]
 
@@ -35,7 +34,7 @@ Pair = tuple[float, float]
 class Reset:
     """How an episode begins."""
 
-    func: wp.Function
+    func: Function
     """(robot: RobotArrays, scene: Scene, skill: SkillSettings, task, settings, level, draw: Draw) -> task of the new
     episode; writes coordinates and rates of `draw.world`."""
     settings: Any = None
@@ -49,11 +48,11 @@ class Reset:
 class Command:
     """How a robot is told what to do."""
 
-    give: wp.Function
+    give: Function
     """(view, scene: Scene, task, values: wp.vec4, heading: float) -> task with a command from outside."""
-    due: wp.Function | None = None
+    due: Function | None = None
     """(task) -> bool, whether a new command is drawn within the episode."""
-    draw: wp.Function | None = None
+    draw: Function | None = None
     """(view, scene: Scene, task, level, draw: Draw) -> task with a new command."""
 
     def __post_init__(self) -> None:
@@ -160,7 +159,9 @@ class TaskCfg:
             "curriculum counts": (self.curriculum.options["counts"], {0: state}),
         }
         for where, (func, structs) in expected.items():
-            found = [] if func is None else list(func.input_types.values())
+            if func is None:
+                continue
+            found = list(func.input_types.values())
             for place, struct in structs.items() if found else ():
                 kind = found[place] if len(found) > place else None
                 if kind not in (Any, struct):
@@ -265,7 +266,7 @@ class Handover:
 
     source: TaskCfg
     target: TaskCfg
-    when: wp.Function
+    when: Function
     """(view, task of the source, requested: bool) -> bool"""
-    begin: wp.Function
+    begin: Function
     """(view, task of the source) -> task of the target; then the target's `Command.give`, if the request has one."""

@@ -6,13 +6,13 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-import warp as wp
 
 from jumper_warp.kernels.attitude.commands import give_turn
 from jumper_warp.kernels.jump.reset import give_jump
 from jumper_warp.kernels.velocity.commands import give_velocity
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.kernels import Function
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,7 @@ class CommandLayout:
         return ", ".join(f"{value.name}{' (optional)' if value.optional else ''}" for value in self.values)
 
 
-LAYOUTS: dict[wp.Function, CommandLayout] = {
+LAYOUTS: dict[Function, CommandLayout] = {
     give_jump: CommandLayout(
         (
             CommandValue("x [m]"),

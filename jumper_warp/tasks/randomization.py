@@ -118,7 +118,8 @@ class RandomizationCfg:
     def off(cls) -> RandomizationCfg:
         """Return a configuration with every row off."""
         rows = [name for name, field in cls.__dataclass_fields__.items() if "Range" in str(field.type)]
-        return cls(**dict.fromkeys(rows), push_share=1.0)
+        off: dict[str, Any] = dict.fromkeys(rows)
+        return cls(**off, push_share=1.0)
 
     @classmethod
     def walking(cls) -> RandomizationCfg:

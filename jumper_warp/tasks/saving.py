@@ -52,7 +52,7 @@ def name_of(thing: Any) -> str:
     Of a file that runs as a program the module is its stem, under which `--task-module` loads it.
     Raises TaskError for one that would not be found again.
     """
-    python = thing.func if isinstance(thing, wp.Function) else getattr(thing, "cls", thing)
+    python: Any = thing.func if isinstance(thing, wp.Function) else getattr(thing, "cls", thing)
     module, name = python.__module__, python.__qualname__
     if vars(sys.modules.get(module, object)).get(name) is not thing:
         raise TaskError(f"{module}:{name} cannot be saved: define it under this name at the top level of a module")
@@ -239,8 +239,8 @@ def _tuple(saved: Any, hint: Any, where: str, find: Finder) -> tuple[Any, ...]:
 
 def _object(saved: dict[str, Any], hint: Any, where: str, find: Finder) -> Any:
     """Return a saved term or dataclass; of the kind that the field asks for, unless it names one of these."""
-    kind = hint if "type" not in saved and dataclasses.is_dataclass(hint) else find(saved.get("type"), where)
     wanted = object if hint is Any else hint
+    kind = hint if "type" not in saved and dataclasses.is_dataclass(hint) else find(saved.get("type"), where)
     if not (isinstance(kind, type) and isinstance(wanted, type) and issubclass(kind, wanted)):
         raise TaskError(f"{where}: expected {_word(hint)}, got {shown(saved.get('type'))}")
     content = {key: value for key, value in saved.items() if key != "type"}

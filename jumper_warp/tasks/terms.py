@@ -7,6 +7,7 @@ numbers of a task lie in one array on the device, so that each can change while 
 from __future__ import annotations
 
 import inspect
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple, get_type_hints
 
@@ -17,6 +18,7 @@ from jumper_warp.kernels.mdp.parameters import RobotParameters
 from jumper_warp.kernels.mdp.view import RobotArrays, RobotView
 from jumper_warp.utils.checks import FLOAT32_MAX
 from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.kernels import Function
 
 REQUIRED = inspect.Parameter.empty
 AXES = {2: ("x", "y"), 3: ("x", "y", "z")}
@@ -27,18 +29,18 @@ MOTORS = tuple(f"{leg}_{motor}" for leg in LEGS for motor in ("lateral", "outer"
 class Term:
     """A Warp function with its numbers. Equal terms have the same function, name, numbers and options."""
 
-    context: ClassVar[int] = 2
+    context: int = 2
     """How many arguments of the function come from the kernel."""
     takes: ClassVar[tuple[Any, ...]] = (RobotView,)
     """What the first of them may be."""
     returns: ClassVar[tuple[Any, ...]] = ()
     """What the function may return; anything if empty."""
-    settings: ClassVar[dict[str, float]] = {}
+    settings: ClassVar[dict[str, Any]] = {}
     """Numbers that the kernel itself reads, with their defaults; they come before those of the function."""
-    options: ClassVar[dict[str, Any]] = {}
+    options: Mapping[str, Any] = {}
     """What is compiled in, with its defaults."""
 
-    def __init__(self, func: wp.Function, *, name: str = "", **given: Any) -> None:
+    def __init__(self, func: Function, *, name: str = "", **given: Any) -> None:
         """Args:
 
         func: Signature as the class says.
@@ -54,7 +56,8 @@ class Term:
         self.func, self.name = func, name or func.key.split(".")[-1]
         where = f"{kind} {self.name}"
         self._check_types(where)
-        params = list(inspect.signature(func.func).parameters.values())[self.context :]
+        python: Any = func.func
+        params = list(inspect.signature(python).parameters.values())[self.context :]
         known = self.settings | {p.name: p.default for p in params}
         if len(known) < len(self.settings) + len(params) or set(known) & {"func", "name", *self.options}:
             raise InputError(
@@ -87,7 +90,7 @@ class Term:
 
     def replace(self, **changes: Any) -> Any:
         """Return the term with other numbers or options; raises ValueError as the constructor."""
-        return type(self)(**({"func": self.func, "name": self.name} | self.numbers | self.options | changes))
+        return type(self)(**{"func": self.func, "name": self.name, **self.numbers, **self.options, **changes})
 
     @property
     def of_state(self) -> Any:
@@ -103,7 +106,7 @@ class Term:
         return hash((type(self), self.name))
 
     def __repr__(self) -> str:
-        numbers = "".join(f", {key}={value!r}" for key, value in (self.numbers | self.options).items())
+        numbers = "".join(f", {key}={value!r}" for key, value in {**self.numbers, **self.options}.items())
         return f"{type(self).__name__}({self.name}{numbers})"
 
 
@@ -111,10 +114,10 @@ class RewardTerm(Term):
     """(view: RobotView, task, ...) -> float; times the weight, and times the policy step [s] unless paid `once`."""
 
     settings: ClassVar = {"weight": REQUIRED}
-    options: ClassVar = {"once": False}
+    options: Mapping[str, Any] = {"once": False}
     returns: ClassVar = (float, wp.float32)
 
-    def __init__(self, func: wp.Function, weight: float, **given: Any) -> None:
+    def __init__(self, func: Function, weight: float, **given: Any) -> None:
         super().__init__(func, weight=weight, **given)
 
     @property
@@ -130,7 +133,7 @@ class TerminationTerm(Term):
     rate and the curriculum count.
     """
 
-    options: ClassVar = {"time_out": False, "success": False}
+    options: Mapping[str, Any] = {"time_out": False, "success": False}
     returns: ClassVar = (bool, wp.bool)
 
 
@@ -143,10 +146,10 @@ class ObservationTerm(Term):
     """
 
     settings: ClassVar = {"noise": 0.0, "scale": 1.0, "clip": 100.0}
-    options: ClassVar = {"history": 1, "delayed": False}
+    options: Mapping[str, Any] = {"history": 1, "delayed": False}
     takes: ClassVar = (RobotView, RobotParameters, RobotArrays)
 
-    def __init__(self, func: wp.Function, **given: Any) -> None:
+    def __init__(self, func: Function, **given: Any) -> None:
         if isinstance(func, wp.Function) and RobotArrays in func.input_types.values():
             self.context = 3
         super().__init__(func, **given)
@@ -184,10 +187,10 @@ class EventTerm(Term):
     """
 
     settings: ClassVar = {"least": 0.0, "most": 0.0}
-    options: ClassVar = {"mode": "reset", "repack": True, "spread": False}
+    options: Mapping[str, Any] = {"mode": "reset", "repack": True, "spread": False}
     takes: ClassVar = (RobotParameters,)
 
-    def __init__(self, func: wp.Function, **given: Any) -> None:
+    def __init__(self, func: Function, **given: Any) -> None:
         super().__init__(func, **given)
         mode, least, most = self.options["mode"], self.numbers["least"], self.numbers["most"]
         if mode not in ("startup", "reset", "interval"):
@@ -215,10 +218,10 @@ class Curriculum(Term):
     """
 
     settings: ClassVar = {"tolerance": REQUIRED, "promote_after": 5}
-    options: ClassVar = {"counts": REQUIRED, "unit": "m"}
+    options: Mapping[str, Any] = {"counts": REQUIRED, "unit": "m"}
     returns: ClassVar = (float, wp.float32)
 
-    def __init__(self, func: wp.Function, **given: Any) -> None:
+    def __init__(self, func: Function, **given: Any) -> None:
         super().__init__(func, **given)
         if not isinstance(self.options["counts"], wp.Function):
             raise InputError(f"Curriculum {self.name}: counts must be a @wp.func (task) -> bool")
@@ -241,7 +244,7 @@ class StateMetric:
 class Row(NamedTuple):
     """A term as the kernels see it: a function, and the places of its numbers in the task's array."""
 
-    func: wp.Function
+    func: Function
     first: int
     """Of the settings."""
     lo: int
@@ -249,4 +252,5 @@ class Row(NamedTuple):
     hi: int
     plain: bool
     """No parameters; Warp refuses an empty `*p[lo:lo]`."""
-    term: Term
+    term: Any
+    """Of the kind of its section."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from numbers import Integral
 from typing import Any
 
 import numpy as np
@@ -47,13 +46,13 @@ def check_within(name: str, values: np.ndarray, bounds: tuple[float, float]) -> 
 
 def check_count(name: str, value: Any) -> None:
     """Raises ValueError: the value is no whole number of at least 1."""
-    if isinstance(value, bool) or not isinstance(value, Integral) or value < 1:
+    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 1:
         raise InputError(f"{name} must be a whole number of at least 1, got {value!r:.40}")
 
 
 def check_seed(value: Any) -> None:
     """Raises ValueError: the value is no whole number that the kernels' draws take as a seed."""
-    if isinstance(value, bool) or not isinstance(value, Integral) or not 0 <= value <= MOST_SEED:
+    if isinstance(value, bool) or not isinstance(value, int | np.integer) or not 0 <= value <= MOST_SEED:
         raise InputError(f"seed must be in 0 .. {MOST_SEED}, got {value!r:.40}")
 
 

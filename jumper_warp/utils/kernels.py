@@ -1,16 +1,30 @@
-"""Compilation of Warp kernels side by side, instead of one module after the other at their first launches."""
+"""Types of Warp functions and kernels, and compilation of kernels side by side."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from functools import partial
+from typing import TYPE_CHECKING, Any, cast
 
+import numpy as np
 import warp as wp
+from numpy.typing import NDArray
 
 from jumper_warp.utils.threads import available_threads, run_side_by_side
 
+if TYPE_CHECKING:  # Warp annotates its decorators as if they returned the decorated function
+    Function = wp.Function | Callable[..., Any]
+    Kernel = wp.Kernel | Callable[..., None]
+else:
+    Function, Kernel = wp.Function, wp.Kernel
 
-def load_kernels(kernels: Iterable[tuple[wp.Kernel, int]], device: wp.Device) -> None:
+
+def records(structs: wp.array) -> NDArray[np.void]:
+    """Return an array of structs as NumPy records (waits for the device)."""
+    return cast("NDArray[np.void]", structs.numpy())
+
+
+def load_kernels(kernels: Iterable[tuple[Kernel, int]], device: wp.Device) -> None:
     """Compile, or read from Warp's cache on disk, the modules of kernels that are launched with these block sizes.
 
     Raises what the compiler raises.

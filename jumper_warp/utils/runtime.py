@@ -46,9 +46,9 @@ def device_info(device: wp.DeviceLike = None) -> DeviceInfo:
     found = wp.get_device(device)
     if not found.is_cuda:
         return DeviceInfo(found.alias, found.name, driver=None, mempool=False, graphs=True)
-    major, minor = wp.get_cuda_driver_version()
+    driver = ".".join(map(str, wp.get_cuda_driver_version() or ()))
     pooled = wp.is_mempool_enabled(found)
-    return DeviceInfo(found.alias, found.name, driver=f"{major}.{minor}", mempool=pooled, graphs=pooled)
+    return DeviceInfo(found.alias, found.name, driver=driver, mempool=pooled, graphs=pooled)
 
 
 def report_device(device: wp.DeviceLike = None, console: Console | None = None) -> DeviceInfo:
