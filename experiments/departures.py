@@ -28,10 +28,11 @@ from jumper_warp.utils.output import output_dir, write_metrics
 from jumper_warp.utils.runtime import announce
 from support.departure_runs import JUMPS, KEPT, TESTS, WIDTH, Jump, measured, report, settings, trained
 from support.departures import DEPARTURES, Undone, flags_of
+from support.scripts import ThreadArgs
 
 
 @dataclass(frozen=True)
-class Args:
+class Args(ThreadArgs):
     """Flags."""
 
     task: Jump = "vertical-jump"
@@ -54,12 +55,6 @@ class Args:
     """More flags of `jumper train`, for all trainings: --train="--ppo.gamma 0.98"."""
     measure: bool = True
     """Make the jumps after each training."""
-    out: Path | None = None
-    """Folder for runs, metrics.json, table and plot (default: outputs/departures/<time>)."""
-    device: str | None = None
-    """Warp device."""
-    threads: int | None = None
-    """CPU threads that share the worlds (default: all cores); they change no result."""
 
     def __post_init__(self) -> None:
         """Check the values."""

@@ -16,7 +16,6 @@ import itertools
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from multiprocessing import get_context
-from pathlib import Path
 from typing import Any
 
 import tyro
@@ -29,6 +28,7 @@ from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.output import output_dir, write_metrics
 from jumper_warp.utils.runtime import announce
 from support.learning import TESTED, Curve, curve_metrics, draw_curves
+from support.scripts import DeviceArgs
 from support.timed_training import timed_training
 from support.variants import DEFAULT, variant
 
@@ -36,7 +36,7 @@ TASK = "vertical-jump"
 
 
 @dataclass(frozen=True)
-class Args:
+class Args(DeviceArgs):
     """Flags."""
 
     seconds: float = 60.0
@@ -57,10 +57,6 @@ class Args:
     """Policy steps that the policy sees, as `jumper train --history` (default: as the task says)."""
     randomize: bool = False
     """Train with randomisation and noise."""
-    out: Path | None = None
-    """Folder for metrics.json and plot (default: outputs/learning_curves/<time>)."""
-    device: str | None = None
-    """Warp device."""
 
     def __post_init__(self) -> None:
         """Check the values."""

@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any, Literal
 
 import tyro
@@ -29,11 +28,12 @@ from jumper_warp.robot.overlay import with_springs
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.output import output_dir, write_metrics
 from jumper_warp.utils.runtime import announce
+from support.scripts import DeviceArgs
 from support.spring_jumps import FILTERS, SpringJumps
 
 
 @dataclass(frozen=True)
-class Args:
+class Args(DeviceArgs):
     """Flags."""
 
     stiffness: tuple[float, ...] = (0.0, 125.0, 250.0, 375.0, 500.0, 625.0, 750.0, 875.0, 1000.0, 1250.0, 1500.0)
@@ -50,10 +50,6 @@ class Args:
     """[m/s^2] Downward."""
     filter: Literal["both", "stock", "loose"] = "both"
     """Motor command filter: that of the vertical jump, the loose one, or each in turn."""
-    out: Path | None = None
-    """Folder for figures, plot and recording (default: outputs/leg_springs/<time>)."""
-    device: str | None = None
-    """Warp device."""
 
     def __post_init__(self) -> None:
         """Check the values."""

@@ -30,6 +30,7 @@ from jumper_warp.utils.output import output_dir, write_metrics
 from jumper_warp.utils.runtime import announce
 from jumper_warp.viz.snapshot import Camera, contact_sheet
 from support.open_loop import SQUAT, draw_trace, follow_jump, jump_metrics
+from support.scripts import DeviceArgs
 
 HARDWARE_APEX = 1.075
 """[m] Paper, open loop on the robot at 18 N m."""
@@ -40,7 +41,7 @@ PER_MOTOR = tuple(f"peak_{what}_{leg}" for what in ("torque", "speed") for leg i
 
 
 @dataclass(frozen=True)
-class Args:
+class Args(DeviceArgs):
     """Flags."""
 
     solver: Literal["jumper", "mujoco"] = "jumper"
@@ -59,10 +60,6 @@ class Args:
     """[N/m] [m] Stiffness and rest length of springs between the knees of each leg (default: none)."""
     robot: Path | None = None
     """Robot overlay, as `jumper sysid` writes it, in place of springs."""
-    out: Path | None = None
-    """Folder for figures, plot and recording (default: outputs/open_loop_jump/<time>)."""
-    device: str | None = None
-    """Warp device."""
 
     def __post_init__(self) -> None:
         """Check the values."""

@@ -30,12 +30,13 @@ from jumper_warp.utils.output import output_dir, write_metrics
 from jumper_warp.utils.runtime import announce
 from support.gradient_variance import variances
 from support.learning import Curve, curve_metrics, draw_curves, learning_curve, make_judge
+from support.scripts import DeviceArgs
 
 TASK = "vertical-jump"
 
 
 @dataclass(frozen=True)
-class Args:
+class Args(DeviceArgs):
     """Flags."""
 
     seconds: float = 120.0
@@ -62,10 +63,6 @@ class Args:
     """Policy steps of the windows whose gradients are measured."""
     worlds: int = 256
     """Worlds of that."""
-    out: Path | None = None
-    """Folder for metrics.json and plots (default: outputs/shac/<time>)."""
-    device: str | None = None
-    """Warp device."""
 
     def __post_init__(self) -> None:
         """Raises InputError: a setting is out of range."""

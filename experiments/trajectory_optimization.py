@@ -34,12 +34,13 @@ from jumper_warp.utils.output import output_dir, write_metrics
 from jumper_warp.utils.runtime import announce
 from support.motion_replay import Replay, plot
 from support.optimized_jumps import FINE, JUMPS, LIMITED, around, optimise
+from support.scripts import ThreadArgs
 
 KNOWN = JUMPS | LIMITED
 
 
 @dataclass(frozen=True)
-class Args:
+class Args(ThreadArgs):
     """Flags."""
 
     jumps: tuple[str, ...] = tuple(JUMPS)
@@ -52,12 +53,6 @@ class Args:
     """Iterations of the last descent (default: those of each jump)."""
     seed: int = 0
     """Of random candidates and displacements."""
-    out: Path | None = None
-    """Folder for metrics, plots, targets and recordings (default: outputs/trajectory_optimization/<time>)."""
-    device: str | None = None
-    """Warp device."""
-    threads: int | None = None
-    """CPU threads that share the worlds (default: all cores); they change no result."""
 
     def __post_init__(self) -> None:
         """Check the values."""

@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 import torch
@@ -16,10 +15,11 @@ from jumper_warp.rl.graphs import Captured
 from jumper_warp.sim.simulation import Simulation
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.utils.errors import InputError
+from support.scripts import ThreadArgs
 
 
 @dataclass(frozen=True)
-class SoakArgs:
+class SoakArgs(ThreadArgs):
     """Flags of a soak test."""
 
     envs: int = 1024
@@ -40,12 +40,6 @@ class SoakArgs:
     """Name of a task whose environment is tried, with limits and filter of its own, instead of the simulation alone."""
     seed: int = 0
     """Of actions, masses and friction."""
-    out: Path | None = None
-    """Folder for metrics.json (default: outputs/soak_test/<time>)."""
-    device: str | None = None
-    """Warp device."""
-    threads: int | None = None
-    """CPU threads that share the worlds (default: all cores); they change no result."""
 
     def __post_init__(self) -> None:
         """Check the values."""
