@@ -27,9 +27,8 @@ from jumper_warp.tasks.observations import with_history
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.output import output_dir, write_metrics
 from jumper_warp.utils.runtime import announce
-from support.learning import TESTED, Curve, curve_metrics, draw_curves
+from support.learning import TESTED, Curve, curve_metrics, draw_curves, timed_training
 from support.scripts import DeviceArgs
-from support.timed_training import timed_training
 from support.variants import DEFAULT, variant
 
 TASK = "vertical-jump"

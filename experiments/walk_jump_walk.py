@@ -21,7 +21,6 @@ import tyro
 from jumper_warp.cli.main import run_command
 from jumper_warp.evaluation.courses import Course, course_metrics, draw_course
 from jumper_warp.evaluation.places import random_headings
-from jumper_warp.evaluation.plots import drawn
 from jumper_warp.evaluation.run import EvaluationArgs, SkillRun
 from jumper_warp.evaluation.scripts import ScriptStep
 from jumper_warp.policies.skills import SkillNames
@@ -109,9 +108,8 @@ def main(args: Args) -> dict:
     run = SkillRun.of(name, args, SkillNames(args.policy, args.jump_up, args.jump_to))
     course = Course(scripts(args), random_headings(args.robots, args.seed))
     run.follow(run.env(args.robots, block=course.block), course, film=name)
-    with drawn(run.folder / "course.png", 5, 1, figsize=(10, 9), sharex=True) as axes:
-        draw_course(axes, course, 0)
-        axes[0].set_title(f"walk, jump, walk: robot 0 of {len(course.end)}, {run.title}")
+    title = f"walk, jump, walk: robot 0 of {course.count}, {run.title}"
+    draw_course(run.folder / "course.png", course, 0, title)
     return run.report(course_metrics(course), {} if args.course else PAPER)
 
 

@@ -15,9 +15,11 @@ import warp as wp
 from jumper_warp.envs.env import Env
 from jumper_warp.evaluation.heights import run_jumps
 from jumper_warp.evaluation.plots import drawn
+from jumper_warp.rl.cfg import PpoCfg
 from jumper_warp.rl.ppo import Ppo
 from jumper_warp.rl.shac import Shac
 from jumper_warp.tasks.cfg import TaskCfg
+from support.timing import process_age
 
 RATES = (0.5, 0.8, 0.9, 0.95, 1.0)
 """[1] Success rates whose first times are reported."""
@@ -87,6 +89,22 @@ def learning_curve(
         curve.seconds.append(trained)
         curve.steps.append(curve.iterations * ppo.batch_size)
         curve.success.append(success(ppo, judge, heights))
+    return curve
+
+
+def timed_training(task: TaskCfg, cfg: PpoCfg, args: Any, seed: int) -> Curve:
+    """Train, and return the curve with the time from the start of this process until the training was ready.
+
+    args: envs, device, randomize, jumps, seconds, every and heights, as `experiments/learning_curves.py` has them.
+    """
+    torch.manual_seed(seed)
+    env = Env(task, args.envs, seed=seed, device=args.device, randomize=args.randomize, noise=args.randomize)
+    ppo = Ppo(env, cfg)
+    warm_up(env, ppo)
+    ready, judge = process_age(), make_judge(task, args.jumps, args.device)
+    success(ppo, judge)
+    curve = learning_curve(env, ppo, judge, args.seconds, args.every, args.heights)
+    curve.ready = ready
     return curve
 
 

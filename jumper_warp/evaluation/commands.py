@@ -16,7 +16,6 @@ from rich.table import Table
 from jumper_warp.evaluation.courses import Course, course_metrics, draw_course
 from jumper_warp.evaluation.film import Film
 from jumper_warp.evaluation.log import EvaluationLog, run_evaluation
-from jumper_warp.evaluation.plots import drawn
 from jumper_warp.evaluation.run import EvaluationRun, SkillRun
 from jumper_warp.evaluation.scripts import read_script
 from jumper_warp.policies.conditions import Conditions
@@ -54,8 +53,8 @@ def evaluate(run: EvaluationRun, cfg: EvaluateCfg) -> dict[str, Any]:
     if cfg.keep and is_run(run.source):
         raise PolicyError(f"{run.source}: a run keeps no figures; export it first")
     run.prepare("evaluate", cfg.conditions, cfg.out)
-    env = run.env(cfg.flags.count)
-    log = run.follow(env, cfg.flags.log(env.task, cfg.conditions.seed))
+    log = cfg.flags.log(run.evaluation.for_evaluation(run.task), cfg.conditions.seed)
+    run.follow(run.env(log.count), log)
     figures = {
         "task": run.policy.interface.task,
         **run.tried_in,
@@ -120,9 +119,8 @@ def play(run: EvaluationRun, cfg: PlayCfg) -> Path:
     """
     flags, name = cfg.flags, run.policy.interface.task
     run.prepare("play", cfg.conditions, cfg.out)
-    env = run.env(flags.count)
-    log = flags.log(env.task)
-    worlds = range(flags.count)
+    log = flags.log(run.evaluation.for_evaluation(run.task))
+    env, worlds = run.env(log.count), range(log.count)
     notes = {"task": name, **log.notes(worlds), "solver": cfg.conditions.solver}
     film = Film(env, log, worlds, spacing=log.spacing, notes=notes, motors=True)
     run_evaluation(run.policy.act, env, log, seconds=cfg.seconds or flags.seconds, watch=film, stop=False)
@@ -169,8 +167,7 @@ def play_script(cfg: ScriptCfg) -> Path:
     film = Film(env, course, [0], notes={**course.notes([0]), "solver": cfg.conditions.solver})
     run_evaluation(run.actor(env), env, course, watch=film)
     path = film.save_rrd(run.folder / "course.rrd")
-    with drawn(run.folder / "course.png", 5, 1, figsize=(10, 9), sharex=True) as axes:
-        draw_course(axes, course, 0)
+    draw_course(run.folder / "course.png", course, 0)
     figures = {"outcome": str(course.outcomes[0]), **course_metrics(course)}
     write_metrics(run.folder, figures)
     print_figures(figures)

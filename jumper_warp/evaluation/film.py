@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import warp as wp
@@ -18,6 +18,7 @@ from jumper_warp.utils.rotations import rotate
 
 if TYPE_CHECKING:
     from jumper_warp.envs.env import Env
+    from jumper_warp.evaluation.log import EvaluationLog
     from jumper_warp.robot.grounds import BlockCfg
 
 ANKLE = np.array([0.0, 0.0, -0.3])
@@ -63,20 +64,13 @@ class Links:
         return here.body_q.numpy().reshape(n, -1, 7), here.body_qd.numpy().reshape(n, -1, 6)
 
 
-class HasSeries(Protocol):
-    """Follows worlds and can tell how they are."""
-
-    def series(self, worlds: Sequence[int]) -> Mapping[str, Any]:
-        """Return what to draw of some worlds over time, `group/quantity [unit]` to its present value."""
-
-
 class Film:
     """Collects what some worlds of an environment look like; call it after every policy step."""
 
     def __init__(
         self,
         env: Env,
-        log: HasSeries,
+        log: EvaluationLog,
         worlds: Sequence[int],
         *,
         spacing: float = 1.2,
@@ -155,6 +149,12 @@ class Film:
             state.body_q.assign(recording.poses[frame])
             pictures.append(camera.picture(state))
         contact_sheet(pictures, path, strip.captions)
+
+
+def allocated(array: wp.array | None) -> wp.array:
+    """Return an array of Newton's state or model, of which one may lack; those of a built robot lack none."""
+    assert array is not None
+    return array
 
 
 def ankles(poses: np.ndarray) -> np.ndarray:

@@ -8,13 +8,14 @@ from __future__ import annotations
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from types import ModuleType
-from typing import Any, Literal, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
+import tyro
 from rich.console import Console
 from rich.table import Table
 
@@ -43,53 +44,29 @@ Log = TypeVar("Log", bound=EvaluationLog)
 
 
 @dataclass(frozen=True)
-class EvaluationArgs:
-    """Flags of every experiment that evaluates a policy."""
+class EvaluationArgs(Conditions):
+    """Flags of every experiment that evaluates a policy; randomised robots have observation noise too."""
 
+    noise: tyro.conf.Suppress[tyro.conf.Fixed[bool]] = False
     policy: str = "horizontal_jump"
     """Name or folder of a policy, a run's folder, or a checkpoint."""
-    solver: Literal["jumper", "mujoco"] = "jumper"
-    """Physics: the dedicated solver, or Newton's SolverMuJoCo."""
-    randomize: bool = False
-    """Randomisation, observation noise, latency and pushes as in training."""
-    push_in_flight: bool = False
-    """Randomised pushes act in flight too, and not only while a paw is down."""
-    latency: float | None = None
-    """[ms] From action to motor, to the nearest physics step (default: none, or drawn if randomised)."""
-    gains: tuple[float, float] | None = None
-    """[1] Scales of kp and kd of all motors (default: 1, or drawn if randomised)."""
-    friction: float | None = None
-    """[1] Of the paws, static and dynamic (default: nominal, or drawn if randomised)."""
-    robot: Path | None = None
-    """Robot overlay, as `jumper sysid` writes it (default: that of the training, if it had one)."""
-    seed: int = 0
-    """Of what is drawn."""
     record: int = 1
     """Number of jumps to record for the Rerun viewer and, one of them, as a filmstrip; 0: none."""
     out: Path | None = None
     """Folder for figures, plots, recordings and filmstrips (default: outputs/<name>/<time>)."""
-    device: str | None = None
-    """Warp device."""
-    threads: int | None = None
-    """CPU threads that share the worlds (default: all cores); they change no result."""
-    gravity: float | None = None
-    """[m/s^2] Downward (default: that of the policy's task)."""
 
     def __post_init__(self) -> None:
         """Check the values."""
+        super().__post_init__()
         if self.record < 0:
             raise InputError(f"record must not be negative, got {self.record}")
         checked_threads(self.threads)
-        conditions_of(self)
 
 
 def conditions_of(args: EvaluationArgs) -> Conditions:
-    """Return the conditions that an experiment's flags ask for. Raises InputError: one is out of range."""
-    same = (
-        "solver", "randomize", "seed", "device", "threads", "gravity", "push_in_flight", "latency", "gains", "friction",
-        "robot",
-    )  # fmt: skip
-    return Conditions(noise=args.randomize, **{name: getattr(args, name) for name in same})
+    """Return the conditions that an experiment's flags ask for."""
+    values = {spec.name: getattr(args, spec.name) for spec in fields(Conditions)}
+    return Conditions(**values | {"noise": args.randomize})
 
 
 class Run(ABC):
