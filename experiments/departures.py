@@ -89,7 +89,7 @@ def main(args: Args) -> dict[str, Any]:
     for name, seed, undone in args.trainings():  # a wrong flag is refused before any training
         settings(undone, args.command(undone, seed, Path(name)))
     announce(args.device, args.threads)
-    folder, found = output_dir("departures", args.out), {}
+    folder, found, table = output_dir("departures", args.out), {}, None
     values: dict[str, Any] = {"task": args.task, "iterations": args.length, "envs": args.envs}
     for name, seed, undone in args.trainings():
         checkpoint = trained(undone, args.command(undone, seed, folder / f"{name}_{seed}"))
@@ -100,7 +100,7 @@ def main(args: Args) -> dict[str, Any]:
         values |= {f"{test}_{key}_{name}_{seed}": tests[test][key] for test in TESTS for key in tests[test]}
         write_metrics(folder, values)
         table = report(found, f"{args.task}, {args.length} iterations", folder)
-    if found:
+    if table is not None:
         Console(width=WIDTH).print(table)
     print(f"{'metrics, table, plot and ' if found else ''}runs in {folder}")
     return values

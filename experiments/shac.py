@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, cast
 
 import torch
 import tyro
@@ -20,6 +20,7 @@ import tyro
 from jumper_warp.cli.main import run_command
 from jumper_warp.diff.differentiable_env import DifferentiableEnv
 from jumper_warp.envs.env import Env
+from jumper_warp.envs.vec_env import DifferentiableVecEnv
 from jumper_warp.registry import make_task, trainer_settings
 from jumper_warp.rl.cfg import ShacCfg
 from jumper_warp.rl.ppo import Ppo
@@ -83,9 +84,9 @@ def train(args: Args, trainer: str, seed: int) -> Curve:
     judge = make_judge(env.tasks[0], args.jumps, args.device)
     settings = replace(settings, hidden=args.hidden)
     if trainer == "shac":
-        env = DifferentiableEnv(env)
+        smooth = cast(DifferentiableVecEnv, DifferentiableEnv(env))
         settings = replace(settings, num_steps=args.window, init_std=args.init_std)
-        return learning_curve(env, Shac(env, settings, ShacCfg()), judge, args.seconds, args.every)
+        return learning_curve(smooth, Shac(smooth, settings, ShacCfg()), judge, args.seconds, args.every)
     return learning_curve(env, Ppo(env, settings), judge, args.seconds, args.every)
 
 

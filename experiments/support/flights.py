@@ -87,11 +87,11 @@ class Flights(EvaluationLog):
         goals[:, 2] = self.apex
         env.evaluation_reset(jump_commands(goals, DELAY if self.late is None else 0.0, env.step_dt))
 
-    def open_loop(self) -> np.ndarray:
-        """Return the transversal angles [deg] of the next policy step, (num_envs, 4)."""
+    def open_loop(self, late: np.ndarray) -> np.ndarray:
+        """Return the transversal angles [deg] of the next policy step, (num_envs, 4); late: as of the flights."""
         step, n = len(self.tilts), len(self.apex)
         squat = 45.0 + (SQUAT - 45.0) * min(step / RAMP, 1.0)
-        delay = self.late @ (0.5 * ROWS.T) / self.step_dt
+        delay = late @ (0.5 * ROWS.T) / self.step_dt
         share = np.clip(step + 1 - (RAMP + HOLD) - (delay - delay.min(axis=1, keepdims=True)), 0.0, 1.0)
         if step < RAMP + HOLD + EXTEND:
             return squat + (STRETCHED - squat) * share
@@ -108,7 +108,7 @@ class Flights(EvaluationLog):
             return chosen
         pushing = self._left < 0
         legs = np.zeros((n, 4, 3))
-        legs[:, :, 1:] = ((self.open_loop() - 45.0) / scale)[:, :, None]
+        legs[:, :, 1:] = ((self.open_loop(self.late) - 45.0) / scale)[:, :, None]
         chosen[pushing] = legs.reshape(n, 12)[pushing]
         return chosen
 
@@ -238,6 +238,9 @@ def draw_flights(path: Path, found: Mapping[str, Flights]) -> None:
 class FlightRun(Run):
     """Follows flights of a jump and a policy that turns."""
 
+    flights: Flights
+    """Under way."""
+
     def __init__(self, args: EvaluationArgs, landing: str, jump: str) -> None:
         """Open the policies that turn (args) and land (none if empty); jump: the task that takes off and lands then.
 
@@ -253,7 +256,6 @@ class FlightRun(Run):
         if takes_off.evaluation not in HEIGHTS:
             raise PolicyError(f"this needs a jump to heights, got {takes_off.name}")
         self.tasks = takes_off, turning
-        self.flights: Flights | None = None
         self.prepare("flight_attitude", conditions_of(args), args.out, record=args.record)
 
     def actor(self, env: Env) -> Callable[[torch.Tensor], torch.Tensor]:

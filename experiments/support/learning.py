@@ -13,6 +13,7 @@ import torch
 import warp as wp
 
 from jumper_warp.envs.env import Env
+from jumper_warp.envs.vec_env import VecEnv
 from jumper_warp.evaluation.heights import run_jumps
 from jumper_warp.evaluation.plots import drawn
 from jumper_warp.rl.cfg import PpoCfg
@@ -55,7 +56,7 @@ def success(ppo: Ppo | Shac, judge: Env, heights: tuple[float, float] = TESTED) 
     return float(run_jumps(ppo.model.act, judge, np.linspace(*heights, judge.num_envs)).success.mean())
 
 
-def warm_up(env: Env, ppo: Ppo | Shac) -> None:
+def warm_up(env: VecEnv, ppo: Ppo | Shac) -> None:
     """Compile the environment's kernels and the trainer's functions, and begin all episodes anew."""
     env.reset()
     env.step(torch.zeros(env.num_envs, env.num_actions, device=env.device))
@@ -65,7 +66,7 @@ def warm_up(env: Env, ppo: Ppo | Shac) -> None:
 
 
 def learning_curve(
-    env: Env, ppo: Ppo | Shac, judge: Env, seconds: float, every: float, heights: tuple[float, float] = TESTED
+    env: VecEnv, ppo: Ppo | Shac, judge: Env, seconds: float, every: float, heights: tuple[float, float] = TESTED
 ) -> Curve:
     """Train for a time [s] as `jumper train --max-seconds` does, and return the curve; the test is off the clock.
 
@@ -75,16 +76,16 @@ def learning_curve(
     heights [m]: of the test's jumps.
     """
     warm_up(env, ppo)
-    curve, trained = Curve(), 0.0
+    curve, trained, device = Curve(), 0.0, wp.device_from_torch(env.device)
     while trained < seconds:
-        wp.synchronize_device(env.wp_device)
+        wp.synchronize_device(device)
         start = time.perf_counter()
         until = min(trained + every, seconds)
         while (spent := trained + time.perf_counter() - start) < until:
             ppo.set_progress(spent / seconds)
             ppo.iterate()
             curve.iterations += 1
-            wp.synchronize_device(env.wp_device)
+            wp.synchronize_device(device)
         trained += time.perf_counter() - start
         curve.seconds.append(trained)
         curve.steps.append(curve.iterations * ppo.batch_size)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from jumper_warp.evaluation.film import allocated, ankles
+from jumper_warp.evaluation.film import ankles
 from jumper_warp.evaluation.limits import EXTEND, HOLD, RAMP
 from jumper_warp.evaluation.plots import drawn
 from jumper_warp.robot.model import LEGS, MOTOR_JOINTS
@@ -74,7 +74,7 @@ def follow_jump(
                 (now, q[2], sim.base_velocity()[0, 2], motor_values(q[7:]), motor_values(qd[6:]),
                  sim.torque.numpy()[:, 0].copy(), sim.paw_force.numpy()[:, 0].copy(), sim.loop_gap()[0])
             )  # fmt: skip
-        frames.append(allocated(sim.state.body_q).numpy().copy())
+        frames.append(sim.state.body_q.numpy().copy())
         record(recorder, frames[-1], rows[-1])
     return Trace(*(np.array(column) for column in zip(*rows, strict=True))), recorder, frames
 

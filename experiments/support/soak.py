@@ -13,6 +13,7 @@ import warp as wp
 from jumper_warp.envs.env import Env
 from jumper_warp.rl.graphs import Captured
 from jumper_warp.sim.simulation import Simulation
+from jumper_warp.sim.solver import SolverJumper
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.utils.errors import InputError
 from support.scripts import ThreadArgs
@@ -54,7 +55,7 @@ def randomize(sim: Simulation, rng: np.random.Generator) -> None:
     scale = rng.uniform(0.8, 1.25, n).astype(np.float32)
     model.body_mass.assign(model.body_mass.numpy() * np.repeat(scale, 21))
     model.body_inertia.assign(model.body_inertia.numpy() * np.repeat(scale, 21)[:, None, None])
-    worlds, friction = model.shape_world.numpy(), rng.uniform(0.2, 1.2, n).astype(np.float32)
+    worlds, friction = np.asarray(model.shape_world.numpy(), dtype=int), rng.uniform(0.2, 1.2, n).astype(np.float32)
     mu = model.shape_material_mu.numpy()
     mu[worlds >= 0] = friction[worlds[worlds >= 0]]
     model.shape_material_mu.assign(mu)
@@ -96,6 +97,7 @@ class Totals:
     def __init__(self, sim: Simulation) -> None:
         self._rates = wp.to_torch(sim.state.joint_qd).view(sim.num_worlds, -1)
         self._state = wp.to_torch(sim.state.joint_q).view(sim.num_worlds, -1)
+        assert isinstance(sim.solver, SolverJumper)
         self._residual, self._tolerance = wp.to_torch(sim.solver.residual), sim.solver.tolerance
         self._speeds = self._rates.new_zeros(2)  # [m/s] of a base, [rad/s] of a joint
         self._counts = torch.zeros(3, dtype=torch.int64, device=self._rates.device)

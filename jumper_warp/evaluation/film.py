@@ -14,12 +14,14 @@ import numpy as np
 import warp as wp
 
 from jumper_warp.robot.model import LEGS, build_model
+from jumper_warp.sim.solver import SolverJumper
 from jumper_warp.utils.rotations import rotate
 
 if TYPE_CHECKING:
     from jumper_warp.envs.env import Env
     from jumper_warp.evaluation.log import EvaluationLog
     from jumper_warp.robot.grounds import BlockCfg
+    from jumper_warp.sim.simulation import Simulation
 
 ANKLE = np.array([0.0, 0.0, -0.3])
 """[m] In the shank's frame."""
@@ -37,9 +39,9 @@ class Strip:
     """Of the filmed world."""
     frames: Sequence[int]
     captions: Sequence[str]
-    eye: Sequence[float]
+    eye: Sequence[float] | np.ndarray
     """[m] Of the camera, world frame."""
-    target: Sequence[float]
+    target: Sequence[float] | np.ndarray
     """[m] Where it looks."""
     size: tuple[int, int]
     """[px] Width and height of a picture."""
@@ -108,7 +110,7 @@ class Film:
         series = self.log.series(self.worlds) | (self._motor_series() if self.motors else {})
         forces = sim.paw_force.numpy().transpose(1, 0, 2)[self.worlds]
         if self.block is not None:
-            self.block_places.append(sim.solver.block_position()[self.worlds])
+            self.block_places.append(block_places(sim)[self.worlds])
         self.frames += 1
         self.recorder.record(self.frames * self.env.step_dt, poses.reshape(-1, 7), series, ankles(poses), forces)
 
@@ -143,7 +145,7 @@ class Film:
         from jumper_warp.viz.snapshot import Camera, contact_sheet
 
         recording = self.recorder.recording()
-        camera = Camera(self.model, strip.eye, strip.target, strip.size, world=strip.index)
+        camera = Camera(self.model, tuple(strip.eye), tuple(strip.target), strip.size, world=strip.index)
         state, pictures = self.model.state(), []
         for frame in strip.frames:
             state.body_q.assign(recording.poses[frame])
@@ -151,10 +153,10 @@ class Film:
         contact_sheet(pictures, path, strip.captions)
 
 
-def allocated(array: wp.array | None) -> wp.array:
-    """Return an array of Newton's state or model, of which one may lack; those of a built robot lack none."""
-    assert array is not None
-    return array
+def block_places(sim: Simulation) -> np.ndarray:
+    """Return the places [m] of the sliding blocks, world frame, (num_worlds, 2); SolverJumper alone has any."""
+    assert isinstance(sim.solver, SolverJumper)
+    return sim.solver.block_position()
 
 
 def ankles(poses: np.ndarray) -> np.ndarray:

@@ -11,6 +11,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from jumper_warp.envs.env import Env
 from jumper_warp.tasks.cfg import TaskCfg
@@ -137,11 +138,11 @@ def within(values: np.ndarray, limits: tuple[float, float]) -> np.ndarray:
     return (values >= limits[0] - 5e-4) & (values <= limits[1] + 5e-4)
 
 
-def mean(values: np.ndarray | Sequence[float | None]) -> float | None:
+def mean(values: ArrayLike | Sequence[float | None]) -> float | None:
     """Return the mean of what is a number, None if nothing is."""
-    values = np.asarray(values, dtype=float)
-    values = values[~np.isnan(values)]
-    return float(values.mean()) if len(values) else None
+    numbers = np.asarray(values, dtype=float)
+    numbers = numbers[~np.isnan(numbers)]
+    return float(numbers.mean()) if len(numbers) else None
 
 
 def largest(values: np.ndarray) -> float | None:

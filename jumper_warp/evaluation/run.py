@@ -65,8 +65,9 @@ class EvaluationArgs(Conditions):
 
 def conditions_of(args: EvaluationArgs) -> Conditions:
     """Return the conditions that an experiment's flags ask for."""
-    values = {spec.name: getattr(args, spec.name) for spec in fields(Conditions)}
-    return Conditions(**values | {"noise": args.randomize})
+    values: dict[str, Any] = {spec.name: getattr(args, spec.name) for spec in fields(Conditions)}
+    values["noise"] = args.randomize
+    return Conditions(**values)
 
 
 class Run(ABC):

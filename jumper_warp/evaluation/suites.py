@@ -13,6 +13,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from jumper_warp.evaluation.film import block_places
 from jumper_warp.evaluation.log import largest, mean, within
 from jumper_warp.evaluation.places import AT_END, FALLS, MISSED, PlaceLog, landing_metrics, trained_range
 from jumper_warp.evaluation.plots import Track, draw_landings, draw_paths, drawn
@@ -236,7 +237,7 @@ class Platform(Suite):
             done[name] = self.jump(run, goals[:, None], env, headings=headings, film=name, drawn=special)
             values |= {f"{name}_{metric}": value for metric, value in landing_metrics(done[name]).items()}
             if "block" in special:
-                slide = np.linalg.norm(env.sim.solver.block_position() - special["block"].center, axis=1)
+                slide = np.linalg.norm(block_places(env.sim) - special["block"].center, axis=1)
                 values |= {"block_mean_slide_m": float(slide.mean()), "block_max_slide_m": float(slide.max())}
         titles = {f"{name}, {run.title}": landings for name, landings in done.items()}
         draw_landings(run.folder / "landings.png", titles, (5.0 * len(done), 4.0))
@@ -319,12 +320,12 @@ def draw_distances(run: EvaluationRun, values: dict[str, Any]) -> None:
 def distance_metrics(bins: dict[float, PlaceLog]) -> dict[str, Any]:
     """Return the metrics over all bins (middle [m] to jumps), and lists with an entry a bin."""
     each = [landing_metrics(landings) for landings in bins.values()]
-    lists = {name: [values[name] for values in each] for name in EACH}
+    lists: dict[str, list[Any]] = {name: [values[name] for values in each] for name in EACH}
     flown = [base_at_touchdown(landings) for landings in bins.values()]
     landed = [landings.landing[landings.success][:, 0] for landings in bins.values()]
     inside = [landings.success[within(landings.places[..., 0], IN_RANGE)] for landings in bins.values()]
     values: dict[str, Any] = {
-        "jumps": sum(values["jumps"] for values in each),
+        "jumps": sum(int(landings.begun.sum()) for landings in bins.values()),
         "mean_error_m": mean(lists["mean_error_m"]),
         "success_rate_in_range": mean(np.concatenate(inside)),
         **{rate: mean(lists[rate]) for rate in (*KINDS.values(), "fall_rate", "miss_rate", "still_landing_rate")},
