@@ -54,7 +54,6 @@ class Args(ThreadArgs):
     """Root of another checkout to compare with."""
 
     def __post_init__(self) -> None:
-        """Check the values."""
         for name in ("steps", "repeats", "iterations", "num_steps"):
             if getattr(self, name) < 1:
                 raise InputError(f"{name} must be at least 1, got {getattr(self, name)}")

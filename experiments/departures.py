@@ -24,11 +24,10 @@ from rich.console import Console
 
 from jumper_warp.cli.main import run_command
 from jumper_warp.utils.errors import InputError
-from jumper_warp.utils.output import output_dir, write_metrics
-from jumper_warp.utils.runtime import announce
+from jumper_warp.utils.output import write_metrics
 from support.departure_runs import JUMPS, KEPT, TESTS, WIDTH, Jump, measured, report, settings, trained
 from support.departures import DEPARTURES, Undone, flags_of
-from support.scripts import ThreadArgs
+from support.scripts import ThreadArgs, prepare
 
 
 @dataclass(frozen=True)
@@ -57,7 +56,6 @@ class Args(ThreadArgs):
     """Make the jumps after each training."""
 
     def __post_init__(self) -> None:
-        """Check the values."""
         unknown = set(self.only) - {KEPT, *DEPARTURES[self.task]}
         if unknown:
             raise InputError(f"departures of {self.task} are {', '.join(DEPARTURES[self.task])}, not {min(unknown)}")
@@ -88,8 +86,7 @@ def main(args: Args) -> dict[str, Any]:
     """Train and measure each, and return the metrics."""
     for name, seed, undone in args.trainings():  # a wrong flag is refused before any training
         settings(undone, args.command(undone, seed, Path(name)))
-    announce(args.device, args.threads)
-    folder, found, table = output_dir("departures", args.out), {}, None
+    folder, found, table = prepare("departures", args, args.threads), {}, None
     values: dict[str, Any] = {"task": args.task, "iterations": args.length, "envs": args.envs}
     for name, seed, undone in args.trainings():
         checkpoint = trained(undone, args.command(undone, seed, folder / f"{name}_{seed}"))

@@ -46,7 +46,6 @@ class Args:
     """Folder for metrics.json (default: outputs/dynamics_agreement/<time>)."""
 
     def __post_init__(self) -> None:
-        """Check the values."""
         if self.states < 1:
             raise InputError(f"states must be at least 1, got {self.states}")
 

@@ -45,7 +45,6 @@ class Args(EvaluationArgs):
     """[m] Lowest and highest that the policy which lands is told."""
 
     def __post_init__(self) -> None:
-        """Check the values."""
         super().__post_init__()
         if self.flights < 1 or not 0.0 <= self.late <= 100.0:
             raise InputError(f"need at least one flight, and late in 0 to 100 ms, got {self.flights}, {self.late}")

@@ -18,10 +18,8 @@ import tyro
 
 from jumper_warp.cli.main import run_command
 from jumper_warp.evaluation.plots import drawn
-from jumper_warp.utils.output import output_dir
-from jumper_warp.utils.runtime import announce
 from support.gradients import INNER, OUTER, TICKS, GradientJump, apex, check, schedule
-from support.scripts import DeviceArgs, report
+from support.scripts import DeviceArgs, prepare, report
 
 WEAK_PUSH = (20.0, 20.0)
 """[deg] The push-off that the ascent starts from."""
@@ -80,8 +78,7 @@ def plot(rollout: Any, actions: tuple[np.ndarray, np.ndarray], ascent: Ascent, p
 
 def main(args: DeviceArgs) -> dict:
     """Run the experiment and return its figures."""
-    announce(args.device)
-    folder = output_dir("gradient_check", args.out)
+    folder = prepare("gradient_check", args)
     start = time.perf_counter()
     rollout, checks = check(args.device)
     ascent = ascend(args.device)

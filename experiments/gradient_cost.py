@@ -40,7 +40,6 @@ class Args(DeviceArgs):
     """Whether to compute in double precision."""
 
     def __post_init__(self) -> None:
-        """Check the values."""
         if self.repeats < 1 or (self.worlds is not None and self.worlds < 1):
             raise InputError("worlds and repeats must be at least 1")
 

@@ -55,7 +55,6 @@ class Args:
     """CPU threads (default: all cores)."""
 
     def __post_init__(self) -> None:
-        """Check the values."""
         if self.seeds < 1 or self.others < 1 or self.jumps < 3:
             raise InputError(
                 f"need at least 1 seed, 1 other and 3 jumps, got {self.seeds}, {self.others}, {self.jumps}"

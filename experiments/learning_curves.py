@@ -25,10 +25,9 @@ from jumper_warp.cli.main import run_command
 from jumper_warp.registry import make_task, trainer_settings
 from jumper_warp.tasks.observations import with_history
 from jumper_warp.utils.errors import InputError
-from jumper_warp.utils.output import output_dir, write_metrics
-from jumper_warp.utils.runtime import announce
+from jumper_warp.utils.output import write_metrics
 from support.learning import TESTED, Curve, curve_metrics, draw_curves, timed_training
-from support.scripts import DeviceArgs
+from support.scripts import DeviceArgs, prepare
 from support.variants import DEFAULT, variant
 
 TASK = "vertical-jump"
@@ -58,7 +57,6 @@ class Args(DeviceArgs):
     """Train with randomisation and noise."""
 
     def __post_init__(self) -> None:
-        """Check the values."""
         for name in self.variants:
             variant(trainer_settings(TASK), name)
         if not self.variants or not self.seeds or min(self.seeds) < 0:
@@ -82,8 +80,7 @@ def train_in_process(args: Args, name: str, seed: int) -> Curve:
 
 def main(args: Args) -> dict[str, Any]:
     """Train every variant with every seed and return the metrics."""
-    announce(args.device)
-    folder = output_dir("learning_curves", args.out)
+    folder = prepare("learning_curves", args)
     values: dict[str, Any] = {"seconds": args.seconds, "envs": args.envs, "randomize": args.randomize}
     values |= {"seeds": list(args.seeds), "heights_m": list(args.heights), "history": args.history}
     curves: dict[str, list[Curve]] = {name: [] for name in args.variants}

@@ -26,9 +26,8 @@ from jumper_warp.robot.gravity import EARTH, MARS
 from jumper_warp.robot.motors import jumping_motors
 from jumper_warp.robot.overlay import with_springs
 from jumper_warp.utils.errors import InputError
-from jumper_warp.utils.output import output_dir, write_metrics
-from jumper_warp.utils.runtime import announce
-from support.scripts import DeviceArgs
+from jumper_warp.utils.output import write_metrics
+from support.scripts import DeviceArgs, prepare
 from support.spring_jumps import FILTERS, SpringJumps
 
 
@@ -52,7 +51,6 @@ class Args(DeviceArgs):
     """Motor command filter: that of the vertical jump, the loose one, or each in turn."""
 
     def __post_init__(self) -> None:
-        """Check the values."""
         if not self.stiffness or not self.squats:
             raise InputError("need at least one stiffness and one squat")
         for stiffness in self.stiffness:
@@ -68,8 +66,7 @@ class Args(DeviceArgs):
 def main(args: Args) -> dict:
     """Run the experiment and return its figures."""
     start = time.perf_counter()
-    announce(args.device)
-    folder = output_dir("leg_springs", args.out)
+    folder = prepare("leg_springs", args)
     values: dict[str, Any] = {"gravity_m_s2": args.gravity, "torque_limit_nm": args.torque, "kp_nm_rad": args.kp,
                               "spring_length_m": args.length, "stiffness_n_m": list(args.stiffness)}  # fmt: skip
     place = {EARTH: "Earth", MARS: "Mars"}.get(args.gravity, f"{args.gravity:g} m/s^2")

@@ -27,11 +27,10 @@ from jumper_warp.rl.ppo import Ppo
 from jumper_warp.rl.shac import Shac
 from jumper_warp.tasks.observations import with_history
 from jumper_warp.utils.errors import InputError
-from jumper_warp.utils.output import output_dir, write_metrics
-from jumper_warp.utils.runtime import announce
+from jumper_warp.utils.output import write_metrics
 from support.gradient_variance import variances
 from support.learning import Curve, curve_metrics, draw_curves, learning_curve, make_judge
-from support.scripts import DeviceArgs
+from support.scripts import DeviceArgs, prepare
 
 TASK = "vertical-jump"
 
@@ -104,8 +103,7 @@ def compare(args: Args, folder: Path) -> dict[str, Any]:
 
 def main(args: Args) -> dict[str, Any]:
     """Measure, train, draw, and return the figures."""
-    announce(args.device)
-    folder = output_dir("shac", args.out)
+    folder = prepare("shac", args)
     values = {"envs": args.envs, "window": args.window, "worlds": args.worlds}
     values |= variances(lambda: make_env(args, args.worlds), args.horizons, folder / "variance.png")
     values |= compare(args, folder) if args.seconds > 0.0 else {}

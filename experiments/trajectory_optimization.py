@@ -30,11 +30,10 @@ from rich.table import Table
 
 from jumper_warp.cli.main import run_command
 from jumper_warp.utils.errors import InputError
-from jumper_warp.utils.output import output_dir, write_metrics
-from jumper_warp.utils.runtime import announce
+from jumper_warp.utils.output import write_metrics
 from support.motion_replay import Replay, plot
 from support.optimized_jumps import FINE, JUMPS, LIMITED, around, optimise
-from support.scripts import ThreadArgs
+from support.scripts import ThreadArgs, prepare
 
 KNOWN = JUMPS | LIMITED
 
@@ -55,7 +54,6 @@ class Args(ThreadArgs):
     """Of random candidates and displacements."""
 
     def __post_init__(self) -> None:
-        """Check the values."""
         unknown = [name for name in self.jumps if name not in KNOWN]
         if unknown or not self.jumps:
             raise InputError(f"no jump {(unknown or [''])[0]!r:.40}; there are {', '.join(KNOWN)}")
@@ -84,9 +82,8 @@ def run_jump(name: str, args: Args, folder: Path, found: dict[str, np.ndarray]) 
 
 def main(args: Args) -> dict[str, Any]:
     """Optimise, and return the metrics."""
-    announce(args.device, args.threads)
     torch.set_num_threads(1)  # its arrays are small, and the worlds have the cores
-    folder, found = output_dir("trajectory_optimization", args.out), {}
+    folder, found = prepare("trajectory_optimization", args, args.threads), {}
     replays: dict[str, Replay] = {}
     values: dict[str, Any] = {}
     table = Table("jump", "reached", "violation", "simulated steps", "reverse steps", "processor [s]", "wall [s]")

@@ -59,7 +59,6 @@ class Args(EvaluationArgs):
     """Whether courses have blocks to jump onto; SolverMuJoCo has none."""
 
     def __post_init__(self) -> None:
-        """Check the values."""
         super().__post_init__()
         if not 1 <= self.robots <= 20_000:
             raise InputError(f"robots must be in 1 to 20000, got {self.robots}")

@@ -37,14 +37,12 @@ class Args(EvaluationArgs):
     """Flags."""
 
     policy: str = "walking_flat"
-    """Name or folder of a policy, a run's folder, or a checkpoint."""
     per_axis: int = 13
     """Commands along each axis of the grid; one robot for each of all three, and as many in the other tests."""
     record: int = 1
     """Number of robots to record for the Rerun viewer, redirected while they walk; 0: none."""
 
     def __post_init__(self) -> None:
-        """Check the values."""
         super().__post_init__()
         if self.per_axis < 2:
             raise InputError(f"per_axis must be at least 2, got {self.per_axis}")

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from jumper_warp.utils.output import write_metrics
+from jumper_warp.utils.output import output_dir, write_metrics
+from jumper_warp.utils.runtime import announce
 
 
 @dataclass(frozen=True)
@@ -26,6 +27,12 @@ class ThreadArgs(DeviceArgs):
 
     threads: int | None = None
     """CPU threads that share the worlds (default: all cores); they change no result."""
+
+
+def prepare(name: str, args: DeviceArgs, threads: int | None = None) -> Path:
+    """Take up device and threads, print them, and return the folder of a script's results."""
+    announce(args.device, threads)
+    return output_dir(name, args.out)
 
 
 def report(folder: Path, values: Mapping[str, Any]) -> None:

@@ -43,7 +43,6 @@ class SoakArgs(ThreadArgs):
     """Of actions, masses and friction."""
 
     def __post_init__(self) -> None:
-        """Check the values."""
         for name in ("envs", "steps", "hold", "episode"):
             if getattr(self, name) < 1:
                 raise InputError(f"{name} must be at least 1, got {getattr(self, name)}")

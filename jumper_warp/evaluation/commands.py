@@ -46,9 +46,7 @@ class EvaluateCfg(Generic[Flags]):
 def evaluate(run: EvaluationRun, cfg: EvaluateCfg) -> dict[str, Any]:
     """Evaluate, print a table, write `metrics.json` and the rows of the log as CSV, and return the figures.
 
-    Raises:
-        PolicyError: The policy cannot be used or cannot keep figures.
-        OSError: The folder cannot be made.
+    Raises PolicyError: the policy cannot be used or cannot keep figures; OSError: the folder cannot be made.
     """
     if cfg.keep and is_run(run.source):
         raise PolicyError(f"{run.source}: a run keeps no figures; export it first")
@@ -113,9 +111,7 @@ class PlayCfg(Generic[Flags]):
 def play(run: EvaluationRun, cfg: PlayCfg) -> Path:
     """Simulate, write a recording and `metrics.json`, print a table; return the path of the recording.
 
-    Raises:
-        PolicyError: The policy cannot be used.
-        OSError: The folder cannot be made.
+    Raises PolicyError: the policy cannot be used; OSError: the folder cannot be made.
     """
     flags, name = cfg.flags, run.policy.interface.task
     run.prepare("play", cfg.conditions, cfg.out)
@@ -154,10 +150,7 @@ class ScriptCfg:
 def play_script(cfg: ScriptCfg) -> Path:
     """Simulate, write a recording, a plot and `metrics.json`, print a table; return the path of the recording.
 
-    Raises:
-        InputError: The script cannot be used, or there is no such device.
-        PolicyError: A policy cannot be used.
-        OSError: The folder cannot be made.
+    Raises InputError: the script or device cannot be used; PolicyError: a policy; OSError: the folder.
     """
     script = read_script(cfg.script)
     run = SkillRun(cfg.policies)

@@ -81,17 +81,11 @@ class Film:
         notes: Mapping[str, Any] | None = None,
         motors: bool = False,
     ) -> None:
-        """Film worlds of the environment, together with the series of the log.
+        """Film worlds (at least one) of the environment, together with the series of the log.
 
-        Args:
-            env: What is filmed.
-            log: Follows its episodes.
-            worlds: Indices, at least one.
-            spacing: Distance [m] along y by which each world is drawn beside the one before it; 0 on a heightfield.
-            ground: What is drawn below, as in `build_model`.
-            block: The environment's sliding blocks, if it has any.
-            notes: Saved along; must be JSON.
-            motors: Whether to add torques and actions of the first world.
+        spacing: [m] along y, by which each world is drawn beside the one before it; 0 on a heightfield. ground: as in
+        `build_model`; block: the environment's sliding blocks, if it has any; notes: saved along, must be JSON;
+        motors: whether to add torques and actions of the first world.
         """
         from jumper_warp.viz.recorder import Recorder
 

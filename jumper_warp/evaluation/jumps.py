@@ -78,16 +78,10 @@ class JumpLog(EvaluationLog):
     ) -> None:
         """Begin with no jump ended.
 
-        Args:
-            goals: [m] (num_envs, jumps in a row, 2) landing places ahead and to the left, or 3: with the base height at
-                the apex, 0 if any will do.
-            terminations: Names of the ends of an episode, SUCCESS among them.
-            headings: [rad] (num_envs,) or one for all.
-            delay: [s] Until the first jump is commanded; (num_envs,) or one for all.
-            rest: [s] From touchdown until the jump is over, and the next one commanded.
-
-        Raises:
-            InputError: Goals have another shape, or SUCCESS is not there.
+        goals: [m] (num_envs, jumps in a row, 2) landing places ahead and to the left, or 3: with the base height at the
+        apex, 0 if any will do; terminations: names of the ends of an episode, SUCCESS among them; headings: [rad]
+        (num_envs,) or one for all; delay: [s] until the first jump is commanded, likewise; rest: [s] from touchdown
+        until the jump is over, and the next one commanded. Raises InputError: another shape, or no SUCCESS.
         """
         goals = np.asarray(goals, dtype=float)
         if goals.ndim != 3 or goals.shape[2] not in (2, 3):

@@ -95,15 +95,10 @@ def run_evaluation(
     watch: Callable[[], object] | None = None,
     stop: bool = True,
 ) -> None:
-    """Let every world do what the log asks, until everything has ended.
+    """Run one episode a world as the log commands, until all have ended.
 
-    Args:
-        act: Observations (num_envs, num_obs) to actions, such as `Policy.act`.
-        env: One world a row of the log.
-        log: What is asked for, and what becomes of it.
-        seconds: Simulated time at most (default: the log's).
-        watch: Called after every policy step.
-        stop: Whether to stop when everything has ended, instead of at the end of the time.
+    act: observations (num_envs, num_obs) to actions, such as `Policy.act`; seconds: simulated time at most (default:
+    the log's); watch: called after every policy step; stop: False to continue to the end of the time.
     """
     log.begin(env)
     for _ in range(round((log.seconds if seconds is None else seconds) / env.step_dt)):

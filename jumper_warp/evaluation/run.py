@@ -56,7 +56,6 @@ class EvaluationArgs(Conditions):
     """Folder for figures, plots, recordings and filmstrips (default: outputs/<name>/<time>)."""
 
     def __post_init__(self) -> None:
-        """Check the values."""
         super().__post_init__()
         if self.record < 0:
             raise InputError(f"record must not be negative, got {self.record}")
@@ -132,14 +131,10 @@ class Run(ABC):
         drawn: Mapping[str, Any] | None = None,
         watch: Callable[[Log], None] | None = None,
     ) -> Log:
-        """Let every world do what a log asks, and return the log.
+        """Run one episode a world as a log commands, and return the log.
 
-        Args:
-            env: Of `env`.
-            log: One row a world.
-            film: Name of the recording and filmstrip of some of the worlds; no film without.
-            drawn: The environment's `ground` and `block`, if they are to be seen in the film.
-            watch: Called with the log after every policy step.
+        film: name of the recording and filmstrip of some of the worlds; no film without. drawn: the environment's
+        `ground` and `block`, if the film shows them. watch: called with the log after every policy step.
         """
         pictures = self._film(env, log, drawn or {}) if film and self.record else None
 
@@ -188,13 +183,8 @@ class EvaluationRun(Run):
     def __init__(self, source: str | Path, modules: Iterable[ModuleType] = ()) -> None:
         """Open a policy; call `prepare` before anything else.
 
-        Args:
-            source: Name or folder of a policy, a run's folder, or a checkpoint.
-            modules: That the user has named, for tasks that are not the project's.
-
-        Raises:
-            PolicyError: The policy cannot be used, or nothing is known of how it is evaluated.
-            CheckpointError: The checkpoint cannot be used.
+        source: name or folder of a policy, a run's folder, or a checkpoint; modules: that the user has named, for tasks
+        that are not the project's. Raises PolicyError, also for an unknown evaluation, or CheckpointError.
         """
         super().__init__()
         self.source, self.modules = source, list(modules)
@@ -212,16 +202,8 @@ class EvaluationRun(Run):
     ) -> EvaluationRun:
         """Return the run of an experiment, prepared.
 
-        Args:
-            name: Of the experiment and its folder.
-            args: Flags.
-            evaluations: Keys of `EVALUATIONS`, one of which the policy must have.
-            modules: That the user has named.
-
-        Raises:
-            PolicyError: The policy cannot be used, or is evaluated otherwise.
-            CheckpointError: The checkpoint cannot be used.
-            InputError: There is no such device.
+        evaluations: keys of `EVALUATIONS`, one of which the policy must have, else PolicyError; modules: that the user
+        has named. Raises as the constructor and `prepare`.
         """
         run = cls(args.policy, modules)
         if run.task.evaluation not in evaluations:
@@ -244,16 +226,10 @@ class EvaluationRun(Run):
         conditions: Conditions | None = None,
         **scene: Any,
     ) -> Env:
-        """Return the policy's environment.
+        """Return the policy's environment of `count` worlds. Raises PolicyError as `env_of_policy`.
 
-        Args:
-            count: Number of worlds.
-            change: Returns the task with the terminations that count (default: as its evaluation says).
-            conditions: Other ones than the run's.
-            scene: More settings of `Env`.
-
-        Raises:
-            PolicyError: As `env_of_policy`.
+        change: returns the task with the terminations that count (default: as its evaluation says); conditions: other
+        ones than the run's; scene: more settings of `Env`.
         """
         change, conditions = change or self.evaluation.for_evaluation, conditions or self.conditions
         env = env_of_policy(self.policy, count, conditions, change=change, modules=self.modules, **scene)
@@ -267,7 +243,7 @@ class SkillRun(Run):
     """Opens the policies of one robot, follows it as often as wanted, and reports."""
 
     def __init__(self, names: SkillNames | None = None) -> None:
-        """Open policies; call `prepare` before anything else. Raises PolicyError or CheckpointError: see there."""
+        """Open policies; call `prepare` before anything else. Raises PolicyError or CheckpointError."""
         super().__init__()
         self.skills = SkillPolicies(names)
 

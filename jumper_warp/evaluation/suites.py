@@ -79,7 +79,6 @@ class Grid(Suite):
     paper: ClassVar = {"mean_error_m": 0.025, "success_rate": 0.968, "success_rate_in_range": 1.0}
 
     def __post_init__(self) -> None:
-        """Check the values."""
         super().__post_init__()
         check(min(self.columns, self.rows) >= 1, f"need at least one column and row, got {self.columns}, {self.rows}")
 
@@ -109,7 +108,6 @@ class Ring(Suite):
     least: ClassVar = (len(SECTORS), 0.1)
 
     def __post_init__(self) -> None:
-        """Check the values."""
         super().__post_init__()
         check(0.0 < self.radius < 3.0, f"radius must be in (0, 3) m, got {self.radius}")
 
@@ -151,7 +149,6 @@ class Consecutive(Suite):
     paper: ClassVar = {"mean_error_m": 0.0054}
 
     def __post_init__(self) -> None:
-        """Check the values."""
         super().__post_init__()
         check(min(self.trials, self.row) >= 1, f"need at least one trial and row, got {self.trials}, {self.row}")
 
@@ -210,7 +207,6 @@ class Platform(Suite):
     name: ClassVar = "platform"
 
     def __post_init__(self) -> None:
-        """Check the values."""
         super().__post_init__()
         low, high = 0.3, GROUND_LOWER[0]
         check(low <= self.edge < high, f"edge must be from {low} m to below {high} m, got {self.edge}")
@@ -273,7 +269,6 @@ class Farthest(Suite):
     paper: ClassVar = {"hop_free_distance_m": 1.25}
 
     def __post_init__(self) -> None:
-        """Check the values."""
         super().__post_init__()
         good, limits = 0.1 <= self.first <= self.last <= LIMIT, f"0.1 <= first <= last <= {LIMIT:g} m"
         check(good, f"need {limits}, got {self.first} and {self.last}")
