@@ -17,8 +17,7 @@ from jumper_warp.cli.main import run_command
 from jumper_warp.robot.description import load_description
 from jumper_warp.utils.output import output_dir
 from jumper_warp.utils.runtime import announce
-from support.inverse_kinematics import InverseKinematics
-from support.poses import random_motors
+from support.inverse_kinematics import InverseKinematics, random_motors
 from support.scripts import DeviceArgs, report
 from support.timing import median_time
 

@@ -94,7 +94,7 @@ def main(args: Args) -> dict[str, Any]:
         values |= {f"{name}_{key}": value for key, value in replay.metrics().items()}
         if name == "still":
             values |= {"still_longest_lift_s": replay.longest_lift, "still_highest_lift_m": replay.highest_lift}
-        replay.save_rrd(folder / f"{name}.rrd")
+        replay.recorder.save_rrd(folder / f"{name}.rrd")
         replay.save_strip(folder / f"{name}_strip.png")
         write_metrics(folder, values)
         table.add_row(

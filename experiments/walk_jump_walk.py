@@ -25,6 +25,7 @@ from jumper_warp.evaluation.run import EvaluationArgs, SkillRun
 from jumper_warp.evaluation.scripts import ScriptStep
 from jumper_warp.policies.skills import SkillNames
 from jumper_warp.utils.errors import InputError
+from support.walks import PAPER
 
 REACH, EACH = 0.8, 2.0
 """[m/s] and [rad/s] of the commands; [s] from one to the next."""
@@ -37,8 +38,6 @@ COMMANDS = 10
 JUMPS = ("jump_up", "jump_to", "jump_onto")
 PROBABILITIES = (0.35, 0.2, 0.15, 0.15, 0.15)
 """Of walking, turning and each of the jumps."""
-PAPER = {"rmse_vx_m_s": 0.17, "rmse_vy_m_s": 0.05, "rmse_yaw_rate_rad_s": 0.12}
-"""The paper's figures, one test on the robot."""
 
 
 @dataclass(frozen=True)

@@ -24,12 +24,10 @@ from jumper_warp.evaluation.run import EvaluationArgs, EvaluationRun
 from jumper_warp.evaluation.velocities import AXES, Walks, check_walks, grid, tracking_metrics
 from jumper_warp.utils.errors import InputError
 from support.gaits import Gait
-from support.walks import HOLD, REACH, STEP, kicked, redirected, settling_times, sped_up, speed_metrics
+from support.walks import HOLD, PAPER, REACH, STEP, kicked, redirected, settling_times, sped_up, speed_metrics
 
 GAIT_SPEED = 0.8
 """[m/s] Of the straight walk whose gait is measured."""
-PAPER = {"rmse_vx_m_s": 0.17, "rmse_vy_m_s": 0.05, "rmse_yaw_rate_rad_s": 0.12}
-"""The paper's figures, on hardware, with commands up to 0.8 that a person gave."""
 
 
 @dataclass(frozen=True)

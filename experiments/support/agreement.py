@@ -17,7 +17,7 @@ from jumper_warp.robot.pinocchio_model import build_pinocchio
 from jumper_warp.robot.values import RobotValues
 from jumper_warp.sim.dynamics import JumperDynamics
 from jumper_warp.sim.overlay import MOTOR_DOFS, write_model
-from support.poses import random_motors
+from support.inverse_kinematics import random_motors
 
 MARGIN = 0.35
 """[rad] From the stops: a stretched leg is singular."""

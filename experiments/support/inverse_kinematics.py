@@ -1,4 +1,4 @@
-"""Poses of many robots from the places of their paws, in one launch. The kernels are imported: they have no facade."""
+"""Random poses, and poses of many robots from the places of their paws; the kernels are imported: no facade."""
 
 from __future__ import annotations
 
@@ -11,6 +11,17 @@ from jumper_warp.kernels.kinematics import geometry
 from jumper_warp.kernels.kinematics.inverse import LegLimits, inverse_kinematics_kernel, paws_kernel
 from jumper_warp.robot.description import MOTOR_JOINTS, RobotDescription
 from jumper_warp.robot.model import leg_geometry_array
+
+
+def random_motors(description: RobotDescription, n: int, rng: np.random.Generator, margin: float = 0.0) -> np.ndarray:
+    """Return motor angles [rad], shape (12, n), uniform between the stops, a margin [rad] away from them."""
+    lateral, outer = (description.joint(name) for name in MOTOR_JOINTS[:2])
+    least, most = (outer.lower + margin, outer.upper - margin)
+    swing = rng.uniform(lateral.lower + margin, lateral.upper - margin, (4, 1, n))
+    first = rng.uniform(least, most, (4, 1, n))
+    lowest = np.maximum(least, description.transversal_sum[0] + margin - first)
+    highest = np.minimum(most, description.transversal_sum[1] - margin - first)
+    return np.concatenate([swing, first, rng.uniform(lowest, highest)], axis=1).reshape(12, n)
 
 
 def leg_limits(description: RobotDescription) -> Any:

@@ -52,7 +52,6 @@ def make_judge(task: TaskCfg, jumps: int, device: str | None) -> Env:
 
 def success(ppo: Ppo | Shac, judge: Env, heights: tuple[float, float] = TESTED) -> float:
     """Return the share of jumps to heights [m] from the first to the second that succeed, one a world."""
-
     return float(run_jumps(ppo.model.act, judge, np.linspace(*heights, judge.num_envs)).success.mean())
 
 

@@ -87,20 +87,26 @@ def print_figures(figures: dict[str, Any]) -> None:
     Console().print(table)
 
 
+@dataclass(frozen=True, kw_only=True)
+class RecordingCfg:
+    """How something is recorded."""
+
+    conditions: Annotated[Conditions, tyro.conf.arg(name="")] = field(default_factory=Conditions)
+    """What the policies are tried in."""
+    out: Path | None = None
+    """Folder for the recording, metrics.json and plots (default: outputs/play/<time>)."""
+    viewer: Literal["none", "rerun"] = "none"
+    """Open the recording in Rerun's viewer, which then listens on this machine's loopback address only."""
+
+
 @dataclass(frozen=True)
-class PlayCfg(Generic[Flags]):
+class PlayCfg(RecordingCfg, Generic[Flags]):
     """Let a policy act, and record it."""
 
     flags: Annotated[Flags, tyro.conf.arg(name="")]
     """`jumper_warp.evaluation.registry.PlayFlags`"""
     seconds: float | None = None
     """[s] Length of the recording (default: for jumps 3.5, and 2.5 for each further one; else 10)."""
-    conditions: Annotated[Conditions, tyro.conf.arg(name="")] = field(default_factory=Conditions)
-    """What the policy is tried in."""
-    out: Path | None = None
-    """Folder for the recording and metrics.json (default: outputs/play/<time>)."""
-    viewer: Literal["none", "rerun"] = "none"
-    """Open the recording in Rerun's viewer, which then listens on this machine's loopback address only."""
 
     def __post_init__(self) -> None:
         """Raises InputError: a setting is out of range."""
@@ -119,7 +125,7 @@ def play(run: EvaluationRun, cfg: PlayCfg) -> Path:
     env, worlds = run.env(log.count), range(log.count)
     notes = {"task": name, **log.notes(worlds), "solver": cfg.conditions.solver}
     film = Film(env, log, worlds, spacing=log.spacing, notes=notes, motors=True)
-    run_evaluation(run.policy.act, env, log, seconds=cfg.seconds or flags.seconds, watch=film, stop=False)
+    run_evaluation(run.policy.act, env, log, seconds=cfg.seconds or flags.length, watch=film, stop=False)
     path = film.save_rrd(run.folder / f"{log.row}.rrd", log.marks(worlds))
     write_metrics(run.folder, log.columns())
     print_rows(log)
@@ -127,7 +133,7 @@ def play(run: EvaluationRun, cfg: PlayCfg) -> Path:
 
 
 @dataclass(frozen=True)
-class ScriptCfg:
+class ScriptCfg(RecordingCfg):
     """Let one robot walk and jump with several policies, as a script says, and record it.
 
     A script is a JSON list of {"walk": [vx, vy, yaw_rate], "seconds": s}, {"stand": s}, {"jump_up": height},
@@ -139,12 +145,6 @@ class ScriptCfg:
     """File with the commands."""
     policies: Annotated[SkillNames, tyro.conf.arg(name="")] = field(default_factory=SkillNames)
     """Who carries them out."""
-    conditions: Annotated[Conditions, tyro.conf.arg(name="")] = field(default_factory=Conditions)
-    """What the policies are tried in."""
-    out: Path | None = None
-    """Folder for the recording, a plot and metrics.json (default: outputs/play/<time>)."""
-    viewer: Literal["none", "rerun"] = "none"
-    """Open the recording in Rerun's viewer, which then listens on this machine's loopback address only."""
 
 
 def play_script(cfg: ScriptCfg) -> Path:

@@ -170,12 +170,12 @@ class EpisodeGoals:
     command: tuple[float, ...] = ()
     """Up to four numbers, as the task's command takes them; those left out are 0."""
 
-    seconds = 10.0
+    length = 10.0
 
     def __post_init__(self) -> None:
         """Raises InputError: a setting is out of range."""
-        check_episodes(1, self.command, self.seconds)
+        check_episodes(1, self.command, self.length)
 
     def log(self, task: TaskCfg) -> Episodes:
         """Return one robot's episode."""
-        return Episodes(filled(self.command, 1, task), task, self.seconds)
+        return Episodes(filled(self.command, 1, task), task, self.length)

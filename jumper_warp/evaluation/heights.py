@@ -241,11 +241,6 @@ class HeightGoals:
         if not 1 <= len(self.height) <= MAX_ROBOTS or not all(0.0 < height < 10.0 for height in self.height):
             raise InputError(f"height takes 1 to {MAX_ROBOTS} numbers in (0, 10) m, got {self.height}")
 
-    @property
-    def seconds(self) -> float:
-        """[s] Length of the recording."""
-        return self.length
-
     def log(self, task: TaskCfg) -> HeightLog:
         """Return one jump a robot."""
         return HeightLog(np.array(self.height), termination_names(task))

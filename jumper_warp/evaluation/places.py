@@ -268,8 +268,8 @@ class PlaceGoals:
         return self.goal or self.unless_told
 
     @property
-    def seconds(self) -> float:
-        """[s] Length of the recording."""
+    def length(self) -> float:
+        """[s] Of the recording."""
         return SECONDS + SECONDS_MORE * len(self.then)
 
     def log(self, task: TaskCfg) -> PlaceLog:

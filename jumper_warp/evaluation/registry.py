@@ -33,8 +33,8 @@ class PlayFlags(Protocol):
     """A frozen dataclass: flags of `jumper play`."""
 
     @property
-    def seconds(self) -> float:
-        """[s] Length of the recording."""
+    def length(self) -> float:
+        """[s] Of the recording."""
         ...
 
     def log(self, task: TaskCfg) -> EvaluationLog:

@@ -316,7 +316,7 @@ def distance_metrics(bins: dict[float, PlaceLog]) -> dict[str, Any]:
     """Return the metrics over all bins (middle [m] to jumps), and lists with an entry a bin."""
     each = [landing_metrics(landings) for landings in bins.values()]
     lists: dict[str, list[Any]] = {name: [values[name] for values in each] for name in EACH}
-    flown = [base_at_touchdown(landings) for landings in bins.values()]
+    flown = [mean(np.linalg.norm(log.touchdown[log.success], axis=-1)) for log in bins.values()]
     landed = [landings.landing[landings.success][:, 0] for landings in bins.values()]
     inside = [landings.success[within(landings.places[..., 0], IN_RANGE)] for landings in bins.values()]
     values: dict[str, Any] = {
@@ -334,11 +334,6 @@ def distance_metrics(bins: dict[float, PlaceLog]) -> dict[str, Any]:
     values["farthest_success_m"] = largest(np.concatenate(landed))
     values |= {"bin_m": list(bins), "bin_base_at_touchdown_m": flown}
     return values | {f"bin_{name}": column for name, column in lists.items()}
-
-
-def base_at_touchdown(landings: PlaceLog) -> float | None:
-    """Return the mean distance [m] of the base from its start when the first paw comes down, over the successes."""
-    return mean(np.linalg.norm(landings.touchdown[landings.success], axis=-1))
 
 
 SUITES: tuple[type[Suite], ...] = (HeightSweep, DistanceSweep, Grid, Ring, Consecutive, Platform, Farthest)

@@ -227,7 +227,7 @@ class TurnGoals:
     angle: float = 90.0
     """[deg] Of every turn."""
 
-    seconds = 4.0
+    length = 4.0
 
     def __post_init__(self) -> None:
         """Raises InputError: the angle is out of range."""
@@ -236,4 +236,4 @@ class TurnGoals:
 
     def log(self, task: TaskCfg) -> Turns:
         """Return one turn a robot."""
-        return Turns(turns_about_axes(len(DIRECTIONS), self.angle), seconds=self.seconds)
+        return Turns(turns_about_axes(len(DIRECTIONS), self.angle), seconds=self.length)

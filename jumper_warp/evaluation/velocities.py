@@ -241,7 +241,7 @@ class VelocityGoals:
 
     def __post_init__(self) -> None:
         """Raises InputError: a setting is out of range."""
-        check_walks(1, self.seconds, *(value for command in self.velocity for value in command))
+        check_walks(1, self.length, *(value for command in self.velocity for value in command))
 
     @property
     def velocities(self) -> tuple[Velocity, ...]:
@@ -249,14 +249,14 @@ class VelocityGoals:
         return self.velocity or self.unless_told
 
     @property
-    def seconds(self) -> float:
-        """[s] Length of the recording."""
+    def length(self) -> float:
+        """[s] Of the recording."""
         return self.each * len(self.velocities)
 
     def log(self, task: TaskCfg) -> Walks:
         """Return one robot's walk."""
         commands = np.array(self.velocities, dtype=float)[None]
-        return Walks(commands, task, self.seconds, times=self.each * np.arange(commands.shape[1]))
+        return Walks(commands, task, self.length, times=self.each * np.arange(commands.shape[1]))
 
 
 def check_walks(robots: int, seconds: float, *commands: float) -> None:
