@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -206,7 +206,7 @@ def sweep_metrics(jumps: HeightLog, in_range: tuple[float, float]) -> Metrics:
 class HeightFlags(JumpFlags):
     """Jumps to evenly spaced heights."""
 
-    in_range: tuple[float, float] = (0.5, 1.1)
+    in_range: tuple[float, float] = field(default=(0.5, 1.1), kw_only=True)
     lower: float = 0.5
     """[m] Lowest commanded base height."""
     upper: float = 1.2

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -238,7 +238,7 @@ class JumpFlags:
 
     jumps: int = 200
     """Number of jumps."""
-    in_range: tuple[float, float] = (0.3, 1.4)
+    in_range: tuple[float, float] = field(default=(0.3, 1.4), kw_only=True)
     """[m] Distances or heights that the success rate in range counts."""
 
     def __post_init__(self) -> None:

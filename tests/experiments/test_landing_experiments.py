@@ -271,7 +271,7 @@ def test_second_hop_is_measured_from_where_the_first_one_ended(hops):
     ],
 )
 def test_suite_leaves_metrics_plot_and_recording(suite, settings, files, policy, tmp_path):
-    values = suite(policy, record=1, out=tmp_path, device="cpu", **settings).run()
+    values = suite(policy=policy, record=1, out=tmp_path, device="cpu", **settings).run()
     saved = json.loads((tmp_path / "metrics.json").read_text())
     assert saved == values and saved.keys() >= SHARED
     assert (saved["success_rate"], saved["torque_limit_nm"]) == (0.0, 18.0)
@@ -289,7 +289,7 @@ def test_numbers_of_the_paper_stand_beside_those_of_a_policy(policy, tmp_path, m
 
 
 def test_randomised_robot_that_stands_still_is_off_by_the_whole_way(policy, tmp_path):
-    values = DistanceSweep(policy, jumps=4, record=0, randomize=True, out=tmp_path, device="cpu").run()
+    values = DistanceSweep(policy=policy, jumps=4, record=0, randomize=True, out=tmp_path, device="cpu").run()
     assert values["mean_error_m"] == pytest.approx(0.9, abs=0.05)
     assert values["randomize"] and values["landing_rate"] == 0.0
     assert (values["trained_lower_m"], values["trained_upper_m"]) == (0.2, 2.2)

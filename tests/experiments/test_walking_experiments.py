@@ -42,8 +42,9 @@ def test_robots_that_stand_still_follow_nothing(policies, tmp_path):
 
 def test_robots_that_stand_still_come_nowhere_on_any_ground(policies, tmp_path):
     args = walking_terrain.Args(
-        str(policies / "velocity-flat"), robots=3, terrains=("flat", "stairs"), record=1, out=tmp_path, device="cpu"
-    )
+        policy=str(policies / "velocity-flat"), robots=3, terrains=("flat", "stairs"), record=1, out=tmp_path,
+        device="cpu",
+    )  # fmt: skip
     figures = walking_terrain.main(args)
     assert figures["success_rate_flat"] < 0.02 and figures["success_rate_stairs"] < 0.02
     assert figures["fall_rate_flat"] == 0.0 and (tmp_path / "terrain.png").is_file()
