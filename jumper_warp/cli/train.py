@@ -139,9 +139,15 @@ def env_maker(task: TaskCfg, args: TrainArgs) -> MakeEnv:
     def make(num_envs: int, seed: int, device: torch.device) -> VecEnv:
         check_memory(task, args.cfg.ppo, args.solver, num_envs, device)
         env = Env(
-            task, num_envs, seed=seed, device=str(device), solver=args.solver, randomize=args.randomize,
-            noise=args.noise, robot=overlay,
-        )  # fmt: skip
+            task,
+            num_envs,
+            seed=seed,
+            device=str(device),
+            solver=args.solver,
+            randomize=args.randomize,
+            noise=args.noise,
+            robot=overlay,
+        )
         if args.cfg.trainer != "shac":
             return env
         from jumper_warp.diff.differentiable_env import DifferentiableEnv
@@ -178,14 +184,6 @@ def check_saving(task: TaskCfg) -> None:
         raise InputError(f"{task.name} would not come back as it is from what is saved with its policies")
 
 
-def check_symmetry(task: TaskCfg, cfg: TrainCfg) -> None:
-    """Raise InputError if symmetry is asked for and the mirror image of what the policy sees is not known."""
-    from jumper_warp.tasks.mirror import mirror_of
-
-    if cfg.ppo.symmetry != "off":
-        mirror_of(task, "policy")
-
-
 def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> TrainResult:
     """Train as the arguments say; modules: that the user has named, whose tasks are registered by now.
 
@@ -193,10 +191,12 @@ def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> TrainResult:
     """
     parsed, task = parse_train(args)
     from jumper_warp.rl.runner import train
+    from jumper_warp.tasks.mirror import mirror_of
     from jumper_warp.utils.runtime import announce
 
     check_saving(task)
-    check_symmetry(task, parsed.cfg)
+    if parsed.cfg.ppo.symmetry != "off":
+        mirror_of(task, "policy")  # raises InputError where a term has no known mirror image
     start = None
     if parsed.cfg.start_from and not parsed.checkpoint:
         from jumper_warp.policies.warm_start import start_from

@@ -67,12 +67,25 @@ class Env(Stages):
     """
 
     def __init__(
-        self, task: TaskCfg | Sequence[TaskCfg], num_envs: int, *, seed: int = 0,
-        device: str | torch.device | None = None, solver: SolverName = "jumper", randomize: bool = True,
-        noise: bool = True, auto_reset: bool = True, visuals: bool = False, ground: Any = "plane",
-        block: BlockCfg | None = None, skill: np.ndarray | int = 0, handovers: Sequence[Handover] = (),
-        robot: RobotOverlay | None = None, threads: int | None = None, refine: int = 1,
-    ) -> None:  # fmt: skip
+        self,
+        task: TaskCfg | Sequence[TaskCfg],
+        num_envs: int,
+        *,
+        seed: int = 0,
+        device: str | torch.device | None = None,
+        solver: SolverName = "jumper",
+        randomize: bool = True,
+        noise: bool = True,
+        auto_reset: bool = True,
+        visuals: bool = False,
+        ground: Any = "plane",
+        block: BlockCfg | None = None,
+        skill: np.ndarray | int = 0,
+        handovers: Sequence[Handover] = (),
+        robot: RobotOverlay | None = None,
+        threads: int | None = None,
+        refine: int = 1,
+    ):
         """Build everything; call `reset` before the first step.
 
         ground, block: as in `Simulation`; by default the terrain of the first task that has one, or what tasks draw, if
@@ -133,29 +146,19 @@ class Env(Stages):
         new commands where they are due. After `evaluation_reset` episodes end again when all worlds have begun anew.
         Raises ValueError: not a seed, not worlds, or both. RuntimeError: worlds before the first reset of all.
         """
-        if worlds is not None:
-            return self._reset_some(checked_worlds(worlds, self.num_envs), seed)
+        chosen = self._all if worlds is None else self._array(checked_worlds(worlds, self.num_envs))
+        if worlds is not None and seed is not None:
+            raise InputError("a seed is for all worlds: reset(seed), or reset(worlds=...) without one")
+        if worlds is not None and not self._started:
+            raise RuntimeError("call reset of all worlds before the first of some")
         if seed is not None:
             check_seed(seed)
             self._start_over(seed)
-        self._ends_episodes = True
-        self.compile()
-        self._tick(self._all)
-        self._begin(self._part(), self._all)
-        self._observe(self._part(), beginning=0)
-        return self._step.obs, {}
-
-    def _reset_some(self, mask: np.ndarray, seed: int | None) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
-        """Begin new episodes where mask is not 0."""
-        if seed is not None:
-            raise InputError("a seed is for all worlds: reset(seed), or reset(worlds=...) without one")
-        if not self._started:
-            raise RuntimeError("call reset of all worlds before the first of some")
+        self._ends_episodes = self._ends_episodes or worlds is None
         self.compile()  # an evaluation compiles no draws
-        chosen = self._array(mask)
         self._tick(chosen)
         self._begin(self._part(), chosen)
-        self._observe(self._part(), beginning=1)
+        self._observe(self._part(), beginning=int(worlds is not None))
         return self._step.obs, {}
 
     def compile(self) -> None:

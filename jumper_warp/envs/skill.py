@@ -10,6 +10,7 @@ import numpy as np
 import torch
 import warp as wp
 
+from jumper_warp.envs.arrays import fill
 from jumper_warp.kernels.mdp.env import RING, Counters, Nothing, SkillSettings
 from jumper_warp.kernels.mdp.events import make_event_kernel
 from jumper_warp.kernels.mdp.observe import CHUNK, ObservationArrays, make_observe_kernel
@@ -45,11 +46,10 @@ class Skill:
 
     def _counters(self) -> Any:
         n, task, counters = self.num_envs, self.task, Counters()
-        counters.term_sum = wp.zeros((max(len(task.rewards), 1), n), dtype=wp.float64, device=self.device)
-        counters.ending_count = wp.zeros((len(task.terminations), n), dtype=int, device=self.device)
-        for name in ("counted", "succeeded", "bad_actions", "error_sum"):
-            kind = wp.float64 if name == "error_sum" else int
-            setattr(counters, name, wp.zeros(n, dtype=kind, device=self.device))
+        fill(counters, ("term_sum",), (max(len(task.rewards), 1), n), wp.float64, self.device)
+        fill(counters, ("ending_count",), (len(task.terminations), n), int, self.device)
+        fill(counters, ("counted", "succeeded", "bad_actions"), n, int, self.device)
+        fill(counters, ("error_sum",), n, wp.float64, self.device)
         return counters
 
     def _structs(self, values: list, kind: Any = None) -> wp.array:
@@ -74,9 +74,9 @@ class Skill:
         self.columns = wp.array(np.array(columns, dtype=np.int32).T, dtype=int, device=self.device)
         self.num_chunks = -(-sum(len(task.rows[group]) for group in task.groups) // CHUNK)
         arrays = ObservationArrays()
-        shapes = {"raw": (len(columns), n), "now": start, "final": start, "past": (RING, n, max(past, 1))}
-        for name, shape in shapes.items():
-            setattr(arrays, name, wp.zeros(shape, dtype=float, device=self.device))
+        fill(arrays, ("raw",), (len(columns), n), float, self.device)
+        fill(arrays, ("now", "final"), start, float, self.device)
+        fill(arrays, ("past",), (RING, n, max(past, 1)), float, self.device)
         arrays.latency = wp.zeros(n, dtype=int, device=self.device)
         arrays.substeps = substeps
         self.observations = arrays

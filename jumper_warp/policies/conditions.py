@@ -9,8 +9,7 @@ from types import ModuleType
 from typing import TYPE_CHECKING, Any, Literal
 
 from jumper_warp.policies.policy import Policy
-from jumper_warp.policies.restore import restored_task
-from jumper_warp.policies.spec import PolicyError
+from jumper_warp.policies.restore import task_of_policy
 from jumper_warp.robot.gravity import check_gravity
 from jumper_warp.robot.model import PHYSICS_DT
 from jumper_warp.robot.overlay import RobotOverlay, load_overlay
@@ -107,9 +106,14 @@ class Conditions:
 
 
 def env_of_policy(
-    policy: Policy, num_envs: int, conditions: Conditions, *, change: Callable[[TaskCfg], TaskCfg] | None = None,
-    modules: Iterable[ModuleType] = (), **scene: Any,
-) -> Env:  # fmt: skip
+    policy: Policy,
+    num_envs: int,
+    conditions: Conditions,
+    *,
+    change: Callable[[TaskCfg], TaskCfg] | None = None,
+    modules: Iterable[ModuleType] = (),
+    **scene: Any,
+) -> Env:
     """Return the environment that a policy was trained in, with other conditions.
 
     Without rewards, without what the critic sees, and unless randomised without events: so their functions need not be
@@ -122,11 +126,16 @@ def env_of_policy(
     from jumper_warp.envs.env import Env
 
     leave_out = [section for section in OPTIONAL if section != "events" or not conditions.randomize]
-    task = restored_task(policy.config, modules, leave_out=leave_out)
-    if task.observation_names != policy.interface.observation_names:
-        raise PolicyError("the policy's observation is not the one that this version of its task gives")
+    task = task_of_policy(policy, modules, leave_out=leave_out)
     return Env(
-        conditions.applied(task if change is None else change(task)), num_envs, seed=conditions.seed,
-        device=conditions.device, solver=conditions.solver, randomize=conditions.draws, noise=conditions.noise,
-        auto_reset=False, robot=conditions.overlay(policy.config), **scene,
-    )  # fmt: skip
+        conditions.applied(task if change is None else change(task)),
+        num_envs,
+        seed=conditions.seed,
+        device=conditions.device,
+        solver=conditions.solver,
+        randomize=conditions.draws,
+        noise=conditions.noise,
+        auto_reset=False,
+        robot=conditions.overlay(policy.config),
+        **scene,
+    )

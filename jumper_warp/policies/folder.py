@@ -44,9 +44,13 @@ NO_FOLDERS = (".pt", ".pth", ".onnx", ".safetensors")
 
 
 def save_policy(
-    folder: Path, policy: Policy, *, readme: str | None = None, files: Mapping[str, bytes] | None = None,
+    folder: Path,
+    policy: Policy,
+    *,
+    readme: str | None = None,
+    files: Mapping[str, bytes] | None = None,
     overwrite: bool = False,
-) -> Path:  # fmt: skip
+) -> Path:
     """Write a policy's folder, whole or not at all; return its path.
 
     Commit and versions are added to the policy's configuration unless it brings its own. readme: text of `README.md`,

@@ -25,9 +25,13 @@ class Policy(nn.Module):
     std: torch.Tensor
 
     def __init__(
-        self, layers: Weights, mean: torch.Tensor, std: torch.Tensor, interface: PolicyInterface,
+        self,
+        layers: Weights,
+        mean: torch.Tensor,
+        std: torch.Tensor,
+        interface: PolicyInterface,
         config: Mapping[str, Any] | None = None,
-    ) -> None:  # fmt: skip
+    ) -> None:
         """Copy the tensors, as float32.
 
         mean, std: (num_obs,) what is subtracted from raw observations, and what they are divided by. config: what else

@@ -9,9 +9,20 @@ from collections.abc import Collection, Iterable
 from types import ModuleType
 from typing import Any
 
+from jumper_warp.policies.policy import Policy
 from jumper_warp.policies.spec import PolicyError
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.tasks.saving import OPTIONAL, TaskError, task_from_json
+
+
+def task_of_policy(
+    policy: Policy, modules: Iterable[ModuleType] = (), *, leave_out: Collection[str] = OPTIONAL
+) -> TaskCfg:
+    """Return a policy's task, as `restored_task`. Raises PolicyError also if its observation is not the policy's."""
+    task = restored_task(policy.config, modules, leave_out=leave_out)
+    if task.observation_names != policy.interface.observation_names:
+        raise PolicyError("the policy's observation is not the one that this version of its task gives")
+    return task
 
 
 def restored_task(
@@ -25,10 +36,8 @@ def restored_task(
     Raises PolicyError: the configuration is not of a task that is known here.
     """
     try:
-        saved = config["env"]["task"]
-    except (KeyError, TypeError) as error:
-        raise PolicyError(f"no task in the configuration ({type(error).__name__}: {error})") from error
-    try:
-        return task_from_json(saved, modules, leave_out=leave_out)
+        return task_from_json(config["env"]["task"], modules, leave_out=leave_out)
     except TaskError as error:
         raise PolicyError(f"task in the configuration: {error}") from error
+    except (KeyError, TypeError) as error:
+        raise PolicyError(f"no task in the configuration ({type(error).__name__}: {error})") from error

@@ -48,14 +48,11 @@ def open_policy(source: str | Path, *, newest: bool = False) -> Policy:
     """
     if not is_run(source):
         return load_policy(source)
-    source = Path(source)
-    if source.suffix == ".pt":
-        return _policy_of_checkpoint(source, load_checkpoint(source))
-    folder = source / CHECKPOINTS
-    if newest:
-        path, state, _ = latest_checkpoint(folder)
-        return _policy_of_checkpoint(path, state)
-    path = best_checkpoint(folder)
+    path = Path(source)
+    if path.suffix != ".pt" and newest:
+        newest_checkpoint = latest_checkpoint(path / CHECKPOINTS)
+        return _policy_of_checkpoint(newest_checkpoint.path, newest_checkpoint.state)
+    path = path if path.suffix == ".pt" else best_checkpoint(path / CHECKPOINTS)
     return _policy_of_checkpoint(path, load_checkpoint(path))
 
 

@@ -28,7 +28,7 @@ class Stopwatch:
     """Seconds that a device spends between marks, without waiting for it until they are read."""
 
     def __init__(self, device: torch.device) -> None:
-        self._cuda = device.type == "cuda"
+        self._cuda, self._since = device.type == "cuda", time.perf_counter()
         self._laps: list[list[Any]] = []
 
     def start(self) -> None:
@@ -43,38 +43,33 @@ class Stopwatch:
             mark.record()
         self._laps[-1].append(mark)
 
-    def read(self) -> list[float]:
-        """Return the mean seconds of each part over all laps since the last call; waits for the device."""
+    def read(self) -> tuple[list[float], float]:
+        """Return mean seconds of each part since the last call, and of an iteration on the host's clock.
+
+        Waits for the device. Time between laps counts to the iterations.
+        """
         laps, self._laps = self._laps, []
         if self._cuda:
             torch.cuda.synchronize()
             seconds = [[a.elapsed_time(b) / 1.0e3 for a, b in pairwise(lap)] for lap in laps]
         else:
             seconds = [[b - a for a, b in pairwise(lap)] for lap in laps]
-        return [sum(part) / len(part) for part in zip(*seconds, strict=True)]
-
-
-class Pace:
-    """Seconds of an iteration, on the host's clock."""
-
-    def __init__(self, iteration: int) -> None:
-        """iteration: how many have been done."""
-        self._time, self._iteration = time.perf_counter(), iteration
-
-    def lap(self, iteration: int) -> float:
-        """Return the mean seconds of the iterations since the last lap; `iteration`, more than then, have been done."""
-        since, done = self._time, self._iteration
-        self._time, self._iteration = time.perf_counter(), iteration
-        return (self._time - since) / (iteration - done)
+        since, self._since = self._since, time.perf_counter()
+        return [sum(part) / len(part) for part in zip(*seconds, strict=True)], (self._since - since) / len(laps)
 
 
 class TrainingLog:
     """Context in which figures are logged. Nothing that cannot be written stops the training; it is told once."""
 
     def __init__(
-        self, folder: Path, config: dict[str, Any], total: int, tensorboard: bool = True, wandb: bool = False,
+        self,
+        folder: Path,
+        config: dict[str, Any],
+        total: int,
+        tensorboard: bool = True,
+        wandb: bool = False,
         iteration: int = 0,
-    ) -> None:  # fmt: skip
+    ) -> None:
         """folder: the run's, exists. config: everything that the run was started with, ready for JSON.
 
         total: iterations that the run has at its end. tensorboard: write events. wandb: upload to Weights & Biases.

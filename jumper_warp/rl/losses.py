@@ -34,10 +34,7 @@ def actor_gradient(
     Where r A is the smaller, ∂/∂log π = -r A / batch, else 0.
 
     rows: (batch, columns) as `layout`; entropy_coef: (); symmetry: of the policy; out: the vector's part of actor and
-    noise.
-
-    Returns:
-        Surrogate, entropy, mean squared asymmetry (0 without symmetry) and KL(old ‖ new).
+    noise. Return surrogate, entropy, mean squared asymmetry (0 without symmetry) and KL(old ‖ new).
     """
     batch, dtype = layout.split(rows), DTYPES[cfg.precision]
     mean, difference, seen = forward_actor(actor, layout.features(rows), symmetry, dtype)

@@ -32,12 +32,6 @@ STATISTICS = ("surrogate", "value", "entropy", "asymmetry", "kl", "gradient_acto
 """What `Ppo.statistics` averages over minibatches; skipped is the share of steps with a non-finite gradient,
 asymmetry the mean square of f(x) - N f(M x), see `jumper_warp.rl.mirror`, 0 without symmetry."""
 
-FIGURES = (
-    *(f"Loss/{name}" for name in STATISTICS), "Loss/learning_rate", "Policy/mean_std", "Train/mean_return",
-    "Train/mean_length",
-)  # fmt: skip
-"""Names of all that `Ppo.statistics` returns; those of Train/ once an episode has ended."""
-
 
 class Ppo:
     """The algorithm on one environment: `collect` fills the rollout, `update` learns from it, `iterate` does both."""

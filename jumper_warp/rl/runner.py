@@ -20,9 +20,18 @@ import torch
 from jumper_warp.envs.vec_env import DifferentiableVecEnv, VecEnv
 from jumper_warp.rl.cfg import TrainCfg
 from jumper_warp.rl.checkpoint import DAMAGE, Checkpoint, CheckpointError, one_line, save_checkpoint
-from jumper_warp.rl.distributed import Rank, all_same, gather, join_ranks, one_rank_first, wait_for_ranks, world_size
-from jumper_warp.rl.logger import Pace, Stopwatch, TrainingLog
-from jumper_warp.rl.ppo import FIGURES, Ppo
+from jumper_warp.rl.distributed import (
+    Rank,
+    all_same,
+    gather,
+    join_ranks,
+    largest_over_ranks,
+    one_rank_first,
+    wait_for_ranks,
+    world_size,
+)
+from jumper_warp.rl.logger import Stopwatch, TrainingLog
+from jumper_warp.rl.ppo import STATISTICS, Ppo
 from jumper_warp.rl.resume import (
     CHECKPOINTS,
     changed_files,
@@ -34,7 +43,7 @@ from jumper_warp.rl.resume import (
     spent_seconds,
     started_from,
 )
-from jumper_warp.rl.shac import FIGURES as SHAC_FIGURES
+from jumper_warp.rl.shac import STATISTICS as SHAC_STATISTICS
 from jumper_warp.rl.shac import Shac
 from jumper_warp.rl.start import Start, begin_with
 from jumper_warp.utils.errors import InputError
@@ -47,6 +56,8 @@ CONFIG = "config.json"
 """File of a run: all settings, versions and the commit."""
 PERF = ("Perf/fps", "Perf/collect_s", "Perf/update_s", "Perf/elapsed_s")
 """Logged figures of the training itself: steps per second, and seconds."""
+LEARNING = ("Loss/learning_rate", "Policy/mean_std", "Train/mean_return", "Train/mean_length")
+"""Logged besides the losses; those of Train/ once an episode has ended."""
 INTERRUPTED = 130
 """Exit code of a training that was asked to stop."""
 
@@ -174,7 +185,8 @@ class Run:
         self._command = command or f"jumper train {cfg.task}"
         by_gradients = cfg.trainer == "shac"
         self.ppo = Shac(cast(DifferentiableVecEnv, env), cfg.ppo, cfg.shac) if by_gradients else Ppo(env, cfg.ppo)
-        _check_best_by(cfg.best_by, {*env.metrics(), *(SHAC_FIGURES if by_gradients else FIGURES), *PERF})
+        losses = {f"Loss/{name}" for name in (SHAC_STATISTICS if by_gradients else STATISTICS)}
+        _check_best_by(cfg.best_by, {*env.metrics(), *losses, *LEARNING, *PERF})
         self.config = full_config(cfg, env, rank)
         self.iteration, self.seconds = 0, 0.0  # that the run had before this process
         self._begin: float | None = None  # on the clock, as if all seconds that count were of this process
@@ -219,7 +231,7 @@ class Run:
         if self.iteration == 0:
             self.env.reset()
         start, first = time.perf_counter(), self.iteration + 1
-        watch, pace = Stopwatch(self.rank.device), Pace(self.iteration)
+        watch = Stopwatch(self.rank.device)
         with self._log() as log:
             for note in [f"run {self.folder}", *self.notes]:
                 log.say(note)
@@ -237,12 +249,11 @@ class Run:
                     self._begin_counting()
                 ending = self._ending(stop)
                 if ending or self.iteration % cfg.log_interval == 0:
-                    times, seconds = watch.read(), pace.lap(self.iteration)
+                    times, seconds = watch.read()
                     self.figures = self._read(times, seconds)
                     log.log(self.iteration, self.figures, self._left(seconds))
                 elif self.iteration == first:  # it takes longer than the others
                     watch.read()
-                    pace.lap(self.iteration)
                 if ending or self.iteration % cfg.save_interval == 0:
                     self._save(log, ending, stop)
         return TrainResult(self.folder, self.iteration, time.perf_counter() - start, self.figures)
@@ -265,10 +276,8 @@ class Run:
 
     def _progress(self) -> float:
         """Return how much of the training is over, by iterations or by time, whichever is further."""
-        done = self.iteration / self.cfg.iterations
-        if self.cfg.max_seconds > 0.0:
-            done = max(done, self._elapsed() / self.cfg.max_seconds)
-        return done
+        timed = self.cfg.max_seconds > 0.0
+        return max(self.iteration / self.cfg.iterations, self._elapsed() / self.cfg.max_seconds if timed else 0.0)
 
     def _left(self, seconds: float) -> float:
         """Return how long the rest takes [s] at so many seconds an iteration."""
@@ -285,9 +294,7 @@ class Run:
             return False
         late = 0.0 < self.cfg.max_seconds <= self._elapsed()
         if world_size() > 1:
-            wish = torch.tensor([float(stop.asked), float(late)], device=self.rank.device)
-            torch.distributed.all_reduce(wish, op=torch.distributed.ReduceOp.MAX)
-            stop.asked, late = (value > 0.0 for value in wish.tolist())
+            stop.asked, late = map(bool, largest_over_ranks([int(stop.asked), int(late)]))
         return stop.asked or late
 
     def _read(self, times: list[float], seconds: float) -> dict[str, float]:
@@ -314,8 +321,8 @@ class Run:
             log.say(f"{folder}: not saved, will try again: {error.strerror}")
             return
         if ending:
-            more = f", continue with: {self._command} --resume {shlex.quote(str(self.folder))}" if stop.asked else ""
-            log.say(f"saved {path}{more}")
+            again = f", continue with: {self._command} --resume {shlex.quote(str(self.folder))}"
+            log.say(f"saved {path}{again if stop.asked else ''}")
 
     def _others(self, own: dict[str, Any]) -> list[dict[str, Any]]:
         """Return, in process 0, what only the other processes know: their worlds and random numbers."""
@@ -325,7 +332,7 @@ class Run:
 
 
 class _Silent:
-    """Stands for the log where nobody listens."""
+    """Stands for the log in all processes but the first."""
 
     def __enter__(self) -> _Silent:
         return self

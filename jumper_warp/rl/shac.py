@@ -23,11 +23,7 @@ from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.state_checks import check_parts, check_tensor
 
 STATISTICS = ("actor", "value", "gradient_actor", "gradient_critic")
-FIGURES = (
-    *(f"Loss/{name}" for name in STATISTICS), "Loss/learning_rate", "Policy/mean_std", "Train/mean_return",
-    "Train/mean_length",
-)  # fmt: skip
-"""Names of all that `Shac.statistics` returns; those of Train/ once an episode has ended."""
+"""What `Shac.statistics` averages over optimiser steps."""
 
 
 class Shac:

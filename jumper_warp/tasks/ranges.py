@@ -15,14 +15,20 @@ Pair = tuple[float, float]
 """Lower and upper end."""
 
 
-def check_ranges(what: str, cfg: Any, skip: Collection[str] = ()) -> None:
-    """Raise InputError: a number of a dataclass is not finite, or a pair falls; skip: fields that are neither."""
+def check_ranges(what: str, cfg: Any, skip: Collection[str] = (), not_negative: Collection[str] = ()) -> None:
+    """Raise InputError: a number of a dataclass is not finite, a pair falls, or one of `not_negative` is below 0.
+
+    skip: fields that are neither numbers nor pairs.
+    """
     for name, value in vars(cfg).items():
         if name in skip:
             continue
         check_finite(f"{what} {name}", *(value if isinstance(value, tuple) else (value,)))
         if isinstance(value, tuple) and not value[0] <= value[1]:
             raise InputError(f"{what} {name} must be (lower, upper), got {value}")
+        least = value[0] if isinstance(value, tuple) else value
+        if name in not_negative and least < 0.0:
+            raise InputError(f"{what} {name} must not be negative, got {least}")
 
 
 def filled(struct: Any, cfg: Any, skip: Collection[str] = (), degrees: Collection[str] = ()) -> Any:

@@ -88,23 +88,16 @@ def git_commit(folder: Path | None = None) -> Commit | None:
     None without git, outside a git tree, in a tree without commits, and where the enclosing tree does not track
     the folder, as for a package installed inside another project.
     """
-    return _own_commit() if folder is None else _commit_of(folder)
+    if folder is None:
+        return _own_commit()
+    commit = _git(folder, "rev-parse", "--verify", "HEAD") if _git(folder, "ls-files") else None
+    return Commit(commit.strip(), bool(_git(folder, "status", "--porcelain", "--", ":/"))) if commit else None
 
 
 @functools.cache
 def _own_commit() -> Commit | None:
     """Return the commit of this package's source tree; what has been imported from it stays the same."""
-    return _commit_of(Path(__file__).parent)
-
-
-def _commit_of(folder: Path) -> Commit | None:
-    """Return the commit of the source tree in a folder, or None, as `git_commit`."""
-    if not _git(folder, "ls-files"):
-        return None
-    commit = _git(folder, "rev-parse", "--verify", "HEAD")
-    if not commit:
-        return None
-    return Commit(commit.strip(), dirty=bool(_git(folder, "status", "--porcelain", "--", ":/")))
+    return git_commit(Path(__file__).parent)
 
 
 def _git(folder: Path, *arguments: str) -> str | None:

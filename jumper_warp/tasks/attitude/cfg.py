@@ -10,7 +10,7 @@ import warp as wp
 from jumper_warp.kernels.attitude.commands import TurnRanges
 from jumper_warp.kernels.attitude.reset import AttitudeSettings
 from jumper_warp.tasks.ranges import Pair, check_ranges, filled
-from jumper_warp.utils.checks import check_not_negative, check_positive, check_shares
+from jumper_warp.utils.checks import check_positive, check_shares
 from jumper_warp.utils.errors import InputError
 
 
@@ -59,10 +59,9 @@ class AttitudeResetCfg:
 
     def __post_init__(self) -> None:
         """Raises ValueError: a pair is reversed, a number not finite or out of range."""
-        check_ranges("reset", self)
+        check_ranges("reset", self, not_negative=("spin",))
         check_positive("reset episode", *self.episode)
         check_positive("reset height", self.height)
-        check_not_negative("reset spin", self.spin)
         check_shares("reset", default_share=self.default_share)
 
     def values(self, step_dt: float) -> Any:

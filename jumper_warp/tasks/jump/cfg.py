@@ -190,13 +190,9 @@ class ResetCfg:
         shares = self._shares()
         if not min(shares) >= 0.0 or sum(shares) > 1.0 + 1e-9:
             raise InputError(f"reset shares must be >= 0 and add up to at most 1, got {shares}")
-        check_ranges("reset", self, skip=("ground", "shares_of"))
+        positive = ("command_delay", "long_wait", "again_delay", "lean", "push_length", "push_acceleration")
+        check_ranges("reset", self, skip=("ground", "shares_of"), not_negative=positive)
         check_shares("reset", long_wait_share=self.long_wait_share)
-        for name in ("command_delay", "long_wait", "again_delay", "lean", "push_length", "push_acceleration"):
-            value = getattr(self, name)
-            least = value[0] if isinstance(value, tuple) else value
-            if not least >= 0.0:
-                raise InputError(f"reset {name} must not be negative, got {least}")
         if self.shares_of not in ("resets", "time"):
             raise InputError(f"reset shares_of must be resets or time, got {self.shares_of!r:.40}")
 

@@ -13,7 +13,7 @@ from jumper_warp.kernels.velocity.commands import CommandRanges
 from jumper_warp.kernels.velocity.reset import Map, VelocitySettings
 from jumper_warp.robot.terrain import TerrainCfg, terrain_map
 from jumper_warp.tasks.ranges import Pair, check_ranges, filled
-from jumper_warp.utils.checks import check_finite, check_not_negative, check_shares
+from jumper_warp.utils.checks import check_finite, check_shares
 from jumper_warp.utils.errors import InputError
 
 Reach = tuple[float, float, float, float]
@@ -107,10 +107,7 @@ class VelocityResetCfg:
 
     def __post_init__(self) -> None:
         """Raises ValueError: a pair is reversed, a number not finite or out of range."""
-        check_ranges("reset", self, skip=("terrain",))
-        for name, value in vars(self).items():
-            if name != "terrain":
-                check_not_negative(f"reset {name}", *(value if isinstance(value, tuple) else (value,)))
+        check_ranges("reset", self, skip=("terrain",), not_negative=vars(self))
         check_shares("reset", default_share=self.default_share, lifted_share=self.lifted_share)
 
     def values(self, step_dt: float) -> Any:
