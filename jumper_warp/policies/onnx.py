@@ -142,9 +142,8 @@ def policy_of_onnx(data: bytes, interface: PolicyInterface, config: Mapping[str,
 
     interface, config: those of the policy, from elsewhere; the graph and the metadata of the file must be of these.
 
-    Raises:
-        PolicyError: The file is damaged, its weights are not those of a usable policy of the interface, or its graph,
-            its opset or its metadata differ from what `onnx_model` makes of them.
+    Raises PolicyError: the file is damaged, its weights are not those of a usable policy of the interface, or its
+    graph, its opset or its metadata differ from what `onnx_model` makes of them.
     """
     model = onnx.ModelProto()
     try:

@@ -228,10 +228,6 @@ TERMS = {
     "rest": lambda r, p: at_ease(r) * phi(norm(r["vel"]), p["speed"]) * phi(norm(r["spin"]), p["spin"]),
     "landing_tilt": lambda r, p: (r["phase"] == LANDED) * (lean(r) / np.sin(p["width"])) ** 2,
     "descent_tilt": lambda r, p: (r["phase"] == FLIGHT) * (r["vel"][:, 2] <= 0.0) * (lean(r) / np.sin(p["width"])) ** 2,
-    "lifted_paws": lambda r, p: (
-        ((r["phase"] == LANDED) & (r["phase_steps"] > p["steps"]))
-        * np.count_nonzero(r["force"] <= CONTACT_FORCE, axis=0)
-    ),
     "lifted_again": lambda r, p: (
         (r["phase"] == LANDED)
         * np.sum(
