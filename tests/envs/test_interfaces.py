@@ -240,10 +240,10 @@ def test_an_environment_that_begins_nothing_by_itself_never_does_and_can_be_give
     env = make_env(N, reset=only("default"), auto_reset=False)
     edit_episodes(env, 0, phase=LANDED, phase_steps=59)
     for steps in (1, 2):
-        done = env.step(REST).terminated | env.step(REST).truncated
-        assert env.done[0] == 1.0 and env.task_arrays()["steps"][0] == 2 * steps
-    env.reset(worlds=done)
-    assert env.task_arrays()["steps"].tolist() == [0] + [4] * (N - 1)
+        step = env.step(REST)
+        assert env.done[0] == 1.0 and env.task_arrays()["steps"][0] == steps
+    env.reset(worlds=step.terminated | step.truncated)
+    assert env.task_arrays()["steps"].tolist() == [0] + [2] * (N - 1)
 
 
 def test_a_part_of_the_worlds_may_be_evaluated_anew():

@@ -1,5 +1,4 @@
 import dataclasses
-import socket
 
 import pytest
 import torch
@@ -15,7 +14,7 @@ from jumper_warp.rl.adam import adapted_lr
 from jumper_warp.rl.cfg import PpoCfg
 from jumper_warp.rl.ppo import STATISTICS, Ppo
 from jumper_warp.rl.samples import Batch, gae
-from toy_task import SMALL, PushTask, fill, local_order, update_half
+from toy_task import SMALL, PushTask, fill, free_port, local_order, update_half
 
 PLAIN = PpoCfg(
     num_steps=8, epochs=1, minibatches=1, hidden=(16, 8), normalise_value=False, reward_scale=1.0, max_grad_norm=1e9
@@ -267,12 +266,6 @@ def test_an_iteration_never_waits_for_the_host():
 def test_the_check_for_waiting_sees_an_item():
     with pytest.raises(AssertionError, match="_local_scalar_dense"), NoHost():
         torch.ones(()).item()
-
-
-def free_port():
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return probe.getsockname()[1]
 
 
 def test_two_processes_equal_one_with_all_worlds(tmp_path):

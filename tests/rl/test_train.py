@@ -3,7 +3,6 @@ import json
 import math
 import os
 import signal
-import socket
 import time
 
 import pytest
@@ -18,7 +17,7 @@ from jumper_warp.rl.distributed import Rank
 from jumper_warp.rl.logger import FIGURES
 from jumper_warp.rl.rsl_rl import rsl_rl_config, train_rsl_rl
 from jumper_warp.rl.runner import CHECKPOINTS, CONFIG, Run, Stop, train
-from toy_task import SMALL, PushTask, train_rank
+from toy_task import SMALL, PushTask, free_port, push_cfg, train_rank
 
 
 def make_env(num_envs, seed, device):
@@ -27,10 +26,7 @@ def make_env(num_envs, seed, device):
 
 @pytest.fixture
 def cfg(tmp_path):
-    return TrainCfg(
-        task="push", num_envs=32, iterations=4, device="cpu", log_root=tmp_path / "logs", log_interval=2,
-        save_interval=2, tensorboard=False, ppo=SMALL,
-    )  # fmt: skip
+    return push_cfg(tmp_path / "logs")
 
 
 def final_state(result):
@@ -208,10 +204,7 @@ def test_tensorboard_gets_the_figures(cfg):
 
 
 def test_two_processes_train_one_policy(cfg, tmp_path):
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
-    torch.multiprocessing.spawn(train_rank, (port, cfg, str(tmp_path / "rank")), nprocs=2)
+    torch.multiprocessing.spawn(train_rank, (free_port(), cfg, str(tmp_path / "rank")), nprocs=2)
     first, second = (torch.load(tmp_path / f"rank{rank}", weights_only=True) for rank in range(2))
     assert equal(first["model"], second["model"])
     assert (first["num_envs"], second["num_envs"]) == (16, 16)
