@@ -26,7 +26,7 @@ WIDE = {"symmetry": "off", "hidden": (512, 256, 256)}
         ("slippery_jump", "horizontal-jump-mars", {}),
         ("slippery_jump", "horizontal-jump-mars", WIDE),
         ("vertical_jump", "vertical-jump-mars", {"symmetry": "off"}),
-        ("walking_flat", "velocity-flat", {"symmetry": "loss", "hidden": (512, 256, 256)}),
+        ("walking_flat", "velocity-flat", WIDE),
     ],
 )
 def test_a_training_begins_as_a_shipped_policy_acts(name, task, change):

@@ -245,17 +245,6 @@ def test_a_checkpoint_that_began_with_random_weights_is_resumed(cfg, before):
     assert json.loads((result.folder / CONFIG).read_text())["train"]["start_from"] is None
 
 
-def test_after_an_elastic_restart_the_checkpoint_wins(cfg, monkeypatch):
-    monkeypatch.setenv("TORCHELASTIC_RUN_ID", "one")
-    monkeypatch.setenv("TORCHELASTIC_RESTART_COUNT", "0")
-    first = train(cfg, make_env, start=start_of(actor()))
-    monkeypatch.setenv("TORCHELASTIC_RESTART_COUNT", "1")
-    again = train(dataclasses.replace(cfg, iterations=2), make_env, start=start_of(actor()))
-    assert (again.folder, again.iteration) == (first.folder, 2)
-    assert model_of(again)["obs_moments.count"] == (KNOWN_ITERATIONS + 2) * 32 * SMALL.num_steps
-    assert json.loads((again.folder / CONFIG).read_text())["train"]["start_from"] == "pusher"
-
-
 def test_name_and_policy_need_each_other(cfg):
     for start_from, start in (("pusher", None), (None, start_of(actor()))):
         with pytest.raises(InputError, match=r"start_from and start.* need each other"):
