@@ -13,7 +13,6 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
-import newton
 import numpy as np
 import warp as wp
 
@@ -28,6 +27,7 @@ from jumper_warp.sim.slices import Worlds, slices_of
 from jumper_warp.sim.solver import check_step
 from jumper_warp.utils.checks import check_within
 from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.newton_types import Model
 from jumper_warp.utils.threads import checked_threads, run_side_by_side
 
 MAX_SWEEPS = 200
@@ -85,7 +85,7 @@ class Rollout:
 
     def __init__(
         self,
-        model: newton.Model,
+        model: Model,
         motors: MotorCfg | None = None,
         command_filter: FilterCfg | None = None,
         *,

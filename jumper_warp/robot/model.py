@@ -10,7 +10,7 @@ import dataclasses
 import math
 from collections.abc import Callable
 from types import ModuleType
-from typing import Any
+from typing import Any, cast
 
 import newton
 import numpy as np
@@ -22,6 +22,7 @@ from jumper_warp.robot.gravity import EARTH, check_gravity
 from jumper_warp.robot.parts import Link, Shape
 from jumper_warp.utils.checks import check_count
 from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.newton_types import Model
 
 __all__ = [
     "LEGS",
@@ -72,7 +73,7 @@ def build_model(
     requires_grad: bool = False,
     visuals: bool = True,
     extras: Extras | None = None,
-) -> newton.Model:
+) -> Model:
     """Return a Newton model of `num_worlds` robots, standing in the default pose.
 
     Args:
@@ -107,10 +108,10 @@ def build_model(
         extras(robot)
     builder.replicate(robot, num_worlds, label_prefixes=[f"world_{i}" for i in range(num_worlds)])
     _add_ground(builder, ground)
-    return builder.finalize(device=device, requires_grad=requires_grad)
+    return cast(Model, builder.finalize(device=device, requires_grad=requires_grad))
 
 
-def other_colliders(model: newton.Model) -> np.ndarray:
+def other_colliders(model: Model) -> np.ndarray:
     """Return the indices of the shapes that collide and are neither paws nor the ground that all worlds share."""
     flags, worlds, kinds = model.shape_flags.numpy(), model.shape_world.numpy(), model.shape_type.numpy()
     ground = (worlds == -1) & np.isin(kinds, [int(newton.GeoType.PLANE), int(newton.GeoType.HFIELD)])

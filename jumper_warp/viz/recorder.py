@@ -4,11 +4,11 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import newton
 import numpy as np
 import warp as wp
 
 from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.newton_types import Model
 from jumper_warp.viz.recording import SERIES_NAME, Recording
 from jumper_warp.viz.rerun import write_rrd
 from jumper_warp.viz.shapes import ShapeMesh, shape_meshes
@@ -26,7 +26,7 @@ class Recorder:
 
     def __init__(
         self,
-        model: newton.Model,
+        model: Model,
         worlds: Sequence[int] = (0,),
         *,
         spacing: float = 0.0,

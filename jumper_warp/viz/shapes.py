@@ -8,6 +8,7 @@ import trimesh
 from newton import GeoType
 
 from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.newton_types import Model
 
 PLANE_EXTENT = 10.0
 """Half the side of the patch drawn for an infinite plane [m]."""
@@ -34,7 +35,7 @@ class ShapeMesh:
     """(num_triangles, 3) int32, indices of vertices."""
 
 
-def shape_meshes(model: newton.Model, worlds: tuple[int, ...]) -> list[ShapeMesh]:
+def shape_meshes(model: Model, worlds: tuple[int, ...]) -> list[ShapeMesh]:
     """Return the meshes of the visible shapes of some worlds, and of those that all worlds share.
 
     Raises:

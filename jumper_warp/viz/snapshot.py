@@ -6,12 +6,12 @@ from pathlib import Path
 
 import matplotlib.figure
 import matplotlib.image
-import newton
 import numpy as np
 import warp as wp
 from newton.sensors import SensorCamera
 
 from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.newton_types import Model, State
 
 EYE = (1.1, 1.4, 0.6)
 """Default position of the eye [m], world frame: ahead of the robot, on its left."""
@@ -36,7 +36,7 @@ class Camera:
 
     def __init__(
         self,
-        model: newton.Model,
+        model: Model,
         eye: Sequence[float] = EYE,
         target: Sequence[float] = TARGET,
         size: tuple[int, int] = SIZE,
@@ -70,7 +70,7 @@ class Camera:
         self._world = wp.array([world], dtype=wp.int32, device=model.device)
         self._pixels = self._sensor.allocate_image_color(1, *size)
 
-    def picture(self, state: newton.State) -> np.ndarray:
+    def picture(self, state: State) -> np.ndarray:
         """Return the picture of a state, from its `body_q`: (height, width, 3) uint8, RGB."""
         self._model.bvh_refit_shapes(state)
         self._sensor.update(state, self._pose, self._rays, color_image=self._pixels, world_indices=self._world)
@@ -94,8 +94,8 @@ def look_at(eye: Sequence[float], target: Sequence[float]) -> wp.transformf:
 
 
 def render(
-    model: newton.Model,
-    state: newton.State,
+    model: Model,
+    state: State,
     path: Path,
     eye: Sequence[float] = EYE,
     target: Sequence[float] = TARGET,
