@@ -192,7 +192,7 @@ def characterise_motor(
     deviation = np.minimum(factor * np.sqrt(np.diag(np.linalg.inv(best.jac.T @ best.jac))), 1.0)
     found = constants(best.x)
     intervals = {
-        name: tuple(value * math.exp(side * 1.96 * p * d) for side in (-1.0, 1.0))
+        name: (value * math.exp(-1.96 * p * d), value * math.exp(1.96 * p * d))
         for (name, value), p, d in zip(found.items(), prior, deviation, strict=True)
     }
     unknown = tuple(name for name, d in zip(names, deviation, strict=True) if d > 0.5)

@@ -167,7 +167,7 @@ class Motion:
             return self
         return replace(self, **{name: values[first:end] for name, values in self._arrays().items()})
 
-    def _arrays(self) -> dict[str, np.ndarray]:
+    def _arrays(self) -> dict[str, Any]:
         """Return all columns by name."""
         return {f.name: getattr(self, f.name) for f in fields(self) if isinstance(getattr(self, f.name), np.ndarray)}
 

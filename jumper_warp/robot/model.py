@@ -264,7 +264,7 @@ def _add_visuals(builder: newton.ModelBuilder, body: int, link: Link, meshes: di
             builder.add_shape_cylinder(body, radius=shape.size[0], half_height=0.5 * shape.size[1], **common)
         elif shape.kind == "sphere":
             builder.add_shape_sphere(body, radius=shape.size[0], **common)
-        else:
+        elif shape.mesh is not None:
             mesh = meshes.get(id(shape.mesh))
             if mesh is None:
                 mesh = newton.Mesh(shape.mesh.vertices, shape.mesh.triangles.flatten(), compute_inertia=False)

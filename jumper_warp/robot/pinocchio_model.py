@@ -8,17 +8,16 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+import pinocchio
 
 from jumper_warp.robot.description import LEGS, MOTOR_JOINTS, RobotDescription, load_description
 from jumper_warp.robot.values import LINK_KINDS, RobotValues
 from jumper_warp.utils.errors import InputError
 
-if TYPE_CHECKING:
-    import pinocchio as pin
-
+pin: Any = pinocchio  # a compiled module without types
 PROXIMAL_ACCURACY = 1.0e-12
 PROXIMAL_DAMPING = 1.0e-10
 """A planar loop has three rows of rank two; the proximal term keeps the solve regular."""
@@ -36,8 +35,10 @@ class PinocchioRobot:
     The buffers in `data` are overwritten by every call.
     """
 
-    model: pin.Model
-    data: pin.Data
+    model: Any
+    """`pinocchio.Model`"""
+    data: Any
+    """`pinocchio.Data`"""
     constraints: Any
     """Loop constraint models, in leg order."""
     constraint_data: Any
@@ -61,8 +62,6 @@ class PinocchioRobot:
         Raises:
             ValueError: a loop cannot be closed.
         """
-        import pinocchio as pin
-
         q = pin.neutral(self.model)
         q[0:3] = base_pos
         q[3:7] = base_quat_xyzw
@@ -76,8 +75,6 @@ class PinocchioRobot:
 
     def loop_gap(self, q: np.ndarray) -> float:
         """Return the largest distance [m] between the two anchors of a loop."""
-        import pinocchio as pin
-
         pin.forwardKinematics(self.model, self.data, q)
         anchors = [
             [self.data.oMi[joint].act(placement.translation) for joint, placement in ends]
@@ -89,8 +86,6 @@ class PinocchioRobot:
 
     def paw_positions(self, q: np.ndarray) -> np.ndarray:
         """Return the paws' centres [m], shape (4, 3), world frame, legs FL, FR, BL, BR, of a configuration (27,)."""
-        import pinocchio as pin
-
         pin.forwardKinematics(self.model, self.data, q)
         return np.array([self.data.oMi[c.joint1_id].act(c.joint1_placement.translation) for c in self.constraints])
 
@@ -101,8 +96,6 @@ class PinocchioRobot:
             q: Configuration, shape (27,).
             v: Velocity, shape (26,), as `closed_velocity` returns it.
         """
-        import pinocchio as pin
-
         pin.forwardKinematics(self.model, self.data, q, v)
         found = []
         for c in self.constraints:
@@ -129,8 +122,6 @@ class PinocchioRobot:
             base_twist: Linear velocity of the body origin and angular velocity, body frame, shape (6,).
             motor_rates: [rad/s], shape (12,), motor order.
         """
-        import pinocchio as pin
-
         v = np.zeros(self.model.nv)
         v[self.motor_v] = motor_rates
         pin.computeJointJacobians(self.model, self.data, q)
@@ -152,8 +143,6 @@ class PinocchioRobot:
             v: Velocity that keeps them closed, shape (26,).
             motor_torques: [N m], shape (12,), motor order. Motors carry their armature, and no friction.
         """
-        import pinocchio as pin
-
         torques = np.zeros(self.model.nv)
         torques[self.motor_v] = motor_torques
         pin.initConstraintDynamics(self.model, self.data, self.constraints, self.constraint_data)
@@ -187,8 +176,6 @@ def build_pinocchio(description: RobotDescription | None = None, values: RobotVa
         values: Masses and armatures of a robot that differs from it, as `RobotOverlay.robots()` returns them; the
             first robot counts, and nothing but its `base_mass`, `base_com`, `base_inertia`, `link_mass` and `armature`.
     """
-    import pinocchio as pin
-
     description = load_description() if description is None else description
     values = RobotValues.nominal(1, description) if values is None else values
     model = pin.buildModelFromXML(description.urdf, pin.JointModelFreeFlyer())
@@ -220,14 +207,12 @@ def build_pinocchio(description: RobotDescription | None = None, values: RobotVa
     )
 
 
-def _write_masses(model: pin.Model, description: RobotDescription, values: RobotValues) -> None:
+def _write_masses(model: Any, description: RobotDescription, values: RobotValues) -> None:
     """Give the links the masses, centres of mass and inertias of the first of some robots."""
-    import pinocchio as pin
-
     base, ratio = description.links[0], values.base_mass[0, 0] / description.links[0].mass
     inertia = ratio * values.base_inertia[0, 0] * base.inertia
     model.inertias[1] = pin.Inertia(values.base_mass[0, 0], values.base_com[0], inertia)
-    ratios = dict(zip(LINK_KINDS, values.link_mass[0], strict=True))
+    ratios: dict[str, float] = dict(zip(LINK_KINDS, values.link_mass[0], strict=True))
     for joint in description.joints:
         link, scale = description.link(joint.child), ratios[joint.child[3:]]
         own = pin.Inertia(scale * link.mass, link.com, scale * link.inertia)

@@ -109,6 +109,7 @@ class JumperPhysics(Physics):
     """`SolverJumper`: a policy step in one launch."""
 
     sliced = True
+    solver: SolverJumper
 
     def __init__(self, sim: Any, block: BlockCfg | None, tolerance: float, keep_momentum: bool) -> None:
         """Make the solver for a simulation's model; raises ValueError as `SolverJumper`."""
@@ -170,6 +171,7 @@ class MujocoPhysics(Physics):
     """Newton's SolverMuJoCo, physics step by physics step, with this robot's motors and passive joints."""
 
     sliced = False
+    solver: newton.solvers.SolverMuJoCo
 
     def __init__(self, sim: Any, observe_forces: bool) -> None:
         """Make the solver for a simulation's model, whose knee damping it takes over."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, cast
 
 import newton
 import numpy as np
@@ -197,7 +197,7 @@ class Simulation:
         if kind not in ("bool", "torch.bool") or shape != (self.num_worlds,):
             raise InputError(f"mask must be bool of shape ({self.num_worlds},), got {kind} of shape {shape}")
         if of_torch:
-            given = wp.from_torch(given.contiguous())
+            given = wp.from_torch(cast("torch.Tensor", given).contiguous())
         elif isinstance(given, np.ndarray):
             given = wp.array(given, dtype=wp.bool, device=self.device)
         wp.copy(self._mask, given, count=self.num_worlds)

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
         joint_qd: wp.array
         body_q: wp.array
         body_qd: wp.array
+        body_f: wp.array
 
     class Control(newton.Control):
         """Controls of joints."""

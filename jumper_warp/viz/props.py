@@ -27,7 +27,7 @@ def with_marks(recording: Recording, places: np.ndarray) -> Recording:
     disc = np.concatenate([np.zeros((1, 3)), rim]) + (0.0, 0.0, MARK_LIFT)
     corner = np.arange(MARK_CORNERS)
     triangles = np.stack([np.zeros_like(corner), 1 + corner, 1 + (corner + 1) % MARK_CORNERS], axis=1).astype(np.int32)
-    normals = np.tile(np.float32([0.0, 0.0, 1.0]), (len(disc), 1))
+    normals = np.tile(np.array([0.0, 0.0, 1.0], np.float32), (len(disc), 1))
     marks = []
     for rank, of_world in enumerate(places):
         for number, place in enumerate(of_world):

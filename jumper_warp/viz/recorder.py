@@ -139,7 +139,7 @@ class Recorder:
             worlds=self._worlds,
             bodies=self._names,
             poses=np.stack(self._poses),
-            series={name: np.array(values) for name, values in self._series.items()},
+            series={name: np.array(values) for name, values in (self._series or {}).items()},
             contact_points=np.stack([points for points, _ in self._contacts]),
             contact_forces=np.stack([forces for _, forces in self._contacts]),
             spacing=self._spacing,

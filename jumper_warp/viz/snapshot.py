@@ -3,6 +3,7 @@
 import math
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import matplotlib.figure
 import matplotlib.image
@@ -58,7 +59,8 @@ class Camera:
             raise InputError(f"world {world} is outside the model's {model.world_count} worlds")
         self._model = model
         self._sensor = SensorCamera(model)
-        self._sensor.create_default_light(direction=wp.normalize(wp.vec3(*LIGHT_DIRECTION)))
+        direction: Any = wp.vec3(*LIGHT_DIRECTION)
+        self._sensor.create_default_light(direction=wp.normalize(direction))
         self._sensor.set_ambient_light(AMBIENT)
         self._sensor.default_clear_data = SensorCamera.ClearData(clear_color=SKY)
         self._sensor.default_render_config.enable_shadows = True
@@ -68,13 +70,14 @@ class Camera:
         )
         self._pose = wp.array([look_at(eye, target)], dtype=wp.transformf, device=model.device)
         self._world = wp.array([world], dtype=wp.int32, device=model.device)
-        self._pixels = self._sensor.allocate_image_color(1, *size)
+        self._pixels: Any = self._sensor.allocate_image_color(1, *size)
 
     def picture(self, state: State) -> np.ndarray:
         """Return the picture of a state, from its `body_q`: (height, width, 3) uint8, RGB."""
         self._model.bvh_refit_shapes(state)
         self._sensor.update(state, self._pose, self._rays, color_image=self._pixels, world_indices=self._world)
-        return SensorCamera.Utils.to_rgba_from_color(self._pixels).numpy()[0, ..., :3].copy()
+        colors: Any = SensorCamera.Utils.to_rgba_from_color(self._pixels)
+        return colors.numpy()[0, ..., :3].copy()
 
 
 def look_at(eye: Sequence[float], target: Sequence[float]) -> wp.transformf:
@@ -90,20 +93,9 @@ def look_at(eye: Sequence[float], target: Sequence[float]) -> wp.transformf:
     ahead /= np.linalg.norm(ahead)
     right /= np.linalg.norm(right)
     axes = np.stack([right, np.cross(right, ahead), -ahead], axis=1)
-    return wp.transformf(wp.vec3(*map(float, eye)), wp.quat_from_matrix(wp.mat33(*axes.ravel().tolist())))
-
-
-def render(
-    model: Model,
-    state: State,
-    path: Path,
-    eye: Sequence[float] = EYE,
-    target: Sequence[float] = TARGET,
-    size: tuple[int, int] = SIZE,
-) -> Path:
-    """Write a picture of world 0 as a PNG file, see `Camera`; return its path."""
-    matplotlib.image.imsave(path, Camera(model, eye, target, size).picture(state))
-    return Path(path)
+    position: Any = wp.vec3(*map(float, eye))
+    matrix: Any = wp.mat33(*axes.ravel().tolist())
+    return wp.transformf(position, wp.quat_from_matrix(matrix))
 
 
 def contact_sheet(
