@@ -24,15 +24,6 @@ from jumper_warp.utils.checks import check_count
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.newton_types import Model
 
-__all__ = [
-    "LEGS",
-    "MOTOR_JOINTS",
-    "build_model",
-    "leg_geometry",
-    "leg_geometry_array",
-    "standing_configuration",
-]
-
 PHYSICS_DT = 1.0 / 480.0
 """Physics step [s] that contacts and loops are tuned for."""
 

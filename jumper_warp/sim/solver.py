@@ -113,40 +113,23 @@ class SolverJumper(SolverBase):
         warn_of_colliders(model)
         self.max_sweeps = max_sweeps
         self.tolerance = tolerance
+        work = self.dynamics.work
+        self.contact_force: wp.array = work.contact_force
+        """Force of the ground on each paw in the last step [N], world frame, vec3 of shape (4, num_worlds)."""
+        self.peak_force: wp.array = work.peak_force
+        """Largest total paw force of the last call [N], shape (num_worlds,)."""
+        self.torque: wp.array = work.torque
+        """Torque of each motor in the last step [N m], shape (12, num_worlds)."""
+        self.residual: wp.array = work.residual
+        """Largest velocity change [m/s] of the last contact sweep, worst step of the last call, (num_worlds,)."""
+        self.sweeps: wp.array = work.sweeps
+        """Most contact sweeps of a step in the last call, on a GPU rounds of all paws at once, shape (num_worlds,)."""
+        self.invalid: wp.array = work.invalid
+        """1 where a world became non-finite and waits for `reset`, shape (num_worlds,)."""
         self._differentiable = DifferentiableStep(self.dynamics, max_sweeps, min(tolerance, DIFFERENTIABLE_TOLERANCE))
         self._default_control = model.control(clone_variables=False)
         self._no_body_f = wp.zeros(model.body_count, dtype=wp.spatial_vectorf, device=model.device)
         self._old_body_qd = wp.zeros(model.body_count, dtype=wp.spatial_vectorf, device=model.device)
-
-    @property
-    def contact_force(self) -> wp.array:
-        """Force of the ground on each paw in the last step [N], world frame, vec3 of shape (4, num_worlds)."""
-        return self.dynamics.work.contact_force
-
-    @property
-    def peak_force(self) -> wp.array:
-        """Largest total paw force of the last call [N], shape (num_worlds,)."""
-        return self.dynamics.work.peak_force
-
-    @property
-    def torque(self) -> wp.array:
-        """Torque of each motor in the last step [N m], shape (12, num_worlds)."""
-        return self.dynamics.work.torque
-
-    @property
-    def residual(self) -> wp.array:
-        """Largest velocity change [m/s] of the last contact sweep, worst step of the last call, (num_worlds,)."""
-        return self.dynamics.work.residual
-
-    @property
-    def sweeps(self) -> wp.array:
-        """Most contact sweeps of a step in the last call, on a GPU rounds of all paws at once, shape (num_worlds,)."""
-        return self.dynamics.work.sweeps
-
-    @property
-    def invalid(self) -> wp.array:
-        """1 where a world became non-finite and waits for `reset`, shape (num_worlds,)."""
-        return self.dynamics.work.invalid
 
     def step(
         self,

@@ -95,7 +95,8 @@ def look_at(eye: Sequence[float], target: Sequence[float]) -> wp.transformf:
     axes = np.stack([right, np.cross(right, ahead), -ahead], axis=1)
     position: Any = wp.vec3(*map(float, eye))
     matrix: Any = wp.mat33(*axes.ravel().tolist())
-    return wp.transformf(position, wp.quat_from_matrix(matrix))
+    orientation: Any = wp.quat_from_matrix(matrix)
+    return wp.transformf(position, orientation)
 
 
 def contact_sheet(
