@@ -268,13 +268,18 @@ def parse_settings(path: Path, text: str) -> dict[str, Any]:
     return settings
 
 
-def read_csv(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-    """Return channels and settings of a CSV file. Raises InputError or OSError."""
+def csv_rows(path: Path) -> list[list[str]]:
+    """Return the cells of a CSV file. Raises InputError or OSError."""
     try:
         with path.open(newline="", encoding="utf-8") as file:
-            rows = list(csv.reader(file))
+            return list(csv.reader(file))
     except (UnicodeDecodeError, csv.Error) as error:
         raise InputError(f"{path}: expected CSV text ({error})") from None
+
+
+def read_csv(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    """Return channels and settings of a CSV file. Raises InputError or OSError."""
+    rows = csv_rows(path)
     if len(rows) < 2:
         raise InputError(f"{path}: expected a line of names and rows of numbers")
     names, columns = [name.strip() for name in rows[0]], []

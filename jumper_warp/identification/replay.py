@@ -9,6 +9,7 @@ from typing import Literal
 import numpy as np
 import warp as wp
 
+from jumper_warp.diff.bodies import PAIRS
 from jumper_warp.diff.rollout import Rollout
 from jumper_warp.kernels import layout
 from jumper_warp.robot.description import RobotDescription, load_description
@@ -165,8 +166,7 @@ def parameter_table(nominal: np.ndarray, robots: RobotValues) -> np.ndarray:
     table = np.repeat(nominal, len(robots.base_mass), axis=1)
     mass, com = robots.base_mass[:, 0], robots.base_com.T
     old_mass, old_first = table[layout.BASE], table[layout.BASE + 1 : layout.BASE + 4]
-    pairs = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
-    for row, (i, j) in enumerate(pairs, int(layout.BASE) + 4):
+    for row, (i, j) in enumerate(PAIRS, int(layout.BASE) + 4):
         central = table[row] - old_first[i] * old_first[j] / old_mass
         table[row] = central * robots.base_inertia[:, 0] * mass / old_mass + mass * com[i] * com[j]
     table[layout.BASE], table[layout.BASE + 1 : layout.BASE + 4] = mass, mass * com
