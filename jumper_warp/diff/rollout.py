@@ -87,9 +87,7 @@ class Rollout:
         motors: By default the jumping gains at 18 N m.
         command_filter: None leaves the targets as they are.
         description: The model's, by default the project's.
-        double: Whether to compute in double precision.
-        dt: Physics step [s].
-        substeps: Physics steps in a policy step.
+        dt: Physics step [s], `substeps` of which are in a policy step.
         every: Physics steps from one row of a trajectory to the next, a divisor of `substeps`; by default all.
         tolerance: Of the contact iteration [m/s], by default `TOLERANCE` or `TOLERANCE_DOUBLE`.
         threads: Of a CPU, which share the worlds out and change no bit; as in `Simulation`.

@@ -89,15 +89,8 @@ def descend(
     explained best by then; residuals that stand out count less (a paw that strikes 1 ms late is all wrong for a
     moment). At last all residuals count fully.
 
-    Args:
-        descent: To record the steps.
-        parameters: What is unknown.
-        motions: All, as the first stages and as the last ones take them: the physics steps may differ.
-        pieces: Motions in short pieces for a first stage; none: without.
-        knowledge: Of the robot besides the motions.
-
-    Raises:
-        InputError: the model cannot follow a motion.
+    motions: all, as the first stages and as the last ones take them: the physics steps may differ. pieces: motions in
+    short pieces for a first stage, or none. Raises InputError: the model cannot follow a motion.
     """
     replay, (rough, whole) = descent.replay, motions
     z = np.zeros(len(parameters))

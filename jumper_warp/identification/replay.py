@@ -91,19 +91,12 @@ class Replay:
         gains: Literal["jumping", "walking"] = "jumping",
         torque_limit: float = 18.0,
     ) -> Record:
-        """Return what N worlds do.
+        """Return what N worlds do, `robots` and `starts` of each, without contact history.
 
-        Args:
-            robots: Of N worlds.
-            starts: Of N worlds, without contact history.
-            target: Motor targets [rad] of every physics step, (lead + steps, 12), held from step to step.
-            rows: To record; row 0 is the start.
-            stride: Physics steps from row to row.
-            dt: Physics step [s].
-            lead: Steps of `target` before the start; a latency asks for them.
-            base: "fixed" holds the base where it starts.
-            gains: Of the description, which the ratios of `robots` scale.
-            torque_limit: [N m] Likewise.
+        target: motor targets [rad] of every physics step of dt [s], (lead + steps, 12), held from step to step; a
+        latency asks for `lead` steps before the start. rows: to record, `stride` physics steps apart; row 0 is the
+        start. base: "fixed" holds the base where it starts. gains, torque_limit [N m]: of the description, which the
+        ratios of `robots` scale.
         """
         count, steps = len(starts.angle), (rows - 1) * stride + 1  # the last row's torques take one more step
         rollout, nominal = self._rollout(count, dt)

@@ -65,15 +65,13 @@ def build_model(
     visuals: bool = True,
     extras: Extras | None = None,
 ) -> Model:
-    """Return a Newton model of `num_worlds` robots, standing in the default pose.
+    """Return a Newton model of `num_worlds` robots, standing in the default pose; labels start with `world_i/`.
 
     Args:
-        num_worlds: Number of worlds, one robot each; labels start with `world_i/`.
         description: The robot; by default the project's own.
         ground: "plane" (z = 0), a heightfield, or None for free flight.
         friction: Coulomb friction coefficient of the paws [1].
         gravity: Downward, of every world [m/s^2]; `model.gravity` holds that of each.
-        device: Warp device.
         requires_grad: Whether the model's arrays carry gradients.
         visuals: Whether to add shapes that only viewers see. Without them large batches build faster.
         extras: Adds the caller's own sites and shapes. It is called once, with the builder of one robot, whose links

@@ -54,13 +54,8 @@ class PinocchioRobot:
     def configuration(self, base_pos: np.ndarray, base_quat_xyzw: np.ndarray, motors: np.ndarray) -> np.ndarray:
         """Return q, shape (27,), with the knee angles that close the loops, ankles below the knees.
 
-        Args:
-            base_pos: Body origin [m], shape (3,), world frame.
-            base_quat_xyzw: Body to world, unit, shape (4,).
-            motors: Motor angles [rad], shape (12,), motor order.
-
-        Raises:
-            ValueError: a loop cannot be closed.
+        base_pos: body origin [m], world frame. base_quat_xyzw: body to world, unit. motors: angles [rad] in motor
+        order. Raises ValueError: a loop cannot be closed.
         """
         q = pin.neutral(self.model)
         q[0:3] = base_pos
@@ -92,9 +87,7 @@ class PinocchioRobot:
     def paw_velocities(self, q: np.ndarray, v: np.ndarray) -> np.ndarray:
         """Return the velocities of the paws' centres [m/s], shape (4, 3), world frame, legs FL, FR, BL, BR.
 
-        Args:
-            q: Configuration, shape (27,).
-            v: Velocity, shape (26,), as `closed_velocity` returns it.
+        q: (27,); v: (26,), as `closed_velocity` returns it.
         """
         pin.forwardKinematics(self.model, self.data, q, v)
         found = []
@@ -115,12 +108,10 @@ class PinocchioRobot:
         return np.stack(columns, axis=2)
 
     def closed_velocity(self, q: np.ndarray, base_twist: np.ndarray, motor_rates: np.ndarray) -> np.ndarray:
-        """Return v, shape (26,), with the knee rates that keep the loops closed.
+        """Return v, shape (26,), with the knee rates that keep the loops of a configuration (27,) closed.
 
-        Args:
-            q: Configuration with closed loops, shape (27,).
-            base_twist: Linear velocity of the body origin and angular velocity, body frame, shape (6,).
-            motor_rates: [rad/s], shape (12,), motor order.
+        base_twist: linear velocity [m/s] of the body origin and angular velocity [rad/s], body frame. motor_rates:
+        [rad/s], motor order.
         """
         v = np.zeros(self.model.nv)
         v[self.motor_v] = motor_rates
@@ -136,12 +127,8 @@ class PinocchioRobot:
         """Return the acceleration dv/dt, shape (26,), of the robot in free flight under gravity, loops rigid.
 
         The base's six are derivatives of its components in the body frame, which turns: the origin's own acceleration
-        is theirs plus omega x v.
-
-        Args:
-            q: Configuration with closed loops, shape (27,).
-            v: Velocity that keeps them closed, shape (26,).
-            motor_torques: [N m], shape (12,), motor order. Motors carry their armature, and no friction.
+        is theirs plus omega x v. q: (27,), loops closed; v: (26,), which keeps them closed; motor_torques: [N m],
+        (12,), motor order. Motors carry their armature, and no friction.
         """
         torques = np.zeros(self.model.nv)
         torques[self.motor_v] = motor_torques
@@ -169,12 +156,10 @@ class PinocchioRobot:
 
 
 def build_pinocchio(description: RobotDescription | None = None, values: RobotValues | None = None) -> PinocchioRobot:
-    """Return the robot in Pinocchio, with a free-flying base.
+    """Return the robot in Pinocchio, with a free-flying base; by default the project's own.
 
-    Args:
-        description: The robot; by default the project's own.
-        values: Masses and armatures of a robot that differs from it, as `RobotOverlay.robots()` returns them; the
-            first robot counts, and nothing but its `base_mass`, `base_com`, `base_inertia`, `link_mass` and `armature`.
+    values: a robot that differs from the description, as `RobotOverlay.robots()` returns it; the first one counts, and
+    nothing but its `base_mass`, `base_com`, `base_inertia`, `link_mass` and `armature`.
     """
     description = load_description() if description is None else description
     values = RobotValues.nominal(1, description) if values is None else values

@@ -37,14 +37,13 @@ SolverName = Literal["jumper", "mujoco"]
 
 
 class Simulation:
-    """Worlds of the robot under position targets, on either solver.
+    """Worlds of the robot under position targets, on either solver; it begins standing in the default pose.
 
     Give raw motor targets [rad] to `set_targets`, or write them on the device to `target`, (12, num_worlds), where
     nothing checks them; then call `step` for one policy step: the filter once, then `substeps` times motors and
     physics. Everything is on the device; nothing waits for it.
 
     Args:
-        num_worlds: Number of worlds, the robot standing in the default pose.
         solver: "jumper" or "mujoco" (Newton's SolverMuJoCo).
         motors: By default the jumping gains at 18 N m.
         command_filter: None leaves the targets as they are.
@@ -52,8 +51,7 @@ class Simulation:
         block: A block in each world that slides when the robot pushes it; on SolverJumper only.
         friction: Of the paws [1].
         gravity: Downward, of every world [m/s^2].
-        dt: Physics step [s].
-        substeps: Physics steps in a policy step.
+        dt: Physics step [s], `substeps` of which are in a policy step.
         tolerance: Of SolverJumper's contact iteration [m/s].
         keep_momentum: Whether robots that fly freely keep their momentum from policy step to policy step exactly,
             by a correction of the base's velocity; on SolverJumper only.
@@ -62,7 +60,6 @@ class Simulation:
         extras: Adds the caller's own sites and shapes to every world, as in `build_model`.
         robot: What differs from the description: an overlay, or values of one robot or of one a world. Their
             latency is the caller's to apply.
-        device: Warp device.
         threads: Of a CPU, which share the worlds out and change no bit; by default what
             `jumper_warp.utils.threads.set_threads` chose, or all cores. SolverMuJoCo and few worlds use one.
 

@@ -167,22 +167,13 @@ class SolverJumper(SolverBase):
     ) -> None:
         """Advance every world by `substeps` steps of dt [s], the motors following targets, in one launch.
 
-        Args:
-            state_in: State before; may be `state_out`.
-            state_out: State after.
-            motors: `jumper_warp.kernels.actuation.motors.MotorArrays` (see `jumper_warp.robot.motors.motor_arrays`).
-            target: Motor angles [rad], shape (12, num_worlds), held.
-            dt: Physics step [s].
-            substeps: Number of physics steps.
-            control: Additional joint forces, held.
-            previous: Motor angles [rad] that the motors follow until the target arrives.
-            delay: Physics steps until it does, shape (num_worlds,).
-            bodies: Whether to write passive joints, loop joints and bodies; the solver itself does not need them.
-            observables: Observables of the whole call.
-            worlds: Which are advanced, by default all.
+        motors: `jumper_warp.kernels.actuation.motors.MotorArrays`, see `jumper_warp.robot.motors.motor_arrays`.
+        target: motor angles [rad], (12, num_worlds), held; with `delay` [physics steps], (num_worlds,), the motors
+        follow `previous` until it arrives. control: additional joint forces, held. bodies: whether to write passive
+        joints, loop joints and bodies, which the solver itself does not need. observables: of the whole call. worlds:
+        which are advanced, by default all. `state_out` may be `state_in`.
 
-        Raises:
-            ValueError: dt is not finite and positive, or substeps no whole number of at least 1.
+        Raises ValueError: dt is not finite and positive, or substeps no whole number of at least 1.
         """
         self.validate_observables(observables)
         drive = self.dynamics.drive(*self._forces(state_in, control), motors, target, previous, delay)

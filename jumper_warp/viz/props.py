@@ -40,11 +40,8 @@ def with_marks(recording: Recording, places: np.ndarray) -> Recording:
 def with_blocks(recording: Recording, centers: np.ndarray, half: np.ndarray, height: np.ndarray) -> Recording:
     """Return the recording with a moving block in each world, standing on z = 0.
 
-    Args:
-        recording: As it is without.
-        centers: [m] x and y, world frame, (frames, recorded worlds, 2).
-        half: [m] Half extents along x and y, (recorded worlds, 2).
-        height: [m] (recorded worlds,)
+    centers: [m] x and y, world frame, (frames, recorded worlds, 2). half: [m] half extents along x and y, (recorded
+    worlds, 2). height: [m] (recorded worlds,).
     """
     poses, names, shapes = [recording.poses], list(recording.bodies), list(recording.shapes)
     for rank, world in enumerate(recording.worlds):

@@ -43,17 +43,9 @@ class Camera:
         size: tuple[int, int] = SIZE,
         world: int = 0,
     ) -> None:
-        """Place the camera.
+        """Place the camera at `eye`, `target` in the middle of the picture [m], world frame; size: width, height [px].
 
-        Args:
-            model: Its visible shapes are drawn.
-            eye: Position [m], world frame, shape (3,).
-            target: Point in the middle of the picture [m], world frame, shape (3,).
-            size: Width and height [px].
-            world: Which world to draw.
-
-        Raises:
-            ValueError: Eye and target coincide or lie on one vertical, or the model has no such world.
+        Raises ValueError: eye and target coincide or lie on one vertical, or the model has no such world.
         """
         if not 0 <= world < model.world_count:
             raise InputError(f"world {world} is outside the model's {model.world_count} worlds")
@@ -102,16 +94,10 @@ def look_at(eye: Sequence[float], target: Sequence[float]) -> wp.transformf:
 def contact_sheet(
     pictures: Sequence[np.ndarray], path: Path, captions: Sequence[str] | None = None, columns: int | None = None
 ) -> Path:
-    """Write pictures side by side as one PNG file; return its path.
+    """Write pictures, (height, width, 3) uint8 of one size, side by side as one PNG file; return its path.
 
-    Args:
-        pictures: (height, width, 3) uint8 each, all of one size.
-        path: Where to write.
-        captions: One per picture, drawn in its upper left corner.
-        columns: Pictures per row. Default: all in one row, a filmstrip.
-
-    Raises:
-        ValueError: No pictures, unequal sizes, or another number of captions.
+    captions: one per picture, drawn in its upper left corner. columns: pictures per row, by default all. Raises
+    ValueError: no pictures, unequal sizes, or another number of captions.
     """
     if not pictures or len({picture.shape for picture in pictures}) != 1:
         raise InputError("a contact sheet needs pictures, all of one size")
