@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import warp as wp
 
-from jumper_warp.robot.model import LEGS, build_model
+from jumper_warp.robot.description import LEGS
+from jumper_warp.robot.model import build_model
 from jumper_warp.sim.solver import SolverJumper
 from jumper_warp.utils.rotations import rotate
 
@@ -109,7 +110,7 @@ class Film:
         self.recorder.record(self.frames * self.env.step_dt, poses.reshape(-1, 7), series, ankles(poses), forces)
 
     def _motor_series(self) -> dict[str, float]:
-        from jumper_warp.robot.model import MOTOR_JOINTS
+        from jumper_warp.robot.description import MOTOR_JOINTS
 
         world = self.worlds[0]
         torque, action = self.env.sim.torque.numpy()[:, world], self.env.action[world].cpu().numpy()
