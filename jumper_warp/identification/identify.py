@@ -70,19 +70,9 @@ def identify(
 ) -> Identification:
     """Return the parameters that explain the motions best.
 
-    Args:
-        motions: What was recorded.
-        parameters: What is unknown.
-        noise: Of the sensors.
-        knowledge: Of the robot besides the motions.
-        dt: Largest physics step [s], by default 1/480.
-        description: Of the nominal robot, by default the project's.
-        replay: Worlds of an earlier call, to be used again; its description counts.
-        device: Warp device.
-        threads: Of a CPU.
-
-    Raises:
-        InputError: no motions, motions with gaps, without measurements or that the model cannot follow.
+    knowledge: of the robot besides the motions. dt: largest physics step [s], by default 1/480. replay: worlds of an
+    earlier call, to be used again; its description counts. threads: of a CPU. Raises InputError: no motions, motions
+    with gaps, without measurements or that the model cannot follow.
     """
     if not motions:
         raise InputError("there must be at least one motion")
@@ -114,9 +104,7 @@ def identify_by_evolution(
     device: wp.DeviceLike = None,
     threads: int | None = None,
 ) -> Identification:
-    """Return what CMA-ES finds in `max_seconds`; other arguments as of `identify`.
-
-    Motions start as their first rows say.
+    """Return what CMA-ES finds in `max_seconds`, motions starting as their first rows say; see `identify`.
 
     Raises InputError: as `identify`, or `cma` is not installed.
     """

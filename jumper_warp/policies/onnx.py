@@ -163,7 +163,7 @@ def _tensors(initialisers: Iterable[TensorProto]) -> dict[str, torch.Tensor]:
     """Return the normaliser and the layers that initialisers hold, by their names in a policy."""
     found = {}
     for stored in initialisers:
-        layer = LAYER.fullmatch(stored.name)
+        layer = LAYER.fullmatch(str(stored.name))  # protobuf gives bytes where a name is no UTF-8
         if layer is None and stored.name not in STORED:
             continue
         name = STORED[stored.name] if layer is None else f"actor.{layer[1]}.{layer[2]}"

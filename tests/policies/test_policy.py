@@ -322,6 +322,12 @@ REFUSALS = {
         change_model(lambda m: stored(m, "actor_0_weight").dims.append(2)),
         "actor.0.weight does not hold as many numbers as its shape needs",
     ),
+    "name that is no text": (
+        lambda f: reseal(
+            f, "policy.onnx", (f / "policy.onnx").read_bytes().replace(b"actor_0_bias", b"actor_0_bia\xff")
+        ),
+        "missing or unknown: actor.0.bias",
+    ),
     "weights in another file": (change_model(keep_outside), NOT_OURS),
     "another opset": (change_model(lambda m: setattr(m.opset_import[0], "version", 17)), NOT_OURS),
     "another operator": (change_model(lambda m: setattr(m.graph.node[8], "op_type", "Relu")), NOT_OURS),
