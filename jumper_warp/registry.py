@@ -179,9 +179,8 @@ def load_installed(point: EntryPoint) -> None:
 def load_task_module(name: str) -> ModuleType:
     """Import a FILE.py, or a module by name, so that the tasks that it registers are known.
 
-    Raises:
-        InputError: There is none, its name belongs to another module, or what it registers or defines is refused.
-        OSError: The file cannot be read.
+    Raises InputError: there is none, its name belongs to another module, or what it registers or defines is refused.
+    OSError: the file cannot be read.
     """
     path, before = Path(name), dict(TASKS)
     try:

@@ -11,7 +11,7 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, cast
 
 import tyro
 
@@ -25,8 +25,7 @@ if TYPE_CHECKING:
 
     import torch
 
-    from jumper_warp.diff.differentiable_env import DifferentiableEnv
-    from jumper_warp.envs.env import Env
+    from jumper_warp.envs.vec_env import VecEnv
     from jumper_warp.rl.runner import MakeEnv, TrainResult
     from jumper_warp.robot.overlay import RobotOverlay
     from jumper_warp.tasks.cfg import TaskCfg
@@ -59,8 +58,7 @@ def parse_train(args: Sequence[str]) -> tuple[TrainArgs, TaskCfg]:
 
     Those of a run that is resumed are its own, where no flag changes them.
 
-    Raises:
-        InputError: The task is missing, unknown or given twice, a setting is out of range, or there is no such run.
+    Raises InputError: the task is missing, unknown or given twice, a setting is out of range, or there is no such run.
     """
     names = ", ".join(task_names())
     if not args:
@@ -138,23 +136,17 @@ def env_maker(task: TaskCfg, args: TrainArgs) -> MakeEnv:
 
     overlay = args.robot_of_run if args.robot is None else load_overlay(args.robot)
 
-    def make(num_envs: int, seed: int, device: torch.device) -> Env | DifferentiableEnv:
+    def make(num_envs: int, seed: int, device: torch.device) -> VecEnv:
         check_memory(task, args.cfg.ppo, args.solver, num_envs, device)
         env = Env(
-            task,
-            num_envs,
-            seed=seed,
-            device=str(device),
-            solver=args.solver,
-            randomize=args.randomize,
-            noise=args.noise,
-            robot=overlay,
-        )
+            task, num_envs, seed=seed, device=str(device), solver=args.solver, randomize=args.randomize,
+            noise=args.noise, robot=overlay,
+        )  # fmt: skip
         if args.cfg.trainer != "shac":
             return env
         from jumper_warp.diff.differentiable_env import DifferentiableEnv
 
-        return DifferentiableEnv(env)
+        return cast("VecEnv", DifferentiableEnv(env))
 
     return make
 

@@ -62,8 +62,7 @@ def delay_arrays(num_envs: int, latency: wp.array, substeps: int, device: Any) -
     """Return the kernels' `Delays`; latency [physics steps]: (num_envs,)."""
     delays = Delays()
     delays.past_target = wp.zeros((RING, 12, num_envs), dtype=float, device=device)
-    delays.late_target = wp.zeros((12, num_envs), dtype=float, device=device)
-    delays.earlier_target = wp.zeros((12, num_envs), dtype=float, device=device)
+    delays.late_target, delays.earlier_target = (wp.zeros((12, num_envs), dtype=float, device=device) for _ in range(2))
     delays.late_steps = wp.zeros(num_envs, dtype=int, device=device)
     delays.steps, delays.substeps = latency, substeps
     return delays
@@ -92,11 +91,12 @@ def checked_tasks(task: Any, handovers: Sequence[Handover]) -> tuple[TaskCfg, ..
         raise InputError(f"an environment needs at least one task, each with a name of its own, got {names}")
     first = tasks[0].motors
     for each in tasks[1:]:
-        pairs = ((each.motors.lateral, first.lateral), (each.motors.transversal, first.transversal))
-        same = (each.motors.fade_start, each.motors.fade_end) == (first.fade_start, first.fade_end)
-        if not (same and all(one.peak == other.peak for one, other in pairs)):
+        limits, its = (
+            (motors.fade_start, motors.fade_end, motors.lateral.peak, motors.transversal.peak)
+            for motors in (first, each.motors)
+        )
+        if its != limits:
             raise InputError(f"{each.name} needs the peak torque and the over-speed protection of {names[0]}'s motors")
-    for each in tasks[1:]:
         if each.gravity != tasks[0].gravity:
             raise InputError(f"{each.name} has a gravity of {each.gravity} m/s^2, {names[0]} of {tasks[0].gravity}")
     for each in handovers:
@@ -132,10 +132,14 @@ def checked_action(action: Any, shape: tuple[int, ...], device: torch.device) ->
     return action.detach()
 
 
+def on_host(values: Any) -> Any:
+    """Return a tensor as an array, and anything else unchanged."""
+    return values.detach().cpu().numpy() if isinstance(values, torch.Tensor) else values
+
+
 def as_numbers(values: Any, what: str) -> np.ndarray:
     """Return values as float32. Raises ValueError: not numbers, or lists of different lengths."""
-    if isinstance(values, torch.Tensor):
-        values = values.detach().cpu().numpy()
+    values = on_host(values)
     try:
         return np.asarray(values, dtype=np.float32)
     except (ValueError, TypeError) as error:
@@ -166,9 +170,7 @@ def checked_mask(worlds: Any, num_envs: int) -> np.ndarray:
     """Return which worlds are meant as float32 ones and zeros, all for None. Raises ValueError for another shape."""
     if worlds is None:
         return np.ones(num_envs, dtype=np.float32)
-    if isinstance(worlds, torch.Tensor):
-        worlds = worlds.detach().cpu().numpy()
-    array = np.asarray(worlds)
+    array = np.asarray(on_host(worlds))
     if array.shape != (num_envs,) or array.dtype != bool:
         raise InputError(f"worlds must be bool of shape ({num_envs},), got {array.dtype} of shape {array.shape}")
     return array.astype(np.float32)
@@ -176,7 +178,7 @@ def checked_mask(worlds: Any, num_envs: int) -> np.ndarray:
 
 def checked_worlds(worlds: Any, num_envs: int) -> np.ndarray:
     """Return the mask of worlds, given as bool or as indices. Raises ValueError: neither, twice the same or none."""
-    array = worlds.detach().cpu().numpy() if isinstance(worlds, torch.Tensor) else np.asarray(worlds)
+    array = np.asarray(on_host(worlds))
     if array.dtype.kind not in "iu":
         return checked_mask(array, num_envs)
     fits = array.ndim == 1 and bool(((array >= 0) & (array < num_envs)).all())

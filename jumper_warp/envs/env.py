@@ -67,25 +67,12 @@ class Env(Stages):
     """
 
     def __init__(
-        self,
-        task: TaskCfg | Sequence[TaskCfg],
-        num_envs: int,
-        *,
-        seed: int = 0,
-        device: str | torch.device | None = None,
-        solver: SolverName = "jumper",
-        randomize: bool = True,
-        noise: bool = True,
-        auto_reset: bool = True,
-        visuals: bool = False,
-        ground: Any = "plane",
-        block: BlockCfg | None = None,
-        skill: np.ndarray | int = 0,
-        handovers: Sequence[Handover] = (),
-        robot: RobotOverlay | None = None,
-        threads: int | None = None,
-        refine: int = 1,
-    ):
+        self, task: TaskCfg | Sequence[TaskCfg], num_envs: int, *, seed: int = 0,
+        device: str | torch.device | None = None, solver: SolverName = "jumper", randomize: bool = True,
+        noise: bool = True, auto_reset: bool = True, visuals: bool = False, ground: Any = "plane",
+        block: BlockCfg | None = None, skill: np.ndarray | int = 0, handovers: Sequence[Handover] = (),
+        robot: RobotOverlay | None = None, threads: int | None = None, refine: int = 1,
+    ) -> None:  # fmt: skip
         """Build everything; call `reset` before the first step.
 
         ground, block: as in `Simulation`; by default the terrain of the first task that has one, or what tasks draw, if
@@ -300,11 +287,11 @@ class Env(Stages):
             dt=sim.dt,
             substeps=sim.substeps,
             default_angle=wp.to_torch(self.robot.default_angle),
-            com=wp.to_torch(sim.model.body_com).view(n, -1, 3)[:, 0],
+            com=wp.to_torch(self.robot.body_com).view(n, -1, 3)[:, 0],
             parameters=parameters
             | {"table": wp.to_torch(dynamics.robot.table), "latency": wp.to_torch(self.parameters.latency) * sim.dt},
-            q=compact_columns(wp.to_torch(sim.state.joint_q).view(n, -1), 7),
-            qd=compact_columns(wp.to_torch(sim.state.joint_qd).view(n, -1), 6),
+            q=compact_columns(wp.to_torch(self.robot.joint_q).view(n, -1), 7),
+            qd=compact_columns(wp.to_torch(self.robot.joint_qd).view(n, -1), 6),
             before=past[(clock - 1) % len(past), :, torch.arange(n, device=self.device)].T,
             impulse=wp.to_torch(self.robot.impulse),
             action=wp.to_torch(self.robot.action),
@@ -336,29 +323,29 @@ class Env(Stages):
         `task` and `interface` are of the first task; several have `tasks`, and `handovers` as their functions' names.
         `robot` is there if an overlay was given.
         """
-        several = {
+        config = {
+            "task": task_to_json(self.task),
+            "interface": interface(self.task),
+            "num_envs": self.num_envs,
+            "seed": self.seed,
+            "physics_dt_s": self.physics_dt,
+            "policy_dt_s": self.step_dt,
+            "contact_tolerance_m_s": CONTACT_TOLERANCE,
+            "solver": type(self.sim.solver).__name__,
+            "randomize": self._conditions[0],
+            "noise": self._conditions[1],
+            "quaternion_order": "xyzw",
+        }
+        if self._overlay is not None:
+            config = {"robot": self._overlay.to_json(), **config}
+        if len(self.tasks) == 1:
+            return config
+        return {
             "tasks": [task_to_json(task) for task in self.tasks],
             "first_skill": self._first_skill.tolist(),
             "handovers": [handover_to_json(handover) for handover in self.handovers],
+            **config,
         }
-        overlay = {} if self._overlay is None else {"robot": self._overlay.to_json()}
-        return (
-            (several if len(self.tasks) > 1 else {})
-            | overlay
-            | {
-                "task": task_to_json(self.task),
-                "interface": interface(self.task),
-                "num_envs": self.num_envs,
-                "seed": self.seed,
-                "physics_dt_s": self.physics_dt,
-                "policy_dt_s": self.step_dt,
-                "contact_tolerance_m_s": CONTACT_TOLERANCE,
-                "solver": type(self.sim.solver).__name__,
-                "randomize": self._conditions[0],
-                "noise": self._conditions[1],
-                "quaternion_order": "xyzw",
-            }
-        )
 
     def state_dict(self) -> dict[str, torch.Tensor]:
         """Return everything that the next step depends on, as `jumper_warp.envs.state.save_state`."""

@@ -47,9 +47,9 @@ class Skill:
         n, task, counters = self.num_envs, self.task, Counters()
         counters.term_sum = wp.zeros((max(len(task.rewards), 1), n), dtype=wp.float64, device=self.device)
         counters.ending_count = wp.zeros((len(task.terminations), n), dtype=int, device=self.device)
-        for name in ("counted", "succeeded", "bad_actions"):
-            setattr(counters, name, wp.zeros(n, dtype=int, device=self.device))
-        counters.error_sum = wp.zeros(n, dtype=wp.float64, device=self.device)
+        for name in ("counted", "succeeded", "bad_actions", "error_sum"):
+            kind = wp.float64 if name == "error_sum" else int
+            setattr(counters, name, wp.zeros(n, dtype=kind, device=self.device))
         return counters
 
     def _structs(self, values: list, kind: Any = None) -> wp.array:
@@ -74,10 +74,9 @@ class Skill:
         self.columns = wp.array(np.array(columns, dtype=np.int32).T, dtype=int, device=self.device)
         self.num_chunks = -(-sum(len(task.rows[group]) for group in task.groups) // CHUNK)
         arrays = ObservationArrays()
-        arrays.raw = wp.zeros((len(columns), n), dtype=float, device=self.device)
-        arrays.now = wp.zeros(start, dtype=float, device=self.device)
-        arrays.final = wp.zeros(start, dtype=float, device=self.device)
-        arrays.past = wp.zeros((RING, n, max(past, 1)), dtype=float, device=self.device)
+        shapes = {"raw": (len(columns), n), "now": start, "final": start, "past": (RING, n, max(past, 1))}
+        for name, shape in shapes.items():
+            setattr(arrays, name, wp.zeros(shape, dtype=float, device=self.device))
         arrays.latency = wp.zeros(n, dtype=int, device=self.device)
         arrays.substeps = substeps
         self.observations = arrays
@@ -131,9 +130,8 @@ class Skill:
             figures[f"Episode_Termination/{term.name}"] = float(count) / ended
         counted, succeeded = int(counters.counted.numpy().sum()), int(counters.succeeded.numpy().sum())
         figures["Metrics/success"] = succeeded / max(counted, 1)
-        figures[f"Metrics/error_{task.curriculum.options['unit']}"] = float(counters.error_sum.numpy().sum()) / max(
-            succeeded, 1
-        )
+        error = float(counters.error_sum.numpy().sum())
+        figures[f"Metrics/error_{task.curriculum.options['unit']}"] = error / max(succeeded, 1)
         figures["Metrics/bad_actions"] = float(counters.bad_actions.numpy().sum())
         for name in Counters.vars:
             getattr(counters, name).zero_()
@@ -147,11 +145,9 @@ class Skill:
         states = records(self.states).copy()
         for metric in metrics:
             values = states[metric.field].astype(np.float64)
-            if metric.per is None:
-                figures[metric.name] = float(values.mean())
-            else:
-                total = float(states[metric.per].astype(np.float64).sum())
-                figures[metric.name] = float(values.sum()) / total if total else 0.0
+            total = 0.0 if metric.per is None else float(states[metric.per].astype(np.float64).sum())
+            mean = float(values.mean()) if metric.per is None else 0.0
+            figures[metric.name] = float(values.sum()) / total if total else mean
         for metric in metrics:
             if metric.per is not None:
                 states[metric.field] = states[metric.per] = 0.0

@@ -107,29 +107,17 @@ class Conditions:
 
 
 def env_of_policy(
-    policy: Policy,
-    num_envs: int,
-    conditions: Conditions,
-    *,
-    change: Callable[[TaskCfg], TaskCfg] | None = None,
-    modules: Iterable[ModuleType] = (),
-    **scene: Any,
-) -> Env:
+    policy: Policy, num_envs: int, conditions: Conditions, *, change: Callable[[TaskCfg], TaskCfg] | None = None,
+    modules: Iterable[ModuleType] = (), **scene: Any,
+) -> Env:  # fmt: skip
     """Return the environment that a policy was trained in, with other conditions.
 
     Without rewards, without what the critic sees, and unless randomised without events: so their functions need not be
     found, and are not run.
 
-    Args:
-        policy: Its configuration tells the task.
-        num_envs: Number of worlds.
-        conditions: Physics, randomisation and noise.
-        change: Returns the task that is wanted instead.
-        modules: That the user has named, for tasks that are not the project's.
-        scene: More settings of `Env`, such as its ground.
-
-    Raises:
-        PolicyError: This version of the project cannot rebuild it, or its observation is not the policy's.
+    policy: names the task in its configuration. change: returns the task that is wanted instead. modules: that the user
+    has named, for tasks that are not the project's. scene: more settings of `Env`, such as its ground.
+    Raises PolicyError: this version of the project cannot rebuild it, or its observation is not the policy's.
     """
     from jumper_warp.envs.env import Env
 
@@ -138,14 +126,7 @@ def env_of_policy(
     if task.observation_names != policy.interface.observation_names:
         raise PolicyError("the policy's observation is not the one that this version of its task gives")
     return Env(
-        conditions.applied(task if change is None else change(task)),
-        num_envs,
-        seed=conditions.seed,
-        device=conditions.device,
-        solver=conditions.solver,
-        randomize=conditions.draws,
-        noise=conditions.noise,
-        auto_reset=False,
-        robot=conditions.overlay(policy.config),
-        **scene,
-    )
+        conditions.applied(task if change is None else change(task)), num_envs, seed=conditions.seed,
+        device=conditions.device, solver=conditions.solver, randomize=conditions.draws, noise=conditions.noise,
+        auto_reset=False, robot=conditions.overlay(policy.config), **scene,
+    )  # fmt: skip

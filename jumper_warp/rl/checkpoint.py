@@ -44,8 +44,7 @@ def save_checkpoint(folder: Path, state: dict[str, Any], score: float | None = N
         score: The higher, the better, NaN is none; the best checkpoint is never removed.
         keep: How many of the last saved stay, at least 1.
 
-    Raises:
-        OSError: The disk is full or the folder cannot be written.
+    Raises OSError: the disk is full or the folder cannot be written.
     """
     folder.mkdir(parents=True, exist_ok=True)
     buffer = io.BytesIO()
@@ -74,9 +73,8 @@ def save_checkpoint(folder: Path, state: dict[str, Any], score: float | None = N
 def load_checkpoint(path: Path) -> dict[str, Any]:
     """Return what was saved, on the CPU.
 
-    Raises:
-        CheckpointError: The file is missing, has no checksum, differs from it, or is no checkpoint; or its iteration
-            is not the one of the manifest.
+    Raises CheckpointError: the file is missing, has no checksum, differs from it, or is no checkpoint; or its iteration
+    is not the one of the manifest.
     """
     entry = _read_manifest(path.parent).get(path.name)
     if not path.is_file():
@@ -112,8 +110,7 @@ def one_line(error: Exception) -> str:
 def latest_checkpoint(folder: Path) -> Checkpoint:
     """Return the last saved usable checkpoint.
 
-    Raises:
-        CheckpointError: None is usable.
+    Raises CheckpointError: none is usable.
     """
     manifest = _read_manifest(folder)
     refusals: list[str] = []
@@ -128,8 +125,7 @@ def latest_checkpoint(folder: Path) -> Checkpoint:
 def best_checkpoint(folder: Path) -> Path:
     """Return the path of the checkpoint with the highest score, or of the last saved if none has one.
 
-    Raises:
-        CheckpointError: There is none.
+    Raises CheckpointError: there is none.
     """
     manifest = _read_manifest(folder)
     if not manifest:

@@ -85,8 +85,7 @@ def join_ranks(device: str | None = None, threads: int | None = None) -> Rank:
 
     threads: of torch on a CPU, unless OMP_NUM_THREADS is set.
 
-    Raises:
-        ValueError: There is no such device.
+    Raises ValueError: there is no such device.
     """
     kind = torch.device(device or ("cuda" if torch.cuda.is_available() else "cpu"))
     if kind.type == "cuda" and not torch.cuda.is_available():

@@ -13,11 +13,11 @@ from concurrent.futures import ThreadPoolExecutor
 from datetime import datetime
 from pathlib import Path
 from types import FrameType
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import torch
 
-from jumper_warp.envs.vec_env import VecEnv
+from jumper_warp.envs.vec_env import DifferentiableVecEnv, VecEnv
 from jumper_warp.rl.cfg import TrainCfg
 from jumper_warp.rl.checkpoint import DAMAGE, Checkpoint, CheckpointError, one_line, save_checkpoint
 from jumper_warp.rl.distributed import Rank, all_same, gather, join_ranks, one_rank_first, wait_for_ranks, world_size
@@ -94,20 +94,19 @@ def train(
 ) -> TrainResult:  # fmt: skip
     """Train to the last iteration or the time limit, and save.
 
-    command: What the user would type to go on, without `--resume`; by default `jumper train TASK`.
-    as_rsl_rl: Needed with trainer rsl-rl. start: The policy that cfg.start_from names, needed with it.
-    checkpoint: The one that cfg.resume names, if it has been read.
+    command: what the user would type to continue, without `--resume`; by default `jumper train TASK`. as_rsl_rl: needed
+    with trainer rsl-rl. start: the policy that cfg.start_from names, needed with it. checkpoint: the one that
+    cfg.resume names, if it has been read.
 
-    Raises:
-        ValueError: A setting does not fit the environment or the machine.
-        CheckpointError: There is nothing usable to resume from, or the end could not be saved.
-        SystemExit: With code INTERRUPTED, after Ctrl-C or SIGTERM ended the iteration and it was saved.
+    Raises ValueError: a setting does not fit the environment or the machine. CheckpointError: there is nothing usable
+    to resume from, or the end could not be saved. SystemExit: with code INTERRUPTED, after Ctrl-C or SIGTERM ended the
+    iteration and it was saved.
     """
     set_threads(cfg.threads)
     rank = join_ranks(cfg.device, cfg.threads)
     run: Run | None = None
     try:
-        _check_processes(cfg, rank, as_rsl_rl is not None)
+        _check_processes(cfg, rank)
         if checkpoint is None and bool(cfg.start_from) != (start is not None):
             raise InputError("start_from and start, the policy that it names, need each other")
         env = make_env(cfg.num_envs // rank.size, (cfg.seed + 1000 * rank.index) % 2**31, rank.device)
@@ -128,12 +127,10 @@ def train(
             torch.distributed.destroy_process_group()
 
 
-def _check_processes(cfg: TrainCfg, rank: Rank, adapted: bool) -> None:
+def _check_processes(cfg: TrainCfg, rank: Rank) -> None:
     """Raises ValueError: the trainer cannot be had, or worlds or samples do not divide."""
     if cfg.trainer != "ppo" and rank.size > 1:
         raise InputError(f"trainer {cfg.trainer} is offered for one process only")
-    if cfg.trainer == "rsl-rl" and not adapted:
-        raise InputError("trainer rsl-rl needs as_rsl_rl, which adapts the environment")
     if cfg.num_envs % rank.size:
         raise InputError(f"num_envs {cfg.num_envs} is not divisible by {rank.size} processes")
     if cfg.trainer == "ppo":
@@ -176,7 +173,7 @@ class Run:
         self.cfg, self.env, self.rank = cfg, env, rank
         self._command = command or f"jumper train {cfg.task}"
         by_gradients = cfg.trainer == "shac"
-        self.ppo = Shac(env, cfg.ppo, cfg.shac) if by_gradients else Ppo(env, cfg.ppo)
+        self.ppo = Shac(cast(DifferentiableVecEnv, env), cfg.ppo, cfg.shac) if by_gradients else Ppo(env, cfg.ppo)
         _check_best_by(cfg.best_by, {*env.metrics(), *(SHAC_FIGURES if by_gradients else FIGURES), *PERF})
         self.config = full_config(cfg, env, rank)
         self.iteration, self.seconds = 0, 0.0  # that the run had before this process
@@ -243,8 +240,9 @@ class Run:
                     times, seconds = watch.read(), pace.lap(self.iteration)
                     self.figures = self._read(times, seconds)
                     log.log(self.iteration, self.figures, self._left(seconds))
-                elif self.iteration == first:  # its time tells nothing of the others
-                    watch.read(), pace.lap(self.iteration)
+                elif self.iteration == first:  # it takes longer than the others
+                    watch.read()
+                    pace.lap(self.iteration)
                 if ending or self.iteration % cfg.save_interval == 0:
                     self._save(log, ending, stop)
         return TrainResult(self.folder, self.iteration, time.perf_counter() - start, self.figures)
@@ -351,7 +349,9 @@ def new_folder(cfg: TrainCfg, rank: Rank) -> Path:
     return folder
 
 
-def _train_rsl_rl(cfg: TrainCfg, env: VecEnv, as_rsl_rl: AsRslRl, rank: Rank) -> TrainResult:
+def _train_rsl_rl(cfg: TrainCfg, env: VecEnv, as_rsl_rl: AsRslRl | None, rank: Rank) -> TrainResult:
+    if as_rsl_rl is None:
+        raise InputError("trainer rsl-rl needs as_rsl_rl, which adapts the environment")
     from jumper_warp.rl.rsl_rl import train_rsl_rl
 
     folder = new_folder(cfg, rank)

@@ -31,10 +31,14 @@ Tape = list[list[tuple[torch.Tensor, torch.Tensor]]]
 class Actor(Protocol):
     """A policy's weights, normaliser and interface, as `jumper_warp.policies.policy.Policy` has them."""
 
-    layers: Sequence[tuple[torch.Tensor, torch.Tensor]]
     mean: torch.Tensor
     std: torch.Tensor
     interface: Any
+
+    @property
+    def layers(self) -> Sequence[tuple[torch.Tensor, torch.Tensor]]:
+        """Weight and bias of each layer."""
+        ...
 
 
 class Network:

@@ -5,7 +5,7 @@ import subprocess
 from importlib import metadata
 from pathlib import Path
 from platform import python_version
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import warp as wp
 from rich.console import Console
@@ -72,8 +72,7 @@ def announce(device: str | None, threads: int | None = None) -> DeviceInfo:
 
     threads: of a CPU, for all simulations that are made from now on, as in `set_threads`.
 
-    Raises:
-        InputError: There is no such device, or no such number of threads.
+    Raises InputError: there is no such device, or no such number of threads.
     """
     set_threads(threads)
     wp.config.log_level = wp.LOG_WARNING
@@ -115,6 +114,12 @@ def _git(folder: Path, *arguments: str) -> str | None:
     except (OSError, subprocess.TimeoutExpired):
         return None
     return answer.stdout if answer.returncode == 0 else None
+
+
+def source_versions() -> dict[str, Any]:
+    """Return the commit of this package's source tree, whether it is dirty, and `versions`."""
+    commit = git_commit()
+    return {"commit": commit and commit.hash, "dirty": commit and commit.dirty, "versions": versions()}
 
 
 def versions() -> dict[str, str | None]:
