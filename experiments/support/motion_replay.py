@@ -17,8 +17,9 @@ from jumper_warp.evaluation.film import ankles
 from jumper_warp.evaluation.plots import drawn
 from jumper_warp.kernels.collision.robot import collision_kernel
 from jumper_warp.kernels.layout import COORDS
+from jumper_warp.robot.description import MOTOR_JOINTS
 from jumper_warp.robot.gravity import EARTH
-from jumper_warp.robot.model import MOTOR_JOINTS, build_model
+from jumper_warp.robot.model import build_model
 from jumper_warp.sim.simulation import Simulation, motor_values
 from jumper_warp.trajectory.problem import Motion, Problem
 

@@ -12,7 +12,7 @@ import numpy as np
 from jumper_warp.evaluation.film import ankles
 from jumper_warp.evaluation.limits import EXTEND, HOLD, RAMP
 from jumper_warp.evaluation.plots import drawn
-from jumper_warp.robot.model import LEGS, MOTOR_JOINTS
+from jumper_warp.robot.description import LEGS, MOTOR_JOINTS
 from jumper_warp.sim.simulation import Simulation, motor_values
 
 if TYPE_CHECKING:

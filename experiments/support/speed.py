@@ -194,7 +194,7 @@ def time_ppo(envs: int, cfg: PpoCfg, iterations: int, device: str | None) -> dic
         ppo.iterate(mark=watch.mark)
 
     wall = wall_time(iterate, device, iterations)
-    collect, update = watch.read()
+    (collect, update), _ = watch.read()
     after = ppo.model.log_std.detach()
     if not bool(after.isfinite().all()) or torch.equal(after, before):
         raise RuntimeError("the policy did not learn")

@@ -160,7 +160,7 @@ def gauss_newton_step(
 
     rows: of J, (n, weights) for each group of worlds; misses (n,); importance: the diagonal of W, (n,).
     """
-    by_off, back = vjp(anchor.off, weights)
+    by_off, back = vjp(anchor.off, weights)[:2]
     right = -back(by_off)[0]
     for row, miss, weight in zip(rows, misses, importance, strict=True):
         right = right - row.T @ (weight * miss)

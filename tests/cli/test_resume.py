@@ -6,6 +6,7 @@ import shutil
 import pytest
 import torch
 
+from cli_helpers import run as command
 from jumper_warp.cli import main as cli
 from jumper_warp.cli.train import env_maker, parse_train
 from jumper_warp.registry import make_task
@@ -20,13 +21,8 @@ HERE = ["--device", "cpu", "--no-tensorboard"]
 
 def train(capsys, *args):
     """Return exit code, the folder that was told, and the lines of standard error."""
-    code = 0
-    try:
-        cli.main(["train", "vertical-jump", *HERE, *args])
-    except SystemExit as end:
-        code = end.code
-    captured = capsys.readouterr()
-    return code, captured.out.strip(), captured.err.splitlines()
+    code, out, err = command(capsys, "train", "vertical-jump", *HERE, *args)
+    return code, out.strip(), err
 
 
 @pytest.fixture(scope="module")
@@ -130,9 +126,8 @@ def test_settings_that_do_not_fit_the_checkpoint_are_named(capsys, run):
 
 
 def test_a_run_of_another_task_is_refused(capsys, run):
-    with pytest.raises(SystemExit):
-        cli.main(["train", "horizontal-jump", "--resume", str(run)])
-    assert "of a run of vertical-jump, not of horizontal-jump" in capsys.readouterr().err
+    _, _, told = command(capsys, "train", "horizontal-jump", "--resume", str(run))
+    assert "of a run of vertical-jump, not of horizontal-jump" in told[-1]
 
 
 def test_unreadable_settings_are_refused(capsys, run):

@@ -5,6 +5,7 @@ import json
 import pytest
 import torch
 
+from cli_helpers import run
 from jumper_warp.cli import main as cli
 from jumper_warp.cli.train import command_line
 from jumper_warp.policies.runs import open_policy
@@ -69,10 +70,8 @@ def test_a_repeated_command_resumes_the_run_that_it_began(tmp_path, capsys):
     ],
 )
 def test_what_cannot_be_started_from_is_told_in_one_line(more, message, capsys, tmp_path):
-    with pytest.raises(SystemExit) as caught:
-        cli.main([*TRAIN, *more, "--log-root", str(tmp_path)])
-    told = capsys.readouterr().err.splitlines()
-    assert caught.value.code == 2 and message in " ".join(told)
+    code, _, told = run(capsys, *TRAIN, *more, "--log-root", str(tmp_path))
+    assert code == 2 and message in " ".join(told)
     assert not list(tmp_path.iterdir())
 
 

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from cli_helpers import run
 from jumper_warp.cli import main as cli
 from jumper_warp.cli.main import split_task_modules
 from jumper_warp.cli.train import check_saving, command_line
@@ -86,17 +87,6 @@ register_task("low-jump", low_jump, ppo=PpoCfg(gamma=0.9))
 '''
 TRAIN = ["--num-envs", "4", "--iterations", "1", "--no-tensorboard", "--device", "cpu", "--ppo.num-steps", "2"]
 TRAIN += ["--ppo.minibatches", "2", "--ppo.hidden", "8", "--env.rewards.rest.height", "0.4"]
-
-
-def run(capsys, *args):
-    """Return exit code, output and error lines of a command."""
-    code = 0
-    try:
-        cli.main(args)
-    except SystemExit as end:
-        code = end.code
-    captured = capsys.readouterr()
-    return code, captured.out, captured.err.splitlines()
 
 
 def forget():
@@ -280,7 +270,7 @@ def test_run_of_an_older_version_is_refused_with_the_commit_that_reads_it(capsys
     [
         ("import warp as wp\n", "import warp as wp\nimport not_there\n", "own_faults.py:6: ModuleNotFoundError"),
         ("weight=2.0, ", "", "own_faults.py:{line}: TypeError: RewardTerm.__init__() missing"),
-        ("view.quat,", "view.quad,", "own_faults.py, function level: `quad` is not an attribute of 'view'"),
+        ("tilt(view)", "tilt(view.quad)", "own_faults.py, function level: `quad` is not an attribute of 'view'"),
     ],
 )
 def test_a_mistake_in_a_users_file_is_told_in_one_line(right, wrong, told, tmp_path, monkeypatch, capsys):
@@ -292,24 +282,12 @@ def test_a_mistake_in_a_users_file_is_told_in_one_line(right, wrong, told, tmp_p
     line = next(i for i, row in enumerate(text.splitlines(), 1) if "RewardTerm(level" in row)
     monkeypatch.delitem(sys.modules, "own_faults", raising=False)
     before = dict(TASKS)
-    args = [
-        "train",
-        "own-faults",
-        "--task-module",
-        str(path),
-        "--device",
-        "cpu",
-        "--num-envs",
-        "4",
-        "--iterations",
-        "1",
-    ]
+    args = [*"--device cpu --num-envs 4 --iterations 1".split(), "--log-root", str(tmp_path)]
     try:
-        with pytest.raises(SystemExit) as stopped:
-            cli.main([*args, "--log-root", str(tmp_path)])
+        code, _, err = run(capsys, "train", "own-faults", "--task-module", str(path), *args)
     finally:
         TASKS.clear()
         TASKS.update(before)
         sys.modules.pop("own_faults", None)
-    lines = [row for row in capsys.readouterr().err.splitlines() if row.startswith("jumper:")]
-    assert stopped.value.code == 2 and len(lines) == 1 and told.format(line=line) in lines[0]
+    lines = [row for row in err if row.startswith("jumper:")]
+    assert code == 2 and len(lines) == 1 and told.format(line=line) in lines[0]

@@ -340,18 +340,6 @@ def test_rsl_rl_sees_the_environments_groups():
     assert done.dtype == torch.long
 
 
-def test_rsl_rl_restarts_its_count_with_the_episodes():
-    adapter = RslRlVecEnv(jumper(), metrics_every=100)
-    adapter.reset()
-    expected = torch.zeros(N, dtype=torch.long)
-    for action in ACTIONS:
-        done = adapter.step(torch.from_numpy(action))[2]
-        expected = (expected + 1) * (1 - done)
-        assert torch.equal(adapter.episode_length_buf, expected)
-    adapter.reset()
-    assert not adapter.episode_length_buf.any()
-
-
 def test_rsl_rl_trains_on_the_environment(one_thread):
     torch.manual_seed(0)
     env = jumper()

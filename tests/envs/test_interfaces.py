@@ -236,12 +236,14 @@ def test_an_evaluation_ends_no_episode_until_reset():
     assert set(env._graphs) == {True, False}
 
 
-def test_an_environment_that_begins_nothing_by_itself_never_does():
+def test_an_environment_that_begins_nothing_by_itself_never_does_and_can_be_given_new_beginnings():
     env = make_env(N, reset=only("default"), auto_reset=False)
     edit_episodes(env, 0, phase=LANDED, phase_steps=59)
     for steps in (1, 2):
-        env.step(REST)
+        step = env.step(REST)
         assert env.done[0] == 1.0 and env.task_arrays()["steps"][0] == steps
+    env.reset(worlds=step.terminated | step.truncated)
+    assert env.task_arrays()["steps"].tolist() == [0] + [2] * (N - 1)
 
 
 def test_a_part_of_the_worlds_may_be_evaluated_anew():
@@ -358,14 +360,6 @@ def test_some_worlds_may_begin_anew(worlds):
     states = env.sim.joint_q()[chosen]
     env.reset(worlds=worlds)
     assert (env.sim.joint_q()[chosen] != states).any(axis=1).all()  # drawn anew
-
-
-def test_an_environment_without_new_beginnings_of_its_own_can_be_given_them():
-    env = make_env(N, reset=only("default"), auto_reset=False)
-    edit_episodes(env, 0, phase=LANDED, phase_steps=59)
-    done = env.step(REST).terminated | env.step(REST).truncated
-    env.reset(worlds=done)
-    assert env.task_arrays()["steps"].tolist() == [0] + [2] * (N - 1)
 
 
 @pytest.mark.parametrize(

@@ -14,7 +14,6 @@ import hold_height
 from jumper_warp.envs.env import Env
 from jumper_warp.rl.cfg import PpoCfg
 from jumper_warp.rl.ppo import Ppo
-from jumper_warp.tasks.randomization import RandomizationCfg
 from jumper_warp.tasks.saving import TaskError, task_from_json, task_to_json
 
 ROOT = Path(__file__).parents[2]
@@ -203,13 +202,6 @@ def saved(tmp_path) -> Path:
     return path
 
 
-def test_it_is_read_back_as_it_was(saved):
-    task = task_from_json(json.loads(saved.read_text()), [hold_height])
-    expected = hold_height.hold_height().with_terms("rewards", near_goal={"weight": 50.0, "width": 0.04})
-    assert task == expected and task != hold_height.hold_height()
-    assert task.randomization == RandomizationCfg.walking() and task.numbers == expected.numbers
-
-
 def test_a_new_process_that_is_told_its_file_gives_the_same_rewards(saved, tmp_path):
     actions = 0.5 * (2.0 * torch.rand((150, N, 12), generator=torch.Generator().manual_seed(0)) - 1.0)
     np.save(tmp_path / "actions.npy", actions.numpy())
@@ -220,14 +212,6 @@ def test_a_new_process_that_is_told_its_file_gives_the_same_rewards(saved, tmp_p
         ended += env.done.sum()
         np.testing.assert_array_equal(env.reward, expected)
     assert ended >= N and len(np.unique(expected)) == N
-
-
-def test_a_new_process_that_is_not_told_its_file_says_what_it_needs(saved):
-    path = saved.with_name("tasks.json")
-    path.write_text(f"[{saved.read_text()}]")
-    said = python(UNNAMED, path, path=FILE.parent)
-    assert said.count("\n") == 1
-    assert "needs 'hold_height:" in said and "--task-module" in said
 
 
 # ---------------------------------------------------------------- nothing is imported

@@ -75,34 +75,8 @@ def test_draws_are_independent(drawn, nominal):
     np.testing.assert_array_equal(drawn["dynamic_friction"], drawn["dynamic_friction"][:1].repeat(4, 0))
 
 
-def test_cutoff_stays_below_no_load_speed(drawn, nominal):
-    share = drawn["cutoff_speed"] / nominal["cutoff_speed"][:, :1]
-    assert share.min() >= 0.8 - 1e-5 and share.max() <= 1.4 + 1e-5
-    assert (drawn["cutoff_speed"] <= 0.95 * drawn["no_load_speed"] + 1e-4).all()
-    free = drawn["cutoff_speed"] < 0.94 * drawn["no_load_speed"]
-    assert free.mean() > 0.7 and share[free].min() < 0.82
-
-
 def test_static_friction_is_not_below_dynamic(drawn):
     assert (drawn["static_friction"] >= drawn["dynamic_friction"] * (1.0 - 1e-6)).all()
-    overlapping = dataclasses.replace(OFF, static_friction=(0.6, 1.2), dynamic_friction=(0.8, 1.0))
-    found = read(randomized(overlapping))
-    assert (found["static_friction"] >= found["dynamic_friction"] * (1.0 - 1e-6)).all()
-    assert fills(found["dynamic_friction"], 0.8, 1.0)
-
-
-def test_latency_is_in_whole_physics_steps_within_the_range(drawn):
-    # 16 ms are 7.68 steps of 1/480 s, nearest to 8
-    for name in ("latency", "observation_latency"):
-        assert set(np.unique(drawn[name])) == set(range(9))
-
-
-@pytest.mark.parametrize("steps", [1, 8, 13])  # the last is 12.999999999999998 in floating point
-def test_a_latency_of_whole_physics_steps_is_kept(steps):
-    exactly = (1000.0 * steps / 480.0,) * 2
-    env = randomized(dataclasses.replace(OFF, latency=exactly, observation_latency=exactly), 2)
-    assert env.parameters.latency.numpy().tolist() == [steps] * 2
-    assert env.parameters.observation_latency.numpy().tolist() == [steps] * 2
 
 
 def test_a_link_gains_mass_and_inertia_alike(drawn, nominal):

@@ -8,9 +8,8 @@ import signal
 import sys
 from pathlib import Path
 
-from jumper_warp.rl.cfg import TrainCfg
 from jumper_warp.rl.runner import train
-from toy_task import SMALL, PushTask
+from toy_task import SMALL, PushTask, push_cfg
 
 STEPS = SMALL.num_steps
 
@@ -27,9 +26,5 @@ class Mortal(PushTask):
 
 
 if __name__ == "__main__":
-    cfg = TrainCfg(
-        resume="latest-or-new",
-        task="push", num_envs=32, iterations=6, device="cpu", log_root=Path(sys.argv[1]), log_interval=1,
-        save_interval=2, keep=10, tensorboard=False, ppo=SMALL,
-    )  # fmt: skip
+    cfg = push_cfg(Path(sys.argv[1]), resume="latest-or-new", iterations=6, log_interval=1, keep=10)
     train(cfg, lambda n, seed, device: Mortal(n, seed, device, episode_length=20 + 7 * int(os.environ["RANK"])))

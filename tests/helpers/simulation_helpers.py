@@ -1,7 +1,9 @@
 """Driving a simulation by hand in tests, and reading paws out of it."""
 
 import dataclasses
+import math
 
+import newton
 import numpy as np
 import warp as wp
 from scipy.spatial.transform import Rotation
@@ -71,6 +73,21 @@ def thrown(sim, seed, height=(0.4, 1.0), speed=1.5, joint_rate=4.0):
     write_state(sim, states.joint_q(), states.joint_qd())
     command(sim, states.angles)
     sim.filter_targets()
+
+
+def slope(degrees, height=0.0):
+    """A plane that rises along x, as a heightfield."""
+    x = np.linspace(-20.0, 20.0, 41)
+    heights = np.tile(height + math.tan(math.radians(degrees)) * x, (41, 1))
+    return newton.Heightfield(data=heights.astype(np.float32), nrow=41, ncol=41, hx=20.0, hy=20.0)
+
+
+def tilted(sim, degrees):
+    """Stand all robots on a slope, the base parallel to it, and return its rotation."""
+    q, turn = sim.joint_q().copy(), Rotation.from_euler("y", -degrees, degrees=True)
+    q[:, :3], q[:, 3:7] = turn.apply([0.0, 0.0, q[0, 2]]), turn.as_quat()
+    write_state(sim, q)
+    return turn
 
 
 def stiff_motors():

@@ -1,6 +1,9 @@
 """A mass on a line that is to be pushed to the origin: small enough to train in a second."""
 
+import dataclasses
 import os
+import socket
+from pathlib import Path
 
 import torch
 
@@ -10,6 +13,15 @@ from jumper_warp.rl.runner import train
 
 torch.set_num_threads(1)  # on matrices this small, threads mostly wait for each other
 SMALL = PpoCfg(num_steps=16, hidden=(32, 32), minibatches=4)
+
+
+def push_cfg(folder: Path, **changes) -> TrainCfg:
+    """Return the settings of a short training on the task, which logs to a folder."""
+    cfg = TrainCfg(
+        task="push", num_envs=32, iterations=4, device="cpu", log_root=folder, log_interval=2, save_interval=2,
+        tensorboard=False, ppo=SMALL,
+    )  # fmt: skip
+    return dataclasses.replace(cfg, **changes)
 
 
 class PushTask:
@@ -95,6 +107,12 @@ def fill(ppo: Ppo, worlds: slice, num_worlds: int) -> None:
 
 def local_order(rank: int, size: int) -> torch.Tensor:
     return torch.randperm(size, generator=torch.Generator().manual_seed(rank))
+
+
+def free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return probe.getsockname()[1]
 
 
 def join(rank: int, port: int) -> None:

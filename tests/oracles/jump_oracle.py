@@ -3,7 +3,7 @@
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from jump_helpers import DEFAULT_ANGLE, make_episode, make_view
+from jump_helpers import DEFAULT_ANGLE
 
 DT = 1.0 / 60.0
 CONTACT_FORCE = 0.1  # [N]
@@ -38,51 +38,6 @@ def robot_of(env) -> dict[str, np.ndarray]:
         "clipped": np.sum((views.target.numpy().astype(float) - views.safe_target.numpy()) ** 2, axis=0),
     }
     return robot | {name: tasks[name].copy() for name in EPISODE}
-
-
-def random_robots(n: int, seed: int) -> dict[str, np.ndarray]:
-    """Return robots in all phases, near and far from their goals and headings, some of them next to yaw 180 degrees."""
-    rng = np.random.default_rng(seed)
-    near = 10.0 ** rng.uniform(-2.0, 0.0, (n, 1))
-    heading = np.where(rng.random(n) < 0.3, np.pi * rng.choice([-1.0, 1.0], n), rng.uniform(-np.pi, np.pi, n))
-    turn = Rotation.from_euler("z", heading[:, None]) * Rotation.from_rotvec(near * rng.normal(size=(n, 3)))
-    goal = np.concatenate([rng.uniform(-2.0, 2.0, (n, 2)), np.zeros((n, 1))], axis=1)
-    pos = goal + near * rng.normal(size=(n, 3))
-    pos[:, 2] = rng.uniform(0.15, 0.9, n)
-    vel = near * np.array([2.0, 2.0, 3.0]) * rng.normal(size=(n, 3))
-    return {
-        "pos": pos, "quat": turn.as_quat(), "vel": vel, "acc": 40.0 * rng.normal(size=(n, 3)),
-        "spin": 10.0 * near * rng.normal(size=(n, 3)), "rate": rng.normal(size=(12, n)),
-        "angle": DEFAULT_ANGLE[:, None] + near.T * rng.normal(size=(12, n)),
-        "rate_change": 100.0 * rng.normal(size=(12, n)),
-        "torque": 9.0 * rng.normal(size=(12, n)), "action": rng.uniform(-1.0, 1.0, (12, n)),
-        "old_action": rng.uniform(-1.0, 1.0, (12, n)), "force": 100.0 * rng.uniform(-0.5, 1.0, (4, n)).clip(0.0),
-        "clipped": rng.random(n),
-        "old_torque": 9.0 * rng.normal(size=(12, n)), "peak": 150.0 * rng.random((4, n)),
-        "paws": pos + 0.3 * rng.normal(size=(4, n, 3)), "air_time": rng.uniform(0.0, 0.2, (4, n)),
-        "paws_landed": rng.integers(0, 16, n),
-        "goal": goal, "heading": heading, "start": pos + near * rng.normal(size=(n, 3)), "phase": rng.integers(0, 3, n),
-        "phase_steps": rng.integers(0, 60, n), "steps": rng.integers(0, 60, n), "command_step": rng.integers(0, 60, n),
-        "took_off": rng.integers(0, 2, n), "touched_down": rng.integers(0, 2, n), "at_apex": rng.integers(0, 2, n),
-        "apex_passed": rng.integers(0, 2, n), "max_height": rng.uniform(0.3, 1.0, n),
-    }  # fmt: skip
-
-
-def kernel_inputs(r: dict) -> tuple[list, list]:
-    """Return the `RobotView` and the `JumpState` of each of some robots."""
-    views, tasks = [], []
-    gravity = Rotation.from_quat(r["quat"]).inv().apply([0.0, 0.0, -1.0])
-    motors = ("angle", "rate", "rate_change", "torque", "old_torque", "action", "old_action")
-    for i in range(len(r["pos"])):
-        base = {"pos": r["pos"][i], "quat": r["quat"][i], "lin_vel": r["vel"][i], "lin_acc": r["acc"][i]}
-        base |= {"old_lin_vel": r["vel"][i] - DT * r["acc"][i]}
-        base |= {"ang_vel": r["spin"][i], "gravity": gravity[i], "paw_force": r["force"][:, i]}
-        base |= {"peak_force": r["peak"][:, i], "air_time": r["air_time"][:, i], "paw_pos": r["paws"][:, i].ravel()}
-        base |= {"contact": (r["force"][:, i] > CONTACT_FORCE).astype(float)}
-        base |= {"contacts": int(np.count_nonzero(r["force"][:, i] > CONTACT_FORCE))}
-        views.append(make_view(**base, **{name: r[name][:, i] for name in motors}, clipped=float(r["clipped"][i])))
-        tasks.append(make_episode(**{name: r[name][i] if r[name].ndim > 1 else r[name][i].item() for name in EPISODE}))
-    return views, tasks
 
 
 def between(before: dict, after: dict, action: np.ndarray) -> dict[str, np.ndarray]:
@@ -141,11 +96,6 @@ def rotation_error(r):
     """Angle [rad] between the body and the level frame with the heading."""
     level = Rotation.from_euler("z", r["heading"][:, None])
     return (level.inv() * Rotation.from_quat(r["quat"])).magnitude()
-
-
-def yaw_error(r):
-    """Yaw [rad] beyond the heading, within -pi to pi."""
-    return np.angle(np.exp(1j * (Rotation.from_quat(r["quat"]).as_euler("ZYX")[:, 0] - r["heading"])))
 
 
 def error(r):
@@ -228,10 +178,6 @@ TERMS = {
     "rest": lambda r, p: at_ease(r) * phi(norm(r["vel"]), p["speed"]) * phi(norm(r["spin"]), p["spin"]),
     "landing_tilt": lambda r, p: (r["phase"] == LANDED) * (lean(r) / np.sin(p["width"])) ** 2,
     "descent_tilt": lambda r, p: (r["phase"] == FLIGHT) * (r["vel"][:, 2] <= 0.0) * (lean(r) / np.sin(p["width"])) ** 2,
-    "lifted_paws": lambda r, p: (
-        ((r["phase"] == LANDED) & (r["phase_steps"] > p["steps"]))
-        * np.count_nonzero(r["force"] <= CONTACT_FORCE, axis=0)
-    ),
     "lifted_again": lambda r, p: (
         (r["phase"] == LANDED)
         * np.sum(

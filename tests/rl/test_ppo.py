@@ -1,5 +1,4 @@
 import dataclasses
-import socket
 
 import pytest
 import torch
@@ -15,7 +14,7 @@ from jumper_warp.rl.adam import adapted_lr
 from jumper_warp.rl.cfg import PpoCfg
 from jumper_warp.rl.ppo import STATISTICS, Ppo
 from jumper_warp.rl.samples import Batch, gae
-from toy_task import SMALL, PushTask, fill, local_order, update_half
+from toy_task import SMALL, PushTask, fill, free_port, local_order, update_half
 
 PLAIN = PpoCfg(
     num_steps=8, epochs=1, minibatches=1, hidden=(16, 8), normalise_value=False, reward_scale=1.0, max_grad_norm=1e9
@@ -109,16 +108,6 @@ def test_step_size_after_the_update_equals_rsl_rl(pair):
     assert ppo.lr.item() == pytest.approx(theirs.learning_rate)
 
 
-def test_gradients_are_shortened_as_rsl_rl_does():
-    torch.manual_seed(0)
-    ppo = Ppo(PushTask(16), dataclasses.replace(PLAIN, max_grad_norm=0.05))
-    fill(ppo, slice(None), 16)
-    ppo.update()
-    actor, critic = (part.norm().item() for part in ppo.flat.gradients())
-    assert actor == pytest.approx(0.05, rel=1e-4)
-    assert critic == pytest.approx(0.05, rel=1e-4)
-
-
 def test_gae_by_hand():
     # gamma 0.5, lambda 0.5; the second step ends an episode.
     # delta: 1 + 0.5*4 - 2 = 1;  2 - 4 = -2;  3 + 0.5*8 - 6 = 1.  Advantage: 1 - 0.25*2 = 0.5; -2; 1.
@@ -168,13 +157,13 @@ def test_the_timeout_looks_at_the_old_episode():
     ],
 )
 def test_step_size_follows_the_divergence(lr, kl, expected):
-    found = adapted_lr(torch.tensor(lr), torch.tensor(kl), PpoCfg(desired_kl=0.01, min_lr=1.0e-5))
+    found = adapted_lr(torch.tensor(lr), torch.tensor(kl), PpoCfg(desired_kl=0.01, min_lr=1.0e-5), 0.01)
     assert found.item() == pytest.approx(expected)
 
 
 def test_step_size_stays_without_desired_divergence():
     cfg = PpoCfg(desired_kl=0.0)
-    assert adapted_lr(torch.tensor(1e-3), torch.tensor(9.0), cfg).item() == pytest.approx(1e-3)
+    assert adapted_lr(torch.tensor(1e-3), torch.tensor(9.0), cfg, 0.0).item() == pytest.approx(1e-3)
 
 
 def trained(iterations):
@@ -210,11 +199,6 @@ def test_the_critic_learns_the_return_in_its_own_unit():
         value = ppo.model.value(ppo.rollout.critic_obs)
     assert value.mean().item() == pytest.approx(expected, rel=0.1)
     assert head.abs().max() < 5.0
-
-
-def test_the_same_seed_gives_the_same_bits():
-    first, second = trained(3)[0].model.state_dict(), trained(3)[0].model.state_dict()
-    assert all(torch.equal(value, second[name]) for name, value in first.items())
 
 
 class BrokenWorlds(PushTask):
@@ -282,12 +266,6 @@ def test_an_iteration_never_waits_for_the_host():
 def test_the_check_for_waiting_sees_an_item():
     with pytest.raises(AssertionError, match="_local_scalar_dense"), NoHost():
         torch.ones(()).item()
-
-
-def free_port():
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return probe.getsockname()[1]
 
 
 def test_two_processes_equal_one_with_all_worlds(tmp_path):
@@ -431,11 +409,3 @@ def test_settings_out_of_range_are_refused(change, message):
 def test_minibatches_must_divide_the_batch():
     with pytest.raises(ValueError, match="7 minibatches do not divide 8 x 16"):
         Ppo(PushTask(16), dataclasses.replace(PLAIN, minibatches=7))
-
-
-def test_a_batch_is_time_major():
-    ppo = Ppo(PushTask(4), PLAIN)
-    fill(ppo, slice(None), 4)
-    batch = ppo.batch()
-    assert isinstance(batch, Batch)
-    torch.testing.assert_close(batch.action[5], ppo.rollout.action[1, 1])

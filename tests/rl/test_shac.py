@@ -5,11 +5,11 @@ import dataclasses
 import pytest
 import torch
 
-from jumper_warp.rl.cfg import ShacCfg, TrainCfg
+from jumper_warp.rl.cfg import ShacCfg
 from jumper_warp.rl.runner import train
 from jumper_warp.rl.shac import Shac
 from jumper_warp.utils.errors import InputError
-from toy_task import SMALL, PushTask
+from toy_task import SMALL, PushTask, push_cfg
 
 CFG = dataclasses.replace(SMALL, init_std=0.3, num_steps=8)
 
@@ -135,10 +135,7 @@ def test_a_saved_training_goes_on_in_the_same_bits_and_the_same_seed_repeats_the
 
 
 def test_a_run_trains_with_it(tmp_path):
-    cfg = TrainCfg(
-        task="push", num_envs=16, iterations=3, device="cpu", log_root=tmp_path, log_interval=1, tensorboard=False,
-        trainer="shac", ppo=CFG,
-    )  # fmt: skip
+    cfg = push_cfg(tmp_path, num_envs=16, iterations=3, log_interval=1, trainer="shac", ppo=CFG)
     result = train(cfg, lambda n, seed, device: SmoothPushTask(n, seed, device, episode_length=8))
     assert result.iteration == 3
     assert result.figures["Train/mean_length"] == 8.0

@@ -7,7 +7,6 @@ import pytest
 import torch
 from test_shac import SmoothPushTask
 
-from jumper_warp.rl.cfg import TrainCfg
 from jumper_warp.rl.checkpoint import load_checkpoint, save_checkpoint
 from jumper_warp.rl.mirror import nearest_plain_layers, plain_layers, symmetric_layers, symmetry_of
 from jumper_warp.rl.networks import EPS, ActorCritic
@@ -15,7 +14,7 @@ from jumper_warp.rl.ppo import Ppo
 from jumper_warp.rl.runner import CHECKPOINTS, CONFIG, train
 from jumper_warp.rl.start import KNOWN_ITERATIONS, begin_with, make_start
 from jumper_warp.utils.errors import InputError
-from toy_task import SMALL, PushTask
+from toy_task import SMALL, PushTask, push_cfg
 
 SYMMETRY = symmetry_of(PushTask(1))
 SYMMETRIC = dataclasses.replace(SMALL, symmetry="actor")
@@ -48,10 +47,8 @@ def start_of(model, cfg=SMALL, activation="elu"):
 
 @pytest.fixture
 def cfg(tmp_path):
-    return TrainCfg(
-        task="push", num_envs=32, iterations=1, device="cpu", log_root=tmp_path, log_interval=1, tensorboard=False,
-        ppo=dataclasses.replace(SMALL, lr=1e-9, min_lr=1e-9, max_lr=1e-9), start_from="pusher",
-    )  # fmt: skip
+    ppo = dataclasses.replace(SMALL, lr=1e-9, min_lr=1e-9, max_lr=1e-9)
+    return push_cfg(tmp_path, iterations=1, log_interval=1, ppo=ppo, start_from="pusher")
 
 
 def make_env(num_envs, seed, device):
@@ -246,29 +243,6 @@ def test_a_checkpoint_that_began_with_random_weights_is_resumed(cfg, before):
     save_checkpoint(path.parent, {**state, "config": json.dumps(config) if before else state["config"]})
     result = train(dataclasses.replace(cfg, start_from=None, resume=str(first.folder), iterations=2), make_env)
     assert json.loads((result.folder / CONFIG).read_text())["train"]["start_from"] is None
-
-
-def test_after_an_elastic_restart_the_checkpoint_wins(cfg, monkeypatch):
-    monkeypatch.setenv("TORCHELASTIC_RUN_ID", "one")
-    monkeypatch.setenv("TORCHELASTIC_RESTART_COUNT", "0")
-    first = train(cfg, make_env, start=start_of(actor()))
-    monkeypatch.setenv("TORCHELASTIC_RESTART_COUNT", "1")
-    again = train(dataclasses.replace(cfg, iterations=2), make_env, start=start_of(actor()))
-    assert (again.folder, again.iteration) == (first.folder, 2)
-    assert model_of(again)["obs_moments.count"] == (KNOWN_ITERATIONS + 2) * 32 * SMALL.num_steps
-    assert json.loads((again.folder / CONFIG).read_text())["train"]["start_from"] == "pusher"
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"resume": "latest"}, "resume, .* or start_from, .* not both"),
-        ({"trainer": "rsl-rl"}, "start_from is not offered with trainer rsl-rl"),
-    ],
-)
-def test_settings_that_exclude_a_start_are_refused(change, message):
-    with pytest.raises(InputError, match=message):
-        TrainCfg(start_from="pusher", **change)
 
 
 def test_name_and_policy_need_each_other(cfg):

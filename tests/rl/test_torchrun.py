@@ -2,7 +2,6 @@
 
 import json
 import os
-import socket
 import subprocess
 import sys
 from pathlib import Path
@@ -14,14 +13,9 @@ import elastic_task
 from jumper_warp.rl.checkpoint import load_checkpoint
 from jumper_warp.rl.logger import FIGURES
 from jumper_warp.rl.runner import CHECKPOINTS
+from toy_task import free_port
 
 STEPS = elastic_task.STEPS
-
-
-def free_port():
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return probe.getsockname()[1]
 
 
 def start(folder, nodes, *deaths, restarts=0):

@@ -5,18 +5,14 @@ import time
 
 import pytest
 
-from jumper_warp.rl.cfg import TrainCfg
 from jumper_warp.rl.checkpoint import load_checkpoint
 from jumper_warp.rl.runner import CHECKPOINTS, train
-from toy_task import SMALL, PushTask
+from toy_task import SMALL, PushTask, push_cfg
 
 
 @pytest.fixture
 def cfg(tmp_path):
-    return TrainCfg(
-        task="push", num_envs=32, iterations=100, device="cpu", log_root=tmp_path / "logs", log_interval=2,
-        save_interval=2, tensorboard=False, ppo=SMALL,
-    )  # fmt: skip
+    return push_cfg(tmp_path / "logs", iterations=100)
 
 
 def saved_seconds(result):

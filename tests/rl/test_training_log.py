@@ -6,21 +6,17 @@ import resource
 import pytest
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from jumper_warp.rl.cfg import TrainCfg
 from jumper_warp.rl.logger import FIGURES, TrainingLog, _duration
 from jumper_warp.rl.metrics_file import MetricsFile
 from jumper_warp.rl.runner import CHECKPOINTS, train
-from toy_task import SMALL, PushTask
+from toy_task import PushTask, push_cfg
 
 NUMBERS = {"Perf/fps": 1234.0, "Metrics/success": 0.5}
 
 
 @pytest.fixture
 def cfg(tmp_path):
-    return TrainCfg(
-        task="push", num_envs=32, iterations=6, device="cpu", log_root=tmp_path / "logs", log_interval=1,
-        save_interval=2, tensorboard=False, ppo=SMALL,
-    )  # fmt: skip
+    return push_cfg(tmp_path / "logs", iterations=6, log_interval=1)
 
 
 @contextlib.contextmanager

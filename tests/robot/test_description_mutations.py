@@ -11,6 +11,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from json_helpers import places
 from jumper_warp.robot.description import DEFAULT_DESCRIPTION, RobotDescriptionError, load_description
 
 JSON = json.loads(DEFAULT_DESCRIPTION.read_text())
@@ -51,14 +52,6 @@ def attributes(root):
                 continue
 
 
-def slots(tree):
-    """Every place of a JSON tree: its container, and its key or index."""
-    for key in list(tree) if isinstance(tree, dict) else range(len(tree)):
-        yield tree, key
-        if isinstance(tree[key], dict | list):
-            yield from slots(tree[key])
-
-
 def is_number(value):
     return isinstance(value, int | float) and not isinstance(value, bool)
 
@@ -66,7 +59,7 @@ def is_number(value):
 def magnitudes():
     """The absolute values of all numbers of the description."""
     found = {abs(value) for _, _, values in attributes(ElementTree.fromstring(URDF)) for value in values}
-    found |= {abs(table[key]) for table, key in slots(JSON) if is_number(table[key])}
+    found |= {abs(table[key]) for table, key in places(JSON) if is_number(table[key])}
     return sorted(found - {0.0})
 
 
@@ -77,7 +70,7 @@ def change_everywhere(magnitude, change):
         if magnitude in map(abs, values):
             holder[name] = " ".join(repr(change(v) if abs(v) == magnitude else v) for v in values)
     tree = json.loads(json.dumps(JSON))
-    for table, key in slots(tree):
+    for table, key in places(tree):
         if is_number(table[key]) and abs(table[key]) == magnitude:
             table[key] = change(table[key])
     return ElementTree.tostring(root, encoding="unicode"), json.dumps(tree)
@@ -143,7 +136,7 @@ def test_numbers_that_are_not_finite_are_refused(assets):
 @given(data=st.data())
 def test_one_changed_place_of_the_json_is_refused_or_harmless(assets, data):
     tree = json.loads(json.dumps(JSON))
-    table, key = data.draw(st.sampled_from(list(slots(tree))))
+    table, key = data.draw(st.sampled_from(list(places(tree))))
     old = table[key]
     if data.draw(st.booleans()):
         table[key] = data.draw(st.sampled_from([*JUNK, *NOT_FINITE, 0, *(old * f for f in FACTORS if is_number(old))]))

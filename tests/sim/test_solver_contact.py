@@ -1,7 +1,6 @@
 import itertools
 import math
 
-import newton
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -14,8 +13,10 @@ from simulation_helpers import (
     paw_forces,
     simulation,
     slip_velocities,
+    slope,
     stiff_motors,
     thrown,
+    tilted,
     write_state,
 )
 from solver_helpers import DOFS, MOTOR_Q, MOTOR_V
@@ -112,21 +113,10 @@ def test_friction_opposes_sliding_at_mu_times_the_normal_force():
     assert checked > 1000
 
 
-def slope(degrees, height=0.0):
-    """A plane that rises along x, as a heightfield."""
-    x = np.linspace(-20.0, 20.0, 41)
-    heights = np.tile(height + math.tan(math.radians(degrees)) * x, (41, 1))
-    return newton.Heightfield(data=heights.astype(np.float32), nrow=41, ncol=41, hx=20.0, hy=20.0)
-
-
 def on_slope(num_worlds, degrees, friction):
-    """Robots standing on a slope on stiff legs, the base parallel to it."""
+    """Robots standing on a slope on stiff legs, the base parallel to it, and its rotation."""
     sim = simulation(num_worlds, ground=slope(degrees), friction=friction, motors=stiff_motors())
-    q = sim.joint_q().copy()
-    tilt = Rotation.from_euler("y", -degrees, degrees=True)
-    q[:, :3], q[:, 3:7] = tilt.apply([0.0, 0.0, q[0, 2]]), tilt.as_quat()
-    write_state(sim, q)
-    return sim, tilt
+    return sim, tilted(sim, degrees)
 
 
 def test_robot_holds_on_a_slope_below_the_friction_angle():

@@ -3,20 +3,15 @@ import numpy as np
 import pytest
 import warp as wp
 from newton import ModelFlags, StateFlags
-from newton.sensors import SensorIMU
 from newton.solvers import SolverBase
 
 from jumper_warp.robot.model import build_model
 from jumper_warp.sim.dynamics import NotThisRobotError
-from jumper_warp.sim.simulation import Simulation
 from jumper_warp.sim.solver import SolverJumper
+from simulation_helpers import simulation
 from solver_helpers import BODIES, COORDS, DOFS, KNEE_V, MOTOR_V
 
 DT = 1.0 / 480.0
-
-
-def simulation(num_worlds, **arguments):
-    return Simulation(num_worlds, visuals=False, device="cpu", **arguments)
 
 
 def launch(sim):
@@ -167,19 +162,6 @@ def test_gravity_of_each_world():
     assert sim.joint_qd()[:, :3] == pytest.approx(np.array([[0.0, 0.0, -9.81], [1.0, 2.0, -3.0]]) * DT, abs=1e-6)
 
 
-def test_reset_restores_only_the_masked_worlds():
-    sim = simulation(3)
-    reference = sim.joint_q().copy()
-    trajectory(sim, steps=10)
-    moved, rates = sim.joint_q().copy(), sim.joint_qd().copy()
-    sim.solver.reset(sim.state, wp.array([False, True, False, False], dtype=wp.bool, device="cpu"))
-    assert sim.joint_q()[1] == pytest.approx(reference[1], abs=1e-6)
-    assert not sim.joint_qd()[1].any()
-    for world in (0, 2):
-        assert sim.joint_q()[world] == pytest.approx(moved[world], abs=1e-6)
-        assert sim.joint_qd()[world] == pytest.approx(rates[world], abs=1e-4)
-
-
 def test_reset_of_the_solver_alone_leaves_the_state():
     sim = simulation(2)
     trajectory(sim, steps=25)
@@ -272,27 +254,6 @@ def test_bodies_are_those_of_newtons_kinematics(pair):
     assert sim.loop_gap().max() < 1e-6
 
 
-def imu_site(sim):
-    """Make a paw shape a site and return its label."""
-    index = next(i for i, label in enumerate(sim.model.shape_label) if label.endswith("world_0/FL_paw"))
-    flags = sim.model.shape_flags.numpy()
-    flags[index] |= int(newton.ShapeFlags.SITE)
-    sim.model.shape_flags.assign(flags)
-    return sim.model.shape_label[index]
-
-
-def test_imu_on_a_standing_robot_measures_gravity():
-    sim = simulation(1)
-    sensor = SensorIMU(sim.model, sites=imu_site(sim), request_state_attributes=False)
-    observables = sim.solver.observables(kinds=sensor.solver_observable_kinds)
-    for _ in range(120):
-        sim.step()
-    sim.solver.step_motors(sim.state, sim.state, sim.motors, sim.target, DT, 1, observables=observables)
-    sensor.update(sim.state, observables=observables)
-    assert np.linalg.norm(sensor.accelerometer.numpy()[0]) == pytest.approx(9.81, abs=0.02)
-    assert np.linalg.norm(sensor.gyroscope.numpy()[0]) < 0.01
-
-
 def test_body_accelerations_are_observable():
     sim = simulation(1, ground=None)
     observables = sim.solver.observables({SolverBase.ObservableKind.BODY_QDD})
@@ -301,15 +262,3 @@ def test_body_accelerations_are_observable():
     assert observables.body_qdd.numpy() == pytest.approx(fall, abs=5e-3)
     with pytest.raises(ValueError, match="contact_f"):
         sim.solver.observables({"contact_f"})
-
-
-def test_viewer_takes_the_state():
-    sim = simulation(2)
-    viewer = newton.viewer.ViewerNull(num_frames=2)
-    viewer.set_model(sim.model)
-    while viewer.is_running():
-        sim.step()
-        viewer.begin_frame(0.0)
-        viewer.log_state(sim.state)
-        viewer.end_frame()
-    assert viewer.frame_count == 2

@@ -2,7 +2,6 @@
 
 import math
 
-import newton
 import numpy as np
 import pytest
 import warp as wp
@@ -14,7 +13,17 @@ from jumper_warp.kernels import layout
 from jumper_warp.robot.model import LIMIT_DAMPING, LIMIT_STIFFNESS, build_model
 from jumper_warp.robot.motors import vertical_jump_filter
 from jumper_warp.sim.dynamics import JumperDynamics
-from simulation_helpers import PAW_RADIUS, WEIGHT, command, paw_centres, paw_forces, simulation, write_state
+from simulation_helpers import (
+    PAW_RADIUS,
+    WEIGHT,
+    command,
+    paw_centres,
+    paw_forces,
+    simulation,
+    slope,
+    tilted,
+    write_state,
+)
 from solver_helpers import BODIES, DOFS, MOTOR_V, Reference, States, random_states
 
 DT = 1.0 / 480.0
@@ -26,19 +35,6 @@ STRENGTH = DT * LIMIT_STIFFNESS + LIMIT_DAMPING
 """[N m s/rad]"""
 SQUATS = [2.05, 2.1, 2.4, 2.6]
 """[rad] Targets of the transversal motors; their stop is at 2.09 rad."""
-
-
-def slope(degrees):
-    x = np.linspace(-20.0, 20.0, 41)
-    heights = np.tile(math.tan(math.radians(degrees)) * x, (41, 1))
-    return newton.Heightfield(data=heights.astype(np.float32), nrow=41, ncol=41, hx=20.0, hy=20.0)
-
-
-def tilt(sim, degrees):
-    """Put standing robots on a slope, the base parallel to it."""
-    q, turn = sim.joint_q().copy(), Rotation.from_euler("y", -degrees, degrees=True)
-    q[:, :3], q[:, 3:7] = turn.apply([0.0, 0.0, q[0, 2]]), turn.as_quat()
-    write_state(sim, q)
 
 
 def randomise(sim, seed):
@@ -100,7 +96,7 @@ def test_robots_of_all_kinds_rest_on_the_stops_of_the_squat():
 
 def test_robot_rests_on_the_stops_on_a_slope():
     sim = simulation(len(SQUATS), ground=slope(10.0))
-    tilt(sim, 10.0)
+    tilted(sim, 10.0)
     peak_to_peak, lost = ripple(sim, np.array(SQUATS))
     assert peak_to_peak.max() < 0.01 * WEIGHT
     assert lost == 0.0

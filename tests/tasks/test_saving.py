@@ -10,6 +10,7 @@ import pytest
 import warp as wp
 
 import hold_height
+from json_helpers import places
 from jumper_warp.kernels.jump import rewards
 from jumper_warp.kernels.jump.state import JumpState
 from jumper_warp.kernels.mdp.view import RobotView
@@ -192,14 +193,6 @@ VALUES = [
     deep(300), {"type": ["x"]}, {"type": {"type": "x"}},
 ]  # fmt: skip
 KEYS = ["extra", "", "a\nb", "\ud800", "type", "func", "name", "self", "weight", "history", "settings", "version"]
-
-
-def places(tree):
-    """Every place of a JSON tree: its container, and its key or index."""
-    for key in list(tree) if isinstance(tree, dict) else range(len(tree)):
-        yield tree, key
-        if isinstance(tree[key], dict | list):
-            yield from places(tree[key])
 
 
 def mutate(tree, rng):

@@ -293,15 +293,6 @@ def test_a_command_before_the_first_step_is_taken_by_a_robot_that_stands(env):
     assert not after["command_step"].any() and not after["jumps"].any()
 
 
-def test_the_policy_sees_its_next_jump_after_the_next_step(env):
-    land(env, goal=(0.0, 0.0, 0.0))
-    env.auto_reset = False
-    goals = np.tile([0.7, -0.2, 0.0], (N, 1))
-    env.command(goals, np.ones(N, dtype=bool))
-    env.step(REST)
-    np.testing.assert_allclose(env.obs[:, :2], goals[:, :2], atol=0.01)  # the base moves by millimetres in a step
-
-
 # ---------------------------------------------------------------- success
 
 
@@ -342,16 +333,3 @@ def test_five_near_landings_raise_the_level_and_a_far_one_does_not(env):
 
 
 # ---------------------------------------------------------------- the critic's observation at an episode's end
-
-
-def test_the_critics_last_observation_is_kept_beside_the_first_of_the_next_episode(env):
-    stand(env)
-    edit_episodes(env, slice(0, 5), phase=LANDED, phase_steps=59)
-    env.step(0.2 * random_actions(N, 1)[0])
-    ended = env.done == 1.0
-    assert ended.tolist() == [True] * 5 + [False] * (N - 5)
-    assert torch.equal(env.critic_obs[~ended], env.final_critic_obs[~ended])
-    first, last = env.critic_obs[ended], env.final_critic_obs[ended]
-    assert last[:, 48:51].tolist() == [[0.0, 0.0, 1.0]] * 5 and first[:, 48:51].tolist() == [[1.0, 0.0, 0.0]] * 5
-    np.testing.assert_allclose(last[:, 51], 1.0, atol=1e-6)
-    assert not first[:, 51].any()

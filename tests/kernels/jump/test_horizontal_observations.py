@@ -190,14 +190,6 @@ def test_the_critic_sees_paw_forces_in_body_weights_and_no_more_than_five():
     np.testing.assert_allclose(found, [0.0, 1.0, 0.5, 5.0], atol=1e-6)
 
 
-def test_what_is_not_finite_is_seen_as_zero_by_both():
-    robots = random_robots(HORIZONTAL)
-    robots.q[3, 0], robots.qd[4, 0], robots.q[5, 3], robots.force[1, 6, 0] = math.nan, math.inf, math.nan, math.nan
-    actor, critic = robots.both()
-    assert np.isfinite(actor).all() and np.isfinite(critic).all()
-    assert not critic[3, [0, 1, ROBOT + 7, ROBOT + 9]].any()
-
-
 # ---------------------------------------------------------------- in the environment
 
 

@@ -95,13 +95,6 @@ def test_a_sensor_offset_is_added_to_its_own_angle():
     assert difference[COLUMN["angle_FR_outer"]] == pytest.approx(0.03, abs=1e-6)
 
 
-def test_what_is_not_finite_is_seen_as_zero():
-    robots = standing()
-    robots.q[0, 8], robots.qd[0, 0] = math.nan, math.inf
-    obs = robots.observe()[0]
-    assert np.isfinite(obs).all() and obs[COLUMN["angle_FL_outer"]] == 0.0
-
-
 @pytest.fixture(scope="module")
 def draws():
     """Noise over its standard deviation in 4 steps of 4096 worlds, (4, 4096, 33), and the raw noise."""

@@ -80,10 +80,3 @@ def test_early_takeoff():
     assert holds("early_takeoff", make_view(), make_episode(took_off=1, steps=29, **jumped))
     assert not holds("early_takeoff", make_view(), make_episode(took_off=1, steps=30, **jumped))
     assert not holds("early_takeoff", make_view(), make_episode(took_off=0, steps=29, **jumped))
-
-
-def test_second_takeoff_is_off_all_paws_rising_after_the_landing():
-    for contacts, vz, phase, again in ((0, 0.3, LANDED, True), (0, 0.2, LANDED, False), (1, 0.3, LANDED, False),
-                                       (0, 0.3, FLIGHT, False), (0, 0.3, STANCE, False)):  # fmt: skip
-        view = make_view(contacts=contacts, lin_vel=(0.0, 0.0, vz))
-        assert holds("second_takeoff", view, make_episode(phase=phase), speed=0.25) is again

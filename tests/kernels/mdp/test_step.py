@@ -68,7 +68,7 @@ def test_weights_and_parameters_change_while_it_runs(probe):
     np.testing.assert_allclose(probe.skill.term_value.numpy(), expected, rtol=1e-5, atol=1e-6)
 
 
-@pytest.mark.parametrize("number", [np.nan, np.inf])
+@pytest.mark.parametrize("number", [np.nan, np.inf, -np.inf])
 def test_a_term_that_is_not_finite_erases_no_other_and_is_seen(probe, number):
     _, other, height = random_state(probe)
     probe.write(value=np.where(np.arange(N) < 5, number, 1.0))
