@@ -190,14 +190,7 @@ class Rollout:
         self.dynamics.robot.geometry.assign(legs)
 
     def run(
-        self,
-        targets: Any,
-        q: Any,
-        qd: Any,
-        *,
-        before: Any = None,
-        wrench: Any = None,
-        impulse: wp.array | None = None,
+        self, targets: Any, q: Any, qd: Any, *, before: Any = None, wrench: Any = None, impulse: wp.array | None = None
     ) -> Trajectory:
         """Simulate. Arrays of Warp or NumPy, of the shapes below or without worlds, which then are alike.
 

@@ -124,7 +124,7 @@ def play(run: EvaluationRun, cfg: PlayCfg) -> Path:
     log = flags.log(run.evaluation.for_evaluation(run.task))
     env, worlds = run.env(log.count), range(log.count)
     notes = {"task": name, **log.notes(worlds), "solver": cfg.conditions.solver}
-    film = Film(env, log, worlds, spacing=log.spacing, notes=notes, motors=True)
+    film = Film(env, log.series, worlds, spacing=log.spacing, notes=notes, motors=True)
     run_evaluation(run.policy.act, env, log, seconds=cfg.seconds or flags.length, watch=film, stop=False)
     path = film.save_rrd(run.folder / f"{log.row}.rrd", log.marks(worlds))
     write_metrics(run.folder, log.columns())
@@ -157,7 +157,7 @@ def play_script(cfg: ScriptCfg) -> Path:
     run.prepare("play", cfg.conditions, cfg.out)
     course = Course([script])
     env = run.env(1, block=course.block)
-    film = Film(env, course, [0], notes={**course.notes([0]), "solver": cfg.conditions.solver})
+    film = Film(env, course.series, [0], notes={**course.notes([0]), "solver": cfg.conditions.solver})
     run_evaluation(run.actor(env), env, course, watch=film)
     path = film.save_rrd(run.folder / "course.rrd")
     draw_course(run.folder / "course.png", course, 0)

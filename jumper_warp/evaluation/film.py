@@ -5,7 +5,7 @@ Nothing of the viewer or the pictures is imported before there is something to f
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -20,7 +20,6 @@ from jumper_warp.utils.rotations import rotate
 
 if TYPE_CHECKING:
     from jumper_warp.envs.env import Env
-    from jumper_warp.evaluation.log import EvaluationLog
     from jumper_warp.robot.grounds import BlockCfg
     from jumper_warp.sim.simulation import Simulation
 
@@ -73,7 +72,7 @@ class Film:
     def __init__(
         self,
         env: Env,
-        log: EvaluationLog,
+        series: Callable[[Sequence[int]], Mapping[str, float]],
         worlds: Sequence[int],
         *,
         spacing: float = 1.2,
@@ -82,7 +81,9 @@ class Film:
         notes: Mapping[str, Any] | None = None,
         motors: bool = False,
     ) -> None:
-        """Film worlds (at least one) of the environment, together with the series of the log.
+        """Film worlds (at least one) of the environment, together with series of numbers.
+
+        series: returns what to draw of the worlds over time, as `EvaluationLog.series`.
 
         spacing: [m] along y, by which each world is drawn beside the one before it; 0 on a heightfield. ground: as in
         `build_model`; block: the environment's sliding blocks, if it has any; notes: saved along, must be JSON;
@@ -90,7 +91,7 @@ class Film:
         """
         from jumper_warp.viz.recorder import Recorder
 
-        self.env, self.log, self.worlds, self.spacing, self.motors = env, log, list(worlds), spacing, motors
+        self.env, self.series, self.worlds, self.spacing, self.motors = env, series, list(worlds), spacing, motors
         self.links = Links(env)
         self.model = build_model(len(worlds), ground=ground, device=env.wp_device)
         self.recorder = Recorder(self.model, range(len(worlds)), spacing=spacing, notes=notes)
@@ -102,7 +103,7 @@ class Film:
         """Add the environment's state of the moment."""
         sim = self.env.sim
         poses = self.links.read()[0][self.worlds]
-        series = self.log.series(self.worlds) | (self._motor_series() if self.motors else {})
+        series = {**self.series(self.worlds), **(self._motor_series() if self.motors else {})}
         forces = sim.paw_force.numpy().transpose(1, 0, 2)[self.worlds]
         if self.block is not None:
             self.block_places.append(block_places(sim)[self.worlds])

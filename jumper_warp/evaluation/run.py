@@ -148,7 +148,7 @@ class Run(ABC):
         self._latency.append(env.parameters.latency.numpy().copy())
         self._physics_dt = env.physics_dt
         if pictures is not None:
-            self._develop(pictures, film)
+            self._develop(pictures, log, film)
         return log
 
     def _film(self, env: Env, log: EvaluationLog, drawn: Mapping[str, Any]) -> Film:
@@ -156,12 +156,13 @@ class Run(ABC):
         ground = drawn.get("ground", "plane")
         worlds = np.linspace(0, env.num_envs - 1, min(self.record, env.num_envs)).round().astype(int).tolist()
         spacing = log.spacing if isinstance(ground, str) else 0.0
-        return Film(env, log, worlds, spacing=spacing, ground=ground, block=drawn.get("block"), notes=log.notes(worlds))
+        block, notes = drawn.get("block"), log.notes(worlds)
+        return Film(env, log.series, worlds, spacing=spacing, ground=ground, block=block, notes=notes)
 
-    def _develop(self, film: Film, name: str) -> None:
+    def _develop(self, film: Film, log: EvaluationLog, name: str) -> None:
         """Write a film as a recording, and as a filmstrip; this shows no blocks."""
-        film.save_rrd(self.folder / f"{name}.rrd", film.log.marks(film.worlds))
-        strip = None if film.block is not None else film.log.strip(film)
+        film.save_rrd(self.folder / f"{name}.rrd", log.marks(film.worlds))
+        strip = None if film.block is not None else log.strip(film)
         if strip is not None:
             film.save_strip(strip, self.folder / f"{strip.name or name}.png")
 

@@ -97,7 +97,6 @@ def identify_by_evolution(
     noise: NoiseLevels | None = None,
     knowledge: Sequence[Knowledge] = (),
     dt: float | None = None,
-    description: RobotDescription | None = None,
     max_seconds: float = 60.0,
     population: int = POPULATION,
     seed: int = 0,
@@ -114,7 +113,7 @@ def identify_by_evolution(
         raise InputError("CMA-ES needs the package cma, which is not installed: pip install cma") from None
     if not motions or not max_seconds > 0.0 or population < 4:
         raise InputError("evolution needs motions, a time above 0 s and a population of at least 4")
-    replay = Replay(description=description, device=device, threads=threads)
+    replay = Replay(device=device, threads=threads)
     whole = [MotionResiduals(motion, parameters, noise or NoiseLevels(), replay.description, dt) for motion in motions]
     problem = LeastSquares(parameters, whole, replay, knowledge)
     point, descent = problem.expected(), Descent(replay)

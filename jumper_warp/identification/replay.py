@@ -64,11 +64,7 @@ class Replay:
     """Worlds that replay motor targets: a `Rollout` for each number of worlds and physics step, made at first use."""
 
     def __init__(
-        self,
-        *,
-        description: RobotDescription | None = None,
-        device: wp.DeviceLike = None,
-        threads: int | None = None,
+        self, *, description: RobotDescription | None = None, device: wp.DeviceLike = None, threads: int | None = None
     ):
         """Prepare; threads: of a CPU."""
         self.description = load_description() if description is None else description

@@ -71,13 +71,13 @@ class PinocchioRobot:
     def loop_gap(self, q: np.ndarray) -> float:
         """Return the largest distance [m] between the two anchors of a loop."""
         pin.forwardKinematics(self.model, self.data, q)
-        anchors = [
-            [self.data.oMi[joint].act(placement.translation) for joint, placement in ends]
-            for ends in (
-                ((c.joint1_id, c.joint1_placement), (c.joint2_id, c.joint2_placement)) for c in self.constraints
-            )
-        ]
-        return max(float(np.linalg.norm(a - b)) for a, b in anchors)
+        place = self.data.oMi
+        gaps = (
+            place[c.joint1_id].act(c.joint1_placement.translation)
+            - place[c.joint2_id].act(c.joint2_placement.translation)
+            for c in self.constraints
+        )
+        return max(float(np.linalg.norm(gap)) for gap in gaps)
 
     def paw_positions(self, q: np.ndarray) -> np.ndarray:
         """Return the paws' centres [m], shape (4, 3), world frame, legs FL, FR, BL, BR, of a configuration (27,)."""
@@ -101,11 +101,8 @@ class PinocchioRobot:
 
         Legs FL, FR, BL, BR; motors lateral, outer, inner; the base does not move.
         """
-        columns = []
-        for motor in range(3):
-            rates = np.tile(np.eye(3)[motor], 4)
-            columns.append(self.paw_velocities(q, self.closed_velocity(q, np.zeros(6), rates)))
-        return np.stack(columns, axis=2)
+        rates = (np.tile(motor, 4) for motor in np.eye(3))
+        return np.stack([self.paw_velocities(q, self.closed_velocity(q, np.zeros(6), rate)) for rate in rates], axis=2)
 
     def closed_velocity(self, q: np.ndarray, base_twist: np.ndarray, motor_rates: np.ndarray) -> np.ndarray:
         """Return v, shape (26,), with the knee rates that keep the loops of a configuration (27,) closed.

@@ -11,7 +11,7 @@ import warp as wp
 
 from jumper_warp.kernels.actuation.command_filter import command_filter_kernel
 from jumper_warp.kernels.actuation.readout import base_velocity_kernel
-from jumper_warp.kernels.dynamics.restore import StateArrays, restore_motors_kernel, restore_state_kernel
+from jumper_warp.kernels.dynamics.restore import restore_motors_kernel, restore_state_kernel
 from jumper_warp.kernels.layout import COORDS, DOFS
 from jumper_warp.robot.gravity import EARTH
 from jumper_warp.robot.grounds import BlockCfg
@@ -22,9 +22,8 @@ from jumper_warp.robot.values import RobotValues
 from jumper_warp.sim.overlay import write_model, write_motors, write_springs
 from jumper_warp.sim.physics import JumperPhysics, MujocoPhysics, Physics
 from jumper_warp.sim.slices import SlicedGraph, Worlds, slices_of
-from jumper_warp.sim.solver import TOLERANCE, check_step, check_tolerance
+from jumper_warp.sim.solver import TOLERANCE, check_step, check_tolerance, state_arrays
 from jumper_warp.utils.errors import InputError
-from jumper_warp.utils.newton_types import State
 from jumper_warp.utils.threads import checked_threads
 
 if TYPE_CHECKING:
@@ -286,14 +285,6 @@ class Simulation:
                 ends.append(frames[body, :3] + turned)
             gaps.append(np.linalg.norm(ends[0] - ends[1]))
         return np.array(gaps).reshape(self.num_worlds, 4).max(axis=1)
-
-
-def state_arrays(state: State) -> Any:
-    """Return the kernels' view of a state."""
-    arrays = StateArrays()
-    arrays.joint_q, arrays.joint_qd = state.joint_q, state.joint_qd
-    arrays.body_q, arrays.body_qd = state.body_q, state.body_qd
-    return arrays
 
 
 def motor_values(joint_values: np.ndarray) -> np.ndarray:

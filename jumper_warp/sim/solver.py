@@ -15,7 +15,13 @@ from newton import ModelFlags, StateFlags
 from newton.solvers import SolverBase
 
 from jumper_warp.kernels.actuation.readout import body_acceleration_kernel
-from jumper_warp.kernels.dynamics.restore import clear_contact_kernel, rest_blocks_kernel, restore_values_kernel
+from jumper_warp.kernels.dynamics.restore import (
+    StateArrays,
+    clear_contact_kernel,
+    rest_blocks_kernel,
+    restore_state_kernel,
+)
+from jumper_warp.kernels.layout import COORDS
 from jumper_warp.robot.description import RobotDescription
 from jumper_warp.robot.grounds import BlockCfg
 from jumper_warp.robot.model import other_colliders
@@ -45,6 +51,14 @@ def check_tolerance(tolerance: float) -> None:
     """Raise ValueError unless the tolerance [m/s] of a contact iteration is finite and above 0."""
     if not 0.0 < tolerance < math.inf:
         raise InputError(f"tolerance must be finite and above 0 [m/s], got {tolerance!r}")
+
+
+def state_arrays(state: State | Model) -> Any:
+    """Return the kernels' view of a state, or of the reference pose of a model."""
+    arrays = StateArrays()
+    arrays.joint_q, arrays.joint_qd = state.joint_q, state.joint_qd
+    arrays.body_q, arrays.body_qd = state.body_q, state.body_qd
+    return arrays
 
 
 def warn_of_colliders(model: Model) -> None:
@@ -277,12 +291,7 @@ class SolverJumper(SolverBase):
         if flags & ModelFlags.MODEL_PROPERTIES:
             self.dynamics.pack_gravity()
 
-    def reset(
-        self,
-        state: State,
-        world_mask: wp.array | None = None,
-        flags: StateFlags | int | None = None,
-    ) -> None:
+    def reset(self, state: State, world_mask: wp.array | None = None, flags: StateFlags | int | None = None) -> None:
         """Forget contact history and the invalid flag of the masked worlds, and put them in the reference pose.
 
         Blocks return to their starts.
@@ -293,23 +302,12 @@ class SolverJumper(SolverBase):
         if world_mask is None:
             world_mask = wp.full(n + 1, True, dtype=wp.bool, device=device)
         work = self.dynamics.work
-        wp.launch(
-            clear_contact_kernel,
-            dim=n,
-            inputs=[world_mask],
-            outputs=[work.impulse, work.contact_force, work.invalid],
-            device=device,
-        )
+        outputs = [work.impulse, work.contact_force, work.invalid]
+        wp.launch(clear_contact_kernel, dim=n, inputs=[world_mask], outputs=outputs, device=device)
         if flags is not None and int(flags) == int(StateFlags.NONE):
             return
         if self.dynamics.robot.ground.blocks.shape[0] > 0:
             self.reset_blocks(world_mask)
-        for reference, values in ((self.model.joint_q, state.joint_q), (self.model.joint_qd, state.joint_qd)):
-            wp.launch(
-                restore_values_kernel,
-                dim=(n, values.shape[0] // n),
-                inputs=[world_mask, reference.reshape((n, -1))],
-                outputs=[values.reshape((n, -1))],
-                device=device,
-            )
+        inputs, outputs = [world_mask, state_arrays(self.model)], [state_arrays(state)]
+        wp.launch(restore_state_kernel, dim=(n, int(COORDS)), inputs=inputs, outputs=outputs, device=device)
         self.dynamics.full_state(state.joint_q, state.joint_qd, state.body_q, state.body_qd)

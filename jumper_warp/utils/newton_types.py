@@ -36,6 +36,8 @@ if TYPE_CHECKING:
         body_inv_inertia: wp.array
         body_inv_mass: wp.array
         body_mass: wp.array
+        body_q: wp.array
+        body_qd: wp.array
         body_world: wp.array
         gravity: wp.array
         joint_armature: wp.array

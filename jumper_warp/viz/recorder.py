@@ -118,8 +118,7 @@ class Recorder:
     def recording(self) -> Recording:
         """Return what was recorded so far.
 
-        Raises:
-            ValueError: There is no frame.
+        Raises ValueError: there is no frame.
         """
         if not self._times:
             raise InputError("nothing was recorded")

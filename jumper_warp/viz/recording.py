@@ -83,8 +83,7 @@ class Recording:
 def load_npz(path: Path) -> Recording:
     """Read what `Recording.save_npz` wrote.
 
-    Raises:
-        RecordingError: The file is missing, damaged, of another kind or of another version.
+    Raises RecordingError: the file is missing, damaged, of another kind or of another version.
     """
     try:
         with np.load(path, allow_pickle=False) as archive:

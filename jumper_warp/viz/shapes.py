@@ -39,8 +39,7 @@ class ShapeMesh:
 def shape_meshes(model: Model, worlds: tuple[int, ...]) -> list[ShapeMesh]:
     """Return the meshes of the visible shapes of some worlds, and of those that all worlds share.
 
-    Raises:
-        ValueError: A visible shape is of a kind that has no mesh here (a cone or a splat).
+    Raises ValueError: a visible shape is of a kind that has no mesh here (a cone or a splat).
     """
     kinds = model.shape_type.numpy()
     scales = model.shape_scale.numpy().astype(float)

@@ -75,8 +75,7 @@ class Camera:
 def look_at(eye: Sequence[float], target: Sequence[float]) -> wp.transformf:
     """Return the pose of a camera, looking along its -z with +y up, from eye to target [m], world z up.
 
-    Raises:
-        ValueError: Eye and target coincide or lie on one vertical.
+    Raises ValueError: eye and target coincide or lie on one vertical.
     """
     ahead = np.asarray(target, dtype=float) - np.asarray(eye, dtype=float)
     right = np.cross(ahead, [0.0, 0.0, 1.0])

@@ -120,17 +120,3 @@ def rest_blocks_kernel(
     world = wp.tid()
     if mask[world]:
         rest_block(ground, world)
-
-
-@wp.kernel
-def restore_values_kernel(
-    # in
-    mask: wp.array(dtype=wp.bool),
-    reference: wp.array2d(dtype=float),
-    # out
-    values: wp.array2d(dtype=float),
-):
-    """Copy the rows of the masked worlds from `reference`; launch over the shape of `values`, (num_worlds, any)."""
-    world, i = wp.tid()
-    if mask[world]:
-        values[world, i] = reference[world, i]
