@@ -28,6 +28,7 @@ class Captured:
         self._graph = None
 
     def __call__(self) -> None:
+        """Run the procedure once."""
         if self.enabled and self._warm and self._graph is None:
             self._capture()
         if self._graph is not None:
