@@ -138,16 +138,8 @@ def env_maker(task: TaskCfg, args: TrainArgs) -> MakeEnv:
 
     def make(num_envs: int, seed: int, device: torch.device) -> VecEnv:
         check_memory(task, args.cfg.ppo, args.solver, num_envs, device)
-        env = Env(
-            task,
-            num_envs,
-            seed=seed,
-            device=str(device),
-            solver=args.solver,
-            randomize=args.randomize,
-            noise=args.noise,
-            robot=overlay,
-        )
+        settings: dict[str, Any] = {name: getattr(args, name) for name in ("solver", "randomize", "noise")}
+        env = Env(task, num_envs, seed=seed, device=str(device), robot=overlay, **settings)
         if args.cfg.trainer != "shac":
             return env
         from jumper_warp.diff.differentiable_env import DifferentiableEnv

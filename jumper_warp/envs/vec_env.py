@@ -20,11 +20,8 @@ class VecEnv(Protocol):
     num_envs: int
     """Worlds, each with an episode of its own."""
     num_obs: int
-    """Columns of `obs`."""
     num_critic_obs: int
-    """Columns of `critic_obs`."""
     num_actions: int
-    """Columns of an action."""
     device: torch.device
     """Where all tensors are, the action too."""
     obs: torch.Tensor

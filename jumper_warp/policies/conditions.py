@@ -83,6 +83,11 @@ class Conditions:
         saved = config.get("env", {}).get("robot")
         return None if saved is None else RobotOverlay.from_json(saved)
 
+    def env_settings(self, config: dict[str, Any]) -> dict[str, Any]:
+        """Return settings of `Env`; config: of a policy, as in `overlay`, and raises as it."""
+        same = {name: getattr(self, name) for name in ("seed", "device", "solver", "noise", "threads")}
+        return {**same, "randomize": self.draws, "auto_reset": False, "robot": self.overlay(config)}
+
     @property
     def draws(self) -> bool:
         """Whether the environment sets parameters at resets."""
@@ -127,15 +132,5 @@ def env_of_policy(
 
     leave_out = [section for section in OPTIONAL if section != "events" or not conditions.randomize]
     task = task_of_policy(policy, modules, leave_out=leave_out)
-    return Env(
-        conditions.applied(task if change is None else change(task)),
-        num_envs,
-        seed=conditions.seed,
-        device=conditions.device,
-        solver=conditions.solver,
-        randomize=conditions.draws,
-        noise=conditions.noise,
-        auto_reset=False,
-        robot=conditions.overlay(policy.config),
-        **scene,
-    )
+    task = conditions.applied(task if change is None else change(task))
+    return Env(task, num_envs, **conditions.env_settings(policy.config), **scene)

@@ -44,18 +44,12 @@ NO_FOLDERS = (".pt", ".pth", ".onnx", ".safetensors")
 
 
 def save_policy(
-    folder: Path,
-    policy: Policy,
-    *,
-    readme: str | None = None,
-    files: Mapping[str, bytes] | None = None,
-    overwrite: bool = False,
+    folder: Path, policy: Policy, *, files: Mapping[str, bytes] | None = None, overwrite: bool = False
 ) -> Path:
     """Write a policy's folder, whole or not at all; return its path.
 
-    Commit and versions are added to the policy's configuration unless it brings its own. readme: text of `README.md`,
-    by default a few lines on what the folder holds. files: more files by name, such as a learning curve. overwrite:
-    whether a policy that is there already is replaced, with all its files.
+    Commit and versions are added to the policy's configuration unless it brings its own. files: more files by name,
+    such as a learning curve. overwrite: whether a policy that is there already is replaced, with all its files.
     Raises PolicyError: the folder exists and is not to be overwritten, or is no policy's; or a name is malformed.
     """
     folder = checked_folder(folder)
@@ -67,7 +61,7 @@ def save_policy(
         **(files or {}),
         CONFIG: json_bytes(config),
         ONNX: onnx_bytes(policy, config),
-        README: (readme or default_readme(policy)).encode(),
+        README: default_readme(policy).encode(),
     }
     aside = folder.with_name(f".{folder.name}.{os.getpid()}")
     old = folder.with_name(f".{folder.name}.{os.getpid()}.old")

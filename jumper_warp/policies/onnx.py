@@ -28,7 +28,6 @@ IR_VERSION = 9
 INPUT, OUTPUT = "obs", "actions"
 OPERATORS = {"elu": "Elu", "relu": "Relu", "tanh": "Tanh"}
 METADATA_VERSION = 2
-"""Of the metadata."""
 ORIGIN = ("commit", "dirty")
 """Entries of a policy's configuration that its metadata repeats."""
 STORED = {"mean": "normaliser.mean", "std": "normaliser.std"}

@@ -63,11 +63,8 @@ class SkillPolicies:
         from jumper_warp.envs.env import Env
 
         self.skills, self.handovers = self._in(conditions)
-        env = Env(
-            self.skills, count, seed=conditions.seed, device=conditions.device, solver=conditions.solver,
-            randomize=conditions.draws, noise=conditions.noise, auto_reset=False, threads=conditions.threads,
-            skill=WALK, handovers=self.handovers, robot=conditions.overlay({}), **scene,
-        )  # fmt: skip
+        settings = conditions.env_settings({})
+        env = Env(self.skills, count, skill=WALK, handovers=self.handovers, **settings, **scene)
         for policy in self.policies:
             policy.to(env.device)
         return env

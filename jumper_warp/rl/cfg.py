@@ -198,10 +198,9 @@ class TrainCfg:
         check_not_negative("max_seconds", self.max_seconds)
         checked_threads(self.threads)
         check_seed(self.seed)
-        if self.trainer == "rsl-rl" and self.resume:
-            raise InputError("resume is not offered with trainer rsl-rl")
-        if self.trainer == "rsl-rl" and self.start_from:
-            raise InputError("start_from is not offered with trainer rsl-rl")
+        for name in ("resume", "start_from"):
+            if self.trainer == "rsl-rl" and getattr(self, name):
+                raise InputError(f"{name} is not offered with trainer rsl-rl")
         if self.resume and self.resume != LATEST_OR_NEW and self.start_from:
             raise InputError("give resume, which goes on with a training, or start_from, which begins one, not both")
         if self.trainer != "ppo" and self.ppo.symmetry != "off":

@@ -136,7 +136,7 @@ def _read_manifest(folder: Path, missing_ok: bool = False) -> dict[str, dict[str
     try:
         manifest = json.loads(path.read_text())
         if not all(_is_entry(entry) for entry in manifest.values()):
-            raise ValueError("incomplete")
+            raise CheckpointError(f"{path}: not readable")
     except OSError as error:
         raise CheckpointError(f"{path}: {error.strerror}") from error
     except (ValueError, AttributeError, RecursionError) as error:

@@ -89,7 +89,6 @@ class TrainingLog:
         self._task = self._progress.add_task("training", total=total)
 
     def __enter__(self) -> TrainingLog:
-        """Show the progress."""
         self._progress.start()
         if self._figures.dropped:
             self.say(f"{self._figures.path}: dropped {self._figures.dropped} lines, cut or of later iterations")
@@ -98,7 +97,6 @@ class TrainingLog:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Close everything."""
         self._progress.stop()
         for file in (self._figures, self._events):
             with suppress(OSError):

@@ -71,7 +71,6 @@ class TrainResult(NamedTuple):
     """What a finished training leaves."""
 
     folder: Path
-    """The run's."""
     iteration: int
     """Iterations that the policy has had."""
     seconds: float
@@ -84,13 +83,11 @@ class Stop:
     """Context in which Ctrl-C and SIGTERM set `asked`; the second Ctrl-C interrupts at once."""
 
     def __enter__(self) -> Stop:
-        """Take over the signals."""
         self.asked = False
         self._previous = {number: signal.signal(number, self._ask) for number in (signal.SIGINT, signal.SIGTERM)}
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Give the signals back."""
         for number, handler in self._previous.items():
             signal.signal(number, handler)
 

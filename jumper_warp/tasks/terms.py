@@ -41,12 +41,9 @@ class Term:
     """What is compiled in, with its defaults."""
 
     def __init__(self, func: Function, *, name: str = "", **given: Any) -> None:
-        """Args:
+        """func: with the signature that the class names. name: for logs and flags (default: the function's).
 
-        func: Signature as the class says.
-        name: Under which it is logged and set by flags (default: the function's).
-        given: Numbers and options by name.
-
+        given: numbers and options by name.
         Raises ValueError: a number is missing, unknown or not finite, or the function is not one for such a term.
         """
         kind = type(self).__name__

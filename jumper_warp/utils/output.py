@@ -29,8 +29,7 @@ def output_dir(name: str, out: Path | None = None) -> Path:
         out.mkdir(parents=True, exist_ok=True)
         return out
     stamp = datetime.now().strftime("%Y-%m-%d_%H-%M-%S")
-    folder = Path("outputs", name, stamp)
-    repeat = 1
+    folder, repeat = Path("outputs", name, stamp), 1
     while folder.exists():
         repeat += 1
         folder = folder.with_name(f"{stamp}_{repeat}")

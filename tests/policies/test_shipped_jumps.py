@@ -12,8 +12,8 @@ def test_the_omnidirectional_policy_jumps_all_around(tmp_path):
 
 def test_sight_brings_the_robot_onto_a_block_that_a_blind_one_touches(tmp_path):
     flags = {"jumps": 8, "edge": 0.35, "record": 0, "device": "cpu"}
-    sighted = Platform("sighted_jump", out=tmp_path / "sighted", **flags).run()
-    blind = Platform("horizontal_jump", out=tmp_path / "blind", **flags).run()
+    sighted = Platform(policy="sighted_jump", out=tmp_path / "sighted", **flags).run()
+    blind = Platform(policy="horizontal_jump", out=tmp_path / "blind", **flags).run()
     assert sighted["block_success_rate"] == 1.0 and sighted["platform_success_rate"] == 1.0
     assert blind["block_success_rate"] < 0.7
 
@@ -21,7 +21,7 @@ def test_sight_brings_the_robot_onto_a_block_that_a_blind_one_touches(tmp_path):
 def test_the_slippery_policy_stands_where_another_falls(tmp_path):
     flags = {"jumps": 12, "friction": 0.3, "record": 0, "device": "cpu"}
     ready, other = (
-        DistanceSweep(name, out=tmp_path / name, **flags).run() for name in ("slippery_jump", "horizontal_jump")
+        DistanceSweep(policy=name, out=tmp_path / name, **flags).run() for name in ("slippery_jump", "horizontal_jump")
     )
     assert ready["success_rate"] == 1.0 and ready["mean_error_m"] < 0.015  # 0.0074 m of 500 jumps
     assert other["success_rate"] < 0.8

@@ -31,10 +31,7 @@ from jumper_warp.tasks.velocity.cfg import CommandCfg, VelocityResetCfg
 SENSED = ("lin_vel", "ang_vel", "gravity", "angle", "rate")
 """Observations that come as late as the sensors do."""
 
-WITHOUT_HISTORY = (
-    ObservationTerm(velocity.command),
-    *(term.replace(delayed=term.name in SENSED) for term in ROBOT),
-)
+WITHOUT_HISTORY = (ObservationTerm(velocity.command), *(term.replace(delayed=term.name in SENSED) for term in ROBOT))
 """What the paper's walking policy sees, in another order."""
 
 POLICY = remembered(WITHOUT_HISTORY)
