@@ -17,7 +17,9 @@ wp.config.log_level = wp.LOG_WARNING
 SHARED = ("vertical-jump", "horizontal-jump", "velocity-flat", "velocity-rough", "attitude")
 """Tasks whose kernels many files need, besides that of `hold_height`."""
 MUJOCO = """
+import warp as wp
 from jumper_warp.sim.simulation import Simulation
+wp.config.log_level = wp.LOG_WARNING
 Simulation(2, solver="mujoco", visuals=False, device="cpu").step()
 """
 
