@@ -31,19 +31,10 @@ COLORS = ("tab:red", "tab:green", "tab:blue")
 
 
 @dataclass(frozen=True)
-class Args(EvaluationArgs):
-    """Flags."""
+class Args(EvaluationArgs, TurnFlags):
+    """Flags; as many turns about any axis as about the body's."""
 
     policy: str = "attitude"
-    """Name or folder of a policy, a run's folder, or a checkpoint."""
-    turns: int = 60
-    """Number of turns about the body's axes, and of those about any axis."""
-    angle: float = 90.0
-    """[deg] Of every turn."""
-    tolerance: float = 5.0
-    """[deg] Error up to which a robot is at its goal."""
-    seconds: float = 5.0
-    """[s] Of which every turn is followed."""
     keep_momentum: bool = True
     """Whether the momentum of free flight is kept exactly, whatever the training had."""
     refine: int = 1
@@ -52,13 +43,8 @@ class Args(EvaluationArgs):
     """Number of turns to record for the Rerun viewer and, the first of them, as a filmstrip; 0: none."""
 
     def __post_init__(self) -> None:
-        """Check the values."""
         super().__post_init__()
-        self.flags()
-
-    def flags(self) -> TurnFlags:
-        """Return what is asked for. Raises InputError: a setting is out of range."""
-        return TurnFlags(self.turns, self.angle, self.tolerance, self.seconds)
+        TurnFlags.__post_init__(self)
 
 
 def plot(run: EvaluationRun, turns: Turns, title: str) -> None:
@@ -86,7 +72,7 @@ def main(args: Args) -> dict:
     run = EvaluationRun.of("attitude", args, ("attitude",))
     env = run.env(args.turns, lambda task: replace(task, keep_momentum=args.keep_momentum), refine=args.refine)
     run.told |= {"physics_step_s": env.physics_dt, "keep_momentum": args.keep_momentum}
-    turns, watch = args.flags().log(run.task, args.seed), MomentumWatch(env)
+    turns, watch = args.log(run.task, args.seed), MomentumWatch(env)
     inertia = rotational_inertia(env.sim)
     run.follow(env, turns, film="turns", watch=watch)
     values = turn_metrics(turns) | axis_metrics(turns) | watch.metrics(turns.apart, inertia)

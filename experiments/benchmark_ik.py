@@ -8,7 +8,6 @@ Before anything is timed the answer is checked: every paw position that a pose w
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 import tyro
@@ -16,15 +15,15 @@ import warp as wp
 
 from jumper_warp.cli.main import run_command
 from jumper_warp.robot.description import load_description
-from jumper_warp.utils.output import output_dir, write_metrics
+from jumper_warp.utils.output import output_dir
 from jumper_warp.utils.runtime import announce
-from support.inverse_kinematics import InverseKinematics
-from support.poses import random_motors
+from support.inverse_kinematics import InverseKinematics, random_motors
+from support.scripts import DeviceArgs, report
 from support.timing import median_time
 
 
 @dataclass(frozen=True)
-class Args:
+class Args(DeviceArgs):
     """Flags."""
 
     poses: int = 65536
@@ -34,10 +33,6 @@ class Args:
     scatter: float = 0.3
     """Half edge [m] of the cube around each paw's reachable position that the scattered targets fill."""
     seed: int = 0
-    out: Path | None = None
-    """Folder for metrics.json (default: outputs/benchmark_ik/<time>)."""
-    device: str | None = None
-    """Warp device."""
 
 
 def main(args: Args) -> dict:
@@ -50,7 +45,7 @@ def main(args: Args) -> dict:
     offset = rng.uniform(-args.scatter, args.scatter, (4, n, 3)).astype(np.float32)
     scattered = wp.array(paws.numpy() + offset, dtype=wp.vec3, device=device)
     robots.solve(paws)
-    reached, farthest = robots.reachable.numpy().mean(), robots.residual.numpy().max()
+    reached, farthest = robots.reachable.numpy().mean(), float(robots.residual.numpy().max())
     if reached < 1.0 or not farthest < 1.0e-5:
         raise RuntimeError(f"{100.0 * reached:.4f} % reached, residual {farthest:.2e} m: the time means nothing")
     times = [median_time(lambda aim=aim: robots.solve(aim), device, repeats=args.repeats) for aim in (paws, scattered)]
@@ -63,10 +58,7 @@ def main(args: Args) -> dict:
         "scattered_time [ms]": 1.0e3 * times[1],
         "scattered_reachable [%]": 100.0 * robots.reachable.numpy().mean(),
     }
-    write_metrics(folder, values)
-    for name, value in values.items():
-        print(f"{name:28} {value if isinstance(value, str) else f'{value:.6g}'}")
-    print(f"metrics in {folder}")
+    report(folder, values)
     return values
 
 

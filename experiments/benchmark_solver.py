@@ -19,15 +19,16 @@ import warp as wp
 from jumper_warp.cli.main import run_command
 from jumper_warp.sim.simulation import SolverName
 from jumper_warp.utils.errors import InputError
-from jumper_warp.utils.output import output_dir, write_metrics
+from jumper_warp.utils.output import output_dir
 from jumper_warp.utils.runtime import announce
 from jumper_warp.utils.threads import checked_threads
+from support.scripts import DeviceArgs, report
 from support.speed import time_solver, time_threads
 from support.timing import over_baseline
 
 
 @dataclass(frozen=True)
-class Args:
+class Args(DeviceArgs):
     """Flags."""
 
     envs: list[int] = field(default_factory=lambda: [64])
@@ -39,10 +40,6 @@ class Args:
     """Policy steps in a repetition, standing."""
     baseline: Path | None = None
     """Root of another checkout to compare with."""
-    out: Path | None = None
-    """Folder for metrics.json (default: outputs/benchmark_solver/<time>)."""
-    device: str | None = None
-    """Warp device."""
     threads: list[int] | None = None
     """Numbers of CPU threads to compare (default: all cores, nothing is compared)."""
 
@@ -69,10 +66,7 @@ def main(args: Args) -> dict:
         prefix = "" if len(args.envs) == 1 else f"envs_{envs}_"
         values |= {f"{prefix}{name}": value for name, value in figures.items()}
     values |= {"envs": args.envs, **over_baseline(args.baseline, "experiments/benchmark_solver.py", args, values)}
-    write_metrics(folder, values)
-    for name, value in values.items():
-        print(f"{name:34} {value:,.3f}" if isinstance(value, float) else f"{name:34} {value}")
-    print(f"metrics in {folder}")
+    report(folder, values)
     return values
 
 

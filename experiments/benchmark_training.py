@@ -16,21 +16,20 @@ from pathlib import Path
 
 import tyro
 import warp as wp
-from rich.console import Console
-from rich.table import Table
 
 from jumper_warp.cli.main import run_command
 from jumper_warp.rl.cfg import PpoCfg
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.output import output_dir, write_metrics
 from jumper_warp.utils.runtime import announce
+from support.scripts import ThreadArgs, report
 from support.speed import time_parts, time_ppo, time_rsl_rl
 from support.timing import over_baseline
 from support.variants import VARIANTS, variant
 
 
 @dataclass(frozen=True)
-class Args:
+class Args(ThreadArgs):
     """Flags."""
 
     envs: tuple[int, ...] | None = None
@@ -53,15 +52,8 @@ class Args:
     """Time PPO and its variants only."""
     baseline: Path | None = None
     """Root of another checkout to compare with."""
-    out: Path | None = None
-    """Folder for metrics.json (default: outputs/benchmark_training/<time>)."""
-    device: str | None = None
-    """Warp device."""
-    threads: int | None = None
-    """CPU threads that share the worlds (default: all cores); they change no result."""
 
     def __post_init__(self) -> None:
-        """Check the values."""
         for name in ("steps", "repeats", "iterations", "num_steps"):
             if getattr(self, name) < 1:
                 raise InputError(f"{name} must be at least 1, got {getattr(self, name)}")
@@ -95,13 +87,7 @@ def main(args: Args) -> dict:
         values |= time_rsl_rl(train_envs, args.num_steps, args.iterations, args.device)
         values["ppo_over_rsl_rl"] = values["ppo_steps_per_s"] / values["rsl_rl_steps_per_s"]
     values |= over_baseline(args.baseline, "experiments/benchmark_training.py", args, values)
-    write_metrics(folder, values)
-    table = Table("figure", "value", title="Policy steps of 8 physics steps, motors included, graphs on")
-    for name, value in values.items():
-        large = isinstance(value, float) and value >= 1e3
-        table.add_row(name, f"{value:,.0f}" if large else f"{value:.4g}" if isinstance(value, float) else str(value))
-    Console().print(table)
-    print(f"figures in {folder}")
+    report(folder, values)
     return values
 
 

@@ -24,14 +24,14 @@ from rich.console import Console
 
 from jumper_warp.cli.main import run_command
 from jumper_warp.utils.errors import InputError
-from jumper_warp.utils.output import output_dir, write_metrics
-from jumper_warp.utils.runtime import announce
+from jumper_warp.utils.output import write_metrics
 from support.departure_runs import JUMPS, KEPT, TESTS, WIDTH, Jump, measured, report, settings, trained
 from support.departures import DEPARTURES, Undone, flags_of
+from support.scripts import ThreadArgs, prepare
 
 
 @dataclass(frozen=True)
-class Args:
+class Args(ThreadArgs):
     """Flags."""
 
     task: Jump = "vertical-jump"
@@ -54,15 +54,8 @@ class Args:
     """More flags of `jumper train`, for all trainings: --train="--ppo.gamma 0.98"."""
     measure: bool = True
     """Make the jumps after each training."""
-    out: Path | None = None
-    """Folder for runs, metrics.json, table and plot (default: outputs/departures/<time>)."""
-    device: str | None = None
-    """Warp device."""
-    threads: int | None = None
-    """CPU threads that share the worlds (default: all cores); they change no result."""
 
     def __post_init__(self) -> None:
-        """Check the values."""
         unknown = set(self.only) - {KEPT, *DEPARTURES[self.task]}
         if unknown:
             raise InputError(f"departures of {self.task} are {', '.join(DEPARTURES[self.task])}, not {min(unknown)}")
@@ -93,8 +86,7 @@ def main(args: Args) -> dict[str, Any]:
     """Train and measure each, and return the metrics."""
     for name, seed, undone in args.trainings():  # a wrong flag is refused before any training
         settings(undone, args.command(undone, seed, Path(name)))
-    announce(args.device, args.threads)
-    folder, found = output_dir("departures", args.out), {}
+    folder, found, table = prepare("departures", args, args.threads), {}, None
     values: dict[str, Any] = {"task": args.task, "iterations": args.length, "envs": args.envs}
     for name, seed, undone in args.trainings():
         checkpoint = trained(undone, args.command(undone, seed, folder / f"{name}_{seed}"))
@@ -105,7 +97,7 @@ def main(args: Args) -> dict[str, Any]:
         values |= {f"{test}_{key}_{name}_{seed}": tests[test][key] for test in TESTS for key in tests[test]}
         write_metrics(folder, values)
         table = report(found, f"{args.task}, {args.length} iterations", folder)
-    if found:
+    if table is not None:
         Console(width=WIDTH).print(table)
     print(f"{'metrics, table, plot and ' if found else ''}runs in {folder}")
     return values

@@ -14,8 +14,6 @@ from pathlib import Path
 
 import numpy as np
 import tyro
-from rich.console import Console
-from rich.table import Table
 
 from jumper_warp.cli.main import run_command
 from jumper_warp.robot.overlay import load_overlay
@@ -48,7 +46,6 @@ class Args:
     """Folder for metrics.json (default: outputs/dynamics_agreement/<time>)."""
 
     def __post_init__(self) -> None:
-        """Check the values."""
         if self.states < 1:
             raise InputError(f"states must be at least 1, got {self.states}")
 
@@ -66,14 +63,12 @@ def main(args: Args) -> dict:
     values = RobotValues.nominal(1) if args.robot is None else load_overlay(args.robot).robots()
     states = random_states(args.states, args.seed)
     found, expected = ours(values, states), pinocchios(values, states)
-    table = Table("quantity", "largest", "largest difference", "relative", title=f"{args.states} random states")
     metrics: dict = {"states": args.states, "robot": None if args.robot is None else str(args.robot)}
     for name, unit in UNITS.items():
         size, off, relative = differences(found[name], expected[name])
         metrics |= {f"{name}_difference [{unit}]": off, f"{name}_relative_difference": relative}
-        table.add_row(name.replace("_", " "), f"{size:.4g} {unit}", f"{off:.1e} {unit}", f"{relative:.1e}")
+        print(f"{name:26} up to {size:.4g} {unit}, largest difference {off:.1e} {unit}, relative {relative:.1e}")
     write_metrics(folder, metrics)
-    Console().print(table)
     print(f"metrics in {folder}")
     return metrics
 

@@ -20,11 +20,9 @@ import numpy as np
 import tyro
 
 from jumper_warp.cli.main import run_command
-from jumper_warp.evaluation.log import EvaluationLog
-from jumper_warp.evaluation.plots import drawn
 from jumper_warp.evaluation.run import EvaluationArgs
 from jumper_warp.utils.errors import InputError
-from support.flights import FlightRun, Flights, flight_metrics
+from support.flights import FlightRun, Flights, delays, draw_flights, flight_metrics
 
 
 @dataclass(frozen=True)
@@ -47,7 +45,6 @@ class Args(EvaluationArgs):
     """[m] Lowest and highest that the policy which lands is told."""
 
     def __post_init__(self) -> None:
-        """Check the values."""
         super().__post_init__()
         if self.flights < 1 or not 0.0 <= self.late <= 100.0:
             raise InputError(f"need at least one flight, and late in 0 to 100 ms, got {self.flights}, {self.late}")
@@ -55,24 +52,6 @@ class Args(EvaluationArgs):
             raise InputError(f"heights must be in 0.3 to 10 m and rise, got {self.heights}")
         if self.takeoff == "policy" and not self.landing:
             raise InputError("takeoff by a policy needs one: --landing")
-
-
-def delays(count: int, most: float, seed: int) -> np.ndarray:
-    """Return by how much later front and left legs extend, (count, 2): from half of the most to it, to any side."""
-    rng = np.random.default_rng(seed)
-    size, angle = rng.uniform(0.5 * most, most, count), rng.uniform(0.0, 2.0 * np.pi, count)
-    return np.stack([size * np.cos(angle), size * np.sin(angle)], axis=1)
-
-
-def plot(run: FlightRun, found: dict[str, EvaluationLog]) -> None:
-    """Draw tilt and height of all flights over time."""
-    with drawn(run.folder / "flights.png", 2, len(found), figsize=(11, 6), sharex=True, sharey="row") as axes:
-        for column, (name, flights) in zip(axes.T, found.items(), strict=True):
-            time = np.arange(len(flights.tilts)) * flights.step_dt
-            column[0].plot(time, np.degrees(np.array(flights.tilts)), linewidth=0.6, alpha=0.5, color="tab:red")
-            column[1].plot(time, np.array(flights.heights), linewidth=0.6, alpha=0.5, color="tab:blue")
-            column[0].set(ylabel="tilt [deg]", title=f"{name}: {flights.success.mean():.0%} landed upright")
-            column[1].set(xlabel="time [s]", ylabel="base height [m]")
 
 
 def main(args: Args) -> dict:
@@ -83,7 +62,7 @@ def main(args: Args) -> dict:
     found = {
         name: run.fly(env, Flights(heights, late, turns=name == "turning"), name) for name in ("turning", "without")
     }
-    plot(run, found)
+    draw_flights(run.folder / "flights.png", found)
     told = {"takeoff": args.takeoff, "landing": args.landing or "default pose"}
     values = told | ({} if late is None else {"late_ms": args.late}) | flight_metrics(found["turning"])
     values |= {f"without_turning_{name}": value for name, value in flight_metrics(found["without"]).items()}

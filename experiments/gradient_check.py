@@ -15,30 +15,17 @@ from typing import Any
 
 import numpy as np
 import tyro
-from rich.console import Console
-from rich.table import Table
 
 from jumper_warp.cli.main import run_command
 from jumper_warp.evaluation.plots import drawn
-from jumper_warp.utils.output import output_dir, write_metrics
-from jumper_warp.utils.runtime import announce
 from support.gradients import INNER, OUTER, TICKS, GradientJump, apex, check, schedule
+from support.scripts import DeviceArgs, prepare, report
 
 WEAK_PUSH = (20.0, 20.0)
 """[deg] The push-off that the ascent starts from."""
 ASCENT_STEPS = 20
 ASCENT_CHANGE = 0.05
 """[rad] Largest change of a target in a step of the ascent."""
-
-
-@dataclass(frozen=True)
-class Args:
-    """Flags."""
-
-    out: Path | None = None
-    """Folder for figures and plot (default: outputs/gradient_check/<time>)."""
-    device: str | None = None
-    """Warp device."""
 
 
 @dataclass
@@ -89,10 +76,9 @@ def plot(rollout: Any, actions: tuple[np.ndarray, np.ndarray], ascent: Ascent, p
             axis.legend(fontsize=8, ncols=2)
 
 
-def main(args: Args) -> dict:
+def main(args: DeviceArgs) -> dict:
     """Run the experiment and return its figures."""
-    announce(args.device)
-    folder = output_dir("gradient_check", args.out)
+    folder = prepare("gradient_check", args)
     start = time.perf_counter()
     rollout, checks = check(args.device)
     ascent = ascend(args.device)
@@ -106,15 +92,10 @@ def main(args: Args) -> dict:
         "apex_after_m": ascent.apex[-1],
         "seconds": time.perf_counter() - start,
     }
-    write_metrics(folder, values)
     plot(rollout, checks["actions"], ascent, folder / "gradients.png")
-    table = Table("figure", "value", title="Gradients of the apex; errors relative to the largest entry")
-    for name, value in values.items():
-        table.add_row(name, f"{value:.3g}")
-    Console().print(table)
-    print(f"figures and plot in {folder}")
+    report(folder, values)
     return values
 
 
 if __name__ == "__main__":
-    run_command(lambda: main(tyro.cli(Args)))
+    run_command(lambda: main(tyro.cli(DeviceArgs)))

@@ -12,7 +12,6 @@ double precision.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 import tyro
@@ -21,15 +20,16 @@ import warp as wp
 from jumper_warp.cli.main import run_command
 from jumper_warp.sim.simulation import SUBSTEPS
 from jumper_warp.utils.errors import InputError
-from jumper_warp.utils.output import output_dir, write_metrics
+from jumper_warp.utils.output import output_dir
 from jumper_warp.utils.runtime import announce
 from support.gradient_runs import GradientRun, PlainJump
 from support.gradients import PUSH, TICKS, schedule
+from support.scripts import DeviceArgs, report
 from support.timing import device_memory, wall_time
 
 
 @dataclass(frozen=True)
-class Args:
+class Args(DeviceArgs):
     """Flags."""
 
     worlds: int | None = None
@@ -38,13 +38,8 @@ class Args:
     """Timed repetitions; the fastest counts, and the two kinds take turns."""
     double: bool = False
     """Whether to compute in double precision."""
-    out: Path | None = None
-    """Folder for metrics.json (default: outputs/gradient_cost/<time>)."""
-    device: str | None = None
-    """Warp device."""
 
     def __post_init__(self) -> None:
-        """Check the values."""
         if self.repeats < 1 or (self.worlds is not None and self.worlds < 1):
             raise InputError("worlds and repeats must be at least 1")
 
@@ -85,10 +80,7 @@ def main(args: Args) -> dict:
     }
     if device.is_cuda:
         values["memory_kib_a_world"] = (device_memory(device) - before) / worlds / 1024.0
-    write_metrics(folder, values)
-    for key, value in values.items():
-        print(f"{key:28} {value:.4g}" if isinstance(value, float) else f"{key:28} {value}")
-    print(f"figures in {folder}")
+    report(folder, values)
     return values
 
 

@@ -16,18 +16,17 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 import tyro
-from rich.console import Console
-from rich.table import Table
 
 from jumper_warp.cli.main import run_command
 from jumper_warp.identification.parameters import jumper_parameters
 from jumper_warp.identification.recording import KINDS, replay_plan, simulate_plan
 from jumper_warp.identification.replay import Replay
 from jumper_warp.utils.errors import InputError
-from jumper_warp.utils.output import output_dir, write_metrics
+from jumper_warp.utils.output import output_dir
 from jumper_warp.utils.runtime import announce
 from support.identification_methods import compare_methods
 from support.known_robots import make_case, plot_cases, policy_errors, run_case
+from support.scripts import report
 
 REFINE = 16
 """Steps of the finer truth in a step of the model."""
@@ -56,7 +55,6 @@ class Args:
     """CPU threads (default: all cores)."""
 
     def __post_init__(self) -> None:
-        """Check the values."""
         if self.seeds < 1 or self.others < 1 or self.jumps < 3:
             raise InputError(
                 f"need at least 1 seed, 1 other and 3 jumps, got {self.seeds}, {self.others}, {self.jumps}"
@@ -96,14 +94,9 @@ def main(args: Args) -> dict[str, Any]:
         values |= compare_methods(parameters, cases[0][0], replay, ours, cases[0][2].seconds)
     if "policy" in args.parts:
         values |= policy_errors(args.policy, args.jumps, cases[0][0], cases[0][2], folder)
-    write_metrics(folder, values)
     if rows:
         plot_cases(rows, folder / "identification.png")
-    table = Table("metric", "value", title="Identification of known robots")
-    for name, value in values.items():
-        table.add_row(name, str([round(x, 3) for x in value]) if isinstance(value, list) else f"{value:.4g}")
-    Console().print(table)
-    print(f"metrics and plot in {folder}")
+    report(folder, values)
     return values
 
 

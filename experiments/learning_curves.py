@@ -16,7 +16,6 @@ import itertools
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from multiprocessing import get_context
-from pathlib import Path
 from typing import Any
 
 import tyro
@@ -26,17 +25,16 @@ from jumper_warp.cli.main import run_command
 from jumper_warp.registry import make_task, trainer_settings
 from jumper_warp.tasks.observations import with_history
 from jumper_warp.utils.errors import InputError
-from jumper_warp.utils.output import output_dir, write_metrics
-from jumper_warp.utils.runtime import announce
-from support.learning import TESTED, Curve, curve_metrics, draw_curves
-from support.timed_training import timed_training
+from jumper_warp.utils.output import write_metrics
+from support.learning import TESTED, Curve, curve_metrics, draw_curves, timed_training
+from support.scripts import DeviceArgs, prepare
 from support.variants import DEFAULT, variant
 
 TASK = "vertical-jump"
 
 
 @dataclass(frozen=True)
-class Args:
+class Args(DeviceArgs):
     """Flags."""
 
     seconds: float = 60.0
@@ -57,13 +55,8 @@ class Args:
     """Policy steps that the policy sees, as `jumper train --history` (default: as the task says)."""
     randomize: bool = False
     """Train with randomisation and noise."""
-    out: Path | None = None
-    """Folder for metrics.json and plot (default: outputs/learning_curves/<time>)."""
-    device: str | None = None
-    """Warp device."""
 
     def __post_init__(self) -> None:
-        """Check the values."""
         for name in self.variants:
             variant(trainer_settings(TASK), name)
         if not self.variants or not self.seeds or min(self.seeds) < 0:
@@ -87,8 +80,7 @@ def train_in_process(args: Args, name: str, seed: int) -> Curve:
 
 def main(args: Args) -> dict[str, Any]:
     """Train every variant with every seed and return the metrics."""
-    announce(args.device)
-    folder = output_dir("learning_curves", args.out)
+    folder = prepare("learning_curves", args)
     values: dict[str, Any] = {"seconds": args.seconds, "envs": args.envs, "randomize": args.randomize}
     values |= {"seeds": list(args.seeds), "heights_m": list(args.heights), "history": args.history}
     curves: dict[str, list[Curve]] = {name: [] for name in args.variants}

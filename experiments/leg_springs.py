@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any, Literal
 
 import tyro
@@ -27,13 +26,13 @@ from jumper_warp.robot.gravity import EARTH, MARS
 from jumper_warp.robot.motors import jumping_motors
 from jumper_warp.robot.overlay import with_springs
 from jumper_warp.utils.errors import InputError
-from jumper_warp.utils.output import output_dir, write_metrics
-from jumper_warp.utils.runtime import announce
+from jumper_warp.utils.output import write_metrics
+from support.scripts import DeviceArgs, prepare
 from support.spring_jumps import FILTERS, SpringJumps
 
 
 @dataclass(frozen=True)
-class Args:
+class Args(DeviceArgs):
     """Flags."""
 
     stiffness: tuple[float, ...] = (0.0, 125.0, 250.0, 375.0, 500.0, 625.0, 750.0, 875.0, 1000.0, 1250.0, 1500.0)
@@ -50,13 +49,8 @@ class Args:
     """[m/s^2] Downward."""
     filter: Literal["both", "stock", "loose"] = "both"
     """Motor command filter: that of the vertical jump, the loose one, or each in turn."""
-    out: Path | None = None
-    """Folder for figures, plot and recording (default: outputs/leg_springs/<time>)."""
-    device: str | None = None
-    """Warp device."""
 
     def __post_init__(self) -> None:
-        """Check the values."""
         if not self.stiffness or not self.squats:
             raise InputError("need at least one stiffness and one squat")
         for stiffness in self.stiffness:
@@ -72,8 +66,7 @@ class Args:
 def main(args: Args) -> dict:
     """Run the experiment and return its figures."""
     start = time.perf_counter()
-    announce(args.device)
-    folder = output_dir("leg_springs", args.out)
+    folder = prepare("leg_springs", args)
     values: dict[str, Any] = {"gravity_m_s2": args.gravity, "torque_limit_nm": args.torque, "kp_nm_rad": args.kp,
                               "spring_length_m": args.length, "stiffness_n_m": list(args.stiffness)}  # fmt: skip
     place = {EARTH: "Earth", MARS: "Mars"}.get(args.gravity, f"{args.gravity:g} m/s^2")

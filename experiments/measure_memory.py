@@ -46,7 +46,7 @@ def array_bytes() -> int:
     return sum({array.ptr: array.capacity for array in arrays}.values())
 
 
-def measure(args: Args) -> dict[str, int]:
+def measure(args: Args) -> dict[str, float]:
     """Return the peak of this process's main memory and the size of all arrays [byte] after building one environment.
 
     All is on the CPU; the arrays are the same on a GPU.

@@ -24,13 +24,13 @@ from jumper_warp.utils.output import output_dir, write_metrics
 
 
 @wp.func
-def even_load(view: mdp.RobotView, task: mdp.JumpState, spread: float) -> float:
+def even_load(view: mdp.RobotView, task: mdp.JumpState, spread: float) -> float:  # pyright: ignore[reportGeneralTypeIssues]
     """Even load: exp(-deviation / spread) of the paw forces [N] from their mean, on the ground."""
     if task.phase == mdp.FLIGHT:
         return 0.0
-    mean = wp.dot(view.paw_force, wp.vec4(0.25))
-    off = view.paw_force - wp.vec4(mean)
-    return wp.exp(-wp.length(off) / spread)
+    force = view.paw_force
+    mean = 0.25 * (force[0] + force[1] + force[2] + force[3])
+    return wp.exp(-wp.length(force - wp.vec4(mean)) / spread)
 
 
 TASK = make_task("vertical-jump")

@@ -20,16 +20,17 @@ import tyro
 
 from jumper_warp.cli.main import run_command
 from jumper_warp.evaluation.commands import print_figures
+from jumper_warp.robot.description import LEGS
 from jumper_warp.robot.gravity import EARTH
-from jumper_warp.robot.model import LEGS, build_model
+from jumper_warp.robot.model import build_model
 from jumper_warp.robot.motors import jumping_motors, loose_filter, vertical_jump_filter
 from jumper_warp.robot.overlay import load_overlay, with_springs
 from jumper_warp.sim.simulation import Simulation
 from jumper_warp.utils.errors import InputError
-from jumper_warp.utils.output import output_dir, write_metrics
-from jumper_warp.utils.runtime import announce
+from jumper_warp.utils.output import write_metrics
 from jumper_warp.viz.snapshot import Camera, contact_sheet
 from support.open_loop import SQUAT, draw_trace, follow_jump, jump_metrics
+from support.scripts import DeviceArgs, prepare
 
 HARDWARE_APEX = 1.075
 """[m] Paper, open loop on the robot at 18 N m."""
@@ -40,7 +41,7 @@ PER_MOTOR = tuple(f"peak_{what}_{leg}" for what in ("torque", "speed") for leg i
 
 
 @dataclass(frozen=True)
-class Args:
+class Args(DeviceArgs):
     """Flags."""
 
     solver: Literal["jumper", "mujoco"] = "jumper"
@@ -59,13 +60,8 @@ class Args:
     """[N/m] [m] Stiffness and rest length of springs between the knees of each leg (default: none)."""
     robot: Path | None = None
     """Robot overlay, as `jumper sysid` writes it, in place of springs."""
-    out: Path | None = None
-    """Folder for figures, plot and recording (default: outputs/open_loop_jump/<time>)."""
-    device: str | None = None
-    """Warp device."""
 
     def __post_init__(self) -> None:
-        """Check the values."""
         if self.spring is not None and self.robot is not None:
             raise InputError("give springs or a robot, which may have springs")
 
@@ -84,8 +80,7 @@ def draw_filmstrip(frames: list[np.ndarray], path: Path) -> None:
 def main(args: Args) -> dict:
     """Run the experiment and return its figures."""
     start = time.perf_counter()
-    announce(args.device)
-    folder = output_dir("open_loop_jump", args.out)
+    folder = prepare("open_loop_jump", args)
     variant = {"solver": args.solver, "gravity_m_s2": args.gravity, "torque_limit_nm": args.torque,
                "kp_nm_rad": args.kp, "loose_filter": args.loose, "squat_command_deg": args.squat}  # fmt: skip
     robot = None if args.robot is None else load_overlay(args.robot)

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, cast
 
 import torch
 import tyro
@@ -20,22 +20,23 @@ import tyro
 from jumper_warp.cli.main import run_command
 from jumper_warp.diff.differentiable_env import DifferentiableEnv
 from jumper_warp.envs.env import Env
+from jumper_warp.envs.vec_env import DifferentiableVecEnv
 from jumper_warp.registry import make_task, trainer_settings
 from jumper_warp.rl.cfg import ShacCfg
 from jumper_warp.rl.ppo import Ppo
 from jumper_warp.rl.shac import Shac
 from jumper_warp.tasks.observations import with_history
 from jumper_warp.utils.errors import InputError
-from jumper_warp.utils.output import output_dir, write_metrics
-from jumper_warp.utils.runtime import announce
+from jumper_warp.utils.output import write_metrics
 from support.gradient_variance import variances
 from support.learning import Curve, curve_metrics, draw_curves, learning_curve, make_judge
+from support.scripts import DeviceArgs, prepare
 
 TASK = "vertical-jump"
 
 
 @dataclass(frozen=True)
-class Args:
+class Args(DeviceArgs):
     """Flags."""
 
     seconds: float = 120.0
@@ -62,10 +63,6 @@ class Args:
     """Policy steps of the windows whose gradients are measured."""
     worlds: int = 256
     """Worlds of that."""
-    out: Path | None = None
-    """Folder for metrics.json and plots (default: outputs/shac/<time>)."""
-    device: str | None = None
-    """Warp device."""
 
     def __post_init__(self) -> None:
         """Raises InputError: a setting is out of range."""
@@ -86,9 +83,9 @@ def train(args: Args, trainer: str, seed: int) -> Curve:
     judge = make_judge(env.tasks[0], args.jumps, args.device)
     settings = replace(settings, hidden=args.hidden)
     if trainer == "shac":
-        env = DifferentiableEnv(env)
+        smooth = cast(DifferentiableVecEnv, DifferentiableEnv(env))
         settings = replace(settings, num_steps=args.window, init_std=args.init_std)
-        return learning_curve(env, Shac(env, settings, ShacCfg()), judge, args.seconds, args.every)
+        return learning_curve(smooth, Shac(smooth, settings, ShacCfg()), judge, args.seconds, args.every)
     return learning_curve(env, Ppo(env, settings), judge, args.seconds, args.every)
 
 
@@ -106,8 +103,7 @@ def compare(args: Args, folder: Path) -> dict[str, Any]:
 
 def main(args: Args) -> dict[str, Any]:
     """Measure, train, draw, and return the figures."""
-    announce(args.device)
-    folder = output_dir("shac", args.out)
+    folder = prepare("shac", args)
     values = {"envs": args.envs, "window": args.window, "worlds": args.worlds}
     values |= variances(lambda: make_env(args, args.worlds), args.horizons, folder / "variance.png")
     values |= compare(args, folder) if args.seconds > 0.0 else {}

@@ -19,15 +19,13 @@ from jumper_warp.envs.env import Env
 from jumper_warp.registry import make_task
 from jumper_warp.robot.motors import vertical_jump_filter
 from jumper_warp.sim.simulation import Simulation
-from jumper_warp.utils.output import output_dir, write_metrics
-from jumper_warp.utils.runtime import announce
+from support.scripts import prepare, report
 from support.soak import SoakArgs, hardest, soak_env, soak_simulation
 
 
 def main(args: SoakArgs) -> dict:
     """Run the soak test and return its figures."""
-    announce(args.device, args.threads)
-    folder = output_dir("soak_test", args.out)
+    folder = prepare("soak_test", args, args.threads)
     torch.manual_seed(args.seed)
     if args.task is None:
         command_filter = vertical_jump_filter() if args.filter else None
@@ -36,10 +34,7 @@ def main(args: SoakArgs) -> dict:
     else:
         env = Env(hardest(make_task(args.task)), args.envs, seed=args.seed, device=args.device, threads=args.threads)
         figures = soak_env(env, args) | {"task": args.task}
-    write_metrics(folder, figures | {"envs": args.envs, "filter": args.filter, "seed": args.seed})
-    for name, value in figures.items():
-        print(f"{name:34s} {value if isinstance(value, str) else f'{value:,.6g}'}")
-    print(f"figures in {folder}")
+    report(folder, figures | {"envs": args.envs, "filter": args.filter, "seed": args.seed})
     return figures
 
 

@@ -38,7 +38,6 @@ class Args(EvaluationArgs):
     """[m] Nearest and farthest of one that jumps to places."""
 
     def __post_init__(self) -> None:
-        """Check the values."""
         super().__post_init__()
         if self.squats < 1 or not 1.5 <= self.hold <= 30.0:
             raise InputError(f"need at least one squat, and hold in 1.5 to 30 s, got {self.squats}, {self.hold}")

@@ -30,16 +30,16 @@ from rich.table import Table
 
 from jumper_warp.cli.main import run_command
 from jumper_warp.utils.errors import InputError
-from jumper_warp.utils.output import output_dir, write_metrics
-from jumper_warp.utils.runtime import announce
+from jumper_warp.utils.output import write_metrics
 from support.motion_replay import Replay, plot
 from support.optimized_jumps import FINE, JUMPS, LIMITED, around, optimise
+from support.scripts import ThreadArgs, prepare
 
 KNOWN = JUMPS | LIMITED
 
 
 @dataclass(frozen=True)
-class Args:
+class Args(ThreadArgs):
     """Flags."""
 
     jumps: tuple[str, ...] = tuple(JUMPS)
@@ -52,15 +52,8 @@ class Args:
     """Iterations of the last descent (default: those of each jump)."""
     seed: int = 0
     """Of random candidates and displacements."""
-    out: Path | None = None
-    """Folder for metrics, plots, targets and recordings (default: outputs/trajectory_optimization/<time>)."""
-    device: str | None = None
-    """Warp device."""
-    threads: int | None = None
-    """CPU threads that share the worlds (default: all cores); they change no result."""
 
     def __post_init__(self) -> None:
-        """Check the values."""
         unknown = [name for name in self.jumps if name not in KNOWN]
         if unknown or not self.jumps:
             raise InputError(f"no jump {(unknown or [''])[0]!r:.40}; there are {', '.join(KNOWN)}")
@@ -89,9 +82,8 @@ def run_jump(name: str, args: Args, folder: Path, found: dict[str, np.ndarray]) 
 
 def main(args: Args) -> dict[str, Any]:
     """Optimise, and return the metrics."""
-    announce(args.device, args.threads)
     torch.set_num_threads(1)  # its arrays are small, and the worlds have the cores
-    folder, found = output_dir("trajectory_optimization", args.out), {}
+    folder, found = prepare("trajectory_optimization", args, args.threads), {}
     replays: dict[str, Replay] = {}
     values: dict[str, Any] = {}
     table = Table("jump", "reached", "violation", "simulated steps", "reverse steps", "processor [s]", "wall [s]")
@@ -102,7 +94,7 @@ def main(args: Args) -> dict[str, Any]:
         values |= {f"{name}_{key}": value for key, value in replay.metrics().items()}
         if name == "still":
             values |= {"still_longest_lift_s": replay.longest_lift, "still_highest_lift_m": replay.highest_lift}
-        replay.save_rrd(folder / f"{name}.rrd")
+        replay.recorder.save_rrd(folder / f"{name}.rrd")
         replay.save_strip(folder / f"{name}_strip.png")
         write_metrics(folder, values)
         table.add_row(

@@ -21,11 +21,11 @@ import tyro
 from jumper_warp.cli.main import run_command
 from jumper_warp.evaluation.courses import Course, course_metrics, draw_course
 from jumper_warp.evaluation.places import random_headings
-from jumper_warp.evaluation.plots import drawn
 from jumper_warp.evaluation.run import EvaluationArgs, SkillRun
 from jumper_warp.evaluation.scripts import ScriptStep
 from jumper_warp.policies.skills import SkillNames
 from jumper_warp.utils.errors import InputError
+from support.walks import PAPER
 
 REACH, EACH = 0.8, 2.0
 """[m/s] and [rad/s] of the commands; [s] from one to the next."""
@@ -38,8 +38,6 @@ COMMANDS = 10
 JUMPS = ("jump_up", "jump_to", "jump_onto")
 PROBABILITIES = (0.35, 0.2, 0.15, 0.15, 0.15)
 """Of walking, turning and each of the jumps."""
-PAPER = {"rmse_vx_m_s": 0.17, "rmse_vy_m_s": 0.05, "rmse_yaw_rate_rad_s": 0.12}
-"""The paper's figures, one test on the robot."""
 
 
 @dataclass(frozen=True)
@@ -60,7 +58,6 @@ class Args(EvaluationArgs):
     """Whether courses have blocks to jump onto; SolverMuJoCo has none."""
 
     def __post_init__(self) -> None:
-        """Check the values."""
         super().__post_init__()
         if not 1 <= self.robots <= 20_000:
             raise InputError(f"robots must be in 1 to 20000, got {self.robots}")
@@ -109,9 +106,8 @@ def main(args: Args) -> dict:
     run = SkillRun.of(name, args, SkillNames(args.policy, args.jump_up, args.jump_to))
     course = Course(scripts(args), random_headings(args.robots, args.seed))
     run.follow(run.env(args.robots, block=course.block), course, film=name)
-    with drawn(run.folder / "course.png", 5, 1, figsize=(10, 9), sharex=True) as axes:
-        draw_course(axes, course, 0)
-        axes[0].set_title(f"walk, jump, walk: robot 0 of {len(course.end)}, {run.title}")
+    title = f"walk, jump, walk: robot 0 of {course.count}, {run.title}"
+    draw_course(run.folder / "course.png", course, 0, title)
     return run.report(course_metrics(course), {} if args.course else PAPER)
 
 

@@ -33,7 +33,6 @@ class Args(EvaluationArgs):
     """Flags."""
 
     policy: str = "walking_rough"
-    """Name or folder of a policy, a run's folder, or a checkpoint."""
     robots: int = 500
     """Robots on each terrain."""
     terrains: tuple[str, ...] = KINDS
@@ -50,7 +49,6 @@ class Args(EvaluationArgs):
     """Number of robots to record on each terrain for the Rerun viewer; 0: none."""
 
     def __post_init__(self) -> None:
-        """Check the values."""
         super().__post_init__()
         check_walks(self.robots, SECONDS, self.speed)
         if not 0.0 < self.speed <= 0.6:

@@ -24,12 +24,10 @@ from jumper_warp.evaluation.run import EvaluationArgs, EvaluationRun
 from jumper_warp.evaluation.velocities import AXES, Walks, check_walks, grid, tracking_metrics
 from jumper_warp.utils.errors import InputError
 from support.gaits import Gait
-from support.walks import HOLD, REACH, STEP, kicked, redirected, settling_times, sped_up, speed_metrics
+from support.walks import HOLD, PAPER, REACH, STEP, kicked, redirected, settling_times, sped_up, speed_metrics
 
 GAIT_SPEED = 0.8
 """[m/s] Of the straight walk whose gait is measured."""
-PAPER = {"rmse_vx_m_s": 0.17, "rmse_vy_m_s": 0.05, "rmse_yaw_rate_rad_s": 0.12}
-"""The paper's figures, on hardware, with commands up to 0.8 that a person gave."""
 
 
 @dataclass(frozen=True)
@@ -37,14 +35,12 @@ class Args(EvaluationArgs):
     """Flags."""
 
     policy: str = "walking_flat"
-    """Name or folder of a policy, a run's folder, or a checkpoint."""
     per_axis: int = 13
     """Commands along each axis of the grid; one robot for each of all three, and as many in the other tests."""
     record: int = 1
     """Number of robots to record for the Rerun viewer, redirected while they walk; 0: none."""
 
     def __post_init__(self) -> None:
-        """Check the values."""
         super().__post_init__()
         if self.per_axis < 2:
             raise InputError(f"per_axis must be at least 2, got {self.per_axis}")

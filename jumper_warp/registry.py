@@ -73,13 +73,9 @@ TURNS = PpoCfg(gamma=0.99, entropy_coef=0.001, init_std=0.5, symmetry="actor")
 """How turning in flight is trained."""
 
 TASKS: dict[str, TaskEntry] = {
-    "vertical-jump": TaskEntry(
-        "jumper_warp.tasks.jump.vertical:vertical_jump", HEIGHTS, aliases=("Olympus-Vertical-Jump",)
-    ),
+    "vertical-jump": TaskEntry("jumper_warp.tasks.jump.vertical:vertical_jump", HEIGHTS, ("Olympus-Vertical-Jump",)),
     "horizontal-jump": TaskEntry(
-        "jumper_warp.tasks.jump.horizontal:horizontal_jump",
-        PLACES,
-        aliases=("Olympus-Horizontal-Jump",),
+        "jumper_warp.tasks.jump.horizontal:horizontal_jump", PLACES, ("Olympus-Horizontal-Jump",)
     ),
     "horizontal-jump-slippery": TaskEntry("jumper_warp.tasks.jump.horizontal:horizontal_jump_slippery", PLACES),
     "horizontal-jump-sighted": TaskEntry("jumper_warp.tasks.jump.horizontal:horizontal_jump_sighted", PLACES),
@@ -179,9 +175,8 @@ def load_installed(point: EntryPoint) -> None:
 def load_task_module(name: str) -> ModuleType:
     """Import a FILE.py, or a module by name, so that the tasks that it registers are known.
 
-    Raises:
-        InputError: There is none, its name belongs to another module, or what it registers or defines is refused.
-        OSError: The file cannot be read.
+    Raises InputError: there is none, its name belongs to another module, or what it registers or defines is refused.
+    OSError: the file cannot be read.
     """
     path, before = Path(name), dict(TASKS)
     try:

@@ -17,7 +17,7 @@ from jumper_warp.robot.pinocchio_model import build_pinocchio
 from jumper_warp.robot.values import RobotValues
 from jumper_warp.sim.dynamics import JumperDynamics
 from jumper_warp.sim.overlay import MOTOR_DOFS, write_model
-from support.poses import random_motors
+from support.inverse_kinematics import random_motors
 
 MARGIN = 0.35
 """[rad] From the stops: a stretched leg is singular."""
@@ -63,7 +63,7 @@ def ours(values: RobotValues, states: States) -> Quantities:
         return turn, origin, turn.inv().apply(qd[:, 3:6])
 
     after = array(q), array(qd)
-    drive = dynamics.drive(array(force), wp.zeros(21 * n, dtype=wp.spatial_vector, device="cpu"))
+    drive = dynamics.drive(array(force), wp.zeros(21 * n, dtype=wp.spatial_vectorf, device="cpu"))
     dynamics.advance(dynamics.settings(DT, 1, 50, 1.0e-5), drive, *after, *after)
     new_q, new_qd = (rows.numpy().reshape(n, -1) for rows in after)
     (turn, origin, spin), (_, new_origin, new_spin) = base(q, qd), base(new_q, new_qd)
@@ -81,18 +81,19 @@ def our_paws(dynamics: JumperDynamics, q: np.ndarray) -> Quantities:
     q[:, 3:7] = 0.0, 0.0, 0.0, 1.0
     shanks = [model.body_label.index(f"world_0/{leg}_inner_shank") for leg in LEGS]
     anchors = np.array([loop.parent_anchor for loop in dynamics.description.loops])
-    arms, columns = anchors - model.body_com.numpy()[shanks], []
+    arms, paws, columns = anchors - model.body_com.numpy()[shanks], [], []
     for motor in range(3):
         rates = np.zeros((n, 38))
         rates[:, MOTOR_DOFS[motor::3]] = 1.0
-        arrays = [wp.array(rows.ravel(), dtype=wp.float64, device="cpu") for rows in (q, rates)]
+        angles, speeds = (wp.array(rows.ravel(), dtype=wp.float64, device="cpu") for rows in (q, rates))
         state = model.state()
-        dynamics.full_state(*arrays, state.body_q, state.body_qd)
+        dynamics.full_state(angles, speeds, state.body_q, state.body_qd)
         pose, twist = (rows.numpy().reshape(n, 21, -1)[:, shanks] for rows in (state.body_q, state.body_qd))
         turn = Rotation.from_quat(pose[..., 3:].reshape(-1, 4))
         out, arm = (turn.apply(np.tile(rows, (n, 1))).reshape(n, 4, 3) for rows in (anchors, arms))
+        paws.append(pose[..., :3] + out)
         columns.append(twist[..., :3] + np.cross(twist[..., 3:], arm))
-    return {"paw_position": pose[..., :3] + out, "paw_jacobian": np.stack(columns, axis=3)}
+    return {"paw_position": paws[0], "paw_jacobian": np.stack(columns, axis=3)}
 
 
 def pinocchios(values: RobotValues, states: States) -> Quantities:

@@ -6,7 +6,7 @@ import json
 import shlex
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, cast
 
 import numpy as np
 from rich.console import Console
@@ -108,7 +108,7 @@ def measured(checkpoint: Path, args: Any, folder: Path) -> dict[str, dict[str, A
     for test, count in zip(TESTS, args.jumps, strict=True):
         drawn_robots = test == "randomized"
         conditions = replace(run.conditions, randomize=drawn_robots, noise=drawn_robots)
-        flags = replace(run.evaluation.flags, jumps=count, **JUMPS[args.task].goals)
+        flags: Any = replace(cast(Any, run.evaluation.flags), jumps=count, **JUMPS[args.task].goals)
         env = run.env(count, lambda task: run.evaluation.for_evaluation(replace(task, terminations=ends)), conditions)
         values = flags.metrics(run.follow(env, flags.log(env.task, 0)))
         values["error_m"] = values.get("mean_abs_error_m", values.get("mean_error_m"))

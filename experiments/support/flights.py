@@ -7,8 +7,9 @@ policy or with the legs held in the default pose.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,7 +17,8 @@ import torch
 
 from jumper_warp.envs.env import Env
 from jumper_warp.evaluation.jumps import DELAY, jump_commands, yaw_of
-from jumper_warp.evaluation.log import NO_END, EvaluationLog, Metrics, failures, finite, largest, mean
+from jumper_warp.evaluation.log import NO_END, EvaluationLog, Metrics, failures, finite, largest, mean, mean_and_max
+from jumper_warp.evaluation.plots import drawn
 from jumper_warp.evaluation.run import HEIGHTS, EvaluationArgs, Run, conditions_of
 from jumper_warp.policies.policy import Policy
 from jumper_warp.policies.restore import restored_task
@@ -54,49 +56,30 @@ class Flights(EvaluationLog):
     apex: np.ndarray
     """[m] (num_envs,) Heights that the jump's policy is told."""
     late: np.ndarray | None = None
-    """[s] (num_envs, 2) By how much later the front legs, and the left ones, extend than the others; None: the jump's
-    policy takes off."""
+    """[s] (num_envs, 2) By how much later front and left legs extend; None: the jump's policy takes off."""
     turns: bool = True
     """Whether the robots turn in flight."""
     seconds: float = 9.0
-    end: np.ndarray = field(init=False)
-    """Index in OUTCOMES, -1 while under way."""
-    takeoff_tilt: np.ndarray = field(init=False)
-    """[rad]"""
-    takeoff_spin: np.ndarray = field(init=False)
-    """[rad/s]"""
-    takeoff_momentum: np.ndarray = field(init=False)
-    """[kg m^2/s] Angular, about the com."""
-    largest_tilt: np.ndarray = field(init=False)
-    """[rad] In flight."""
-    touchdown_tilt: np.ndarray = field(init=False)
-    """[rad] In the step before the touchdown."""
-    touchdown_turn: np.ndarray = field(init=False)
-    """[rad] Out of the heading that it began with, at that time."""
-    height: np.ndarray = field(init=False)
-    """[m] Largest of the base."""
-    flight_time: np.ndarray = field(init=False)
-    """[s]"""
-    drift: np.ndarray = field(init=False)
-    """[kg m^2/s] Largest change of the angular momentum high in flight, which only the solver can have made."""
-    tilts: list[np.ndarray] = field(default_factory=list, init=False)
-    """[rad] (num_envs,) After every policy step, until the end."""
-    heights: list[np.ndarray] = field(default_factory=list, init=False)
-    """[m] (num_envs,) Of the base."""
-
     row = "flight"
     spacing = 1.6
 
     def __post_init__(self) -> None:
         """Begin with nothing done."""
-        n = len(self.apex)
-        self.end, self.step_dt = np.full(n, -1), 1.0 / 60.0
+        self.count, self.step_dt = len(self.apex), 1.0 / 60.0
+        n = self.count
+        self.end = np.full(n, -1)  # index in OUTCOMES, -1 while under way
+        self.takeoff_tilt, self.takeoff_spin = (np.full(n, np.nan) for _ in range(2))  # [rad], [rad/s]
+        self.takeoff_momentum = np.full(n, np.nan)  # [kg m^2/s] angular, about the com
+        self.largest_tilt = np.zeros(n)  # [rad] in flight
+        self.touchdown_tilt = np.full(n, np.nan)  # [rad] in the step before the touchdown
+        self.touchdown_turn = np.full(n, np.nan)  # [rad] out of the heading that it began with, at that time
+        self.height = np.zeros(n)  # [m] largest of the base
+        self.flight_time = np.full(n, np.nan)  # [s]
+        self.drift = np.zeros(n)  # [kg m^2/s] largest change of the angular momentum high in flight, by the solver
+        self.tilts: list[np.ndarray] = []  # [rad] (num_envs,) after every policy step, until the end
+        self.heights: list[np.ndarray] = []  # [m] (num_envs,) of the base
         self._left, self._down = np.full(n, -1), np.full(n, -1)
         self._clear, self._turned, self._begun = np.zeros(n, dtype=int), np.zeros(n), np.zeros((n, 3))
-        names = ("takeoff_tilt", "takeoff_spin", "takeoff_momentum", "touchdown_tilt", "touchdown_turn", "flight_time")
-        for name in names:
-            setattr(self, name, np.full(n, np.nan))
-        self.largest_tilt, self.height, self.drift = (np.zeros(n) for _ in range(3))
 
     def begin(self, env: Any) -> None:
         """Stand every robot in the default pose."""
@@ -104,11 +87,11 @@ class Flights(EvaluationLog):
         goals[:, 2] = self.apex
         env.evaluation_reset(jump_commands(goals, DELAY if self.late is None else 0.0, env.step_dt))
 
-    def open_loop(self) -> np.ndarray:
-        """Return the transversal angles [deg] of the next policy step, (num_envs, 4)."""
+    def open_loop(self, late: np.ndarray) -> np.ndarray:
+        """Return the transversal angles [deg] of the next policy step, (num_envs, 4); late: as of the flights."""
         step, n = len(self.tilts), len(self.apex)
         squat = 45.0 + (SQUAT - 45.0) * min(step / RAMP, 1.0)
-        delay = self.late @ (0.5 * ROWS.T) / self.step_dt
+        delay = late @ (0.5 * ROWS.T) / self.step_dt
         share = np.clip(step + 1 - (RAMP + HOLD) - (delay - delay.min(axis=1, keepdims=True)), 0.0, 1.0)
         if step < RAMP + HOLD + EXTEND:
             return squat + (STRETCHED - squat) * share
@@ -125,7 +108,7 @@ class Flights(EvaluationLog):
             return chosen
         pushing = self._left < 0
         legs = np.zeros((n, 4, 3))
-        legs[:, :, 1:] = ((self.open_loop() - 45.0) / scale)[:, :, None]
+        legs[:, :, 1:] = ((self.open_loop(self.late) - 45.0) / scale)[:, :, None]
         chosen[pushing] = legs.reshape(n, 12)[pushing]
         return chosen
 
@@ -227,17 +210,36 @@ def flight_metrics(flights: Flights) -> Metrics:
         "mean_apex_m": mean(flights.height),
         **({"mean_abs_height_error_m": mean(np.abs(flights.height - flights.apex))} if flights.late is None else {}),
         "mean_largest_tilt_deg": mean(np.degrees(flights.largest_tilt)),
-        "mean_touchdown_tilt_deg": mean(np.degrees(flights.touchdown_tilt)),
-        "max_touchdown_tilt_deg": largest(np.degrees(flights.touchdown_tilt)),
-        "mean_touchdown_turn_deg": mean(np.degrees(flights.touchdown_turn)),
-        "max_touchdown_turn_deg": largest(np.degrees(flights.touchdown_turn)),
+        **mean_and_max("touchdown_tilt_deg", np.degrees(flights.touchdown_tilt)),
+        **mean_and_max("touchdown_turn_deg", np.degrees(flights.touchdown_turn)),
         **failures(flights.outcomes[~flights.success]),
         "failed_before_touchdown": int((~flights.success & np.isnan(flights.flight_time)).sum()),
     }
 
 
+def delays(count: int, most: float, seed: int) -> np.ndarray:
+    """Return by how much later front and left legs extend, (count, 2): from half of the most to it, to any side."""
+    rng = np.random.default_rng(seed)
+    size, angle = rng.uniform(0.5 * most, most, count), rng.uniform(0.0, 2.0 * np.pi, count)
+    return np.stack([size * np.cos(angle), size * np.sin(angle)], axis=1)
+
+
+def draw_flights(path: Path, found: Mapping[str, Flights]) -> None:
+    """Draw tilt and height of all flights over time, a column for each name."""
+    with drawn(path, 2, len(found), figsize=(11, 6), sharex=True, sharey="row") as axes:
+        for column, (name, flights) in zip(axes.T, found.items(), strict=True):
+            time = np.arange(len(flights.tilts)) * flights.step_dt
+            column[0].plot(time, np.degrees(np.array(flights.tilts)), linewidth=0.6, alpha=0.5, color="tab:red")
+            column[1].plot(time, np.array(flights.heights), linewidth=0.6, alpha=0.5, color="tab:blue")
+            column[0].set(ylabel="tilt [deg]", title=f"{name}: {flights.success.mean():.0%} landed upright")
+            column[1].set(xlabel="time [s]", ylabel="base height [m]")
+
+
 class FlightRun(Run):
     """Follows flights of a jump and a policy that turns."""
+
+    flights: Flights
+    """Under way."""
 
     def __init__(self, args: EvaluationArgs, landing: str, jump: str) -> None:
         """Open the policies that turn (args) and land (none if empty); jump: the task that takes off and lands then.
@@ -254,7 +256,6 @@ class FlightRun(Run):
         if takes_off.evaluation not in HEIGHTS:
             raise PolicyError(f"this needs a jump to heights, got {takes_off.name}")
         self.tasks = takes_off, turning
-        self.flights: Flights | None = None
         self.prepare("flight_attitude", conditions_of(args), args.out, record=args.record)
 
     def actor(self, env: Env) -> Callable[[torch.Tensor], torch.Tensor]:

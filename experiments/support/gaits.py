@@ -9,7 +9,7 @@ import numpy as np
 
 from jumper_warp.evaluation.log import Metrics
 from jumper_warp.kernels.layout import BODIES
-from jumper_warp.robot.model import LEGS
+from jumper_warp.robot.description import LEGS
 
 
 @dataclass

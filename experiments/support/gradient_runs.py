@@ -26,7 +26,7 @@ class PlainJump:
         self._targets = rollout.array(np.repeat(targets[:, :, None], n, axis=2))
         safe = rollout.array(np.zeros((12, n)))
         limits = filter_params(vertical_jump_filter(), module=modules.command_filter)
-        wrench = wp.zeros(dynamics.model.body_count, dtype=wp.spatial_vector, device=rollout.device)
+        wrench = wp.zeros(dynamics.model.body_count, dtype=wp.spatial_vectorf, device=rollout.device)
         motors = rollout.motors
         drive = dynamics.drive(rollout.array(np.zeros(38 * n)), wrench, motors, safe)
         settings = dynamics.settings(PHYSICS_DT, SUBSTEPS, MAX_SWEEPS, TOLERANCE)
@@ -45,6 +45,7 @@ class PlainJump:
         run()
         with wp.ScopedCapture(device=rollout.device) as capture:
             run()
+        assert capture.graph is not None
         self._graph, self._arrays = capture.graph, (drive, safe, wrench)  # a graph on a GPU keeps no arrays alive
 
     def run(self) -> None:

@@ -29,6 +29,8 @@ SLIP_FRICTION = 0.25
 OUTER, INNER = 1, 2
 """Motors of the front left leg in the plot."""
 PARAMETERS = ("table", "saturation")
+Pair = tuple[np.ndarray, np.ndarray]
+"""A gradient and its differences."""
 
 
 def schedule(push: tuple[float, float]) -> np.ndarray:
@@ -113,17 +115,17 @@ def mass_directions(table: np.ndarray) -> np.ndarray:
     return directions
 
 
-def check(device: str | None) -> tuple[Trajectory, dict[str, tuple[np.ndarray, np.ndarray]]]:
+def check(device: str | None) -> tuple[Trajectory, dict[str, Pair]]:
     """Return the jump, and by input the gradient of its apex beside the differences."""
     jump = GradientJump(1, double=True, device=device)
     rollout, grads = jump.gradients({})
     motors = [(t, m) for m in (OUTER, INNER) for t in range(TICKS)]
     coords, rates = [2, 3, 4, 5, *range(7, 19)], list(range(18))
 
-    def pair(found: np.ndarray, name: str, directions: np.ndarray, step: float, inputs: dict) -> tuple:
+    def pair(found: np.ndarray, name: str, directions: np.ndarray, step: float, inputs: dict) -> Pair:
         return found, differences(inputs, name, directions, step, device)
 
-    def chosen(name: str, which: list, step: float, gradient: np.ndarray, inputs: dict) -> tuple:
+    def chosen(name: str, which: list, step: float, gradient: np.ndarray, inputs: dict) -> Pair:
         found = np.array([gradient[entry] for entry in which])
         return pair(found, name, entries(gradient.shape, which), step, inputs)
 
@@ -139,5 +141,5 @@ def check(device: str | None) -> tuple[Trajectory, dict[str, tuple[np.ndarray, n
         "mass": pair(grads["mass"], "table", mass_directions(jump.values["table"]), 1.0e-6, {}),
         "torque_limit": chosen("saturation", list(range(12)), 1.0e-5, grads["saturation"], {}),
         "friction": chosen("table", friction_rows, 1.0e-6, slip_grad, slip),
-        "initial_state": tuple(np.concatenate(parts) for parts in zip(position, speed, strict=True)),
+        "initial_state": (np.concatenate([position[0], speed[0]]), np.concatenate([position[1], speed[1]])),
     }

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
+from jumper_warp.envs.env import Env
 from jumper_warp.evaluation.jumps import jump_commands
-from jumper_warp.evaluation.log import EvaluationEnv, EvaluationLog, Metrics, largest, mean
+from jumper_warp.evaluation.log import EvaluationLog, Metrics, mean, mean_and_max
 
 DOWN = 0.1
 """[N] Of a paw that is on the ground."""
@@ -25,27 +26,23 @@ class Holds(EvaluationLog):
     """[s] Until the jump would be commanded; all that is followed."""
     window: float = 1.0
     """[s] At the end of it, what is looked at."""
-    peaks: list[np.ndarray] = field(default_factory=list, init=False)
-    """[N] (num_envs, 4) Largest force on each paw in each policy step, of all its physics steps."""
-    forces: list[np.ndarray] = field(default_factory=list, init=False)
-    """[N] (num_envs, 4) Force on each paw at the end of it."""
-    torques: list[np.ndarray] = field(default_factory=list, init=False)
-    """[N m] (num_envs, 12) Of the motors."""
-    over: np.ndarray = field(init=False)
-    """Whether each episode ended before the command."""
-
     row = "squat"
 
     def __post_init__(self) -> None:
         """Begin with nothing seen."""
-        self.over, self.step_dt = np.zeros(len(self.goals), dtype=bool), 1.0 / 60.0
+        self.count, self.step_dt = len(self.goals), 1.0 / 60.0
+        self.over = np.zeros(self.count, dtype=bool)  # whether each episode ended before the command
+        # in each policy step, (num_envs, 4), (num_envs, 4), (num_envs, 12)
+        self.peaks: list[np.ndarray] = []  # [N] largest force on each paw, of all its physics steps
+        self.forces: list[np.ndarray] = []  # [N] force on each paw at the end of it
+        self.torques: list[np.ndarray] = []  # [N m] of the motors
 
     @property
     def seconds(self) -> float:
         """[s] Simulated time."""
         return self.hold
 
-    def begin(self, env: EvaluationEnv) -> None:
+    def begin(self, env: Env) -> None:
         """Stand every robot still, with a goal and no command yet."""
         self.step_dt = env.step_dt
         env.evaluation_reset(jump_commands(self.goals, self.hold + 1.0, env.step_dt))
@@ -106,10 +103,8 @@ def hold_metrics(holds: Holds) -> Metrics:
     return {
         "squats": len(holds.over),
         "holding_rate": float((~holds.over).mean()),
-        "mean_paw_force_range_n": mean(spread),
+        **mean_and_max("paw_force_range_n", spread),
         "median_paw_force_range_n": float(np.median(spread)) if len(spread) else None,
-        "max_paw_force_range_n": largest(spread),
         "lost_paw_share": mean((holds.last(holds.forces) < DOWN).ravel()),
-        "mean_torque_ripple_nm": mean(ripple),
-        "max_torque_ripple_nm": largest(ripple),
+        **mean_and_max("torque_ripple_nm", ripple),
     }

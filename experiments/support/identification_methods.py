@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from typing import Any, cast
 
 import numpy as np
 from scipy.optimize import least_squares
@@ -69,7 +70,7 @@ def scipy_fit(problem: LeastSquares, seconds: float) -> Point:
     inside = begin.z + 0.2 * (begin.z <= low)  # its trust region shrinks at bounds
     try:
         least_squares(
-            residuals, np.concatenate([inside, *begin.starts]), jacobian,
+            residuals, np.concatenate([inside, *begin.starts]), cast(Any, jacobian),
             (np.concatenate([low, -wide]), np.concatenate([high, wide])),
         )  # fmt: skip
     except OutOfTime:

@@ -1,33 +1,31 @@
-"""Poses of many robots from the places of their paws, in one launch. The kernels are imported: they have no facade."""
+"""Random poses, and poses of many robots from the places of their paws; the kernels are imported: no facade."""
 
 from __future__ import annotations
+
+from typing import Any
 
 import numpy as np
 import warp as wp
 
 from jumper_warp.kernels.kinematics import geometry
-from jumper_warp.kernels.kinematics.inverse import LegLimits, inverse_kinematics_kernel
-from jumper_warp.kernels.kinematics.leg import leg_forward_kinematics
+from jumper_warp.kernels.kinematics.inverse import LegLimits, inverse_kinematics_kernel, paws_kernel
 from jumper_warp.robot.description import MOTOR_JOINTS, RobotDescription
 from jumper_warp.robot.model import leg_geometry_array
 
 
-@wp.kernel(enable_backward=False)
-def paws_kernel(
-    # in
-    legs: wp.array(dtype=geometry.LegGeometry),
-    motors: wp.array2d(dtype=float),
-    # out
-    paws: wp.array2d(dtype=wp.vec3),
-):
-    """Write paw positions [m] (4, n) in the body frame for motor angles [rad] (12, n)."""
-    leg, robot = wp.tid()
-    m = 3 * leg
-    paws[leg, robot] = leg_forward_kinematics(legs[leg], motors[m, robot], motors[m + 1, robot], motors[m + 2, robot])
+def random_motors(description: RobotDescription, n: int, rng: np.random.Generator, margin: float = 0.0) -> np.ndarray:
+    """Return motor angles [rad], shape (12, n), uniform between the stops, a margin [rad] away from them."""
+    lateral, outer = (description.joint(name) for name in MOTOR_JOINTS[:2])
+    least, most = (outer.lower + margin, outer.upper - margin)
+    swing = rng.uniform(lateral.lower + margin, lateral.upper - margin, (4, 1, n))
+    first = rng.uniform(least, most, (4, 1, n))
+    lowest = np.maximum(least, description.transversal_sum[0] + margin - first)
+    highest = np.minimum(most, description.transversal_sum[1] - margin - first)
+    return np.concatenate([swing, first, rng.uniform(lowest, highest)], axis=1).reshape(12, n)
 
 
-def leg_limits(description: RobotDescription) -> LegLimits:
-    """Return the hard stops of a leg."""
+def leg_limits(description: RobotDescription) -> Any:
+    """Return the hard stops of a leg, `LegLimits`."""
     lateral, outer = (description.joint(name) for name in MOTOR_JOINTS[:2])
     limits = LegLimits()
     limits.lateral_lower, limits.lateral_upper = lateral.lower, lateral.upper

@@ -13,11 +13,14 @@ import torch
 import warp as wp
 
 from jumper_warp.envs.env import Env
+from jumper_warp.envs.vec_env import VecEnv
 from jumper_warp.evaluation.heights import run_jumps
 from jumper_warp.evaluation.plots import drawn
+from jumper_warp.rl.cfg import PpoCfg
 from jumper_warp.rl.ppo import Ppo
 from jumper_warp.rl.shac import Shac
 from jumper_warp.tasks.cfg import TaskCfg
+from support.timing import process_age
 
 RATES = (0.5, 0.8, 0.9, 0.95, 1.0)
 """[1] Success rates whose first times are reported."""
@@ -49,11 +52,10 @@ def make_judge(task: TaskCfg, jumps: int, device: str | None) -> Env:
 
 def success(ppo: Ppo | Shac, judge: Env, heights: tuple[float, float] = TESTED) -> float:
     """Return the share of jumps to heights [m] from the first to the second that succeed, one a world."""
-
     return float(run_jumps(ppo.model.act, judge, np.linspace(*heights, judge.num_envs)).success.mean())
 
 
-def warm_up(env: Env, ppo: Ppo | Shac) -> None:
+def warm_up(env: VecEnv, ppo: Ppo | Shac) -> None:
     """Compile the environment's kernels and the trainer's functions, and begin all episodes anew."""
     env.reset()
     env.step(torch.zeros(env.num_envs, env.num_actions, device=env.device))
@@ -63,7 +65,7 @@ def warm_up(env: Env, ppo: Ppo | Shac) -> None:
 
 
 def learning_curve(
-    env: Env, ppo: Ppo | Shac, judge: Env, seconds: float, every: float, heights: tuple[float, float] = TESTED
+    env: VecEnv, ppo: Ppo | Shac, judge: Env, seconds: float, every: float, heights: tuple[float, float] = TESTED
 ) -> Curve:
     """Train for a time [s] as `jumper train --max-seconds` does, and return the curve; the test is off the clock.
 
@@ -73,20 +75,36 @@ def learning_curve(
     heights [m]: of the test's jumps.
     """
     warm_up(env, ppo)
-    curve, trained = Curve(), 0.0
+    curve, trained, device = Curve(), 0.0, wp.device_from_torch(env.device)
     while trained < seconds:
-        wp.synchronize_device(env.wp_device)
+        wp.synchronize_device(device)
         start = time.perf_counter()
         until = min(trained + every, seconds)
         while (spent := trained + time.perf_counter() - start) < until:
             ppo.set_progress(spent / seconds)
             ppo.iterate()
             curve.iterations += 1
-            wp.synchronize_device(env.wp_device)
+            wp.synchronize_device(device)
         trained += time.perf_counter() - start
         curve.seconds.append(trained)
         curve.steps.append(curve.iterations * ppo.batch_size)
         curve.success.append(success(ppo, judge, heights))
+    return curve
+
+
+def timed_training(task: TaskCfg, cfg: PpoCfg, args: Any, seed: int) -> Curve:
+    """Train, and return the curve with the time from the start of this process until the training was ready.
+
+    args: envs, device, randomize, jumps, seconds, every and heights, as `experiments/learning_curves.py` has them.
+    """
+    torch.manual_seed(seed)
+    env = Env(task, args.envs, seed=seed, device=args.device, randomize=args.randomize, noise=args.randomize)
+    ppo = Ppo(env, cfg)
+    warm_up(env, ppo)
+    ready, judge = process_age(), make_judge(task, args.jumps, args.device)
+    success(ppo, judge)
+    curve = learning_curve(env, ppo, judge, args.seconds, args.every, args.heights)
+    curve.ready = ready
     return curve
 
 

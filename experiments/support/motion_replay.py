@@ -17,8 +17,9 @@ from jumper_warp.evaluation.film import ankles
 from jumper_warp.evaluation.plots import drawn
 from jumper_warp.kernels.collision.robot import collision_kernel
 from jumper_warp.kernels.layout import COORDS
+from jumper_warp.robot.description import MOTOR_JOINTS
 from jumper_warp.robot.gravity import EARTH
-from jumper_warp.robot.model import MOTOR_JOINTS, build_model
+from jumper_warp.robot.model import build_model
 from jumper_warp.sim.simulation import Simulation, motor_values
 from jumper_warp.trajectory.problem import Motion, Problem
 
@@ -141,10 +142,6 @@ class Replay:
             "largest_tilt_deg": math.degrees(float(self.tilt.max())), "collisions": self.flags,
             "deepest_paw_mm": float(-1000.0 * self.gap.min()), "peak_torque_nm": float(np.abs(self.torque).max()),
         }  # fmt: skip
-
-    def save_rrd(self, path: Path) -> None:
-        """Write the recording."""
-        self.recorder.save_rrd(path)
 
     def save_strip(self, path: Path, count: int = 8) -> None:
         """Draw the robot at evenly spaced moments from the push-off on."""

@@ -9,9 +9,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from jumper_warp.evaluation.film import ankles
 from jumper_warp.evaluation.limits import EXTEND, HOLD, RAMP
 from jumper_warp.evaluation.plots import drawn
-from jumper_warp.robot.model import LEGS, MOTOR_JOINTS
+from jumper_warp.robot.description import LEGS, MOTOR_JOINTS
 from jumper_warp.sim.simulation import Simulation, motor_values
 
 if TYPE_CHECKING:
@@ -73,25 +74,22 @@ def follow_jump(
                 (now, q[2], sim.base_velocity()[0, 2], motor_values(q[7:]), motor_values(qd[6:]),
                  sim.torque.numpy()[:, 0].copy(), sim.paw_force.numpy()[:, 0].copy(), sim.loop_gap()[0])
             )  # fmt: skip
-        record(recorder, sim, rows[-1])
         frames.append(sim.state.body_q.numpy().copy())
+        record(recorder, frames[-1], rows[-1])
     return Trace(*(np.array(column) for column in zip(*rows, strict=True))), recorder, frames
 
 
-def record(recorder: Recorder, sim: Simulation, row: tuple) -> None:
-    """Add a frame to the recording."""
+def record(recorder: Recorder, poses: np.ndarray, row: tuple) -> None:
+    """Add a frame to the recording; poses: (21, 7) of the links."""
     now, height, speed, angle, rate, torque, force, _ = row
     series = {"base/height [m]": height, "base/vertical speed [m s⁻¹]": speed}
     for i, name in enumerate(MOTOR_JOINTS):
         series[f"torque/{name} [N m]"] = torque[i]
         series[f"angle/{name} [deg]"] = np.degrees(angle[i])
         series[f"speed/{name} [rad s⁻¹]"] = rate[i]
-    paws = sim.state.body_q.numpy()[[5, 10, 15, 20]]
-    down = np.array([0.0, 0.0, -0.3])
-    points = paws[:, :3] + down + 2.0 * np.cross(paws[:, 3:6], np.cross(paws[:, 3:6], down) + paws[:, 6:] * down)
     for i, leg in enumerate(LEGS):
         series[f"paw force/{leg} [N]"] = float(np.linalg.norm(force[i]))
-    recorder.record(now, sim.state.body_q, series, contact_points=points, contact_forces=force)
+    recorder.record(now, poses, series, contact_points=ankles(poses[None])[0], contact_forces=force)
 
 
 def jump_metrics(trace: Trace) -> dict[str, float]:

@@ -173,6 +173,7 @@ UPWARD = (
 )
 CALM: dict[str, Any] = {"slack": 0.03, "look": 5, "calmer": 0.7}
 """Starts that go back often, and on with smaller steps."""
+CALMEST: dict[str, Any] = CALM | {"slack": 0.02}
 FORWARD = (
     (QUICK | {"lean": LEAN}, Stage(40, 40, rate=0.05, noise=0.05, least=1.0, slack=0.1)),
     (QUICK | {"lean": LEAN}, Stage(16, 40, rate=0.05, noise=0.05, least=1.0, slack=0.1)),
@@ -181,7 +182,7 @@ FORWARD = (
     (QUICK, Stage(8, 80, rate=0.02, noise=0.015, least=0.2, penalty=40.0, dual=2.0, crossings=40, **CALM)),
     (QUICK, Stage(6, 80, rate=0.02, noise=0.01, least=0.2, penalty=40.0, dual=2.0, crossings=40, **CALM)),
     (QUICK, Stage(4, 100, rate=0.015, noise=0.006, least=0.1, penalty=40.0, dual=2.0, crossings=40, **CALM)),
-    (QUICK, Stage(3, 150, rate=0.01, noise=0.003, least=0.1, penalty=100.0, dual=4.0, **(CALM | {"slack": 0.02}))),
+    (QUICK, Stage(3, 150, rate=0.01, noise=0.003, least=0.1, penalty=100.0, dual=4.0, **CALMEST)),
 )
 JUMPS = {
     "farthest": Jump(

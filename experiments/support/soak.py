@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 import torch
@@ -14,12 +13,14 @@ import warp as wp
 from jumper_warp.envs.env import Env
 from jumper_warp.rl.graphs import Captured
 from jumper_warp.sim.simulation import Simulation
+from jumper_warp.sim.solver import SolverJumper
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.utils.errors import InputError
+from support.scripts import ThreadArgs
 
 
 @dataclass(frozen=True)
-class SoakArgs:
+class SoakArgs(ThreadArgs):
     """Flags of a soak test."""
 
     envs: int = 1024
@@ -40,15 +41,8 @@ class SoakArgs:
     """Name of a task whose environment is tried, with limits and filter of its own, instead of the simulation alone."""
     seed: int = 0
     """Of actions, masses and friction."""
-    out: Path | None = None
-    """Folder for metrics.json (default: outputs/soak_test/<time>)."""
-    device: str | None = None
-    """Warp device."""
-    threads: int | None = None
-    """CPU threads that share the worlds (default: all cores); they change no result."""
 
     def __post_init__(self) -> None:
-        """Check the values."""
         for name in ("envs", "steps", "hold", "episode"):
             if getattr(self, name) < 1:
                 raise InputError(f"{name} must be at least 1, got {getattr(self, name)}")
@@ -60,7 +54,7 @@ def randomize(sim: Simulation, rng: np.random.Generator) -> None:
     scale = rng.uniform(0.8, 1.25, n).astype(np.float32)
     model.body_mass.assign(model.body_mass.numpy() * np.repeat(scale, 21))
     model.body_inertia.assign(model.body_inertia.numpy() * np.repeat(scale, 21)[:, None, None])
-    worlds, friction = model.shape_world.numpy(), rng.uniform(0.2, 1.2, n).astype(np.float32)
+    worlds, friction = np.asarray(model.shape_world.numpy(), dtype=int), rng.uniform(0.2, 1.2, n).astype(np.float32)
     mu = model.shape_material_mu.numpy()
     mu[worlds >= 0] = friction[worlds[worlds >= 0]]
     model.shape_material_mu.assign(mu)
@@ -102,6 +96,7 @@ class Totals:
     def __init__(self, sim: Simulation) -> None:
         self._rates = wp.to_torch(sim.state.joint_qd).view(sim.num_worlds, -1)
         self._state = wp.to_torch(sim.state.joint_q).view(sim.num_worlds, -1)
+        assert isinstance(sim.solver, SolverJumper)
         self._residual, self._tolerance = wp.to_torch(sim.solver.residual), sim.solver.tolerance
         self._speeds = self._rates.new_zeros(2)  # [m/s] of a base, [rad/s] of a joint
         self._counts = torch.zeros(3, dtype=torch.int64, device=self._rates.device)

@@ -36,12 +36,17 @@ def command(sim: Simulation, degrees: float, steps: int) -> float:
     return wall_time(sim.step, sim.device, steps)
 
 
+def check_standing(sim: Simulation, most: float) -> None:
+    """Raise RuntimeError unless the base of every robot is between 0.33 m and the most [m] high."""
+    height = sim.joint_q()[:, 2]
+    if not (np.all(height > 0.33) and np.all(height < most)):
+        raise RuntimeError(f"the robots do not stand: heights {height.min():.3f} to {height.max():.3f} m")
+
+
 def time_standing(sim: Simulation, steps: int, repeats: int) -> float:
     """Return seconds a policy step while standing; every robot must stand."""
     command(sim, DEFAULT, 90)
-    standing = sim.joint_q()[:, 2]
-    if not (np.all(standing > 0.33) and np.all(standing < 0.37)):
-        raise RuntimeError(f"the robots do not stand: heights {standing.min():.3f} to {standing.max():.3f} m")
+    check_standing(sim, 0.37)
     return median_time(sim.step, sim.device, steps, repeats)
 
 
@@ -94,9 +99,7 @@ def standing_solver(envs: int, device: str | None) -> Callable[[], None]:
     sim = Simulation(envs, motors=task.motors, visuals=False, device=device)
     for _ in range(60):
         sim.step()
-    standing = sim.joint_q()[:, 2]
-    if not (np.all(standing > 0.33) and np.all(standing < 0.40)):
-        raise RuntimeError(f"the robots do not stand: heights {standing.min():.3f} to {standing.max():.3f} m")
+    check_standing(sim, 0.40)
 
     def advance(worlds: Worlds) -> None:
         sim.physics.advance(sim.substeps, sim.target, bodies=False, worlds=worlds)
@@ -191,7 +194,7 @@ def time_ppo(envs: int, cfg: PpoCfg, iterations: int, device: str | None) -> dic
         ppo.iterate(mark=watch.mark)
 
     wall = wall_time(iterate, device, iterations)
-    collect, update = watch.read()
+    (collect, update), _ = watch.read()
     after = ppo.model.log_std.detach()
     if not bool(after.isfinite().all()) or torch.equal(after, before):
         raise RuntimeError("the policy did not learn")

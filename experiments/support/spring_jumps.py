@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from jumper_warp.robot.motors import MotorCfg, loose_filter, vertical_jump_filter
-from jumper_warp.robot.overlay import with_springs
+from jumper_warp.robot.overlay import RobotOverlay, with_springs
 from jumper_warp.robot.values import RobotValues
 from jumper_warp.sim.simulation import Simulation
 from support.open_loop import EXTEND, HOLD, RAMP, STAND, follow_jump, jump_metrics, transversal_command
@@ -32,7 +33,7 @@ class SpringJumps:
     """[m] Of the springs at rest."""
     device: str | None
 
-    def simulation(self, count: int, robot: object, **settings: object) -> Simulation:
+    def simulation(self, count: int, robot: RobotOverlay | RobotValues, **settings: Any) -> Simulation:
         """Return the simulation of `count` robots."""
         return Simulation(count, motors=self.motors, command_filter=FILTERS[self.filter](), gravity=self.gravity,
                           robot=robot, device=self.device, **settings)  # fmt: skip

@@ -82,8 +82,9 @@ def flags_of(args: Any) -> list[str]:
     flags: list[str] = []
     for spec in dataclasses.fields(args):
         value, name = getattr(args, spec.name), spec.name.replace("_", "-")
-        made = spec.default_factory is not dataclasses.MISSING
-        if spec.name in ("out", "baseline") or value == (spec.default_factory() if made else spec.default):
+        make = spec.default_factory
+        default = spec.default if make is dataclasses.MISSING else make()
+        if spec.name in ("out", "baseline") or value == default:
             continue
         if isinstance(value, bool):
             flags.append(f"--{name}" if value else f"--no-{name}")

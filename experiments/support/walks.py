@@ -18,6 +18,8 @@ SETTLED = 0.1
 """[m/s] Error of a robot that has settled on a new command."""
 SMOOTHING = 0.2
 """[s] Over which velocities are averaged to tell whether it has."""
+PAPER = {"rmse_vx_m_s": 0.17, "rmse_vy_m_s": 0.05, "rmse_yaw_rate_rad_s": 0.12}
+"""Tracking errors of the paper, one test on the robot: commands up to 0.8 that a person gave."""
 HOLD = 0.5
 """[s] For which a robot stays within that error that has settled in spite of pushes."""
 

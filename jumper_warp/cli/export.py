@@ -37,10 +37,8 @@ def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> None:
 def export(cfg: ExportCfg) -> Path:
     """Write what the configuration asks for, print where, and return the path.
 
-    Raises:
-        PolicyError: The source cannot be used, two policies cannot be blended, the folder has a file's name, or it
-            exists and is not to be overwritten.
-        CheckpointError: The checkpoint cannot be used.
+    Raises PolicyError: the source cannot be used, two policies cannot be blended, the folder has a file's name, or it
+    exists and is not to be overwritten. CheckpointError: the checkpoint cannot be used.
     """
     from jumper_warp.policies.blend import blend
     from jumper_warp.policies.folder import checked_folder, save_policy

@@ -30,8 +30,7 @@ def settings_of_run(checkpoint: Checkpoint, cfg: TrainCfg) -> tuple[dict[str, An
 
     cfg: Settings that the run does not have, and those of the session, see SESSION.
 
-    Raises:
-        CheckpointError: The run is of another task or version, or its settings cannot be used.
+    Raises CheckpointError: the run is of another task or version, or its settings cannot be used.
     """
     saved = _config(checkpoint, cfg.task)
     try:

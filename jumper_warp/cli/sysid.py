@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import ModuleType
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import tyro
 
@@ -15,7 +14,7 @@ from jumper_warp.cli.main import TASK_MODULE_HELP, UsageError, parse
 from jumper_warp.identification.motions import NoiseLevels, load_motions
 from jumper_warp.identification.parameters import jumper_parameters
 from jumper_warp.utils.errors import InputError
-from jumper_warp.utils.files import write_whole
+from jumper_warp.utils.files import json_bytes, write_whole
 
 HELP = f"""\
 usage: jumper sysid DATA ... [flags]
@@ -155,11 +154,11 @@ def sysid(cfg: SysidCfg) -> None:
 
     cfg.noise.check()
     parameters = jumper_parameters(names(cfg.params)).without(names(cfg.without))
-    knowledge = [] if cfg.mass is None else [weighed(cfg.mass, cfg.mass_deviation)]
     given = {name: getattr(cfg, name) for name in ("base", "gains", "torque_limit", "torque_constant")}
     motions = load_motions(cfg.data, **given)
     announce(cfg.device, cfg.threads)
-    settings = dict(noise=cfg.noise, knowledge=knowledge, dt=cfg.dt, device=cfg.device, threads=cfg.threads)
+    settings: dict[str, Any] = {name: getattr(cfg, name) for name in ("noise", "dt", "device", "threads")}
+    settings["knowledge"] = [] if cfg.mass is None else [weighed(cfg.mass, cfg.mass_deviation)]
     if cfg.method == "cma":
         found = identify_by_evolution(motions, parameters, max_seconds=cfg.max_seconds, **settings)
     else:
@@ -167,9 +166,8 @@ def sysid(cfg: SysidCfg) -> None:
     folder = output_dir("sysid", cfg.out)
     write_results(found, folder, f"jumper sysid of {', '.join(motion.name for motion in motions)}")
     table = Table("parameter", "unit", "described", "found", "95 %", box=None)
-    for parameter, value, (low, high), sure in zip(
-        found.parameters, found.values, found.intervals, found.identified, strict=True
-    ):
+    rows = zip(found.parameters, found.values, found.intervals, found.identified, strict=True)
+    for parameter, value, (low, high), sure in rows:
         row = (parameter.name, parameter.unit, f"{parameter.nominal:.5g}", f"{value:.5g}", f"{low:.5g} … {high:.5g}")
         table.add_row(*row, style=None if sure else "dim")
     Console().print(table)
@@ -203,13 +201,11 @@ def excite(cfg: ExciteCfg) -> None:
     chosen = choose(scorer, KINDS * cfg.sets, candidates=cfg.candidates, seconds=cfg.seconds, seed=cfg.seed)
     rng = None if cfg.exact else np.random.default_rng([cfg.seed, 1])
     folder = output_dir("excite", cfg.out)
-    motions = record(
-        chosen, folder, robots=robots, noise=cfg.noise, solver=cfg.solver, rng=rng, torque=cfg.torque
-    )  # fmt: skip
+    motions = record(chosen, folder, robots=robots, noise=cfg.noise, solver=cfg.solver, rng=rng, torque=cfg.torque)
     for motion, gain in zip(motions, chosen.gain, strict=True):
         print(f"{motion.name}: {len(motion.time) / 240.0:.2f} s, information up to here {gain:.1f} nat")
     mass = float(total_mass(robots)[0])
-    write_whole(folder / "excite.json", (json.dumps({"mass_kg": mass} | chosen.to_json(), indent=2) + "\n").encode())
+    write_whole(folder / "excite.json", json_bytes({"mass_kg": mass} | chosen.to_json()))
     sure = int((chosen.deviations < 0.5).sum())
     print(f"{sure} of {len(parameters)} parameters are expected to be identified; motions in {folder}")
     print(f"the recorded robot weighs {mass:.3f} kg: jumper sysid {folder} --mass {mass:.3f}")
@@ -222,7 +218,7 @@ def characterise(cfg: ActuatorCfg) -> None:
 
     found = characterise_motor(load_bench(cfg.bench), cfg.motor, cfg.torque_noise)
     folder = output_dir("actuator", cfg.out)
-    write_whole(folder / "actuator.json", (json.dumps(found.to_json(), indent=2) + "\n").encode())
+    write_whole(folder / "actuator.json", json_bytes(found.to_json()))
     for name, (value, low, high, unit) in found.rows().items():
         print(f"{name:<16}{value:10.5g} {unit:<6} 95 % {low:.5g} … {high:.5g}")
     print(folder / "actuator.json")

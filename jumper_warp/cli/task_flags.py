@@ -38,7 +38,8 @@ class Flag(NamedTuple):
 
 def flags_of(task: TaskCfg) -> Any:
     """Return a task's settings as a dataclass that tyro makes flags of. Raises InputError: two flags are the same."""
-    return _flag_of_dataclass(task, task.name).value
+    flags = _flag_of_dataclass(task, task.name)
+    return flags and flags.value
 
 
 def with_flags(task: TaskCfg, flags: Any) -> TaskCfg:
@@ -57,12 +58,12 @@ def field_docs(kind: type) -> dict[str, str]:
     docs = {}
     for base in reversed(kind.__mro__[:-1]):
         try:
-            body = ast.parse(textwrap.dedent(inspect.getsource(base))).body[0].body
+            tree: Any = ast.parse(textwrap.dedent(inspect.getsource(base)))
         except (OSError, TypeError, SyntaxError):
             continue
-        for field, text in itertools.pairwise(body):
+        for field, text in itertools.pairwise(tree.body[0].body):
             if isinstance(field, ast.AnnAssign) and isinstance(text, ast.Expr) and isinstance(text.value, ast.Constant):
-                docs[field.target.id] = " ".join(text.value.value.split())
+                docs[ast.unparse(field.target)] = " ".join(str(text.value.value).split())
     return docs
 
 
@@ -74,9 +75,9 @@ def _flag(value: Any, hint: Any, where: str) -> Flag | None:
         return _flag(value.settings, Any, where)
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         return _flag_of_dataclass(value, where)
-    if _has_parts(value):
-        parts = {name: _flag(part, Any, f"{where} {name}") for name, part in _parts(value).items()}
-        found = {name: flag for name, flag in parts.items() if flag is not None}
+    if parts := _parts(value):
+        flags = {name: _flag(part, Any, f"{where} {name}") for name, part in parts.items()}
+        found = {name: flag for name, flag in flags.items() if flag is not None}
         return _group(None, found, where) if found else None
     return Flag(hint, value) if _is_number(value, hint) else None
 
@@ -133,26 +134,17 @@ def _changed(value: Any, flags: Any) -> Any:
         parts = {spec.name: getattr(value, spec.name) for spec in dataclasses.fields(value)}
         new = {name: _changed(part, given[flag_name(name)]) for name, part in parts.items() if flag_name(name) in given}
         return dataclasses.replace(value, **new)
-    if _has_parts(value):
+    if parts := _parts(value):
         given = _members(flags)
-        return tuple(
-            _changed(part, given[flag_name(name)]) if flag_name(name) in given else part
-            for name, part in _parts(value).items()
-        )
+        names = {name: flag_name(name) for name in parts}
+        return tuple(_changed(part, given[names[n]]) if names[n] in given else part for n, part in parts.items())
     return flags
 
 
-def _has_parts(value: Any) -> bool:
-    """Return whether a setting is a tuple of terms or of groups of settings."""
-    return (
-        isinstance(value, tuple)
-        and bool(value)
-        and all(isinstance(v, Term) or dataclasses.is_dataclass(v) for v in value)
-    )
-
-
-def _parts(value: tuple[Any, ...]) -> dict[str, Any]:
-    """Return the terms of a tuple by name, or its groups of settings by number."""
+def _parts(value: Any) -> dict[str, Any]:
+    """Return the terms of a tuple by name, or its groups of settings by number; nothing if it holds anything else."""
+    if not isinstance(value, tuple) or not all(isinstance(v, Term) or dataclasses.is_dataclass(v) for v in value):
+        return {}
     return {part.name if isinstance(part, Term) else str(i): part for i, part in enumerate(value)}
 
 

@@ -11,7 +11,7 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, cast
 
 import tyro
 
@@ -25,8 +25,7 @@ if TYPE_CHECKING:
 
     import torch
 
-    from jumper_warp.diff.differentiable_env import DifferentiableEnv
-    from jumper_warp.envs.env import Env
+    from jumper_warp.envs.vec_env import VecEnv
     from jumper_warp.rl.runner import MakeEnv, TrainResult
     from jumper_warp.robot.overlay import RobotOverlay
     from jumper_warp.tasks.cfg import TaskCfg
@@ -59,8 +58,7 @@ def parse_train(args: Sequence[str]) -> tuple[TrainArgs, TaskCfg]:
 
     Those of a run that is resumed are its own, where no flag changes them.
 
-    Raises:
-        InputError: The task is missing, unknown or given twice, a setting is out of range, or there is no such run.
+    Raises InputError: the task is missing, unknown or given twice, a setting is out of range, or there is no such run.
     """
     names = ", ".join(task_names())
     if not args:
@@ -138,7 +136,7 @@ def env_maker(task: TaskCfg, args: TrainArgs) -> MakeEnv:
 
     overlay = args.robot_of_run if args.robot is None else load_overlay(args.robot)
 
-    def make(num_envs: int, seed: int, device: torch.device) -> Env | DifferentiableEnv:
+    def make(num_envs: int, seed: int, device: torch.device) -> VecEnv:
         check_memory(task, args.cfg.ppo, args.solver, num_envs, device)
         env = Env(
             task,
@@ -154,7 +152,7 @@ def env_maker(task: TaskCfg, args: TrainArgs) -> MakeEnv:
             return env
         from jumper_warp.diff.differentiable_env import DifferentiableEnv
 
-        return DifferentiableEnv(env)
+        return cast("VecEnv", DifferentiableEnv(env))
 
     return make
 
@@ -186,14 +184,6 @@ def check_saving(task: TaskCfg) -> None:
         raise InputError(f"{task.name} would not come back as it is from what is saved with its policies")
 
 
-def check_symmetry(task: TaskCfg, cfg: TrainCfg) -> None:
-    """Raise InputError if symmetry is asked for and the mirror image of what the policy sees is not known."""
-    from jumper_warp.tasks.mirror import mirror_of
-
-    if cfg.ppo.symmetry != "off":
-        mirror_of(task, "policy")
-
-
 def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> TrainResult:
     """Train as the arguments say; modules: that the user has named, whose tasks are registered by now.
 
@@ -201,10 +191,12 @@ def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> TrainResult:
     """
     parsed, task = parse_train(args)
     from jumper_warp.rl.runner import train
+    from jumper_warp.tasks.mirror import mirror_of
     from jumper_warp.utils.runtime import announce
 
     check_saving(task)
-    check_symmetry(task, parsed.cfg)
+    if parsed.cfg.ppo.symmetry != "off":
+        mirror_of(task, "policy")  # raises InputError where a term has no known mirror image
     start = None
     if parsed.cfg.start_from and not parsed.checkpoint:
         from jumper_warp.policies.warm_start import start_from

@@ -36,15 +36,6 @@ class Need(NamedTuple):
     per_world: int
 
 
-class Place(NamedTuple):
-    """A memory, and what this process may take of it."""
-
-    name: str
-    need: Need
-    free: int
-    """[byte]"""
-
-
 def learning_need(cfg: PpoCfg, num_obs: int, num_critic_obs: int) -> Need:
     """Return what PPO takes on the device, for networks and rollouts; num_critic_obs: the environment's, of a world.
 
@@ -78,28 +69,27 @@ def free_main_memory() -> int:
 def check_memory(task: TaskCfg, ppo: PpoCfg, solver: SolverName, num_envs: int, device: torch.device) -> None:
     """Refuse a training of so many worlds in this process that does not fit into memory.
 
-    Raises:
-        ValueError: It does not; the line tells the estimate, what is free, and a number of worlds that fits.
+    Raises ValueError: it does not; the line tells the estimate, what is free, and a number of worlds that fits.
     """
     widths = [max(end for _, end in task.layout(group).values()) for group in ("policy", "critic")]
     learning = learning_need(ppo, *widths)
     main = free_main_memory() // int(os.environ.get("LOCAL_WORLD_SIZE", "1"))
+    building = Need(0, BUILDING[solver])
     if device.type == "cuda":
         standing = Need(learning.fixed, STANDING[solver] + learning.per_world)
-        places = [
-            Place("main memory", Need(0, BUILDING[solver]), main),
-            Place(f"memory of {device}", standing, torch.cuda.mem_get_info(device)[0]),
-        ]
+        card = torch.cuda.mem_get_info(device)[0]
+        memories = [(building, main, "main memory"), (standing, card, f"memory of {device}")]
     else:
-        places = [Place("main memory", Need(learning.fixed, BUILDING[solver] + learning.per_world), main)]
-    fit = min((place.free - place.need.fixed) // place.need.per_world for place in places)
+        memories = [(Need(learning.fixed, building.per_world + learning.per_world), main, "main memory")]
+    fits = [(free - need.fixed) // need.per_world for need, free, _ in memories]
+    fit = min(fits)
     if num_envs <= fit:
         return
-    short = min(places, key=lambda place: (place.free - place.need.fixed) // place.need.per_world)
-    needed = (short.need.fixed + num_envs * short.need.per_world) / 1.0e9
+    need, free, name = memories[fits.index(fit)]
+    needed = (need.fixed + num_envs * need.per_world) / 1.0e9
     grain = ppo.minibatches // math.gcd(ppo.minibatches, ppo.num_steps)
     most = world_size() * (fit // grain * grain)
     raise InputError(
-        f"num_envs {world_size() * num_envs} needs about {needed:,.1f} GB of {short.name} in each process, "
-        f"{short.free / 1.0e9:,.1f} GB are free: " + (f"num_envs {most} would fit" if most > 0 else "none would fit")
+        f"num_envs {world_size() * num_envs} needs about {needed:,.1f} GB of {name} in each process, "
+        f"{free / 1.0e9:,.1f} GB are free: " + (f"num_envs {most} would fit" if most > 0 else "none would fit")
     )

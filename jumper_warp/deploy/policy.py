@@ -79,7 +79,7 @@ class DeployedPolicy:
 
     def act(self, observation: np.ndarray) -> np.ndarray:
         """Return the action, (12,) within -1 to 1, and remember it for the next observation."""
-        self.action = self._session.run(["actions"], {"obs": observation[None]})[0][0]
+        self.action = np.asarray(self._session.run(["actions"], {"obs": observation[None]})[0])[0]
         return self.action
 
     def filtered(self, target: np.ndarray, angle: Any, rate: Any) -> np.ndarray:

@@ -27,8 +27,8 @@ class DifferentiableEnv:
         self.env, self.loop, self.world_norm = env, ClosedLoop(env), world_norm
         if not any(term.func.key in SMOOTH for term in self.loop.task.rewards):
             raise InputError(f"{self.loop.task.name}: no reward has a derivative")
-        self._state: LoopState | None = None
-        self._final: LoopState | None = None
+        self._state: LoopState
+        self._final: LoopState
 
     def __getattr__(self, name: str) -> Any:
         """Return what the environment has of that name."""
@@ -40,19 +40,18 @@ class DifferentiableEnv:
 
     def observe(self) -> tuple[torch.Tensor, torch.Tensor]:
         """Return `obs` and `critic_obs` with their derivatives."""
-        env, state = self.env, self._state
-        return tuple(
-            anchored(told, self.loop.observe(state, told, group))
-            for told, group in ((env.obs, "policy"), (env.critic_obs, "critic"))
-        )
+        return self._anchored(self._state, self.env.obs, self.env.critic_obs)
 
     def observe_final(self) -> tuple[torch.Tensor, torch.Tensor]:
         """Return `final_obs` and `final_critic_obs` of the last step with their derivatives."""
-        env, state = self.env, self._final
-        return tuple(
-            anchored(told, self.loop.observe(state, told, group))
-            for told, group in ((env.final_obs, "policy"), (env.final_critic_obs, "critic"))
-        )
+        return self._anchored(self._final, self.env.final_obs, self.env.final_critic_obs)
+
+    def _anchored(
+        self, state: LoopState, obs: torch.Tensor, critic_obs: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return observations of both networks with their derivatives by a state."""
+        observe = self.loop.observe
+        return anchored(obs, observe(state, obs)), anchored(critic_obs, observe(state, critic_obs, "critic"))
 
     def step_with_gradient(self, action: torch.Tensor) -> torch.Tensor:
         """Make a policy step; return the reward (num_envs,) with the derivatives of its smooth terms.

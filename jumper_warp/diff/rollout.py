@@ -13,7 +13,6 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
-import newton
 import numpy as np
 import warp as wp
 
@@ -28,6 +27,7 @@ from jumper_warp.sim.slices import Worlds, slices_of
 from jumper_warp.sim.solver import check_step
 from jumper_warp.utils.checks import check_within
 from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.newton_types import Model
 from jumper_warp.utils.threads import checked_threads, run_side_by_side
 
 MAX_SWEEPS = 200
@@ -69,7 +69,7 @@ class Trajectory:
     from_start: bool = False
     """Whether the motors followed the angles that they started at, and not a `before` that was given."""
 
-    def end(self) -> dict[str, wp.array]:
+    def end(self) -> dict[str, Any]:
         """Return what a rollout that goes on from here is given: q, qd, before, impulse."""
         last = self.impulse.shape[0] - 1
         return {"q": self.q[-1], "qd": self.qd[-1], "before": self.safe[-1], "impulse": self.impulse[last]}
@@ -81,11 +81,26 @@ class Rollout:
     Gradients are those of the contact modes and of the branches of filter and motors that the rollout went through:
     exact where no mode changes (`adjoint.step_adjoint`). The worlds' parameters are in `parameters`, which may
     be written at any time between a reverse pass and the next rollout.
+
+    Args:
+        model: The robot's worlds, as `jumper_warp.robot.model.build_model` returns it, without moving blocks.
+        motors: By default the jumping gains at 18 N m.
+        command_filter: None leaves the targets as they are.
+        description: The model's, by default the project's.
+        dt: Physics step [s], `substeps` of which are in a policy step.
+        every: Physics steps from one row of a trajectory to the next, a divisor of `substeps`; by default all.
+        tolerance: Of the contact iteration [m/s], by default `TOLERANCE` or `TOLERANCE_DOUBLE`.
+        threads: Of a CPU, which share the worlds out and change no bit; as in `Simulation`.
+
+    Raises:
+        NotThisRobotError: the model is another robot's.
+        InputError: dt or tolerance not finite and positive, substeps no whole number above 0, or `every` no divisor
+            of it.
     """
 
     def __init__(
         self,
-        model: newton.Model,
+        model: Model,
         motors: MotorCfg | None = None,
         command_filter: FilterCfg | None = None,
         *,
@@ -97,25 +112,6 @@ class Rollout:
         tolerance: float | None = None,
         threads: int | None = None,
     ):
-        """Prepare for a model of `jumper_warp.robot.model.build_model`.
-
-        Args:
-            model: The robot's worlds, without moving blocks.
-            motors: By default the jumping gains at 18 N m.
-            command_filter: None leaves the targets as they are.
-            description: The model's, by default the project's.
-            double: Whether to compute in double precision.
-            dt: Physics step [s].
-            substeps: Physics steps in a policy step.
-            every: Physics steps from one row of a trajectory to the next, a divisor of `substeps`; by default all.
-            tolerance: Of the contact iteration [m/s], by default `TOLERANCE` or `TOLERANCE_DOUBLE`.
-            threads: Of a CPU, which share the worlds out and change no bit; as in `Simulation`.
-
-        Raises:
-            NotThisRobotError: the model is another robot's.
-            InputError: dt or tolerance not finite and positive, substeps no whole number above 0, or `every` no divisor
-                of it.
-        """
         check_step(dt, substeps)
         every = substeps if every is None else every
         if every not in range(1, substeps + 1) or substeps % every != 0:
@@ -145,7 +141,7 @@ class Rollout:
         self.by_legs = self.device.is_cuda
         """Whether a thread has a leg or a world, by default a leg on a GPU and a world on a CPU."""
         self.slices = slices_of(self.num_worlds, 1 if self.device.is_cuda else checked_threads(threads))
-        wrench = wp.zeros(model.body_count, dtype=wp.spatial_vector, device=self.device)
+        wrench = wp.zeros(model.body_count, dtype=wp.spatial_vectorf, device=self.device)
         self._drive = self.dynamics.drive(self._zeros(model.joint_dof_count), wrench)
         self._record: Any = None
         self._legs: LegReverse | None = None
@@ -194,14 +190,7 @@ class Rollout:
         self.dynamics.robot.geometry.assign(legs)
 
     def run(
-        self,
-        targets: Any,
-        q: Any,
-        qd: Any,
-        *,
-        before: Any = None,
-        wrench: Any = None,
-        impulse: wp.array | None = None,
+        self, targets: Any, q: Any, qd: Any, *, before: Any = None, wrench: Any = None, impulse: wp.array | None = None
     ) -> Trajectory:
         """Simulate. Arrays of Warp or NumPy, of the shapes below or without worlds, which then are alike.
 
@@ -290,9 +279,10 @@ class Rollout:
             wp.copy(gradients.safe, safe)  # which the reverse pass adds to
         motion = [self._timing(count), self._actuation, commands, trajectory.safe, rows]
         if self.by_legs:
-            for into, seed in ((gradients.q, q), (gradients.qd, qd)):
-                if seed is not None:
-                    wp.copy(into, seed[-1])
+            last: Any
+            for into, last in ((gradients.q, q), (gradients.qd, qd)):
+                if last is not None:
+                    wp.copy(into, last[-1])
             if self._legs is None:
                 self._legs = LegReverse(self.dynamics, self.every)
             self._legs.run(self._new_settings(), motion, seeds, gradients)
@@ -322,7 +312,7 @@ class Rollout:
         seeds.pressed = wp.zeros((0, 0, 0), dtype=wp.uint8, device=self.device)
         return seeds
 
-    def _named(self, gradient: wp.array) -> dict[str, wp.array]:
+    def _named(self, gradient: Any) -> dict[str, wp.array]:
         """Return the rows of a gradient by name."""
         names, first = {}, 0
         for name, array in self.parameters.items():

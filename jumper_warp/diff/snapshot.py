@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
-import newton
 import torch
+
+from jumper_warp.utils.newton_types import Model
 
 
 class Snapshot(NamedTuple):
@@ -17,7 +18,7 @@ class Snapshot(NamedTuple):
     """Name of the solver's class."""
     blocks: bool
     """Whether the worlds have moving blocks."""
-    model: newton.Model
+    model: Model
     dt: float
     """[s] Physics step."""
     substeps: int

@@ -62,7 +62,9 @@ def simulate(
     its reverse pass for a parameter that another call has changed meanwhile, and this one was not given.
     """
     named = {"targets": targets, "q": q, "qd": qd, "before": before, "wrench": wrench} | parameters
-    given = {name: tensor for name, tensor in named.items() if tensor is not None or name in COMMANDS[:3]}
+    given: dict[str, Any] = {
+        name: tensor for name, tensor in named.items() if tensor is not None or name in COMMANDS[:3]
+    }
     for name, tensor in given.items() if impulse is None else [*given.items(), ("impulse", impulse)]:
         if not isinstance(tensor, torch.Tensor):
             raise InputError(f"{name} must be a torch tensor, got {type(tensor).__name__}")

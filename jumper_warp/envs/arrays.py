@@ -21,6 +21,12 @@ FIRST_CLOCK = 2 * RING
 """Of every world, so that rings can look back from the first step on."""
 
 
+def fill(struct: Any, names: Iterable[str], shape: int | tuple[int, ...], kind: Any, device: Any) -> None:
+    """Give members of a kernels' struct arrays of zeros of their own."""
+    for name in names:
+        setattr(struct, name, wp.zeros(shape, dtype=kind, device=device))
+
+
 def robot_arrays(sim: Simulation, step_dt: float) -> Any:
     """Return the kernels' `RobotArrays` on a simulation's memory; step_dt [s]: policy step."""
     n, device, robot = sim.num_worlds, sim.device, RobotArrays()
@@ -29,14 +35,12 @@ def robot_arrays(sim: Simulation, step_dt: float) -> Any:
     robot.invalid, robot.impulse = sim.physics.invalid, sim.physics.impulse
     robot.paw_force, robot.peak_force = sim.paw_force, sim.physics.peak_paw_force
     robot.torque, robot.joint_offset = sim.torque, sim.motors.offset
-    for name in ("paw_pos", "paw_vel"):
-        setattr(robot, name, wp.zeros((4, n), dtype=wp.vec3, device=device))
-    for name in ("contact_time", "air_time", "touchdown_speed", "paw_height"):
-        setattr(robot, name, wp.zeros((4, n), dtype=float, device=device))
-    robot.collisions = wp.zeros((4, n), dtype=int, device=device)
-    for name in ("old_torque", "action", "old_action", "older_action", "target", "safe_target", "old_rate"):
-        setattr(robot, name, wp.zeros((12, n), dtype=float, device=device))
-    robot.old_lin_vel = wp.zeros(n, dtype=wp.vec3, device=device)
+    motors = ("old_torque", "action", "old_action", "older_action", "target", "safe_target", "old_rate")
+    fill(robot, ("paw_pos", "paw_vel"), (4, n), wp.vec3, device)
+    fill(robot, ("contact_time", "air_time", "touchdown_speed", "paw_height"), (4, n), float, device)
+    fill(robot, ("collisions",), (4, n), int, device)
+    fill(robot, motors, (12, n), float, device)
+    fill(robot, ("old_lin_vel",), n, wp.vec3, device)
     robot.default_angle = wp.array(load_description().pose("default"), dtype=float, device=device)
     robot.step_dt = step_dt
     return robot
@@ -46,14 +50,12 @@ def env_arrays(num_envs: int, seed: int, skill: wp.array, device: Any) -> Any:
     """Return the kernels' `EnvArrays`."""
     env = EnvArrays()
     env.seed, env.skill = seed, skill
-    env.wanted = wp.zeros(num_envs, dtype=wp.vec4, device=device)
-    for name in ("request", "told", "fresh", "ending", "broken", "bad_action", "level", "streak"):
-        setattr(env, name, wp.zeros(num_envs, dtype=int, device=device))
+    counts = ("request", "told", "fresh", "ending", "broken", "bad_action", "level", "streak")
+    fill(env, ("wanted",), num_envs, wp.vec4, device)
+    fill(env, counts, num_envs, int, device)
+    fill(env, ("reward", "done", "timeout"), num_envs, float, device)
+    fill(env, ("terminated", "truncated"), num_envs, wp.bool, device)
     env.clock = wp.full(num_envs, FIRST_CLOCK, dtype=int, device=device)
-    for name in ("reward", "done", "timeout"):
-        setattr(env, name, wp.zeros(num_envs, dtype=float, device=device))
-    for name in ("terminated", "truncated"):
-        setattr(env, name, wp.zeros(num_envs, dtype=wp.bool, device=device))
     env.request.fill_(-1)
     return env
 
@@ -61,10 +63,9 @@ def env_arrays(num_envs: int, seed: int, skill: wp.array, device: Any) -> Any:
 def delay_arrays(num_envs: int, latency: wp.array, substeps: int, device: Any) -> Any:
     """Return the kernels' `Delays`; latency [physics steps]: (num_envs,)."""
     delays = Delays()
-    delays.past_target = wp.zeros((RING, 12, num_envs), dtype=float, device=device)
-    delays.late_target = wp.zeros((12, num_envs), dtype=float, device=device)
-    delays.earlier_target = wp.zeros((12, num_envs), dtype=float, device=device)
-    delays.late_steps = wp.zeros(num_envs, dtype=int, device=device)
+    fill(delays, ("past_target",), (RING, 12, num_envs), float, device)
+    fill(delays, ("late_target", "earlier_target"), (12, num_envs), float, device)
+    fill(delays, ("late_steps",), num_envs, int, device)
     delays.steps, delays.substeps = latency, substeps
     return delays
 
@@ -92,11 +93,12 @@ def checked_tasks(task: Any, handovers: Sequence[Handover]) -> tuple[TaskCfg, ..
         raise InputError(f"an environment needs at least one task, each with a name of its own, got {names}")
     first = tasks[0].motors
     for each in tasks[1:]:
-        pairs = ((each.motors.lateral, first.lateral), (each.motors.transversal, first.transversal))
-        same = (each.motors.fade_start, each.motors.fade_end) == (first.fade_start, first.fade_end)
-        if not (same and all(one.peak == other.peak for one, other in pairs)):
+        limits, its = (
+            (motors.fade_start, motors.fade_end, motors.lateral.peak, motors.transversal.peak)
+            for motors in (first, each.motors)
+        )
+        if its != limits:
             raise InputError(f"{each.name} needs the peak torque and the over-speed protection of {names[0]}'s motors")
-    for each in tasks[1:]:
         if each.gravity != tasks[0].gravity:
             raise InputError(f"{each.name} has a gravity of {each.gravity} m/s^2, {names[0]} of {tasks[0].gravity}")
     for each in handovers:
@@ -132,10 +134,14 @@ def checked_action(action: Any, shape: tuple[int, ...], device: torch.device) ->
     return action.detach()
 
 
+def on_host(values: Any) -> Any:
+    """Return a tensor as an array, and anything else unchanged."""
+    return values.detach().cpu().numpy() if isinstance(values, torch.Tensor) else values
+
+
 def as_numbers(values: Any, what: str) -> np.ndarray:
     """Return values as float32. Raises ValueError: not numbers, or lists of different lengths."""
-    if isinstance(values, torch.Tensor):
-        values = values.detach().cpu().numpy()
+    values = on_host(values)
     try:
         return np.asarray(values, dtype=np.float32)
     except (ValueError, TypeError) as error:
@@ -166,9 +172,7 @@ def checked_mask(worlds: Any, num_envs: int) -> np.ndarray:
     """Return which worlds are meant as float32 ones and zeros, all for None. Raises ValueError for another shape."""
     if worlds is None:
         return np.ones(num_envs, dtype=np.float32)
-    if isinstance(worlds, torch.Tensor):
-        worlds = worlds.detach().cpu().numpy()
-    array = np.asarray(worlds)
+    array = np.asarray(on_host(worlds))
     if array.shape != (num_envs,) or array.dtype != bool:
         raise InputError(f"worlds must be bool of shape ({num_envs},), got {array.dtype} of shape {array.shape}")
     return array.astype(np.float32)
@@ -176,7 +180,7 @@ def checked_mask(worlds: Any, num_envs: int) -> np.ndarray:
 
 def checked_worlds(worlds: Any, num_envs: int) -> np.ndarray:
     """Return the mask of worlds, given as bool or as indices. Raises ValueError: neither, twice the same or none."""
-    array = worlds.detach().cpu().numpy() if isinstance(worlds, torch.Tensor) else np.asarray(worlds)
+    array = np.asarray(on_host(worlds))
     if array.dtype.kind not in "iu":
         return checked_mask(array, num_envs)
     fits = array.ndim == 1 and bool(((array >= 0) & (array < num_envs)).all())

@@ -146,29 +146,19 @@ class Env(Stages):
         new commands where they are due. After `evaluation_reset` episodes end again when all worlds have begun anew.
         Raises ValueError: not a seed, not worlds, or both. RuntimeError: worlds before the first reset of all.
         """
-        if worlds is not None:
-            return self._reset_some(checked_worlds(worlds, self.num_envs), seed)
+        chosen = self._all if worlds is None else self._array(checked_worlds(worlds, self.num_envs))
+        if worlds is not None and seed is not None:
+            raise InputError("a seed is for all worlds: reset(seed), or reset(worlds=...) without one")
+        if worlds is not None and not self._started:
+            raise RuntimeError("call reset of all worlds before the first of some")
         if seed is not None:
             check_seed(seed)
             self._start_over(seed)
-        self._ends_episodes = True
-        self.compile()
-        self._tick(self._all)
-        self._begin(self._part(), self._all)
-        self._observe(self._part(), beginning=0)
-        return self._step.obs, {}
-
-    def _reset_some(self, mask: np.ndarray, seed: int | None) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
-        """Begin new episodes where mask is not 0."""
-        if seed is not None:
-            raise InputError("a seed is for all worlds: reset(seed), or reset(worlds=...) without one")
-        if not self._started:
-            raise RuntimeError("call reset of all worlds before the first of some")
+        self._ends_episodes = self._ends_episodes or worlds is None
         self.compile()  # an evaluation compiles no draws
-        chosen = self._array(mask)
         self._tick(chosen)
         self._begin(self._part(), chosen)
-        self._observe(self._part(), beginning=1)
+        self._observe(self._part(), beginning=int(worlds is not None))
         return self._step.obs, {}
 
     def compile(self) -> None:
@@ -300,11 +290,11 @@ class Env(Stages):
             dt=sim.dt,
             substeps=sim.substeps,
             default_angle=wp.to_torch(self.robot.default_angle),
-            com=wp.to_torch(sim.model.body_com).view(n, -1, 3)[:, 0],
+            com=wp.to_torch(self.robot.body_com).view(n, -1, 3)[:, 0],
             parameters=parameters
             | {"table": wp.to_torch(dynamics.robot.table), "latency": wp.to_torch(self.parameters.latency) * sim.dt},
-            q=compact_columns(wp.to_torch(sim.state.joint_q).view(n, -1), 7),
-            qd=compact_columns(wp.to_torch(sim.state.joint_qd).view(n, -1), 6),
+            q=compact_columns(wp.to_torch(self.robot.joint_q).view(n, -1), 7),
+            qd=compact_columns(wp.to_torch(self.robot.joint_qd).view(n, -1), 6),
             before=past[(clock - 1) % len(past), :, torch.arange(n, device=self.device)].T,
             impulse=wp.to_torch(self.robot.impulse),
             action=wp.to_torch(self.robot.action),
@@ -336,29 +326,29 @@ class Env(Stages):
         `task` and `interface` are of the first task; several have `tasks`, and `handovers` as their functions' names.
         `robot` is there if an overlay was given.
         """
-        several = {
+        config = {
+            "task": task_to_json(self.task),
+            "interface": interface(self.task),
+            "num_envs": self.num_envs,
+            "seed": self.seed,
+            "physics_dt_s": self.physics_dt,
+            "policy_dt_s": self.step_dt,
+            "contact_tolerance_m_s": CONTACT_TOLERANCE,
+            "solver": type(self.sim.solver).__name__,
+            "randomize": self._conditions[0],
+            "noise": self._conditions[1],
+            "quaternion_order": "xyzw",
+        }
+        if self._overlay is not None:
+            config = {"robot": self._overlay.to_json(), **config}
+        if len(self.tasks) == 1:
+            return config
+        return {
             "tasks": [task_to_json(task) for task in self.tasks],
             "first_skill": self._first_skill.tolist(),
             "handovers": [handover_to_json(handover) for handover in self.handovers],
+            **config,
         }
-        overlay = {} if self._overlay is None else {"robot": self._overlay.to_json()}
-        return (
-            (several if len(self.tasks) > 1 else {})
-            | overlay
-            | {
-                "task": task_to_json(self.task),
-                "interface": interface(self.task),
-                "num_envs": self.num_envs,
-                "seed": self.seed,
-                "physics_dt_s": self.physics_dt,
-                "policy_dt_s": self.step_dt,
-                "contact_tolerance_m_s": CONTACT_TOLERANCE,
-                "solver": type(self.sim.solver).__name__,
-                "randomize": self._conditions[0],
-                "noise": self._conditions[1],
-                "quaternion_order": "xyzw",
-            }
-        )
 
     def state_dict(self) -> dict[str, torch.Tensor]:
         """Return everything that the next step depends on, as `jumper_warp.envs.state.save_state`."""

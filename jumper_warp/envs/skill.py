@@ -10,6 +10,7 @@ import numpy as np
 import torch
 import warp as wp
 
+from jumper_warp.envs.arrays import fill
 from jumper_warp.kernels.mdp.env import RING, Counters, Nothing, SkillSettings
 from jumper_warp.kernels.mdp.events import make_event_kernel
 from jumper_warp.kernels.mdp.observe import CHUNK, ObservationArrays, make_observe_kernel
@@ -45,11 +46,10 @@ class Skill:
 
     def _counters(self) -> Any:
         n, task, counters = self.num_envs, self.task, Counters()
-        counters.term_sum = wp.zeros((max(len(task.rewards), 1), n), dtype=wp.float64, device=self.device)
-        counters.ending_count = wp.zeros((len(task.terminations), n), dtype=int, device=self.device)
-        for name in ("counted", "succeeded", "bad_actions"):
-            setattr(counters, name, wp.zeros(n, dtype=int, device=self.device))
-        counters.error_sum = wp.zeros(n, dtype=wp.float64, device=self.device)
+        fill(counters, ("term_sum",), (max(len(task.rewards), 1), n), wp.float64, self.device)
+        fill(counters, ("ending_count",), (len(task.terminations), n), int, self.device)
+        fill(counters, ("counted", "succeeded", "bad_actions"), n, int, self.device)
+        fill(counters, ("error_sum",), n, wp.float64, self.device)
         return counters
 
     def _structs(self, values: list, kind: Any = None) -> wp.array:
@@ -74,10 +74,9 @@ class Skill:
         self.columns = wp.array(np.array(columns, dtype=np.int32).T, dtype=int, device=self.device)
         self.num_chunks = -(-sum(len(task.rows[group]) for group in task.groups) // CHUNK)
         arrays = ObservationArrays()
-        arrays.raw = wp.zeros((len(columns), n), dtype=float, device=self.device)
-        arrays.now = wp.zeros(start, dtype=float, device=self.device)
-        arrays.final = wp.zeros(start, dtype=float, device=self.device)
-        arrays.past = wp.zeros((RING, n, max(past, 1)), dtype=float, device=self.device)
+        fill(arrays, ("raw",), (len(columns), n), float, self.device)
+        fill(arrays, ("now", "final"), start, float, self.device)
+        fill(arrays, ("past",), (RING, n, max(past, 1)), float, self.device)
         arrays.latency = wp.zeros(n, dtype=int, device=self.device)
         arrays.substeps = substeps
         self.observations = arrays
@@ -131,9 +130,8 @@ class Skill:
             figures[f"Episode_Termination/{term.name}"] = float(count) / ended
         counted, succeeded = int(counters.counted.numpy().sum()), int(counters.succeeded.numpy().sum())
         figures["Metrics/success"] = succeeded / max(counted, 1)
-        figures[f"Metrics/error_{task.curriculum.options['unit']}"] = float(counters.error_sum.numpy().sum()) / max(
-            succeeded, 1
-        )
+        error = float(counters.error_sum.numpy().sum())
+        figures[f"Metrics/error_{task.curriculum.options['unit']}"] = error / max(succeeded, 1)
         figures["Metrics/bad_actions"] = float(counters.bad_actions.numpy().sum())
         for name in Counters.vars:
             getattr(counters, name).zero_()
@@ -147,11 +145,9 @@ class Skill:
         states = records(self.states).copy()
         for metric in metrics:
             values = states[metric.field].astype(np.float64)
-            if metric.per is None:
-                figures[metric.name] = float(values.mean())
-            else:
-                total = float(states[metric.per].astype(np.float64).sum())
-                figures[metric.name] = float(values.sum()) / total if total else 0.0
+            total = 0.0 if metric.per is None else float(states[metric.per].astype(np.float64).sum())
+            mean = float(values.mean()) if metric.per is None else 0.0
+            figures[metric.name] = float(values.sum()) / total if total else mean
         for metric in metrics:
             if metric.per is not None:
                 states[metric.field] = states[metric.per] = 0.0

@@ -46,8 +46,7 @@ def save_state(env: Stages) -> dict[str, torch.Tensor]:
 def load_state(env: Stages, state: dict[str, torch.Tensor]) -> None:
     """Put a saved state back, so that the next step is the one that would have followed.
 
-    Raises:
-        ValueError: It is of another number of environments, other fields, robots or seed; nothing is changed.
+    Raises ValueError: it is of another number of environments, other fields, robots or seed; nothing is changed.
     """
     if not isinstance(state, dict):
         raise InputError(f"a saved environment must be a dictionary, got {type(state).__name__}")
@@ -63,14 +62,14 @@ def load_state(env: Stages, state: dict[str, torch.Tensor]) -> None:
     if isinstance(done, torch.Tensor) and done.dim() == 1 and len(done) != env.num_envs:
         raise InputError(f"saved for {len(done)} environments, there are {env.num_envs}")
     for skill in env.skills:
-        timer = state[f"{skill.task.name}/timer"]
+        name = skill.task.name
+        timer, changed = state[f"{name}/timer"], state[f"{name}/changed"]
         if isinstance(timer, torch.Tensor) and timer.dim() == 2 and len(timer) != skill.timer.shape[0]:
-            raise InputError(f"saved with other randomisation or events of {skill.task.name}")
-        changed = state[f"{skill.task.name}/changed"]
+            raise InputError(f"saved with other randomisation or events of {name}")
         if isinstance(changed, torch.Tensor) and changed.dim() == 1 and len(changed) != skill.changed.shape[0]:
-            raise InputError(f"saved with other terms of {skill.task.name}")
+            raise InputError(f"saved with other terms of {name}")
         if isinstance(changed, torch.Tensor) and bool((changed.isnan() | changed.isneginf()).any()):
-            raise InputError(f"saved {skill.task.name}/changed is not a number")
+            raise InputError(f"saved {name}/changed is not a number")
     for name, tensor in tensors.items():
         check_tensor(state[name], tensor, f"saved {name}")
     for field, (prefix, name) in fields.items():
@@ -126,9 +125,9 @@ def _records(env: Stages) -> dict[str, wp.array]:
 def _tensors(env: Stages) -> dict[str, torch.Tensor]:
     """Return views of the environment's own memory by name."""
     found: dict[str, Any] = {}
-    for prefix, struct in (("robot", env.robot), ("env", env.worlds), ("delays", env.delays),
-                           ("parameters", env.parameters)):  # fmt: skip
-        kind = {"robot": RobotArrays, "env": EnvArrays, "delays": Delays, "parameters": RobotParameters}[prefix]
+    structs = (("robot", RobotArrays, env.robot), ("env", EnvArrays, env.worlds), ("delays", Delays, env.delays),
+               ("parameters", RobotParameters, env.parameters))  # fmt: skip
+    for prefix, kind, struct in structs:
         for name in kind.vars:
             if name not in CONSTANT and not name.startswith("nominal_"):
                 found[f"{prefix}.{name}"] = getattr(struct, name)

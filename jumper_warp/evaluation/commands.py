@@ -16,7 +16,6 @@ from rich.table import Table
 from jumper_warp.evaluation.courses import Course, course_metrics, draw_course
 from jumper_warp.evaluation.film import Film
 from jumper_warp.evaluation.log import EvaluationLog, run_evaluation
-from jumper_warp.evaluation.plots import drawn
 from jumper_warp.evaluation.run import EvaluationRun, SkillRun
 from jumper_warp.evaluation.scripts import read_script
 from jumper_warp.policies.conditions import Conditions
@@ -47,15 +46,13 @@ class EvaluateCfg(Generic[Flags]):
 def evaluate(run: EvaluationRun, cfg: EvaluateCfg) -> dict[str, Any]:
     """Evaluate, print a table, write `metrics.json` and the rows of the log as CSV, and return the figures.
 
-    Raises:
-        PolicyError: The policy cannot be used or cannot keep figures.
-        OSError: The folder cannot be made.
+    Raises PolicyError: the policy cannot be used or cannot keep figures; OSError: the folder cannot be made.
     """
     if cfg.keep and is_run(run.source):
         raise PolicyError(f"{run.source}: a run keeps no figures; export it first")
     run.prepare("evaluate", cfg.conditions, cfg.out)
-    env = run.env(cfg.flags.count)
-    log = run.follow(env, cfg.flags.log(env.task, cfg.conditions.seed))
+    log = cfg.flags.log(run.evaluation.for_evaluation(run.task), cfg.conditions.seed)
+    run.follow(run.env(log.count), log)
     figures = {
         "task": run.policy.interface.task,
         **run.tried_in,
@@ -90,20 +87,26 @@ def print_figures(figures: dict[str, Any]) -> None:
     Console().print(table)
 
 
+@dataclass(frozen=True, kw_only=True)
+class RecordingCfg:
+    """How something is recorded."""
+
+    conditions: Annotated[Conditions, tyro.conf.arg(name="")] = field(default_factory=Conditions)
+    """What the policies are tried in."""
+    out: Path | None = None
+    """Folder for the recording, metrics.json and plots (default: outputs/play/<time>)."""
+    viewer: Literal["none", "rerun"] = "none"
+    """Open the recording in Rerun's viewer, which then listens on this machine's loopback address only."""
+
+
 @dataclass(frozen=True)
-class PlayCfg(Generic[Flags]):
+class PlayCfg(RecordingCfg, Generic[Flags]):
     """Let a policy act, and record it."""
 
     flags: Annotated[Flags, tyro.conf.arg(name="")]
     """`jumper_warp.evaluation.registry.PlayFlags`"""
     seconds: float | None = None
     """[s] Length of the recording (default: for jumps 3.5, and 2.5 for each further one; else 10)."""
-    conditions: Annotated[Conditions, tyro.conf.arg(name="")] = field(default_factory=Conditions)
-    """What the policy is tried in."""
-    out: Path | None = None
-    """Folder for the recording and metrics.json (default: outputs/play/<time>)."""
-    viewer: Literal["none", "rerun"] = "none"
-    """Open the recording in Rerun's viewer, which then listens on this machine's loopback address only."""
 
     def __post_init__(self) -> None:
         """Raises InputError: a setting is out of range."""
@@ -114,18 +117,15 @@ class PlayCfg(Generic[Flags]):
 def play(run: EvaluationRun, cfg: PlayCfg) -> Path:
     """Simulate, write a recording and `metrics.json`, print a table; return the path of the recording.
 
-    Raises:
-        PolicyError: The policy cannot be used.
-        OSError: The folder cannot be made.
+    Raises PolicyError: the policy cannot be used; OSError: the folder cannot be made.
     """
     flags, name = cfg.flags, run.policy.interface.task
     run.prepare("play", cfg.conditions, cfg.out)
-    env = run.env(flags.count)
-    log = flags.log(env.task)
-    worlds = range(flags.count)
+    log = flags.log(run.evaluation.for_evaluation(run.task))
+    env, worlds = run.env(log.count), range(log.count)
     notes = {"task": name, **log.notes(worlds), "solver": cfg.conditions.solver}
-    film = Film(env, log, worlds, spacing=log.spacing, notes=notes, motors=True)
-    run_evaluation(run.policy.act, env, log, seconds=cfg.seconds or flags.seconds, watch=film, stop=False)
+    film = Film(env, log.series, worlds, spacing=log.spacing, notes=notes, motors=True)
+    run_evaluation(run.policy.act, env, log, seconds=cfg.seconds or flags.length, watch=film, stop=False)
     path = film.save_rrd(run.folder / f"{log.row}.rrd", log.marks(worlds))
     write_metrics(run.folder, log.columns())
     print_rows(log)
@@ -133,7 +133,7 @@ def play(run: EvaluationRun, cfg: PlayCfg) -> Path:
 
 
 @dataclass(frozen=True)
-class ScriptCfg:
+class ScriptCfg(RecordingCfg):
     """Let one robot walk and jump with several policies, as a script says, and record it.
 
     A script is a JSON list of {"walk": [vx, vy, yaw_rate], "seconds": s}, {"stand": s}, {"jump_up": height},
@@ -145,32 +145,22 @@ class ScriptCfg:
     """File with the commands."""
     policies: Annotated[SkillNames, tyro.conf.arg(name="")] = field(default_factory=SkillNames)
     """Who carries them out."""
-    conditions: Annotated[Conditions, tyro.conf.arg(name="")] = field(default_factory=Conditions)
-    """What the policies are tried in."""
-    out: Path | None = None
-    """Folder for the recording, a plot and metrics.json (default: outputs/play/<time>)."""
-    viewer: Literal["none", "rerun"] = "none"
-    """Open the recording in Rerun's viewer, which then listens on this machine's loopback address only."""
 
 
 def play_script(cfg: ScriptCfg) -> Path:
     """Simulate, write a recording, a plot and `metrics.json`, print a table; return the path of the recording.
 
-    Raises:
-        InputError: The script cannot be used, or there is no such device.
-        PolicyError: A policy cannot be used.
-        OSError: The folder cannot be made.
+    Raises InputError: the script or device cannot be used; PolicyError: a policy; OSError: the folder.
     """
     script = read_script(cfg.script)
     run = SkillRun(cfg.policies)
     run.prepare("play", cfg.conditions, cfg.out)
     course = Course([script])
     env = run.env(1, block=course.block)
-    film = Film(env, course, [0], notes={**course.notes([0]), "solver": cfg.conditions.solver})
+    film = Film(env, course.series, [0], notes={**course.notes([0]), "solver": cfg.conditions.solver})
     run_evaluation(run.actor(env), env, course, watch=film)
     path = film.save_rrd(run.folder / "course.rrd")
-    with drawn(run.folder / "course.png", 5, 1, figsize=(10, 9), sharex=True) as axes:
-        draw_course(axes, course, 0)
+    draw_course(run.folder / "course.png", course, 0)
     figures = {"outcome": str(course.outcomes[0]), **course_metrics(course)}
     write_metrics(run.folder, figures)
     print_figures(figures)

@@ -8,15 +8,17 @@ Velocities go from one command to the next at a limited rate.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from itertools import pairwise
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from jumper_warp.evaluation.log import EvaluationLog, Metrics, failures, finite, largest, mean
+from jumper_warp.evaluation.plots import drawn
 from jumper_warp.evaluation.scripts import ScriptStep
-from jumper_warp.evaluation.velocities import AXES, SKIP, body_velocity, rms
+from jumper_warp.evaluation.velocities import SKIP, body_velocity, rmse_metrics, velocity_series
 from jumper_warp.policies.skills import JUMP_TO, JUMP_UP, WALK
 from jumper_warp.robot.grounds import BlockCfg
 from jumper_warp.tasks.switching import FALLS
@@ -53,35 +55,6 @@ class Course(EvaluationLog):
     """One a robot, all of as many commands."""
     headings: np.ndarray | float = 0.0
     """[rad] (robots,) At the start."""
-    end: np.ndarray = field(init=False)
-    """(robots,) Index in OUTCOMES, -1 while under way."""
-    current: np.ndarray = field(init=False)
-    """(robots,) Number of the command under way; that of all commands after the last."""
-    began: np.ndarray = field(init=False)
-    """(robots, commands) Policy step in which each command came, -1: it did not."""
-    switched: np.ndarray = field(init=False)
-    """(robots, commands) Policy step in which the jump skill took over."""
-    takeoff: np.ndarray = field(init=False)
-    """(robots, commands) Policy step of the takeoff."""
-    over: np.ndarray = field(init=False)
-    """(robots, commands) Policy step in which the command was over."""
-    apex: np.ndarray = field(init=False)
-    """[m] (robots, commands) Largest base height of the jump."""
-    offset: np.ndarray = field(init=False)
-    """[m] (robots, commands, 2) From the jump's goal to the base as walking takes over, world axes."""
-    velocity: list[np.ndarray] = field(default_factory=list, init=False)
-    """(robots, 3) After every policy step: ahead, left [m/s], about z [rad/s]; not a number after the end."""
-    wanted: list[np.ndarray] = field(default_factory=list, init=False)
-    """(robots, 3) Velocity that the policy was commanded; not a number while walking is not active."""
-    counts: list[np.ndarray] = field(default_factory=list, init=False)
-    """(robots,) Whether the step counts for the tracking error: walking, SKIP seconds after a command."""
-    skills: list[np.ndarray] = field(default_factory=list, init=False)
-    """(robots,) Active skill."""
-    height: list[np.ndarray] = field(default_factory=list, init=False)
-    """[m] (robots,) Of the base."""
-    force: list[np.ndarray] = field(default_factory=list, init=False)
-    """[N] (robots, 4) On each paw."""
-
     row = "robot"
     spacing = 2.0
 
@@ -90,15 +63,28 @@ class Course(EvaluationLog):
         lengths = {len(script) for script in self.scripts}
         if len(lengths) != 1 or 0 in lengths:
             raise InputError(f"a course needs scripts of one length, got {sorted(lengths)} commands")
-        n, k = len(self.scripts), lengths.pop()
+        n, k = shape = len(self.scripts), lengths.pop()
         self.onto = np.array([[step.kind == "jump_onto" for step in script] for script in self.scripts])
         self.target = np.array([[SKILL_OF[step.kind] for step in script] for script in self.scripts])
         self.goal = np.array([[step.goal for step in script] for script in self.scripts])
         self.lasts = np.array([[step.seconds for step in script] for script in self.scripts])
-        self.end, self.current, self.step_dt = np.full(n, -1), np.zeros(n, dtype=int), 1.0 / 60.0
-        self.began, self.switched, self.takeoff, self.over = (np.full((n, k), -1) for _ in range(4))
+        self.count, self.step_dt = n, 1.0 / 60.0
+        self.end = np.full(n, -1)  # (robots,) index in OUTCOMES, -1 while under way
+        self.current = np.zeros(n, dtype=int)  # (robots,) number of the command under way; after the last, of all
+        self.began = np.full(shape, -1)  # (robots, commands) policy step in which each command came, -1: it did not
         self.began[:, 0] = 0
-        self.apex, self.offset = np.full((n, k), np.nan), np.full((n, k, 2), np.nan)
+        self.switched = np.full(shape, -1)  # (robots, commands) policy step in which the jump skill took over
+        self.takeoff = np.full(shape, -1)  # (robots, commands) policy step of the takeoff
+        self.over = np.full(shape, -1)  # (robots, commands) policy step in which the command was over
+        self.apex = np.full(shape, np.nan)  # [m] (robots, commands) largest base height of the jump
+        self.offset = np.full((n, k, 2), np.nan)  # [m] from the goal to the base as walking takes over, world axes
+        # after every policy step
+        self.velocity: list[np.ndarray] = []  # (robots, 3) ahead, left [m/s], about z [rad/s]; NaN after the end
+        self.wanted: list[np.ndarray] = []  # (robots, 3) that the policy was commanded; NaN while it does not walk
+        self.counts: list[np.ndarray] = []  # (robots,) whether it counts for the tracking error: walking, SKIP later
+        self.skills: list[np.ndarray] = []  # (robots,) active skill
+        self.height: list[np.ndarray] = []  # [m] (robots,) of the base
+        self.force: list[np.ndarray] = []  # [N] (robots, 4) on each paw
         self._skill, self._aim, self._told = np.zeros(n, dtype=int), np.zeros((n, 3)), np.zeros((n, 3))
 
     @property
@@ -257,11 +243,8 @@ class Course(EvaluationLog):
 
     def series(self, worlds: Sequence[int]) -> dict[str, float]:
         """Return velocity and command, height and active skill."""
-        series = {}
+        series = velocity_series(self.velocity[-1], np.nan_to_num(self.wanted[-1]), worlds)
         for world in worlds:
-            for i, (axis, unit) in enumerate(zip(AXES, ("m/s", "m/s", "rad/s"), strict=True)):
-                series[f"{axis}/robot {world} [{unit}]"] = float(self.velocity[-1][world, i])
-                series[f"{axis}/command of {world} [{unit}]"] = float(np.nan_to_num(self.wanted[-1][world, i]))
             series[f"height/base of {world} [m]"] = float(self.height[-1][world])
             series[f"skill/of {world} [1]"] = float(self.skills[-1][world])
         return series
@@ -291,8 +274,6 @@ def course_metrics(course: Course) -> Metrics:
     waited = (course.takeoff - course.began)[made] * course.step_dt
     stopped = (course.switched - course.began)[jumps & (course.switched >= 0)] * course.step_dt
     done = course.outcomes == "done"
-    tracking = dict(zip(("rmse_vx_m_s", "rmse_vy_m_s", "rmse_yaw_rate_rad_s"), finite(tracking_error(course)),
-                        strict=True))  # fmt: skip
     ripple, step = handover_forces(course)
     return {
         "robots": robots,
@@ -300,7 +281,7 @@ def course_metrics(course: Course) -> Metrics:
         "on_goal_rate": float((done & course.on_goal.all(axis=1)).mean()),
         "fall_rate": float(course.fallen.mean()),
         "stuck_rate": float((course.end == STUCK).mean()),
-        **tracking,
+        **rmse_metrics(tracking_error(course)),
         "apex_error_m": mean(apex),
         "max_apex_error_m": largest(apex),
         "mean_signed_apex_error_m": mean(course.apex_error),
@@ -320,10 +301,10 @@ def course_metrics(course: Course) -> Metrics:
 
 
 def tracking_error(course: Course) -> np.ndarray:
-    """Return the root mean square of velocity less command over all steps that count, (3,)."""
+    """Return velocity less command, (steps, robots, 3), NaN where it does not count."""
     error = np.array(course.velocity, dtype=float) - np.array(course.wanted, dtype=float)
     error[~np.array(course.counts)] = np.nan
-    return rms(error, axis=(0, 1))
+    return error
 
 
 def handover_forces(course: Course) -> tuple[np.ndarray, np.ndarray]:
@@ -350,20 +331,22 @@ def active_spans(course: Course, world: int) -> list[tuple[int, float, float]]:
     return [(int(skills[a]), a * course.step_dt, b * course.step_dt) for a, b in pairwise(edges)]
 
 
-def draw_course(axes: np.ndarray, course: Course, world: int) -> None:
-    """Draw velocities and commands, height and active skill of a robot over time, on five axes."""
-    time = course.step_dt * np.arange(1, len(course.skills) + 1)
-    velocity, wanted = (np.array(values)[:, world] for values in (course.velocity, course.wanted))
-    labels = ("vx [m/s]", "vy [m/s]", "yaw rate [rad/s]")
-    for i, label in enumerate(labels):
-        axes[i].plot(time, velocity[:, i], color="tab:blue", linewidth=0.9, label="actual")
-        axes[i].plot(time, wanted[:, i], color="tab:red", linewidth=1.2, label="commanded")
-        axes[i].set(ylabel=label, ylim=(-1.6, 1.6))
-    axes[0].legend(loc="upper right", ncols=2)
-    axes[3].plot(time, np.array(course.height)[:, world], color="tab:blue", linewidth=0.9)
-    axes[3].set(ylabel="height [m]")
-    axes[4].step(time, np.array(course.skills)[:, world], where="pre", color="black", linewidth=1.0)
-    axes[4].set(xlabel="time [s]", ylabel="skill", yticks=list(NAMES), yticklabels=list(NAMES.values()))
-    for skill, begin, end in active_spans(course, world):
-        for axis in axes:
-            axis.axvspan(begin, end, color=COLOURS[skill], alpha=0.15, linewidth=0.0)
+def draw_course(path: Path, course: Course, world: int, title: str = "") -> None:
+    """Draw velocities and commands, height and active skill of a robot over time."""
+    with drawn(path, 5, 1, figsize=(10, 9), sharex=True) as axes:
+        time = course.step_dt * np.arange(1, len(course.skills) + 1)
+        velocity, wanted = (np.array(values)[:, world] for values in (course.velocity, course.wanted))
+        labels = ("vx [m/s]", "vy [m/s]", "yaw rate [rad/s]")
+        for i, label in enumerate(labels):
+            axes[i].plot(time, velocity[:, i], color="tab:blue", linewidth=0.9, label="actual")
+            axes[i].plot(time, wanted[:, i], color="tab:red", linewidth=1.2, label="commanded")
+            axes[i].set(ylabel=label, ylim=(-1.6, 1.6))
+        axes[0].legend(loc="upper right", ncols=2)
+        axes[3].plot(time, np.array(course.height)[:, world], color="tab:blue", linewidth=0.9)
+        axes[3].set(ylabel="height [m]")
+        axes[4].step(time, np.array(course.skills)[:, world], where="pre", color="black", linewidth=1.0)
+        axes[4].set(xlabel="time [s]", ylabel="skill", yticks=list(NAMES), yticklabels=list(NAMES.values()))
+        for skill, begin, end in active_spans(course, world):
+            for axis in axes:
+                axis.axvspan(begin, end, color=COLOURS[skill], alpha=0.15, linewidth=0.0)
+        axes[0].set_title(title)

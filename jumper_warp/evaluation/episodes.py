@@ -9,7 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from jumper_warp.evaluation.log import NO_END, EvaluationEnv, EvaluationLog, Metrics, finite, mean
+from jumper_warp.envs.env import Env
+from jumper_warp.evaluation.log import NO_END, EvaluationLog, Metrics, finite, mean
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.tasks.commands import layout_of
 from jumper_warp.utils.errors import InputError
@@ -42,12 +43,12 @@ class Episodes(EvaluationLog):
 
     def __post_init__(self) -> None:
         """Begin with no episode ended."""
-        count = len(self.commands)
+        self.count = count = len(self.commands)
         self.end, self.length = np.full(count, -1), np.zeros(count)
         self.start, self.place = (np.full((count, 3), np.nan) for _ in range(2))
         self._height_sum, self._steps = np.zeros(count), np.zeros(count, dtype=int)
 
-    def begin(self, env: EvaluationEnv) -> None:
+    def begin(self, env: Env) -> None:
         """Stand every world in the default pose with its command."""
         env.evaluation_reset(self.commands)
         self.start = env.task_arrays()["base_pos"].copy()
@@ -153,11 +154,6 @@ class EpisodeFlags:
         """Raises InputError: a setting is out of range."""
         check_episodes(self.episodes, self.command, self.seconds)
 
-    @property
-    def count(self) -> int:
-        """Number of worlds."""
-        return self.episodes
-
     def log(self, task: TaskCfg, seed: int) -> Episodes:
         """Return episodes with this command."""
         return Episodes(filled(self.command, self.episodes, task), task, self.seconds)
@@ -174,13 +170,12 @@ class EpisodeGoals:
     command: tuple[float, ...] = ()
     """Up to four numbers, as the task's command takes them; those left out are 0."""
 
-    count = 1
-    seconds = 10.0
+    length = 10.0
 
     def __post_init__(self) -> None:
         """Raises InputError: a setting is out of range."""
-        check_episodes(self.count, self.command, self.seconds)
+        check_episodes(1, self.command, self.length)
 
     def log(self, task: TaskCfg) -> Episodes:
         """Return one robot's episode."""
-        return Episodes(filled(self.command, self.count, task), task, self.seconds)
+        return Episodes(filled(self.command, 1, task), task, self.length)

@@ -5,20 +5,23 @@ Nothing of the viewer or the pictures is imported before there is something to f
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import warp as wp
 
-from jumper_warp.robot.model import LEGS, build_model
+from jumper_warp.robot.description import LEGS
+from jumper_warp.robot.model import build_model
+from jumper_warp.sim.solver import SolverJumper
 from jumper_warp.utils.rotations import rotate
 
 if TYPE_CHECKING:
     from jumper_warp.envs.env import Env
     from jumper_warp.robot.grounds import BlockCfg
+    from jumper_warp.sim.simulation import Simulation
 
 ANKLE = np.array([0.0, 0.0, -0.3])
 """[m] In the shank's frame."""
@@ -36,9 +39,9 @@ class Strip:
     """Of the filmed world."""
     frames: Sequence[int]
     captions: Sequence[str]
-    eye: Sequence[float]
+    eye: Sequence[float] | np.ndarray
     """[m] Of the camera, world frame."""
-    target: Sequence[float]
+    target: Sequence[float] | np.ndarray
     """[m] Where it looks."""
     size: tuple[int, int]
     """[px] Width and height of a picture."""
@@ -63,20 +66,13 @@ class Links:
         return here.body_q.numpy().reshape(n, -1, 7), here.body_qd.numpy().reshape(n, -1, 6)
 
 
-class HasSeries(Protocol):
-    """Follows worlds and can tell how they are."""
-
-    def series(self, worlds: Sequence[int]) -> Mapping[str, Any]:
-        """Return what to draw of some worlds over time, `group/quantity [unit]` to its present value."""
-
-
 class Film:
     """Collects what some worlds of an environment look like; call it after every policy step."""
 
     def __init__(
         self,
         env: Env,
-        log: HasSeries,
+        series: Callable[[Sequence[int]], Mapping[str, float]],
         worlds: Sequence[int],
         *,
         spacing: float = 1.2,
@@ -85,21 +81,17 @@ class Film:
         notes: Mapping[str, Any] | None = None,
         motors: bool = False,
     ) -> None:
-        """Film worlds of the environment, together with the series of the log.
+        """Film worlds (at least one) of the environment, together with series of numbers.
 
-        Args:
-            env: What is filmed.
-            log: Follows its episodes.
-            worlds: Indices, at least one.
-            spacing: Distance [m] along y by which each world is drawn beside the one before it; 0 on a heightfield.
-            ground: What is drawn below, as in `build_model`.
-            block: The environment's sliding blocks, if it has any.
-            notes: Saved along; must be JSON.
-            motors: Whether to add torques and actions of the first world.
+        series: returns what to draw of the worlds over time, as `EvaluationLog.series`.
+
+        spacing: [m] along y, by which each world is drawn beside the one before it; 0 on a heightfield. ground: as in
+        `build_model`; block: the environment's sliding blocks, if it has any; notes: saved along, must be JSON;
+        motors: whether to add torques and actions of the first world.
         """
         from jumper_warp.viz.recorder import Recorder
 
-        self.env, self.log, self.worlds, self.spacing, self.motors = env, log, list(worlds), spacing, motors
+        self.env, self.series, self.worlds, self.spacing, self.motors = env, series, list(worlds), spacing, motors
         self.links = Links(env)
         self.model = build_model(len(worlds), ground=ground, device=env.wp_device)
         self.recorder = Recorder(self.model, range(len(worlds)), spacing=spacing, notes=notes)
@@ -111,15 +103,15 @@ class Film:
         """Add the environment's state of the moment."""
         sim = self.env.sim
         poses = self.links.read()[0][self.worlds]
-        series = self.log.series(self.worlds) | (self._motor_series() if self.motors else {})
+        series = {**self.series(self.worlds), **(self._motor_series() if self.motors else {})}
         forces = sim.paw_force.numpy().transpose(1, 0, 2)[self.worlds]
         if self.block is not None:
-            self.block_places.append(sim.solver.block_position()[self.worlds])
+            self.block_places.append(block_places(sim)[self.worlds])
         self.frames += 1
         self.recorder.record(self.frames * self.env.step_dt, poses.reshape(-1, 7), series, ankles(poses), forces)
 
     def _motor_series(self) -> dict[str, float]:
-        from jumper_warp.robot.model import MOTOR_JOINTS
+        from jumper_warp.robot.description import MOTOR_JOINTS
 
         world = self.worlds[0]
         torque, action = self.env.sim.torque.numpy()[:, world], self.env.action[world].cpu().numpy()
@@ -149,12 +141,18 @@ class Film:
         from jumper_warp.viz.snapshot import Camera, contact_sheet
 
         recording = self.recorder.recording()
-        camera = Camera(self.model, strip.eye, strip.target, strip.size, world=strip.index)
+        camera = Camera(self.model, tuple(strip.eye), tuple(strip.target), strip.size, world=strip.index)
         state, pictures = self.model.state(), []
         for frame in strip.frames:
             state.body_q.assign(recording.poses[frame])
             pictures.append(camera.picture(state))
         contact_sheet(pictures, path, strip.captions)
+
+
+def block_places(sim: Simulation) -> np.ndarray:
+    """Return the places [m] of the sliding blocks, world frame, (num_worlds, 2); SolverJumper alone has any."""
+    assert isinstance(sim.solver, SolverJumper)
+    return sim.solver.block_position()
 
 
 def ankles(poses: np.ndarray) -> np.ndarray:

@@ -10,18 +10,19 @@ import numpy as np
 import torch
 import tyro
 
+from jumper_warp.envs.env import Env
 from jumper_warp.evaluation.film import Film, Strip, moments
-from jumper_warp.evaluation.jumps import DELAY, REST_SPEED, REST_TIME, STANCE, JumpLog, check_jumps
+from jumper_warp.evaluation.jumps import DELAY, REST_SPEED, REST_TIME, STANCE, JumpFlags, JumpLog, stance_metrics
 from jumper_warp.evaluation.log import (
     CAME_APART,
     COLLIDED,
     SUCCESS,
-    EvaluationEnv,
     Metrics,
     failures,
     finite,
     largest,
     mean,
+    mean_and_max,
     run_evaluation,
     termination_names,
     with_ends,
@@ -63,7 +64,6 @@ def for_sweep(task: TaskCfg) -> TaskCfg:
 class HeightLog(JumpLog):
     """One jump to a height per world. A jump that landed within the task's limit, if it has one, is a success."""
 
-    speed_time = REST_TIME
     success, outcomes = JumpLog.landed, JumpLog.ends
 
     def __init__(self, heights: np.ndarray, terminations: tuple[str, ...], rest: float = REST_TIME) -> None:
@@ -71,6 +71,7 @@ class HeightLog(JumpLog):
         goals = np.zeros((len(heights), 1, 3))
         goals[:, 0, 2] = heights
         super().__init__(goals, terminations, rest=rest)
+        self.speed_time = REST_TIME
 
     @property
     def seconds(self) -> float:
@@ -128,7 +129,7 @@ def view_of(apex: float) -> tuple[tuple[float, float, float], tuple[float, float
     return (1.5 * taller, 2.0 * taller, middle + 0.35 * taller), (0.0, 0.0, middle), (320, round(420 * taller))
 
 
-def run_jumps(act: Callable[[torch.Tensor], torch.Tensor], env: EvaluationEnv, heights: np.ndarray) -> HeightLog:
+def run_jumps(act: Callable[[torch.Tensor], torch.Tensor], env: Env, heights: np.ndarray) -> HeightLog:
     """Let every world jump to its height (num_envs,) [m] once; act: as in `run_evaluation`."""
     jumps = HeightLog(heights, termination_names(env.task))
     run_evaluation(act, env, jumps)
@@ -141,43 +142,35 @@ def jump_metrics(jumps: HeightLog, in_range: tuple[float, float]) -> Metrics:
     Errors are over all jumps, failed ones included, but those whose simulation came apart, which `came_apart` counts.
     Metrics of landings are over the successful jumps. in_range [m]: heights that `success_rate_in_range` counts.
     """
-    inside = within(jumps.commanded, in_range)
-    error, success, outcomes = np.abs(jumps.error), jumps.success, jumps.outcomes
+    success, outcomes = jumps.success, jumps.outcomes
     metrics: Metrics = {
-        "jumps": len(jumps.end),
-        "mean_abs_error_m": mean(error),
-        "mean_abs_error_in_range_m": mean(error[inside]),
-        "max_abs_error_of_successes_m": largest(error[success]),
+        **height_metrics(jumps, in_range),
+        "max_abs_error_of_successes_m": largest(np.abs(jumps.error)[success]),
         "success_rate": mean(success),
-        "success_rate_in_range": mean(success[inside]),
+        "success_rate_in_range": mean(success[within(jumps.commanded, in_range)]),
         "range_lower_m": in_range[0],
         "range_upper_m": in_range[1],
         "at_rest_within_1_s_rate": mean((jumps.rest_speed < REST_SPEED)[success]),
         "mean_landing_tilt_deg": mean(np.degrees(jumps.tilt[success])),
-        "max_landing_tilt_deg": largest(np.degrees(jumps.tilt[success])),
-        **stance_metrics(jumps),
-        "collision_rate": mean(outcomes == COLLIDED),
         "fall_rate": mean(np.isin(outcomes, (*FALLS, COLLIDED, CAME_APART))),
         "miss_rate": mean(outcomes == WRONG_HEIGHT),
-        CAME_APART: int(np.isnan(jumps.error).sum()),
     }
     return metrics | failures(outcomes[~success])
 
 
-def stance_metrics(jumps: HeightLog) -> Metrics:
-    """Return metrics of the stance after landings: still paws, second takeoffs, drift in the plane and turn.
-
-    `still_landing_rate` is of all jumps, the others of the landed ones.
-    """
-    landed, turn = jumps.landed, np.degrees(np.abs(jumps.yaw))
+def height_metrics(jumps: HeightLog, in_range: tuple[float, float]) -> Metrics:
+    """Return the errors, and how landed jumps stand: a second takeoff, drift in the plane, turn."""
+    error, landed = np.abs(jumps.error), jumps.landed
+    beyond = (jumps.drift > DRIFT) | (np.degrees(np.abs(jumps.yaw)) > TURN)
     return {
-        "still_landing_rate": mean(jumps.still),
+        "jumps": len(jumps.end),
+        "mean_abs_error_m": mean(error),
+        "mean_abs_error_in_range_m": mean(error[within(jumps.commanded, in_range)]),
+        **stance_metrics(jumps),
         "second_takeoff_rate": mean((jumps.takeoffs > 0)[landed]),
-        "mean_drift_m": mean(jumps.drift[landed]),
-        "max_drift_m": largest(jumps.drift[landed]),
-        "mean_turn_deg": mean(turn[landed]),
-        "max_turn_deg": largest(turn[landed]),
-        "beyond_authors_drift_or_turn_rate": mean(((jumps.drift > DRIFT) | (turn > TURN))[landed]),
+        **mean_and_max("drift_m", jumps.drift[landed]),
+        "beyond_authors_drift_or_turn_rate": mean(beyond[landed]),
+        CAME_APART: int(np.isnan(error).sum()),
     }
 
 
@@ -188,13 +181,11 @@ def sweep_metrics(jumps: HeightLog, in_range: tuple[float, float]) -> Metrics:
     the apex count neither there nor against the success.
     in_range [m]: heights that `success_rate_in_range` counts.
     """
-    commanded, error, near = jumps.commanded, np.abs(jumps.error), jumps.reached
-    tilt, at_rest = np.where(np.isnan(error), 0.0, np.degrees(jumps.tilt)), jumps.rest_speed < REST_SPEED
+    commanded, near = jumps.commanded, jumps.reached
+    tilt, at_rest = np.where(np.isnan(jumps.error), 0.0, np.degrees(jumps.tilt)), jumps.rest_speed < REST_SPEED
     landed = jumps.landed & (tilt < LEVEL) & at_rest
     return {
-        "jumps": len(jumps.end),
-        "mean_abs_error_m": mean(error),
-        "mean_abs_error_in_range_m": mean(error[within(commanded, in_range)]),
+        **height_metrics(jumps, in_range),
         "mean_error_m": mean(jumps.error),
         "success_rate": mean(near),
         "success_and_landing_rate": mean(near & landed),
@@ -202,42 +193,30 @@ def sweep_metrics(jumps: HeightLog, in_range: tuple[float, float]) -> Metrics:
         "success_rate_0_6_1_1": mean(near[within(commanded, (0.6, 1.1))]),
         "largest_reached_m": largest(jumps.error + commanded),
         "landing_rate": mean(landed),
-        "max_landing_tilt_deg": largest(np.degrees(jumps.tilt[jumps.landed])),
-        **stance_metrics(jumps),
-        "collision_rate": mean(jumps.ends == COLLIDED),
         "fall_rate": mean(np.isin(jumps.ends, FALLS)),
         "miss_rate": mean(jumps.landed & ~jumps.early & ~near),
         "no_jump_rate": mean(jumps.ends == "no_jump"),
         "early_rate": mean(jumps.early),
         "at_rest_within_1_s_rate": mean(at_rest),
         "largest_tilt_deg": largest(tilt),
-        CAME_APART: int(np.isnan(jumps.error).sum()),
     }
 
 
 @dataclass(frozen=True)
-class HeightFlags:
+class HeightFlags(JumpFlags):
     """Jumps to evenly spaced heights."""
 
-    jumps: int = 200
-    """Number of jumps."""
+    in_range: tuple[float, float] = (0.5, 1.1)
     lower: float = 0.5
     """[m] Lowest commanded base height."""
     upper: float = 1.2
     """[m] Highest."""
-    in_range: tuple[float, float] = (0.5, 1.1)
-    """[m] Heights that the success rate in range counts."""
 
     def __post_init__(self) -> None:
         """Raises InputError: a setting is out of range."""
-        check_jumps(self.jumps, self.in_range)
+        super().__post_init__()
         if not 0.0 < self.lower <= self.upper < 10.0:
             raise InputError(f"heights must be in (0, 10) m and rise, got {self.lower}, {self.upper}")
-
-    @property
-    def count(self) -> int:
-        """Number of worlds."""
-        return self.jumps
 
     def log(self, task: TaskCfg, seed: int) -> HeightLog:
         """Return jumps to these heights."""
@@ -261,16 +240,6 @@ class HeightGoals:
         """Raises InputError: a height is out of range, or their number."""
         if not 1 <= len(self.height) <= MAX_ROBOTS or not all(0.0 < height < 10.0 for height in self.height):
             raise InputError(f"height takes 1 to {MAX_ROBOTS} numbers in (0, 10) m, got {self.height}")
-
-    @property
-    def count(self) -> int:
-        """Number of worlds."""
-        return len(self.height)
-
-    @property
-    def seconds(self) -> float:
-        """[s] Length of the recording."""
-        return self.length
 
     def log(self, task: TaskCfg) -> HeightLog:
         """Return one jump a robot."""

@@ -96,6 +96,7 @@ def follow(group: Group, network: Network, *, derivatives: bool) -> Misses:
         for _ in range(begin):
             env.step(network.act(env.obs))
     state, states, tape = loop.state(), [], Tape()
+    arrays: dict[str, np.ndarray] = {}
     for _ in range(begin, last):
         if derivatives:
             state, _ = loop.step(state, network.act(loop.seen(state), tape=tape))

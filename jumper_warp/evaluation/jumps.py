@@ -3,10 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
-from jumper_warp.evaluation.log import CAME_APART, NO_END, EvaluationEnv, EvaluationLog, success_index
+from jumper_warp.envs.env import Env
+from jumper_warp.evaluation.log import (
+    CAME_APART,
+    COLLIDED,
+    NO_END,
+    EvaluationLog,
+    Metrics,
+    largest,
+    mean,
+    mean_and_max,
+    success_index,
+)
 from jumper_warp.utils.errors import InputError
 
 STANCE, LANDED = 0, 2
@@ -30,7 +42,7 @@ NOT_BEGUN = "not_begun"
 """Outcome of a jump that was due after one that failed."""
 
 
-def paw_arrays(env: EvaluationEnv) -> dict[str, np.ndarray]:
+def paw_arrays(env: Env) -> dict[str, np.ndarray]:
     """Return which paws are on the ground, (num_envs, 4), and the base's upward speed [m/s]."""
     force = np.linalg.norm(env.sim.paw_force.numpy(), axis=2)
     return {"paws_down": (force > env.task.contact_force).T, "up": env.sim.base_velocity()[:, 2]}
@@ -53,23 +65,8 @@ class JumpLog(EvaluationLog):
     when it is commanded. Nothing of a jump changes after its end.
     """
 
-    goals: np.ndarray  # [m] (..., 3) landing place ahead and to the left, base height at the apex, 0 if any will do
-    current: np.ndarray  # (num_envs,) number of the jump under way; that of jumps in a row after the end
-    end: np.ndarray  # index of the end in `terminations`, -1 before it
-    place: np.ndarray  # [m] (..., 2) base at the end, world
-    target: np.ndarray  # [m] (..., 2) where it should be, world
-    touchdown: np.ndarray  # [m] (..., 2) base at touchdown, world
-    place_soon: np.ndarray  # [m] (..., 2) base SOON after touchdown, world
-    heading: np.ndarray  # [rad] of the jump
-    yaw: np.ndarray  # [rad] of the base at the end, from the jump's heading
-    drift: np.ndarray  # [m] of the base in the plane, from the start to the end
-    apex: np.ndarray  # [m] largest base height
-    tilt: np.ndarray  # [rad] largest since touchdown
-    rest_speed: np.ndarray  # [m/s] of the base `speed_time` after touchdown; infinite before
-    early: np.ndarray  # whether the jump began before the command
-    air_time: np.ndarray  # [s] longest that no paw was on the ground after touchdown
-    lift_time: np.ndarray  # [s] longest that any paw was off the ground after its own first contact in the landing
-    takeoffs: np.ndarray  # number of takeoffs after touchdown: upward at TAKEOFF_SPEED with no paw down
+    speed_time: float
+    """[s] After touchdown, when the base's speed is recorded."""
 
     def __init__(
         self,
@@ -81,40 +78,48 @@ class JumpLog(EvaluationLog):
     ) -> None:
         """Begin with no jump ended.
 
-        Args:
-            goals: (num_envs, jumps in a row, 3) [m].
-            terminations: Names of the ends of an episode, SUCCESS among them.
-            headings: [rad] (num_envs,) or one for all.
-            delay: [s] Until the first jump is commanded; (num_envs,) or one for all.
-            rest: [s] From touchdown until the jump is over, and the next one commanded.
+        goals: [m] (num_envs, jumps in a row, 2) landing places ahead and to the left, or 3: with the base height at the
+        apex, 0 if any will do; terminations: names of the ends of an episode, SUCCESS among them; headings: [rad]
+        (num_envs,) or one for all; delay: [s] until the first jump is commanded, likewise; rest: [s] from touchdown
+        until the jump is over, and the next one commanded. Raises InputError: another shape, or no SUCCESS.
         """
-        self.goals, self.terminations = goals, terminations
-        self.headings, self.delay, self.rest = headings, delay, rest
-        shape = goals.shape[:2]
-        self.current, self.end = np.zeros(shape[0], dtype=int), np.full(shape, -1)
-        self.place, self.target, self.touchdown, self.place_soon = (np.full((*shape, 2), np.nan) for _ in range(4))
-        self.heading, self.yaw, self.drift, self.apex, self.tilt = (np.full(shape, np.nan) for _ in range(5))
-        self.rest_speed, self.early = np.full(shape, np.inf), np.zeros(shape, dtype=bool)
-        self.air_time, self.lift_time = np.zeros(shape), np.zeros(shape)
-        self.takeoffs = np.zeros(shape, dtype=int)
-        self._aloft, self._lifted = np.zeros(shape[0]), np.zeros((shape[0], 4))
-        self._came_down, self._flies = np.zeros((shape[0], 4), dtype=bool), np.zeros(shape[0], dtype=bool)
+        goals = np.asarray(goals, dtype=float)
+        if goals.ndim != 3 or goals.shape[2] not in (2, 3):
+            raise InputError(f"goals must have shape (num_envs, jumps, 2 or 3), got {goals.shape}")
+        self.goals, self.terminations = np.pad(goals, ((0, 0), (0, 0), (0, 3 - goals.shape[2]))), terminations
+        self.headings, self.delay, self.rest, self.speed_time = headings, delay, rest, rest
+        self.count, *_ = shape = goals.shape[:2]
+        self.current = np.zeros(
+            self.count, dtype=int
+        )  # (num_envs,) number of the jump under way; after the end, of all
+        self.end = np.full(shape, -1)  # index of the end in `terminations`, -1 before it
+        self.place = np.full((*shape, 2), np.nan)  # [m] (..., 2) base at the end, world
+        self.target = np.full((*shape, 2), np.nan)  # [m] (..., 2) where it should be, world
+        self.touchdown = np.full((*shape, 2), np.nan)  # [m] (..., 2) base at touchdown, world
+        self.place_soon = np.full((*shape, 2), np.nan)  # [m] (..., 2) base SOON after touchdown, world
+        self.heading = np.full(shape, np.nan)  # [rad] of the jump
+        self.yaw = np.full(shape, np.nan)  # [rad] of the base at the end, from the jump's heading
+        self.drift = np.full(shape, np.nan)  # [m] of the base in the plane, from the start to the end
+        self.apex = np.full(shape, np.nan)  # [m] largest base height
+        self.tilt = np.full(shape, np.nan)  # [rad] largest since touchdown
+        self.rest_speed = np.full(shape, np.inf)  # [m/s] of the base `speed_time` after touchdown; infinite before
+        self.early = np.zeros(shape, dtype=bool)  # whether the jump began before the command
+        self.air_time = np.zeros(shape)  # [s] longest that no paw was on the ground after touchdown
+        self.lift_time = np.zeros(shape)  # [s] longest that a paw was off the ground after its own first contact
+        self.takeoffs = np.zeros(shape, dtype=int)  # after touchdown: upward at TAKEOFF_SPEED with no paw down
+        self._aloft, self._lifted = np.zeros(self.count), np.zeros((self.count, 4))
+        self._came_down, self._flies = np.zeros((self.count, 4), dtype=bool), np.zeros(self.count, dtype=bool)
         self._success = success_index(terminations)
 
-    @property
-    def speed_time(self) -> float:
-        """[s] After touchdown, when the base's speed is recorded."""
-        return self.rest
-
-    def begin(self, env: EvaluationEnv) -> None:
+    def begin(self, env: Env) -> None:
         """Stand every world in the default pose with its first goal."""
         env.evaluation_reset(jump_commands(self.goals[:, 0], self.delay, env.step_dt), self.headings)
 
-    def look(self, env: EvaluationEnv) -> dict[str, np.ndarray]:
+    def look(self, env: Env) -> dict[str, np.ndarray]:
         """Return the state of every world's episode, which of its paws are on the ground, and how fast it rises."""
         return env.task_arrays() | paw_arrays(env)
 
-    def follow(self, env: EvaluationEnv) -> bool:
+    def follow(self, env: Env) -> bool:
         """Look at the environment after a policy step, and command the jumps that are due."""
         before = self.current.copy()
         ended = super().follow(env)
@@ -179,7 +184,12 @@ class JumpLog(EvaluationLog):
     def ends(self) -> np.ndarray:
         """Name of each jump's end, whether or not it met its goal."""
         names = np.array([*self.terminations, NO_END], dtype=object)[self.end]
-        return np.where(np.isnan(self.heading), NOT_BEGUN, names)
+        return np.where(self.begun, names, NOT_BEGUN)
+
+    @property
+    def begun(self) -> np.ndarray:
+        """Whether the jump was begun."""
+        return ~np.isnan(self.heading)
 
     @property
     def broken(self) -> np.ndarray:
@@ -211,12 +221,32 @@ class JumpLog(EvaluationLog):
         return {f"height/base of {world} [m]": self.seen["base_pos"][world, 2] for world in worlds}
 
 
-def check_jumps(jumps: int, in_range: tuple[float, float]) -> None:
-    """Raise InputError unless there is a jump and a range [m]."""
-    if jumps < 1:
-        raise InputError(f"jumps must be at least 1, got {jumps}")
-    if not 0.0 <= in_range[0] <= in_range[1] < 10.0:
-        raise InputError(f"in_range must be in [0, 10) m and rise, got {in_range[0]}, {in_range[1]}")
+def stance_metrics(jumps: JumpLog) -> Metrics:
+    """Return still landings and collisions, shares of all jumps, and the largest tilt and turns of the landed ones."""
+    begun, landed = jumps.begun, jumps.landed
+    return {
+        "still_landing_rate": mean(jumps.still[begun]),
+        "collision_rate": mean((jumps.ends == COLLIDED)[begun]),
+        "max_landing_tilt_deg": largest(np.degrees(jumps.tilt[landed])),
+        **mean_and_max("turn_deg", np.degrees(np.abs(jumps.yaw))[landed]),
+    }
+
+
+@dataclass(frozen=True)
+class JumpFlags:
+    """Jumps from standing still."""
+
+    jumps: int = 200
+    """Number of jumps."""
+    in_range: tuple[float, float] = (0.3, 1.4)
+    """[m] Distances or heights that the success rate in range counts."""
+
+    def __post_init__(self) -> None:
+        """Raises InputError: a setting is out of range."""
+        if self.jumps < 1:
+            raise InputError(f"jumps must be at least 1, got {self.jumps}")
+        if not 0.0 <= self.in_range[0] <= self.in_range[1] < 10.0:
+            raise InputError(f"in_range must be in [0, 10) m and rise, got {self.in_range[0]}, {self.in_range[1]}")
 
 
 def yaw_of(quat: np.ndarray) -> np.ndarray:

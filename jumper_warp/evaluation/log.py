@@ -8,15 +8,18 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import torch
+from numpy.typing import ArrayLike
 
+from jumper_warp.envs.env import Env
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.utils.errors import InputError
 
 if TYPE_CHECKING:
+    import torch
+
     from jumper_warp.evaluation.film import Film, Strip
 
 SUCCESS = "success"
@@ -28,29 +31,6 @@ NO_END = "no_end"
 Metrics = dict[str, float | int | None]
 
 
-class EvaluationEnv(Protocol):
-    """What an evaluation run asks of an environment; `jumper_warp.envs.env.Env` is one."""
-
-    num_envs: int
-    device: torch.device
-    step_dt: float
-    obs: torch.Tensor
-    task: Any
-    sim: Any
-
-    def evaluation_reset(self, commands: np.ndarray, headings: np.ndarray | float = 0.0) -> None:
-        """Stand every world still with its command, and end no episode."""
-
-    def command(self, commands: np.ndarray, worlds: np.ndarray | None = None) -> None:
-        """Give some of the worlds another command."""
-
-    def step(self, action: torch.Tensor) -> Any:
-        """Advance one policy step."""
-
-    def task_arrays(self) -> dict[str, np.ndarray]:
-        """Return the state of every world's episode, one array a field of the task's state, and of its base."""
-
-
 class EvaluationLog(ABC):
     """Asks every world for something, and keeps what became of it."""
 
@@ -58,6 +38,8 @@ class EvaluationLog(ABC):
     """What a row of `columns` is about, in a word."""
     spacing = 1.2
     """[m] Between robots that are drawn side by side."""
+    count: int
+    """Number of worlds."""
     seen: dict[str, np.ndarray]
     """What was seen of the environment last."""
 
@@ -67,7 +49,7 @@ class EvaluationLog(ABC):
         """[s] Simulated time after which what has not ended is a failure."""
 
     @abstractmethod
-    def begin(self, env: EvaluationEnv) -> None:
+    def begin(self, env: Env) -> None:
         """Stand every world at its start."""
 
     @abstractmethod
@@ -94,11 +76,11 @@ class EvaluationLog(ABC):
         """Return the filmstrip that shows most of a film, if there is one."""
         return None
 
-    def look(self, env: EvaluationEnv) -> dict[str, np.ndarray]:
+    def look(self, env: Env) -> dict[str, np.ndarray]:
         """Return what is to be known of every world after a policy step."""
         return env.task_arrays()
 
-    def follow(self, env: EvaluationEnv) -> bool:
+    def follow(self, env: Env) -> bool:
         """Look at the environment after a policy step; return whether everything has ended."""
         self.seen = self.look(env)
         return self.update(self.seen, env.step_dt)
@@ -106,22 +88,17 @@ class EvaluationLog(ABC):
 
 def run_evaluation(
     act: Callable[[torch.Tensor], torch.Tensor],
-    env: EvaluationEnv,
+    env: Env,
     log: EvaluationLog,
     *,
     seconds: float | None = None,
     watch: Callable[[], object] | None = None,
     stop: bool = True,
 ) -> None:
-    """Let every world do what the log asks, until everything has ended.
+    """Run one episode a world as the log commands, until all have ended.
 
-    Args:
-        act: Observations (num_envs, num_obs) to actions, such as `Policy.act`.
-        env: One world a row of the log.
-        log: What is asked for, and what becomes of it.
-        seconds: Simulated time at most (default: the log's).
-        watch: Called after every policy step.
-        stop: Whether to stop when everything has ended, instead of at the end of the time.
+    act: observations (num_envs, num_obs) to actions, such as `Policy.act`; seconds: simulated time at most (default:
+    the log's); watch: called after every policy step; stop: False to continue to the end of the time.
     """
     log.begin(env)
     for _ in range(round((log.seconds if seconds is None else seconds) / env.step_dt)):
@@ -156,17 +133,22 @@ def within(values: np.ndarray, limits: tuple[float, float]) -> np.ndarray:
     return (values >= limits[0] - 5e-4) & (values <= limits[1] + 5e-4)
 
 
-def mean(values: np.ndarray | Sequence[float | None]) -> float | None:
+def mean(values: ArrayLike | Sequence[float | None]) -> float | None:
     """Return the mean of what is a number, None if nothing is."""
-    values = np.asarray(values, dtype=float)
-    values = values[~np.isnan(values)]
-    return float(values.mean()) if len(values) else None
+    numbers = np.asarray(values, dtype=float)
+    numbers = numbers[~np.isnan(numbers)]
+    return float(numbers.mean()) if len(numbers) else None
 
 
 def largest(values: np.ndarray) -> float | None:
     """Return the largest of what is a number, None if nothing is."""
     values = values[~np.isnan(values)]
     return float(values.max()) if len(values) else None
+
+
+def mean_and_max(name: str, values: np.ndarray) -> Metrics:
+    """Return the mean and the largest of what is a number, as `mean_<name>` and `max_<name>`."""
+    return {f"mean_{name}": mean(values), f"max_{name}": largest(values)}
 
 
 def failures(outcomes: np.ndarray) -> Metrics:

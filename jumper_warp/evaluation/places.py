@@ -16,7 +16,7 @@ import tyro
 
 from jumper_warp.evaluation.film import PICTURE, Film, Strip, beside, moments
 from jumper_warp.evaluation.heights import MAX_ROBOTS
-from jumper_warp.evaluation.jumps import DELAY, NOT_BEGUN, REST_SPEED, REST_TIME, TAKEOFF_SPEED, JumpLog, check_jumps
+from jumper_warp.evaluation.jumps import REST_SPEED, REST_TIME, TAKEOFF_SPEED, JumpFlags, JumpLog, stance_metrics
 from jumper_warp.evaluation.log import (
     CAME_APART,
     COLLIDED,
@@ -24,8 +24,8 @@ from jumper_warp.evaluation.log import (
     Metrics,
     failures,
     finite,
-    largest,
     mean,
+    mean_and_max,
     termination_names,
     with_ends,
     within,
@@ -71,19 +71,10 @@ class PlaceLog(JumpLog):
 
     spacing = 3.0
 
-    def __init__(
-        self,
-        places: np.ndarray,
-        terminations: tuple[str, ...],
-        headings: np.ndarray | float = 0.0,
-        delay: np.ndarray | float = DELAY,
-        rest: float = REST_TIME,
-    ) -> None:
-        """places: (num_envs, jumps in a row, 2) [m]; the others as in `JumpLog`. Raises InputError: another shape."""
-        self.places = np.asarray(places, dtype=float)
-        if self.places.ndim != 3 or self.places.shape[2] != 2:
-            raise InputError(f"goals must have shape (num_envs, jumps, 2), got {self.places.shape}")
-        super().__init__(np.pad(self.places, ((0, 0), (0, 0), (0, 1))), terminations, headings, delay, rest)
+    @property
+    def places(self) -> np.ndarray:
+        """[m] (..., 2) Goals, ahead and to the left."""
+        return self.goals[..., :2]
 
     @property
     def seconds(self) -> float:
@@ -172,17 +163,13 @@ def landing_metrics(landings: PlaceLog, inside: np.ndarray | None = None) -> Met
 
     inside: which jumps the metrics in range count, shaped like `landings.end`; without it there are none.
     """
-    begun = landings.ends != NOT_BEGUN
-    error, success, landed = landings.error, landings.success, landings.landed
+    begun, error, success, landed = landings.begun, landings.error, landings.success, landings.landed
     offset = np.where(np.isnan(error)[..., None], np.nan, landings.offset)
-    tilt, yaw = np.degrees(landings.tilt), np.degrees(np.abs(landings.yaw))
     at_rest = "at_rest_within_1_s_rate" if landings.rest == REST_TIME else AT_END
     metrics: Metrics = {
         "jumps": int(begun.sum()),
-        "mean_error_m": mean(error),
-        "mean_error_of_successes_m": mean(error[success]),
-        "max_error_of_successes_m": largest(error[success]),
-        "max_error_m": largest(error),
+        **mean_and_max("error_m", error),
+        **mean_and_max("error_of_successes_m", error[success]),
         "mean_error_ahead_m": mean(offset[..., 0]),
         "mean_error_left_m": mean(offset[..., 1]),
         "success_rate": mean(success[begun]),
@@ -193,14 +180,10 @@ def landing_metrics(landings: PlaceLog, inside: np.ndarray | None = None) -> Met
         "step_rate": mean(landings.stepped[landed]),
         "mean_error_at_touchdown_m": mean(landings.distance(landings.touchdown)[landed]),
         "mean_error_0_3_s_after_touchdown_m": mean(landings.distance(landings.place_soon)[landed]),
-        "still_landing_rate": mean(landings.still[begun]),
+        **stance_metrics(landings),
         "second_takeoff_rate": mean((landings.takeoffs > 0)[np.isfinite(landings.touchdown).all(axis=-1)]),
         at_rest: mean((landings.rest_speed < REST_SPEED)[landed]),
-        "mean_landing_tilt_deg": mean(tilt[landed]),
-        "max_landing_tilt_deg": largest(tilt[landed]),
-        "mean_turn_deg": mean(yaw[landed]),
-        "max_turn_deg": largest(yaw[landed]),
-        "collision_rate": mean((landings.ends == COLLIDED)[begun]),
+        "mean_landing_tilt_deg": mean(np.degrees(landings.tilt[landed])),
         "fall_rate": mean(np.isin(landings.ends, FALLS)[begun]),
         "miss_rate": mean((landings.outcomes == MISSED)[begun]),
         "early_rate": mean(landings.early[begun]),
@@ -228,34 +211,25 @@ def random_headings(count: int, seed: int) -> np.ndarray:
 
 
 @dataclass(frozen=True)
-class PlaceFlags:
+class PlaceFlags(JumpFlags):
     """Jumps to places from standing still."""
 
-    jumps: int = 200
-    """Number of jumps."""
     x: Place = (0.3, 1.5)
     """[m] Goals ahead, evenly spaced between these."""
     y: Place = (0.0, 0.0)
     """[m] Goals to the left, drawn between these."""
     heading: Literal["any"] | float = "any"
     """[deg] Heading of all robots, or any: drawn from the full circle."""
-    in_range: Place = (0.3, 1.4)
-    """[m] Distances that the success rate in range counts."""
 
     def __post_init__(self) -> None:
         """Raises InputError: a setting is out of range."""
-        check_jumps(self.jumps, self.in_range)
+        super().__post_init__()
         for name in ("x", "y"):
             low, high = getattr(self, name)
             if not -10.0 < low <= high < 10.0:
                 raise InputError(f"{name} must be in (-10, 10) m and rise, got {low}, {high}")
         if self.heading != "any" and not math.isfinite(self.heading):
             raise InputError(f"heading must be finite or any, got {self.heading}")
-
-    @property
-    def count(self) -> int:
-        """Number of worlds."""
-        return self.jumps
 
     def log(self, task: TaskCfg, seed: int) -> PlaceLog:
         """Return single jumps with these goals and headings."""
@@ -294,13 +268,8 @@ class PlaceGoals:
         return self.goal or self.unless_told
 
     @property
-    def count(self) -> int:
-        """Number of worlds."""
-        return len(self.goals)
-
-    @property
-    def seconds(self) -> float:
-        """[s] Length of the recording."""
+    def length(self) -> float:
+        """[s] Of the recording."""
         return SECONDS + SECONDS_MORE * len(self.then)
 
     def log(self, task: TaskCfg) -> PlaceLog:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -50,7 +50,7 @@ def draw_landings(path: Path, tests: dict[str, PlaceLog], size: tuple[float, flo
             axis.scatter(landing[good, 0], landing[good, 1], s=12, color="tab:blue", label="landed there")
             axis.scatter(landing[~good, 0], landing[~good, 1], s=14, color="tab:red", label="failed")
             axis.set(xlabel="ahead [m]", ylabel="to the left [m]", title=title, aspect="equal")
-        axis.figure.legend(*axis.get_legend_handles_labels(), loc="outside lower center", ncols=3)
+        axes[0, 0].figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=3)
 
 
 class Track:
@@ -71,7 +71,7 @@ class Track:
         return np.stack([cos * x + sin * y, cos * y - sin * x], axis=-1)
 
 
-def draw_paths(path: Path, paths: dict[str, np.ndarray], goals: dict[str, Sequence], title: str) -> None:
+def draw_paths(path: Path, paths: dict[str, np.ndarray], goals: Mapping[str, Sequence], title: str) -> None:
     """Draw ways of bases from above, a panel a test; where a test has a row of goals, these if no jump has an error.
 
     paths [m]: by test, of `Track.in_start_frame`; goals [m]: by test, each relative to the one before.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Literal, Protocol
+from typing import Any, Literal, Protocol
 
 from jumper_warp.evaluation import heights, places
 from jumper_warp.evaluation.episodes import EpisodeFlags, EpisodeGoals
@@ -20,27 +20,26 @@ from jumper_warp.tasks.cfg import TaskCfg
 class EvaluationFlags(Protocol):
     """A frozen dataclass: flags of `jumper evaluate`."""
 
-    @property
-    def count(self) -> int:
-        """Number of worlds."""
-
     def log(self, task: TaskCfg, seed: int) -> EvaluationLog:
         """Return what is asked for, one row a world."""
+        ...
 
-    def metrics(self, log: EvaluationLog) -> Metrics:
-        """Return what to report."""
+    def metrics(self, log: Any) -> Metrics:
+        """Return what to report of its log."""
+        ...
 
 
 class PlayFlags(Protocol):
     """A frozen dataclass: flags of `jumper play`."""
 
-    count: int
-    """Number of worlds."""
-    seconds: float
-    """[s] Length of the recording."""
+    @property
+    def length(self) -> float:
+        """[s] Of the recording."""
+        ...
 
     def log(self, task: TaskCfg) -> EvaluationLog:
         """Return what is asked for, one row a world."""
+        ...
 
 
 @dataclass(frozen=True)

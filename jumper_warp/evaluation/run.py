@@ -8,13 +8,14 @@ from __future__ import annotations
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from types import ModuleType
-from typing import Any, Literal, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
+import tyro
 from rich.console import Console
 from rich.table import Table
 
@@ -22,13 +23,13 @@ from jumper_warp.envs.env import Env
 from jumper_warp.evaluation.film import Film
 from jumper_warp.evaluation.log import EvaluationLog, run_evaluation
 from jumper_warp.evaluation.registry import evaluation_of
-from jumper_warp.identification.parameters import TRANSVERSAL
 from jumper_warp.policies.conditions import Conditions, env_of_policy
 from jumper_warp.policies.restore import restored_task
 from jumper_warp.policies.runs import open_policy
 from jumper_warp.policies.skills import SkillNames, SkillPolicies
 from jumper_warp.policies.spec import PolicyError
 from jumper_warp.robot.model import PHYSICS_DT
+from jumper_warp.robot.values import TRANSVERSAL
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.output import output_dir, write_metrics
@@ -43,53 +44,29 @@ Log = TypeVar("Log", bound=EvaluationLog)
 
 
 @dataclass(frozen=True)
-class EvaluationArgs:
-    """Flags of every experiment that evaluates a policy."""
+class EvaluationArgs(Conditions):
+    """Flags of every experiment that evaluates a policy; randomised robots have observation noise too."""
 
+    noise: tyro.conf.Suppress[tyro.conf.Fixed[bool]] = False
     policy: str = "horizontal_jump"
     """Name or folder of a policy, a run's folder, or a checkpoint."""
-    solver: Literal["jumper", "mujoco"] = "jumper"
-    """Physics: the dedicated solver, or Newton's SolverMuJoCo."""
-    randomize: bool = False
-    """Randomisation, observation noise, latency and pushes as in training."""
-    push_in_flight: bool = False
-    """Randomised pushes act in flight too, and not only while a paw is down."""
-    latency: float | None = None
-    """[ms] From action to motor, to the nearest physics step (default: none, or drawn if randomised)."""
-    gains: tuple[float, float] | None = None
-    """[1] Scales of kp and kd of all motors (default: 1, or drawn if randomised)."""
-    friction: float | None = None
-    """[1] Of the paws, static and dynamic (default: nominal, or drawn if randomised)."""
-    robot: Path | None = None
-    """Robot overlay, as `jumper sysid` writes it (default: that of the training, if it had one)."""
-    seed: int = 0
-    """Of what is drawn."""
     record: int = 1
     """Number of jumps to record for the Rerun viewer and, one of them, as a filmstrip; 0: none."""
     out: Path | None = None
     """Folder for figures, plots, recordings and filmstrips (default: outputs/<name>/<time>)."""
-    device: str | None = None
-    """Warp device."""
-    threads: int | None = None
-    """CPU threads that share the worlds (default: all cores); they change no result."""
-    gravity: float | None = None
-    """[m/s^2] Downward (default: that of the policy's task)."""
 
     def __post_init__(self) -> None:
-        """Check the values."""
+        super().__post_init__()
         if self.record < 0:
             raise InputError(f"record must not be negative, got {self.record}")
         checked_threads(self.threads)
-        conditions_of(self)
 
 
 def conditions_of(args: EvaluationArgs) -> Conditions:
-    """Return the conditions that an experiment's flags ask for. Raises InputError: one is out of range."""
-    same = (
-        "solver", "randomize", "seed", "device", "threads", "gravity", "push_in_flight", "latency", "gains", "friction",
-        "robot",
-    )  # fmt: skip
-    return Conditions(noise=args.randomize, **{name: getattr(args, name) for name in same})
+    """Return the conditions that an experiment's flags ask for."""
+    values: dict[str, Any] = {spec.name: getattr(args, spec.name) for spec in fields(Conditions)}
+    values["noise"] = args.randomize
+    return Conditions(**values)
 
 
 class Run(ABC):
@@ -154,14 +131,10 @@ class Run(ABC):
         drawn: Mapping[str, Any] | None = None,
         watch: Callable[[Log], None] | None = None,
     ) -> Log:
-        """Let every world do what a log asks, and return the log.
+        """Run one episode a world as a log commands, and return the log.
 
-        Args:
-            env: Of `env`.
-            log: One row a world.
-            film: Name of the recording and filmstrip of some of the worlds; no film without.
-            drawn: The environment's `ground` and `block`, if they are to be seen in the film.
-            watch: Called with the log after every policy step.
+        film: name of the recording and filmstrip of some of the worlds; no film without. drawn: the environment's
+        `ground` and `block`, if the film shows them. watch: called with the log after every policy step.
         """
         pictures = self._film(env, log, drawn or {}) if film and self.record else None
 
@@ -175,7 +148,7 @@ class Run(ABC):
         self._latency.append(env.parameters.latency.numpy().copy())
         self._physics_dt = env.physics_dt
         if pictures is not None:
-            self._develop(pictures, film)
+            self._develop(pictures, log, film)
         return log
 
     def _film(self, env: Env, log: EvaluationLog, drawn: Mapping[str, Any]) -> Film:
@@ -183,12 +156,13 @@ class Run(ABC):
         ground = drawn.get("ground", "plane")
         worlds = np.linspace(0, env.num_envs - 1, min(self.record, env.num_envs)).round().astype(int).tolist()
         spacing = log.spacing if isinstance(ground, str) else 0.0
-        return Film(env, log, worlds, spacing=spacing, ground=ground, block=drawn.get("block"), notes=log.notes(worlds))
+        block, notes = drawn.get("block"), log.notes(worlds)
+        return Film(env, log.series, worlds, spacing=spacing, ground=ground, block=block, notes=notes)
 
-    def _develop(self, film: Film, name: str) -> None:
+    def _develop(self, film: Film, log: EvaluationLog, name: str) -> None:
         """Write a film as a recording, and as a filmstrip; this shows no blocks."""
-        film.save_rrd(self.folder / f"{name}.rrd", film.log.marks(film.worlds))
-        strip = None if film.block is not None else film.log.strip(film)
+        film.save_rrd(self.folder / f"{name}.rrd", log.marks(film.worlds))
+        strip = None if film.block is not None else log.strip(film)
         if strip is not None:
             film.save_strip(strip, self.folder / f"{strip.name or name}.png")
 
@@ -210,13 +184,8 @@ class EvaluationRun(Run):
     def __init__(self, source: str | Path, modules: Iterable[ModuleType] = ()) -> None:
         """Open a policy; call `prepare` before anything else.
 
-        Args:
-            source: Name or folder of a policy, a run's folder, or a checkpoint.
-            modules: That the user has named, for tasks that are not the project's.
-
-        Raises:
-            PolicyError: The policy cannot be used, or nothing is known of how it is evaluated.
-            CheckpointError: The checkpoint cannot be used.
+        source: name or folder of a policy, a run's folder, or a checkpoint; modules: that the user has named, for tasks
+        that are not the project's. Raises PolicyError, also for an unknown evaluation, or CheckpointError.
         """
         super().__init__()
         self.source, self.modules = source, list(modules)
@@ -234,16 +203,8 @@ class EvaluationRun(Run):
     ) -> EvaluationRun:
         """Return the run of an experiment, prepared.
 
-        Args:
-            name: Of the experiment and its folder.
-            args: Flags.
-            evaluations: Keys of `EVALUATIONS`, one of which the policy must have.
-            modules: That the user has named.
-
-        Raises:
-            PolicyError: The policy cannot be used, or is evaluated otherwise.
-            CheckpointError: The checkpoint cannot be used.
-            InputError: There is no such device.
+        evaluations: keys of `EVALUATIONS`, one of which the policy must have, else PolicyError; modules: that the user
+        has named. Raises as the constructor and `prepare`.
         """
         run = cls(args.policy, modules)
         if run.task.evaluation not in evaluations:
@@ -266,16 +227,10 @@ class EvaluationRun(Run):
         conditions: Conditions | None = None,
         **scene: Any,
     ) -> Env:
-        """Return the policy's environment.
+        """Return the policy's environment of `count` worlds. Raises PolicyError as `env_of_policy`.
 
-        Args:
-            count: Number of worlds.
-            change: Returns the task with the terminations that count (default: as its evaluation says).
-            conditions: Other ones than the run's.
-            scene: More settings of `Env`.
-
-        Raises:
-            PolicyError: As `env_of_policy`.
+        change: returns the task with the terminations that count (default: as its evaluation says); conditions: other
+        ones than the run's; scene: more settings of `Env`.
         """
         change, conditions = change or self.evaluation.for_evaluation, conditions or self.conditions
         env = env_of_policy(self.policy, count, conditions, change=change, modules=self.modules, **scene)
@@ -289,7 +244,7 @@ class SkillRun(Run):
     """Opens the policies of one robot, follows it as often as wanted, and reports."""
 
     def __init__(self, names: SkillNames | None = None) -> None:
-        """Open policies; call `prepare` before anything else. Raises PolicyError or CheckpointError: see there."""
+        """Open policies; call `prepare` before anything else. Raises PolicyError or CheckpointError."""
         super().__init__()
         self.skills = SkillPolicies(names)
 

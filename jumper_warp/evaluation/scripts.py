@@ -48,7 +48,8 @@ class ScriptStep:
         """What the environment is commanded: a velocity, or a jump's place and height."""
         if self.kind == "jump_up":
             return (0.0, 0.0, self.values[0])
-        return (*self.values, *(3 - len(self.values)) * (0.0,))
+        x, y, z = (*self.values, 0.0, 0.0, 0.0)[:3]
+        return x, y, z
 
 
 def read_script(path: Path) -> tuple[ScriptStep, ...]:

@@ -13,6 +13,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from jumper_warp.evaluation.film import block_places
 from jumper_warp.evaluation.log import largest, mean, within
 from jumper_warp.evaluation.places import AT_END, FALLS, MISSED, PlaceLog, landing_metrics, trained_range
 from jumper_warp.evaluation.plots import Track, draw_landings, draw_paths, drawn
@@ -78,7 +79,6 @@ class Grid(Suite):
     paper: ClassVar = {"mean_error_m": 0.025, "success_rate": 0.968, "success_rate_in_range": 1.0}
 
     def __post_init__(self) -> None:
-        """Check the values."""
         super().__post_init__()
         check(min(self.columns, self.rows) >= 1, f"need at least one column and row, got {self.columns}, {self.rows}")
 
@@ -108,7 +108,6 @@ class Ring(Suite):
     least: ClassVar = (len(SECTORS), 0.1)
 
     def __post_init__(self) -> None:
-        """Check the values."""
         super().__post_init__()
         check(0.0 < self.radius < 3.0, f"radius must be in (0, 3) m, got {self.radius}")
 
@@ -150,7 +149,6 @@ class Consecutive(Suite):
     paper: ClassVar = {"mean_error_m": 0.0054}
 
     def __post_init__(self) -> None:
-        """Check the values."""
         super().__post_init__()
         check(min(self.trials, self.row) >= 1, f"need at least one trial and row, got {self.trials}, {self.row}")
 
@@ -209,7 +207,6 @@ class Platform(Suite):
     name: ClassVar = "platform"
 
     def __post_init__(self) -> None:
-        """Check the values."""
         super().__post_init__()
         low, high = 0.3, GROUND_LOWER[0]
         check(low <= self.edge < high, f"edge must be from {low} m to below {high} m, got {self.edge}")
@@ -236,7 +233,7 @@ class Platform(Suite):
             done[name] = self.jump(run, goals[:, None], env, headings=headings, film=name, drawn=special)
             values |= {f"{name}_{metric}": value for metric, value in landing_metrics(done[name]).items()}
             if "block" in special:
-                slide = np.linalg.norm(env.sim.solver.block_position() - special["block"].center, axis=1)
+                slide = np.linalg.norm(block_places(env.sim) - special["block"].center, axis=1)
                 values |= {"block_mean_slide_m": float(slide.mean()), "block_max_slide_m": float(slide.max())}
         titles = {f"{name}, {run.title}": landings for name, landings in done.items()}
         draw_landings(run.folder / "landings.png", titles, (5.0 * len(done), 4.0))
@@ -272,7 +269,6 @@ class Farthest(Suite):
     paper: ClassVar = {"hop_free_distance_m": 1.25}
 
     def __post_init__(self) -> None:
-        """Check the values."""
         super().__post_init__()
         good, limits = 0.1 <= self.first <= self.last <= LIMIT, f"0.1 <= first <= last <= {LIMIT:g} m"
         check(good, f"need {limits}, got {self.first} and {self.last}")
@@ -319,12 +315,12 @@ def draw_distances(run: EvaluationRun, values: dict[str, Any]) -> None:
 def distance_metrics(bins: dict[float, PlaceLog]) -> dict[str, Any]:
     """Return the metrics over all bins (middle [m] to jumps), and lists with an entry a bin."""
     each = [landing_metrics(landings) for landings in bins.values()]
-    lists = {name: [values[name] for values in each] for name in EACH}
-    flown = [base_at_touchdown(landings) for landings in bins.values()]
+    lists: dict[str, list[Any]] = {name: [values[name] for values in each] for name in EACH}
+    flown = [mean(np.linalg.norm(log.touchdown[log.success], axis=-1)) for log in bins.values()]
     landed = [landings.landing[landings.success][:, 0] for landings in bins.values()]
     inside = [landings.success[within(landings.places[..., 0], IN_RANGE)] for landings in bins.values()]
     values: dict[str, Any] = {
-        "jumps": sum(values["jumps"] for values in each),
+        "jumps": sum(int(landings.begun.sum()) for landings in bins.values()),
         "mean_error_m": mean(lists["mean_error_m"]),
         "success_rate_in_range": mean(np.concatenate(inside)),
         **{rate: mean(lists[rate]) for rate in (*KINDS.values(), "fall_rate", "miss_rate", "still_landing_rate")},
@@ -338,11 +334,6 @@ def distance_metrics(bins: dict[float, PlaceLog]) -> dict[str, Any]:
     values["farthest_success_m"] = largest(np.concatenate(landed))
     values |= {"bin_m": list(bins), "bin_base_at_touchdown_m": flown}
     return values | {f"bin_{name}": column for name, column in lists.items()}
-
-
-def base_at_touchdown(landings: PlaceLog) -> float | None:
-    """Return the mean distance [m] of the base from its start when the first paw comes down, over the successes."""
-    return mean(np.linalg.norm(landings.touchdown[landings.success], axis=-1))
 
 
 SUITES: tuple[type[Suite], ...] = (HeightSweep, DistanceSweep, Grid, Ring, Consecutive, Platform, Farthest)

@@ -57,7 +57,6 @@ class Suite(EvaluationArgs):
     """Jumps and rest [s] at least."""
 
     def __post_init__(self) -> None:
-        """Check the values."""
         super().__post_init__()
         jumps, rest = self.least
         check(self.jumps >= jumps, f"need at least {jumps} jump{'s' * (jumps > 1)}, got {self.jumps}")
@@ -123,7 +122,6 @@ class HeightSweep(Suite):
     least: ClassVar = (3, REST_TIME)
 
     def __post_init__(self) -> None:
-        """Check the values."""
         super().__post_init__()
         check(0.0 < self.heights[0] <= self.heights[1] < 10.0, f"heights must be in (0, 10) m, got {self.heights}")
 
@@ -178,7 +176,6 @@ class DistanceSweep(Suite):
     least: ClassVar = (3, 0.1)
 
     def __post_init__(self) -> None:
-        """Check the values."""
         super().__post_init__()
         (near, far), goals = self.distances, f"{self.distances}, {self.aside} aside"
         check(0.0 < near < far < 10.0 and 0.0 <= self.aside < 10.0, f"goals must be within 10 m and rise, got {goals}")

@@ -8,13 +8,13 @@ from typing import Any
 
 import numpy as np
 
+from jumper_warp.envs.env import Env
 from jumper_warp.evaluation.film import Film, Strip
 from jumper_warp.evaluation.log import (
     CAME_APART,
     COLLIDED,
     NO_END,
     SUCCESS,
-    EvaluationEnv,
     EvaluationLog,
     Metrics,
     failures,
@@ -75,11 +75,11 @@ class Turns(EvaluationLog):
 
     def __post_init__(self) -> None:
         """Begin with nothing done."""
-        self.turns = np.asarray(self.turns, dtype=float)
-        self.collided, self.apart = (np.zeros(len(self.turns), dtype=bool) for _ in range(2))
+        self.turns, self.count = np.asarray(self.turns, dtype=float), len(self.turns)
+        self.collided, self.apart = (np.zeros(self.count, dtype=bool) for _ in range(2))
         self.step_dt = 1.0 / 60.0
 
-    def begin(self, env: EvaluationEnv) -> None:
+    def begin(self, env: Env) -> None:
         """Let every robot float in the default pose with its turn to make."""
         self.step_dt = env.step_dt
         env.evaluation_reset(self.turns)
@@ -211,11 +211,6 @@ class TurnFlags:
         if not 0.1 <= self.seconds <= 60.0:
             raise InputError(f"seconds must be in [0.1, 60], got {self.seconds}")
 
-    @property
-    def count(self) -> int:
-        """Number of worlds."""
-        return self.turns
-
     def log(self, task: TaskCfg, seed: int) -> Turns:
         """Return the turns."""
         return Turns(turns_about_axes(self.turns, self.angle), self.tolerance, self.seconds)
@@ -232,8 +227,7 @@ class TurnGoals:
     angle: float = 90.0
     """[deg] Of every turn."""
 
-    count = len(DIRECTIONS)
-    seconds = 4.0
+    length = 4.0
 
     def __post_init__(self) -> None:
         """Raises InputError: the angle is out of range."""
@@ -242,4 +236,4 @@ class TurnGoals:
 
     def log(self, task: TaskCfg) -> Turns:
         """Return one turn a robot."""
-        return Turns(turns_about_axes(self.count, self.angle), seconds=self.seconds)
+        return Turns(turns_about_axes(len(DIRECTIONS), self.angle), seconds=self.length)

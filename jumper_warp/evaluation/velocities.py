@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 import tyro
 
+from jumper_warp.envs.env import Env
 from jumper_warp.evaluation.film import PICTURE, Film, Strip, beside
-from jumper_warp.evaluation.log import EvaluationEnv, EvaluationLog, Metrics, finite
+from jumper_warp.evaluation.log import EvaluationLog, Metrics, finite
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.rotations import INVERSE, rotate
@@ -55,20 +56,20 @@ class Walks(EvaluationLog):
 
     def __post_init__(self) -> None:
         """Begin with nobody fallen."""
-        count = len(self.commands)
-        self.end, self.fall_step = np.full(count, -1), np.zeros(count, dtype=int)
+        self.count = len(self.commands)
+        self.end, self.fall_step = np.full(self.count, -1), np.zeros(self.count, dtype=int)
         self.times = np.asarray(self.times, dtype=float)
         self.step_dt = 0.0
         falls = [not term.options["time_out"] for term in self.task.terminations]
         self._is_fall = np.array([*falls, False])
 
-    def begin(self, env: EvaluationEnv) -> None:
+    def begin(self, env: Env) -> None:
         """Stand every robot in the default pose with its first command, and the gait's clock as the task has it."""
         self.step_dt = env.step_dt
         gait = np.full((len(self.commands), 1), getattr(self.task.reset.settings, "gait", 0.0))
         env.evaluation_reset(np.concatenate([self.commands[:, 0], gait], axis=1), self.headings)
 
-    def look(self, env: EvaluationEnv) -> dict[str, np.ndarray]:
+    def look(self, env: Env) -> dict[str, np.ndarray]:
         """Return attitude and velocity of every base, give the commands that are due, and kick."""
         sim = env.sim
         q, qd = sim.joint_q(), sim.joint_qd()
@@ -137,12 +138,7 @@ class Walks(EvaluationLog):
 
     def series(self, worlds: Sequence[int]) -> dict[str, float]:
         """Return velocity and command of robots."""
-        series, wanted = {}, self.wanted()[-1]
-        for world in worlds:
-            for i, (axis, unit) in enumerate(zip(AXES, ("m/s", "m/s", "rad/s"), strict=True)):
-                series[f"{axis}/robot {world} [{unit}]"] = float(self.velocity[-1][world, i])
-                series[f"{axis}/command of {world} [{unit}]"] = float(wanted[world, i])
-        return series
+        return velocity_series(self.velocity[-1], self.wanted()[-1], worlds)
 
     def notes(self, worlds: Sequence[int]) -> dict[str, Any]:
         """Return the commands."""
@@ -166,6 +162,22 @@ def body_velocity(arrays: dict[str, np.ndarray]) -> np.ndarray:
     return np.stack([vel[:, 0], vel[:, 1], ang[:, 2]], axis=1)
 
 
+def velocity_series(velocity: np.ndarray, wanted: np.ndarray, worlds: Sequence[int]) -> dict[str, float]:
+    """Return velocities and commands, (robots, 3) each, of some robots as `EvaluationLog.series` has them."""
+    series = {}
+    for world in worlds:
+        for i, (axis, unit) in enumerate(zip(AXES, ("m/s", "m/s", "rad/s"), strict=True)):
+            series[f"{axis}/robot {world} [{unit}]"] = float(velocity[world, i])
+            series[f"{axis}/command of {world} [{unit}]"] = float(wanted[world, i])
+    return series
+
+
+def rmse_metrics(error: np.ndarray) -> Metrics:
+    """Return the root mean square of velocity errors (steps, robots, 3), without those that are NaN."""
+    names = ("rmse_vx_m_s", "rmse_vy_m_s", "rmse_yaw_rate_rad_s")
+    return dict(zip(names, finite(rms(error, axis=(0, 1))), strict=True))
+
+
 def rms(values: np.ndarray, axis: int | tuple[int, ...] | None = None) -> np.ndarray:
     """Return the root of the mean square of what is a number, NaN where nothing is."""
     known = np.isfinite(values)
@@ -176,10 +188,8 @@ def rms(values: np.ndarray, axis: int | tuple[int, ...] | None = None) -> np.nda
 
 def tracking_metrics(walks: Walks) -> Metrics:
     """Return errors over all robots and all time that counts, and how many fell."""
-    error = rms(walks.errors(), axis=(0, 1))
-    values = dict(zip(("rmse_vx_m_s", "rmse_vy_m_s", "rmse_yaw_rate_rad_s"), finite(error), strict=True))
-    robots, falls = len(walks.end), int(walks.fallen.sum())
-    metrics: Metrics = values | {"robots": robots, "falls": falls, "fall_rate": falls / robots}
+    robots, falls = walks.count, int(walks.fallen.sum())
+    metrics = rmse_metrics(walks.errors()) | {"robots": robots, "falls": falls, "fall_rate": falls / robots}
     return metrics | {f"fell_by_{name}": int((walks.outcomes == name).sum())
                       for name in sorted(set(walks.outcomes[walks.fallen]))}  # fmt: skip
 
@@ -207,11 +217,6 @@ class VelocityFlags:
         if self.per_axis < 2:
             raise InputError(f"per_axis must be at least 2, got {self.per_axis}")
 
-    @property
-    def count(self) -> int:
-        """Number of worlds."""
-        return self.per_axis**3
-
     def log(self, task: TaskCfg, seed: int) -> Walks:
         """Return walks with these commands."""
         return Walks(grid(self.per_axis, self.reach), task, self.seconds)
@@ -234,11 +239,9 @@ class VelocityGoals:
     each: float = 2.5
     """[s] From command to command."""
 
-    count = 1
-
     def __post_init__(self) -> None:
         """Raises InputError: a setting is out of range."""
-        check_walks(self.count, self.seconds, *(value for command in self.velocity for value in command))
+        check_walks(1, self.length, *(value for command in self.velocity for value in command))
 
     @property
     def velocities(self) -> tuple[Velocity, ...]:
@@ -246,14 +249,14 @@ class VelocityGoals:
         return self.velocity or self.unless_told
 
     @property
-    def seconds(self) -> float:
-        """[s] Length of the recording."""
+    def length(self) -> float:
+        """[s] Of the recording."""
         return self.each * len(self.velocities)
 
     def log(self, task: TaskCfg) -> Walks:
         """Return one robot's walk."""
         commands = np.array(self.velocities, dtype=float)[None]
-        return Walks(commands, task, self.seconds, times=self.each * np.arange(commands.shape[1]))
+        return Walks(commands, task, self.length, times=self.each * np.arange(commands.shape[1]))
 
 
 def check_walks(robots: int, seconds: float, *commands: float) -> None:

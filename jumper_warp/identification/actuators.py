@@ -11,7 +11,6 @@ with a time constant of the current loop.
 
 from __future__ import annotations
 
-import csv
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -21,6 +20,7 @@ from typing import Any, Literal
 import numpy as np
 from scipy.optimize import least_squares
 
+from jumper_warp.identification.motions import csv_rows
 from jumper_warp.identification.uncertainty import mismatch_factor
 from jumper_warp.robot.description import load_description
 from jumper_warp.robot.motors import OVERSPEED_END, OVERSPEED_START
@@ -77,11 +77,7 @@ def load_bench(path: Path) -> Bench:
 
     Raises InputError: what is wrong with it; OSError: it cannot be read.
     """
-    try:
-        with Path(path).open(newline="", encoding="utf-8") as file:
-            rows = list(csv.reader(file))
-    except (UnicodeDecodeError, csv.Error) as error:
-        raise InputError(f"{path}: expected CSV text ({error})") from None
+    rows = csv_rows(Path(path))
     names = [name.strip() for name in rows[0]] if rows else []
     missing = [name for name in COLUMNS if name not in names]
     if missing:
@@ -192,7 +188,7 @@ def characterise_motor(
     deviation = np.minimum(factor * np.sqrt(np.diag(np.linalg.inv(best.jac.T @ best.jac))), 1.0)
     found = constants(best.x)
     intervals = {
-        name: tuple(value * math.exp(side * 1.96 * p * d) for side in (-1.0, 1.0))
+        name: (value * math.exp(-1.96 * p * d), value * math.exp(1.96 * p * d))
         for (name, value), p, d in zip(found.items(), prior, deviation, strict=True)
     }
     unknown = tuple(name for name, d in zip(names, deviation, strict=True) if d > 0.5)

@@ -89,15 +89,8 @@ def descend(
     explained best by then; residuals that stand out count less (a paw that strikes 1 ms late is all wrong for a
     moment). At last all residuals count fully.
 
-    Args:
-        descent: To record the steps.
-        parameters: What is unknown.
-        motions: All, as the first stages and as the last ones take them: the physics steps may differ.
-        pieces: Motions in short pieces for a first stage; none: without.
-        knowledge: Of the robot besides the motions.
-
-    Raises:
-        InputError: the model cannot follow a motion.
+    motions: all, as the first stages and as the last ones take them: the physics steps may differ. pieces: motions in
+    short pieces for a first stage, or none. Raises InputError: the model cannot follow a motion.
     """
     replay, (rough, whole) = descent.replay, motions
     z = np.zeros(len(parameters))
@@ -105,19 +98,18 @@ def descend(
         problem = LeastSquares(parameters, pieces, replay, knowledge, robust=True)
         begin = problem.expected()
         z = descent.steps_down(problem, begin, problem.normal(begin), worth=0.1)[0].z
-    best = None
+    found = []
     for _ in range(ATTEMPTS):
         point, linearised = one_after_another(descent, parameters, rough, knowledge, z)
         final = LeastSquares(parameters, whole, replay, knowledge)
         if whole is not rough:
             linearised = final.known_at(final.residuals(point), linearised)
         point, normal = descent.steps_down(final, point, final.assemble(point, linearised))
-        if best is None or normal.cost < best[2].cost:
-            best = final, point, normal
+        found.append((final, point, normal))
         if descent.promised < STUCK * max(1.0, normal.data_cost / final.count):
             break
         z = point.z
-    return best
+    return min(found, key=lambda end: end[2].cost)
 
 
 def one_after_another(
@@ -128,7 +120,7 @@ def one_after_another(
     z: np.ndarray,
 ) -> tuple[Point, list[Linearised]]:
     """Return where all motions together lead, taken one after another from parameters z, and their Jacobians there."""
-    point, normal, taken = Point(z, []), None, []
+    point, taken, linearised = Point(z, []), [], []
     while len(taken) < len(motions):
         left = [i for i in range(len(motions)) if i not in taken]
         held = [i for i in left if not motions[i].free]
@@ -137,11 +129,12 @@ def one_after_another(
         for part in (1.0,) if held else HORIZONS:
             begun = [motions[i] for i in taken] + [motions[i].until(part) for i in new]
             problem = LeastSquares(parameters, begun, descent.replay, knowledge, robust=True)
-            normal = problem.normal(point, normal.linearised[: len(taken)] if normal else ())
+            normal = problem.normal(point, linearised[: len(taken)])
             point, normal = descent.steps_down(problem, point, normal, WORTH_A_STEP)
+            linearised = normal.linearised
         taken += new
     order = np.argsort(taken)
-    return Point(point.z, [point.starts[i] for i in order]), [normal.linearised[i] for i in order]
+    return Point(point.z, [point.starts[i] for i in order]), [linearised[i] for i in order]
 
 
 def misfit(motion: MotionResiduals, replay: Replay, z: np.ndarray) -> float:

@@ -70,19 +70,9 @@ def identify(
 ) -> Identification:
     """Return the parameters that explain the motions best.
 
-    Args:
-        motions: What was recorded.
-        parameters: What is unknown.
-        noise: Of the sensors.
-        knowledge: Of the robot besides the motions.
-        dt: Largest physics step [s], by default 1/480.
-        description: Of the nominal robot, by default the project's.
-        replay: Worlds of an earlier call, to be used again; its description counts.
-        device: Warp device.
-        threads: Of a CPU.
-
-    Raises:
-        InputError: no motions, motions with gaps, without measurements or that the model cannot follow.
+    knowledge: of the robot besides the motions. dt: largest physics step [s], by default 1/480. replay: worlds of an
+    earlier call, to be used again; its description counts. threads: of a CPU. Raises InputError: no motions, motions
+    with gaps, without measurements or that the model cannot follow.
     """
     if not motions:
         raise InputError("there must be at least one motion")
@@ -107,16 +97,13 @@ def identify_by_evolution(
     noise: NoiseLevels | None = None,
     knowledge: Sequence[Knowledge] = (),
     dt: float | None = None,
-    description: RobotDescription | None = None,
     max_seconds: float = 60.0,
     population: int = POPULATION,
     seed: int = 0,
     device: wp.DeviceLike = None,
     threads: int | None = None,
 ) -> Identification:
-    """Return what CMA-ES finds in `max_seconds`; other arguments as of `identify`.
-
-    Motions start as their first rows say.
+    """Return what CMA-ES finds in `max_seconds`, motions starting as their first rows say; see `identify`.
 
     Raises InputError: as `identify`, or `cma` is not installed.
     """
@@ -126,7 +113,7 @@ def identify_by_evolution(
         raise InputError("CMA-ES needs the package cma, which is not installed: pip install cma") from None
     if not motions or not max_seconds > 0.0 or population < 4:
         raise InputError("evolution needs motions, a time above 0 s and a population of at least 4")
-    replay = Replay(description=description, device=device, threads=threads)
+    replay = Replay(device=device, threads=threads)
     whole = [MotionResiduals(motion, parameters, noise or NoiseLevels(), replay.description, dt) for motion in motions]
     problem = LeastSquares(parameters, whole, replay, knowledge)
     point, descent = problem.expected(), Descent(replay)

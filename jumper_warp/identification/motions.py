@@ -167,7 +167,7 @@ class Motion:
             return self
         return replace(self, **{name: values[first:end] for name, values in self._arrays().items()})
 
-    def _arrays(self) -> dict[str, np.ndarray]:
+    def _arrays(self) -> dict[str, Any]:
         """Return all columns by name."""
         return {f.name: getattr(self, f.name) for f in fields(self) if isinstance(getattr(self, f.name), np.ndarray)}
 
@@ -196,22 +196,15 @@ def load_motions(data: Sequence[Path], **settings: Any) -> list[Motion]:
 def load_motion(
     path: Path, *, base: str = "", gains: str = "", torque_limit: float = 0.0, torque_constant: float = 0.0
 ) -> Motion:
-    """Return the motion of a file.
+    """Return the motion of a file; base, gains and torque_limit [N m] override its settings, see `Motion`.
 
     npz: arrays named as the fields of `Motion`, and its settings as JSON in `settings`. CSV and Parquet: columns named
     `time`, `target/FL_lateral`, `position/x`, `quaternion/w` and so on, each with its unit in brackets if it is not the
     default: `angle/FL_outer [deg]`. Settings of a table lie in a JSON file beside it of the same name, or are given.
+    torque_constant: [N m/A] of the joint's torque per current, for tables with `current` instead of `torque`.
 
-    Args:
-        path: The file.
-        base: As in `Motion`; overrides the file, as the next ones do.
-        gains: As in `Motion`.
-        torque_limit: As in `Motion` [N m].
-        torque_constant: [N m/A] Of the joint's torque per current, for tables with `current` instead of `torque`.
-
-    Raises:
-        InputError: what is missing, of another shape or unit, or not finite; the message names it.
-        OSError: the file cannot be read.
+    Raises InputError: what is missing, of another shape or unit, or not finite; the message names it. OSError: the file
+    cannot be read.
     """
     path = Path(path)
     if path.suffix not in READERS:
@@ -268,13 +261,18 @@ def parse_settings(path: Path, text: str) -> dict[str, Any]:
     return settings
 
 
-def read_csv(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-    """Return channels and settings of a CSV file. Raises InputError or OSError."""
+def csv_rows(path: Path) -> list[list[str]]:
+    """Return the cells of a CSV file. Raises InputError or OSError."""
     try:
         with path.open(newline="", encoding="utf-8") as file:
-            rows = list(csv.reader(file))
+            return list(csv.reader(file))
     except (UnicodeDecodeError, csv.Error) as error:
         raise InputError(f"{path}: expected CSV text ({error})") from None
+
+
+def read_csv(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    """Return channels and settings of a CSV file. Raises InputError or OSError."""
+    rows = csv_rows(path)
     if len(rows) < 2:
         raise InputError(f"{path}: expected a line of names and rows of numbers")
     names, columns = [name.strip() for name in rows[0]], []

@@ -11,12 +11,10 @@ from typing import Literal
 import numpy as np
 
 from jumper_warp.robot.description import MOTOR_JOINTS, RobotDescription, load_description
-from jumper_warp.robot.values import LINK_KINDS, MOTOR_QUANTITIES, PAW_FRICTION, RobotValues
+from jumper_warp.robot.values import LATERAL, LINK_KINDS, MOTOR_QUANTITIES, PAW_FRICTION, TRANSVERSAL, RobotValues
 from jumper_warp.utils.errors import InputError
 
 GROUPS = ("motors", "masses", "friction", "latency", "offsets")
-LATERAL = tuple(range(0, 12, 3))
-TRANSVERSAL = tuple(motor for motor in range(12) if motor % 3)
 BASE_ONLY = ("base_mass", "base_com", "base_inertia", "paw_friction")
 """Quantities that do not matter while the base is held and the paws hang free."""
 

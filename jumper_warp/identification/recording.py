@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import warp as wp
@@ -122,7 +122,8 @@ def replay_plan(replay: Replay, plan: Plan, robots: RobotValues, refine: int = 1
         robots, start_of(replay, plan, robots), target, rows=rest + len(rows), stride=stride, dt=period / stride,
         base=plan.base, torque_limit=plan.torque_limit,
     )  # fmt: skip
-    return Record(*(getattr(record, name)[rest:].copy() for name in list(vars(record))[:-1]), record.valid)
+    rows = {name: values[rest:].copy() for name, values in vars(record).items() if name != "valid"}
+    return Record(**rows, valid=record.valid)
 
 
 def simulate_plan(
@@ -147,14 +148,13 @@ def simulate_plan(
     found = []
     begin = sim.joint_q()[0, :7].copy()
     for row in range(len(target)):
+        q, qd = sim.joint_q()[0].copy(), sim.joint_qd()[0].copy()
         for step in range(stride):
             now = row * stride + step
             whole = math.floor(late)
             newer, older = (target[max(now - whole - i, 0) // stride] for i in (0, 1))
             aim = (1.0 - (late - whole)) * newer + (late - whole) * older
             wanted.assign(aim[:, None].astype(np.float32))
-            if step == 0:
-                q, qd = sim.joint_q()[0].copy(), sim.joint_qd()[0].copy()
             sim.physics.advance(1, wanted)
             if step == 0 and row >= rest:  # the torques are those that this step began with
                 torque = sim.torque.numpy()[:, 0]
@@ -213,7 +213,7 @@ def measured(
     """
     levels = (noise or NoiseLevels()).of_channels()
     rows = len(plan.rows)
-    values = {
+    values: dict[str, Any] = {
         "angle": record.angle[:, :, 0] + robots.offset[:1],
         "rate": record.rate[:, :, 0],
         "torque": record.torque[:, :, 0],

@@ -9,18 +9,9 @@ from typing import Literal
 import numpy as np
 import warp as wp
 
+from jumper_warp.diff.bodies import PAIRS
 from jumper_warp.diff.rollout import Rollout
-from jumper_warp.kernels.layout import (
-    ARMATURE,
-    BASE,
-    FRICTION,
-    KNEE_DAMPING,
-    LEG_ROWS,
-    MOMENT_ROWS,
-    MU_DYNAMIC,
-    MU_STATIC,
-    SPRING,
-)
+from jumper_warp.kernels import layout
 from jumper_warp.robot.description import RobotDescription, load_description
 from jumper_warp.robot.model import build_model
 from jumper_warp.robot.motors import MotorCfg
@@ -73,11 +64,7 @@ class Replay:
     """Worlds that replay motor targets: a `Rollout` for each number of worlds and physics step, made at first use."""
 
     def __init__(
-        self,
-        *,
-        description: RobotDescription | None = None,
-        device: wp.DeviceLike = None,
-        threads: int | None = None,
+        self, *, description: RobotDescription | None = None, device: wp.DeviceLike = None, threads: int | None = None
     ):
         """Prepare; threads: of a CPU."""
         self.description = load_description() if description is None else description
@@ -100,19 +87,12 @@ class Replay:
         gains: Literal["jumping", "walking"] = "jumping",
         torque_limit: float = 18.0,
     ) -> Record:
-        """Return what N worlds do.
+        """Return what N worlds do, `robots` and `starts` of each, without contact history.
 
-        Args:
-            robots: Of N worlds.
-            starts: Of N worlds, without contact history.
-            target: Motor targets [rad] of every physics step, (lead + steps, 12), held from step to step.
-            rows: To record; row 0 is the start.
-            stride: Physics steps from row to row.
-            dt: Physics step [s].
-            lead: Steps of `target` before the start; a latency asks for them.
-            base: "fixed" holds the base where it starts.
-            gains: Of the description, which the ratios of `robots` scale.
-            torque_limit: [N m] Likewise.
+        target: motor targets [rad] of every physics step of dt [s], (lead + steps, 12), held from step to step; a
+        latency asks for `lead` steps before the start. rows: to record, `stride` physics steps apart; row 0 is the
+        start. base: "fixed" holds the base where it starts. gains, torque_limit [N m]: of the description, which the
+        ratios of `robots` scale.
         """
         count, steps = len(starts.angle), (rows - 1) * stride + 1  # the last row's torques take one more step
         rollout, nominal = self._rollout(count, dt)
@@ -174,19 +154,18 @@ def parameter_table(nominal: np.ndarray, robots: RobotValues) -> np.ndarray:
     """Return the parameter table of N robots, (321, N); nominal: of the described one, (321, 1)."""
     table = np.repeat(nominal, len(robots.base_mass), axis=1)
     mass, com = robots.base_mass[:, 0], robots.base_com.T
-    old_mass, old_first = table[BASE], table[BASE + 1 : BASE + 4]
-    pairs = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
-    for row, (i, j) in enumerate(pairs, int(BASE) + 4):
+    old_mass, old_first = table[layout.BASE], table[layout.BASE + 1 : layout.BASE + 4]
+    for row, (i, j) in enumerate(PAIRS, int(layout.BASE) + 4):
         central = table[row] - old_first[i] * old_first[j] / old_mass
         table[row] = central * robots.base_inertia[:, 0] * mass / old_mass + mass * com[i] * com[j]
-    table[BASE], table[BASE + 1 : BASE + 4] = mass, mass * com
+    table[layout.BASE], table[layout.BASE + 1 : layout.BASE + 4] = mass, mass * com
     for leg in range(4):
-        rows, motors = table[leg * int(LEG_ROWS) : (leg + 1) * int(LEG_ROWS)], slice(3 * leg, 3 * leg + 3)
+        rows, motors = table[leg * int(layout.LEG_ROWS) : (leg + 1) * int(layout.LEG_ROWS)], slice(3 * leg, 3 * leg + 3)
         for link in range(len(LINK_KINDS)):
-            rows[link * MOMENT_ROWS : (link + 1) * MOMENT_ROWS] *= robots.link_mass[:, link]
-        rows[ARMATURE : ARMATURE + 3] = robots.armature[:, motors].T
-        rows[FRICTION : FRICTION + 3] = robots.motor_friction[:, motors].T
-        rows[KNEE_DAMPING : KNEE_DAMPING + 2] = robots.knee_damping[:, 0]
-        rows[[MU_DYNAMIC, MU_STATIC]] = robots.paw_friction[:, 0]
-        rows[SPRING], rows[SPRING + 1] = robots.spring_stiffness[:, 0], robots.spring_length[:, 0]
+            rows[link * layout.MOMENT_ROWS : (link + 1) * layout.MOMENT_ROWS] *= robots.link_mass[:, link]
+        rows[layout.ARMATURE : layout.ARMATURE + 3] = robots.armature[:, motors].T
+        rows[layout.FRICTION : layout.FRICTION + 3] = robots.motor_friction[:, motors].T
+        rows[layout.KNEE_DAMPING : layout.KNEE_DAMPING + 2] = robots.knee_damping[:, 0]
+        rows[[layout.MU_DYNAMIC, layout.MU_STATIC]] = robots.paw_friction[:, 0]
+        rows[layout.SPRING], rows[layout.SPRING + 1] = robots.spring_stiffness[:, 0], robots.spring_length[:, 0]
     return table

@@ -59,7 +59,7 @@ def to_json(found: Identification) -> dict[str, Any]:
         "wall_s": found.seconds,
         "cpu_s": found.cpu_seconds,
         "world_steps": found.world_steps,
-        "fits": [{name: value for name, value in vars(fit).items()} for fit in found.fits],
+        "fits": [vars(fit) for fit in found.fits],
         "open_directions": [
             {"information": d.information, "words": d.words, "weights": dict(d.weights)} for d in found.directions
         ],
@@ -119,6 +119,14 @@ def open_directions(found: Identification) -> str:
     return f"<h2>What the data leaves open</h2><ul>{lines}</ul>"
 
 
+def table(heads: Sequence[str], rows: Sequence[tuple[str, Sequence[str]]]) -> str:
+    """Return a table; rows: class, or nothing, and cells of each."""
+    text = "<table><tr>" + "".join(f"<th>{head}</th>" for head in heads) + "</tr>"
+    for kind, cells in rows:
+        text += f"<tr{kind and ' class='}{kind}>" + "".join(f"<td>{html.escape(cell)}</td>" for cell in cells) + "</tr>"
+    return text + "</table>"
+
+
 def parameter_table(found: Identification) -> str:
     """Return all parameters with their intervals."""
     rows = []
@@ -126,10 +134,9 @@ def parameter_table(found: Identification) -> str:
         found.parameters, found.values, found.intervals, found.identified, strict=True
     ):
         cells = (parameter.name, parameter.unit, *(f"{x:.5g}" for x in (parameter.nominal, value, low, high)))
-        kind = "" if sure else " class=open"
-        rows.append(f"<tr{kind}>" + "".join(f"<td>{html.escape(cell)}</td>" for cell in cells) + "</tr>")
-    heads = "".join(f"<th>{name}</th>" for name in ("parameter", "unit", "described", "found", "from", "to (95 %)"))
-    return f"<table><tr>{heads}</tr>{''.join(rows)}</table><p class=open>Grey: the prior says more than the data.</p>"
+        rows.append(("" if sure else "open", cells))
+    heads = ("parameter", "unit", "described", "found", "from", "to (95 %)")
+    return table(heads, rows) + "<p class=open>Grey: the prior says more than the data.</p>"
 
 
 def fit_table(found: Identification) -> str:
@@ -137,16 +144,9 @@ def fit_table(found: Identification) -> str:
     rows = []
     for fit in found.fits:
         unit, factor = UNITS[fit.channel]
-        cells = (
-            fit.motion,
-            fit.channel,
-            f"{fit.nominal_chi2:.4g}",
-            f"{fit.chi2:.3f}",
-            f"{factor * fit.rms:.3g} {unit}",
-        )
-        rows.append("<tr>" + "".join(f"<td>{html.escape(cell)}</td>" for cell in cells) + "</tr>")
-    heads = "".join(f"<th>{name}</th>" for name in ("motion", "channel", "described χ²", "found χ²", "rms error"))
-    return f"<table><tr>{heads}</tr>{''.join(rows)}</table>"
+        values = (f"{fit.nominal_chi2:.4g}", f"{fit.chi2:.3f}", f"{factor * fit.rms:.3g} {unit}")
+        rows.append(("", (fit.motion, fit.channel, *values)))
+    return table(("motion", "channel", "described χ²", "found χ²", "rms error"), rows)
 
 
 def image(figure: Any) -> str:

@@ -210,7 +210,7 @@ class MotionResiduals:
             if name == "orientation":
                 found = np.moveaxis(at_rows(record.quaternion), 1, 2)
                 found = found / np.linalg.norm(found, axis=-1, keepdims=True)
-                known = np.nan_to_num(self.motion.quaternion) + np.array([0.0, 0.0, 0.0, 1.0e-12])
+                known = np.nan_to_num(np.asarray(self.motion.quaternion)) + np.array([0.0, 0.0, 0.0, 1.0e-12])
                 known = known / np.linalg.norm(known, axis=-1, keepdims=True) * INVERSE
                 columns.append(np.moveaxis(to_vector(multiply(found, known[:, None])), 1, 2))
             else:

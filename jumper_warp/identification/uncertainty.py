@@ -138,7 +138,7 @@ def in_words(parameters: ParameterSet, vector: np.ndarray) -> str:
     shares: dict[str, float] = {}
     for parameter, component in zip(parameters, vector, strict=True):
         shares[parameter.quantity] = shares.get(parameter.quantity, 0.0) + float(component) ** 2
-    quantities = sorted(shares, key=shares.get, reverse=True)
+    quantities = sorted(shares, key=shares.__getitem__, reverse=True)
     quantities = [quantity for quantity in quantities if shares[quantity] > 0.15][:3] or quantities[:1]
     who = members(parameters.parameters, vector, quantities[0])
     what = " and ".join(plain(quantity) for quantity in quantities)

@@ -17,13 +17,9 @@ def blend(policy: Policy, other: Policy, share: float) -> Policy:
     The other's first layer is written for that normaliser before. The configuration tells the share, and commit and
     iteration of the other, as `blended`.
 
-    Args:
-        policy: What the blend is with share 0.
-        other: What it is with share 1, within the limits of normalised observations.
-        share: From 0 to 1.
-
-    Raises:
-        PolicyError: They do not read and drive the same by networks of the same form, or the share is out of range.
+    policy: what the blend is with share 0. other: what it is with share 1, within the limits of normalised
+    observations. share: from 0 to 1.
+    Raises PolicyError: they do not read and drive the same by networks of the same form, or the share is out of range.
     """
     if not 0.0 <= share <= 1.0:
         raise PolicyError(f"the share of a blend must be from 0 to 1, got {share}")

@@ -9,8 +9,7 @@ from types import ModuleType
 from typing import TYPE_CHECKING, Any, Literal
 
 from jumper_warp.policies.policy import Policy
-from jumper_warp.policies.restore import restored_task
-from jumper_warp.policies.spec import PolicyError
+from jumper_warp.policies.restore import task_of_policy
 from jumper_warp.robot.gravity import check_gravity
 from jumper_warp.robot.model import PHYSICS_DT
 from jumper_warp.robot.overlay import RobotOverlay, load_overlay
@@ -120,23 +119,14 @@ def env_of_policy(
     Without rewards, without what the critic sees, and unless randomised without events: so their functions need not be
     found, and are not run.
 
-    Args:
-        policy: Its configuration tells the task.
-        num_envs: Number of worlds.
-        conditions: Physics, randomisation and noise.
-        change: Returns the task that is wanted instead.
-        modules: That the user has named, for tasks that are not the project's.
-        scene: More settings of `Env`, such as its ground.
-
-    Raises:
-        PolicyError: This version of the project cannot rebuild it, or its observation is not the policy's.
+    policy: names the task in its configuration. change: returns the task that is wanted instead. modules: that the user
+    has named, for tasks that are not the project's. scene: more settings of `Env`, such as its ground.
+    Raises PolicyError: this version of the project cannot rebuild it, or its observation is not the policy's.
     """
     from jumper_warp.envs.env import Env
 
     leave_out = [section for section in OPTIONAL if section != "events" or not conditions.randomize]
-    task = restored_task(policy.config, modules, leave_out=leave_out)
-    if task.observation_names != policy.interface.observation_names:
-        raise PolicyError("the policy's observation is not the one that this version of its task gives")
+    task = task_of_policy(policy, modules, leave_out=leave_out)
     return Env(
         conditions.applied(task if change is None else change(task)),
         num_envs,

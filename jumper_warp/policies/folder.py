@@ -25,8 +25,8 @@ from jumper_warp.policies.policy import Policy
 from jumper_warp.policies.spec import PolicyError, PolicyInterface
 from jumper_warp.utils.assets import ASSETS
 from jumper_warp.utils.checks import version_refusal
-from jumper_warp.utils.files import write_whole
-from jumper_warp.utils.runtime import git_commit, versions
+from jumper_warp.utils.files import json_bytes, write_whole
+from jumper_warp.utils.runtime import source_versions
 
 POLICIES = ASSETS / "policies"
 """Where the project's own policies lie."""
@@ -53,26 +53,19 @@ def save_policy(
 ) -> Path:
     """Write a policy's folder, whole or not at all; return its path.
 
-    Args:
-        folder: Where to; its parent is made if need be.
-        policy: What to save. Commit and versions are added to its configuration unless it brings its own.
-        readme: Text of `README.md`; by default a few lines on what the folder holds.
-        files: More files by name, such as a learning curve.
-        overwrite: Whether a policy that is there already is replaced, with all its files.
-
-    Raises:
-        PolicyError: The folder exists and is not to be overwritten, or is no policy's; or a name is malformed.
+    Commit and versions are added to the policy's configuration unless it brings its own. readme: text of `README.md`,
+    by default a few lines on what the folder holds. files: more files by name, such as a learning curve. overwrite:
+    whether a policy that is there already is replaced, with all its files.
+    Raises PolicyError: the folder exists and is not to be overwritten, or is no policy's; or a name is malformed.
     """
     folder = checked_folder(folder)
     if folder.exists() and not (overwrite and (folder / MANIFEST).is_file()):
         raise PolicyError(f"{folder} exists" + ("" if not overwrite else " and is no policy's"))
-    commit = git_commit()
-    origin = {"commit": commit.hash if commit else None, "dirty": commit.dirty if commit else None}
-    config = {**origin, "versions": versions(), **policy.config}
+    config = {**source_versions(), **policy.config}
     config |= {"schema_version": SCHEMA_VERSION, "interface": policy.interface.to_json()}
     content = {
         **(files or {}),
-        CONFIG: _json_bytes(config),
+        CONFIG: json_bytes(config),
         ONNX: onnx_bytes(policy, config),
         README: (readme or default_readme(policy)).encode(),
     }
@@ -99,10 +92,9 @@ def checked_folder(folder: Path) -> Path:
 
 
 def add_files(folder: Path, files: Mapping[str, bytes]) -> None:
-    """Add or replace files of a policy, such as its figures. The rest of the folder is checked first.
+    """Add or replace files of a policy, such as its plots. The rest of the folder is checked first.
 
-    Raises:
-        PolicyError: The folder is not a whole policy, or a name is malformed or one of the policy's own.
+    Raises PolicyError: the folder is not a whole policy, or a name is malformed or one of the policy's own.
     """
     folder = Path(folder)
     sums = _checked_sums(folder)
@@ -119,7 +111,7 @@ def _write(folder: Path, files: Mapping[str, bytes], sums: Mapping[str, str]) ->
             raise PolicyError(f"a policy cannot hold a file named {name!r:.60}")
     sums = {**sums, **{name: hashlib.sha256(data).hexdigest() for name, data in files.items() if name != README}}
     manifest = {"format": FORMAT, "schema_version": SCHEMA_VERSION, "sha256": dict(sorted(sums.items()))}
-    for name, data in {**files, MANIFEST: _json_bytes(manifest)}.items():
+    for name, data in {**files, MANIFEST: json_bytes(manifest)}.items():
         write_whole(folder / name, data)
 
 
@@ -129,10 +121,9 @@ def list_policies() -> tuple[str, ...]:
 
 
 def find_policy(name: str | Path) -> Path:
-    """Return the folder of one of the project's policies by name (- for _ will do), or a policy's folder as it is.
+    """Return the folder of one of the project's policies by name (- for _ will do), or a policy's folder.
 
-    Raises:
-        PolicyError: There is none.
+    Raises PolicyError: there is none.
     """
     text = str(name)
     own = POLICIES / text.replace("-", "_")
@@ -146,9 +137,8 @@ def find_policy(name: str | Path) -> Path:
 def load_policy(name: str | Path, device: str | torch.device = "cpu") -> Policy:
     """Return a policy by name or folder, with every file checked. See `find_policy`.
 
-    Raises:
-        PolicyError: The policy is missing, truncated, altered, of another version, or its weights are not finite or
-            not of the shape that its configuration asks for.
+    Raises PolicyError: the policy is missing, truncated, altered, of another version, or its weights are not finite or
+    not of the shape that its configuration asks for.
     """
     folder = find_policy(name)
     sums = _checked_sums(folder)
@@ -206,16 +196,12 @@ def _bytes(path: Path) -> bytes:
 def _json(path: Path, data: bytes) -> dict[str, Any]:
     try:
         content = json.loads(data)
-        _json_bytes(content)  # neither NaN nor half a character, which could not be written again
+        json_bytes(content)  # neither NaN nor half a character, which could not be written again
     except (ValueError, RecursionError) as error:
         raise PolicyError(f"{path}: not JSON ({type(error).__name__})") from error
     if not isinstance(content, dict):
         raise PolicyError(f"{path}: not a JSON object")
     return content
-
-
-def _json_bytes(content: Mapping[str, Any]) -> bytes:
-    return (json.dumps(content, indent=2, ensure_ascii=False, allow_nan=False) + "\n").encode()
 
 
 def default_readme(policy: Policy) -> str:

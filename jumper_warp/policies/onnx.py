@@ -142,9 +142,8 @@ def policy_of_onnx(data: bytes, interface: PolicyInterface, config: Mapping[str,
 
     interface, config: those of the policy, from elsewhere; the graph and the metadata of the file must be of these.
 
-    Raises:
-        PolicyError: The file is damaged, its weights are not those of a usable policy of the interface, or its graph,
-            its opset or its metadata differ from what `onnx_model` makes of them.
+    Raises PolicyError: the file is damaged, its weights are not those of a usable policy of the interface, or its
+    graph, its opset or its metadata differ from what `onnx_model` makes of them.
     """
     model = onnx.ModelProto()
     try:
@@ -164,7 +163,7 @@ def _tensors(initialisers: Iterable[TensorProto]) -> dict[str, torch.Tensor]:
     """Return the normaliser and the layers that initialisers hold, by their names in a policy."""
     found = {}
     for stored in initialisers:
-        layer = LAYER.fullmatch(stored.name)
+        layer = LAYER.fullmatch(str(stored.name))  # protobuf gives bytes where a name is no UTF-8
         if layer is None and stored.name not in STORED:
             continue
         name = STORED[stored.name] if layer is None else f"actor.{layer[1]}.{layer[2]}"

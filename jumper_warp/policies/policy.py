@@ -2,30 +2,31 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import torch
 from torch import nn
 
 from jumper_warp.policies.spec import PolicyError, PolicyInterface
+from jumper_warp.rl.mirror import Weights
+from jumper_warp.rl.networks import ACTIVATIONS, weights_of
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.normalise import normalise
 
-ACTIVATION_MODULES = {"elu": nn.ELU, "relu": nn.ReLU, "tanh": nn.Tanh}
-
 LARGEST = 1.0e38
 """Below the largest number of single precision."""
-
-Layers = Sequence[tuple[torch.Tensor, torch.Tensor]]
 
 
 class Policy(nn.Module):
     """The actor with its normaliser. `act` is the whole way from raw observations to actions."""
 
+    mean: torch.Tensor
+    std: torch.Tensor
+
     def __init__(
         self,
-        layers: Layers,
+        layers: Weights,
         mean: torch.Tensor,
         std: torch.Tensor,
         interface: PolicyInterface,
@@ -33,16 +34,10 @@ class Policy(nn.Module):
     ) -> None:
         """Copy the tensors, as float32.
 
-        Args:
-            layers: Weight (out, in) and bias (out,) of each layer, first to last.
-            mean: (num_obs,) of the raw observations.
-            std: (num_obs,) what observations are divided by.
-            interface: What the policy reads and drives.
-            config: Whatever else made it, as JSON holds it: environment, training.
-
-        Raises:
-            PolicyError: A tensor has another shape than the interface asks for, is not finite or so large that an
-                action would not be, or std is not positive.
+        mean, std: (num_obs,) what is subtracted from raw observations, and what they are divided by. config: what else
+        made the policy, as JSON holds it: environment, training.
+        Raises PolicyError: a tensor has another shape than the interface asks for, is not finite or so large that an
+        action would not be, or std is not positive.
         """
         super().__init__()
         self.interface = interface
@@ -61,26 +56,13 @@ class Policy(nn.Module):
             linear.weight.data, linear.bias.data = weight, tensors[f"actor.{i}.bias"]
             self.actor.append(linear)
             if i < len(layers) - 1:
-                self.actor.append(ACTIVATION_MODULES[interface.activation]())
+                self.actor.append(ACTIVATIONS[interface.activation]())
         self.requires_grad_(False)
 
-    @classmethod
-    def from_actor(
-        cls,
-        actor: nn.Sequential,
-        mean: torch.Tensor,
-        std: torch.Tensor,
-        interface: PolicyInterface,
-        config: Mapping[str, Any] | None = None,
-    ) -> Policy:
-        """Return the policy of a trained actor: linear layers with the interface's activation between."""
-        layers = [(module.weight, module.bias) for module in actor if isinstance(module, nn.Linear)]
-        return cls(layers, mean, std, interface, config)
-
     @property
-    def layers(self) -> list[tuple[torch.Tensor, torch.Tensor]]:
+    def layers(self) -> Weights:
         """Weight and bias of each layer."""
-        return [(module.weight, module.bias) for module in self.actor if isinstance(module, nn.Linear)]
+        return weights_of(self.actor)
 
     def tensors(self) -> dict[str, torch.Tensor]:
         """Return all tensors by the names that they are saved under, on the CPU."""
@@ -97,8 +79,7 @@ class Policy(nn.Module):
 
         obs: (..., num_obs), a tensor on the policy's device, of any kind of numbers.
 
-        Raises:
-            ValueError: No tensor, or the last axis has another size than the policy's observation.
+        Raises ValueError: no tensor, or the last axis has another size than the policy's observation.
         """
         if not isinstance(obs, torch.Tensor):
             raise InputError(f"the policy reads a torch tensor, got {type(obs).__name__}: torch.as_tensor makes one")

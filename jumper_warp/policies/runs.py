@@ -44,20 +44,15 @@ def is_run(source: str | Path) -> bool:
 def open_policy(source: str | Path, *, newest: bool = False) -> Policy:
     """Return a policy by name or folder, or that of a run's best (or newest) checkpoint or of a checkpoint.
 
-    Raises:
-        PolicyError: There is none, or it cannot be used.
-        CheckpointError: The checkpoint cannot be used.
+    Raises PolicyError or CheckpointError: there is none, or it cannot be used.
     """
     if not is_run(source):
         return load_policy(source)
-    source = Path(source)
-    if source.suffix == ".pt":
-        return _policy_of_checkpoint(source, load_checkpoint(source))
-    folder = source / CHECKPOINTS
-    if newest:
-        path, state, _ = latest_checkpoint(folder)
-        return _policy_of_checkpoint(path, state)
-    path = best_checkpoint(folder)
+    path = Path(source)
+    if path.suffix != ".pt" and newest:
+        newest_checkpoint = latest_checkpoint(path / CHECKPOINTS)
+        return _policy_of_checkpoint(newest_checkpoint.path, newest_checkpoint.state)
+    path = path if path.suffix == ".pt" else best_checkpoint(path / CHECKPOINTS)
     return _policy_of_checkpoint(path, load_checkpoint(path))
 
 
@@ -80,16 +75,14 @@ def _policy_of_checkpoint(path: Path, state: dict[str, Any]) -> Policy:
         commit = config.get("commit") or {"hash": None, "dirty": None}
         config |= {"commit": commit["hash"], "dirty": commit["dirty"], "iteration": state["iteration"]}
         described = {**env["interface"], "observation_limit": RAW_LIMIT, "normalised_limit": NORMALISED_LIMIT}
+        return Policy(layers, mean, std, make_interface(described, **times, **shape), config)
     except TaskError as error:
         raise CheckpointError(f"{path}: {error}") from error
-    except DAMAGE as error:
-        raise _no_training(path, error) from error
-    try:
-        return Policy(layers, mean, std, make_interface(described, **times, **shape), config)
     except PolicyError as error:
         raise PolicyError(f"{path}: {error}") from error
     except DAMAGE as error:
-        raise _no_training(path, error) from error
+        said = f"not of a training of this project ({type(error).__name__}: {one_line(error)})"
+        raise CheckpointError(f"{path}: {said}") from error
 
 
 def _symmetry(model: dict[str, torch.Tensor]) -> Symmetry | None:
@@ -98,10 +91,6 @@ def _symmetry(model: dict[str, torch.Tensor]) -> Symmetry | None:
         return None
     parts = ((model[f"mirror_{name}_order"], model[f"mirror_{name}_signs"], name) for name in Symmetry._fields)
     return Symmetry(*(image(*part) for part in parts))
-
-
-def _no_training(path: Path, error: Exception) -> CheckpointError:
-    return CheckpointError(f"{path}: not of a training of this project ({type(error).__name__}: {one_line(error)})")
 
 
 def learning_curve(source: Path) -> bytes | None:

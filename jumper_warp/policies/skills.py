@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import torch
 
 from jumper_warp.policies.conditions import Conditions
-from jumper_warp.policies.policy import Policy
-from jumper_warp.policies.restore import restored_task
+from jumper_warp.policies.restore import task_of_policy
 from jumper_warp.policies.runs import open_policy
 from jumper_warp.policies.spec import PolicyError
 from jumper_warp.tasks.cfg import Handover, TaskCfg
@@ -44,20 +42,13 @@ class SkillPolicies:
         self.names = SkillNames() if names is None else names
         sources = (self.names.walk, self.names.jump_up, self.names.jump_to)
         self.policies = [open_policy(source) for source in sources]
-        self.tasks = [self._task(policy, source) for policy, source in zip(self.policies, sources, strict=True)]
+        self.tasks = [task_of_policy(policy) for policy in self.policies]
         for task, kinds in zip(self.tasks, (("velocity",), ("height",), ("place", "around")), strict=True):
             if task.evaluation not in kinds:
                 raise PolicyError(
                     f"this needs a policy that is evaluated by {' or '.join(kinds)}, got one of {task.name}"
                 )
         self.skills, self.handovers = self._in(Conditions())
-
-    @staticmethod
-    def _task(policy: Policy, source: str | Path) -> TaskCfg:
-        task = restored_task(policy.config)
-        if task.observation_names != policy.interface.observation_names:
-            raise PolicyError(f"{source}: its observation is not the one that this version of its task gives")
-        return task
 
     def _in(self, conditions: Conditions) -> tuple[list[TaskCfg], list[Handover]]:
         """Return the tasks in some conditions and their handovers. Raises PolicyError: these are no such tasks."""

@@ -4,17 +4,15 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import re
 from dataclasses import dataclass, field
 from typing import Any, get_type_hints
 
+from jumper_warp.rl.cfg import ACTIVATIONS
+from jumper_warp.utils.checks import NAME
 from jumper_warp.utils.errors import InputError
 
-ACTIVATIONS = ("elu", "relu", "tanh")
 MAX_HIDDEN = 64
 """Most hidden layers."""
-NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_. -]{0,99}")
-"""Of a task, an entry of the observation, or a joint: lists of them are joined by commas, and name files."""
 TURN = 2.0 * math.pi
 PER_JOINT = {
     "action_scale": (-TURN, TURN),  # [rad]

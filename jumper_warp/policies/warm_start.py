@@ -25,10 +25,8 @@ def start_from(source: str | Path, task: TaskCfg, cfg: PpoCfg) -> Start:
 
     Scales of actions, gains, torques, times and all that the environment does may be others than the policy's own.
 
-    Raises:
-        PolicyError: There is no such policy, or it cannot be used.
-        CheckpointError: The checkpoint cannot be used.
-        InputError: Its observation or its joints are not the task's, or as `make_start`.
+    Raises PolicyError or CheckpointError: there is no such policy, or it cannot be used. Raises InputError: its
+    observation or its joints are not the task's, or as `make_start`.
     """
     policy = open_policy(source)
     check_interface(policy.interface, interface(task))
@@ -53,12 +51,13 @@ def _compared(face: PolicyInterface, described: dict[str, Any]) -> Iterator[tupl
     """Yield what has to agree, of the policy and of the task."""
     for what, name in (("observation", "observation_names"), ("action", "joint_names")):
         for column, pair in enumerate(zip_longest(getattr(face, name), described[name], fillvalue="none")):
-            yield f"{what} {column}", *pair
+            yield f"{what} {column}", pair[0], pair[1]
     layout = described["observation_layout"]
     for name, term in face.observation_layout.items():  # none if they are not known
         for key, own in term.items():
             yield f"{key} of {name}", own, layout.get(name, {}).get(key, "none")
-    for joint, *pair in zip(face.joint_names, face.default_joint_pos, described["default_joint_pos"], strict=True):
-        yield f"default angle [rad] of {joint}", *(round(angle, 6) for angle in pair)
+    angles = zip(face.joint_names, face.default_joint_pos, described["default_joint_pos"], strict=True)
+    for joint, own, other in angles:
+        yield f"default angle [rad] of {joint}", round(own, 6), round(other, 6)
     yield "limit of observations", face.observation_limit, RAW_LIMIT
     yield "limit of observations in standard deviations", face.normalised_limit, NORMALISED_LIMIT

@@ -16,13 +16,10 @@ EPS = 1.0e-8
 """Added to the root of the mean squared gradient."""
 
 
-def adapted_lr(
-    lr: torch.Tensor, kl: torch.Tensor, cfg: PpoCfg, desired_kl: torch.Tensor | float | None = None
-) -> torch.Tensor:
+def adapted_lr(lr: torch.Tensor, kl: torch.Tensor, cfg: PpoCfg, desired_kl: torch.Tensor | float) -> torch.Tensor:
     """Return the step size after a divergence: 1.5 times smaller above twice the desired one, larger below half."""
     if cfg.desired_kl <= 0.0:
         return lr
-    desired_kl = cfg.desired_kl if desired_kl is None else desired_kl
     slower = torch.where(kl > 2.0 * desired_kl, (lr / 1.5).clamp(min=cfg.min_lr), lr)
     too_slow = (kl < 0.5 * desired_kl) & (kl > 0.0)
     return torch.where(too_slow, (lr * 1.5).clamp(max=cfg.max_lr), slower)
@@ -75,10 +72,9 @@ class FlatAdam:
 
 
 def clip_gradient(gradient: torch.Tensor, actor_size: int, size: int, most: float) -> torch.Tensor:
-    """Shorten the parts of actor and critic to the norm `most`, in place; a non-finite part becomes zero.
+    """Shorten the parts of actor and critic to the norm `most`, in place; return their norms before, (2,).
 
-    Returns:
-        (2,) their norms before.
+    A non-finite part becomes zero.
     """
     parts = (gradient[:actor_size], gradient[actor_size:size])
     norms = torch.stack([torch.linalg.vector_norm(part) for part in parts])
@@ -104,10 +100,9 @@ def adam_step(vectors: AdamVectors) -> None:
 def descend(
     vectors: AdamVectors, actor_size: int, desired_kl: torch.Tensor, cfg: PpoCfg
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Make a step along the gradient that is there, whose last number is the divergence, see `FlatParameters`.
+    """Make a step along the gradient, whose last number is the divergence, see `FlatParameters`.
 
-    Returns:
-        The divergence (), and the norms (2,) of the actor's and the critic's gradient before clipping.
+    Return the divergence (), and the norms (2,) of the actor's and the critic's gradient before clipping.
     """
     kl = vectors.gradient[-1].clone()
     norms = clip_gradient(vectors.gradient, actor_size, vectors.value.shape[0], cfg.max_grad_norm)

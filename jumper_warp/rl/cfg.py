@@ -102,8 +102,7 @@ class PpoCfg:
     def batch_size(self, num_envs: int) -> int:
         """Return the samples that num_envs worlds give in an iteration.
 
-        Raises:
-            ValueError: There is only one, which has no standard deviation, or the minibatches do not divide them.
+        Raises ValueError: there is only one, which has no standard deviation, or the minibatches do not divide them.
         """
         size = self.num_steps * num_envs
         if size < 2:

@@ -38,14 +38,9 @@ class Checkpoint(NamedTuple):
 def save_checkpoint(folder: Path, state: dict[str, Any], score: float | None = None, keep: int = 3) -> Path:
     """Save tensors, numbers and strings as `iteration_XXXXXX.pt`, and return its path.
 
-    Args:
-        folder: Made if need be.
-        state: Has at least the keys of REQUIRED.
-        score: The higher, the better, NaN is none; the best checkpoint is never removed.
-        keep: How many of the last saved stay, at least 1.
-
-    Raises:
-        OSError: The disk is full or the folder cannot be written.
+    folder: made if need be. state: has at least the keys of REQUIRED. score: the higher, the better, NaN is none; the
+    best checkpoint is never removed. keep: how many of the last saved stay, at least 1.
+    Raises OSError: the disk is full or the folder cannot be written.
     """
     folder.mkdir(parents=True, exist_ok=True)
     buffer = io.BytesIO()
@@ -55,14 +50,10 @@ def save_checkpoint(folder: Path, state: dict[str, Any], score: float | None = N
     write_whole(path, data)
     manifest = _read_manifest(folder, missing_ok=True)
     manifest.pop(path.name, None)  # the order is that of saving
-    manifest[path.name] = {
-        "sha256": hashlib.sha256(data).hexdigest(),
-        "iteration": state["iteration"],
-        "score": score,
-    }
-    newest = list(manifest)[-keep:]
-    best = _best(manifest)
-    old = [name for name in manifest if name not in newest and name != best]
+    digest = hashlib.sha256(data).hexdigest()
+    manifest[path.name] = {"sha256": digest, "iteration": state["iteration"], "score": score}
+    kept = [*list(manifest)[-keep:], _best(manifest)]
+    old = [name for name in manifest if name not in kept]
     for name in old:
         del manifest[name]
     write_whole(folder / MANIFEST, json.dumps(manifest, indent=1).encode())
@@ -74,9 +65,8 @@ def save_checkpoint(folder: Path, state: dict[str, Any], score: float | None = N
 def load_checkpoint(path: Path) -> dict[str, Any]:
     """Return what was saved, on the CPU.
 
-    Raises:
-        CheckpointError: The file is missing, has no checksum, differs from it, or is no checkpoint; or its iteration
-            is not the one of the manifest.
+    Raises CheckpointError: the file is missing, has no checksum, differs from it, or is no checkpoint; or its iteration
+    is not the one of the manifest.
     """
     entry = _read_manifest(path.parent).get(path.name)
     if not path.is_file():
@@ -93,8 +83,7 @@ def load_checkpoint(path: Path) -> dict[str, Any]:
         state = torch.load(io.BytesIO(data), map_location="cpu", weights_only=True)
     except Exception as error:  # a damaged pickle raises anything
         raise CheckpointError(f"{path}: not readable as tensors: {one_line(error)}") from error
-    missing = [key for key in REQUIRED if not isinstance(state, dict) or key not in state]
-    if missing:
+    if missing := [key for key in REQUIRED if not isinstance(state, dict) or key not in state]:
         raise CheckpointError(f"{path}: lacks {', '.join(missing)}")
     for key, kind in REQUIRED.items():
         if type(state[key]) is not kind:
@@ -112,8 +101,7 @@ def one_line(error: Exception) -> str:
 def latest_checkpoint(folder: Path) -> Checkpoint:
     """Return the last saved usable checkpoint.
 
-    Raises:
-        CheckpointError: None is usable.
+    Raises CheckpointError: none is usable.
     """
     manifest = _read_manifest(folder)
     refusals: list[str] = []
@@ -128,8 +116,7 @@ def latest_checkpoint(folder: Path) -> Checkpoint:
 def best_checkpoint(folder: Path) -> Path:
     """Return the path of the checkpoint with the highest score, or of the last saved if none has one.
 
-    Raises:
-        CheckpointError: There is none.
+    Raises CheckpointError: there is none.
     """
     manifest = _read_manifest(folder)
     if not manifest:
@@ -148,13 +135,12 @@ def _read_manifest(folder: Path, missing_ok: bool = False) -> dict[str, dict[str
         return {}
     try:
         manifest = json.loads(path.read_text())
-        complete = all(_is_entry(entry) for entry in manifest.values())
+        if not all(_is_entry(entry) for entry in manifest.values()):
+            raise ValueError("incomplete")
     except OSError as error:
         raise CheckpointError(f"{path}: {error.strerror}") from error
     except (ValueError, AttributeError, RecursionError) as error:
         raise CheckpointError(f"{path}: not readable") from error
-    if not complete:
-        raise CheckpointError(f"{path}: not readable")
     return manifest
 
 

@@ -48,7 +48,7 @@ class Compiler:
         return call
 
 
-def _options() -> dict[str, bool] | None:
+def _options() -> dict[str, str | int | bool | Callable[..., Any]] | None:
     """Return options of Inductor: it may not choose by time between kernels that add up in another order."""
     if BACKEND != "inductor":
         return None

@@ -27,28 +27,24 @@ def wait_for_ranks() -> None:
         torch.distributed.barrier()
 
 
+def largest_over_ranks(values: list[int]) -> list[int]:
+    """Return the largest of each number over all processes; each waits for the others."""
+    if world_size() == 1:
+        return values
+    vector = torch.tensor(values, device="cuda" if torch.distributed.get_backend() == "nccl" else "cpu")
+    torch.distributed.all_reduce(vector, op=torch.distributed.ReduceOp.MAX)
+    return vector.tolist()
+
+
 def all_ranks(agreed: bool) -> bool:
     """Return whether all processes agree; each waits for the others."""
-    if world_size() == 1:
-        return agreed
-    vote = torch.tensor(float(agreed), device=_device())
-    torch.distributed.all_reduce(vote, op=torch.distributed.ReduceOp.MIN)
-    return vote.item() > 0.0
+    return largest_over_ranks([int(not agreed)]) == [0]
 
 
 def all_same(text: str) -> bool:
     """Return whether all processes call this with the same text; each waits for the others."""
-    if world_size() == 1:
-        return True
     number = int.from_bytes(hashlib.sha256(text.encode()).digest()[:7], "big")
-    ends = torch.tensor([number, -number], device=_device())
-    torch.distributed.all_reduce(ends, op=torch.distributed.ReduceOp.MAX)
-    return bool(ends[0] == -ends[1])
-
-
-def _device() -> torch.device:
-    """Return where tensors that the processes exchange must lie."""
-    return torch.device("cuda" if torch.distributed.get_backend() == "nccl" else "cpu")
+    return largest_over_ranks([number, -number]) == [number, -number]
 
 
 def one_rank_first(procedure: Callable[[], None]) -> None:
@@ -85,8 +81,7 @@ def join_ranks(device: str | None = None, threads: int | None = None) -> Rank:
 
     threads: of torch on a CPU, unless OMP_NUM_THREADS is set.
 
-    Raises:
-        ValueError: There is no such device.
+    Raises ValueError: there is no such device.
     """
     kind = torch.device(device or ("cuda" if torch.cuda.is_available() else "cpu"))
     if kind.type == "cuda" and not torch.cuda.is_available():

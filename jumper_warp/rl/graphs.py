@@ -16,7 +16,7 @@ class Captured:
     Where it cannot be captured, on any rank, all ranks go on eagerly, and say so.
     """
 
-    def __init__(self, procedure: Callable[[], None], enabled: bool) -> None:
+    def __init__(self, procedure: Callable[[], object], enabled: bool) -> None:
         """procedure: reads and writes the same tensors in every call, and waits for no result."""
         self._procedure = procedure
         self.enabled = enabled

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import math
 import time
 from contextlib import suppress
@@ -12,7 +13,7 @@ from typing import Any
 
 import torch
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeElapsedColumn, TimeRemainingColumn
 
 from jumper_warp.rl.metrics_file import MetricsFile
 from jumper_warp.utils.errors import InputError
@@ -27,7 +28,7 @@ class Stopwatch:
     """Seconds that a device spends between marks, without waiting for it until they are read."""
 
     def __init__(self, device: torch.device) -> None:
-        self._cuda = device.type == "cuda"
+        self._cuda, self._since = device.type == "cuda", time.perf_counter()
         self._laps: list[list[Any]] = []
 
     def start(self) -> None:
@@ -37,36 +38,24 @@ class Stopwatch:
 
     def mark(self) -> None:
         """End a part of the lap."""
-        if not self._cuda:
-            self._laps[-1].append(time.perf_counter())
-            return
-        event = torch.cuda.Event(enable_timing=True)
-        event.record()
-        self._laps[-1].append(event)
+        mark: Any = torch.cuda.Event(enable_timing=True) if self._cuda else time.perf_counter()
+        if self._cuda:
+            mark.record()
+        self._laps[-1].append(mark)
 
-    def read(self) -> list[float]:
-        """Return the mean seconds of each part over all laps since the last call; waits for the device."""
+    def read(self) -> tuple[list[float], float]:
+        """Return mean seconds of each part since the last call, and of an iteration on the host's clock.
+
+        Waits for the device. Time between laps counts to the iterations.
+        """
         laps, self._laps = self._laps, []
         if self._cuda:
             torch.cuda.synchronize()
             seconds = [[a.elapsed_time(b) / 1.0e3 for a, b in pairwise(lap)] for lap in laps]
         else:
             seconds = [[b - a for a, b in pairwise(lap)] for lap in laps]
-        return [sum(part) / len(part) for part in zip(*seconds, strict=True)]
-
-
-class Pace:
-    """Seconds of an iteration, on the host's clock."""
-
-    def __init__(self, iteration: int) -> None:
-        """iteration: how many have been done."""
-        self._time, self._iteration = time.perf_counter(), iteration
-
-    def lap(self, iteration: int) -> float:
-        """Return the mean seconds of the iterations since the last lap; `iteration`, more than then, have been done."""
-        since, done = self._time, self._iteration
-        self._time, self._iteration = time.perf_counter(), iteration
-        return (self._time - since) / (iteration - done)
+        since, self._since = self._since, time.perf_counter()
+        return [sum(part) / len(part) for part in zip(*seconds, strict=True)], (self._since - since) / len(laps)
 
 
 class TrainingLog:
@@ -81,18 +70,12 @@ class TrainingLog:
         wandb: bool = False,
         iteration: int = 0,
     ) -> None:
-        """Args:
+        """folder: the run's, exists. config: everything that the run was started with, ready for JSON.
 
-        folder: The run's, exists.
-        config: Everything that the run was started with, ready for JSON.
-        total: Iterations that the run is to have at its end.
-        tensorboard: Write events.
-        wandb: Upload to Weights & Biases.
-        iteration: How many the run has had; what was logged of later ones is dropped.
-
-        Raises:
-            ValueError: Weights & Biases is asked for and not installed.
-            OSError: The figures cannot be read or written.
+        total: iterations that the run has at its end. tensorboard: write events. wandb: upload to Weights & Biases.
+        iteration: how many the run has had; what was logged of later ones is dropped.
+        Raises ValueError: Weights & Biases is requested and not installed. OSError: the metrics cannot be read or
+        written.
         """
         self._console = _LastingConsole(stderr=True)
         self._figures = MetricsFile(folder / FIGURES, iteration)
@@ -100,15 +83,9 @@ class TrainingLog:
         self._full = False
         self._total = total
         self._wandb = _wandb(folder, config) if wandb else None
-        self._progress = Progress(
-            TextColumn("{task.description}"),
-            BarColumn(bar_width=24),
-            MofNCompleteColumn(),
-            TimeElapsedColumn(),
-            TimeRemainingColumn(),
-            console=self._console,
-            disable=not self._console.is_terminal,
-        )
+        columns = (BarColumn(bar_width=24), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn())
+        hidden = not self._console.is_terminal
+        self._progress = Progress("{task.description}", *columns, console=self._console, disable=hidden)
         self._task = self._progress.add_task("training", total=total)
 
     def __enter__(self) -> TrainingLog:
@@ -179,18 +156,17 @@ class _LastingConsole(Console):
 def _summary(figures: dict[str, float]) -> str:
     """Return the few figures to watch, in one line."""
     parts = [f"{figures['Perf/fps']:,.0f} steps/s"]
-    if "Train/mean_return" in figures:
-        parts.append(f"return {figures['Train/mean_return']:.2f}")
-    if "Metrics/success" in figures:
-        parts.append(f"success {100.0 * figures['Metrics/success']:.1f} %")
+    if (total := figures.get("Train/mean_return")) is not None:
+        parts.append(f"return {total:.2f}")
+    if (success := figures.get("Metrics/success")) is not None:
+        parts.append(f"success {100.0 * success:.1f} %")
     return ", ".join(parts)
 
 
 def _broken_terms(figures: dict[str, float]) -> list[str]:
     """Return the names of reward terms whose means are not finite."""
-    return [
-        name.replace(REWARDS, "") for name, value in figures.items() if REWARDS in name and not math.isfinite(value)
-    ]
+    means = {name.replace(REWARDS, ""): value for name, value in figures.items() if REWARDS in name}
+    return [name for name, value in means.items() if not math.isfinite(value)]
 
 
 def _duration(seconds: float) -> str:
@@ -210,7 +186,7 @@ def _event_writer(folder: Path, iteration: int) -> Any:
 
 def _wandb(folder: Path, config: dict[str, Any]) -> Any:
     try:
-        import wandb
+        wandb = importlib.import_module("wandb")
     except ImportError as error:
-        raise InputError("wandb is asked for but not installed: pip install wandb") from error
+        raise InputError("wandb is requested but not installed: pip install wandb") from error
     return wandb.init(project="jumper-warp", dir=str(folder), config=config)

@@ -13,7 +13,7 @@ from jumper_warp.rl.cfg import PpoCfg
 from jumper_warp.rl.flat import Layers, joined
 from jumper_warp.rl.mirror import Symmetry
 from jumper_warp.rl.networks import gaussian_kl, gaussian_log_prob
-from jumper_warp.rl.passes import DTYPES, backward, backward_both, forward, forward_both
+from jumper_warp.rl.passes import DTYPES, backward, backward_actor, forward, forward_actor
 from jumper_warp.rl.samples import RowLayout
 
 
@@ -34,33 +34,21 @@ def actor_gradient(
     Where r A is the smaller, ∂/∂log π = -r A / batch, else 0.
 
     rows: (batch, columns) as `layout`; entropy_coef: (); symmetry: of the policy; out: the vector's part of actor and
-    noise.
-
-    Returns:
-        Surrogate, entropy, mean squared asymmetry (0 without symmetry) and KL(old ‖ new).
+    noise. Return surrogate, entropy, mean squared asymmetry (0 without symmetry) and KL(old ‖ new).
     """
     batch, dtype = layout.split(rows), DTYPES[cfg.precision]
-    if symmetry is None:
-        mean, seen = forward(actor, layout.features(rows), dtype)
-    else:
-        own, image, seen = forward_both(actor, layout.features(rows), symmetry, dtype)
-        mean = 0.5 * (own + image)
+    mean, difference, seen = forward_actor(actor, layout.features(rows), symmetry, dtype)
     ratio = torch.exp(gaussian_log_prob(batch.action, mean, log_std) - batch.log_prob)
     gain = batch.advantage * ratio
     clipped = batch.advantage * ratio.clamp(1.0 - cfg.clip, 1.0 + cfg.clip)
     slope = torch.where(gain > clipped, 0.0, gain)[:, None] / -rows.shape[0]
     deviation = (batch.action - mean) * torch.exp(-log_std)
     noise = (slope * (deviation.square() - 1.0)).sum(0) - entropy_coef
-    slope = slope * deviation * torch.exp(-log_std)
-    if symmetry is None:
-        gradients, asymmetry = backward(actor, seen, slope, dtype), torch.zeros_like(gain[0])
-    else:
-        gradients = backward_both(actor, seen, (0.5 * slope, 0.5 * slope), symmetry, dtype)
-        asymmetry = (own - image).square().mean()
+    gradients = backward_actor(actor, seen, slope * deviation * torch.exp(-log_std), symmetry, dtype)
     out.copy_(joined([*gradients, noise]))
     entropy = (log_std + 0.5 * math.log(2.0 * math.pi * math.e)).sum()
     kl = gaussian_kl(batch.mean, old_log_std, mean, log_std).mean()
-    return -torch.minimum(gain, clipped).mean(), entropy, asymmetry, kl
+    return -torch.minimum(gain, clipped).mean(), entropy, difference.square().mean(), kl
 
 
 def critic_gradient(

@@ -16,8 +16,7 @@ class MetricsFile:
     def __init__(self, path: Path, iteration: int) -> None:
         """Open the file to continue after `iteration`: drop lines of later ones, half lines and what is no JSON.
 
-        Raises:
-            OSError: It cannot be read or written.
+        Raises OSError: it cannot be read or written.
         """
         content = path.read_bytes() if path.is_file() else b""
         lines = content.splitlines()
@@ -35,8 +34,7 @@ class MetricsFile:
     def add(self, iteration: int, metrics: dict[str, float]) -> None:
         """Append the metrics of an iteration, null for those that are not finite.
 
-        Raises:
-            OSError: The disk is full, say. The file is unchanged; the line is kept, and written with the next one.
+        Raises OSError: the disk is full, say. The file is unchanged; the line is kept, and written with the next one.
         """
         values = {name: value if math.isfinite(value) else None for name, value in metrics.items()}
         self._waiting += json.dumps({"iteration": iteration, **values}, allow_nan=False).encode() + b"\n"

@@ -13,10 +13,15 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
+import numpy as np
 import torch
 
 from jumper_warp.envs.vec_env import MirroredVecEnv, VecEnv
 from jumper_warp.utils.errors import InputError
+
+Weights = list[tuple[torch.Tensor, torch.Tensor]]
+"""Weight (out, in) and bias (out,) of each layer of a network, first to last."""
+Vector = Sequence[float] | np.ndarray | torch.Tensor
 
 
 class Image(NamedTuple):
@@ -60,7 +65,7 @@ class Symmetry(NamedTuple):
         return Symmetry(self.obs.padded(columns), self.action)
 
 
-def image(order: Sequence[int], signs: Sequence[float], name: str, device: Any = None) -> Image:
+def image(order: Vector, signs: Vector, name: str, device: Any = None) -> Image:
     """Return the image of vectors called `name`. Raises ValueError: mirroring twice does not give back what was."""
     places = torch.as_tensor(order, dtype=torch.int64, device=device)
     flips = torch.as_tensor(signs, dtype=torch.float32, device=device)
@@ -84,9 +89,7 @@ def symmetry_of(env: VecEnv) -> Symmetry:
     return Symmetry(obs, action)
 
 
-def plain_layers(
-    layers: Sequence[tuple[torch.Tensor, torch.Tensor]], symmetry: Symmetry
-) -> list[tuple[torch.Tensor, torch.Tensor]]:
+def plain_layers(layers: Weights, symmetry: Symmetry) -> Weights:
     """Return weights and biases of a plain network that answers as the symmetric actor, of twice the widths.
 
     layers: those of f, with activations between. So a symmetric policy is saved and exported as any other.
@@ -106,9 +109,7 @@ def plain_layers(
     return found
 
 
-def nearest_plain_layers(
-    layers: Sequence[tuple[torch.Tensor, torch.Tensor]], symmetry: Symmetry
-) -> list[tuple[torch.Tensor, torch.Tensor]]:
+def nearest_plain_layers(layers: Weights, symmetry: Symmetry) -> Weights:
     """Return the layers of the form of `plain_layers` that are nearest to these, of the same shapes.
 
     layers: at least two, hidden ones of even widths. The nearest by the sum of squared differences: what must be equal
@@ -121,17 +122,13 @@ def nearest_plain_layers(
         if index == len(layers) - 1:
             halves.append((weight[:, :columns] + action @ weight[:, columns:], bias))
             continue
-        if index == 0:
-            half = weight[:rows] + weight[rows:] @ obs
-        else:
-            half = weight[:rows, :columns] + weight[rows:, columns:]
+        first = index == 0
+        half = weight[:rows] + weight[rows:] @ obs if first else weight[:rows, :columns] + weight[rows:, columns:]
         halves.append((0.5 * half, 0.5 * (bias[:rows] + bias[rows:])))
     return plain_layers(halves, symmetry)
 
 
-def symmetric_layers(
-    layers: Sequence[tuple[torch.Tensor, torch.Tensor]], symmetry: Symmetry
-) -> list[tuple[torch.Tensor, torch.Tensor]]:
+def symmetric_layers(layers: Weights, symmetry: Symmetry) -> Weights:
     """Return weights and biases of f, of half the widths, from those that `plain_layers` made of them; copies.
 
     Of f's last bias only the symmetric part is left, which answers alike. Raises InputError: the layers are not of that

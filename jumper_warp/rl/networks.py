@@ -9,7 +9,7 @@ from torch import nn
 
 from jumper_warp.envs.vec_env import sanitise
 from jumper_warp.rl.distributed import average_over_ranks, world_size
-from jumper_warp.rl.mirror import Image, Symmetry
+from jumper_warp.rl.mirror import Image, Symmetry, Weights
 from jumper_warp.utils.normalise import normalise
 
 NORMALISED_LIMIT = 10.0
@@ -124,6 +124,11 @@ def mlp(sizes: Sequence[int], activation: str, out_gain: float) -> nn.Sequential
     return nn.Sequential(*layers)
 
 
+def weights_of(network: nn.Module) -> Weights:
+    """Return weight and bias of each linear layer of a network."""
+    return [(module.weight, module.bias) for module in network.children() if isinstance(module, nn.Linear)]
+
+
 class ActorCritic(nn.Module):
     """Two separate networks, each on its own normalised observation; the noise does not depend on the state."""
 
@@ -137,15 +142,10 @@ class ActorCritic(nn.Module):
         num_critic_obs: int | None = None,
         symmetry: Symmetry | None = None,
     ) -> None:
-        """Args:
+        """num_obs, num_critic_obs (default: num_obs): entries of the observations of actor and critic.
 
-        num_obs: Entries of the actor's observation.
-        num_actions: Entries of an action.
-        hidden: Widths of the hidden layers of both networks.
-        activation: A key of ACTIVATIONS.
-        init_std: Standard deviation of the noise on every action at the start.
-        num_critic_obs: Entries of the critic's observation (default: num_obs).
-        symmetry: Of the policy, see `jumper_warp.rl.mirror`; its images are saved with the weights.
+        hidden: widths of the hidden layers of both networks. activation: a key of ACTIVATIONS. init_std: standard
+        deviation of the noise on every action at the start. symmetry: of the policy, saved with the weights.
         """
         super().__init__()
         num_critic_obs = num_obs if num_critic_obs is None else num_critic_obs

@@ -46,21 +46,30 @@ def backward(layers: Layers, seen: list[torch.Tensor], slope: torch.Tensor, dtyp
     return found
 
 
-def forward_both(
-    layers: Layers, x: torch.Tensor, symmetry: Symmetry, dtype: torch.dtype
+def forward_actor(
+    layers: Layers, x: torch.Tensor, symmetry: Symmetry | None, dtype: torch.dtype
 ) -> tuple[torch.Tensor, torch.Tensor, list[torch.Tensor]]:
-    """Return f(x) and N f(M x), (batch, actions) each, and what `backward_both` needs; as `passes.forward`."""
+    """Return the policy's mean (batch, actions), f(x) - N f(M x), 0 without symmetry, and what `backward_actor` needs.
+
+    Arguments as of `forward`; symmetry: of the policy, in the notation of `jumper_warp.rl.mirror`.
+    """
+    if symmetry is None:
+        mean, seen = forward(layers, x, dtype)
+        return mean, torch.zeros_like(mean), seen
     output, seen = forward(layers, torch.cat([x, symmetry.obs.of(x)]), dtype)
     own, other = output.chunk(2)
-    return own, symmetry.action.of(other), seen
+    image = symmetry.action.of(other)
+    return 0.5 * (own + image), own - image, seen
 
 
-def backward_both(
-    layers: Layers, seen: list[torch.Tensor], slopes: tuple[torch.Tensor, torch.Tensor], symmetry: Symmetry,
-    dtype: torch.dtype,
-) -> list[torch.Tensor]:  # fmt: skip
-    """Return the gradients of weights and biases; slopes: of the loss with respect to what `forward_both` returned."""
-    return backward(layers, seen, torch.cat([slopes[0], symmetry.action.of(slopes[1])]), dtype)
+def backward_actor(
+    layers: Layers, seen: list[torch.Tensor], slope: torch.Tensor, symmetry: Symmetry | None, dtype: torch.dtype
+) -> list[torch.Tensor]:
+    """Return the gradients of weights and biases; slope: of the loss with respect to the mean of `forward_actor`."""
+    if symmetry is None:
+        return backward(layers, seen, slope, dtype)
+    half = 0.5 * slope
+    return backward(layers, seen, torch.cat([half, symmetry.action.of(half)]), dtype)
 
 
 def _through(activation: str, slope: torch.Tensor, output: torch.Tensor) -> torch.Tensor:

@@ -32,12 +32,6 @@ STATISTICS = ("surrogate", "value", "entropy", "asymmetry", "kl", "gradient_acto
 """What `Ppo.statistics` averages over minibatches; skipped is the share of steps with a non-finite gradient,
 asymmetry the mean square of f(x) - N f(M x), see `jumper_warp.rl.mirror`, 0 without symmetry."""
 
-FIGURES = (
-    *(f"Loss/{name}" for name in STATISTICS), "Loss/learning_rate", "Policy/mean_std", "Train/mean_return",
-    "Train/mean_length",
-)  # fmt: skip
-"""Names of all that `Ppo.statistics` returns; those of Train/ once an episode has ended."""
-
 
 class Ppo:
     """The algorithm on one environment: `collect` fills the rollout, `update` learns from it, `iterate` does both."""
@@ -45,8 +39,7 @@ class Ppo:
     def __init__(self, env: VecEnv, cfg: PpoCfg) -> None:
         """Build networks and buffers on the environment's device; the weights follow torch's CPU seed.
 
-        Raises:
-            ValueError: As `PpoCfg.batch_size`, or as `symmetry_of` if symmetry is asked for.
+        Raises ValueError as `PpoCfg.batch_size`, and as `symmetry_of` if symmetry is requested.
         """
         self.batch_size = cfg.batch_size(env.num_envs)
         self.env, self.cfg = env, cfg
@@ -77,7 +70,7 @@ class Ppo:
         self._sums = torch.zeros(len(STATISTICS) + 1, **counts)  # and their number
         self._actor_gradient, self._critic_gradient = compiler(actor_gradient), compiler(critic_gradient)
         self._finish = compiler(_finish)
-        procedures = (self.collector.roll, self.batch, self._learn)
+        procedures: tuple[Callable[[], object], ...] = (self.collector.roll, self.batch, self._learn)
         self._roll, self._batch, self._optimise = (Captured(each, cuda and cfg.graphs) for each in procedures)
 
     def iterate(self, mark: Callable[[], None] = lambda: None) -> None:
@@ -188,8 +181,7 @@ class Ppo:
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Take up what `state_dict` gave.
 
-        Raises:
-            ValueError: A part is missing, unknown, of another shape or type, or not finite; nothing is changed.
+        Raises ValueError: a part is missing, unknown, of another shape or type, or not finite; nothing is changed.
         """
         self._check(state)
         self.model.load_state_dict(state["model"])

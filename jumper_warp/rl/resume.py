@@ -37,8 +37,7 @@ DERIVED = ("interface", "num_envs", "seed")
 def find_checkpoint(cfg: TrainCfg) -> Checkpoint | None:
     """Return the checkpoint to resume; None: a new run begins.
 
-    Raises:
-        CheckpointError: There is none that can be used.
+    Raises CheckpointError: there is none that can be used.
     """
     if not cfg.resume:
         return None
@@ -60,8 +59,7 @@ def find_checkpoint(cfg: TrainCfg) -> Checkpoint | None:
 def own_part(state: dict[str, Any], rank: Rank) -> dict[str, Any]:
     """Return the part of a checkpoint that is a process's own: `env`, `rng` and its part of `ppo`.
 
-    Raises:
-        ValueError: It was saved by another number of processes, or a part is missing.
+    Raises ValueError: it was saved by another number of processes, or a part is missing.
     """
     others = state.get("others")
     if not isinstance(others, list):
@@ -145,8 +143,7 @@ def random_state() -> dict[str, torch.Tensor]:
 def set_random_state(state: dict[str, torch.Tensor]) -> None:
     """Take up what `random_state` gave; a GPU's only where there is one.
 
-    Raises:
-        ValueError: A part is missing or no state of a generator; nothing is changed.
+    Raises ValueError: a part is missing or no state of a generator; nothing is changed.
     """
     own = random_state()
     if not isinstance(state, dict) or "cpu" not in state:

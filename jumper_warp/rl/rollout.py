@@ -11,7 +11,7 @@ from jumper_warp.rl.compiling import Compiler
 from jumper_warp.rl.flat import FlatParameters, Layers
 from jumper_warp.rl.mirror import Symmetry
 from jumper_warp.rl.networks import NORMALISED_LIMIT, ActorCritic
-from jumper_warp.rl.passes import DTYPES, forward, forward_both
+from jumper_warp.rl.passes import DTYPES, forward_actor
 from jumper_warp.utils.normalise import normalise
 
 
@@ -109,11 +109,7 @@ def _act(
     for raw, place in zip(seen, kept, strict=True):
         place.copy_(sanitise(raw))
     features = normalised(sanitise(seen[0]), scaling, actor.weights[0].shape[1])
-    if symmetry is None:
-        mean, _ = forward(actor, features, dtype)
-    else:
-        own, image, _ = forward_both(actor, features, symmetry, dtype)
-        mean = 0.5 * (own + image)
+    mean, _, _ = forward_actor(actor, features, symmetry, dtype)
     decided[0].copy_(mean)
     decided[1].mul_(log_std.exp()).add_(mean)
 

@@ -16,6 +16,7 @@ def rsl_rl_config(cfg: PpoCfg, save_interval: int, seed: int) -> dict[str, Any]:
 
     The environment has the observation groups `policy` and `critic`; save_interval: iterations between checkpoints.
     """
+    same = {name: getattr(cfg, name) for name in ("desired_kl", "gamma", "lam", "entropy_coef", "max_grad_norm")}
     network = {"class_name": "MLPModel", "hidden_dims": list(cfg.hidden), "activation": cfg.activation}
     network["obs_normalization"] = True
     noise = {"class_name": "GaussianDistribution", "init_std": cfg.init_std, "std_type": "log"}
@@ -34,14 +35,10 @@ def rsl_rl_config(cfg: PpoCfg, save_interval: int, seed: int) -> dict[str, Any]:
             "num_mini_batches": cfg.minibatches,
             "learning_rate": cfg.lr,
             "schedule": "adaptive" if cfg.desired_kl > 0.0 else "fixed",
-            "desired_kl": cfg.desired_kl,
-            "gamma": cfg.gamma,
-            "lam": cfg.lam,
-            "entropy_coef": cfg.entropy_coef,
             "clip_param": cfg.clip,
             "value_loss_coef": cfg.value_coef,
-            "max_grad_norm": cfg.max_grad_norm,
             "use_clipped_value_loss": cfg.clip_value,
+            **same,
         },
     }
 

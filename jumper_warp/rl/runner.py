@@ -13,16 +13,25 @@ from concurrent.futures import ThreadPoolExecutor
 from datetime import datetime
 from pathlib import Path
 from types import FrameType
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import torch
 
-from jumper_warp.envs.vec_env import VecEnv
+from jumper_warp.envs.vec_env import DifferentiableVecEnv, VecEnv
 from jumper_warp.rl.cfg import TrainCfg
 from jumper_warp.rl.checkpoint import DAMAGE, Checkpoint, CheckpointError, one_line, save_checkpoint
-from jumper_warp.rl.distributed import Rank, all_same, gather, join_ranks, one_rank_first, wait_for_ranks, world_size
-from jumper_warp.rl.logger import Pace, Stopwatch, TrainingLog
-from jumper_warp.rl.ppo import FIGURES, Ppo
+from jumper_warp.rl.distributed import (
+    Rank,
+    all_same,
+    gather,
+    join_ranks,
+    largest_over_ranks,
+    one_rank_first,
+    wait_for_ranks,
+    world_size,
+)
+from jumper_warp.rl.logger import Stopwatch, TrainingLog
+from jumper_warp.rl.ppo import STATISTICS, Ppo
 from jumper_warp.rl.resume import (
     CHECKPOINTS,
     changed_files,
@@ -34,7 +43,7 @@ from jumper_warp.rl.resume import (
     spent_seconds,
     started_from,
 )
-from jumper_warp.rl.shac import FIGURES as SHAC_FIGURES
+from jumper_warp.rl.shac import STATISTICS as SHAC_STATISTICS
 from jumper_warp.rl.shac import Shac
 from jumper_warp.rl.start import Start, begin_with
 from jumper_warp.utils.errors import InputError
@@ -47,6 +56,8 @@ CONFIG = "config.json"
 """File of a run: all settings, versions and the commit."""
 PERF = ("Perf/fps", "Perf/collect_s", "Perf/update_s", "Perf/elapsed_s")
 """Logged figures of the training itself: steps per second, and seconds."""
+LEARNING = ("Loss/learning_rate", "Policy/mean_std", "Train/mean_return", "Train/mean_length")
+"""Logged besides the losses; those of Train/ once an episode has ended."""
 INTERRUPTED = 130
 """Exit code of a training that was asked to stop."""
 
@@ -94,20 +105,19 @@ def train(
 ) -> TrainResult:  # fmt: skip
     """Train to the last iteration or the time limit, and save.
 
-    command: What the user would type to go on, without `--resume`; by default `jumper train TASK`.
-    as_rsl_rl: Needed with trainer rsl-rl. start: The policy that cfg.start_from names, needed with it.
-    checkpoint: The one that cfg.resume names, if it has been read.
+    command: what the user would type to continue, without `--resume`; by default `jumper train TASK`. as_rsl_rl: needed
+    with trainer rsl-rl. start: the policy that cfg.start_from names, needed with it. checkpoint: the one that
+    cfg.resume names, if it has been read.
 
-    Raises:
-        ValueError: A setting does not fit the environment or the machine.
-        CheckpointError: There is nothing usable to resume from, or the end could not be saved.
-        SystemExit: With code INTERRUPTED, after Ctrl-C or SIGTERM ended the iteration and it was saved.
+    Raises ValueError: a setting does not fit the environment or the machine. CheckpointError: there is nothing usable
+    to resume from, or the end could not be saved. SystemExit: with code INTERRUPTED, after Ctrl-C or SIGTERM ended the
+    iteration and it was saved.
     """
     set_threads(cfg.threads)
     rank = join_ranks(cfg.device, cfg.threads)
     run: Run | None = None
     try:
-        _check_processes(cfg, rank, as_rsl_rl is not None)
+        _check_processes(cfg, rank)
         if checkpoint is None and bool(cfg.start_from) != (start is not None):
             raise InputError("start_from and start, the policy that it names, need each other")
         env = make_env(cfg.num_envs // rank.size, (cfg.seed + 1000 * rank.index) % 2**31, rank.device)
@@ -128,12 +138,10 @@ def train(
             torch.distributed.destroy_process_group()
 
 
-def _check_processes(cfg: TrainCfg, rank: Rank, adapted: bool) -> None:
+def _check_processes(cfg: TrainCfg, rank: Rank) -> None:
     """Raises ValueError: the trainer cannot be had, or worlds or samples do not divide."""
     if cfg.trainer != "ppo" and rank.size > 1:
         raise InputError(f"trainer {cfg.trainer} is offered for one process only")
-    if cfg.trainer == "rsl-rl" and not adapted:
-        raise InputError("trainer rsl-rl needs as_rsl_rl, which adapts the environment")
     if cfg.num_envs % rank.size:
         raise InputError(f"num_envs {cfg.num_envs} is not divisible by {rank.size} processes")
     if cfg.trainer == "ppo":
@@ -176,8 +184,9 @@ class Run:
         self.cfg, self.env, self.rank = cfg, env, rank
         self._command = command or f"jumper train {cfg.task}"
         by_gradients = cfg.trainer == "shac"
-        self.ppo = Shac(env, cfg.ppo, cfg.shac) if by_gradients else Ppo(env, cfg.ppo)
-        _check_best_by(cfg.best_by, {*env.metrics(), *(SHAC_FIGURES if by_gradients else FIGURES), *PERF})
+        self.ppo = Shac(cast(DifferentiableVecEnv, env), cfg.ppo, cfg.shac) if by_gradients else Ppo(env, cfg.ppo)
+        losses = {f"Loss/{name}" for name in (SHAC_STATISTICS if by_gradients else STATISTICS)}
+        _check_best_by(cfg.best_by, {*env.metrics(), *losses, *LEARNING, *PERF})
         self.config = full_config(cfg, env, rank)
         self.iteration, self.seconds = 0, 0.0  # that the run had before this process
         self._begin: float | None = None  # on the clock, as if all seconds that count were of this process
@@ -222,7 +231,7 @@ class Run:
         if self.iteration == 0:
             self.env.reset()
         start, first = time.perf_counter(), self.iteration + 1
-        watch, pace = Stopwatch(self.rank.device), Pace(self.iteration)
+        watch = Stopwatch(self.rank.device)
         with self._log() as log:
             for note in [f"run {self.folder}", *self.notes]:
                 log.say(note)
@@ -240,11 +249,11 @@ class Run:
                     self._begin_counting()
                 ending = self._ending(stop)
                 if ending or self.iteration % cfg.log_interval == 0:
-                    times, seconds = watch.read(), pace.lap(self.iteration)
+                    times, seconds = watch.read()
                     self.figures = self._read(times, seconds)
                     log.log(self.iteration, self.figures, self._left(seconds))
-                elif self.iteration == first:  # its time tells nothing of the others
-                    watch.read(), pace.lap(self.iteration)
+                elif self.iteration == first:  # it takes longer than the others
+                    watch.read()
                 if ending or self.iteration % cfg.save_interval == 0:
                     self._save(log, ending, stop)
         return TrainResult(self.folder, self.iteration, time.perf_counter() - start, self.figures)
@@ -267,10 +276,8 @@ class Run:
 
     def _progress(self) -> float:
         """Return how much of the training is over, by iterations or by time, whichever is further."""
-        done = self.iteration / self.cfg.iterations
-        if self.cfg.max_seconds > 0.0:
-            done = max(done, self._elapsed() / self.cfg.max_seconds)
-        return done
+        timed = self.cfg.max_seconds > 0.0
+        return max(self.iteration / self.cfg.iterations, self._elapsed() / self.cfg.max_seconds if timed else 0.0)
 
     def _left(self, seconds: float) -> float:
         """Return how long the rest takes [s] at so many seconds an iteration."""
@@ -287,9 +294,7 @@ class Run:
             return False
         late = 0.0 < self.cfg.max_seconds <= self._elapsed()
         if world_size() > 1:
-            wish = torch.tensor([float(stop.asked), float(late)], device=self.rank.device)
-            torch.distributed.all_reduce(wish, op=torch.distributed.ReduceOp.MAX)
-            stop.asked, late = (value > 0.0 for value in wish.tolist())
+            stop.asked, late = map(bool, largest_over_ranks([int(stop.asked), int(late)]))
         return stop.asked or late
 
     def _read(self, times: list[float], seconds: float) -> dict[str, float]:
@@ -316,8 +321,8 @@ class Run:
             log.say(f"{folder}: not saved, will try again: {error.strerror}")
             return
         if ending:
-            more = f", continue with: {self._command} --resume {shlex.quote(str(self.folder))}" if stop.asked else ""
-            log.say(f"saved {path}{more}")
+            again = f", continue with: {self._command} --resume {shlex.quote(str(self.folder))}"
+            log.say(f"saved {path}{again if stop.asked else ''}")
 
     def _others(self, own: dict[str, Any]) -> list[dict[str, Any]]:
         """Return, in process 0, what only the other processes know: their worlds and random numbers."""
@@ -327,7 +332,7 @@ class Run:
 
 
 class _Silent:
-    """Stands for the log where nobody listens."""
+    """Stands for the log in all processes but the first."""
 
     def __enter__(self) -> _Silent:
         return self
@@ -351,7 +356,9 @@ def new_folder(cfg: TrainCfg, rank: Rank) -> Path:
     return folder
 
 
-def _train_rsl_rl(cfg: TrainCfg, env: VecEnv, as_rsl_rl: AsRslRl, rank: Rank) -> TrainResult:
+def _train_rsl_rl(cfg: TrainCfg, env: VecEnv, as_rsl_rl: AsRslRl | None, rank: Rank) -> TrainResult:
+    if as_rsl_rl is None:
+        raise InputError("trainer rsl-rl needs as_rsl_rl, which adapts the environment")
     from jumper_warp.rl.rsl_rl import train_rsl_rl
 
     folder = new_folder(cfg, rank)

@@ -52,8 +52,8 @@ class RowLayout(NamedTuple):
     @property
     def widths(self) -> tuple[int, int, int]:
         """Columns of both groups of features and of the rest, filled up."""
-        rest = 2 * self.num_actions + 4
-        return tuple(aligned(width, ROW_ALIGNMENT) for width in (self.num_obs, self.num_critic_obs, rest))  # type: ignore[return-value]
+        obs, critic_obs = aligned(self.num_obs, ROW_ALIGNMENT), aligned(self.num_critic_obs, ROW_ALIGNMENT)
+        return obs, critic_obs, aligned(2 * self.num_actions + 4, ROW_ALIGNMENT)
 
     def features(self, rows: torch.Tensor) -> torch.Tensor:
         """Return the actor's features with the zero columns that its first weight has."""
@@ -91,15 +91,9 @@ def gae(
 
     The recurrence A[t] = δ[t] + w[t] A[t+1] is solved by doubling: log2(steps) passes over all steps at once.
 
-    Args:
-        reward: (steps, num_envs), with the bootstrap of timeouts already in it.
-        done: (steps, num_envs), 1 where nothing follows.
-        value: (steps + 1, num_envs) expected return before each step and after the last.
-        gamma: Discount per step.
-        lam: Weight of longer estimates.
-
-    Returns:
-        Advantages and returns, each (steps, num_envs).
+    Return advantages and returns, each (steps, num_envs). reward: (steps, num_envs), with the bootstrap of timeouts
+    already in it. done: (steps, num_envs), 1 where nothing follows. value: (steps + 1, num_envs) expected return before
+    each step and after the last. gamma: discount per step. lam: weight of longer estimates.
     """
     alive = 1.0 - done
     advantage = reward + gamma * alive * value[1:] - value[:-1]
@@ -177,10 +171,8 @@ def _estimate(
     """Return what the critic makes of a rollout, and moments of it.
 
     experience: critic_obs, final_critic_obs, reward, done and timeout of a `RolloutBuffer`; rows: at a time.
-
-    Returns:
-        The critic's output, advantages and returns (samples,); and mean and variance of advantages, returns,
-        observations and the critic's observations.
+    Return the critic's output, advantages and returns (samples,); and mean and variance of advantages, returns,
+    observations and the critic's observations.
     """
     critic_obs, final_critic_obs, reward, done, timeout = experience
     columns, dtype = critic.weights[0].shape[1], DTYPES[cfg.precision]

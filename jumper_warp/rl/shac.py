@@ -10,7 +10,7 @@ parallel differentiable simulation.
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
@@ -23,11 +23,7 @@ from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.state_checks import check_parts, check_tensor
 
 STATISTICS = ("actor", "value", "gradient_actor", "gradient_critic")
-FIGURES = (
-    *(f"Loss/{name}" for name in STATISTICS), "Loss/learning_rate", "Policy/mean_std", "Train/mean_return",
-    "Train/mean_length",
-)  # fmt: skip
-"""Names of all that `Shac.statistics` returns; those of Train/ once an episode has ended."""
+"""What `Shac.statistics` averages over optimiser steps."""
 
 
 class Shac:
@@ -80,7 +76,7 @@ class Shac:
         """Act for a window; return the actor's loss, and what the critic learns from, time first."""
         env, cfg, model = self.env, self.cfg, self.model
         seen: dict[str, list[torch.Tensor]] = {name: [] for name in ("obs", "critic_obs", "reward", "next", "done")}
-        discount, total = torch.ones(env.num_envs, device=env.device), 0.0
+        discount, total = torch.ones(env.num_envs, device=env.device), torch.zeros(env.num_envs, device=env.device)
         env.begin_window()
         for step in range(cfg.num_steps):
             obs, critic_obs = env.observe()
@@ -144,7 +140,7 @@ class Shac:
                 slow.lerp_(fast, shac.target_rate)
         return sum(losses) / len(losses), sum(norms) / len(norms)
 
-    def _descend(self, name: str, params: list[torch.Tensor], loss: torch.Tensor, longest: float) -> float:
+    def _descend(self, name: str, params: Sequence[torch.Tensor], loss: torch.Tensor, longest: float) -> float:
         """Make an optimiser step, none if the gradient is not finite; return its norm before it is shortened."""
         optimiser = self.optimisers[name]
         optimiser.zero_grad()

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from typing import NamedTuple
 
 import torch
-from torch import nn
 
 from jumper_warp.rl.cfg import PpoCfg
-from jumper_warp.rl.mirror import Symmetry, nearest_plain_layers, symmetric_layers
-from jumper_warp.rl.networks import EPS, ActorCritic
+from jumper_warp.rl.mirror import Symmetry, Weights, nearest_plain_layers, symmetric_layers
+from jumper_warp.rl.networks import EPS, ActorCritic, weights_of
 from jumper_warp.utils.errors import InputError
 
 KNOWN_ITERATIONS = 100
@@ -24,8 +23,8 @@ NEARLY = 0.05
 class Start(NamedTuple):
     """What an `ActorCritic` begins with."""
 
-    layers: list[tuple[torch.Tensor, torch.Tensor]]
-    """Weight (out, in) and bias (out,) of each layer of the actor."""
+    layers: Weights
+    """Of the actor."""
     mean: torch.Tensor
     """(num_obs,) of the raw observations."""
     std: torch.Tensor
@@ -35,25 +34,19 @@ class Start(NamedTuple):
 
 
 def make_start(
-    layers: Sequence[tuple[torch.Tensor, torch.Tensor]], mean: torch.Tensor, std: torch.Tensor, activation: str,
-    cfg: PpoCfg, symmetry: Symmetry | None = None,
+    layers: Weights, mean: torch.Tensor, std: torch.Tensor, activation: str, cfg: PpoCfg,
+    symmetry: Symmetry | None = None,
 ) -> Start:  # fmt: skip
     """Return what a training with these settings begins with to act as a policy does.
 
     A policy g that is not mirror-symmetric begins a training with symmetry actor as (g(x) + N g(M x)) / 2, in the
     notation of `jumper_warp.rl.mirror`; one that was, but for small changes of its weights, as the nearest that is.
 
-    Args:
-        layers: Of the policy as a plain network; weight (out, in) and bias (out,) each.
-        mean: (num_obs,) of its raw observations.
-        std: (num_obs,) what it divides observations by.
-        activation: Between its layers.
-        cfg: Settings of the training.
-        symmetry: The mirror images, if the training is with symmetry actor.
+    layers: of the policy as a plain network, with activation between; mean, std: (num_obs,) what it subtracts from raw
+    observations and divides them by; symmetry: the mirror images, if the training is with symmetry actor.
 
-    Raises:
-        InputError: The settings make other hidden layers or another activation, or a deviation is smaller than what is
-            added to variances.
+    Raises InputError: the settings make other hidden layers or another activation, or a deviation is smaller than what
+    is added to variances.
     """
     if activation != cfg.activation:
         raise InputError(
@@ -74,7 +67,7 @@ def make_start(
     if half is not None and symmetry is not None:
         return Start(half, mean, std, "" if _is_symmetric(layers, symmetry) else "made mirror-symmetric")
     if symmetry is None:
-        return Start(list(layers), mean, std)
+        return Start(layers, mean, std)
     return _averaged(layers, mean, std, symmetry)
 
 
@@ -82,41 +75,35 @@ def make_start(
 def begin_with(start: Start, model: ActorCritic, samples: int) -> None:
     """Put the weights and the statistics of observations into a model, in place; its noise and its critic stay.
 
-    samples: of all worlds in an iteration.
-
-    Raises:
-        InputError: The model's observation, action or layers are of other sizes; nothing is changed.
+    samples: of all worlds in an iteration. Raises InputError: the model's observation, action or layers are of other
+    sizes; nothing is changed.
     """
-    linear = [module for module in model.actor if isinstance(module, nn.Linear)]
-    has = [tuple(weight.shape) for weight, _ in start.layers]
-    made = [tuple(layer.weight.shape) for layer in linear]
+    own = weights_of(model.actor)
+    has, made = ([tuple(weight.shape) for weight, _ in layers] for layers in (start.layers, own))
     if has != made:
         raise InputError(f"start_from: the policy's weights are of shapes {_words(has)}, the training's {_words(made)}")
-    for layer, (weight, bias) in zip(linear, start.layers, strict=True):
-        layer.weight.copy_(weight)
-        layer.bias.copy_(bias)
+    for (weight, bias), (new_weight, new_bias) in zip(own, start.layers, strict=True):
+        weight.copy_(new_weight)
+        bias.copy_(new_bias)
     moments = model.obs_moments
     moments.mean.copy_(start.mean)
     moments.var.copy_((start.std.double().square() - EPS).clamp(min=0.0))
     moments.count.fill_(KNOWN_ITERATIONS * samples)
 
 
-def _half(
-    layers: Sequence[tuple[torch.Tensor, torch.Tensor]], mean: torch.Tensor, std: torch.Tensor, symmetry: Symmetry
-) -> list[tuple[torch.Tensor, torch.Tensor]] | None:
+def _half(layers: Weights, mean: torch.Tensor, std: torch.Tensor, symmetry: Symmetry) -> Weights | None:
     """Return the layers of f, see `symmetric_layers`, or None: they or the statistics are not nearly symmetric."""
     widths = [len(bias) for _, bias in layers[:-1]]
     symmetric = torch.allclose(symmetry.obs.of(mean), mean, atol=1e-5) and torch.allclose(std[symmetry.obs.order], std)
     if not symmetric or not widths or any(width % 2 for width in widths):
         return None
     nearest = nearest_plain_layers(layers, symmetry)
-    near = all(
-        (one - other).norm() <= NEARLY * one.norm() for (one, _), (other, _) in zip(layers, nearest, strict=True)
-    )
+    pairs = zip(layers, nearest, strict=True)
+    near = all((one - other).norm() <= NEARLY * one.norm() for (one, _), (other, _) in pairs)
     return symmetric_layers(nearest, symmetry) if near else None
 
 
-def _is_symmetric(layers: Sequence[tuple[torch.Tensor, torch.Tensor]], symmetry: Symmetry) -> bool:
+def _is_symmetric(layers: Weights, symmetry: Symmetry) -> bool:
     try:
         symmetric_layers(layers, symmetry)
     except InputError:
@@ -124,23 +111,18 @@ def _is_symmetric(layers: Sequence[tuple[torch.Tensor, torch.Tensor]], symmetry:
     return True
 
 
-def _averaged(
-    layers: Sequence[tuple[torch.Tensor, torch.Tensor]], mean: torch.Tensor, std: torch.Tensor, symmetry: Symmetry
-) -> Start:
+def _averaged(layers: Weights, mean: torch.Tensor, std: torch.Tensor, symmetry: Symmetry) -> Start:
     """Return g as the network f of a symmetric actor, and the statistics of its samples and their images."""
     middle, var = symmetry.obs.moments(mean.double(), std.double().square())
-    own = [
-        (weight.to(mean.dtype), bias.to(mean.dtype))
-        for weight, bias in scaled_by(layers, mean, std, middle, var.sqrt())
-    ]
+    scaled = scaled_by(layers, mean, std, middle, var.sqrt())
+    own = [(weight.to(mean.dtype), bias.to(mean.dtype)) for weight, bias in scaled]
     change = "its answers averaged with their mirror images"
     return Start(own, middle.to(mean.dtype), var.sqrt().to(std.dtype), change)
 
 
 def scaled_by(
-    layers: Sequence[tuple[torch.Tensor, torch.Tensor]], mean: torch.Tensor, std: torch.Tensor,
-    other_mean: torch.Tensor, other_std: torch.Tensor,
-) -> list[tuple[torch.Tensor, torch.Tensor]]:  # fmt: skip
+    layers: Weights, mean: torch.Tensor, std: torch.Tensor, other_mean: torch.Tensor, other_std: torch.Tensor
+) -> Weights:
     """Return the layers, float64, for observations scaled by other statistics (num_obs,) than by mean and std.
 
     The first makes up for the change: W (x - mean) / std stays the same for all x within the limits.

@@ -40,7 +40,7 @@ def leg_dimensions(description: RobotDescription, leg: str) -> LegDimensions:
     lateral, outer, inner = (description.joint(f"{leg}_{name}").origin for name in ("lateral", "outer", "inner"))
     knee = description.joint(f"{leg}_outer_knee").origin
     return LegDimensions(
-        hip=tuple(map(float, lateral)),
+        hip=(float(lateral[0]), float(lateral[1]), float(lateral[2])),
         front=math.copysign(1.0, lateral[0]),
         side=math.copysign(1.0, lateral[1]),
         outer_x=float(outer[0]),

@@ -60,16 +60,11 @@ class BlockCfg:
 
 
 def platform(height: float, *, edge: float = 0.5, size: float = SIZE, cell: float = CELL) -> newton.Heightfield:
-    """Return level ground with a step across x: z = 0 up to `edge`, beyond it `height`.
+    """Return level ground with a step across x: z = 0 up to `edge` [m], beyond it `height` [m], negative for a drop.
 
-    Args:
-        height: Of the ground beyond the edge [m]; negative for a drop, so that the robot starts on a platform.
-        edge: Where the step begins [m] along x, moved back to the nearest node; the wall takes one cell.
-        size: Edge of the square [m].
-        cell: Distance between nodes [m], at most; it is made to divide `size`.
-
-    Raises:
-        ValueError: `height` is zero or not finite, an edge not between 0 and the rim, or as `uneven` for size and cell.
+    The edge moves back to the nearest node, and the wall takes one cell. size: edge of the square [m]; cell: largest
+    distance between nodes [m]. Raises ValueError: `height` is zero or not finite, an edge not between 0 and the rim,
+    or as `uneven` for size and cell.
     """
     x = _nodes(size, cell)
     if not (np.isfinite(height) and height != 0.0):
@@ -89,20 +84,13 @@ def uneven(
     size: float = SIZE,
     cell: float = CELL,
 ) -> newton.Heightfield:
-    """Return smooth random bumps, level within `flat_radius` of the origin.
+    """Return smooth random bumps up to `amplitude` [m] high and deep, level within `flat_radius` [m] of the origin.
 
-    Args:
-        amplitude: Largest height or depth [m].
-        seed: Of the bumps; the same seed gives the same ground.
-        flat_radius: Radius [m] of the level ground at the start; the bumps grow to full height over the next
-            two `length`s.
-        length: Correlation length [m], where the correlation of two heights has fallen to 1/e. With the defaults slopes
-            reach 20 to 25 degrees.
-        size: Edge of the square [m].
-        cell: Distance between nodes [m], at most; it is made to divide `size`.
+    The bumps grow to full height over the next two `length`s: the correlation length [m], where the correlation of two
+    heights has fallen to 1/e. With the defaults slopes reach 20 to 25 degrees. size: edge of the square [m]; cell:
+    largest distance between nodes [m].
 
-    Raises:
-        ValueError: a length that is not positive, a cell above half of `size`, or no room beyond `flat_radius`.
+    Raises ValueError: a length that is not positive, a cell above half of `size`, or no room beyond `flat_radius`.
     """
     x = _nodes(size, cell)
     if not (amplitude > 0.0 and length > 0.0):

@@ -10,7 +10,7 @@ import dataclasses
 import math
 from collections.abc import Callable
 from types import ModuleType
-from typing import Any
+from typing import Any, cast
 
 import newton
 import numpy as np
@@ -22,15 +22,7 @@ from jumper_warp.robot.gravity import EARTH, check_gravity
 from jumper_warp.robot.parts import Link, Shape
 from jumper_warp.utils.checks import check_count
 from jumper_warp.utils.errors import InputError
-
-__all__ = [
-    "LEGS",
-    "MOTOR_JOINTS",
-    "build_model",
-    "leg_geometry",
-    "leg_geometry_array",
-    "standing_configuration",
-]
+from jumper_warp.utils.newton_types import Model
 
 PHYSICS_DT = 1.0 / 480.0
 """Physics step [s] that contacts and loops are tuned for."""
@@ -72,16 +64,14 @@ def build_model(
     requires_grad: bool = False,
     visuals: bool = True,
     extras: Extras | None = None,
-) -> newton.Model:
-    """Return a Newton model of `num_worlds` robots, standing in the default pose.
+) -> Model:
+    """Return a Newton model of `num_worlds` robots, standing in the default pose; labels start with `world_i/`.
 
     Args:
-        num_worlds: Number of worlds, one robot each; labels start with `world_i/`.
         description: The robot; by default the project's own.
         ground: "plane" (z = 0), a heightfield, or None for free flight.
         friction: Coulomb friction coefficient of the paws [1].
         gravity: Downward, of every world [m/s^2]; `model.gravity` holds that of each.
-        device: Warp device.
         requires_grad: Whether the model's arrays carry gradients.
         visuals: Whether to add shapes that only viewers see. Without them large batches build faster.
         extras: Adds the caller's own sites and shapes. It is called once, with the builder of one robot, whose links
@@ -107,10 +97,10 @@ def build_model(
         extras(robot)
     builder.replicate(robot, num_worlds, label_prefixes=[f"world_{i}" for i in range(num_worlds)])
     _add_ground(builder, ground)
-    return builder.finalize(device=device, requires_grad=requires_grad)
+    return cast(Model, builder.finalize(device=device, requires_grad=requires_grad))
 
 
-def other_colliders(model: newton.Model) -> np.ndarray:
+def other_colliders(model: Model) -> np.ndarray:
     """Return the indices of the shapes that collide and are neither paws nor the ground that all worlds share."""
     flags, worlds, kinds = model.shape_flags.numpy(), model.shape_world.numpy(), model.shape_type.numpy()
     ground = (worlds == -1) & np.isin(kinds, [int(newton.GeoType.PLANE), int(newton.GeoType.HFIELD)])
@@ -263,7 +253,7 @@ def _add_visuals(builder: newton.ModelBuilder, body: int, link: Link, meshes: di
             builder.add_shape_cylinder(body, radius=shape.size[0], half_height=0.5 * shape.size[1], **common)
         elif shape.kind == "sphere":
             builder.add_shape_sphere(body, radius=shape.size[0], **common)
-        else:
+        elif shape.mesh is not None:
             mesh = meshes.get(id(shape.mesh))
             if mesh is None:
                 mesh = newton.Mesh(shape.mesh.vertices, shape.mesh.triangles.flatten(), compute_inertia=False)

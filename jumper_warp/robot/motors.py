@@ -79,23 +79,14 @@ class MotorCfg:
         motors = description.motors
         if len({*motors[0::3]}) > 1 or len({*motors[1::3], *motors[2::3]}) > 1:
             raise InputError(f"{description.path}: the lateral motors, and the transversal ones, must be of one type")
-        return cls(
-            lateral=motor_kind(motors[0], gains, lateral_torque),
-            transversal=motor_kind(motors[1], gains, transversal_torque),
-        )
+        return cls(motor_kind(motors[0], gains, lateral_torque), motor_kind(motors[1], gains, transversal_torque))
 
 
 def motor_kind(motor: Motor, gains: Literal["jumping", "walking"], torque: float) -> MotorKindCfg:
     """Return the settings of a motor type, limited to `torque` [N m] and to its peak torque."""
     chosen = getattr(motor, gains)
-    return MotorKindCfg(
-        kp=chosen.kp,
-        kd=chosen.kd,
-        saturation=min(torque, motor.peak_torque),
-        peak=motor.peak_torque,
-        cutoff_speed=motor.cutoff_speed,
-        no_load_speed=motor.no_load_speed,
-    )
+    saturation, peak = min(torque, motor.peak_torque), motor.peak_torque
+    return MotorKindCfg(chosen.kp, chosen.kd, saturation, peak, motor.cutoff_speed, motor.no_load_speed)
 
 
 def jumping_motors(torque: float = 18.0, lateral_torque: float | None = None) -> MotorCfg:
@@ -180,47 +171,30 @@ class FilterCfg:
                 raise InputError(f"filter {name} must be finite and > 0, got {getattr(self, name)}")
 
 
+JUMP_LATERAL = LimitsCfg(-15.0, 15.0, lower_zone=10.0, upper_zone=15.0)
+JUMP_TRANSVERSAL = LimitsCfg(-30.0, 140.0, lower_zone=10.0, upper_zone=15.0)
+
+
 def vertical_jump_filter() -> FilterCfg:
     """Return the filter for vertical jumps."""
-    return FilterCfg(
-        lateral=LimitsCfg(-15.0, 15.0, lower_zone=10.0, upper_zone=15.0),
-        transversal=LimitsCfg(-30.0, 140.0, lower_zone=10.0, upper_zone=15.0),
-        sum=LimitsCfg(0.0, 240.0, lower_zone=35.0, upper_zone=45.0),
-        horizon=8.0 / 60.0,
-    )
+    return FilterCfg(JUMP_LATERAL, JUMP_TRANSVERSAL, sum=LimitsCfg(0.0, 240.0, 35.0, 45.0), horizon=8.0 / 60.0)
 
 
 def horizontal_jump_filter() -> FilterCfg:
     """Return the filter for horizontal jumps."""
-    return FilterCfg(
-        lateral=LimitsCfg(-15.0, 15.0, lower_zone=10.0, upper_zone=15.0),
-        transversal=LimitsCfg(-30.0, 140.0, lower_zone=10.0, upper_zone=15.0),
-        sum=LimitsCfg(0.0, 220.0, lower_zone=30.0, upper_zone=30.0),
-        horizon=8.0 / 60.0,
-    )
+    return FilterCfg(JUMP_LATERAL, JUMP_TRANSVERSAL, sum=LimitsCfg(0.0, 220.0, 30.0, 30.0), horizon=8.0 / 60.0)
 
 
 def walking_filter() -> FilterCfg:
     """Return the filter for walking: no hard zones, and the lateral range that the robot's hard stops leave."""
-    return FilterCfg(
-        lateral=LimitsCfg(-50.0, 110.0),
-        transversal=LimitsCfg(-30.0, 140.0),
-        sum=LimitsCfg(0.0, 220.0),
-        horizon=5.0 / 60.0,
-    )
+    lateral, transversal = LimitsCfg(-50.0, 110.0), LimitsCfg(-30.0, 140.0)
+    return FilterCfg(lateral, transversal, sum=LimitsCfg(0.0, 220.0), horizon=5.0 / 60.0)
 
 
 def loose_filter() -> FilterCfg:
-    """Return a filter that leaves full torque to the last, for the jump with all that the motors can give.
-
-    It looks two policy steps ahead.
-    """
-    return FilterCfg(
-        lateral=LimitsCfg(-15.0, 15.0),
-        transversal=LimitsCfg(-30.0, 140.0),
-        sum=LimitsCfg(0.0, 240.0),
-        horizon=2.0 / 60.0,
-    )
+    """Return a filter that looks two policy steps ahead and leaves full torque to the last, for the highest jumps."""
+    lateral, transversal = LimitsCfg(-15.0, 15.0), LimitsCfg(-30.0, 140.0)
+    return FilterCfg(lateral, transversal, sum=LimitsCfg(0.0, 240.0), horizon=2.0 / 60.0)
 
 
 def filter_params(cfg: FilterCfg, *, module: ModuleType = command_filter) -> Any:

@@ -8,17 +8,16 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+import pinocchio
 
 from jumper_warp.robot.description import LEGS, MOTOR_JOINTS, RobotDescription, load_description
 from jumper_warp.robot.values import LINK_KINDS, RobotValues
 from jumper_warp.utils.errors import InputError
 
-if TYPE_CHECKING:
-    import pinocchio as pin
-
+pin: Any = pinocchio  # a compiled module without types
 PROXIMAL_ACCURACY = 1.0e-12
 PROXIMAL_DAMPING = 1.0e-10
 """A planar loop has three rows of rank two; the proximal term keeps the solve regular."""
@@ -36,8 +35,10 @@ class PinocchioRobot:
     The buffers in `data` are overwritten by every call.
     """
 
-    model: pin.Model
-    data: pin.Data
+    model: Any
+    """`pinocchio.Model`"""
+    data: Any
+    """`pinocchio.Data`"""
     constraints: Any
     """Loop constraint models, in leg order."""
     constraint_data: Any
@@ -53,16 +54,9 @@ class PinocchioRobot:
     def configuration(self, base_pos: np.ndarray, base_quat_xyzw: np.ndarray, motors: np.ndarray) -> np.ndarray:
         """Return q, shape (27,), with the knee angles that close the loops, ankles below the knees.
 
-        Args:
-            base_pos: Body origin [m], shape (3,), world frame.
-            base_quat_xyzw: Body to world, unit, shape (4,).
-            motors: Motor angles [rad], shape (12,), motor order.
-
-        Raises:
-            ValueError: a loop cannot be closed.
+        base_pos: body origin [m], world frame. base_quat_xyzw: body to world, unit. motors: angles [rad] in motor
+        order. Raises ValueError: a loop cannot be closed.
         """
-        import pinocchio as pin
-
         q = pin.neutral(self.model)
         q[0:3] = base_pos
         q[3:7] = base_quat_xyzw
@@ -76,33 +70,25 @@ class PinocchioRobot:
 
     def loop_gap(self, q: np.ndarray) -> float:
         """Return the largest distance [m] between the two anchors of a loop."""
-        import pinocchio as pin
-
         pin.forwardKinematics(self.model, self.data, q)
-        anchors = [
-            [self.data.oMi[joint].act(placement.translation) for joint, placement in ends]
-            for ends in (
-                ((c.joint1_id, c.joint1_placement), (c.joint2_id, c.joint2_placement)) for c in self.constraints
-            )
-        ]
-        return max(float(np.linalg.norm(a - b)) for a, b in anchors)
+        place = self.data.oMi
+        gaps = (
+            place[c.joint1_id].act(c.joint1_placement.translation)
+            - place[c.joint2_id].act(c.joint2_placement.translation)
+            for c in self.constraints
+        )
+        return max(float(np.linalg.norm(gap)) for gap in gaps)
 
     def paw_positions(self, q: np.ndarray) -> np.ndarray:
         """Return the paws' centres [m], shape (4, 3), world frame, legs FL, FR, BL, BR, of a configuration (27,)."""
-        import pinocchio as pin
-
         pin.forwardKinematics(self.model, self.data, q)
         return np.array([self.data.oMi[c.joint1_id].act(c.joint1_placement.translation) for c in self.constraints])
 
     def paw_velocities(self, q: np.ndarray, v: np.ndarray) -> np.ndarray:
         """Return the velocities of the paws' centres [m/s], shape (4, 3), world frame, legs FL, FR, BL, BR.
 
-        Args:
-            q: Configuration, shape (27,).
-            v: Velocity, shape (26,), as `closed_velocity` returns it.
+        q: (27,); v: (26,), as `closed_velocity` returns it.
         """
-        import pinocchio as pin
-
         pin.forwardKinematics(self.model, self.data, q, v)
         found = []
         for c in self.constraints:
@@ -115,22 +101,15 @@ class PinocchioRobot:
 
         Legs FL, FR, BL, BR; motors lateral, outer, inner; the base does not move.
         """
-        columns = []
-        for motor in range(3):
-            rates = np.tile(np.eye(3)[motor], 4)
-            columns.append(self.paw_velocities(q, self.closed_velocity(q, np.zeros(6), rates)))
-        return np.stack(columns, axis=2)
+        rates = (np.tile(motor, 4) for motor in np.eye(3))
+        return np.stack([self.paw_velocities(q, self.closed_velocity(q, np.zeros(6), rate)) for rate in rates], axis=2)
 
     def closed_velocity(self, q: np.ndarray, base_twist: np.ndarray, motor_rates: np.ndarray) -> np.ndarray:
-        """Return v, shape (26,), with the knee rates that keep the loops closed.
+        """Return v, shape (26,), with the knee rates that keep the loops of a configuration (27,) closed.
 
-        Args:
-            q: Configuration with closed loops, shape (27,).
-            base_twist: Linear velocity of the body origin and angular velocity, body frame, shape (6,).
-            motor_rates: [rad/s], shape (12,), motor order.
+        base_twist: linear velocity [m/s] of the body origin and angular velocity [rad/s], body frame. motor_rates:
+        [rad/s], motor order.
         """
-        import pinocchio as pin
-
         v = np.zeros(self.model.nv)
         v[self.motor_v] = motor_rates
         pin.computeJointJacobians(self.model, self.data, q)
@@ -145,15 +124,9 @@ class PinocchioRobot:
         """Return the acceleration dv/dt, shape (26,), of the robot in free flight under gravity, loops rigid.
 
         The base's six are derivatives of its components in the body frame, which turns: the origin's own acceleration
-        is theirs plus omega x v.
-
-        Args:
-            q: Configuration with closed loops, shape (27,).
-            v: Velocity that keeps them closed, shape (26,).
-            motor_torques: [N m], shape (12,), motor order. Motors carry their armature, and no friction.
+        is theirs plus omega x v. q: (27,), loops closed; v: (26,), which keeps them closed; motor_torques: [N m],
+        (12,), motor order. Motors carry their armature, and no friction.
         """
-        import pinocchio as pin
-
         torques = np.zeros(self.model.nv)
         torques[self.motor_v] = motor_torques
         pin.initConstraintDynamics(self.model, self.data, self.constraints, self.constraint_data)
@@ -180,15 +153,11 @@ class PinocchioRobot:
 
 
 def build_pinocchio(description: RobotDescription | None = None, values: RobotValues | None = None) -> PinocchioRobot:
-    """Return the robot in Pinocchio, with a free-flying base.
+    """Return the robot in Pinocchio, with a free-flying base; by default the project's own.
 
-    Args:
-        description: The robot; by default the project's own.
-        values: Masses and armatures of a robot that differs from it, as `RobotOverlay.robots()` returns them; the
-            first robot counts, and nothing but its `base_mass`, `base_com`, `base_inertia`, `link_mass` and `armature`.
+    values: a robot that differs from the description, as `RobotOverlay.robots()` returns it; the first one counts, and
+    nothing but its `base_mass`, `base_com`, `base_inertia`, `link_mass` and `armature`.
     """
-    import pinocchio as pin
-
     description = load_description() if description is None else description
     values = RobotValues.nominal(1, description) if values is None else values
     model = pin.buildModelFromXML(description.urdf, pin.JointModelFreeFlyer())
@@ -220,14 +189,12 @@ def build_pinocchio(description: RobotDescription | None = None, values: RobotVa
     )
 
 
-def _write_masses(model: pin.Model, description: RobotDescription, values: RobotValues) -> None:
+def _write_masses(model: Any, description: RobotDescription, values: RobotValues) -> None:
     """Give the links the masses, centres of mass and inertias of the first of some robots."""
-    import pinocchio as pin
-
     base, ratio = description.links[0], values.base_mass[0, 0] / description.links[0].mass
     inertia = ratio * values.base_inertia[0, 0] * base.inertia
     model.inertias[1] = pin.Inertia(values.base_mass[0, 0], values.base_com[0], inertia)
-    ratios = dict(zip(LINK_KINDS, values.link_mass[0], strict=True))
+    ratios: dict[str, float] = dict(zip(LINK_KINDS, values.link_mass[0], strict=True))
     for joint in description.joints:
         link, scale = description.link(joint.child), ratios[joint.child[3:]]
         own = pin.Inertia(scale * link.mass, link.com, scale * link.inertia)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import newton
 import numpy as np
@@ -88,8 +89,10 @@ def terrain_map(cfg: TerrainCfg) -> newton.Heightfield:
             y, x = edge + j * nodes, edge + i * nodes
             rng = np.random.default_rng([cfg.seed, i, j])
             heights[y : y + nodes + 1, x : x + nodes + 1] = tile_heights(cfg, kind, (i + 1) / cfg.rows, rng)
-    half_x, half_y = (0.5 * cell * (size - 1) for size in (heights.shape[1], heights.shape[0]))
-    return newton.Heightfield(data=heights, nrow=heights.shape[0], ncol=heights.shape[1], hx=half_x, hy=half_y)
+    rows, cols = heights.shape
+    return newton.Heightfield(
+        data=heights, nrow=rows, ncol=cols, hx=0.5 * cell * (cols - 1), hy=0.5 * cell * (rows - 1)
+    )
 
 
 def single_tile(cfg: TerrainCfg, kind: str) -> newton.Heightfield:
@@ -110,79 +113,73 @@ def tile_heights(cfg: TerrainCfg, kind: str, difficulty: float, rng: np.random.G
     """Return the heights [m] of a tile's nodes, rows along y, 0 on its rim; difficulty: 0 to 1."""
     nodes = math.ceil(cfg.tile / cfg.cell - 1.0e-9) + 1
     axis = np.linspace(-0.5 * cfg.tile, 0.5 * cfg.tile, nodes)
-    x, y = np.meshgrid(axis, axis)
-    return _SHAPES[kind](cfg, difficulty, rng, x, y)
+    return _SHAPES[kind](_Tile(cfg, difficulty, rng, *np.meshgrid(axis, axis)))
 
 
-def _inward(cfg: TerrainCfg, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Return the way [m] from the rim towards the level middle, which it does not enter."""
-    off = np.maximum(np.abs(x), np.abs(y))
-    return np.clip(0.5 * cfg.tile - cfg.rim - off, 0.0, 0.5 * cfg.tile - cfg.rim - cfg.start)
+class _Tile(NamedTuple):
+    """A tile: how hard it is, and the coordinates x and y [m] of its nodes, from its middle."""
+
+    cfg: TerrainCfg
+    difficulty: float
+    rng: np.random.Generator
+    x: np.ndarray
+    y: np.ndarray
+
+    @property
+    def off(self) -> np.ndarray:
+        """Distance [m] from the middle along x or y, the larger one."""
+        return np.maximum(np.abs(self.x), np.abs(self.y))
+
+    @property
+    def reach(self) -> float:
+        """Distance [m] of the level rim from the middle."""
+        return 0.5 * self.cfg.tile - self.cfg.rim
+
+    @property
+    def step(self) -> float:
+        """Height of steps [m]."""
+        return self.cfg.step[0] + self.difficulty * (self.cfg.step[1] - self.cfg.step[0])
+
+    def slope(self) -> np.ndarray:
+        """Return ground that rises from the rim to the level middle."""
+        return math.tan(math.radians(self.difficulty * self.cfg.slope)) * self._inward()
+
+    def stairs(self) -> np.ndarray:
+        """Return steps of 0.6 m that rise from the rim to the level middle."""
+        return self.step * np.floor(self._inward() / 0.6 + 1.0e-6)
+
+    def _inward(self) -> np.ndarray:
+        """Return the way [m] from the rim towards the level middle, which it does not enter."""
+        return np.clip(self.reach - self.off, 0.0, self.reach - self.cfg.start)
+
+    def waves(self, shortest: float, longest: float, count: int) -> np.ndarray:
+        """Return a sum of plane waves in any direction, of wavelengths [m] drawn between two, as high as they may be.
+
+        It is level on the rim and in the middle, and grows to full height over 0.3 m.
+        """
+        total = np.zeros_like(self.x)
+        for length in self.rng.uniform(shortest, longest, count):
+            angle, phase = self.rng.uniform(0.0, 2.0 * math.pi, 2)
+            along = math.cos(angle) * self.x + math.sin(angle) * self.y
+            total += math.sqrt(length) * np.sin(2.0 * math.pi * along / length + phase)
+        share = np.clip(np.minimum(self.reach - self.off, self.off - self.cfg.start) / 0.3, 0.0, 1.0)
+        total *= share * share * (3.0 - 2.0 * share)
+        return total / np.abs(total).max() * self.difficulty * self.cfg.uneven
+
+    def blocks(self) -> np.ndarray:
+        """Return squares of 0.5 m, half of them a step high."""
+        raised = self.rng.integers(0, 2, (64, 64))
+        square = raised[np.floor(self.y / 0.5).astype(int) + 32, np.floor(self.x / 0.5).astype(int) + 32]
+        return self.step * square * ((self.off > self.cfg.start) & (self.off < self.reach))
 
 
-def _blend(cfg: TerrainCfg, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Return a share that is 0 on the rim and in the level middle, and 1 from 0.3 m away from them."""
-    off = np.maximum(np.abs(x), np.abs(y))
-    share = np.clip(np.minimum(0.5 * cfg.tile - cfg.rim - off, off - cfg.start) / 0.3, 0.0, 1.0)
-    return share * share * (3.0 - 2.0 * share)
-
-
-def _flat(cfg: TerrainCfg, difficulty: float, rng: np.random.Generator, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    return np.zeros_like(x)
-
-
-def _waves_of(
-    cfg: TerrainCfg, difficulty: float, rng: np.random.Generator, x: np.ndarray, y: np.ndarray, lengths: np.ndarray
-) -> np.ndarray:
-    """Return a sum of plane waves in any direction, wavelengths [m] as given, as high and deep as they may be."""
-    total = np.zeros_like(x)
-    for length in lengths:
-        angle, phase = rng.uniform(0.0, 2.0 * math.pi, 2)
-        along = math.cos(angle) * x + math.sin(angle) * y
-        total += math.sqrt(length) * np.sin(2.0 * math.pi * along / length + phase)
-    total *= _blend(cfg, x, y)
-    return total / np.abs(total).max() * difficulty * cfg.uneven
-
-
-def _uneven(cfg: TerrainCfg, difficulty: float, rng: np.random.Generator, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    return _waves_of(cfg, difficulty, rng, x, y, rng.uniform(0.3, 1.2, 40))
-
-
-def _waves(cfg: TerrainCfg, difficulty: float, rng: np.random.Generator, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    return _waves_of(cfg, difficulty, rng, x, y, rng.uniform(1.0, 4.0, 6))
-
-
-def _slope(cfg: TerrainCfg, difficulty: float, rng: np.random.Generator, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    return math.tan(math.radians(difficulty * cfg.slope)) * _inward(cfg, x, y)
-
-
-def _bowl(cfg: TerrainCfg, difficulty: float, rng: np.random.Generator, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    return -_slope(cfg, difficulty, rng, x, y)
-
-
-def _step(cfg: TerrainCfg, difficulty: float) -> float:
-    """Return the height of steps [m]."""
-    return cfg.step[0] + difficulty * (cfg.step[1] - cfg.step[0])
-
-
-def _stairs(cfg: TerrainCfg, difficulty: float, rng: np.random.Generator, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    return _step(cfg, difficulty) * np.floor(_inward(cfg, x, y) / 0.6 + 1.0e-6)
-
-
-def _pit(cfg: TerrainCfg, difficulty: float, rng: np.random.Generator, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    return -_stairs(cfg, difficulty, rng, x, y)
-
-
-def _blocks(cfg: TerrainCfg, difficulty: float, rng: np.random.Generator, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Return squares of 0.5 m, half of them a step high."""
-    raised = rng.integers(0, 2, (64, 64))
-    square = raised[np.floor(y / 0.5).astype(int) + 32, np.floor(x / 0.5).astype(int) + 32]
-    off = np.maximum(np.abs(x), np.abs(y))
-    outside = (off > cfg.start) & (off < 0.5 * cfg.tile - cfg.rim)
-    return _step(cfg, difficulty) * square * outside
-
-
-_SHAPES: dict[str, Callable[..., np.ndarray]] = {
-    "flat": _flat, "uneven": _uneven, "waves": _waves, "slope": _slope, "bowl": _bowl, "stairs": _stairs,
-    "pit": _pit, "blocks": _blocks,
-}  # fmt: skip
+_SHAPES: dict[str, Callable[[_Tile], np.ndarray]] = {
+    "flat": lambda tile: np.zeros_like(tile.x),
+    "uneven": lambda tile: tile.waves(0.3, 1.2, 40),
+    "waves": lambda tile: tile.waves(1.0, 4.0, 6),
+    "slope": _Tile.slope,
+    "bowl": lambda tile: -tile.slope(),
+    "stairs": _Tile.stairs,
+    "pit": lambda tile: -tile.stairs(),
+    "blocks": _Tile.blocks,
+}

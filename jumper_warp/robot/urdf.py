@@ -116,7 +116,7 @@ class UrdfReader:
 
     def link(self, element: Element) -> Link:
         """Return one link, with its mass and inertia checked."""
-        name = element.get("name")
+        name = element.get("name", "")
         part = f"link {name}"
         inertial = self.child(element, "inertial", part)
         mass = self.numbers(self.child(inertial, "mass", part), "value", 1, part)[0]
@@ -141,14 +141,14 @@ class UrdfReader:
 
     def joint(self, element: Element) -> Joint:
         """Return one joint, with its axis and limits checked."""
-        name = element.get("name")
+        name = element.get("name", "")
         part = f"joint {name}"
         kind = element.get("type")
         self.require(kind == "revolute", part, f"expected type revolute, found {kind}")
         parent, child = (self.child(element, tag, part).get("link") or "" for tag in ("parent", "child"))
         axis = np.array(self.numbers(self.child(element, "axis", part), "xyz", 3, part))
         length = np.linalg.norm(axis)
-        self.require(abs(length - 1.0) < 1.0e-6, part, f"expected an axis of length 1, found {axis.tolist()}")
+        self.require(bool(abs(length - 1.0) < 1.0e-6), part, f"expected an axis of length 1, found {axis.tolist()}")
         limit = self.child(element, "limit", part)
         keys = ("lower", "upper", "effort", "velocity")
         lower, upper, effort, velocity = (self.numbers(limit, key, 1, part)[0] for key in keys)

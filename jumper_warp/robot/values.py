@@ -10,6 +10,8 @@ from jumper_warp.robot.description import RobotDescription, load_description
 
 LINK_KINDS = ("housing", "outer_thigh", "outer_shank", "inner_thigh", "inner_shank")
 """Links of a leg; those of one kind share their mass ratio."""
+LATERAL, TRANSVERSAL = tuple(range(0, 12, 3)), tuple(motor for motor in range(12) if motor % 3)
+"""Indices of the motors of each kind."""
 PAW_FRICTION = 0.9
 """[1] Of the described robot, as in `Simulation`."""
 MOTOR_QUANTITIES = (

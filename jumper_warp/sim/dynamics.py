@@ -16,6 +16,7 @@ from jumper_warp.robot.model import leg_geometry_array
 from jumper_warp.sim.precision import float64_kernels
 from jumper_warp.sim.slices import Worlds
 from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.newton_types import Model
 
 LINKS = ("housing", "outer_thigh", "outer_shank", "inner_thigh", "inner_shank")
 JOINTS = ("lateral", "outer", "outer_knee", "inner", "inner_knee")
@@ -45,7 +46,7 @@ def kernel_modules(double: bool = False) -> SimpleNamespace:
     )
 
 
-def check_model(model: newton.Model) -> None:
+def check_model(model: Model) -> None:
     """Raise NotThisRobotError unless every world of a model holds this robot, its labels in the expected order."""
     bodies = ["body"] + [f"{leg}_{link}" for leg in LEGS for link in LINKS]
     joints = ["base"] + [f"{leg}_{joint}" for leg in LEGS for joint in JOINTS] + [f"{leg}_ankle" for leg in LEGS]
@@ -79,7 +80,7 @@ def check_model(model: newton.Model) -> None:
             raise NotThisRobotError(f"{number} {what} cannot be simulated: every world must hold {ALONE}")
 
 
-def find_paws(model: newton.Model) -> np.ndarray:
+def find_paws(model: Model) -> np.ndarray:
     """Return the shape indices of the paws, shape (num_worlds, 4)."""
     paws = {leg: [] for leg in LEGS}
     for i, label in enumerate(model.shape_label):
@@ -92,7 +93,7 @@ def find_paws(model: newton.Model) -> np.ndarray:
     return np.array([paws[leg] for leg in LEGS], dtype=np.int32).T
 
 
-def find_ground(model: newton.Model) -> int:
+def find_ground(model: Model) -> int:
     """Return the index of the ground shape, a plane z = 0 or a heightfield of the global world; -1 without one.
 
     Raises NotThisRobotError for more than one, or a plane that is not z = 0.
@@ -111,7 +112,7 @@ def find_ground(model: newton.Model) -> int:
     return int(found[0])
 
 
-def ground_struct(model: newton.Model, shape: int, ground_module: ModuleType) -> Any:
+def ground_struct(model: Model, shape: int, ground_module: ModuleType) -> Any:
     """Return the kernels' `Ground` for a ground shape; without one (-1) a plane far below."""
     ground = ground_module.Ground()
     heights = np.zeros((1, 1), dtype=np.float32)
@@ -134,7 +135,7 @@ def block_array(cfg: BlockCfg | None, num_worlds: int, modules: SimpleNamespace,
     """Return the kernels' `Block` of every world, at rest at its start; empty without blocks."""
     block = modules.ground.Block
     fields = {} if cfg is None else cfg.per_world(num_worlds)
-    values = np.zeros(num_worlds if fields else 0, dtype=block.numpy_dtype())
+    values: Any = np.zeros(num_worlds if fields else 0, dtype=block.numpy_dtype())
     for name, value in fields.items():
         values[name] = value
     if fields:
@@ -152,7 +153,7 @@ class JumperDynamics:
 
     def __init__(
         self,
-        model: newton.Model,
+        model: Model,
         *,
         description: RobotDescription | None = None,
         block: BlockCfg | None = None,
@@ -195,14 +196,15 @@ class JumperDynamics:
         """Return fresh work arrays."""
         scalar, n = self.modules.scalar, self.num_worlds
         work = self.modules.drive.Workspace()
-        work.impulse = wp.zeros((4, n), dtype=scalar.vec3, device=self.device)
-        work.contact_force = wp.zeros((4, n), dtype=scalar.vec3, device=self.device)
-        work.peak_force = wp.zeros(n, dtype=scalar.real, device=self.device)
-        work.peak_paw_force = wp.zeros((4, n), dtype=scalar.real, device=self.device)
-        work.torque = wp.zeros((12, n), dtype=scalar.real, device=self.device)
-        work.residual = wp.zeros(n, dtype=scalar.real, device=self.device)
-        work.sweeps = wp.zeros(n, dtype=int, device=self.device)
-        work.invalid = wp.zeros(n, dtype=int, device=self.device)
+        for names, shape, dtype in (
+            (("impulse", "contact_force"), (4, n), scalar.vec3),
+            (("peak_force", "residual"), n, scalar.real),
+            (("peak_paw_force",), (4, n), scalar.real),
+            (("torque",), (12, n), scalar.real),
+            (("sweeps", "invalid"), n, int),
+        ):
+            for name in names:
+                setattr(work, name, wp.zeros(shape, dtype=dtype, device=self.device))
         work.reference_q = wp.array(self.model.joint_q.numpy(), dtype=scalar.real, device=self.device)
         return work
 
@@ -226,11 +228,8 @@ class JumperDynamics:
     def pack_masses(self) -> None:
         """Read masses, centres of mass and inertias."""
         m = self.model
-        self._launch(
-            self.modules.parameters.pack_masses_kernel,
-            (self.num_worlds, 21),
-            [m.body_mass, m.body_com, m.body_inertia],
-        )
+        arrays = [m.body_mass, m.body_com, m.body_inertia]
+        self._launch(self.modules.parameters.pack_masses_kernel, (self.num_worlds, 21), arrays)
 
     def pack_joints(self) -> None:
         """Read armature, friction, damping and hard stops."""
@@ -248,12 +247,7 @@ class JumperDynamics:
         self._launch(
             self.modules.parameters.pack_friction_kernel,
             (self.num_worlds, 4),
-            [
-                self._paws,
-                self._ground_shape,
-                self.model.shape_material_mu,
-                self.static_friction_ratio,
-            ],
+            [self._paws, self._ground_shape, self.model.shape_material_mu, self.static_friction_ratio],
         )
 
     def repack(self, mask: wp.array, worlds: Worlds | None = None) -> None:

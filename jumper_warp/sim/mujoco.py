@@ -7,12 +7,13 @@ import warp as wp
 
 from jumper_warp.robot.model import PAWS, PHYSICS_DT, other_colliders
 from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.newton_types import Model
 
 MUJOCO_FRICTION = 0.005
 """[1] Least friction of the paws on SolverMuJoCo: at 0.001 its pyramidal cone gives NaN in single precision."""
 
 
-def mujoco_solver(model: newton.Model, *, dt: float = PHYSICS_DT, **overrides) -> newton.solvers.SolverMuJoCo:
+def mujoco_solver(model: Model, *, dt: float = PHYSICS_DT, **overrides) -> newton.solvers.SolverMuJoCo:
     """Return Newton's MuJoCo solver with stiff loops for physics steps of `dt` [s].
 
     It knows neither a damper with a largest torque nor a stop of the sum of two angles. `Simulation` takes the knees'

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import Any
 
-import newton
 import numpy as np
 import warp as wp
 
@@ -12,12 +11,13 @@ from jumper_warp.kernels.layout import BODIES, DOFS
 from jumper_warp.robot.model import KNEE_DOFS
 from jumper_warp.robot.values import LINK_KINDS, RobotValues
 from jumper_warp.sim.dynamics import JumperDynamics, find_paws
+from jumper_warp.utils.newton_types import Model
 
 MOTOR_DOFS = [6 + 5 * leg + joint for leg in range(4) for joint in (0, 1, 3)]
 """A world's motors in `joint_qd`."""
 
 
-def write_model(model: newton.Model, robots: RobotValues, *, paws: bool = True) -> None:
+def write_model(model: Model, robots: RobotValues, *, paws: bool = True) -> None:
     """Write masses, joints and the paws' friction into a model that is as described, before a solver reads it.
 
     robots: one for all worlds, or one a world. paws: whether to write their friction.

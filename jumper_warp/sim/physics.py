@@ -1,8 +1,9 @@
-"""How a simulation is advanced, on either solver, behind one small protocol."""
+"""How a simulation is advanced, on either solver, behind one small interface."""
 
 from __future__ import annotations
 
-from typing import Any, Protocol
+from abc import ABC, abstractmethod
+from typing import Any
 
 import newton
 import warp as wp
@@ -33,8 +34,8 @@ DRAWN_FLAGS = (
 """What domain randomisation changes."""
 
 
-class Physics(Protocol):
-    """What a simulation and an environment ask of a solver. Arrays keep their place."""
+class Physics(ABC):
+    """A solver as a simulation and an environment drive it. Arrays keep their place."""
 
     sliced: bool
     """Whether it can advance some of the worlds alone."""
@@ -54,6 +55,11 @@ class Physics(Protocol):
     peak_paw_force: wp.array
     """(4, num_worlds) [N], largest on each paw in the last call of `advance`."""
 
+    def __init__(self, sim: Any) -> None:
+        """Belong to a simulation."""
+        self._sim = sim
+
+    @abstractmethod
     def advance(
         self,
         substeps: int,
@@ -70,36 +76,44 @@ class Physics(Protocol):
         default all.
         """
 
+    @abstractmethod
     def parameters_changed(self, mask: wp.array | None = None, worlds: Worlds | None = None) -> None:
         """Read the model's masses, joints and friction again, where mask (num_worlds,) is not 0; None: everywhere.
 
         worlds: at which the mask is looked at, by default all.
         """
 
-    def after_reset(self, mask: wp.array) -> None:
-        """Let everything follow from coordinates that were written anew where mask (num_worlds,) is not 0."""
-
+    @abstractmethod
     def forget(self, mask: wp.array) -> None:
         """Drop what is carried from step to step where mask (num_worlds + 1,) bool is set."""
 
+    @abstractmethod
+    def after_reset(self, mask: wp.array) -> None:
+        """Let everything follow from coordinates that were written anew where mask (num_worlds,) is not 0."""
+
     def write_bodies(self) -> None:
         """Bring the state's passive joints and bodies up to date."""
+        state = self._sim.state
+        self.dynamics.full_state(state.joint_q, state.joint_qd, state.body_q, state.body_qd)
 
     def kernels(self) -> list[tuple[wp.Kernel, int]]:
         """Return what a policy step launches and can be compiled before, each with its block size."""
+        return []
 
     def carried(self) -> dict[str, wp.array]:
         """Return what the next step depends on besides coordinates and impulses, by name."""
+        return {}
 
 
-class JumperPhysics:
+class JumperPhysics(Physics):
     """`SolverJumper`: a policy step in one launch."""
 
     sliced = True
+    solver: SolverJumper
 
     def __init__(self, sim: Any, block: BlockCfg | None, tolerance: float, keep_momentum: bool) -> None:
         """Make the solver for a simulation's model; raises ValueError as `SolverJumper`."""
-        self._sim = sim
+        super().__init__(sim)
         self.solver = SolverJumper(sim.model, block=block, tolerance=tolerance)
         self.dynamics = self.solver.dynamics
         work = self.dynamics.work
@@ -146,30 +160,23 @@ class JumperPhysics:
         if self._sim.block is not None:
             self.solver.reset_blocks(mask)
 
-    def write_bodies(self) -> None:
-        """See `Physics.write_bodies`."""
-        state = self._sim.state
-        self.dynamics.full_state(state.joint_q, state.joint_qd, state.body_q, state.body_qd)
-
     def kernels(self) -> list[tuple[wp.Kernel, int]]:
         """See `Physics.kernels`."""
         momentum = self.dynamics.modules.momentum
         kept = [(momentum.momentum_kernel, 32), (momentum.keep_momentum_kernel, 32)]
         return [self.dynamics.advance_kernel(), *(kept if self._momenta is not None else [])]
 
-    def carried(self) -> dict[str, wp.array]:
-        """See `Physics.carried`."""
-        return {}
 
-
-class MujocoPhysics:
+class MujocoPhysics(Physics):
     """Newton's SolverMuJoCo, physics step by physics step, with this robot's motors and passive joints."""
 
     sliced = False
+    solver: newton.solvers.SolverMuJoCo
 
     def __init__(self, sim: Any, observe_forces: bool) -> None:
         """Make the solver for a simulation's model, whose knee damping it takes over."""
-        self._sim, n, device, model = sim, sim.num_worlds, sim.device, sim.model
+        super().__init__(sim)
+        n, device, model = sim.num_worlds, sim.device, sim.model
         self.dynamics = JumperDynamics(model)  # refuses another robot
         damping = model.joint_damping.numpy().reshape(n, -1)
         knee_damping = float(damping[0, KNEE_DOFS[0]])
@@ -220,7 +227,7 @@ class MujocoPhysics:
         self._launch(motor_values_kernel, motors, [joint_f], [self.torque])
         self._launch(passive_torque_kernel, (sim.num_worlds, 4), [q, qd, *self._passive], [joint_f])
         self.solver.step(state, state, sim.control, self._contacts, sim.dt, observables=self._observables)
-        if self._sensor is not None:
+        if self._sensor is not None and self._contacts is not None:
             self._sensor.update(state, self._contacts, observables=self._observables)
             inputs = [self._sensor.total_force, int(restart)]
             self._launch(
@@ -243,15 +250,6 @@ class MujocoPhysics:
         for left_over in (self.solver.mjw_data.cvel, self.solver.mjw_data.cdof_dot):
             self._launch(zero_worlds_kernel, left_over.shape, [mask], [left_over])
 
-    def write_bodies(self) -> None:
-        """See `Physics.write_bodies`."""
-        state = self._sim.state
-        self.dynamics.full_state(state.joint_q, state.joint_qd, state.body_q, state.body_qd)
-
-    def kernels(self) -> list[tuple[wp.Kernel, int]]:
-        """See `Physics.kernels`; Newton's solver compiles its own at their first launches."""
-        return []
-
     def carried(self) -> dict[str, wp.array]:
         """See `Physics.carried`."""
         data = self.solver.mjw_data
@@ -259,5 +257,5 @@ class MujocoPhysics:
         bodies = {"body_q": self._sim.state.body_q, "body_qd": self._sim.state.body_qd}
         return bodies | {name: getattr(data, name) for name in names}
 
-    def _launch(self, kernel: wp.Kernel, dim: int | tuple[int, ...], inputs: list, outputs: list) -> None:
+    def _launch(self, kernel: Any, dim: int | tuple[int, ...], inputs: list, outputs: list) -> None:
         wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self._sim.device)

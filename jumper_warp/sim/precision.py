@@ -17,6 +17,7 @@ def float64_kernels() -> ModuleType:
         spec = importlib.util.spec_from_file_location(
             name, kernels.__file__, submodule_search_locations=list(kernels.__path__)
         )
+        assert spec is not None and spec.loader is not None
         package = importlib.util.module_from_spec(spec)
         sys.modules[name] = package
         spec.loader.exec_module(package)

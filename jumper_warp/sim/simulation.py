@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, cast
 
 import newton
 import numpy as np
@@ -11,7 +11,7 @@ import warp as wp
 
 from jumper_warp.kernels.actuation.command_filter import command_filter_kernel
 from jumper_warp.kernels.actuation.readout import base_velocity_kernel
-from jumper_warp.kernels.dynamics.restore import StateArrays, restore_motors_kernel, restore_state_kernel
+from jumper_warp.kernels.dynamics.restore import restore_motors_kernel, restore_state_kernel
 from jumper_warp.kernels.layout import COORDS, DOFS
 from jumper_warp.robot.gravity import EARTH
 from jumper_warp.robot.grounds import BlockCfg
@@ -22,7 +22,7 @@ from jumper_warp.robot.values import RobotValues
 from jumper_warp.sim.overlay import write_model, write_motors, write_springs
 from jumper_warp.sim.physics import JumperPhysics, MujocoPhysics, Physics
 from jumper_warp.sim.slices import SlicedGraph, Worlds, slices_of
-from jumper_warp.sim.solver import TOLERANCE, check_step, check_tolerance
+from jumper_warp.sim.solver import TOLERANCE, check_step, check_tolerance, state_arrays
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.threads import checked_threads
 
@@ -36,11 +36,36 @@ SolverName = Literal["jumper", "mujoco"]
 
 
 class Simulation:
-    """Worlds of the robot under position targets, on either solver.
+    """Worlds of the robot under position targets, on either solver; it begins standing in the default pose.
 
     Give raw motor targets [rad] to `set_targets`, or write them on the device to `target`, (12, num_worlds), where
     nothing checks them; then call `step` for one policy step: the filter once, then `substeps` times motors and
     physics. Everything is on the device; nothing waits for it.
+
+    Args:
+        solver: "jumper" or "mujoco" (Newton's SolverMuJoCo).
+        motors: By default the jumping gains at 18 N m.
+        command_filter: None leaves the targets as they are.
+        ground: As in `build_model`.
+        block: A block in each world that slides when the robot pushes it; on SolverJumper only.
+        friction: Of the paws [1].
+        gravity: Downward, of every world [m/s^2].
+        dt: Physics step [s], `substeps` of which are in a policy step.
+        tolerance: Of SolverJumper's contact iteration [m/s].
+        keep_momentum: Whether robots that fly freely keep their momentum from policy step to policy step exactly,
+            by a correction of the base's velocity; on SolverJumper only.
+        observe_forces: Whether to measure paw forces on MuJoCo, which costs time; SolverJumper always has them.
+        visuals: Whether to add shapes that only viewers see.
+        extras: Adds the caller's own sites and shapes to every world, as in `build_model`.
+        robot: What differs from the description: an overlay, or values of one robot or of one a world. Their
+            latency is the caller's to apply.
+        threads: Of a CPU, which share the worlds out and change no bit; by default what
+            `jumper_warp.utils.threads.set_threads` chose, or all cores. SolverMuJoCo and few worlds use one.
+
+    Raises:
+        ValueError: unknown solver, a block on MuJoCo, dt or tolerance not finite and positive, substeps or
+            threads no whole number of at least 1, or as `build_model` and `SolverJumper`.
+        NotThisRobotError: `extras` adds more than sites and shapes.
     """
 
     def __init__(
@@ -65,36 +90,6 @@ class Simulation:
         device: wp.DeviceLike = None,
         threads: int | None = None,
     ):
-        """Build the model, solver and motors, the robot standing in the default pose.
-
-        Args:
-            num_worlds: Number of worlds.
-            solver: "jumper" or "mujoco" (Newton's SolverMuJoCo).
-            motors: By default the jumping gains at 18 N m.
-            command_filter: None leaves the targets as they are.
-            ground: As in `build_model`.
-            block: A block in each world that slides when the robot pushes it; on SolverJumper only.
-            friction: Of the paws [1].
-            gravity: Downward, of every world [m/s^2].
-            dt: Physics step [s].
-            substeps: Physics steps in a policy step.
-            tolerance: Of SolverJumper's contact iteration [m/s].
-            keep_momentum: Whether robots that fly freely keep their momentum from policy step to policy step exactly,
-                by a correction of the base's velocity; on SolverJumper only.
-            observe_forces: Whether to measure paw forces on MuJoCo, which costs time; SolverJumper always has them.
-            visuals: Whether to add shapes that only viewers see.
-            extras: Adds the caller's own sites and shapes to every world, as in `build_model`.
-            robot: What differs from the description: an overlay, or values of one robot or of one a world. Their
-                latency is the caller's to apply.
-            device: Warp device.
-            threads: Of a CPU, which share the worlds out and change no bit; by default what
-                `jumper_warp.utils.threads.set_threads` chose, or all cores. SolverMuJoCo and few worlds use one.
-
-        Raises:
-            ValueError: unknown solver, a block on MuJoCo, dt or tolerance not finite and positive, substeps or
-                threads no whole number of at least 1, or as `build_model` and `SolverJumper`.
-            NotThisRobotError: `extras` adds more than sites and shapes.
-        """
         if solver not in ("jumper", "mujoco"):
             raise InputError(f"solver must be 'jumper' or 'mujoco', got {solver!r}")
         if solver == "mujoco" and block is not None:
@@ -108,35 +103,19 @@ class Simulation:
             num_worlds, ground=ground, friction=friction, gravity=gravity, visuals=visuals, extras=extras,
             device=device,
         )  # fmt: skip
-        values = robot.robots() if isinstance(robot, RobotOverlay) else robot
-        if values is not None:
-            given = isinstance(robot, RobotValues) or "paw_friction" in robot.values
-            write_model(self.model, values, paws=given)
-        self.robot = values
-        self.device = self.model.device
-        self.num_worlds = num_worlds
-        self.block = block
-        self.dt = dt
-        self.substeps = substeps
+        self.device, self.num_worlds, self.block = self.model.device, num_worlds, block
+        self.dt, self.substeps = dt, substeps
         self.motors = motor_arrays(motors or jumping_motors(), num_worlds, device=self.device)
-        if values is not None:
-            write_motors(self.motors, values)
+        self.robot = self._write_robot(robot)
         self._filter = None if command_filter is None else filter_params(command_filter)
-        self.state = self.model.state()
-        self.control = self.model.control()
-        standing = motor_values(self.model.joint_q.numpy().reshape(num_worlds, -1)[:, 7:])
-        self._standing = wp.array(standing.T, dtype=float, device=self.device)
-        self.target, self._safe_target = wp.clone(self._standing), wp.clone(self._standing)
-        self._mask = wp.zeros(num_worlds + 1, dtype=wp.bool, device=self.device)  # the last one: no world
-        self._base_velocity = wp.zeros(num_worlds, dtype=wp.vec3, device=self.device)
-        self._graphs: dict[str, SlicedGraph | None] = {}
+        self._make_arrays()
         self.physics: Physics = (
             JumperPhysics(self, block, tolerance, keep_momentum)
             if solver == "jumper"
             else MujocoPhysics(self, observe_forces)
         )
-        if values is not None:
-            write_springs(self.physics.dynamics, values)
+        if self.robot is not None:
+            write_springs(self.physics.dynamics, self.robot)
         shared = self.physics.sliced and not self.device.is_cuda
         self.slices = slices_of(num_worlds, threads if shared else 1)
         self.solver = self.physics.solver
@@ -147,12 +126,32 @@ class Simulation:
         start.assign(self.state)
         self._start = state_arrays(start)
 
+    def _write_robot(self, robot: RobotOverlay | RobotValues | None) -> RobotValues | None:
+        """Write a robot that differs from the description into model and motors; return its values."""
+        values = robot.robots() if isinstance(robot, RobotOverlay) else robot
+        if values is not None:
+            paws = not isinstance(robot, RobotOverlay) or "paw_friction" in robot.values
+            write_model(self.model, values, paws=paws)
+            write_motors(self.motors, values)
+        return values
+
+    def _make_arrays(self) -> None:
+        """Make the state, the targets and the arrays that are read out."""
+        self.state, self.control = self.model.state(), self.model.control()
+        standing = motor_values(self.model.joint_q.numpy().reshape(self.num_worlds, -1)[:, 7:])
+        self._standing = wp.array(standing.T, dtype=float, device=self.device)
+        self.target, self._safe_target = wp.clone(self._standing), wp.clone(self._standing)
+        self._mask = wp.zeros(self.num_worlds + 1, dtype=wp.bool, device=self.device)  # the last one: no world
+        self._base_velocity = wp.zeros(self.num_worlds, dtype=wp.vec3, device=self.device)
+        self._graphs: dict[str, SlicedGraph | None] = {}
+
     def set_targets(self, angles: np.ndarray | torch.Tensor | Sequence) -> None:
         """Write raw motor targets [rad], (12, num_worlds), or (12,) for all worlds, to `target`.
 
         Raises ValueError: another shape, or not finite.
         """
-        values = np.asarray(angles.detach().cpu() if hasattr(angles, "detach") else angles, dtype=np.float32)
+        given: Any = angles
+        values = np.asarray(given.detach().cpu() if hasattr(given, "detach") else given, dtype=np.float32)
         if values.shape not in ((12,), (12, self.num_worlds)):
             raise InputError(f"targets must have shape (12, {self.num_worlds}) or (12,), got {values.shape}")
         if not np.isfinite(values).all():
@@ -184,19 +183,20 @@ class Simulation:
         if mask is None:
             self._mask.fill_(True)
             return
+        given: Any = mask
         of_torch = hasattr(mask, "is_cuda")
         try:
-            mask = mask if of_torch or isinstance(mask, wp.array) else np.asarray(mask)
-            kind, shape = getattr(mask.dtype, "__name__", str(mask.dtype)), tuple(mask.shape)
+            given = given if of_torch or isinstance(given, wp.array) else np.asarray(given)
+            kind, shape = getattr(given.dtype, "__name__", str(given.dtype)), tuple(given.shape)
         except ValueError:  # lists of different lengths
             kind, shape = "lists", "several lengths"
         if kind not in ("bool", "torch.bool") or shape != (self.num_worlds,):
             raise InputError(f"mask must be bool of shape ({self.num_worlds},), got {kind} of shape {shape}")
         if of_torch:
-            mask = wp.from_torch(mask.contiguous())
-        elif isinstance(mask, np.ndarray):
-            mask = wp.array(mask, dtype=wp.bool, device=self.device)
-        wp.copy(self._mask, mask, count=self.num_worlds)
+            given = wp.from_torch(cast("torch.Tensor", given).contiguous())
+        elif isinstance(given, np.ndarray):
+            given = wp.array(given, dtype=wp.bool, device=self.device)
+        wp.copy(self._mask, given, count=self.num_worlds)
 
     def filter_targets(self) -> None:
         """Run the motor command filter on `target` once, on the angles that the sensors read (`motors.offset`).
@@ -247,7 +247,7 @@ class Simulation:
     def _physics(self, substeps: int, worlds: Worlds) -> None:
         self.physics.advance(substeps, self._safe_target, worlds=worlds)
 
-    def _launch(self, kernel: wp.Kernel, dim: int | tuple[int, ...], inputs: list, outputs: list) -> None:
+    def _launch(self, kernel: Any, dim: int | tuple[int, ...], inputs: list, outputs: list) -> None:
         wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device)
 
     def joint_q(self) -> np.ndarray:
@@ -285,14 +285,6 @@ class Simulation:
                 ends.append(frames[body, :3] + turned)
             gaps.append(np.linalg.norm(ends[0] - ends[1]))
         return np.array(gaps).reshape(self.num_worlds, 4).max(axis=1)
-
-
-def state_arrays(state: newton.State) -> Any:
-    """Return the kernels' view of a state."""
-    arrays = StateArrays()
-    arrays.joint_q, arrays.joint_qd = state.joint_q, state.joint_qd
-    arrays.body_q, arrays.body_qd = state.body_q, state.body_qd
-    return arrays
 
 
 def motor_values(joint_values: np.ndarray) -> np.ndarray:

@@ -14,7 +14,14 @@ import warp as wp
 from newton import ModelFlags, StateFlags
 from newton.solvers import SolverBase
 
-from jumper_warp.kernels.terrain.ground import Ground, rest_block
+from jumper_warp.kernels.actuation.readout import body_acceleration_kernel
+from jumper_warp.kernels.dynamics.restore import (
+    StateArrays,
+    clear_contact_kernel,
+    rest_blocks_kernel,
+    restore_state_kernel,
+)
+from jumper_warp.kernels.layout import COORDS
 from jumper_warp.robot.description import RobotDescription
 from jumper_warp.robot.grounds import BlockCfg
 from jumper_warp.robot.model import other_colliders
@@ -22,6 +29,7 @@ from jumper_warp.sim.dynamics import JumperDynamics
 from jumper_warp.sim.slices import Worlds
 from jumper_warp.sim.tape import DifferentiableStep
 from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.newton_types import Control, Model, State
 
 MAX_SWEEPS = 50
 """Most sweeps of the contact iteration in a step."""
@@ -45,7 +53,15 @@ def check_tolerance(tolerance: float) -> None:
         raise InputError(f"tolerance must be finite and above 0 [m/s], got {tolerance!r}")
 
 
-def warn_of_colliders(model: newton.Model) -> None:
+def state_arrays(state: State | Model) -> Any:
+    """Return the kernels' view of a state, or of the reference pose of a model."""
+    arrays = StateArrays()
+    arrays.joint_q, arrays.joint_qd = state.joint_q, state.joint_qd
+    arrays.body_q, arrays.body_qd = state.body_q, state.body_qd
+    return arrays
+
+
+def warn_of_colliders(model: Model) -> None:
     """Say which shapes collide in the model but not on SolverJumper."""
     ignored = other_colliders(model)
     if len(ignored) > 0:
@@ -54,61 +70,6 @@ def warn_of_colliders(model: newton.Model) -> None:
             f"{model.shape_label[ignored[0]]!r:.60}: only the paws touch, ground and blocks",
             stacklevel=3,
         )
-
-
-@wp.kernel(enable_backward=False)
-def _clear_kernel(
-    # in
-    mask: wp.array(dtype=wp.bool),
-    # out
-    impulse: wp.array2d(dtype=wp.vec3),
-    contact_force: wp.array2d(dtype=wp.vec3),
-    invalid: wp.array(dtype=int),
-):
-    world = wp.tid()
-    if mask[world]:
-        invalid[world] = 0
-        for k in range(4):
-            impulse[k, world] = wp.vec3(0.0)
-            contact_force[k, world] = wp.vec3(0.0)
-
-
-@wp.kernel(enable_backward=False)
-def _rest_blocks_kernel(
-    # in
-    mask: wp.array(dtype=wp.bool),
-    # in, out
-    ground: Ground,
-):
-    world = wp.tid()
-    if mask[world]:
-        rest_block(ground, world)
-
-
-@wp.kernel(enable_backward=False)
-def _restore_kernel(
-    # in
-    mask: wp.array(dtype=wp.bool),
-    reference: wp.array2d(dtype=float),
-    # out
-    values: wp.array2d(dtype=float),
-):
-    world, i = wp.tid()
-    if mask[world]:
-        values[world, i] = reference[world, i]
-
-
-@wp.kernel(enable_backward=False)
-def _acceleration_kernel(
-    # in
-    before: wp.array(dtype=wp.spatial_vector),
-    after: wp.array(dtype=wp.spatial_vector),
-    dt: float,
-    # out
-    body_qdd: wp.array(dtype=wp.spatial_vector),
-):
-    body = wp.tid()
-    body_qdd[body] = (after[body] - before[body]) / dt
 
 
 class SolverJumper(SolverBase):
@@ -139,11 +100,12 @@ class SolverJumper(SolverBase):
     there until `reset` clears it.
     """
 
+    model: Model
     SUPPORTED_OBSERVABLES = frozenset({SolverBase.ObservableKind.BODY_QDD})
 
     def __init__(
         self,
-        model: newton.Model,
+        model: Model,
         *,
         description: RobotDescription | None = None,
         block: BlockCfg | None = None,
@@ -165,46 +127,29 @@ class SolverJumper(SolverBase):
         warn_of_colliders(model)
         self.max_sweeps = max_sweeps
         self.tolerance = tolerance
+        work = self.dynamics.work
+        self.contact_force: wp.array = work.contact_force
+        """Force of the ground on each paw in the last step [N], world frame, vec3 of shape (4, num_worlds)."""
+        self.peak_force: wp.array = work.peak_force
+        """Largest total paw force of the last call [N], shape (num_worlds,)."""
+        self.torque: wp.array = work.torque
+        """Torque of each motor in the last step [N m], shape (12, num_worlds)."""
+        self.residual: wp.array = work.residual
+        """Largest velocity change [m/s] of the last contact sweep, worst step of the last call, (num_worlds,)."""
+        self.sweeps: wp.array = work.sweeps
+        """Most contact sweeps of a step in the last call, on a GPU rounds of all paws at once, shape (num_worlds,)."""
+        self.invalid: wp.array = work.invalid
+        """1 where a world became non-finite and waits for `reset`, shape (num_worlds,)."""
         self._differentiable = DifferentiableStep(self.dynamics, max_sweeps, min(tolerance, DIFFERENTIABLE_TOLERANCE))
         self._default_control = model.control(clone_variables=False)
-        self._no_body_f = wp.zeros(model.body_count, dtype=wp.spatial_vector, device=model.device)
-        self._old_body_qd = wp.zeros(model.body_count, dtype=wp.spatial_vector, device=model.device)
-
-    @property
-    def contact_force(self) -> wp.array:
-        """Force of the ground on each paw in the last step [N], world frame, vec3 of shape (4, num_worlds)."""
-        return self.dynamics.work.contact_force
-
-    @property
-    def peak_force(self) -> wp.array:
-        """Largest total paw force of the last call [N], shape (num_worlds,)."""
-        return self.dynamics.work.peak_force
-
-    @property
-    def torque(self) -> wp.array:
-        """Torque of each motor in the last step [N m], shape (12, num_worlds)."""
-        return self.dynamics.work.torque
-
-    @property
-    def residual(self) -> wp.array:
-        """Largest velocity change [m/s] of the last contact sweep, worst step of the last call, (num_worlds,)."""
-        return self.dynamics.work.residual
-
-    @property
-    def sweeps(self) -> wp.array:
-        """Most contact sweeps of a step in the last call, on a GPU rounds of all paws at once, shape (num_worlds,)."""
-        return self.dynamics.work.sweeps
-
-    @property
-    def invalid(self) -> wp.array:
-        """1 where a world became non-finite and waits for `reset`, shape (num_worlds,)."""
-        return self.dynamics.work.invalid
+        self._no_body_f = wp.zeros(model.body_count, dtype=wp.spatial_vectorf, device=model.device)
+        self._old_body_qd = wp.zeros(model.body_count, dtype=wp.spatial_vectorf, device=model.device)
 
     def step(
         self,
-        state_in: newton.State,
-        state_out: newton.State,
-        control: newton.Control | None,
+        state_in: State,
+        state_out: State,
+        control: Control | None,
         contacts: newton.Contacts | None,
         dt: float,
         *,
@@ -220,14 +165,14 @@ class SolverJumper(SolverBase):
 
     def step_motors(
         self,
-        state_in: newton.State,
-        state_out: newton.State,
+        state_in: State,
+        state_out: State,
         motors: Any,
         target: wp.array,
         dt: float,
         substeps: int,
         *,
-        control: newton.Control | None = None,
+        control: Control | None = None,
         previous: wp.array | None = None,
         delay: wp.array | None = None,
         bodies: bool = True,
@@ -236,36 +181,27 @@ class SolverJumper(SolverBase):
     ) -> None:
         """Advance every world by `substeps` steps of dt [s], the motors following targets, in one launch.
 
-        Args:
-            state_in: State before; may be `state_out`.
-            state_out: State after.
-            motors: `jumper_warp.kernels.actuation.motors.MotorArrays` (see `jumper_warp.robot.motors.motor_arrays`).
-            target: Motor angles [rad], shape (12, num_worlds), held.
-            dt: Physics step [s].
-            substeps: Number of physics steps.
-            control: Additional joint forces, held.
-            previous: Motor angles [rad] that the motors follow until the target arrives.
-            delay: Physics steps until it does, shape (num_worlds,).
-            bodies: Whether to write passive joints, loop joints and bodies; the solver itself does not need them.
-            observables: Observables of the whole call.
-            worlds: Which are advanced, by default all.
+        motors: `jumper_warp.kernels.actuation.motors.MotorArrays`, see `jumper_warp.robot.motors.motor_arrays`.
+        target: motor angles [rad], (12, num_worlds), held; with `delay` [physics steps], (num_worlds,), the motors
+        follow `previous` until it arrives. control: additional joint forces, held. bodies: whether to write passive
+        joints, loop joints and bodies, which the solver itself does not need. observables: of the whole call. worlds:
+        which are advanced, by default all. `state_out` may be `state_in`.
 
-        Raises:
-            ValueError: dt is not finite and positive, or substeps no whole number of at least 1.
+        Raises ValueError: dt is not finite and positive, or substeps no whole number of at least 1.
         """
         self.validate_observables(observables)
         drive = self.dynamics.drive(*self._forces(state_in, control), motors, target, previous, delay)
         self._advance(state_in, state_out, drive, dt, substeps, observables, bodies, worlds)
 
-    def _forces(self, state: newton.State, control: newton.Control | None) -> tuple[wp.array, wp.array]:
+    def _forces(self, state: State, control: Control | None) -> tuple[wp.array, wp.array]:
         """Return the joint forces and body wrenches that act."""
         control = self._default_control if control is None else control
         return control.joint_f, self._no_body_f if state.body_f is None else state.body_f
 
     def _advance(
         self,
-        state_in: newton.State,
-        state_out: newton.State,
+        state_in: State,
+        state_out: State,
         drive: Any,
         dt: float,
         substeps: int,
@@ -274,8 +210,9 @@ class SolverJumper(SolverBase):
         worlds: Worlds | None = None,
     ) -> None:
         check_step(dt, substeps)
-        wants_qdd = observables is not None and observables.is_requested(SolverBase.ObservableKind.BODY_QDD)
-        if wants_qdd:
+        qdd = None
+        if observables is not None and observables.is_requested(SolverBase.ObservableKind.BODY_QDD):
+            qdd = observables.body_qdd
             wp.copy(self._old_body_qd, state_in.body_qd)
         coordinates = (state_in.joint_q, state_in.joint_qd)
         out = (state_out.joint_q, state_out.joint_qd)
@@ -286,31 +223,31 @@ class SolverJumper(SolverBase):
         else:
             settings = self.dynamics.settings(dt, substeps, self.max_sweeps, self.tolerance)
             self.dynamics.advance(settings, drive, *coordinates, *out, worlds)
-        if bodies or wants_qdd:
+        if bodies or qdd is not None:
             self.dynamics.full_state(*out, state_out.body_q, state_out.body_qd, worlds)
-        if wants_qdd:
+        if qdd is not None:
             wp.launch(
-                _acceleration_kernel,
+                body_acceleration_kernel,
                 dim=self.model.body_count,
                 inputs=[self._old_body_qd, state_out.body_qd, dt * substeps],
-                outputs=[observables.body_qdd],
+                outputs=[qdd],
                 device=self.model.device,
             )
 
     def block_position(self) -> np.ndarray:
         """Return the centres of the blocks [m], world frame, (num_worlds, 2). Raises ValueError without blocks."""
-        return self._blocks().numpy()["center"].copy()
+        return self._block_values()["center"].copy()
 
     def block_velocity(self) -> np.ndarray:
         """Return the velocities of the blocks [m/s], world frame, (num_worlds, 2). Raises ValueError without blocks."""
-        return self._blocks().numpy()["velocity"].copy()
+        return self._block_values()["velocity"].copy()
 
     def place_blocks(self, center: np.ndarray, worlds: Sequence[int] | None = None) -> None:
         """Put the blocks of some worlds, by default all, at rest to new starts [m], world frame, (2,) or (worlds, 2).
 
         Raises ValueError without blocks.
         """
-        values = self._blocks().numpy()
+        values = self._block_values()
         values["start"][slice(None) if worlds is None else list(worlds)] = center
         self._blocks().assign(values)
         self.reset_blocks(worlds)
@@ -326,7 +263,11 @@ class SolverJumper(SolverBase):
             chosen = np.zeros(n, dtype=bool)
             chosen[slice(None) if worlds is None else list(worlds)] = True
             mask = wp.array(chosen, dtype=wp.bool, device=device)
-        wp.launch(_rest_blocks_kernel, dim=n, inputs=[mask, self.dynamics.robot.ground], device=device)
+        wp.launch(rest_blocks_kernel, dim=n, inputs=[mask, self.dynamics.robot.ground], device=device)
+
+    def _block_values(self) -> Any:
+        """Return the blocks as a structured array of NumPy. Raises ValueError without blocks."""
+        return self._blocks().numpy()
 
     def _blocks(self) -> wp.array:
         """Return the kernels' `Block` of every world. Raises ValueError without blocks."""
@@ -350,12 +291,7 @@ class SolverJumper(SolverBase):
         if flags & ModelFlags.MODEL_PROPERTIES:
             self.dynamics.pack_gravity()
 
-    def reset(
-        self,
-        state: newton.State,
-        world_mask: wp.array | None = None,
-        flags: StateFlags | int | None = None,
-    ) -> None:
+    def reset(self, state: State, world_mask: wp.array | None = None, flags: StateFlags | int | None = None) -> None:
         """Forget contact history and the invalid flag of the masked worlds, and put them in the reference pose.
 
         Blocks return to their starts.
@@ -366,23 +302,12 @@ class SolverJumper(SolverBase):
         if world_mask is None:
             world_mask = wp.full(n + 1, True, dtype=wp.bool, device=device)
         work = self.dynamics.work
-        wp.launch(
-            _clear_kernel,
-            dim=n,
-            inputs=[world_mask],
-            outputs=[work.impulse, work.contact_force, work.invalid],
-            device=device,
-        )
+        outputs = [work.impulse, work.contact_force, work.invalid]
+        wp.launch(clear_contact_kernel, dim=n, inputs=[world_mask], outputs=outputs, device=device)
         if flags is not None and int(flags) == int(StateFlags.NONE):
             return
         if self.dynamics.robot.ground.blocks.shape[0] > 0:
             self.reset_blocks(world_mask)
-        for reference, values in ((self.model.joint_q, state.joint_q), (self.model.joint_qd, state.joint_qd)):
-            wp.launch(
-                _restore_kernel,
-                dim=(n, values.shape[0] // n),
-                inputs=[world_mask, reference.reshape((n, -1))],
-                outputs=[values.reshape((n, -1))],
-                device=device,
-            )
+        inputs, outputs = [world_mask, state_arrays(self.model)], [state_arrays(state)]
+        wp.launch(restore_state_kernel, dim=(n, int(COORDS)), inputs=inputs, outputs=outputs, device=device)
         self.dynamics.full_state(state.joint_q, state.joint_qd, state.body_q, state.body_qd)

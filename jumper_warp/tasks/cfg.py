@@ -13,6 +13,7 @@ from jumper_warp.kernels.mdp.terminations import came_apart
 from jumper_warp.robot.gravity import EARTH, check_gravity
 from jumper_warp.robot.motors import FilterCfg, MotorCfg
 from jumper_warp.tasks.randomization import RandomizationCfg
+from jumper_warp.tasks.ranges import Pair
 from jumper_warp.tasks.terms import (
     Advance,
     Curriculum,
@@ -24,10 +25,9 @@ from jumper_warp.tasks.terms import (
     Term,
     TerminationTerm,
 )
+from jumper_warp.utils.checks import check_not_negative
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.kernels import Function
-
-Pair = tuple[float, float]
 
 
 @dataclass(frozen=True)
@@ -117,11 +117,10 @@ class TaskCfg:
             if len(set(names)) < len(names):
                 raise InputError(f"every term of {self.name}'s {section} needs a name of its own, got {names}")
         for section, rows in self.rows.items():
-            for row in rows:
-                if row.term.of_state not in (Any, self.state):
-                    raise InputError(
-                        f"{self.name} {section}: {row.term.name} is for {row.term.of_state.key}, not {self.state.key}"
-                    )
+            for term in (row.term for row in rows):
+                if term.of_state not in (Any, self.state):
+                    wanted = f"is for {term.of_state.key}, not {self.state.key}"
+                    raise InputError(f"{self.name} {section}: {term.name} {wanted}")
         self._check_functions()
         if came_apart not in [term.func for term in self.terminations]:
             raise InputError(f"{self.name} needs the termination came_apart, for worlds whose state is no longer one")
@@ -131,14 +130,10 @@ class TaskCfg:
             for field_name in {metric.field, metric.per or metric.field} - set(self.state.vars):
                 raise InputError(f"{self.name}: metric {metric.name} needs {field_name!r}, which its state has not")
         check_gravity(self.gravity)
-        if not 0.0 <= self.lift < math.inf:
-            raise InputError(f"{self.name}: lift must be finite and >= 0, got {self.lift}")
-        if not 0.0 <= self.contact_force < math.inf:
-            raise InputError(f"{self.name}: contact_force must be finite and >= 0, got {self.contact_force}")
+        for name in ("lift", "contact_force", "block_margin"):
+            check_not_negative(f"{self.name}: {name}", getattr(self, name))
         if not 0.0 <= self.link_margin <= APART:
             raise InputError(f"{self.name}: link_margin must be in [0, {APART:g}], got {self.link_margin}")
-        if not 0.0 <= self.block_margin < math.inf:
-            raise InputError(f"{self.name}: block_margin must be finite and >= 0, got {self.block_margin}")
         if self.reward_floor is not None and not math.isfinite(self.reward_floor):
             raise InputError(f"{self.name}: reward_floor must be finite or None, got {self.reward_floor}")
 
@@ -165,10 +160,8 @@ class TaskCfg:
             for place, struct in structs.items() if found else ():
                 kind = found[place] if len(found) > place else None
                 if kind not in (Any, struct):
-                    takes = getattr(kind, "key", kind)
-                    raise InputError(
-                        f"{self.name} {where}: argument {place + 1} of {func.key} is {takes}, the task has {struct.key}"
-                    )
+                    what = f"argument {place + 1} of {func.key} is {getattr(kind, 'key', kind)}"
+                    raise InputError(f"{self.name} {where}: {what}, the task has {struct.key}")
 
     @functools.cached_property
     def rows(self) -> dict[str, list[Row]]:
@@ -203,8 +196,8 @@ class TaskCfg:
         """Return the columns of an observation group, (first, end) by the name of the term."""
         columns, first = {}, 0
         for term in getattr(self, group):
-            columns[term.name] = (first, first + term.width * term.options["history"])
-            first = columns[term.name][1]
+            end = first + term.width * term.options["history"]
+            columns[term.name], first = (first, end), end
         return columns
 
     @property

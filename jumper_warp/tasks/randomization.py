@@ -10,7 +10,7 @@ from typing import Any, Literal
 from jumper_warp.kernels.mdp import parameters
 from jumper_warp.robot.description import load_description
 from jumper_warp.tasks.terms import EventTerm
-from jumper_warp.utils.checks import check_finite
+from jumper_warp.utils.checks import check_finite, check_shares
 from jumper_warp.utils.errors import InputError
 
 Range = tuple[float, float] | None
@@ -110,9 +110,7 @@ class RandomizationCfg:
             value = getattr(self, name)
             if value is not None and not 0.0 <= value[0] <= value[1] <= LONGEST_LATENCY:
                 raise InputError(f"randomisation range {name} must be in 0 to {LONGEST_LATENCY:g} ms, got {value}")
-        for name in ("push_share", "no_latency"):
-            if not 0.0 <= getattr(self, name) <= 1.0:
-                raise InputError(f"randomisation {name} must be in [0, 1], got {getattr(self, name)}")
+        check_shares("randomisation", push_share=self.push_share, no_latency=self.no_latency)
 
     @classmethod
     def off(cls) -> RandomizationCfg:
@@ -148,11 +146,7 @@ class RandomizationCfg:
         return replace(self, redraw="reset", **timing)
 
     def with_fixed(
-        self,
-        *,
-        latency: float | None = None,
-        gains: tuple[float, float] | None = None,
-        friction: float | None = None,
+        self, *, latency: float | None = None, gains: tuple[float, float] | None = None, friction: float | None = None
     ) -> RandomizationCfg:
         """Return the same with rows of one value: latency [ms], scales of kp and kd [1], friction of the paws [1].
 
@@ -169,8 +163,8 @@ class RandomizationCfg:
 
         def add(func: Any, pair: Range, scale: float = 1.0, spread: bool = False, **more: float) -> None:
             if pair is not None:
-                lower, upper = scale * pair[0], scale * pair[1]
-                found.append(EventTerm(func, mode=self.redraw, spread=spread, lower=lower, upper=upper, **more))
+                ends = {"lower": scale * pair[0], "upper": scale * pair[1]}
+                found.append(EventTerm(func, mode=self.redraw, spread=spread, **ends, **more))
 
         add(parameters.base_mass, self.base_mass)
         add(parameters.link_mass, self.link_mass, spread=True)

@@ -10,7 +10,6 @@ import functools
 import importlib
 import math
 import pkgutil
-import re
 import sys
 from collections.abc import Collection, Iterable
 from pathlib import Path
@@ -23,7 +22,7 @@ import jumper_warp.tasks
 from jumper_warp.kernels.mdp.env import Nothing
 from jumper_warp.tasks.cfg import Handover, TaskCfg
 from jumper_warp.tasks.terms import RewardTerm, Term
-from jumper_warp.utils.checks import version_refusal
+from jumper_warp.utils.checks import NAME, version_refusal
 from jumper_warp.utils.errors import InputError
 
 VERSION = 3
@@ -32,8 +31,6 @@ OWN = ("jumper_warp.tasks.", "jumper_warp.robot.", "jumper_warp.kernels.")
 """Beginnings of the names of the project's modules that a task may name."""
 OPTIONAL = ("rewards", "critic", "events")
 """Sections that a policy needs for training only."""
-NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_. -]{0,99}")
-"""Of a task or a term."""
 MAX_ENTRIES = 1000
 """Longest list; a kernel of more terms would not be compiled in a day."""
 Struct = type(Nothing)
@@ -93,24 +90,6 @@ def handover_to_json(handover: Handover) -> dict[str, Any]:
     return {**tasks, "when": name_of(handover.when), "begin": name_of(handover.begin)}
 
 
-def handover_from_json(saved: Any, tasks: Iterable[TaskCfg], modules: Iterable[ModuleType] = ()) -> Handover:
-    """Return a saved handover between some tasks.
-
-    modules: that the user has named. Raises TaskError: a task or function is not among them, or it is no handover.
-    """
-    named, find = {task.name: task for task in tasks}, Finder(modules)
-    if not isinstance(saved, dict) or set(saved) != {"source", "target", "when", "begin"}:
-        raise TaskError(f"a handover has source, target, when and begin, got {shown(saved)}")
-    for end in ("source", "target"):
-        if not isinstance(saved[end], str) or saved[end] not in named:
-            raise TaskError(f"handover {end}: no task {shown(saved[end])} here")
-    found = {name: find(saved[name], f"handover {name}") for name in ("when", "begin")}
-    for name, func in found.items():
-        if not isinstance(func, wp.Function):
-            raise TaskError(f"handover {name}: {saved[name]!r:.80} is not a @wp.func")
-    return Handover(named[saved["source"]], named[saved["target"]], found["when"], found["begin"])
-
-
 def shown(value: Any) -> str:
     """Return a short word on a value, however deep or long it is."""
     if value is None or isinstance(value, bool | int | float | str):
@@ -166,13 +145,9 @@ def check_version(saved: Any) -> None:
 def task_from_json(saved: Any, modules: Iterable[ModuleType] = (), *, leave_out: Collection[str] = ()) -> TaskCfg:
     """Return a saved task; settings that it lacks have their defaults.
 
-    Args:
-        saved: What `task_to_json` gave.
-        modules: That the user has named.
-        leave_out: Sections of OPTIONAL that are not wanted, and whose functions need not be found.
-
-    Raises:
-        TaskError: It is not a task of this version, or a function is in none of the modules.
+    saved: what `task_to_json` gave. modules: that the user has named. leave_out: sections of OPTIONAL that are not
+    wanted, and whose functions need not be found.
+    Raises TaskError: it is not a task of this version, or a function is in none of the modules.
     """
     check_version(saved)
     content = {key: value for key, value in saved.items() if key not in ("version", "type")}

@@ -24,20 +24,16 @@ from jumper_warp.tasks.terms import TerminationTerm
 from jumper_warp.tasks.units import DEG
 from jumper_warp.utils.errors import InputError
 
-FALLS = (
-    TerminationTerm(terminations.came_apart),
-    TerminationTerm(terminations.collided),
-    TerminationTerm(terminations.tilted, angle=60.0 * DEG),
-    TerminationTerm(terminations.low_base, height=0.10),
+FALLS, FALLS_FROM_FLIGHT = (
+    (
+        TerminationTerm(terminations.came_apart),
+        TerminationTerm(terminations.collided),
+        TerminationTerm(tilt, angle=60.0 * DEG),
+        TerminationTerm(terminations.low_base, height=0.10),
+    )
+    for tilt in (terminations.tilted, terminations.fallen)
 )
-"""What ends the episode of a robot that switches, whatever its skill."""
-FALLS_FROM_FLIGHT = (
-    TerminationTerm(terminations.came_apart),
-    TerminationTerm(terminations.collided),
-    TerminationTerm(terminations.fallen, angle=60.0 * DEG),
-    TerminationTerm(terminations.low_base, height=0.10),
-)
-"""Of one that turns in flight: there any tilt will do."""
+"""What ends the episode of a robot that switches, whatever its skill, and of one that turns in flight at any tilt."""
 
 
 def for_switching(

@@ -47,8 +47,7 @@ class Term:
         name: Under which it is logged and set by flags (default: the function's).
         given: Numbers and options by name.
 
-        Raises:
-            ValueError: A number is missing, unknown or not finite, or the function is not one for such a term.
+        Raises ValueError: a number is missing, unknown or not finite, or the function is not one for such a term.
         """
         kind = type(self).__name__
         if not isinstance(func, wp.Function):

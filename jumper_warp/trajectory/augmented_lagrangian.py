@@ -61,17 +61,10 @@ def minimise(
     step: float = 0.1,
     seed: int = 0,
 ) -> Progress:
-    """Return what was found from some starts.
+    """Return what was found from some starts (starts, n), all entries within `lower` and `upper`.
 
-    Args:
-        problem: What is minimised.
-        begin: Candidates (starts, n).
-        iterations: Each of one gradient and `len(LENGTHS) + RANDOM` simulations a start.
-        lower, upper: Bounds of all entries.
-        step: [1] Largest entry of the first steps.
-        seed: Of the random steps.
-
-    Raises InputError for starts of another shape.
+    An iteration takes one gradient and `len(LENGTHS) + RANDOM` simulations a start. step: [1] largest entry of the
+    first steps. Raises InputError for starts of another shape.
     """
     if begin.ndim != 2 or begin.shape[1] != len(problem.knots) or len(begin) < 1:
         raise InputError(f"starts must have shape (starts, {len(problem.knots)}), got {begin.shape}")

@@ -31,10 +31,14 @@ Tape = list[list[tuple[torch.Tensor, torch.Tensor]]]
 class Actor(Protocol):
     """A policy's weights, normaliser and interface, as `jumper_warp.policies.policy.Policy` has them."""
 
-    layers: Sequence[tuple[torch.Tensor, torch.Tensor]]
     mean: torch.Tensor
     std: torch.Tensor
     interface: Any
+
+    @property
+    def layers(self) -> Sequence[tuple[torch.Tensor, torch.Tensor]]:
+        """Weight and bias of each layer."""
+        ...
 
 
 class Network:
@@ -156,7 +160,7 @@ def gauss_newton_step(
 
     rows: of J, (n, weights) for each group of worlds; misses (n,); importance: the diagonal of W, (n,).
     """
-    by_off, back = vjp(anchor.off, weights)
+    by_off, back = vjp(anchor.off, weights)[:2]
     right = -back(by_off)[0]
     for row, miss, weight in zip(rows, misses, importance, strict=True):
         right = right - row.T @ (weight * miss)

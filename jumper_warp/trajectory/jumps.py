@@ -97,13 +97,8 @@ def landing_pitch(most: float, speed: float = 0.25, height: float = 0.30) -> Ter
 
 def stays(most: float, speed: float = 0.25) -> Term:
     """Keep the base within `most` [m] of its start while in stance, in the plane."""
-
-    def term(motion: Motion) -> torch.Tensor:
-        way = motion.q[..., :2] - motion.q[0, :, :2]
-        away = (way.square().sum(-1) + 1.0e-12).sqrt() - most
-        return torch.where(before_takeoff(motion, speed), away, 0.0)
-
-    return term
+    away = drifts(most)
+    return lambda motion: torch.where(before_takeoff(motion, speed), away(motion), 0.0)
 
 
 def leans_back(most: float, speed: float = 0.25) -> Term:

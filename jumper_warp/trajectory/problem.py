@@ -49,7 +49,7 @@ class Knots:
     def __post_init__(self) -> None:
         """Raises InputError: knots that do not rise from 0, or beyond the motion."""
         rise = len(self.at) > 1 and self.at[0] == 0.0 and bool(np.all(np.diff(self.at) > 0.0))
-        if not rise or not self.at[-1] < self.steps:
+        if not rise or not max(self.at) < self.steps:
             raise InputError(f"knots must rise from 0 and end before step {self.steps}, got {self.at}")
 
     @property

@@ -13,7 +13,7 @@ import torch
 import warp as wp
 
 from jumper_warp.diff.bodies import moment_rows
-from jumper_warp.diff.rollout import GEOMETRY_NAMES, Rollout
+from jumper_warp.diff.rollout import Rollout
 from jumper_warp.kernels.collision.robot import HOUSING_LENGTH, HOUSING_RADIUS, SHANK_FREE, SHANK_RADIUS, THIGH_RADIUS
 from jumper_warp.kernels.layout import BODIES
 
@@ -90,10 +90,10 @@ class WholeBody:
         device = str(rollout.device)
         lengths = torch.as_tensor(rollout.geometry(), dtype=self._real, device=device)
         self._hip = lengths[:, :3]
-        for name, column in zip(GEOMETRY_NAMES[3:], lengths[:, 3:].unbind(1), strict=True):
-            setattr(self, f"_{name}", column)
-        self.paw_radius = lengths[:, -1]
-        """[m] (4,)"""
+        self._outer_x, self._inner_x, self._plane_y, self._knee_y, self._thigh, self._shank, self.paw_radius = lengths[
+            :, 3:
+        ].unbind(1)
+        """[m] (4,) each, in the order of `jumper_warp.diff.rollout.GEOMETRY_NAMES`."""
         self._front = lengths.new_tensor(FRONT)
         self._side = lengths.new_tensor(SIDE)
         self._flip = torch.stack([self._front, -self._front], dim=-1)

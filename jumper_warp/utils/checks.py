@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import re
 from typing import Any
 
 import numpy as np
 
 from jumper_warp.utils.errors import InputError
 
+NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_. -]{0,99}")
+"""Of tasks, terms, observation columns and joints: lists of them are joined by commas, and they name files."""
 FLOAT32_MAX = 3.4028234e38
 """Beyond it, single precision is infinite, which all settings become on their way to a device."""
 MOST_SEED = 2**31 - 1
@@ -42,6 +45,13 @@ def check_within(name: str, values: np.ndarray, bounds: tuple[float, float]) -> 
     outside = ~((values >= bounds[0]) & (values <= bounds[1]))
     if outside.any():
         raise InputError(f"{name} must be in [{bounds[0]:g}, {bounds[1]:g}], got {values[outside][0]:g}")
+
+
+def check_shares(what: str, **shares: float) -> None:
+    """Raises ValueError: one of the shares is not in 0 to 1."""
+    for name, share in shares.items():
+        if not 0.0 <= share <= 1.0:
+            raise InputError(f"{what} {name} must be in [0, 1], got {share}")
 
 
 def check_count(name: str, value: Any) -> None:

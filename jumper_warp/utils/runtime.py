@@ -5,7 +5,7 @@ import subprocess
 from importlib import metadata
 from pathlib import Path
 from platform import python_version
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import warp as wp
 from rich.console import Console
@@ -72,8 +72,7 @@ def announce(device: str | None, threads: int | None = None) -> DeviceInfo:
 
     threads: of a CPU, for all simulations that are made from now on, as in `set_threads`.
 
-    Raises:
-        InputError: There is no such device, or no such number of threads.
+    Raises InputError: there is no such device, or no such number of threads.
     """
     set_threads(threads)
     wp.config.log_level = wp.LOG_WARNING
@@ -89,23 +88,16 @@ def git_commit(folder: Path | None = None) -> Commit | None:
     None without git, outside a git tree, in a tree without commits, and where the enclosing tree does not track
     the folder, as for a package installed inside another project.
     """
-    return _own_commit() if folder is None else _commit_of(folder)
+    if folder is None:
+        return _own_commit()
+    commit = _git(folder, "rev-parse", "--verify", "HEAD") if _git(folder, "ls-files") else None
+    return Commit(commit.strip(), bool(_git(folder, "status", "--porcelain", "--", ":/"))) if commit else None
 
 
 @functools.cache
 def _own_commit() -> Commit | None:
     """Return the commit of this package's source tree; what has been imported from it stays the same."""
-    return _commit_of(Path(__file__).parent)
-
-
-def _commit_of(folder: Path) -> Commit | None:
-    """Return the commit of the source tree in a folder, or None, as `git_commit`."""
-    if not _git(folder, "ls-files"):
-        return None
-    commit = _git(folder, "rev-parse", "--verify", "HEAD")
-    if not commit:
-        return None
-    return Commit(commit.strip(), dirty=bool(_git(folder, "status", "--porcelain", "--", ":/")))
+    return git_commit(Path(__file__).parent)
 
 
 def _git(folder: Path, *arguments: str) -> str | None:
@@ -115,6 +107,12 @@ def _git(folder: Path, *arguments: str) -> str | None:
     except (OSError, subprocess.TimeoutExpired):
         return None
     return answer.stdout if answer.returncode == 0 else None
+
+
+def source_versions() -> dict[str, Any]:
+    """Return the commit of this package's source tree, whether it is dirty, and `versions`."""
+    commit = git_commit()
+    return {"commit": commit and commit.hash, "dirty": commit and commit.dirty, "versions": versions()}
 
 
 def versions() -> dict[str, str | None]:

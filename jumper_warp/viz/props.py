@@ -27,7 +27,7 @@ def with_marks(recording: Recording, places: np.ndarray) -> Recording:
     disc = np.concatenate([np.zeros((1, 3)), rim]) + (0.0, 0.0, MARK_LIFT)
     corner = np.arange(MARK_CORNERS)
     triangles = np.stack([np.zeros_like(corner), 1 + corner, 1 + (corner + 1) % MARK_CORNERS], axis=1).astype(np.int32)
-    normals = np.tile(np.float32([0.0, 0.0, 1.0]), (len(disc), 1))
+    normals = np.tile(np.array([0.0, 0.0, 1.0], np.float32), (len(disc), 1))
     marks = []
     for rank, of_world in enumerate(places):
         for number, place in enumerate(of_world):
@@ -40,11 +40,8 @@ def with_marks(recording: Recording, places: np.ndarray) -> Recording:
 def with_blocks(recording: Recording, centers: np.ndarray, half: np.ndarray, height: np.ndarray) -> Recording:
     """Return the recording with a moving block in each world, standing on z = 0.
 
-    Args:
-        recording: As it is without.
-        centers: [m] x and y, world frame, (frames, recorded worlds, 2).
-        half: [m] Half extents along x and y, (recorded worlds, 2).
-        height: [m] (recorded worlds,)
+    centers: [m] x and y, world frame, (frames, recorded worlds, 2). half: [m] half extents along x and y, (recorded
+    worlds, 2). height: [m] (recorded worlds,).
     """
     poses, names, shapes = [recording.poses], list(recording.bodies), list(recording.shapes)
     for rank, world in enumerate(recording.worlds):

@@ -4,11 +4,11 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import newton
 import numpy as np
 import warp as wp
 
 from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.newton_types import Model
 from jumper_warp.viz.recording import SERIES_NAME, Recording
 from jumper_warp.viz.rerun import write_rrd
 from jumper_warp.viz.shapes import ShapeMesh, shape_meshes
@@ -26,23 +26,17 @@ class Recorder:
 
     def __init__(
         self,
-        model: newton.Model,
+        model: Model,
         worlds: Sequence[int] = (0,),
         *,
         spacing: float = 0.0,
         notes: Mapping[str, Any] | None = None,
     ) -> None:
-        """Record some worlds of a model.
+        """Record some worlds of a model, whose bodies and shapes are read once.
 
-        Args:
-            model: Where the bodies and shapes are read from, once.
-            worlds: Indices of the worlds to record.
-            spacing: Distance [m] along y by which each world is drawn beside the one before it. Zero keeps the true
-                positions, as a heightfield needs.
-            notes: Saved along; must be JSON.
-
-        Raises:
-            ValueError: A world has no bodies, or a visible shape cannot be drawn.
+        spacing: distance [m] along y by which each world is drawn beside the one before it; zero keeps the true
+        positions, as a heightfield needs. notes: saved along; must be JSON.
+        Raises ValueError: a world has no bodies, or a visible shape cannot be drawn.
         """
         world_of_body = model.body_world.numpy()
         for world in worlds:
@@ -72,18 +66,13 @@ class Recorder:
         contact_points: np.ndarray | None = None,
         contact_forces: np.ndarray | None = None,
     ) -> None:
-        """Add a frame.
+        """Add a frame at a time [s] later than the frame before.
 
-        Args:
-            time: [s], later than the frame before.
-            body_poses: Poses of all bodies of the model, as in `state.body_q`: (body_count, 7), pos [m] and quat xyzw.
-            series: `group/quantity [unit]` to value; the same names in every frame.
-            contact_points: [m], world frame, (num_worlds, contacts_per_world, 3) or (contacts, 3) for one world; the
-                same number in every frame.
-            contact_forces: [N] on the robot, same shape and frame.
-
-        Raises:
-            ValueError: Time does not increase, a shape is wrong, or a name is malformed, new or missing.
+        body_poses: of all bodies of the model, as in `state.body_q`: (body_count, 7), pos [m] and quat xyzw. series:
+        `group/quantity [unit]` to value, the same names in every frame. contact_points [m] and contact_forces [N] on
+        the robot: world frame, (num_worlds, contacts_per_world, 3) or (contacts, 3) for one world, the same number in
+        every frame.
+        Raises ValueError: time does not increase, a shape is wrong, or a name is malformed, new or missing.
         """
         if self._times and not time > self._times[-1]:
             raise InputError(f"time must increase, got {time} s after {self._times[-1]} s")
@@ -129,8 +118,7 @@ class Recorder:
     def recording(self) -> Recording:
         """Return what was recorded so far.
 
-        Raises:
-            ValueError: There is no frame.
+        Raises ValueError: there is no frame.
         """
         if not self._times:
             raise InputError("nothing was recorded")
@@ -139,7 +127,7 @@ class Recorder:
             worlds=self._worlds,
             bodies=self._names,
             poses=np.stack(self._poses),
-            series={name: np.array(values) for name, values in self._series.items()},
+            series={name: np.array(values) for name, values in (self._series or {}).items()},
             contact_points=np.stack([points for points, _ in self._contacts]),
             contact_forces=np.stack([forces for _, forces in self._contacts]),
             spacing=self._spacing,

@@ -3,8 +3,8 @@
 A recording stands on its own: what was seen can be drawn without the model that made it.
 """
 
+import io
 import json
-import os
 import re
 import zipfile
 import zlib
@@ -16,10 +16,14 @@ from typing import Any
 import numpy as np
 
 from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.files import write_whole
 from jumper_warp.viz.shapes import ShapeMesh
 
 FORMAT = "jumper-warp recording"
 VERSION = 1
+ARRAYS = ("times", "poses", "contact_points", "contact_forces")
+SURFACE = ("vertices", "normals", "triangles")
+"""Arrays of a recording, and of each of its shapes."""
 SERIES_NAME = re.compile(r"[^/\[\]]+/[^/\[\]]+ \[[^\[\]]+\]")
 """Names of series: `group/quantity [unit]`, with 1 as the unit of a pure number."""
 
@@ -65,34 +69,21 @@ class Recording:
             "spacing": self.spacing,
             "notes": self.notes,
         }
-        arrays = {
-            "header": np.array(json.dumps(header)),
-            "times": self.times,
-            "poses": self.poses,
-            "series": np.array(list(self.series.values()), dtype=np.float64).reshape(len(self.series), -1),
-            "contact_points": self.contact_points,
-            "contact_forces": self.contact_forces,
-        }
+        arrays = {name: getattr(self, name) for name in ARRAYS}
+        arrays["header"] = np.array(json.dumps(header))
+        arrays["series"] = np.array(list(self.series.values()), dtype=np.float64).reshape(len(self.series), -1)
         for index, shape in enumerate(self.shapes):
-            arrays[f"shape{index}_vertices"] = shape.vertices
-            arrays[f"shape{index}_normals"] = shape.normals
-            arrays[f"shape{index}_triangles"] = shape.triangles
-        path = Path(path)
-        aside = path.with_name(f".{path.name}.{os.getpid()}")
-        try:
-            with aside.open("wb") as file:
-                np.savez_compressed(file, **arrays)
-            os.replace(aside, path)
-        finally:
-            aside.unlink(missing_ok=True)
-        return path
+            arrays |= {f"shape{index}_{part}": getattr(shape, part) for part in SURFACE}
+        data = io.BytesIO()
+        np.savez_compressed(data, **arrays)
+        write_whole(Path(path), data.getvalue())
+        return Path(path)
 
 
 def load_npz(path: Path) -> Recording:
     """Read what `Recording.save_npz` wrote.
 
-    Raises:
-        RecordingError: The file is missing, damaged, of another kind or of another version.
+    Raises RecordingError: the file is missing, damaged, of another kind or of another version.
     """
     try:
         with np.load(path, allow_pickle=False) as archive:
@@ -107,26 +98,18 @@ def load_npz(path: Path) -> Recording:
 
 
 def _from_archive(header: dict[str, Any], archive: Mapping[str, np.ndarray]) -> Recording:
-    shapes = [
+    shapes = tuple(
         ShapeMesh(
-            shape["name"],
-            shape["body"],
-            tuple(shape["color"]),
-            archive[f"shape{index}_vertices"],
-            archive[f"shape{index}_normals"],
-            archive[f"shape{index}_triangles"],
+            shape["name"], shape["body"], tuple(shape["color"]), *(archive[f"shape{index}_{part}"] for part in SURFACE)
         )
         for index, shape in enumerate(header["shapes"])
-    ]
+    )
     return Recording(
-        times=archive["times"],
+        **{name: archive[name] for name in ARRAYS},
         worlds=tuple(header["worlds"]),
         bodies=tuple(header["bodies"]),
-        poses=archive["poses"],
         series=dict(zip(header["series"], archive["series"], strict=True)),
-        contact_points=archive["contact_points"],
-        contact_forces=archive["contact_forces"],
         spacing=header["spacing"],
-        shapes=tuple(shapes),
+        shapes=shapes,
         notes=header["notes"],
     )

@@ -36,8 +36,7 @@ EYE_OFFSET = np.array([1.3, 1.7, 0.6])
 def write_rrd(recording: "Recording", path: Path) -> Path:
     """Write a recording for the Rerun viewer, whole or not at all; return the path.
 
-    Raises:
-        ImportError: rerun-sdk is not installed.
+    Raises ImportError: rerun-sdk is not installed.
     """
     rr = _import_rerun()
     aside = path.with_name(f".{path.name}.{os.getpid()}")

@@ -1,6 +1,7 @@
 """Triangle meshes of what a Newton model shows: one mesh per visible shape."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import newton
 import numpy as np
@@ -8,6 +9,7 @@ import trimesh
 from newton import GeoType
 
 from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.newton_types import Model
 
 PLANE_EXTENT = 10.0
 """Half the side of the patch drawn for an infinite plane [m]."""
@@ -34,11 +36,10 @@ class ShapeMesh:
     """(num_triangles, 3) int32, indices of vertices."""
 
 
-def shape_meshes(model: newton.Model, worlds: tuple[int, ...]) -> list[ShapeMesh]:
+def shape_meshes(model: Model, worlds: tuple[int, ...]) -> list[ShapeMesh]:
     """Return the meshes of the visible shapes of some worlds, and of those that all worlds share.
 
-    Raises:
-        ValueError: A visible shape is of a kind that has no mesh here (a cone or a splat).
+    Raises ValueError: a visible shape is of a kind that has no mesh here (a cone or a splat).
     """
     kinds = model.shape_type.numpy()
     scales = model.shape_scale.numpy().astype(float)
@@ -60,7 +61,7 @@ def shape_meshes(model: newton.Model, worlds: tuple[int, ...]) -> list[ShapeMesh
     return meshes
 
 
-def _surface(kind: GeoType, scale: np.ndarray, source: object, label: str) -> trimesh.Trimesh:
+def _surface(kind: GeoType, scale: np.ndarray, source: Any, label: str) -> trimesh.Trimesh:
     """Return the mesh of one shape in its own frame. scale: Newton's three size parameters [m]."""
     if kind == GeoType.SPHERE:
         return trimesh.creation.icosphere(subdivisions=3, radius=scale[0])
@@ -121,7 +122,7 @@ def _placed(
     return ShapeMesh(
         name,
         body,
-        tuple(float(channel) for channel in color),
+        (float(color[0]), float(color[1]), float(color[2])),
         np.asarray(smooth.vertices, dtype=np.float32),
         np.asarray(smooth.vertex_normals, dtype=np.float32),
         np.asarray(smooth.faces, dtype=np.int32),

@@ -3,15 +3,16 @@
 import math
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import matplotlib.figure
 import matplotlib.image
-import newton
 import numpy as np
 import warp as wp
 from newton.sensors import SensorCamera
 
 from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.newton_types import Model, State
 
 EYE = (1.1, 1.4, 0.6)
 """Default position of the eye [m], world frame: ahead of the robot, on its left."""
@@ -36,29 +37,22 @@ class Camera:
 
     def __init__(
         self,
-        model: newton.Model,
+        model: Model,
         eye: Sequence[float] = EYE,
         target: Sequence[float] = TARGET,
         size: tuple[int, int] = SIZE,
         world: int = 0,
     ) -> None:
-        """Place the camera.
+        """Place the camera at `eye`, `target` in the middle of the picture [m], world frame; size: width, height [px].
 
-        Args:
-            model: Its visible shapes are drawn.
-            eye: Position [m], world frame, shape (3,).
-            target: Point in the middle of the picture [m], world frame, shape (3,).
-            size: Width and height [px].
-            world: Which world to draw.
-
-        Raises:
-            ValueError: Eye and target coincide or lie on one vertical, or the model has no such world.
+        Raises ValueError: eye and target coincide or lie on one vertical, or the model has no such world.
         """
         if not 0 <= world < model.world_count:
             raise InputError(f"world {world} is outside the model's {model.world_count} worlds")
         self._model = model
         self._sensor = SensorCamera(model)
-        self._sensor.create_default_light(direction=wp.normalize(wp.vec3(*LIGHT_DIRECTION)))
+        direction: Any = wp.vec3(*LIGHT_DIRECTION)
+        self._sensor.create_default_light(direction=wp.normalize(direction))
         self._sensor.set_ambient_light(AMBIENT)
         self._sensor.default_clear_data = SensorCamera.ClearData(clear_color=SKY)
         self._sensor.default_render_config.enable_shadows = True
@@ -68,20 +62,20 @@ class Camera:
         )
         self._pose = wp.array([look_at(eye, target)], dtype=wp.transformf, device=model.device)
         self._world = wp.array([world], dtype=wp.int32, device=model.device)
-        self._pixels = self._sensor.allocate_image_color(1, *size)
+        self._pixels: Any = self._sensor.allocate_image_color(1, *size)
 
-    def picture(self, state: newton.State) -> np.ndarray:
+    def picture(self, state: State) -> np.ndarray:
         """Return the picture of a state, from its `body_q`: (height, width, 3) uint8, RGB."""
         self._model.bvh_refit_shapes(state)
         self._sensor.update(state, self._pose, self._rays, color_image=self._pixels, world_indices=self._world)
-        return SensorCamera.Utils.to_rgba_from_color(self._pixels).numpy()[0, ..., :3].copy()
+        colors: Any = SensorCamera.Utils.to_rgba_from_color(self._pixels)
+        return colors.numpy()[0, ..., :3].copy()
 
 
 def look_at(eye: Sequence[float], target: Sequence[float]) -> wp.transformf:
     """Return the pose of a camera, looking along its -z with +y up, from eye to target [m], world z up.
 
-    Raises:
-        ValueError: Eye and target coincide or lie on one vertical.
+    Raises ValueError: eye and target coincide or lie on one vertical.
     """
     ahead = np.asarray(target, dtype=float) - np.asarray(eye, dtype=float)
     right = np.cross(ahead, [0.0, 0.0, 1.0])
@@ -90,35 +84,19 @@ def look_at(eye: Sequence[float], target: Sequence[float]) -> wp.transformf:
     ahead /= np.linalg.norm(ahead)
     right /= np.linalg.norm(right)
     axes = np.stack([right, np.cross(right, ahead), -ahead], axis=1)
-    return wp.transformf(wp.vec3(*map(float, eye)), wp.quat_from_matrix(wp.mat33(*axes.ravel().tolist())))
-
-
-def render(
-    model: newton.Model,
-    state: newton.State,
-    path: Path,
-    eye: Sequence[float] = EYE,
-    target: Sequence[float] = TARGET,
-    size: tuple[int, int] = SIZE,
-) -> Path:
-    """Write a picture of world 0 as a PNG file, see `Camera`; return its path."""
-    matplotlib.image.imsave(path, Camera(model, eye, target, size).picture(state))
-    return Path(path)
+    position: Any = wp.vec3(*map(float, eye))
+    matrix: Any = wp.mat33(*axes.ravel().tolist())
+    orientation: Any = wp.quat_from_matrix(matrix)
+    return wp.transformf(position, orientation)
 
 
 def contact_sheet(
     pictures: Sequence[np.ndarray], path: Path, captions: Sequence[str] | None = None, columns: int | None = None
 ) -> Path:
-    """Write pictures side by side as one PNG file; return its path.
+    """Write pictures, (height, width, 3) uint8 of one size, side by side as one PNG file; return its path.
 
-    Args:
-        pictures: (height, width, 3) uint8 each, all of one size.
-        path: Where to write.
-        captions: One per picture, drawn in its upper left corner.
-        columns: Pictures per row. Default: all in one row, a filmstrip.
-
-    Raises:
-        ValueError: No pictures, unequal sizes, or another number of captions.
+    captions: one per picture, drawn in its upper left corner. columns: pictures per row, by default all. Raises
+    ValueError: no pictures, unequal sizes, or another number of captions.
     """
     if not pictures or len({picture.shape for picture in pictures}) != 1:
         raise InputError("a contact sheet needs pictures, all of one size")

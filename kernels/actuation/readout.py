@@ -75,3 +75,17 @@ def base_velocity_kernel(
     """Write the velocity of the base link's origin [m/s], world frame; launch over worlds."""
     world = wp.tid()
     velocity[world] = load_base(joint_q, joint_qd, body_com[world * BODIES], world).lin
+
+
+@wp.kernel
+def body_acceleration_kernel(
+    # in
+    before: wp.array(dtype=wp.spatial_vector),
+    after: wp.array(dtype=wp.spatial_vector),
+    dt: float,
+    # out
+    acceleration: wp.array(dtype=wp.spatial_vector),
+):
+    """Write the mean acceleration of each body over dt [s]; one thread per body."""
+    body = wp.tid()
+    acceleration[body] = (after[body] - before[body]) / dt

@@ -3,6 +3,7 @@
 import warp as wp
 
 from ..layout import BODIES, COORDS, DOFS
+from ..terrain.ground import Ground, rest_block
 
 wp.set_module_options({"enable_backward": False})
 
@@ -88,3 +89,34 @@ def mask_kernel(
     """Write where a mask is not 0; one thread per world."""
     world = wp.tid()
     chosen[world] = mask[world] != 0.0
+
+
+@wp.kernel
+def clear_contact_kernel(
+    # in
+    mask: wp.array(dtype=wp.bool),
+    # out
+    impulse: wp.array2d(dtype=wp.vec3),
+    contact_force: wp.array2d(dtype=wp.vec3),
+    invalid: wp.array(dtype=int),
+):
+    """Forget contact history and the invalid flag of the masked worlds; one thread per world."""
+    world = wp.tid()
+    if mask[world]:
+        invalid[world] = 0
+        for k in range(4):
+            impulse[k, world] = wp.vec3(0.0)
+            contact_force[k, world] = wp.vec3(0.0)
+
+
+@wp.kernel
+def rest_blocks_kernel(
+    # in
+    mask: wp.array(dtype=wp.bool),
+    # in, out
+    ground: Ground,
+):
+    """Put the blocks of the masked worlds back to their starts, at rest; one thread per world."""
+    world = wp.tid()
+    if mask[world]:
+        rest_block(ground, world)

@@ -254,14 +254,6 @@ def descent_tilt(view: RobotView, task: JumpState, width: float) -> float:
 
 
 @wp.func
-def lifted_paws(view: RobotView, task: JumpState, steps: float) -> float:
-    """Steps after landing: paws off the ground later than steps policy steps after touchdown, 0 to 4."""
-    if task.phase != LANDED or task.phase_steps <= int(steps):
-        return 0.0
-    return float(4 - view.contacts)
-
-
-@wp.func
 def lifted_again(view: RobotView, task: JumpState, free: float) -> float:
     """Still landing: paws off the ground again for more than `free` [s] after their own first contact, 0 to 4."""
     count = float(0.0)

@@ -191,6 +191,22 @@ def leg_inverse_kinematics(geo: LegGeometry, limits: LegLimits, ankle_body: vec3
 
 
 @wp.kernel
+def paws_kernel(
+    # in
+    geometry: wp.array(dtype=LegGeometry),
+    motors: wp.array2d(dtype=real),
+    # out
+    paws: wp.array2d(dtype=vec3),
+):
+    """Write paw positions [m] (4, n), body frame, of motor angles [rad] (12, n); launched over (4, n)."""
+    leg, robot = wp.tid()
+    m = 3 * leg
+    paws[leg, robot] = leg_forward_kinematics(
+        geometry[leg], motors[m, robot], motors[m + 1, robot], motors[m + 2, robot]
+    )
+
+
+@wp.kernel
 def inverse_kinematics_kernel(
     # in
     geometry: wp.array(dtype=LegGeometry),

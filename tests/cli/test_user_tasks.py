@@ -270,7 +270,7 @@ def test_run_of_an_older_version_is_refused_with_the_commit_that_reads_it(capsys
     [
         ("import warp as wp\n", "import warp as wp\nimport not_there\n", "own_faults.py:6: ModuleNotFoundError"),
         ("weight=2.0, ", "", "own_faults.py:{line}: TypeError: RewardTerm.__init__() missing"),
-        ("mdp.tilt(view)", "view.quad", "own_faults.py, function level: `quad` is not an attribute of 'view'"),
+        ("tilt(view)", "tilt(view.quad)", "own_faults.py, function level: `quad` is not an attribute of 'view'"),
     ],
 )
 def test_a_mistake_in_a_users_file_is_told_in_one_line(right, wrong, told, tmp_path, monkeypatch, capsys):

@@ -6,7 +6,6 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from jumper_warp.envs.env import Env
-from jumper_warp.policies.restore import restored_skills
 from jumper_warp.registry import make_task
 from jumper_warp.tasks.switching import flight_skills
 from jumper_warp.utils.errors import InputError
@@ -76,12 +75,6 @@ def test_failures_in_flight_are_told_from_those_after_it():
     flights.flight_time[1:] = 2.0
     metrics = flight_metrics(flights)
     assert metrics["failed_by_collided"] == 2 and metrics["failed_before_touchdown"] == 1
-
-
-def test_handovers_are_read_back(flown):
-    tasks, handovers = restored_skills(flown[0].config())
-    assert [task.name for task in tasks] == ["vertical-jump-mars", "attitude"]
-    assert [h.when.key for h in handovers] == [h.when.key for h in flown[0].handovers]
 
 
 def test_other_tasks_are_refused():

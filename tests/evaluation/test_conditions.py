@@ -166,7 +166,7 @@ def test_latency_is_told_as_it_was_simulated():
 
 def test_run_tells_the_latency_it_simulated_over_several_policy_steps(tmp_path):
     save_policy(tmp_path / "still", still_policy("horizontal-jump"))
-    args = EvaluationArgs(str(tmp_path / "still"), latency=40.0, record=0, out=tmp_path, device="cpu")
+    args = EvaluationArgs(policy=str(tmp_path / "still"), latency=40.0, record=0, out=tmp_path, device="cpu")
     run = EvaluationRun.of("test", args)
     env = run.env(2)
     asked = places.PlaceLog(np.array([[[0.5, 0.0]]] * 2), tuple(term.name for term in env.task.terminations))

@@ -150,7 +150,7 @@ def test_played_velocities_come_one_after_the_other():
     one, two = ((0.5, 0.0, 0.3),), ((0.5, 0.0, 0.3), (0.0, -0.2, 0.0))
     np.testing.assert_array_equal(VelocityGoals(velocity=one).log(TASK).commands, [one])
     goals = VelocityGoals(velocity=two, each=2.0)
-    assert goals.seconds == 4.0 and goals.log(TASK).times.tolist() == [0.0, 2.0]
+    assert goals.length == 4.0 and goals.log(TASK).times.tolist() == [0.0, 2.0]
     np.testing.assert_array_equal(goals.log(TASK).commands, [two])
     assert VelocityGoals().log(TASK).commands.shape == (1, 6, 3)
 

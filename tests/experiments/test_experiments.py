@@ -8,7 +8,6 @@ import pytest
 import torch
 
 from experiments import (
-    ablations,
     benchmark_solver,
     benchmark_training,
     gradient_cost,
@@ -22,16 +21,8 @@ from jumper_warp.evaluation.limits import limit_metrics
 from jumper_warp.evaluation.sweeps import HEIGHTS_IN_RANGE, HeightSweep
 from jumper_warp.policies.conditions import Conditions, env_of_policy
 from jumper_warp.registry import make_task
-from jumper_warp.rl.cfg import PpoCfg
-from jumper_warp.tasks.saving import plain
 from jumper_warp.utils.errors import InputError
 from landing_helpers import OPEN_LOOP_APEX, still_policy
-from support.ablations import (
-    ABLATIONS,
-    without_curriculum,
-    without_estimate,
-    without_reference_states,
-)
 from support.learning import Curve
 from support.soak import SoakArgs, hardest
 from support.timing import flags_of, over_baseline
@@ -173,50 +164,13 @@ def test_sweep_of_a_run_leaves_figures_plot_recording_and_filmstrip(trained, tmp
         assert (tmp_path / name).stat().st_size > 1000, name
 
 
-# ---------------------------------------------------------------- ablations
-
-
-def test_each_ablation_changes_its_own_part_only():
-    task = make_task("vertical-jump")
-    plainly = plain(task)
-    parts = {name: {key for key, value in plain(change(task)).items() if value != plainly[key]}
-             for name, change in ABLATIONS.items()}  # fmt: skip
-    assert parts == {
-        "without_estimate": {"rewards"}, "without_reference_states": {"reset"}, "without_curriculum": {"levels"},
-    }  # fmt: skip
-    weights = {term.name: term.weight for term in without_estimate(task).rewards}
-    assert weights["estimated_jump_height"] == 0.0
-    assert weights["jump_height"] == {term.name: term.weight for term in task.rewards}["jump_height"] > 0.0
-    reset = without_reference_states(task).reset.settings
-    assert (reset.standing, reset.default, reset.in_flight, reset.touchdown) == (0.8, 0.2, 0.0, 0.0)
-    assert without_curriculum(task).levels == (task.levels[-1],)
-
-
-def test_ablation_of_a_task_without_the_estimate_is_refused():
-    task = make_task("vertical-jump")
-    with pytest.raises(ValueError, match="estimated_jump_height"):
-        without_estimate(replace(task, name="other", rewards=task.rewards[:1]))
+# ---------------------------------------------------------------- learning curves
 
 
 def test_seconds_to_a_rate_are_those_of_the_first_evaluation_that_has_it():
     curve = Curve(seconds=[5.0, 10.0, 15.0, 20.0], success=[0.1, 0.85, 0.7, 0.9])
     assert curve.seconds_to(0.8) == 10.0
     assert curve.seconds_to(0.95) is None
-
-
-def test_ablations_write_a_curve_per_variant(tmp_path):
-    names = ["full", "without_curriculum"]
-    args = ablations.Args(
-        seconds=0.5, every=0.25, variants=names, envs=8, jumps=2, ppo=PpoCfg(num_steps=8), out=tmp_path, device="cpu"
-    )
-    values = ablations.main(args)
-    assert values == json.loads((tmp_path / "metrics.json").read_text())
-    for name in names:
-        assert values[f"curve_seconds_{name}"][-1] >= 0.5
-        assert values[f"success_{name}"] == values[f"curve_success_{name}"][-1] == 0.0
-        assert values[f"seconds_to_80_percent_{name}"] is None
-        assert values[f"iterations_{name}"] >= 1
-    assert (tmp_path / "ablations.png").is_file()
 
 
 def test_learning_curves_tell_when_each_training_was_good_enough(tmp_path, monkeypatch):

@@ -26,7 +26,9 @@ def policies(tmp_path_factory):
 
 
 def test_robots_that_stand_still_follow_nothing(policies, tmp_path):
-    args = walking_tracking.Args(str(policies / "velocity-flat"), per_axis=2, record=0, out=tmp_path, device="cpu")
+    args = walking_tracking.Args(
+        policy=str(policies / "velocity-flat"), per_axis=2, record=0, out=tmp_path, device="cpu"
+    )
     values = walking_tracking.main(args)
     figures = json.loads((tmp_path / "metrics.json").read_text())
     assert figures == values and (tmp_path / "tracking.png").is_file()
@@ -64,7 +66,9 @@ def test_kicks_and_speeds_are_those_of_the_test():
 
 def test_policy_of_another_task_and_settings_out_of_range_are_refused(policies, tmp_path):
     with pytest.raises(PolicyError, match="evaluated by velocity"):
-        walking_tracking.main(walking_tracking.Args(str(policies / "horizontal-jump"), out=tmp_path, device="cpu"))
+        walking_tracking.main(
+            walking_tracking.Args(policy=str(policies / "horizontal-jump"), out=tmp_path, device="cpu")
+        )
     with pytest.raises(InputError, match="per_axis"):
         walking_tracking.Args(per_axis=1)
     with pytest.raises(InputError, match="speed"):

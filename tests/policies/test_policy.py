@@ -15,7 +15,7 @@ from jumper_warp.policies.folder import add_files, find_policy, list_policies, l
 from jumper_warp.policies.onnx import export_onnx, onnx_bytes
 from jumper_warp.policies.policy import Policy
 from jumper_warp.policies.spec import PolicyError, PolicyInterface
-from jumper_warp.rl.networks import ActorCritic
+from jumper_warp.rl.networks import ActorCritic, weights_of
 
 
 def make_interface(num_obs=1, num_actions=1, hidden=(1,), **changes):
@@ -55,8 +55,8 @@ def model():
 def trained(model):
     interface = make_interface(48, 12, (64, 32))
     moments = model.obs_moments
-    return Policy.from_actor(
-        model.actor, moments.mean, moments.scale(), interface, {"env": {"seed": 5}, "commit": "abc"}
+    return Policy(
+        weights_of(model.actor), moments.mean, moments.scale(), interface, {"env": {"seed": 5}, "commit": "abc"}
     )
 
 
@@ -321,6 +321,12 @@ REFUSALS = {
     "fewer numbers than the shape": (
         change_model(lambda m: stored(m, "actor_0_weight").dims.append(2)),
         "actor.0.weight does not hold as many numbers as its shape needs",
+    ),
+    "name that is no text": (
+        lambda f: reseal(
+            f, "policy.onnx", (f / "policy.onnx").read_bytes().replace(b"actor_0_bias", b"actor_0_bia\xff")
+        ),
+        "missing or unknown: actor.0.bias",
     ),
     "weights in another file": (change_model(keep_outside), NOT_OURS),
     "another opset": (change_model(lambda m: setattr(m.opset_import[0], "version", 17)), NOT_OURS),

@@ -94,7 +94,7 @@ def test_unknown_reward_is_refused_unless_rewards_are_not_wanted(saved):
 
 def test_a_reward_that_the_task_does_not_use_comes_back(saved):
     task, config = saved
-    task = dataclasses.replace(task, rewards=(*task.rewards, RewardTerm(rewards.lifted_paws, -3.0, steps=30.0)))
+    task = dataclasses.replace(task, rewards=(*task.rewards, RewardTerm(rewards.lifted_again, -3.0, free=0.1)))
     config["env"]["task"] = json.loads(json.dumps(task_to_json(task)))
     assert whole(config) == task
 

@@ -157,13 +157,13 @@ def test_the_timeout_looks_at_the_old_episode():
     ],
 )
 def test_step_size_follows_the_divergence(lr, kl, expected):
-    found = adapted_lr(torch.tensor(lr), torch.tensor(kl), PpoCfg(desired_kl=0.01, min_lr=1.0e-5))
+    found = adapted_lr(torch.tensor(lr), torch.tensor(kl), PpoCfg(desired_kl=0.01, min_lr=1.0e-5), 0.01)
     assert found.item() == pytest.approx(expected)
 
 
 def test_step_size_stays_without_desired_divergence():
     cfg = PpoCfg(desired_kl=0.0)
-    assert adapted_lr(torch.tensor(1e-3), torch.tensor(9.0), cfg).item() == pytest.approx(1e-3)
+    assert adapted_lr(torch.tensor(1e-3), torch.tensor(9.0), cfg, 0.0).item() == pytest.approx(1e-3)
 
 
 def trained(iterations):

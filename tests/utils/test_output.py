@@ -1,5 +1,6 @@
 import json
 import math
+import os
 import subprocess
 import sys
 
@@ -72,9 +73,9 @@ def test_old_figures_stay_whole_if_writing_fails(tmp_path, monkeypatch):
     figures.write_metrics(tmp_path, {"apex": 1.0})
 
     def full_disk(*_):
-        raise OSError("no space left")
+        raise OSError(28, "no space left")
 
-    monkeypatch.setattr(figures.os, "replace", full_disk)
+    monkeypatch.setattr(os, "replace", full_disk)
     with pytest.raises(OSError, match="no space left"):
         figures.write_metrics(tmp_path, {"apex": 2.0})
     assert json.loads((tmp_path / "metrics.json").read_text()) == {"apex": 1.0}

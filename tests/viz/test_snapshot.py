@@ -70,12 +70,6 @@ def test_picture_follows_the_state_and_keeps_the_last_one(model, state):
     assert np.nonzero(colored(before, 0))[1].mean() < 32.0 < np.nonzero(colored(after, 0))[1].mean()
 
 
-def test_render_writes_the_picture(model, state, tmp_path):
-    path = snapshot.render(model, state, tmp_path / "ball.png", (-2.0, 0.0, 0.0), (0.0, 0.0, 0.0), (64, 48))
-    assert matplotlib.image.imread(path).shape[:2] == (48, 64)
-    assert colored((255 * matplotlib.image.imread(path)[..., :3]).astype(np.uint8), 0).any()
-
-
 def test_contact_sheet_keeps_order_and_pixels(tmp_path):
     shades = [np.full((30, 40, 3), shade, dtype=np.uint8) for shade in (10, 100, 200)]
     sheet = matplotlib.image.imread(snapshot.contact_sheet(shades, tmp_path / "sheet.png", columns=2))

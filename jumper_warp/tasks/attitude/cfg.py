@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,10 +9,9 @@ import warp as wp
 
 from jumper_warp.kernels.attitude.commands import TurnRanges
 from jumper_warp.kernels.attitude.reset import AttitudeSettings
-from jumper_warp.utils.checks import check_finite, check_not_negative, check_positive
+from jumper_warp.tasks.ranges import Pair, check_ranges, filled
+from jumper_warp.utils.checks import check_positive, check_shares
 from jumper_warp.utils.errors import InputError
-
-Pair = tuple[float, float]
 
 
 @dataclass(frozen=True)
@@ -32,15 +30,11 @@ class TurnCfg:
         """Raises ValueError: a range or a share is not one."""
         if not 0.0 <= self.angle[0] <= self.angle[1] <= 180.0:
             raise InputError(f"turn angle must be (lower, upper) within 0 to 180 degrees, got {self.angle}")
-        if not 0.0 <= self.axis_share <= 1.0:
-            raise InputError(f"turn axis_share must be in [0, 1], got {self.axis_share}")
+        check_shares("turn", axis_share=self.axis_share)
 
     def values(self) -> Any:
         """Return the kernels' `TurnRanges`."""
-        ranges = TurnRanges()
-        ranges.angle = wp.vec2(*(math.radians(angle) for angle in self.angle))
-        ranges.axis_share = self.axis_share
-        return ranges
+        return filled(TurnRanges(), self, degrees=("angle",))
 
 
 @dataclass(frozen=True)
@@ -65,21 +59,13 @@ class AttitudeResetCfg:
 
     def __post_init__(self) -> None:
         """Raises ValueError: a pair is reversed, a number not finite or out of range."""
-        for name, value in vars(self).items():
-            check_finite(f"reset {name}", *(value if isinstance(value, tuple) else (value,)))
-            if isinstance(value, tuple) and not value[0] <= value[1]:
-                raise InputError(f"reset {name} must be (lower, upper), got {value}")
+        check_ranges("reset", self, not_negative=("spin",))
         check_positive("reset episode", *self.episode)
         check_positive("reset height", self.height)
-        check_not_negative("reset spin", self.spin)
-        if not 0.0 <= self.default_share <= 1.0:
-            raise InputError(f"reset default_share must be in [0, 1], got {self.default_share}")
+        check_shares("reset", default_share=self.default_share)
 
     def values(self, step_dt: float) -> Any:
         """Return the kernels' `AttitudeSettings`: angles in radians, times in policy steps of step_dt [s]."""
-        settings = AttitudeSettings()
+        settings = filled(AttitudeSettings(), self, skip=("episode",), degrees=("lateral", "transversal"))
         settings.episode_steps = wp.vec2(*(seconds / step_dt for seconds in self.episode))
-        settings.height, settings.default_share, settings.spin = self.height, self.default_share, self.spin
-        for name in ("lateral", "transversal"):
-            setattr(settings, name, wp.vec2(*(math.radians(angle) for angle in getattr(self, name))))
         return settings

@@ -14,10 +14,10 @@ from jumper_warp.kernels.jump.ground_draws import EVERY_SIDE, GroundRanges
 from jumper_warp.kernels.jump.reset import JumpLevel, JumpSettings
 from jumper_warp.kernels.jump.reset_draws import ResetRanges
 from jumper_warp.kernels.jump.state import vec_schemes
-from jumper_warp.utils.checks import check_finite, check_positive
+from jumper_warp.tasks.ranges import Pair, check_ranges, filled
+from jumper_warp.utils.checks import check_positive, check_shares
 from jumper_warp.utils.errors import InputError
 
-Pair = tuple[float, float]
 SHARES = ("standing", "default", "in_flight", "touchdown", "pushing")
 """Of the ways in which an episode begins; the rest begins just landed."""
 
@@ -64,10 +64,7 @@ class GroundCfg:
 
     def ranges(self) -> Any:
         """Return the kernels' `GroundRanges`."""
-        ranges = GroundRanges()
-        for name, value in vars(self).items():
-            setattr(ranges, name, wp.vec2(*value) if isinstance(value, tuple) else value)
-        return ranges
+        return filled(GroundRanges(), self)
 
 
 @dataclass(frozen=True)
@@ -94,8 +91,7 @@ class Level:
         if not all(-math.inf < low <= high < math.inf for low, high in pairs):
             raise InputError(f"a level's ranges must be finite and rise, got {self}")
         check_positive("base_height of a level", *self.base_height)
-        if not 0.0 <= self.jump_again <= 1.0:
-            raise InputError(f"level jump_again must be in [0, 1], got {self.jump_again}")
+        check_shares("level", jump_again=self.jump_again)
 
     def values(self) -> Any:
         """Return the kernels' `JumpLevel`."""
@@ -194,18 +190,9 @@ class ResetCfg:
         shares = self._shares()
         if not min(shares) >= 0.0 or sum(shares) > 1.0 + 1e-9:
             raise InputError(f"reset shares must be >= 0 and add up to at most 1, got {shares}")
-        for name, value in vars(self).items():
-            if name not in ("ground", "shares_of"):
-                check_finite(f"reset {name}", *(value if isinstance(value, tuple) else (value,)))
-            if isinstance(value, tuple) and not value[0] <= value[1]:
-                raise InputError(f"reset {name} must be (lower, upper), got {value}")
-        if not 0.0 <= self.long_wait_share <= 1.0:
-            raise InputError(f"reset long_wait_share must be in [0, 1], got {self.long_wait_share}")
-        for name in ("command_delay", "long_wait", "again_delay", "lean", "push_length", "push_acceleration"):
-            value = getattr(self, name)
-            least = value[0] if isinstance(value, tuple) else value
-            if not least >= 0.0:
-                raise InputError(f"reset {name} must not be negative, got {least}")
+        positive = ("command_delay", "long_wait", "again_delay", "lean", "push_length", "push_acceleration")
+        check_ranges("reset", self, skip=("ground", "shares_of"), not_negative=positive)
+        check_shares("reset", long_wait_share=self.long_wait_share)
         if self.shares_of not in ("resets", "time"):
             raise InputError(f"reset shares_of must be resets or time, got {self.shares_of!r:.40}")
 
@@ -231,24 +218,16 @@ class ResetCfg:
         return replace(self, ground=GroundCfg())
 
     def _ranges(self, step_dt: float) -> Any:
-        ranges = ResetRanges()
-        *others, pushing = self._shares()
-        landed = 1.0 - sum(self._shares())
-        ranges.shares = vec_schemes(*others, landed if landed > 1.0e-6 else 0.0, pushing)
-        ranges.of_time = int(self.shares_of == "time")
         degrees = (
             "tilt", "forward_pitch", "heading", "takeoff_angle", "takeoff_pitch", "flight_lateral",
             "flight_transversal",
         )  # fmt: skip
         apart = (*SHARES, "shares_of", "command_delay", "long_wait", "again_delay", "ground")
-        for name, value in vars(self).items():
-            if name in apart:
-                continue
-            scale = math.pi / 180.0 if name in degrees else 1.0
-            if isinstance(value, tuple):
-                setattr(ranges, name, wp.vec2(scale * value[0], scale * value[1]))
-            else:
-                setattr(ranges, name, scale * value)
+        ranges = filled(ResetRanges(), self, apart, degrees)
+        *others, pushing = self._shares()
+        landed = 1.0 - sum(self._shares())
+        ranges.shares = vec_schemes(*others, landed if landed > 1.0e-6 else 0.0, pushing)
+        ranges.of_time = int(self.shares_of == "time")
         ranges.command_delay = round(self.command_delay / step_dt)
         ranges.long_wait = round(self.long_wait / step_dt)
         ranges.again_delay = wp.vec2(*(delay / step_dt for delay in self.again_delay))

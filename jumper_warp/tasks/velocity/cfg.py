@@ -12,10 +12,10 @@ import warp as wp
 from jumper_warp.kernels.velocity.commands import CommandRanges
 from jumper_warp.kernels.velocity.reset import Map, VelocitySettings
 from jumper_warp.robot.terrain import TerrainCfg, terrain_map
-from jumper_warp.utils.checks import check_finite, check_not_negative
+from jumper_warp.tasks.ranges import Pair, check_ranges, filled
+from jumper_warp.utils.checks import check_finite, check_shares
 from jumper_warp.utils.errors import InputError
 
-Pair = tuple[float, float]
 Reach = tuple[float, float, float, float]
 
 
@@ -107,27 +107,12 @@ class VelocityResetCfg:
 
     def __post_init__(self) -> None:
         """Raises ValueError: a pair is reversed, a number not finite or out of range."""
-        for name, value in vars(self).items():
-            if name == "terrain":
-                continue
-            check_finite(f"reset {name}", *(value if isinstance(value, tuple) else (value,)))
-            if isinstance(value, tuple):
-                if not 0.0 <= value[0] <= value[1]:
-                    raise InputError(f"reset {name} must be (lower, upper) and not negative, got {value}")
-            else:
-                check_not_negative(f"reset {name}", value)
+        check_ranges("reset", self, skip=("terrain",), not_negative=vars(self))
         check_shares("reset", default_share=self.default_share, lifted_share=self.lifted_share)
 
     def values(self, step_dt: float) -> Any:
         """Return the kernels' `VelocitySettings`: angles in radians, times in policy steps of step_dt [s]."""
-        settings = VelocitySettings()
-        apart = ("episode", "gait", "terrain")
-        for name, value in vars(self).items():
-            if name in apart:
-                continue
-            scale = math.pi / 180.0 if name in ("tilt", "heading") else 1.0
-            scaled = wp.vec2(*(scale * v for v in value)) if isinstance(value, tuple) else scale * value
-            setattr(settings, name, scaled)
+        settings = filled(VelocitySettings(), self, skip=("episode", "gait", "terrain"), degrees=("tilt", "heading"))
         settings.episode_steps, settings.pace = round(self.episode / step_dt), self.gait * step_dt
         tiles = Map()
         tiles.rows, tiles.cols, tiles.tile = self.terrain.rows, self.terrain.cols, self.terrain.tile
@@ -141,10 +126,3 @@ class VelocityResetCfg:
     def on_level_ground(self) -> VelocityResetCfg:
         """Return the same without a map."""
         return replace(self, terrain=TerrainCfg.none())
-
-
-def check_shares(what: str, **shares: float) -> None:
-    """Raise InputError unless each share is in 0 to 1."""
-    for name, share in shares.items():
-        if not 0.0 <= share <= 1.0:
-            raise InputError(f"{what} {name} must be in [0, 1], got {share}")

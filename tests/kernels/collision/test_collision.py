@@ -72,7 +72,7 @@ def joint_coordinates(pos, quat_xyzw, motors):
 
 def collide(pos, quat_xyzw, motors_deg, margin=1.0, heights=None, module=collision_module):
     """Flags and clearance [m], each shape (n,)."""
-    package = module.__package__.removesuffix(".collision")
+    package = module.__package__.rpartition(".")[0]
     joint_q = joint_coordinates(pos, quat_xyzw, np.radians(motors_deg))
     flags = wp.zeros(len(joint_q), dtype=wp.int32, device="cpu")
     clearance = wp.zeros(len(joint_q), dtype=wp.float32, device="cpu")

@@ -1,0 +1,51 @@
+"""Flags and report that many scripts share."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from jumper_warp.utils.output import output_dir, write_metrics
+from jumper_warp.utils.runtime import announce
+
+
+@dataclass(frozen=True)
+class DeviceArgs:
+    """Flags of a script that computes on one device."""
+
+    out: Path | None = None
+    """Folder for metrics.json, plots and recordings (default: outputs/<script>/<time>)."""
+    device: str | None = None
+    """Warp device."""
+
+
+@dataclass(frozen=True)
+class ThreadArgs(DeviceArgs):
+    """Flags of a script whose worlds may share CPU threads."""
+
+    threads: int | None = None
+    """CPU threads that share the worlds (default: all cores); they change no result."""
+
+
+def prepare(name: str, args: DeviceArgs, threads: int | None = None) -> Path:
+    """Take up device and threads, print them, and return the folder of a script's results."""
+    announce(args.device, threads)
+    return output_dir(name, args.out)
+
+
+def report(folder: Path, values: Mapping[str, Any]) -> None:
+    """Write metrics.json into a folder, and print the metrics and the folder."""
+    write_metrics(folder, values)
+    for name, value in values.items():
+        items = value if isinstance(value, list | tuple) else [value]
+        print(f"{name:40} {', '.join(map(number_text, items))}")
+    print(f"metrics, plots and recordings in {folder}")
+
+
+def number_text(value: Any) -> str:
+    """Return a number with four digits, a large one with all before the decimal point; anything else as text."""
+    if not isinstance(value, float):
+        return str(value)
+    return f"{value:,.0f}" if abs(value) >= 1.0e3 else f"{value:.4g}"

@@ -1,0 +1,65 @@
+"""Newton's model, state and control of a built robot for a type checker: the arrays that Newton calls optional exist.
+
+At run time they are Newton's own classes.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import newton
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    import warp as wp
+
+    class State(newton.State):
+        """A state of bodies and joints."""
+
+        joint_q: wp.array
+        joint_qd: wp.array
+        body_q: wp.array
+        body_qd: wp.array
+        body_f: wp.array
+
+    class Control(newton.Control):
+        """Controls of joints."""
+
+        joint_f: wp.array
+
+    class Model(newton.Model):
+        """A finalized model of bodies, joints and shapes."""
+
+        body_com: wp.array
+        body_inertia: wp.array
+        body_inv_inertia: wp.array
+        body_inv_mass: wp.array
+        body_mass: wp.array
+        body_q: wp.array
+        body_qd: wp.array
+        body_world: wp.array
+        gravity: wp.array
+        joint_armature: wp.array
+        joint_child: wp.array
+        joint_damping: wp.array
+        joint_friction: wp.array
+        joint_mimic_joint: wp.array
+        joint_parent: wp.array
+        joint_q: wp.array
+        joint_qd: wp.array
+        joint_X_c: wp.array
+        joint_X_p: wp.array
+        shape_body: wp.array
+        shape_color: wp.array
+        shape_flags: wp.array
+        shape_material_mu: wp.array
+        shape_scale: wp.array
+        shape_source: list[Any]
+        shape_transform: wp.array
+        shape_type: wp.array
+        shape_world: wp.array
+        state: Callable[..., State]
+        control: Callable[..., Control]
+else:
+    Model, State, Control = newton.Model, newton.State, newton.Control
