@@ -1,4 +1,6 @@
 import os
+import subprocess
+import sys
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # workers share the cores; before torch reads it
 
@@ -6,21 +8,30 @@ import pytest
 import torch
 import warp as wp
 
+from hold_height import hold_height
 from jumper_warp.envs.env import Env
 from jumper_warp.registry import make_task
 from support.soak import hardest
 
 wp.config.log_level = wp.LOG_WARNING
 SHARED = ("vertical-jump", "horizontal-jump", "velocity-flat", "velocity-rough", "attitude")
-"""Tasks whose kernels many files need."""
+"""Tasks whose kernels many files need, besides that of `hold_height`."""
+MUJOCO = """
+import warp as wp
+from jumper_warp.sim.simulation import Simulation
+wp.config.log_level = wp.LOG_WARNING
+Simulation(2, solver="mujoco", visuals=False, device="cpu").step()
+"""
 
 
 def pytest_sessionstart(session):
     """Compile what most files need before workers begin, who else would compile the same kernels at the same time."""
     options = session.config.option
     if (getattr(options, "numprocesses", None) or 0) > 1 and not options.file_or_dir:
-        for name in SHARED:
-            Env(hardest(make_task(name)), 2, device="cpu").compile()  # a whole map takes seconds, and the same kernels
+        with subprocess.Popen([sys.executable, "-c", MUJOCO]):
+            for name in SHARED:
+                Env(hardest(make_task(name)), 2, device="cpu").compile()  # a whole map takes seconds, the kernels alike
+            Env(hold_height(), 2, device="cpu").compile()
 
 
 @pytest.fixture(scope="module")

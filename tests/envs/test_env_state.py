@@ -1,6 +1,4 @@
 import dataclasses
-import shutil
-import socket
 
 import numpy as np
 import pytest
@@ -13,12 +11,12 @@ from jumper_warp.envs.env import Env
 from jumper_warp.envs.state import nominal_fingerprint
 from jumper_warp.registry import make_task
 from jumper_warp.rl.cfg import PpoCfg, TrainCfg
-from jumper_warp.rl.checkpoint import CheckpointError, load_checkpoint
+from jumper_warp.rl.checkpoint import load_checkpoint
 from jumper_warp.rl.runner import CHECKPOINTS, train
 from jumper_warp.robot.motors import jumping_motors
 from jumper_warp.tasks.jump.cfg import GroundCfg
 from jumper_warp.tasks.randomization import RandomizationCfg
-from toy_task import SMALL, PushTask, join
+from toy_task import equal
 
 N = 16
 PPO = PpoCfg(num_steps=8, hidden=(32, 32), minibatches=4)
@@ -44,13 +42,6 @@ def train_jump(cfg):
 
     result = train(cfg, make)
     return made[0], load_checkpoint(result.folder / CHECKPOINTS / f"iteration_{result.iteration:06d}.pt")
-
-
-def equal(a, b):
-    if isinstance(a, (dict, list)):
-        keys = a.keys() if isinstance(a, dict) else range(len(a))
-        return len(a) == len(b) and all(equal(a[key], b[key]) for key in keys)
-    return torch.equal(a, b) if isinstance(a, torch.Tensor) else a == b
 
 
 @pytest.fixture
@@ -283,40 +274,3 @@ def test_a_state_of_before_the_first_reset_begins_as_a_new_environment_does():
         env.reset()
     assert equal(saved.state_dict(), fresh.state_dict())
     assert len(set(fresh.sim.motors.kp.numpy().ravel())) == 24
-
-
-# ---------------------------------------------------------------- several processes
-
-
-def train_push(rank, ports, cfg):
-    """One of two processes: train to the end, then again from the middle; episodes outlast an iteration."""
-    torch.set_num_threads(1)
-
-    def make(num_envs, seed, device):
-        return PushTask(num_envs, seed, device, episode_length=20 + 7 * rank)
-
-    join(rank, ports[0])
-    train(cfg, make)
-    (folder,) = cfg.log_root.glob(f"jump/*/{CHECKPOINTS}")
-    if rank == 0:
-        shutil.copyfile(folder / "iteration_000004.pt", cfg.log_root / "whole.pt")
-    join(rank, ports[1])
-    train(dataclasses.replace(cfg, resume=str(folder / "iteration_000002.pt")), make)
-
-
-def test_every_process_takes_up_its_own_worlds(cfg):
-    cfg = dataclasses.replace(cfg, ppo=SMALL)
-    with socket.socket() as one, socket.socket() as two:
-        for probe in (one, two):
-            probe.bind(("127.0.0.1", 0))
-        ports = (one.getsockname()[1], two.getsockname()[1])
-    torch.multiprocessing.spawn(train_push, (ports, cfg), nprocs=2)
-    (folder,) = cfg.log_root.glob(f"jump/*/{CHECKPOINTS}")
-    expected = torch.load(cfg.log_root / "whole.pt", weights_only=True)
-    found = load_checkpoint(folder / "iteration_000004.pt")
-    assert not equal(expected["env"], expected["others"][0]["env"])
-    for part in ("ppo", "env", "rng", "others"):
-        assert equal(found[part], expected[part]), part
-    alone = dataclasses.replace(cfg, num_envs=N // 2, resume=str(folder / "iteration_000002.pt"))
-    with pytest.raises(CheckpointError, match="saved by 2 processes, there are 1"):
-        train(alone, lambda n, seed, device: PushTask(n, seed))

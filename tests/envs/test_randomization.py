@@ -6,6 +6,7 @@ import math
 import numpy as np
 import pytest
 
+from jumper_warp.kernels.mdp import parameters
 from jumper_warp.tasks.randomization import RandomizationCfg
 from randomization_helpers import (
     ALL,
@@ -86,42 +87,39 @@ def test_a_link_gains_mass_and_inertia_alike(drawn, nominal):
 
 
 AFFECTED = {
-    "base_mass": ["base_mass", "base_moments"],
-    "com_shift": ["com_shift", "base_moments"],
     "static_friction": ["static_friction"],
     "dynamic_friction": ["dynamic_friction", "static_friction"],
-    "gains": ["kp", "kd"],
-    "link_mass": ["link_mass", "link_moments"],
+    **{row: [row] for row in ("no_load_speed", "cutoff_speed", "force", "torque")},
 }
+"""What the rows change that share an event with another."""
 
 
-def same(name, found, expected):
-    """Whether values are the same, bit for bit, but for the quotient of two of them."""
-    return (
-        np.allclose(found, expected, rtol=1e-6, atol=1e-9) if name == "com_shift" else np.array_equal(found, expected)
-    )
-
-
-@pytest.mark.parametrize("row", ALL)
-def test_a_row_alone_changes_nothing_else(nominal, row):
-    """Not one bit, but of rows that are drawn together."""
+@pytest.mark.parametrize("row", AFFECTED)
+def test_a_row_that_shares_its_event_changes_nothing_else(nominal, row):
+    """Not one bit."""
     found = read(randomized(dataclasses.replace(OFF, **{row: ALL[row]}), 4))
-    nominal = {name: values[..., :4] for name, values in nominal.items()}
-    changed = [name for name in found if not same(name, found[name], nominal[name])]
-    allowed = AFFECTED.get(row, [row])
-    assert set(changed) <= set(allowed) and allowed[0] in changed
+    changed = [name for name in found if not np.array_equal(found[name], nominal[name][..., :4])]
+    assert set(changed) <= set(AFFECTED[row]) and AFFECTED[row][0] in changed
 
 
-@pytest.mark.parametrize("row", ALL)
+@pytest.mark.parametrize("row", AFFECTED)
 def test_a_row_off_is_nominal(nominal, row):
     found = read(randomized(dataclasses.replace(RandomizationCfg(**ALL, **HELD), **{row: None}), 4))
-    for name in AFFECTED.get(row, [row])[:1]:
-        if row == "static_friction":
-            np.testing.assert_allclose(found[name], found["dynamic_friction"])
-        elif row == "dynamic_friction":
-            np.testing.assert_allclose(found[name], np.broadcast_to(found[name][:1, :1], found[name].shape))
-        else:
-            assert same(name, found[name], nominal[name][..., :4])
+    if row == "static_friction":
+        np.testing.assert_allclose(found[row], found["dynamic_friction"])
+    elif row == "dynamic_friction":
+        np.testing.assert_allclose(found[row], np.broadcast_to(found[row][:1, :1], found[row].shape))
+    else:
+        np.testing.assert_array_equal(found[row], nominal[row][..., :4])
+
+
+@pytest.mark.parametrize("row", sorted(set(ALL) - set(AFFECTED)))
+def test_any_other_row_is_an_event_of_its_own(row):
+    (alone,) = dataclasses.replace(OFF, **{row: ALL[row]}).events()
+    assert alone.func is getattr(parameters, "action_latency" if row == "latency" else row)
+    every = RandomizationCfg(**ALL, **HELD)
+    rest = dataclasses.replace(every, **{row: None}).events()
+    assert [event.func for event in rest] == [event.func for event in every.events() if event.func is not alone.func]
 
 
 def test_the_same_seed_draws_the_same_and_another_does_not():

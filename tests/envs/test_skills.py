@@ -11,50 +11,24 @@ import hold_height
 from hold_height import HoldState
 from jump_helpers import random_actions
 from jumper_warp.envs.env import Env
-from jumper_warp.kernels.jump.state import JumpState
 from jumper_warp.kernels.mdp.view import RobotView
 from jumper_warp.registry import make_task
 from jumper_warp.robot.motors import jumping_motors
 from jumper_warp.tasks.cfg import Handover
 from jumper_warp.tasks.randomization import RandomizationCfg
+from skill_helpers import begin_hold, begin_jump, when_asked_to_hold, when_asked_to_jump
 
 N = 16
 DEG = np.pi / 180.0
 JUMP = dataclasses.replace(make_task("vertical-jump"), action_scale=(40.0, 90.0))
 HOLD = dataclasses.replace(hold_height.hold_height(), action_scale=(40.0, 40.0))
+AGAIN = dataclasses.replace(HOLD, name="hold-again")
 SKILL = np.arange(N) % 3 == 1
-
-
-@wp.func
-def when_asked_to_jump(view: RobotView, task: HoldState, requested: bool) -> bool:
-    return requested
-
-
-@wp.func
-def when_asked_to_hold(view: RobotView, task: JumpState, requested: bool) -> bool:
-    return requested
 
 
 @wp.func
 def always(view: RobotView, task: HoldState, requested: bool) -> bool:
     return True
-
-
-@wp.func
-def begin_jump(view: RobotView, task: HoldState) -> JumpState:
-    new = JumpState()
-    new.start = view.pos
-    new.max_height = view.pos[2]
-    new.goal = wp.vec3(view.pos[0], view.pos[1], 0.6 + task.goal)
-    new.command_step = 1000
-    return new
-
-
-@wp.func
-def begin_hold(view: RobotView, task: JumpState) -> HoldState:
-    new = HoldState()
-    new.goal = 0.3
-    return new
 
 
 @wp.func
@@ -182,11 +156,10 @@ def test_a_switch_leaves_the_robot_and_all_other_worlds_as_they_are():
 
 def test_a_switch_between_skills_of_equal_motors_changes_no_step_at_all():
     """The same targets with a switch and without: masses, latency and pushes are those of before."""
-    other = dataclasses.replace(HOLD, name="hold-again", rewards=HOLD.rewards[:1])
-    there = Handover(HOLD, other, when_asked_to_jump, go_on_holding)
-    back = Handover(other, HOLD, when_asked_to_jump, go_on_holding)
+    there = Handover(HOLD, AGAIN, when_asked_to_jump, go_on_holding)
+    back = Handover(AGAIN, HOLD, when_asked_to_jump, go_on_holding)
     actions = 0.1 * random_actions(N, 10)
-    quiet, asked = (make(HOLD, other, handovers=(there, back)) for _ in range(2))
+    quiet, asked = (make(HOLD, AGAIN, handovers=(there, back)) for _ in range(2))
     expected, _ = followed(quiet, actions)
     found, skills = followed(asked, actions, request_at=3, skill=1)
     assert (skills[3:] == ASKED).all() and not asked.done.any() and not quiet.done.any()
@@ -254,9 +227,8 @@ def test_a_new_skill_sees_nothing_of_before_its_beginning():
 
 
 def test_a_world_goes_over_at_most_once_a_step_and_not_where_its_episode_ends():
-    other = dataclasses.replace(HOLD, name="hold-again")
-    handovers = (Handover(HOLD, other, always, go_on_holding), Handover(other, HOLD, always, go_on_holding))
-    env = make(HOLD, other, handovers=handovers)
+    handovers = (Handover(HOLD, AGAIN, always, go_on_holding), Handover(AGAIN, HOLD, always, go_on_holding))
+    env = make(HOLD, AGAIN, handovers=handovers)
     records = env.skills[0].states.numpy().copy()
     records["steps"][2] = 119  # ends now, and begins anew in the skill that it is in
     env.skills[0].states.assign(records)

@@ -12,7 +12,6 @@ import torch
 import warp as wp
 
 import hold_height
-from hold_height import HoldState
 from jump_helpers import random_actions
 from jumper_warp.cli.main import main
 from jumper_warp.envs.env import Env
@@ -29,6 +28,7 @@ from jumper_warp.tasks.cfg import Handover
 from jumper_warp.tasks.randomization import RandomizationCfg
 from jumper_warp.utils import threads as pool
 from jumper_warp.utils.errors import InputError
+from skill_helpers import begin_hold, begin_jump, when_asked_to_jump
 
 N = 3 * LEAST + 2
 JUMP = dataclasses.replace(
@@ -38,29 +38,8 @@ HOLD = hold_height.hold_height()
 
 
 @wp.func
-def asked_to_jump(view: RobotView, task: HoldState, requested: bool) -> bool:
-    return requested
-
-
-@wp.func
-def begin_jump(view: RobotView, task: HoldState) -> JumpState:
-    new = JumpState()
-    new.start = view.pos
-    new.max_height = view.pos[2]
-    new.goal = wp.vec3(view.pos[0], view.pos[1], 0.6)
-    return new
-
-
-@wp.func
 def in_the_air(view: RobotView, task: JumpState, requested: bool) -> bool:
     return view.contacts == 0
-
-
-@wp.func
-def begin_hold(view: RobotView, task: JumpState) -> HoldState:
-    new = HoldState()
-    new.goal = 0.3
-    return new
 
 
 @pytest.fixture(autouse=True)
@@ -110,7 +89,7 @@ def test_an_environment_has_the_same_bits_on_any_number_of_threads(alone, thread
 
 
 def test_skills_and_their_handovers_have_the_same_bits():
-    there, back = Handover(HOLD, JUMP, asked_to_jump, begin_jump), Handover(JUMP, HOLD, in_the_air, begin_hold)
+    there, back = Handover(HOLD, JUMP, when_asked_to_jump, begin_jump), Handover(JUMP, HOLD, in_the_air, begin_hold)
     expected, found = (
         story(threads, 120, (JUMP, HOLD), skill=np.arange(N) % 2, handovers=(there, back)) for threads in (1, 3)
     )

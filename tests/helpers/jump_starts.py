@@ -1,5 +1,7 @@
 """Thousands of beginnings of jumps, and what they are made of, for tests of resets."""
 
+from functools import cached_property
+
 import numpy as np
 import pinocchio as pin
 import warp as wp
@@ -39,7 +41,12 @@ class Starts:
         self.goal = self.episodes["goal"] * [1.0, 1.0, 0.0]
         self.distance = np.linalg.norm(self.goal, axis=1)
         self.along = self.goal / self.distance[:, None]
-        self.paws = paws_of(env, self.q, self.qd)
+        self._model = env.sim.model
+
+    @cached_property
+    def paws(self) -> np.ndarray:
+        """Places of the paws [m], (worlds, 4, 3)."""
+        return paws_of(self._model, self.q, self.qd)
 
     def split(self, vectors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the parts of horizontal vectors towards the goal and to its left."""
@@ -53,9 +60,9 @@ class Starts:
         return turned * np.array([[1, 1, 1], [1, -1, 1], [-1, 1, 1], [-1, -1, 1]])
 
 
-def paws_of(env: Env, q: np.ndarray, qd: np.ndarray) -> np.ndarray:
+def paws_of(model, q: np.ndarray, qd: np.ndarray) -> np.ndarray:
     """Return the places of the paws [m] from Pinocchio, (worlds, 4, 3), of rows of joint_q and joint_qd."""
-    reference, states = Reference(env.sim.model), States.read(q, qd)
+    reference, states = Reference(model), States.read(q, qd)
     robot, joints = reference.robot, [paw_joint(reference, leg) for leg in range(4)]
     paws = np.zeros((len(states.pos), 4, 3))
     for i in range(len(paws)):

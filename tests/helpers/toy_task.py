@@ -2,6 +2,7 @@
 
 import dataclasses
 import os
+import shutil
 import socket
 from pathlib import Path
 
@@ -9,7 +10,7 @@ import torch
 
 from jumper_warp.rl.cfg import PpoCfg, TrainCfg
 from jumper_warp.rl.ppo import Ppo
-from jumper_warp.rl.runner import train
+from jumper_warp.rl.runner import CHECKPOINTS, train
 
 torch.set_num_threads(1)  # on matrices this small, threads mostly wait for each other
 SMALL = PpoCfg(num_steps=16, hidden=(32, 32), minibatches=4)
@@ -109,6 +110,13 @@ def local_order(rank: int, size: int) -> torch.Tensor:
     return torch.randperm(size, generator=torch.Generator().manual_seed(rank))
 
 
+def equal(a, b) -> bool:
+    if isinstance(a, (dict, list)):
+        keys = a.keys() if isinstance(a, dict) else range(len(a))
+        return len(a) == len(b) and all(equal(a[key], b[key]) for key in keys)
+    return torch.equal(a, b) if isinstance(a, torch.Tensor) else a == b
+
+
 def free_port() -> int:
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
@@ -153,3 +161,18 @@ def train_rank(rank: int, port: int, cfg: TrainCfg, path: str) -> None:
     result = train(cfg, make_env)
     outcome = {"model": networks[0].state_dict(), "seed": made[0].seed, "num_envs": made[0].num_envs}
     torch.save({**outcome, "iteration": result.iteration}, path + str(rank))
+
+
+def train_twice(rank: int, ports: tuple[int, int], cfg: TrainCfg) -> None:
+    """One of two processes: train to the end, then again from the middle; episodes outlast an iteration."""
+
+    def make(num_envs: int, seed: int, device: torch.device) -> PushTask:
+        return PushTask(num_envs, seed, device, episode_length=20 + 7 * rank)
+
+    join(rank, ports[0])
+    train(cfg, make)
+    (folder,) = cfg.log_root.glob(f"push/*/{CHECKPOINTS}")
+    if rank == 0:
+        shutil.copyfile(folder / "iteration_000004.pt", cfg.log_root / "whole.pt")
+    join(rank, ports[1])
+    train(dataclasses.replace(cfg, resume=str(folder / "iteration_000002.pt")), make)

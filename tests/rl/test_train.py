@@ -17,7 +17,7 @@ from jumper_warp.rl.distributed import Rank
 from jumper_warp.rl.logger import FIGURES
 from jumper_warp.rl.rsl_rl import rsl_rl_config, train_rsl_rl
 from jumper_warp.rl.runner import CHECKPOINTS, CONFIG, Run, Stop, train
-from toy_task import SMALL, PushTask, free_port, push_cfg, train_rank
+from toy_task import SMALL, PushTask, equal, free_port, push_cfg, train_rank, train_twice
 
 
 def make_env(num_envs, seed, device):
@@ -31,12 +31,6 @@ def cfg(tmp_path):
 
 def final_state(result):
     return load_checkpoint(result.folder / CHECKPOINTS / f"iteration_{result.iteration:06d}.pt")
-
-
-def equal(a, b):
-    if isinstance(a, dict):
-        return a.keys() == b.keys() and all(equal(a[key], b[key]) for key in a)
-    return torch.equal(a, b)
 
 
 def test_a_run_leaves_settings_figures_and_checkpoints(cfg):
@@ -212,6 +206,19 @@ def test_two_processes_train_one_policy(cfg, tmp_path):
     assert first["seed"] != second["seed"]
     (folder,) = cfg.log_root.glob("push/*")
     assert equal(load_checkpoint(folder / CHECKPOINTS / "iteration_000004.pt")["ppo"]["model"], first["model"])
+
+
+def test_every_process_takes_up_its_own_worlds(cfg):
+    torch.multiprocessing.spawn(train_twice, ((free_port(), free_port()), cfg), nprocs=2)
+    (folder,) = cfg.log_root.glob(f"push/*/{CHECKPOINTS}")
+    expected = torch.load(cfg.log_root / "whole.pt", weights_only=True)
+    found = load_checkpoint(folder / "iteration_000004.pt")
+    assert not equal(expected["env"], expected["others"][0]["env"])
+    for part in ("ppo", "env", "rng", "others"):
+        assert equal(found[part], expected[part]), part
+    alone = dataclasses.replace(cfg, num_envs=cfg.num_envs // 2, resume=str(folder / "iteration_000002.pt"))
+    with pytest.raises(CheckpointError, match="saved by 2 processes, there are 1"):
+        train(alone, lambda n, seed, device: PushTask(n, seed))
 
 
 @pytest.mark.parametrize(
