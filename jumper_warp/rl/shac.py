@@ -107,7 +107,8 @@ class Shac:
         return {"loss": loss, **{name: torch.stack(rows) for name, rows in seen.items()}}
 
     def _target_value(self, critic_obs: torch.Tensor) -> torch.Tensor:
-        return self.model.value_moments.restore(self.target(self.model.critic_features(critic_obs)).squeeze(-1))
+        head = self.target(self.model.critic_features(critic_obs)).squeeze(-1)
+        return self.model.value_moments.scaling().restore(head)
 
     def _count(self, reward: torch.Tensor, done: torch.Tensor) -> None:
         now = self.episode + torch.stack([reward, torch.ones_like(reward)])
@@ -128,7 +129,7 @@ class Shac:
         if cfg.normalise_value:
             model.value_moments.update(returns.flatten())
         features = model.critic_features(critic_obs.flatten(0, 1))
-        wanted = model.value_moments.normalise(returns.flatten())
+        wanted = model.value_moments.scaling().normalise(returns.flatten())
         losses, norms = [], []
         for _ in range(shac.critic_epochs):
             for rows in torch.randperm(len(wanted), device=wanted.device).chunk(shac.critic_minibatches):
