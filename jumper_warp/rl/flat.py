@@ -124,8 +124,7 @@ class FlatAdam:
         """lr: step size at the start, kept on the device as `self.lr`."""
         self.flat = flat
         self.mean, self.square = torch.zeros_like(flat.value), torch.zeros_like(flat.value)
-        self.step = torch.zeros((), device=flat.value.device)
-        self.lr = torch.full((), lr, device=flat.value.device)
+        self.step, self.lr = (torch.full((), x, device=flat.value.device) for x in (0.0, lr))
         self.vectors = AdamVectors(flat.value, flat.gradient, self.mean, self.square, self.step, self.lr)
 
     def state_dict(self) -> dict[int, dict[str, torch.Tensor]]:

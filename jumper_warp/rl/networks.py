@@ -6,6 +6,8 @@ the host. With y the layer's output, x its input and s = ∂L/∂(Wx + b): ∂L/
 slope of each activation follows from y alone: elu' = 1 + min(y, 0), relu' = [y > 0], tanh' = 1 - y².
 """
 
+from __future__ import annotations
+
 import math
 from collections.abc import Sequence
 from itertools import pairwise
@@ -39,6 +41,19 @@ class Moments(NamedTuple):
     count: int
     """Number of samples."""
 
+    @staticmethod
+    def of(x: torch.Tensor, rows: int | None = None) -> Moments:
+        """Return the moments over the first axis of x (batch, ...).
+
+        rows: taken at a time, in two passes, which takes a CPU a sixth of the time (default: all, in one).
+        """
+        if rows is None:
+            var, mean = torch.var_mean(x, dim=0, correction=0)
+        else:
+            mean = x.mean(0)
+            var = torch.stack([(part - mean).square().sum(0) for part in x.split(rows)]).sum(0) / x.shape[0]
+        return Moments(mean, var, x.shape[0])
+
 
 class Scaling(NamedTuple):
     """What samples are scaled by, each float32 and of one sample's shape."""
@@ -55,7 +70,7 @@ class Scaling(NamedTuple):
         return x * self.std + self.mean
 
     def features(self, obs: torch.Tensor, columns: int) -> torch.Tensor:
-        """Return sanitised observations (batch, n) scaled, limited, and filled up with zeros to so many columns."""
+        """Return sanitised observations (..., n) scaled, limited, and filled up with zeros to so many columns."""
         features = normalise(obs, self.mean, self.std, NORMALISED_LIMIT)
         return functional.pad(features, (0, columns - obs.shape[-1]))
 
@@ -73,19 +88,6 @@ def joint_moments(own: Sequence[Moments]) -> list[Moments]:
         pairs = zip(parts[::2], parts[1::2], moments, strict=True)
         moments = [(a.view_as(like), (b - a.square()).clamp(min=0.0).view_as(like)) for a, b, (like, _) in pairs]
     return [Moments(*pair, each.count * world_size()) for pair, each in zip(moments, own, strict=True)]
-
-
-def own_moments(x: torch.Tensor, rows: int | None = None) -> Moments:
-    """Return the moments over the first axis of this rank's batch (batch, ...).
-
-    rows: taken at a time, in two passes, which takes a CPU a sixth of the time (default: all, in one).
-    """
-    if rows is None:
-        var, mean = torch.var_mean(x, dim=0, correction=0)
-        return Moments(mean, var, x.shape[0])
-    mean = x.mean(0)
-    var = torch.stack([(part - mean).square().sum(0) for part in x.split(rows)]).sum(0) / x.shape[0]
-    return Moments(mean, var, x.shape[0])
 
 
 def gaussian_log_prob(x: torch.Tensor, mean: torch.Tensor, log_std: torch.Tensor) -> torch.Tensor:
@@ -120,7 +122,7 @@ class RunningMoments(nn.Module):
     @torch.no_grad()
     def update(self, x: torch.Tensor) -> None:
         """Take in a batch of finite samples (batch, *shape); those of the other ranks come with it, exactly."""
-        self.take(joint_moments([own_moments(x)])[0])
+        self.take(joint_moments([Moments.of(x)])[0])
 
     @torch.no_grad()
     def take(self, moments: Moments) -> None:
@@ -203,11 +205,11 @@ class ActorCritic(nn.Module):
 
     def features(self, obs: torch.Tensor) -> torch.Tensor:
         """Return what the actor sees of raw observations (..., num_obs): finite, scaled, within ±NORMALISED_LIMIT."""
-        return _features(obs, self.obs_moments)
+        return self.obs_moments.scaling().features(sanitise(obs), obs.shape[-1])
 
     def critic_features(self, critic_obs: torch.Tensor) -> torch.Tensor:
         """Return what the critic sees of its raw observations (..., num_critic_obs), likewise."""
-        return _features(critic_obs, self.critic_moments)
+        return self.critic_moments.scaling().features(sanitise(critic_obs), critic_obs.shape[-1])
 
     def value_head(self, critic_features: torch.Tensor) -> torch.Tensor:
         """Return the critic's output, in standard deviations of the return; (...)."""
@@ -223,10 +225,6 @@ class ActorCritic(nn.Module):
         return self.mean(self.features(obs)).clamp(-1.0, 1.0)
 
 
-def _features(obs: torch.Tensor, moments: RunningMoments) -> torch.Tensor:
-    return normalise(sanitise(obs), *moments.scaling(), NORMALISED_LIMIT)
-
-
 class Layers(NamedTuple):
     """A network as tensors; layer i maps (batch, columns of weights[i]) to (batch, rows of weights[i])."""
 
@@ -237,76 +235,69 @@ class Layers(NamedTuple):
     activation: str
     """Of all layers but the last: elu, relu or tanh."""
 
+    def forward(self, x: torch.Tensor, dtype: torch.dtype) -> tuple[torch.Tensor, list[torch.Tensor]]:
+        """Return the network's output, float32, and what each of its layers saw.
+
+        The last layer computes in float32, the others in `dtype`; x: (batch, columns of the first weight), float32.
+        """
+        seen = []
+        activation = getattr(functional, self.activation)
+        for weight, bias in zip(self.weights[:-1], self.biases[:-1], strict=True):
+            seen.append(x.to(dtype))
+            x = activation(functional.linear(seen[-1], weight.to(dtype), bias.to(dtype)))
+        seen.append(x.float())
+        return functional.linear(seen[-1], self.weights[-1], self.biases[-1]), seen
+
+    def backward(self, seen: list[torch.Tensor], slope: torch.Tensor, dtype: torch.dtype) -> list[torch.Tensor]:
+        """Return the gradients of weight and bias of each layer, first to last, float32.
+
+        seen: as `forward` gave it; slope: (batch, outputs) of the loss with respect to the network's output.
+        """
+        found: list[torch.Tensor] = []
+        for index in reversed(range(len(seen))):
+            x = seen[index]
+            slope = slope.to(x.dtype)
+            found = [(slope.t() @ x).float(), slope.sum(0, dtype=torch.float32), *found]
+            if index > 0:
+                slope = _through(self.activation, slope @ self.weights[index].to(x.dtype), x).to(dtype)
+        return found
+
 
 class Actor(NamedTuple):
-    """The policy as tensors."""
+    """The policy as tensors, in the notation of `jumper_warp.rl.mirror`."""
 
     layers: Layers
     log_std: torch.Tensor
     """(num_actions,) of the noise."""
     symmetry: Symmetry | None
-    """With an image of observations as wide as the first weight; notation of `jumper_warp.rl.mirror`."""
+    """With an image of observations as wide as the first weight."""
+
+    def forward(self, x: torch.Tensor, dtype: torch.dtype) -> ActorOutput:
+        """Return the policy's output; arguments as of `Layers.forward`."""
+        if self.symmetry is None:
+            mean, seen = self.layers.forward(x, dtype)
+            return ActorOutput(mean, torch.zeros_like(mean), seen)
+        output, seen = self.layers.forward(torch.cat([x, self.symmetry.obs.of(x)]), dtype)
+        own, other = output.chunk(2)
+        image = self.symmetry.action.of(other)
+        return ActorOutput(0.5 * (own + image), own - image, seen)
+
+    def backward(self, seen: list[torch.Tensor], slope: torch.Tensor, dtype: torch.dtype) -> list[torch.Tensor]:
+        """Return the gradients of weights and biases; slope: of the loss with respect to `ActorOutput.mean`."""
+        if self.symmetry is None:
+            return self.layers.backward(seen, slope, dtype)
+        half = 0.5 * slope
+        return self.layers.backward(seen, torch.cat([half, self.symmetry.action.of(half)]), dtype)
 
 
 class ActorOutput(NamedTuple):
     """What a pass of the policy gives."""
 
     mean: torch.Tensor
-    """(batch, num_actions)"""
     difference: torch.Tensor
-    """(batch, num_actions) f(x) - N f(M x); 0 without symmetry."""
+    """f(x) - N f(M x), 0 without symmetry; (batch, num_actions) like the mean."""
     seen: list[torch.Tensor]
-    """What each layer saw, for `backward_actor`."""
-
-
-def forward(layers: Layers, x: torch.Tensor, dtype: torch.dtype) -> tuple[torch.Tensor, list[torch.Tensor]]:
-    """Return a network's output, float32, and what each of its layers saw.
-
-    The last layer computes in float32, the others in `dtype`; x: (batch, columns of the first weight), float32.
-    """
-    seen = []
-    activation = getattr(functional, layers.activation)
-    for weight, bias in zip(layers.weights[:-1], layers.biases[:-1], strict=True):
-        seen.append(x.to(dtype))
-        x = activation(functional.linear(seen[-1], weight.to(dtype), bias.to(dtype)))
-    seen.append(x.float())
-    return functional.linear(seen[-1], layers.weights[-1], layers.biases[-1]), seen
-
-
-def backward(layers: Layers, seen: list[torch.Tensor], slope: torch.Tensor, dtype: torch.dtype) -> list[torch.Tensor]:
-    """Return the gradients of weight and bias of each layer, first to last, float32.
-
-    seen: as `forward` gave it; slope: (batch, outputs) of the loss with respect to the network's output.
-    """
-    found: list[torch.Tensor] = []
-    for index in reversed(range(len(seen))):
-        x = seen[index]
-        slope = slope.to(x.dtype)
-        found = [(slope.t() @ x).float(), slope.sum(0, dtype=torch.float32), *found]
-        if index > 0:
-            slope = _through(layers.activation, slope @ layers.weights[index].to(x.dtype), x).to(dtype)
-    return found
-
-
-def forward_actor(actor: Actor, x: torch.Tensor, dtype: torch.dtype) -> ActorOutput:
-    """Return the policy's output; arguments as of `forward`."""
-    if actor.symmetry is None:
-        mean, seen = forward(actor.layers, x, dtype)
-        return ActorOutput(mean, torch.zeros_like(mean), seen)
-    output, seen = forward(actor.layers, torch.cat([x, actor.symmetry.obs.of(x)]), dtype)
-    own, other = output.chunk(2)
-    image = actor.symmetry.action.of(other)
-    return ActorOutput(0.5 * (own + image), own - image, seen)
-
-
-def backward_actor(
-    actor: Actor, seen: list[torch.Tensor], slope: torch.Tensor, dtype: torch.dtype
-) -> list[torch.Tensor]:
-    """Return the gradients of weights and biases; slope: of the loss with respect to the mean of `forward_actor`."""
-    if actor.symmetry is None:
-        return backward(actor.layers, seen, slope, dtype)
-    half = 0.5 * slope
-    return backward(actor.layers, seen, torch.cat([half, actor.symmetry.action.of(half)]), dtype)
+    """What each layer saw, for `Actor.backward`."""
 
 
 def _through(activation: str, slope: torch.Tensor, output: torch.Tensor) -> torch.Tensor:

@@ -7,7 +7,7 @@ Nothing between the first action and the last optimiser step waits for the host.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import torch
@@ -18,18 +18,7 @@ from jumper_warp.rl.distributed import average_over_ranks
 from jumper_warp.rl.flat import AdamVectors, FlatAdam, FlatParameters, adam_step, adapted_lr, clip_gradient, joined
 from jumper_warp.rl.graphs import Captured, Compiler
 from jumper_warp.rl.mirror import symmetry_of
-from jumper_warp.rl.networks import (
-    DTYPES,
-    Actor,
-    ActorCritic,
-    Layers,
-    backward,
-    backward_actor,
-    forward,
-    forward_actor,
-    gaussian_kl,
-    gaussian_log_prob,
-)
+from jumper_warp.rl.networks import DTYPES, Actor, ActorCritic, Layers, gaussian_kl, gaussian_log_prob
 from jumper_warp.rl.rollout import Collector
 from jumper_warp.rl.samples import Batch, RowLayout, Sampler
 from jumper_warp.utils.allocator import keep_freed_memory
@@ -50,13 +39,12 @@ class ActorLosses(NamedTuple):
 
 
 class StepStatistics(NamedTuple):
-    """Of an optimiser step, each (); losses and divergence from before it."""
+    """Of an optimiser step, each (); losses and divergence from before it, as in `ActorLosses`."""
 
     surrogate: torch.Tensor
     value: torch.Tensor
     """Value loss before weighting [variances of the return]."""
     entropy: torch.Tensor
-    """As in `ActorLosses`, like asymmetry."""
     asymmetry: torch.Tensor
     kl: torch.Tensor
     """KL(old ‖ new) [nat], over all ranks."""
@@ -161,18 +149,18 @@ class Ppo:
 
     @torch.no_grad()
     def minibatch_step(self, rows: torch.Tensor, exchange: bool = True) -> StepStatistics:
-        """Make one optimiser step, and return its statistics, which also count in `statistics`.
+        """Make one optimiser step, and return its statistics, which `statistics` averages; nothing waits for the host.
 
         rows: samples (batch, columns of `sampler.layout`); exchange: whether to average over all ranks.
         """
-        flat, cfg, layout = self.flat, self.cfg, self.sampler.layout
-        value_loss = self._critic_gradient(rows, layout, flat.critic, cfg, flat.critic_gradient)
+        flat, sampler, cfg = self.flat, self.sampler, self.cfg
+        value_loss = self._critic_gradient(rows, sampler.layout, flat.critic, cfg, flat.critic_gradient)
         losses = self._actor_gradient(
-            rows, layout, flat.actor, self.sampler.old_log_std, self._entropy_coef, cfg, flat.actor_gradient
+            rows, sampler.layout, flat.actor, sampler.old_log_std, self._entropy_coef, cfg, flat.actor_gradient
         )
         flat.kl.copy_(losses.kl)
         if exchange:
-            average_over_ranks(flat.exchanged)
+            average_over_ranks(flat.exchanged)  # gradient and divergence
         return self._optimiser_step(
             self.optimiser.vectors, flat.actor_size, flat.kl, self._desired_kl, cfg, losses, value_loss, self._sums
         )
@@ -186,17 +174,7 @@ class Ppo:
 
     def statistics(self) -> dict[str, float]:
         """Return averages since the last call, of losses and of finished episodes; waits for the device."""
-        finished = self.collector.finished
-        (*sums, count), ended = self._sums.tolist(), finished.sum(1).tolist()
-        result = {f"Loss/{name}": total / max(count, 1.0) for name, total in zip(STATISTICS, sums, strict=True)}
-        result["Loss/learning_rate"] = self.lr.item()
-        result["Policy/mean_std"] = self.model.log_std.exp().mean().item()
-        if ended[2] > 0.0:
-            result["Train/mean_return"] = ended[0] / ended[2]
-            result["Train/mean_length"] = ended[1] / ended[2]
-        for total in (self._sums, finished):
-            total.zero_()
-        return result
+        return take_averages(STATISTICS, self._sums, self.collector.finished, self.lr, self.model.log_std)
 
     def state_dict(self) -> dict[str, Any]:
         """Return networks, statistics and optimiser, tensors only."""
@@ -259,7 +237,7 @@ def critic_gradient(
     rows: (batch, columns) as `layout`; out: the vector's part of the critic.
     """
     batch, dtype = layout.split(rows), DTYPES[cfg.precision]
-    head, seen = forward(critic, layout.critic_features(rows), dtype)
+    head, seen = critic.forward(layout.critic_features(rows), dtype)
     change = head.squeeze(-1) - batch.value
     error = head.squeeze(-1) - batch.target
     loss, slope = error.square(), error
@@ -268,7 +246,7 @@ def critic_gradient(
         slope = torch.where(near.square() > loss, near * (change.abs() <= cfg.clip), error)
         loss = torch.maximum(loss, near.square())
     slope = slope * (2.0 * cfg.value_coef / rows.shape[0])
-    out.copy_(joined(backward(critic, seen, slope[:, None], dtype)))
+    out.copy_(joined(critic.backward(seen, slope[:, None], dtype)))
     return loss.mean()
 
 
@@ -284,14 +262,14 @@ def actor_gradient(
     rows: (batch, columns) as `layout`; entropy_coef: (); out: the vector's part of actor and noise.
     """
     batch, dtype, log_std = layout.split(rows), DTYPES[cfg.precision], actor.log_std
-    mean, difference, seen = forward_actor(actor, layout.features(rows), dtype)
+    mean, difference, seen = actor.forward(layout.features(rows), dtype)
     ratio = torch.exp(gaussian_log_prob(batch.action, mean, log_std) - batch.log_prob)
     gain = batch.advantage * ratio
     clipped = batch.advantage * ratio.clamp(1.0 - cfg.clip, 1.0 + cfg.clip)
     slope = torch.where(gain > clipped, 0.0, gain)[:, None] / -rows.shape[0]
     deviation = (batch.action - mean) * torch.exp(-log_std)
     noise = (slope * (deviation.square() - 1.0)).sum(0) - entropy_coef
-    gradients = backward_actor(actor, seen, slope * deviation * torch.exp(-log_std), dtype)
+    gradients = actor.backward(seen, slope * deviation * torch.exp(-log_std), dtype)
     out.copy_(joined([*gradients, noise]))
     entropy = (log_std + 0.5 * math.log(2.0 * math.pi * math.e)).sum()
     kl = gaussian_kl(batch.mean, old_log_std, mean, log_std).mean()
@@ -310,6 +288,25 @@ def optimiser_step(
     norms = clip_gradient(vectors.gradient, actor_size, cfg.max_grad_norm)
     adam_step(vectors)
     skipped = 1.0 - norms.isfinite().all().float()
-    step = StepStatistics(losses.surrogate, value_loss, losses.entropy, losses.asymmetry, kl, *norms, skipped)
+    surrogate, entropy, asymmetry, _ = losses
+    step = StepStatistics(surrogate, value_loss, entropy, asymmetry, kl.clone(), norms[0], norms[1], skipped)
     sums.add_(torch.nan_to_num(torch.stack([*step, torch.ones_like(kl)]), nan=0.0, posinf=0.0, neginf=0.0))
     return step
+
+
+def take_averages(
+    names: Sequence[str], sums: torch.Tensor, finished: torch.Tensor, lr: torch.Tensor, log_std: torch.Tensor
+) -> dict[str, float]:
+    """Return averages to log since the last call, and set their sums to zero; waits for the device.
+
+    sums: (len(names) + 1,) of losses, and the number of steps; finished: (3, ...) as `Collector.finished`; lr: ();
+    log_std: (num_actions,).
+    """
+    (*totals, count), ended = sums.tolist(), finished.view(3, -1).sum(1).tolist()
+    result = {f"Loss/{name}": total / max(count, 1.0) for name, total in zip(names, totals, strict=True)}
+    result |= {"Loss/learning_rate": lr.item(), "Policy/mean_std": log_std.exp().mean().item()}
+    if ended[2] > 0.0:
+        result |= {"Train/mean_return": ended[0] / ended[2], "Train/mean_length": ended[1] / ended[2]}
+    sums.zero_()
+    finished.zero_()
+    return result

@@ -10,7 +10,7 @@ from jumper_warp.envs.vec_env import VecEnv, sanitise
 from jumper_warp.rl.cfg import PpoCfg
 from jumper_warp.rl.flat import FlatParameters
 from jumper_warp.rl.graphs import Compiler
-from jumper_warp.rl.networks import DTYPES, Actor, ActorCritic, Scaling, forward_actor
+from jumper_warp.rl.networks import DTYPES, Actor, ActorCritic, Scaling
 
 
 class RolloutBuffer(NamedTuple):
@@ -37,8 +37,7 @@ class RolloutBuffer(NamedTuple):
 
     def at(self, step: int) -> RolloutBuffer:
         """Return views of one step."""
-        log_std = self.log_std
-        return self._replace(**{n: x[step] for n, x in self._asdict().items() if x is not log_std})
+        return self._replace(**{name: x[step] for name, x in self._asdict().items() if name != "log_std"})
 
 
 def make_rollout_buffer(num_steps: int, env: VecEnv, num_critic_obs: int) -> RolloutBuffer:
@@ -48,17 +47,10 @@ def make_rollout_buffer(num_steps: int, env: VecEnv, num_critic_obs: int) -> Rol
         return torch.zeros(*shape, device=env.device)
 
     steps, worlds, actions = num_steps, env.num_envs, env.num_actions
-    return RolloutBuffer(
-        obs=buffer(steps + 1, worlds, env.num_obs),
-        critic_obs=buffer(steps + 1, worlds, num_critic_obs),
-        final_critic_obs=buffer(steps, worlds, num_critic_obs),
-        action=buffer(steps, worlds, actions),
-        mean=buffer(steps, worlds, actions),
-        log_std=buffer(actions),
-        reward=buffer(steps, worlds),
-        done=buffer(steps, worlds),
-        timeout=buffer(steps, worlds),
-    )
+    obs, critic_obs = buffer(steps + 1, worlds, env.num_obs), buffer(steps + 1, worlds, num_critic_obs)
+    action, mean, final_critic_obs = (buffer(steps, worlds, size) for size in (actions, actions, num_critic_obs))
+    reward, done, timeout = (buffer(steps, worlds) for _ in range(3))
+    return RolloutBuffer(obs, critic_obs, final_critic_obs, action, mean, buffer(actions), reward, done, timeout)
 
 
 class Collector:
@@ -105,22 +97,8 @@ class Collector:
         self._act(self.env.obs, self._critic_obs, step, self._actor, self._scaling, DTYPES[self.cfg.precision])
 
     def _remember(self, step: RolloutBuffer) -> None:
-        env = self.env
-        outcome = Outcome(env.reward, env.done, env.timeout, self._final_critic_obs)
-        self._keep(outcome, step, self.episode, self.finished, self.cfg.reward_scale)
-
-
-class Outcome(NamedTuple):
-    """What a step of the environment gives, as `VecEnv` has it."""
-
-    reward: torch.Tensor
-    """(num_envs,)"""
-    done: torch.Tensor
-    """(num_envs,)"""
-    timeout: torch.Tensor
-    """(num_envs,)"""
-    final_critic_obs: torch.Tensor
-    """(num_envs, num_critic_obs) raw."""
+        env, scale = self.env, self.cfg.reward_scale
+        self._keep(env.reward, env.done, env.timeout, self._final_critic_obs, step, self.episode, self.finished, scale)
 
 
 def _act(
@@ -129,20 +107,21 @@ def _act(
     """Keep raw observations (num_envs, n), and decide: mean and action, which holds standard normal noise before."""
     step.obs.copy_(sanitise(obs))
     step.critic_obs.copy_(sanitise(critic_obs))
-    mean = forward_actor(actor, scaling.features(sanitise(obs), actor.layers.weights[0].shape[1]), dtype).mean
+    mean = actor.forward(scaling.features(sanitise(obs), actor.layers.weights[0].shape[1]), dtype).mean
     step.mean.copy_(mean)
     step.action.mul_(actor.log_std.exp()).add_(mean)
 
 
 def _keep(
-    outcome: Outcome, step: RolloutBuffer, episode: torch.Tensor, finished: torch.Tensor, reward_scale: float
-) -> None:
+    reward: torch.Tensor, done: torch.Tensor, timeout: torch.Tensor, final_critic_obs: torch.Tensor,
+    step: RolloutBuffer, episode: torch.Tensor, finished: torch.Tensor, reward_scale: float,
+) -> None:  # fmt: skip
     """Keep reward, done, timeout and the critic's last observation; count returns and lengths."""
-    reward = torch.nan_to_num(outcome.reward, nan=0.0, posinf=0.0, neginf=0.0)
+    reward = torch.nan_to_num(reward, nan=0.0, posinf=0.0, neginf=0.0)
     step.reward.copy_(reward * reward_scale)
-    step.done.copy_(outcome.done)
-    step.timeout.copy_(outcome.timeout)
-    step.final_critic_obs.copy_(outcome.final_critic_obs)
+    step.done.copy_(done)
+    step.timeout.copy_(timeout)
+    step.final_critic_obs.copy_(final_critic_obs)
     now = episode + torch.stack([reward, torch.ones_like(reward)])
-    finished.add_(torch.cat([now * outcome.done, outcome.done[None].double()]))
-    episode.copy_(now * (1.0 - outcome.done))
+    finished.add_(torch.cat([now * done, done[None].double()]))
+    episode.copy_(now * (1.0 - done))

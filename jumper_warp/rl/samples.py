@@ -12,17 +12,7 @@ from jumper_warp.rl.cfg import PpoCfg
 from jumper_warp.rl.flat import ROW_ALIGNMENT, FlatParameters, aligned
 from jumper_warp.rl.graphs import Compiler
 from jumper_warp.rl.mirror import Image
-from jumper_warp.rl.networks import (
-    DTYPES,
-    ActorCritic,
-    Layers,
-    Moments,
-    Scaling,
-    forward,
-    gaussian_log_prob,
-    joint_moments,
-    own_moments,
-)
+from jumper_warp.rl.networks import DTYPES, ActorCritic, Layers, Moments, Scaling, gaussian_log_prob, joint_moments
 from jumper_warp.rl.rollout import RolloutBuffer
 
 CPU_ROWS = 4096
@@ -52,9 +42,8 @@ class RolloutMoments(NamedTuple):
     """Of the samples of a rollout."""
 
     advantage: Moments
-    """()"""
     target: Moments
-    """()"""
+    """() each."""
     obs: Moments
     """(num_obs,)"""
     critic_obs: Moments
@@ -221,7 +210,7 @@ def compute_values_and_gae(
     def value_head(critic_obs: torch.Tensor) -> torch.Tensor:
         """Return the critic's output (steps, num_envs) for (steps, num_envs, num_critic_obs)."""
         scaling, parts = scalings.critic_obs, _parts(critic_obs.flatten(0, 1), rows)
-        heads = [forward(critic, scaling.features(sanitise(part), columns), dtype)[0] for part in parts]
+        heads = [critic.forward(scaling.features(sanitise(part), columns), dtype)[0] for part in parts]
         return torch.cat(heads).view(critic_obs.shape[:2])
 
     head, final_head = value_head(buffer.critic_obs), value_head(buffer.final_critic_obs)
@@ -229,7 +218,7 @@ def compute_values_and_gae(
     reward = buffer.reward + cfg.gamma * buffer.timeout * final_value
     advantage, target = (x.flatten() for x in gae(reward, buffer.done, value, cfg.gamma, cfg.lam))
     samples = (advantage, target, buffer.obs[:-1].flatten(0, 1), buffer.critic_obs[:-1].flatten(0, 1))
-    moments = RolloutMoments(*(own_moments(x, rows) for x in samples))
+    moments = RolloutMoments(*(Moments.of(x, rows) for x in samples))
     return Estimates(head[:-1].flatten(), advantage, target, moments)
 
 

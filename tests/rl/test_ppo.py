@@ -237,7 +237,7 @@ def test_a_gradient_that_is_not_finite_changes_nothing():
     before = {name: value.clone() for name, value in ppo.model.named_parameters()}
     batch.advantage.mul_(float("nan"))
     batch.target.mul_(float("inf"))
-    ppo.minibatch_step(ppo.sampler.rows)
+    assert ppo.minibatch_step(ppo.sampler.rows).skipped == 1.0
     assert all(torch.equal(value, before[name]) for name, value in ppo.model.named_parameters())
     assert ppo.statistics()["Loss/skipped"] == 1.0
 

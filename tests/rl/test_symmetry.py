@@ -13,7 +13,7 @@ from jumper_warp.rl.cfg import PpoCfg, TrainCfg
 from jumper_warp.rl.checkpoint import save_checkpoint
 from jumper_warp.rl.flat import FlatParameters
 from jumper_warp.rl.mirror import Symmetry, image, plain_layers
-from jumper_warp.rl.networks import ActorCritic, backward_actor, forward_actor
+from jumper_warp.rl.networks import ActorCritic
 from jumper_warp.rl.ppo import Ppo
 from jumper_warp.tasks.interface import interface
 from jumper_warp.tasks.mirror import mirror_of, mirror_of_action
@@ -62,10 +62,10 @@ def test_passes_over_both_images_equal_autograd():
     mean = 0.5 * (own + other)
     expected = torch.autograd.grad(mean, list(model.actor.parameters()), slope)
     wide = torch.nn.functional.pad(x, (0, actor.layers.weights[0].shape[1] - NUM_OBS))
-    *outputs, seen = forward_actor(actor, wide, torch.float32)
+    *outputs, seen = actor.forward(wide, torch.float32)
     for found, right in zip(outputs, (mean, own - other), strict=True):
         torch.testing.assert_close(found, right, atol=1e-5, rtol=1e-5)
-    first, *others = backward_actor(actor, seen, slope, torch.float32)
+    first, *others = actor.backward(seen, slope, torch.float32)
     for found, right in zip((first[:, :NUM_OBS], *others), expected, strict=True):
         torch.testing.assert_close(found, right, atol=1e-4, rtol=1e-4)
 

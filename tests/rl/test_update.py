@@ -9,7 +9,7 @@ import torch
 from jumper_warp.rl import graphs
 from jumper_warp.rl.cfg import PpoCfg
 from jumper_warp.rl.flat import FlatAdam, FlatParameters, adam_step
-from jumper_warp.rl.networks import ActorCritic, backward, forward, gaussian_log_prob
+from jumper_warp.rl.networks import ActorCritic, gaussian_log_prob
 from jumper_warp.rl.ppo import Ppo
 from toy_task import PushTask, fill
 
@@ -181,11 +181,11 @@ def test_a_networks_passes_equal_autograd_in_double_precision_and_nearly_so_in_h
     x, slope = torch.randn(64, 8), torch.randn(64, 3)
     expected = torch.autograd.grad(model.actor(x), list(model.actor.parameters()), slope)
     for dtype, most in ((torch.float32, 1e-5), (torch.bfloat16, 2e-2)):
-        output, seen = forward(layers, x, dtype)
+        output, seen = layers.forward(x, dtype)
         assert [each.dtype for each in seen] == [dtype, dtype, torch.float32]
         scale = model.actor(x).detach().abs().max()
         assert (output - model.actor(x)).abs().max() < most * scale
-        for found, right in zip(backward(layers, seen, slope, dtype), expected, strict=True):
+        for found, right in zip(layers.backward(seen, slope, dtype), expected, strict=True):
             assert found.dtype == torch.float32
             assert (found - right).norm() < most * right.norm()
 
