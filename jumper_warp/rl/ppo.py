@@ -7,30 +7,56 @@ Nothing between the first action and the last optimiser step waits for the host.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
 
 import torch
 
 from jumper_warp.envs.vec_env import VecEnv
-from jumper_warp.rl.adam import AdamVectors, FlatAdam, descend
 from jumper_warp.rl.cfg import PpoCfg
-from jumper_warp.rl.compiling import Compiler
 from jumper_warp.rl.distributed import average_over_ranks
-from jumper_warp.rl.flat import FlatParameters
-from jumper_warp.rl.graphs import Captured
-from jumper_warp.rl.losses import actor_gradient, critic_gradient
+from jumper_warp.rl.flat import AdamVectors, FlatAdam, FlatParameters, adam_step, adapted_lr, clip_gradient, joined
+from jumper_warp.rl.graphs import Captured, Compiler
 from jumper_warp.rl.mirror import symmetry_of
-from jumper_warp.rl.networks import ActorCritic
+from jumper_warp.rl.networks import DTYPES, Actor, ActorCritic, Layers, gaussian_kl, gaussian_log_prob
 from jumper_warp.rl.rollout import Collector
-from jumper_warp.rl.samples import Batch, Sampler
+from jumper_warp.rl.samples import Batch, RowLayout, Sampler
 from jumper_warp.utils.allocator import keep_freed_memory
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.state_checks import check_parts, check_tensor, check_values
 
-STATISTICS = ("surrogate", "value", "entropy", "asymmetry", "kl", "gradient_actor", "gradient_critic", "skipped")
-"""What `Ppo.statistics` averages over minibatches; skipped is the share of steps with a non-finite gradient,
-asymmetry the mean square of f(x) - N f(M x), see `jumper_warp.rl.mirror`, 0 without symmetry."""
+
+class ActorLosses(NamedTuple):
+    """Of a minibatch, each ()."""
+
+    surrogate: torch.Tensor
+    entropy: torch.Tensor
+    """Of the policy [nat]."""
+    asymmetry: torch.Tensor
+    """Mean square of f(x) - N f(M x), see `jumper_warp.rl.mirror`; 0 without symmetry."""
+    kl: torch.Tensor
+    """KL(old ‖ new) [nat]."""
+
+
+class StepStatistics(NamedTuple):
+    """Of an optimiser step, each (); losses and divergence from before it, as in `ActorLosses`."""
+
+    surrogate: torch.Tensor
+    value: torch.Tensor
+    """Value loss before weighting [variances of the return]."""
+    entropy: torch.Tensor
+    asymmetry: torch.Tensor
+    kl: torch.Tensor
+    """KL(old ‖ new) [nat], over all ranks."""
+    gradient_actor: torch.Tensor
+    """Norm of the gradient before clipping, over all ranks."""
+    gradient_critic: torch.Tensor
+    skipped: torch.Tensor
+    """1 if a gradient is not finite, and so counts as 0."""
+
+
+STATISTICS = StepStatistics._fields
+"""What `Ppo.statistics` averages over minibatches."""
 
 
 class Ppo:
@@ -54,8 +80,6 @@ class Ppo:
             env.num_obs, env.num_actions, cfg.hidden, cfg.activation, cfg.init_std, num_critic_obs, symmetry
         ).to(env.device)  # fmt: skip
         self.flat = FlatParameters(self.model, cfg.activation)
-        self._parts = (self.flat.actor(self.flat.value), self.flat.critic(), self.flat.gradients())
-        self._symmetry = symmetry and symmetry.padded(self._parts[0][0].weights[0].shape[1])
         self.optimiser = FlatAdam(self.flat, cfg.lr)
         self.lr = self.optimiser.lr
         self._desired_kl = torch.full((), cfg.desired_kl, device=env.device)
@@ -69,7 +93,7 @@ class Ppo:
         counts = {"dtype": torch.float64, "device": env.device}  # float32 counts to 2^24 only
         self._sums = torch.zeros(len(STATISTICS) + 1, **counts)  # and their number
         self._actor_gradient, self._critic_gradient = compiler(actor_gradient), compiler(critic_gradient)
-        self._finish = compiler(_finish)
+        self._optimiser_step = compiler(optimiser_step)
         procedures: tuple[Callable[[], object], ...] = (self.collector.roll, self.batch, self._learn)
         self._roll, self._batch, self._optimise = (Captured(each, cuda and cfg.graphs) for each in procedures)
 
@@ -97,7 +121,7 @@ class Ppo:
         before = [tensor.clone() for tensor in changed]
         self.collector.rehearse()
         self.sampler.rehearse()
-        self._step(self._differentiate(self._minibatch))
+        self.minibatch_step(self._minibatch, exchange=False)
         for tensor, value in zip(changed, before, strict=True):
             tensor.copy_(value)
 
@@ -121,31 +145,25 @@ class Ppo:
         for order in self._orders:
             for samples in order.chunk(self.cfg.minibatches):
                 torch.index_select(self.sampler.rows, 0, samples, out=self._minibatch)
-                self._descend(self._minibatch)
-
-    def _descend(self, rows: torch.Tensor) -> None:
-        """Make one optimiser step with samples (batch, columns); a non-finite gradient counts as none."""
-        found = self._differentiate(rows)
-        average_over_ranks(self.flat.gradient)
-        self._step(found)
+                self.minibatch_step(self._minibatch)
 
     @torch.no_grad()
-    def _differentiate(self, rows: torch.Tensor) -> tuple[torch.Tensor, ...]:
-        """Fill the gradient; return surrogate, value loss, entropy and asymmetry."""
-        (actor, log_std), critic, (to_actor, to_critic) = self._parts
-        layout, cfg, old_log_std = self.sampler.layout, self.cfg, self.sampler.old_log_std
-        value_loss = self._critic_gradient(rows, layout, critic, cfg, to_critic)
-        found = self._actor_gradient(
-            rows, layout, actor, log_std, old_log_std, self._entropy_coef, cfg, self._symmetry, to_actor
+    def minibatch_step(self, rows: torch.Tensor, exchange: bool = True) -> StepStatistics:
+        """Make one optimiser step, and return its statistics, which `statistics` averages; nothing waits for the host.
+
+        rows: samples (batch, columns of `sampler.layout`); exchange: whether to average over all ranks.
+        """
+        flat, sampler, cfg = self.flat, self.sampler, self.cfg
+        value_loss = self._critic_gradient(rows, sampler.layout, flat.critic, cfg, flat.critic_gradient)
+        losses = self._actor_gradient(
+            rows, sampler.layout, flat.actor, sampler.old_log_std, self._entropy_coef, cfg, flat.actor_gradient
         )
-        surrogate, entropy, asymmetry, kl = found
-        self.flat.gradient[-1] = kl
-        return surrogate, value_loss, entropy, asymmetry
-
-    @torch.no_grad()
-    def _step(self, found: tuple[torch.Tensor, ...]) -> None:
-        """Descend along the gradient; found: as `_differentiate` returned it."""
-        self._finish(self.optimiser.vectors, self.flat.actor_size, self._desired_kl, self.cfg, found, self._sums)
+        flat.kl.copy_(losses.kl)
+        if exchange:
+            average_over_ranks(flat.exchanged)  # gradient and divergence
+        return self._optimiser_step(
+            self.optimiser.vectors, flat.actor_size, flat.kl, self._desired_kl, cfg, losses, value_loss, self._sums
+        )
 
     def set_progress(self, progress: float) -> None:
         """Tell how much of the training is over, from 0 to 1; does not wait for the device."""
@@ -156,17 +174,7 @@ class Ppo:
 
     def statistics(self) -> dict[str, float]:
         """Return averages since the last call, of losses and of finished episodes; waits for the device."""
-        finished = self.collector.finished
-        (*sums, count), ended = self._sums.tolist(), finished.sum(1).tolist()
-        result = {f"Loss/{name}": total / max(count, 1.0) for name, total in zip(STATISTICS, sums, strict=True)}
-        result["Loss/learning_rate"] = self.lr.item()
-        result["Policy/mean_std"] = self.model.log_std.exp().mean().item()
-        if ended[2] > 0.0:
-            result["Train/mean_return"] = ended[0] / ended[2]
-            result["Train/mean_length"] = ended[1] / ended[2]
-        for total in (self._sums, finished):
-            total.zero_()
-        return result
+        return take_averages(STATISTICS, self._sums, self.collector.finished, self.lr, self.model.log_std)
 
     def state_dict(self) -> dict[str, Any]:
         """Return networks, statistics and optimiser, tensors only."""
@@ -219,12 +227,86 @@ class Ppo:
             graph.close()
 
 
-def _finish(
-    vectors: AdamVectors, actor_size: int, desired_kl: torch.Tensor, cfg: PpoCfg, found: tuple[torch.Tensor, ...],
-    sums: torch.Tensor,
-) -> None:  # fmt: skip
-    """Make the optimiser step and count its figures; found: as `Ppo._differentiate` returned it."""
-    kl, norms = descend(vectors, actor_size, desired_kl, cfg)
+def critic_gradient(
+    rows: torch.Tensor, layout: RowLayout, critic: Layers, cfg: PpoCfg, out: torch.Tensor
+) -> torch.Tensor:
+    """Write the gradient of the weighted value loss to `out`, and return the loss before weighting.
+
+    The squared error, or with `clip_value` the larger of it and that of the value kept within `clip` of the old one.
+
+    rows: (batch, columns) as `layout`; out: the vector's part of the critic.
+    """
+    batch, dtype = layout.split(rows), DTYPES[cfg.precision]
+    head, seen = critic.forward(layout.critic_features(rows), dtype)
+    change = head.squeeze(-1) - batch.value
+    error = head.squeeze(-1) - batch.target
+    loss, slope = error.square(), error
+    if cfg.clip_value:
+        near = batch.value + change.clamp(-cfg.clip, cfg.clip) - batch.target
+        slope = torch.where(near.square() > loss, near * (change.abs() <= cfg.clip), error)
+        loss = torch.maximum(loss, near.square())
+    slope = slope * (2.0 * cfg.value_coef / rows.shape[0])
+    out.copy_(joined(critic.backward(seen, slope[:, None], dtype)))
+    return loss.mean()
+
+
+def actor_gradient(
+    rows: torch.Tensor, layout: RowLayout, actor: Actor, old_log_std: torch.Tensor, entropy_coef: torch.Tensor,
+    cfg: PpoCfg, out: torch.Tensor,
+) -> ActorLosses:  # fmt: skip
+    """Write the gradient of surrogate and entropy bonus to `out`.
+
+    The clipped surrogate of Schulman et al. 2017, eq. 7, as a loss: -E[min(r A, clip(r) A)] with r = π(a) / π_old(a).
+    Where r A is the smaller, ∂/∂log π = -r A / batch, else 0.
+
+    rows: (batch, columns) as `layout`; entropy_coef: (); out: the vector's part of actor and noise.
+    """
+    batch, dtype, log_std = layout.split(rows), DTYPES[cfg.precision], actor.log_std
+    mean, difference, seen = actor.forward(layout.features(rows), dtype)
+    ratio = torch.exp(gaussian_log_prob(batch.action, mean, log_std) - batch.log_prob)
+    gain = batch.advantage * ratio
+    clipped = batch.advantage * ratio.clamp(1.0 - cfg.clip, 1.0 + cfg.clip)
+    slope = torch.where(gain > clipped, 0.0, gain)[:, None] / -rows.shape[0]
+    deviation = (batch.action - mean) * torch.exp(-log_std)
+    noise = (slope * (deviation.square() - 1.0)).sum(0) - entropy_coef
+    gradients = actor.backward(seen, slope * deviation * torch.exp(-log_std), dtype)
+    out.copy_(joined([*gradients, noise]))
+    entropy = (log_std + 0.5 * math.log(2.0 * math.pi * math.e)).sum()
+    kl = gaussian_kl(batch.mean, old_log_std, mean, log_std).mean()
+    return ActorLosses(-torch.minimum(gain, clipped).mean(), entropy, difference.square().mean(), kl)
+
+
+def optimiser_step(
+    vectors: AdamVectors, actor_size: int, kl: torch.Tensor, desired_kl: torch.Tensor, cfg: PpoCfg, losses: ActorLosses,
+    value_loss: torch.Tensor, sums: torch.Tensor,
+) -> StepStatistics:  # fmt: skip
+    """Adapt the step size to the divergence kl (), clip the gradient, make a step of Adam, and count the step.
+
+    A non-finite gradient counts as none. sums: (len(STATISTICS) + 1,) of the statistics of all steps, and their number.
+    """
+    vectors.lr.copy_(adapted_lr(vectors.lr, kl, cfg, desired_kl))
+    norms = clip_gradient(vectors.gradient, actor_size, cfg.max_grad_norm)
+    adam_step(vectors)
     skipped = 1.0 - norms.isfinite().all().float()
-    terms = torch.stack([*found, kl, *norms, skipped, torch.ones_like(kl)])
-    sums.add_(torch.nan_to_num(terms, nan=0.0, posinf=0.0, neginf=0.0))
+    surrogate, entropy, asymmetry, _ = losses
+    step = StepStatistics(surrogate, value_loss, entropy, asymmetry, kl.clone(), norms[0], norms[1], skipped)
+    sums.add_(torch.nan_to_num(torch.stack([*step, torch.ones_like(kl)]), nan=0.0, posinf=0.0, neginf=0.0))
+    return step
+
+
+def take_averages(
+    names: Sequence[str], sums: torch.Tensor, finished: torch.Tensor, lr: torch.Tensor, log_std: torch.Tensor
+) -> dict[str, float]:
+    """Return averages to log since the last call, and set their sums to zero; waits for the device.
+
+    sums: (len(names) + 1,) of losses, and the number of steps; finished: (3, ...) as `Collector.finished`; lr: ();
+    log_std: (num_actions,).
+    """
+    (*totals, count), ended = sums.tolist(), finished.view(3, -1).sum(1).tolist()
+    result = {f"Loss/{name}": total / max(count, 1.0) for name, total in zip(names, totals, strict=True)}
+    result |= {"Loss/learning_rate": lr.item(), "Policy/mean_std": log_std.exp().mean().item()}
+    if ended[2] > 0.0:
+        result |= {"Train/mean_return": ended[0] / ended[2], "Train/mean_length": ended[1] / ended[2]}
+    sums.zero_()
+    finished.zero_()
+    return result

@@ -2,38 +2,55 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import torch
-from torch.nn import functional
 
 from jumper_warp.envs.vec_env import VecEnv, sanitise
 from jumper_warp.rl.cfg import PpoCfg
-from jumper_warp.rl.compiling import Compiler
-from jumper_warp.rl.flat import FlatParameters, Layers
-from jumper_warp.rl.mirror import Symmetry
-from jumper_warp.rl.networks import NORMALISED_LIMIT, ActorCritic
-from jumper_warp.rl.passes import DTYPES, forward_actor
-from jumper_warp.utils.normalise import normalise
+from jumper_warp.rl.flat import FlatParameters
+from jumper_warp.rl.graphs import Compiler
+from jumper_warp.rl.networks import DTYPES, Actor, ActorCritic, Scaling
 
 
-class RolloutBuffer:
-    """Buffers of num_steps policy steps of all worlds; time is the first axis."""
+class RolloutBuffer(NamedTuple):
+    """Buffers of policy steps of all worlds; each shape without its first axis in one step's view."""
 
-    def __init__(self, num_steps: int, env: VecEnv, num_critic_obs: int) -> None:
-        """num_critic_obs: entries of what the critic sees, which need not be the environment's `critic_obs`."""
+    obs: torch.Tensor
+    """(num_steps + 1, num_envs, num_obs) sanitised."""
+    critic_obs: torch.Tensor
+    """(num_steps + 1, num_envs, num_critic_obs) sanitised; the actor's without `PpoCfg.asymmetric`."""
+    final_critic_obs: torch.Tensor
+    """(num_steps, num_envs, num_critic_obs) after the step, before a reset."""
+    action: torch.Tensor
+    """(num_steps, num_envs, num_actions)"""
+    mean: torch.Tensor
+    """(num_steps, num_envs, num_actions) of the policy."""
+    log_std: torch.Tensor
+    """(num_actions,) of the policy, the same in all steps."""
+    reward: torch.Tensor
+    """(num_steps, num_envs) times `PpoCfg.reward_scale`."""
+    done: torch.Tensor
+    """(num_steps, num_envs) 1 where the episode ended."""
+    timeout: torch.Tensor
+    """(num_steps, num_envs) 1 where it was cut off."""
 
-        def buffer(*shape: int) -> torch.Tensor:
-            return torch.zeros(*shape, device=env.device)
+    def at(self, step: int) -> RolloutBuffer:
+        """Return views of one step."""
+        return self._replace(**{name: x[step] for name, x in self._asdict().items() if name != "log_std"})
 
-        steps, worlds, actions = num_steps, env.num_envs, env.num_actions
-        self.obs = buffer(steps + 1, worlds, env.num_obs)
-        self.critic_obs = buffer(steps + 1, worlds, num_critic_obs)
-        self.final_critic_obs = buffer(steps, worlds, num_critic_obs)
-        self.action = buffer(steps, worlds, actions)
-        self.mean = buffer(steps, worlds, actions)
-        self.log_std = buffer(actions)
-        self.reward = buffer(steps, worlds)
-        self.done = buffer(steps, worlds)
-        self.timeout = buffer(steps, worlds)
+
+def make_rollout_buffer(num_steps: int, env: VecEnv, num_critic_obs: int) -> RolloutBuffer:
+    """Return buffers of zeros; num_critic_obs: entries of the critic's observation, which may be the actor's."""
+
+    def buffer(*shape: int) -> torch.Tensor:
+        return torch.zeros(*shape, device=env.device)
+
+    steps, worlds, actions = num_steps, env.num_envs, env.num_actions
+    obs, critic_obs = buffer(steps + 1, worlds, env.num_obs), buffer(steps + 1, worlds, num_critic_obs)
+    action, mean, final_critic_obs = (buffer(steps, worlds, size) for size in (actions, actions, num_critic_obs))
+    reward, done, timeout = (buffer(steps, worlds) for _ in range(3))
+    return RolloutBuffer(obs, critic_obs, final_critic_obs, action, mean, buffer(actions), reward, done, timeout)
 
 
 class Collector:
@@ -44,11 +61,10 @@ class Collector:
         self.env, self.cfg = env, cfg
         self._critic_obs = env.critic_obs if cfg.asymmetric else env.obs
         self._final_critic_obs = env.final_critic_obs if cfg.asymmetric else env.final_obs
-        self.rollout = RolloutBuffer(cfg.num_steps, env, self._critic_obs.shape[1])
-        self._moments = model.obs_moments
-        self._actor, self._log_std = flat.actor(flat.value)
-        self._symmetry = model.symmetry and model.symmetry.padded(self._actor.weights[0].shape[1])
-        self._scaling = torch.zeros(2, env.num_obs, device=env.device)
+        self.rollout = make_rollout_buffer(cfg.num_steps, env, self._critic_obs.shape[1])
+        self._steps = [self.rollout.at(step) for step in range(cfg.num_steps)]
+        self._moments, self._actor = model.obs_moments, flat.actor
+        self._scaling = Scaling(*(torch.zeros(env.num_obs, device=env.device) for _ in Scaling._fields))
         counts = {"dtype": torch.float64, "device": env.device}  # float32 counts to 2^24 only
         self.episode = torch.zeros(2, env.num_envs, **counts)
         """Return and length so far."""
@@ -60,12 +76,13 @@ class Collector:
     def roll(self) -> None:
         """Act for `num_steps` policy steps."""
         env, rollout = self.env, self.rollout
-        self._scaling.copy_(torch.stack(self._moments.scaling()))
-        rollout.log_std.copy_(self._log_std)
+        for place, value in zip(self._scaling, self._moments.scaling(), strict=True):
+            place.copy_(value)
+        rollout.log_std.copy_(self._actor.log_std)
         rollout.action.normal_()
-        for step in range(self.cfg.num_steps):
+        for step in self._steps:
             self._decide(step)
-            env.step(rollout.action[step])
+            env.step(step.action)
             self._remember(step)
         rollout.obs[-1] = sanitise(env.obs)
         rollout.critic_obs[-1] = sanitise(self._critic_obs)
@@ -73,57 +90,38 @@ class Collector:
     @torch.no_grad()
     def rehearse(self) -> None:
         """Compile, as if one step were made; spoils the rollout and the counts of episodes."""
-        self._decide(0)
-        self._remember(0)
+        self._decide(self._steps[0])
+        self._remember(self._steps[0])
 
-    def _decide(self, step: int) -> None:
-        rollout, dtype = self.rollout, DTYPES[self.cfg.precision]
-        seen, kept = (self.env.obs, self._critic_obs), (rollout.obs[step], rollout.critic_obs[step])
-        decided = (rollout.mean[step], rollout.action[step])
-        self._act(seen, kept, decided, self._actor, self._log_std, self._scaling, dtype, self._symmetry)
+    def _decide(self, step: RolloutBuffer) -> None:
+        self._act(self.env.obs, self._critic_obs, step, self._actor, self._scaling, DTYPES[self.cfg.precision])
 
-    def _remember(self, step: int) -> None:
-        env, rollout = self.env, self.rollout
-        happened = (env.reward, env.done, env.timeout, self._final_critic_obs)
-        kept = (rollout.reward[step], rollout.done[step], rollout.timeout[step], rollout.final_critic_obs[step])
-        self._keep(happened, kept, self.episode, self.finished, self.cfg.reward_scale)
-
-
-Pair = tuple[torch.Tensor, torch.Tensor]
-
-
-def normalised(obs: torch.Tensor, scaling: torch.Tensor | Pair, columns: int) -> torch.Tensor:
-    """Return sanitised observations (batch, n) scaled, limited, and filled up with zeros to so many columns.
-
-    scaling: mean and standard deviation, (n,) each.
-    """
-    features = normalise(obs, scaling[0], scaling[1], NORMALISED_LIMIT)
-    return functional.pad(features, (0, columns - obs.shape[-1]))
+    def _remember(self, step: RolloutBuffer) -> None:
+        env, scale = self.env, self.cfg.reward_scale
+        self._keep(env.reward, env.done, env.timeout, self._final_critic_obs, step, self.episode, self.finished, scale)
 
 
 def _act(
-    seen: Pair, kept: Pair, decided: Pair, actor: Layers, log_std: torch.Tensor, scaling: torch.Tensor,
-    dtype: torch.dtype, symmetry: Symmetry | None,
-) -> None:  # fmt: skip
-    """Keep what actor and critic see, and decide: mean and action, which holds standard normal noise before."""
-    for raw, place in zip(seen, kept, strict=True):
-        place.copy_(sanitise(raw))
-    features = normalised(sanitise(seen[0]), scaling, actor.weights[0].shape[1])
-    mean, _, _ = forward_actor(actor, features, symmetry, dtype)
-    decided[0].copy_(mean)
-    decided[1].mul_(log_std.exp()).add_(mean)
+    obs: torch.Tensor, critic_obs: torch.Tensor, step: RolloutBuffer, actor: Actor, scaling: Scaling, dtype: torch.dtype
+) -> None:
+    """Keep raw observations (num_envs, n), and decide: mean and action, which holds standard normal noise before."""
+    step.obs.copy_(sanitise(obs))
+    step.critic_obs.copy_(sanitise(critic_obs))
+    mean = actor.forward(scaling.features(sanitise(obs), actor.layers.weights[0].shape[1]), dtype).mean
+    step.mean.copy_(mean)
+    step.action.mul_(actor.log_std.exp()).add_(mean)
 
 
 def _keep(
-    happened: tuple[torch.Tensor, ...], kept: tuple[torch.Tensor, ...], episode: torch.Tensor, finished: torch.Tensor,
-    reward_scale: float,
+    reward: torch.Tensor, done: torch.Tensor, timeout: torch.Tensor, final_critic_obs: torch.Tensor,
+    step: RolloutBuffer, episode: torch.Tensor, finished: torch.Tensor, reward_scale: float,
 ) -> None:  # fmt: skip
     """Keep reward, done, timeout and the critic's last observation; count returns and lengths."""
-    reward = torch.nan_to_num(happened[0], nan=0.0, posinf=0.0, neginf=0.0)
-    kept[0].copy_(reward * reward_scale)
-    for found, place in zip(happened[1:], kept[1:], strict=True):
-        place.copy_(found)
-    done = happened[1]
+    reward = torch.nan_to_num(reward, nan=0.0, posinf=0.0, neginf=0.0)
+    step.reward.copy_(reward * reward_scale)
+    step.done.copy_(done)
+    step.timeout.copy_(timeout)
+    step.final_critic_obs.copy_(final_critic_obs)
     now = episode + torch.stack([reward, torch.ones_like(reward)])
     finished.add_(torch.cat([now * done, done[None].double()]))
     episode.copy_(now * (1.0 - done))

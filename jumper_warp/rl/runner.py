@@ -232,7 +232,7 @@ class Run:
         with self._log() as log:
             for note in [f"run {self.folder}", *self.notes]:
                 log.say(note)
-            ending = self.iteration >= cfg.iterations or 0.0 < cfg.max_seconds <= self.seconds
+            ending = is_last_iteration(self.iteration, cfg, 0.0 < cfg.max_seconds <= self.seconds)
             if ending:
                 seconds = f"--max-seconds {cfg.max_seconds:g}"
                 limit = f"--iterations {cfg.iterations}" if self.iteration >= cfg.iterations else seconds
@@ -244,7 +244,7 @@ class Run:
                 self.iteration += 1
                 if self.iteration == first:
                     self._begin_counting()
-                ending = self._ending(stop)
+                ending = is_last_iteration(self.iteration, cfg, self.sync_stop_request(stop))
                 if ending or self.iteration % cfg.log_interval == 0:
                     times, seconds = watch.read()
                     self.figures = self._read(times, seconds)
@@ -283,14 +283,15 @@ class Run:
             left = min(left, max(self.cfg.max_seconds - self._elapsed(), 0.0))
         return left
 
-    def _ending(self, stop: Stop) -> bool:
-        """Return whether this iteration is the last; the processes agree, which they ask when they log."""
-        if self.iteration >= self.cfg.iterations:
-            return True
-        if world_size() > 1 and self.iteration % self.cfg.log_interval:
-            return False
+    def sync_stop_request(self, stop: Stop) -> bool:
+        """Return whether to end early, because a process was asked to or is at the time limit.
+
+        Several processes exchange this when they log, not otherwise; `stop.asked` becomes the same in all of them.
+        """
         late = 0.0 < self.cfg.max_seconds <= self._elapsed()
         if world_size() > 1:
+            if self.iteration % self.cfg.log_interval:
+                return False
             stop.asked, late = map(bool, largest_over_ranks([int(stop.asked), int(late)]))
         return stop.asked or late
 
@@ -326,6 +327,11 @@ class Run:
         if world_size() == 1:
             return []
         return gather({**own, "ppo": {"episode": own["ppo"]["episode"].cpu()}}, self.rank)[1:]
+
+
+def is_last_iteration(iteration: int, cfg: TrainCfg, end_early: bool) -> bool:
+    """Return whether a run with so many iterations behind it is at its end."""
+    return end_early or iteration >= cfg.iterations
 
 
 class _Silent:

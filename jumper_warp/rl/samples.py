@@ -9,12 +9,11 @@ import torch
 
 from jumper_warp.envs.vec_env import sanitise
 from jumper_warp.rl.cfg import PpoCfg
-from jumper_warp.rl.compiling import Compiler
-from jumper_warp.rl.flat import ROW_ALIGNMENT, FlatParameters, Layers, aligned
+from jumper_warp.rl.flat import ROW_ALIGNMENT, FlatParameters, aligned
+from jumper_warp.rl.graphs import Compiler
 from jumper_warp.rl.mirror import Image
-from jumper_warp.rl.networks import ActorCritic, gaussian_log_prob, joint_moments, own_moments
-from jumper_warp.rl.passes import DTYPES, forward
-from jumper_warp.rl.rollout import Pair, RolloutBuffer, normalised
+from jumper_warp.rl.networks import DTYPES, ActorCritic, Layers, Moments, Scaling, gaussian_log_prob, joint_moments
+from jumper_warp.rl.rollout import RolloutBuffer
 
 CPU_ROWS = 4096
 """Samples that a CPU takes at a time, so that what is made of them stays in its caches."""
@@ -37,6 +36,42 @@ class Batch(NamedTuple):
     advantage: torch.Tensor
     target: torch.Tensor
     """(batch,) what the critic should have put out."""
+
+
+class RolloutMoments(NamedTuple):
+    """Of the samples of a rollout."""
+
+    advantage: Moments
+    target: Moments
+    """() each."""
+    obs: Moments
+    """(num_obs,)"""
+    critic_obs: Moments
+    """(num_critic_obs,)"""
+
+
+class Estimates(NamedTuple):
+    """What the critic makes of a rollout; batch = num_steps · num_envs, time-major."""
+
+    value: torch.Tensor
+    """(batch,) the critic's output [standard deviations of the return]."""
+    advantage: torch.Tensor
+    """(batch,) [scaled reward]"""
+    target: torch.Tensor
+    """(batch,) returns [scaled reward]."""
+    moments: RolloutMoments
+    """Over this rank's samples."""
+
+
+class Scalings(NamedTuple):
+    """By which observations and values are scaled."""
+
+    obs: Scaling
+    """(num_obs,)"""
+    critic_obs: Scaling
+    """(num_critic_obs,)"""
+    value: Scaling
+    """() of the return."""
 
 
 class RowLayout(NamedTuple):
@@ -116,7 +151,7 @@ class Sampler:
     ) -> None:  # fmt: skip
         """flat: the parameters of `model`; obs_image: of observations whose statistics are to be symmetric."""
         self._obs_image = obs_image
-        self._rollout, self._cfg, self._model, self._critic = rollout, cfg, model, flat.critic()
+        self._rollout, self._cfg, self._model, self._critic = rollout, cfg, model, flat.critic
         steps, worlds, num_actions = rollout.action.shape
         self.layout = RowLayout(rollout.obs.shape[2], rollout.critic_obs.shape[2], num_actions)
         self.rows = rollout.obs.new_zeros(steps * worlds, sum(self.layout.widths))
@@ -124,92 +159,82 @@ class Sampler:
         self.old_log_std = torch.zeros_like(rollout.log_std)
         """Of the policy that acted."""
         self._rows = CPU_ROWS if self.rows.device.type == "cpu" else None
-        self._estimate, self._pack = compiler(_estimate), compiler(_pack)
+        self._compute_values_and_gae, self._write = compiler(compute_values_and_gae), compiler(_write)
 
     @torch.no_grad()
     def pack(self) -> None:
         """Write the rollout to `rows` and take it into the running statistics."""
         model = self._model
         scalings = self._scalings()  # with which actor and critic acted
-        estimates, own = self._estimates(scalings[1])
-        of_advantage, of_target, of_obs, of_critic_obs = joint_moments(own, self.rows.shape[0])
+        estimates = self._estimates(scalings)
+        moments = RolloutMoments(*joint_moments(estimates.moments))
+        of_obs = moments.obs
         if self._obs_image is not None:
-            of_obs = (*self._obs_image.moments(*of_obs[:2]), of_obs[2])
+            of_obs = Moments(*self._obs_image.moments(of_obs.mean, of_obs.var), of_obs.count)
         model.obs_moments.take(of_obs)
-        model.critic_moments.take(of_critic_obs)
+        model.critic_moments.take(moments.critic_obs)
         if self._cfg.normalise_value:
-            model.value_moments.take(of_target)
-        mean, var, count = of_advantage
-        self._write(scalings, estimates, (mean.float(), ((var * count / (count - 1)).sqrt() + 1.0e-8).float()))
+            model.value_moments.take(moments.target)
+        mean, var, count = moments.advantage
+        of_advantage = Scaling(mean.float(), ((var * count / (count - 1)).sqrt() + 1.0e-8).float())
+        self._pack(scalings, estimates, of_advantage)
         self.old_log_std.copy_(self._rollout.log_std)
 
     @torch.no_grad()
     def rehearse(self) -> None:
         """Compile, as if a rollout were packed; spoils `rows`."""
         scalings = self._scalings()
-        self._write(scalings, self._estimates(scalings[1])[0], self._model.value_moments.scaling())
+        self._pack(scalings, self._estimates(scalings), scalings.value)
 
-    def _scalings(self) -> tuple[Pair, Pair]:
-        return self._model.obs_moments.scaling(), self._model.critic_moments.scaling()
+    def _scalings(self) -> Scalings:
+        model = self._model
+        return Scalings(*(each.scaling() for each in (model.obs_moments, model.critic_moments, model.value_moments)))
 
-    def _estimates(self, critic_scaling: Pair) -> tuple[tuple[torch.Tensor, ...], list[Pair]]:
-        rollout, of_value = self._rollout, self._model.value_moments.scaling()
-        experience = (rollout.critic_obs, rollout.final_critic_obs, rollout.reward, rollout.done, rollout.timeout)
-        return self._estimate(experience, rollout.obs, self._critic, critic_scaling, of_value, self._cfg, self._rows)
+    def _estimates(self, scalings: Scalings) -> Estimates:
+        return self._compute_values_and_gae(self._rollout, self._critic, scalings, self._cfg, self._rows)
 
-    def _write(self, scalings: tuple[Pair, Pair], estimates: tuple[torch.Tensor, ...], advantage_scaling: Pair) -> None:
-        rollout = self._rollout
-        acted = (rollout.obs, rollout.critic_obs, rollout.action, rollout.mean, rollout.log_std)
-        target_scaling = self._model.value_moments.scaling() if self._cfg.normalise_value else None
-        self._pack(self.rows, self.layout, acted, scalings, estimates, advantage_scaling, target_scaling, self._rows)
+    def _pack(self, scalings: Scalings, estimates: Estimates, of_advantage: Scaling) -> None:
+        of_target = self._model.value_moments.scaling() if self._cfg.normalise_value else None
+        self._write(self.rows, self.layout, self._rollout, scalings, estimates, of_advantage, of_target, self._rows)
 
 
-def _estimate(
-    experience: tuple[torch.Tensor, ...], obs: torch.Tensor, critic: Layers, critic_scaling: Pair, value_scaling: Pair,
-    cfg: PpoCfg, rows: int | None,
-) -> tuple[tuple[torch.Tensor, ...], list[Pair]]:  # fmt: skip
-    """Return what the critic makes of a rollout, and moments of it.
+def compute_values_and_gae(
+    buffer: RolloutBuffer, critic: Layers, scalings: Scalings, cfg: PpoCfg, rows: int | None
+) -> Estimates:
+    """Return values, advantages and returns (num_steps · num_envs,) of a rollout, and moments of its samples.
 
-    experience: critic_obs, final_critic_obs, reward, done and timeout of a `RolloutBuffer`; rows: at a time.
-    Return the critic's output, advantages and returns (samples,); and mean and variance of advantages, returns,
-    observations and the critic's observations.
+    A timeout counts the value of the last observation. rows: observations that the critic takes at a time (None: all).
     """
-    critic_obs, final_critic_obs, reward, done, timeout = experience
     columns, dtype = critic.weights[0].shape[1], DTYPES[cfg.precision]
 
-    def head(raw: torch.Tensor) -> torch.Tensor:
-        parts = _parts(raw.flatten(0, 1), rows)
-        found = [forward(critic, normalised(sanitise(part), critic_scaling, columns), dtype)[0] for part in parts]
-        return torch.cat(found).view(raw.shape[:2])
+    def value_head(critic_obs: torch.Tensor) -> torch.Tensor:
+        """Return the critic's output (steps, num_envs) for (steps, num_envs, num_critic_obs)."""
+        scaling, parts = scalings.critic_obs, _parts(critic_obs.flatten(0, 1), rows)
+        heads = [critic.forward(scaling.features(sanitise(part), columns), dtype)[0] for part in parts]
+        return torch.cat(heads).view(critic_obs.shape[:2])
 
-    now, final = head(critic_obs), head(final_critic_obs)
-    now_value, final_value = (x * value_scaling[1] + value_scaling[0] for x in (now, final))
-    advantage, target = gae(reward + cfg.gamma * timeout * final_value, done, now_value, cfg.gamma, cfg.lam)
-    seen = (obs[:-1].flatten(0, 1), critic_obs[:-1].flatten(0, 1))
-    own = [own_moments(x, rows) for x in (advantage.flatten(), target.flatten(), *seen)]
-    return (now[:-1].flatten(), advantage.flatten(), target.flatten()), own
+    head, final_head = value_head(buffer.critic_obs), value_head(buffer.final_critic_obs)
+    value, final_value = scalings.value.restore(head), scalings.value.restore(final_head)
+    reward = buffer.reward + cfg.gamma * buffer.timeout * final_value
+    advantage, target = (x.flatten() for x in gae(reward, buffer.done, value, cfg.gamma, cfg.lam))
+    samples = (advantage, target, buffer.obs[:-1].flatten(0, 1), buffer.critic_obs[:-1].flatten(0, 1))
+    moments = RolloutMoments(*(Moments.of(x, rows) for x in samples))
+    return Estimates(head[:-1].flatten(), advantage, target, moments)
 
 
-def _pack(
-    rows: torch.Tensor, layout: RowLayout, acted: tuple[torch.Tensor, ...], scalings: tuple[Pair, Pair],
-    estimates: tuple[torch.Tensor, ...], advantage_scaling: Pair, target_scaling: Pair | None, count: int | None,
+def _write(
+    rows: torch.Tensor, layout: RowLayout, buffer: RolloutBuffer, scalings: Scalings, estimates: Estimates,
+    of_advantage: Scaling, of_target: Scaling | None, count: int | None,
 ) -> None:  # fmt: skip
-    """Write samples to rows, so many at a time.
-
-    acted: obs, critic_obs, action, mean and log_std of a `RolloutBuffer`; estimates: of `_estimate`.
-    """
-    obs, critic_obs, action, mean, log_std = acted
-    value, advantage, target = estimates
-    if target_scaling is not None:
-        target = (target - target_scaling[0]) / target_scaling[1]
-    advantage = (advantage - advantage_scaling[0]) / advantage_scaling[1]
-    pieces = [x.flatten(0, 1) for x in (obs[:-1], critic_obs[:-1], action, mean)] + [value, advantage, target]
-    for into, *part in zip(_parts(rows, count), *[_parts(x, count) for x in pieces], strict=True):
-        seen, critic_seen, acting, meant, worth, gain, goal = part
-        features = normalised(seen, scalings[0], layout.num_obs)
-        critic_features = normalised(critic_seen, scalings[1], layout.num_critic_obs)
-        log_prob = gaussian_log_prob(acting, meant, log_std)
-        into.copy_(layout.pack(Batch(features, critic_features, acting, meant, log_prob, worth, gain, goal)))
+    """Write samples to rows (batch, columns of `layout`), so many at a time."""
+    target = estimates.target if of_target is None else of_target.normalise(estimates.target)
+    steps = [x.flatten(0, 1) for x in (buffer.obs[:-1], buffer.critic_obs[:-1], buffer.action, buffer.mean)]
+    pieces = [rows, *steps, estimates.value, of_advantage.normalise(estimates.advantage), target]
+    for into, obs, critic_obs, action, mean, *estimated in zip(*[_parts(x, count) for x in pieces], strict=True):
+        features = scalings.obs.features(obs, layout.num_obs)
+        critic_features = scalings.critic_obs.features(critic_obs, layout.num_critic_obs)
+        log_prob = gaussian_log_prob(action, mean, buffer.log_std)
+        into.copy_(layout.pack(Batch(features, critic_features, action, mean, log_prob, *estimated)))
 
 
 def _parts(x: torch.Tensor, rows: int | None) -> tuple[torch.Tensor, ...]:

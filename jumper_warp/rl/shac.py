@@ -19,6 +19,7 @@ from torch.nn import functional
 from jumper_warp.envs.vec_env import DifferentiableVecEnv, sanitise
 from jumper_warp.rl.cfg import PpoCfg, ShacCfg
 from jumper_warp.rl.networks import ActorCritic
+from jumper_warp.rl.ppo import take_averages
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.state_checks import check_parts, check_tensor
 
@@ -107,7 +108,8 @@ class Shac:
         return {"loss": loss, **{name: torch.stack(rows) for name, rows in seen.items()}}
 
     def _target_value(self, critic_obs: torch.Tensor) -> torch.Tensor:
-        return self.model.value_moments.restore(self.target(self.model.critic_features(critic_obs)).squeeze(-1))
+        head = self.target(self.model.critic_features(critic_obs)).squeeze(-1)
+        return self.model.value_moments.scaling().restore(head)
 
     def _count(self, reward: torch.Tensor, done: torch.Tensor) -> None:
         now = self.episode + torch.stack([reward, torch.ones_like(reward)])
@@ -128,7 +130,7 @@ class Shac:
         if cfg.normalise_value:
             model.value_moments.update(returns.flatten())
         features = model.critic_features(critic_obs.flatten(0, 1))
-        wanted = model.value_moments.normalise(returns.flatten())
+        wanted = model.value_moments.scaling().normalise(returns.flatten())
         losses, norms = [], []
         for _ in range(shac.critic_epochs):
             for rows in torch.randperm(len(wanted), device=wanted.device).chunk(shac.critic_minibatches):
@@ -156,15 +158,7 @@ class Shac:
 
     def statistics(self) -> dict[str, float]:
         """Return averages since the last call, of losses and of finished episodes."""
-        *sums, count = self._sums.tolist()
-        result = {f"Loss/{name}": total / max(count, 1.0) for name, total in zip(STATISTICS, sums, strict=True)}
-        result |= {"Loss/learning_rate": float(self.lr), "Policy/mean_std": self.model.log_std.exp().mean().item()}
-        total, length, ended = self._finished.tolist()
-        if ended > 0.0:
-            result |= {"Train/mean_return": total / ended, "Train/mean_length": length / ended}
-        self._sums.zero_()
-        self._finished.zero_()
-        return result
+        return take_averages(STATISTICS, self._sums, self._finished, self.lr, self.model.log_std)
 
     def _parts(self) -> dict[str, torch.Tensor]:
         """Return all tensors of the state by name, in place where there are any."""

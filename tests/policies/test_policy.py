@@ -56,7 +56,7 @@ def trained(model):
     interface = make_interface(48, 12, (64, 32))
     moments = model.obs_moments
     return Policy(
-        weights_of(model.actor), moments.mean, moments.scale(), interface, {"env": {"seed": 5}, "commit": "abc"}
+        weights_of(model.actor), moments.mean, moments.scaling().std, interface, {"env": {"seed": 5}, "commit": "abc"}
     )
 
 

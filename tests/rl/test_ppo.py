@@ -10,8 +10,8 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 from jumper_warp.rl import networks
 from jumper_warp.rl import ppo as ppo_module
-from jumper_warp.rl.adam import adapted_lr
 from jumper_warp.rl.cfg import PpoCfg
+from jumper_warp.rl.flat import adapted_lr
 from jumper_warp.rl.ppo import STATISTICS, Ppo
 from jumper_warp.rl.samples import Batch, gae
 from toy_task import SMALL, PushTask, fill, free_port, local_order, update_half
@@ -75,7 +75,7 @@ def pair():
             param.add_(0.1 * torch.randn_like(param))
     copy_weights(ppo.model, theirs)
     their_losses = theirs.update()
-    ppo._descend(ppo.sampler.rows)
+    ppo.minibatch_step(ppo.sampler.rows)
     return ppo, batch, theirs, their_losses, ppo.statistics()
 
 
@@ -237,7 +237,7 @@ def test_a_gradient_that_is_not_finite_changes_nothing():
     before = {name: value.clone() for name, value in ppo.model.named_parameters()}
     batch.advantage.mul_(float("nan"))
     batch.target.mul_(float("inf"))
-    ppo._descend(ppo.sampler.rows)
+    assert ppo.minibatch_step(ppo.sampler.rows).skipped == 1.0
     assert all(torch.equal(value, before[name]) for name, value in ppo.model.named_parameters())
     assert ppo.statistics()["Loss/skipped"] == 1.0
 
@@ -313,7 +313,7 @@ def test_an_iteration_exchanges_its_statistics_once_and_a_gradient_a_minibatch(m
         ppos[-1].collect()
         ppos[-1].update()
     alone, one_of_two = ppos
-    assert sizes == [2 * (1 + 1 + 2 + 3)] + 12 * [alone.flat.gradient.numel()]
+    assert sizes == [2 * (1 + 1 + 2 + 3)] + 12 * [alone.flat.exchanged.numel()]
     torch.testing.assert_close(one_of_two.flat.value, alone.flat.value, atol=2e-5, rtol=1e-3)
     torch.testing.assert_close(one_of_two.model.obs_moments.var, alone.model.obs_moments.var, atol=1e-6, rtol=1e-3)
     assert one_of_two.model.obs_moments.count == 2 * alone.model.obs_moments.count
@@ -348,9 +348,10 @@ def test_an_old_checkpoints_episodes_in_single_precision_are_taken_up():
 
 
 def noise_gradient(ppo, progress):
-    """Return the gradient by the noise's logarithms at a progress of the training, on the same samples."""
+    """Return the gradient by the noise's logarithms at a progress of the training, on the same samples and weights."""
     ppo.set_progress(progress)
-    ppo._differentiate(ppo.sampler.rows)
+    ppo.lr.zero_()
+    ppo.minibatch_step(ppo.sampler.rows)
     return ppo.model.log_std.grad.clone()
 
 

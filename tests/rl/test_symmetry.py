@@ -8,13 +8,12 @@ import torch
 from jumper_warp.cli.main import main
 from jumper_warp.policies.runs import open_policy
 from jumper_warp.registry import TASKS, TaskEntry, make_task
-from jumper_warp.rl import compiling
+from jumper_warp.rl import graphs
 from jumper_warp.rl.cfg import PpoCfg, TrainCfg
 from jumper_warp.rl.checkpoint import save_checkpoint
 from jumper_warp.rl.flat import FlatParameters
 from jumper_warp.rl.mirror import Symmetry, image, plain_layers
 from jumper_warp.rl.networks import ActorCritic
-from jumper_warp.rl.passes import backward_actor, forward_actor
 from jumper_warp.rl.ppo import Ppo
 from jumper_warp.tasks.interface import interface
 from jumper_warp.tasks.mirror import mirror_of, mirror_of_action
@@ -57,17 +56,16 @@ def test_no_sideways_answer_to_a_symmetric_observation():
 def test_passes_over_both_images_equal_autograd():
     model, x = walker(), torch.randn(40, NUM_OBS)
     flat = FlatParameters(model, "elu")
-    layers, _ = flat.actor(flat.value)
+    actor = flat.actor
     slope = torch.randn(40, 12)
     own, other = model.actor(x), mirrored(model.actor(mirrored(x, OBS)), ACTION)
     mean = 0.5 * (own + other)
     expected = torch.autograd.grad(mean, list(model.actor.parameters()), slope)
-    columns = layers.weights[0].shape[1]
-    both, wide = WALKING.padded(columns), torch.nn.functional.pad(x, (0, columns - NUM_OBS))
-    *outputs, seen = forward_actor(layers, wide, both, torch.float32)
+    wide = torch.nn.functional.pad(x, (0, actor.layers.weights[0].shape[1] - NUM_OBS))
+    *outputs, seen = actor.forward(wide, torch.float32)
     for found, right in zip(outputs, (mean, own - other), strict=True):
         torch.testing.assert_close(found, right, atol=1e-5, rtol=1e-5)
-    first, *others = backward_actor(layers, seen, slope, both, torch.float32)
+    first, *others = actor.backward(seen, slope, torch.float32)
     for found, right in zip((first[:, :NUM_OBS], *others), expected, strict=True):
         torch.testing.assert_close(found, right, atol=1e-4, rtol=1e-4)
 
@@ -124,7 +122,7 @@ def test_symmetric_actor_acts_and_stays_symmetric_in_training():
 
 
 def test_symmetric_update_traces_into_one_graph(monkeypatch):
-    monkeypatch.setattr(compiling, "BACKEND", "eager")
+    monkeypatch.setattr(graphs, "BACKEND", "eager")
     found = []
     for compiled in ("off", "on"):
         torch.manual_seed(0)

@@ -41,7 +41,7 @@ def test_the_rollout_takes_what_is_said(envs, asymmetric):
     cfg = dataclasses.replace(SMALL, asymmetric=asymmetric)
     for env, _ in envs:
         ppo = Ppo(env, cfg)
-        buffers = sum(x.numel() * x.element_size() for name, x in vars(ppo.rollout).items() if name != "log_std")
+        buffers = sum(x.numel() * x.element_size() for name, x in ppo.rollout._asdict().items() if name != "log_std")
         critic_obs = env.num_critic_obs if asymmetric else env.num_obs
         assert buffers == env.num_envs * rollout_bytes(cfg.num_steps, env.num_obs, critic_obs)
         need = learning_need(cfg, env.num_obs, env.num_critic_obs)

@@ -6,12 +6,10 @@ import math
 import pytest
 import torch
 
-from jumper_warp.rl import compiling
-from jumper_warp.rl.adam import FlatAdam, adam_step
+from jumper_warp.rl import graphs
 from jumper_warp.rl.cfg import PpoCfg
-from jumper_warp.rl.flat import FlatParameters
+from jumper_warp.rl.flat import FlatAdam, FlatParameters, adam_step
 from jumper_warp.rl.networks import ActorCritic, gaussian_log_prob
-from jumper_warp.rl.passes import backward, forward
 from jumper_warp.rl.ppo import Ppo
 from toy_task import PushTask, fill
 
@@ -142,7 +140,7 @@ def test_samples_equal_those_of_a_loop_over_time():
     close = {"atol": 1e-5, "rtol": 1e-4}
     torch.testing.assert_close(batch["advantage"], (advantage - advantage.mean()) / advantage.std(), **close)
     returns = advantage + values[:-1].flatten()
-    torch.testing.assert_close(ppo.model.value_moments.restore(batch["target"]), returns, **close)
+    torch.testing.assert_close(ppo.model.value_moments.scaling().restore(batch["target"]), returns, **close)
     torch.testing.assert_close(batch["features"], model.features(rollout.obs[:-1]).flatten(0, 1), **close)
     torch.testing.assert_close(
         batch["critic_features"], model.critic_features(rollout.critic_obs[:-1]).flatten(0, 1), **close
@@ -179,15 +177,15 @@ def test_a_networks_passes_equal_autograd_in_double_precision_and_nearly_so_in_h
     torch.manual_seed(0)
     model = ActorCritic(8, 3, (32, 16))
     flat = FlatParameters(model, "elu")
-    layers, _ = flat.actor(flat.value)
+    layers = flat.actor.layers
     x, slope = torch.randn(64, 8), torch.randn(64, 3)
     expected = torch.autograd.grad(model.actor(x), list(model.actor.parameters()), slope)
     for dtype, most in ((torch.float32, 1e-5), (torch.bfloat16, 2e-2)):
-        output, seen = forward(layers, x, dtype)
+        output, seen = layers.forward(x, dtype)
         assert [each.dtype for each in seen] == [dtype, dtype, torch.float32]
         scale = model.actor(x).detach().abs().max()
         assert (output - model.actor(x)).abs().max() < most * scale
-        for found, right in zip(backward(layers, seen, slope, dtype), expected, strict=True):
+        for found, right in zip(layers.backward(seen, slope, dtype), expected, strict=True):
             assert found.dtype == torch.float32
             assert (found - right).norm() < most * right.norm()
 
@@ -220,7 +218,7 @@ def test_a_compiled_minibatch_equals_an_eager_one():
     for ppo in (eager, compiled):
         ppo.sampler.old_log_std.copy_(eager.rollout.log_std)
         for samples in torch.arange(ppo.batch_size).chunk(4):
-            ppo._descend(eager.sampler.rows[samples])
+            ppo.minibatch_step(eager.sampler.rows[samples])
     assert compiled.compiler.enabled
     torch.testing.assert_close(compiled.flat.value, eager.flat.value, atol=1e-6, rtol=1e-5)
     assert compiled.statistics() == pytest.approx(eager.statistics(), rel=1e-4, abs=1e-6)
@@ -237,7 +235,7 @@ def test_without_a_compiler_training_goes_on_and_says_so_once(capsys, monkeypatc
 
     expected = trained("off")
     assert capsys.readouterr().err == ""
-    monkeypatch.setattr(compiling, "BACKEND", broken_backend)
+    monkeypatch.setattr(graphs, "BACKEND", broken_backend)
     assert torch.equal(trained("on"), expected)
     lines = capsys.readouterr().err.splitlines()
     assert len(lines) == 1 and lines[0].startswith("not compiled, training is slower: ")
