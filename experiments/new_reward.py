@@ -5,7 +5,7 @@
 A term is a pure Warp function of the robot (`mdp.RobotView`), the state of the task (`mdp.JumpState`; `Any` for a term
 that every task can use) and numbers by name, and a line that gives it a weight and these numbers. It is compiled into
 the task's one step kernel and logged by its name; weight and numbers can be changed while a training runs:
-`env.skills[0].set("rewards", "even_load", weight=2.0)`.
+`env.set("rewards.even_load.weight", 2.0)`.
 """
 
 from __future__ import annotations

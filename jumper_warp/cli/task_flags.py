@@ -2,7 +2,8 @@
 
     --env.rewards.jump-height.weight 30 --env.policy.lin-vel.noise 0.1 --env.reset.standing 0.5 --env.contact-force 0.2
 
-They are derived from the task itself: numbers of terms by the term's name, everything else by the field's.
+They are derived from the task itself. A term's number has the flag of its dotted name (`jumper_warp.tasks.params`),
+without the term where a section has only one, as `--env.curriculum.tolerance`; everything else has its field's.
 """
 
 from __future__ import annotations
@@ -40,11 +41,6 @@ def flags_of(task: TaskCfg) -> Any:
     """Return a task's settings as a dataclass that tyro makes flags of. Raises InputError: two flags are the same."""
     flags = _flag_of_dataclass(task, task.name)
     return flags and flags.value
-
-
-def with_flags(task: TaskCfg, flags: Any) -> TaskCfg:
-    """Return the task with the settings of `flags_of`, changed or not. Raises ValueError as `TaskCfg` does."""
-    return _changed(task, flags)
 
 
 def flag_name(name: str) -> str:
@@ -85,10 +81,10 @@ def _flag(value: Any, hint: Any, where: str) -> Flag | None:
 def _flag_of_dataclass(value: Any, where: str) -> Flag | None:
     """Return the flags of the fields of a dataclass; those that hold functions and names have none."""
     hints, docs, flags = get_type_hints(type(value)), field_docs(type(value)), {}
-    for spec in dataclasses.fields(value):
-        flag = _flag(getattr(value, spec.name), hints[spec.name], f"{where} {spec.name}")
+    for name, part in _parts(value).items():
+        flag = _flag(part, hints[name], f"{where} {name}")
         if flag is not None:
-            flags[spec.name] = flag._replace(about=docs.get(spec.name, flag.about))
+            flags[name] = flag._replace(about=docs.get(name, flag.about))
     return _group(_first_paragraph(type(value).__doc__), flags, where) if flags else None
 
 
@@ -120,29 +116,28 @@ def _members(group: Any) -> dict[str, Any]:
     return {spec.metadata["flag"]: getattr(group, spec.name) for spec in dataclasses.fields(group)}
 
 
-def _changed(value: Any, flags: Any) -> Any:
-    """Return a part of a task with the values of its flags."""
-    if isinstance(value, Term):
-        given = _members(flags)
-        known = {**value.numbers, **value.options}
-        new = {key: given[flag_name(key)] for key in known if flag_name(key) in given}
-        return value.replace(**{key: number for key, number in new.items() if number != known[key]})
+def with_flags(value: Any, flags: Any) -> Any:
+    """Return a task, or a part of one, with the values of its `flags_of`. Raises ValueError as `TaskCfg` does."""
     if isinstance(value, Reset):
-        return dataclasses.replace(value, settings=_changed(value.settings, flags))
-    if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        given = _members(flags)
-        parts = {spec.name: getattr(value, spec.name) for spec in dataclasses.fields(value)}
-        new = {name: _changed(part, given[flag_name(name)]) for name, part in parts.items() if flag_name(name) in given}
-        return dataclasses.replace(value, **new)
-    if parts := _parts(value):
-        given = _members(flags)
-        names = {name: flag_name(name) for name in parts}
-        return tuple(_changed(part, given[names[n]]) if names[n] in given else part for n, part in parts.items())
-    return flags
+        return dataclasses.replace(value, settings=with_flags(value.settings, flags))
+    if not (parts := _parts(value)):
+        return flags
+    given = _members(flags)
+    new = {name: with_flags(part, given[flag_name(name)]) for name, part in parts.items() if flag_name(name) in given}
+    if isinstance(value, Term):
+        return value.replace(**{key: number for key, number in new.items() if number != parts[key]})
+    return tuple((parts | new).values()) if isinstance(value, tuple) else dataclasses.replace(value, **new)
 
 
 def _parts(value: Any) -> dict[str, Any]:
-    """Return the terms of a tuple by name, or its groups of settings by number; nothing if it holds anything else."""
+    """Return a term's numbers and options, a dataclass's fields, or a tuple's terms by name or dataclasses by number.
+
+    Of anything else nothing.
+    """
+    if isinstance(value, Term):
+        return {**value.numbers, **value.options}
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return {spec.name: getattr(value, spec.name) for spec in dataclasses.fields(value)}
     if not isinstance(value, tuple) or not all(isinstance(v, Term) or dataclasses.is_dataclass(v) for v in value):
         return {}
     return {part.name if isinstance(part, Term) else str(i): part for i, part in enumerate(value)}

@@ -80,25 +80,25 @@ def parse_train(args: Sequence[str]) -> tuple[TrainArgs, TaskCfg]:
         if checkpoint := find_checkpoint(named):
             settings, task = settings_of_run(checkpoint, default.cfg)
             default = dataclasses.replace(default, **settings)
-    parsed = parse_settings(for_robot(task, overlay_in(args[1:])), default, args[1:])
+    parsed, task = parse_settings(for_robot(task, overlay_in(args[1:])), default, args[1:])
     if parsed.cfg.task != name:
         raise UsageError(f"give the task once, got {name} and --task {parsed.cfg.task}")
-    from jumper_warp.cli.task_flags import with_flags
     from jumper_warp.tasks.observations import with_history
 
-    return parsed, with_history(with_flags(task, parsed.env), parsed.history)
+    return parsed, with_history(task, parsed.history)
 
 
-def parse_settings(task: TaskCfg, default: TrainArgs, args: Sequence[str]) -> Any:
-    """Return the settings, with those of the task as `env`; exits where tyro does."""
-    from jumper_warp.cli.task_flags import flags_of
+def parse_settings(task: TaskCfg, default: TrainArgs, args: Sequence[str]) -> tuple[Any, TaskCfg]:
+    """Return the settings, and the task with those of `--env`; exits where tyro does. Raises InputError as the task."""
+    from jumper_warp.cli.task_flags import flags_of, with_flags
 
     flags = flags_of(task)
     made: dict[str, Any] = {"bases": (TrainArgs,), "frozen": True, "namespace": {"__module__": __name__}}
     kind: Any = dataclasses.make_dataclass("TaskTrainArgs", [("env", type(flags), flags)], **made)
     given = {spec.name: getattr(default, spec.name) for spec in dataclasses.fields(default)}
     about = f"Train a policy on {task.name}."
-    return parse(kind, f"train {task.name}", args, default=kind(**given), description=about)
+    parsed = parse(kind, f"train {task.name}", args, default=kind(**given), description=about)
+    return parsed, with_flags(task, parsed.env)
 
 
 def value_of(name: str, args: Sequence[str]) -> str | None:

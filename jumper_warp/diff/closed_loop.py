@@ -115,7 +115,7 @@ class ClosedLoop:
             robots.model, task.motors, task.command_filter, double=double, dt=robots.dt, substeps=robots.substeps
         )
         self.dtype = torch.float64 if double else torch.float32
-        self.draws = bool(task.rows["events"])
+        self.draws = bool(task.params.slots["events"])
         """Whether resets draw other robots."""
         self.layout = task.layout("policy")
         self._columns = {

@@ -199,6 +199,19 @@ class Env(Stages):
             self._graphs[resets].replay()
         return self._step
 
+    def set(self, name: str, value: float, skill: int = 0) -> None:
+        """Change a number of a task's term, at once and in captured graphs too: `rewards.jump_height.weight`.
+
+        name: section, term and number, as in `jumper_warp.tasks.params`; skill: index of the task.
+        Raises ValueError: no such number or skill, or a value that is not finite.
+        """
+        self._check_skill(skill)
+        self.skills[skill].params.set(name, value)
+
+    def _check_skill(self, skill: int) -> None:
+        if not 0 <= skill < len(self.skills):
+            raise InputError(f"skill must be an index below {len(self.skills)}, got {skill}")
+
     # ------------------------------------------------------------------ commands from outside
 
     def evaluation_reset(self, commands: Any, headings: Any = 0.0, worlds: Any = None) -> None:
@@ -248,8 +261,7 @@ class Env(Stages):
         over, relative to base and yaw as they are then; by default the skill begins as the handover says.
         Raises ValueError: no such skill, or commands of another shape, out of bounds or not finite.
         """
-        if not 0 <= skill < len(self.skills):
-            raise InputError(f"skill must be an index below {len(self.skills)}, got {skill}")
+        self._check_skill(skill)
         mask, values = checked_mask(worlds, self.num_envs), np.zeros((self.num_envs, 4), dtype=np.float32)
         if commands is not None:
             values = checked_commands(commands, mask, [self.tasks[skill]])

@@ -19,7 +19,7 @@ from jumper_warp.kernels.mdp.step import make_step_kernel
 from jumper_warp.kernels.mdp.view import vec12
 from jumper_warp.robot.motors import filter_params
 from jumper_warp.tasks.cfg import TaskCfg
-from jumper_warp.utils.errors import InputError
+from jumper_warp.tasks.params import ParamArrays
 from jumper_warp.utils.kernels import Kernel, records
 
 _KERNELS: dict[tuple, Kernel] = {}
@@ -32,11 +32,9 @@ class Skill:
         """Allocate everything; index: of the skill in the environment; step_dt [s]: policy step."""
         self.task, self.index, self.num_envs, self.device = task, index, num_envs, device
         self.kernels = kernels_of(task)
-        self.numbers = wp.array(task.numbers, dtype=float, device=device)
-        self.changed = wp.full(len(task.numbers), math.inf, dtype=float, device=device)
-        """Of `numbers`, those that `set` has changed; infinite where it has not."""
+        self.params = ParamArrays(task.params, device)
         self.states = wp.zeros(num_envs, dtype=task.state, device=device)
-        self.num_events = len(task.rows["events"])
+        self.num_events = len(task.params.slots["events"])
         self.timer = wp.zeros((max(self.num_events, 1), num_envs), dtype=int, device=device)
         self.term_value = wp.zeros((max(len(task.rewards), 1), num_envs), dtype=float, device=device)
         self.counters = self._counters()
@@ -63,16 +61,15 @@ class Skill:
         widths = {group: max((end for _, end in layout.values()), default=0) for group, layout in layouts.items()}
         columns, start, past = [], 0, 0
         for index, group in enumerate(task.groups):
-            for row in task.rows[group]:
-                term, oldest = row.term, layouts[group][row.term.name][0]
-                delayed = int(term.options["delayed"])
-                for j in range(term.width):
-                    columns.append((len(columns), index, start, widths[group], row.first, oldest + j, term.width,
-                                    term.options["history"], delayed, past))  # fmt: skip
+            for slot in task.params.slots[group]:
+                width, oldest, delayed = slot.term.width, layouts[group][slot.term.name][0], int(slot.delayed)
+                for j in range(width):
+                    columns.append((len(columns), index, start, widths[group], slot.noise, slot.scale, slot.clip,
+                                    oldest + j, width, slot.history, delayed, past))  # fmt: skip
                     past += delayed
             start += n * widths[group]
         self.columns = wp.array(np.array(columns, dtype=np.int32).T, dtype=int, device=self.device)
-        self.num_chunks = -(-sum(len(task.rows[group]) for group in task.groups) // CHUNK)
+        self.num_chunks = -(-sum(len(task.params.slots[group]) for group in task.groups) // CHUNK)
         arrays = ObservationArrays()
         fill(arrays, ("raw",), (len(columns), n), float, self.device)
         fill(arrays, ("now", "final"), start, float, self.device)
@@ -103,21 +100,9 @@ class Skill:
         return settings
 
     def set(self, section: str, name: str, **numbers: float) -> None:
-        """Change numbers of a term, at once and in captured graphs too.
-
-        Raises ValueError for an unknown term or number, or a value that is not finite.
-        """
+        """Change numbers of a term, as `Env.set` changes one; raises ValueError as it does."""
         for key, value in numbers.items():
-            if not math.isfinite(value):
-                raise InputError(f"{section} {name}: {key} must be finite, got {value}")
-            i = self.task.place(section, name, key)
-            for array in (self.numbers, self.changed):
-                array[i : i + 1].fill_(value)
-
-    def restore_numbers(self) -> None:
-        """Take the task's numbers but for those in `changed` (waits for the device)."""
-        changed = self.changed.numpy()
-        self.numbers.assign(np.where(np.isinf(changed), np.array(self.task.numbers, dtype=np.float32), changed))
+            self.params.set(f"{section}.{name}.{key}", value)
 
     def metrics(self) -> dict[str, float]:
         """Return means since the last call, and clear the counters (waits for the device)."""
@@ -157,18 +142,16 @@ class Skill:
 
 def kernels_of(task: TaskCfg) -> dict[str, Kernel]:
     """Return a task's kernels; tasks share each that reads the same of them, whatever their numbers."""
-    rows = {
-        section: tuple((row.func, row.first, row.lo, row.hi, tuple(row.term.options.items())) for row in section_rows)
-        for section, section_rows in task.rows.items()
-    }
-    ends = tuple(rows[section] for section in ("advance", "curriculum", "rewards", "terminations"))
+    slots = task.params.slots
+    compiled = {section: tuple(slot.compiled for slot in of_section) for section, of_section in slots.items()}
+    ends = tuple(compiled[section] for section in ("advance", "curriculum", "rewards", "terminations"))
     begins = (task.reset.func, task.settings_type, task.level_type, task.command.due, task.command.draw)
     return {
         "step": _kernel(make_step_kernel, task, task.state, ends, task.reward_floor),
         "reset": _kernel(make_reset_kernel, task, task.state, begins),
         "give": _kernel(make_give_kernel, task, task.state, task.command.give),
-        "observe": _kernel(make_observe_kernel, task, task.state, tuple(rows[group] for group in task.groups)),
-        "event": _kernel(make_event_kernel, task.rows["events"], rows["events"]),
+        "observe": _kernel(make_observe_kernel, task, task.state, tuple(compiled[group] for group in task.groups)),
+        "event": _kernel(make_event_kernel, slots["events"], compiled["events"]),
     }
 
 

@@ -83,7 +83,7 @@ class Stages:
         """Let the solver and the terms read what was put back."""
         self._started = bool((self.worlds.clock.numpy() > FIRST_CLOCK).all())
         for skill in self.skills:
-            skill.restore_numbers()
+            skill.params.restore()
         self.sim.physics.parameters_changed()
 
     def kernels(self, draws: bool = True) -> list[tuple[Kernel, int]]:
@@ -138,7 +138,7 @@ class Stages:
         for skill in self.skills:
             self._launch(
                 skill.kernels["step"], part.count,
-                [skill.index, self.robot, self._scene.ground, len(skill.task.levels), skill.numbers, part.env,
+                [skill.index, self.robot, self._scene.ground, len(skill.task.levels), skill.params.values, part.env,
                  skill.states, skill.term_value, skill.counters],
             )  # fmt: skip
 
@@ -189,16 +189,17 @@ class Stages:
     def _events(self, part: Part, stage: int, mask: wp.array) -> None:
         """Run the events of a stage, and let the solver read what they changed."""
         for skill in self.skills:
-            due = {i: row.term for i, row in enumerate(skill.task.rows["events"]) if row.term.due_at(stage)}
+            slots = enumerate(skill.task.params.slots["events"])
+            due = {i: slot for i, slot in slots if slot.term.due_at(stage)}
             if due:
-                spread = self.wp_device.is_cuda and any(term.options["spread"] for term in due.values())
+                spread = self.wp_device.is_cuda and any(slot.spread for slot in due.values())
                 first, lanes = min(due), events.LANES if spread else 1
                 self._launch(
                     skill.kernels["event"], (max(due) - first + 1, lanes, part.count),
-                    [skill.index, stage, first, lanes, mask, self.step_dt, part.env, skill.numbers, skill.timer,
+                    [skill.index, stage, first, lanes, mask, self.step_dt, part.env, skill.params.values, skill.timer,
                      self.parameters], BLOCKS["event"], EVENT_BLOCKS,
                 )  # fmt: skip
-            if any(term.options["repack"] for term in due.values()):
+            if any(slot.repack for slot in due.values()):
                 self.sim.physics.parameters_changed(mask, Worlds(part.first, part.count))
 
     def _forget(self, part: Part, mask: wp.array) -> None:
@@ -215,9 +216,9 @@ class Stages:
             self._launch(
                 skill.kernels["observe"], (skill.num_chunks, part.count),
                 [skill.index, self.robot, self.parameters, self._scene.ground, part.env, skill.states,
-                 skill.numbers, beginning, arrays.raw],
+                 skill.params.values, beginning, arrays.raw],
             )  # fmt: skip
-            inputs = [skill.index, part.env, skill.columns, skill.numbers, beginning, arrays]
+            inputs = [skill.index, part.env, skill.columns, skill.params.values, beginning, arrays]
             self._launch(condition_kernel, (part.count, int(LANES)), inputs, CONDITION_BLOCK)
 
     def _launch(

@@ -34,7 +34,7 @@ def save_state(env: Stages) -> dict[str, torch.Tensor]:
     """Return everything that the next step depends on, on the CPU (waits for the device); counters are left out.
 
     Drawn parameters are in it, nominal ones only as a fingerprint; of the numbers of the task's terms those that
-    `Skill.set` has changed.
+    `Env.set` has changed.
     """
     state = {name: tensor.to("cpu", copy=True) for name, tensor in _tensors(env).items()}
     for prefix, array in _records(env).items():
@@ -66,7 +66,7 @@ def load_state(env: Stages, state: dict[str, torch.Tensor]) -> None:
         timer, changed = state[f"{name}/timer"], state[f"{name}/changed"]
         if isinstance(timer, torch.Tensor) and timer.dim() == 2 and len(timer) != skill.timer.shape[0]:
             raise InputError(f"saved with other randomisation or events of {name}")
-        if isinstance(changed, torch.Tensor) and changed.dim() == 1 and len(changed) != skill.changed.shape[0]:
+        if isinstance(changed, torch.Tensor) and changed.dim() == 1 and len(changed) != skill.params.changed.shape[0]:
             raise InputError(f"saved with other terms of {name}")
         if isinstance(changed, torch.Tensor) and bool((changed.isnan() | changed.isneginf()).any()):
             raise InputError(f"saved {name}/changed is not a number")
@@ -135,5 +135,5 @@ def _tensors(env: Stages) -> dict[str, torch.Tensor]:
     found |= {f"solver.{name}": array for name, array in env.sim.physics.carried().items()}
     for skill in env.skills:
         found |= {f"{skill.task.name}/{name}": getattr(skill.observations, name) for name in ("now", "final", "past")}
-        found |= {f"{skill.task.name}/timer": skill.timer, f"{skill.task.name}/changed": skill.changed}
+        found |= {f"{skill.task.name}/timer": skill.timer, f"{skill.task.name}/changed": skill.params.changed}
     return {name: wp.to_torch(array) for name, array in found.items() if isinstance(array, wp.array)}

@@ -22,7 +22,8 @@ MORE = 30
 """Policy steps from the end of the extension on, in which the apex has passed."""
 INNER = (0.6, 1.1)
 """[m] Heights that are told apart."""
-PUSH = "push"
+PUSHES = ("events.push.force_", "events.push.torque_")
+"""Beginnings of the names of numbers that pushes are drawn from."""
 
 
 def open_loop_action(step: int) -> float:
@@ -43,11 +44,10 @@ def open_loop_limits(env: Env, fresh: dict[str, Any]) -> np.ndarray:
     fresh: `env.state_dict()` before its first `evaluation_reset`.
     """
     env.load_state_dict(fresh)
-    skill = env.skills[0]
-    pushes = {f"{what}_{end}": 0.0 for what in ("force", "torque") for end in ("lower", "upper")}
-    drawn = [row.term.numbers for row in skill.task.rows["events"] if row.term.name == PUSH]
-    if drawn:
-        skill.set("events", PUSH, **pushes)
+    params = env.skills[0].task.params
+    pushes = {name: params.values[i] for name, i in params.names.items() if name.startswith(PUSHES)}
+    for name in pushes:
+        env.set(name, 0.0)
     env.evaluation_reset(jump_commands(np.zeros((env.num_envs, 3)), 0.0, env.step_dt))
     highest, broken = np.zeros(env.num_envs), np.zeros(env.num_envs, dtype=bool)
     for step in range(STAND + RAMP + HOLD + EXTEND + MORE):
@@ -57,8 +57,8 @@ def open_loop_limits(env: Env, fresh: dict[str, Any]) -> np.ndarray:
         broken |= env.worlds.broken.numpy() != 0
         if step >= STAND + RAMP + HOLD:
             highest = np.fmax(highest, arrays["base_pos"][:, 2])
-    if drawn:
-        skill.set("events", PUSH, **{name: drawn[0][name] for name in pushes})
+    for name, value in pushes.items():
+        env.set(name, value)
     return np.where(broken, np.nan, highest)
 
 

@@ -12,6 +12,7 @@ from jumper_warp.kernels.mdp.starts import APART
 from jumper_warp.kernels.mdp.terminations import came_apart
 from jumper_warp.robot.gravity import EARTH, check_gravity
 from jumper_warp.robot.motors import FilterCfg, MotorCfg
+from jumper_warp.tasks.params import TaskParams
 from jumper_warp.tasks.randomization import RandomizationCfg
 from jumper_warp.tasks.ranges import Pair
 from jumper_warp.tasks.terms import (
@@ -20,7 +21,6 @@ from jumper_warp.tasks.terms import (
     EventTerm,
     ObservationTerm,
     RewardTerm,
-    Row,
     StateMetric,
     Term,
     TerminationTerm,
@@ -116,8 +116,8 @@ class TaskCfg:
             names = [term.name for term in getattr(self, section)]
             if len(set(names)) < len(names):
                 raise InputError(f"every term of {self.name}'s {section} needs a name of its own, got {names}")
-        for section, rows in self.rows.items():
-            for term in (row.term for row in rows):
+        for section, slots in self.params.slots.items():
+            for term in (slot.term for slot in slots):
                 if term.of_state not in (Any, self.state):
                     wanted = f"is for {term.of_state.key}, not {self.state.key}"
                     raise InputError(f"{self.name} {section}: {term.name} {wanted}")
@@ -164,33 +164,12 @@ class TaskCfg:
                     raise InputError(f"{self.name} {where}: {what}, the task has {struct.key}")
 
     @functools.cached_property
-    def rows(self) -> dict[str, list[Row]]:
-        """All terms by section; their numbers follow each other in one array."""
-        rows: dict[str, list[Row]] = {}
-        first = 0
-        events = (*self.randomization.events(), *self.events)
+    def params(self) -> TaskParams:
+        """Numbers of all terms."""
         sections = {"advance": (self.advance,), "curriculum": (self.curriculum,), "rewards": self.rewards,
                     "terminations": self.terminations, "policy": self.policy, "critic": self.critic,
-                    "events": events}  # fmt: skip
-        for section, terms in sections.items():
-            rows[section] = []
-            for term in terms:
-                hi = first + len(term.numbers)
-                rows[section].append(Row(term.func, first, hi - term.num_params, hi, term.num_params == 0, term))
-                first = hi
-        return rows
-
-    @property
-    def numbers(self) -> list[float]:
-        """Values of all terms' numbers."""
-        return [float(x) for rows in self.rows.values() for row in rows for x in row.term.numbers.values()]
-
-    def place(self, section: str, name: str, key: str) -> int:
-        """Return where a number of a term lies in `numbers`. Raises ValueError if there is none."""
-        for row in self.rows.get(section, ()):
-            if row.term.name == name and key in row.term.numbers:
-                return row.first + list(row.term.numbers).index(key)
-        raise InputError(f"{self.name} has no {key!r} of a {section} term {name!r}")
+                    "events": (*self.randomization.events(), *self.events)}  # fmt: skip
+        return TaskParams(self.name, sections)
 
     def layout(self, group: str) -> dict[str, tuple[int, int]]:
         """Return the columns of an observation group, (first, end) by the name of the term."""

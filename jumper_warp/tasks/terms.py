@@ -9,7 +9,7 @@ from __future__ import annotations
 import inspect
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar, NamedTuple, get_type_hints
+from typing import Any, ClassVar, get_type_hints
 
 import warp as wp
 
@@ -235,18 +235,3 @@ class StateMetric:
     """Field of the task's state, float; all that are read are set to 0."""
     per: str | None = None
     """Field by whose sum over all worlds that of `field` is divided; None: its mean over all worlds, which stays."""
-
-
-class Row(NamedTuple):
-    """A term as the kernels see it: a function, and the places of its numbers in the task's array."""
-
-    func: Function
-    first: int
-    """Of the settings."""
-    lo: int
-    """Of the function's parameters."""
-    hi: int
-    plain: bool
-    """No parameters; Warp refuses an empty `*p[lo:lo]`."""
-    term: Any
-    """Of the kind of its section."""

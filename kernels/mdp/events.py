@@ -19,10 +19,9 @@ def steps_until(draw: Draw, least: float, most: float, step_dt: float) -> int:
     return wp.max(int(wp.round(between(draw, -1, least, most) / step_dt)), 1)
 
 
-def make_event_kernel(rows: list) -> wp.Kernel:
-    """Return the kernel of a task's events; rows: see `jumper_warp.tasks.terms.Row`."""
-    modes = [MODES[row.term.options["mode"]] for row in rows]
-    spread = [bool(row.term.options["spread"]) for row in rows]
+def make_event_kernel(slots: list) -> wp.Kernel:
+    """Return the kernel of a task's events; slots: see `jumper_warp.tasks.params.TermSlot`."""
+    modes = [MODES[slot.mode] for slot in slots]
 
     @wp.kernel(module="unique", module_options=FAST)
     def event_kernel(
@@ -51,10 +50,10 @@ def make_event_kernel(rows: list) -> wp.Kernel:
         world += env.first
         if env.skill[world] != skill or mask[world] == 0.0:
             return
-        for i in range(wp.static(len(rows))):
-            if row == i and (wp.static(spread[i]) or lane == 0):
+        for i in range(wp.static(len(slots))):
+            if row == i and (wp.static(bool(slots[i].spread)) or lane == 0):
                 draw = make_draw(env.seed, world, env.clock[world], EVENT + 100 * stage + i)
-                if wp.static(spread[i]):
+                if wp.static(bool(slots[i].spread)):
                     draw.lane = lane
                     draw.lanes = lanes
                 due = stage == wp.static(modes[i])
@@ -62,13 +61,13 @@ def make_event_kernel(rows: list) -> wp.Kernel:
                     left = timer[i, world] - 1
                     due = stage == wp.static(AT_RESET) or (stage == wp.static(AT_STEP) and left == 0)
                     if due or left < 0:
-                        left = steps_until(draw, p[wp.static(rows[i].first)], p[wp.static(rows[i].first + 1)], step_dt)
+                        left = steps_until(draw, p[wp.static(slots[i].least)], p[wp.static(slots[i].most)], step_dt)
                     if stage != wp.static(STARTUP):
                         timer[i, world] = left
                 if due:
-                    if wp.static(rows[i].plain):
-                        wp.static(rows[i].func)(robot, draw)
+                    if wp.static(slots[i].plain):
+                        wp.static(slots[i].func)(robot, draw)
                     else:
-                        wp.static(rows[i].func)(robot, draw, *p[wp.static(rows[i].lo) : wp.static(rows[i].hi)])
+                        wp.static(slots[i].func)(robot, draw, *p[wp.static(slots[i].lo) : wp.static(slots[i].hi)])
 
     return event_kernel

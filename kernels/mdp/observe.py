@@ -27,7 +27,9 @@ class Column:
     group: int
     start: int  # of the group's rows
     stride: int  # columns of the group
-    first: int  # of noise, scale and clip in the array of numbers
+    noise: int  # its index in the array of numbers, as those of scale and clip
+    scale: int
+    clip: int
     oldest: int  # column of its oldest frame
     width: int  # columns of a frame
     history: int  # number of frames
@@ -49,18 +51,20 @@ class ObservationArrays:
 
 @wp.func
 def load_column(columns: wp.array2d(dtype=int), component: int) -> Column:
-    """Return a component's row; columns: (fields, components), so that neighbouring threads read neighbours."""
+    """Return a component's row; columns: (fields of `Column`, components), so that neighbours read neighbours."""
     column = Column()
     column.raw = columns[0, component]
     column.group = columns[1, component]
     column.start = columns[2, component]
     column.stride = columns[3, component]
-    column.first = columns[4, component]
-    column.oldest = columns[5, component]
-    column.width = columns[6, component]
-    column.history = columns[7, component]
-    column.delayed = columns[8, component]
-    column.past = columns[9, component]
+    column.noise = columns[4, component]
+    column.scale = columns[5, component]
+    column.clip = columns[6, component]
+    column.oldest = columns[7, component]
+    column.width = columns[8, component]
+    column.history = columns[9, component]
+    column.delayed = columns[10, component]
+    column.past = columns[11, component]
     return column
 
 
@@ -79,11 +83,11 @@ def store(value: Any, row: int, world: int, out: wp.array2d(dtype=float)):  # no
 
 def make_observe_kernel(task: Any) -> wp.Kernel:
     """Return the kernel that evaluates all observation terms of a task."""
-    rows = [row for group in task.groups for row in task.rows[group]]
-    first = [next(iter(row.func.input_types.values())) for row in rows]
+    slots = [slot for group in task.groups for slot in task.params.slots[group]]
+    first = [next(iter(slot.func.input_types.values())) for slot in slots]
     of_parameters = [kind is RobotParameters for kind in first]
     of_ground = [kind is RobotArrays for kind in first]
-    places = [sum(row.term.width for row in rows[:i]) for i in range(len(rows))]
+    places = [sum(slot.term.width for slot in slots[:i]) for i in range(len(slots))]
 
     @wp.kernel(module="unique", module_options=FAST)
     def observe_kernel(
@@ -107,20 +111,20 @@ def make_observe_kernel(task: Any) -> wp.Kernel:
         world += env.first
         if env.skill[world] != skill or (beginning != 0 and env.fresh[world] == 0):
             return
-        for c in range(wp.static((len(rows) + CHUNK - 1) // CHUNK)):
+        for c in range(wp.static((len(slots) + CHUNK - 1) // CHUNK)):
             if chunk == c:
                 view = load_view(robot, ground, world)
-                for i in range(wp.static(c * CHUNK), wp.static(min((c + 1) * CHUNK, len(rows)))):
+                for i in range(wp.static(c * CHUNK), wp.static(min((c + 1) * CHUNK, len(slots)))):
                     if wp.static(of_parameters[i]):
-                        store(wp.static(rows[i].func)(parameters, world), wp.static(places[i]), world, raw)
+                        store(wp.static(slots[i].func)(parameters, world), wp.static(places[i]), world, raw)
                     elif wp.static(of_ground[i]):
-                        store(wp.static(rows[i].func)(robot, ground, world), wp.static(places[i]), world, raw)
-                    elif wp.static(rows[i].plain):
-                        store(wp.static(rows[i].func)(view, states[world]), wp.static(places[i]), world, raw)
+                        store(wp.static(slots[i].func)(robot, ground, world), wp.static(places[i]), world, raw)
+                    elif wp.static(slots[i].plain):
+                        store(wp.static(slots[i].func)(view, states[world]), wp.static(places[i]), world, raw)
                     else:
                         store(
-                            wp.static(rows[i].func)(
-                                view, states[world], *p[wp.static(rows[i].lo) : wp.static(rows[i].hi)]
+                            wp.static(slots[i].func)(
+                                view, states[world], *p[wp.static(slots[i].lo) : wp.static(slots[i].hi)]
                             ),
                             wp.static(places[i]),
                             world,
@@ -188,10 +192,10 @@ def condition(arrays: ObservationArrays, column: Column, p: wp.array(dtype=float
     value = or_zero(arrays.raw[column.raw, m.world], m.broken)
     if column.delayed != 0:
         value = late(arrays, m, column.past, value)
-    noise = p[column.first]
+    noise = p[column.noise]
     if noise > 0.0:
         value += noise * cut_gaussian(draw_at(m.draws, m.world, OBSERVATION + column.group), column.oldest)
-    value = or_zero(p[column.first + 1] * wp.clamp(value, -p[column.first + 2], p[column.first + 2]), m.broken)
+    value = or_zero(p[column.scale] * wp.clamp(value, -p[column.clip], p[column.clip]), m.broken)
     i = column.start + m.world * column.stride + column.oldest
     again = beginning != 0 and m.fresh == COMMANDED
     for _ in range(column.history - 1):

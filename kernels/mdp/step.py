@@ -49,13 +49,9 @@ def write_outcome(
 
 def make_step_kernel(task: Any) -> wp.Kernel:
     """Return the kernel that ends a policy step; task: see `jumper_warp.tasks.cfg.TaskCfg`."""
-    (advance,), endings, rewards = (task.rows[name] for name in ("advance", "terminations", "rewards"))
-    (curriculum,) = task.rows["curriculum"]
-    counts = task.curriculum.options["counts"]
-    time_outs = [bool(row.term.options["time_out"]) for row in endings]
-    successes = [bool(row.term.options["success"]) for row in endings]
-    once = [bool(row.term.options["once"]) for row in rewards]
-    broken_ending = [row.func for row in endings].index(came_apart)
+    (advance,), endings, rewards = (task.params.slots[name] for name in ("advance", "terminations", "rewards"))
+    (curriculum,) = task.params.slots["curriculum"]
+    broken_ending = [slot.func for slot in endings].index(came_apart)
     floor = task.reward_floor
 
     @wp.kernel(module="unique", module_options=FAST)
@@ -102,8 +98,8 @@ def make_step_kernel(task: Any) -> wp.Kernel:
                     )
                 if holds:
                     ending = i
-                    timeout = wp.where(wp.static(time_outs[i]), 1.0, 0.0)
-                    success = wp.static(successes[i])
+                    timeout = wp.where(wp.static(bool(endings[i].time_out)), 1.0, 0.0)
+                    success = wp.static(bool(endings[i].success))
 
         total = float(0.0)
         for i in range(wp.static(len(rewards))):
@@ -111,8 +107,8 @@ def make_step_kernel(task: Any) -> wp.Kernel:
                 raw = wp.static(rewards[i].func)(view, state)
             else:
                 raw = wp.static(rewards[i].func)(view, state, *p[wp.static(rewards[i].lo) : wp.static(rewards[i].hi)])
-            value = p[wp.static(rewards[i].first)] * raw
-            if wp.static(not once[i]):
+            value = p[wp.static(rewards[i].weight)] * raw
+            if wp.static(not rewards[i].once):
                 value = value * robot.step_dt
             if broken:
                 value = float(0.0)
@@ -128,9 +124,9 @@ def make_step_kernel(task: Any) -> wp.Kernel:
         states[world] = state
         if ending != NOT_ENDED:
             counters.ending_count[ending, world] = counters.ending_count[ending, world] + 1
-            if wp.static(counts)(state):
+            if wp.static(curriculum.counts)(state):
                 error = wp.static(curriculum.func)(view, state)
-                success = success and error <= p[wp.static(curriculum.first)]
-                count_episode(env, counters, world, success, error, p[wp.static(curriculum.first + 1)], num_levels)
+                success = success and error <= p[wp.static(curriculum.tolerance)]
+                count_episode(env, counters, world, success, error, p[wp.static(curriculum.promote_after)], num_levels)
 
     return step_kernel

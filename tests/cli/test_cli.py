@@ -183,8 +183,9 @@ def test_interrupt_exits_with_130(capsys, monkeypatch):
 # ---------------------------------------------------------------------- flags
 
 
-def flag_of(section, term, key):
-    """Flag of a number of a term."""
+def flag_of(name):
+    """Flag of a number of a term by its dotted name."""
+    section, term, key = name.split(".")
     middle = "" if section in ("advance", "curriculum") else f".{flag_name(term)}"
     return f"--env.{section}{middle}.{flag_name(key)}"
 
@@ -192,23 +193,21 @@ def flag_of(section, term, key):
 @pytest.mark.parametrize("name", ["vertical-jump", "horizontal-jump", "hold-height"])
 def test_every_number_of_every_term_has_a_flag_that_reaches_the_kernels(name):
     task = hold_height() if name == "hold-height" else make_task(name)
-    drawn = [term.name for term in task.randomization.events()]  # has flags of its own
+    drawn = tuple(f"events.{term.name}." for term in task.randomization.events())  # has flags of its own
     args, expected = [], {}
-    for section, rows in task.rows.items():
-        for term in (row.term for row in rows if section != "events" or row.term.name not in drawn):
-            for key, value in term.numbers.items():
-                changed = value if key == "most" else value + 1
-                args += [flag_of(section, term.name, key), str(changed)]
-                expected[section, term.name, key] = changed
-    changed_task = parsed(task, args)
-    for place, value in expected.items():
-        assert changed_task.numbers[changed_task.place(*place)] == value, place
+    for name, i in task.params.names.items():
+        if not name.startswith(drawn):
+            expected[name] = task.params.values[i] + (not name.endswith(".most"))
+            args += [flag_of(name), f"{expected[name]:.17g}"]
+    params = parsed(task, args).params
+    for name, value in expected.items():
+        assert params.values[params.index(name)] == value, name
     assert len(expected) > 40
 
 
 def parsed(task, args):
     """Task with the flags of a command line."""
-    return with_flags(task, parse_settings(task, TrainArgs(), args).env)
+    return parse_settings(task, TrainArgs(), args)[1]
 
 
 def leaves(value, path=""):
@@ -295,9 +294,9 @@ def test_flags_reach_the_arrays_that_kernels_read():
     _, task = parse_train(["vertical-jump", *flags.split()])
     env = Env(task, 2, device="cpu", randomize=False)
     skill = env.skills[0]
-    numbers = skill.numbers.numpy()
-    places = (("rewards", "jump_height", "weight"), ("terminations", "tilted", "angle"), ("policy", "lin_vel", "noise"))
-    assert [numbers[env.skills[0].task.place(*place)] for place in places] == pytest.approx([25.0, 0.4, 0.3])
+    numbers = skill.params.values.numpy()
+    names = ("rewards.jump_height.weight", "terminations.tilted.angle", "policy.lin_vel.noise")
+    assert [numbers[task.params.index(name)] for name in names] == pytest.approx([25.0, 0.4, 0.3])
     assert skill.settings.numpy()["states"]["tilt"][0] == pytest.approx(np.radians(9.0))
     assert skill.levels.numpy()["base_height"][0] == pytest.approx([0.3, 0.31])
     settings = skill.settings_of_skill()

@@ -253,11 +253,10 @@ def test_numbers_that_were_set_come_back_and_the_others_are_the_tasks():
     state = env.state_dict()
     other.skills[0].set("rewards", "jump_height", wide=0.9)
     other.load_state_dict(state)
-    numbers = other.skills[0].numbers.numpy()
-    task = other.skills[0].task
-    expected = np.array(task.numbers, dtype=np.float32)
+    numbers, params = other.skills[0].params.values.numpy(), other.skills[0].task.params
+    expected = np.array(params.values, dtype=np.float32)
     for key, value in (("weight", 7.0), ("fine", 0.2)):
-        expected[task.place("rewards", "jump_height", key)] = value
+        expected[params.index(f"rewards.jump_height.{key}")] = value
     np.testing.assert_array_equal(numbers, expected)
     state["vertical-jump/changed"][0] = np.nan
     with pytest.raises(ValueError, match="changed is not a number"):

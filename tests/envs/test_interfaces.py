@@ -312,7 +312,7 @@ def test_a_number_of_a_term_may_change_in_captured_steps():
     for _ in range(3):
         env.step(REST)
     before = env.skills[0].term_value.numpy().copy()
-    env.skills[0].set("rewards", "orientation", weight=2.0 * term.weight)
+    env.set("rewards.orientation.weight", 2.0 * term.weight)
     env.step(REST)
     np.testing.assert_allclose(env.skills[0].term_value.numpy()[index], 2.0 * before[index], rtol=1e-3)
     env.skills[0].set("terminations", "low_base", height=10.0)
@@ -321,19 +321,22 @@ def test_a_number_of_a_term_may_change_in_captured_steps():
 
 
 @pytest.mark.parametrize(
-    ("section", "name", "numbers", "message"),
+    ("name", "value", "message"),
     [
-        ("rewards", "orientation", {"weight": NAN}, "orientation: weight must be finite, got nan"),
-        ("rewards", "orientation", {"depth": 1.0}, "no 'depth' of a rewards term 'orientation'"),
-        ("rewards", "levitation", {"weight": 1.0}, "no 'weight' of a rewards term 'levitation'"),
-        ("prizes", "orientation", {"weight": 1.0}, "no 'weight' of a prizes term 'orientation'"),
+        ("rewards.orientation.weight", NAN, "rewards.orientation.weight must be finite, got nan"),
+        ("rewards.orientation.depth", 1.0, "no 'depth' of a rewards term 'orientation'"),
+        ("rewards.levitation.weight", 1.0, "no 'weight' of a rewards term 'levitation'"),
+        ("prizes.orientation.weight", 1.0, "no 'weight' of a prizes term 'orientation'"),
+        ("weight", 1.0, "names are like rewards.jump_height.weight"),
     ],
 )
-def test_a_number_that_is_none_is_refused(env, section, name, numbers, message):
-    before = env.skills[0].numbers.numpy().copy()
+def test_a_number_that_is_none_is_refused(env, name, value, message):
+    before = env.skills[0].params.values.numpy().copy()
     with pytest.raises(ValueError, match=message):
-        env.skills[0].set(section, name, **numbers)
-    np.testing.assert_array_equal(env.skills[0].numbers.numpy(), before)
+        env.set(name, value)
+    with pytest.raises(ValueError, match="skill must be an index below 1, got 1"):
+        env.set("rewards.orientation.weight", 1.0, skill=1)
+    np.testing.assert_array_equal(env.skills[0].params.values.numpy(), before)
 
 
 # ---------------------------------------------------------------- worlds that begin anew

@@ -58,7 +58,7 @@ def test_limits_are_of_the_very_robots_that_jumped_before():
     drawn, skill = read(env), env.skills[0]
     for _ in range(30):
         env.step(torch.zeros((8, 12)))
-    numbers = skill.numbers.numpy().copy()
+    numbers = skill.params.values.numpy().copy()
     limits = open_loop_limits(env, fresh)
     found = read(env)
     for name in drawn:
@@ -66,6 +66,6 @@ def test_limits_are_of_the_very_robots_that_jumped_before():
             assert not found[name].any()
         else:
             np.testing.assert_array_equal(found[name], drawn[name], err_msg=name)
-    np.testing.assert_array_equal(skill.numbers.numpy(), numbers)
+    np.testing.assert_array_equal(skill.params.values.numpy(), numbers)
     assert 0.75 < limits.min() < limits.max() - 0.05 < 1.3
     np.testing.assert_array_equal(open_loop_limits(env, fresh), limits)

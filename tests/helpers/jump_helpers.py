@@ -109,7 +109,7 @@ class Robots:
         """task: of jumping; what is drawn for a world is left out."""
         task = without_draws(task)
         self.skill, self.n = Skill(task, 0, n, STEP_DT, SUBSTEPS, "cpu"), n
-        self.numbers = {True: array(task.numbers), False: array(task.without_noise().numbers)}
+        self.numbers = {True: array(task.params.values), False: array(task.without_noise().params.values)}
         self.q, self.qd = np.zeros((n, 43)), np.zeros((n, 38))
         self.q[:, 2], self.q[:, 6], self.q[:, 7 + MOTOR_SLOTS] = 0.35, 1.0, DEFAULT_ANGLE
         self.com, self.action, self.offset = np.zeros(3), np.zeros((12, n)), np.zeros((12, n))

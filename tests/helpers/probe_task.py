@@ -245,13 +245,13 @@ class Probe:
     def step(self) -> None:
         """Launch the end of a step."""
         skill = self.skill
-        inputs = [skill.index, self.robot, self.ground, len(self.task.levels), skill.numbers, self.worlds, skill.states,
-                  skill.term_value, skill.counters]  # fmt: skip
+        inputs = [skill.index, self.robot, self.ground, len(self.task.levels), skill.params.values, self.worlds,
+                  skill.states, skill.term_value, skill.counters]  # fmt: skip
         wp.launch(skill.kernels["step"], self.n, inputs, device="cpu")
 
     def observe(self, beginning: int = 0) -> None:
         """Launch the observation."""
-        states, numbers = self.skill.states, self.skill.numbers
+        states, numbers = self.skill.states, self.skill.params.values
         observe(self.skill, self.robot, self.parameters, self.ground, self.worlds, states, numbers, beginning)
 
     def next_clock(self) -> None:

@@ -233,7 +233,7 @@ def test_mutated_task_is_a_task_or_refused_in_one_line_and_nothing_is_imported(n
             refused += 1
             assert len(str(error).splitlines()) == 1 and 0 < len(str(error)) < 500
             continue
-        assert isinstance(found, TaskCfg) and all(math.isfinite(number) for number in found.numbers)
+        assert isinstance(found, TaskCfg) and all(math.isfinite(number) for number in found.params.values)
         assert len(found.observation_names) < 10**6
         assert task_from_json(json.loads(json.dumps(task_to_json(found), allow_nan=False)), modules) == found
     assert set(sys.modules) == loaded and 40 < refused < 200

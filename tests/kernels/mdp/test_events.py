@@ -59,7 +59,8 @@ class Events(Probe):
     def run(self, stage, mask=1.0):
         """Launch the events of a stage where mask is not 0."""
         skill, mask = self.skill, array(np.broadcast_to(np.asarray(mask, dtype=float), N))
-        inputs = [skill.index, stage, 0, LANES, mask, STEP_DT, self.worlds, skill.numbers, skill.timer, self.parameters]
+        inputs = [skill.index, stage, 0, LANES, mask, STEP_DT, self.worlds, skill.params.values, skill.timer,
+                  self.parameters]  # fmt: skip
         wp.launch(skill.kernels["event"], (skill.num_events, LANES, N), inputs, device="cpu")
 
     def counted(self):
