@@ -154,12 +154,11 @@ def sysid(cfg: SysidCfg) -> None:
 
     cfg.noise.check()
     parameters = jumper_parameters(names(cfg.params)).without(names(cfg.without))
-    knowledge = [] if cfg.mass is None else [weighed(cfg.mass, cfg.mass_deviation)]
+    settings: dict[str, Any] = {name: getattr(cfg, name) for name in ("noise", "dt", "device", "threads")}
+    settings["knowledge"] = [] if cfg.mass is None else [weighed(cfg.mass, cfg.mass_deviation)]
     given = {name: getattr(cfg, name) for name in ("base", "gains", "torque_limit", "torque_constant")}
     motions = load_motions(cfg.data, **given)
     announce(cfg.device, cfg.threads)
-    settings: dict[str, Any] = {name: getattr(cfg, name) for name in ("noise", "dt", "device", "threads")}
-    settings["knowledge"] = knowledge
     if cfg.method == "cma":
         found = identify_by_evolution(motions, parameters, max_seconds=cfg.max_seconds, **settings)
     else:

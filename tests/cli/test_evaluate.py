@@ -54,7 +54,9 @@ def test_places_are_spread_ahead_and_drawn_aside_and_headings_too():
 
 
 def test_one_heading_is_that_of_all_in_radians():
-    assert PlaceFlags(2, (0.3, 0.4), (0.0, 0.0), 90.0).log(TASK, 0).headings == pytest.approx(0.5 * math.pi)
+    assert PlaceFlags(jumps=2, x=(0.3, 0.4), y=(0.0, 0.0), heading=90.0).log(TASK, 0).headings == pytest.approx(
+        0.5 * math.pi
+    )
 
 
 @pytest.mark.parametrize(
@@ -102,7 +104,7 @@ def test_policy_comes_first(command, args):
 
 def test_range_of_places_counts_distances():
     goals = [[0.3, 0.0], [0.0, -0.3], [0.6, 0.6]]
-    flags = PlaceFlags(3, (0.0, 0.0), (0.0, 0.0), 0.0, in_range=(0.3, 0.5))
+    flags = PlaceFlags(jumps=3, x=(0.0, 0.0), y=(0.0, 0.0), heading=0.0, in_range=(0.3, 0.5))
     landings = flags.log(TASK, 0)
     landings.places[:, 0] = goals
     landings.place[:, 0], landings.target[:, 0] = goals, goals
@@ -114,7 +116,7 @@ def test_range_of_places_counts_distances():
 
 
 def test_heights_are_spread_evenly():
-    assert HeightFlags(3, 0.6, 1.0).log(TASK, 0).commanded[:, 0] == pytest.approx([0.6, 0.8, 1.0])
+    assert HeightFlags(jumps=3, lower=0.6, upper=1.0).log(TASK, 0).commanded[:, 0] == pytest.approx([0.6, 0.8, 1.0])
 
 
 def test_csv_has_a_line_a_jump_and_nothing_where_there_is_no_number():
