@@ -20,7 +20,6 @@ from .start_states import (
     JumpStart,
     ResetRanges,
     draw_scheme,
-    time_spent,
     write_start,
 )
 from .state import FLIGHT, LANDED, STANCE, JumpState
@@ -148,19 +147,16 @@ def begin_next_jump(old: JumpState, ground: Ground, goal: wp.vec3, pos: wp.vec3,
 
 
 @wp.func
-def place_ground(
-    ground: Ground, world: int, draw: Draw, ranges: ResetRanges, grounds: GroundRanges, scheme: int,
-    heading: float, goal: wp.vec3,
-) -> Ground:  # fmt: skip
+def place_ground(ground: Ground, start: JumpStart, grounds: GroundRanges, draw: Draw) -> Ground:
     """Put the block of a world to its start, or draw another if blocks are drawn; returns the ground as it is there."""
     if grounds.platform + grounds.block > 0.0:
         block = Block()
-        if scheme == STANDING or scheme == DEFAULT:
-            block = draw_ground(draw, grounds, footprint(ranges, heading), goal)
-        ground.blocks[world] = block
+        if start.scheme == STANDING or start.scheme == DEFAULT:
+            block = draw_ground(draw, grounds, footprint(start.ranges, start.heading), start.goal)
+        ground.blocks[draw.world] = block
     else:
-        rest_block(ground, world)
-    return world_ground(ground, world)
+        rest_block(ground, draw.world)
+    return world_ground(ground, draw.world)
 
 
 @wp.func
@@ -171,24 +167,22 @@ def reset_jump(
     """Begin an episode at a stage of a jump, and return its state."""
     world = draw.world
     ranges = settings.states
-    spent = time_spent(old)
-    heading = between(draw, streams.HEADING, -ranges.heading, ranges.heading)
-    goal = turned(draw_goal(draw, level), heading)
+    spent = old.spent
+    spent[old.scheme] += float(old.steps)
     start = JumpStart()
     start.scheme = draw_scheme(draw, ranges, spent)
-    start.heading = heading
-    start.goal = goal
+    start.heading = between(draw, streams.HEADING, -ranges.heading, ranges.heading)
+    start.goal = turned(draw_goal(draw, level), start.heading)
     start.base_height = level.base_height
     start.ranges = ranges
     start.limits = leg_limits(skill.command_filter)
-    here = place_ground(scene.ground, world, draw, ranges, settings.grounds, start.scheme, heading, goal)
-    start.ground = here
+    start.ground = place_ground(scene.ground, start, settings.grounds, draw)
     scheme = write_start(robot, scene, start, draw)
-    pos = base_pos(robot, world)
-    task = begin_task(draw, ranges, scheme, goal, pos, robot.joint_qd[world * DOFS + 2], level.jump_again)
-    task.heading = heading
+    vz = robot.joint_qd[world * DOFS + 2]
+    task = begin_task(draw, ranges, scheme, start.goal, base_pos(robot, world), vz, level.jump_again)
+    task.heading = start.heading
     task.spent = spent
-    task.goal_ground = surface(here, goal[0], goal[1])[0]
+    task.goal_ground = surface(start.ground, start.goal[0], start.goal[1])[0]
     return task
 
 

@@ -1,9 +1,7 @@
 """Start states of a jump (paper, Section V-D: reference state initialisation), one function a scheme.
 
 Standing or squatting on given paw positions, the default pose, pushing off, in flight on a projectile to the goal, just
-before touchdown, and just landed. Joint angles come from the closed-form inverse kinematics and joint rates from the
-leg's Jacobian, so every state satisfies the loops. A sample whose paws cannot be reached within limits, whose links
-touch, or whose paws are below the ground is rejected; the default pose stands in after the last attempt.
+before touchdown, and just landed. The default pose stands in after the last attempt.
 
 A jump goes from above the origin to `goal`: x, y [m] of the landing and, for a vertical jump, the base height [m]
 wanted at the apex; where none is wanted, the takeoff angle is drawn.
@@ -24,7 +22,7 @@ from ..mdp.view import RobotArrays, turned
 from ..terrain.ground import Ground, surface
 from . import streams
 from .phase import time_to_height
-from .state import SCHEMES, JumpState, vec_schemes
+from .state import SCHEMES, vec_schemes
 
 wp.set_module_options({"enable_backward": False})
 
@@ -126,16 +124,6 @@ def most_lacking(shares: vec_schemes, spent: vec_schemes) -> int:
             scheme = i
             most = lack
     return scheme
-
-
-@wp.func
-def time_spent(old: JumpState) -> vec_schemes:
-    """Return how many policy steps [1] a world has spent in episodes of each scheme, an ended one included."""
-    spent = old.spent
-    for i in range(SCHEMES):
-        if i == old.scheme:
-            spent[i] += float(old.steps)
-    return spent
 
 
 @wp.func

@@ -1,7 +1,9 @@
 """Rejection sampling of start states: attempts in turn in one thread, or on a GPU by a warp, 8 attempts of 4 legs.
 
-On a GPU the 32 threads of a world differ in `Draw.lane` alone, and reach every exchange together (see `lanes`). Each
-thread writes to coordinates of its own until an attempt is accepted.
+Joint angles come from the closed-form inverse kinematics and joint rates from the leg's Jacobian, so that every state
+satisfies the loops. A sample whose paws cannot be reached within limits, or whose links touch what they must not, is
+rejected. On a GPU the 32 threads of a world differ in `Draw.lane` alone, and reach every exchange together (see
+`lanes`); each writes to coordinates of its own until one is accepted.
 """
 
 from typing import Any
@@ -17,7 +19,7 @@ from ..state import leg_coord, leg_dof, load_motors, store_motors
 from ..terrain.ground import Ground
 from .env import Scene
 from .random import Draw, branch
-from .starts import APART, LegSample, store_leg
+from .starts import APART, LegSample
 from .view import RobotArrays
 
 wp.set_module_options({"enable_backward": False})
@@ -29,13 +31,13 @@ LANES = 32
 
 @wp.func
 def first_leg(draw: Draw) -> int:
-    """Return the first leg that a thread draws."""
+    """Return the first leg that a thread samples."""
     return draw.lane % 4
 
 
 @wp.func
 def leg_step(draw: Draw) -> int:
-    """Return how many legs further a thread draws its next one."""
+    """Return how many legs further a thread samples its next one."""
     return wp.min(draw.lanes, 4)
 
 
@@ -48,21 +50,9 @@ def all_legs(draw: Draw, flag: bool) -> bool:
 
 
 @wp.func
-def taken_first(draw: Draw, attempt: int) -> int:
-    """Return the smallest attempt that was taken; attempt: that of the thread, `ATTEMPTS` if none was."""
-    if draw.lanes > 1:
-        return least_of_attempts(attempt)
-    return attempt
-
-
-@wp.func
-def of_leg(draw: Draw, v: vec3, leg: int) -> vec3:
-    """Return the vector of a leg; v: that of the thread's leg, or in a single thread of the leg asked for."""
-    if draw.lanes > 1:
-        return vec3(
-            from_leg_of_attempt(v[0], leg), from_leg_of_attempt(v[1], leg), from_leg_of_attempt(v[2], leg)
-        )  # fmt: skip
-    return v
+def vec_from_leg(v: vec3, leg: int) -> vec3:
+    """Return the vector of one leg of the attempt, in each of its four threads."""
+    return vec3(from_leg_of_attempt(v[0], leg), from_leg_of_attempt(v[1], leg), from_leg_of_attempt(v[2], leg))
 
 
 @wp.func
@@ -70,6 +60,13 @@ def meet_attempts(draw: Draw):
     """Wait for the threads of a world; each then sees what the others wrote."""
     if draw.lanes > 1:
         meet()
+
+
+@wp.func
+def store_leg(leg: int, sample: LegSample, joint_q: wp.array(dtype=float), joint_qd: wp.array(dtype=float)):
+    """Write a leg."""
+    store_motors(joint_q, leg_coord(0, leg), sample.angles)
+    store_motors(joint_qd, leg_dof(0, leg), sample.rates)
 
 
 @wp.func
@@ -87,8 +84,8 @@ def pose_is_valid(
     if draw.lanes > 1:
         other = LegSample()
         for leg in range(geometry.shape[0]):
-            other.angles = of_leg(draw, own.angles, leg)
-            other.rates = of_leg(draw, own.rates, leg)
+            other.angles = vec_from_leg(own.angles, leg)
+            other.rates = vec_from_leg(own.rates, leg)
             store_leg(leg, other, joint_q, joint_qd)
     flags = int(0)
     for turn in range(first_leg(draw), geometry.shape[0], leg_step(draw)):
@@ -127,7 +124,9 @@ def write_first_valid(
 
     accepted: attempt of this thread that was valid, `ATTEMPTS` if none was.
     """
-    first = taken_first(draw, accepted)
+    first = accepted
+    if draw.lanes > 1:
+        first = least_of_attempts(accepted)
     if accepted == first and first < ATTEMPTS and first_leg(draw) == 0:
         for i in range(7):
             joint_q[draw.world * COORDS + i] = own_q[i]

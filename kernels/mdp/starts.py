@@ -1,11 +1,10 @@
-"""Parts of start states that tasks share: a leg at or over a place, its storage, and places of the paws."""
+"""Parts of start states that tasks share: legs at or over a place, places of the paws, orientations."""
 
 import warp as wp
 
 from ..kinematics.geometry import LegGeometry
 from ..kinematics.inverse import LegLimits, clamped_closed_form
 from ..kinematics.leg import leg_forward_kinematics, leg_inverse_velocity
-from ..state import leg_coord, leg_dof, store_motors
 from .random import Draw, within
 
 wp.set_module_options({"enable_backward": False})
@@ -69,10 +68,3 @@ def turn_of(yaw: float, pitch: float, roll: float) -> wp.quat:
         * wp.quat_from_axis_angle(wp.vec3(0.0, 1.0, 0.0), pitch)
         * wp.quat_from_axis_angle(wp.vec3(1.0, 0.0, 0.0), roll)
     )
-
-
-@wp.func
-def store_leg(leg: int, sample: LegSample, joint_q: wp.array(dtype=float), joint_qd: wp.array(dtype=float)):
-    """Write a leg."""
-    store_motors(joint_q, leg_coord(0, leg), sample.angles)
-    store_motors(joint_qd, leg_dof(0, leg), sample.rates)

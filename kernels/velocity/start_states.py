@@ -1,8 +1,6 @@
 """Start states of velocity tracking: any pose of the base, any places of the paws, in motion, on any ground.
 
-Joint angles come from the closed-form inverse kinematics and joint rates from the leg's Jacobian, so that every state
-satisfies the loops. A sample whose paws cannot be reached within limits, or whose links touch what they must not, is
-rejected; the default pose stands in after the last attempt.
+The default pose stands in after the last attempt.
 """
 
 import warp as wp
