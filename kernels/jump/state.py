@@ -9,7 +9,7 @@ FLIGHT = wp.constant(1)
 LANDED = wp.constant(2)
 
 
-SCHEMES = wp.constant(6)  # ways in which an episode begins, see `reset_draws`
+SCHEMES = wp.constant(6)  # ways in which an episode begins, see `start_states`
 vec_schemes = wp.types.vector(length=6, dtype=wp.float32)
 
 

@@ -1,13 +1,26 @@
-"""Attempts at a draw of a robot's state: in turn in one thread, or on a GPU by a warp, 8 attempts of 4 legs each.
+"""Rejection sampling of start states: attempts in turn in one thread, or on a GPU by a warp, 8 attempts of 4 legs.
 
-On a GPU the 32 threads of a world differ in `Draw.lane` alone, and reach every exchange together (see `lanes`).
+Joint angles come from the closed-form inverse kinematics and joint rates from the leg's Jacobian, so that every state
+satisfies the loops. A sample whose paws cannot be reached within limits, or whose links touch what they must not, is
+rejected. On a GPU the 32 threads of a world differ in `Draw.lane` alone, and reach every exchange together (see
+`lanes`); each writes to coordinates of its own until one is accepted.
 """
+
+from typing import Any
 
 import warp as wp
 
+from ..collision.robot import leg_collisions
+from ..kinematics.geometry import LegGeometry
 from ..lanes import all_of_attempt, from_leg_of_attempt, least_of_attempts, meet
+from ..layout import COORDS, DOFS
 from ..scalar import vec3
-from .random import Draw
+from ..state import leg_coord, leg_dof, load_motors, store_motors
+from ..terrain.ground import Ground
+from .env import Scene
+from .random import Draw, branch
+from .starts import APART, LegSample
+from .view import RobotArrays
 
 wp.set_module_options({"enable_backward": False})
 
@@ -17,26 +30,14 @@ LANES = 32
 
 
 @wp.func
-def first_attempt(draw: Draw) -> int:
-    """Return the first attempt that a thread makes."""
-    return draw.lane // 4
-
-
-@wp.func
-def attempt_step(draw: Draw) -> int:
-    """Return how many attempts further a thread makes its next one."""
-    return wp.max(draw.lanes // 4, 1)
-
-
-@wp.func
 def first_leg(draw: Draw) -> int:
-    """Return the first leg that a thread draws."""
+    """Return the first leg that a thread samples."""
     return draw.lane % 4
 
 
 @wp.func
 def leg_step(draw: Draw) -> int:
-    """Return how many legs further a thread draws its next one."""
+    """Return how many legs further a thread samples its next one."""
     return wp.min(draw.lanes, 4)
 
 
@@ -49,21 +50,9 @@ def all_legs(draw: Draw, flag: bool) -> bool:
 
 
 @wp.func
-def taken_first(draw: Draw, attempt: int) -> int:
-    """Return the smallest attempt that was taken; attempt: that of the thread, `ATTEMPTS` if none was."""
-    if draw.lanes > 1:
-        return least_of_attempts(attempt)
-    return attempt
-
-
-@wp.func
-def of_leg(draw: Draw, v: vec3, leg: int) -> vec3:
-    """Return the vector of a leg; v: that of the thread's leg, or in a single thread of the leg asked for."""
-    if draw.lanes > 1:
-        return vec3(
-            from_leg_of_attempt(v[0], leg), from_leg_of_attempt(v[1], leg), from_leg_of_attempt(v[2], leg)
-        )  # fmt: skip
-    return v
+def vec_from_leg(v: vec3, leg: int) -> vec3:
+    """Return the vector of one leg of the attempt, in each of its four threads."""
+    return vec3(from_leg_of_attempt(v[0], leg), from_leg_of_attempt(v[1], leg), from_leg_of_attempt(v[2], leg))
 
 
 @wp.func
@@ -71,3 +60,101 @@ def meet_attempts(draw: Draw):
     """Wait for the threads of a world; each then sees what the others wrote."""
     if draw.lanes > 1:
         meet()
+
+
+@wp.func
+def store_leg(leg: int, sample: LegSample, joint_q: wp.array(dtype=float), joint_qd: wp.array(dtype=float)):
+    """Write a leg."""
+    store_motors(joint_q, leg_coord(0, leg), sample.angles)
+    store_motors(joint_qd, leg_dof(0, leg), sample.rates)
+
+
+@wp.func
+def pose_is_valid(
+    geometry: wp.array(dtype=LegGeometry), ground: Ground, draw: Draw, own: LegSample, reachable: bool,
+    joint_q: wp.array(dtype=float), joint_qd: wp.array(dtype=float),
+) -> bool:  # fmt: skip
+    """Return whether legs are reachable and touch nothing; completes the coordinates by the legs of other threads.
+
+    own: the leg that a thread has sampled, if it is one of several; reachable: whether its legs are.
+    """
+    all_reachable = all_legs(draw, reachable)
+    if draw.lanes == 1 and not all_reachable:
+        return False  # several threads go on together
+    if draw.lanes > 1:
+        other = LegSample()
+        for leg in range(geometry.shape[0]):
+            other.angles = vec_from_leg(own.angles, leg)
+            other.rates = vec_from_leg(own.rates, leg)
+            store_leg(leg, other, joint_q, joint_qd)
+    flags = int(0)
+    for turn in range(first_leg(draw), geometry.shape[0], leg_step(draw)):
+        flags = flags | leg_collisions(geometry, ground, joint_q, 0, turn, APART)
+    return all_legs(draw, all_reachable and flags == 0)
+
+
+@wp.func
+def write_sample_and_check(
+    sample_base: wp.Function, sample_leg: wp.Function, start: Any, robot: RobotArrays, scene: Scene, draw: Draw,
+    attempt: int, joint_q: wp.array(dtype=float), joint_qd: wp.array(dtype=float),
+) -> bool:  # fmt: skip
+    """Write the sample of an attempt to coordinates of one world, and return whether it is valid."""
+    base = sample_base(start, robot, draw, attempt)
+    for j in range(3):
+        joint_q[j] = base.pos[j]
+        joint_qd[j] = base.com_vel[j]
+        joint_qd[3 + j] = base.ang_vel[j]
+    for j in range(4):
+        joint_q[3 + j] = base.quat[j]
+    reachable = bool(True)
+    own = LegSample()
+    for leg in range(first_leg(draw), scene.geometry.shape[0], leg_step(draw)):
+        own = sample_leg(start, base, scene.geometry[leg], draw, leg)
+        reachable = reachable and own.reachable
+        store_leg(leg, own, joint_q, joint_qd)
+    return pose_is_valid(scene.geometry, start.ground, draw, own, reachable, joint_q, joint_qd)
+
+
+@wp.func
+def write_first_valid(
+    geometry: wp.array(dtype=LegGeometry), draw: Draw, accepted: int, own_q: wp.array(dtype=float),
+    own_qd: wp.array(dtype=float), joint_q: wp.array(dtype=float), joint_qd: wp.array(dtype=float),
+) -> bool:  # fmt: skip
+    """Write the first valid attempt to the coordinates of all worlds; returns whether there is one.
+
+    accepted: attempt of this thread that was valid, `ATTEMPTS` if none was.
+    """
+    first = accepted
+    if draw.lanes > 1:
+        first = least_of_attempts(accepted)
+    if accepted == first and first < ATTEMPTS and first_leg(draw) == 0:
+        for i in range(7):
+            joint_q[draw.world * COORDS + i] = own_q[i]
+        for i in range(6):
+            joint_qd[draw.world * DOFS + i] = own_qd[i]
+        for leg in range(geometry.shape[0]):
+            store_motors(joint_q, leg_coord(draw.world, leg), load_motors(own_q, leg_coord(0, leg)))
+            store_motors(joint_qd, leg_dof(draw.world, leg), load_motors(own_qd, leg_dof(0, leg)))
+    meet_attempts(draw)
+    return first < ATTEMPTS
+
+
+@wp.func
+def sample_valid_state(
+    sample_base: wp.Function, sample_leg: wp.Function, start: Any, robot: RobotArrays, scene: Scene, draw: Draw
+) -> bool:
+    """Sample states of a world until one is valid, and write it; returns whether one of the attempts was.
+
+    A task's `start_states` define how: start: struct of what all attempts share, with the `ground` of the world.
+    sample_base: (start, robot, draw, attempt) -> struct with pos [m], quat (xyzw), com_vel [m/s] and ang_vel [rad/s] of
+    the base, world axes. sample_leg: (start, base, geometry, draw, leg) -> `LegSample`.
+    """
+    own_q = wp.zeros(shape=(COORDS,), dtype=float)
+    own_qd = wp.zeros(shape=(DOFS,), dtype=float)
+    accepted = int(ATTEMPTS)
+    for attempt in range(draw.lane // 4, ATTEMPTS, wp.max(draw.lanes // 4, 1)):
+        if accepted == ATTEMPTS:
+            fresh = branch(draw, attempt)
+            if write_sample_and_check(sample_base, sample_leg, start, robot, scene, fresh, attempt, own_q, own_qd):
+                accepted = attempt
+    return write_first_valid(scene.geometry, draw, accepted, own_q, own_qd, robot.joint_q, robot.joint_qd)

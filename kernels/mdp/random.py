@@ -8,6 +8,10 @@ COMMAND = wp.constant(2)
 OBSERVATION = wp.constant(100)
 EVENT = wp.constant(1000)  # a hundred for each stage
 
+# numbers of a stream beside those of tasks and events
+INTERVAL = wp.constant(-1)  # until the next time of an event
+ANY_LEVEL = wp.constant(-2)  # of the curriculum, of a world past the last
+
 
 @wp.struct
 class Draw:

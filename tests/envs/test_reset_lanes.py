@@ -23,7 +23,7 @@ def reset_by(env, lanes):
     return env.sim.joint_q(), env.sim.joint_qd(), skill.states.numpy().copy()
 
 
-@pytest.mark.parametrize("name", ["velocity-rough", "horizontal-jump"])
+@pytest.mark.parametrize("name", ["velocity-rough", "horizontal-jump", "attitude"])
 def test_threads_of_a_world_find_what_one_finds(name, monkeypatch):
     env = Env(hardest(make_task(name)), N, seed=3, device="cpu", randomize=False, noise=False)
     env.reset()

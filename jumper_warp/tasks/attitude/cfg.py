@@ -8,7 +8,7 @@ from typing import Any
 import warp as wp
 
 from jumper_warp.kernels.attitude.commands import TurnRanges
-from jumper_warp.kernels.attitude.reset import AttitudeSettings
+from jumper_warp.kernels.attitude.start_states import AttitudeSettings
 from jumper_warp.tasks.ranges import Pair, check_ranges, filled
 from jumper_warp.utils.checks import check_positive, check_shares
 from jumper_warp.utils.errors import InputError

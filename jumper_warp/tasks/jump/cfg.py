@@ -12,7 +12,7 @@ import warp as wp
 
 from jumper_warp.kernels.jump.ground_draws import EVERY_SIDE, GroundRanges
 from jumper_warp.kernels.jump.reset import JumpLevel, JumpSettings
-from jumper_warp.kernels.jump.reset_draws import ResetRanges
+from jumper_warp.kernels.jump.start_states import ResetRanges
 from jumper_warp.kernels.jump.state import vec_schemes
 from jumper_warp.tasks.ranges import Pair, check_ranges, filled
 from jumper_warp.utils.checks import check_positive, check_shares

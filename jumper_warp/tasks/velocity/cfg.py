@@ -10,7 +10,7 @@ import newton
 import warp as wp
 
 from jumper_warp.kernels.velocity.commands import CommandRanges
-from jumper_warp.kernels.velocity.reset import Map, VelocitySettings
+from jumper_warp.kernels.velocity.start_states import Map, VelocitySettings
 from jumper_warp.robot.terrain import TerrainCfg, terrain_map
 from jumper_warp.tasks.ranges import Pair, check_ranges, filled
 from jumper_warp.utils.checks import check_finite, check_shares

@@ -1,0 +1,94 @@
+"""Start states of turning: afloat in any attitude, legs anywhere or in the default pose."""
+
+import warp as wp
+
+from ..kinematics.geometry import LegGeometry
+from ..kinematics.inverse import LegLimits
+from ..layout import BODIES
+from ..mdp.attempts import ATTEMPTS, sample_valid_state
+from ..mdp.env import Scene, SkillSettings
+from ..mdp.random import Draw, between, within
+from ..mdp.reset import leg_limits
+from ..mdp.starts import LegSample
+from ..mdp.view import RobotArrays
+from ..terrain.ground import Ground, surface, world_ground
+from . import streams
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.struct
+class AttitudeSettings:
+    """How episodes begin; pairs are (lower, upper)."""
+
+    episode_steps: wp.vec2  # policy steps that an episode lasts
+    height: float  # [m] of the base above the ground
+    default_share: float  # share of episodes that begin in the default pose
+    lateral: wp.vec2  # [rad] of drawn legs
+    transversal: wp.vec2  # [rad]
+    spin: float  # [rad/s] half width of the angular velocity about each axis
+
+
+@wp.struct
+class AttitudeStart:
+    """What all attempts at a start state share, the base included."""
+
+    pos: wp.vec3  # [m] of the base
+    quat: wp.quat  # xyzw, body to world
+    com_vel: wp.vec3  # [m/s] world axes
+    ang_vel: wp.vec3  # [rad/s] world axes
+    default_legs: bool  # whether the legs are in the default pose
+    default_angle: wp.array(dtype=float)  # [rad] of the motors
+    settings: AttitudeSettings
+    limits: LegLimits
+    ground: Ground
+
+
+@wp.func
+def sample_base(start: AttitudeStart, robot: RobotArrays, draw: Draw, attempt: int) -> AttitudeStart:
+    """Return the base, the same in every attempt; in the last one the legs are in the default pose."""
+    base = start
+    base.default_legs = start.default_legs or attempt == ATTEMPTS - 1
+    return base
+
+
+@wp.func
+def sample_leg(start: AttitudeStart, base: AttitudeStart, geo: LegGeometry, draw: Draw, leg: int) -> LegSample:
+    """Return a leg at rest; reachable if the sum of its transversal angles keeps its limits."""
+    found = LegSample()
+    if base.default_legs:
+        for j in range(3):
+            found.angles[j] = start.default_angle[3 * leg + j]
+        found.reachable = True
+        return found
+    found.angles = wp.vec3(
+        within(draw, streams.LATERAL + leg, start.settings.lateral),
+        within(draw, streams.OUTER + leg, start.settings.transversal),
+        within(draw, streams.INNER + leg, start.settings.transversal),
+    )
+    total = found.angles[1] + found.angles[2]
+    found.reachable = total > start.limits.sum_lower and total < start.limits.sum_upper
+    return found
+
+
+@wp.func
+def write_start(
+    robot: RobotArrays, scene: Scene, skill: SkillSettings, settings: AttitudeSettings, quat: wp.quat, draw: Draw
+):
+    """Write a start state with an orientation (xyzw) to a world."""
+    w = settings.spin
+    start = AttitudeStart()
+    start.ground = world_ground(scene.ground, draw.world)
+    start.pos = wp.vec3(0.0, 0.0, surface(start.ground, 0.0, 0.0)[0] + settings.height)
+    start.quat = quat
+    start.ang_vel = wp.vec3(
+        between(draw, streams.SPIN, -w, w),
+        between(draw, streams.SPIN + 1, -w, w),
+        between(draw, streams.SPIN + 2, -w, w),
+    )
+    start.com_vel = wp.cross(start.ang_vel, wp.quat_rotate(quat, robot.body_com[draw.world * BODIES]))
+    start.default_legs = between(draw, streams.DEFAULT_LEGS, 0.0, 1.0) < settings.default_share
+    start.default_angle = robot.default_angle
+    start.settings = settings
+    start.limits = leg_limits(skill.command_filter)
+    sample_valid_state(sample_base, sample_leg, start, robot, scene, draw)

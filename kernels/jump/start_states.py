@@ -1,0 +1,322 @@
+"""Start states of a jump (paper, Section V-D: reference state initialisation), one function a scheme.
+
+Standing or squatting on given paw positions, the default pose, pushing off, in flight on a projectile to the goal, just
+before touchdown, and just landed. The default pose stands in after the last attempt.
+
+A jump goes from above the origin to `goal`: x, y [m] of the landing and, for a vertical jump, the base height [m]
+wanted at the apex; where none is wanted, the takeoff angle is drawn.
+"""
+
+import warp as wp
+
+from ..kinematics.geometry import LegGeometry
+from ..kinematics.inverse import LegLimits
+from ..kinematics.leg import leg_forward_kinematics
+from ..layout import BODIES
+from ..mdp.attempts import sample_valid_state
+from ..mdp.env import Scene
+from ..mdp.random import Draw, between, within
+from ..mdp.reset import store_pose
+from ..mdp.starts import LegSample, leg_over_ground, leg_to, place_beside, turn_of
+from ..mdp.view import RobotArrays, turned
+from ..terrain.ground import Ground, surface
+from . import streams
+from .phase import time_to_height
+from .state import SCHEMES, vec_schemes
+
+wp.set_module_options({"enable_backward": False})
+
+STANDING = wp.constant(0)
+DEFAULT = wp.constant(1)
+IN_FLIGHT = wp.constant(2)
+TOUCHDOWN = wp.constant(3)
+AFTER_LANDING = wp.constant(4)
+PUSHING = wp.constant(5)
+
+
+@wp.struct
+class ResetRanges:
+    """Ranges of the drawn states; pairs are (lower, upper), angles [rad], lengths [m]."""
+
+    shares: vec_schemes  # of standing, default, in flight, touchdown, just landed, pushing off
+    of_time: int  # 1: shares are of the time that a world spends in episodes, 0: of its resets
+    base_xy: float  # half width
+    tilt: float  # half width of roll, pitch; of yaw too around the heading
+    forward_pitch: float  # largest mean pitch of standing states
+    lean: float  # base of the deepest squats behind the middle of the paws, at most; straight above it at the highest
+    heading: float  # half width of the heading
+    front_x: wp.vec2  # paw ahead of the base
+    front_y: wp.vec2  # paw beside the base, absolute
+    back_x: wp.vec2  # paw behind the base, absolute
+    back_y: wp.vec2
+    takeoff_height: wp.vec2
+    takeoff_ahead: wp.vec2  # base ahead of its start, towards the goal
+    takeoff_pitch: wp.vec2  # nose down, of states in flight and pushing off
+    push_length: wp.vec2  # of the way to the takeoff, straight along its velocity
+    push_acceleration: wp.vec2  # [m/s^2] along it
+    takeoff_angle: wp.vec2  # above the horizon, where no apex is wanted
+    highest_apex: float  # of jumps with a drawn angle
+    landing_height: float  # of the base, where the projectile ends
+    flight_time: wp.vec2  # share of the time in the air
+    flight_lateral: float  # half width
+    flight_transversal: wp.vec2
+    touchdown_time: wp.vec2  # [s] before landing
+    touchdown_behind: wp.vec2  # base behind the projectile, so that the paws are ahead of it
+    paw_depth: wp.vec2  # paws below the base before touchdown
+    landed_height: wp.vec2
+    landed_ahead: wp.vec2  # base ahead of the goal
+    landed_speed: wp.vec2  # [m/s] downward
+    command_delay: int  # most policy steps until the jump is commanded
+    long_wait_share: float  # of the draws in which it may be `long_wait`
+    long_wait: int
+    again_delay: wp.vec2  # policy steps after touchdown
+
+
+@wp.struct
+class JumpStart:
+    """What all attempts at a start state share."""
+
+    scheme: int
+    heading: float  # [rad] yaw
+    goal: wp.vec3  # [m] from the origin, world axes
+    base_height: wp.vec2  # [m] range of standing starts
+    ranges: ResetRanges
+    limits: LegLimits
+    ground: Ground
+
+
+@wp.struct
+class JumpBase:
+    """The base in an attempt, see `sample_valid_state`; paws are placed around `spot`."""
+
+    pos: wp.vec3
+    quat: wp.quat
+    com_vel: wp.vec3
+    ang_vel: wp.vec3
+    lin_vel: wp.vec3  # [m/s] of the origin, world axes
+    height: float  # [m] above the ground at the origin
+    spot: wp.vec3  # [m] on the ground, or below the projectile before touchdown
+
+
+@wp.func
+def scheme_of_shares(shares: vec_schemes, u: float) -> int:
+    """Return the scheme at u in [0, 1) of the shares one after the other."""
+    scheme = int(0)
+    rest = u
+    for i in range(SCHEMES):
+        if rest >= 0.0 and shares[i] > 0.0:
+            scheme = i
+        rest -= shares[i]
+    return scheme
+
+
+@wp.func
+def most_lacking(shares: vec_schemes, spent: vec_schemes) -> int:
+    """Return the scheme that is farthest behind its share of what was spent, in policy steps."""
+    total = float(0.0)
+    for i in range(SCHEMES):
+        total += spent[i]
+    scheme = int(0)
+    most = float(-3.0e38)
+    for i in range(SCHEMES):
+        lack = shares[i] * total - spent[i]
+        if shares[i] > 0.0 and lack > most:
+            scheme = i
+            most = lack
+    return scheme
+
+
+@wp.func
+def draw_scheme(draw: Draw, ranges: ResetRanges, spent: vec_schemes) -> int:
+    """Return the scheme of a new episode; shares of time are drawn once, and then what lacks most comes next."""
+    if ranges.of_time != 0 and wp.length_sq(spent) > 0.0:
+        return most_lacking(ranges.shares, spent)
+    return scheme_of_shares(ranges.shares, between(draw, streams.SCHEME, 0.0, 1.0))
+
+
+@wp.func
+def sample_quat(draw: Draw, ranges: ResetRanges, heading: float, pitch: float) -> wp.quat:
+    """Return an orientation (xyzw) around a heading and a pitch [rad]."""
+    yaw = heading + between(draw, streams.YAW, -ranges.tilt, ranges.tilt)
+    tip = pitch + between(draw, streams.PITCH, -ranges.tilt, ranges.tilt)
+    roll = between(draw, streams.ROLL, -ranges.tilt, ranges.tilt)
+    return turn_of(yaw, tip, roll)
+
+
+@wp.func
+def sample_offset(draw: Draw, ranges: ResetRanges) -> wp.vec3:
+    """Return a horizontal offset [m] of the base."""
+    x = between(draw, streams.OFFSET_X, -ranges.base_xy, ranges.base_xy)
+    return wp.vec3(x, between(draw, streams.OFFSET_Y, -ranges.base_xy, ranges.base_xy), 0.0)
+
+
+@wp.func
+def direction(start: JumpStart) -> wp.vec3:
+    """Return the horizontal unit vector towards the goal, along the heading for a jump on the spot."""
+    to_goal = wp.vec3(start.goal[0], start.goal[1], 0.0)
+    if wp.length(to_goal) > 1.0e-3:
+        return wp.normalize(to_goal)
+    return turned(wp.vec3(1.0, 0.0, 0.0), start.heading)
+
+
+@wp.func
+def standing(start: JumpStart, draw: Draw) -> JumpBase:
+    """Return a base at rest over paws around the origin; the deeper a squat, the farther it may lean back."""
+    ranges = start.ranges
+    lower = start.base_height[0]
+    upper = start.base_height[1]
+    height = within(draw, streams.HEIGHT, start.base_height)
+    tip = between(draw, streams.FORWARD_PITCH, 0.0, ranges.forward_pitch)
+    lean = (upper - height) / wp.max(upper - lower, 1.0e-6) * between(draw, streams.LEAN, 0.0, ranges.lean)
+    base = JumpBase()
+    base.quat = sample_quat(draw, ranges, start.heading, tip)
+    base.pos = sample_offset(draw, ranges) + wp.vec3(0.0, 0.0, height) - lean * direction(start)
+    return base
+
+
+@wp.func
+def just_landed(start: JumpStart, draw: Draw) -> JumpBase:
+    """Return a base that sinks over paws around the goal."""
+    ranges = start.ranges
+    base = JumpBase()
+    base.quat = sample_quat(draw, ranges, start.heading, 0.0)
+    base.spot = wp.vec3(start.goal[0], start.goal[1], 0.0)
+    ahead = within(draw, streams.LANDED_AHEAD, ranges.landed_ahead)
+    base.pos = sample_offset(draw, ranges) + base.spot + ahead * direction(start)
+    base.pos[2] = within(draw, streams.LANDED_HEIGHT, ranges.landed_height)
+    base.lin_vel = wp.vec3(0.0, 0.0, -within(draw, streams.LANDED_SPEED, ranges.landed_speed))
+    return base
+
+
+@wp.func
+def takeoff_speed(draw: Draw, ranges: ResetRanges, height: float, distance: float, apex: float, g: float) -> float:
+    """Return the upward speed [m/s] with which a jump over a distance [m] leaves a height [m]."""
+    if apex > 0.0:
+        return wp.sqrt(wp.max(2.0 * g * (apex - height), 0.0))
+    # height + v_z t - g t^2 / 2 = landing_height, where v_z t = distance tan(angle)
+    climb = distance * wp.tan(within(draw, streams.TAKEOFF_ANGLE, ranges.takeoff_angle))
+    t = wp.sqrt(wp.max(2.0 * (height - ranges.landing_height + climb) / g, 1.0e-6))
+    limit = wp.sqrt(wp.max(2.0 * g * (ranges.highest_apex - height), 0.0))
+    return wp.min(climb / t, limit)
+
+
+@wp.func
+def in_flight(start: JumpStart, draw: Draw, g: float) -> JumpBase:
+    """Return a base on the projectile to the goal; of other schemes, shortly before its end or at the takeoff."""
+    ranges = start.ranges
+    along = direction(start)
+    height = within(draw, streams.TAKEOFF_HEIGHT, ranges.takeoff_height)
+    way = wp.length(wp.vec3(start.goal[0], start.goal[1], 0.0))
+    ahead = wp.min(within(draw, streams.TAKEOFF_AHEAD, ranges.takeoff_ahead), way)
+    distance = way - ahead
+    up = takeoff_speed(draw, ranges, height, distance, start.goal[2], g)
+    duration = wp.max(time_to_height(height, up, ranges.landing_height, g), 1.0e-3)
+    forward = distance / duration
+    t = duration * within(draw, streams.FLIGHT_TIME, ranges.flight_time)
+    if start.scheme == TOUCHDOWN:
+        t = wp.max(duration - within(draw, streams.TOUCHDOWN_TIME, ranges.touchdown_time), 0.0)
+    if start.scheme == PUSHING:
+        t = float(0.0)
+    rise = wp.vec3(0.0, 0.0, height + up * t - 0.5 * g * t * t)
+    base = JumpBase()
+    base.quat = sample_quat(draw, ranges, start.heading, within(draw, streams.TAKEOFF_PITCH, ranges.takeoff_pitch))
+    base.pos = sample_offset(draw, ranges) + (ahead + forward * t) * along + rise
+    base.lin_vel = forward * along + wp.vec3(0.0, 0.0, up - g * t)
+    return base
+
+
+@wp.func
+def before_touchdown(start: JumpStart, draw: Draw, g: float) -> JumpBase:
+    """Return a base shortly before it lands, behind the spot that its paws surround."""
+    base = in_flight(start, draw, g)
+    base.spot = wp.vec3(base.pos[0], base.pos[1], 0.0)
+    base.pos = base.pos - within(draw, streams.TOUCHDOWN_BEHIND, start.ranges.touchdown_behind) * direction(start)
+    return base
+
+
+@wp.func
+def pushing_off(start: JumpStart, draw: Draw, g: float) -> JumpBase:
+    """Return a base before a takeoff, over paws around the start: on a straight line, evenly accelerated."""
+    ranges = start.ranges
+    base = in_flight(start, draw, g)
+    back = within(draw, streams.PUSH_LENGTH, ranges.push_length)
+    speed = wp.length(base.lin_vel)
+    before = speed * speed - 2.0 * back * within(draw, streams.PUSH_ACCELERATION, ranges.push_acceleration)
+    way = wp.normalize(base.lin_vel)
+    base.pos = base.pos - back * way
+    base.lin_vel = wp.sqrt(wp.max(before, 0.0)) * way
+    return base
+
+
+@wp.func
+def sample_base(start: JumpStart, robot: RobotArrays, draw: Draw, attempt: int) -> JumpBase:
+    """Return the base of the start's scheme in an attempt."""
+    g = -robot.gravity[draw.world][2]
+    base = JumpBase()
+    if start.scheme == STANDING:
+        base = standing(start, draw)
+    elif start.scheme == AFTER_LANDING:
+        base = just_landed(start, draw)
+    elif start.scheme == IN_FLIGHT:
+        base = in_flight(start, draw, g)
+    elif start.scheme == TOUCHDOWN:
+        base = before_touchdown(start, draw, g)
+    elif start.scheme == PUSHING:
+        base = pushing_off(start, draw, g)
+    base.com_vel = base.lin_vel + wp.cross(base.ang_vel, wp.quat_rotate(base.quat, robot.body_com[draw.world * BODIES]))
+    base.height = base.pos[2]
+    base.pos = base.pos + wp.vec3(0.0, 0.0, surface(start.ground, 0.0, 0.0)[0])
+    return base
+
+
+@wp.func
+def leg_in_flight(ranges: ResetRanges, base: JumpBase, geo: LegGeometry, draw: Draw, leg: int) -> LegSample:
+    """Return a leg in flight, its paw above the ground: both thighs about alike, all legs about alike."""
+    lower = ranges.flight_transversal[0]
+    upper = ranges.flight_transversal[1]
+    middle = within(draw, streams.FLIGHT_TRANSVERSAL, ranges.flight_transversal)
+    lateral = between(draw, streams.FLIGHT_LATERAL, -ranges.flight_lateral, ranges.flight_lateral)
+    angles = wp.vec3(
+        lateral + between(draw, streams.LEG_LATERAL + leg, -0.03, 0.03),
+        wp.clamp(middle + between(draw, streams.LEG_OUTER + leg, -0.1, 0.1), lower, upper),
+        wp.clamp(middle + between(draw, streams.LEG_INNER + leg, -0.1, 0.1), lower, upper),
+    )
+    found = LegSample()
+    found.angles = angles
+    ankle = leg_forward_kinematics(geo, angles[0], angles[1], angles[2])
+    found.reachable = base.height + wp.quat_rotate(base.quat, ankle)[2] >= geo.paw_radius + 0.01
+    return found
+
+
+@wp.func
+def sample_leg(start: JumpStart, base: JumpBase, geo: LegGeometry, draw: Draw, leg: int) -> LegSample:
+    """Return a leg of an attempt: in flight, or by its paw's place on the ground, above it before touchdown."""
+    ranges = start.ranges
+    if start.scheme == IN_FLIGHT:
+        return leg_in_flight(ranges, base, geo, draw, leg)
+    beside = place_beside(draw, leg, ranges.front_x, ranges.front_y, ranges.back_x, ranges.back_y)
+    spot = base.spot + turned(beside, start.heading)
+    paw = spot - base.pos
+    if start.scheme == TOUCHDOWN:
+        # paws hang below the base, a little above the ground at least
+        depth = within(draw, streams.PAW_DEPTH, ranges.paw_depth)
+        paw[2] = -wp.min(depth, base.height - geo.paw_radius - 0.025)
+    else:
+        lift = surface(start.ground, 0.0, 0.0)[0]
+        paw[2] = surface(start.ground, spot[0], spot[1])[0] + geo.paw_radius - base.height - lift
+    found = leg_to(geo, start.limits, wp.quat_rotate_inv(base.quat, paw))
+    if start.scheme == AFTER_LANDING or start.scheme == PUSHING:
+        # the paw rests on the ground while the base moves, so the joints move too
+        moving = base.lin_vel + wp.cross(base.ang_vel, paw)
+        found = leg_over_ground(geo, found, -wp.quat_rotate_inv(base.quat, moving))
+    return found
+
+
+@wp.func
+def write_start(robot: RobotArrays, scene: Scene, start: JumpStart, draw: Draw) -> int:
+    """Write a start state to a world, and return its scheme: `DEFAULT` where no attempt was valid too."""
+    if start.scheme != DEFAULT:
+        if sample_valid_state(sample_base, sample_leg, start, robot, scene, draw):
+            return start.scheme
+    store_pose(robot, scene, draw.world, start.heading, surface(start.ground, 0.0, 0.0)[0])
+    return DEFAULT

@@ -1,0 +1,155 @@
+"""Start states of velocity tracking: any pose of the base, any places of the paws, in motion, on any ground.
+
+The default pose stands in after the last attempt.
+"""
+
+import warp as wp
+
+from ..kinematics.geometry import LegGeometry
+from ..kinematics.inverse import LegLimits
+from ..layout import BODIES, COORDS
+from ..mdp.attempts import sample_valid_state
+from ..mdp.env import Scene, SkillSettings
+from ..mdp.random import Draw, between, within
+from ..mdp.reset import leg_limits, store_pose
+from ..mdp.starts import LegSample, leg_over_ground, leg_to, place_beside, turn_of
+from ..mdp.view import RobotArrays, turned
+from ..terrain.ground import Ground, surface, world_ground
+from . import streams
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.struct
+class Map:
+    """A map of square tiles around the origin: harder ones with growing x, of another kind with growing y."""
+
+    rows: int  # along x, 0: no map
+    cols: int  # along y
+    tile: float  # [m] edge of a tile
+
+
+@wp.struct
+class VelocitySettings:
+    """How episodes begin; pairs are (lower, upper)."""
+
+    map: Map
+    episode_steps: int  # policy steps that an episode lasts
+    pace: float  # cycles of the gait in a policy step, 0: no clock
+    default_share: float  # share of episodes that begin in the default pose at rest
+    base_xy: float  # [m] half width
+    height: wp.vec2  # [m] of the base above the ground
+    tilt: float  # [rad] half width of roll and pitch
+    heading: float  # [rad] half width
+    front_x: wp.vec2  # [m] paws relative to the base
+    front_y: wp.vec2
+    back_x: wp.vec2
+    back_y: wp.vec2
+    lift: float  # [m] most of the paws in the air
+    lifted_share: float  # share of paws in the air
+    lin_vel: float  # [m/s] half width of the base's velocity along each axis
+    ang_vel: float  # [rad/s] half width of its angular velocity about each axis
+    tolerance: float  # [m/s] mean error up to which an episode is a success
+
+
+@wp.struct
+class VelocityStart:
+    """What all attempts at a start state share."""
+
+    spot: wp.vec2  # [m] of the ground that the base is around
+    heading: float  # [rad]
+    settings: VelocitySettings
+    limits: LegLimits
+    ground: Ground
+
+
+@wp.struct
+class VelocityBase:
+    """The base in an attempt, see `sample_valid_state`."""
+
+    pos: wp.vec3
+    quat: wp.quat
+    com_vel: wp.vec3
+    ang_vel: wp.vec3
+    lin_vel: wp.vec3  # [m/s] of the origin, world axes
+    body_rate: wp.vec3  # [rad/s] angular velocity, body axes
+
+
+@wp.func
+def draw_spot(draw: Draw, map: Map, level: int) -> wp.vec2:
+    """Return the middle of a tile [m] of a level, of any level past the last; the origin without a map."""
+    if map.rows == 0:
+        return wp.vec2(0.0)
+    row = level
+    if row >= map.rows:
+        row = wp.min(int(between(draw, streams.ROW, 0.0, float(map.rows))), map.rows - 1)
+    col = wp.min(int(between(draw, streams.COL, 0.0, float(map.cols))), map.cols - 1)
+    return wp.vec2(
+        map.tile * (float(row) + 0.5 - 0.5 * float(map.rows)), map.tile * (float(col) + 0.5 - 0.5 * float(map.cols))
+    )
+
+
+@wp.func
+def sample_base(start: VelocityStart, robot: RobotArrays, draw: Draw, attempt: int) -> VelocityBase:
+    """Return a base in motion around the start's spot."""
+    settings = start.settings
+    v = settings.lin_vel
+    w = settings.ang_vel
+    roll = between(draw, streams.ROLL, -settings.tilt, settings.tilt)
+    pitch = between(draw, streams.PITCH, -settings.tilt, settings.tilt)
+    x = start.spot[0] + between(draw, streams.OFFSET_X, -settings.base_xy, settings.base_xy)
+    y = start.spot[1] + between(draw, streams.OFFSET_Y, -settings.base_xy, settings.base_xy)
+    base = VelocityBase()
+    base.quat = turn_of(start.heading, pitch, roll)
+    base.pos = wp.vec3(x, y, surface(start.ground, x, y)[0] + within(draw, streams.HEIGHT, settings.height))
+    base.lin_vel = wp.vec3(
+        between(draw, streams.LIN_VEL, -v, v),
+        between(draw, streams.LIN_VEL + 1, -v, v),
+        0.3 * between(draw, streams.LIN_VEL + 2, -v, v),
+    )
+    base.body_rate = wp.vec3(
+        between(draw, streams.ANG_VEL, -w, w),
+        between(draw, streams.ANG_VEL + 1, -w, w),
+        between(draw, streams.ANG_VEL + 2, -w, w),
+    )
+    base.ang_vel = wp.quat_rotate(base.quat, base.body_rate)
+    base.com_vel = base.lin_vel + wp.cross(base.ang_vel, wp.quat_rotate(base.quat, robot.body_com[draw.world * BODIES]))
+    return base
+
+
+@wp.func
+def sample_leg(start: VelocityStart, base: VelocityBase, geo: LegGeometry, draw: Draw, leg: int) -> LegSample:
+    """Return a leg; its paw rests on the ground, or is in the air in a share of draws."""
+    settings = start.settings
+    beside = place_beside(draw, leg, settings.front_x, settings.front_y, settings.back_x, settings.back_y)
+    paw = base.pos + turned(beside, start.heading)
+    lifted = between(draw, streams.LIFTED + leg, 0.0, 1.0) < settings.lifted_share
+    up = float(0.0)
+    if lifted:
+        up = between(draw, streams.LIFT + leg, 0.01, settings.lift)
+    paw[2] = surface(start.ground, paw[0], paw[1])[0] + geo.paw_radius + up
+    ankle = wp.quat_rotate_inv(base.quat, paw - base.pos)
+    found = leg_to(geo, start.limits, ankle)
+    if lifted:
+        return found
+    return leg_over_ground(geo, found, -wp.quat_rotate_inv(base.quat, base.lin_vel) - wp.cross(base.body_rate, ankle))
+
+
+@wp.func
+def write_start(
+    robot: RobotArrays, scene: Scene, skill: SkillSettings, settings: VelocitySettings, terrain_level: int, draw: Draw
+):
+    """Write a start state to a world: a sampled one, or in a share of draws the default pose."""
+    world = draw.world
+    start = VelocityStart()
+    start.spot = draw_spot(draw, settings.map, terrain_level)
+    start.heading = between(draw, streams.HEADING, -settings.heading, settings.heading)
+    start.settings = settings
+    start.limits = leg_limits(skill.command_filter)
+    start.ground = world_ground(scene.ground, world)
+    if between(draw, streams.DEFAULT_POSE, 0.0, 1.0) >= settings.default_share:
+        if sample_valid_state(sample_base, sample_leg, start, robot, scene, draw):
+            return
+    store_pose(robot, scene, world, start.heading, surface(start.ground, start.spot[0], start.spot[1])[0])
+    robot.joint_q[world * COORDS] = start.spot[0]
+    robot.joint_q[world * COORDS + 1] = start.spot[1]
