@@ -3,7 +3,7 @@ import pytest
 import torch
 
 from jumper_warp.envs.vec_env import sanitise
-from jumper_warp.rl.networks import ActorCritic, RunningMoments, gaussian_kl, gaussian_log_prob, own_moments
+from jumper_warp.rl.networks import ActorCritic, Moments, RunningMoments, gaussian_kl, gaussian_log_prob
 
 
 def test_log_density_and_divergence_equal_torch():
@@ -25,22 +25,22 @@ def test_moments_equal_numpy_over_all_batches():
     everything = np.concatenate(batches).astype(float)
     np.testing.assert_allclose(moments.mean, everything.mean(0), rtol=1e-6)
     np.testing.assert_allclose(moments.var, everything.var(0), rtol=1e-5)
-    scaled = moments.normalise(torch.from_numpy(batches[1]))
+    scaled = moments.scaling().normalise(torch.from_numpy(batches[1]))
     np.testing.assert_allclose(scaled, (batches[1] - everything.mean(0)) / np.sqrt(everything.var(0) + 1e-5), atol=1e-4)
-    np.testing.assert_allclose(moments.restore(scaled), batches[1], rtol=1e-5)
+    np.testing.assert_allclose(moments.scaling().restore(scaled), batches[1], rtol=1e-5)
 
 
 @pytest.mark.parametrize("rows", [None, 1, 64, 200, 1000])
 def test_moments_of_a_batch_do_not_depend_on_the_rows_at_a_time(rows):
     batch = np.random.default_rng(0).normal(50.0, (1.0, 5.0), (200, 2)).astype(np.float32)
-    mean, var = own_moments(torch.from_numpy(batch), rows)
+    mean, var, _ = Moments.of(torch.from_numpy(batch), rows)
     np.testing.assert_allclose(mean, batch.astype(float).mean(0), rtol=1e-6)
     np.testing.assert_allclose(var, batch.astype(float).var(0), rtol=1e-5)
 
 
 def test_moments_start_as_identity():
     x = torch.tensor([[3.0, -4.0]])
-    torch.testing.assert_close(RunningMoments((2,)).normalise(x), x, rtol=1e-6, atol=0.0)
+    torch.testing.assert_close(RunningMoments((2,)).scaling().normalise(x), x, rtol=1e-6, atol=0.0)
 
 
 def test_actions_are_clipped_means():
