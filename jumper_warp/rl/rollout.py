@@ -23,17 +23,15 @@ class RolloutBuffer(NamedTuple):
     final_critic_obs: torch.Tensor
     """(num_steps, num_envs, num_critic_obs) after the step, before a reset."""
     action: torch.Tensor
-    """(num_steps, num_envs, num_actions)"""
     mean: torch.Tensor
-    """(num_steps, num_envs, num_actions) of the policy."""
+    """(num_steps, num_envs, num_actions) of the policy, like the action."""
     log_std: torch.Tensor
     """(num_actions,) of the policy, the same in all steps."""
     reward: torch.Tensor
     """(num_steps, num_envs) times `PpoCfg.reward_scale`."""
     done: torch.Tensor
-    """(num_steps, num_envs) 1 where the episode ended."""
     timeout: torch.Tensor
-    """(num_steps, num_envs) 1 where it was cut off."""
+    """(num_steps, num_envs) 1 where the episode was cut off; done: where it ended, cut off or not."""
 
     def at(self, step: int) -> RolloutBuffer:
         """Return views of one step."""

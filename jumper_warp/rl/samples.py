@@ -56,9 +56,8 @@ class Estimates(NamedTuple):
     value: torch.Tensor
     """(batch,) the critic's output [standard deviations of the return]."""
     advantage: torch.Tensor
-    """(batch,) [scaled reward]"""
     target: torch.Tensor
-    """(batch,) returns [scaled reward]."""
+    """(batch,) returns, like the advantage in scaled rewards."""
     moments: RolloutMoments
     """Over this rank's samples."""
 
