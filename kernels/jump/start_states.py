@@ -94,7 +94,8 @@ class JumpBase:
     com_vel: wp.vec3
     ang_vel: wp.vec3
     lin_vel: wp.vec3  # [m/s] of the origin, world axes
-    height: float  # [m] above the ground at the origin
+    ground_height: float  # [m] at the origin
+    height: float  # [m] above it
     spot: wp.vec3  # [m] on the ground, or below the projectile before touchdown
 
 
@@ -202,7 +203,7 @@ def takeoff_speed(draw: Draw, ranges: ResetRanges, height: float, distance: floa
 
 @wp.func
 def in_flight(start: JumpStart, draw: Draw, g: float) -> JumpBase:
-    """Return a base on the projectile to the goal; of other schemes, shortly before its end or at the takeoff."""
+    """Return a base on the projectile to the goal: anywhere, shortly before touchdown, or for a push at the takeoff."""
     ranges = start.ranges
     along = direction(start)
     height = within(draw, streams.TAKEOFF_HEIGHT, ranges.takeoff_height)
@@ -226,24 +227,23 @@ def in_flight(start: JumpStart, draw: Draw, g: float) -> JumpBase:
 
 
 @wp.func
-def before_touchdown(start: JumpStart, draw: Draw, g: float) -> JumpBase:
-    """Return a base shortly before it lands, behind the spot that its paws surround."""
-    base = in_flight(start, draw, g)
-    base.spot = wp.vec3(base.pos[0], base.pos[1], 0.0)
-    base.pos = base.pos - within(draw, streams.TOUCHDOWN_BEHIND, start.ranges.touchdown_behind) * direction(start)
+def before_touchdown(start: JumpStart, flight: JumpBase, draw: Draw) -> JumpBase:
+    """Return a base in flight moved behind the spot that its paws surround."""
+    base = flight
+    base.spot = wp.vec3(flight.pos[0], flight.pos[1], 0.0)
+    base.pos = flight.pos - within(draw, streams.TOUCHDOWN_BEHIND, start.ranges.touchdown_behind) * direction(start)
     return base
 
 
 @wp.func
-def pushing_off(start: JumpStart, draw: Draw, g: float) -> JumpBase:
-    """Return a base before a takeoff, over paws around the start: on a straight line, evenly accelerated."""
-    ranges = start.ranges
-    base = in_flight(start, draw, g)
-    back = within(draw, streams.PUSH_LENGTH, ranges.push_length)
-    speed = wp.length(base.lin_vel)
-    before = speed * speed - 2.0 * back * within(draw, streams.PUSH_ACCELERATION, ranges.push_acceleration)
-    way = wp.normalize(base.lin_vel)
-    base.pos = base.pos - back * way
+def pushing_off(start: JumpStart, takeoff: JumpBase, draw: Draw) -> JumpBase:
+    """Return a base before its takeoff, over paws around the start: on a straight line, evenly accelerated."""
+    base = takeoff
+    back = within(draw, streams.PUSH_LENGTH, start.ranges.push_length)
+    speed = wp.length(takeoff.lin_vel)
+    before = speed * speed - 2.0 * back * within(draw, streams.PUSH_ACCELERATION, start.ranges.push_acceleration)
+    way = wp.normalize(takeoff.lin_vel)
+    base.pos = takeoff.pos - back * way
     base.lin_vel = wp.sqrt(wp.max(before, 0.0)) * way
     return base
 
@@ -251,21 +251,21 @@ def pushing_off(start: JumpStart, draw: Draw, g: float) -> JumpBase:
 @wp.func
 def sample_base(start: JumpStart, robot: RobotArrays, draw: Draw, attempt: int) -> JumpBase:
     """Return the base of the start's scheme in an attempt."""
-    g = -robot.gravity[draw.world][2]
     base = JumpBase()
     if start.scheme == STANDING:
         base = standing(start, draw)
     elif start.scheme == AFTER_LANDING:
         base = just_landed(start, draw)
-    elif start.scheme == IN_FLIGHT:
-        base = in_flight(start, draw, g)
-    elif start.scheme == TOUCHDOWN:
-        base = before_touchdown(start, draw, g)
-    elif start.scheme == PUSHING:
-        base = pushing_off(start, draw, g)
+    else:
+        base = in_flight(start, draw, -robot.gravity[draw.world][2])
+        if start.scheme == TOUCHDOWN:
+            base = before_touchdown(start, base, draw)
+        if start.scheme == PUSHING:
+            base = pushing_off(start, base, draw)
     base.com_vel = base.lin_vel + wp.cross(base.ang_vel, wp.quat_rotate(base.quat, robot.body_com[draw.world * BODIES]))
     base.height = base.pos[2]
-    base.pos = base.pos + wp.vec3(0.0, 0.0, surface(start.ground, 0.0, 0.0)[0])
+    base.ground_height = surface(start.ground, 0.0, 0.0)[0]
+    base.pos = base.pos + wp.vec3(0.0, 0.0, base.ground_height)
     return base
 
 
@@ -302,8 +302,8 @@ def sample_leg(start: JumpStart, base: JumpBase, geo: LegGeometry, draw: Draw, l
         depth = within(draw, streams.PAW_DEPTH, ranges.paw_depth)
         paw[2] = -wp.min(depth, base.height - geo.paw_radius - 0.025)
     else:
-        lift = surface(start.ground, 0.0, 0.0)[0]
-        paw[2] = surface(start.ground, spot[0], spot[1])[0] + geo.paw_radius - base.height - lift
+        below = surface(start.ground, spot[0], spot[1])[0]
+        paw[2] = below + geo.paw_radius - base.height - base.ground_height
     found = leg_to(geo, start.limits, wp.quat_rotate_inv(base.quat, paw))
     if start.scheme == AFTER_LANDING or start.scheme == PUSHING:
         # the paw rests on the ground while the base moves, so the joints move too
