@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Callable
 from typing import Any
@@ -51,12 +52,21 @@ class Compiler:
 
 
 def _options() -> dict[str, str | int | bool | Callable[..., Any]] | None:
-    """Return options of Inductor: it may not choose by time between kernels that add up in another order."""
+    """Return options of Inductor: it may not choose by time between kernels that add up in another order.
+
+    With ATEN_CPU_CAPABILITY=avx2 vectors have 256 bits: PyTorch 2.13 would compile AVX-512 code against AVX2 headers,
+    and crash.
+    """
     if BACKEND != "inductor":
         return None
     from torch._inductor import config
 
-    return {"deterministic": True} if hasattr(config, "deterministic") else {}
+    options: dict[str, str | int | bool | Callable[..., Any]] = {}
+    if hasattr(config, "deterministic"):
+        options["deterministic"] = True
+    if os.environ.get("ATEN_CPU_CAPABILITY") == "avx2":
+        options["cpp.simdlen"] = 256
+    return options
 
 
 def _reason(error: Exception) -> str:
