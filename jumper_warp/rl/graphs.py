@@ -54,8 +54,7 @@ class Compiler:
 def _options() -> dict[str, str | int | bool | Callable[..., Any]] | None:
     """Return options of Inductor: it may not choose by time between kernels that add up in another order.
 
-    With ATEN_CPU_CAPABILITY=avx2 vectors have 256 bits: PyTorch 2.13 would compile AVX-512 code against AVX2 headers,
-    and crash.
+    ATEN_CPU_CAPABILITY limits its vectors too: PyTorch 2.13 would compile AVX-512 code against headers of the limit.
     """
     if BACKEND != "inductor":
         return None
@@ -64,8 +63,9 @@ def _options() -> dict[str, str | int | bool | Callable[..., Any]] | None:
     options: dict[str, str | int | bool | Callable[..., Any]] = {}
     if hasattr(config, "deterministic"):
         options["deterministic"] = True
-    if os.environ.get("ATEN_CPU_CAPABILITY") == "avx2":
-        options["cpp.simdlen"] = 256
+    simdlen = {"avx2": 256, "default": 1}.get(os.environ.get("ATEN_CPU_CAPABILITY", ""))
+    if simdlen is not None:
+        options["cpp.simdlen"] = simdlen
     return options
 
 
