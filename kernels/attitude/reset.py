@@ -17,7 +17,7 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.func
 def reset_attitude(
-    robot: RobotArrays, scene: Scene, skill: SkillSettings, old: AttitudeState, settings: AttitudeSettings,
+    arrays: RobotArrays, scene: Scene, skill: SkillSettings, old: AttitudeState, settings: AttitudeSettings,
     level: TurnRanges, draw: Draw,
 ) -> AttitudeState:  # fmt: skip
     """Begin an episode with a drawn turn, and return its state."""
@@ -25,6 +25,6 @@ def reset_attitude(
     rest_block(scene.ground, draw.world)
     quat = draw_unit_quat(branch(draw, streams.ORIENTATION_BRANCH))
     meet_attempts(draw)
-    write_start(robot, scene, skill, settings, quat, draw)
+    write_start(arrays, scene, skill, settings, quat, draw)
     new.episode_steps = wp.max(int(within(draw, streams.EPISODE_STEPS, settings.episode_steps) + 0.5), 1)
     return with_goal(new, quat, quat * draw_turn(branch(draw, streams.TURN_BRANCH), level))

@@ -45,7 +45,7 @@ class AttitudeStart:
 
 
 @wp.func
-def sample_base(start: AttitudeStart, robot: RobotArrays, draw: Draw, attempt: int) -> AttitudeStart:
+def sample_base(start: AttitudeStart, arrays: RobotArrays, draw: Draw, attempt: int) -> AttitudeStart:
     """Return the base, the same in every attempt; in the last one the legs are in the default pose."""
     base = start
     base.default_legs = start.default_legs or attempt == ATTEMPTS - 1
@@ -73,7 +73,7 @@ def sample_leg(start: AttitudeStart, base: AttitudeStart, geo: LegGeometry, draw
 
 @wp.func
 def write_start(
-    robot: RobotArrays, scene: Scene, skill: SkillSettings, settings: AttitudeSettings, quat: wp.quat, draw: Draw
+    arrays: RobotArrays, scene: Scene, skill: SkillSettings, settings: AttitudeSettings, quat: wp.quat, draw: Draw
 ):
     """Write a start state with an orientation (xyzw) to a world."""
     w = settings.spin
@@ -86,9 +86,9 @@ def write_start(
         between(draw, streams.SPIN + 1, -w, w),
         between(draw, streams.SPIN + 2, -w, w),
     )
-    start.com_vel = wp.cross(start.ang_vel, wp.quat_rotate(quat, robot.body_com[draw.world * BODIES]))
+    start.com_vel = wp.cross(start.ang_vel, wp.quat_rotate(quat, arrays.body_com[draw.world * BODIES]))
     start.default_legs = between(draw, streams.DEFAULT_LEGS, 0.0, 1.0) < settings.default_share
-    start.default_angle = robot.default_angle
+    start.default_angle = arrays.default_angle
     start.settings = settings
     start.limits = leg_limits(skill.command_filter)
-    sample_valid_state(sample_base, sample_leg, start, robot, scene, draw)
+    sample_valid_state(sample_base, sample_leg, start, arrays, scene, draw)

@@ -95,14 +95,14 @@ def edges_of_block(block: Block, from_x: float, from_y: float, heading: float) -
 
 
 @wp.func
-def block_ahead(robot: RobotArrays, ground: Ground, world: int) -> vec7:
+def block_ahead(arrays: RobotArrays, ground: Ground, world: int) -> vec7:
     """What the block ahead is like: where it begins and ends [m] ahead of the base, and its height above the floor [m].
 
     Along three rays in the base's heading, 0.2 m to its left, through it and to its right; 2 m where there is none.
     """
     block = world_ground(ground, world).block
-    pos = base_pos(robot, world)
-    heading = yaw_of(base_quat(robot, world))
+    pos = base_pos(arrays, world)
+    heading = yaw_of(base_quat(arrays, world))
     seen = vec7()
     for i in range(3):
         aside = turned(wp.vec3(0.0, 0.2 * float(1 - i), 0.0), heading)

@@ -161,7 +161,7 @@ def place_ground(ground: Ground, start: JumpStart, grounds: GroundRanges, draw: 
 
 @wp.func
 def reset_jump(
-    robot: RobotArrays, scene: Scene, skill: SkillSettings, old: JumpState, settings: JumpSettings, level: JumpLevel,
+    arrays: RobotArrays, scene: Scene, skill: SkillSettings, old: JumpState, settings: JumpSettings, level: JumpLevel,
     draw: Draw,
 ) -> JumpState:  # fmt: skip
     """Begin an episode at a stage of a jump, and return its state."""
@@ -177,9 +177,9 @@ def reset_jump(
     start.ranges = ranges
     start.limits = leg_limits(skill.command_filter)
     start.ground = place_ground(scene.ground, start, settings.grounds, draw)
-    scheme = write_start(robot, scene, start, draw)
-    vz = robot.joint_qd[world * DOFS + 2]
-    task = begin_task(draw, ranges, scheme, start.goal, base_pos(robot, world), vz, level.jump_again)
+    scheme = write_start(arrays, scene, start, draw)
+    vz = arrays.joint_qd[world * DOFS + 2]
+    task = begin_task(draw, ranges, scheme, start.goal, base_pos(arrays, world), vz, level.jump_again)
     task.heading = start.heading
     task.spent = spent
     task.goal_ground = surface(start.ground, start.goal[0], start.goal[1])[0]

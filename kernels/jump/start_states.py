@@ -249,7 +249,7 @@ def pushing_off(start: JumpStart, takeoff: JumpBase, draw: Draw) -> JumpBase:
 
 
 @wp.func
-def sample_base(start: JumpStart, robot: RobotArrays, draw: Draw, attempt: int) -> JumpBase:
+def sample_base(start: JumpStart, arrays: RobotArrays, draw: Draw, attempt: int) -> JumpBase:
     """Return the base of the start's scheme in an attempt."""
     base = JumpBase()
     if start.scheme == STANDING:
@@ -257,12 +257,14 @@ def sample_base(start: JumpStart, robot: RobotArrays, draw: Draw, attempt: int) 
     elif start.scheme == AFTER_LANDING:
         base = just_landed(start, draw)
     else:
-        base = in_flight(start, draw, -robot.gravity[draw.world][2])
+        base = in_flight(start, draw, -arrays.gravity[draw.world][2])
         if start.scheme == TOUCHDOWN:
             base = before_touchdown(start, base, draw)
         if start.scheme == PUSHING:
             base = pushing_off(start, base, draw)
-    base.com_vel = base.lin_vel + wp.cross(base.ang_vel, wp.quat_rotate(base.quat, robot.body_com[draw.world * BODIES]))
+    base.com_vel = base.lin_vel + wp.cross(
+        base.ang_vel, wp.quat_rotate(base.quat, arrays.body_com[draw.world * BODIES])
+    )
     base.height = base.pos[2]
     base.ground_height = surface(start.ground, 0.0, 0.0)[0]
     base.pos = base.pos + wp.vec3(0.0, 0.0, base.ground_height)
@@ -313,10 +315,10 @@ def sample_leg(start: JumpStart, base: JumpBase, geo: LegGeometry, draw: Draw, l
 
 
 @wp.func
-def write_start(robot: RobotArrays, scene: Scene, start: JumpStart, draw: Draw) -> int:
+def write_start(arrays: RobotArrays, scene: Scene, start: JumpStart, draw: Draw) -> int:
     """Write a start state to a world, and return its scheme: `DEFAULT` where no attempt was valid too."""
     if start.scheme != DEFAULT:
-        if sample_valid_state(sample_base, sample_leg, start, robot, scene, draw):
+        if sample_valid_state(sample_base, sample_leg, start, arrays, scene, draw):
             return start.scheme
-    store_pose(robot, scene, draw.world, start.heading, surface(start.ground, 0.0, 0.0)[0])
+    store_pose(arrays, scene, draw.world, start.heading, surface(start.ground, 0.0, 0.0)[0])
     return DEFAULT

@@ -11,17 +11,17 @@ wp.set_module_options({"enable_backward": False})
 
 
 @wp.func
-def remember(robot: RobotArrays, push: wp.array(dtype=wp.spatial_vector), push_in_flight: int, world: int):
+def remember(arrays: RobotArrays, push: wp.array(dtype=wp.spatial_vector), push_in_flight: int, world: int):
     """Begin a world's policy step: keep the base's velocity, apply its push."""
-    robot.old_lin_vel[world] = base_velocity(robot, world, base_quat(robot, world))
+    arrays.old_lin_vel[world] = base_velocity(arrays, world, base_quat(arrays, world))
     pushed = push_in_flight
     for k in range(4):
-        if robot.contact_time[k, world] > 0.0:
+        if arrays.contact_time[k, world] > 0.0:
             pushed = int(1)
     wrench = wp.spatial_vector()
     if pushed != 0:
         wrench = push[world]
-    robot.body_f[world * BODIES] = wrench
+    arrays.body_f[world * BODIES] = wrench
 
 
 @wp.func
@@ -41,7 +41,7 @@ def action_kernel(
     skills: wp.array(dtype=SkillSettings),
     push: wp.array(dtype=wp.spatial_vector),
     # in, out
-    robot: RobotArrays,
+    arrays: RobotArrays,
     env: EnvArrays,
     delays: Delays,
 ):
@@ -54,8 +54,8 @@ def action_kernel(
     skill = skills[env.skill[world]]
     q = world * COORDS + 7 + 5 * leg
     d = world * DOFS + 6 + 5 * leg
-    angles = wp.vec3(robot.joint_q[q], robot.joint_q[q + 1], robot.joint_q[q + 3])
-    rates = wp.vec3(robot.joint_qd[d], robot.joint_qd[d + 1], robot.joint_qd[d + 3])
+    angles = wp.vec3(arrays.joint_q[q], arrays.joint_q[q + 1], arrays.joint_q[q + 3])
+    rates = wp.vec3(arrays.joint_qd[d], arrays.joint_qd[d + 1], arrays.joint_qd[d + 3])
     target = wp.vec3(0.0)
     for j in range(3):
         m = 3 * leg + j
@@ -64,20 +64,20 @@ def action_kernel(
             asked = 0.0
             env.bad_action[world] = 1
         action = wp.clamp(asked, -1.0, 1.0)
-        robot.older_action[m, world] = robot.old_action[m, world]
-        robot.old_action[m, world] = robot.action[m, world]
-        robot.action[m, world] = action
-        robot.old_rate[m, world] = rates[j]
-        robot.old_torque[m, world] = robot.torque[m, world]
-        angles[j] = angles[j] + robot.joint_offset[m, world]
-        target[j] = action * skill.action_scale[m] + robot.default_angle[m]
+        arrays.older_action[m, world] = arrays.old_action[m, world]
+        arrays.old_action[m, world] = arrays.action[m, world]
+        arrays.action[m, world] = action
+        arrays.old_rate[m, world] = rates[j]
+        arrays.old_torque[m, world] = arrays.torque[m, world]
+        angles[j] = angles[j] + arrays.joint_offset[m, world]
+        target[j] = action * skill.action_scale[m] + arrays.default_angle[m]
     safe = filter_leg(target, angles, rates, skill.command_filter)
     clock = env.clock[world]
     for j in range(3):
         m = 3 * leg + j
-        robot.target[m, world] = target[j]
-        robot.safe_target[m, world] = safe[j]
+        arrays.target[m, world] = target[j]
+        arrays.safe_target[m, world] = safe[j]
         delays.past_target[clock % RING, m, world] = safe[j]
         delayed(delays, clock, world, m)
     if leg == 0:
-        remember(robot, push, skill.push_in_flight, world)
+        remember(arrays, push, skill.push_in_flight, world)

@@ -95,11 +95,11 @@ def pose_is_valid(
 
 @wp.func
 def write_sample_and_check(
-    sample_base: wp.Function, sample_leg: wp.Function, start: Any, robot: RobotArrays, scene: Scene, draw: Draw,
+    sample_base: wp.Function, sample_leg: wp.Function, start: Any, arrays: RobotArrays, scene: Scene, draw: Draw,
     attempt: int, joint_q: wp.array(dtype=float), joint_qd: wp.array(dtype=float),
 ) -> bool:  # fmt: skip
     """Write the sample of an attempt to coordinates of one world, and return whether it is valid."""
-    base = sample_base(start, robot, draw, attempt)
+    base = sample_base(start, arrays, draw, attempt)
     for j in range(3):
         joint_q[j] = base.pos[j]
         joint_qd[j] = base.com_vel[j]
@@ -141,7 +141,7 @@ def write_first_valid(
 
 @wp.func
 def sample_valid_state(
-    sample_base: wp.Function, sample_leg: wp.Function, start: Any, robot: RobotArrays, scene: Scene, draw: Draw
+    sample_base: wp.Function, sample_leg: wp.Function, start: Any, arrays: RobotArrays, scene: Scene, draw: Draw
 ) -> bool:
     """Sample states of a world until one is valid, and write it; returns whether one of the attempts was.
 
@@ -155,6 +155,6 @@ def sample_valid_state(
     for attempt in range(draw.lane // 4, ATTEMPTS, wp.max(draw.lanes // 4, 1)):
         if accepted == ATTEMPTS:
             fresh = branch(draw, attempt)
-            if write_sample_and_check(sample_base, sample_leg, start, robot, scene, fresh, attempt, own_q, own_qd):
+            if write_sample_and_check(sample_base, sample_leg, start, arrays, scene, fresh, attempt, own_q, own_qd):
                 accepted = attempt
-    return write_first_valid(scene.geometry, draw, accepted, own_q, own_qd, robot.joint_q, robot.joint_qd)
+    return write_first_valid(scene.geometry, draw, accepted, own_q, own_qd, arrays.joint_q, arrays.joint_qd)

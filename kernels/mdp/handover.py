@@ -15,7 +15,7 @@ NONE = wp.constant(-1)
 
 @wp.func
 def hand_over(
-    robot: RobotArrays, parameters: RobotParameters, env: EnvArrays, skills: wp.array(dtype=SkillSettings),
+    arrays: RobotArrays, parameters: RobotParameters, env: EnvArrays, skills: wp.array(dtype=SkillSettings),
     world: int, target: int,
 ):  # fmt: skip
     """Make another skill the active one: its motors from now on, and as last action the one that holds the targets."""
@@ -24,11 +24,11 @@ def hand_over(
     env.told[world] = 0
     env.fresh[world] = BEGUN
     for m in range(12):
-        off = robot.safe_target[m, world] - robot.default_angle[m]
+        off = arrays.safe_target[m, world] - arrays.default_angle[m]
         action = wp.clamp(off / skills[target].action_scale[m], -1.0, 1.0)
-        robot.action[m, world] = action
-        robot.old_action[m, world] = action
-        robot.older_action[m, world] = action
+        arrays.action[m, world] = action
+        arrays.old_action[m, world] = action
+        arrays.older_action[m, world] = action
         set_motor(parameters, world, m)
 
 
@@ -65,7 +65,7 @@ def make_handover_kernel(handover: Any) -> wp.Kernel:
         skills: wp.array(dtype=SkillSettings),
         moved: wp.array(dtype=int),
         # in, out
-        robot: RobotArrays,
+        arrays: RobotArrays,
         parameters: RobotParameters,
         env: EnvArrays,
         sources: wp.array(dtype=handover.source.state),
@@ -78,14 +78,14 @@ def make_handover_kernel(handover: Any) -> wp.Kernel:
         world = env.first + wp.tid()
         if env.skill[world] != source or env.done[world] != 0.0 or moved[world] != 0:
             return
-        view = load_view(robot, scene.ground, world)
+        view = load_view(arrays, scene.ground, world)
         if wp.static(when)(view, sources[world], env.request[world] == target):
             begun = wp.static(begin)(view, sources[world])
             if env.request[world] == target and env.told[world] != 0:
                 targets[world] = wp.static(give)(view, scene, begun, env.wanted[world], yaw_of(view.quat))
             else:
                 targets[world] = begun
-            hand_over(robot, parameters, env, skills, world, target)
+            hand_over(arrays, parameters, env, skills, world, target)
             moved[world] = 1
 
     return handover_kernel

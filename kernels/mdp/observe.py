@@ -93,7 +93,7 @@ def make_observe_kernel(task: Any) -> wp.Kernel:
     def observe_kernel(
         # in
         skill: int,
-        robot: RobotArrays,
+        arrays: RobotArrays,
         parameters: RobotParameters,
         ground: Ground,
         env: EnvArrays,
@@ -113,12 +113,12 @@ def make_observe_kernel(task: Any) -> wp.Kernel:
             return
         for c in range(wp.static((len(slots) + CHUNK - 1) // CHUNK)):
             if chunk == c:
-                view = load_view(robot, ground, world)
+                view = load_view(arrays, ground, world)
                 for i in range(wp.static(c * CHUNK), wp.static(min((c + 1) * CHUNK, len(slots)))):
                     if wp.static(of_parameters[i]):
                         store(wp.static(slots[i].func)(parameters, world), wp.static(places[i]), world, raw)
                     elif wp.static(of_ground[i]):
-                        store(wp.static(slots[i].func)(robot, ground, world), wp.static(places[i]), world, raw)
+                        store(wp.static(slots[i].func)(arrays, ground, world), wp.static(places[i]), world, raw)
                     elif wp.static(slots[i].plain):
                         store(wp.static(slots[i].func)(view, states[world]), wp.static(places[i]), world, raw)
                     else:

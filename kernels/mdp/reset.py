@@ -46,7 +46,7 @@ def make_reset_kernel(task: Any) -> wp.Kernel:
         # in, out
         env: EnvArrays,
         states: wp.array(dtype=task.state),
-        robot: RobotArrays,
+        arrays: RobotArrays,
     ):
         """Begin a new episode where mask is not 0, else a new command where it is due; launch over (worlds, lanes).
 
@@ -70,7 +70,7 @@ def make_reset_kernel(task: Any) -> wp.Kernel:
             level = wp.min(int(between(draw, ANY_LEVEL, 0.0, float(levels.shape[0]))), levels.shape[0] - 1)
         if begins:
             old = before_reset(states[world], env.done[world])
-            state = wp.static(reset)(robot, scene, skills[skill], old, settings[0], levels[level], draw)
+            state = wp.static(reset)(arrays, scene, skills[skill], old, settings[0], levels[level], draw)
             meet_attempts(draw)
             if lane == 0:
                 states[world] = state
@@ -78,7 +78,7 @@ def make_reset_kernel(task: Any) -> wp.Kernel:
                 env.broken[world] = 0
         elif wp.static(command is not None):
             if lane == 0:
-                view = load_view(robot, scene.ground, world)
+                view = load_view(arrays, scene.ground, world)
                 fresh = make_draw(env.seed, world, env.clock[world], COMMAND)
                 states[world] = wp.static(command)(view, scene, states[world], levels[level], fresh)
                 env.fresh[world] = COMMANDED
@@ -99,7 +99,7 @@ def make_give_kernel(task: Any) -> wp.Kernel:
         values: wp.array(dtype=wp.vec4),
         headings: wp.array(dtype=float),
         scene: Scene,
-        robot: RobotArrays,
+        arrays: RobotArrays,
         # in, out
         env: EnvArrays,
         states: wp.array(dtype=task.state),
@@ -111,7 +111,7 @@ def make_give_kernel(task: Any) -> wp.Kernel:
         world = wp.tid()
         if env.skill[world] != skill or mask[world] == 0.0:
             return
-        view = load_view(robot, scene.ground, world)
+        view = load_view(arrays, scene.ground, world)
         if begins != 0:
             fresh = task.state()
             states[world] = wp.static(give)(view, scene, fresh, values[world], headings[world])
@@ -139,17 +139,17 @@ def leg_limits(params: FilterParams) -> LegLimits:
 
 
 @wp.func
-def store_pose(robot: RobotArrays, scene: Scene, world: int, heading: float, lift: float):
+def store_pose(arrays: RobotArrays, scene: Scene, world: int, heading: float, lift: float):
     """Write the model's reference pose at rest, turned to a heading [rad] and lifted [m]."""
     q = world * COORDS
     for j in range(int(COORDS)):
-        robot.joint_q[q + j] = scene.reference_q[q + j]
+        arrays.joint_q[q + j] = scene.reference_q[q + j]
     for j in range(int(DOFS)):
-        robot.joint_qd[world * DOFS + j] = 0.0
+        arrays.joint_qd[world * DOFS + j] = 0.0
     turn = wp.quat_from_axis_angle(wp.vec3(0.0, 0.0, 1.0), heading)
     for j in range(4):
-        robot.joint_q[q + 3 + j] = turn[j]
-    robot.joint_q[q + 2] = scene.reference_q[q + 2] + lift
+        arrays.joint_q[q + 3 + j] = turn[j]
+    arrays.joint_q[q + 2] = scene.reference_q[q + 2] + lift
 
 
 @wp.kernel
@@ -161,7 +161,7 @@ def stand_kernel(
     skills: wp.array(dtype=SkillSettings),
     skill: wp.array(dtype=int),
     # in, out
-    robot: RobotArrays,
+    arrays: RobotArrays,
 ):
     """Stand robots in the default pose with a heading [rad] where mask is not 0, blocks at their starts.
 
@@ -171,7 +171,7 @@ def stand_kernel(
     if mask[world] != 0.0:
         rest_block(scene.ground, world)
         lift = surface(world_ground(scene.ground, world), 0.0, 0.0)[0] + skills[skill[world]].lift
-        store_pose(robot, scene, world, headings[world], lift)
+        store_pose(arrays, scene, world, headings[world], lift)
 
 
 @wp.kernel
@@ -194,7 +194,7 @@ def forget_kernel(
     mask: wp.array(dtype=float),
     geometry: wp.array(dtype=LegGeometry),
     # in, out
-    robot: RobotArrays,
+    arrays: RobotArrays,
     delays: Delays,
 ):
     """Forget the past where mask is not 0: actions, torques, contacts; one thread per (motor, world).
@@ -206,27 +206,27 @@ def forget_kernel(
     if mask[world] == 0.0:
         return
     slot = motor_slot(m)
-    angle = robot.joint_q[world * COORDS + 7 + slot]
-    robot.torque[m, world] = 0.0
-    robot.old_torque[m, world] = 0.0
-    robot.action[m, world] = 0.0
-    robot.old_action[m, world] = 0.0
-    robot.older_action[m, world] = 0.0
-    robot.target[m, world] = angle
-    robot.safe_target[m, world] = angle
-    robot.old_rate[m, world] = robot.joint_qd[world * DOFS + 6 + slot]
+    angle = arrays.joint_q[world * COORDS + 7 + slot]
+    arrays.torque[m, world] = 0.0
+    arrays.old_torque[m, world] = 0.0
+    arrays.action[m, world] = 0.0
+    arrays.old_action[m, world] = 0.0
+    arrays.older_action[m, world] = 0.0
+    arrays.target[m, world] = angle
+    arrays.safe_target[m, world] = angle
+    arrays.old_rate[m, world] = arrays.joint_qd[world * DOFS + 6 + slot]
     for i in range(RING):
         delays.past_target[i, m, world] = angle
     if m < 4:
-        robot.impulse[m, world] = wp.vec3(0.0)
-        robot.paw_force[m, world] = wp.vec3(0.0)
-        robot.peak_force[m, world] = 0.0
-        robot.contact_time[m, world] = 0.0
-        robot.air_time[m, world] = 0.0
-        robot.touchdown_speed[m, world] = 0.0
-        robot.paw_height[m, world] = 0.0
-        robot.collisions[m, world] = 0
-        follow_paw(robot, geometry[m], world, m)
+        arrays.impulse[m, world] = wp.vec3(0.0)
+        arrays.paw_force[m, world] = wp.vec3(0.0)
+        arrays.peak_force[m, world] = 0.0
+        arrays.contact_time[m, world] = 0.0
+        arrays.air_time[m, world] = 0.0
+        arrays.touchdown_speed[m, world] = 0.0
+        arrays.paw_height[m, world] = 0.0
+        arrays.collisions[m, world] = 0
+        follow_paw(arrays, geometry[m], world, m)
     if m == 0:
-        robot.invalid[world] = 0
-        robot.old_lin_vel[world] = base_velocity(robot, world, base_quat(robot, world))
+        arrays.invalid[world] = 0
+        arrays.old_lin_vel[world] = base_velocity(arrays, world, base_quat(arrays, world))

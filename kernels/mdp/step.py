@@ -58,7 +58,7 @@ def make_step_kernel(task: Any) -> wp.Kernel:
     def step_kernel(
         # in
         skill: int,
-        robot: RobotArrays,
+        arrays: RobotArrays,
         ground: Ground,
         num_levels: int,
         p: wp.array(dtype=float),
@@ -76,7 +76,7 @@ def make_step_kernel(task: Any) -> wp.Kernel:
         world = env.first + wp.tid()
         if env.skill[world] != skill:
             return
-        view = load_view(robot, ground, world)
+        view = load_view(arrays, ground, world)
         if wp.static(advance.plain):
             state = wp.static(advance.func)(view, states[world])
         else:
@@ -85,7 +85,7 @@ def make_step_kernel(task: Any) -> wp.Kernel:
         ending = int(NOT_ENDED)
         timeout = float(0.0)
         success = bool(False)
-        broken = robot.invalid[world] != 0 or env.bad_action[world] != 0 or speed_limit_broken(view)
+        broken = arrays.invalid[world] != 0 or env.bad_action[world] != 0 or speed_limit_broken(view)
         if broken:
             ending = wp.static(broken_ending)
         for i in range(wp.static(len(endings))):
@@ -109,7 +109,7 @@ def make_step_kernel(task: Any) -> wp.Kernel:
                 raw = wp.static(rewards[i].func)(view, state, *p[wp.static(rewards[i].lo) : wp.static(rewards[i].hi)])
             value = p[wp.static(rewards[i].weight)] * raw
             if wp.static(not rewards[i].once):
-                value = value * robot.step_dt
+                value = value * arrays.step_dt
             if broken:
                 value = float(0.0)
             term_value[i, world] = value

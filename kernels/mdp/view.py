@@ -83,89 +83,89 @@ class RobotArrays:
 
 
 @wp.func
-def base_velocity(robot: RobotArrays, world: int, quat: wp.quat) -> wp.vec3:
+def base_velocity(arrays: RobotArrays, world: int, quat: wp.quat) -> wp.vec3:
     """Return the velocity of the base origin [m/s], world frame."""
     i = world * DOFS
-    com_vel = wp.vec3(robot.joint_qd[i], robot.joint_qd[i + 1], robot.joint_qd[i + 2])
-    ang = wp.vec3(robot.joint_qd[i + 3], robot.joint_qd[i + 4], robot.joint_qd[i + 5])
-    return com_vel - wp.cross(ang, wp.quat_rotate(quat, robot.body_com[world * BODIES]))
+    com_vel = wp.vec3(arrays.joint_qd[i], arrays.joint_qd[i + 1], arrays.joint_qd[i + 2])
+    ang = wp.vec3(arrays.joint_qd[i + 3], arrays.joint_qd[i + 4], arrays.joint_qd[i + 5])
+    return com_vel - wp.cross(ang, wp.quat_rotate(quat, arrays.body_com[world * BODIES]))
 
 
 @wp.func
-def base_pos(robot: RobotArrays, world: int) -> wp.vec3:
+def base_pos(arrays: RobotArrays, world: int) -> wp.vec3:
     """Return the base origin [m], world frame."""
     i = world * COORDS
-    return wp.vec3(robot.joint_q[i], robot.joint_q[i + 1], robot.joint_q[i + 2])
+    return wp.vec3(arrays.joint_q[i], arrays.joint_q[i + 1], arrays.joint_q[i + 2])
 
 
 @wp.func
-def base_quat(robot: RobotArrays, world: int) -> wp.quat:
+def base_quat(arrays: RobotArrays, world: int) -> wp.quat:
     """Return the base's orientation, xyzw, body to world."""
     i = world * COORDS + 3
-    return wp.quat(robot.joint_q[i], robot.joint_q[i + 1], robot.joint_q[i + 2], robot.joint_q[i + 3])
+    return wp.quat(arrays.joint_q[i], arrays.joint_q[i + 1], arrays.joint_q[i + 2], arrays.joint_q[i + 3])
 
 
 @wp.func
-def load_base_view(robot: RobotArrays, ground: Ground, world: int) -> RobotView:
+def load_base_view(arrays: RobotArrays, ground: Ground, world: int) -> RobotView:
     """Return the view with the base's entries filled in."""
     j = world * DOFS
     view = RobotView()
     view.world = world
-    view.pos = base_pos(robot, world)
-    quat = base_quat(robot, world)
+    view.pos = base_pos(arrays, world)
+    quat = base_quat(arrays, world)
     view.quat = quat
-    view.lin_vel = base_velocity(robot, world, quat)
-    view.old_lin_vel = robot.old_lin_vel[world]
-    view.lin_acc = (view.lin_vel - view.old_lin_vel) / robot.step_dt
-    ang = wp.vec3(robot.joint_qd[j + 3], robot.joint_qd[j + 4], robot.joint_qd[j + 5])
+    view.lin_vel = base_velocity(arrays, world, quat)
+    view.old_lin_vel = arrays.old_lin_vel[world]
+    view.lin_acc = (view.lin_vel - view.old_lin_vel) / arrays.step_dt
+    ang = wp.vec3(arrays.joint_qd[j + 3], arrays.joint_qd[j + 4], arrays.joint_qd[j + 5])
     view.ang_vel = wp.quat_rotate_inv(quat, ang)
     view.gravity = wp.quat_rotate_inv(quat, wp.vec3(0.0, 0.0, -1.0))
-    view.fall_acc = -robot.gravity[world][2]
+    view.fall_acc = -arrays.gravity[world][2]
     below = surface(world_ground(ground, world), view.pos[0], view.pos[1])
     view.height = view.pos[2] - below[0]
     return view
 
 
 @wp.func
-def load_view(robot: RobotArrays, ground: Ground, world: int) -> RobotView:
+def load_view(arrays: RobotArrays, ground: Ground, world: int) -> RobotView:
     """Return the robot of a world."""
-    view = load_base_view(robot, ground, world)
+    view = load_base_view(arrays, ground, world)
     contacts = int(0)
     collisions = int(0)
     for k in range(4):
-        time = robot.contact_time[k, world]
+        time = arrays.contact_time[k, world]
         down = time > 0.0
         contacts += wp.where(down, 1, 0)
-        collisions = collisions | robot.collisions[k, world]
+        collisions = collisions | arrays.collisions[k, world]
         view.contact[k] = wp.where(down, 1.0, 0.0)
-        view.first_contact[k] = wp.where(down and robot.air_time[k, world] > 0.0, 1.0, 0.0)
+        view.first_contact[k] = wp.where(down and arrays.air_time[k, world] > 0.0, 1.0, 0.0)
         view.contact_time[k] = time
-        view.air_time[k] = robot.air_time[k, world]
-        view.touchdown_speed[k] = robot.touchdown_speed[k, world]
-        view.paw_force[k] = wp.length(robot.paw_force[k, world])
-        view.peak_force[k] = robot.peak_force[k, world]
-        view.paw_height[k] = robot.paw_height[k, world]
+        view.air_time[k] = arrays.air_time[k, world]
+        view.touchdown_speed[k] = arrays.touchdown_speed[k, world]
+        view.paw_force[k] = wp.length(arrays.paw_force[k, world])
+        view.peak_force[k] = arrays.peak_force[k, world]
+        view.paw_height[k] = arrays.paw_height[k, world]
         for j in range(3):
-            view.paw_pos[k, j] = robot.paw_pos[k, world][j]
-            view.paw_vel[k, j] = robot.paw_vel[k, world][j]
+            view.paw_pos[k, j] = arrays.paw_pos[k, world][j]
+            view.paw_vel[k, j] = arrays.paw_vel[k, world][j]
     view.contacts = contacts
     view.collisions = collisions
     clipped = float(0.0)
     for m in range(12):
         slot = motor_slot(m)
-        rate = robot.joint_qd[world * DOFS + 6 + slot]
-        angle = robot.joint_q[world * COORDS + 7 + slot]
+        rate = arrays.joint_qd[world * DOFS + 6 + slot]
+        angle = arrays.joint_q[world * COORDS + 7 + slot]
         view.angle[m] = angle
-        view.sensed_angle[m] = angle + robot.joint_offset[m, world]
+        view.sensed_angle[m] = angle + arrays.joint_offset[m, world]
         view.rate[m] = rate
-        view.rate_change[m] = (rate - robot.old_rate[m, world]) / robot.step_dt
-        view.torque[m] = robot.torque[m, world]
-        view.old_torque[m] = robot.old_torque[m, world]
-        view.action[m] = robot.action[m, world]
-        view.old_action[m] = robot.old_action[m, world]
-        view.older_action[m] = robot.older_action[m, world]
-        view.default_angle[m] = robot.default_angle[m]
-        off = robot.target[m, world] - robot.safe_target[m, world]
+        view.rate_change[m] = (rate - arrays.old_rate[m, world]) / arrays.step_dt
+        view.torque[m] = arrays.torque[m, world]
+        view.old_torque[m] = arrays.old_torque[m, world]
+        view.action[m] = arrays.action[m, world]
+        view.old_action[m] = arrays.old_action[m, world]
+        view.older_action[m] = arrays.older_action[m, world]
+        view.default_angle[m] = arrays.default_angle[m]
+        off = arrays.target[m, world] - arrays.safe_target[m, world]
         clipped += off * off
     view.clipped = clipped
     return view

@@ -49,21 +49,21 @@ def paw_heights(view: RobotView, task: VelocityState) -> wp.vec4:
 
 
 @wp.func
-def push(robot: RobotArrays, ground: Ground, world: int) -> vec6:
+def push(arrays: RobotArrays, ground: Ground, world: int) -> vec6:
     """Push on the base, body axes, over 10 N and 3 N m."""
-    wrench = robot.body_f[world * BODIES]
-    quat = base_quat(robot, world)
+    wrench = arrays.body_f[world * BODIES]
+    quat = base_quat(arrays, world)
     force = 0.1 * wp.quat_rotate_inv(quat, wp.vec3(wrench[0], wrench[1], wrench[2]))
     torque = wp.quat_rotate_inv(quat, wp.vec3(wrench[3], wrench[4], wrench[5])) / 3.0
     return vec6(force[0], force[1], force[2], torque[0], torque[1], torque[2])
 
 
 @wp.func
-def ground_heights(robot: RobotArrays, ground: Ground, world: int) -> vec15:
+def ground_heights(arrays: RobotArrays, ground: Ground, world: int) -> vec15:
     """Height of the base above the ground around it [m], less 0.35: 5 rows from back to front, 3 from right to left."""
     here = world_ground(ground, world)
-    pos = base_pos(robot, world)
-    heading = yaw_of(base_quat(robot, world))
+    pos = base_pos(arrays, world)
+    heading = yaw_of(base_quat(arrays, world))
     found = vec15()
     for i in range(15):
         way = turned(wp.vec3(0.25 * float(i / 3 - 2), 0.2 * float(i % 3 - 1), 0.0), heading)

@@ -58,15 +58,15 @@ def carried_over(
 
 @wp.func
 def reset_velocity(
-    robot: RobotArrays, scene: Scene, skill: SkillSettings, old: VelocityState, settings: VelocitySettings,
+    arrays: RobotArrays, scene: Scene, skill: SkillSettings, old: VelocityState, settings: VelocitySettings,
     level: CommandRanges, draw: Draw,
 ) -> VelocityState:  # fmt: skip
     """Begin an episode with a drawn command, and return its state."""
     world = draw.world
-    new = carried_over(old, base_pos(robot, world), settings.tolerance, level.levels, settings.map.rows)
+    new = carried_over(old, base_pos(arrays, world), settings.tolerance, level.levels, settings.map.rows)
     rest_block(scene.ground, world)
     meet_attempts(draw)  # all have read where the base was
-    write_start(robot, scene, skill, settings, new.terrain_level, draw)
+    write_start(arrays, scene, skill, settings, new.terrain_level, draw)
     new.episode_steps = settings.episode_steps
     new.pace = settings.pace
     new.phase = between(draw, streams.GAIT_PHASE, 0.0, 1.0)

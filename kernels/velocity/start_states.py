@@ -90,7 +90,7 @@ def draw_spot(draw: Draw, map: Map, level: int) -> wp.vec2:
 
 
 @wp.func
-def sample_base(start: VelocityStart, robot: RobotArrays, draw: Draw, attempt: int) -> VelocityBase:
+def sample_base(start: VelocityStart, arrays: RobotArrays, draw: Draw, attempt: int) -> VelocityBase:
     """Return a base in motion around the start's spot."""
     settings = start.settings
     v = settings.lin_vel
@@ -113,7 +113,9 @@ def sample_base(start: VelocityStart, robot: RobotArrays, draw: Draw, attempt: i
         between(draw, streams.ANG_VEL + 2, -w, w),
     )
     base.ang_vel = wp.quat_rotate(base.quat, base.body_rate)
-    base.com_vel = base.lin_vel + wp.cross(base.ang_vel, wp.quat_rotate(base.quat, robot.body_com[draw.world * BODIES]))
+    base.com_vel = base.lin_vel + wp.cross(
+        base.ang_vel, wp.quat_rotate(base.quat, arrays.body_com[draw.world * BODIES])
+    )
     return base
 
 
@@ -137,7 +139,7 @@ def sample_leg(start: VelocityStart, base: VelocityBase, geo: LegGeometry, draw:
 
 @wp.func
 def write_start(
-    robot: RobotArrays, scene: Scene, skill: SkillSettings, settings: VelocitySettings, terrain_level: int, draw: Draw
+    arrays: RobotArrays, scene: Scene, skill: SkillSettings, settings: VelocitySettings, terrain_level: int, draw: Draw
 ):
     """Write a start state to a world: a sampled one, or in a share of draws the default pose."""
     world = draw.world
@@ -148,8 +150,8 @@ def write_start(
     start.limits = leg_limits(skill.command_filter)
     start.ground = world_ground(scene.ground, world)
     if between(draw, streams.DEFAULT_POSE, 0.0, 1.0) >= settings.default_share:
-        if sample_valid_state(sample_base, sample_leg, start, robot, scene, draw):
+        if sample_valid_state(sample_base, sample_leg, start, arrays, scene, draw):
             return
-    store_pose(robot, scene, world, start.heading, surface(start.ground, start.spot[0], start.spot[1])[0])
-    robot.joint_q[world * COORDS] = start.spot[0]
-    robot.joint_q[world * COORDS + 1] = start.spot[1]
+    store_pose(arrays, scene, world, start.heading, surface(start.ground, start.spot[0], start.spot[1])[0])
+    arrays.joint_q[world * COORDS] = start.spot[0]
+    arrays.joint_q[world * COORDS + 1] = start.spot[1]

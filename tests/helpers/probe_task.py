@@ -86,11 +86,11 @@ def advance_probe(view: RobotView, task: ProbeState, growth: float) -> ProbeStat
 
 @wp.func
 def reset_probe(
-    robot: RobotArrays, scene: Scene, skill: SkillSettings, old: ProbeState, settings: ProbeSettings, level: ProbeLevel,
+    arrays: RobotArrays, scene: Scene, skill: SkillSettings, old: ProbeState, settings: ProbeSettings, level: ProbeLevel,
     draw: Draw,
 ) -> ProbeState:  # fmt: skip
     """Stand; keep a draw in `other` and the level in `counts`."""
-    store_pose(robot, scene, draw.world, 0.5, 0.25)
+    store_pose(arrays, scene, draw.world, 0.5, 0.25)
     new = ProbeState()
     new.value = settings.value
     new.other = between(draw, 0, 0.0, 1.0)

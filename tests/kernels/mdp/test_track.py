@@ -76,12 +76,12 @@ def test_paws_are_where_pinocchio_puts_them_and_move_alike(sim, robots):
 
 @wp.kernel(enable_backward=False)
 def seen_kernel(
-    robot: RobotArrays, ground: Ground, contact: wp.array(dtype=wp.vec4), first: wp.array(dtype=wp.vec4),
+    arrays: RobotArrays, ground: Ground, contact: wp.array(dtype=wp.vec4), first: wp.array(dtype=wp.vec4),
     contacts: wp.array(dtype=int), collisions: wp.array(dtype=int),
 ):  # fmt: skip
     """Read what rewards see of the paws."""
     world = wp.tid()
-    view = load_view(robot, ground, world)
+    view = load_view(arrays, ground, world)
     contact[world] = view.contact
     first[world] = view.first_contact
     contacts[world] = view.contacts
