@@ -49,11 +49,11 @@ class Command:
     """How a robot is told what to do."""
 
     give: Function
-    """(view, scene: Scene, task, values: wp.vec4, heading: float) -> task with a command from outside."""
+    """(robot, scene: Scene, task, values: wp.vec4, heading: float) -> task with a command from outside."""
     due: Function | None = None
     """(task) -> bool, whether a new command is drawn within the episode."""
     draw: Function | None = None
-    """(view, scene: Scene, task, level, draw: Draw) -> task with a new command."""
+    """(robot, scene: Scene, task, level, draw: Draw) -> task with a new command."""
 
     def __post_init__(self) -> None:
         """Raises ValueError: one of due and draw is missing."""
@@ -239,6 +239,6 @@ class Handover:
     source: TaskCfg
     target: TaskCfg
     when: Function
-    """(view, task of the source, requested: bool) -> bool"""
+    """(robot, task of the source, requested: bool) -> bool"""
     begin: Function
-    """(view, task of the source) -> task of the target; then the target's `Command.give`, if the request has one."""
+    """(robot, task of the source) -> task of the target; then the target's `Command.give`, if the request has one."""

@@ -55,15 +55,15 @@ def with_goal(task: AttitudeState, quat: wp.quat, goal: wp.quat) -> AttitudeStat
 
 
 @wp.func
-def advance_attitude(view: RobotView, task: AttitudeState, tolerance: float) -> AttitudeState:
+def advance_attitude(robot: RobotView, task: AttitudeState, tolerance: float) -> AttitudeState:
     """Return the state one policy step later; tolerance [rad]: error up to which the robot is at its goal."""
     t = task
     t.steps = task.steps + 1
     t.old_error = task.error
-    t.error = angle_between(view.quat, task.goal)
+    t.error = angle_between(robot.quat, task.goal)
     t.inside = wp.where(t.error <= tolerance, task.inside + 1, 0)
-    t.max_height = wp.max(task.max_height, view.pos[2])
-    if view.collisions != 0:
+    t.max_height = wp.max(task.max_height, robot.pos[2])
+    if robot.collisions != 0:
         t.collisions = task.collisions + 1
     return t
 
@@ -88,7 +88,7 @@ def carried_over(old: AttitudeState) -> AttitudeState:
 
 
 @wp.func
-def attitude_error(view: RobotView, task: AttitudeState) -> float:
+def attitude_error(robot: RobotView, task: AttitudeState) -> float:
     """Angle of the rotation to the goal [rad]."""
     return task.error
 

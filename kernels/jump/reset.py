@@ -193,33 +193,33 @@ def another_jump_due(task: JumpState) -> bool:
 
 
 @wp.func
-def draw_next_jump(view: RobotView, scene: Scene, task: JumpState, level: JumpLevel, draw: Draw) -> JumpState:
+def draw_next_jump(robot: RobotView, scene: Scene, task: JumpState, level: JumpLevel, draw: Draw) -> JumpState:
     """Return the state of an episode that goes on with another jump, to a drawn goal."""
     goal = draw_goal(draw, level)
-    new = begin_next_jump(task, world_ground(scene.ground, view.world), goal, view.pos, yaw_of(view.quat))
+    new = begin_next_jump(task, world_ground(scene.ground, robot.world), goal, robot.pos, yaw_of(robot.quat))
     new.again_step = draw_again(draw, task.again_delay, level.jump_again)
     return new
 
 
 @wp.func
-def give_jump(view: RobotView, scene: Scene, task: JumpState, values: wp.vec4, heading: float) -> JumpState:
+def give_jump(robot: RobotView, scene: Scene, task: JumpState, values: wp.vec4, heading: float) -> JumpState:
     """Ask a robot that stands at its start, or has landed, for a jump.
 
     values: goal x, y [m] relative to base and heading, base height at the apex [m], and at a start the policy step of
     the command.
     """
-    here = world_ground(scene.ground, view.world)
+    here = world_ground(scene.ground, robot.world)
     goal = wp.vec3(values[0], values[1], values[2])
     if task.phase == LANDED:
-        return begin_next_jump(task, here, goal, view.pos, heading)
+        return begin_next_jump(task, here, goal, robot.pos, heading)
     if task.phase != STANCE or task.steps > 0:
         return task
     new = JumpState()
     new.heading = heading
-    new.start = view.pos
-    new.goal = turned(goal, heading) + wp.vec3(view.pos[0], view.pos[1], 0.0)
+    new.start = robot.pos
+    new.goal = turned(goal, heading) + wp.vec3(robot.pos[0], robot.pos[1], 0.0)
     new.goal_ground = surface(here, new.goal[0], new.goal[1])[0]
-    new.max_height = view.pos[2]
+    new.max_height = robot.pos[2]
     new.command_step = int(values[3])
     return new
 

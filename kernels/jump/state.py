@@ -42,9 +42,9 @@ class JumpState:
 
 
 @wp.func
-def goal_offset(view: RobotView, task: JumpState) -> wp.vec3:
+def goal_offset(robot: RobotView, task: JumpState) -> wp.vec3:
     """Return the horizontal way from the base to the goal [m], world axes."""
-    return wp.vec3(task.goal[0] - view.pos[0], task.goal[1] - view.pos[1], 0.0)
+    return wp.vec3(task.goal[0] - robot.pos[0], task.goal[1] - robot.pos[1], 0.0)
 
 
 @wp.func

@@ -78,11 +78,11 @@ def make_handover_kernel(handover: Any) -> wp.Kernel:
         world = env.first + wp.tid()
         if env.skill[world] != source or env.done[world] != 0.0 or moved[world] != 0:
             return
-        view = load_view(arrays, scene.ground, world)
-        if wp.static(when)(view, sources[world], env.request[world] == target):
-            begun = wp.static(begin)(view, sources[world])
+        robot = load_view(arrays, scene.ground, world)
+        if wp.static(when)(robot, sources[world], env.request[world] == target):
+            begun = wp.static(begin)(robot, sources[world])
             if env.request[world] == target and env.told[world] != 0:
-                targets[world] = wp.static(give)(view, scene, begun, env.wanted[world], yaw_of(view.quat))
+                targets[world] = wp.static(give)(robot, scene, begun, env.wanted[world], yaw_of(robot.quat))
             else:
                 targets[world] = begun
             hand_over(arrays, parameters, env, skills, world, target)

@@ -113,18 +113,18 @@ def make_observe_kernel(task: Any) -> wp.Kernel:
             return
         for c in range(wp.static((len(slots) + CHUNK - 1) // CHUNK)):
             if chunk == c:
-                view = load_view(arrays, ground, world)
+                robot = load_view(arrays, ground, world)
                 for i in range(wp.static(c * CHUNK), wp.static(min((c + 1) * CHUNK, len(slots)))):
                     if wp.static(of_parameters[i]):
                         store(wp.static(slots[i].func)(parameters, world), wp.static(places[i]), world, raw)
                     elif wp.static(of_ground[i]):
                         store(wp.static(slots[i].func)(arrays, ground, world), wp.static(places[i]), world, raw)
                     elif wp.static(slots[i].plain):
-                        store(wp.static(slots[i].func)(view, states[world]), wp.static(places[i]), world, raw)
+                        store(wp.static(slots[i].func)(robot, states[world]), wp.static(places[i]), world, raw)
                     else:
                         store(
                             wp.static(slots[i].func)(
-                                view, states[world], *p[wp.static(slots[i].lo) : wp.static(slots[i].hi)]
+                                robot, states[world], *p[wp.static(slots[i].lo) : wp.static(slots[i].hi)]
                             ),
                             wp.static(places[i]),
                             world,

@@ -78,9 +78,9 @@ def make_reset_kernel(task: Any) -> wp.Kernel:
                 env.broken[world] = 0
         elif wp.static(command is not None):
             if lane == 0:
-                view = load_view(arrays, scene.ground, world)
+                robot = load_view(arrays, scene.ground, world)
                 fresh = make_draw(env.seed, world, env.clock[world], COMMAND)
-                states[world] = wp.static(command)(view, scene, states[world], levels[level], fresh)
+                states[world] = wp.static(command)(robot, scene, states[world], levels[level], fresh)
                 env.fresh[world] = COMMANDED
 
     return reset_kernel
@@ -111,14 +111,14 @@ def make_give_kernel(task: Any) -> wp.Kernel:
         world = wp.tid()
         if env.skill[world] != skill or mask[world] == 0.0:
             return
-        view = load_view(arrays, scene.ground, world)
+        robot = load_view(arrays, scene.ground, world)
         if begins != 0:
             fresh = task.state()
-            states[world] = wp.static(give)(view, scene, fresh, values[world], headings[world])
+            states[world] = wp.static(give)(robot, scene, fresh, values[world], headings[world])
             env.fresh[world] = BEGUN
             env.broken[world] = 0
         else:
-            states[world] = wp.static(give)(view, scene, states[world], values[world], yaw_of(view.quat))
+            states[world] = wp.static(give)(robot, scene, states[world], values[world], yaw_of(robot.quat))
             if env.fresh[world] != BEGUN:
                 env.fresh[world] = COMMANDED
 

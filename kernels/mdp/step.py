@@ -76,25 +76,25 @@ def make_step_kernel(task: Any) -> wp.Kernel:
         world = env.first + wp.tid()
         if env.skill[world] != skill:
             return
-        view = load_view(arrays, ground, world)
+        robot = load_view(arrays, ground, world)
         if wp.static(advance.plain):
-            state = wp.static(advance.func)(view, states[world])
+            state = wp.static(advance.func)(robot, states[world])
         else:
-            state = wp.static(advance.func)(view, states[world], *p[wp.static(advance.lo) : wp.static(advance.hi)])
+            state = wp.static(advance.func)(robot, states[world], *p[wp.static(advance.lo) : wp.static(advance.hi)])
 
         ending = int(NOT_ENDED)
         timeout = float(0.0)
         success = bool(False)
-        broken = arrays.invalid[world] != 0 or env.bad_action[world] != 0 or speed_limit_broken(view)
+        broken = arrays.invalid[world] != 0 or env.bad_action[world] != 0 or speed_limit_broken(robot)
         if broken:
             ending = wp.static(broken_ending)
         for i in range(wp.static(len(endings))):
             if ending == NOT_ENDED:
                 if wp.static(endings[i].plain):
-                    holds = wp.static(endings[i].func)(view, state)
+                    holds = wp.static(endings[i].func)(robot, state)
                 else:
                     holds = wp.static(endings[i].func)(
-                        view, state, *p[wp.static(endings[i].lo) : wp.static(endings[i].hi)]
+                        robot, state, *p[wp.static(endings[i].lo) : wp.static(endings[i].hi)]
                     )
                 if holds:
                     ending = i
@@ -104,9 +104,9 @@ def make_step_kernel(task: Any) -> wp.Kernel:
         total = float(0.0)
         for i in range(wp.static(len(rewards))):
             if wp.static(rewards[i].plain):
-                raw = wp.static(rewards[i].func)(view, state)
+                raw = wp.static(rewards[i].func)(robot, state)
             else:
-                raw = wp.static(rewards[i].func)(view, state, *p[wp.static(rewards[i].lo) : wp.static(rewards[i].hi)])
+                raw = wp.static(rewards[i].func)(robot, state, *p[wp.static(rewards[i].lo) : wp.static(rewards[i].hi)])
             value = p[wp.static(rewards[i].weight)] * raw
             if wp.static(not rewards[i].once):
                 value = value * arrays.step_dt
@@ -125,7 +125,7 @@ def make_step_kernel(task: Any) -> wp.Kernel:
         if ending != NOT_ENDED:
             counters.ending_count[ending, world] = counters.ending_count[ending, world] + 1
             if wp.static(curriculum.counts)(state):
-                error = wp.static(curriculum.func)(view, state)
+                error = wp.static(curriculum.func)(robot, state)
                 success = success and error <= p[wp.static(curriculum.tolerance)]
                 count_episode(env, counters, world, success, error, p[wp.static(curriculum.promote_after)], num_levels)
 

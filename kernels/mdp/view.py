@@ -109,27 +109,27 @@ def base_quat(arrays: RobotArrays, world: int) -> wp.quat:
 def load_base_view(arrays: RobotArrays, ground: Ground, world: int) -> RobotView:
     """Return the view with the base's entries filled in."""
     j = world * DOFS
-    view = RobotView()
-    view.world = world
-    view.pos = base_pos(arrays, world)
+    robot = RobotView()
+    robot.world = world
+    robot.pos = base_pos(arrays, world)
     quat = base_quat(arrays, world)
-    view.quat = quat
-    view.lin_vel = base_velocity(arrays, world, quat)
-    view.old_lin_vel = arrays.old_lin_vel[world]
-    view.lin_acc = (view.lin_vel - view.old_lin_vel) / arrays.step_dt
+    robot.quat = quat
+    robot.lin_vel = base_velocity(arrays, world, quat)
+    robot.old_lin_vel = arrays.old_lin_vel[world]
+    robot.lin_acc = (robot.lin_vel - robot.old_lin_vel) / arrays.step_dt
     ang = wp.vec3(arrays.joint_qd[j + 3], arrays.joint_qd[j + 4], arrays.joint_qd[j + 5])
-    view.ang_vel = wp.quat_rotate_inv(quat, ang)
-    view.gravity = wp.quat_rotate_inv(quat, wp.vec3(0.0, 0.0, -1.0))
-    view.fall_acc = -arrays.gravity[world][2]
-    below = surface(world_ground(ground, world), view.pos[0], view.pos[1])
-    view.height = view.pos[2] - below[0]
-    return view
+    robot.ang_vel = wp.quat_rotate_inv(quat, ang)
+    robot.gravity = wp.quat_rotate_inv(quat, wp.vec3(0.0, 0.0, -1.0))
+    robot.fall_acc = -arrays.gravity[world][2]
+    below = surface(world_ground(ground, world), robot.pos[0], robot.pos[1])
+    robot.height = robot.pos[2] - below[0]
+    return robot
 
 
 @wp.func
 def load_view(arrays: RobotArrays, ground: Ground, world: int) -> RobotView:
     """Return the robot of a world."""
-    view = load_base_view(arrays, ground, world)
+    robot = load_base_view(arrays, ground, world)
     contacts = int(0)
     collisions = int(0)
     for k in range(4):
@@ -137,51 +137,51 @@ def load_view(arrays: RobotArrays, ground: Ground, world: int) -> RobotView:
         down = time > 0.0
         contacts += wp.where(down, 1, 0)
         collisions = collisions | arrays.collisions[k, world]
-        view.contact[k] = wp.where(down, 1.0, 0.0)
-        view.first_contact[k] = wp.where(down and arrays.air_time[k, world] > 0.0, 1.0, 0.0)
-        view.contact_time[k] = time
-        view.air_time[k] = arrays.air_time[k, world]
-        view.touchdown_speed[k] = arrays.touchdown_speed[k, world]
-        view.paw_force[k] = wp.length(arrays.paw_force[k, world])
-        view.peak_force[k] = arrays.peak_force[k, world]
-        view.paw_height[k] = arrays.paw_height[k, world]
+        robot.contact[k] = wp.where(down, 1.0, 0.0)
+        robot.first_contact[k] = wp.where(down and arrays.air_time[k, world] > 0.0, 1.0, 0.0)
+        robot.contact_time[k] = time
+        robot.air_time[k] = arrays.air_time[k, world]
+        robot.touchdown_speed[k] = arrays.touchdown_speed[k, world]
+        robot.paw_force[k] = wp.length(arrays.paw_force[k, world])
+        robot.peak_force[k] = arrays.peak_force[k, world]
+        robot.paw_height[k] = arrays.paw_height[k, world]
         for j in range(3):
-            view.paw_pos[k, j] = arrays.paw_pos[k, world][j]
-            view.paw_vel[k, j] = arrays.paw_vel[k, world][j]
-    view.contacts = contacts
-    view.collisions = collisions
+            robot.paw_pos[k, j] = arrays.paw_pos[k, world][j]
+            robot.paw_vel[k, j] = arrays.paw_vel[k, world][j]
+    robot.contacts = contacts
+    robot.collisions = collisions
     clipped = float(0.0)
     for m in range(12):
         slot = motor_slot(m)
         rate = arrays.joint_qd[world * DOFS + 6 + slot]
         angle = arrays.joint_q[world * COORDS + 7 + slot]
-        view.angle[m] = angle
-        view.sensed_angle[m] = angle + arrays.joint_offset[m, world]
-        view.rate[m] = rate
-        view.rate_change[m] = (rate - arrays.old_rate[m, world]) / arrays.step_dt
-        view.torque[m] = arrays.torque[m, world]
-        view.old_torque[m] = arrays.old_torque[m, world]
-        view.action[m] = arrays.action[m, world]
-        view.old_action[m] = arrays.old_action[m, world]
-        view.older_action[m] = arrays.older_action[m, world]
-        view.default_angle[m] = arrays.default_angle[m]
+        robot.angle[m] = angle
+        robot.sensed_angle[m] = angle + arrays.joint_offset[m, world]
+        robot.rate[m] = rate
+        robot.rate_change[m] = (rate - arrays.old_rate[m, world]) / arrays.step_dt
+        robot.torque[m] = arrays.torque[m, world]
+        robot.old_torque[m] = arrays.old_torque[m, world]
+        robot.action[m] = arrays.action[m, world]
+        robot.old_action[m] = arrays.old_action[m, world]
+        robot.older_action[m] = arrays.older_action[m, world]
+        robot.default_angle[m] = arrays.default_angle[m]
         off = arrays.target[m, world] - arrays.safe_target[m, world]
         clipped += off * off
-    view.clipped = clipped
-    return view
+    robot.clipped = clipped
+    return robot
 
 
 @wp.func
-def speed_limit_broken(view: RobotView) -> bool:
+def speed_limit_broken(robot: RobotView) -> bool:
     """Return whether a state is non-finite or faster than the robot can ever be: the world has come apart."""
     fastest = float(0.0)
-    total = wp.length_sq(view.pos) + wp.length_sq(view.lin_vel) + wp.length_sq(view.ang_vel)
+    total = wp.length_sq(robot.pos) + wp.length_sq(robot.lin_vel) + wp.length_sq(robot.ang_vel)
     for m in range(12):
-        fastest = wp.max(fastest, wp.abs(view.rate[m]))
-        total += view.rate[m] * view.rate[m] + view.angle[m] * view.angle[m]  # max() would pass over a NaN
+        fastest = wp.max(fastest, wp.abs(robot.rate[m]))
+        total += robot.rate[m] * robot.rate[m] + robot.angle[m] * robot.angle[m]  # max() would pass over a NaN
     if not wp.isfinite(total):
         return True
-    return wp.length(view.lin_vel) > 15.0 or wp.length(view.ang_vel) > 40.0 or fastest > 120.0
+    return wp.length(robot.lin_vel) > 15.0 or wp.length(robot.ang_vel) > 40.0 or fastest > 120.0
 
 
 @wp.func
@@ -207,23 +207,23 @@ def rotation_from(quat: wp.quat, heading: float) -> float:
 
 
 @wp.func
-def tilt(view: RobotView) -> float:
+def tilt(robot: RobotView) -> float:
     """Return the angle [rad] between body z and world z."""
-    return wp.acos(wp.clamp(-view.gravity[2], -1.0, 1.0))
+    return wp.acos(wp.clamp(-robot.gravity[2], -1.0, 1.0))
 
 
 @wp.func
-def braking(view: RobotView) -> float:
+def braking(robot: RobotView) -> float:
     """Return what the base lost of its speed of the step before, over the step [m/s^2], <= 0.
 
     Speed that it gained against that motion, as in a rebound, does not count: a fall that ends within the step has lost
     all of its speed.
     """
-    speed = wp.length(view.old_lin_vel)
+    speed = wp.length(robot.old_lin_vel)
     if speed < 1.0e-6:
         return 0.0
-    kept = wp.dot(view.lin_vel, view.old_lin_vel) / speed
-    rate = wp.dot(view.lin_acc, view.old_lin_vel) / speed
+    kept = wp.dot(robot.lin_vel, robot.old_lin_vel) / speed
+    rate = wp.dot(robot.lin_acc, robot.old_lin_vel) / speed
     if kept < 0.0:
         rate = rate * speed / (speed - kept)
     return wp.min(rate, 0.0)

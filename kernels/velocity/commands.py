@@ -80,7 +80,9 @@ def command_due(task: VelocityState) -> bool:
 
 
 @wp.func
-def draw_command(view: RobotView, scene: Scene, task: VelocityState, level: CommandRanges, draw: Draw) -> VelocityState:
+def draw_command(
+    robot: RobotView, scene: Scene, task: VelocityState, level: CommandRanges, draw: Draw
+) -> VelocityState:
     """Return the state of an episode that goes on with a drawn command."""
     new = with_command(task, draw_velocity(draw, level, task.command_level))
     new.command_lasts = wp.max(int(within(draw, streams.LASTS, level.lasts)), 1)
@@ -88,7 +90,9 @@ def draw_command(view: RobotView, scene: Scene, task: VelocityState, level: Comm
 
 
 @wp.func
-def give_velocity(view: RobotView, scene: Scene, task: VelocityState, values: wp.vec4, heading: float) -> VelocityState:
+def give_velocity(
+    robot: RobotView, scene: Scene, task: VelocityState, values: wp.vec4, heading: float
+) -> VelocityState:
     """Command a velocity until another comes: ahead, to the left [m/s] and about z [rad/s], body axes.
 
     The fourth value is the gait's frequency [Hz], 0: as it was.

@@ -43,18 +43,18 @@ class VelocityState:
 
 
 @wp.func
-def velocity_error(view: RobotView, task: VelocityState) -> wp.vec3:
+def velocity_error(robot: RobotView, task: VelocityState) -> wp.vec3:
     """Return velocity less command: ahead [m/s], to the left [m/s], about z [rad/s], body axes."""
-    vel = wp.quat_rotate_inv(view.quat, view.lin_vel)
-    return wp.vec3(vel[0] - task.command[0], vel[1] - task.command[1], view.ang_vel[2] - task.command[2])
+    vel = wp.quat_rotate_inv(robot.quat, robot.lin_vel)
+    return wp.vec3(vel[0] - task.command[0], vel[1] - task.command[1], robot.ang_vel[2] - task.command[2])
 
 
 @wp.func
-def follow_steps(view: RobotView, task: VelocityState) -> VelocityState:
+def follow_steps(robot: RobotView, task: VelocityState) -> VelocityState:
     """Return the state with the paws' steps taken in: how many there were lately, and how high the paws went."""
     t = task
     for k in range(4):
-        came_down = view.first_contact[k]
+        came_down = robot.first_contact[k]
         oldest = (task.recent[k] >> wp.int64(44)) & wp.int64(1)
         kept = (task.recent[k] << wp.int64(1)) & wp.int64(35184372088831)  # 2^45 - 1
         t.recent[k] = kept | wp.int64(came_down)
@@ -62,14 +62,14 @@ def follow_steps(view: RobotView, task: VelocityState) -> VelocityState:
         if came_down > 0.0 and task.standing == 0:
             t.touchdowns = t.touchdowns + 0.25
             t.apexes = t.apexes + 0.25 * task.swing_height[k]
-        t.swing_height[k] = wp.where(view.contact[k] > 0.0, 0.0, wp.max(task.swing_height[k], view.paw_height[k]))
+        t.swing_height[k] = wp.where(robot.contact[k] > 0.0, 0.0, wp.max(task.swing_height[k], robot.paw_height[k]))
     return t
 
 
 @wp.func
-def advance_velocity(view: RobotView, task: VelocityState, settle: float) -> VelocityState:
+def advance_velocity(robot: RobotView, task: VelocityState, settle: float) -> VelocityState:
     """Return the state one policy step later; errors count from `settle` policy steps after a command on."""
-    t = follow_steps(view, task)
+    t = follow_steps(robot, task)
     t.steps = task.steps + 1
     t.command_steps = task.command_steps + 1
     phase = task.phase + task.pace
@@ -78,7 +78,7 @@ def advance_velocity(view: RobotView, task: VelocityState, settle: float) -> Vel
     t.minutes = task.minutes + 1.0 / (60.0 * POLICY_RATE)
     if task.standing == 0:
         t.seconds_walking = task.seconds_walking + 1.0 / POLICY_RATE
-    error = velocity_error(view, task)
+    error = velocity_error(robot, task)
     xy = wp.length(wp.vec2(error[0], error[1]))
     yaw = wp.abs(error[2])
     if t.command_steps > int(settle) and xy < ABSURD and yaw < ABSURD:  # both false if not a number
@@ -100,7 +100,7 @@ def mean_error(task: VelocityState) -> float:
 
 
 @wp.func
-def tracking_error(view: RobotView, task: VelocityState) -> float:
+def tracking_error(robot: RobotView, task: VelocityState) -> float:
     """Mean error of the episode [m/s]."""
     return mean_error(task)
 

@@ -27,12 +27,12 @@ SKILL = np.arange(N) % 3 == 1
 
 
 @wp.func
-def always(view: RobotView, task: HoldState, requested: bool) -> bool:
+def always(robot: RobotView, task: HoldState, requested: bool) -> bool:
     return True
 
 
 @wp.func
-def go_on_holding(view: RobotView, task: HoldState) -> HoldState:
+def go_on_holding(robot: RobotView, task: HoldState) -> HoldState:
     return task
 
 

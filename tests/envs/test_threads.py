@@ -38,8 +38,8 @@ HOLD = hold_height.hold_height()
 
 
 @wp.func
-def in_the_air(view: RobotView, task: JumpState, requested: bool) -> bool:
-    return view.contacts == 0
+def in_the_air(robot: RobotView, task: JumpState, requested: bool) -> bool:
+    return robot.contacts == 0
 
 
 @pytest.fixture(autouse=True)

@@ -53,9 +53,9 @@ class Table:
 
         self._kernel = table_kernel
 
-    def __call__(self, name: str, view: RobotView, task: JumpState, **numbers: float) -> float | bool:
+    def __call__(self, name: str, robot: RobotView, task: JumpState, **numbers: float) -> float | bool:
         """Return the value of one function."""
-        return self._returns(self.all(name, [view], [task], **numbers)[0])
+        return self._returns(self.all(name, [robot], [task], **numbers)[0])
 
     def all(self, name: str, views: list, tasks: list, **numbers: float) -> np.ndarray:
         """Return the values of one function, one a robot and its episode; numbers: all of its own, by name."""

@@ -76,7 +76,7 @@ class ProbeLevelCfg:
 
 
 @wp.func
-def advance_probe(view: RobotView, task: ProbeState, growth: float) -> ProbeState:
+def advance_probe(robot: RobotView, task: ProbeState, growth: float) -> ProbeState:
     """Let the value grow."""
     new = task
     new.steps = task.steps + 1
@@ -99,7 +99,7 @@ def reset_probe(
 
 
 @wp.func
-def give_probe(view: RobotView, scene: Scene, task: ProbeState, values: wp.vec4, heading: float) -> ProbeState:
+def give_probe(robot: RobotView, scene: Scene, task: ProbeState, values: wp.vec4, heading: float) -> ProbeState:
     """Take over the first value and the heading."""
     new = task
     new.value = values[0]
@@ -114,7 +114,7 @@ def command_due(task: ProbeState) -> bool:
 
 
 @wp.func
-def draw_command(view: RobotView, scene: Scene, task: ProbeState, level: ProbeLevel, draw: Draw) -> ProbeState:
+def draw_command(robot: RobotView, scene: Scene, task: ProbeState, level: ProbeLevel, draw: Draw) -> ProbeState:
     """Keep a draw in `other` and the level in `counts`."""
     new = task
     new.other = between(draw, 0, 0.0, 1.0)
@@ -123,31 +123,31 @@ def draw_command(view: RobotView, scene: Scene, task: ProbeState, level: ProbeLe
 
 
 @wp.func
-def value(view: RobotView, task: ProbeState) -> float:
+def value(robot: RobotView, task: ProbeState) -> float:
     """The value."""
     return task.value
 
 
 @wp.func
-def offset_square(view: RobotView, task: ProbeState, offset: float, scale: float) -> float:
+def offset_square(robot: RobotView, task: ProbeState, offset: float, scale: float) -> float:
     """Squared distance of the value from an offset, times a scale."""
     return scale * (task.value - offset) * (task.value - offset)
 
 
 @wp.func
-def other(view: RobotView, task: ProbeState) -> float:
+def other(robot: RobotView, task: ProbeState) -> float:
     """The other number."""
     return task.other
 
 
 @wp.func
-def base_height(view: RobotView, task: Any) -> float:
+def base_height(robot: RobotView, task: Any) -> float:
     """Height of the base [m]."""
-    return view.height
+    return robot.height
 
 
 @wp.func
-def other_above(view: RobotView, task: ProbeState, limit: float) -> bool:
+def other_above(robot: RobotView, task: ProbeState, limit: float) -> bool:
     """Whether the other number is above a limit."""
     return task.other > limit
 
@@ -159,7 +159,7 @@ def counts(task: ProbeState) -> bool:
 
 
 @wp.func
-def both(view: RobotView, task: ProbeState) -> wp.vec2:
+def both(robot: RobotView, task: ProbeState) -> wp.vec2:
     """Both numbers."""
     return wp.vec2(task.value, task.other)
 
