@@ -49,11 +49,11 @@ class Command:
     """How a robot is told what to do."""
 
     give: Function
-    """(robot, scene: Scene, task, values: wp.vec4, heading: float) -> task with a command from outside."""
+    """(robot, scene: Scene, state, values: wp.vec4, heading: float) -> task with a command from outside."""
     due: Function | None = None
-    """(task) -> bool, whether a new command is drawn within the episode."""
+    """(state) -> bool, whether a new command is drawn within the episode."""
     draw: Function | None = None
-    """(robot, scene: Scene, task, level, draw: Draw) -> task with a new command."""
+    """(robot, scene: Scene, state, level, draw: Draw) -> task with a new command."""
 
     def __post_init__(self) -> None:
         """Raises ValueError: one of due and draw is missing."""

@@ -91,7 +91,7 @@ class Term:
     @property
     def of_state(self) -> Any:
         """The struct of the task's state that the function reads, or Any."""
-        return self.func.input_types.get("task", Any)
+        return self.func.input_types.get("state", Any)
 
     def __eq__(self, other: object) -> bool:
         return type(self) is type(other) and all(
@@ -210,7 +210,7 @@ class Curriculum(Term):
     """(view: RobotView, task) -> error of an ended episode.
 
     An episode that ends with success and an error up to `tolerance` is one; `promote_after` of them in a row raise the
-    world's level. counts: (task) -> bool, whether an episode counts at all. unit: of the error, as it is logged.
+    world's level. counts: (state) -> bool, whether an episode counts at all. unit: of the error, as it is logged.
     """
 
     settings: ClassVar = {"tolerance": REQUIRED, "promote_after": 5}
@@ -220,7 +220,7 @@ class Curriculum(Term):
     def __init__(self, func: Function, **given: Any) -> None:
         super().__init__(func, **given)
         if not isinstance(self.options["counts"], wp.Function):
-            raise InputError(f"Curriculum {self.name}: counts must be a @wp.func (task) -> bool")
+            raise InputError(f"Curriculum {self.name}: counts must be a @wp.func (state) -> bool")
         if self.numbers["tolerance"] < 0.0 or self.numbers["promote_after"] < 1:
             raise InputError(f"Curriculum {self.name}: tolerance must not be negative, promote_after at least 1")
 

@@ -52,9 +52,9 @@ def draw_turn(draw: Draw, ranges: TurnRanges) -> wp.quat:
 
 
 @wp.func
-def give_turn(robot: RobotView, scene: Scene, task: AttitudeState, values: wp.vec4, heading: float) -> AttitudeState:
+def give_turn(robot: RobotView, scene: Scene, state: AttitudeState, values: wp.vec4, heading: float) -> AttitudeState:
     """Command a turn (quaternion xyzw, of any length but 0) from the orientation that the robot has; 0: none."""
     turn = wp.quat(values[0], values[1], values[2], values[3])
     if wp.length(values) == 0.0:
         turn = wp.quat(0.0, 0.0, 0.0, 1.0)
-    return with_goal(task, robot.quat, robot.quat * wp.normalize(turn))
+    return with_goal(state, robot.quat, robot.quat * wp.normalize(turn))

@@ -28,37 +28,37 @@ def estimated_landing(pos: wp.vec3, lin_vel: wp.vec3, height: float, g: float) -
 
 
 @wp.func
-def landing_error_estimate(robot: RobotView, task: JumpState, height: float) -> float:
+def landing_error_estimate(robot: RobotView, state: JumpState, height: float) -> float:
     """Return how far from the goal [m] the base's projectile falls through a height [m] above the ground there."""
-    landing = estimated_landing(robot.pos, robot.lin_vel, height + task.goal_ground, robot.fall_acc)
-    return wp.length(wp.vec2(task.goal[0] - landing[0], task.goal[1] - landing[1]))
+    landing = estimated_landing(robot.pos, robot.lin_vel, height + state.goal_ground, robot.fall_acc)
+    return wp.length(wp.vec2(state.goal[0] - landing[0], state.goal[1] - landing[1]))
 
 
 @wp.func
-def next_phase(task: JumpState, robot: RobotView, takeoff_speed: float) -> int:
+def next_phase(state: JumpState, robot: RobotView, takeoff_speed: float) -> int:
     """Return the phase after this policy step; a takeoff needs free paws and an upward speed [m/s]."""
-    if task.phase == STANCE and robot.contacts == 0 and robot.lin_vel[2] > takeoff_speed:
+    if state.phase == STANCE and robot.contacts == 0 and robot.lin_vel[2] > takeoff_speed:
         return FLIGHT
-    if task.phase == FLIGHT and robot.contacts > 0:
+    if state.phase == FLIGHT and robot.contacts > 0:
         return LANDED
-    return task.phase
+    return state.phase
 
 
 @wp.func
-def advance_jump(robot: RobotView, task: JumpState, takeoff_speed: float) -> JumpState:
+def advance_jump(robot: RobotView, state: JumpState, takeoff_speed: float) -> JumpState:
     """Return the jump's state one policy step later; takeoff_speed [m/s]: upward, that begins a flight."""
-    t = task
-    t.steps = task.steps + 1
-    phase = next_phase(task, robot, takeoff_speed)
-    t.took_off = wp.where(task.phase == STANCE and phase == FLIGHT, 1, 0)
-    t.touched_down = wp.where(task.phase == FLIGHT and phase == LANDED, 1, 0)
-    t.phase_steps = wp.where(phase == task.phase, task.phase_steps + 1, 0)
+    t = state
+    t.steps = state.steps + 1
+    phase = next_phase(state, robot, takeoff_speed)
+    t.took_off = wp.where(state.phase == STANCE and phase == FLIGHT, 1, 0)
+    t.touched_down = wp.where(state.phase == FLIGHT and phase == LANDED, 1, 0)
+    t.phase_steps = wp.where(phase == state.phase, state.phase_steps + 1, 0)
     t.phase = phase
     if t.took_off == 1:
         t.max_height = robot.pos[2]
         t.apex_passed = 0
     t.at_apex = 0
-    if phase != STANCE and task.apex_passed == 0:
+    if phase != STANCE and state.apex_passed == 0:
         t.max_height = wp.max(t.max_height, robot.pos[2])
         if robot.lin_vel[2] <= 0.0 or t.touched_down == 1:
             t.apex_passed = 1
@@ -74,5 +74,5 @@ def advance_jump(robot: RobotView, task: JumpState, takeoff_speed: float) -> Jum
                 t.paws_landed = t.paws_landed | (1 << k)
     t.idle_steps = 0
     if phase == STANCE and t.steps >= t.command_step and wp.length(robot.lin_vel) < 0.1:
-        t.idle_steps = task.idle_steps + 1
+        t.idle_steps = state.idle_steps + 1
     return t

@@ -98,52 +98,52 @@ def begin_task(
     draw: Draw, ranges: ResetRanges, scheme: int, goal: wp.vec3, pos: wp.vec3, vz: float, jump_again: float
 ) -> JumpState:
     """Return the state of a new episode that begins with a scheme at a base position [m] and upward speed [m/s]."""
-    task = JumpState()
-    task.scheme = scheme
-    task.goal = goal
-    task.start = pos
-    task.max_height = pos[2]
-    task.command_step = draw_command(draw, ranges)
-    task.again_delay = ranges.again_delay
-    task.again_step = draw_again(draw, ranges.again_delay, jump_again)
+    state = JumpState()
+    state.scheme = scheme
+    state.goal = goal
+    state.start = pos
+    state.max_height = pos[2]
+    state.command_step = draw_command(draw, ranges)
+    state.again_delay = ranges.again_delay
+    state.again_step = draw_again(draw, ranges.again_delay, jump_again)
     if scheme == PUSHING or (scheme == STANDING and ranges.lean > 0.0):
-        task.start = wp.vec3(0.0, 0.0, pos[2])
+        state.start = wp.vec3(0.0, 0.0, pos[2])
     if scheme == PUSHING:
-        task.command_step = 0
+        state.command_step = 0
     if scheme == IN_FLIGHT or scheme == TOUCHDOWN:
-        task.phase = FLIGHT
-        task.command_step = 0
+        state.phase = FLIGHT
+        state.command_step = 0
         if vz <= 0.0:
-            task.apex_passed = 1
-            task.max_height = wp.max(goal[2], pos[2])
+            state.apex_passed = 1
+            state.max_height = wp.max(goal[2], pos[2])
     if scheme == AFTER_LANDING:
-        task.phase = LANDED
-        task.command_step = 0
-        task.apex_passed = 1
-        task.max_height = wp.max(goal[2], pos[2])
-        task.phase_steps = int(between(draw, streams.LANDED_STEPS, 0.0, 17.999))
-    return task
+        state.phase = LANDED
+        state.command_step = 0
+        state.apex_passed = 1
+        state.max_height = wp.max(goal[2], pos[2])
+        state.phase_steps = int(between(draw, streams.LANDED_STEPS, 0.0, 17.999))
+    return state
 
 
 @wp.func
 def begin_next_jump(old: JumpState, ground: Ground, goal: wp.vec3, pos: wp.vec3, heading: float) -> JumpState:
     """Return the state of an episode that goes on with another jump at once; goal relative to base and heading."""
-    task = old
-    task.heading = heading
-    task.goal = turned(goal, heading) + wp.vec3(pos[0], pos[1], 0.0)
-    task.goal_ground = surface(ground, task.goal[0], task.goal[1])[0]
-    task.start = pos
-    task.phase = STANCE
-    task.phase_steps = 0
-    task.command_step = old.steps
-    task.apex_passed = 0
-    task.idle_steps = 0
-    task.max_height = pos[2]
-    task.peak_tilt = 0.0
-    task.paws_landed = 0
-    task.again_step = 0
-    task.jumps = old.jumps + 1
-    return task
+    state = old
+    state.heading = heading
+    state.goal = turned(goal, heading) + wp.vec3(pos[0], pos[1], 0.0)
+    state.goal_ground = surface(ground, state.goal[0], state.goal[1])[0]
+    state.start = pos
+    state.phase = STANCE
+    state.phase_steps = 0
+    state.command_step = old.steps
+    state.apex_passed = 0
+    state.idle_steps = 0
+    state.max_height = pos[2]
+    state.peak_tilt = 0.0
+    state.paws_landed = 0
+    state.again_step = 0
+    state.jumps = old.jumps + 1
+    return state
 
 
 @wp.func
@@ -179,30 +179,30 @@ def reset_jump(
     start.ground = place_ground(scene.ground, start, settings.grounds, draw)
     scheme = write_start(arrays, scene, start, draw)
     vz = arrays.joint_qd[world * DOFS + 2]
-    task = begin_task(draw, ranges, scheme, start.goal, base_pos(arrays, world), vz, level.jump_again)
-    task.heading = start.heading
-    task.spent = spent
-    task.goal_ground = surface(start.ground, start.goal[0], start.goal[1])[0]
-    return task
+    state = begin_task(draw, ranges, scheme, start.goal, base_pos(arrays, world), vz, level.jump_again)
+    state.heading = start.heading
+    state.spent = spent
+    state.goal_ground = surface(start.ground, start.goal[0], start.goal[1])[0]
+    return state
 
 
 @wp.func
-def another_jump_due(task: JumpState) -> bool:
+def another_jump_due(state: JumpState) -> bool:
     """Return whether a landed robot gets another goal now."""
-    return task.phase == LANDED and task.again_step > 0 and task.phase_steps >= task.again_step
+    return state.phase == LANDED and state.again_step > 0 and state.phase_steps >= state.again_step
 
 
 @wp.func
-def draw_next_jump(robot: RobotView, scene: Scene, task: JumpState, level: JumpLevel, draw: Draw) -> JumpState:
+def draw_next_jump(robot: RobotView, scene: Scene, state: JumpState, level: JumpLevel, draw: Draw) -> JumpState:
     """Return the state of an episode that goes on with another jump, to a drawn goal."""
     goal = draw_goal(draw, level)
-    new = begin_next_jump(task, world_ground(scene.ground, robot.world), goal, robot.pos, yaw_of(robot.quat))
-    new.again_step = draw_again(draw, task.again_delay, level.jump_again)
+    new = begin_next_jump(state, world_ground(scene.ground, robot.world), goal, robot.pos, yaw_of(robot.quat))
+    new.again_step = draw_again(draw, state.again_delay, level.jump_again)
     return new
 
 
 @wp.func
-def give_jump(robot: RobotView, scene: Scene, task: JumpState, values: wp.vec4, heading: float) -> JumpState:
+def give_jump(robot: RobotView, scene: Scene, state: JumpState, values: wp.vec4, heading: float) -> JumpState:
     """Ask a robot that stands at its start, or has landed, for a jump.
 
     values: goal x, y [m] relative to base and heading, base height at the apex [m], and at a start the policy step of
@@ -210,10 +210,10 @@ def give_jump(robot: RobotView, scene: Scene, task: JumpState, values: wp.vec4, 
     """
     here = world_ground(scene.ground, robot.world)
     goal = wp.vec3(values[0], values[1], values[2])
-    if task.phase == LANDED:
-        return begin_next_jump(task, here, goal, robot.pos, heading)
-    if task.phase != STANCE or task.steps > 0:
-        return task
+    if state.phase == LANDED:
+        return begin_next_jump(state, here, goal, robot.pos, heading)
+    if state.phase != STANCE or state.steps > 0:
+        return state
     new = JumpState()
     new.heading = heading
     new.start = robot.pos
@@ -225,6 +225,6 @@ def give_jump(robot: RobotView, scene: Scene, task: JumpState, values: wp.vec4, 
 
 
 @wp.func
-def from_standing(task: JumpState) -> bool:
+def from_standing(state: JumpState) -> bool:
     """Return whether an episode began standing, and so counts for the curriculum."""
-    return task.scheme <= DEFAULT
+    return state.scheme <= DEFAULT

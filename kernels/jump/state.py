@@ -42,18 +42,18 @@ class JumpState:
 
 
 @wp.func
-def goal_offset(robot: RobotView, task: JumpState) -> wp.vec3:
+def goal_offset(robot: RobotView, state: JumpState) -> wp.vec3:
     """Return the horizontal way from the base to the goal [m], world axes."""
-    return wp.vec3(task.goal[0] - robot.pos[0], task.goal[1] - robot.pos[1], 0.0)
+    return wp.vec3(state.goal[0] - robot.pos[0], state.goal[1] - robot.pos[1], 0.0)
 
 
 @wp.func
-def commanded(task: JumpState) -> bool:
+def commanded(state: JumpState) -> bool:
     """Return whether a jump is asked for and not yet landed (the paper's c)."""
-    return task.steps >= task.command_step and task.phase != LANDED
+    return state.steps >= state.command_step and state.phase != LANDED
 
 
 @wp.func
-def waiting(task: JumpState) -> bool:
+def waiting(state: JumpState) -> bool:
     """Return whether a jump is asked for but the robot still stands."""
-    return task.phase == STANCE and task.steps >= task.command_step
+    return state.phase == STANCE and state.steps >= state.command_step

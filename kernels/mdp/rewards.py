@@ -41,42 +41,42 @@ def posture_offset(robot: RobotView, shift: float) -> float:
 
 
 @wp.func
-def ground_force(robot: RobotView, task: Any, weight_force: float) -> float:
+def ground_force(robot: RobotView, state: Any, weight_force: float) -> float:
     """Ground force L2: sum of squared paw forces over that of the robot's weight [N]."""
     return wp.dot(robot.paw_force, robot.paw_force) / (weight_force * weight_force)
 
 
 @wp.func
-def action_clip(robot: RobotView, task: Any) -> float:
+def action_clip(robot: RobotView, state: Any) -> float:
     """Action clip: squared distance that the command filter moved the targets [rad^2]."""
     return robot.clipped
 
 
 @wp.func
-def motor_torque_sq(robot: RobotView, task: Any) -> float:
+def motor_torque_sq(robot: RobotView, state: Any) -> float:
     """Motor torque: sum of squares [N^2 m^2]."""
     return square_sum(robot.torque)
 
 
 @wp.func
-def joint_acceleration(robot: RobotView, task: Any) -> float:
+def joint_acceleration(robot: RobotView, state: Any) -> float:
     """Joint acceleration: sum of squares [rad^2/s^4]."""
     return square_sum(robot.rate_change)
 
 
 @wp.func
-def action_rate(robot: RobotView, task: Any) -> float:
+def action_rate(robot: RobotView, state: Any) -> float:
     """Action rate: sum of squared changes of the action."""
     return square_sum(robot.action - robot.old_action)
 
 
 @wp.func
-def action_acceleration(robot: RobotView, task: Any) -> float:
+def action_acceleration(robot: RobotView, state: Any) -> float:
     """Action acceleration: sum of squared second differences of the action."""
     return square_sum(robot.action - 2.0 * robot.old_action + robot.older_action)
 
 
 @wp.func
-def collision(robot: RobotView, task: Any) -> float:
+def collision(robot: RobotView, state: Any) -> float:
     """Collision: 1 if anything but a paw touched the ground, or links touched each other."""
     return wp.where(robot.collisions != 0, 1.0, 0.0)

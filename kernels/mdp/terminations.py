@@ -11,36 +11,36 @@ from .view import RobotView, speed_limit_broken, tilt
 
 
 @wp.func
-def too_long(robot: RobotView, task: Any, steps: float) -> bool:
+def too_long(robot: RobotView, state: Any, steps: float) -> bool:
     """Episode of so many policy steps."""
-    return task.steps >= int(steps)
+    return state.steps >= int(steps)
 
 
 @wp.func
-def came_apart(robot: RobotView, task: Any) -> bool:
+def came_apart(robot: RobotView, state: Any) -> bool:
     """State non-finite or absurdly fast."""
     return speed_limit_broken(robot)
 
 
 @wp.func
-def low_base(robot: RobotView, task: Any, height: float) -> bool:
+def low_base(robot: RobotView, state: Any, height: float) -> bool:
     """Base less than a height [m] above the ground."""
     return robot.height < height
 
 
 @wp.func
-def tilted(robot: RobotView, task: Any, angle: float) -> bool:
+def tilted(robot: RobotView, state: Any, angle: float) -> bool:
     """Body z more than an angle [rad] from vertical."""
     return tilt(robot) > angle
 
 
 @wp.func
-def fallen(robot: RobotView, task: Any, angle: float) -> bool:
+def fallen(robot: RobotView, state: Any, angle: float) -> bool:
     """Body z more than an angle [rad] from vertical while a paw is on the ground."""
     return robot.contacts > 0 and tilt(robot) > angle
 
 
 @wp.func
-def collided(robot: RobotView, task: Any) -> bool:
+def collided(robot: RobotView, state: Any) -> bool:
     """Anything but a paw touched the ground, or links touched each other."""
     return robot.collisions != 0

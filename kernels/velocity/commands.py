@@ -62,9 +62,9 @@ def draw_velocity(draw: Draw, ranges: CommandRanges, level: int) -> wp.vec3:
 
 
 @wp.func
-def with_command(task: VelocityState, command: wp.vec3) -> VelocityState:
+def with_command(state: VelocityState, command: wp.vec3) -> VelocityState:
     """Return the state with a command that has just come."""
-    new = task
+    new = state
     new.command = command
     new.command_steps = 0
     new.standing = wp.where(wp.max(wp.abs(command)) < LEAST, 1, 0)
@@ -74,30 +74,30 @@ def with_command(task: VelocityState, command: wp.vec3) -> VelocityState:
 
 
 @wp.func
-def command_due(task: VelocityState) -> bool:
+def command_due(state: VelocityState) -> bool:
     """Return whether the command has lasted long enough."""
-    return task.command_lasts > 0 and task.command_steps >= task.command_lasts
+    return state.command_lasts > 0 and state.command_steps >= state.command_lasts
 
 
 @wp.func
 def draw_command(
-    robot: RobotView, scene: Scene, task: VelocityState, level: CommandRanges, draw: Draw
+    robot: RobotView, scene: Scene, state: VelocityState, level: CommandRanges, draw: Draw
 ) -> VelocityState:
     """Return the state of an episode that goes on with a drawn command."""
-    new = with_command(task, draw_velocity(draw, level, task.command_level))
+    new = with_command(state, draw_velocity(draw, level, state.command_level))
     new.command_lasts = wp.max(int(within(draw, streams.LASTS, level.lasts)), 1)
     return new
 
 
 @wp.func
 def give_velocity(
-    robot: RobotView, scene: Scene, task: VelocityState, values: wp.vec4, heading: float
+    robot: RobotView, scene: Scene, state: VelocityState, values: wp.vec4, heading: float
 ) -> VelocityState:
     """Command a velocity until another comes: ahead, to the left [m/s] and about z [rad/s], body axes.
 
     The fourth value is the gait's frequency [Hz], 0: as it was.
     """
-    new = with_command(task, wp.vec3(values[0], values[1], values[2]))
+    new = with_command(state, wp.vec3(values[0], values[1], values[2]))
     if values[3] > 0.0:
         new.pace = values[3] / POLICY_RATE
     new.command_lasts = 0

@@ -12,38 +12,38 @@ vec15 = wp.types.vector(length=15, dtype=wp.float32)
 
 
 @wp.func
-def command(robot: RobotView, task: VelocityState) -> wp.vec3:
+def command(robot: RobotView, state: VelocityState) -> wp.vec3:
     """Wanted velocity ahead and to the left [m/s] and yaw rate [rad/s], body axes."""
-    return task.command
+    return state.command
 
 
 @wp.func
-def clock(robot: RobotView, task: VelocityState) -> wp.vec2:
+def clock(robot: RobotView, state: VelocityState) -> wp.vec2:
     """Sine and cosine of the gait's phase."""
-    angle = 2.0 * wp.pi * task.phase
+    angle = 2.0 * wp.pi * state.phase
     return wp.vec2(wp.sin(angle), wp.cos(angle))
 
 
 @wp.func
-def command_age(robot: RobotView, task: VelocityState) -> float:
+def command_age(robot: RobotView, state: VelocityState) -> float:
     """Time since the command, at most 2 s."""
-    return wp.min(float(task.command_steps) / POLICY_RATE, 2.0)
+    return wp.min(float(state.command_steps) / POLICY_RATE, 2.0)
 
 
 @wp.func
-def contact_times(robot: RobotView, task: VelocityState) -> wp.vec4:
+def contact_times(robot: RobotView, state: VelocityState) -> wp.vec4:
     """Time that each paw has been on the ground, at most 1 s."""
     return wp.min(robot.contact_time, wp.vec4(1.0))
 
 
 @wp.func
-def recent_steps(robot: RobotView, task: VelocityState) -> wp.vec4:
+def recent_steps(robot: RobotView, state: VelocityState) -> wp.vec4:
     """How often each paw came down in the last 0.75 s."""
-    return task.recent_steps
+    return state.recent_steps
 
 
 @wp.func
-def paw_heights(robot: RobotView, task: VelocityState) -> wp.vec4:
+def paw_heights(robot: RobotView, state: VelocityState) -> wp.vec4:
     """Height of each paw above the ground below it [m], times ten."""
     return 10.0 * robot.paw_height
 

@@ -33,7 +33,7 @@ STRETCH = torch.tensor([0.0, -1.0, -1.0] * 4).repeat(N, 1)
 
 
 @wp.func
-def my_own_term(robot: RobotView, task: JumpState, scale: float) -> float:
+def my_own_term(robot: RobotView, state: JumpState, scale: float) -> float:
     """Height of the base times a scale."""
     return scale * robot.pos[2]
 

@@ -27,13 +27,13 @@ SKILL = np.arange(N) % 3 == 1
 
 
 @wp.func
-def always(robot: RobotView, task: HoldState, requested: bool) -> bool:
+def always(robot: RobotView, state: HoldState, requested: bool) -> bool:
     return True
 
 
 @wp.func
-def go_on_holding(robot: RobotView, task: HoldState) -> HoldState:
-    return task
+def go_on_holding(robot: RobotView, state: HoldState) -> HoldState:
+    return state
 
 
 TO_JUMP = Handover(HOLD, JUMP, when_asked_to_jump, begin_jump)

@@ -38,7 +38,7 @@ HOLD = hold_height.hold_height()
 
 
 @wp.func
-def in_the_air(robot: RobotView, task: JumpState, requested: bool) -> bool:
+def in_the_air(robot: RobotView, state: JumpState, requested: bool) -> bool:
     return robot.contacts == 0
 
 

@@ -74,12 +74,12 @@ class HoldLevelCfg:
 
 
 @wp.func
-def advance_hold(view: mdp.RobotView, task: HoldState, tolerance: float) -> HoldState:
+def advance_hold(view: mdp.RobotView, state: HoldState, tolerance: float) -> HoldState:
     """Count steps, and those near the goal up to a tolerance [m]."""
-    new = task
-    new.steps = task.steps + 1
-    new.age = task.age + 1
-    new.near = wp.where(wp.abs(view.height - task.goal) < tolerance, task.near + 1, 0)
+    new = state
+    new.steps = state.steps + 1
+    new.age = state.age + 1
+    new.near = wp.where(wp.abs(view.height - state.goal) < tolerance, state.near + 1, 0)
     return new
 
 
@@ -97,9 +97,9 @@ def reset_hold(
 
 
 @wp.func
-def give_hold(view: mdp.RobotView, scene: mdp.Scene, task: HoldState, values: wp.vec4, heading: float) -> HoldState:
+def give_hold(view: mdp.RobotView, scene: mdp.Scene, state: HoldState, values: wp.vec4, heading: float) -> HoldState:
     """Command a height [m], the first of the values, until another comes."""
-    new = task
+    new = state
     new.goal = values[0]
     new.age = 0
     new.lasts = 0
@@ -107,48 +107,48 @@ def give_hold(view: mdp.RobotView, scene: mdp.Scene, task: HoldState, values: wp
 
 
 @wp.func
-def another_goal_due(task: HoldState) -> bool:
+def another_goal_due(state: HoldState) -> bool:
     """Whether the command has lasted long enough."""
-    return task.lasts > 0 and task.age >= task.lasts
+    return state.lasts > 0 and state.age >= state.lasts
 
 
 @wp.func
-def draw_goal(view: mdp.RobotView, scene: mdp.Scene, task: HoldState, level: HoldLevel, draw: mdp.Draw) -> HoldState:
+def draw_goal(view: mdp.RobotView, scene: mdp.Scene, state: HoldState, level: HoldLevel, draw: mdp.Draw) -> HoldState:
     """Command another height."""
-    new = task
+    new = state
     new.goal = mdp.within(draw, 1, level.goal)
     new.age = 0
     return new
 
 
 @wp.func
-def height_error(view: mdp.RobotView, task: HoldState) -> float:
+def height_error(view: mdp.RobotView, state: HoldState) -> float:
     """Distance from the commanded height [m]."""
-    return wp.abs(view.height - task.goal)
+    return wp.abs(view.height - state.goal)
 
 
 @wp.func
-def every_episode(task: HoldState) -> bool:
+def every_episode(state: HoldState) -> bool:
     """All episodes count."""
     return True
 
 
 @wp.func
-def near_goal(view: mdp.RobotView, task: HoldState, width: float) -> float:
+def near_goal(view: mdp.RobotView, state: HoldState, width: float) -> float:
     """Closeness to the commanded height; width [m]: of the kernel."""
-    return mdp.rewards.psi(view.height - task.goal, width)
+    return mdp.rewards.psi(view.height - state.goal, width)
 
 
 @wp.func
-def held(view: mdp.RobotView, task: HoldState, steps: float) -> bool:
+def held(view: mdp.RobotView, state: HoldState, steps: float) -> bool:
     """Near the goal for so many policy steps in a row."""
-    return task.near >= int(steps)
+    return state.near >= int(steps)
 
 
 @wp.func
-def wanted_height(view: mdp.RobotView, task: HoldState) -> float:
+def wanted_height(view: mdp.RobotView, state: HoldState) -> float:
     """The commanded height [m]."""
-    return task.goal
+    return state.goal
 
 
 @wp.func

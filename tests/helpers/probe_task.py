@@ -76,11 +76,11 @@ class ProbeLevelCfg:
 
 
 @wp.func
-def advance_probe(robot: RobotView, task: ProbeState, growth: float) -> ProbeState:
+def advance_probe(robot: RobotView, state: ProbeState, growth: float) -> ProbeState:
     """Let the value grow."""
-    new = task
-    new.steps = task.steps + 1
-    new.value = task.value + growth
+    new = state
+    new.steps = state.steps + 1
+    new.value = state.value + growth
     return new
 
 
@@ -99,69 +99,69 @@ def reset_probe(
 
 
 @wp.func
-def give_probe(robot: RobotView, scene: Scene, task: ProbeState, values: wp.vec4, heading: float) -> ProbeState:
+def give_probe(robot: RobotView, scene: Scene, state: ProbeState, values: wp.vec4, heading: float) -> ProbeState:
     """Take over the first value and the heading."""
-    new = task
+    new = state
     new.value = values[0]
     new.other = heading
     return new
 
 
 @wp.func
-def command_due(task: ProbeState) -> bool:
+def command_due(state: ProbeState) -> bool:
     """Due at a value of 7."""
-    return task.value == 7.0
+    return state.value == 7.0
 
 
 @wp.func
-def draw_command(robot: RobotView, scene: Scene, task: ProbeState, level: ProbeLevel, draw: Draw) -> ProbeState:
+def draw_command(robot: RobotView, scene: Scene, state: ProbeState, level: ProbeLevel, draw: Draw) -> ProbeState:
     """Keep a draw in `other` and the level in `counts`."""
-    new = task
+    new = state
     new.other = between(draw, 0, 0.0, 1.0)
     new.counts = level.number
     return new
 
 
 @wp.func
-def value(robot: RobotView, task: ProbeState) -> float:
+def value(robot: RobotView, state: ProbeState) -> float:
     """The value."""
-    return task.value
+    return state.value
 
 
 @wp.func
-def offset_square(robot: RobotView, task: ProbeState, offset: float, scale: float) -> float:
+def offset_square(robot: RobotView, state: ProbeState, offset: float, scale: float) -> float:
     """Squared distance of the value from an offset, times a scale."""
-    return scale * (task.value - offset) * (task.value - offset)
+    return scale * (state.value - offset) * (state.value - offset)
 
 
 @wp.func
-def other(robot: RobotView, task: ProbeState) -> float:
+def other(robot: RobotView, state: ProbeState) -> float:
     """The other number."""
-    return task.other
+    return state.other
 
 
 @wp.func
-def base_height(robot: RobotView, task: Any) -> float:
+def base_height(robot: RobotView, state: Any) -> float:
     """Height of the base [m]."""
     return robot.height
 
 
 @wp.func
-def other_above(robot: RobotView, task: ProbeState, limit: float) -> bool:
+def other_above(robot: RobotView, state: ProbeState, limit: float) -> bool:
     """Whether the other number is above a limit."""
-    return task.other > limit
+    return state.other > limit
 
 
 @wp.func
-def counts(task: ProbeState) -> bool:
+def counts(state: ProbeState) -> bool:
     """Whether the episode counts for the curriculum."""
-    return task.counts != 0
+    return state.counts != 0
 
 
 @wp.func
-def both(robot: RobotView, task: ProbeState) -> wp.vec2:
+def both(robot: RobotView, state: ProbeState) -> wp.vec2:
     """Both numbers."""
-    return wp.vec2(task.value, task.other)
+    return wp.vec2(state.value, state.other)
 
 
 @wp.func

@@ -23,7 +23,7 @@ JUMP = "jumper_warp.kernels.jump"
 
 
 @wp.func
-def rest(robot: RobotView, task: Any, speed: float, spin: float) -> float:
+def rest(robot: RobotView, state: Any, speed: float, spin: float) -> float:
     """Another rest than the project's, with the same numbers."""
     return speed + spin
 
@@ -91,7 +91,7 @@ def test_sections_of_a_training_can_be_left_out_with_their_functions():
 
 def local_func():
     @wp.func
-    def inner(robot: RobotView, task: Any) -> float:
+    def inner(robot: RobotView, state: Any) -> float:
         return 1.0
 
     return inner
