@@ -5,7 +5,7 @@ import warp as wp
 from .env import EnvArrays
 from .options import FAST
 from .parameters import RobotParameters
-from .random import EVENT, INTERVAL, Draw, between, make_draw
+from .random import EVENT, INTERVAL, Draw, between, make_stream
 
 STARTUP, AT_RESET, AT_STEP = 0, 1, 2
 LANES = 8
@@ -52,7 +52,7 @@ def make_event_kernel(slots: list) -> wp.Kernel:
             return
         for i in range(wp.static(len(slots))):
             if row == i and (wp.static(bool(slots[i].spread)) or lane == 0):
-                draw = make_draw(env.seed, world, env.clock[world], EVENT + 100 * stage + i)
+                draw = make_stream(env.seed, world, env.clock[world], EVENT + 100 * stage + i)
                 if wp.static(bool(slots[i].spread)):
                     draw.lane = lane
                     draw.lanes = lanes

@@ -8,7 +8,7 @@ from ..terrain.ground import Ground
 from .env import BEGUN, COMMANDED, RING, EnvArrays
 from .options import FAST
 from .parameters import RobotParameters
-from .random import OBSERVATION, cut_gaussian, draw_at, moment_of
+from .random import OBSERVATION, cut_gaussian, step_key, stream_at
 from .view import RobotArrays, load_view
 
 wp.set_module_options(FAST)
@@ -147,7 +147,7 @@ class Moment:
     """What all components of a world have in common in a step."""
 
     world: int
-    draws: wp.uint32  # see `moment_of`
+    draws: wp.uint32  # see `step_key`
     fresh: int  # as in `EnvArrays`
     broken: bool
     now: int  # place in the rings of past values
@@ -163,7 +163,7 @@ def moment(env: EnvArrays, arrays: ObservationArrays, world: int) -> Moment:
     whole = arrays.latency[world] // arrays.substeps
     m = Moment()
     m.world = world
-    m.draws = moment_of(env.seed, world, clock)
+    m.draws = step_key(env.seed, world, clock)
     m.fresh = env.fresh[world]
     m.broken = env.broken[world] != 0
     m.now = clock % RING
@@ -194,7 +194,7 @@ def condition(arrays: ObservationArrays, column: Column, p: wp.array(dtype=float
         value = late(arrays, m, column.past, value)
     noise = p[column.noise]
     if noise > 0.0:
-        value += noise * cut_gaussian(draw_at(m.draws, m.world, OBSERVATION + column.group), column.oldest)
+        value += noise * cut_gaussian(stream_at(m.draws, m.world, OBSERVATION + column.group), column.oldest)
     value = or_zero(p[column.scale] * wp.clamp(value, -p[column.clip], p[column.clip]), m.broken)
     i = column.start + m.world * column.stride + column.oldest
     again = beginning != 0 and m.fresh == COMMANDED

@@ -24,13 +24,13 @@ class Draw:
 
 
 @wp.func
-def moment_of(seed: int, world: int, clock: int) -> wp.uint32:
+def step_key(seed: int, world: int, clock: int) -> wp.uint32:
     """Return what the numbers of all streams at one moment begin with; clock: policy steps that the world has made."""
     return wp.rand_init(int(wp.rand_init(seed, world)), clock)
 
 
 @wp.func
-def draw_at(moment: wp.uint32, world: int, stream: int) -> Draw:
+def stream_at(moment: wp.uint32, world: int, stream: int) -> Draw:
     """Return the numbers of a stream at a moment."""
     draw = Draw()
     draw.world = world
@@ -40,9 +40,9 @@ def draw_at(moment: wp.uint32, world: int, stream: int) -> Draw:
 
 
 @wp.func
-def make_draw(seed: int, world: int, clock: int, stream: int) -> Draw:
+def make_stream(seed: int, world: int, clock: int, stream: int) -> Draw:
     """Return the numbers of a stream; clock: policy steps that the world has made."""
-    return draw_at(moment_of(seed, world, clock), world, stream)
+    return stream_at(step_key(seed, world, clock), world, stream)
 
 
 @wp.func

@@ -12,7 +12,7 @@ from ..terrain.ground import rest_block, surface, world_ground
 from .attempts import meet_attempts
 from .env import BEGUN, COMMANDED, RING, Delays, EnvArrays, Scene, SkillSettings
 from .options import FAST
-from .random import ANY_LEVEL, COMMAND, RESET, between, make_draw
+from .random import ANY_LEVEL, COMMAND, RESET, between, make_stream
 from .track import follow_paw
 from .view import RobotArrays, base_quat, base_velocity, load_view, yaw_of
 
@@ -62,7 +62,7 @@ def make_reset_kernel(task: Any) -> wp.Kernel:
             commanded = wp.static(due)(states[world])
         if not (begins or commanded):
             return
-        draw = make_draw(env.seed, world, env.clock[world], RESET)
+        draw = make_stream(env.seed, world, env.clock[world], RESET)
         draw.lane = lane
         draw.lanes = lanes
         level = env.level[world]
@@ -79,7 +79,7 @@ def make_reset_kernel(task: Any) -> wp.Kernel:
         elif wp.static(command is not None):
             if lane == 0:
                 robot = load_view(arrays, scene.ground, world)
-                fresh = make_draw(env.seed, world, env.clock[world], COMMAND)
+                fresh = make_stream(env.seed, world, env.clock[world], COMMAND)
                 states[world] = wp.static(command)(robot, scene, states[world], levels[level], fresh)
                 env.fresh[world] = COMMANDED
 

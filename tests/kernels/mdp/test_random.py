@@ -5,7 +5,7 @@ import pytest
 import warp as wp
 from scipy.stats import kstest
 
-from jumper_warp.kernels.mdp.random import between, branch, cut_gaussian, make_draw, within
+from jumper_warp.kernels.mdp.random import between, branch, cut_gaussian, make_stream, within
 from mdp_helpers import array
 
 WORLDS, COLUMNS = 4096, 8
@@ -28,7 +28,7 @@ def draw_kernel(
 ):
     """Draw columns from `first` on; branch_of < 0: from the stream itself."""
     i = wp.tid()
-    draw = make_draw(seed, worlds[i], clock, stream)
+    draw = make_stream(seed, worlds[i], clock, stream)
     if branch_of >= 0:
         draw = branch(draw, branch_of)
     seeds[i] = draw.seed
@@ -172,5 +172,5 @@ def truncated(x):
 
 
 def test_a_draw_belongs_to_its_world():
-    draw = make_draw(3, 12, 40, 1)
+    draw = make_stream(3, 12, 40, 1)
     assert draw.world == 12 and branch(draw, 5).world == 12
