@@ -21,7 +21,7 @@ from jumper_warp.kernels.mdp import observations, rewards, terminations
 from jumper_warp.kernels.mdp import parameters as events
 from jumper_warp.kernels.mdp.env import Scene, SkillSettings
 from jumper_warp.kernels.mdp.parameters import RobotParameters
-from jumper_warp.kernels.mdp.random import Draw, between, branch, cut_gaussian, within
+from jumper_warp.kernels.mdp.random import Draw, between, branch, clamped_normal, within
 from jumper_warp.kernels.mdp.reset import store_pose
 from jumper_warp.kernels.mdp.view import RobotArrays, RobotView, tilt, vec12, yaw_of
 from jumper_warp.kernels.terrain.ground import Ground, surface, world_ground
@@ -66,8 +66,8 @@ __all__ = [
     "VelocityState",
     "between",
     "branch",
+    "clamped_normal",
     "commanded",
-    "cut_gaussian",
     "events",
     "observations",
     "rewards",

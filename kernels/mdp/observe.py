@@ -8,7 +8,7 @@ from ..terrain.ground import Ground
 from .env import BEGUN, COMMANDED, RING, EnvArrays
 from .options import FAST
 from .parameters import RobotParameters
-from .random import OBSERVATION, cut_gaussian, step_key, stream_at
+from .random import OBSERVATION, clamped_normal, step_key, stream_at
 from .view import RobotArrays, load_view
 
 wp.set_module_options(FAST)
@@ -194,7 +194,7 @@ def condition(arrays: ObservationArrays, column: Column, p: wp.array(dtype=float
         value = late(arrays, m, column.past, value)
     noise = p[column.noise]
     if noise > 0.0:
-        value += noise * cut_gaussian(stream_at(m.draws, m.world, OBSERVATION + column.group), column.oldest)
+        value += noise * clamped_normal(stream_at(m.draws, m.world, OBSERVATION + column.group), column.oldest)
     value = or_zero(p[column.scale] * wp.clamp(value, -p[column.clip], p[column.clip]), m.broken)
     i = column.start + m.world * column.stride + column.oldest
     again = beginning != 0 and m.fresh == COMMANDED

@@ -66,6 +66,6 @@ def within(draw: Draw, i: int, pair: wp.vec2) -> float:
 
 
 @wp.func
-def cut_gaussian(draw: Draw, i: int) -> float:
+def clamped_normal(draw: Draw, i: int) -> float:
     """Return the i-th number, standard normal, cut at one standard deviation."""
     return wp.clamp(wp.randn(wp.rand_init(int(draw.seed), i)), -1.0, 1.0)

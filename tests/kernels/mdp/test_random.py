@@ -5,7 +5,7 @@ import pytest
 import warp as wp
 from scipy.stats import kstest
 
-from jumper_warp.kernels.mdp.random import between, branch, cut_gaussian, make_stream, within
+from jumper_warp.kernels.mdp.random import between, branch, clamped_normal, make_stream, within
 from mdp_helpers import array
 
 WORLDS, COLUMNS = 4096, 8
@@ -35,7 +35,7 @@ def draw_kernel(
     for j in range(uniform.shape[1]):
         uniform[i, j] = between(draw, first + j, -2.0, 3.0)
         pairs[i, j] = within(draw, first + j, wp.vec2(-2.0, 3.0))
-        normal[i, j] = cut_gaussian(draw, first + j)
+        normal[i, j] = clamped_normal(draw, first + j)
 
 
 def draws(worlds=None, seed=7, clock=16, stream=1, branch_of=-1, first=0, columns=COLUMNS):
