@@ -3,7 +3,7 @@
 import warp as wp
 
 from ..mdp.env import Scene
-from ..mdp.random import Draw, between, branch, within
+from ..mdp.random import Draw, branch, uniform, uniform_range
 from ..mdp.view import RobotView
 from . import streams
 from .state import AttitudeState, with_goal
@@ -22,9 +22,9 @@ class TurnRanges:
 @wp.func
 def draw_unit_quat(draw: Draw) -> wp.quat:
     """Return a random orientation (xyzw), uniform over all (Shoemake 1992)."""
-    a = between(draw, streams.QUAT, 0.0, 1.0)
-    b = between(draw, streams.QUAT + 1, 0.0, 2.0 * wp.pi)
-    c = between(draw, streams.QUAT + 2, 0.0, 2.0 * wp.pi)
+    a = uniform(draw, streams.QUAT, 0.0, 1.0)
+    b = uniform(draw, streams.QUAT + 1, 0.0, 2.0 * wp.pi)
+    c = uniform(draw, streams.QUAT + 2, 0.0, 2.0 * wp.pi)
     s = wp.sqrt(1.0 - a)
     r = wp.sqrt(a)
     return wp.quat(s * wp.sin(b), s * wp.cos(b), r * wp.sin(c), r * wp.cos(c))
@@ -33,13 +33,13 @@ def draw_unit_quat(draw: Draw) -> wp.quat:
 @wp.func
 def draw_axis(draw: Draw, axis_share: float) -> wp.vec3:
     """Return a unit vector: one of the body's axes in a share of draws, else any, uniform over the sphere."""
-    sign = wp.where(between(draw, streams.SIGN, 0.0, 1.0) < 0.5, -1.0, 1.0)
-    if between(draw, streams.ALONG_BODY, 0.0, 1.0) < axis_share:
+    sign = wp.where(uniform(draw, streams.SIGN, 0.0, 1.0) < 0.5, -1.0, 1.0)
+    if uniform(draw, streams.ALONG_BODY, 0.0, 1.0) < axis_share:
         axis = wp.vec3(0.0)
-        axis[wp.min(int(between(draw, streams.BODY_AXIS, 0.0, 3.0)), 2)] = sign
+        axis[wp.min(int(uniform(draw, streams.BODY_AXIS, 0.0, 3.0)), 2)] = sign
         return axis
-    z = between(draw, streams.AXIS_Z, -1.0, 1.0)
-    around = between(draw, streams.AXIS_AROUND, 0.0, 2.0 * wp.pi)
+    z = uniform(draw, streams.AXIS_Z, -1.0, 1.0)
+    around = uniform(draw, streams.AXIS_AROUND, 0.0, 2.0 * wp.pi)
     r = wp.sqrt(1.0 - z * z)
     return wp.vec3(r * wp.cos(around), r * wp.sin(around), z)
 
@@ -48,7 +48,7 @@ def draw_axis(draw: Draw, axis_share: float) -> wp.vec3:
 def draw_turn(draw: Draw, ranges: TurnRanges) -> wp.quat:
     """Return a drawn turn (xyzw), body axes."""
     axis = draw_axis(branch(draw, streams.AXIS_BRANCH), ranges.axis_share)
-    return wp.quat_from_axis_angle(axis, within(draw, streams.ANGLE, ranges.angle))
+    return wp.quat_from_axis_angle(axis, uniform_range(draw, streams.ANGLE, ranges.angle))
 
 
 @wp.func

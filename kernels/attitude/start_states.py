@@ -7,7 +7,7 @@ from ..kinematics.inverse import LegLimits
 from ..layout import BODIES
 from ..mdp.attempts import ATTEMPTS, sample_valid_state
 from ..mdp.env import Scene, SkillSettings
-from ..mdp.random import Draw, between, within
+from ..mdp.random import Draw, uniform, uniform_range
 from ..mdp.reset import leg_limits
 from ..mdp.starts import LegSample
 from ..mdp.view import RobotArrays
@@ -62,9 +62,9 @@ def sample_leg(start: AttitudeStart, base: AttitudeStart, geo: LegGeometry, draw
         found.reachable = True
         return found
     found.angles = wp.vec3(
-        within(draw, streams.LATERAL + leg, start.settings.lateral),
-        within(draw, streams.OUTER + leg, start.settings.transversal),
-        within(draw, streams.INNER + leg, start.settings.transversal),
+        uniform_range(draw, streams.LATERAL + leg, start.settings.lateral),
+        uniform_range(draw, streams.OUTER + leg, start.settings.transversal),
+        uniform_range(draw, streams.INNER + leg, start.settings.transversal),
     )
     total = found.angles[1] + found.angles[2]
     found.reachable = total > start.limits.sum_lower and total < start.limits.sum_upper
@@ -82,12 +82,12 @@ def write_start(
     start.pos = wp.vec3(0.0, 0.0, surface(start.ground, 0.0, 0.0)[0] + settings.height)
     start.quat = quat
     start.ang_vel = wp.vec3(
-        between(draw, streams.SPIN, -w, w),
-        between(draw, streams.SPIN + 1, -w, w),
-        between(draw, streams.SPIN + 2, -w, w),
+        uniform(draw, streams.SPIN, -w, w),
+        uniform(draw, streams.SPIN + 1, -w, w),
+        uniform(draw, streams.SPIN + 2, -w, w),
     )
     start.com_vel = wp.cross(start.ang_vel, wp.quat_rotate(quat, arrays.body_com[draw.world * BODIES]))
-    start.default_legs = between(draw, streams.DEFAULT_LEGS, 0.0, 1.0) < settings.default_share
+    start.default_legs = uniform(draw, streams.DEFAULT_LEGS, 0.0, 1.0) < settings.default_share
     start.default_angle = arrays.default_angle
     start.settings = settings
     start.limits = leg_limits(skill.command_filter)

@@ -4,7 +4,7 @@ import warp as wp
 
 from ..layout import DOFS
 from ..mdp.env import Scene, SkillSettings
-from ..mdp.random import Draw, between, within
+from ..mdp.random import Draw, uniform, uniform_range
 from ..mdp.reset import leg_limits
 from ..mdp.view import RobotArrays, RobotView, base_pos, turned, yaw_of
 from ..terrain.ground import Block, Ground, rest_block, surface, world_ground
@@ -64,9 +64,9 @@ def draw_goal(draw: Draw, level: JumpLevel) -> wp.vec3:
     lower = level.goal_lower
     upper = level.goal_upper
     goal = wp.vec3(
-        between(draw, streams.GOAL, lower[0], upper[0]),
-        between(draw, streams.GOAL + 1, lower[1], upper[1]),
-        between(draw, streams.GOAL + 2, lower[2], upper[2]),
+        uniform(draw, streams.GOAL, lower[0], upper[0]),
+        uniform(draw, streams.GOAL + 1, lower[1], upper[1]),
+        uniform(draw, streams.GOAL + 2, lower[2], upper[2]),
     )
     if level.round != 0:
         goal = rounded(goal, lower, upper)
@@ -79,14 +79,14 @@ def draw_again(draw: Draw, delay: wp.vec2, share: float) -> int:
 
     delay: range in policy steps.
     """
-    steps = int(within(draw, streams.AGAIN_STEP, delay))
-    return wp.where(between(draw, streams.AGAIN, 0.0, 1.0) < share, wp.max(steps, 1), 0)
+    steps = int(uniform_range(draw, streams.AGAIN_STEP, delay))
+    return wp.where(uniform(draw, streams.AGAIN, 0.0, 1.0) < share, wp.max(steps, 1), 0)
 
 
 @wp.func
 def draw_command(draw: Draw, ranges: ResetRanges) -> int:
     """Return at which policy step the jump is commanded: uniform, a share of the draws in the longer of two ranges."""
-    u = between(draw, streams.COMMAND_STEP, 0.0, 1.0)
+    u = uniform(draw, streams.COMMAND_STEP, 0.0, 1.0)
     share = ranges.long_wait_share
     soon = (u - share) / wp.max(1.0 - share, 1.0e-6) * (float(ranges.command_delay) + 0.999)
     later = u / wp.max(share, 1.0e-6) * (float(ranges.long_wait) + 0.999)
@@ -121,7 +121,7 @@ def begin_task(
         state.command_step = 0
         state.apex_passed = 1
         state.max_height = wp.max(goal[2], pos[2])
-        state.phase_steps = int(between(draw, streams.LANDED_STEPS, 0.0, 17.999))
+        state.phase_steps = int(uniform(draw, streams.LANDED_STEPS, 0.0, 17.999))
     return state
 
 
@@ -171,7 +171,7 @@ def reset_jump(
     spent[old.scheme] += float(old.steps)
     start = JumpStart()
     start.scheme = draw_scheme(draw, ranges, spent)
-    start.heading = between(draw, streams.HEADING, -ranges.heading, ranges.heading)
+    start.heading = uniform(draw, streams.HEADING, -ranges.heading, ranges.heading)
     start.goal = turned(draw_goal(draw, level), start.heading)
     start.base_height = level.base_height
     start.ranges = ranges

@@ -15,7 +15,7 @@ from ..kinematics.leg import leg_forward_kinematics
 from ..layout import BODIES
 from ..mdp.attempts import sample_valid_state
 from ..mdp.env import Scene
-from ..mdp.random import Draw, between, within
+from ..mdp.random import Draw, uniform, uniform_range
 from ..mdp.reset import store_pose
 from ..mdp.starts import LegSample, leg_over_ground, leg_to, place_beside, turn_of
 from ..mdp.view import RobotArrays, turned
@@ -132,23 +132,23 @@ def draw_scheme(draw: Draw, ranges: ResetRanges, spent: vec_schemes) -> int:
     """Return the scheme of a new episode; shares of time are drawn once, and then what lacks most comes next."""
     if ranges.of_time != 0 and wp.length_sq(spent) > 0.0:
         return most_lacking(ranges.shares, spent)
-    return scheme_of_shares(ranges.shares, between(draw, streams.SCHEME, 0.0, 1.0))
+    return scheme_of_shares(ranges.shares, uniform(draw, streams.SCHEME, 0.0, 1.0))
 
 
 @wp.func
 def sample_quat(draw: Draw, ranges: ResetRanges, heading: float, pitch: float) -> wp.quat:
     """Return an orientation (xyzw) around a heading and a pitch [rad]."""
-    yaw = heading + between(draw, streams.YAW, -ranges.tilt, ranges.tilt)
-    tip = pitch + between(draw, streams.PITCH, -ranges.tilt, ranges.tilt)
-    roll = between(draw, streams.ROLL, -ranges.tilt, ranges.tilt)
+    yaw = heading + uniform(draw, streams.YAW, -ranges.tilt, ranges.tilt)
+    tip = pitch + uniform(draw, streams.PITCH, -ranges.tilt, ranges.tilt)
+    roll = uniform(draw, streams.ROLL, -ranges.tilt, ranges.tilt)
     return turn_of(yaw, tip, roll)
 
 
 @wp.func
 def sample_offset(draw: Draw, ranges: ResetRanges) -> wp.vec3:
     """Return a horizontal offset [m] of the base."""
-    x = between(draw, streams.OFFSET_X, -ranges.base_xy, ranges.base_xy)
-    return wp.vec3(x, between(draw, streams.OFFSET_Y, -ranges.base_xy, ranges.base_xy), 0.0)
+    x = uniform(draw, streams.OFFSET_X, -ranges.base_xy, ranges.base_xy)
+    return wp.vec3(x, uniform(draw, streams.OFFSET_Y, -ranges.base_xy, ranges.base_xy), 0.0)
 
 
 @wp.func
@@ -166,9 +166,9 @@ def standing(start: JumpStart, draw: Draw) -> JumpBase:
     ranges = start.ranges
     lower = start.base_height[0]
     upper = start.base_height[1]
-    height = within(draw, streams.HEIGHT, start.base_height)
-    tip = between(draw, streams.FORWARD_PITCH, 0.0, ranges.forward_pitch)
-    lean = (upper - height) / wp.max(upper - lower, 1.0e-6) * between(draw, streams.LEAN, 0.0, ranges.lean)
+    height = uniform_range(draw, streams.HEIGHT, start.base_height)
+    tip = uniform(draw, streams.FORWARD_PITCH, 0.0, ranges.forward_pitch)
+    lean = (upper - height) / wp.max(upper - lower, 1.0e-6) * uniform(draw, streams.LEAN, 0.0, ranges.lean)
     base = JumpBase()
     base.quat = sample_quat(draw, ranges, start.heading, tip)
     base.pos = sample_offset(draw, ranges) + wp.vec3(0.0, 0.0, height) - lean * direction(start)
@@ -182,10 +182,10 @@ def just_landed(start: JumpStart, draw: Draw) -> JumpBase:
     base = JumpBase()
     base.quat = sample_quat(draw, ranges, start.heading, 0.0)
     base.spot = wp.vec3(start.goal[0], start.goal[1], 0.0)
-    ahead = within(draw, streams.LANDED_AHEAD, ranges.landed_ahead)
+    ahead = uniform_range(draw, streams.LANDED_AHEAD, ranges.landed_ahead)
     base.pos = sample_offset(draw, ranges) + base.spot + ahead * direction(start)
-    base.pos[2] = within(draw, streams.LANDED_HEIGHT, ranges.landed_height)
-    base.lin_vel = wp.vec3(0.0, 0.0, -within(draw, streams.LANDED_SPEED, ranges.landed_speed))
+    base.pos[2] = uniform_range(draw, streams.LANDED_HEIGHT, ranges.landed_height)
+    base.lin_vel = wp.vec3(0.0, 0.0, -uniform_range(draw, streams.LANDED_SPEED, ranges.landed_speed))
     return base
 
 
@@ -195,7 +195,7 @@ def takeoff_speed(draw: Draw, ranges: ResetRanges, height: float, distance: floa
     if apex > 0.0:
         return wp.sqrt(wp.max(2.0 * g * (apex - height), 0.0))
     # height + v_z t - g t^2 / 2 = landing_height, where v_z t = distance tan(angle)
-    climb = distance * wp.tan(within(draw, streams.TAKEOFF_ANGLE, ranges.takeoff_angle))
+    climb = distance * wp.tan(uniform_range(draw, streams.TAKEOFF_ANGLE, ranges.takeoff_angle))
     t = wp.sqrt(wp.max(2.0 * (height - ranges.landing_height + climb) / g, 1.0e-6))
     limit = wp.sqrt(wp.max(2.0 * g * (ranges.highest_apex - height), 0.0))
     return wp.min(climb / t, limit)
@@ -206,21 +206,23 @@ def in_flight(start: JumpStart, draw: Draw, g: float) -> JumpBase:
     """Return a base on the projectile to the goal: anywhere, shortly before touchdown, or for a push at the takeoff."""
     ranges = start.ranges
     along = direction(start)
-    height = within(draw, streams.TAKEOFF_HEIGHT, ranges.takeoff_height)
+    height = uniform_range(draw, streams.TAKEOFF_HEIGHT, ranges.takeoff_height)
     way = wp.length(wp.vec3(start.goal[0], start.goal[1], 0.0))
-    ahead = wp.min(within(draw, streams.TAKEOFF_AHEAD, ranges.takeoff_ahead), way)
+    ahead = wp.min(uniform_range(draw, streams.TAKEOFF_AHEAD, ranges.takeoff_ahead), way)
     distance = way - ahead
     up = takeoff_speed(draw, ranges, height, distance, start.goal[2], g)
     duration = wp.max(time_to_height(height, up, ranges.landing_height, g), 1.0e-3)
     forward = distance / duration
-    t = duration * within(draw, streams.FLIGHT_TIME, ranges.flight_time)
+    t = duration * uniform_range(draw, streams.FLIGHT_TIME, ranges.flight_time)
     if start.scheme == TOUCHDOWN:
-        t = wp.max(duration - within(draw, streams.TOUCHDOWN_TIME, ranges.touchdown_time), 0.0)
+        t = wp.max(duration - uniform_range(draw, streams.TOUCHDOWN_TIME, ranges.touchdown_time), 0.0)
     if start.scheme == PUSHING:
         t = float(0.0)
     rise = wp.vec3(0.0, 0.0, height + up * t - 0.5 * g * t * t)
     base = JumpBase()
-    base.quat = sample_quat(draw, ranges, start.heading, within(draw, streams.TAKEOFF_PITCH, ranges.takeoff_pitch))
+    base.quat = sample_quat(
+        draw, ranges, start.heading, uniform_range(draw, streams.TAKEOFF_PITCH, ranges.takeoff_pitch)
+    )
     base.pos = sample_offset(draw, ranges) + (ahead + forward * t) * along + rise
     base.lin_vel = forward * along + wp.vec3(0.0, 0.0, up - g * t)
     return base
@@ -231,7 +233,9 @@ def before_touchdown(start: JumpStart, flight: JumpBase, draw: Draw) -> JumpBase
     """Return a base in flight moved behind the spot that its paws surround."""
     base = flight
     base.spot = wp.vec3(flight.pos[0], flight.pos[1], 0.0)
-    base.pos = flight.pos - within(draw, streams.TOUCHDOWN_BEHIND, start.ranges.touchdown_behind) * direction(start)
+    base.pos = flight.pos - uniform_range(draw, streams.TOUCHDOWN_BEHIND, start.ranges.touchdown_behind) * direction(
+        start
+    )
     return base
 
 
@@ -239,9 +243,9 @@ def before_touchdown(start: JumpStart, flight: JumpBase, draw: Draw) -> JumpBase
 def pushing_off(start: JumpStart, takeoff: JumpBase, draw: Draw) -> JumpBase:
     """Return a base before its takeoff, over paws around the start: on a straight line, evenly accelerated."""
     base = takeoff
-    back = within(draw, streams.PUSH_LENGTH, start.ranges.push_length)
+    back = uniform_range(draw, streams.PUSH_LENGTH, start.ranges.push_length)
     speed = wp.length(takeoff.lin_vel)
-    before = speed * speed - 2.0 * back * within(draw, streams.PUSH_ACCELERATION, start.ranges.push_acceleration)
+    before = speed * speed - 2.0 * back * uniform_range(draw, streams.PUSH_ACCELERATION, start.ranges.push_acceleration)
     way = wp.normalize(takeoff.lin_vel)
     base.pos = takeoff.pos - back * way
     base.lin_vel = wp.sqrt(wp.max(before, 0.0)) * way
@@ -276,12 +280,12 @@ def leg_in_flight(ranges: ResetRanges, base: JumpBase, geo: LegGeometry, draw: D
     """Return a leg in flight, its paw above the ground: both thighs about alike, all legs about alike."""
     lower = ranges.flight_transversal[0]
     upper = ranges.flight_transversal[1]
-    middle = within(draw, streams.FLIGHT_TRANSVERSAL, ranges.flight_transversal)
-    lateral = between(draw, streams.FLIGHT_LATERAL, -ranges.flight_lateral, ranges.flight_lateral)
+    middle = uniform_range(draw, streams.FLIGHT_TRANSVERSAL, ranges.flight_transversal)
+    lateral = uniform(draw, streams.FLIGHT_LATERAL, -ranges.flight_lateral, ranges.flight_lateral)
     angles = wp.vec3(
-        lateral + between(draw, streams.LEG_LATERAL + leg, -0.03, 0.03),
-        wp.clamp(middle + between(draw, streams.LEG_OUTER + leg, -0.1, 0.1), lower, upper),
-        wp.clamp(middle + between(draw, streams.LEG_INNER + leg, -0.1, 0.1), lower, upper),
+        lateral + uniform(draw, streams.LEG_LATERAL + leg, -0.03, 0.03),
+        wp.clamp(middle + uniform(draw, streams.LEG_OUTER + leg, -0.1, 0.1), lower, upper),
+        wp.clamp(middle + uniform(draw, streams.LEG_INNER + leg, -0.1, 0.1), lower, upper),
     )
     found = LegSample()
     found.angles = angles
@@ -301,7 +305,7 @@ def sample_leg(start: JumpStart, base: JumpBase, geo: LegGeometry, draw: Draw, l
     paw = spot - base.pos
     if start.scheme == TOUCHDOWN:
         # paws hang below the base, a little above the ground at least
-        depth = within(draw, streams.PAW_DEPTH, ranges.paw_depth)
+        depth = uniform_range(draw, streams.PAW_DEPTH, ranges.paw_depth)
         paw[2] = -wp.min(depth, base.height - geo.paw_radius - 0.025)
     else:
         below = surface(start.ground, spot[0], spot[1])[0]

@@ -5,7 +5,7 @@ import warp as wp
 from .env import EnvArrays
 from .options import FAST
 from .parameters import RobotParameters
-from .random import EVENT, INTERVAL, Draw, between, make_stream
+from .random import EVENT, INTERVAL, Draw, make_stream, uniform
 
 STARTUP, AT_RESET, AT_STEP = 0, 1, 2
 LANES = 8
@@ -16,7 +16,7 @@ MODES = {"startup": STARTUP, "reset": AT_RESET, "interval": AT_STEP}
 @wp.func
 def steps_until(draw: Draw, least: float, most: float, step_dt: float) -> int:
     """Return a drawn number of policy steps between two times [s], at least one."""
-    return wp.max(int(wp.round(between(draw, INTERVAL, least, most) / step_dt)), 1)
+    return wp.max(int(wp.round(uniform(draw, INTERVAL, least, most) / step_dt)), 1)
 
 
 def make_event_kernel(slots: list) -> wp.Kernel:

@@ -9,7 +9,7 @@ import warp as wp
 
 from ..actuation.motors import MotorArrays
 from ..layout import BODIES, DOFS, motor_slot
-from .random import Draw, between
+from .random import Draw, uniform
 
 wp.set_module_options({"enable_backward": False, "max_unroll": 1})  # long loops in short code
 
@@ -65,20 +65,20 @@ def write_mass(robot: RobotParameters, world: int, body: int, scale: float):
 @wp.func
 def base_mass(robot: RobotParameters, draw: Draw, lower: float, upper: float):
     """Add a mass [kg] to the base, its inertia in proportion."""
-    write_mass(robot, draw.world, 0, 1.0 + between(draw, 0, lower, upper) / robot.nominal_mass[0])
+    write_mass(robot, draw.world, 0, 1.0 + uniform(draw, 0, lower, upper) / robot.nominal_mass[0])
 
 
 @wp.func
 def link_mass(robot: RobotParameters, draw: Draw, lower: float, upper: float):
     """Scale mass and inertia of each link of the legs."""
     for body in range(1 + draw.lane, BODIES, draw.lanes):
-        write_mass(robot, draw.world, body, between(draw, body, lower, upper))
+        write_mass(robot, draw.world, body, uniform(draw, body, lower, upper))
 
 
 @wp.func
 def com_shift(robot: RobotParameters, draw: Draw, lower: float, upper: float):
     """Shift the base's centre of mass [m] along each axis."""
-    shift = wp.vec3(between(draw, 0, lower, upper), between(draw, 1, lower, upper), between(draw, 2, lower, upper))
+    shift = wp.vec3(uniform(draw, 0, lower, upper), uniform(draw, 1, lower, upper), uniform(draw, 2, lower, upper))
     robot.body_com[draw.world * BODIES] = robot.nominal_com[0] + shift
 
 
@@ -87,14 +87,14 @@ def armature(robot: RobotParameters, draw: Draw, lower: float, upper: float):
     """Scale each motor's armature."""
     for m in range(draw.lane, 12, draw.lanes):
         dof = 6 + motor_slot(m)
-        robot.joint_armature[draw.world * DOFS + dof] = robot.nominal_armature[dof] * between(draw, m, lower, upper)
+        robot.joint_armature[draw.world * DOFS + dof] = robot.nominal_armature[dof] * uniform(draw, m, lower, upper)
 
 
 @wp.func
 def motor_friction(robot: RobotParameters, draw: Draw, lower: float, upper: float):
     """Give each motor a Coulomb friction [N m]."""
     for m in range(draw.lane, 12, draw.lanes):
-        robot.joint_friction[draw.world * DOFS + 6 + motor_slot(m)] = between(draw, m, lower, upper)
+        robot.joint_friction[draw.world * DOFS + 6 + motor_slot(m)] = uniform(draw, m, lower, upper)
 
 
 @wp.func
@@ -147,7 +147,7 @@ def gains(
 ):  # fmt: skip
     """Scale kp and kd of each motor."""
     for m in range(draw.lane, 12, draw.lanes):
-        ratio = wp.vec2(between(draw, m, kp_lower, kp_upper), between(draw, 12 + m, kd_lower, kd_upper))
+        ratio = wp.vec2(uniform(draw, m, kp_lower, kp_upper), uniform(draw, 12 + m, kd_lower, kd_upper))
         robot.gain_ratio[m, draw.world] = ratio
         set_gains(robot, draw.world, m, ratio)
 
@@ -160,7 +160,7 @@ def speed_limits(
     """Scale no-load and cutoff speed of each motor; the cutoff stays below the no-load speed."""
     for m in range(draw.lane, 12, draw.lanes):
         ratio = wp.vec2(
-            between(draw, m, no_load_lower, no_load_upper), between(draw, 12 + m, cutoff_lower, cutoff_upper)
+            uniform(draw, m, no_load_lower, no_load_upper), uniform(draw, 12 + m, cutoff_lower, cutoff_upper)
         )
         robot.speed_ratio[m, draw.world] = ratio
         set_speed_limits(robot, draw.world, m, ratio)
@@ -170,7 +170,7 @@ def speed_limits(
 def joint_offset(robot: RobotParameters, draw: Draw, lower: float, upper: float):
     """Give each motor's position sensor a constant error [rad] besides its nominal one."""
     for m in range(draw.lane, 12, draw.lanes):
-        robot.motors.offset[m, draw.world] = robot.nominal_offset[m] + between(draw, m, lower, upper)
+        robot.motors.offset[m, draw.world] = robot.nominal_offset[m] + uniform(draw, m, lower, upper)
 
 
 @wp.func
@@ -179,8 +179,8 @@ def friction(
     static_upper: float,
 ):  # fmt: skip
     """Draw the paws' dynamic coefficient, and a static one that is not below it."""
-    dynamic = between(draw, 0, dynamic_lower, dynamic_upper)
-    static = wp.max(between(draw, 1, static_lower, static_upper), dynamic)
+    dynamic = uniform(draw, 0, dynamic_lower, dynamic_upper)
+    static = wp.max(uniform(draw, 1, static_lower, static_upper), dynamic)
     for k in range(4):
         robot.shape_mu[robot.paw_shapes[4 * draw.world + k]] = dynamic
     # without dynamic friction there is no static one either
@@ -196,9 +196,9 @@ def physics_steps(robot: RobotParameters, seconds: float) -> int:
 @wp.func
 def drawn_delay(robot: RobotParameters, draw: Draw, lower: float, upper: float, none: float) -> int:
     """Return a drawn delay [physics steps], none in a share of draws."""
-    if between(draw, 1, 0.0, 1.0) < none:
+    if uniform(draw, 1, 0.0, 1.0) < none:
         return 0
-    return physics_steps(robot, between(draw, 0, lower, upper))
+    return physics_steps(robot, uniform(draw, 0, lower, upper))
 
 
 @wp.func
@@ -220,8 +220,8 @@ def push(
 ):  # fmt: skip
     """Push the base with a force [N] along and a torque [N m] about each world axis in a share of draws, else not."""
     wrench = wp.spatial_vector()
-    if between(draw, 6, 0.0, 1.0) < share:
+    if uniform(draw, 6, 0.0, 1.0) < share:
         for i in range(3):
-            wrench[i] = between(draw, i, force_lower, force_upper)
-            wrench[3 + i] = between(draw, 3 + i, torque_lower, torque_upper)
+            wrench[i] = uniform(draw, i, force_lower, force_upper)
+            wrench[3 + i] = uniform(draw, 3 + i, torque_lower, torque_upper)
     robot.push[draw.world] = wrench

@@ -54,15 +54,15 @@ def branch(draw: Draw, i: int) -> Draw:
 
 
 @wp.func
-def between(draw: Draw, i: int, lower: float, upper: float) -> float:
+def uniform(draw: Draw, i: int, lower: float, upper: float) -> float:
     """Return the i-th number, uniform in [lower, upper)."""
     return lower + (upper - lower) * wp.randf(wp.rand_init(int(draw.seed), i))
 
 
 @wp.func
-def within(draw: Draw, i: int, pair: wp.vec2) -> float:
+def uniform_range(draw: Draw, i: int, pair: wp.vec2) -> float:
     """Return the i-th number, uniform in a pair (lower, upper)."""
-    return between(draw, i, pair[0], pair[1])
+    return uniform(draw, i, pair[0], pair[1])
 
 
 @wp.func

@@ -12,7 +12,7 @@ from ..terrain.ground import rest_block, surface, world_ground
 from .attempts import meet_attempts
 from .env import BEGUN, COMMANDED, RING, Delays, EnvArrays, Scene, SkillSettings
 from .options import FAST
-from .random import ANY_LEVEL, COMMAND, RESET, between, make_stream
+from .random import ANY_LEVEL, COMMAND, RESET, make_stream, uniform
 from .track import follow_paw
 from .view import RobotArrays, base_quat, base_velocity, load_view, yaw_of
 
@@ -67,7 +67,7 @@ def make_reset_kernel(task: Any) -> wp.Kernel:
         draw.lanes = lanes
         level = env.level[world]
         if level >= levels.shape[0]:
-            level = wp.min(int(between(draw, ANY_LEVEL, 0.0, float(levels.shape[0]))), levels.shape[0] - 1)
+            level = wp.min(int(uniform(draw, ANY_LEVEL, 0.0, float(levels.shape[0]))), levels.shape[0] - 1)
         if begins:
             old = before_reset(states[world], env.done[world])
             state = wp.static(reset)(arrays, scene, skills[skill], old, settings[0], levels[level], draw)

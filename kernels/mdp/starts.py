@@ -5,7 +5,7 @@ import warp as wp
 from ..kinematics.geometry import LegGeometry
 from ..kinematics.inverse import LegLimits, clamped_closed_form
 from ..kinematics.leg import leg_forward_kinematics, leg_inverse_velocity
-from .random import Draw, within
+from .random import Draw, uniform_range
 
 wp.set_module_options({"enable_backward": False})
 
@@ -50,11 +50,11 @@ def place_beside(
     draw: Draw, leg: int, front_x: wp.vec2, front_y: wp.vec2, back_x: wp.vec2, back_y: wp.vec2
 ) -> wp.vec3:  # fmt: skip
     """Return a paw's place [m] relative to the spot that the paws surround, z = 0; ranges of absolute values."""
-    x = within(draw, PAW_X + leg, front_x)
-    y = within(draw, PAW_Y + leg, front_y)
+    x = uniform_range(draw, PAW_X + leg, front_x)
+    y = uniform_range(draw, PAW_Y + leg, front_y)
     if leg >= 2:
-        x = -within(draw, PAW_X + leg, back_x)
-        y = within(draw, PAW_Y + leg, back_y)
+        x = -uniform_range(draw, PAW_X + leg, back_x)
+        y = uniform_range(draw, PAW_Y + leg, back_y)
     if leg % 2 == 1:
         y = -y
     return wp.vec3(x, y, 0.0)

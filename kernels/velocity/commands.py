@@ -3,7 +3,7 @@
 import warp as wp
 
 from ..mdp.env import Scene
-from ..mdp.random import Draw, between, within
+from ..mdp.random import Draw, uniform, uniform_range
 from ..mdp.view import RobotView
 from . import streams
 from .state import POLICY_RATE, VelocityState
@@ -42,18 +42,18 @@ def draw_velocity(draw: Draw, ranges: CommandRanges, level: int) -> wp.vec3:
     Beyond the first level, the faster it goes along x, the less far it reaches across and in turning: an ellipse
     between the largest reach along x and those of the level across it.
     """
-    kind = between(draw, streams.KIND, 0.0, 1.0)
+    kind = uniform(draw, streams.KIND, 0.0, 1.0)
     if kind < ranges.stand:
         return wp.vec3(0.0)
     reach = reach_of(ranges, level)
-    easy = level == 0 or between(draw, streams.NARROW, 0.0, 1.0) < ranges.narrow_share
+    easy = level == 0 or uniform(draw, streams.NARROW, 0.0, 1.0) < ranges.narrow_share
     if easy:
         reach = ranges.narrow
-    spin = between(draw, streams.TURN, -reach[3], reach[3])
+    spin = uniform(draw, streams.TURN, -reach[3], reach[3])
     if kind < ranges.stand + ranges.turn:
         return wp.vec3(0.0, 0.0, spin)
-    ahead = between(draw, streams.AHEAD, -reach[1], reach[0])
-    side = between(draw, streams.SIDE, -reach[2], reach[2])
+    ahead = uniform(draw, streams.AHEAD, -reach[1], reach[0])
+    side = uniform(draw, streams.SIDE, -reach[2], reach[2])
     if easy:
         return wp.vec3(ahead, side, spin)
     share = ahead / wp.where(ahead > 0.0, ranges.wide[0], ranges.wide[1])
@@ -85,7 +85,7 @@ def draw_command(
 ) -> VelocityState:
     """Return the state of an episode that goes on with a drawn command."""
     new = with_command(state, draw_velocity(draw, level, state.command_level))
-    new.command_lasts = wp.max(int(within(draw, streams.LASTS, level.lasts)), 1)
+    new.command_lasts = wp.max(int(uniform_range(draw, streams.LASTS, level.lasts)), 1)
     return new
 
 

@@ -4,7 +4,7 @@ import warp as wp
 
 from ..mdp.attempts import meet_attempts
 from ..mdp.env import Scene, SkillSettings
-from ..mdp.random import Draw, between, within
+from ..mdp.random import Draw, uniform, uniform_range
 from ..mdp.view import RobotArrays, base_pos
 from ..terrain.ground import rest_block
 from . import streams
@@ -69,8 +69,8 @@ def reset_velocity(
     write_start(arrays, scene, skill, settings, new.terrain_level, draw)
     new.episode_steps = settings.episode_steps
     new.pace = settings.pace
-    new.phase = between(draw, streams.GAIT_PHASE, 0.0, 1.0)
+    new.phase = uniform(draw, streams.GAIT_PHASE, 0.0, 1.0)
     new.limit = map_limit(settings.map)
     new = with_command(new, draw_velocity(draw, level, new.command_level))
-    new.command_lasts = wp.max(int(within(draw, streams.LASTS, level.lasts)), 1)
+    new.command_lasts = wp.max(int(uniform_range(draw, streams.LASTS, level.lasts)), 1)
     return new

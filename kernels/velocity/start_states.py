@@ -10,7 +10,7 @@ from ..kinematics.inverse import LegLimits
 from ..layout import BODIES, COORDS
 from ..mdp.attempts import sample_valid_state
 from ..mdp.env import Scene, SkillSettings
-from ..mdp.random import Draw, between, within
+from ..mdp.random import Draw, uniform, uniform_range
 from ..mdp.reset import leg_limits, store_pose
 from ..mdp.starts import LegSample, leg_over_ground, leg_to, place_beside, turn_of
 from ..mdp.view import RobotArrays, turned
@@ -82,8 +82,8 @@ def draw_spot(draw: Draw, map: Map, level: int) -> wp.vec2:
         return wp.vec2(0.0)
     row = level
     if row >= map.rows:
-        row = wp.min(int(between(draw, streams.ROW, 0.0, float(map.rows))), map.rows - 1)
-    col = wp.min(int(between(draw, streams.COL, 0.0, float(map.cols))), map.cols - 1)
+        row = wp.min(int(uniform(draw, streams.ROW, 0.0, float(map.rows))), map.rows - 1)
+    col = wp.min(int(uniform(draw, streams.COL, 0.0, float(map.cols))), map.cols - 1)
     return wp.vec2(
         map.tile * (float(row) + 0.5 - 0.5 * float(map.rows)), map.tile * (float(col) + 0.5 - 0.5 * float(map.cols))
     )
@@ -95,22 +95,22 @@ def sample_base(start: VelocityStart, arrays: RobotArrays, draw: Draw, attempt: 
     settings = start.settings
     v = settings.lin_vel
     w = settings.ang_vel
-    roll = between(draw, streams.ROLL, -settings.tilt, settings.tilt)
-    pitch = between(draw, streams.PITCH, -settings.tilt, settings.tilt)
-    x = start.spot[0] + between(draw, streams.OFFSET_X, -settings.base_xy, settings.base_xy)
-    y = start.spot[1] + between(draw, streams.OFFSET_Y, -settings.base_xy, settings.base_xy)
+    roll = uniform(draw, streams.ROLL, -settings.tilt, settings.tilt)
+    pitch = uniform(draw, streams.PITCH, -settings.tilt, settings.tilt)
+    x = start.spot[0] + uniform(draw, streams.OFFSET_X, -settings.base_xy, settings.base_xy)
+    y = start.spot[1] + uniform(draw, streams.OFFSET_Y, -settings.base_xy, settings.base_xy)
     base = VelocityBase()
     base.quat = turn_of(start.heading, pitch, roll)
-    base.pos = wp.vec3(x, y, surface(start.ground, x, y)[0] + within(draw, streams.HEIGHT, settings.height))
+    base.pos = wp.vec3(x, y, surface(start.ground, x, y)[0] + uniform_range(draw, streams.HEIGHT, settings.height))
     base.lin_vel = wp.vec3(
-        between(draw, streams.LIN_VEL, -v, v),
-        between(draw, streams.LIN_VEL + 1, -v, v),
-        0.3 * between(draw, streams.LIN_VEL + 2, -v, v),
+        uniform(draw, streams.LIN_VEL, -v, v),
+        uniform(draw, streams.LIN_VEL + 1, -v, v),
+        0.3 * uniform(draw, streams.LIN_VEL + 2, -v, v),
     )
     base.body_rate = wp.vec3(
-        between(draw, streams.ANG_VEL, -w, w),
-        between(draw, streams.ANG_VEL + 1, -w, w),
-        between(draw, streams.ANG_VEL + 2, -w, w),
+        uniform(draw, streams.ANG_VEL, -w, w),
+        uniform(draw, streams.ANG_VEL + 1, -w, w),
+        uniform(draw, streams.ANG_VEL + 2, -w, w),
     )
     base.ang_vel = wp.quat_rotate(base.quat, base.body_rate)
     base.com_vel = base.lin_vel + wp.cross(
@@ -125,10 +125,10 @@ def sample_leg(start: VelocityStart, base: VelocityBase, geo: LegGeometry, draw:
     settings = start.settings
     beside = place_beside(draw, leg, settings.front_x, settings.front_y, settings.back_x, settings.back_y)
     paw = base.pos + turned(beside, start.heading)
-    lifted = between(draw, streams.LIFTED + leg, 0.0, 1.0) < settings.lifted_share
+    lifted = uniform(draw, streams.LIFTED + leg, 0.0, 1.0) < settings.lifted_share
     up = float(0.0)
     if lifted:
-        up = between(draw, streams.LIFT + leg, 0.01, settings.lift)
+        up = uniform(draw, streams.LIFT + leg, 0.01, settings.lift)
     paw[2] = surface(start.ground, paw[0], paw[1])[0] + geo.paw_radius + up
     ankle = wp.quat_rotate_inv(base.quat, paw - base.pos)
     found = leg_to(geo, start.limits, ankle)
@@ -145,11 +145,11 @@ def write_start(
     world = draw.world
     start = VelocityStart()
     start.spot = draw_spot(draw, settings.map, terrain_level)
-    start.heading = between(draw, streams.HEADING, -settings.heading, settings.heading)
+    start.heading = uniform(draw, streams.HEADING, -settings.heading, settings.heading)
     start.settings = settings
     start.limits = leg_limits(skill.command_filter)
     start.ground = world_ground(scene.ground, world)
-    if between(draw, streams.DEFAULT_POSE, 0.0, 1.0) >= settings.default_share:
+    if uniform(draw, streams.DEFAULT_POSE, 0.0, 1.0) >= settings.default_share:
         if sample_valid_state(sample_base, sample_leg, start, arrays, scene, draw):
             return
     store_pose(arrays, scene, world, start.heading, surface(start.ground, start.spot[0], start.spot[1])[0])

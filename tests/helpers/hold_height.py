@@ -89,9 +89,9 @@ def reset_hold(
     level: HoldLevel, draw: mdp.Draw,
 ) -> HoldState:  # fmt: skip
     """Stand in the default pose with any heading."""
-    mdp.store_pose(robot, scene, draw.world, mdp.between(draw, 0, -settings.heading, settings.heading), 0.0)
+    mdp.store_pose(robot, scene, draw.world, mdp.uniform(draw, 0, -settings.heading, settings.heading), 0.0)
     new = HoldState()
-    new.goal = mdp.within(draw, 1, level.goal)
+    new.goal = mdp.uniform_range(draw, 1, level.goal)
     new.lasts = settings.lasts
     return new
 
@@ -116,7 +116,7 @@ def another_goal_due(state: HoldState) -> bool:
 def draw_goal(view: mdp.RobotView, scene: mdp.Scene, state: HoldState, level: HoldLevel, draw: mdp.Draw) -> HoldState:
     """Command another height."""
     new = state
-    new.goal = mdp.within(draw, 1, level.goal)
+    new.goal = mdp.uniform_range(draw, 1, level.goal)
     new.age = 0
     return new
 
@@ -155,7 +155,7 @@ def wanted_height(view: mdp.RobotView, state: HoldState) -> float:
 def weak_motors(robot: mdp.RobotParameters, draw: mdp.Draw, lower: float, upper: float):
     """Scale the torque limit of each motor."""
     for m in range(12):
-        robot.torque_ratio[m, draw.world] = mdp.between(draw, m, lower, upper)
+        robot.torque_ratio[m, draw.world] = mdp.uniform(draw, m, lower, upper)
         mdp.events.set_torque_limit(robot, draw.world, m)
 
 

@@ -10,7 +10,7 @@ from jumper_warp.envs.skill import Skill
 from jumper_warp.kernels.mdp import terminations
 from jumper_warp.kernels.mdp.env import Scene, SkillSettings
 from jumper_warp.kernels.mdp.parameters import RobotParameters
-from jumper_warp.kernels.mdp.random import Draw, between
+from jumper_warp.kernels.mdp.random import Draw, uniform
 from jumper_warp.kernels.mdp.reset import store_pose
 from jumper_warp.kernels.mdp.view import RobotArrays, RobotView
 from jumper_warp.kernels.terrain.ground import Ground
@@ -93,7 +93,7 @@ def reset_probe(
     store_pose(arrays, scene, draw.world, 0.5, 0.25)
     new = ProbeState()
     new.value = settings.value
-    new.other = between(draw, 0, 0.0, 1.0)
+    new.other = uniform(draw, 0, 0.0, 1.0)
     new.counts = level.number
     return new
 
@@ -117,7 +117,7 @@ def command_due(state: ProbeState) -> bool:
 def draw_command(robot: RobotView, scene: Scene, state: ProbeState, level: ProbeLevel, draw: Draw) -> ProbeState:
     """Keep a draw in `other` and the level in `counts`."""
     new = state
-    new.other = between(draw, 0, 0.0, 1.0)
+    new.other = uniform(draw, 0, 0.0, 1.0)
     new.counts = level.number
     return new
 

@@ -61,7 +61,7 @@ def begun(other_env):
     return begin
 
 
-def within(values, lower, upper, reach=0.02):
+def uniform_range(values, lower, upper, reach=0.02):
     """Whether values stay in a range and come near both of its ends."""
     width = upper - lower
     inside = values.min() >= lower - 1e-5 and values.max() <= upper + 1e-5
@@ -93,9 +93,9 @@ def test_phase_and_counters_fit_the_scheme(drawn):
     for name in ("steps", "idle_steps", "took_off", "touched_down", "at_apex", "streak"):
         assert not episodes[name].any(), name
     on_feet = episodes["scheme"] < 2
-    assert within(episodes["command_step"][on_feet], 0, 30) and not episodes["command_step"][~on_feet].any()
+    assert uniform_range(episodes["command_step"][on_feet], 0, 30) and not episodes["command_step"][~on_feet].any()
     landed = episodes["phase"] == LANDED
-    assert within(episodes["phase_steps"][landed], 0, 17) and not episodes["phase_steps"][~landed].any()
+    assert uniform_range(episodes["phase_steps"][landed], 0, 17) and not episodes["phase_steps"][~landed].any()
     # a flight on its way down, and a landed robot, have reached the goal
     passed = landed | ((episodes["phase"] == FLIGHT) & (qd[:, 2] <= 0.0))
     np.testing.assert_array_equal(episodes["apex_passed"], passed)
@@ -105,9 +105,9 @@ def test_phase_and_counters_fit_the_scheme(drawn):
 def test_goals_and_starts_are_within_the_level(drawn):
     env, episodes, q, _ = drawn
     level = env.task.levels[episodes["level"][0]]
-    assert within(episodes["goal"][:, 2], level.goal_lower[2], level.goal_upper[2])
+    assert uniform_range(episodes["goal"][:, 2], level.goal_lower[2], level.goal_upper[2])
     standing = some(episodes, "standing", N)
-    assert within(q[standing, 2], *level.base_height)
+    assert uniform_range(q[standing, 2], *level.base_height)
     np.testing.assert_array_equal(episodes["start"], q[:, :3].astype(np.float32))
     default = q[some(episodes, "default", N)][:, MOTOR_Q]
     np.testing.assert_array_equal(default, np.broadcast_to(DEFAULT_ANGLE.astype(np.float32), default.shape))
@@ -118,9 +118,9 @@ def test_base_place_and_attitude_cover_their_ranges(drawn, scheme):
     _, episodes, q, qd = drawn
     worlds = some(episodes, scheme, N)
     for axis in (0, 1):
-        assert within(q[worlds, axis], -0.05, 0.05)
-        assert within(euler(q[worlds, 3:7])[:, axis], -5.0 * DEG, 5.0 * DEG)
-    assert within(euler(q[worlds, 3:7])[:, 2], -5.0 * DEG, 5.0 * DEG)
+        assert uniform_range(q[worlds, axis], -0.05, 0.05)
+        assert uniform_range(euler(q[worlds, 3:7])[:, axis], -5.0 * DEG, 5.0 * DEG)
+    assert uniform_range(euler(q[worlds, 3:7])[:, 2], -5.0 * DEG, 5.0 * DEG)
     np.testing.assert_allclose(np.linalg.norm(q[worlds, 3:7], axis=1), 1.0, atol=1e-6)
     assert not qd[worlds, :2].any() and not qd[worlds, 3:6].any()
 
@@ -145,14 +145,14 @@ def test_robots_on_their_feet_have_their_paws_at_rest_on_the_ground(drawn, schem
     np.testing.assert_allclose(velocity, 0.0, atol=2e-3)
     if scheme != "default":
         spots = position * np.array([[1, 1, 1], [1, -1, 1], [-1, 1, 1], [-1, -1, 1]])
-        assert within(spots[..., 0], 0.20, 0.22, 0.1)
-        assert within(spots[:, :2, 1], 0.15, 0.17, 0.1) and within(spots[:, 2:, 1], 0.20, 0.22, 0.1)
+        assert uniform_range(spots[..., 0], 0.20, 0.22, 0.1)
+        assert uniform_range(spots[:, :2, 1], 0.15, 0.17, 0.1) and uniform_range(spots[:, 2:, 1], 0.20, 0.22, 0.1)
 
 
 def test_landed_robots_still_fall(drawn):
     _, episodes, q, qd = drawn
     worlds = some(episodes, "landed", N)
-    assert within(-qd[worlds, 2], 0.0, 1.0) and within(q[worlds, 2], 0.30, 0.42)
+    assert uniform_range(-qd[worlds, 2], 0.0, 1.0) and uniform_range(q[worlds, 2], 0.30, 0.42)
     assert np.abs(qd[worlds][:, MOTOR_V]).max() > 1.0
 
 
@@ -177,7 +177,7 @@ def test_flights_cover_the_leg_ranges_and_touchdowns_reach_for_the_ground(drawn)
     env, episodes, q, _ = drawn
     angles = q[some(episodes, "in_flight", N)][:, MOTOR_Q].reshape(-1, 4, 3)
     assert np.abs(angles[..., 0]).max() <= 10.0 * DEG + 0.03 + 1e-5
-    assert within(angles[..., 1:], 0.0, 90.0 * DEG)
+    assert uniform_range(angles[..., 1:], 0.0, 90.0 * DEG)
     worlds = some(episodes, "touchdown")
     height = paws_and_velocities(env, worlds)[0][..., 2]
     depth = q[worlds, 2][:, None] - height
@@ -237,7 +237,7 @@ def test_heading_and_forward_pitch(begun):
     env = begun(only("standing", heading=180.0, forward_pitch=10.0))
     angles = euler(env.sim.joint_q()[:, 3:7].astype(float))
     # a mean from 0 to 10 degrees, and 5 degrees to either side of it
-    assert within(angles[:, 1], -5.0 * DEG, 15.0 * DEG, 0.05)
+    assert uniform_range(angles[:, 1], -5.0 * DEG, 15.0 * DEG, 0.05)
     spread = math.sqrt(2.0 * 10.0**2 / 12.0) * DEG
     assert angles[:, 1].mean() == pytest.approx(5.0 * DEG, abs=4.0 * spread / math.sqrt(N))
     assert angles[:, 1].std() == pytest.approx(spread, rel=4.0 / math.sqrt(2.0 * N))

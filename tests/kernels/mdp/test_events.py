@@ -8,7 +8,7 @@ import warp as wp
 from jump_helpers import edit_episodes, make_env, random_actions
 from jumper_warp.kernels.mdp.events import AT_RESET, AT_STEP, STARTUP
 from jumper_warp.kernels.mdp.parameters import RobotParameters
-from jumper_warp.kernels.mdp.random import Draw, between
+from jumper_warp.kernels.mdp.random import Draw, uniform
 from jumper_warp.registry import make_task
 from jumper_warp.tasks.randomization import RandomizationCfg
 from jumper_warp.tasks.terms import EventTerm
@@ -33,7 +33,7 @@ def mark(robot: RobotParameters, draw: Draw):
 @wp.func
 def drawn_force(robot: RobotParameters, draw: Draw, lower: float, upper: float):
     """Draw a force."""
-    robot.push[draw.world] = wp.spatial_vector(between(draw, 0, lower, upper), 0.0, 0.0, 0.0, 0.0, 0.0)
+    robot.push[draw.world] = wp.spatial_vector(uniform(draw, 0, lower, upper), 0.0, 0.0, 0.0, 0.0, 0.0)
 
 
 EVENTS = (

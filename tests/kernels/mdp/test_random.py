@@ -5,7 +5,7 @@ import pytest
 import warp as wp
 from scipy.stats import kstest
 
-from jumper_warp.kernels.mdp.random import between, branch, clamped_normal, make_stream, within
+from jumper_warp.kernels.mdp.random import branch, clamped_normal, make_stream, uniform_range
 from mdp_helpers import array
 
 WORLDS, COLUMNS = 4096, 8
@@ -33,8 +33,8 @@ def draw_kernel(
         draw = branch(draw, branch_of)
     seeds[i] = draw.seed
     for j in range(uniform.shape[1]):
-        uniform[i, j] = between(draw, first + j, -2.0, 3.0)
-        pairs[i, j] = within(draw, first + j, wp.vec2(-2.0, 3.0))
+        uniform[i, j] = uniform(draw, first + j, -2.0, 3.0)
+        pairs[i, j] = uniform_range(draw, first + j, wp.vec2(-2.0, 3.0))
         normal[i, j] = clamped_normal(draw, first + j)
 
 

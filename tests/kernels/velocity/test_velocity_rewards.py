@@ -78,8 +78,8 @@ def shank_lean(r, free, hip, thigh, shank):
                  for side, a in ((1.0, outer), (-1.0, inner))]  # fmt: skip
         links = []
         for turn in (1.0, -1.0):  # by the law of cosines, at the first knee
-            between = knees[1] - knees[0]
-            angle = np.arctan2(between[1], between[0]) + turn * np.arccos(np.linalg.norm(between) / (2.0 * shank))
+            uniform = knees[1] - knees[0]
+            angle = np.arctan2(uniform[1], uniform[0]) + turn * np.arccos(np.linalg.norm(uniform) / (2.0 * shank))
             links.append(knees[0] + shank * np.array([np.cos(angle), np.sin(angle)]))
         ankle = min(links, key=lambda p: p[1])
         leans = [np.arccos(np.dot(ankle - knee, down) / shank) for knee in knees]
