@@ -3,7 +3,7 @@
 import warp as wp
 
 from ..mdp.env import Scene
-from ..mdp.random import Draw, branch, uniform, uniform_range
+from ..mdp.random import Draw, fold_in, uniform, uniform_range
 from ..mdp.view import RobotView
 from . import streams
 from .state import AttitudeState, with_goal
@@ -47,7 +47,7 @@ def draw_axis(draw: Draw, axis_share: float) -> wp.vec3:
 @wp.func
 def draw_turn(draw: Draw, ranges: TurnRanges) -> wp.quat:
     """Return a drawn turn (xyzw), body axes."""
-    axis = draw_axis(branch(draw, streams.AXIS_BRANCH), ranges.axis_share)
+    axis = draw_axis(fold_in(draw, streams.AXIS_BRANCH), ranges.axis_share)
     return wp.quat_from_axis_angle(axis, uniform_range(draw, streams.ANGLE, ranges.angle))
 
 

@@ -4,7 +4,7 @@ import warp as wp
 
 from ..mdp.attempts import meet_attempts
 from ..mdp.env import Scene, SkillSettings
-from ..mdp.random import Draw, branch, uniform_range
+from ..mdp.random import Draw, fold_in, uniform_range
 from ..mdp.view import RobotArrays
 from ..terrain.ground import rest_block
 from . import streams
@@ -23,8 +23,8 @@ def reset_attitude(
     """Begin an episode with a drawn turn, and return its state."""
     new = carried_over(old)
     rest_block(scene.ground, draw.world)
-    quat = draw_unit_quat(branch(draw, streams.ORIENTATION_BRANCH))
+    quat = draw_unit_quat(fold_in(draw, streams.ORIENTATION_BRANCH))
     meet_attempts(draw)
     write_start(arrays, scene, skill, settings, quat, draw)
     new.episode_steps = wp.max(int(uniform_range(draw, streams.EPISODE_STEPS, settings.episode_steps) + 0.5), 1)
-    return with_goal(new, quat, quat * draw_turn(branch(draw, streams.TURN_BRANCH), level))
+    return with_goal(new, quat, quat * draw_turn(fold_in(draw, streams.TURN_BRANCH), level))

@@ -18,7 +18,7 @@ from ..scalar import vec3
 from ..state import leg_coord, leg_dof, load_motors, store_motors
 from ..terrain.ground import Ground
 from .env import Scene
-from .random import Draw, branch
+from .random import Draw, fold_in
 from .starts import APART, LegSample
 from .view import RobotArrays
 
@@ -154,7 +154,7 @@ def sample_valid_state(
     accepted = int(ATTEMPTS)
     for attempt in range(draw.lane // 4, ATTEMPTS, wp.max(draw.lanes // 4, 1)):
         if accepted == ATTEMPTS:
-            fresh = branch(draw, attempt)
+            fresh = fold_in(draw, attempt)
             if write_sample_and_check(sample_base, sample_leg, start, arrays, scene, fresh, attempt, own_q, own_qd):
                 accepted = attempt
     return write_first_valid(scene.geometry, draw, accepted, own_q, own_qd, arrays.joint_q, arrays.joint_qd)

@@ -46,7 +46,7 @@ def make_stream(seed: int, world: int, clock: int, stream: int) -> Draw:
 
 
 @wp.func
-def branch(draw: Draw, i: int) -> Draw:
+def fold_in(draw: Draw, i: int) -> Draw:
     """Return other numbers, independent for every i."""
     other = draw
     other.seed = wp.rand_init(int(draw.seed), 7919 + i)
