@@ -21,7 +21,7 @@ from jumper_warp.kernels.mdp import observations, rewards, terminations
 from jumper_warp.kernels.mdp import parameters as events
 from jumper_warp.kernels.mdp.env import Scene, SkillSettings
 from jumper_warp.kernels.mdp.parameters import RobotParameters
-from jumper_warp.kernels.mdp.random import Draw, clamped_normal, fold_in, uniform, uniform_range
+from jumper_warp.kernels.mdp.random import RngStream, clamped_normal, fold_in, uniform, uniform_range
 from jumper_warp.kernels.mdp.reset import store_pose
 from jumper_warp.kernels.mdp.view import RobotArrays, RobotView, tilt, vec12, yaw_of
 from jumper_warp.kernels.terrain.ground import Ground, surface, world_ground
@@ -46,7 +46,6 @@ __all__ = [
     "AttitudeState",
     "Command",
     "Curriculum",
-    "Draw",
     "EventTerm",
     "Ground",
     "Handover",
@@ -55,6 +54,7 @@ __all__ = [
     "RandomizationCfg",
     "Reset",
     "RewardTerm",
+    "RngStream",
     "RobotArrays",
     "RobotParameters",
     "RobotView",

@@ -4,7 +4,7 @@ import warp as wp
 
 from ..mdp.attempts import meet_attempts
 from ..mdp.env import Scene, SkillSettings
-from ..mdp.random import Draw, fold_in, uniform_range
+from ..mdp.random import RngStream, fold_in, uniform_range
 from ..mdp.view import RobotArrays
 from ..terrain.ground import rest_block
 from . import streams
@@ -18,7 +18,7 @@ wp.set_module_options({"enable_backward": False})
 @wp.func
 def reset_attitude(
     arrays: RobotArrays, scene: Scene, skill: SkillSettings, old: AttitudeState, settings: AttitudeSettings,
-    level: TurnRanges, draw: Draw,
+    level: TurnRanges, draw: RngStream,
 ) -> AttitudeState:  # fmt: skip
     """Begin an episode with a drawn turn, and return its state."""
     new = carried_over(old)

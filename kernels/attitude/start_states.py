@@ -7,7 +7,7 @@ from ..kinematics.inverse import LegLimits
 from ..layout import BODIES
 from ..mdp.attempts import ATTEMPTS, sample_valid_state
 from ..mdp.env import Scene, SkillSettings
-from ..mdp.random import Draw, uniform, uniform_range
+from ..mdp.random import RngStream, uniform, uniform_range
 from ..mdp.reset import leg_limits
 from ..mdp.starts import LegSample
 from ..mdp.view import RobotArrays
@@ -45,7 +45,7 @@ class AttitudeStart:
 
 
 @wp.func
-def sample_base(start: AttitudeStart, arrays: RobotArrays, draw: Draw, attempt: int) -> AttitudeStart:
+def sample_base(start: AttitudeStart, arrays: RobotArrays, draw: RngStream, attempt: int) -> AttitudeStart:
     """Return the base, the same in every attempt; in the last one the legs are in the default pose."""
     base = start
     base.default_legs = start.default_legs or attempt == ATTEMPTS - 1
@@ -53,7 +53,7 @@ def sample_base(start: AttitudeStart, arrays: RobotArrays, draw: Draw, attempt: 
 
 
 @wp.func
-def sample_leg(start: AttitudeStart, base: AttitudeStart, geo: LegGeometry, draw: Draw, leg: int) -> LegSample:
+def sample_leg(start: AttitudeStart, base: AttitudeStart, geo: LegGeometry, draw: RngStream, leg: int) -> LegSample:
     """Return a leg at rest; reachable if the sum of its transversal angles keeps its limits."""
     found = LegSample()
     if base.default_legs:
@@ -73,7 +73,7 @@ def sample_leg(start: AttitudeStart, base: AttitudeStart, geo: LegGeometry, draw
 
 @wp.func
 def write_start(
-    arrays: RobotArrays, scene: Scene, skill: SkillSettings, settings: AttitudeSettings, quat: wp.quat, draw: Draw
+    arrays: RobotArrays, scene: Scene, skill: SkillSettings, settings: AttitudeSettings, quat: wp.quat, draw: RngStream
 ):
     """Write a start state with an orientation (xyzw) to a world."""
     w = settings.spin

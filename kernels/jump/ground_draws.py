@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from ..mdp.random import Draw, uniform, uniform_range
+from ..mdp.random import RngStream, uniform, uniform_range
 from ..scalar import real, vec2
 from ..terrain.ground import Block
 from . import streams
@@ -53,7 +53,7 @@ def fixed_block(center: wp.vec2, half: wp.vec2, height: float) -> Block:
 
 
 @wp.func
-def draw_platform(draw: Draw, ranges: GroundRanges, foot: wp.vec2, goal: wp.vec3) -> Block:
+def draw_platform(draw: RngStream, ranges: GroundRanges, foot: wp.vec2, goal: wp.vec3) -> Block:
     """Return a platform under a robot at the origin; none if its paws could not land beside it."""
     half = foot + wp.vec2(
         uniform(draw, streams.PLATFORM_ROOM_X, EVERY_SIDE, ranges.room),
@@ -66,7 +66,7 @@ def draw_platform(draw: Draw, ranges: GroundRanges, foot: wp.vec2, goal: wp.vec3
 
 
 @wp.func
-def draw_block(draw: Draw, ranges: GroundRanges, foot: wp.vec2, goal: wp.vec3) -> Block:
+def draw_block(draw: RngStream, ranges: GroundRanges, foot: wp.vec2, goal: wp.vec3) -> Block:
     """Return a block under the goal; none without room for its near side between the paws before and after the jump.
 
     The near side is anywhere there, more often near than far (a third within a ninth of the room), across the axis
@@ -92,7 +92,7 @@ def draw_block(draw: Draw, ranges: GroundRanges, foot: wp.vec2, goal: wp.vec3) -
 
 
 @wp.func
-def draw_ground(draw: Draw, ranges: GroundRanges, foot: wp.vec2, goal: wp.vec3) -> Block:
+def draw_ground(draw: RngStream, ranges: GroundRanges, foot: wp.vec2, goal: wp.vec3) -> Block:
     """Return the block of a standing start at the origin with a goal [m], world axes; mostly there is none."""
     u = uniform(draw, streams.GROUND, 0.0, 1.0)
     if u < ranges.platform:

@@ -4,7 +4,7 @@ import warp as wp
 
 from ..layout import DOFS
 from ..mdp.env import Scene, SkillSettings
-from ..mdp.random import Draw, uniform, uniform_range
+from ..mdp.random import RngStream, uniform, uniform_range
 from ..mdp.reset import leg_limits
 from ..mdp.view import RobotArrays, RobotView, base_pos, turned, yaw_of
 from ..terrain.ground import Block, Ground, rest_block, surface, world_ground
@@ -59,7 +59,7 @@ def rounded(goal: wp.vec3, lower: wp.vec3, upper: wp.vec3) -> wp.vec3:
 
 
 @wp.func
-def draw_goal(draw: Draw, level: JumpLevel) -> wp.vec3:
+def draw_goal(draw: RngStream, level: JumpLevel) -> wp.vec3:
     """Return a goal of a level relative to start and heading."""
     lower = level.goal_lower
     upper = level.goal_upper
@@ -74,7 +74,7 @@ def draw_goal(draw: Draw, level: JumpLevel) -> wp.vec3:
 
 
 @wp.func
-def draw_again(draw: Draw, delay: wp.vec2, share: float) -> int:
+def draw_again(draw: RngStream, delay: wp.vec2, share: float) -> int:
     """Return how many policy steps after touchdown another goal comes; 0: none, in all but a share of draws.
 
     delay: range in policy steps.
@@ -84,7 +84,7 @@ def draw_again(draw: Draw, delay: wp.vec2, share: float) -> int:
 
 
 @wp.func
-def draw_command(draw: Draw, ranges: ResetRanges) -> int:
+def draw_command(draw: RngStream, ranges: ResetRanges) -> int:
     """Return at which policy step the jump is commanded: uniform, a share of the draws in the longer of two ranges."""
     u = uniform(draw, streams.COMMAND_STEP, 0.0, 1.0)
     share = ranges.long_wait_share
@@ -95,7 +95,7 @@ def draw_command(draw: Draw, ranges: ResetRanges) -> int:
 
 @wp.func
 def begin_task(
-    draw: Draw, ranges: ResetRanges, scheme: int, goal: wp.vec3, pos: wp.vec3, vz: float, jump_again: float
+    draw: RngStream, ranges: ResetRanges, scheme: int, goal: wp.vec3, pos: wp.vec3, vz: float, jump_again: float
 ) -> JumpState:
     """Return the state of a new episode that begins with a scheme at a base position [m] and upward speed [m/s]."""
     state = JumpState()
@@ -147,7 +147,7 @@ def begin_next_jump(old: JumpState, ground: Ground, goal: wp.vec3, pos: wp.vec3,
 
 
 @wp.func
-def place_ground(ground: Ground, start: JumpStart, grounds: GroundRanges, draw: Draw) -> Ground:
+def place_ground(ground: Ground, start: JumpStart, grounds: GroundRanges, draw: RngStream) -> Ground:
     """Put the block of a world to its start, or draw another if blocks are drawn; returns the ground as it is there."""
     if grounds.platform + grounds.block > 0.0:
         block = Block()
@@ -162,7 +162,7 @@ def place_ground(ground: Ground, start: JumpStart, grounds: GroundRanges, draw: 
 @wp.func
 def reset_jump(
     arrays: RobotArrays, scene: Scene, skill: SkillSettings, old: JumpState, settings: JumpSettings, level: JumpLevel,
-    draw: Draw,
+    draw: RngStream,
 ) -> JumpState:  # fmt: skip
     """Begin an episode at a stage of a jump, and return its state."""
     world = draw.world
@@ -193,7 +193,7 @@ def another_jump_due(state: JumpState) -> bool:
 
 
 @wp.func
-def draw_next_jump(robot: RobotView, scene: Scene, state: JumpState, level: JumpLevel, draw: Draw) -> JumpState:
+def draw_next_jump(robot: RobotView, scene: Scene, state: JumpState, level: JumpLevel, draw: RngStream) -> JumpState:
     """Return the state of an episode that goes on with another jump, to a drawn goal."""
     goal = draw_goal(draw, level)
     new = begin_next_jump(state, world_ground(scene.ground, robot.world), goal, robot.pos, yaw_of(robot.quat))

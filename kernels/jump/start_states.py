@@ -15,7 +15,7 @@ from ..kinematics.leg import leg_forward_kinematics
 from ..layout import BODIES
 from ..mdp.attempts import sample_valid_state
 from ..mdp.env import Scene
-from ..mdp.random import Draw, uniform, uniform_range
+from ..mdp.random import RngStream, uniform, uniform_range
 from ..mdp.reset import store_pose
 from ..mdp.starts import LegSample, leg_over_ground, leg_to, place_beside, turn_of
 from ..mdp.view import RobotArrays, turned
@@ -128,7 +128,7 @@ def most_lacking(shares: vec_schemes, spent: vec_schemes) -> int:
 
 
 @wp.func
-def draw_scheme(draw: Draw, ranges: ResetRanges, spent: vec_schemes) -> int:
+def draw_scheme(draw: RngStream, ranges: ResetRanges, spent: vec_schemes) -> int:
     """Return the scheme of a new episode; shares of time are drawn once, and then what lacks most comes next."""
     if ranges.of_time != 0 and wp.length_sq(spent) > 0.0:
         return most_lacking(ranges.shares, spent)
@@ -136,7 +136,7 @@ def draw_scheme(draw: Draw, ranges: ResetRanges, spent: vec_schemes) -> int:
 
 
 @wp.func
-def sample_quat(draw: Draw, ranges: ResetRanges, heading: float, pitch: float) -> wp.quat:
+def sample_quat(draw: RngStream, ranges: ResetRanges, heading: float, pitch: float) -> wp.quat:
     """Return an orientation (xyzw) around a heading and a pitch [rad]."""
     yaw = heading + uniform(draw, streams.YAW, -ranges.tilt, ranges.tilt)
     tip = pitch + uniform(draw, streams.PITCH, -ranges.tilt, ranges.tilt)
@@ -145,7 +145,7 @@ def sample_quat(draw: Draw, ranges: ResetRanges, heading: float, pitch: float) -
 
 
 @wp.func
-def sample_offset(draw: Draw, ranges: ResetRanges) -> wp.vec3:
+def sample_offset(draw: RngStream, ranges: ResetRanges) -> wp.vec3:
     """Return a horizontal offset [m] of the base."""
     x = uniform(draw, streams.OFFSET_X, -ranges.base_xy, ranges.base_xy)
     return wp.vec3(x, uniform(draw, streams.OFFSET_Y, -ranges.base_xy, ranges.base_xy), 0.0)
@@ -161,7 +161,7 @@ def direction(start: JumpStart) -> wp.vec3:
 
 
 @wp.func
-def standing(start: JumpStart, draw: Draw) -> JumpBase:
+def standing(start: JumpStart, draw: RngStream) -> JumpBase:
     """Return a base at rest over paws around the origin; the deeper a squat, the farther it may lean back."""
     ranges = start.ranges
     lower = start.base_height[0]
@@ -176,7 +176,7 @@ def standing(start: JumpStart, draw: Draw) -> JumpBase:
 
 
 @wp.func
-def just_landed(start: JumpStart, draw: Draw) -> JumpBase:
+def just_landed(start: JumpStart, draw: RngStream) -> JumpBase:
     """Return a base that sinks over paws around the goal."""
     ranges = start.ranges
     base = JumpBase()
@@ -190,7 +190,7 @@ def just_landed(start: JumpStart, draw: Draw) -> JumpBase:
 
 
 @wp.func
-def takeoff_speed(draw: Draw, ranges: ResetRanges, height: float, distance: float, apex: float, g: float) -> float:
+def takeoff_speed(draw: RngStream, ranges: ResetRanges, height: float, distance: float, apex: float, g: float) -> float:
     """Return the upward speed [m/s] with which a jump over a distance [m] leaves a height [m]."""
     if apex > 0.0:
         return wp.sqrt(wp.max(2.0 * g * (apex - height), 0.0))
@@ -202,7 +202,7 @@ def takeoff_speed(draw: Draw, ranges: ResetRanges, height: float, distance: floa
 
 
 @wp.func
-def in_flight(start: JumpStart, draw: Draw, g: float) -> JumpBase:
+def in_flight(start: JumpStart, draw: RngStream, g: float) -> JumpBase:
     """Return a base on the projectile to the goal: anywhere, shortly before touchdown, or for a push at the takeoff."""
     ranges = start.ranges
     along = direction(start)
@@ -229,7 +229,7 @@ def in_flight(start: JumpStart, draw: Draw, g: float) -> JumpBase:
 
 
 @wp.func
-def before_touchdown(start: JumpStart, flight: JumpBase, draw: Draw) -> JumpBase:
+def before_touchdown(start: JumpStart, flight: JumpBase, draw: RngStream) -> JumpBase:
     """Return a base in flight moved behind the spot that its paws surround."""
     base = flight
     base.spot = wp.vec3(flight.pos[0], flight.pos[1], 0.0)
@@ -240,7 +240,7 @@ def before_touchdown(start: JumpStart, flight: JumpBase, draw: Draw) -> JumpBase
 
 
 @wp.func
-def pushing_off(start: JumpStart, takeoff: JumpBase, draw: Draw) -> JumpBase:
+def pushing_off(start: JumpStart, takeoff: JumpBase, draw: RngStream) -> JumpBase:
     """Return a base before its takeoff, over paws around the start: on a straight line, evenly accelerated."""
     base = takeoff
     back = uniform_range(draw, streams.PUSH_LENGTH, start.ranges.push_length)
@@ -253,7 +253,7 @@ def pushing_off(start: JumpStart, takeoff: JumpBase, draw: Draw) -> JumpBase:
 
 
 @wp.func
-def sample_base(start: JumpStart, arrays: RobotArrays, draw: Draw, attempt: int) -> JumpBase:
+def sample_base(start: JumpStart, arrays: RobotArrays, draw: RngStream, attempt: int) -> JumpBase:
     """Return the base of the start's scheme in an attempt."""
     base = JumpBase()
     if start.scheme == STANDING:
@@ -276,7 +276,7 @@ def sample_base(start: JumpStart, arrays: RobotArrays, draw: Draw, attempt: int)
 
 
 @wp.func
-def leg_in_flight(ranges: ResetRanges, base: JumpBase, geo: LegGeometry, draw: Draw, leg: int) -> LegSample:
+def leg_in_flight(ranges: ResetRanges, base: JumpBase, geo: LegGeometry, draw: RngStream, leg: int) -> LegSample:
     """Return a leg in flight, its paw above the ground: both thighs about alike, all legs about alike."""
     lower = ranges.flight_transversal[0]
     upper = ranges.flight_transversal[1]
@@ -295,7 +295,7 @@ def leg_in_flight(ranges: ResetRanges, base: JumpBase, geo: LegGeometry, draw: D
 
 
 @wp.func
-def sample_leg(start: JumpStart, base: JumpBase, geo: LegGeometry, draw: Draw, leg: int) -> LegSample:
+def sample_leg(start: JumpStart, base: JumpBase, geo: LegGeometry, draw: RngStream, leg: int) -> LegSample:
     """Return a leg of an attempt: in flight, or by its paw's place on the ground, above it before touchdown."""
     ranges = start.ranges
     if start.scheme == IN_FLIGHT:
@@ -319,7 +319,7 @@ def sample_leg(start: JumpStart, base: JumpBase, geo: LegGeometry, draw: Draw, l
 
 
 @wp.func
-def write_start(arrays: RobotArrays, scene: Scene, start: JumpStart, draw: Draw) -> int:
+def write_start(arrays: RobotArrays, scene: Scene, start: JumpStart, draw: RngStream) -> int:
     """Write a start state to a world, and return its scheme: `DEFAULT` where no attempt was valid too."""
     if start.scheme != DEFAULT:
         if sample_valid_state(sample_base, sample_leg, start, arrays, scene, draw):

@@ -2,7 +2,7 @@
 
 Joint angles come from the closed-form inverse kinematics and joint rates from the leg's Jacobian, so that every state
 satisfies the loops. A sample whose paws cannot be reached within limits, or whose links touch what they must not, is
-rejected. On a GPU the 32 threads of a world differ in `Draw.lane` alone, and reach every exchange together (see
+rejected. On a GPU the 32 threads of a world differ in `RngStream.lane` alone, and reach every exchange together (see
 `lanes`); each writes to coordinates of its own until one is accepted.
 """
 
@@ -18,7 +18,7 @@ from ..scalar import vec3
 from ..state import leg_coord, leg_dof, load_motors, store_motors
 from ..terrain.ground import Ground
 from .env import Scene
-from .random import Draw, fold_in
+from .random import RngStream, fold_in
 from .starts import APART, LegSample
 from .view import RobotArrays
 
@@ -30,19 +30,19 @@ LANES = 32
 
 
 @wp.func
-def first_leg(draw: Draw) -> int:
+def first_leg(draw: RngStream) -> int:
     """Return the first leg that a thread samples."""
     return draw.lane % 4
 
 
 @wp.func
-def leg_step(draw: Draw) -> int:
+def leg_step(draw: RngStream) -> int:
     """Return how many legs further a thread samples its next one."""
     return wp.min(draw.lanes, 4)
 
 
 @wp.func
-def all_legs(draw: Draw, flag: bool) -> bool:
+def all_legs(draw: RngStream, flag: bool) -> bool:
     """Return whether a flag, which each thread has for its legs, is set for all legs of an attempt."""
     if draw.lanes > 1:
         return all_of_attempt(flag)
@@ -56,7 +56,7 @@ def vec_from_leg(v: vec3, leg: int) -> vec3:
 
 
 @wp.func
-def meet_attempts(draw: Draw):
+def meet_attempts(draw: RngStream):
     """Wait for the threads of a world; each then sees what the others wrote."""
     if draw.lanes > 1:
         meet()
@@ -71,7 +71,7 @@ def store_leg(leg: int, sample: LegSample, joint_q: wp.array(dtype=float), joint
 
 @wp.func
 def pose_is_valid(
-    geometry: wp.array(dtype=LegGeometry), ground: Ground, draw: Draw, own: LegSample, reachable: bool,
+    geometry: wp.array(dtype=LegGeometry), ground: Ground, draw: RngStream, own: LegSample, reachable: bool,
     joint_q: wp.array(dtype=float), joint_qd: wp.array(dtype=float),
 ) -> bool:  # fmt: skip
     """Return whether legs are reachable and touch nothing; completes the coordinates by the legs of other threads.
@@ -95,7 +95,7 @@ def pose_is_valid(
 
 @wp.func
 def write_sample_and_check(
-    sample_base: wp.Function, sample_leg: wp.Function, start: Any, arrays: RobotArrays, scene: Scene, draw: Draw,
+    sample_base: wp.Function, sample_leg: wp.Function, start: Any, arrays: RobotArrays, scene: Scene, draw: RngStream,
     attempt: int, joint_q: wp.array(dtype=float), joint_qd: wp.array(dtype=float),
 ) -> bool:  # fmt: skip
     """Write the sample of an attempt to coordinates of one world, and return whether it is valid."""
@@ -117,7 +117,7 @@ def write_sample_and_check(
 
 @wp.func
 def write_first_valid(
-    geometry: wp.array(dtype=LegGeometry), draw: Draw, accepted: int, own_q: wp.array(dtype=float),
+    geometry: wp.array(dtype=LegGeometry), draw: RngStream, accepted: int, own_q: wp.array(dtype=float),
     own_qd: wp.array(dtype=float), joint_q: wp.array(dtype=float), joint_qd: wp.array(dtype=float),
 ) -> bool:  # fmt: skip
     """Write the first valid attempt to the coordinates of all worlds; returns whether there is one.
@@ -141,7 +141,7 @@ def write_first_valid(
 
 @wp.func
 def sample_valid_state(
-    sample_base: wp.Function, sample_leg: wp.Function, start: Any, arrays: RobotArrays, scene: Scene, draw: Draw
+    sample_base: wp.Function, sample_leg: wp.Function, start: Any, arrays: RobotArrays, scene: Scene, draw: RngStream
 ) -> bool:
     """Sample states of a world until one is valid, and write it; returns whether one of the attempts was.
 

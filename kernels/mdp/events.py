@@ -5,7 +5,7 @@ import warp as wp
 from .env import EnvArrays
 from .options import FAST
 from .parameters import RobotParameters
-from .random import EVENT, INTERVAL, Draw, make_stream, uniform
+from .random import EVENT, INTERVAL, RngStream, make_stream, uniform
 
 STARTUP, AT_RESET, AT_STEP = 0, 1, 2
 LANES = 8
@@ -14,7 +14,7 @@ MODES = {"startup": STARTUP, "reset": AT_RESET, "interval": AT_STEP}
 
 
 @wp.func
-def steps_until(draw: Draw, least: float, most: float, step_dt: float) -> int:
+def steps_until(draw: RngStream, least: float, most: float, step_dt: float) -> int:
     """Return a drawn number of policy steps between two times [s], at least one."""
     return wp.max(int(wp.round(uniform(draw, INTERVAL, least, most) / step_dt)), 1)
 

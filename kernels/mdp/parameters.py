@@ -9,7 +9,7 @@ import warp as wp
 
 from ..actuation.motors import MotorArrays
 from ..layout import BODIES, DOFS, motor_slot
-from .random import Draw, uniform
+from .random import RngStream, uniform
 
 wp.set_module_options({"enable_backward": False, "max_unroll": 1})  # long loops in short code
 
@@ -63,27 +63,27 @@ def write_mass(robot: RobotParameters, world: int, body: int, scale: float):
 
 
 @wp.func
-def base_mass(robot: RobotParameters, draw: Draw, lower: float, upper: float):
+def base_mass(robot: RobotParameters, draw: RngStream, lower: float, upper: float):
     """Add a mass [kg] to the base, its inertia in proportion."""
     write_mass(robot, draw.world, 0, 1.0 + uniform(draw, 0, lower, upper) / robot.nominal_mass[0])
 
 
 @wp.func
-def link_mass(robot: RobotParameters, draw: Draw, lower: float, upper: float):
+def link_mass(robot: RobotParameters, draw: RngStream, lower: float, upper: float):
     """Scale mass and inertia of each link of the legs."""
     for body in range(1 + draw.lane, BODIES, draw.lanes):
         write_mass(robot, draw.world, body, uniform(draw, body, lower, upper))
 
 
 @wp.func
-def com_shift(robot: RobotParameters, draw: Draw, lower: float, upper: float):
+def com_shift(robot: RobotParameters, draw: RngStream, lower: float, upper: float):
     """Shift the base's centre of mass [m] along each axis."""
     shift = wp.vec3(uniform(draw, 0, lower, upper), uniform(draw, 1, lower, upper), uniform(draw, 2, lower, upper))
     robot.body_com[draw.world * BODIES] = robot.nominal_com[0] + shift
 
 
 @wp.func
-def armature(robot: RobotParameters, draw: Draw, lower: float, upper: float):
+def armature(robot: RobotParameters, draw: RngStream, lower: float, upper: float):
     """Scale each motor's armature."""
     for m in range(draw.lane, 12, draw.lanes):
         dof = 6 + motor_slot(m)
@@ -91,7 +91,7 @@ def armature(robot: RobotParameters, draw: Draw, lower: float, upper: float):
 
 
 @wp.func
-def motor_friction(robot: RobotParameters, draw: Draw, lower: float, upper: float):
+def motor_friction(robot: RobotParameters, draw: RngStream, lower: float, upper: float):
     """Give each motor a Coulomb friction [N m]."""
     for m in range(draw.lane, 12, draw.lanes):
         robot.joint_friction[draw.world * DOFS + 6 + motor_slot(m)] = uniform(draw, m, lower, upper)
@@ -143,7 +143,7 @@ def motors_kernel(
 
 @wp.func
 def gains(
-    robot: RobotParameters, draw: Draw, kp_lower: float, kp_upper: float, kd_lower: float, kd_upper: float
+    robot: RobotParameters, draw: RngStream, kp_lower: float, kp_upper: float, kd_lower: float, kd_upper: float
 ):  # fmt: skip
     """Scale kp and kd of each motor."""
     for m in range(draw.lane, 12, draw.lanes):
@@ -154,7 +154,7 @@ def gains(
 
 @wp.func
 def speed_limits(
-    robot: RobotParameters, draw: Draw, no_load_lower: float, no_load_upper: float, cutoff_lower: float,
+    robot: RobotParameters, draw: RngStream, no_load_lower: float, no_load_upper: float, cutoff_lower: float,
     cutoff_upper: float,
 ):  # fmt: skip
     """Scale no-load and cutoff speed of each motor; the cutoff stays below the no-load speed."""
@@ -167,7 +167,7 @@ def speed_limits(
 
 
 @wp.func
-def joint_offset(robot: RobotParameters, draw: Draw, lower: float, upper: float):
+def joint_offset(robot: RobotParameters, draw: RngStream, lower: float, upper: float):
     """Give each motor's position sensor a constant error [rad] besides its nominal one."""
     for m in range(draw.lane, 12, draw.lanes):
         robot.motors.offset[m, draw.world] = robot.nominal_offset[m] + uniform(draw, m, lower, upper)
@@ -175,7 +175,7 @@ def joint_offset(robot: RobotParameters, draw: Draw, lower: float, upper: float)
 
 @wp.func
 def friction(
-    robot: RobotParameters, draw: Draw, dynamic_lower: float, dynamic_upper: float, static_lower: float,
+    robot: RobotParameters, draw: RngStream, dynamic_lower: float, dynamic_upper: float, static_lower: float,
     static_upper: float,
 ):  # fmt: skip
     """Draw the paws' dynamic coefficient, and a static one that is not below it."""
@@ -194,7 +194,7 @@ def physics_steps(robot: RobotParameters, seconds: float) -> int:
 
 
 @wp.func
-def drawn_delay(robot: RobotParameters, draw: Draw, lower: float, upper: float, none: float) -> int:
+def drawn_delay(robot: RobotParameters, draw: RngStream, lower: float, upper: float, none: float) -> int:
     """Return a drawn delay [physics steps], none in a share of draws."""
     if uniform(draw, 1, 0.0, 1.0) < none:
         return 0
@@ -202,20 +202,20 @@ def drawn_delay(robot: RobotParameters, draw: Draw, lower: float, upper: float, 
 
 
 @wp.func
-def action_latency(robot: RobotParameters, draw: Draw, lower: float, upper: float, none: float = 0.0):
+def action_latency(robot: RobotParameters, draw: RngStream, lower: float, upper: float, none: float = 0.0):
     """Delay actions [s], but not in a share of worlds."""
     robot.latency[draw.world] = drawn_delay(robot, draw, lower, upper, none)
 
 
 @wp.func
-def observation_latency(robot: RobotParameters, draw: Draw, lower: float, upper: float, none: float = 0.0):
+def observation_latency(robot: RobotParameters, draw: RngStream, lower: float, upper: float, none: float = 0.0):
     """Delay what the policy reads of its sensors [s], but not in a share of worlds."""
     robot.observation_latency[draw.world] = drawn_delay(robot, draw, lower, upper, none)
 
 
 @wp.func
 def push(
-    robot: RobotParameters, draw: Draw, share: float, force_lower: float, force_upper: float, torque_lower: float,
+    robot: RobotParameters, draw: RngStream, share: float, force_lower: float, force_upper: float, torque_lower: float,
     torque_upper: float,
 ):  # fmt: skip
     """Push the base with a force [N] along and a torque [N m] about each world axis in a share of draws, else not."""

@@ -14,7 +14,7 @@ ANY_LEVEL = wp.constant(-2)  # of the curriculum, of a world past the last
 
 
 @wp.struct
-class Draw:
+class RngStream:
     """Independent random numbers of one world."""
 
     world: int
@@ -30,9 +30,9 @@ def step_key(seed: int, world: int, clock: int) -> wp.uint32:
 
 
 @wp.func
-def stream_at(moment: wp.uint32, world: int, stream: int) -> Draw:
+def stream_at(moment: wp.uint32, world: int, stream: int) -> RngStream:
     """Return the numbers of a stream at a moment."""
-    draw = Draw()
+    draw = RngStream()
     draw.world = world
     draw.lanes = 1
     draw.seed = wp.rand_init(int(moment), stream)
@@ -40,13 +40,13 @@ def stream_at(moment: wp.uint32, world: int, stream: int) -> Draw:
 
 
 @wp.func
-def make_stream(seed: int, world: int, clock: int, stream: int) -> Draw:
+def make_stream(seed: int, world: int, clock: int, stream: int) -> RngStream:
     """Return the numbers of a stream; clock: policy steps that the world has made."""
     return stream_at(step_key(seed, world, clock), world, stream)
 
 
 @wp.func
-def fold_in(draw: Draw, i: int) -> Draw:
+def fold_in(draw: RngStream, i: int) -> RngStream:
     """Return other numbers, independent for every i."""
     other = draw
     other.seed = wp.rand_init(int(draw.seed), 7919 + i)
@@ -54,18 +54,18 @@ def fold_in(draw: Draw, i: int) -> Draw:
 
 
 @wp.func
-def uniform(draw: Draw, i: int, lower: float, upper: float) -> float:
+def uniform(draw: RngStream, i: int, lower: float, upper: float) -> float:
     """Return the i-th number, uniform in [lower, upper)."""
     return lower + (upper - lower) * wp.randf(wp.rand_init(int(draw.seed), i))
 
 
 @wp.func
-def uniform_range(draw: Draw, i: int, pair: wp.vec2) -> float:
+def uniform_range(draw: RngStream, i: int, pair: wp.vec2) -> float:
     """Return the i-th number, uniform in a pair (lower, upper)."""
     return uniform(draw, i, pair[0], pair[1])
 
 
 @wp.func
-def clamped_normal(draw: Draw, i: int) -> float:
+def clamped_normal(draw: RngStream, i: int) -> float:
     """Return the i-th number, standard normal, cut at one standard deviation."""
     return wp.clamp(wp.randn(wp.rand_init(int(draw.seed), i)), -1.0, 1.0)

@@ -5,7 +5,7 @@ import warp as wp
 from ..kinematics.geometry import LegGeometry
 from ..kinematics.inverse import LegLimits, clamped_closed_form
 from ..kinematics.leg import leg_forward_kinematics, leg_inverse_velocity
-from .random import Draw, uniform_range
+from .random import RngStream, uniform_range
 
 wp.set_module_options({"enable_backward": False})
 
@@ -47,7 +47,7 @@ def leg_over_ground(geo: LegGeometry, leg: LegSample, ankle_vel: wp.vec3) -> Leg
 
 @wp.func
 def place_beside(
-    draw: Draw, leg: int, front_x: wp.vec2, front_y: wp.vec2, back_x: wp.vec2, back_y: wp.vec2
+    draw: RngStream, leg: int, front_x: wp.vec2, front_y: wp.vec2, back_x: wp.vec2, back_y: wp.vec2
 ) -> wp.vec3:  # fmt: skip
     """Return a paw's place [m] relative to the spot that the paws surround, z = 0; ranges of absolute values."""
     x = uniform_range(draw, PAW_X + leg, front_x)

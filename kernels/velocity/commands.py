@@ -3,7 +3,7 @@
 import warp as wp
 
 from ..mdp.env import Scene
-from ..mdp.random import Draw, uniform, uniform_range
+from ..mdp.random import RngStream, uniform, uniform_range
 from ..mdp.view import RobotView
 from . import streams
 from .state import POLICY_RATE, VelocityState
@@ -36,7 +36,7 @@ def reach_of(ranges: CommandRanges, level: int) -> wp.vec4:
 
 
 @wp.func
-def draw_velocity(draw: Draw, ranges: CommandRanges, level: int) -> wp.vec3:
+def draw_velocity(draw: RngStream, ranges: CommandRanges, level: int) -> wp.vec3:
     """Return a command of a level.
 
     Beyond the first level, the faster it goes along x, the less far it reaches across and in turning: an ellipse
@@ -81,7 +81,7 @@ def command_due(state: VelocityState) -> bool:
 
 @wp.func
 def draw_command(
-    robot: RobotView, scene: Scene, state: VelocityState, level: CommandRanges, draw: Draw
+    robot: RobotView, scene: Scene, state: VelocityState, level: CommandRanges, draw: RngStream
 ) -> VelocityState:
     """Return the state of an episode that goes on with a drawn command."""
     new = with_command(state, draw_velocity(draw, level, state.command_level))

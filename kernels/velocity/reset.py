@@ -4,7 +4,7 @@ import warp as wp
 
 from ..mdp.attempts import meet_attempts
 from ..mdp.env import Scene, SkillSettings
-from ..mdp.random import Draw, uniform, uniform_range
+from ..mdp.random import RngStream, uniform, uniform_range
 from ..mdp.view import RobotArrays, base_pos
 from ..terrain.ground import rest_block
 from . import streams
@@ -59,7 +59,7 @@ def carried_over(
 @wp.func
 def reset_velocity(
     arrays: RobotArrays, scene: Scene, skill: SkillSettings, old: VelocityState, settings: VelocitySettings,
-    level: CommandRanges, draw: Draw,
+    level: CommandRanges, draw: RngStream,
 ) -> VelocityState:  # fmt: skip
     """Begin an episode with a drawn command, and return its state."""
     world = draw.world

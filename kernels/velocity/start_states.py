@@ -10,7 +10,7 @@ from ..kinematics.inverse import LegLimits
 from ..layout import BODIES, COORDS
 from ..mdp.attempts import sample_valid_state
 from ..mdp.env import Scene, SkillSettings
-from ..mdp.random import Draw, uniform, uniform_range
+from ..mdp.random import RngStream, uniform, uniform_range
 from ..mdp.reset import leg_limits, store_pose
 from ..mdp.starts import LegSample, leg_over_ground, leg_to, place_beside, turn_of
 from ..mdp.view import RobotArrays, turned
@@ -76,7 +76,7 @@ class VelocityBase:
 
 
 @wp.func
-def draw_spot(draw: Draw, map: Map, level: int) -> wp.vec2:
+def draw_spot(draw: RngStream, map: Map, level: int) -> wp.vec2:
     """Return the middle of a tile [m] of a level, of any level past the last; the origin without a map."""
     if map.rows == 0:
         return wp.vec2(0.0)
@@ -90,7 +90,7 @@ def draw_spot(draw: Draw, map: Map, level: int) -> wp.vec2:
 
 
 @wp.func
-def sample_base(start: VelocityStart, arrays: RobotArrays, draw: Draw, attempt: int) -> VelocityBase:
+def sample_base(start: VelocityStart, arrays: RobotArrays, draw: RngStream, attempt: int) -> VelocityBase:
     """Return a base in motion around the start's spot."""
     settings = start.settings
     v = settings.lin_vel
@@ -120,7 +120,7 @@ def sample_base(start: VelocityStart, arrays: RobotArrays, draw: Draw, attempt: 
 
 
 @wp.func
-def sample_leg(start: VelocityStart, base: VelocityBase, geo: LegGeometry, draw: Draw, leg: int) -> LegSample:
+def sample_leg(start: VelocityStart, base: VelocityBase, geo: LegGeometry, draw: RngStream, leg: int) -> LegSample:
     """Return a leg; its paw rests on the ground, or is in the air in a share of draws."""
     settings = start.settings
     beside = place_beside(draw, leg, settings.front_x, settings.front_y, settings.back_x, settings.back_y)
@@ -139,7 +139,12 @@ def sample_leg(start: VelocityStart, base: VelocityBase, geo: LegGeometry, draw:
 
 @wp.func
 def write_start(
-    arrays: RobotArrays, scene: Scene, skill: SkillSettings, settings: VelocitySettings, terrain_level: int, draw: Draw
+    arrays: RobotArrays,
+    scene: Scene,
+    skill: SkillSettings,
+    settings: VelocitySettings,
+    terrain_level: int,
+    draw: RngStream,
 ):
     """Write a start state to a world: a sampled one, or in a share of draws the default pose."""
     world = draw.world

@@ -86,7 +86,7 @@ def advance_hold(view: mdp.RobotView, state: HoldState, tolerance: float) -> Hol
 @wp.func
 def reset_hold(
     robot: mdp.RobotArrays, scene: mdp.Scene, skill: mdp.SkillSettings, old: HoldState, settings: HoldSettings,
-    level: HoldLevel, draw: mdp.Draw,
+    level: HoldLevel, draw: mdp.RngStream,
 ) -> HoldState:  # fmt: skip
     """Stand in the default pose with any heading."""
     mdp.store_pose(robot, scene, draw.world, mdp.uniform(draw, 0, -settings.heading, settings.heading), 0.0)
@@ -113,7 +113,9 @@ def another_goal_due(state: HoldState) -> bool:
 
 
 @wp.func
-def draw_goal(view: mdp.RobotView, scene: mdp.Scene, state: HoldState, level: HoldLevel, draw: mdp.Draw) -> HoldState:
+def draw_goal(
+    view: mdp.RobotView, scene: mdp.Scene, state: HoldState, level: HoldLevel, draw: mdp.RngStream
+) -> HoldState:
     """Command another height."""
     new = state
     new.goal = mdp.uniform_range(draw, 1, level.goal)
@@ -152,7 +154,7 @@ def wanted_height(view: mdp.RobotView, state: HoldState) -> float:
 
 
 @wp.func
-def weak_motors(robot: mdp.RobotParameters, draw: mdp.Draw, lower: float, upper: float):
+def weak_motors(robot: mdp.RobotParameters, draw: mdp.RngStream, lower: float, upper: float):
     """Scale the torque limit of each motor."""
     for m in range(12):
         robot.torque_ratio[m, draw.world] = mdp.uniform(draw, m, lower, upper)

@@ -10,7 +10,7 @@ from jumper_warp.envs.skill import Skill
 from jumper_warp.kernels.mdp import terminations
 from jumper_warp.kernels.mdp.env import Scene, SkillSettings
 from jumper_warp.kernels.mdp.parameters import RobotParameters
-from jumper_warp.kernels.mdp.random import Draw, uniform
+from jumper_warp.kernels.mdp.random import RngStream, uniform
 from jumper_warp.kernels.mdp.reset import store_pose
 from jumper_warp.kernels.mdp.view import RobotArrays, RobotView
 from jumper_warp.kernels.terrain.ground import Ground
@@ -87,7 +87,7 @@ def advance_probe(robot: RobotView, state: ProbeState, growth: float) -> ProbeSt
 @wp.func
 def reset_probe(
     arrays: RobotArrays, scene: Scene, skill: SkillSettings, old: ProbeState, settings: ProbeSettings, level: ProbeLevel,
-    draw: Draw,
+    draw: RngStream,
 ) -> ProbeState:  # fmt: skip
     """Stand; keep a draw in `other` and the level in `counts`."""
     store_pose(arrays, scene, draw.world, 0.5, 0.25)
@@ -114,7 +114,7 @@ def command_due(state: ProbeState) -> bool:
 
 
 @wp.func
-def draw_command(robot: RobotView, scene: Scene, state: ProbeState, level: ProbeLevel, draw: Draw) -> ProbeState:
+def draw_command(robot: RobotView, scene: Scene, state: ProbeState, level: ProbeLevel, draw: RngStream) -> ProbeState:
     """Keep a draw in `other` and the level in `counts`."""
     new = state
     new.other = uniform(draw, 0, 0.0, 1.0)

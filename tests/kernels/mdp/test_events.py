@@ -8,7 +8,7 @@ import warp as wp
 from jump_helpers import edit_episodes, make_env, random_actions
 from jumper_warp.kernels.mdp.events import AT_RESET, AT_STEP, STARTUP
 from jumper_warp.kernels.mdp.parameters import RobotParameters
-from jumper_warp.kernels.mdp.random import Draw, uniform
+from jumper_warp.kernels.mdp.random import RngStream, uniform
 from jumper_warp.registry import make_task
 from jumper_warp.tasks.randomization import RandomizationCfg
 from jumper_warp.tasks.terms import EventTerm
@@ -19,19 +19,19 @@ N = 256
 
 
 @wp.func
-def count(robot: RobotParameters, draw: Draw, times: float):
+def count(robot: RobotParameters, draw: RngStream, times: float):
     """Count in the latency how often the event ran."""
     robot.latency[draw.world] = robot.latency[draw.world] + int(times)
 
 
 @wp.func
-def mark(robot: RobotParameters, draw: Draw):
+def mark(robot: RobotParameters, draw: RngStream):
     """Count in the latency of observations."""
     robot.observation_latency[draw.world] = robot.observation_latency[draw.world] + 1
 
 
 @wp.func
-def drawn_force(robot: RobotParameters, draw: Draw, lower: float, upper: float):
+def drawn_force(robot: RobotParameters, draw: RngStream, lower: float, upper: float):
     """Draw a force."""
     robot.push[draw.world] = wp.spatial_vector(uniform(draw, 0, lower, upper), 0.0, 0.0, 0.0, 0.0, 0.0)
 
