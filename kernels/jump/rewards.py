@@ -69,7 +69,9 @@ def horizontal_velocity(robot: RobotView, state: JumpState, width: float, share:
 @wp.func
 def orientation(robot: RobotView, state: JumpState, width: float, share: float) -> float:
     """Orientation error: phi_width of the horizontal part of projected gravity; `share` of it while a jump is due."""
-    return phi(wp.length(wp.vec2(robot.gravity[0], robot.gravity[1])), width) * patience(state, share)
+    return phi(wp.length(wp.vec2(robot.projected_gravity[0], robot.projected_gravity[1])), width) * patience(
+        state, share
+    )
 
 
 @wp.func
@@ -233,7 +235,7 @@ def rest(robot: RobotView, state: JumpState, speed: float, spin: float) -> float
 @wp.func
 def tilt_over(robot: RobotView, width: float) -> float:
     """Return the squared sine of the angle between body z and world z over that of width [rad]."""
-    sine = wp.length(wp.vec2(robot.gravity[0], robot.gravity[1])) / wp.sin(width)
+    sine = wp.length(wp.vec2(robot.projected_gravity[0], robot.projected_gravity[1])) / wp.sin(width)
     return sine * sine
 
 

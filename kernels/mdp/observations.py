@@ -25,7 +25,7 @@ def ang_vel(robot: RobotView, state: Any) -> wp.vec3:
 @wp.func
 def gravity(robot: RobotView, state: Any) -> wp.vec3:
     """Direction of gravity, body axes [1]."""
-    return robot.gravity
+    return robot.projected_gravity
 
 
 @wp.func

@@ -21,7 +21,7 @@ class RobotView:
     old_lin_vel: wp.vec3  # [m/s] the same one policy step before
     lin_acc: wp.vec3  # [m/s^2] base origin, world, mean of the policy step
     ang_vel: wp.vec3  # [rad/s] body axes
-    gravity: wp.vec3  # [1] direction of gravity in body axes
+    projected_gravity: wp.vec3  # [1] direction of gravity in body axes
     fall_acc: float  # [m/s^2] of gravity, downward
     angle: vec12  # [rad]
     sensed_angle: vec12  # [rad] as the motors' position sensors read it
@@ -119,7 +119,7 @@ def load_base_view(arrays: RobotArrays, ground: Ground, world: int) -> RobotView
     robot.lin_acc = (robot.lin_vel - robot.old_lin_vel) / arrays.step_dt
     ang = wp.vec3(arrays.joint_qd[j + 3], arrays.joint_qd[j + 4], arrays.joint_qd[j + 5])
     robot.ang_vel = wp.quat_rotate_inv(quat, ang)
-    robot.gravity = wp.quat_rotate_inv(quat, wp.vec3(0.0, 0.0, -1.0))
+    robot.projected_gravity = wp.quat_rotate_inv(quat, wp.vec3(0.0, 0.0, -1.0))
     robot.fall_acc = -arrays.gravity[world][2]
     below = surface(world_ground(ground, world), robot.pos[0], robot.pos[1])
     robot.height = robot.pos[2] - below[0]
@@ -209,7 +209,7 @@ def rotation_from(quat: wp.quat, heading: float) -> float:
 @wp.func
 def tilt(robot: RobotView) -> float:
     """Return the angle [rad] between body z and world z."""
-    return wp.acos(wp.clamp(-robot.gravity[2], -1.0, 1.0))
+    return wp.acos(wp.clamp(-robot.projected_gravity[2], -1.0, 1.0))
 
 
 @wp.func

@@ -42,7 +42,10 @@ def lateral_stability(robot: RobotView, state: VelocityState) -> float:
 @wp.func
 def flat(robot: RobotView, state: VelocityState) -> float:
     """Flat L2: square of the horizontal part of projected gravity [1]."""
-    return robot.gravity[0] * robot.gravity[0] + robot.gravity[1] * robot.gravity[1]
+    return (
+        robot.projected_gravity[0] * robot.projected_gravity[0]
+        + robot.projected_gravity[1] * robot.projected_gravity[1]
+    )
 
 
 @wp.func
@@ -169,7 +172,7 @@ def shank_lean(robot: RobotView, state: VelocityState, free: float, hip: float, 
     A shank that leans far over its paw hits the edge of a step beside it. The angles are those in the leg's plane, with
     the pitch of the base. hip: half the distance of the transversal axes [m]; thigh, shank: lengths [m].
     """
-    down = wp.vec2(robot.gravity[0], robot.gravity[2])
+    down = wp.vec2(robot.projected_gravity[0], robot.projected_gravity[2])
     total = float(0.0)
     for k in range(4):
         front = wp.where(k < 2, 1.0, -1.0)
