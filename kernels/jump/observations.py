@@ -53,14 +53,14 @@ def phase_times(robot: RobotView, state: JumpState) -> wp.vec2:
 @wp.func
 def height_errors(robot: RobotView, state: JumpState) -> wp.vec2:
     """Highest base height so far, and its ballistic estimate, less the wanted one [m]."""
-    apex = estimated_apex(robot.pos, robot.lin_vel, robot.fall_acc)
+    apex = estimated_apex(robot.pos, robot.lin_vel, robot.gravity_magnitude)
     return wp.vec2(state.max_height - state.goal[2], apex - state.goal[2])
 
 
 @wp.func
 def landing_miss(robot: RobotView, state: JumpState) -> wp.vec2:
     """Way from the ballistic landing to the goal [m], ahead and to the left."""
-    landing = estimated_landing(robot.pos, robot.lin_vel, LANDING_HEIGHT + state.goal_ground, robot.fall_acc)
+    landing = estimated_landing(robot.pos, robot.lin_vel, LANDING_HEIGHT + state.goal_ground, robot.gravity_magnitude)
     miss = turned(wp.vec3(state.goal[0] - landing[0], state.goal[1] - landing[1], 0.0), -yaw_of(robot.quat))
     return wp.vec2(miss[0], miss[1])
 

@@ -30,7 +30,7 @@ def estimated_landing(pos: wp.vec3, lin_vel: wp.vec3, height: float, g: float) -
 @wp.func
 def landing_error_estimate(robot: RobotView, state: JumpState, height: float) -> float:
     """Return how far from the goal [m] the base's projectile falls through a height [m] above the ground there."""
-    landing = estimated_landing(robot.pos, robot.lin_vel, height + state.goal_ground, robot.fall_acc)
+    landing = estimated_landing(robot.pos, robot.lin_vel, height + state.goal_ground, robot.gravity_magnitude)
     return wp.length(wp.vec2(state.goal[0] - landing[0], state.goal[1] - landing[1]))
 
 

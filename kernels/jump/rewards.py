@@ -56,7 +56,9 @@ def estimated_jump_height(robot: RobotView, state: JumpState, fine: float, sharp
     """Est jump height: the same of the ballistic estimate, in flight until the apex."""
     if state.phase != FLIGHT or state.apex_passed != 0:
         return 0.0
-    return height_kernel(estimated_apex(robot.pos, robot.lin_vel, robot.fall_acc) - state.goal[2], fine, sharp, wide)
+    return height_kernel(
+        estimated_apex(robot.pos, robot.lin_vel, robot.gravity_magnitude) - state.goal[2], fine, sharp, wide
+    )
 
 
 @wp.func
@@ -282,7 +284,7 @@ def capture_point(robot: RobotView, state: JumpState, width: float) -> float:
     """
     if state.phase != LANDED:
         return 0.0
-    reach = wp.sqrt(wp.max(robot.height, 0.0) / robot.fall_acc)
+    reach = wp.sqrt(wp.max(robot.height, 0.0) / robot.gravity_magnitude)
     x = robot.pos[0] + reach * robot.lin_vel[0]
     y = robot.pos[1] + reach * robot.lin_vel[1]
     for k in range(4):

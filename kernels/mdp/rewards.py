@@ -61,7 +61,7 @@ def motor_torque_sq(robot: RobotView, state: Any) -> float:
 @wp.func
 def joint_acceleration(robot: RobotView, state: Any) -> float:
     """Joint acceleration: sum of squares [rad^2/s^4]."""
-    return square_sum(robot.rate_change)
+    return square_sum(robot.joint_acc)
 
 
 @wp.func

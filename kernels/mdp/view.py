@@ -22,11 +22,11 @@ class RobotView:
     lin_acc: wp.vec3  # [m/s^2] base origin, world, mean of the policy step
     ang_vel: wp.vec3  # [rad/s] body axes
     projected_gravity: wp.vec3  # [1] direction of gravity in body axes
-    fall_acc: float  # [m/s^2] of gravity, downward
+    gravity_magnitude: float  # [m/s^2] of gravity, downward
     angle: vec12  # [rad]
     sensed_angle: vec12  # [rad] as the motors' position sensors read it
     rate: vec12  # [rad/s]
-    rate_change: vec12  # [rad/s^2] mean of the policy step
+    joint_acc: vec12  # [rad/s^2] mean of the policy step
     torque: vec12  # [N m] last physics step
     old_torque: vec12  # [N m] last physics step of the policy step before
     action: vec12  # [1] within -1..1
@@ -120,7 +120,7 @@ def load_base_view(arrays: RobotArrays, ground: Ground, world: int) -> RobotView
     ang = wp.vec3(arrays.joint_qd[j + 3], arrays.joint_qd[j + 4], arrays.joint_qd[j + 5])
     robot.ang_vel = wp.quat_rotate_inv(quat, ang)
     robot.projected_gravity = wp.quat_rotate_inv(quat, wp.vec3(0.0, 0.0, -1.0))
-    robot.fall_acc = -arrays.gravity[world][2]
+    robot.gravity_magnitude = -arrays.gravity[world][2]
     below = surface(world_ground(ground, world), robot.pos[0], robot.pos[1])
     robot.height = robot.pos[2] - below[0]
     return robot
@@ -158,7 +158,7 @@ def load_view(arrays: RobotArrays, ground: Ground, world: int) -> RobotView:
         robot.angle[m] = angle
         robot.sensed_angle[m] = angle + arrays.joint_offset[m, world]
         robot.rate[m] = rate
-        robot.rate_change[m] = (rate - arrays.old_rate[m, world]) / arrays.step_dt
+        robot.joint_acc[m] = (rate - arrays.old_rate[m, world]) / arrays.step_dt
         robot.torque[m] = arrays.torque[m, world]
         robot.old_torque[m] = arrays.old_torque[m, world]
         robot.action[m] = arrays.action[m, world]

@@ -93,9 +93,9 @@ def about_to_land(robot: RobotView, state: AttitudeState, requested: bool) -> bo
     """Turning to the jump: down soon, or down."""
     if robot.contacts > 0:
         return True
-    if robot.fall_acc <= 0.0 or robot.lin_vel[2] > 0.0:
+    if robot.gravity_magnitude <= 0.0 or robot.lin_vel[2] > 0.0:
         return False
-    left = time_to_height(robot.height, robot.lin_vel[2], LANDING_HEIGHT, robot.fall_acc)
+    left = time_to_height(robot.height, robot.lin_vel[2], LANDING_HEIGHT, robot.gravity_magnitude)
     return left < LANDING_TIME or robot.height < LANDING_HEIGHT
 
 

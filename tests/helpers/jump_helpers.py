@@ -80,7 +80,7 @@ def make_view(**fields) -> RobotView:
     view = RobotView()
     view.pos, view.quat, view.gravity = wp.vec3(0.0, 0.0, 0.4), wp.quat_identity(), wp.vec3(0.0, 0.0, -1.0)
     view.angle = view.default_angle = vec12(*DEFAULT_ANGLE)
-    view.fall_acc = 9.81
+    view.gravity_magnitude = 9.81
     for name, value in fields.items():
         kind = type(getattr(view, name))
         setattr(view, name, kind(*value) if np.ndim(value) else value)

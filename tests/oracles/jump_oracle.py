@@ -44,7 +44,7 @@ def between(before: dict, after: dict, action: np.ndarray) -> dict[str, np.ndarr
     """Return the robot after a step, with what follows from the step; action: (12, worlds)."""
     return after | {
         "acc": (after["vel"] - before["vel"]) / DT,
-        "rate_change": (after["rate"] - before["rate"]) / DT,
+        "joint_acc": (after["rate"] - before["rate"]) / DT,
         "action": action,
         "old_action": before["action"],
     }
@@ -199,7 +199,7 @@ TERMS = {
     "ground_force": lambda r, p: np.sum(r["force"] ** 2, axis=0) / p["weight_force"] ** 2,
     "action_clip": lambda r, p: r["clipped"],
     "motor_torque_sq": lambda r, p: np.sum(r["torque"] ** 2, axis=0),
-    "joint_acceleration": lambda r, p: np.sum(r["rate_change"] ** 2, axis=0),
+    "joint_acceleration": lambda r, p: np.sum(r["joint_acc"] ** 2, axis=0),
     "action_rate": lambda r, p: np.sum((r["action"] - r["old_action"]) ** 2, axis=0),
 }
 """(robot, numbers) -> value of every world, before weight and step."""

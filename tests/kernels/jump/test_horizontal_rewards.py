@@ -206,7 +206,7 @@ def test_bracing_is_paid_where_a_pendulum_stops_over_the_paws():
     view = make_view(pos=(0.0, 0.0, 0.24525), lin_vel=(2.0, 0.0, -3.0), paw_pos=paws.ravel())
     landed = make_episode(phase=LANDED)
     assert paid("capture_point", view, landed, width=0.1) == pytest.approx(1.0, abs=1e-4)
-    view.fall_acc = 9.81 / 4.0  # twice as far
+    view.gravity_magnitude = 9.81 / 4.0  # twice as far
     assert paid("capture_point", view, landed, width=0.3162) == pytest.approx(E(-1.0), rel=1e-3)
     assert paid("capture_point", view, make_episode(phase=FLIGHT), width=0.1) == 0.0
 
