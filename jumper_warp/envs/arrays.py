@@ -35,12 +35,12 @@ def robot_arrays(sim: Simulation, step_dt: float) -> Any:
     robot.invalid, robot.impulse = sim.physics.invalid, sim.physics.impulse
     robot.paw_force, robot.peak_force = sim.paw_force, sim.physics.peak_paw_force
     robot.torque, robot.joint_offset = sim.torque, sim.motors.offset
-    motors = ("old_torque", "action", "old_action", "older_action", "target", "safe_target", "old_rate")
+    motors = ("prev_torque", "action", "prev_action", "prev_prev_action", "target", "safe_target", "prev_rate")
     fill(robot, ("paw_pos", "paw_vel"), (4, n), wp.vec3, device)
     fill(robot, ("contact_time", "air_time", "touchdown_speed", "paw_height"), (4, n), float, device)
     fill(robot, ("collisions",), (4, n), int, device)
     fill(robot, motors, (12, n), float, device)
-    fill(robot, ("old_lin_vel",), n, wp.vec3, device)
+    fill(robot, ("prev_lin_vel",), n, wp.vec3, device)
     robot.default_angle = wp.array(load_description().pose("default"), dtype=float, device=device)
     robot.step_dt = step_dt
     return robot

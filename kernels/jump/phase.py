@@ -64,7 +64,7 @@ def advance_jump(robot: RobotView, state: JumpState, takeoff_speed: float) -> Ju
             t.apex_passed = 1
             t.at_apex = 1
     if t.touched_down == 1:
-        t.touchdown_vel = robot.old_lin_vel
+        t.touchdown_vel = robot.prev_lin_vel
         t.peak_tilt = 0.0
         t.paws_landed = 0
     if phase == LANDED:

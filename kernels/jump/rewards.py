@@ -301,7 +301,7 @@ def resting_action_rate(robot: RobotView, state: JumpState) -> float:
     """Quiet actions: sum of squared changes of the action, while the robot should rest."""
     if not should_rest(state):
         return 0.0
-    return square_sum(robot.action - robot.old_action)
+    return square_sum(robot.action - robot.prev_action)
 
 
 @wp.func
@@ -309,7 +309,7 @@ def torque_ripple(robot: RobotView, state: JumpState) -> float:
     """Torque ripple: sum of squared changes of the motor torques over the step [N^2 m^2], while it should rest."""
     if not should_rest(state):
         return 0.0
-    return square_sum(robot.torque - robot.old_torque)
+    return square_sum(robot.torque - robot.prev_torque)
 
 
 @wp.func

@@ -13,7 +13,7 @@ wp.set_module_options({"enable_backward": False})
 @wp.func
 def remember(arrays: RobotArrays, push: wp.array(dtype=wp.spatial_vector), push_in_flight: int, world: int):
     """Begin a world's policy step: keep the base's velocity, apply its push."""
-    arrays.old_lin_vel[world] = base_velocity(arrays, world, base_quat(arrays, world))
+    arrays.prev_lin_vel[world] = base_velocity(arrays, world, base_quat(arrays, world))
     pushed = push_in_flight
     for k in range(4):
         if arrays.contact_time[k, world] > 0.0:
@@ -64,11 +64,11 @@ def action_kernel(
             asked = 0.0
             env.bad_action[world] = 1
         action = wp.clamp(asked, -1.0, 1.0)
-        arrays.older_action[m, world] = arrays.old_action[m, world]
-        arrays.old_action[m, world] = arrays.action[m, world]
+        arrays.prev_prev_action[m, world] = arrays.prev_action[m, world]
+        arrays.prev_action[m, world] = arrays.action[m, world]
         arrays.action[m, world] = action
-        arrays.old_rate[m, world] = rates[j]
-        arrays.old_torque[m, world] = arrays.torque[m, world]
+        arrays.prev_rate[m, world] = rates[j]
+        arrays.prev_torque[m, world] = arrays.torque[m, world]
         angles[j] = angles[j] + arrays.joint_offset[m, world]
         target[j] = action * skill.action_scale[m] + arrays.default_angle[m]
     safe = filter_leg(target, angles, rates, skill.command_filter)

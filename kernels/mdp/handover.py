@@ -27,8 +27,8 @@ def hand_over(
         off = arrays.safe_target[m, world] - arrays.default_angle[m]
         action = wp.clamp(off / skills[target].action_scale[m], -1.0, 1.0)
         arrays.action[m, world] = action
-        arrays.old_action[m, world] = action
-        arrays.older_action[m, world] = action
+        arrays.prev_action[m, world] = action
+        arrays.prev_prev_action[m, world] = action
         set_motor(parameters, world, m)
 
 

@@ -208,13 +208,13 @@ def forget_kernel(
     slot = motor_slot(m)
     angle = arrays.joint_q[world * COORDS + 7 + slot]
     arrays.torque[m, world] = 0.0
-    arrays.old_torque[m, world] = 0.0
+    arrays.prev_torque[m, world] = 0.0
     arrays.action[m, world] = 0.0
-    arrays.old_action[m, world] = 0.0
-    arrays.older_action[m, world] = 0.0
+    arrays.prev_action[m, world] = 0.0
+    arrays.prev_prev_action[m, world] = 0.0
     arrays.target[m, world] = angle
     arrays.safe_target[m, world] = angle
-    arrays.old_rate[m, world] = arrays.joint_qd[world * DOFS + 6 + slot]
+    arrays.prev_rate[m, world] = arrays.joint_qd[world * DOFS + 6 + slot]
     for i in range(RING):
         delays.past_target[i, m, world] = angle
     if m < 4:
@@ -229,4 +229,4 @@ def forget_kernel(
         follow_paw(arrays, geometry[m], world, m)
     if m == 0:
         arrays.invalid[world] = 0
-        arrays.old_lin_vel[world] = base_velocity(arrays, world, base_quat(arrays, world))
+        arrays.prev_lin_vel[world] = base_velocity(arrays, world, base_quat(arrays, world))

@@ -67,13 +67,13 @@ def joint_acceleration(robot: RobotView, state: Any) -> float:
 @wp.func
 def action_rate(robot: RobotView, state: Any) -> float:
     """Action rate: sum of squared changes of the action."""
-    return square_sum(robot.action - robot.old_action)
+    return square_sum(robot.action - robot.prev_action)
 
 
 @wp.func
 def action_acceleration(robot: RobotView, state: Any) -> float:
     """Action acceleration: sum of squared second differences of the action."""
-    return square_sum(robot.action - 2.0 * robot.old_action + robot.older_action)
+    return square_sum(robot.action - 2.0 * robot.prev_action + robot.prev_prev_action)
 
 
 @wp.func

@@ -18,7 +18,7 @@ class RobotView:
     height: float  # [m] of the base origin above the ground below it
     quat: wp.quat  # xyzw, body to world
     lin_vel: wp.vec3  # [m/s] base origin, world
-    old_lin_vel: wp.vec3  # [m/s] the same one policy step before
+    prev_lin_vel: wp.vec3  # [m/s] the same one policy step before
     lin_acc: wp.vec3  # [m/s^2] base origin, world, mean of the policy step
     ang_vel: wp.vec3  # [rad/s] body axes
     projected_gravity: wp.vec3  # [1] direction of gravity in body axes
@@ -28,10 +28,10 @@ class RobotView:
     rate: vec12  # [rad/s]
     joint_acc: vec12  # [rad/s^2] mean of the policy step
     torque: vec12  # [N m] last physics step
-    old_torque: vec12  # [N m] last physics step of the policy step before
+    prev_torque: vec12  # [N m] last physics step of the policy step before
     action: vec12  # [1] within -1..1
-    old_action: vec12
-    older_action: vec12  # two policy steps before
+    prev_action: vec12
+    prev_prev_action: vec12  # two policy steps before
     clipped: float  # [rad^2] squared distance that the command filter moved the targets
     default_angle: vec12  # [rad]
     contacts: int  # number of paws on the ground
@@ -68,15 +68,15 @@ class RobotArrays:
     touchdown_speed: wp.array2d(dtype=float)
     collisions: wp.array2d(dtype=int)
     torque: wp.array2d(dtype=float)  # (12, num_worlds), like all below
-    old_torque: wp.array2d(dtype=float)
+    prev_torque: wp.array2d(dtype=float)
     action: wp.array2d(dtype=float)
-    old_action: wp.array2d(dtype=float)
-    older_action: wp.array2d(dtype=float)
+    prev_action: wp.array2d(dtype=float)
+    prev_prev_action: wp.array2d(dtype=float)
     target: wp.array2d(dtype=float)  # [rad] before the filter
     safe_target: wp.array2d(dtype=float)  # [rad] after it
-    old_rate: wp.array2d(dtype=float)
+    prev_rate: wp.array2d(dtype=float)
     joint_offset: wp.array2d(dtype=float)  # [rad] constant error of each motor's position sensor
-    old_lin_vel: wp.array(dtype=wp.vec3)  # (num_worlds,)
+    prev_lin_vel: wp.array(dtype=wp.vec3)  # (num_worlds,)
     default_angle: wp.array(dtype=float)  # (12,)
     step_dt: float  # [s] policy step
     paw_height: wp.array2d(dtype=float)  # [m] (4, num_worlds) above the ground
@@ -115,8 +115,8 @@ def load_base_view(arrays: RobotArrays, ground: Ground, world: int) -> RobotView
     quat = base_quat(arrays, world)
     robot.quat = quat
     robot.lin_vel = base_velocity(arrays, world, quat)
-    robot.old_lin_vel = arrays.old_lin_vel[world]
-    robot.lin_acc = (robot.lin_vel - robot.old_lin_vel) / arrays.step_dt
+    robot.prev_lin_vel = arrays.prev_lin_vel[world]
+    robot.lin_acc = (robot.lin_vel - robot.prev_lin_vel) / arrays.step_dt
     ang = wp.vec3(arrays.joint_qd[j + 3], arrays.joint_qd[j + 4], arrays.joint_qd[j + 5])
     robot.ang_vel = wp.quat_rotate_inv(quat, ang)
     robot.projected_gravity = wp.quat_rotate_inv(quat, wp.vec3(0.0, 0.0, -1.0))
@@ -158,12 +158,12 @@ def load_view(arrays: RobotArrays, ground: Ground, world: int) -> RobotView:
         robot.angle[m] = angle
         robot.sensed_angle[m] = angle + arrays.joint_offset[m, world]
         robot.rate[m] = rate
-        robot.joint_acc[m] = (rate - arrays.old_rate[m, world]) / arrays.step_dt
+        robot.joint_acc[m] = (rate - arrays.prev_rate[m, world]) / arrays.step_dt
         robot.torque[m] = arrays.torque[m, world]
-        robot.old_torque[m] = arrays.old_torque[m, world]
+        robot.prev_torque[m] = arrays.prev_torque[m, world]
         robot.action[m] = arrays.action[m, world]
-        robot.old_action[m] = arrays.old_action[m, world]
-        robot.older_action[m] = arrays.older_action[m, world]
+        robot.prev_action[m] = arrays.prev_action[m, world]
+        robot.prev_prev_action[m] = arrays.prev_prev_action[m, world]
         robot.default_angle[m] = arrays.default_angle[m]
         off = arrays.target[m, world] - arrays.safe_target[m, world]
         clipped += off * off
@@ -219,11 +219,11 @@ def braking(robot: RobotView) -> float:
     Speed that it gained against that motion, as in a rebound, does not count: a fall that ends within the step has lost
     all of its speed.
     """
-    speed = wp.length(robot.old_lin_vel)
+    speed = wp.length(robot.prev_lin_vel)
     if speed < 1.0e-6:
         return 0.0
-    kept = wp.dot(robot.lin_vel, robot.old_lin_vel) / speed
-    rate = wp.dot(robot.lin_acc, robot.old_lin_vel) / speed
+    kept = wp.dot(robot.lin_vel, robot.prev_lin_vel) / speed
+    rate = wp.dot(robot.lin_acc, robot.prev_lin_vel) / speed
     if kept < 0.0:
         rate = rate * speed / (speed - kept)
     return wp.min(rate, 0.0)

@@ -144,7 +144,7 @@ def jerk(robot: RobotView, state: VelocityState) -> float:
     """Jerk: number of motors whose torque changed its sign since the last policy step."""
     total = float(0.0)
     for m in range(12):
-        total += wp.where(wp.sign(robot.torque[m]) != wp.sign(robot.old_torque[m]), 1.0, 0.0)
+        total += wp.where(wp.sign(robot.torque[m]) != wp.sign(robot.prev_torque[m]), 1.0, 0.0)
     return total
 
 

@@ -16,7 +16,7 @@ DEFAULT_ANGLE = np.tile([0.0, np.pi / 4.0, np.pi / 4.0], 4)  # [rad]
 MOTOR_SLOTS = np.array([5 * leg + joint for leg in range(4) for joint in (0, 1, 3)])
 PAWS = ("impulse", "paw_force", "peak_force", "paw_pos", "paw_vel", "contact_time", "air_time", "touchdown_speed",
         "collisions", "paw_height")  # fmt: skip
-MOTORS = ("torque", "old_torque", "action", "old_action", "older_action", "target", "safe_target", "old_rate",
+MOTORS = ("torque", "prev_torque", "action", "prev_action", "prev_prev_action", "target", "safe_target", "prev_rate",
           "joint_offset")  # fmt: skip
 
 
@@ -37,7 +37,7 @@ def standing_robots(n: int):
     for names, rows in ((PAWS, 4), (MOTORS, 12)):
         for name in names:
             setattr(robot, name, wp.zeros((rows, n), dtype=RobotArrays.vars[name].type.dtype, device="cpu"))
-    robot.old_lin_vel = array(np.zeros((n, 3)), wp.vec3)
+    robot.prev_lin_vel = array(np.zeros((n, 3)), wp.vec3)
     robot.default_angle, robot.step_dt = array(DEFAULT_ANGLE), STEP_DT
     return robot
 

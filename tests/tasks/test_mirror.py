@@ -69,7 +69,7 @@ def reflection():
     change(robot.body_com, (n, BODIES, 3), lambda c: c * FLIP)
     for name in ("contact_time", "air_time", "touchdown_speed", "peak_force", "paw_height", "paw_force"):
         change(getattr(robot, name), None, lambda x: x[:, LEGS], worlds_last=True)
-    for name in ("action", "old_action", "older_action", "torque", "joint_offset"):
+    for name in ("action", "prev_action", "prev_prev_action", "torque", "joint_offset"):
         change(getattr(robot, name), None, lambda x: x[:, MOTORS], worlds_last=True)
     for array in (parameters.gain_ratio, parameters.motors.no_load_speed):
         change(array, None, lambda x: x[:, MOTORS], worlds_last=True)

@@ -213,8 +213,8 @@ def test_bracing_is_paid_where_a_pendulum_stops_over_the_paws():
 
 def test_ripple_costs_while_the_robot_should_rest_only():
     view = make_view(
-        torque=np.arange(12.0), old_torque=np.arange(12.0) - 0.5, paw_force=(30.0, 30.0, 30.0, 30.0),
-        peak_force=(30.0, 40.0, 30.0, 30.0), action=np.full(12, 0.1), old_action=np.zeros(12),
+        torque=np.arange(12.0), prev_torque=np.arange(12.0) - 0.5, paw_force=(30.0, 30.0, 30.0, 30.0),
+        peak_force=(30.0, 40.0, 30.0, 30.0), action=np.full(12, 0.1), prev_action=np.zeros(12),
     )  # fmt: skip
     resting = (make_episode(steps=3, command_step=9), make_episode(phase=LANDED, phase_steps=30))
     moving = (make_episode(steps=9, command_step=9), make_episode(phase=FLIGHT), make_episode(phase=LANDED))

@@ -61,12 +61,12 @@ def test_an_action_is_clamped_and_scaled_about_the_default_pose():
     clamped = np.clip(action, -1.0, 1.0)
     np.testing.assert_array_equal(commands.motors("action"), clamped)
     np.testing.assert_allclose(commands.motors("target"), DEFAULT_ANGLE + SCALE * clamped, atol=1e-6)
-    assert not commands.motors("old_action").any()
+    assert not commands.motors("prev_action").any()
     commands.act(0.5 * action)
-    np.testing.assert_array_equal(commands.motors("old_action"), clamped)
-    assert not commands.motors("older_action").any()
+    np.testing.assert_array_equal(commands.motors("prev_action"), clamped)
+    assert not commands.motors("prev_prev_action").any()
     commands.act(0.2 * action)
-    np.testing.assert_array_equal(commands.motors("older_action"), clamped)
+    np.testing.assert_array_equal(commands.motors("prev_prev_action"), clamped)
 
 
 def test_a_world_takes_the_action_and_the_scale_of_its_own_skill():
@@ -90,9 +90,9 @@ def test_what_happened_before_the_step_is_kept():
     commands.robot.joint_qd.assign(qd.ravel())
     commands.robot.torque.assign(torque.T)
     commands.act(np.zeros((32, 12)))
-    np.testing.assert_array_equal(commands.motors("old_rate"), rates)
-    np.testing.assert_array_equal(commands.motors("old_torque"), torque)
-    np.testing.assert_array_equal(commands.robot.old_lin_vel.numpy(), np.tile([1.0, 2.0, 3.0], (32, 1)))
+    np.testing.assert_array_equal(commands.motors("prev_rate"), rates)
+    np.testing.assert_array_equal(commands.motors("prev_torque"), torque)
+    np.testing.assert_array_equal(commands.robot.prev_lin_vel.numpy(), np.tile([1.0, 2.0, 3.0], (32, 1)))
 
 
 @pytest.mark.parametrize(("offset", "safe"), [(0.0, 24.375), (4.0, 16.875), (-10.0, 30.0)])

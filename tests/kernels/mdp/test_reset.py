@@ -280,9 +280,9 @@ def test_forgetting_touches_the_masked_worlds_only(stage):
     unchanged(before[0], after[0], SOME, but=FORGOTTEN)
 
 
-ZERO = ("torque", "old_torque", "action", "old_action", "older_action", "impulse", "paw_force", "peak_force",
+ZERO = ("torque", "prev_torque", "action", "prev_action", "prev_prev_action", "impulse", "paw_force", "peak_force",
         "contact_time", "air_time", "touchdown_speed", "paw_height", "invalid", "collisions")  # fmt: skip
-FORGOTTEN = (*ZERO, "target", "safe_target", "old_rate", "old_lin_vel", "paw_pos", "paw_vel")
+FORGOTTEN = (*ZERO, "target", "safe_target", "prev_rate", "prev_lin_vel", "paw_pos", "paw_vel")
 
 
 def test_nothing_has_been_done_felt_or_touched_before_a_beginning(stage):
@@ -296,11 +296,11 @@ def test_nothing_has_been_done_felt_or_touched_before_a_beginning(stage):
     angles = q[:, 7 + MOTOR_SLOTS][SOME]
     for name in ("target", "safe_target"):
         np.testing.assert_array_equal(rows(getattr(found, name))[SOME], angles, name)
-    np.testing.assert_array_equal(rows(found.old_rate)[SOME], qd[:, 6 + MOTOR_SLOTS][SOME])
+    np.testing.assert_array_equal(rows(found.prev_rate)[SOME], qd[:, 6 + MOTOR_SLOTS][SOME])
     past = stage.delays.past_target.numpy()
     np.testing.assert_array_equal(past[:, :, SOME], np.tile(angles.T, (8, 1, 1)))
     origin = qd[:, :3] - np.cross(qd[:, 3:6], Rotation.from_quat(q[:, 3:7]).apply([0.01, -0.02, 0.03]))
-    np.testing.assert_allclose(found.old_lin_vel[SOME], origin[SOME], atol=1e-5)
+    np.testing.assert_allclose(found.prev_lin_vel[SOME], origin[SOME], atol=1e-5)
 
 
 def test_paws_are_known_where_they_are_at_a_beginning():
