@@ -156,8 +156,8 @@ class Env(Stages):
             self._start_over(seed)
         self._ends_episodes = self._ends_episodes or worlds is None
         self.compile()  # an evaluation compiles no draws
-        self._tick(chosen)
-        self._begin(self._part(), chosen)
+        self._advance_rng(chosen)
+        self._reset_worlds(self._part(), chosen)
         self._observe(self._part(), beginning=int(worlds is not None))
         return self._step.obs, {}
 
@@ -233,13 +233,13 @@ class Env(Stages):
             load_kernels(self.kernels(draws=False), self.wp_device)
         if self._draws_ground:
             self._scene.ground.blocks.zero_()
-        self._tick(mask)
-        self._go_home(self._part(), mask)
-        self._draw(self._part(), mask)
+        self._advance_rng(mask)
+        self._restore_first_task(self._part(), mask)
+        self._randomize(self._part(), mask)
         inputs = [mask, headings, self._scene, self._settings, self.worlds.skill, self.robot]
         self._launch(stand_kernel, n, inputs)
-        self._forget(self._part(), mask)
-        self._give(mask, 1, values, headings)
+        self._clear_history(self._part(), mask)
+        self._set_commands(mask, 1, values, headings)
         self.worlds.done.zero_()
         self._observe(self._part(), beginning=1)
 
@@ -251,7 +251,7 @@ class Env(Stages):
         Raises ValueError: values of another shape, out of bounds or not finite.
         """
         chosen = checked_mask(worlds, self.num_envs)
-        self._give(self._array(chosen), 0, checked_commands(commands, chosen, self.tasks), self._all)
+        self._set_commands(self._array(chosen), 0, checked_commands(commands, chosen, self.tasks), self._all)
         self._observe(self._part(), beginning=1)
 
     def request(self, skill: int, worlds: Any = None, commands: Any = None) -> None:

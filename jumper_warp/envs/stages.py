@@ -116,11 +116,11 @@ class Stages:
         worlds: for which they are launched, by default all; no stage of some reads or writes what is of others.
         """
         part = self._part(worlds)
-        return {"action": lambda: self._act(part), "physics": lambda: self._advance(part),
-                "episode": lambda: self._judge(part), "observe": lambda: self._observe(part, beginning=0),
-                "reset": lambda: self._renew(part)}  # fmt: skip
+        return {"action": lambda: self._apply_actions(part), "physics": lambda: self._advance(part),
+                "episode": lambda: self._compute_rewards_and_dones(part), "observe": lambda: self._observe(part, beginning=0),
+                "reset": lambda: self._reset_done(part)}  # fmt: skip
 
-    def _act(self, part: Part) -> None:
+    def _apply_actions(self, part: Part) -> None:
         inputs = [self._action, self._settings, self.parameters.push, self.robot, part.env, self.delays]
         self._launch(action_kernel, (4, part.count), inputs)
         self._events(part, AT_STEP, self._all)
@@ -134,7 +134,7 @@ class Stages:
         inputs = [scene.geometry, scene.ground, self._settings, part.env, self.robot]
         self._launch(track_kernel, (4, part.count), inputs)
 
-    def _judge(self, part: Part) -> None:
+    def _compute_rewards_and_dones(self, part: Part) -> None:
         for skill in self.skills:
             self._launch(
                 skill.kernels["step"], part.count,
@@ -142,11 +142,11 @@ class Stages:
                  skill.states, skill.term_value, skill.counters],
             )  # fmt: skip
 
-    def _renew(self, part: Part) -> None:
+    def _reset_done(self, part: Part) -> None:
         self._hand_over(part)
         begins = self.auto_reset and self._ends_episodes
         if begins:
-            self._begin(part, self.worlds.done)
+            self._reset_worlds(part, self.worlds.done)
         if self._handovers or begins:
             self._observe(part, beginning=1)
 
@@ -160,10 +160,10 @@ class Stages:
                  part.env, self.skills[source].states, self.skills[target].states],
             )  # fmt: skip
 
-    def _begin(self, part: Part, mask: wp.array) -> None:
+    def _reset_worlds(self, part: Part, mask: wp.array) -> None:
         """Begin new episodes where mask is not 0, in the first skill, and commands where they are due."""
-        self._go_home(part, mask)
-        self._draw(part, mask)
+        self._restore_first_task(part, mask)
+        self._randomize(part, mask)
         for skill in self.skills:
             lanes = attempts.LANES if self.wp_device.is_cuda and skill.task.reset.side_by_side else 1
             self._launch(
@@ -171,14 +171,14 @@ class Stages:
                 [skill.index, lanes, mask, self._scene, self._settings, skill.settings, skill.levels, part.env,
                  skill.states, self.robot], BLOCKS["reset"],
             )  # fmt: skip
-        self._forget(part, mask)
+        self._clear_history(part, mask)
 
-    def _go_home(self, part: Part, mask: wp.array) -> None:
+    def _restore_first_task(self, part: Part, mask: wp.array) -> None:
         """Put worlds back into their first skill where mask is not 0, and forget what they were asked for."""
         if len(self.skills) > 1:
             self._launch(home_kernel, part.count, [mask, self._home, self.parameters, part.env])
 
-    def _draw(self, part: Part, mask: wp.array) -> None:
+    def _randomize(self, part: Part, mask: wp.array) -> None:
         """Draw parameters of episodes that begin where mask is not 0."""
         if not self._started:  # all worlds begin
             self._launch(motors_kernel, (12, self.num_envs), [self.parameters])
@@ -202,12 +202,12 @@ class Stages:
             if any(slot.repack for slot in due.values()):
                 self.sim.physics.parameters_changed(mask, Worlds(part.first, part.count))
 
-    def _forget(self, part: Part, mask: wp.array) -> None:
+    def _clear_history(self, part: Part, mask: wp.array) -> None:
         inputs = [part.first, mask, self._scene.geometry, self.robot, self.delays]
         self._launch(forget_kernel, (12, part.count), inputs)
         self.sim.physics.after_reset(mask)
 
-    def _tick(self, mask: wp.array) -> None:
+    def _advance_rng(self, mask: wp.array) -> None:
         self._launch(tick_kernel, self.num_envs, [mask, self.worlds])
 
     def _observe(self, part: Part, beginning: int) -> None:
@@ -227,7 +227,7 @@ class Stages:
         """Launch; blocks: most blocks of a GPU, whose threads take turns (0: as many as there are threads)."""
         wp.launch(kernel, dim=dim, inputs=inputs, device=self.wp_device, block_dim=block, max_blocks=blocks)
 
-    def _give(self, mask: wp.array, begins: int, values: np.ndarray, headings: wp.array) -> None:
+    def _set_commands(self, mask: wp.array, begins: int, values: np.ndarray, headings: wp.array) -> None:
         commands = wp.array(values, dtype=wp.vec4, device=self.wp_device)
         for skill in self.skills:
             self._launch(
