@@ -14,7 +14,7 @@ from jumper_warp.envs.arrays import fill
 from jumper_warp.kernels.mdp.env import RING, Counters, Nothing, SkillSettings
 from jumper_warp.kernels.mdp.events import make_event_kernel
 from jumper_warp.kernels.mdp.observe import CHUNK, ObservationArrays, make_observe_kernel
-from jumper_warp.kernels.mdp.reset import make_give_kernel, make_reset_kernel
+from jumper_warp.kernels.mdp.reset import make_reset_kernel, make_set_command_kernel
 from jumper_warp.kernels.mdp.step import make_step_kernel
 from jumper_warp.kernels.mdp.view import vec12
 from jumper_warp.robot.motors import filter_params
@@ -149,7 +149,7 @@ def kernels_of(task: TaskCfg) -> dict[str, Kernel]:
     return {
         "step": _kernel(make_step_kernel, task, task.state, ends, task.reward_floor),
         "reset": _kernel(make_reset_kernel, task, task.state, begins),
-        "give": _kernel(make_give_kernel, task, task.state, task.command.give),
+        "give": _kernel(make_set_command_kernel, task, task.state, task.command.give),
         "observe": _kernel(make_observe_kernel, task, task.state, tuple(compiled[group] for group in task.groups)),
         "event": _kernel(make_event_kernel, slots["events"], compiled["events"]),
     }

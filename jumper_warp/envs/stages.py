@@ -15,10 +15,10 @@ from jumper_warp.kernels.mdp import attempts, events
 from jumper_warp.kernels.mdp.actions import action_kernel
 from jumper_warp.kernels.mdp.env import EnvArrays, SkillSettings
 from jumper_warp.kernels.mdp.events import AT_RESET, AT_STEP, STARTUP
-from jumper_warp.kernels.mdp.handover import home_kernel, make_handover_kernel
-from jumper_warp.kernels.mdp.observe import LANES, condition_kernel
+from jumper_warp.kernels.mdp.handover import make_handover_kernel, restore_task_kernel
+from jumper_warp.kernels.mdp.observe import LANES, postprocess_obs_kernel
 from jumper_warp.kernels.mdp.parameters import motors_kernel
-from jumper_warp.kernels.mdp.reset import forget_kernel, tick_kernel
+from jumper_warp.kernels.mdp.reset import advance_rng_kernel, clear_history_kernel
 from jumper_warp.kernels.mdp.track import track_kernel
 from jumper_warp.sim.simulation import Simulation
 from jumper_warp.sim.slices import Worlds
@@ -29,7 +29,7 @@ BLOCK = 32
 """Threads of a block: small ones spread a few thousand heavy threads over all multiprocessors."""
 BLOCKS = {"reset": 128, "event": 256}
 """Of kernels of a task that are not launched so, by name."""
-CONDITION_BLOCK = 256
+POSTPROCESS_BLOCK = 256
 EVENT_BLOCKS = 264
 """Most blocks of events: of their many threads few have something to do, and a new block costs more than a turn."""
 
@@ -88,12 +88,12 @@ class Stages:
 
     def kernels(self, draws: bool = True) -> list[tuple[Kernel, int]]:
         """Return what `reset` and `step` launch, each with its block size; draws: the draw of starts too."""
-        shared = [action_kernel, motors_kernel, forget_kernel, tick_kernel, track_kernel]
-        shared += [home_kernel] if len(self.skills) > 1 else []
+        shared = [action_kernel, motors_kernel, clear_history_kernel, advance_rng_kernel, track_kernel]
+        shared += [restore_task_kernel] if len(self.skills) > 1 else []
         shared += [kernel for kernel, _, _ in self._handovers]
         names = [name for name in self.skills[0].kernels if draws or name != "reset"]
         found = [(skill.kernels[name], BLOCKS.get(name, BLOCK)) for skill in self.skills for name in names]
-        found += [(condition_kernel, CONDITION_BLOCK), *((kernel, BLOCK) for kernel in shared)]
+        found += [(postprocess_obs_kernel, POSTPROCESS_BLOCK), *((kernel, BLOCK) for kernel in shared)]
         return found + self.sim.physics.kernels()
 
     def _part(self, worlds: Worlds | None = None) -> Part:
@@ -176,7 +176,7 @@ class Stages:
     def _restore_first_task(self, part: Part, mask: wp.array) -> None:
         """Put worlds back into their first skill where mask is not 0, and forget what they were asked for."""
         if len(self.skills) > 1:
-            self._launch(home_kernel, part.count, [mask, self._home, self.parameters, part.env])
+            self._launch(restore_task_kernel, part.count, [mask, self._home, self.parameters, part.env])
 
     def _randomize(self, part: Part, mask: wp.array) -> None:
         """Draw parameters of episodes that begin where mask is not 0."""
@@ -204,11 +204,11 @@ class Stages:
 
     def _clear_history(self, part: Part, mask: wp.array) -> None:
         inputs = [part.first, mask, self._scene.geometry, self.robot, self.delays]
-        self._launch(forget_kernel, (12, part.count), inputs)
+        self._launch(clear_history_kernel, (12, part.count), inputs)
         self.sim.physics.after_reset(mask)
 
     def _advance_rng(self, mask: wp.array) -> None:
-        self._launch(tick_kernel, self.num_envs, [mask, self.worlds])
+        self._launch(advance_rng_kernel, self.num_envs, [mask, self.worlds])
 
     def _observe(self, part: Part, beginning: int) -> None:
         for skill in self.skills:
@@ -219,7 +219,7 @@ class Stages:
                  skill.params.values, beginning, arrays.raw],
             )  # fmt: skip
             inputs = [skill.index, part.env, skill.columns, skill.params.values, beginning, arrays]
-            self._launch(condition_kernel, (part.count, int(LANES)), inputs, CONDITION_BLOCK)
+            self._launch(postprocess_obs_kernel, (part.count, int(LANES)), inputs, POSTPROCESS_BLOCK)
 
     def _launch(
         self, kernel: Kernel, dim: int | tuple[int, ...], inputs: list, block: int = BLOCK, blocks: int = 0

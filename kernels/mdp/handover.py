@@ -33,7 +33,7 @@ def hand_over(
 
 
 @wp.kernel
-def home_kernel(
+def restore_task_kernel(
     # in
     mask: wp.array(dtype=float),
     home: wp.array(dtype=int),

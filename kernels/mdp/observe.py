@@ -212,7 +212,7 @@ def condition(arrays: ObservationArrays, column: Column, p: wp.array(dtype=float
 
 
 @wp.kernel
-def condition_kernel(
+def postprocess_obs_kernel(
     # in
     skill: int,
     env: EnvArrays,

@@ -86,12 +86,12 @@ def make_reset_kernel(task: Any) -> wp.Kernel:
     return reset_kernel
 
 
-def make_give_kernel(task: Any) -> wp.Kernel:
+def make_set_command_kernel(task: Any) -> wp.Kernel:
     """Return the kernel that gives worlds a command from outside."""
     give = task.command.give
 
     @wp.kernel(module="unique", enable_backward=False)
-    def give_kernel(
+    def set_command_kernel(
         # in
         skill: int,
         mask: wp.array(dtype=float),
@@ -122,7 +122,7 @@ def make_give_kernel(task: Any) -> wp.Kernel:
             if env.fresh[world] != BEGUN:
                 env.fresh[world] = COMMANDED
 
-    return give_kernel
+    return set_command_kernel
 
 
 @wp.func
@@ -175,7 +175,7 @@ def stand_kernel(
 
 
 @wp.kernel
-def tick_kernel(
+def advance_rng_kernel(
     # in
     mask: wp.array(dtype=float),
     # in, out
@@ -188,7 +188,7 @@ def tick_kernel(
 
 
 @wp.kernel
-def forget_kernel(
+def clear_history_kernel(
     # in
     first: int,
     mask: wp.array(dtype=float),

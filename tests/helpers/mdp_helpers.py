@@ -7,7 +7,7 @@ import warp as wp
 
 from jumper_warp.envs.arrays import delay_arrays, env_arrays
 from jumper_warp.kernels.layout import BODIES, COORDS, DOFS
-from jumper_warp.kernels.mdp.observe import LANES, condition_kernel
+from jumper_warp.kernels.mdp.observe import LANES, postprocess_obs_kernel
 from jumper_warp.kernels.mdp.view import RobotArrays
 
 STEP_DT = 1.0 / 60.0  # [s]
@@ -71,4 +71,4 @@ def observe(skill, robot, parameters, ground, worlds, states, numbers, beginning
     inputs = [skill.index, robot, parameters, ground, worlds, states, numbers, beginning, arrays.raw]
     wp.launch(skill.kernels["observe"], (skill.num_chunks, skill.num_envs), inputs, device="cpu")
     inputs = [skill.index, worlds, skill.columns, numbers, beginning, arrays]
-    wp.launch(condition_kernel, (skill.num_envs, int(LANES)), inputs, device="cpu")
+    wp.launch(postprocess_obs_kernel, (skill.num_envs, int(LANES)), inputs, device="cpu")

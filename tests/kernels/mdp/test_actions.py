@@ -10,7 +10,7 @@ from jumper_warp.envs.skill import Skill
 from jumper_warp.kernels.mdp.actions import action_kernel
 from jumper_warp.kernels.mdp.env import SkillSettings
 from jumper_warp.kernels.mdp.parameters import action_latency
-from jumper_warp.kernels.mdp.reset import tick_kernel
+from jumper_warp.kernels.mdp.reset import advance_rng_kernel
 from jumper_warp.registry import make_task
 from jumper_warp.robot.motors import LimitsCfg, vertical_jump_filter
 from jumper_warp.tasks.randomization import RandomizationCfg
@@ -41,7 +41,7 @@ class Commands:
         action = array(np.reshape(action, (-1, self.n, 12)))
         inputs = [action, self.settings, self.push, self.robot, self.worlds, self.delays]
         wp.launch(action_kernel, (4, self.n), inputs, device="cpu")
-        wp.launch(tick_kernel, self.n, [array(np.ones(self.n)), self.worlds], device="cpu")
+        wp.launch(advance_rng_kernel, self.n, [array(np.ones(self.n)), self.worlds], device="cpu")
 
     def motors(self, name):
         """Return an array of the motors, (n, 12)."""

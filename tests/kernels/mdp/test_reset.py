@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import kstest
 
 from jumper_warp.kernels.mdp.env import BEGUN, COMMANDED, Delays, EnvArrays, Scene, SkillSettings
-from jumper_warp.kernels.mdp.reset import forget_kernel, stand_kernel, tick_kernel
+from jumper_warp.kernels.mdp.reset import advance_rng_kernel, clear_history_kernel, stand_kernel
 from jumper_warp.kernels.mdp.track import track_kernel
 from jumper_warp.kernels.mdp.view import RobotArrays
 from jumper_warp.robot.grounds import BlockCfg
@@ -49,7 +49,7 @@ class Stage(Probe):
     def forget(self, chosen):
         """Launch what forgets the past."""
         inputs = [0, self.mask(chosen), self.scene.geometry, self.robot, self.delays]
-        wp.launch(forget_kernel, (12, self.n), inputs, device="cpu")
+        wp.launch(clear_history_kernel, (12, self.n), inputs, device="cpu")
 
     def stand(self, chosen, headings):
         """Launch what stands robots up."""
@@ -263,7 +263,7 @@ def test_robots_stand_up_with_their_headings_on_the_block_below_them_at_its_star
 
 def test_the_clock_goes_on_in_the_masked_worlds(stage):
     clock = stage.world("clock")
-    wp.launch(tick_kernel, N, [stage.mask(SOME), stage.worlds], device="cpu")
+    wp.launch(advance_rng_kernel, N, [stage.mask(SOME), stage.worlds], device="cpu")
     np.testing.assert_array_equal(stage.world("clock"), clock + SOME)
 
 
