@@ -337,7 +337,7 @@ class JumperDynamics:
         inputs = [first, self.robot, q, qd, momenta]
         wp.launch(self.modules.momentum.momentum_kernel, count, inputs, device=self.device, block_dim=32)
 
-    def keep_momenta(
+    def project_momentum(
         self, q: wp.array, qd: wp.array, momenta: Any, body_f: wp.array, time: float, worlds: Worlds | None = None
     ) -> None:
         """Correct the base's velocities where a robot flew freely in the last call of `advance`, which took a time [s].
@@ -346,7 +346,7 @@ class JumperDynamics:
         """
         first, count = worlds or (0, self.num_worlds)
         inputs = [first, self.robot, momenta, body_f, self.work.peak_force, self.work.invalid, time, q, qd]
-        wp.launch(self.modules.momentum.keep_momentum_kernel, count, inputs, device=self.device, block_dim=32)
+        wp.launch(self.modules.momentum.project_momentum_kernel, count, inputs, device=self.device, block_dim=32)
 
     def full_state(
         self, q: wp.array, qd: wp.array, body_q: wp.array, body_qd: wp.array, worlds: Worlds | None = None

@@ -140,7 +140,7 @@ class JumperPhysics(Physics):
             bodies=bodies and momenta is None, worlds=worlds,
         )  # fmt: skip
         if momenta is not None:
-            self.dynamics.keep_momenta(q, qd, momenta, state.body_f, sim.dt * substeps, worlds)
+            self.dynamics.project_momentum(q, qd, momenta, state.body_f, sim.dt * substeps, worlds)
             if bodies:
                 self.dynamics.full_state(q, qd, state.body_q, state.body_qd, worlds)
 
@@ -163,7 +163,7 @@ class JumperPhysics(Physics):
     def kernels(self) -> list[tuple[wp.Kernel, int]]:
         """See `Physics.kernels`."""
         momentum = self.dynamics.modules.momentum
-        kept = [(momentum.momentum_kernel, 32), (momentum.keep_momentum_kernel, 32)]
+        kept = [(momentum.momentum_kernel, 32), (momentum.project_momentum_kernel, 32)]
         return [self.dynamics.advance_kernel(), *(kept if self._momenta is not None else [])]
 
 

@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from ..mdp.attempts import meet_attempts
+from ..mdp.attempts import sync_attempts
 from ..mdp.env import Scene, SkillSettings
 from ..mdp.random import RngStream, fold_in, uniform_range
 from ..mdp.view import RobotArrays
@@ -24,7 +24,7 @@ def reset_attitude(
     new = carried_over(old)
     rest_block(scene.ground, draw.world)
     quat = draw_unit_quat(fold_in(draw, streams.ORIENTATION_BRANCH))
-    meet_attempts(draw)
+    sync_attempts(draw)
     write_start(arrays, scene, skill, settings, quat, draw)
     new.episode_steps = wp.max(int(uniform_range(draw, streams.EPISODE_STEPS, settings.episode_steps) + 0.5), 1)
     return with_goal(new, quat, quat * draw_turn(fold_in(draw, streams.TURN_BRANCH), level))

@@ -12,7 +12,7 @@ import warp as wp
 
 from ..collision.robot import leg_collisions
 from ..kinematics.geometry import LegGeometry
-from ..lanes import all_of_attempt, from_leg_of_attempt, least_of_attempts, meet
+from ..lanes import all_of_attempt, from_leg_of_attempt, least_of_attempts, sync_legs
 from ..layout import COORDS, DOFS
 from ..scalar import vec3
 from ..state import leg_coord, leg_dof, load_motors, store_motors
@@ -56,10 +56,10 @@ def vec_from_leg(v: vec3, leg: int) -> vec3:
 
 
 @wp.func
-def meet_attempts(draw: RngStream):
+def sync_attempts(draw: RngStream):
     """Wait for the threads of a world; each then sees what the others wrote."""
     if draw.lanes > 1:
-        meet()
+        sync_legs()
 
 
 @wp.func
@@ -135,7 +135,7 @@ def write_first_valid(
         for leg in range(geometry.shape[0]):
             store_motors(joint_q, leg_coord(draw.world, leg), load_motors(own_q, leg_coord(0, leg)))
             store_motors(joint_qd, leg_dof(draw.world, leg), load_motors(own_qd, leg_dof(0, leg)))
-    meet_attempts(draw)
+    sync_attempts(draw)
     return first < ATTEMPTS
 
 

@@ -9,7 +9,7 @@ from ..kinematics.geometry import LegGeometry
 from ..kinematics.inverse import LegLimits
 from ..layout import COORDS, DOFS, motor_slot
 from ..terrain.ground import rest_block, surface, world_ground
-from .attempts import meet_attempts
+from .attempts import sync_attempts
 from .env import BEGUN, COMMANDED, RING, Delays, EnvArrays, Scene, SkillSettings
 from .options import FAST
 from .random import ANY_LEVEL, COMMAND, RESET, make_stream, uniform
@@ -71,7 +71,7 @@ def make_reset_kernel(task: Any) -> wp.Kernel:
         if begins:
             old = before_reset(states[world], env.done[world])
             state = wp.static(reset)(arrays, scene, skills[skill], old, settings[0], levels[level], draw)
-            meet_attempts(draw)
+            sync_attempts(draw)
             if lane == 0:
                 states[world] = state
                 env.fresh[world] = BEGUN

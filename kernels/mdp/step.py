@@ -8,7 +8,7 @@ from ..terrain.ground import Ground
 from .env import Counters, EnvArrays
 from .options import FAST
 from .terminations import came_apart
-from .view import RobotArrays, load_view, speed_limit_broken
+from .view import RobotArrays, has_diverged, load_view
 
 NOT_ENDED = wp.constant(-1)
 
@@ -85,7 +85,7 @@ def make_step_kernel(task: Any) -> wp.Kernel:
         ending = int(NOT_ENDED)
         timeout = float(0.0)
         success = bool(False)
-        broken = arrays.invalid[world] != 0 or env.bad_action[world] != 0 or speed_limit_broken(robot)
+        broken = arrays.invalid[world] != 0 or env.bad_action[world] != 0 or has_diverged(robot)
         if broken:
             ending = wp.static(broken_ending)
         for i in range(wp.static(len(endings))):

@@ -7,7 +7,7 @@ from typing import Any
 
 import warp as wp
 
-from .view import RobotView, speed_limit_broken, tilt
+from .view import RobotView, has_diverged, tilt
 
 
 @wp.func
@@ -19,7 +19,7 @@ def too_long(robot: RobotView, state: Any, steps: float) -> bool:
 @wp.func
 def came_apart(robot: RobotView, state: Any) -> bool:
     """State non-finite or absurdly fast."""
-    return speed_limit_broken(robot)
+    return has_diverged(robot)
 
 
 @wp.func

@@ -172,7 +172,7 @@ def load_view(arrays: RobotArrays, ground: Ground, world: int) -> RobotView:
 
 
 @wp.func
-def speed_limit_broken(robot: RobotView) -> bool:
+def has_diverged(robot: RobotView) -> bool:
     """Return whether a state is non-finite or faster than the robot can ever be: the world has come apart."""
     fastest = float(0.0)
     total = wp.length_sq(robot.pos) + wp.length_sq(robot.lin_vel) + wp.length_sq(robot.ang_vel)

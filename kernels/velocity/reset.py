@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from ..mdp.attempts import meet_attempts
+from ..mdp.attempts import sync_attempts
 from ..mdp.env import Scene, SkillSettings
 from ..mdp.random import RngStream, uniform, uniform_range
 from ..mdp.view import RobotArrays, base_pos
@@ -65,7 +65,7 @@ def reset_velocity(
     world = draw.world
     new = carried_over(old, base_pos(arrays, world), settings.tolerance, level.levels, settings.map.rows)
     rest_block(scene.ground, world)
-    meet_attempts(draw)  # all have read where the base was
+    sync_attempts(draw)  # all have read where the base was
     write_start(arrays, scene, skill, settings, new.terrain_level, draw)
     new.episode_steps = settings.episode_steps
     new.pace = settings.pace
