@@ -128,7 +128,7 @@ class Flights(EvaluationLog):
         ended = super().follow(env)
         fresh = (self._left >= 0) & (before < 0)
         if self.turns and fresh.any():
-            env.request(TURN, fresh)
+            env.requested_task(TURN, fresh)
         return ended
 
     def update(self, arrays: dict[str, np.ndarray], step_dt: float) -> bool:

@@ -50,13 +50,13 @@ def env_arrays(num_envs: int, seed: int, skill: wp.array, device: Any) -> Any:
     """Return the kernels' `EnvArrays`."""
     env = EnvArrays()
     env.seed, env.skill = seed, skill
-    counts = ("request", "told", "fresh", "ending", "broken", "bad_action", "level", "streak")
-    fill(env, ("wanted",), num_envs, wp.vec4, device)
+    counts = ("requested_task", "has_command", "history_reset", "ending", "broken", "bad_action", "level", "streak")
+    fill(env, ("pending_command",), num_envs, wp.vec4, device)
     fill(env, counts, num_envs, int, device)
     fill(env, ("reward", "done", "timeout"), num_envs, float, device)
     fill(env, ("terminated", "truncated"), num_envs, wp.bool, device)
     env.clock = wp.full(num_envs, FIRST_CLOCK, dtype=int, device=device)
-    env.request.fill_(-1)
+    env.requested_task.fill_(-1)
     return env
 
 

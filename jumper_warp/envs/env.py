@@ -171,7 +171,7 @@ class Env(Stages):
         self.seed = self.worlds.seed = seed
         self._started = False
         self._graphs.clear()  # they hold the old seed
-        for array, value in ((self.worlds.clock, FIRST_CLOCK), (self.worlds.request, -1), (self.worlds.told, 0),
+        for array, value in ((self.worlds.clock, FIRST_CLOCK), (self.worlds.requested_task, -1), (self.worlds.has_command, 0),
                              (self.worlds.level, 0), (self.worlds.streak, 0)):  # fmt: skip
             array.fill_(value)
         self.worlds.skill.assign(self._first_skill)
@@ -266,8 +266,8 @@ class Env(Stages):
         if commands is not None:
             values = checked_commands(commands, mask, [self.tasks[skill]])
         mask = mask > 0.0
-        for array, new in ((self.worlds.request, skill), (self.worlds.told, int(commands is not None)),
-                           (self.worlds.wanted, values[mask])):  # fmt: skip
+        for array, new in ((self.worlds.requested_task, skill), (self.worlds.has_command, int(commands is not None)),
+                           (self.worlds.pending_command, values[mask])):  # fmt: skip
             kept = array.numpy()
             kept[mask] = new
             array.assign(kept)

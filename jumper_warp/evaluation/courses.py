@@ -158,7 +158,7 @@ class Course(EvaluationLog):
             asked = worlds & (self.target[rows, at] == skill)
             if asked.any():
                 delay = np.full((len(rows), 1), round(SQUAT / self.step_dt))
-                env.request(skill, asked, np.concatenate([self.goal[rows, at], delay], axis=1))
+                env.requested_task(skill, asked, np.concatenate([self.goal[rows, at], delay], axis=1))
 
     def update(self, arrays: dict[str, np.ndarray], step_dt: float) -> bool:
         """Take in a policy step; return whether all courses have ended."""

@@ -37,10 +37,12 @@ class EnvArrays:
     first: int  # world of the first thread of a launch
     clock: wp.array(dtype=int)  # policy steps made; with the seed, all state of the random numbers
     skill: wp.array(dtype=int)  # index of the task that a world is in
-    request: wp.array(dtype=int)  # skill that is asked for, -1: none
-    wanted: wp.array(dtype=wp.vec4)  # command that the skill is given when it takes over
-    told: wp.array(dtype=int)  # 1: there is one
-    fresh: wp.array(dtype=int)  # BEGUN: an episode or a skill, observations have no past; COMMANDED: within an episode
+    requested_task: wp.array(dtype=int)  # skill that is asked for, -1: none
+    pending_command: wp.array(dtype=wp.vec4)  # command that the skill is given when it takes over
+    has_command: wp.array(dtype=int)  # 1: there is one
+    history_reset: wp.array(
+        dtype=int
+    )  # BEGUN: an episode or a skill, observations have no past; COMMANDED: within an episode
     reward: wp.array(dtype=float)
     done: wp.array(dtype=float)  # 1: the episode ended
     timeout: wp.array(dtype=float)  # 1: it ended without failure

@@ -20,9 +20,9 @@ def hand_over(
 ):  # fmt: skip
     """Make another skill the active one: its motors from now on, and as last action the one that holds the targets."""
     env.skill[world] = target
-    env.request[world] = NONE
-    env.told[world] = 0
-    env.fresh[world] = BEGUN
+    env.requested_task[world] = NONE
+    env.has_command[world] = 0
+    env.history_reset[world] = BEGUN
     for m in range(12):
         off = arrays.safe_target[m, world] - arrays.default_angle[m]
         action = wp.clamp(off / skills[target].action_scale[m], -1.0, 1.0)
@@ -46,8 +46,8 @@ def restore_task_kernel(
     if mask[world] == 0.0:
         return
     env.skill[world] = home[world]
-    env.request[world] = NONE
-    env.told[world] = 0
+    env.requested_task[world] = NONE
+    env.has_command[world] = 0
     for m in range(12):
         set_motor(parameters, world, m)
 
@@ -79,10 +79,10 @@ def make_handover_kernel(handover: Any) -> wp.Kernel:
         if env.skill[world] != source or env.done[world] != 0.0 or moved[world] != 0:
             return
         robot = load_view(arrays, scene.ground, world)
-        if wp.static(when)(robot, sources[world], env.request[world] == target):
+        if wp.static(when)(robot, sources[world], env.requested_task[world] == target):
             begun = wp.static(begin)(robot, sources[world])
-            if env.request[world] == target and env.told[world] != 0:
-                targets[world] = wp.static(give)(robot, scene, begun, env.wanted[world], yaw_of(robot.quat))
+            if env.requested_task[world] == target and env.has_command[world] != 0:
+                targets[world] = wp.static(give)(robot, scene, begun, env.pending_command[world], yaw_of(robot.quat))
             else:
                 targets[world] = begun
             hand_over(arrays, parameters, env, skills, world, target)

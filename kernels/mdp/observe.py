@@ -109,7 +109,7 @@ def make_observe_kernel(task: Any) -> wp.Kernel:
         """
         chunk, world = wp.tid()
         world += env.first
-        if env.skill[world] != skill or (beginning != 0 and env.fresh[world] == 0):
+        if env.skill[world] != skill or (beginning != 0 and env.history_reset[world] == 0):
             return
         for c in range(wp.static((len(slots) + CHUNK - 1) // CHUNK)):
             if chunk == c:
@@ -164,7 +164,7 @@ def moment(env: EnvArrays, arrays: ObservationArrays, world: int) -> Moment:
     m = Moment()
     m.world = world
     m.draws = step_key(env.seed, world, clock)
-    m.fresh = env.fresh[world]
+    m.fresh = env.history_reset[world]
     m.broken = env.broken[world] != 0
     m.now = clock % RING
     m.newer = (clock - whole) % RING
@@ -230,7 +230,7 @@ def postprocess_obs_kernel(
     """
     world, lane = wp.tid()
     world += env.first
-    if env.skill[world] != skill or (beginning != 0 and env.fresh[world] == 0):
+    if env.skill[world] != skill or (beginning != 0 and env.history_reset[world] == 0):
         return
     m = moment(env, arrays, world)
     for component in range(lane, columns.shape[1], LANES):

@@ -74,14 +74,14 @@ def make_reset_kernel(task: Any) -> wp.Kernel:
             sync_attempts(draw)
             if lane == 0:
                 states[world] = state
-                env.fresh[world] = BEGUN
+                env.history_reset[world] = BEGUN
                 env.broken[world] = 0
         elif wp.static(command is not None):
             if lane == 0:
                 robot = load_view(arrays, scene.ground, world)
                 fresh = make_stream(env.seed, world, env.clock[world], COMMAND)
                 states[world] = wp.static(command)(robot, scene, states[world], levels[level], fresh)
-                env.fresh[world] = COMMANDED
+                env.history_reset[world] = COMMANDED
 
     return reset_kernel
 
@@ -115,12 +115,12 @@ def make_set_command_kernel(task: Any) -> wp.Kernel:
         if begins != 0:
             fresh = task.state()
             states[world] = wp.static(give)(robot, scene, fresh, values[world], headings[world])
-            env.fresh[world] = BEGUN
+            env.history_reset[world] = BEGUN
             env.broken[world] = 0
         else:
             states[world] = wp.static(give)(robot, scene, states[world], values[world], yaw_of(robot.quat))
-            if env.fresh[world] != BEGUN:
-                env.fresh[world] = COMMANDED
+            if env.history_reset[world] != BEGUN:
+                env.history_reset[world] = COMMANDED
 
     return set_command_kernel
 

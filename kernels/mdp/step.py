@@ -44,7 +44,7 @@ def write_outcome(
     counters.bad_actions[world] = counters.bad_actions[world] + env.bad_action[world]
     env.bad_action[world] = 0
     env.clock[world] = env.clock[world] + 1
-    env.fresh[world] = 0
+    env.history_reset[world] = 0
 
 
 def make_step_kernel(task: Any) -> wp.Kernel:

@@ -247,10 +247,10 @@ def test_a_seed_brings_every_world_back_to_its_first_task():
     env = jumper(2, task=[TASK, dataclasses.replace(TASK, name="other")], skill=np.array([1, 0]))
     env.reset()
     env.worlds.skill.zero_()
-    env.request(1)
+    env.requested_task(1)
     env.reset(seed=5)
     assert env.worlds.skill.numpy().tolist() == [1, 0]
-    assert env.worlds.request.numpy().tolist() == [-1, -1]
+    assert env.worlds.requested_task.numpy().tolist() == [-1, -1]
 
 
 def test_seeds_reproduce_and_differ():

@@ -93,7 +93,7 @@ def test_after_a_switch_observation_and_filter_are_those_of_a_fresh_environment_
             states = alone.skills[0].states.numpy().copy()
             states[0] = s.state
             alone.skills[0].states.assign(wp.array(states, dtype=alone.task.state, device="cpu"))
-            alone.worlds.fresh.fill_(1)
+            alone.worlds.history_reset.fill_(1)
             alone._observe(alone._part(), beginning=1)
             assert torch.equal(alone.obs[0], s.obs), (target, alone.obs[0] - s.obs)
             alone.action[0] = torch.from_numpy(s.next_action)

@@ -257,7 +257,7 @@ class Probe:
     def next_clock(self) -> None:
         """Let all worlds be one policy step further on, and no longer new."""
         self.worlds.clock.assign(self.worlds.clock.numpy() + 1)
-        self.worlds.fresh.zero_()
+        self.worlds.history_reset.zero_()
 
     def obs(self, group: str, final: bool = False) -> np.ndarray:
         """Return an observation group, (n, columns)."""

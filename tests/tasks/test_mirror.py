@@ -91,7 +91,7 @@ def reflection():
     )
     parameters.observation_latency.zero_()
     env.worlds.broken.zero_()
-    env.worlds.fresh.fill_(1)
+    env.worlds.history_reset.fill_(1)
     env.stages()["observe"]()
     return env.task, {"policy": env.obs.numpy().copy(), "critic": env.critic_obs.numpy().copy()}
 

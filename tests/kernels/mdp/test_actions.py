@@ -221,8 +221,8 @@ def test_a_push_acts_on_the_base_while_a_paw_is_down_or_in_the_air_too_where_the
 
 def test_a_step_moves_the_clock_on_and_nothing_is_new_any_more():
     env = make_env(4)
-    env.worlds.fresh.fill_(1)
+    env.worlds.history_reset.fill_(1)
     clock = env.worlds.clock.numpy().copy()
     env.step(torch.zeros(4, 12))
     np.testing.assert_array_equal(env.worlds.clock.numpy(), clock + 1)
-    assert not env.worlds.fresh.numpy().any()
+    assert not env.worlds.history_reset.numpy().any()

@@ -18,7 +18,7 @@ def probe():
     """Worlds whose first observation has no past; exact."""
     probe = Probe(N)
     probe.skill.set("policy", "value", noise=0.0)
-    probe.worlds.fresh.fill_(1)
+    probe.worlds.history_reset.fill_(1)
     return probe
 
 
@@ -109,7 +109,7 @@ def test_history_shifts_by_a_frame_a_step_and_begins_with_the_first_frame_everyw
 
 def begin_some(probe, worlds, value, other):
     """Begin an episode in some worlds after a step, as an environment does."""
-    probe.worlds.fresh.assign(np.isin(np.arange(N), worlds).astype(int))
+    probe.worlds.history_reset.assign(np.isin(np.arange(N), worlds).astype(int))
     states = probe.skill.states.numpy().copy()
     states["value"][worlds], states["other"][worlds] = value, other
     probe.write(value=states["value"], other=states["other"])
@@ -181,7 +181,7 @@ def test_a_command_within_an_episode_renews_the_newest_frame_and_keeps_those_bef
     policy, critic = play(probe, values, others)
     probe.worlds.clock.assign(probe.worlds.clock.numpy() - 1)  # as after the last step
     some, rest = np.arange(0, N, 4), np.setdiff1d(np.arange(N), np.arange(0, N, 4))
-    probe.worlds.fresh.assign(np.isin(np.arange(N), some) * int(COMMANDED))
+    probe.worlds.history_reset.assign(np.isin(np.arange(N), some) * int(COMMANDED))
     probe.write(value=7.5, other=-7.5)
     for _ in range(2):  # a second time changes nothing
         probe.observe(beginning=1)
@@ -192,7 +192,7 @@ def test_a_command_within_an_episode_renews_the_newest_frame_and_keeps_those_bef
         np.testing.assert_array_equal(now[some][:, [5, 6, 7, 8]], np.tile([7.5, -7.5], (len(some), 2)))
         np.testing.assert_array_equal(probe.obs("critic")[some][:, 2], critic[-1, some][:, 2])
     probe.next_clock()
-    probe.worlds.fresh.zero_()
+    probe.worlds.history_reset.zero_()
     probe.latency.fill_(8)
     again, _ = play(probe, values[:1], others[:1])
     np.testing.assert_array_equal(again[0][some][:, [3, 4, 7, 8]], np.tile([7.5, -7.5], (len(some), 2)))

@@ -228,7 +228,7 @@ def test_a_command_from_outside_within_an_episode_comes_in_the_robots_heading(st
 
 
 def test_a_command_before_the_first_step_leaves_a_beginning_one(stage):
-    stage.worlds.fresh.fill_(BEGUN)
+    stage.worlds.history_reset.fill_(BEGUN)
     stage.give(SOME, 0, np.zeros((N, 4)), np.zeros(N))
     assert (stage.world("fresh") == BEGUN).all()
 
