@@ -9,14 +9,14 @@ from pathlib import Path
 import numpy as np
 
 from jumper_warp.evaluation.heights import run_jumps
-from jumper_warp.evaluation.plots import drawn
+from jumper_warp.evaluation.plots import figure
 from jumper_warp.identification.excitation import unsafe
 from jumper_warp.identification.findings import Identification
 from jumper_warp.identification.identify import identify, total_mass, weighed
 from jumper_warp.identification.least_squares import Knowledge
 from jumper_warp.identification.motions import Motion
 from jumper_warp.identification.parameters import ParameterSet
-from jumper_warp.identification.recording import KINDS, Plan, draw_plan, measured, replay_plan
+from jumper_warp.identification.recording import KINDS, Plan, measured, plot_plan, replay_plan
 from jumper_warp.identification.replay import Record, Replay
 from jumper_warp.policies.conditions import Conditions, env_of_policy
 from jumper_warp.policies.runs import open_policy
@@ -58,11 +58,11 @@ def make_case(parameters: ParameterSet, seed: int, carry: Carry, replay: Replay)
     nominal = parameters.robots(np.zeros((1, len(z))))
     plans: list[Plan] = []
     while len(plans) < len(KINDS):
-        plan = draw_plan(KINDS[len(plans)], rng)
+        plan = plot_plan(KINDS[len(plans)], rng)
         if not unsafe(plan, replay_plan(replay, plan, nominal)):
             plans.append(plan)
     motions = [measured(p, f"{i} {p.kind}", carry(p, robots), robots, rng) for i, p in enumerate(plans)]
-    held_out = draw_plan("small jump", rng, torque_limit=HELD_OUT_TORQUE)
+    held_out = plot_plan("small jump", rng, torque_limit=HELD_OUT_TORQUE)
     mass = weighed(float(total_mass(robots)[0] + SCALE * rng.normal()), SCALE)
     return Case(z, robots, motions, mass, held_out, carry(held_out, robots))
 
@@ -146,7 +146,7 @@ def plot_cases(rows: list[dict[str, float]], path: Path) -> None:
          {"yscale": "log"}),
         ("time [s]", {"wall": "wall_s", "CPU": "cpu_s"}, {"ylim": (0.0, None)}),
     )  # fmt: skip
-    with drawn(path, 1, len(panels), figsize=(14, 3.2)) as axes:
+    with figure(path, 1, len(panels), figsize=(14, 3.2)) as axes:
         for axis, (title, series, settings) in zip(axes, panels, strict=True):
             for label, name in series.items():
                 axis.plot([row[name] for row in rows], "o", label=label)
