@@ -25,7 +25,7 @@ from jumper_warp.utils.kernels import Kernel, records
 _KERNELS: dict[tuple, Kernel] = {}
 
 
-class Skill:
+class TaskRuntime:
     """The side of an environment that belongs to one task. Struct and array attributes are the kernels' arguments."""
 
     def __init__(self, task: TaskCfg, index: int, num_envs: int, step_dt: float, substeps: int, device: Any) -> None:

@@ -10,7 +10,7 @@ import warp as wp
 
 from jumper_warp.envs.arrays import FIRST_CLOCK, checked_skill, delay_arrays, env_arrays, robot_arrays, scene_of
 from jumper_warp.envs.parameters import robot_parameters
-from jumper_warp.envs.skill import Skill
+from jumper_warp.envs.skill import TaskRuntime
 from jumper_warp.kernels.mdp import attempts, events
 from jumper_warp.kernels.mdp.actions import action_kernel
 from jumper_warp.kernels.mdp.env import EnvArrays, SkillSettings
@@ -63,7 +63,7 @@ class Stages:
         n, device, sim = self.num_envs, self.wp_device, self.sim
         self._first_skill = checked_skill(skill, n, len(tasks))
         active, self._home = (wp.array(self._first_skill, dtype=int, device=device) for _ in range(2))
-        self.skills = [Skill(task, i, n, self.step_dt, sim.substeps, device) for i, task in enumerate(tasks)]
+        self.skills = [TaskRuntime(task, i, n, self.step_dt, sim.substeps, device) for i, task in enumerate(tasks)]
         self.parameters = robot_parameters(sim, tuple(tasks), active)
         self.robot, self._scene = robot_arrays(sim, self.step_dt), scene_of(sim)
         self.worlds = env_arrays(n, self.seed, active, device)
