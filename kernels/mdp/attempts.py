@@ -12,7 +12,7 @@ import warp as wp
 
 from ..collision.robot import leg_collisions
 from ..kinematics.geometry import LegGeometry
-from ..lanes import all_of_attempt, from_leg_of_attempt, least_of_attempts, sync_legs
+from ..lanes import all_of_attempt, from_leg_of_attempt, least_of_attempts, sync_lanes
 from ..layout import COORDS, DOFS
 from ..scalar import vec3
 from ..state import leg_coord, leg_dof, load_motors, store_motors
@@ -59,7 +59,7 @@ def vec_from_leg(v: vec3, leg: int) -> vec3:
 def sync_attempts(draw: RngStream):
     """Wait for the threads of a world; each then sees what the others wrote."""
     if draw.lanes > 1:
-        sync_legs()
+        sync_lanes()
 
 
 @wp.func

@@ -20,7 +20,7 @@ from ...actuation.stops import (
     revised_stops,
     stop_rows,
 )
-from ...lanes import any_world, first_leg, from_leg, max_legs, sum_legs, sum_vec, sync_legs
+from ...lanes import any_world, first_leg, from_leg, max_legs, sum_legs, sum_vec, sync_lanes
 from ...layout import GRAVITY
 from ...scalar import real, vec3
 from ...state import BaseState, base_com, leg_coord, leg_dof, load_base, load_motors, store_base, store_motors
@@ -242,7 +242,7 @@ def advance_leg(
         push = sum_vec(wp.where(contact.on_block != 0, -solved.impulse, vec3(real(0.0))))
         if writes and done and robot.ground.blocks[world].exists != 0:
             move_block(robot.ground, world, wp.quat_rotate(base.quat, block_velocity(block, push)), dt)
-        sync_legs()
+        sync_lanes()
     if done:
         moved = moved_base(base, lin + solved.lin, ang + solved.ang, dt)
         return stepped(old, moved, old.angles + dt * rates, rates, torque, solved, total, pressed)
