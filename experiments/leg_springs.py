@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import tyro
-from jumper_warp.robot.projected_gravity import EARTH, MARS
+from jumper_warp.robot.gravity import EARTH, MARS
 from rich.console import Console
 from rich.table import Table
 

@@ -17,7 +17,7 @@ from typing import Any, Literal
 
 import numpy as np
 import tyro
-from jumper_warp.robot.projected_gravity import EARTH
+from jumper_warp.robot.gravity import EARTH
 
 from jumper_warp.cli.main import run_command
 from jumper_warp.evaluation.commands import print_figures

@@ -5,8 +5,8 @@
     from jumper_warp import make_task, mdp
 
     @wp.func
-    def level(view: mdp.RobotView, task: mdp.JumpState, scale: float) -> float:
-        return wp.where(task.phase == mdp.FLIGHT, mdp.rewards.psi(mdp.tilt(view), scale), 0.0)
+    def level(robot: mdp.RobotView, state: mdp.JumpState, scale: float) -> float:
+        return wp.where(state.phase == mdp.FLIGHT, mdp.rewards.psi(mdp.tilt(view), scale), 0.0)
 
     jump = make_task("vertical-jump")
     jump = replace(jump, rewards=(*jump.rewards, mdp.RewardTerm(level, weight=2.0, scale=0.1)))

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import torch
 import warp as wp
-from jumper_warp.robot.projected_gravity import EARTH
+from jumper_warp.robot.gravity import EARTH
 
 from jumper_warp.diff.rollout import compact
 from jumper_warp.diff.torch_rollout import TorchTrajectory

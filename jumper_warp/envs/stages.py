@@ -117,7 +117,8 @@ class Stages:
         """
         part = self._part(worlds)
         return {"action": lambda: self._apply_actions(part), "physics": lambda: self._advance(part),
-                "episode": lambda: self._compute_rewards_and_dones(part), "observe": lambda: self._observe(part, beginning=0),
+                "episode": lambda: self._compute_rewards_and_dones(part),
+                "observe": lambda: self._observe(part, beginning=0),
                 "reset": lambda: self._reset_done(part)}  # fmt: skip
 
     def _apply_actions(self, part: Part) -> None:

@@ -107,7 +107,7 @@ class Term:
 
 
 class RewardTerm(Term):
-    """(view: RobotView, task, ...) -> float; times the weight, and times the policy step [s] unless paid `once`."""
+    """(robot: RobotView, state, ...) -> float; times the weight, and times the policy step [s] unless paid `once`."""
 
     settings: ClassVar = {"weight": REQUIRED}
     options: Mapping[str, Any] = {"once": False}
@@ -123,7 +123,7 @@ class RewardTerm(Term):
 
 
 class TerminationTerm(Term):
-    """(view: RobotView, task, ...) -> bool.
+    """(robot: RobotView, state, ...) -> bool.
 
     time_out: an end that says nothing against the state, so that what would follow counts. success: what the success
     rate and the curriculum count.
@@ -134,7 +134,7 @@ class TerminationTerm(Term):
 
 
 class ObservationTerm(Term):
-    """(view: RobotView, task, ...) -> float or vector; or likewise (parameters: RobotParameters, world: int), or of the
+    """(robot: RobotView, state, ...) -> float or vector; or likewise (parameters: RobotParameters, world: int), or of the
     ground around the robot (robot: RobotArrays, ground: Ground, world: int).
 
     noise: standard deviation, cut at one. Then clipped to plus and minus `clip`, and scaled. history: frames, the
@@ -203,11 +203,11 @@ class EventTerm(Term):
 
 
 class Advance(Term):
-    """(view: RobotView, task, ...) -> task, one policy step later: the task's phase machine."""
+    """(robot: RobotView, state, ...) -> state, one policy step later: the task's phase machine."""
 
 
 class Curriculum(Term):
-    """(view: RobotView, task) -> error of an ended episode.
+    """(robot: RobotView, state) -> error of an ended episode.
 
     An episode that ends with success and an error up to `tolerance` is one; `promote_after` of them in a row raise the
     world's level. counts: (state) -> bool, whether an episode counts at all. unit: of the error, as it is logged.

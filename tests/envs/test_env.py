@@ -213,8 +213,8 @@ def test_a_new_episode_forgets_the_old_one():
     arrays, robot = env.task_arrays(), env.robot
     for name in ("steps", "phase", "phase_steps", "idle_steps", "took_off", "touched_down", "at_apex", "apex_passed"):
         assert not arrays[name].any(), name
-    for name in ("action", "prev_action", "prev_prev_action", "prev_rate", "torque", "prev_torque", "paw_force", "impulse",
-                 "contact_time", "air_time", "touchdown_speed", "peak_force", "prev_lin_vel"):  # fmt: skip
+    for name in ("action", "prev_action", "prev_prev_action", "prev_rate", "torque", "prev_torque", "paw_force",
+                 "impulse", "contact_time", "air_time", "touchdown_speed", "peak_force", "prev_lin_vel"):  # fmt: skip
         assert not getattr(robot, name).numpy().any(), name
     assert not env.obs[:, -12:].any() and env.final_obs[:, -12:].any()
     angles = env.sim.joint_q()[:, 7:27].reshape(N, 4, 5)[:, :, [0, 1, 3]].reshape(N, 12)

@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 import tyro
-from jumper_warp.robot.projected_gravity import MARS
+from jumper_warp.robot.gravity import MARS
 
 from jump_helpers import DEG, episodes_of, make_env, only
 from jump_starts import Starts

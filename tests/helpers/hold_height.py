@@ -74,12 +74,12 @@ class HoldLevelCfg:
 
 
 @wp.func
-def advance_hold(view: mdp.RobotView, state: HoldState, tolerance: float) -> HoldState:
+def advance_hold(robot: mdp.RobotView, state: HoldState, tolerance: float) -> HoldState:
     """Count steps, and those near the goal up to a tolerance [m]."""
     new = state
     new.steps = state.steps + 1
     new.age = state.age + 1
-    new.near = wp.where(wp.abs(view.height - state.goal) < tolerance, state.near + 1, 0)
+    new.near = wp.where(wp.abs(robot.height - state.goal) < tolerance, state.near + 1, 0)
     return new
 
 
@@ -97,7 +97,7 @@ def reset_hold(
 
 
 @wp.func
-def give_hold(view: mdp.RobotView, scene: mdp.Scene, state: HoldState, values: wp.vec4, heading: float) -> HoldState:
+def give_hold(robot: mdp.RobotView, scene: mdp.Scene, state: HoldState, values: wp.vec4, heading: float) -> HoldState:
     """Command a height [m], the first of the values, until another comes."""
     new = state
     new.goal = values[0]
@@ -114,7 +114,7 @@ def another_goal_due(state: HoldState) -> bool:
 
 @wp.func
 def draw_goal(
-    view: mdp.RobotView, scene: mdp.Scene, state: HoldState, level: HoldLevel, draw: mdp.RngStream
+    robot: mdp.RobotView, scene: mdp.Scene, state: HoldState, level: HoldLevel, draw: mdp.RngStream
 ) -> HoldState:
     """Command another height."""
     new = state
@@ -124,9 +124,9 @@ def draw_goal(
 
 
 @wp.func
-def height_error(view: mdp.RobotView, state: HoldState) -> float:
+def height_error(robot: mdp.RobotView, state: HoldState) -> float:
     """Distance from the commanded height [m]."""
-    return wp.abs(view.height - state.goal)
+    return wp.abs(robot.height - state.goal)
 
 
 @wp.func
@@ -136,19 +136,19 @@ def every_episode(state: HoldState) -> bool:
 
 
 @wp.func
-def near_goal(view: mdp.RobotView, state: HoldState, width: float) -> float:
+def near_goal(robot: mdp.RobotView, state: HoldState, width: float) -> float:
     """Closeness to the commanded height; width [m]: of the kernel."""
-    return mdp.rewards.psi(view.height - state.goal, width)
+    return mdp.rewards.psi(robot.height - state.goal, width)
 
 
 @wp.func
-def held(view: mdp.RobotView, state: HoldState, steps: float) -> bool:
+def held(robot: mdp.RobotView, state: HoldState, steps: float) -> bool:
     """Near the goal for so many policy steps in a row."""
     return state.near >= int(steps)
 
 
 @wp.func
-def wanted_height(view: mdp.RobotView, state: HoldState) -> float:
+def wanted_height(robot: mdp.RobotView, state: HoldState) -> float:
     """The commanded height [m]."""
     return state.goal
 

@@ -86,8 +86,8 @@ def advance_probe(robot: RobotView, state: ProbeState, growth: float) -> ProbeSt
 
 @wp.func
 def reset_probe(
-    arrays: RobotArrays, scene: Scene, skill: SkillSettings, old: ProbeState, settings: ProbeSettings, level: ProbeLevel,
-    draw: RngStream,
+    arrays: RobotArrays, scene: Scene, skill: SkillSettings, old: ProbeState, settings: ProbeSettings,
+    level: ProbeLevel, draw: RngStream,
 ) -> ProbeState:  # fmt: skip
     """Stand; keep a draw in `other` and the level in `counts`."""
     store_pose(arrays, scene, draw.world, 0.5, 0.25)
