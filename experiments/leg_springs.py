@@ -17,12 +17,12 @@ from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import tyro
-from jumper_warp.robot.gravity import EARTH, MARS
 from rich.console import Console
 from rich.table import Table
 
 from jumper_warp.cli.main import run_command
 from jumper_warp.evaluation.plots import figure
+from jumper_warp.robot.gravity import EARTH, MARS
 from jumper_warp.robot.motors import jumping_motors
 from jumper_warp.robot.overlay import with_springs
 from jumper_warp.utils.errors import InputError

@@ -17,11 +17,11 @@ from typing import Any, Literal
 
 import numpy as np
 import tyro
-from jumper_warp.robot.gravity import EARTH
 
 from jumper_warp.cli.main import run_command
 from jumper_warp.evaluation.commands import print_figures
 from jumper_warp.robot.description import LEGS
+from jumper_warp.robot.gravity import EARTH
 from jumper_warp.robot.model import build_model
 from jumper_warp.robot.motors import jumping_motors, loose_filter, vertical_jump_filter
 from jumper_warp.robot.overlay import load_overlay, with_springs

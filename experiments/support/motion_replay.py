@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 import torch
 import warp as wp
-from jumper_warp.robot.gravity import EARTH
 
 from jumper_warp.diff.rollout import compact
 from jumper_warp.diff.torch_rollout import TorchTrajectory
@@ -19,6 +18,7 @@ from jumper_warp.evaluation.plots import figure
 from jumper_warp.kernels.collision.robot import collision_kernel
 from jumper_warp.kernels.layout import COORDS
 from jumper_warp.robot.description import MOTOR_JOINTS
+from jumper_warp.robot.gravity import EARTH
 from jumper_warp.robot.model import build_model
 from jumper_warp.sim.simulation import Simulation, motor_values
 from jumper_warp.trajectory.problem import Motion, Problem

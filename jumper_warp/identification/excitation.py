@@ -12,7 +12,7 @@ import numpy as np
 
 from jumper_warp.identification.motions import DEGREES, Motion, NoiseLevels
 from jumper_warp.identification.parameters import ParameterSet
-from jumper_warp.identification.recording import KINDS, Kind, Plan, draw_plan, measured, replay_plan, simulate_plan
+from jumper_warp.identification.recording import KINDS, Kind, Plan, measured, plot_plan, replay_plan, simulate_plan
 from jumper_warp.identification.replay import Record, Replay
 from jumper_warp.identification.residuals import MotionResiduals
 from jumper_warp.robot.motors import FilterCfg, walking_filter
@@ -117,7 +117,7 @@ def choose(
     for kind in kinds:
         best: tuple[float, Plan | None, np.ndarray] = (-math.inf, None, known)
         for _ in range(candidates):
-            plan = draw_plan(kind, rng, seconds)
+            plan = plot_plan(kind, rng, seconds)
             record = scorer.record(plan)
             reason = unsafe(plan, record)
             if reason:

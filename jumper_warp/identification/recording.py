@@ -53,7 +53,7 @@ class Plan:
         return np.repeat(self.target, SAMPLES, axis=0)
 
 
-def draw_plan(kind: Kind, rng: np.random.Generator, seconds: float = 1.25, torque_limit: float = 12.0) -> Plan:
+def plot_plan(kind: Kind, rng: np.random.Generator, seconds: float = 1.25, torque_limit: float = 12.0) -> Plan:
     """Return a random plan of a kind."""
     ticks = round(seconds / TICK)
     if ticks < 30 or not seconds < 60.0:

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from jumper_warp.policies.policy import Policy
 from jumper_warp.policies.restore import task_of_policy
+from jumper_warp.robot.gravity import check_gravity
 from jumper_warp.robot.model import PHYSICS_DT
 from jumper_warp.robot.overlay import RobotOverlay, load_overlay
-from jumper_warp.robot.gravity import check_gravity
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.tasks.randomization import RandomizationCfg
 from jumper_warp.tasks.saving import OPTIONAL

@@ -18,8 +18,8 @@ import warp as wp
 
 from jumper_warp.robot.checks import LegDimensions, knee_angles, leg_dimensions
 from jumper_warp.robot.description import LEGS, MOTOR_JOINTS, RobotDescription, load_description
-from jumper_warp.robot.parts import Link, Shape
 from jumper_warp.robot.gravity import EARTH, check_gravity
+from jumper_warp.robot.parts import Link, Shape
 from jumper_warp.utils.checks import check_count
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.newton_types import Model

@@ -13,11 +13,11 @@ from jumper_warp.kernels.actuation.command_filter import command_filter_kernel
 from jumper_warp.kernels.actuation.readout import base_velocity_kernel
 from jumper_warp.kernels.dynamics.restore import restore_motors_kernel, restore_state_kernel
 from jumper_warp.kernels.layout import COORDS, DOFS
+from jumper_warp.robot.gravity import EARTH
 from jumper_warp.robot.grounds import BlockCfg
 from jumper_warp.robot.model import PHYSICS_DT, Extras, build_model
 from jumper_warp.robot.motors import FilterCfg, MotorCfg, filter_params, jumping_motors, motor_arrays
 from jumper_warp.robot.overlay import RobotOverlay
-from jumper_warp.robot.gravity import EARTH
 from jumper_warp.robot.values import RobotValues
 from jumper_warp.sim.overlay import write_model, write_motors, write_springs
 from jumper_warp.sim.physics import JumperPhysics, MujocoPhysics, Physics

@@ -10,8 +10,8 @@ from typing import Any
 from jumper_warp.kernels.mdp.env import Nothing
 from jumper_warp.kernels.mdp.starts import APART
 from jumper_warp.kernels.mdp.terminations import came_apart
-from jumper_warp.robot.motors import FilterCfg, MotorCfg
 from jumper_warp.robot.gravity import EARTH, check_gravity
+from jumper_warp.robot.motors import FilterCfg, MotorCfg
 from jumper_warp.tasks.params import TaskParams
 from jumper_warp.tasks.randomization import RandomizationCfg
 from jumper_warp.tasks.ranges import Pair

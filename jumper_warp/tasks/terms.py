@@ -134,8 +134,8 @@ class TerminationTerm(Term):
 
 
 class ObservationTerm(Term):
-    """(robot: RobotView, state, ...) -> float or vector; or likewise (parameters: RobotParameters, world: int), or of the
-    ground around the robot (robot: RobotArrays, ground: Ground, world: int).
+    """(robot: RobotView, state, ...) -> float or vector; or likewise (parameters: RobotParameters, world: int), or of
+    the ground around the robot (arrays: RobotArrays, ground: Ground, world: int).
 
     noise: standard deviation, cut at one. Then clipped to plus and minus `clip`, and scaled. history: frames, the
     oldest first. delayed: whether it comes as late as the world's sensors do.

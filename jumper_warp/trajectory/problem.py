@@ -20,9 +20,9 @@ import torch
 
 from jumper_warp.diff.rollout import Rollout
 from jumper_warp.diff.torch_rollout import TorchTrajectory, simulate
+from jumper_warp.robot.gravity import EARTH
 from jumper_warp.robot.model import PHYSICS_DT, build_model
 from jumper_warp.robot.motors import FilterCfg, MotorCfg, jumping_motors
-from jumper_warp.robot.gravity import EARTH
 from jumper_warp.sim.simulation import SUBSTEPS
 from jumper_warp.trajectory.whole_body import Momentum, WholeBody
 from jumper_warp.utils.errors import InputError

@@ -5,7 +5,6 @@ import dataclasses
 import numpy as np
 import pytest
 import tyro
-from jumper_warp.robot.gravity import MARS
 
 from jump_helpers import DEG, episodes_of, make_env, only
 from jump_starts import Starts
@@ -14,6 +13,7 @@ from jumper_warp.envs.env import Env
 from jumper_warp.evaluation.run import EvaluationArgs, conditions_of
 from jumper_warp.policies.conditions import Conditions
 from jumper_warp.registry import make_task
+from jumper_warp.robot.gravity import MARS
 from jumper_warp.sim.simulation import Simulation
 from jumper_warp.utils.errors import InputError
 

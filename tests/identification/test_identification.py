@@ -11,7 +11,7 @@ from jumper_warp.identification.identify import identify, total_mass, weighed
 from jumper_warp.identification.least_squares import gram
 from jumper_warp.identification.motions import NoiseLevels
 from jumper_warp.identification.parameters import Parameter, ParameterSet, jumper_parameters
-from jumper_warp.identification.recording import KINDS, draw_plan, measured, replay_plan, simulate_plan
+from jumper_warp.identification.recording import KINDS, measured, plot_plan, replay_plan, simulate_plan
 from jumper_warp.identification.replay import Replay
 from jumper_warp.identification.residuals import MotionResiduals
 from jumper_warp.identification.stance import paw_positions, stance, unevenness
@@ -40,7 +40,7 @@ def some_truth(parameters, seed=0):
 def test_a_replay_moves_as_the_simulation_does_with_all_parameters_changed(replay, kind):
     parameters = jumper_parameters()
     robots = parameters.robots(some_truth(parameters))
-    plan = draw_plan(kind, np.random.default_rng(1), seconds=0.6)
+    plan = plot_plan(kind, np.random.default_rng(1), seconds=0.6)
     ours, theirs = replay_plan(replay, plan, robots), simulate_plan(plan, robots=robots)
     assert ours.valid.all() and np.ptp(ours.angle[:, 1, 0]) > 2.0 * DEGREE
     np.testing.assert_allclose(ours.angle, theirs.angle, atol=0.01 * DEGREE)
@@ -51,7 +51,7 @@ def test_a_replay_moves_as_the_simulation_does_with_all_parameters_changed(repla
 
 def test_a_target_arrives_late_by_parts_of_a_step(replay):
     parameters = jumper_parameters(["latency"])
-    plan = draw_plan("hung chirp", np.random.default_rng(0), seconds=0.5)
+    plan = plot_plan("hung chirp", np.random.default_rng(0), seconds=0.5)
     second_tick = []
     for steps in (0.0, 0.25, 0.5, 1.0):
         robots = parameters.robots(parameters.normalised(np.array([[steps / 480.0]])))
@@ -84,7 +84,7 @@ def standing(replay):
     parameters, rng = jumper_parameters(["offsets"]), np.random.default_rng(4)
     truth = some_truth(parameters)
     robots = parameters.robots(truth)
-    plan = draw_plan("standing chirp", rng, seconds=0.5)
+    plan = plot_plan("standing chirp", rng, seconds=0.5)
     motion = measured(plan, "standing", replay_plan(replay, plan, robots), robots, rng)
     return MotionResiduals(motion, parameters, NoiseLevels(), replay.description), truth
 
@@ -152,7 +152,7 @@ def found(replay):
     truth = some_truth(parameters, seed=2)
     robots = parameters.robots(truth)
     small = Replay(threads=2)
-    plans = [draw_plan(kind, rng, seconds=0.6) for kind in ("hung chirp", "standing chirp")]
+    plans = [plot_plan(kind, rng, seconds=0.6) for kind in ("hung chirp", "standing chirp")]
     motions = [measured(plan, f"m{i}", replay_plan(small, plan, robots), robots, rng) for i, plan in enumerate(plans)]
     mass = weighed(float(total_mass(robots)[0]))
     return identify(motions, parameters, knowledge=[mass], replay=small), truth, motions
@@ -174,7 +174,7 @@ def test_known_parameters_are_found_within_their_intervals(found):
 
 def test_the_jacobian_is_that_of_single_changes_and_legs_share_worlds_in_the_air(replay):
     parameters, rng = jumper_parameters(["motors"]), np.random.default_rng(3)
-    plan = draw_plan("hung chirp", rng, seconds=0.5)
+    plan = plot_plan("hung chirp", rng, seconds=0.5)
     robots = parameters.robots(some_truth(parameters))
     motion = measured(plan, "hung", replay_plan(replay, plan, robots), robots, rng)
     problem = MotionResiduals(motion, parameters, NoiseLevels(), replay.description)
@@ -205,7 +205,7 @@ def test_masses_and_gains_that_share_a_scale_are_named(replay):
     wanted = ("kp", "kd", "link_mass", "armature", "motor_friction", "knee_damping")
     parameters = ParameterSet(tuple(p for p in jumper_parameters() if p.quantity in wanted))
     scorer = Scorer(parameters, replay=Replay(threads=2))
-    plan = draw_plan("hung chirp", np.random.default_rng(0), seconds=0.6)
+    plan = plot_plan("hung chirp", np.random.default_rng(0), seconds=0.6)
     information = scorer.information(plan, scorer.record(plan))
     words = [direction.words for direction in weak_directions(parameters, information)]
     assert any("share a scale: add a weighed mass" in line for line in words), words

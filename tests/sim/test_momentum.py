@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
-from jumper_warp.robot.gravity import MARS
 
+from jumper_warp.robot.gravity import MARS
 from jumper_warp.robot.motors import jumping_motors
 from jumper_warp.sim.simulation import Simulation
 from support.momentum import momentum

@@ -12,8 +12,8 @@ from __future__ import annotations
 from dataclasses import replace
 
 from jumper_warp.kernels.jump import rewards, terminations
-from jumper_warp.robot.motors import MotorCfg, jumping_motors, loose_filter
 from jumper_warp.robot.gravity import EARTH, MARS
+from jumper_warp.robot.motors import MotorCfg, jumping_motors, loose_filter
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.tasks.jump.cfg import GroundCfg, ladder
 from jumper_warp.tasks.jump.horizontal import NEAREST, horizontal_jump, level
