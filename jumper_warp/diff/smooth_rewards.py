@@ -65,9 +65,9 @@ def make_moment(loop: ClosedLoop, state: LoopState, old: LoopState, arrays: Mapp
     )  # fmt: skip
 
 
-def phi(squared: torch.Tensor, width: float) -> torch.Tensor:
-    """Return exp(-x^2 / width^2) for x^2."""
-    return torch.exp(-squared / width**2)
+def phi(squared: torch.Tensor, std: float) -> torch.Tensor:
+    """Return exp(-x^2 / std^2) for x^2."""
+    return torch.exp(-squared / std**2)
 
 
 def norm(x: torch.Tensor) -> torch.Tensor:
@@ -83,25 +83,31 @@ def apex(m: Moment) -> torch.Tensor:
 def height_kernel(m: Moment, p: Mapping[str, float]) -> torch.Tensor:
     """Return how close the apex is to the goal."""
     miss = apex(m) - m.goal
-    return phi(miss.square(), p["fine"]) + 3.0 * torch.exp(-miss.abs() / p["sharp"]) + phi(miss.square(), p["wide"])
+    return (
+        phi(miss.square(), p["std_fine"])
+        + 3.0 * torch.exp(-miss.abs() / p["scale_sharp"])
+        + phi(miss.square(), p["std_wide"])
+    )
 
 
 def patience(m: Moment, p: Mapping[str, float]) -> torch.Tensor:
-    """Return 1, or the share that is left while a commanded jump has not begun."""
-    return torch.where(m.due, p["share"], 1.0)
+    """Return 1, or `waiting_scale` while a commanded jump has not begun."""
+    return torch.where(m.due, p["waiting_scale"], 1.0)
 
 
 def posture(m: Moment, p: Mapping[str, float], shift: float) -> torch.Tensor:
     """Return phi of the rms offset from the default pose, transversal motors moved by a shift [rad]."""
     shifts = m.default.new_tensor(4 * [0.0, shift, shift])
-    return phi((m.motion.angle - m.default - shifts).square().mean(1), p["width"])
+    return phi((m.motion.angle - m.default - shifts).square().mean(1), p["std"])
 
 
 def symmetry(m: Moment, p: Mapping[str, float]) -> torch.Tensor:
     """Return the closeness of the transversal angles to each other and of the lateral ones to 0."""
     legs = m.motion.angle.view(-1, 4, 3)
     spread = legs[:, :, 1:].flatten(1).var(1, correction=0)
-    return phi(spread.square(), p["variance"]) * phi(legs[:, :, 0].square().sum(1), p["lateral"]) * patience(m, p)
+    return (
+        phi(spread.square(), p["std_variance"]) * phi(legs[:, :, 0].square().sum(1), p["std_lateral"]) * patience(m, p)
+    )
 
 
 def level(m: Moment) -> torch.Tensor:
@@ -114,17 +120,17 @@ SMOOTH: dict[str, Smooth] = {
     "jump_height": lambda m, p: m.at_apex * height_kernel(m, p),
     "estimated_jump_height": lambda m, p: m.rising * height_kernel(m, p),
     "horizontal_velocity": lambda m, p: (
-        torch.exp(-norm(m.motion.lin_vel[:, :2]) / p["width"]) * torch.where(m.phase == STANCE, 1.0, 2.0)
+        torch.exp(-norm(m.motion.lin_vel[:, :2]) / p["speed_scale"]) * torch.where(m.phase == STANCE, 1.0, 2.0)
     ) * patience(m, p),
-    "orientation": lambda m, p: phi(level(m), p["width"]) * patience(m, p),
-    "angular_velocity": lambda m, p: phi(m.motion.ang_vel.square().sum(1), p["width"]) * patience(m, p),
+    "orientation": lambda m, p: phi(level(m), p["std"]) * patience(m, p),
+    "angular_velocity": lambda m, p: phi(m.motion.ang_vel.square().sum(1), p["std"]) * patience(m, p),
     "joint_symmetry": symmetry,
     "ground_posture": lambda m, p: (m.phase != FLIGHT) * posture(m, p, p["shift"]) * patience(m, p),
     "air_posture": lambda m, p: (m.phase == FLIGHT) * posture(m, p, 0.0),
     "retract": lambda m, p: m.soon * posture(m, p, p["shift"]),
-    "rest": lambda m, p: m.resting * phi(m.motion.lin_vel.square().sum(1), p["speed"])
-    * phi(m.motion.ang_vel.square().sum(1), p["spin"]),
-    "landing_tilt": lambda m, p: (m.phase == LANDED) * level(m) / np.sin(p["width"]) ** 2,
+    "rest": lambda m, p: m.resting * phi(m.motion.lin_vel.square().sum(1), p["std_lin_vel"])
+    * phi(m.motion.ang_vel.square().sum(1), p["std_ang_vel"]),
+    "landing_tilt": lambda m, p: (m.phase == LANDED) * level(m) / np.sin(p["angle"]) ** 2,
     "catch_landing": lambda m, p: m.soon * (-m.motion.lin_vel[:, 2]).clamp(0.0, 1.0),
     "damp_landing": lambda m, p: m.soon * m.motion.rate.view(-1, 4, 3)[:, :, 1:].flatten(1).clamp(0.0, 1.0).mean(1),
     "motor_torque_sq": lambda m, p: m.state.torque.square().sum(0),

@@ -192,15 +192,15 @@ class RandomizationCfg:
                 EventTerm(parameters.friction, mode=self.redraw, dynamic_lower=dynamic[0], dynamic_upper=dynamic[1],
                           static_lower=static[0], static_upper=static[1])
             )  # fmt: skip
-        add(parameters.action_latency, self.latency, 1.0e-3, none=self.no_latency)
-        add(parameters.observation_latency, self.observation_latency, 1.0e-3, none=self.no_latency)
+        add(parameters.action_latency, self.latency, 1.0e-3, zero_probability=self.no_latency)
+        add(parameters.observation_latency, self.observation_latency, 1.0e-3, zero_probability=self.no_latency)
         if self.force or self.torque:
             force, torque = self.force or (0.0, 0.0), self.torque or (0.0, 0.0)
             timing: dict[str, Any] = {"mode": "reset", "repack": False}
             if self.push_interval is not None:
                 timing |= {"mode": "interval", "least": self.push_interval[0], "most": self.push_interval[1]}
             found.append(
-                EventTerm(parameters.push, **timing, share=self.push_share, force_lower=force[0], force_upper=force[1],
-                          torque_lower=torque[0], torque_upper=torque[1])
+                EventTerm(parameters.push, **timing, probability=self.push_share, force_lower=force[0],
+                          force_upper=force[1], torque_lower=torque[0], torque_upper=torque[1])
             )  # fmt: skip
         return tuple(found)

@@ -14,22 +14,22 @@ def approach(robot: RobotView, state: AttitudeState) -> float:
 
 
 @wp.func
-def attitude(robot: RobotView, state: AttitudeState, width: float) -> float:
-    """Attitude: phi of the angle to the goal; width [rad]."""
-    return phi(state.error, width)
+def attitude(robot: RobotView, state: AttitudeState, std: float) -> float:
+    """Attitude: phi of the angle to the goal; std [rad]."""
+    return phi(state.error, std)
 
 
 @wp.func
-def hold(robot: RobotView, state: AttitudeState, width: float, spin: float) -> float:
-    """Hold: at the goal, not turning; phi of the angle, width [rad], times phi of the angular speed, spin [rad/s]."""
-    return phi(state.error, width) * phi(wp.length(robot.ang_vel), spin)
+def hold(robot: RobotView, state: AttitudeState, std: float, std_ang_vel: float) -> float:
+    """Hold: at the goal, not turning; phi of the angle, std [rad], and of the angular speed, std_ang_vel [rad/s]."""
+    return phi(state.error, std) * phi(wp.length(robot.ang_vel), std_ang_vel)
 
 
 @wp.func
-def landing_posture(robot: RobotView, state: AttitudeState, width: float, posture: float) -> float:
-    """Landing posture: at the goal and near the default pose; phi of the angle, width [rad], and of the rms offset of
-    the motors, posture [rad]."""
-    return phi(state.error, width) * phi(posture_offset(robot, 0.0), posture)
+def landing_posture(robot: RobotView, state: AttitudeState, std: float, std_posture: float) -> float:
+    """Landing posture: at the goal and near the default pose; phi of the angle, std [rad], and of the rms offset of
+    the motors, std_posture [rad]."""
+    return phi(state.error, std) * phi(posture_offset(robot, 0.0), std_posture)
 
 
 @wp.func

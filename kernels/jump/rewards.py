@@ -15,9 +15,9 @@ RECOVERED = wp.constant(30)  # policy steps: 0.5 s after touchdown
 
 
 @wp.func
-def patience(state: JumpState, share: float) -> float:
-    """Return the weight of what pays without jumping: `share` while a commanded jump has not begun, else 1."""
-    return wp.where(waiting(state), share, 1.0)
+def patience(state: JumpState, waiting_scale: float) -> float:
+    """Return the weight of what pays without jumping: `waiting_scale` while a commanded jump has not begun, else 1."""
+    return wp.where(waiting(state), waiting_scale, 1.0)
 
 
 @wp.func
@@ -38,53 +38,60 @@ def should_rest(state: JumpState) -> bool:
 
 
 @wp.func
-def height_kernel(error: float, fine: float, sharp: float, wide: float) -> float:
-    """Return phi_fine + 3 psi_sharp + phi_wide of a height error [m]; the last, wide one gives a slope to low jumps."""
-    return phi(error, fine) + 3.0 * psi(error, sharp) + phi(error, wide)
+def height_kernel(error: float, std_fine: float, scale_sharp: float, std_wide: float) -> float:
+    """Return phi_fine + 3 psi_sharp + phi_wide of a height error [m]; the wide one gives a slope to low jumps."""
+    return phi(error, std_fine) + 3.0 * psi(error, scale_sharp) + phi(error, std_wide)
 
 
 @wp.func
-def jump_height(robot: RobotView, state: JumpState, fine: float, sharp: float, wide: float) -> float:
+def jump_height(robot: RobotView, state: JumpState, std_fine: float, scale_sharp: float, std_wide: float) -> float:
     """Jump height: closeness of the highest base height to the goal, once, at the apex."""
     if state.at_apex == 0:
         return 0.0
-    return height_kernel(state.max_height - state.goal[2], fine, sharp, wide)
+    return height_kernel(state.max_height - state.goal[2], std_fine, scale_sharp, std_wide)
 
 
 @wp.func
-def estimated_jump_height(robot: RobotView, state: JumpState, fine: float, sharp: float, wide: float) -> float:
+def estimated_jump_height(
+    robot: RobotView, state: JumpState, std_fine: float, scale_sharp: float, std_wide: float
+) -> float:
     """Est jump height: the same of the ballistic estimate, in flight until the apex."""
     if state.phase != FLIGHT or state.apex_passed != 0:
         return 0.0
     return height_kernel(
-        estimated_apex(robot.pos, robot.lin_vel, robot.gravity_magnitude) - state.goal[2], fine, sharp, wide
+        estimated_apex(robot.pos, robot.lin_vel, robot.gravity_magnitude) - state.goal[2],
+        std_fine,
+        scale_sharp,
+        std_wide,
     )
 
 
 @wp.func
-def horizontal_velocity(robot: RobotView, state: JumpState, width: float, share: float) -> float:
-    """Staying over the spot: exp(-|v_xy| / width), doubled off stance; `share` of it while a jump is due."""
+def horizontal_velocity(robot: RobotView, state: JumpState, speed_scale: float, waiting_scale: float) -> float:
+    """Staying over the spot: exp(-|v_xy| / speed_scale), twice off stance; `waiting_scale` of it while due."""
     speed = wp.length(wp.vec2(robot.lin_vel[0], robot.lin_vel[1]))
-    return wp.exp(-speed / width) * wp.where(state.phase == STANCE, 1.0, 2.0) * patience(state, share)
+    return wp.exp(-speed / speed_scale) * wp.where(state.phase == STANCE, 1.0, 2.0) * patience(state, waiting_scale)
 
 
 @wp.func
-def orientation(robot: RobotView, state: JumpState, width: float, share: float) -> float:
-    """Orientation error: phi_width of the horizontal part of projected gravity; `share` of it while a jump is due."""
-    return phi(wp.length(wp.vec2(robot.projected_gravity[0], robot.projected_gravity[1])), width) * patience(
-        state, share
+def orientation(robot: RobotView, state: JumpState, std: float, waiting_scale: float) -> float:
+    """Orientation error: phi_std of the horizontal projected gravity; `waiting_scale` of it while due."""
+    return phi(wp.length(wp.vec2(robot.projected_gravity[0], robot.projected_gravity[1])), std) * patience(
+        state, waiting_scale
     )
 
 
 @wp.func
-def angular_velocity(robot: RobotView, state: JumpState, width: float, share: float) -> float:
-    """Angular velocity: phi_width(|w|); `share` of it while a jump is due."""
-    return phi(wp.length(robot.ang_vel), width) * patience(state, share)
+def angular_velocity(robot: RobotView, state: JumpState, std: float, waiting_scale: float) -> float:
+    """Angular velocity: phi_std(|w|); `waiting_scale` of it while due."""
+    return phi(wp.length(robot.ang_vel), std) * patience(state, waiting_scale)
 
 
 @wp.func
-def joint_symmetry(robot: RobotView, state: JumpState, variance: float, lateral: float, share: float) -> float:
-    """Joint symmetry: phi of the transversal angles' variance and of |lateral angles|; `share` of it while due."""
+def joint_symmetry(
+    robot: RobotView, state: JumpState, std_variance: float, std_lateral: float, waiting_scale: float
+) -> float:
+    """Joint symmetry: phi of the transversal angles' variance and |lateral angles|; `waiting_scale` of it while due."""
     total = float(0.0)
     total_sq = float(0.0)
     lateral_sq = float(0.0)
@@ -96,51 +103,51 @@ def joint_symmetry(robot: RobotView, state: JumpState, variance: float, lateral:
             total += a
             total_sq += a * a
     spread = total_sq / 8.0 - total * total / 64.0
-    return phi(spread, variance) * phi(wp.sqrt(lateral_sq), lateral) * patience(state, share)
+    return phi(spread, std_variance) * phi(wp.sqrt(lateral_sq), std_lateral) * patience(state, waiting_scale)
 
 
 @wp.func
-def ground_posture(robot: RobotView, state: JumpState, width: float, shift: float, share: float) -> float:
-    """Desired joint position on the ground: phi_width of the offset from default, transversal motors + shift.
+def ground_posture(robot: RobotView, state: JumpState, std: float, shift: float, waiting_scale: float) -> float:
+    """Desired joint position on the ground: phi_std of the offset from default, transversal motors + shift.
 
-    `share` of it while a jump is due.
+    `waiting_scale` of it while a jump is due.
     """
     if state.phase == FLIGHT:
         return 0.0
-    return phi(posture_offset(robot, shift), width) * patience(state, share)
+    return phi(posture_offset(robot, shift), std) * patience(state, waiting_scale)
 
 
 @wp.func
-def air_posture(robot: RobotView, state: JumpState, width: float) -> float:
-    """Desired joint position in the air: phi_width of the offset from default."""
+def air_posture(robot: RobotView, state: JumpState, std: float) -> float:
+    """Desired joint position in the air: phi_std of the offset from default."""
     if state.phase != FLIGHT:
         return 0.0
-    return phi(posture_offset(robot, 0.0), width)
+    return phi(posture_offset(robot, 0.0), std)
 
 
 @wp.func
-def retract(robot: RobotView, state: JumpState, width: float, shift: float) -> float:
-    """Retracting after landing: phi_width of the offset from default, transversal motors + shift, first 0.3 s."""
+def retract(robot: RobotView, state: JumpState, std: float, shift: float) -> float:
+    """Retracting after landing: phi_std of the offset from default, transversal motors + shift, first 0.3 s."""
     if not just_landed(state):
         return 0.0
-    return phi(posture_offset(robot, shift), width)
+    return phi(posture_offset(robot, shift), std)
 
 
 # ---------------------------------------------------------------- horizontal jump
 
 
 @wp.func
-def tracking(robot: RobotView, state: JumpState, wide: float, fine: float, fine_share: float) -> float:
-    """Tracking: phi_wide + fine_share phi_fine of the distance from the goal [m], after takeoff."""
+def tracking(robot: RobotView, state: JumpState, std_wide: float, std_fine: float, fine_weight: float) -> float:
+    """Tracking: phi_wide + fine_weight phi_fine of the distance from the goal [m], after takeoff."""
     if state.phase == STANCE:
         return 0.0
     error = wp.length(goal_offset(robot, state))
-    return phi(error, wide) + fine_share * phi(error, fine)
+    return phi(error, std_wide) + fine_weight * phi(error, std_fine)
 
 
 @wp.func
 def estimated_tracking(
-    robot: RobotView, state: JumpState, middle: float, wide: float, fine: float, height: float
+    robot: RobotView, state: JumpState, std_middle: float, std_wide: float, std_fine: float, height: float
 ) -> float:
     """Est tracking: phi_middle + 0.1 phi_wide + 0.3 phi_fine of the ballistic landing's distance from the goal.
 
@@ -149,42 +156,42 @@ def estimated_tracking(
     if state.phase != FLIGHT:
         return 0.0
     error = landing_error_estimate(robot, state, height)
-    return phi(error, middle) + 0.1 * phi(error, wide) + 0.3 * phi(error, fine)
+    return phi(error, std_middle) + 0.1 * phi(error, std_wide) + 0.3 * phi(error, std_fine)
 
 
 @wp.func
-def flight_orientation(robot: RobotView, state: JumpState, width: float) -> float:
-    """Orientation error: phi_width of the rotation from level and heading, in flight while moving toward the goal."""
+def flight_orientation(robot: RobotView, state: JumpState, std: float) -> float:
+    """Orientation error: phi_std of the rotation from level and heading, in flight while moving toward the goal."""
     if state.phase != FLIGHT or wp.dot(robot.lin_vel, goal_offset(robot, state)) <= 0.0:
         return 0.0
-    return phi(rotation_from(robot.quat, state.heading), width)
+    return phi(rotation_from(robot.quat, state.heading), std)
 
 
 @wp.func
-def flight_angular_velocity(robot: RobotView, state: JumpState, width: float) -> float:
-    """Angular velocity: phi_width(|w|), in flight."""
+def flight_angular_velocity(robot: RobotView, state: JumpState, std: float) -> float:
+    """Angular velocity: phi_std(|w|), in flight."""
     if state.phase != FLIGHT:
         return 0.0
-    return phi(wp.length(robot.ang_vel), width)
+    return phi(wp.length(robot.ang_vel), std)
 
 
 @wp.func
-def left_right_symmetry(robot: RobotView, state: JumpState, width: float, share: float) -> float:
-    """Joint symmetry: phi_width of the rms difference of left and right transversal angles; `share` of it while due."""
+def left_right_symmetry(robot: RobotView, state: JumpState, std: float, waiting_scale: float) -> float:
+    """Joint symmetry: phi_std of the rms left-right difference of transversal angles, `waiting_scale` of it if due."""
     total = float(0.0)
     for m in range(12):
         if m % 3 != 0 and (m / 3) % 2 == 0:
             off = robot.angle[m] - robot.angle[m + 3]
             total += off * off
-    return phi(wp.sqrt(total / 4.0), width) * patience(state, share)
+    return phi(wp.sqrt(total / 4.0), std) * patience(state, waiting_scale)
 
 
 @wp.func
-def standing_posture(robot: RobotView, state: JumpState, width: float, shift: float) -> float:
-    """Stance: phi_width of the offset from default, transversal motors + shift, while the robot should rest."""
+def standing_posture(robot: RobotView, state: JumpState, std: float, shift: float) -> float:
+    """Stance: phi_std of the offset from default, transversal motors + shift, while the robot should rest."""
     if not should_rest(state):
         return 0.0
-    return phi(posture_offset(robot, shift), width)
+    return phi(posture_offset(robot, shift), std)
 
 
 # ---------------------------------------------------------------- impacts and landing
@@ -227,43 +234,43 @@ def damp_landing(robot: RobotView, state: JumpState) -> float:
 
 
 @wp.func
-def rest(robot: RobotView, state: JumpState, speed: float, spin: float) -> float:
-    """Rest: phi_speed(|v|) phi_spin(|w|), while the robot should rest."""
+def rest(robot: RobotView, state: JumpState, std_lin_vel: float, std_ang_vel: float) -> float:
+    """Rest: phi_std_lin_vel(|v|) phi_std_ang_vel(|w|), while the robot should rest."""
     if not should_rest(state):
         return 0.0
-    return phi(wp.length(robot.lin_vel), speed) * phi(wp.length(robot.ang_vel), spin)
+    return phi(wp.length(robot.lin_vel), std_lin_vel) * phi(wp.length(robot.ang_vel), std_ang_vel)
 
 
 @wp.func
-def tilt_over(robot: RobotView, width: float) -> float:
-    """Return the squared sine of the angle between body z and world z over that of width [rad]."""
-    sine = wp.length(wp.vec2(robot.projected_gravity[0], robot.projected_gravity[1])) / wp.sin(width)
+def tilt_over(robot: RobotView, angle: float) -> float:
+    """Return the squared sine of the angle between body z and world z over that of `angle` [rad]."""
+    sine = wp.length(wp.vec2(robot.projected_gravity[0], robot.projected_gravity[1])) / wp.sin(angle)
     return sine * sine
 
 
 @wp.func
-def landing_tilt(robot: RobotView, state: JumpState, width: float) -> float:
-    """Tilt after touchdown: squared sine of the angle between body z and world z over that of width [rad]."""
+def landing_tilt(robot: RobotView, state: JumpState, angle: float) -> float:
+    """Tilt after touchdown: squared sine of the tilt over that of `angle` [rad]."""
     if state.phase != LANDED:
         return 0.0
-    return tilt_over(robot, width)
+    return tilt_over(robot, angle)
 
 
 @wp.func
-def descent_tilt(robot: RobotView, state: JumpState, width: float) -> float:
-    """Tilt while the base falls in flight: squared sine as in `landing_tilt`, with the same width [rad]."""
+def descent_tilt(robot: RobotView, state: JumpState, angle: float) -> float:
+    """Tilt while the base falls in flight: squared sine as in `landing_tilt`."""
     if state.phase != FLIGHT or robot.lin_vel[2] > 0.0:
         return 0.0
-    return tilt_over(robot, width)
+    return tilt_over(robot, angle)
 
 
 @wp.func
-def lifted_again(robot: RobotView, state: JumpState, free: float) -> float:
-    """Still landing: paws off the ground again for more than `free` [s] after their own first contact, 0 to 4."""
+def lifted_again(robot: RobotView, state: JumpState, threshold: float) -> float:
+    """Still landing: paws off the ground again for more than `threshold` [s] after their own first contact, 0 to 4."""
     count = float(0.0)
     if state.phase == LANDED:
         for k in range(4):
-            if (state.paws_landed >> k) & 1 == 1 and robot.contact[k] == 0.0 and robot.air_time[k] > free:
+            if (state.paws_landed >> k) & 1 == 1 and robot.contact[k] == 0.0 and robot.air_time[k] > threshold:
                 count += 1.0
     return count
 
@@ -277,8 +284,8 @@ def paws_down(robot: RobotView, state: JumpState) -> float:
 
 
 @wp.func
-def capture_point(robot: RobotView, state: JumpState, width: float) -> float:
-    """Bracing: phi_width of the way from the middle of the paws to where a pendulum of the base's height would stop.
+def capture_point(robot: RobotView, state: JumpState, std: float) -> float:
+    """Bracing: phi_std of the way from the middle of the paws to where a pendulum of the base's height would stop.
 
     After touchdown. The pendulum that moves with the base comes to rest over p + v sqrt(h / g).
     """
@@ -290,7 +297,7 @@ def capture_point(robot: RobotView, state: JumpState, width: float) -> float:
     for k in range(4):
         x -= 0.25 * robot.paw_pos[k, 0]
         y -= 0.25 * robot.paw_pos[k, 1]
-    return phi(wp.length(wp.vec2(x, y)), width)
+    return phi(wp.length(wp.vec2(x, y)), std)
 
 
 # ---------------------------------------------------------------- standing quietly

@@ -194,33 +194,35 @@ def physics_steps(robot: RobotParameters, seconds: float) -> int:
 
 
 @wp.func
-def drawn_delay(robot: RobotParameters, draw: RngStream, lower: float, upper: float, none: float) -> int:
-    """Return a drawn delay [physics steps], none in a share of draws."""
-    if uniform(draw, 1, 0.0, 1.0) < none:
+def drawn_delay(robot: RobotParameters, draw: RngStream, lower: float, upper: float, zero_probability: float) -> int:
+    """Return a drawn delay [physics steps], 0 with `zero_probability`."""
+    if uniform(draw, 1, 0.0, 1.0) < zero_probability:
         return 0
     return physics_steps(robot, uniform(draw, 0, lower, upper))
 
 
 @wp.func
-def action_latency(robot: RobotParameters, draw: RngStream, lower: float, upper: float, none: float = 0.0):
-    """Delay actions [s], but not in a share of worlds."""
-    robot.latency[draw.world] = drawn_delay(robot, draw, lower, upper, none)
+def action_latency(robot: RobotParameters, draw: RngStream, lower: float, upper: float, zero_probability: float = 0.0):
+    """Delay actions [s]; none with `zero_probability`."""
+    robot.latency[draw.world] = drawn_delay(robot, draw, lower, upper, zero_probability)
 
 
 @wp.func
-def observation_latency(robot: RobotParameters, draw: RngStream, lower: float, upper: float, none: float = 0.0):
-    """Delay what the policy reads of its sensors [s], but not in a share of worlds."""
-    robot.observation_latency[draw.world] = drawn_delay(robot, draw, lower, upper, none)
+def observation_latency(
+    robot: RobotParameters, draw: RngStream, lower: float, upper: float, zero_probability: float = 0.0
+):
+    """Delay what the policy reads of its sensors [s]; none with `zero_probability`."""
+    robot.observation_latency[draw.world] = drawn_delay(robot, draw, lower, upper, zero_probability)
 
 
 @wp.func
 def push(
-    robot: RobotParameters, draw: RngStream, share: float, force_lower: float, force_upper: float, torque_lower: float,
-    torque_upper: float,
+    robot: RobotParameters, draw: RngStream, probability: float, force_lower: float, force_upper: float,
+    torque_lower: float, torque_upper: float,
 ):  # fmt: skip
-    """Push the base with a force [N] along and a torque [N m] about each world axis in a share of draws, else not."""
+    """Push the base with a force [N] along and a torque [N m] about each world axis with `probability`."""
     wrench = wp.spatial_vector()
-    if uniform(draw, 6, 0.0, 1.0) < share:
+    if uniform(draw, 6, 0.0, 1.0) < probability:
         for i in range(3):
             wrench[i] = uniform(draw, i, force_lower, force_upper)
             wrench[3 + i] = uniform(draw, 3 + i, torque_lower, torque_upper)

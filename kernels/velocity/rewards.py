@@ -14,16 +14,16 @@ def moving(state: VelocityState) -> float:
 
 
 @wp.func
-def linear_velocity(robot: RobotView, state: VelocityState, width: float) -> float:
-    """Linear velocity tracking: phi_width of the distance [m/s] of the velocity in the plane from the command."""
+def linear_velocity(robot: RobotView, state: VelocityState, std: float) -> float:
+    """Linear velocity tracking: phi_std of the distance [m/s] of the velocity in the plane from the command."""
     error = velocity_error(robot, state)
-    return phi(wp.length(wp.vec2(error[0], error[1])), width)
+    return phi(wp.length(wp.vec2(error[0], error[1])), std)
 
 
 @wp.func
-def yaw_rate(robot: RobotView, state: VelocityState, width: float) -> float:
-    """Yaw rate tracking: phi_width of the error [rad/s]."""
-    return phi(velocity_error(robot, state)[2], width)
+def yaw_rate(robot: RobotView, state: VelocityState, std: float) -> float:
+    """Yaw rate tracking: phi_std of the error [rad/s]."""
+    return phi(velocity_error(robot, state)[2], std)
 
 
 @wp.func
@@ -49,8 +49,8 @@ def flat(robot: RobotView, state: VelocityState) -> float:
 
 
 @wp.func
-def stand(robot: RobotView, state: VelocityState, width: float) -> float:
-    """Stand: phi_width of the rms offset [rad] of the transversal angles from default, when commanded to stand."""
+def stand(robot: RobotView, state: VelocityState, std: float) -> float:
+    """Stand: phi_std of the rms offset [rad] of the transversal angles from default, when commanded to stand."""
     if state.standing == 0:
         return 0.0
     total = float(0.0)
@@ -58,7 +58,7 @@ def stand(robot: RobotView, state: VelocityState, width: float) -> float:
         if m % 3 != 0:
             off = robot.angle[m] - robot.default_angle[m]
             total += off * off
-    return phi(wp.sqrt(total / 8.0), width)
+    return phi(wp.sqrt(total / 8.0), std)
 
 
 @wp.func
@@ -85,20 +85,20 @@ def transversal_position(robot: RobotView, state: VelocityState, steepness: floa
 
 
 @wp.func
-def air_time(robot: RobotView, state: VelocityState, least: float) -> float:
-    """Air time: sum of the times in the air less `least` [s] of paws that come down, when commanded to move."""
+def air_time(robot: RobotView, state: VelocityState, threshold: float) -> float:
+    """Air time: sum of the times in the air less `threshold` [s] of paws that come down, when commanded to move."""
     total = float(0.0)
     for k in range(4):
-        total += robot.first_contact[k] * (robot.air_time[k] - least)
+        total += robot.first_contact[k] * (robot.air_time[k] - threshold)
     return total * moving(state)
 
 
 @wp.func
-def rapid_stepping(robot: RobotView, state: VelocityState, free: float) -> float:
-    """Rapid stepping: sum over paws of steps in the last 0.75 s beyond those that are free; it grows without bound."""
+def rapid_stepping(robot: RobotView, state: VelocityState, threshold: float) -> float:
+    """Rapid stepping: sum over paws of steps in the last 0.75 s beyond `threshold`, without bound."""
     total = float(0.0)
     for k in range(4):
-        total += wp.max(state.recent_steps[k] - free, 0.0)
+        total += wp.max(state.recent_steps[k] - threshold, 0.0)
     return total
 
 
@@ -109,11 +109,11 @@ def restless_stand(robot: RobotView, state: VelocityState) -> float:
 
 
 @wp.func
-def foot_clearance(robot: RobotView, state: VelocityState, height: float) -> float:
-    """Foot clearance: sum over paws in the air of (height above ground - wanted [m])^2 times horizontal speed [m/s]."""
+def foot_clearance(robot: RobotView, state: VelocityState, target_height: float) -> float:
+    """Foot clearance: sum over paws in the air of (height - target_height [m])^2 times horizontal speed [m/s]."""
     total = float(0.0)
     for k in range(4):
-        off = robot.paw_height[k] - height
+        off = robot.paw_height[k] - target_height
         speed = wp.length(wp.vec2(robot.paw_vel[k, 0], robot.paw_vel[k, 1]))
         total += (1.0 - robot.contact[k]) * off * off * speed
     return total
@@ -166,8 +166,10 @@ def trot_schedule(robot: RobotView, state: VelocityState, duty: float) -> float:
 
 
 @wp.func
-def shank_lean(robot: RobotView, state: VelocityState, free: float, hip: float, thigh: float, shank: float) -> float:
-    """Shank lean: sum over both shanks of paws on the ground of squared angles from vertical beyond `free` [rad].
+def shank_lean(
+    robot: RobotView, state: VelocityState, threshold: float, hip: float, thigh: float, shank: float
+) -> float:
+    """Shank lean: sum over both shanks of paws on the ground of squared angles from vertical beyond `threshold` [rad].
 
     A shank that leans far over its paw hits the edge of a step beside it. The angles are those in the leg's plane, with
     the pitch of the base. hip: half the distance of the transversal axes [m]; thigh, shank: lengths [m].
@@ -186,6 +188,6 @@ def shank_lean(robot: RobotView, state: VelocityState, free: float, hip: float, 
         for j in range(2):
             way = ankle - wp.where(j == 0, knee, twin)
             lean = wp.acos(wp.clamp(wp.dot(way, down) / (shank * wp.max(wp.length(down), 1.0e-6)), -1.0, 1.0))
-            excess = wp.max(lean - free, 0.0)
+            excess = wp.max(lean - threshold, 0.0)
             total += robot.contact[k] * excess * excess
     return total

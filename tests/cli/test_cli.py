@@ -254,7 +254,7 @@ def test_flags_left_alone_leave_the_task_alone(name):
 
 def test_flags_change_training_and_task():
     flags = (
-        "--env.rewards.jump-height.weight 25 --env.rewards.jump-height.fine 0.2"
+        "--env.rewards.jump-height.weight 25 --env.rewards.jump-height.std-fine 0.2"
         " --env.terminations.wrong-height.tolerance 0.07 --env.advance.takeoff-speed 0.5"
         " --env.policy.lin-vel.noise 0.3 --env.policy.gravity.history 2"
         " --env.curriculum.tolerance 0.05 --env.curriculum.promote-after 7 --env.reset.standing 0.5"
@@ -263,7 +263,7 @@ def test_flags_change_training_and_task():
         " --env.contact-force 0.2 --env.reward-floor None --ppo.gamma 0.9 --no-noise --solver mujoco"
     )
     args, task = parse_train(["Olympus-Vertical-Jump", *flags.split()])
-    assert task.rewards[0].numbers == {"weight": 25.0, "fine": 0.2, "sharp": 0.05, "wide": 0.4}
+    assert task.rewards[0].numbers == {"weight": 25.0, "std_fine": 0.2, "scale_sharp": 0.05, "std_wide": 0.4}
     assert {end.name: end.numbers for end in task.terminations}["wrong_height"] == {"tolerance": 0.07}
     seen = {term.name: term for term in task.policy}
     assert (seen["lin_vel"].numbers["noise"], seen["gravity"].options["history"]) == (0.3, 2)

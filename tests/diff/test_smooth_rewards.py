@@ -17,7 +17,7 @@ TASK = make_task("vertical-jump").on_level_ground()
 
 def height_reward(term, error):
     """The reward for a height error [m], as its page defines it: phi_fine + 3 psi_sharp + phi_wide, once."""
-    fine, sharp, wide = (term.numbers[name] for name in ("fine", "sharp", "wide"))
+    fine, sharp, wide = (term.numbers[name] for name in ("std_fine", "scale_sharp", "std_wide"))
     shares = np.exp(-((error / fine) ** 2)) + 3.0 * np.exp(-np.abs(error) / sharp) + np.exp(-((error / wide) ** 2))
     return term.numbers["weight"] * shares
 

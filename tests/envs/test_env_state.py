@@ -249,13 +249,13 @@ def test_an_environment_goes_on_with_late_observations_and_history_bit_for_bit()
 def test_numbers_that_were_set_come_back_and_the_others_are_the_tasks():
     env, other = (make_env(4, **settings) for settings in ({}, {"task": make_task("vertical-jump").with_terms(
         "rewards", orientation={"weight": 3.5})}))  # fmt: skip
-    env.skills[0].set("rewards", "jump_height", weight=7.0, fine=0.2)
+    env.skills[0].set("rewards", "jump_height", weight=7.0, std_fine=0.2)
     state = env.state_dict()
-    other.skills[0].set("rewards", "jump_height", wide=0.9)
+    other.skills[0].set("rewards", "jump_height", std_wide=0.9)
     other.load_state_dict(state)
     numbers, params = other.skills[0].params.values.numpy(), other.skills[0].task.params
     expected = np.array(params.values, dtype=np.float32)
-    for key, value in (("weight", 7.0), ("fine", 0.2)):
+    for key, value in (("weight", 7.0), ("std_fine", 0.2)):
         expected[params.index(f"rewards.jump_height.{key}")] = value
     np.testing.assert_array_equal(numbers, expected)
     state["vertical-jump/changed"][0] = np.nan

@@ -57,7 +57,7 @@ def phi(x, s):
 
 def height_kernel(error, p):
     """The height reward of Table III with a third, wide kernel."""
-    return phi(error, p["fine"]) + 3.0 * np.exp(-np.abs(error) / p["sharp"]) + phi(error, p["wide"])
+    return phi(error, p["std_fine"]) + 3.0 * np.exp(-np.abs(error) / p["scale_sharp"]) + phi(error, p["std_wide"])
 
 
 def norm(vectors):
@@ -129,8 +129,8 @@ def capture_offset(r):
 
 def symmetry(r, p):
     """Vertical jump: variance of the transversal, size of the lateral angles."""
-    spread = phi(np.var(r["angle"][T], axis=0), p["variance"])
-    return spread * phi(np.linalg.norm(r["angle"][~T], axis=0), p["lateral"])
+    spread = phi(np.var(r["angle"][T], axis=0), p["std_variance"])
+    return spread * phi(np.linalg.norm(r["angle"][~T], axis=0), p["std_lateral"])
 
 
 def left_right(r):
@@ -150,45 +150,49 @@ TERMS = {
         ((r["phase"] == FLIGHT) & (r["apex_passed"] == 0)) * height_kernel(rising_to(r) - r["goal"][:, 2], p)
     ),
     "horizontal_velocity": lambda r, p: (
-        np.exp(-norm(r["vel"][:, :2]) / p["width"]) * np.where(r["phase"] == STANCE, 1.0, 2.0) * due(r, p["share"])
+        np.exp(-norm(r["vel"][:, :2]) / p["speed_scale"])
+        * np.where(r["phase"] == STANCE, 1.0, 2.0)
+        * due(r, p["waiting_scale"])
     ),
-    "orientation": lambda r, p: phi(lean(r), p["width"]) * due(r, p["share"]),
-    "angular_velocity": lambda r, p: phi(norm(r["spin"]), p["width"]) * due(r, p["share"]),
-    "joint_symmetry": lambda r, p: symmetry(r, p) * due(r, p["share"]),
-    "ground_posture": lambda r, p: (r["phase"] != FLIGHT) * posture(r, p["width"], p["shift"]) * due(r, p["share"]),
-    "air_posture": lambda r, p: (r["phase"] == FLIGHT) * posture(r, p["width"]),
-    "retract": lambda r, p: soon(r) * posture(r, p["width"], p["shift"]),
+    "orientation": lambda r, p: phi(lean(r), p["std"]) * due(r, p["waiting_scale"]),
+    "angular_velocity": lambda r, p: phi(norm(r["spin"]), p["std"]) * due(r, p["waiting_scale"]),
+    "joint_symmetry": lambda r, p: symmetry(r, p) * due(r, p["waiting_scale"]),
+    "ground_posture": lambda r, p: (
+        (r["phase"] != FLIGHT) * posture(r, p["std"], p["shift"]) * due(r, p["waiting_scale"])
+    ),
+    "air_posture": lambda r, p: (r["phase"] == FLIGHT) * posture(r, p["std"]),
+    "retract": lambda r, p: soon(r) * posture(r, p["std"], p["shift"]),
     "tracking": lambda r, p: (
-        (r["phase"] != STANCE) * (phi(error(r), p["wide"]) + p["fine_share"] * phi(error(r), p["fine"]))
+        (r["phase"] != STANCE) * (phi(error(r), p["std_wide"]) + p["fine_weight"] * phi(error(r), p["std_fine"]))
     ),
     "estimated_tracking": lambda r, p: (
         (r["phase"] == FLIGHT)
         * sum(
-            share * phi(estimated_error(r, p["height"]), p[width])
-            for share, width in ((1.0, "middle"), (0.1, "wide"), (0.3, "fine"))
+            share * phi(estimated_error(r, p["height"]), p[std])
+            for share, std in ((1.0, "std_middle"), (0.1, "std_wide"), (0.3, "std_fine"))
         )
     ),
     "flight_orientation": lambda r, p: (
         ((r["phase"] == FLIGHT) & (np.sum((r["goal"] - r["pos"])[:, :2] * r["vel"][:, :2], axis=1) > 0.0))
-        * phi(rotation_error(r), p["width"])
+        * phi(rotation_error(r), p["std"])
     ),
-    "flight_angular_velocity": lambda r, p: (r["phase"] == FLIGHT) * phi(norm(r["spin"]), p["width"]),
-    "left_right_symmetry": lambda r, p: phi(left_right(r), p["width"]) * due(r, p["share"]),
-    "standing_posture": lambda r, p: at_ease(r) * posture(r, p["width"], p["shift"]),
-    "rest": lambda r, p: at_ease(r) * phi(norm(r["vel"]), p["speed"]) * phi(norm(r["spin"]), p["spin"]),
-    "landing_tilt": lambda r, p: (r["phase"] == LANDED) * (lean(r) / np.sin(p["width"])) ** 2,
-    "descent_tilt": lambda r, p: (r["phase"] == FLIGHT) * (r["vel"][:, 2] <= 0.0) * (lean(r) / np.sin(p["width"])) ** 2,
+    "flight_angular_velocity": lambda r, p: (r["phase"] == FLIGHT) * phi(norm(r["spin"]), p["std"]),
+    "left_right_symmetry": lambda r, p: phi(left_right(r), p["std"]) * due(r, p["waiting_scale"]),
+    "standing_posture": lambda r, p: at_ease(r) * posture(r, p["std"], p["shift"]),
+    "rest": lambda r, p: at_ease(r) * phi(norm(r["vel"]), p["std_lin_vel"]) * phi(norm(r["spin"]), p["std_ang_vel"]),
+    "landing_tilt": lambda r, p: (r["phase"] == LANDED) * (lean(r) / np.sin(p["angle"])) ** 2,
+    "descent_tilt": lambda r, p: (r["phase"] == FLIGHT) * (r["vel"][:, 2] <= 0.0) * (lean(r) / np.sin(p["angle"])) ** 2,
     "lifted_again": lambda r, p: (
         (r["phase"] == LANDED)
         * np.sum(
             (r["paws_landed"][None] >> np.arange(4)[:, None] & 1 == 1)
             & (r["force"] <= CONTACT_FORCE)
-            & (r["air_time"] > p["free"]),
+            & (r["air_time"] > p["threshold"]),
             axis=0,
         )
     ),
     "paws_down": lambda r, p: (r["phase"] == LANDED) * np.count_nonzero(r["force"] > CONTACT_FORCE, axis=0),
-    "capture_point": lambda r, p: (r["phase"] == LANDED) * phi(norm(capture_offset(r)), p["width"]),
+    "capture_point": lambda r, p: (r["phase"] == LANDED) * phi(norm(capture_offset(r)), p["std"]),
     "resting_action_rate": lambda r, p: at_ease(r) * np.sum((r["action"] - r["prev_action"]) ** 2, axis=0),
     "torque_ripple": lambda r, p: at_ease(r) * np.sum((r["torque"] - r["prev_torque"]) ** 2, axis=0),
     "force_ripple": lambda r, p: at_ease(r) * np.sum(((r["peak"] - r["force"]) / p["weight_force"]) ** 2, axis=0),

@@ -58,7 +58,7 @@ def test_layout_that_does_not_fit_is_refused(change, message):
 @pytest.fixture
 def saved():
     """Configuration of a changed vertical jump, as a file holds it, and the task without what only a training needs."""
-    task = make_task("vertical-jump").with_terms("rewards", jump_height={"weight": 7.0, "fine": 0.2})
+    task = make_task("vertical-jump").with_terms("rewards", jump_height={"weight": 7.0, "std_fine": 0.2})
     randomization = dataclasses.replace(task.randomization, latency=None, gains=(0.9, 1.1))
     curriculum = task.curriculum.replace(promote_after=3)
     task = dataclasses.replace(
@@ -94,7 +94,7 @@ def test_unknown_reward_is_refused_unless_rewards_are_not_wanted(saved):
 
 def test_a_reward_that_the_task_does_not_use_comes_back(saved):
     task, config = saved
-    task = dataclasses.replace(task, rewards=(*task.rewards, RewardTerm(rewards.lifted_again, -3.0, free=0.1)))
+    task = dataclasses.replace(task, rewards=(*task.rewards, RewardTerm(rewards.lifted_again, -3.0, threshold=0.1)))
     config["env"]["task"] = json.loads(json.dumps(task_to_json(task)))
     assert whole(config) == task
 

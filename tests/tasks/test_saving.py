@@ -52,7 +52,7 @@ def test_task_of_a_user_comes_back_with_its_module_only():
 def with_own_rest():
     """The vertical jump with this file's `rest` in place of the project's."""
     task = make_task("vertical-jump")
-    mine = RewardTerm(rest, 20.0, speed=0.1, spin=0.5)
+    mine = RewardTerm(rest, 20.0, std_lin_vel=0.1, std_ang_vel=0.5)
     return dataclasses.replace(task, rewards=tuple(mine if t.name == "rest" else t for t in task.rewards))
 
 
@@ -136,7 +136,7 @@ def test_setting_that_would_not_come_back_is_not_saved(value):
         (lambda t: t.update(wings=2), "task: unknown setting 'wings'"),
         (lambda t: t["rewards"][3].pop("weight"), r"task.rewards\[3\]: a reward needs a weight"),
         (lambda t: t["rewards"][0].update(fin=0.1), r"task.rewards\[0\]: .* unknown parameter 'fin'"),
-        (lambda t: t["rewards"][0].pop("fine"), r"task.rewards\[0\]: .* parameter 'fine' is missing"),
+        (lambda t: t["rewards"][0].pop("std_fine"), r"task.rewards\[0\]: .* parameter 'std_fine' is missing"),
         (lambda t: t["rewards"][0].update(name="a\nb"), "a name is of letters"),
         (lambda t: t["rewards"][0].update(once="yes"), r"task.rewards\[0\].once: expected bool, got 'yes'"),
         (lambda t: t["rewards"][0].update(weight=10**400), r"weight: must be finite, got a huge integer"),

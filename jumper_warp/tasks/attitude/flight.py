@@ -46,11 +46,11 @@ CRITIC = (
 
 REWARDS = (
     RewardTerm(rewards.approach, 15.0),
-    RewardTerm(rewards.attitude, 2.5, name="attitude_wide", width=60.0 * DEG),
-    RewardTerm(rewards.attitude, 1.5, name="attitude_narrow", width=10.0 * DEG),
-    RewardTerm(rewards.attitude, 1.0, name="attitude_fine", width=3.0 * DEG),
-    RewardTerm(rewards.hold, 2.0, width=10.0 * DEG, spin=0.5),
-    RewardTerm(rewards.landing_posture, 1.0, width=15.0 * DEG, posture=30.0 * DEG),
+    RewardTerm(rewards.attitude, 2.5, name="attitude_wide", std=60.0 * DEG),
+    RewardTerm(rewards.attitude, 1.5, name="attitude_narrow", std=10.0 * DEG),
+    RewardTerm(rewards.attitude, 1.0, name="attitude_fine", std=3.0 * DEG),
+    RewardTerm(rewards.hold, 2.0, std=10.0 * DEG, std_ang_vel=0.5),
+    RewardTerm(rewards.landing_posture, 1.0, std=15.0 * DEG, std_posture=30.0 * DEG),
     RewardTerm(rewards.spin, -0.01),
     RewardTerm(mdp_rewards.collision, -20.0),
     RewardTerm(mdp_rewards.action_clip, -0.1),

@@ -51,15 +51,15 @@ def vertical_jump_mars() -> TaskCfg:
     )  # fmt: skip
     ends = tuple(term for term in task.terminations if term.func is not terminations.second_takeoff)
     task = replace(task, terminations=ends)  # robots that only learn to land bounce, and must live to learn not to
-    falling = RewardTerm(rewards.descent_tilt, -60.0, width=10.0 * DEG)  # a long flight turns a robot that tips slowly
-    landed = RewardTerm(rewards.lifted_again, -30.0, free=0.0)  # what its policies were trained with
+    falling = RewardTerm(rewards.descent_tilt, -60.0, angle=10.0 * DEG)  # a long flight turns a robot that tips slowly
+    landed = RewardTerm(rewards.lifted_again, -30.0, threshold=0.0)  # what its policies were trained with
     kept = (landed if term.func is rewards.paws_down else term for term in task.rewards)
     task = replace(task, rewards=(*kept, falling))
     return task.with_terms(
         "rewards",
-        jump_height={"wide": 0.8},
-        estimated_jump_height={"weight": 30.0, "wide": 0.8},
-        angular_velocity={"weight": 10.0, "width": 0.5},
+        jump_height={"std_wide": 0.8},
+        estimated_jump_height={"weight": 30.0, "std_wide": 0.8},
+        angular_velocity={"weight": 10.0, "std": 0.5},
         air_posture={"weight": 70.0},
         ground_posture={"weight": 20.0},
         joint_symmetry={"weight": 15.0},
@@ -98,7 +98,9 @@ def horizontal_jump_mars() -> TaskCfg:
         turned_touchdown={"rotation": 40.0 * DEG, "yaw": 20.0 * DEG},
     )  # fmt: skip
     return task.with_terms(
-        "rewards", estimated_tracking={"middle": 0.5, "wide": 1.2, "fine": 0.15}, tracking={"wide": 0.4, "fine": 0.05}
+        "rewards",
+        estimated_tracking={"std_middle": 0.5, "std_wide": 1.2, "std_fine": 0.15},
+        tracking={"std_wide": 0.4, "std_fine": 0.05},
     )
 
 

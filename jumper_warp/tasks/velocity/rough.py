@@ -26,7 +26,7 @@ COMMANDS = CommandCfg(narrow=(0.8, 0.6, 0.4, 0.8), wide=(0.8, 0.6, 0.4, 0.8), le
 GROUNDS = (*KINDS, "pit", "blocks")
 """Of the map's columns."""
 STEPS_UP = (
-    RewardTerm(rewards.shank_lean, -5.0, free=35.0 * DEG, hip=0.045, thigh=0.175, shank=0.3),
+    RewardTerm(rewards.shank_lean, -5.0, threshold=35.0 * DEG, hip=0.045, thigh=0.175, shank=0.3),
     RewardTerm(mdp_rewards.collision, -4.0, once=True),
 )
 """What keeps shanks off the edges of steps; without a floor of the total, below which a collision would not count."""
@@ -53,6 +53,6 @@ def velocity_rough() -> TaskCfg:
         yaw_rate_fine={"weight": 2.5},
         air_time={"weight": 5.0},
         rapid_stepping={"weight": -0.1},
-        foot_clearance={"weight": -30.0, "height": 0.10},
+        foot_clearance={"weight": -30.0, "target_height": 0.10},
     )
     return replace(task, rewards=(*task.rewards, *STEPS_UP), reward_floor=None)

@@ -14,7 +14,7 @@ E = math.exp
 PHASES = [int(STANCE), int(FLIGHT), int(LANDED)]
 TRANSVERSAL = np.tile([0.0, 1.0, 1.0], 4)
 LATERAL = 1.0 - TRANSVERSAL
-HEIGHT = {"fine": 0.10, "sharp": 0.05, "wide": 0.4}
+HEIGHT = {"std_fine": 0.10, "scale_sharp": 0.05, "std_wide": 0.4}
 
 
 def name_of(value):
@@ -49,14 +49,19 @@ def test_estimated_jump_height_is_ballistic_and_paid_in_flight_before_the_apex()
 
 
 ALWAYS_PAID = [
-    ("horizontal_velocity", {"lin_vel": (0.03, -0.04, 7.0)}, {"width": 0.05, "share": 0.25}, [E(-1.0), 2.0 * E(-1.0)]),
-    ("orientation", {"gravity": (0.06, -0.08, -0.995)}, {"width": 0.1, "share": 0.25}, [E(-1.0), E(-1.0)]),
-    ("angular_velocity", {"ang_vel": (2.0, -1.0, 2.0)}, {"width": 3.0, "share": 0.25}, [E(-1.0), E(-1.0)]),
+    (
+        "horizontal_velocity",
+        {"lin_vel": (0.03, -0.04, 7.0)},
+        {"speed_scale": 0.05, "waiting_scale": 0.25},
+        [E(-1.0), 2.0 * E(-1.0)],
+    ),
+    ("orientation", {"gravity": (0.06, -0.08, -0.995)}, {"std": 0.1, "waiting_scale": 0.25}, [E(-1.0), E(-1.0)]),
+    ("angular_velocity", {"ang_vel": (2.0, -1.0, 2.0)}, {"std": 3.0, "waiting_scale": 0.25}, [E(-1.0), E(-1.0)]),
     # transversal angles 0.5 and 0.9 in equal number: variance 0.04; |lateral| = sqrt(4) * 0.1
     (
         "joint_symmetry",
         {"angle": np.tile([0.1, 0.5, 0.9], 4)},
-        {"variance": 0.04, "lateral": 0.2, "share": 0.25},
+        {"std_variance": 0.04, "std_lateral": 0.2, "waiting_scale": 0.25},
         [E(-2.0), E(-2.0)],
     ),
 ]  # (term, robot, numbers, value in [stance, off stance])
@@ -78,15 +83,15 @@ def test_joint_symmetry_falls_with_variance_and_with_lateral_angles():
     lateral_only = make_view(angle=np.tile([0.1, 0.7, 0.7], 4))
     variance_only = make_view(angle=np.tile([0.0, 0.5, 0.9], 4))
     task = make_episode(command_step=1)
-    widths = {"variance": 0.04, "lateral": 0.2, "share": 1.0}
+    widths = {"std_variance": 0.04, "std_lateral": 0.2, "waiting_scale": 1.0}
     assert paid("joint_symmetry", lateral_only, task, **widths) == pytest.approx(E(-1.0), rel=1e-4)
     assert paid("joint_symmetry", variance_only, task, **widths) == pytest.approx(E(-1.0), rel=1e-4)
 
 
 POSTURES = [
-    ("ground_posture", 35.0 * DEG, {"width": 10.0 * DEG, "shift": 35.0 * DEG, "share": 1.0}, PHASES[0::2]),
-    ("air_posture", 0.0, {"width": 10.0 * DEG}, PHASES[1:2]),
-    ("retract", 15.0 * DEG, {"width": 10.0 * DEG, "shift": 15.0 * DEG}, PHASES[2:]),
+    ("ground_posture", 35.0 * DEG, {"std": 10.0 * DEG, "shift": 35.0 * DEG, "waiting_scale": 1.0}, PHASES[0::2]),
+    ("air_posture", 0.0, {"std": 10.0 * DEG}, PHASES[1:2]),
+    ("retract", 15.0 * DEG, {"std": 10.0 * DEG, "shift": 15.0 * DEG}, PHASES[2:]),
 ]
 
 
@@ -105,7 +110,7 @@ def test_postures_count_the_rms_offset_of_all_motors(term, shift, p, phases):
 
 
 LANDING_TERMS = [
-    ("retract", make_view(), {"width": 0.2, "shift": 0.0}, 1.0),
+    ("retract", make_view(), {"std": 0.2, "shift": 0.0}, 1.0),
     ("soft_impact", make_view(), {"limit": 49.05}, 1.0),
     ("catch_landing", make_view(lin_vel=(0.0, 0.0, -0.4)), {}, 0.4),
     ("damp_landing", make_view(rate=0.5 * TRANSVERSAL), {}, 0.5),

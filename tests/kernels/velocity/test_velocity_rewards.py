@@ -68,7 +68,7 @@ def clearance(r, height):
     return np.sum((1.0 - r["contact"]) * (r["paw_height"] - height) ** 2 * speed)
 
 
-def shank_lean(r, free, hip, thigh, shank):
+def shank_lean(r, threshold, hip, thigh, shank):
     """Knees by the thighs' angles, ankles where circles about them meet below, angles between links and gravity."""
     down, total = r["gravity"][[0, 2]] / np.linalg.norm(r["gravity"][[0, 2]]), 0.0
     for leg, contact in enumerate(r["contact"]):
@@ -83,20 +83,20 @@ def shank_lean(r, free, hip, thigh, shank):
             links.append(knees[0] + shank * np.array([np.cos(angle), np.sin(angle)]))
         ankle = min(links, key=lambda p: p[1])
         leans = [np.arccos(np.dot(ankle - knee, down) / shank) for knee in knees]
-        total += contact * sum(max(lean - free, 0.0) ** 2 for lean in leans)
+        total += contact * sum(max(lean - threshold, 0.0) ** 2 for lean in leans)
     return total
 
 
-LEG = {"free": 0.5, "hip": 0.045, "thigh": 0.175, "shank": 0.3}
+LEG = {"threshold": 0.5, "hip": 0.045, "thigh": 0.175, "shank": 0.3}
 OFF = {"angle": lambda r: r["angle"] - DEFAULT_ANGLE}
 EXPECTED = {
-    "linear_velocity": ({"width": 0.5}, lambda r: np.exp(-np.sum((r["vel"] - r["command"])[:2] ** 2) / 0.25)),
-    "yaw_rate": ({"width": 0.5}, lambda r: np.exp(-((r["ang_vel"][2] - r["command"][2]) ** 2) / 0.25)),
+    "linear_velocity": ({"std": 0.5}, lambda r: np.exp(-np.sum((r["vel"] - r["command"])[:2] ** 2) / 0.25)),
+    "yaw_rate": ({"std": 0.5}, lambda r: np.exp(-((r["ang_vel"][2] - r["command"][2]) ** 2) / 0.25)),
     "vertical_velocity": ({}, lambda r: r["vel"][2] ** 2),
     "lateral_stability": ({}, lambda r: np.sum(r["ang_vel"][:2] ** 2)),
     "flat": ({}, lambda r: np.sum(r["gravity"][:2] ** 2)),
     "stand": (
-        {"width": 0.5},
+        {"std": 0.5},
         lambda r: np.exp(-np.mean(OFF["angle"](r)[TRANSVERSAL] ** 2) / 0.25) * r["standing"],
     ),
     "lateral_position": (
@@ -108,12 +108,12 @@ EXPECTED = {
         lambda r: np.sum(np.exp(-50.0 * (OFF["angle"](r)[TRANSVERSAL] - 0.2) ** 20) - 1.0),
     ),
     "air_time": (
-        {"least": 0.25},
+        {"threshold": 0.25},
         lambda r: np.sum(r["first_contact"] * (r["air_time"] - 0.25)) * (1 - r["standing"]),
     ),
-    "rapid_stepping": ({"free": 2.0}, lambda r: np.sum(np.maximum(r["recent_steps"] - 2.0, 0.0))),
+    "rapid_stepping": ({"threshold": 2.0}, lambda r: np.sum(np.maximum(r["recent_steps"] - 2.0, 0.0))),
     "restless_stand": ({}, lambda r: np.sum(1.0 - r["contact"]) * r["standing"]),
-    "foot_clearance": ({"height": 0.07}, lambda r: clearance(r, 0.07)),
+    "foot_clearance": ({"target_height": 0.07}, lambda r: clearance(r, 0.07)),
     "slip": ({}, lambda r: np.sum(r["contact"] * np.sum(r["paw_vel"][:, :2] ** 2, axis=1))),
     "touchdown": ({}, lambda r: np.sum(r["first_contact"] * r["touchdown_speed"] ** 2)),
     "jerk": ({}, lambda r: np.sum(np.sign(r["torque"]) != np.sign(r["prev_torque"]))),
@@ -141,12 +141,14 @@ def test_shanks_lean_as_inverse_kinematics_has_them():
     """In the default pose a shank is off vertical by asin of (0.045 + 0.175 sin 45 deg) / 0.3: 34.3 degrees."""
     view = make_view(contact=np.ones(4), gravity=(0.0, 0.0, -1.0))
     lean = np.arcsin((0.045 + 0.175 * np.sin(np.pi / 4.0)) / 0.3)
-    assert paid("shank_lean", view, make_state(), **(LEG | {"free": 0.0})) == pytest.approx(8.0 * lean**2, rel=1e-5)
-    assert paid("shank_lean", view, make_state(), **(LEG | {"free": lean + 0.01})) == 0.0
+    assert paid("shank_lean", view, make_state(), **(LEG | {"threshold": 0.0})) == pytest.approx(
+        8.0 * lean**2, rel=1e-5
+    )
+    assert paid("shank_lean", view, make_state(), **(LEG | {"threshold": lean + 0.01})) == 0.0
 
 
 def test_standing_robot_at_rest_gets_full_tracking():
     state = make_state(standing=1)
-    assert paid("linear_velocity", make_view(), state, width=0.1) == pytest.approx(1.0)
-    assert paid("stand", make_view(), state, width=0.1) == pytest.approx(1.0)
+    assert paid("linear_velocity", make_view(), state, std=0.1) == pytest.approx(1.0)
+    assert paid("stand", make_view(), state, std=0.1) == pytest.approx(1.0)
     assert vec12(*DEFAULT_ANGLE) == make_view().default_angle
