@@ -172,7 +172,8 @@ class Env(Stages):
         self._started = False
         self._graphs.clear()  # they hold the old seed
         for array, value in ((self.worlds.clock, FIRST_CLOCK), (self.worlds.requested_task, -1),
-                             (self.worlds.has_command, 0), (self.worlds.level, 0), (self.worlds.streak, 0)):  # fmt: skip
+                             (self.worlds.has_command, 0), (self.worlds.level, 0),
+                             (self.worlds.streak, 0)):  # fmt: skip
             array.fill_(value)
         self.worlds.skill.assign(self._first_skill)
         for skill in self.skills:

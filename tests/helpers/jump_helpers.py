@@ -8,7 +8,7 @@ import torch
 import warp as wp
 
 from jumper_warp.envs.env import Env
-from jumper_warp.envs.skill import Skill
+from jumper_warp.envs.skill import TaskRuntime
 from jumper_warp.kernels.jump.reset import JumpLevel, JumpSettings
 from jumper_warp.kernels.jump.state import JumpState
 from jumper_warp.kernels.mdp.parameters import RobotParameters
@@ -108,7 +108,7 @@ class Robots:
     def __init__(self, task: TaskCfg, n: int = 1):
         """task: of jumping; what is drawn for a world is left out."""
         task = without_draws(task)
-        self.skill, self.n = Skill(task, 0, n, STEP_DT, SUBSTEPS, "cpu"), n
+        self.skill, self.n = TaskRuntime(task, 0, n, STEP_DT, SUBSTEPS, "cpu"), n
         self.numbers = {True: array(task.params.values), False: array(task.without_noise().params.values)}
         self.q, self.qd = np.zeros((n, 43)), np.zeros((n, 38))
         self.q[:, 2], self.q[:, 6], self.q[:, 7 + MOTOR_SLOTS] = 0.35, 1.0, DEFAULT_ANGLE

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from jumper_warp.envs.skill import Skill
+from jumper_warp.envs.skill import TaskRuntime
 from jumper_warp.kernels.mdp import terminations
 from jumper_warp.kernels.mdp.env import Scene, SkillSettings
 from jumper_warp.kernels.mdp.parameters import RobotParameters
@@ -218,7 +218,7 @@ class Probe:
     def __init__(self, n: int, task: TaskCfg | None = None, index: int = 0, seed: int = 0):
         """index: of the skill."""
         self.n, self.task = n, probe_task() if task is None else task
-        self.skill = Skill(self.task, index, n, STEP_DT, SUBSTEPS, "cpu")
+        self.skill = TaskRuntime(self.task, index, n, STEP_DT, SUBSTEPS, "cpu")
         self.robot, self.worlds, self.delays = standing_robots(n), new_worlds(n, seed), no_delays(n)
         self.parameters, self.ground = RobotParameters(), Ground()
         self.ground.heights = array(np.zeros((1, 1)))

@@ -6,7 +6,7 @@ import torch
 import warp as wp
 
 from jump_helpers import make_env, only, random_actions
-from jumper_warp.envs.skill import Skill
+from jumper_warp.envs.skill import TaskRuntime
 from jumper_warp.kernels.mdp.actions import action_kernel
 from jumper_warp.kernels.mdp.env import SkillSettings
 from jumper_warp.kernels.mdp.parameters import action_latency
@@ -29,7 +29,7 @@ class Commands:
 
     def __init__(self, n, tasks=(), delay=0):
         """tasks: of the skills, (by default one); delay [physics steps]: of each world."""
-        skills = [Skill(task, i, n, STEP_DT, SUBSTEPS, "cpu") for i, task in enumerate(tasks or [probe_task()])]
+        skills = [TaskRuntime(task, i, n, STEP_DT, SUBSTEPS, "cpu") for i, task in enumerate(tasks or [probe_task()])]
         self.n, self.robot, self.worlds = n, standing_robots(n), new_worlds(n)
         self.delays = no_delays(n, delay)
         self.settings = wp.array([s.settings_of_skill() for s in skills], dtype=SkillSettings, device="cpu")
