@@ -32,7 +32,7 @@ def standing_robots(n: int):
     robot.joint_q, robot.joint_qd = array(q.ravel()), array(np.zeros(n * int(DOFS)))
     robot.body_com = array(np.zeros((n * int(BODIES), 3)), wp.vec3)
     robot.body_f = array(np.zeros((n * int(BODIES), 6)), wp.spatial_vector)
-    robot.projected_gravity = array(np.tile([0.0, 0.0, -9.81], (n + 1, 1)), wp.vec3)
+    robot.gravity = array(np.tile([0.0, 0.0, -9.81], (n + 1, 1)), wp.vec3)
     robot.invalid = array(np.zeros(n), int)
     for names, rows in ((PAWS, 4), (MOTORS, 12)):
         for name in names:
