@@ -17,7 +17,7 @@ from ..mdp.attempts import sample_valid_state
 from ..mdp.env import Scene
 from ..mdp.random import RngStream, uniform, uniform_range
 from ..mdp.reset import store_pose
-from ..mdp.starts import LegSample, leg_over_ground, leg_to, place_beside, turn_of
+from ..mdp.starts import LegSample, leg_ik, quat_from_ypr, sample_foot_offset, with_foot_velocity
 from ..mdp.view import RobotArrays, turned
 from ..terrain.ground import Ground, surface
 from . import streams
@@ -141,7 +141,7 @@ def sample_quat(draw: RngStream, ranges: ResetRanges, heading: float, pitch: flo
     yaw = heading + uniform(draw, streams.YAW, -ranges.tilt, ranges.tilt)
     tip = pitch + uniform(draw, streams.PITCH, -ranges.tilt, ranges.tilt)
     roll = uniform(draw, streams.ROLL, -ranges.tilt, ranges.tilt)
-    return turn_of(yaw, tip, roll)
+    return quat_from_ypr(yaw, tip, roll)
 
 
 @wp.func
@@ -300,7 +300,7 @@ def sample_leg(start: JumpStart, base: JumpBase, geo: LegGeometry, draw: RngStre
     ranges = start.ranges
     if start.scheme == IN_FLIGHT:
         return leg_in_flight(ranges, base, geo, draw, leg)
-    beside = place_beside(draw, leg, ranges.front_x, ranges.front_y, ranges.back_x, ranges.back_y)
+    beside = sample_foot_offset(draw, leg, ranges.front_x, ranges.front_y, ranges.back_x, ranges.back_y)
     spot = base.spot + turned(beside, start.heading)
     paw = spot - base.pos
     if start.scheme == TOUCHDOWN:
@@ -310,11 +310,11 @@ def sample_leg(start: JumpStart, base: JumpBase, geo: LegGeometry, draw: RngStre
     else:
         below = surface(start.ground, spot[0], spot[1])[0]
         paw[2] = below + geo.paw_radius - base.height - base.ground_height
-    found = leg_to(geo, start.limits, wp.quat_rotate_inv(base.quat, paw))
+    found = leg_ik(geo, start.limits, wp.quat_rotate_inv(base.quat, paw))
     if start.scheme == AFTER_LANDING or start.scheme == PUSHING:
         # the paw rests on the ground while the base moves, so the joints move too
         moving = base.lin_vel + wp.cross(base.ang_vel, paw)
-        found = leg_over_ground(geo, found, -wp.quat_rotate_inv(base.quat, moving))
+        found = with_foot_velocity(geo, found, -wp.quat_rotate_inv(base.quat, moving))
     return found
 
 

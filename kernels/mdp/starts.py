@@ -27,7 +27,7 @@ class LegSample:
 
 
 @wp.func
-def leg_to(geo: LegGeometry, limits: LegLimits, ankle: wp.vec3) -> LegSample:
+def leg_ik(geo: LegGeometry, limits: LegLimits, ankle: wp.vec3) -> LegSample:
     """Return the leg at rest with its ankle in a place [m], body axes."""
     found = LegSample()
     angles = clamped_closed_form(geo, limits, ankle - geo.hip)
@@ -37,7 +37,7 @@ def leg_to(geo: LegGeometry, limits: LegLimits, ankle: wp.vec3) -> LegSample:
 
 
 @wp.func
-def leg_over_ground(geo: LegGeometry, leg: LegSample, ankle_vel: wp.vec3) -> LegSample:
+def with_foot_velocity(geo: LegGeometry, leg: LegSample, ankle_vel: wp.vec3) -> LegSample:
     """Return a leg whose ankle moves relative to the base [m/s], body axes."""
     found = leg
     found.rates = leg_inverse_velocity(geo, leg.angles, ankle_vel)
@@ -46,7 +46,7 @@ def leg_over_ground(geo: LegGeometry, leg: LegSample, ankle_vel: wp.vec3) -> Leg
 
 
 @wp.func
-def place_beside(
+def sample_foot_offset(
     draw: RngStream, leg: int, front_x: wp.vec2, front_y: wp.vec2, back_x: wp.vec2, back_y: wp.vec2
 ) -> wp.vec3:  # fmt: skip
     """Return a paw's place [m] relative to the spot that the paws surround, z = 0; ranges of absolute values."""
@@ -61,7 +61,7 @@ def place_beside(
 
 
 @wp.func
-def turn_of(yaw: float, pitch: float, roll: float) -> wp.quat:
+def quat_from_ypr(yaw: float, pitch: float, roll: float) -> wp.quat:
     """Return an orientation (xyzw), body to world: roll first, yaw last [rad]."""
     return (
         wp.quat_from_axis_angle(wp.vec3(0.0, 0.0, 1.0), yaw)

@@ -12,7 +12,7 @@ from ..mdp.attempts import sample_valid_state
 from ..mdp.env import Scene, SkillSettings
 from ..mdp.random import RngStream, uniform, uniform_range
 from ..mdp.reset import leg_limits, store_pose
-from ..mdp.starts import LegSample, leg_over_ground, leg_to, place_beside, turn_of
+from ..mdp.starts import LegSample, leg_ik, quat_from_ypr, sample_foot_offset, with_foot_velocity
 from ..mdp.view import RobotArrays, turned
 from ..terrain.ground import Ground, surface, world_ground
 from . import streams
@@ -100,7 +100,7 @@ def sample_base(start: VelocityStart, arrays: RobotArrays, draw: RngStream, atte
     x = start.spot[0] + uniform(draw, streams.OFFSET_X, -settings.base_xy, settings.base_xy)
     y = start.spot[1] + uniform(draw, streams.OFFSET_Y, -settings.base_xy, settings.base_xy)
     base = VelocityBase()
-    base.quat = turn_of(start.heading, pitch, roll)
+    base.quat = quat_from_ypr(start.heading, pitch, roll)
     base.pos = wp.vec3(x, y, surface(start.ground, x, y)[0] + uniform_range(draw, streams.HEIGHT, settings.height))
     base.lin_vel = wp.vec3(
         uniform(draw, streams.LIN_VEL, -v, v),
@@ -123,7 +123,7 @@ def sample_base(start: VelocityStart, arrays: RobotArrays, draw: RngStream, atte
 def sample_leg(start: VelocityStart, base: VelocityBase, geo: LegGeometry, draw: RngStream, leg: int) -> LegSample:
     """Return a leg; its paw rests on the ground, or is in the air in a share of draws."""
     settings = start.settings
-    beside = place_beside(draw, leg, settings.front_x, settings.front_y, settings.back_x, settings.back_y)
+    beside = sample_foot_offset(draw, leg, settings.front_x, settings.front_y, settings.back_x, settings.back_y)
     paw = base.pos + turned(beside, start.heading)
     lifted = uniform(draw, streams.LIFTED + leg, 0.0, 1.0) < settings.lifted_share
     up = float(0.0)
@@ -131,10 +131,12 @@ def sample_leg(start: VelocityStart, base: VelocityBase, geo: LegGeometry, draw:
         up = uniform(draw, streams.LIFT + leg, 0.01, settings.lift)
     paw[2] = surface(start.ground, paw[0], paw[1])[0] + geo.paw_radius + up
     ankle = wp.quat_rotate_inv(base.quat, paw - base.pos)
-    found = leg_to(geo, start.limits, ankle)
+    found = leg_ik(geo, start.limits, ankle)
     if lifted:
         return found
-    return leg_over_ground(geo, found, -wp.quat_rotate_inv(base.quat, base.lin_vel) - wp.cross(base.body_rate, ankle))
+    return with_foot_velocity(
+        geo, found, -wp.quat_rotate_inv(base.quat, base.lin_vel) - wp.cross(base.body_rate, ankle)
+    )
 
 
 @wp.func
