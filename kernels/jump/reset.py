@@ -6,7 +6,7 @@ from ..layout import DOFS
 from ..mdp.env import Scene, SkillSettings
 from ..mdp.random import RngStream, uniform, uniform_range
 from ..mdp.reset import leg_limits
-from ..mdp.view import RobotArrays, RobotView, base_pos, turned, yaw_of
+from ..mdp.view import RobotArrays, RobotView, base_pos, rotate_yaw, yaw_of
 from ..terrain.ground import Block, Ground, rest_block, surface, world_ground
 from . import streams
 from .ground_draws import GroundRanges, draw_ground, footprint
@@ -130,7 +130,7 @@ def begin_next_jump(old: JumpState, ground: Ground, goal: wp.vec3, pos: wp.vec3,
     """Return the state of an episode that goes on with another jump at once; goal relative to base and heading."""
     state = old
     state.heading = heading
-    state.goal = turned(goal, heading) + wp.vec3(pos[0], pos[1], 0.0)
+    state.goal = rotate_yaw(goal, heading) + wp.vec3(pos[0], pos[1], 0.0)
     state.goal_ground = surface(ground, state.goal[0], state.goal[1])[0]
     state.start = pos
     state.phase = STANCE
@@ -172,7 +172,7 @@ def reset_jump(
     start = JumpStart()
     start.scheme = draw_scheme(draw, ranges, spent)
     start.heading = uniform(draw, streams.HEADING, -ranges.heading, ranges.heading)
-    start.goal = turned(draw_goal(draw, level), start.heading)
+    start.goal = rotate_yaw(draw_goal(draw, level), start.heading)
     start.base_height = level.base_height
     start.ranges = ranges
     start.limits = leg_limits(skill.command_filter)
@@ -217,7 +217,7 @@ def give_jump(robot: RobotView, scene: Scene, state: JumpState, values: wp.vec4,
     new = JumpState()
     new.heading = heading
     new.start = robot.pos
-    new.goal = turned(goal, heading) + wp.vec3(robot.pos[0], robot.pos[1], 0.0)
+    new.goal = rotate_yaw(goal, heading) + wp.vec3(robot.pos[0], robot.pos[1], 0.0)
     new.goal_ground = surface(here, new.goal[0], new.goal[1])[0]
     new.max_height = robot.pos[2]
     new.command_step = int(values[3])

@@ -18,7 +18,7 @@ from ..mdp.env import Scene
 from ..mdp.random import RngStream, uniform, uniform_range
 from ..mdp.reset import store_pose
 from ..mdp.starts import LegSample, leg_ik, quat_from_ypr, sample_foot_offset, with_foot_velocity
-from ..mdp.view import RobotArrays, turned
+from ..mdp.view import RobotArrays, rotate_yaw
 from ..terrain.ground import Ground, surface
 from . import streams
 from .phase import time_to_height
@@ -157,7 +157,7 @@ def direction(start: JumpStart) -> wp.vec3:
     to_goal = wp.vec3(start.goal[0], start.goal[1], 0.0)
     if wp.length(to_goal) > 1.0e-3:
         return wp.normalize(to_goal)
-    return turned(wp.vec3(1.0, 0.0, 0.0), start.heading)
+    return rotate_yaw(wp.vec3(1.0, 0.0, 0.0), start.heading)
 
 
 @wp.func
@@ -301,7 +301,7 @@ def sample_leg(start: JumpStart, base: JumpBase, geo: LegGeometry, draw: RngStre
     if start.scheme == IN_FLIGHT:
         return leg_in_flight(ranges, base, geo, draw, leg)
     beside = sample_foot_offset(draw, leg, ranges.front_x, ranges.front_y, ranges.back_x, ranges.back_y)
-    spot = base.spot + turned(beside, start.heading)
+    spot = base.spot + rotate_yaw(beside, start.heading)
     paw = spot - base.pos
     if start.scheme == TOUCHDOWN:
         # paws hang below the base, a little above the ground at least

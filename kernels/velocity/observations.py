@@ -3,7 +3,7 @@
 import warp as wp
 
 from ..layout import BODIES
-from ..mdp.view import RobotArrays, RobotView, base_pos, base_quat, turned, yaw_of
+from ..mdp.view import RobotArrays, RobotView, base_pos, base_quat, rotate_yaw, yaw_of
 from ..terrain.ground import Ground, surface, world_ground
 from .state import POLICY_RATE, VelocityState
 
@@ -66,6 +66,6 @@ def ground_heights(arrays: RobotArrays, ground: Ground, world: int) -> vec15:
     heading = yaw_of(base_quat(arrays, world))
     found = vec15()
     for i in range(15):
-        way = turned(wp.vec3(0.25 * float(i / 3 - 2), 0.2 * float(i % 3 - 1), 0.0), heading)
+        way = rotate_yaw(wp.vec3(0.25 * float(i / 3 - 2), 0.2 * float(i % 3 - 1), 0.0), heading)
         found[i] = pos[2] - surface(here, pos[0] + way[0], pos[1] + way[1])[0] - 0.35
     return found

@@ -13,7 +13,7 @@ from ..mdp.env import Scene, SkillSettings
 from ..mdp.random import RngStream, uniform, uniform_range
 from ..mdp.reset import leg_limits, store_pose
 from ..mdp.starts import LegSample, leg_ik, quat_from_ypr, sample_foot_offset, with_foot_velocity
-from ..mdp.view import RobotArrays, turned
+from ..mdp.view import RobotArrays, rotate_yaw
 from ..terrain.ground import Ground, surface, world_ground
 from . import streams
 
@@ -124,7 +124,7 @@ def sample_leg(start: VelocityStart, base: VelocityBase, geo: LegGeometry, draw:
     """Return a leg; its paw rests on the ground, or is in the air in a share of draws."""
     settings = start.settings
     beside = sample_foot_offset(draw, leg, settings.front_x, settings.front_y, settings.back_x, settings.back_y)
-    paw = base.pos + turned(beside, start.heading)
+    paw = base.pos + rotate_yaw(beside, start.heading)
     lifted = uniform(draw, streams.LIFTED + leg, 0.0, 1.0) < settings.lifted_share
     up = float(0.0)
     if lifted:

@@ -56,8 +56,8 @@ class Starts:
     def paws_around(self, spot: np.ndarray) -> np.ndarray:
         """Return the paws relative to places (worlds, 3), in the jump's heading, all as if they were front left."""
         relative = self.paws - spot[:, None]
-        turned = np.stack([self.heading.inv().apply(relative[:, leg]) for leg in range(4)], axis=1)
-        return turned * np.array([[1, 1, 1], [1, -1, 1], [-1, 1, 1], [-1, -1, 1]])
+        rotate_yaw = np.stack([self.heading.inv().apply(relative[:, leg]) for leg in range(4)], axis=1)
+        return rotate_yaw * np.array([[1, 1, 1], [1, -1, 1], [-1, 1, 1], [-1, -1, 1]])
 
 
 def paws_of(model, q: np.ndarray, qd: np.ndarray) -> np.ndarray:
