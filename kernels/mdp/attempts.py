@@ -19,7 +19,7 @@ from ..state import leg_coord, leg_dof, load_motors, store_motors
 from ..terrain.ground import Ground
 from .env import Scene
 from .random import RngStream, fold_in
-from .starts import APART, LegSample
+from .starts import MIN_LINK_DISTANCE, LegSample
 from .view import RobotArrays
 
 wp.set_module_options({"enable_backward": False})
@@ -89,7 +89,7 @@ def pose_is_valid(
             store_leg(leg, other, joint_q, joint_qd)
     flags = int(0)
     for turn in range(first_leg(draw), geometry.shape[0], leg_step(draw)):
-        flags = flags | leg_collisions(geometry, ground, joint_q, 0, turn, APART)
+        flags = flags | leg_collisions(geometry, ground, joint_q, 0, turn, MIN_LINK_DISTANCE)
     return all_legs(draw, all_reachable and flags == 0)
 
 

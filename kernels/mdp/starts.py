@@ -9,9 +9,9 @@ from .random import RngStream, uniform_range
 
 wp.set_module_options({"enable_backward": False})
 
-MISS = wp.constant(1.0e-4)  # [m] by which a paw may miss its place
-FASTEST = wp.constant(30.0)  # [rad/s] norm of a leg's motor rates
-APART = wp.constant(0.005)  # [m] least between links
+MAX_FOOT_ERROR = wp.constant(1.0e-4)  # [m] by which a paw may miss its place
+MAX_LEG_SPEED = wp.constant(30.0)  # [rad/s] norm of a leg's motor rates
+MIN_LINK_DISTANCE = wp.constant(0.005)  # [m] least between links
 
 PAW_X, PAW_Y = 20, 24
 """Numbers of a stream, the first of four: one a leg."""
@@ -32,7 +32,7 @@ def leg_ik(geo: LegGeometry, limits: LegLimits, ankle: wp.vec3) -> LegSample:
     found = LegSample()
     angles = clamped_closed_form(geo, limits, ankle - geo.hip)
     found.angles = angles
-    found.reachable = wp.length(leg_forward_kinematics(geo, angles[0], angles[1], angles[2]) - ankle) <= MISS
+    found.reachable = wp.length(leg_forward_kinematics(geo, angles[0], angles[1], angles[2]) - ankle) <= MAX_FOOT_ERROR
     return found
 
 
@@ -41,7 +41,7 @@ def with_foot_velocity(geo: LegGeometry, leg: LegSample, ankle_vel: wp.vec3) -> 
     """Return a leg whose ankle moves relative to the base [m/s], body axes."""
     found = leg
     found.rates = leg_inverse_velocity(geo, leg.angles, ankle_vel)
-    found.reachable = leg.reachable and wp.length(found.rates) <= FASTEST
+    found.reachable = leg.reachable and wp.length(found.rates) <= MAX_LEG_SPEED
     return found
 
 
