@@ -9,7 +9,7 @@ import numpy as np
 import torch
 import warp as wp
 
-from jumper_warp.kernels.mdp.env import RING, Delays, EnvArrays, Scene
+from jumper_warp.kernels.mdp.env import RING, Delays, EpisodeArrays, Scene
 from jumper_warp.kernels.mdp.view import RobotArrays
 from jumper_warp.robot.description import load_description
 from jumper_warp.sim.simulation import Simulation
@@ -46,18 +46,18 @@ def robot_arrays(sim: Simulation, step_dt: float) -> Any:
     return robot
 
 
-def env_arrays(num_envs: int, seed: int, skill: wp.array, device: Any) -> Any:
-    """Return the kernels' `EnvArrays`."""
-    env = EnvArrays()
-    env.seed, env.skill = seed, skill
+def episode_arrays(num_envs: int, seed: int, skill: wp.array, device: Any) -> Any:
+    """Return the kernels' `EpisodeArrays`."""
+    episode = EpisodeArrays()
+    episode.seed, episode.skill = seed, skill
     counts = ("requested_task", "has_command", "history_reset", "ending", "broken", "bad_action", "level", "streak")
-    fill(env, ("pending_command",), num_envs, wp.vec4, device)
-    fill(env, counts, num_envs, int, device)
-    fill(env, ("reward", "done", "timeout"), num_envs, float, device)
-    fill(env, ("terminated", "truncated"), num_envs, wp.bool, device)
-    env.clock = wp.full(num_envs, FIRST_CLOCK, dtype=int, device=device)
-    env.requested_task.fill_(-1)
-    return env
+    fill(episode, ("pending_command",), num_envs, wp.vec4, device)
+    fill(episode, counts, num_envs, int, device)
+    fill(episode, ("reward", "done", "timeout"), num_envs, float, device)
+    fill(episode, ("terminated", "truncated"), num_envs, wp.bool, device)
+    episode.clock = wp.full(num_envs, FIRST_CLOCK, dtype=int, device=device)
+    episode.requested_task.fill_(-1)
+    return episode
 
 
 def delay_arrays(num_envs: int, latency: wp.array, substeps: int, device: Any) -> Any:

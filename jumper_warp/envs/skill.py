@@ -11,7 +11,7 @@ import torch
 import warp as wp
 
 from jumper_warp.envs.arrays import fill
-from jumper_warp.kernels.mdp.env import RING, Counters, Nothing, SkillSettings
+from jumper_warp.kernels.mdp.env import RING, Counters, NoSettings, SkillSettings
 from jumper_warp.kernels.mdp.events import make_event_kernel
 from jumper_warp.kernels.mdp.observe import CHUNK, ObservationArrays, make_observe_kernel
 from jumper_warp.kernels.mdp.reset import make_reset_kernel, make_set_command_kernel
@@ -52,7 +52,7 @@ class TaskRuntime:
 
     def _structs(self, values: list, kind: Any = None) -> wp.array:
         """Return structs as an array; an unused one where there are none."""
-        values = values or [Nothing()]
+        values = values or [NoSettings()]
         return wp.array(values, dtype=kind or values[0]._cls, device=self.device)
 
     def _allocate_observations(self, substeps: int) -> None:

@@ -8,12 +8,12 @@ from typing import Any, NamedTuple
 import numpy as np
 import warp as wp
 
-from jumper_warp.envs.arrays import FIRST_CLOCK, checked_skill, delay_arrays, env_arrays, robot_arrays, scene_of
+from jumper_warp.envs.arrays import FIRST_CLOCK, checked_skill, delay_arrays, episode_arrays, robot_arrays, scene_of
 from jumper_warp.envs.parameters import robot_parameters
 from jumper_warp.envs.skill import TaskRuntime
 from jumper_warp.kernels.mdp import attempts, events
 from jumper_warp.kernels.mdp.actions import action_kernel
-from jumper_warp.kernels.mdp.env import EnvArrays, SkillSettings
+from jumper_warp.kernels.mdp.episode import EpisodeArrays, SkillSettings
 from jumper_warp.kernels.mdp.events import AT_RESET, AT_STEP, STARTUP
 from jumper_warp.kernels.mdp.handover import make_handover_kernel, restore_task_kernel
 from jumper_warp.kernels.mdp.observe import LANES, postprocess_obs_kernel
@@ -39,8 +39,8 @@ class Part(NamedTuple):
 
     first: int
     count: int
-    env: Any
-    """The kernels' `EnvArrays` that begin at `first`."""
+    episode: Any
+    """The kernels' `EpisodeArrays` that begin at `first`."""
 
 
 class Stages:
@@ -66,7 +66,7 @@ class Stages:
         self.skills = [TaskRuntime(task, i, n, self.step_dt, sim.substeps, device) for i, task in enumerate(tasks)]
         self.parameters = robot_parameters(sim, tuple(tasks), active)
         self.robot, self._scene = robot_arrays(sim, self.step_dt), scene_of(sim)
-        self.worlds = env_arrays(n, self.seed, active, device)
+        self.worlds = episode_arrays(n, self.seed, active, device)
         self.delays = delay_arrays(n, self.parameters.latency, sim.substeps, device)
         for each in self.skills:
             each.observations.latency = self.parameters.observation_latency
@@ -100,8 +100,8 @@ class Stages:
         """Return some of the worlds as stages are launched for them, by default all."""
         if worlds is None or worlds.count == self.num_envs:
             return Part(0, self.num_envs, self.worlds)
-        env = EnvArrays()
-        for name in EnvArrays.vars:
+        env = EpisodeArrays()
+        for name in EpisodeArrays.vars:
             setattr(env, name, getattr(self.worlds, name))
         env.first = worlds.first
         return Part(*worlds, env)
@@ -122,7 +122,7 @@ class Stages:
                 "reset": lambda: self._reset_done(part)}  # fmt: skip
 
     def _apply_actions(self, part: Part) -> None:
-        inputs = [self._action, self._settings, self.parameters.push, self.robot, part.env, self.delays]
+        inputs = [self._action, self._settings, self.parameters.push, self.robot, part.episode, self.delays]
         self._launch(action_kernel, (4, part.count), inputs)
         self._events(part, AT_STEP, self._all)
 
@@ -132,14 +132,14 @@ class Stages:
             self.sim.substeps, delays.late_target, delays.earlier_target, delays.late_steps, bodies=False,
             worlds=Worlds(part.first, part.count),
         )  # fmt: skip
-        inputs = [scene.geometry, scene.ground, self._settings, part.env, self.robot]
+        inputs = [scene.geometry, scene.ground, self._settings, part.episode, self.robot]
         self._launch(track_kernel, (4, part.count), inputs)
 
     def _compute_rewards_and_dones(self, part: Part) -> None:
         for skill in self.skills:
             self._launch(
                 skill.kernels["step"], part.count,
-                [skill.index, self.robot, self._scene.ground, len(skill.task.levels), skill.params.values, part.env,
+                [skill.index, self.robot, self._scene.ground, len(skill.task.levels), skill.params.values, part.episode,
                  skill.states, skill.term_value, skill.counters],
             )  # fmt: skip
 
@@ -158,7 +158,7 @@ class Stages:
             self._launch(
                 kernel, part.count,
                 [source, target, self._scene, self._settings, self._moved, self.robot, self.parameters,
-                 part.env, self.skills[source].states, self.skills[target].states],
+                 part.episode, self.skills[source].states, self.skills[target].states],
             )  # fmt: skip
 
     def _reset_worlds(self, part: Part, mask: wp.array) -> None:
@@ -169,7 +169,7 @@ class Stages:
             lanes = attempts.LANES if self.wp_device.is_cuda and skill.task.reset.side_by_side else 1
             self._launch(
                 skill.kernels["reset"], (part.count, lanes),
-                [skill.index, lanes, mask, self._scene, self._settings, skill.settings, skill.levels, part.env,
+                [skill.index, lanes, mask, self._scene, self._settings, skill.settings, skill.levels, part.episode,
                  skill.states, self.robot], BLOCKS["reset"],
             )  # fmt: skip
         self._clear_history(part, mask)
@@ -177,7 +177,7 @@ class Stages:
     def _restore_first_task(self, part: Part, mask: wp.array) -> None:
         """Put worlds back into their first skill where mask is not 0, and forget what they were asked for."""
         if len(self.skills) > 1:
-            self._launch(restore_task_kernel, part.count, [mask, self._home, self.parameters, part.env])
+            self._launch(restore_task_kernel, part.count, [mask, self._home, self.parameters, part.episode])
 
     def _randomize(self, part: Part, mask: wp.array) -> None:
         """Draw parameters of episodes that begin where mask is not 0."""
@@ -197,7 +197,7 @@ class Stages:
                 first, lanes = min(due), events.LANES if spread else 1
                 self._launch(
                     skill.kernels["event"], (max(due) - first + 1, lanes, part.count),
-                    [skill.index, stage, first, lanes, mask, self.step_dt, part.env, skill.params.values, skill.timer,
+                    [skill.index, stage, first, lanes, mask, self.step_dt, part.episode, skill.params.values, skill.timer,
                      self.parameters], BLOCKS["event"], EVENT_BLOCKS,
                 )  # fmt: skip
             if any(slot.repack for slot in due.values()):
@@ -216,10 +216,10 @@ class Stages:
             arrays = skill.observations
             self._launch(
                 skill.kernels["observe"], (skill.num_chunks, part.count),
-                [skill.index, self.robot, self.parameters, self._scene.ground, part.env, skill.states,
+                [skill.index, self.robot, self.parameters, self._scene.ground, part.episode, skill.states,
                  skill.params.values, beginning, arrays.raw],
             )  # fmt: skip
-            inputs = [skill.index, part.env, skill.columns, skill.params.values, beginning, arrays]
+            inputs = [skill.index, part.episode, skill.columns, skill.params.values, beginning, arrays]
             self._launch(postprocess_obs_kernel, (part.count, int(LANES)), inputs, POSTPROCESS_BLOCK)
 
     def _launch(

@@ -11,7 +11,7 @@ import torch
 import warp as wp
 
 from jumper_warp.envs.arrays import FIRST_CLOCK
-from jumper_warp.kernels.mdp.env import RING, Delays, EnvArrays
+from jumper_warp.kernels.mdp.env import RING, Delays, EpisodeArrays
 from jumper_warp.kernels.mdp.parameters import RobotParameters
 from jumper_warp.kernels.mdp.view import RobotArrays
 from jumper_warp.utils.errors import InputError
@@ -125,7 +125,7 @@ def _records(env: Stages) -> dict[str, wp.array]:
 def _tensors(env: Stages) -> dict[str, torch.Tensor]:
     """Return views of the environment's own memory by name."""
     found: dict[str, Any] = {}
-    structs = (("robot", RobotArrays, env.robot), ("env", EnvArrays, env.worlds), ("delays", Delays, env.delays),
+    structs = (("robot", RobotArrays, env.robot), ("env", EpisodeArrays, env.worlds), ("delays", Delays, env.delays),
                ("parameters", RobotParameters, env.parameters))  # fmt: skip
     for prefix, kind, struct in structs:
         for name in kind.vars:

@@ -7,7 +7,7 @@ import math
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from jumper_warp.kernels.mdp.env import Nothing
+from jumper_warp.kernels.mdp.env import NoSettings
 from jumper_warp.kernels.mdp.starts import APART
 from jumper_warp.kernels.mdp.terminations import came_apart
 from jumper_warp.robot.gravity import EARTH, check_gravity
@@ -187,12 +187,12 @@ class TaskCfg:
     @property
     def settings_type(self) -> Any:
         """The struct of the reset's settings."""
-        return Nothing if self.reset.settings is None else self.reset.settings.struct
+        return NoSettings if self.reset.settings is None else self.reset.settings.struct
 
     @property
     def level_type(self) -> Any:
         """The struct of a level."""
-        return self.levels[0].struct if self.levels else Nothing
+        return self.levels[0].struct if self.levels else NoSettings
 
     def with_terms(self, section: str, **changes: dict[str, Any]) -> TaskCfg:
         """Return the task with other numbers or options in terms of a section, by name.

@@ -19,7 +19,7 @@ from typing import Any, Union, get_args, get_origin, get_type_hints
 import warp as wp
 
 import jumper_warp.tasks
-from jumper_warp.kernels.mdp.env import Nothing
+from jumper_warp.kernels.mdp.env import NoSettings
 from jumper_warp.tasks.cfg import Handover, TaskCfg
 from jumper_warp.tasks.terms import RewardTerm, Term
 from jumper_warp.utils.checks import NAME, version_refusal
@@ -33,7 +33,7 @@ OPTIONAL = ("rewards", "critic", "events")
 """Sections that a policy needs for training only."""
 MAX_ENTRIES = 1000
 """Longest list; a kernel of more terms would not be compiled in a day."""
-Struct = type(Nothing)
+Struct = type(NoSettings)
 
 
 class TaskError(InputError):

@@ -4,7 +4,7 @@ import warp as wp
 
 from ..actuation.command_filter import filter_leg
 from ..layout import BODIES, COORDS, DOFS
-from .env import RING, Delays, EnvArrays, SkillSettings
+from .env import RING, Delays, EpisodeArrays, SkillSettings
 from .view import RobotArrays, base_quat, base_velocity
 
 wp.set_module_options({"enable_backward": False})
@@ -42,7 +42,7 @@ def action_kernel(
     push: wp.array(dtype=wp.spatial_vector),
     # in, out
     arrays: RobotArrays,
-    env: EnvArrays,
+    episode: EpisodeArrays,
     delays: Delays,
 ):
     """Clamp, scale and filter the action (skills, num_worlds, 12) of each world's skill; one thread per (leg, world).
@@ -50,8 +50,8 @@ def action_kernel(
     An action that is not finite counts as 0, and its world as broken.
     """
     leg, world = wp.tid()
-    world += env.first
-    skill = skills[env.skill[world]]
+    world += episode.first
+    skill = skills[episode.skill[world]]
     q = world * COORDS + 7 + 5 * leg
     d = world * DOFS + 6 + 5 * leg
     angles = wp.vec3(arrays.joint_q[q], arrays.joint_q[q + 1], arrays.joint_q[q + 3])
@@ -59,10 +59,10 @@ def action_kernel(
     target = wp.vec3(0.0)
     for j in range(3):
         m = 3 * leg + j
-        asked = policy_action[env.skill[world], world, m]
+        asked = policy_action[episode.skill[world], world, m]
         if not wp.isfinite(asked):
             asked = 0.0
-            env.bad_action[world] = 1
+            episode.bad_action[world] = 1
         action = wp.clamp(asked, -1.0, 1.0)
         arrays.prev_prev_action[m, world] = arrays.prev_action[m, world]
         arrays.prev_action[m, world] = arrays.action[m, world]
@@ -72,7 +72,7 @@ def action_kernel(
         angles[j] = angles[j] + arrays.joint_offset[m, world]
         target[j] = action * skill.action_scale[m] + arrays.default_angle[m]
     safe = filter_leg(target, angles, rates, skill.command_filter)
-    clock = env.clock[world]
+    clock = episode.clock[world]
     for j in range(3):
         m = 3 * leg + j
         arrays.target[m, world] = target[j]

@@ -23,14 +23,14 @@ class Scene:
 
 
 @wp.struct
-class Nothing:
+class NoSettings:
     """Stands for the settings of a reset, or a level, that has none."""
 
     unused: float
 
 
 @wp.struct
-class EnvArrays:
+class EpisodeArrays:
     """Bookkeeping of all worlds, arrays of shape (num_worlds,)."""
 
     seed: int

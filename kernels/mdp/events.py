@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from .env import EnvArrays
+from .env import EpisodeArrays
 from .options import FAST
 from .parameters import RobotParameters
 from .random import EVENT, INTERVAL, RngStream, make_stream, uniform
@@ -32,7 +32,7 @@ def make_event_kernel(slots: list) -> wp.Kernel:
         lanes: int,
         mask: wp.array(dtype=float),
         step_dt: float,
-        env: EnvArrays,
+        episode: EpisodeArrays,
         p: wp.array(dtype=float),
         # in, out
         timer: wp.array2d(dtype=int),
@@ -47,12 +47,12 @@ def make_event_kernel(slots: list) -> wp.Kernel:
         """
         row, lane, world = wp.tid()
         row += first
-        world += env.first
-        if env.skill[world] != skill or mask[world] == 0.0:
+        world += episode.first
+        if episode.skill[world] != skill or mask[world] == 0.0:
             return
         for i in range(wp.static(len(slots))):
             if row == i and (wp.static(bool(slots[i].spread)) or lane == 0):
-                draw = make_stream(env.seed, world, env.clock[world], EVENT + 100 * stage + i)
+                draw = make_stream(episode.seed, world, episode.clock[world], EVENT + 100 * stage + i)
                 if wp.static(bool(slots[i].spread)):
                     draw.lane = lane
                     draw.lanes = lanes

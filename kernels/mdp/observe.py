@@ -5,7 +5,7 @@ from typing import Any
 import warp as wp
 
 from ..terrain.ground import Ground
-from .env import BEGUN, COMMANDED, RING, EnvArrays
+from .env import BEGUN, COMMANDED, RING, EpisodeArrays
 from .options import FAST
 from .parameters import RobotParameters
 from .random import OBSERVATION, clamped_normal, step_key, stream_at
@@ -96,7 +96,7 @@ def make_observe_kernel(task: Any) -> wp.Kernel:
         arrays: RobotArrays,
         parameters: RobotParameters,
         ground: Ground,
-        env: EnvArrays,
+        episode: EpisodeArrays,
         states: wp.array(dtype=task.state),
         p: wp.array(dtype=float),
         beginning: int,
@@ -108,8 +108,8 @@ def make_observe_kernel(task: Any) -> wp.Kernel:
         beginning 1: only where an episode or the skill has just begun, or another command came.
         """
         chunk, world = wp.tid()
-        world += env.first
-        if env.skill[world] != skill or (beginning != 0 and env.history_reset[world] == 0):
+        world += episode.first
+        if episode.skill[world] != skill or (beginning != 0 and episode.history_reset[world] == 0):
             return
         for c in range(wp.static((len(slots) + CHUNK - 1) // CHUNK)):
             if chunk == c:
@@ -148,7 +148,7 @@ class Moment:
 
     world: int
     draws: wp.uint32  # see `step_key`
-    fresh: int  # as in `EnvArrays`
+    fresh: int  # as in `EpisodeArrays`
     broken: bool
     now: int  # place in the rings of past values
     newer: int  # place of the value that a sensor's latency has passed
@@ -157,15 +157,15 @@ class Moment:
 
 
 @wp.func
-def moment(env: EnvArrays, arrays: ObservationArrays, world: int) -> Moment:
+def moment(episode: EpisodeArrays, arrays: ObservationArrays, world: int) -> Moment:
     """Return what a world's components have in common."""
-    clock = env.clock[world]
+    clock = episode.clock[world]
     whole = arrays.latency[world] // arrays.substeps
     m = Moment()
     m.world = world
-    m.draws = step_key(env.seed, world, clock)
-    m.fresh = env.history_reset[world]
-    m.broken = env.broken[world] != 0
+    m.draws = step_key(episode.seed, world, clock)
+    m.fresh = episode.history_reset[world]
+    m.broken = episode.broken[world] != 0
     m.now = clock % RING
     m.newer = (clock - whole) % RING
     m.older = (clock - whole - 1) % RING
@@ -215,7 +215,7 @@ def condition(arrays: ObservationArrays, column: Column, p: wp.array(dtype=float
 def postprocess_obs_kernel(
     # in
     skill: int,
-    env: EnvArrays,
+    episode: EpisodeArrays,
     columns: wp.array2d(dtype=int),
     p: wp.array(dtype=float),
     beginning: int,
@@ -229,9 +229,9 @@ def postprocess_obs_kernel(
     stay, and so does `final`.
     """
     world, lane = wp.tid()
-    world += env.first
-    if env.skill[world] != skill or (beginning != 0 and env.history_reset[world] == 0):
+    world += episode.first
+    if episode.skill[world] != skill or (beginning != 0 and episode.history_reset[world] == 0):
         return
-    m = moment(env, arrays, world)
+    m = moment(episode, arrays, world)
     for component in range(lane, columns.shape[1], LANES):
         condition(arrays, load_column(columns, component), p, m, beginning)

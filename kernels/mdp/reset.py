@@ -10,7 +10,7 @@ from ..kinematics.inverse import LegLimits
 from ..layout import COORDS, DOFS, motor_slot
 from ..terrain.ground import rest_block, surface, world_ground
 from .attempts import sync_attempts
-from .env import BEGUN, COMMANDED, RING, Delays, EnvArrays, Scene, SkillSettings
+from .env import BEGUN, COMMANDED, RING, Delays, EpisodeArrays, Scene, SkillSettings
 from .options import FAST
 from .random import ANY_LEVEL, COMMAND, RESET, make_stream, uniform
 from .track import follow_paw
@@ -44,7 +44,7 @@ def make_reset_kernel(task: Any) -> wp.Kernel:
         settings: wp.array(dtype=settings_type),
         levels: wp.array(dtype=level_type),
         # in, out
-        env: EnvArrays,
+        episode: EpisodeArrays,
         states: wp.array(dtype=task.state),
         arrays: RobotArrays,
     ):
@@ -53,8 +53,8 @@ def make_reset_kernel(task: Any) -> wp.Kernel:
         The lanes, neighbours in a warp, do the same but for what they share by `draw.lane`.
         """
         world, lane = wp.tid()
-        world += env.first
-        if env.skill[world] != skill:
+        world += episode.first
+        if episode.skill[world] != skill:
             return
         begins = mask[world] != 0.0
         commanded = bool(False)
@@ -62,26 +62,26 @@ def make_reset_kernel(task: Any) -> wp.Kernel:
             commanded = wp.static(due)(states[world])
         if not (begins or commanded):
             return
-        draw = make_stream(env.seed, world, env.clock[world], RESET)
+        draw = make_stream(episode.seed, world, episode.clock[world], RESET)
         draw.lane = lane
         draw.lanes = lanes
-        level = env.level[world]
+        level = episode.level[world]
         if level >= levels.shape[0]:
             level = wp.min(int(uniform(draw, ANY_LEVEL, 0.0, float(levels.shape[0]))), levels.shape[0] - 1)
         if begins:
-            old = before_reset(states[world], env.done[world])
+            old = before_reset(states[world], episode.done[world])
             state = wp.static(reset)(arrays, scene, skills[skill], old, settings[0], levels[level], draw)
             sync_attempts(draw)
             if lane == 0:
                 states[world] = state
-                env.history_reset[world] = BEGUN
-                env.broken[world] = 0
+                episode.history_reset[world] = BEGUN
+                episode.broken[world] = 0
         elif wp.static(command is not None):
             if lane == 0:
                 robot = load_view(arrays, scene.ground, world)
-                fresh = make_stream(env.seed, world, env.clock[world], COMMAND)
+                fresh = make_stream(episode.seed, world, episode.clock[world], COMMAND)
                 states[world] = wp.static(command)(robot, scene, states[world], levels[level], fresh)
-                env.history_reset[world] = COMMANDED
+                episode.history_reset[world] = COMMANDED
 
     return reset_kernel
 
@@ -101,7 +101,7 @@ def make_set_command_kernel(task: Any) -> wp.Kernel:
         scene: Scene,
         arrays: RobotArrays,
         # in, out
-        env: EnvArrays,
+        episode: EpisodeArrays,
         states: wp.array(dtype=task.state),
     ):
         """Give a command where mask is not 0; one thread per world.
@@ -109,18 +109,18 @@ def make_set_command_kernel(task: Any) -> wp.Kernel:
         begins 1: to a new episode, with its heading [rad]; 0: to the one under way, in the heading that the robot has.
         """
         world = wp.tid()
-        if env.skill[world] != skill or mask[world] == 0.0:
+        if episode.skill[world] != skill or mask[world] == 0.0:
             return
         robot = load_view(arrays, scene.ground, world)
         if begins != 0:
             fresh = task.state()
             states[world] = wp.static(give)(robot, scene, fresh, values[world], headings[world])
-            env.history_reset[world] = BEGUN
-            env.broken[world] = 0
+            episode.history_reset[world] = BEGUN
+            episode.broken[world] = 0
         else:
             states[world] = wp.static(give)(robot, scene, states[world], values[world], yaw_of(robot.quat))
-            if env.history_reset[world] != BEGUN:
-                env.history_reset[world] = COMMANDED
+            if episode.history_reset[world] != BEGUN:
+                episode.history_reset[world] = COMMANDED
 
     return set_command_kernel
 
@@ -179,12 +179,12 @@ def advance_rng_kernel(
     # in
     mask: wp.array(dtype=float),
     # in, out
-    env: EnvArrays,
+    episode: EpisodeArrays,
 ):
     """Move the clock on where mask is not 0, so that what follows draws anew; one thread per world."""
     world = wp.tid()
     if mask[world] != 0.0:
-        env.clock[world] = env.clock[world] + 1
+        episode.clock[world] = episode.clock[world] + 1
 
 
 @wp.kernel

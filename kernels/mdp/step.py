@@ -5,7 +5,7 @@ from typing import Any
 import warp as wp
 
 from ..terrain.ground import Ground
-from .env import Counters, EnvArrays
+from .env import Counters, EpisodeArrays
 from .options import FAST
 from .terminations import came_apart
 from .view import RobotArrays, has_diverged, load_view
@@ -15,14 +15,20 @@ NOT_ENDED = wp.constant(-1)
 
 @wp.func
 def count_episode(
-    env: EnvArrays, counters: Counters, world: int, success: bool, error: float, promote_after: float, num_levels: int
+    episode: EpisodeArrays,
+    counters: Counters,
+    world: int,
+    success: bool,
+    error: float,
+    promote_after: float,
+    num_levels: int,
 ):
     """Take an ended episode into the curriculum: successes in a row raise the world's level."""
-    streak = wp.where(success, env.streak[world] + 1, 0)
+    streak = wp.where(success, episode.streak[world] + 1, 0)
     if streak >= int(promote_after):
         streak = int(0)
-        env.level[world] = wp.min(env.level[world] + 1, num_levels)
-    env.streak[world] = streak
+        episode.level[world] = wp.min(episode.level[world] + 1, num_levels)
+    episode.streak[world] = streak
     counters.counted[world] = counters.counted[world] + 1
     if success:
         counters.succeeded[world] = counters.succeeded[world] + 1
@@ -31,20 +37,20 @@ def count_episode(
 
 @wp.func
 def write_outcome(
-    env: EnvArrays, counters: Counters, world: int, total: float, ending: int, timeout: float, broken: bool
+    episode: EpisodeArrays, counters: Counters, world: int, total: float, ending: int, timeout: float, broken: bool
 ):
     """Write how a policy step of a world ended."""
-    env.reward[world] = total
-    env.ending[world] = ending
-    env.done[world] = wp.where(ending == NOT_ENDED, 0.0, 1.0)
-    env.timeout[world] = timeout
-    env.terminated[world] = ending != NOT_ENDED and timeout == 0.0
-    env.truncated[world] = timeout != 0.0
-    env.broken[world] = wp.where(broken, 1, 0)
-    counters.bad_actions[world] = counters.bad_actions[world] + env.bad_action[world]
-    env.bad_action[world] = 0
-    env.clock[world] = env.clock[world] + 1
-    env.history_reset[world] = 0
+    episode.reward[world] = total
+    episode.ending[world] = ending
+    episode.done[world] = wp.where(ending == NOT_ENDED, 0.0, 1.0)
+    episode.timeout[world] = timeout
+    episode.terminated[world] = ending != NOT_ENDED and timeout == 0.0
+    episode.truncated[world] = timeout != 0.0
+    episode.broken[world] = wp.where(broken, 1, 0)
+    counters.bad_actions[world] = counters.bad_actions[world] + episode.bad_action[world]
+    episode.bad_action[world] = 0
+    episode.clock[world] = episode.clock[world] + 1
+    episode.history_reset[world] = 0
 
 
 def make_step_kernel(task: Any) -> wp.Kernel:
@@ -63,7 +69,7 @@ def make_step_kernel(task: Any) -> wp.Kernel:
         num_levels: int,
         p: wp.array(dtype=float),
         # in, out
-        env: EnvArrays,
+        episode: EpisodeArrays,
         states: wp.array(dtype=task.state),
         # out
         term_value: wp.array2d(dtype=float),
@@ -73,8 +79,8 @@ def make_step_kernel(task: Any) -> wp.Kernel:
 
         term_value: rewards of this step, weights applied, (rewards, num_worlds). Those that are not finite count 0.
         """
-        world = env.first + wp.tid()
-        if env.skill[world] != skill:
+        world = episode.first + wp.tid()
+        if episode.skill[world] != skill:
             return
         robot = load_view(arrays, ground, world)
         if wp.static(advance.plain):
@@ -85,7 +91,7 @@ def make_step_kernel(task: Any) -> wp.Kernel:
         ending = int(NOT_ENDED)
         timeout = float(0.0)
         success = bool(False)
-        broken = arrays.invalid[world] != 0 or env.bad_action[world] != 0 or has_diverged(robot)
+        broken = arrays.invalid[world] != 0 or episode.bad_action[world] != 0 or has_diverged(robot)
         if broken:
             ending = wp.static(broken_ending)
         for i in range(wp.static(len(endings))):
@@ -120,13 +126,15 @@ def make_step_kernel(task: Any) -> wp.Kernel:
             total = float(0.0)
         if wp.static(floor is not None):
             total = wp.max(total, wp.static(0.0 if floor is None else float(floor)))
-        write_outcome(env, counters, world, total, ending, timeout, broken)
+        write_outcome(episode, counters, world, total, ending, timeout, broken)
         states[world] = state
         if ending != NOT_ENDED:
             counters.ending_count[ending, world] = counters.ending_count[ending, world] + 1
             if wp.static(curriculum.counts)(state):
                 error = wp.static(curriculum.func)(robot, state)
                 success = success and error <= p[wp.static(curriculum.tolerance)]
-                count_episode(env, counters, world, success, error, p[wp.static(curriculum.promote_after)], num_levels)
+                count_episode(
+                    episode, counters, world, success, error, p[wp.static(curriculum.promote_after)], num_levels
+                )
 
     return step_kernel

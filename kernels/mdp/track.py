@@ -8,7 +8,7 @@ from ..kinematics.geometry import LegGeometry
 from ..layout import COORDS
 from ..state import leg_coord, leg_dof, load_motors
 from ..terrain.ground import Ground, grown_block, surface, world_ground
-from .env import EnvArrays, SkillSettings
+from .env import EpisodeArrays, SkillSettings
 from .view import RobotArrays, base_pos, base_quat, base_velocity
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
@@ -59,14 +59,14 @@ def track_kernel(
     geometry: wp.array(dtype=LegGeometry),
     ground: Ground,
     skills: wp.array(dtype=SkillSettings),
-    env: EnvArrays,
+    episode: EpisodeArrays,
     # in, out
     arrays: RobotArrays,
 ):
     """Follow every paw, and find what must not touch; one thread per (leg, world)."""
     leg, world = wp.tid()
-    world += env.first
-    skill = skills[env.skill[world]]
+    world += episode.first
+    skill = skills[episode.skill[world]]
     down = wp.length(arrays.paw_force[leg, world]) > skill.contact_force
     time_contact(arrays, world, leg, down)  # before the velocity of the step before is written over
     follow_paw(arrays, geometry[leg], world, leg)

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import warp as wp
 
-from jumper_warp.envs.arrays import delay_arrays, env_arrays
+from jumper_warp.envs.arrays import delay_arrays, episode_arrays
 from jumper_warp.kernels.layout import BODIES, COORDS, DOFS
 from jumper_warp.kernels.mdp.observe import LANES, postprocess_obs_kernel
 from jumper_warp.kernels.mdp.view import RobotArrays
@@ -43,8 +43,8 @@ def standing_robots(n: int):
 
 
 def new_worlds(n: int, seed: int = 0, skill=0):
-    """Return `EnvArrays` of worlds that have made no step."""
-    return env_arrays(n, seed, array(np.broadcast_to(skill, n), int), "cpu")
+    """Return `EpisodeArrays` of worlds that have made no step."""
+    return episode_arrays(n, seed, array(np.broadcast_to(skill, n), int), "cpu")
 
 
 def no_delays(n: int, steps=0):

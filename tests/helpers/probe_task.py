@@ -239,7 +239,7 @@ class Probe:
         return self.skill.states.numpy()[name].copy()
 
     def world(self, name: str) -> np.ndarray:
-        """Return an array of `EnvArrays`."""
+        """Return an array of `EpisodeArrays`."""
         return getattr(self.worlds, name).numpy().copy()
 
     def step(self) -> None:

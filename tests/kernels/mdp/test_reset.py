@@ -6,7 +6,7 @@ import warp as wp
 from scipy.spatial.transform import Rotation
 from scipy.stats import kstest
 
-from jumper_warp.kernels.mdp.env import BEGUN, COMMANDED, Delays, EnvArrays, Scene, SkillSettings
+from jumper_warp.kernels.mdp.env import BEGUN, COMMANDED, Delays, EpisodeArrays, Scene, SkillSettings
 from jumper_warp.kernels.mdp.reset import advance_rng_kernel, clear_history_kernel, stand_kernel
 from jumper_warp.kernels.mdp.track import track_kernel
 from jumper_warp.kernels.mdp.view import RobotArrays
@@ -104,12 +104,12 @@ def unchanged(before, after, worlds, but=()):
 def test_a_reset_begins_episodes_in_the_masked_worlds_and_touches_no_other(stage):
     stage.scramble()
     stage.write(value=1.5, other=-1.0, steps=9)
-    before, worlds = values_of(stage.robot, RobotArrays), values_of(stage.worlds, EnvArrays)
+    before, worlds = values_of(stage.robot, RobotArrays), values_of(stage.worlds, EpisodeArrays)
     stage.worlds.broken.fill_(1)
     stage.reset(SOME)
     after = values_of(stage.robot, RobotArrays)
     unchanged(before, after, ~SOME)
-    unchanged(worlds, values_of(stage.worlds, EnvArrays), ~SOME, but=("broken",))
+    unchanged(worlds, values_of(stage.worlds, EpisodeArrays), ~SOME, but=("broken",))
     np.testing.assert_array_equal(stage.world("fresh"), SOME)
     np.testing.assert_array_equal(stage.world("broken"), ~SOME)
     np.testing.assert_array_equal(stage.read("value"), np.where(SOME, 2.5, 1.5))
