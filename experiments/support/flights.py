@@ -120,7 +120,7 @@ class Flights(EvaluationLog):
         forces = np.linalg.norm(env.sim.paw_force.numpy(), axis=2)
         return {"base_pos": q[:, :3].copy(), "tilt": np.arccos(np.clip(up, -1.0, 1.0)), "turn": np.abs(yaw_of(quat)),
                 "rise": qd[:, 2].copy(), "spin": np.linalg.norm(qd[:, 3:6], axis=1), "down": (forces > 0.1).any(axis=0),
-                "ending": env.worlds.ending.numpy().copy(), "momentum": momentum(env.sim)[1]}  # fmt: skip
+                "ending": env.episodes.ending.numpy().copy(), "momentum": momentum(env.sim)[1]}  # fmt: skip
 
     def follow(self, env: Any) -> bool:
         """Look at the environment after a policy step, and ask for a turn where a flight has begun."""

@@ -52,7 +52,7 @@ class Holds(EvaluationLog):
         return {
             "peak": env.sim.physics.peak_paw_force.numpy().T.copy(),
             "force": np.linalg.norm(env.sim.paw_force.numpy(), axis=2).T.copy(),
-            "torque": env.sim.torque.numpy().T.copy(), "ending": env.worlds.ending.numpy().copy(),
+            "torque": env.sim.torque.numpy().T.copy(), "ending": env.episodes.ending.numpy().copy(),
         }  # fmt: skip
 
     def update(self, arrays: dict[str, np.ndarray], step_dt: float) -> bool:

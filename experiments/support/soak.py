@@ -136,7 +136,7 @@ def soak_env(env: Env, args: SoakArgs) -> dict:
     """
     env.reset()
     apart = [term.name for term in env.task.terminations].index("came_apart")
-    ending, totals, action = wp.to_torch(env.worlds.ending), Totals(env.sim), torch.zeros_like(env.action)
+    ending, totals, action = wp.to_torch(env.episodes.ending), Totals(env.sim), torch.zeros_like(env.action)
 
     def some() -> None:
         action.uniform_(-1.0, 1.0)

@@ -48,7 +48,7 @@ class GymVectorEnv(gymnasium.vector.VectorEnv):
         self.env, self.num_envs = env, env.num_envs
         self.endings = tuple(term.name for term in env.task.terminations)
         self._all_groups, self._tensors, self._began = all_groups, tensors, False
-        self._ending = wp.to_torch(env.worlds.ending)
+        self._ending = wp.to_torch(env.episodes.ending)
         widths = {"policy": env.num_obs, "critic": env.num_critic_obs}
         boxes = {group: Box(-RAW_LIMIT, RAW_LIMIT, (width,)) for group, width in widths.items()}
         self.single_observation_space = Dict([*boxes.items()]) if all_groups else boxes["policy"]

@@ -66,7 +66,7 @@ class Stages:
         self.skills = [TaskRuntime(task, i, n, self.step_dt, sim.substeps, device) for i, task in enumerate(tasks)]
         self.parameters = robot_parameters(sim, tuple(tasks), active)
         self.robot, self._scene = robot_arrays(sim, self.step_dt), scene_of(sim)
-        self.worlds = episode_arrays(n, self.seed, active, device)
+        self.episodes = episode_arrays(n, self.seed, active, device)
         self.delays = delay_arrays(n, self.parameters.latency, sim.substeps, device)
         for each in self.skills:
             each.observations.latency = self.parameters.observation_latency
@@ -81,7 +81,7 @@ class Stages:
 
     def restored(self) -> None:
         """Let the solver and the terms read what was put back."""
-        self._started = bool((self.worlds.clock.numpy() > FIRST_CLOCK).all())
+        self._started = bool((self.episodes.clock.numpy() > FIRST_CLOCK).all())
         for skill in self.skills:
             skill.params.restore()
         self.sim.physics.parameters_changed()
@@ -99,10 +99,10 @@ class Stages:
     def _part(self, worlds: Worlds | None = None) -> Part:
         """Return some of the worlds as stages are launched for them, by default all."""
         if worlds is None or worlds.count == self.num_envs:
-            return Part(0, self.num_envs, self.worlds)
+            return Part(0, self.num_envs, self.episodes)
         env = EpisodeArrays()
         for name in EpisodeArrays.vars:
-            setattr(env, name, getattr(self.worlds, name))
+            setattr(env, name, getattr(self.episodes, name))
         env.first = worlds.first
         return Part(*worlds, env)
 
@@ -147,7 +147,7 @@ class Stages:
         self._hand_over(part)
         begins = self.auto_reset and self._ends_episodes
         if begins:
-            self._reset_worlds(part, self.worlds.done)
+            self._reset_worlds(part, self.episodes.done)
         if self._handovers or begins:
             self._observe(part, beginning=1)
 
@@ -209,7 +209,7 @@ class Stages:
         self.sim.physics.after_reset(mask)
 
     def _advance_rng(self, mask: wp.array) -> None:
-        self._launch(advance_rng_kernel, self.num_envs, [mask, self.worlds])
+        self._launch(advance_rng_kernel, self.num_envs, [mask, self.episodes])
 
     def _observe(self, part: Part, beginning: int) -> None:
         for skill in self.skills:
@@ -233,5 +233,5 @@ class Stages:
         for skill in self.skills:
             self._launch(
                 skill.kernels["give"], self.num_envs,
-                [skill.index, mask, begins, commands, headings, self._scene, self.robot, self.worlds, skill.states],
+                [skill.index, mask, begins, commands, headings, self._scene, self.robot, self.episodes, skill.states],
             )  # fmt: skip

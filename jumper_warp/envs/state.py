@@ -125,7 +125,7 @@ def _records(env: Stages) -> dict[str, wp.array]:
 def _tensors(env: Stages) -> dict[str, torch.Tensor]:
     """Return views of the environment's own memory by name."""
     found: dict[str, Any] = {}
-    structs = (("robot", RobotArrays, env.robot), ("env", EpisodeArrays, env.worlds), ("delays", Delays, env.delays),
+    structs = (("robot", RobotArrays, env.robot), ("env", EpisodeArrays, env.episodes), ("delays", Delays, env.delays),
                ("parameters", RobotParameters, env.parameters))  # fmt: skip
     for prefix, kind, struct in structs:
         for name in kind.vars:

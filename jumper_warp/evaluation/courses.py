@@ -110,8 +110,8 @@ class Course(EvaluationLog):
         q, qd = env.sim.joint_q(), env.sim.joint_qd()
         seen = {
             "base_pos": q[:, :3].copy(), "base_quat": q[:, 3:7].copy(), "base_ang_vel": qd[:, 3:6].copy(),
-            "base_vel": env.sim.base_velocity(), "skill": env.worlds.skill.numpy().copy(),
-            "ending": env.worlds.ending.numpy().copy(),
+            "base_vel": env.sim.base_velocity(), "skill": env.episodes.skill.numpy().copy(),
+            "ending": env.episodes.ending.numpy().copy(),
             "force": np.linalg.norm(env.sim.paw_force.numpy(), axis=2).T,
         }  # fmt: skip
         rows = np.arange(len(q))

@@ -54,7 +54,7 @@ def open_loop_limits(env: Env, fresh: dict[str, Any]) -> np.ndarray:
         level = open_loop_action(step)
         env.step(torch.tensor([0.0, level, level] * 4, device=env.device).repeat(env.num_envs, 1))
         arrays = env.task_arrays()
-        broken |= env.worlds.broken.numpy() != 0
+        broken |= env.episodes.broken.numpy() != 0
         if step >= STAND + RAMP + HOLD:
             highest = np.fmax(highest, arrays["base_pos"][:, 2])
     for name, value in pushes.items():

@@ -237,7 +237,7 @@ def test_a_seed_makes_what_a_new_environment_of_it_makes(redraw):
     envs, new = (GymVectorEnv(jumper(task=task, seed=seed)) for seed in (1, 5))
     envs.reset()
     played(envs)
-    envs.env.worlds.level.fill_(2)  # as if the curriculum had gone on
+    envs.env.episodes.level.fill_(2)  # as if the curriculum had gone on
     np.testing.assert_array_equal(envs.reset(seed=5)[0], new.reset()[0])
     assert_same(played(envs), played(new))
     np.testing.assert_array_equal(envs.reset()[0], new.reset()[0])
@@ -246,11 +246,11 @@ def test_a_seed_makes_what_a_new_environment_of_it_makes(redraw):
 def test_a_seed_brings_every_world_back_to_its_first_task():
     env = jumper(2, task=[TASK, dataclasses.replace(TASK, name="other")], skill=np.array([1, 0]))
     env.reset()
-    env.worlds.skill.zero_()
+    env.episodes.skill.zero_()
     env.requested_task(1)
     env.reset(seed=5)
-    assert env.worlds.skill.numpy().tolist() == [1, 0]
-    assert env.worlds.requested_task.numpy().tolist() == [-1, -1]
+    assert env.episodes.skill.numpy().tolist() == [1, 0]
+    assert env.episodes.requested_task.numpy().tolist() == [-1, -1]
 
 
 def test_seeds_reproduce_and_differ():
@@ -345,14 +345,14 @@ def test_rsl_rl_trains_on_the_environment(one_thread):
     env = jumper()
     adapter = RslRlVecEnv(env, metrics_every=SMALL.num_steps)
     adapter.reset()
-    before = env.worlds.clock.numpy().copy()
+    before = env.episodes.clock.numpy().copy()
     runner = OnPolicyRunner(adapter, rsl_rl_config(SMALL, 100, 0), log_dir=None, device="cpu")
     old = [p.detach().clone() for p in runner.alg.actor.parameters()]
     runner.learn(2, init_at_random_ep_len=True)
     new = list(runner.alg.actor.parameters())
     assert all(p.isfinite().all() for p in new)
     assert any(not torch.equal(a, b) for a, b in zip(old, new, strict=True))
-    assert (env.worlds.clock.numpy() - before == 2 * SMALL.num_steps).all()
+    assert (env.episodes.clock.numpy() - before == 2 * SMALL.num_steps).all()
 
 
 def test_rsl_rl_bootstraps_time_outs_but_not_failures(one_thread):

@@ -69,7 +69,7 @@ def rollout():
         expected.append(expected_terms(TASK, before, after, action.clamp(-1.0, 1.0).numpy().T))
         rewarded.append(env.reward.clone().numpy())
         phases.append(after["phase"])
-        env._begin(env._part(), wp.clone(env.worlds.done))
+        env._begin(env._part(), wp.clone(env.episodes.done))
     return np.array(logged), np.array(expected), np.array(rewarded), np.array(phases)
 
 
@@ -182,7 +182,7 @@ def test_a_new_episode_leaves_other_worlds_alone():
         assert torch.equal(getattr(one, name)[rest], getattr(other, name)[rest]), name
     np.testing.assert_array_equal(one.sim.joint_q()[rest], other.sim.joint_q()[rest])
     np.testing.assert_array_equal(one.sim.joint_qd()[rest], other.sim.joint_qd()[rest])
-    np.testing.assert_array_equal(one.worlds.clock.numpy()[rest], other.worlds.clock.numpy()[rest])
+    np.testing.assert_array_equal(one.episodes.clock.numpy()[rest], other.episodes.clock.numpy()[rest])
     for name, values in drawn_of(one).items():
         np.testing.assert_array_equal(values[..., rest], drawn_of(other)[name][..., rest], err_msg=name)
     assert (one.skills[0].states.numpy()[rest] == other.skills[0].states.numpy()[rest]).all()

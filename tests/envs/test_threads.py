@@ -84,7 +84,7 @@ def test_an_environment_has_the_same_bits_on_any_number_of_threads(alone, thread
     rows, env = alone[0], alone[-1]
     assert (rows[..., -2].sum(0) > 1).all() and rows[..., -2].sum(0).unique().numel() > 1
     assert len(np.unique(env.parameters.push.numpy(), axis=0)) > N // 4
-    assert env.worlds.level.numpy().max() > 0
+    assert env.episodes.level.numpy().max() > 0
     assert_same(story(threads), alone)
 
 

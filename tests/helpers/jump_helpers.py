@@ -115,7 +115,7 @@ class Robots:
         self.com, self.action, self.offset = np.zeros(3), np.zeros((12, n)), np.zeros((12, n))
         self.force, self.heights = np.zeros((4, n, 3)), np.zeros((1, 1))
         self.tasks = [make_episode(goal=(0.0, 0.0, 0.8), command_step=5)] * n
-        self.worlds = new_worlds(n, seed=7919)
+        self.episodes = new_worlds(n, seed=7919)
 
     def observe(self, noise: bool = False) -> np.ndarray:
         """Return the actor's observations, (n, 48); draws go on from call to call."""
@@ -133,8 +133,8 @@ class Robots:
         ground.heights = array(self.heights)
         ground.rows, ground.cols = self.heights.shape if self.heights.size > 1 else (0, 0)
         ground.half_x = ground.half_y = 2.0
-        observe(skill, robot, RobotParameters(), ground, self.worlds, tasks, self.numbers[noise])
-        self.worlds.clock.assign(self.worlds.clock.numpy() + 1)
+        observe(skill, robot, RobotParameters(), ground, self.episodes, tasks, self.numbers[noise])
+        self.episodes.clock.assign(self.episodes.clock.numpy() + 1)
         return skill.obs["policy"].double().numpy().copy(), skill.obs["critic"].double().numpy().copy()
 
 
@@ -187,7 +187,7 @@ def edit_episodes(env: Env, worlds=slice(None), **fields) -> None:
     records = states.numpy().copy()
     for name, value in fields.items():
         if name in OF_WORLD:
-            kept = getattr(env.worlds, name)
+            kept = getattr(env.episodes, name)
             values = kept.numpy().copy()
             values[worlds] = value
             kept.assign(values)
@@ -200,7 +200,7 @@ def episodes_of(env: Env) -> dict[str, np.ndarray]:
     """Return copies of all fields of worlds' episodes, and their level and streak."""
     records = env.skills[0].states.numpy()
     fields = {name: records[name].copy() for name in records.dtype.names}
-    return fields | {name: getattr(env.worlds, name).numpy().copy() for name in OF_WORLD}
+    return fields | {name: getattr(env.episodes, name).numpy().copy() for name in OF_WORLD}
 
 
 def edit_coordinates(env: Env, world: int, *, q: dict | None = None, qd: dict | None = None) -> None:

@@ -219,11 +219,11 @@ class Probe:
         """index: of the skill."""
         self.n, self.task = n, probe_task() if task is None else task
         self.skill = TaskRuntime(self.task, index, n, STEP_DT, SUBSTEPS, "cpu")
-        self.robot, self.worlds, self.delays = standing_robots(n), new_worlds(n, seed), no_delays(n)
+        self.robot, self.episodes, self.delays = standing_robots(n), new_worlds(n, seed), no_delays(n)
         self.parameters, self.ground = RobotParameters(), Ground()
         self.ground.heights = array(np.zeros((1, 1)))
         self.parameters.latency = array(np.zeros(n), int)
-        self.parameters.skill = self.worlds.skill
+        self.parameters.skill = self.episodes.skill
         self.latency = array(np.zeros(n), int)
         self.skill.observations.latency = self.latency
 
@@ -240,24 +240,24 @@ class Probe:
 
     def world(self, name: str) -> np.ndarray:
         """Return an array of `EpisodeArrays`."""
-        return getattr(self.worlds, name).numpy().copy()
+        return getattr(self.episodes, name).numpy().copy()
 
     def step(self) -> None:
         """Launch the end of a step."""
         skill = self.skill
-        inputs = [skill.index, self.robot, self.ground, len(self.task.levels), skill.params.values, self.worlds,
+        inputs = [skill.index, self.robot, self.ground, len(self.task.levels), skill.params.values, self.episodes,
                   skill.states, skill.term_value, skill.counters]  # fmt: skip
         wp.launch(skill.kernels["step"], self.n, inputs, device="cpu")
 
     def observe(self, beginning: int = 0) -> None:
         """Launch the observation."""
         states, numbers = self.skill.states, self.skill.params.values
-        observe(self.skill, self.robot, self.parameters, self.ground, self.worlds, states, numbers, beginning)
+        observe(self.skill, self.robot, self.parameters, self.ground, self.episodes, states, numbers, beginning)
 
     def next_clock(self) -> None:
         """Let all worlds be one policy step further on, and no longer new."""
-        self.worlds.clock.assign(self.worlds.clock.numpy() + 1)
-        self.worlds.history_reset.zero_()
+        self.episodes.clock.assign(self.episodes.clock.numpy() + 1)
+        self.episodes.history_reset.zero_()
 
     def obs(self, group: str, final: bool = False) -> np.ndarray:
         """Return an observation group, (n, columns)."""

@@ -207,7 +207,7 @@ def test_shares_of_time_are_met_however_long_episodes_are():
         schemes.append(episodes_of(env)["scheme"])
         resets += np.bincount(schemes[-1], minlength=6)
         edit_episodes(env, steps=length[schemes[-1]])
-        env.worlds.done.fill_(1.0)
+        env.episodes.done.fill_(1.0)
         env.reset()
     wanted = np.array([0.40, 0.15, 0.15, 0.15, 0.05, 0.10])
     time = resets * length

@@ -30,7 +30,7 @@ class Commands:
     def __init__(self, n, tasks=(), delay=0):
         """tasks: of the skills, (by default one); delay [physics steps]: of each world."""
         skills = [TaskRuntime(task, i, n, STEP_DT, SUBSTEPS, "cpu") for i, task in enumerate(tasks or [probe_task()])]
-        self.n, self.robot, self.worlds = n, standing_robots(n), new_worlds(n)
+        self.n, self.robot, self.episodes = n, standing_robots(n), new_worlds(n)
         self.delays = no_delays(n, delay)
         self.settings = wp.array([s.settings_of_skill() for s in skills], dtype=SkillSettings, device="cpu")
         self.push = wp.zeros(n, dtype=wp.spatial_vector, device="cpu")
@@ -39,9 +39,9 @@ class Commands:
     def act(self, action):
         """Begin a step with an action, (n, 12) or (skills, n, 12)."""
         action = array(np.reshape(action, (-1, self.n, 12)))
-        inputs = [action, self.settings, self.push, self.robot, self.worlds, self.delays]
+        inputs = [action, self.settings, self.push, self.robot, self.episodes, self.delays]
         wp.launch(action_kernel, (4, self.n), inputs, device="cpu")
-        wp.launch(advance_rng_kernel, self.n, [array(np.ones(self.n)), self.worlds], device="cpu")
+        wp.launch(advance_rng_kernel, self.n, [array(np.ones(self.n)), self.episodes], device="cpu")
 
     def motors(self, name):
         """Return an array of the motors, (n, 12)."""
@@ -72,7 +72,7 @@ def test_an_action_is_clamped_and_scaled_about_the_default_pose():
 def test_a_world_takes_the_action_and_the_scale_of_its_own_skill():
     other = dataclasses.replace(probe_task(), name="other", action_scale=(30.0, 45.0))
     commands = Commands(32, [probe_task(), other])
-    commands.worlds.skill.assign(np.arange(32) % 2)
+    commands.episodes.skill.assign(np.arange(32) % 2)
     actions = np.stack([random_action(32, seed=1), random_action(32, seed=2)])
     commands.act(actions)
     odd = (np.arange(32) % 2 == 1)[:, None]
@@ -123,7 +123,7 @@ def test_an_action_that_is_not_finite_counts_as_0_and_is_told(bad):
     commands.act(action)
     expected = np.where(np.isfinite(action), action, 0.0)
     np.testing.assert_array_equal(commands.motors("action"), expected)
-    assert commands.worlds.bad_action.numpy().tolist() == [0, 0, 0, 1, 0, 1, 0, 0]
+    assert commands.episodes.bad_action.numpy().tolist() == [0, 0, 0, 1, 0, 1, 0, 0]
 
 
 # ---------------------------------------------------------------- latency
@@ -152,7 +152,7 @@ def test_motors_follow_the_target_of_as_many_physics_steps_ago_as_the_latency():
 
 def test_the_ring_goes_on_over_thousands_of_steps():
     commands = Commands(len(DELAYS), delay=DELAYS)
-    commands.worlds.clock.fill_(2**20 - 3)
+    commands.episodes.clock.fill_(2**20 - 3)
     past = [np.tile(DEFAULT_ANGLE, (len(DELAYS), 1)).astype(np.float32)] * 8
     for step in range(40):
         commands.act(0.2 * random_action(len(DELAYS), seed=step))
@@ -206,7 +206,7 @@ def test_a_drawn_latency_is_the_one_that_acts():
 def test_a_push_acts_on_the_base_while_a_paw_is_down_or_in_the_air_too_where_the_skill_says_so():
     flying = probe_task(name="flying", randomization=dataclasses.replace(RandomizationCfg.off(), push_in_flight=True))
     commands = Commands(8, [probe_task(), flying])
-    commands.worlds.skill.assign([0, 0, 0, 0, 1, 1, 1, 1])
+    commands.episodes.skill.assign([0, 0, 0, 0, 1, 1, 1, 1])
     wrench = np.arange(48.0).reshape(8, 6) + 1.0
     commands.push.assign(wrench)
     time = np.zeros((4, 8))
@@ -221,8 +221,8 @@ def test_a_push_acts_on_the_base_while_a_paw_is_down_or_in_the_air_too_where_the
 
 def test_a_step_moves_the_clock_on_and_nothing_is_new_any_more():
     env = make_env(4)
-    env.worlds.history_reset.fill_(1)
-    clock = env.worlds.clock.numpy().copy()
+    env.episodes.history_reset.fill_(1)
+    clock = env.episodes.clock.numpy().copy()
     env.step(torch.zeros(4, 12))
-    np.testing.assert_array_equal(env.worlds.clock.numpy(), clock + 1)
-    assert not env.worlds.history_reset.numpy().any()
+    np.testing.assert_array_equal(env.episodes.clock.numpy(), clock + 1)
+    assert not env.episodes.history_reset.numpy().any()

@@ -120,10 +120,10 @@ def test_the_state_moves_on_before_it_is_judged(probe):
 def test_worlds_of_another_skill_are_passed_over(probe):
     random_state(probe)
     away = np.arange(N) % 3 == 0
-    probe.worlds.skill.assign(np.where(away, 1, 0))
+    probe.episodes.skill.assign(np.where(away, 1, 0))
     probe.write(other=2.0e3)
     for name in ("reward", "done", "timeout", "ending", "broken"):
-        write(getattr(probe.worlds, name), slice(None), 5)
+        write(getattr(probe.episodes, name), slice(None), 5)
     before = probe.skill.states.numpy().copy()
     probe.step()
     np.testing.assert_array_equal(probe.skill.states.numpy()[away], before[away])
@@ -160,7 +160,7 @@ def break_world(probe, how, world):
     if how == "invalid":
         write(probe.robot.invalid, world, 1)
     elif how == "action":
-        write(probe.worlds.bad_action, world, 1)
+        write(probe.episodes.bad_action, world, 1)
     elif how == "fast":
         write(probe.robot.joint_qd, 38 * world + 2, 15.1)
     else:
@@ -218,7 +218,7 @@ def test_anything_else_breaks_the_row(probe, failure):
 
 
 def test_a_broken_world_is_no_success(probe):
-    write(probe.worlds.streak, slice(None), 2)
+    write(probe.episodes.streak, slice(None), 2)
     break_world(probe, "invalid", 0)
     end(probe)
     assert probe.world("level").tolist() == [0] + [1] * (N - 1)
