@@ -17,7 +17,7 @@ from jumper_warp.tasks.cfg import Handover, TaskCfg
 from jumper_warp.tasks.commands import check_commands
 from jumper_warp.utils.errors import InputError
 
-FIRST_CLOCK = 2 * RING
+FIRST_STEP_COUNT = 2 * RING
 """Of every world, so that rings can look back from the first step on."""
 
 
@@ -55,7 +55,7 @@ def episode_arrays(num_envs: int, seed: int, skill: wp.array, device: Any) -> An
     fill(episode, counts, num_envs, int, device)
     fill(episode, ("reward", "done", "timeout"), num_envs, float, device)
     fill(episode, ("terminated", "truncated"), num_envs, wp.bool, device)
-    episode.clock = wp.full(num_envs, FIRST_CLOCK, dtype=int, device=device)
+    episode.step_count = wp.full(num_envs, FIRST_STEP_COUNT, dtype=int, device=device)
     episode.requested_task.fill_(-1)
     return episode
 

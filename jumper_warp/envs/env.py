@@ -12,7 +12,7 @@ import warp as wp
 from jumper_warp.diff.actuation import MOTOR_CONSTANTS
 from jumper_warp.diff.snapshot import Snapshot, compact_columns
 from jumper_warp.envs.arrays import (
-    FIRST_CLOCK,
+    FIRST_STEP_COUNT,
     checked_action,
     checked_commands,
     checked_mask,
@@ -171,7 +171,7 @@ class Env(Stages):
         self.seed = self.episodes.seed = seed
         self._started = False
         self._graphs.clear()  # they hold the old seed
-        for array, value in ((self.episodes.clock, FIRST_CLOCK), (self.episodes.requested_task, -1),
+        for array, value in ((self.episodes.step_count, FIRST_STEP_COUNT), (self.episodes.requested_task, -1),
                              (self.episodes.has_command, 0), (self.episodes.level, 0),
                              (self.episodes.streak, 0)):  # fmt: skip
             array.fill_(value)
@@ -292,7 +292,7 @@ class Env(Stages):
     def snapshot(self) -> Snapshot:
         """Return the robots, their parameters and their state, as gradients need them; waits for nothing."""
         sim, n = self.sim, self.num_envs
-        past, clock = wp.to_torch(self.delays.past_target), wp.to_torch(self.episodes.clock).long()
+        past, step_count = wp.to_torch(self.delays.past_target), wp.to_torch(self.episodes.step_count).long()
         parameters = {name: wp.to_torch(getattr(sim.motors, name)) for name in MOTOR_CONSTANTS}
         dynamics = sim.physics.dynamics
         return Snapshot(
@@ -308,7 +308,7 @@ class Env(Stages):
             | {"table": wp.to_torch(dynamics.robot.table), "latency": wp.to_torch(self.parameters.latency) * sim.dt},
             q=compact_columns(wp.to_torch(self.robot.joint_q).view(n, -1), 7),
             qd=compact_columns(wp.to_torch(self.robot.joint_qd).view(n, -1), 6),
-            before=past[(clock - 1) % len(past), :, torch.arange(n, device=self.device)].T,
+            before=past[(step_count - 1) % len(past), :, torch.arange(n, device=self.device)].T,
             impulse=wp.to_torch(self.robot.impulse),
             action=wp.to_torch(self.robot.action),
             torque=wp.to_torch(self.robot.torque),

@@ -8,7 +8,14 @@ from typing import Any, NamedTuple
 import numpy as np
 import warp as wp
 
-from jumper_warp.envs.arrays import FIRST_CLOCK, checked_skill, delay_arrays, episode_arrays, robot_arrays, scene_of
+from jumper_warp.envs.arrays import (
+    FIRST_STEP_COUNT,
+    checked_skill,
+    delay_arrays,
+    episode_arrays,
+    robot_arrays,
+    scene_of,
+)
 from jumper_warp.envs.parameters import robot_parameters
 from jumper_warp.envs.skill import TaskRuntime
 from jumper_warp.kernels.mdp import attempts, events
@@ -81,7 +88,7 @@ class Stages:
 
     def restored(self) -> None:
         """Let the solver and the terms read what was put back."""
-        self._started = bool((self.episodes.clock.numpy() > FIRST_CLOCK).all())
+        self._started = bool((self.episodes.step_count.numpy() > FIRST_STEP_COUNT).all())
         for skill in self.skills:
             skill.params.restore()
         self.sim.physics.parameters_changed()

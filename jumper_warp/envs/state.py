@@ -10,7 +10,7 @@ import numpy as np
 import torch
 import warp as wp
 
-from jumper_warp.envs.arrays import FIRST_CLOCK
+from jumper_warp.envs.arrays import FIRST_STEP_COUNT
 from jumper_warp.kernels.mdp.env import RING, Delays, EpisodeArrays
 from jumper_warp.kernels.mdp.parameters import RobotParameters
 from jumper_warp.kernels.mdp.view import RobotArrays
@@ -96,7 +96,7 @@ def _check_indices(env: Stages, state: dict[str, torch.Tensor]) -> None:
     bounds = {
         "env.level": (0, max(len(skill.task.levels) for skill in env.skills)),
         "env.skill": (0, len(env.skills) - 1),
-        "env.clock": (FIRST_CLOCK, math.inf),
+        "env.step_count": (FIRST_STEP_COUNT, math.inf),
         "parameters.latency": (0, longest),
         "parameters.observation_latency": (0, longest),
     }

@@ -25,11 +25,11 @@ def remember(arrays: RobotArrays, push: wp.array(dtype=wp.spatial_vector), push_
 
 
 @wp.func
-def delayed(delays: Delays, clock: int, world: int, m: int):
+def delayed(delays: Delays, step_count: int, world: int, m: int):
     """Choose what a motor follows: the target of as many physics steps ago as the latency asks for."""
     whole = delays.steps[world] // delays.substeps
-    delays.late_target[m, world] = delays.past_target[(clock - whole) % RING, m, world]
-    delays.earlier_target[m, world] = delays.past_target[(clock - whole - 1) % RING, m, world]
+    delays.late_target[m, world] = delays.past_target[(step_count - whole) % RING, m, world]
+    delays.earlier_target[m, world] = delays.past_target[(step_count - whole - 1) % RING, m, world]
     if m == 0:
         delays.late_steps[world] = delays.steps[world] - whole * delays.substeps
 
@@ -72,12 +72,12 @@ def action_kernel(
         angles[j] = angles[j] + arrays.joint_offset[m, world]
         target[j] = action * skill.action_scale[m] + arrays.default_angle[m]
     safe = filter_leg(target, angles, rates, skill.command_filter)
-    clock = episode.clock[world]
+    step_count = episode.step_count[world]
     for j in range(3):
         m = 3 * leg + j
         arrays.target[m, world] = target[j]
         arrays.safe_target[m, world] = safe[j]
-        delays.past_target[clock % RING, m, world] = safe[j]
-        delayed(delays, clock, world, m)
+        delays.past_target[step_count % RING, m, world] = safe[j]
+        delayed(delays, step_count, world, m)
     if leg == 0:
         remember(arrays, push, skill.push_in_flight, world)

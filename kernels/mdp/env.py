@@ -35,7 +35,7 @@ class EpisodeArrays:
 
     seed: int
     first: int  # world of the first thread of a launch
-    clock: wp.array(dtype=int)  # policy steps made; with the seed, all state of the random numbers
+    step_count: wp.array(dtype=int)  # policy steps made; with the seed, all state of the random numbers
     skill: wp.array(dtype=int)  # index of the task that a world is in
     requested_task: wp.array(dtype=int)  # skill that is asked for, -1: none
     pending_command: wp.array(dtype=wp.vec4)  # command that the skill is given when it takes over

@@ -52,7 +52,7 @@ def make_event_kernel(slots: list) -> wp.Kernel:
             return
         for i in range(wp.static(len(slots))):
             if row == i and (wp.static(bool(slots[i].spread)) or lane == 0):
-                draw = make_stream(episode.seed, world, episode.clock[world], EVENT + 100 * stage + i)
+                draw = make_stream(episode.seed, world, episode.step_count[world], EVENT + 100 * stage + i)
                 if wp.static(bool(slots[i].spread)):
                     draw.lane = lane
                     draw.lanes = lanes

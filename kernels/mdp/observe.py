@@ -159,16 +159,16 @@ class Moment:
 @wp.func
 def moment(episode: EpisodeArrays, arrays: ObservationArrays, world: int) -> Moment:
     """Return what a world's components have in common."""
-    clock = episode.clock[world]
+    step_count = episode.step_count[world]
     whole = arrays.latency[world] // arrays.substeps
     m = Moment()
     m.world = world
-    m.draws = step_key(episode.seed, world, clock)
+    m.draws = step_key(episode.seed, world, step_count)
     m.fresh = episode.history_reset[world]
     m.broken = episode.broken[world] != 0
-    m.now = clock % RING
-    m.newer = (clock - whole) % RING
-    m.older = (clock - whole - 1) % RING
+    m.now = step_count % RING
+    m.newer = (step_count - whole) % RING
+    m.older = (step_count - whole - 1) % RING
     m.share = float(arrays.latency[world] - whole * arrays.substeps) / float(arrays.substeps)
     return m
 

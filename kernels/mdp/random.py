@@ -24,9 +24,9 @@ class RngStream:
 
 
 @wp.func
-def step_key(seed: int, world: int, clock: int) -> wp.uint32:
+def step_key(seed: int, world: int, step_count: int) -> wp.uint32:
     """Return what the numbers of all streams at one moment begin with; clock: policy steps that the world has made."""
-    return wp.rand_init(int(wp.rand_init(seed, world)), clock)
+    return wp.rand_init(int(wp.rand_init(seed, world)), step_count)
 
 
 @wp.func
@@ -40,9 +40,9 @@ def stream_at(moment: wp.uint32, world: int, stream: int) -> RngStream:
 
 
 @wp.func
-def make_stream(seed: int, world: int, clock: int, stream: int) -> RngStream:
+def make_stream(seed: int, world: int, step_count: int, stream: int) -> RngStream:
     """Return the numbers of a stream; clock: policy steps that the world has made."""
-    return stream_at(step_key(seed, world, clock), world, stream)
+    return stream_at(step_key(seed, world, step_count), world, stream)
 
 
 @wp.func

@@ -62,7 +62,7 @@ def make_reset_kernel(task: Any) -> wp.Kernel:
             commanded = wp.static(due)(states[world])
         if not (begins or commanded):
             return
-        draw = make_stream(episode.seed, world, episode.clock[world], RESET)
+        draw = make_stream(episode.seed, world, episode.step_count[world], RESET)
         draw.lane = lane
         draw.lanes = lanes
         level = episode.level[world]
@@ -79,7 +79,7 @@ def make_reset_kernel(task: Any) -> wp.Kernel:
         elif wp.static(command is not None):
             if lane == 0:
                 robot = load_view(arrays, scene.ground, world)
-                fresh = make_stream(episode.seed, world, episode.clock[world], COMMAND)
+                fresh = make_stream(episode.seed, world, episode.step_count[world], COMMAND)
                 states[world] = wp.static(command)(robot, scene, states[world], levels[level], fresh)
                 episode.history_reset[world] = COMMANDED
 
@@ -184,7 +184,7 @@ def advance_rng_kernel(
     """Move the clock on where mask is not 0, so that what follows draws anew; one thread per world."""
     world = wp.tid()
     if mask[world] != 0.0:
-        episode.clock[world] = episode.clock[world] + 1
+        episode.step_count[world] = episode.step_count[world] + 1
 
 
 @wp.kernel

@@ -49,7 +49,7 @@ def write_outcome(
     episode.broken[world] = wp.where(broken, 1, 0)
     counters.bad_actions[world] = counters.bad_actions[world] + episode.bad_action[world]
     episode.bad_action[world] = 0
-    episode.clock[world] = episode.clock[world] + 1
+    episode.step_count[world] = episode.step_count[world] + 1
     episode.history_reset[world] = 0
 
 

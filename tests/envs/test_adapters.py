@@ -345,14 +345,14 @@ def test_rsl_rl_trains_on_the_environment(one_thread):
     env = jumper()
     adapter = RslRlVecEnv(env, metrics_every=SMALL.num_steps)
     adapter.reset()
-    before = env.episodes.clock.numpy().copy()
+    before = env.episodes.step_count.numpy().copy()
     runner = OnPolicyRunner(adapter, rsl_rl_config(SMALL, 100, 0), log_dir=None, device="cpu")
     old = [p.detach().clone() for p in runner.alg.actor.parameters()]
     runner.learn(2, init_at_random_ep_len=True)
     new = list(runner.alg.actor.parameters())
     assert all(p.isfinite().all() for p in new)
     assert any(not torch.equal(a, b) for a, b in zip(old, new, strict=True))
-    assert (env.episodes.clock.numpy() - before == 2 * SMALL.num_steps).all()
+    assert (env.episodes.step_count.numpy() - before == 2 * SMALL.num_steps).all()
 
 
 def test_rsl_rl_bootstraps_time_outs_but_not_failures(one_thread):

@@ -182,7 +182,7 @@ def test_a_new_episode_leaves_other_worlds_alone():
         assert torch.equal(getattr(one, name)[rest], getattr(other, name)[rest]), name
     np.testing.assert_array_equal(one.sim.joint_q()[rest], other.sim.joint_q()[rest])
     np.testing.assert_array_equal(one.sim.joint_qd()[rest], other.sim.joint_qd()[rest])
-    np.testing.assert_array_equal(one.episodes.clock.numpy()[rest], other.episodes.clock.numpy()[rest])
+    np.testing.assert_array_equal(one.episodes.step_count.numpy()[rest], other.episodes.step_count.numpy()[rest])
     for name, values in drawn_of(one).items():
         np.testing.assert_array_equal(values[..., rest], drawn_of(other)[name][..., rest], err_msg=name)
     assert (one.skills[0].states.numpy()[rest] == other.skills[0].states.numpy()[rest]).all()

@@ -134,7 +134,7 @@ class Robots:
         ground.rows, ground.cols = self.heights.shape if self.heights.size > 1 else (0, 0)
         ground.half_x = ground.half_y = 2.0
         observe(skill, robot, RobotParameters(), ground, self.episodes, tasks, self.numbers[noise])
-        self.episodes.clock.assign(self.episodes.clock.numpy() + 1)
+        self.episodes.step_count.assign(self.episodes.step_count.numpy() + 1)
         return skill.obs["policy"].double().numpy().copy(), skill.obs["critic"].double().numpy().copy()
 
 

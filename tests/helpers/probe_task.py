@@ -256,7 +256,7 @@ class Probe:
 
     def next_clock(self) -> None:
         """Let all worlds be one policy step further on, and no longer new."""
-        self.episodes.clock.assign(self.episodes.clock.numpy() + 1)
+        self.episodes.step_count.assign(self.episodes.step_count.numpy() + 1)
         self.episodes.history_reset.zero_()
 
     def obs(self, group: str, final: bool = False) -> np.ndarray:

@@ -24,8 +24,8 @@ QUAT = np.array([-1.0, 1.0, -1.0, 1.0])
 
 def task():
     """The task on rough ground with a clock, so that every term of all velocity tasks is there."""
-    rough, clock = make_task("velocity-rough"), ObservationTerm(velocity.clock)
-    return dataclasses.replace(rough, policy=(*rough.policy, clock), critic=(*rough.critic, clock))
+    rough, step_count = make_task("velocity-rough"), ObservationTerm(velocity.step_count)
+    return dataclasses.replace(rough, policy=(*rough.policy, step_count), critic=(*rough.critic, step_count))
 
 
 def reflected(values, change):
