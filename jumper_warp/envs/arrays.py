@@ -50,7 +50,16 @@ def episode_arrays(num_envs: int, seed: int, skill: wp.array, device: Any) -> An
     """Return the kernels' `EpisodeArrays`."""
     episode = EpisodeArrays()
     episode.seed, episode.skill = seed, skill
-    counts = ("requested_task", "has_command", "history_reset", "ending", "broken", "bad_action", "level", "streak")
+    counts = (
+        "requested_task",
+        "has_command",
+        "history_reset",
+        "termination",
+        "broken",
+        "bad_action",
+        "level",
+        "streak",
+    )
     fill(episode, ("pending_command",), num_envs, wp.vec4, device)
     fill(episode, counts, num_envs, int, device)
     fill(episode, ("reward", "done", "timeout"), num_envs, float, device)

@@ -287,7 +287,7 @@ class Env(Stages):
         arrays = {name: np.array(state[name]) for name in state.dtype.names or ()}
         q, qd = self.sim.joint_q(), self.sim.joint_qd()
         arrays |= {"base_pos": q[:, :3].copy(), "base_quat": q[:, 3:7].copy(), "base_vel": qd[:, :3].copy()}
-        return arrays | {name: getattr(self.episodes, name).numpy().copy() for name in ("done", "ending", "level")}
+        return arrays | {name: getattr(self.episodes, name).numpy().copy() for name in ("done", "termination", "level")}
 
     def snapshot(self) -> Snapshot:
         """Return the robots, their parameters and their state, as gradients need them; waits for nothing."""

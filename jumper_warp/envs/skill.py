@@ -45,7 +45,7 @@ class TaskRuntime:
     def _counters(self) -> Any:
         n, task, counters = self.num_envs, self.task, Counters()
         fill(counters, ("term_sum",), (max(len(task.rewards), 1), n), wp.float64, self.device)
-        fill(counters, ("ending_count",), (len(task.terminations), n), int, self.device)
+        fill(counters, ("termination_count",), (len(task.terminations), n), int, self.device)
         fill(counters, ("counted", "succeeded", "bad_actions"), n, int, self.device)
         fill(counters, ("error_sum",), n, wp.float64, self.device)
         return counters
@@ -107,7 +107,7 @@ class TaskRuntime:
     def metrics(self) -> dict[str, float]:
         """Return means since the last call, and clear the counters (waits for the device)."""
         task, counters, figures = self.task, self.counters, {}
-        endings = counters.ending_count.numpy().sum(axis=1)
+        endings = counters.termination_count.numpy().sum(axis=1)
         ended = max(int(endings.sum()), 1)
         for term, total in zip(task.rewards, counters.term_sum.numpy().sum(axis=1), strict=False):
             figures[f"Episode_Reward/{term.name}"] = float(total) / ended

@@ -48,7 +48,7 @@ class EpisodeArrays:
     timeout: wp.array(dtype=float)  # 1: it ended without failure
     terminated: wp.array(dtype=wp.bool)  # it ended with failure
     truncated: wp.array(dtype=wp.bool)  # it ended without
-    ending: wp.array(dtype=int)  # index of the termination, -1: none
+    termination: wp.array(dtype=int)  # index of the termination, -1: none
     broken: wp.array(dtype=int)  # 1: the state is not one of a robot; observations are 0
     bad_action: wp.array(dtype=int)  # 1: the action was not finite; the world is broken at the end of the step
     level: wp.array(dtype=int)  # curriculum; the number of levels means that all were passed
@@ -60,7 +60,7 @@ class Counters:
     """Results that grow until the host clears them."""
 
     term_sum: wp.array2d(dtype=wp.float64)  # (rewards, num_worlds)
-    ending_count: wp.array2d(dtype=int)  # (terminations, num_worlds)
+    termination_count: wp.array2d(dtype=int)  # (terminations, num_worlds)
     counted: wp.array(dtype=int)  # (num_worlds,) ended episodes that count for the curriculum
     succeeded: wp.array(dtype=int)  # of these, successful
     error_sum: wp.array(dtype=wp.float64)  # of the successful ones

@@ -10,7 +10,7 @@ from .options import FAST
 from .terminations import came_apart
 from .view import RobotArrays, has_diverged, load_view
 
-NOT_ENDED = wp.constant(-1)
+NOT_TERMINATED = wp.constant(-1)
 
 
 @wp.func
@@ -37,14 +37,14 @@ def count_episode(
 
 @wp.func
 def write_outcome(
-    episode: EpisodeArrays, counters: Counters, world: int, total: float, ending: int, timeout: float, broken: bool
+    episode: EpisodeArrays, counters: Counters, world: int, total: float, termination: int, timeout: float, broken: bool
 ):
     """Write how a policy step of a world ended."""
     episode.reward[world] = total
-    episode.ending[world] = ending
-    episode.done[world] = wp.where(ending == NOT_ENDED, 0.0, 1.0)
+    episode.termination[world] = termination
+    episode.done[world] = wp.where(termination == NOT_TERMINATED, 0.0, 1.0)
     episode.timeout[world] = timeout
-    episode.terminated[world] = ending != NOT_ENDED and timeout == 0.0
+    episode.terminated[world] = termination != NOT_TERMINATED and timeout == 0.0
     episode.truncated[world] = timeout != 0.0
     episode.broken[world] = wp.where(broken, 1, 0)
     counters.bad_actions[world] = counters.bad_actions[world] + episode.bad_action[world]
@@ -88,14 +88,14 @@ def make_step_kernel(task: Any) -> wp.Kernel:
         else:
             state = wp.static(advance.func)(robot, states[world], *p[wp.static(advance.lo) : wp.static(advance.hi)])
 
-        ending = int(NOT_ENDED)
+        termination = int(NOT_TERMINATED)
         timeout = float(0.0)
         success = bool(False)
         broken = arrays.invalid[world] != 0 or episode.bad_action[world] != 0 or has_diverged(robot)
         if broken:
-            ending = wp.static(broken_ending)
+            termination = wp.static(broken_ending)
         for i in range(wp.static(len(endings))):
-            if ending == NOT_ENDED:
+            if termination == NOT_TERMINATED:
                 if wp.static(endings[i].plain):
                     holds = wp.static(endings[i].func)(robot, state)
                 else:
@@ -103,7 +103,7 @@ def make_step_kernel(task: Any) -> wp.Kernel:
                         robot, state, *p[wp.static(endings[i].lo) : wp.static(endings[i].hi)]
                     )
                 if holds:
-                    ending = i
+                    termination = i
                     timeout = wp.where(wp.static(bool(endings[i].time_out)), 1.0, 0.0)
                     success = wp.static(bool(endings[i].success))
 
@@ -126,10 +126,10 @@ def make_step_kernel(task: Any) -> wp.Kernel:
             total = float(0.0)
         if wp.static(floor is not None):
             total = wp.max(total, wp.static(0.0 if floor is None else float(floor)))
-        write_outcome(episode, counters, world, total, ending, timeout, broken)
+        write_outcome(episode, counters, world, total, termination, timeout, broken)
         states[world] = state
-        if ending != NOT_ENDED:
-            counters.ending_count[ending, world] = counters.ending_count[ending, world] + 1
+        if termination != NOT_TERMINATED:
+            counters.termination_count[termination, world] = counters.termination_count[termination, world] + 1
             if wp.static(curriculum.counts)(state):
                 error = wp.static(curriculum.func)(robot, state)
                 success = success and error <= p[wp.static(curriculum.tolerance)]

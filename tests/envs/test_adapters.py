@@ -111,7 +111,12 @@ def test_gymnasium_gets_copies(tensors):
         *values, step_infos = envs.step(action)
         given += values
         infos = step_infos or infos
-    given += [infos["_final_obs"], infos["_final_info"], infos["final_info"]["ending"], infos["final_info"]["_ending"]]
+    given += [
+        infos["_final_obs"],
+        infos["_final_info"],
+        infos["final_info"]["termination"],
+        infos["final_info"]["_ending"],
+    ]
     given += [infos["final_obs"]] if tensors else [row for row in infos["final_obs"] if row is not None]
     shown = [value.clone() if tensors else value.copy() for value in given]
     played(envs, actions[13:])
@@ -174,7 +179,7 @@ def test_final_infos_tell_why_an_episode_ended():
     for _, _, terminated, truncated, infos in played(envs):
         for world in np.flatnonzero(terminated | truncated):
             assert infos["_final_info"][world] and infos["final_info"]["_ending"][world]
-            name = envs.endings[infos["final_info"]["ending"][world]]
+            name = envs.endings[infos["final_info"]["termination"][world]]
             assert (name in ("too_long", "success")) == truncated[world]
             seen.add(name)
     assert {"too_long", "tilted"} <= seen
@@ -196,7 +201,7 @@ def test_tensors_are_what_arrays_are():
             for group in ("policy", "critic"):
                 np.testing.assert_array_equal(infos["final_obs"][world][group], other_infos["final_obs"][group][world])
         if "final_info" in infos:
-            np.testing.assert_array_equal(infos["final_info"]["ending"], other_infos["final_info"]["ending"])
+            np.testing.assert_array_equal(infos["final_info"]["termination"], other_infos["final_info"]["termination"])
 
 
 def test_statistics_of_a_wrapper_are_those_counted_by_hand():

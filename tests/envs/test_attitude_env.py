@@ -87,7 +87,7 @@ def test_an_episode_succeeds_within_tolerance_and_without_touching(env):
         step = env.step(action)
     assert step.truncated.all() and not step.terminated.any()
     names = [term.name for term in env.task.terminations]
-    ends = [names[i] for i in env.episodes.ending.numpy()]
+    ends = [names[i] for i in env.episodes.termination.numpy()]
     assert ends[2] == "ended" and ends.count("ended_clear") == N - 1
     metrics = env.metrics()
     assert metrics["Metrics/success"] == pytest.approx((N - 2) / N)

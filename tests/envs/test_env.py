@@ -96,16 +96,16 @@ ENDING_CASES = {
 }
 
 
-@pytest.mark.parametrize("ending", ENDING_CASES)
-def test_a_termination_ends_the_episode(env, ending):
+@pytest.mark.parametrize("termination", ENDING_CASES)
+def test_a_termination_ends_the_episode(env, termination):
     stand(env, command_step=1000)
-    edit_episodes(env, 3, **ENDING_CASES[ending])
-    if ending == "low_base":
+    edit_episodes(env, 3, **ENDING_CASES[termination])
+    if termination == "low_base":
         edit_coordinates(env, 3, q={2: 0.05})
     env.step(REST)
-    assert ending_names(env) == ["" if world != 3 else ending for world in range(N)]
+    assert ending_names(env) == ["" if world != 3 else termination for world in range(N)]
     assert env.done.tolist() == [float(world == 3) for world in range(N)]
-    without_failure = ending in ("success", "too_long")
+    without_failure = termination in ("success", "too_long")
     assert env.timeout.tolist() == [float(world == 3 and without_failure) for world in range(N)]
 
 

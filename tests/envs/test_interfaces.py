@@ -317,7 +317,7 @@ def test_a_number_of_a_term_may_change_in_captured_steps():
     np.testing.assert_allclose(env.skills[0].term_value.numpy()[index], 2.0 * before[index], rtol=1e-3)
     env.skills[0].set("terminations", "low_base", height=10.0)
     env.step(REST)
-    assert env.done.all() and [TASK.terminations[i].name for i in env.episodes.ending.numpy()] == ["low_base"] * N
+    assert env.done.all() and [TASK.terminations[i].name for i in env.episodes.termination.numpy()] == ["low_base"] * N
 
 
 @pytest.mark.parametrize(

@@ -115,7 +115,9 @@ def test_its_terminations_and_curriculum_are_its_own():
     env.episodes.streak.fill_(1)
     env.step(torch.zeros((N, 12)))
     names = [term.name for term in env.task.terminations]
-    assert [names[i] if i >= 0 else "" for i in env.episodes.ending.numpy()] == ["held", "too_long"] + [""] * (N - 2)
+    assert [names[i] if i >= 0 else "" for i in env.episodes.termination.numpy()] == ["held", "too_long"] + [""] * (
+        N - 2
+    )
     assert env.timeout.tolist() == [1.0, 1.0] + [0.0] * (N - 2)
     assert env.episodes.level.numpy().tolist() == [1] + [0] * (N - 1)
     assert env.episodes.streak.numpy().tolist() == [0, 0] + [1] * (N - 2)

@@ -101,7 +101,7 @@ def test_every_skill_counts_its_own():
         env.step(action.repeat(2, 1, 1))
         ended += env.done.numpy()
     for index, skill in enumerate(env.skills):
-        counted = skill.counters.ending_count.numpy().sum(axis=0)
+        counted = skill.counters.termination_count.numpy().sum(axis=0)
         np.testing.assert_array_equal(counted, np.where(index == SKILL, ended, 0.0))
 
 

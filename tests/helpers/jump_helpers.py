@@ -220,4 +220,4 @@ def random_actions(num_envs: int, steps: int, seed: int = 0) -> torch.Tensor:
 def ending_names(env: Env) -> list[str]:
     """Return the termination that ended each world's episode in the last step, "" where none did."""
     names = [term.name for term in env.task.terminations]
-    return [names[i] if i >= 0 else "" for i in env.task_arrays()["ending"]]
+    return [names[i] if i >= 0 else "" for i in env.task_arrays()["termination"]]
