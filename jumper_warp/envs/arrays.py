@@ -55,7 +55,7 @@ def episode_arrays(num_envs: int, seed: int, skill: wp.array, device: Any) -> An
         "has_command",
         "history_reset",
         "termination",
-        "broken",
+        "diverged",
         "bad_action",
         "level",
         "streak",

@@ -49,7 +49,7 @@ class EpisodeArrays:
     terminated: wp.array(dtype=wp.bool)  # it ended with failure
     truncated: wp.array(dtype=wp.bool)  # it ended without
     termination: wp.array(dtype=int)  # index of the termination, -1: none
-    broken: wp.array(dtype=int)  # 1: the state is not one of a robot; observations are 0
+    diverged: wp.array(dtype=int)  # 1: the state is not one of a robot; observations are 0
     bad_action: wp.array(dtype=int)  # 1: the action was not finite; the world is broken at the end of the step
     level: wp.array(dtype=int)  # curriculum; the number of levels means that all were passed
     streak: wp.array(dtype=int)  # successes in a row

@@ -135,9 +135,9 @@ def make_observe_kernel(task: Any) -> wp.Kernel:
 
 
 @wp.func
-def or_zero(value: float, broken: bool) -> float:
+def or_zero(value: float, diverged: bool) -> float:
     """Return 0 instead of the value of a world that came apart, or of one that is not finite."""
-    if broken or not wp.isfinite(value):
+    if diverged or not wp.isfinite(value):
         return 0.0
     return value
 
@@ -149,7 +149,7 @@ class Moment:
     world: int
     draws: wp.uint32  # see `step_key`
     fresh: int  # as in `EpisodeArrays`
-    broken: bool
+    diverged: bool
     now: int  # place in the rings of past values
     newer: int  # place of the value that a sensor's latency has passed
     older: int  # place of the one before
@@ -165,7 +165,7 @@ def moment(episode: EpisodeArrays, arrays: ObservationArrays, world: int) -> Mom
     m.world = world
     m.draws = step_key(episode.seed, world, step_count)
     m.fresh = episode.history_reset[world]
-    m.broken = episode.broken[world] != 0
+    m.diverged = episode.diverged[world] != 0
     m.now = step_count % RING
     m.newer = (step_count - whole) % RING
     m.older = (step_count - whole - 1) % RING
@@ -189,18 +189,18 @@ def late(arrays: ObservationArrays, m: Moment, column: int, value: float) -> flo
 @wp.func
 def condition(arrays: ObservationArrays, column: Column, p: wp.array(dtype=float), m: Moment, beginning: int):
     """Turn a component's raw value into an observation, behind the frames before."""
-    value = or_zero(arrays.raw[column.raw, m.world], m.broken)
+    value = or_zero(arrays.raw[column.raw, m.world], m.diverged)
     if column.delayed != 0:
         value = late(arrays, m, column.past, value)
     noise = p[column.noise]
     if noise > 0.0:
         value += noise * clamped_normal(stream_at(m.draws, m.world, OBSERVATION + column.group), column.oldest)
-    value = or_zero(p[column.scale] * wp.clamp(value, -p[column.clip], p[column.clip]), m.broken)
+    value = or_zero(p[column.scale] * wp.clamp(value, -p[column.clip], p[column.clip]), m.diverged)
     i = column.start + m.world * column.stride + column.oldest
     again = beginning != 0 and m.fresh == COMMANDED
     for _ in range(column.history - 1):
         frame = arrays.now[i + wp.where(again, 0, column.width)]
-        if m.broken or m.fresh == BEGUN:
+        if m.diverged or m.fresh == BEGUN:
             frame = value
         arrays.now[i] = frame
         if beginning == 0:

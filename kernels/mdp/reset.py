@@ -75,7 +75,7 @@ def make_reset_kernel(task: Any) -> wp.Kernel:
             if lane == 0:
                 states[world] = state
                 episode.history_reset[world] = BEGUN
-                episode.broken[world] = 0
+                episode.diverged[world] = 0
         elif wp.static(command is not None):
             if lane == 0:
                 robot = load_view(arrays, scene.ground, world)
@@ -116,7 +116,7 @@ def make_set_command_kernel(task: Any) -> wp.Kernel:
             fresh = task.state()
             states[world] = wp.static(give)(robot, scene, fresh, values[world], headings[world])
             episode.history_reset[world] = BEGUN
-            episode.broken[world] = 0
+            episode.diverged[world] = 0
         else:
             states[world] = wp.static(give)(robot, scene, states[world], values[world], yaw_of(robot.quat))
             if episode.history_reset[world] != BEGUN:

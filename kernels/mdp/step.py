@@ -37,7 +37,13 @@ def count_episode(
 
 @wp.func
 def write_outcome(
-    episode: EpisodeArrays, counters: Counters, world: int, total: float, termination: int, timeout: float, broken: bool
+    episode: EpisodeArrays,
+    counters: Counters,
+    world: int,
+    total: float,
+    termination: int,
+    timeout: float,
+    diverged: bool,
 ):
     """Write how a policy step of a world ended."""
     episode.reward[world] = total
@@ -46,7 +52,7 @@ def write_outcome(
     episode.timeout[world] = timeout
     episode.terminated[world] = termination != NOT_TERMINATED and timeout == 0.0
     episode.truncated[world] = timeout != 0.0
-    episode.broken[world] = wp.where(broken, 1, 0)
+    episode.diverged[world] = wp.where(diverged, 1, 0)
     counters.bad_actions[world] = counters.bad_actions[world] + episode.bad_action[world]
     episode.bad_action[world] = 0
     episode.step_count[world] = episode.step_count[world] + 1
@@ -91,8 +97,8 @@ def make_step_kernel(task: Any) -> wp.Kernel:
         termination = int(NOT_TERMINATED)
         timeout = float(0.0)
         success = bool(False)
-        broken = arrays.invalid[world] != 0 or episode.bad_action[world] != 0 or has_diverged(robot)
-        if broken:
+        diverged = arrays.invalid[world] != 0 or episode.bad_action[world] != 0 or has_diverged(robot)
+        if diverged:
             termination = wp.static(broken_ending)
         for i in range(wp.static(len(endings))):
             if termination == NOT_TERMINATED:
@@ -116,7 +122,7 @@ def make_step_kernel(task: Any) -> wp.Kernel:
             value = p[wp.static(rewards[i].weight)] * raw
             if wp.static(not rewards[i].once):
                 value = value * arrays.step_dt
-            if broken:
+            if diverged:
                 value = float(0.0)
             term_value[i, world] = value
             counters.term_sum[i, world] = counters.term_sum[i, world] + wp.float64(value)
@@ -126,7 +132,7 @@ def make_step_kernel(task: Any) -> wp.Kernel:
             total = float(0.0)
         if wp.static(floor is not None):
             total = wp.max(total, wp.static(0.0 if floor is None else float(floor)))
-        write_outcome(episode, counters, world, total, termination, timeout, broken)
+        write_outcome(episode, counters, world, total, termination, timeout, diverged)
         states[world] = state
         if termination != NOT_TERMINATED:
             counters.termination_count[termination, world] = counters.termination_count[termination, world] + 1

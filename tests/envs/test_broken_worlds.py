@@ -48,11 +48,11 @@ SUCCEEDING = {"phase": LANDED, "phase_steps": 100}
 )
 def test_a_world_that_came_apart_ends_at_once_and_touches_no_other(env, case, episode):
     outcomes = []
-    for broken in (False, True):
+    for diverged in (False, True):
         env.episodes.step_count.fill_(FIRST_STEP_COUNT)  # the same draws
         env.reset()
         edit_episodes(env, command_step=1000)
-        if broken:
+        if diverged:
             edit_coordinates(env, 9, **BROKEN[case])
             edit_episodes(env, 9, **episode)
         env.step(REST)

@@ -90,7 +90,7 @@ def reflection():
         command_steps=state["command_steps"][:HALF],
     )
     parameters.observation_latency.zero_()
-    env.episodes.broken.zero_()
+    env.episodes.diverged.zero_()
     env.episodes.history_reset.fill_(1)
     env.stages()["observe"]()
     return env.task, {"policy": env.obs.numpy().copy(), "critic": env.critic_obs.numpy().copy()}
