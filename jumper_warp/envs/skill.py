@@ -46,7 +46,7 @@ class TaskRuntime:
         n, task, counters = self.num_envs, self.task, Counters()
         fill(counters, ("term_sum",), (max(len(task.rewards), 1), n), wp.float64, self.device)
         fill(counters, ("termination_count",), (len(task.terminations), n), int, self.device)
-        fill(counters, ("counted", "succeeded", "bad_actions"), n, int, self.device)
+        fill(counters, ("curriculum_episodes", "curriculum_successes", "bad_actions"), n, int, self.device)
         fill(counters, ("error_sum",), n, wp.float64, self.device)
         return counters
 
@@ -113,7 +113,10 @@ class TaskRuntime:
             figures[f"Episode_Reward/{term.name}"] = float(total) / ended
         for term, count in zip(task.terminations, endings, strict=True):
             figures[f"Episode_Termination/{term.name}"] = float(count) / ended
-        counted, succeeded = int(counters.counted.numpy().sum()), int(counters.succeeded.numpy().sum())
+        counted, succeeded = (
+            int(counters.curriculum_episodes.numpy().sum()),
+            int(counters.curriculum_successes.numpy().sum()),
+        )
         figures["Metrics/success"] = succeeded / max(counted, 1)
         error = float(counters.error_sum.numpy().sum())
         figures[f"Metrics/error_{task.curriculum.options['unit']}"] = error / max(succeeded, 1)

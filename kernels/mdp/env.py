@@ -61,8 +61,8 @@ class Counters:
 
     term_sum: wp.array2d(dtype=wp.float64)  # (rewards, num_worlds)
     termination_count: wp.array2d(dtype=int)  # (terminations, num_worlds)
-    counted: wp.array(dtype=int)  # (num_worlds,) ended episodes that count for the curriculum
-    succeeded: wp.array(dtype=int)  # of these, successful
+    curriculum_episodes: wp.array(dtype=int)  # (num_worlds,) ended episodes that count for the curriculum
+    curriculum_successes: wp.array(dtype=int)  # of these, successful
     error_sum: wp.array(dtype=wp.float64)  # of the successful ones
     bad_actions: wp.array(dtype=int)  # actions that were not finite
 

@@ -14,7 +14,7 @@ NOT_TERMINATED = wp.constant(-1)
 
 
 @wp.func
-def count_episode(
+def update_curriculum(
     episode: EpisodeArrays,
     counters: Counters,
     world: int,
@@ -29,14 +29,14 @@ def count_episode(
         streak = int(0)
         episode.level[world] = wp.min(episode.level[world] + 1, num_levels)
     episode.streak[world] = streak
-    counters.counted[world] = counters.counted[world] + 1
+    counters.curriculum_episodes[world] = counters.curriculum_episodes[world] + 1
     if success:
-        counters.succeeded[world] = counters.succeeded[world] + 1
+        counters.curriculum_successes[world] = counters.curriculum_successes[world] + 1
         counters.error_sum[world] = counters.error_sum[world] + wp.float64(error)
 
 
 @wp.func
-def write_outcome(
+def write_step_result(
     episode: EpisodeArrays,
     counters: Counters,
     world: int,
@@ -132,14 +132,14 @@ def make_step_kernel(task: Any) -> wp.Kernel:
             total = float(0.0)
         if wp.static(floor is not None):
             total = wp.max(total, wp.static(0.0 if floor is None else float(floor)))
-        write_outcome(episode, counters, world, total, termination, timeout, diverged)
+        write_step_result(episode, counters, world, total, termination, timeout, diverged)
         states[world] = state
         if termination != NOT_TERMINATED:
             counters.termination_count[termination, world] = counters.termination_count[termination, world] + 1
             if wp.static(curriculum.counts)(state):
                 error = wp.static(curriculum.func)(robot, state)
                 success = success and error <= p[wp.static(curriculum.tolerance)]
-                count_episode(
+                update_curriculum(
                     episode, counters, world, success, error, p[wp.static(curriculum.promote_after)], num_levels
                 )
 
