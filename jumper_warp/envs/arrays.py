@@ -72,9 +72,9 @@ def episode_arrays(num_envs: int, seed: int, skill: wp.array, device: Any) -> An
 def delay_arrays(num_envs: int, latency: wp.array, substeps: int, device: Any) -> Any:
     """Return the kernels' `Delays`; latency [physics steps]: (num_envs,)."""
     delays = Delays()
-    fill(delays, ("past_target",), (RING, 12, num_envs), float, device)
-    fill(delays, ("late_target", "earlier_target"), (12, num_envs), float, device)
-    fill(delays, ("late_steps",), num_envs, int, device)
+    fill(delays, ("target_history",), (RING, 12, num_envs), float, device)
+    fill(delays, ("current_target", "prev_target"), (12, num_envs), float, device)
+    fill(delays, ("switch_step",), num_envs, int, device)
     delays.steps, delays.substeps = latency, substeps
     return delays
 

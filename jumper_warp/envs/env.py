@@ -292,7 +292,7 @@ class Env(Stages):
     def snapshot(self) -> Snapshot:
         """Return the robots, their parameters and their state, as gradients need them; waits for nothing."""
         sim, n = self.sim, self.num_envs
-        past, step_count = wp.to_torch(self.delays.past_target), wp.to_torch(self.episodes.step_count).long()
+        past, step_count = wp.to_torch(self.delays.target_history), wp.to_torch(self.episodes.step_count).long()
         parameters = {name: wp.to_torch(getattr(sim.motors, name)) for name in MOTOR_CONSTANTS}
         dynamics = sim.physics.dynamics
         return Snapshot(

@@ -136,7 +136,7 @@ class Stages:
     def _advance(self, part: Part) -> None:
         delays, scene = self.delays, self._scene
         self.sim.physics.advance(
-            self.sim.substeps, delays.late_target, delays.earlier_target, delays.late_steps, bodies=False,
+            self.sim.substeps, delays.current_target, delays.prev_target, delays.switch_step, bodies=False,
             worlds=Worlds(part.first, part.count),
         )  # fmt: skip
         inputs = [scene.geometry, scene.ground, self._settings, part.episode, self.robot]

@@ -28,10 +28,10 @@ def remember(arrays: RobotArrays, push: wp.array(dtype=wp.spatial_vector), push_
 def delayed(delays: Delays, step_count: int, world: int, m: int):
     """Choose what a motor follows: the target of as many physics steps ago as the latency asks for."""
     whole = delays.steps[world] // delays.substeps
-    delays.late_target[m, world] = delays.past_target[(step_count - whole) % RING, m, world]
-    delays.earlier_target[m, world] = delays.past_target[(step_count - whole - 1) % RING, m, world]
+    delays.current_target[m, world] = delays.target_history[(step_count - whole) % RING, m, world]
+    delays.prev_target[m, world] = delays.target_history[(step_count - whole - 1) % RING, m, world]
     if m == 0:
-        delays.late_steps[world] = delays.steps[world] - whole * delays.substeps
+        delays.switch_step[world] = delays.steps[world] - whole * delays.substeps
 
 
 @wp.kernel
@@ -77,7 +77,7 @@ def action_kernel(
         m = 3 * leg + j
         arrays.target[m, world] = target[j]
         arrays.safe_target[m, world] = safe[j]
-        delays.past_target[step_count % RING, m, world] = safe[j]
+        delays.target_history[step_count % RING, m, world] = safe[j]
         delayed(delays, step_count, world, m)
     if leg == 0:
         remember(arrays, push, skill.push_in_flight, world)

@@ -84,9 +84,9 @@ class SkillSettings:
 class Delays:
     """Latency: what was commanded lately, and which of it the motors follow."""
 
-    past_target: wp.array3d(dtype=float)  # [rad] (RING, 12, num_worlds) filtered targets, a ring over policy steps
+    target_history: wp.array3d(dtype=float)  # [rad] (RING, 12, num_worlds) filtered targets, a ring over policy steps
     steps: wp.array(dtype=int)  # [physics steps] (num_worlds,) from action to motor
     substeps: int  # physics steps in a policy step
-    late_steps: wp.array(dtype=int)  # [physics steps] (num_worlds,) what is left of the latency in a policy step
-    late_target: wp.array2d(dtype=float)  # [rad] (12, num_worlds) what the motors follow after `late_steps`
-    earlier_target: wp.array2d(dtype=float)  # [rad] (12, num_worlds) what they follow before
+    switch_step: wp.array(dtype=int)  # [physics steps] (num_worlds,) what is left of the latency in a policy step
+    current_target: wp.array2d(dtype=float)  # [rad] (12, num_worlds) what the motors follow after `late_steps`
+    prev_target: wp.array2d(dtype=float)  # [rad] (12, num_worlds) what they follow before

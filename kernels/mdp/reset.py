@@ -216,7 +216,7 @@ def clear_history_kernel(
     arrays.safe_target[m, world] = angle
     arrays.prev_rate[m, world] = arrays.joint_qd[world * DOFS + 6 + slot]
     for i in range(RING):
-        delays.past_target[i, m, world] = angle
+        delays.target_history[i, m, world] = angle
     if m < 4:
         arrays.impulse[m, world] = wp.vec3(0.0)
         arrays.paw_force[m, world] = wp.vec3(0.0)

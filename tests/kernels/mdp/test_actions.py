@@ -34,7 +34,7 @@ class Commands:
         self.delays = no_delays(n, delay)
         self.settings = wp.array([s.settings_of_skill() for s in skills], dtype=SkillSettings, device="cpu")
         self.push = wp.zeros(n, dtype=wp.spatial_vector, device="cpu")
-        self.delays.past_target.assign(np.tile(DEFAULT_ANGLE[None, :, None], (8, 1, n)))
+        self.delays.target_history.assign(np.tile(DEFAULT_ANGLE[None, :, None], (8, 1, n)))
 
     def act(self, action):
         """Begin a step with an action, (n, 12) or (skills, n, 12)."""
@@ -139,8 +139,8 @@ def test_motors_follow_the_target_of_as_many_physics_steps_ago_as_the_latency():
     for action in asked:
         commands.act(np.tile(action, (len(DELAYS), 1)))
         np.testing.assert_array_equal(commands.motors("safe_target"), commands.motors("target"))
-        late, earlier = commands.delays.late_target.numpy().T, commands.delays.earlier_target.numpy().T
-        when = commands.delays.late_steps.numpy()
+        late, earlier = commands.delays.current_target.numpy().T, commands.delays.prev_target.numpy().T
+        when = commands.delays.switch_step.numpy()
         assert (when >= 0).all() and (when < SUBSTEPS).all()
         followed += [np.where((substep < when)[:, None], earlier, late) for substep in range(SUBSTEPS)]
     followed = np.array(followed)
@@ -157,7 +157,7 @@ def test_the_ring_goes_on_over_thousands_of_steps():
     for step in range(40):
         commands.act(0.2 * random_action(len(DELAYS), seed=step))
         past.append(commands.motors("safe_target"))
-        late, earlier = commands.delays.late_target.numpy().T, commands.delays.earlier_target.numpy().T
+        late, earlier = commands.delays.current_target.numpy().T, commands.delays.prev_target.numpy().T
         for world, delay in enumerate(DELAYS):
             np.testing.assert_array_equal(late[world], past[-1 - delay // 8][world])
             np.testing.assert_array_equal(earlier[world], past[-2 - delay // 8][world])

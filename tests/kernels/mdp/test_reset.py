@@ -297,7 +297,7 @@ def test_nothing_has_been_done_felt_or_touched_before_a_beginning(stage):
     for name in ("target", "safe_target"):
         np.testing.assert_array_equal(rows(getattr(found, name))[SOME], angles, name)
     np.testing.assert_array_equal(rows(found.prev_rate)[SOME], qd[:, 6 + MOTOR_SLOTS][SOME])
-    past = stage.delays.past_target.numpy()
+    past = stage.delays.target_history.numpy()
     np.testing.assert_array_equal(past[:, :, SOME], np.tile(angles.T, (8, 1, 1)))
     origin = qd[:, :3] - np.cross(qd[:, 3:6], Rotation.from_quat(q[:, 3:7]).apply([0.01, -0.02, 0.03]))
     np.testing.assert_allclose(found.prev_lin_vel[SOME], origin[SOME], atol=1e-5)
@@ -317,7 +317,7 @@ def test_paws_are_known_where_they_are_at_a_beginning():
 
 
 def test_motors_hold_still_after_a_beginning_however_late_they_are(stage):
-    write(stage.delays.past_target, slice(None), 9.0)
+    write(stage.delays.target_history, slice(None), 9.0)
     stage.forget(1.0)
     angles = stage.robot.joint_q.numpy().reshape(N, 43)[:, 7 + MOTOR_SLOTS]
-    assert (stage.delays.past_target.numpy() == angles.T).all()
+    assert (stage.delays.target_history.numpy() == angles.T).all()
