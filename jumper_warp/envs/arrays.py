@@ -35,7 +35,7 @@ def robot_arrays(sim: Simulation, step_dt: float) -> Any:
     robot.invalid, robot.impulse = sim.physics.invalid, sim.physics.impulse
     robot.paw_force, robot.peak_force = sim.paw_force, sim.physics.peak_paw_force
     robot.torque, robot.joint_offset = sim.torque, sim.motors.offset
-    motors = ("prev_torque", "action", "prev_action", "prev_prev_action", "target", "safe_target", "prev_rate")
+    motors = ("prev_torque", "action", "prev_action", "prev_prev_action", "target", "filtered_target", "prev_rate")
     fill(robot, ("paw_pos", "paw_vel"), (4, n), wp.vec3, device)
     fill(robot, ("contact_time", "air_time", "touchdown_speed", "paw_height"), (4, n), float, device)
     fill(robot, ("collisions",), (4, n), int, device)

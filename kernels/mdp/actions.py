@@ -11,7 +11,7 @@ wp.set_module_options({"enable_backward": False})
 
 
 @wp.func
-def remember(arrays: RobotArrays, push: wp.array(dtype=wp.spatial_vector), push_in_flight: int, world: int):
+def begin_policy_step(arrays: RobotArrays, push: wp.array(dtype=wp.spatial_vector), push_in_flight: int, world: int):
     """Begin a world's policy step: keep the base's velocity, apply its push."""
     arrays.prev_lin_vel[world] = base_velocity(arrays, world, base_quat(arrays, world))
     pushed = push_in_flight
@@ -25,7 +25,7 @@ def remember(arrays: RobotArrays, push: wp.array(dtype=wp.spatial_vector), push_
 
 
 @wp.func
-def delayed(delays: Delays, step_count: int, world: int, m: int):
+def select_delayed_target(delays: Delays, step_count: int, world: int, m: int):
     """Choose what a motor follows: the target of as many physics steps ago as the latency asks for."""
     whole = delays.steps[world] // delays.substeps
     delays.current_target[m, world] = delays.target_history[(step_count - whole) % RING, m, world]
@@ -76,8 +76,8 @@ def action_kernel(
     for j in range(3):
         m = 3 * leg + j
         arrays.target[m, world] = target[j]
-        arrays.safe_target[m, world] = safe[j]
+        arrays.filtered_target[m, world] = safe[j]
         delays.target_history[step_count % RING, m, world] = safe[j]
-        delayed(delays, step_count, world, m)
+        select_delayed_target(delays, step_count, world, m)
     if leg == 0:
-        remember(arrays, push, skill.push_in_flight, world)
+        begin_policy_step(arrays, push, skill.push_in_flight, world)

@@ -24,7 +24,7 @@ def hand_over(
     episode.has_command[world] = 0
     episode.history_reset[world] = BEGUN
     for m in range(12):
-        off = arrays.safe_target[m, world] - arrays.default_angle[m]
+        off = arrays.filtered_target[m, world] - arrays.default_angle[m]
         action = wp.clamp(off / skills[target].action_scale[m], -1.0, 1.0)
         arrays.action[m, world] = action
         arrays.prev_action[m, world] = action

@@ -213,7 +213,7 @@ def clear_history_kernel(
     arrays.prev_action[m, world] = 0.0
     arrays.prev_prev_action[m, world] = 0.0
     arrays.target[m, world] = angle
-    arrays.safe_target[m, world] = angle
+    arrays.filtered_target[m, world] = angle
     arrays.prev_rate[m, world] = arrays.joint_qd[world * DOFS + 6 + slot]
     for i in range(RING):
         delays.target_history[i, m, world] = angle

@@ -73,7 +73,7 @@ class RobotArrays:
     prev_action: wp.array2d(dtype=float)
     prev_prev_action: wp.array2d(dtype=float)
     target: wp.array2d(dtype=float)  # [rad] before the filter
-    safe_target: wp.array2d(dtype=float)  # [rad] after it
+    filtered_target: wp.array2d(dtype=float)  # [rad] after it
     prev_rate: wp.array2d(dtype=float)
     joint_offset: wp.array2d(dtype=float)  # [rad] constant error of each motor's position sensor
     prev_lin_vel: wp.array(dtype=wp.vec3)  # (num_worlds,)
@@ -165,7 +165,7 @@ def load_view(arrays: RobotArrays, ground: Ground, world: int) -> RobotView:
         robot.prev_action[m] = arrays.prev_action[m, world]
         robot.prev_prev_action[m] = arrays.prev_prev_action[m, world]
         robot.default_angle[m] = arrays.default_angle[m]
-        off = arrays.target[m, world] - arrays.safe_target[m, world]
+        off = arrays.target[m, world] - arrays.filtered_target[m, world]
         clipped += off * off
     robot.clipped = clipped
     return robot

@@ -218,7 +218,7 @@ def test_a_new_episode_forgets_the_old_one():
         assert not getattr(robot, name).numpy().any(), name
     assert not env.obs[:, -12:].any() and env.final_obs[:, -12:].any()
     angles = env.sim.joint_q()[:, 7:27].reshape(N, 4, 5)[:, :, [0, 1, 3]].reshape(N, 12)
-    np.testing.assert_array_equal(robot.safe_target.numpy().T, angles)
+    np.testing.assert_array_equal(robot.filtered_target.numpy().T, angles)
     np.testing.assert_array_equal(env.delays.target_history.numpy(), np.broadcast_to(angles.T, (8, 12, N)))
 
 

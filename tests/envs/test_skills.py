@@ -178,11 +178,11 @@ def test_motors_filter_and_scales_become_those_of_the_new_skill_and_drawn_ratios
     before, action = parameters_of(env), torch.zeros((2, N, 12))
     action[:, :, ::3] = 1.0  # lateral
     env.step(action)
-    np.testing.assert_allclose(env.robot.safe_target.numpy()[::3], 40.0 * DEG, rtol=1e-6)
+    np.testing.assert_allclose(env.robot.filtered_target.numpy()[::3], 40.0 * DEG, rtol=1e-6)
     env.requested_task(0, ASKED)
     env.step(action)
     assert not env.done.any()
-    held = env.robot.safe_target.numpy() - env.robot.default_angle.numpy()[:, None]
+    held = env.robot.filtered_target.numpy() - env.robot.default_angle.numpy()[:, None]
     scale = np.tile([40.0, 90.0, 90.0], 4)[:, None] * DEG
     np.testing.assert_allclose(env.robot.action.numpy()[:, ASKED], (held / scale)[:, ASKED], atol=1e-6)
     after = parameters_of(env)
@@ -199,7 +199,7 @@ def test_motors_filter_and_scales_become_those_of_the_new_skill_and_drawn_ratios
         np.testing.assert_allclose(after[name][:, ASKED] / new, before[name][:, ASKED] / old, rtol=1e-5, err_msg=name)
     assert (after["cutoff_speed"] <= 0.95 * after["no_load_speed"] + 1e-5).all()
     env.step(action)
-    lateral = env.robot.safe_target.numpy()[::3] / DEG
+    lateral = env.robot.filtered_target.numpy()[::3] / DEG
     np.testing.assert_allclose(env.robot.target.numpy()[::3], 40.0 * DEG, rtol=1e-6)
     near = lateral[:, ASKED] < 15.0 + 1e-4  # the filter binds where the limit is near
     assert near.mean() > 0.3 and (np.abs(lateral[:, ASKED][~near] - 40.0) < 1e-4).all()

@@ -56,7 +56,7 @@ def followed():
             if name == "action":
                 for each in fresh:
                     each.next_action = env.robot.action.numpy()[:, each.world].copy()
-                    each.next_safe = env.robot.safe_target.numpy()[:, each.world].copy()
+                    each.next_safe = env.robot.filtered_target.numpy()[:, each.world].copy()
         fresh = [Switch(env, w) for w in np.flatnonzero(env.episodes.skill.numpy() != was)]
         switches += fresh
         if course.follow(env):
@@ -98,7 +98,7 @@ def test_after_a_switch_observation_and_filter_are_those_of_a_fresh_environment_
             assert torch.equal(alone.obs[0], s.obs), (target, alone.obs[0] - s.obs)
             alone.action[0] = torch.from_numpy(s.next_action)
             alone.stages()["action"]()
-            np.testing.assert_array_equal(alone.robot.safe_target.numpy()[:, 0], s.next_safe)
+            np.testing.assert_array_equal(alone.robot.filtered_target.numpy()[:, 0], s.next_safe)
 
 
 def test_jumps_are_commanded_from_the_squat_after_they_took_over_and_walking_stands_first(followed):

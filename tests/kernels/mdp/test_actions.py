@@ -109,8 +109,8 @@ def test_targets_are_filtered_by_what_the_sensors_read(offset, safe):
     commands.robot.joint_offset.assign(np.full((12, 1), offset * DEG))
     commands.act(np.eye(1, 12))
     assert commands.motors("target")[0, 0] == pytest.approx(30.0 * DEG)
-    assert commands.motors("safe_target")[0, 0] == pytest.approx(safe * DEG, abs=1e-5)
-    np.testing.assert_array_equal(commands.motors("target")[0, 1:], commands.motors("safe_target")[0, 1:])
+    assert commands.motors("filtered_target")[0, 0] == pytest.approx(safe * DEG, abs=1e-5)
+    np.testing.assert_array_equal(commands.motors("target")[0, 1:], commands.motors("filtered_target")[0, 1:])
 
 
 # ---------------------------------------------------------------- actions that are no numbers
@@ -138,7 +138,7 @@ def test_motors_follow_the_target_of_as_many_physics_steps_ago_as_the_latency():
     followed = []
     for action in asked:
         commands.act(np.tile(action, (len(DELAYS), 1)))
-        np.testing.assert_array_equal(commands.motors("safe_target"), commands.motors("target"))
+        np.testing.assert_array_equal(commands.motors("filtered_target"), commands.motors("target"))
         late, earlier = commands.delays.current_target.numpy().T, commands.delays.prev_target.numpy().T
         when = commands.delays.switch_step.numpy()
         assert (when >= 0).all() and (when < SUBSTEPS).all()
@@ -156,7 +156,7 @@ def test_the_ring_goes_on_over_thousands_of_steps():
     past = [np.tile(DEFAULT_ANGLE, (len(DELAYS), 1)).astype(np.float32)] * 8
     for step in range(40):
         commands.act(0.2 * random_action(len(DELAYS), seed=step))
-        past.append(commands.motors("safe_target"))
+        past.append(commands.motors("filtered_target"))
         late, earlier = commands.delays.current_target.numpy().T, commands.delays.prev_target.numpy().T
         for world, delay in enumerate(DELAYS):
             np.testing.assert_array_equal(late[world], past[-1 - delay // 8][world])
@@ -175,7 +175,7 @@ def test_the_solvers_motors_follow_it_too():
     now = wp.zeros((12, len(delays)), dtype=float, device="cpu")
     for action in 0.3 * random_actions(len(delays), 12, seed=1):
         env.step(action)
-        past += SUBSTEPS * [env.robot.safe_target.numpy().T.copy()]
+        past += SUBSTEPS * [env.robot.filtered_target.numpy().T.copy()]
         for substep in range(SUBSTEPS):
             when = len(past) - SUBSTEPS + substep - delays
             targets = [past[at][world] if at >= 0 else still[world] for world, at in enumerate(when)]

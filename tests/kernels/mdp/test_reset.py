@@ -282,7 +282,7 @@ def test_forgetting_touches_the_masked_worlds_only(stage):
 
 ZERO = ("torque", "prev_torque", "action", "prev_action", "prev_prev_action", "impulse", "paw_force", "peak_force",
         "contact_time", "air_time", "touchdown_speed", "paw_height", "invalid", "collisions")  # fmt: skip
-FORGOTTEN = (*ZERO, "target", "safe_target", "prev_rate", "prev_lin_vel", "paw_pos", "paw_vel")
+FORGOTTEN = (*ZERO, "target", "filtered_target", "prev_rate", "prev_lin_vel", "paw_pos", "paw_vel")
 
 
 def test_nothing_has_been_done_felt_or_touched_before_a_beginning(stage):
@@ -294,7 +294,7 @@ def test_nothing_has_been_done_felt_or_touched_before_a_beginning(stage):
         assert rows(getattr(found, name))[~SOME].all(), name
     q, qd = found.joint_q.reshape(N, 43), found.joint_qd.reshape(N, 38)
     angles = q[:, 7 + MOTOR_SLOTS][SOME]
-    for name in ("target", "safe_target"):
+    for name in ("target", "filtered_target"):
         np.testing.assert_array_equal(rows(getattr(found, name))[SOME], angles, name)
     np.testing.assert_array_equal(rows(found.prev_rate)[SOME], qd[:, 6 + MOTOR_SLOTS][SOME])
     past = stage.delays.target_history.numpy()
