@@ -13,7 +13,7 @@ from .attempts import sync_attempts
 from .env import BEGUN, COMMANDED, RING, Delays, EpisodeArrays, Scene, SkillSettings
 from .options import FAST
 from .random import ANY_LEVEL, COMMAND, RESET, make_stream, uniform
-from .track import follow_paw
+from .track import update_paw_kinematics
 from .view import RobotArrays, base_quat, base_velocity, load_view, yaw_of
 
 wp.set_module_options({"enable_backward": False})
@@ -226,7 +226,7 @@ def clear_history_kernel(
         arrays.touchdown_speed[m, world] = 0.0
         arrays.paw_height[m, world] = 0.0
         arrays.collisions[m, world] = 0
-        follow_paw(arrays, geometry[m], world, m)
+        update_paw_kinematics(arrays, geometry[m], world, m)
     if m == 0:
         arrays.invalid[world] = 0
         arrays.prev_lin_vel[world] = base_velocity(arrays, world, base_quat(arrays, world))
