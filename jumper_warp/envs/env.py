@@ -23,7 +23,7 @@ from jumper_warp.envs.arrays import (
 )
 from jumper_warp.envs.stages import Stages
 from jumper_warp.envs.state import load_state, save_state
-from jumper_warp.kernels.mdp.reset import stand_kernel
+from jumper_warp.kernels.mdp.reset import default_pose_kernel
 from jumper_warp.robot.grounds import BlockCfg
 from jumper_warp.robot.model import PHYSICS_DT
 from jumper_warp.robot.overlay import RobotOverlay
@@ -238,7 +238,7 @@ class Env(Stages):
         self._restore_first_task(self._part(), mask)
         self._randomize(self._part(), mask)
         inputs = [mask, headings, self._scene, self._settings, self.episodes.skill, self.robot]
-        self._launch(stand_kernel, n, inputs)
+        self._launch(default_pose_kernel, n, inputs)
         self._clear_history(self._part(), mask)
         self._set_commands(mask, 1, values, headings)
         self.episodes.done.zero_()

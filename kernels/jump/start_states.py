@@ -16,7 +16,7 @@ from ..layout import BODIES
 from ..mdp.attempts import sample_valid_state
 from ..mdp.env import Scene
 from ..mdp.random import RngStream, uniform, uniform_range
-from ..mdp.reset import store_pose
+from ..mdp.reset import write_default_pose
 from ..mdp.starts import LegSample, leg_ik, quat_from_ypr, sample_foot_offset, with_foot_velocity
 from ..mdp.view import RobotArrays, rotate_yaw
 from ..terrain.ground import Ground, surface
@@ -324,5 +324,5 @@ def write_start(arrays: RobotArrays, scene: Scene, start: JumpStart, draw: RngSt
     if start.scheme != DEFAULT:
         if sample_valid_state(sample_base, sample_leg, start, arrays, scene, draw):
             return start.scheme
-    store_pose(arrays, scene, draw.world, start.heading, surface(start.ground, 0.0, 0.0)[0])
+    write_default_pose(arrays, scene, draw.world, start.heading, surface(start.ground, 0.0, 0.0)[0])
     return DEFAULT

@@ -20,7 +20,7 @@ wp.set_module_options({"enable_backward": False})
 
 
 @wp.func
-def before_reset(old: Any, done: float):
+def previous_state(old: Any, done: float):
     """Return the state that a new episode follows; one that was cut off from outside counts as not begun."""
     state = old
     if done == 0.0:
@@ -69,7 +69,7 @@ def make_reset_kernel(task: Any) -> wp.Kernel:
         if level >= levels.shape[0]:
             level = wp.min(int(uniform(draw, ANY_LEVEL, 0.0, float(levels.shape[0]))), levels.shape[0] - 1)
         if begins:
-            old = before_reset(states[world], episode.done[world])
+            old = previous_state(states[world], episode.done[world])
             state = wp.static(reset)(arrays, scene, skills[skill], old, settings[0], levels[level], draw)
             sync_attempts(draw)
             if lane == 0:
@@ -139,7 +139,7 @@ def leg_limits(params: FilterParams) -> LegLimits:
 
 
 @wp.func
-def store_pose(arrays: RobotArrays, scene: Scene, world: int, heading: float, lift: float):
+def write_default_pose(arrays: RobotArrays, scene: Scene, world: int, heading: float, ground_height: float):
     """Write the model's reference pose at rest, turned to a heading [rad] and lifted [m]."""
     q = world * COORDS
     for j in range(int(COORDS)):
@@ -149,11 +149,11 @@ def store_pose(arrays: RobotArrays, scene: Scene, world: int, heading: float, li
     turn = wp.quat_from_axis_angle(wp.vec3(0.0, 0.0, 1.0), heading)
     for j in range(4):
         arrays.joint_q[q + 3 + j] = turn[j]
-    arrays.joint_q[q + 2] = scene.reference_q[q + 2] + lift
+    arrays.joint_q[q + 2] = scene.reference_q[q + 2] + ground_height
 
 
 @wp.kernel
-def stand_kernel(
+def default_pose_kernel(
     # in
     mask: wp.array(dtype=float),
     headings: wp.array(dtype=float),
@@ -170,8 +170,8 @@ def stand_kernel(
     world = wp.tid()
     if mask[world] != 0.0:
         rest_block(scene.ground, world)
-        lift = surface(world_ground(scene.ground, world), 0.0, 0.0)[0] + skills[skill[world]].lift
-        store_pose(arrays, scene, world, headings[world], lift)
+        ground_height = surface(world_ground(scene.ground, world), 0.0, 0.0)[0] + skills[skill[world]].lift
+        write_default_pose(arrays, scene, world, headings[world], ground_height)
 
 
 @wp.kernel

@@ -11,7 +11,7 @@ from ..layout import BODIES, COORDS
 from ..mdp.attempts import sample_valid_state
 from ..mdp.env import Scene, SkillSettings
 from ..mdp.random import RngStream, uniform, uniform_range
-from ..mdp.reset import leg_limits, store_pose
+from ..mdp.reset import leg_limits, write_default_pose
 from ..mdp.starts import LegSample, leg_ik, quat_from_ypr, sample_foot_offset, with_foot_velocity
 from ..mdp.view import RobotArrays, rotate_yaw
 from ..terrain.ground import Ground, surface, world_ground
@@ -159,6 +159,6 @@ def write_start(
     if uniform(draw, streams.DEFAULT_POSE, 0.0, 1.0) >= settings.default_share:
         if sample_valid_state(sample_base, sample_leg, start, arrays, scene, draw):
             return
-    store_pose(arrays, scene, world, start.heading, surface(start.ground, start.spot[0], start.spot[1])[0])
+    write_default_pose(arrays, scene, world, start.heading, surface(start.ground, start.spot[0], start.spot[1])[0])
     arrays.joint_q[world * COORDS] = start.spot[0]
     arrays.joint_q[world * COORDS + 1] = start.spot[1]

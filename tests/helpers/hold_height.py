@@ -89,7 +89,7 @@ def reset_hold(
     level: HoldLevel, draw: mdp.RngStream,
 ) -> HoldState:  # fmt: skip
     """Stand in the default pose with any heading."""
-    mdp.store_pose(robot, scene, draw.world, mdp.uniform(draw, 0, -settings.heading, settings.heading), 0.0)
+    mdp.write_default_pose(robot, scene, draw.world, mdp.uniform(draw, 0, -settings.heading, settings.heading), 0.0)
     new = HoldState()
     new.goal = mdp.uniform_range(draw, 1, level.goal)
     new.lasts = settings.lasts

@@ -11,7 +11,7 @@ from jumper_warp.kernels.mdp import terminations
 from jumper_warp.kernels.mdp.env import Scene, SkillSettings
 from jumper_warp.kernels.mdp.parameters import RobotParameters
 from jumper_warp.kernels.mdp.random import RngStream, uniform
-from jumper_warp.kernels.mdp.reset import store_pose
+from jumper_warp.kernels.mdp.reset import write_default_pose
 from jumper_warp.kernels.mdp.view import RobotArrays, RobotView
 from jumper_warp.kernels.terrain.ground import Ground
 from jumper_warp.robot.motors import jumping_motors, vertical_jump_filter
@@ -90,7 +90,7 @@ def reset_probe(
     level: ProbeLevel, draw: RngStream,
 ) -> ProbeState:  # fmt: skip
     """Stand; keep a draw in `other` and the level in `counts`."""
-    store_pose(arrays, scene, draw.world, 0.5, 0.25)
+    write_default_pose(arrays, scene, draw.world, 0.5, 0.25)
     new = ProbeState()
     new.value = settings.value
     new.other = uniform(draw, 0, 0.0, 1.0)

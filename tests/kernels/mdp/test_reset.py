@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import kstest
 
 from jumper_warp.kernels.mdp.env import BEGUN, COMMANDED, Delays, EpisodeArrays, Scene, SkillSettings
-from jumper_warp.kernels.mdp.reset import advance_rng_kernel, clear_history_kernel, stand_kernel
+from jumper_warp.kernels.mdp.reset import advance_rng_kernel, clear_history_kernel, default_pose_kernel
 from jumper_warp.kernels.mdp.track import track_kernel
 from jumper_warp.kernels.mdp.view import RobotArrays
 from jumper_warp.robot.grounds import BlockCfg
@@ -54,7 +54,7 @@ class Stage(Probe):
     def stand(self, chosen, headings):
         """Launch what stands robots up."""
         inputs = [self.mask(chosen), array(headings), self.scene, self.settings, self.episodes.skill, self.robot]
-        wp.launch(stand_kernel, self.n, inputs, device="cpu")
+        wp.launch(default_pose_kernel, self.n, inputs, device="cpu")
 
     def scramble(self, seed=0):
         """Give the robots random states and pasts."""
