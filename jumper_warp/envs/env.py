@@ -158,7 +158,7 @@ class Env(Stages):
         self.compile()  # an evaluation compiles no draws
         self._advance_rng(chosen)
         self._reset_worlds(self._part(), chosen)
-        self._observe(self._part(), beginning=int(worlds is not None))
+        self._observe(self._part(), after_reset=int(worlds is not None))
         return self._step.obs, {}
 
     def compile(self) -> None:
@@ -242,7 +242,7 @@ class Env(Stages):
         self._clear_history(self._part(), mask)
         self._set_commands(mask, 1, values, headings)
         self.episodes.done.zero_()
-        self._observe(self._part(), beginning=1)
+        self._observe(self._part(), after_reset=1)
 
     def command(self, commands: Any, worlds: Any = None) -> None:
         """Give worlds a command within their episode; `obs` shows it at once.
@@ -253,7 +253,7 @@ class Env(Stages):
         """
         chosen = checked_mask(worlds, self.num_envs)
         self._set_commands(self._array(chosen), 0, checked_commands(commands, chosen, self.tasks), self._all)
-        self._observe(self._part(), beginning=1)
+        self._observe(self._part(), after_reset=1)
 
     def request(self, skill: int, worlds: Any = None, commands: Any = None) -> None:
         """Ask worlds to hand over to another skill as soon as a handover allows it.

@@ -125,7 +125,7 @@ class Stages:
         part = self._part(worlds)
         return {"action": lambda: self._apply_actions(part), "physics": lambda: self._advance(part),
                 "episode": lambda: self._compute_rewards_and_dones(part),
-                "observe": lambda: self._observe(part, beginning=0),
+                "observe": lambda: self._observe(part, after_reset=0),
                 "reset": lambda: self._reset_done(part)}  # fmt: skip
 
     def _apply_actions(self, part: Part) -> None:
@@ -156,7 +156,7 @@ class Stages:
         if begins:
             self._reset_worlds(part, self.episodes.done)
         if self._handovers or begins:
-            self._observe(part, beginning=1)
+            self._observe(part, after_reset=1)
 
     def _hand_over(self, part: Part) -> None:
         if self._handovers:
@@ -218,15 +218,15 @@ class Stages:
     def _advance_rng(self, mask: wp.array) -> None:
         self._launch(advance_rng_kernel, self.num_envs, [mask, self.episodes])
 
-    def _observe(self, part: Part, beginning: int) -> None:
+    def _observe(self, part: Part, after_reset: int) -> None:
         for skill in self.skills:
             arrays = skill.observations
             self._launch(
                 skill.kernels["observe"], (skill.num_chunks, part.count),
                 [skill.index, self.robot, self.parameters, self._scene.ground, part.episode, skill.states,
-                 skill.params.values, beginning, arrays.raw],
+                 skill.params.values, after_reset, arrays.raw],
             )  # fmt: skip
-            inputs = [skill.index, part.episode, skill.columns, skill.params.values, beginning, arrays]
+            inputs = [skill.index, part.episode, skill.columns, skill.params.values, after_reset, arrays]
             self._launch(postprocess_obs_kernel, (part.count, int(LANES)), inputs, POSTPROCESS_BLOCK)
 
     def _launch(

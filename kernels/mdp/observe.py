@@ -20,7 +20,7 @@ LANES = wp.constant(32)
 
 
 @wp.struct
-class Column:
+class ObservationColumn:
     """Where a component of an observation term comes from and stands in the rows of its group."""
 
     raw: int  # its row among the raw values
@@ -50,9 +50,9 @@ class ObservationArrays:
 
 
 @wp.func
-def load_column(columns: wp.array2d(dtype=int), component: int) -> Column:
+def load_column(columns: wp.array2d(dtype=int), component: int) -> ObservationColumn:
     """Return a component's row; columns: (fields of `Column`, components), so that neighbours read neighbours."""
-    column = Column()
+    column = ObservationColumn()
     column.raw = columns[0, component]
     column.group = columns[1, component]
     column.start = columns[2, component]
@@ -99,7 +99,7 @@ def make_observe_kernel(task: Any) -> wp.Kernel:
         episode: EpisodeArrays,
         states: wp.array(dtype=task.state),
         p: wp.array(dtype=float),
-        beginning: int,
+        after_reset: int,
         # out
         raw: wp.array2d(dtype=float),
     ):
@@ -109,7 +109,7 @@ def make_observe_kernel(task: Any) -> wp.Kernel:
         """
         chunk, world = wp.tid()
         world += episode.first
-        if episode.skill[world] != skill or (beginning != 0 and episode.history_reset[world] == 0):
+        if episode.skill[world] != skill or (after_reset != 0 and episode.history_reset[world] == 0):
             return
         for c in range(wp.static((len(slots) + CHUNK - 1) // CHUNK)):
             if chunk == c:
@@ -135,7 +135,7 @@ def make_observe_kernel(task: Any) -> wp.Kernel:
 
 
 @wp.func
-def or_zero(value: float, diverged: bool) -> float:
+def finite_or_zero(value: float, diverged: bool) -> float:
     """Return 0 instead of the value of a world that came apart, or of one that is not finite."""
     if diverged or not wp.isfinite(value):
         return 0.0
@@ -143,7 +143,7 @@ def or_zero(value: float, diverged: bool) -> float:
 
 
 @wp.struct
-class Moment:
+class StepContext:
     """What all components of a world have in common in a step."""
 
     world: int
@@ -157,11 +157,11 @@ class Moment:
 
 
 @wp.func
-def moment(episode: EpisodeArrays, arrays: ObservationArrays, world: int) -> Moment:
+def step_context(episode: EpisodeArrays, arrays: ObservationArrays, world: int) -> StepContext:
     """Return what a world's components have in common."""
     step_count = episode.step_count[world]
     whole = arrays.latency[world] // arrays.substeps
-    m = Moment()
+    m = StepContext()
     m.world = world
     m.draws = step_key(episode.seed, world, step_count)
     m.fresh = episode.history_reset[world]
@@ -174,7 +174,7 @@ def moment(episode: EpisodeArrays, arrays: ObservationArrays, world: int) -> Mom
 
 
 @wp.func
-def late(arrays: ObservationArrays, m: Moment, column: int, value: float) -> float:
+def delay_value(arrays: ObservationArrays, m: StepContext, column: int, value: float) -> float:
     """Return what a sensor gave as long ago as its latency says, between policy steps a straight line."""
     if m.fresh == BEGUN:
         for i in range(RING):
@@ -187,27 +187,29 @@ def late(arrays: ObservationArrays, m: Moment, column: int, value: float) -> flo
 
 
 @wp.func
-def condition(arrays: ObservationArrays, column: Column, p: wp.array(dtype=float), m: Moment, beginning: int):
+def postprocess(
+    arrays: ObservationArrays, column: ObservationColumn, p: wp.array(dtype=float), m: StepContext, after_reset: int
+):
     """Turn a component's raw value into an observation, behind the frames before."""
-    value = or_zero(arrays.raw[column.raw, m.world], m.diverged)
+    value = finite_or_zero(arrays.raw[column.raw, m.world], m.diverged)
     if column.delayed != 0:
-        value = late(arrays, m, column.past, value)
+        value = delay_value(arrays, m, column.past, value)
     noise = p[column.noise]
     if noise > 0.0:
         value += noise * clamped_normal(stream_at(m.draws, m.world, OBSERVATION + column.group), column.oldest)
-    value = or_zero(p[column.scale] * wp.clamp(value, -p[column.clip], p[column.clip]), m.diverged)
+    value = finite_or_zero(p[column.scale] * wp.clamp(value, -p[column.clip], p[column.clip]), m.diverged)
     i = column.start + m.world * column.stride + column.oldest
-    again = beginning != 0 and m.fresh == COMMANDED
+    again = after_reset != 0 and m.fresh == COMMANDED
     for _ in range(column.history - 1):
         frame = arrays.now[i + wp.where(again, 0, column.width)]
         if m.diverged or m.fresh == BEGUN:
             frame = value
         arrays.now[i] = frame
-        if beginning == 0:
+        if after_reset == 0:
             arrays.final[i] = frame
         i += column.width
     arrays.now[i] = value
-    if beginning == 0:
+    if after_reset == 0:
         arrays.final[i] = value
 
 
@@ -218,7 +220,7 @@ def postprocess_obs_kernel(
     episode: EpisodeArrays,
     columns: wp.array2d(dtype=int),
     p: wp.array(dtype=float),
-    beginning: int,
+    after_reset: int,
     # in, out
     arrays: ObservationArrays,
 ):
@@ -230,8 +232,8 @@ def postprocess_obs_kernel(
     """
     world, lane = wp.tid()
     world += episode.first
-    if episode.skill[world] != skill or (beginning != 0 and episode.history_reset[world] == 0):
+    if episode.skill[world] != skill or (after_reset != 0 and episode.history_reset[world] == 0):
         return
-    m = moment(episode, arrays, world)
+    m = step_context(episode, arrays, world)
     for component in range(lane, columns.shape[1], LANES):
-        condition(arrays, load_column(columns, component), p, m, beginning)
+        postprocess(arrays, load_column(columns, component), p, m, after_reset)

@@ -94,7 +94,7 @@ def test_after_a_switch_observation_and_filter_are_those_of_a_fresh_environment_
             states[0] = s.state
             alone.skills[0].states.assign(wp.array(states, dtype=alone.task.state, device="cpu"))
             alone.episodes.history_reset.fill_(1)
-            alone._observe(alone._part(), beginning=1)
+            alone._observe(alone._part(), after_reset=1)
             assert torch.equal(alone.obs[0], s.obs), (target, alone.obs[0] - s.obs)
             alone.action[0] = torch.from_numpy(s.next_action)
             alone.stages()["action"]()

@@ -249,10 +249,10 @@ class Probe:
                   skill.states, skill.term_value, skill.counters]  # fmt: skip
         wp.launch(skill.kernels["step"], self.n, inputs, device="cpu")
 
-    def observe(self, beginning: int = 0) -> None:
+    def observe(self, after_reset: int = 0) -> None:
         """Launch the observation."""
         states, numbers = self.skill.states, self.skill.params.values
-        observe(self.skill, self.robot, self.parameters, self.ground, self.episodes, states, numbers, beginning)
+        observe(self.skill, self.robot, self.parameters, self.ground, self.episodes, states, numbers, after_reset)
 
     def next_clock(self) -> None:
         """Let all worlds be one policy step further on, and no longer new."""
