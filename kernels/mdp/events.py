@@ -65,7 +65,7 @@ def make_event_kernel(slots: list) -> wp.Kernel:
                     if stage != wp.static(STARTUP):
                         timer[i, world] = left
                 if due:
-                    if wp.static(slots[i].plain):
+                    if wp.static(slots[i].parameterless):
                         wp.static(slots[i].func)(robot, draw)
                     else:
                         wp.static(slots[i].func)(robot, draw, *p[wp.static(slots[i].lo) : wp.static(slots[i].hi)])

@@ -119,7 +119,7 @@ def make_observe_kernel(task: Any) -> wp.Kernel:
                         store(wp.static(slots[i].func)(parameters, world), wp.static(places[i]), world, raw)
                     elif wp.static(of_ground[i]):
                         store(wp.static(slots[i].func)(arrays, ground, world), wp.static(places[i]), world, raw)
-                    elif wp.static(slots[i].plain):
+                    elif wp.static(slots[i].parameterless):
                         store(wp.static(slots[i].func)(robot, states[world]), wp.static(places[i]), world, raw)
                     else:
                         store(

@@ -89,10 +89,12 @@ def make_step_kernel(task: Any) -> wp.Kernel:
         if episode.skill[world] != skill:
             return
         robot = load_view(arrays, ground, world)
-        if wp.static(advance.plain):
+        if wp.static(advance.parameterless):
             state = wp.static(advance.func)(robot, states[world])
         else:
-            state = wp.static(advance.func)(robot, states[world], *p[wp.static(advance.lo) : wp.static(advance.hi)])
+            state = wp.static(advance.func)(
+                robot, states[world], *p[wp.static(advance.params_start) : wp.static(advance.params_stop)]
+            )
 
         termination = int(NOT_TERMINATED)
         timeout = float(0.0)
@@ -102,7 +104,7 @@ def make_step_kernel(task: Any) -> wp.Kernel:
             termination = wp.static(broken_ending)
         for i in range(wp.static(len(endings))):
             if termination == NOT_TERMINATED:
-                if wp.static(endings[i].plain):
+                if wp.static(endings[i].parameterless):
                     holds = wp.static(endings[i].func)(robot, state)
                 else:
                     holds = wp.static(endings[i].func)(
@@ -115,7 +117,7 @@ def make_step_kernel(task: Any) -> wp.Kernel:
 
         total = float(0.0)
         for i in range(wp.static(len(rewards))):
-            if wp.static(rewards[i].plain):
+            if wp.static(rewards[i].parameterless):
                 raw = wp.static(rewards[i].func)(robot, state)
             else:
                 raw = wp.static(rewards[i].func)(robot, state, *p[wp.static(rewards[i].lo) : wp.static(rewards[i].hi)])
