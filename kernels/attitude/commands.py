@@ -20,7 +20,7 @@ class TurnRanges:
 
 
 @wp.func
-def draw_unit_quat(draw: RngStream) -> wp.quat:
+def sample_unit_quat(draw: RngStream) -> wp.quat:
     """Return a random orientation (xyzw), uniform over all (Shoemake 1992)."""
     a = uniform(draw, streams.QUAT, 0.0, 1.0)
     b = uniform(draw, streams.QUAT + 1, 0.0, 2.0 * wp.pi)
@@ -31,7 +31,7 @@ def draw_unit_quat(draw: RngStream) -> wp.quat:
 
 
 @wp.func
-def draw_axis(draw: RngStream, axis_share: float) -> wp.vec3:
+def sample_axis(draw: RngStream, axis_share: float) -> wp.vec3:
     """Return a unit vector: one of the body's axes in a share of draws, else any, uniform over the sphere."""
     sign = wp.where(uniform(draw, streams.SIGN, 0.0, 1.0) < 0.5, -1.0, 1.0)
     if uniform(draw, streams.ALONG_BODY, 0.0, 1.0) < axis_share:
@@ -45,9 +45,9 @@ def draw_axis(draw: RngStream, axis_share: float) -> wp.vec3:
 
 
 @wp.func
-def draw_turn(draw: RngStream, ranges: TurnRanges) -> wp.quat:
+def sample_rotation(draw: RngStream, ranges: TurnRanges) -> wp.quat:
     """Return a drawn turn (xyzw), body axes."""
-    axis = draw_axis(fold_in(draw, streams.AXIS_BRANCH), ranges.axis_share)
+    axis = sample_axis(fold_in(draw, streams.AXIS_BRANCH), ranges.axis_share)
     return wp.quat_from_axis_angle(axis, uniform_range(draw, streams.ANGLE, ranges.angle))
 
 

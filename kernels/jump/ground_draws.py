@@ -53,7 +53,7 @@ def fixed_block(center: wp.vec2, half: wp.vec2, height: float) -> Block:
 
 
 @wp.func
-def draw_platform(draw: RngStream, ranges: GroundRanges, foot: wp.vec2, goal: wp.vec3) -> Block:
+def sample_platform(draw: RngStream, ranges: GroundRanges, foot: wp.vec2, goal: wp.vec3) -> Block:
     """Return a platform under a robot at the origin; none if its paws could not land beside it."""
     half = foot + wp.vec2(
         uniform(draw, streams.PLATFORM_ROOM_X, EVERY_SIDE, ranges.room),
@@ -66,7 +66,7 @@ def draw_platform(draw: RngStream, ranges: GroundRanges, foot: wp.vec2, goal: wp
 
 
 @wp.func
-def draw_block(draw: RngStream, ranges: GroundRanges, foot: wp.vec2, goal: wp.vec3) -> Block:
+def sample_block(draw: RngStream, ranges: GroundRanges, foot: wp.vec2, goal: wp.vec3) -> Block:
     """Return a block under the goal; none without room for its near side between the paws before and after the jump.
 
     The near side is anywhere there, more often near than far (a third within a ninth of the room), across the axis
@@ -92,11 +92,11 @@ def draw_block(draw: RngStream, ranges: GroundRanges, foot: wp.vec2, goal: wp.ve
 
 
 @wp.func
-def draw_ground(draw: RngStream, ranges: GroundRanges, foot: wp.vec2, goal: wp.vec3) -> Block:
+def sample_ground(draw: RngStream, ranges: GroundRanges, foot: wp.vec2, goal: wp.vec3) -> Block:
     """Return the block of a standing start at the origin with a goal [m], world axes; mostly there is none."""
     u = uniform(draw, streams.GROUND, 0.0, 1.0)
     if u < ranges.platform:
-        return draw_platform(draw, ranges, foot, goal)
+        return sample_platform(draw, ranges, foot, goal)
     if u < ranges.platform + ranges.block:
-        return draw_block(draw, ranges, foot, goal)
+        return sample_block(draw, ranges, foot, goal)
     return Block()

@@ -9,7 +9,7 @@ from ..mdp.reset import leg_limits
 from ..mdp.view import RobotArrays, RobotView, base_pos, rotate_yaw, yaw_of
 from ..terrain.ground import Block, Ground, rest_block, surface, world_ground
 from . import streams
-from .ground_draws import GroundRanges, draw_ground, footprint
+from .ground_draws import GroundRanges, footprint, sample_ground
 from .start_states import (
     AFTER_LANDING,
     DEFAULT,
@@ -19,7 +19,7 @@ from .start_states import (
     TOUCHDOWN,
     JumpStart,
     ResetRanges,
-    draw_scheme,
+    sample_start_mode,
     write_start,
 )
 from .state import FLIGHT, LANDED, STANCE, JumpState
@@ -47,7 +47,7 @@ class JumpLevel:
 
 
 @wp.func
-def rounded(goal: wp.vec3, lower: wp.vec3, upper: wp.vec3) -> wp.vec3:
+def project_to_ellipse(goal: wp.vec3, lower: wp.vec3, upper: wp.vec3) -> wp.vec3:
     """Return a goal of a box around the start moved into the ellipse that touches the box's sides, its height kept.
 
     Each quarter has its own half axes, so that reaches ahead, back and to either side can differ.
@@ -59,7 +59,7 @@ def rounded(goal: wp.vec3, lower: wp.vec3, upper: wp.vec3) -> wp.vec3:
 
 
 @wp.func
-def draw_goal(draw: RngStream, level: JumpLevel) -> wp.vec3:
+def sample_goal(draw: RngStream, level: JumpLevel) -> wp.vec3:
     """Return a goal of a level relative to start and heading."""
     lower = level.goal_lower
     upper = level.goal_upper
@@ -69,12 +69,12 @@ def draw_goal(draw: RngStream, level: JumpLevel) -> wp.vec3:
         uniform(draw, streams.GOAL + 2, lower[2], upper[2]),
     )
     if level.round != 0:
-        goal = rounded(goal, lower, upper)
+        goal = project_to_ellipse(goal, lower, upper)
     return goal
 
 
 @wp.func
-def draw_again(draw: RngStream, delay: wp.vec2, share: float) -> int:
+def sample_next_jump_step(draw: RngStream, delay: wp.vec2, share: float) -> int:
     """Return how many policy steps after touchdown another goal comes; 0: none, in all but a share of draws.
 
     delay: range in policy steps.
@@ -84,7 +84,7 @@ def draw_again(draw: RngStream, delay: wp.vec2, share: float) -> int:
 
 
 @wp.func
-def draw_command(draw: RngStream, ranges: ResetRanges) -> int:
+def sample_command_step(draw: RngStream, ranges: ResetRanges) -> int:
     """Return at which policy step the jump is commanded: uniform, a share of the draws in the longer of two ranges."""
     u = uniform(draw, streams.COMMAND_STEP, 0.0, 1.0)
     share = ranges.long_wait_share
@@ -94,7 +94,7 @@ def draw_command(draw: RngStream, ranges: ResetRanges) -> int:
 
 
 @wp.func
-def begin_task(
+def begin_jump(
     draw: RngStream, ranges: ResetRanges, scheme: int, goal: wp.vec3, pos: wp.vec3, vz: float, jump_again: float
 ) -> JumpState:
     """Return the state of a new episode that begins with a scheme at a base position [m] and upward speed [m/s]."""
@@ -103,9 +103,9 @@ def begin_task(
     state.goal = goal
     state.start = pos
     state.max_height = pos[2]
-    state.command_step = draw_command(draw, ranges)
+    state.command_step = sample_command_step(draw, ranges)
     state.again_delay = ranges.again_delay
-    state.again_step = draw_again(draw, ranges.again_delay, jump_again)
+    state.again_step = sample_next_jump_step(draw, ranges.again_delay, jump_again)
     if scheme == PUSHING or (scheme == STANDING and ranges.lean > 0.0):
         state.start = wp.vec3(0.0, 0.0, pos[2])
     if scheme == PUSHING:
@@ -152,7 +152,7 @@ def place_ground(ground: Ground, start: JumpStart, grounds: GroundRanges, draw: 
     if grounds.platform + grounds.block > 0.0:
         block = Block()
         if start.scheme == STANDING or start.scheme == DEFAULT:
-            block = draw_ground(draw, grounds, footprint(start.ranges, start.heading), start.goal)
+            block = sample_ground(draw, grounds, footprint(start.ranges, start.heading), start.goal)
         ground.blocks[draw.world] = block
     else:
         rest_block(ground, draw.world)
@@ -170,16 +170,16 @@ def reset_jump(
     spent = old.spent
     spent[old.scheme] += float(old.steps)
     start = JumpStart()
-    start.scheme = draw_scheme(draw, ranges, spent)
+    start.scheme = sample_start_mode(draw, ranges, spent)
     start.heading = uniform(draw, streams.HEADING, -ranges.heading, ranges.heading)
-    start.goal = rotate_yaw(draw_goal(draw, level), start.heading)
+    start.goal = rotate_yaw(sample_goal(draw, level), start.heading)
     start.base_height = level.base_height
     start.ranges = ranges
     start.limits = leg_limits(skill.command_filter)
     start.ground = place_ground(scene.ground, start, settings.grounds, draw)
     scheme = write_start(arrays, scene, start, draw)
     vz = arrays.joint_qd[world * DOFS + 2]
-    state = begin_task(draw, ranges, scheme, start.goal, base_pos(arrays, world), vz, level.jump_again)
+    state = begin_jump(draw, ranges, scheme, start.goal, base_pos(arrays, world), vz, level.jump_again)
     state.heading = start.heading
     state.spent = spent
     state.goal_ground = surface(start.ground, start.goal[0], start.goal[1])[0]
@@ -195,9 +195,9 @@ def another_jump_due(state: JumpState) -> bool:
 @wp.func
 def draw_next_jump(robot: RobotView, scene: Scene, state: JumpState, level: JumpLevel, draw: RngStream) -> JumpState:
     """Return the state of an episode that goes on with another jump, to a drawn goal."""
-    goal = draw_goal(draw, level)
+    goal = sample_goal(draw, level)
     new = begin_next_jump(state, world_ground(scene.ground, robot.world), goal, robot.pos, yaw_of(robot.quat))
-    new.again_step = draw_again(draw, state.again_delay, level.jump_again)
+    new.again_step = sample_next_jump_step(draw, state.again_delay, level.jump_again)
     return new
 
 

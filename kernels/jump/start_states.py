@@ -128,7 +128,7 @@ def most_lacking(shares: vec_schemes, spent: vec_schemes) -> int:
 
 
 @wp.func
-def draw_scheme(draw: RngStream, ranges: ResetRanges, spent: vec_schemes) -> int:
+def sample_start_mode(draw: RngStream, ranges: ResetRanges, spent: vec_schemes) -> int:
     """Return the scheme of a new episode; shares of time are drawn once, and then what lacks most comes next."""
     if ranges.of_time != 0 and wp.length_sq(spent) > 0.0:
         return most_lacking(ranges.shares, spent)

@@ -36,7 +36,7 @@ def reach_of(ranges: CommandRanges, level: int) -> wp.vec4:
 
 
 @wp.func
-def draw_velocity(draw: RngStream, ranges: CommandRanges, level: int) -> wp.vec3:
+def sample_velocity_command(draw: RngStream, ranges: CommandRanges, level: int) -> wp.vec3:
     """Return a command of a level.
 
     Beyond the first level, the faster it goes along x, the less far it reaches across and in turning: an ellipse
@@ -84,7 +84,7 @@ def draw_command(
     robot: RobotView, scene: Scene, state: VelocityState, level: CommandRanges, draw: RngStream
 ) -> VelocityState:
     """Return the state of an episode that goes on with a drawn command."""
-    new = with_command(state, draw_velocity(draw, level, state.command_level))
+    new = with_command(state, sample_velocity_command(draw, level, state.command_level))
     new.command_lasts = wp.max(int(uniform_range(draw, streams.LASTS, level.lasts)), 1)
     return new
 

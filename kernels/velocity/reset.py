@@ -8,7 +8,7 @@ from ..mdp.random import RngStream, uniform, uniform_range
 from ..mdp.view import RobotArrays, base_pos
 from ..terrain.ground import rest_block
 from . import streams
-from .commands import CommandRanges, draw_velocity, with_command
+from .commands import CommandRanges, sample_velocity_command, with_command
 from .start_states import Map, VelocitySettings, write_start
 from .state import VelocityState, mean_error
 from .terminations import off_map
@@ -71,6 +71,6 @@ def reset_velocity(
     new.pace = settings.pace
     new.phase = uniform(draw, streams.GAIT_PHASE, 0.0, 1.0)
     new.limit = map_limit(settings.map)
-    new = with_command(new, draw_velocity(draw, level, new.command_level))
+    new = with_command(new, sample_velocity_command(draw, level, new.command_level))
     new.command_lasts = wp.max(int(uniform_range(draw, streams.LASTS, level.lasts)), 1)
     return new

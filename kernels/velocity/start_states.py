@@ -76,7 +76,7 @@ class VelocityBase:
 
 
 @wp.func
-def draw_spot(draw: RngStream, map: Map, level: int) -> wp.vec2:
+def sample_tile(draw: RngStream, map: Map, level: int) -> wp.vec2:
     """Return the middle of a tile [m] of a level, of any level past the last; the origin without a map."""
     if map.rows == 0:
         return wp.vec2(0.0)
@@ -151,7 +151,7 @@ def write_start(
     """Write a start state to a world: a sampled one, or in a share of draws the default pose."""
     world = draw.world
     start = VelocityStart()
-    start.spot = draw_spot(draw, settings.map, terrain_level)
+    start.spot = sample_tile(draw, settings.map, terrain_level)
     start.heading = uniform(draw, streams.HEADING, -settings.heading, settings.heading)
     start.settings = settings
     start.limits = leg_limits(skill.command_filter)

@@ -113,7 +113,7 @@ def another_goal_due(state: HoldState) -> bool:
 
 
 @wp.func
-def draw_goal(
+def sample_goal(
     robot: mdp.RobotView, scene: mdp.Scene, state: HoldState, level: HoldLevel, draw: mdp.RngStream
 ) -> HoldState:
     """Command another height."""
@@ -175,7 +175,7 @@ def hold_height() -> mdp.TaskCfg:
         state=HoldState,
         advance=mdp.Advance(advance_hold, tolerance=0.02),
         reset=mdp.Reset(reset_hold, HoldResetCfg()),
-        command=mdp.Command(give_hold, another_goal_due, draw_goal),
+        command=mdp.Command(give_hold, another_goal_due, sample_goal),
         curriculum=mdp.Curriculum(height_error, tolerance=0.03, promote_after=2, counts=every_episode),
         rewards=(
             mdp.RewardTerm(near_goal, 60.0, width=0.05),
