@@ -59,14 +59,14 @@ def project_to_ellipse(goal: wp.vec3, lower: wp.vec3, upper: wp.vec3) -> wp.vec3
 
 
 @wp.func
-def sample_goal(draw: RngStream, level: JumpLevel) -> wp.vec3:
+def sample_goal(rng: RngStream, level: JumpLevel) -> wp.vec3:
     """Return a goal of a level relative to start and heading."""
     lower = level.goal_lower
     upper = level.goal_upper
     goal = wp.vec3(
-        uniform(draw, streams.GOAL, lower[0], upper[0]),
-        uniform(draw, streams.GOAL + 1, lower[1], upper[1]),
-        uniform(draw, streams.GOAL + 2, lower[2], upper[2]),
+        uniform(rng, streams.GOAL, lower[0], upper[0]),
+        uniform(rng, streams.GOAL + 1, lower[1], upper[1]),
+        uniform(rng, streams.GOAL + 2, lower[2], upper[2]),
     )
     if level.round != 0:
         goal = project_to_ellipse(goal, lower, upper)
@@ -74,19 +74,19 @@ def sample_goal(draw: RngStream, level: JumpLevel) -> wp.vec3:
 
 
 @wp.func
-def sample_next_jump_step(draw: RngStream, delay: wp.vec2, share: float) -> int:
+def sample_next_jump_step(rng: RngStream, delay: wp.vec2, share: float) -> int:
     """Return how many policy steps after touchdown another goal comes; 0: none, in all but a share of draws.
 
     delay: range in policy steps.
     """
-    steps = int(uniform_range(draw, streams.AGAIN_STEP, delay))
-    return wp.where(uniform(draw, streams.AGAIN, 0.0, 1.0) < share, wp.max(steps, 1), 0)
+    steps = int(uniform_range(rng, streams.AGAIN_STEP, delay))
+    return wp.where(uniform(rng, streams.AGAIN, 0.0, 1.0) < share, wp.max(steps, 1), 0)
 
 
 @wp.func
-def sample_command_step(draw: RngStream, ranges: ResetRanges) -> int:
+def sample_command_step(rng: RngStream, ranges: ResetRanges) -> int:
     """Return at which policy step the jump is commanded: uniform, a share of the draws in the longer of two ranges."""
-    u = uniform(draw, streams.COMMAND_STEP, 0.0, 1.0)
+    u = uniform(rng, streams.COMMAND_STEP, 0.0, 1.0)
     share = ranges.long_wait_share
     soon = (u - share) / wp.max(1.0 - share, 1.0e-6) * (float(ranges.command_delay) + 0.999)
     later = u / wp.max(share, 1.0e-6) * (float(ranges.long_wait) + 0.999)
@@ -95,7 +95,7 @@ def sample_command_step(draw: RngStream, ranges: ResetRanges) -> int:
 
 @wp.func
 def begin_jump(
-    draw: RngStream, ranges: ResetRanges, scheme: int, goal: wp.vec3, pos: wp.vec3, vz: float, jump_again: float
+    rng: RngStream, ranges: ResetRanges, scheme: int, goal: wp.vec3, pos: wp.vec3, vz: float, jump_again: float
 ) -> JumpState:
     """Return the state of a new episode that begins with a scheme at a base position [m] and upward speed [m/s]."""
     state = JumpState()
@@ -103,9 +103,9 @@ def begin_jump(
     state.goal = goal
     state.start = pos
     state.max_height = pos[2]
-    state.command_step = sample_command_step(draw, ranges)
+    state.command_step = sample_command_step(rng, ranges)
     state.again_delay = ranges.again_delay
-    state.again_step = sample_next_jump_step(draw, ranges.again_delay, jump_again)
+    state.again_step = sample_next_jump_step(rng, ranges.again_delay, jump_again)
     if scheme == PUSHING or (scheme == STANDING and ranges.lean > 0.0):
         state.start = wp.vec3(0.0, 0.0, pos[2])
     if scheme == PUSHING:
@@ -121,7 +121,7 @@ def begin_jump(
         state.command_step = 0
         state.apex_passed = 1
         state.max_height = wp.max(goal[2], pos[2])
-        state.phase_steps = int(uniform(draw, streams.LANDED_STEPS, 0.0, 17.999))
+        state.phase_steps = int(uniform(rng, streams.LANDED_STEPS, 0.0, 17.999))
     return state
 
 
@@ -147,39 +147,39 @@ def begin_next_jump(old: JumpState, ground: Ground, goal: wp.vec3, pos: wp.vec3,
 
 
 @wp.func
-def place_ground(ground: Ground, start: JumpStart, grounds: GroundRanges, draw: RngStream) -> Ground:
+def place_ground(ground: Ground, start: JumpStart, grounds: GroundRanges, rng: RngStream) -> Ground:
     """Put the block of a world to its start, or draw another if blocks are drawn; returns the ground as it is there."""
     if grounds.platform + grounds.block > 0.0:
         block = Block()
         if start.scheme == STANDING or start.scheme == DEFAULT:
-            block = sample_ground(draw, grounds, footprint(start.ranges, start.heading), start.goal)
-        ground.blocks[draw.world] = block
+            block = sample_ground(rng, grounds, footprint(start.ranges, start.heading), start.goal)
+        ground.blocks[rng.world] = block
     else:
-        rest_block(ground, draw.world)
-    return world_ground(ground, draw.world)
+        rest_block(ground, rng.world)
+    return world_ground(ground, rng.world)
 
 
 @wp.func
 def reset_jump(
     arrays: RobotArrays, scene: Scene, skill: SkillSettings, old: JumpState, settings: JumpSettings, level: JumpLevel,
-    draw: RngStream,
+    rng: RngStream,
 ) -> JumpState:  # fmt: skip
     """Begin an episode at a stage of a jump, and return its state."""
-    world = draw.world
+    world = rng.world
     ranges = settings.states
     spent = old.spent
     spent[old.scheme] += float(old.steps)
     start = JumpStart()
-    start.scheme = sample_start_mode(draw, ranges, spent)
-    start.heading = uniform(draw, streams.HEADING, -ranges.heading, ranges.heading)
-    start.goal = rotate_yaw(sample_goal(draw, level), start.heading)
+    start.scheme = sample_start_mode(rng, ranges, spent)
+    start.heading = uniform(rng, streams.HEADING, -ranges.heading, ranges.heading)
+    start.goal = rotate_yaw(sample_goal(rng, level), start.heading)
     start.base_height = level.base_height
     start.ranges = ranges
     start.limits = leg_limits(skill.command_filter)
-    start.ground = place_ground(scene.ground, start, settings.grounds, draw)
-    scheme = write_start(arrays, scene, start, draw)
+    start.ground = place_ground(scene.ground, start, settings.grounds, rng)
+    scheme = write_start(arrays, scene, start, rng)
     vz = arrays.joint_qd[world * DOFS + 2]
-    state = begin_jump(draw, ranges, scheme, start.goal, base_pos(arrays, world), vz, level.jump_again)
+    state = begin_jump(rng, ranges, scheme, start.goal, base_pos(arrays, world), vz, level.jump_again)
     state.heading = start.heading
     state.spent = spent
     state.goal_ground = surface(start.ground, start.goal[0], start.goal[1])[0]
@@ -193,11 +193,11 @@ def another_jump_due(state: JumpState) -> bool:
 
 
 @wp.func
-def draw_next_jump(robot: RobotView, scene: Scene, state: JumpState, level: JumpLevel, draw: RngStream) -> JumpState:
+def draw_next_jump(robot: RobotView, scene: Scene, state: JumpState, level: JumpLevel, rng: RngStream) -> JumpState:
     """Return the state of an episode that goes on with another jump, to a drawn goal."""
-    goal = sample_goal(draw, level)
+    goal = sample_goal(rng, level)
     new = begin_next_jump(state, world_ground(scene.ground, robot.world), goal, robot.pos, yaw_of(robot.quat))
-    new.again_step = sample_next_jump_step(draw, state.again_delay, level.jump_again)
+    new.again_step = sample_next_jump_step(rng, state.again_delay, level.jump_again)
     return new
 
 

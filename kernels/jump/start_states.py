@@ -128,27 +128,27 @@ def most_lacking(shares: vec_schemes, spent: vec_schemes) -> int:
 
 
 @wp.func
-def sample_start_mode(draw: RngStream, ranges: ResetRanges, spent: vec_schemes) -> int:
+def sample_start_mode(rng: RngStream, ranges: ResetRanges, spent: vec_schemes) -> int:
     """Return the scheme of a new episode; shares of time are drawn once, and then what lacks most comes next."""
     if ranges.of_time != 0 and wp.length_sq(spent) > 0.0:
         return most_lacking(ranges.shares, spent)
-    return scheme_of_shares(ranges.shares, uniform(draw, streams.SCHEME, 0.0, 1.0))
+    return scheme_of_shares(ranges.shares, uniform(rng, streams.SCHEME, 0.0, 1.0))
 
 
 @wp.func
-def sample_quat(draw: RngStream, ranges: ResetRanges, heading: float, pitch: float) -> wp.quat:
+def sample_quat(rng: RngStream, ranges: ResetRanges, heading: float, pitch: float) -> wp.quat:
     """Return an orientation (xyzw) around a heading and a pitch [rad]."""
-    yaw = heading + uniform(draw, streams.YAW, -ranges.tilt, ranges.tilt)
-    tip = pitch + uniform(draw, streams.PITCH, -ranges.tilt, ranges.tilt)
-    roll = uniform(draw, streams.ROLL, -ranges.tilt, ranges.tilt)
+    yaw = heading + uniform(rng, streams.YAW, -ranges.tilt, ranges.tilt)
+    tip = pitch + uniform(rng, streams.PITCH, -ranges.tilt, ranges.tilt)
+    roll = uniform(rng, streams.ROLL, -ranges.tilt, ranges.tilt)
     return quat_from_ypr(yaw, tip, roll)
 
 
 @wp.func
-def sample_offset(draw: RngStream, ranges: ResetRanges) -> wp.vec3:
+def sample_offset(rng: RngStream, ranges: ResetRanges) -> wp.vec3:
     """Return a horizontal offset [m] of the base."""
-    x = uniform(draw, streams.OFFSET_X, -ranges.base_xy, ranges.base_xy)
-    return wp.vec3(x, uniform(draw, streams.OFFSET_Y, -ranges.base_xy, ranges.base_xy), 0.0)
+    x = uniform(rng, streams.OFFSET_X, -ranges.base_xy, ranges.base_xy)
+    return wp.vec3(x, uniform(rng, streams.OFFSET_Y, -ranges.base_xy, ranges.base_xy), 0.0)
 
 
 @wp.func
@@ -161,91 +161,89 @@ def direction(start: JumpStart) -> wp.vec3:
 
 
 @wp.func
-def standing(start: JumpStart, draw: RngStream) -> JumpBase:
+def standing(start: JumpStart, rng: RngStream) -> JumpBase:
     """Return a base at rest over paws around the origin; the deeper a squat, the farther it may lean back."""
     ranges = start.ranges
     lower = start.base_height[0]
     upper = start.base_height[1]
-    height = uniform_range(draw, streams.HEIGHT, start.base_height)
-    tip = uniform(draw, streams.FORWARD_PITCH, 0.0, ranges.forward_pitch)
-    lean = (upper - height) / wp.max(upper - lower, 1.0e-6) * uniform(draw, streams.LEAN, 0.0, ranges.lean)
+    height = uniform_range(rng, streams.HEIGHT, start.base_height)
+    tip = uniform(rng, streams.FORWARD_PITCH, 0.0, ranges.forward_pitch)
+    lean = (upper - height) / wp.max(upper - lower, 1.0e-6) * uniform(rng, streams.LEAN, 0.0, ranges.lean)
     base = JumpBase()
-    base.quat = sample_quat(draw, ranges, start.heading, tip)
-    base.pos = sample_offset(draw, ranges) + wp.vec3(0.0, 0.0, height) - lean * direction(start)
+    base.quat = sample_quat(rng, ranges, start.heading, tip)
+    base.pos = sample_offset(rng, ranges) + wp.vec3(0.0, 0.0, height) - lean * direction(start)
     return base
 
 
 @wp.func
-def just_landed(start: JumpStart, draw: RngStream) -> JumpBase:
+def just_landed(start: JumpStart, rng: RngStream) -> JumpBase:
     """Return a base that sinks over paws around the goal."""
     ranges = start.ranges
     base = JumpBase()
-    base.quat = sample_quat(draw, ranges, start.heading, 0.0)
+    base.quat = sample_quat(rng, ranges, start.heading, 0.0)
     base.spot = wp.vec3(start.goal[0], start.goal[1], 0.0)
-    ahead = uniform_range(draw, streams.LANDED_AHEAD, ranges.landed_ahead)
-    base.pos = sample_offset(draw, ranges) + base.spot + ahead * direction(start)
-    base.pos[2] = uniform_range(draw, streams.LANDED_HEIGHT, ranges.landed_height)
-    base.lin_vel = wp.vec3(0.0, 0.0, -uniform_range(draw, streams.LANDED_SPEED, ranges.landed_speed))
+    ahead = uniform_range(rng, streams.LANDED_AHEAD, ranges.landed_ahead)
+    base.pos = sample_offset(rng, ranges) + base.spot + ahead * direction(start)
+    base.pos[2] = uniform_range(rng, streams.LANDED_HEIGHT, ranges.landed_height)
+    base.lin_vel = wp.vec3(0.0, 0.0, -uniform_range(rng, streams.LANDED_SPEED, ranges.landed_speed))
     return base
 
 
 @wp.func
-def takeoff_speed(draw: RngStream, ranges: ResetRanges, height: float, distance: float, apex: float, g: float) -> float:
+def takeoff_speed(rng: RngStream, ranges: ResetRanges, height: float, distance: float, apex: float, g: float) -> float:
     """Return the upward speed [m/s] with which a jump over a distance [m] leaves a height [m]."""
     if apex > 0.0:
         return wp.sqrt(wp.max(2.0 * g * (apex - height), 0.0))
     # height + v_z t - g t^2 / 2 = landing_height, where v_z t = distance tan(angle)
-    climb = distance * wp.tan(uniform_range(draw, streams.TAKEOFF_ANGLE, ranges.takeoff_angle))
+    climb = distance * wp.tan(uniform_range(rng, streams.TAKEOFF_ANGLE, ranges.takeoff_angle))
     t = wp.sqrt(wp.max(2.0 * (height - ranges.landing_height + climb) / g, 1.0e-6))
     limit = wp.sqrt(wp.max(2.0 * g * (ranges.highest_apex - height), 0.0))
     return wp.min(climb / t, limit)
 
 
 @wp.func
-def in_flight(start: JumpStart, draw: RngStream, g: float) -> JumpBase:
+def in_flight(start: JumpStart, rng: RngStream, g: float) -> JumpBase:
     """Return a base on the projectile to the goal: anywhere, shortly before touchdown, or for a push at the takeoff."""
     ranges = start.ranges
     along = direction(start)
-    height = uniform_range(draw, streams.TAKEOFF_HEIGHT, ranges.takeoff_height)
+    height = uniform_range(rng, streams.TAKEOFF_HEIGHT, ranges.takeoff_height)
     way = wp.length(wp.vec3(start.goal[0], start.goal[1], 0.0))
-    ahead = wp.min(uniform_range(draw, streams.TAKEOFF_AHEAD, ranges.takeoff_ahead), way)
+    ahead = wp.min(uniform_range(rng, streams.TAKEOFF_AHEAD, ranges.takeoff_ahead), way)
     distance = way - ahead
-    up = takeoff_speed(draw, ranges, height, distance, start.goal[2], g)
+    up = takeoff_speed(rng, ranges, height, distance, start.goal[2], g)
     duration = wp.max(time_to_height(height, up, ranges.landing_height, g), 1.0e-3)
     forward = distance / duration
-    t = duration * uniform_range(draw, streams.FLIGHT_TIME, ranges.flight_time)
+    t = duration * uniform_range(rng, streams.FLIGHT_TIME, ranges.flight_time)
     if start.scheme == TOUCHDOWN:
-        t = wp.max(duration - uniform_range(draw, streams.TOUCHDOWN_TIME, ranges.touchdown_time), 0.0)
+        t = wp.max(duration - uniform_range(rng, streams.TOUCHDOWN_TIME, ranges.touchdown_time), 0.0)
     if start.scheme == PUSHING:
         t = float(0.0)
     rise = wp.vec3(0.0, 0.0, height + up * t - 0.5 * g * t * t)
     base = JumpBase()
-    base.quat = sample_quat(
-        draw, ranges, start.heading, uniform_range(draw, streams.TAKEOFF_PITCH, ranges.takeoff_pitch)
-    )
-    base.pos = sample_offset(draw, ranges) + (ahead + forward * t) * along + rise
+    base.quat = sample_quat(rng, ranges, start.heading, uniform_range(rng, streams.TAKEOFF_PITCH, ranges.takeoff_pitch))
+    base.pos = sample_offset(rng, ranges) + (ahead + forward * t) * along + rise
     base.lin_vel = forward * along + wp.vec3(0.0, 0.0, up - g * t)
     return base
 
 
 @wp.func
-def before_touchdown(start: JumpStart, flight: JumpBase, draw: RngStream) -> JumpBase:
+def before_touchdown(start: JumpStart, flight: JumpBase, rng: RngStream) -> JumpBase:
     """Return a base in flight moved behind the spot that its paws surround."""
     base = flight
     base.spot = wp.vec3(flight.pos[0], flight.pos[1], 0.0)
-    base.pos = flight.pos - uniform_range(draw, streams.TOUCHDOWN_BEHIND, start.ranges.touchdown_behind) * direction(
+    base.pos = flight.pos - uniform_range(rng, streams.TOUCHDOWN_BEHIND, start.ranges.touchdown_behind) * direction(
         start
     )
     return base
 
 
 @wp.func
-def pushing_off(start: JumpStart, takeoff: JumpBase, draw: RngStream) -> JumpBase:
+def pushing_off(start: JumpStart, takeoff: JumpBase, rng: RngStream) -> JumpBase:
     """Return a base before its takeoff, over paws around the start: on a straight line, evenly accelerated."""
     base = takeoff
-    back = uniform_range(draw, streams.PUSH_LENGTH, start.ranges.push_length)
+    back = uniform_range(rng, streams.PUSH_LENGTH, start.ranges.push_length)
     speed = wp.length(takeoff.lin_vel)
-    before = speed * speed - 2.0 * back * uniform_range(draw, streams.PUSH_ACCELERATION, start.ranges.push_acceleration)
+    before = speed * speed - 2.0 * back * uniform_range(rng, streams.PUSH_ACCELERATION, start.ranges.push_acceleration)
     way = wp.normalize(takeoff.lin_vel)
     base.pos = takeoff.pos - back * way
     base.lin_vel = wp.sqrt(wp.max(before, 0.0)) * way
@@ -253,22 +251,20 @@ def pushing_off(start: JumpStart, takeoff: JumpBase, draw: RngStream) -> JumpBas
 
 
 @wp.func
-def sample_base(start: JumpStart, arrays: RobotArrays, draw: RngStream, attempt: int) -> JumpBase:
+def sample_base(start: JumpStart, arrays: RobotArrays, rng: RngStream, attempt: int) -> JumpBase:
     """Return the base of the start's scheme in an attempt."""
     base = JumpBase()
     if start.scheme == STANDING:
-        base = standing(start, draw)
+        base = standing(start, rng)
     elif start.scheme == AFTER_LANDING:
-        base = just_landed(start, draw)
+        base = just_landed(start, rng)
     else:
-        base = in_flight(start, draw, -arrays.gravity[draw.world][2])
+        base = in_flight(start, rng, -arrays.gravity[rng.world][2])
         if start.scheme == TOUCHDOWN:
-            base = before_touchdown(start, base, draw)
+            base = before_touchdown(start, base, rng)
         if start.scheme == PUSHING:
-            base = pushing_off(start, base, draw)
-    base.com_vel = base.lin_vel + wp.cross(
-        base.ang_vel, wp.quat_rotate(base.quat, arrays.body_com[draw.world * BODIES])
-    )
+            base = pushing_off(start, base, rng)
+    base.com_vel = base.lin_vel + wp.cross(base.ang_vel, wp.quat_rotate(base.quat, arrays.body_com[rng.world * BODIES]))
     base.height = base.pos[2]
     base.ground_height = surface(start.ground, 0.0, 0.0)[0]
     base.pos = base.pos + wp.vec3(0.0, 0.0, base.ground_height)
@@ -276,16 +272,16 @@ def sample_base(start: JumpStart, arrays: RobotArrays, draw: RngStream, attempt:
 
 
 @wp.func
-def leg_in_flight(ranges: ResetRanges, base: JumpBase, geo: LegGeometry, draw: RngStream, leg: int) -> LegSample:
+def leg_in_flight(ranges: ResetRanges, base: JumpBase, geo: LegGeometry, rng: RngStream, leg: int) -> LegSample:
     """Return a leg in flight, its paw above the ground: both thighs about alike, all legs about alike."""
     lower = ranges.flight_transversal[0]
     upper = ranges.flight_transversal[1]
-    middle = uniform_range(draw, streams.FLIGHT_TRANSVERSAL, ranges.flight_transversal)
-    lateral = uniform(draw, streams.FLIGHT_LATERAL, -ranges.flight_lateral, ranges.flight_lateral)
+    middle = uniform_range(rng, streams.FLIGHT_TRANSVERSAL, ranges.flight_transversal)
+    lateral = uniform(rng, streams.FLIGHT_LATERAL, -ranges.flight_lateral, ranges.flight_lateral)
     angles = wp.vec3(
-        lateral + uniform(draw, streams.LEG_LATERAL + leg, -0.03, 0.03),
-        wp.clamp(middle + uniform(draw, streams.LEG_OUTER + leg, -0.1, 0.1), lower, upper),
-        wp.clamp(middle + uniform(draw, streams.LEG_INNER + leg, -0.1, 0.1), lower, upper),
+        lateral + uniform(rng, streams.LEG_LATERAL + leg, -0.03, 0.03),
+        wp.clamp(middle + uniform(rng, streams.LEG_OUTER + leg, -0.1, 0.1), lower, upper),
+        wp.clamp(middle + uniform(rng, streams.LEG_INNER + leg, -0.1, 0.1), lower, upper),
     )
     found = LegSample()
     found.angles = angles
@@ -295,17 +291,17 @@ def leg_in_flight(ranges: ResetRanges, base: JumpBase, geo: LegGeometry, draw: R
 
 
 @wp.func
-def sample_leg(start: JumpStart, base: JumpBase, geo: LegGeometry, draw: RngStream, leg: int) -> LegSample:
+def sample_leg(start: JumpStart, base: JumpBase, geo: LegGeometry, rng: RngStream, leg: int) -> LegSample:
     """Return a leg of an attempt: in flight, or by its paw's place on the ground, above it before touchdown."""
     ranges = start.ranges
     if start.scheme == IN_FLIGHT:
-        return leg_in_flight(ranges, base, geo, draw, leg)
-    beside = sample_foot_offset(draw, leg, ranges.front_x, ranges.front_y, ranges.back_x, ranges.back_y)
+        return leg_in_flight(ranges, base, geo, rng, leg)
+    beside = sample_foot_offset(rng, leg, ranges.front_x, ranges.front_y, ranges.back_x, ranges.back_y)
     spot = base.spot + rotate_yaw(beside, start.heading)
     paw = spot - base.pos
     if start.scheme == TOUCHDOWN:
         # paws hang below the base, a little above the ground at least
-        depth = uniform_range(draw, streams.PAW_DEPTH, ranges.paw_depth)
+        depth = uniform_range(rng, streams.PAW_DEPTH, ranges.paw_depth)
         paw[2] = -wp.min(depth, base.height - geo.paw_radius - 0.025)
     else:
         below = surface(start.ground, spot[0], spot[1])[0]
@@ -319,10 +315,10 @@ def sample_leg(start: JumpStart, base: JumpBase, geo: LegGeometry, draw: RngStre
 
 
 @wp.func
-def write_start(arrays: RobotArrays, scene: Scene, start: JumpStart, draw: RngStream) -> int:
+def write_start(arrays: RobotArrays, scene: Scene, start: JumpStart, rng: RngStream) -> int:
     """Write a start state to a world, and return its scheme: `DEFAULT` where no attempt was valid too."""
     if start.scheme != DEFAULT:
-        if sample_valid_state(sample_base, sample_leg, start, arrays, scene, draw):
+        if sample_valid_state(sample_base, sample_leg, start, arrays, scene, rng):
             return start.scheme
-    write_default_pose(arrays, scene, draw.world, start.heading, surface(start.ground, 0.0, 0.0)[0])
+    write_default_pose(arrays, scene, rng.world, start.heading, surface(start.ground, 0.0, 0.0)[0])
     return DEFAULT

@@ -62,16 +62,16 @@ def make_reset_kernel(task: Any) -> wp.Kernel:
             commanded = wp.static(due)(states[world])
         if not (begins or commanded):
             return
-        draw = make_stream(episode.seed, world, episode.step_count[world], RESET)
-        draw.lane = lane
-        draw.lanes = lanes
+        rng = make_stream(episode.seed, world, episode.step_count[world], RESET)
+        rng.lane = lane
+        rng.lanes = lanes
         level = episode.level[world]
         if level >= levels.shape[0]:
-            level = wp.min(int(uniform(draw, ANY_LEVEL, 0.0, float(levels.shape[0]))), levels.shape[0] - 1)
+            level = wp.min(int(uniform(rng, ANY_LEVEL, 0.0, float(levels.shape[0]))), levels.shape[0] - 1)
         if begins:
             old = previous_state(states[world], episode.done[world])
-            state = wp.static(reset)(arrays, scene, skills[skill], old, settings[0], levels[level], draw)
-            sync_attempts(draw)
+            state = wp.static(reset)(arrays, scene, skills[skill], old, settings[0], levels[level], rng)
+            sync_attempts(rng)
             if lane == 0:
                 states[world] = state
                 episode.history_reset[world] = BEGUN

@@ -47,14 +47,14 @@ def with_foot_velocity(geo: LegGeometry, leg: LegSample, ankle_vel: wp.vec3) -> 
 
 @wp.func
 def sample_foot_offset(
-    draw: RngStream, leg: int, front_x: wp.vec2, front_y: wp.vec2, back_x: wp.vec2, back_y: wp.vec2
+    rng: RngStream, leg: int, front_x: wp.vec2, front_y: wp.vec2, back_x: wp.vec2, back_y: wp.vec2
 ) -> wp.vec3:  # fmt: skip
     """Return a paw's place [m] relative to the spot that the paws surround, z = 0; ranges of absolute values."""
-    x = uniform_range(draw, PAW_X + leg, front_x)
-    y = uniform_range(draw, PAW_Y + leg, front_y)
+    x = uniform_range(rng, PAW_X + leg, front_x)
+    y = uniform_range(rng, PAW_Y + leg, front_y)
     if leg >= 2:
-        x = -uniform_range(draw, PAW_X + leg, back_x)
-        y = uniform_range(draw, PAW_Y + leg, back_y)
+        x = -uniform_range(rng, PAW_X + leg, back_x)
+        y = uniform_range(rng, PAW_Y + leg, back_y)
     if leg % 2 == 1:
         y = -y
     return wp.vec3(x, y, 0.0)

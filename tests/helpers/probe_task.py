@@ -87,13 +87,13 @@ def advance_probe(robot: RobotView, state: ProbeState, growth: float) -> ProbeSt
 @wp.func
 def reset_probe(
     arrays: RobotArrays, scene: Scene, skill: SkillSettings, old: ProbeState, settings: ProbeSettings,
-    level: ProbeLevel, draw: RngStream,
+    level: ProbeLevel, rng: RngStream,
 ) -> ProbeState:  # fmt: skip
     """Stand; keep a draw in `other` and the level in `counts`."""
-    write_default_pose(arrays, scene, draw.world, 0.5, 0.25)
+    write_default_pose(arrays, scene, rng.world, 0.5, 0.25)
     new = ProbeState()
     new.value = settings.value
-    new.other = uniform(draw, 0, 0.0, 1.0)
+    new.other = uniform(rng, 0, 0.0, 1.0)
     new.counts = level.number
     return new
 
@@ -114,10 +114,10 @@ def command_due(state: ProbeState) -> bool:
 
 
 @wp.func
-def draw_command(robot: RobotView, scene: Scene, state: ProbeState, level: ProbeLevel, draw: RngStream) -> ProbeState:
+def draw_command(robot: RobotView, scene: Scene, state: ProbeState, level: ProbeLevel, rng: RngStream) -> ProbeState:
     """Keep a draw in `other` and the level in `counts`."""
     new = state
-    new.other = uniform(draw, 0, 0.0, 1.0)
+    new.other = uniform(rng, 0, 0.0, 1.0)
     new.counts = level.number
     return new
 

@@ -19,21 +19,21 @@ N = 256
 
 
 @wp.func
-def count(robot: RobotParameters, draw: RngStream, times: float):
+def count(robot: RobotParameters, rng: RngStream, times: float):
     """Count in the latency how often the event ran."""
-    robot.latency[draw.world] = robot.latency[draw.world] + int(times)
+    robot.latency[rng.world] = robot.latency[rng.world] + int(times)
 
 
 @wp.func
-def mark(robot: RobotParameters, draw: RngStream):
+def mark(robot: RobotParameters, rng: RngStream):
     """Count in the latency of observations."""
-    robot.observation_latency[draw.world] = robot.observation_latency[draw.world] + 1
+    robot.observation_latency[rng.world] = robot.observation_latency[rng.world] + 1
 
 
 @wp.func
-def drawn_force(robot: RobotParameters, draw: RngStream, lower: float, upper: float):
+def drawn_force(robot: RobotParameters, rng: RngStream, lower: float, upper: float):
     """Draw a force."""
-    robot.push[draw.world] = wp.spatial_vector(uniform(draw, 0, lower, upper), 0.0, 0.0, 0.0, 0.0, 0.0)
+    robot.push[rng.world] = wp.spatial_vector(uniform(rng, 0, lower, upper), 0.0, 0.0, 0.0, 0.0, 0.0)
 
 
 EVENTS = (
