@@ -95,28 +95,28 @@ def sample_command_step(rng: RngStream, ranges: ResetRanges) -> int:
 
 @wp.func
 def begin_jump(
-    rng: RngStream, ranges: ResetRanges, scheme: int, goal: wp.vec3, pos: wp.vec3, vz: float, jump_again: float
+    rng: RngStream, ranges: ResetRanges, start_mode: int, goal: wp.vec3, pos: wp.vec3, vz: float, jump_again: float
 ) -> JumpState:
     """Return the state of a new episode that begins with a scheme at a base position [m] and upward speed [m/s]."""
     state = JumpState()
-    state.scheme = scheme
+    state.start_mode = start_mode
     state.goal = goal
     state.start = pos
     state.max_height = pos[2]
     state.command_step = sample_command_step(rng, ranges)
     state.again_delay = ranges.again_delay
-    state.again_step = sample_next_jump_step(rng, ranges.again_delay, jump_again)
-    if scheme == PUSHING or (scheme == STANDING and ranges.lean > 0.0):
+    state.next_jump_step = sample_next_jump_step(rng, ranges.again_delay, jump_again)
+    if start_mode == PUSHING or (start_mode == STANDING and ranges.lean > 0.0):
         state.start = wp.vec3(0.0, 0.0, pos[2])
-    if scheme == PUSHING:
+    if start_mode == PUSHING:
         state.command_step = 0
-    if scheme == IN_FLIGHT or scheme == TOUCHDOWN:
+    if start_mode == IN_FLIGHT or start_mode == TOUCHDOWN:
         state.phase = FLIGHT
         state.command_step = 0
         if vz <= 0.0:
             state.apex_passed = 1
             state.max_height = wp.max(goal[2], pos[2])
-    if scheme == AFTER_LANDING:
+    if start_mode == AFTER_LANDING:
         state.phase = LANDED
         state.command_step = 0
         state.apex_passed = 1
@@ -141,7 +141,7 @@ def begin_next_jump(old: JumpState, ground: Ground, goal: wp.vec3, pos: wp.vec3,
     state.max_height = pos[2]
     state.peak_tilt = 0.0
     state.paws_landed = 0
-    state.again_step = 0
+    state.next_jump_step = 0
     state.jumps = old.jumps + 1
     return state
 
@@ -151,7 +151,7 @@ def place_ground(ground: Ground, start: JumpStart, grounds: GroundRanges, rng: R
     """Put the block of a world to its start, or draw another if blocks are drawn; returns the ground as it is there."""
     if grounds.platform + grounds.block > 0.0:
         block = Block()
-        if start.scheme == STANDING or start.scheme == DEFAULT:
+        if start.start_mode == STANDING or start.start_mode == DEFAULT:
             block = sample_ground(rng, grounds, footprint(start.ranges, start.heading), start.goal)
         ground.blocks[rng.world] = block
     else:
@@ -167,21 +167,21 @@ def reset_jump(
     """Begin an episode at a stage of a jump, and return its state."""
     world = rng.world
     ranges = settings.states
-    spent = old.spent
-    spent[old.scheme] += float(old.steps)
+    steps_per_mode = old.steps_per_mode
+    steps_per_mode[old.start_mode] += float(old.steps)
     start = JumpStart()
-    start.scheme = sample_start_mode(rng, ranges, spent)
+    start.start_mode = sample_start_mode(rng, ranges, steps_per_mode)
     start.heading = uniform(rng, streams.HEADING, -ranges.heading, ranges.heading)
     start.goal = rotate_yaw(sample_goal(rng, level), start.heading)
     start.base_height = level.base_height
     start.ranges = ranges
     start.limits = leg_limits(skill.command_filter)
     start.ground = place_ground(scene.ground, start, settings.grounds, rng)
-    scheme = write_start(arrays, scene, start, rng)
+    start_mode = write_start(arrays, scene, start, rng)
     vz = arrays.joint_qd[world * DOFS + 2]
-    state = begin_jump(rng, ranges, scheme, start.goal, base_pos(arrays, world), vz, level.jump_again)
+    state = begin_jump(rng, ranges, start_mode, start.goal, base_pos(arrays, world), vz, level.jump_again)
     state.heading = start.heading
-    state.spent = spent
+    state.steps_per_mode = steps_per_mode
     state.goal_ground = surface(start.ground, start.goal[0], start.goal[1])[0]
     return state
 
@@ -189,7 +189,7 @@ def reset_jump(
 @wp.func
 def another_jump_due(state: JumpState) -> bool:
     """Return whether a landed robot gets another goal now."""
-    return state.phase == LANDED and state.again_step > 0 and state.phase_steps >= state.again_step
+    return state.phase == LANDED and state.next_jump_step > 0 and state.phase_steps >= state.next_jump_step
 
 
 @wp.func
@@ -197,7 +197,7 @@ def draw_next_jump(robot: RobotView, scene: Scene, state: JumpState, level: Jump
     """Return the state of an episode that goes on with another jump, to a drawn goal."""
     goal = sample_goal(rng, level)
     new = begin_next_jump(state, world_ground(scene.ground, robot.world), goal, robot.pos, yaw_of(robot.quat))
-    new.again_step = sample_next_jump_step(rng, state.again_delay, level.jump_again)
+    new.next_jump_step = sample_next_jump_step(rng, state.again_delay, level.jump_again)
     return new
 
 
@@ -227,4 +227,4 @@ def give_jump(robot: RobotView, scene: Scene, state: JumpState, values: wp.vec4,
 @wp.func
 def from_standing(state: JumpState) -> bool:
     """Return whether an episode began standing, and so counts for the curriculum."""
-    return state.scheme <= DEFAULT
+    return state.start_mode <= DEFAULT

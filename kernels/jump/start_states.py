@@ -22,7 +22,7 @@ from ..mdp.view import RobotArrays, rotate_yaw
 from ..terrain.ground import Ground, surface
 from . import streams
 from .phase import time_to_height
-from .state import SCHEMES, vec_schemes
+from .state import NUM_START_MODES, vec_start_modes
 
 wp.set_module_options({"enable_backward": False})
 
@@ -38,7 +38,7 @@ PUSHING = wp.constant(5)
 class ResetRanges:
     """Ranges of the drawn states; pairs are (lower, upper), angles [rad], lengths [m]."""
 
-    shares: vec_schemes  # of standing, default, in flight, touchdown, just landed, pushing off
+    shares: vec_start_modes  # of standing, default, in flight, touchdown, just landed, pushing off
     of_time: int  # 1: shares are of the time that a world spends in episodes, 0: of its resets
     base_xy: float  # half width
     tilt: float  # half width of roll, pitch; of yaw too around the heading
@@ -76,7 +76,7 @@ class ResetRanges:
 class JumpStart:
     """What all attempts at a start state share."""
 
-    scheme: int
+    start_mode: int
     heading: float  # [rad] yaw
     goal: wp.vec3  # [m] from the origin, world axes
     base_height: wp.vec2  # [m] range of standing starts
@@ -100,39 +100,39 @@ class JumpBase:
 
 
 @wp.func
-def scheme_of_shares(shares: vec_schemes, u: float) -> int:
+def start_mode_at(shares: vec_start_modes, u: float) -> int:
     """Return the scheme at u in [0, 1) of the shares one after the other."""
-    scheme = int(0)
+    start_mode = int(0)
     rest = u
-    for i in range(SCHEMES):
+    for i in range(NUM_START_MODES):
         if rest >= 0.0 and shares[i] > 0.0:
-            scheme = i
+            start_mode = i
         rest -= shares[i]
-    return scheme
+    return start_mode
 
 
 @wp.func
-def most_lacking(shares: vec_schemes, spent: vec_schemes) -> int:
+def least_sampled_mode(shares: vec_start_modes, steps_per_mode: vec_start_modes) -> int:
     """Return the scheme that is farthest behind its share of what was spent, in policy steps."""
     total = float(0.0)
-    for i in range(SCHEMES):
-        total += spent[i]
-    scheme = int(0)
+    for i in range(NUM_START_MODES):
+        total += steps_per_mode[i]
+    start_mode = int(0)
     most = float(-3.0e38)
-    for i in range(SCHEMES):
-        lack = shares[i] * total - spent[i]
+    for i in range(NUM_START_MODES):
+        lack = shares[i] * total - steps_per_mode[i]
         if shares[i] > 0.0 and lack > most:
-            scheme = i
+            start_mode = i
             most = lack
-    return scheme
+    return start_mode
 
 
 @wp.func
-def sample_start_mode(rng: RngStream, ranges: ResetRanges, spent: vec_schemes) -> int:
+def sample_start_mode(rng: RngStream, ranges: ResetRanges, steps_per_mode: vec_start_modes) -> int:
     """Return the scheme of a new episode; shares of time are drawn once, and then what lacks most comes next."""
-    if ranges.of_time != 0 and wp.length_sq(spent) > 0.0:
-        return most_lacking(ranges.shares, spent)
-    return scheme_of_shares(ranges.shares, uniform(rng, streams.SCHEME, 0.0, 1.0))
+    if ranges.of_time != 0 and wp.length_sq(steps_per_mode) > 0.0:
+        return least_sampled_mode(ranges.shares, steps_per_mode)
+    return start_mode_at(ranges.shares, uniform(rng, streams.START_MODE, 0.0, 1.0))
 
 
 @wp.func
@@ -214,9 +214,9 @@ def in_flight(start: JumpStart, rng: RngStream, g: float) -> JumpBase:
     duration = wp.max(time_to_height(height, up, ranges.landing_height, g), 1.0e-3)
     forward = distance / duration
     t = duration * uniform_range(rng, streams.FLIGHT_TIME, ranges.flight_time)
-    if start.scheme == TOUCHDOWN:
+    if start.start_mode == TOUCHDOWN:
         t = wp.max(duration - uniform_range(rng, streams.TOUCHDOWN_TIME, ranges.touchdown_time), 0.0)
-    if start.scheme == PUSHING:
+    if start.start_mode == PUSHING:
         t = float(0.0)
     rise = wp.vec3(0.0, 0.0, height + up * t - 0.5 * g * t * t)
     base = JumpBase()
@@ -254,15 +254,15 @@ def pushing_off(start: JumpStart, takeoff: JumpBase, rng: RngStream) -> JumpBase
 def sample_base(start: JumpStart, arrays: RobotArrays, rng: RngStream, attempt: int) -> JumpBase:
     """Return the base of the start's scheme in an attempt."""
     base = JumpBase()
-    if start.scheme == STANDING:
+    if start.start_mode == STANDING:
         base = standing(start, rng)
-    elif start.scheme == AFTER_LANDING:
+    elif start.start_mode == AFTER_LANDING:
         base = just_landed(start, rng)
     else:
         base = in_flight(start, rng, -arrays.gravity[rng.world][2])
-        if start.scheme == TOUCHDOWN:
+        if start.start_mode == TOUCHDOWN:
             base = before_touchdown(start, base, rng)
-        if start.scheme == PUSHING:
+        if start.start_mode == PUSHING:
             base = pushing_off(start, base, rng)
     base.com_vel = base.lin_vel + wp.cross(base.ang_vel, wp.quat_rotate(base.quat, arrays.body_com[rng.world * BODIES]))
     base.height = base.pos[2]
@@ -294,12 +294,12 @@ def leg_in_flight(ranges: ResetRanges, base: JumpBase, geo: LegGeometry, rng: Rn
 def sample_leg(start: JumpStart, base: JumpBase, geo: LegGeometry, rng: RngStream, leg: int) -> LegSample:
     """Return a leg of an attempt: in flight, or by its paw's place on the ground, above it before touchdown."""
     ranges = start.ranges
-    if start.scheme == IN_FLIGHT:
+    if start.start_mode == IN_FLIGHT:
         return leg_in_flight(ranges, base, geo, rng, leg)
     beside = sample_foot_offset(rng, leg, ranges.front_x, ranges.front_y, ranges.back_x, ranges.back_y)
     spot = base.spot + rotate_yaw(beside, start.heading)
     paw = spot - base.pos
-    if start.scheme == TOUCHDOWN:
+    if start.start_mode == TOUCHDOWN:
         # paws hang below the base, a little above the ground at least
         depth = uniform_range(rng, streams.PAW_DEPTH, ranges.paw_depth)
         paw[2] = -wp.min(depth, base.height - geo.paw_radius - 0.025)
@@ -307,7 +307,7 @@ def sample_leg(start: JumpStart, base: JumpBase, geo: LegGeometry, rng: RngStrea
         below = surface(start.ground, spot[0], spot[1])[0]
         paw[2] = below + geo.paw_radius - base.height - base.ground_height
     found = leg_ik(geo, start.limits, wp.quat_rotate_inv(base.quat, paw))
-    if start.scheme == AFTER_LANDING or start.scheme == PUSHING:
+    if start.start_mode == AFTER_LANDING or start.start_mode == PUSHING:
         # the paw rests on the ground while the base moves, so the joints move too
         moving = base.lin_vel + wp.cross(base.ang_vel, paw)
         found = with_foot_velocity(geo, found, -wp.quat_rotate_inv(base.quat, moving))
@@ -317,8 +317,8 @@ def sample_leg(start: JumpStart, base: JumpBase, geo: LegGeometry, rng: RngStrea
 @wp.func
 def write_start(arrays: RobotArrays, scene: Scene, start: JumpStart, rng: RngStream) -> int:
     """Write a start state to a world, and return its scheme: `DEFAULT` where no attempt was valid too."""
-    if start.scheme != DEFAULT:
+    if start.start_mode != DEFAULT:
         if sample_valid_state(sample_base, sample_leg, start, arrays, scene, rng):
-            return start.scheme
+            return start.start_mode
     write_default_pose(arrays, scene, rng.world, start.heading, surface(start.ground, 0.0, 0.0)[0])
     return DEFAULT

@@ -114,7 +114,7 @@ def test_counters_are_means_of_the_episodes_that_ended(env):
     env.metrics()
     edit_episodes(env, slice(0, 3), phase=LANDED, phase_steps=59, max_height=0.8, goal=(0.0, 0.0, 0.77))
     edit_episodes(env, slice(3, 7), steps=200, command_step=0)
-    edit_episodes(env, slice(7, 9), phase=LANDED, phase_steps=59, scheme=4)  # begun just landed: not counted
+    edit_episodes(env, slice(7, 9), phase=LANDED, phase_steps=59, start_mode=4)  # begun just landed: not counted
     env.step(REST)
     total = env.skills[0].term_value.numpy().sum(axis=1)
     figures = env.metrics()
@@ -140,11 +140,11 @@ def finish(env, worlds, success: bool) -> None:
     assert env.done[worlds].all()
 
 
-@pytest.mark.parametrize("scheme", [2, 3, 4])
+@pytest.mark.parametrize("start_mode", [2, 3, 4])
 @pytest.mark.parametrize("success", [True, False])
-def test_other_starts_do_not_count_for_the_curriculum(env, scheme, success):
+def test_other_starts_do_not_count_for_the_curriculum(env, start_mode, success):
     stand(env, level=1, streak=3, command_step=1000)
-    edit_episodes(env, [0], scheme=scheme)
+    edit_episodes(env, [0], start_mode=start_mode)
     finish(env, [0], success)
     assert (episodes_of(env)["level"][0], episodes_of(env)["streak"][0]) == (1, 3)
 

@@ -22,7 +22,7 @@ from jumper_warp.tasks.observations import exact
 from mdp_helpers import DEFAULT_ANGLE, MOTOR_SLOTS, STEP_DT, SUBSTEPS, array, new_worlds, observe, standing_robots
 
 DEG = np.pi / 180.0
-SCHEMES = ("standing", "default", "in_flight", "touchdown", "landed", "pushing")
+NUM_START_MODES = ("standing", "default", "in_flight", "touchdown", "landed", "pushing")
 OF_WORLD = ("level", "streak")
 """What a world keeps from episode to episode."""
 
@@ -144,9 +144,9 @@ def tilted_by(angle: float, axis=(1.0, 0.0, 0.0)) -> dict:
     return {"quat": tuple(quat), "gravity": tuple(wp.quat_rotate_inv(quat, wp.vec3(0.0, 0.0, -1.0)))}
 
 
-def only(scheme: str, reset: ResetCfg | None = None, **ranges) -> ResetCfg:
+def only(start_mode: str, reset: ResetCfg | None = None, **ranges) -> ResetCfg:
     """Return resets that all follow one scheme, otherwise as `reset`."""
-    shares = dict.fromkeys(SHARES, 0.0) | ({} if scheme == "landed" else {scheme: 1.0})
+    shares = dict.fromkeys(SHARES, 0.0) | ({} if start_mode == "landed" else {start_mode: 1.0})
     return dataclasses.replace(ResetCfg() if reset is None else reset, **shares, **ranges)
 
 
