@@ -28,7 +28,7 @@ from jumper_warp.kernels.mdp.parameters import motors_kernel
 from jumper_warp.kernels.mdp.reset import advance_rng_kernel, clear_history_kernel
 from jumper_warp.kernels.mdp.track import track_kernel
 from jumper_warp.sim.simulation import Simulation
-from jumper_warp.sim.slices import Worlds
+from jumper_warp.sim.slices import WorldRange
 from jumper_warp.tasks.cfg import Handover, TaskCfg
 from jumper_warp.utils.kernels import Kernel
 
@@ -41,7 +41,7 @@ EVENT_BLOCKS = 264
 """Most blocks of events: of their many threads few have something to do, and a new block costs more than a turn."""
 
 
-class Part(NamedTuple):
+class WorldSlice(NamedTuple):
     """The worlds that a stage is launched for."""
 
     first: int
@@ -103,21 +103,21 @@ class Stages:
         found += [(postprocess_obs_kernel, POSTPROCESS_BLOCK), *((kernel, BLOCK) for kernel in shared)]
         return found + self.sim.physics.kernels()
 
-    def _part(self, worlds: Worlds | None = None) -> Part:
+    def _part(self, worlds: WorldRange | None = None) -> WorldSlice:
         """Return some of the worlds as stages are launched for them, by default all."""
         if worlds is None or worlds.count == self.num_envs:
-            return Part(0, self.num_envs, self.episodes)
+            return WorldSlice(0, self.num_envs, self.episodes)
         env = EpisodeArrays()
         for name in EpisodeArrays.vars:
             setattr(env, name, getattr(self.episodes, name))
         env.first = worlds.first
-        return Part(*worlds, env)
+        return WorldSlice(*worlds, env)
 
-    def _launch_step(self, worlds: Worlds | None = None) -> None:
+    def _launch_step(self, worlds: WorldRange | None = None) -> None:
         for stage in self.stages(worlds).values():
             stage()
 
-    def stages(self, worlds: Worlds | None = None) -> dict[str, Callable[[], None]]:
+    def stages(self, worlds: WorldRange | None = None) -> dict[str, Callable[[], None]]:
         """Return the parts of a step by name, in order: each launches its kernels and does not wait for them.
 
         worlds: for which they are launched, by default all; no stage of some reads or writes what is of others.
@@ -128,21 +128,21 @@ class Stages:
                 "observe": lambda: self._observe(part, after_reset=0),
                 "reset": lambda: self._reset_done(part)}  # fmt: skip
 
-    def _apply_actions(self, part: Part) -> None:
+    def _apply_actions(self, part: WorldSlice) -> None:
         inputs = [self._action, self._settings, self.parameters.push, self.robot, part.episode, self.delays]
         self._launch(action_kernel, (4, part.count), inputs)
         self._events(part, AT_STEP, self._all)
 
-    def _advance(self, part: Part) -> None:
+    def _advance(self, part: WorldSlice) -> None:
         delays, scene = self.delays, self._scene
         self.sim.physics.advance(
             self.sim.substeps, delays.current_target, delays.prev_target, delays.switch_step, bodies=False,
-            worlds=Worlds(part.first, part.count),
+            worlds=WorldRange(part.first, part.count),
         )  # fmt: skip
         inputs = [scene.geometry, scene.ground, self._settings, part.episode, self.robot]
         self._launch(track_kernel, (4, part.count), inputs)
 
-    def _compute_rewards_and_dones(self, part: Part) -> None:
+    def _compute_rewards_and_dones(self, part: WorldSlice) -> None:
         for skill in self.skills:
             self._launch(
                 skill.kernels["step"], part.count,
@@ -150,7 +150,7 @@ class Stages:
                  skill.states, skill.term_value, skill.counters],
             )  # fmt: skip
 
-    def _reset_done(self, part: Part) -> None:
+    def _reset_done(self, part: WorldSlice) -> None:
         self._hand_over(part)
         begins = self.auto_reset and self._ends_episodes
         if begins:
@@ -158,7 +158,7 @@ class Stages:
         if self._handovers or begins:
             self._observe(part, after_reset=1)
 
-    def _hand_over(self, part: Part) -> None:
+    def _hand_over(self, part: WorldSlice) -> None:
         if self._handovers:
             self._moved[part.first : part.first + part.count].zero_()
         for kernel, source, target in self._handovers:
@@ -168,7 +168,7 @@ class Stages:
                  part.episode, self.skills[source].states, self.skills[target].states],
             )  # fmt: skip
 
-    def _reset_worlds(self, part: Part, mask: wp.array) -> None:
+    def _reset_worlds(self, part: WorldSlice, mask: wp.array) -> None:
         """Begin new episodes where mask is not 0, in the first skill, and commands where they are due."""
         self._restore_first_task(part, mask)
         self._randomize(part, mask)
@@ -181,12 +181,12 @@ class Stages:
             )  # fmt: skip
         self._clear_history(part, mask)
 
-    def _restore_first_task(self, part: Part, mask: wp.array) -> None:
+    def _restore_first_task(self, part: WorldSlice, mask: wp.array) -> None:
         """Put worlds back into their first skill where mask is not 0, and forget what they were asked for."""
         if len(self.skills) > 1:
             self._launch(restore_task_kernel, part.count, [mask, self._home, self.parameters, part.episode])
 
-    def _randomize(self, part: Part, mask: wp.array) -> None:
+    def _randomize(self, part: WorldSlice, mask: wp.array) -> None:
         """Draw parameters of episodes that begin where mask is not 0."""
         if not self._started:  # all worlds begin
             self._launch(motors_kernel, (12, self.num_envs), [self.parameters])
@@ -194,7 +194,7 @@ class Stages:
             self._started = True
         self._events(part, AT_RESET, mask)
 
-    def _events(self, part: Part, stage: int, mask: wp.array) -> None:
+    def _events(self, part: WorldSlice, stage: int, mask: wp.array) -> None:
         """Run the events of a stage, and let the solver read what they changed."""
         for skill in self.skills:
             slots = enumerate(skill.task.params.slots["events"])
@@ -208,9 +208,9 @@ class Stages:
                      self.parameters], BLOCKS["event"], EVENT_BLOCKS,
                 )  # fmt: skip
             if any(slot.repack for slot in due.values()):
-                self.sim.physics.parameters_changed(mask, Worlds(part.first, part.count))
+                self.sim.physics.parameters_changed(mask, WorldRange(part.first, part.count))
 
-    def _clear_history(self, part: Part, mask: wp.array) -> None:
+    def _clear_history(self, part: WorldSlice, mask: wp.array) -> None:
         inputs = [part.first, mask, self._scene.geometry, self.robot, self.delays]
         self._launch(clear_history_kernel, (12, part.count), inputs)
         self.sim.physics.after_reset(mask)
@@ -218,7 +218,7 @@ class Stages:
     def _advance_rng(self, mask: wp.array) -> None:
         self._launch(advance_rng_kernel, self.num_envs, [mask, self.episodes])
 
-    def _observe(self, part: Part, after_reset: int) -> None:
+    def _observe(self, part: WorldSlice, after_reset: int) -> None:
         for skill in self.skills:
             arrays = skill.observations
             self._launch(

@@ -23,7 +23,7 @@ from jumper_warp.rl.checkpoint import load_checkpoint
 from jumper_warp.rl.runner import CHECKPOINTS, train
 from jumper_warp.robot.motors import vertical_jump_filter
 from jumper_warp.sim.simulation import Simulation
-from jumper_warp.sim.slices import LEAST, Worlds, slices_of
+from jumper_warp.sim.slices import LEAST, WorldRange, slices_of
 from jumper_warp.tasks.cfg import Handover
 from jumper_warp.tasks.randomization import RandomizationCfg
 from jumper_warp.utils import threads as pool
@@ -163,7 +163,7 @@ def test_slices_hold_each_world_once_and_are_about_equal(worlds, threads):
     assert all(each.first % LEAST == 0 for each in slices)
     counts = [each.count for each in slices]
     assert max(counts) - min(counts) < 2 * LEAST
-    assert worlds >= 2 * LEAST or slices == [Worlds(0, worlds)]
+    assert worlds >= 2 * LEAST or slices == [WorldRange(0, worlds)]
 
 
 def test_mujoco_has_one_slice():
