@@ -69,7 +69,6 @@ __all__ = [
     "fold_in",
     "observations",
     "rewards",
-    "store_pose",
     "surface",
     "terminations",
     "tilt",
@@ -78,5 +77,6 @@ __all__ = [
     "vec12",
     "waiting",
     "world_ground",
+    "write_default_pose",
     "yaw_of",
 ]

@@ -20,7 +20,7 @@ from jumper_warp.envs.parameters import robot_parameters
 from jumper_warp.envs.skill import TaskRuntime
 from jumper_warp.kernels.mdp import attempts, events
 from jumper_warp.kernels.mdp.actions import action_kernel
-from jumper_warp.kernels.mdp.episode import EpisodeArrays, SkillSettings
+from jumper_warp.kernels.mdp.env import EpisodeArrays, SkillSettings
 from jumper_warp.kernels.mdp.events import AT_RESET, AT_STEP, STARTUP
 from jumper_warp.kernels.mdp.handover import make_handover_kernel, restore_task_kernel
 from jumper_warp.kernels.mdp.observe import LANES, postprocess_obs_kernel
@@ -204,8 +204,8 @@ class Stages:
                 first, lanes = min(due), events.LANES if spread else 1
                 self._launch(
                     skill.kernels["event"], (max(due) - first + 1, lanes, part.count),
-                    [skill.index, stage, first, lanes, mask, self.step_dt, part.episode, skill.params.values, skill.timer,
-                     self.parameters], BLOCKS["event"], EVENT_BLOCKS,
+                    [skill.index, stage, first, lanes, mask, self.step_dt, part.episode, skill.params.values,
+                     skill.timer, self.parameters], BLOCKS["event"], EVENT_BLOCKS,
                 )  # fmt: skip
             if any(slot.repack for slot in due.values()):
                 self.sim.physics.parameters_changed(mask, WorldRange(part.first, part.count))

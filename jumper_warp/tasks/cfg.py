@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 from jumper_warp.kernels.mdp.env import NoSettings
-from jumper_warp.kernels.mdp.starts import APART
+from jumper_warp.kernels.mdp.starts import MIN_LINK_DISTANCE
 from jumper_warp.kernels.mdp.terminations import came_apart
 from jumper_warp.robot.gravity import EARTH, check_gravity
 from jumper_warp.robot.motors import FilterCfg, MotorCfg
@@ -132,8 +132,8 @@ class TaskCfg:
         check_gravity(self.gravity)
         for name in ("lift", "contact_force", "block_margin"):
             check_not_negative(f"{self.name}: {name}", getattr(self, name))
-        if not 0.0 <= self.link_margin <= APART:
-            raise InputError(f"{self.name}: link_margin must be in [0, {APART:g}], got {self.link_margin}")
+        if not 0.0 <= self.link_margin <= MIN_LINK_DISTANCE:
+            raise InputError(f"{self.name}: link_margin must be in [0, {MIN_LINK_DISTANCE:g}], got {self.link_margin}")
         if self.reward_floor is not None and not math.isfinite(self.reward_floor):
             raise InputError(f"{self.name}: reward_floor must be finite or None, got {self.reward_floor}")
 

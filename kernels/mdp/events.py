@@ -68,6 +68,8 @@ def make_event_kernel(slots: list) -> wp.Kernel:
                     if wp.static(slots[i].parameterless):
                         wp.static(slots[i].func)(robot, rng)
                     else:
-                        wp.static(slots[i].func)(robot, rng, *p[wp.static(slots[i].lo) : wp.static(slots[i].hi)])
+                        wp.static(slots[i].func)(
+                            robot, rng, *p[wp.static(slots[i].params_start) : wp.static(slots[i].params_stop)]
+                        )
 
     return event_kernel

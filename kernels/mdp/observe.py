@@ -124,7 +124,9 @@ def make_observe_kernel(task: Any) -> wp.Kernel:
                     else:
                         store(
                             wp.static(slots[i].func)(
-                                robot, states[world], *p[wp.static(slots[i].lo) : wp.static(slots[i].hi)]
+                                robot,
+                                states[world],
+                                *p[wp.static(slots[i].params_start) : wp.static(slots[i].params_stop)],
                             ),
                             wp.static(places[i]),
                             world,

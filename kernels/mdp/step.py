@@ -108,7 +108,7 @@ def make_step_kernel(task: Any) -> wp.Kernel:
                     holds = wp.static(endings[i].func)(robot, state)
                 else:
                     holds = wp.static(endings[i].func)(
-                        robot, state, *p[wp.static(endings[i].lo) : wp.static(endings[i].hi)]
+                        robot, state, *p[wp.static(endings[i].params_start) : wp.static(endings[i].params_stop)]
                     )
                 if holds:
                     termination = i
@@ -120,7 +120,9 @@ def make_step_kernel(task: Any) -> wp.Kernel:
             if wp.static(rewards[i].parameterless):
                 raw = wp.static(rewards[i].func)(robot, state)
             else:
-                raw = wp.static(rewards[i].func)(robot, state, *p[wp.static(rewards[i].lo) : wp.static(rewards[i].hi)])
+                raw = wp.static(rewards[i].func)(
+                    robot, state, *p[wp.static(rewards[i].params_start) : wp.static(rewards[i].params_stop)]
+                )
             value = p[wp.static(rewards[i].weight)] * raw
             if wp.static(not rewards[i].once):
                 value = value * arrays.step_dt

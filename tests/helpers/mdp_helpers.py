@@ -16,8 +16,8 @@ DEFAULT_ANGLE = np.tile([0.0, np.pi / 4.0, np.pi / 4.0], 4)  # [rad]
 MOTOR_SLOTS = np.array([5 * leg + joint for leg in range(4) for joint in (0, 1, 3)])
 PAWS = ("impulse", "paw_force", "peak_force", "paw_pos", "paw_vel", "contact_time", "air_time", "touchdown_speed",
         "collisions", "paw_height")  # fmt: skip
-MOTORS = ("torque", "prev_torque", "action", "prev_action", "prev_prev_action", "target", "filtered_target", "prev_rate",
-          "joint_offset")  # fmt: skip
+MOTORS = ("torque", "prev_torque", "action", "prev_action", "prev_prev_action", "target", "filtered_target",
+          "prev_rate", "joint_offset")  # fmt: skip
 
 
 def array(values, dtype=float) -> wp.array:
