@@ -22,7 +22,6 @@ from jumper_warp.kernels.mdp import parameters as events
 from jumper_warp.kernels.mdp.env import Scene, SkillSettings
 from jumper_warp.kernels.mdp.parameters import RobotParameters
 from jumper_warp.kernels.mdp.random import RngStream, clamped_normal, fold_in, uniform, uniform_range
-from jumper_warp.kernels.mdp.reset import store_pose
 from jumper_warp.kernels.mdp.view import RobotArrays, RobotView, tilt, vec12, yaw_of
 from jumper_warp.kernels.terrain.ground import Ground, surface, world_ground
 from jumper_warp.kernels.velocity.state import VelocityState
@@ -70,7 +69,6 @@ __all__ = [
     "fold_in",
     "observations",
     "rewards",
-    "store_pose",
     "surface",
     "terminations",
     "tilt",
@@ -79,5 +77,6 @@ __all__ = [
     "vec12",
     "waiting",
     "world_ground",
+    "write_default_pose",
     "yaw_of",
 ]

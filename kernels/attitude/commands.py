@@ -20,35 +20,35 @@ class TurnRanges:
 
 
 @wp.func
-def draw_unit_quat(draw: RngStream) -> wp.quat:
+def sample_unit_quat(rng: RngStream) -> wp.quat:
     """Return a random orientation (xyzw), uniform over all (Shoemake 1992)."""
-    a = uniform(draw, streams.QUAT, 0.0, 1.0)
-    b = uniform(draw, streams.QUAT + 1, 0.0, 2.0 * wp.pi)
-    c = uniform(draw, streams.QUAT + 2, 0.0, 2.0 * wp.pi)
+    a = uniform(rng, streams.QUAT, 0.0, 1.0)
+    b = uniform(rng, streams.QUAT + 1, 0.0, 2.0 * wp.pi)
+    c = uniform(rng, streams.QUAT + 2, 0.0, 2.0 * wp.pi)
     s = wp.sqrt(1.0 - a)
     r = wp.sqrt(a)
     return wp.quat(s * wp.sin(b), s * wp.cos(b), r * wp.sin(c), r * wp.cos(c))
 
 
 @wp.func
-def draw_axis(draw: RngStream, axis_share: float) -> wp.vec3:
+def sample_axis(rng: RngStream, axis_share: float) -> wp.vec3:
     """Return a unit vector: one of the body's axes in a share of draws, else any, uniform over the sphere."""
-    sign = wp.where(uniform(draw, streams.SIGN, 0.0, 1.0) < 0.5, -1.0, 1.0)
-    if uniform(draw, streams.ALONG_BODY, 0.0, 1.0) < axis_share:
+    sign = wp.where(uniform(rng, streams.SIGN, 0.0, 1.0) < 0.5, -1.0, 1.0)
+    if uniform(rng, streams.ALONG_BODY, 0.0, 1.0) < axis_share:
         axis = wp.vec3(0.0)
-        axis[wp.min(int(uniform(draw, streams.BODY_AXIS, 0.0, 3.0)), 2)] = sign
+        axis[wp.min(int(uniform(rng, streams.BODY_AXIS, 0.0, 3.0)), 2)] = sign
         return axis
-    z = uniform(draw, streams.AXIS_Z, -1.0, 1.0)
-    around = uniform(draw, streams.AXIS_AROUND, 0.0, 2.0 * wp.pi)
+    z = uniform(rng, streams.AXIS_Z, -1.0, 1.0)
+    around = uniform(rng, streams.AXIS_AROUND, 0.0, 2.0 * wp.pi)
     r = wp.sqrt(1.0 - z * z)
     return wp.vec3(r * wp.cos(around), r * wp.sin(around), z)
 
 
 @wp.func
-def draw_turn(draw: RngStream, ranges: TurnRanges) -> wp.quat:
+def sample_rotation(rng: RngStream, ranges: TurnRanges) -> wp.quat:
     """Return a drawn turn (xyzw), body axes."""
-    axis = draw_axis(fold_in(draw, streams.AXIS_BRANCH), ranges.axis_share)
-    return wp.quat_from_axis_angle(axis, uniform_range(draw, streams.ANGLE, ranges.angle))
+    axis = sample_axis(fold_in(rng, streams.AXIS_BRANCH), ranges.axis_share)
+    return wp.quat_from_axis_angle(axis, uniform_range(rng, streams.ANGLE, ranges.angle))
 
 
 @wp.func

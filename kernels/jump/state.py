@@ -9,8 +9,8 @@ FLIGHT = wp.constant(1)
 LANDED = wp.constant(2)
 
 
-SCHEMES = wp.constant(6)  # ways in which an episode begins, see `start_states`
-vec_schemes = wp.types.vector(length=6, dtype=wp.float32)
+NUM_START_MODES = wp.constant(6)  # ways in which an episode begins, see `start_states`
+vec_start_modes = wp.types.vector(length=6, dtype=wp.float32)
 
 
 @wp.struct
@@ -33,12 +33,12 @@ class JumpState:
     max_height: float  # [m] of the base since takeoff
     touchdown_vel: wp.vec3  # [m/s] of the base, step before touchdown
     peak_tilt: float  # [rad] largest between body and world z since touchdown
-    scheme: int  # reset scheme that began the episode
-    again_step: int  # policy steps after touchdown at which another goal comes, 0: never
+    start_mode: int  # reset scheme that began the episode
+    next_jump_step: int  # policy steps after touchdown at which another goal comes, 0: never
     again_delay: wp.vec2  # policy steps between which that of yet another goal is drawn
     jumps: int  # jumps that were followed by another in this episode
     paws_landed: int  # bits of the paws that have come down since touchdown
-    spent: vec_schemes  # policy steps that the world has spent in episodes of each scheme, before this one
+    steps_per_mode: vec_start_modes  # policy steps that the world has spent in episodes of each scheme, before this one
 
 
 @wp.func

@@ -10,17 +10,17 @@ from ..kinematics.inverse import LegLimits
 from ..layout import COORDS, DOFS, motor_slot
 from ..terrain.ground import rest_block, surface, world_ground
 from .attempts import sync_attempts
-from .env import BEGUN, COMMANDED, RING, Delays, EnvArrays, Scene, SkillSettings
+from .env import BEGUN, COMMANDED, RING, Delays, EpisodeArrays, Scene, SkillSettings
 from .options import FAST
 from .random import ANY_LEVEL, COMMAND, RESET, make_stream, uniform
-from .track import follow_paw
+from .track import update_paw_kinematics
 from .view import RobotArrays, base_quat, base_velocity, load_view, yaw_of
 
 wp.set_module_options({"enable_backward": False})
 
 
 @wp.func
-def before_reset(old: Any, done: float):
+def previous_state(old: Any, done: float):
     """Return the state that a new episode follows; one that was cut off from outside counts as not begun."""
     state = old
     if done == 0.0:
@@ -44,7 +44,7 @@ def make_reset_kernel(task: Any) -> wp.Kernel:
         settings: wp.array(dtype=settings_type),
         levels: wp.array(dtype=level_type),
         # in, out
-        env: EnvArrays,
+        episode: EpisodeArrays,
         states: wp.array(dtype=task.state),
         arrays: RobotArrays,
     ):
@@ -53,8 +53,8 @@ def make_reset_kernel(task: Any) -> wp.Kernel:
         The lanes, neighbours in a warp, do the same but for what they share by `draw.lane`.
         """
         world, lane = wp.tid()
-        world += env.first
-        if env.skill[world] != skill:
+        world += episode.first
+        if episode.skill[world] != skill:
             return
         begins = mask[world] != 0.0
         commanded = bool(False)
@@ -62,26 +62,26 @@ def make_reset_kernel(task: Any) -> wp.Kernel:
             commanded = wp.static(due)(states[world])
         if not (begins or commanded):
             return
-        draw = make_stream(env.seed, world, env.clock[world], RESET)
-        draw.lane = lane
-        draw.lanes = lanes
-        level = env.level[world]
+        rng = make_stream(episode.seed, world, episode.step_count[world], RESET)
+        rng.lane = lane
+        rng.lanes = lanes
+        level = episode.level[world]
         if level >= levels.shape[0]:
-            level = wp.min(int(uniform(draw, ANY_LEVEL, 0.0, float(levels.shape[0]))), levels.shape[0] - 1)
+            level = wp.min(int(uniform(rng, ANY_LEVEL, 0.0, float(levels.shape[0]))), levels.shape[0] - 1)
         if begins:
-            old = before_reset(states[world], env.done[world])
-            state = wp.static(reset)(arrays, scene, skills[skill], old, settings[0], levels[level], draw)
-            sync_attempts(draw)
+            old = previous_state(states[world], episode.done[world])
+            state = wp.static(reset)(arrays, scene, skills[skill], old, settings[0], levels[level], rng)
+            sync_attempts(rng)
             if lane == 0:
                 states[world] = state
-                env.history_reset[world] = BEGUN
-                env.broken[world] = 0
+                episode.history_reset[world] = BEGUN
+                episode.diverged[world] = 0
         elif wp.static(command is not None):
             if lane == 0:
                 robot = load_view(arrays, scene.ground, world)
-                fresh = make_stream(env.seed, world, env.clock[world], COMMAND)
+                fresh = make_stream(episode.seed, world, episode.step_count[world], COMMAND)
                 states[world] = wp.static(command)(robot, scene, states[world], levels[level], fresh)
-                env.history_reset[world] = COMMANDED
+                episode.history_reset[world] = COMMANDED
 
     return reset_kernel
 
@@ -101,7 +101,7 @@ def make_set_command_kernel(task: Any) -> wp.Kernel:
         scene: Scene,
         arrays: RobotArrays,
         # in, out
-        env: EnvArrays,
+        episode: EpisodeArrays,
         states: wp.array(dtype=task.state),
     ):
         """Give a command where mask is not 0; one thread per world.
@@ -109,18 +109,18 @@ def make_set_command_kernel(task: Any) -> wp.Kernel:
         begins 1: to a new episode, with its heading [rad]; 0: to the one under way, in the heading that the robot has.
         """
         world = wp.tid()
-        if env.skill[world] != skill or mask[world] == 0.0:
+        if episode.skill[world] != skill or mask[world] == 0.0:
             return
         robot = load_view(arrays, scene.ground, world)
         if begins != 0:
             fresh = task.state()
             states[world] = wp.static(give)(robot, scene, fresh, values[world], headings[world])
-            env.history_reset[world] = BEGUN
-            env.broken[world] = 0
+            episode.history_reset[world] = BEGUN
+            episode.diverged[world] = 0
         else:
             states[world] = wp.static(give)(robot, scene, states[world], values[world], yaw_of(robot.quat))
-            if env.history_reset[world] != BEGUN:
-                env.history_reset[world] = COMMANDED
+            if episode.history_reset[world] != BEGUN:
+                episode.history_reset[world] = COMMANDED
 
     return set_command_kernel
 
@@ -139,7 +139,7 @@ def leg_limits(params: FilterParams) -> LegLimits:
 
 
 @wp.func
-def store_pose(arrays: RobotArrays, scene: Scene, world: int, heading: float, lift: float):
+def write_default_pose(arrays: RobotArrays, scene: Scene, world: int, heading: float, ground_height: float):
     """Write the model's reference pose at rest, turned to a heading [rad] and lifted [m]."""
     q = world * COORDS
     for j in range(int(COORDS)):
@@ -149,11 +149,11 @@ def store_pose(arrays: RobotArrays, scene: Scene, world: int, heading: float, li
     turn = wp.quat_from_axis_angle(wp.vec3(0.0, 0.0, 1.0), heading)
     for j in range(4):
         arrays.joint_q[q + 3 + j] = turn[j]
-    arrays.joint_q[q + 2] = scene.reference_q[q + 2] + lift
+    arrays.joint_q[q + 2] = scene.reference_q[q + 2] + ground_height
 
 
 @wp.kernel
-def stand_kernel(
+def default_pose_kernel(
     # in
     mask: wp.array(dtype=float),
     headings: wp.array(dtype=float),
@@ -170,8 +170,8 @@ def stand_kernel(
     world = wp.tid()
     if mask[world] != 0.0:
         rest_block(scene.ground, world)
-        lift = surface(world_ground(scene.ground, world), 0.0, 0.0)[0] + skills[skill[world]].lift
-        store_pose(arrays, scene, world, headings[world], lift)
+        ground_height = surface(world_ground(scene.ground, world), 0.0, 0.0)[0] + skills[skill[world]].lift
+        write_default_pose(arrays, scene, world, headings[world], ground_height)
 
 
 @wp.kernel
@@ -179,12 +179,12 @@ def advance_rng_kernel(
     # in
     mask: wp.array(dtype=float),
     # in, out
-    env: EnvArrays,
+    episode: EpisodeArrays,
 ):
     """Move the clock on where mask is not 0, so that what follows draws anew; one thread per world."""
     world = wp.tid()
     if mask[world] != 0.0:
-        env.clock[world] = env.clock[world] + 1
+        episode.step_count[world] = episode.step_count[world] + 1
 
 
 @wp.kernel
@@ -213,10 +213,10 @@ def clear_history_kernel(
     arrays.prev_action[m, world] = 0.0
     arrays.prev_prev_action[m, world] = 0.0
     arrays.target[m, world] = angle
-    arrays.safe_target[m, world] = angle
+    arrays.filtered_target[m, world] = angle
     arrays.prev_rate[m, world] = arrays.joint_qd[world * DOFS + 6 + slot]
     for i in range(RING):
-        delays.past_target[i, m, world] = angle
+        delays.target_history[i, m, world] = angle
     if m < 4:
         arrays.impulse[m, world] = wp.vec3(0.0)
         arrays.paw_force[m, world] = wp.vec3(0.0)
@@ -226,7 +226,7 @@ def clear_history_kernel(
         arrays.touchdown_speed[m, world] = 0.0
         arrays.paw_height[m, world] = 0.0
         arrays.collisions[m, world] = 0
-        follow_paw(arrays, geometry[m], world, m)
+        update_paw_kinematics(arrays, geometry[m], world, m)
     if m == 0:
         arrays.invalid[world] = 0
         arrays.prev_lin_vel[world] = base_velocity(arrays, world, base_quat(arrays, world))

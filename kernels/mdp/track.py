@@ -8,14 +8,14 @@ from ..kinematics.geometry import LegGeometry
 from ..layout import COORDS
 from ..state import leg_coord, leg_dof, load_motors
 from ..terrain.ground import Ground, grown_block, surface, world_ground
-from .env import EnvArrays, SkillSettings
+from .env import EpisodeArrays, SkillSettings
 from .view import RobotArrays, base_pos, base_quat, base_velocity
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
 
 
 @wp.func
-def follow_paw(arrays: RobotArrays, geo: LegGeometry, world: int, leg: int):
+def update_paw_kinematics(arrays: RobotArrays, geo: LegGeometry, world: int, leg: int):
     """Write place and velocity of a paw."""
     quat = base_quat(arrays, world)
     angles = load_motors(arrays.joint_q, leg_coord(world, leg))
@@ -30,14 +30,14 @@ def follow_paw(arrays: RobotArrays, geo: LegGeometry, world: int, leg: int):
 
 
 @wp.func
-def height_of_paw(arrays: RobotArrays, geo: LegGeometry, ground: Ground, world: int, leg: int) -> float:
+def paw_clearance(arrays: RobotArrays, geo: LegGeometry, ground: Ground, world: int, leg: int) -> float:
     """Return the height of a paw's lowest point above the ground below its centre [m]."""
     pos = arrays.paw_pos[leg, world]
     return pos[2] - surface(world_ground(ground, world), pos[0], pos[1])[0] - geo.paw_radius
 
 
 @wp.func
-def time_contact(arrays: RobotArrays, world: int, leg: int, down: bool):
+def update_contact_timers(arrays: RobotArrays, world: int, leg: int, down: bool):
     """Count how long a paw has been down or up; `air_time` stays through the step of its first contact."""
     was_down = arrays.contact_time[leg, world] > 0.0
     if down:
@@ -59,18 +59,18 @@ def track_kernel(
     geometry: wp.array(dtype=LegGeometry),
     ground: Ground,
     skills: wp.array(dtype=SkillSettings),
-    env: EnvArrays,
+    episode: EpisodeArrays,
     # in, out
     arrays: RobotArrays,
 ):
     """Follow every paw, and find what must not touch; one thread per (leg, world)."""
     leg, world = wp.tid()
-    world += env.first
-    skill = skills[env.skill[world]]
+    world += episode.first
+    skill = skills[episode.skill[world]]
     down = wp.length(arrays.paw_force[leg, world]) > skill.contact_force
-    time_contact(arrays, world, leg, down)  # before the velocity of the step before is written over
-    follow_paw(arrays, geometry[leg], world, leg)
-    arrays.paw_height[leg, world] = height_of_paw(arrays, geometry[leg], ground, world, leg)
+    update_contact_timers(arrays, world, leg, down)  # before the velocity of the step before is written over
+    update_paw_kinematics(arrays, geometry[leg], world, leg)
+    arrays.paw_height[leg, world] = paw_clearance(arrays, geometry[leg], ground, world, leg)
     here = grown_block(world_ground(ground, world), skill.block_margin)
     arrays.collisions[leg, world] = leg_collisions(
         geometry, here, arrays.joint_q, world * COORDS, leg, skill.link_margin

@@ -73,7 +73,7 @@ class RobotArrays:
     prev_action: wp.array2d(dtype=float)
     prev_prev_action: wp.array2d(dtype=float)
     target: wp.array2d(dtype=float)  # [rad] before the filter
-    safe_target: wp.array2d(dtype=float)  # [rad] after it
+    filtered_target: wp.array2d(dtype=float)  # [rad] after it
     prev_rate: wp.array2d(dtype=float)
     joint_offset: wp.array2d(dtype=float)  # [rad] constant error of each motor's position sensor
     prev_lin_vel: wp.array(dtype=wp.vec3)  # (num_worlds,)
@@ -165,7 +165,7 @@ def load_view(arrays: RobotArrays, ground: Ground, world: int) -> RobotView:
         robot.prev_action[m] = arrays.prev_action[m, world]
         robot.prev_prev_action[m] = arrays.prev_prev_action[m, world]
         robot.default_angle[m] = arrays.default_angle[m]
-        off = arrays.target[m, world] - arrays.safe_target[m, world]
+        off = arrays.target[m, world] - arrays.filtered_target[m, world]
         clipped += off * off
     robot.clipped = clipped
     return robot
@@ -192,13 +192,13 @@ def yaw_of(quat: wp.quat) -> float:
 
 
 @wp.func
-def turned(v: wp.vec3, heading: float) -> wp.vec3:
+def rotate_yaw(v: wp.vec3, heading: float) -> wp.vec3:
     """Return a vector turned about z by a heading [rad]."""
     return wp.quat_rotate(wp.quat_from_axis_angle(wp.vec3(0.0, 0.0, 1.0), heading), v)
 
 
 @wp.func
-def rotation_from(quat: wp.quat, heading: float) -> float:
+def angle_from_level(quat: wp.quat, heading: float) -> float:
     """Return the angle [rad] between an orientation (xyzw) and the level one with a heading [rad]."""
     half = 0.5 * heading
     level = wp.quat(0.0, 0.0, wp.sin(half), wp.cos(half))
@@ -213,7 +213,7 @@ def tilt(robot: RobotView) -> float:
 
 
 @wp.func
-def braking(robot: RobotView) -> float:
+def base_deceleration(robot: RobotView) -> float:
     """Return what the base lost of its speed of the step before, over the step [m/s^2], <= 0.
 
     Speed that it gained against that motion, as in a rebound, does not count: a fall that ends within the step has lost

@@ -36,24 +36,24 @@ def reach_of(ranges: CommandRanges, level: int) -> wp.vec4:
 
 
 @wp.func
-def draw_velocity(draw: RngStream, ranges: CommandRanges, level: int) -> wp.vec3:
+def sample_velocity_command(rng: RngStream, ranges: CommandRanges, level: int) -> wp.vec3:
     """Return a command of a level.
 
     Beyond the first level, the faster it goes along x, the less far it reaches across and in turning: an ellipse
     between the largest reach along x and those of the level across it.
     """
-    kind = uniform(draw, streams.KIND, 0.0, 1.0)
+    kind = uniform(rng, streams.KIND, 0.0, 1.0)
     if kind < ranges.stand:
         return wp.vec3(0.0)
     reach = reach_of(ranges, level)
-    easy = level == 0 or uniform(draw, streams.NARROW, 0.0, 1.0) < ranges.narrow_share
+    easy = level == 0 or uniform(rng, streams.NARROW, 0.0, 1.0) < ranges.narrow_share
     if easy:
         reach = ranges.narrow
-    spin = uniform(draw, streams.TURN, -reach[3], reach[3])
+    spin = uniform(rng, streams.TURN, -reach[3], reach[3])
     if kind < ranges.stand + ranges.turn:
         return wp.vec3(0.0, 0.0, spin)
-    ahead = uniform(draw, streams.AHEAD, -reach[1], reach[0])
-    side = uniform(draw, streams.SIDE, -reach[2], reach[2])
+    ahead = uniform(rng, streams.AHEAD, -reach[1], reach[0])
+    side = uniform(rng, streams.SIDE, -reach[2], reach[2])
     if easy:
         return wp.vec3(ahead, side, spin)
     share = ahead / wp.where(ahead > 0.0, ranges.wide[0], ranges.wide[1])
@@ -81,11 +81,11 @@ def command_due(state: VelocityState) -> bool:
 
 @wp.func
 def draw_command(
-    robot: RobotView, scene: Scene, state: VelocityState, level: CommandRanges, draw: RngStream
+    robot: RobotView, scene: Scene, state: VelocityState, level: CommandRanges, rng: RngStream
 ) -> VelocityState:
     """Return the state of an episode that goes on with a drawn command."""
-    new = with_command(state, draw_velocity(draw, level, state.command_level))
-    new.command_lasts = wp.max(int(uniform_range(draw, streams.LASTS, level.lasts)), 1)
+    new = with_command(state, sample_velocity_command(rng, level, state.command_level))
+    new.command_lasts = wp.max(int(uniform_range(rng, streams.LASTS, level.lasts)), 1)
     return new
 
 
