@@ -18,7 +18,7 @@ def command(robot: RobotView, state: VelocityState) -> wp.vec3:
 
 
 @wp.func
-def step_count(robot: RobotView, state: VelocityState) -> wp.vec2:
+def gait_phase(robot: RobotView, state: VelocityState) -> wp.vec2:
     """Sine and cosine of the gait's phase."""
     angle = 2.0 * wp.pi * state.phase
     return wp.vec2(wp.sin(angle), wp.cos(angle))

@@ -24,8 +24,8 @@ QUAT = np.array([-1.0, 1.0, -1.0, 1.0])
 
 def task():
     """The task on rough ground with a clock, so that every term of all velocity tasks is there."""
-    rough, step_count = make_task("velocity-rough"), ObservationTerm(velocity.step_count)
-    return dataclasses.replace(rough, policy=(*rough.policy, step_count), critic=(*rough.critic, step_count))
+    rough, gait_phase = make_task("velocity-rough"), ObservationTerm(velocity.gait_phase)
+    return dataclasses.replace(rough, policy=(*rough.policy, gait_phase), critic=(*rough.critic, gait_phase))
 
 
 def reflected(values, change):
