@@ -173,7 +173,10 @@ def test_what_is_not_there_is_refused(tmp_path, monkeypatch, name, message):
 @pytest.mark.parametrize(
     ("code", "message"),
     [
-        ("RewardTerm(rewards.rest, 1.0, std_lin_vel=0.1, std_ang_vel=0.5, fine=2.0)", "unknown parameter 'fine'"),
+        (
+            "RewardTerm(rewards.base_at_rest, 1.0, std_lin_vel=0.1, std_ang_vel=0.5, fine=2.0)",
+            "unknown parameter 'fine'",
+        ),
         ("register_task('vertical-jump', low_jump)", "there is a task 'vertical-jump' already"),
         ("def broken(:", "invalid syntax"),
     ],

@@ -64,7 +64,7 @@ def without_another_goal(task: TaskCfg) -> TaskCfg:
 
 DEPARTURES: dict[str, dict[str, Undone]] = {
     "vertical-jump": {
-        "standing_still_and_level": "--env.rewards.rest.weight 0 --env.rewards.landing-tilt.weight 0",
+        "standing_still_and_level": "--env.rewards.base-at-rest.weight 0 --env.rewards.landing-tilt.weight 0",
         "paws_down": "--env.rewards.paws-down.weight 0",
         "second_takeoff": "--env.terminations.second-takeoff.speed 100",
         "quiet_standing": (

@@ -127,8 +127,8 @@ SMOOTH: dict[str, Smooth] = {
     "joint_symmetry": symmetry,
     "ground_posture": lambda m, p: (m.phase != FLIGHT) * posture(m, p, p["shift"]) * patience(m, p),
     "air_posture": lambda m, p: (m.phase == FLIGHT) * posture(m, p, 0.0),
-    "retract": lambda m, p: m.soon * posture(m, p, p["shift"]),
-    "rest": lambda m, p: m.resting * phi(m.motion.lin_vel.square().sum(1), p["std_lin_vel"])
+    "post_landing_posture": lambda m, p: m.soon * posture(m, p, p["shift"]),
+    "base_at_rest": lambda m, p: m.resting * phi(m.motion.lin_vel.square().sum(1), p["std_lin_vel"])
     * phi(m.motion.ang_vel.square().sum(1), p["std_ang_vel"]),
     "landing_tilt": lambda m, p: (m.phase == LANDED) * level(m) / np.sin(p["angle"]) ** 2,
     "catch_landing": lambda m, p: m.soon * (-m.motion.lin_vel[:, 2]).clamp(0.0, 1.0),

@@ -126,7 +126,7 @@ def air_posture(robot: RobotView, state: JumpState, std: float) -> float:
 
 
 @wp.func
-def retract(robot: RobotView, state: JumpState, std: float, shift: float) -> float:
+def post_landing_posture(robot: RobotView, state: JumpState, std: float, shift: float) -> float:
     """Retracting after landing: phi_std of the offset from default, transversal motors + shift, first 0.3 s."""
     if not just_landed(state):
         return 0.0
@@ -234,7 +234,7 @@ def damp_landing(robot: RobotView, state: JumpState) -> float:
 
 
 @wp.func
-def rest(robot: RobotView, state: JumpState, std_lin_vel: float, std_ang_vel: float) -> float:
+def base_at_rest(robot: RobotView, state: JumpState, std_lin_vel: float, std_ang_vel: float) -> float:
     """Rest: phi_std_lin_vel(|v|) phi_std_ang_vel(|w|), while the robot should rest."""
     if not should_rest(state):
         return 0.0

@@ -8,8 +8,8 @@ from .state import FLIGHT, LANDED, STANCE, JumpState, goal_offset, waiting
 
 
 @wp.func
-def success(robot: RobotView, state: JumpState, steps: float) -> bool:
-    """So many policy steps after touchdown: the jump is over."""
+def landed_for(robot: RobotView, state: JumpState, steps: float) -> bool:
+    """Landed since `steps` policy steps: the jump is over."""
     return state.phase == LANDED and state.phase_steps >= int(steps)
 
 

@@ -27,21 +27,21 @@ def yaw_rate(robot: RobotView, state: VelocityState, std: float) -> float:
 
 
 @wp.func
-def vertical_velocity(robot: RobotView, state: VelocityState) -> float:
-    """Vertical velocity L2: its square [m^2/s^2], body axes."""
+def lin_vel_z_l2(robot: RobotView, state: VelocityState) -> float:
+    """Vertical velocity: its square [m^2/s^2], body axes."""
     up = wp.quat_rotate_inv(robot.quat, robot.lin_vel)[2]
     return up * up
 
 
 @wp.func
-def lateral_stability(robot: RobotView, state: VelocityState) -> float:
-    """Lateral stability L2: square of the angular velocity about body x and y [rad^2/s^2]."""
+def ang_vel_xy_l2(robot: RobotView, state: VelocityState) -> float:
+    """Lateral stability: square of the angular velocity about body x and y [rad^2/s^2]."""
     return robot.ang_vel[0] * robot.ang_vel[0] + robot.ang_vel[1] * robot.ang_vel[1]
 
 
 @wp.func
-def flat(robot: RobotView, state: VelocityState) -> float:
-    """Flat L2: square of the horizontal part of projected gravity [1]."""
+def flat_orientation_l2(robot: RobotView, state: VelocityState) -> float:
+    """Square of the horizontal part of projected gravity [1] (flat in the paper)."""
     return (
         robot.projected_gravity[0] * robot.projected_gravity[0]
         + robot.projected_gravity[1] * robot.projected_gravity[1]
@@ -49,8 +49,8 @@ def flat(robot: RobotView, state: VelocityState) -> float:
 
 
 @wp.func
-def stand(robot: RobotView, state: VelocityState, std: float) -> float:
-    """Stand: phi_std of the rms offset [rad] of the transversal angles from default, when commanded to stand."""
+def standing_posture(robot: RobotView, state: VelocityState, std: float) -> float:
+    """Stance: phi_std of the rms offset [rad] of the transversal angles from default, when commanded to stand."""
     if state.standing == 0:
         return 0.0
     total = float(0.0)
@@ -140,8 +140,8 @@ def touchdown(robot: RobotView, state: VelocityState) -> float:
 
 
 @wp.func
-def jerk(robot: RobotView, state: VelocityState) -> float:
-    """Jerk: number of motors whose torque changed its sign since the last policy step."""
+def torque_sign_changes(robot: RobotView, state: VelocityState) -> float:
+    """Number of motors whose torque changed its sign since the last policy step (jerk in the paper)."""
     total = float(0.0)
     for m in range(12):
         total += wp.where(wp.sign(robot.torque[m]) != wp.sign(robot.prev_torque[m]), 1.0, 0.0)

@@ -15,7 +15,8 @@ from jumper_warp.robot.overlay import with_springs
 
 SMALL = ["--ppo.num-steps", "2", "--ppo.minibatches", "2", "--ppo.hidden", "8"]
 OWN = ["--num-envs", "4", "--iterations", "1", "--seed", "3", "--save-interval", "7", "--no-noise", "--no-randomize",
-       "--history", "1", "--env.gravity", "3.71", "--env.rewards.rest.weight", "-0.5", "--ppo.gamma=0.9"]  # fmt: skip
+       "--history", "1", "--env.gravity", "3.71", "--env.rewards.base-at-rest.weight", "-0.5",
+       "--ppo.gamma=0.9"]  # fmt: skip
 HERE = ["--device", "cpu", "--no-tensorboard"]
 
 
@@ -64,12 +65,12 @@ def test_a_run_goes_on_with_its_own_settings(capsys, run, begun):
 
 
 def test_flags_change_the_settings_and_each_change_is_told(capsys, run):
-    flags = ["--env.gravity", "9.81", "--env.rewards.rest.weight", "-0.25", "--ppo.gamma", "0.95", "--noise"]
+    flags = ["--env.gravity", "9.81", "--env.rewards.base-at-rest.weight", "-0.25", "--ppo.gamma", "0.95", "--noise"]
     flags += ["--env.reset.tilt", "2"]
     code, _, told = train(capsys, "--resume", str(run), "--iterations", "2", *flags)
     assert code == 0 and changed(told) == [
         "iterations 1 -> 2", "ppo.gamma 0.9 -> 0.95", "noise False -> True", "env.reset.tilt 5.0 -> 2.0",
-        "env.rewards.rest.weight -0.5 -> -0.25", "env.gravity 3.71 -> 9.81",
+        "env.rewards.base-at-rest.weight -0.5 -> -0.25", "env.gravity 3.71 -> 9.81",
     ]  # fmt: skip
     after = config(run)
     assert after["env"]["task"]["gravity"] == 9.81 and after["train"]["ppo"]["gamma"] == 0.95

@@ -23,7 +23,7 @@ from jumper_warp.rl.checkpoint import save_checkpoint
 from jumper_warp.tasks.saving import TaskError
 
 TASK = '''\
-"""Two jumps with a `rest` that is not the project's."""
+"""Two jumps with a `base_at_rest` that is not the project's."""
 
 from dataclasses import replace
 from typing import Any
@@ -40,7 +40,7 @@ from jumper_warp.kernels.mdp.view import RobotView
 
 
 @wp.func
-def rest(robot: RobotView, state: Any, height: float) -> float:
+def base_at_rest(robot: RobotView, state: Any, height: float) -> float:
     """Base height over a height [m]."""
     return view.height / height
 
@@ -70,7 +70,7 @@ def tame_jump():
     return replace(
         task,
         name="tame-jump",
-        rewards=(RewardTerm(rest, 2.0, height=0.5), *task.rewards[:3]),
+        rewards=(RewardTerm(base_at_rest, 2.0, height=0.5), *task.rewards[:3]),
         critic=(*task.critic, ObservationTerm(strange)),
         events=(EventTerm(slow, lower=0.9, upper=1.0),),
     )
@@ -86,7 +86,7 @@ register_task("tame-jump", tame_jump, ppo=PpoCfg(gamma=0.9), aliases=("Tame",))
 register_task("low-jump", low_jump, ppo=PpoCfg(gamma=0.9))
 '''
 TRAIN = ["--num-envs", "4", "--iterations", "1", "--no-tensorboard", "--device", "cpu", "--ppo.num-steps", "2"]
-TRAIN += ["--ppo.minibatches", "2", "--ppo.hidden", "8", "--env.rewards.rest.height", "0.4"]
+TRAIN += ["--ppo.minibatches", "2", "--ppo.hidden", "8", "--env.rewards.base-at-rest.height", "0.4"]
 
 
 def forget():
@@ -153,14 +153,14 @@ def test_list_shows_installed_tasks_and_what_is_wrong_with_others(capsys, tmp_pa
 
 def test_help_of_a_task_has_its_own_flags(capsys, path):
     code, out, _ = run(capsys, "train", "Tame", "--task-module", path, "--help")
-    assert code == 0 and "--env.rewards.rest.height FLOAT" in out and "--env.events.slow.lower FLOAT" in out
+    assert code == 0 and "--env.rewards.base-at-rest.height FLOAT" in out and "--env.events.slow.lower FLOAT" in out
     assert "--ppo.gamma FLOAT" in out and "(default: 0.9)" in out
 
 
 def test_training_saves_functions_by_module_and_name(runs):
     config = json.loads((runs["tame-jump"] / "config.json").read_text())
-    (rest,) = (term for term in config["env"]["task"]["rewards"] if term["name"] == "rest")
-    assert (rest["func"], rest["height"]) == ("my_jumps:rest", 0.4)
+    (base_at_rest,) = (term for term in config["env"]["task"]["rewards"] if term["name"] == "base_at_rest")
+    assert (base_at_rest["func"], base_at_rest["height"]) == ("my_jumps:base_at_rest", 0.4)
     assert config["train"]["ppo"]["gamma"] == 0.9 and config["train"]["task"] == "tame-jump"
 
 
@@ -192,12 +192,12 @@ def test_events_are_asked_for_where_they_run(capsys, runs):
 
 def test_reward_of_a_user_does_not_become_the_projects(runs, path):
     config = open_policy(runs["tame-jump"]).config
-    with pytest.raises(PolicyError, match=r"task.rewards\[0\] needs 'my_jumps:rest'"):
+    with pytest.raises(PolicyError, match=r"task.rewards\[0\] needs 'my_jumps:base_at_rest'"):
         restored_task(config, leave_out=())
     module = load_task_module(path)
     task = restored_task(config, [module], leave_out=())
-    assert task.rewards[0].func is module.rest is not rewards.rest
-    assert task == make_task("tame-jump").with_terms("rewards", rest={"height": 0.4})
+    assert task.rewards[0].func is module.base_at_rest is not rewards.base_at_rest
+    assert task == make_task("tame-jump").with_terms("rewards", base_at_rest={"height": 0.4})
 
 
 def test_command_that_goes_on_names_the_module(path):
@@ -237,12 +237,12 @@ def test_a_changed_file_is_told_and_settings_stay_those_of_the_run(capsys, runs,
 
 
 def test_task_whose_functions_could_not_be_found_again_is_not_trained(capsys, tmp_path):
-    lost = TASK.replace("RewardTerm(rest", "RewardTerm(kept")
-    lost = lost.replace("def tame_jump", "kept, rest = rest, None\n\n\ndef tame_jump")
+    lost = TASK.replace("RewardTerm(base_at_rest", "RewardTerm(kept")
+    lost = lost.replace("def tame_jump", "kept, base_at_rest = base_at_rest, None\n\n\ndef tame_jump")
     (tmp_path / "my_jumps.py").write_text(lost)
     args = ["train", "tame-jump", "--task-module", str(tmp_path / "my_jumps.py"), *TRAIN, "--log-root", str(tmp_path)]
     code, out, err = run(capsys, *args)
-    assert (code, out) == (2, "") and "my_jumps:rest cannot be saved: define it under this name" in err[-1]
+    assert (code, out) == (2, "") and "my_jumps:base_at_rest cannot be saved: define it under this name" in err[-1]
     assert not (tmp_path / "tame-jump").exists()
 
 
@@ -250,7 +250,7 @@ def test_all_of_the_projects_tasks_can_be_trained():
     for name in TASKS:
         check_saving(make_task(name))
     with pytest.raises(TaskError):
-        check_saving(make_task("vertical-jump").with_terms("rewards", rest={"name": "a:b"}))
+        check_saving(make_task("vertical-jump").with_terms("rewards", base_at_rest={"name": "a:b"}))
 
 
 @pytest.mark.parametrize("task", [{"version": 2, "name": "vertical-jump"}, {"name": "vertical-jump", "terms": []}])

@@ -161,7 +161,7 @@ TERMS = {
         (r["phase"] != FLIGHT) * posture(r, p["std"], p["shift"]) * due(r, p["waiting_scale"])
     ),
     "air_posture": lambda r, p: (r["phase"] == FLIGHT) * posture(r, p["std"]),
-    "retract": lambda r, p: soon(r) * posture(r, p["std"], p["shift"]),
+    "post_landing_posture": lambda r, p: soon(r) * posture(r, p["std"], p["shift"]),
     "tracking": lambda r, p: (
         (r["phase"] != STANCE) * (phi(error(r), p["std_wide"]) + p["fine_weight"] * phi(error(r), p["std_fine"]))
     ),
@@ -179,7 +179,9 @@ TERMS = {
     "flight_angular_velocity": lambda r, p: (r["phase"] == FLIGHT) * phi(norm(r["spin"]), p["std"]),
     "left_right_symmetry": lambda r, p: phi(left_right(r), p["std"]) * due(r, p["waiting_scale"]),
     "standing_posture": lambda r, p: at_ease(r) * posture(r, p["std"], p["shift"]),
-    "rest": lambda r, p: at_ease(r) * phi(norm(r["vel"]), p["std_lin_vel"]) * phi(norm(r["spin"]), p["std_ang_vel"]),
+    "base_at_rest": lambda r, p: (
+        at_ease(r) * phi(norm(r["vel"]), p["std_lin_vel"]) * phi(norm(r["spin"]), p["std_ang_vel"])
+    ),
     "landing_tilt": lambda r, p: (r["phase"] == LANDED) * (lean(r) / np.sin(p["angle"])) ** 2,
     "descent_tilt": lambda r, p: (r["phase"] == FLIGHT) * (r["vel"][:, 2] <= 0.0) * (lean(r) / np.sin(p["angle"])) ** 2,
     "lifted_again": lambda r, p: (

@@ -31,9 +31,9 @@ JUMP = "jumper_warp.kernels.jump"
 
 
 @wp.func
-def rest(robot: RobotView, state: Any, speed: float, spin: float) -> float:
-    """Another rest than the project's, with the same numbers."""
-    return speed + spin
+def base_at_rest(robot: RobotView, state: Any, std_lin_vel: float, std_ang_vel: float) -> float:
+    """Another `base_at_rest` than the project's, with the same numbers."""
+    return std_lin_vel + std_ang_vel
 
 
 THIS = sys.modules[__name__]
@@ -58,18 +58,18 @@ def test_task_of_a_user_comes_back_with_its_module_only():
 
 
 def with_own_rest():
-    """The vertical jump with this file's `rest` in place of the project's."""
+    """The vertical jump with this file's `base_at_rest` in place of the project's."""
     task = make_task("vertical-jump")
-    mine = RewardTerm(rest, 20.0, std_lin_vel=0.1, std_ang_vel=0.5)
-    return dataclasses.replace(task, rewards=tuple(mine if t.name == "rest" else t for t in task.rewards))
+    mine = RewardTerm(base_at_rest, 20.0, std_lin_vel=0.1, std_ang_vel=0.5)
+    return dataclasses.replace(task, rewards=tuple(mine if t.name == "base_at_rest" else t for t in task.rewards))
 
 
 def test_function_of_a_user_is_never_taken_for_the_projects_of_the_same_name():
     task = with_own_rest()
-    with pytest.raises(TaskError, match=rf"task.rewards\[9\] needs '{__name__}:rest': name the file"):
+    with pytest.raises(TaskError, match=rf"task.rewards\[9\] needs '{__name__}:base_at_rest': name the file"):
         task_from_json(saved(task))
     found = {term.name: term.func for term in task_from_json(saved(task), [THIS]).rewards}
-    assert found["rest"] is rest and found["rest"] is not rewards.rest
+    assert found["base_at_rest"] is base_at_rest and found["base_at_rest"] is not rewards.base_at_rest
 
 
 def test_module_that_is_loaded_but_was_not_named_is_not_looked_into():
@@ -117,11 +117,11 @@ def test_function_that_could_not_be_found_again_is_not_saved(func):
 
 def test_function_of_a_program_has_the_name_of_its_file(monkeypatch):
     main = sys.modules["__main__"]
-    monkeypatch.setattr(main, "rest", rest, raising=False)
+    monkeypatch.setattr(main, "base_at_rest", base_at_rest, raising=False)
     monkeypatch.setattr(main, "__file__", "/some/where/my_task.py", raising=False)
     monkeypatch.setattr(main, "__spec__", None)
-    monkeypatch.setattr(rest.func, "__module__", "__main__")
-    assert name_of(rest) == "my_task:rest"
+    monkeypatch.setattr(base_at_rest.func, "__module__", "__main__")
+    assert name_of(base_at_rest) == "my_task:base_at_rest"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -191,13 +191,13 @@ def deep(levels):
 
 VALUES = [
     None, True, False, 0, 1, -1, 2.5, -0.0, 1e308, -1e300, 1e-300, math.nan, math.inf, -math.inf, 10**30, 10**400,
-    "", "x", "rest", "a\nb", "\ud800", "os:system", "os.path:join", "trap:func", f"{JUMP}.rewards:rest",
+    "", "x", "base_at_rest", "a\nb", "\ud800", "os:system", "os.path:join", "trap:func", f"{JUMP}.rewards:base_at_rest",
     f"{JUMP}.state:JumpState", "jumper_warp.kernels.mdp.env:Nothing", f"{JUMP}.rewards:wp", f"{JUMP}.rewards:",
     ":rest", "a:b:c", "jumper_warp.tasks.cfg:TaskCfg", "jumper_warp.tasks.terms:Term", "jumper_warp.tasks.cfg:Reset",
     "jumper_warp.tasks.terms:EventTerm", "jumper_warp.robot.description:RobotDescription",
     "jumper_warp.robot.parts:Motor", "jumper_warp.tasks.jump.cfg:GroundCfg", "jumper_warp.tasks.saving:Finder",
     [], [1], [1.0, 2.0], [[1.0]], ["a"] * 3, [None] * 5000, [{}] * 5000, {}, {"type": None}, {"a": 1}, {"type": "os:x"},
-    {"type": "jumper_warp.tasks.jump.cfg:GroundCfg"}, {"func": f"{JUMP}.rewards:rest"}, {"a\nb": [math.nan]},
+    {"type": "jumper_warp.tasks.jump.cfg:GroundCfg"}, {"func": f"{JUMP}.rewards:base_at_rest"}, {"a\nb": [math.nan]},
     deep(300), {"type": ["x"]}, {"type": {"type": "x"}},
 ]  # fmt: skip
 KEYS = ["extra", "", "a\nb", "\ud800", "type", "func", "name", "self", "weight", "history", "settings", "version"]

@@ -11,7 +11,7 @@ from jumper_warp.utils.sources import changed_sources, source_sums
 
 def test_files_outside_the_project_are_named_by_their_module():
     saved = {
-        "task": [{"func": "json.decoder:JSONDecoder"}, "jumper_warp.kernels.jump.rewards:rest"],
+        "task": [{"func": "json.decoder:JSONDecoder"}, "jumper_warp.kernels.jump.rewards:base_at_rest"],
         "say": "now: nothing",
         "n": 1,
     }

@@ -32,7 +32,7 @@ REWARDS = (
     RewardTerm(rewards.flight_angular_velocity, 4.0, std=10.0),
     RewardTerm(rewards.left_right_symmetry, 20.0, std=0.5, waiting_scale=0.1),
     RewardTerm(rewards.standing_posture, 50.0, std=20.0 * DEG, shift=25.0 * DEG),
-    RewardTerm(rewards.rest, 40.0, std_lin_vel=0.1, std_ang_vel=0.5),
+    RewardTerm(rewards.base_at_rest, 40.0, std_lin_vel=0.1, std_ang_vel=0.5),
     RewardTerm(rewards.landing_tilt, -60.0, angle=10.0 * DEG),
     RewardTerm(rewards.descent_tilt, -60.0, angle=10.0 * DEG),
     RewardTerm(rewards.lifted_again, -30.0, threshold=0.0),
@@ -49,7 +49,7 @@ REWARDS = (
 )
 
 TERMINATIONS = (
-    TerminationTerm(terminations.success, steps=1.0 * SECOND, time_out=True, success=True),
+    TerminationTerm(terminations.landed_for, name="success", steps=1.0 * SECOND, time_out=True, success=True),
     TerminationTerm(mdp_terminations.came_apart),
     TerminationTerm(terminations.early_takeoff),
     TerminationTerm(terminations.predicted_miss, tolerance=0.55, steps=0.1 * SECOND, height=LANDING_HEIGHT),

@@ -40,8 +40,8 @@ REWARDS = (
     RewardTerm(rewards.joint_symmetry, 35.0, std_variance=0.05, std_lateral=0.35, waiting_scale=PATIENCE),
     RewardTerm(rewards.ground_posture, 10.0, std=10.0 * DEG, shift=35.0 * DEG, waiting_scale=PATIENCE),
     RewardTerm(rewards.air_posture, 80.0, std=15.0 * DEG),
-    RewardTerm(rewards.retract, 10.0, std=15.0 * DEG, shift=15.0 * DEG),
-    RewardTerm(rewards.rest, 20.0, std_lin_vel=0.1, std_ang_vel=0.5),
+    RewardTerm(rewards.post_landing_posture, 10.0, std=15.0 * DEG, shift=15.0 * DEG),
+    RewardTerm(rewards.base_at_rest, 20.0, std_lin_vel=0.1, std_ang_vel=0.5),
     RewardTerm(rewards.landing_tilt, -120.0, angle=10.0 * DEG),
     RewardTerm(rewards.paws_down, 30.0),
     RewardTerm(rewards.soft_impact, 5.0, limit=5.0 * G),
@@ -57,7 +57,7 @@ REWARDS = (
 )
 
 TERMINATIONS = (
-    TerminationTerm(terminations.success, steps=1.0 * SECOND, time_out=True, success=True),
+    TerminationTerm(terminations.landed_for, name="success", steps=1.0 * SECOND, time_out=True, success=True),
     TerminationTerm(mdp_terminations.came_apart),
     TerminationTerm(terminations.early_takeoff),
     TerminationTerm(terminations.wrong_height, tolerance=0.10),

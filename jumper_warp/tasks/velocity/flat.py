@@ -57,10 +57,10 @@ REWARDS = (
     RewardTerm(rewards.linear_velocity, 2.0, name="linear_velocity_fine", std=0.1),
     RewardTerm(rewards.yaw_rate, 1.5, std=0.5),
     RewardTerm(rewards.yaw_rate, 4.3, name="yaw_rate_fine", std=0.1),
-    RewardTerm(rewards.vertical_velocity, -1.0),
-    RewardTerm(rewards.lateral_stability, -0.1),
-    RewardTerm(rewards.flat, -50.0),
-    RewardTerm(rewards.stand, 1.5, std=10.0 * DEG),
+    RewardTerm(rewards.lin_vel_z_l2, -1.0),
+    RewardTerm(rewards.ang_vel_xy_l2, -0.1),
+    RewardTerm(rewards.flat_orientation_l2, -50.0),
+    RewardTerm(rewards.standing_posture, 1.5, std=10.0 * DEG),
     RewardTerm(rewards.restless_stand, -0.2),
     RewardTerm(rewards.lateral_position, 0.18, steepness=100.0),
     RewardTerm(rewards.transversal_position, 0.1, steepness=5000.0, shift=10.0 * DEG),
@@ -74,7 +74,7 @@ REWARDS = (
     RewardTerm(mdp_rewards.joint_acceleration, -2.0e-7),
     RewardTerm(mdp_rewards.action_rate, -0.08),
     RewardTerm(mdp_rewards.action_acceleration, -0.03),
-    RewardTerm(rewards.jerk, -5.0e-3),
+    RewardTerm(rewards.torque_sign_changes, -5.0e-3),
 )
 
 TERMINATIONS = (

@@ -47,8 +47,8 @@ def velocity_rough() -> TaskCfg:
     )
     task = task.with_terms(
         "rewards",
-        flat={"weight": -5.0},
-        vertical_velocity={"weight": -0.3},
+        flat_orientation_l2={"weight": -5.0},
+        lin_vel_z_l2={"weight": -0.3},
         linear_velocity_fine={"weight": 1.5},
         yaw_rate_fine={"weight": 2.5},
         air_time={"weight": 5.0},

@@ -136,11 +136,11 @@ def test_standing_is_paid_before_the_command_and_half_a_second_after_touchdown(e
     assert paid("standing_posture", wanted, task, **posture) == pytest.approx(float(due))
     off = make_view(angle=DEFAULT_ANGLE + 25.0 * DEG * TRANSVERSAL + 20.0 * DEG)
     assert paid("standing_posture", off, task, **posture) == pytest.approx(due * E(-1.0), rel=1e-4)
-    assert paid("rest", make_view(), task, **still) == pytest.approx(float(due))
+    assert paid("base_at_rest", make_view(), task, **still) == pytest.approx(float(due))
     slow = make_view(lin_vel=(0.06, 0.0, -0.08))
-    assert paid("rest", slow, task, **still) == pytest.approx(due * E(-1.0), rel=1e-4)
+    assert paid("base_at_rest", slow, task, **still) == pytest.approx(due * E(-1.0), rel=1e-4)
     turning = make_view(lin_vel=(0.06, 0.0, -0.08), ang_vel=(0.3, 0.4, 0.0))
-    assert paid("rest", turning, task, **still) == pytest.approx(due * E(-2.0), rel=1e-4)
+    assert paid("base_at_rest", turning, task, **still) == pytest.approx(due * E(-2.0), rel=1e-4)
 
 
 @pytest.mark.parametrize("axis", [(1.0, 0.0, 0.0), (0.6, -0.8, 0.0)])

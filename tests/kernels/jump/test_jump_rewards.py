@@ -8,7 +8,7 @@ from jumper_warp.kernels.jump import rewards
 from jumper_warp.kernels.jump.state import FLIGHT, LANDED, STANCE
 
 NAMES = """jump_height estimated_jump_height horizontal_velocity orientation angular_velocity joint_symmetry
-ground_posture air_posture retract paws_down soft_impact stance_impact catch_landing damp_landing"""
+ground_posture air_posture post_landing_posture paws_down soft_impact stance_impact catch_landing damp_landing"""
 paid = Table(functions(rewards, NAMES), float)
 E = math.exp
 PHASES = [int(STANCE), int(FLIGHT), int(LANDED)]
@@ -91,7 +91,7 @@ def test_joint_symmetry_falls_with_variance_and_with_lateral_angles():
 POSTURES = [
     ("ground_posture", 35.0 * DEG, {"std": 10.0 * DEG, "shift": 35.0 * DEG, "waiting_scale": 1.0}, PHASES[0::2]),
     ("air_posture", 0.0, {"std": 10.0 * DEG}, PHASES[1:2]),
-    ("retract", 15.0 * DEG, {"std": 10.0 * DEG, "shift": 15.0 * DEG}, PHASES[2:]),
+    ("post_landing_posture", 15.0 * DEG, {"std": 10.0 * DEG, "shift": 15.0 * DEG}, PHASES[2:]),
 ]
 
 
@@ -110,7 +110,7 @@ def test_postures_count_the_rms_offset_of_all_motors(term, shift, p, phases):
 
 
 LANDING_TERMS = [
-    ("retract", make_view(), {"std": 0.2, "shift": 0.0}, 1.0),
+    ("post_landing_posture", make_view(), {"std": 0.2, "shift": 0.0}, 1.0),
     ("soft_impact", make_view(), {"limit": 49.05}, 1.0),
     ("catch_landing", make_view(lin_vel=(0.0, 0.0, -0.4)), {}, 0.4),
     ("damp_landing", make_view(rate=0.5 * TRANSVERSAL), {}, 0.5),

@@ -4,17 +4,19 @@ from jump_helpers import Table, functions, make_episode, make_view
 from jumper_warp.kernels.jump import terminations
 from jumper_warp.kernels.jump.state import FLIGHT, LANDED, STANCE
 
-NAMES = "success wrong_height low_touchdown moved_away slanted_takeoff hard_impact no_jump early_takeoff second_takeoff"
+NAMES = (
+    "landed_for wrong_height low_touchdown moved_away slanted_takeoff hard_impact no_jump early_takeoff second_takeoff"
+)
 holds = Table(functions(terminations, NAMES), bool)
 
 
 def test_success_comes_a_time_after_touchdown():
     for steps, over in ((59, False), (60, True)):
         landed = make_episode(phase=LANDED, phase_steps=steps)
-        assert holds("success", make_view(), landed, steps=60.0) is over
+        assert holds("landed_for", make_view(), landed, steps=60.0) is over
     for phase in (STANCE, FLIGHT):
         elsewhere = make_episode(phase=phase, phase_steps=200)
-        assert not holds("success", make_view(), elsewhere, steps=60.0)
+        assert not holds("landed_for", make_view(), elsewhere, steps=60.0)
 
 
 @pytest.mark.parametrize(

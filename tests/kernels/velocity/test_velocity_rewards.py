@@ -14,8 +14,9 @@ from jumper_warp.tasks.velocity.flat import velocity_trot
 from jumper_warp.tasks.velocity.rough import velocity_rough
 from mdp_helpers import DEFAULT_ANGLE
 
-NAMES = """linear_velocity yaw_rate vertical_velocity lateral_stability flat stand lateral_position transversal_position
-air_time rapid_stepping restless_stand foot_clearance slip touchdown jerk trot_schedule shank_lean"""
+NAMES = """linear_velocity yaw_rate lin_vel_z_l2 ang_vel_xy_l2 flat_orientation_l2 standing_posture lateral_position
+transversal_position air_time rapid_stepping restless_stand foot_clearance slip touchdown torque_sign_changes
+trot_schedule shank_lean"""
 paid = Table(functions(rewards, NAMES), float, VelocityState)
 TRANSVERSAL = np.arange(12) % 3 != 0
 N = 16
@@ -92,10 +93,10 @@ OFF = {"angle": lambda r: r["angle"] - DEFAULT_ANGLE}
 EXPECTED = {
     "linear_velocity": ({"std": 0.5}, lambda r: np.exp(-np.sum((r["vel"] - r["command"])[:2] ** 2) / 0.25)),
     "yaw_rate": ({"std": 0.5}, lambda r: np.exp(-((r["ang_vel"][2] - r["command"][2]) ** 2) / 0.25)),
-    "vertical_velocity": ({}, lambda r: r["vel"][2] ** 2),
-    "lateral_stability": ({}, lambda r: np.sum(r["ang_vel"][:2] ** 2)),
-    "flat": ({}, lambda r: np.sum(r["gravity"][:2] ** 2)),
-    "stand": (
+    "lin_vel_z_l2": ({}, lambda r: r["vel"][2] ** 2),
+    "ang_vel_xy_l2": ({}, lambda r: np.sum(r["ang_vel"][:2] ** 2)),
+    "flat_orientation_l2": ({}, lambda r: np.sum(r["gravity"][:2] ** 2)),
+    "standing_posture": (
         {"std": 0.5},
         lambda r: np.exp(-np.mean(OFF["angle"](r)[TRANSVERSAL] ** 2) / 0.25) * r["standing"],
     ),
@@ -116,7 +117,7 @@ EXPECTED = {
     "foot_clearance": ({"target_height": 0.07}, lambda r: clearance(r, 0.07)),
     "slip": ({}, lambda r: np.sum(r["contact"] * np.sum(r["paw_vel"][:, :2] ** 2, axis=1))),
     "touchdown": ({}, lambda r: np.sum(r["first_contact"] * r["touchdown_speed"] ** 2)),
-    "jerk": ({}, lambda r: np.sum(np.sign(r["torque"]) != np.sign(r["prev_torque"]))),
+    "torque_sign_changes": ({}, lambda r: np.sum(np.sign(r["torque"]) != np.sign(r["prev_torque"]))),
     "shank_lean": (LEG, lambda r: shank_lean(r, **LEG)),
     "trot_schedule": ({"duty": 0.55}, lambda r: trot(r, 0.55)),
 }  # fmt: skip
@@ -150,5 +151,5 @@ def test_shanks_lean_as_inverse_kinematics_has_them():
 def test_standing_robot_at_rest_gets_full_tracking():
     state = make_state(standing=1)
     assert paid("linear_velocity", make_view(), state, std=0.1) == pytest.approx(1.0)
-    assert paid("stand", make_view(), state, std=0.1) == pytest.approx(1.0)
+    assert paid("standing_posture", make_view(), state, std=0.1) == pytest.approx(1.0)
     assert vec12(*DEFAULT_ANGLE) == make_view().default_angle
