@@ -124,9 +124,7 @@ def make_observe_kernel(task: Any) -> wp.Kernel:
                     else:
                         store(
                             wp.static(slots[i].func)(
-                                robot,
-                                states[world],
-                                *p[wp.static(slots[i].params_start) : wp.static(slots[i].params_stop)],
+                                robot, states[world], *p[wp.static(slots[i].start) : wp.static(slots[i].stop)]
                             ),
                             wp.static(places[i]),
                             world,

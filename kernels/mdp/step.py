@@ -93,7 +93,7 @@ def make_step_kernel(task: Any) -> wp.Kernel:
             state = wp.static(advance.func)(robot, states[world])
         else:
             state = wp.static(advance.func)(
-                robot, states[world], *p[wp.static(advance.params_start) : wp.static(advance.params_stop)]
+                robot, states[world], *p[wp.static(advance.start) : wp.static(advance.stop)]
             )
 
         termination = int(NOT_TERMINATED)
@@ -108,7 +108,7 @@ def make_step_kernel(task: Any) -> wp.Kernel:
                     holds = wp.static(endings[i].func)(robot, state)
                 else:
                     holds = wp.static(endings[i].func)(
-                        robot, state, *p[wp.static(endings[i].params_start) : wp.static(endings[i].params_stop)]
+                        robot, state, *p[wp.static(endings[i].start) : wp.static(endings[i].stop)]
                     )
                 if holds:
                     termination = i
@@ -121,7 +121,7 @@ def make_step_kernel(task: Any) -> wp.Kernel:
                 raw = wp.static(rewards[i].func)(robot, state)
             else:
                 raw = wp.static(rewards[i].func)(
-                    robot, state, *p[wp.static(rewards[i].params_start) : wp.static(rewards[i].params_stop)]
+                    robot, state, *p[wp.static(rewards[i].start) : wp.static(rewards[i].stop)]
                 )
             value = p[wp.static(rewards[i].weight)] * raw
             if wp.static(not rewards[i].once):
