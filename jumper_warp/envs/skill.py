@@ -148,11 +148,11 @@ def kernels_of(task: TaskCfg) -> dict[str, Kernel]:
     slots = task.params.slots
     compiled = {section: tuple(slot.compiled for slot in of_section) for section, of_section in slots.items()}
     ends = tuple(compiled[section] for section in ("advance", "curriculum", "rewards", "terminations"))
-    begins = (task.reset.func, task.settings_type, task.level_type, task.command.due, task.command.draw)
+    begins = (task.reset.func, task.settings_type, task.level_type, task.command.resample_due, task.command.resample)
     return {
         "step": _kernel(make_step_kernel, task, task.state, ends, task.reward_floor),
         "reset": _kernel(make_reset_kernel, task, task.state, begins),
-        "give": _kernel(make_set_command_kernel, task, task.state, task.command.give),
+        "set_command": _kernel(make_set_command_kernel, task, task.state, task.command.set),
         "observe": _kernel(make_observe_kernel, task, task.state, tuple(compiled[group] for group in task.groups)),
         "event": _kernel(make_event_kernel, slots["events"], compiled["events"]),
     }

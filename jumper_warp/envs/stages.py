@@ -239,6 +239,6 @@ class Stages:
         commands = wp.array(values, dtype=wp.vec4, device=self.wp_device)
         for skill in self.skills:
             self._launch(
-                skill.kernels["give"], self.num_envs,
+                skill.kernels["set_command"], self.num_envs,
                 [skill.index, mask, begins, commands, headings, self._scene, self.robot, self.episodes, skill.states],
             )  # fmt: skip

@@ -35,8 +35,8 @@ class Reset:
     """How an episode begins."""
 
     func: Function
-    """(robot: RobotArrays, scene: Scene, skill: SkillSettings, task, settings, level, draw: Draw) -> task of the new
-    episode; writes coordinates and rates of `draw.world`."""
+    """(robot: RobotArrays, scene: Scene, skill: SkillSettings, state, settings, level, rng: RngStream) -> state of the
+    new episode; writes coordinates and rates of `rng.world`."""
     settings: Any = None
     """Frozen dataclass with `struct`, the type of the kernels' settings, and `values(step_dt)`, which makes them."""
     side_by_side: bool = False
@@ -46,19 +46,19 @@ class Reset:
 
 @dataclass(frozen=True)
 class Command:
-    """How a robot is told what to do."""
+    """Command of a task: set from outside, and resampled within an episode."""
 
-    give: Function
-    """(robot, scene: Scene, state, values: wp.vec4, heading: float) -> task with a command from outside."""
-    due: Function | None = None
-    """(state) -> bool, whether a new command is drawn within the episode."""
-    draw: Function | None = None
-    """(robot, scene: Scene, state, level, draw: Draw) -> task with a new command."""
+    set: Function
+    """(robot, scene: Scene, state, values: wp.vec4, heading: float) -> state with a command from outside."""
+    resample_due: Function | None = None
+    """(state) -> bool, whether a new command is sampled within the episode."""
+    resample: Function | None = None
+    """(robot, scene: Scene, state, level, rng: RngStream) -> state with a sampled command."""
 
     def __post_init__(self) -> None:
-        """Raises ValueError: one of due and draw is missing."""
-        if (self.due is None) != (self.draw is None):
-            raise InputError("a command needs both due and draw, or neither")
+        """Raises ValueError: one of resample_due and resample is missing."""
+        if (self.resample_due is None) != (self.resample is None):
+            raise InputError("a command needs both resample_due and resample, or neither")
 
 
 @dataclass(frozen=True)
@@ -148,9 +148,9 @@ class TaskCfg:
         state, level = self.state, self.level_type
         expected = {
             "reset": (self.reset.func, {3: state, 4: self.settings_type, 5: level}),
-            "command give": (self.command.give, {2: state}),
-            "command due": (self.command.due, {0: state}),
-            "command draw": (self.command.draw, {2: state, 3: level}),
+            "command set": (self.command.set, {2: state}),
+            "command resample_due": (self.command.resample_due, {0: state}),
+            "command resample": (self.command.resample, {2: state, 3: level}),
             "curriculum counts": (self.curriculum.options["counts"], {0: state}),
         }
         for where, (func, structs) in expected.items():
@@ -241,4 +241,4 @@ class Handover:
     when: Function
     """(robot, task of the source, requested: bool) -> bool"""
     begin: Function
-    """(robot, task of the source) -> task of the target; then the target's `Command.give`, if the request has one."""
+    """(robot, task of the source) -> task of the target; then the target's `Command.set`, if the request has one."""

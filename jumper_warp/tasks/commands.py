@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from jumper_warp.kernels.attitude.commands import give_turn
-from jumper_warp.kernels.jump.reset import give_jump
-from jumper_warp.kernels.velocity.commands import give_velocity
+from jumper_warp.kernels.attitude.commands import set_turn
+from jumper_warp.kernels.jump.reset import set_jump
+from jumper_warp.kernels.velocity.commands import set_velocity
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.kernels import Function
@@ -45,7 +45,7 @@ class CommandLayout:
 
 
 LAYOUTS: dict[Function, CommandLayout] = {
-    give_jump: CommandLayout(
+    set_jump: CommandLayout(
         (
             CommandValue("x [m]"),
             CommandValue("y [m]"),
@@ -53,7 +53,7 @@ LAYOUTS: dict[Function, CommandLayout] = {
             CommandValue("policy step of the command [1]", least=0.0, optional=True),
         )
     ),
-    give_velocity: CommandLayout(
+    set_velocity: CommandLayout(
         (
             CommandValue("forward [m/s]"),
             CommandValue("left [m/s]"),
@@ -61,16 +61,16 @@ LAYOUTS: dict[Function, CommandLayout] = {
             CommandValue("gait [Hz]", least=0.0, optional=True),
         )
     ),
-    give_turn: CommandLayout(tuple(CommandValue(f"quaternion {axis} [1]") for axis in "xyzw"), nonzero=True),
+    set_turn: CommandLayout(tuple(CommandValue(f"quaternion {axis} [1]") for axis in "xyzw"), nonzero=True),
 }
-"""By `Command.give`. Of another function a command is any one to four numbers."""
+"""By `Command.set`. Of another function a command is any one to four numbers."""
 
 ANY = CommandLayout((CommandValue("a number"), *(CommandValue("a number", optional=True) for _ in range(3))))
 
 
 def layout_of(task: TaskCfg) -> CommandLayout:
     """Return what a task's command takes."""
-    return LAYOUTS.get(task.command.give, ANY)
+    return LAYOUTS.get(task.command.set, ANY)
 
 
 def check_commands(commands: np.ndarray, task: TaskCfg, num_envs: int, worlds: np.ndarray) -> None:

@@ -52,7 +52,7 @@ def sample_rotation(rng: RngStream, ranges: TurnRanges) -> wp.quat:
 
 
 @wp.func
-def give_turn(robot: RobotView, scene: Scene, state: AttitudeState, values: wp.vec4, heading: float) -> AttitudeState:
+def set_turn(robot: RobotView, scene: Scene, state: AttitudeState, values: wp.vec4, heading: float) -> AttitudeState:
     """Command a turn (quaternion xyzw, of any length but 0) from the orientation that the robot has; 0: none."""
     turn = wp.quat(values[0], values[1], values[2], values[3])
     if wp.length(values) == 0.0:

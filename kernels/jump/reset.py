@@ -187,13 +187,13 @@ def reset_jump(
 
 
 @wp.func
-def another_jump_due(state: JumpState) -> bool:
+def next_jump_due(state: JumpState) -> bool:
     """Return whether a landed robot gets another goal now."""
     return state.phase == LANDED and state.next_jump_step > 0 and state.phase_steps >= state.next_jump_step
 
 
 @wp.func
-def draw_next_jump(robot: RobotView, scene: Scene, state: JumpState, level: JumpLevel, rng: RngStream) -> JumpState:
+def resample_jump(robot: RobotView, scene: Scene, state: JumpState, level: JumpLevel, rng: RngStream) -> JumpState:
     """Return the state of an episode that goes on with another jump, to a drawn goal."""
     goal = sample_goal(rng, level)
     new = begin_next_jump(state, world_ground(scene.ground, robot.world), goal, robot.pos, yaw_of(robot.quat))
@@ -202,7 +202,7 @@ def draw_next_jump(robot: RobotView, scene: Scene, state: JumpState, level: Jump
 
 
 @wp.func
-def give_jump(robot: RobotView, scene: Scene, state: JumpState, values: wp.vec4, heading: float) -> JumpState:
+def set_jump(robot: RobotView, scene: Scene, state: JumpState, values: wp.vec4, heading: float) -> JumpState:
     """Ask a robot that stands at its start, or has landed, for a jump.
 
     values: goal x, y [m] relative to base and heading, base height at the apex [m], and at a start the policy step of

@@ -9,7 +9,7 @@ from .state import FLIGHT, LANDED, STANCE, JumpState, goal_offset, waiting
 
 @wp.func
 def landed_for(robot: RobotView, state: JumpState, steps: float) -> bool:
-    """Landed since `steps` policy steps: the jump is over."""
+    """Landed for `steps` policy steps: the jump is over."""
     return state.phase == LANDED and state.phase_steps >= int(steps)
 
 

@@ -54,7 +54,7 @@ def restore_task_kernel(
 
 def make_handover_kernel(handover: Any) -> wp.Kernel:
     """Return the kernel of a handover; handover: see `jumper_warp.tasks.cfg.Handover`."""
-    when, begin, give = handover.when, handover.begin, handover.target.command.give
+    when, begin, set_command = handover.when, handover.begin, handover.target.command.set
 
     @wp.kernel(module="unique", enable_backward=False)
     def handover_kernel(
@@ -82,7 +82,7 @@ def make_handover_kernel(handover: Any) -> wp.Kernel:
         if wp.static(when)(robot, sources[world], episode.requested_task[world] == target):
             begun = wp.static(begin)(robot, sources[world])
             if episode.requested_task[world] == target and episode.has_command[world] != 0:
-                targets[world] = wp.static(give)(
+                targets[world] = wp.static(set_command)(
                     robot, scene, begun, episode.pending_command[world], yaw_of(robot.quat)
                 )
             else:

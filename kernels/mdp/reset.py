@@ -30,7 +30,7 @@ def previous_state(old: Any, done: float):
 
 def make_reset_kernel(task: Any) -> wp.Kernel:
     """Return the kernel that begins a task's episodes; task: see `jumper_warp.tasks.cfg.TaskCfg`."""
-    reset, due, command = task.reset.func, task.command.due, task.command.draw
+    reset, due, command = task.reset.func, task.command.resample_due, task.command.resample
     settings_type, level_type = task.settings_type, task.level_type
 
     @wp.kernel(module="unique", module_options=FAST)
@@ -88,7 +88,7 @@ def make_reset_kernel(task: Any) -> wp.Kernel:
 
 def make_set_command_kernel(task: Any) -> wp.Kernel:
     """Return the kernel that gives worlds a command from outside."""
-    give = task.command.give
+    set_command = task.command.set
 
     @wp.kernel(module="unique", enable_backward=False)
     def set_command_kernel(
@@ -114,11 +114,11 @@ def make_set_command_kernel(task: Any) -> wp.Kernel:
         robot = load_view(arrays, scene.ground, world)
         if begins != 0:
             fresh = task.state()
-            states[world] = wp.static(give)(robot, scene, fresh, values[world], headings[world])
+            states[world] = wp.static(set_command)(robot, scene, fresh, values[world], headings[world])
             episode.history_reset[world] = BEGUN
             episode.diverged[world] = 0
         else:
-            states[world] = wp.static(give)(robot, scene, states[world], values[world], yaw_of(robot.quat))
+            states[world] = wp.static(set_command)(robot, scene, states[world], values[world], yaw_of(robot.quat))
             if episode.history_reset[world] != BEGUN:
                 episode.history_reset[world] = COMMANDED
 

@@ -74,13 +74,13 @@ def with_command(state: VelocityState, command: wp.vec3) -> VelocityState:
 
 
 @wp.func
-def command_due(state: VelocityState) -> bool:
+def resample_due(state: VelocityState) -> bool:
     """Return whether the command has lasted long enough."""
     return state.command_lasts > 0 and state.command_steps >= state.command_lasts
 
 
 @wp.func
-def draw_command(
+def resample_velocity(
     robot: RobotView, scene: Scene, state: VelocityState, level: CommandRanges, rng: RngStream
 ) -> VelocityState:
     """Return the state of an episode that goes on with a drawn command."""
@@ -90,7 +90,7 @@ def draw_command(
 
 
 @wp.func
-def give_velocity(
+def set_velocity(
     robot: RobotView, scene: Scene, state: VelocityState, values: wp.vec4, heading: float
 ) -> VelocityState:
     """Command a velocity until another comes: ahead, to the left [m/s] and about z [rad/s], body axes.

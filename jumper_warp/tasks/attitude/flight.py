@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from jumper_warp.kernels.attitude import observations as attitude
 from jumper_warp.kernels.attitude import rewards, state, terminations
-from jumper_warp.kernels.attitude.commands import give_turn
+from jumper_warp.kernels.attitude.commands import set_turn
 from jumper_warp.kernels.attitude.reset import reset_attitude
 from jumper_warp.kernels.attitude.state import AttitudeState
 from jumper_warp.kernels.mdp import rewards as mdp_rewards
@@ -80,7 +80,7 @@ def attitude_in_flight() -> TaskCfg:
         state=AttitudeState,
         advance=Advance(state.advance_attitude, tolerance=TOLERANCE * DEG),
         reset=Reset(reset_attitude, AttitudeResetCfg(), side_by_side=True),
-        command=Command(give_turn),
+        command=Command(set_turn),
         curriculum=Curriculum(
             state.attitude_error, tolerance=10.0 * DEG, promote_after=5, counts=state.every_episode, unit="rad"
         ),

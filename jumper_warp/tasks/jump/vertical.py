@@ -92,7 +92,7 @@ def vertical_jump() -> TaskCfg:
         state=JumpState,
         advance=Advance(phase.advance_jump, takeoff_speed=TAKEOFF_SPEED),
         reset=Reset(reset.reset_jump, RESET, side_by_side=True),
-        command=Command(reset.give_jump, reset.another_jump_due, reset.draw_next_jump),
+        command=Command(reset.set_jump, reset.next_jump_due, reset.resample_jump),
         curriculum=Curriculum(errors.height_error, tolerance=0.05, counts=reset.from_standing),
         rewards=REWARDS,
         terminations=TERMINATIONS,

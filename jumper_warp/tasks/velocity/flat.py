@@ -104,7 +104,7 @@ def velocity_flat() -> TaskCfg:
         state=VelocityState,
         advance=Advance(state.advance_velocity, settle=1.0 * SECOND),
         reset=Reset(reset_velocity, VelocityResetCfg(), side_by_side=True),
-        command=Command(commands.give_velocity, commands.command_due, commands.draw_command),
+        command=Command(commands.set_velocity, commands.resample_due, commands.resample_velocity),
         curriculum=Curriculum(
             state.tracking_error, tolerance=0.18, promote_after=1_000_000, counts=state.every_episode, unit="m_s"
         ),

@@ -44,7 +44,7 @@ class Stage(Probe):
         skill = self.skill
         inputs = [skill.index, self.mask(chosen), begins, array(values, wp.vec4), array(headings), self.scene,
                   self.robot, self.episodes, skill.states]  # fmt: skip
-        wp.launch(skill.kernels["give"], self.n, inputs, device="cpu")
+        wp.launch(skill.kernels["set_command"], self.n, inputs, device="cpu")
 
     def forget(self, chosen):
         """Launch what forgets the past."""
@@ -197,7 +197,9 @@ def test_a_beginning_comes_before_a_command_and_draws_other_numbers(stage):
 
 def test_a_task_without_drawn_commands_begins_alike():
     task = probe_task()
-    stage = Stage(task=dataclasses.replace(task, command=dataclasses.replace(task.command, due=None, draw=None)))
+    stage = Stage(
+        task=dataclasses.replace(task, command=dataclasses.replace(task.command, resample_due=None, resample=None))
+    )
     stage.write(value=7.0, other=-1.0)
     stage.reset(SOME)
     np.testing.assert_array_equal(stage.read("other") == -1.0, ~SOME)
