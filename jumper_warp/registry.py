@@ -37,7 +37,7 @@ class TaskEntry:
     ppo: PpoCfg = field(default_factory=PpoCfg)
     """Settings of the algorithm unless told otherwise."""
     aliases: tuple[str, ...] = ()
-    best_by: str = "Metrics/success"
+    best_metric: str = "Metrics/success"
     """The logged figure that makes a checkpoint the best, unless told otherwise."""
 
     @property
@@ -91,9 +91,11 @@ TASKS: dict[str, TaskEntry] = {
     "velocity-flat": TaskEntry(
         "jumper_warp.tasks.velocity.flat:velocity_flat", WALKING, ("Olympus-Walk",), "Metrics/score"
     ),
-    "velocity-rough": TaskEntry("jumper_warp.tasks.velocity.rough:velocity_rough", WALKING, best_by="Metrics/score"),
-    "velocity-trot": TaskEntry("jumper_warp.tasks.velocity.flat:velocity_trot", WALKING, best_by="Metrics/score"),
-    "attitude": TaskEntry("jumper_warp.tasks.attitude.flight:attitude_in_flight", TURNS, best_by="Metrics/settled"),
+    "velocity-rough": TaskEntry(
+        "jumper_warp.tasks.velocity.rough:velocity_rough", WALKING, best_metric="Metrics/score"
+    ),
+    "velocity-trot": TaskEntry("jumper_warp.tasks.velocity.flat:velocity_trot", WALKING, best_metric="Metrics/score"),
+    "attitude": TaskEntry("jumper_warp.tasks.attitude.flight:attitude_in_flight", TURNS, best_metric="Metrics/settled"),
 }  # fmt: skip
 """The project's tasks, and those that were registered or asked for."""
 

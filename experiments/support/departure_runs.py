@@ -17,7 +17,7 @@ from jumper_warp.cli.train import env_maker, parse_train
 from jumper_warp.evaluation.plots import figure
 from jumper_warp.evaluation.run import HEIGHTS, EvaluationRun
 from jumper_warp.policies.conditions import Conditions
-from jumper_warp.policies.warm_start import start_from
+from jumper_warp.policies.warm_start import load_init_policy
 from jumper_warp.registry import make_task
 from jumper_warp.rl.resume import CHECKPOINTS
 from jumper_warp.rl.runner import CONFIG, train
@@ -73,7 +73,7 @@ JUMPS: dict[Jump, Jumps] = {
     "horizontal-jump": Jumps(800, {"x": (0.3, 1.5)}, (0.3, 1.5)),
     "omnidirectional-jump": Jumps(1000, {"x": (-0.8, 1.2), "y": (-0.8, 0.8)}, (0.3, 1.2)),
     "horizontal-jump-mars-loose": Jumps(
-        1000, {"x": (0.5, 4.2)}, (0.5, 4.2), "--start-from horizontal_jump --ppo.init-std 0.3"
+        1000, {"x": (0.5, 4.2)}, (0.5, 4.2), "--init-policy horizontal_jump --ppo.init-std 0.3"
     ),
 }
 
@@ -94,7 +94,7 @@ def trained(undone: Undone, arguments: list[str]) -> Path:
         if other or config["env"]["task"] != task_to_json(task):
             raise InputError(f"{found[-1].parents[1]} was trained with other settings: choose another --out")
         return found[-1]
-    start = start_from(parsed.cfg.start_from, task, parsed.cfg.ppo) if parsed.cfg.start_from else None
+    start = load_init_policy(parsed.cfg.init_policy, task, parsed.cfg.ppo) if parsed.cfg.init_policy else None
     typed = shlex.join(["jumper", "train", *arguments])
     result = train(parsed.cfg, env_maker(task, parsed), typed, start=start)
     return result.folder / name.format(result.iteration)

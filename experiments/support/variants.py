@@ -20,7 +20,7 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "four_minibatches": {"minibatches": 4},
     "less_noise": {"init_std": 0.5},
     "less_noise_bfloat16": {"init_std": 0.5, "precision": "bfloat16"},
-    "small": {"hidden": (128, 64, 64), "final_kl": 0.005},
+    "small": {"hidden": (128, 64, 64), "final_desired_kl": 0.005},
 }
 """What each changes of `PpoCfg`."""
 

@@ -70,8 +70,8 @@ def parse_train(args: Sequence[str]) -> tuple[TrainArgs, TaskCfg]:
     if args[0].startswith("-"):
         raise UsageError(f"the task comes first: jumper train TASK [flags]; tasks: {names}")
     name, entry = find_task(args[0])
-    default, task = TrainArgs(TrainCfg(task=name, ppo=entry.ppo, best_by=entry.best_by)), make_task(name)
-    given = {name: value_of(f"--{name.replace('_', '-')}", args[1:]) for name in ("resume", "log_root", "start_from")}
+    default, task = TrainArgs(TrainCfg(task=name, ppo=entry.ppo, best_metric=entry.best_metric)), make_task(name)
+    given = {name: value_of(f"--{name.replace('_', '-')}", args[1:]) for name in ("resume", "log_root", "init_policy")}
     if given["resume"]:
         from jumper_warp.cli.resumed import settings_of_run
         from jumper_warp.rl.resume import find_checkpoint
@@ -150,14 +150,14 @@ def env_maker(task: TaskCfg, args: TrainArgs) -> MakeEnv:
 
 
 def command_line(args: Sequence[str], modules: Sequence[ModuleType]) -> str:
-    """Return what was typed, without `--resume` and `--start-from`, to which one more `--resume` can be added.
+    """Return what was typed, without `--resume` and `--init-policy`, to which one more `--resume` can be added.
 
     Modules are named by their file, those of a package by their name.
     """
     kept, given = [], iter(args)
     for arg in given:
         flag, equals, _ = arg.partition("=")
-        if flag.replace("_", "-") not in ("--resume", "--start-from"):
+        if flag.replace("_", "-") not in ("--resume", "--init-policy"):
             kept.append(arg)
         elif not equals:
             next(given, None)
@@ -179,7 +179,7 @@ def check_saving(task: TaskCfg) -> None:
 def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> TrainResult:
     """Train as the arguments say; modules: that the user has named, whose tasks are registered by now.
 
-    Raises as `parse_train`, `jumper_warp.policies.warm_start.start_from` and `jumper_warp.rl.runner.train`.
+    Raises as `parse_train`, `jumper_warp.policies.warm_start.load_init_policy` and `jumper_warp.rl.runner.train`.
     """
     parsed, task = parse_train(args)
     from jumper_warp.rl.runner import train
@@ -190,10 +190,10 @@ def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> TrainResult:
     if parsed.cfg.ppo.symmetry != "off":
         mirror_of(task, "policy")  # raises InputError where a term has no known mirror image
     start = None
-    if parsed.cfg.start_from and not parsed.checkpoint:
-        from jumper_warp.policies.warm_start import start_from
+    if parsed.cfg.init_policy and not parsed.checkpoint:
+        from jumper_warp.policies.warm_start import load_init_policy
 
-        start = start_from(parsed.cfg.start_from, task, parsed.cfg.ppo)
+        start = load_init_policy(parsed.cfg.init_policy, task, parsed.cfg.ppo)
     first = os.environ.get("RANK", "0") == "0"
     if first:
         announce(parsed.cfg.device, parsed.cfg.threads)

@@ -42,7 +42,7 @@ def learning_need(cfg: PpoCfg, num_obs: int, num_critic_obs: int) -> Need:
     The peak is in the critic's pass over the whole rollout: the buffers, the samples as rows with their orders, the
     normalised observations with a copy of them, and the two widest layers.
     """
-    critic_obs = num_critic_obs if cfg.asymmetric else num_obs
+    critic_obs = num_critic_obs if cfg.asymmetric_critic else num_obs
     sizes = ((num_obs, *cfg.hidden, NUM_ACTIONS), (critic_obs, *cfg.hidden, 1))
     weights = sum((a + 1) * b for each in sizes for a, b in pairwise(each))
     row = FLOAT * (num_obs + critic_obs + 2 * NUM_ACTIONS + 4 + ZEROS)

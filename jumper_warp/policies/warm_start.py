@@ -20,7 +20,7 @@ from jumper_warp.tasks.mirror import mirror_of, mirror_of_action
 from jumper_warp.utils.errors import InputError
 
 
-def start_from(source: str | Path, task: TaskCfg, cfg: PpoCfg) -> Start:
+def load_init_policy(source: str | Path, task: TaskCfg, cfg: PpoCfg) -> Start:
     """Return what a training of a task begins with to act as a policy does; source: as `open_policy` takes it.
 
     Scales of actions, gains, torques, times and all that the environment does may be others than the policy's own.
@@ -44,7 +44,7 @@ def check_interface(face: PolicyInterface, described: dict[str, Any]) -> None:
     """
     for what, own, other in _compared(face, described):
         if own != other:
-            raise InputError(f"start_from: {what}: the policy has {own}, the task {other}")
+            raise InputError(f"init_policy: {what}: the policy has {own}, the task {other}")
 
 
 def _compared(face: PolicyInterface, described: dict[str, Any]) -> Iterator[tuple[str, Any, Any]]:

@@ -34,7 +34,7 @@ class PpoCfg:
     """Clipping range of the probability ratio, and of the value in standard deviations of the return."""
     value_coef: float = 2.0
     """Weight of the value loss."""
-    asymmetric: bool = True
+    asymmetric_critic: bool = True
     """Whether the critic sees what only a simulation knows, instead of the actor's observation."""
     clip_value: bool = True
     """Whether the value loss is clipped."""
@@ -42,7 +42,7 @@ class PpoCfg:
     """Whether the critic predicts the return in its running standard deviations."""
     entropy_coef: float = 0.0015
     """Weight of the entropy bonus."""
-    final_entropy: float | None = None
+    final_entropy_coef: float | None = None
     """What entropy_coef becomes, in a straight line over the second half of a training; None: it stays. Much noise
     finds the way, little the finer policy."""
     lr: float = 1.0e-3
@@ -53,7 +53,7 @@ class PpoCfg:
     """Its upper bound."""
     desired_kl: float = 0.01
     """The step size falls above twice and rises below half of this divergence; 0 keeps it fixed."""
-    final_kl: float = 0.002
+    final_desired_kl: float = 0.002
     """What desired_kl falls to, in a straight line over the second half of a training; smaller steps, finer policy."""
     max_grad_norm: float = 1.0
     """Gradients of the actor and of the critic are each shortened to this norm."""
@@ -82,10 +82,10 @@ class PpoCfg:
         """Raises ValueError: a setting is out of range."""
         for name in ("num_steps", "epochs", "minibatches", "lr", "max_grad_norm", "init_std", "clip", "reward_scale"):
             check_positive(name, getattr(self, name))
-        for name in ("value_coef", "entropy_coef", "desired_kl", "final_kl"):
+        for name in ("value_coef", "entropy_coef", "desired_kl", "final_desired_kl"):
             check_not_negative(name, getattr(self, name))
-        if self.final_entropy is not None:
-            check_not_negative("final_entropy", self.final_entropy)
+        if self.final_entropy_coef is not None:
+            check_not_negative("final_entropy_coef", self.final_entropy_coef)
         for name in ("gamma", "lam"):
             if not 0.0 <= getattr(self, name) <= 1.0:
                 raise InputError(f"{name} must be in [0, 1], got {getattr(self, name)}")
@@ -169,13 +169,13 @@ class TrainCfg:
     """Iterations between two checkpoints."""
     keep: int = 3
     """How many of the newest checkpoints stay; the best stays anyway."""
-    best_by: str = "Metrics/success"
+    best_metric: str = "Metrics/success"
     """The logged figure that makes a checkpoint the best; higher is better."""
     resume: str | None = None
     """A checkpoint, a run's folder, `latest` for the task's latest run with a checkpoint, or `latest-or-new`, which
     begins a new run if there is none. `jumper train` resumes with the settings of that run; flags override them. Not
     saved are device, threads, log_root, tensorboard and wandb."""
-    start_from: str | None = None
+    init_policy: str | None = None
     """A policy's name or folder, a run's folder (its best checkpoint) or a checkpoint: a new training begins with that
     policy's actor, its weights and its statistics of observations. The critic, the optimiser and the noise are new."""
     trainer: Literal["ppo", "shac", "rsl-rl"] = "ppo"
@@ -198,10 +198,10 @@ class TrainCfg:
         check_not_negative("max_seconds", self.max_seconds)
         checked_threads(self.threads)
         check_seed(self.seed)
-        for name in ("resume", "start_from"):
+        for name in ("resume", "init_policy"):
             if self.trainer == "rsl-rl" and getattr(self, name):
                 raise InputError(f"{name} is not offered with trainer rsl-rl")
-        if self.resume and self.resume != LATEST_OR_NEW and self.start_from:
-            raise InputError("give resume, which goes on with a training, or start_from, which begins one, not both")
+        if self.resume and self.resume != LATEST_OR_NEW and self.init_policy:
+            raise InputError("give resume, which goes on with a training, or init_policy, which begins one, not both")
         if self.trainer != "ppo" and self.ppo.symmetry != "off":
             raise InputError(f"symmetry is not offered with trainer {self.trainer}")

@@ -74,7 +74,7 @@ class Ppo:
             torch.set_float32_matmul_precision("high" if cfg.tf32 else "highest")
         else:
             keep_freed_memory()
-        num_critic_obs = env.num_critic_obs if cfg.asymmetric else env.num_obs
+        num_critic_obs = env.num_critic_obs if cfg.asymmetric_critic else env.num_obs
         symmetry = None if cfg.symmetry == "off" else symmetry_of(env)
         self.model = ActorCritic(
             env.num_obs, env.num_actions, cfg.hidden, cfg.activation, cfg.init_std, num_critic_obs, symmetry
@@ -168,8 +168,8 @@ class Ppo:
     def set_progress(self, progress: float) -> None:
         """Tell how much of the training is over, from 0 to 1; does not wait for the device."""
         cfg, late = self.cfg, min(max(2.0 * progress - 1.0, 0.0), 1.0)
-        self._desired_kl.fill_((1.0 - late) * cfg.desired_kl + late * min(cfg.final_kl, cfg.desired_kl))
-        final = cfg.entropy_coef if cfg.final_entropy is None else cfg.final_entropy
+        self._desired_kl.fill_((1.0 - late) * cfg.desired_kl + late * min(cfg.final_desired_kl, cfg.desired_kl))
+        final = cfg.entropy_coef if cfg.final_entropy_coef is None else cfg.final_entropy_coef
         self._entropy_coef.fill_((1.0 - late) * cfg.entropy_coef + late * final)
 
     def statistics(self) -> dict[str, float]:

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 CHECKPOINTS = "checkpoints"
 """Folder of a run that holds its checkpoints."""
-SESSION = ("device", "threads", "log_root", "resume", "start_from", "tensorboard", "wandb")
+SESSION = ("device", "threads", "log_root", "resume", "init_policy", "tensorboard", "wandb")
 """Settings of a training that are not kept when its run is resumed."""
 DERIVED = ("interface", "num_envs", "seed")
 """What an environment tells of itself that other settings say."""
@@ -66,11 +66,11 @@ def own_part(state: dict[str, Any], rank: Rank) -> dict[str, Any]:
     return own
 
 
-def started_from(state: dict[str, Any]) -> str | None:
+def init_policy_of(state: dict[str, Any]) -> str | None:
     """Return the policy that the run of a checkpoint began with; None: with random weights, or it is not told."""
     try:
         settings = json.loads(state["config"])["train"]
-        return str(settings["start_from"]) if settings.get("start_from") else None
+        return str(settings["init_policy"]) if settings.get("init_policy") else None
     except (LookupError, TypeError, ValueError, AttributeError):
         return None
 

@@ -19,7 +19,7 @@ class RolloutBuffer(NamedTuple):
     obs: torch.Tensor
     """(num_steps + 1, num_envs, num_obs) sanitised."""
     critic_obs: torch.Tensor
-    """(num_steps + 1, num_envs, num_critic_obs) sanitised; the actor's without `PpoCfg.asymmetric`."""
+    """(num_steps + 1, num_envs, num_critic_obs) sanitised; the actor's without `PpoCfg.asymmetric_critic`."""
     final_critic_obs: torch.Tensor
     """(num_steps, num_envs, num_critic_obs) after the step, before a reset."""
     action: torch.Tensor
@@ -57,8 +57,8 @@ class Collector:
     def __init__(self, env: VecEnv, cfg: PpoCfg, model: ActorCritic, flat: FlatParameters, compiler: Compiler) -> None:
         """flat: the parameters of `model`."""
         self.env, self.cfg = env, cfg
-        self._critic_obs = env.critic_obs if cfg.asymmetric else env.obs
-        self._final_critic_obs = env.final_critic_obs if cfg.asymmetric else env.final_obs
+        self._critic_obs = env.critic_obs if cfg.asymmetric_critic else env.obs
+        self._final_critic_obs = env.final_critic_obs if cfg.asymmetric_critic else env.final_obs
         self.rollout = make_rollout_buffer(cfg.num_steps, env, self._critic_obs.shape[1])
         self._steps = [self.rollout.at(step) for step in range(cfg.num_steps)]
         self._moments, self._actor = model.obs_moments, flat.actor

@@ -41,7 +41,7 @@ from jumper_warp.rl.resume import (
     random_state,
     set_random_state,
     spent_seconds,
-    started_from,
+    init_policy_of,
 )
 from jumper_warp.rl.shac import STATISTICS as SHAC_STATISTICS
 from jumper_warp.rl.shac import Shac
@@ -103,7 +103,7 @@ def train(
     """Train to the last iteration or the time limit, and save.
 
     command: what the user would type to continue, without `--resume`; by default `jumper train TASK`. as_rsl_rl: needed
-    with trainer rsl-rl. start: the policy that cfg.start_from names, needed with it. checkpoint: the one that
+    with trainer rsl-rl. start: the policy that cfg.init_policy names, needed with it. checkpoint: the one that
     cfg.resume names, if it has been read.
 
     Raises ValueError: a setting does not fit the environment or the machine. CheckpointError: there is nothing usable
@@ -115,8 +115,8 @@ def train(
     run: Run | None = None
     try:
         _check_processes(cfg, rank)
-        if checkpoint is None and bool(cfg.start_from) != (start is not None):
-            raise InputError("start_from and start, the policy that it names, need each other")
+        if checkpoint is None and bool(cfg.init_policy) != (start is not None):
+            raise InputError("init_policy and start, the policy that it names, need each other")
         env = make_env(cfg.num_envs // rank.size, (cfg.seed + 1000 * rank.index) % 2**31, rank.device)
         if cfg.trainer == "rsl-rl":
             return _train_rsl_rl(cfg, env, as_rsl_rl, rank)
@@ -145,11 +145,11 @@ def _check_processes(cfg: TrainCfg, rank: Rank) -> None:
         cfg.ppo.batch_size(cfg.num_envs // rank.size)
 
 
-def _check_best_by(name: str, logged: set[str]) -> None:
+def _check_best_metric(name: str, logged: set[str]) -> None:
     """Raises ValueError: no figure of this name is logged."""
     if name not in logged:
         some = ", ".join(sorted(each for each in logged if each.startswith(("Metrics/", "Train/"))))
-        raise InputError(f"best_by must name a logged figure, such as {some}, got {name!r:.60}")
+        raise InputError(f"best_metric must name a logged figure, such as {some}, got {name!r:.60}")
 
 
 def full_config(cfg: TrainCfg, env: VecEnv, rank: Rank) -> dict[str, Any]:
@@ -183,7 +183,7 @@ class Run:
         by_gradients = cfg.trainer == "shac"
         self.ppo = Shac(cast(DifferentiableVecEnv, env), cfg.ppo, cfg.shac) if by_gradients else Ppo(env, cfg.ppo)
         losses = {f"Loss/{name}" for name in (SHAC_STATISTICS if by_gradients else STATISTICS)}
-        _check_best_by(cfg.best_by, {*env.metrics(), *losses, *LEARNING, *PERF})
+        _check_best_metric(cfg.best_metric, {*env.metrics(), *losses, *LEARNING, *PERF})
         self.config = full_config(cfg, env, rank)
         self.iteration, self.seconds = 0, 0.0  # that the run had before this process
         self._begin: float | None = None  # on the clock, as if all seconds that count were of this process
@@ -194,7 +194,7 @@ class Run:
             raise InputError("the processes found different checkpoints: log_root must be a folder that all can read")
         if start is not None and checkpoint is None:
             begin_with(start, self.ppo.model, cfg.num_envs * cfg.ppo.num_steps)
-            self.notes.append(", ".join(filter(None, (f"starts from {cfg.start_from}", start.change))))
+            self.notes.append(", ".join(filter(None, (f"starts from {cfg.init_policy}", start.change))))
         torch.manual_seed(cfg.seed + 1 + rank.index)
         self.folder = new_folder(cfg, rank) if checkpoint is None else self._resume(checkpoint)
         if rank.index == 0:
@@ -215,7 +215,7 @@ class Run:
             told = f" ({', '.join(changed)})" if changed else ""
             raise CheckpointError(f"{path}: does not fit these settings: {one_line(error)}{told}") from error
         self.iteration = state["iteration"]
-        self.config["train"]["start_from"] = started_from(state)
+        self.config["train"]["init_policy"] = init_policy_of(state)
         return path.parent.parent
 
     def iterate(self, stop: Stop) -> TrainResult:
@@ -312,7 +312,7 @@ class Run:
         state["config"] = json.dumps(self.config)
         folder = self.folder / CHECKPOINTS
         try:
-            path = save_checkpoint(folder, state, self.figures.get(self.cfg.best_by), self.cfg.keep)
+            path = save_checkpoint(folder, state, self.figures.get(self.cfg.best_metric), self.cfg.keep)
         except OSError as error:
             if ending:
                 raise CheckpointError(f"{folder}: not saved: {error.strerror}") from error

@@ -39,7 +39,7 @@ class Shac:
             raise InputError("trainer shac needs an environment with gradients")
         self.env, self.cfg, self.shac = env, cfg, shac
         self.batch_size = cfg.num_steps * env.num_envs
-        critic_obs = env.num_critic_obs if cfg.asymmetric else env.num_obs
+        critic_obs = env.num_critic_obs if cfg.asymmetric_critic else env.num_obs
         self.model = ActorCritic(
             env.num_obs, env.num_actions, cfg.hidden, cfg.activation, cfg.init_std, critic_obs
         ).to(env.device)  # fmt: skip
@@ -86,14 +86,14 @@ class Shac:
             action = mean + model.log_std.exp() * noise
             reward = cfg.reward_scale * torch.nan_to_num(env.step_with_gradient(action), 0.0, 0.0, 0.0)
             seen["obs"].append(obs.detach())
-            seen["critic_obs"].append((critic_obs if cfg.asymmetric else obs).detach())
+            seen["critic_obs"].append((critic_obs if cfg.asymmetric_critic else obs).detach())
             seen["reward"].append(reward.detach())
             done, timeout = env.done.clone(), env.timeout.clone()
-            after = self._target_value(env.observe_final()[int(cfg.asymmetric)]) * timeout
+            after = self._target_value(env.observe_final()[int(cfg.asymmetric_critic)]) * timeout
             if step == cfg.num_steps - 1:
-                following = self._target_value(env.observe()[int(cfg.asymmetric)])
+                following = self._target_value(env.observe()[int(cfg.asymmetric_critic)])
             else:
-                following = self._target_value((env.critic_obs if cfg.asymmetric else env.obs).clone()).detach()
+                following = self._target_value((env.critic_obs if cfg.asymmetric_critic else env.obs).clone()).detach()
             value = torch.where(done > 0.0, after, following)
             seen["next"].append(value.detach())
             seen["done"].append(done)

@@ -50,7 +50,7 @@ def make_start(
     """
     if activation != cfg.activation:
         raise InputError(
-            f"start_from: the policy has activation {activation}, these settings make {cfg.activation}: "
+            f"init_policy: the policy has activation {activation}, these settings make {cfg.activation}: "
             f"give --ppo.activation {activation}"
         )
     has = [len(bias) for _, bias in layers[:-1]]
@@ -59,11 +59,11 @@ def make_start(
     if wanted != list(cfg.hidden):
         made = [width if half is None else 2 * width for width in cfg.hidden]
         raise InputError(
-            f"start_from: the policy has hidden layers {_words(has)}, these settings make {_words(made)}: "
+            f"init_policy: the policy has hidden layers {_words(has)}, these settings make {_words(made)}: "
             f"give --ppo.hidden {_words(wanted, ' ')}"
         )
     if not (std.double().square() > 0.999 * EPS).all():
-        raise InputError(f"start_from: the policy divides an observation by {std.min():.3g}, least is {EPS**0.5:.3g}")
+        raise InputError(f"init_policy: the policy divides an observation by {std.min():.3g}, least is {EPS**0.5:.3g}")
     if half is not None and symmetry is not None:
         return Start(half, mean, std, "" if _is_symmetric(layers, symmetry) else "made mirror-symmetric")
     if symmetry is None:
@@ -81,7 +81,9 @@ def begin_with(start: Start, model: ActorCritic, samples: int) -> None:
     own = weights_of(model.actor)
     has, made = ([tuple(weight.shape) for weight, _ in layers] for layers in (start.layers, own))
     if has != made:
-        raise InputError(f"start_from: the policy's weights are of shapes {_words(has)}, the training's {_words(made)}")
+        raise InputError(
+            f"init_policy: the policy's weights are of shapes {_words(has)}, the training's {_words(made)}"
+        )
     for (weight, bias), (new_weight, new_bias) in zip(own, start.layers, strict=True):
         weight.copy_(new_weight)
         bias.copy_(new_bias)

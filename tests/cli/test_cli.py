@@ -318,7 +318,7 @@ def test_training_has_the_settings_of_its_task(name, ppo):
 
 
 def test_best_checkpoint_is_chosen_by_the_figure_of_the_task():
-    names = {name: parse_train([name])[0].cfg.best_by for name in ("vertical-jump", "velocity-rough")}
+    names = {name: parse_train([name])[0].cfg.best_metric for name in ("vertical-jump", "velocity-rough")}
     assert names == {"vertical-jump": "Metrics/success", "velocity-rough": "Metrics/score"}
 
 

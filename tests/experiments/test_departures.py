@@ -67,7 +67,7 @@ def test_what_is_undone_elsewhere():
     assert {(level.goal_lower[1], level.goal_upper[1]) for level in goals} == {(-0.3, 0.3)} and len(goals) == 8
     parsed, limits = undone("horizontal-jump-mars-loose", "limits")
     ends = {term.name: term.numbers for term in limits.terminations}
-    assert parsed.cfg.start_from == "horizontal_jump" and limits.curriculum.numbers["tolerance"] == 0.1
+    assert parsed.cfg.init_policy == "horizontal_jump" and limits.curriculum.numbers["tolerance"] == 0.1
     assert (ends["missed_goal"]["tolerance"], ends["predicted_miss"]["tolerance"]) == (0.5, 0.55)
     earth, plain = make_task("horizontal-jump"), make_task("omnidirectional-jump")
     (touchdown,) = (term.numbers for term in earth.terminations if term.name == "turned_touchdown")

@@ -31,7 +31,7 @@ def test_each_network_gets_its_own_statistics():
 
 
 def test_a_symmetric_critic_gets_the_actors_observation():
-    ppo = Ppo(PushTask(4, episode_length=3), dataclasses.replace(SHORT, asymmetric=False))
+    ppo = Ppo(PushTask(4, episode_length=3), dataclasses.replace(SHORT, asymmetric_critic=False))
     ppo.env.reset()
     ppo.collect()
     assert torch.equal(ppo.rollout.critic_obs, ppo.rollout.obs)
@@ -50,10 +50,10 @@ class WageTask(PushTask):
         self.reward.copy_(self.critic_obs[:, 2])
 
 
-@pytest.mark.parametrize("asymmetric", [True, False])
-def test_only_an_asymmetric_critic_knows_what_the_actor_cannot_see(asymmetric):
+@pytest.mark.parametrize("asymmetric_critic", [True, False])
+def test_only_an_asymmetric_critic_knows_what_the_actor_cannot_see(asymmetric_critic):
     torch.manual_seed(0)
-    ppo = Ppo(WageTask(128), dataclasses.replace(SMALL, gamma=0.5, lam=0.0, asymmetric=asymmetric))
+    ppo = Ppo(WageTask(128), dataclasses.replace(SMALL, gamma=0.5, lam=0.0, asymmetric_critic=asymmetric_critic))
     ppo.env.reset()
     for _ in range(20):
         ppo.collect()
@@ -62,4 +62,4 @@ def test_only_an_asymmetric_critic_knows_what_the_actor_cannot_see(asymmetric):
         value = ppo.model.value(ppo.rollout.critic_obs).mean(0)
     told = (value[1::2].mean() - value[::2].mean()).item()
     # A wage of 1 is worth 0.6 / (1 - 0.5) = 1.2.
-    assert told == pytest.approx(1.2 if asymmetric else 0.0, abs=0.1)
+    assert told == pytest.approx(1.2 if asymmetric_critic else 0.0, abs=0.1)

@@ -358,7 +358,7 @@ def noise_gradient(ppo, progress):
 @pytest.mark.parametrize(("final", "late"), [(0.004, 0.012), (None, 0.02)])
 def test_the_entropy_bonus_falls_over_the_second_half(final, late):
     torch.manual_seed(0)
-    ppo = Ppo(PushTask(16), dataclasses.replace(PLAIN, entropy_coef=0.02, final_entropy=final))
+    ppo = Ppo(PushTask(16), dataclasses.replace(PLAIN, entropy_coef=0.02, final_entropy_coef=final))
     fill(ppo, slice(None), 16)
     ppo.batch()
     first, half = noise_gradient(ppo, 0.0), noise_gradient(ppo, 0.5)
@@ -396,8 +396,8 @@ def test_state_is_taken_up_exactly():
         ({"entropy_coef": float("nan")}, "entropy_coef must be finite and not negative, got nan"),
         ({"value_coef": float("inf")}, "value_coef must be finite"),
         ({"desired_kl": float("nan")}, "desired_kl must be finite"),
-        ({"final_entropy": -1.0}, "final_entropy must be finite and not negative, got -1.0"),
-        ({"final_kl": -1.0}, "final_kl must be finite and not negative"),
+        ({"final_entropy_coef": -1.0}, "final_entropy_coef must be finite and not negative, got -1.0"),
+        ({"final_desired_kl": -1.0}, "final_desired_kl must be finite and not negative"),
         ({"max_lr": float("inf")}, "max_lr must be finite"),
         ({"lr": float("nan")}, "lr must be positive"),
     ],

@@ -69,7 +69,7 @@ def test_the_gradient_is_that_of_the_windows_rewards_and_values():
 
 def test_the_loss_is_what_its_definition_says_world_by_world():
     """Two windows of episodes that end by time-out and, pushed away fast, by failure; summed by hand."""
-    algorithm = shac(num_envs=6, num_steps=14, asymmetric=False)
+    algorithm = shac(num_envs=6, num_steps=14, asymmetric_critic=False)
     env, model, gamma = algorithm.env, algorithm.model, algorithm.cfg.gamma
     env.start[0] = torch.tensor([4.5, 3.0])  # lost in a step, again and again
     env.reset()

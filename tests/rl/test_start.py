@@ -48,7 +48,7 @@ def start_of(model, cfg=SMALL, activation="elu"):
 @pytest.fixture
 def cfg(tmp_path):
     ppo = dataclasses.replace(SMALL, lr=1e-9, min_lr=1e-9, max_lr=1e-9)
-    return push_cfg(tmp_path, iterations=1, log_interval=1, ppo=ppo, start_from="pusher")
+    return push_cfg(tmp_path, iterations=1, log_interval=1, ppo=ppo, init_policy="pusher")
 
 
 def make_env(num_envs, seed, device):
@@ -143,7 +143,7 @@ def test_a_training_begins_as_the_policy_acts(given, symmetry, hidden):
     ],
 )
 def test_settings_of_another_network_are_refused_in_one_line(symmetric, change, message):
-    with pytest.raises(InputError, match=f"start_from: the policy .*{message}") as caught:
+    with pytest.raises(InputError, match=f"init_policy: the policy .*{message}") as caught:
         start_of(actor(symmetry=SYMMETRY if symmetric else None), dataclasses.replace(SMALL, **change))
     assert "\n" not in str(caught.value)
 
@@ -199,7 +199,7 @@ def test_a_deviation_that_statistics_cannot_have_is_refused():
 def test_a_model_of_other_sizes_is_left_alone():
     model = ActorCritic(3, 1, (32, 32))
     before = model.actor[0].weight.clone()
-    with pytest.raises(InputError, match=r"start_from: .* of shapes \(32, 2\), .* the training's \(32, 3\)"):
+    with pytest.raises(InputError, match=r"init_policy: .* of shapes \(32, 2\), .* the training's \(32, 3\)"):
         begin_with(start_of(actor()), model, samples=1)
     assert torch.equal(model.actor[0].weight, before) and not model.obs_moments.count
 
@@ -219,33 +219,33 @@ def test_a_training_starts_from_a_policy_and_tells_so(cfg, capsys, trainer, env)
     samples = 32 * SMALL.num_steps
     assert found["obs_moments.count"] == (KNOWN_ITERATIONS + 1) * samples
     assert 0.0 < (found["obs_moments.mean"] - model.obs_moments.mean).abs().max() < 0.05
-    assert json.loads((result.folder / CONFIG).read_text())["train"]["start_from"] == "pusher"
+    assert json.loads((result.folder / CONFIG).read_text())["train"]["init_policy"] == "pusher"
 
 
 def test_a_resumed_training_goes_on_from_its_checkpoint_and_keeps_what_it_began_with(cfg, capsys):
     first = train(cfg, make_env, start=start_of(actor()))
     capsys.readouterr()
-    resumed = dataclasses.replace(cfg, start_from=None, resume=str(first.folder), iterations=2)
+    resumed = dataclasses.replace(cfg, init_policy=None, resume=str(first.folder), iterations=2)
     second = train(resumed, make_env)
     assert "starts from" not in capsys.readouterr().err
     assert model_of(second)["obs_moments.count"] == (KNOWN_ITERATIONS + 2) * 32 * SMALL.num_steps
-    assert json.loads((second.folder / CONFIG).read_text())["train"]["start_from"] == "pusher"
+    assert json.loads((second.folder / CONFIG).read_text())["train"]["init_policy"] == "pusher"
 
 
 @pytest.mark.parametrize("before", [True, False])
 def test_a_checkpoint_that_began_with_random_weights_is_resumed(cfg, before):
     """before: of before there was a choice."""
-    first = train(dataclasses.replace(cfg, start_from=None), make_env)
+    first = train(dataclasses.replace(cfg, init_policy=None), make_env)
     path = first.folder / CHECKPOINTS / "iteration_000001.pt"
     state = load_checkpoint(path)
     config = json.loads(state["config"])
-    assert config["train"].pop("start_from", 0) is None
+    assert config["train"].pop("init_policy", 0) is None
     save_checkpoint(path.parent, {**state, "config": json.dumps(config) if before else state["config"]})
-    result = train(dataclasses.replace(cfg, start_from=None, resume=str(first.folder), iterations=2), make_env)
-    assert json.loads((result.folder / CONFIG).read_text())["train"]["start_from"] is None
+    result = train(dataclasses.replace(cfg, init_policy=None, resume=str(first.folder), iterations=2), make_env)
+    assert json.loads((result.folder / CONFIG).read_text())["train"]["init_policy"] is None
 
 
 def test_name_and_policy_need_each_other(cfg):
-    for start_from, start in (("pusher", None), (None, start_of(actor()))):
-        with pytest.raises(InputError, match=r"start_from and start.* need each other"):
-            train(dataclasses.replace(cfg, start_from=start_from), make_env, start=start)
+    for init_policy, start in (("pusher", None), (None, start_of(actor()))):
+        with pytest.raises(InputError, match=r"init_policy and start.* need each other"):
+            train(dataclasses.replace(cfg, init_policy=init_policy), make_env, start=start)

@@ -78,7 +78,9 @@ def test_a_resumed_run_goes_on_in_time(cfg):
     run, result = resume_after(cfg, 99.7, limit=100.0)
     assert result.iteration > 2 and result.seconds < 5.0
     assert final_state(result)["seconds"] >= result.figures["Perf/elapsed_s"] >= 100.0
-    assert run.ppo._desired_kl.item() == pytest.approx(cfg.ppo.final_kl, rel=0.05)  # desired_kl by its own time alone
+    assert run.ppo._desired_kl.item() == pytest.approx(
+        cfg.ppo.final_desired_kl, rel=0.05
+    )  # desired_kl by its own time alone
 
 
 def test_a_resumed_run_whose_time_is_over_ends_at_once(cfg):
@@ -112,7 +114,7 @@ def test_a_named_checkpoint_that_is_damaged_is_refused(cfg):
         train(dataclasses.replace(cfg, resume=str(path)), make_env)
 
 
-@pytest.mark.parametrize("change", [{"hidden": (16, 16)}, {"asymmetric": False}])
+@pytest.mark.parametrize("change", [{"hidden": (16, 16)}, {"asymmetric_critic": False}])
 def test_a_checkpoint_of_other_networks_is_refused_in_one_line(cfg, change):
     result = train(cfg, make_env)
     other = dataclasses.replace(cfg, resume=str(result.folder), ppo=dataclasses.replace(SMALL, **change))
@@ -259,16 +261,16 @@ def test_a_score_that_is_never_logged_is_refused_before_the_first_iteration(cfg)
         def step(self, action):
             pytest.fail("an iteration began")
 
-    message = r"best_by must name a logged figure, such as Metrics/success, Train/mean_length, .*, got 'nonsense'"
+    message = r"best_metric must name a logged figure, such as Metrics/success, Train/mean_length, .*, got 'nonsense'"
     with pytest.raises(ValueError, match=message):
-        train(dataclasses.replace(cfg, best_by="nonsense"), Unmoved)
+        train(dataclasses.replace(cfg, best_metric="nonsense"), Unmoved)
     assert not cfg.log_root.exists()
 
 
 def test_every_logged_figure_can_be_the_score(cfg):
     figures = train(cfg, make_env).figures
     for name in figures:
-        Run(dataclasses.replace(cfg, best_by=name), make_env(32, 1, "cpu"), Rank(0, 1, torch.device("cpu")))
+        Run(dataclasses.replace(cfg, best_metric=name), make_env(32, 1, "cpu"), Rank(0, 1, torch.device("cpu")))
     assert {"Train/mean_return", "Perf/fps", "Loss/kl", "Metrics/success"} <= figures.keys()
 
 
@@ -300,20 +302,20 @@ def test_rsl_rl_gets_copies():
         assert torch.equal(value, copy)
 
 
-@pytest.mark.parametrize(("asymmetric", "column"), [(True, 2), (False, 0)])
-def test_rsl_rl_gives_the_critic_its_own_observation(asymmetric, column):
+@pytest.mark.parametrize(("asymmetric_critic", "column"), [(True, 2), (False, 0)])
+def test_rsl_rl_gives_the_critic_its_own_observation(asymmetric_critic, column):
     env = PushTask(4, episode_length=50)
     env.reset()
     adapter = RslRlVecEnv(env, metrics_every=4)
-    config = rsl_rl_config(dataclasses.replace(SMALL, asymmetric=asymmetric), 1, 0)
+    config = rsl_rl_config(dataclasses.replace(SMALL, asymmetric_critic=asymmetric_critic), 1, 0)
     algorithm = OnPolicyRunner(adapter, config, log_dir=None, device="cpu").alg
     obs = adapter.get_observations()
     assert torch.equal(obs["critic"], env.critic_obs)
-    assert (algorithm.actor.obs_dim, algorithm.critic.obs_dim) == (2, 3 if asymmetric else 2)
+    assert (algorithm.actor.obs_dim, algorithm.critic.obs_dim) == (2, 3 if asymmetric_critic else 2)
     with torch.inference_mode():
         before = algorithm.actor(obs), algorithm.critic(obs)
-        obs["critic" if asymmetric else "policy"][:, column] += 1.0
-        assert torch.equal(algorithm.actor(obs), before[0]) == asymmetric
+        obs["critic" if asymmetric_critic else "policy"][:, column] += 1.0
+        assert torch.equal(algorithm.actor(obs), before[0]) == asymmetric_critic
         assert not torch.equal(algorithm.critic(obs), before[1])
 
 

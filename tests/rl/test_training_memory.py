@@ -36,13 +36,13 @@ def test_an_environments_arrays_take_what_is_said(envs):
     assert (many - few) / 32.0 == pytest.approx(STANDING["jumper"], rel=0.05)
 
 
-@pytest.mark.parametrize("asymmetric", [True, False])
-def test_the_rollout_takes_what_is_said(envs, asymmetric):
-    cfg = dataclasses.replace(SMALL, asymmetric=asymmetric)
+@pytest.mark.parametrize("asymmetric_critic", [True, False])
+def test_the_rollout_takes_what_is_said(envs, asymmetric_critic):
+    cfg = dataclasses.replace(SMALL, asymmetric_critic=asymmetric_critic)
     for env, _ in envs:
         ppo = Ppo(env, cfg)
         buffers = sum(x.numel() * x.element_size() for name, x in ppo.rollout._asdict().items() if name != "log_std")
-        critic_obs = env.num_critic_obs if asymmetric else env.num_obs
+        critic_obs = env.num_critic_obs if asymmetric_critic else env.num_obs
         assert buffers == env.num_envs * rollout_bytes(cfg.num_steps, env.num_obs, critic_obs)
         need = learning_need(cfg, env.num_obs, env.num_critic_obs)
         adam = 4 * 4 * sum(p.numel() for p in ppo.model.parameters())  # weight, gradient and two moments

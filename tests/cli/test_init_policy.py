@@ -1,4 +1,4 @@
-"""`jumper train --start-from`."""
+"""`jumper train --init-policy`."""
 
 import json
 
@@ -20,7 +20,7 @@ TRAIN += [part for name in ("lr", "min-lr", "max-lr") for part in (f"--ppo.{name
 def begun(tmp_path_factory):
     """Folder of a training of one iteration without a step that counts, which began with a shipped policy."""
     root = tmp_path_factory.mktemp("logs")
-    cli.main([*TRAIN, "--start-from", "slippery_jump", "--log-root", str(root)])
+    cli.main([*TRAIN, "--init-policy", "slippery_jump", "--log-root", str(root)])
     (folder,) = (root / "horizontal-jump-mars").iterdir()
     return folder
 
@@ -32,41 +32,41 @@ def test_training_begins_with_the_policy(begun):
         torch.testing.assert_close(same_bias, bias, atol=1e-6, rtol=0.0)
     drift = (found.mean - policy.mean).abs() / policy.std
     assert 0.0 < drift.max() < 0.2
-    assert found.config["train"]["start_from"] == "slippery_jump"
+    assert found.config["train"]["init_policy"] == "slippery_jump"
     assert found.config["train"]["ppo"]["init_std"] == 0.3
     log_std = load_checkpoint(begun / "checkpoints" / "iteration_000001.pt")["ppo"]["model"]["log_std"]
     torch.testing.assert_close(log_std.exp(), torch.full((12,), 0.3), atol=1e-6, rtol=0.0)
 
 
 def test_training_begins_with_a_run(begun, tmp_path, capsys):
-    cli.main([*TRAIN, "--start-from", str(begun), "--log-root", str(tmp_path)])
+    cli.main([*TRAIN, "--init-policy", str(begun), "--log-root", str(tmp_path)])
     assert f"starts from {begun}" in capsys.readouterr().err.splitlines()
     (folder,) = (tmp_path / "horizontal-jump-mars").iterdir()
-    assert json.loads((folder / "config.json").read_text())["train"]["start_from"] == str(begun)
+    assert json.loads((folder / "config.json").read_text())["train"]["init_policy"] == str(begun)
 
 
 def test_a_repeated_command_resumes_the_run_that_it_began(tmp_path, capsys):
     told = []
     for iterations in ("1", "2"):
-        flags = ["--start-from", "slippery_jump", "--resume", "latest-or-new", "--iterations", iterations]
+        flags = ["--init-policy", "slippery_jump", "--resume", "latest-or-new", "--iterations", iterations]
         cli.main([*TRAIN, *flags, "--log-root", str(tmp_path)])
         told.append(capsys.readouterr().err)
     (folder,) = (tmp_path / "horizontal-jump-mars").iterdir()
     assert "starts from slippery_jump" in told[0] and "resumed" not in told[0]
     assert f"resumed {folder / 'checkpoints' / 'iteration_000001.pt'}" in told[1] and "starts from" not in told[1]
     config = json.loads((folder / "config.json").read_text())["train"]
-    assert (config["iterations"], config["start_from"]) == (2, "slippery_jump")
+    assert (config["iterations"], config["init_policy"]) == (2, "slippery_jump")
     assert (folder / "checkpoints" / "iteration_000002.pt").is_file()
 
 
 @pytest.mark.parametrize(
     ("more", "message"),
     [
-        (["--start-from", "vertical_jump"], "start_from: observation "),
-        (["--start-from", "slippery_jump", "--ppo.symmetry", "off"], "give --ppo.hidden 512 256 256"),
-        (["--start-from", "no_jump"], "no_jump"),
-        (["--start-from", "slippery_jump", "--resume", "latest"], "not both"),
-        (["--start-from", "slippery_jump", "--trainer", "rsl-rl", "--ppo.symmetry", "off"], "not offered"),
+        (["--init-policy", "vertical_jump"], "init_policy: observation "),
+        (["--init-policy", "slippery_jump", "--ppo.symmetry", "off"], "give --ppo.hidden 512 256 256"),
+        (["--init-policy", "no_jump"], "no_jump"),
+        (["--init-policy", "slippery_jump", "--resume", "latest"], "not both"),
+        (["--init-policy", "slippery_jump", "--trainer", "rsl-rl", "--ppo.symmetry", "off"], "not offered"),
     ],
 )
 def test_what_cannot_be_started_from_is_told_in_one_line(more, message, capsys, tmp_path):
@@ -76,5 +76,5 @@ def test_what_cannot_be_started_from_is_told_in_one_line(more, message, capsys, 
 
 
 def test_command_that_goes_on_does_not_start_again():
-    args = ["push", "--start-from", "pusher", "--seed", "3", "--start_from=x", "--resume", "latest"]
+    args = ["push", "--init-policy", "pusher", "--seed", "3", "--init_policy=x", "--resume", "latest"]
     assert command_line(args, []) == "jumper train push --seed 3"
