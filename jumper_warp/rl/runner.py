@@ -37,11 +37,11 @@ from jumper_warp.rl.resume import (
     changed_files,
     changes,
     find_checkpoint,
+    init_policy_of,
     own_part,
     random_state,
     set_random_state,
     spent_seconds,
-    init_policy_of,
 )
 from jumper_warp.rl.shac import STATISTICS as SHAC_STATISTICS
 from jumper_warp.rl.shac import Shac
