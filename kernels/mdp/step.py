@@ -15,14 +15,9 @@ NOT_TERMINATED = wp.constant(-1)
 
 @wp.func
 def update_curriculum(
-    episode: EpisodeArrays,
-    counters: Counters,
-    world: int,
-    success: bool,
-    error: float,
-    promote_after: float,
+    episode: EpisodeArrays, counters: Counters, world: int, success: bool, error: float, promote_after: float,
     num_levels: int,
-):
+):  # fmt: skip
     """Take an ended episode into the curriculum: successes in a row raise the world's level."""
     streak = wp.where(success, episode.streak[world] + 1, 0)
     if streak >= int(promote_after):
@@ -37,14 +32,9 @@ def update_curriculum(
 
 @wp.func
 def write_step_result(
-    episode: EpisodeArrays,
-    counters: Counters,
-    world: int,
-    total: float,
-    termination: int,
-    timeout: float,
+    episode: EpisodeArrays, counters: Counters, world: int, total: float, termination: int, timeout: float,
     diverged: bool,
-):
+):  # fmt: skip
     """Write how a policy step of a world ended."""
     episode.reward[world] = total
     episode.termination[world] = termination

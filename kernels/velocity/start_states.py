@@ -139,13 +139,9 @@ def sample_leg(start: VelocityStart, base: VelocityBase, geo: LegGeometry, rng: 
 
 @wp.func
 def write_start(
-    arrays: RobotArrays,
-    scene: Scene,
-    skill: SkillSettings,
-    settings: VelocitySettings,
-    terrain_level: int,
+    arrays: RobotArrays, scene: Scene, skill: SkillSettings, settings: VelocitySettings, terrain_level: int,
     rng: RngStream,
-):
+):  # fmt: skip
     """Write a start state to a world: a sampled one, or in a share of draws the default pose."""
     world = rng.world
     start = VelocityStart()

@@ -78,7 +78,7 @@ def functions(module, names: str) -> list[wp.Function]:
 def make_view(**fields) -> RobotView:
     """Return a robot at rest in the default pose, 0.4 m high; vectors of 12 may be any sequence."""
     view = RobotView()
-    view.pos, view.quat, view.gravity = wp.vec3(0.0, 0.0, 0.4), wp.quat_identity(), wp.vec3(0.0, 0.0, -1.0)
+    view.pos, view.quat, view.projected_gravity = wp.vec3(0.0, 0.0, 0.4), wp.quat_identity(), wp.vec3(0.0, 0.0, -1.0)
     view.angle = view.default_angle = vec12(*DEFAULT_ANGLE)
     view.gravity_magnitude = 9.81
     for name, value in fields.items():
