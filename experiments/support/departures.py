@@ -52,14 +52,14 @@ def alike_all_around(task: TaskCfg) -> TaskCfg:
     levels = list(task.levels)
     for i, level in enumerate(levels):
         reach = level.goal_upper[0]
-        if level.round:
+        if level.elliptical:
             levels[i] = replace(level, goal_lower=(-reach, -reach, 0.0), goal_upper=(reach, reach, 0.0))
     return replace(task, levels=tuple(levels))
 
 
 def without_another_goal(task: TaskCfg) -> TaskCfg:
     """Return the task in which no landed robot gets another goal."""
-    return replace(task, levels=tuple(replace(level, jump_again=0.0) for level in task.levels))
+    return replace(task, levels=tuple(replace(level, next_jump_probability=0.0) for level in task.levels))
 
 
 DEPARTURES: dict[str, dict[str, Undone]] = {
@@ -73,9 +73,9 @@ DEPARTURES: dict[str, dict[str, Undone]] = {
         ),
         "changes_of_the_action": "--env.rewards.action-rate.weight -0.1",
         "one_step_seen": "--history 1",
-        "links_may_come_near": "--env.link-margin 0",
-        "shares_of_resets": "--env.reset.shares-of resets",
-        "none_pushing_off": "--env.reset.pushing 0 --env.reset.standing 0.6",
+        "links_may_come_near": "--env.self-collision-margin 0",
+        "shares_of_resets": "--env.reset.balance-by resets",
+        "none_pushing_off": "--env.reset.start-probability.pushing 0 --env.reset.start-probability.standing 0.6",
         "promoted_after_one": "--env.curriculum.promote-after 1",
         "tolerance_of_levels": "--env.curriculum.tolerance 0.1",
         "jumping_early": may_jump_early,

@@ -95,8 +95,9 @@ class TaskRuntime:
         settings.command_filter = filter_params(self.task.command_filter)
         settings.contact_force = self.task.contact_force
         settings.push_in_flight = int(self.task.randomization.push_in_flight)
-        settings.lift, settings.link_margin = self.task.lift, self.task.link_margin
-        settings.block_margin = self.task.block_margin
+        settings.eval_height_offset = self.task.eval_height_offset
+        settings.self_collision_margin = self.task.self_collision_margin
+        settings.obstacle_margin = self.task.obstacle_margin
         return settings
 
     def set(self, section: str, name: str, **numbers: float) -> None:

@@ -44,7 +44,7 @@ SECTIONS = ("schema", "source", "values", "randomization")
 RANDOMIZED = (
     "static_friction", "dynamic_friction", "base_mass", "link_mass", "com_shift", "gains", "damping_gains",
     "no_load_speed", "cutoff_speed", "motor_friction", "armature", "joint_offset", "latency", "observation_latency",
-    "force", "torque", "push_interval",
+    "push_force", "push_torque", "push_interval",
 )  # fmt: skip
 """Ranges that may be given: the rows of `RandomizationCfg`."""
 

@@ -92,13 +92,13 @@ class TaskCfg:
     """[m/s^2] Downward, of every world; all estimates of flights take it from there."""
     keep_momentum: bool = False
     """Whether robots in free flight keep their momentum exactly, as in `Simulation`."""
-    lift: float = 0.0
+    eval_height_offset: float = 0.0
     """[m] Above standing, at which robots begin whose policy is measured."""
     contact_force: float = 0.1
     """[N] Above it a paw counts as in contact."""
-    link_margin: float = 0.0
+    self_collision_margin: float = 0.0
     """[m] Links closer to one another than this count as touching, in training; in tests of policies links touch."""
-    block_margin: float = 0.0
+    obstacle_margin: float = 0.0
     """[m] By which blocks are wider and higher for links that must not touch them, in training, not in tests either."""
     reward_floor: float | None = 0.0
     """Least total reward of a step; None: no floor."""
@@ -130,16 +130,17 @@ class TaskCfg:
             for field_name in {metric.field, metric.per or metric.field} - set(self.state.vars):
                 raise InputError(f"{self.name}: metric {metric.name} needs {field_name!r}, which its state has not")
         check_gravity(self.gravity)
-        for name in ("lift", "contact_force", "block_margin"):
+        for name in ("eval_height_offset", "contact_force", "obstacle_margin"):
             check_not_negative(f"{self.name}: {name}", getattr(self, name))
-        if not 0.0 <= self.link_margin <= MIN_LINK_DISTANCE:
-            raise InputError(f"{self.name}: link_margin must be in [0, {MIN_LINK_DISTANCE:g}], got {self.link_margin}")
+        if not 0.0 <= self.self_collision_margin <= MIN_LINK_DISTANCE:
+            limits = f"[0, {MIN_LINK_DISTANCE:g}], got {self.self_collision_margin}"
+            raise InputError(f"{self.name}: self_collision_margin must be in {limits}")
         if self.reward_floor is not None and not math.isfinite(self.reward_floor):
             raise InputError(f"{self.name}: reward_floor must be finite or None, got {self.reward_floor}")
 
     def without_margins(self) -> TaskCfg:
         """Return the task as policies are tested on it: links touch where they do."""
-        return replace(self, link_margin=0.0, block_margin=0.0)
+        return replace(self, self_collision_margin=0.0, obstacle_margin=0.0)
 
     def _check_functions(self) -> None:
         """Raises ValueError: a function outside the tables takes other structs than those of this task."""

@@ -10,7 +10,7 @@ from typing import Any, Literal
 from jumper_warp.kernels.mdp import parameters
 from jumper_warp.robot.description import load_description
 from jumper_warp.tasks.terms import EventTerm
-from jumper_warp.utils.checks import check_finite, check_shares
+from jumper_warp.utils.checks import check_finite, check_probabilities
 from jumper_warp.utils.errors import InputError
 
 Range = tuple[float, float] | None
@@ -22,8 +22,8 @@ LONGEST_LATENCY = 100.0
 """[ms] What the ring of past targets and observations holds: 48 physics steps, six policy steps."""
 PUSH_INTERVAL = (0.2, 0.5)
 """[s] After which a push comes, stays or goes (authors' configuration)."""
-PUSH_SHARE = 0.25
-"""[1] Share of these intervals in which there is a push (authors' configuration)."""
+PUSH_PROBABILITY = 0.25
+"""[1] That there is a push in such an interval (authors' configuration)."""
 
 
 @cache
@@ -76,23 +76,23 @@ class RandomizationCfg:
     """[ms] From action to motor, rounded to the nearest physics step."""
     observation_latency: Range = None
     """[ms] From sensor to policy, rounded to the nearest physics step."""
-    no_latency: float = 0.0
-    """[1] Share of draws of either latency that give none. Else no latency on both sides, the nominal case, has next to
-    no weight in training, and a policy may chatter there."""
-    force: Range = (-5.0, 5.0)
+    zero_latency_probability: float = 0.0
+    """[1] Of no latency, for either of the two. Else the nominal case has next to no weight in training, and a policy
+    may chatter there."""
+    push_force: Range = (-5.0, 5.0)
     """[N] On the base, along each world axis, while a paw is on the ground."""
-    torque: Range = (-3.0, 3.0)
+    push_torque: Range = (-3.0, 3.0)
     """[N m] On the base, about each world axis, while a paw is on the ground."""
     push_interval: Range = PUSH_INTERVAL
     """[s] Between two draws of the push; None: one for the whole episode."""
-    push_share: float = PUSH_SHARE
-    """[1] Share of the intervals in which there is a push."""
+    push_probability: float = PUSH_PROBABILITY
+    """[1] That there is a push in an interval."""
     push_in_flight: bool = False
     """Whether pushes act in the air too."""
     damping_gains: Range = None
     """[1] Scales kd of each motor; None: drawn from `gains`."""
-    redraw: Literal["startup", "reset"] = "reset"
-    """When all but the pushes is drawn: once, or at every reset of a world."""
+    resample_at: Literal["startup", "reset"] = "reset"
+    """When all but the pushes is sampled: once, or at every reset of a world."""
 
     def __post_init__(self) -> None:
         """Raises ValueError: a range falls, is not finite, or reaches what no robot can have."""
@@ -110,18 +110,18 @@ class RandomizationCfg:
             value = getattr(self, name)
             if value is not None and not 0.0 <= value[0] <= value[1] <= LONGEST_LATENCY:
                 raise InputError(f"randomisation range {name} must be in 0 to {LONGEST_LATENCY:g} ms, got {value}")
-        check_shares("randomisation", push_share=self.push_share, no_latency=self.no_latency)
+        check_probabilities("randomisation", self, "push_probability", "zero_latency_probability")
 
     @classmethod
     def off(cls) -> RandomizationCfg:
         """Return a configuration with every row off."""
         rows = [name for name, field in cls.__dataclass_fields__.items() if "Range" in str(field.type)]
         off: dict[str, Any] = dict.fromkeys(rows)
-        return cls(**off, push_share=1.0)
+        return cls(**off, push_probability=1.0)
 
     @classmethod
     def walking(cls) -> RandomizationCfg:
-        """Return the paper's ranges for walking, and either latency left out in a share of worlds."""
+        """Return the paper's ranges for walking, and no latency with probability 0.2."""
         return cls(
             static_friction=(0.8, 0.95),
             dynamic_friction=(0.7, 0.8),
@@ -130,8 +130,8 @@ class RandomizationCfg:
             motor_friction=(0.0, 0.04),
             latency=(0.0, 32.0),
             observation_latency=(0.0, 32.0),
-            no_latency=0.2,
-            force=(-10.0, 10.0),
+            zero_latency_probability=0.2,
+            push_force=(-10.0, 10.0),
             push_in_flight=True,
         )
 
@@ -142,8 +142,8 @@ class RandomizationCfg:
 
     def in_tests(self) -> RandomizationCfg:
         """Return the same ranges, drawn at every reset, with pushes that come and go, however the training had it."""
-        timing = {} if self.push_interval else {"push_interval": PUSH_INTERVAL, "push_share": PUSH_SHARE}
-        return replace(self, redraw="reset", **timing)
+        timing = {} if self.push_interval else {"push_interval": PUSH_INTERVAL, "push_probability": PUSH_PROBABILITY}
+        return replace(self, resample_at="reset", **timing)
 
     def with_fixed(
         self, *, latency: float | None = None, gains: tuple[float, float] | None = None, friction: float | None = None
@@ -164,7 +164,7 @@ class RandomizationCfg:
         def add(func: Any, pair: Range, scale: float = 1.0, spread: bool = False, **more: float) -> None:
             if pair is not None:
                 ends = {"lower": scale * pair[0], "upper": scale * pair[1]}
-                found.append(EventTerm(func, mode=self.redraw, spread=spread, **ends, **more))
+                found.append(EventTerm(func, mode=self.resample_at, spread=spread, **ends, **more))
 
         add(parameters.base_mass, self.base_mass)
         add(parameters.link_mass, self.link_mass, spread=True)
@@ -175,13 +175,13 @@ class RandomizationCfg:
             kp = self.gains or (1.0, 1.0)
             kd = self.damping_gains or kp
             found.append(
-                EventTerm(parameters.gains, mode=self.redraw, spread=True, kp_lower=kp[0], kp_upper=kp[1],
+                EventTerm(parameters.gains, mode=self.resample_at, spread=True, kp_lower=kp[0], kp_upper=kp[1],
                           kd_lower=kd[0], kd_upper=kd[1])
             )  # fmt: skip
         if self.no_load_speed or self.cutoff_speed:
             low, high = self.no_load_speed or (1.0, 1.0), self.cutoff_speed or (1.0, 1.0)
             found.append(
-                EventTerm(parameters.speed_limits, mode=self.redraw, spread=True, no_load_lower=low[0],
+                EventTerm(parameters.speed_limits, mode=self.resample_at, spread=True, no_load_lower=low[0],
                           no_load_upper=low[1], cutoff_lower=high[0], cutoff_upper=high[1])
             )  # fmt: skip
         add(parameters.joint_offset, self.joint_offset, math.pi / 180.0, spread=True)
@@ -189,18 +189,19 @@ class RandomizationCfg:
             dynamic = self.dynamic_friction or (NOMINAL_FRICTION, NOMINAL_FRICTION)
             static = self.static_friction or (0.0, 0.0)  # not below the dynamic one
             found.append(
-                EventTerm(parameters.friction, mode=self.redraw, dynamic_lower=dynamic[0], dynamic_upper=dynamic[1],
-                          static_lower=static[0], static_upper=static[1])
+                EventTerm(parameters.friction, mode=self.resample_at, dynamic_lower=dynamic[0],
+                          dynamic_upper=dynamic[1], static_lower=static[0], static_upper=static[1])
             )  # fmt: skip
-        add(parameters.action_latency, self.latency, 1.0e-3, zero_probability=self.no_latency)
-        add(parameters.observation_latency, self.observation_latency, 1.0e-3, zero_probability=self.no_latency)
-        if self.force or self.torque:
-            force, torque = self.force or (0.0, 0.0), self.torque or (0.0, 0.0)
+        zero = self.zero_latency_probability
+        add(parameters.action_latency, self.latency, 1.0e-3, zero_probability=zero)
+        add(parameters.observation_latency, self.observation_latency, 1.0e-3, zero_probability=zero)
+        if self.push_force or self.push_torque:
+            force, torque = self.push_force or (0.0, 0.0), self.push_torque or (0.0, 0.0)
             timing: dict[str, Any] = {"mode": "reset", "repack": False}
             if self.push_interval is not None:
                 timing |= {"mode": "interval", "least": self.push_interval[0], "most": self.push_interval[1]}
             found.append(
-                EventTerm(parameters.push, **timing, probability=self.push_share, force_lower=force[0],
+                EventTerm(parameters.push, **timing, probability=self.push_probability, force_lower=force[0],
                           force_upper=force[1], torque_lower=torque[0], torque_upper=torque[1])
             )  # fmt: skip
         return tuple(found)

@@ -56,10 +56,12 @@ def flight_skills(jump: TaskCfg, turning: TaskCfg) -> tuple[list[TaskCfg], list[
     for task, state in ((jump, JumpState), (turning, AttitudeState)):
         if task.state is not state:
             raise InputError(f"turning in flight needs a task of {state.key} here, got {task.name}")
-    randomization = replace(jump.randomization, redraw="reset")
+    randomization = replace(jump.randomization, resample_at="reset")
     jump, turning = (
         for_switching(
-            replace(task, gravity=jump.gravity, lift=jump.lift, keep_momentum=True), randomization, FALLS_FROM_FLIGHT
+            replace(task, gravity=jump.gravity, eval_height_offset=jump.eval_height_offset, keep_momentum=True),
+            randomization,
+            FALLS_FROM_FLIGHT,
         )
         for task in (jump, turning)
     )
@@ -78,7 +80,7 @@ def skills_and_handovers(walking: TaskCfg, jumps: tuple[TaskCfg, ...]) -> tuple[
     for task, state in ((walking, VelocityState), *((jump, JumpState) for jump in jumps)):
         if task.state is not state:
             raise InputError(f"switching needs a task of {state.key} here, got {task.name}")
-    randomization = replace((jumps[-1] if jumps else walking).randomization, redraw="reset")
+    randomization = replace((jumps[-1] if jumps else walking).randomization, resample_at="reset")
     walk = for_switching(walking, randomization)
     tasks, found = [walk], []
     for jump in jumps:

@@ -47,11 +47,11 @@ def check_within(name: str, values: np.ndarray, bounds: tuple[float, float]) -> 
         raise InputError(f"{name} must be in [{bounds[0]:g}, {bounds[1]:g}], got {values[outside][0]:g}")
 
 
-def check_shares(what: str, **shares: float) -> None:
-    """Raises ValueError: one of the shares is not in 0 to 1."""
-    for name, share in shares.items():
-        if not 0.0 <= share <= 1.0:
-            raise InputError(f"{what} {name} must be in [0, 1], got {share}")
+def check_probabilities(what: str, cfg: Any, *names: str) -> None:
+    """Raises ValueError: one of these fields of a configuration is not in 0 to 1."""
+    for name in names:
+        if not 0.0 <= (value := getattr(cfg, name)) <= 1.0:
+            raise InputError(f"{what} {name} must be in [0, 1], got {value}")
 
 
 def check_count(name: str, value: Any) -> None:

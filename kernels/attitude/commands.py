@@ -16,7 +16,7 @@ class TurnRanges:
     """Ranges of drawn turns."""
 
     angle: wp.vec2  # [rad] smallest and largest
-    axis_share: float  # share of turns about x, y or z of the body; the others are about any axis
+    body_axis_probability: float  # of a turn about x, y or z of the body; the others are about any axis
 
 
 @wp.func
@@ -31,10 +31,10 @@ def sample_unit_quat(rng: RngStream) -> wp.quat:
 
 
 @wp.func
-def sample_axis(rng: RngStream, axis_share: float) -> wp.vec3:
+def sample_axis(rng: RngStream, body_axis_probability: float) -> wp.vec3:
     """Return a unit vector: one of the body's axes in a share of draws, else any, uniform over the sphere."""
     sign = wp.where(uniform(rng, streams.SIGN, 0.0, 1.0) < 0.5, -1.0, 1.0)
-    if uniform(rng, streams.ALONG_BODY, 0.0, 1.0) < axis_share:
+    if uniform(rng, streams.ALONG_BODY, 0.0, 1.0) < body_axis_probability:
         axis = wp.vec3(0.0)
         axis[wp.min(int(uniform(rng, streams.BODY_AXIS, 0.0, 3.0)), 2)] = sign
         return axis
@@ -47,7 +47,7 @@ def sample_axis(rng: RngStream, axis_share: float) -> wp.vec3:
 @wp.func
 def sample_rotation(rng: RngStream, ranges: TurnRanges) -> wp.quat:
     """Return a drawn turn (xyzw), body axes."""
-    axis = sample_axis(fold_in(rng, streams.AXIS_BRANCH), ranges.axis_share)
+    axis = sample_axis(fold_in(rng, streams.AXIS_BRANCH), ranges.body_axis_probability)
     return wp.quat_from_axis_angle(axis, uniform_range(rng, streams.ANGLE, ranges.angle))
 
 

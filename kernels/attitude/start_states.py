@@ -23,7 +23,7 @@ class AttitudeSettings:
 
     episode_steps: wp.vec2  # policy steps that an episode lasts
     height: float  # [m] of the base above the ground
-    default_share: float  # share of episodes that begin in the default pose
+    default_pose_probability: float  # of a start in the default pose
     lateral: wp.vec2  # [rad] of drawn legs
     transversal: wp.vec2  # [rad]
     spin: float  # [rad/s] half width of the angular velocity about each axis
@@ -87,7 +87,7 @@ def write_start(
         uniform(rng, streams.SPIN + 2, -w, w),
     )
     start.com_vel = wp.cross(start.ang_vel, wp.quat_rotate(quat, arrays.body_com[rng.world * BODIES]))
-    start.default_legs = uniform(rng, streams.DEFAULT_LEGS, 0.0, 1.0) < settings.default_share
+    start.default_legs = uniform(rng, streams.DEFAULT_LEGS, 0.0, 1.0) < settings.default_pose_probability
     start.default_angle = arrays.default_angle
     start.settings = settings
     start.limits = leg_limits(skill.command_filter)

@@ -42,8 +42,8 @@ class JumpLevel:
     goal_lower: wp.vec3  # [m] relative to start and heading: landing x, y, and base height at the apex (0: any)
     goal_upper: wp.vec3
     base_height: wp.vec2  # [m] of standing starts
-    jump_again: float  # share of landed robots that get another goal
-    round: int  # 1: goals are drawn from the ellipse inside the box
+    next_jump_probability: float  # of another goal for a landed robot
+    elliptical: int  # 1: goals are drawn from the ellipse inside the box
 
 
 @wp.func
@@ -68,7 +68,7 @@ def sample_goal(rng: RngStream, level: JumpLevel) -> wp.vec3:
         uniform(rng, streams.GOAL + 1, lower[1], upper[1]),
         uniform(rng, streams.GOAL + 2, lower[2], upper[2]),
     )
-    if level.round != 0:
+    if level.elliptical != 0:
         goal = project_to_ellipse(goal, lower, upper)
     return goal
 
@@ -87,7 +87,7 @@ def sample_next_jump_step(rng: RngStream, delay: wp.vec2, share: float) -> int:
 def sample_command_step(rng: RngStream, ranges: ResetRanges) -> int:
     """Return at which policy step the jump is commanded: uniform, a share of the draws in the longer of two ranges."""
     u = uniform(rng, streams.COMMAND_STEP, 0.0, 1.0)
-    share = ranges.long_wait_share
+    share = ranges.long_wait_probability
     soon = (u - share) / wp.max(1.0 - share, 1.0e-6) * (float(ranges.command_delay) + 0.999)
     later = u / wp.max(share, 1.0e-6) * (float(ranges.long_wait) + 0.999)
     return int(wp.where(u < share, later, soon))
@@ -95,8 +95,9 @@ def sample_command_step(rng: RngStream, ranges: ResetRanges) -> int:
 
 @wp.func
 def begin_jump(
-    rng: RngStream, ranges: ResetRanges, start_mode: int, goal: wp.vec3, pos: wp.vec3, vz: float, jump_again: float
-) -> JumpState:
+    rng: RngStream, ranges: ResetRanges, start_mode: int, goal: wp.vec3, pos: wp.vec3, vz: float,
+    next_jump_probability: float,
+) -> JumpState:  # fmt: skip
     """Return the state of a new episode that begins with a scheme at a base position [m] and upward speed [m/s]."""
     state = JumpState()
     state.start_mode = start_mode
@@ -104,8 +105,8 @@ def begin_jump(
     state.start = pos
     state.max_height = pos[2]
     state.command_step = sample_command_step(rng, ranges)
-    state.again_delay = ranges.again_delay
-    state.next_jump_step = sample_next_jump_step(rng, ranges.again_delay, jump_again)
+    state.next_jump_delay = ranges.next_jump_delay
+    state.next_jump_step = sample_next_jump_step(rng, ranges.next_jump_delay, next_jump_probability)
     if start_mode == PUSHING or (start_mode == STANDING and ranges.lean > 0.0):
         state.start = wp.vec3(0.0, 0.0, pos[2])
     if start_mode == PUSHING:
@@ -179,7 +180,7 @@ def reset_jump(
     start.ground = place_ground(scene.ground, start, settings.grounds, rng)
     start_mode = write_start(arrays, scene, start, rng)
     vz = arrays.joint_qd[world * DOFS + 2]
-    state = begin_jump(rng, ranges, start_mode, start.goal, base_pos(arrays, world), vz, level.jump_again)
+    state = begin_jump(rng, ranges, start_mode, start.goal, base_pos(arrays, world), vz, level.next_jump_probability)
     state.heading = start.heading
     state.steps_per_mode = steps_per_mode
     state.goal_ground = surface(start.ground, start.goal[0], start.goal[1])[0]
@@ -197,7 +198,7 @@ def resample_jump(robot: RobotView, scene: Scene, state: JumpState, level: JumpL
     """Return the state of an episode that goes on with another jump, to a drawn goal."""
     goal = sample_goal(rng, level)
     new = begin_next_jump(state, world_ground(scene.ground, robot.world), goal, robot.pos, yaw_of(robot.quat))
-    new.next_jump_step = sample_next_jump_step(rng, state.again_delay, level.jump_again)
+    new.next_jump_step = sample_next_jump_step(rng, state.next_jump_delay, level.next_jump_probability)
     return new
 
 

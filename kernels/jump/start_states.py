@@ -1,4 +1,4 @@
-"""Start states of a jump (paper, Section V-D: reference state initialisation), one function a scheme.
+"""Start states of a jump (paper, Section V-D: reference state initialisation), one function a start mode.
 
 Standing or squatting on given paw positions, the default pose, pushing off, in flight on a projectile to the goal, just
 before touchdown, and just landed. The default pose stands in after the last attempt.
@@ -38,8 +38,8 @@ PUSHING = wp.constant(5)
 class ResetRanges:
     """Ranges of the drawn states; pairs are (lower, upper), angles [rad], lengths [m]."""
 
-    shares: vec_start_modes  # of standing, default, in flight, touchdown, just landed, pushing off
-    of_time: int  # 1: shares are of the time that a world spends in episodes, 0: of its resets
+    start_probability: vec_start_modes  # of standing, default, in flight, touchdown, just landed, pushing off
+    by_steps: int  # 1: probabilities are of a world's policy steps, 0: of its resets
     base_xy: float  # half width
     tilt: float  # half width of roll, pitch; of yaw too around the heading
     forward_pitch: float  # largest mean pitch of standing states
@@ -67,9 +67,9 @@ class ResetRanges:
     landed_ahead: wp.vec2  # base ahead of the goal
     landed_speed: wp.vec2  # [m/s] downward
     command_delay: int  # most policy steps until the jump is commanded
-    long_wait_share: float  # of the draws in which it may be `long_wait`
+    long_wait_probability: float  # of the draws in which it may be `long_wait`
     long_wait: int
-    again_delay: wp.vec2  # policy steps after touchdown
+    next_jump_delay: wp.vec2  # policy steps after touchdown
 
 
 @wp.struct
@@ -100,28 +100,28 @@ class JumpBase:
 
 
 @wp.func
-def start_mode_at(shares: vec_start_modes, u: float) -> int:
-    """Return the scheme at u in [0, 1) of the shares one after the other."""
+def start_mode_at(probability: vec_start_modes, u: float) -> int:
+    """Return the start mode at u in [0, 1) of the cumulated probabilities."""
     start_mode = int(0)
     rest = u
     for i in range(NUM_START_MODES):
-        if rest >= 0.0 and shares[i] > 0.0:
+        if rest >= 0.0 and probability[i] > 0.0:
             start_mode = i
-        rest -= shares[i]
+        rest -= probability[i]
     return start_mode
 
 
 @wp.func
-def least_sampled_mode(shares: vec_start_modes, steps_per_mode: vec_start_modes) -> int:
-    """Return the scheme that is farthest behind its share of what was spent, in policy steps."""
+def least_sampled_mode(probability: vec_start_modes, steps_per_mode: vec_start_modes) -> int:
+    """Return the start mode whose policy steps are farthest behind its probability."""
     total = float(0.0)
     for i in range(NUM_START_MODES):
         total += steps_per_mode[i]
     start_mode = int(0)
     most = float(-3.0e38)
     for i in range(NUM_START_MODES):
-        lack = shares[i] * total - steps_per_mode[i]
-        if shares[i] > 0.0 and lack > most:
+        lack = probability[i] * total - steps_per_mode[i]
+        if probability[i] > 0.0 and lack > most:
             start_mode = i
             most = lack
     return start_mode
@@ -129,10 +129,10 @@ def least_sampled_mode(shares: vec_start_modes, steps_per_mode: vec_start_modes)
 
 @wp.func
 def sample_start_mode(rng: RngStream, ranges: ResetRanges, steps_per_mode: vec_start_modes) -> int:
-    """Return the scheme of a new episode; shares of time are drawn once, and then what lacks most comes next."""
-    if ranges.of_time != 0 and wp.length_sq(steps_per_mode) > 0.0:
-        return least_sampled_mode(ranges.shares, steps_per_mode)
-    return start_mode_at(ranges.shares, uniform(rng, streams.START_MODE, 0.0, 1.0))
+    """Return the start mode of a new episode; by steps, the one that is farthest behind after the first."""
+    if ranges.by_steps != 0 and wp.length_sq(steps_per_mode) > 0.0:
+        return least_sampled_mode(ranges.start_probability, steps_per_mode)
+    return start_mode_at(ranges.start_probability, uniform(rng, streams.START_MODE, 0.0, 1.0))
 
 
 @wp.func
@@ -252,7 +252,7 @@ def pushing_off(start: JumpStart, takeoff: JumpBase, rng: RngStream) -> JumpBase
 
 @wp.func
 def sample_base(start: JumpStart, arrays: RobotArrays, rng: RngStream, attempt: int) -> JumpBase:
-    """Return the base of the start's scheme in an attempt."""
+    """Return the base of the start mode in an attempt."""
     base = JumpBase()
     if start.start_mode == STANDING:
         base = standing(start, rng)
@@ -316,7 +316,7 @@ def sample_leg(start: JumpStart, base: JumpBase, geo: LegGeometry, rng: RngStrea
 
 @wp.func
 def write_start(arrays: RobotArrays, scene: Scene, start: JumpStart, rng: RngStream) -> int:
-    """Write a start state to a world, and return its scheme: `DEFAULT` where no attempt was valid too."""
+    """Write a start state to a world, and return its start mode: `DEFAULT` where no attempt was valid too."""
     if start.start_mode != DEFAULT:
         if sample_valid_state(sample_base, sample_leg, start, arrays, scene, rng):
             return start.start_mode

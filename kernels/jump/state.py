@@ -35,7 +35,7 @@ class JumpState:
     peak_tilt: float  # [rad] largest between body and world z since touchdown
     start_mode: int  # reset scheme that began the episode
     next_jump_step: int  # policy steps after touchdown at which another goal comes, 0: never
-    again_delay: wp.vec2  # policy steps between which that of yet another goal is drawn
+    next_jump_delay: wp.vec2  # policy steps between which that of yet another goal is drawn
     jumps: int  # jumps that were followed by another in this episode
     paws_landed: int  # bits of the paws that have come down since touchdown
     steps_per_mode: vec_start_modes  # policy steps that the world has spent in episodes of each scheme, before this one

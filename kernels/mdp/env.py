@@ -75,9 +75,9 @@ class SkillSettings:
     command_filter: FilterParams
     contact_force: float  # [N] above it a paw is in contact
     push_in_flight: int  # 1: pushes act in the air too
-    lift: float  # [m] above standing, at which robots begin whose policy is measured
-    link_margin: float  # [m] links closer to one another than this count as touching
-    block_margin: float  # [m] by which blocks are wider and higher for what must not touch them
+    eval_height_offset: float  # [m] above standing, at which robots begin whose policy is measured
+    self_collision_margin: float  # [m] links closer to one another than this count as touching
+    obstacle_margin: float  # [m] by which blocks are wider and higher for what must not touch them
 
 
 @wp.struct

@@ -170,8 +170,8 @@ def default_pose_kernel(
     world = wp.tid()
     if mask[world] != 0.0:
         rest_block(scene.ground, world)
-        ground_height = surface(world_ground(scene.ground, world), 0.0, 0.0)[0] + skills[skill[world]].lift
-        write_default_pose(arrays, scene, world, headings[world], ground_height)
+        height = surface(world_ground(scene.ground, world), 0.0, 0.0)[0] + skills[skill[world]].eval_height_offset
+        write_default_pose(arrays, scene, world, headings[world], height)
 
 
 @wp.kernel

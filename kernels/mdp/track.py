@@ -71,7 +71,7 @@ def track_kernel(
     update_contact_timers(arrays, world, leg, down)  # before the velocity of the step before is written over
     update_paw_kinematics(arrays, geometry[leg], world, leg)
     arrays.paw_height[leg, world] = paw_clearance(arrays, geometry[leg], ground, world, leg)
-    here = grown_block(world_ground(ground, world), skill.block_margin)
+    here = grown_block(world_ground(ground, world), skill.obstacle_margin)
     arrays.collisions[leg, world] = leg_collisions(
-        geometry, here, arrays.joint_q, world * COORDS, leg, skill.link_margin
+        geometry, here, arrays.joint_q, world * COORDS, leg, skill.self_collision_margin
     )

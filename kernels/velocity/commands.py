@@ -17,22 +17,22 @@ LEAST = wp.constant(0.05)  # [m/s], [rad/s] a command that is smaller in all thr
 class CommandRanges:
     """Ranges of drawn commands; reaches are (ahead, back, to either side [m/s], turning [rad/s])."""
 
-    narrow: wp.vec4  # reach at the first level
-    wide: wp.vec4  # reach at the last level
+    first_range: wp.vec4  # reach at the first level
+    last_range: wp.vec4  # reach at the last level
     levels: int  # from the first to the last
-    narrow_share: float  # share of commands of the first level on all others
-    stand: float  # share of commands to stand
-    turn: float  # share of commands to turn on the spot
-    lasts: wp.vec2  # [policy steps] from command to command
+    first_range_probability: float  # of a command of the first level on all others
+    standing_probability: float  # of the command to stand
+    turn_in_place_probability: float  # of a command to turn on the spot
+    resampling_time_range: wp.vec2  # [policy steps] from command to command
 
 
 @wp.func
 def reach_of(ranges: CommandRanges, level: int) -> wp.vec4:
     """Return the reach at a level."""
     if ranges.levels == 0:
-        return ranges.narrow
+        return ranges.first_range
     share = float(wp.min(level, ranges.levels)) / float(ranges.levels)
-    return ranges.narrow + share * (ranges.wide - ranges.narrow)
+    return ranges.first_range + share * (ranges.last_range - ranges.first_range)
 
 
 @wp.func
@@ -43,20 +43,20 @@ def sample_velocity_command(rng: RngStream, ranges: CommandRanges, level: int) -
     between the largest reach along x and those of the level across it.
     """
     kind = uniform(rng, streams.KIND, 0.0, 1.0)
-    if kind < ranges.stand:
+    if kind < ranges.standing_probability:
         return wp.vec3(0.0)
     reach = reach_of(ranges, level)
-    easy = level == 0 or uniform(rng, streams.NARROW, 0.0, 1.0) < ranges.narrow_share
+    easy = level == 0 or uniform(rng, streams.NARROW, 0.0, 1.0) < ranges.first_range_probability
     if easy:
-        reach = ranges.narrow
+        reach = ranges.first_range
     spin = uniform(rng, streams.TURN, -reach[3], reach[3])
-    if kind < ranges.stand + ranges.turn:
+    if kind < ranges.standing_probability + ranges.turn_in_place_probability:
         return wp.vec3(0.0, 0.0, spin)
     ahead = uniform(rng, streams.AHEAD, -reach[1], reach[0])
     side = uniform(rng, streams.SIDE, -reach[2], reach[2])
     if easy:
         return wp.vec3(ahead, side, spin)
-    share = ahead / wp.where(ahead > 0.0, ranges.wide[0], ranges.wide[1])
+    share = ahead / wp.where(ahead > 0.0, ranges.last_range[0], ranges.last_range[1])
     left = wp.sqrt(wp.max(1.0 - share * share, 0.04))
     return wp.vec3(ahead, left * side, left * spin)
 
@@ -85,7 +85,7 @@ def resample_velocity(
 ) -> VelocityState:
     """Return the state of an episode that goes on with a drawn command."""
     new = with_command(state, sample_velocity_command(rng, level, state.command_level))
-    new.command_lasts = wp.max(int(uniform_range(rng, streams.LASTS, level.lasts)), 1)
+    new.command_lasts = wp.max(int(uniform_range(rng, streams.LASTS, level.resampling_time_range)), 1)
     return new
 
 

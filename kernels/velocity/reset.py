@@ -72,5 +72,5 @@ def reset_velocity(
     new.phase = uniform(rng, streams.GAIT_PHASE, 0.0, 1.0)
     new.limit = map_limit(settings.map)
     new = with_command(new, sample_velocity_command(rng, level, new.command_level))
-    new.command_lasts = wp.max(int(uniform_range(rng, streams.LASTS, level.lasts)), 1)
+    new.command_lasts = wp.max(int(uniform_range(rng, streams.LASTS, level.resampling_time_range)), 1)
     return new

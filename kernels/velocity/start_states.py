@@ -36,7 +36,7 @@ class VelocitySettings:
     map: Map
     episode_steps: int  # policy steps that an episode lasts
     pace: float  # cycles of the gait in a policy step, 0: no clock
-    default_share: float  # share of episodes that begin in the default pose at rest
+    default_pose_probability: float  # of a start in the default pose at rest
     base_xy: float  # [m] half width
     height: wp.vec2  # [m] of the base above the ground
     tilt: float  # [rad] half width of roll and pitch
@@ -45,8 +45,8 @@ class VelocitySettings:
     front_y: wp.vec2
     back_x: wp.vec2
     back_y: wp.vec2
-    lift: float  # [m] most of the paws in the air
-    lifted_share: float  # share of paws in the air
+    max_swing_height: float  # [m] greatest of the paws in the air
+    swing_probability: float  # of a paw being in the air
     lin_vel: float  # [m/s] half width of the base's velocity along each axis
     ang_vel: float  # [rad/s] half width of its angular velocity about each axis
     tolerance: float  # [m/s] mean error up to which an episode is a success
@@ -123,10 +123,10 @@ def sample_leg(start: VelocityStart, base: VelocityBase, geo: LegGeometry, rng: 
     settings = start.settings
     beside = sample_foot_offset(rng, leg, settings.front_x, settings.front_y, settings.back_x, settings.back_y)
     paw = base.pos + rotate_yaw(beside, start.heading)
-    lifted = uniform(rng, streams.LIFTED + leg, 0.0, 1.0) < settings.lifted_share
+    lifted = uniform(rng, streams.LIFTED + leg, 0.0, 1.0) < settings.swing_probability
     up = float(0.0)
     if lifted:
-        up = uniform(rng, streams.LIFT + leg, 0.01, settings.lift)
+        up = uniform(rng, streams.LIFT + leg, 0.01, settings.max_swing_height)
     paw[2] = surface(start.ground, paw[0], paw[1])[0] + geo.paw_radius + up
     ankle = wp.quat_rotate_inv(base.quat, paw - base.pos)
     found = leg_ik(geo, start.limits, ankle)
@@ -150,7 +150,7 @@ def write_start(
     start.settings = settings
     start.limits = leg_limits(skill.command_filter)
     start.ground = world_ground(scene.ground, world)
-    if uniform(rng, streams.DEFAULT_POSE, 0.0, 1.0) >= settings.default_share:
+    if uniform(rng, streams.DEFAULT_POSE, 0.0, 1.0) >= settings.default_pose_probability:
         if sample_valid_state(sample_base, sample_leg, start, arrays, scene, rng):
             return
     write_default_pose(arrays, scene, world, start.heading, surface(start.ground, start.spot[0], start.spot[1])[0])

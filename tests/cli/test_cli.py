@@ -257,8 +257,9 @@ def test_flags_change_training_and_task():
         "--env.rewards.jump-height.weight 25 --env.rewards.jump-height.std-fine 0.2"
         " --env.terminations.wrong-height.tolerance 0.07 --env.advance.takeoff-speed 0.5"
         " --env.policy.lin-vel.noise 0.3 --env.policy.gravity.history 2"
-        " --env.curriculum.tolerance 0.05 --env.curriculum.promote-after 7 --env.reset.standing 0.5"
-        " --env.reset.ground.drop 0.1 0.2 --env.levels.1.jump-again 0.5 --env.motors.lateral.kp 11"
+        " --env.curriculum.tolerance 0.05 --env.curriculum.promote-after 7"
+        " --env.reset.start-probability.standing 0.45 --env.reset.start-probability.default 0.2"
+        " --env.reset.ground.drop 0.1 0.2 --env.levels.1.next-jump-probability 0.5 --env.motors.lateral.kp 11"
         " --env.command-filter.sum.upper 200 --env.randomization.latency None --env.action-scale 10 80"
         " --env.contact-force 0.2 --env.reward-floor None --ppo.gamma 0.9 --no-noise --solver mujoco"
     )
@@ -269,8 +270,8 @@ def test_flags_change_training_and_task():
     assert (seen["lin_vel"].numbers["noise"], seen["gravity"].options["history"]) == (0.3, 2)
     assert task.advance.numbers == {"takeoff_speed": 0.5}
     assert task.curriculum.numbers == {"tolerance": 0.05, "promote_after": 7}
-    assert task.reset.settings.standing == 0.5 and task.reset.settings.ground.drop == (0.1, 0.2)
-    assert task.levels[1].jump_again == 0.5 and task.levels[0] == make_task("vertical-jump").levels[0]
+    assert task.reset.settings.start_probability.standing == 0.45 and task.reset.settings.ground.drop == (0.1, 0.2)
+    assert task.levels[1].next_jump_probability == 0.5 and task.levels[0] == make_task("vertical-jump").levels[0]
     assert task.motors.lateral.kp == 11.0 and task.command_filter.sum.upper == 200.0
     assert task.randomization.latency is None and task.action_scale == (10.0, 80.0)
     assert (task.contact_force, task.reward_floor) == (0.2, None)

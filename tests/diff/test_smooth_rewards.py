@@ -10,6 +10,7 @@ from jumper_warp.diff.smooth_rewards import SMOOTH, make_moment
 from jumper_warp.envs.env import Env
 from jumper_warp.policies.runs import open_policy
 from jumper_warp.registry import make_task
+from jumper_warp.tasks.jump.cfg import StartProbability
 from jumper_warp.trajectory.gauss_newton import Network
 
 TASK = make_task("vertical-jump").on_level_ground()
@@ -67,7 +68,7 @@ def test_smooth_rewards_have_the_values_of_the_environments_terms():
 def test_an_environment_with_gradients_has_the_same_values_and_its_rewards_those_derivatives():
     """Three steps of robots in flight: single precision, so by differences of a hundredth of the action."""
     flights = TASK.reset.settings
-    flights = type(flights)(standing=0.0, default=0.0, in_flight=1.0, flight_time=(0.05, 0.3))
+    flights = type(flights)(start_probability=StartProbability(in_flight=1.0), flight_time=(0.05, 0.3))
     task = TASK.__class__(**{**vars_of(TASK), "reset": TASK.reset.__class__(TASK.reset.func, flights)})
     envs = [Env(task, 3, seed=5, randomize=False, noise=False, device="cpu") for _ in range(2)]
     for env in envs:

@@ -236,9 +236,9 @@ def test_wrappers_stack():
 # ---------------------------------------------------------------- Gymnasium: seeds
 
 
-@pytest.mark.parametrize("redraw", ["reset", "startup"])
-def test_a_seed_makes_what_a_new_environment_of_it_makes(redraw):
-    task = dataclasses.replace(SHORT, randomization=RandomizationCfg(redraw=redraw))
+@pytest.mark.parametrize("resample_at", ["reset", "startup"])
+def test_a_seed_makes_what_a_new_environment_of_it_makes(resample_at):
+    task = dataclasses.replace(SHORT, randomization=RandomizationCfg(resample_at=resample_at))
     envs, new = (GymVectorEnv(jumper(task=task, seed=seed)) for seed in (1, 5))
     envs.reset()
     played(envs)

@@ -157,5 +157,5 @@ def test_what_cannot_be_is_refused():
         TurnCfg((20.0, 200.0))
     with pytest.raises(InputError, match=r"must be \(lower, upper\)"):
         AttitudeResetCfg(lateral=(10.0, -10.0))
-    with pytest.raises(InputError, match="lift must be finite"):
-        dataclasses.replace(make_task("attitude"), lift=-1.0)
+    with pytest.raises(InputError, match="eval_height_offset must be finite"):
+        dataclasses.replace(make_task("attitude"), eval_height_offset=-1.0)

@@ -264,7 +264,7 @@ def test_numbers_that_were_set_come_back_and_the_others_are_the_tasks():
 
 
 def test_a_state_of_before_the_first_reset_begins_as_a_new_environment_does():
-    task = dataclasses.replace(make_task("vertical-jump"), randomization=RandomizationCfg(redraw="startup"))
+    task = dataclasses.replace(make_task("vertical-jump"), randomization=RandomizationCfg(resample_at="startup"))
     saved, fresh = (Env(task, 2, seed=1, device="cpu") for _ in range(2))
     fresh.load_state_dict(saved.state_dict())
     with pytest.raises(RuntimeError, match="call reset before the first step"):

@@ -47,7 +47,7 @@ def test_off_is_the_robot_as_described(nominal):
     first = {name: values[..., :1] for name, values in nominal.items()}
     for name, values in nominal.items():
         np.testing.assert_array_equal(values, np.broadcast_to(first[name], values.shape), err_msg=name)
-    for name in ("joint_offset", "latency", "observation_latency", "force", "torque"):
+    for name in ("joint_offset", "latency", "observation_latency", "push_force", "push_torque"):
         assert not nominal[name].any(), name
     np.testing.assert_allclose(nominal["static_friction"], nominal["dynamic_friction"])
     assert nominal["base_mass"][0] == pytest.approx(6.431, abs=2e-3)
@@ -68,8 +68,8 @@ def test_draws_are_independent(drawn, nominal):
     """Of links, motors, axes and rows; only the paws of a world share their friction."""
     rows = [
         drawn["base_mass"][None], drawn["link_mass"], drawn["com_shift"], drawn["kp"], drawn["kd"],
-        drawn["no_load_speed"], drawn["armature"], drawn["motor_friction"], drawn["joint_offset"], drawn["force"],
-        drawn["torque"], drawn["dynamic_friction"][:1], drawn["latency"][None], drawn["observation_latency"][None],
+        drawn["no_load_speed"], drawn["armature"], drawn["motor_friction"], drawn["joint_offset"], drawn["push_force"],
+        drawn["push_torque"], drawn["dynamic_friction"][:1], drawn["latency"][None], drawn["observation_latency"][None],
     ]  # fmt: skip
     matrix = np.corrcoef(np.concatenate(rows))
     assert np.abs(matrix - np.eye(len(matrix))).max() < 5.0 / math.sqrt(512)
@@ -89,7 +89,7 @@ def test_a_link_gains_mass_and_inertia_alike(drawn, nominal):
 AFFECTED = {
     "static_friction": ["static_friction"],
     "dynamic_friction": ["dynamic_friction", "static_friction"],
-    **{row: [row] for row in ("no_load_speed", "cutoff_speed", "force", "torque")},
+    **{row: [row] for row in ("no_load_speed", "cutoff_speed", "push_force", "push_torque")},
 }
 """What the rows change that share an event with another."""
 

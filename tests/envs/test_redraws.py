@@ -71,7 +71,7 @@ def test_a_world_draws_anew_at_its_reset_and_at_no_other_time(solver):
 
 @pytest.mark.parametrize("solver", ["jumper", "mujoco"])
 def test_drawn_at_the_start_stays(solver):
-    env = randomized(RandomizationCfg(**ALL, **HELD, redraw="startup"), 4, solver=solver)
+    env = randomized(RandomizationCfg(**ALL, **HELD, resample_at="startup"), 4, solver=solver)
     first, of_solver = seen(env), own_model(env)
     assert len(np.unique(env.sim.model.body_mass.numpy())) == 84
     for action in random_actions(4, 3):
@@ -81,7 +81,7 @@ def test_drawn_at_the_start_stays(solver):
     env.reset()
     found = seen(env)
     for name in first:
-        if name in ("force", "torque"):  # a push is of an episode
+        if name in ("push_force", "push_torque"):  # a push is of an episode
             assert not np.array_equal(found[name], first[name])
         else:
             np.testing.assert_array_equal(found[name], first[name], err_msg=name)
@@ -94,7 +94,7 @@ def test_an_evaluation_draws_for_its_worlds_only():
     before, chosen = read(env), np.arange(6) % 2 == 0
     env.evaluation_reset(np.zeros((6, 4)), worlds=chosen)
     after = read(env)
-    for name in ("link_mass", "kp", "joint_offset", "force"):
+    for name in ("link_mass", "kp", "joint_offset", "push_force"):
         changed = (before[name] != after[name]).any(axis=0)
         np.testing.assert_array_equal(changed, chosen, err_msg=name)
 

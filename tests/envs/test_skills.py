@@ -173,7 +173,9 @@ def test_motors_filter_and_scales_become_those_of_the_new_skill_and_drawn_ratios
         JUMP.motors, transversal=dataclasses.replace(JUMP.motors.transversal, kp=30.0, no_load_speed=35.0))
     )  # fmt: skip
     still = RandomizationCfg.walking()
-    hold = dataclasses.replace(HOLD, events=(), randomization=dataclasses.replace(still, force=None, torque=None))
+    hold = dataclasses.replace(
+        HOLD, events=(), randomization=dataclasses.replace(still, push_force=None, push_torque=None)
+    )
     env = make(task, hold, skill=1, handovers=(Handover(hold, task, when_asked_to_jump, begin_jump),))
     before, action = parameters_of(env), torch.zeros((2, N, 12))
     action[:, :, ::3] = 1.0  # lateral

@@ -13,13 +13,16 @@ from jumper_warp.kernels.jump.state import LANDED
 from jumper_warp.policies.conditions import Conditions
 from jumper_warp.policies.folder import save_policy
 from jumper_warp.registry import make_task
-from jumper_warp.tasks.randomization import PUSH_INTERVAL, PUSH_SHARE, RandomizationCfg
+from jumper_warp.tasks.randomization import PUSH_INTERVAL, PUSH_PROBABILITY, RandomizationCfg
 from landing_helpers import still_policy
 
 DT = 1.0 / 480.0
 JUMP = make_task("horizontal-jump")
 HELD = dataclasses.replace(
-    JUMP, randomization=RandomizationCfg(push_interval=None, push_share=1.0, redraw="startup", force=(-7.0, 7.0))
+    JUMP,
+    randomization=RandomizationCfg(
+        push_interval=None, push_probability=1.0, resample_at="startup", push_force=(-7.0, 7.0)
+    ),
 )
 """Trained with one wrench for the whole episode, drawn once."""
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -64,17 +67,18 @@ def test_second_takeoff_ends_the_jump_where_that_is_asked_for():
 
 def test_pushes_of_a_test_come_and_go_however_they_were_trained_with():
     figure = Conditions(randomize=True).applied(HELD).randomization
-    assert (figure.push_interval, figure.push_share, figure.redraw) == (PUSH_INTERVAL, PUSH_SHARE, "reset")
+    assert (figure.push_interval, figure.push_probability) == (PUSH_INTERVAL, PUSH_PROBABILITY)
+    assert figure.resample_at == "reset"
     assert (figure.push_in_flight, figure.force) == (False, (-7.0, 7.0))
-    own = dataclasses.replace(HELD, randomization=RandomizationCfg(push_interval=(1.0, 2.0), push_share=0.5))
+    own = dataclasses.replace(HELD, randomization=RandomizationCfg(push_interval=(1.0, 2.0), push_probability=0.5))
     figure = Conditions(randomize=True).applied(own).randomization
-    assert (figure.push_interval, figure.push_share) == ((1.0, 2.0), 0.5)
+    assert (figure.push_interval, figure.push_probability) == ((1.0, 2.0), 0.5)
 
 
 @pytest.mark.parametrize("in_flight", [False, True])
 def test_pushes_of_a_test_act_in_flight_where_that_is_asked_for(in_flight):
     conditions = Conditions(randomize=True, push_in_flight=in_flight)
-    task = conditions.applied(dataclasses.replace(HELD, randomization=RandomizationCfg(push_share=1.0)))
+    task = conditions.applied(dataclasses.replace(HELD, randomization=RandomizationCfg(push_probability=1.0)))
     env = make_env(2, task=places.for_evaluation(task), randomize=True, auto_reset=False)
     env.evaluation_reset(np.zeros((2, 4)))
     edit_coordinates(env, 1, q={2: 1.0})
@@ -95,9 +99,9 @@ def test_walking_is_pushed_in_flight_in_any_case():
 
 
 def test_nominal_conditions_leave_the_task_alone_but_for_margins():
-    assert HELD.link_margin > 0.0
-    wary = dataclasses.replace(HELD, block_margin=0.01)
-    assert Conditions().applied(wary) == dataclasses.replace(HELD, link_margin=0.0)
+    assert HELD.self_collision_margin > 0.0
+    wary = dataclasses.replace(HELD, obstacle_margin=0.01)
+    assert Conditions().applied(wary) == dataclasses.replace(HELD, self_collision_margin=0.0)
 
 
 def test_fixed_parameters_are_all_that_changes_of_a_nominal_robot():

@@ -56,7 +56,7 @@ def test_what_is_undone_in_python():
     assert [level.base_height for level in places] == 4 * [(0.22, 0.35), (0.22, 0.45)]
     assert {level.goal_lower[0] for level in places} == {0.4}
     again = undone("horizontal-jump", "another_goal")[1].levels
-    assert {level.jump_again for level in again} == {0.0}
+    assert {level.next_jump_probability for level in again} == {0.0}
 
 
 def test_what_is_undone_elsewhere():
@@ -117,7 +117,7 @@ def test_trainings_are_measured_by_the_ends_of_the_task_as_it_is_and_not_made_tw
     with pytest.raises(InputError, match="other settings"):
         departures.main(replace(args, train=args.train + " --ppo.gamma 0.9"))
     with pytest.raises(InputError, match="other settings"):
-        departures.main(replace(args, train=args.train + " --env.link-margin 0.001"))
+        departures.main(replace(args, train=args.train + " --env.self-collision-margin 0.001"))
 
 
 def test_a_training_may_end_by_the_clock(tmp_path):

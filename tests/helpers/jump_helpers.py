@@ -16,13 +16,13 @@ from jumper_warp.kernels.mdp.view import RobotView, vec12
 from jumper_warp.kernels.terrain.ground import Ground
 from jumper_warp.registry import make_task
 from jumper_warp.tasks.cfg import TaskCfg
-from jumper_warp.tasks.jump.cfg import SHARES, Level, ResetCfg
+from jumper_warp.tasks.jump.cfg import Level, ResetCfg, StartProbability
 from jumper_warp.tasks.jump.observations import EPISODE
 from jumper_warp.tasks.observations import exact
 from mdp_helpers import DEFAULT_ANGLE, MOTOR_SLOTS, STEP_DT, SUBSTEPS, array, new_worlds, observe, standing_robots
 
 DEG = np.pi / 180.0
-NUM_START_MODES = ("standing", "default", "in_flight", "touchdown", "landed", "pushing")
+NUM_START_MODES = ("standing", "default", "in_flight", "touchdown", "after_landing", "pushing")
 OF_WORLD = ("level", "streak")
 """What a world keeps from episode to episode."""
 
@@ -146,8 +146,8 @@ def tilted_by(angle: float, axis=(1.0, 0.0, 0.0)) -> dict:
 
 def only(start_mode: str, reset: ResetCfg | None = None, **ranges) -> ResetCfg:
     """Return resets that all follow one scheme, otherwise as `reset`."""
-    shares = dict.fromkeys(SHARES, 0.0) | ({} if start_mode == "landed" else {start_mode: 1.0})
-    return dataclasses.replace(ResetCfg() if reset is None else reset, **shares, **ranges)
+    probability = StartProbability(**{start_mode: 1.0})
+    return dataclasses.replace(ResetCfg() if reset is None else reset, start_probability=probability, **ranges)
 
 
 def resetting(task: TaskCfg, reset: ResetCfg) -> TaskCfg:

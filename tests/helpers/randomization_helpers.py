@@ -24,21 +24,21 @@ PAPER = {
     "static_friction": (0.9, 1.2), "dynamic_friction": (0.8, 0.9), "base_mass": (-1.0, 2.0), "link_mass": (0.8, 1.2),
     "com_shift": (-0.03, 0.03), "gains": (0.6, 1.4), "no_load_speed": (0.8, 1.2), "cutoff_speed": (0.8, 1.4),
     "motor_friction": (0.005, 0.04), "armature": (0.6, 1.4), "joint_offset": (-2.0, 2.0), "latency": (0.0, 16.0),
-    "force": (-5.0, 5.0), "torque": (-3.0, 3.0),
+    "push_force": (-5.0, 5.0), "push_torque": (-3.0, 3.0),
 }  # fmt: skip
 """Table V, jumping."""
 WALKING = PAPER | {
     "static_friction": (0.8, 0.95), "dynamic_friction": (0.7, 0.8), "no_load_speed": (0.6, 1.2),
     "cutoff_speed": (0.6, 1.4), "motor_friction": (0.0, 0.04), "latency": (0.0, 32.0),
-    "observation_latency": (0.0, 32.0), "force": (-10.0, 10.0),
+    "observation_latency": (0.0, 32.0), "push_force": (-10.0, 10.0),
 }  # fmt: skip
 """Table V, walking; the text adds that its latency applies to observations too."""
 BEYOND = {
-    "observation_latency": None, "push_interval": (0.2, 0.5), "push_share": 0.25, "push_in_flight": False,
-    "damping_gains": None, "redraw": "reset", "no_latency": 0.0,
+    "observation_latency": None, "push_interval": (0.2, 0.5), "push_probability": 0.25, "push_in_flight": False,
+    "damping_gains": None, "resample_at": "reset", "zero_latency_probability": 0.0,
 }  # fmt: skip
 """What the table does not tell, for jumping."""
-HELD = {"push_interval": None, "push_share": 1.0}
+HELD = {"push_interval": None, "push_probability": 1.0}
 """A push in every episode, from its beginning to its end."""
 ALL = PAPER | {"observation_latency": (0.0, 16.0)}
 """Every row."""
@@ -71,8 +71,8 @@ def read(env):
         "joint_offset": motors.offset.numpy().astype(float),
         "latency": parameters.latency.numpy().astype(float),
         "observation_latency": parameters.observation_latency.numpy().astype(float),
-        "force": parameters.push.numpy()[:, :3].T.astype(float),
-        "torque": parameters.push.numpy()[:, 3:].T.astype(float),
+        "push_force": parameters.push.numpy()[:, :3].T.astype(float),
+        "push_torque": parameters.push.numpy()[:, 3:].T.astype(float),
     }
 
 
@@ -113,8 +113,8 @@ ROWS = {
     "motor_friction": lambda now, then: now["motor_friction"],
     "armature": lambda now, then: now["armature"] / then["armature"],
     "joint_offset": lambda now, then: now["joint_offset"] / DEG,
-    "force": lambda now, then: now["force"],
-    "torque": lambda now, then: now["torque"],
+    "push_force": lambda now, then: now["push_force"],
+    "push_torque": lambda now, then: now["push_torque"],
     "dynamic_friction": lambda now, then: now["dynamic_friction"],
     "static_friction": lambda now, then: now["static_friction"],
 }

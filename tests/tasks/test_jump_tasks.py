@@ -10,14 +10,14 @@ from jumper_warp.cli.task_flags import flags_of
 from jumper_warp.cli.train import parse_train
 from jumper_warp.registry import make_task
 from jumper_warp.robot.motors import loose_filter, vertical_jump_filter
-from jumper_warp.tasks.jump.cfg import Level, ladder
+from jumper_warp.tasks.jump.cfg import Level, cross_levels
 
 GOALS = (Level((0.0, 0.0, 0.5), (0.0, 0.0, 0.6), (0.3, 0.3)), Level((0.0, 0.0, 0.6), (0.0, 0.0, 0.9), (0.3, 0.3)))
 STARTS = ((0.22, 0.35), (0.22, 0.45))
 
 
 def test_starts_have_a_curriculum_of_their_own_within_each_level_of_goals():
-    levels = ladder(GOALS, STARTS)
+    levels = cross_levels(GOALS, STARTS)
     assert [level.goal_upper[2] for level in levels] == [0.6, 0.6, 0.9, 0.9]
     assert [level.base_height for level in levels] == [*STARTS, *STARTS]
 
@@ -37,7 +37,7 @@ def test_tolerances_of_the_curricula_are_the_papers():
 def test_reaches_grow_at_their_own_rates_all_around():
     task = make_task("omnidirectional-jump")
     reaches = [(level.goal_upper[0], level.goal_upper[1], -level.goal_lower[0]) for level in task.levels[2::2]]
-    assert all(level.round for level in task.levels[2:])
+    assert all(level.elliptical for level in task.levels[2:])
     assert reaches == sorted(reaches) and all(
         reach > wanted for reach, wanted in zip(reaches[-1], (1.2, 0.8, 0.8), strict=True)
     )
@@ -54,8 +54,9 @@ def test_mars_has_its_gravity_and_all_of_the_motors(name):
     assert loose.levels[-1].goal_upper[axis] > beaten
 
 
-UNDOING = """--env.curriculum.tolerance 0.1 --env.reset.shares-of resets --env.reset.pushing 0 --env.reset.standing 0.45
---env.reset.in-flight 0.175 --env.reset.touchdown 0.175 --env.reset.lean 0 --env.reset.takeoff-ahead 0 0.1
+UNDOING = """--env.curriculum.tolerance 0.1 --env.reset.balance-by resets --env.reset.start-probability.pushing 0
+--env.reset.start-probability.standing 0.45 --env.reset.start-probability.in-flight 0.175
+--env.reset.start-probability.touchdown 0.175 --env.reset.lean 0 --env.reset.takeoff-ahead 0 0.1
 --env.reset.takeoff-pitch 0 0 --env.reset.takeoff-angle 50 75 --env.reset.heading 0 --env.reset.ground.platform 0
 --env.reset.ground.block 0 --env.rewards.lifted-again.weight 0 --env.rewards.capture-point.weight 0
 --env.rewards.resting-action-rate.weight 0 --env.rewards.torque-ripple.weight 0 --env.rewards.force-ripple.weight 0
@@ -68,7 +69,7 @@ UNDOING = """--env.curriculum.tolerance 0.1 --env.reset.shares-of resets --env.r
 
 def test_departures_are_undone_from_the_command_line():
     task = parse_train(["horizontal-jump", *UNDOING.split()])[1]
-    assert task.reset.settings.shares_of == "resets" and task.reset.settings.lean == 0.0
+    assert task.reset.settings.balance_by == "resets" and task.reset.settings.lean == 0.0
     ends = {term.name: term.numbers for term in task.terminations}
     assert ends["second_takeoff"]["speed"] == 100.0 and ends["missed_goal"]["tolerance"] == 0.2
     assert not any(

@@ -162,7 +162,7 @@ def test_setting_that_would_not_come_back_is_not_saved(value):
          "needs struct and values"),
         (lambda t: t["curriculum"].update(counts=None), "expected module:name, got None"),
         (lambda t: t.update(randomization={"gains": [0.5]}), "task.randomization.gains: expected 2 entries, got 1"),
-        (lambda t: t["randomization"].update(redraw="never"), "task.randomization.redraw: must be one of"),
+        (lambda t: t["randomization"].update(resample_at="never"), "task.randomization.resample_at: must be one of"),
     ],
 )  # fmt: skip
 def test_what_is_no_task_is_refused(change, message):

@@ -10,7 +10,7 @@ import warp as wp
 from jumper_warp.kernels.attitude.commands import TurnRanges
 from jumper_warp.kernels.attitude.start_states import AttitudeSettings
 from jumper_warp.tasks.ranges import Pair, check_ranges, filled
-from jumper_warp.utils.checks import check_positive, check_shares
+from jumper_warp.utils.checks import check_positive, check_probabilities
 from jumper_warp.utils.errors import InputError
 
 
@@ -20,17 +20,17 @@ class TurnCfg:
 
     angle: Pair
     """[deg] Smallest and largest."""
-    axis_share: float = 0.5
-    """[1] Share of turns about x, y or z of the body; the others are about any axis."""
+    body_axis_probability: float = 0.5
+    """[1] Of a turn about x, y or z of the body; the others are about any axis."""
 
     struct = TurnRanges
     """What the kernels read."""
 
     def __post_init__(self) -> None:
-        """Raises ValueError: a range or a share is not one."""
+        """Raises ValueError: a range or a probability is not one."""
         if not 0.0 <= self.angle[0] <= self.angle[1] <= 180.0:
             raise InputError(f"turn angle must be (lower, upper) within 0 to 180 degrees, got {self.angle}")
-        check_shares("turn", axis_share=self.axis_share)
+        check_probabilities("turn", self, "body_axis_probability")
 
     def values(self) -> Any:
         """Return the kernels' `TurnRanges`."""
@@ -45,8 +45,8 @@ class AttitudeResetCfg:
     """[s] Length of an episode; drawn, so that not all worlds are at the same stage of theirs."""
     height: float = 2.0
     """[m] Of the base above the ground."""
-    default_share: float = 0.3
-    """[1] Share of episodes that begin in the default pose."""
+    default_pose_probability: float = 0.3
+    """[1] Of a start in the default pose."""
     lateral: Pair = (-20.0, 80.0)
     """[deg] Of the other legs' motors."""
     transversal: Pair = (0.0, 105.0)
@@ -62,7 +62,7 @@ class AttitudeResetCfg:
         check_ranges("reset", self, not_negative=("spin",))
         check_positive("reset episode", *self.episode)
         check_positive("reset height", self.height)
-        check_shares("reset", default_share=self.default_share)
+        check_probabilities("reset", self, "default_pose_probability")
 
     def values(self, step_dt: float) -> Any:
         """Return the kernels' `AttitudeSettings`: angles in radians, times in policy steps of step_dt [s]."""

@@ -15,11 +15,8 @@ from jumper_warp.kernels.jump.reset import JumpLevel, JumpSettings
 from jumper_warp.kernels.jump.start_states import ResetRanges
 from jumper_warp.kernels.jump.state import vec_start_modes
 from jumper_warp.tasks.ranges import Pair, check_ranges, filled
-from jumper_warp.utils.checks import check_positive, check_shares
+from jumper_warp.utils.checks import check_positive, check_probabilities
 from jumper_warp.utils.errors import InputError
-
-SHARES = ("standing", "default", "in_flight", "touchdown", "pushing")
-"""Of the ways in which an episode begins; the rest begins just landed."""
 
 
 @dataclass(frozen=True)
@@ -77,9 +74,9 @@ class Level:
     """Largest goal."""
     base_height: Pair
     """[m] Of standing starts; low ones are deep squats."""
-    jump_again: float = 0.0
-    """[1] Share of the episodes in which a landed robot gets another goal."""
-    round: bool = False
+    next_jump_probability: float = 0.0
+    """[1] Of another goal for a landed robot."""
+    elliptical: bool = False
     """Whether goals lie in the ellipse inside the box alone, whose half axes are the reaches each way."""
 
     struct = JumpLevel
@@ -91,18 +88,18 @@ class Level:
         if not all(-math.inf < low <= high < math.inf for low, high in pairs):
             raise InputError(f"a level's ranges must be finite and rise, got {self}")
         check_positive("base_height of a level", *self.base_height)
-        check_shares("level", jump_again=self.jump_again)
+        check_probabilities("level", self, "next_jump_probability")
 
     def values(self) -> Any:
         """Return the kernels' `JumpLevel`."""
         level = JumpLevel()
         level.goal_lower, level.goal_upper = wp.vec3(*self.goal_lower), wp.vec3(*self.goal_upper)
-        level.base_height, level.jump_again = wp.vec2(*self.base_height), self.jump_again
-        level.round = int(self.round)
+        level.base_height, level.next_jump_probability = wp.vec2(*self.base_height), self.next_jump_probability
+        level.elliptical = int(self.elliptical)
         return level
 
 
-def ladder(goals: Sequence[Level], starts: Sequence[Pair]) -> tuple[Level, ...]:
+def cross_levels(goals: Sequence[Level], starts: Sequence[Pair]) -> tuple[Level, ...]:
     """Return the levels of two curricula: for each level of goals all ranges of standing starts [m], easiest first.
 
     So the starts have their own curriculum, which begins anew with every level of goals, as the authors have it.
@@ -111,17 +108,34 @@ def ladder(goals: Sequence[Level], starts: Sequence[Pair]) -> tuple[Level, ...]:
 
 
 @dataclass(frozen=True)
-class ResetCfg:
-    """Reference state initialisation: shares of the schemes and ranges of their states; angles in degrees."""
+class StartProbability:
+    """[1] Probabilities of the modes in which an episode begins, in the order of the kernels; they add up to 1."""
 
-    standing: float = 0.60
-    default: float = 0.15
-    in_flight: float = 0.20
+    standing: float = 0.0
+    """On four paws, from upright to a deep squat."""
+    default: float = 0.0
+    """In the default pose."""
+    in_flight: float = 0.0
     touchdown: float = 0.0
+    """Just before it."""
+    after_landing: float = 0.0
     pushing: float = 0.0
-    """Shares; what is left begins just landed."""
-    shares_of: Literal["resets", "time"] = "resets"
-    """Whether shares are of resets, or of the time spent in episodes, which a world evens out from reset to reset."""
+    """During the push of a takeoff."""
+
+    def __post_init__(self) -> None:
+        """Raises ValueError: one is negative, or they do not add up to 1."""
+        values = tuple(vars(self).values())
+        if not min(values) >= 0.0 or not abs(sum(values) - 1.0) < 1.0e-6:
+            raise InputError(f"start_probability must be >= 0 and add up to 1, got {vars(self)}")
+
+
+@dataclass(frozen=True)
+class ResetCfg:
+    """Reference state initialisation: probabilities of start modes and ranges of their states; angles in degrees."""
+
+    start_probability: StartProbability = StartProbability(0.60, 0.15, 0.20, after_landing=0.05)
+    balance_by: Literal["resets", "steps"] = "resets"
+    """Whether the probabilities are of resets, or of policy steps, which a world evens out from reset to reset."""
     base_xy: float = 0.05
     """[m]"""
     tilt: float = 5.0
@@ -178,26 +192,20 @@ class ResetCfg:
     """What standing starts stand on or jump to."""
     command_delay: float = 0.5
     """[s] Longest time until the jump is commanded."""
-    long_wait_share: float = 0.0
-    """[1] Share of the episodes in which it is `long_wait`: a policy learns to wait, and most episodes stay short."""
+    long_wait_probability: float = 0.0
+    """[1] Of `long_wait` instead: a policy learns to wait, and most episodes stay short."""
     long_wait: float = 2.5
     """[s]"""
-    again_delay: Pair = (0.2, 0.7)
-    """[s] From touchdown to the other goal."""
+    next_jump_delay: Pair = (0.2, 0.7)
+    """[s] From touchdown to the next goal."""
 
     def __post_init__(self) -> None:
-        """Raises ValueError: shares do not add up, a pair is reversed, a number not finite or out of range."""
-        shares = self._shares()
-        if not min(shares) >= 0.0 or sum(shares) > 1.0 + 1e-9:
-            raise InputError(f"reset shares must be >= 0 and add up to at most 1, got {shares}")
-        positive = ("command_delay", "long_wait", "again_delay", "lean", "push_length", "push_acceleration")
-        check_ranges("reset", self, skip=("ground", "shares_of"), not_negative=positive)
-        check_shares("reset", long_wait_share=self.long_wait_share)
-        if self.shares_of not in ("resets", "time"):
-            raise InputError(f"reset shares_of must be resets or time, got {self.shares_of!r:.40}")
-
-    def _shares(self) -> tuple[float, ...]:
-        return tuple(getattr(self, name) for name in SHARES)
+        """Raises ValueError: a pair is reversed, a number not finite or out of range."""
+        positive = ("command_delay", "long_wait", "next_jump_delay", "lean", "push_length", "push_acceleration")
+        check_ranges("reset", self, skip=("start_probability", "ground", "balance_by"), not_negative=positive)
+        check_probabilities("reset", self, "long_wait_probability")
+        if self.balance_by not in ("resets", "steps"):
+            raise InputError(f"reset balance_by must be resets or steps, got {self.balance_by!r:.40}")
 
     struct = JumpSettings
     """What the kernels read."""
@@ -222,13 +230,11 @@ class ResetCfg:
             "tilt", "forward_pitch", "heading", "takeoff_angle", "takeoff_pitch", "flight_lateral",
             "flight_transversal",
         )  # fmt: skip
-        apart = (*SHARES, "shares_of", "command_delay", "long_wait", "again_delay", "ground")
+        apart = ("start_probability", "balance_by", "command_delay", "long_wait", "next_jump_delay", "ground")
         ranges = filled(ResetRanges(), self, apart, degrees)
-        *others, pushing = self._shares()
-        landed = 1.0 - sum(self._shares())
-        ranges.shares = vec_start_modes(*others, landed if landed > 1.0e-6 else 0.0, pushing)
-        ranges.of_time = int(self.shares_of == "time")
+        ranges.start_probability = vec_start_modes(*vars(self.start_probability).values())
+        ranges.by_steps = int(self.balance_by == "steps")
         ranges.command_delay = round(self.command_delay / step_dt)
         ranges.long_wait = round(self.long_wait / step_dt)
-        ranges.again_delay = wp.vec2(*(delay / step_dt for delay in self.again_delay))
+        ranges.next_jump_delay = wp.vec2(*(delay / step_dt for delay in self.next_jump_delay))
         return ranges

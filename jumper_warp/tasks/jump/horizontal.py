@@ -14,7 +14,7 @@ from jumper_warp.kernels.mdp import rewards as mdp_rewards
 from jumper_warp.kernels.mdp import terminations as mdp_terminations
 from jumper_warp.robot.motors import horizontal_jump_filter, jumping_motors
 from jumper_warp.tasks.cfg import Command, Reset, TaskCfg
-from jumper_warp.tasks.jump.cfg import GroundCfg, Level, ResetCfg, ladder
+from jumper_warp.tasks.jump.cfg import GroundCfg, Level, ResetCfg, StartProbability, cross_levels
 from jumper_warp.tasks.jump.observations import HORIZONTAL, SIGHT, SIGHTED, critic
 from jumper_warp.tasks.jump.vertical import QUIET, STARTS
 from jumper_warp.tasks.observations import remembered
@@ -66,16 +66,14 @@ TERMINATIONS = (
 )
 
 
-JUMP_AGAIN = 0.175
-"""Share of the episodes past the first level in which a landed robot gets another goal."""
+NEXT_JUMP_PROBABILITY = 0.175
+"""[1] Of another goal for a landed robot, past the first level."""
 
 RESET = ResetCfg(
-    standing=0.40,
-    default=0.15,
-    in_flight=0.15,
-    touchdown=0.15,
-    pushing=0.10,
-    shares_of="time",
+    start_probability=StartProbability(
+        standing=0.40, default=0.15, in_flight=0.15, touchdown=0.15, after_landing=0.05, pushing=0.10
+    ),
+    balance_by="steps",
     forward_pitch=10.0,
     lean=0.20,
     heading=180.0,
@@ -92,17 +90,19 @@ RESET = ResetCfg(
 )
 
 
-def level(x: tuple[float, float], y: float, jump_again: float = JUMP_AGAIN) -> Level:
+def level(x: tuple[float, float], y: float, next_jump_probability: float = NEXT_JUMP_PROBABILITY) -> Level:
     """Return a level with goals ahead within x [m], up to y [m] to either side."""
-    return Level((x[0], -y, 0.0), (x[1], y, 0.0), STARTS[0], jump_again)
+    return Level((x[0], -y, 0.0), (x[1], y, 0.0), STARTS[0], next_jump_probability)
 
 
-def around(ahead: float, aside: float, back: float) -> Level:
+def level_all_around(ahead: float, aside: float, back: float) -> Level:
     """Return a level with goals up to these distances [m] ahead, to either side and back."""
-    return Level((-back, -aside, 0.0), (ahead, aside, 0.0), STARTS[0], JUMP_AGAIN, round=True)
+    return Level((-back, -aside, 0.0), (ahead, aside, 0.0), STARTS[0], NEXT_JUMP_PROBABILITY, elliptical=True)
 
 
-NEAREST = level((0.2, 0.5), 0.0, jump_again=0.0)
+REACHES = ((0.4, 0.3, 0.3), (0.7, 0.5, 0.5), (1.0, 0.7, 0.7), (1.4, 0.95, 0.95))
+"""[m] Of goals all around: ahead, aside, back; by level."""
+NEAREST = level((0.2, 0.5), 0.0, next_jump_probability=0.0)
 """Where every curriculum begins."""
 
 
@@ -119,7 +119,7 @@ def horizontal_jump() -> TaskCfg:
         terminations=TERMINATIONS,
         policy=remembered(HORIZONTAL),
         critic=critic(HORIZONTAL, SIGHT),
-        levels=ladder(
+        levels=cross_levels(
             (
                 NEAREST,
                 level((0.25, 0.8), 0.15),
@@ -133,7 +133,7 @@ def horizontal_jump() -> TaskCfg:
         motors=jumping_motors(18.0, lateral_torque=12.0),
         command_filter=horizontal_jump_filter(),
         action_scale=(15.0, 90.0),
-        link_margin=0.005,
+        self_collision_margin=0.005,
         evaluation="place",
     )
 
@@ -170,8 +170,8 @@ def omnidirectional_jump() -> TaskCfg:
         task,
         name="omnidirectional-jump",
         evaluation="around",
-        levels=ladder(
-            (NEAREST, around(0.4, 0.3, 0.3), around(0.7, 0.5, 0.5), around(1.0, 0.7, 0.7), around(1.4, 0.95, 0.95)),
+        levels=cross_levels(
+            (NEAREST, *(level_all_around(*reach) for reach in REACHES)),
             STARTS,
         ),
         reset=replace(task.reset, settings=settings),

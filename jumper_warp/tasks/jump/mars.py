@@ -15,7 +15,7 @@ from jumper_warp.kernels.jump import rewards, terminations
 from jumper_warp.robot.gravity import EARTH, MARS
 from jumper_warp.robot.motors import MotorCfg, jumping_motors, loose_filter
 from jumper_warp.tasks.cfg import TaskCfg
-from jumper_warp.tasks.jump.cfg import GroundCfg, ladder
+from jumper_warp.tasks.jump.cfg import GroundCfg, cross_levels
 from jumper_warp.tasks.jump.horizontal import NEAREST, horizontal_jump, level
 from jumper_warp.tasks.jump.vertical import STARTS, heights, vertical_jump
 from jumper_warp.tasks.terms import RewardTerm
@@ -85,7 +85,7 @@ def horizontal_jump_mars() -> TaskCfg:
         name="horizontal-jump-mars",
         gravity=MARS,
         motors=mars_motors(12.0),
-        levels=ladder(
+        levels=cross_levels(
             (NEAREST, level((0.5, 1.3), 0.1), level((1.0, 1.85), 0.2), level((1.4, 2.6), 0.3), level((2.0, 3.75), 0.3),
              level((3.0, 4.75), 0.3)), STARTS,
         ),

@@ -12,7 +12,7 @@ from jumper_warp.kernels.mdp import rewards as mdp_rewards
 from jumper_warp.kernels.mdp import terminations as mdp_terminations
 from jumper_warp.robot.motors import jumping_motors, vertical_jump_filter
 from jumper_warp.tasks.cfg import Command, Reset, TaskCfg
-from jumper_warp.tasks.jump.cfg import Level, ResetCfg, ladder
+from jumper_warp.tasks.jump.cfg import Level, ResetCfg, StartProbability, cross_levels
 from jumper_warp.tasks.jump.observations import VERTICAL, critic
 from jumper_warp.tasks.observations import remembered
 from jumper_warp.tasks.terms import Advance, Curriculum, RewardTerm, TerminationTerm
@@ -77,12 +77,15 @@ TERMINATIONS = (
 STARTS = ((0.22, 0.35), (0.22, 0.45))
 """[m] Base heights of standing starts, deep squats first."""
 
-RESET = ResetCfg(standing=0.50, default=0.15, in_flight=0.20, pushing=0.10, shares_of="time")
+RESET = ResetCfg(
+    start_probability=StartProbability(0.50, default=0.15, in_flight=0.20, after_landing=0.05, pushing=0.10),
+    balance_by="steps",
+)
 
 
 def heights(*pairs: tuple[float, float]) -> tuple[Level, ...]:
     """Return levels with goals between two base heights [m] each, and for each of them all starts."""
-    return ladder([Level((0.0, 0.0, low), (0.0, 0.0, high), STARTS[0]) for low, high in pairs], STARTS)
+    return cross_levels([Level((0.0, 0.0, low), (0.0, 0.0, high), STARTS[0]) for low, high in pairs], STARTS)
 
 
 def vertical_jump() -> TaskCfg:
@@ -102,6 +105,6 @@ def vertical_jump() -> TaskCfg:
         motors=jumping_motors(18.0, lateral_torque=10.0),
         command_filter=vertical_jump_filter(),
         action_scale=(15.0, 90.0),
-        link_margin=0.005,
+        self_collision_margin=0.005,
         evaluation="height",
     )

@@ -13,7 +13,7 @@ from jumper_warp.kernels.velocity.commands import CommandRanges
 from jumper_warp.kernels.velocity.start_states import Map, VelocitySettings
 from jumper_warp.robot.terrain import TerrainCfg, terrain_map
 from jumper_warp.tasks.ranges import Pair, check_ranges, filled
-from jumper_warp.utils.checks import check_finite, check_shares
+from jumper_warp.utils.checks import check_finite, check_probabilities
 from jumper_warp.utils.errors import InputError
 
 Reach = tuple[float, float, float, float]
@@ -23,43 +23,45 @@ Reach = tuple[float, float, float, float]
 class CommandCfg:
     """Drawn commands. A reach is (ahead, back, to either side [m/s], turning to either side [rad/s])."""
 
-    narrow: Reach = (0.8, 0.8, 0.8, 0.8)
+    first_range: Reach = (0.8, 0.8, 0.8, 0.8)
     """At the first level."""
-    wide: Reach = (2.2, 1.6, 1.0, 1.4)
+    last_range: Reach = (2.2, 1.6, 1.0, 1.4)
     """At the last level. From the second on, going fast along x leaves less room for going sideways and turning."""
     levels: int = 10
     """Steps from the first level to the last; 0: all commands are of the first."""
-    narrow_share: float = 0.5
-    """[1] Share of commands of the first level on all others."""
-    stand: float = 0.12
-    """[1] Share of commands to stand."""
-    turn: float = 0.05
-    """[1] Share of commands to turn on the spot."""
-    lasts: Pair = (2.0, 6.0)
+    first_range_probability: float = 0.5
+    """[1] Of a command of the first level on all others."""
+    standing_probability: float = 0.12
+    """[1] Of the command to stand."""
+    turn_in_place_probability: float = 0.05
+    """[1] Of a command to turn on the spot."""
+    resampling_time_range: Pair = (2.0, 6.0)
     """[s] From command to command."""
 
     struct = CommandRanges
     """What the kernels read."""
 
     def __post_init__(self) -> None:
-        """Raises ValueError: a range or a share is not one."""
-        check_finite("command reach", *self.narrow, *self.wide)
-        if not all(0.0 < low <= high for low, high in zip(self.narrow, self.wide, strict=True)):
-            raise InputError(f"command reaches must be positive and not shrink, got {self.narrow}, {self.wide}")
+        """Raises ValueError: a range or a probability is not one."""
+        check_finite("command reach", *self.first_range, *self.last_range)
+        if not all(0.0 < low <= high for low, high in zip(self.first_range, self.last_range, strict=True)):
+            raise InputError(f"command ranges must be positive and grow, got {self.first_range}, {self.last_range}")
         if self.levels < 0:
             raise InputError(f"command levels must not be negative, got {self.levels}")
-        check_shares("command", narrow_share=self.narrow_share, stand=self.stand, turn=self.turn)
-        if self.stand + self.turn > 1.0:
-            raise InputError(f"command shares must add up to at most 1, got {self.stand}, {self.turn}")
-        if not 0.0 < self.lasts[0] <= self.lasts[1] < math.inf:
-            raise InputError(f"command lasts must be (lower, upper), positive and finite, got {self.lasts}")
+        kinds = ("standing_probability", "turn_in_place_probability")
+        check_probabilities("command", self, "first_range_probability", *kinds)
+        if self.standing_probability + self.turn_in_place_probability > 1.0:
+            raise InputError(f"command {' and '.join(kinds)} must add up to at most 1")
+        low, high = self.resampling_time_range
+        if not 0.0 < low <= high < math.inf:
+            raise InputError(f"resampling_time_range must be (lower, upper), positive and finite, got ({low}, {high})")
 
     def values(self) -> Any:
         """Return the kernels' `CommandRanges`."""
-        ranges = CommandRanges()
-        ranges.narrow, ranges.wide, ranges.levels = wp.vec4(*self.narrow), wp.vec4(*self.wide), self.levels
-        ranges.narrow_share, ranges.stand, ranges.turn = self.narrow_share, self.stand, self.turn
-        ranges.lasts = wp.vec2(*(60.0 * seconds for seconds in self.lasts))
+        ranges = filled(CommandRanges(), self, skip=("first_range", "last_range", "levels", "resampling_time_range"))
+        ranges.first_range, ranges.last_range = wp.vec4(*self.first_range), wp.vec4(*self.last_range)
+        ranges.levels = self.levels
+        ranges.resampling_time_range = wp.vec2(*(60.0 * seconds for seconds in self.resampling_time_range))
         return ranges
 
 
@@ -71,8 +73,8 @@ class VelocityResetCfg:
     """[s] Length of an episode."""
     gait: float = 0.0
     """[Hz] Frequency of the clock, 0: none. What it is for are the trot's observation and reward."""
-    default_share: float = 0.1
-    """[1] Share of episodes that begin in the default pose at rest."""
+    default_pose_probability: float = 0.1
+    """[1] Of a start in the default pose at rest."""
     base_xy: float = 0.1
     """[m] Half width."""
     height: Pair = (0.30, 0.50)
@@ -89,10 +91,10 @@ class VelocityResetCfg:
     """[m]"""
     back_y: Pair = (0.16, 0.28)
     """[m]"""
-    lift: float = 0.10
-    """[m] Most of paws in the air."""
-    lifted_share: float = 0.3
-    """[1] Share of paws in the air."""
+    max_swing_height: float = 0.10
+    """[m] Greatest height of paws in the air."""
+    swing_probability: float = 0.3
+    """[1] Of a paw being in the air."""
     lin_vel: float = 0.5
     """[m/s] Half width of the base's velocity along x and y, three tenths of it along z."""
     ang_vel: float = 0.5
@@ -108,7 +110,7 @@ class VelocityResetCfg:
     def __post_init__(self) -> None:
         """Raises ValueError: a pair is reversed, a number not finite or out of range."""
         check_ranges("reset", self, skip=("terrain",), not_negative=vars(self))
-        check_shares("reset", default_share=self.default_share, lifted_share=self.lifted_share)
+        check_probabilities("reset", self, "default_pose_probability", "swing_probability")
 
     def values(self, step_dt: float) -> Any:
         """Return the kernels' `VelocitySettings`: angles in radians, times in policy steps of step_dt [s]."""

@@ -21,7 +21,7 @@ from jumper_warp.tasks.units import DEG
 from jumper_warp.tasks.velocity.cfg import CommandCfg
 from jumper_warp.tasks.velocity.flat import WITHOUT_HISTORY, velocity_flat
 
-COMMANDS = CommandCfg(narrow=(0.8, 0.6, 0.4, 0.8), wide=(0.8, 0.6, 0.4, 0.8), levels=0)
+COMMANDS = CommandCfg(first_range=(0.8, 0.6, 0.4, 0.8), last_range=(0.8, 0.6, 0.4, 0.8), levels=0)
 """What is commanded on the map."""
 GROUNDS = (*KINDS, "pit", "blocks")
 """Of the map's columns."""

@@ -210,7 +210,7 @@ def test_an_episode_knows_the_ground_at_its_goal(scenes, kind):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("start_mode", ["in_flight", "touchdown", "landed"])
+@pytest.mark.parametrize("start_mode", ["in_flight", "touchdown", "after_landing"])
 def test_the_ground_is_level_where_a_jump_has_begun(env, kind, start_mode):
     for start in ("default", start_mode):
         begin_by(env, only(start, resets_of(env), ground=KINDS[kind]))

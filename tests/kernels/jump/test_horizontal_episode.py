@@ -35,7 +35,7 @@ def env():
 
 def again_and_again(share):
     """Return the task in which a share of the landed robots gets another goal past the first level."""
-    levels = (TASK.levels[0], *(dataclasses.replace(level, jump_again=share) for level in TASK.levels[1:]))
+    levels = (TASK.levels[0], *(dataclasses.replace(level, next_jump_probability=share) for level in TASK.levels[1:]))
     return dataclasses.replace(TASK, levels=levels)
 
 
@@ -215,7 +215,7 @@ def test_another_goal_moves_nothing_but_the_episode():
 def test_jumps_follow_each_other_as_often_as_planned(env):
     land(env, next_jump_step=13)
     env.step(REST)
-    planned = env.task_arrays()["next_jump_step"]  # jump_again = 1: after every second jump a third
+    planned = env.task_arrays()["next_jump_step"]  # next_jump_probability = 1: after every second jump a third
     assert planned.min() >= 12 and planned.max() <= 42 and len(set(planned)) > 20
     never = make_env(N, task=again_and_again(0.0), reset=only("default"))
     land(never, next_jump_step=13)

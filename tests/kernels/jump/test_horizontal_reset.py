@@ -51,12 +51,12 @@ def starts(env):
     found = {start_mode: Starts(env, start_mode) for start_mode in NUM_START_MODES}
     return found | {
         f"exact {start_mode}": Starts(env, start_mode, exact=True)
-        for start_mode in ("in_flight", "touchdown", "landed")
+        for start_mode in ("in_flight", "touchdown", "after_landing")
     }
 
 
 def test_schemes_have_the_tasks_shares(env):
-    begin_by(env, dataclasses.replace(resets_of(env), shares_of="resets"))
+    begin_by(env, dataclasses.replace(resets_of(env), balance_by="resets"))
     edit_episodes(env, level=np.arange(N) % len(env.task.levels))
     env.reset()
     shares = np.bincount(episodes_of(env)["start_mode"], minlength=6) / N
@@ -112,7 +112,7 @@ def test_goals_lie_in_the_levels_box_or_ellipse_turned_by_the_heading(env, start
         here = ahead[found.level == number]
         for axis in (0, 1):
             assert covers(here[:, axis], level.goal_lower[axis], level.goal_upper[axis], 0.05)
-        if level.round:
+        if level.elliptical:
             reach = np.where(here < 0.0, np.negative(level.goal_lower), level.goal_upper)[:, :2]
             radius = np.linalg.norm(here[:, :2] / reach, axis=1)
             assert radius.max() <= 1.0 + 1e-4 and np.histogram(radius, 4, (0.0, 1.0))[0].min() > 0
@@ -157,7 +157,7 @@ def test_standing_paws_are_on_the_ground_within_their_boxes(env, starts):
 
 
 def test_landed_robots_are_around_their_goal_with_paws_at_rest_on_the_ground(starts):
-    found = starts["landed"]
+    found = starts["after_landing"]
     np.testing.assert_allclose(found.paws[..., 2], PAW_RADIUS, atol=2e-4)
     paws = found.paws_around(found.goal)
     assert covers(paws[..., 0], 0.20, 0.22)
@@ -324,6 +324,6 @@ def test_another_goal_is_planned_past_the_first_level_only(env, starts):
     assert not planned[level == 1].any()
     assert share == pytest.approx(0.175, abs=4.0 * np.sqrt(0.175 * 0.825 / (level > 1).sum()))
     assert covers(planned[planned > 0], 12.0, 42.0, 0.05)  # 0.2 to 0.7 s
-    set_levels(env, *(dataclasses.replace(level, jump_again=0.0) for level in env.task.levels))
+    set_levels(env, *(dataclasses.replace(level, next_jump_probability=0.0) for level in env.task.levels))
     env.reset()
     assert not episodes_of(env)["next_jump_step"].any()

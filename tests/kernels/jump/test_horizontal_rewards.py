@@ -18,6 +18,7 @@ from jump_helpers import (
 from jump_oracle import expected_terms, robot_of
 from jumper_warp.kernels.jump.state import FLIGHT, LANDED, STANCE
 from jumper_warp.registry import make_task
+from jumper_warp.tasks.jump.cfg import StartProbability
 
 TASK = make_task("horizontal-jump")
 E = math.exp
@@ -169,8 +170,8 @@ def test_descent_tilt_counts_in_flight_while_the_base_falls(axis):
 @pytest.fixture(scope="module")
 def rollout():
     """Logged and expected terms of jumps from all starts, (steps, terms, worlds)."""
-    shares = {"standing": 0.2, "default": 0.2, "in_flight": 0.2, "touchdown": 0.2}
-    env = make_env(64, task=TASK, reset=dataclasses.replace(TASK.reset.settings, **shares), seed=3)
+    starts = StartProbability(standing=0.2, default=0.2, in_flight=0.2, touchdown=0.2, after_landing=0.2)
+    env = make_env(64, task=TASK, reset=dataclasses.replace(TASK.reset.settings, start_probability=starts), seed=3)
     env.auto_reset = False
     logged, expected = [], []
     for step, action in enumerate(0.2 * random_actions(64, 60)):

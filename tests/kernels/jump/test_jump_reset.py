@@ -19,13 +19,13 @@ from jump_helpers import (
 from jump_starts import PAW_RADIUS, collision_flags, paws_and_velocities
 from jumper_warp.kernels.jump.state import FLIGHT, LANDED, STANCE
 from jumper_warp.registry import make_task
-from jumper_warp.tasks.jump.cfg import Level, ResetCfg
+from jumper_warp.tasks.jump.cfg import Level, ResetCfg, StartProbability
 from solver_helpers import MOTOR_Q, MOTOR_V
 
 N = 4096
 TASK = make_task("vertical-jump")
 G = 9.81
-ALL = ResetCfg(standing=0.3, default=0.1, in_flight=0.25, touchdown=0.2)
+ALL = ResetCfg(start_probability=StartProbability(0.3, 0.1, in_flight=0.25, touchdown=0.2, after_landing=0.15))
 SHARES = np.array([0.3, 0.1, 0.25, 0.2, 0.15])
 
 
@@ -113,7 +113,7 @@ def test_goals_and_starts_are_within_the_level(drawn):
     np.testing.assert_array_equal(default, np.broadcast_to(DEFAULT_ANGLE.astype(np.float32), default.shape))
 
 
-@pytest.mark.parametrize("start_mode", ["standing", "in_flight", "touchdown", "landed"])
+@pytest.mark.parametrize("start_mode", ["standing", "in_flight", "touchdown", "after_landing"])
 def test_base_place_and_attitude_cover_their_ranges(drawn, start_mode):
     _, episodes, q, qd = drawn
     worlds = some(episodes, start_mode, N)
@@ -127,7 +127,7 @@ def test_base_place_and_attitude_cover_their_ranges(drawn, start_mode):
 
 @pytest.mark.parametrize("share", [0.0, 0.25, 1.0])
 def test_a_share_of_the_commands_comes_after_a_long_wait(begun, share):
-    reset = only("default", command_delay=0.5, long_wait_share=share, long_wait=2.0)
+    reset = only("default", command_delay=0.5, long_wait_probability=share, long_wait=2.0)
     found = episodes_of(begun(reset))["command_step"]
     # 31 and 121 steps, each as likely as the others of its range
     expected = (1.0 - share) * (np.arange(121) < 31) / 31.0 + share / 121.0
@@ -136,7 +136,7 @@ def test_a_share_of_the_commands_comes_after_a_long_wait(begun, share):
     assert np.abs(np.cumsum(counts) / N - np.cumsum(expected)).max() < 1.95 / np.sqrt(N)  # Kolmogorov, 1 in 1000
 
 
-@pytest.mark.parametrize("start_mode", ["standing", "default", "landed"])
+@pytest.mark.parametrize("start_mode", ["standing", "default", "after_landing"])
 def test_robots_on_their_feet_have_their_paws_at_rest_on_the_ground(drawn, start_mode):
     env, episodes, _, _ = drawn
     worlds = some(episodes, start_mode)
@@ -151,7 +151,7 @@ def test_robots_on_their_feet_have_their_paws_at_rest_on_the_ground(drawn, start
 
 def test_landed_robots_still_fall(drawn):
     _, episodes, q, qd = drawn
-    worlds = some(episodes, "landed", N)
+    worlds = some(episodes, "after_landing", N)
     assert uniform_range(-qd[worlds, 2], 0.0, 1.0) and uniform_range(q[worlds, 2], 0.30, 0.42)
     assert np.abs(qd[worlds][:, MOTOR_V]).max() > 1.0
 
@@ -219,7 +219,7 @@ def test_loops_are_closed():
     assert env.sim.loop_gap().max() < 1e-5
 
 
-@pytest.mark.parametrize("start_mode", ["standing", "in_flight", "touchdown", "landed"])
+@pytest.mark.parametrize("start_mode", ["standing", "in_flight", "touchdown", "after_landing"])
 def test_the_default_pose_rarely_stands_in(begun, start_mode):
     env = begun(only(start_mode), Level((0.0, 0.0, 0.45), (0.0, 0.0, 1.2), (0.22, 0.45)))
     assert np.mean(env.task_arrays()["start_mode"] == NUM_START_MODES.index("default")) < 0.005
@@ -264,29 +264,28 @@ def test_worlds_past_the_last_level_draw_a_level_each_time(begun):
 
 
 @pytest.mark.parametrize(
-    "shares", [{"standing": -0.1}, {"standing": 0.9}, {"standing": 0.0, "default": 0.0, "in_flight": 1.1}]
+    "probability", [{"standing": -0.1, "default": 1.1}, {"standing": 0.9}, {"in_flight": 1.1}, {"standing": math.nan}]
 )
-def test_impossible_shares_are_refused(shares):
-    with pytest.raises(ValueError, match="shares"):
-        ResetCfg(**shares)
+def test_refuses_start_probabilities_that_do_not_add_up_to_1(probability):
+    with pytest.raises(ValueError, match="start_probability must be >= 0 and add up to 1"):
+        StartProbability(**probability)
 
 
 @pytest.mark.parametrize(
     ("change", "message"),
     [
         ({"paw_depth": (0.45, 0.3)}, r"paw_depth must be \(lower, upper\), got \(0.45, 0.3\)"),
-        ({"again_delay": (0.7, 0.2)}, "again_delay must be"),
+        ({"next_jump_delay": (0.7, 0.2)}, "next_jump_delay must be"),
         ({"landed_speed": (math.nan, 1.0)}, "landed_speed must be"),
         ({"landed_speed": (0.0, math.inf)}, "landed_speed must be finite, got inf"),
         ({"base_xy": math.nan}, "base_xy must be finite, got nan"),
         ({"command_delay": -0.1}, "command_delay must not be negative, got -0.1"),
         ({"long_wait": -0.1}, "long_wait must not be negative, got -0.1"),
-        ({"long_wait_share": 1.1}, r"long_wait_share must be in \[0, 1\], got 1.1"),
-        ({"again_delay": (-0.1, 0.2)}, "again_delay must not be negative"),
+        ({"long_wait_probability": 1.1}, r"long_wait_probability must be in \[0, 1\], got 1.1"),
+        ({"next_jump_delay": (-0.1, 0.2)}, "next_jump_delay must not be negative"),
         ({"lean": -0.1}, "lean must not be negative, got -0.1"),
         ({"push_length": (-0.1, 0.2)}, "push_length must not be negative"),
-        ({"shares_of": "worlds"}, "shares_of must be resets or time, got 'worlds'"),
-        ({"pushing": 0.1}, "shares must be >= 0 and add up to at most 1"),
+        ({"balance_by": "worlds"}, "balance_by must be resets or steps, got 'worlds'"),
     ],
 )
 def test_impossible_starts_are_refused(change, message):
@@ -297,26 +296,30 @@ def test_impossible_starts_are_refused(change, message):
 
 @pytest.mark.parametrize("share", [1.1, -0.1, math.nan])
 def test_impossible_shares_of_another_jump_are_refused(share):
-    with pytest.raises(ValueError, match="jump_again must be in") as caught:
-        Level((0.0, 0.0, 0.5), (0.0, 0.0, 0.6), (0.22, 0.35), jump_again=share)
+    with pytest.raises(ValueError, match="next_jump_probability must be in") as caught:
+        Level((0.0, 0.0, 0.5), (0.0, 0.0, 0.6), (0.22, 0.35), next_jump_probability=share)
     assert "\n" not in str(caught.value)
 
 
 def test_settings_reach_the_kernels_by_name_in_radians_and_steps():
-    cfg = ResetCfg(standing=0.5, default=0.25, in_flight=0.125, tilt=180.0, paw_depth=(0.25, 0.5))
-    delays = {"command_delay": 0.25, "long_wait": 1.5, "long_wait_share": 0.25, "again_delay": (0.5, 1.0)}
+    starts = StartProbability(standing=0.5, default=0.25, in_flight=0.125, after_landing=0.125)
+    cfg = ResetCfg(start_probability=starts, tilt=180.0, paw_depth=(0.25, 0.5))
+    delays = {"command_delay": 0.25, "long_wait": 1.5, "long_wait_probability": 0.25, "next_jump_delay": (0.5, 1.0)}
     ranges = dataclasses.replace(cfg, **delays).values(1.0 / 60.0).states
-    assert list(ranges.shares) == [0.5, 0.25, 0.125, 0.0, 0.125, 0.0] and ranges.of_time == 0
-    timed = dataclasses.replace(cfg, pushing=0.125, shares_of="time").values(1.0 / 60.0).states
-    assert list(timed.shares) == [0.5, 0.25, 0.125, 0.0, 0.0, 0.125] and timed.of_time == 1
+    assert list(ranges.start_probability) == [0.5, 0.25, 0.125, 0.0, 0.125, 0.0] and ranges.by_steps == 0
+    pushing = dataclasses.replace(starts, after_landing=0.0, pushing=0.125)
+    timed = dataclasses.replace(cfg, start_probability=pushing, balance_by="steps").values(1.0 / 60.0).states
+    assert list(timed.start_probability) == [0.5, 0.25, 0.125, 0.0, 0.0, 0.125] and timed.by_steps == 1
     assert ranges.tilt == pytest.approx(math.pi) and list(ranges.takeoff_angle) == pytest.approx([0.872665, 1.308997])
     assert list(ranges.paw_depth) == [0.25, 0.5]
-    assert (ranges.command_delay, ranges.long_wait, ranges.long_wait_share) == (15, 90, 0.25)
-    assert list(ranges.again_delay) == pytest.approx([30.0, 60.0])
+    assert (ranges.command_delay, ranges.long_wait, ranges.long_wait_probability) == (15, 90, 0.25)
+    assert list(ranges.next_jump_delay) == pytest.approx([30.0, 60.0])
 
 
 def test_a_levels_numbers_reach_the_kernels():
-    level = Level((0.25, -0.5, 0.0), (0.5, 0.75, 1.0), (0.125, 0.375), jump_again=0.75, round=True).values()
-    assert level.round == 1
+    level = Level(
+        (0.25, -0.5, 0.0), (0.5, 0.75, 1.0), (0.125, 0.375), next_jump_probability=0.75, elliptical=True
+    ).values()
+    assert level.elliptical == 1
     assert (list(level.goal_lower), list(level.goal_upper)) == ([0.25, -0.5, 0.0], [0.5, 0.75, 1.0])
-    assert (list(level.base_height), level.jump_again) == ([0.125, 0.375], 0.75)
+    assert (list(level.base_height), level.next_jump_probability) == ([0.125, 0.375], 0.75)

@@ -203,7 +203,7 @@ def test_draws_follow_seed_and_clock_and_nothing_else():
         assert abs(np.corrcoef(first, other)[0, 1]) < 5.0 / np.sqrt(N)
 
 
-WALKING = dataclasses.replace(RandomizationCfg.walking(), push_interval=(0.05, 0.1), push_share=0.7)
+WALKING = dataclasses.replace(RandomizationCfg.walking(), push_interval=(0.05, 0.1), push_probability=0.7)
 
 
 def test_a_replayed_graph_draws_the_same_bits_as_single_launches():

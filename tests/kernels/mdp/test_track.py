@@ -20,12 +20,16 @@ N = 64
 WEIGHT = 142.0  # [N]
 
 
-def contact_force(force, link_margin=0.0, block_margin=0.0):
+def contact_force(force, self_collision_margin=0.0, obstacle_margin=0.0):
     """Return the settings of skills with a least contact force [N] each."""
     settings = []
     for least in np.atleast_1d(force):
         found = TaskRuntime(make_task("vertical-jump"), 0, 1, STEP_DT, 8, "cpu").settings_of_skill()
-        found.contact_force, found.link_margin, found.block_margin = float(least), link_margin, block_margin
+        found.contact_force, found.self_collision_margin, found.obstacle_margin = (
+            float(least),
+            self_collision_margin,
+            obstacle_margin,
+        )
         settings.append(found)
     return wp.array(settings, dtype=SkillSettings, device="cpu")
 
@@ -238,7 +242,7 @@ def test_blocks_are_larger_by_their_margin_for_links_but_not_for_paws(sim, poses
     for drawn, settings in ((0.0, margin), (margin, 0.0), (0.0, 0.0)):
         ground, robot = hills(), standing_robots(n)
         ground.blocks, robot.joint_q = blocks(n, drawn), poses
-        track(robot, sim, ground=ground, settings=contact_force(0.1, block_margin=settings))
+        track(robot, sim, ground=ground, settings=contact_force(0.1, obstacle_margin=settings))
         found.append((robot.collisions.numpy().copy(), robot.paw_height.numpy().copy()))
     (flags, heights), (grown, _), (plain, level) = found
     np.testing.assert_array_equal(flags, grown)

@@ -87,7 +87,7 @@ def test_commands_of_the_last_level_reach_far_ahead_but_not_across_as_well(env):
     edit(env, command_level=10, steps=0)
     env.reset()
     command = states_of(env)["command"]
-    ahead, back, aside, turning = TASK.levels[0].wide
+    ahead, back, aside, turning = TASK.levels[0].last_range
     assert 0.9 * ahead < command[:, 0].max() <= ahead and command[:, 0].min() >= -back
     assert 0.85 * aside < np.abs(command[:, 1]).max() <= aside
     assert 0.85 * turning < np.abs(command[:, 2]).max() <= turning
@@ -140,8 +140,8 @@ def test_a_seed_begins_as_it_began_before_levels_included(env):
 
 
 def test_reset_ranges_are_taken_from_the_task():
-    settings = dataclasses.replace(RESET, height=(0.40, 0.41), tilt=0.0, lin_vel=0.0, ang_vel=0.0, default_share=0.0,
-                                   lifted_share=0.0, gait=2.0, episode=5.0)  # fmt: skip
+    still = {"tilt": 0.0, "lin_vel": 0.0, "ang_vel": 0.0, "default_pose_probability": 0.0, "swing_probability": 0.0}
+    settings = dataclasses.replace(RESET, height=(0.40, 0.41), gait=2.0, episode=5.0, **still)
     values = settings.values(1.0 / 60.0)
     assert values.episode_steps == 300 and values.pace == pytest.approx(1.0 / 30.0)
     assert tuple(values.height) == pytest.approx((0.40, 0.41)) and values.map.rows == 0
