@@ -35,7 +35,7 @@ class Reset:
     """How an episode begins."""
 
     func: Function
-    """(robot: RobotArrays, scene: Scene, skill: SkillSettings, task, settings, level, draw: Draw) -> task of the new
+    """(arrays: RobotArrays, scene: Scene, skill: SkillSettings, old, settings, level, rng: RngStream) -> state of the new
     episode; writes coordinates and rates of `draw.world`."""
     settings: Any = None
     """Frozen dataclass with `struct`, the type of the kernels' settings, and `values(step_dt)`, which makes them."""
@@ -53,7 +53,7 @@ class Command:
     due: Function | None = None
     """(state) -> bool, whether a new command is drawn within the episode."""
     draw: Function | None = None
-    """(robot, scene: Scene, state, level, draw: Draw) -> task with a new command."""
+    """(robot, scene: Scene, state, level, rng: RngStream) -> state with a new command."""
 
     def __post_init__(self) -> None:
         """Raises ValueError: one of due and draw is missing."""
