@@ -53,7 +53,7 @@ def sample_rotation(rng: RngStream, ranges: TurnRanges) -> wp.quat:
 
 @wp.func
 def give_turn(robot: RobotView, scene: Scene, state: AttitudeState, values: wp.vec4, heading: float) -> AttitudeState:
-    """Return the state with a commanded rotation (xyzw, any length) from the present orientation; all 0: no rotation."""
+    """Return the state with a commanded rotation (xyzw, any length) from the present orientation; 0: none."""
     turn = wp.quat(values[0], values[1], values[2], values[3])
     if wp.length(values) == 0.0:
         turn = wp.quat(0.0, 0.0, 0.0, 1.0)
