@@ -6,7 +6,7 @@
 
     @wp.func
     def level(robot: mdp.RobotView, state: mdp.JumpState, scale: float) -> float:
-        return wp.where(state.phase == mdp.FLIGHT, mdp.rewards.psi(mdp.tilt(view), scale), 0.0)
+        return wp.where(state.phase == mdp.FLIGHT, mdp.rewards.psi(mdp.tilt(robot), scale), 0.0)
 
     jump = make_task("vertical-jump")
     jump = replace(jump, rewards=(*jump.rewards, mdp.RewardTerm(level, weight=2.0, scale=0.1)))

@@ -1,4 +1,4 @@
-"""The end of a policy step: the task moves on, its terminations and rewards, and the curriculum."""
+"""End of a policy step: advance the task's state, then terminations, rewards and the curriculum."""
 
 from typing import Any
 
@@ -18,7 +18,7 @@ def update_curriculum(
     episode: EpisodeArrays, counters: Counters, world: int, success: bool, error: float, promote_after: float,
     num_levels: int,
 ):  # fmt: skip
-    """Take an ended episode into the curriculum: successes in a row raise the world's level."""
+    """Count an ended episode for the curriculum: `promote_after` successes in a row raise the world's level."""
     streak = wp.where(success, episode.streak[world] + 1, 0)
     if streak >= int(promote_after):
         streak = int(0)
@@ -35,7 +35,7 @@ def write_step_result(
     episode: EpisodeArrays, counters: Counters, world: int, total: float, termination: int, timeout: float,
     diverged: bool,
 ):  # fmt: skip
-    """Write how a policy step of a world ended."""
+    """Write reward, done flags and termination of a world's policy step, and advance its step count."""
     episode.reward[world] = total
     episode.termination[world] = termination
     episode.done[world] = wp.where(termination == NOT_TERMINATED, 0.0, 1.0)
@@ -71,7 +71,7 @@ def make_step_kernel(task: Any) -> wp.Kernel:
         term_value: wp.array2d(dtype=float),
         counters: Counters,
     ):
-        """Move every world of the skill on by one policy step; one thread per world.
+        """Advance the task state of every world of a skill by one policy step; one thread per world.
 
         term_value: rewards of this step, weights applied, (rewards, num_worlds). Those that are not finite count 0.
         """

@@ -28,7 +28,7 @@ OF_WORLD = ("level", "streak")
 
 
 class Table:
-    """Functions of (view, task, ...), compiled into one kernel as a task's are, to be called one at a time."""
+    """Functions of (robot, state, ...), compiled into one kernel as a task's are, to be called one at a time."""
 
     def __init__(self, funcs, returns: type, state=JumpState):
         """funcs: of terms of the state's task or of any; returns: float or bool."""
