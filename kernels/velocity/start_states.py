@@ -77,7 +77,7 @@ class VelocityBase:
 
 @wp.func
 def sample_tile(rng: RngStream, map: Map, level: int) -> wp.vec2:
-    """Return the centre [m] of a sampled tile of a terrain level, past the last one of any; the origin without a map."""
+    """Return the centre [m] of a sampled tile of a terrain level (any past the last); the origin without a map."""
     if map.rows == 0:
         return wp.vec2(0.0)
     row = level
