@@ -92,7 +92,8 @@ def _flag_of_term(term: Term, where: str) -> Flag | None:
     """Return the flags of a term's numbers, and of the options that are whole numbers."""
     settings = {**term.settings, **term.options}
     numbers = term.numbers | {key: option for key, option in term.options.items() if type(option) is int}
-    flags = {key: Flag(int if type(settings.get(key)) is int else float, value) for key, value in numbers.items()}
+    kinds = {int: int, tuple: tuple[float, float]}
+    flags = {key: Flag(kinds.get(type(settings.get(key)), float), value) for key, value in numbers.items()}
     return _group(_first_paragraph(inspect.getdoc(term.func.func)), flags, where) if flags else None
 
 

@@ -147,6 +147,6 @@ def smooth_reward(task: Any, moment: Moment) -> torch.Tensor:
     total = torch.zeros_like(moment.goal)
     for term in task.rewards:
         if term.func.key in SMOOTH:
-            time = 1.0 if term.options["once"] else moment.step_dt
+            time = moment.step_dt if term.options["scale_by_dt"] else 1.0
             total = total + term.numbers["weight"] * time * SMOOTH[term.func.key](moment, term.numbers)
     return total

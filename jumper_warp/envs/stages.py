@@ -173,7 +173,7 @@ class Stages:
         self._restore_first_task(part, mask)
         self._randomize(part, mask)
         for skill in self.skills:
-            lanes = attempts.LANES if self.wp_device.is_cuda and skill.task.reset.side_by_side else 1
+            lanes = attempts.LANES if self.wp_device.is_cuda and skill.task.reset.parallel else 1
             self._launch(
                 skill.kernels["reset"], (part.count, lanes),
                 [skill.index, lanes, mask, self._scene, self._settings, skill.settings, skill.levels, part.episode,
@@ -200,14 +200,14 @@ class Stages:
             slots = enumerate(skill.task.params.slots["events"])
             due = {i: slot for i, slot in slots if slot.term.due_at(stage)}
             if due:
-                spread = self.wp_device.is_cuda and any(slot.spread for slot in due.values())
-                first, lanes = min(due), events.LANES if spread else 1
+                parallel = self.wp_device.is_cuda and any(slot.parallel for slot in due.values())
+                first, lanes = min(due), events.LANES if parallel else 1
                 self._launch(
                     skill.kernels["event"], (max(due) - first + 1, lanes, part.count),
                     [skill.index, stage, first, lanes, mask, self.step_dt, part.episode, skill.params.values,
                      skill.timer, self.parameters], BLOCKS["event"], EVENT_BLOCKS,
                 )  # fmt: skip
-            if any(slot.repack for slot in due.values()):
+            if any(slot.update_solver for slot in due.values()):
                 self.sim.physics.parameters_changed(mask, WorldRange(part.first, part.count))
 
     def _clear_history(self, part: WorldSlice, mask: wp.array) -> None:

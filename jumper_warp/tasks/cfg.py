@@ -39,7 +39,7 @@ class Reset:
     the new episode; writes coordinates and rates of `rng.world`."""
     settings: Any = None
     """Frozen dataclass with `struct`, the type of the kernels' settings, and `values(step_dt)`, which makes them."""
-    side_by_side: bool = False
+    parallel: bool = False
     """Whether `func` makes attempts `range(rng.lane, number, rng.lanes)`, which threads of a GPU share: they run it
     with the same arguments but for `rng.lane`, and all that they write otherwise must be the same."""
 

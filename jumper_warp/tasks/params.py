@@ -20,15 +20,18 @@ from jumper_warp.utils.errors import InputError
 class TermSlot(SimpleNamespace):
     """A term as kernels read it.
 
-    Each of its `settings` is an attribute, the index of its value: `p[slot.weight]`. So are its options, as values.
+    Each of its `settings` is an attribute, the index of its value, of a pair the first: `p[slot.weight]`. So are its
+    options, as values.
     """
 
     def __init__(self, term: Any, offset: int) -> None:
         """offset: index of the term's first number."""
-        super().__init__(**term.options, **{name: offset + i for i, name in enumerate(term.settings)})
+        numbers = list(term.flat_numbers)
+        settings = numbers[: len(numbers) - term.num_params]
+        super().__init__(**term.options, **{name.removesuffix(".lower"): offset + i for i, name in enumerate(settings)})
         self.term, self.func, self.parameterless = term, term.func, not term.num_params
         """parameterless: Warp refuses an empty `*p[start:start]`."""
-        self.start, self.stop = offset + len(term.settings), offset + len(term.numbers)
+        self.start, self.stop = offset + len(settings), offset + len(numbers)
         """Range of the function's parameters."""
         self.compiled = (term.func, offset, self.start, self.stop, *term.options.items())
         """What a kernel holds of the term; tasks with the same share the kernel, whatever their numbers."""
@@ -48,7 +51,7 @@ class TaskParams:
         for section, terms in sections.items():
             for term in terms:
                 self.slots[section].append(TermSlot(term, len(self.values)))
-                for key, value in term.numbers.items():
+                for key, value in term.flat_numbers.items():
                     self.names.setdefault(f"{section}.{term.name}.{key}", len(self.values))
                     self.values.append(float(value))
 

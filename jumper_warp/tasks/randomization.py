@@ -161,30 +161,30 @@ class RandomizationCfg:
         """Return the rows that are on as events."""
         found = []
 
-        def add(func: Any, pair: Range, scale: float = 1.0, spread: bool = False, **more: float) -> None:
+        def add(func: Any, pair: Range, scale: float = 1.0, parallel: bool = False, **more: float) -> None:
             if pair is not None:
                 ends = {"lower": scale * pair[0], "upper": scale * pair[1]}
-                found.append(EventTerm(func, mode=self.resample_at, spread=spread, **ends, **more))
+                found.append(EventTerm(func, mode=self.resample_at, parallel=parallel, **ends, **more))
 
         add(parameters.base_mass, self.base_mass)
-        add(parameters.link_mass, self.link_mass, spread=True)
+        add(parameters.link_mass, self.link_mass, parallel=True)
         add(parameters.com_shift, self.com_shift)
-        add(parameters.armature, self.armature, spread=True)
-        add(parameters.motor_friction, self.motor_friction, spread=True)
+        add(parameters.armature, self.armature, parallel=True)
+        add(parameters.motor_friction, self.motor_friction, parallel=True)
         if self.gains or self.damping_gains:
             kp = self.gains or (1.0, 1.0)
             kd = self.damping_gains or kp
             found.append(
-                EventTerm(parameters.gains, mode=self.resample_at, spread=True, kp_lower=kp[0], kp_upper=kp[1],
+                EventTerm(parameters.gains, mode=self.resample_at, parallel=True, kp_lower=kp[0], kp_upper=kp[1],
                           kd_lower=kd[0], kd_upper=kd[1])
             )  # fmt: skip
         if self.no_load_speed or self.cutoff_speed:
             low, high = self.no_load_speed or (1.0, 1.0), self.cutoff_speed or (1.0, 1.0)
             found.append(
-                EventTerm(parameters.speed_limits, mode=self.resample_at, spread=True, no_load_lower=low[0],
+                EventTerm(parameters.speed_limits, mode=self.resample_at, parallel=True, no_load_lower=low[0],
                           no_load_upper=low[1], cutoff_lower=high[0], cutoff_upper=high[1])
             )  # fmt: skip
-        add(parameters.joint_offset, self.joint_offset, math.pi / 180.0, spread=True)
+        add(parameters.joint_offset, self.joint_offset, math.pi / 180.0, parallel=True)
         if self.dynamic_friction or self.static_friction:
             dynamic = self.dynamic_friction or (NOMINAL_FRICTION, NOMINAL_FRICTION)
             static = self.static_friction or (0.0, 0.0)  # not below the dynamic one
@@ -197,9 +197,9 @@ class RandomizationCfg:
         add(parameters.observation_latency, self.observation_latency, 1.0e-3, zero_probability=zero)
         if self.push_force or self.push_torque:
             force, torque = self.push_force or (0.0, 0.0), self.push_torque or (0.0, 0.0)
-            timing: dict[str, Any] = {"mode": "reset", "repack": False}
+            timing: dict[str, Any] = {"mode": "reset", "update_solver": False}
             if self.push_interval is not None:
-                timing |= {"mode": "interval", "least": self.push_interval[0], "most": self.push_interval[1]}
+                timing |= {"mode": "interval", "interval_range_s": self.push_interval}
             found.append(
                 EventTerm(parameters.push, **timing, probability=self.push_probability, force_lower=force[0],
                           force_upper=force[1], torque_lower=torque[0], torque_upper=torque[1])

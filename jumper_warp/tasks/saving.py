@@ -21,6 +21,7 @@ import warp as wp
 import jumper_warp.tasks
 from jumper_warp.kernels.mdp.env import NoSettings
 from jumper_warp.tasks.cfg import Handover, TaskCfg
+from jumper_warp.tasks.ranges import Pair
 from jumper_warp.tasks.terms import RewardTerm, Term
 from jumper_warp.utils.checks import NAME, version_refusal
 from jumper_warp.utils.errors import InputError
@@ -59,19 +60,19 @@ def name_of(thing: Any) -> str:
     return f"{module}:{name}"
 
 
-def parameterless(value: Any) -> Any:
+def json_value(value: Any) -> Any:
     """Return a configuration as JSON can hold it. Raises TaskError: a part of it could not be read back."""
     if isinstance(value, Term):
-        options = {key: parameterless(option) for key, option in value.options.items()}
+        options = {key: json_value(option) for key, option in value.options.items()}
         named = {"type": name_of(type(value)), "func": name_of(value.func), "name": value.name}
-        return {**named, **value.numbers, **options}
+        return {**named, **{key: json_value(number) for key, number in value.numbers.items()}, **options}
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        fields = {spec.name: parameterless(getattr(value, spec.name)) for spec in dataclasses.fields(value)}
+        fields = {spec.name: json_value(getattr(value, spec.name)) for spec in dataclasses.fields(value)}
         return {"type": name_of(type(value)), **fields}
     if isinstance(value, wp.Function | Struct):
         return name_of(value)
     if isinstance(value, tuple):
-        return [parameterless(v) for v in value]
+        return [json_value(v) for v in value]
     if not (value is None or isinstance(value, bool | int | float | str)):
         raise TaskError(f"{shown(value)} cannot be saved: settings are numbers, strings, tuples and dataclasses")
     if isinstance(value, float) and not math.isfinite(value):
@@ -81,7 +82,7 @@ def parameterless(value: Any) -> Any:
 
 def task_to_json(task: TaskCfg) -> dict[str, Any]:
     """Return a task as JSON can hold it. Raises TaskError: a function of it cannot be found again."""
-    return {"version": VERSION, **parameterless(task)}
+    return {"version": VERSION, **json_value(task)}
 
 
 def handover_to_json(handover: Handover) -> dict[str, Any]:
@@ -238,7 +239,8 @@ def _term(kind: type[Term], saved: dict[str, Any], where: str, find: Finder) -> 
     if not 0 <= saved.get("history", 1) <= MAX_ENTRIES:
         raise TaskError(f"{where}.history must be at most {MAX_ENTRIES}")
     for key in set(saved) - set(kind.options) - {"name"}:
-        _scalar(saved[key], float, f"{where}.{key}"[:100])
+        hint = Pair if isinstance(kind.settings.get(key), tuple) else float
+        saved[key] = _value(saved[key], hint, f"{where}.{key}"[:100], find)
     if kind is RewardTerm and "weight" not in saved:
         raise TaskError(f"{where}: a reward needs a weight")
     try:

@@ -69,7 +69,9 @@ class Term:
         for key, value in self.numbers.items():
             if value is REQUIRED:
                 raise InputError(f"{where}: parameter {key!r} is missing")
-            if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) <= FLOAT32_MAX:
+            parts = value if isinstance(known[key], tuple) and isinstance(value, tuple) else (value,)
+            wrong = any(isinstance(part, bool) or not isinstance(part, int | float) for part in parts)
+            if wrong or not all(abs(part) <= FLOAT32_MAX for part in parts):
                 raise InputError(f"{where}: parameter {key!r} must be a finite number, got {value!r:.60}")
         self.options = {key: given.get(key, default) for key, default in type(self).options.items()}
         self.num_params = len(params)
@@ -87,6 +89,15 @@ class Term:
     def replace(self, **changes: Any) -> Any:
         """Return the term with other numbers or options; raises ValueError as the constructor."""
         return type(self)(**{"func": self.func, "name": self.name, **self.numbers, **self.options, **changes})
+
+    @property
+    def flat_numbers(self) -> dict[str, float]:
+        """Numbers by name in the order of the device's array; a pair as `name.lower` and `name.upper`."""
+        flat: dict[str, float] = {}
+        for key, value in self.numbers.items():
+            pair = isinstance(value, tuple)
+            flat |= {f"{key}.lower": value[0], f"{key}.upper": value[1]} if pair else {key: value}
+        return flat
 
     @property
     def of_state(self) -> Any:
@@ -107,10 +118,10 @@ class Term:
 
 
 class RewardTerm(Term):
-    """(robot: RobotView, state, ...) -> float; times the weight, and times the policy step [s] unless paid `once`."""
+    """(robot: RobotView, state, ...) -> float; times the weight, and with `scale_by_dt` times the policy step [s]."""
 
     settings: ClassVar = {"weight": REQUIRED}
-    options: Mapping[str, Any] = {"once": False}
+    options: Mapping[str, Any] = {"scale_by_dt": True}
     returns: ClassVar = (float, wp.float32)
 
     def __init__(self, func: Function, weight: float, **given: Any) -> None:
@@ -177,24 +188,26 @@ class ObservationTerm(Term):
 class EventTerm(Term):
     """(parameters: RobotParameters, rng: RngStream, ...), writes the parameters of `rng.world`.
 
-    mode: once at the start ("startup"), at every "reset", or also at "interval"s of `least` to `most` seconds.
-    repack: whether the solver must read the model again, as after any but pushes and latencies.
-    spread: whether its loop is one over range(draw.lane, end, draw.lanes), which threads share; not at intervals.
+    mode: once at the start ("startup"), at every "reset", or also at "interval"s sampled from
+    `interval_range_s`.
+    update_solver: whether the solver must read the model again, as after any but pushes and latencies.
+    parallel: whether its loop is one over range(rng.lane, end, rng.lanes), which threads share; not at intervals.
     """
 
-    settings: ClassVar = {"least": 0.0, "most": 0.0}
-    options: Mapping[str, Any] = {"mode": "reset", "repack": True, "spread": False}
+    settings: ClassVar = {"interval_range_s": (0.0, 0.0)}
+    options: Mapping[str, Any] = {"mode": "reset", "update_solver": True, "parallel": False}
     takes: ClassVar = (RobotParameters,)
 
     def __init__(self, func: Function, **given: Any) -> None:
         super().__init__(func, **given)
-        mode, least, most = self.options["mode"], self.numbers["least"], self.numbers["most"]
+        mode, interval = self.options["mode"], self.numbers["interval_range_s"]
         if mode not in ("startup", "reset", "interval"):
             raise InputError(f"EventTerm {self.name}: mode must be startup, reset or interval, got {mode!r:.40}")
-        if mode == "interval" and self.options["spread"]:
-            raise InputError(f"EventTerm {self.name}: an event at intervals cannot be spread")
-        if mode == "interval" and not 0.0 < least <= most:
-            raise InputError(f"EventTerm {self.name}: an interval needs 0 < least <= most [s], got {least}, {most}")
+        if mode == "interval" and self.options["parallel"]:
+            raise InputError(f"EventTerm {self.name}: an event at intervals cannot be parallel")
+        rises = isinstance(interval, tuple) and len(interval) == 2 and 0.0 <= interval[0] <= interval[1]
+        if not rises or (mode == "interval" and interval[0] == 0.0):
+            raise InputError(f"EventTerm {self.name}: interval_range_s must be (lower, upper) above 0, got {interval}")
 
     def due_at(self, stage: int) -> bool:
         """Return whether it may be due at a stage of `jumper_warp.kernels.mdp.events`."""

@@ -40,7 +40,7 @@ def make_event_kernel(slots: list) -> wp.Kernel:
     ):
         """Run what is due at a stage where mask is not 0; launch over (events from `first` on, lanes, num_worlds).
 
-        The lanes share the loops of events that are `spread`; of the others the first lane is all.
+        The lanes share the loops of events that are `parallel`; of the others the first lane is all.
 
         timer: policy steps until the next time, (events, num_worlds), 0: not set yet, as after a handover. An interval
         event is due at a reset as well.
@@ -51,9 +51,9 @@ def make_event_kernel(slots: list) -> wp.Kernel:
         if episode.skill[world] != skill or mask[world] == 0.0:
             return
         for i in range(wp.static(len(slots))):
-            if row == i and (wp.static(bool(slots[i].spread)) or lane == 0):
+            if row == i and (wp.static(bool(slots[i].parallel)) or lane == 0):
                 rng = make_stream(episode.seed, world, episode.step_count[world], EVENT + 100 * stage + i)
-                if wp.static(bool(slots[i].spread)):
+                if wp.static(bool(slots[i].parallel)):
                     rng.lane = lane
                     rng.lanes = lanes
                 due = stage == wp.static(modes[i])
@@ -61,7 +61,12 @@ def make_event_kernel(slots: list) -> wp.Kernel:
                     left = timer[i, world] - 1
                     due = stage == wp.static(AT_RESET) or (stage == wp.static(AT_STEP) and left == 0)
                     if due or left < 0:
-                        left = steps_until(rng, p[wp.static(slots[i].least)], p[wp.static(slots[i].most)], step_dt)
+                        left = steps_until(
+                            rng,
+                            p[wp.static(slots[i].interval_range_s)],
+                            p[wp.static(slots[i].interval_range_s + 1)],
+                            step_dt,
+                        )
                     if stage != wp.static(STARTUP):
                         timer[i, world] = left
                 if due:

@@ -114,7 +114,7 @@ def make_step_kernel(task: Any) -> wp.Kernel:
                     robot, state, *p[wp.static(rewards[i].start) : wp.static(rewards[i].stop)]
                 )
             value = p[wp.static(rewards[i].weight)] * raw
-            if wp.static(not rewards[i].once):
+            if wp.static(bool(rewards[i].scale_by_dt)):
                 value = value * arrays.step_dt
             if diverged:
                 value = float(0.0)

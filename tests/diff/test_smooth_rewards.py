@@ -36,7 +36,7 @@ def test_smooth_rewards_have_the_values_of_the_environments_terms():
         for term, values in zip(TASK.rewards, env.skills[0].term_value.numpy(), strict=True):
             if term.func.key not in SMOOTH:
                 continue
-            time = 1.0 if term.options["once"] else env.step_dt
+            time = env.step_dt if term.options["scale_by_dt"] else 1.0
             found = term.numbers["weight"] * time * SMOOTH[term.func.key](moment, term.numbers)
             if term.name == "jump_height":
                 at_apex = (goes_on.numpy() == 1) & (arrays["at_apex"] == 1)

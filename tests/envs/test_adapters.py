@@ -205,13 +205,13 @@ def test_tensors_are_what_arrays_are():
 
 
 def test_statistics_of_a_wrapper_are_those_counted_by_hand():
-    parameterless, envs = GymVectorEnv(jumper(seed=4)), RecordEpisodeStatistics(GymVectorEnv(jumper(seed=4)))
-    parameterless.reset()
+    plain, envs = GymVectorEnv(jumper(seed=4)), RecordEpisodeStatistics(GymVectorEnv(jumper(seed=4)))
+    plain.reset()
     envs.reset()
     returns, lengths = np.zeros(N), np.zeros(N, dtype=int)
     expected = []
     for action in ACTIONS:
-        _, reward, terminated, truncated, _ = parameterless.step(action)
+        _, reward, terminated, truncated, _ = plain.step(action)
         *_, infos = envs.step(action)
         returns += reward
         lengths += 1

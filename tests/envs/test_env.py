@@ -288,7 +288,7 @@ def test_mujoco_takes_the_same_steps():
         (lambda: dataclasses.replace(TASK, rewards=(*TASK.rewards, TASK.rewards[0])), "name of its own"),
         (lambda: dataclasses.replace(TASK, terminations=()), "came_apart"),
         (lambda: dataclasses.replace(TASK, terminations=TASK.terminations[:1]), "came_apart"),
-        (lambda: dataclasses.replace(TASK, levels=()), "argument 6 of reset_jump is JumpLevel, the task has Nothing"),
+        (lambda: dataclasses.replace(TASK, levels=()), "argument 6 of reset_jump is JumpLevel, the task has NoSettings"),
         (lambda: RewardTerm(my_own_term, math.nan, scale=1.0), "my_own_term: parameter 'weight' must be a finite"),
         (lambda: RewardTerm(my_own_term, 1.0, scale=1.0, width=1.0), "unknown parameter 'width'"),
         (lambda: RewardTerm(my_own_term, 1.0), "parameter 'scale' is missing"),

@@ -182,7 +182,7 @@ def probe_task(**changes) -> TaskCfg:
         rewards=(
             RewardTerm(value, 3.0),
             RewardTerm(offset_square, -0.5, offset=1.5, scale=2.0),
-            RewardTerm(other, 4.0, once=True),
+            RewardTerm(other, 4.0, scale_by_dt=False),
             RewardTerm(base_height, 10.0),
         ),
         terminations=(

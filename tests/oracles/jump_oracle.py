@@ -221,7 +221,7 @@ def expected_terms(task, before: dict, after: dict, action: np.ndarray) -> np.nd
     robot = between(before, after, action)
     return np.array(
         [
-            TERMS[term.name](robot, params_of(term)) * term.weight * (1.0 if term.options["once"] else DT)
+            TERMS[term.name](robot, params_of(term)) * term.weight * (DT if term.options["scale_by_dt"] else 1.0)
             for term in task.rewards
         ]
     )

@@ -20,8 +20,8 @@ from jumper_warp.tasks.saving import (
     MAX_ENTRIES,
     OPTIONAL,
     TaskError,
+    json_value,
     name_of,
-    parameterless,
     task_from_json,
     task_to_json,
 )
@@ -132,7 +132,7 @@ class Settings:
 @pytest.mark.parametrize("value", [math.nan, math.inf, {"a": 1.0}, [1.0], b"x", object()])
 def test_setting_that_would_not_come_back_is_not_saved(value):
     with pytest.raises(TaskError):
-        parameterless(Settings(value))
+        json_value(Settings(value))
 
 
 @pytest.mark.parametrize(
@@ -146,15 +146,15 @@ def test_setting_that_would_not_come_back_is_not_saved(value):
         (lambda t: t["rewards"][0].update(fin=0.1), r"task.rewards\[0\]: .* unknown parameter 'fin'"),
         (lambda t: t["rewards"][0].pop("std_fine"), r"task.rewards\[0\]: .* parameter 'std_fine' is missing"),
         (lambda t: t["rewards"][0].update(name="a\nb"), "a name is of letters"),
-        (lambda t: t["rewards"][0].update(once="yes"), r"task.rewards\[0\].once: expected bool, got 'yes'"),
+        (lambda t: t["rewards"][0].update(scale_by_dt=2), r"task.rewards\[0\].scale_by_dt: expected bool, got 2"),
         (lambda t: t["rewards"][0].update(weight=10**400), r"weight: must be finite, got a huge integer"),
         (lambda t: t["rewards"][0].update(func="jumper_warp.kernels.jump.state:JumpState"), "is not a @wp.func"),
         (lambda t: t["rewards"][0].update(func="jumper_warp.kernels.jump.rewards:wp"), "there is no such one here"),
-        (lambda t: t["rewards"][0].update(func=f"{JUMP}.terminations:success", steps=1.0), "must return float"),
+        (lambda t: t["rewards"][0].update(func=f"{JUMP}.terminations:landed_for", steps=1.0), "must return float"),
         (lambda t: t["rewards"][0].update(type="jumper_warp.tasks.terms:TerminationTerm"), "expected .* RewardTerm"),
         (lambda t: t["policy"][0].update(history=10**9), "history must be at most"),
         (lambda t: t["advance"].update(func="jumper_warp.kernels.mdp.view:load_view"), "must be annotated RobotView"),
-        (lambda t: t.update(state="jumper_warp.kernels.mdp.env:Nothing"), "not a struct that counts steps"),
+        (lambda t: t.update(state="jumper_warp.kernels.mdp.env:NoSettings"), "not a struct that counts steps"),
         (lambda t: t["levels"].append({"type": "jumper_warp.robot.motors:LimitsCfg", "lower": 0.0, "upper": 1.0}),
          r"task.levels\[6\]: .* needs struct and values"),
         (lambda t: t.update(levels=t["levels"] * MAX_ENTRIES), f"expected at most {MAX_ENTRIES} entries"),
@@ -192,7 +192,7 @@ def deep(levels):
 VALUES = [
     None, True, False, 0, 1, -1, 2.5, -0.0, 1e308, -1e300, 1e-300, math.nan, math.inf, -math.inf, 10**30, 10**400,
     "", "x", "base_at_rest", "a\nb", "\ud800", "os:system", "os.path:join", "trap:func", f"{JUMP}.rewards:base_at_rest",
-    f"{JUMP}.state:JumpState", "jumper_warp.kernels.mdp.env:Nothing", f"{JUMP}.rewards:wp", f"{JUMP}.rewards:",
+    f"{JUMP}.state:JumpState", "jumper_warp.kernels.mdp.env:NoSettings", f"{JUMP}.rewards:wp", f"{JUMP}.rewards:",
     ":rest", "a:b:c", "jumper_warp.tasks.cfg:TaskCfg", "jumper_warp.tasks.terms:Term", "jumper_warp.tasks.cfg:Reset",
     "jumper_warp.tasks.terms:EventTerm", "jumper_warp.robot.description:RobotDescription",
     "jumper_warp.robot.parts:Motor", "jumper_warp.tasks.jump.cfg:GroundCfg", "jumper_warp.tasks.saving:Finder",

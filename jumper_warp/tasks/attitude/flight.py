@@ -79,7 +79,7 @@ def attitude_in_flight() -> TaskCfg:
         name="attitude",
         state=AttitudeState,
         advance=Advance(state.advance_attitude, tolerance=TOLERANCE * DEG),
-        reset=Reset(reset_attitude, AttitudeResetCfg(), side_by_side=True),
+        reset=Reset(reset_attitude, AttitudeResetCfg(), parallel=True),
         command=Command(set_turn),
         curriculum=Curriculum(
             state.attitude_error, tolerance=10.0 * DEG, promote_after=5, counts=state.every_episode, unit="rad"

@@ -112,7 +112,7 @@ def horizontal_jump() -> TaskCfg:
         name="horizontal-jump",
         state=JumpState,
         advance=Advance(phase.advance_jump, takeoff_speed=0.25),
-        reset=Reset(reset.reset_jump, RESET, side_by_side=True),
+        reset=Reset(reset.reset_jump, RESET, parallel=True),
         command=Command(reset.set_jump, reset.next_jump_due, reset.resample_jump),
         curriculum=Curriculum(errors.landing_error, tolerance=0.10, counts=reset.from_standing),
         rewards=REWARDS,

@@ -32,7 +32,7 @@ QUIET = (
 """What standing quietly costs less of, before the command and after the landing."""
 
 REWARDS = (
-    RewardTerm(rewards.jump_height, 40.0, std_fine=0.10, scale_sharp=0.05, std_wide=0.4, once=True),
+    RewardTerm(rewards.jump_height, 40.0, std_fine=0.10, scale_sharp=0.05, std_wide=0.4, scale_by_dt=False),
     RewardTerm(rewards.estimated_jump_height, 20.0, std_fine=0.10, scale_sharp=0.05, std_wide=0.4),
     RewardTerm(rewards.horizontal_velocity, 10.0, speed_scale=0.04, waiting_scale=PATIENCE),
     RewardTerm(rewards.orientation, 15.0, std=0.1, waiting_scale=PATIENCE),
@@ -94,7 +94,7 @@ def vertical_jump() -> TaskCfg:
         name="vertical-jump",
         state=JumpState,
         advance=Advance(phase.advance_jump, takeoff_speed=TAKEOFF_SPEED),
-        reset=Reset(reset.reset_jump, RESET, side_by_side=True),
+        reset=Reset(reset.reset_jump, RESET, parallel=True),
         command=Command(reset.set_jump, reset.next_jump_due, reset.resample_jump),
         curriculum=Curriculum(errors.height_error, tolerance=0.05, counts=reset.from_standing),
         rewards=REWARDS,

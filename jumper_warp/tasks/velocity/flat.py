@@ -103,7 +103,7 @@ def velocity_flat() -> TaskCfg:
         name="velocity-flat",
         state=VelocityState,
         advance=Advance(state.advance_velocity, settle=1.0 * SECOND),
-        reset=Reset(reset_velocity, VelocityResetCfg(), side_by_side=True),
+        reset=Reset(reset_velocity, VelocityResetCfg(), parallel=True),
         command=Command(commands.set_velocity, commands.resample_due, commands.resample_velocity),
         curriculum=Curriculum(
             state.tracking_error, tolerance=0.18, promote_after=1_000_000, counts=state.every_episode, unit="m_s"

@@ -27,7 +27,7 @@ GROUNDS = (*KINDS, "pit", "blocks")
 """Of the map's columns."""
 STEPS_UP = (
     RewardTerm(rewards.shank_lean, -5.0, threshold=35.0 * DEG, hip=0.045, thigh=0.175, shank=0.3),
-    RewardTerm(mdp_rewards.collision, -4.0, once=True),
+    RewardTerm(mdp_rewards.collision, -4.0, scale_by_dt=False),
 )
 """What keeps shanks off the edges of steps; without a floor of the total, below which a collision would not count."""
 

@@ -39,8 +39,8 @@ def drawn_force(robot: RobotParameters, rng: RngStream, lower: float, upper: flo
 EVENTS = (
     EventTerm(count, name="start", mode="startup", times=1.0),
     EventTerm(count, name="begin", mode="reset", times=1000.0),
-    EventTerm(mark, mode="interval", least=4.0 * STEP_DT, most=9.0 * STEP_DT),
-    EventTerm(mark, name="regular", mode="interval", least=3.0 * STEP_DT, most=3.0 * STEP_DT),
+    EventTerm(mark, mode="interval", interval_range_s=(4.0 * STEP_DT, 9.0 * STEP_DT)),
+    EventTerm(mark, name="regular", mode="interval", interval_range_s=(3.0 * STEP_DT, 3.0 * STEP_DT)),
     EventTerm(drawn_force, mode="reset", lower=2.0, upper=3.0),
 )
 REGULAR = 3
@@ -63,7 +63,7 @@ class Events(Probe):
                   self.parameters]  # fmt: skip
         wp.launch(skill.kernels["event"], (skill.num_events, LANES, N), inputs, device="cpu")
 
-    def curriculum_episodes(self):
+    def counted(self):
         """Return how often the counting events ran at the start, and at resets."""
         found = self.parameters.latency.numpy()
         return found % 1000, found // 1000
@@ -181,7 +181,8 @@ def test_an_interval_that_no_reset_began_starts_with_the_first_step():
 
 def test_an_interval_shorter_than_a_step_comes_in_every_step():
     events = Events("regular")
-    events.skill.set("events", "regular", least=0.1 * STEP_DT, most=0.2 * STEP_DT)
+    events.skill.params.set("events.regular.interval_range_s.lower", 0.1 * STEP_DT)
+    events.skill.params.set("events.regular.interval_range_s.upper", 0.2 * STEP_DT)
     assert (gaps_of(events, 5) == 1).all()
 
 

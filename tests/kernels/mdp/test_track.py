@@ -244,7 +244,7 @@ def test_blocks_are_larger_by_their_margin_for_links_but_not_for_paws(sim, poses
         ground.blocks, robot.joint_q = blocks(n, drawn), poses
         track(robot, sim, ground=ground, settings=contact_force(0.1, obstacle_margin=settings))
         found.append((robot.collisions.numpy().copy(), robot.paw_height.numpy().copy()))
-    (flags, heights), (grown, _), (parameterless, level) = found
+    (flags, heights), (grown, _), (json_value, level) = found
     np.testing.assert_array_equal(flags, grown)
-    assert (flags & parameterless == parameterless).all() and (flags != parameterless).any(axis=0).sum() > 20
+    assert (flags & json_value == json_value).all() and (flags != json_value).any(axis=0).sum() > 20
     np.testing.assert_array_equal(heights, level)
