@@ -26,7 +26,7 @@ from jumper_warp.kernels.mdp.reset import write_default_pose
 from jumper_warp.kernels.mdp.view import RobotArrays, RobotView, tilt, vec12, yaw_of
 from jumper_warp.kernels.terrain.ground import Ground, surface, world_ground
 from jumper_warp.kernels.velocity.state import VelocityState
-from jumper_warp.tasks.cfg import Command, Handover, Reset, TaskCfg
+from jumper_warp.tasks.cfg import Command, Handover, ObservationsCfg, Reset, TaskCfg
 from jumper_warp.tasks.randomization import RandomizationCfg
 from jumper_warp.tasks.terms import (
     Advance,
@@ -51,6 +51,7 @@ __all__ = [
     "Handover",
     "JumpState",
     "ObservationTerm",
+    "ObservationsCfg",
     "RandomizationCfg",
     "Reset",
     "RewardTerm",

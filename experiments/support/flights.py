@@ -263,9 +263,9 @@ class FlightRun(Run):
         scale = env.skills[JUMP].task.action_scale[1]
 
         def act(obs: torch.Tensor) -> torch.Tensor:
-            jump = None if self.landing is None else self.landing.act(env.skills[JUMP].obs["policy"])
+            jump = None if self.landing is None else self.landing.act(env.skills[JUMP].obs["actor"])
             action = torch.as_tensor(self.flights.action(scale, jump), dtype=torch.float32, device=env.device)
-            return torch.stack([action, self.turn.act(env.skills[TURN].obs["policy"])])
+            return torch.stack([action, self.turn.act(env.skills[TURN].obs["actor"])])
 
         return act
 

@@ -1,6 +1,6 @@
 """A task's settings as flags of the command line, whatever the task; functions are left as the task has them.
 
-    --env.rewards.jump-height.weight 30 --env.policy.lin-vel.noise 0.1 --env.reset.tilt 3 --env.contact-force 0.2
+    --env.rewards.jump-height.weight 30 --env.observations.actor.lin-vel.noise 0.1 --env.reset.tilt 3
 
 They are derived from the task itself. A term's number has the flag of its dotted name (`jumper_warp.tasks.params`),
 without the term where a section has only one, as `--env.curriculum.tolerance`; everything else has its field's.

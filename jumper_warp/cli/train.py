@@ -188,7 +188,7 @@ def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> TrainResult:
 
     check_saving(task)
     if parsed.cfg.ppo.symmetry != "off":
-        mirror_of(task, "policy")  # raises InputError where a term has no known mirror image
+        mirror_of(task, "actor")  # raises InputError where a term has no known mirror image
     start = None
     if parsed.cfg.init_policy and not parsed.checkpoint:
         from jumper_warp.policies.warm_start import load_init_policy

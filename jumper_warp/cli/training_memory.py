@@ -71,7 +71,7 @@ def check_memory(task: TaskCfg, ppo: PpoCfg, solver: SolverName, num_envs: int, 
 
     Raises ValueError: it does not; the line tells the estimate, what is free, and a number of worlds that fits.
     """
-    widths = [max(end for _, end in task.layout(group).values()) for group in ("policy", "critic")]
+    widths = [max(end for _, end in task.layout(group).values()) for group in ("actor", "critic")]
     learning = learning_need(ppo, *widths)
     main = free_main_memory() // int(os.environ.get("LOCAL_WORLD_SIZE", "1"))
     building = Need(0, BUILDING[solver])

@@ -107,8 +107,8 @@ class ClosedLoop:
             raise InputError("gradients need a ground without moving blocks: train with level ground")
         if task.randomization.observation_latency:
             raise InputError(f"{task.name}: gradients need observations without latency")
-        for term in (*task.policy, *task.critic):
-            if term.options["history"] > 1 and (term.func.key not in OWN or term not in task.policy):
+        for term in (*task.observations.actor, *task.observations.critic):
+            if term.options["history"] > 1 and (term.func.key not in OWN or term not in task.observations.actor):
                 raise InputError(f"{task.name}: gradients of a history need one of the robot's state, not {term.name}")
         self.env, self.num_worlds = env, env.num_envs
         self.rollout = Rollout(
@@ -117,11 +117,12 @@ class ClosedLoop:
         self.dtype = torch.float64 if double else torch.float32
         self.draws = bool(task.params.slots["events"])
         """Whether resets draw other robots."""
-        self.layout = task.layout("policy")
+        self.layout = task.layout("actor")
         self._columns = {
-            group: [(term, *task.layout(group)[term.name]) for term in getattr(task, group)] for group in task.groups
+            group: [(term, *task.layout(group)[term.name]) for term in getattr(task.observations, group)]
+            for group in task.groups
         }
-        self._remembered = [entry for entry in self._columns["policy"] if entry[0].options["history"] > 1]
+        self._remembered = [entry for entry in self._columns["actor"] if entry[0].options["history"] > 1]
         lateral, transversal = (math.radians(scale) for scale in task.action_scale)
         like = {"dtype": self.dtype, "device": env.device}
         self.scale = torch.tensor(4 * [lateral, transversal, transversal], **like)
@@ -199,7 +200,7 @@ class ClosedLoop:
         gravity = rotated_back(quat, q.new_tensor(DOWN).expand(len(q), 3))
         return Motion(q[:, :3], quat, lin_vel, rotated_back(quat, ang), gravity, q[:, 7:], qd[:, 6:])
 
-    def observe(self, state: LoopState, told: torch.Tensor, group: str = "policy") -> torch.Tensor:
+    def observe(self, state: LoopState, told: torch.Tensor, group: str = "actor") -> torch.Tensor:
         """Return what the policy, or the critic, sees of a state, (num_worlds, columns), without noise.
 
         told: (num_worlds, columns), of which those that are not of the robot's state, such as commands, are taken.

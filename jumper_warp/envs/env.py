@@ -127,8 +127,8 @@ class Env(Stages):
         """Let torch see Warp's memory."""
         self.num_actions, self.actions = 12, wp.to_torch(self._action)
         self.action, first = self.actions[0], self.skills[0]
-        self.obs, self.critic_obs = first.obs["policy"], first.obs["critic"]
-        self.final_obs, self.final_critic_obs = first.final_obs["policy"], first.final_obs["critic"]
+        self.obs, self.critic_obs = first.obs["actor"], first.obs["critic"]
+        self.final_obs, self.final_critic_obs = first.final_obs["actor"], first.final_obs["critic"]
         self.num_obs, self.num_critic_obs = self.obs.shape[1], self.critic_obs.shape[1]
         terms = wp.to_torch(first.term_value)
         self.reward_terms = {term.name: terms[i] for i, term in enumerate(first.task.rewards)}
@@ -332,7 +332,7 @@ class Env(Stages):
 
         Raises ValueError: the mirror image of a term is not known.
         """
-        return mirror_of_action() if what == "action" else mirror_of(self.task, "policy")
+        return mirror_of_action() if what == "action" else mirror_of(self.task, "actor")
 
     def config(self) -> dict:
         """Return everything that defines the environment, as JSON can hold it.

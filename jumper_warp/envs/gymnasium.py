@@ -49,9 +49,9 @@ class GymVectorEnv(gymnasium.vector.VectorEnv):
         self.endings = tuple(term.name for term in env.task.terminations)
         self._all_groups, self._tensors, self._began = all_groups, tensors, False
         self._ending = wp.to_torch(env.episodes.termination)
-        widths = {"policy": env.num_obs, "critic": env.num_critic_obs}
+        widths = {"actor": env.num_obs, "critic": env.num_critic_obs}
         boxes = {group: Box(-RAW_LIMIT, RAW_LIMIT, (width,)) for group, width in widths.items()}
-        self.single_observation_space = Dict([*boxes.items()]) if all_groups else boxes["policy"]
+        self.single_observation_space = Dict([*boxes.items()]) if all_groups else boxes["actor"]
         self.single_action_space = Box(-1.0, 1.0, (env.num_actions,))
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
@@ -112,8 +112,8 @@ class GymVectorEnv(gymnasium.vector.VectorEnv):
     def _shown(self, groups: dict[str, torch.Tensor]) -> Obs:
         """Return copies as the observation space has them, finite and bounded."""
         if not self._all_groups:
-            return self._given(sanitise(groups["policy"]))
-        return {group: self._given(sanitise(groups[group])) for group in ("policy", "critic")}
+            return self._given(sanitise(groups["actor"]))
+        return {group: self._given(sanitise(groups[group])) for group in ("actor", "critic")}
 
     def _rows(self, obs: Obs, worlds: np.ndarray) -> np.ndarray:
         """Return the observation of each of some worlds as an object, None for others."""

@@ -46,7 +46,7 @@ class RslRlVecEnv(RslRlEnv):
 
     def get_observations(self) -> TensorDict:
         """Return the observations as groups `policy` and `critic`, finite and bounded."""
-        groups = {"policy": sanitise(self.env.obs), "critic": sanitise(self.env.critic_obs)}
+        groups = {"actor": sanitise(self.env.obs), "critic": sanitise(self.env.critic_obs)}
         return TensorDict(groups, batch_size=[self.num_envs], device=self.device)
 
     def step(self, actions: torch.Tensor) -> tuple[TensorDict, torch.Tensor, torch.Tensor, dict[str, Any]]:

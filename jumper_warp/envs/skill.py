@@ -61,7 +61,7 @@ class TaskRuntime:
         widths = {group: max((end for _, end in layout.values()), default=0) for group, layout in layouts.items()}
         columns, start, past = [], 0, 0
         for index, group in enumerate(task.groups):
-            for slot in task.params.slots[group]:
+            for slot in task.params.slots[f"observations.{group}"]:
                 width, oldest, delayed = slot.term.width, layouts[group][slot.term.name][0], int(slot.delayed)
                 for j in range(width):
                     columns.append((len(columns), index, start, widths[group], slot.noise, slot.scale, slot.clip,
@@ -69,7 +69,7 @@ class TaskRuntime:
                     past += delayed
             start += n * widths[group]
         self.columns = wp.array(np.array(columns, dtype=np.int32).T, dtype=int, device=self.device)
-        self.num_chunks = -(-sum(len(task.params.slots[group]) for group in task.groups) // CHUNK)
+        self.num_chunks = -(-sum(len(task.params.slots[f"observations.{group}"]) for group in task.groups) // CHUNK)
         arrays = ObservationArrays()
         fill(arrays, ("raw",), (len(columns), n), float, self.device)
         fill(arrays, ("now", "final"), start, float, self.device)
@@ -154,7 +154,9 @@ def kernels_of(task: TaskCfg) -> dict[str, Kernel]:
         "step": _kernel(make_step_kernel, task, task.state, ends, task.reward_floor),
         "reset": _kernel(make_reset_kernel, task, task.state, begins),
         "set_command": _kernel(make_set_command_kernel, task, task.state, task.command.set),
-        "observe": _kernel(make_observe_kernel, task, task.state, tuple(compiled[group] for group in task.groups)),
+        "observe": _kernel(
+            make_observe_kernel, task, task.state, tuple(compiled[f"observations.{group}"] for group in task.groups)
+        ),
         "event": _kernel(make_event_kernel, slots["events"], compiled["events"]),
     }
 

@@ -72,5 +72,5 @@ class SkillPolicies:
     def act(self, env: Env) -> torch.Tensor:
         """Return every skill's actions for its observations, (skills, num_envs, 12); nothing waits for the device."""
         return torch.stack(
-            [policy.act(skill.obs["policy"]) for policy, skill in zip(self.policies, env.skills, strict=True)]
+            [policy.act(skill.obs["actor"]) for policy, skill in zip(self.policies, env.skills, strict=True)]
         )

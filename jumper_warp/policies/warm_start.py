@@ -32,7 +32,7 @@ def load_init_policy(source: str | Path, task: TaskCfg, cfg: PpoCfg) -> Start:
     check_interface(policy.interface, interface(task))
     symmetry = None
     if cfg.symmetry == "actor":
-        obs, action = mirror_of(task, "policy"), mirror_of_action()
+        obs, action = mirror_of(task, "actor"), mirror_of_action()
         symmetry = Symmetry(image(*obs, "observation"), image(*action, "action"))
     return make_start(policy.layers, policy.mean, policy.std, policy.interface.activation, cfg, symmetry)
 

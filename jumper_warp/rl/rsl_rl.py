@@ -26,7 +26,7 @@ def rsl_rl_config(cfg: PpoCfg, save_interval: int, seed: int) -> dict[str, Any]:
         "seed": seed,
         "check_for_nan": False,
         "logger": "tensorboard",
-        "obs_groups": {"actor": ["policy"], "critic": ["critic" if cfg.asymmetric_critic else "policy"]},
+        "obs_groups": {"actor": ["actor"], "critic": ["critic" if cfg.asymmetric_critic else "actor"]},
         "actor": {**network, "distribution_cfg": noise},
         "critic": dict(network),
         "algorithm": {

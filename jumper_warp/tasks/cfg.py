@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import math
+import operator
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -62,6 +63,14 @@ class Command:
 
 
 @dataclass(frozen=True)
+class ObservationsCfg:
+    """Observation terms of the two networks."""
+
+    actor: tuple[ObservationTerm, ...]
+    critic: tuple[ObservationTerm, ...]
+
+
+@dataclass(frozen=True)
 class TaskCfg:
     """A task on the robot."""
 
@@ -75,10 +84,7 @@ class TaskCfg:
     rewards: tuple[RewardTerm, ...]
     terminations: tuple[TerminationTerm, ...]
     """The first that holds ends the episode."""
-    policy: tuple[ObservationTerm, ...]
-    """What the actor sees."""
-    critic: tuple[ObservationTerm, ...]
-    """What the critic sees."""
+    observations: ObservationsCfg
     motors: MotorCfg
     command_filter: FilterCfg
     action_scale: Pair
@@ -107,13 +113,13 @@ class TaskCfg:
     evaluation: str = "episode"
     """How policies are measured and played: a key of `jumper_warp.evaluation.registry.EVALUATIONS`."""
 
-    groups = ("policy", "critic")
+    groups = ("actor", "critic")
     """Names of the observation groups."""
 
     def __post_init__(self) -> None:
         """Raises ValueError: two terms share a name, one is for another task's state, or a setting is out of range."""
-        for section in ("rewards", "terminations", *self.groups, "events"):
-            names = [term.name for term in getattr(self, section)]
+        for section in ("rewards", "terminations", "observations.actor", "observations.critic", "events"):
+            names = [term.name for term in operator.attrgetter(section)(self)]
             if len(set(names)) < len(names):
                 raise InputError(f"every term of {self.name}'s {section} needs a name of its own, got {names}")
         for section, slots in self.params.slots.items():
@@ -168,14 +174,15 @@ class TaskCfg:
     def params(self) -> TaskParams:
         """Numbers of all terms."""
         sections = {"advance": (self.advance,), "curriculum": (self.curriculum,), "rewards": self.rewards,
-                    "terminations": self.terminations, "policy": self.policy, "critic": self.critic,
+                    "terminations": self.terminations, "observations.actor": self.observations.actor,
+                    "observations.critic": self.observations.critic,
                     "events": (*self.randomization.events(), *self.events)}  # fmt: skip
         return TaskParams(self.name, sections)
 
     def layout(self, group: str) -> dict[str, tuple[int, int]]:
         """Return the columns of an observation group, (first, end) by the name of the term."""
         columns, first = {}, 0
-        for term in getattr(self, group):
+        for term in getattr(self.observations, group):
             end = first + term.width * term.options["history"]
             columns[term.name], first = (first, end), end
         return columns
@@ -183,7 +190,7 @@ class TaskCfg:
     @property
     def observation_names(self) -> tuple[str, ...]:
         """Names of all columns that the policy sees, in order."""
-        return tuple(column for term in self.policy for column in term.columns)
+        return tuple(column for term in self.observations.actor for column in term.columns)
 
     @property
     def settings_type(self) -> Any:
@@ -208,8 +215,8 @@ class TaskCfg:
 
     def without_noise(self) -> TaskCfg:
         """Return the task with exact observations."""
-        groups = {g: tuple(term.replace(noise=0.0) for term in getattr(self, g)) for g in self.groups}
-        return replace(self, **groups)
+        exact = {g: tuple(term.replace(noise=0.0) for term in getattr(self.observations, g)) for g in self.groups}
+        return replace(self, observations=ObservationsCfg(**exact))
 
     @property
     def draws_ground(self) -> bool:

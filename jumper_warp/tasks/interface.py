@@ -27,7 +27,7 @@ def interface(task: TaskCfg) -> dict[str, Any]:
         "observation_layout": {
             term.name: {"first": first, "end": end, "scale": term.numbers["scale"], "clip": term.numbers["clip"],
                         "history": term.options["history"]}
-            for term, (first, end) in zip(task.policy, task.layout("policy").values(), strict=True)
+            for term, (first, end) in zip(task.observations.actor, task.layout("actor").values(), strict=True)
         },
         "joint_names": list(MOTOR_JOINTS),
         "action_scale": per_motor(*map(math.radians, task.action_scale)),

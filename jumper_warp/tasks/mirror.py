@@ -64,7 +64,7 @@ def mirror_of(task: TaskCfg, group: str) -> Mirror:
     """
     order: list[int] = []
     signs: list[int] = []
-    for term in getattr(task, group):
+    for term in getattr(task.observations, group):
         width = term.width
         if term.func in _PLAIN:
             places, flips = tuple(range(width)), _PLAIN[term.func]

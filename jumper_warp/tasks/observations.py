@@ -44,7 +44,9 @@ def remembered(terms: tuple[ObservationTerm, ...], steps: int = 4) -> tuple[Obse
 
 def with_history(task: TaskCfg, steps: int | None) -> TaskCfg:
     """Return the task whose policy sees so many policy steps; None: as it is."""
-    return task if steps is None else replace(task, policy=remembered(task.policy, steps))
+    if steps is None:
+        return task
+    return replace(task, observations=replace(task.observations, actor=remembered(task.observations.actor, steps)))
 
 
 def exact(terms: tuple[ObservationTerm, ...]) -> tuple[ObservationTerm, ...]:

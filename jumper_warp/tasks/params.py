@@ -1,4 +1,4 @@
-"""Numbers of a task's terms in one array, by dotted name: `rewards.jump_height.weight`, `policy.lin_vel.noise`.
+"""Numbers of a task's terms in one array, by name: `rewards.jump_height.weight`, `observations.actor.lin_vel.noise`.
 
 Flags change a task's numbers before its environment is made, `Env.set` while it runs; kernels read them by `TermSlot`.
 """

@@ -152,7 +152,9 @@ def task_from_json(saved: Any, modules: Iterable[ModuleType] = (), *, leave_out:
     """
     check_version(saved)
     content = {key: value for key, value in saved.items() if key not in ("version", "type")}
-    content |= {section: [] for section in OPTIONAL if section in leave_out}
+    content |= {section: [] for section in ("rewards", "events") if section in leave_out}
+    if "critic" in leave_out and isinstance(observations := content.get("observations"), dict):
+        content["observations"] = observations | {"critic": []}
     try:
         return _build(TaskCfg, content, "task", Finder(modules))
     except TaskError:

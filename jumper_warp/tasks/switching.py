@@ -43,7 +43,15 @@ def for_switching(
 
     randomization: of the robot, which all its skills share.
     """
-    task = replace(task, terminations=falls, randomization=randomization, events=(), rewards=(), critic=(), metrics=())
+    task = replace(
+        task,
+        terminations=falls,
+        randomization=randomization,
+        events=(),
+        rewards=(),
+        observations=replace(task.observations, critic=()),
+        metrics=(),
+    )
     return task.on_level_ground()
 
 

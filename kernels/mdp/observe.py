@@ -83,7 +83,7 @@ def store(value: Any, row: int, world: int, out: wp.array2d(dtype=float)):  # no
 
 def make_observe_kernel(task: Any) -> wp.Kernel:
     """Return the kernel that evaluates all observation terms of a task."""
-    slots = [slot for group in task.groups for slot in task.params.slots[group]]
+    slots = [slot for group in task.groups for slot in task.params.slots[f"observations.{group}"]]
     input_types = [next(iter(slot.func.input_types.values())) for slot in slots]
     reads_parameters = [kind is RobotParameters for kind in input_types]
     reads_ground = [kind is RobotArrays for kind in input_types]

@@ -256,7 +256,7 @@ def test_flags_change_training_and_task():
     flags = (
         "--env.rewards.jump-height.weight 25 --env.rewards.jump-height.std-fine 0.2"
         " --env.terminations.wrong-height.tolerance 0.07 --env.advance.takeoff-speed 0.5"
-        " --env.policy.lin-vel.noise 0.3 --env.policy.gravity.history 2"
+        " --env.observations.actor.lin-vel.noise 0.3 --env.observations.actor.gravity.history 2"
         " --env.curriculum.tolerance 0.05 --env.curriculum.promote-after 7"
         " --env.reset.start-probability.standing 0.45 --env.reset.start-probability.default 0.2"
         " --env.reset.ground.drop 0.1 0.2 --env.levels.1.next-jump-probability 0.5 --env.motors.lateral.kp 11"
@@ -266,7 +266,7 @@ def test_flags_change_training_and_task():
     args, task = parse_train(["Olympus-Vertical-Jump", *flags.split()])
     assert task.rewards[0].numbers == {"weight": 25.0, "std_fine": 0.2, "scale_sharp": 0.05, "std_wide": 0.4}
     assert {end.name: end.numbers for end in task.terminations}["wrong_height"] == {"tolerance": 0.07}
-    seen = {term.name: term for term in task.policy}
+    seen = {term.name: term for term in task.observations.actor}
     assert (seen["lin_vel"].numbers["noise"], seen["gravity"].options["history"]) == (0.3, 2)
     assert task.advance.numbers == {"takeoff_speed": 0.5}
     assert task.curriculum.numbers == {"tolerance": 0.05, "promote_after": 7}
@@ -281,22 +281,23 @@ def test_flags_change_training_and_task():
 
 def test_history_is_how_many_steps_of_what_noise_blurs_the_policy_sees():
     _, task = parse_train(["vertical-jump", "--history", "2"])
-    steps = {term.name: term.options["history"] for term in task.policy}
+    steps = {term.name: term.options["history"] for term in task.observations.actor}
     assert [steps[name] for name in ("lin_vel", "ang_vel", "gravity", "angle", "last_action")] == [2] * 5
     assert steps["wanted_height"] == steps["rate"] == 1
-    assert task.critic == make_task("vertical-jump").critic
+    assert task.observations.critic == make_task("vertical-jump").observations.critic
     with pytest.raises(InputError, match="history must be at least 1"):
         parse_train(["vertical-jump", "--history", "0"])
 
 
 def test_flags_reach_the_arrays_that_kernels_read():
-    flags = "--env.rewards.jump-height.weight 25 --env.terminations.tilted.angle 0.4 --env.policy.lin-vel.noise 0.3"
+    flags = "--env.rewards.jump-height.weight 25 --env.terminations.tilted.angle 0.4"
+    flags += " --env.observations.actor.lin-vel.noise 0.3"
     flags += " --env.reset.tilt 9 --env.levels.0.base-height 0.3 0.31 --env.contact-force 0.7 --env.action-scale 10 80"
     _, task = parse_train(["vertical-jump", *flags.split()])
     env = Env(task, 2, device="cpu", randomize=False)
     skill = env.skills[0]
     numbers = skill.params.values.numpy()
-    names = ("rewards.jump_height.weight", "terminations.tilted.angle", "policy.lin_vel.noise")
+    names = ("rewards.jump_height.weight", "terminations.tilted.angle", "observations.actor.lin_vel.noise")
     assert [numbers[task.params.index(name)] for name in names] == pytest.approx([25.0, 0.4, 0.3])
     assert skill.settings.numpy()["states"]["tilt"][0] == pytest.approx(np.radians(9.0))
     assert skill.levels.numpy()["base_height"][0] == pytest.approx([0.3, 0.31])

@@ -71,7 +71,7 @@ def tame_jump():
         task,
         name="tame-jump",
         rewards=(RewardTerm(base_at_rest, 2.0, height=0.5), *task.rewards[:3]),
-        critic=(*task.critic, ObservationTerm(strange)),
+        observations=replace(task.observations, critic=(*task.observations.critic, ObservationTerm(strange))),
         events=(EventTerm(slow, lower=0.9, upper=1.0),),
     )
 

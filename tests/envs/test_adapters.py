@@ -69,7 +69,7 @@ def test_gymnasium_makes_the_named_task():
     envs = gymnasium.make_vec("jumper_warp/VerticalJump-v0", num_envs=2, device="cpu", seed=7, all_groups=True)
     assert isinstance(envs, GymVectorEnv)
     assert (envs.env.task.name, envs.env.num_envs, envs.env.seed) == ("vertical-jump", 2, 7)
-    assert set(envs.single_observation_space) == {"policy", "critic"}
+    assert set(envs.single_observation_space) == {"actor", "critic"}
     assert envs.spec.id == "jumper_warp/VerticalJump-v0"
 
 
@@ -78,7 +78,7 @@ def test_what_a_step_gives_is_in_its_space(all_groups):
     envs = GymVectorEnv(jumper(), all_groups=all_groups)
     assert envs.single_action_space == gymnasium.spaces.Box(-1.0, 1.0, (12,))
     space = envs.single_observation_space
-    assert (space["policy"] if all_groups else space).shape == (envs.env.num_obs,)
+    assert (space["actor"] if all_groups else space).shape == (envs.env.num_obs,)
     obs, infos = envs.reset(seed=1)
     assert obs in envs.observation_space and infos == {}
     results = played(envs)
@@ -131,7 +131,7 @@ def test_absurd_observations_and_rewards_are_kept_out():
 
     def step(action):
         result = original(action)
-        result.obs["policy"][0, :3] = torch.tensor([torch.nan, 1.0e6, -torch.inf])
+        result.obs["actor"][0, :3] = torch.tensor([torch.nan, 1.0e6, -torch.inf])
         result.reward[0] = torch.nan
         return result
 
@@ -156,15 +156,15 @@ def test_an_ended_episode_begins_anew_in_the_same_step():
     for action in ACTIONS:
         obs, reward, terminated, truncated, infos = envs.step(action)
         old, new = unreset.step(torch.from_numpy(action)), reset.step(torch.from_numpy(action))
-        np.testing.assert_array_equal(obs, new.obs["policy"])
+        np.testing.assert_array_equal(obs, new.obs["actor"])
         np.testing.assert_array_equal(reward[first], old.reward.numpy()[first])
         np.testing.assert_array_equal(terminated[first], old.terminated.numpy()[first])
         np.testing.assert_array_equal(truncated[first], old.truncated.numpy()[first])
         ended = terminated | truncated
         np.testing.assert_array_equal(infos.get("_final_obs", np.zeros(N, dtype=bool)), ended)
         for world in np.flatnonzero(ended & first):
-            np.testing.assert_array_equal(infos["final_obs"][world], old.obs["policy"][world])
-            assert not np.array_equal(obs[world], old.obs["policy"][world])
+            np.testing.assert_array_equal(infos["final_obs"][world], old.obs["actor"][world])
+            assert not np.array_equal(obs[world], old.obs["actor"][world])
         if ended.any():
             assert all(row is None for row in infos["final_obs"][~ended])
         seen += [(terminated & first).sum(), (truncated & first).sum()]
@@ -198,7 +198,7 @@ def test_tensors_are_what_arrays_are():
             assert isinstance(b, torch.Tensor)
             np.testing.assert_array_equal(a, b)
         for world in np.flatnonzero(other_infos["_final_obs"]):
-            for group in ("policy", "critic"):
+            for group in ("actor", "critic"):
                 np.testing.assert_array_equal(infos["final_obs"][world][group], other_infos["final_obs"][group][world])
         if "final_info" in infos:
             np.testing.assert_array_equal(infos["final_info"]["termination"], other_infos["final_info"]["termination"])
@@ -338,9 +338,9 @@ def test_rsl_rl_sees_the_environments_groups():
     adapter = RslRlVecEnv(env, metrics_every=100)
     obs, extras = adapter.reset()
     assert (obs.batch_size, extras) == (torch.Size([N]), {})
-    assert torch.equal(obs["policy"], env.obs) and torch.equal(obs["critic"], env.critic_obs)
+    assert torch.equal(obs["actor"], env.obs) and torch.equal(obs["critic"], env.critic_obs)
     obs, reward, done, extras = adapter.step(torch.from_numpy(ACTIONS[0]))
-    assert (obs["policy"].shape, obs["critic"].shape) == ((N, env.num_obs), (N, env.num_critic_obs))
+    assert (obs["actor"].shape, obs["critic"].shape) == ((N, env.num_obs), (N, env.num_critic_obs))
     assert reward.shape == done.shape == extras["time_outs"].shape == (N,)
     assert done.dtype == torch.long
 

@@ -61,12 +61,12 @@ def test_episodes_begin_afloat_at_rest_in_any_attitude_with_a_turn_of_the_level(
 
 
 def test_the_policy_sees_the_rotation_that_is_left(env):
-    obs = env.reset()[0]["policy"].numpy()
+    obs = env.reset()[0]["actor"].numpy()
     arrays = env.task_arrays()
-    first, end = env.task.layout("policy")["turn_left"]
+    first, end = env.task.layout("actor")["turn_left"]
     expected = rotate_yaw(arrays["base_quat"], arrays["goal"]).as_quat(canonical=True)
     np.testing.assert_allclose(obs[:, first:end], expected, atol=1e-5)
-    mirror = mirror_of(env.task, "policy")
+    mirror = mirror_of(env.task, "actor")
     flip = np.diag([1.0, -1.0, 1.0])
     reflected = Rotation.from_matrix(flip @ Rotation.from_quat(expected).as_matrix() @ flip).as_quat(canonical=True)
     np.testing.assert_allclose((mirror.signs * obs[:, mirror.order])[:, first:end], reflected, atol=1e-5)

@@ -91,13 +91,13 @@ def test_a_step_gives_the_tensors_of_the_environment():
     """Views, rewritten in place, that agree with each other."""
     env = make_env(N, noise=True, randomize=True, seed=3)
     obs, extras = env.reset()
-    assert obs["policy"] is env.obs and obs["critic"] is env.critic_obs and extras == {}
+    assert obs["actor"] is env.obs and obs["critic"] is env.critic_obs and extras == {}
     kept, ends = None, torch.zeros(2)
     for action in random_actions(N, 200):
         step = env.step(action)
         assert kept is None or all(a is b for a, b in zip(step, kept, strict=True))
         kept = step
-        assert step.obs["policy"] is env.obs and step.extras["final_obs"]["critic"] is env.final_critic_obs
+        assert step.obs["actor"] is env.obs and step.extras["final_obs"]["critic"] is env.final_critic_obs
         assert step.reward is env.reward and step.extras["time_outs"] is env.timeout
         assert step.terminated.dtype == step.truncated.dtype == torch.bool
         assert torch.equal(step.truncated, env.timeout == 1.0)
@@ -352,7 +352,7 @@ def test_some_worlds_may_begin_anew(worlds):
     before, motions, kept = env.task_arrays(), env.sim.joint_q().copy(), env.obs.clone()
     obs, extras = env.reset(worlds=worlds)
     found = env.task_arrays()
-    assert obs["policy"] is env.obs and extras == {} and (found["level"] == 2).all()
+    assert obs["actor"] is env.obs and extras == {} and (found["level"] == 2).all()
     assert (found["steps"][chosen] == 0).all()
     changed = (env.sim.joint_q() != motions).any(axis=1)
     assert changed.tolist() == chosen.tolist() == (env.obs != kept).any(dim=1).tolist()

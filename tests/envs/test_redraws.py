@@ -161,7 +161,7 @@ def test_a_sensor_offset_acts_on_the_motor_and_on_the_observation():
         wrong.step(action)
         honest.step(lower)
     np.testing.assert_allclose(wrong.sim.joint_q(), honest.sim.joint_q(), atol=1e-4)
-    _, end = wrong.task.layout("policy")["angle"]
+    _, end = wrong.task.layout("actor")["angle"]
     seen = (wrong.obs - honest.obs)[0, end - 12 : end].numpy()
     np.testing.assert_allclose(seen, offset[:, 0], atol=1e-4)
 

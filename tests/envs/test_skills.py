@@ -79,7 +79,7 @@ def test_worlds_of_a_skill_are_those_of_an_environment_with_that_skill_alone(ind
         both.step(actions)
         alone.step(action)
         skill, expected = both.skills[index], alone.skills[0]
-        for group in ("policy", "critic"):
+        for group in ("actor", "critic"):
             for kind in ("obs", "final_obs"):
                 found, wanted = (getattr(each, kind)[group][mine] for each in (skill, expected))
                 assert torch.equal(found, wanted), (step, group, kind)
@@ -150,7 +150,7 @@ def test_a_switch_leaves_the_robot_and_all_other_worlds_as_they_are():
         rest = ~ASKED
         np.testing.assert_array_equal(coordinates(asked)[rest], coordinates(twin)[rest])
         assert torch.equal(asked.reward[rest], twin.reward[rest])
-        assert torch.equal(asked.skills[1].obs["policy"][rest], twin.skills[1].obs["policy"][rest])
+        assert torch.equal(asked.skills[1].obs["actor"][rest], twin.skills[1].obs["actor"][rest])
     assert (coordinates(asked)[ASKED] != coordinates(twin)[ASKED]).any()  # other motors, filter and scales
 
 
@@ -211,21 +211,21 @@ def test_motors_filter_and_scales_become_those_of_the_new_skill_and_drawn_ratios
 def test_a_new_skill_sees_nothing_of_before_its_beginning():
     """The history of observations and what sensors give late, also of a skill that the world was in before."""
     env = make(JUMP, HOLD, skill=1, handovers=(TO_JUMP, TO_HOLD), noise=False)
-    first, end = HOLD.layout("policy")["height"]
+    first, end = HOLD.layout("actor")["height"]
     actions = 0.3 * random_actions(N, 30)
     followed(env, actions[:8], request_at=5)  # to jumping
-    kept = env.skills[1].obs["policy"].clone()
+    kept = env.skills[1].obs["actor"].clone()
     followed(env, actions[8:15], request_at=6, skill=1)  # and back
     assert (env.episodes.skill.numpy() == 1).all() and not env.done.any()
-    seen = env.skills[1].obs["policy"][ASKED, first:end].numpy()
+    seen = env.skills[1].obs["actor"][ASKED, first:end].numpy()
     height = env.sim.joint_q()[ASKED, 2]
     np.testing.assert_allclose(seen, np.repeat(5.0 * height[:, None], 3, axis=1), rtol=1e-5)
     assert (seen != kept[ASKED, first:end].numpy()).all()
     followed(env, actions[15:16])
-    following = env.skills[1].obs["policy"][ASKED, first:end].numpy()
+    following = env.skills[1].obs["actor"][ASKED, first:end].numpy()
     np.testing.assert_array_equal(following[:, :2], seen[:, 1:])
-    last_first, last_end = HOLD.layout("policy")["last_action"]
-    np.testing.assert_array_equal(env.skills[1].obs["policy"][ASKED, last_first:last_end], actions[15][ASKED])
+    last_first, last_end = HOLD.layout("actor")["last_action"]
+    np.testing.assert_array_equal(env.skills[1].obs["actor"][ASKED, last_first:last_end], actions[15][ASKED])
 
 
 def test_a_world_goes_over_at_most_once_a_step_and_not_where_its_episode_ends():
@@ -272,8 +272,8 @@ def test_a_command_that_came_with_the_request_is_given_as_the_skill_takes_over()
     states = env.skills[0].states.numpy()
     np.testing.assert_allclose(states["goal"][ASKED, 2], commands[ASKED, 2], rtol=1e-6)
     assert (states["command_step"][ASKED] == 0).all() and states["command_step"][7] == 1000
-    first, _ = JUMP.layout("policy")["wanted_height"]
-    np.testing.assert_allclose(env.skills[0].obs["policy"][ASKED, first], commands[ASKED, 2], rtol=1e-6)
+    first, _ = JUMP.layout("actor")["wanted_height"]
+    np.testing.assert_allclose(env.skills[0].obs["actor"][ASKED, first], commands[ASKED, 2], rtol=1e-6)
     assert not env.episodes.has_command.numpy()[ASKED].any() and (env.episodes.skill.numpy()[8:] == 1).all()
     with pytest.raises(ValueError, match=r"16 rows or one for all, got shape \(3, 2\)"):
         env.requested_task(0, ASKED, np.zeros((3, 2)))

@@ -35,7 +35,7 @@ class Switch:
     def __init__(self, env: Env, world: int) -> None:
         self.world, self.target = world, int(env.episodes.skill.numpy()[world])
         self.after, self.action = coordinates(env)[world], env.robot.action.numpy()[:, world].copy()
-        self.obs = env.skills[self.target].obs["policy"][world].clone()
+        self.obs = env.skills[self.target].obs["actor"][world].clone()
         self.state = env.skills[self.target].states.numpy()[world].copy()
         self.next_action = self.next_safe = None
 

@@ -163,7 +163,7 @@ def weak_motors(robot: mdp.RobotParameters, rng: mdp.RngStream, lower: float, up
 
 def hold_height() -> mdp.TaskCfg:
     """Return the task."""
-    policy = (
+    actor = (
         mdp.ObservationTerm(wanted_height, scale=5.0),
         mdp.ObservationTerm(mdp.observations.height, noise=0.002, scale=5.0, history=3, delayed=True),
         mdp.ObservationTerm(mdp.observations.gravity, noise=0.02),
@@ -188,8 +188,9 @@ def hold_height() -> mdp.TaskCfg:
             mdp.TerminationTerm(held, steps=100.0, time_out=True, success=True),
             mdp.TerminationTerm(mdp.terminations.too_long, steps=120.0, time_out=True),
         ),
-        policy=policy,
-        critic=(*policy, mdp.ObservationTerm(mdp.observations.drawn_latency)),
+        observations=mdp.ObservationsCfg(
+            actor=actor, critic=(*actor, mdp.ObservationTerm(mdp.observations.drawn_latency))
+        ),
         levels=(HoldLevelCfg((0.22, 0.42)), HoldLevelCfg((0.20, 0.44))),
         motors=walking_motors(),
         command_filter=walking_filter(),

@@ -15,7 +15,7 @@ from jumper_warp.kernels.mdp.parameters import RobotParameters
 from jumper_warp.kernels.mdp.view import RobotView, vec12
 from jumper_warp.kernels.terrain.ground import Ground
 from jumper_warp.registry import make_task
-from jumper_warp.tasks.cfg import TaskCfg
+from jumper_warp.tasks.cfg import ObservationsCfg, TaskCfg
 from jumper_warp.tasks.jump.cfg import Level, ResetCfg, StartProbability
 from jumper_warp.tasks.jump.observations import EPISODE
 from jumper_warp.tasks.observations import exact
@@ -98,8 +98,8 @@ def make_episode(**fields) -> JumpState:
 
 def without_draws(task: TaskCfg) -> TaskCfg:
     """Return a jump without history whose critic sees nothing drawn: 48 columns as the actor, 15 of its own."""
-    policy = tuple(term.replace(history=1) for term in task.policy)
-    return dataclasses.replace(task, policy=policy, critic=(*exact(policy), *EPISODE))
+    actor = tuple(term.replace(history=1) for term in task.observations.actor)
+    return dataclasses.replace(task, observations=ObservationsCfg(actor=actor, critic=(*exact(actor), *EPISODE)))
 
 
 class Robots:
@@ -135,7 +135,7 @@ class Robots:
         ground.half_x = ground.half_y = 2.0
         observe(skill, robot, RobotParameters(), ground, self.episodes, tasks, self.numbers[noise])
         self.episodes.step_count.assign(self.episodes.step_count.numpy() + 1)
-        return skill.obs["policy"].double().numpy().copy(), skill.obs["critic"].double().numpy().copy()
+        return skill.obs["actor"].double().numpy().copy(), skill.obs["critic"].double().numpy().copy()
 
 
 def tilted_by(angle: float, axis=(1.0, 0.0, 0.0)) -> dict:

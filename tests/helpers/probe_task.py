@@ -15,7 +15,7 @@ from jumper_warp.kernels.mdp.reset import write_default_pose
 from jumper_warp.kernels.mdp.view import RobotArrays, RobotView
 from jumper_warp.kernels.terrain.ground import Ground
 from jumper_warp.robot.motors import jumping_motors, vertical_jump_filter
-from jumper_warp.tasks.cfg import Command, Reset, TaskCfg
+from jumper_warp.tasks.cfg import Command, ObservationsCfg, Reset, TaskCfg
 from jumper_warp.tasks.randomization import RandomizationCfg
 from jumper_warp.tasks.terms import Advance, Curriculum, ObservationTerm, RewardTerm, TerminationTerm
 from mdp_helpers import STEP_DT, SUBSTEPS, array, new_worlds, no_delays, observe, standing_robots
@@ -192,15 +192,17 @@ def probe_task(**changes) -> TaskCfg:
             TerminationTerm(terminations.came_apart),
             TerminationTerm(terminations.too_long, steps=100.0),
         ),
-        policy=(
-            ObservationTerm(value, noise=0.5, scale=10.0, clip=4.0),
-            ObservationTerm(both, history=3),
-            ObservationTerm(both, name="late", delayed=True),
-        ),
-        critic=(
-            ObservationTerm(other),
-            ObservationTerm(latency_of),
-            ObservationTerm(value, name="late", delayed=True, history=2),
+        observations=ObservationsCfg(
+            actor=(
+                ObservationTerm(value, noise=0.5, scale=10.0, clip=4.0),
+                ObservationTerm(both, history=3),
+                ObservationTerm(both, name="late", delayed=True),
+            ),
+            critic=(
+                ObservationTerm(other),
+                ObservationTerm(latency_of),
+                ObservationTerm(value, name="late", delayed=True, history=2),
+            ),
         ),
         motors=jumping_motors(18.0),
         command_filter=vertical_jump_filter(),

@@ -75,7 +75,9 @@ def whole(config, *modules):
 def test_task_comes_back_from_its_configuration(saved):
     task, config = saved
     assert whole(config) == task != make_task("vertical-jump")
-    assert restored_task(config) == dataclasses.replace(task, rewards=(), critic=(), events=())
+    assert restored_task(config) == dataclasses.replace(
+        task, rewards=(), observations=dataclasses.replace(task.observations, critic=()), events=()
+    )
 
 
 def test_setting_that_is_not_saved_keeps_its_default(saved):
@@ -140,7 +142,10 @@ def test_a_termination_that_is_none_is_refused(saved, name, prefix):
         (lambda t: t.update(name=""), "task.name is of letters"),
         (lambda t: t.pop("terminations"), "task.terminations is missing"),
         (lambda t: t["terminations"][1].update(func="os:system"), r"task.terminations\[1\] needs 'os:system'"),
-        (lambda t: t["policy"][0].update(func="other"), r"task.policy\[0\]: expected module:name, got 'other'"),
+        (
+            lambda t: t["observations"]["actor"][0].update(func="other"),
+            r"task.observations.actor\[0\]: expected module:name, got 'other'",
+        ),
         (lambda t: t["reset"]["settings"].update(wings=2), "task.reset.settings: unknown setting 'wings'"),
         (lambda t: t["reset"]["settings"].update(lean="much"), "settings.lean: expected float, got 'much'"),
         (lambda t: t["reset"]["settings"].update(lean=math.nan), "settings.lean: must be finite"),

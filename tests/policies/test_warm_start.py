@@ -31,7 +31,7 @@ WIDE = {"symmetry": "off", "hidden": (512, 256, 256)}
 )
 def test_a_training_begins_as_a_shipped_policy_acts(name, task, change):
     policy, cfg, task = open_policy(name), dataclasses.replace(TASKS[task].ppo, **change), make_task(task)
-    symmetry = Symmetry(image(*mirror_of(task, "policy"), "observation"), image(*mirror_of_action(), "action"))
+    symmetry = Symmetry(image(*mirror_of(task, "actor"), "observation"), image(*mirror_of_action(), "action"))
     symmetry = symmetry if cfg.symmetry == "actor" else None
     assert (symmetry is not None) == (name == "slippery_jump" and not change)
     torch.manual_seed(0)
@@ -71,7 +71,7 @@ def test_another_history_is_refused():
 
 def test_a_symmetric_training_begins_with_the_nearest_symmetric_form_of_a_fine_tuned_policy():
     policy, task, cfg = open_policy("horizontal_jump"), make_task("horizontal-jump"), TASKS["horizontal-jump"].ppo
-    symmetry = Symmetry(image(*mirror_of(task, "policy"), "observation"), image(*mirror_of_action(), "action"))
+    symmetry = Symmetry(image(*mirror_of(task, "actor"), "observation"), image(*mirror_of_action(), "action"))
     start = load_init_policy("horizontal_jump", task, cfg)
     model = ActorCritic(147, 12, cfg.hidden, cfg.activation, cfg.init_std, symmetry=symmetry)
     begin_with(start, model, samples=1000)

@@ -22,14 +22,14 @@ PLAIN = PpoCfg(
 
 
 def groups(obs, critic_obs):
-    return TensorDict({"policy": obs, "critic": critic_obs}, batch_size=[obs.shape[0]])
+    return TensorDict({"actor": obs, "critic": critic_obs}, batch_size=[obs.shape[0]])
 
 
 def as_rsl_rl(ppo):
     """rsl-rl's PPO with the same weights and settings."""
     cfg, env, ours = ppo.cfg, ppo.env, ppo.model
     obs = groups(torch.zeros(env.num_envs, 2), torch.zeros(env.num_envs, 3))
-    sets = {"actor": ["policy"], "critic": ["critic"]}
+    sets = {"actor": ["actor"], "critic": ["critic"]}
     noise = {"class_name": "GaussianDistribution", "init_std": cfg.init_std, "std_type": "log"}
     actor = MLPModel(obs, sets, "actor", 1, cfg.hidden, "elu", distribution_cfg=noise)
     critic = MLPModel(obs, sets, "critic", 1, cfg.hidden, "elu")

@@ -21,7 +21,7 @@ from jumper_warp.tasks.saving import task_to_json
 from jumper_warp.utils.errors import InputError
 from toy_task import PushTask, fill
 
-OBS, ACTION = mirror_of(make_task("velocity-flat"), "policy"), mirror_of_action()
+OBS, ACTION = mirror_of(make_task("velocity-flat"), "actor"), mirror_of_action()
 WALKING = Symmetry(image(*OBS, "observation"), image(*ACTION, "action"))
 NUM_OBS = len(OBS.order)
 CFG = PpoCfg(num_steps=8, epochs=2, minibatches=2, hidden=(16, 9), symmetry="actor")

@@ -295,7 +295,7 @@ def test_rsl_rl_gets_copies():
     adapter = RslRlVecEnv(env, metrics_every=2)
     first = adapter.get_observations()
     obs, reward, done, extras = adapter.step(torch.ones(3, 1))
-    found = (first["policy"], first["critic"], obs["policy"], obs["critic"], reward, done, extras["time_outs"])
+    found = (first["actor"], first["critic"], obs["actor"], obs["critic"], reward, done, extras["time_outs"])
     shown = [value.clone() for value in found]
     adapter.step(torch.ones(3, 1))
     for value, copy in zip(found, shown, strict=True):
@@ -314,7 +314,7 @@ def test_rsl_rl_gives_the_critic_its_own_observation(asymmetric_critic, column):
     assert (algorithm.actor.obs_dim, algorithm.critic.obs_dim) == (2, 3 if asymmetric_critic else 2)
     with torch.inference_mode():
         before = algorithm.actor(obs), algorithm.critic(obs)
-        obs["critic" if asymmetric_critic else "policy"][:, column] += 1.0
+        obs["critic" if asymmetric_critic else "actor"][:, column] += 1.0
         assert torch.equal(algorithm.actor(obs), before[0]) == asymmetric_critic
         assert not torch.equal(algorithm.critic(obs), before[1])
 
@@ -352,5 +352,5 @@ def test_rsl_rl_learns_to_push_the_mass_to_the_origin():
     actor = runner.alg.get_policy().eval()
     with torch.inference_mode():
         for _ in range(40):
-            env.step(actor(TensorDict({"policy": env.obs}, batch_size=[128])))
+            env.step(actor(TensorDict({"actor": env.obs}, batch_size=[128])))
     assert env.obs[:, 0].abs().max() < 0.3

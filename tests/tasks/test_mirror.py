@@ -10,6 +10,7 @@ from jumper_warp.kernels.mdp import observations as obs
 from jumper_warp.kernels.velocity import observations as velocity
 from jumper_warp.registry import make_task
 from jumper_warp.robot.terrain import TerrainCfg, single_tile
+from jumper_warp.tasks.cfg import ObservationsCfg
 from jumper_warp.tasks.mirror import LEGS, MOTORS, mirror_of, mirror_of_action
 from jumper_warp.tasks.terms import ObservationTerm
 from jumper_warp.utils.errors import InputError
@@ -25,7 +26,12 @@ QUAT = np.array([-1.0, 1.0, -1.0, 1.0])
 def task():
     """The task on rough ground with a clock, so that every term of all velocity tasks is there."""
     rough, gait_phase = make_task("velocity-rough"), ObservationTerm(velocity.gait_phase)
-    return dataclasses.replace(rough, policy=(*rough.policy, gait_phase), critic=(*rough.critic, gait_phase))
+    return dataclasses.replace(
+        rough,
+        observations=ObservationsCfg(
+            actor=(*rough.observations.actor, gait_phase), critic=(*rough.observations.critic, gait_phase)
+        ),
+    )
 
 
 def reflected(values, change):
@@ -93,10 +99,10 @@ def reflection():
     env.episodes.diverged.zero_()
     env.episodes.history_reset.fill_(1)
     env.stages()["observe"]()
-    return env.task, {"policy": env.obs.numpy().copy(), "critic": env.critic_obs.numpy().copy()}
+    return env.task, {"actor": env.obs.numpy().copy(), "critic": env.critic_obs.numpy().copy()}
 
 
-@pytest.mark.parametrize("group", ["policy", "critic"])
+@pytest.mark.parametrize("group", ["actor", "critic"])
 def test_mirrored_robot_sees_the_mirror_image(reflection, group):
     env_task, seen = reflection
     mirror = mirror_of(env_task, group)
@@ -109,13 +115,15 @@ def test_mirrored_robot_sees_the_mirror_image(reflection, group):
 
 
 def test_mirroring_twice_gives_back_what_was():
-    for mirror in (mirror_of(task(), "policy"), mirror_of(task(), "critic"), mirror_of_action()):
+    for mirror in (mirror_of(task(), "actor"), mirror_of(task(), "critic"), mirror_of_action()):
         x = np.random.default_rng(0).normal(size=len(mirror.order))
         once = mirror.signs * x[mirror.order]
         np.testing.assert_allclose(mirror.signs * once[mirror.order], x)
 
 
 def test_term_whose_image_is_not_known_is_refused():
-    other = dataclasses.replace(make_task("velocity-flat"), critic=(ObservationTerm(obs.drawn_push),))
+    other = dataclasses.replace(
+        make_task("velocity-flat"), observations=ObservationsCfg(actor=(), critic=(ObservationTerm(obs.drawn_push),))
+    )
     with pytest.raises(InputError, match="mirror image of drawn_push is not known"):
         mirror_of(other, "critic")

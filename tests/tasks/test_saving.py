@@ -89,12 +89,14 @@ def test_module_without_the_function_is_told_so():
 
 def test_sections_of_a_training_can_be_left_out_with_their_functions():
     task, content = with_own_rest(), saved(with_own_rest())
-    content["critic"][0]["func"] = content["rewards"][0]["func"] = "elsewhere:unknown"
-    expected = dataclasses.replace(task, rewards=(), critic=(), events=())
+    content["observations"]["critic"][0]["func"] = content["rewards"][0]["func"] = "elsewhere:unknown"
+    expected = dataclasses.replace(
+        task, rewards=(), observations=dataclasses.replace(task.observations, critic=()), events=()
+    )
     assert task_from_json(content, leave_out=OPTIONAL) == expected
-    content["policy"][0]["func"] = "elsewhere:unknown"
-    with pytest.raises(TaskError, match=r"task.policy\[0\] needs 'elsewhere:unknown'"):
-        task_from_json(content, leave_out=("rewards", "critic", "events", "policy"))
+    content["observations"]["actor"][0]["func"] = "elsewhere:unknown"
+    with pytest.raises(TaskError, match=r"task.observations.actor\[0\] needs 'elsewhere:unknown'"):
+        task_from_json(content, leave_out=("rewards", "critic", "events", "actor"))
 
 
 def local_func():
@@ -152,7 +154,7 @@ def test_setting_that_would_not_come_back_is_not_saved(value):
         (lambda t: t["rewards"][0].update(func="jumper_warp.kernels.jump.rewards:wp"), "there is no such one here"),
         (lambda t: t["rewards"][0].update(func=f"{JUMP}.terminations:landed_for", steps=1.0), "must return float"),
         (lambda t: t["rewards"][0].update(type="jumper_warp.tasks.terms:TerminationTerm"), "expected .* RewardTerm"),
-        (lambda t: t["policy"][0].update(history=10**9), "history must be at most"),
+        (lambda t: t["observations"]["actor"][0].update(history=10**9), "history must be at most"),
         (lambda t: t["advance"].update(func="jumper_warp.kernels.mdp.view:load_view"), "must be annotated RobotView"),
         (lambda t: t.update(state="jumper_warp.kernels.mdp.env:NoSettings"), "not a struct that counts steps"),
         (lambda t: t["levels"].append({"type": "jumper_warp.robot.motors:LimitsCfg", "lower": 0.0, "upper": 1.0}),

@@ -19,7 +19,7 @@ from jumper_warp.kernels.mdp import rewards as mdp_rewards
 from jumper_warp.kernels.mdp import terminations as mdp_terminations
 from jumper_warp.robot.motors import jumping_motors, walking_filter
 from jumper_warp.tasks.attitude.cfg import AttitudeResetCfg, TurnCfg
-from jumper_warp.tasks.cfg import Command, Reset, TaskCfg
+from jumper_warp.tasks.cfg import Command, ObservationsCfg, Reset, TaskCfg
 from jumper_warp.tasks.observations import DRAWN, ROBOT, exact
 from jumper_warp.tasks.randomization import RandomizationCfg
 from jumper_warp.tasks.terms import Advance, Curriculum, ObservationTerm, RewardTerm, StateMetric, TerminationTerm
@@ -30,14 +30,14 @@ TORQUE = 8.0
 TOLERANCE = 5.0
 """[deg] Of the goal."""
 
-POLICY = (
+ACTOR = (
     ObservationTerm(attitude.turn_left, noise=0.02),
     *(term for term in ROBOT if term.name not in ("lin_vel", "gravity")),
 )
 """The rotation to the goal, angular velocity, motors and last action."""
 
 CRITIC = (
-    *exact(POLICY),
+    *exact(ACTOR),
     ObservationTerm(attitude.time_left),
     ObservationTerm(attitude.in_collision),
     *(term for term in DRAWN if term.name not in ("drawn_friction", "drawn_push")),
@@ -87,8 +87,7 @@ def attitude_in_flight() -> TaskCfg:
         levels=(TurnCfg((5.0, 40.0)), TurnCfg((10.0, 70.0)), TurnCfg((20.0, 100.0)), TurnCfg((20.0, 140.0))),
         rewards=REWARDS,
         terminations=TERMINATIONS,
-        policy=POLICY,
-        critic=CRITIC,
+        observations=ObservationsCfg(actor=ACTOR, critic=CRITIC),
         motors=jumping_motors(TORQUE),
         command_filter=walking_filter(),
         action_scale=(90.0, 90.0),

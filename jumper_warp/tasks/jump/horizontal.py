@@ -13,7 +13,7 @@ from jumper_warp.kernels.jump.state import JumpState
 from jumper_warp.kernels.mdp import rewards as mdp_rewards
 from jumper_warp.kernels.mdp import terminations as mdp_terminations
 from jumper_warp.robot.motors import horizontal_jump_filter, jumping_motors
-from jumper_warp.tasks.cfg import Command, Reset, TaskCfg
+from jumper_warp.tasks.cfg import Command, ObservationsCfg, Reset, TaskCfg
 from jumper_warp.tasks.jump.cfg import GroundCfg, Level, ResetCfg, StartProbability, cross_levels
 from jumper_warp.tasks.jump.observations import HORIZONTAL, SIGHT, SIGHTED, critic
 from jumper_warp.tasks.jump.vertical import QUIET, STARTS
@@ -117,8 +117,7 @@ def horizontal_jump() -> TaskCfg:
         curriculum=Curriculum(errors.landing_error, tolerance=0.10, counts=reset.from_standing),
         rewards=REWARDS,
         terminations=TERMINATIONS,
-        policy=remembered(HORIZONTAL),
-        critic=critic(HORIZONTAL, SIGHT),
+        observations=ObservationsCfg(actor=remembered(HORIZONTAL), critic=critic(HORIZONTAL, SIGHT)),
         levels=cross_levels(
             (
                 NEAREST,
@@ -151,8 +150,7 @@ def horizontal_jump_sighted() -> TaskCfg:
     return replace(
         task,
         name="horizontal-jump-sighted",
-        policy=remembered(SIGHTED),
-        critic=critic(SIGHTED),
+        observations=ObservationsCfg(actor=remembered(SIGHTED), critic=critic(SIGHTED)),
         reset=replace(task.reset, settings=replace(RESET, ground=ground)),
     )
 

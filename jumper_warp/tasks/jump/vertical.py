@@ -11,7 +11,7 @@ from jumper_warp.kernels.jump.state import JumpState
 from jumper_warp.kernels.mdp import rewards as mdp_rewards
 from jumper_warp.kernels.mdp import terminations as mdp_terminations
 from jumper_warp.robot.motors import jumping_motors, vertical_jump_filter
-from jumper_warp.tasks.cfg import Command, Reset, TaskCfg
+from jumper_warp.tasks.cfg import Command, ObservationsCfg, Reset, TaskCfg
 from jumper_warp.tasks.jump.cfg import Level, ResetCfg, StartProbability, cross_levels
 from jumper_warp.tasks.jump.observations import VERTICAL, critic
 from jumper_warp.tasks.observations import remembered
@@ -99,8 +99,7 @@ def vertical_jump() -> TaskCfg:
         curriculum=Curriculum(errors.height_error, tolerance=0.05, counts=reset.from_standing),
         rewards=REWARDS,
         terminations=TERMINATIONS,
-        policy=remembered(VERTICAL),
-        critic=critic(VERTICAL),
+        observations=ObservationsCfg(actor=remembered(VERTICAL), critic=critic(VERTICAL)),
         levels=heights((0.5, 0.7), (0.45, 0.95), (0.45, 1.15)),
         motors=jumping_motors(18.0, lateral_torque=10.0),
         command_filter=vertical_jump_filter(),

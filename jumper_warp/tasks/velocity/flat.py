@@ -21,7 +21,7 @@ from jumper_warp.kernels.velocity import observations as velocity
 from jumper_warp.kernels.velocity.reset import reset_velocity
 from jumper_warp.kernels.velocity.state import VelocityState
 from jumper_warp.robot.motors import walking_filter, walking_motors
-from jumper_warp.tasks.cfg import Command, Reset, TaskCfg
+from jumper_warp.tasks.cfg import Command, ObservationsCfg, Reset, TaskCfg
 from jumper_warp.tasks.observations import DRAWN, ROBOT, exact, remembered
 from jumper_warp.tasks.randomization import RandomizationCfg
 from jumper_warp.tasks.terms import Advance, Curriculum, ObservationTerm, RewardTerm, StateMetric, TerminationTerm
@@ -34,7 +34,7 @@ SENSED = ("lin_vel", "ang_vel", "gravity", "angle", "rate")
 WITHOUT_HISTORY = (ObservationTerm(velocity.command), *(term.replace(delayed=term.name in SENSED) for term in ROBOT))
 """What the paper's walking policy sees, in another order."""
 
-POLICY = remembered(WITHOUT_HISTORY)
+ACTOR = remembered(WITHOUT_HISTORY)
 """The same over four policy steps."""
 
 CRITIC = (
@@ -110,8 +110,7 @@ def velocity_flat() -> TaskCfg:
         ),
         rewards=REWARDS,
         terminations=TERMINATIONS,
-        policy=POLICY,
-        critic=CRITIC,
+        observations=ObservationsCfg(actor=ACTOR, critic=CRITIC),
         levels=(CommandCfg(),),
         motors=walking_motors(),
         command_filter=walking_filter(),
@@ -131,6 +130,7 @@ def velocity_trot() -> TaskCfg:
         name="velocity-trot",
         reset=replace(flat.reset, settings=replace(flat.reset.settings, gait=2.0)),
         rewards=(*flat.rewards, RewardTerm(rewards.trot_schedule, 2.0, duty=0.55)),
-        policy=(*flat.policy, gait_phase),
-        critic=(*flat.critic, gait_phase),
+        observations=ObservationsCfg(
+            actor=(*flat.observations.actor, gait_phase), critic=(*flat.observations.critic, gait_phase)
+        ),
     )

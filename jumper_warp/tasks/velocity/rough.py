@@ -15,7 +15,7 @@ from jumper_warp.kernels.mdp import rewards as mdp_rewards
 from jumper_warp.kernels.velocity import observations as velocity
 from jumper_warp.kernels.velocity import rewards
 from jumper_warp.robot.terrain import KINDS, TerrainCfg
-from jumper_warp.tasks.cfg import TaskCfg
+from jumper_warp.tasks.cfg import ObservationsCfg, TaskCfg
 from jumper_warp.tasks.terms import ObservationTerm, RewardTerm
 from jumper_warp.tasks.units import DEG
 from jumper_warp.tasks.velocity.cfg import CommandCfg
@@ -42,8 +42,9 @@ def velocity_rough() -> TaskCfg:
             flat.reset, settings=replace(flat.reset.settings, terrain=TerrainCfg(kinds=GROUNDS), tolerance=0.25)
         ),
         levels=(COMMANDS,),
-        policy=WITHOUT_HISTORY,
-        critic=(*flat.critic, ObservationTerm(velocity.ground_heights)),
+        observations=ObservationsCfg(
+            actor=WITHOUT_HISTORY, critic=(*flat.observations.critic, ObservationTerm(velocity.ground_heights))
+        ),
     )
     task = task.with_terms(
         "rewards",

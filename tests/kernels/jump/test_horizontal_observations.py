@@ -237,7 +237,7 @@ def edges(block, base, heading):
 
 def test_the_block_ahead_is_seen_along_three_rays():
     task = make_task("horizontal-jump-sighted")
-    assert list(task.layout("policy"))[-1] == "block_ahead"
+    assert list(task.layout("actor"))[-1] == "block_ahead"
     env = make_env(256, task=task, reset=only("standing", task.reset.settings), randomize=True, seed=5)
     edit_episodes(env, level=7)
     env.reset()
@@ -286,7 +286,7 @@ def test_a_mirrored_robot_sees_the_mirror_image(task):
     for episode in robots.tasks:
         episode.goal = wp.vec3(episode.goal[0], -episode.goal[1], episode.goal[2])
     second, seen = robots.both(), robots.skill.task
-    for group, a, b in zip(("policy", "critic"), first, second, strict=True):
+    for group, a, b in zip(("actor", "critic"), first, second, strict=True):
         mirror = mirror_of(seen, group)
         np.testing.assert_allclose(b, mirror.signs * a[:, mirror.order], atol=1e-5)
         assert np.abs(b - a).max() > 0.5

@@ -1,6 +1,7 @@
 import numpy as np
 
 from jumper_warp.kernels.mdp import observations as obs
+from jumper_warp.tasks.cfg import ObservationsCfg
 from jumper_warp.tasks.terms import ObservationTerm
 from mdp_helpers import DEFAULT_ANGLE, write
 from probe_task import Probe, probe_task
@@ -10,7 +11,8 @@ TERMS = (obs.contacts, obs.air_times, obs.paw_forces, obs.height, obs.angle)
 
 
 def test_paws_and_sensors_are_seen_as_they_are_stored():
-    probe = Probe(N, probe_task(policy=tuple(ObservationTerm(term) for term in TERMS)))
+    seen = ObservationsCfg(actor=tuple(ObservationTerm(term) for term in TERMS), critic=())
+    probe = Probe(N, probe_task(observations=seen))
     rng = np.random.default_rng(0)
     down, air = rng.random((4, N)) < 0.5, rng.random((4, N)).astype(np.float32)
     force = 300.0 * rng.normal(size=(4, N, 3)).astype(np.float32)
@@ -21,7 +23,7 @@ def test_paws_and_sensors_are_seen_as_they_are_stored():
     probe.robot.joint_offset.assign(offset)
     write(probe.robot.joint_q, slice(2, None, 43), height)
     probe.observe()
-    found = probe.obs("policy")
+    found = probe.obs("actor")
     np.testing.assert_array_equal(found[:, :4], down.T)
     np.testing.assert_array_equal(found[:, 4:8], air.T)
     np.testing.assert_allclose(found[:, 8:12], np.minimum(np.linalg.norm(force, axis=2).T / 140.0, 5.0), rtol=1e-5)

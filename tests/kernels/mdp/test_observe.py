@@ -17,7 +17,7 @@ DEPTH = 8
 def probe():
     """Worlds whose first observation has no past; exact."""
     probe = Probe(N)
-    probe.skill.set("policy", "value", noise=0.0)
+    probe.skill.set("observations.actor", "value", noise=0.0)
     probe.episodes.history_reset.fill_(1)
     return probe
 
@@ -34,7 +34,7 @@ def play(probe, values, others):
     for value, other in zip(values, others, strict=True):
         probe.write(value=value, other=other)
         probe.observe()
-        policy.append(probe.obs("policy"))
+        policy.append(probe.obs("actor"))
         critic.append(probe.obs("critic"))
         probe.next_clock()
     return np.array(policy), np.array(critic)
@@ -46,9 +46,9 @@ def test_terms_follow_each_other_in_their_groups(probe):
     probe.observe()
     value, other = np.arange(N) / 16.0, -np.arange(N) / 32.0
     expected = np.stack([10.0 * value, *3 * [value, other], value, other], axis=1)
-    np.testing.assert_array_equal(probe.obs("policy"), expected.astype(np.float32))
+    np.testing.assert_array_equal(probe.obs("actor"), expected.astype(np.float32))
     np.testing.assert_array_equal(probe.obs("critic"), np.stack([other, np.arange(N), value, value], axis=1))
-    np.testing.assert_array_equal(probe.obs("policy", final=True), probe.obs("policy"))
+    np.testing.assert_array_equal(probe.obs("actor", final=True), probe.obs("actor"))
 
 
 # ---------------------------------------------------------------- noise, clipping, scale
@@ -56,21 +56,21 @@ def test_terms_follow_each_other_in_their_groups(probe):
 
 def noise_of(probe):
     """Return the noise of each world over its standard deviation, as it comes at the present clock."""
-    probe.skill.set("policy", "value", noise=1.0, scale=1.0, clip=100.0)
+    probe.skill.set("observations.actor", "value", noise=1.0, scale=1.0, clip=100.0)
     probe.write(value=0.0)
     probe.observe()
-    return probe.obs("policy")[:, 0].copy()
+    return probe.obs("actor")[:, 0].copy()
 
 
 def test_noise_comes_before_the_clipping_and_the_scale_after(probe):
     noise = noise_of(probe)
     assert np.abs(noise).max() == 1.0 and np.ptp(noise) > 1.5
-    probe.skill.set("policy", "value", noise=NOISE, scale=SCALE, clip=CLIP)
+    probe.skill.set("observations.actor", "value", noise=NOISE, scale=SCALE, clip=CLIP)
     value = np.linspace(-5.0, 5.0, N).astype(np.float32)
     probe.write(value=value)
     probe.observe()
     expected = SCALE * np.clip(value + NOISE * noise, -CLIP, CLIP)
-    np.testing.assert_allclose(probe.obs("policy")[:, 0], expected, rtol=1e-6)
+    np.testing.assert_allclose(probe.obs("actor")[:, 0], expected, rtol=1e-6)
     assert 2 < np.count_nonzero(np.abs(expected) == 40.0) < N - 10
 
 
@@ -84,7 +84,7 @@ def test_noise_is_another_in_every_step_and_the_same_again_at_the_same_clock(pro
 
 
 def test_terms_without_noise_are_exact_beside_noisy_ones(probe):
-    probe.skill.set("policy", "value", noise=1.0)
+    probe.skill.set("observations.actor", "value", noise=1.0)
     values, others = sequence(4)
     policy, critic = play(probe, values, others)
     np.testing.assert_array_equal(policy[..., 5], values)
@@ -121,7 +121,7 @@ def test_a_new_episode_has_no_past_and_the_last_observation_keeps_that_of_the_ol
     policy, critic = play(probe, values, others)
     some, rest = np.arange(0, N, 4), np.setdiff1d(np.arange(N), np.arange(0, N, 4))
     begin_some(probe, some, 7.5, -7.5)
-    now, final = probe.obs("policy"), probe.obs("policy", final=True)
+    now, final = probe.obs("actor"), probe.obs("actor", final=True)
     np.testing.assert_array_equal(final, policy[-1])
     np.testing.assert_array_equal(probe.obs("critic", final=True), critic[-1])
     np.testing.assert_array_equal(now[rest], policy[-1, rest])
@@ -185,7 +185,7 @@ def test_a_command_within_an_episode_renews_the_newest_frame_and_keeps_those_bef
     probe.write(value=7.5, other=-7.5)
     for _ in range(2):  # a second time changes nothing
         probe.observe(after_reset=1)
-        now, final = probe.obs("policy"), probe.obs("policy", final=True)
+        now, final = probe.obs("actor"), probe.obs("actor", final=True)
         np.testing.assert_array_equal(final, policy[-1])
         np.testing.assert_array_equal(now[rest], policy[-1, rest])
         np.testing.assert_array_equal(now[some][:, [1, 2, 3, 4]], policy[-1, some][:, [1, 2, 3, 4]])
@@ -203,7 +203,7 @@ def test_a_command_within_an_episode_renews_the_newest_frame_and_keeps_those_bef
 
 
 def test_broken_worlds_read_0_in_all_frames_and_go_on_without_a_trace(probe):
-    probe.skill.set("policy", "value", noise=1.0)
+    probe.skill.set("observations.actor", "value", noise=1.0)
     probe.latency.fill_(12)
     play(probe, *sequence(4))
     diverged = np.arange(N) % 5 == 0
@@ -211,13 +211,13 @@ def test_broken_worlds_read_0_in_all_frames_and_go_on_without_a_trace(probe):
     write(probe.robot.joint_q, slice(0, 43), np.nan)
     probe.write(value=np.where(diverged, np.nan, 1.0), other=np.where(diverged, np.inf, 1.0))
     probe.observe()
-    for group in ("policy", "critic"):
+    for group in ("actor", "critic"):
         for final in (False, True):
             seen = probe.obs(group, final)
             assert np.isfinite(seen).all() and not seen[diverged].any() and (np.abs(seen[~diverged, 1:]) > 0).any()
     probe.episodes.diverged.zero_()
     begin_some(probe, np.flatnonzero(diverged), 0.5, 0.25)
-    found = probe.obs("policy")[diverged][:, 1:]
+    found = probe.obs("actor")[diverged][:, 1:]
     np.testing.assert_array_equal(found, np.tile([0.5, 0.25], (diverged.sum(), 4)))
 
 
@@ -235,7 +235,7 @@ def test_a_number_that_is_not_finite_reads_0_and_leaves_the_rest_alone(probe, ba
 def test_worlds_of_another_skill_are_passed_over(probe):
     away = np.arange(N) % 3 == 0
     play(probe, *sequence(3))
-    before = {group: probe.obs(group) for group in ("policy", "critic")}
+    before = {group: probe.obs(group) for group in ("actor", "critic")}
     past = probe.skill.observations.past.numpy().copy()
     probe.episodes.skill.assign(away.astype(int))
     play(probe, *sequence(1, seed=1))
