@@ -37,7 +37,7 @@ def main(args: Args) -> dict:
     folder, values = output_dir("paper_tests", args.out), {}
     table = Table("policy", "test", "metric", "here", "paper")
     for policy in args.policies:
-        for name, suite in suites_for(EvaluationRun(policy).task.evaluation).items():
+        for name, suite in suites_for(EvaluationRun(policy).task.evaluation_suite).items():
             if not suite.paper:
                 continue
             flags: dict[str, Any] = {key: value for key, value in asdict(args).items() if key != "policies"}

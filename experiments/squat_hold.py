@@ -64,7 +64,7 @@ def main(args: Args) -> dict:
     """Hold squats and return the figures."""
     run = EvaluationRun.of("squat_hold", args, (*HEIGHTS, *PLACES))
     env = run.env(args.squats)
-    up = run.task.evaluation in HEIGHTS
+    up = run.task.evaluation_suite in HEIGHTS
     goals = hold_goals(args.squats, args.height if up else args.distance, up=up)
     holds = run.follow(env, Holds(goals, args.hold), film="holds")
     if not holds.over.all():

@@ -112,7 +112,7 @@ def measured(checkpoint: Path, args: Any, folder: Path) -> dict[str, dict[str, A
         env = run.env(count, lambda task: run.evaluation.for_evaluation(replace(task, terminations=ends)), conditions)
         values = flags.metrics(run.follow(env, flags.log(env.task, 0)))
         values["error_m"] = values.get("mean_abs_error_m", values.get("mean_error_m"))
-        goals = hold_goals(args.squats, JUMPS[args.task].squats, up=run.task.evaluation in HEIGHTS)
+        goals = hold_goals(args.squats, JUMPS[args.task].squats, up=run.task.evaluation_suite in HEIGHTS)
         values |= hold_metrics(run.follow(run.env(args.squats, conditions=conditions), Holds(goals, HOLD)))
         tests[test] = {name: value for name, value in values.items() if isinstance(value, bool | int | float | None)}
     return tests

@@ -250,10 +250,10 @@ class FlightRun(Run):
         self.turn: Policy = open_policy(args.policy)
         self.landing: Policy | None = open_policy(landing) if landing else None
         turning = restored_task(self.turn.config)
-        if turning.evaluation != "attitude":
+        if turning.evaluation_suite != "attitude":
             raise PolicyError(f"this needs a policy that turns in flight, {args.policy} is of {turning.name}")
         takes_off = make_task(jump) if self.landing is None else restored_task(self.landing.config)
-        if takes_off.evaluation not in HEIGHTS:
+        if takes_off.evaluation_suite not in HEIGHTS:
             raise PolicyError(f"this needs a jump to heights, got {takes_off.name}")
         self.tasks = takes_off, turning
         self.prepare("flight_attitude", conditions_of(args), args.out, record=args.record)

@@ -50,7 +50,7 @@ def run_suite(opened: EvaluationRun, args: Sequence[str]) -> None:
     from jumper_warp.evaluation.suites import suites_for
 
     flag = args.index(SUITE)
-    suites, name = suites_for(opened.task.evaluation), "".join(args[flag + 1 : flag + 2])
+    suites, name = suites_for(opened.task.evaluation_suite), "".join(args[flag + 1 : flag + 2])
     if name not in suites:
         there = ", ".join(suites) or "none"
         raise UsageError(f"no suite {name!r:.60} for policies of {opened.task.name}; there are {there}")

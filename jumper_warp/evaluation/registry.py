@@ -1,4 +1,4 @@
-"""How policies are evaluated and played, by the key that a task names in `TaskCfg.evaluation`."""
+"""How policies are evaluated and played, by the key that a task names in `TaskCfg.evaluation_suite`."""
 
 from __future__ import annotations
 
@@ -59,16 +59,16 @@ class Evaluation:
 HEIGHT = Evaluation(HeightFlags(), HeightGoals(), heights.for_evaluation, "height")
 PLACE = Evaluation(PlaceFlags(), PlaceGoals(), places.for_evaluation, "place")
 EVALUATIONS: dict[str, Evaluation] = {
-    "height": HEIGHT,
-    "place": PLACE,
-    "height-mars": replace(
+    "apex_height": HEIGHT,
+    "landing_position": PLACE,
+    "apex_height_mars": replace(
         HEIGHT, flags=HeightFlags(lower=1.0, upper=3.3, in_range=(1.0, 2.9)), play=HeightGoals((1.5, 2.3, 3.0), 6.0)
     ),
-    "place-mars": replace(
+    "landing_position_mars": replace(
         PLACE, flags=PlaceFlags(x=(0.5, 4.2), in_range=(0.5, 3.9)),
         play=PlaceGoals(unless_told=((1.0, 0.0), (2.5, 0.0), (3.9, 0.0))),
     ),
-    "around": replace(
+    "omnidirectional": replace(
         PLACE, flags=PlaceFlags(x=(-0.7, 0.7), y=(-0.7, 0.7), in_range=(0.0, 0.7)), misses=None,
         play=PlaceGoals(unless_told=((0.5, 0.0), (0.0, 0.5), (-0.5, 0.0))),
     ),
@@ -81,6 +81,8 @@ EVALUATIONS: dict[str, Evaluation] = {
 
 def evaluation_of(task: TaskCfg) -> Evaluation:
     """Return how policies of a task are evaluated. Raises PolicyError for a key that is not there."""
-    if task.evaluation not in EVALUATIONS:
-        raise PolicyError(f"{task.name} asks for the evaluation {task.evaluation!r:.60}; there are {[*EVALUATIONS]}")
-    return EVALUATIONS[task.evaluation]
+    if task.evaluation_suite not in EVALUATIONS:
+        raise PolicyError(
+            f"{task.name} asks for the evaluation {task.evaluation_suite!r:.60}; there are {[*EVALUATIONS]}"
+        )
+    return EVALUATIONS[task.evaluation_suite]

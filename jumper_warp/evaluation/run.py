@@ -36,9 +36,9 @@ from jumper_warp.utils.output import output_dir, write_metrics
 from jumper_warp.utils.runtime import announce
 from jumper_warp.utils.threads import checked_threads
 
-HEIGHTS = ("height", "height-mars")
+HEIGHTS = ("apex_height", "apex_height_mars")
 """Evaluations of policies that jump to heights."""
-PLACES = ("place", "around", "place-mars")
+PLACES = ("landing_position", "omnidirectional", "landing_position_mars")
 """Of those that jump to places."""
 Log = TypeVar("Log", bound=EvaluationLog)
 
@@ -207,10 +207,10 @@ class EvaluationRun(Run):
         has named. Raises as the constructor and `prepare`.
         """
         run = cls(args.policy, modules)
-        if run.task.evaluation not in evaluations:
+        if run.task.evaluation_suite not in evaluations:
             raise PolicyError(
                 f"this needs a policy that is evaluated by {' or '.join(evaluations)}, "
-                f"{args.policy} is of {run.task.name}, by {run.task.evaluation}"
+                f"{args.policy} is of {run.task.name}, by {run.task.evaluation_suite}"
             )
         run.prepare(name, conditions_of(args), args.out, record=args.record)
         run.told = {"task": run.task.name} if len(evaluations) > 1 else {}

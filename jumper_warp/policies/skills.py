@@ -43,8 +43,10 @@ class SkillPolicies:
         sources = (self.names.walk, self.names.jump_up, self.names.jump_to)
         self.policies = [open_policy(source) for source in sources]
         self.tasks = [task_of_policy(policy) for policy in self.policies]
-        for task, kinds in zip(self.tasks, (("velocity",), ("height",), ("place", "around")), strict=True):
-            if task.evaluation not in kinds:
+        for task, kinds in zip(
+            self.tasks, (("velocity",), ("apex_height",), ("landing_position", "omnidirectional")), strict=True
+        ):
+            if task.evaluation_suite not in kinds:
                 raise PolicyError(
                     f"this needs a policy that is evaluated by {' or '.join(kinds)}, got one of {task.name}"
                 )

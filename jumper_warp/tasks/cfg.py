@@ -110,7 +110,7 @@ class TaskCfg:
     """Least total reward of a step; None: no floor."""
     metrics: tuple[StateMetric, ...] = ()
     """What is logged of the state, besides the means of all terms."""
-    evaluation: str = "episode"
+    evaluation_suite: str = "episode"
     """How policies are measured and played: a key of `jumper_warp.evaluation.registry.EVALUATIONS`."""
 
     groups = ("actor", "critic")

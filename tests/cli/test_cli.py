@@ -243,7 +243,7 @@ def test_every_other_setting_has_a_flag(name):
 def test_fields_of_a_task_without_a_flag_are_its_code_and_its_names():
     flags = {spec.metadata["flag"] for spec in dataclasses.fields(flags_of(hold_height()))}
     names = {flag_name(spec.name) for spec in dataclasses.fields(TaskCfg)}
-    assert names - flags == {"name", "state", "command", "evaluation", "metrics"} and not flags - names
+    assert names - flags == {"name", "state", "command", "evaluation_suite", "metrics"} and not flags - names
 
 
 @pytest.mark.parametrize("name", [*TASKS, "hold-height"])

@@ -15,7 +15,7 @@ from jumper_warp.registry import TASKS, make_task
 from jumper_warp.utils.errors import InputError
 from landing_helpers import still_policy
 
-TASK = EVALUATIONS["place"].for_evaluation(make_task("horizontal-jump"))
+TASK = EVALUATIONS["landing_position"].for_evaluation(make_task("horizontal-jump"))
 
 
 @pytest.fixture(scope="module")
@@ -30,7 +30,8 @@ def policies(tmp_path_factory):
 def test_every_task_is_measured_by_a_success_that_comes_after_all_falls():
     kinds = {name: evaluation_of(make_task(name)) for name in TASKS if name.endswith("-jump")}
     assert [kinds[name] is EVALUATIONS[key] for name, key in (
-        ("vertical-jump", "height"), ("horizontal-jump", "place"), ("omnidirectional-jump", "around"),
+        ("vertical-jump", "apex_height"), ("horizontal-jump", "landing_position"),
+        ("omnidirectional-jump", "omnidirectional"),
     )] == [True] * 3  # fmt: skip
     for name, kind in kinds.items():
         ends = [term.name for term in kind.for_evaluation(make_task(name)).terminations]
@@ -38,8 +39,10 @@ def test_every_task_is_measured_by_a_success_that_comes_after_all_falls():
 
 
 def test_task_with_an_unknown_evaluation_is_refused():
-    with pytest.raises(PolicyError, match=r"horizontal-jump asks for the evaluation 'walk'; there are \['height', 'pl"):
-        evaluation_of(replace(TASK, evaluation="walk"))
+    with pytest.raises(
+        PolicyError, match=r"horizontal-jump asks for the evaluation 'walk'; there are \['apex_height', 'l"
+    ):
+        evaluation_of(replace(TASK, evaluation_suite="walk"))
 
 
 def test_places_are_spread_ahead_and_drawn_aside_and_headings_too():

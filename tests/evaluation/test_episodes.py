@@ -103,7 +103,7 @@ def test_impossible_settings_are_refused(make, message):
 def policy(tmp_path_factory):
     """Folder of a policy of a task that says nothing of its evaluation, which holds the default pose."""
     folder, still = tmp_path_factory.mktemp("policy") / "still", still_policy("horizontal-jump")
-    task = replace(make_task("horizontal-jump"), name="any-task", evaluation="episode")
+    task = replace(make_task("horizontal-jump"), name="any-task", evaluation_suite="episode")
     still.config = {"env": {"task": task_to_json(task)}}
     still.interface = replace(still.interface, task="any-task")
     save_policy(folder, still)

@@ -97,5 +97,5 @@ def attitude_in_flight() -> TaskCfg:
         eval_height_offset=2.0,
         reward_floor=None,
         metrics=METRICS,
-        evaluation="attitude",
+        evaluation_suite="attitude",
     )

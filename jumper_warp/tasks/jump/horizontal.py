@@ -133,7 +133,7 @@ def horizontal_jump() -> TaskCfg:
         command_filter=horizontal_jump_filter(),
         action_scale=(15.0, 90.0),
         self_collision_margin=0.005,
-        evaluation="place",
+        evaluation_suite="landing_position",
     )
 
 
@@ -167,7 +167,7 @@ def omnidirectional_jump() -> TaskCfg:
     task = replace(
         task,
         name="omnidirectional-jump",
-        evaluation="around",
+        evaluation_suite="omnidirectional",
         levels=cross_levels(
             (NEAREST, *(level_all_around(*reach) for reach in REACHES)),
             STARTS,

@@ -42,7 +42,7 @@ def vertical_jump_mars() -> TaskCfg:
         gravity=MARS,
         motors=mars_motors(10.0),
         levels=heights((0.7, 1.3), (0.7, 1.8), (0.7, 2.4), (0.7, 3.1)),
-        evaluation="height-mars",
+        evaluation_suite="apex_height_mars",
     )
     task = replace(task, curriculum=task.curriculum.replace(tolerance=0.05 * FARTHER))
     task = task.with_terms(
@@ -90,7 +90,7 @@ def horizontal_jump_mars() -> TaskCfg:
              level((3.0, 4.75), 0.3)), STARTS,
         ),
         reset=replace(task.reset, settings=settings),
-        evaluation="place-mars",
+        evaluation_suite="landing_position_mars",
     )  # fmt: skip
     task = replace(task, curriculum=task.curriculum.replace(tolerance=0.10 * FARTHER))
     task = task.with_terms(

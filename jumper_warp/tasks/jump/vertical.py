@@ -105,5 +105,5 @@ def vertical_jump() -> TaskCfg:
         command_filter=vertical_jump_filter(),
         action_scale=(15.0, 90.0),
         self_collision_margin=0.005,
-        evaluation="height",
+        evaluation_suite="apex_height",
     )

@@ -117,7 +117,7 @@ def velocity_flat() -> TaskCfg:
         action_scale=(60.0, 60.0),
         randomization=RandomizationCfg.walking(),
         metrics=METRICS,
-        evaluation="velocity",
+        evaluation_suite="velocity",
     )
 
 
