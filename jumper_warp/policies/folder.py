@@ -31,7 +31,7 @@ from jumper_warp.utils.runtime import source_versions
 POLICIES = ASSETS / "policies"
 """Where the project's own policies lie."""
 FORMAT = "jumper-warp policy"
-SCHEMA_VERSION = 2
+SCHEMA_VERSION = 3
 MANIFEST = "manifest.json"
 CONFIG = "config.json"
 ONNX = "policy.onnx"

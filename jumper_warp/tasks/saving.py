@@ -26,7 +26,7 @@ from jumper_warp.tasks.terms import RewardTerm, Term
 from jumper_warp.utils.checks import NAME, version_refusal
 from jumper_warp.utils.errors import InputError
 
-VERSION = 3
+VERSION = 4
 """Of the form in which tasks are saved."""
 OWN = ("jumper_warp.tasks.", "jumper_warp.robot.", "jumper_warp.kernels.")
 """Beginnings of the names of the project's modules that a task may name."""

@@ -15,8 +15,8 @@ FLOAT32_MAX = 3.4028234e38
 """Beyond it, single precision is infinite, which all settings become on their way to a device."""
 MOST_SEED = 2**31 - 1
 """Of the kernels' draws."""
-LAST_OF_OLDER_VERSIONS = "c88f715"
-"""The last commit that reads policies, tasks and runs of older versions than today's."""
+LAST_OF_PREVIOUS_VERSION = "05fa856"
+"""The last commit that reads policies, tasks and runs of the previous version."""
 
 
 def check_finite(name: str, *values: float) -> None:
@@ -67,5 +67,5 @@ def check_seed(value: Any) -> None:
 
 
 def version_refusal(found: str, known: int) -> str:
-    """Return why a file of another version is refused, and which commit reads the older ones."""
-    return f"has version {found}, this is version {known}; commit {LAST_OF_OLDER_VERSIONS} reads older ones"
+    """Return why a file of another version is refused, and which commit reads the previous version."""
+    return f"has version {found}, this is version {known}; commit {LAST_OF_PREVIOUS_VERSION} reads version {known - 1}"

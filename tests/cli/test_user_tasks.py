@@ -262,7 +262,7 @@ def test_run_of_an_older_version_is_refused_with_the_commit_that_reads_it(capsys
     source = ["vertical-jump", "--resume"] if command == "train" else []
     code, out, err = run(capsys, command, *source, str(tmp_path / "run"))
     assert (code, out) == (2, "") and len(err) == 1
-    assert f"the task has version {task.get('version')}, this is version 3; commit c88f715 reads older ones" in err[0]
+    assert f"the task has version {task.get('version')}, this is version 4; commit 05fa856 reads version 3" in err[0]
 
 
 @pytest.mark.parametrize(

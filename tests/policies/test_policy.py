@@ -276,16 +276,16 @@ REFUSALS = {
         "names a file",
     ),
     "manifest of the future": (
-        lambda f: edit_json(f, "manifest.json", lambda m: m.update(schema_version=3)),
-        "manifest.json: has version 3, this is version 2",
+        lambda f: edit_json(f, "manifest.json", lambda m: m.update(schema_version=4)),
+        "manifest.json: has version 4, this is version 3",
     ),
     "config of the future": (
-        lambda f: edit_json(f, "config.json", lambda c: c.update(schema_version=3)),
-        "config.json: has version 3, this is version 2",
+        lambda f: edit_json(f, "config.json", lambda c: c.update(schema_version=4)),
+        "config.json: has version 4, this is version 3",
     ),
     "older version": (
-        lambda f: edit_json(f, "manifest.json", lambda m: m.update(schema_version=1)),
-        "has version 1, this is version 2; commit c88f715 reads older ones",
+        lambda f: edit_json(f, "manifest.json", lambda m: m.update(schema_version=2)),
+        "has version 2, this is version 3; commit 05fa856 reads version 2",
     ),
     "folder in place of a file": (
         lambda f: ((f / "policy.onnx").unlink(), (f / "policy.onnx").mkdir()),

@@ -164,9 +164,9 @@ def test_configuration_that_is_no_task_is_refused(saved, change, message):
 
 def test_task_of_another_version_is_refused_with_the_commit_that_reads_it(saved):
     _, config = saved
-    for version in (2, 4):
+    for version in (3, 5):
         config["env"]["task"]["version"] = version
-        with pytest.raises(PolicyError, match=f"has version {version}, this is version 3; commit c88f715 reads older"):
+        with pytest.raises(PolicyError, match=f"has version {version}, this is version 4; commit 05fa856"):
             restored_task(config)
 
 
