@@ -88,11 +88,11 @@ DEPARTURES: dict[str, dict[str, Undone]] = {
         "starts": "--env.reset.tilt 1 --env.reset.base-xy 0",
     },
     "horizontal-jump": {
-        "estimated_tracking": "--env.rewards.estimated-tracking.fine 0.001",
+        "estimated_tracking": "--env.rewards.estimated-tracking.std-fine 0.001",
         "error_at_touchdown": "--env.terminations.missed-goal.tolerance 0.2",
         "predicted_error": "--env.terminations.predicted-miss.tolerance 0.45",
         "base_at_touchdown": "--env.terminations.low-touchdown.height 0.3",
-        "symmetry": "--env.rewards.left-right-symmetry.share 1",
+        "symmetry": "--env.rewards.left-right-symmetry.waiting-scale 1",
         "bracing": "--env.rewards.capture-point.weight 0",
         "goals": places_of_paper,
         "heading": "--env.reset.heading 0",
@@ -107,9 +107,9 @@ DEPARTURES: dict[str, dict[str, Undone]] = {
     "horizontal-jump-mars-loose": {
         "goals": places_of_sequel,
         "wide_kernels": (
-            "--env.rewards.estimated-tracking.middle 0.3 --env.rewards.estimated-tracking.wide 0.5 "
-            "--env.rewards.estimated-tracking.fine 0.1 --env.rewards.tracking.wide 0.15 "
-            "--env.rewards.tracking.fine 0.03"
+            "--env.rewards.estimated-tracking.std-middle 0.3 --env.rewards.estimated-tracking.std-wide 0.5 "
+            "--env.rewards.estimated-tracking.std-fine 0.1 --env.rewards.tracking.std-wide 0.15 "
+            "--env.rewards.tracking.std-fine 0.03"
         ),
         "limits": (
             "--env.terminations.predicted-miss.tolerance 0.55 --env.terminations.missed-goal.tolerance 0.5 "

@@ -61,8 +61,8 @@ UNDOING = """--env.curriculum.tolerance 0.1 --env.reset.balance-by resets --env.
 --env.reset.ground.block 0 --env.rewards.lifted-again.weight 0 --env.rewards.capture-point.weight 0
 --env.rewards.resting-action-rate.weight 0 --env.rewards.torque-ripple.weight 0 --env.rewards.force-ripple.weight 0
 --env.rewards.base-at-rest.weight 0 --env.rewards.landing-tilt.weight 0 --env.rewards.orientation.weight 0
---env.rewards.ground-force.weight 0 --env.rewards.tracking.fine-share 0 --env.rewards.action-rate.weight -0.03
---env.rewards.left-right-symmetry.share 1 --env.terminations.missed-goal.tolerance 0.2
+--env.rewards.ground-force.weight 0 --env.rewards.tracking.fine-weight 0 --env.rewards.action-rate.weight -0.03
+--env.rewards.left-right-symmetry.waiting-scale 1 --env.terminations.missed-goal.tolerance 0.2
 --env.terminations.predicted-miss.tolerance 0.45 --env.terminations.low-touchdown.height 0.3
 --env.terminations.second-takeoff.speed 100 --ppo.entropy-coef 0.001"""
 
