@@ -164,7 +164,7 @@ def test_landed_robots_are_around_their_goal_with_paws_at_rest_on_the_ground(sta
     assert covers(paws[:, :2, 1], 0.15, 0.17) and covers(paws[:, 2:, 1], 0.20, 0.22)
     assert covers(found.pos[:, 2], 0.30, 0.45)
     assert covers(-found.vel[:, 2], 0.0, 1.0) and not found.vel[:, :2].any()
-    exact = starts["exact landed"]
+    exact = starts["exact after_landing"]
     ahead, aside = exact.split((exact.pos - exact.goal) * [1.0, 1.0, 0.0])
     assert covers(ahead, -0.15, 0.10) and np.abs(aside).max() < 1e-5
     error = np.linalg.norm((found.pos - found.goal)[:, :2], axis=1)
