@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from jumper_warp.policies.policy import Policy
 from jumper_warp.policies.spec import PolicyError
-from jumper_warp.rl.start import scaled_by
+from jumper_warp.rl.actor_init import rescale_inputs
 
 
 def blend(policy: Policy, other: Policy, share: float) -> Policy:
@@ -25,7 +25,7 @@ def blend(policy: Policy, other: Policy, share: float) -> Policy:
         raise PolicyError(f"the share of a blend must be from 0 to 1, got {share}")
     if policy.interface != other.interface:
         raise PolicyError("policies of a blend must read and drive the same by networks of the same form")
-    its = scaled_by(other.layers, other.mean, other.std, policy.mean, policy.std)
+    its = rescale_inputs(other.layers, other.mean, other.std, policy.mean, policy.std)
     pairs = zip(policy.layers, its, strict=True)
     layers = [
         ((1.0 - share) * w.double() + share * v, (1.0 - share) * b.double() + share * c) for (w, b), (v, c) in pairs

@@ -13,20 +13,20 @@ from jumper_warp.policies.spec import PolicyInterface
 from jumper_warp.rl.cfg import PpoCfg
 from jumper_warp.rl.mirror import Symmetry, image
 from jumper_warp.rl.networks import NORMALISED_LIMIT
-from jumper_warp.rl.start import Start, make_start
+from jumper_warp.rl.actor_init import ActorInit, make_actor_init
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.tasks.interface import interface
 from jumper_warp.tasks.mirror import mirror_of, mirror_of_action
 from jumper_warp.utils.errors import InputError
 
 
-def start_from(source: str | Path, task: TaskCfg, cfg: PpoCfg) -> Start:
+def actor_init_from_policy(source: str | Path, task: TaskCfg, cfg: PpoCfg) -> ActorInit:
     """Return what a training of a task begins with to act as a policy does; source: as `open_policy` takes it.
 
     Scales of actions, gains, torques, times and all that the environment does may be others than the policy's own.
 
     Raises PolicyError or CheckpointError: there is no such policy, or it cannot be used. Raises InputError: its
-    observation or its joints are not the task's, or as `make_start`.
+    observation or its joints are not the task's, or as `make_actor_init`.
     """
     policy = open_policy(source)
     check_interface(policy.interface, interface(task))
@@ -34,7 +34,7 @@ def start_from(source: str | Path, task: TaskCfg, cfg: PpoCfg) -> Start:
     if cfg.symmetry == "actor":
         obs, action = mirror_of(task, "policy"), mirror_of_action()
         symmetry = Symmetry(image(*obs, "observation"), image(*action, "action"))
-    return make_start(policy.layers, policy.mean, policy.std, policy.interface.activation, cfg, symmetry)
+    return make_actor_init(policy.layers, policy.mean, policy.std, policy.interface.activation, cfg, symmetry)
 
 
 def check_interface(face: PolicyInterface, described: dict[str, Any]) -> None:

@@ -45,7 +45,7 @@ from jumper_warp.rl.resume import (
 )
 from jumper_warp.rl.shac import STATISTICS as SHAC_STATISTICS
 from jumper_warp.rl.shac import Shac
-from jumper_warp.rl.start import Start, begin_with
+from jumper_warp.rl.actor_init import ActorInit, apply_actor_init
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.files import write_whole
 from jumper_warp.utils.runtime import git_commit, versions
@@ -98,7 +98,7 @@ class Stop:
 
 def train(
     cfg: TrainCfg, make_env: MakeEnv, command: str | None = None, as_rsl_rl: AsRslRl | None = None,
-    start: Start | None = None, checkpoint: Checkpoint | None = None,
+    start: ActorInit | None = None, checkpoint: Checkpoint | None = None,
 ) -> TrainResult:  # fmt: skip
     """Train to the last iteration or the time limit, and save.
 
@@ -171,7 +171,7 @@ class Run:
     """A training under way in this process."""
 
     def __init__(
-        self, cfg: TrainCfg, env: VecEnv, rank: Rank, command: str | None = None, start: Start | None = None,
+        self, cfg: TrainCfg, env: VecEnv, rank: Rank, command: str | None = None, start: ActorInit | None = None,
         checkpoint: Checkpoint | None = None,
     ) -> None:  # fmt: skip
         """Build the algorithm, and take up a checkpoint if the configuration names one, or else begin with a policy.
@@ -193,7 +193,7 @@ class Run:
         if not all_same(str(checkpoint and (checkpoint.path, checkpoint.state["iteration"]))):
             raise InputError("the processes found different checkpoints: log_root must be a folder that all can read")
         if start is not None and checkpoint is None:
-            begin_with(start, self.ppo.model, cfg.num_envs * cfg.ppo.num_steps)
+            apply_actor_init(start, self.ppo.model, cfg.num_envs * cfg.ppo.num_steps)
             self.notes.append(", ".join(filter(None, (f"starts from {cfg.start_from}", start.change))))
         torch.manual_seed(cfg.seed + 1 + rank.index)
         self.folder = new_folder(cfg, rank) if checkpoint is None else self._resume(checkpoint)

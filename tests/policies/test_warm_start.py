@@ -7,11 +7,11 @@ import torch
 
 from jumper_warp.policies.runs import open_policy
 from jumper_warp.policies.spec import PolicyError
-from jumper_warp.policies.warm_start import check_interface, start_from
+from jumper_warp.policies.warm_start import check_interface, actor_init_from_policy
 from jumper_warp.registry import TASKS, make_task
 from jumper_warp.rl.mirror import Symmetry, image
 from jumper_warp.rl.networks import ActorCritic
-from jumper_warp.rl.start import begin_with
+from jumper_warp.rl.actor_init import apply_actor_init
 from jumper_warp.tasks.interface import interface
 from jumper_warp.tasks.mirror import mirror_of, mirror_of_action
 from jumper_warp.tasks.observations import with_history
@@ -37,7 +37,7 @@ def test_a_training_begins_as_a_shipped_policy_acts(name, task, change):
     torch.manual_seed(0)
     sizes = policy.interface.sizes
     model = ActorCritic(sizes[0], sizes[-1], cfg.hidden, cfg.activation, cfg.init_std, symmetry=symmetry)
-    begin_with(start_from(name, task, cfg), model, samples=1000)
+    apply_actor_init(actor_init_from_policy(name, task, cfg), model, samples=1000)
     obs = policy.mean + 2.0 * policy.std * torch.randn(500, sizes[0])
     acted = policy.act(obs)
     assert acted.std() > 0.1
@@ -55,26 +55,26 @@ def test_a_training_begins_as_a_shipped_policy_acts(name, task, change):
 )  # fmt: skip
 def test_what_does_not_fit_is_refused_in_one_line(name, task, change, message):
     with pytest.raises(InputError, match=f"start_from: .*{message}") as caught:
-        start_from(name, make_task(task), dataclasses.replace(TASKS[task].ppo, **change))
+        actor_init_from_policy(name, make_task(task), dataclasses.replace(TASKS[task].ppo, **change))
     assert "\n" not in str(caught.value)
 
 
 def test_no_such_policy_is_told():
     with pytest.raises(PolicyError, match="no_jump"):
-        start_from("no_jump", make_task("horizontal-jump"), TASKS["horizontal-jump"].ppo)
+        actor_init_from_policy("no_jump", make_task("horizontal-jump"), TASKS["horizontal-jump"].ppo)
 
 
 def test_another_history_is_refused():
     with pytest.raises(InputError, match=r"start_from: observation \d+: the policy has \w+"):
-        start_from("horizontal_jump", with_history(make_task("horizontal-jump"), 1), TASKS["horizontal-jump"].ppo)
+        actor_init_from_policy("horizontal_jump", with_history(make_task("horizontal-jump"), 1), TASKS["horizontal-jump"].ppo)
 
 
 def test_a_symmetric_training_begins_with_the_nearest_symmetric_form_of_a_fine_tuned_policy():
     policy, task, cfg = open_policy("horizontal_jump"), make_task("horizontal-jump"), TASKS["horizontal-jump"].ppo
     symmetry = Symmetry(image(*mirror_of(task, "policy"), "observation"), image(*mirror_of_action(), "action"))
-    start = start_from("horizontal_jump", task, cfg)
+    start = actor_init_from_policy("horizontal_jump", task, cfg)
     model = ActorCritic(147, 12, cfg.hidden, cfg.activation, cfg.init_std, symmetry=symmetry)
-    begin_with(start, model, samples=1000)
+    apply_actor_init(start, model, samples=1000)
     obs = policy.mean + policy.std * torch.randn(500, 147, generator=torch.manual_seed(2))
     assert start.change == "made mirror-symmetric"
     assert 0.0 < (model.act(obs) - policy.act(obs)).abs().mean() < 0.01

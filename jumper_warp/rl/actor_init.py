@@ -12,7 +12,7 @@ from jumper_warp.rl.mirror import Symmetry, Weights, nearest_plain_layers, symme
 from jumper_warp.rl.networks import EPS, ActorCritic, weights_of
 from jumper_warp.utils.errors import InputError
 
-KNOWN_ITERATIONS = 100
+PRIOR_ITERATIONS = 100
 """The policy's statistics of observations weigh as much as the samples of so many iterations: the mean and variance of
 what the robot sees now replace them slowly, so that the actor need not follow a jump of its inputs."""
 
@@ -20,7 +20,7 @@ NEARLY = 0.05
 """Of the norm of each layer's weights, that fine-tuning may have taken from the form of a mirror-symmetric actor."""
 
 
-class Start(NamedTuple):
+class ActorInit(NamedTuple):
     """What an `ActorCritic` begins with."""
 
     layers: Weights
@@ -33,10 +33,10 @@ class Start(NamedTuple):
     """What had to be done to a policy that is not mirror-symmetric for a training that is."""
 
 
-def make_start(
+def make_actor_init(
     layers: Weights, mean: torch.Tensor, std: torch.Tensor, activation: str, cfg: PpoCfg,
     symmetry: Symmetry | None = None,
-) -> Start:  # fmt: skip
+) -> ActorInit:  # fmt: skip
     """Return what a training with these settings begins with to act as a policy does.
 
     A policy g that is not mirror-symmetric begins a training with symmetry actor as (g(x) + N g(M x)) / 2, in the
@@ -65,14 +65,14 @@ def make_start(
     if not (std.double().square() > 0.999 * EPS).all():
         raise InputError(f"start_from: the policy divides an observation by {std.min():.3g}, least is {EPS**0.5:.3g}")
     if half is not None and symmetry is not None:
-        return Start(half, mean, std, "" if _is_symmetric(layers, symmetry) else "made mirror-symmetric")
+        return ActorInit(half, mean, std, "" if _is_symmetric(layers, symmetry) else "made mirror-symmetric")
     if symmetry is None:
-        return Start(layers, mean, std)
+        return ActorInit(layers, mean, std)
     return _averaged(layers, mean, std, symmetry)
 
 
 @torch.no_grad()
-def begin_with(start: Start, model: ActorCritic, samples: int) -> None:
+def apply_actor_init(start: ActorInit, model: ActorCritic, samples: int) -> None:
     """Put the weights and the statistics of observations into a model, in place; its noise and its critic stay.
 
     samples: of all worlds in an iteration. Raises InputError: the model's observation, action or layers are of other
@@ -88,7 +88,7 @@ def begin_with(start: Start, model: ActorCritic, samples: int) -> None:
     moments = model.obs_moments
     moments.mean.copy_(start.mean)
     moments.var.copy_((start.std.double().square() - EPS).clamp(min=0.0))
-    moments.count.fill_(KNOWN_ITERATIONS * samples)
+    moments.count.fill_(PRIOR_ITERATIONS * samples)
 
 
 def _half(layers: Weights, mean: torch.Tensor, std: torch.Tensor, symmetry: Symmetry) -> Weights | None:
@@ -111,16 +111,16 @@ def _is_symmetric(layers: Weights, symmetry: Symmetry) -> bool:
     return True
 
 
-def _averaged(layers: Weights, mean: torch.Tensor, std: torch.Tensor, symmetry: Symmetry) -> Start:
+def _averaged(layers: Weights, mean: torch.Tensor, std: torch.Tensor, symmetry: Symmetry) -> ActorInit:
     """Return g as the network f of a symmetric actor, and the statistics of its samples and their images."""
     middle, var = symmetry.obs.moments(mean.double(), std.double().square())
-    scaled = scaled_by(layers, mean, std, middle, var.sqrt())
+    scaled = rescale_inputs(layers, mean, std, middle, var.sqrt())
     own = [(weight.to(mean.dtype), bias.to(mean.dtype)) for weight, bias in scaled]
     change = "its answers averaged with their mirror images"
-    return Start(own, middle.to(mean.dtype), var.sqrt().to(std.dtype), change)
+    return ActorInit(own, middle.to(mean.dtype), var.sqrt().to(std.dtype), change)
 
 
-def scaled_by(
+def rescale_inputs(
     layers: Weights, mean: torch.Tensor, std: torch.Tensor, other_mean: torch.Tensor, other_std: torch.Tensor
 ) -> Weights:
     """Return the layers, float64, for observations scaled by other statistics (num_obs,) than by mean and std.

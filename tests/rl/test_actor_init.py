@@ -12,7 +12,7 @@ from jumper_warp.rl.mirror import nearest_plain_layers, plain_layers, symmetric_
 from jumper_warp.rl.networks import EPS, ActorCritic
 from jumper_warp.rl.ppo import Ppo
 from jumper_warp.rl.runner import CHECKPOINTS, CONFIG, train
-from jumper_warp.rl.start import KNOWN_ITERATIONS, begin_with, make_start
+from jumper_warp.rl.actor_init import PRIOR_ITERATIONS, apply_actor_init, make_actor_init
 from jumper_warp.utils.errors import InputError
 from toy_task import SMALL, PushTask, push_cfg
 
@@ -42,7 +42,7 @@ def start_of(model, cfg=SMALL, activation="elu"):
     """Return how a training begins with this actor, exported as a plain network."""
     layers = layers_of(model) if model.symmetry is None else plain_layers(layers_of(model), model.symmetry)
     symmetry = SYMMETRY if cfg.symmetry == "actor" else None
-    return make_start(layers, *model.obs_moments.scaling(), activation, cfg, symmetry)
+    return make_actor_init(layers, *model.obs_moments.scaling(), activation, cfg, symmetry)
 
 
 @pytest.fixture
@@ -122,9 +122,9 @@ def test_a_training_begins_as_the_policy_acts(given, symmetry, hidden):
     model, cfg = actor(symmetry=given), dataclasses.replace(SMALL, symmetry=symmetry, hidden=hidden)
     ppo = Ppo(PushTask(8), cfg)
     before = {name: tensor.clone() for name, tensor in ppo.model.state_dict().items()}
-    begin_with(start_of(model, cfg), ppo.model, samples=128)
+    apply_actor_init(start_of(model, cfg), ppo.model, samples=128)
     torch.testing.assert_close(ppo.model.act(OBS), model.act(OBS), atol=1e-5, rtol=0.0)
-    assert ppo.model.obs_moments.count == KNOWN_ITERATIONS * 128
+    assert ppo.model.obs_moments.count == PRIOR_ITERATIONS * 128
     for name, tensor in ppo.model.state_dict().items():
         assert name.startswith(("actor.", "obs_moments.")) or torch.equal(tensor, before[name]), name
     ppo.env.reset()
@@ -156,7 +156,7 @@ def averaged(act, obs):
 def test_a_symmetric_training_begins_with_the_average_of_a_policys_answers_and_their_images():
     model, ppo = actor(), Ppo(PushTask(8), SYMMETRIC)
     start = start_of(model, SYMMETRIC)
-    begin_with(start, ppo.model, samples=128)
+    apply_actor_init(start, ppo.model, samples=128)
     mean, std = model.obs_moments.scaling()
     obs = 0.5 * OBS  # within the limits of both statistics
     expected = averaged(lambda obs: model.actor((obs - mean) / std), obs).clamp(-1.0, 1.0)
@@ -179,28 +179,28 @@ def test_a_policy_that_fine_tuning_has_bent_begins_as_the_nearest_symmetric_one(
     scaling = actor(symmetry=SYMMETRY).obs_moments.scaling()
     torch.manual_seed(2)
     little, much = ([(w + share * w.std() * torch.randn_like(w), b) for w, b in exact] for share in (0.01, 0.5))
-    start = make_start(little, *scaling, "elu", SYMMETRIC, SYMMETRY)
+    start = make_actor_init(little, *scaling, "elu", SYMMETRIC, SYMMETRY)
     assert start.change == "made mirror-symmetric"
     for own, made in zip(nearest_plain_layers(little, SYMMETRY), plain_layers(start.layers, SYMMETRY), strict=True):
         torch.testing.assert_close(made, own)
     with pytest.raises(InputError, match=r"give --ppo\.hidden 64 64"):  # averaged, which needs all of its widths
-        make_start(much, *scaling, "elu", SYMMETRIC, SYMMETRY)
+        make_actor_init(much, *scaling, "elu", SYMMETRIC, SYMMETRY)
 
 
 def test_a_deviation_that_statistics_cannot_have_is_refused():
     model = actor()
     model.obs_moments.var.zero_()
-    begin_with(start_of(model), model, samples=1)
+    apply_actor_init(start_of(model), model, samples=1)
     assert (model.obs_moments.var >= 0.0).all() and (model.obs_moments.var < 0.01 * EPS).all()
     with pytest.raises(InputError, match=r"divides an observation by 0\.001, least is 0\.00316"):
-        make_start(layers_of(model), torch.zeros(2), torch.tensor([1.0, 1e-3]), "elu", SMALL)
+        make_actor_init(layers_of(model), torch.zeros(2), torch.tensor([1.0, 1e-3]), "elu", SMALL)
 
 
 def test_a_model_of_other_sizes_is_left_alone():
     model = ActorCritic(3, 1, (32, 32))
     before = model.actor[0].weight.clone()
     with pytest.raises(InputError, match=r"start_from: .* of shapes \(32, 2\), .* the training's \(32, 3\)"):
-        begin_with(start_of(actor()), model, samples=1)
+        apply_actor_init(start_of(actor()), model, samples=1)
     assert torch.equal(model.actor[0].weight, before) and not model.obs_moments.count
 
 
@@ -211,24 +211,24 @@ def test_a_model_of_other_sizes_is_left_alone():
 def test_a_training_starts_from_a_policy_and_tells_so(cfg, capsys, trainer, env):
     cfg = dataclasses.replace(cfg, trainer=trainer, shac=dataclasses.replace(cfg.shac, lr=1e-9))
     model = actor()
-    result = train(cfg, env, start=start_of(model))
+    result = train(cfg, env, actor_init=start_of(model))
     found, told = model_of(result), capsys.readouterr().err.splitlines()
     assert told[1] == "starts from pusher"
     torch.testing.assert_close(found["actor.0.weight"], model.actor[0].weight.data, atol=1e-6, rtol=0.0)
     torch.testing.assert_close(found["log_std"], torch.zeros(1), atol=1e-6, rtol=0.0)
     samples = 32 * SMALL.num_steps
-    assert found["obs_moments.count"] == (KNOWN_ITERATIONS + 1) * samples
+    assert found["obs_moments.count"] == (PRIOR_ITERATIONS + 1) * samples
     assert 0.0 < (found["obs_moments.mean"] - model.obs_moments.mean).abs().max() < 0.05
     assert json.loads((result.folder / CONFIG).read_text())["train"]["start_from"] == "pusher"
 
 
 def test_a_resumed_training_goes_on_from_its_checkpoint_and_keeps_what_it_began_with(cfg, capsys):
-    first = train(cfg, make_env, start=start_of(actor()))
+    first = train(cfg, make_env, actor_init=start_of(actor()))
     capsys.readouterr()
     resumed = dataclasses.replace(cfg, start_from=None, resume=str(first.folder), iterations=2)
     second = train(resumed, make_env)
     assert "starts from" not in capsys.readouterr().err
-    assert model_of(second)["obs_moments.count"] == (KNOWN_ITERATIONS + 2) * 32 * SMALL.num_steps
+    assert model_of(second)["obs_moments.count"] == (PRIOR_ITERATIONS + 2) * 32 * SMALL.num_steps
     assert json.loads((second.folder / CONFIG).read_text())["train"]["start_from"] == "pusher"
 
 
@@ -248,4 +248,4 @@ def test_a_checkpoint_that_began_with_random_weights_is_resumed(cfg, before):
 def test_name_and_policy_need_each_other(cfg):
     for start_from, start in (("pusher", None), (None, start_of(actor()))):
         with pytest.raises(InputError, match=r"start_from and start.* need each other"):
-            train(dataclasses.replace(cfg, start_from=start_from), make_env, start=start)
+            train(dataclasses.replace(cfg, start_from=start_from), make_env, actor_init=start)
