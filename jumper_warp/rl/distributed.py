@@ -27,7 +27,7 @@ def wait_for_ranks() -> None:
         torch.distributed.barrier()
 
 
-def largest_over_ranks(values: list[int]) -> list[int]:
+def all_reduce_max(values: list[int]) -> list[int]:
     """Return the largest of each number over all processes; each waits for the others."""
     if world_size() == 1:
         return values
@@ -36,18 +36,18 @@ def largest_over_ranks(values: list[int]) -> list[int]:
     return vector.tolist()
 
 
-def all_ranks(agreed: bool) -> bool:
+def all_ranks_agree(agreed: bool) -> bool:
     """Return whether all processes agree; each waits for the others."""
-    return largest_over_ranks([int(not agreed)]) == [0]
+    return all_reduce_max([int(not agreed)]) == [0]
 
 
-def all_same(text: str) -> bool:
+def same_on_all_ranks(text: str) -> bool:
     """Return whether all processes call this with the same text; each waits for the others."""
     number = int.from_bytes(hashlib.sha256(text.encode()).digest()[:7], "big")
-    return largest_over_ranks([number, -number]) == [number, -number]
+    return all_reduce_max([number, -number]) == [number, -number]
 
 
-def one_rank_first(procedure: Callable[[], None]) -> None:
+def local_rank_zero_first(procedure: Callable[[], None]) -> None:
     """Run a procedure on the first process of each machine, then on the others, which find its files."""
     if world_size() == 1:
         procedure()
@@ -59,7 +59,7 @@ def one_rank_first(procedure: Callable[[], None]) -> None:
         wait_for_ranks()
 
 
-def average_over_ranks(x: torch.Tensor) -> torch.Tensor:
+def all_reduce_mean(x: torch.Tensor) -> torch.Tensor:
     """Average a tensor in place over all training processes, and return it."""
     if world_size() > 1:
         torch.distributed.all_reduce(x)
@@ -76,7 +76,7 @@ class Rank(NamedTuple):
     device: torch.device
 
 
-def join_ranks(device: str | None = None, threads: int | None = None) -> Rank:
+def init_distributed(device: str | None = None, threads: int | None = None) -> Rank:
     """Return this process's place; under torchrun (RANK, LOCAL_RANK, WORLD_SIZE), join the other processes.
 
     threads: of torch on a CPU, unless OMP_NUM_THREADS is set.

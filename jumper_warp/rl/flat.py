@@ -72,9 +72,9 @@ class FlatParameters:
         """Numbers of all parameters; of actor and noise, which the critic's follow."""
         device = model.log_std.device
         self.value = torch.zeros(self.size, device=device)
-        self.exchanged = torch.zeros(self.size + ALIGNMENT, device=device)
+        self.all_reduced = torch.zeros(self.size + ALIGNMENT, device=device)
         """What ranks average in one exchange: the gradient, and `kl` as the last number."""
-        self.gradient, self.kl = self.exchanged[: self.size], self.exchanged[-1]
+        self.gradient, self.kl = self.all_reduced[: self.size], self.all_reduced[-1]
         """(size,) as `value`; () KL(old ‖ new) of the minibatch."""
         self.actor_gradient, self.critic_gradient = self.gradient.split((self.actor_size, self.size - self.actor_size))
         for param, segment in zip(self.params, self.segments, strict=True):

@@ -9,7 +9,7 @@ from typing import Any
 
 import torch
 
-from jumper_warp.rl.distributed import all_ranks, wait_for_ranks
+from jumper_warp.rl.distributed import all_ranks_agree, wait_for_ranks
 
 BACKEND = "inductor"
 """Of torch.compile."""
@@ -114,7 +114,7 @@ class Captured:
                 self._procedure()
         except RuntimeError as error:
             reason = f": {str(error).splitlines()[0]}"[:300]
-        self.enabled = all_ranks(not reason)
+        self.enabled = all_ranks_agree(not reason)
         if self.enabled:
             self._graph = graph
         else:

@@ -18,7 +18,7 @@ from torch import nn
 from torch.nn import functional
 
 from jumper_warp.envs.vec_env import sanitise
-from jumper_warp.rl.distributed import average_over_ranks, world_size
+from jumper_warp.rl.distributed import all_reduce_mean, world_size
 from jumper_warp.rl.mirror import Image, Symmetry, Weights
 from jumper_warp.utils.normalise import normalise
 
@@ -75,7 +75,7 @@ class Scaling(NamedTuple):
         return functional.pad(features, (0, columns - obs.shape[-1]))
 
 
-def joint_moments(own: Sequence[Moments]) -> list[Moments]:
+def all_reduce_moments(own: Sequence[Moments]) -> list[Moments]:
     """Return the moments, float64, over all ranks' batches, all in one exchange.
 
     own: of some quantities of any shape over this rank's batch, which has the same size on every rank. E[x²] - E[x]²
@@ -84,7 +84,7 @@ def joint_moments(own: Sequence[Moments]) -> list[Moments]:
     moments = [(mean.double(), var.double()) for mean, var, _ in own]
     if world_size() > 1:
         vector = torch.cat([part.flatten() for mean, var in moments for part in (mean, var + mean.square())])
-        parts = average_over_ranks(vector).split([mean.numel() for mean, _ in moments for _ in range(2)])
+        parts = all_reduce_mean(vector).split([mean.numel() for mean, _ in moments for _ in range(2)])
         pairs = zip(parts[::2], parts[1::2], moments, strict=True)
         moments = [(a.view_as(like), (b - a.square()).clamp(min=0.0).view_as(like)) for a, b, (like, _) in pairs]
     return [Moments(*pair, each.count * world_size()) for pair, each in zip(moments, own, strict=True)]
@@ -122,7 +122,7 @@ class RunningMoments(nn.Module):
     @torch.no_grad()
     def update(self, x: torch.Tensor) -> None:
         """Take in a batch of finite samples (batch, *shape); those of the other ranks come with it, exactly."""
-        self.take(joint_moments([Moments.of(x)])[0])
+        self.take(all_reduce_moments([Moments.of(x)])[0])
 
     @torch.no_grad()
     def take(self, moments: Moments) -> None:

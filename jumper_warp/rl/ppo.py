@@ -14,7 +14,7 @@ import torch
 
 from jumper_warp.envs.vec_env import VecEnv
 from jumper_warp.rl.cfg import PpoCfg
-from jumper_warp.rl.distributed import average_over_ranks
+from jumper_warp.rl.distributed import all_reduce_mean
 from jumper_warp.rl.flat import AdamVectors, FlatAdam, FlatParameters, adam_step, adapted_lr, clip_gradient, joined
 from jumper_warp.rl.graphs import Captured, Compiler
 from jumper_warp.rl.mirror import symmetry_of
@@ -160,7 +160,7 @@ class Ppo:
         )
         flat.kl.copy_(losses.kl)
         if exchange:
-            average_over_ranks(flat.exchanged)  # gradient and divergence
+            all_reduce_mean(flat.all_reduced)  # gradient and divergence
         return self._optimiser_step(
             self.optimiser.vectors, flat.actor_size, flat.kl, self._desired_kl, cfg, losses, value_loss, self._sums
         )

@@ -22,11 +22,11 @@ from jumper_warp.rl.cfg import TrainCfg
 from jumper_warp.rl.checkpoint import DAMAGE, Checkpoint, CheckpointError, one_line, save_checkpoint
 from jumper_warp.rl.distributed import (
     Rank,
-    all_same,
+    same_on_all_ranks,
     gather,
-    join_ranks,
-    largest_over_ranks,
-    one_rank_first,
+    init_distributed,
+    all_reduce_max,
+    local_rank_zero_first,
     wait_for_ranks,
     world_size,
 )
@@ -111,7 +111,7 @@ def train(
     iteration and it was saved.
     """
     set_threads(cfg.threads)
-    rank = join_ranks(cfg.device, cfg.threads)
+    rank = init_distributed(cfg.device, cfg.threads)
     run: Run | None = None
     try:
         _check_processes(cfg, rank)
@@ -190,7 +190,7 @@ class Run:
         self.figures: dict[str, float] = {}
         self.notes: list[str] = []
         checkpoint = checkpoint or find_checkpoint(cfg)
-        if not all_same(str(checkpoint and (checkpoint.path, checkpoint.state["iteration"]))):
+        if not same_on_all_ranks(str(checkpoint and (checkpoint.path, checkpoint.state["iteration"]))):
             raise InputError("the processes found different checkpoints: log_root must be a folder that all can read")
         if start is not None and checkpoint is None:
             apply_actor_init(start, self.ppo.model, cfg.num_envs * cfg.ppo.num_steps)
@@ -223,7 +223,7 @@ class Run:
         cfg, ppo = self.cfg, self.ppo
         with ThreadPoolExecutor(1) as pool:
             kernels = pool.submit(getattr(self.env, "compile", lambda: None))  # not every `VecEnv` has something to
-            one_rank_first(ppo.prepare)
+            local_rank_zero_first(ppo.prepare)
             kernels.result()
         if self.iteration == 0:
             self.env.reset()
@@ -292,7 +292,7 @@ class Run:
         if world_size() > 1:
             if self.iteration % self.cfg.log_interval:
                 return False
-            stop.asked, late = map(bool, largest_over_ranks([int(stop.asked), int(late)]))
+            stop.asked, late = map(bool, all_reduce_max([int(stop.asked), int(late)]))
         return stop.asked or late
 
     def _read(self, times: list[float], seconds: float) -> dict[str, float]:

@@ -12,7 +12,7 @@ from jumper_warp.rl.cfg import PpoCfg
 from jumper_warp.rl.flat import ROW_ALIGNMENT, FlatParameters, aligned
 from jumper_warp.rl.graphs import Compiler
 from jumper_warp.rl.mirror import Image
-from jumper_warp.rl.networks import DTYPES, ActorCritic, Layers, Moments, Scaling, gaussian_log_prob, joint_moments
+from jumper_warp.rl.networks import DTYPES, ActorCritic, Layers, Moments, Scaling, gaussian_log_prob, all_reduce_moments
 from jumper_warp.rl.rollout import RolloutBuffer
 
 CPU_ROWS = 4096
@@ -166,7 +166,7 @@ class Sampler:
         model = self._model
         scalings = self._scalings()  # with which actor and critic acted
         estimates = self._estimates(scalings)
-        moments = RolloutMoments(*joint_moments(estimates.moments))
+        moments = RolloutMoments(*all_reduce_moments(estimates.moments))
         of_obs = moments.obs
         if self._obs_image is not None:
             of_obs = Moments(*self._obs_image.moments(of_obs.mean, of_obs.var), of_obs.count)

@@ -305,15 +305,15 @@ def test_an_iteration_exchanges_its_statistics_once_and_a_gradient_a_minibatch(m
             return x  # as if the other rank had seen the same
 
         monkeypatch.setattr(networks, "world_size", lambda ranks=ranks: ranks)
-        monkeypatch.setattr(networks, "average_over_ranks", exchange)
-        monkeypatch.setattr(ppo_module, "average_over_ranks", exchange)
+        monkeypatch.setattr(networks, "all_reduce_mean", exchange)
+        monkeypatch.setattr(ppo_module, "all_reduce_mean", exchange)
         torch.manual_seed(0)
         ppos.append(Ppo(PushTask(16), cfg))
         ppos[-1].env.reset()
         ppos[-1].collect()
         ppos[-1].update()
     alone, one_of_two = ppos
-    assert sizes == [2 * (1 + 1 + 2 + 3)] + 12 * [alone.flat.exchanged.numel()]
+    assert sizes == [2 * (1 + 1 + 2 + 3)] + 12 * [alone.flat.all_reduced.numel()]
     torch.testing.assert_close(one_of_two.flat.value, alone.flat.value, atol=2e-5, rtol=1e-3)
     torch.testing.assert_close(one_of_two.model.obs_moments.var, alone.model.obs_moments.var, atol=1e-6, rtol=1e-3)
     assert one_of_two.model.obs_moments.count == 2 * alone.model.obs_moments.count

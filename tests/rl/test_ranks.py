@@ -14,14 +14,14 @@ from toy_task import SMALL, PushTask
 def test_torch_has_half_the_cores_but_two_where_there_are(cores, threads, one_thread, monkeypatch):
     monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
     monkeypatch.setattr(distributed, "available_threads", lambda: cores)
-    assert distributed.join_ranks("cpu").size == 1
+    assert distributed.init_distributed("cpu").size == 1
     assert torch.get_num_threads() == threads
 
 
 def test_torchs_threads_stay_where_the_environment_names_them(one_thread, monkeypatch):
     monkeypatch.setenv("OMP_NUM_THREADS", "3")
     torch.set_num_threads(1)
-    distributed.join_ranks("cpu")
+    distributed.init_distributed("cpu")
     assert torch.get_num_threads() == 1
 
 
