@@ -10,7 +10,7 @@ from torch import nn
 
 from jumper_warp.policies.spec import PolicyError, PolicyInterface
 from jumper_warp.rl.mirror import Weights
-from jumper_warp.rl.networks import ACTIVATIONS, weights_of
+from jumper_warp.rl.networks import ACTIVATIONS, linear_layers
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.normalise import normalise
 
@@ -62,7 +62,7 @@ class Policy(nn.Module):
     @property
     def layers(self) -> Weights:
         """Weight and bias of each layer."""
-        return weights_of(self.actor)
+        return linear_layers(self.actor)
 
     def tensors(self) -> dict[str, torch.Tensor]:
         """Return all tensors by the names that they are saved under, on the CPU."""

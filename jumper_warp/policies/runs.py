@@ -18,7 +18,7 @@ from jumper_warp.rl.checkpoint import (
     load_checkpoint,
     one_line,
 )
-from jumper_warp.rl.mirror import Symmetry, image, plain_layers
+from jumper_warp.rl.mirror import Symmetry, mirror_map, expand_symmetric_layers
 from jumper_warp.rl.networks import EPS, NORMALISED_LIMIT
 from jumper_warp.rl.resume import CHECKPOINTS
 from jumper_warp.tasks.saving import TaskError, check_version
@@ -71,7 +71,7 @@ def _policy_of_checkpoint(path: Path, state: dict[str, Any]) -> Policy:
         times = {"policy_dt": env["policy_dt_s"], "physics_dt": env["physics_dt_s"]}
         shape = {"hidden": tuple(ppo["hidden"]), "activation": ppo["activation"]}
         if symmetry := _symmetry(model):
-            layers, shape["hidden"] = plain_layers(layers, symmetry), tuple(2 * width for width in ppo["hidden"])
+            layers, shape["hidden"] = expand_symmetric_layers(layers, symmetry), tuple(2 * width for width in ppo["hidden"])
         commit = config.get("commit") or {"hash": None, "dirty": None}
         config |= {"commit": commit["hash"], "dirty": commit["dirty"], "iteration": state["iteration"]}
         described = {**env["interface"], "observation_limit": RAW_LIMIT, "normalised_limit": NORMALISED_LIMIT}
@@ -90,7 +90,7 @@ def _symmetry(model: dict[str, torch.Tensor]) -> Symmetry | None:
     if not any(name.startswith("mirror_") for name in model):
         return None
     parts = ((model[f"mirror_{name}_order"], model[f"mirror_{name}_signs"], name) for name in Symmetry._fields)
-    return Symmetry(*(image(*part) for part in parts))
+    return Symmetry(*(mirror_map(*part) for part in parts))
 
 
 def learning_curve(source: Path) -> bytes | None:

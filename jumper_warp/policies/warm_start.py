@@ -11,7 +11,7 @@ from jumper_warp.envs.vec_env import RAW_LIMIT
 from jumper_warp.policies.runs import open_policy
 from jumper_warp.policies.spec import PolicyInterface
 from jumper_warp.rl.cfg import PpoCfg
-from jumper_warp.rl.mirror import Symmetry, image
+from jumper_warp.rl.mirror import Symmetry, mirror_map
 from jumper_warp.rl.networks import NORMALISED_LIMIT
 from jumper_warp.rl.actor_init import ActorInit, make_actor_init
 from jumper_warp.tasks.cfg import TaskCfg
@@ -33,7 +33,7 @@ def actor_init_from_policy(source: str | Path, task: TaskCfg, cfg: PpoCfg) -> Ac
     symmetry = None
     if cfg.symmetry == "actor":
         obs, action = mirror_of(task, "policy"), mirror_of_action()
-        symmetry = Symmetry(image(*obs, "observation"), image(*action, "action"))
+        symmetry = Symmetry(mirror_map(*obs, "observation"), mirror_map(*action, "action"))
     return make_actor_init(policy.layers, policy.mean, policy.std, policy.interface.activation, cfg, symmetry)
 
 

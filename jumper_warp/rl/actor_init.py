@@ -8,8 +8,8 @@ from typing import NamedTuple
 import torch
 
 from jumper_warp.rl.cfg import PpoCfg
-from jumper_warp.rl.mirror import Symmetry, Weights, nearest_plain_layers, symmetric_layers
-from jumper_warp.rl.networks import EPS, ActorCritic, weights_of
+from jumper_warp.rl.mirror import Symmetry, Weights, nearest_expanded_layers, contract_expanded_layers
+from jumper_warp.rl.networks import EPS, ActorCritic, linear_layers
 from jumper_warp.utils.errors import InputError
 
 PRIOR_ITERATIONS = 100
@@ -78,7 +78,7 @@ def apply_actor_init(start: ActorInit, model: ActorCritic, samples: int) -> None
     samples: of all worlds in an iteration. Raises InputError: the model's observation, action or layers are of other
     sizes; nothing is changed.
     """
-    own = weights_of(model.actor)
+    own = linear_layers(model.actor)
     has, made = ([tuple(weight.shape) for weight, _ in layers] for layers in (start.layers, own))
     if has != made:
         raise InputError(f"start_from: the policy's weights are of shapes {_words(has)}, the training's {_words(made)}")
@@ -92,20 +92,20 @@ def apply_actor_init(start: ActorInit, model: ActorCritic, samples: int) -> None
 
 
 def _half(layers: Weights, mean: torch.Tensor, std: torch.Tensor, symmetry: Symmetry) -> Weights | None:
-    """Return the layers of f, see `symmetric_layers`, or None: they or the statistics are not nearly symmetric."""
+    """Return the layers of f, see `contract_expanded_layers`, or None: they or the statistics are not nearly symmetric."""
     widths = [len(bias) for _, bias in layers[:-1]]
     symmetric = torch.allclose(symmetry.obs.of(mean), mean, atol=1e-5) and torch.allclose(std[symmetry.obs.order], std)
     if not symmetric or not widths or any(width % 2 for width in widths):
         return None
-    nearest = nearest_plain_layers(layers, symmetry)
+    nearest = nearest_expanded_layers(layers, symmetry)
     pairs = zip(layers, nearest, strict=True)
     near = all((one - other).norm() <= NEARLY * one.norm() for (one, _), (other, _) in pairs)
-    return symmetric_layers(nearest, symmetry) if near else None
+    return contract_expanded_layers(nearest, symmetry) if near else None
 
 
 def _is_symmetric(layers: Weights, symmetry: Symmetry) -> bool:
     try:
-        symmetric_layers(layers, symmetry)
+        contract_expanded_layers(layers, symmetry)
     except InputError:
         return False
     return True

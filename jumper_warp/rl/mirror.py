@@ -24,7 +24,7 @@ Weights = list[tuple[torch.Tensor, torch.Tensor]]
 Vector = Sequence[float] | np.ndarray | torch.Tensor
 
 
-class Image(NamedTuple):
+class MirrorMap(NamedTuple):
     """The mirror image of vectors (..., n)."""
 
     order: torch.Tensor
@@ -44,10 +44,10 @@ class Image(NamedTuple):
         image = self.signs.to(mean.dtype) * mean[self.order]
         return 0.5 * (mean + image), 0.5 * (var + var[self.order]) + 0.25 * (mean - image).square()
 
-    def padded(self, columns: int) -> Image:
+    def padded(self, columns: int) -> MirrorMap:
         """Return the image of vectors that are filled up to so many columns, which stay where they are."""
         more = torch.arange(len(self.order), columns, device=self.order.device)
-        return Image(torch.cat([self.order, more]), torch.cat([self.signs, torch.ones_like(more, dtype=torch.float32)]))
+        return MirrorMap(torch.cat([self.order, more]), torch.cat([self.signs, torch.ones_like(more, dtype=torch.float32)]))
 
     def matrix(self) -> torch.Tensor:
         """Return the image as a matrix (n, n)."""
@@ -57,15 +57,15 @@ class Image(NamedTuple):
 class Symmetry(NamedTuple):
     """Mirror images of what the actor sees and does."""
 
-    obs: Image
-    action: Image
+    obs: MirrorMap
+    action: MirrorMap
 
     def padded(self, columns: int) -> Symmetry:
         """Return the same for observations that are filled up to so many columns."""
         return Symmetry(self.obs.padded(columns), self.action)
 
 
-def image(order: Vector, signs: Vector, name: str, device: Any = None) -> Image:
+def mirror_map(order: Vector, signs: Vector, name: str, device: Any = None) -> MirrorMap:
     """Return the image of vectors called `name`. Raises ValueError: mirroring twice does not give back what was."""
     places = torch.as_tensor(order, dtype=torch.int64, device=device)
     flips = torch.as_tensor(signs, dtype=torch.float32, device=device)
@@ -73,7 +73,7 @@ def image(order: Vector, signs: Vector, name: str, device: Any = None) -> Image:
     each = torch.arange(len(places), device=device) if fits else None
     if not (fits and bool((places[places] == each).all()) and bool((flips * flips[places] == 1.0).all())):
         raise InputError(f"the mirror image of {name} is not its own inverse")
-    return Image(places, flips)
+    return MirrorMap(places, flips)
 
 
 def symmetry_of(env: VecEnv) -> Symmetry:
@@ -83,13 +83,13 @@ def symmetry_of(env: VecEnv) -> Symmetry:
     """
     if not isinstance(env, MirroredVecEnv):
         raise InputError("symmetry needs an environment that tells mirror images of observation and action")
-    obs, action = (image(*env.mirror(name), name, env.device) for name in ("observation", "action"))
+    obs, action = (mirror_map(*env.mirror(name), name, env.device) for name in ("observation", "action"))
     if (len(obs.order), len(action.order)) != (env.num_obs, env.num_actions):
         raise InputError("the mirror images are not of this environment's observation and action")
     return Symmetry(obs, action)
 
 
-def plain_layers(layers: Weights, symmetry: Symmetry) -> Weights:
+def expand_symmetric_layers(layers: Weights, symmetry: Symmetry) -> Weights:
     """Return weights and biases of a plain network that answers as the symmetric actor, of twice the widths.
 
     layers: those of f, with activations between. So a symmetric policy is saved and exported as any other.
@@ -109,8 +109,8 @@ def plain_layers(layers: Weights, symmetry: Symmetry) -> Weights:
     return found
 
 
-def nearest_plain_layers(layers: Weights, symmetry: Symmetry) -> Weights:
-    """Return the layers of the form of `plain_layers` that are nearest to these, of the same shapes.
+def nearest_expanded_layers(layers: Weights, symmetry: Symmetry) -> Weights:
+    """Return the layers of the form of `expand_symmetric_layers` that are nearest to these, of the same shapes.
 
     layers: at least two, hidden ones of even widths. The nearest by the sum of squared differences: what must be equal
     is the mean, what must be 0 is dropped.
@@ -125,11 +125,11 @@ def nearest_plain_layers(layers: Weights, symmetry: Symmetry) -> Weights:
         first = index == 0
         half = weight[:rows] + weight[rows:] @ obs if first else weight[:rows, :columns] + weight[rows:, columns:]
         halves.append((0.5 * half, 0.5 * (bias[:rows] + bias[rows:])))
-    return plain_layers(halves, symmetry)
+    return expand_symmetric_layers(halves, symmetry)
 
 
-def symmetric_layers(layers: Weights, symmetry: Symmetry) -> Weights:
-    """Return weights and biases of f, of half the widths, from those that `plain_layers` made of them; copies.
+def contract_expanded_layers(layers: Weights, symmetry: Symmetry) -> Weights:
+    """Return weights and biases of f, of half the widths, from those that `expand_symmetric_layers` made of them; copies.
 
     Of f's last bias only the symmetric part is left, which answers alike. Raises InputError: the layers are not of that
     form.
@@ -142,7 +142,7 @@ def symmetric_layers(layers: Weights, symmetry: Symmetry) -> Weights:
         factor = 2.0 if last and not first else 1.0
         found.append((factor * weight[:rows, :columns], bias[:rows].clone()))
     sizes = (layers[0][0].shape[1], layers[-1][0].shape[0])
-    again = plain_layers(found, symmetry) if sizes == (len(symmetry.obs.order), len(symmetry.action.order)) else []
+    again = expand_symmetric_layers(found, symmetry) if sizes == (len(symmetry.obs.order), len(symmetry.action.order)) else []
     if len(again) != len(layers) or not all(
         one.shape == other.shape and torch.allclose(one, other, rtol=1e-6, atol=1e-6)
         for own, made in zip(layers, again, strict=True)

@@ -19,7 +19,7 @@ from torch.nn import functional
 
 from jumper_warp.envs.vec_env import sanitise
 from jumper_warp.rl.distributed import all_reduce_mean, world_size
-from jumper_warp.rl.mirror import Image, Symmetry, Weights
+from jumper_warp.rl.mirror import MirrorMap, Symmetry, Weights
 from jumper_warp.utils.normalise import normalise
 
 NORMALISED_LIMIT = 10.0
@@ -151,7 +151,7 @@ def mlp(sizes: Sequence[int], activation: str, out_gain: float) -> nn.Sequential
     return nn.Sequential(*layers)
 
 
-def weights_of(network: nn.Module) -> Weights:
+def linear_layers(network: nn.Module) -> Weights:
     """Return weight and bias of each linear layer of a network."""
     return [(module.weight, module.bias) for module in network.children() if isinstance(module, nn.Linear)]
 
@@ -193,7 +193,7 @@ class ActorCritic(nn.Module):
         if not self._symmetric:
             return None
         parts = [
-            Image(*(getattr(self, f"mirror_{name}_{part}") for part in Image._fields)) for name in Symmetry._fields
+            MirrorMap(*(getattr(self, f"mirror_{name}_{part}") for part in MirrorMap._fields)) for name in Symmetry._fields
         ]
         return Symmetry(*parts)
 

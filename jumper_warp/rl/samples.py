@@ -11,7 +11,7 @@ from jumper_warp.envs.vec_env import sanitise
 from jumper_warp.rl.cfg import PpoCfg
 from jumper_warp.rl.flat import ROW_ALIGNMENT, FlatParameters, aligned
 from jumper_warp.rl.graphs import Compiler
-from jumper_warp.rl.mirror import Image
+from jumper_warp.rl.mirror import MirrorMap
 from jumper_warp.rl.networks import DTYPES, ActorCritic, Layers, Moments, Scaling, gaussian_log_prob, all_reduce_moments
 from jumper_warp.rl.rollout import RolloutBuffer
 
@@ -146,7 +146,7 @@ class Sampler:
 
     def __init__(
         self, rollout: RolloutBuffer, cfg: PpoCfg, model: ActorCritic, flat: FlatParameters, compiler: Compiler,
-        obs_image: Image | None = None,
+        obs_image: MirrorMap | None = None,
     ) -> None:  # fmt: skip
         """flat: the parameters of `model`; obs_image: of observations whose statistics are to be symmetric."""
         self._obs_image = obs_image

@@ -15,7 +15,7 @@ from jumper_warp.policies.folder import add_files, find_policy, list_policies, l
 from jumper_warp.policies.onnx import export_onnx, onnx_bytes
 from jumper_warp.policies.policy import Policy
 from jumper_warp.policies.spec import PolicyError, PolicyInterface
-from jumper_warp.rl.networks import ActorCritic, weights_of
+from jumper_warp.rl.networks import ActorCritic, linear_layers
 
 
 def make_interface(num_obs=1, num_actions=1, hidden=(1,), **changes):
@@ -56,7 +56,7 @@ def trained(model):
     interface = make_interface(48, 12, (64, 32))
     moments = model.obs_moments
     return Policy(
-        weights_of(model.actor), moments.mean, moments.scaling().std, interface, {"env": {"seed": 5}, "commit": "abc"}
+        linear_layers(model.actor), moments.mean, moments.scaling().std, interface, {"env": {"seed": 5}, "commit": "abc"}
     )
 
 

@@ -8,7 +8,7 @@ import torch
 from test_shac import SmoothPushTask
 
 from jumper_warp.rl.checkpoint import load_checkpoint, save_checkpoint
-from jumper_warp.rl.mirror import nearest_plain_layers, plain_layers, symmetric_layers, symmetry_of
+from jumper_warp.rl.mirror import nearest_expanded_layers, expand_symmetric_layers, contract_expanded_layers, symmetry_of
 from jumper_warp.rl.networks import EPS, ActorCritic
 from jumper_warp.rl.ppo import Ppo
 from jumper_warp.rl.runner import CHECKPOINTS, CONFIG, train
@@ -40,7 +40,7 @@ def layers_of(model):
 
 def start_of(model, cfg=SMALL, activation="elu"):
     """Return how a training begins with this actor, exported as a plain network."""
-    layers = layers_of(model) if model.symmetry is None else plain_layers(layers_of(model), model.symmetry)
+    layers = layers_of(model) if model.symmetry is None else expand_symmetric_layers(layers_of(model), model.symmetry)
     symmetry = SYMMETRY if cfg.symmetry == "actor" else None
     return make_actor_init(layers, *model.obs_moments.scaling(), activation, cfg, symmetry)
 
@@ -66,7 +66,7 @@ def model_of(result):
 def test_layers_of_a_symmetric_actor_come_back_from_the_plain_ones(hidden):
     layers = layers_of(actor(hidden, SYMMETRY))
     layers[-1][1].zero_()  # the part of the bias that f(x) and N f(M x) do not cancel is 0 here
-    found = symmetric_layers(plain_layers(layers, SYMMETRY), SYMMETRY)
+    found = contract_expanded_layers(expand_symmetric_layers(layers, SYMMETRY), SYMMETRY)
     for own, made in zip(layers, found, strict=True):
         torch.testing.assert_close(made, own, atol=0.0, rtol=0.0)
 
@@ -80,31 +80,31 @@ def changed(layers, index, part):
 @pytest.mark.parametrize("index", [0, 1, 2])
 @pytest.mark.parametrize("part", [0, 1])
 def test_layers_that_are_not_symmetric_are_refused(index, part):
-    layers = plain_layers(layers_of(actor(symmetry=SYMMETRY)), SYMMETRY)
+    layers = expand_symmetric_layers(layers_of(actor(symmetry=SYMMETRY)), SYMMETRY)
     with pytest.raises(InputError, match="not those of a mirror-symmetric actor"):
-        symmetric_layers(changed(layers, index, part), SYMMETRY)
+        contract_expanded_layers(changed(layers, index, part), SYMMETRY)
 
 
 @pytest.mark.parametrize("sizes", [(2, 8, 7, 1), (2, 7, 1), (2, 1, 1), (3, 8, 1), (2, 8, 2)])
 def test_layers_of_sizes_that_no_symmetric_actor_has_are_refused(sizes):
     layers = layers_of(ActorCritic(sizes[0], sizes[-1], sizes[1:-1]))
     with pytest.raises(InputError, match="not those of a mirror-symmetric actor"):
-        symmetric_layers(layers, SYMMETRY)
+        contract_expanded_layers(layers, SYMMETRY)
 
 
 @pytest.mark.parametrize("hidden", [(16,), (32, 24), (8, 6, 4)])
 def test_the_nearest_symmetric_layers_answer_mirrored_and_leave_symmetric_ones_alone(hidden):
-    exact = plain_layers(layers_of(actor(hidden, SYMMETRY)), SYMMETRY)
-    for own, made in zip(exact, nearest_plain_layers(exact, SYMMETRY), strict=True):
+    exact = expand_symmetric_layers(layers_of(actor(hidden, SYMMETRY)), SYMMETRY)
+    for own, made in zip(exact, nearest_expanded_layers(exact, SYMMETRY), strict=True):
         torch.testing.assert_close(made, own)
     torch.manual_seed(1)
     bent = [tuple(tensor + 0.1 * torch.randn_like(tensor) for tensor in layer) for layer in exact]
-    near = nearest_plain_layers(bent, SYMMETRY)
-    symmetric_layers(near, SYMMETRY)  # raises if they are not
+    near = nearest_expanded_layers(bent, SYMMETRY)
+    contract_expanded_layers(near, SYMMETRY)  # raises if they are not
     rest = torch.cat(
         [(b - n).flatten() for own, made in zip(bent, near, strict=True) for b, n in zip(own, made, strict=True)]
     )
-    other = plain_layers(layers_of(actor(hidden, SYMMETRY)), SYMMETRY)
+    other = expand_symmetric_layers(layers_of(actor(hidden, SYMMETRY)), SYMMETRY)
     along = torch.cat(
         [(o - n).flatten() for own, made in zip(other, near, strict=True) for o, n in zip(own, made, strict=True)]
     )
@@ -175,13 +175,13 @@ def test_statistics_that_are_not_symmetric_make_a_policy_that_is_not():
 
 
 def test_a_policy_that_fine_tuning_has_bent_begins_as_the_nearest_symmetric_one():
-    exact = plain_layers(layers_of(actor(symmetry=SYMMETRY)), SYMMETRY)
+    exact = expand_symmetric_layers(layers_of(actor(symmetry=SYMMETRY)), SYMMETRY)
     scaling = actor(symmetry=SYMMETRY).obs_moments.scaling()
     torch.manual_seed(2)
     little, much = ([(w + share * w.std() * torch.randn_like(w), b) for w, b in exact] for share in (0.01, 0.5))
     start = make_actor_init(little, *scaling, "elu", SYMMETRIC, SYMMETRY)
     assert start.change == "made mirror-symmetric"
-    for own, made in zip(nearest_plain_layers(little, SYMMETRY), plain_layers(start.layers, SYMMETRY), strict=True):
+    for own, made in zip(nearest_expanded_layers(little, SYMMETRY), expand_symmetric_layers(start.layers, SYMMETRY), strict=True):
         torch.testing.assert_close(made, own)
     with pytest.raises(InputError, match=r"give --ppo\.hidden 64 64"):  # averaged, which needs all of its widths
         make_actor_init(much, *scaling, "elu", SYMMETRIC, SYMMETRY)

@@ -12,7 +12,7 @@ from jumper_warp.rl import graphs
 from jumper_warp.rl.cfg import PpoCfg, TrainCfg
 from jumper_warp.rl.checkpoint import save_checkpoint
 from jumper_warp.rl.flat import FlatParameters
-from jumper_warp.rl.mirror import Symmetry, image, plain_layers
+from jumper_warp.rl.mirror import Symmetry, mirror_map, expand_symmetric_layers
 from jumper_warp.rl.networks import ActorCritic
 from jumper_warp.rl.ppo import Ppo
 from jumper_warp.tasks.interface import interface
@@ -22,7 +22,7 @@ from jumper_warp.utils.errors import InputError
 from toy_task import PushTask, fill
 
 OBS, ACTION = mirror_of(make_task("velocity-flat"), "policy"), mirror_of_action()
-WALKING = Symmetry(image(*OBS, "observation"), image(*ACTION, "action"))
+WALKING = Symmetry(mirror_map(*OBS, "observation"), mirror_map(*ACTION, "action"))
 NUM_OBS = len(OBS.order)
 CFG = PpoCfg(num_steps=8, epochs=2, minibatches=2, hidden=(16, 9), symmetry="actor")
 
@@ -75,7 +75,7 @@ def test_plain_network_answers_alike(hidden):
     model, x = walker(hidden), torch.randn(16, NUM_OBS)
     linear = [layer for layer in model.actor if isinstance(layer, torch.nn.Linear)]
     expected = model.mean(x)
-    layers = plain_layers([(layer.weight, layer.bias) for layer in linear], WALKING)
+    layers = expand_symmetric_layers([(layer.weight, layer.bias) for layer in linear], WALKING)
     for index, (weight, bias) in enumerate(layers):
         x = torch.nn.functional.linear(x, weight, bias)
         x = torch.nn.functional.elu(x) if index < len(layers) - 1 else x
@@ -100,7 +100,7 @@ def test_symmetric_statistics_are_those_of_both_images():
 )  # fmt: skip
 def test_image_that_is_not_its_own_inverse_is_refused(wrong):
     with pytest.raises(InputError, match="mirror image of action is not its own inverse"):
-        image(*wrong, "action")
+        mirror_map(*wrong, "action")
 
 
 # ---------------------------------------------------------------- training
