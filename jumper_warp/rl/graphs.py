@@ -75,7 +75,7 @@ def _reason(error: Exception) -> str:
     return f"{type(inner).__name__}: {lines[0] if lines else ''}"[:300]
 
 
-class Captured:
+class CapturedProcedure:
     """A procedure that, if enabled, runs eagerly once and as a CUDA graph from then on.
 
     Where it cannot be captured, on any rank, all ranks go on eagerly, and say so.

@@ -16,11 +16,11 @@ from jumper_warp.envs.vec_env import VecEnv
 from jumper_warp.rl.cfg import PpoCfg
 from jumper_warp.rl.distributed import all_reduce_mean
 from jumper_warp.rl.flat import AdamVectors, FlatAdam, FlatParameters, adam_step, adapted_lr, clip_gradient, joined
-from jumper_warp.rl.graphs import Captured, Compiler
+from jumper_warp.rl.graphs import CapturedProcedure, Compiler
 from jumper_warp.rl.mirror import symmetry_of
 from jumper_warp.rl.networks import DTYPES, Actor, ActorCritic, Layers, gaussian_kl, gaussian_log_prob
 from jumper_warp.rl.rollout import Collector
-from jumper_warp.rl.samples import Batch, RowLayout, Sampler
+from jumper_warp.rl.samples import Batch, RowLayout, BatchPacker
 from jumper_warp.utils.allocator import keep_freed_memory
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.state_checks import check_parts, check_tensor, check_values
@@ -87,15 +87,15 @@ class Ppo:
         self.compiler = compiler = Compiler(cfg.compile == "on" or (cfg.compile == "auto" and cuda))
         self.collector = Collector(env, cfg, self.model, self.flat, compiler)
         self.rollout = self.collector.rollout
-        self.sampler = Sampler(self.rollout, cfg, self.model, self.flat, compiler, symmetry and symmetry.obs)
-        self._minibatch = self.sampler.rows.new_zeros(self.batch_size // cfg.minibatches, self.sampler.rows.shape[1])
+        self.packer = BatchPacker(self.rollout, cfg, self.model, self.flat, compiler, symmetry and symmetry.obs)
+        self._minibatch = self.packer.rows.new_zeros(self.batch_size // cfg.minibatches, self.packer.rows.shape[1])
         self._orders = torch.zeros(cfg.epochs, self.batch_size, dtype=torch.int64, device=env.device)
         counts = {"dtype": torch.float64, "device": env.device}  # float32 counts to 2^24 only
         self._sums = torch.zeros(len(STATISTICS) + 1, **counts)  # and their number
         self._actor_gradient, self._critic_gradient = compiler(actor_gradient), compiler(critic_gradient)
         self._optimiser_step = compiler(optimiser_step)
         procedures: tuple[Callable[[], object], ...] = (self.collector.roll, self.batch, self._learn)
-        self._roll, self._batch, self._optimise = (Captured(each, cuda and cfg.graphs) for each in procedures)
+        self._roll, self._batch, self._optimise = (CapturedProcedure(each, cuda and cfg.graphs) for each in procedures)
 
     def iterate(self, mark: Callable[[], None] = lambda: None) -> None:
         """Do one iteration; mark is called when the rollout, and when the update has been launched."""
@@ -119,22 +119,22 @@ class Ppo:
             return
         changed = [*self.optimiser.vectors, self._sums, self.collector.episode, self.collector.finished]
         before = [tensor.clone() for tensor in changed]
-        self.collector.rehearse()
-        self.sampler.rehearse()
+        self.collector.warm_up()
+        self.packer.warm_up()
         self.minibatch_step(self._minibatch, exchange=False)
         for tensor, value in zip(changed, before, strict=True):
             tensor.copy_(value)
 
     @torch.no_grad()
     def batch(self) -> Batch:
-        """Return the rollout as samples, time-major, and take it into the running statistics; views of `sampler.rows`.
+        """Return the rollout as samples, time-major, and take it into the running statistics; views of `packer.rows`.
 
         Their orders for all epochs are drawn with them.
         """
-        self.sampler.pack()
+        self.packer.pack()
         for order in self._orders:
             order.copy_(self.order())
-        return self.sampler.layout.split(self.sampler.rows)
+        return self.packer.layout.split(self.packer.rows)
 
     def order(self) -> torch.Tensor:
         """Return a random order of the batch's samples, (batch_size,)."""
@@ -144,19 +144,19 @@ class Ppo:
     def _learn(self) -> None:
         for order in self._orders:
             for samples in order.chunk(self.cfg.minibatches):
-                torch.index_select(self.sampler.rows, 0, samples, out=self._minibatch)
+                torch.index_select(self.packer.rows, 0, samples, out=self._minibatch)
                 self.minibatch_step(self._minibatch)
 
     @torch.no_grad()
     def minibatch_step(self, rows: torch.Tensor, exchange: bool = True) -> StepStatistics:
         """Make one optimiser step, and return its statistics, which `statistics` averages; nothing waits for the host.
 
-        rows: samples (batch, columns of `sampler.layout`); exchange: whether to average over all ranks.
+        rows: samples (batch, columns of `packer.layout`); exchange: whether to average over all ranks.
         """
-        flat, sampler, cfg = self.flat, self.sampler, self.cfg
-        value_loss = self._critic_gradient(rows, sampler.layout, flat.critic, cfg, flat.critic_gradient)
+        flat, packer, cfg = self.flat, self.packer, self.cfg
+        value_loss = self._critic_gradient(rows, packer.layout, flat.critic, cfg, flat.critic_gradient)
         losses = self._actor_gradient(
-            rows, sampler.layout, flat.actor, sampler.old_log_std, self._entropy_coef, cfg, flat.actor_gradient
+            rows, packer.layout, flat.actor, packer.old_log_std, self._entropy_coef, cfg, flat.actor_gradient
         )
         flat.kl.copy_(losses.kl)
         if exchange:

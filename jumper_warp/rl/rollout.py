@@ -86,7 +86,7 @@ class Collector:
         rollout.critic_obs[-1] = sanitise(self._critic_obs)
 
     @torch.no_grad()
-    def rehearse(self) -> None:
+    def warm_up(self) -> None:
         """Compile, as if one step were made; spoils the rollout and the counts of episodes."""
         self._decide(self._steps[0])
         self._remember(self._steps[0])

@@ -141,7 +141,7 @@ def gae(
     return advantage, advantage + value[:-1]
 
 
-class Sampler:
+class BatchPacker:
     """Turns a rollout into rows to learn from."""
 
     def __init__(
@@ -180,7 +180,7 @@ class Sampler:
         self.old_log_std.copy_(self._rollout.log_std)
 
     @torch.no_grad()
-    def rehearse(self) -> None:
+    def warm_up(self) -> None:
         """Compile, as if a rollout were packed; spoils `rows`."""
         scalings = self._scalings()
         self._pack(scalings, self._estimates(scalings), scalings.value)

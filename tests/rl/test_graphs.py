@@ -1,7 +1,7 @@
 import pytest
 
 from jumper_warp.rl import graphs
-from jumper_warp.rl.graphs import Captured
+from jumper_warp.rl.graphs import CapturedProcedure
 
 
 @pytest.fixture
@@ -26,7 +26,7 @@ def refusing(monkeypatch):
 @pytest.mark.usefixtures("refusing")
 def test_what_cannot_be_captured_runs_eagerly_and_says_so_once(capsys):
     calls = []
-    captured = Captured(lambda: calls.append(None), enabled=True)
+    captured = CapturedProcedure(lambda: calls.append(None), enabled=True)
     for _ in range(4):
         captured()
     assert len(calls) == 4

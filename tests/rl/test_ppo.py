@@ -75,7 +75,7 @@ def pair():
             param.add_(0.1 * torch.randn_like(param))
     copy_weights(ppo.model, theirs)
     their_losses = theirs.update()
-    ppo.minibatch_step(ppo.sampler.rows)
+    ppo.minibatch_step(ppo.packer.rows)
     return ppo, batch, theirs, their_losses, ppo.statistics()
 
 
@@ -237,7 +237,7 @@ def test_a_gradient_that_is_not_finite_changes_nothing():
     before = {name: value.clone() for name, value in ppo.model.named_parameters()}
     batch.advantage.mul_(float("nan"))
     batch.target.mul_(float("inf"))
-    assert ppo.minibatch_step(ppo.sampler.rows).skipped == 1.0
+    assert ppo.minibatch_step(ppo.packer.rows).skipped == 1.0
     assert all(torch.equal(value, before[name]) for name, value in ppo.model.named_parameters())
     assert ppo.statistics()["Loss/skipped"] == 1.0
 
@@ -351,7 +351,7 @@ def noise_gradient(ppo, progress):
     """Return the gradient by the noise's logarithms at a progress of the training, on the same samples and weights."""
     ppo.set_progress(progress)
     ppo.lr.zero_()
-    ppo.minibatch_step(ppo.sampler.rows)
+    ppo.minibatch_step(ppo.packer.rows)
     return ppo.model.log_std.grad.clone()
 
 

@@ -71,7 +71,7 @@ def learnt(cfg, device="cpu"):
     before.load_state_dict(ppo.state_dict()["model"])
     torch.manual_seed(1)
     ppo.update()
-    batch = {name: part.clone() for name, part in ppo.sampler.layout.split(ppo.sampler.rows)._asdict().items()}
+    batch = {name: part.clone() for name, part in ppo.packer.layout.split(ppo.packer.rows)._asdict().items()}
     return ppo, before, batch, ppo._orders.clone()
 
 
@@ -82,12 +82,12 @@ def test_samples_do_not_depend_on_how_many_are_taken_at_a_time(rows):
     fill(ppo, slice(None), WORLDS)
     fresh = {name: value.clone() for name, value in ppo.model.state_dict().items()}
     ppo.batch()
-    at_once = ppo.sampler.rows.clone()
+    at_once = ppo.packer.rows.clone()
     ppo.model.load_state_dict(fresh)
-    ppo.sampler.rows.zero_()
-    ppo.sampler._rows = rows
+    ppo.packer.rows.zero_()
+    ppo.packer._rows = rows
     ppo.batch()
-    torch.testing.assert_close(ppo.sampler.rows, at_once, atol=1e-5, rtol=1e-5)
+    torch.testing.assert_close(ppo.packer.rows, at_once, atol=1e-5, rtol=1e-5)
     assert at_once.abs().max() > 0.5
 
 
@@ -216,9 +216,9 @@ def test_a_compiled_minibatch_equals_an_eager_one():
     compiled = Ppo(PushTask(WORLDS), dataclasses.replace(CFG, hidden=(8,), compile="on"))
     compiled.load_state_dict(eager.state_dict())
     for ppo in (eager, compiled):
-        ppo.sampler.old_log_std.copy_(eager.rollout.log_std)
+        ppo.packer.old_log_std.copy_(eager.rollout.log_std)
         for samples in torch.arange(ppo.batch_size).chunk(4):
-            ppo.minibatch_step(eager.sampler.rows[samples])
+            ppo.minibatch_step(eager.packer.rows[samples])
     assert compiled.compiler.enabled
     torch.testing.assert_close(compiled.flat.value, eager.flat.value, atol=1e-6, rtol=1e-5)
     assert compiled.statistics() == pytest.approx(eager.statistics(), rel=1e-4, abs=1e-6)
