@@ -11,12 +11,12 @@ from jumper_warp.policies.folder import load_policy
 from jumper_warp.policies.policy import Policy
 from jumper_warp.policies.spec import PolicyError, make_interface
 from jumper_warp.rl.checkpoint import (
-    DAMAGE,
+    DECODE_ERRORS,
     CheckpointError,
     best_checkpoint,
     latest_checkpoint,
     load_checkpoint,
-    one_line,
+    one_line_message,
 )
 from jumper_warp.rl.mirror import Symmetry, mirror_map, expand_symmetric_layers
 from jumper_warp.rl.networks import EPS, NORMALISED_LIMIT
@@ -80,8 +80,8 @@ def _policy_of_checkpoint(path: Path, state: dict[str, Any]) -> Policy:
         raise CheckpointError(f"{path}: {error}") from error
     except PolicyError as error:
         raise PolicyError(f"{path}: {error}") from error
-    except DAMAGE as error:
-        said = f"not of a training of this project ({type(error).__name__}: {one_line(error)})"
+    except DECODE_ERRORS as error:
+        said = f"not of a training of this project ({type(error).__name__}: {one_line_message(error)})"
         raise CheckpointError(f"{path}: {said}") from error
 
 

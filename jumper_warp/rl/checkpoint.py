@@ -18,7 +18,7 @@ MANIFEST = "manifest.json"
 """Beside the checkpoints: SHA-256, iteration and score of each."""
 REQUIRED = {"iteration": int, "ppo": dict, "env": dict, "rng": dict, "config": str}
 """What every checkpoint holds, and of which type."""
-DAMAGE = (LookupError, TypeError, ValueError, AttributeError, RuntimeError)
+DECODE_ERRORS = (LookupError, TypeError, ValueError, AttributeError, RuntimeError)
 """What reading a part of a checkpoint raises that is missing or of another kind."""
 
 
@@ -31,7 +31,7 @@ class Checkpoint(NamedTuple):
 
     path: Path
     state: dict[str, Any]
-    passed_over: list[str]
+    skipped: list[str]
     """Why newer ones cannot be used, a line each."""
 
 
@@ -82,7 +82,7 @@ def load_checkpoint(path: Path) -> dict[str, Any]:
     try:
         state = torch.load(io.BytesIO(data), map_location="cpu", weights_only=True)
     except Exception as error:  # a damaged pickle raises anything
-        raise CheckpointError(f"{path}: not readable as tensors: {one_line(error)}") from error
+        raise CheckpointError(f"{path}: not readable as tensors: {one_line_message(error)}") from error
     if missing := [key for key in REQUIRED if not isinstance(state, dict) or key not in state]:
         raise CheckpointError(f"{path}: lacks {', '.join(missing)}")
     for key, kind in REQUIRED.items():
@@ -93,7 +93,7 @@ def load_checkpoint(path: Path) -> dict[str, Any]:
     return state
 
 
-def one_line(error: Exception) -> str:
+def one_line_message(error: Exception) -> str:
     """Return what an error says, on one line of at most 300 characters; its type if it says nothing."""
     return " ".join(str(error).split())[:300] or type(error).__name__
 

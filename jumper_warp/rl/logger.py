@@ -18,7 +18,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeElapsedCo
 from jumper_warp.rl.metrics_file import MetricsFile
 from jumper_warp.utils.errors import InputError
 
-FIGURES = "metrics.jsonl"
+METRICS_FILE = "metrics.jsonl"
 """In a run's folder: one JSON object per logged iteration."""
 REWARDS = "Episode_Reward/"
 """In the names of reward terms' means."""
@@ -78,7 +78,7 @@ class TrainingLog:
         written.
         """
         self._console = _LastingConsole(stderr=True)
-        self._figures = MetricsFile(folder / FIGURES, iteration)
+        self._figures = MetricsFile(folder / METRICS_FILE, iteration)
         self._events = _event_writer(folder, iteration) if tensorboard else None
         self._full = False
         self._total = total
@@ -138,7 +138,7 @@ class TrainingLog:
                 self._events.add_scalar(name, value, iteration)
             self._events.flush()
         except OSError as error:
-            self.say(f"no TensorBoard events from iteration {iteration} on: {error.strerror}; {FIGURES} has them all")
+            self.say(f"no TensorBoard events from iteration {iteration} on: {error.strerror}; {METRICS_FILE} has them all")
             with suppress(OSError):
                 self._events.close()
             self._events = None

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from jumper_warp.rl.cfg import LATEST, LATEST_OR_NEW
-from jumper_warp.rl.checkpoint import DAMAGE, MANIFEST, Checkpoint, CheckpointError, latest_checkpoint, load_checkpoint
+from jumper_warp.rl.checkpoint import DECODE_ERRORS, MANIFEST, Checkpoint, CheckpointError, latest_checkpoint, load_checkpoint
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.sources import changed_sources
 from jumper_warp.utils.state_checks import check_parts, check_tensor
@@ -49,7 +49,7 @@ def find_checkpoint(cfg: TrainCfg) -> Checkpoint | None:
     return Checkpoint(path, load_checkpoint(path), []) if path.suffix == ".pt" else latest_checkpoint(folder)
 
 
-def own_part(state: dict[str, Any], rank: Rank) -> dict[str, Any]:
+def rank_state(state: dict[str, Any], rank: Rank) -> dict[str, Any]:
     """Return the part of a checkpoint that is a process's own: `env`, `rng` and its part of `ppo`.
 
     Raises ValueError: it was saved by another number of processes, or a part is missing.
@@ -66,7 +66,7 @@ def own_part(state: dict[str, Any], rank: Rank) -> dict[str, Any]:
     return own
 
 
-def started_from(state: dict[str, Any]) -> str | None:
+def saved_init_policy(state: dict[str, Any]) -> str | None:
     """Return the policy that the run of a checkpoint began with; None: with random weights, or it is not told."""
     try:
         settings = json.loads(state["config"])["train"]
@@ -82,17 +82,17 @@ def changes(state: dict[str, Any], config: dict[str, Any]) -> list[str]:
     """
     try:
         old, new = _settings(json.loads(state["config"])), _settings(config)
-    except DAMAGE:
+    except DECODE_ERRORS:
         return []
     differ = [name for name in {**old, **new} if old.get(name) != new.get(name)]
     return [f"{name} {old.get(name)!s:.80} -> {new.get(name)!s:.80}" for name in differ]
 
 
-def changed_files(state: dict[str, Any], config: dict[str, Any]) -> list[str]:
+def changed_user_files(state: dict[str, Any], config: dict[str, Any]) -> list[str]:
     """Return a line on each of the user's files that is not what it was when the checkpoint was saved."""
     try:
         return changed_sources(json.loads(state["config"])["sources"], config["sources"])
-    except DAMAGE:
+    except DECODE_ERRORS:
         return []
 
 
@@ -117,7 +117,7 @@ def _flat(value: Any, name: str = "") -> dict[str, Any]:
     return {key: leaf for part in parts for key, leaf in part.items()}
 
 
-def spent_seconds(state: dict[str, Any]) -> float:
+def saved_seconds(state: dict[str, Any]) -> float:
     """Return the seconds of the run that a checkpoint tells, 0 if it tells none. Raises ValueError: it is no time."""
     seconds = state.get("seconds", 0.0)
     if type(seconds) not in (int, float) or not 0.0 <= seconds < math.inf:

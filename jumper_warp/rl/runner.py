@@ -19,7 +19,7 @@ import torch
 
 from jumper_warp.envs.vec_env import DifferentiableVecEnv, VecEnv
 from jumper_warp.rl.cfg import TrainCfg
-from jumper_warp.rl.checkpoint import DAMAGE, Checkpoint, CheckpointError, one_line, save_checkpoint
+from jumper_warp.rl.checkpoint import DECODE_ERRORS, Checkpoint, CheckpointError, one_line_message, save_checkpoint
 from jumper_warp.rl.distributed import (
     Rank,
     same_on_all_ranks,
@@ -34,14 +34,14 @@ from jumper_warp.rl.logger import Stopwatch, TrainingLog
 from jumper_warp.rl.ppo import STATISTICS, Ppo
 from jumper_warp.rl.resume import (
     CHECKPOINTS,
-    changed_files,
+    changed_user_files,
     changes,
     find_checkpoint,
-    own_part,
+    rank_state,
     random_state,
     set_random_state,
-    spent_seconds,
-    started_from,
+    saved_seconds,
+    saved_init_policy,
 )
 from jumper_warp.rl.shac import STATISTICS as SHAC_STATISTICS
 from jumper_warp.rl.shac import Shac
@@ -75,14 +75,14 @@ class TrainResult(NamedTuple):
     """Iterations that the policy has had."""
     seconds: float
     """Wall-clock time of this process's iterations [s], the first one included."""
-    figures: dict[str, float]
+    metrics: dict[str, float]
     """The last logged ones."""
 
 
-class Stop:
+class StopRequest:
     """Context in which Ctrl-C and SIGTERM set `asked`; the second Ctrl-C interrupts at once."""
 
-    def __enter__(self) -> Stop:
+    def __enter__(self) -> StopRequest:
         self.asked = False
         self._previous = {number: signal.signal(number, self._ask) for number in (signal.SIGINT, signal.SIGTERM)}
         return self
@@ -112,7 +112,7 @@ def train(
     """
     set_threads(cfg.threads)
     rank = init_distributed(cfg.device, cfg.threads)
-    run: Run | None = None
+    run: TrainingRun | None = None
     try:
         _check_processes(cfg, rank)
         if checkpoint is None and bool(cfg.start_from) != (start is not None):
@@ -121,8 +121,8 @@ def train(
         if cfg.trainer == "rsl-rl":
             return _train_rsl_rl(cfg, env, as_rsl_rl, rank)
         torch.manual_seed(cfg.seed)  # the same weights in all processes
-        run = Run(cfg, env, rank, command, start, checkpoint)
-        with Stop() as stop:
+        run = TrainingRun(cfg, env, rank, command, start, checkpoint)
+        with StopRequest() as stop:
             result = run.iterate(stop)
         wait_for_ranks()
         if stop.asked:
@@ -167,7 +167,7 @@ def full_config(cfg: TrainCfg, env: VecEnv, rank: Rank) -> dict[str, Any]:
     }
 
 
-class Run:
+class TrainingRun:
     """A training under way in this process."""
 
     def __init__(
@@ -187,7 +187,7 @@ class Run:
         self.config = full_config(cfg, env, rank)
         self.iteration, self.seconds = 0, 0.0  # that the run had before this process
         self._begin: float | None = None  # on the clock, as if all seconds that count were of this process
-        self.figures: dict[str, float] = {}
+        self.metrics: dict[str, float] = {}
         self.notes: list[str] = []
         checkpoint = checkpoint or find_checkpoint(cfg)
         if not same_on_all_ranks(str(checkpoint and (checkpoint.path, checkpoint.state["iteration"]))):
@@ -204,21 +204,21 @@ class Run:
         path, state, refusals = checkpoint
         changed = changes(state, self.config)
         self.notes += [*(f"passed over: {refusal}" for refusal in refusals), f"resumed {path}", *changed]
-        self.notes += changed_files(state, self.config)
+        self.notes += changed_user_files(state, self.config)
         try:
-            own = own_part(state, self.rank)
+            own = rank_state(state, self.rank)
             self.ppo.load_state_dict({**state["ppo"], **own["ppo"]})
             self.env.load_state_dict(own["env"])
-            self.seconds = spent_seconds(state)
+            self.seconds = saved_seconds(state)
             set_random_state(own["rng"])
-        except DAMAGE as error:
+        except DECODE_ERRORS as error:
             told = f" ({', '.join(changed)})" if changed else ""
-            raise CheckpointError(f"{path}: does not fit these settings: {one_line(error)}{told}") from error
+            raise CheckpointError(f"{path}: does not fit these settings: {one_line_message(error)}{told}") from error
         self.iteration = state["iteration"]
-        self.config["train"]["start_from"] = started_from(state)
+        self.config["train"]["start_from"] = saved_init_policy(state)
         return path.parent.parent
 
-    def iterate(self, stop: Stop) -> TrainResult:
+    def iterate(self, stop: StopRequest) -> TrainResult:
         """Iterate until the end, the time limit or a wish to stop; log and save on the way."""
         cfg, ppo = self.cfg, self.ppo
         with ThreadPoolExecutor(1) as pool:
@@ -247,13 +247,13 @@ class Run:
                 ending = is_last_iteration(self.iteration, cfg, self.sync_stop_request(stop))
                 if ending or self.iteration % cfg.log_interval == 0:
                     times, seconds = watch.read()
-                    self.figures = self._read(times, seconds)
-                    log.log(self.iteration, self.figures, self._left(seconds))
+                    self.metrics = self._read(times, seconds)
+                    log.log(self.iteration, self.metrics, self._left(seconds))
                 elif self.iteration == first:  # it takes longer than the others
                     watch.read()
                 if ending or self.iteration % cfg.save_interval == 0:
                     self._save(log, ending, stop)
-        return TrainResult(self.folder, self.iteration, time.perf_counter() - start, self.figures)
+        return TrainResult(self.folder, self.iteration, time.perf_counter() - start, self.metrics)
 
     def _log(self) -> TrainingLog | _Silent:
         if self.rank.index != 0:
@@ -283,7 +283,7 @@ class Run:
             left = min(left, max(self.cfg.max_seconds - self._elapsed(), 0.0))
         return left
 
-    def sync_stop_request(self, stop: Stop) -> bool:
+    def sync_stop_request(self, stop: StopRequest) -> bool:
         """Return whether to end early, because a process was asked to or is at the time limit.
 
         Several processes exchange this when they log, not otherwise; `stop.asked` becomes the same in all of them.
@@ -301,7 +301,7 @@ class Run:
         perf = (steps / seconds, *times, self._elapsed())
         return {**self.ppo.statistics(), **self.env.metrics(), **dict(zip(PERF, perf, strict=True))}
 
-    def _save(self, log: TrainingLog | _Silent, ending: bool, stop: Stop) -> None:
+    def _save(self, log: TrainingLog | _Silent, ending: bool, stop: StopRequest) -> None:
         """Save a checkpoint; a failure is only told, and tried again next time, unless this is the last."""
         seconds = self._elapsed()
         own = {"ppo": self.ppo.state_dict(), "env": self.env.state_dict(), "rng": random_state()}
@@ -312,7 +312,7 @@ class Run:
         state["config"] = json.dumps(self.config)
         folder = self.folder / CHECKPOINTS
         try:
-            path = save_checkpoint(folder, state, self.figures.get(self.cfg.best_by), self.cfg.keep)
+            path = save_checkpoint(folder, state, self.metrics.get(self.cfg.best_by), self.cfg.keep)
         except OSError as error:
             if ending:
                 raise CheckpointError(f"{folder}: not saved: {error.strerror}") from error

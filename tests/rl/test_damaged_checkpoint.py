@@ -15,7 +15,7 @@ from jumper_warp.policies.spec import PolicyError
 from jumper_warp.rl.cfg import PpoCfg, TrainCfg
 from jumper_warp.rl.checkpoint import MANIFEST, CheckpointError, load_checkpoint, save_checkpoint
 from jumper_warp.rl.distributed import Rank
-from jumper_warp.rl.runner import CHECKPOINTS, Run, train
+from jumper_warp.rl.runner import CHECKPOINTS, TrainingRun, train
 
 PPO = PpoCfg(num_steps=4, hidden=(8, 4), minibatches=2, epochs=1)
 ALONE = Rank(0, 1, torch.device("cpu"))
@@ -44,7 +44,7 @@ class Saved:
         """Return what is wrong with the checkpoint, or None after an iteration from it."""
         cfg = TrainCfg(**{**vars(self.cfg), "iterations": 100, "resume": str(self.path)})
         try:
-            run = Run(cfg, self.env, ALONE)
+            run = TrainingRun(cfg, self.env, ALONE)
         except CheckpointError as error:
             return str(error)
         run.ppo.collect()
@@ -193,7 +193,7 @@ def test_parts_of_another_process_are_named(saved):
     saved.save({**saved.state, "others": [own]})
     cfg = TrainCfg(**{**vars(saved.cfg), "resume": str(saved.path)})
     with pytest.raises(CheckpointError, match=r"others\.0 lacks rng, has nothing besides"):
-        Run(cfg, saved.env, Rank(1, 2, torch.device("cpu")))
+        TrainingRun(cfg, saved.env, Rank(1, 2, torch.device("cpu")))
 
 
 @pytest.mark.parametrize("entry", [{"sha256": 3}, {"iteration": "1"}, {"iteration": True}, {"score": "high"}, 3])

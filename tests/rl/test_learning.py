@@ -4,7 +4,7 @@ import json
 from jumper_warp.envs.env import Env
 from jumper_warp.registry import make_task
 from jumper_warp.rl.cfg import PpoCfg, TrainCfg
-from jumper_warp.rl.logger import FIGURES
+from jumper_warp.rl.logger import METRICS_FILE
 from jumper_warp.rl.runner import train
 
 CFG = TrainCfg(
@@ -18,7 +18,7 @@ def mean_returns(cfg: TrainCfg) -> list[float]:
     task = make_task("vertical-jump")
     task = dataclasses.replace(task, levels=task.levels[:1])
     result = train(cfg, lambda n, seed, _: Env(task, n, seed=seed, device="cpu", randomize=False, noise=False))
-    lines = (result.folder / FIGURES).read_text().splitlines()
+    lines = (result.folder / METRICS_FILE).read_text().splitlines()
     return [json.loads(line)["Train/mean_return"] for line in lines]
 
 

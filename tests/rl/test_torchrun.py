@@ -12,7 +12,7 @@ import torch
 
 import elastic_task
 from jumper_warp.rl.checkpoint import load_checkpoint
-from jumper_warp.rl.logger import FIGURES
+from jumper_warp.rl.logger import METRICS_FILE
 from jumper_warp.rl.runner import CHECKPOINTS
 from toy_task import free_port
 
@@ -50,7 +50,7 @@ def assert_same_training(found, expected):
     one, other = (load_checkpoint(run / CHECKPOINTS / "iteration_000006.pt") for run in (found, expected))
     for part in ("ppo", "env", "rng", "others"):
         assert_equal(one[part], other[part], part)
-    lines = [[json.loads(line) for line in (run / FIGURES).read_text().splitlines()] for run in (found, expected)]
+    lines = [[json.loads(line) for line in (run / METRICS_FILE).read_text().splitlines()] for run in (found, expected)]
     kept = [[(line["iteration"], line["Loss/kl"]) for line in log] for log in lines]
     assert kept[0] == kept[1] and [iteration for iteration, _ in kept[0]] == [1, 2, 3, 4, 5, 6]
 

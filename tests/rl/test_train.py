@@ -14,9 +14,9 @@ from jumper_warp.envs.rsl_rl import RslRlVecEnv
 from jumper_warp.rl.cfg import TrainCfg
 from jumper_warp.rl.checkpoint import MANIFEST, CheckpointError, load_checkpoint, save_checkpoint
 from jumper_warp.rl.distributed import Rank
-from jumper_warp.rl.logger import FIGURES
+from jumper_warp.rl.logger import METRICS_FILE
 from jumper_warp.rl.rsl_rl import rsl_rl_config, train_rsl_rl
-from jumper_warp.rl.runner import CHECKPOINTS, CONFIG, Run, Stop, train
+from jumper_warp.rl.runner import CHECKPOINTS, CONFIG, TrainingRun, StopRequest, train
 from toy_task import SMALL, PushTask, equal, free_port, push_cfg, train_rank, train_twice
 
 
@@ -40,7 +40,7 @@ def test_a_run_leaves_settings_figures_and_checkpoints(cfg):
     assert settings["train"]["ppo"]["num_steps"] == 16
     assert settings["env"] == {"episode_length": 16}
     assert settings["versions"]["torch"].split("+")[0] == torch.__version__.split("+")[0]
-    lines = [json.loads(line) for line in (result.folder / FIGURES).read_text().splitlines()]
+    lines = [json.loads(line) for line in (result.folder / METRICS_FILE).read_text().splitlines()]
     assert [line["iteration"] for line in lines] == [2, 4]
     assert lines[-1]["Train/mean_length"] == 16.0
     assert {"Perf/fps", "Perf/collect_s", "Perf/update_s", "Loss/kl", "Metrics/success"} <= lines[0].keys()
@@ -53,7 +53,7 @@ def test_a_run_leaves_settings_figures_and_checkpoints(cfg):
 
 def test_each_logged_iteration_is_told(cfg, capsys):
     result = train(cfg, make_env)
-    figures, told = result.figures, capsys.readouterr().err.splitlines()
+    figures, told = result.metrics, capsys.readouterr().err.splitlines()
     fps, total = f"{figures['Perf/fps']:,.0f}", f"{figures['Train/mean_return']:.2f}"
     success = f"{100.0 * figures['Metrics/success']:.1f}"
     assert told[0] == f"run {result.folder}"
@@ -69,15 +69,15 @@ def resume_after(cfg, seconds, limit):
     assert 0.0 < state.pop("seconds") <= half.seconds
     save_checkpoint(half.folder / CHECKPOINTS, state if seconds is None else {**state, "seconds": seconds})
     cfg = dataclasses.replace(cfg, iterations=100_000, max_seconds=limit, resume=str(half.folder))
-    run = Run(cfg, make_env(cfg.num_envs, 1, "cpu"), Rank(0, 1, torch.device("cpu")))
-    with Stop() as stop:
+    run = TrainingRun(cfg, make_env(cfg.num_envs, 1, "cpu"), Rank(0, 1, torch.device("cpu")))
+    with StopRequest() as stop:
         return run, run.iterate(stop)
 
 
 def test_a_resumed_run_goes_on_in_time(cfg):
     run, result = resume_after(cfg, 99.7, limit=100.0)
     assert result.iteration > 2 and result.seconds < 5.0
-    assert final_state(result)["seconds"] >= result.figures["Perf/elapsed_s"] >= 100.0
+    assert final_state(result)["seconds"] >= result.metrics["Perf/elapsed_s"] >= 100.0
     assert run.ppo._desired_kl.item() == pytest.approx(cfg.ppo.final_kl, rel=0.05)  # desired_kl by its own time alone
 
 
@@ -184,7 +184,7 @@ def test_a_full_disk_is_told_and_training_goes_on(cfg, capsys):
     with pytest.raises(CheckpointError, match="not saved"):
         train(cfg, lambda n, seed, device: Blocking(n, seed, device))
     assert "will try again" in capsys.readouterr().err
-    (figures,) = cfg.log_root.glob(f"push/*/{FIGURES}")
+    (figures,) = cfg.log_root.glob(f"push/*/{METRICS_FILE}")
     assert len(figures.read_text().splitlines()) == 2
 
 
@@ -266,9 +266,9 @@ def test_a_score_that_is_never_logged_is_refused_before_the_first_iteration(cfg)
 
 
 def test_every_logged_figure_can_be_the_score(cfg):
-    figures = train(cfg, make_env).figures
+    figures = train(cfg, make_env).metrics
     for name in figures:
-        Run(dataclasses.replace(cfg, best_by=name), make_env(32, 1, "cpu"), Rank(0, 1, torch.device("cpu")))
+        TrainingRun(dataclasses.replace(cfg, best_by=name), make_env(32, 1, "cpu"), Rank(0, 1, torch.device("cpu")))
     assert {"Train/mean_return", "Perf/fps", "Loss/kl", "Metrics/success"} <= figures.keys()
 
 

@@ -42,7 +42,7 @@ def test_the_time_limit_counts_from_the_end_of_the_first_iteration(cfg, monkeypa
     limited = dataclasses.replace(cfg, max_seconds=60.0)
     result = train_clocked(monkeypatch, limited, [500.0] + [1.0] * 79)  # 16 steps an iteration; the first compiles
     assert (result.iteration, result.seconds) == (5, 515.0 + 4 * 16.0)
-    assert (result.figures["Perf/elapsed_s"], saved_seconds(result)) == (64.0, 64.0)
+    assert (result.metrics["Perf/elapsed_s"], saved_seconds(result)) == (64.0, 64.0)
     on = dataclasses.replace(limited, max_seconds=80.0, resume=str(result.folder))
     again = train_clocked(monkeypatch, on, [700.0] + [1.0] * 31)  # another iteration to warm up, and one that counts
     assert (again.iteration, saved_seconds(again)) == (7, 80.0)

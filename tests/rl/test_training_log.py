@@ -6,7 +6,7 @@ import resource
 import pytest
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from jumper_warp.rl.logger import FIGURES, TrainingLog, _duration
+from jumper_warp.rl.logger import METRICS_FILE, TrainingLog, _duration
 from jumper_warp.rl.metrics_file import MetricsFile
 from jumper_warp.rl.runner import CHECKPOINTS, train
 from toy_task import PushTask, push_cfg
@@ -41,7 +41,7 @@ def steps(folder):
 
 
 def test_figures_that_found_no_room_follow_in_order(tmp_path):
-    path = tmp_path / FIGURES
+    path = tmp_path / METRICS_FILE
     file = MetricsFile(path, 0)
     file.add(1, {"Loss/value": 0.5})
     before = path.read_bytes()
@@ -75,7 +75,7 @@ def test_a_disk_that_is_full_for_a_while_loses_no_figure_and_is_told_once(cfg, c
     cfg = dataclasses.replace(cfg, tensorboard=tensorboard)
     with contextlib.ExitStack() as Filling.stack:
         result = train(cfg, Filling)
-    assert iterations(result.folder / FIGURES) == [1, 2, 3, 4, 5, 6]
+    assert iterations(result.folder / METRICS_FILE) == [1, 2, 3, 4, 5, 6]
     assert (result.folder / CHECKPOINTS / "iteration_000006.pt").exists()
     told = capsys.readouterr().err.splitlines()
     assert ["training continues" in line for line in told].count(True) == 1
@@ -102,7 +102,7 @@ def test_a_reward_term_that_is_no_number_is_told_and_kept_as_json(tmp_path, caps
     def refuse(text):
         raise AssertionError(text)
 
-    saved = [json.loads(line, parse_constant=refuse) for line in (tmp_path / FIGURES).read_text().splitlines()]
+    saved = [json.loads(line, parse_constant=refuse) for line in (tmp_path / METRICS_FILE).read_text().splitlines()]
     assert [line["iteration"] for line in saved] == [1, 2, 3]
     assert saved[1]["Episode_Reward/tilt"] is None and saved[1]["Loss/value"] == 1.0
 
@@ -118,12 +118,12 @@ def test_a_terminal_that_is_gone_stops_nothing(tmp_path, monkeypatch):
         log._console.file = Gone()
         for iteration in (1, 2):
             log.log(iteration, NUMBERS, 5.0)
-    assert iterations(tmp_path / FIGURES) == [1, 2]
+    assert iterations(tmp_path / METRICS_FILE) == [1, 2]
 
 
 def test_a_resumed_run_drops_a_half_line_and_later_iterations(cfg, capsys):
     half = train(dataclasses.replace(cfg, iterations=4), PushTask)
-    path = half.folder / FIGURES
+    path = half.folder / METRICS_FILE
     kept = path.read_text().splitlines()[:2]
     path.write_bytes(path.read_bytes()[:-30])
     resume = str(half.folder / CHECKPOINTS / "iteration_000002.pt")
@@ -147,7 +147,7 @@ def test_a_resumed_run_drops_a_half_line_and_later_iterations(cfg, capsys):
     ],
 )
 def test_a_file_of_figures_is_whole_again(tmp_path, content, kept):
-    path = tmp_path / FIGURES
+    path = tmp_path / METRICS_FILE
     path.write_bytes(content)
     MetricsFile(path, 2).add(3, {})
     assert iterations(path) == [*kept, 3]
