@@ -184,7 +184,7 @@ def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> TrainResult:
     parsed, task = parse_train(args)
     from jumper_warp.rl.runner import train
     from jumper_warp.tasks.mirror import mirror_of
-    from jumper_warp.utils.runtime import announce
+    from jumper_warp.utils.runtime import configure_device
 
     check_saving(task)
     if parsed.cfg.ppo.symmetry != "off":
@@ -196,7 +196,7 @@ def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> TrainResult:
         start = actor_init_from_policy(parsed.cfg.start_from, task, parsed.cfg.ppo)
     first = os.environ.get("RANK", "0") == "0"
     if first:
-        announce(parsed.cfg.device, parsed.cfg.threads)
+        configure_device(parsed.cfg.device, parsed.cfg.threads)
     as_rsl_rl = None
     if parsed.cfg.trainer == "rsl-rl":
         from jumper_warp.envs.rsl_rl import RslRlVecEnv as as_rsl_rl

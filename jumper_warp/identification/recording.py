@@ -17,7 +17,7 @@ from jumper_warp.robot.motors import MotorCfg
 from jumper_warp.robot.values import RobotValues
 from jumper_warp.sim.simulation import Simulation, SolverName, motor_values
 from jumper_warp.utils.errors import InputError
-from jumper_warp.utils.rotations import from_vector, multiply
+from jumper_warp.utils.rotations import from_rotation_vector, multiply
 
 Kind = Literal["hung chirp", "standing chirp", "small jump"]
 KINDS: tuple[Kind, ...] = ("hung chirp", "hung chirp", "standing chirp", "small jump")
@@ -222,7 +222,7 @@ def measured(
     quaternion = record.quaternion[:, :, 0]
     if rng is not None:
         values = {key: x + levels[key][0] * rng.normal(size=x.shape) for key, x in values.items()}
-        quaternion = multiply(from_vector(levels["orientation"][0] * rng.normal(size=(rows, 3))), quaternion)
+        quaternion = multiply(from_rotation_vector(levels["orientation"][0] * rng.normal(size=(rows, 3))), quaternion)
     between = (np.arange(rows) % base_every != 0)[:, None]
     values["position"], quaternion = (np.where(between, math.nan, x) for x in (values["position"], quaternion))
     if not torque:

@@ -20,12 +20,12 @@ from typing import Any
 
 import torch
 
-from jumper_warp.policies.onnx import onnx_bytes, policy_of_onnx
+from jumper_warp.policies.onnx import onnx_bytes, policy_from_onnx
 from jumper_warp.policies.policy import Policy
 from jumper_warp.policies.spec import PolicyError, PolicyInterface
 from jumper_warp.utils.assets import ASSETS
-from jumper_warp.utils.checks import version_refusal
-from jumper_warp.utils.files import json_bytes, write_whole
+from jumper_warp.utils.checks import version_error
+from jumper_warp.utils.files import json_bytes, write_atomically
 from jumper_warp.utils.runtime import source_versions
 
 POLICIES = ASSETS / "policies"
@@ -106,7 +106,7 @@ def _write(folder: Path, files: Mapping[str, bytes], sums: Mapping[str, str]) ->
     sums = {**sums, **{name: hashlib.sha256(data).hexdigest() for name, data in files.items() if name != README}}
     manifest = {"format": FORMAT, "schema_version": SCHEMA_VERSION, "sha256": dict(sorted(sums.items()))}
     for name, data in {**files, MANIFEST: json_bytes(manifest)}.items():
-        write_whole(folder / name, data)
+        write_atomically(folder / name, data)
 
 
 def list_policies() -> tuple[str, ...]:
@@ -141,7 +141,7 @@ def load_policy(name: str | Path, device: str | torch.device = "cpu") -> Policy:
     data = _checked_bytes(folder / ONNX, sums[ONNX])
     try:
         interface = PolicyInterface.from_json(config.get("interface"))
-        return policy_of_onnx(data, interface, config).to(device)
+        return policy_from_onnx(data, interface, config).to(device)
     except PolicyError as error:
         raise PolicyError(f"{folder}: {error}") from error
 
@@ -165,7 +165,7 @@ def _checked_sums(folder: Path) -> dict[str, str]:
 
 def _check_version(path: Path, content: Mapping[str, Any]) -> None:
     if (found := content.get("schema_version")) != SCHEMA_VERSION:
-        raise PolicyError(f"{path}: {version_refusal(f'{found!r:.20}', SCHEMA_VERSION)}")
+        raise PolicyError(f"{path}: {version_error(f'{found!r:.20}', SCHEMA_VERSION)}")
 
 
 def _checked_bytes(path: Path, digest: Any) -> bytes:

@@ -21,7 +21,7 @@ from onnx import TensorProto, helper, numpy_helper
 
 from jumper_warp.policies.policy import Policy, check_tensors
 from jumper_warp.policies.spec import PolicyError, PolicyInterface
-from jumper_warp.utils.files import write_whole
+from jumper_warp.utils.files import write_atomically
 
 OPSET = 18
 IR_VERSION = 9
@@ -136,7 +136,7 @@ def onnx_bytes(policy: Policy, config: Mapping[str, Any] | None = None) -> bytes
     return model.SerializeToString(deterministic=True)
 
 
-def policy_of_onnx(data: bytes, interface: PolicyInterface, config: Mapping[str, Any]) -> Policy:
+def policy_from_onnx(data: bytes, interface: PolicyInterface, config: Mapping[str, Any]) -> Policy:
     """Return the policy that `onnx_bytes` wrote, bitwise.
 
     interface, config: those of the policy, from elsewhere; the graph and the metadata of the file must be of these.
@@ -184,5 +184,5 @@ def export_onnx(policy: Policy, path: Path) -> Path:
     """Write a policy as one ONNX file, whole or not at all; return its path."""
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    write_whole(path, onnx_bytes(policy))
+    write_atomically(path, onnx_bytes(policy))
     return path

@@ -100,10 +100,10 @@ def learning_curve(source: Path) -> bytes | None:
     """
     run = source.parents[1] if source.suffix == ".pt" else source
     path = run / METRICS
-    return short_curve(path.read_bytes()) if path.is_file() else None
+    return thinned_curve(path.read_bytes()) if path.is_file() else None
 
 
-def short_curve(logged: bytes) -> bytes:
+def thinned_curve(logged: bytes) -> bytes:
     """Return what a policy's folder keeps of logged metrics; a line that is not whole is left out."""
     rows = [row for line in logged.splitlines() if (row := _row(line))]
     last = len(rows) - 1

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import torch
 
 from jumper_warp.utils.errors import InputError
-from jumper_warp.utils.files import write_whole
+from jumper_warp.utils.files import write_atomically
 
 MANIFEST = "manifest.json"
 """Beside the checkpoints: SHA-256, iteration and score of each."""
@@ -47,7 +47,7 @@ def save_checkpoint(folder: Path, state: dict[str, Any], score: float | None = N
     torch.save(state, buffer)
     data = buffer.getvalue()
     path = folder / f"iteration_{state['iteration']:06d}.pt"
-    write_whole(path, data)
+    write_atomically(path, data)
     manifest = _read_manifest(folder, missing_ok=True)
     manifest.pop(path.name, None)  # the order is that of saving
     digest = hashlib.sha256(data).hexdigest()
@@ -56,7 +56,7 @@ def save_checkpoint(folder: Path, state: dict[str, Any], score: float | None = N
     old = [name for name in manifest if name not in kept]
     for name in old:
         del manifest[name]
-    write_whole(folder / MANIFEST, json.dumps(manifest, indent=1).encode())
+    write_atomically(folder / MANIFEST, json.dumps(manifest, indent=1).encode())
     for name in old:
         (folder / name).unlink(missing_ok=True)
     return path

@@ -7,7 +7,7 @@ import math
 from contextlib import suppress
 from pathlib import Path
 
-from jumper_warp.utils.files import write_whole
+from jumper_warp.utils.files import write_atomically
 
 
 class MetricsFile:
@@ -26,7 +26,7 @@ class MetricsFile:
         """Lines that were."""
         whole = b"".join(line + b"\n" for line in kept)
         if whole != content:
-            write_whole(path, whole)
+            write_atomically(path, whole)
         self._file = path.open("ab", buffering=0)
         self._size = len(whole)
         self._waiting = b""

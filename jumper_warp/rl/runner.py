@@ -47,9 +47,9 @@ from jumper_warp.rl.shac import STATISTICS as SHAC_STATISTICS
 from jumper_warp.rl.shac import Shac
 from jumper_warp.rl.actor_init import ActorInit, apply_actor_init
 from jumper_warp.utils.errors import InputError
-from jumper_warp.utils.files import write_whole
+from jumper_warp.utils.files import write_atomically
 from jumper_warp.utils.runtime import git_commit, versions
-from jumper_warp.utils.sources import source_sums
+from jumper_warp.utils.sources import source_checksums
 from jumper_warp.utils.threads import set_threads
 
 CONFIG = "config.json"
@@ -163,7 +163,7 @@ def full_config(cfg: TrainCfg, env: VecEnv, rank: Rank) -> dict[str, Any]:
         "device": str(rank.device),
         "versions": versions(),
         "commit": commit and commit._asdict(),
-        "sources": source_sums(described),
+        "sources": source_checksums(described),
     }
 
 
@@ -198,7 +198,7 @@ class TrainingRun:
         torch.manual_seed(cfg.seed + 1 + rank.index)
         self.folder = new_folder(cfg, rank) if checkpoint is None else self._resume(checkpoint)
         if rank.index == 0:
-            write_whole(self.folder / CONFIG, json.dumps(self.config, indent=1).encode())
+            write_atomically(self.folder / CONFIG, json.dumps(self.config, indent=1).encode())
 
     def _resume(self, checkpoint: Checkpoint) -> Path:
         path, state, refusals = checkpoint
@@ -367,7 +367,7 @@ def _train_rsl_rl(cfg: TrainCfg, env: VecEnv, as_rsl_rl: AsRslRl | None, rank: R
     folder = new_folder(cfg, rank)
     if rank.index == 0:
         print(f"run {folder}", file=sys.stderr)
-        write_whole(folder / CONFIG, json.dumps(full_config(cfg, env, rank), indent=1).encode())
+        write_atomically(folder / CONFIG, json.dumps(full_config(cfg, env, rank), indent=1).encode())
     begin = time.perf_counter()
     torch.manual_seed(cfg.seed + rank.index)
     env.reset()

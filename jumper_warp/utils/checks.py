@@ -66,6 +66,6 @@ def check_seed(value: Any) -> None:
         raise InputError(f"seed must be in 0 .. {MOST_SEED}, got {value!r:.40}")
 
 
-def version_refusal(found: str, known: int) -> str:
+def version_error(found: str, known: int) -> str:
     """Return why a file of another version is refused, and which commit reads the older ones."""
     return f"has version {found}, this is version {known}; commit {LAST_OF_OLDER_VERSIONS} reads older ones"

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 
-def write_whole(path: Path, data: bytes) -> None:
+def write_atomically(path: Path, data: bytes) -> None:
     """Write a file so that whoever looks finds either the old content or the new, also after a power cut.
 
     Raises OSError: the disk is full or the folder cannot be written; `filename` is the path.

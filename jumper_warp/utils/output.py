@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from jumper_warp.utils.errors import InputError
-from jumper_warp.utils.files import json_bytes, write_whole
+from jumper_warp.utils.files import json_bytes, write_atomically
 from jumper_warp.utils.runtime import device_info, source_versions
 
 Scalar = float | int | str | bool | None
@@ -50,7 +50,7 @@ def write_metrics(folder: Path, figures: Mapping[str, Scalar | list[Scalar]]) ->
     command = [Path(sys.argv[0]).name, *sys.argv[1:]]
     run = source_versions() | {"device": device_info()._asdict(), "command": command}
     for name, content in (("run.json", run), ("metrics.json", plain)):
-        write_whole(folder / name, json_bytes(content))
+        write_atomically(folder / name, json_bytes(content))
     return folder / "metrics.json"
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-INVERSE = np.array([-1.0, -1.0, -1.0, 1.0])
+CONJUGATE = np.array([-1.0, -1.0, -1.0, 1.0])
 """Signs of the inverse of a quaternion."""
 
 
@@ -21,13 +21,13 @@ def multiply(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return np.concatenate([vector, scalar], axis=-1)
 
 
-def from_vector(vector: np.ndarray) -> np.ndarray:
+def from_rotation_vector(vector: np.ndarray) -> np.ndarray:
     """Return the quaternions xyzw (..., 4) of rotation vectors (..., 3) [rad]."""
     angle = np.linalg.norm(vector, axis=-1, keepdims=True)
     return np.concatenate([0.5 * np.sinc(0.5 * angle / np.pi) * vector, np.cos(0.5 * angle)], axis=-1)
 
 
-def to_vector(quaternion: np.ndarray) -> np.ndarray:
+def to_rotation_vector(quaternion: np.ndarray) -> np.ndarray:
     """Return the rotation vectors (..., 3) [rad] of quaternions xyzw (..., 4), at most half a turn."""
     quaternion = quaternion * np.where(quaternion[..., 3:] < 0.0, -1.0, 1.0)
     size = np.linalg.norm(quaternion[..., :3], axis=-1, keepdims=True)

@@ -67,7 +67,7 @@ def report_device(device: wp.DeviceLike = None, console: Console | None = None) 
     return info
 
 
-def announce(device: str | None, threads: int | None = None) -> DeviceInfo:
+def configure_device(device: str | None, threads: int | None = None) -> DeviceInfo:
     """Print a line on the device that is going to be used, and silence Warp's notes on its modules.
 
     threads: of a CPU, for all simulations that are made from now on, as in `set_threads`.

@@ -12,7 +12,7 @@ OWN = "jumper_warp."
 """Beginning of the names of the project's modules; the commit identifies their content."""
 
 
-def source_sums(saved: Any) -> dict[str, str]:
+def source_checksums(saved: Any) -> dict[str, str]:
     """Return the SHA-256 of each file outside the project that has a function which `module:name` in `saved` names.
 
     By module; saved: nested dicts and lists, such as a task as JSON. Modules that are not loaded, or have no file that
@@ -27,7 +27,7 @@ def source_sums(saved: Any) -> dict[str, str]:
 
 
 def changed_sources(old: Any, new: dict[str, str]) -> list[str]:
-    """Return a line on each module whose file is not what it was; old: as `source_sums` gave it, or anything."""
+    """Return a line on each module whose file is not what it was; old: as `source_checksums` gave it, or anything."""
     before = old if isinstance(old, dict) else {}
     return [
         f"{module} has changed since: its functions are those of now, settings those of the run"

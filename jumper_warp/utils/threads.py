@@ -39,7 +39,7 @@ def set_threads(threads: int | None) -> None:
     _chosen = None if threads is None else checked_threads(threads)
 
 
-def run_side_by_side(jobs: Iterable[Callable[[], object]], threads: int) -> None:
+def run_in_parallel(jobs: Iterable[Callable[[], object]], threads: int) -> None:
     """Run jobs on so many threads, of which the caller's is one, and return when all have ended.
 
     Raises what one of them raised; jobs that no thread has begun by then are left out.

@@ -13,7 +13,7 @@ from jumper_warp.rl.checkpoint import (
     load_checkpoint,
     save_checkpoint,
 )
-from jumper_warp.utils.files import write_whole
+from jumper_warp.utils.files import write_atomically
 
 
 def state(iteration):
@@ -134,14 +134,14 @@ def test_no_usable_checkpoint_is_told(tmp_path):
 
 def test_a_failed_write_leaves_the_old_file(tmp_path, monkeypatch):
     path = tmp_path / "file"
-    write_whole(path, b"old")
+    write_atomically(path, b"old")
 
     def full(*_):
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(os, "fsync", full)
     with pytest.raises(OSError, match="No space left") as caught:
-        write_whole(path, b"new")
+        write_atomically(path, b"new")
     assert caught.value.filename == str(path)  # by which the command line knows a refusal
     assert path.read_bytes() == b"old"
     assert [entry.name for entry in tmp_path.iterdir()] == ["file"]

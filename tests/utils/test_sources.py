@@ -6,7 +6,7 @@ from pathlib import Path
 
 from jumper_warp.registry import make_task
 from jumper_warp.tasks.saving import task_to_json
-from jumper_warp.utils.sources import changed_sources, source_sums
+from jumper_warp.utils.sources import changed_sources, source_checksums
 
 
 def test_files_outside_the_project_are_named_by_their_module():
@@ -16,9 +16,9 @@ def test_files_outside_the_project_are_named_by_their_module():
         "n": 1,
     }
     held = hashlib.sha256(Path(json.decoder.__file__).read_bytes()).hexdigest()
-    assert source_sums(saved) == {"json.decoder": held}
-    assert source_sums(["sys:path", "no.such.module:thing", None, 2.0]) == {}
-    assert source_sums(task_to_json(make_task("vertical-jump"))) == {}
+    assert source_checksums(saved) == {"json.decoder": held}
+    assert source_checksums(["sys:path", "no.such.module:thing", None, 2.0]) == {}
+    assert source_checksums(task_to_json(make_task("vertical-jump"))) == {}
 
 
 def test_changes_are_told_of_files_that_were_known():
