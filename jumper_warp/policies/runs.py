@@ -18,7 +18,7 @@ from jumper_warp.rl.checkpoint import (
     load_checkpoint,
     one_line_message,
 )
-from jumper_warp.rl.mirror import Symmetry, mirror_map, expand_symmetric_layers
+from jumper_warp.rl.mirror import Symmetry, expand_symmetric_layers, mirror_map
 from jumper_warp.rl.networks import EPS, NORMALISED_LIMIT
 from jumper_warp.rl.resume import CHECKPOINTS
 from jumper_warp.tasks.saving import TaskError, check_version
@@ -71,7 +71,10 @@ def _policy_of_checkpoint(path: Path, state: dict[str, Any]) -> Policy:
         times = {"policy_dt": env["policy_dt_s"], "physics_dt": env["physics_dt_s"]}
         shape = {"hidden": tuple(ppo["hidden"]), "activation": ppo["activation"]}
         if symmetry := _symmetry(model):
-            layers, shape["hidden"] = expand_symmetric_layers(layers, symmetry), tuple(2 * width for width in ppo["hidden"])
+            layers, shape["hidden"] = (
+                expand_symmetric_layers(layers, symmetry),
+                tuple(2 * width for width in ppo["hidden"]),
+            )
         commit = config.get("commit") or {"hash": None, "dirty": None}
         config |= {"commit": commit["hash"], "dirty": commit["dirty"], "iteration": state["iteration"]}
         described = {**env["interface"], "observation_limit": RAW_LIMIT, "normalised_limit": NORMALISED_LIMIT}

@@ -10,10 +10,10 @@ from typing import Any
 from jumper_warp.envs.vec_env import RAW_LIMIT
 from jumper_warp.policies.runs import open_policy
 from jumper_warp.policies.spec import PolicyInterface
+from jumper_warp.rl.actor_init import ActorInit, make_actor_init
 from jumper_warp.rl.cfg import PpoCfg
 from jumper_warp.rl.mirror import Symmetry, mirror_map
 from jumper_warp.rl.networks import NORMALISED_LIMIT
-from jumper_warp.rl.actor_init import ActorInit, make_actor_init
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.tasks.interface import interface
 from jumper_warp.tasks.mirror import mirror_of, mirror_of_action

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import torch
 
 from jumper_warp.rl.cfg import PpoCfg
-from jumper_warp.rl.mirror import Symmetry, Weights, nearest_expanded_layers, contract_expanded_layers
+from jumper_warp.rl.mirror import Symmetry, Weights, contract_expanded_layers, nearest_expanded_layers
 from jumper_warp.rl.networks import EPS, ActorCritic, linear_layers
 from jumper_warp.utils.errors import InputError
 

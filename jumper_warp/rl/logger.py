@@ -138,7 +138,9 @@ class TrainingLog:
                 self._events.add_scalar(name, value, iteration)
             self._events.flush()
         except OSError as error:
-            self.say(f"no TensorBoard events from iteration {iteration} on: {error.strerror}; {METRICS_FILE} has them all")
+            self.say(
+                f"no TensorBoard events from iteration {iteration} on: {error.strerror}; {METRICS_FILE} has them all"
+            )
             with suppress(OSError):
                 self._events.close()
             self._events = None

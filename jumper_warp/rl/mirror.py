@@ -47,7 +47,9 @@ class MirrorMap(NamedTuple):
     def padded(self, columns: int) -> MirrorMap:
         """Return the image of vectors that are filled up to so many columns, which stay where they are."""
         more = torch.arange(len(self.order), columns, device=self.order.device)
-        return MirrorMap(torch.cat([self.order, more]), torch.cat([self.signs, torch.ones_like(more, dtype=torch.float32)]))
+        return MirrorMap(
+            torch.cat([self.order, more]), torch.cat([self.signs, torch.ones_like(more, dtype=torch.float32)])
+        )
 
     def matrix(self) -> torch.Tensor:
         """Return the image as a matrix (n, n)."""
@@ -142,7 +144,11 @@ def contract_expanded_layers(layers: Weights, symmetry: Symmetry) -> Weights:
         factor = 2.0 if last and not first else 1.0
         found.append((factor * weight[:rows, :columns], bias[:rows].clone()))
     sizes = (layers[0][0].shape[1], layers[-1][0].shape[0])
-    again = expand_symmetric_layers(found, symmetry) if sizes == (len(symmetry.obs.order), len(symmetry.action.order)) else []
+    again = (
+        expand_symmetric_layers(found, symmetry)
+        if sizes == (len(symmetry.obs.order), len(symmetry.action.order))
+        else []
+    )
     if len(again) != len(layers) or not all(
         one.shape == other.shape and torch.allclose(one, other, rtol=1e-6, atol=1e-6)
         for own, made in zip(layers, again, strict=True)

@@ -193,7 +193,8 @@ class ActorCritic(nn.Module):
         if not self._symmetric:
             return None
         parts = [
-            MirrorMap(*(getattr(self, f"mirror_{name}_{part}") for part in MirrorMap._fields)) for name in Symmetry._fields
+            MirrorMap(*(getattr(self, f"mirror_{name}_{part}") for part in MirrorMap._fields))
+            for name in Symmetry._fields
         ]
         return Symmetry(*parts)
 

@@ -20,7 +20,7 @@ from jumper_warp.rl.graphs import CapturedProcedure, Compiler
 from jumper_warp.rl.mirror import symmetry_of
 from jumper_warp.rl.networks import DTYPES, Actor, ActorCritic, Layers, gaussian_kl, gaussian_log_prob
 from jumper_warp.rl.rollout import Collector
-from jumper_warp.rl.samples import Batch, RowLayout, BatchPacker
+from jumper_warp.rl.samples import Batch, BatchPacker, RowLayout
 from jumper_warp.utils.allocator import keep_freed_memory
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.state_checks import check_parts, check_tensor, check_values

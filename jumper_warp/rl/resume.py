@@ -10,7 +10,14 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from jumper_warp.rl.cfg import LATEST, LATEST_OR_NEW
-from jumper_warp.rl.checkpoint import DECODE_ERRORS, MANIFEST, Checkpoint, CheckpointError, latest_checkpoint, load_checkpoint
+from jumper_warp.rl.checkpoint import (
+    DECODE_ERRORS,
+    MANIFEST,
+    Checkpoint,
+    CheckpointError,
+    latest_checkpoint,
+    load_checkpoint,
+)
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.sources import changed_sources
 from jumper_warp.utils.state_checks import check_parts, check_tensor

@@ -18,15 +18,16 @@ from typing import Any, NamedTuple, cast
 import torch
 
 from jumper_warp.envs.vec_env import DifferentiableVecEnv, VecEnv
+from jumper_warp.rl.actor_init import ActorInit, apply_actor_init
 from jumper_warp.rl.cfg import TrainCfg
 from jumper_warp.rl.checkpoint import DECODE_ERRORS, Checkpoint, CheckpointError, one_line_message, save_checkpoint
 from jumper_warp.rl.distributed import (
     Rank,
-    same_on_all_ranks,
+    all_reduce_max,
     gather,
     init_distributed,
-    all_reduce_max,
     local_rank_zero_first,
+    same_on_all_ranks,
     wait_for_ranks,
     world_size,
 )
@@ -37,15 +38,14 @@ from jumper_warp.rl.resume import (
     changed_user_files,
     changes,
     find_checkpoint,
-    rank_state,
     random_state,
-    set_random_state,
-    saved_seconds,
+    rank_state,
     saved_init_policy,
+    saved_seconds,
+    set_random_state,
 )
 from jumper_warp.rl.shac import STATISTICS as SHAC_STATISTICS
 from jumper_warp.rl.shac import Shac
-from jumper_warp.rl.actor_init import ActorInit, apply_actor_init
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.files import write_atomically
 from jumper_warp.utils.runtime import git_commit, versions

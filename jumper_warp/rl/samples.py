@@ -12,7 +12,7 @@ from jumper_warp.rl.cfg import PpoCfg
 from jumper_warp.rl.flat import ROW_ALIGNMENT, FlatParameters, aligned
 from jumper_warp.rl.graphs import Compiler
 from jumper_warp.rl.mirror import MirrorMap
-from jumper_warp.rl.networks import DTYPES, ActorCritic, Layers, Moments, Scaling, gaussian_log_prob, all_reduce_moments
+from jumper_warp.rl.networks import DTYPES, ActorCritic, Layers, Moments, Scaling, all_reduce_moments, gaussian_log_prob
 from jumper_warp.rl.rollout import RolloutBuffer
 
 CPU_ROWS = 4096

@@ -56,7 +56,11 @@ def trained(model):
     interface = make_interface(48, 12, (64, 32))
     moments = model.obs_moments
     return Policy(
-        linear_layers(model.actor), moments.mean, moments.scaling().std, interface, {"env": {"seed": 5}, "commit": "abc"}
+        linear_layers(model.actor),
+        moments.mean,
+        moments.scaling().std,
+        interface,
+        {"env": {"seed": 5}, "commit": "abc"},
     )
 
 

@@ -7,11 +7,11 @@ import torch
 
 from jumper_warp.policies.runs import open_policy
 from jumper_warp.policies.spec import PolicyError
-from jumper_warp.policies.warm_start import check_interface, actor_init_from_policy
+from jumper_warp.policies.warm_start import actor_init_from_policy, check_interface
 from jumper_warp.registry import TASKS, make_task
+from jumper_warp.rl.actor_init import apply_actor_init
 from jumper_warp.rl.mirror import Symmetry, mirror_map
 from jumper_warp.rl.networks import ActorCritic
-from jumper_warp.rl.actor_init import apply_actor_init
 from jumper_warp.tasks.interface import interface
 from jumper_warp.tasks.mirror import mirror_of, mirror_of_action
 from jumper_warp.tasks.observations import with_history
@@ -31,7 +31,9 @@ WIDE = {"symmetry": "off", "hidden": (512, 256, 256)}
 )
 def test_a_training_begins_as_a_shipped_policy_acts(name, task, change):
     policy, cfg, task = open_policy(name), dataclasses.replace(TASKS[task].ppo, **change), make_task(task)
-    symmetry = Symmetry(mirror_map(*mirror_of(task, "policy"), "observation"), mirror_map(*mirror_of_action(), "action"))
+    symmetry = Symmetry(
+        mirror_map(*mirror_of(task, "policy"), "observation"), mirror_map(*mirror_of_action(), "action")
+    )
     symmetry = symmetry if cfg.symmetry == "actor" else None
     assert (symmetry is not None) == (name == "slippery_jump" and not change)
     torch.manual_seed(0)
@@ -66,12 +68,16 @@ def test_no_such_policy_is_told():
 
 def test_another_history_is_refused():
     with pytest.raises(InputError, match=r"start_from: observation \d+: the policy has \w+"):
-        actor_init_from_policy("horizontal_jump", with_history(make_task("horizontal-jump"), 1), TASKS["horizontal-jump"].ppo)
+        actor_init_from_policy(
+            "horizontal_jump", with_history(make_task("horizontal-jump"), 1), TASKS["horizontal-jump"].ppo
+        )
 
 
 def test_a_symmetric_training_begins_with_the_nearest_symmetric_form_of_a_fine_tuned_policy():
     policy, task, cfg = open_policy("horizontal_jump"), make_task("horizontal-jump"), TASKS["horizontal-jump"].ppo
-    symmetry = Symmetry(mirror_map(*mirror_of(task, "policy"), "observation"), mirror_map(*mirror_of_action(), "action"))
+    symmetry = Symmetry(
+        mirror_map(*mirror_of(task, "policy"), "observation"), mirror_map(*mirror_of_action(), "action")
+    )
     start = actor_init_from_policy("horizontal_jump", task, cfg)
     model = ActorCritic(147, 12, cfg.hidden, cfg.activation, cfg.init_std, symmetry=symmetry)
     apply_actor_init(start, model, samples=1000)

@@ -7,12 +7,17 @@ import pytest
 import torch
 from test_shac import SmoothPushTask
 
+from jumper_warp.rl.actor_init import PRIOR_ITERATIONS, apply_actor_init, make_actor_init
 from jumper_warp.rl.checkpoint import load_checkpoint, save_checkpoint
-from jumper_warp.rl.mirror import nearest_expanded_layers, expand_symmetric_layers, contract_expanded_layers, symmetry_of
+from jumper_warp.rl.mirror import (
+    contract_expanded_layers,
+    expand_symmetric_layers,
+    nearest_expanded_layers,
+    symmetry_of,
+)
 from jumper_warp.rl.networks import EPS, ActorCritic
 from jumper_warp.rl.ppo import Ppo
 from jumper_warp.rl.runner import CHECKPOINTS, CONFIG, train
-from jumper_warp.rl.actor_init import PRIOR_ITERATIONS, apply_actor_init, make_actor_init
 from jumper_warp.utils.errors import InputError
 from toy_task import SMALL, PushTask, push_cfg
 
@@ -181,7 +186,9 @@ def test_a_policy_that_fine_tuning_has_bent_begins_as_the_nearest_symmetric_one(
     little, much = ([(w + share * w.std() * torch.randn_like(w), b) for w, b in exact] for share in (0.01, 0.5))
     start = make_actor_init(little, *scaling, "elu", SYMMETRIC, SYMMETRY)
     assert start.change == "made mirror-symmetric"
-    for own, made in zip(nearest_expanded_layers(little, SYMMETRY), expand_symmetric_layers(start.layers, SYMMETRY), strict=True):
+    for own, made in zip(
+        nearest_expanded_layers(little, SYMMETRY), expand_symmetric_layers(start.layers, SYMMETRY), strict=True
+    ):
         torch.testing.assert_close(made, own)
     with pytest.raises(InputError, match=r"give --ppo\.hidden 64 64"):  # averaged, which needs all of its widths
         make_actor_init(much, *scaling, "elu", SYMMETRIC, SYMMETRY)

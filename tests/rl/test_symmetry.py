@@ -12,7 +12,7 @@ from jumper_warp.rl import graphs
 from jumper_warp.rl.cfg import PpoCfg, TrainCfg
 from jumper_warp.rl.checkpoint import save_checkpoint
 from jumper_warp.rl.flat import FlatParameters
-from jumper_warp.rl.mirror import Symmetry, mirror_map, expand_symmetric_layers
+from jumper_warp.rl.mirror import Symmetry, expand_symmetric_layers, mirror_map
 from jumper_warp.rl.networks import ActorCritic
 from jumper_warp.rl.ppo import Ppo
 from jumper_warp.tasks.interface import interface

@@ -16,7 +16,7 @@ from jumper_warp.rl.checkpoint import MANIFEST, CheckpointError, load_checkpoint
 from jumper_warp.rl.distributed import Rank
 from jumper_warp.rl.logger import METRICS_FILE
 from jumper_warp.rl.rsl_rl import rsl_rl_config, train_rsl_rl
-from jumper_warp.rl.runner import CHECKPOINTS, CONFIG, TrainingRun, StopRequest, train
+from jumper_warp.rl.runner import CHECKPOINTS, CONFIG, StopRequest, TrainingRun, train
 from toy_task import SMALL, PushTask, equal, free_port, push_cfg, train_rank, train_twice
 
 
