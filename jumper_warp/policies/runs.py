@@ -19,7 +19,7 @@ from jumper_warp.rl.checkpoint import (
     one_line_message,
 )
 from jumper_warp.rl.mirror import Symmetry, expand_symmetric_layers, mirror_map
-from jumper_warp.rl.networks import EPS, NORMALISED_LIMIT
+from jumper_warp.rl.networks import NORMALISED_LIMIT, VARIANCE_EPS
 from jumper_warp.rl.resume import CHECKPOINTS
 from jumper_warp.tasks.saving import TaskError, check_version
 
@@ -67,7 +67,7 @@ def _policy_of_checkpoint(path: Path, state: dict[str, Any]) -> Policy:
         names.sort(key=lambda key: int(key.split(".")[1]))
         layers = [(model[name], model[name.removesuffix("weight") + "bias"]) for name in names]
         mean = model["obs_moments.mean"].float()
-        std = (model["obs_moments.var"] + EPS).sqrt().float()
+        std = (model["obs_moments.var"] + VARIANCE_EPS).sqrt().float()
         times = {"policy_dt": env["policy_dt_s"], "physics_dt": env["physics_dt_s"]}
         shape = {"hidden": tuple(ppo["hidden"]), "activation": ppo["activation"]}
         if symmetry := _symmetry(model):

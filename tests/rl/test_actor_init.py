@@ -15,7 +15,7 @@ from jumper_warp.rl.mirror import (
     nearest_expanded_layers,
     symmetry_of,
 )
-from jumper_warp.rl.networks import EPS, ActorCritic
+from jumper_warp.rl.networks import VARIANCE_EPS, ActorCritic
 from jumper_warp.rl.ppo import Ppo
 from jumper_warp.rl.runner import CHECKPOINTS, CONFIG, train
 from jumper_warp.utils.errors import InputError
@@ -155,7 +155,7 @@ def test_settings_of_another_network_are_refused_in_one_line(symmetric, change, 
 
 def averaged(act, obs):
     """Return what a policy answers, averaged with the image of what it answers to the image."""
-    return 0.5 * (act(obs) + SYMMETRY.action.of(act(SYMMETRY.obs.of(obs))))
+    return 0.5 * (act(obs) + SYMMETRY.action.apply(act(SYMMETRY.obs.apply(obs))))
 
 
 def test_a_symmetric_training_begins_with_the_average_of_a_policys_answers_and_their_images():
@@ -168,7 +168,7 @@ def test_a_symmetric_training_begins_with_the_average_of_a_policys_answers_and_t
     assert "averaged" in start.change and (expected - model.act(obs)).abs().max() > 0.1
     torch.testing.assert_close(ppo.model.act(obs), expected, atol=1e-5, rtol=0.0)
     mean, std = ppo.model.obs_moments.scaling()
-    torch.testing.assert_close(SYMMETRY.obs.of(mean), mean)
+    torch.testing.assert_close(SYMMETRY.obs.apply(mean), mean)
     torch.testing.assert_close(std[SYMMETRY.obs.order], std)
 
 
@@ -198,7 +198,7 @@ def test_a_deviation_that_statistics_cannot_have_is_refused():
     model = actor()
     model.obs_moments.var.zero_()
     apply_actor_init(start_of(model), model, samples=1)
-    assert (model.obs_moments.var >= 0.0).all() and (model.obs_moments.var < 0.01 * EPS).all()
+    assert (model.obs_moments.var >= 0.0).all() and (model.obs_moments.var < 0.01 * VARIANCE_EPS).all()
     with pytest.raises(InputError, match=r"divides an observation by 0\.001, least is 0\.00316"):
         make_actor_init(layers_of(model), torch.zeros(2), torch.tensor([1.0, 1e-3]), "elu", SMALL)
 

@@ -34,14 +34,14 @@ def test_what_is_saved_is_loaded(tmp_path):
 
 def test_the_newest_and_the_best_stay(tmp_path):
     for iteration, score in enumerate([0.1, 0.9, 0.3, None, 0.2], start=1):
-        save_checkpoint(tmp_path, state(iteration), score, keep=2)
+        save_checkpoint(tmp_path, state(iteration), score, max_checkpoints=2)
     assert sorted(path.stem for path in tmp_path.glob("*.pt")) == [f"iteration_00000{i}" for i in (2, 4, 5)]
     assert best_checkpoint(tmp_path).stem == "iteration_000002"
 
 
 def test_what_follows_an_older_checkpoint_is_the_newest(tmp_path):
     for iteration in (100, 200, 300, 110, 300, 120):  # resumed from 100 after 300, and from 110
-        newest = save_checkpoint(tmp_path, state(iteration), keep=2)
+        newest = save_checkpoint(tmp_path, state(iteration), max_checkpoints=2)
         assert latest_checkpoint(tmp_path)[0] == newest
     assert sorted(path.stem for path in tmp_path.glob("*.pt")) == ["iteration_000120", "iteration_000300"]
 

@@ -4,7 +4,7 @@ import json
 from jumper_warp.envs.env import Env
 from jumper_warp.registry import make_task
 from jumper_warp.rl.cfg import PpoCfg, TrainCfg
-from jumper_warp.rl.logger import METRICS_FILE
+from jumper_warp.rl.metrics_file import METRICS_FILE
 from jumper_warp.rl.runner import train
 
 CFG = TrainCfg(

@@ -27,13 +27,13 @@ def test_moments_equal_numpy_over_all_batches():
     np.testing.assert_allclose(moments.var, everything.var(0), rtol=1e-5)
     scaled = moments.scaling().normalise(torch.from_numpy(batches[1]))
     np.testing.assert_allclose(scaled, (batches[1] - everything.mean(0)) / np.sqrt(everything.var(0) + 1e-5), atol=1e-4)
-    np.testing.assert_allclose(moments.scaling().restore(scaled), batches[1], rtol=1e-5)
+    np.testing.assert_allclose(moments.scaling().denormalise(scaled), batches[1], rtol=1e-5)
 
 
 @pytest.mark.parametrize("rows", [None, 1, 64, 200, 1000])
 def test_moments_of_a_batch_do_not_depend_on_the_rows_at_a_time(rows):
     batch = np.random.default_rng(0).normal(50.0, (1.0, 5.0), (200, 2)).astype(np.float32)
-    mean, var, _ = Moments.of(torch.from_numpy(batch), rows)
+    mean, var, _ = Moments.from_samples(torch.from_numpy(batch), rows)
     np.testing.assert_allclose(mean, batch.astype(float).mean(0), rtol=1e-6)
     np.testing.assert_allclose(var, batch.astype(float).var(0), rtol=1e-5)
 

@@ -53,7 +53,7 @@ def test_the_gradient_is_that_of_the_windows_rewards_and_values():
     def loss():
         algorithm.env.load_state_dict(start)
         torch.set_rng_state(noise)
-        return algorithm.window()["loss"]
+        return algorithm.window().loss
 
     weights = [*algorithm.model.actor.parameters(), algorithm.model.log_std]
     found = torch.autograd.grad(loss(), weights)
@@ -77,7 +77,7 @@ def test_the_loss_is_what_its_definition_says_world_by_world():
         model.actor[-1].bias += 0.2
     env.begin_window()
     start, noise = env.state_dict(), torch.get_rng_state()
-    loss = float(algorithm.window()["loss"])
+    loss = float(algorithm.window().loss)
     env.load_state_dict(start)
     torch.set_rng_state(noise)
     sums, powers, ends = torch.zeros(6), torch.zeros(6), {"cut": 0, "lost": 0}

@@ -85,7 +85,7 @@ def test_plain_network_answers_alike(hidden):
 
 def test_symmetric_statistics_are_those_of_both_images():
     x = torch.randn(5000, NUM_OBS) * 0.7 + torch.linspace(-1.0, 1.0, NUM_OBS)
-    mean, var = WALKING.obs.moments(x.mean(0), x.var(0, correction=0))
+    mean, var = WALKING.obs.symmetrise_moments(x.mean(0), x.var(0, correction=0))
     both = torch.cat([x, mirrored(x, OBS)])
     torch.testing.assert_close(mean, both.mean(0), atol=1e-5, rtol=1e-5)
     torch.testing.assert_close(var, both.var(0, correction=0), atol=1e-5, rtol=1e-5)

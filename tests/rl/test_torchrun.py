@@ -12,7 +12,7 @@ import torch
 
 import elastic_task
 from jumper_warp.rl.checkpoint import load_checkpoint
-from jumper_warp.rl.logger import METRICS_FILE
+from jumper_warp.rl.metrics_file import METRICS_FILE
 from jumper_warp.rl.runner import CHECKPOINTS
 from toy_task import free_port
 

@@ -14,7 +14,7 @@ from jumper_warp.envs.rsl_rl import RslRlVecEnv
 from jumper_warp.rl.cfg import TrainCfg
 from jumper_warp.rl.checkpoint import MANIFEST, CheckpointError, load_checkpoint, save_checkpoint
 from jumper_warp.rl.distributed import Rank
-from jumper_warp.rl.logger import METRICS_FILE
+from jumper_warp.rl.metrics_file import METRICS_FILE
 from jumper_warp.rl.rsl_rl import rsl_rl_config, train_rsl_rl
 from jumper_warp.rl.runner import CHECKPOINTS, CONFIG, StopRequest, TrainingRun, train
 from toy_task import SMALL, PushTask, equal, free_port, push_cfg, train_rank, train_twice
@@ -101,7 +101,7 @@ def test_latest_passes_over_a_damaged_checkpoint(cfg, capsys):
     resumed = train(dataclasses.replace(cfg, resume="latest", iterations=3), make_env)
     assert (resumed.folder, resumed.iteration) == (result.folder, 3)
     told = capsys.readouterr().err
-    assert "passed over" in told
+    assert "skipped: " in told
     assert "iteration_000002.pt" in told
 
 
@@ -259,7 +259,7 @@ def test_a_score_that_is_never_logged_is_refused_before_the_first_iteration(cfg)
         def step(self, action):
             pytest.fail("an iteration began")
 
-    message = r"best_by must name a logged figure, such as Metrics/success, Train/mean_length, .*, got 'nonsense'"
+    message = r"best_by must name a logged metric, such as Metrics/success, Train/mean_length, .*, got 'nonsense'"
     with pytest.raises(ValueError, match=message):
         train(dataclasses.replace(cfg, best_by="nonsense"), Unmoved)
     assert not cfg.log_root.exists()

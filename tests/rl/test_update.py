@@ -85,7 +85,7 @@ def test_samples_do_not_depend_on_how_many_are_taken_at_a_time(rows):
     at_once = ppo.packer.rows.clone()
     ppo.model.load_state_dict(fresh)
     ppo.packer.rows.zero_()
-    ppo.packer._rows = rows
+    ppo.packer._chunk_size = rows
     ppo.batch()
     torch.testing.assert_close(ppo.packer.rows, at_once, atol=1e-5, rtol=1e-5)
     assert at_once.abs().max() > 0.5
@@ -140,7 +140,7 @@ def test_samples_equal_those_of_a_loop_over_time():
     close = {"atol": 1e-5, "rtol": 1e-4}
     torch.testing.assert_close(batch["advantage"], (advantage - advantage.mean()) / advantage.std(), **close)
     returns = advantage + values[:-1].flatten()
-    torch.testing.assert_close(ppo.model.value_moments.scaling().restore(batch["target"]), returns, **close)
+    torch.testing.assert_close(ppo.model.value_moments.scaling().denormalise(batch["target"]), returns, **close)
     torch.testing.assert_close(batch["features"], model.features(rollout.obs[:-1]).flatten(0, 1), **close)
     torch.testing.assert_close(
         batch["critic_features"], model.critic_features(rollout.critic_obs[:-1]).flatten(0, 1), **close
@@ -168,7 +168,7 @@ def test_many_steps_equal_adam():
                 torch.testing.assert_close(mine.data, param.data, atol=2e-6 * (step + 1) ** 0.5, rtol=1e-5)
     gaps = torch.ones_like(flat.value)
     for segment in flat.segments:
-        segment.own(gaps).zero_()
+        segment.view(gaps).zero_()
     assert gaps.sum() > 100.0
     assert not (gaps * flat.value).any()
 
