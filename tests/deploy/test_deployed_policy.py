@@ -23,7 +23,7 @@ def without_past(policy, readings):
 
 
 def without_filter(policy, readings):
-    policy.filtered = lambda target, angle, rate: target
+    policy.filter_targets = lambda target, angle, rate: target
     return readings
 
 
@@ -77,13 +77,13 @@ def test_observations_actions_and_targets_are_those_of_the_environment(page, nam
         readings = page["readings"](env.sim)
         velocity = env.sim.base_velocity()[0]
         if tick == COMMAND_STEP:
-            command.give()
+            command.request()
         asked = command.update(velocity[2], page["paws_down"](env.sim))
         way = page["way_to"](place, env.sim) if tick >= COMMAND_STEP else np.zeros(2)
         given = {"wanted_height": goal[2], "jump_command": asked} if goal[2] else {"goal": way}
         seen = deployed.observe(readings | given)
         action, expected = deployed.act(seen), policy.act(env.obs)
-        safe = deployed.filtered(deployed.default + deployed.scale * action, readings["angle"], readings["rate"])
+        safe = deployed.filter_targets(deployed.default + deployed.scale * action, readings["angle"], readings["rate"])
         own = env.obs[0].numpy().copy()
         wrong = max(wrong, np.abs(velocity - own[12:15]).max())
         env.step(expected)
@@ -92,7 +92,7 @@ def test_observations_actions_and_targets_are_those_of_the_environment(page, nam
         theirs = env.robot.safe_target.numpy()[:, 0]
         pairs = ((seen, own), (action, expected[0].numpy()), (safe, theirs))
         off = np.maximum(off, [np.abs(a - b).max() for a, b in pairs])
-    assert env.task_arrays()["phase"][0] == 2 and (command.wanted, command.in_flight) == (False, False)
+    assert env.task_arrays()["phase"][0] == 2 and (command.requested, command.in_flight) == (False, False)
     assert off.max() < 3.0e-5, off  # [SI]; rounding: body axes in single precision, ONNX's sums
     assert wrong > 0.05  # velocities in world axes would have been seen
 
@@ -107,7 +107,7 @@ def jump(page, change=None, late=0, ticks=180):
     apex, takeoffs, flying, asked = 0.0, 0, False, []
     for tick in range(ticks):
         if tick == COMMAND_STEP:
-            command.give()
+            command.request()
         up, down = robot.base_velocity()[0, 2], page["paws_down"](robot)
         asked.append(command.update(up, down))
         readings = page["readings"](robot)
@@ -171,7 +171,7 @@ def test_readings_that_do_not_fit_are_refused(change, message):
 
 def test_a_command_given_before_it_landed_ends_with_the_landing():
     command = JumpCommand()
-    command.give()
+    command.request()
     steps = [(0.0, 4), (0.7, 0), (0.8, 1), (0.8, 0), (-1.0, 0), (-1.0, 1), (0.9, 0)]
     assert [command.update(*step) for step in steps] == [1.0, 1.0, 1.0, 1.0, 1.0, 0.0, 0.0]
 

@@ -51,11 +51,11 @@ def test_what_cannot_be_blended_is_refused(other):
     with pytest.raises(PolicyError, match=r"share of a blend must be from 0 to 1, got 1\.1"):
         blend(HORIZONTAL, other, 1.1)
     for policy in (open_policy("vertical_jump"), open_policy("walking_flat")):
-        with pytest.raises(PolicyError, match="must read and drive the same"):
+        with pytest.raises(PolicyError, match="must have the same interface"):
             blend(HORIZONTAL, policy, 0.5)
     interface = dataclasses.replace(HORIZONTAL.interface, action_scale=tuple(1.0 for _ in range(12)))
     scaled = Policy(other.layers, other.mean, other.std, interface)
-    with pytest.raises(PolicyError, match="must read and drive the same"):
+    with pytest.raises(PolicyError, match="must have the same interface"):
         blend(HORIZONTAL, scaled, 0.5)
 
 
@@ -66,4 +66,4 @@ def test_the_command_writes_a_blend(other, obs, tmp_path, capsys):
     torch.testing.assert_close(open_policy(tmp_path / "blend").act(obs), expected, atol=1e-6, rtol=0.0)
     with pytest.raises(SystemExit, match="2"):
         main(["export", "horizontal_jump", "--blend", "walking_flat", "0.5", "--out", str(tmp_path / "no")])
-    assert "must read and drive the same" in capsys.readouterr().err and not (tmp_path / "no").exists()
+    assert "must have the same interface" in capsys.readouterr().err and not (tmp_path / "no").exists()

@@ -254,5 +254,5 @@ def test_a_checkpoint_that_began_with_random_weights_is_resumed(cfg, before):
 
 def test_name_and_policy_need_each_other(cfg):
     for start_from, start in (("pusher", None), (None, start_of(actor()))):
-        with pytest.raises(InputError, match=r"start_from and start.* need each other"):
+        with pytest.raises(InputError, match=r"start_from and actor_init.* need each other"):
             train(dataclasses.replace(cfg, start_from=start_from), make_env, actor_init=start)
