@@ -6,6 +6,8 @@ trade off what each does better.
 
 from __future__ import annotations
 
+import torch
+
 from jumper_warp.policies.policy import Policy
 from jumper_warp.policies.spec import PolicyError
 from jumper_warp.rl.actor_init import rescale_inputs
@@ -25,10 +27,12 @@ def blend(policy: Policy, other: Policy, fraction: float) -> Policy:
     if policy.interface != other.interface:
         raise PolicyError("policies of a blend must have the same interface: observation, action and network sizes")
     other_layers = rescale_inputs(other.layers, other.mean, other.std, policy.mean, policy.std)
-    layers = [
-        tuple((1.0 - fraction) * mine.double() + fraction * theirs for mine, theirs in zip(*pair, strict=True))
-        for pair in zip(policy.layers, other_layers, strict=True)
-    ]
+
+    def mix(mine: torch.Tensor, theirs: torch.Tensor) -> torch.Tensor:
+        return (1.0 - fraction) * mine.double() + fraction * theirs
+
+    pairs = zip(policy.layers, other_layers, strict=True)
+    layers = [(mix(w, other_w), mix(b, other_b)) for (w, b), (other_w, other_b) in pairs]
     origin = {key: other.config[key] for key in ("commit", "iteration") if key in other.config}
     blended = {"share": fraction, **origin}
     return Policy(layers, policy.mean, policy.std, policy.interface, policy.config | {"blended": blended})

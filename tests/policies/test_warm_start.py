@@ -1,4 +1,4 @@
-"""Trainings that begin with a shipped policy."""
+"""Warm start of a training from a shipped policy."""
 
 import dataclasses
 
@@ -29,7 +29,7 @@ WIDE = {"symmetry": "off", "hidden": (512, 256, 256)}
         ("walking_flat", "velocity-flat", WIDE),
     ],
 )
-def test_a_training_begins_as_a_shipped_policy_acts(name, task, change):
+def test_initialised_actor_acts_as_the_shipped_policy(name, task, change):
     policy, cfg, task = open_policy(name), dataclasses.replace(TASKS[task].ppo, **change), make_task(task)
     symmetry = Symmetry(
         mirror_map(*mirror_of(task, "policy"), "observation"), mirror_map(*mirror_of_action(), "action")
@@ -55,25 +55,25 @@ def test_a_training_begins_as_a_shipped_policy_acts(name, task, change):
         ("horizontal_jump", "horizontal-jump-sighted", {}, r"observation 147: the policy has none, the task block_\w+"),
     ],
 )  # fmt: skip
-def test_what_does_not_fit_is_refused_in_one_line(name, task, change, message):
+def test_refuses_a_policy_that_does_not_fit_in_one_line(name, task, change, message):
     with pytest.raises(InputError, match=f"start_from: .*{message}") as caught:
         actor_init_from_policy(name, make_task(task), dataclasses.replace(TASKS[task].ppo, **change))
     assert "\n" not in str(caught.value)
 
 
-def test_no_such_policy_is_told():
+def test_refuses_an_unknown_policy():
     with pytest.raises(PolicyError, match="no_jump"):
         actor_init_from_policy("no_jump", make_task("horizontal-jump"), TASKS["horizontal-jump"].ppo)
 
 
-def test_another_history_is_refused():
+def test_refuses_a_policy_with_another_history():
     with pytest.raises(InputError, match=r"start_from: observation \d+: the policy has \w+"):
         actor_init_from_policy(
             "horizontal_jump", with_history(make_task("horizontal-jump"), 1), TASKS["horizontal-jump"].ppo
         )
 
 
-def test_a_symmetric_training_begins_with_the_nearest_symmetric_form_of_a_fine_tuned_policy():
+def test_symmetric_training_starts_from_the_projection_of_a_fine_tuned_policy():
     policy, task, cfg = open_policy("horizontal_jump"), make_task("horizontal-jump"), TASKS["horizontal-jump"].ppo
     symmetry = Symmetry(
         mirror_map(*mirror_of(task, "policy"), "observation"), mirror_map(*mirror_of_action(), "action")
@@ -86,8 +86,8 @@ def test_a_symmetric_training_begins_with_the_nearest_symmetric_form_of_a_fine_t
     assert 0.0 < (model.act(obs) - policy.act(obs)).abs().mean() < 0.01
 
 
-def changed_layout(face):
-    layout = {name: dict(term) for name, term in face.observation_layout.items()}
+def changed_layout(policy_interface):
+    layout = {name: dict(term) for name, term in policy_interface.observation_layout.items()}
     next(iter(layout.values()))["scale"] = 7.0
     return {"observation_layout": layout}
 
@@ -97,25 +97,35 @@ def changed_layout(face):
     [
         (changed_layout, r"scale of \w+: the policy has 7.0, the task 1.0"),
         (
-            lambda face: {"joint_names": face.joint_names[1:] + face.joint_names[:1]},
+            lambda policy_interface: {
+                "joint_names": policy_interface.joint_names[1:] + policy_interface.joint_names[:1]
+            },
             r"action 0: the policy has FL_outer, the task FL_lateral",
         ),
         (
-            lambda face: {"default_joint_pos": (1.0, *face.default_joint_pos[1:])},
+            lambda policy_interface: {"default_joint_pos": (1.0, *policy_interface.default_joint_pos[1:])},
             "default angle .*: the policy has 1.0",
         ),
-        (lambda face: {"observation_limit": 5.0}, "limit of observations: the policy has 5.0, the task 100.0"),
-        (lambda face: {"normalised_limit": 5.0}, "in standard deviations: the policy has 5.0, the task 10.0"),
+        (
+            lambda policy_interface: {"observation_limit": 5.0},
+            "limit of observations: the policy has 5.0, the task 100.0",
+        ),
+        (
+            lambda policy_interface: {"normalised_limit": 5.0},
+            "in standard deviations: the policy has 5.0, the task 10.0",
+        ),
     ],
 )
-def test_the_first_difference_of_the_interface_is_named(change, message):
-    face = open_policy("horizontal_jump").interface
+def test_error_message_names_the_first_difference_of_the_interfaces(change, message):
+    policy_interface = open_policy("horizontal_jump").interface
     with pytest.raises(InputError, match=message):
-        check_interface(dataclasses.replace(face, **change(face)), interface(make_task("horizontal-jump")))
+        check_interface(
+            dataclasses.replace(policy_interface, **change(policy_interface)), interface(make_task("horizontal-jump"))
+        )
 
 
-def test_scales_gains_and_a_layout_that_was_not_kept_may_differ():
-    face = open_policy("horizontal_jump").interface
-    numbers = {name: tuple(1.5 for _ in face.joint_names) for name in ("action_scale", "joint_stiffness")}
-    other = dataclasses.replace(face, **numbers, observation_layout={}, policy_dt=0.05)
+def test_scales_gains_and_an_unknown_layout_may_differ():
+    policy_interface = open_policy("horizontal_jump").interface
+    numbers = {name: tuple(1.5 for _ in policy_interface.joint_names) for name in ("action_scale", "joint_stiffness")}
+    other = dataclasses.replace(policy_interface, **numbers, observation_layout={}, policy_dt=0.05)
     check_interface(other, interface(make_task("horizontal-jump-mars")))

@@ -6,7 +6,7 @@ from jumper_warp.rl.graphs import CapturedProcedure
 
 @pytest.fixture
 def refusing(monkeypatch):
-    """A GPU on which no capture succeeds."""
+    """Replaces torch.cuda by one on which every graph capture fails."""
 
     def refuse(*_, **__):
         raise RuntimeError("operation not permitted when stream is capturing\nand more")
@@ -24,7 +24,7 @@ def refusing(monkeypatch):
 
 
 @pytest.mark.usefixtures("refusing")
-def test_what_cannot_be_captured_runs_eagerly_and_says_so_once(capsys):
+def test_failed_capture_runs_eagerly_and_warns_once(capsys):
     calls = []
     captured = CapturedProcedure(lambda: calls.append(None), enabled=True)
     for _ in range(4):
