@@ -50,8 +50,8 @@ class DeployedPolicy:
     def targets(self, readings: Mapping[str, Any]) -> np.ndarray:
         """Return the motor targets until the next policy step [rad], (12,); call it every `policy_dt`.
 
-        readings: values of each observation term but last_action, by name; `angle` as measured, the default pose not
-        subtracted. Raises ValueError: readings are missing, unknown, or of another size.
+        readings: each observation term but last_action, by name; `angle` without subtracting the default pose.
+        Raises ValueError: readings are missing, unknown, or of another size.
         """
         action = self.act(self.observe(readings))
         return self.filter_targets(self.default + self.scale * action, readings["angle"], readings["rate"])
@@ -64,10 +64,7 @@ class DeployedPolicy:
         return np.concatenate([self._term(name, term, readings) for name, term in self.layout.items()])
 
     def _term(self, name: str, term: Mapping[str, Any], readings: Mapping[str, Any]) -> np.ndarray:
-        """Return the columns of an observation term, oldest frame first; at the start all frames are the first reading.
-
-        term: its entry in the observation layout.
-        """
+        """Return the columns of an observation term (an entry of `layout`), oldest frame first, at first all equal."""
         value = self.action if name == LAST_ACTION else np.atleast_1d(np.asarray(readings[name], dtype=np.float32))
         width = (term["end"] - term["first"]) // term["history"]
         if value.shape != (width,):
@@ -95,14 +92,11 @@ class DeployedPolicy:
         angle, rate = (np.asarray(values, dtype=np.float32).reshape(4, 3) for values in (angle, rate))
         filtered = np.empty_like(target)
         for motor, kind in enumerate(("lateral", "transversal", "transversal")):
-            filtered[:, motor] = limit_command(
-                target[:, motor], angle[:, motor], rate[:, motor], settings[kind], settings
-            )
+            joint = (target[:, motor], angle[:, motor], rate[:, motor])
+            filtered[:, motor] = limit_command(*joint, settings[kind], settings)
         total = filtered[:, 1] + filtered[:, 2]
-        limited_total = limit_command(
-            total, angle[:, 1] + angle[:, 2], rate[:, 1] + rate[:, 2], settings["sum"], settings
-        )
-        filtered[:, 1:] += 0.5 * (limited_total - total)[:, None]
+        sums = (total, angle[:, 1] + angle[:, 2], rate[:, 1] + rate[:, 2])
+        filtered[:, 1:] += 0.5 * (limit_command(*sums, settings["sum"], settings) - total)[:, None]
         return filtered.ravel()
 
 
@@ -141,10 +135,7 @@ class JumpCommand:
         self.requested = True
 
     def update(self, up: float, paws_down: int) -> float:
-        """Return `jump_command` of this policy step; call it before `targets`.
-
-        up: vertical velocity of the base in the world frame [m/s]; paws_down: number of paws in contact.
-        """
+        """Return `jump_command` for `targets`; up: vertical velocity of the base in the world frame [m/s]."""
         if self.in_flight and paws_down > 0:
             self.requested, self.in_flight = False, False
         elif paws_down == 0 and up > self._takeoff_speed:

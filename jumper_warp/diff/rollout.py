@@ -219,7 +219,7 @@ class Rollout:
         q, qd = self._input("q", q, (19,)), self._input("qd", qd, (18,))
         commands.before = q[7:] if before is None else self._input("before", before, (12,))
         commands.wrench = self._zeros(count, 6, self.num_worlds) if wrench is None else (
-            self._input("wrench", wrench, (count, 6))
+            self._input("wrench", wrench, (count, 6)),
         )  # fmt: skip
         pushes = (4, self.num_worlds)
         if impulse is not None and not (

@@ -78,7 +78,7 @@ def chirp_targets(ticks: int, rng: np.random.Generator, hung: bool) -> np.ndarra
     for motor in range(12):
         lateral = motor % 3 == 0
         size = (rng.uniform(6.0, 11.0) if lateral else rng.uniform(9.0, 15.0)) if hung else (
-            rng.uniform(2.0, 5.0) if lateral else rng.uniform(5.0, 10.0)
+            rng.uniform(2.0, 5.0) if lateral else rng.uniform(5.0, 10.0),
         )  # fmt: skip
         pace = rng.uniform(0.8, 1.2) if hung else 1.0
         wave = np.sin(2.0 * math.pi * (pace * turns + rng.uniform()))

@@ -94,6 +94,7 @@ class Conditions:
         return self.randomize or bool(self.fixed)
 
     def _with_fixed(self, ranges: RandomizationCfg) -> RandomizationCfg:
+        """Return randomisation ranges with the `fixed` parameters set to their value."""
         return ranges.with_fixed(**self.fixed)
 
     def applied(self, task: TaskCfg) -> TaskCfg:
@@ -111,14 +112,9 @@ class Conditions:
 
 
 def env_of_policy(
-    policy: Policy,
-    num_envs: int,
-    conditions: Conditions,
-    *,
-    change: Callable[[TaskCfg], TaskCfg] | None = None,
-    modules: Iterable[ModuleType] = (),
-    **scene: Any,
-) -> Env:
+    policy: Policy, num_envs: int, conditions: Conditions, *, change: Callable[[TaskCfg], TaskCfg] | None = None,
+    modules: Iterable[ModuleType] = (), **scene: Any,
+) -> Env:  # fmt: skip
     """Return the environment of a policy's task in some test conditions.
 
     It has no rewards, no critic observation, and events only if randomised, so that their functions are not needed.

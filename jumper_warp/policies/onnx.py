@@ -44,10 +44,12 @@ class _GraphBuilder:
         self.constants: list[onnx.TensorProto] = []
 
     def constant(self, name: str, value: Any, dtype: type = np.float32) -> str:
+        """Add a constant (initialiser)."""
         self.constants.append(numpy_helper.from_array(np.asarray(value, dtype), name))
         return name
 
     def add(self, operator: str, inputs: list[str], output: str, **attributes: Any) -> str:
+        """Add a node."""
         self.nodes.append(helper.make_node(operator, inputs, [output], name=output, **attributes))
         return output
 

@@ -25,13 +25,9 @@ class Policy(nn.Module):
     std: torch.Tensor
 
     def __init__(
-        self,
-        layers: Weights,
-        mean: torch.Tensor,
-        std: torch.Tensor,
-        interface: PolicyInterface,
+        self, layers: Weights, mean: torch.Tensor, std: torch.Tensor, interface: PolicyInterface,
         config: Mapping[str, Any] | None = None,
-    ) -> None:
+    ) -> None:  # fmt: skip
         """Copy the tensors, as float32.
 
         layers: weight (out, in) and bias (out,) of each layer. mean, std: (num_obs,) of raw observations. interface:

@@ -13,16 +13,10 @@ from jumper_warp.envs.vec_env import RAW_LIMIT
 from jumper_warp.policies.folder import load_policy
 from jumper_warp.policies.policy import Policy
 from jumper_warp.policies.spec import PolicyError, make_interface
-from jumper_warp.rl.checkpoint import (
-    DECODE_ERRORS,
-    CheckpointError,
-    best_checkpoint,
-    latest_checkpoint,
-    load_checkpoint,
-    one_line_message,
-)
+from jumper_warp.rl import checkpoint as checkpoints
+from jumper_warp.rl.checkpoint import DECODE_ERRORS, CheckpointError, one_line_message
 from jumper_warp.rl.metrics_file import METRICS_FILE
-from jumper_warp.rl.mirror import Symmetry, Weights, expand_symmetric_layers, mirror_map
+from jumper_warp.rl.mirror import Symmetry, Weights, expand_layers, mirror_map
 from jumper_warp.rl.networks import NORMALISED_LIMIT, VARIANCE_EPS
 from jumper_warp.rl.resume import CHECKPOINTS
 from jumper_warp.tasks.saving import TaskError, check_version
@@ -50,33 +44,25 @@ def open_policy(source: str | Path, *, newest: bool = False) -> Policy:
         return load_policy(source)
     path = Path(source)
     if path.suffix != ".pt" and newest:
-        checkpoint = latest_checkpoint(path / CHECKPOINTS)
+        checkpoint = checkpoints.latest_checkpoint(path / CHECKPOINTS)
         return _policy_of_checkpoint(checkpoint.path, checkpoint.state)
-    path = path if path.suffix == ".pt" else best_checkpoint(path / CHECKPOINTS)
-    return _policy_of_checkpoint(path, load_checkpoint(path))
+    path = path if path.suffix == ".pt" else checkpoints.best_checkpoint(path / CHECKPOINTS)
+    return _policy_of_checkpoint(path, checkpoints.load_checkpoint(path))
 
 
 @dataclass(frozen=True)
 class CheckpointContents:
     """Typed contents of a training checkpoint that make up its policy."""
 
-    config: dict[str, Any]
-    """Configuration of the policy: of the run, with commit, dirty and iteration."""
-    interface: dict[str, Any]
-    """Description of observation and action, as `jumper_warp.tasks.interface` makes it."""
-    policy_dt: float
-    """[s]"""
-    physics_dt: float
-    """[s]"""
+    config: dict[str, Any]  # configuration of the policy: of the run, with commit, dirty and iteration
+    interface: dict[str, Any]  # description of observation and action, as `jumper_warp.tasks.interface` makes it
+    policy_dt: float  # [s]
+    physics_dt: float  # [s]
     activation: str
-    hidden: tuple[int, ...]
-    """Widths of the hidden layers of `layers`."""
-    layers: Weights
-    """Weight (out, in) and bias (out,) of each layer of the actor as a plain network."""
-    mean: torch.Tensor
-    """(num_obs,) mean of raw observations."""
-    std: torch.Tensor
-    """(num_obs,) standard deviation that observations are divided by."""
+    hidden: tuple[int, ...]  # widths of the hidden layers of `layers`
+    layers: Weights  # weight (out, in) and bias (out,) of each layer of the actor as a plain network
+    mean: torch.Tensor  # (num_obs,) mean of raw observations
+    std: torch.Tensor  # (num_obs,) standard deviation that observations are divided by
 
     @classmethod
     def from_dict(cls, state: dict[str, Any]) -> CheckpointContents:
@@ -86,13 +72,14 @@ class CheckpointContents:
         """
         try:
             config = json.loads(state["config"])
-            env, ppo, model = config["env"], config["train"]["ppo"], state["ppo"]["model"]
+            env, ppo = config["env"], config["train"]["ppo"]
             check_version(env["task"])
+            model = state["ppo"]["model"]
             commit = config.get("commit") or {"hash": None, "dirty": None}
             config |= {"commit": commit["hash"], "dirty": commit["dirty"], "iteration": state["iteration"]}
             layers, hidden = _actor_layers(model), tuple(ppo["hidden"])
             if symmetry := _symmetry(model):
-                layers, hidden = expand_symmetric_layers(layers, symmetry), tuple(2 * width for width in hidden)
+                layers, hidden = expand_layers(layers, symmetry), tuple(2 * width for width in hidden)
             mean, var = _tensor(model, "obs_moments.mean"), _tensor(model, "obs_moments.var")
             return cls(
                 config, dict(env["interface"]), env["policy_dt_s"], env["physics_dt_s"], ppo["activation"], hidden,
@@ -107,10 +94,8 @@ class CheckpointContents:
     def policy(self) -> Policy:
         """Return the policy. Raises PolicyError: interface, layers and statistics do not fit each other."""
         description = {**self.interface, "observation_limit": RAW_LIMIT, "normalised_limit": NORMALISED_LIMIT}
-        interface = make_interface(
-            description, policy_dt=self.policy_dt, physics_dt=self.physics_dt, hidden=self.hidden,
-            activation=self.activation,
-        )  # fmt: skip
+        network = {"hidden": self.hidden, "activation": self.activation}
+        interface = make_interface(description, policy_dt=self.policy_dt, physics_dt=self.physics_dt, **network)
         return Policy(self.layers, self.mean, self.std, interface, self.config)
 
 

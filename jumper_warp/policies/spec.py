@@ -46,37 +46,23 @@ class PolicyInterface:
     commands the motor angle a · action_scale + default_joint_pos.
     """
 
-    task: str
-    """Name of the task."""
-    observation_names: tuple[str, ...]
-    """Name of each entry of the observation, in order."""
-    joint_names: tuple[str, ...]
-    """Motors in the order of the action and of the tuples below."""
-    action_scale: tuple[float, ...]
-    """[rad]"""
-    default_joint_pos: tuple[float, ...]
-    """[rad]"""
-    joint_stiffness: tuple[float, ...]
-    """[N m/rad]"""
-    joint_damping: tuple[float, ...]
-    """[N m s/rad]"""
-    torque_limit: tuple[float, ...]
-    """[N m]"""
-    command_filter: dict[str, Any]
-    """Fields of `jumper_warp.robot.motors.FilterCfg`: angles [deg], horizon [s]."""
-    policy_dt: float
-    """[s] Time between actions."""
-    physics_dt: float
-    """[s] Physics step of the training."""
-    hidden: tuple[int, ...]
-    """Widths of the hidden layers."""
+    task: str  # name of the task
+    observation_names: tuple[str, ...]  # name of each entry of the observation, in order
+    joint_names: tuple[str, ...]  # motors in the order of the action and of the tuples below
+    action_scale: tuple[float, ...]  # [rad]
+    default_joint_pos: tuple[float, ...]  # [rad]
+    joint_stiffness: tuple[float, ...]  # [N m/rad]
+    joint_damping: tuple[float, ...]  # [N m s/rad]
+    torque_limit: tuple[float, ...]  # [N m]
+    command_filter: dict[str, Any]  # fields of `jumper_warp.robot.motors.FilterCfg`: angles [deg], horizon [s]
+    policy_dt: float  # [s] Time between actions
+    physics_dt: float  # [s] Physics step of the training
+    hidden: tuple[int, ...]  # widths of the hidden layers
     activation: str = "elu"
     observation_layout: dict[str, Any] = field(default_factory=dict)
     """Terms by name, each with first and end column, scale, clip and history; empty if unknown."""
-    observation_limit: float = 100.0
-    """Raw observations are clamped to ± this; entries that are not finite count as 0."""
-    normalised_limit: float = 10.0
-    """Normalised observations are clamped to ± this is_tuple standard deviations."""
+    observation_limit: float = 100.0  # raw observations are clamped to ± this; entries that are not finite count as 0
+    normalised_limit: float = 10.0  # normalised observations are clamped to ± this is_tuple standard deviations
     quaternion_order: str = "xyzw"
 
     def __post_init__(self) -> None:

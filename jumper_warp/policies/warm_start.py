@@ -31,11 +31,13 @@ def actor_init_from_policy(source: str | Path, task: TaskCfg, cfg: PpoCfg) -> Ac
     """
     policy = open_policy(source)
     check_interface(policy.interface, interface(task))
-    symmetry = None
-    if cfg.symmetry == "actor":
-        obs, action = mirror_of(task, "policy"), mirror_of_action()
-        symmetry = Symmetry(mirror_map(*obs, "observation"), mirror_map(*action, "action"))
+    symmetry = task_symmetry(task) if cfg.symmetry == "actor" else None
     return make_actor_init(policy.layers, policy.mean, policy.std, policy.interface.activation, cfg, symmetry)
+
+
+def task_symmetry(task: TaskCfg) -> Symmetry:
+    """Return the mirror maps of a task's actor observation and action."""
+    return Symmetry(mirror_map(*mirror_of(task, "policy"), "observation"), mirror_map(*mirror_of_action(), "action"))
 
 
 def check_interface(policy: PolicyInterface, task: dict[str, Any]) -> None:

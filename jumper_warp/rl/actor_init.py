@@ -8,7 +8,7 @@ from typing import NamedTuple
 import torch
 
 from jumper_warp.rl.cfg import PpoCfg
-from jumper_warp.rl.mirror import Symmetry, Weights, contract_expanded_layers, nearest_expanded_layers
+from jumper_warp.rl.mirror import Symmetry, Weights, contract_layers, nearest_expanded_layers
 from jumper_warp.rl.networks import VARIANCE_EPS, ActorCritic, linear_layers
 from jumper_warp.utils.errors import InputError
 
@@ -23,14 +23,10 @@ SYMMETRY_TOLERANCE = 0.05
 class ActorInit(NamedTuple):
     """Initial weights and observation statistics of an actor."""
 
-    layers: Weights
-    """Weight and bias of each layer."""
-    mean: torch.Tensor
-    """(num_obs,) mean of raw observations."""
-    std: torch.Tensor
-    """(num_obs,) standard deviation that observations are divided by."""
-    change: str = ""
-    """How the policy was made mirror-symmetric, for the log; empty if it was not changed."""
+    layers: Weights  # weight and bias of each layer
+    mean: torch.Tensor  # (num_obs,) mean of raw observations
+    std: torch.Tensor  # (num_obs,) standard deviation that observations are divided by
+    change: str = ""  # how the policy was made mirror-symmetric, for the log; empty if it was not changed
 
 
 def make_actor_init(
@@ -94,7 +90,7 @@ def apply_actor_init(actor_init: ActorInit, model: ActorCritic, samples: int) ->
 
 
 def _contracted_layers(layers: Weights, mean: torch.Tensor, std: torch.Tensor, symmetry: Symmetry) -> Weights | None:
-    """Return the layers of f (`contract_expanded_layers`); None if layers or statistics are not nearly symmetric."""
+    """Return the layers of f (`contract_layers`); None if layers or statistics are not nearly symmetric."""
     widths = [len(bias) for _, bias in layers[:-1]]
     mean_symmetric = torch.allclose(symmetry.obs.apply(mean), mean, atol=1e-5)
     symmetric = mean_symmetric and torch.allclose(std[symmetry.obs.order], std)
@@ -103,13 +99,13 @@ def _contracted_layers(layers: Weights, mean: torch.Tensor, std: torch.Tensor, s
     nearest = nearest_expanded_layers(layers, symmetry)
     pairs = zip(layers, nearest, strict=True)
     near = all((one - other).norm() <= SYMMETRY_TOLERANCE * one.norm() for (one, _), (other, _) in pairs)
-    return contract_expanded_layers(nearest, symmetry) if near else None
+    return contract_layers(nearest, symmetry) if near else None
 
 
 def _is_symmetric(layers: Weights, symmetry: Symmetry) -> bool:
-    """Return whether the layers have the form of `expand_symmetric_layers`."""
+    """Return whether the layers have the form of `expand_layers`."""
     try:
-        contract_expanded_layers(layers, symmetry)
+        contract_layers(layers, symmetry)
     except InputError:
         return False
     return True
@@ -138,4 +134,5 @@ def rescale_inputs(
 
 
 def _joined(values: Iterable[object], separator: str = ", ") -> str:
+    """Return values as text."""
     return separator.join(map(str, values))

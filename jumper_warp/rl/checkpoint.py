@@ -30,10 +30,8 @@ class Checkpoint(NamedTuple):
     """A loaded checkpoint."""
 
     path: Path
-    state: dict[str, Any]
-    """Contents, with at least the keys of REQUIRED."""
-    skipped: list[str]
-    """Reasons why newer checkpoints cannot be used, one line each."""
+    state: dict[str, Any]  # contents, with at least the keys of REQUIRED
+    skipped: list[str]  # reasons why newer checkpoints cannot be used, one line each
 
 
 def save_checkpoint(folder: Path, state: dict[str, Any], score: float | None = None, max_checkpoints: int = 3) -> Path:

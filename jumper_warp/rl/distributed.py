@@ -70,10 +70,8 @@ def all_reduce_mean(x: torch.Tensor) -> torch.Tensor:
 class Rank(NamedTuple):
     """Rank, world size and device of this process."""
 
-    index: int
-    """0 for the process that logs and saves."""
-    size: int
-    """Number of processes."""
+    index: int  # 0 for the process that logs and saves
+    size: int  # number of processes
     device: torch.device
 
 

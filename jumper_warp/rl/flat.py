@@ -28,12 +28,9 @@ def aligned(count: int, to: int) -> int:
 class Segment(NamedTuple):
     """Location of one parameter in a flat vector."""
 
-    start: int
-    """Index of its first entry."""
-    padded_shape: tuple[int, ...]
-    """Shape with zero-padded columns."""
-    shape: tuple[int, ...]
-    """Shape of the parameter itself."""
+    start: int  # index of its first entry
+    padded_shape: tuple[int, ...]  # shape with zero-padded columns
+    shape: tuple[int, ...]  # shape of the parameter itself
 
     @property
     def size(self) -> int:
@@ -100,23 +97,19 @@ def flatten_aligned(gradients: list[torch.Tensor]) -> torch.Tensor:
 
 
 def _layers(params: list[torch.Tensor], activation: str) -> Layers:
+    """Return a network from its parameters in the order weight, bias of each layer."""
     return Layers(tuple(params[::2]), tuple(params[1::2]), activation)
 
 
 class AdamVectors(NamedTuple):
     """Parameters, gradient and state of Adam; all vectors are (size,) in the order of `FlatParameters.value`."""
 
-    value: torch.Tensor
-    """(size,) parameters."""
+    value: torch.Tensor  # (size,) parameters
     gradient: torch.Tensor
-    exp_avg: torch.Tensor
-    """(size,) first moment: running mean of the gradient."""
-    exp_avg_sq: torch.Tensor
-    """(size,) second moment: running mean of the squared gradient."""
-    step: torch.Tensor
-    """() number of steps so far."""
-    lr: torch.Tensor
-    """() learning rate."""
+    exp_avg: torch.Tensor  # (size,) first moment: running mean of the gradient
+    exp_avg_sq: torch.Tensor  # (size,) second moment: running mean of the squared gradient
+    step: torch.Tensor  # () number of steps so far
+    lr: torch.Tensor  # () learning rate
 
 
 class FlatAdam:

@@ -60,14 +60,9 @@ class TrainingLog:
     """Context manager that logs metrics. A failure to write prints one warning, and does not stop the training."""
 
     def __init__(
-        self,
-        folder: Path,
-        config: dict[str, Any],
-        total: int,
-        tensorboard: bool = True,
-        wandb: bool = False,
+        self, folder: Path, config: dict[str, Any], total: int, tensorboard: bool = True, wandb: bool = False,
         iteration: int = 0,
-    ) -> None:
+    ) -> None:  # fmt: skip
         """folder: the run's existing folder. config: JSON-ready configuration of the run.
 
         total: iterations at the run's end. tensorboard: whether to write events. wandb: whether to upload to Weights &

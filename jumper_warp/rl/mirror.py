@@ -27,10 +27,8 @@ Vector = Sequence[float] | np.ndarray | torch.Tensor
 class MirrorMap(NamedTuple):
     """Mirror map of vectors (..., n): a signed permutation that is its own inverse."""
 
-    order: torch.Tensor
-    """(n,) int64, the entry of x that each entry of the image comes from."""
-    signs: torch.Tensor
-    """(n,) float32, 1 or -1"""
+    order: torch.Tensor  # (n,) int64, the entry of x that each entry of the image comes from
+    signs: torch.Tensor  # (n,) float32, 1 or -1
 
     def apply(self, x: torch.Tensor) -> torch.Tensor:
         """Return the mirror image of x (..., n)."""
@@ -93,7 +91,7 @@ def symmetry_of(env: VecEnv) -> Symmetry:
     return Symmetry(obs, action)
 
 
-def expand_symmetric_layers(layers: Weights, symmetry: Symmetry) -> Weights:
+def expand_layers(layers: Weights, symmetry: Symmetry) -> Weights:
     """Return the layers of a plain network, of twice the widths, with the same output as the symmetric actor.
 
     layers: layers of f, with activations between. A symmetric policy is saved and exported in this form.
@@ -114,7 +112,7 @@ def expand_symmetric_layers(layers: Weights, symmetry: Symmetry) -> Weights:
 
 
 def nearest_expanded_layers(layers: Weights, symmetry: Symmetry) -> Weights:
-    """Return the layers, in the form of `expand_symmetric_layers`, with the least squared distance to these.
+    """Return the layers, in the form of `expand_layers`, with the least squared distance to these.
 
     layers: at least two, hidden ones of even widths. Blocks that must be equal are averaged, blocks that must be zero
     are dropped; shapes stay.
@@ -129,11 +127,11 @@ def nearest_expanded_layers(layers: Weights, symmetry: Symmetry) -> Weights:
         first = index == 0
         half = weight[:rows] + weight[rows:] @ obs if first else weight[:rows, :columns] + weight[rows:, columns:]
         halves.append((0.5 * half, 0.5 * (bias[:rows] + bias[rows:])))
-    return expand_symmetric_layers(halves, symmetry)
+    return expand_layers(halves, symmetry)
 
 
-def contract_expanded_layers(layers: Weights, symmetry: Symmetry) -> Weights:
-    """Return copies of the layers of f, of half the widths: the inverse of `expand_symmetric_layers`.
+def contract_layers(layers: Weights, symmetry: Symmetry) -> Weights:
+    """Return copies of the layers of f, of half the widths: the inverse of `expand_layers`.
 
     Only the symmetric part of f's last bias can be recovered; the policy is the same. Raises InputError: the layers are
     not in that form.
@@ -146,7 +144,7 @@ def contract_expanded_layers(layers: Weights, symmetry: Symmetry) -> Weights:
         factor = 2.0 if last and not first else 1.0
         contracted.append((factor * weight[:rows, :columns], bias[:rows].clone()))
     sizes_fit = (layers[0][0].shape[1], layers[-1][0].shape[0]) == (len(symmetry.obs.order), len(symmetry.action.order))
-    again = expand_symmetric_layers(contracted, symmetry) if sizes_fit else []
+    again = expand_layers(contracted, symmetry) if sizes_fit else []
     if len(again) != len(layers) or not all(
         one.shape == other.shape and torch.allclose(one, other, rtol=1e-6, atol=1e-6)
         for layer, expanded in zip(layers, again, strict=True)

@@ -36,10 +36,8 @@ class Moments(NamedTuple):
     """Mean, population variance and count of a batch; mean and variance have the shape of one sample."""
 
     mean: torch.Tensor
-    var: torch.Tensor
-    """Population variance."""
-    count: int
-    """Number of samples."""
+    var: torch.Tensor  # population variance
+    count: int  # number of samples
 
     @staticmethod
     def from_samples(x: torch.Tensor, chunk_size: int | None = None) -> Moments:
@@ -164,15 +162,9 @@ class ActorCritic(nn.Module):
     """Actor and critic as separate networks with normalised observations, and state-independent exploration noise."""
 
     def __init__(
-        self,
-        num_obs: int,
-        num_actions: int,
-        hidden: Sequence[int],
-        activation: str = "elu",
-        init_std: float = 1.0,
-        num_critic_obs: int | None = None,
-        symmetry: Symmetry | None = None,
-    ) -> None:
+        self, num_obs: int, num_actions: int, hidden: Sequence[int], activation: str = "elu", init_std: float = 1.0,
+        num_critic_obs: int | None = None, symmetry: Symmetry | None = None,
+    ) -> None:  # fmt: skip
         """num_obs, num_critic_obs (default: num_obs): sizes of the observations of actor and critic.
 
         hidden: widths of the hidden layers of both networks. activation: a key of ACTIVATIONS. init_std: initial
@@ -233,12 +225,9 @@ class ActorCritic(nn.Module):
 class Layers(NamedTuple):
     """A multilayer perceptron as tensors, with its forward and backward pass."""
 
-    weights: tuple[torch.Tensor, ...]
-    """(outputs, inputs) each; the first has zero columns up to a multiple of `flat.ROW_ALIGNMENT`."""
-    biases: tuple[torch.Tensor, ...]
-    """(outputs,) each."""
-    activation: str
-    """Of all layers but the last: elu, relu or tanh."""
+    weights: tuple[torch.Tensor, ...]  # (outputs, inputs) each; the first is zero-padded to `flat.ROW_ALIGNMENT`
+    biases: tuple[torch.Tensor, ...]  # (outputs,) each
+    activation: str  # of all layers but the last: elu, relu or tanh
 
     def forward(self, x: torch.Tensor, dtype: torch.dtype) -> tuple[torch.Tensor, list[torch.Tensor]]:
         """Return the network's output (batch, outputs), float32, and the input of each layer for `backward`.
@@ -272,10 +261,8 @@ class ActorTensors(NamedTuple):
     """The policy as tensors, with its forward and backward pass; notation of `jumper_warp.rl.mirror`."""
 
     layers: Layers
-    log_std: torch.Tensor
-    """(num_actions,) of the exploration noise."""
-    symmetry: Symmetry | None
-    """Its mirror map of observations is padded to the columns of the first weight."""
+    log_std: torch.Tensor  # (num_actions,) of the exploration noise
+    symmetry: Symmetry | None  # its mirror map of observations is padded to the columns of the first weight
 
     def forward(self, x: torch.Tensor, dtype: torch.dtype) -> ActorOutput:
         """Return the policy's mean for features x; arguments as for `Layers.forward`."""
@@ -301,12 +288,9 @@ class ActorTensors(NamedTuple):
 class ActorOutput(NamedTuple):
     """Output of a forward pass of the policy."""
 
-    mean: torch.Tensor
-    """(batch, num_actions)"""
-    difference: torch.Tensor
-    """(batch, num_actions) f(x) - N f(M x); 0 without symmetry."""
-    layer_inputs: list[torch.Tensor]
-    """Input of each layer, for `ActorTensors.backward`."""
+    mean: torch.Tensor  # (batch, num_actions)
+    difference: torch.Tensor  # (batch, num_actions) f(x) - N f(M x); 0 without symmetry
+    layer_inputs: list[torch.Tensor]  # input of each layer, for `ActorTensors.backward`
 
 
 def _activation_backward(activation: str, grad: torch.Tensor, output: torch.Tensor) -> torch.Tensor:

@@ -38,30 +38,22 @@ class ActorLosses(NamedTuple):
     """ActorTensors statistics of a minibatch, each ()."""
 
     surrogate: torch.Tensor
-    entropy: torch.Tensor
-    """Entropy of the policy [nat]."""
-    asymmetry: torch.Tensor
-    """Mean square of f(x) - N f(M x), see `jumper_warp.rl.mirror`; 0 without symmetry."""
-    kl: torch.Tensor
-    """KL(old ‖ new) [nat]."""
+    entropy: torch.Tensor  # entropy of the policy [nat]
+    asymmetry: torch.Tensor  # mean square of f(x) - N f(M x), see `jumper_warp.rl.mirror`; 0 without symmetry
+    kl: torch.Tensor  # KL(old ‖ new) [nat]
 
 
 class StepStatistics(NamedTuple):
     """Statistics of an optimiser step, each (); losses and divergence before the step, as in `ActorLosses`."""
 
     surrogate: torch.Tensor
-    value: torch.Tensor
-    """Value loss before weighting [variances of the return]."""
+    value: torch.Tensor  # value loss before weighting [variances of the return]
     entropy: torch.Tensor
     asymmetry: torch.Tensor
-    kl: torch.Tensor
-    """KL(old ‖ new) [nat], over all ranks."""
-    gradient_actor: torch.Tensor
-    """Norm of the actor's gradient before clipping, averaged over all ranks."""
-    gradient_critic: torch.Tensor
-    """Norm of the critic's gradient, likewise."""
-    skipped: torch.Tensor
-    """1 if a gradient was not finite and was replaced by 0."""
+    kl: torch.Tensor  # KL(old ‖ new) [nat], over all ranks
+    gradient_actor: torch.Tensor  # norm of the actor's gradient before clipping, averaged over all ranks
+    gradient_critic: torch.Tensor  # norm of the critic's gradient, likewise
+    skipped: torch.Tensor  # 1 if a gradient was not finite and was replaced by 0
 
 
 STATISTICS = StepStatistics._fields
@@ -86,7 +78,7 @@ class Ppo:
         num_critic_obs = env.num_critic_obs if cfg.asymmetric else env.num_obs
         symmetry = None if cfg.symmetry == "off" else symmetry_of(env)
         self.model = ActorCritic(
-            env.num_obs, env.num_actions, cfg.hidden, cfg.activation, cfg.init_std, num_critic_obs, symmetry
+            env.num_obs, env.num_actions, cfg.hidden, cfg.activation, cfg.init_std, num_critic_obs, symmetry,
         ).to(env.device)  # fmt: skip
         self.flat = FlatParameters(self.model, cfg.activation)
         self.optimiser = FlatAdam(self.flat, cfg.lr)

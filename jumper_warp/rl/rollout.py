@@ -16,24 +16,15 @@ from jumper_warp.rl.networks import DTYPES, ActorCritic, ActorTensors, Scaling
 class RolloutBuffer(NamedTuple):
     """Transitions of all worlds over num_steps policy steps; `at` returns one step, without the first axis."""
 
-    obs: torch.Tensor
-    """(num_steps + 1, num_envs, num_obs) sanitised."""
-    critic_obs: torch.Tensor
-    """(num_steps + 1, num_envs, num_critic_obs) sanitised; equal to obs without `PpoCfg.asymmetric`."""
-    final_critic_obs: torch.Tensor
-    """(num_steps, num_envs, num_critic_obs) after the step, before a reset."""
-    action: torch.Tensor
-    """(num_steps, num_envs, num_actions) sampled."""
-    mean: torch.Tensor
-    """(num_steps, num_envs, num_actions) of the policy."""
-    log_std: torch.Tensor
-    """(num_actions,) of the policy, the same in all steps."""
-    reward: torch.Tensor
-    """(num_steps, num_envs) times `PpoCfg.reward_scale`."""
-    done: torch.Tensor
-    """(num_steps, num_envs) 1 where the episode ended, by termination or timeout."""
-    timeout: torch.Tensor
-    """(num_steps, num_envs) 1 where the episode was truncated."""
+    obs: torch.Tensor  # (num_steps + 1, num_envs, num_obs) sanitised
+    critic_obs: torch.Tensor  # (num_steps + 1, num_envs, num_critic_obs) sanitised; obs if not `PpoCfg.asymmetric`
+    final_critic_obs: torch.Tensor  # (num_steps, num_envs, num_critic_obs) after the step, before a reset
+    action: torch.Tensor  # (num_steps, num_envs, num_actions) sampled
+    mean: torch.Tensor  # (num_steps, num_envs, num_actions) of the policy
+    log_std: torch.Tensor  # (num_actions,) of the policy, the same in all steps
+    reward: torch.Tensor  # (num_steps, num_envs) times `PpoCfg.reward_scale`
+    done: torch.Tensor  # (num_steps, num_envs) 1 where the episode ended, by termination or timeout
+    timeout: torch.Tensor  # (num_steps, num_envs) 1 where the episode was truncated
 
     def at(self, step: int) -> RolloutBuffer:
         """Return views of one step."""
@@ -94,11 +85,13 @@ class Collector:
         self._record_step(self._steps[0])
 
     def _act_step(self, step: RolloutBuffer) -> None:
+        """Write observations, mean and action of the present state to `step`, one step of the buffer."""
         self._sample_action(
             self.env.obs, self._critic_obs, step, self._actor, self._scaling, DTYPES[self.cfg.precision]
         )
 
     def _record_step(self, step: RolloutBuffer) -> None:
+        """Write the result of the environment's last step to `step`, one step of the buffer."""
         env, scale = self.env, self.cfg.reward_scale
         final_critic_obs, counts = self._final_critic_obs, (self.episode, self.finished)
         self._record(env.reward, env.done, env.timeout, final_critic_obs, step, *counts, scale)

@@ -18,32 +18,14 @@ from typing import Any, NamedTuple, cast
 import torch
 
 from jumper_warp.envs.vec_env import DifferentiableVecEnv, VecEnv
+from jumper_warp.rl import distributed, resume
 from jumper_warp.rl.actor_init import ActorInit, apply_actor_init
 from jumper_warp.rl.cfg import TrainCfg
 from jumper_warp.rl.checkpoint import DECODE_ERRORS, Checkpoint, CheckpointError, one_line_message, save_checkpoint
-from jumper_warp.rl.distributed import (
-    Rank,
-    all_reduce_max,
-    gather_states,
-    init_distributed,
-    local_rank_zero_first,
-    same_on_all_ranks,
-    wait_for_ranks,
-    world_size,
-)
+from jumper_warp.rl.distributed import Rank
 from jumper_warp.rl.logger import Stopwatch, TrainingLog
 from jumper_warp.rl.ppo import STATISTICS, Ppo
-from jumper_warp.rl.resume import (
-    CHECKPOINTS,
-    changed_settings,
-    changed_user_files,
-    find_checkpoint,
-    random_state,
-    rank_state,
-    saved_init_policy,
-    saved_seconds,
-    set_random_state,
-)
+from jumper_warp.rl.resume import CHECKPOINTS
 from jumper_warp.rl.shac import STATISTICS as SHAC_STATISTICS
 from jumper_warp.rl.shac import Shac
 from jumper_warp.utils.errors import InputError
@@ -70,14 +52,10 @@ AsRslRl = Callable[[VecEnv, int], Any]
 class TrainResult(NamedTuple):
     """Result of a finished training."""
 
-    folder: Path
-    """The run's folder."""
-    iteration: int
-    """Number of iterations, over all resumes."""
-    seconds: float
-    """Wall-clock time of this process's iterations [s], including the first_iteration."""
-    metrics: dict[str, float]
-    """Last logged metrics."""
+    folder: Path  # the run's folder
+    iteration: int  # number of iterations, over all resumes
+    seconds: float  # wall-clock time of this process's iterations [s], including the first
+    metrics: dict[str, float]  # last logged metrics
 
 
 class StopRequest:
@@ -112,7 +90,7 @@ def train(
     after a checkpoint was saved.
     """
     set_threads(cfg.threads)
-    rank = init_distributed(cfg.device, cfg.threads)
+    rank = distributed.init_distributed(cfg.device, cfg.threads)
     run: TrainingRun | None = None
     try:
         _check_processes(cfg, rank)
@@ -125,7 +103,7 @@ def train(
         run = TrainingRun(cfg, env, rank, command, actor_init, checkpoint)
         with StopRequest() as stop:
             result = run.iterate(stop)
-        wait_for_ranks()
+        distributed.wait_for_ranks()
         if stop.requested:
             raise SystemExit(INTERRUPTED)
         return result
@@ -190,8 +168,8 @@ class TrainingRun:
         self._clock_start: float | None = None  # time at which the run would have started without interruption
         self.metrics: dict[str, float] = {}
         self.notes: list[str] = []
-        checkpoint = checkpoint or find_checkpoint(cfg)
-        if not same_on_all_ranks(str(checkpoint and (checkpoint.path, checkpoint.state["iteration"]))):
+        checkpoint = checkpoint or resume.find_checkpoint(cfg)
+        if not distributed.same_on_all_ranks(str(checkpoint and (checkpoint.path, checkpoint.state["iteration"]))):
             raise InputError("the processes found different checkpoints: log_root must be a folder that all can read")
         if actor_init is not None and checkpoint is None:
             apply_actor_init(actor_init, self.ppo.model, cfg.num_envs * cfg.ppo.num_steps)
@@ -204,20 +182,20 @@ class TrainingRun:
     def _resume(self, checkpoint: Checkpoint) -> Path:
         """Load a checkpoint, and return its run's folder. Raises CheckpointError: it does not fit the settings."""
         path, state, skipped = checkpoint
-        changed = changed_settings(state, self.config)
+        changed = resume.changed_settings(state, self.config)
         self.notes += [*(f"skipped: {reason}" for reason in skipped), f"resumed {path}", *changed]
-        self.notes += changed_user_files(state, self.config)
+        self.notes += resume.changed_user_files(state, self.config)
         try:
-            local = rank_state(state, self.rank)
+            local = resume.rank_state(state, self.rank)
             self.ppo.load_state_dict({**state["ppo"], **local["ppo"]})
             self.env.load_state_dict(local["env"])
-            self.seconds = saved_seconds(state)
-            set_random_state(local["rng"])
+            self.seconds = resume.saved_seconds(state)
+            resume.set_random_state(local["rng"])
         except DECODE_ERRORS as error:
             suffix = f" ({', '.join(changed)})" if changed else ""
             raise CheckpointError(f"{path}: does not fit these settings: {one_line_message(error)}{suffix}") from error
         self.iteration = state["iteration"]
-        self.config["train"]["start_from"] = saved_init_policy(state)
+        self.config["train"]["start_from"] = resume.saved_init_policy(state)
         return path.parent.parent
 
     def iterate(self, stop: StopRequest) -> TrainResult:
@@ -225,7 +203,7 @@ class TrainingRun:
         cfg, ppo = self.cfg, self.ppo
         with ThreadPoolExecutor(1) as pool:
             kernels = pool.submit(getattr(self.env, "compile", lambda: None))  # optional for a `VecEnv`
-            local_rank_zero_first(ppo.compile)
+            distributed.local_rank_zero_first(ppo.compile)
             kernels.result()
         if self.iteration == 0:
             self.env.reset()
@@ -292,10 +270,10 @@ class TrainingRun:
         Several processes synchronise this, and `stop.requested`, only in iterations that they log.
         """
         over_time = 0.0 < self.cfg.max_seconds <= self._elapsed()
-        if world_size() > 1:
+        if distributed.world_size() > 1:
             if self.iteration % self.cfg.log_interval:
                 return False
-            stop.requested, over_time = map(bool, all_reduce_max([int(stop.requested), int(over_time)]))
+            stop.requested, over_time = map(bool, distributed.all_reduce_max([int(stop.requested), int(over_time)]))
         return stop.requested or over_time
 
     def _read_metrics(self, times: list[float], seconds: float) -> dict[str, float]:
@@ -307,7 +285,7 @@ class TrainingRun:
     def _save(self, log: TrainingLog | _NoLog, is_last: bool, stop: StopRequest) -> None:
         """Save a checkpoint in rank 0; a failure prints a warning, and raises CheckpointError only in the last."""
         seconds = self._elapsed()
-        local = {"ppo": self.ppo.state_dict(), "env": self.env.state_dict(), "rng": random_state()}
+        local = {"ppo": self.ppo.state_dict(), "env": self.env.state_dict(), "rng": resume.random_state()}
         others = self._other_ranks(local)
         if self.rank.index != 0:
             return
@@ -327,9 +305,9 @@ class TrainingRun:
 
     def _other_ranks(self, local: dict[str, Any]) -> list[dict[str, Any]]:
         """Return, in rank 0, the per-rank state of the other ranks: worlds, episode counts and random generators."""
-        if world_size() == 1:
+        if distributed.world_size() == 1:
             return []
-        return gather_states({**local, "ppo": {"episode": local["ppo"]["episode"].cpu()}}, self.rank)[1:]
+        return distributed.gather_states({**local, "ppo": {"episode": local["ppo"]["episode"].cpu()}}, self.rank)[1:]
 
 
 def is_last_iteration(iteration: int, cfg: TrainCfg, end_early: bool) -> bool:

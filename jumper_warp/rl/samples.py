@@ -22,57 +22,40 @@ CPU_CHUNK_SIZE = 4096
 class Batch(NamedTuple):
     """Samples of one or all minibatches; first axis: sample."""
 
-    features: torch.Tensor
-    """(batch, num_obs) normalised observations."""
-    critic_features: torch.Tensor
-    """(batch, num_critic_obs) normalised observations of the critic."""
-    action: torch.Tensor
-    """(batch, num_actions)"""
-    mean: torch.Tensor
-    """(batch, num_actions) mean of the policy that acted."""
-    log_prob: torch.Tensor
-    """(batch,) log probability of the action under that policy."""
-    value: torch.Tensor
-    """(batch,) the critic's output during the rollout."""
-    advantage: torch.Tensor
-    """(batch,) normalised."""
-    target: torch.Tensor
-    """(batch,) return, in the units of the critic's output."""
+    features: torch.Tensor  # (batch, num_obs) normalised observations
+    critic_features: torch.Tensor  # (batch, num_critic_obs) normalised observations of the critic
+    action: torch.Tensor  # (batch, num_actions)
+    mean: torch.Tensor  # (batch, num_actions) mean of the policy that acted
+    log_prob: torch.Tensor  # (batch,) log probability of the action under that policy
+    value: torch.Tensor  # (batch,) the critic's output during the rollout
+    advantage: torch.Tensor  # (batch,) normalised
+    target: torch.Tensor  # (batch,) return, in the units of the critic's output
 
 
 class RolloutMoments(NamedTuple):
     """Mean, variance and count over the samples of a rollout."""
 
     advantage: Moments
-    target: Moments
-    """() each."""
-    obs: Moments
-    """(num_obs,)"""
-    critic_obs: Moments
-    """(num_critic_obs,)"""
+    target: Moments  # () each
+    obs: Moments  # (num_obs,)
+    critic_obs: Moments  # (num_critic_obs,)
 
 
 class Estimates(NamedTuple):
     """Values, advantages and returns of a rollout; batch = num_steps · num_envs, time-major."""
 
-    value: torch.Tensor
-    """(batch,) the critic's output [standard deviations of the return]."""
+    value: torch.Tensor  # (batch,) the critic's output [standard deviations of the return]
     advantage: torch.Tensor
-    target: torch.Tensor
-    """(batch,) returns; advantage and target are in scaled rewards."""
-    moments: RolloutMoments
-    """Moments over this rank's samples."""
+    target: torch.Tensor  # (batch,) returns; advantage and target are in scaled rewards
+    moments: RolloutMoments  # moments over this rank's samples
 
 
 class Scalings(NamedTuple):
     """Mean and standard deviation that normalise observations and values."""
 
-    obs: Scaling
-    """(num_obs,)"""
-    critic_obs: Scaling
-    """(num_critic_obs,)"""
-    value: Scaling
-    """() for the return."""
+    obs: Scaling  # (num_obs,)
+    critic_obs: Scaling  # (num_critic_obs,)
+    value: Scaling  # () for the return
 
 
 class RowLayout(NamedTuple):
@@ -190,13 +173,16 @@ class BatchPacker:
         self._pack(scalings, self._estimates(scalings), advantage_scaling=scalings.value)
 
     def _scalings(self) -> Scalings:
+        """Return the present normalisation of observations and values."""
         model = self._model
         return Scalings(*(each.scaling() for each in (model.obs_moments, model.critic_moments, model.value_moments)))
 
     def _estimates(self, scalings: Scalings) -> Estimates:
+        """Return values, advantages and returns of the rollout."""
         return self._compute_values_and_gae(self._rollout, self._critic, scalings, self._cfg, self._chunk_size)
 
     def _pack(self, scalings: Scalings, estimates: Estimates, advantage_scaling: Scaling) -> None:
+        """Write the rollout with its estimates to `rows`."""
         target_scaling = self._model.value_moments.scaling() if self._cfg.normalise_value else None
         self._write_rows(
             self.rows,

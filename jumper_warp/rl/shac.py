@@ -30,18 +30,12 @@ STATISTICS = ("actor", "value", "gradient_actor", "gradient_critic")
 class Window(NamedTuple):
     """Actor loss of a window, and its samples for the critic."""
 
-    loss: torch.Tensor
-    """() actor loss, differentiable."""
-    obs: torch.Tensor
-    """(num_steps, num_envs, num_obs)"""
-    critic_obs: torch.Tensor
-    """(num_steps, num_envs, num_critic_obs)"""
-    reward: torch.Tensor
-    """(num_steps, num_envs) scaled."""
-    next_value: torch.Tensor
-    """(num_steps, num_envs) target critic's value after the step; 0 after a termination."""
-    done: torch.Tensor
-    """(num_steps, num_envs)"""
+    loss: torch.Tensor  # () actor loss, differentiable
+    obs: torch.Tensor  # (num_steps, num_envs, num_obs)
+    critic_obs: torch.Tensor  # (num_steps, num_envs, num_critic_obs)
+    reward: torch.Tensor  # (num_steps, num_envs) scaled
+    next_value: torch.Tensor  # (num_steps, num_envs) target critic's value after the step; 0 after a termination
+    done: torch.Tensor  # (num_steps, num_envs)
 
 
 class Shac:
@@ -58,7 +52,7 @@ class Shac:
         self.batch_size = cfg.num_steps * env.num_envs
         critic_obs = env.num_critic_obs if cfg.asymmetric else env.num_obs
         self.model = ActorCritic(
-            env.num_obs, env.num_actions, cfg.hidden, cfg.activation, cfg.init_std, critic_obs
+            env.num_obs, env.num_actions, cfg.hidden, cfg.activation, cfg.init_std, critic_obs,
         ).to(env.device)  # fmt: skip
         self.target = copy.deepcopy(self.model.critic).requires_grad_(False)
         self._actor = [*self.model.actor.parameters(), self.model.log_std]

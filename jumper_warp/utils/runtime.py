@@ -20,25 +20,18 @@ PACKAGES = ("jumper-warp", "warp-lang", "newton", "mujoco", "mujoco-warp", "torc
 class Commit(NamedTuple):
     """Commit and state of a source tree."""
 
-    hash: str
-    """Full hash of the checked-out commit."""
-    dirty: bool
-    """Whether there are modified or untracked files."""
+    hash: str  # full hash of the checked-out commit
+    dirty: bool  # whether there are modified or untracked files
 
 
 class DeviceInfo(NamedTuple):
     """Properties of a Warp device."""
 
-    alias: str
-    """Warp's name of the device, for example `cpu` or `cuda:0`."""
-    name: str
-    """Product name of the processor."""
-    driver: str | None
-    """CUDA version that the driver supports; None on a CPU."""
-    mempool: bool
-    """Whether device memory comes from a stream-ordered pool, which captured graphs need to allocate."""
-    graphs: bool
-    """Whether a step that allocates memory can be captured as a graph."""
+    alias: str  # warp's name of the device, for example `cpu` or `cuda:0`
+    name: str  # product name of the processor
+    driver: str | None  # CUDA version that the driver supports; None on a CPU
+    mempool: bool  # whether device memory comes from a stream-ordered pool, which captured graphs need to allocate
+    graphs: bool  # whether a step that allocates memory can be captured as a graph
 
 
 def device_info(device: wp.DeviceLike = None) -> DeviceInfo:

@@ -18,28 +18,17 @@ SHAPE = {"policy_dt": 1 / 60, "physics_dt": 1 / 480, "hidden": (256, 128, 128)}
 
 
 def test_interface_of_the_vertical_jump_has_the_robots_values():
-    policy_interface = make_interface(interface(make_task("vertical-jump")), **SHAPE)
-    assert policy_interface.sizes == (147, 256, 128, 128, 12)
-    assert policy_interface.joint_names[:4] == ("FL_lateral", "FL_outer", "FL_inner", "FR_lateral")
-    assert policy_interface.action_scale[:3] == pytest.approx([0.261799, 1.570796, 1.570796], abs=1e-6)
-    assert policy_interface.default_joint_pos[3:6] == pytest.approx([0.0, 0.785398, 0.785398], abs=1e-6)
-    assert policy_interface.joint_stiffness == (17.0,) * 12
-    assert policy_interface.joint_damping[:3] == (1.8, 0.8, 0.8)
-    assert policy_interface.torque_limit[:3] == (10.0, 18.0, 18.0)
-    assert policy_interface.command_filter["sum"] == {
-        "lower": 0.0,
-        "upper": 240.0,
-        "lower_zone": 35.0,
-        "upper_zone": 45.0,
-    }
-    assert policy_interface.observation_layout["lin_vel"] == {
-        "first": 3,
-        "end": 15,
-        "scale": 1.0,
-        "clip": 100.0,
-        "history": 4,
-    }
-    assert PolicyInterface.from_json(json.loads(json.dumps(policy_interface.to_json()))) == policy_interface
+    spec = make_interface(interface(make_task("vertical-jump")), **SHAPE)
+    assert spec.sizes == (147, 256, 128, 128, 12)
+    assert spec.joint_names[:4] == ("FL_lateral", "FL_outer", "FL_inner", "FR_lateral")
+    assert spec.action_scale[:3] == pytest.approx([0.261799, 1.570796, 1.570796], abs=1e-6)
+    assert spec.default_joint_pos[3:6] == pytest.approx([0.0, 0.785398, 0.785398], abs=1e-6)
+    assert spec.joint_stiffness == (17.0,) * 12
+    assert spec.joint_damping[:3] == (1.8, 0.8, 0.8)
+    assert spec.torque_limit[:3] == (10.0, 18.0, 18.0)
+    assert spec.command_filter["sum"] == {"lower": 0.0, "upper": 240.0, "lower_zone": 35.0, "upper_zone": 45.0}
+    assert spec.observation_layout["lin_vel"] == {"first": 3, "end": 15, "scale": 1.0, "clip": 100.0, "history": 4}
+    assert PolicyInterface.from_json(json.loads(json.dumps(spec.to_json()))) == spec
 
 
 def test_interface_has_scales_and_history():
@@ -60,10 +49,10 @@ def test_interface_has_scales_and_history():
     ],
 )
 def test_refuses_an_invalid_observation_layout(change, message):
-    policy_interface = make_interface(interface(make_task("vertical-jump")), **SHAPE).to_json()
-    change(policy_interface["observation_layout"])
+    spec = make_interface(interface(make_task("vertical-jump")), **SHAPE).to_json()
+    change(spec["observation_layout"])
     with pytest.raises(PolicyError, match=message):
-        PolicyInterface.from_json(json.loads(json.dumps(policy_interface)))
+        PolicyInterface.from_json(json.loads(json.dumps(spec)))
 
 
 @pytest.fixture

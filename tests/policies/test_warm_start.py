@@ -7,13 +7,11 @@ import torch
 
 from jumper_warp.policies.runs import open_policy
 from jumper_warp.policies.spec import PolicyError
-from jumper_warp.policies.warm_start import actor_init_from_policy, check_interface
+from jumper_warp.policies.warm_start import actor_init_from_policy, check_interface, task_symmetry
 from jumper_warp.registry import TASKS, make_task
 from jumper_warp.rl.actor_init import apply_actor_init
-from jumper_warp.rl.mirror import Symmetry, mirror_map
 from jumper_warp.rl.networks import ActorCritic
 from jumper_warp.tasks.interface import interface
-from jumper_warp.tasks.mirror import mirror_of, mirror_of_action
 from jumper_warp.tasks.observations import with_history
 from jumper_warp.utils.errors import InputError
 
@@ -31,10 +29,7 @@ WIDE = {"symmetry": "off", "hidden": (512, 256, 256)}
 )
 def test_initialised_actor_acts_as_the_shipped_policy(name, task, change):
     policy, cfg, task = open_policy(name), dataclasses.replace(TASKS[task].ppo, **change), make_task(task)
-    symmetry = Symmetry(
-        mirror_map(*mirror_of(task, "policy"), "observation"), mirror_map(*mirror_of_action(), "action")
-    )
-    symmetry = symmetry if cfg.symmetry == "actor" else None
+    symmetry = task_symmetry(task) if cfg.symmetry == "actor" else None
     assert (symmetry is not None) == (name == "slippery_jump" and not change)
     torch.manual_seed(0)
     sizes = policy.interface.sizes
@@ -75,9 +70,7 @@ def test_refuses_a_policy_with_another_history():
 
 def test_symmetric_training_starts_from_the_projection_of_a_fine_tuned_policy():
     policy, task, cfg = open_policy("horizontal_jump"), make_task("horizontal-jump"), TASKS["horizontal-jump"].ppo
-    symmetry = Symmetry(
-        mirror_map(*mirror_of(task, "policy"), "observation"), mirror_map(*mirror_of_action(), "action")
-    )
+    symmetry = task_symmetry(task)
     start = actor_init_from_policy("horizontal_jump", task, cfg)
     model = ActorCritic(147, 12, cfg.hidden, cfg.activation, cfg.init_std, symmetry=symmetry)
     apply_actor_init(start, model, samples=1000)
@@ -86,8 +79,8 @@ def test_symmetric_training_starts_from_the_projection_of_a_fine_tuned_policy():
     assert 0.0 < (model.act(obs) - policy.act(obs)).abs().mean() < 0.01
 
 
-def changed_layout(policy_interface):
-    layout = {name: dict(term) for name, term in policy_interface.observation_layout.items()}
+def changed_layout(spec):
+    layout = {name: dict(term) for name, term in spec.observation_layout.items()}
     next(iter(layout.values()))["scale"] = 7.0
     return {"observation_layout": layout}
 
@@ -97,35 +90,25 @@ def changed_layout(policy_interface):
     [
         (changed_layout, r"scale of \w+: the policy has 7.0, the task 1.0"),
         (
-            lambda policy_interface: {
-                "joint_names": policy_interface.joint_names[1:] + policy_interface.joint_names[:1]
-            },
+            lambda spec: {"joint_names": spec.joint_names[1:] + spec.joint_names[:1]},
             r"action 0: the policy has FL_outer, the task FL_lateral",
         ),
         (
-            lambda policy_interface: {"default_joint_pos": (1.0, *policy_interface.default_joint_pos[1:])},
+            lambda spec: {"default_joint_pos": (1.0, *spec.default_joint_pos[1:])},
             "default angle .*: the policy has 1.0",
         ),
-        (
-            lambda policy_interface: {"observation_limit": 5.0},
-            "limit of observations: the policy has 5.0, the task 100.0",
-        ),
-        (
-            lambda policy_interface: {"normalised_limit": 5.0},
-            "in standard deviations: the policy has 5.0, the task 10.0",
-        ),
+        (lambda spec: {"observation_limit": 5.0}, "limit of observations: the policy has 5.0, the task 100.0"),
+        (lambda spec: {"normalised_limit": 5.0}, "in standard deviations: the policy has 5.0, the task 10.0"),
     ],
 )
 def test_error_message_names_the_first_difference_of_the_interfaces(change, message):
-    policy_interface = open_policy("horizontal_jump").interface
+    spec = open_policy("horizontal_jump").interface
     with pytest.raises(InputError, match=message):
-        check_interface(
-            dataclasses.replace(policy_interface, **change(policy_interface)), interface(make_task("horizontal-jump"))
-        )
+        check_interface(dataclasses.replace(spec, **change(spec)), interface(make_task("horizontal-jump")))
 
 
 def test_scales_gains_and_an_unknown_layout_may_differ():
-    policy_interface = open_policy("horizontal_jump").interface
-    numbers = {name: tuple(1.5 for _ in policy_interface.joint_names) for name in ("action_scale", "joint_stiffness")}
-    other = dataclasses.replace(policy_interface, **numbers, observation_layout={}, policy_dt=0.05)
+    spec = open_policy("horizontal_jump").interface
+    numbers = {name: tuple(1.5 for _ in spec.joint_names) for name in ("action_scale", "joint_stiffness")}
+    other = dataclasses.replace(spec, **numbers, observation_layout={}, policy_dt=0.05)
     check_interface(other, interface(make_task("horizontal-jump-mars")))

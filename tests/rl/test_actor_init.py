@@ -10,12 +10,7 @@ from test_shac import SmoothPushTask
 
 from jumper_warp.rl.actor_init import PRIOR_ITERATIONS, apply_actor_init, make_actor_init
 from jumper_warp.rl.checkpoint import load_checkpoint, save_checkpoint
-from jumper_warp.rl.mirror import (
-    contract_expanded_layers,
-    expand_symmetric_layers,
-    nearest_expanded_layers,
-    symmetry_of,
-)
+from jumper_warp.rl.mirror import contract_layers, expand_layers, nearest_expanded_layers, symmetry_of
 from jumper_warp.rl.networks import VARIANCE_EPS, ActorCritic
 from jumper_warp.rl.ppo import Ppo
 from jumper_warp.rl.runner import CHECKPOINTS, CONFIG, train
@@ -46,7 +41,7 @@ def layers_of(model):
 
 def actor_init_of(model, cfg=SMALL, activation="elu"):
     """Return the `ActorInit` of this actor, policy_symmetry as a plain network."""
-    layers = layers_of(model) if model.symmetry is None else expand_symmetric_layers(layers_of(model), model.symmetry)
+    layers = layers_of(model) if model.symmetry is None else expand_layers(layers_of(model), model.symmetry)
     symmetry = SYMMETRY if cfg.symmetry == "actor" else None
     return make_actor_init(layers, *model.obs_moments.scaling(), activation, cfg, symmetry)
 
@@ -72,7 +67,7 @@ def model_of(result):
 def test_contract_inverts_expand_of_symmetric_layers(hidden):
     layers = layers_of(actor(hidden, SYMMETRY))
     layers[-1][1].zero_()  # the part of the bias that f(x) and N f(M x) do not cancel is 0 here
-    contracted = contract_expanded_layers(expand_symmetric_layers(layers, SYMMETRY), SYMMETRY)
+    contracted = contract_layers(expand_layers(layers, SYMMETRY), SYMMETRY)
     for layer, result in zip(layers, contracted, strict=True):
         torch.testing.assert_close(result, layer, atol=0.0, rtol=0.0)
 
@@ -86,28 +81,28 @@ def changed(layers, index, part):
 @pytest.mark.parametrize("index", [0, 1, 2])
 @pytest.mark.parametrize("part", [0, 1])
 def test_contract_refuses_layers_that_are_not_symmetric(index, part):
-    layers = expand_symmetric_layers(layers_of(actor(symmetry=SYMMETRY)), SYMMETRY)
+    layers = expand_layers(layers_of(actor(symmetry=SYMMETRY)), SYMMETRY)
     with pytest.raises(InputError, match="not those of a mirror-symmetric actor"):
-        contract_expanded_layers(changed(layers, index, part), SYMMETRY)
+        contract_layers(changed(layers, index, part), SYMMETRY)
 
 
 @pytest.mark.parametrize("sizes", [(2, 8, 7, 1), (2, 7, 1), (2, 1, 1), (3, 8, 1), (2, 8, 2)])
 def test_contract_refuses_sizes_of_no_symmetric_actor(sizes):
     layers = layers_of(ActorCritic(sizes[0], sizes[-1], sizes[1:-1]))
     with pytest.raises(InputError, match="not those of a mirror-symmetric actor"):
-        contract_expanded_layers(layers, SYMMETRY)
+        contract_layers(layers, SYMMETRY)
 
 
 @pytest.mark.parametrize("hidden", [(16,), (32, 24), (8, 6, 4)])
 def test_nearest_expanded_layers_is_an_orthogonal_projection(hidden):
-    exact = expand_symmetric_layers(layers_of(actor(hidden, SYMMETRY)), SYMMETRY)
+    exact = expand_layers(layers_of(actor(hidden, SYMMETRY)), SYMMETRY)
     for layer, result in zip(exact, nearest_expanded_layers(exact, SYMMETRY), strict=True):
         torch.testing.assert_close(result, layer)
     torch.manual_seed(1)
     perturbed = [tuple(tensor + 0.1 * torch.randn_like(tensor) for tensor in layer) for layer in exact]
     nearest = nearest_expanded_layers(perturbed, SYMMETRY)
-    contract_expanded_layers(nearest, SYMMETRY)  # raises if they are not symmetric
-    other = expand_symmetric_layers(layers_of(actor(hidden, SYMMETRY)), SYMMETRY)
+    contract_layers(nearest, SYMMETRY)  # raises if they are not symmetric
+    other = expand_layers(layers_of(actor(hidden, SYMMETRY)), SYMMETRY)
     residual, tangent = (flat_difference(layers, nearest) for layers in (perturbed, other))
     assert abs(torch.dot(residual, tangent)) < 1e-4 * residual.norm() * tangent.norm()
 
@@ -182,14 +177,14 @@ def test_asymmetric_statistics_make_the_policy_asymmetric():
 
 
 def test_nearly_symmetric_policy_is_projected_to_the_nearest_symmetric_one():
-    exact = expand_symmetric_layers(layers_of(actor(symmetry=SYMMETRY)), SYMMETRY)
+    exact = expand_layers(layers_of(actor(symmetry=SYMMETRY)), SYMMETRY)
     scaling = actor(symmetry=SYMMETRY).obs_moments.scaling()
     torch.manual_seed(2)
     little, much = ([(w + share * w.std() * torch.randn_like(w), b) for w, b in exact] for share in (0.01, 0.5))
     start = make_actor_init(little, *scaling, "elu", SYMMETRIC, SYMMETRY)
     assert start.change == "made mirror-symmetric"
     for expected, result in zip(
-        nearest_expanded_layers(little, SYMMETRY), expand_symmetric_layers(start.layers, SYMMETRY), strict=True
+        nearest_expanded_layers(little, SYMMETRY), expand_layers(start.layers, SYMMETRY), strict=True
     ):
         torch.testing.assert_close(result, expected)
     with pytest.raises(

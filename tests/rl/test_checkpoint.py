@@ -121,9 +121,9 @@ def test_latest_checkpoint_skips_damaged_ones(tmp_path):
     paths = [save_checkpoint(tmp_path, state(iteration)) for iteration in (1, 2, 3)]
     cut(paths[2])
     flip(paths[1])
-    path, state, refusals = latest_checkpoint(tmp_path)
-    assert (path, state["iteration"]) == (paths[0], 1)
-    assert [refusal.split(":")[0] for refusal in refusals] == [str(paths[2]), str(paths[1])]
+    path, loaded, skipped = latest_checkpoint(tmp_path)
+    assert (path, loaded["iteration"]) == (paths[0], 1)
+    assert [reason.split(":")[0] for reason in skipped] == [str(paths[2]), str(paths[1])]
 
 
 def test_latest_checkpoint_raises_if_all_are_damaged(tmp_path):

@@ -12,7 +12,7 @@ from jumper_warp.rl import graphs
 from jumper_warp.rl.cfg import PpoCfg, TrainCfg
 from jumper_warp.rl.checkpoint import save_checkpoint
 from jumper_warp.rl.flat import FlatParameters
-from jumper_warp.rl.mirror import Symmetry, expand_symmetric_layers, mirror_map
+from jumper_warp.rl.mirror import Symmetry, expand_layers, mirror_map
 from jumper_warp.rl.networks import ActorCritic
 from jumper_warp.rl.ppo import Ppo
 from jumper_warp.tasks.interface import interface
@@ -75,7 +75,7 @@ def test_expanded_plain_network_has_the_same_output(hidden):
     model, x = walker(hidden), torch.randn(16, NUM_OBS)
     linear = [layer for layer in model.actor if isinstance(layer, torch.nn.Linear)]
     expected = model.mean(x)
-    layers = expand_symmetric_layers([(layer.weight, layer.bias) for layer in linear], WALKING)
+    layers = expand_layers([(layer.weight, layer.bias) for layer in linear], WALKING)
     for index, (weight, bias) in enumerate(layers):
         x = torch.nn.functional.linear(x, weight, bias)
         x = torch.nn.functional.elu(x) if index < len(layers) - 1 else x
