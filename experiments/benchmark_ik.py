@@ -16,7 +16,7 @@ import warp as wp
 from jumper_warp.cli.main import run_command
 from jumper_warp.robot.description import load_description
 from jumper_warp.utils.output import output_dir
-from jumper_warp.utils.runtime import announce
+from jumper_warp.utils.runtime import configure_device
 from support.inverse_kinematics import InverseKinematics, random_motors
 from support.scripts import DeviceArgs, report
 from support.timing import median_time
@@ -37,7 +37,7 @@ class Args(DeviceArgs):
 
 def main(args: Args) -> dict:
     """Run the benchmark and return its metrics."""
-    info, device, n = announce(args.device), wp.get_device(args.device), args.poses
+    info, device, n = configure_device(args.device), wp.get_device(args.device), args.poses
     folder = output_dir("benchmark_ik", args.out)
     description, rng = load_description(), np.random.default_rng(args.seed)
     robots = InverseKinematics(description, n, device)

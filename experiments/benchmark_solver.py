@@ -20,7 +20,7 @@ from jumper_warp.cli.main import run_command
 from jumper_warp.sim.simulation import SolverName
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.output import output_dir
-from jumper_warp.utils.runtime import announce
+from jumper_warp.utils.runtime import configure_device
 from jumper_warp.utils.threads import checked_threads
 from support.scripts import DeviceArgs, report
 from support.speed import time_solver, time_threads
@@ -51,7 +51,7 @@ class Args(DeviceArgs):
 
 def main(args: Args) -> dict:
     """Run the benchmark and return its metrics."""
-    values: dict = {"device": announce(args.device, args.threads[-1] if args.threads else None).name}
+    values: dict = {"device": configure_device(args.device, args.threads[-1] if args.threads else None).name}
     if args.threads and wp.get_device(args.device).is_cuda:
         raise InputError("threads are compared on a CPU; add --device cpu")
     folder = output_dir("benchmark_solver", args.out)

@@ -21,7 +21,7 @@ from jumper_warp.cli.main import run_command
 from jumper_warp.rl.cfg import PpoCfg
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.output import output_dir, write_metrics
-from jumper_warp.utils.runtime import announce
+from jumper_warp.utils.runtime import configure_device
 from support.scripts import ThreadArgs, report
 from support.speed import time_parts, time_ppo, time_rsl_rl
 from support.timing import over_baseline
@@ -67,7 +67,7 @@ class Args(ThreadArgs):
 
 def main(args: Args) -> dict:
     """Run the benchmark and return its figures."""
-    info = announce(args.device, args.threads)
+    info = configure_device(args.device, args.threads)
     folder = output_dir("benchmark_training", args.out)
     gpu = wp.get_device(args.device).is_cuda
     envs = args.envs or ((4096, 8192, 16384) if gpu else (64,))

@@ -20,7 +20,7 @@ from jumper_warp.robot.overlay import load_overlay
 from jumper_warp.robot.values import RobotValues
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.output import output_dir, write_metrics
-from jumper_warp.utils.runtime import announce
+from jumper_warp.utils.runtime import configure_device
 from support.agreement import ours, pinocchios, random_states
 
 UNITS = {
@@ -58,7 +58,7 @@ def differences(found: np.ndarray, expected: np.ndarray) -> tuple[float, float, 
 
 def main(args: Args) -> dict:
     """Compare all quantities and return the metrics."""
-    announce("cpu")
+    configure_device("cpu")
     folder = output_dir("dynamics_agreement", args.out)
     values = RobotValues.nominal(1) if args.robot is None else load_overlay(args.robot).robots()
     states = random_states(args.states, args.seed)

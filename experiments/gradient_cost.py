@@ -21,7 +21,7 @@ from jumper_warp.cli.main import run_command
 from jumper_warp.sim.simulation import SUBSTEPS
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.output import output_dir
-from jumper_warp.utils.runtime import announce
+from jumper_warp.utils.runtime import configure_device
 from support.gradient_runs import GradientRun, PlainJump
 from support.gradients import PUSH, TICKS, schedule
 from support.scripts import DeviceArgs, report
@@ -46,7 +46,7 @@ class Args(DeviceArgs):
 
 def main(args: Args) -> dict:
     """Run the experiment and return its figures."""
-    name, device = announce(args.device, 1).name, wp.get_device(args.device)
+    name, device = configure_device(args.device, 1).name, wp.get_device(args.device)
     folder = output_dir("gradient_cost", args.out)
     worlds = args.worlds or (4096 if device.is_cuda else 64)
     exact = GradientRun(1, True, args.device).run()

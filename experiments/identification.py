@@ -23,7 +23,7 @@ from jumper_warp.identification.recording import KINDS, replay_plan, simulate_pl
 from jumper_warp.identification.replay import Replay
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.output import output_dir
-from jumper_warp.utils.runtime import announce
+from jumper_warp.utils.runtime import configure_device
 from support.identification_methods import compare_methods
 from support.known_robots import make_case, plot_cases, policy_errors, run_case
 from support.scripts import report
@@ -63,7 +63,7 @@ class Args:
 
 def main(args: Args) -> dict[str, Any]:
     """Run the experiment and return its metrics."""
-    announce("cpu", args.threads)
+    configure_device("cpu", args.threads)
     folder, parameters = output_dir("identification", args.out), jumper_parameters()
     replay = Replay(device="cpu", threads=args.threads)
     ours = partial(replay_plan, Replay(device="cpu", threads=1))

@@ -67,8 +67,8 @@ def main(args: Args) -> dict:
                    device=args.device, tensorboard=False)  # fmt: skip
     result = train(cfg, make_env)
     values = {
-        "even_load_per_episode": result.figures["Episode_Reward/even_load"],
-        "mean_return": result.figures.get("Train/mean_return"),
+        "even_load_per_episode": result.metrics["Episode_Reward/even_load"],
+        "mean_return": result.metrics.get("Train/mean_return"),
         "iterations": result.iteration,
     }
     write_metrics(folder, values)

@@ -17,7 +17,7 @@ from jumper_warp.envs.env import Env
 from jumper_warp.evaluation.plots import figure
 from jumper_warp.policies.policy import Policy
 from jumper_warp.policies.runs import open_policy
-from jumper_warp.rl.networks import ActorCritic, weights_of
+from jumper_warp.rl.networks import ActorCritic, linear_layers
 from jumper_warp.trajectory.gauss_newton import Network, Tape, world_rows
 
 NOISE = 0.2
@@ -80,7 +80,7 @@ def policies() -> dict[str, Policy]:
     face = trained.interface
     torch.manual_seed(0)
     new = ActorCritic(face.sizes[0], face.sizes[-1], face.hidden, face.activation)
-    return {"new": Policy(weights_of(new.actor), trained.mean, trained.std, face), "trained": trained}
+    return {"new": Policy(linear_layers(new.actor), trained.mean, trained.std, face), "trained": trained}
 
 
 def spreads_of(policy: Policy, env: DifferentiableEnv, horizons: tuple[int, ...]) -> dict[str, list[Spread]]:

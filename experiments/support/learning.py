@@ -59,7 +59,7 @@ def warm_up(env: VecEnv, ppo: Ppo | Shac) -> None:
     """Compile the environment's kernels and the trainer's functions, and begin all episodes anew."""
     env.reset()
     env.step(torch.zeros(env.num_envs, env.num_actions, device=env.device))
-    ppo.prepare()
+    ppo.compile()
     env.reset()
     env.metrics()
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from jumper_warp.utils.output import output_dir, write_metrics
-from jumper_warp.utils.runtime import announce
+from jumper_warp.utils.runtime import configure_device
 
 
 @dataclass(frozen=True)
@@ -31,7 +31,7 @@ class ThreadArgs(DeviceArgs):
 
 def prepare(name: str, args: DeviceArgs, threads: int | None = None) -> Path:
     """Take up device and threads, print them, and return the folder of a script's results."""
-    announce(args.device, threads)
+    configure_device(args.device, threads)
     return output_dir(name, args.out)
 
 

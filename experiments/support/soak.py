@@ -11,7 +11,7 @@ import torch
 import warp as wp
 
 from jumper_warp.envs.env import Env
-from jumper_warp.rl.graphs import Captured
+from jumper_warp.rl.graphs import CapturedProcedure
 from jumper_warp.sim.simulation import Simulation
 from jumper_warp.sim.solver import SolverJumper
 from jumper_warp.tasks.cfg import TaskCfg
@@ -144,7 +144,7 @@ def soak_env(env: Env, args: SoakArgs) -> dict:
             env.step(action)
             totals.take(termination == apart, env.obs, env.critic_obs, env.reward)
 
-    run, rounds = Captured(some, env.device.type == "cuda"), -(-args.steps // args.hold)
+    run, rounds = CapturedProcedure(some, env.device.type == "cuda"), -(-args.steps // args.hold)
     looks = max(args.episode // args.hold, 1)
     start = time.perf_counter()
     for i in range(rounds):

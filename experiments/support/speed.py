@@ -183,7 +183,7 @@ def time_ppo(envs: int, cfg: PpoCfg, iterations: int, device: str | None) -> dic
     begin = time.perf_counter()
     ppo = Ppo(env, cfg)
     before = ppo.model.log_std.detach().clone()
-    ppo.prepare()
+    ppo.compile()
     for _ in range(3):  # eager, capture, replay
         ppo.iterate()
     wp.synchronize_device(device)

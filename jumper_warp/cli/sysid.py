@@ -14,7 +14,7 @@ from jumper_warp.cli.main import TASK_MODULE_HELP, UsageError, parse
 from jumper_warp.identification.motions import NoiseLevels, load_motions
 from jumper_warp.identification.parameters import jumper_parameters
 from jumper_warp.utils.errors import InputError
-from jumper_warp.utils.files import json_bytes, write_whole
+from jumper_warp.utils.files import json_bytes, write_atomically
 
 HELP = f"""\
 usage: jumper sysid DATA ... [flags]
@@ -150,7 +150,7 @@ def sysid(cfg: SysidCfg) -> None:
     from jumper_warp.identification.identify import identify, identify_by_evolution, weighed
     from jumper_warp.identification.report import write_results
     from jumper_warp.utils.output import output_dir
-    from jumper_warp.utils.runtime import announce
+    from jumper_warp.utils.runtime import configure_device
 
     cfg.noise.check()
     parameters = jumper_parameters(names(cfg.params)).without(names(cfg.without))
@@ -158,7 +158,7 @@ def sysid(cfg: SysidCfg) -> None:
     settings["knowledge"] = [] if cfg.mass is None else [weighed(cfg.mass, cfg.mass_deviation)]
     given = {name: getattr(cfg, name) for name in ("base", "gains", "torque_limit", "torque_constant")}
     motions = load_motions(cfg.data, **given)
-    announce(cfg.device, cfg.threads)
+    configure_device(cfg.device, cfg.threads)
     if cfg.method == "cma":
         found = identify_by_evolution(motions, parameters, max_seconds=cfg.max_seconds, **settings)
     else:
@@ -191,12 +191,12 @@ def excite(cfg: ExciteCfg) -> None:
     from jumper_warp.robot.overlay import load_overlay
     from jumper_warp.robot.values import RobotValues
     from jumper_warp.utils.output import output_dir
-    from jumper_warp.utils.runtime import announce
+    from jumper_warp.utils.runtime import configure_device
 
     cfg.noise.check()
     parameters = jumper_parameters(names(cfg.params))
     robots = RobotValues.nominal(1) if cfg.robot is None else load_overlay(cfg.robot).robots()
-    announce("cpu", cfg.threads)
+    configure_device("cpu", cfg.threads)
     scorer = Scorer(parameters, cfg.noise, Replay(device="cpu", threads=cfg.threads))
     chosen = choose(scorer, KINDS * cfg.sets, candidates=cfg.candidates, seconds=cfg.seconds, seed=cfg.seed)
     rng = None if cfg.exact else np.random.default_rng([cfg.seed, 1])
@@ -205,7 +205,7 @@ def excite(cfg: ExciteCfg) -> None:
     for motion, gain in zip(motions, chosen.gain, strict=True):
         print(f"{motion.name}: {len(motion.time) / 240.0:.2f} s, information up to here {gain:.1f} nat")
     mass = float(total_mass(robots)[0])
-    write_whole(folder / "excite.json", json_bytes({"mass_kg": mass} | chosen.to_json()))
+    write_atomically(folder / "excite.json", json_bytes({"mass_kg": mass} | chosen.to_json()))
     sure = int((chosen.deviations < 0.5).sum())
     print(f"{sure} of {len(parameters)} parameters are expected to be identified; motions in {folder}")
     print(f"the recorded robot weighs {mass:.3f} kg: jumper sysid {folder} --mass {mass:.3f}")
@@ -218,7 +218,7 @@ def characterise(cfg: ActuatorCfg) -> None:
 
     found = characterise_motor(load_bench(cfg.bench), cfg.motor, cfg.torque_noise)
     folder = output_dir("actuator", cfg.out)
-    write_whole(folder / "actuator.json", json_bytes(found.to_json()))
+    write_atomically(folder / "actuator.json", json_bytes(found.to_json()))
     for name, (value, low, high, unit) in found.rows().items():
         print(f"{name:<16}{value:10.5g} {unit:<6} 95 % {low:.5g} … {high:.5g}")
     print(folder / "actuator.json")

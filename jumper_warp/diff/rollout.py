@@ -28,7 +28,7 @@ from jumper_warp.sim.solver import check_step
 from jumper_warp.utils.checks import check_within
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.newton_types import Model
-from jumper_warp.utils.threads import checked_threads, run_side_by_side
+from jumper_warp.utils.threads import checked_threads, run_in_parallel
 
 MAX_SWEEPS = 200
 """Most sweeps of the contact iteration in a step."""
@@ -219,7 +219,7 @@ class Rollout:
         q, qd = self._input("q", q, (19,)), self._input("qd", qd, (18,))
         commands.before = q[7:] if before is None else self._input("before", before, (12,))
         commands.wrench = self._zeros(count, 6, self.num_worlds) if wrench is None else (
-            self._input("wrench", wrench, (count, 6))
+            self._input("wrench", wrench, (count, 6)),
         )  # fmt: skip
         pushes = (4, self.num_worlds)
         if impulse is not None and not (
@@ -358,7 +358,7 @@ class Rollout:
 
         jobs: list[Callable[[], None]] = [partial(launch, worlds) for worlds in self.slices]
         # Warp finds a kernel's function at its first launch; of two threads that do so at once one would run nothing
-        run_side_by_side(jobs, len(jobs) if kernel.key in self._launched else 1)
+        run_in_parallel(jobs, len(jobs) if kernel.key in self._launched else 1)
         self._launched.add(kernel.key)
 
     def _input(self, name: str, values: Any, shape: tuple[int, ...]) -> wp.array:

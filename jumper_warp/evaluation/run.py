@@ -33,7 +33,7 @@ from jumper_warp.robot.values import TRANSVERSAL
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.output import output_dir, write_metrics
-from jumper_warp.utils.runtime import announce
+from jumper_warp.utils.runtime import configure_device
 from jumper_warp.utils.threads import checked_threads
 
 HEIGHTS = ("height", "height-mars")
@@ -92,7 +92,7 @@ class Run(ABC):
         name: of the folder, unless `out` is given; record: number of worlds that are filmed.
         Raises InputError: there is no such device or number of threads; OSError: the folder cannot be made.
         """
-        announce(conditions.device, conditions.threads)
+        configure_device(conditions.device, conditions.threads)
         self.conditions, self.record = conditions, record
         self.folder = output_dir(name, out)
 

@@ -14,7 +14,7 @@ from jumper_warp.evaluation.film import PICTURE, Film, Strip, beside
 from jumper_warp.evaluation.log import EvaluationLog, Metrics, finite
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.utils.errors import InputError
-from jumper_warp.utils.rotations import INVERSE, rotate
+from jumper_warp.utils.rotations import CONJUGATE, rotate
 
 Velocity = tuple[float, float, float]
 AXES = ("vx", "vy", "yaw_rate")
@@ -156,7 +156,7 @@ class Walks(EvaluationLog):
 
 def body_velocity(arrays: dict[str, np.ndarray]) -> np.ndarray:
     """Return the velocity ahead and to the left [m/s] and the yaw rate [rad/s], body axes, (robots, 3)."""
-    back = arrays["base_quat"].astype(float) * INVERSE
+    back = arrays["base_quat"].astype(float) * CONJUGATE
     vel = rotate(back, arrays["base_vel"].astype(float))
     ang = rotate(back, arrays["base_ang_vel"].astype(float))
     return np.stack([vel[:, 0], vel[:, 1], ang[:, 2]], axis=1)

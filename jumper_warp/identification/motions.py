@@ -17,7 +17,7 @@ import numpy as np
 from jumper_warp.robot.description import MOTOR_JOINTS
 from jumper_warp.utils.checks import check_positive
 from jumper_warp.utils.errors import InputError
-from jumper_warp.utils.files import write_whole
+from jumper_warp.utils.files import write_atomically
 
 PER_MOTOR = ("target", "angle", "rate", "torque")
 CHANNELS = ("angle", "rate", "torque", "position", "quaternion")
@@ -177,7 +177,7 @@ class Motion:
         settings["notes"] = dict(self.notes)
         data = io.BytesIO()
         np.savez_compressed(data, settings=np.array(json.dumps(settings)), **self._arrays())
-        write_whole(path, data.getvalue())
+        write_atomically(path, data.getvalue())
 
 
 def load_motions(data: Sequence[Path], **settings: Any) -> list[Motion]:

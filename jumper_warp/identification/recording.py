@@ -17,7 +17,7 @@ from jumper_warp.robot.motors import MotorCfg
 from jumper_warp.robot.values import RobotValues
 from jumper_warp.sim.simulation import Simulation, SolverName, motor_values
 from jumper_warp.utils.errors import InputError
-from jumper_warp.utils.rotations import from_vector, multiply
+from jumper_warp.utils.rotations import from_rotation_vector, multiply
 
 Kind = Literal["hung chirp", "standing chirp", "small jump"]
 KINDS: tuple[Kind, ...] = ("hung chirp", "hung chirp", "standing chirp", "small jump")
@@ -78,7 +78,7 @@ def chirp_targets(ticks: int, rng: np.random.Generator, hung: bool) -> np.ndarra
     for motor in range(12):
         lateral = motor % 3 == 0
         size = (rng.uniform(6.0, 11.0) if lateral else rng.uniform(9.0, 15.0)) if hung else (
-            rng.uniform(2.0, 5.0) if lateral else rng.uniform(5.0, 10.0)
+            rng.uniform(2.0, 5.0) if lateral else rng.uniform(5.0, 10.0),
         )  # fmt: skip
         pace = rng.uniform(0.8, 1.2) if hung else 1.0
         wave = np.sin(2.0 * math.pi * (pace * turns + rng.uniform()))
@@ -222,7 +222,7 @@ def measured(
     quaternion = record.quaternion[:, :, 0]
     if rng is not None:
         values = {key: x + levels[key][0] * rng.normal(size=x.shape) for key, x in values.items()}
-        quaternion = multiply(from_vector(levels["orientation"][0] * rng.normal(size=(rows, 3))), quaternion)
+        quaternion = multiply(from_rotation_vector(levels["orientation"][0] * rng.normal(size=(rows, 3))), quaternion)
     between = (np.arange(rows) % base_every != 0)[:, None]
     values["position"], quaternion = (np.where(between, math.nan, x) for x in (values["position"], quaternion))
     if not torque:

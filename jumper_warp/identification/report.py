@@ -17,7 +17,7 @@ from jumper_warp.identification.findings import Identification
 from jumper_warp.identification.replay import Replay
 from jumper_warp.identification.residuals import MotionResiduals
 from jumper_warp.robot.description import MOTOR_JOINTS
-from jumper_warp.utils.files import write_whole
+from jumper_warp.utils.files import write_atomically
 
 UNITS = {"angle": ("deg", 180.0 / math.pi), "rate": ("rad/s", 1.0), "torque": ("N m", 1.0), "position": ("m", 1.0),
          "orientation": ("deg", 180.0 / math.pi)}  # fmt: skip
@@ -70,7 +70,7 @@ def to_json(found: Identification) -> dict[str, Any]:
 def write_results(found: Identification, folder: Path, source: str) -> None:
     """Write the overlay `identified.json`, whose source is noted, `report.json` and `report.html`. Raises OSError."""
     found.overlay(source).save(folder / "identified.json")
-    write_whole(folder / "report.json", (json.dumps(to_json(found), indent=2) + "\n").encode())
+    write_atomically(folder / "report.json", (json.dumps(to_json(found), indent=2) + "\n").encode())
     write_report(found, folder)
 
 
@@ -90,7 +90,7 @@ def write_report(found: Identification, folder: Path) -> None:
     for motion, start in zip(found.motions, found.starts, strict=True):
         parts.append(f"<h3>{html.escape(motion.motion.name)}</h3><p>{image(motion_plot(found, motion, start))}</p>")
     page = f"<!doctype html><html lang=en><meta charset=utf-8><title>{TITLE}</title><style>{STYLE}</style>"
-    write_whole(folder / "report.html", (page + "\n".join(parts) + "</html>\n").encode())
+    write_atomically(folder / "report.html", (page + "\n".join(parts) + "</html>\n").encode())
 
 
 def summary(found: Identification) -> str:

@@ -15,7 +15,7 @@ from jumper_warp.identification.stance import HANGING_HEIGHT, levelled, levellin
 from jumper_warp.robot.description import RobotDescription
 from jumper_warp.robot.values import RobotValues
 from jumper_warp.utils.errors import InputError
-from jumper_warp.utils.rotations import INVERSE, from_vector, multiply, rotate, to_vector
+from jumper_warp.utils.rotations import CONJUGATE, from_rotation_vector, multiply, rotate, to_rotation_vector
 
 LONGEST_GAP = 0.1
 """[s] Between two rows of a motion."""
@@ -136,7 +136,7 @@ class MotionResiduals:
             ground = stance(self.description, angle[None], rate[None])
             place[2] = ground.height[0]
             place, place_prior = first_values(motion.position, place, 0.02, 0.05)
-            up = rotate(quaternion * INVERSE, np.array([0.0, 0.0, 1.0]))
+            up = rotate(quaternion * CONJUGATE, np.array([0.0, 0.0, 1.0]))
             near = abs(place[2] - ground.height[0]) < 0.03 and float(up @ ground.up[0]) > math.cos(math.radians(6.0))
             self.standing = near and ground.gap[0] < 0.02
             if motion.position is not None:
@@ -179,7 +179,7 @@ class MotionResiduals:
             start.quaternion = multiply(half / np.linalg.norm(half, axis=1, keepdims=True), start.quaternion)
             start.position[:, 2] = ground.height
             start.velocity, start.spin = (rotate(start.quaternion, v) for v in (ground.velocity, ground.spin))
-        start.quaternion = multiply(from_vector(d[:, 24:27]), start.quaternion)
+        start.quaternion = multiply(from_rotation_vector(d[:, 24:27]), start.quaternion)
         if self.free:
             start.position = start.position + d[:, 27:30]
             start.velocity = start.velocity + d[:, 30:33]
@@ -211,8 +211,8 @@ class MotionResiduals:
                 found = np.moveaxis(at_rows(record.quaternion), 1, 2)
                 found = found / np.linalg.norm(found, axis=-1, keepdims=True)
                 known = np.nan_to_num(np.asarray(self.motion.quaternion)) + np.array([0.0, 0.0, 0.0, 1.0e-12])
-                known = known / np.linalg.norm(known, axis=-1, keepdims=True) * INVERSE
-                columns.append(np.moveaxis(to_vector(multiply(found, known[:, None])), 1, 2))
+                known = known / np.linalg.norm(known, axis=-1, keepdims=True) * CONJUGATE
+                columns.append(np.moveaxis(to_rotation_vector(multiply(found, known[:, None])), 1, 2))
             else:
                 values = at_rows(getattr(record, name))
                 columns.append(values + robots.offset.T if name == "angle" else values)

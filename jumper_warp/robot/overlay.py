@@ -16,7 +16,7 @@ from jumper_warp.robot.bounds import Range
 from jumper_warp.robot.description import RobotDescription
 from jumper_warp.robot.values import RobotValues
 from jumper_warp.utils.errors import InputError
-from jumper_warp.utils.files import write_whole
+from jumper_warp.utils.files import write_atomically
 
 SCHEMA = "jumper-warp robot overlay 1"
 RATIO = Range(0.05, 3.0, "times the described value")
@@ -113,7 +113,7 @@ class RobotOverlay:
 
     def save(self, path: Path) -> None:
         """Write it as a JSON file. Raises OSError."""
-        write_whole(path, (json.dumps(self.to_json(), indent=2, allow_nan=False) + "\n").encode())
+        write_atomically(path, (json.dumps(self.to_json(), indent=2, allow_nan=False) + "\n").encode())
 
 
 def check_names(what: str, names: Iterable[str], known: Iterable[str]) -> None:

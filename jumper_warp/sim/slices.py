@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import warp as wp
 
-from jumper_warp.utils.threads import run_side_by_side
+from jumper_warp.utils.threads import run_in_parallel
 
 LEAST = 16
 """Worlds of the smallest slice: fewer are not worth a thread, and two slices share no cache line of an array's row."""
@@ -50,4 +50,4 @@ class SlicedGraph:
         if len(self._graphs) == 1:
             wp.capture_launch(self._graphs[0])
         else:
-            run_side_by_side([partial(wp.capture_launch, graph) for graph in self._graphs], len(self._graphs))
+            run_in_parallel([partial(wp.capture_launch, graph) for graph in self._graphs], len(self._graphs))

@@ -175,13 +175,13 @@ def test_mujoco_has_one_slice():
 
 def test_jobs_run_at_the_same_time():
     meeting = threading.Barrier(3, timeout=30.0)
-    pool.run_side_by_side([meeting.wait] * 3, 3)
+    pool.run_in_parallel([meeting.wait] * 3, 3)
 
 
 def test_each_job_runs_once_whatever_the_number_of_threads():
     for threads in (1, 2, 5):
         done: list[int] = []
-        pool.run_side_by_side([partial(done.append, i) for i in range(7)], threads)
+        pool.run_in_parallel([partial(done.append, i) for i in range(7)], threads)
         assert sorted(done) == list(range(7))
 
 
@@ -201,9 +201,9 @@ def test_what_a_job_raises_reaches_the_caller_when_the_others_have_ended(failing
     jobs = [take_time, take_time]
     jobs[failing] = fail
     with pytest.raises(FloatingPointError, match="a slice failed"):
-        pool.run_side_by_side(jobs, 2)
+        pool.run_in_parallel(jobs, 2)
     assert ended == [True]
-    pool.run_side_by_side([lambda: ended.append(True)] * 2, 2)  # the threads go on
+    pool.run_in_parallel([lambda: ended.append(True)] * 2, 2)  # the threads go on
     assert len(ended) == 3
 
 
