@@ -92,7 +92,7 @@ def test_observations_actions_and_targets_agree_with_the_environment(page, name,
         env.step(expected)
         assert deployed.action is action  # the last action of the next observation
         deployed.action = expected[0].numpy()  # a policy may amplify differences of its last actions in flight
-        env_target = env.robot.safe_target.numpy()[:, 0]
+        env_target = env.robot.filtered_target.numpy()[:, 0]
         pairs = ((obs, env_obs), (action, expected[0].numpy()), (filtered, env_target))
         errors = np.maximum(errors, [np.abs(a - b).max() for a, b in pairs])
     assert env.task_arrays()["phase"][0] == 2 and (command.requested, command.in_flight) == (False, False)
