@@ -22,7 +22,7 @@ import tyro
 from jumper_warp.cli.main import run_command
 from jumper_warp.evaluation.plots import drawn
 from jumper_warp.evaluation.run import EvaluationArgs, EvaluationRun
-from jumper_warp.evaluation.turns import DIRECTIONS, TurnFlags, Turns, axis_metrics, turn_metrics, turns_about_any
+from jumper_warp.evaluation.turns import DIRECTIONS, AttitudeLog, TurnFlags, axis_metrics, turn_metrics, turns_about_any
 from support.momentum import MomentumWatch, rotational_inertia
 
 HARDWARE = {"mean_settling_s": 2.6}
@@ -47,7 +47,7 @@ class Args(EvaluationArgs, TurnFlags):
         TurnFlags.__post_init__(self)
 
 
-def plot(run: EvaluationRun, turns: Turns, title: str) -> None:
+def plot(run: EvaluationRun, turns: AttitudeLog, title: str) -> None:
     """Draw the errors of turns about the body's axes over time."""
     errors = np.degrees(np.array(turns.errors))
     time = (np.arange(len(errors)) + 1) * turns.step_dt
@@ -77,7 +77,7 @@ def main(args: Args) -> dict:
     run.follow(env, turns, film="turns", watch=watch)
     values = turn_metrics(turns) | axis_metrics(turns) | watch.metrics(turns.apart, inertia)
     plot(run, turns, f"{args.turns} turns by {args.angle:g} degrees, {run.title}")
-    others = Turns(turns_about_any(args.turns, args.angle, args.seed), args.tolerance, args.seconds)
+    others = AttitudeLog(turns_about_any(args.turns, args.angle, args.seed), args.tolerance, args.seconds)
     run.follow(env, others)
     values |= {f"any_axis_{name}": value for name, value in turn_metrics(others).items()}
     return run.report(values, HARDWARE)

@@ -22,7 +22,7 @@ import tyro
 from jumper_warp.cli.main import run_command
 from jumper_warp.evaluation.run import EvaluationArgs
 from jumper_warp.utils.errors import InputError
-from support.flights import FlightRun, Flights, delays, draw_flights, flight_metrics
+from support.flights import FlightLog, FlightRun, delays, draw_flights, flight_metrics
 
 
 @dataclass(frozen=True)
@@ -60,7 +60,7 @@ def main(args: Args) -> dict:
     env, heights = run.env(args.flights), np.linspace(*args.heights, args.flights)
     late = delays(args.flights, 1.0e-3 * args.late, args.seed) if args.takeoff == "open-loop" else None
     found = {
-        name: run.fly(env, Flights(heights, late, turns=name == "turning"), name) for name in ("turning", "without")
+        name: run.fly(env, FlightLog(heights, late, turns=name == "turning"), name) for name in ("turning", "without")
     }
     draw_flights(run.folder / "flights.png", found)
     told = {"takeoff": args.takeoff, "landing": args.landing or "default pose"}

@@ -19,7 +19,7 @@ from jumper_warp.cli.main import run_command
 from jumper_warp.evaluation.plots import drawn
 from jumper_warp.evaluation.run import HEIGHTS, PLACES, EvaluationArgs, EvaluationRun
 from jumper_warp.utils.errors import InputError
-from support.holds import Holds, hold_goals, hold_metrics
+from support.holds import SquatLog, hold_goals, hold_metrics
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,7 @@ def main(args: Args) -> dict:
     env = run.env(args.squats)
     up = run.task.evaluation in HEIGHTS
     goals = hold_goals(args.squats, args.height if up else args.distance, up=up)
-    holds = run.follow(env, Holds(goals, args.hold), film="holds")
+    holds = run.follow(env, SquatLog(goals, args.hold), film="holds")
     if not holds.over.all():
         plot(run, holds)
     return run.report({"hold_s": args.hold} | hold_metrics(holds), {})

@@ -19,7 +19,7 @@ from jumper_warp.cli.main import run_command
 from jumper_warp.evaluation.places import random_headings
 from jumper_warp.evaluation.plots import drawn
 from jumper_warp.evaluation.run import EvaluationArgs, EvaluationRun
-from jumper_warp.evaluation.velocities import Walks, check_walks
+from jumper_warp.evaluation.velocities import VelocityLog, check_walks
 from jumper_warp.robot.terrain import KINDS, TerrainCfg, single_tile
 from jumper_warp.utils.errors import InputError
 from support.walks import walked
@@ -63,7 +63,7 @@ def main(args: Args) -> dict:
     for kind in args.terrains:
         ground = single_tile(terrain, kind)
         env = run.env(args.robots, ground=ground)
-        asked = Walks(commands, env.task, SECONDS, headings=random_headings(args.robots, args.seed))
+        asked = VelocityLog(commands, env.task, SECONDS, headings=random_headings(args.robots, args.seed))
         walks = run.follow(env, asked, film=kind, drawn={"ground": ground})
         shares[kind] = walked(walks)
         figures[f"success_rate_{kind}"] = float(shares[kind].mean())

@@ -21,7 +21,7 @@ import tyro
 from jumper_warp.cli.main import run_command
 from jumper_warp.evaluation.plots import drawn
 from jumper_warp.evaluation.run import EvaluationArgs, EvaluationRun
-from jumper_warp.evaluation.velocities import AXES, Walks, check_walks, grid, tracking_metrics
+from jumper_warp.evaluation.velocities import AXES, VelocityLog, check_walks, grid, tracking_metrics
 from jumper_warp.utils.errors import InputError
 from support.gaits import Gait
 from support.walks import HOLD, PAPER, REACH, STEP, kicked, redirected, settling_times, sped_up, speed_metrics
@@ -47,7 +47,7 @@ class Args(EvaluationArgs):
         check_walks(self.per_axis**3, 10.0)
 
 
-def plot(run: EvaluationRun, walks: Walks, settling: np.ndarray) -> None:
+def plot(run: EvaluationRun, walks: VelocityLog, settling: np.ndarray) -> None:
     """Draw mean velocities over commands, and how soon robots settle."""
     history = walks.history()[round(1.0 / walks.step_dt) :]
     with drawn(run.folder / "tracking.png", 2, 2, figsize=(9, 8)) as axes:
@@ -69,13 +69,13 @@ def main(args: Args) -> dict:
     """Run all tests and return their figures."""
     run, rng = EvaluationRun.of("walking_tracking", args, ("velocity",)), np.random.default_rng(args.seed)
     env = run.env(args.per_axis**3)
-    walks = run.follow(env, Walks(grid(args.per_axis, 3 * (REACH,)), env.task))
+    walks = run.follow(env, VelocityLog(grid(args.per_axis, 3 * (REACH,)), env.task))
     again = run.follow(env, redirected(env, rng), film="walk")
     settling = settling_times(again)
     fast, which = sped_up(env)
     run.follow(env, fast)
     thrown = run.follow(env, kicked(env, rng))
-    straight, gait = Walks(np.tile([GAIT_SPEED, 0.0, 0.0], (env.num_envs, 1, 1)), env.task), Gait(env)
+    straight, gait = VelocityLog(np.tile([GAIT_SPEED, 0.0, 0.0], (env.num_envs, 1, 1)), env.task), Gait(env)
     run.follow(env, straight, watch=gait)
     plot(run, walks, settling)
     median, held = (float(np.median(times)) for times in (settling, settling_times(again, HOLD)))

@@ -25,7 +25,7 @@ from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.tasks.saving import task_to_json
 from jumper_warp.utils.errors import InputError
 from support.departures import Undone
-from support.holds import Holds, hold_goals, hold_metrics
+from support.holds import SquatLog, hold_goals, hold_metrics
 
 ELSEWHERE = {"log_root", "device", "threads"}
 """Settings in which a training may differ from one that is there already."""
@@ -113,7 +113,7 @@ def measured(checkpoint: Path, args: Any, folder: Path) -> dict[str, dict[str, A
         values = flags.metrics(run.follow(env, flags.log(env.task, 0)))
         values["error_m"] = values.get("mean_abs_error_m", values.get("mean_error_m"))
         goals = hold_goals(args.squats, JUMPS[args.task].squats, up=run.task.evaluation in HEIGHTS)
-        values |= hold_metrics(run.follow(run.env(args.squats, conditions=conditions), Holds(goals, HOLD)))
+        values |= hold_metrics(run.follow(run.env(args.squats, conditions=conditions), SquatLog(goals, HOLD)))
         tests[test] = {name: value for name, value in values.items() if isinstance(value, bool | int | float | None)}
     return tests
 

@@ -50,7 +50,7 @@ ROWS = np.array([[1.0, 1.0], [1.0, -1.0], [-1.0, 1.0], [-1.0, -1.0]])
 
 
 @dataclass
-class Flights(EvaluationLog):
+class FlightLog(EvaluationLog):
     """What became of one jump per world; arrays have shape (num_envs,). Nothing changes after its end."""
 
     apex: np.ndarray
@@ -284,7 +284,7 @@ class FlightRun(Run):
         self.told["gravity_m_s2"] = env.task.gravity
         return env
 
-    def fly(self, env: Env, flights: Flights, film: str) -> Flights:
+    def fly(self, env: Env, flights: FlightLog, film: str) -> FlightLog:
         """Follow flights, and return them."""
         self.flights = flights
         self.follow(env, flights, film=film)

@@ -17,7 +17,7 @@ DOWN = 0.1
 
 
 @dataclass
-class Holds(EvaluationLog):
+class SquatLog(EvaluationLog):
     """What robots do that squat and wait, a world each; nothing of one is looked at after its end."""
 
     goals: np.ndarray
@@ -91,7 +91,7 @@ class Holds(EvaluationLog):
 
 
 def hold_goals(count: int, reach: tuple[float, float], *, up: bool) -> np.ndarray:
-    """Return goals, evenly over a reach [m], as `Holds` takes them, (count, 3); up: heights, else places ahead."""
+    """Return goals, evenly over a reach [m], as `SquatLog` takes them, (count, 3); up: heights, else places ahead."""
     goals = np.zeros((count, 3))
     goals[:, 2 if up else 0] = np.linspace(*reach, count)
     return goals

@@ -6,7 +6,7 @@ import numpy as np
 
 from jumper_warp.envs.env import Env
 from jumper_warp.evaluation.log import Metrics
-from jumper_warp.evaluation.velocities import SKIP, Walks
+from jumper_warp.evaluation.velocities import SKIP, VelocityLog
 
 REACH, STEP, KICK = 0.8, 0.8, 0.5
 """[m/s] and [rad/s] of the commands; [m/s] by which a command and a velocity jump."""
@@ -24,13 +24,13 @@ HOLD = 0.5
 """[s] For which a robot stays within that error that has settled in spite of pushes."""
 
 
-def redirected(env: Env, rng: np.random.Generator) -> Walks:
+def redirected(env: Env, rng: np.random.Generator) -> VelocityLog:
     """Return walks with another command after 3 s."""
     commands = steps_of(rng, env.num_envs, REACH, STEP)
-    return Walks(commands, env.task, 7.0, times=np.array([0.0, 3.0]))
+    return VelocityLog(commands, env.task, 7.0, times=np.array([0.0, 3.0]))
 
 
-def sped_up(env: Env) -> tuple[Walks, np.ndarray]:
+def sped_up(env: Env) -> tuple[VelocityLog, np.ndarray]:
     """Return walks at ever higher speeds, and the index of each robot's direction."""
     which = np.arange(env.num_envs) % len(DIRECTIONS)
     commands = np.zeros((env.num_envs, 7, 3))
@@ -38,18 +38,18 @@ def sped_up(env: Env) -> tuple[Walks, np.ndarray]:
         speeds = sign * np.linspace(0.3, highest, int((which == i).sum()))
         commands[which == i, :, axis] = speeds[:, None] * np.linspace(1.0 / 7.0, 1.0, 7)
     times = RAMP * np.arange(7) / 7.0
-    return Walks(commands, env.task, RAMP + 1.0 + KEEP, times=times), which
+    return VelocityLog(commands, env.task, RAMP + 1.0 + KEEP, times=times), which
 
 
-def kicked(env: Env, rng: np.random.Generator) -> Walks:
+def kicked(env: Env, rng: np.random.Generator) -> VelocityLog:
     """Return walks with drawn commands whose velocity jumps at a drawn moment."""
     n = env.num_envs
     commands, angle = rng.uniform(-REACH, REACH, (n, 1, 3)), rng.uniform(0.0, 2.0 * np.pi, n)
     kick = KICK * np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    return Walks(commands, env.task, 7.0, kick_time=rng.uniform(2.0, 4.0, n), kick=kick)
+    return VelocityLog(commands, env.task, 7.0, kick_time=rng.uniform(2.0, 4.0, n), kick=kick)
 
 
-def speed_metrics(walks: Walks, which: np.ndarray) -> Metrics:
+def speed_metrics(walks: VelocityLog, which: np.ndarray) -> Metrics:
     """Return the highest speed that was kept in each direction."""
     found: Metrics = {}
     for i, (name, (axis, _, _)) in enumerate(DIRECTIONS.items()):
@@ -73,7 +73,7 @@ def steps_of(rng: np.random.Generator, robots: int, reach: float, step: float) -
     return commands
 
 
-def settling_times(walks: Walks, hold: float | None = None) -> np.ndarray:
+def settling_times(walks: VelocityLog, hold: float | None = None) -> np.ndarray:
     """Return how long after the last command each robot's velocity in the plane stays within SETTLED of it [s].
 
     Velocities are means of the last SMOOTHING seconds. Infinite where it never does, or the robot falls.
@@ -95,7 +95,7 @@ def settling_times(walks: Walks, hold: float | None = None) -> np.ndarray:
     return np.where(last == len(off), np.inf, last * walks.step_dt)
 
 
-def kept_speeds(walks: Walks, axis: int, seconds: float, share: float) -> np.ndarray:
+def kept_speeds(walks: VelocityLog, axis: int, seconds: float, share: float) -> np.ndarray:
     """Return which robots kept their last command along an axis within a share of it over the last seconds on average.
 
     The two other velocities are not judged.
@@ -105,7 +105,7 @@ def kept_speeds(walks: Walks, axis: int, seconds: float, share: float) -> np.nda
     return np.abs(last - wanted) <= share * np.abs(wanted)
 
 
-def walked(walks: Walks) -> np.ndarray:
+def walked(walks: VelocityLog) -> np.ndarray:
     """Return the share of the way that each robot went until it fell, at most 1, commanded to go straight ahead.
 
     What it goes ahead counts, whatever its heading is then; the time of setting off, SKIP, is not asked for.

@@ -13,7 +13,7 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
-from jumper_warp.evaluation.courses import Course, course_metrics, draw_course
+from jumper_warp.evaluation.courses import CourseLog, course_metrics, draw_course
 from jumper_warp.evaluation.film import Film
 from jumper_warp.evaluation.log import EvaluationLog, run_evaluation
 from jumper_warp.evaluation.run import EvaluationRun, SkillRun
@@ -155,7 +155,7 @@ def play_script(cfg: ScriptCfg) -> Path:
     script = read_script(cfg.script)
     run = SkillRun(cfg.policies)
     run.prepare("play", cfg.conditions, cfg.out)
-    course = Course([script])
+    course = CourseLog([script])
     env = run.env(1, block=course.block)
     film = Film(env, course.series, [0], notes={**course.notes([0]), "solver": cfg.conditions.solver})
     run_evaluation(run.actor(env), env, course, watch=film)

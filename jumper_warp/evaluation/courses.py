@@ -48,7 +48,7 @@ NAMES = {WALK: "walk", JUMP_UP: "jump up", JUMP_TO: "jump to"}
 
 
 @dataclass
-class Course(EvaluationLog):
+class CourseLog(EvaluationLog):
     """What became of every robot's course; nothing of a robot counts after its end."""
 
     scripts: Sequence[Sequence[ScriptStep]]
@@ -260,7 +260,7 @@ def _worst(values: np.ndarray) -> np.ndarray:
     return np.where(known.any(axis=1), np.where(known, values, -np.inf).max(axis=1), np.nan)
 
 
-def course_metrics(course: Course) -> Metrics:
+def course_metrics(course: CourseLog) -> Metrics:
     """Return the metrics of all robots together.
 
     `success_rate` is the share of robots that made every command without a fall, whatever their errors;
@@ -300,14 +300,14 @@ def course_metrics(course: Course) -> Metrics:
     } | failures(course.outcomes[~done])  # fmt: skip
 
 
-def tracking_error(course: Course) -> np.ndarray:
+def tracking_error(course: CourseLog) -> np.ndarray:
     """Return velocity less command, (steps, robots, 3), NaN where it does not count."""
     error = np.array(course.velocity, dtype=float) - np.array(course.wanted, dtype=float)
     error[~np.array(course.counts)] = np.nan
     return error
 
 
-def handover_forces(course: Course) -> tuple[np.ndarray, np.ndarray]:
+def handover_forces(course: CourseLog) -> tuple[np.ndarray, np.ndarray]:
     """Return how the force on a paw varies before each handover to a jump [N], and by how much it steps there.
 
     Of the paw where it does so most: peak to peak over the last QUIET seconds of the stand before it; and from the last
@@ -324,14 +324,14 @@ def handover_forces(course: Course) -> tuple[np.ndarray, np.ndarray]:
     return np.array(ripples), np.array(steps)
 
 
-def active_spans(course: Course, world: int) -> list[tuple[int, float, float]]:
+def active_spans(course: CourseLog, world: int) -> list[tuple[int, float, float]]:
     """Return the skills of a robot one after the other: index, beginning and end [s]."""
     skills = np.array(course.skills)[:, world]
     edges = [0, *(np.flatnonzero(np.diff(skills)) + 1).tolist(), len(skills)]
     return [(int(skills[a]), a * course.step_dt, b * course.step_dt) for a, b in pairwise(edges)]
 
 
-def draw_course(path: Path, course: Course, world: int, title: str = "") -> None:
+def draw_course(path: Path, course: CourseLog, world: int, title: str = "") -> None:
     """Draw velocities and commands, height and active skill of a robot over time."""
     with drawn(path, 5, 1, figsize=(10, 9), sharex=True) as axes:
         time = course.step_dt * np.arange(1, len(course.skills) + 1)

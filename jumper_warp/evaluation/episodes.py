@@ -21,7 +21,7 @@ MOST_NUMBERS = 4
 
 
 @dataclass
-class Episodes(EvaluationLog):
+class EpisodeLog(EvaluationLog):
     """What became of one episode per world; each array has shape (num_envs, ...). Nothing changes after its end."""
 
     commands: np.ndarray
@@ -154,9 +154,9 @@ class EpisodeFlags:
         """Raises InputError: a setting is out of range."""
         check_episodes(self.episodes, self.command, self.seconds)
 
-    def log(self, task: TaskCfg, seed: int) -> Episodes:
+    def log(self, task: TaskCfg, seed: int) -> EpisodeLog:
         """Return episodes with this command."""
-        return Episodes(filled(self.command, self.episodes, task), task, self.seconds)
+        return EpisodeLog(filled(self.command, self.episodes, task), task, self.seconds)
 
     def metrics(self, log: Episodes) -> Metrics:
         """Return `episode_metrics`."""
@@ -176,6 +176,6 @@ class EpisodeGoals:
         """Raises InputError: a setting is out of range."""
         check_episodes(1, self.command, self.length)
 
-    def log(self, task: TaskCfg) -> Episodes:
+    def log(self, task: TaskCfg) -> EpisodeLog:
         """Return one robot's episode."""
-        return Episodes(filled(self.command, 1, task), task, self.length)
+        return EpisodeLog(filled(self.command, 1, task), task, self.length)

@@ -66,7 +66,7 @@ def ended_by_takeoff(task: TaskCfg) -> TaskCfg:
     return replace(task, terminations=(*task.terminations[:-1], takeoff, task.terminations[-1]))
 
 
-class PlaceLog(JumpLog):
+class LandingLog(JumpLog):
     """Jumps to places in the plane. One that begins on command and lands within SUCCESS_TOLERANCE is a success."""
 
     spacing = 3.0
@@ -153,7 +153,7 @@ class PlaceLog(JumpLog):
         return Strip(index, frames, captions, eye, target, PICTURE)
 
 
-def landing_metrics(landings: PlaceLog, inside: np.ndarray | None = None) -> Metrics:
+def landing_metrics(landings: LandingLog, inside: np.ndarray | None = None) -> Metrics:
     """Return the metrics of jumps to places, all rows together.
 
     Errors are over all jumps, failed ones included, but those whose simulation came apart, which `came_apart` counts,
@@ -231,14 +231,14 @@ class PlaceFlags(JumpFlags):
         if self.heading != "any" and not math.isfinite(self.heading):
             raise InputError(f"heading must be finite or any, got {self.heading}")
 
-    def log(self, task: TaskCfg, seed: int) -> PlaceLog:
+    def log(self, task: TaskCfg, seed: int) -> LandingLog:
         """Return single jumps with these goals and headings."""
         rng = np.random.default_rng(seed)
         places = np.stack([np.linspace(*self.x, self.jumps), rng.uniform(*self.y, self.jumps)], axis=1)
         headings = random_headings(self.jumps, seed) if self.heading == "any" else math.radians(self.heading)
-        return PlaceLog(places[:, None], termination_names(task), headings)
+        return LandingLog(places[:, None], termination_names(task), headings)
 
-    def metrics(self, log: PlaceLog) -> Metrics:
+    def metrics(self, log: LandingLog) -> Metrics:
         """Return `landing_metrics`, with the range."""
         inside = within(np.linalg.norm(log.places, axis=-1), self.in_range)
         return landing_metrics(log, inside) | {"range_lower_m": self.in_range[0], "range_upper_m": self.in_range[1]}
@@ -272,6 +272,6 @@ class PlaceGoals:
         """[s] Of the recording."""
         return SECONDS + SECONDS_MORE * len(self.then)
 
-    def log(self, task: TaskCfg) -> PlaceLog:
+    def log(self, task: TaskCfg) -> LandingLog:
         """Return one row of jumps a robot."""
-        return PlaceLog(np.array([[goal, *self.then] for goal in self.goals]), termination_names(task))
+        return LandingLog(np.array([[goal, *self.then] for goal in self.goals]), termination_names(task))

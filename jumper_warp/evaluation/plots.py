@@ -11,7 +11,7 @@ import matplotlib
 import numpy as np
 
 from jumper_warp.evaluation.jumps import JumpLog
-from jumper_warp.evaluation.places import PlaceLog
+from jumper_warp.evaluation.places import LandingLog
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
@@ -40,7 +40,7 @@ def draw_sweep(
     axis.legend(loc="upper left")
 
 
-def draw_landings(path: Path, tests: dict[str, PlaceLog], size: tuple[float, float]) -> None:
+def draw_landings(path: Path, tests: dict[str, LandingLog], size: tuple[float, float]) -> None:
     """Draw goals and landings of first jumps from above, the start at the origin, a panel a test (title to jumps)."""
     with drawn(path, 1, len(tests), figsize=size, squeeze=False) as axes:
         for axis, (title, landings) in zip(axes[0], tests.items(), strict=True):

@@ -15,7 +15,7 @@ import numpy as np
 
 from jumper_warp.evaluation.film import block_places
 from jumper_warp.evaluation.log import largest, mean, within
-from jumper_warp.evaluation.places import AT_END, FALLS, MISSED, PlaceLog, landing_metrics, trained_range
+from jumper_warp.evaluation.places import AT_END, FALLS, MISSED, LandingLog, landing_metrics, trained_range
 from jumper_warp.evaluation.plots import Track, draw_landings, draw_paths, drawn
 from jumper_warp.evaluation.run import EvaluationRun
 from jumper_warp.evaluation.sweeps import DistanceSweep, HeightSweep, Suite, check
@@ -167,7 +167,7 @@ class Consecutive(Suite):
         return {"rest_s": self.rest} | consecutive_metrics(*logs)
 
 
-def consecutive_metrics(pairs: PlaceLog, row: PlaceLog) -> dict[str, Any]:
+def consecutive_metrics(pairs: LandingLog, row: LandingLog) -> dict[str, Any]:
     """Return the metrics of both tests of jumps in a row; the first half of the pairs are the diagonal ones."""
     values, ten = (landing_metrics(landings) for landings in (pairs, row))
     for part in (values, ten):
@@ -227,7 +227,7 @@ class Platform(Suite):
         """Follow the jumps of all scenes, draw them, and return each scene's metrics under its name, and their mean."""
         rng = np.random.default_rng(self.seed)
         goals, values = rng.uniform(GROUND_LOWER, GROUND_UPPER, (self.jumps, 2)), {}
-        done: dict[str, PlaceLog] = {}
+        done: dict[str, LandingLog] = {}
         for name, special, headings in self.scenes(goals, rng):
             env = run.env(self.jumps, **special)
             done[name] = self.jump(run, goals[:, None], env, headings=headings, film=name, drawn=special)
@@ -312,7 +312,7 @@ def draw_distances(run: EvaluationRun, values: dict[str, Any]) -> None:
         bottom.set(xlabel="commanded distance [m]", ylabel="mean error of successes [m]", ylim=(0.0, None))
 
 
-def distance_metrics(bins: dict[float, PlaceLog]) -> dict[str, Any]:
+def distance_metrics(bins: dict[float, LandingLog]) -> dict[str, Any]:
     """Return the metrics over all bins (middle [m] to jumps), and lists with an entry a bin."""
     each = [landing_metrics(landings) for landings in bins.values()]
     lists: dict[str, list[Any]] = {name: [values[name] for values in each] for name in EACH}

@@ -15,7 +15,7 @@ from jumper_warp.evaluation.jumps import DELAY, REST_TIME
 from jumper_warp.evaluation.limits import limit_metrics, open_loop_limits
 from jumper_warp.evaluation.log import Metrics, mean, termination_names, within
 from jumper_warp.evaluation.places import (
-    PlaceLog,
+    LandingLog,
     ended_by_takeoff,
     for_evaluation,
     landing_metrics,
@@ -83,14 +83,14 @@ class Suite(EvaluationArgs):
         headings: np.ndarray | None = None,
         delay: np.ndarray | float = DELAY,
         **follow: Any,
-    ) -> PlaceLog:
+    ) -> LandingLog:
         """Return jumps to places [m], (num_envs, jumps in a row, 2).
 
-        env, headings: made and drawn unless given; delay: as in `PlaceLog`; follow: as in `EvaluationRun.follow`.
+        env, headings: made and drawn unless given; delay: as in `LandingLog`; follow: as in `EvaluationRun.follow`.
         """
         env = run.env(len(places)) if env is None else env
         headings = random_headings(len(places), self.seed) if headings is None else headings
-        return run.follow(env, PlaceLog(places, termination_names(env.task), headings, delay, self.rest), **follow)
+        return run.follow(env, LandingLog(places, termination_names(env.task), headings, delay, self.rest), **follow)
 
     def pushed_in_flight(self, run: EvaluationRun, measure: Callable[[Conditions], Metrics], *names: str) -> Metrics:
         """Return some metrics of a randomised test in which robots are pushed in flight too."""
@@ -180,7 +180,7 @@ class DistanceSweep(Suite):
         (near, far), goals = self.distances, f"{self.distances}, {self.aside} aside"
         check(0.0 < near < far < 10.0 and 0.0 <= self.aside < 10.0, f"goals must be within 10 m and rise, got {goals}")
 
-    def follow(self, run: EvaluationRun, conditions: Conditions, film: str = "") -> PlaceLog:
+    def follow(self, run: EvaluationRun, conditions: Conditions, film: str = "") -> LandingLog:
         """Return the jumps in some conditions."""
         aside = np.random.default_rng(self.seed + 1).uniform(-self.aside, self.aside, self.jumps)
         places = np.stack([np.linspace(*self.distances, self.jumps), aside], axis=1)[:, None]
@@ -188,7 +188,7 @@ class DistanceSweep(Suite):
         return self.jump(run, places, env, film=film)
 
     @staticmethod
-    def metrics(landings: PlaceLog) -> Metrics:
+    def metrics(landings: LandingLog) -> Metrics:
         """Return the metrics of the sweep."""
         distance = landings.places[..., 0]
         values = landing_metrics(landings, within(distance, DISTANCES_IN_RANGE))

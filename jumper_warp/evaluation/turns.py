@@ -52,7 +52,7 @@ def turns_about_any(count: int, angle: float, seed: int) -> np.ndarray:
 
 
 @dataclass
-class Turns(EvaluationLog):
+class AttitudeLog(EvaluationLog):
     """What became of one turn per world; arrays have shape (num_envs,). What came apart is followed no further."""
 
     turns: np.ndarray
@@ -211,9 +211,9 @@ class TurnFlags:
         if not 0.1 <= self.seconds <= 60.0:
             raise InputError(f"seconds must be in [0.1, 60], got {self.seconds}")
 
-    def log(self, task: TaskCfg, seed: int) -> Turns:
+    def log(self, task: TaskCfg, seed: int) -> AttitudeLog:
         """Return the turns."""
-        return Turns(turns_about_axes(self.turns, self.angle), self.tolerance, self.seconds)
+        return AttitudeLog(turns_about_axes(self.turns, self.angle), self.tolerance, self.seconds)
 
     def metrics(self, log: Turns) -> Metrics:
         """Return `turn_metrics` and `axis_metrics`."""
@@ -234,6 +234,6 @@ class TurnGoals:
         if not 0.0 < self.angle <= 180.0:
             raise InputError(f"angle must be in (0, 180] degrees, got {self.angle}")
 
-    def log(self, task: TaskCfg) -> Turns:
+    def log(self, task: TaskCfg) -> AttitudeLog:
         """Return one turn a robot."""
-        return Turns(turns_about_axes(len(DIRECTIONS), self.angle), seconds=self.length)
+        return AttitudeLog(turns_about_axes(len(DIRECTIONS), self.angle), seconds=self.length)

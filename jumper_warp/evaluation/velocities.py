@@ -28,7 +28,7 @@ MOST_ROBOTS = 20_000
 
 
 @dataclass
-class Walks(EvaluationLog):
+class VelocityLog(EvaluationLog):
     """What became of one robot per world; nothing of a robot counts after its fall."""
 
     commands: np.ndarray
@@ -186,7 +186,7 @@ def rms(values: np.ndarray, axis: int | tuple[int, ...] | None = None) -> np.nda
         return np.sqrt(total.sum(axis=axis) / np.where(known.sum(axis=axis) > 0, known.sum(axis=axis), np.nan))
 
 
-def tracking_metrics(walks: Walks) -> Metrics:
+def tracking_metrics(walks: VelocityLog) -> Metrics:
     """Return errors over all robots and all time that counts, and how many fell."""
     robots, falls = walks.count, int(walks.fallen.sum())
     metrics = rmse_metrics(walks.errors()) | {"robots": robots, "falls": falls, "fall_rate": falls / robots}
@@ -217,11 +217,11 @@ class VelocityFlags:
         if self.per_axis < 2:
             raise InputError(f"per_axis must be at least 2, got {self.per_axis}")
 
-    def log(self, task: TaskCfg, seed: int) -> Walks:
+    def log(self, task: TaskCfg, seed: int) -> VelocityLog:
         """Return walks with these commands."""
-        return Walks(grid(self.per_axis, self.reach), task, self.seconds)
+        return VelocityLog(grid(self.per_axis, self.reach), task, self.seconds)
 
-    def metrics(self, log: Walks) -> Metrics:
+    def metrics(self, log: VelocityLog) -> Metrics:
         """Return `tracking_metrics`."""
         return tracking_metrics(log)
 
@@ -253,10 +253,10 @@ class VelocityGoals:
         """[s] Of the recording."""
         return self.each * len(self.velocities)
 
-    def log(self, task: TaskCfg) -> Walks:
+    def log(self, task: TaskCfg) -> VelocityLog:
         """Return one robot's walk."""
         commands = np.array(self.velocities, dtype=float)[None]
-        return Walks(commands, task, self.length, times=self.each * np.arange(commands.shape[1]))
+        return VelocityLog(commands, task, self.length, times=self.each * np.arange(commands.shape[1]))
 
 
 def check_walks(robots: int, seconds: float, *commands: float) -> None:

@@ -8,7 +8,7 @@ import torch
 import warp as wp
 
 from jumper_warp.envs.env import Env
-from jumper_warp.evaluation.courses import SQUAT, Course
+from jumper_warp.evaluation.courses import SQUAT, CourseLog
 from jumper_warp.evaluation.scripts import parse_script
 from jumper_warp.policies.conditions import Conditions
 from jumper_warp.policies.skills import JUMP_TO, JUMP_UP, WALK, SkillNames, SkillPolicies
@@ -45,7 +45,7 @@ def followed():
     """Return policies, environment, course and all switches of a nominal run whose stages are launched one by one."""
     policies = SkillPolicies()
     env = policies.env(N, Conditions(device="cpu", threads=1))
-    course, switches, fresh = Course(SCRIPTS), [], []
+    course, switches, fresh = CourseLog(SCRIPTS), [], []
     course.begin(env)
     for _ in range(round(course.seconds / env.step_dt)):
         env.actions.copy_(policies.act(env))

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from jumper_warp.evaluation.courses import PATIENCE, SLEW, Course, active_spans, course_metrics
+from jumper_warp.evaluation.courses import PATIENCE, SLEW, CourseLog, active_spans, course_metrics
 from jumper_warp.evaluation.scripts import ScriptStep
 from jumper_warp.policies.skills import JUMP_TO, JUMP_UP, WALK
 from jumper_warp.utils.errors import InputError
@@ -68,8 +68,8 @@ class MadeUp:
         }  # fmt: skip
 
 
-def followed(script=SCRIPT, n=2, **made_up) -> tuple[Course, MadeUp]:
-    course, env = Course([script] * n), MadeUp(n, **made_up)
+def followed(script=SCRIPT, n=2, **made_up) -> tuple[CourseLog, MadeUp]:
+    course, env = CourseLog([script] * n), MadeUp(n, **made_up)
     course.look = lambda env: env.step()
     course.begin(env)
     for _ in range(round(course.seconds / DT)):
@@ -117,8 +117,8 @@ def test_landing_is_measured_from_the_goal_and_may_miss_it():
 
 def test_a_block_is_put_under_the_goal_when_the_jump_onto_it_takes_over():
     plain, onto = (ScriptStep(kind, (1.3, 0.1)) for kind in ("jump_to", "jump_onto"))
-    course, env = Course([(plain, plain), (plain, onto)]), MadeUp(2)
-    assert course.block is not None and Course([(plain, plain)]).block is None
+    course, env = CourseLog([(plain, plain), (plain, onto)]), MadeUp(2)
+    assert course.block is not None and CourseLog([(plain, plain)]).block is None
     course.look = lambda env: env.step()
     course.begin(env)
     while not course.follow(env):
@@ -142,7 +142,7 @@ def test_robot_that_never_stops_is_stuck():
 
 def test_scripts_of_different_lengths_are_refused():
     with pytest.raises(InputError, match="one length"):
-        Course([SCRIPT, SCRIPT[:1]])
+        CourseLog([SCRIPT, SCRIPT[:1]])
 
 
 def test_series_and_columns_tell_of_the_robot():

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from jumper_warp.cli import evaluate, play
-from jumper_warp.evaluation.episodes import EpisodeFlags, EpisodeGoals, Episodes, episode_metrics
+from jumper_warp.evaluation.episodes import EpisodeFlags, EpisodeGoals, episode_metrics
 from jumper_warp.policies.folder import save_policy
 from jumper_warp.registry import make_task
 from jumper_warp.tasks.saving import task_to_json
@@ -81,7 +81,7 @@ def test_columns_have_a_row_an_episode_and_none_where_there_is_no_number(episode
 
 
 def test_all_ended_is_told():
-    log = Episodes(np.zeros((1, 4)), TASK)
+    log = EpisodeLog(np.zeros((1, 4)), TASK)
     assert log.update({"base_pos": np.zeros((1, 3)), "ending": np.array([3])}, DT)
 
 

@@ -6,7 +6,7 @@ import pytest
 import warp as wp
 
 from jumper_warp.evaluation.jumps import wrapped, yaw_of
-from jumper_warp.evaluation.places import PlaceLog, ended_by_takeoff, for_evaluation, landing_metrics, trained_range
+from jumper_warp.evaluation.places import LandingLog, ended_by_takeoff, for_evaluation, landing_metrics, trained_range
 from jumper_warp.registry import make_task
 
 DT = 1.0 / 60.0
@@ -67,7 +67,7 @@ class Stub:
 def five_jumps():
     """One good, one that misses, one that comes apart, one that collides, one without a jump; heading left."""
     goals = np.array([[[1.0, 0.0]], [[0.6, 0.2]], [[0.8, 0.0]], [[1.2, 0.0]], [[0.5, 0.0]]])
-    landings = PlaceLog(goals, TERMINATIONS, QUARTER)
+    landings = LandingLog(goals, TERMINATIONS, QUARTER)
     env = Stub(5)
     landings.begin(env)
     # headed to the left, the goals lie at (-y, x)
@@ -147,7 +147,7 @@ def test_nothing_changes_after_the_end():
 
 
 def test_jump_before_the_command_is_no_success():
-    landings, env = PlaceLog(np.zeros((1, 1, 2)), TERMINATIONS), Stub(1)
+    landings, env = LandingLog(np.zeros((1, 1, 2)), TERMINATIONS), Stub(1)
     landings.begin(env)
     env.now(took_off=1, steps=29)
     assert not landings.follow(env)
@@ -160,7 +160,7 @@ def test_jump_before_the_command_is_no_success():
 
 @pytest.mark.parametrize(("steps", "hopped"), [([3, 3], False), ([1, 4], True)])
 def test_long_enough_in_the_air_after_touchdown_is_another_jump(steps, hopped):
-    landings, env = PlaceLog(np.zeros((1, 1, 2)), TERMINATIONS), Stub(1)
+    landings, env = LandingLog(np.zeros((1, 1, 2)), TERMINATIONS), Stub(1)
     landings.begin(env)
     for phase, force, count in ((1, 0.0, 20), (2, 0.0, steps[0]), (2, 9.0, 2), (2, 0.05, steps[1])):
         env.now(phase=phase)
@@ -186,7 +186,7 @@ def test_long_enough_in_the_air_after_touchdown_is_another_jump(steps, hopped):
     ],
 )
 def test_paw_lifted_again_after_its_own_contact_is_a_step(contacts, stepped):
-    landings, env = PlaceLog(np.zeros((1, 1, 2)), TERMINATIONS), Stub(1)
+    landings, env = LandingLog(np.zeros((1, 1, 2)), TERMINATIONS), Stub(1)
     landings.begin(env)
     for phase, rows in ((0, [((0, 1, 2, 3), 5)]), (1, [((), 20)]), (2, contacts)):
         env.now(phase=phase)
@@ -212,7 +212,7 @@ def test_paw_lifted_again_after_its_own_contact_is_a_step(contacts, stepped):
     ],
 )
 def test_second_takeoffs_are_upward_with_no_paw_down(moments, takeoffs):
-    landings, env = PlaceLog(np.zeros((1, 1, 2)), TERMINATIONS), Stub(1)
+    landings, env = LandingLog(np.zeros((1, 1, 2)), TERMINATIONS), Stub(1)
     landings.begin(env)
     env.stand_on()
     env.now(phase=1, base_vel=[0.0, 0.0, 3.0])  # the jump's own takeoff is none
@@ -235,7 +235,7 @@ def test_second_takeoffs_are_upward_with_no_paw_down(moments, takeoffs):
 
 
 def test_fall_after_the_first_second_counts_where_the_jump_is_followed_for_longer():
-    landings, env = PlaceLog(np.zeros((2, 1, 2)), TERMINATIONS, rest=3.0), Stub(2)
+    landings, env = LandingLog(np.zeros((2, 1, 2)), TERMINATIONS, rest=3.0), Stub(2)
     landings.begin(env)
     env.now(phase=2, phase_steps=60, ending=0)
     assert not landings.follow(env)
@@ -250,7 +250,7 @@ def test_fall_after_the_first_second_counts_where_the_jump_is_followed_for_longe
 
 
 def test_flight_of_the_next_jump_is_no_step():
-    landings, env = PlaceLog(np.zeros((1, 2, 2)), TERMINATIONS), Stub(1)
+    landings, env = LandingLog(np.zeros((1, 2, 2)), TERMINATIONS), Stub(1)
     landings.begin(env)
     env.now(phase=2, phase_steps=60)
     assert not landings.follow(env) and len(env.commanded) == 1
@@ -264,7 +264,7 @@ def test_flight_of_the_next_jump_is_no_step():
 
 
 def test_jump_that_does_not_end_fails_where_it_is():
-    landings, env = PlaceLog(np.array([[[0.4, 0.0]]]), TERMINATIONS), Stub(1)
+    landings, env = LandingLog(np.array([[[0.4, 0.0]]]), TERMINATIONS), Stub(1)
     landings.begin(env)
     assert not landings.follow(env)
     metrics = landing_metrics(landings)
@@ -273,7 +273,7 @@ def test_jump_that_does_not_end_fails_where_it_is():
 
 def two_in_a_row():
     """A row that goes through, and one whose first jump collides."""
-    landings, env = PlaceLog(np.array([[[0.8, 0.2], [0.7, 0.0]]] * 2), TERMINATIONS, rest=0.5), Stub(2)
+    landings, env = LandingLog(np.array([[[0.8, 0.2], [0.7, 0.0]]] * 2), TERMINATIONS, rest=0.5), Stub(2)
     landings.begin(env)
     env.now(base_pos=[0.8, 0.15, 0.3], phase=2, phase_steps=[29, 10], ending=[-1, COLLIDED])
     assert not landings.follow(env) and not env.commanded
@@ -326,17 +326,17 @@ def test_trained_range_is_that_of_all_levels_straight_ahead(task, range_m):
 
 def test_each_world_may_have_its_own_time_of_the_command():
     env = Stub(2)
-    PlaceLog(np.zeros((2, 1, 2)), TERMINATIONS, delay=np.array([0.5, 0.25])).begin(env)
+    LandingLog(np.zeros((2, 1, 2)), TERMINATIONS, delay=np.array([0.5, 0.25])).begin(env)
     assert env.command_step.tolist() == [30.0, 15.0]
 
 
 def test_row_has_time_for_every_jump():
-    assert PlaceLog(np.zeros((1, 2, 2)), TERMINATIONS).seconds == pytest.approx(10.5)
+    assert LandingLog(np.zeros((1, 2, 2)), TERMINATIONS).seconds == pytest.approx(10.5)
 
 
 def test_goals_of_another_shape_are_refused():
     with pytest.raises(ValueError, match="goals must have shape"):
-        PlaceLog(np.zeros((3, 2)), TERMINATIONS)
+        LandingLog(np.zeros((3, 2)), TERMINATIONS)
 
 
 @pytest.mark.parametrize("angle", [-3.0, -0.5, 0.0, 2.0])

@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from jumper_warp.evaluation import velocities
-from jumper_warp.evaluation.velocities import VelocityFlags, VelocityGoals, Walks
+from jumper_warp.evaluation.velocities import VelocityFlags, VelocityGoals, VelocityLog
 from jumper_warp.registry import make_task
 from jumper_warp.utils.errors import InputError
 from support import gaits
@@ -19,10 +19,10 @@ NAMES = [term.name for term in TASK.terminations]
 ROBOTS = 3
 
 
-def followed(velocity_of, *, seconds=2.0, falls=None, task=TASK, commands=None, times=(0.0,), **given) -> Walks:
-    """Walks of robots whose velocity (robots, 3) is a function of time [s]; falls: policy step by robot."""
+def followed(velocity_of, *, seconds=2.0, falls=None, task=TASK, commands=None, times=(0.0,), **given) -> VelocityLog:
+    """Return the log of robots whose velocity (robots, 3) is a function of time [s]; falls: policy step by robot."""
     commands = np.tile([0.5, -0.2, 0.4], (ROBOTS, 1, 1)) if commands is None else commands
-    walks = Walks(commands, task, seconds, times=np.array(times), **given)
+    walks = VelocityLog(commands, task, seconds, times=np.array(times), **given)
     turn = Rotation.random(ROBOTS, random_state=4)
     for step in range(1, round(seconds / DT) + 1):
         wanted = velocity_of(step * DT)
@@ -59,7 +59,7 @@ def test_nothing_counts_after_a_fall():
 
 
 def test_end_of_the_time_is_no_fall():
-    walks = Walks(np.zeros((1, 1, 3)), TASK, 1.0)
+    walks = VelocityLog(np.zeros((1, 1, 3)), TASK, 1.0)
     arrays = {"base_quat": np.array([[0.0, 0.0, 0.0, 1.0]]), "base_vel": np.zeros((1, 3)),
               "base_ang_vel": np.zeros((1, 3)), "ending": np.array([NAMES.index("finished")])}  # fmt: skip
     walks.update(arrays, DT)

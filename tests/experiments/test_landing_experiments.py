@@ -12,7 +12,7 @@ import torch
 from experiments import paper_tests
 from jumper_warp.evaluation.film import beside
 from jumper_warp.evaluation.log import run_evaluation, termination_names
-from jumper_warp.evaluation.places import ENDS, PlaceLog
+from jumper_warp.evaluation.places import ENDS, LandingLog
 from jumper_warp.evaluation.plots import Track
 from jumper_warp.evaluation.run import EvaluationArgs, EvaluationRun, shown
 from jumper_warp.evaluation.suites import Consecutive, Farthest, Grid, Platform, consecutive_metrics, distance_metrics
@@ -38,7 +38,7 @@ def policy(tmp_path_factory):
 
 def ended(goals, landing, end, **changes):
     """Return rows of jumps that ended as told; goals and landing [m], (rows, jumps, 2), heading 0."""
-    landings = PlaceLog(np.array(goals, dtype=float), ENDS)
+    landings = LandingLog(np.array(goals, dtype=float), ENDS)
     landings.end[:] = end
     landings.target[:], landings.place[:], landings.touchdown[:] = goals, landing, landing
     landings.heading[:], landings.yaw[:], landings.tilt[:] = 0.0, 0.0, 0.0
@@ -117,7 +117,7 @@ def test_row_without_a_fall_may_miss_its_goals():
 
 def test_paths_are_drawn_from_the_start_and_along_the_heading():
     track = Track()
-    landings = PlaceLog(np.zeros((2, 1, 2)), ENDS)
+    landings = LandingLog(np.zeros((2, 1, 2)), ENDS)
     for place in ([0.0, 0.0, 0.3], [0.0, 1.0, 0.3]):
         landings.seen = {"base_pos": np.array([place, place])}
         track(landings)
@@ -230,7 +230,7 @@ def hops():
 
     env = env_of_policy(policy, 3, Conditions(device="cpu"), change=change)
     goals = np.array([[[0.0, 0.0], [0.0, 0.05]], [[0.05, 0.0], [0.3, 0.0]], [[0.5, -0.2], [0.0, 0.0]]])
-    landings = PlaceLog(
+    landings = LandingLog(
         goals, termination_names(env.task), headings=np.array([0.0, 2.0, -1.5]), delay=np.array([0.5, 0.4, 0.3])
     )
     script = Hop()

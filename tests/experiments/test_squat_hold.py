@@ -7,14 +7,14 @@ import pytest
 
 from experiments import squat_hold
 from jumper_warp.utils.errors import InputError
-from support.holds import Holds, hold_metrics
+from support.holds import SquatLog, hold_metrics
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 def held(steps, **changes):
     """Return three robots, the last of which ends; steps: forces (4,) of the first two in turn; torques are 0 and 2."""
-    holds = Holds(np.zeros((3, 3)), hold=1.5, window=2.0 / 60.0)
+    holds = SquatLog(np.zeros((3, 3)), hold=1.5, window=2.0 / 60.0)
     for step, force in enumerate(steps):
         arrays = {
             "force": np.tile(force, (3, 1)), "peak": np.tile(force, (3, 1)) + [[1.0], [2.0], [900.0]],
