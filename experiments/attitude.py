@@ -22,7 +22,14 @@ import tyro
 from jumper_warp.cli.main import run_command
 from jumper_warp.evaluation.plots import drawn
 from jumper_warp.evaluation.run import EvaluationArgs, EvaluationRun
-from jumper_warp.evaluation.turns import DIRECTIONS, AttitudeLog, TurnFlags, axis_metrics, turn_metrics, turns_about_any
+from jumper_warp.evaluation.turns import (
+    DIRECTIONS,
+    AttitudeFlags,
+    AttitudeLog,
+    axis_metrics,
+    turn_metrics,
+    turns_about_any,
+)
 from support.momentum import MomentumWatch, rotational_inertia
 
 HARDWARE = {"mean_settling_s": 2.6}
@@ -31,7 +38,7 @@ COLORS = ("tab:red", "tab:green", "tab:blue")
 
 
 @dataclass(frozen=True)
-class Args(EvaluationArgs, TurnFlags):
+class Args(EvaluationArgs, AttitudeFlags):
     """Flags; as many turns about any axis as about the body's."""
 
     policy: str = "attitude"
@@ -44,7 +51,7 @@ class Args(EvaluationArgs, TurnFlags):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        TurnFlags.__post_init__(self)
+        AttitudeFlags.__post_init__(self)
 
 
 def plot(run: EvaluationRun, turns: AttitudeLog, title: str) -> None:

@@ -164,7 +164,7 @@ class EpisodeFlags:
 
 
 @dataclass(frozen=True)
-class EpisodeGoals:
+class EpisodePlayFlags:
     """An episode that is recorded."""
 
     command: tuple[float, ...] = ()

@@ -228,7 +228,7 @@ class HeightFlags(JumpFlags):
 
 
 @dataclass(frozen=True)
-class HeightGoals:
+class HeightPlayFlags:
     """Jumps to heights that are recorded."""
 
     height: tuple[float, ...] = (0.6, 0.9, 1.1)

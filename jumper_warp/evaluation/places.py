@@ -211,7 +211,7 @@ def random_headings(count: int, seed: int) -> np.ndarray:
 
 
 @dataclass(frozen=True)
-class PlaceFlags(JumpFlags):
+class LandingFlags(JumpFlags):
     """Jumps to places from standing still."""
 
     x: Place = (0.3, 1.5)
@@ -245,7 +245,7 @@ class PlaceFlags(JumpFlags):
 
 
 @dataclass(frozen=True)
-class PlaceGoals:
+class LandingPlayFlags:
     """Jumps to places that are recorded."""
 
     goal: tyro.conf.UseAppendAction[tuple[Place, ...]] = ()

@@ -7,12 +7,12 @@ from dataclasses import dataclass, replace
 from typing import Any, Literal, Protocol
 
 from jumper_warp.evaluation import heights, places
-from jumper_warp.evaluation.episodes import EpisodeFlags, EpisodeGoals
-from jumper_warp.evaluation.heights import HeightFlags, HeightGoals
+from jumper_warp.evaluation.episodes import EpisodeFlags, EpisodePlayFlags
+from jumper_warp.evaluation.heights import HeightFlags, HeightPlayFlags
 from jumper_warp.evaluation.log import EvaluationLog, Metrics
-from jumper_warp.evaluation.places import PlaceFlags, PlaceGoals
-from jumper_warp.evaluation.turns import TurnFlags, TurnGoals
-from jumper_warp.evaluation.velocities import VelocityFlags, VelocityGoals
+from jumper_warp.evaluation.places import LandingFlags, LandingPlayFlags
+from jumper_warp.evaluation.turns import AttitudeFlags, AttitudePlayFlags
+from jumper_warp.evaluation.velocities import VelocityFlags, VelocityPlayFlags
 from jumper_warp.policies.spec import PolicyError
 from jumper_warp.tasks.cfg import TaskCfg
 
@@ -56,25 +56,25 @@ class Evaluation:
     """What `jumper finetune` makes its jumps miss by less; None: it does not know how."""
 
 
-HEIGHT = Evaluation(HeightFlags(), HeightGoals(), heights.for_evaluation, "height")
-PLACE = Evaluation(PlaceFlags(), PlaceGoals(), places.for_evaluation, "place")
+HEIGHT = Evaluation(HeightFlags(), HeightPlayFlags(), heights.for_evaluation, "height")
+PLACE = Evaluation(LandingFlags(), LandingPlayFlags(), places.for_evaluation, "place")
 EVALUATIONS: dict[str, Evaluation] = {
     "height": HEIGHT,
     "place": PLACE,
     "height-mars": replace(
-        HEIGHT, flags=HeightFlags(lower=1.0, upper=3.3, in_range=(1.0, 2.9)), play=HeightGoals((1.5, 2.3, 3.0), 6.0)
+        HEIGHT, flags=HeightFlags(lower=1.0, upper=3.3, in_range=(1.0, 2.9)), play=HeightPlayFlags((1.5, 2.3, 3.0), 6.0)
     ),
     "place-mars": replace(
-        PLACE, flags=PlaceFlags(x=(0.5, 4.2), in_range=(0.5, 3.9)),
-        play=PlaceGoals(unless_told=((1.0, 0.0), (2.5, 0.0), (3.9, 0.0))),
+        PLACE, flags=LandingFlags(x=(0.5, 4.2), in_range=(0.5, 3.9)),
+        play=LandingPlayFlags(unless_told=((1.0, 0.0), (2.5, 0.0), (3.9, 0.0))),
     ),
     "around": replace(
-        PLACE, flags=PlaceFlags(x=(-0.7, 0.7), y=(-0.7, 0.7), in_range=(0.0, 0.7)), misses=None,
-        play=PlaceGoals(unless_told=((0.5, 0.0), (0.0, 0.5), (-0.5, 0.0))),
+        PLACE, flags=LandingFlags(x=(-0.7, 0.7), y=(-0.7, 0.7), in_range=(0.0, 0.7)), misses=None,
+        play=LandingPlayFlags(unless_told=((0.5, 0.0), (0.0, 0.5), (-0.5, 0.0))),
     ),
-    "velocity": Evaluation(VelocityFlags(), VelocityGoals(), TaskCfg.on_level_ground),
-    "attitude": Evaluation(TurnFlags(), TurnGoals()),
-    "episode": Evaluation(EpisodeFlags(), EpisodeGoals()),
+    "velocity": Evaluation(VelocityFlags(), VelocityPlayFlags(), TaskCfg.on_level_ground),
+    "attitude": Evaluation(AttitudeFlags(), AttitudePlayFlags()),
+    "episode": Evaluation(EpisodeFlags(), EpisodePlayFlags()),
 }  # fmt: skip
 """A user's module may add its own."""
 

@@ -190,7 +190,7 @@ def axis_metrics(turns: Turns) -> Metrics:
 
 
 @dataclass(frozen=True)
-class TurnFlags:
+class AttitudeFlags:
     """Turns about the body's axes, each way, from rest in the default pose."""
 
     turns: int = 60
@@ -221,7 +221,7 @@ class TurnFlags:
 
 
 @dataclass(frozen=True)
-class TurnGoals:
+class AttitudePlayFlags:
     """Turns that are recorded, about the body's axes, each way."""
 
     angle: float = 90.0

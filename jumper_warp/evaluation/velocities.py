@@ -227,7 +227,7 @@ class VelocityFlags:
 
 
 @dataclass(frozen=True)
-class VelocityGoals:
+class VelocityPlayFlags:
     """A walk that is recorded: commands one after the other."""
 
     velocity: tyro.conf.UseAppendAction[tuple[Velocity, ...]] = ()

@@ -7,7 +7,7 @@ import pytest
 from jumper_warp.cli import evaluate, play
 from jumper_warp.evaluation.commands import csv_text
 from jumper_warp.evaluation.heights import HeightFlags, HeightLog
-from jumper_warp.evaluation.places import ENDS, PlaceFlags
+from jumper_warp.evaluation.places import ENDS, LandingFlags
 from jumper_warp.evaluation.registry import EVALUATIONS, evaluation_of
 from jumper_warp.policies.folder import save_policy
 from jumper_warp.policies.spec import PolicyError
@@ -43,7 +43,7 @@ def test_task_with_an_unknown_evaluation_is_refused():
 
 
 def test_places_are_spread_ahead_and_drawn_aside_and_headings_too():
-    flags = PlaceFlags(jumps=5, y=(-0.2, 0.1))
+    flags = LandingFlags(jumps=5, y=(-0.2, 0.1))
     log = flags.log(TASK, seed=3)
     assert log.places[:, 0, 0] == pytest.approx([0.3, 0.6, 0.9, 1.2, 1.5])
     aside = log.places[:, 0, 1]
@@ -54,7 +54,7 @@ def test_places_are_spread_ahead_and_drawn_aside_and_headings_too():
 
 
 def test_one_heading_is_that_of_all_in_radians():
-    assert PlaceFlags(jumps=2, x=(0.3, 0.4), y=(0.0, 0.0), heading=90.0).log(TASK, 0).headings == pytest.approx(
+    assert LandingFlags(jumps=2, x=(0.3, 0.4), y=(0.0, 0.0), heading=90.0).log(TASK, 0).headings == pytest.approx(
         0.5 * math.pi
     )
 
@@ -104,7 +104,7 @@ def test_policy_comes_first(command, args):
 
 def test_range_of_places_counts_distances():
     goals = [[0.3, 0.0], [0.0, -0.3], [0.6, 0.6]]
-    flags = PlaceFlags(jumps=3, x=(0.0, 0.0), y=(0.0, 0.0), heading=0.0, in_range=(0.3, 0.5))
+    flags = LandingFlags(jumps=3, x=(0.0, 0.0), y=(0.0, 0.0), heading=0.0, in_range=(0.3, 0.5))
     landings = flags.log(TASK, 0)
     landings.places[:, 0] = goals
     landings.place[:, 0], landings.target[:, 0] = goals, goals

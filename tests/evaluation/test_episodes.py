@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from jumper_warp.cli import evaluate, play
-from jumper_warp.evaluation.episodes import EpisodeFlags, EpisodeGoals, episode_metrics
+from jumper_warp.evaluation.episodes import EpisodeFlags, EpisodePlayFlags, episode_metrics
 from jumper_warp.policies.folder import save_policy
 from jumper_warp.registry import make_task
 from jumper_warp.tasks.saving import task_to_json
@@ -90,7 +90,7 @@ def test_all_ended_is_told():
     [
         (lambda: EpisodeFlags(episodes=0), "episodes must be at least 1"),
         (lambda: EpisodeFlags(command=(0.0,) * 5), "command takes up to 4 finite numbers"),
-        (lambda: EpisodeGoals(command=(float("nan"),)), "command takes up to 4 finite numbers"),
+        (lambda: EpisodePlayFlags(command=(float("nan"),)), "command takes up to 4 finite numbers"),
         (lambda: EpisodeFlags(seconds=0.0), r"seconds must be in \(0, 600\]"),
     ],
 )
