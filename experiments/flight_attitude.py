@@ -22,7 +22,7 @@ import tyro
 from jumper_warp.cli.main import run_command
 from jumper_warp.evaluation.run import EvaluationArgs
 from jumper_warp.utils.errors import InputError
-from support.flights import FlightLog, FlightRun, delays, draw_flights, flight_metrics
+from support.flights import FlightLog, FlightRun, delays, flight_metrics, plot_flights
 
 
 @dataclass(frozen=True)
@@ -62,7 +62,7 @@ def main(args: Args) -> dict:
     found = {
         name: run.fly(env, FlightLog(heights, late, turns=name == "turning"), name) for name in ("turning", "without")
     }
-    draw_flights(run.folder / "flights.png", found)
+    plot_flights(run.folder / "flights.png", found)
     told = {"takeoff": args.takeoff, "landing": args.landing or "default pose"}
     values = told | ({} if late is None else {"late_ms": args.late}) | flight_metrics(found["turning"])
     values |= {f"without_turning_{name}": value for name, value in flight_metrics(found["without"]).items()}

@@ -26,7 +26,7 @@ from jumper_warp.registry import make_task, trainer_settings
 from jumper_warp.tasks.observations import with_history
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.output import write_metrics
-from support.learning import TESTED, Curve, curve_metrics, draw_curves, timed_training
+from support.learning import TESTED, Curve, curve_metrics, plot_curves, timed_training
 from support.scripts import DeviceArgs, prepare
 from support.variants import DEFAULT, variant
 
@@ -90,7 +90,7 @@ def main(args: Args) -> dict[str, Any]:
         values |= curve_metrics(curve, f"{name}_{seed}") | {f"ready_s_{name}_{seed}": curve.ready}
         print(f"ready after {curve.ready:.1f} s", flush=True)
         write_metrics(folder, values)
-        draw_curves(curves, folder / "learning_curves.png")
+        plot_curves(curves, folder / "learning_curves.png")
     print(f"metrics and plot in {folder}")
     return values
 

@@ -29,7 +29,7 @@ from jumper_warp.sim.simulation import Simulation
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.output import write_metrics
 from jumper_warp.viz.snapshot import Camera, contact_sheet
-from support.open_loop import SQUAT, draw_trace, follow_jump, jump_metrics
+from support.open_loop import SQUAT, follow_jump, jump_metrics, plot_trace
 from support.scripts import DeviceArgs, prepare
 
 HARDWARE_APEX = 1.075
@@ -66,7 +66,7 @@ class Args(DeviceArgs):
             raise InputError("give springs or a robot, which may have springs")
 
 
-def draw_filmstrip(frames: list[np.ndarray], path: Path) -> None:
+def save_filmstrip(frames: list[np.ndarray], path: Path) -> None:
     """Draw the robot at a few moments side by side; frames: body poses of every tick, (21, 7) each."""
     model = build_model(1)
     state = model.state()
@@ -97,12 +97,12 @@ def main(args: Args) -> dict:
         device=args.device,
     )  # fmt: skip
     trace, recorder, frames = follow_jump(sim, variant, args.squat)
-    draw_filmstrip(frames, folder / "jump_strip.png")
+    save_filmstrip(frames, folder / "jump_strip.png")
     values: dict[str, Any] = {**variant, **jump_metrics(trace), "hardware_apex_height_m": None}
     if args.torque == 18.0 and args.gravity == EARTH and not args.loose and robot is None:
         values["hardware_apex_height_m"] = HARDWARE_APEX
     write_metrics(folder, values)
-    draw_trace(folder / "jump.png", trace, f"Open-loop jump, {args.solver}, {args.torque:g} N m", HARDWARE_APEX)
+    plot_trace(folder / "jump.png", trace, f"Open-loop jump, {args.solver}, {args.torque:g} N m", HARDWARE_APEX)
     recorder.save_rrd(folder / "jump.rrd")
     print_figures({name: value for name, value in values.items() if not name.startswith(PER_MOTOR)})
     print(f"{time.perf_counter() - start:.1f} s; figures, plot and recording (rerun {folder / 'jump.rrd'}) in {folder}")

@@ -29,7 +29,7 @@ from jumper_warp.tasks.observations import with_history
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.output import write_metrics
 from support.gradient_variance import variances
-from support.learning import Curve, curve_metrics, draw_curves, learning_curve, make_judge
+from support.learning import Curve, curve_metrics, learning_curve, make_judge, plot_curves
 from support.scripts import DeviceArgs, prepare
 
 TASK = "vertical-jump"
@@ -97,7 +97,7 @@ def compare(args: Args, folder: Path) -> dict[str, Any]:
             curves[trainer].append(train(args, trainer, seed))
             values |= curve_metrics(curves[trainer][-1], f"{trainer}_{seed}")
             write_metrics(folder, values)
-    draw_curves(curves, folder / "curves.png")
+    plot_curves(curves, folder / "curves.png")
     return values
 
 

@@ -18,7 +18,7 @@ import torch
 from jumper_warp.envs.env import Env
 from jumper_warp.evaluation.jumps import DELAY, jump_commands, yaw_of
 from jumper_warp.evaluation.log import NO_END, EvaluationLog, Metrics, failures, finite, largest, mean, mean_and_max
-from jumper_warp.evaluation.plots import drawn
+from jumper_warp.evaluation.plots import figure
 from jumper_warp.evaluation.run import HEIGHTS, EvaluationArgs, Run, conditions_of
 from jumper_warp.policies.policy import Policy
 from jumper_warp.policies.restore import restored_task
@@ -197,7 +197,7 @@ class FlightLog(EvaluationLog):
         return told if self.late is None else told | {"late_ms": (1000.0 * self.late[list(worlds)]).tolist()}
 
 
-def flight_metrics(flights: Flights) -> Metrics:
+def flight_metrics(flights: FlightLog) -> Metrics:
     """Return the metrics of flights; means are over all that took off, or touched down."""
     return {
         "flights": len(flights.end),
@@ -224,9 +224,9 @@ def delays(count: int, most: float, seed: int) -> np.ndarray:
     return np.stack([size * np.cos(angle), size * np.sin(angle)], axis=1)
 
 
-def draw_flights(path: Path, found: Mapping[str, Flights]) -> None:
+def plot_flights(path: Path, found: Mapping[str, FlightLog]) -> None:
     """Draw tilt and height of all flights over time, a column for each name."""
-    with drawn(path, 2, len(found), figsize=(11, 6), sharex=True, sharey="row") as axes:
+    with figure(path, 2, len(found), figsize=(11, 6), sharex=True, sharey="row") as axes:
         for column, (name, flights) in zip(axes.T, found.items(), strict=True):
             time = np.arange(len(flights.tilts)) * flights.step_dt
             column[0].plot(time, np.degrees(np.array(flights.tilts)), linewidth=0.6, alpha=0.5, color="tab:red")
@@ -238,7 +238,7 @@ def draw_flights(path: Path, found: Mapping[str, Flights]) -> None:
 class FlightRun(Run):
     """Follows flights of a jump and a policy that turns."""
 
-    flights: Flights
+    flights: FlightLog
     """Under way."""
 
     def __init__(self, args: EvaluationArgs, landing: str, jump: str) -> None:

@@ -97,7 +97,7 @@ def hold_goals(count: int, reach: tuple[float, float], *, up: bool) -> np.ndarra
     return goals
 
 
-def hold_metrics(holds: Holds) -> Metrics:
+def hold_metrics(holds: SquatLog) -> Metrics:
     """Return the metrics of robots that squat and wait; forces and torques are of those that still do at the end."""
     spread, ripple = holds.force_range, holds.torque_ripple
     return {

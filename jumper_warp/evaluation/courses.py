@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from jumper_warp.evaluation.log import EvaluationLog, Metrics, failures, finite, largest, mean
-from jumper_warp.evaluation.plots import drawn
+from jumper_warp.evaluation.plots import figure
 from jumper_warp.evaluation.scripts import ScriptStep
 from jumper_warp.evaluation.velocities import SKIP, body_velocity, rmse_metrics, velocity_series
 from jumper_warp.policies.skills import JUMP_TO, JUMP_UP, WALK
@@ -331,9 +331,9 @@ def active_spans(course: CourseLog, world: int) -> list[tuple[int, float, float]
     return [(int(skills[a]), a * course.step_dt, b * course.step_dt) for a, b in pairwise(edges)]
 
 
-def draw_course(path: Path, course: CourseLog, world: int, title: str = "") -> None:
+def plot_course(path: Path, course: CourseLog, world: int, title: str = "") -> None:
     """Draw velocities and commands, height and active skill of a robot over time."""
-    with drawn(path, 5, 1, figsize=(10, 9), sharex=True) as axes:
+    with figure(path, 5, 1, figsize=(10, 9), sharex=True) as axes:
         time = course.step_dt * np.arange(1, len(course.skills) + 1)
         velocity, wanted = (np.array(values)[:, world] for values in (course.velocity, course.wanted))
         labels = ("vx [m/s]", "vy [m/s]", "yaw rate [rad/s]")

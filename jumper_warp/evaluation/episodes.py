@@ -103,7 +103,7 @@ class EpisodeLog(EvaluationLog):
         return {"commands": self.commands[list(worlds)].tolist()}
 
 
-def episode_metrics(episodes: Episodes) -> Metrics:
+def episode_metrics(episodes: EpisodeLog) -> Metrics:
     """Return the metrics of episodes: shares of all, means over all, and how many ended in which way."""
     outcomes, still = episodes.outcomes, episodes.end < 0
     success, timed_out = episodes.of_kind("success"), episodes.of_kind("time_out")
@@ -158,7 +158,7 @@ class EpisodeFlags:
         """Return episodes with this command."""
         return EpisodeLog(filled(self.command, self.episodes, task), task, self.seconds)
 
-    def metrics(self, log: Episodes) -> Metrics:
+    def metrics(self, log: EpisodeLog) -> Metrics:
         """Return `episode_metrics`."""
         return episode_metrics(log)
 

@@ -159,7 +159,7 @@ class AttitudeLog(EvaluationLog):
         return Strip(0, frames, captions, **view, name="turn_strip")
 
 
-def turn_metrics(turns: Turns) -> Metrics:
+def turn_metrics(turns: AttitudeLog) -> Metrics:
     """Return the metrics of turns; times are means over those that settled, rates are of all."""
     settling, outcomes = turns.settling, turns.outcomes
     metrics: Metrics = {
@@ -179,7 +179,7 @@ def turn_metrics(turns: Turns) -> Metrics:
     return metrics | failures(outcomes[~turns.success])
 
 
-def axis_metrics(turns: Turns) -> Metrics:
+def axis_metrics(turns: AttitudeLog) -> Metrics:
     """Return mean settling times and success rates of turns of `turns_about_axes`, by axis and direction."""
     metrics: Metrics = {}
     for i, name in enumerate(DIRECTIONS):
@@ -215,7 +215,7 @@ class AttitudeFlags:
         """Return the turns."""
         return AttitudeLog(turns_about_axes(self.turns, self.angle), self.tolerance, self.seconds)
 
-    def metrics(self, log: Turns) -> Metrics:
+    def metrics(self, log: AttitudeLog) -> Metrics:
         """Return `turn_metrics` and `axis_metrics`."""
         return turn_metrics(log) | axis_metrics(log)
 

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from jumper_warp.cli import evaluate, play
-from jumper_warp.evaluation.episodes import EpisodeFlags, EpisodePlayFlags, episode_metrics
+from jumper_warp.evaluation.episodes import EpisodeFlags, EpisodeLog, EpisodePlayFlags, episode_metrics
 from jumper_warp.policies.folder import save_policy
 from jumper_warp.registry import make_task
 from jumper_warp.tasks.saving import task_to_json
