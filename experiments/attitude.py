@@ -81,11 +81,11 @@ def main(args: Args) -> dict:
     run.told |= {"physics_step_s": env.physics_dt, "keep_momentum": args.keep_momentum}
     turns, watch = args.log(run.task, args.seed), MomentumWatch(env)
     inertia = rotational_inertia(env.sim)
-    run.follow(env, turns, film="turns", watch=watch)
+    run.run_episodes(env, turns, film="turns", watch=watch)
     values = turn_metrics(turns) | axis_metrics(turns) | watch.metrics(turns.apart, inertia)
     plot(run, turns, f"{args.turns} turns by {args.angle:g} degrees, {run.title}")
     others = AttitudeLog(turns_about_any(args.turns, args.angle, args.seed), args.tolerance, args.seconds)
-    run.follow(env, others)
+    run.run_episodes(env, others)
     values |= {f"any_axis_{name}": value for name, value in turn_metrics(others).items()}
     return run.report(values, HARDWARE)
 

@@ -66,7 +66,7 @@ def main(args: Args) -> dict:
     env = run.env(args.squats)
     up = run.task.evaluation in HEIGHTS
     goals = hold_goals(args.squats, args.height if up else args.distance, up=up)
-    holds = run.follow(env, SquatLog(goals, args.hold), film="holds")
+    holds = run.run_episodes(env, SquatLog(goals, args.hold), film="holds")
     if not holds.over.all():
         plot(run, holds)
     return run.report({"hold_s": args.hold} | hold_metrics(holds), {})

@@ -105,7 +105,7 @@ def main(args: Args) -> dict:
     name = "course" if args.course else "walk_jump_walk"
     run = SkillRun.of(name, args, SkillNames(args.policy, args.jump_up, args.jump_to))
     course = CourseLog(scripts(args), random_headings(args.robots, args.seed))
-    run.follow(run.env(args.robots, block=course.block), course, film=name)
+    run.run_episodes(run.env(args.robots, block=course.block), course, film=name)
     title = f"walk, jump, walk: robot 0 of {course.count}, {run.title}"
     plot_course(run.folder / "course.png", course, 0, title)
     return run.report(course_metrics(course), {} if args.course else PAPER)

@@ -64,7 +64,7 @@ def main(args: Args) -> dict:
         ground = single_tile(terrain, kind)
         env = run.env(args.robots, ground=ground)
         asked = VelocityLog(commands, env.task, SECONDS, headings=random_headings(args.robots, args.seed))
-        walks = run.follow(env, asked, film=kind, drawn={"ground": ground})
+        walks = run.run_episodes(env, asked, film=kind, drawn={"ground": ground})
         shares[kind] = walked(walks)
         figures[f"success_rate_{kind}"] = float(shares[kind].mean())
         figures[f"fall_rate_{kind}"] = float(walks.fallen.mean())

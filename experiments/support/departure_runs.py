@@ -110,10 +110,10 @@ def measured(checkpoint: Path, args: Any, folder: Path) -> dict[str, dict[str, A
         conditions = replace(run.conditions, randomize=drawn_robots, noise=drawn_robots)
         flags: Any = replace(cast(Any, run.evaluation.flags), jumps=count, **JUMPS[args.task].goals)
         env = run.env(count, lambda task: run.evaluation.for_evaluation(replace(task, terminations=ends)), conditions)
-        values = flags.metrics(run.follow(env, flags.log(env.task, 0)))
+        values = flags.metrics(run.run_episodes(env, flags.log(env.task, 0)))
         values["error_m"] = values.get("mean_abs_error_m", values.get("mean_error_m"))
         goals = hold_goals(args.squats, JUMPS[args.task].squats, up=run.task.evaluation in HEIGHTS)
-        values |= hold_metrics(run.follow(run.env(args.squats, conditions=conditions), SquatLog(goals, HOLD)))
+        values |= hold_metrics(run.run_episodes(run.env(args.squats, conditions=conditions), SquatLog(goals, HOLD)))
         tests[test] = {name: value for name, value in values.items() if isinstance(value, bool | int | float | None)}
     return tests
 

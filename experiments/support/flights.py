@@ -112,7 +112,7 @@ class FlightLog(EvaluationLog):
         chosen[pushing] = legs.reshape(n, 12)[pushing]
         return chosen
 
-    def look(self, env: Any) -> dict[str, np.ndarray]:
+    def read_env(self, env: Any) -> dict[str, np.ndarray]:
         """Return what is to be known of every robot."""
         q, qd = env.sim.joint_q(), env.sim.joint_qd()
         quat = q[:, 3:7]
@@ -122,10 +122,10 @@ class FlightLog(EvaluationLog):
                 "rise": qd[:, 2].copy(), "spin": np.linalg.norm(qd[:, 3:6], axis=1), "down": (forces > 0.1).any(axis=0),
                 "ending": env.worlds.ending.numpy().copy(), "momentum": momentum(env.sim)[1]}  # fmt: skip
 
-    def follow(self, env: Any) -> bool:
+    def record_step(self, env: Any) -> bool:
         """Look at the environment after a policy step, and ask for a turn where a flight has begun."""
         before = self._left.copy()
-        ended = super().follow(env)
+        ended = super().record_step(env)
         fresh = (self._left >= 0) & (before < 0)
         if self.turns and fresh.any():
             env.request(TURN, fresh)
@@ -287,5 +287,5 @@ class FlightRun(Run):
     def fly(self, env: Env, flights: FlightLog, film: str) -> FlightLog:
         """Follow flights, and return them."""
         self.flights = flights
-        self.follow(env, flights, film=film)
+        self.run_episodes(env, flights, film=film)
         return flights

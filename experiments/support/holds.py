@@ -47,7 +47,7 @@ class SquatLog(EvaluationLog):
         self.step_dt = env.step_dt
         env.evaluation_reset(jump_commands(self.goals, self.hold + 1.0, env.step_dt))
 
-    def look(self, env: Any) -> dict[str, np.ndarray]:
+    def read_env(self, env: Any) -> dict[str, np.ndarray]:
         """Return forces, torques and ends."""
         return {
             "peak": env.sim.physics.peak_paw_force.numpy().T.copy(),

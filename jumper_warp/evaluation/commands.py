@@ -52,7 +52,7 @@ def evaluate(run: EvaluationRun, cfg: EvaluateCfg) -> dict[str, Any]:
         raise PolicyError(f"{run.source}: a run keeps no figures; export it first")
     run.prepare("evaluate", cfg.conditions, cfg.out)
     log = cfg.flags.log(run.evaluation.for_evaluation(run.task), cfg.conditions.seed)
-    run.follow(run.env(log.count), log)
+    run.run_episodes(run.env(log.count), log)
     figures = {
         "task": run.policy.interface.task,
         **run.tried_in,
@@ -126,7 +126,7 @@ def play(run: EvaluationRun, cfg: PlayCfg) -> Path:
     notes = {"task": name, **log.notes(worlds), "solver": cfg.conditions.solver}
     film = Film(env, log.series, worlds, spacing=log.spacing, notes=notes, motors=True)
     run_evaluation(run.policy.act, env, log, seconds=cfg.seconds or flags.length, watch=film, stop=False)
-    path = film.save_rrd(run.folder / f"{log.row}.rrd", log.marks(worlds))
+    path = film.save_rrd(run.folder / f"{log.row}.rrd", log.goal_markers(worlds))
     write_metrics(run.folder, log.columns())
     print_rows(log)
     return shown(path, cfg.viewer)

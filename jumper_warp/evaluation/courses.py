@@ -105,7 +105,7 @@ class CourseLog(EvaluationLog):
         env.evaluation_reset(self._told, self.headings)
         self._ask(env, np.full(len(self.end), True))
 
-    def look(self, env: Any) -> dict[str, np.ndarray]:
+    def read_env(self, env: Any) -> dict[str, np.ndarray]:
         """Return what is to be known of every robot, and of its last jump of each kind."""
         q, qd = env.sim.joint_q(), env.sim.joint_qd()
         seen = {
@@ -121,10 +121,10 @@ class CourseLog(EvaluationLog):
             seen[f"jump_{name}"] = np.array(of_kind)[np.where(kind == JUMP_TO, 1, 0), rows]
         return seen
 
-    def follow(self, env: Any) -> bool:
+    def record_step(self, env: Any) -> bool:
         """Look at the environment after a policy step, and command and ask for what is due."""
         before, was = self.current.copy(), self._skill
-        ended = super().follow(env)
+        ended = super().record_step(env)
         rows, running = np.arange(len(before)), self.end < 0
         at = np.minimum(self.current, self.target.shape[1] - 1)
         fresh, jumping = running & (self.current > before), self.target[rows, at] != WALK

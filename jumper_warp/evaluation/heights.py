@@ -111,7 +111,7 @@ class HeightLog(JumpLog):
         """Return the commanded heights [m]."""
         return {"targets_m": self.commanded[list(worlds), 0].tolist()}
 
-    def strip(self, film: Film) -> Strip:
+    def filmstrip(self, film: Film) -> Strip:
         """Return pictures of the jump nearest to SHOWN_HEIGHT."""
         heights = self.commanded[film.worlds, 0]
         index = int(np.argmin(np.abs(heights - SHOWN_HEIGHT)))

@@ -115,14 +115,14 @@ class JumpLog(EvaluationLog):
         """Stand every world in the default pose with its first goal."""
         env.evaluation_reset(jump_commands(self.goals[:, 0], self.delay, env.step_dt), self.headings)
 
-    def look(self, env: Env) -> dict[str, np.ndarray]:
+    def read_env(self, env: Env) -> dict[str, np.ndarray]:
         """Return the state of every world's episode, which of its paws are on the ground, and how fast it rises."""
         return env.task_arrays() | paw_arrays(env)
 
-    def follow(self, env: Env) -> bool:
+    def record_step(self, env: Env) -> bool:
         """Look at the environment after a policy step, and command the jumps that are due."""
         before = self.current.copy()
-        ended = super().follow(env)
+        ended = super().record_step(env)
         due = (self.current > before) & (self.current < self.goals.shape[1])
         if due.any():
             goals = np.zeros((env.num_envs, 3), dtype=np.float32)

@@ -64,7 +64,7 @@ class EvaluationLog(ABC):
     def series(self, worlds: Sequence[int]) -> dict[str, float]:
         """Return what to draw of some worlds over time, `group/quantity [unit]` to its present value."""
 
-    def marks(self, worlds: Sequence[int]) -> np.ndarray | None:
+    def goal_markers(self, worlds: Sequence[int]) -> np.ndarray | None:
         """Return places to mark in a picture [m], world frame, (worlds, places a world, 3), if there are any."""
         return None
 
@@ -72,17 +72,17 @@ class EvaluationLog(ABC):
         """Return what to save with a recording of some worlds, as JSON can hold it."""
         return {}
 
-    def strip(self, film: Film) -> Strip | None:
+    def filmstrip(self, film: Film) -> Strip | None:
         """Return the filmstrip that shows most of a film, if there is one."""
         return None
 
-    def look(self, env: Env) -> dict[str, np.ndarray]:
+    def read_env(self, env: Env) -> dict[str, np.ndarray]:
         """Return what is to be known of every world after a policy step."""
         return env.task_arrays()
 
-    def follow(self, env: Env) -> bool:
+    def record_step(self, env: Env) -> bool:
         """Look at the environment after a policy step; return whether everything has ended."""
-        self.seen = self.look(env)
+        self.seen = self.read_env(env)
         return self.update(self.seen, env.step_dt)
 
 
@@ -103,7 +103,7 @@ def run_evaluation(
     log.begin(env)
     for _ in range(round((log.seconds if seconds is None else seconds) / env.step_dt)):
         env.step(act(env.obs))
-        ended = log.follow(env)
+        ended = log.record_step(env)
         if watch is not None:
             watch()
         if ended and stop:

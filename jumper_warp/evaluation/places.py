@@ -128,7 +128,7 @@ class LandingLog(JumpLog):
         way = np.linalg.norm((self.seen["base_pos"] - self.seen["goal"])[:, :2], axis=1)
         return super().series(worlds) | {f"distance/goal of {world} [m]": way[world] for world in worlds}
 
-    def marks(self, worlds: Sequence[int]) -> np.ndarray:
+    def goal_markers(self, worlds: Sequence[int]) -> np.ndarray:
         """Return the goals that were commanded [m], world frame, (worlds, jumps in a row, 3), z = 0."""
         target = self.target[list(worlds)]
         return np.concatenate([target, np.zeros_like(target[..., :1])], axis=-1)
@@ -137,7 +137,7 @@ class LandingLog(JumpLog):
         """Return the goals [m]."""
         return {"goals_m": self.places[list(worlds)].tolist()}
 
-    def strip(self, film: Film) -> Strip:
+    def filmstrip(self, film: Film) -> Strip:
         """Return pictures of the jump, or row of jumps, that begins with about SHOWN_DISTANCE."""
         distance = np.linalg.norm(self.places[film.worlds, 0], axis=1)
         index = int(np.argmin(np.abs(distance - SHOWN_DISTANCE)))

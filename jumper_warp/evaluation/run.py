@@ -122,7 +122,7 @@ class Run(ABC):
             values |= latency_metrics(np.concatenate(self._latency), self._physics_dt, conditions.latency)
         return values
 
-    def follow(
+    def run_episodes(
         self,
         env: Env,
         log: Log,
@@ -161,8 +161,8 @@ class Run(ABC):
 
     def _develop(self, film: Film, log: EvaluationLog, name: str) -> None:
         """Write a film as a recording, and as a filmstrip; this shows no blocks."""
-        film.save_rrd(self.folder / f"{name}.rrd", log.marks(film.worlds))
-        strip = None if film.block is not None else log.strip(film)
+        film.save_rrd(self.folder / f"{name}.rrd", log.goal_markers(film.worlds))
+        strip = None if film.block is not None else log.filmstrip(film)
         if strip is not None:
             film.save_strip(strip, self.folder / f"{strip.name or name}.png")
 

@@ -90,7 +90,7 @@ class Grid(Suite):
 
     def measure(self, run: EvaluationRun) -> dict[str, Any]:
         """Follow jumps, draw them, and return the metrics."""
-        landings = self.jump(run, self.places, film="jumps")
+        landings = self.run_landings(run, self.places, film="jumps")
         plot_landings(run.folder / "grid.png", {f"{len(landings.end)} jumps, {run.title}": landings}, (8.0, 5.0))
         inside = landings.places[..., 0] < AHEAD[1] - 1.0e-6
         return {"goals": self.columns * self.rows, **landing_metrics(landings, inside)}
@@ -115,7 +115,7 @@ class Ring(Suite):
         """Follow jumps, draw them, and return the metrics, also those of each quarter."""
         angle = np.linspace(0.0, 2.0 * np.pi, self.jumps, endpoint=False)
         places = self.radius * np.stack([np.cos(angle), np.sin(angle)], axis=-1)[:, None]
-        landings = self.jump(run, places, film="jumps")
+        landings = self.run_landings(run, places, film="jumps")
         title = f"{self.jumps} jumps over {self.radius:g} m, {run.title}"
         plot_landings(run.folder / "landings.png", {title: landings}, (6.0, 6.5))
         sector = np.round(np.arctan2(places[..., 1], places[..., 0]) / (0.5 * np.pi)).astype(int) % len(SECTORS)
@@ -160,7 +160,7 @@ class Consecutive(Suite):
         logs, paths = [], []
         for name, places in (("pairs", pairs), ("row", rows)):
             track, delay = Track(), rng.uniform(*DELAYS, len(places))
-            logs.append(self.jump(run, places, delay=delay, film=name, watch=track))
+            logs.append(self.run_landings(run, places, delay=delay, film=name, watch=track))
             paths.append(track.in_start_frame(logs[-1].headings))
         parts = dict(zip((*PAIRS, f"{self.row} in a row"), (*np.split(paths[0], 2), paths[1]), strict=True))
         plot_paths(run.folder / "paths.png", parts, PAIRS, run.title)
@@ -230,7 +230,7 @@ class Platform(Suite):
         done: dict[str, LandingLog] = {}
         for name, special, headings in self.scenes(goals, rng):
             env = run.env(self.jumps, **special)
-            done[name] = self.jump(run, goals[:, None], env, headings=headings, film=name, drawn=special)
+            done[name] = self.run_landings(run, goals[:, None], env, headings=headings, film=name, drawn=special)
             values |= {f"{name}_{metric}": value for metric, value in landing_metrics(done[name]).items()}
             if "block" in special:
                 slide = np.linalg.norm(block_places(env.sim) - special["block"].center, axis=1)
@@ -285,7 +285,7 @@ class Farthest(Suite):
         env, bins = run.env(self.jumps), {}
         for number in range(round((self.last - self.first) / BIN) + 1):
             middle = round(self.first + number * BIN, 6)
-            bins[middle] = self.jump(run, self.places(middle), env, film=f"jump_{middle:.1f}_m")
+            bins[middle] = self.run_landings(run, self.places(middle), env, film=f"jump_{middle:.1f}_m")
             success = bins[middle].success.mean()
             print(f"{middle:.1f} m: {success:.1%} success", flush=True)
             if success < GIVEN_UP:

@@ -74,7 +74,7 @@ class Suite(EvaluationArgs):
         run = EvaluationRun.of(self.name, self, self.evaluations, modules)
         return run.report(self.measure(run), self.paper)
 
-    def jump(
+    def run_landings(
         self,
         run: EvaluationRun,
         places: np.ndarray,
@@ -82,15 +82,16 @@ class Suite(EvaluationArgs):
         *,
         headings: np.ndarray | None = None,
         delay: np.ndarray | float = DELAY,
-        **follow: Any,
+        **options: Any,
     ) -> LandingLog:
         """Return jumps to places [m], (num_envs, jumps in a row, 2).
 
-        env, headings: made and drawn unless given; delay: as in `LandingLog`; follow: as in `EvaluationRun.follow`.
+        env, headings: new and sampled by default; delay: as in `LandingLog`; options: of `EvaluationRun.run_episodes`.
         """
         env = run.env(len(places)) if env is None else env
         headings = random_headings(len(places), self.seed) if headings is None else headings
-        return run.follow(env, LandingLog(places, termination_names(env.task), headings, delay, self.rest), **follow)
+        log = LandingLog(places, termination_names(env.task), headings, delay, self.rest)
+        return run.run_episodes(env, log, **options)
 
     def pushed_in_flight(self, run: EvaluationRun, measure: Callable[[Conditions], Metrics], *names: str) -> Metrics:
         """Return some metrics of a randomised test in which robots are pushed in flight too."""
@@ -125,16 +126,16 @@ class HeightSweep(Suite):
         super().__post_init__()
         check(0.0 < self.heights[0] <= self.heights[1] < 10.0, f"heights must be in (0, 10) m, got {self.heights}")
 
-    def follow(self, run: EvaluationRun, env: Env, film: str = "") -> HeightLog:
+    def run_jumps(self, run: EvaluationRun, env: Env, film: str = "") -> HeightLog:
         """Return the jumps."""
         heights = np.linspace(*self.heights, self.jumps)
-        return run.follow(env, HeightLog(heights, termination_names(env.task), self.rest), film=film)
+        return run.run_episodes(env, HeightLog(heights, termination_names(env.task), self.rest), film=film)
 
     def measure(self, run: EvaluationRun) -> dict[str, Any]:
         """Follow jumps and open-loop jumps, draw them, and return the metrics."""
         env = run.env(self.jumps, for_sweep)
         fresh = env.state_dict()
-        jumps = self.follow(run, env, "jumps")
+        jumps = self.run_jumps(run, env, "jumps")
         limit = open_loop_limits(env, fresh)
         with figure(run.folder / "sweep.png", figsize=(6, 5.5)) as axis:
             axis.scatter(jumps.commanded, limit, s=5, color="0.6", label="open-loop jump of the same robot")
@@ -144,7 +145,7 @@ class HeightSweep(Suite):
             axis.set_title(f"{self.jumps} jumps, {run.title}", wrap=True)
 
         def pushed(conditions: Conditions) -> Metrics:
-            return sweep_metrics(self.follow(run, run.env(self.jumps, for_sweep, conditions)), HEIGHTS_IN_RANGE)
+            return sweep_metrics(self.run_jumps(run, run.env(self.jumps, for_sweep, conditions)), HEIGHTS_IN_RANGE)
 
         names = ("mean_abs_error_m", "success_rate", "success_rate_in_range", "fall_rate", "miss_rate", "landing_rate")
         values = sweep_metrics(jumps, HEIGHTS_IN_RANGE) | limit_metrics(jumps, limit)
@@ -180,12 +181,12 @@ class DistanceSweep(Suite):
         (near, far), goals = self.distances, f"{self.distances}, {self.aside} aside"
         check(0.0 < near < far < 10.0 and 0.0 <= self.aside < 10.0, f"goals must be within 10 m and rise, got {goals}")
 
-    def follow(self, run: EvaluationRun, conditions: Conditions, film: str = "") -> LandingLog:
+    def run_jumps(self, run: EvaluationRun, conditions: Conditions, film: str = "") -> LandingLog:
         """Return the jumps in some conditions."""
         aside = np.random.default_rng(self.seed + 1).uniform(-self.aside, self.aside, self.jumps)
         places = np.stack([np.linspace(*self.distances, self.jumps), aside], axis=1)[:, None]
         env = run.env(self.jumps, ended_by_takeoff if self.end_at_second_takeoff else for_evaluation, conditions)
-        return self.jump(run, places, env, film=film)
+        return self.run_landings(run, places, env, film=film)
 
     @staticmethod
     def metrics(landings: LandingLog) -> Metrics:
@@ -196,7 +197,7 @@ class DistanceSweep(Suite):
 
     def measure(self, run: EvaluationRun) -> dict[str, Any]:
         """Follow jumps, draw them, and return the metrics."""
-        landings, trained = self.follow(run, run.conditions, "jumps"), trained_range(run.task)
+        landings, trained = self.run_jumps(run, run.conditions, "jumps"), trained_range(run.task)
         with figure(run.folder / "sweep.png", figsize=(6, 5.5)) as axis:
             axis.axvspan(*TRAINED, color="0.5", alpha=0.08, label="training of the paper")
             axis.axvspan(*trained.values(), color="tab:orange", alpha=0.06, label="training of this policy")
@@ -207,7 +208,7 @@ class DistanceSweep(Suite):
             axis.set_title(f"{self.jumps} jumps, {run.title}", wrap=True)
         values = {"rest_s": self.rest, "end_at_second_takeoff": self.end_at_second_takeoff, **self.metrics(landings)}
         pushed = self.pushed_in_flight(
-            run, lambda conditions: self.metrics(self.follow(run, conditions)), "mean_error_m", "success_rate",
+            run, lambda conditions: self.metrics(self.run_jumps(run, conditions)), "mean_error_m", "success_rate",
             "success_rate_in_range", "fall_rate", "miss_rate", "still_landing_rate", "max_landing_tilt_deg",
         )  # fmt: skip
         return values | trained | pushed

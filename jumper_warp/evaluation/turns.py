@@ -84,7 +84,7 @@ class AttitudeLog(EvaluationLog):
         self.step_dt = env.step_dt
         env.evaluation_reset(self.turns)
 
-    def look(self, env: Any) -> dict[str, np.ndarray]:
+    def read_env(self, env: Any) -> dict[str, np.ndarray]:
         """Return the state of every world's episode, and its base's angular velocity."""
         return env.task_arrays() | {"base_ang_vel": env.sim.joint_qd()[:, 3:6].copy()}
 
@@ -148,7 +148,7 @@ class AttitudeLog(EvaluationLog):
         """Return the turns."""
         return {"turns_xyzw": self.turns[list(worlds)].tolist()}
 
-    def strip(self, film: Film) -> Strip:
+    def filmstrip(self, film: Film) -> Strip:
         """Return pictures of the first filmed turn, until it has settled."""
         world = film.worlds[0]
         until = np.nan_to_num(self.settling[world], nan=self.seconds)

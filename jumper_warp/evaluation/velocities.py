@@ -69,7 +69,7 @@ class VelocityLog(EvaluationLog):
         gait = np.full((len(self.commands), 1), getattr(self.task.reset.settings, "gait", 0.0))
         env.evaluation_reset(np.concatenate([self.commands[:, 0], gait], axis=1), self.headings)
 
-    def look(self, env: Env) -> dict[str, np.ndarray]:
+    def read_env(self, env: Env) -> dict[str, np.ndarray]:
         """Return attitude and velocity of every base, give the commands that are due, and kick."""
         sim = env.sim
         q, qd = sim.joint_q(), sim.joint_qd()
@@ -144,7 +144,7 @@ class VelocityLog(EvaluationLog):
         """Return the commands."""
         return {"commands": self.commands[list(worlds)].tolist(), "times_s": self.times.tolist()}
 
-    def strip(self, film: Film) -> Strip:
+    def filmstrip(self, film: Film) -> Strip:
         """Return pictures of the last stride of the first filmed robot."""
         base = film.base(0)
         first = max(0, len(base) - 1 - round(SHOWN_TIME / film.env.step_dt))

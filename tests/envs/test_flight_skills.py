@@ -29,7 +29,7 @@ def flown():
         turn, jump = (env.skills[skill].states.numpy().copy() for skill in (TURN, JUMP))
         height, rise = env.sim.joint_q()[:, 2].copy(), env.sim.joint_qd()[:, 2].copy()
         seen.append((env.worlds.skill.numpy().copy(), turn, jump, height, rise))
-        if flights.follow(env):
+        if flights.record_step(env):
             break
     return env, flights, seen
 

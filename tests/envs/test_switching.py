@@ -59,7 +59,7 @@ def followed():
                     each.next_safe = env.robot.safe_target.numpy()[:, each.world].copy()
         fresh = [Switch(env, w) for w in np.flatnonzero(env.worlds.skill.numpy() != was)]
         switches += fresh
-        if course.follow(env):
+        if course.record_step(env):
             break
     return policies, env, course, switches
 

@@ -170,7 +170,7 @@ def test_run_tells_the_latency_it_simulated_over_several_policy_steps(tmp_path):
     run = EvaluationRun.of("test", args)
     env = run.env(2)
     asked = places.LandingLog(np.array([[[0.5, 0.0]]] * 2), tuple(term.name for term in env.task.terminations))
-    run.follow(env, asked)
+    run.run_episodes(env, asked)
     values = run.report({}, {})
     assert (values["latency_asked_ms"], values["latency"]) == (40.0, "39.6 ms (19 physics steps)")
     assert values["latency_ms"] == pytest.approx(1000.0 * 19 / 480)

@@ -70,10 +70,10 @@ class MadeUp:
 
 def followed(script=SCRIPT, n=2, **made_up) -> tuple[CourseLog, MadeUp]:
     course, env = CourseLog([script] * n), MadeUp(n, **made_up)
-    course.look = lambda env: env.step()
+    course.read_env = lambda env: env.step()
     course.begin(env)
     for _ in range(round(course.seconds / DT)):
-        if course.follow(env):
+        if course.record_step(env):
             break
     return course, env
 
@@ -119,9 +119,9 @@ def test_a_block_is_put_under_the_goal_when_the_jump_onto_it_takes_over():
     plain, onto = (ScriptStep(kind, (1.3, 0.1)) for kind in ("jump_to", "jump_onto"))
     course, env = CourseLog([(plain, plain), (plain, onto)]), MadeUp(2)
     assert course.block is not None and CourseLog([(plain, plain)]).block is None
-    course.look = lambda env: env.step()
+    course.read_env = lambda env: env.step()
     course.begin(env)
-    while not course.follow(env):
+    while not course.record_step(env):
         pass
     assert env.placed == [(course.switched[1, 1], [[3.0, 4.0]], [1])] and course.switched[1, 1] > course.over[1, 0]
 

@@ -44,10 +44,10 @@ def episodes():
     assert env.commands.tolist() == [[0.5, 0.1, 0.0, 0.0]] * 4
     env.now(ending=[0, -1, -1, ENDS.index("came_apart")])
     env.now(base_pos=[[1.5, 0.0, 0.4], [1.0, 0.1, 0.2], [1.0, 0.0, 0.3], [np.nan, 0.0, 9.0]])
-    assert not log.follow(env)
+    assert not log.record_step(env)
     env.now(ending=[ENDS.index("tilted"), ENDS.index("low_base"), -1, -1])
     env.now(base_pos=[[9.0, 9.0, 9.0], [1.0, 0.4, 0.0], [1.0, 0.0, 0.3], [9.0, 9.0, 9.0]])
-    assert not log.follow(env)
+    assert not log.record_step(env)
     return log
 
 

@@ -73,10 +73,10 @@ def five_jumps():
     # headed to the left, the goals lie at (-y, x)
     touchdown = [[0.05, 0.9, 0.4], [-0.2, 0.8, 0.4], *([[0.0] * 3] * 3)]
     env.now(base_pos=touchdown, phase=[2, 2, 1, 1, 0], touched_down=[1, 1, 0, 0, 0])
-    assert not landings.follow(env)
+    assert not landings.record_step(env)
     env.now(touched_down=0)
     env.now(base_pos=[[0.05, 0.93, 0.3], [-0.2, 0.7, 0.3], *([[0.0] * 3] * 3)], phase_steps=[18, 18, 3, 3, 9])
-    assert not landings.follow(env)
+    assert not landings.record_step(env)
     env.now(
         base_pos=[[0.03, 0.96, 0.3], [-0.2, 0.8, 0.3], [1e9, 0.0, 0.0], [0.0, 0.9, 0.1], [0.0, 0.0, 0.3]],
         base_quat=[about_z(QUARTER + 0.1), about_z(QUARTER - 0.3), *([[0.0, 0.0, 0.0, 1.0]] * 3)],
@@ -84,7 +84,7 @@ def five_jumps():
         phase=[2, 2, 1, 2, 0], phase_steps=[60, 60, 3, 20, 9], ending=[0, -1, 1, COLLIDED, NO_JUMP],
         peak_tilt=[0.1, 0.2, 3.0, 1.0, 0.0], max_height=[0.6, 0.5, 9.0, 0.7, 0.3],
     )  # fmt: skip
-    assert landings.follow(env)
+    assert landings.record_step(env)
     return landings
 
 
@@ -142,7 +142,7 @@ def test_nothing_changes_after_the_end():
     before = landings.landing.copy()
     later = Stub(5)
     later.now(ending=COLLIDED, base_pos=7.0)
-    assert landings.follow(later)
+    assert landings.record_step(later)
     assert np.array_equal(landings.landing, before) and landings.success.sum() == 1
 
 
@@ -150,9 +150,9 @@ def test_jump_before_the_command_is_no_success():
     landings, env = LandingLog(np.zeros((1, 1, 2)), TERMINATIONS), Stub(1)
     landings.begin(env)
     env.now(took_off=1, steps=29)
-    assert not landings.follow(env)
+    assert not landings.record_step(env)
     env.now(took_off=0, steps=120, phase=2, phase_steps=60)
-    assert landings.follow(env)
+    assert landings.record_step(env)
     metrics = landing_metrics(landings)
     assert (metrics["success_rate"], metrics["early_rate"], metrics["landing_rate"]) == (0.0, 1.0, 1.0)
     assert metrics["failed_by_early"] == 1
@@ -166,10 +166,10 @@ def test_long_enough_in_the_air_after_touchdown_is_another_jump(steps, hopped):
         env.now(phase=phase)
         env.sim.paw_force.fill_(wp.vec3(0.0, 0.0, force))
         for _ in range(count):
-            assert not landings.follow(env)
+            assert not landings.record_step(env)
     env.now(phase_steps=60)
     env.sim.paw_force.fill_(wp.vec3(0.0, 0.0, 9.0))
-    assert landings.follow(env)
+    assert landings.record_step(env)
     assert landings.air_time[0, 0] == pytest.approx(max(steps) * DT)
     metrics = landing_metrics(landings)
     assert (metrics["success_rate"], metrics["second_hop_rate"]) == (1.0, float(hopped))
@@ -193,9 +193,9 @@ def test_paw_lifted_again_after_its_own_contact_is_a_step(contacts, stepped):
         for down, count in rows:
             env.stand_on(*down)
             for _ in range(count):
-                assert not landings.follow(env)
+                assert not landings.record_step(env)
     env.now(phase_steps=60)
-    assert landings.follow(env)
+    assert landings.record_step(env)
     metrics = landing_metrics(landings)
     assert (metrics["success_rate"], metrics["second_hop_rate"]) == (1.0, 0.0)
     assert (metrics["step_rate"], metrics["step_free_success_rate"]) == (float(stepped), float(not stepped))
@@ -216,19 +216,19 @@ def test_second_takeoffs_are_upward_with_no_paw_down(moments, takeoffs):
     landings.begin(env)
     env.stand_on()
     env.now(phase=1, base_vel=[0.0, 0.0, 3.0])  # the jump's own takeoff is none
-    assert not landings.follow(env)
+    assert not landings.record_step(env)
     env.now(phase=2, touched_down=1, base_vel=[0.0, 0.0, 0.0])
     env.stand_on(0, 1, 2, 3)
-    assert not landings.follow(env)
+    assert not landings.record_step(env)
     env.now(touched_down=0)
     for down, up, count in moments:
         env.stand_on(*down)
         env.now(base_vel=[0.0, 0.0, up])
         for _ in range(count):
-            assert not landings.follow(env)
+            assert not landings.record_step(env)
     env.now(phase_steps=60, base_vel=0.0)
     env.stand_on(0, 1, 2, 3)
-    assert landings.follow(env)
+    assert landings.record_step(env)
     assert landings.takeoffs[0, 0] == takeoffs
     metrics = landing_metrics(landings)
     assert (metrics["success_rate"], metrics["second_takeoff_rate"]) == (1.0, float(takeoffs > 0))
@@ -238,11 +238,11 @@ def test_fall_after_the_first_second_counts_where_the_jump_is_followed_for_longe
     landings, env = LandingLog(np.zeros((2, 1, 2)), TERMINATIONS, rest=3.0), Stub(2)
     landings.begin(env)
     env.now(phase=2, phase_steps=60, ending=0)
-    assert not landings.follow(env)
+    assert not landings.record_step(env)
     env.now(phase_steps=120, ending=[0, 2])
-    assert not landings.follow(env)
+    assert not landings.record_step(env)
     env.now(phase_steps=180, ending=0)
-    assert landings.follow(env)
+    assert landings.record_step(env)
     assert landings.outcomes[:, 0].tolist() == ["success", "low_base"]
     metrics = landing_metrics(landings)
     assert (metrics["success_rate"], metrics["fall_rate"], metrics["miss_rate"]) == (0.5, 0.5, 0.0)
@@ -253,20 +253,20 @@ def test_flight_of_the_next_jump_is_no_step():
     landings, env = LandingLog(np.zeros((1, 2, 2)), TERMINATIONS), Stub(1)
     landings.begin(env)
     env.now(phase=2, phase_steps=60)
-    assert not landings.follow(env) and len(env.commanded) == 1
+    assert not landings.record_step(env) and len(env.commanded) == 1
     env.now(phase=1)
     env.stand_on()
     for _ in range(9):
-        assert not landings.follow(env)
+        assert not landings.record_step(env)
     env.now(phase=2, phase_steps=60)
-    assert landings.follow(env)
+    assert landings.record_step(env)
     assert landings.success.all() and not landings.stepped.any()
 
 
 def test_jump_that_does_not_end_fails_where_it_is():
     landings, env = LandingLog(np.array([[[0.4, 0.0]]]), TERMINATIONS), Stub(1)
     landings.begin(env)
-    assert not landings.follow(env)
+    assert not landings.record_step(env)
     metrics = landing_metrics(landings)
     assert metrics["mean_error_m"] == pytest.approx(0.4) and metrics["failed_by_no_end"] == 1
 
@@ -276,9 +276,9 @@ def two_in_a_row():
     landings, env = LandingLog(np.array([[[0.8, 0.2], [0.7, 0.0]]] * 2), TERMINATIONS, rest=0.5), Stub(2)
     landings.begin(env)
     env.now(base_pos=[0.8, 0.15, 0.3], phase=2, phase_steps=[29, 10], ending=[-1, COLLIDED])
-    assert not landings.follow(env) and not env.commanded
+    assert not landings.record_step(env) and not env.commanded
     env.now(phase_steps=30)
-    assert not landings.follow(env)
+    assert not landings.record_step(env)
     return landings, env
 
 
@@ -292,7 +292,7 @@ def test_next_jump_is_commanded_after_the_rest_and_only_after_a_landing():
 def test_next_jump_is_measured_from_its_own_goal():
     landings, env = two_in_a_row()
     env.now(base_pos=[[1.48, 0.15, 0.3], [0.0, 0.0, 0.0]], phase=2, phase_steps=30, ending=0)
-    assert landings.follow(env)
+    assert landings.record_step(env)
     assert landings.error[0] == pytest.approx([0.05, 0.02])
     assert landings.outcomes.tolist() == [["success", "success"], ["collided", "not_begun"]]
     metrics = landing_metrics(landings)
@@ -300,7 +300,7 @@ def test_next_jump_is_measured_from_its_own_goal():
     assert "success_rate_in_range" not in metrics and "mean_error_in_range_m" not in metrics
     everywhere = landing_metrics(landings, np.ones((2, 2), dtype=bool))
     assert everywhere["success_rate_in_range"] == pytest.approx(2 / 3)
-    assert landings.marks([0])[0, :, :2] == pytest.approx(np.array([[0.8, 0.2], [1.5, 0.15]]))
+    assert landings.goal_markers([0])[0, :, :2] == pytest.approx(np.array([[0.8, 0.2], [1.5, 0.15]]))
 
 
 def test_columns_have_a_row_a_jump_and_none_for_jumps_that_were_not_begun():

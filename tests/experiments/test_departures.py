@@ -100,11 +100,11 @@ def test_trainings_are_measured_by_the_ends_of_the_task_as_it_is_and_not_made_tw
     assert not (tmp_path / "metrics.json").exists()
     config = next((tmp_path / "jumping_early_1").rglob("config.json")).read_text()
     assert "early_takeoff" not in [term["name"] for term in json.loads(config)["env"]["task"]["terminations"]]
-    ends, follow = [], departure_runs.EvaluationRun.follow
+    ends, run_episodes = [], departure_runs.EvaluationRun.run_episodes
     monkeypatch.setattr(departure_runs, "train", None)
     monkeypatch.setattr(
-        departure_runs.EvaluationRun, "follow",
-        lambda run, env, log: ends.append([term.name for term in env.task.terminations]) or follow(run, env, log),
+        departure_runs.EvaluationRun, "run_episodes",
+        lambda run, env, log: ends.append([term.name for term in env.task.terminations]) or run_episodes(run, env, log),
     )  # fmt: skip
     values = departures.main(replace(args, measure=True, threads=2))
     assert len(ends) == 4 and all("early_takeoff" in names for names in ends[::2])
