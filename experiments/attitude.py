@@ -20,9 +20,7 @@ import numpy as np
 import tyro
 
 from jumper_warp.cli.main import run_command
-from jumper_warp.evaluation.plots import figure
-from jumper_warp.evaluation.run import EvaluationArgs, EvaluationRun
-from jumper_warp.evaluation.turns import (
+from jumper_warp.evaluation.attitude import (
     DIRECTIONS,
     AttitudeFlags,
     AttitudeLog,
@@ -30,6 +28,8 @@ from jumper_warp.evaluation.turns import (
     turn_metrics,
     turns_about_any,
 )
+from jumper_warp.evaluation.plots import figure
+from jumper_warp.evaluation.run import EvaluationArgs, EvaluationRun
 from support.momentum import MomentumWatch, rotational_inertia
 
 HARDWARE = {"mean_settling_s": 2.6}

@@ -29,7 +29,7 @@ from jumper_warp.sim.simulation import Simulation
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.output import write_metrics
 from jumper_warp.viz.snapshot import Camera, contact_sheet
-from support.open_loop import SQUAT, follow_jump, jump_metrics, plot_trace
+from support.open_loop import SQUAT, follow_jump, plot_trace, trace_metrics
 from support.scripts import DeviceArgs, prepare
 
 HARDWARE_APEX = 1.075
@@ -98,7 +98,7 @@ def main(args: Args) -> dict:
     )  # fmt: skip
     trace, recorder, frames = follow_jump(sim, variant, args.squat)
     save_filmstrip(frames, folder / "jump_strip.png")
-    values: dict[str, Any] = {**variant, **jump_metrics(trace), "hardware_apex_height_m": None}
+    values: dict[str, Any] = {**variant, **trace_metrics(trace), "hardware_apex_height_m": None}
     if args.torque == 18.0 and args.gravity == EARTH and not args.loose and robot is None:
         values["hardware_apex_height_m"] = HARDWARE_APEX
     write_metrics(folder, values)

@@ -29,7 +29,7 @@ from jumper_warp.tasks.observations import with_history
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.output import write_metrics
 from support.gradient_variance import variances
-from support.learning import Curve, curve_metrics, learning_curve, make_judge, plot_curves
+from support.learning import Curve, curve_metrics, make_judge, plot_curves, train_and_evaluate
 from support.scripts import DeviceArgs, prepare
 
 TASK = "vertical-jump"
@@ -85,8 +85,8 @@ def train(args: Args, trainer: str, seed: int) -> Curve:
     if trainer == "shac":
         smooth = cast(DifferentiableVecEnv, DifferentiableEnv(env))
         settings = replace(settings, num_steps=args.window, init_std=args.init_std)
-        return learning_curve(smooth, Shac(smooth, settings, ShacCfg()), judge, args.seconds, args.every)
-    return learning_curve(env, Ppo(env, settings), judge, args.seconds, args.every)
+        return train_and_evaluate(smooth, Shac(smooth, settings, ShacCfg()), judge, args.seconds, args.every)
+    return train_and_evaluate(env, Ppo(env, settings), judge, args.seconds, args.every)
 
 
 def compare(args: Args, folder: Path) -> dict[str, Any]:

@@ -19,7 +19,7 @@ from jumper_warp.cli.main import run_command
 from jumper_warp.evaluation.plots import figure
 from jumper_warp.evaluation.run import HEIGHTS, PLACES, EvaluationArgs, EvaluationRun
 from jumper_warp.utils.errors import InputError
-from support.holds import SquatLog, hold_goals, hold_metrics
+from support.squats import SquatLog, hold_goals, hold_metrics
 
 
 @dataclass(frozen=True)

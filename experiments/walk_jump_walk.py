@@ -20,7 +20,7 @@ import tyro
 
 from jumper_warp.cli.main import run_command
 from jumper_warp.evaluation.courses import CourseLog, course_metrics, plot_course
-from jumper_warp.evaluation.places import random_headings
+from jumper_warp.evaluation.landings import random_headings
 from jumper_warp.evaluation.run import EvaluationArgs, SkillRun
 from jumper_warp.evaluation.scripts import ScriptStep
 from jumper_warp.policies.skills import SkillNames

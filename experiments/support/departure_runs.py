@@ -25,7 +25,7 @@ from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.tasks.saving import task_to_json
 from jumper_warp.utils.errors import InputError
 from support.departures import Undone
-from support.holds import SquatLog, hold_goals, hold_metrics
+from support.squats import SquatLog, hold_goals, hold_metrics
 
 ELSEWHERE = {"log_root", "device", "threads"}
 """Settings in which a training may differ from one that is there already."""
@@ -109,7 +109,7 @@ def measured(checkpoint: Path, args: Any, folder: Path) -> dict[str, dict[str, A
         drawn_robots = test == "randomized"
         conditions = replace(run.conditions, randomize=drawn_robots, noise=drawn_robots)
         flags: Any = replace(cast(Any, run.evaluation.flags), jumps=count, **JUMPS[args.task].goals)
-        env = run.env(count, lambda task: run.evaluation.for_evaluation(replace(task, terminations=ends)), conditions)
+        env = run.env(count, lambda task: run.evaluation.prepare_task(replace(task, terminations=ends)), conditions)
         values = flags.metrics(run.run_episodes(env, flags.log(env.task, 0)))
         values["error_m"] = values.get("mean_abs_error_m", values.get("mean_error_m"))
         goals = hold_goals(args.squats, JUMPS[args.task].squats, up=run.task.evaluation in HEIGHTS)

@@ -64,7 +64,7 @@ def warm_up(env: VecEnv, ppo: Ppo | Shac) -> None:
     env.metrics()
 
 
-def learning_curve(
+def train_and_evaluate(
     env: VecEnv, ppo: Ppo | Shac, judge: Env, seconds: float, every: float, heights: tuple[float, float] = TESTED
 ) -> Curve:
     """Train for a time [s] as `jumper train --max-seconds` does, and return the curve; the test is off the clock.
@@ -103,7 +103,7 @@ def timed_training(task: TaskCfg, cfg: PpoCfg, args: Any, seed: int) -> Curve:
     warm_up(env, ppo)
     ready, judge = process_age(), make_judge(task, args.jumps, args.device)
     success(ppo, judge)
-    curve = learning_curve(env, ppo, judge, args.seconds, args.every, args.heights)
+    curve = train_and_evaluate(env, ppo, judge, args.seconds, args.every, args.heights)
     curve.ready = ready
     return curve
 

@@ -92,7 +92,7 @@ def record(recorder: Recorder, poses: np.ndarray, row: tuple) -> None:
     recorder.record(now, poses, series, contact_points=ankles(poses[None])[0], contact_forces=force)
 
 
-def jump_metrics(trace: Trace) -> dict[str, float]:
+def trace_metrics(trace: Trace) -> dict[str, float]:
     """Return the metrics of the jump, in SI units but for the gap of the loops [mm]."""
     contact = np.linalg.norm(trace.force, axis=2).max(axis=1) > 0.1
     extend = trace.time > (STAND + RAMP + HOLD) / 60.0

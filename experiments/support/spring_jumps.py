@@ -13,7 +13,7 @@ from jumper_warp.robot.motors import MotorCfg, loose_filter, vertical_jump_filte
 from jumper_warp.robot.overlay import RobotOverlay, with_springs
 from jumper_warp.robot.values import RobotValues
 from jumper_warp.sim.simulation import Simulation
-from support.open_loop import EXTEND, HOLD, RAMP, STAND, follow_jump, jump_metrics, transversal_command
+from support.open_loop import EXTEND, HOLD, RAMP, STAND, follow_jump, trace_metrics, transversal_command
 
 FALLING = 60
 """Ticks after the extension in which a jump may still rise."""
@@ -62,4 +62,4 @@ class SpringJumps:
         sim = self.simulation(1, with_springs(stiffness, self.length))
         trace, recorder, _ = follow_jump(sim, {"spring_stiffness_n_m": stiffness, "squat_command_deg": squat}, squat)
         recorder.save_rrd(folder / f"jump_{self.filter}.rrd")
-        return jump_metrics(trace)
+        return trace_metrics(trace)

@@ -34,7 +34,7 @@ class EvaluateCfg(Generic[Flags]):
     """Try a policy many times and report how well it did."""
 
     flags: Annotated[Flags, tyro.conf.arg(name="")]
-    """`jumper_warp.evaluation.registry.EvaluationFlags`"""
+    """`jumper_warp.evaluation.evaluations.EvaluationFlags`"""
     conditions: Annotated[Conditions, tyro.conf.arg(name="")] = field(default_factory=Conditions)
     """What the policy is tried in."""
     out: Path | None = None
@@ -51,7 +51,7 @@ def evaluate(run: EvaluationRun, cfg: EvaluateCfg) -> dict[str, Any]:
     if cfg.keep and is_run(run.source):
         raise PolicyError(f"{run.source}: a run keeps no figures; export it first")
     run.prepare("evaluate", cfg.conditions, cfg.out)
-    log = cfg.flags.log(run.evaluation.for_evaluation(run.task), cfg.conditions.seed)
+    log = cfg.flags.log(run.evaluation.prepare_task(run.task), cfg.conditions.seed)
     run.run_episodes(run.env(log.count), log)
     figures = {
         "task": run.policy.interface.task,
@@ -104,7 +104,7 @@ class PlayCfg(RecordingCfg, Generic[Flags]):
     """Let a policy act, and record it."""
 
     flags: Annotated[Flags, tyro.conf.arg(name="")]
-    """`jumper_warp.evaluation.registry.PlayFlags`"""
+    """`jumper_warp.evaluation.evaluations.PlayFlags`"""
     seconds: float | None = None
     """[s] Length of the recording (default: for jumps 3.5, and 2.5 for each further one; else 10)."""
 
@@ -121,7 +121,7 @@ def play(run: EvaluationRun, cfg: PlayCfg) -> Path:
     """
     flags, name = cfg.flags, run.policy.interface.task
     run.prepare("play", cfg.conditions, cfg.out)
-    log = flags.log(run.evaluation.for_evaluation(run.task))
+    log = flags.log(run.evaluation.prepare_task(run.task))
     env, worlds = run.env(log.count), range(log.count)
     notes = {"task": name, **log.notes(worlds), "solver": cfg.conditions.solver}
     film = Film(env, log.series, worlds, spacing=log.spacing, notes=notes, motors=True)

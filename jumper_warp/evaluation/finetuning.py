@@ -18,9 +18,9 @@ from typing import Any
 import numpy as np
 import torch
 
-from jumper_warp.evaluation.jump_misses import Group, Misses, follow
+from jumper_warp.evaluation.evaluations import evaluation_of
+from jumper_warp.evaluation.jump_errors import Group, Misses, follow
 from jumper_warp.evaluation.jumps import LANDED, jump_commands
-from jumper_warp.evaluation.registry import evaluation_of
 from jumper_warp.policies.conditions import Conditions, env_of_policy
 from jumper_warp.policies.policy import Policy
 from jumper_warp.tasks.cfg import TaskCfg
@@ -102,7 +102,7 @@ def make_groups(policy: Policy, cfg: FinetuneCfg, modules: Iterable[ModuleType] 
     rng, groups = np.random.default_rng(cfg.seed), []
 
     def level(task: TaskCfg) -> TaskCfg:
-        return evaluation_of(task).for_evaluation(task).on_level_ground()
+        return evaluation_of(task).prepare_task(task).on_level_ground()
 
     def latencies(task: TaskCfg) -> TaskCfg:
         ranges = RandomizationCfg.off().with_fixed(friction=task.randomization.nominal_friction)

@@ -25,7 +25,7 @@ from jumper_warp.evaluation.log import (
     mean_and_max,
     run_evaluation,
     termination_names,
-    with_ends,
+    with_terminations,
     within,
 )
 from jumper_warp.tasks.cfg import TaskCfg
@@ -50,15 +50,15 @@ SHOWN_HEIGHT = 1.0
 """[m] The filmstrip shows the jump nearest to this."""
 
 
-def for_evaluation(task: TaskCfg) -> TaskCfg:
+def with_success_last(task: TaskCfg) -> TaskCfg:
     """Return a task whose success is judged last, so that it hides no fall."""
     names = [term.name for term in task.terminations if term.name != SUCCESS]
-    return with_ends(task, (*names, SUCCESS))
+    return with_terminations(task, (*names, SUCCESS))
 
 
-def for_sweep(task: TaskCfg) -> TaskCfg:
+def with_sweep_terminations(task: TaskCfg) -> TaskCfg:
     """Return a task with the terminations that count in a sweep."""
-    return with_ends(task, SWEEP_ENDS)
+    return with_terminations(task, SWEEP_ENDS)
 
 
 class HeightLog(JumpLog):
@@ -136,7 +136,7 @@ def run_jumps(act: Callable[[torch.Tensor], torch.Tensor], env: Env, heights: np
     return jumps
 
 
-def jump_metrics(jumps: HeightLog, in_range: tuple[float, float]) -> Metrics:
+def apex_metrics(jumps: HeightLog, in_range: tuple[float, float]) -> Metrics:
     """Return the metrics of jumps to heights.
 
     Errors are over all jumps, failed ones included, but those whose simulation came apart, which `came_apart` counts.
@@ -144,7 +144,7 @@ def jump_metrics(jumps: HeightLog, in_range: tuple[float, float]) -> Metrics:
     """
     success, outcomes = jumps.success, jumps.outcomes
     metrics: Metrics = {
-        **height_metrics(jumps, in_range),
+        **apex_error_metrics(jumps, in_range),
         "max_abs_error_of_successes_m": largest(np.abs(jumps.error)[success]),
         "success_rate": mean(success),
         "success_rate_in_range": mean(success[within(jumps.commanded, in_range)]),
@@ -158,7 +158,7 @@ def jump_metrics(jumps: HeightLog, in_range: tuple[float, float]) -> Metrics:
     return metrics | failures(outcomes[~success])
 
 
-def height_metrics(jumps: HeightLog, in_range: tuple[float, float]) -> Metrics:
+def apex_error_metrics(jumps: HeightLog, in_range: tuple[float, float]) -> Metrics:
     """Return the errors, and how landed jumps stand: a second takeoff, drift in the plane, turn."""
     error, landed = np.abs(jumps.error), jumps.landed
     beyond = (jumps.drift > DRIFT) | (np.degrees(np.abs(jumps.yaw)) > TURN)
@@ -185,7 +185,7 @@ def sweep_metrics(jumps: HeightLog, in_range: tuple[float, float]) -> Metrics:
     tilt, at_rest = np.where(np.isnan(jumps.error), 0.0, np.degrees(jumps.tilt)), jumps.rest_speed < REST_SPEED
     landed = jumps.landed & (tilt < LEVEL) & at_rest
     return {
-        **height_metrics(jumps, in_range),
+        **apex_error_metrics(jumps, in_range),
         "mean_error_m": mean(jumps.error),
         "success_rate": mean(near),
         "success_and_landing_rate": mean(near & landed),
@@ -223,8 +223,8 @@ class HeightFlags(JumpFlags):
         return HeightLog(np.linspace(self.lower, self.upper, self.jumps), termination_names(task))
 
     def metrics(self, log: HeightLog) -> Metrics:
-        """Return `jump_metrics`."""
-        return jump_metrics(log, self.in_range)
+        """Return `apex_metrics`."""
+        return apex_metrics(log, self.in_range)
 
 
 @dataclass(frozen=True)

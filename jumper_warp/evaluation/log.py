@@ -117,7 +117,7 @@ def success_index(terminations: Sequence[str]) -> int:
     return list(terminations).index(SUCCESS)
 
 
-def with_ends(task: TaskCfg, names: Sequence[str]) -> TaskCfg:
+def with_terminations(task: TaskCfg, names: Sequence[str]) -> TaskCfg:
     """Return a task of whose terminations those with some names are left, judged in the order of the names."""
     terms = {term.name: term for term in task.terminations}
     return replace(task, terminations=tuple(terms[name] for name in names if name in terms))

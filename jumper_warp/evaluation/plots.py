@@ -11,7 +11,7 @@ import matplotlib
 import numpy as np
 
 from jumper_warp.evaluation.jumps import JumpLog
-from jumper_warp.evaluation.places import LandingLog
+from jumper_warp.evaluation.landings import LandingLog
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt

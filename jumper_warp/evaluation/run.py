@@ -20,9 +20,9 @@ from rich.console import Console
 from rich.table import Table
 
 from jumper_warp.envs.env import Env
+from jumper_warp.evaluation.evaluations import evaluation_of
 from jumper_warp.evaluation.film import Film
 from jumper_warp.evaluation.log import EvaluationLog, run_evaluation
-from jumper_warp.evaluation.registry import evaluation_of
 from jumper_warp.policies.conditions import Conditions, env_of_policy
 from jumper_warp.policies.restore import restored_task
 from jumper_warp.policies.runs import open_policy
@@ -232,7 +232,7 @@ class EvaluationRun(Run):
         change: returns the task with the terminations that count (default: as its evaluation says); conditions: other
         ones than the run's; scene: more settings of `Env`.
         """
-        change, conditions = change or self.evaluation.for_evaluation, conditions or self.conditions
+        change, conditions = change or self.evaluation.prepare_task, conditions or self.conditions
         env = env_of_policy(self.policy, count, conditions, change=change, modules=self.modules, **scene)
         self.policy.to(env.device)
         self.told["gravity_m_s2"] = env.task.gravity

@@ -14,8 +14,8 @@ from typing import Any, ClassVar
 import numpy as np
 
 from jumper_warp.evaluation.film import block_places
+from jumper_warp.evaluation.landings import AT_END, FALLS, MISSED, LandingLog, landing_metrics, trained_range
 from jumper_warp.evaluation.log import largest, mean, within
-from jumper_warp.evaluation.places import AT_END, FALLS, MISSED, LandingLog, landing_metrics, trained_range
 from jumper_warp.evaluation.plots import Track, figure, plot_landings, plot_paths
 from jumper_warp.evaluation.run import EvaluationRun
 from jumper_warp.evaluation.sweeps import DistanceSweep, HeightSweep, Suite, check

@@ -6,16 +6,16 @@ import pytest
 
 from jumper_warp.cli import evaluate, play
 from jumper_warp.evaluation.commands import csv_text
+from jumper_warp.evaluation.evaluations import EVALUATIONS, evaluation_of
 from jumper_warp.evaluation.heights import HeightFlags, HeightLog
-from jumper_warp.evaluation.places import ENDS, LandingFlags
-from jumper_warp.evaluation.registry import EVALUATIONS, evaluation_of
+from jumper_warp.evaluation.landings import ENDS, LandingFlags
 from jumper_warp.policies.folder import save_policy
 from jumper_warp.policies.spec import PolicyError
 from jumper_warp.registry import TASKS, make_task
 from jumper_warp.utils.errors import InputError
 from landing_helpers import still_policy
 
-TASK = EVALUATIONS["place"].for_evaluation(make_task("horizontal-jump"))
+TASK = EVALUATIONS["place"].prepare_task(make_task("horizontal-jump"))
 
 
 @pytest.fixture(scope="module")
@@ -33,7 +33,7 @@ def test_every_task_is_measured_by_a_success_that_comes_after_all_falls():
         ("vertical-jump", "height"), ("horizontal-jump", "place"), ("omnidirectional-jump", "around"),
     )] == [True] * 3  # fmt: skip
     for name, kind in kinds.items():
-        ends = [term.name for term in kind.for_evaluation(make_task(name)).terminations]
+        ends = [term.name for term in kind.prepare_task(make_task(name)).terminations]
         assert ends[-1] == "success" and (name == "vertical-jump" or set(ends) == set(ENDS))
 
 

@@ -10,8 +10,8 @@ import warp as wp
 from scipy.spatial.transform import Rotation
 
 from jumper_warp.envs.env import Env
+from jumper_warp.evaluation.attitude import AttitudeLog, axis_metrics, turn_metrics, turns_about_axes
 from jumper_warp.evaluation.log import run_evaluation
-from jumper_warp.evaluation.turns import AttitudeLog, axis_metrics, turn_metrics, turns_about_axes
 from jumper_warp.kernels.attitude.state import AttitudeState
 from jumper_warp.registry import make_task
 from jumper_warp.robot.pinocchio_model import build_pinocchio

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from jump_helpers import edit_coordinates, edit_episodes, ending_names, make_env
-from jumper_warp.evaluation import heights, places
+from jumper_warp.evaluation import heights, landings
 from jumper_warp.evaluation.run import EvaluationArgs, EvaluationRun, latency_metrics, latency_text
 from jumper_warp.kernels.jump.state import LANDED
 from jumper_warp.policies.conditions import Conditions
@@ -31,10 +31,10 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 @pytest.mark.parametrize(
     ("name", "change"),
     [
-        ("horizontal-jump", places.for_evaluation),
-        ("horizontal-jump", places.ended_by_takeoff),
-        ("vertical-jump", heights.for_evaluation),
-        ("vertical-jump", heights.for_sweep),
+        ("horizontal-jump", landings.with_landing_terminations),
+        ("horizontal-jump", landings.with_second_takeoff),
+        ("vertical-jump", heights.with_success_last),
+        ("vertical-jump", heights.with_sweep_terminations),
     ],
 )
 def test_fall_two_seconds_after_a_landing_is_not_hidden_by_its_success(name, change):
@@ -48,7 +48,7 @@ def test_fall_two_seconds_after_a_landing_is_not_hidden_by_its_success(name, cha
 
 def test_second_takeoff_ends_the_jump_where_that_is_asked_for():
     names = {}
-    for change in (places.for_evaluation, places.ended_by_takeoff):
+    for change in (landings.with_landing_terminations, landings.with_second_takeoff):
         env = make_env(2, task=change(JUMP), auto_reset=False)
         env.evaluation_reset(np.zeros((2, 4)))
         edit_episodes(env, phase=LANDED, phase_steps=5)
@@ -56,7 +56,7 @@ def test_second_takeoff_ends_the_jump_where_that_is_asked_for():
             edit_coordinates(env, world, q={2: 1.0}, qd={2: up + 9.81 / 60.0})
         env.step(torch.zeros((2, 12)))
         names[change.__name__] = ending_names(env)
-    assert names == {"for_evaluation": ["", ""], "ended_by_takeoff": ["second_takeoff", ""]}
+    assert names == {"with_landing_terminations": ["", ""], "with_second_takeoff": ["second_takeoff", ""]}
 
 
 # ---------------------------------------------------------------- pushes
@@ -75,7 +75,7 @@ def test_pushes_of_a_test_come_and_go_however_they_were_trained_with():
 def test_pushes_of_a_test_act_in_flight_where_that_is_asked_for(in_flight):
     conditions = Conditions(randomize=True, push_in_flight=in_flight)
     task = conditions.applied(dataclasses.replace(HELD, randomization=RandomizationCfg(push_share=1.0)))
-    env = make_env(2, task=places.for_evaluation(task), randomize=True, auto_reset=False)
+    env = make_env(2, task=landings.with_landing_terminations(task), randomize=True, auto_reset=False)
     env.evaluation_reset(np.zeros((2, 4)))
     edit_coordinates(env, 1, q={2: 1.0})
     for _ in range(2):  # in the first, the paws of all were last seen in the air
@@ -102,7 +102,7 @@ def test_nominal_conditions_leave_the_task_alone_but_for_margins():
 
 def test_fixed_parameters_are_all_that_changes_of_a_nominal_robot():
     conditions = Conditions(latency=8.0, gains=(0.6, 1.0), friction=0.4)
-    task = places.for_evaluation(JUMP)
+    task = landings.with_landing_terminations(JUMP)
     nominal = make_env(2, task=task, auto_reset=False)
     env = make_env(2, task=conditions.applied(task), randomize=conditions.draws, auto_reset=False)
     assert env.parameters.latency.numpy().tolist() == [4, 4]  # 3.84
@@ -117,7 +117,7 @@ def test_fixed_parameters_are_all_that_changes_of_a_nominal_robot():
 
 
 def test_a_fixed_parameter_that_is_nominal_changes_no_bit():
-    conditions, task = Conditions(latency=0.0), places.for_evaluation(JUMP)
+    conditions, task = Conditions(latency=0.0), landings.with_landing_terminations(JUMP)
     pair = [make_env(2, task=task), make_env(2, task=conditions.applied(task), randomize=conditions.draws)]
     for env in pair:
         env.auto_reset = False
@@ -169,7 +169,7 @@ def test_run_tells_the_latency_it_simulated_over_several_policy_steps(tmp_path):
     args = EvaluationArgs(policy=str(tmp_path / "still"), latency=40.0, record=0, out=tmp_path, device="cpu")
     run = EvaluationRun.of("test", args)
     env = run.env(2)
-    asked = places.LandingLog(np.array([[[0.5, 0.0]]] * 2), tuple(term.name for term in env.task.terminations))
+    asked = landings.LandingLog(np.array([[[0.5, 0.0]]] * 2), tuple(term.name for term in env.task.terminations))
     run.run_episodes(env, asked)
     values = run.report({}, {})
     assert (values["latency_asked_ms"], values["latency"]) == (40.0, "39.6 ms (19 physics steps)")

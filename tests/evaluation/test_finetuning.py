@@ -8,7 +8,7 @@ import torch
 
 from jumper_warp.cli.main import main
 from jumper_warp.evaluation.finetuning import FinetuneCfg, finetune, make_groups, with_aim
-from jumper_warp.evaluation.jump_misses import follow
+from jumper_warp.evaluation.jump_errors import follow
 from jumper_warp.policies.policy import Policy
 from jumper_warp.policies.runs import open_policy
 from jumper_warp.trajectory.gauss_newton import Network

@@ -6,7 +6,13 @@ import pytest
 import warp as wp
 
 from jumper_warp.evaluation.jumps import wrapped, yaw_of
-from jumper_warp.evaluation.places import LandingLog, ended_by_takeoff, for_evaluation, landing_metrics, trained_range
+from jumper_warp.evaluation.landings import (
+    LandingLog,
+    landing_metrics,
+    trained_range,
+    with_landing_terminations,
+    with_second_takeoff,
+)
 from jumper_warp.registry import make_task
 
 DT = 1.0 / 60.0
@@ -313,9 +319,9 @@ def test_columns_have_a_row_a_jump_and_none_for_jumps_that_were_not_begun():
 
 
 def test_terminations_of_an_evaluation_leave_the_shaping_out():
-    terms = for_evaluation(make_task("horizontal-jump")).terminations
+    terms = with_landing_terminations(make_task("horizontal-jump")).terminations
     assert [term.name for term in terms] == ["came_apart", "low_base", "collided", "no_jump", "success"]
-    terms = ended_by_takeoff(make_task("horizontal-jump")).terminations
+    terms = with_second_takeoff(make_task("horizontal-jump")).terminations
     assert [term.name for term in terms][-2:] == ["second_takeoff", "success"]
 
 

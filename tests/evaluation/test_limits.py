@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from jump_helpers import make_env
-from jumper_warp.evaluation.heights import for_sweep
+from jumper_warp.evaluation.heights import with_sweep_terminations
 from jumper_warp.evaluation.jumps import jump_commands
 from jumper_warp.evaluation.limits import EXTEND, HOLD, RAMP, open_loop_limits
 from jumper_warp.policies.conditions import Conditions
@@ -23,7 +23,7 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 
 def begun(conditions, worlds):
     """Return an environment that has begun no episode yet, and its state."""
-    task = conditions.applied(for_sweep(make_task("vertical-jump")))
+    task = conditions.applied(with_sweep_terminations(make_task("vertical-jump")))
     env = make_env(worlds, task=task, randomize=conditions.draws, auto_reset=False)
     return env, env.state_dict()
 

@@ -16,7 +16,7 @@ from experiments import (
     shac,
     soak_test,
 )
-from jumper_warp.evaluation.heights import HeightLog, for_sweep, run_jumps, sweep_metrics
+from jumper_warp.evaluation.heights import HeightLog, run_jumps, sweep_metrics, with_sweep_terminations
 from jumper_warp.evaluation.limits import limit_metrics
 from jumper_warp.evaluation.sweeps import HEIGHTS_IN_RANGE, HeightSweep
 from jumper_warp.policies.conditions import Conditions, env_of_policy
@@ -130,7 +130,7 @@ class Script:
 
 @pytest.fixture(scope="module")
 def sweep_env():
-    return env_of_policy(still_policy("vertical-jump"), 3, Conditions(device="cpu"), change=for_sweep)
+    return env_of_policy(still_policy("vertical-jump"), 3, Conditions(device="cpu"), change=with_sweep_terminations)
 
 
 @pytest.mark.parametrize(("begin", "early"), [(31, False), (-45, True)])

@@ -11,8 +11,8 @@ import torch
 
 from experiments import paper_tests
 from jumper_warp.evaluation.film import beside
+from jumper_warp.evaluation.landings import ENDS, LandingLog
 from jumper_warp.evaluation.log import run_evaluation, termination_names
-from jumper_warp.evaluation.places import ENDS, LandingLog
 from jumper_warp.evaluation.plots import Track
 from jumper_warp.evaluation.run import EvaluationArgs, EvaluationRun, shown
 from jumper_warp.evaluation.suites import Consecutive, Farthest, Grid, Platform, consecutive_metrics, distance_metrics

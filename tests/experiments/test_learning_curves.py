@@ -7,7 +7,7 @@ import torch
 import warp as wp
 
 from support import learning
-from support.learning import Curve, learning_curve
+from support.learning import Curve, train_and_evaluate
 
 
 class Trainer:
@@ -38,7 +38,7 @@ def test_a_timed_training_runs_through_the_schedule_of_one_of_that_length(monkey
         learning, "success", lambda ppo, judge, heights: asked.append(heights) or time.sleep(0.05) or 0.5
     )
     trainer = Trainer()
-    curve = learning_curve(env, trainer, None, 0.3, 0.1, (0.5, 0.9))
+    curve = train_and_evaluate(env, trainer, None, 0.3, 0.1, (0.5, 0.9))
     assert trainer.progress == sorted(trainer.progress) and trainer.progress[0] < 0.02
     assert 0.8 < trainer.progress[-1] < 1.0  # evaluations do not count: with them it would be beyond 1
     assert curve.iterations == len(trainer.progress) and curve.steps[-1] == 64 * curve.iterations

@@ -7,7 +7,7 @@ import pytest
 
 from experiments import squat_hold
 from jumper_warp.utils.errors import InputError
-from support.holds import SquatLog, hold_metrics
+from support.squats import SquatLog, hold_metrics
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 

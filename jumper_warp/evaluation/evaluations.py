@@ -6,12 +6,12 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any, Literal, Protocol
 
-from jumper_warp.evaluation import heights, places
+from jumper_warp.evaluation import heights, landings
+from jumper_warp.evaluation.attitude import AttitudeFlags, AttitudePlayFlags
 from jumper_warp.evaluation.episodes import EpisodeFlags, EpisodePlayFlags
 from jumper_warp.evaluation.heights import HeightFlags, HeightPlayFlags
+from jumper_warp.evaluation.landings import LandingFlags, LandingPlayFlags
 from jumper_warp.evaluation.log import EvaluationLog, Metrics
-from jumper_warp.evaluation.places import LandingFlags, LandingPlayFlags
-from jumper_warp.evaluation.turns import AttitudeFlags, AttitudePlayFlags
 from jumper_warp.evaluation.velocities import VelocityFlags, VelocityPlayFlags
 from jumper_warp.policies.spec import PolicyError
 from jumper_warp.tasks.cfg import TaskCfg
@@ -50,14 +50,14 @@ class Evaluation:
     """What is asked for in an evaluation, unless told otherwise."""
     play: PlayFlags
     """What is played, unless told otherwise."""
-    for_evaluation: Callable[[TaskCfg], TaskCfg] = lambda task: task
+    prepare_task: Callable[[TaskCfg], TaskCfg] = lambda task: task
     """Returns the task with the terminations that count here."""
     misses: Literal["height", "place"] | None = None
     """What `jumper finetune` makes its jumps miss by less; None: it does not know how."""
 
 
-HEIGHT = Evaluation(HeightFlags(), HeightPlayFlags(), heights.for_evaluation, "height")
-PLACE = Evaluation(LandingFlags(), LandingPlayFlags(), places.for_evaluation, "place")
+HEIGHT = Evaluation(HeightFlags(), HeightPlayFlags(), heights.with_success_last, "height")
+PLACE = Evaluation(LandingFlags(), LandingPlayFlags(), landings.with_landing_terminations, "place")
 EVALUATIONS: dict[str, Evaluation] = {
     "height": HEIGHT,
     "place": PLACE,

@@ -3,7 +3,7 @@ import math
 import numpy as np
 import pytest
 
-from jumper_warp.evaluation.heights import HeightLog, jump_metrics, view_of
+from jumper_warp.evaluation.heights import HeightLog, apex_metrics, view_of
 from jumper_warp.viz.snapshot import FIELD_OF_VIEW
 
 
@@ -33,7 +33,7 @@ def test_metrics_by_hand():
     assert not jumps.update(step_of(jumps, ending=[0, 1, 0, -1], **landed, **heights, **speeds, **places), 1.0 / 60.0)
     later = {"max_height": [9.0, 9.0, 9.0, 0.9], "peak_tilt": [3.0] * 4}
     assert jumps.update(step_of(jumps, ending=[2, 2, 2, 2], **later), 1.0 / 60.0)
-    metrics = jump_metrics(jumps, (0.5, 1.1))
+    metrics = apex_metrics(jumps, (0.5, 1.1))
     expected = {
         "jumps": 4,
         "mean_abs_error_m": (0.02 + 0.04 + 0.3) / 3,
@@ -64,7 +64,7 @@ def test_metrics_by_hand():
 def test_jump_that_never_ends_is_a_failure():
     jumps = HeightLog(np.array([0.5]), ("success",))
     assert not jumps.update(step_of(jumps), 1.0 / 60.0)
-    metrics = jump_metrics(jumps, (0.5, 1.1))
+    metrics = apex_metrics(jumps, (0.5, 1.1))
     assert metrics["success_rate"] == 0.0 and metrics["failed_by_no_end"] == 1
     assert metrics["max_landing_tilt_deg"] is None
 
@@ -89,7 +89,7 @@ def test_jump_is_early_if_it_has_begun_when_the_command_comes():
 def test_a_jump_to_another_height_is_a_miss_and_no_fall():
     jumps = HeightLog(np.array([0.5, 0.6, 0.7]), ("wrong_height", "collided", "success"))
     jumps.update(step_of(jumps, ending=[0, 1, -1], phase=[2, 2, 2], phase_steps=[0, 3, 60]), 1.0 / 60.0)
-    metrics = jump_metrics(jumps, (0.5, 1.1))
+    metrics = apex_metrics(jumps, (0.5, 1.1))
     assert [metrics[name] for name in ("success_rate", "fall_rate", "miss_rate")] == pytest.approx([1 / 3] * 3)
 
 

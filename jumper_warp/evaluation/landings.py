@@ -27,7 +27,7 @@ from jumper_warp.evaluation.log import (
     mean,
     mean_and_max,
     termination_names,
-    with_ends,
+    with_terminations,
     within,
 )
 from jumper_warp.kernels.jump import terminations
@@ -54,14 +54,14 @@ SHOWN_DISTANCE = 1.0
 """[m] The filmstrip shows the jump nearest to this."""
 
 
-def for_evaluation(task: TaskCfg) -> TaskCfg:
+def with_landing_terminations(task: TaskCfg) -> TaskCfg:
     """Return a task with the terminations that count in an evaluation."""
-    return with_ends(task, ENDS)
+    return with_terminations(task, ENDS)
 
 
-def ended_by_takeoff(task: TaskCfg) -> TaskCfg:
+def with_second_takeoff(task: TaskCfg) -> TaskCfg:
     """Return the same, and a second takeoff after landing ends the jump, as in the authors' configuration."""
-    task = for_evaluation(task)
+    task = with_landing_terminations(task)
     takeoff = TerminationTerm(terminations.second_takeoff, speed=TAKEOFF_SPEED)
     return replace(task, terminations=(*task.terminations[:-1], takeoff, task.terminations[-1]))
 
