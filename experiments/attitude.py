@@ -76,12 +76,12 @@ def plot(run: EvaluationRun, turns: AttitudeLog, title: str) -> None:
 
 def main(args: Args) -> dict:
     """Run the test and return its figures."""
-    run = EvaluationRun.of("attitude", args, ("attitude",))
+    run = EvaluationRun.from_args("attitude", args, ("attitude",))
     env = run.env(args.turns, lambda task: replace(task, keep_momentum=args.keep_momentum), refine=args.refine)
-    run.told |= {"physics_step_s": env.physics_dt, "keep_momentum": args.keep_momentum}
+    run.setup_metrics |= {"physics_step_s": env.physics_dt, "keep_momentum": args.keep_momentum}
     turns, watch = args.log(run.task, args.seed), MomentumWatch(env)
     inertia = rotational_inertia(env.sim)
-    run.run_episodes(env, turns, film="turns", watch=watch)
+    run.run_episodes(env, turns, film="turns", on_step=watch)
     values = turn_metrics(turns) | axis_metrics(turns) | watch.metrics(turns.apart, inertia)
     plot(run, turns, f"{args.turns} turns by {args.angle:g} degrees, {run.title}")
     others = AttitudeLog(turns_about_any(args.turns, args.angle, args.seed), args.tolerance, args.seconds)

@@ -18,7 +18,7 @@ from rich.console import Console
 from rich.table import Table
 
 from jumper_warp.cli.main import run_command
-from jumper_warp.evaluation.run import EvaluationArgs, EvaluationRun, shown
+from jumper_warp.evaluation.run import EvaluationArgs, EvaluationRun, format_value
 from jumper_warp.evaluation.suites import suites_for
 from jumper_warp.utils.output import output_dir, write_metrics
 
@@ -44,7 +44,7 @@ def main(args: Args) -> dict:
             found = suite(**flags | {"policy": policy, "out": folder / f"{Path(policy).name}_{name}"}).run()
             for metric, paper in suite.paper.items():
                 values[f"{Path(policy).name}_{name}_{metric}"] = found[metric]
-                table.add_row(policy, name, metric, shown(found[metric]), f"{paper:g}")
+                table.add_row(policy, name, metric, format_value(found[metric]), f"{paper:g}")
     write_metrics(folder, values)
     Console().print(table)
     return values

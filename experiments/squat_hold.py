@@ -62,7 +62,7 @@ def plot(run: EvaluationRun, holds: SquatLog) -> None:
 
 def main(args: Args) -> dict:
     """Hold squats and return the figures."""
-    run = EvaluationRun.of("squat_hold", args, (*HEIGHTS, *PLACES))
+    run = EvaluationRun.from_args("squat_hold", args, (*HEIGHTS, *PLACES))
     env = run.env(args.squats)
     up = run.task.evaluation in HEIGHTS
     goals = hold_goals(args.squats, args.height if up else args.distance, up=up)

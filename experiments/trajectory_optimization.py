@@ -95,7 +95,7 @@ def main(args: Args) -> dict[str, Any]:
         if name == "still":
             values |= {"still_longest_lift_s": replay.longest_lift, "still_highest_lift_m": replay.highest_lift}
         replay.recorder.save_rrd(folder / f"{name}.rrd")
-        replay.save_strip(folder / f"{name}_strip.png")
+        replay.save_filmstrip(folder / f"{name}_strip.png")
         write_metrics(folder, values)
         table.add_row(
             KNOWN[name].label, f"{row['value']:.3f} {KNOWN[name].unit}", f"{row['violation']:.4f}",

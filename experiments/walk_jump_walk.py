@@ -103,7 +103,7 @@ def scripts(args: Args) -> list[list[ScriptStep]]:
 def main(args: Args) -> dict:
     """Run the test and return its figures."""
     name = "course" if args.course else "walk_jump_walk"
-    run = SkillRun.of(name, args, SkillNames(args.policy, args.jump_up, args.jump_to))
+    run = SkillRun.from_args(name, args, SkillNames(args.policy, args.jump_up, args.jump_to))
     course = CourseLog(scripts(args), random_headings(args.robots, args.seed))
     run.run_episodes(run.env(args.robots, block=course.block), course, film=name)
     title = f"walk, jump, walk: robot 0 of {course.count}, {run.title}"

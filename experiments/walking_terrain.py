@@ -57,14 +57,14 @@ class Args(EvaluationArgs):
 
 def main(args: Args) -> dict:
     """Walk on every terrain and return the figures."""
-    run = EvaluationRun.of("walking_terrain", args, ("velocity",))
+    run = EvaluationRun.from_args("walking_terrain", args, ("velocity",))
     commands, figures, shares = np.tile([args.speed, 0.0, 0.0], (args.robots, 1, 1)), {}, {}
     terrain = TerrainCfg(tile=14.0, uneven=args.uneven, slope=args.slope, step=(args.step, args.step))
     for kind in args.terrains:
         ground = single_tile(terrain, kind)
         env = run.env(args.robots, ground=ground)
         asked = VelocityLog(commands, env.task, SECONDS, headings=random_headings(args.robots, args.seed))
-        walks = run.run_episodes(env, asked, film=kind, drawn={"ground": ground})
+        walks = run.run_episodes(env, asked, film=kind, film_scene={"ground": ground})
         shares[kind] = walked(walks)
         figures[f"success_rate_{kind}"] = float(shares[kind].mean())
         figures[f"fall_rate_{kind}"] = float(walks.fallen.mean())

@@ -67,7 +67,7 @@ def plot(run: EvaluationRun, walks: VelocityLog, settling: np.ndarray) -> None:
 
 def main(args: Args) -> dict:
     """Run all tests and return their figures."""
-    run, rng = EvaluationRun.of("walking_tracking", args, ("velocity",)), np.random.default_rng(args.seed)
+    run, rng = EvaluationRun.from_args("walking_tracking", args, ("velocity",)), np.random.default_rng(args.seed)
     env = run.env(args.per_axis**3)
     walks = run.run_episodes(env, VelocityLog(grid(args.per_axis, 3 * (REACH,)), env.task))
     again = run.run_episodes(env, redirected(env, rng), film="walk")
@@ -76,7 +76,7 @@ def main(args: Args) -> dict:
     run.run_episodes(env, fast)
     thrown = run.run_episodes(env, kicked(env, rng))
     straight, gait = VelocityLog(np.tile([GAIT_SPEED, 0.0, 0.0], (env.num_envs, 1, 1)), env.task), Gait(env)
-    run.run_episodes(env, straight, watch=gait)
+    run.run_episodes(env, straight, on_step=gait)
     plot(run, walks, settling)
     median, held = (float(np.median(times)) for times in (settling, settling_times(again, HOLD)))
     return run.report(

@@ -17,7 +17,16 @@ import torch
 
 from jumper_warp.envs.env import Env
 from jumper_warp.evaluation.jumps import DELAY, jump_commands, yaw_of
-from jumper_warp.evaluation.log import NO_END, EvaluationLog, Metrics, failures, finite, largest, mean, mean_and_max
+from jumper_warp.evaluation.log import (
+    NO_END,
+    EvaluationLog,
+    Metrics,
+    failure_counts,
+    finite,
+    largest,
+    mean,
+    mean_and_max,
+)
 from jumper_warp.evaluation.plots import figure
 from jumper_warp.evaluation.run import HEIGHTS, EvaluationArgs, Run, conditions_of
 from jumper_warp.policies.policy import Policy
@@ -60,7 +69,7 @@ class FlightLog(EvaluationLog):
     turns: bool = True
     """Whether the robots turn in flight."""
     seconds: float = 9.0
-    row = "flight"
+    row_name = "flight"
     spacing = 1.6
 
     def __post_init__(self) -> None:
@@ -212,7 +221,7 @@ def flight_metrics(flights: FlightLog) -> Metrics:
         "mean_largest_tilt_deg": mean(np.degrees(flights.largest_tilt)),
         **mean_and_max("touchdown_tilt_deg", np.degrees(flights.touchdown_tilt)),
         **mean_and_max("touchdown_turn_deg", np.degrees(flights.touchdown_turn)),
-        **failures(flights.outcomes[~flights.success]),
+        **failure_counts(flights.outcomes[~flights.success]),
         "failed_before_touchdown": int((~flights.success & np.isnan(flights.flight_time)).sum()),
     }
 
@@ -281,7 +290,7 @@ class FlightRun(Run):
         for policy in (self.turn, self.landing):
             if policy is not None:
                 policy.to(env.device)
-        self.told["gravity_m_s2"] = env.task.gravity
+        self.setup_metrics["gravity_m_s2"] = env.task.gravity
         return env
 
     def fly(self, env: Env, flights: FlightLog, film: str) -> FlightLog:

@@ -143,7 +143,7 @@ class Replay:
             "deepest_paw_mm": float(-1000.0 * self.gap.min()), "peak_torque_nm": float(np.abs(self.torque).max()),
         }  # fmt: skip
 
-    def save_strip(self, path: Path, count: int = 8) -> None:
+    def save_filmstrip(self, path: Path, count: int = 8) -> None:
         """Draw the robot at evenly spaced moments from the push-off on."""
         from jumper_warp.viz.snapshot import Camera, contact_sheet
 

@@ -26,7 +26,7 @@ class SquatLog(EvaluationLog):
     """[s] Until the jump would be commanded; all that is followed."""
     window: float = 1.0
     """[s] At the end of it, what is looked at."""
-    row = "squat"
+    row_name = "squat"
 
     def __post_init__(self) -> None:
         """Begin with nothing seen."""

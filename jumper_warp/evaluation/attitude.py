@@ -9,15 +9,15 @@ from typing import Any
 import numpy as np
 
 from jumper_warp.envs.env import Env
-from jumper_warp.evaluation.film import Film, Strip
+from jumper_warp.evaluation.film import Film, Filmstrip
 from jumper_warp.evaluation.log import (
-    CAME_APART,
     COLLIDED,
+    DIVERGED,
     NO_END,
     SUCCESS,
     EvaluationLog,
     Metrics,
-    failures,
+    failure_counts,
     finite,
     mean,
 )
@@ -70,7 +70,7 @@ class AttitudeLog(EvaluationLog):
     apart: np.ndarray = field(init=False)
     """Whether the simulation came apart."""
 
-    row = "turn"
+    row_name = "turn"
     spacing = 1.5
 
     def __post_init__(self) -> None:
@@ -128,7 +128,7 @@ class AttitudeLog(EvaluationLog):
     def outcomes(self) -> np.ndarray:
         """Name of what became of each turn."""
         ends = np.where(self.success, SUCCESS, np.where(self.collided, COLLIDED, NO_END))
-        return np.where(self.apart, CAME_APART, ends)
+        return np.where(self.apart, DIVERGED, ends)
 
     def columns(self) -> dict[str, list]:
         """Return the turns, errors [deg] and times [s]."""
@@ -148,15 +148,15 @@ class AttitudeLog(EvaluationLog):
         """Return the turns."""
         return {"turns_xyzw": self.turns[list(worlds)].tolist()}
 
-    def filmstrip(self, film: Film) -> Strip:
+    def filmstrip(self, film: Film) -> Filmstrip:
         """Return pictures of the first filmed turn, until it has settled."""
         world = film.worlds[0]
         until = np.nan_to_num(self.settling[world], nan=self.seconds)
         frames = np.linspace(0, round(until / self.step_dt) - 1, SHOWN).round().astype(int).tolist()
         captions = [f"{(i + 1) * self.step_dt:.2f} s, {np.degrees(self.errors[i][world]):.0f} deg" for i in frames]
-        height = float(film.base(0)[0, 2])
+        height = float(film.base_positions(0)[0, 2])
         view = {"eye": (1.2, 1.5, height + 0.5), "target": (0.0, 0.0, height - 0.05), "size": (320, 320)}
-        return Strip(0, frames, captions, **view, name="turn_strip")
+        return Filmstrip(0, frames, captions, **view, name="turn_strip")
 
 
 def turn_metrics(turns: AttitudeLog) -> Metrics:
@@ -174,9 +174,9 @@ def turn_metrics(turns: AttitudeLog) -> Metrics:
         "max_settling_s": mean(settling[settling == np.nanmax(settling)]) if np.isfinite(settling).any() else None,
         "mean_spin_at_end_rad_s": mean(turns.spins[-1]),
         "collision_rate": float(turns.collided.mean()),
-        CAME_APART: int(turns.apart.sum()),
+        DIVERGED: int(turns.apart.sum()),
     }
-    return metrics | failures(outcomes[~turns.success])
+    return metrics | failure_counts(outcomes[~turns.success])
 
 
 def axis_metrics(turns: AttitudeLog) -> Metrics:

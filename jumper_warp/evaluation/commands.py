@@ -55,12 +55,12 @@ def evaluate(run: EvaluationRun, cfg: EvaluateCfg) -> dict[str, Any]:
     run.run_episodes(run.env(log.count), log)
     figures = {
         "task": run.policy.interface.task,
-        **run.tried_in,
+        **run.condition_metrics,
         "noise": cfg.conditions.noise,
         **cfg.flags.metrics(log),
     }
     write_metrics(run.folder, figures)
-    rows = f"{log.row}s.csv"
+    rows = f"{log.row_name}s.csv"
     (run.folder / rows).write_text(csv_text(log))
     if cfg.keep:
         files = {name: (run.folder / name).read_bytes() for name in ("metrics.json", "run.json", rows)}
@@ -124,12 +124,12 @@ def play(run: EvaluationRun, cfg: PlayCfg) -> Path:
     log = flags.log(run.evaluation.prepare_task(run.task))
     env, worlds = run.env(log.count), range(log.count)
     notes = {"task": name, **log.notes(worlds), "solver": cfg.conditions.solver}
-    film = Film(env, log.series, worlds, spacing=log.spacing, notes=notes, motors=True)
-    run_evaluation(run.policy.act, env, log, seconds=cfg.seconds or flags.length, watch=film, stop=False)
-    path = film.save_rrd(run.folder / f"{log.row}.rrd", log.goal_markers(worlds))
+    film = Film(env, log.series, worlds, spacing=log.spacing, notes=notes, record_motors=True)
+    run_evaluation(run.policy.act, env, log, seconds=cfg.seconds or flags.length, on_step=film, stop=False)
+    path = film.save_rrd(run.folder / f"{log.row_name}.rrd", log.goal_markers(worlds))
     write_metrics(run.folder, log.columns())
     print_rows(log)
-    return shown(path, cfg.viewer)
+    return show_recording(path, cfg.viewer)
 
 
 @dataclass(frozen=True)
@@ -158,16 +158,16 @@ def play_script(cfg: ScriptCfg) -> Path:
     course = CourseLog([script])
     env = run.env(1, block=course.block)
     film = Film(env, course.series, [0], notes={**course.notes([0]), "solver": cfg.conditions.solver})
-    run_evaluation(run.actor(env), env, course, watch=film)
+    run_evaluation(run.actor(env), env, course, on_step=film)
     path = film.save_rrd(run.folder / "course.rrd")
     plot_course(run.folder / "course.png", course, 0)
     figures = {"outcome": str(course.outcomes[0]), **course_metrics(course)}
     write_metrics(run.folder, figures)
     print_figures(figures)
-    return shown(path, cfg.viewer)
+    return show_recording(path, cfg.viewer)
 
 
-def shown(path: Path, viewer: str) -> Path:
+def show_recording(path: Path, viewer: str) -> Path:
     """Print the path of a recording to standard error, open the viewer if there is one, and return the path."""
     Console(stderr=True).print(str(path), highlight=False, soft_wrap=True)
     if viewer == "rerun":

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from jumper_warp.evaluation.log import EvaluationLog, Metrics, failures, finite, largest, mean
+from jumper_warp.evaluation.log import EvaluationLog, Metrics, failure_counts, finite, largest, mean
 from jumper_warp.evaluation.plots import figure
 from jumper_warp.evaluation.scripts import ScriptStep
 from jumper_warp.evaluation.velocities import SKIP, body_velocity, rmse_metrics, velocity_series
@@ -55,7 +55,7 @@ class CourseLog(EvaluationLog):
     """One a robot, all of as many commands."""
     headings: np.ndarray | float = 0.0
     """[rad] (robots,) At the start."""
-    row = "robot"
+    row_name = "robot"
     spacing = 2.0
 
     def __post_init__(self) -> None:
@@ -297,7 +297,7 @@ def course_metrics(course: CourseLog) -> Metrics:
         "max_handover_force_ripple_n": largest(ripple),
         "handover_force_step_n": mean(step),
         "max_handover_force_step_n": largest(step),
-    } | failures(course.outcomes[~done])  # fmt: skip
+    } | failure_counts(course.outcomes[~done])  # fmt: skip
 
 
 def tracking_error(course: CourseLog) -> np.ndarray:

@@ -38,7 +38,7 @@ class EpisodeLog(EvaluationLog):
     place: np.ndarray = field(init=False)
     """[m] (..., 3) Base at the end, world."""
 
-    row = "episode"
+    row_name = "episode"
     spacing = 2.0
 
     def __post_init__(self) -> None:
@@ -92,7 +92,7 @@ class EpisodeLog(EvaluationLog):
 
     def series(self, worlds: Sequence[int]) -> dict[str, float]:
         """Return the base's height and its distance from the start [m]."""
-        series, pos = {}, self.seen["base_pos"]
+        series, pos = {}, self.arrays["base_pos"]
         for world in worlds:
             series[f"height/base of {world} [m]"] = pos[world, 2]
             series[f"distance/start of {world} [m]"] = np.linalg.norm((pos - self.start)[world, :2])

@@ -1,4 +1,4 @@
-"""How policies are evaluated and played, by the key that a task names in `TaskCfg.evaluation`."""
+"""Table of evaluations: flags, terminations and metrics by the key in `TaskCfg.evaluation`."""
 
 from __future__ import annotations
 
@@ -18,46 +18,46 @@ from jumper_warp.tasks.cfg import TaskCfg
 
 
 class EvaluationFlags(Protocol):
-    """A frozen dataclass: flags of `jumper evaluate`."""
+    """Flags of `jumper evaluate` for a kind of task; a frozen dataclass."""
 
     def log(self, task: TaskCfg, seed: int) -> EvaluationLog:
-        """Return what is asked for, one row a world."""
+        """Return the log that gives the commands, one episode per world."""
         ...
 
     def metrics(self, log: Any) -> Metrics:
-        """Return what to report of its log."""
+        """Return the metrics of a finished log of `log`."""
         ...
 
 
 class PlayFlags(Protocol):
-    """A frozen dataclass: flags of `jumper play`."""
+    """Flags of `jumper play` for a kind of task; a frozen dataclass."""
 
     @property
     def length(self) -> float:
-        """[s] Of the recording."""
+        """[s] Default length of the recording."""
         ...
 
     def log(self, task: TaskCfg) -> EvaluationLog:
-        """Return what is asked for, one row a world."""
+        """Return the log that gives the commands, one episode per world."""
         ...
 
 
 @dataclass(frozen=True)
 class Evaluation:
-    """How policies of a task are evaluated."""
+    """How `jumper evaluate`, `play` and `finetune` handle the policies of a task."""
 
     flags: EvaluationFlags
-    """What is asked for in an evaluation, unless told otherwise."""
+    """Default flags of `jumper evaluate`."""
     play: PlayFlags
-    """What is played, unless told otherwise."""
+    """Default flags of `jumper play`."""
     prepare_task: Callable[[TaskCfg], TaskCfg] = lambda task: task
-    """Returns the task with the terminations that count here."""
-    misses: Literal["height", "place"] | None = None
-    """What `jumper finetune` makes its jumps miss by less; None: it does not know how."""
+    """Returns the task with the terminations that the evaluation uses."""
+    finetune_target: Literal["apex", "landing"] | None = None
+    """Error that `jumper finetune` reduces; None: these policies cannot be fine-tuned."""
 
 
-HEIGHT = Evaluation(HeightFlags(), HeightPlayFlags(), heights.with_success_last, "height")
-PLACE = Evaluation(LandingFlags(), LandingPlayFlags(), landings.with_landing_terminations, "place")
+HEIGHT = Evaluation(HeightFlags(), HeightPlayFlags(), heights.with_success_last, "apex")
+PLACE = Evaluation(LandingFlags(), LandingPlayFlags(), landings.with_landing_terminations, "landing")
 EVALUATIONS: dict[str, Evaluation] = {
     "height": HEIGHT,
     "place": PLACE,
@@ -66,21 +66,21 @@ EVALUATIONS: dict[str, Evaluation] = {
     ),
     "place-mars": replace(
         PLACE, flags=LandingFlags(x=(0.5, 4.2), in_range=(0.5, 3.9)),
-        play=LandingPlayFlags(unless_told=((1.0, 0.0), (2.5, 0.0), (3.9, 0.0))),
+        play=LandingPlayFlags(default_goals=((1.0, 0.0), (2.5, 0.0), (3.9, 0.0))),
     ),
     "around": replace(
-        PLACE, flags=LandingFlags(x=(-0.7, 0.7), y=(-0.7, 0.7), in_range=(0.0, 0.7)), misses=None,
-        play=LandingPlayFlags(unless_told=((0.5, 0.0), (0.0, 0.5), (-0.5, 0.0))),
+        PLACE, flags=LandingFlags(x=(-0.7, 0.7), y=(-0.7, 0.7), in_range=(0.0, 0.7)), finetune_target=None,
+        play=LandingPlayFlags(default_goals=((0.5, 0.0), (0.0, 0.5), (-0.5, 0.0))),
     ),
     "velocity": Evaluation(VelocityFlags(), VelocityPlayFlags(), TaskCfg.on_level_ground),
     "attitude": Evaluation(AttitudeFlags(), AttitudePlayFlags()),
     "episode": Evaluation(EpisodeFlags(), EpisodePlayFlags()),
 }  # fmt: skip
-"""A user's module may add its own."""
+"""Evaluations by key; a user's module may add its own."""
 
 
 def evaluation_of(task: TaskCfg) -> Evaluation:
-    """Return how policies of a task are evaluated. Raises PolicyError for a key that is not there."""
+    """Return the evaluation of a task. Raises PolicyError: its key is unknown."""
     if task.evaluation not in EVALUATIONS:
         raise PolicyError(f"{task.name} asks for the evaluation {task.evaluation!r:.60}; there are {[*EVALUATIONS]}")
     return EVALUATIONS[task.evaluation]

@@ -119,10 +119,10 @@ def make_groups(policy: Policy, cfg: FinetuneCfg, modules: Iterable[ModuleType] 
                 randomize=draws, noise=name == "randomized", seed=cfg.seed, device=cfg.device, threads=cfg.threads
             )
             env = env_of_policy(policy, count, conditions, change=change, modules=modules)
-            misses = evaluation_of(env.task).misses
-            if misses is None:
+            target = evaluation_of(env.task).finetune_target
+            if target is None:
                 raise InputError(f"fine-tuning is for jumps to heights and places, not for {env.task.name}")
-            goals, to_height = np.zeros((count, 3)), misses == "height"
+            goals, to_height = np.zeros((count, 3)), target == "apex"
             goals[:, 2 if to_height else 0] = np.linspace(*(cfg.heights if to_height else cfg.distances), count)
             delays = rng.uniform(*DELAYS, count)
             groups.append(Group(name, env, std, jump_commands(goals, delays, env.step_dt), to_height))

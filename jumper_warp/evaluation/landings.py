@@ -1,7 +1,7 @@
-"""Jumps to places in the plane: their log, the metrics of it, and the flags that make it.
+"""Jumps to landing positions: log, metrics, and flags of `jumper evaluate` and `play`.
 
-A jump is over once the robot has had a second to come to rest; the distance between base and goal then is its error. A
-jump that fails before is measured where it failed. Hops and steps on the way there are reported separately.
+The error of a jump is the horizontal distance between base and goal a second after touchdown, or where the jump failed
+before. Second hops and steps after touchdown are reported separately.
 """
 
 from __future__ import annotations
@@ -14,15 +14,15 @@ from typing import Any, Literal
 import numpy as np
 import tyro
 
-from jumper_warp.evaluation.film import PICTURE, Film, Strip, beside, moments
+from jumper_warp.evaluation.film import PICTURE_SIZE, Film, Filmstrip, keyframes, side_view
 from jumper_warp.evaluation.heights import MAX_ROBOTS
 from jumper_warp.evaluation.jumps import REST_SPEED, REST_TIME, TAKEOFF_SPEED, JumpFlags, JumpLog, stance_metrics
 from jumper_warp.evaluation.log import (
-    CAME_APART,
     COLLIDED,
+    DIVERGED,
     SUCCESS,
     Metrics,
-    failures,
+    failure_counts,
     finite,
     mean,
     mean_and_max,
@@ -35,88 +35,88 @@ from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.tasks.terms import TerminationTerm
 from jumper_warp.utils.errors import InputError
 
-Place = tuple[float, float]
+Position2D = tuple[float, float]
 SUCCESS_TOLERANCE = 0.1
-"""[m] A landed jump that ends this close to its goal succeeds."""
-ENDS = (CAME_APART, "low_base", COLLIDED, "no_jump", SUCCESS)
-"""Terminations of the task that end a jump here, in this order, so that no success hides a fall; the others only shape
-the training."""
-FALLS = (CAME_APART, "low_base", COLLIDED)
+"""[m] Largest error of a successful jump."""
+LANDING_TERMINATIONS = (DIVERGED, "low_base", COLLIDED, "no_jump", SUCCESS)
+"""Terminations that end a jump of an evaluation, in order of precedence: success last, so that it hides no fall. The
+other terminations of a task only shape the training."""
+FALLS = (DIVERGED, "low_base", COLLIDED)
 MISSED = "missed"
-"""Outcome of a jump that landed well, but elsewhere."""
+"""Outcome of a jump that landed, but beyond SUCCESS_TOLERANCE."""
 EARLY = "early"
-"""Outcome of a jump that began before the command."""
-AT_END = "below_0_1_m_s_at_the_end_rate"
-"""Name of the share of landed jumps whose base was at rest (`REST_SPEED`) when the jump was over."""
-SECONDS, SECONDS_MORE = 3.5, 2.5
-"""[s] Of a recording, and for each further jump."""
+"""Outcome of a landed jump that began before its command."""
+AT_REST_AT_END = "below_0_1_m_s_at_the_end_rate"
+"""Metric: share of landed jumps whose base was at rest (`REST_SPEED`) when the jump was over."""
+JUMP_SECONDS, NEXT_JUMP_SECONDS = 3.5, 2.5
+"""[s] Length of a recording of one jump, and addition for each further jump."""
 SHOWN_DISTANCE = 1.0
-"""[m] The filmstrip shows the jump nearest to this."""
+"""[m] The filmstrip shows the jump whose goal is nearest to this distance."""
 
 
 def with_landing_terminations(task: TaskCfg) -> TaskCfg:
-    """Return a task with the terminations that count in an evaluation."""
-    return with_terminations(task, ENDS)
+    """Return the task with the terminations of an evaluation, LANDING_TERMINATIONS."""
+    return with_terminations(task, LANDING_TERMINATIONS)
 
 
 def with_second_takeoff(task: TaskCfg) -> TaskCfg:
-    """Return the same, and a second takeoff after landing ends the jump, as in the authors' configuration."""
+    """Return the task with LANDING_TERMINATIONS, then a second takeoff, as in the authors' configuration."""
     task = with_landing_terminations(task)
     takeoff = TerminationTerm(terminations.second_takeoff, speed=TAKEOFF_SPEED)
     return replace(task, terminations=(*task.terminations[:-1], takeoff, task.terminations[-1]))
 
 
 class LandingLog(JumpLog):
-    """Jumps to places in the plane. One that begins on command and lands within SUCCESS_TOLERANCE is a success."""
+    """Log of jumps to landing positions; success: begun on command and landed within SUCCESS_TOLERANCE."""
 
     spacing = 3.0
 
     @property
-    def places(self) -> np.ndarray:
-        """[m] (..., 2) Goals, ahead and to the left."""
+    def goal_positions(self) -> np.ndarray:
+        """[m] (..., 2) Goals ahead and to the left of where the jump starts."""
         return self.goals[..., :2]
 
     @property
     def seconds(self) -> float:
-        """[s] In which a row has ended: a jump waits, squats and flies for at most 3.5 s."""
+        """[s] Maximum simulated time: each jump waits, squats and flies for at most 3.5 s."""
         return 1.0 + self.goals.shape[1] * (3.5 + self.rest) + float(np.max(self.delay))
 
     @property
     def offset(self) -> np.ndarray:
-        """[m] (..., 2) From goal to base at the end, ahead and to the left of the jump's heading."""
-        x, y = np.moveaxis(self.place - self.target, -1, 0)
+        """[m] (..., 2) Signed error at the end, goal to base, ahead and to the left of the jump's heading."""
+        x, y = np.moveaxis(self.end_position - self.goal_world, -1, 0)
         cos, sin = np.cos(-self.heading), np.sin(-self.heading)
         return np.stack([cos * x - sin * y, sin * x + cos * y], axis=-1)
 
     @property
     def landing(self) -> np.ndarray:
-        """[m] (..., 2) Base at the end, where the goals are measured."""
-        return self.places + self.offset
+        """[m] (..., 2) Base position at the end, in the frame of `goal_positions`."""
+        return self.goal_positions + self.offset
 
     @property
     def error(self) -> np.ndarray:
-        """[m] Distance of the base from the goal at the end; NaN where the simulation came apart."""
-        broken = self.broken | ~np.isfinite(self.place).all(axis=-1)
-        return np.where(broken, np.nan, self.distance(self.place))
+        """[m] Horizontal distance of the base from the goal at the end; NaN where the simulation diverged."""
+        invalid = self.diverged | ~np.isfinite(self.end_position).all(axis=-1)
+        return np.where(invalid, np.nan, self.goal_distance(self.end_position))
 
-    def distance(self, place: np.ndarray) -> np.ndarray:
-        """Return the distance [m] of places (..., 2), world, from the goals."""
-        return np.linalg.norm(place - self.target, axis=-1)
+    def goal_distance(self, position: np.ndarray) -> np.ndarray:
+        """Return the distances [m] of positions (num_envs, jumps in a row, 2), world frame, from the goals."""
+        return np.linalg.norm(position - self.goal_world, axis=-1)
 
     @property
     def success(self) -> np.ndarray:
-        """Whether the jump, begun on command, was landed near its goal."""
+        """Whether the jump began on command and landed within SUCCESS_TOLERANCE of its goal."""
         return self.landed & (np.nan_to_num(self.error, nan=np.inf) <= SUCCESS_TOLERANCE) & ~self.early
 
     @property
     def outcomes(self) -> np.ndarray:
-        """Name of each jump's end, MISSED or EARLY where it was landed without success."""
+        """Outcome of each jump: SUCCESS, MISSED or EARLY if landed without success, else what ended it."""
         missed = np.where(self.landed & ~self.success, np.where(self.early, EARLY, MISSED), self.ends)
         return np.where(self.success, SUCCESS, missed)
 
     def columns(self) -> dict[str, list]:
-        """Return goals, headings, landings and errors, and the ends; row after row."""
-        numbers = {f"goal_{axis}_m": self.places[..., i] for i, axis in enumerate("xy")}
+        """Return goals, headings, landing positions, errors and outcomes, one value per jump, world after world."""
+        numbers = {f"goal_{axis}_m": self.goal_positions[..., i] for i, axis in enumerate("xy")}
         numbers |= {"heading_deg": np.degrees(self.heading)}
         numbers |= {f"landing_{axis}_m": self.landing[..., i] for i, axis in enumerate("xy")}
         numbers |= {"error_m": self.error}
@@ -124,48 +124,48 @@ class LandingLog(JumpLog):
         return {name: finite(values.ravel()) for name, values in numbers.items()} | ends
 
     def series(self, worlds: Sequence[int]) -> dict[str, float]:
-        """Return the base's height and its distance from the current goal [m]."""
-        way = np.linalg.norm((self.seen["base_pos"] - self.seen["goal"])[:, :2], axis=1)
-        return super().series(worlds) | {f"distance/goal of {world} [m]": way[world] for world in worlds}
+        """Return the base's height and its distance from the current goal [m] of some worlds."""
+        distance = np.linalg.norm((self.arrays["base_pos"] - self.arrays["goal"])[:, :2], axis=1)
+        return super().series(worlds) | {f"distance/goal of {world} [m]": distance[world] for world in worlds}
 
     def goal_markers(self, worlds: Sequence[int]) -> np.ndarray:
-        """Return the goals that were commanded [m], world frame, (worlds, jumps in a row, 3), z = 0."""
-        target = self.target[list(worlds)]
+        """Return the commanded goals [m], world frame, (worlds, jumps in a row, 3), z = 0."""
+        target = self.goal_world[list(worlds)]
         return np.concatenate([target, np.zeros_like(target[..., :1])], axis=-1)
 
     def notes(self, worlds: Sequence[int]) -> dict[str, Any]:
-        """Return the goals [m]."""
-        return {"goals_m": self.places[list(worlds)].tolist()}
+        """Return the goals [m] of some worlds."""
+        return {"goals_m": self.goal_positions[list(worlds)].tolist()}
 
-    def filmstrip(self, film: Film) -> Strip:
-        """Return pictures of the jump, or row of jumps, that begins with about SHOWN_DISTANCE."""
-        distance = np.linalg.norm(self.places[film.worlds, 0], axis=1)
+    def filmstrip(self, film: Film) -> Filmstrip:
+        """Return a filmstrip of the world whose first goal is nearest to SHOWN_DISTANCE."""
+        distance = np.linalg.norm(self.goal_positions[film.worlds, 0], axis=1)
         index = int(np.argmin(np.abs(distance - SHOWN_DISTANCE)))
-        base = film.base(index)
-        if self.places.shape[1] == 1:
+        base = film.base_positions(index)
+        if self.goal_positions.shape[1] == 1:
             delay = np.broadcast_to(self.delay, film.env.num_envs)[film.worlds[index]]
-            frames = moments(base[:, 2], round(delay / film.env.step_dt) - 1)
+            frames = keyframes(base[:, 2], round(delay / film.env.step_dt) - 1)
         else:
             frames = np.linspace(0, len(base) - 1, 9).round().astype(int).tolist()
-        ends = self.place[film.worlds[index]]
-        eye, target = beside(base[0, :2], ends[np.isfinite(ends[:, 0])][-1])
+        end_positions = self.end_position[film.worlds[index]]
+        eye, target = side_view(base[0, :2], end_positions[np.isfinite(end_positions[:, 0])][-1])
         captions = [f"{(frame + 1) * film.env.step_dt:.2f} s" for frame in frames]
-        return Strip(index, frames, captions, eye, target, PICTURE)
+        return Filmstrip(index, frames, captions, eye, target, PICTURE_SIZE)
 
 
 def landing_metrics(landings: LandingLog, inside: np.ndarray | None = None) -> Metrics:
-    """Return the metrics of jumps to places, all rows together.
+    """Return the metrics of all commanded jumps of a log.
 
-    Errors are over all jumps, failed ones included, but those whose simulation came apart, which `came_apart` counts,
-    and those that were not begun. `ahead` and `left` are signed. Tilts, turns, hops and steps are those of the landed
-    jumps. `still_landing_rate` is of all jumps, `second_takeoff_rate` of those that came down. `fall_rate` and
-    `miss_rate` share no jump: one that misses has landed on its paws, but elsewhere.
+    Errors include failed jumps, but not those whose simulation diverged, which `came_apart` counts. `ahead` and `left`
+    are signed. Tilts, turns, hops and steps are over landed jumps, `still_landing_rate` over all jumps and
+    `second_takeoff_rate` over those that touched down. `fall_rate` and `miss_rate` count disjoint jumps: a miss has
+    landed on its paws, but away from its goal.
 
-    inside: which jumps the metrics in range count, shaped like `landings.end`; without it there are none.
+    inside: mask of the jumps that the `in_range` metrics count, shaped like `landings.end`; None: no such metrics.
     """
     begun, error, success, landed = landings.begun, landings.error, landings.success, landings.landed
     offset = np.where(np.isnan(error)[..., None], np.nan, landings.offset)
-    at_rest = "at_rest_within_1_s_rate" if landings.rest == REST_TIME else AT_END
+    at_rest = "at_rest_within_1_s_rate" if landings.rest == REST_TIME else AT_REST_AT_END
     metrics: Metrics = {
         "jumps": int(begun.sum()),
         **mean_and_max("error_m", error),
@@ -178,8 +178,8 @@ def landing_metrics(landings: LandingLog, inside: np.ndarray | None = None) -> M
         "landing_rate": mean(landed[begun]),
         "second_hop_rate": mean(landings.hopped[landed]),
         "step_rate": mean(landings.stepped[landed]),
-        "mean_error_at_touchdown_m": mean(landings.distance(landings.touchdown)[landed]),
-        "mean_error_0_3_s_after_touchdown_m": mean(landings.distance(landings.place_soon)[landed]),
+        "mean_error_at_touchdown_m": mean(landings.goal_distance(landings.touchdown)[landed]),
+        "mean_error_0_3_s_after_touchdown_m": mean(landings.goal_distance(landings.position_soon)[landed]),
         **stance_metrics(landings),
         "second_takeoff_rate": mean((landings.takeoffs > 0)[np.isfinite(landings.touchdown).all(axis=-1)]),
         at_rest: mean((landings.rest_speed < REST_SPEED)[landed]),
@@ -187,7 +187,7 @@ def landing_metrics(landings: LandingLog, inside: np.ndarray | None = None) -> M
         "fall_rate": mean(np.isin(landings.ends, FALLS)[begun]),
         "miss_rate": mean((landings.outcomes == MISSED)[begun]),
         "early_rate": mean(landings.early[begun]),
-        CAME_APART: int(landings.broken.sum()),
+        DIVERGED: int(landings.diverged.sum()),
     }
     if inside is not None:
         inside = begun & inside
@@ -196,17 +196,17 @@ def landing_metrics(landings: LandingLog, inside: np.ndarray | None = None) -> M
             "success_rate_in_range": mean(success[inside]),
             "still_landing_rate_in_range": mean(landings.still[inside]),
         }
-    return metrics | failures(landings.outcomes[begun & ~success])
+    return metrics | failure_counts(landings.outcomes[begun & ~success])
 
 
 def trained_range(task: TaskCfg) -> dict[str, float]:
-    """Return the distances straight ahead [m] that the levels of a task's training drew goals from."""
+    """Return the range of goal distances straight ahead [m] over all levels of a task's training."""
     lower, upper = zip(*((level.goal_lower[0], level.goal_upper[0]) for level in task.levels), strict=True)
     return {"trained_lower_m": max(min(lower), 0.0), "trained_upper_m": max(upper)}
 
 
 def random_headings(count: int, seed: int) -> np.ndarray:
-    """Return headings (count,) [rad] over the full circle."""
+    """Return random headings [rad] over the full circle, (count,)."""
     return np.random.default_rng(seed).uniform(-math.pi, math.pi, count)
 
 
@@ -214,9 +214,9 @@ def random_headings(count: int, seed: int) -> np.ndarray:
 class LandingFlags(JumpFlags):
     """Jumps to places from standing still."""
 
-    x: Place = (0.3, 1.5)
+    x: tuple[float, float] = (0.3, 1.5)
     """[m] Goals ahead, evenly spaced between these."""
-    y: Place = (0.0, 0.0)
+    y: tuple[float, float] = (0.0, 0.0)
     """[m] Goals to the left, drawn between these."""
     heading: Literal["any"] | float = "any"
     """[deg] Heading of all robots, or any: drawn from the full circle."""
@@ -232,15 +232,15 @@ class LandingFlags(JumpFlags):
             raise InputError(f"heading must be finite or any, got {self.heading}")
 
     def log(self, task: TaskCfg, seed: int) -> LandingLog:
-        """Return single jumps with these goals and headings."""
+        """Return the log of single jumps with these goals and headings, one per world."""
         rng = np.random.default_rng(seed)
-        places = np.stack([np.linspace(*self.x, self.jumps), rng.uniform(*self.y, self.jumps)], axis=1)
+        goals = np.stack([np.linspace(*self.x, self.jumps), rng.uniform(*self.y, self.jumps)], axis=1)
         headings = random_headings(self.jumps, seed) if self.heading == "any" else math.radians(self.heading)
-        return LandingLog(places[:, None], termination_names(task), headings)
+        return LandingLog(goals[:, None], termination_names(task), headings)
 
     def metrics(self, log: LandingLog) -> Metrics:
-        """Return `landing_metrics`, with the range."""
-        inside = within(np.linalg.norm(log.places, axis=-1), self.in_range)
+        """Return `landing_metrics` and the range of its `in_range` metrics."""
+        inside = within(np.linalg.norm(log.goal_positions, axis=-1), self.in_range)
         return landing_metrics(log, inside) | {"range_lower_m": self.in_range[0], "range_upper_m": self.in_range[1]}
 
 
@@ -248,11 +248,11 @@ class LandingFlags(JumpFlags):
 class LandingPlayFlags:
     """Jumps to places that are recorded."""
 
-    goal: tyro.conf.UseAppendAction[tuple[Place, ...]] = ()
+    goal: tyro.conf.UseAppendAction[tuple[Position2D, ...]] = ()
     """[m] Where to land, ahead and to the left; once for each robot (default: three robots, each to another place)."""
-    then: tyro.conf.UseAppendAction[tuple[Place, ...]] = ()
+    then: tyro.conf.UseAppendAction[tuple[Position2D, ...]] = ()
     """[m] Where all robots jump next, a second after touchdown, from where they are by then; once for each jump."""
-    unless_told: tyro.conf.Suppress[tuple[Place, ...]] = ((0.5, 0.0), (0.9, 0.0), (1.3, 0.0))
+    default_goals: tyro.conf.Suppress[tuple[Position2D, ...]] = ((0.5, 0.0), (0.9, 0.0), (1.3, 0.0))
     """[m] Goals if there are none; flags that are given several times would be added to a default."""
 
     def __post_init__(self) -> None:
@@ -263,15 +263,15 @@ class LandingPlayFlags:
                 raise InputError(f"{name} takes up to {MAX_ROBOTS} places in (-10, 10) m, got {places}")
 
     @property
-    def goals(self) -> tuple[Place, ...]:
-        """[m] First goals, one a robot."""
-        return self.goal or self.unless_told
+    def goals(self) -> tuple[Position2D, ...]:
+        """[m] First goals, one per robot."""
+        return self.goal or self.default_goals
 
     @property
     def length(self) -> float:
-        """[s] Of the recording."""
-        return SECONDS + SECONDS_MORE * len(self.then)
+        """[s] Length of the recording."""
+        return JUMP_SECONDS + NEXT_JUMP_SECONDS * len(self.then)
 
     def log(self, task: TaskCfg) -> LandingLog:
-        """Return one row of jumps a robot."""
+        """Return the log of the jumps, one sequence per robot."""
         return LandingLog(np.array([[goal, *self.then] for goal in self.goals]), termination_names(task))

@@ -13,10 +13,10 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from jumper_warp.evaluation.film import block_places
-from jumper_warp.evaluation.landings import AT_END, FALLS, MISSED, LandingLog, landing_metrics, trained_range
+from jumper_warp.evaluation.film import block_positions
+from jumper_warp.evaluation.landings import AT_REST_AT_END, FALLS, MISSED, LandingLog, landing_metrics, trained_range
 from jumper_warp.evaluation.log import largest, mean, within
-from jumper_warp.evaluation.plots import Track, figure, plot_landings, plot_paths
+from jumper_warp.evaluation.plots import BasePaths, figure, plot_landings, plot_paths
 from jumper_warp.evaluation.run import EvaluationRun
 from jumper_warp.evaluation.sweeps import DistanceSweep, HeightSweep, Suite, check
 from jumper_warp.robot.grounds import BlockCfg, platform, uneven
@@ -31,7 +31,7 @@ ROW_LOWER, ROW_UPPER, DELAYS = (0.4, -0.2), (0.9, 0.2), (0.3, 1.0)
 """[m] Goals of the jumps in a long row; [s] until the first command of any row."""
 OF_ROWS = (
     "success_rate", "fall_rate", "miss_rate", "step_rate", "still_landing_rate", "second_takeoff_rate",
-    "max_landing_tilt_deg", AT_END,
+    "max_landing_tilt_deg", AT_REST_AT_END,
 )  # fmt: skip
 """Metrics that are reported of the long rows too."""
 GROUND_LOWER, GROUND_UPPER = (0.8, -0.15), (1.4, 0.15)
@@ -92,7 +92,7 @@ class Grid(Suite):
         """Follow jumps, draw them, and return the metrics."""
         landings = self.run_landings(run, self.places, film="jumps")
         plot_landings(run.folder / "grid.png", {f"{len(landings.end)} jumps, {run.title}": landings}, (8.0, 5.0))
-        inside = landings.places[..., 0] < AHEAD[1] - 1.0e-6
+        inside = landings.goal_positions[..., 0] < AHEAD[1] - 1.0e-6
         return {"goals": self.columns * self.rows, **landing_metrics(landings, inside)}
 
 
@@ -159,9 +159,9 @@ class Consecutive(Suite):
         rows = rng.uniform(ROW_LOWER, ROW_UPPER, (self.trials, self.row, 2))
         logs, paths = [], []
         for name, places in (("pairs", pairs), ("row", rows)):
-            track, delay = Track(), rng.uniform(*DELAYS, len(places))
-            logs.append(self.run_landings(run, places, delay=delay, film=name, watch=track))
-            paths.append(track.in_start_frame(logs[-1].headings))
+            base_paths, delay = BasePaths(), rng.uniform(*DELAYS, len(places))
+            logs.append(self.run_landings(run, places, delay=delay, film=name, on_step=base_paths))
+            paths.append(base_paths.in_start_frame(logs[-1].headings))
         parts = dict(zip((*PAIRS, f"{self.row} in a row"), (*np.split(paths[0], 2), paths[1]), strict=True))
         plot_paths(run.folder / "paths.png", parts, PAIRS, run.title)
         return {"rest_s": self.rest} | consecutive_metrics(*logs)
@@ -172,7 +172,7 @@ def consecutive_metrics(pairs: LandingLog, row: LandingLog) -> dict[str, Any]:
     values, ten = (landing_metrics(landings) for landings in (pairs, row))
     for part in (values, ten):
         if "at_rest_within_1_s_rate" in part:
-            part[AT_END] = part.pop("at_rest_within_1_s_rate")
+            part[AT_REST_AT_END] = part.pop("at_rest_within_1_s_rate")
     halves = zip(PAIRS, np.split(pairs.error, 2), strict=True)
     return values | {
         "success_rate_in_range": values["success_rate"],
@@ -230,10 +230,10 @@ class Platform(Suite):
         done: dict[str, LandingLog] = {}
         for name, special, headings in self.scenes(goals, rng):
             env = run.env(self.jumps, **special)
-            done[name] = self.run_landings(run, goals[:, None], env, headings=headings, film=name, drawn=special)
+            done[name] = self.run_landings(run, goals[:, None], env, headings=headings, film=name, film_scene=special)
             values |= {f"{name}_{metric}": value for metric, value in landing_metrics(done[name]).items()}
             if "block" in special:
-                slide = np.linalg.norm(block_places(env.sim) - special["block"].center, axis=1)
+                slide = np.linalg.norm(block_positions(env.sim) - special["block"].center, axis=1)
                 values |= {"block_mean_slide_m": float(slide.mean()), "block_max_slide_m": float(slide.max())}
         titles = {f"{name}, {run.title}": landings for name, landings in done.items()}
         plot_landings(run.folder / "landings.png", titles, (5.0 * len(done), 4.0))
@@ -318,7 +318,7 @@ def distance_metrics(bins: dict[float, LandingLog]) -> dict[str, Any]:
     lists: dict[str, list[Any]] = {name: [values[name] for values in each] for name in EACH}
     flown = [mean(np.linalg.norm(log.touchdown[log.success], axis=-1)) for log in bins.values()]
     landed = [landings.landing[landings.success][:, 0] for landings in bins.values()]
-    inside = [landings.success[within(landings.places[..., 0], IN_RANGE)] for landings in bins.values()]
+    inside = [landings.success[within(landings.goal_positions[..., 0], IN_RANGE)] for landings in bins.values()]
     values: dict[str, Any] = {
         "jumps": sum(int(landings.begun.sum()) for landings in bins.values()),
         "mean_error_m": mean(lists["mean_error_m"]),

@@ -70,9 +70,9 @@ class Suite(EvaluationArgs, ABC):
     def run(self, modules: Iterable[ModuleType] = ()) -> dict[str, Any]:
         """Evaluate the policy, report and return the metrics; modules: the user's task modules.
 
-        Raises PolicyError, CheckpointError or InputError as `EvaluationRun.of`.
+        Raises PolicyError, CheckpointError or InputError as `EvaluationRun.from_args`.
         """
-        run = EvaluationRun.of(self.name, self, self.evaluations, modules)
+        run = EvaluationRun.from_args(self.name, self, self.evaluations, modules)
         return run.report(self.measure(run), self.paper)
 
     def run_landings(
@@ -196,7 +196,7 @@ class DistanceSweep(Suite):
     @staticmethod
     def metrics(landings: LandingLog) -> Metrics:
         """Return the metrics of a log of the sweep."""
-        distance = landings.places[..., 0]
+        distance = landings.goal_positions[..., 0]
         values = landing_metrics(landings, within(distance, DISTANCES_IN_RANGE))
         return values | {"success_rate_0_4_1_0": mean(landings.success[within(distance, PAPER_TRAINED)])}
 
@@ -206,7 +206,7 @@ class DistanceSweep(Suite):
         with figure(run.folder / "sweep.png", figsize=(6, 5.5)) as axis:
             axis.axvspan(*PAPER_TRAINED, color="0.5", alpha=0.08, label="training of the paper")
             axis.axvspan(*trained.values(), color="tab:orange", alpha=0.06, label="training of this policy")
-            commanded, reached = landings.places[..., 0], landings.landing[..., 0]
+            commanded, reached = landings.goal_positions[..., 0], landings.landing[..., 0]
             plot_sweep(axis, commanded, reached, landings.success, SUCCESS_TOLERANCE, ("landed there", "failed"))
             axis.set(xlabel="commanded distance [m]", ylabel="distance of the base at the end [m]")
             axis.set(xlim=(self.distances[0] - 0.05, self.distances[1] + 0.05))

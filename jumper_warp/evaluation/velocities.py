@@ -10,7 +10,7 @@ import numpy as np
 import tyro
 
 from jumper_warp.envs.env import Env
-from jumper_warp.evaluation.film import PICTURE, Film, Strip, beside
+from jumper_warp.evaluation.film import PICTURE_SIZE, Film, Filmstrip, side_view
 from jumper_warp.evaluation.log import EvaluationLog, Metrics, finite
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.utils.errors import InputError
@@ -51,7 +51,7 @@ class VelocityLog(EvaluationLog):
     fall_step: np.ndarray = field(init=False)
     """(robots,) Policy step of the fall; one past the last where there is none."""
 
-    row = "robot"
+    row_name = "robot"
     spacing = 2.0
 
     def __post_init__(self) -> None:
@@ -144,14 +144,14 @@ class VelocityLog(EvaluationLog):
         """Return the commands."""
         return {"commands": self.commands[list(worlds)].tolist(), "times_s": self.times.tolist()}
 
-    def filmstrip(self, film: Film) -> Strip:
+    def filmstrip(self, film: Film) -> Filmstrip:
         """Return pictures of the last stride of the first filmed robot."""
-        base = film.base(0)
+        base = film.base_positions(0)
         first = max(0, len(base) - 1 - round(SHOWN_TIME / film.env.step_dt))
         frames = np.linspace(first, len(base) - 1, PICTURES).round().astype(int).tolist()
-        eye, target = beside(base[first, :2], base[-1, :2])
+        eye, target = side_view(base[first, :2], base[-1, :2])
         captions = [f"{(frame + 1) * film.env.step_dt:.2f} s" for frame in frames]
-        return Strip(0, frames, captions, eye + [0.0, 0.0, base[-1, 2] - 0.3], target, PICTURE)
+        return Filmstrip(0, frames, captions, eye + [0.0, 0.0, base[-1, 2] - 0.3], target, PICTURE_SIZE)
 
 
 def body_velocity(arrays: dict[str, np.ndarray]) -> np.ndarray:
@@ -232,7 +232,7 @@ class VelocityPlayFlags:
 
     velocity: tyro.conf.UseAppendAction[tuple[Velocity, ...]] = ()
     """[m/s], [m/s], [rad/s] Ahead, to the left and about z; once for each command (default: a walk of six)."""
-    unless_told: tyro.conf.Suppress[tuple[Velocity, ...]] = (
+    default_velocities: tyro.conf.Suppress[tuple[Velocity, ...]] = (
         (0.8, 0.0, 0.0), (0.0, 0.5, 0.0), (0.0, 0.0, 0.8), (-0.5, 0.0, 0.0), (0.6, 0.3, 0.6), (0.0, 0.0, 0.0),
     )  # fmt: skip
     """Commands if there are none; flags that are given several times would be added to a default."""
@@ -246,7 +246,7 @@ class VelocityPlayFlags:
     @property
     def velocities(self) -> tuple[Velocity, ...]:
         """Commands, one after the other."""
-        return self.velocity or self.unless_told
+        return self.velocity or self.default_velocities
 
     @property
     def length(self) -> float:

@@ -8,7 +8,7 @@ from jumper_warp.cli import evaluate, play
 from jumper_warp.evaluation.commands import csv_text
 from jumper_warp.evaluation.evaluations import EVALUATIONS, evaluation_of
 from jumper_warp.evaluation.heights import HeightFlags, HeightLog
-from jumper_warp.evaluation.landings import ENDS, LandingFlags
+from jumper_warp.evaluation.landings import LANDING_TERMINATIONS, LandingFlags
 from jumper_warp.policies.folder import save_policy
 from jumper_warp.policies.spec import PolicyError
 from jumper_warp.registry import TASKS, make_task
@@ -34,7 +34,7 @@ def test_every_task_is_measured_by_a_success_that_comes_after_all_falls():
     )] == [True] * 3  # fmt: skip
     for name, kind in kinds.items():
         ends = [term.name for term in kind.prepare_task(make_task(name)).terminations]
-        assert ends[-1] == "success" and (name == "vertical-jump" or set(ends) == set(ENDS))
+        assert ends[-1] == "success" and (name == "vertical-jump" or set(ends) == set(LANDING_TERMINATIONS))
 
 
 def test_task_with_an_unknown_evaluation_is_refused():
@@ -45,11 +45,11 @@ def test_task_with_an_unknown_evaluation_is_refused():
 def test_places_are_spread_ahead_and_drawn_aside_and_headings_too():
     flags = LandingFlags(jumps=5, y=(-0.2, 0.1))
     log = flags.log(TASK, seed=3)
-    assert log.places[:, 0, 0] == pytest.approx([0.3, 0.6, 0.9, 1.2, 1.5])
-    aside = log.places[:, 0, 1]
+    assert log.goal_positions[:, 0, 0] == pytest.approx([0.3, 0.6, 0.9, 1.2, 1.5])
+    aside = log.goal_positions[:, 0, 1]
     assert -0.2 <= aside.min() < aside.max() <= 0.1
     assert len(set(log.headings)) == 5 and np.abs(log.headings).max() <= math.pi
-    assert np.array_equal(flags.log(TASK, seed=3).places, log.places)
+    assert np.array_equal(flags.log(TASK, seed=3).places, log.goal_positions)
     assert not np.array_equal(flags.log(TASK, seed=4).headings, log.headings)
 
 
@@ -109,7 +109,7 @@ def test_range_of_places_counts_distances():
     landings.places[:, 0] = goals
     landings.place[:, 0], landings.target[:, 0] = goals, goals
     landings.heading[:], landings.yaw[:], landings.tilt[:] = 0.0, 0.0, 0.0
-    landings.end[:, 0] = [*[ENDS.index("success")] * 2, ENDS.index("low_base")]
+    landings.end[:, 0] = [*[LANDING_TERMINATIONS.index("success")] * 2, LANDING_TERMINATIONS.index("low_base")]
     metrics = flags.metrics(landings)
     assert (metrics["success_rate_in_range"], metrics["success_rate"]) == (1.0, pytest.approx(2 / 3))
     assert (metrics["range_lower_m"], metrics["range_upper_m"]) == (0.3, 0.5)

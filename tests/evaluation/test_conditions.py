@@ -167,11 +167,11 @@ def test_latency_is_told_as_it_was_simulated():
 def test_run_tells_the_latency_it_simulated_over_several_policy_steps(tmp_path):
     save_policy(tmp_path / "still", still_policy("horizontal-jump"))
     args = EvaluationArgs(policy=str(tmp_path / "still"), latency=40.0, record=0, out=tmp_path, device="cpu")
-    run = EvaluationRun.of("test", args)
+    run = EvaluationRun.from_args("test", args)
     env = run.env(2)
     asked = landings.LandingLog(np.array([[[0.5, 0.0]]] * 2), tuple(term.name for term in env.task.terminations))
     run.run_episodes(env, asked)
     values = run.report({}, {})
     assert (values["latency_asked_ms"], values["latency"]) == (40.0, "39.6 ms (19 physics steps)")
     assert values["latency_ms"] == pytest.approx(1000.0 * 19 / 480)
-    assert run.title == "jumper, nominal, latency 39.6 ms (19 physics steps)"
+    assert run.title == "SolverJumper, nominal, latency 39.6 ms (19 physics steps)"

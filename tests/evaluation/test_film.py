@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 
-from jumper_warp.evaluation.film import ankles, moments
-from jumper_warp.viz.props import MARK_LIFT, MARK_RADIUS, with_blocks, with_marks
+from jumper_warp.evaluation.film import ankles, keyframes
+from jumper_warp.viz.props import MARK_LIFT, MARK_RADIUS, with_blocks, with_goal_markers
 from jumper_warp.viz.recording import Recording
 
 
@@ -32,17 +32,17 @@ def test_ankles_hang_from_the_knees():
 
 def test_filmstrip_shows_squat_apex_and_catch():
     height = np.array([0.35, 0.35, 0.30, 0.20, 0.40, 0.70, 0.90, 0.70, 0.40, 0.25, 0.30, 0.35])
-    assert moments(height, command=1) == [1, 3, 5, 6, 7, 9, 11]
+    assert keyframes(height, command=1) == [1, 3, 5, 6, 7, 9, 11]
 
 
 @pytest.mark.parametrize(("command", "first"), [(-1, 0), (99, 2)])
 def test_filmstrip_begins_within_the_film(command, first):
-    assert moments(np.array([0.3, 0.4, 0.3]), command)[0] == first
+    assert keyframes(np.array([0.3, 0.4, 0.3]), command)[0] == first
 
 
 def test_marks_lie_at_their_places_beside_each_other_and_only_where_there_is_one():
     places = np.array([[[0.8, 0.2, 0.0], [np.nan, np.nan, 0.0]], [[0.5, 0.0, 0.1], [0.6, 0.0, 0.1]]])
-    shapes = with_marks(recording(), places).shapes
+    shapes = with_goal_markers(recording(), places).shapes
     assert [shape.name for shape in shapes] == ["goal_0_0", "goal_1_0", "goal_1_1"]
     assert all(shape.body == -1 for shape in shapes)
     assert shapes[0].vertices[0] == pytest.approx([0.8, 0.2, MARK_LIFT])

@@ -3,7 +3,7 @@ import math
 import numpy as np
 import pytest
 
-from jumper_warp.evaluation.heights import HeightLog, apex_metrics, view_of
+from jumper_warp.evaluation.heights import HeightLog, apex_metrics, side_camera
 from jumper_warp.viz.snapshot import FIELD_OF_VIEW
 
 
@@ -95,7 +95,7 @@ def test_a_jump_to_another_height_is_a_miss_and_no_fall():
 
 @pytest.mark.parametrize("apex", [0.5, 1.0, 3.6])
 def test_pictures_show_a_jump_from_the_ground_to_its_apex(apex):
-    eye, target, (width, height) = view_of(apex)
+    eye, target, (width, height) = side_camera(apex)
     axis = np.subtract(target, eye) / np.linalg.norm(np.subtract(target, eye))
     for z in (0.0, apex + 0.2):
         ray = np.subtract((0.0, 0.0, z), eye)

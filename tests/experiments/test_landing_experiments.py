@@ -10,11 +10,11 @@ import pytest
 import torch
 
 from experiments import paper_tests
-from jumper_warp.evaluation.film import beside
-from jumper_warp.evaluation.landings import ENDS, LandingLog
+from jumper_warp.evaluation.film import side_view
+from jumper_warp.evaluation.landings import LANDING_TERMINATIONS, LandingLog
 from jumper_warp.evaluation.log import run_evaluation, termination_names
-from jumper_warp.evaluation.plots import Track
-from jumper_warp.evaluation.run import EvaluationArgs, EvaluationRun, shown
+from jumper_warp.evaluation.plots import BasePaths
+from jumper_warp.evaluation.run import EvaluationArgs, EvaluationRun, format_value
 from jumper_warp.evaluation.suites import Consecutive, Farthest, Grid, Platform, consecutive_metrics, distance_metrics
 from jumper_warp.evaluation.sweeps import DistanceSweep
 from jumper_warp.policies.conditions import Conditions, env_of_policy
@@ -23,7 +23,7 @@ from jumper_warp.policies.spec import PolicyError
 from jumper_warp.utils.errors import InputError
 from landing_helpers import OPEN_LOOP_APEX, still_policy
 
-COLLIDED, NO_JUMP, LANDED = (ENDS.index(name) for name in ("collided", "no_jump", "success"))
+COLLIDED, NO_JUMP, LANDED = (LANDING_TERMINATIONS.index(name) for name in ("collided", "no_jump", "success"))
 SHARED = {"mean_error_m", "success_rate", "success_rate_in_range", "jumps", "solver", "randomize", "seed"}
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -38,9 +38,9 @@ def policy(tmp_path_factory):
 
 def ended(goals, landing, end, **changes):
     """Return rows of jumps that ended as told; goals and landing [m], (rows, jumps, 2), heading 0."""
-    landings = LandingLog(np.array(goals, dtype=float), ENDS)
+    landings = LandingLog(np.array(goals, dtype=float), LANDING_TERMINATIONS)
     landings.end[:] = end
-    landings.target[:], landings.place[:], landings.touchdown[:] = goals, landing, landing
+    landings.goal_world[:], landings.end_position[:], landings.touchdown[:] = goals, landing, landing
     landings.heading[:], landings.yaw[:], landings.tilt[:] = 0.0, 0.0, 0.0
     for name, value in changes.items():
         getattr(landings, name)[:] = value
@@ -78,7 +78,7 @@ def test_consecutive_figures_by_hand():
     pairs = ended(goals, np.add(goals, off), LANDED)
     ends = [[LANDED] * 3, [LANDED, COLLIDED, -1]]
     row = ended(np.ones((2, 3, 2)), np.ones((2, 3, 2)) + [0.0, 0.04], ends)
-    row.heading[1, 2] = row.place[1, 2] = np.nan
+    row.heading[1, 2] = row.end_position[1, 2] = np.nan
     row.rest_speed[:] = [[0.05, 0.2, 0.05], [0.05, np.inf, np.inf]]
     figures = consecutive_metrics(pairs, row)
     expected = {
@@ -116,14 +116,14 @@ def test_row_without_a_fall_may_miss_its_goals():
 
 
 def test_paths_are_drawn_from_the_start_and_along_the_heading():
-    track = Track()
-    landings = LandingLog(np.zeros((2, 1, 2)), ENDS)
+    base_paths = BasePaths()
+    landings = LandingLog(np.zeros((2, 1, 2)), LANDING_TERMINATIONS)
     for place in ([0.0, 0.0, 0.3], [0.0, 1.0, 0.3]):
-        landings.seen = {"base_pos": np.array([place, place])}
-        track(landings)
+        landings.arrays = {"base_pos": np.array([place, place])}
+        base_paths(landings)
     landings.current[1] = 1
-    track(landings)
-    paths = track.in_start_frame(np.array([0.5 * math.pi, 0.0]))
+    base_paths(landings)
+    paths = base_paths.in_start_frame(np.array([0.5 * math.pi, 0.0]))
     assert paths[0] == pytest.approx(np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 0.0]]))
     assert paths[1, 1] == pytest.approx([0.0, 1.0]) and np.isnan(paths[1, 2]).all()
 
@@ -179,7 +179,7 @@ def test_distance_without_any_reliable_bin_is_none():
 
 
 def test_figures_are_printed_with_four_digits_in_lists_too():
-    assert shown([0.123456, None, 2]) == "0.1235, None, 2" and shown(1.0 / 3.0) == "0.3333"
+    assert format_value([0.123456, None, 2]) == "0.1235, None, 2" and format_value(1.0 / 3.0) == "0.3333"
 
 
 def test_scenes_put_the_ground_where_it_is_said_to_be():
@@ -199,7 +199,7 @@ def test_scenes_put_the_ground_where_it_is_said_to_be():
 
 
 def test_eye_looks_across_the_path():
-    eye, target = beside(np.array([0.0, 0.0]), np.array([0.0, 1.0]))
+    eye, target = side_view(np.array([0.0, 0.0]), np.array([0.0, 1.0]))
     assert target == pytest.approx([0.0, 0.5, 0.4])
     assert eye == pytest.approx([2.4, 0.5, 0.75])
 
@@ -223,7 +223,7 @@ class Hop:
 def hops():
     """Hops on the spot, each world asked for another place, and a second hop that follows at once."""
     policy = still_policy("horizontal-jump")
-    ends = set(ENDS) - {"no_jump"}  # the script squats too long for the task's patience
+    ends = set(LANDING_TERMINATIONS) - {"no_jump"}  # the script squats too long for the task's patience
 
     def change(task):
         return dataclasses.replace(task, terminations=tuple(term for term in task.terminations if term.name in ends))
@@ -239,7 +239,7 @@ def hops():
         if (landings.current == 1).any() and script.begin == 31:
             script.begin = script.step + 1
 
-    run_evaluation(script.act, env, landings, seconds=8.0, watch=again)
+    run_evaluation(script.act, env, landings, seconds=8.0, on_step=again)
     return landings
 
 
@@ -252,7 +252,7 @@ def test_hop_on_the_spot_lands_near_its_start_and_off_its_goal(hops):
 
 
 def test_second_hop_is_measured_from_where_the_first_one_ended(hops):
-    start = hops.target[:, 1] - hops.place[:, 0]
+    start = hops.goal_world[:, 1] - hops.end_position[:, 0]
     assert np.linalg.norm(start, axis=1) == pytest.approx([0.05, 0.3, 0.0], abs=1e-3)
     assert hops.outcomes[:, 1].tolist() == ["success", "missed", "success"]
 
@@ -312,12 +312,12 @@ def test_policy_of_another_task_is_refused_in_one_line(tmp_path):
     needed = "needs a policy that is evaluated by place or around or place-mars"
     message = f"{needed}, vertical_jump is of vertical-jump, by height"
     with pytest.raises(PolicyError, match=message):
-        EvaluationRun.of("test", EvaluationArgs(policy="vertical_jump", out=tmp_path, device="cpu"))
+        EvaluationRun.from_args("test", EvaluationArgs(policy="vertical_jump", out=tmp_path, device="cpu"))
 
 
 def test_missing_device_is_refused(policy, tmp_path):
     with pytest.raises(InputError, match="no device 'abacus'"):
-        EvaluationRun.of("test", EvaluationArgs(policy=policy, out=tmp_path, device="abacus"))
+        EvaluationRun.from_args("test", EvaluationArgs(policy=policy, out=tmp_path, device="abacus"))
 
 
 def test_script_refuses_a_policy_of_another_task_in_one_line_with_code_2(policy):
