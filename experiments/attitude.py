@@ -63,7 +63,7 @@ def plot(run: EvaluationRun, turns: AttitudeLog, title: str) -> None:
             style = {"color": COLORS[i // 2], "linestyle": "-" if i % 2 == 0 else "--"}
             axes[0].plot(time, errors[:, i::6], alpha=0.15 if errors.shape[1] > 6 else 0.0, linewidth=0.6, **style)
             axes[0].plot(time, np.nanmean(errors[:, i::6], axis=1), label=name.replace("_", " "), **style)
-            settled = turns.settling[i::6]
+            settled = turns.settling_time[i::6]
             axes[1].scatter(np.full(len(settled), i), settled, s=12, color=COLORS[i // 2])
         axes[0].axhline(turns.tolerance, color="0.6", linewidth=0.8)
         axes[0].set(xlabel="time [s]", ylabel="angle to the goal [deg]", title=title)
@@ -82,7 +82,7 @@ def main(args: Args) -> dict:
     turns, watch = args.log(run.task, args.seed), MomentumWatch(env)
     inertia = rotational_inertia(env.sim)
     run.run_episodes(env, turns, film="turns", on_step=watch)
-    values = turn_metrics(turns) | axis_metrics(turns) | watch.metrics(turns.apart, inertia)
+    values = turn_metrics(turns) | axis_metrics(turns) | watch.metrics(turns.diverged, inertia)
     plot(run, turns, f"{args.turns} turns by {args.angle:g} degrees, {run.title}")
     others = AttitudeLog(turns_about_any(args.turns, args.angle, args.seed), args.tolerance, args.seconds)
     run.run_episodes(env, others)

@@ -19,7 +19,7 @@ import numpy as np
 import tyro
 
 from jumper_warp.cli.main import run_command
-from jumper_warp.evaluation.commands import print_figures
+from jumper_warp.evaluation.commands import print_metrics
 from jumper_warp.robot.description import LEGS
 from jumper_warp.robot.gravity import EARTH
 from jumper_warp.robot.model import build_model
@@ -104,7 +104,7 @@ def main(args: Args) -> dict:
     write_metrics(folder, values)
     plot_trace(folder / "jump.png", trace, f"Open-loop jump, {args.solver}, {args.torque:g} N m", HARDWARE_APEX)
     recorder.save_rrd(folder / "jump.rrd")
-    print_figures({name: value for name, value in values.items() if not name.startswith(PER_MOTOR)})
+    print_metrics({name: value for name, value in values.items() if not name.startswith(PER_MOTOR)})
     print(f"{time.perf_counter() - start:.1f} s; figures, plot and recording (rerun {folder / 'jump.rrd'}) in {folder}")
     return values
 

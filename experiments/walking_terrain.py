@@ -19,7 +19,7 @@ from jumper_warp.cli.main import run_command
 from jumper_warp.evaluation.landings import random_headings
 from jumper_warp.evaluation.plots import figure
 from jumper_warp.evaluation.run import EvaluationArgs, EvaluationRun
-from jumper_warp.evaluation.velocities import VelocityLog, check_walks
+from jumper_warp.evaluation.velocities import VelocityLog, check_velocity_settings
 from jumper_warp.robot.terrain import KINDS, TerrainCfg, single_tile
 from jumper_warp.utils.errors import InputError
 from support.walks import walked
@@ -50,7 +50,7 @@ class Args(EvaluationArgs):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_walks(self.robots, SECONDS, self.speed)
+        check_velocity_settings(self.robots, SECONDS, self.speed)
         if not 0.0 < self.speed <= 0.6:
             raise InputError(f"speed must be in (0, 0.6] m/s, so that the walk ends on the tile, got {self.speed}")
 

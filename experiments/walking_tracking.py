@@ -21,7 +21,7 @@ import tyro
 from jumper_warp.cli.main import run_command
 from jumper_warp.evaluation.plots import figure
 from jumper_warp.evaluation.run import EvaluationArgs, EvaluationRun
-from jumper_warp.evaluation.velocities import AXES, VelocityLog, check_walks, grid, tracking_metrics
+from jumper_warp.evaluation.velocities import AXES, VelocityLog, check_velocity_settings, command_grid, tracking_metrics
 from jumper_warp.utils.errors import InputError
 from support.gaits import Gait
 from support.walks import HOLD, PAPER, REACH, STEP, kicked, redirected, settling_times, sped_up, speed_metrics
@@ -44,12 +44,12 @@ class Args(EvaluationArgs):
         super().__post_init__()
         if self.per_axis < 2:
             raise InputError(f"per_axis must be at least 2, got {self.per_axis}")
-        check_walks(self.per_axis**3, 10.0)
+        check_velocity_settings(self.per_axis**3, 10.0)
 
 
 def plot(run: EvaluationRun, walks: VelocityLog, settling: np.ndarray) -> None:
     """Draw mean velocities over commands, and how soon robots settle."""
-    history = walks.history()[round(1.0 / walks.step_dt) :]
+    history = walks.velocity_history()[round(1.0 / walks.step_dt) :]
     with figure(run.folder / "tracking.png", 2, 2, figsize=(9, 8)) as axes:
         for i, (axis, name) in enumerate(zip(axes.flat, AXES, strict=False)):
             wanted = walks.commands[:, 0, i]
@@ -69,7 +69,7 @@ def main(args: Args) -> dict:
     """Run all tests and return their figures."""
     run, rng = EvaluationRun.from_args("walking_tracking", args, ("velocity",)), np.random.default_rng(args.seed)
     env = run.env(args.per_axis**3)
-    walks = run.run_episodes(env, VelocityLog(grid(args.per_axis, 3 * (REACH,)), env.task))
+    walks = run.run_episodes(env, VelocityLog(command_grid(args.per_axis, 3 * (REACH,)), env.task))
     again = run.run_episodes(env, redirected(env, rng), film="walk")
     settling = settling_times(again)
     fast, which = sped_up(env)

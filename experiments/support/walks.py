@@ -6,7 +6,7 @@ import numpy as np
 
 from jumper_warp.envs.env import Env
 from jumper_warp.evaluation.log import Metrics
-from jumper_warp.evaluation.velocities import SKIP, VelocityLog
+from jumper_warp.evaluation.velocities import SETTLING_TIME, VelocityLog
 
 REACH, STEP, KICK = 0.8, 0.8, 0.5
 """[m/s] and [rad/s] of the commands; [m/s] by which a command and a velocity jump."""
@@ -81,11 +81,11 @@ def settling_times(walks: VelocityLog, hold: float | None = None) -> np.ndarray:
     hold: Seconds for which it stays; None: to the end, so that a push seconds later counts too.
     """
     window, first = round(SMOOTHING / walks.step_dt), round(walks.times[-1] / walks.step_dt)
-    velocity = walks.history()[..., :2]
+    velocity = walks.velocity_history()[..., :2]
     total = np.cumsum(velocity, axis=0)
     smooth = velocity.copy()
     smooth[window:] = (total[window:] - total[:-window]) / window
-    off = np.linalg.norm(smooth[first:] - walks.wanted()[first:, :, :2], axis=2)
+    off = np.linalg.norm(smooth[first:] - walks.command_history()[first:, :, :2], axis=2)
     outside = ~(off <= SETTLED)
     if hold is not None:
         steps = min(round(hold / walks.step_dt), len(off))
@@ -100,7 +100,7 @@ def kept_speeds(walks: VelocityLog, axis: int, seconds: float, share: float) -> 
 
     The two other velocities are not judged.
     """
-    last = walks.history()[-round(seconds / walks.step_dt) :, :, axis].mean(axis=0)
+    last = walks.velocity_history()[-round(seconds / walks.step_dt) :, :, axis].mean(axis=0)
     wanted = walks.commands[:, -1, axis]
     return np.abs(last - wanted) <= share * np.abs(wanted)
 
@@ -108,10 +108,10 @@ def kept_speeds(walks: VelocityLog, axis: int, seconds: float, share: float) -> 
 def walked(walks: VelocityLog) -> np.ndarray:
     """Return the share of the way that each robot went until it fell, at most 1, commanded to go straight ahead.
 
-    What it goes ahead counts, whatever its heading is then; the time of setting off, SKIP, is not asked for.
+    What it goes ahead counts, whatever its heading is then; the time of setting off, SETTLING_TIME, is not asked for.
     """
-    way = np.nansum(walks.history()[..., 0], axis=0) * walks.step_dt
-    return np.clip(way / (walks.commands[:, 0, 0] * (walks.seconds - SKIP)), 0.0, 1.0)
+    way = np.nansum(walks.velocity_history()[..., 0], axis=0) * walks.step_dt
+    return np.clip(way / (walks.commands[:, 0, 0] * (walks.seconds - SETTLING_TIME)), 0.0, 1.0)
 
 
 def top_speed(commanded: np.ndarray, kept: np.ndarray, share: float = 0.9, width: float = 0.1) -> float:

@@ -1,8 +1,8 @@
-"""Misses of many jumps at once, and their derivatives by the weights of the policy.
+"""Errors of many jumps at once (apex height or landing position), and their derivatives by the policy's weights.
 
-Whole jumps go through physics, motors, latency, command filter and network, simulated as in an evaluation; derivatives
-reach from the apex back to the command. The apex is a smooth function of the push; contact after it is left out: that
-of a landing place is the derivative of where the projectile comes down, its value where the robot stood in the end.
+Whole jumps are simulated with physics, motors, latency, command filter and network, as in an evaluation. Derivatives
+reach from the apex back to the command; contact after the apex is left out. The value of a landing error is where the
+robot comes to rest, its derivative that of the landing point of the ballistic flight from the apex.
 """
 
 from __future__ import annotations
@@ -19,63 +19,65 @@ from jumper_warp.evaluation.jumps import LANDED, REST_TIME
 from jumper_warp.trajectory.gauss_newton import Network, Tape, world_rows
 
 LANDING_HEIGHT = 0.30
-"""[m] Of the base, where its projectile comes down."""
+"""[m] Base height at which the ballistic flight lands."""
 LATEST = 2.5
-"""[s] After the last command, by when all jumps are past their apex."""
+"""[s] Time after the last command at which all jumps are past their apex."""
 HUBER = 0.02
-"""[m] Misses beyond count less: of jumps that a weak robot cannot make."""
+"""[m] Threshold of the Huber weight: larger errors, of jumps that a weak robot cannot make, count less."""
 
 
-class Misses(NamedTuple):
-    """Of one group of jumps."""
+class JumpErrors(NamedTuple):
+    """Errors of one group of n jumps; m = n for apex heights, m = 2n for landing positions (all x, then all y)."""
 
     value: torch.Tensor
-    """(n,) [m] Of a jump to a place ahead first, then to the left: (2n,)."""
-    rows: torch.Tensor
-    """(n, weights) [m] Derivatives; empty if none were asked for."""
+    """(m,) [m] Errors, 0 where not valid."""
+    jacobian: torch.Tensor
+    """(m, weights) [m] Derivatives by the network's weights; empty if not requested."""
     valid: torch.Tensor
-    """(n,) Whether the jump took off."""
+    """(m,) Whether the jump took off and its error is finite."""
 
 
 @dataclass
-class Group:
-    """Jumps in one environment."""
+class JumpGroup:
+    """Jumps of one environment with fixed commands."""
 
     name: str
     env: Env
     std: float
+    """[m] Standard deviation that weights the errors."""
     commands: np.ndarray
+    """(n, 4) Commands of `jump_commands`."""
     to_height: bool
-    """Whether the apex is what misses, not the place."""
+    """Whether the error is that of the apex height, else of the landing position."""
     loop: ClosedLoop = field(init=False)
 
     def __post_init__(self) -> None:
-        """Keep the environment's state, so that every run draws the same robots."""
-        self._fresh = self.env.state_dict()
+        """Save the environment's state, so that every run samples the same robots."""
+        self._initial_state = self.env.state_dict()
         self.loop = ClosedLoop(self.env)
 
     def begin(self) -> None:
-        """Stand all robots at their start."""
-        self.env.load_state_dict(self._fresh)
+        """Reset all robots to the initial state and set their commands."""
+        self.env.load_state_dict(self._initial_state)
         self.env.evaluation_reset(self.commands)
         self.loop.read_parameters()
 
-    def importance(self, misses: Misses) -> torch.Tensor:
-        """Return the weights of the misses: Huber's, over the variance that the group may have."""
-        huber = (HUBER / misses.value.abs().clamp(min=1.0e-9)).clamp(max=1.0)
-        return torch.where(misses.valid, huber, 0.0) / (self.std**2 * len(misses.value))
+    def importance(self, errors: JumpErrors) -> torch.Tensor:
+        """Return the weights of the errors in the cost, (m,): Huber weight over `std` squared and number of errors."""
+        huber = (HUBER / errors.value.abs().clamp(min=1.0e-9)).clamp(max=1.0)
+        return torch.where(errors.valid, huber, 0.0) / (self.std**2 * len(errors.value))
 
 
-def apex_of(loop: ClosedLoop, states: list[LoopState], arrays: dict[str, np.ndarray]) -> list[torch.Tensor]:
-    """Return the base heights at the apex [m], (n,), as one list entry."""
+def apex_heights(loop: ClosedLoop, states: list[LoopState], arrays: dict[str, np.ndarray]) -> list[torch.Tensor]:
+    """Return the base heights at the apex [m] as a list of one tensor (n,); arrays: the last of `env.task_arrays`."""
     heights = torch.stack([state.q[2] for state in states])
     reached = torch.as_tensor(arrays["max_height"], dtype=heights.dtype, device=heights.device)
     row = (heights.detach() - reached).abs().argmin(0, keepdim=True)
     return [heights.gather(0, row)[0]]
 
 
-def place_of(loop: ClosedLoop, states: list[LoopState], arrays: dict[str, np.ndarray]) -> list[torch.Tensor]:
-    """Return where the base's projectile comes down, x and y [m], (n,) each, seen from the apex."""
+def ballistic_landing(loop: ClosedLoop, states: list[LoopState], arrays: dict[str, np.ndarray]) -> list[torch.Tensor]:
+    """Return x and y [m], (n,) each, of the landing point of the ballistic flight from the apex."""
     reached = torch.as_tensor(arrays["max_height"], device=states[0].q.device)
     row = (torch.stack([state.q[2].detach() for state in states]) - reached).abs().argmin(0)
     motions = [loop.motion(state) for state in states]
@@ -87,8 +89,8 @@ def place_of(loop: ClosedLoop, states: list[LoopState], arrays: dict[str, np.nda
     return [pos[:, i] + fall * vel[:, i] for i in range(2)]
 
 
-def follow(group: Group, network: Network, *, derivatives: bool) -> Misses:
-    """Let all robots of a group jump; return their misses."""
+def jump_errors(group: JumpGroup, network: Network, *, derivatives: bool) -> JumpErrors:
+    """Run the jumps of a group with a network as policy, and return their errors; derivatives: also the Jacobian."""
     env, loop, to_height = group.env, group.loop, group.to_height
     group.begin()
     begin, last = int(group.commands[:, 3].min()), int(group.commands[:, 3].max()) + round(LATEST / env.step_dt)
@@ -109,22 +111,22 @@ def follow(group: Group, network: Network, *, derivatives: bool) -> Misses:
             break
     valid = torch.as_tensor(arrays["phase"] > 0, device=env.device)
     if to_height:
-        found = [arrays["max_height"] - group.commands[:, 2]]
+        errors = [arrays["max_height"] - group.commands[:, 2]]
     else:
-        found = _final_miss(env, network)
-    value = torch.as_tensor(np.concatenate(found), dtype=loop.dtype, device=env.device)
-    valid = valid.repeat(len(found)) & value.isfinite()
-    rows = value.new_zeros(0)
+        errors = _landing_errors(env, network)
+    value = torch.as_tensor(np.concatenate(errors), dtype=loop.dtype, device=env.device)
+    valid = valid.repeat(len(errors)) & value.isfinite()
+    jacobian = value.new_zeros(0)
     if derivatives:
-        numbers = (apex_of if to_height else place_of)(loop, states, arrays)
-        rows = torch.cat([world_rows(number.sum(), tape) for number in numbers]).nan_to_num(0.0, 0.0, 0.0)
-    return Misses(torch.where(valid, value, 0.0), rows, valid)
+        outcomes = (apex_heights if to_height else ballistic_landing)(loop, states, arrays)
+        jacobian = torch.cat([world_rows(outcome.sum(), tape) for outcome in outcomes]).nan_to_num(0.0, 0.0, 0.0)
+    return JumpErrors(torch.where(valid, value, 0.0), jacobian, valid)
 
 
-def _final_miss(env: Env, network: Network) -> list[np.ndarray]:
-    """Go on until the robots have had a second to come to rest, which on Mars takes a fall of up to 1.4 s besides.
+def _landing_errors(env: Env, network: Network) -> list[np.ndarray]:
+    """Continue until a second after touchdown, and return the distances to the goals [m], x and y, (n,) each.
 
-    Returns how far they are from their goals, x and y.
+    On Mars the fall before it takes up to 1.4 s.
     """
     rest = round(REST_TIME / env.step_dt)
     with torch.no_grad():

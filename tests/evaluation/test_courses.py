@@ -5,12 +5,13 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from jumper_warp.evaluation.courses import PATIENCE, SLEW, CourseLog, active_spans, course_metrics
+from jumper_warp.evaluation.courses import JUMP_TIMEOUT, MAX_ACCELERATION, CourseLog, active_spans, course_metrics
 from jumper_warp.evaluation.scripts import ScriptStep
 from jumper_warp.policies.skills import JUMP_TO, JUMP_UP, WALK
 from jumper_warp.utils.errors import InputError
 
 DT = 1.0 / 60.0
+SLEW_STEP = MAX_ACCELERATION * DT
 SCRIPT = (
     ScriptStep("walk", (0.5, 0.1, -0.2), 2.0),
     ScriptStep("jump_up", (0.75,)),
@@ -23,7 +24,7 @@ class MadeUp:
 
     def __init__(self, n: int, error=(0.1, 0.0, 0.0), falls_at=None, never_stops=False):
         self.n, self.error, self.falls_at, self.never_stops = n, np.array(error), falls_at, never_stops
-        self.skill, self.wanted, self.since, self.command_values = np.zeros(n, int), np.full(n, -1), np.zeros(n), None
+        self.skill, self.commands, self.since, self.command_values = np.zeros(n, int), np.full(n, -1), np.zeros(n), None
         self.step_dt, self.steps, self.velocity, self.asked = DT, 0, np.zeros((n, 3)), []
         goals = np.zeros(n, dtype=[("goal", float, 3)])
         goals["goal"] = np.arange(3 * n).reshape(n, 3)
@@ -43,7 +44,7 @@ class MadeUp:
     def request(self, skill, worlds, commands):
         self.goals = commands.copy()
         self.asked += [(self.steps, skill, int(w)) for w in np.flatnonzero(worlds)]
-        self.wanted[worlds] = skill
+        self.commands[worlds] = skill
         self.since[worlds] = 0
 
     def step(self):
@@ -52,8 +53,8 @@ class MadeUp:
         self.since += 1
         took_off = (self.skill >= JUMP_UP) & (self.since == 25)
         for w in range(self.n):
-            if self.skill[w] == WALK and self.wanted[w] >= 0 and self.since[w] >= 50 and not self.never_stops:
-                self.skill[w], self.wanted[w], self.since[w] = self.wanted[w], -1, 0
+            if self.skill[w] == WALK and self.commands[w] >= 0 and self.since[w] >= 50 and not self.never_stops:
+                self.skill[w], self.commands[w], self.since[w] = self.commands[w], -1, 0
             elif self.skill[w] >= JUMP_UP and self.since[w] >= 65:
                 self.skill[w], self.since[w] = WALK, 0
         ending = np.where(self.falls_at == self.steps, 1, -1) * np.ones(self.n, int)
@@ -83,14 +84,15 @@ def test_jump_is_asked_for_after_stopping_and_walking_goes_on_after_it():
     assert env.asked == [(120, JUMP_UP, 0), (120, JUMP_UP, 1)]
     np.testing.assert_allclose(env.goals, [[0.0, 0.0, 0.75, 30.0]] * 2)
     assert [skill for skill, *_ in active_spans(course, 0)] == [WALK, JUMP_UP, WALK]
-    np.testing.assert_array_equal(course.began[0], [0, 120, 235])
-    np.testing.assert_array_equal(course.over[0], [120, 235, 325])
-    assert course.switched[0, 1] == 170 and course.takeoff[0, 1] == 195
+    np.testing.assert_array_equal(course.start_step[0], [0, 120, 235])
+    np.testing.assert_array_equal(course.finish_step[0], [120, 235, 325])
+    assert course.switch_step[0, 1] == 170 and course.takeoff_step[0, 1] == 195
     assert (course.outcomes == "done").all() and not course.fallen.any() and course.on_goal.all()
-    wanted = np.array(course.wanted)[:, 0]
-    np.testing.assert_allclose(wanted[[0, 119, 150]], [[0, 0, 0], [0.5, 0.1, -0.2], [0, 0, 0]])
-    np.testing.assert_allclose(wanted[121], [0.5 - 2 * SLEW * DT, 0.1 - 2 * SLEW * DT, 2 * SLEW * DT - 0.2], rtol=1e-5)
-    assert np.isnan(wanted[171:234]).all() and wanted[300] == pytest.approx([0.3, 0.0, 0.0])
+    commands = np.array(course.commands)[:, 0]
+    np.testing.assert_allclose(commands[[0, 119, 150]], [[0, 0, 0], [0.5, 0.1, -0.2], [0, 0, 0]])
+    slewed = [0.5 - 2 * SLEW_STEP, 0.1 - 2 * SLEW_STEP, 2 * SLEW_STEP - 0.2]
+    np.testing.assert_allclose(commands[121], slewed, rtol=1e-5)
+    assert np.isnan(commands[171:234]).all() and commands[300] == pytest.approx([0.3, 0.0, 0.0])
     assert env.command_values[0] == pytest.approx([0.3, 0.0, 0.0])
 
 
@@ -99,7 +101,7 @@ def test_figures_of_a_course():
     figures = course_metrics(course)
     assert figures["rmse_vx_m_s"] == pytest.approx(0.1) and figures["rmse_vy_m_s"] == pytest.approx(0.2)
     assert figures["rmse_yaw_rate_rad_s"] == pytest.approx(0.05, rel=1e-5)
-    assert sum(np.array(course.counts)[:, 0]) == 60 + 30  # the first second of each command does not count
+    assert sum(np.array(course.is_tracked)[:, 0]) == 60 + 30  # the first second of each command does not count
     assert figures["apex_error_m"] == pytest.approx(0.03) and figures["landing_error_m"] is None
     assert figures["command_to_takeoff_s"] == pytest.approx(75 * DT)
     assert figures["command_to_jump_skill_s"] == pytest.approx(50 * DT)
@@ -109,7 +111,7 @@ def test_figures_of_a_course():
 
 def test_landing_is_measured_from_the_goal_and_may_miss_it():
     course, _ = followed((ScriptStep("jump_to", (0.8, 0.0)), ScriptStep("stand", seconds=0.2)), n=1)
-    assert course_metrics(course)["landing_error_m"] == pytest.approx(0.05) and course.switched[0, 0] > 0
+    assert course_metrics(course)["landing_error_m"] == pytest.approx(0.05) and course.switch_step[0, 0] > 0
     course.offset[0, 0] = 0.2
     assert course_metrics(course)["on_goal_rate"] == 0.0 and course_metrics(course)["success_rate"] == 1.0
     assert [skill for skill, *_ in active_spans(course, 0)] == [WALK, JUMP_TO, WALK]
@@ -123,7 +125,8 @@ def test_a_block_is_put_under_the_goal_when_the_jump_onto_it_takes_over():
     course.begin(env)
     while not course.record_step(env):
         pass
-    assert env.placed == [(course.switched[1, 1], [[3.0, 4.0]], [1])] and course.switched[1, 1] > course.over[1, 0]
+    switch_step = course.switch_step[1, 1]
+    assert env.placed == [(switch_step, [[3.0, 4.0]], [1])] and switch_step > course.finish_step[1, 0]
 
 
 def test_a_fall_ends_a_course():
@@ -131,13 +134,13 @@ def test_a_fall_ends_a_course():
     figures = course_metrics(course)
     assert course.outcomes.tolist() == ["collided", "done"] and figures["failed_by_collided"] == 1
     assert (figures["success_rate"], figures["fall_rate"]) == (0.5, 0.5)
-    assert np.isnan(np.array(course.velocity)[60:, 0]).all() and not np.array(course.counts)[60:, 0].any()
+    assert np.isnan(np.array(course.velocity)[60:, 0]).all() and not np.array(course.is_tracked)[60:, 0].any()
 
 
 def test_robot_that_never_stops_is_stuck():
     course, env = followed(never_stops=True)
     assert course.outcomes.tolist() == ["stuck", "stuck"] and course_metrics(course)["stuck_rate"] == 1.0
-    assert env.steps == 120 + round(PATIENCE / DT) and course_metrics(course)["command_to_takeoff_s"] is None
+    assert env.steps == 120 + round(JUMP_TIMEOUT / DT) and course_metrics(course)["command_to_takeoff_s"] is None
 
 
 def test_scripts_of_different_lengths_are_refused():

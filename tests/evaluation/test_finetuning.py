@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from jumper_warp.cli.main import main
-from jumper_warp.evaluation.finetuning import FinetuneCfg, finetune, make_groups, with_aim
-from jumper_warp.evaluation.jump_errors import follow
+from jumper_warp.evaluation.finetuning import FinetuneCfg, finetune, make_groups, shift_goal_observation
+from jumper_warp.evaluation.jump_errors import jump_errors
 from jumper_warp.policies.policy import Policy
 from jumper_warp.policies.runs import open_policy
 from jumper_warp.trajectory.gauss_newton import Network
@@ -20,7 +20,7 @@ FEW = {"goals": 4, "late": 0, "randomized": 0, "heights": (0.8, 1.05), "iteratio
 @pytest.fixture(scope="module")
 def tuned():
     """A policy that aims 8 mm too high, fine-tuned by one step, and what was done."""
-    return finetune(aiming_high(), FinetuneCfg(**FEW), say=lambda line: None)
+    return finetune(aiming_high(), FinetuneCfg(**FEW), log=lambda line: None)
 
 
 def aiming_high():
@@ -36,14 +36,14 @@ def test_misses_are_those_of_the_policy_in_its_environment_and_gradients_change_
     policy = open_policy("vertical_jump")
     (group,) = make_groups(policy, FinetuneCfg(**FEW))
     network = Network(policy)
-    found, plain = follow(group, network, derivatives=True), follow(group, network, derivatives=False)
-    assert torch.equal(found.value, plain.value)
-    assert found.rows.shape == (4, len(network.weights)) and found.valid.all()
+    errors, plain = jump_errors(group, network, derivatives=True), jump_errors(group, network, derivatives=False)
+    assert torch.equal(errors.value, plain.value)
+    assert errors.jacobian.shape == (4, len(network.weights)) and errors.valid.all()
     group.begin()
     for _ in range(120):
         group.env.step(policy.act(group.env.obs))
     misses = group.env.task_arrays()["max_height"] - np.linspace(0.8, 1.05, 4)
-    np.testing.assert_allclose(found.value.numpy(), misses, rtol=0.0, atol=1.0e-4)
+    np.testing.assert_allclose(errors.value.numpy(), misses, rtol=0.0, atol=1.0e-4)
 
 
 def test_one_step_halves_the_misses_of_a_policy_that_aims_high(tuned):
@@ -55,7 +55,7 @@ def test_one_step_halves_the_misses_of_a_policy_that_aims_high(tuned):
 
 
 def test_the_same_seed_gives_the_same_bits(tuned):
-    again, _ = finetune(aiming_high(), FinetuneCfg(**FEW), say=lambda line: None)
+    again, _ = finetune(aiming_high(), FinetuneCfg(**FEW), log=lambda line: None)
     for name, tensor in tuned[0].tensors().items():
         assert torch.equal(tensor, again.tensors()[name]), name
 
@@ -79,28 +79,28 @@ def test_misses_on_mars_are_those_of_robots_at_rest():
     policy = open_policy("mars_horizontal_jump")
     (group,) = make_groups(policy, FinetuneCfg(**FEW | {"distances": (1.0, 4.0)}))
     assert not group.to_height
-    found = follow(group, Network(policy), derivatives=False)
+    errors = jump_errors(group, Network(policy), derivatives=False)
     arrays = group.env.task_arrays()
-    assert found.valid.all() and (arrays["phase_steps"] >= 60).all()  # a second after touchdown
-    assert found.value.abs().max() < 0.05
+    assert errors.valid.all() and (arrays["phase_steps"] >= 60).all()  # a second after touchdown
+    assert errors.value.abs().max() < 0.05
 
 
 def test_a_policy_sees_its_goals_shifted():
     policy, obs = open_policy("horizontal_jump"), 0.3 * torch.randn((5, 147), generator=torch.manual_seed(3))
     moved = obs.clone()
     moved[:, policy.interface.observation_names.index("goal_x")] += 0.02
-    torch.testing.assert_close(with_aim(policy, 0.02).act(obs), policy.act(moved), rtol=0.0, atol=1.0e-5)
+    torch.testing.assert_close(shift_goal_observation(policy, 0.02).act(obs), policy.act(moved), rtol=0.0, atol=1.0e-5)
     assert (policy.act(moved) - policy.act(obs)).abs().max() > 1.0e-3
 
 
 def test_aim_brings_a_policy_that_jumps_too_far_back_to_its_goals():
     """A policy with its goals 40 mm farther away than in training ends nearer to them than it did then."""
     policy, cfg = open_policy("slippery_jump"), FinetuneCfg(**FEW | {"goals": 8, "iterations": 0})  # no aim was taken
-    own = follow(make_groups(policy, cfg)[0], Network(policy), derivatives=False).value
-    aimed, record = finetune(with_aim(policy, 0.04), cfg, say=lambda line: None)
+    untouched = jump_errors(make_groups(policy, cfg)[0], Network(policy), derivatives=False).value
+    aimed, record = finetune(shift_goal_observation(policy, 0.04), cfg, log=lambda line: None)
     first, *_, last = record["aims"]
     assert first["ahead"]["nominal"] > 0.025 and abs(last["ahead"]["nominal"]) < 0.005
-    assert last["mean_abs_miss_m"]["nominal"] < float(own.abs().mean()) and len(record["steps"]) == 1
+    assert last["mean_abs_miss_m"]["nominal"] < float(untouched.abs().mean()) and len(record["steps"]) == 1
     for mine, theirs in zip(aimed.layers, policy.layers, strict=True):
         assert torch.equal(mine[0], theirs[0]) and torch.equal(mine[1], theirs[1])
     assert not torch.equal(aimed.mean, policy.mean)

@@ -103,7 +103,7 @@ def test_commands_count_from_the_step_after_they_came():
     commands = np.zeros((ROBOTS, 2, 3))
     commands[:, 1, 0] = 1.0
     walks = followed(lambda t: np.zeros((ROBOTS, 3)), commands=commands, times=(0.0, 1.0))
-    np.testing.assert_array_equal(walks.wanted()[:, 0, 0], [0.0] * 60 + [1.0] * 60)
+    np.testing.assert_array_equal(walks.command_history()[:, 0, 0], [0.0] * 60 + [1.0] * 60)
 
 
 def test_share_of_the_way_stops_at_a_fall():
@@ -128,7 +128,7 @@ def test_kept_speed_is_the_mean_of_the_last_seconds():
 
 
 def test_grid_and_steps_are_where_they_should_be():
-    commands = velocities.grid(3, (0.8, 0.6, 0.4))
+    commands = velocities.command_grid(3, (0.8, 0.6, 0.4))
     assert commands.shape == (27, 1, 3) and {tuple(c) for c in commands[:, 0]} >= {(0.8, -0.6, 0.4), (0.0, 0.0, 0.0)}
     pairs = steps_of(np.random.default_rng(0), 200, 0.8, 0.8)
     np.testing.assert_allclose(np.linalg.norm((pairs[:, 1] - pairs[:, 0])[:, :2], axis=1), 0.8)

@@ -65,11 +65,11 @@ def test_sweep_counts_ranges_by_distance():
 
 
 def test_grid_has_every_goal_as_often_as_wanted():
-    goals = Grid(columns=3, rows=2, jumps=2).places
+    goals = Grid(columns=3, rows=2, jumps=2).goals
     assert goals.shape == (12, 1, 2)
     assert goals[:4, 0].tolist() == [[0.35, -0.35], [0.35, -0.35], [0.35, 0.35], [0.35, 0.35]]
     assert goals[-1, 0].tolist() == [1.4, 0.35]
-    assert len(Grid().places) == 220
+    assert len(Grid().goals) == 220
 
 
 def test_consecutive_figures_by_hand():
@@ -140,8 +140,8 @@ def of(middle, *, clean, stepped=0, hopped=0):
 @pytest.mark.parametrize(("direction", "unit"), [(0.0, (1.0, 0.0)), (90.0, (0.0, 1.0)), (180.0, (-1.0, 0.0))])
 def test_goals_of_a_bin_lie_in_a_direction(direction, unit):
     expected = np.array([0.75, 0.775, 0.8, 0.825, 0.85])[:, None, None] * np.array(unit)
-    np.testing.assert_allclose(Farthest(jumps=5, direction=direction).places(0.8), expected, atol=1e-12)
-    one = Farthest(jumps=1, direction=direction).places(0.8)
+    np.testing.assert_allclose(Farthest(jumps=5, direction=direction).goals(0.8), expected, atol=1e-12)
+    one = Farthest(jumps=1, direction=direction).goals(0.8)
     np.testing.assert_allclose(one, 0.8 * np.array(unit)[None, None], atol=1e-12)
 
 
