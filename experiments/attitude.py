@@ -1,15 +1,15 @@
-"""Turning in free flight: a policy turns the floating robot by 90 degrees about each axis, each way, and about others.
+"""Turns in free flight: a policy turns the floating robot by 90 degrees about each body axis and about random axes.
 
     python experiments/attitude.py --policy attitude --turns 60 --out outputs/attitude
     python experiments/attitude.py --policy logs/attitude/<run> --randomize --angle 60
 
-Robots float at rest in the default pose, in zero gravity, and are told to turn once. A turn is settled from when the
-error stays within a tolerance until the end; it succeeds if it is, and nothing has touched anything. The authors' robot
-turned by 90 degrees in 2.6 s. Nothing but its own legs turns the robot, so that its angular momentum should stay 0:
-what the solver makes of it is told, as the largest of all robots at any time, and as the angle by which it alone turns
-a robot: its integral over the moment of inertia in the default pose. By default the momentum is kept (`Simulation`);
-`--no-keep-momentum` tells what the solver alone would do, `--refine 4` turns the same robots with a physics step of a
-quarter, and `--solver mujoco` with physics that the policy was not trained on and that keep no momentum.
+Robots float at rest in the default pose, in zero gravity, and one turn is commanded. The settling time is that from
+which the error stays within a tolerance until the end; a turn succeeds if it settles without a collision. The authors'
+robot turned by 90 degrees in 2.6 s. The robot turns by its legs alone, so its angular momentum should stay 0. Its drift
+is reported as the largest value of all robots, and as the turn that it causes: its integral over the moment of inertia
+in the default pose. By default the momentum is conserved (`Simulation`). `--no-keep-momentum` shows the solver alone,
+`--refine 4` a physics step of a quarter, and `--solver mujoco` physics that the policy was not trained on and that
+does not conserve momentum.
 """
 
 from __future__ import annotations
@@ -30,10 +30,10 @@ from jumper_warp.evaluation.attitude import (
 )
 from jumper_warp.evaluation.plots import figure
 from jumper_warp.evaluation.run import EvaluationArgs, EvaluationRun
-from support.momentum import MomentumWatch, rotational_inertia
+from support.momentum import MomentumRecorder, rotational_inertia
 
 HARDWARE = {"mean_settling_s": 2.6}
-"""The authors' robot, 90 degrees."""
+"""Settling time of the authors' robot, 90 degrees."""
 COLORS = ("tab:red", "tab:green", "tab:blue")
 
 
@@ -54,8 +54,8 @@ class Args(EvaluationArgs, AttitudeFlags):
         AttitudeFlags.__post_init__(self)
 
 
-def plot(run: EvaluationRun, turns: AttitudeLog, title: str) -> None:
-    """Draw the errors of turns about the body's axes over time."""
+def plot_turns(run: EvaluationRun, turns: AttitudeLog, title: str) -> None:
+    """Plot errors over time and settling times of turns about the body's axes, a color per axis."""
     errors = np.degrees(np.array(turns.errors))
     time = (np.arange(len(errors)) + 1) * turns.step_dt
     with figure(run.folder / "turns.png", 1, 2, figsize=(11, 4.2)) as axes:
@@ -75,15 +75,15 @@ def plot(run: EvaluationRun, turns: AttitudeLog, title: str) -> None:
 
 
 def main(args: Args) -> dict:
-    """Run the test and return its figures."""
+    """Run both tests and return the metrics."""
     run = EvaluationRun.from_args("attitude", args, ("attitude",))
     env = run.env(args.turns, lambda task: replace(task, keep_momentum=args.keep_momentum), refine=args.refine)
     run.setup_metrics |= {"physics_step_s": env.physics_dt, "keep_momentum": args.keep_momentum}
-    turns, watch = args.log(run.task, args.seed), MomentumWatch(env)
+    turns, momentum = args.log(run.task, args.seed), MomentumRecorder(env)
     inertia = rotational_inertia(env.sim)
-    run.run_episodes(env, turns, film="turns", on_step=watch)
-    values = turn_metrics(turns) | axis_metrics(turns) | watch.metrics(turns.diverged, inertia)
-    plot(run, turns, f"{args.turns} turns by {args.angle:g} degrees, {run.title}")
+    run.run_episodes(env, turns, film="turns", on_step=momentum)
+    values = turn_metrics(turns) | axis_metrics(turns) | momentum.metrics(turns.diverged, inertia)
+    plot_turns(run, turns, f"{args.turns} turns by {args.angle:g} degrees, {run.title}")
     others = AttitudeLog(turns_about_any(args.turns, args.angle, args.seed), args.tolerance, args.seconds)
     run.run_episodes(env, others)
     values |= {f"any_axis_{name}": value for name, value in turn_metrics(others).items()}

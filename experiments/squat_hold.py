@@ -19,7 +19,7 @@ from jumper_warp.cli.main import run_command
 from jumper_warp.evaluation.plots import figure
 from jumper_warp.evaluation.run import HEIGHTS, PLACES, EvaluationArgs, EvaluationRun
 from jumper_warp.utils.errors import InputError
-from support.squats import SquatLog, hold_goals, hold_metrics
+from support.squats import SquatLog, squat_goals, squat_metrics
 
 
 @dataclass(frozen=True)
@@ -65,11 +65,11 @@ def main(args: Args) -> dict:
     run = EvaluationRun.from_args("squat_hold", args, (*HEIGHTS, *PLACES))
     env = run.env(args.squats)
     up = run.task.evaluation in HEIGHTS
-    goals = hold_goals(args.squats, args.height if up else args.distance, up=up)
+    goals = squat_goals(args.squats, args.height if up else args.distance, up=up)
     holds = run.run_episodes(env, SquatLog(goals, args.hold), film="holds")
     if not holds.over.all():
         plot(run, holds)
-    return run.report({"hold_s": args.hold} | hold_metrics(holds), {})
+    return run.report({"hold_s": args.hold} | squat_metrics(holds), {})
 
 
 if __name__ == "__main__":

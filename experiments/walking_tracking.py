@@ -23,7 +23,7 @@ from jumper_warp.evaluation.plots import figure
 from jumper_warp.evaluation.run import EvaluationArgs, EvaluationRun
 from jumper_warp.evaluation.velocities import AXES, VelocityLog, check_velocity_settings, command_grid, tracking_metrics
 from jumper_warp.utils.errors import InputError
-from support.gaits import Gait
+from support.gaits import GaitRecorder
 from support.walks import HOLD, PAPER, REACH, STEP, kicked, redirected, settling_times, sped_up, speed_metrics
 
 GAIT_SPEED = 0.8
@@ -75,7 +75,7 @@ def main(args: Args) -> dict:
     fast, which = sped_up(env)
     run.run_episodes(env, fast)
     thrown = run.run_episodes(env, kicked(env, rng))
-    straight, gait = VelocityLog(np.tile([GAIT_SPEED, 0.0, 0.0], (env.num_envs, 1, 1)), env.task), Gait(env)
+    straight, gait = VelocityLog(np.tile([GAIT_SPEED, 0.0, 0.0], (env.num_envs, 1, 1)), env.task), GaitRecorder(env)
     run.run_episodes(env, straight, on_step=gait)
     plot(run, walks, settling)
     median, held = (float(np.median(times)) for times in (settling, settling_times(again, HOLD)))

@@ -47,7 +47,7 @@ def _links(sim: Any) -> tuple[np.ndarray, ...]:
 
 
 @dataclass
-class MomentumWatch:
+class MomentumRecorder:
     """Follows the momentum of all robots; call it after every policy step."""
 
     env: Any

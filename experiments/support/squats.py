@@ -90,14 +90,14 @@ class SquatLog(EvaluationLog):
         }
 
 
-def hold_goals(count: int, reach: tuple[float, float], *, up: bool) -> np.ndarray:
+def squat_goals(count: int, reach: tuple[float, float], *, up: bool) -> np.ndarray:
     """Return goals, evenly over a reach [m], as `SquatLog` takes them, (count, 3); up: heights, else places ahead."""
     goals = np.zeros((count, 3))
     goals[:, 2 if up else 0] = np.linspace(*reach, count)
     return goals
 
 
-def hold_metrics(holds: SquatLog) -> Metrics:
+def squat_metrics(holds: SquatLog) -> Metrics:
     """Return the metrics of robots that squat and wait; forces and torques are of those that still do at the end."""
     spread, ripple = holds.force_range, holds.torque_ripple
     return {

@@ -177,7 +177,7 @@ def test_gait_of_a_made_up_trot():
 
 def test_gait_takes_no_sample_of_the_beginning():
     env = SimpleNamespace(step_dt=DT)
-    gait = gaits.Gait(env, skip=0.5)
+    gait = gaits.GaitRecorder(env, skip=0.5)
     for _ in range(30):
         gait()
     assert not gait.contact and gait.metrics(np.zeros(2, dtype=bool)) == {}

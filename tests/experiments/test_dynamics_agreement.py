@@ -7,7 +7,7 @@ import pytest
 
 from experiments import dynamics_agreement
 from jumper_warp.robot.overlay import RobotOverlay
-from support.agreement import ours, pinocchios, random_states
+from support.agreement import jumper_quantities, pinocchio_quantities, random_states
 
 OVERLAY = RobotOverlay(
     {
@@ -32,7 +32,7 @@ def test_all_quantities_agree_to_single_precision_of_the_masses(tmp_path, overla
 def test_a_mass_that_is_wrong_by_a_hundredth_is_seen():
     right, wrong, states = OVERLAY.robots(), OVERLAY.robots(), random_states(4, 1)
     wrong.base_mass *= 1.01
-    found, expected = ours(right, states), pinocchios(wrong, states)
-    relative = dynamics_agreement.differences(found["joint_acceleration"], expected["joint_acceleration"])[2]
+    actual, expected = jumper_quantities(right, states), pinocchio_quantities(wrong, states)
+    relative = dynamics_agreement.differences(actual["joint_acceleration"], expected["joint_acceleration"])[2]
     assert 1.0e-4 < relative < 1.0e-1
-    assert dynamics_agreement.differences(found["paw_jacobian"], expected["paw_jacobian"])[2] < 1.0e-6
+    assert dynamics_agreement.differences(actual["paw_jacobian"], expected["paw_jacobian"])[2] < 1.0e-6

@@ -23,7 +23,7 @@ from jumper_warp.policies.conditions import Conditions, env_of_policy
 from jumper_warp.registry import make_task
 from jumper_warp.utils.errors import InputError
 from landing_helpers import OPEN_LOOP_APEX, still_policy
-from support.learning import Curve
+from support.learning import LearningCurve
 from support.soak import SoakArgs, hardest
 from support.timing import flags_of, over_baseline
 
@@ -168,7 +168,7 @@ def test_sweep_of_a_run_leaves_figures_plot_recording_and_filmstrip(trained, tmp
 
 
 def test_seconds_to_a_rate_are_those_of_the_first_evaluation_that_has_it():
-    curve = Curve(seconds=[5.0, 10.0, 15.0, 20.0], success=[0.1, 0.85, 0.7, 0.9])
+    curve = LearningCurve(seconds=[5.0, 10.0, 15.0, 20.0], success=[0.1, 0.85, 0.7, 0.9])
     assert curve.seconds_to(0.8) == 10.0
     assert curve.seconds_to(0.95) is None
 
@@ -176,7 +176,7 @@ def test_seconds_to_a_rate_are_those_of_the_first_evaluation_that_has_it():
 def test_learning_curves_tell_when_each_training_was_good_enough(tmp_path, monkeypatch):
     def train(args, name, seed):
         if seed == 1:
-            return Curve([2.0, 4.0, 6.0], [0.5, 0.96, 0.9], [10, 20, 30], ready=3.0)
+            return LearningCurve([2.0, 4.0, 6.0], [0.5, 0.96, 0.9], [10, 20, 30], ready=3.0)
         return learning_curves.train(args, name, seed)
 
     monkeypatch.setattr(learning_curves, "train_in_process", train)

@@ -7,7 +7,7 @@ import pytest
 
 from experiments import squat_hold
 from jumper_warp.utils.errors import InputError
-from support.squats import SquatLog, hold_metrics
+from support.squats import SquatLog, squat_metrics
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -30,13 +30,13 @@ def test_figures_against_hand_numbers():
     # the last two steps: the fourth paw between its peak of 40 + 1 or 2 and 0
     np.testing.assert_allclose(holds.force_range, [41.0, 42.0])
     np.testing.assert_allclose(holds.torque_ripple, 1.0)
-    metrics = hold_metrics(holds)
+    metrics = squat_metrics(holds)
     assert metrics["holding_rate"] == pytest.approx(2.0 / 3.0) and metrics["lost_paw_share"] == 1.0 / 8.0
     assert (metrics["mean_paw_force_range_n"], metrics["max_paw_force_range_n"]) == (41.5, 42.0)
 
 
 def test_robots_that_do_not_hold_have_no_forces():
-    metrics = hold_metrics(held([np.ones(4)] * 2, ending=np.zeros(3)))
+    metrics = squat_metrics(held([np.ones(4)] * 2, ending=np.zeros(3)))
     assert metrics["holding_rate"] == 0.0
     assert all(value is None for name, value in metrics.items() if name not in ("squats", "holding_rate"))
 
