@@ -24,7 +24,7 @@ from jumper_warp.utils.runtime import announce
 from jumper_warp.utils.threads import checked_threads
 from support.scripts import DeviceArgs, report
 from support.speed import time_solver, time_threads
-from support.timing import over_baseline
+from support.timing import baseline_ratios
 
 
 @dataclass(frozen=True)
@@ -65,7 +65,7 @@ def main(args: Args) -> dict:
             metrics |= time_threads(envs, args.threads, args.steps, args.repeats)
         prefix = "" if len(args.envs) == 1 else f"envs_{envs}_"
         values |= {f"{prefix}{name}": value for name, value in metrics.items()}
-    values |= {"envs": args.envs, **over_baseline(args.baseline, "experiments/benchmark_solver.py", args, values)}
+    values |= {"envs": args.envs, **baseline_ratios(args.baseline, "experiments/benchmark_solver.py", args, values)}
     report(folder, values)
     return values
 

@@ -24,7 +24,7 @@ from jumper_warp.utils.output import output_dir, write_metrics
 from jumper_warp.utils.runtime import announce
 from support.scripts import ThreadArgs, report
 from support.speed import time_parts, time_ppo, time_rsl_rl
-from support.timing import over_baseline
+from support.timing import baseline_ratios
 from support.variants import VARIANTS, variant
 
 
@@ -86,7 +86,7 @@ def main(args: Args) -> dict:
     if args.rsl_rl and not args.only_ppo:
         values |= time_rsl_rl(train_envs, args.num_steps, args.iterations, args.device)
         values["ppo_over_rsl_rl"] = values["ppo_steps_per_s"] / values["rsl_rl_steps_per_s"]
-    values |= over_baseline(args.baseline, "experiments/benchmark_training.py", args, values)
+    values |= baseline_ratios(args.baseline, "experiments/benchmark_training.py", args, values)
     report(folder, values)
     return values
 

@@ -105,7 +105,7 @@ def compare(args: Args, folder: Path) -> dict[str, Any]:
 def main(args: Args) -> dict[str, Any]:
     """Measure gradient noise, train, plot both, and return the metrics."""
     folder = prepare("shac", args)
-    values = {"envs": args.envs, "window": args.window, "worlds": args.worlds}
+    values: dict[str, Any] = {"envs": args.envs, "window": args.window, "worlds": args.worlds}
     stats = measure_stats(lambda: make_env(args, args.worlds), args.horizons)
     plot_variances(stats, args.horizons, folder / "variance.png")
     print_variances(stats, args.horizons)

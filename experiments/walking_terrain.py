@@ -1,11 +1,11 @@
-"""How far a walking policy comes on uneven ground, slopes and steps that it does not see.
+"""Distance that a walking policy covers on uneven ground, slopes and steps that it does not observe.
 
     python experiments/walking_terrain.py --policy walking_rough --robots 500 --out outputs/terrain
 
-Robots start in the middle of a tile with headings of their own and are commanded to go straight ahead at 0.5 m/s for
-10 s. The success rate of a terrain is the share of the way that they walk before they fall, on average. Slopes and
-stairs go down from the start, bowls and pits up. `--randomize` adds the randomisation, noise and latency of the
-training; `--solver mujoco` is a check against physics that the policy was not trained on.
+Robots start in the middle of a tile with random headings and are commanded to walk straight ahead at 0.5 m/s for 10 s.
+The success rate of a terrain is the mean share of the commanded distance that they walk before they fall. Slopes and
+stairs descend from the start, bowls and pits ascend. `--randomize` adds the randomisation, noise and latency of the
+training; `--solver mujoco` evaluates on physics that the policy was not trained on.
 """
 
 from __future__ import annotations
@@ -22,10 +22,10 @@ from jumper_warp.evaluation.run import EvaluationArgs, EvaluationRun
 from jumper_warp.evaluation.velocities import VelocityLog, check_velocity_settings
 from jumper_warp.robot.terrain import KINDS, TerrainCfg, single_tile
 from jumper_warp.utils.errors import InputError
-from support.walks import walked
+from support.walks import walked_share
 
 SECONDS = 10.0
-"""[s] Of each walk."""
+"""[s] Time of each walk."""
 
 
 @dataclass(frozen=True)
@@ -56,22 +56,22 @@ class Args(EvaluationArgs):
 
 
 def main(args: Args) -> dict:
-    """Walk on every terrain and return the figures."""
+    """Run the walks on every terrain, plot the shares, and return the metrics."""
     run = EvaluationRun.from_args("walking_terrain", args, ("velocity",))
-    commands, figures, shares = np.tile([args.speed, 0.0, 0.0], (args.robots, 1, 1)), {}, {}
+    commands, metrics, shares = np.tile([args.speed, 0.0, 0.0], (args.robots, 1, 1)), {}, {}
     terrain = TerrainCfg(tile=14.0, uneven=args.uneven, slope=args.slope, step=(args.step, args.step))
     for kind in args.terrains:
         ground = single_tile(terrain, kind)
         env = run.env(args.robots, ground=ground)
-        asked = VelocityLog(commands, env.task, SECONDS, headings=random_headings(args.robots, args.seed))
-        walks = run.run_episodes(env, asked, film=kind, film_scene={"ground": ground})
-        shares[kind] = walked(walks)
-        figures[f"success_rate_{kind}"] = float(shares[kind].mean())
-        figures[f"fall_rate_{kind}"] = float(walks.fallen.mean())
+        log = VelocityLog(commands, env.task, SECONDS, headings=random_headings(args.robots, args.seed))
+        walks = run.run_episodes(env, log, film=kind, film_scene={"ground": ground})
+        shares[kind] = walked_share(walks)
+        metrics[f"success_rate_{kind}"] = float(shares[kind].mean())
+        metrics[f"fall_rate_{kind}"] = float(walks.fallen.mean())
     with figure(run.folder / "terrain.png", figsize=(7, 4)) as axis:
         axis.boxplot([shares[kind] for kind in args.terrains], tick_labels=list(args.terrains), whis=(5, 95))
         axis.set(ylabel="share of the way", title=f"{args.robots} robots each, {run.title}", ylim=(0.0, 1.05))
-    return run.report({"robots": args.robots, "speed_m_s": args.speed} | figures, {})
+    return run.report({"robots": args.robots, "speed_m_s": args.speed} | metrics, {})
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Squats that are held: how quietly a robot waits for the command to jump."""
+"""Held squats: log and metrics of paw forces and motor torques before the command to jump."""
 
 from __future__ import annotations
 
@@ -12,26 +12,26 @@ from jumper_warp.envs.env import Env
 from jumper_warp.evaluation.jumps import jump_commands
 from jumper_warp.evaluation.log import EvaluationLog, Metrics, mean, mean_and_max
 
-DOWN = 0.1
-"""[N] Of a paw that is on the ground."""
+CONTACT_FORCE = 0.1
+"""[N] Smallest force on a paw that is on the ground."""
 
 
 @dataclass
 class SquatLog(EvaluationLog):
-    """What robots do that squat and wait, a world each; nothing of one is looked at after its end."""
+    """Log of robots that squat and wait, one per world; samples after an episode's end are ignored."""
 
     goals: np.ndarray
-    """[m] (num_envs, 3) For which they squat: place relative to start and heading, and height."""
+    """[m] (num_envs, 3) Goals of the jumps: x, y relative to start and heading, and apex height z."""
     hold: float = 3.0
-    """[s] Until the jump would be commanded; all that is followed."""
+    """[s] Simulated time, within which the jump is not commanded."""
     window: float = 1.0
-    """[s] At the end of it, what is looked at."""
+    """[s] Window at its end over which forces and torques are evaluated."""
     row_name = "squat"
 
     def __post_init__(self) -> None:
-        """Begin with nothing seen."""
+        """Begin with nothing recorded."""
         self.count, self.step_dt = len(self.goals), 1.0 / 60.0
-        self.over = np.zeros(self.count, dtype=bool)  # whether each episode ended before the command
+        self.ended = np.zeros(self.count, dtype=bool)  # whether each episode has ended
         # in each policy step, (num_envs, 4), (num_envs, 4), (num_envs, 12)
         self.peaks: list[np.ndarray] = []  # [N] largest force on each paw, of all its physics steps
         self.forces: list[np.ndarray] = []  # [N] force on each paw at the end of it
@@ -43,12 +43,12 @@ class SquatLog(EvaluationLog):
         return self.hold
 
     def begin(self, env: Env) -> None:
-        """Stand every robot still, with a goal and no command yet."""
+        """Reset every robot to the default pose, with its goal and a command after the simulated time."""
         self.step_dt = env.step_dt
         env.evaluation_reset(jump_commands(self.goals, self.hold + 1.0, env.step_dt))
 
     def read_env(self, env: Any) -> dict[str, np.ndarray]:
-        """Return forces, torques and ends."""
+        """Return paw forces [N], motor torques [N m] and terminations."""
         return {
             "peak": env.sim.physics.peak_paw_force.numpy().T.copy(),
             "force": np.linalg.norm(env.sim.paw_force.numpy(), axis=2).T.copy(),
@@ -56,32 +56,32 @@ class SquatLog(EvaluationLog):
         }  # fmt: skip
 
     def update(self, arrays: dict[str, np.ndarray], step_dt: float) -> bool:
-        """Take in a policy step; return whether all have ended."""
-        self.over |= arrays["ending"] >= 0
-        for kept, name in ((self.peaks, "peak"), (self.forces, "force"), (self.torques, "torque")):
-            kept.append(arrays[name])
-        return bool(self.over.all())
+        """Record a policy step from the arrays of `read_env`; return whether all episodes have ended."""
+        self.ended |= arrays["ending"] >= 0
+        for history, name in ((self.peaks, "peak"), (self.forces, "force"), (self.torques, "torque")):
+            history.append(arrays[name])
+        return bool(self.ended.all())
 
-    def last(self, values: list[np.ndarray]) -> np.ndarray:
-        """Return what was seen in the window, of the robots that still hold, (steps, robots, ...)."""
-        return np.array(values[-round(self.window / self.step_dt) :])[:, ~self.over]
+    def in_window(self, values: list[np.ndarray]) -> np.ndarray:
+        """Return the values within the window of the robots that still hold, (steps, robots, ...)."""
+        return np.array(values[-round(self.window / self.step_dt) :])[:, ~self.ended]
 
     @property
     def force_range(self) -> np.ndarray:
-        """[N] (robots,) Between the largest and the smallest force on a paw in the window, the largest of the four."""
-        return (self.last(self.peaks).max(axis=0) - self.last(self.forces).min(axis=0)).max(axis=1)
+        """[N] (robots,) Largest minus smallest force on a paw within the window, maximum over the four paws."""
+        return (self.in_window(self.peaks).max(axis=0) - self.in_window(self.forces).min(axis=0)).max(axis=1)
 
     @property
     def torque_ripple(self) -> np.ndarray:
-        """[N m] (robots,) Standard deviation of a motor's torque in the window, root mean square over motors."""
-        return np.sqrt(self.last(self.torques).var(axis=0).mean(axis=1))
+        """[N m] (robots,) Standard deviation of a motor's torque within the window, RMS over motors."""
+        return np.sqrt(self.in_window(self.torques).var(axis=0).mean(axis=1))
 
     def columns(self) -> dict[str, list]:
-        """Return force and torque of each robot that holds."""
+        """Return force range and torque ripple of every robot that squats."""
         return {"paw_force_range_n": self.force_range.tolist(), "torque_ripple_nm": self.torque_ripple.tolist()}
 
     def series(self, worlds: Sequence[int]) -> dict[str, float]:
-        """Return the forces on the paws."""
+        """Return the force on every paw of some worlds."""
         names = ("front left", "front right", "back left", "back right")
         return {
             f"force/{name} of {world} [N]": float(self.forces[-1][world, paw])
@@ -91,20 +91,20 @@ class SquatLog(EvaluationLog):
 
 
 def squat_goals(count: int, reach: tuple[float, float], *, up: bool) -> np.ndarray:
-    """Return goals, evenly over a reach [m], as `SquatLog` takes them, (count, 3); up: heights, else places ahead."""
+    """Return evenly spaced goals [m] for `SquatLog`, (count, 3), between limits; up: apex heights, else ahead."""
     goals = np.zeros((count, 3))
     goals[:, 2 if up else 0] = np.linspace(*reach, count)
     return goals
 
 
-def squat_metrics(holds: SquatLog) -> Metrics:
-    """Return the metrics of robots that squat and wait; forces and torques are of those that still do at the end."""
-    spread, ripple = holds.force_range, holds.torque_ripple
+def squat_metrics(squats: SquatLog) -> Metrics:
+    """Return the metrics of held squats; forces and torques are those of the robots that hold to the end."""
+    spread, ripple = squats.force_range, squats.torque_ripple
     return {
-        "squats": len(holds.over),
-        "holding_rate": float((~holds.over).mean()),
+        "squats": len(squats.ended),
+        "holding_rate": float((~squats.ended).mean()),
         **mean_and_max("paw_force_range_n", spread),
         "median_paw_force_range_n": float(np.median(spread)) if len(spread) else None,
-        "lost_paw_share": mean((holds.last(holds.forces) < DOWN).ravel()),
+        "lost_paw_share": mean((squats.in_window(squats.forces) < CONTACT_FORCE).ravel()),
         **mean_and_max("torque_ripple_nm", ripple),
     }

@@ -11,7 +11,7 @@ from jumper_warp.evaluation.velocities import VelocityFlags, VelocityLog, Veloci
 from jumper_warp.registry import make_task
 from jumper_warp.utils.errors import InputError
 from support import gaits
-from support.walks import kept_speeds, settling_times, steps_of, top_speed, walked
+from support.walks import kept_speeds, settling_times, step_commands, top_speed, walked_share
 
 DT = 1.0 / 60.0
 TASK = make_task("velocity-flat")
@@ -109,9 +109,9 @@ def test_commands_count_from_the_step_after_they_came():
 def test_share_of_the_way_stops_at_a_fall():
     commands = np.tile([0.5, 0.0, 0.0], (ROBOTS, 1, 1))
     walks = followed(lambda t: np.tile([0.3, 0.1, 0.0], (ROBOTS, 1)), seconds=3.0, commands=commands, falls={2: 91})
-    assert walked(walks) == pytest.approx([0.9, 0.9, 0.45], rel=1e-5)  # of the last two seconds
+    assert walked_share(walks) == pytest.approx([0.9, 0.9, 0.45], rel=1e-5)  # of the last two seconds
     fast = followed(lambda t: np.tile([0.9, 0.0, 0.0], (ROBOTS, 1)), commands=commands)
-    assert walked(fast) == pytest.approx([1.0] * 3)
+    assert walked_share(fast) == pytest.approx([1.0] * 3)
 
 
 def test_top_speed_is_that_of_the_highest_class_that_is_kept():
@@ -130,7 +130,7 @@ def test_kept_speed_is_the_mean_of_the_last_seconds():
 def test_grid_and_steps_are_where_they_should_be():
     commands = velocities.command_grid(3, (0.8, 0.6, 0.4))
     assert commands.shape == (27, 1, 3) and {tuple(c) for c in commands[:, 0]} >= {(0.8, -0.6, 0.4), (0.0, 0.0, 0.0)}
-    pairs = steps_of(np.random.default_rng(0), 200, 0.8, 0.8)
+    pairs = step_commands(np.random.default_rng(0), 200, 0.8, 0.8)
     np.testing.assert_allclose(np.linalg.norm((pairs[:, 1] - pairs[:, 0])[:, :2], axis=1), 0.8)
     assert np.abs(pairs).max() <= 0.8 and (pairs[:, 0, 2] == pairs[:, 1, 2]).all()
 

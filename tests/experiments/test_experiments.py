@@ -25,7 +25,7 @@ from jumper_warp.utils.errors import InputError
 from landing_helpers import OPEN_LOOP_APEX, still_policy
 from support.learning import LearningCurve
 from support.soak import SoakArgs, hardest
-from support.timing import flags_of, over_baseline
+from support.timing import baseline_ratios, changed_flags
 
 SWEEP_ENDS = ("success", "came_apart", "low_base", "tilted", "collided", "no_jump", "too_long")
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -274,15 +274,15 @@ def test_rates_are_told_over_those_of_a_baseline(tmp_path):
 
     figures = {"steps_per_s_jump": 100.0, "steps_per_s_new": 7.0, "apex_m": 1.1}
     args = Args((4, 8), False, tmp_path / "base")
-    ratios = over_baseline(args.baseline, "experiments/script.py", args, figures)
+    ratios = baseline_ratios(args.baseline, "experiments/script.py", args, figures)
     assert ratios == {"steps_per_s_jump_over_baseline": 2.0}
-    assert over_baseline(None, "experiments/script.py", args, figures) == {}
+    assert baseline_ratios(None, "experiments/script.py", args, figures) == {}
     with pytest.raises(InputError, match=r"fails: .*AssertionError"):
-        over_baseline(args.baseline, "experiments/script.py", Args((4,), False, args.baseline), figures)
+        baseline_ratios(args.baseline, "experiments/script.py", Args((4,), False, args.baseline), figures)
     with pytest.raises(InputError, match=r"no experiments/other\.py in"):
-        over_baseline(args.baseline, "experiments/other.py", args, figures)
-    assert flags_of(Args((4,), True, tmp_path, device="cpu")) == ["--envs", "4", "--noise", "--device", "cpu"]
-    assert flags_of(Args((4,), True, tmp_path, newest=4)) == ["--envs", "4", "--noise", "--newest", "4"]
+        baseline_ratios(args.baseline, "experiments/other.py", args, figures)
+    assert changed_flags(Args((4,), True, tmp_path, device="cpu")) == ["--envs", "4", "--noise", "--device", "cpu"]
+    assert changed_flags(Args((4,), True, tmp_path, newest=4)) == ["--envs", "4", "--noise", "--newest", "4"]
 
 
 def test_benchmark_of_solvers_tells_both_and_their_ratio(tmp_path):

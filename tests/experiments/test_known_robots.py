@@ -6,7 +6,7 @@ import pytest
 from jumper_warp.identification.parameters import jumper_parameters
 from jumper_warp.identification.recording import replay_plan
 from jumper_warp.identification.replay import Replay
-from support.identification_methods import chi2_at, problem_of
+from support.identification_methods import chi2_at, make_problem
 from support.known_robots import MOST, make_case, prediction_errors
 
 
@@ -16,10 +16,10 @@ def drawn():
     parameters, one = jumper_parameters(), Replay(device="cpu", threads=1)
     many = Replay(device="cpu", threads=1)
 
-    def carry(plan, robots):
+    def simulate(plan, robots):
         return replay_plan(one, plan, robots)
 
-    return parameters, make_case(parameters, 3, carry, many), many, carry
+    return parameters, make_case(parameters, 3, simulate, many), many, simulate
 
 
 def test_a_robot_is_drawn_from_the_priors_and_always_late(drawn):
@@ -30,16 +30,16 @@ def test_a_robot_is_drawn_from_the_priors_and_always_late(drawn):
 
 
 def test_a_robot_predicts_itself_exactly_and_another_one_does_not(drawn):
-    parameters, case, _, carry = drawn
-    assert max(prediction_errors(case, case.robots, carry)) < 1.0e-12
-    angle, height = prediction_errors(case, parameters.robots(np.zeros((1, len(parameters)))), carry)
+    parameters, case, _, simulate = drawn
+    assert max(prediction_errors(case, case.robots, simulate)) < 1.0e-12
+    angle, height = prediction_errors(case, parameters.robots(np.zeros((1, len(parameters)))), simulate)
     assert angle > 0.5 and height > 1.0
 
 
 def test_the_truth_explains_what_was_measured_to_its_noise(drawn):
     """But for where the motions started, which is expected and not known here."""
     parameters, case, many, _ = drawn
-    problem = problem_of(parameters, case, many)
+    problem = make_problem(parameters, case, many)
     point = problem.expected()
     described = chi2_at(problem, point)
     point.z[:] = case.truth

@@ -26,7 +26,7 @@ def held(steps, **changes):
 
 def test_figures_against_hand_numbers():
     holds = held([np.full(4, 500.0), np.full(4, 40.0), np.array([40.0, 43.0, 40.0, 0.0])])
-    np.testing.assert_array_equal(holds.over, [False, False, True])
+    np.testing.assert_array_equal(holds.ended, [False, False, True])
     # the last two steps: the fourth paw between its peak of 40 + 1 or 2 and 0
     np.testing.assert_allclose(holds.force_range, [41.0, 42.0])
     np.testing.assert_allclose(holds.torque_ripple, 1.0)

@@ -11,7 +11,7 @@ from jumper_warp.policies.spec import PolicyError
 from jumper_warp.registry import make_task
 from jumper_warp.utils.errors import InputError
 from landing_helpers import still_policy
-from support.walks import kicked, sped_up
+from support.walks import kicked_walks, sped_up_walks
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -55,10 +55,10 @@ def test_kicks_and_speeds_are_those_of_the_test():
     class Env:
         num_envs, task, step_dt = 16, make_task("velocity-flat"), 1.0 / 60.0
 
-    thrown = kicked(Env, np.random.default_rng(0))
+    thrown = kicked_walks(Env, np.random.default_rng(0))
     np.testing.assert_allclose(np.linalg.norm(thrown.kick, axis=1), 0.5)
     assert thrown.kick_time.min() >= 2.0 and thrown.kick_time.max() <= 4.0
-    fast, which = sped_up(Env)
+    fast, which = sped_up_walks(Env)
     last = fast.commands[:, -1]
     np.testing.assert_allclose(last[which == 1, 0], -np.linspace(0.3, 4.0, 4))
     np.testing.assert_allclose(last[which == 2, 1], np.linspace(0.3, 2.0, 4))
