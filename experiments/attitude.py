@@ -20,14 +20,7 @@ import numpy as np
 import tyro
 
 from jumper_warp.cli.main import run_command
-from jumper_warp.evaluation.attitude import (
-    DIRECTIONS,
-    AttitudeFlags,
-    AttitudeLog,
-    axis_metrics,
-    turn_metrics,
-    turns_about_any,
-)
+from jumper_warp.evaluation.attitude import DIRECTIONS, AttitudeFlags, AttitudeLog, random_turns, turn_metrics
 from jumper_warp.evaluation.plots import figure
 from jumper_warp.evaluation.run import EvaluationArgs, EvaluationRun
 from support.momentum import MomentumRecorder, rotational_inertia
@@ -82,9 +75,9 @@ def main(args: Args) -> dict:
     turns, momentum = args.log(run.task, args.seed), MomentumRecorder(env)
     inertia = rotational_inertia(env.sim)
     run.run_episodes(env, turns, film="turns", on_step=momentum)
-    values = turn_metrics(turns) | axis_metrics(turns) | momentum.metrics(turns.diverged, inertia)
+    values = args.metrics(turns) | momentum.metrics(turns.diverged, inertia)
     plot_turns(run, turns, f"{args.turns} turns by {args.angle:g} degrees, {run.title}")
-    others = AttitudeLog(turns_about_any(args.turns, args.angle, args.seed), args.tolerance, args.seconds)
+    others = AttitudeLog(random_turns(args.turns, args.angle, args.seed), args.tolerance, args.seconds)
     run.run_episodes(env, others)
     values |= {f"any_axis_{name}": value for name, value in turn_metrics(others).items()}
     return run.report(values, HARDWARE)

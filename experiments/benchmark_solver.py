@@ -44,7 +44,6 @@ class Args(DeviceArgs):
     """Numbers of CPU threads to compare (default: all cores, nothing is compared)."""
 
     def __post_init__(self) -> None:
-        """Raises InputError: a number of threads is not one."""
         for threads in self.threads or []:
             checked_threads(threads)
 

@@ -25,17 +25,7 @@ from rich.console import Console
 from jumper_warp.cli.main import run_command
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.output import write_metrics
-from support.departure_runs import (
-    BASELINE,
-    JUMP_TASKS,
-    TABLE_WIDTH,
-    TESTS,
-    JumpTask,
-    evaluate_checkpoint,
-    parse_settings,
-    report,
-    train_or_load,
-)
+from support.departure_runs import BASELINE, JUMP_TASKS, TESTS, WIDTH, JumpTask, evaluate, parse, report, train_or_load
 from support.departures import DEPARTURES, Ablation, ablation_flags
 from support.scripts import ThreadArgs, prepare
 
@@ -95,20 +85,20 @@ class Args(ThreadArgs):
 def main(args: Args) -> dict[str, Any]:
     """Train and evaluate each ablation, write the table and the plot, and return the metrics."""
     for name, seed, ablation in args.trainings():  # a wrong flag is refused before any training
-        parse_settings(ablation, args.command(ablation, seed, Path(name)))
+        parse(ablation, args.command(ablation, seed, Path(name)))
     folder, results, table = prepare("departures", args, args.threads), {}, None
     values: dict[str, Any] = {"task": args.task, "iterations": args.length, "envs": args.envs}
     for name, seed, ablation in args.trainings():
         checkpoint = train_or_load(ablation, args.command(ablation, seed, folder / f"{name}_{seed}"))
         if not args.measure:
             continue
-        tests = results[name, seed] = evaluate_checkpoint(checkpoint, args, folder)
+        tests = results[name, seed] = evaluate(checkpoint, args, folder)
         values[f"flags_{name}"] = ablation_flags(ablation)
         values |= {f"{test}_{key}_{name}_{seed}": tests[test][key] for test in TESTS for key in tests[test]}
         write_metrics(folder, values)
         table = report(results, f"{args.task}, {args.length} iterations", folder)
     if table is not None:
-        Console(width=TABLE_WIDTH).print(table)
+        Console(width=WIDTH).print(table)
     print(f"{'metrics, table, plot and ' if results else ''}runs in {folder}")
     return values
 

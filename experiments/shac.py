@@ -65,7 +65,6 @@ class Args(DeviceArgs):
     """Worlds of that."""
 
     def __post_init__(self) -> None:
-        """Raises InputError: a setting is out of range."""
         if not self.seeds or not self.trainers or min((self.every, *self.horizons, self.worlds - 1)) <= 0:
             raise InputError("need seeds, trainers, at least 2 worlds, and positive times and horizons")
 

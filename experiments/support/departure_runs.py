@@ -47,7 +47,7 @@ COLUMNS = {
     "torque ripple [N m]": ("mean_torque_ripple_nm", 1.0),
 }
 """Columns of the table: metric and scale; cells are nominal / randomised."""
-TABLE_WIDTH = 180
+WIDTH = 180
 """Width of the table in characters."""
 MetricsByTraining = dict[tuple[str, int], dict[str, dict[str, Any]]]
 """Metrics by training (name, seed), test and name."""
@@ -78,7 +78,7 @@ JUMP_TASKS: dict[JumpTask, DepartureCfg] = {
 }
 
 
-def parse_settings(ablation: Ablation, arguments: list[str]) -> tuple[Any, TaskCfg]:
+def parse(ablation: Ablation, arguments: list[str]) -> tuple[Any, TaskCfg]:
     """Return the parsed settings of `jumper train`, and its task with the ablation."""
     parsed, task = parse_train(arguments)
     return parsed, task if isinstance(ablation, str) else ablation(task)
@@ -86,7 +86,7 @@ def parse_settings(ablation: Ablation, arguments: list[str]) -> tuple[Any, TaskC
 
 def train_or_load(ablation: Ablation, arguments: list[str]) -> Path:
     """Return the last checkpoint of a training, which is run unless it exists. Raises InputError: other settings."""
-    (parsed, task), name = parse_settings(ablation, arguments), f"{CHECKPOINTS}/iteration_{{:06d}}.pt"
+    (parsed, task), name = parse(ablation, arguments), f"{CHECKPOINTS}/iteration_{{:06d}}.pt"
     if checkpoints := sorted(Path(parsed.cfg.log_root).glob(f"*/*/{name.format(parsed.cfg.iterations)}")):
         config = json.loads((checkpoints[-1].parents[1] / CONFIG).read_text())
         requested = json.loads(json.dumps(asdict(parsed.cfg), default=str))
@@ -100,7 +100,7 @@ def train_or_load(ablation: Ablation, arguments: list[str]) -> Path:
     return result.folder / name.format(result.iteration)
 
 
-def evaluate_checkpoint(checkpoint: Path, args: Any, folder: Path) -> dict[str, dict[str, Any]]:
+def evaluate(checkpoint: Path, args: Any, folder: Path) -> dict[str, dict[str, Any]]:
     """Return the metrics of a policy's jumps and held squats by test; args: `Args` of `experiments/departures.py`."""
     run, ends = EvaluationRun(checkpoint), make_task(args.task).terminations
     run.prepare("departures", Conditions(device=args.device, threads=args.threads), folder)
@@ -124,7 +124,7 @@ def report(results: MetricsByTraining, title: str, folder: Path) -> Table:
     for (name, seed), tests in results.items():
         table.add_row(f"{name.replace('_', ' ')}, {seed}", *(cell(tests, *column) for column in COLUMNS.values()))
     with (folder / "departures.txt").open("w") as file:
-        Console(file=file, width=TABLE_WIDTH).print(table)
+        Console(file=file, width=WIDTH).print(table)
     plot_results(results, folder / "departures.png")
     return table
 

@@ -17,16 +17,7 @@ import torch
 
 from jumper_warp.envs.env import Env
 from jumper_warp.evaluation.jumps import DELAY, jump_commands, yaw_of
-from jumper_warp.evaluation.log import (
-    NO_END,
-    EvaluationLog,
-    Metrics,
-    failure_counts,
-    finite,
-    largest,
-    mean,
-    mean_and_max,
-)
+from jumper_warp.evaluation.log import NO_END, EvaluationLog, Metrics, failed_by, finite, largest, mean, mean_and_max
 from jumper_warp.evaluation.plots import figure
 from jumper_warp.evaluation.run import HEIGHTS, EvaluationArgs, Run, conditions_of
 from jumper_warp.policies.policy import Policy
@@ -222,7 +213,7 @@ def flight_metrics(flights: FlightLog) -> Metrics:
         "mean_largest_tilt_deg": mean(np.degrees(flights.largest_tilt)),
         **mean_and_max("touchdown_tilt_deg", np.degrees(flights.touchdown_tilt)),
         **mean_and_max("touchdown_turn_deg", np.degrees(flights.touchdown_turn)),
-        **failure_counts(flights.outcomes[~flights.success]),
+        **failed_by(flights.outcomes[~flights.success]),
         "failed_before_touchdown": int((~flights.success & np.isnan(flights.flight_time)).sum()),
     }
 

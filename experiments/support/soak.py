@@ -94,16 +94,11 @@ def hardest(task: TaskCfg) -> TaskCfg:
 class SoakTotals(NamedTuple):
     """Totals of a soak test over all worlds and steps."""
 
-    flagged: int
-    """Worlds that were flagged as non-finite."""
-    unsolved: int
-    """World steps whose contacts did not converge."""
-    rows: int
-    """World steps with a value that is not finite."""
-    speed: float
-    """[m/s] Largest speed of a base."""
-    joint_speed: float
-    """[rad/s] Largest speed of a joint."""
+    flagged: int  # worlds flagged as non-finite
+    unsolved: int  # world steps whose contacts did not converge
+    rows: int  # world steps with a value that is not finite
+    speed: float  # [m/s] largest speed of a base
+    joint_speed: float  # [rad/s] largest speed of a joint
 
 
 class SoakCounters:

@@ -17,7 +17,7 @@ from jumper_warp.evaluation.log import (
     SUCCESS,
     EvaluationLog,
     Metrics,
-    failure_counts,
+    failed_by,
     finite,
     mean,
 )
@@ -33,7 +33,7 @@ PICTURES = 6
 """Number of pictures in a filmstrip."""
 
 
-def turns_about_axes(count: int, angle: float) -> np.ndarray:
+def axis_turns(count: int, angle: float) -> np.ndarray:
     """Return quaternions xyzw, body axes, (count, 4), of turns by an angle [deg] that cycle through DIRECTIONS."""
     half = 0.5 * np.radians(angle)
     quats = np.zeros((count, 4))
@@ -43,7 +43,7 @@ def turns_about_axes(count: int, angle: float) -> np.ndarray:
     return quats
 
 
-def turns_about_any(count: int, angle: float, seed: int) -> np.ndarray:
+def random_turns(count: int, angle: float, seed: int) -> np.ndarray:
     """Return quaternions xyzw, body axes, (count, 4), of turns by an angle [deg] about uniformly random axes."""
     axis = np.random.default_rng(seed).normal(size=(count, 3))
     axis /= np.linalg.norm(axis, axis=1, keepdims=True)
@@ -176,11 +176,11 @@ def turn_metrics(turns: AttitudeLog) -> Metrics:
         "collision_rate": float(turns.collided.mean()),
         DIVERGED: int(turns.diverged.sum()),
     }
-    return metrics | failure_counts(outcomes[~turns.success])
+    return metrics | failed_by(outcomes[~turns.success])
 
 
 def axis_metrics(turns: AttitudeLog) -> Metrics:
-    """Return mean settling time, success rate and final error of turns of `turns_about_axes`, by direction."""
+    """Return mean settling time, success rate and final error of turns of `axis_turns`, by direction."""
     metrics: Metrics = {}
     for i, name in enumerate(DIRECTIONS):
         metrics[f"{name}_settling_s"] = mean(turns.settling_time[i::6])
@@ -203,7 +203,6 @@ class AttitudeFlags:
     """[s] Of which every turn is followed."""
 
     def __post_init__(self) -> None:
-        """Raises InputError: a setting is out of range."""
         if self.turns < len(DIRECTIONS):
             raise InputError(f"turns must be at least {len(DIRECTIONS)}, got {self.turns}")
         if not 0.0 < self.angle <= 180.0 or not 0.0 < self.tolerance <= 180.0:
@@ -213,7 +212,7 @@ class AttitudeFlags:
 
     def log(self, task: TaskCfg, seed: int) -> AttitudeLog:
         """Return the log of the turns, one per world."""
-        return AttitudeLog(turns_about_axes(self.turns, self.angle), self.tolerance, self.seconds)
+        return AttitudeLog(axis_turns(self.turns, self.angle), self.tolerance, self.seconds)
 
     def metrics(self, log: AttitudeLog) -> Metrics:
         """Return `turn_metrics` and `axis_metrics`."""
@@ -230,10 +229,9 @@ class AttitudePlayFlags:
     length = 4.0
 
     def __post_init__(self) -> None:
-        """Raises InputError: the angle is out of range."""
         if not 0.0 < self.angle <= 180.0:
             raise InputError(f"angle must be in (0, 180] degrees, got {self.angle}")
 
     def log(self, task: TaskCfg) -> AttitudeLog:
         """Return the log of six turns, one per robot."""
-        return AttitudeLog(turns_about_axes(len(DIRECTIONS), self.angle), seconds=self.length)
+        return AttitudeLog(axis_turns(len(DIRECTIONS), self.angle), seconds=self.length)

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from jumper_warp.evaluation.log import EvaluationLog, Metrics, failure_counts, finite, largest, mean
+from jumper_warp.evaluation.log import EvaluationLog, Metrics, failed_by, finite, largest, mean
 from jumper_warp.evaluation.plots import figure
 from jumper_warp.evaluation.scripts import ScriptStep
 from jumper_warp.evaluation.velocities import SETTLING_TIME, body_velocity, rmse_metrics, velocity_series
@@ -301,7 +301,7 @@ def course_metrics(course: CourseLog) -> Metrics:
         "max_handover_force_ripple_n": largest(ripple),
         "handover_force_step_n": mean(step),
         "max_handover_force_step_n": largest(step),
-    } | failure_counts(course.outcomes[~done])  # fmt: skip
+    } | failed_by(course.outcomes[~done])  # fmt: skip
 
 
 def tracking_error(course: CourseLog) -> np.ndarray:

@@ -151,7 +151,6 @@ class EpisodeFlags:
     """[s] Length at most."""
 
     def __post_init__(self) -> None:
-        """Raises InputError: a setting is out of range."""
         check_episodes(self.episodes, self.command, self.seconds)
 
     def log(self, task: TaskCfg, seed: int) -> EpisodeLog:
@@ -173,7 +172,6 @@ class EpisodePlayFlags:
     length = 10.0
 
     def __post_init__(self) -> None:
-        """Raises InputError: a setting is out of range."""
         check_episodes(1, self.command, self.length)
 
     def log(self, task: TaskCfg) -> EpisodeLog:

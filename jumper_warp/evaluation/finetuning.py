@@ -77,7 +77,6 @@ class FinetuneCfg:
     """CPU threads that share the worlds (default: all cores); they change no result."""
 
     def __post_init__(self) -> None:
-        """Raises InputError: a setting is out of range."""
         if self.goals < 2 or min(self.late, self.randomized, self.iterations) < 0:
             raise InputError("fine-tuning needs at least 2 goals, and no negative number of jumps or steps")
         for name in ("miss_std", "late_std", "randomized_std", "action_std", "landing_std"):

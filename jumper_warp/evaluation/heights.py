@@ -18,7 +18,7 @@ from jumper_warp.evaluation.log import (
     DIVERGED,
     SUCCESS,
     Metrics,
-    failure_counts,
+    failed_by,
     finite,
     largest,
     mean,
@@ -161,7 +161,7 @@ def apex_metrics(jumps: HeightLog, in_range: tuple[float, float]) -> Metrics:
         "fall_rate": mean(np.isin(outcomes, (*FALLS, COLLIDED, DIVERGED))),
         "miss_rate": mean(outcomes == WRONG_HEIGHT),
     }
-    return metrics | failure_counts(outcomes[~success])
+    return metrics | failed_by(outcomes[~success])
 
 
 def apex_error_metrics(jumps: HeightLog, in_range: tuple[float, float]) -> Metrics:
@@ -218,7 +218,6 @@ class HeightFlags(JumpFlags):
     """[m] Highest."""
 
     def __post_init__(self) -> None:
-        """Raises InputError: a setting is out of range."""
         super().__post_init__()
         if not 0.0 < self.lower <= self.upper < 10.0:
             raise InputError(f"heights must be in (0, 10) m and rise, got {self.lower}, {self.upper}")
@@ -242,7 +241,6 @@ class HeightPlayFlags:
     """[s] Of the recording, unless another is given."""
 
     def __post_init__(self) -> None:
-        """Raises InputError: a height is out of range, or their number."""
         if not 1 <= len(self.height) <= MAX_ROBOTS or not all(0.0 < height < 10.0 for height in self.height):
             raise InputError(f"height takes 1 to {MAX_ROBOTS} numbers in (0, 10) m, got {self.height}")
 

@@ -245,7 +245,6 @@ class JumpFlags:
     """[m] Distances or heights that the success rate in range counts."""
 
     def __post_init__(self) -> None:
-        """Raises InputError: a setting is out of range."""
         if self.jumps < 1:
             raise InputError(f"jumps must be at least 1, got {self.jumps}")
         if not 0.0 <= self.in_range[0] <= self.in_range[1] < 10.0:

@@ -22,7 +22,7 @@ from jumper_warp.evaluation.log import (
     DIVERGED,
     SUCCESS,
     Metrics,
-    failure_counts,
+    failed_by,
     finite,
     mean,
     mean_and_max,
@@ -196,7 +196,7 @@ def landing_metrics(landings: LandingLog, inside: np.ndarray | None = None) -> M
             "success_rate_in_range": mean(success[inside]),
             "still_landing_rate_in_range": mean(landings.still[inside]),
         }
-    return metrics | failure_counts(landings.outcomes[begun & ~success])
+    return metrics | failed_by(landings.outcomes[begun & ~success])
 
 
 def trained_range(task: TaskCfg) -> dict[str, float]:
@@ -222,7 +222,6 @@ class LandingFlags(JumpFlags):
     """[deg] Heading of all robots, or any: drawn from the full circle."""
 
     def __post_init__(self) -> None:
-        """Raises InputError: a setting is out of range."""
         super().__post_init__()
         for name in ("x", "y"):
             low, high = getattr(self, name)
@@ -256,7 +255,6 @@ class LandingPlayFlags:
     """[m] Goals if there are none; flags that are given several times would be added to a default."""
 
     def __post_init__(self) -> None:
-        """Raises InputError: a place is out of range, or their number."""
         for name in ("goal", "then"):
             places = getattr(self, name)
             if len(places) > MAX_ROBOTS or not all(-10.0 < value < 10.0 for place in places for value in place):

@@ -151,7 +151,7 @@ def mean_and_max(name: str, values: np.ndarray) -> Metrics:
     return {f"mean_{name}": mean(values), f"max_{name}": largest(values)}
 
 
-def failure_counts(outcomes: np.ndarray) -> Metrics:
+def failed_by(outcomes: np.ndarray) -> Metrics:
     """Return the number of failed episodes by outcome, as `failed_by_<outcome>`; outcomes: of the failed ones."""
     return {f"failed_by_{name}": int((outcomes == name).sum()) for name in sorted(set(outcomes))}
 

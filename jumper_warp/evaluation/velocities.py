@@ -215,7 +215,6 @@ class VelocityFlags:
     """[s] Length; the first second does not count for the error."""
 
     def __post_init__(self) -> None:
-        """Raises InputError: a setting is out of range."""
         check_velocity_settings(self.per_axis**3, self.seconds, *self.reach)
         if self.per_axis < 2:
             raise InputError(f"per_axis must be at least 2, got {self.per_axis}")
@@ -243,7 +242,6 @@ class VelocityPlayFlags:
     """[s] From command to command."""
 
     def __post_init__(self) -> None:
-        """Raises InputError: a setting is out of range."""
         check_velocity_settings(1, self.length, *(value for command in self.velocity for value in command))
 
     @property

@@ -49,7 +49,7 @@ def test_places_are_spread_ahead_and_drawn_aside_and_headings_too():
     aside = log.goal_positions[:, 0, 1]
     assert -0.2 <= aside.min() < aside.max() <= 0.1
     assert len(set(log.headings)) == 5 and np.abs(log.headings).max() <= math.pi
-    assert np.array_equal(flags.log(TASK, seed=3).places, log.goal_positions)
+    assert np.array_equal(flags.log(TASK, seed=3).goal_positions, log.goal_positions)
     assert not np.array_equal(flags.log(TASK, seed=4).headings, log.headings)
 
 
@@ -106,7 +106,7 @@ def test_range_of_places_counts_distances():
     goals = [[0.3, 0.0], [0.0, -0.3], [0.6, 0.6]]
     flags = LandingFlags(jumps=3, x=(0.0, 0.0), y=(0.0, 0.0), heading=0.0, in_range=(0.3, 0.5))
     landings = flags.log(TASK, 0)
-    landings.places[:, 0] = goals
+    landings.goal_positions[:, 0] = goals
     landings.place[:, 0], landings.target[:, 0] = goals, goals
     landings.heading[:], landings.yaw[:], landings.tilt[:] = 0.0, 0.0, 0.0
     landings.end[:, 0] = [*[LANDING_TERMINATIONS.index("success")] * 2, LANDING_TERMINATIONS.index("low_base")]

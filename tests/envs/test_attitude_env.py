@@ -10,7 +10,7 @@ import warp as wp
 from scipy.spatial.transform import Rotation
 
 from jumper_warp.envs.env import Env
-from jumper_warp.evaluation.attitude import AttitudeLog, axis_metrics, turn_metrics, turns_about_axes
+from jumper_warp.evaluation.attitude import AttitudeLog, axis_metrics, axis_turns, turn_metrics
 from jumper_warp.evaluation.log import run_evaluation
 from jumper_warp.kernels.attitude.state import AttitudeState
 from jumper_warp.registry import make_task
@@ -138,7 +138,7 @@ def test_leg_motions_turn_the_robot_but_give_it_no_momentum(env):
 
 
 def test_turns_are_followed_until_they_settle(env):
-    turns = AttitudeLog(turns_about_axes(N, 90.0), seconds=0.2)
+    turns = AttitudeLog(axis_turns(N, 90.0), seconds=0.2)
     run_evaluation(lambda obs: torch.zeros(N, 12), env, turns)
     np.testing.assert_allclose(env.task_arrays()["base_pos"][:, 2], 2.35, atol=0.05)
     np.testing.assert_allclose(np.degrees(turns.error), 90.0, atol=5.0)

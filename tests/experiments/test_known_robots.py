@@ -1,4 +1,4 @@
-"""Known robots of the identification experiment: as drawn, and how well robots predict what they did."""
+"""Known robots of the identification experiment: sampling, prediction errors and χ²."""
 
 import numpy as np
 import pytest
@@ -11,8 +11,8 @@ from support.known_robots import MOST, make_case, prediction_errors
 
 
 @pytest.fixture(scope="module")
-def drawn():
-    """Parameters, one known robot, what replays, and what carries a plan out."""
+def sampled_case():
+    """Parameters, a case of one known robot, the batched replay, and the function that simulates a plan."""
     parameters, one = jumper_parameters(), Replay(device="cpu", threads=1)
     many = Replay(device="cpu", threads=1)
 
@@ -22,23 +22,23 @@ def drawn():
     return parameters, make_case(parameters, 3, simulate, many), many, simulate
 
 
-def test_a_robot_is_drawn_from_the_priors_and_always_late(drawn):
-    parameters, case, _, _ = drawn
+def test_sampled_robot_is_within_priors_and_has_latency(sampled_case):
+    parameters, case, _, _ = sampled_case
     assert np.abs(case.truth).max() <= 0.2 + MOST and case.truth.std() > 0.4
     assert case.truth[parameters.names.index("latency")] >= 0.2
     assert len(case.motions) == 4 and case.held_out.torque_limit == 16.0
 
 
-def test_a_robot_predicts_itself_exactly_and_another_one_does_not(drawn):
-    parameters, case, _, simulate = drawn
+def test_true_robot_predicts_held_out_jump_exactly(sampled_case):
+    parameters, case, _, simulate = sampled_case
     assert max(prediction_errors(case, case.robots, simulate)) < 1.0e-12
     angle, height = prediction_errors(case, parameters.robots(np.zeros((1, len(parameters)))), simulate)
     assert angle > 0.5 and height > 1.0
 
 
-def test_the_truth_explains_what_was_measured_to_its_noise(drawn):
-    """But for where the motions started, which is expected and not known here."""
-    parameters, case, many, _ = drawn
+def test_true_parameters_lower_chi2_of_measurements(sampled_case):
+    """Initial states are at their expected values, not the true ones."""
+    parameters, case, many, _ = sampled_case
     problem = make_problem(parameters, case, many)
     point = problem.expected()
     described = chi2_at(problem, point)

@@ -1,4 +1,4 @@
-"""A task whose every number is in the hands of a test: its terms read what the test writes into its state."""
+"""A task for tests of the stages: its terms read values that the test writes into the state."""
 
 import dataclasses
 from typing import Any
@@ -213,7 +213,7 @@ def probe_task(**changes) -> TaskCfg:
 
 
 class Probe:
-    """Worlds of the task with all their arrays, the robots at rest, and launches of its stages."""
+    """Worlds of the task with robots at rest, all their arrays, and methods that launch the stages."""
 
     def __init__(self, n: int, task: TaskCfg | None = None, index: int = 0, seed: int = 0):
         """index: of the skill."""
@@ -243,19 +243,19 @@ class Probe:
         return getattr(self.worlds, name).numpy().copy()
 
     def step(self) -> None:
-        """Launch the end of a step."""
+        """Launch the step stage."""
         skill = self.skill
         inputs = [skill.index, self.robot, self.ground, len(self.task.levels), skill.params.values, self.worlds,
                   skill.states, skill.term_value, skill.counters]  # fmt: skip
         wp.launch(skill.kernels["step"], self.n, inputs, device="cpu")
 
     def observe(self, beginning: int = 0) -> None:
-        """Launch the observation."""
+        """Launch the observation stage; beginning: as in `observe`."""
         states, numbers = self.skill.states, self.skill.params.values
         observe(self.skill, self.robot, self.parameters, self.ground, self.worlds, states, numbers, beginning)
 
     def next_clock(self) -> None:
-        """Let all worlds be one policy step further on, and no longer new."""
+        """Advance the clocks of all worlds by a policy step, and clear their `fresh` flags."""
         self.worlds.clock.assign(self.worlds.clock.numpy() + 1)
         self.worlds.fresh.zero_()
 
