@@ -21,11 +21,9 @@ from jumper_warp.evaluation.plots import figure
 from support.gradients import INNER, OUTER, TICKS, GradientJump, GradientPair, apex, check, schedule
 from support.scripts import DeviceArgs, prepare, report
 
-WEAK_PUSH = (20.0, 20.0)
-"""[deg] Commands of the push-off that the ascent starts from."""
+WEAK_PUSH = (20.0, 20.0)  # [deg] Commands of the push-off that the ascent starts from
 ASCENT_STEPS = 20
-ASCENT_CHANGE = 0.05
-"""[rad] Largest change of a target in a step of the ascent."""
+ASCENT_CHANGE = 0.05  # [rad] Largest change of a target in a step of the ascent
 
 
 @dataclass

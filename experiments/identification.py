@@ -28,8 +28,7 @@ from support.identification_methods import compare_methods
 from support.known_robots import make_case, plot_cases, policy_errors, run_case
 from support.scripts import report
 
-REFINE = 16
-"""Physics steps of the finer truth per step of the model."""
+REFINE = 16  # Physics steps of the finer truth per step of the model
 Experiment = Literal["same", "fine", "rough", "mujoco", "methods", "policy"]
 
 

@@ -33,8 +33,7 @@ from jumper_warp.viz.snapshot import Camera, contact_sheet
 from support.open_loop import SQUAT, plot_trace, simulate_jump, trace_metrics
 from support.scripts import DeviceArgs, prepare
 
-HARDWARE_APEX = 1.075
-"""[m] Paper, open loop on the robot at 18 N m."""
+HARDWARE_APEX = 1.075  # [m] Paper, open loop on the robot at 18 N m
 STRIP_TIMES = (0.9, 2.2, 2.32, 2.45, 2.7, 2.95, 3.15, 3.8)
 """[s] Times of the filmstrip's pictures: standing, squatting, push-off, rising, apex, falling, landing, standing."""
 PER_MOTOR = tuple(f"peak_{what}_{leg}" for what in ("torque", "speed") for leg in LEGS)

@@ -26,17 +26,12 @@ from jumper_warp.policies.skills import SkillNames
 from jumper_warp.utils.errors import InputError
 from support.walks import PAPER
 
-REACH, EACH = 0.8, 2.0
-"""[m/s] and [rad/s] Limit of the commanded velocities; [s] time of each command."""
-HEIGHT, DISTANCE = 0.75, 0.85
-"""[m] Apex height and distance of the paper's two jumps."""
-WALKS = (3, 3, 2)
-"""Numbers of walking commands before, between and after the jumps."""
-COMMANDS = 10
-"""Number of commands in a course."""
+REACH, EACH = 0.8, 2.0  # [m/s] and [rad/s] Limit of the commanded velocities; [s] time of each command
+HEIGHT, DISTANCE = 0.75, 0.85  # [m] Apex height and distance of the paper's two jumps
+WALKS = (3, 3, 2)  # Numbers of walking commands before, between and after the jumps
+COMMANDS = 10  # Number of commands in a course
 JUMPS = ("jump_up", "jump_to", "jump_onto")
-PROBABILITIES = (0.35, 0.2, 0.15, 0.15, 0.15)
-"""Probabilities of walking, turning and each of the jumps."""
+PROBABILITIES = (0.35, 0.2, 0.15, 0.15, 0.15)  # Probabilities of walking, turning and each of the jumps
 
 
 @dataclass(frozen=True)

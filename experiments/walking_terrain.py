@@ -24,8 +24,7 @@ from jumper_warp.robot.terrain import KINDS, TerrainCfg, single_tile
 from jumper_warp.utils.errors import InputError
 from support.walks import walked_share
 
-SECONDS = 10.0
-"""[s] Time of each walk."""
+SECONDS = 10.0  # [s] Time of each walk
 
 
 @dataclass(frozen=True)

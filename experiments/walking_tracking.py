@@ -36,8 +36,7 @@ from support.walks import (
     speed_metrics,
 )  # fmt: skip
 
-GAIT_SPEED = 0.8
-"""[m/s] Speed of the straight walk whose gait is measured."""
+GAIT_SPEED = 0.8  # [m/s] Speed of the straight walk whose gait is measured
 
 
 @dataclass(frozen=True)

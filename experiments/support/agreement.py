@@ -19,10 +19,8 @@ from jumper_warp.sim.dynamics import JumperDynamics
 from jumper_warp.sim.overlay import MOTOR_DOFS, write_model
 from support.inverse_kinematics import random_motors
 
-MARGIN = 0.35
-"""[rad] Distance of the motor angles from the stops; a stretched leg is singular."""
-DT = 1.0e-6
-"""[s] Time step over which the change of velocity gives the acceleration."""
+MARGIN = 0.35  # [rad] Distance of the motor angles from the stops; a stretched leg is singular
+DT = 1.0e-6  # [s] Time step over which the change of velocity gives the acceleration
 States = dict[str, np.ndarray]
 Quantities = dict[str, np.ndarray]
 

@@ -27,13 +27,10 @@ from jumper_warp.utils.errors import InputError
 from support.departures import Ablation
 from support.squats import SquatLog, squat_goals, squat_metrics
 
-ELSEWHERE = {"log_root", "device", "threads"}
-"""Settings in which a training may differ from a saved one."""
-HOLD = 3.0
-"""[s] Time for which squats are held."""
+ELSEWHERE = {"log_root", "device", "threads"}  # Settings in which a training may differ from a saved one
+HOLD = 3.0  # [s] Time for which squats are held
 TESTS = ("nominal", "randomized")
-BASELINE = "kept"
-"""Name of the training with all departures."""
+BASELINE = "kept"  # Name of the training with all departures
 COLUMNS = {
     "error [mm]": ("error_m", 1000.0),
     "success [%]": ("success_rate", 100.0),
@@ -47,8 +44,7 @@ COLUMNS = {
     "torque ripple [N m]": ("mean_torque_ripple_nm", 1.0),
 }
 """Columns of the table: metric and scale; cells are nominal / randomised."""
-WIDTH = 180
-"""Width of the table in characters."""
+WIDTH = 180  # Width of the table in characters
 MetricsByTraining = dict[tuple[str, int], dict[str, dict[str, Any]]]
 """Metrics by training (name, seed), test and name."""
 
@@ -57,14 +53,10 @@ MetricsByTraining = dict[tuple[str, int], dict[str, dict[str, Any]]]
 class DepartureCfg:
     """How the ablations of a task are trained and evaluated."""
 
-    iterations: int
-    """Iterations of each training."""
-    goals: dict[str, Any]
-    """[m] Flags that set the goals of the evaluated jumps."""
-    squats: tuple[float, float]
-    """[m] Range of goals for which squats are held."""
-    begin: str = ""
-    """More flags of every training."""
+    iterations: int  # Iterations of each training
+    goals: dict[str, Any]  # [m] Flags that set the goals of the evaluated jumps
+    squats: tuple[float, float]  # [m] Range of goals for which squats are held
+    begin: str = ""  # More flags of every training
 
 
 JumpTask = Literal["vertical-jump", "horizontal-jump", "omnidirectional-jump", "horizontal-jump-mars-loose"]

@@ -28,22 +28,15 @@ from jumper_warp.registry import make_task
 from jumper_warp.tasks.switching import FALLS_FROM_FLIGHT, flight_skills
 from support.momentum import momentum
 
-JUMP, TURN = 0, 1
-"""Indices of the skills in the environment."""
+JUMP, TURN = 0, 1  # Indices of the skills in the environment
 RAMP, HOLD, EXTEND = 25, 35, 40
 """Numbers of policy steps of the ramp into the squat, the held squat, and at most of the extension."""
-SQUAT = 120.0
-"""[deg] Commanded transversal angle of the squat."""
-STRETCHED = -45.0
-"""[deg] Commanded transversal angle of the extension."""
-HIGH = 0.7
-"""[m] Base height above which no paw can touch level ground."""
-UPRIGHT = 30.0
-"""[deg] Largest tilt of a successful landing."""
-CLEAR = 3
-"""Policy steps without contact that count as takeoff of a policy; open loop, one is enough."""
-AFTER = 1.5
-"""[s] Time after touchdown at which a landing is evaluated."""
+SQUAT = 120.0  # [deg] Commanded transversal angle of the squat
+STRETCHED = -45.0  # [deg] Commanded transversal angle of the extension
+HIGH = 0.7  # [m] Base height above which no paw can touch level ground
+UPRIGHT = 30.0  # [deg] Largest tilt of a successful landing
+CLEAR = 3  # Policy steps without contact that count as takeoff of a policy; open loop, one is enough
+AFTER = 1.5  # [s] Time after touchdown at which a landing is evaluated
 OUTCOMES = (*(term.name for term in FALLS_FROM_FLIGHT), "landed", "tilted", "no_takeoff")
 LEG_SIGNS = np.array([[1.0, 1.0], [1.0, -1.0], [-1.0, 1.0], [-1.0, -1.0]])
 """Sign of each leg FL, FR, BL, BR along front and left."""
@@ -53,12 +46,10 @@ LEG_SIGNS = np.array([[1.0, 1.0], [1.0, -1.0], [-1.0, 1.0], [-1.0, -1.0]])
 class FlightLog(EvaluationLog):
     """Log of one flight per world; arrays have shape (num_envs,) and do not change after the flight's end."""
 
-    apex: np.ndarray
-    """[m] (num_envs,) Apex heights that are commanded to the jump's policy."""
+    apex: np.ndarray  # [m] (num_envs,) Apex heights that are commanded to the jump's policy
     late: np.ndarray | None = None
     """[s] (num_envs, 2) Delay of the extension of front and left legs; None: the jump's policy takes off."""
-    turns: bool = True
-    """Whether the turning skill is requested in flight."""
+    turns: bool = True  # Whether the turning skill is requested in flight
     seconds: float = 9.0
     row_name = "flight"
     spacing = 1.6

@@ -20,8 +20,7 @@ from jumper_warp.policies.runs import open_policy
 from jumper_warp.rl.networks import ActorCritic, weights_of
 from jumper_warp.trajectory.gauss_newton import Network, Tape, world_rows
 
-NOISE = 0.2
-"""[1] Standard deviation of the actions in windows."""
+NOISE = 0.2  # [1] Standard deviation of the actions in windows
 ESTIMATORS = ("physics", "score")
 METRICS = {"deviation": "std", "signal": "signal", "worlds_needed": "worlds_needed", "non_finite": "non_finite"}
 """Field of `GradientStats` by name of the metric."""
@@ -31,12 +30,9 @@ METRICS = {"deviation": "std", "signal": "signal", "worlds_needed": "worlds_need
 class GradientStats:
     """Statistics over worlds of one estimator's gradients, (weights,) each."""
 
-    std: float
-    """Square root of the sum over weights of the variance between worlds."""
-    signal: float
-    """Norm of the mean over worlds, without the part expected from noise alone; 0 if noise explains it."""
-    non_finite: float
-    """Share of worlds whose gradient is not finite."""
+    std: float  # Square root of the sum over weights of the variance between worlds
+    signal: float  # Norm of the mean over worlds, without the part expected from noise alone; 0 if noise explains it
+    non_finite: float  # Share of worlds whose gradient is not finite
 
     @property
     def worlds_needed(self) -> float:

@@ -18,16 +18,13 @@ from jumper_warp.robot.description import load_description
 from jumper_warp.robot.model import build_model, standing_configuration
 from jumper_warp.robot.motors import jumping_motors, vertical_jump_filter
 
-TICKS = 36
-"""Number of policy steps of 1/60 s of the jump."""
+TICKS = 36  # Number of policy steps of 1/60 s of the jump
 SQUAT = math.radians(85.0)
 PUSH = (-5.0, -8.0)
 """[deg] Outer and inner transversal command of the push-off; the filter binds, the motors saturate at first."""
-SLIP_SPEED = 1.5
-"""[m/s] Initial forward speed of the jump on slippery ground for the gradient by friction."""
+SLIP_SPEED = 1.5  # [m/s] Initial forward speed of the jump on slippery ground for the gradient by friction
 SLIP_FRICTION = 0.25
-OUTER, INNER = 1, 2
-"""Motors of the front left leg whose targets are checked."""
+OUTER, INNER = 1, 2  # Motors of the front left leg whose targets are checked
 PARAMETERS = ("table", "saturation")
 GradientPair = tuple[np.ndarray, np.ndarray]
 """Gradient of the apex along some directions, and its central differences; the same shape."""

@@ -23,26 +23,21 @@ from jumper_warp.policies.runs import open_policy
 from jumper_warp.robot.overlay import overlay_of
 from jumper_warp.robot.values import RobotValues
 
-SPREAD, MOST = 0.7, 1.5
-"""Standard deviation and limit of the sampled parameters, in standard deviations of the priors."""
-HELD_OUT_TORQUE = 16.0
-"""[N m] Torque limit of the held-out jump."""
-SCALE_STD = 0.02
-"""[kg] Standard deviation of the weighed mass."""
+SPREAD, MOST = 0.7, 1.5  # Standard deviation and limit of the sampled parameters, in standard deviations of the priors
+HELD_OUT_TORQUE = 16.0  # [N m] Torque limit of the held-out jump
+SCALE_STD = 0.02  # [kg] Standard deviation of the weighed mass
 
 
 @dataclass
 class Case:
     """A known robot, its recorded motions, and a held-out jump."""
 
-    truth: np.ndarray
-    """(parameters,) True parameters, normalised by the priors."""
+    truth: np.ndarray  # (parameters,) True parameters, normalised by the priors
     robots: RobotValues
     motions: list[Motion]
     mass: Knowledge
     held_out: Plan
-    record: Record
-    """Measured trajectory of the held-out jump."""
+    record: Record  # Measured trajectory of the held-out jump
 
 
 Simulate = Callable[[Plan, RobotValues], Record]

@@ -22,24 +22,19 @@ from jumper_warp.rl.shac import Shac
 from jumper_warp.tasks.cfg import TaskCfg
 from support.timing import process_age
 
-RATES = (0.5, 0.8, 0.9, 0.95, 1.0)
-"""[1] Success rates for which the time to reach them is reported."""
-TEST_HEIGHTS = (0.5, 1.1)
-"""[m] Default range of the heights of the evaluated jumps."""
+RATES = (0.5, 0.8, 0.9, 0.95, 1.0)  # [1] Success rates for which the time to reach them is reported
+TEST_HEIGHTS = (0.5, 1.1)  # [m] Default range of the heights of the evaluated jumps
 
 
 @dataclass
 class LearningCurve:
     """Success of one training over its time; lists have one entry per evaluation."""
 
-    seconds: list[float] = field(default_factory=list)
-    """Training time so far."""
+    seconds: list[float] = field(default_factory=list)  # Training time so far
     success: list[float] = field(default_factory=list)
-    steps: list[int] = field(default_factory=list)
-    """Policy steps of all worlds together so far."""
+    steps: list[int] = field(default_factory=list)  # Policy steps of all worlds together so far
     iterations: int = 0
-    ready: float = 0.0
-    """[s] Time from the start of the process to the start of the training; 0 if not measured."""
+    ready: float = 0.0  # [s] Time from the start of the process to the start of the training; 0 if not measured
 
     def seconds_to(self, rate: float) -> float | None:
         """Return the training time [s] of the first evaluation with at least this success rate, or None."""

@@ -23,12 +23,9 @@ from jumper_warp.robot.model import build_model
 from jumper_warp.sim.simulation import Simulation, motor_values
 from jumper_warp.trajectory.problem import Motion, Problem
 
-CONTACT_FORCE = 0.1
-"""[N] Force above which a paw is in contact."""
-TAKEOFF_SPEED = 0.25
-"""[m/s] Smallest upward speed of the base at takeoff."""
-PAW_RADIUS = 0.025
-"""[m] Radius of a paw."""
+CONTACT_FORCE = 0.1  # [N] Force above which a paw is in contact
+TAKEOFF_SPEED = 0.25  # [m/s] Smallest upward speed of the base at takeoff
+PAW_RADIUS = 0.025  # [m] Radius of a paw
 
 
 class MotionReplay:

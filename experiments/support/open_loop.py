@@ -18,11 +18,9 @@ from jumper_warp.sim.simulation import Simulation, motor_values
 if TYPE_CHECKING:
     from jumper_warp.viz.recorder import Recorder
 
-STAND, LAND = 60, 60
-"""Numbers of policy steps in the default pose before and after the jump."""
+STAND, LAND = 60, 60  # Numbers of policy steps in the default pose before and after the jump
 
-SQUAT = 135.0
-"""[deg] Commanded transversal angle of the squat, which the command filter does not let the legs reach."""
+SQUAT = 135.0  # [deg] Commanded transversal angle of the squat, which the command filter does not let the legs reach
 
 
 def transversal_command(tick: int, squat: float = SQUAT) -> float:

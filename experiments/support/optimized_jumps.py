@@ -29,26 +29,18 @@ from support.motion_replay import TAKEOFF_SPEED, MotionReplay
 PITCH, AWAY, AHEAD = math.radians(29.8), 0.2985, 0.045
 """[rad], [m], [m] Largest pitch at landing, distance of the base from its start in stance, and distance of hind paws on
 the ground ahead of their start; slightly inside 30 degrees, 0.3 m (the task's limit) and 0.05 m."""
-FREE = 100.0
-"""[rad], [m] Value of a limit that never binds."""
-TILT = math.radians(8.0)
-"""[rad] Largest tilt of vertical jumps at any time."""
-DRIFT = 0.15
-"""[m] Largest distance of the base from its start in vertical jumps at any time."""
-HEIGHT = 0.80
-"""[m] Apex height of the jump with the least work."""
-STILL_HEIGHT = 0.65
-"""[m] Apex height of the jump that lands still."""
-SOFT = 4.5
-"""[g] Largest acceleration of the base over a policy step of the landing; the tasks end an episode at 5."""
-APEX_STEPS = 61
-"""Number of policy steps of a motion up to the apex."""
+FREE = 100.0  # [rad], [m] Value of a limit that never binds
+TILT = math.radians(8.0)  # [rad] Largest tilt of vertical jumps at any time
+DRIFT = 0.15  # [m] Largest distance of the base from its start in vertical jumps at any time
+HEIGHT = 0.80  # [m] Apex height of the jump with the least work
+STILL_HEIGHT = 0.65  # [m] Apex height of the jump that lands still
+SOFT = 4.5  # [g] Largest acceleration of the base over a policy step of the landing; the tasks end an episode at 5
+APEX_STEPS = 61  # Number of policy steps of a motion up to the apex
 BACK, LEAN = 0.28, 1.0
 """[m], [1] Backward distance of the base that early stages of the search for the farthest flight reward; weight."""
 POSTURES = np.array([[-0.2, -0.7, 0.7, -0.3], [0.6, 0.0, 0.3, 0.8], [0.9, 0.5, 0.9, 0.5]])
 """[1] Actions of a run-up in place: base behind the paws, hind legs folded under it, crouch."""
-SCATTER = 0.35
-"""[1] Standard deviation of these postures."""
+SCATTER = 0.35  # [1] Standard deviation of these postures
 
 
 def squats(knots: Knots, count: int, rng: np.random.Generator, push: int = 32) -> np.ndarray:
@@ -92,22 +84,14 @@ class Jump:
     """A jump to optimise: its problem, the stages of the search, and the reported value."""
 
     label: str
-    unit: str
-    """Unit of `value`."""
-    make: Callable[..., Problem]
-    """Returns the problem for the settings of a stage, device and threads."""
-    stages: tuple[tuple[Mapping[str, Any], Stage], ...]
-    """Stages of the search, each with its settings of `make`."""
-    value: Callable[[MotionReplay], float]
-    """Returns the reported value of a replay."""
-    draw: Callable[[Knots, int, np.random.Generator], np.ndarray] = squats
-    """Returns a number of random candidates."""
-    samples: int = 2048
-    """Default number of random candidates."""
-    polish: int = 40
-    """Default number of iterations of the last descent."""
-    after: str = ""
-    """Name of the jump whose solution is also a candidate; empty: none."""
+    unit: str  # Unit of `value`
+    make: Callable[..., Problem]  # Returns the problem for the settings of a stage, device and threads
+    stages: tuple[tuple[Mapping[str, Any], Stage], ...]  # Stages of the search, each with its settings of `make`
+    value: Callable[[MotionReplay], float]  # Returns the reported value of a replay
+    draw: Callable[[Knots, int, np.random.Generator], np.ndarray] = squats  # Returns a number of random candidates
+    samples: int = 2048  # Default number of random candidates
+    polish: int = 40  # Default number of iterations of the last descent
+    after: str = ""  # Name of the jump whose solution is also a candidate; empty: none
 
     def replay(self, targets: np.ndarray, device: str | None = None) -> MotionReplay:
         """Return the replay of targets [rad], (steps, 12)."""
@@ -121,8 +105,7 @@ class Jump:
         return replace(self, stages=stages)
 
 
-FORWARD_KNOTS = Knots((0.0, 8.0, 16.0, *map(float, range(24, 48))), steps=53)
-"""Knots of the farthest flight."""
+FORWARD_KNOTS = Knots((0.0, 8.0, 16.0, *map(float, range(24, 48))), steps=53)  # Knots of the farthest flight
 
 
 def motors_of(torque: float, speed: float = 1.0) -> MotorCfg:
@@ -162,10 +145,8 @@ def _vertical(
 
 
 FINE: dict[str, Any] = {"substeps": SUBSTEPS}
-COARSE = FINE | {"substeps": 4}
-"""Fewer physics steps per policy step, for the first stages of a search."""
-QUICK = FINE | {"double": False, "tolerance": None}
-"""Single precision, and its tolerance of the contact iteration."""
+COARSE = FINE | {"substeps": 4}  # Fewer physics steps per policy step, for the first stages of a search
+QUICK = FINE | {"double": False, "tolerance": None}  # Single precision, and its tolerance of the contact iteration
 UPWARD = (
     (COARSE, Stage(32, 40, rate=0.05, noise=0.05, least=1.0)),
     (COARSE, Stage(12, 100, rate=0.04, noise=0.04)),

@@ -21,12 +21,9 @@ from jumper_warp.sim.simulation import Simulation, SolverName
 from jumper_warp.sim.slices import SlicedGraph, Worlds
 from support.timing import device_memory, median_time, wall_time
 
-SQUAT, DEFAULT, EXTEND = 110.0, 45.0, -10.0
-"""[deg] Commanded transversal angles of the scripted jump."""
-JUMP_STEPS = 45
-"""Number of timed policy steps of the scripted jump: push-off, flight, landing."""
-CALLS = 3
-"""Launches of a part of a policy step per repetition."""
+SQUAT, DEFAULT, EXTEND = 110.0, 45.0, -10.0  # [deg] Commanded transversal angles of the scripted jump
+JUMP_STEPS = 45  # Number of timed policy steps of the scripted jump: push-off, flight, landing
+CALLS = 3  # Launches of a part of a policy step per repetition
 
 
 def command(sim: Simulation, degrees: float, steps: int) -> float:

@@ -15,8 +15,7 @@ from jumper_warp.robot.values import RobotValues
 from jumper_warp.sim.simulation import Simulation
 from support.open_loop import EXTEND, HOLD, RAMP, STAND, simulate_jump, trace_metrics, transversal_command
 
-FALLING = 60
-"""Number of policy steps after the extension in which a jump may still rise."""
+FALLING = 60  # Number of policy steps after the extension in which a jump may still rise
 FILTERS = {"stock": vertical_jump_filter, "loose": loose_filter}
 
 
@@ -25,12 +24,9 @@ class SpringJumps:
     """Open-loop jumps with given motors, command filter, gravity and spring length."""
 
     motors: MotorCfg
-    filter: str
-    """One of FILTERS."""
-    gravity: float
-    """[m/s^2] Downward."""
-    length: float
-    """[m] Rest length of the springs."""
+    filter: str  # One of FILTERS
+    gravity: float  # [m/s^2] Downward
+    length: float  # [m] Rest length of the springs
     device: str | None
 
     def simulation(self, count: int, robot: RobotOverlay | RobotValues, **settings: Any) -> Simulation:

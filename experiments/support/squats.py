@@ -12,20 +12,16 @@ from jumper_warp.envs.env import Env
 from jumper_warp.evaluation.jumps import jump_commands
 from jumper_warp.evaluation.log import EvaluationLog, Metrics, mean, mean_and_max
 
-CONTACT_FORCE = 0.1
-"""[N] Smallest force on a paw that is on the ground."""
+CONTACT_FORCE = 0.1  # [N] Smallest force on a paw that is on the ground
 
 
 @dataclass
 class SquatLog(EvaluationLog):
     """Log of robots that squat and wait, one per world; samples after an episode's end are ignored."""
 
-    goals: np.ndarray
-    """[m] (num_envs, 3) Goals of the jumps: x, y relative to start and heading, and apex height z."""
-    hold: float = 3.0
-    """[s] Simulated time, within which the jump is not commanded."""
-    window: float = 1.0
-    """[s] Window at its end over which forces and torques are evaluated."""
+    goals: np.ndarray  # [m] (num_envs, 3) Goals of the jumps: x, y relative to start and heading, and apex height z
+    hold: float = 3.0  # [s] Simulated time, within which the jump is not commanded
+    window: float = 1.0  # [s] Window at its end over which forces and torques are evaluated
     row_name = "squat"
 
     def __post_init__(self) -> None:

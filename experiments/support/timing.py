@@ -18,8 +18,7 @@ import warp as wp
 
 from jumper_warp.utils.errors import InputError
 
-RATE = "steps_per_s"
-"""Part of the names of metrics that are compared with a baseline."""
+RATE = "steps_per_s"  # Part of the names of metrics that are compared with a baseline
 
 
 def wall_time(body: Callable[[], Any], device: wp.DeviceLike = None, calls: int = 1) -> float:

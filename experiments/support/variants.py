@@ -9,8 +9,7 @@ from typing import Any
 from jumper_warp.rl.cfg import PpoCfg
 from jumper_warp.utils.errors import InputError
 
-DEFAULT = "default"
-"""Name of the unchanged settings."""
+DEFAULT = "default"  # Name of the unchanged settings
 VARIANTS: dict[str, dict[str, Any]] = {
     DEFAULT: {},
     **{

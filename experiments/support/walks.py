@@ -14,14 +14,11 @@ RAMP, KEEP, SHARE = 3.0, 5.0, 0.1
 """[s] Time of the command's ramp, time for which it is held, and [1] tolerance of a kept speed."""
 DIRECTIONS = {"ahead": (0, 1.0, 4.0), "back": (0, -1.0, 4.0), "sideways": (1, 1.0, 2.0), "turning": (2, 1.0, 4.0)}
 """Axis, sign and highest command [m/s] or [rad/s] of the test of top speed."""
-SETTLED = 0.1
-"""[m/s] Largest error of a robot that has settled on a new command."""
-SMOOTHING = 0.2
-"""[s] Window over which velocities are averaged for the settling time."""
+SETTLED = 0.1  # [m/s] Largest error of a robot that has settled on a new command
+SMOOTHING = 0.2  # [s] Window over which velocities are averaged for the settling time
 PAPER = {"rmse_vx_m_s": 0.17, "rmse_vy_m_s": 0.05, "rmse_yaw_rate_rad_s": 0.12}
 """Tracking errors of the paper, one test on the robot: commands up to 0.8 that a person gave."""
-HOLD = 0.5
-"""[s] Time within that error after which a robot has settled, regardless of later pushes."""
+HOLD = 0.5  # [s] Time within that error after which a robot has settled, regardless of later pushes
 
 
 def redirected_walks(env: Env, rng: np.random.Generator) -> VelocityLog:

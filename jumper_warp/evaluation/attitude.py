@@ -27,10 +27,8 @@ from jumper_warp.utils.errors import InputError
 AXES = ("roll", "pitch", "yaw")
 DIRECTIONS = tuple(f"{axis}_{sign}" for axis in AXES for sign in ("plus", "minus"))
 """Turns about the body's x, y and z axes, each way, in the order in which they are commanded."""
-HARDWARE_TIME = 2.6
-"""[s] Time in which the authors' robot turned by 90 degrees."""
-PICTURES = 6
-"""Number of pictures in a filmstrip."""
+HARDWARE_TIME = 2.6  # [s] Time in which the authors' robot turned by 90 degrees
+PICTURES = 6  # Number of pictures in a filmstrip
 
 
 def axis_turns(count: int, angle: float) -> np.ndarray:
@@ -57,18 +55,15 @@ class AttitudeLog(EvaluationLog):
 
     turns: np.ndarray
     """(num_envs, 4) Commanded turns, quaternions xyzw, body axes, relative to the orientation at the start."""
-    tolerance: float = 5.0
-    """[deg] Largest error of a robot at its goal."""
-    seconds: float = 5.0
-    """[s] Simulated time of every turn."""
+    tolerance: float = 5.0  # [deg] Largest error of a robot at its goal
+    seconds: float = 5.0  # [s] Simulated time of every turn
     errors: list[np.ndarray] = field(default_factory=list, init=False)
     """[rad] (num_envs,) Angle to the goal after every policy step; NaN once the world has diverged."""
     angular_speeds: list[np.ndarray] = field(default_factory=list, init=False)
     """[rad/s] (num_envs,) Angular speed of the base after every policy step."""
     collided: np.ndarray = field(init=False)
     """Whether a link other than a paw touched the ground, or links touched each other."""
-    diverged: np.ndarray = field(init=False)
-    """Whether the simulation diverged."""
+    diverged: np.ndarray = field(init=False)  # Whether the simulation diverged
 
     row_name = "turn"
     spacing = 1.5

@@ -27,22 +27,17 @@ from jumper_warp.utils.errors import InputError
 SKILL_OF = {"walk": WALK, "stand": WALK, "jump_up": JUMP_UP, "jump_to": JUMP_TO, "jump_onto": JUMP_TO}
 BLOCK = BlockCfg(center=(1.0e3, 1.0e3), half=(0.55, 0.55), height=0.05, mass=10.0, friction=0.4)
 """Block to jump onto: far away at first, moved under the goal when the jump skill takes over."""
-SQUAT_TIME = 0.5
-"""[s] Time from the jump skill's takeover, when it squats, to its command."""
-MAX_ACCELERATION = 1.25
-"""[m/s^2], [rad/s^2] Rate at which commanded velocities change."""
+SQUAT_TIME = 0.5  # [s] Time from the jump skill's takeover, when it squats, to its command
+MAX_ACCELERATION = 1.25  # [m/s^2], [rad/s^2] Rate at which commanded velocities change
 NUDGE_AFTER, NUDGE_TIME = 2.0, 0.5
 """[s] Time after which a robot that waits for its jump walks a few steps, and how long it does."""
-NUDGE = (0.25, 0.0, 0.0)
-"""[m/s], [rad/s] Commanded velocity of these steps."""
-JUMP_TIMEOUT = 15.0
-"""[s] Time after its request at which an unfinished jump has failed."""
+NUDGE = (0.25, 0.0, 0.0)  # [m/s], [rad/s] Commanded velocity of these steps
+JUMP_TIMEOUT = 15.0  # [s] Time after its request at which an unfinished jump has failed
 STUCK, DONE = len(FALLS), len(FALLS) + 1
 OUTCOMES = (*(term.name for term in FALLS), "stuck", "done")
 GOAL_TOLERANCE, LANDED_PHASE = 0.1, 2
 """[m] Largest error of a jump that is on its goal; the jump's phase after touchdown."""
-FORCE_WINDOW = 0.2
-"""[s] Time before a handover to a jump over which paw forces are evaluated."""
+FORCE_WINDOW = 0.2  # [s] Time before a handover to a jump over which paw forces are evaluated
 COLOURS = {WALK: "white", JUMP_UP: "tab:orange", JUMP_TO: "tab:purple"}
 NAMES = {WALK: "walk", JUMP_UP: "jump up", JUMP_TO: "jump to"}
 
@@ -51,10 +46,8 @@ NAMES = {WALK: "walk", JUMP_UP: "jump up", JUMP_TO: "jump to"}
 class CourseLog(EvaluationLog):
     """Log of one course per robot; samples after a robot's end are ignored."""
 
-    scripts: Sequence[Sequence[ScriptStep]]
-    """One script per robot, all with the same number of commands."""
-    headings: np.ndarray | float = 0.0
-    """[rad] (robots,) Headings at the start, or one for all."""
+    scripts: Sequence[Sequence[ScriptStep]]  # One script per robot, all with the same number of commands
+    headings: np.ndarray | float = 0.0  # [rad] (robots,) Headings at the start, or one for all
     row_name = "robot"
     spacing = 2.0
 

@@ -24,19 +24,13 @@ MAX_COMMAND_SIZE = 4
 class EpisodeLog(EvaluationLog):
     """Log of one episode per world; arrays have shape (num_envs, ...) and do not change after the episode's end."""
 
-    commands: np.ndarray
-    """(num_envs, n) Command of each world, as the task takes it."""
+    commands: np.ndarray  # (num_envs, n) Command of each world, as the task takes it
     task: TaskCfg
-    seconds: float = 10.0
-    """[s] Maximum simulated time."""
-    end: np.ndarray = field(init=False)
-    """(num_envs,) Index of the termination that ended the episode, -1 while it runs."""
-    length: np.ndarray = field(init=False)
-    """[s] (num_envs,) Length of the episode."""
-    start_position: np.ndarray = field(init=False)
-    """[m] (num_envs, 3) Base position at the start, world frame."""
-    end_position: np.ndarray = field(init=False)
-    """[m] (num_envs, 3) Base position at the end, world frame."""
+    seconds: float = 10.0  # [s] Maximum simulated time
+    end: np.ndarray = field(init=False)  # (num_envs,) Index of the termination that ended the episode, -1 while it runs
+    length: np.ndarray = field(init=False)  # [s] (num_envs,) Length of the episode
+    start_position: np.ndarray = field(init=False)  # [m] (num_envs, 3) Base position at the start, world frame
+    end_position: np.ndarray = field(init=False)  # [m] (num_envs, 3) Base position at the end, world frame
 
     row_name = "episode"
     spacing = 2.0

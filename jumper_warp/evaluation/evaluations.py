@@ -46,10 +46,8 @@ class PlayFlags(Protocol):
 class Evaluation:
     """How `jumper evaluate`, `play` and `finetune` handle the policies of a task."""
 
-    flags: EvaluationFlags
-    """Default flags of `jumper evaluate`."""
-    play: PlayFlags
-    """Default flags of `jumper play`."""
+    flags: EvaluationFlags  # Default flags of `jumper evaluate`
+    play: PlayFlags  # Default flags of `jumper play`
     prepare_task: Callable[[TaskCfg], TaskCfg] = lambda task: task
     """Returns the task with the terminations that the evaluation uses."""
     finetune_target: Literal["apex", "landing"] | None = None

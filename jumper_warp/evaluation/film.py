@@ -35,19 +35,13 @@ PICTURE_SIZE = (400, 320)
 class Filmstrip:
     """Frames, captions and camera of a filmstrip of one world."""
 
-    index: int
-    """Index among the recorded worlds."""
-    frames: Sequence[int]
-    """Indices of the recorded frames."""
+    index: int  # Index among the recorded worlds
+    frames: Sequence[int]  # Indices of the recorded frames
     captions: Sequence[str]
-    eye: Sequence[float] | np.ndarray
-    """[m] Position of the camera, world frame, (3,)."""
-    target: Sequence[float] | np.ndarray
-    """[m] Point in the middle of the picture, world frame, (3,)."""
-    size: tuple[int, int]
-    """[px] Width and height of one picture."""
-    name: str = ""
-    """Name of the file without suffix (default: name of the recording)."""
+    eye: Sequence[float] | np.ndarray  # [m] Position of the camera, world frame, (3,)
+    target: Sequence[float] | np.ndarray  # [m] Point in the middle of the picture, world frame, (3,)
+    size: tuple[int, int]  # [px] Width and height of one picture
+    name: str = ""  # Name of the file without suffix (default: name of the recording)
 
 
 class LinkReader:

@@ -18,23 +18,17 @@ from jumper_warp.envs.env import Env
 from jumper_warp.evaluation.jumps import LANDED, REST_TIME
 from jumper_warp.trajectory.gauss_newton import Network, Tape, world_rows
 
-LANDING_HEIGHT = 0.30
-"""[m] Base height at which the ballistic flight lands."""
-LATEST = 2.5
-"""[s] Time after the last command at which all jumps are past their apex."""
-HUBER = 0.02
-"""[m] Threshold of the Huber weight: larger errors, of jumps that a weak robot cannot make, count less."""
+LANDING_HEIGHT = 0.30  # [m] Base height at which the ballistic flight lands
+LATEST = 2.5  # [s] Time after the last command at which all jumps are past their apex
+HUBER = 0.02  # [m] Threshold of the Huber weight: larger errors, of jumps that a weak robot cannot make, count less
 
 
 class JumpErrors(NamedTuple):
     """Errors of one group of n jumps; m = n for apex heights, m = 2n for landing positions (all x, then all y)."""
 
-    value: torch.Tensor
-    """(m,) [m] Errors, 0 where not valid."""
-    jacobian: torch.Tensor
-    """(m, weights) [m] Derivatives by the network's weights; empty if not requested."""
-    valid: torch.Tensor
-    """(m,) Whether the jump took off and its error is finite."""
+    value: torch.Tensor  # (m,) [m] Errors, 0 where not valid
+    jacobian: torch.Tensor  # (m, weights) [m] Derivatives by the network's weights; empty if not requested
+    valid: torch.Tensor  # (m,) Whether the jump took off and its error is finite
 
 
 @dataclass
@@ -43,12 +37,9 @@ class JumpGroup:
 
     name: str
     env: Env
-    std: float
-    """[m] Standard deviation that weights the errors."""
-    commands: np.ndarray
-    """(n, 4) Commands of `jump_commands`."""
-    to_height: bool
-    """Whether the error is that of the apex height, else of the landing position."""
+    std: float  # [m] Standard deviation that weights the errors
+    commands: np.ndarray  # (n, 4) Commands of `jump_commands`
+    to_height: bool  # Whether the error is that of the apex height, else of the landing position
     loop: ClosedLoop = field(init=False)
 
     def __post_init__(self) -> None:

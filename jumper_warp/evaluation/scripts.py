@@ -16,12 +16,10 @@ from typing import Any
 
 from jumper_warp.utils.errors import InputError
 
-KINDS = {"walk": 3, "stand": 1, "jump_up": 1, "jump_to": 2, "jump_onto": 2}
-"""Number of values of each kind of command."""
+KINDS = {"walk": 3, "stand": 1, "jump_up": 1, "jump_to": 2, "jump_onto": 2}  # Number of values of each kind of command
 LIMITS = {"walk": 10.0, "stand": 600.0, "jump_up": 2.0, "jump_to": 5.0, "jump_onto": 5.0}
 """Largest absolute value of each kind of command."""
-MAX_SECONDS = 600.0
-"""[s] Maximum total time of walking and standing in one script."""
+MAX_SECONDS = 600.0  # [s] Maximum total time of walking and standing in one script
 MAX_COMMANDS = 1000
 MAX_BYTES = 2**20
 
@@ -30,13 +28,11 @@ MAX_BYTES = 2**20
 class ScriptStep:
     """One command of a script."""
 
-    kind: str
-    """One of `KINDS`."""
+    kind: str  # One of `KINDS`
     values: tuple[float, ...] = (0.0, 0.0, 0.0)
     """walk: velocity ahead, to the left [m/s], about z [rad/s]; jump_up: height [m]; jump_to, jump_onto: place
     ahead, left [m]."""
-    seconds: float = 0.0
-    """[s] Time of walking or standing; 0 for jumps."""
+    seconds: float = 0.0  # [s] Time of walking or standing; 0 for jumps
 
     @property
     def jumps(self) -> bool:

@@ -34,16 +34,12 @@ class VelocityLog(EvaluationLog):
     commands: np.ndarray
     """(robots, commands, 3) Successive commands: velocity ahead, to the left [m/s], about z [rad/s], body axes."""
     task: TaskCfg
-    seconds: float = 10.0
-    """[s] Simulated time."""
+    seconds: float = 10.0  # [s] Simulated time
     times: np.ndarray = field(default_factory=lambda: np.zeros(1))
     """[s] (commands,) Time of each command; the first is 0."""
-    headings: np.ndarray | float = 0.0
-    """[rad] (robots,) Headings at the start, or one for all."""
-    kick_time: np.ndarray | None = None
-    """[s] (robots,) Time of a step change of each base's velocity, or None."""
-    kick: np.ndarray | None = None
-    """[m/s] (robots, 2) Step change of the velocity at `kick_time`, world axes, or None."""
+    headings: np.ndarray | float = 0.0  # [rad] (robots,) Headings at the start, or one for all
+    kick_time: np.ndarray | None = None  # [s] (robots,) Time of a step change of each base's velocity, or None
+    kick: np.ndarray | None = None  # [m/s] (robots, 2) Step change of the velocity at `kick_time`, world axes, or None
     velocity: list[np.ndarray] = field(default_factory=list, init=False)
     """(robots, 3) Velocity after every policy step, in the components of `commands`."""
     end: np.ndarray = field(init=False)
