@@ -1,4 +1,4 @@
-"""Arrays of robots and worlds made by hand, for tests of the stage kernels that every task shares."""
+"""Arrays of robots and worlds for tests of the stage kernels that every task shares."""
 
 from types import SimpleNamespace
 
@@ -7,7 +7,7 @@ import warp as wp
 
 from jumper_warp.envs.arrays import delay_arrays, episode_arrays
 from jumper_warp.kernels.layout import BODIES, COORDS, DOFS
-from jumper_warp.kernels.mdp.observe import LANES, postprocess_obs_kernel
+from jumper_warp.kernels.mdp.observe import LANES, condition_kernel
 from jumper_warp.kernels.mdp.view import RobotArrays
 
 STEP_DT = 1.0 / 60.0  # [s]
@@ -16,8 +16,8 @@ DEFAULT_ANGLE = np.tile([0.0, np.pi / 4.0, np.pi / 4.0], 4)  # [rad]
 MOTOR_SLOTS = np.array([5 * leg + joint for leg in range(4) for joint in (0, 1, 3)])
 PAWS = ("impulse", "paw_force", "peak_force", "paw_pos", "paw_vel", "contact_time", "air_time", "touchdown_speed",
         "collisions", "paw_height")  # fmt: skip
-MOTORS = ("torque", "prev_torque", "action", "prev_action", "prev_prev_action", "target", "filtered_target",
-          "prev_rate", "joint_offset")  # fmt: skip
+MOTORS = ("torque", "prev_torque", "action", "prev_action", "prev_prev_action", "target", "filtered_target", "prev_rate",
+          "joint_offset")  # fmt: skip
 
 
 def array(values, dtype=float) -> wp.array:
@@ -26,7 +26,7 @@ def array(values, dtype=float) -> wp.array:
 
 
 def standing_robots(n: int):
-    """Return `RobotArrays` of robots at rest in the default pose, 0.35 m high, that have done nothing yet."""
+    """Return `RobotArrays` of n robots at rest in the default pose, 0.35 m high, with empty histories."""
     robot, q = RobotArrays(), np.zeros((n, int(COORDS)))
     q[:, 2], q[:, 6], q[:, 7 + MOTOR_SLOTS] = 0.35, 1.0, DEFAULT_ANGLE
     robot.joint_q, robot.joint_qd = array(q.ravel()), array(np.zeros(n * int(DOFS)))
@@ -43,32 +43,32 @@ def standing_robots(n: int):
 
 
 def new_worlds(n: int, seed: int = 0, skill=0):
-    """Return `EpisodeArrays` of worlds that have made no step."""
+    """Return the `EpisodeArrays` of n new worlds."""
     return episode_arrays(n, seed, array(np.broadcast_to(skill, n), int), "cpu")
 
 
 def no_delays(n: int, steps=0):
-    """Return `Delays` of worlds that command nothing yet; steps: latency [physics steps]."""
+    """Return the `Delays` of n new worlds; steps: latency [physics steps]."""
     return delay_arrays(n, array(np.broadcast_to(steps, n), int), SUBSTEPS, "cpu")
 
 
 def write(target: wp.array, where, values) -> None:
-    """Overwrite a part of an array."""
+    """Overwrite the elements of an array at an index `where`."""
     copy = target.numpy().copy()
     copy[where] = values
     target.assign(copy)
 
 
 def values_of(struct, kind) -> SimpleNamespace:
-    """Return copies of all arrays of a struct as NumPy."""
-    found = {name: getattr(struct, name) for name in kind.vars}
-    return SimpleNamespace(**{name: v.numpy().copy() for name, v in found.items() if isinstance(v, wp.array)})
+    """Return copies of all array fields of a struct as NumPy arrays; kind: its class."""
+    fields = {name: getattr(struct, name) for name in kind.vars}
+    return SimpleNamespace(**{name: v.numpy().copy() for name, v in fields.items() if isinstance(v, wp.array)})
 
 
-def observe(skill, robot, parameters, ground, worlds, states, numbers, after_reset: int = 0) -> None:
-    """Launch the stage that observes on a skill's arrays; beginning 1: only where something has just begun."""
+def observe(skill, robot, parameters, ground, worlds, states, numbers, beginning: int = 0) -> None:
+    """Launch the observation stage of a skill; beginning 1: only in worlds whose episode has just begun."""
     arrays = skill.observations
-    inputs = [skill.index, robot, parameters, ground, worlds, states, numbers, after_reset, arrays.raw]
+    inputs = [skill.index, robot, parameters, ground, worlds, states, numbers, beginning, arrays.raw]
     wp.launch(skill.kernels["observe"], (skill.num_chunks, skill.num_envs), inputs, device="cpu")
-    inputs = [skill.index, worlds, skill.columns, numbers, after_reset, arrays]
-    wp.launch(postprocess_obs_kernel, (skill.num_envs, int(LANES)), inputs, device="cpu")
+    inputs = [skill.index, worlds, skill.columns, numbers, beginning, arrays]
+    wp.launch(condition_kernel, (skill.num_envs, int(LANES)), inputs, device="cpu")
