@@ -16,7 +16,7 @@ from jumper_warp.identification.identify import identify, total_mass, weighed
 from jumper_warp.identification.least_squares import Knowledge
 from jumper_warp.identification.motions import Motion
 from jumper_warp.identification.parameters import ParameterSet
-from jumper_warp.identification.recording import KINDS, Plan, plot_plan, measured, replay_plan
+from jumper_warp.identification.recording import KINDS, Plan, measured, plot_plan, replay_plan
 from jumper_warp.identification.replay import Record, Replay
 from jumper_warp.policies.conditions import Conditions, env_of_policy
 from jumper_warp.policies.runs import open_policy

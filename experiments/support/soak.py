@@ -147,13 +147,14 @@ def soak_env(env: Env, args: SoakArgs) -> dict:
     """
     env.reset()
     diverged = [term.name for term in env.task.terminations].index("came_apart")
-    ending, counters, action = wp.to_torch(env.episodes.termination), SoakCounters(env.sim), torch.zeros_like(env.action)
+    counters, action = SoakCounters(env.sim), torch.zeros_like(env.action)
+    termination = wp.to_torch(env.episodes.termination)
 
     def step_held() -> None:
         action.uniform_(-1.0, 1.0)
         for _ in range(args.hold):
             env.step(action)
-            counters.update(ending == diverged, env.obs, env.critic_obs, env.reward)
+            counters.update(termination == diverged, env.obs, env.critic_obs, env.reward)
 
     run, rounds = Captured(step_held, env.device.type == "cuda"), -(-args.steps // args.hold)
     check_interval = max(args.episode // args.hold, 1)

@@ -7,7 +7,7 @@ import warp as wp
 
 from jumper_warp.envs.arrays import delay_arrays, episode_arrays
 from jumper_warp.kernels.layout import BODIES, COORDS, DOFS
-from jumper_warp.kernels.mdp.observe import LANES, condition_kernel
+from jumper_warp.kernels.mdp.observe import LANES, postprocess_obs_kernel
 from jumper_warp.kernels.mdp.view import RobotArrays
 
 STEP_DT = 1.0 / 60.0  # [s]
@@ -16,8 +16,8 @@ DEFAULT_ANGLE = np.tile([0.0, np.pi / 4.0, np.pi / 4.0], 4)  # [rad]
 MOTOR_SLOTS = np.array([5 * leg + joint for leg in range(4) for joint in (0, 1, 3)])
 PAWS = ("impulse", "paw_force", "peak_force", "paw_pos", "paw_vel", "contact_time", "air_time", "touchdown_speed",
         "collisions", "paw_height")  # fmt: skip
-MOTORS = ("torque", "prev_torque", "action", "prev_action", "prev_prev_action", "target", "filtered_target", "prev_rate",
-          "joint_offset")  # fmt: skip
+MOTORS = ("torque", "prev_torque", "action", "prev_action", "prev_prev_action", "target", "filtered_target",
+          "prev_rate", "joint_offset")  # fmt: skip
 
 
 def array(values, dtype=float) -> wp.array:
@@ -71,4 +71,4 @@ def observe(skill, robot, parameters, ground, worlds, states, numbers, beginning
     inputs = [skill.index, robot, parameters, ground, worlds, states, numbers, beginning, arrays.raw]
     wp.launch(skill.kernels["observe"], (skill.num_chunks, skill.num_envs), inputs, device="cpu")
     inputs = [skill.index, worlds, skill.columns, numbers, beginning, arrays]
-    wp.launch(condition_kernel, (skill.num_envs, int(LANES)), inputs, device="cpu")
+    wp.launch(postprocess_obs_kernel, (skill.num_envs, int(LANES)), inputs, device="cpu")
