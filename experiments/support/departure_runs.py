@@ -17,7 +17,7 @@ from jumper_warp.cli.train import env_maker, parse_train
 from jumper_warp.evaluation.plots import figure
 from jumper_warp.evaluation.run import HEIGHTS, EvaluationRun
 from jumper_warp.policies.conditions import Conditions
-from jumper_warp.policies.warm_start import start_from
+from jumper_warp.policies.warm_start import actor_init_from_policy
 from jumper_warp.registry import make_task
 from jumper_warp.rl.resume import CHECKPOINTS
 from jumper_warp.rl.runner import CONFIG, train
@@ -86,9 +86,9 @@ def train_or_load(ablation: Ablation, arguments: list[str]) -> Path:
         if other or config["env"]["task"] != task_to_json(task):
             raise InputError(f"{checkpoints[-1].parents[1]} was trained with other settings: choose another --out")
         return checkpoints[-1]
-    start = start_from(parsed.cfg.start_from, task, parsed.cfg.ppo) if parsed.cfg.start_from else None
+    start = actor_init_from_policy(parsed.cfg.start_from, task, parsed.cfg.ppo) if parsed.cfg.start_from else None
     typed = shlex.join(["jumper", "train", *arguments])
-    result = train(parsed.cfg, env_maker(task, parsed), typed, start=start)
+    result = train(parsed.cfg, env_maker(task, parsed), typed, actor_init=start)
     return result.folder / name.format(result.iteration)
 
 

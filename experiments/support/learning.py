@@ -55,7 +55,7 @@ def warm_up(env: VecEnv, trainer: Ppo | Shac) -> None:
     """Compile the environment's kernels and the trainer's functions, then reset all episodes."""
     env.reset()
     env.step(torch.zeros(env.num_envs, env.num_actions, device=env.device))
-    trainer.prepare()
+    trainer.compile()
     env.reset()
     env.metrics()
 

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jumper_warp.evaluation.log import Metrics
-from jumper_warp.utils.rotations import INVERSE, rotate
+from jumper_warp.utils.rotations import CONJUGATE, rotate
 
 
 def momentum(sim: Any) -> tuple[np.ndarray, np.ndarray]:
@@ -18,7 +18,7 @@ def momentum(sim: Any) -> tuple[np.ndarray, np.ndarray]:
     """
     mass, inertia, quat, arm, twist = _links(sim)
     linear = mass * twist[..., :3]
-    spin = np.einsum("nbij,nbj->nbi", inertia, rotate(quat * INVERSE, twist[..., 3:]))
+    spin = np.einsum("nbij,nbj->nbi", inertia, rotate(quat * CONJUGATE, twist[..., 3:]))
     return linear.sum(axis=1), (np.cross(arm, linear) + rotate(quat, spin)).sum(axis=1)
 
 
@@ -27,7 +27,7 @@ def rotational_inertia(sim: Any) -> np.ndarray:
     mass, inertia, quat, arm, _ = _links(sim)
     columns = []
     for axis in np.eye(3):
-        spin = np.einsum("nbij,nbj->nbi", inertia, rotate(quat * INVERSE, np.broadcast_to(axis, arm.shape)))
+        spin = np.einsum("nbij,nbj->nbi", inertia, rotate(quat * CONJUGATE, np.broadcast_to(axis, arm.shape)))
         angular = np.cross(arm, mass * np.cross(axis, arm)) + rotate(quat, spin)
         columns.append(angular.sum(axis=1))
     return np.stack(columns, axis=-1)

@@ -12,7 +12,7 @@ import torch
 import warp as wp
 
 from jumper_warp.envs.env import Env
-from jumper_warp.rl.graphs import Captured
+from jumper_warp.rl.graphs import CapturedProcedure
 from jumper_warp.sim.simulation import Simulation
 from jumper_warp.sim.solver import SolverJumper
 from jumper_warp.tasks.cfg import TaskCfg
@@ -156,7 +156,7 @@ def soak_env(env: Env, args: SoakArgs) -> dict:
             env.step(action)
             counters.update(termination == diverged, env.obs, env.critic_obs, env.reward)
 
-    run, rounds = Captured(step_held, env.device.type == "cuda"), -(-args.steps // args.hold)
+    run, rounds = CapturedProcedure(step_held, env.device.type == "cuda"), -(-args.steps // args.hold)
     check_interval = max(args.episode // args.hold, 1)
     start = time.perf_counter()
     for i in range(rounds):

@@ -14,7 +14,7 @@ from jumper_warp.evaluation.film import PICTURE_SIZE, Film, Filmstrip, side_view
 from jumper_warp.evaluation.log import EvaluationLog, Metrics, finite
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.utils.errors import InputError
-from jumper_warp.utils.rotations import INVERSE, rotate
+from jumper_warp.utils.rotations import CONJUGATE, rotate
 
 Velocity = tuple[float, float, float]
 AXES = ("vx", "vy", "yaw_rate")
@@ -155,7 +155,7 @@ def body_velocity(arrays: dict[str, np.ndarray]) -> np.ndarray:
 
     arrays: base_quat (xyzw), base_vel [m/s] and base_ang_vel [rad/s], world axes.
     """
-    back = arrays["base_quat"].astype(float) * INVERSE
+    back = arrays["base_quat"].astype(float) * CONJUGATE
     vel = rotate(back, arrays["base_vel"].astype(float))
     ang = rotate(back, arrays["base_ang_vel"].astype(float))
     return np.stack([vel[:, 0], vel[:, 1], ang[:, 2]], axis=1)
