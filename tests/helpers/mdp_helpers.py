@@ -65,10 +65,10 @@ def values_of(struct, kind) -> SimpleNamespace:
     return SimpleNamespace(**{name: v.numpy().copy() for name, v in fields.items() if isinstance(v, wp.array)})
 
 
-def observe(skill, robot, parameters, ground, worlds, states, numbers, beginning: int = 0) -> None:
-    """Launch the observation stage of a skill; beginning 1: only in worlds whose episode has just begun."""
+def observe(skill, robot, parameters, ground, worlds, states, numbers, after_reset: int = 0) -> None:
+    """Launch the observation stage of a skill; after_reset 1: only in worlds whose episode has just begun."""
     arrays = skill.observations
-    inputs = [skill.index, robot, parameters, ground, worlds, states, numbers, beginning, arrays.raw]
+    inputs = [skill.index, robot, parameters, ground, worlds, states, numbers, after_reset, arrays.raw]
     wp.launch(skill.kernels["observe"], (skill.num_chunks, skill.num_envs), inputs, device="cpu")
-    inputs = [skill.index, worlds, skill.columns, numbers, beginning, arrays]
+    inputs = [skill.index, worlds, skill.columns, numbers, after_reset, arrays]
     wp.launch(postprocess_obs_kernel, (skill.num_envs, int(LANES)), inputs, device="cpu")
