@@ -178,7 +178,7 @@ class JumperDynamics:
         """Stiffness [N/m], 0: none, and rest length [m] of the springs between the knees, shape (num_worlds,); call
         `pack_springs` after a change."""
 
-        self.robot = self.modules.step.Robot()
+        self.robot = self.modules.step.RobotModel()
         self.robot.geometry = leg_geometry_array(self.description, self.modules.geometry, self.device)
         self.robot.table = wp.zeros(
             (self.modules.layout.PARAMETER_ROWS, self.num_worlds),

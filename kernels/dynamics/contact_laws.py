@@ -8,7 +8,7 @@ from ..terrain.ground import floor_normal
 from .base_dynamics import BaseInverse, LegSolve
 from .contact import SEPARATE, SLIDE, PawContact, contact_jacobian, contact_mode, couple_contact
 from .leg_dynamics import PawKinematics
-from .step import Robot, friction_row
+from .step import RobotModel, friction_row
 
 wp.set_module_options({"enable_backward": False})
 
@@ -26,28 +26,28 @@ class PawLaw:
 
 @wp.func
 def contact_at(
-    robot: Robot, k: int, base: BaseState, paw: PawKinematics, leg: LegSolve, inverse: BaseInverse, impulse: vec3
+    model: RobotModel, k: int, base: BaseState, paw: PawKinematics, leg: LegSolve, inverse: BaseInverse, impulse: vec3
 ) -> PawContact:
     """Return paw k's response to impulses; impulse [N s]: in body axes."""
     contact = PawContact()
     contact.active = 1
     contact.impulse = impulse
     centre = base.pos + wp.quat_rotate(base.quat, paw.position)
-    contact.normal = wp.quat_rotate_inv(base.quat, floor_normal(robot.ground, centre))
-    arm = -robot.geometry[k].paw_radius * contact.normal
+    contact.normal = wp.quat_rotate_inv(base.quat, floor_normal(model.ground, centre))
+    arm = -model.geometry[k].paw_radius * contact.normal
     contact.jacobian = contact_jacobian(paw, arm)
     return couple_contact(contact, paw.position + arm, leg, inverse)
 
 
 @wp.func
-def contact_point(robot: Robot, k: int, paw: PawKinematics, contact: PawContact) -> vec3:
+def contact_point(model: RobotModel, k: int, paw: PawKinematics, contact: PawContact) -> vec3:
     """Return where paw k touches [m], body axes, from the base's origin."""
-    return paw.position - robot.geometry[k].paw_radius * contact.normal
+    return paw.position - model.geometry[k].paw_radius * contact.normal
 
 
 @wp.func
 def paw_law(
-    robot: Robot, world: int, k: int, contact: PawContact, before: vec3, velocity: vec3, old_impulse: vec3
+    model: RobotModel, world: int, k: int, contact: PawContact, before: vec3, velocity: vec3, old_impulse: vec3
 ) -> PawLaw:
     """Return the contact law of paw k.
 
@@ -57,7 +57,7 @@ def paw_law(
     law = PawLaw()
     p, n = contact.impulse, contact.normal
     law.mu_row = friction_row(k, before, old_impulse, n)
-    law.mu = robot.table[law.mu_row, world]
+    law.mu = model.table[law.mu_row, world]
     law.mode = contact_mode(p, n, law.mu)
     if law.mode == SEPARATE:
         return law

@@ -7,7 +7,7 @@ from ..layout import BODIES, COORDS, DOFS
 from ..scalar import real, vec3, vec6
 from ..state import leg_dof, load_motors
 from ..terrain.ground import rest_block
-from .step import Robot
+from .step import RobotModel
 
 wp.set_module_options({"enable_backward": False})
 
@@ -56,10 +56,10 @@ class Workspace:
 
 @wp.func
 def freeze_diverged_world(
-    robot: Robot, work: Workspace, world: int, joint_q: wp.array(dtype=real), joint_qd: wp.array(dtype=real)
+    model: RobotModel, work: Workspace, world: int, joint_q: wp.array(dtype=real), joint_qd: wp.array(dtype=real)
 ):
     """Put a world at rest in its reference pose, its block at rest at its start."""
-    rest_block(robot.ground, world)
+    rest_block(model.ground, world)
     for i in range(int(COORDS)):
         joint_q[world * COORDS + i] = work.reference_q[world * COORDS + i]
     for i in range(int(DOFS)):

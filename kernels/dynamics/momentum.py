@@ -13,7 +13,7 @@ from ..state import BaseState, base_com, leg_coord, leg_dof, load_base, load_mot
 from .inertia import MassMoments, inertia_matrix, inertia_mul, inverse_symmetric
 from .leg_dynamics import leg_dynamics, leg_pose
 from .parameters import load_moments, load_vec3
-from .step import Robot, load_leg
+from .step import RobotModel, load_leg
 
 wp.set_module_options({"enable_backward": False})
 
@@ -37,13 +37,13 @@ class Momenta:
 
 @wp.func
 def motion_of(
-    robot: Robot, world: int, base: BaseState, joint_q: wp.array(dtype=real), joint_qd: wp.array(dtype=real)
+    model: RobotModel, world: int, base: BaseState, joint_q: wp.array(dtype=real), joint_qd: wp.array(dtype=real)
 ) -> Motion:  # fmt: skip
     """Return a robot's mass moments and momentum."""
     motion = Motion()
-    body = load_moments(robot.table, BASE, world)
-    for k in range(robot.geometry.shape[0]):
-        own = load_leg(robot, world, k)
+    body = load_moments(model.table, BASE, world)
+    for k in range(model.geometry.shape[0]):
+        own = load_leg(model, world, k)
         rates = load_motors(joint_qd, leg_dof(world, k))
         pose = leg_pose(own.geometry, load_motors(joint_q, leg_coord(world, k)))
         leg = leg_dynamics(own.geometry, own.masses, pose, rates, base.ang, vec3(real(0.0)))
@@ -81,7 +81,7 @@ def corrected(base: BaseState, motion: Motion, lin: vec3, ang: vec3) -> BaseStat
 def momentum_kernel(
     # in
     first: int,
-    robot: Robot,
+    model: RobotModel,
     joint_q: wp.array(dtype=real),
     joint_qd: wp.array(dtype=real),
     # out
@@ -89,8 +89,8 @@ def momentum_kernel(
 ):
     """Write the momentum of every robot; one thread per world."""
     world = first + wp.tid()
-    base = load_base(joint_q, joint_qd, base_com(robot.table, world), world)
-    motion = motion_of(robot, world, base, joint_q, joint_qd)
+    base = load_base(joint_q, joint_qd, base_com(model.table, world), world)
+    motion = motion_of(model, world, base, joint_q, joint_qd)
     momenta.lin[world] = wp.quat_rotate(base.quat, motion.lin)
     momenta.ang[world] = wp.quat_rotate(base.quat, motion.ang)
 
@@ -99,7 +99,7 @@ def momentum_kernel(
 def project_momentum_kernel(
     # in
     first: int,
-    robot: Robot,
+    model: RobotModel,
     momenta: Momenta,
     body_f: wp.array(dtype=wp.spatial_vector),
     peak_force: wp.array(dtype=real),
@@ -116,11 +116,11 @@ def project_momentum_kernel(
     world = first + wp.tid()
     if invalid[world] != 0 or peak_force[world] > real(0.0) or wp.length_sq(body_f[world * BODIES]) > 0.0:
         return
-    if robot.held.shape[0] > 0:
-        if robot.held[world] != 0:
+    if model.held.shape[0] > 0:
+        if model.held[world] != 0:
             return
-    com = base_com(robot.table, world)
+    com = base_com(model.table, world)
     base = load_base(joint_q, joint_qd, com, world)
-    motion = motion_of(robot, world, base, joint_q, joint_qd)
-    lin = momenta.lin[world] + time * motion.body.mass * load_vec3(robot.table, GRAVITY, world)
+    motion = motion_of(model, world, base, joint_q, joint_qd)
+    lin = momenta.lin[world] + time * motion.body.mass * load_vec3(model.table, GRAVITY, world)
     store_base(joint_q, joint_qd, com, world, corrected(base, motion, lin, momenta.ang[world]))

@@ -38,7 +38,7 @@ wp.set_module_options({"enable_backward": False})
 
 
 @wp.struct
-class Robot:
+class RobotModel:
     """What the step reads of the robot and the ground, besides its state."""
 
     geometry: wp.array(dtype=LegGeometry)  # (4,)
@@ -77,12 +77,12 @@ class LegTerms:
 
 
 @wp.func
-def load_leg(robot: Robot, world: int, k: int) -> LegParams:
+def load_leg(model: RobotModel, world: int, k: int) -> LegParams:
     """Return the parameters of leg k."""
     params = LegParams()
-    params.geometry = robot.geometry[k]
-    params.masses = load_masses(robot.table, k, world)
-    params.joints = load_joint_params(robot.table, k, world)
+    params.geometry = model.geometry[k]
+    params.masses = load_masses(model.table, k, world)
+    params.joints = load_joint_params(model.table, k, world)
     return params
 
 
@@ -117,36 +117,36 @@ class Touch:
 
 
 @wp.func
-def block_law(robot: Robot, world: int, base: BaseState, dt: real) -> BlockLaw:
+def block_law(model: RobotModel, world: int, base: BaseState, dt: real) -> BlockLaw:
     """Return the law of a world's block in body axes; a block without mass where there is none."""
     law = BlockLaw()
-    if robot.ground.blocks.shape[0] > 0:
-        block = robot.ground.blocks[world]
+    if model.ground.blocks.shape[0] > 0:
+        block = model.ground.blocks[world]
         law.velocity = wp.quat_rotate_inv(base.quat, vec3(block.velocity[0], block.velocity[1], real(0.0)))
         law.up = wp.quat_rotate_inv(base.quat, vec3(real(0.0), real(0.0), real(1.0)))
         law.mass = block.mass
         law.friction = block.friction
-        law.weight = -dt * block.mass * robot.table[GRAVITY + 2, world]
+        law.weight = -dt * block.mass * model.table[GRAVITY + 2, world]
     return law
 
 
 @wp.func
-def touch_floor(robot: Robot, k: int, base: BaseState, paw: PawKinematics) -> Touch:
+def touch_floor(model: RobotModel, k: int, base: BaseState, paw: PawKinematics) -> Touch:
     """Return where paw k is nearest to the floor."""
     centre = base.pos + wp.quat_rotate(base.quat, paw.position)
     touch = Touch()
-    touch.gap = floor_distance(robot.ground, centre) - robot.geometry[k].paw_radius
-    touch.normal = wp.quat_rotate_inv(base.quat, floor_normal(robot.ground, centre))
+    touch.gap = floor_distance(model.ground, centre) - model.geometry[k].paw_radius
+    touch.normal = wp.quat_rotate_inv(base.quat, floor_normal(model.ground, centre))
     return touch
 
 
 @wp.func
-def touch_block(robot: Robot, world: int, k: int, base: BaseState, paw: PawKinematics, law: BlockLaw) -> Touch:
+def touch_block(model: RobotModel, world: int, k: int, base: BaseState, paw: PawKinematics, law: BlockLaw) -> Touch:
     """Return where paw k is nearest to the block."""
     centre = base.pos + wp.quat_rotate(base.quat, paw.position)
-    block = robot.ground.blocks[world]
+    block = model.ground.blocks[world]
     touch = Touch()
-    touch.gap = block_distance(block, centre) - robot.geometry[k].paw_radius
+    touch.gap = block_distance(block, centre) - model.geometry[k].paw_radius
     touch.normal = wp.quat_rotate_inv(base.quat, block_normal(block, centre))
     touch.velocity = law.velocity
     return touch
@@ -163,7 +163,7 @@ def friction_row(k: int, velocity: vec3, impulse: vec3, normal: vec3) -> int:
 
 @wp.func
 def paw_contact(
-    robot: Robot, world: int, k: int, base: BaseState, lin: vec3, ang: vec3, rates: vec3, old_rates: vec3,
+    model: RobotModel, world: int, k: int, base: BaseState, lin: vec3, ang: vec3, rates: vec3, old_rates: vec3,
     impulse: vec3, pressed: int, paw: PawKinematics, leg: LegSolve, inverse: BaseInverse, block: BlockLaw, dt: real,
 ) -> PawContact:  # fmt: skip
     """Return paw k's contact problem with floor or block, whichever is nearer.
@@ -172,16 +172,16 @@ def paw_contact(
     `base`: at its start; impulse: first guess [N s], world frame; pressed: the leg's hard stops.
     """
     contact = PawContact()
-    touch = touch_floor(robot, k, base, paw)
+    touch = touch_floor(model, k, base, paw)
     on_block = bool(False)
-    if has_block(robot.ground, world):
-        above = touch_block(robot, world, k, base, paw, block)
+    if has_block(model.ground, world):
+        above = touch_block(model, world, k, base, paw, block)
         if above.gap < touch.gap:
             touch = above
             on_block = True
     gap = touch.gap
     normal = touch.normal
-    arm = -robot.geometry[k].paw_radius * normal
+    arm = -model.geometry[k].paw_radius * normal
     point = paw.position + arm
     contact.jacobian = contact_jacobian(paw, arm)
     contact.normal = normal
@@ -193,7 +193,7 @@ def paw_contact(
     contact.impulse = wp.quat_rotate_inv(base.quat, impulse)
     before = wp.quat_rotate_inv(base.quat, base.lin) + wp.cross(base.ang, point) + contact.jacobian * old_rates
     contact.mu_row = friction_row(k, before - touch.velocity, contact.impulse, normal)
-    contact.mu = robot.table[contact.mu_row, world]
+    contact.mu = model.table[contact.mu_row, world]
     contact = couple_contact(contact, point, leg, inverse)
     if on_block:
         contact = add_block(contact, block)
@@ -201,17 +201,17 @@ def paw_contact(
 
 
 @wp.func
-def base_system(robot: Robot, world: int, base: BaseState, g: vec3, force: vec3, moment: vec3) -> BaseSystem:
+def base_system(model: RobotModel, world: int, base: BaseState, g: vec3, force: vec3, moment: vec3) -> BaseSystem:
     """Return the base link's own equations; force [N] and moment [N m] from outside at its com, world axes."""
-    wrench = external_wrench(base, base_com(robot.table, world), force, moment)
-    return base_alone(load_moments(robot.table, BASE, world), base.ang, g, wrench.force, wrench.moment)
+    wrench = external_wrench(base, base_com(model.table, world), force, moment)
+    return base_alone(load_moments(model.table, BASE, world), base.ang, g, wrench.force, wrench.moment)
 
 
 @wp.func
-def hold_base(robot: Robot, world: int, inverse: BaseInverse) -> BaseInverse:
+def hold_base(model: RobotModel, world: int, inverse: BaseInverse) -> BaseInverse:
     """Return the inverse of a world's base system, zero where the base is held: nothing accelerates it."""
-    if robot.held.shape[0] > 0:
-        if robot.held[world] != 0:
+    if model.held.shape[0] > 0:
+        if model.held[world] != 0:
             return BaseInverse()
     return inverse
 

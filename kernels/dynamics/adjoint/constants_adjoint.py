@@ -4,7 +4,7 @@ import warp as wp
 
 from ...actuation.motors import MotorParams
 from ...scalar import real, vec3
-from ..step import Robot, StepSettings, load_leg
+from ..step import RobotModel, StepSettings, load_leg
 from ..trajectory import Actuation, Commands, Rows, Timing, load_world_motor, row_vec3
 from .command_adjoint import add_motor_constants, add_offsets, motor_gradient
 from .gradients import Gradients, thread_sums
@@ -48,7 +48,7 @@ def turn_at(timing: Timing, span: Span, number: int) -> Turn:
 def leg_constants_kernel(
     # in
     turns: int,
-    robot: Robot,
+    model: RobotModel,
     settings: StepSettings,
     timing: Timing,
     rows: Rows,
@@ -65,7 +65,7 @@ def leg_constants_kernel(
     place, turn, leg = wp.tid()
     world = settings.first + place
     dt = settings.dt
-    own = load_leg(robot, world, leg)
+    own = load_leg(model, world, leg)
     sums = thread_sums(gradients, world, turn == 0, True, False)
     for number in range(turns_of(timing, span, turns)):
         at = turn_at(timing, span, number * turns + turn)
@@ -75,7 +75,7 @@ def leg_constants_kernel(
         law = get_law(record, i, world, leg)
         held = held_base(record, world, i, dt, base, get_base_weights(record, i, world))
         weights = get_leg_weights(record, i, world, leg)
-        found = leg_gradient(robot, own, dt, world, leg, rows, seeds, at.step, i, record, base, law, held, weights)
+        found = leg_gradient(model, own, dt, world, leg, rows, seeds, at.step, i, record, base, law, held, weights)
         add_leg_constants(sums, leg, law, found)
 
 

@@ -22,7 +22,7 @@ from ..contact_laws import PawLaw, contact_at, contact_point, paw_law
 from ..inertia import MassMoments
 from ..leg_dynamics import LegMasses
 from ..parameters import load_moments, load_spring, load_stops, load_vec3
-from ..step import LegParams, Robot, base_system, hold_base, leg_terms
+from ..step import LegParams, RobotModel, base_system, hold_base, leg_terms
 from ..trajectory import Rows, row_vec3
 from .gradients import (
     ThreadSums,
@@ -94,21 +94,21 @@ def leg_law(c: PawContact, law: PawLaw, impulse: vec3, point: vec3) -> LegLaw:
 
 @wp.func
 def replay_leg(
-    robot: Robot, own: LegParams, dt: real, world: int, leg: int, force: vec3, moment: vec3,
+    model: RobotModel, own: LegParams, dt: real, world: int, leg: int, force: vec3, moment: vec3,
     first_impulse: wp.array2d(dtype=vec3), rows: Rows, step: int, i: int, record: LegRecord,
 ):  # fmt: skip
     """Make a step again from entry i of the record; see `replay_step`. All threads write the base, the same bits."""
     base = get_base(record, i, world)
     rates = get_vec(record, i, RATES, world, leg)
     angles = get_vec(record, i, ANGLES, world, leg)
-    g = wp.quat_rotate_inv(base.quat, load_vec3(robot.table, GRAVITY, world))
+    g = wp.quat_rotate_inv(base.quat, load_vec3(model.table, GRAVITY, world))
     torque = row_vec3(rows.torque, step, 3 * leg, world)
-    stops = stop_rows(load_stops(robot.table, leg, world), angles, dt)
-    spring = load_spring(robot.table, leg, world)
+    stops = stop_rows(load_stops(model.table, leg, world), angles, dt)
+    spring = load_spring(model.table, leg, world)
     terms = leg_terms(own, spring, angles, rates, torque, stops, int(rows.pressed[step, leg, world]), base.ang, g, dt)
     share = add_leg(BaseSystem(), terms.dynamics, terms.solve)
-    system = sum_systems(base_system(robot, world, base, g, force, moment), share)
-    inverse = hold_base(robot, world, invert(system))
+    system = sum_systems(base_system(model, world, base, g, force, moment), share)
+    inverse = hold_base(model, world, invert(system))
     solve = terms.solve
     put_inverse(record, i, world, inverse)
     paw = terms.paw
@@ -119,9 +119,9 @@ def replay_leg(
     impulse = wp.quat_rotate_inv(base.quat, rows.impulse[step, leg, world])
     touches = wp.dot(impulse, impulse) > real(0.0)
     if touches:
-        c = contact_at(robot, leg, base, paw, solve, inverse, impulse)
+        c = contact_at(model, leg, base, paw, solve, inverse, impulse)
         joint = wp.transpose(c.jacobian) * impulse
-        point = contact_point(robot, leg, paw, c)
+        point = contact_point(model, leg, paw, c)
         push = impulse - wp.transpose(solve.to_lin) * joint
         twist = wp.cross(point, impulse) - wp.transpose(solve.to_ang) * joint
         solve.free += solve.inverse * (joint / dt)
@@ -142,7 +142,7 @@ def replay_leg(
         old_impulse = first_impulse[leg, world]
         if step > 0:
             old_impulse = rows.impulse[step - 1, leg, world]
-        law = paw_law(robot, world, leg, c, before, velocity, wp.quat_rotate_inv(base.quat, old_impulse))
+        law = paw_law(model, world, leg, c, before, velocity, wp.quat_rotate_inv(base.quat, old_impulse))
     if any_world(any_leg(law.mode != SEPARATE)):
         put_law_row(record, i, world, leg, inverted_laws(c, law, leg))
     put_law(record, i, world, leg, leg_law(c, law, impulse, point))
@@ -269,19 +269,19 @@ class LegGradient:
 
 @wp.func
 def leg_gradient(
-    robot: Robot, own: LegParams, dt: real, world: int, leg: int, rows: Rows, seeds: Rows, step: int, i: int,
+    model: RobotModel, own: LegParams, dt: real, world: int, leg: int, rows: Rows, seeds: Rows, step: int, i: int,
     record: LegRecord, base: BaseState, law: LegLaw, held: BaseFactors, weights: LegWeights,
 ) -> LegGradient:  # fmt: skip
     """Return the gradient of `leg_action` in a step."""
     factors = held_leg(record, rows, seeds, world, step, i, leg, dt, law, weights)
-    g = wp.quat_rotate_inv(base.quat, load_vec3(robot.table, GRAVITY, world))
+    g = wp.quat_rotate_inv(base.quat, load_vec3(model.table, GRAVITY, world))
     angles = get_vec(record, i, ANGLES, world, leg)
     rates = get_vec(record, i, RATES, world, leg)
     (geo, masses, joints, spring, stops, _ground, mu, pos, turn, omega, g_adj, angle_adj, rate_adj, _held, _leg,
      _step) = (
         wp.grad(leg_action)(
-            own.geometry, own.masses, own.joints, load_spring(robot.table, leg, world),
-            load_stops(robot.table, leg, world), robot.ground, law.mu, base.pos, base.quat, base.ang, g, angles, rates,
+            own.geometry, own.masses, own.joints, load_spring(model.table, leg, world),
+            load_stops(model.table, leg, world), model.ground, law.mu, base.pos, base.quat, base.ang, g, angles, rates,
             held, factors, dt,
         )
     )  # fmt: skip
@@ -354,8 +354,8 @@ def find_weights(
 
 @wp.func
 def reverse_leg(
-    robot: Robot, own: LegParams, dt: real, world: int, leg: int, force: vec3, moment: vec3, rows: Rows, seeds: Rows,
-    step: int, i: int, record: LegRecord, adj: LegAdjoint, keeps: bool,
+    model: RobotModel, own: LegParams, dt: real, world: int, leg: int, force: vec3, moment: vec3, rows: Rows,
+    seeds: Rows, step: int, i: int, record: LegRecord, adj: LegAdjoint, keeps: bool,
 ) -> LegAdjoint:  # fmt: skip
     """Run a step backwards, see `reverse_step`; if it `keeps`, it records what its equations are weighed with."""
     base = get_base(record, i, world)
@@ -371,14 +371,14 @@ def reverse_leg(
     by_base = weights.base
     # the equations of motion
     held = held_base(record, world, i, dt, base, by_base)
-    found = leg_gradient(robot, own, dt, world, leg, rows, seeds, step, i, record, base, law, held, weights.leg)
+    found = leg_gradient(model, own, dt, world, leg, rows, seeds, step, i, record, base, law, held, weights.leg)
     by_base.seeds.velocity = weights.lin
     by_base.seeds.new_velocity = new_velocity
     by_base.seeds.gravity = sum_vec(found.gravity)
-    gravity = load_vec3(robot.table, GRAVITY, world)
+    gravity = load_vec3(model.table, GRAVITY, world)
     body, com, weight, force_adj, moment_adj, base_turn, lin_adj, base_omega, _base, _seeds, _base_step = wp.grad(
         base_action
-    )(load_moments(robot.table, BASE, world), base_com(robot.table, world), gravity, force, moment, base.quat,
+    )(load_moments(model.table, BASE, world), base_com(model.table, world), gravity, force, moment, base.quat,
       base.lin, base.ang, held, by_base.seeds, dt)  # fmt: skip
     if keeps:
         put_base_weights(record, i, world, by_base)

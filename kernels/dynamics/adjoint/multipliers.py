@@ -12,7 +12,7 @@ from ..contact import SEPARATE, PawContact
 from ..contact_laws import PawLaw, contact_at, contact_point, paw_law
 from ..leg_dynamics import PawKinematics
 from ..parameters import load_spring, load_stops, load_vec3
-from ..step import LegParams, Robot, base_system, hold_base, leg_terms
+from ..step import LegParams, RobotModel, base_system, hold_base, leg_terms
 from ..trajectory import Rows, row_vec3
 from .virtual_power import BaseFactors, LegFactors
 
@@ -90,25 +90,25 @@ def solve_system(
 
 @wp.func
 def replay_step(
-    robot: Robot, params: wp.array(dtype=LegParams), at: StepPlace, rows: Rows, record: StepRecord
+    model: RobotModel, params: wp.array(dtype=LegParams), at: StepPlace, rows: Rows, record: StepRecord
 ):  # fmt: skip
     """Make a step again from its entry of the record, with known torques and impulses; writes the record."""
     dt, world, step, i = at.dt, at.world, at.step, at.entry
     base = record.base[world, i]
-    g = wp.quat_rotate_inv(base.quat, load_vec3(robot.table, GRAVITY, world))
-    system = base_system(robot, world, base, g, at.force, at.moment)
+    g = wp.quat_rotate_inv(base.quat, load_vec3(model.table, GRAVITY, world))
+    system = base_system(model, world, base, g, at.force, at.moment)
     for k in range(record.legs.shape[2]):
         torque = row_vec3(rows.torque, step, 3 * k, world)
         pressed = int(rows.pressed[step, k, world])
         angles = record.angles[world, i, k]
-        stops = stop_rows(load_stops(robot.table, k, world), angles, dt)
-        spring = load_spring(robot.table, k, world)
+        stops = stop_rows(load_stops(model.table, k, world), angles, dt)
+        spring = load_spring(model.table, k, world)
         rates = record.rates[world, i, k]
         terms = leg_terms(params[k], spring, angles, rates, torque, stops, pressed, base.ang, g, dt)
         record.legs[world, i, k] = terms.solve
         record.paws[world, i, k] = terms.paw
         system = add_leg(system, terms.dynamics, terms.solve)
-    inverse = hold_base(robot, world, invert(system))
+    inverse = hold_base(model, world, invert(system))
     record.inverse[world, i] = inverse
     force_impulse = dt * system.force
     moment_impulse = dt * system.moment
@@ -117,11 +117,11 @@ def replay_step(
         if wp.dot(impulse, impulse) > real(0.0):
             solve = record.legs[world, i, k]
             paw = record.paws[world, i, k]
-            contact = contact_at(robot, k, base, paw, solve, inverse, impulse)
+            contact = contact_at(model, k, base, paw, solve, inverse, impulse)
             joint = wp.transpose(contact.jacobian) * impulse
             force_impulse += impulse - wp.transpose(solve.to_lin) * joint
             moment_impulse += (
-                wp.cross(contact_point(robot, k, paw, contact), impulse) - wp.transpose(solve.to_ang) * joint
+                wp.cross(contact_point(model, k, paw, contact), impulse) - wp.transpose(solve.to_ang) * joint
             )
             solve.free += solve.inverse * (joint / dt)
             record.legs[world, i, k] = solve
@@ -204,8 +204,8 @@ def solve_laws(
 
 @wp.func
 def load_laws(
-    robot: Robot, at: StepPlace, first_impulse: wp.array2d(dtype=vec3), rows: Rows, record: StepRecord, m: Multipliers,
-    seeds: Rows, legs: wp.array(dtype=LegReverse), contacts: wp.array(dtype=PawContact),
+    model: RobotModel, at: StepPlace, first_impulse: wp.array2d(dtype=vec3), rows: Rows, record: StepRecord,
+    m: Multipliers, seeds: Rows, legs: wp.array(dtype=LegReverse), contacts: wp.array(dtype=PawContact),
 ) -> bool:  # fmt: skip
     """Write the paws' laws at the solution, and the gradients by their impulses; returns whether any touches."""
     world, i = at.world, at.entry
@@ -220,15 +220,15 @@ def load_laws(
         impulse = wp.quat_rotate_inv(base.quat, rows.impulse[at.step, k, world])
         if wp.dot(impulse, impulse) > real(0.0):
             paw = record.paws[world, i, k]
-            c = contact_at(robot, k, base, paw, record.legs[world, i, k], record.inverse[world, i], impulse)
-            point = contact_point(robot, k, paw, c)
+            c = contact_at(model, k, base, paw, record.legs[world, i, k], record.inverse[world, i], impulse)
+            point = contact_point(model, k, paw, c)
             before = old_lin + wp.cross(base.ang, point) + c.jacobian * record.rates[world, i, k]
             velocity = lin + wp.cross(ang, point) + c.jacobian * record.rates[world, i + 1, k]
             old_impulse = first_impulse[k, world]
             if at.step > 0:
                 old_impulse = rows.impulse[at.step - 1, k, world]
             old_impulse = wp.quat_rotate_inv(base.quat, old_impulse)
-            law = paw_law(robot, world, k, c, before, velocity, old_impulse)
+            law = paw_law(model, world, k, c, before, velocity, old_impulse)
             seed = m.lin + wp.cross(m.ang, point) + c.jacobian * legs[k].virtual_rates
             if seeds.impulse.shape[0] > 0:
                 seed += wp.quat_rotate_inv(base.quat, seeds.impulse[at.step, k, world])
@@ -241,7 +241,7 @@ def load_laws(
 
 @wp.func
 def add_laws(
-    robot: Robot, at: StepPlace, record: StepRecord, before: Multipliers, legs: wp.array(dtype=LegReverse),
+    model: RobotModel, at: StepPlace, record: StepRecord, before: Multipliers, legs: wp.array(dtype=LegReverse),
     contacts: wp.array(dtype=PawContact),
 ) -> Multipliers:  # fmt: skip
     """Return the multipliers with the share of the contact laws, whose own are known; the legs' are replaced."""
@@ -256,7 +256,7 @@ def add_laws(
             more_lin += c.to_lin * y
             more_ang += c.to_ang * y
             m.lin_seed += y
-            m.ang_seed += wp.cross(contact_point(robot, k, record.paws[at.world, at.entry, k], c), y)
+            m.ang_seed += wp.cross(contact_point(model, k, record.paws[at.world, at.entry, k], c), y)
             legs[k].rates = legs[k].rates + joint
             legs[k].virtual_rates = legs[k].virtual_rates + record.legs[at.world, at.entry, k].inverse * joint
     m.lin += more_lin
@@ -269,18 +269,18 @@ def add_laws(
 
 @wp.func
 def find_multipliers(
-    robot: Robot, at: StepPlace, first_impulse: wp.array2d(dtype=vec3), rows: Rows, seeds: Rows, record: StepRecord,
-    lin_seed: vec3, ang_seed: vec3, legs: wp.array(dtype=LegReverse), contacts: wp.array(dtype=PawContact),
-    matrix: wp.array2d(dtype=real), vector: wp.array(dtype=real),
+    model: RobotModel, at: StepPlace, first_impulse: wp.array2d(dtype=vec3), rows: Rows, seeds: Rows,
+    record: StepRecord, lin_seed: vec3, ang_seed: vec3, legs: wp.array(dtype=LegReverse),
+    contacts: wp.array(dtype=PawContact), matrix: wp.array2d(dtype=real), vector: wp.array(dtype=real),
 ) -> Multipliers:  # fmt: skip
     """Return the multipliers of a step's equations for the gradients by the velocities at its end, body axes.
 
     legs: `rates` are those of the motors; to them the share of the contact laws is added.
     """
     m = solve_system(record, at, lin_seed, ang_seed, legs)
-    if load_laws(robot, at, first_impulse, rows, record, m, seeds, legs, contacts):
+    if load_laws(model, at, first_impulse, rows, record, m, seeds, legs, contacts):
         solve_laws(contacts, legs, matrix, vector)
-        m = add_laws(robot, at, record, m, legs, contacts)
+        m = add_laws(model, at, record, m, legs, contacts)
     return m
 
 

@@ -12,7 +12,7 @@ from ...scalar import quat, real, vec3
 from ...state import BaseState, base_com
 from ..contact import PawContact
 from ..parameters import load_moments, load_spring, load_stops
-from ..step import LegParams, Robot, StepSettings, load_leg
+from ..step import LegParams, RobotModel, StepSettings, load_leg
 from ..trajectory import (
     Actuation,
     Arrival,
@@ -77,9 +77,9 @@ class RowSeeds:
 
 
 @wp.func
-def leave_row(rows: Rows, robot: Robot, row: int, world: int, adj: BaseState, com_before: vec3) -> RowSeeds:
+def leave_row(rows: Rows, model: RobotModel, row: int, world: int, adj: BaseState, com_before: vec3) -> RowSeeds:
     """Return the gradient by a row's entries for that by the base's state which is read from it."""
-    com = base_com(robot.table, world)
+    com = base_com(model.table, world)
     pos, orientation, lin, ang, com_adj, _seed = wp.grad(weighed_row)(
         row_vec3(rows.q, row, 0, world), row_quat(rows.q, row, 3, world), row_vec3(rows.qd, row, 0, world),
         row_vec3(rows.qd, row, 3, world), com, adj,
@@ -115,9 +115,9 @@ class RowState:
 
 
 @wp.func
-def enter_row(robot: Robot, world: int, base: BaseState, seeds: RowSeeds) -> RowState:
+def enter_row(model: RobotModel, world: int, base: BaseState, seeds: RowSeeds) -> RowState:
     """Return the gradient by the base's state which a row was written from, for that by the row's entries."""
-    com = base_com(robot.table, world)
+    com = base_com(model.table, world)
     orientation, lin, ang, com_adj, _lin, _ang = wp.grad(weighed_store)(
         base.quat, base.lin, base.ang, com, seeds.lin, seeds.ang
     )
@@ -142,7 +142,7 @@ def add_motor_rows(legs: wp.array(dtype=LegReverse), seeds: Rows, row: int, worl
 
 @wp.func
 def load_parts(
-    robot: Robot,
+    model: RobotModel,
     actuation: Actuation,
     world: int,
     params: wp.array(dtype=LegParams),
@@ -150,7 +150,7 @@ def load_parts(
 ):
     """Write the parameters of a world's legs and motors."""
     for k in range(params.shape[0]):
-        params[k] = load_leg(robot, world, k)
+        params[k] = load_leg(model, world, k)
     for i in range(motors.shape[0]):
         motors[i] = load_world_motor(actuation, i, world)
 
@@ -168,7 +168,7 @@ def place_in(commands: Commands, t: int, dt: real, world: int) -> StepPlace:
 
 @wp.func
 def replay_row(
-    robot: Robot, params: wp.array(dtype=LegParams), place: StepPlace, rows: Rows, row: int, every: int, com: vec3,
+    model: RobotModel, params: wp.array(dtype=LegParams), place: StepPlace, rows: Rows, row: int, every: int, com: vec3,
     record: StepRecord,
 ):  # fmt: skip
     """Make the steps from a row to the next one again."""
@@ -180,7 +180,7 @@ def replay_row(
     for i in range(every):
         at.step = row * every + i
         at.entry = i
-        replay_step(robot, params, at, rows, record)
+        replay_step(model, params, at, rows, record)
 
 
 @wp.func
@@ -248,7 +248,7 @@ def store_start(
 @wp.kernel
 def reverse_kernel(
     # in
-    robot: Robot,
+    model: RobotModel,
     settings: StepSettings,
     timing: Timing,
     actuation: Actuation,
@@ -269,24 +269,24 @@ def reverse_kernel(
     sums = wp.zeros(shape=(GRADIENT_ROWS,), dtype=real)
     params = wp.zeros(shape=(4,), dtype=LegParams)
     motors = wp.zeros(shape=(12,), dtype=MotorParams)
-    load_parts(robot, actuation, world, params, motors)
+    load_parts(model, actuation, world, params, motors)
     late = actuation.latency[world] / settings.dt
     last = timing.steps * timing.substeps / timing.every
     entries = add_row_seeds(RowSeeds(), seeds, last, world)
     add_motor_rows(legs, seeds, last, world)
-    com = base_com(robot.table, world)
+    com = base_com(model.table, world)
     for back in range(last):
         row = last - 1 - back
         t = row * timing.every / timing.substeps
         at = place_in(commands, t, settings.dt, world)
-        replay_row(robot, params, at, rows, row, timing.every, com, record)
-        end = enter_row(robot, world, record.base[world, timing.every], entries)
+        replay_row(model, params, at, rows, row, timing.every, com, record)
+        end = enter_row(model, world, record.base[world, timing.every], entries)
         adj = end.base
         for j in range(timing.every):
             at.entry = timing.every - 1 - j
             at.step = row * timing.every + at.entry
             by_step = reverse_step(
-                robot, params, at, commands.impulse, rows, seeds, record, adj, legs, contacts, matrix, vector, sums
+                model, params, at, commands.impulse, rows, seeds, record, adj, legs, contacts, matrix, vector, sums
             )
             adj = by_step.base
             add_wrench(gradients, t, world, by_step.force, by_step.moment)
@@ -296,7 +296,7 @@ def reverse_kernel(
                 rate = record.rates[world, at.entry, i / 3][i % 3]
                 found = motor_gradient(motors[i], late, commands, safe, timing, at.dt, at.step, i, world, angle, rate)
                 add_motor_adjoint(found, arrived, at, i, seeds, gradients, legs, sums)
-        entries = add_row_seeds(leave_row(rows, robot, row, world, adj, end.com), seeds, row, world)
+        entries = add_row_seeds(leave_row(rows, model, row, world, adj, end.com), seeds, row, world)
         if row * timing.every == t * timing.substeps:
             for k in range(legs.shape[0]):
                 by_filter = filter_gradient(
@@ -304,29 +304,29 @@ def reverse_kernel(
                 )
                 add_filter_adjoint(by_filter, t, k, world, gradients, legs, sums)
         add_motor_rows(legs, seeds, row, world)
-    add_com(sums, robot.table[BASE, world], com, entries.com)
+    add_com(sums, model.table[BASE, world], com, entries.com)
     store_start(gradients, world, entries, legs, sums)
 
 
 @wp.func
 def everything(
-    factors: LegFactors, base: BaseFactors, base_seeds: BaseSeeds, robot: Robot, actuation: Actuation, numbers: Rows,
-    state: BaseState, world: int,
+    factors: LegFactors, base: BaseFactors, base_seeds: BaseSeeds, model: RobotModel, actuation: Actuation,
+    numbers: Rows, state: BaseState, world: int,
 ) -> real:  # fmt: skip
     """Return the sum of all functions whose gradients the reverse pass takes; see `generate_adjoints`."""
-    params = load_leg(robot, world, 0)
+    params = load_leg(model, world, 0)
     v = row_vec3(numbers.q, 0, 0, world)
     q = row_quat(numbers.q, 0, 3, world)
     x = numbers.q[0, 0, world]
-    spring = load_spring(robot.table, 0, world)
-    stops = load_stops(robot.table, 0, world)
+    spring = load_spring(model.table, 0, world)
+    stops = load_stops(model.table, 0, world)
     leg = leg_action(
-        params.geometry, params.masses, params.joints, spring, stops, robot.ground, x, v, q, v, v, v, v, base, factors,
+        params.geometry, params.masses, params.joints, spring, stops, model.ground, x, v, q, v, v, v, v, base, factors,
         x,
     )  # fmt: skip
     return (
         leg
-        + base_action(load_moments(robot.table, BASE, world), v, v, v, v, q, v, v, base, base_seeds, x)
+        + base_action(load_moments(model.table, BASE, world), v, v, v, v, q, v, v, base, base_seeds, x)
         + turned(q, v, x, q)
         + motor_torque(x, x, x, load_world_motor(actuation, 0, world))
         + weighed_filter(v, v, v, load_filter(actuation.limits, world), v)
@@ -344,13 +344,13 @@ def generate_adjoints(module: str) -> wp.Kernel:
 
     @wp.kernel(enable_backward=True, module=wp.get_module(module))
     def adjoints_kernel(
-        factors: LegFactors, base: BaseFactors, base_seeds: BaseSeeds, robot: Robot, actuation: Actuation,
+        factors: LegFactors, base: BaseFactors, base_seeds: BaseSeeds, model: RobotModel, actuation: Actuation,
         numbers: Rows, state: BaseState, sums: wp.array(dtype=real),
     ):  # fmt: skip
         world = wp.tid()
         launched = int(0)  # Warp makes the adjoints anyway, and the compiler drops this kernel's own code
         if launched > 0:
-            sums[world] = everything(factors, base, base_seeds, robot, actuation, numbers, state, world)
+            sums[world] = everything(factors, base, base_seeds, model, actuation, numbers, state, world)
 
     return adjoints_kernel
 

@@ -11,7 +11,7 @@ from ...lanes import sync_lanes
 from ...layout import BASE, GRAVITY
 from ...scalar import quat, real, vec3
 from ...state import base_com
-from ..step import Robot, StepSettings, load_leg
+from ..step import RobotModel, StepSettings, load_leg
 from ..trajectory import (
     Actuation,
     Arrival,
@@ -63,7 +63,7 @@ def first_entry(timing: Timing, span: Span, row: int) -> int:
 def replay_legs_kernel(
     # in
     count: int,
-    robot: Robot,
+    model: RobotModel,
     settings: StepSettings,
     timing: Timing,
     actuation: Actuation,
@@ -84,10 +84,10 @@ def replay_legs_kernel(
     at = first_entry(timing, span, row)
     first = row * timing.every
     t = first / timing.substeps
-    own = load_leg(robot, world, leg)
+    own = load_leg(model, world, leg)
     force = row_vec3(commands.wrench, t, 0, world)
     moment = row_vec3(commands.wrench, t, 3, world)
-    put_base(record, at, world, load_row_base(rows, row, world, base_com(robot.table, world)))
+    put_base(record, at, world, load_row_base(rows, row, world, base_com(model.table, world)))
     put_vec(record, at, ANGLES, world, leg, row_vec3(rows.q, row, 7 + 3 * leg, world))
     put_vec(record, at, RATES, world, leg, row_vec3(rows.qd, row, 6 + 3 * leg, world))
     sync_lanes()
@@ -97,7 +97,7 @@ def replay_legs_kernel(
     late = actuation.latency[world] / settings.dt
     for i in range(timing.every):
         step = first + i
-        replay_leg(robot, own, settings.dt, world, leg, force, moment, commands.impulse, rows, step, at + i, record)
+        replay_leg(model, own, settings.dt, world, leg, force, moment, commands.impulse, rows, step, at + i, record)
         sync_lanes()
         angles = get_vec(record, at + i, ANGLES, world, leg)
         rates = get_vec(record, at + i, RATES, world, leg)
@@ -171,7 +171,7 @@ def reverse_motors(
 def reverse_legs_kernel(
     # in
     count: int,
-    robot: Robot,
+    model: RobotModel,
     settings: StepSettings,
     timing: Timing,
     actuation: Actuation,
@@ -192,7 +192,7 @@ def reverse_legs_kernel(
     place, leg = wp.tid()
     world = settings.first + wp.min(place, count - 1)
     dt = settings.dt
-    own = load_leg(robot, world, leg)
+    own = load_leg(model, world, leg)
     late = actuation.latency[world] / dt
     entries = load_entries(gradients, world)
     adj = load_motor_entries(gradients, world, leg)
@@ -205,7 +205,7 @@ def reverse_legs_kernel(
         t = first / timing.substeps
         force = row_vec3(commands.wrench, t, 0, world)
         moment = row_vec3(commands.wrench, t, 3, world)
-        end = enter_row(robot, world, get_base(record, at + timing.every, world), entries)
+        end = enter_row(model, world, get_base(record, at + timing.every, world), entries)
         adj.base = end.base
         adj.force = vec3(real(0.0))
         adj.moment = vec3(real(0.0))
@@ -213,12 +213,12 @@ def reverse_legs_kernel(
             i = timing.every - 1 - j
             step = first + i
             adj = reverse_leg(
-                robot, own, dt, world, leg, force, moment, rows, seeds, step, at + i, record, adj, place < count
+                model, own, dt, world, leg, force, moment, rows, seeds, step, at + i, record, adj, place < count
             )
             arrived = arrival(step, timing.substeps, late)
             slopes = get_slopes(record, at + i, world, leg)
             adj = reverse_motors(adj, slopes, arrived, seeds, step, leg, world, gradients, place < count)
-        entries = add_row_seeds(leave_row(rows, robot, row, world, adj.base, end.com), seeds, row, world)
+        entries = add_row_seeds(leave_row(rows, model, row, world, adj.base, end.com), seeds, row, world)
         if place < count:
             if leg == 0:
                 add_wrench(gradients, t, world, adj.force, adj.moment)
@@ -241,7 +241,7 @@ def reverse_legs_kernel(
         store_entries(gradients, world, leg, entries, adj)
         if leg == 0:
             add_moments(of_leg, BASE, adj.body)
-            add_com(of_leg, robot.table[BASE, world], base_com(robot.table, world), adj.com + entries.com)
+            add_com(of_leg, model.table[BASE, world], base_com(model.table, world), adj.com + entries.com)
             add_vec3(of_leg, GRAVITY, adj.gravity)
 
 

@@ -18,7 +18,7 @@ from ...scalar import quat, real, vec3
 from ...state import BaseState, base_com
 from ..contact import SEPARATE, PawContact
 from ..parameters import load_moments, load_spring, load_stops, load_vec3
-from ..step import LegParams, Robot
+from ..step import LegParams, RobotModel
 from ..trajectory import Rows
 from .gradients import (
     add_com,
@@ -49,7 +49,7 @@ class BasePart:
 
 @wp.func
 def reverse_leg_part(
-    robot: Robot, params: LegParams, at: StepPlace, k: int, record: StepRecord, g: vec3, base: BaseFactors,
+    model: RobotModel, params: LegParams, at: StepPlace, k: int, record: StepRecord, g: vec3, base: BaseFactors,
     held: LegFactors, legs: wp.array(dtype=LegReverse), sums: wp.array(dtype=real),
 ) -> BasePart:  # fmt: skip
     """Add the gradients of a leg's weighed equations to those by its motors and its parameters."""
@@ -62,8 +62,8 @@ def reverse_leg_part(
     (geo, masses, joints, spring, stops, _ground, mu_adj, pos, turn, omega, g_part, angles, rates, _held, _leg,
      _step) = (
         wp.grad(leg_action)(
-            params.geometry, params.masses, params.joints, load_spring(robot.table, k, world),
-            load_stops(robot.table, k, world), robot.ground, mu, start.pos, start.quat, start.ang, g,
+            params.geometry, params.masses, params.joints, load_spring(model.table, k, world),
+            load_stops(model.table, k, world), model.ground, mu, start.pos, start.quat, start.ang, g,
             record.angles[world, i, k], record.rates[world, i, k], base, held, at.dt,
         )
     )  # fmt: skip
@@ -96,8 +96,8 @@ class StepAdjoint:
 
 @wp.func
 def reverse_step(
-    robot: Robot, params: wp.array(dtype=LegParams), at: StepPlace, first_impulse: wp.array2d(dtype=vec3), rows: Rows,
-    seeds: Rows, record: StepRecord, adj: BaseState, legs: wp.array(dtype=LegReverse),
+    model: RobotModel, params: wp.array(dtype=LegParams), at: StepPlace, first_impulse: wp.array2d(dtype=vec3),
+    rows: Rows, seeds: Rows, record: StepRecord, adj: BaseState, legs: wp.array(dtype=LegReverse),
     contacts: wp.array(dtype=PawContact), matrix: wp.array2d(dtype=real), vector: wp.array(dtype=real),
     sums: wp.array(dtype=real),
 ) -> StepAdjoint:  # fmt: skip
@@ -114,12 +114,12 @@ def reverse_step(
     for k in range(legs.shape[0]):
         legs[k].rates = legs[k].rates + dt * legs[k].angles
     m = find_multipliers(
-        robot, at, first_impulse, rows, seeds, record, wp.quat_rotate_inv(base.quat, new_velocity), ang_seed + adj.ang,
+        model, at, first_impulse, rows, seeds, record, wp.quat_rotate_inv(base.quat, new_velocity), ang_seed + adj.ang,
         legs, contacts, matrix, vector,
     )  # fmt: skip
     # the equations of motion
     held = held_base(at, record, m)
-    gravity = load_vec3(robot.table, GRAVITY, world)
+    gravity = load_vec3(model.table, GRAVITY, world)
     g = wp.quat_rotate_inv(base.quat, gravity)
     out = StepAdjoint()
     out.base.pos = adj.pos
@@ -128,7 +128,7 @@ def reverse_step(
     g_adj = vec3(real(0.0))
     for k in range(legs.shape[0]):
         leg = held_leg(at, k, rows, seeds, record, legs, contacts)
-        part = reverse_leg_part(robot, params[k], at, k, record, g, held, leg, legs, sums)
+        part = reverse_leg_part(model, params[k], at, k, record, g, held, leg, legs, sums)
         out.base.pos += part.pos
         out.base.quat += part.turn
         out.base.ang += part.omega
@@ -139,11 +139,11 @@ def reverse_step(
     weights.gravity = g_adj
     body, com, weight, force_adj, moment_adj, turn, lin_adj, omega, _base, _seeds, _dt_base = wp.grad(
         base_action
-    )(load_moments(robot.table, BASE, world), base_com(robot.table, world), gravity, at.force, at.moment, base.quat,
+    )(load_moments(model.table, BASE, world), base_com(model.table, world), gravity, at.force, at.moment, base.quat,
         base.lin, base.ang, held, weights, dt,
     )  # fmt: skip
     add_moments(sums, BASE, body)
-    add_com(sums, robot.table[BASE, world], base_com(robot.table, world), com)
+    add_com(sums, model.table[BASE, world], base_com(model.table, world), com)
     add_vec3(sums, GRAVITY, weight)
     out.force = force_adj
     out.moment = moment_adj

@@ -16,7 +16,7 @@ from ..base_motion import moved_base
 from ..contact import BlockLaw, PawContact
 from ..drive import Drive, Workspace, base_wrench
 from ..parameters import load_joint_params, load_masses, load_moments, load_spring, load_stops, load_vec3
-from ..step import LegParams, Robot, StepSettings, load_leg
+from ..step import LegParams, RobotModel, StepSettings, load_leg
 from ..trajectory import Rows, store_row_vec3
 from ..world.world_step import LegStep, solve_step
 from .multipliers import LegReverse, StepPlace, StepRecord, find_multipliers, held_base, held_leg, replay_step
@@ -43,7 +43,7 @@ class SolvedStep:
 @wp.kernel(enable_backward=False)
 def solve_kernel(
     # in
-    robot: Robot,
+    model: RobotModel,
     settings: StepSettings,
     drive: Drive,
     joint_q: wp.array(dtype=real),
@@ -55,7 +55,7 @@ def solve_kernel(
 ):
     """Solve every world's contacts and stops; one thread per world."""
     world = wp.tid()
-    base = load_base(joint_q, joint_qd, base_com(robot.table, world), world)
+    base = load_base(joint_q, joint_qd, base_com(model.table, world), world)
     legs = wp.zeros(shape=(4,), dtype=LegStep)
     contacts = wp.zeros(shape=(4,), dtype=PawContact)
     for k in range(legs.shape[0]):
@@ -68,7 +68,7 @@ def solve_kernel(
     wrench = base_wrench(drive.joint_f, drive.body_f, world)
     force = vec3(wrench[0], wrench[1], wrench[2])
     moment = vec3(wrench[3], wrench[4], wrench[5])
-    found = solve_step(robot, settings, world, base, force, moment, BlockLaw(), work.impulse, legs, contacts)
+    found = solve_step(model, settings, world, base, force, moment, BlockLaw(), work.impulse, legs, contacts)
     solved.lin[world] = found.lin
     solved.ang[world] = found.ang
     for k in range(legs.shape[0]):
@@ -83,7 +83,7 @@ def solve_kernel(
 @wp.kernel
 def power_kernel(
     # in
-    robot: Robot,
+    model: RobotModel,
     dt: real,
     joint_q: wp.array(dtype=real),
     joint_qd: wp.array(dtype=real),
@@ -95,17 +95,17 @@ def power_kernel(
 ):
     """Weigh the equations of motion, (4, num_worlds), those of the base with leg 0's; one thread per (leg, world)."""
     k, world = wp.tid()
-    com = base_com(robot.table, world)
+    com = base_com(model.table, world)
     base = load_base(joint_q, joint_qd, com, world)
-    gravity = load_vec3(robot.table, GRAVITY, world)
+    gravity = load_vec3(model.table, GRAVITY, world)
     g = wp.quat_rotate_inv(base.quat, gravity)
     held = solved.base[world]
     leg = solved.legs[k, world]
     rates = load_motors(joint_qd, leg_dof(world, k))
     total = leg_action(
-        robot.geometry[k], load_masses(robot.table, k, world), load_joint_params(robot.table, k, world),
-        load_spring(robot.table, k, world), load_stops(robot.table, k, world), robot.ground,
-        robot.table[solved.mu_row[k, world], world], base.pos, base.quat, base.ang, g,
+        model.geometry[k], load_masses(model.table, k, world), load_joint_params(model.table, k, world),
+        load_spring(model.table, k, world), load_stops(model.table, k, world), model.ground,
+        model.table[solved.mu_row[k, world], world], base.pos, base.quat, base.ang, g,
         load_motors(joint_q, leg_coord(world, k)), rates, held, leg, dt,
     )  # fmt: skip
     total += wp.dot(solved.rate_seed[k, world], rates)
@@ -115,7 +115,7 @@ def power_kernel(
         force = vec3(wrench[0], wrench[1], wrench[2])
         moment = vec3(wrench[3], wrench[4], wrench[5])
         total += base_action(
-            load_moments(robot.table, BASE, world), com, gravity, force, moment, base.quat, base.lin, base.ang, held,
+            load_moments(model.table, BASE, world), com, gravity, force, moment, base.quat, base.lin, base.ang, held,
             solved.seeds[world], dt,
         )  # fmt: skip
         total += wp.dot(solved.ang_seed[world], base.ang)
@@ -133,7 +133,7 @@ class EndVelocities:
 
 @wp.func
 def end_velocities(
-    robot: Robot, dt: real, joint_q: wp.array(dtype=real), joint_qd: wp.array(dtype=real),
+    model: RobotModel, dt: real, joint_q: wp.array(dtype=real), joint_qd: wp.array(dtype=real),
     joint_f: wp.array(dtype=real), body_f: wp.array(dtype=wp.spatial_vector), solved: SolvedStep, record: StepRecord,
     power: wp.array2d(dtype=real), world: int,
 ) -> EndVelocities:  # fmt: skip
@@ -148,7 +148,7 @@ def end_velocities(
 
 @wp.func_grad(end_velocities)
 def adj_end_velocities(
-    robot: Robot, dt: real, joint_q: wp.array(dtype=real), joint_qd: wp.array(dtype=real),
+    model: RobotModel, dt: real, joint_q: wp.array(dtype=real), joint_qd: wp.array(dtype=real),
     joint_f: wp.array(dtype=real), body_f: wp.array(dtype=wp.spatial_vector), solved: SolvedStep, record: StepRecord,
     power: wp.array2d(dtype=real), world: int, adj_ret: EndVelocities,
 ):  # fmt: skip
@@ -164,15 +164,15 @@ def adj_end_velocities(
     at.world = world
     at.force = vec3(wrench[0], wrench[1], wrench[2])
     at.moment = vec3(wrench[3], wrench[4], wrench[5])
-    record.base[world, 0] = load_base(joint_q, joint_qd, base_com(robot.table, world), world)
+    record.base[world, 0] = load_base(joint_q, joint_qd, base_com(model.table, world), world)
     for k in range(legs.shape[0]):
-        params[k] = load_leg(robot, world, k)
+        params[k] = load_leg(model, world, k)
         record.angles[world, 0, k] = load_motors(joint_q, leg_coord(world, k))
         record.rates[world, 0, k] = load_motors(joint_qd, leg_dof(world, k))
         legs[k].rates = vec3(adj_ret.rates[k, 0], adj_ret.rates[k, 1], adj_ret.rates[k, 2])
-    replay_step(robot, params, at, solved.rows, record)
+    replay_step(model, params, at, solved.rows, record)
     m = find_multipliers(
-        robot, at, solved.before, solved.rows, Rows(), record, adj_ret.lin, adj_ret.ang, legs, contacts, matrix, vector
+        model, at, solved.before, solved.rows, Rows(), record, adj_ret.lin, adj_ret.ang, legs, contacts, matrix, vector
     )
     seeds = BaseSeeds()
     seeds.velocity = m.lin_seed
@@ -189,7 +189,7 @@ def adj_end_velocities(
 @wp.kernel
 def integrate_kernel(
     # in
-    robot: Robot,
+    model: RobotModel,
     dt: real,
     joint_q: wp.array(dtype=real),
     joint_qd: wp.array(dtype=real),
@@ -204,9 +204,9 @@ def integrate_kernel(
 ):
     """Move the coordinates with the velocities at the end of the step; one thread per world."""
     world = wp.tid()
-    com = base_com(robot.table, world)
+    com = base_com(model.table, world)
     base = load_base(joint_q, joint_qd, com, world)
-    end = end_velocities(robot, dt, joint_q, joint_qd, joint_f, body_f, solved, record, power, world)
+    end = end_velocities(model, dt, joint_q, joint_qd, joint_f, body_f, solved, record, power, world)
     store_base(joint_q_out, joint_qd_out, com, world, moved_base(base, end.lin, end.ang, dt))
     for k in range(4):
         rates = vec3(end.rates[k, 0], end.rates[k, 1], end.rates[k, 2])

@@ -32,7 +32,7 @@ from ..drive import Drive, LegDrive, Workspace, applied_torque, base_wrench, fre
 from ..parameters import load_spring, load_stops, load_vec3
 from ..step import (
     LegParams,
-    Robot,
+    RobotModel,
     StepSettings,
     base_system,
     block_law,
@@ -132,12 +132,12 @@ class StopTry:
 
 
 @wp.func
-def next_try(robot: Robot, world: int, leg: int, old: LegState, dt: real) -> StopTry:
+def next_try(model: RobotModel, world: int, leg: int, old: LegState, dt: real) -> StopTry:
     """Return the leg's stops for the present try."""
     found = StopTry()
     found.pressed = old.pressed
     if found.pressed != 0 or old.sets == 0:
-        stops = load_stops(robot.table, leg, world)
+        stops = load_stops(model.table, leg, world)
         if found.pressed != 0 or beyond_stops(stops, old.angles + dt * old.rates):
             found.rows = stop_rows(stops, old.angles, dt)
             if old.sets == 0:
@@ -147,10 +147,10 @@ def next_try(robot: Robot, world: int, leg: int, old: LegState, dt: real) -> Sto
 
 @wp.func
 def wanted_stops(
-    robot: Robot, settings: StepSettings, world: int, leg: int, angles: vec3, rates: vec3, pressed: int, sets: int
+    model: RobotModel, settings: StepSettings, world: int, leg: int, angles: vec3, rates: vec3, pressed: int, sets: int
 ) -> int:
     """Return the set that the rates at the end of the step ask for; loads limits again, which would fill registers."""
-    limits = load_stops(robot.table, leg, world)
+    limits = load_stops(model.table, leg, world)
     wanted = int(0)
     if pressed != 0 or beyond_stops(limits, angles + settings.dt * rates):
         rows = stop_rows(limits, angles, settings.dt)
@@ -196,7 +196,7 @@ def tried(old: LegState, pressed: int, wanted: int, chosen: bool) -> LegState:
 
 @wp.func
 def advance_leg(
-    robot: Robot, settings: StepSettings, drive: Drive, own: LegParams, motors: LegDrive, world: int, leg: int,
+    model: RobotModel, settings: StepSettings, drive: Drive, own: LegParams, motors: LegDrive, world: int, leg: int,
     old: LegState, writes: bool,
 ) -> LegState:  # fmt: skip
     """Return the thread's state after a step, or the old one with another set of stops to try for the same step.
@@ -204,28 +204,28 @@ def advance_leg(
     writes: whether the thread is the one that moves its world's block. A world that has made its steps stays.
     """
     dt = settings.dt
-    blocks = robot.ground.blocks.shape[0] > 0
+    blocks = model.ground.blocks.shape[0] > 0
     base = old.base
-    g = wp.quat_rotate_inv(base.quat, load_vec3(robot.table, GRAVITY, world))
+    g = wp.quat_rotate_inv(base.quat, load_vec3(model.table, GRAVITY, world))
     torque = applied_torque(motors, old.step, old.angles, old.rates)
-    stops = next_try(robot, world, leg, old, dt)
+    stops = next_try(model, world, leg, old, dt)
     pressed = stops.pressed
-    spring = load_spring(robot.table, leg, world)
+    spring = load_spring(model.table, leg, world)
     terms = leg_terms(own, spring, old.angles, old.rates, torque, stops.rows, pressed, base.ang, g, dt)
     wrench = base_wrench(drive.joint_f, drive.body_f, world)
     force = vec3(wrench[0], wrench[1], wrench[2])
     moment = vec3(wrench[3], wrench[4], wrench[5])
     share = add_leg(BaseSystem(), terms.dynamics, terms.solve)
-    system = sum_systems(base_system(robot, world, base, g, force, moment), share)
-    inverse = hold_base(robot, world, invert(system))
+    system = sum_systems(base_system(model, world, base, g, force, moment), share)
+    inverse = hold_base(model, world, invert(system))
     lin_acc = solve_lin(inverse, system.force, system.moment)
     ang_acc = solve_ang(inverse, system.force, system.moment)
     lin = wp.quat_rotate_inv(base.quat, base.lin) + dt * lin_acc
     ang = base.ang + dt * ang_acc
     rates = old.rates + dt * motor_acceleration(terms.solve, lin_acc, ang_acc)
-    block = block_law(robot, world, base, dt)
+    block = block_law(model, world, base, dt)
     contact = paw_contact(
-        robot, world, leg, base, lin, ang, rates, old.rates, old.impulse, pressed, terms.paw, terms.solve, inverse,
+        model, world, leg, base, lin, ang, rates, old.rates, old.impulse, pressed, terms.paw, terms.solve, inverse,
         block, dt,
     )  # fmt: skip
     solved = solve_paws(contact, blocks, block, leg, 4 * settings.max_sweeps, settings.tolerance)
@@ -234,14 +234,14 @@ def advance_leg(
     rates -= solve.to_lin * solved.lin + solve.to_ang * solved.ang
     total = sum_vec(solved.impulse)
     sets = old.sets + 1
-    wanted = wanted_stops(robot, settings, world, leg, old.angles, rates, pressed, sets)
+    wanted = wanted_stops(model, settings, world, leg, old.angles, rates, pressed, sets)
     first = first_leg(wanted != pressed)
     agreed = from_leg(wp.where(wanted != pressed, real(1.0), real(0.0)), first) == real(0.0)
     done = old.step < settings.substeps and (agreed or sets >= MAX_SETS)
     if blocks:
         push = sum_vec(wp.where(contact.on_block != 0, -solved.impulse, vec3(real(0.0))))
-        if writes and done and robot.ground.blocks[world].exists != 0:
-            move_block(robot.ground, world, wp.quat_rotate(base.quat, block_velocity(block, push)), dt)
+        if writes and done and model.ground.blocks[world].exists != 0:
+            move_block(model.ground, world, wp.quat_rotate(base.quat, block_velocity(block, push)), dt)
         sync_lanes()
     if done:
         moved = moved_base(base, lin + solved.lin, ang + solved.ang, dt)
@@ -253,7 +253,7 @@ def advance_leg(
 def advance_legs_kernel(
     # in
     count: int,
-    robot: Robot,
+    model: RobotModel,
     settings: StepSettings,
     drive: Drive,
     joint_q: wp.array(dtype=real),
@@ -272,16 +272,16 @@ def advance_legs_kernel(
     """
     place, leg = wp.tid()
     world = settings.first + wp.min(place, count - 1)  # threads beyond the last world repeat it, and write nothing
-    com = base_com(robot.table, world)
+    com = base_com(model.table, world)
     s = LegState()
     s.base = load_base(joint_q, joint_qd, com, world)
     s.angles = load_motors(joint_q, leg_coord(world, leg))
     s.rates = load_motors(joint_qd, leg_dof(world, leg))
     s.impulse = work.impulse[leg, world]
-    own = load_leg(robot, world, leg)
+    own = load_leg(model, world, leg)
     motors = load_leg_drive(drive, world, leg)
     while any_world(s.step < settings.substeps):
-        s = advance_leg(robot, settings, drive, own, motors, world, leg, s, leg == 0 and place < count)
+        s = advance_leg(model, settings, drive, own, motors, world, leg, s, leg == 0 and place < count)
     total = sum_legs(wp.dot(s.angles, s.angles) + wp.dot(s.rates, s.rates))
     broken = work.invalid[world] != 0 or not (finite_base(s.base) and wp.isfinite(total))
     if place >= count:
@@ -289,7 +289,7 @@ def advance_legs_kernel(
     if broken:
         if leg == 0:
             work.invalid[world] = 1
-            freeze_diverged_world(robot, work, world, joint_q_out, joint_qd_out)
+            freeze_diverged_world(model, work, world, joint_q_out, joint_qd_out)
         return
     for j in range(3):
         work.torque[3 * leg + j, world] = s.torque[j]

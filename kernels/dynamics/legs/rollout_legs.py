@@ -7,7 +7,7 @@ from ...layout import DOFS
 from ...scalar import real
 from ...state import base_com
 from ..drive import Drive, LegDrive
-from ..step import Robot, StepSettings, load_leg
+from ..step import RobotModel, StepSettings, load_leg
 from ..trajectory import (
     Actuation,
     Commands,
@@ -30,7 +30,7 @@ wp.set_module_options({"enable_backward": False, "fast_math": True})
 def rollout_legs_kernel(
     # in
     count: int,
-    robot: Robot,
+    model: RobotModel,
     settings: StepSettings,
     timing: Timing,
     actuation: Actuation,
@@ -46,9 +46,9 @@ def rollout_legs_kernel(
     """
     place, leg = wp.tid()
     world = settings.first + wp.min(place, count - 1)  # threads beyond the last world repeat it
-    com = base_com(robot.table, world)
+    com = base_com(model.table, world)
     late = actuation.latency[world] / settings.dt
-    own = load_leg(robot, world, leg)
+    own = load_leg(model, world, leg)
     s = LegState()
     s.impulse = commands.impulse[leg, world]
     for step in range(timing.steps * timing.substeps):
@@ -71,7 +71,7 @@ def rollout_legs_kernel(
         s.step = 0
         s.sets = 0
         while any_world(s.step == 0):
-            s = advance_leg(robot, settings, drive, own, motors, world, leg, s, False)
+            s = advance_leg(model, settings, drive, own, motors, world, leg, s, False)
         store_row_vec3(rows.torque, step, 3 * leg, world, torque)
         rows.impulse[step, leg, world] = s.impulse
         rows.pressed[step, leg, world] = wp.uint8(s.used)

@@ -12,7 +12,7 @@ from ...terrain.ground import has_block, move_block
 from ..base_motion import moved_base
 from ..contact import ContactState, PawContact, block_velocity, push_on_block
 from ..drive import Drive, Workspace, applied_torque, base_wrench, freeze_diverged_world, load_leg_drive
-from ..step import Robot, StepSettings, block_law, finite_base
+from ..step import RobotModel, StepSettings, block_law, finite_base
 from .world_step import LegStep, solve_step
 
 wp.set_module_options({"enable_backward": False})
@@ -20,7 +20,7 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.func
 def advance_once(
-    robot: Robot, settings: StepSettings, drive: Drive, work: Workspace, world: int, step: int, base: BaseState,
+    model: RobotModel, settings: StepSettings, drive: Drive, work: Workspace, world: int, step: int, base: BaseState,
     legs: wp.array(dtype=LegStep), contacts: wp.array(dtype=PawContact), peaks: wp.array(dtype=real),
 ) -> BaseState:  # fmt: skip
     """Advance one world by one step; the angles and rates of the legs' motors are updated in place.
@@ -38,11 +38,11 @@ def advance_once(
     wrench = base_wrench(drive.joint_f, drive.body_f, world)
     force = vec3(wrench[0], wrench[1], wrench[2])
     moment = vec3(wrench[3], wrench[4], wrench[5])
-    block = block_law(robot, world, base, dt)
-    solved = solve_step(robot, settings, world, base, force, moment, block, work.impulse, legs, contacts)
-    if has_block(robot.ground, world):
+    block = block_law(model, world, base, dt)
+    solved = solve_step(model, settings, world, base, force, moment, block, work.impulse, legs, contacts)
+    if has_block(model.ground, world):
         push = push_on_block(contacts)
-        move_block(robot.ground, world, wp.quat_rotate(base.quat, block_velocity(block, push)), dt)
+        move_block(model.ground, world, wp.quat_rotate(base.quat, block_velocity(block, push)), dt)
     record_contacts(work, world, base, contacts, solved.contact, dt, last, peaks)
     for k in range(legs.shape[0]):
         end = legs[k].end
@@ -74,7 +74,7 @@ def record_contacts(
 @wp.kernel
 def advance_kernel(
     # in
-    robot: Robot,
+    model: RobotModel,
     settings: StepSettings,
     drive: Drive,
     joint_q: wp.array(dtype=real),
@@ -91,9 +91,9 @@ def advance_kernel(
     """
     world = settings.first + wp.tid()
     if work.invalid[world] != 0:
-        freeze_diverged_world(robot, work, world, joint_q_out, joint_qd_out)
+        freeze_diverged_world(model, work, world, joint_q_out, joint_qd_out)
         return
-    com = base_com(robot.table, world)
+    com = base_com(model.table, world)
     base = load_base(joint_q, joint_qd, com, world)
     legs = wp.zeros(shape=(4,), dtype=LegStep)
     contacts = wp.zeros(shape=(4,), dtype=PawContact)
@@ -105,7 +105,7 @@ def advance_kernel(
     work.sweeps[world] = 0
     work.peak_force[world] = real(0.0)
     for step in range(settings.substeps):
-        base = advance_once(robot, settings, drive, work, world, step, base, legs, contacts, peaks)
+        base = advance_once(model, settings, drive, work, world, step, base, legs, contacts, peaks)
     total = real(0.0)
     for k in range(legs.shape[0]):
         angles = legs[k].angles
@@ -117,4 +117,4 @@ def advance_kernel(
     store_base(joint_q_out, joint_qd_out, com, world, base)
     if not (finite_base(base) and wp.isfinite(total)):
         work.invalid[world] = 1
-        freeze_diverged_world(robot, work, world, joint_q_out, joint_qd_out)
+        freeze_diverged_world(model, work, world, joint_q_out, joint_qd_out)

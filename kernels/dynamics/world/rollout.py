@@ -11,7 +11,7 @@ from ...scalar import real
 from ...state import BaseState, base_com, leg_dof, store_motors
 from ..contact import PawContact
 from ..drive import Drive, Workspace
-from ..step import Robot, StepSettings
+from ..step import RobotModel, StepSettings
 from ..trajectory import (
     Actuation,
     Commands,
@@ -34,7 +34,7 @@ wp.set_module_options({"enable_backward": False})
 @wp.kernel
 def rollout_kernel(
     # in
-    robot: Robot,
+    model: RobotModel,
     settings: StepSettings,
     timing: Timing,
     actuation: Actuation,
@@ -52,7 +52,7 @@ def rollout_kernel(
     targets.
     """
     world = settings.first + wp.tid()
-    com = base_com(robot.table, world)
+    com = base_com(model.table, world)
     legs = wp.zeros(shape=(4,), dtype=LegStep)
     contacts = wp.zeros(shape=(4,), dtype=PawContact)
     peaks = wp.zeros(shape=(4,), dtype=real)
@@ -78,7 +78,7 @@ def rollout_kernel(
             torque = leg_torque(commands, actuation, safe, arrived, k, world, legs[k].angles, legs[k].rates)
             store_row_vec3(rows.torque, step, 3 * k, world, torque)
             store_motors(drive.joint_f, leg_dof(world, k), torque)
-        base = advance_once(robot, settings, drive, work, world, 0, base, legs, contacts, peaks)
+        base = advance_once(model, settings, drive, work, world, 0, base, legs, contacts, peaks)
         for k in range(legs.shape[0]):
             rows.impulse[step, k, world] = work.impulse[k, world]
             rows.pressed[step, k, world] = wp.uint8(legs[k].pressed)

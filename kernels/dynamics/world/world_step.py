@@ -19,7 +19,7 @@ from ..base_dynamics import LegSolve, add_leg, invert, motor_acceleration, solve
 from ..contact import BlockLaw, ContactState, PawContact, solve_contacts
 from ..leg_dynamics import PawKinematics
 from ..parameters import load_spring, load_stops, load_vec3
-from ..step import Robot, StepSettings, base_system, hold_base, leg_terms, load_leg, paw_contact
+from ..step import RobotModel, StepSettings, base_system, hold_base, leg_terms, load_leg, paw_contact
 
 wp.set_module_options({"enable_backward": False})
 
@@ -50,23 +50,23 @@ class StepSolution:
 
 @wp.func
 def solve_with_stops(
-    robot: Robot, settings: StepSettings, world: int, base: BaseState, force: vec3, moment: vec3, block: BlockLaw,
+    model: RobotModel, settings: StepSettings, world: int, base: BaseState, force: vec3, moment: vec3, block: BlockLaw,
     impulse: wp.array2d(dtype=vec3), legs: wp.array(dtype=LegStep), contacts: wp.array(dtype=PawContact),
 ) -> StepSolution:  # fmt: skip
     """Solve a step with given sets of pressed stops; see `solve_step`."""
     dt = settings.dt
-    g = wp.quat_rotate_inv(base.quat, load_vec3(robot.table, GRAVITY, world))
-    system = base_system(robot, world, base, g, force, moment)
+    g = wp.quat_rotate_inv(base.quat, load_vec3(model.table, GRAVITY, world))
+    system = base_system(model, world, base, g, force, moment)
     for k in range(legs.shape[0]):
-        own = load_leg(robot, world, k)
-        spring = load_spring(robot.table, k, world)
+        own = load_leg(model, world, k)
+        spring = load_spring(model.table, k, world)
         terms = leg_terms(
             own, spring, legs[k].angles, legs[k].rates, legs[k].torque, legs[k].rows, legs[k].pressed, base.ang, g, dt
         )
         legs[k].solve = terms.solve
         legs[k].paw = terms.paw
         system = add_leg(system, terms.dynamics, terms.solve)
-    inverse = hold_base(robot, world, invert(system))
+    inverse = hold_base(model, world, invert(system))
     lin_acc = solve_lin(inverse, system.force, system.moment)
     ang_acc = solve_ang(inverse, system.force, system.moment)
     lin = wp.quat_rotate_inv(base.quat, base.lin) + dt * lin_acc
@@ -75,7 +75,7 @@ def solve_with_stops(
         end = legs[k].rates + dt * motor_acceleration(legs[k].solve, lin_acc, ang_acc)
         legs[k].end = end
         contacts[k] = paw_contact(
-            robot, world, k, base, lin, ang, end, legs[k].rates, impulse[k, world], legs[k].pressed, legs[k].paw,
+            model, world, k, base, lin, ang, end, legs[k].rates, impulse[k, world], legs[k].pressed, legs[k].paw,
             legs[k].solve, inverse, block, dt,
         )  # fmt: skip
     change = solve_contacts(contacts, block, settings.max_sweeps, settings.tolerance)
@@ -107,7 +107,7 @@ def revise_stops(legs: wp.array(dtype=LegStep), slack: real, sets: int) -> bool:
 
 @wp.func
 def solve_step(
-    robot: Robot, settings: StepSettings, world: int, base: BaseState, force: vec3, moment: vec3, block: BlockLaw,
+    model: RobotModel, settings: StepSettings, world: int, base: BaseState, force: vec3, moment: vec3, block: BlockLaw,
     impulse: wp.array2d(dtype=vec3), legs: wp.array(dtype=LegStep), contacts: wp.array(dtype=PawContact),
 ) -> StepSolution:  # fmt: skip
     """Solve a step of one world, and write every leg's pressed stops, contact and motor rates at the end of the step.
@@ -120,7 +120,7 @@ def solve_step(
     """
     dt = settings.dt
     for k in range(legs.shape[0]):
-        rows = stop_rows(load_stops(robot.table, k, world), legs[k].angles, dt)
+        rows = stop_rows(load_stops(model.table, k, world), legs[k].angles, dt)
         legs[k].rows = rows
         legs[k].pressed = pressed_stops(rows, legs[k].rates, real(0.0), 0)
     slack = SLACK * settings.tolerance
@@ -128,7 +128,7 @@ def solve_step(
     sets = int(0)
     working = bool(True)
     while working:
-        solution = solve_with_stops(robot, settings, world, base, force, moment, block, impulse, legs, contacts)
+        solution = solve_with_stops(model, settings, world, base, force, moment, block, impulse, legs, contacts)
         sets += 1
         working = sets < MAX_SETS and revise_stops(legs, slack, sets)
     solution.sets = sets
