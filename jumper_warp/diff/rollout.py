@@ -267,7 +267,7 @@ class Rollout:
         if trajectory.q.shape != rows_of or trajectory.q.dtype != self.real:
             raise InputError(f"this rollout makes trajectories {rows_of}, got {trajectory.q.shape}")
         seeds = self._seeds(trajectory, {"q": q, "qd": qd, "torque": torque, "impulse": impulse, "safe": safe})
-        rows = modules.trajectory.Rows()
+        rows = modules.trajectory.TrajectoryArrays()
         for name in ("q", "qd", "torque", "impulse", "pressed"):
             setattr(rows, name, getattr(trajectory, name))
         gradients = modules.gradients.Gradients()
@@ -296,8 +296,8 @@ class Rollout:
         return found | {"wrench": gradients.wrench} | self._named(gradients.parameters)
 
     def _seeds(self, trajectory: Trajectory, given: dict[str, wp.array | None]) -> Any:
-        """Return the kernels' `Rows` of a gradient by a trajectory. Raises InputError: an array unlike it."""
-        seeds = self.dynamics.modules.trajectory.Rows()
+        """Return the gradient by a trajectory as `TrajectoryArrays`. Raises InputError: an array unlike it."""
+        seeds = self.dynamics.modules.trajectory.TrajectoryArrays()
         for name, array in given.items():
             like = getattr(trajectory, name)
             alike = isinstance(array, wp.array) and array.shape == like.shape and array.dtype == like.dtype
@@ -329,7 +329,7 @@ class Rollout:
     def _rows(self, count: int) -> Any:
         """Return an empty trajectory."""
         steps, n = count * self.substeps, self.num_worlds
-        rows = self.dynamics.modules.trajectory.Rows()
+        rows = self.dynamics.modules.trajectory.TrajectoryArrays()
         rows.q, rows.qd = (self._empty(steps // self.every + 1, size, n) for size in (19, 18))
         rows.torque = self._empty(steps, 12, n)
         rows.impulse = self._empty(steps, 4, n, dtype=self.dynamics.modules.scalar.vec3)

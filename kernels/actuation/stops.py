@@ -48,7 +48,7 @@ class StopParams:
 
 
 @wp.struct
-class StopRows:
+class StopRates:
     """The stops of one leg in a step; rows are lateral, outer, inner, outer + inner."""
 
     lower: vec4  # [rad/s] rate at the end of the step above which the lower stop is free
@@ -65,7 +65,7 @@ class StopForces:
 
 
 @wp.func
-def stop_rows(p: StopParams, angles: vec3, dt: real) -> StopRows:
+def stop_rates(p: StopParams, angles: vec3, dt: real) -> StopRates:
     """Return the stops in a step dt [s] from motor angles [rad]."""
     damping = wp.max(dt * p.ke + p.kd, real(1.0e-9))
     inside = p.ke / damping
@@ -75,21 +75,21 @@ def stop_rows(p: StopParams, angles: vec3, dt: real) -> StopRows:
     above = p.upper - angles
     below_fold = p.sum_lower - fold
     above_fold = p.sum_upper - fold
-    rows = StopRows()
-    rows.damping = damping
-    rows.lower = vec4(
+    stop_rates = StopRates()
+    stop_rates.damping = damping
+    stop_rates.lower = vec4(
         below[0] * wp.where(below[0] > real(0.0), inside, outside),
         below[1] * wp.where(below[1] > real(0.0), inside, outside),
         below[2] * wp.where(below[2] > real(0.0), inside, outside),
         below_fold * wp.where(below_fold > real(0.0), inside, outside),
     )
-    rows.upper = vec4(
+    stop_rates.upper = vec4(
         above[0] * wp.where(above[0] < real(0.0), inside, outside),
         above[1] * wp.where(above[1] < real(0.0), inside, outside),
         above[2] * wp.where(above[2] < real(0.0), inside, outside),
         above_fold * wp.where(above_fold < real(0.0), inside, outside),
     )
-    return rows
+    return stop_rates
 
 
 @wp.func
@@ -109,28 +109,28 @@ def row_side(pressed: int, i: int) -> int:
 
 
 @wp.func
-def pressed_stops(rows: StopRows, rates: vec3, slack: real, pressed: int) -> int:
+def pressed_stops(stop_rates: StopRates, rates: vec3, slack: real, pressed: int) -> int:
     """Return the set of stops that a leg presses which ends the step at `rates` [rad/s].
 
     pressed: the set that led to the rates; its stops are released, and others pressed, only beyond the slack [rad/s].
     """
     rate = vec4(rates[0], rates[1], rates[2], rates[1] + rates[2])
-    if pressed == 0 and not wp.max(wp.max(rows.lower - rate, rate - rows.upper)) > slack:
+    if pressed == 0 and not wp.max(wp.max(stop_rates.lower - rate, rate - stop_rates.upper)) > slack:
         return 0
     found = int(0)
     for i in range(ROWS):
         side = row_side(pressed, i)
-        if rows.lower[i] - rate[i] > wp.where(side == LOWER_STOP, -slack, slack):
+        if stop_rates.lower[i] - rate[i] > wp.where(side == LOWER_STOP, -slack, slack):
             found += LOWER_STOP << (ROW_BITS * i)
-        elif rate[i] - rows.upper[i] > wp.where(side == UPPER_STOP, -slack, slack):
+        elif rate[i] - stop_rates.upper[i] > wp.where(side == UPPER_STOP, -slack, slack):
             found += UPPER_STOP << (ROW_BITS * i)
     return found
 
 
 @wp.func
-def revised_stops(rows: StopRows, rates: vec3, slack: real, pressed: int, sets: int) -> int:
+def revised_stops(stop_rates: StopRates, rates: vec3, slack: real, pressed: int, sets: int) -> int:
     """Return the set to try after `sets` sets of a step, the last of which, `pressed`, led to `rates` [rad/s]."""
-    wanted = pressed_stops(rows, rates, slack, pressed)
+    wanted = pressed_stops(stop_rates, rates, slack, pressed)
     if wanted == pressed or sets < PRESS_ONLY:
         return wanted
     found = pressed
@@ -157,16 +157,16 @@ def change_one(pressed: int, wanted: int) -> int:
 
 
 @wp.func
-def row_torque(rows: StopRows, i: int, rate: real, pressed: int) -> real:
+def row_torque(stop_rates: StopRates, i: int, rate: real, pressed: int) -> real:
     """Return the torque [N m] of row i at its current rate [rad/s]."""
     side = row_side(pressed, i)
     if side == 0:
         return real(0.0)
-    return rows.damping * (wp.where(side == LOWER_STOP, rows.lower[i], rows.upper[i]) - rate)
+    return stop_rates.damping * (wp.where(side == LOWER_STOP, stop_rates.lower[i], stop_rates.upper[i]) - rate)
 
 
 @wp.func
-def stop_forces(rows: StopRows, rates: vec3, pressed: int, dt: real) -> StopForces:
+def stop_forces(stop_rates: StopRates, rates: vec3, pressed: int, dt: real) -> StopForces:
     """Return the forces of a leg's pressed stops; rates [rad/s] at the start of the step."""
     forces = StopForces()
     if pressed == 0:
@@ -174,12 +174,12 @@ def stop_forces(rows: StopRows, rates: vec3, pressed: int, dt: real) -> StopForc
     zero = real(0.0)
     both = vec3(zero, real(1.0), real(1.0))
     single = vec3(
-        row_torque(rows, 0, rates[0], pressed),
-        row_torque(rows, 1, rates[1], pressed),
-        row_torque(rows, 2, rates[2], pressed),
+        row_torque(stop_rates, 0, rates[0], pressed),
+        row_torque(stop_rates, 1, rates[1], pressed),
+        row_torque(stop_rates, 2, rates[2], pressed),
     )
-    forces.torque = single + row_torque(rows, 3, rates[1] + rates[2], pressed) * both
-    c = dt * rows.damping
+    forces.torque = single + row_torque(stop_rates, 3, rates[1] + rates[2], pressed) * both
+    c = dt * stop_rates.damping
     diagonal = vec3(
         wp.where(row_side(pressed, 0) != 0, c, zero),
         wp.where(row_side(pressed, 1) != 0, c, zero),

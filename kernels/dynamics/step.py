@@ -7,7 +7,7 @@ import warp as wp
 
 from ..actuation.joint_forces import JointParams, joint_forces
 from ..actuation.springs import LegSpring, spring_torque
-from ..actuation.stops import StopRows
+from ..actuation.stops import StopRates
 from ..kinematics.geometry import LegGeometry
 from ..layout import BASE, GRAVITY, LEG_ROWS, MU_DYNAMIC, MU_STATIC
 from ..scalar import real, vec3
@@ -88,7 +88,7 @@ def load_leg(model: RobotModel, world: int, k: int) -> LegParams:
 
 @wp.func
 def leg_terms(
-    params: LegParams, spring: LegSpring, angles: vec3, rates: vec3, torque: vec3, rows: StopRows, pressed: int,
+    params: LegParams, spring: LegSpring, angles: vec3, rates: vec3, torque: vec3, stop_rates: StopRates, pressed: int,
     omega: vec3, g: vec3, dt: real,
 ) -> LegTerms:  # fmt: skip
     """Return a leg's dynamics, its elimination with the pressed stops, and its paw."""
@@ -96,7 +96,7 @@ def leg_terms(
     joints = params.joints
     pose = leg_pose(geo, angles)
     dynamics = leg_dynamics(geo, params.masses, pose, rates, omega, g)
-    passive = joint_forces(joints, pose.loop, geo.front, rates, rows, pressed, dt)
+    passive = joint_forces(joints, pose.loop, geo.front, rates, stop_rates, pressed, dt)
     total = torque + passive.torque
     if spring.stiffness != real(0.0):
         total += spring_torque(spring, pose.loop)

@@ -51,7 +51,7 @@ class Commands:
 
 
 @wp.struct
-class Rows:
+class TrajectoryArrays:
     """A trajectory, or the gradient of a number by it; an empty array is one of zeros."""
 
     q: wp.array3d(dtype=real)  # [m], [rad], (K + 1, ROW_COORDS, num_worlds)
@@ -73,44 +73,47 @@ def row_base(pos: vec3, orientation: quat, com_lin: vec3, ang: vec3, com: vec3) 
 
 
 @wp.func
-def row_vec3(rows: wp.array3d(dtype=real), row: int, first: int, world: int) -> vec3:
+def row_vec3(values: wp.array3d(dtype=real), row: int, first: int, world: int) -> vec3:
     """Return three entries of a row."""
-    return vec3(rows[row, first, world], rows[row, first + 1, world], rows[row, first + 2, world])
+    return vec3(values[row, first, world], values[row, first + 1, world], values[row, first + 2, world])
 
 
 @wp.func
-def row_quat(rows: wp.array3d(dtype=real), row: int, first: int, world: int) -> quat:
+def row_quat(values: wp.array3d(dtype=real), row: int, first: int, world: int) -> quat:
     """Return four entries of a row."""
     return quat(
-        rows[row, first, world], rows[row, first + 1, world], rows[row, first + 2, world], rows[row, first + 3, world]
+        values[row, first, world],
+        values[row, first + 1, world],
+        values[row, first + 2, world],
+        values[row, first + 3, world],
     )
 
 
 @wp.func
-def store_row_vec3(rows: wp.array3d(dtype=real), row: int, first: int, world: int, v: vec3):
+def store_row_vec3(values: wp.array3d(dtype=real), row: int, first: int, world: int, v: vec3):
     """Write three entries of a row."""
     for i in range(3):
-        rows[row, first + i, world] = v[i]
+        values[row, first + i, world] = v[i]
 
 
 @wp.func
-def load_row_base(rows: Rows, row: int, world: int, com: vec3) -> BaseState:
+def load_row_base(trajectory: TrajectoryArrays, row: int, world: int, com: vec3) -> BaseState:
     """Return the base's state in a row."""
     return row_base(
-        row_vec3(rows.q, row, 0, world), row_quat(rows.q, row, 3, world),
-        row_vec3(rows.qd, row, 0, world), row_vec3(rows.qd, row, 3, world), com,
+        row_vec3(trajectory.q, row, 0, world), row_quat(trajectory.q, row, 3, world),
+        row_vec3(trajectory.qd, row, 0, world), row_vec3(trajectory.qd, row, 3, world), com,
     )  # fmt: skip
 
 
 @wp.func
-def store_row_base(rows: Rows, row: int, world: int, com: vec3, base: BaseState):
+def store_row_base(trajectory: TrajectoryArrays, row: int, world: int, com: vec3, base: BaseState):
     """Write the base's state to a row."""
     ang = wp.quat_rotate(base.quat, base.ang)
-    store_row_vec3(rows.q, row, 0, world, base.pos)
+    store_row_vec3(trajectory.q, row, 0, world, base.pos)
     for i in range(4):
-        rows.q[row, 3 + i, world] = base.quat[i]
-    store_row_vec3(rows.qd, row, 0, world, base.lin + wp.cross(ang, wp.quat_rotate(base.quat, com)))
-    store_row_vec3(rows.qd, row, 3, world, ang)
+        trajectory.q[row, 3 + i, world] = base.quat[i]
+    store_row_vec3(trajectory.qd, row, 0, world, base.lin + wp.cross(ang, wp.quat_rotate(base.quat, com)))
+    store_row_vec3(trajectory.qd, row, 3, world, ang)
 
 
 @wp.func

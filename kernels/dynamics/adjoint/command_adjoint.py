@@ -76,16 +76,16 @@ def add_targets(gradients: Gradients, arrived: Arrival, motor: int, world: int, 
 
 
 @wp.func
-def add_motor_constants(sums: Any, shared: Any, motor: int, seed: real, found: MotorAdjoint):
+def add_motor_constants(sums: Any, shared: Any, motor: int, cotangent: real, found: MotorAdjoint):
     """Add to the gradients by a motor's constants, and to `shared` by the latency; seed: gradient by its torque."""
-    add_motor(sums, shared, motor, seed, found.constants)
-    add_entry(shared, LATENCY_GRADIENT, seed * found.latency)
+    add_motor(sums, shared, motor, cotangent, found.constants)
+    add_entry(shared, LATENCY_GRADIENT, cotangent * found.latency)
 
 
 @wp.func
-def weighed_filter(target: vec3, angles: vec3, rates: vec3, params: FilterParams, seed: vec3) -> real:
+def filter_adjoint_scalar(target: vec3, angles: vec3, rates: vec3, params: FilterParams, cotangent: vec3) -> real:
     """Return the weighed sum of a leg's filtered targets."""
-    return wp.dot(seed, filter_leg(target, angles, rates, params))
+    return wp.dot(cotangent, filter_leg(target, angles, rates, params))
 
 
 @wp.func
@@ -96,14 +96,14 @@ def filter_gradient(
     """Return a leg's gradients for those by its filtered targets of a policy step."""
     m = 3 * leg
     found = FilterAdjoint()
-    seed = row_vec3(gradients.safe, step, m, world)
-    found.target = seed
+    cotangent = row_vec3(gradients.safe, step, m, world)
+    found.target = cotangent
     if actuation.filtered != 0:
         offset = actuation.motors.offset
         read = angles + vec3(offset[m, world], offset[m + 1, world], offset[m + 2, world])
         target = row_vec3(commands.target, step, m, world)
-        by_target, by_angles, by_rates, by_params, _seed = wp.grad(weighed_filter)(
-            target, read, rates, load_filter(actuation.limits, world), seed
+        by_target, by_angles, by_rates, by_params, _cotangent = wp.grad(filter_adjoint_scalar)(
+            target, read, rates, load_filter(actuation.limits, world), cotangent
         )
         found.target = by_target
         found.angles = by_angles

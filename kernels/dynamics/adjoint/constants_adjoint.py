@@ -5,10 +5,10 @@ import warp as wp
 from ...actuation.motors import MotorParams
 from ...scalar import real, vec3
 from ..step import RobotModel, StepSettings, load_leg
-from ..trajectory import Actuation, Commands, Rows, Timing, load_world_motor, row_vec3
+from ..trajectory import Actuation, Commands, Timing, TrajectoryArrays, load_world_motor, row_vec3
 from .command_adjoint import add_motor_constants, add_offsets, motor_gradient
 from .gradients import Gradients, thread_sums
-from .leg_adjoint import add_leg_constants, held_base, leg_gradient
+from .leg_adjoint import add_leg_constants, base_factors, leg_gradient
 from .leg_record import ANGLES, FILTER, RATES, LegRecord, get_base, get_base_weights, get_law, get_leg_weights, get_vec
 from .rollout_adjoint import generate_adjoints
 from .rollout_legs_adjoint import Span, first_entry
@@ -51,8 +51,8 @@ def leg_constants_kernel(
     model: RobotModel,
     settings: StepSettings,
     timing: Timing,
-    rows: Rows,
-    seeds: Rows,
+    trajectory: TrajectoryArrays,
+    cotangent: TrajectoryArrays,
     span: Span,
     record: LegRecord,
     # in, out
@@ -73,9 +73,11 @@ def leg_constants_kernel(
         i = at.entry
         base = get_base(record, i, world)
         law = get_law(record, i, world, leg)
-        held = held_base(record, world, i, dt, base, get_base_weights(record, i, world))
+        held = base_factors(record, world, i, dt, base, get_base_weights(record, i, world))
         weights = get_leg_weights(record, i, world, leg)
-        found = leg_gradient(model, own, dt, world, leg, rows, seeds, at.step, i, record, base, law, held, weights)
+        found = leg_gradient(
+            model, own, dt, world, leg, trajectory, cotangent, at.step, i, record, base, law, held, weights
+        )
         add_leg_constants(sums, leg, law, found)
 
 
@@ -88,7 +90,7 @@ def motor_constants_kernel(
     actuation: Actuation,
     commands: Commands,
     safe: wp.array3d(dtype=real),
-    seeds: Rows,
+    cotangent: TrajectoryArrays,
     span: Span,
     record: LegRecord,
     # in, out
@@ -113,8 +115,8 @@ def motor_constants_kernel(
         angles = get_vec(record, at.entry, ANGLES, world, leg)
         rates = get_vec(record, at.entry, RATES, world, leg)
         torque = settings.dt * get_leg_weights(record, at.entry, world, leg).rates
-        if seeds.torque.shape[0] > 0:
-            torque += row_vec3(seeds.torque, at.step, 3 * leg, world)
+        if cotangent.torque.shape[0] > 0:
+            torque += row_vec3(cotangent.torque, at.step, 3 * leg, world)
         for c in range(motors.shape[0]):
             by_motor = motor_gradient(
                 motors[c], late, commands, safe, timing, settings.dt, at.step, 3 * leg + c, world, angles[c], rates[c]

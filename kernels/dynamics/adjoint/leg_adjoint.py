@@ -9,7 +9,7 @@ import warp as wp
 
 from ...actuation.joint_forces import JointParams
 from ...actuation.springs import LegSpring
-from ...actuation.stops import StopParams, stop_rows
+from ...actuation.stops import StopParams, stop_rates
 from ...kinematics.geometry import LegGeometry
 from ...lanes import any_world, mat_from_leg, sum_legs, sum_quat, sum_vec, vec_from_leg
 from ...layout import BASE, GRAVITY, LEG_ROWS, MU_DYNAMIC, MU_STATIC
@@ -23,7 +23,7 @@ from ..inertia import MassMoments
 from ..leg_dynamics import LegMasses
 from ..parameters import load_moments, load_spring, load_stops, load_vec3
 from ..step import LegParams, RobotModel, base_system, hold_base, leg_terms
-from ..trajectory import Rows, row_vec3
+from ..trajectory import TrajectoryArrays, row_vec3
 from .gradients import (
     ThreadSums,
     add_entry,
@@ -56,7 +56,7 @@ from .leg_record import (
     put_solve,
     put_vec,
 )
-from .virtual_power import BaseFactors, LegFactors, add, base_action, leg_action, turned
+from .virtual_power import BaseFactors, LegFactors, add, base_action, leg_action, rotation_adjoint_scalar
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
 
@@ -95,17 +95,19 @@ def leg_law(c: PawContact, law: PawLaw, impulse: vec3, point: vec3) -> LegLaw:
 @wp.func
 def replay_leg(
     model: RobotModel, own: LegParams, dt: real, world: int, leg: int, force: vec3, moment: vec3,
-    first_impulse: wp.array2d(dtype=vec3), rows: Rows, step: int, i: int, record: LegRecord,
+    first_impulse: wp.array2d(dtype=vec3), trajectory: TrajectoryArrays, step: int, i: int, record: LegRecord,
 ):  # fmt: skip
     """Make a step again from entry i of the record; see `replay_step`. All threads write the base, the same bits."""
     base = get_base(record, i, world)
     rates = get_vec(record, i, RATES, world, leg)
     angles = get_vec(record, i, ANGLES, world, leg)
     g = wp.quat_rotate_inv(base.quat, load_vec3(model.table, GRAVITY, world))
-    torque = row_vec3(rows.torque, step, 3 * leg, world)
-    stops = stop_rows(load_stops(model.table, leg, world), angles, dt)
+    torque = row_vec3(trajectory.torque, step, 3 * leg, world)
+    stops = stop_rates(load_stops(model.table, leg, world), angles, dt)
     spring = load_spring(model.table, leg, world)
-    terms = leg_terms(own, spring, angles, rates, torque, stops, int(rows.pressed[step, leg, world]), base.ang, g, dt)
+    terms = leg_terms(
+        own, spring, angles, rates, torque, stops, int(trajectory.pressed[step, leg, world]), base.ang, g, dt
+    )
     share = add_leg(BaseSystem(), terms.dynamics, terms.solve)
     system = sum_systems(base_system(model, world, base, g, force, moment), share)
     inverse = hold_base(model, world, invert(system))
@@ -116,7 +118,7 @@ def replay_leg(
     push = vec3(real(0.0))
     twist = vec3(real(0.0))
     point = vec3(real(0.0))
-    impulse = wp.quat_rotate_inv(base.quat, rows.impulse[step, leg, world])
+    impulse = wp.quat_rotate_inv(base.quat, trajectory.impulse[step, leg, world])
     touches = wp.dot(impulse, impulse) > real(0.0)
     if touches:
         c = contact_at(model, leg, base, paw, solve, inverse, impulse)
@@ -141,7 +143,7 @@ def replay_leg(
         velocity = old_lin + lin + wp.cross(base.ang + ang, point) + c.jacobian * ahead
         old_impulse = first_impulse[leg, world]
         if step > 0:
-            old_impulse = rows.impulse[step - 1, leg, world]
+            old_impulse = trajectory.impulse[step - 1, leg, world]
         law = paw_law(model, world, leg, c, before, velocity, wp.quat_rotate_inv(base.quat, old_impulse))
     if any_world(any_leg(law.mode != SEPARATE)):
         put_law_row(record, i, world, leg, inverted_laws(c, law, leg))
@@ -209,14 +211,14 @@ def inverted_laws(c: PawContact, law: PawLaw, leg: int) -> LawRow:
 
 
 @wp.func
-def multiplier(row: LawRow, seed: vec3) -> vec3:
+def multiplier(row: LawRow, impulse_cotangent: vec3) -> vec3:
     """Return the multiplier of a paw's law for the gradients by all paws' impulses; seed: 0 where separated."""
-    found = row.a * vec_from_leg(seed, 0) + row.b * vec_from_leg(seed, 1)
-    return -(found + row.c * vec_from_leg(seed, 2) + row.d * vec_from_leg(seed, 3))
+    found = row.a * vec_from_leg(impulse_cotangent, 0) + row.b * vec_from_leg(impulse_cotangent, 1)
+    return -(found + row.c * vec_from_leg(impulse_cotangent, 2) + row.d * vec_from_leg(impulse_cotangent, 3))
 
 
 @wp.func
-def held_base(record: LegRecord, world: int, i: int, dt: real, base: BaseState, weights: BaseWeights) -> BaseFactors:
+def base_factors(record: LegRecord, world: int, i: int, dt: real, base: BaseState, weights: BaseWeights) -> BaseFactors:
     """Return what is held of the base in a step."""
     ahead = get_base(record, i + 1, world)
     held = BaseFactors()
@@ -230,9 +232,9 @@ def held_base(record: LegRecord, world: int, i: int, dt: real, base: BaseState, 
 
 
 @wp.func
-def held_leg(
-    record: LegRecord, rows: Rows, seeds: Rows, world: int, step: int, i: int, leg: int, dt: real, law: LegLaw,
-    weights: LegWeights,
+def leg_factors(
+    record: LegRecord, trajectory: TrajectoryArrays, cotangent: TrajectoryArrays, world: int, step: int, i: int,
+    leg: int, dt: real, law: LegLaw, weights: LegWeights,
 ) -> LegFactors:  # fmt: skip
     """Return what is held of a leg in a step."""
     held = LegFactors()
@@ -240,12 +242,12 @@ def held_leg(
     held.rates = get_vec(record, i + 1, RATES, world, leg)
     held.acc = (held.rates - get_vec(record, i, RATES, world, leg)) / dt
     held.mode = law.mode
-    held.pressed = int(rows.pressed[step, leg, world])
+    held.pressed = int(trajectory.pressed[step, leg, world])
     if law.mode != SEPARATE:
         held.impulse = law.impulse
         held.law = weights.law
-        if seeds.impulse.shape[0] > 0:
-            held.push = seeds.impulse[step, leg, world]
+        if cotangent.impulse.shape[0] > 0:
+            held.push = cotangent.impulse[step, leg, world]
     return held
 
 
@@ -269,11 +271,12 @@ class LegGradient:
 
 @wp.func
 def leg_gradient(
-    model: RobotModel, own: LegParams, dt: real, world: int, leg: int, rows: Rows, seeds: Rows, step: int, i: int,
-    record: LegRecord, base: BaseState, law: LegLaw, held: BaseFactors, weights: LegWeights,
+    model: RobotModel, own: LegParams, dt: real, world: int, leg: int, trajectory: TrajectoryArrays,
+    cotangent: TrajectoryArrays, step: int, i: int, record: LegRecord, base: BaseState, law: LegLaw, held: BaseFactors,
+    weights: LegWeights,
 ) -> LegGradient:  # fmt: skip
     """Return the gradient of `leg_action` in a step."""
-    factors = held_leg(record, rows, seeds, world, step, i, leg, dt, law, weights)
+    factors = leg_factors(record, trajectory, cotangent, world, step, i, leg, dt, law, weights)
     g = wp.quat_rotate_inv(base.quat, load_vec3(model.table, GRAVITY, world))
     angles = get_vec(record, i, ANGLES, world, leg)
     rates = get_vec(record, i, RATES, world, leg)
@@ -314,30 +317,30 @@ class StepWeights:
 
 @wp.func
 def find_weights(
-    record: LegRecord, world: int, leg: int, seeds: Rows, step: int, i: int, base: BaseState, law: LegLaw,
-    lin_seed: vec3, ang_seed: vec3, rate_seed: vec3,
+    record: LegRecord, world: int, leg: int, cotangent: TrajectoryArrays, step: int, i: int, base: BaseState,
+    law: LegLaw, lin_cotangent: vec3, ang_cotangent: vec3, rate_cotangent: vec3,
 ) -> StepWeights:  # fmt: skip
     """Return the multipliers of a step for the gradients by the velocities at its end; see `find_multipliers`."""
     inverse = get_inverse(record, i, world)
     solve = get_solve(record, i, world, leg)
     found = StepWeights()
-    found.lin = lin_seed
-    found.ang = ang_seed
-    found.rates = rate_seed
-    push = lin_seed - sum_vec(wp.transpose(solve.to_lin) * rate_seed)
-    twist = ang_seed - sum_vec(wp.transpose(solve.to_ang) * rate_seed)
+    found.lin = lin_cotangent
+    found.ang = ang_cotangent
+    found.rates = rate_cotangent
+    push = lin_cotangent - sum_vec(wp.transpose(solve.to_lin) * rate_cotangent)
+    twist = ang_cotangent - sum_vec(wp.transpose(solve.to_ang) * rate_cotangent)
     found.base.lin = solve_lin(inverse, push, twist)
     found.base.ang = solve_ang(inverse, push, twist)
-    found.leg.rates = solve.inverse * rate_seed - solve.to_lin * found.base.lin - solve.to_ang * found.base.ang
+    found.leg.rates = solve.inverse * rate_cotangent - solve.to_lin * found.base.lin - solve.to_ang * found.base.ang
     touches = law.mode != SEPARATE
-    seed = vec3(real(0.0))
+    impulse_cotangent = vec3(real(0.0))
     if touches:
-        seed = found.base.lin + wp.cross(found.base.ang, law.point) + law.jacobian * found.leg.rates
-        if seeds.impulse.shape[0] > 0:
-            seed += wp.quat_rotate_inv(base.quat, seeds.impulse[step, leg, world])
+        impulse_cotangent = found.base.lin + wp.cross(found.base.ang, law.point) + law.jacobian * found.leg.rates
+        if cotangent.impulse.shape[0] > 0:
+            impulse_cotangent += wp.quat_rotate_inv(base.quat, cotangent.impulse[step, leg, world])
     if any_world(any_leg(touches)):
         y = vec3(real(0.0))
-        found.leg.law = multiplier(get_law_row(record, i, world, leg), seed)
+        found.leg.law = multiplier(get_law_row(record, i, world, leg), impulse_cotangent)
         if touches:
             y = wp.transpose(law.by_velocity) * found.leg.law
         joint = wp.transpose(law.jacobian) * y
@@ -354,32 +357,35 @@ def find_weights(
 
 @wp.func
 def reverse_leg(
-    model: RobotModel, own: LegParams, dt: real, world: int, leg: int, force: vec3, moment: vec3, rows: Rows,
-    seeds: Rows, step: int, i: int, record: LegRecord, adj: LegAdjoint, keeps: bool,
+    model: RobotModel, own: LegParams, dt: real, world: int, leg: int, force: vec3, moment: vec3,
+    trajectory: TrajectoryArrays, cotangent: TrajectoryArrays, step: int, i: int, record: LegRecord, adj: LegAdjoint,
+    keeps: bool,
 ) -> LegAdjoint:  # fmt: skip
     """Run a step backwards, see `reverse_step`; if it `keeps`, it records what its equations are weighed with."""
     base = get_base(record, i, world)
     law = get_law(record, i, world, leg)
     new_velocity = adj.base.lin + dt * adj.base.pos
-    quat_adj, ang_seed, _dt, _seed = wp.grad(turned)(
+    quat_adj, ang_cotangent, _dt, _quat_adj = wp.grad(rotation_adjoint_scalar)(
         base.quat, row_vec3(record.base, i + 1, 10, world), dt, adj.base.quat
     )
     weights = find_weights(
-        record, world, leg, seeds, step, i, base, law, wp.quat_rotate_inv(base.quat, new_velocity),
-        ang_seed + adj.base.ang, adj.rates + dt * adj.angles,
+        record, world, leg, cotangent, step, i, base, law, wp.quat_rotate_inv(base.quat, new_velocity),
+        ang_cotangent + adj.base.ang, adj.rates + dt * adj.angles,
     )  # fmt: skip
     by_base = weights.base
     # the equations of motion
-    held = held_base(record, world, i, dt, base, by_base)
-    found = leg_gradient(model, own, dt, world, leg, rows, seeds, step, i, record, base, law, held, weights.leg)
-    by_base.seeds.velocity = weights.lin
-    by_base.seeds.new_velocity = new_velocity
-    by_base.seeds.gravity = sum_vec(found.gravity)
+    held = base_factors(record, world, i, dt, base, by_base)
+    found = leg_gradient(
+        model, own, dt, world, leg, trajectory, cotangent, step, i, record, base, law, held, weights.leg
+    )
+    by_base.cotangent.velocity = weights.lin
+    by_base.cotangent.new_velocity = new_velocity
+    by_base.cotangent.gravity = sum_vec(found.gravity)
     gravity = load_vec3(model.table, GRAVITY, world)
-    body, com, weight, force_adj, moment_adj, base_turn, lin_adj, base_omega, _base, _seeds, _base_step = wp.grad(
+    body, com, weight, force_adj, moment_adj, base_turn, lin_adj, base_omega, _base, _cotangent, _base_step = wp.grad(
         base_action
     )(load_moments(model.table, BASE, world), base_com(model.table, world), gravity, force, moment, base.quat,
-      base.lin, base.ang, held, by_base.seeds, dt)  # fmt: skip
+      base.lin, base.ang, held, by_base.cotangent, dt)  # fmt: skip
     if keeps:
         put_base_weights(record, i, world, by_base)
         put_leg_weights(record, i, world, leg, weights.leg)

@@ -7,7 +7,7 @@ from ...state import BaseState
 from ..base_dynamics import BaseInverse, LegSolve
 from ..contact import SEPARATE
 from ..trajectory import row_quat, row_vec3, store_row_vec3
-from .virtual_power import BaseSeeds
+from .virtual_power import BaseCotangent
 
 wp.set_module_options({"enable_backward": False})
 
@@ -46,7 +46,7 @@ class BaseWeights:
 
     lin: vec3  # virtual velocity
     ang: vec3
-    seeds: BaseSeeds
+    cotangent: BaseCotangent
 
 
 @wp.struct
@@ -293,9 +293,9 @@ def get_base_weights(record: LegRecord, entry: int, world: int) -> BaseWeights:
     weights = BaseWeights()
     weights.lin = row_vec3(record.base, entry, BASE_WEIGHTS, world)
     weights.ang = row_vec3(record.base, entry, BASE_WEIGHTS + 3, world)
-    weights.seeds.velocity = row_vec3(record.base, entry, BASE_WEIGHTS + 6, world)
-    weights.seeds.new_velocity = row_vec3(record.base, entry, BASE_WEIGHTS + 9, world)
-    weights.seeds.gravity = row_vec3(record.base, entry, BASE_WEIGHTS + 12, world)
+    weights.cotangent.velocity = row_vec3(record.base, entry, BASE_WEIGHTS + 6, world)
+    weights.cotangent.new_velocity = row_vec3(record.base, entry, BASE_WEIGHTS + 9, world)
+    weights.cotangent.gravity = row_vec3(record.base, entry, BASE_WEIGHTS + 12, world)
     return weights
 
 
@@ -304,6 +304,6 @@ def put_base_weights(record: LegRecord, entry: int, world: int, weights: BaseWei
     """Write the base's weights."""
     store_row_vec3(record.base, entry, BASE_WEIGHTS, world, weights.lin)
     store_row_vec3(record.base, entry, BASE_WEIGHTS + 3, world, weights.ang)
-    store_row_vec3(record.base, entry, BASE_WEIGHTS + 6, world, weights.seeds.velocity)
-    store_row_vec3(record.base, entry, BASE_WEIGHTS + 9, world, weights.seeds.new_velocity)
-    store_row_vec3(record.base, entry, BASE_WEIGHTS + 12, world, weights.seeds.gravity)
+    store_row_vec3(record.base, entry, BASE_WEIGHTS + 6, world, weights.cotangent.velocity)
+    store_row_vec3(record.base, entry, BASE_WEIGHTS + 9, world, weights.cotangent.new_velocity)
+    store_row_vec3(record.base, entry, BASE_WEIGHTS + 12, world, weights.cotangent.gravity)

@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from ...actuation.stops import stop_rows
+from ...actuation.stops import stop_rates
 from ...layout import GRAVITY
 from ...scalar import real, vec3
 from ...state import BaseState
@@ -13,7 +13,7 @@ from ..contact_laws import PawLaw, contact_at, contact_point, paw_law
 from ..leg_dynamics import PawKinematics
 from ..parameters import load_spring, load_stops, load_vec3
 from ..step import LegParams, RobotModel, base_system, hold_base, leg_terms
-from ..trajectory import Rows, row_vec3
+from ..trajectory import TrajectoryArrays, row_vec3
 from .virtual_power import BaseFactors, LegFactors
 
 wp.set_module_options({"enable_backward": False})
@@ -52,29 +52,29 @@ class LegReverse:
     torque: vec3  # by the torques
     virtual_rates: vec3  # multipliers of the motors' equations
     law: PawLaw
-    seed: vec3  # by the paw's impulse, then the multiplier of its law
+    multiplier: vec3  # by the paw's impulse, then the multiplier of its law
 
 
 @wp.struct
 class Multipliers:
     """Gradients of the base's velocities at the end of a step, and what solving M for them gives; body axes."""
 
-    lin_seed: vec3
-    ang_seed: vec3
+    lin_cotangent: vec3
+    ang_cotangent: vec3
     lin: vec3
     ang: vec3
 
 
 @wp.func
 def solve_system(
-    record: StepRecord, at: StepPlace, lin_seed: vec3, ang_seed: vec3, legs: wp.array(dtype=LegReverse)
+    record: StepRecord, at: StepPlace, lin_cotangent: vec3, ang_cotangent: vec3, legs: wp.array(dtype=LegReverse)
 ) -> Multipliers:
     """Solve M m = seeds, for the motors those by their rates; their m is written to `virtual_rates`."""
     m = Multipliers()
-    m.lin_seed = lin_seed
-    m.ang_seed = ang_seed
-    force = lin_seed
-    moment = ang_seed
+    m.lin_cotangent = lin_cotangent
+    m.ang_cotangent = ang_cotangent
+    force = lin_cotangent
+    moment = ang_cotangent
     for k in range(legs.shape[0]):
         solve = record.legs[at.world, at.entry, k]
         force -= wp.transpose(solve.to_lin) * legs[k].rates
@@ -90,7 +90,8 @@ def solve_system(
 
 @wp.func
 def replay_step(
-    model: RobotModel, params: wp.array(dtype=LegParams), at: StepPlace, rows: Rows, record: StepRecord
+    model: RobotModel, params: wp.array(dtype=LegParams), at: StepPlace, trajectory: TrajectoryArrays,
+    record: StepRecord,
 ):  # fmt: skip
     """Make a step again from its entry of the record, with known torques and impulses; writes the record."""
     dt, world, step, i = at.dt, at.world, at.step, at.entry
@@ -98,10 +99,10 @@ def replay_step(
     g = wp.quat_rotate_inv(base.quat, load_vec3(model.table, GRAVITY, world))
     system = base_system(model, world, base, g, at.force, at.moment)
     for k in range(record.legs.shape[2]):
-        torque = row_vec3(rows.torque, step, 3 * k, world)
-        pressed = int(rows.pressed[step, k, world])
+        torque = row_vec3(trajectory.torque, step, 3 * k, world)
+        pressed = int(trajectory.pressed[step, k, world])
         angles = record.angles[world, i, k]
-        stops = stop_rows(load_stops(model.table, k, world), angles, dt)
+        stops = stop_rates(load_stops(model.table, k, world), angles, dt)
         spring = load_spring(model.table, k, world)
         rates = record.rates[world, i, k]
         terms = leg_terms(params[k], spring, angles, rates, torque, stops, pressed, base.ang, g, dt)
@@ -113,7 +114,7 @@ def replay_step(
     force_impulse = dt * system.force
     moment_impulse = dt * system.moment
     for k in range(record.legs.shape[2]):
-        impulse = wp.quat_rotate_inv(base.quat, rows.impulse[step, k, world])
+        impulse = wp.quat_rotate_inv(base.quat, trajectory.impulse[step, k, world])
         if wp.dot(impulse, impulse) > real(0.0):
             solve = record.legs[world, i, k]
             paw = record.paws[world, i, k]
@@ -170,7 +171,7 @@ def solve_laws(
     contacts: wp.array(dtype=PawContact), legs: wp.array(dtype=LegReverse), matrix: wp.array2d(dtype=real),
     vector: wp.array(dtype=real),
 ):  # fmt: skip
-    """Replace the gradients of the paws' impulses in `seed` by the multipliers of their laws.
+    """Replace the gradients of the paws' impulses in `multiplier` by the multipliers of their laws.
 
     matrix, vector: of shape (12, 12) and (12,), overwritten.
     """
@@ -191,21 +192,22 @@ def solve_laws(
                             matrix[row + r, col + s] = block[r, s]
                     col += 3
             for r in range(3):
-                vector[row + r] = -legs[k].seed[r]
+                vector[row + r] = -legs[k].multiplier[r]
             row += 3
     solve_linear(matrix, vector, row)
     row = int(0)
     for k in range(legs.shape[0]):
-        legs[k].seed = vec3(real(0.0))
+        legs[k].multiplier = vec3(real(0.0))
         if legs[k].law.mode != SEPARATE:
-            legs[k].seed = vec3(vector[row], vector[row + 1], vector[row + 2])
+            legs[k].multiplier = vec3(vector[row], vector[row + 1], vector[row + 2])
             row += 3
 
 
 @wp.func
 def load_laws(
-    model: RobotModel, at: StepPlace, first_impulse: wp.array2d(dtype=vec3), rows: Rows, record: StepRecord,
-    m: Multipliers, seeds: Rows, legs: wp.array(dtype=LegReverse), contacts: wp.array(dtype=PawContact),
+    model: RobotModel, at: StepPlace, first_impulse: wp.array2d(dtype=vec3), trajectory: TrajectoryArrays,
+    record: StepRecord, m: Multipliers, cotangent: TrajectoryArrays, legs: wp.array(dtype=LegReverse),
+    contacts: wp.array(dtype=PawContact),
 ) -> bool:  # fmt: skip
     """Write the paws' laws at the solution, and the gradients by their impulses; returns whether any touches."""
     world, i = at.world, at.entry
@@ -217,7 +219,7 @@ def load_laws(
     touching = bool(False)
     for k in range(legs.shape[0]):
         legs[k].law = PawLaw()
-        impulse = wp.quat_rotate_inv(base.quat, rows.impulse[at.step, k, world])
+        impulse = wp.quat_rotate_inv(base.quat, trajectory.impulse[at.step, k, world])
         if wp.dot(impulse, impulse) > real(0.0):
             paw = record.paws[world, i, k]
             c = contact_at(model, k, base, paw, record.legs[world, i, k], record.inverse[world, i], impulse)
@@ -226,15 +228,15 @@ def load_laws(
             velocity = lin + wp.cross(ang, point) + c.jacobian * record.rates[world, i + 1, k]
             old_impulse = first_impulse[k, world]
             if at.step > 0:
-                old_impulse = rows.impulse[at.step - 1, k, world]
+                old_impulse = trajectory.impulse[at.step - 1, k, world]
             old_impulse = wp.quat_rotate_inv(base.quat, old_impulse)
             law = paw_law(model, world, k, c, before, velocity, old_impulse)
-            seed = m.lin + wp.cross(m.ang, point) + c.jacobian * legs[k].virtual_rates
-            if seeds.impulse.shape[0] > 0:
-                seed += wp.quat_rotate_inv(base.quat, seeds.impulse[at.step, k, world])
+            impulse_cotangent = m.lin + wp.cross(m.ang, point) + c.jacobian * legs[k].virtual_rates
+            if cotangent.impulse.shape[0] > 0:
+                impulse_cotangent += wp.quat_rotate_inv(base.quat, cotangent.impulse[at.step, k, world])
             contacts[k] = c
             legs[k].law = law
-            legs[k].seed = seed
+            legs[k].multiplier = impulse_cotangent
             touching = touching or law.mode != SEPARATE
     return touching
 
@@ -251,12 +253,12 @@ def add_laws(
     for k in range(legs.shape[0]):
         if legs[k].law.mode != SEPARATE:
             c = contacts[k]
-            y = wp.transpose(legs[k].law.by_velocity) * legs[k].seed
+            y = wp.transpose(legs[k].law.by_velocity) * legs[k].multiplier
             joint = wp.transpose(c.jacobian) * y
             more_lin += c.to_lin * y
             more_ang += c.to_ang * y
-            m.lin_seed += y
-            m.ang_seed += wp.cross(contact_point(model, k, record.paws[at.world, at.entry, k], c), y)
+            m.lin_cotangent += y
+            m.ang_cotangent += wp.cross(contact_point(model, k, record.paws[at.world, at.entry, k], c), y)
             legs[k].rates = legs[k].rates + joint
             legs[k].virtual_rates = legs[k].virtual_rates + record.legs[at.world, at.entry, k].inverse * joint
     m.lin += more_lin
@@ -269,23 +271,24 @@ def add_laws(
 
 @wp.func
 def find_multipliers(
-    model: RobotModel, at: StepPlace, first_impulse: wp.array2d(dtype=vec3), rows: Rows, seeds: Rows,
-    record: StepRecord, lin_seed: vec3, ang_seed: vec3, legs: wp.array(dtype=LegReverse),
-    contacts: wp.array(dtype=PawContact), matrix: wp.array2d(dtype=real), vector: wp.array(dtype=real),
+    model: RobotModel, at: StepPlace, first_impulse: wp.array2d(dtype=vec3), trajectory: TrajectoryArrays,
+    cotangent: TrajectoryArrays, record: StepRecord, lin_cotangent: vec3, ang_cotangent: vec3,
+    legs: wp.array(dtype=LegReverse), contacts: wp.array(dtype=PawContact), matrix: wp.array2d(dtype=real),
+    vector: wp.array(dtype=real),
 ) -> Multipliers:  # fmt: skip
     """Return the multipliers of a step's equations for the gradients by the velocities at its end, body axes.
 
     legs: `rates` are those of the motors; to them the share of the contact laws is added.
     """
-    m = solve_system(record, at, lin_seed, ang_seed, legs)
-    if load_laws(model, at, first_impulse, rows, record, m, seeds, legs, contacts):
+    m = solve_system(record, at, lin_cotangent, ang_cotangent, legs)
+    if load_laws(model, at, first_impulse, trajectory, record, m, cotangent, legs, contacts):
         solve_laws(contacts, legs, matrix, vector)
         m = add_laws(model, at, record, m, legs, contacts)
     return m
 
 
 @wp.func
-def held_base(at: StepPlace, record: StepRecord, m: Multipliers) -> BaseFactors:
+def base_factors(at: StepPlace, record: StepRecord, m: Multipliers) -> BaseFactors:
     """Return what is held of the base."""
     base = record.base[at.world, at.entry]
     ahead = record.base[at.world, at.entry + 1]
@@ -300,9 +303,9 @@ def held_base(at: StepPlace, record: StepRecord, m: Multipliers) -> BaseFactors:
 
 
 @wp.func
-def held_leg(
-    at: StepPlace, k: int, rows: Rows, seeds: Rows, record: StepRecord, legs: wp.array(dtype=LegReverse),
-    contacts: wp.array(dtype=PawContact),
+def leg_factors(
+    at: StepPlace, k: int, trajectory: TrajectoryArrays, cotangent: TrajectoryArrays, record: StepRecord,
+    legs: wp.array(dtype=LegReverse), contacts: wp.array(dtype=PawContact),
 ) -> LegFactors:  # fmt: skip
     """Return what is held of a leg."""
     held = LegFactors()
@@ -310,10 +313,10 @@ def held_leg(
     held.rates = record.rates[at.world, at.entry + 1, k]
     held.acc = (held.rates - record.rates[at.world, at.entry, k]) / at.dt
     held.mode = legs[k].law.mode
-    held.pressed = int(rows.pressed[at.step, k, at.world])
+    held.pressed = int(trajectory.pressed[at.step, k, at.world])
     if held.mode != SEPARATE:
         held.impulse = contacts[k].impulse
-        held.law = legs[k].seed
-        if seeds.impulse.shape[0] > 0:
-            held.push = seeds.impulse[at.step, k, at.world]
+        held.law = legs[k].multiplier
+        if cotangent.impulse.shape[0] > 0:
+            held.push = cotangent.impulse[at.step, k, at.world]
     return held

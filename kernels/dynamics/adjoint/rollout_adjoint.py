@@ -17,8 +17,8 @@ from ..trajectory import (
     Actuation,
     Arrival,
     Commands,
-    Rows,
     Timing,
+    TrajectoryArrays,
     arrival,
     load_filter,
     load_row_base,
@@ -34,39 +34,41 @@ from .command_adjoint import (
     add_motor_constants,
     add_offsets,
     add_targets,
+    filter_adjoint_scalar,
     filter_gradient,
     motor_gradient,
-    weighed_filter,
 )
 from .gradients import GRADIENT_ROWS, Gradients, add_com, add_filter
 from .multipliers import LegReverse, StepPlace, StepRecord, replay_step
 from .step_adjoint import reverse_step
-from .virtual_power import BaseFactors, BaseSeeds, LegFactors, base_action, leg_action, turned
+from .virtual_power import BaseCotangent, BaseFactors, LegFactors, base_action, leg_action, rotation_adjoint_scalar
 
 wp.set_module_options({"enable_backward": False})
 
 
 @wp.func
-def weighed_row(pos: vec3, orientation: quat, com_lin: vec3, ang: vec3, com: vec3, seed: BaseState) -> real:
+def row_adjoint_scalar(pos: vec3, orientation: quat, com_lin: vec3, ang: vec3, com: vec3, cotangent: BaseState) -> real:
     """Return the weighed state of the base that a row holds."""
     base = row_base(pos, orientation, com_lin, ang, com)
     return (
-        wp.dot(seed.pos, base.pos)
-        + wp.dot(seed.quat, base.quat)
-        + wp.dot(seed.lin, base.lin)
-        + wp.dot(seed.ang, base.ang)
+        wp.dot(cotangent.pos, base.pos)
+        + wp.dot(cotangent.quat, base.quat)
+        + wp.dot(cotangent.lin, base.lin)
+        + wp.dot(cotangent.ang, base.ang)
     )
 
 
 @wp.func
-def weighed_store(orientation: quat, lin: vec3, omega: vec3, com: vec3, lin_seed: vec3, ang_seed: vec3) -> real:
+def store_adjoint_scalar(
+    orientation: quat, lin: vec3, omega: vec3, com: vec3, lin_cotangent: vec3, ang_cotangent: vec3
+) -> real:
     """Return the weighed velocities that a row holds of a state of the base."""
     ang = wp.quat_rotate(orientation, omega)
-    return wp.dot(ang_seed, ang) + wp.dot(lin_seed, lin + wp.cross(ang, wp.quat_rotate(orientation, com)))
+    return wp.dot(ang_cotangent, ang) + wp.dot(lin_cotangent, lin + wp.cross(ang, wp.quat_rotate(orientation, com)))
 
 
 @wp.struct
-class RowSeeds:
+class RowCotangent:
     """Gradient by the base's entries of a row."""
 
     pos: vec3
@@ -77,37 +79,39 @@ class RowSeeds:
 
 
 @wp.func
-def leave_row(rows: Rows, model: RobotModel, row: int, world: int, adj: BaseState, com_before: vec3) -> RowSeeds:
+def load_row_base_adjoint(
+    trajectory: TrajectoryArrays, model: RobotModel, row: int, world: int, adj: BaseState, com_before: vec3
+) -> RowCotangent:
     """Return the gradient by a row's entries for that by the base's state which is read from it."""
     com = base_com(model.table, world)
-    pos, orientation, lin, ang, com_adj, _seed = wp.grad(weighed_row)(
-        row_vec3(rows.q, row, 0, world), row_quat(rows.q, row, 3, world), row_vec3(rows.qd, row, 0, world),
-        row_vec3(rows.qd, row, 3, world), com, adj,
+    pos, orientation, lin, ang, com_adj, _cotangent = wp.grad(row_adjoint_scalar)(
+        row_vec3(trajectory.q, row, 0, world), row_quat(trajectory.q, row, 3, world),
+        row_vec3(trajectory.qd, row, 0, world), row_vec3(trajectory.qd, row, 3, world), com, adj,
     )  # fmt: skip
-    seeds = RowSeeds()
-    seeds.pos = pos
-    seeds.quat = orientation
-    seeds.lin = lin
-    seeds.ang = ang
-    seeds.com = com_before + com_adj
-    return seeds
+    cotangent = RowCotangent()
+    cotangent.pos = pos
+    cotangent.quat = orientation
+    cotangent.lin = lin
+    cotangent.ang = ang
+    cotangent.com = com_before + com_adj
+    return cotangent
 
 
 @wp.func
-def add_row_seeds(into: RowSeeds, seeds: Rows, row: int, world: int) -> RowSeeds:
+def add_row_cotangent(into: RowCotangent, cotangent: TrajectoryArrays, row: int, world: int) -> RowCotangent:
     """Return the gradient by a row's entries with that of the number itself added."""
     s = into
-    if seeds.q.shape[0] > 0:
-        s.pos += row_vec3(seeds.q, row, 0, world)
-        s.quat += row_quat(seeds.q, row, 3, world)
-    if seeds.qd.shape[0] > 0:
-        s.lin += row_vec3(seeds.qd, row, 0, world)
-        s.ang += row_vec3(seeds.qd, row, 3, world)
+    if cotangent.q.shape[0] > 0:
+        s.pos += row_vec3(cotangent.q, row, 0, world)
+        s.quat += row_quat(cotangent.q, row, 3, world)
+    if cotangent.qd.shape[0] > 0:
+        s.lin += row_vec3(cotangent.qd, row, 0, world)
+        s.ang += row_vec3(cotangent.qd, row, 3, world)
     return s
 
 
 @wp.struct
-class RowState:
+class RowBaseAdjoint:
     """Gradient by the base's state which a row was written from."""
 
     base: BaseState
@@ -115,29 +119,29 @@ class RowState:
 
 
 @wp.func
-def enter_row(model: RobotModel, world: int, base: BaseState, seeds: RowSeeds) -> RowState:
+def store_row_base_adjoint(model: RobotModel, world: int, base: BaseState, cotangent: RowCotangent) -> RowBaseAdjoint:
     """Return the gradient by the base's state which a row was written from, for that by the row's entries."""
     com = base_com(model.table, world)
-    orientation, lin, ang, com_adj, _lin, _ang = wp.grad(weighed_store)(
-        base.quat, base.lin, base.ang, com, seeds.lin, seeds.ang
+    orientation, lin, ang, com_adj, _lin, _ang = wp.grad(store_adjoint_scalar)(
+        base.quat, base.lin, base.ang, com, cotangent.lin, cotangent.ang
     )
-    adj = RowState()
-    adj.base.pos = seeds.pos
-    adj.base.quat = seeds.quat + orientation
+    adj = RowBaseAdjoint()
+    adj.base.pos = cotangent.pos
+    adj.base.quat = cotangent.quat + orientation
     adj.base.lin = lin
     adj.base.ang = ang
-    adj.com = seeds.com + com_adj
+    adj.com = cotangent.com + com_adj
     return adj
 
 
 @wp.func
-def add_motor_rows(legs: wp.array(dtype=LegReverse), seeds: Rows, row: int, world: int):
+def add_motor_rows(legs: wp.array(dtype=LegReverse), cotangent: TrajectoryArrays, row: int, world: int):
     """Add the gradient of the number itself by a row's angles and rates."""
     for k in range(legs.shape[0]):
-        if seeds.q.shape[0] > 0:
-            legs[k].angles = legs[k].angles + row_vec3(seeds.q, row, 7 + 3 * k, world)
-        if seeds.qd.shape[0] > 0:
-            legs[k].rates = legs[k].rates + row_vec3(seeds.qd, row, 6 + 3 * k, world)
+        if cotangent.q.shape[0] > 0:
+            legs[k].angles = legs[k].angles + row_vec3(cotangent.q, row, 7 + 3 * k, world)
+        if cotangent.qd.shape[0] > 0:
+            legs[k].rates = legs[k].rates + row_vec3(cotangent.qd, row, 6 + 3 * k, world)
 
 
 @wp.func
@@ -168,19 +172,19 @@ def place_in(commands: Commands, t: int, dt: real, world: int) -> StepPlace:
 
 @wp.func
 def replay_row(
-    model: RobotModel, params: wp.array(dtype=LegParams), place: StepPlace, rows: Rows, row: int, every: int, com: vec3,
-    record: StepRecord,
+    model: RobotModel, params: wp.array(dtype=LegParams), place: StepPlace, trajectory: TrajectoryArrays, row: int,
+    every: int, com: vec3, record: StepRecord,
 ):  # fmt: skip
     """Make the steps from a row to the next one again."""
     at = place
-    record.base[at.world, 0] = load_row_base(rows, row, at.world, com)
+    record.base[at.world, 0] = load_row_base(trajectory, row, at.world, com)
     for k in range(record.angles.shape[2]):
-        record.angles[at.world, 0, k] = row_vec3(rows.q, row, 7 + 3 * k, at.world)
-        record.rates[at.world, 0, k] = row_vec3(rows.qd, row, 6 + 3 * k, at.world)
+        record.angles[at.world, 0, k] = row_vec3(trajectory.q, row, 7 + 3 * k, at.world)
+        record.rates[at.world, 0, k] = row_vec3(trajectory.qd, row, 6 + 3 * k, at.world)
     for i in range(every):
         at.step = row * every + i
         at.entry = i
-        replay_step(model, params, at, rows, record)
+        replay_step(model, params, at, trajectory, record)
 
 
 @wp.func
@@ -192,21 +196,21 @@ def add_wrench(gradients: Gradients, t: int, world: int, force: vec3, moment: ve
 
 @wp.func
 def add_motor_adjoint(
-    found: MotorAdjoint, arrived: Arrival, at: StepPlace, motor: int, seeds: Rows, gradients: Gradients,
+    found: MotorAdjoint, arrived: Arrival, at: StepPlace, motor: int, cotangent: TrajectoryArrays, gradients: Gradients,
     legs: wp.array(dtype=LegReverse), sums: wp.array(dtype=real),
 ):  # fmt: skip
     """Add the gradients by what a motor's torque in a step depends on."""
     k = motor / 3
     c = motor - 3 * k
-    seed = legs[k].torque[c]
-    if seeds.torque.shape[0] > 0:
-        seed += seeds.torque[at.step, motor, at.world]
-    add_targets(gradients, arrived, motor, at.world, seed * found.target)
-    add_motor_constants(sums, sums, motor, seed, found)
+    torque_cotangent = legs[k].torque[c]
+    if cotangent.torque.shape[0] > 0:
+        torque_cotangent += cotangent.torque[at.step, motor, at.world]
+    add_targets(gradients, arrived, motor, at.world, torque_cotangent * found.target)
+    add_motor_constants(sums, sums, motor, torque_cotangent, found)
     angles = legs[k].angles
     rates = legs[k].rates
-    angles[c] += seed * found.angle
-    rates[c] += seed * found.rate
+    angles[c] += torque_cotangent * found.angle
+    rates[c] += torque_cotangent * found.rate
     legs[k].angles = angles
     legs[k].rates = rates
 
@@ -226,7 +230,11 @@ def add_filter_adjoint(
 
 @wp.func
 def store_start(
-    gradients: Gradients, world: int, entries: RowSeeds, legs: wp.array(dtype=LegReverse), sums: wp.array(dtype=real)
+    gradients: Gradients,
+    world: int,
+    entries: RowCotangent,
+    legs: wp.array(dtype=LegReverse),
+    sums: wp.array(dtype=real),
 ):
     """Write the gradients by the first row and by the parameters."""
     for i in range(sums.shape[0]):
@@ -254,13 +262,13 @@ def reverse_kernel(
     actuation: Actuation,
     commands: Commands,
     safe: wp.array3d(dtype=real),
-    rows: Rows,
-    seeds: Rows,
+    trajectory: TrajectoryArrays,
+    cotangent: TrajectoryArrays,
     # out
     record: StepRecord,
     gradients: Gradients,
 ):
-    """Add the gradient of a number, given that by the trajectory in `seeds`, to `gradients`; one thread per world."""
+    """Add the gradient of a scalar to `gradients`, given that by the trajectory in `cotangent`; one thread per world."""
     world = settings.first + wp.tid()
     legs = wp.zeros(shape=(4,), dtype=LegReverse)
     contacts = wp.zeros(shape=(4,), dtype=PawContact)
@@ -272,21 +280,33 @@ def reverse_kernel(
     load_parts(model, actuation, world, params, motors)
     late = actuation.latency[world] / settings.dt
     last = timing.steps * timing.substeps / timing.every
-    entries = add_row_seeds(RowSeeds(), seeds, last, world)
-    add_motor_rows(legs, seeds, last, world)
+    entries = add_row_cotangent(RowCotangent(), cotangent, last, world)
+    add_motor_rows(legs, cotangent, last, world)
     com = base_com(model.table, world)
     for back in range(last):
         row = last - 1 - back
         t = row * timing.every / timing.substeps
         at = place_in(commands, t, settings.dt, world)
-        replay_row(model, params, at, rows, row, timing.every, com, record)
-        end = enter_row(model, world, record.base[world, timing.every], entries)
+        replay_row(model, params, at, trajectory, row, timing.every, com, record)
+        end = store_row_base_adjoint(model, world, record.base[world, timing.every], entries)
         adj = end.base
         for j in range(timing.every):
             at.entry = timing.every - 1 - j
             at.step = row * timing.every + at.entry
             by_step = reverse_step(
-                model, params, at, commands.impulse, rows, seeds, record, adj, legs, contacts, matrix, vector, sums
+                model,
+                params,
+                at,
+                commands.impulse,
+                trajectory,
+                cotangent,
+                record,
+                adj,
+                legs,
+                contacts,
+                matrix,
+                vector,
+                sums,
             )
             adj = by_step.base
             add_wrench(gradients, t, world, by_step.force, by_step.moment)
@@ -295,29 +315,31 @@ def reverse_kernel(
                 angle = record.angles[world, at.entry, i / 3][i % 3]
                 rate = record.rates[world, at.entry, i / 3][i % 3]
                 found = motor_gradient(motors[i], late, commands, safe, timing, at.dt, at.step, i, world, angle, rate)
-                add_motor_adjoint(found, arrived, at, i, seeds, gradients, legs, sums)
-        entries = add_row_seeds(leave_row(rows, model, row, world, adj, end.com), seeds, row, world)
+                add_motor_adjoint(found, arrived, at, i, cotangent, gradients, legs, sums)
+        entries = add_row_cotangent(
+            load_row_base_adjoint(trajectory, model, row, world, adj, end.com), cotangent, row, world
+        )
         if row * timing.every == t * timing.substeps:
             for k in range(legs.shape[0]):
                 by_filter = filter_gradient(
                     commands, actuation, t, k, world, record.angles[world, 0, k], record.rates[world, 0, k], gradients
                 )
                 add_filter_adjoint(by_filter, t, k, world, gradients, legs, sums)
-        add_motor_rows(legs, seeds, row, world)
+        add_motor_rows(legs, cotangent, row, world)
     add_com(sums, model.table[BASE, world], com, entries.com)
     store_start(gradients, world, entries, legs, sums)
 
 
 @wp.func
-def everything(
-    factors: LegFactors, base: BaseFactors, base_seeds: BaseSeeds, model: RobotModel, actuation: Actuation,
-    numbers: Rows, state: BaseState, world: int,
+def adjoint_roots(
+    factors: LegFactors, base: BaseFactors, base_cotangent: BaseCotangent, model: RobotModel, actuation: Actuation,
+    trajectory: TrajectoryArrays, state: BaseState, world: int,
 ) -> real:  # fmt: skip
     """Return the sum of all functions whose gradients the reverse pass takes; see `generate_adjoints`."""
     params = load_leg(model, world, 0)
-    v = row_vec3(numbers.q, 0, 0, world)
-    q = row_quat(numbers.q, 0, 3, world)
-    x = numbers.q[0, 0, world]
+    v = row_vec3(trajectory.q, 0, 0, world)
+    q = row_quat(trajectory.q, 0, 3, world)
+    x = trajectory.q[0, 0, world]
     spring = load_spring(model.table, 0, world)
     stops = load_stops(model.table, 0, world)
     leg = leg_action(
@@ -326,12 +348,12 @@ def everything(
     )  # fmt: skip
     return (
         leg
-        + base_action(load_moments(model.table, BASE, world), v, v, v, v, q, v, v, base, base_seeds, x)
-        + turned(q, v, x, q)
+        + base_action(load_moments(model.table, BASE, world), v, v, v, v, q, v, v, base, base_cotangent, x)
+        + rotation_adjoint_scalar(q, v, x, q)
         + motor_torque(x, x, x, load_world_motor(actuation, 0, world))
-        + weighed_filter(v, v, v, load_filter(actuation.limits, world), v)
-        + weighed_row(v, q, v, v, v, state)
-        + weighed_store(q, v, v, v, v, v)
+        + filter_adjoint_scalar(v, v, v, load_filter(actuation.limits, world), v)
+        + row_adjoint_scalar(v, q, v, v, v, state)
+        + store_adjoint_scalar(q, v, v, v, v, v)
     )
 
 
@@ -344,13 +366,13 @@ def generate_adjoints(module: str) -> wp.Kernel:
 
     @wp.kernel(enable_backward=True, module=wp.get_module(module))
     def adjoints_kernel(
-        factors: LegFactors, base: BaseFactors, base_seeds: BaseSeeds, model: RobotModel, actuation: Actuation,
-        numbers: Rows, state: BaseState, sums: wp.array(dtype=real),
+        factors: LegFactors, base: BaseFactors, base_cotangent: BaseCotangent, model: RobotModel, actuation: Actuation,
+        trajectory: TrajectoryArrays, state: BaseState, sums: wp.array(dtype=real),
     ):  # fmt: skip
         world = wp.tid()
         launched = int(0)  # Warp makes the adjoints anyway, and the compiler drops this kernel's own code
         if launched > 0:
-            sums[world] = everything(factors, base, base_seeds, model, actuation, numbers, state, world)
+            sums[world] = adjoint_roots(factors, base, base_cotangent, model, actuation, trajectory, state, world)
 
     return adjoints_kernel
 

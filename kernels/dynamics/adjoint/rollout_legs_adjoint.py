@@ -16,8 +16,8 @@ from ..trajectory import (
     Actuation,
     Arrival,
     Commands,
-    Rows,
     Timing,
+    TrajectoryArrays,
     arrival,
     load_row_base,
     load_world_motor,
@@ -40,7 +40,14 @@ from .leg_record import (
     put_slopes,
     put_vec,
 )
-from .rollout_adjoint import RowSeeds, add_row_seeds, add_wrench, enter_row, generate_adjoints, leave_row
+from .rollout_adjoint import (
+    RowCotangent,
+    add_row_cotangent,
+    add_wrench,
+    generate_adjoints,
+    load_row_base_adjoint,
+    store_row_base_adjoint,
+)
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
 
@@ -69,7 +76,7 @@ def replay_legs_kernel(
     actuation: Actuation,
     commands: Commands,
     safe: wp.array3d(dtype=real),
-    rows: Rows,
+    trajectory: TrajectoryArrays,
     span: Span,
     # out
     record: LegRecord,
@@ -87,9 +94,9 @@ def replay_legs_kernel(
     own = load_leg(model, world, leg)
     force = row_vec3(commands.wrench, t, 0, world)
     moment = row_vec3(commands.wrench, t, 3, world)
-    put_base(record, at, world, load_row_base(rows, row, world, base_com(model.table, world)))
-    put_vec(record, at, ANGLES, world, leg, row_vec3(rows.q, row, 7 + 3 * leg, world))
-    put_vec(record, at, RATES, world, leg, row_vec3(rows.qd, row, 6 + 3 * leg, world))
+    put_base(record, at, world, load_row_base(trajectory, row, world, base_com(model.table, world)))
+    put_vec(record, at, ANGLES, world, leg, row_vec3(trajectory.q, row, 7 + 3 * leg, world))
+    put_vec(record, at, RATES, world, leg, row_vec3(trajectory.qd, row, 6 + 3 * leg, world))
     sync_lanes()
     motors = wp.zeros(shape=(3,), dtype=MotorParams)
     for c in range(motors.shape[0]):
@@ -97,7 +104,9 @@ def replay_legs_kernel(
     late = actuation.latency[world] / settings.dt
     for i in range(timing.every):
         step = first + i
-        replay_leg(model, own, settings.dt, world, leg, force, moment, commands.impulse, rows, step, at + i, record)
+        replay_leg(
+            model, own, settings.dt, world, leg, force, moment, commands.impulse, trajectory, step, at + i, record
+        )
         sync_lanes()
         angles = get_vec(record, at + i, ANGLES, world, leg)
         rates = get_vec(record, at + i, RATES, world, leg)
@@ -113,9 +122,9 @@ def replay_legs_kernel(
 
 
 @wp.func
-def load_entries(gradients: Gradients, world: int) -> RowSeeds:
+def load_entries(gradients: Gradients, world: int) -> RowCotangent:
     """Return the gradient by the base's entries of the row after a span."""
-    entries = RowSeeds()
+    entries = RowCotangent()
     entries.pos = vec3(gradients.q[0, world], gradients.q[1, world], gradients.q[2, world])
     entries.quat = quat(gradients.q[3, world], gradients.q[4, world], gradients.q[5, world], gradients.q[6, world])
     entries.lin = vec3(gradients.qd[0, world], gradients.qd[1, world], gradients.qd[2, world])
@@ -124,7 +133,7 @@ def load_entries(gradients: Gradients, world: int) -> RowSeeds:
 
 
 @wp.func
-def store_entries(gradients: Gradients, world: int, leg: int, entries: RowSeeds, adj: LegAdjoint):
+def store_entries(gradients: Gradients, world: int, leg: int, entries: RowCotangent, adj: LegAdjoint):
     """Write the gradient by a span's first row; leg 0 writes the base's."""
     for i in range(3):
         gradients.q[7 + 3 * leg + i, world] = adj.angles[i]
@@ -150,18 +159,18 @@ def load_motor_entries(gradients: Gradients, world: int, leg: int) -> LegAdjoint
 
 @wp.func
 def reverse_motors(
-    old: LegAdjoint, slopes: MotorSlopes, arrived: Arrival, seeds: Rows, step: int, leg: int, world: int,
-    gradients: Gradients, writes: bool,
+    old: LegAdjoint, slopes: MotorSlopes, arrived: Arrival, cotangent: TrajectoryArrays, step: int, leg: int,
+    world: int, gradients: Gradients, writes: bool,
 ) -> LegAdjoint:  # fmt: skip
     """Return the gradient with that by the motors' angles and rates; if it `writes`, add those by their targets."""
     adj = old
-    seed = adj.torque
-    if seeds.torque.shape[0] > 0:
-        seed += row_vec3(seeds.torque, step, 3 * leg, world)
-    adj.angles += wp.cw_mul(seed, slopes.angle)
-    adj.rates += wp.cw_mul(seed, slopes.rate)
+    torque_cotangent = adj.torque
+    if cotangent.torque.shape[0] > 0:
+        torque_cotangent += row_vec3(cotangent.torque, step, 3 * leg, world)
+    adj.angles += wp.cw_mul(torque_cotangent, slopes.angle)
+    adj.rates += wp.cw_mul(torque_cotangent, slopes.rate)
     if writes:
-        by_target = wp.cw_mul(seed, slopes.target)
+        by_target = wp.cw_mul(torque_cotangent, slopes.target)
         for c in range(wp.static(3)):
             add_targets(gradients, arrived, 3 * leg + c, world, by_target[c])
     return adj
@@ -177,8 +186,8 @@ def reverse_legs_kernel(
     actuation: Actuation,
     commands: Commands,
     safe: wp.array3d(dtype=real),
-    rows: Rows,
-    seeds: Rows,
+    trajectory: TrajectoryArrays,
+    cotangent: TrajectoryArrays,
     span: Span,
     # in, out
     record: LegRecord,
@@ -205,7 +214,7 @@ def reverse_legs_kernel(
         t = first / timing.substeps
         force = row_vec3(commands.wrench, t, 0, world)
         moment = row_vec3(commands.wrench, t, 3, world)
-        end = enter_row(model, world, get_base(record, at + timing.every, world), entries)
+        end = store_row_base_adjoint(model, world, get_base(record, at + timing.every, world), entries)
         adj.base = end.base
         adj.force = vec3(real(0.0))
         adj.moment = vec3(real(0.0))
@@ -213,12 +222,27 @@ def reverse_legs_kernel(
             i = timing.every - 1 - j
             step = first + i
             adj = reverse_leg(
-                model, own, dt, world, leg, force, moment, rows, seeds, step, at + i, record, adj, place < count
+                model,
+                own,
+                dt,
+                world,
+                leg,
+                force,
+                moment,
+                trajectory,
+                cotangent,
+                step,
+                at + i,
+                record,
+                adj,
+                place < count,
             )
             arrived = arrival(step, timing.substeps, late)
             slopes = get_slopes(record, at + i, world, leg)
-            adj = reverse_motors(adj, slopes, arrived, seeds, step, leg, world, gradients, place < count)
-        entries = add_row_seeds(leave_row(rows, model, row, world, adj.base, end.com), seeds, row, world)
+            adj = reverse_motors(adj, slopes, arrived, cotangent, step, leg, world, gradients, place < count)
+        entries = add_row_cotangent(
+            load_row_base_adjoint(trajectory, model, row, world, adj.base, end.com), cotangent, row, world
+        )
         if place < count:
             if leg == 0:
                 add_wrench(gradients, t, world, adj.force, adj.moment)
@@ -233,10 +257,10 @@ def reverse_legs_kernel(
                 store_row_vec3(gradients.target, t, 3 * leg, world, by_filter.target)
             adj.angles += by_filter.angles
             adj.rates += by_filter.rates
-        if seeds.q.shape[0] > 0:
-            adj.angles += row_vec3(seeds.q, row, 7 + 3 * leg, world)
-        if seeds.qd.shape[0] > 0:
-            adj.rates += row_vec3(seeds.qd, row, 6 + 3 * leg, world)
+        if cotangent.q.shape[0] > 0:
+            adj.angles += row_vec3(cotangent.q, row, 7 + 3 * leg, world)
+        if cotangent.qd.shape[0] > 0:
+            adj.rates += row_vec3(cotangent.qd, row, 6 + 3 * leg, world)
     if place < count:
         store_entries(gradients, world, leg, entries, adj)
         if leg == 0:

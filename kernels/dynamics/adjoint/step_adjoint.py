@@ -19,7 +19,7 @@ from ...state import BaseState, base_com
 from ..contact import SEPARATE, PawContact
 from ..parameters import load_moments, load_spring, load_stops, load_vec3
 from ..step import LegParams, RobotModel
-from ..trajectory import Rows
+from ..trajectory import TrajectoryArrays
 from .gradients import (
     add_com,
     add_entry,
@@ -31,8 +31,8 @@ from .gradients import (
     add_stops,
     add_vec3,
 )
-from .multipliers import LegReverse, StepPlace, StepRecord, find_multipliers, held_base, held_leg
-from .virtual_power import BaseFactors, BaseSeeds, LegFactors, base_action, leg_action, turned
+from .multipliers import LegReverse, StepPlace, StepRecord, base_factors, find_multipliers, leg_factors
+from .virtual_power import BaseCotangent, BaseFactors, LegFactors, base_action, leg_action, rotation_adjoint_scalar
 
 wp.set_module_options({"enable_backward": False})
 
@@ -97,9 +97,9 @@ class StepAdjoint:
 @wp.func
 def reverse_step(
     model: RobotModel, params: wp.array(dtype=LegParams), at: StepPlace, first_impulse: wp.array2d(dtype=vec3),
-    rows: Rows, seeds: Rows, record: StepRecord, adj: BaseState, legs: wp.array(dtype=LegReverse),
-    contacts: wp.array(dtype=PawContact), matrix: wp.array2d(dtype=real), vector: wp.array(dtype=real),
-    sums: wp.array(dtype=real),
+    trajectory: TrajectoryArrays, cotangent: TrajectoryArrays, record: StepRecord, adj: BaseState,
+    legs: wp.array(dtype=LegReverse), contacts: wp.array(dtype=PawContact), matrix: wp.array2d(dtype=real),
+    vector: wp.array(dtype=real), sums: wp.array(dtype=real),
 ) -> StepAdjoint:  # fmt: skip
     """Run a step backwards: from the gradient by the state at its end to that by the state at its start.
 
@@ -110,34 +110,34 @@ def reverse_step(
     ahead = record.base[world, at.entry + 1]
     # integration of the coordinates
     new_velocity = adj.lin + dt * adj.pos
-    quat_adj, ang_seed, _dt, _seed = wp.grad(turned)(base.quat, ahead.ang, dt, adj.quat)
+    quat_adj, ang_cotangent, _dt, _quat_adj = wp.grad(rotation_adjoint_scalar)(base.quat, ahead.ang, dt, adj.quat)
     for k in range(legs.shape[0]):
         legs[k].rates = legs[k].rates + dt * legs[k].angles
     m = find_multipliers(
-        model, at, first_impulse, rows, seeds, record, wp.quat_rotate_inv(base.quat, new_velocity), ang_seed + adj.ang,
-        legs, contacts, matrix, vector,
+        model, at, first_impulse, trajectory, cotangent, record, wp.quat_rotate_inv(base.quat, new_velocity),
+        ang_cotangent + adj.ang, legs, contacts, matrix, vector,
     )  # fmt: skip
     # the equations of motion
-    held = held_base(at, record, m)
+    held = base_factors(at, record, m)
     gravity = load_vec3(model.table, GRAVITY, world)
     g = wp.quat_rotate_inv(base.quat, gravity)
     out = StepAdjoint()
     out.base.pos = adj.pos
     out.base.quat = quat_adj
-    out.base.ang = m.ang_seed
+    out.base.ang = m.ang_cotangent
     g_adj = vec3(real(0.0))
     for k in range(legs.shape[0]):
-        leg = held_leg(at, k, rows, seeds, record, legs, contacts)
+        leg = leg_factors(at, k, trajectory, cotangent, record, legs, contacts)
         part = reverse_leg_part(model, params[k], at, k, record, g, held, leg, legs, sums)
         out.base.pos += part.pos
         out.base.quat += part.turn
         out.base.ang += part.omega
         g_adj += part.gravity
-    weights = BaseSeeds()
-    weights.velocity = m.lin_seed
+    weights = BaseCotangent()
+    weights.velocity = m.lin_cotangent
     weights.new_velocity = new_velocity
     weights.gravity = g_adj
-    body, com, weight, force_adj, moment_adj, turn, lin_adj, omega, _base, _seeds, _dt_base = wp.grad(
+    body, com, weight, force_adj, moment_adj, turn, lin_adj, omega, _base, _cotangent, _dt_base = wp.grad(
         base_action
     )(load_moments(model.table, BASE, world), base_com(model.table, world), gravity, at.force, at.moment, base.quat,
         base.lin, base.ang, held, weights, dt,

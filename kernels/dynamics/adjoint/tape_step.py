@@ -17,26 +17,26 @@ from ..contact import BlockLaw, PawContact
 from ..drive import Drive, Workspace, base_wrench
 from ..parameters import load_joint_params, load_masses, load_moments, load_spring, load_stops, load_vec3
 from ..step import LegParams, RobotModel, StepSettings, load_leg
-from ..trajectory import Rows, store_row_vec3
+from ..trajectory import TrajectoryArrays, store_row_vec3
 from ..world.world_step import LegStep, solve_step
-from .multipliers import LegReverse, StepPlace, StepRecord, find_multipliers, held_base, held_leg, replay_step
-from .virtual_power import BaseFactors, BaseSeeds, LegFactors, base_action, leg_action
+from .multipliers import LegReverse, StepPlace, StepRecord, base_factors, find_multipliers, leg_factors, replay_step
+from .virtual_power import BaseCotangent, BaseFactors, LegFactors, base_action, leg_action
 
 
 @wp.struct
 class SolvedStep:
     """A step on the tape, arrays by world or by (leg, world): its solution, and what the reverse pass finds of it."""
 
-    rows: Rows  # torques, impulses and pressed stops, shape (1, ..., num_worlds)
+    trajectory: TrajectoryArrays  # torques, impulses and pressed stops, shape (1, ..., num_worlds)
     before: wp.array2d(dtype=vec3)  # [N s] on each paw in the step before, world axes
     lin: wp.array(dtype=vec3)  # [m/s] of the base at the end of the step, in the body axes of its start
     ang: wp.array(dtype=vec3)  # [rad/s]
     rates: wp.array2d(dtype=vec3)  # [rad/s] of the motors
     base: wp.array(dtype=BaseFactors)
-    seeds: wp.array(dtype=BaseSeeds)
-    ang_seed: wp.array(dtype=vec3)  # weight of the base's angular velocity at the start
+    cotangent: wp.array(dtype=BaseCotangent)
+    ang_cotangent: wp.array(dtype=vec3)  # weight of the base's angular velocity at the start
     legs: wp.array2d(dtype=LegFactors)
-    rate_seed: wp.array2d(dtype=vec3)  # weight of the motors' rates at the start
+    rate_cotangent: wp.array2d(dtype=vec3)  # weight of the motors' rates at the start
     mu_row: wp.array2d(dtype=int)  # row of the friction coefficient in the parameter table
 
 
@@ -63,7 +63,7 @@ def solve_kernel(
         legs[k].angles = load_motors(joint_q, leg_coord(world, k))
         legs[k].rates = load_motors(joint_qd, leg_dof(world, k))
         legs[k].torque = torque
-        store_row_vec3(solved.rows.torque, 0, 3 * k, world, torque)
+        store_row_vec3(solved.trajectory.torque, 0, 3 * k, world, torque)
         solved.before[k, world] = work.impulse[k, world]
     wrench = base_wrench(drive.joint_f, drive.body_f, world)
     force = vec3(wrench[0], wrench[1], wrench[2])
@@ -73,9 +73,9 @@ def solve_kernel(
     solved.ang[world] = found.ang
     for k in range(legs.shape[0]):
         impulse = wp.quat_rotate(base.quat, contacts[k].impulse)
-        solved.rates[k, world] = legs[k].end
-        solved.rows.impulse[0, k, world] = impulse
-        solved.rows.pressed[0, k, world] = wp.uint8(legs[k].pressed)
+        solved.rates[k, world] = legs[k].new_rates
+        solved.trajectory.impulse[0, k, world] = impulse
+        solved.trajectory.pressed[0, k, world] = wp.uint8(legs[k].pressed)
         work.impulse[k, world] = impulse
         work.contact_force[k, world] = impulse / settings.dt
 
@@ -108,7 +108,7 @@ def power_kernel(
         model.table[solved.mu_row[k, world], world], base.pos, base.quat, base.ang, g,
         load_motors(joint_q, leg_coord(world, k)), rates, held, leg, dt,
     )  # fmt: skip
-    total += wp.dot(solved.rate_seed[k, world], rates)
+    total += wp.dot(solved.rate_cotangent[k, world], rates)
     total += dt * wp.dot(leg.virtual_rates, load_motors(joint_f, leg_dof(world, k)))
     if k == 0:
         wrench = base_wrench(joint_f, body_f, world)
@@ -116,9 +116,9 @@ def power_kernel(
         moment = vec3(wrench[3], wrench[4], wrench[5])
         total += base_action(
             load_moments(model.table, BASE, world), com, gravity, force, moment, base.quat, base.lin, base.ang, held,
-            solved.seeds[world], dt,
+            solved.cotangent[world], dt,
         )  # fmt: skip
-        total += wp.dot(solved.ang_seed[world], base.ang)
+        total += wp.dot(solved.ang_cotangent[world], base.ang)
     power[k, world] = total
 
 
@@ -170,18 +170,29 @@ def adj_end_velocities(
         record.angles[world, 0, k] = load_motors(joint_q, leg_coord(world, k))
         record.rates[world, 0, k] = load_motors(joint_qd, leg_dof(world, k))
         legs[k].rates = vec3(adj_ret.rates[k, 0], adj_ret.rates[k, 1], adj_ret.rates[k, 2])
-    replay_step(model, params, at, solved.rows, record)
+    replay_step(model, params, at, solved.trajectory, record)
     m = find_multipliers(
-        model, at, solved.before, solved.rows, Rows(), record, adj_ret.lin, adj_ret.ang, legs, contacts, matrix, vector
+        model,
+        at,
+        solved.before,
+        solved.trajectory,
+        TrajectoryArrays(),
+        record,
+        adj_ret.lin,
+        adj_ret.ang,
+        legs,
+        contacts,
+        matrix,
+        vector,
     )
-    seeds = BaseSeeds()
-    seeds.velocity = m.lin_seed
-    solved.base[world] = held_base(at, record, m)
-    solved.seeds[world] = seeds
-    solved.ang_seed[world] = m.ang_seed
+    cotangent = BaseCotangent()
+    cotangent.velocity = m.lin_cotangent
+    solved.base[world] = base_factors(at, record, m)
+    solved.cotangent[world] = cotangent
+    solved.ang_cotangent[world] = m.ang_cotangent
     for k in range(legs.shape[0]):
-        solved.legs[k, world] = held_leg(at, k, solved.rows, Rows(), record, legs, contacts)
-        solved.rate_seed[k, world] = legs[k].rates
+        solved.legs[k, world] = leg_factors(at, k, solved.trajectory, TrajectoryArrays(), record, legs, contacts)
+        solved.rate_cotangent[k, world] = legs[k].rates
         solved.mu_row[k, world] = legs[k].law.mu_row
         wp.adjoint[power][k, world] += real(1.0)
 

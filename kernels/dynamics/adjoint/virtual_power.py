@@ -12,7 +12,7 @@ import warp as wp
 
 from ...actuation.joint_forces import JointParams, joint_forces
 from ...actuation.springs import LegSpring, spring_torque
-from ...actuation.stops import StopParams, StopRows, stop_rows
+from ...actuation.stops import StopParams, StopRates, stop_rates
 from ...kinematics.five_bar import FiveBar, five_bar_bias
 from ...kinematics.geometry import LegGeometry
 from ...scalar import quat, real, vec2, vec3, vec6
@@ -84,7 +84,7 @@ def add(a: MassMoments, b: MassMoments) -> MassMoments:  # noqa: F811
 
 
 @wp.func
-def mixed(a: vec3, b: vec3) -> vec6:
+def second_moment_product(a: vec3, b: vec3) -> vec6:
     """Return the derivative of a^T S b by packed second moments S."""
     return vec6(
         a[0] * b[0], a[1] * b[1], a[2] * b[2],
@@ -127,7 +127,9 @@ def adj_inertia_power(body: MassMoments, frame: FrameMotion, adj_ret: real):
     by_body.first = adj_ret * (wp.cross(lin_v, ang_acc) + wp.cross(by_swing, ang) + wp.cross(acc, ang_v))
     turn = wp.dot(ang_v, ang_acc) + wp.dot(by_spin, ang)
     by_body.second = adj_ret * (
-        vec6(turn, turn, turn, real(0.0), real(0.0), real(0.0)) - mixed(ang_v, ang_acc) - mixed(by_spin, ang)
+        vec6(turn, turn, turn, real(0.0), real(0.0), real(0.0))
+        - second_moment_product(ang_v, ang_acc)
+        - second_moment_product(by_spin, ang)
     )
     wp.adjoint[body] += by_body
     wp.adjoint[frame] += by_frame
@@ -252,10 +254,10 @@ def housing_motion(
 
 @wp.func
 def passive_power(
-    joints: JointParams, loop: FiveBar, front: real, rates: vec3, rows: StopRows, leg: LegFactors, dt: real
+    joints: JointParams, loop: FiveBar, front: real, rates: vec3, stop_rates: StopRates, leg: LegFactors, dt: real
 ) -> real:
     """Return the virtual power [W] of friction, damping, pressed stops and the motors' inertia."""
-    passive = joint_forces(joints, loop, front, rates, rows, leg.pressed, dt)
+    passive = joint_forces(joints, loop, front, rates, stop_rates, leg.pressed, dt)
     implicit = passive.inertia * leg.acc + wp.cw_mul(joints.armature, leg.acc)
     return wp.dot(leg.virtual_rates, passive.torque - implicit)
 
@@ -337,7 +339,7 @@ def leg_action(
         + inertia_power(masses.outer_shank, outer_shank)
         + inertia_power(masses.inner_shank, inner_shank)
     )
-    action = dt * (passive_power(joints, loop, f, rates, stop_rows(stops, angles, dt), leg, dt) - power)
+    action = dt * (passive_power(joints, loop, f, rates, stop_rates(stops, angles, dt), leg, dt) - power)
     if spring.stiffness != zero:
         action += dt * wp.dot(leg.virtual_rates, spring_torque(spring, loop))
     if leg.mode != SEPARATE:
@@ -346,7 +348,7 @@ def leg_action(
 
 
 @wp.struct
-class BaseSeeds:
+class BaseCotangent:
     """Weights of what else depends on the base's orientation and velocity."""
 
     velocity: vec3  # of its linear velocity at the start of the step, body axes
@@ -357,7 +359,7 @@ class BaseSeeds:
 @wp.func
 def base_action(
     body: MassMoments, com: vec3, gravity: vec3, force: vec3, moment: vec3, orientation: quat, lin: vec3, omega: vec3,
-    base: BaseFactors, seeds: BaseSeeds, dt: real,
+    base: BaseFactors, cotangent: BaseCotangent, dt: real,
 ) -> real:  # fmt: skip
     """Return the base link's part of the weighed equations, and what else depends on its orientation and velocity.
 
@@ -375,13 +377,13 @@ def base_action(
     power = wp.dot(base.virtual_lin, push) + wp.dot(base.virtual_ang, twist) - inertia_power(body, frame)
     return (
         dt * power
-        + wp.dot(seeds.gravity, g)
-        + wp.dot(seeds.velocity, wp.quat_rotate_inv(orientation, lin))
-        + wp.dot(seeds.new_velocity, wp.quat_rotate(orientation, base.lin))
+        + wp.dot(cotangent.gravity, g)
+        + wp.dot(cotangent.velocity, wp.quat_rotate_inv(orientation, lin))
+        + wp.dot(cotangent.new_velocity, wp.quat_rotate(orientation, base.lin))
     )
 
 
 @wp.func
-def turned(orientation: quat, ang: vec3, dt: real, seed: quat) -> real:
+def rotation_adjoint_scalar(orientation: quat, ang: vec3, dt: real, cotangent: quat) -> real:
     """Return the weighed orientation after dt [s] at an angular velocity [rad/s], body axes."""
-    return wp.dot(seed, wp.normalize(orientation * exp_rotation(dt * ang)))
+    return wp.dot(cotangent, wp.normalize(orientation * exp_rotation(dt * ang)))

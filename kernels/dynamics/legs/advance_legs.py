@@ -12,13 +12,13 @@ import warp as wp
 from ...actuation.stops import (
     MAX_SETS,
     SLACK,
-    StopRows,
+    StopRates,
     beyond_stops,
     change_one,
     one_by_one,
     pressed_stops,
     revised_stops,
-    stop_rows,
+    stop_rates,
 )
 from ...lanes import any_world, first_leg, from_leg, max_legs, sum_legs, sum_vec, sync_lanes
 from ...layout import GRAVITY
@@ -127,7 +127,7 @@ def solve_paws(c: PawContact, blocks: bool, block: BlockLaw, leg: int, max_round
 class StopTry:
     """The set of pressed stops that a leg tries in a step."""
 
-    rows: StopRows
+    stop_rates: StopRates
     pressed: int
 
 
@@ -139,9 +139,9 @@ def next_try(model: RobotModel, world: int, leg: int, old: LegState, dt: real) -
     if found.pressed != 0 or old.sets == 0:
         stops = load_stops(model.table, leg, world)
         if found.pressed != 0 or beyond_stops(stops, old.angles + dt * old.rates):
-            found.rows = stop_rows(stops, old.angles, dt)
+            found.stop_rates = stop_rates(stops, old.angles, dt)
             if old.sets == 0:
-                found.pressed = pressed_stops(found.rows, old.rates, real(0.0), 0)
+                found.pressed = pressed_stops(found.stop_rates, old.rates, real(0.0), 0)
     return found
 
 
@@ -153,8 +153,8 @@ def wanted_stops(
     limits = load_stops(model.table, leg, world)
     wanted = int(0)
     if pressed != 0 or beyond_stops(limits, angles + settings.dt * rates):
-        rows = stop_rows(limits, angles, settings.dt)
-        wanted = revised_stops(rows, rates, SLACK * settings.tolerance, pressed, sets)
+        bounds = stop_rates(limits, angles, settings.dt)
+        wanted = revised_stops(bounds, rates, SLACK * settings.tolerance, pressed, sets)
     return wanted
 
 
@@ -211,7 +211,7 @@ def advance_leg(
     stops = next_try(model, world, leg, old, dt)
     pressed = stops.pressed
     spring = load_spring(model.table, leg, world)
-    terms = leg_terms(own, spring, old.angles, old.rates, torque, stops.rows, pressed, base.ang, g, dt)
+    terms = leg_terms(own, spring, old.angles, old.rates, torque, stops.stop_rates, pressed, base.ang, g, dt)
     wrench = base_wrench(drive.joint_f, drive.body_f, world)
     force = vec3(wrench[0], wrench[1], wrench[2])
     moment = vec3(wrench[3], wrench[4], wrench[5])

@@ -11,8 +11,8 @@ from ..step import RobotModel, StepSettings, load_leg
 from ..trajectory import (
     Actuation,
     Commands,
-    Rows,
     Timing,
+    TrajectoryArrays,
     arrival,
     filter_commands,
     leg_torque,
@@ -38,7 +38,7 @@ def rollout_legs_kernel(
     drive: Drive,
     # out
     safe: wp.array3d(dtype=real),
-    rows: Rows,
+    trajectory: TrajectoryArrays,
 ):
     """Do what `rollout_kernel` does, to the contact tolerance; launch over (count rounded up to a multiple of 8, 4).
 
@@ -55,9 +55,9 @@ def rollout_legs_kernel(
         t = step / timing.substeps
         row = step / timing.every
         if step == row * timing.every:
-            s.base = load_row_base(rows, row, world, com)
-            s.angles = row_vec3(rows.q, row, 7 + 3 * leg, world)
-            s.rates = row_vec3(rows.qd, row, 6 + 3 * leg, world)
+            s.base = load_row_base(trajectory, row, world, com)
+            s.angles = row_vec3(trajectory.q, row, 7 + 3 * leg, world)
+            s.rates = row_vec3(trajectory.qd, row, 6 + 3 * leg, world)
         if step == t * timing.substeps:
             filter_commands(commands, actuation, t, leg, world, s.angles, s.rates, safe)
             if leg == 0:
@@ -72,12 +72,12 @@ def rollout_legs_kernel(
         s.sets = 0
         while any_world(s.step == 0):
             s = advance_leg(model, settings, drive, own, motors, world, leg, s, False)
-        store_row_vec3(rows.torque, step, 3 * leg, world, torque)
-        rows.impulse[step, leg, world] = s.impulse
-        rows.pressed[step, leg, world] = wp.uint8(s.used)
+        store_row_vec3(trajectory.torque, step, 3 * leg, world, torque)
+        trajectory.impulse[step, leg, world] = s.impulse
+        trajectory.pressed[step, leg, world] = wp.uint8(s.used)
         if step + 1 == (row + 1) * timing.every:
             if leg == 0:
-                store_row_base(rows, row + 1, world, com, s.base)
-            store_row_vec3(rows.q, row + 1, 7 + 3 * leg, world, s.angles)
-            store_row_vec3(rows.qd, row + 1, 6 + 3 * leg, world, s.rates)
+                store_row_base(trajectory, row + 1, world, com, s.base)
+            store_row_vec3(trajectory.q, row + 1, 7 + 3 * leg, world, s.angles)
+            store_row_vec3(trajectory.qd, row + 1, 6 + 3 * leg, world, s.rates)
             sync_lanes()

@@ -45,7 +45,7 @@ def advance_once(
         move_block(model.ground, world, wp.quat_rotate(base.quat, block_velocity(block, push)), dt)
     record_contacts(work, world, base, contacts, solved.contact, dt, last, peaks)
     for k in range(legs.shape[0]):
-        end = legs[k].end
+        end = legs[k].new_rates
         legs[k].rates = end
         legs[k].angles = legs[k].angles + dt * end
     return moved_base(base, solved.lin, solved.ang, dt)

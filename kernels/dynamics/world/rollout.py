@@ -15,8 +15,8 @@ from ..step import RobotModel, StepSettings
 from ..trajectory import (
     Actuation,
     Commands,
-    Rows,
     Timing,
+    TrajectoryArrays,
     arrival,
     filter_commands,
     leg_torque,
@@ -44,7 +44,7 @@ def rollout_kernel(
     work: Workspace,
     # out
     safe: wp.array3d(dtype=real),
-    rows: Rows,
+    trajectory: TrajectoryArrays,
 ):
     """Run a rollout from the state in row 0; one thread per world.
 
@@ -64,10 +64,10 @@ def rollout_kernel(
         t = step / timing.substeps
         row = step / timing.every
         if step == row * timing.every:
-            base = load_row_base(rows, row, world, com)
+            base = load_row_base(trajectory, row, world, com)
             for k in range(legs.shape[0]):
-                legs[k].angles = row_vec3(rows.q, row, 7 + 3 * k, world)
-                legs[k].rates = row_vec3(rows.qd, row, 6 + 3 * k, world)
+                legs[k].angles = row_vec3(trajectory.q, row, 7 + 3 * k, world)
+                legs[k].rates = row_vec3(trajectory.qd, row, 6 + 3 * k, world)
         if step == t * timing.substeps:
             for k in range(legs.shape[0]):
                 filter_commands(commands, actuation, t, k, world, legs[k].angles, legs[k].rates, safe)
@@ -76,14 +76,14 @@ def rollout_kernel(
         arrived = arrival(step, timing.substeps, late)
         for k in range(legs.shape[0]):
             torque = leg_torque(commands, actuation, safe, arrived, k, world, legs[k].angles, legs[k].rates)
-            store_row_vec3(rows.torque, step, 3 * k, world, torque)
+            store_row_vec3(trajectory.torque, step, 3 * k, world, torque)
             store_motors(drive.joint_f, leg_dof(world, k), torque)
         base = advance_once(model, settings, drive, work, world, 0, base, legs, contacts, peaks)
         for k in range(legs.shape[0]):
-            rows.impulse[step, k, world] = work.impulse[k, world]
-            rows.pressed[step, k, world] = wp.uint8(legs[k].pressed)
+            trajectory.impulse[step, k, world] = work.impulse[k, world]
+            trajectory.pressed[step, k, world] = wp.uint8(legs[k].pressed)
         if step + 1 == (row + 1) * timing.every:
-            store_row_base(rows, row + 1, world, com, base)
+            store_row_base(trajectory, row + 1, world, com, base)
             for k in range(legs.shape[0]):
-                store_row_vec3(rows.q, row + 1, 7 + 3 * k, world, legs[k].angles)
-                store_row_vec3(rows.qd, row + 1, 6 + 3 * k, world, legs[k].rates)
+                store_row_vec3(trajectory.q, row + 1, 7 + 3 * k, world, legs[k].angles)
+                store_row_vec3(trajectory.qd, row + 1, 6 + 3 * k, world, legs[k].rates)

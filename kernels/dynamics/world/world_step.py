@@ -5,12 +5,12 @@ import warp as wp
 from ...actuation.stops import (
     MAX_SETS,
     SLACK,
-    StopRows,
+    StopRates,
     change_one,
     one_by_one,
     pressed_stops,
     revised_stops,
-    stop_rows,
+    stop_rates,
 )
 from ...layout import GRAVITY
 from ...scalar import real, vec3
@@ -31,8 +31,8 @@ class LegStep:
     angles: vec3  # [rad] at the start of the step
     rates: vec3  # [rad/s]
     torque: vec3  # [N m]
-    end: vec3  # [rad/s] at the end of the step
-    rows: StopRows
+    new_rates: vec3  # [rad/s] at the end of the step
+    stop_rates: StopRates
     pressed: int  # set of hard stops
     solve: LegSolve
     paw: PawKinematics
@@ -61,7 +61,16 @@ def solve_with_stops(
         own = load_leg(model, world, k)
         spring = load_spring(model.table, k, world)
         terms = leg_terms(
-            own, spring, legs[k].angles, legs[k].rates, legs[k].torque, legs[k].rows, legs[k].pressed, base.ang, g, dt
+            own,
+            spring,
+            legs[k].angles,
+            legs[k].rates,
+            legs[k].torque,
+            legs[k].stop_rates,
+            legs[k].pressed,
+            base.ang,
+            g,
+            dt,
         )
         legs[k].solve = terms.solve
         legs[k].paw = terms.paw
@@ -73,7 +82,7 @@ def solve_with_stops(
     ang = base.ang + dt * ang_acc
     for k in range(legs.shape[0]):
         end = legs[k].rates + dt * motor_acceleration(legs[k].solve, lin_acc, ang_acc)
-        legs[k].end = end
+        legs[k].new_rates = end
         contacts[k] = paw_contact(
             model, world, k, base, lin, ang, end, legs[k].rates, impulse[k, world], legs[k].pressed, legs[k].paw,
             legs[k].solve, inverse, block, dt,
@@ -82,7 +91,7 @@ def solve_with_stops(
     for k in range(legs.shape[0]):
         solve = legs[k].solve
         push = solve.inverse * (wp.transpose(contacts[k].jacobian) * contacts[k].impulse)
-        legs[k].end = legs[k].end + (push - solve.to_lin * change.lin - solve.to_ang * change.ang)
+        legs[k].new_rates = legs[k].new_rates + (push - solve.to_lin * change.lin - solve.to_ang * change.ang)
     solution = StepSolution()
     solution.lin = lin + change.lin
     solution.ang = ang + change.ang
@@ -96,7 +105,7 @@ def revise_stops(legs: wp.array(dtype=LegStep), slack: real, sets: int) -> bool:
     changed = bool(False)
     for k in range(legs.shape[0]):
         pressed = legs[k].pressed
-        wanted = revised_stops(legs[k].rows, legs[k].end, slack, pressed, sets)
+        wanted = revised_stops(legs[k].stop_rates, legs[k].new_rates, slack, pressed, sets)
         if wanted != pressed and not (changed and one_by_one(sets)):
             if one_by_one(sets):
                 wanted = change_one(pressed, wanted)
@@ -120,9 +129,9 @@ def solve_step(
     """
     dt = settings.dt
     for k in range(legs.shape[0]):
-        rows = stop_rows(load_stops(model.table, k, world), legs[k].angles, dt)
-        legs[k].rows = rows
-        legs[k].pressed = pressed_stops(rows, legs[k].rates, real(0.0), 0)
+        bounds = stop_rates(load_stops(model.table, k, world), legs[k].angles, dt)
+        legs[k].stop_rates = bounds
+        legs[k].pressed = pressed_stops(bounds, legs[k].rates, real(0.0), 0)
     slack = SLACK * settings.tolerance
     solution = StepSolution()
     sets = int(0)
