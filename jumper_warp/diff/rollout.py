@@ -217,7 +217,7 @@ class Rollout:
         commands = self.dynamics.modules.trajectory.Commands()
         commands.target = self._input("targets", targets, (count, 12))
         q, qd = self._input("q", q, (19,)), self._input("qd", qd, (18,))
-        commands.before = q[7:] if before is None else self._input("before", before, (12,))
+        commands.initial_target = q[7:] if before is None else self._input("before", before, (12,))
         commands.wrench = self._zeros(count, 6, self.num_worlds) if wrench is None else (
             self._input("wrench", wrench, (count, 6))
         )  # fmt: skip
@@ -271,12 +271,12 @@ class Rollout:
         for name in ("q", "qd", "torque", "impulse", "pressed"):
             setattr(rows, name, getattr(trajectory, name))
         gradients = modules.gradients.Gradients()
-        shapes = {"q": (19,), "qd": (18,), "target": (count, 12), "before": (12,), "wrench": (count, 6),
-                  "safe": (count, 12), "parameters": (int(modules.gradients.GRADIENT_ROWS),)}  # fmt: skip
+        shapes = {"q": (19,), "qd": (18,), "target": (count, 12), "initial_target": (12,), "wrench": (count, 6),
+                  "filtered_target": (count, 12), "parameters": (int(modules.gradients.GRADIENT_ROWS),)}  # fmt: skip
         for name, shape in shapes.items():
             setattr(gradients, name, self._zeros(*shape, n))
         if safe is not None:
-            wp.copy(gradients.safe, safe)  # which the reverse pass adds to
+            wp.copy(gradients.filtered_target, safe)  # which the reverse pass adds to
         motion = [self._timing(count), self._actuation, commands, trajectory.safe, rows]
         if self.by_legs:
             last: Any
@@ -291,8 +291,8 @@ class Rollout:
                 self._record = self.dynamics.step_record(self.every)
             self._launch(modules.rollout_adjoint.reverse_kernel, [*motion, seeds], [self._record, gradients])
         if trajectory.from_start:
-            wp.map(wp.add, gradients.q[7:], gradients.before, out=gradients.q[7:])
-        found = {"targets": gradients.target, "q": gradients.q, "qd": gradients.qd, "before": gradients.before}
+            wp.map(wp.add, gradients.q[7:], gradients.initial_target, out=gradients.q[7:])
+        found = {"targets": gradients.target, "q": gradients.q, "qd": gradients.qd, "before": gradients.initial_target}
         return found | {"wrench": gradients.wrench} | self._named(gradients.parameters)
 
     def _seeds(self, trajectory: Trajectory, given: dict[str, wp.array | None]) -> Any:

@@ -99,7 +99,7 @@ def command_filter_kernel(
     offset: wp.array2d(dtype=real),
     params: FilterParams,
     # out
-    safe_target: wp.array2d(dtype=real),
+    filtered_target: wp.array2d(dtype=real),
 ):
     """Filter the motor targets of every leg. Launch over (4, worlds from `first` on).
 
@@ -112,12 +112,12 @@ def command_filter_kernel(
     coord = coords_per_world * world + 7 + 5 * leg
     dof = dofs_per_world * world + 6 + 5 * leg
     error = vec3(offset[lateral, world], offset[outer, world], offset[inner, world])
-    safe = filter_leg(
+    filtered = filter_leg(
         vec3(raw_target[lateral, world], raw_target[outer, world], raw_target[inner, world]),
         vec3(joint_q[coord], joint_q[coord + 1], joint_q[coord + 3]) + error,
         vec3(joint_qd[dof], joint_qd[dof + 1], joint_qd[dof + 3]),
         params,
     )
-    safe_target[lateral, world] = safe[0]
-    safe_target[outer, world] = safe[1]
-    safe_target[inner, world] = safe[2]
+    filtered_target[lateral, world] = filtered[0]
+    filtered_target[outer, world] = filtered[1]
+    filtered_target[inner, world] = filtered[2]

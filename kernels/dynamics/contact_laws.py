@@ -47,16 +47,16 @@ def contact_point(model: RobotModel, k: int, paw: PawKinematics, contact: PawCon
 
 @wp.func
 def paw_law(
-    model: RobotModel, world: int, k: int, contact: PawContact, before: vec3, velocity: vec3, old_impulse: vec3
+    model: RobotModel, world: int, k: int, contact: PawContact, old_velocity: vec3, velocity: vec3, old_impulse: vec3
 ) -> PawLaw:
     """Return the contact law of paw k.
 
-    before, velocity [m/s]: of the contact point at the start and the end of the step; old_impulse [N s]: of the step
-    before; body axes.
+    old_velocity, velocity [m/s]: of the contact point at the start and the end of the step; old_impulse [N s]: in the
+    preceding step; all in body axes.
     """
     law = PawLaw()
     p, n = contact.impulse, contact.normal
-    law.mu_row = friction_row(k, before, old_impulse, n)
+    law.mu_row = friction_row(k, old_velocity, old_impulse, n)
     law.mu = model.table[law.mu_row, world]
     law.mode = contact_mode(p, n, law.mu)
     if law.mode == SEPARATE:

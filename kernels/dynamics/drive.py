@@ -50,7 +50,7 @@ class Workspace:
     torque: wp.array2d(dtype=real)  # [N m] of each motor in the last step, (12, num_worlds)
     residual: wp.array(dtype=real)  # [m/s] of the contact iteration, largest of the launch
     sweeps: wp.array(dtype=int)  # of the contact iteration, most of the launch
-    invalid: wp.array(dtype=int)  # 1: the world became non-finite and waits for a reset
+    diverged: wp.array(dtype=int)  # 1: the world became non-finite and waits for a reset
     reference_q: wp.array(dtype=real)  # joint_q where invalid worlds are parked
 
 

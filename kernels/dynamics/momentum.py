@@ -103,7 +103,7 @@ def project_momentum_kernel(
     momenta: Momenta,
     body_f: wp.array(dtype=wp.spatial_vector),
     peak_force: wp.array(dtype=real),
-    invalid: wp.array(dtype=int),
+    diverged: wp.array(dtype=int),
     time: real,
     # in, out
     joint_q: wp.array(dtype=real),
@@ -114,7 +114,7 @@ def project_momentum_kernel(
     body_f: wrenches of that time. peak_force [N]: largest on the paws in it.
     """
     world = first + wp.tid()
-    if invalid[world] != 0 or peak_force[world] > real(0.0) or wp.length_sq(body_f[world * BODIES]) > 0.0:
+    if diverged[world] != 0 or peak_force[world] > real(0.0) or wp.length_sq(body_f[world * BODIES]) > 0.0:
         return
     if model.held.shape[0] > 0:
         if model.held[world] != 0:

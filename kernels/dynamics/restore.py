@@ -48,7 +48,7 @@ def restore_motors_kernel(
     standing: wp.array2d(dtype=float),
     # out
     target: wp.array2d(dtype=float),
-    safe_target: wp.array2d(dtype=float),
+    filtered_target: wp.array2d(dtype=float),
     torque: wp.array2d(dtype=float),
     paw_force: wp.array2d(dtype=wp.vec3),
     peak_force: wp.array(dtype=float),
@@ -59,7 +59,7 @@ def restore_motors_kernel(
         return
     for motor in range(12):
         target[motor, world] = standing[motor, world]
-        safe_target[motor, world] = standing[motor, world]
+        filtered_target[motor, world] = standing[motor, world]
         torque[motor, world] = 0.0
     for k in range(4):
         paw_force[k, world] = wp.vec3(0.0)
@@ -98,12 +98,12 @@ def clear_contact_kernel(
     # out
     impulse: wp.array2d(dtype=wp.vec3),
     contact_force: wp.array2d(dtype=wp.vec3),
-    invalid: wp.array(dtype=int),
+    diverged: wp.array(dtype=int),
 ):
     """Forget contact history and the invalid flag of the masked worlds; one thread per world."""
     world = wp.tid()
     if mask[world]:
-        invalid[world] = 0
+        diverged[world] = 0
         for k in range(4):
             impulse[k, world] = wp.vec3(0.0)
             contact_force[k, world] = wp.vec3(0.0)

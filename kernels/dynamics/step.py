@@ -191,8 +191,8 @@ def paw_contact(
     contact.active = 1
     contact.goal = target_normal_velocity(gap, pressed, dt)
     contact.impulse = wp.quat_rotate_inv(base.quat, impulse)
-    before = wp.quat_rotate_inv(base.quat, base.lin) + wp.cross(base.ang, point) + contact.jacobian * old_rates
-    contact.mu_row = friction_row(k, before - touch.velocity, contact.impulse, normal)
+    old_velocity = wp.quat_rotate_inv(base.quat, base.lin) + wp.cross(base.ang, point) + contact.jacobian * old_rates
+    contact.mu_row = friction_row(k, old_velocity - touch.velocity, contact.impulse, normal)
     contact.mu = model.table[contact.mu_row, world]
     contact = couple_contact(contact, point, leg, inverse)
     if on_block:

@@ -45,7 +45,9 @@ class Commands:
     """What a rollout is told; K = T S / every."""
 
     target: wp.array3d(dtype=real)  # [rad], (T, 12, num_worlds)
-    before: wp.array2d(dtype=real)  # [rad], (12, num_worlds): what the motors follow until the first target arrives
+    initial_target: wp.array2d(
+        dtype=real
+    )  # [rad], (12, num_worlds): what the motors follow until the first target arrives
     wrench: wp.array3d(dtype=real)  # [N], [N m] at the base's com, world axes, (T, 6, num_worlds)
     impulse: wp.array2d(dtype=vec3)  # [N s] of each paw in the step before the first, world axes, (4, num_worlds)
 
@@ -152,19 +154,19 @@ def load_world_motor(actuation: Actuation, motor: int, world: int) -> MotorParam
 class Arrival:
     """Which targets a motor follows in a physics step, late by the latency: the mean over the step of what arrived."""
 
-    older: int  # policy step of the target at the start of the physics step; -1: `Commands.before`
+    older: int  # policy step of the target at the start of the physics step; -1: `Commands.initial_target`
     newer: int  # and at its end
     weight: real  # of the newer one
 
 
 @wp.func
-def arrival(step: int, substeps: int, late: real) -> Arrival:
-    """Return what arrives during a physics step; late: latency in physics steps, any fraction.
+def arrival(step: int, substeps: int, delay: real) -> Arrival:
+    """Return what arrives during a physics step; delay: latency in physics steps, any fraction.
 
     Where a target arrives just as the step begins it has weight 1, whose derivative is that of more latency. No target
     arrives before it is sent, whatever the latency.
     """
-    begin = real(step) - late
+    begin = real(step) - delay
     size = real(substeps)
     a = Arrival()
     a.older = wp.clamp(int(wp.ceil(begin / size)) - 1, -1, step / substeps)
@@ -176,33 +178,37 @@ def arrival(step: int, substeps: int, late: real) -> Arrival:
 
 
 @wp.func
-def commanded(safe: wp.array3d(dtype=real), before: wp.array2d(dtype=real), step: int, motor: int, world: int) -> real:
+def commanded(
+    filtered_target: wp.array3d(dtype=real), initial_target: wp.array2d(dtype=real), step: int, motor: int, world: int
+) -> real:
     """Return a motor's target [rad] of a policy step, before the first one what it followed until then."""
     if step < 0:
-        return before[motor, world]
-    return safe[step, motor, world]
+        return initial_target[motor, world]
+    return filtered_target[step, motor, world]
 
 
 @wp.func
-def arrived_target(commands: Commands, safe: wp.array3d(dtype=real), arrived: Arrival, motor: int, world: int) -> real:
+def arrived_target(
+    commands: Commands, filtered_target: wp.array3d(dtype=real), arrived: Arrival, motor: int, world: int
+) -> real:
     """Return the target [rad] that a motor follows in a physics step."""
-    newer = commanded(safe, commands.before, arrived.newer, motor, world)
+    newer = commanded(filtered_target, commands.initial_target, arrived.newer, motor, world)
     if arrived.weight == real(1.0):
         return newer
-    older = commanded(safe, commands.before, arrived.older, motor, world)
+    older = commanded(filtered_target, commands.initial_target, arrived.older, motor, world)
     return older + arrived.weight * (newer - older)
 
 
 @wp.func
 def leg_torque(
-    commands: Commands, actuation: Actuation, safe: wp.array3d(dtype=real), arrived: Arrival, leg: int, world: int,
-    angles: vec3, rates: vec3,
+    commands: Commands, actuation: Actuation, filtered_target: wp.array3d(dtype=real), arrived: Arrival, leg: int,
+    world: int, angles: vec3, rates: vec3,
 ) -> vec3:  # fmt: skip
     """Return the torques [N m] of a leg's motors in a physics step."""
     torque = vec3(real(0.0))
     for j in range(3):
         motor = 3 * leg + j
-        target = arrived_target(commands, safe, arrived, motor, world)
+        target = arrived_target(commands, filtered_target, arrived, motor, world)
         torque[j] = motor_torque(target, angles[j], rates[j], load_world_motor(actuation, motor, world))
     return torque
 
@@ -210,7 +216,7 @@ def leg_torque(
 @wp.func
 def filter_commands(
     commands: Commands, actuation: Actuation, step: int, leg: int, world: int, angles: vec3, rates: vec3,
-    safe: wp.array3d(dtype=real),
+    filtered_target: wp.array3d(dtype=real),
 ):  # fmt: skip
     """Write what the filter lets through of a leg's targets at the start of a policy step."""
     m = 3 * leg
@@ -219,4 +225,4 @@ def filter_commands(
         offset = actuation.motors.offset
         read = angles + vec3(offset[m, world], offset[m + 1, world], offset[m + 2, world])
         target = filter_leg(target, read, rates, load_filter(actuation.limits, world))
-    store_row_vec3(safe, step, m, world, target)
+    store_row_vec3(filtered_target, step, m, world, target)

@@ -59,11 +59,11 @@ def clamp_transversal(limits: LegLimits, outer: real, inner: real) -> vec2:
     """Return (outer, inner) [rad] moved within limits; the inner one gives way to the limits of the sum."""
     lower = limits.transversal_lower
     upper = limits.transversal_upper
-    safe_outer = wp.clamp(outer, wp.max(lower, limits.sum_lower - upper), wp.min(upper, limits.sum_upper - lower))
-    safe_inner = wp.clamp(
-        inner, wp.max(lower, limits.sum_lower - safe_outer), wp.min(upper, limits.sum_upper - safe_outer)
+    clamped_outer = wp.clamp(outer, wp.max(lower, limits.sum_lower - upper), wp.min(upper, limits.sum_upper - lower))
+    clamped_inner = wp.clamp(
+        inner, wp.max(lower, limits.sum_lower - clamped_outer), wp.min(upper, limits.sum_upper - clamped_outer)
     )
-    return vec2(safe_outer, safe_inner)
+    return vec2(clamped_outer, clamped_inner)
 
 
 @wp.func

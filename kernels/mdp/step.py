@@ -85,7 +85,7 @@ def make_step_kernel(task: Any) -> wp.Kernel:
         ending = int(NOT_ENDED)
         timeout = float(0.0)
         success = bool(False)
-        broken = arrays.invalid[world] != 0 or env.bad_action[world] != 0 or has_diverged(robot)
+        broken = arrays.diverged[world] != 0 or env.bad_action[world] != 0 or has_diverged(robot)
         if broken:
             ending = wp.static(broken_ending)
         for i in range(wp.static(len(endings))):

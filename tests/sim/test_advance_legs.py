@@ -116,7 +116,7 @@ def test_a_world_that_came_apart_is_parked():
     q, qd, force = states(model, 0.34)
     qd[4, 3] = np.nan
     found = advance(dynamics, q, qd, force, by_legs=True)
-    np.testing.assert_array_equal(np.flatnonzero(dynamics.work.invalid.numpy()), [4])
+    np.testing.assert_array_equal(np.flatnonzero(dynamics.work.diverged.numpy()), [4])
     np.testing.assert_allclose(found[0].reshape(N, 43)[4], model.joint_q.numpy().reshape(N, 43)[4], atol=1.0e-7)
     np.testing.assert_array_equal(found[1].reshape(N, 38)[4], 0.0)
     np.testing.assert_array_equal(found[2][:, 4], 0.0)

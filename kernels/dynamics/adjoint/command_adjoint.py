@@ -38,24 +38,26 @@ class FilterAdjoint:
 def add_target(gradients: Gradients, step: int, motor: int, world: int, x: real):
     """Add to the gradient by a motor's filtered target of a policy step, or by what it followed before the first."""
     if step < 0:
-        wp.atomic_add(gradients.before, motor, world, x)  # no other thread does; so none waits for what was there
+        wp.atomic_add(
+            gradients.initial_target, motor, world, x
+        )  # no other thread does; so none waits for what was there
     else:
-        wp.atomic_add(gradients.safe, step, motor, world, x)
+        wp.atomic_add(gradients.filtered_target, step, motor, world, x)
 
 
 @wp.func
 def motor_gradient(
-    params: MotorParams, late: real, commands: Commands, safe: wp.array3d(dtype=real), timing: Timing, dt: real,
-    step: int, motor: int, world: int, angle: real, rate: real,
+    params: MotorParams, delay: real, commands: Commands, filtered_target: wp.array3d(dtype=real), timing: Timing,
+    dt: real, step: int, motor: int, world: int, angle: real, rate: real,
 ) -> MotorAdjoint:  # fmt: skip
     """Return the derivatives of a motor's torque in a step."""
     found = MotorAdjoint()
-    arrived = arrival(step, timing.substeps, late)
-    newer = commanded(safe, commands.before, arrived.newer, motor, world)
+    arrived = arrival(step, timing.substeps, delay)
+    newer = commanded(filtered_target, commands.initial_target, arrived.newer, motor, world)
     older = newer
     target = newer
     if arrived.newer > arrived.older:
-        older = commanded(safe, commands.before, arrived.older, motor, world)
+        older = commanded(filtered_target, commands.initial_target, arrived.older, motor, world)
         if arrived.weight != real(1.0):
             target = older + arrived.weight * (newer - older)
     by_target, by_angle, by_rate, by_motor = wp.grad(motor_torque)(target, angle, rate, params)
@@ -96,7 +98,7 @@ def filter_gradient(
     """Return a leg's gradients for those by its filtered targets of a policy step."""
     m = 3 * leg
     found = FilterAdjoint()
-    cotangent = row_vec3(gradients.safe, step, m, world)
+    cotangent = row_vec3(gradients.filtered_target, step, m, world)
     found.target = cotangent
     if actuation.filtered != 0:
         offset = actuation.motors.offset

@@ -89,7 +89,7 @@ def motor_constants_kernel(
     timing: Timing,
     actuation: Actuation,
     commands: Commands,
-    safe: wp.array3d(dtype=real),
+    filtered_target: wp.array3d(dtype=real),
     cotangent: TrajectoryArrays,
     span: Span,
     record: LegRecord,
@@ -105,7 +105,7 @@ def motor_constants_kernel(
     motors = wp.zeros(shape=(3,), dtype=MotorParams)
     for j in range(motors.shape[0]):
         motors[j] = load_world_motor(actuation, 3 * leg + j, world)
-    late = actuation.latency[world] / settings.dt
+    delay = actuation.latency[world] / settings.dt
     of_leg = thread_sums(gradients, world, turn == 0, True, False)
     of_legs = thread_sums(gradients, world, turn == 0 and leg == 0, True, True)
     for number in range(turns_of(timing, span, turns)):
@@ -119,7 +119,17 @@ def motor_constants_kernel(
             torque += row_vec3(cotangent.torque, at.step, 3 * leg, world)
         for c in range(motors.shape[0]):
             by_motor = motor_gradient(
-                motors[c], late, commands, safe, timing, settings.dt, at.step, 3 * leg + c, world, angles[c], rates[c]
+                motors[c],
+                delay,
+                commands,
+                filtered_target,
+                timing,
+                settings.dt,
+                at.step,
+                3 * leg + c,
+                world,
+                angles[c],
+                rates[c],
             )
             add_motor_constants(of_leg, of_legs, 3 * leg + c, torque[c], by_motor)
         by_filter = vec3(real(0.0))

@@ -59,9 +59,9 @@ class Gradients:
     q: wp.array2d(dtype=real)  # of row 0, (ROW_COORDS, num_worlds)
     qd: wp.array2d(dtype=real)  # (ROW_RATES, num_worlds)
     target: wp.array3d(dtype=real)  # (T, 12, num_worlds)
-    before: wp.array2d(dtype=real)  # (12, num_worlds), to be zeroed first
+    initial_target: wp.array2d(dtype=real)  # (12, num_worlds), to be zeroed first
     wrench: wp.array3d(dtype=real)  # (T, 6, num_worlds), likewise
-    safe: wp.array3d(dtype=real)  # of the filtered targets, (T, 12, num_worlds), likewise
+    filtered_target: wp.array3d(dtype=real)  # of the filtered targets, (T, 12, num_worlds), likewise
     parameters: wp.array2d(dtype=real)  # (GRADIENT_ROWS, num_worlds)
 
 

@@ -139,12 +139,12 @@ def replay_leg(
     put_base(record, i + 1, world, moved_base(base, old_lin + lin, base.ang + ang, dt))
     law = PawLaw()
     if touches:
-        before = old_lin + wp.cross(base.ang, point) + c.jacobian * rates
+        old_velocity = old_lin + wp.cross(base.ang, point) + c.jacobian * rates
         velocity = old_lin + lin + wp.cross(base.ang + ang, point) + c.jacobian * ahead
         old_impulse = first_impulse[leg, world]
         if step > 0:
             old_impulse = trajectory.impulse[step - 1, leg, world]
-        law = paw_law(model, world, leg, c, before, velocity, wp.quat_rotate_inv(base.quat, old_impulse))
+        law = paw_law(model, world, leg, c, old_velocity, velocity, wp.quat_rotate_inv(base.quat, old_impulse))
     if any_world(any_leg(law.mode != SEPARATE)):
         put_law_row(record, i, world, leg, inverted_laws(c, law, leg))
     put_law(record, i, world, leg, leg_law(c, law, impulse, point))

@@ -224,13 +224,13 @@ def load_laws(
             paw = record.paws[world, i, k]
             c = contact_at(model, k, base, paw, record.legs[world, i, k], record.inverse[world, i], impulse)
             point = contact_point(model, k, paw, c)
-            before = old_lin + wp.cross(base.ang, point) + c.jacobian * record.rates[world, i, k]
+            old_velocity = old_lin + wp.cross(base.ang, point) + c.jacobian * record.rates[world, i, k]
             velocity = lin + wp.cross(ang, point) + c.jacobian * record.rates[world, i + 1, k]
             old_impulse = first_impulse[k, world]
             if at.step > 0:
                 old_impulse = trajectory.impulse[at.step - 1, k, world]
             old_impulse = wp.quat_rotate_inv(base.quat, old_impulse)
-            law = paw_law(model, world, k, c, before, velocity, old_impulse)
+            law = paw_law(model, world, k, c, old_velocity, velocity, old_impulse)
             impulse_cotangent = m.lin + wp.cross(m.ang, point) + c.jacobian * legs[k].virtual_rates
             if cotangent.impulse.shape[0] > 0:
                 impulse_cotangent += wp.quat_rotate_inv(base.quat, cotangent.impulse[at.step, k, world])
@@ -243,11 +243,11 @@ def load_laws(
 
 @wp.func
 def add_laws(
-    model: RobotModel, at: StepPlace, record: StepRecord, before: Multipliers, legs: wp.array(dtype=LegReverse),
+    model: RobotModel, at: StepPlace, record: StepRecord, multipliers: Multipliers, legs: wp.array(dtype=LegReverse),
     contacts: wp.array(dtype=PawContact),
 ) -> Multipliers:  # fmt: skip
     """Return the multipliers with the share of the contact laws, whose own are known; the legs' are replaced."""
-    m = before
+    m = multipliers
     more_lin = vec3(real(0.0))
     more_ang = vec3(real(0.0))
     for k in range(legs.shape[0]):

@@ -80,7 +80,7 @@ class RowCotangent:
 
 @wp.func
 def load_row_base_adjoint(
-    trajectory: TrajectoryArrays, model: RobotModel, row: int, world: int, adj: BaseState, com_before: vec3
+    trajectory: TrajectoryArrays, model: RobotModel, row: int, world: int, adj: BaseState, later_com: vec3
 ) -> RowCotangent:
     """Return the gradient by a row's entries for that by the base's state which is read from it."""
     com = base_com(model.table, world)
@@ -93,7 +93,7 @@ def load_row_base_adjoint(
     cotangent.quat = orientation
     cotangent.lin = lin
     cotangent.ang = ang
-    cotangent.com = com_before + com_adj
+    cotangent.com = later_com + com_adj
     return cotangent
 
 
@@ -261,14 +261,14 @@ def reverse_kernel(
     timing: Timing,
     actuation: Actuation,
     commands: Commands,
-    safe: wp.array3d(dtype=real),
+    filtered_target: wp.array3d(dtype=real),
     trajectory: TrajectoryArrays,
     cotangent: TrajectoryArrays,
     # out
     record: StepRecord,
     gradients: Gradients,
 ):
-    """Add the gradient of a scalar to `gradients`, given that by the trajectory in `cotangent`; one thread per world."""
+    """Add the gradient of a scalar to `gradients`, given its gradient by the trajectory; one thread per world."""
     world = settings.first + wp.tid()
     legs = wp.zeros(shape=(4,), dtype=LegReverse)
     contacts = wp.zeros(shape=(4,), dtype=PawContact)
@@ -278,7 +278,7 @@ def reverse_kernel(
     params = wp.zeros(shape=(4,), dtype=LegParams)
     motors = wp.zeros(shape=(12,), dtype=MotorParams)
     load_parts(model, actuation, world, params, motors)
-    late = actuation.latency[world] / settings.dt
+    delay = actuation.latency[world] / settings.dt
     last = timing.steps * timing.substeps / timing.every
     entries = add_row_cotangent(RowCotangent(), cotangent, last, world)
     add_motor_rows(legs, cotangent, last, world)
@@ -310,11 +310,13 @@ def reverse_kernel(
             )
             adj = by_step.base
             add_wrench(gradients, t, world, by_step.force, by_step.moment)
-            arrived = arrival(at.step, timing.substeps, late)
+            arrived = arrival(at.step, timing.substeps, delay)
             for i in range(motors.shape[0]):
                 angle = record.angles[world, at.entry, i / 3][i % 3]
                 rate = record.rates[world, at.entry, i / 3][i % 3]
-                found = motor_gradient(motors[i], late, commands, safe, timing, at.dt, at.step, i, world, angle, rate)
+                found = motor_gradient(
+                    motors[i], delay, commands, filtered_target, timing, at.dt, at.step, i, world, angle, rate
+                )
                 add_motor_adjoint(found, arrived, at, i, cotangent, gradients, legs, sums)
         entries = add_row_cotangent(
             load_row_base_adjoint(trajectory, model, row, world, adj, end.com), cotangent, row, world

@@ -75,7 +75,7 @@ def replay_legs_kernel(
     timing: Timing,
     actuation: Actuation,
     commands: Commands,
-    safe: wp.array3d(dtype=real),
+    filtered_target: wp.array3d(dtype=real),
     trajectory: TrajectoryArrays,
     span: Span,
     # out
@@ -101,7 +101,7 @@ def replay_legs_kernel(
     motors = wp.zeros(shape=(3,), dtype=MotorParams)
     for c in range(motors.shape[0]):
         motors[c] = load_world_motor(actuation, 3 * leg + c, world)
-    late = actuation.latency[world] / settings.dt
+    delay = actuation.latency[world] / settings.dt
     for i in range(timing.every):
         step = first + i
         replay_leg(
@@ -113,7 +113,17 @@ def replay_legs_kernel(
         slopes = MotorSlopes()
         for c in range(motors.shape[0]):
             by_motor = motor_gradient(
-                motors[c], late, commands, safe, timing, settings.dt, step, 3 * leg + c, world, angles[c], rates[c]
+                motors[c],
+                delay,
+                commands,
+                filtered_target,
+                timing,
+                settings.dt,
+                step,
+                3 * leg + c,
+                world,
+                angles[c],
+                rates[c],
             )
             slopes.target[c] = by_motor.target
             slopes.angle[c] = by_motor.angle
@@ -185,7 +195,7 @@ def reverse_legs_kernel(
     timing: Timing,
     actuation: Actuation,
     commands: Commands,
-    safe: wp.array3d(dtype=real),
+    filtered_target: wp.array3d(dtype=real),
     trajectory: TrajectoryArrays,
     cotangent: TrajectoryArrays,
     span: Span,
@@ -202,7 +212,7 @@ def reverse_legs_kernel(
     world = settings.first + wp.min(place, count - 1)
     dt = settings.dt
     own = load_leg(model, world, leg)
-    late = actuation.latency[world] / dt
+    delay = actuation.latency[world] / dt
     entries = load_entries(gradients, world)
     adj = load_motor_entries(gradients, world, leg)
     of_leg = thread_sums(gradients, world, place < count, False, False)
@@ -237,7 +247,7 @@ def reverse_legs_kernel(
                 adj,
                 place < count,
             )
-            arrived = arrival(step, timing.substeps, late)
+            arrived = arrival(step, timing.substeps, delay)
             slopes = get_slopes(record, at + i, world, leg)
             adj = reverse_motors(adj, slopes, arrived, cotangent, step, leg, world, gradients, place < count)
         entries = add_row_cotangent(

@@ -28,7 +28,7 @@ class SolvedStep:
     """A step on the tape, arrays by world or by (leg, world): its solution, and what the reverse pass finds of it."""
 
     trajectory: TrajectoryArrays  # torques, impulses and pressed stops, shape (1, ..., num_worlds)
-    before: wp.array2d(dtype=vec3)  # [N s] on each paw in the step before, world axes
+    old_impulse: wp.array2d(dtype=vec3)  # [N s] on each paw in the step before, world axes
     lin: wp.array(dtype=vec3)  # [m/s] of the base at the end of the step, in the body axes of its start
     ang: wp.array(dtype=vec3)  # [rad/s]
     rates: wp.array2d(dtype=vec3)  # [rad/s] of the motors
@@ -64,7 +64,7 @@ def solve_kernel(
         legs[k].rates = load_motors(joint_qd, leg_dof(world, k))
         legs[k].torque = torque
         store_row_vec3(solved.trajectory.torque, 0, 3 * k, world, torque)
-        solved.before[k, world] = work.impulse[k, world]
+        solved.old_impulse[k, world] = work.impulse[k, world]
     wrench = base_wrench(drive.joint_f, drive.body_f, world)
     force = vec3(wrench[0], wrench[1], wrench[2])
     moment = vec3(wrench[3], wrench[4], wrench[5])
@@ -174,7 +174,7 @@ def adj_end_velocities(
     m = find_multipliers(
         model,
         at,
-        solved.before,
+        solved.old_impulse,
         solved.trajectory,
         TrajectoryArrays(),
         record,

@@ -90,7 +90,7 @@ def solve_paws(c: PawContact, blocks: bool, block: BlockLaw, leg: int, max_round
     s.lin = sum_vec(c.to_lin * c.impulse)
     s.ang = sum_vec(c.to_ang * c.impulse)
     working, together = bool(True), bool(True)
-    before = real(ANY_CHANGE)
+    previous_change = real(ANY_CHANGE)
     while any_world(working):
         velocity = c.free + c.from_lin * s.lin + c.from_ang * s.ang + c.own * s.impulse
         if blocks:
@@ -109,8 +109,8 @@ def solve_paws(c: PawContact, blocks: bool, block: BlockLaw, leg: int, max_round
         if working:
             s.residual = wp.sqrt(most)
         working = working and s.residual > tolerance and s.rounds < max_rounds
-        together = together and most <= SHRINKING * SHRINKING * before
-        before = most
+        together = together and most <= SHRINKING * SHRINKING * previous_change
+        previous_change = most
         if leg != chosen and not together:
             step = vec3(real(0.0))
         lin = sum_vec(c.to_lin * step)
@@ -283,12 +283,12 @@ def advance_legs_kernel(
     while any_world(s.step < settings.substeps):
         s = advance_leg(model, settings, drive, own, motors, world, leg, s, leg == 0 and place < count)
     total = sum_legs(wp.dot(s.angles, s.angles) + wp.dot(s.rates, s.rates))
-    broken = work.invalid[world] != 0 or not (finite_base(s.base) and wp.isfinite(total))
+    broken = work.diverged[world] != 0 or not (finite_base(s.base) and wp.isfinite(total))
     if place >= count:
         return
     if broken:
         if leg == 0:
-            work.invalid[world] = 1
+            work.diverged[world] = 1
             freeze_diverged_world(model, work, world, joint_q_out, joint_qd_out)
         return
     for j in range(3):

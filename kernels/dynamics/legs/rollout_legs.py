@@ -37,7 +37,7 @@ def rollout_legs_kernel(
     commands: Commands,
     drive: Drive,
     # out
-    safe: wp.array3d(dtype=real),
+    filtered_target: wp.array3d(dtype=real),
     trajectory: TrajectoryArrays,
 ):
     """Do what `rollout_kernel` does, to the contact tolerance; launch over (count rounded up to a multiple of 8, 4).
@@ -47,7 +47,7 @@ def rollout_legs_kernel(
     place, leg = wp.tid()
     world = settings.first + wp.min(place, count - 1)  # threads beyond the last world repeat it
     com = base_com(model.table, world)
-    late = actuation.latency[world] / settings.dt
+    delay = actuation.latency[world] / settings.dt
     own = load_leg(model, world, leg)
     s = LegState()
     s.impulse = commands.impulse[leg, world]
@@ -59,14 +59,14 @@ def rollout_legs_kernel(
             s.angles = row_vec3(trajectory.q, row, 7 + 3 * leg, world)
             s.rates = row_vec3(trajectory.qd, row, 6 + 3 * leg, world)
         if step == t * timing.substeps:
-            filter_commands(commands, actuation, t, leg, world, s.angles, s.rates, safe)
+            filter_commands(commands, actuation, t, leg, world, s.angles, s.rates, filtered_target)
             if leg == 0:
                 for i in range(6):
                     drive.joint_f[world * DOFS + i] = commands.wrench[t, i, world]
             sync_lanes()
-        arrived = arrival(step, timing.substeps, late)
+        arrived = arrival(step, timing.substeps, delay)
         motors = LegDrive()
-        torque = leg_torque(commands, actuation, safe, arrived, leg, world, s.angles, s.rates)
+        torque = leg_torque(commands, actuation, filtered_target, arrived, leg, world, s.angles, s.rates)
         motors.extra = torque
         s.step = 0
         s.sets = 0

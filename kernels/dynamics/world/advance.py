@@ -90,7 +90,7 @@ def advance_kernel(
     Writes the base and motor coordinates; the passive ones follow in `full_state`.
     """
     world = settings.first + wp.tid()
-    if work.invalid[world] != 0:
+    if work.diverged[world] != 0:
         freeze_diverged_world(model, work, world, joint_q_out, joint_qd_out)
         return
     com = base_com(model.table, world)
@@ -116,5 +116,5 @@ def advance_kernel(
         total += wp.dot(angles, angles) + wp.dot(rates, rates)
     store_base(joint_q_out, joint_qd_out, com, world, base)
     if not (finite_base(base) and wp.isfinite(total)):
-        work.invalid[world] = 1
+        work.diverged[world] = 1
         freeze_diverged_world(model, work, world, joint_q_out, joint_qd_out)

@@ -43,7 +43,7 @@ def rollout_kernel(
     # in, out
     work: Workspace,
     # out
-    safe: wp.array3d(dtype=real),
+    filtered_target: wp.array3d(dtype=real),
     trajectory: TrajectoryArrays,
 ):
     """Run a rollout from the state in row 0; one thread per world.
@@ -56,7 +56,7 @@ def rollout_kernel(
     legs = wp.zeros(shape=(4,), dtype=LegStep)
     contacts = wp.zeros(shape=(4,), dtype=PawContact)
     peaks = wp.zeros(shape=(4,), dtype=real)
-    late = actuation.latency[world] / settings.dt
+    delay = actuation.latency[world] / settings.dt
     for k in range(legs.shape[0]):
         work.impulse[k, world] = commands.impulse[k, world]
     base = BaseState()
@@ -70,12 +70,12 @@ def rollout_kernel(
                 legs[k].rates = row_vec3(trajectory.qd, row, 6 + 3 * k, world)
         if step == t * timing.substeps:
             for k in range(legs.shape[0]):
-                filter_commands(commands, actuation, t, k, world, legs[k].angles, legs[k].rates, safe)
+                filter_commands(commands, actuation, t, k, world, legs[k].angles, legs[k].rates, filtered_target)
             for i in range(6):
                 drive.joint_f[world * DOFS + i] = commands.wrench[t, i, world]
-        arrived = arrival(step, timing.substeps, late)
+        arrived = arrival(step, timing.substeps, delay)
         for k in range(legs.shape[0]):
-            torque = leg_torque(commands, actuation, safe, arrived, k, world, legs[k].angles, legs[k].rates)
+            torque = leg_torque(commands, actuation, filtered_target, arrived, k, world, legs[k].angles, legs[k].rates)
             store_row_vec3(trajectory.torque, step, 3 * k, world, torque)
             store_motors(drive.joint_f, leg_dof(world, k), torque)
         base = advance_once(model, settings, drive, work, world, 0, base, legs, contacts, peaks)
