@@ -17,8 +17,8 @@ def _exchange(gpu: str, sent: str, received: str, threads: int = 4) -> str:
     {gpu}
 #else
     static decltype({sent}) box[{threads}];
-    const int place = WP_TILE_THREAD_IDX % {threads};
-    box[place] = {sent};
+    const int lane = WP_TILE_THREAD_IDX % {threads};
+    box[lane] = {sent};
     WP_TILE_SYNC();
     const auto received = {received};
     WP_TILE_SYNC();
@@ -47,10 +47,10 @@ _LEAST = _exchange(
 )  # fmt: skip
 _ALL = _exchange(
     "return __all_sync(0xfu << (threadIdx.x & 28u), flag);",
-    "flag", "box[place & 28] && box[place & 28 | 1] && box[place & 28 | 2] && box[place & 28 | 3]", 32,
+    "flag", "box[lane & 28] && box[lane & 28 | 1] && box[lane & 28 | 2] && box[lane & 28 | 3]", 32,
 )  # fmt: skip
-_FROM_OWN = _exchange("return __shfl_sync(0xfu << (threadIdx.x & 28u), x, leg, 4);", "x", "box[place & 28 | leg]", 32)
-_TURNS = """
+_FROM_OWN = _exchange("return __shfl_sync(0xfu << (threadIdx.x & 28u), x, leg, 4);", "x", "box[lane & 28 | leg]", 32)
+_STEP_THREADS = """
 #if defined(__CUDA_ARCH__)
     x += __shfl_xor_sync(0xffffffffu, x, 4);
     x += __shfl_xor_sync(0xffffffffu, x, 8);
@@ -80,8 +80,8 @@ def sum_legs(x: real) -> real:
     ...
 
 
-@wp.func_native(_TURNS)
-def sum_turns(x: real) -> real:
+@wp.func_native(_STEP_THREADS)
+def sum_step_threads(x: real) -> real:
     """Return the sum over threads of a leg where a warp has one world, its threads being (8, 4); itself on a CPU."""
     ...
 

@@ -117,27 +117,27 @@ def pressed_stops(stop_rates: StopRates, rates: vec3, slack: real, pressed: int)
     rate = vec4(rates[0], rates[1], rates[2], rates[1] + rates[2])
     if pressed == 0 and not wp.max(wp.max(stop_rates.lower - rate, rate - stop_rates.upper)) > slack:
         return 0
-    found = int(0)
+    stops = int(0)
     for i in range(ROWS):
         side = row_side(pressed, i)
         if stop_rates.lower[i] - rate[i] > wp.where(side == LOWER_STOP, -slack, slack):
-            found += LOWER_STOP << (ROW_BITS * i)
+            stops += LOWER_STOP << (ROW_BITS * i)
         elif rate[i] - stop_rates.upper[i] > wp.where(side == UPPER_STOP, -slack, slack):
-            found += UPPER_STOP << (ROW_BITS * i)
-    return found
+            stops += UPPER_STOP << (ROW_BITS * i)
+    return stops
 
 
 @wp.func
 def revised_stops(stop_rates: StopRates, rates: vec3, slack: real, pressed: int, sets: int) -> int:
     """Return the set to try after `sets` sets of a step, the last of which, `pressed`, led to `rates` [rad/s]."""
-    wanted = pressed_stops(stop_rates, rates, slack, pressed)
-    if wanted == pressed or sets < PRESS_ONLY:
-        return wanted
-    found = pressed
+    required = pressed_stops(stop_rates, rates, slack, pressed)
+    if required == pressed or sets < PRESS_ONLY:
+        return required
+    stops = pressed
     for i in range(ROWS):
         if row_side(pressed, i) == 0:
-            found += wanted & (ROW_MASK << (ROW_BITS * i))
-    return found
+            stops += required & (ROW_MASK << (ROW_BITS * i))
+    return stops
 
 
 @wp.func
@@ -147,12 +147,12 @@ def one_by_one(sets: int) -> bool:
 
 
 @wp.func
-def change_one(pressed: int, wanted: int) -> int:
-    """Return `pressed` with the first row in which it differs from `wanted` changed."""
+def change_one(pressed: int, required: int) -> int:
+    """Return `pressed` with the first row in which it differs from `required` changed."""
     for i in range(ROWS):
         bits = ROW_MASK << (ROW_BITS * i)
-        if (pressed ^ wanted) & bits != 0:
-            return (pressed & ~bits) | (wanted & bits)
+        if (pressed ^ required) & bits != 0:
+            return (pressed & ~bits) | (required & bits)
     return pressed
 
 

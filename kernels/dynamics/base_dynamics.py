@@ -51,7 +51,7 @@ def eliminate_leg(leg: LegDynamics, implicit: mat33, torque: vec3) -> LegSolve:
 
 
 @wp.func
-def base_alone(body: MassMoments, omega: vec3, g: vec3, force: vec3, moment: vec3) -> BaseSystem:
+def base_link_system(body: MassMoments, omega: vec3, g: vec3, force: vec3, moment: vec3) -> BaseSystem:
     """Return the system of the base link alone.
 
     omega: angular velocity [rad/s], g: gravity [m/s^2], force [N] and moment about the origin [N m] from outside;

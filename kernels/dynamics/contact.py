@@ -57,7 +57,7 @@ class PawContact:
     from_ang: mat33
     to_lin: mat33  # S^-1 G^T: base twist per impulse
     to_ang: mat33
-    own: mat33  # A: contact velocity per impulse through the leg alone [1/kg]
+    leg_response: mat33  # A: contact velocity per impulse through the leg alone [1/kg]
     total_inv: mat33  # inverse of `total` [kg]
     total: mat33  # A + G S^-1 G^T, plus 1/mass of the block along the floor: relative velocity per impulse [1/kg]
     impulse: vec3  # [N s]
@@ -108,8 +108,8 @@ def couple_contact(contact: PawContact, point: vec3, leg: LegSolve, base: BaseIn
     ang_t = wp.transpose(c.from_ang)
     c.to_lin = base.lin * lin_t + base.cross * ang_t
     c.to_ang = wp.transpose(base.cross) * lin_t + base.ang * ang_t
-    c.own = c.jacobian * leg_response
-    c.total = c.own + c.from_lin * c.to_lin + c.from_ang * c.to_ang
+    c.leg_response = c.jacobian * leg_response
+    c.total = c.leg_response + c.from_lin * c.to_lin + c.from_ang * c.to_ang
     c.total_inv = wp.inverse(c.total)
     return c
 
@@ -209,7 +209,7 @@ def sweep_contacts(contacts: wp.array(dtype=PawContact), block: BlockLaw, state:
     for k in range(contacts.shape[0]):
         if contacts[k].active != 0:
             c = contacts[k]
-            velocity = c.free + c.from_lin * s.lin + c.from_ang * s.ang + c.own * c.impulse
+            velocity = c.free + c.from_lin * s.lin + c.from_ang * s.ang + c.leg_response * c.impulse
             if c.on_block != 0:
                 velocity -= block_velocity(block, push_on_block(contacts))
             impulse = local_impulse(c, c.impulse, velocity)

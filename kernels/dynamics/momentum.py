@@ -19,7 +19,7 @@ wp.set_module_options({"enable_backward": False})
 
 
 @wp.struct
-class Motion:
+class RobotMomentum:
     """Mass moments and momentum of a robot, body axes."""
 
     body: MassMoments  # of the whole robot about the base origin
@@ -36,45 +36,45 @@ class Momenta:
 
 
 @wp.func
-def motion_of(
+def robot_momentum(
     model: RobotModel, world: int, base: BaseState, joint_q: wp.array(dtype=real), joint_qd: wp.array(dtype=real)
-) -> Motion:  # fmt: skip
+) -> RobotMomentum:  # fmt: skip
     """Return a robot's mass moments and momentum."""
-    motion = Motion()
+    momentum = RobotMomentum()
     body = load_moments(model.table, BASE, world)
     for k in range(model.geometry.shape[0]):
-        own = load_leg(model, world, k)
+        params = load_leg(model, world, k)
         rates = load_motors(joint_qd, leg_dof(world, k))
-        pose = leg_pose(own.geometry, load_motors(joint_q, leg_coord(world, k)))
-        leg = leg_dynamics(own.geometry, own.masses, pose, rates, base.ang, vec3(real(0.0)))
+        pose = leg_pose(params.geometry, load_motors(joint_q, leg_coord(world, k)))
+        leg = leg_dynamics(params.geometry, params.masses, pose, rates, base.ang, vec3(real(0.0)))
         body.mass += leg.body.mass
         body.first += leg.body.first
         body.second += leg.body.second
-        motion.lin += leg.coupling_lin * rates
-        motion.ang += leg.coupling_ang * rates
+        momentum.lin += leg.coupling_lin * rates
+        momentum.ang += leg.coupling_ang * rates
     velocity = wp.quat_rotate_inv(base.quat, base.lin)
-    motion.body = body
-    motion.lin += body.mass * velocity - wp.cross(body.first, base.ang)
-    motion.ang += wp.cross(body.first, velocity) + inertia_mul(body.second, base.ang)
-    motion.ang -= wp.cross(body.first, motion.lin) / body.mass  # from the origin to the centre of mass
-    return motion
+    momentum.body = body
+    momentum.lin += body.mass * velocity - wp.cross(body.first, base.ang)
+    momentum.ang += wp.cross(body.first, velocity) + inertia_mul(body.second, base.ang)
+    momentum.ang -= wp.cross(body.first, momentum.lin) / body.mass  # from the origin to the centre of mass
+    return momentum
 
 
 @wp.func
-def corrected(base: BaseState, motion: Motion, lin: vec3, ang: vec3) -> BaseState:
+def base_with_momentum(base: BaseState, momentum: RobotMomentum, lin: vec3, ang: vec3) -> BaseState:
     """Return the base with the twist that gives the robot a momentum lin [kg m/s], ang [kg m^2/s], world axes."""
-    mass = motion.body.mass
-    com = motion.body.first / mass
+    mass = momentum.body.mass
+    com = momentum.body.first / mass
     # about the centre of mass: I - m (c.c 1 - c c^T)
-    inertia = inertia_matrix(motion.body.second) - mass * (
+    inertia = inertia_matrix(momentum.body.second) - mass * (
         wp.dot(com, com) * wp.identity(n=3, dtype=real) - wp.outer(com, com)
     )
-    turn = inverse_symmetric(inertia) * (wp.quat_rotate_inv(base.quat, ang) - motion.ang)
-    push = (wp.quat_rotate_inv(base.quat, lin) - motion.lin) / mass
-    new = base
-    new.ang = base.ang + turn
-    new.lin = base.lin + wp.quat_rotate(base.quat, push - wp.cross(turn, com))
-    return new
+    ang_change = inverse_symmetric(inertia) * (wp.quat_rotate_inv(base.quat, ang) - momentum.ang)
+    lin_change = (wp.quat_rotate_inv(base.quat, lin) - momentum.lin) / mass
+    corrected = base
+    corrected.ang = base.ang + ang_change
+    corrected.lin = base.lin + wp.quat_rotate(base.quat, lin_change - wp.cross(ang_change, com))
+    return corrected
 
 
 @wp.kernel
@@ -90,9 +90,9 @@ def momentum_kernel(
     """Write the momentum of every robot; one thread per world."""
     world = first + wp.tid()
     base = load_base(joint_q, joint_qd, base_com(model.table, world), world)
-    motion = motion_of(model, world, base, joint_q, joint_qd)
-    momenta.lin[world] = wp.quat_rotate(base.quat, motion.lin)
-    momenta.ang[world] = wp.quat_rotate(base.quat, motion.ang)
+    momentum = robot_momentum(model, world, base, joint_q, joint_qd)
+    momenta.lin[world] = wp.quat_rotate(base.quat, momentum.lin)
+    momenta.ang[world] = wp.quat_rotate(base.quat, momentum.ang)
 
 
 @wp.kernel
@@ -121,6 +121,6 @@ def project_momentum_kernel(
             return
     com = base_com(model.table, world)
     base = load_base(joint_q, joint_qd, com, world)
-    motion = motion_of(model, world, base, joint_q, joint_qd)
-    lin = momenta.lin[world] + time * motion.body.mass * load_vec3(model.table, GRAVITY, world)
-    store_base(joint_q, joint_qd, com, world, corrected(base, motion, lin, momenta.ang[world]))
+    momentum = robot_momentum(model, world, base, joint_q, joint_qd)
+    lin = momenta.lin[world] + time * momentum.body.mass * load_vec3(model.table, GRAVITY, world)
+    store_base(joint_q, joint_qd, com, world, base_with_momentum(base, momentum, lin, momenta.ang[world]))

@@ -17,7 +17,7 @@ from .base_dynamics import (
     BaseInverse,
     BaseSystem,
     LegSolve,
-    base_alone,
+    base_link_system,
     eliminate_leg,
 )
 from .base_motion import external_wrench
@@ -204,7 +204,7 @@ def paw_contact(
 def base_system(model: RobotModel, world: int, base: BaseState, g: vec3, force: vec3, moment: vec3) -> BaseSystem:
     """Return the base link's own equations; force [N] and moment [N m] from outside at its com, world axes."""
     wrench = external_wrench(base, base_com(model.table, world), force, moment)
-    return base_alone(load_moments(model.table, BASE, world), base.ang, g, wrench.force, wrench.moment)
+    return base_link_system(load_moments(model.table, BASE, world), base.ang, g, wrench.force, wrench.moment)
 
 
 @wp.func

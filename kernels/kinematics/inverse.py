@@ -16,7 +16,7 @@ import warp as wp
 from ..scalar import quat, real, vec2, vec3
 from .five_bar import five_bar
 from .geometry import LegGeometry
-from .leg import ankle_in_housing, knee_angles, leg_forward_kinematics, turn_lateral
+from .leg import ankle_in_housing, knee_angles, leg_forward_kinematics, rotate_lateral
 
 wp.set_module_options({"enable_backward": False})
 
@@ -114,7 +114,7 @@ def clamped_closed_form(geo: LegGeometry, limits: LegLimits, target: vec3) -> ve
 def nearest_ankle(geo: LegGeometry, limits: LegLimits, target: vec3, thighs: vec2) -> vec3:
     """Return the ankle position nearest to `target` for thigh angles [rad]; both [m] relative to the hip, body axes."""
     ankle = ankle_in_housing(geo, five_bar(geo, thighs[0], thighs[1]))
-    return turn_lateral(geo, nearest_lateral(geo, limits, target, ankle[2]), ankle)
+    return rotate_lateral(geo, nearest_lateral(geo, limits, target, ankle[2]), ankle)
 
 
 @wp.func

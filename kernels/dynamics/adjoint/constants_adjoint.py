@@ -17,7 +17,7 @@ wp.set_module_options({"enable_backward": False, "fast_math": True})
 
 
 @wp.struct
-class Turn:
+class SpanStep:
     """A step of a span that one of the threads of a leg takes."""
 
     step: int
@@ -26,28 +26,28 @@ class Turn:
 
 
 @wp.func
-def turns_of(timing: Timing, span: Span, turns: int) -> int:
-    """Return how many steps each of `turns` threads takes, one after the other."""
-    return ((span.end - span.begin) * timing.every + turns - 1) / turns
+def steps_per_thread(timing: Timing, span: Span, threads_per_leg: int) -> int:
+    """Return how many steps each of `threads_per_leg` threads takes, one after the other."""
+    return ((span.end - span.begin) * timing.every + threads_per_leg - 1) / threads_per_leg
 
 
 @wp.func
-def turn_at(timing: Timing, span: Span, number: int) -> Turn:
-    """Return step `number` of a span."""
-    found = Turn()
+def span_step(timing: Timing, span: Span, k: int) -> SpanStep:
+    """Return step `k` of a span."""
+    step = SpanStep()
     end = span.end * timing.every
-    found.step = span.begin * timing.every + number
-    found.weight = wp.where(found.step < end, real(1.0), real(0.0))
-    found.step = wp.min(found.step, end - 1)
-    row = found.step / timing.every
-    found.entry = first_entry(timing, span, row) + found.step - row * timing.every
-    return found
+    step.step = span.begin * timing.every + k
+    step.weight = wp.where(step.step < end, real(1.0), real(0.0))
+    step.step = wp.min(step.step, end - 1)
+    row = step.step / timing.every
+    step.entry = first_entry(timing, span, row) + step.step - row * timing.every
+    return step
 
 
 @wp.kernel
 def leg_constants_kernel(
     # in
-    turns: int,
+    threads_per_leg: int,
     model: RobotModel,
     settings: StepSettings,
     timing: Timing,
@@ -62,29 +62,29 @@ def leg_constants_kernel(
 
     turns: threads that share the steps of a leg, 8 on a GPU, with a warp a world, and 1 on a CPU.
     """
-    place, turn, leg = wp.tid()
-    world = settings.first + place
+    index, thread, leg = wp.tid()
+    world = settings.first + index
     dt = settings.dt
-    own = load_leg(model, world, leg)
-    sums = thread_sums(gradients, world, turn == 0, True, False)
-    for number in range(turns_of(timing, span, turns)):
-        at = turn_at(timing, span, number * turns + turn)
+    params = load_leg(model, world, leg)
+    sums = thread_sums(gradients, world, thread == 0, True, False)
+    for k in range(steps_per_thread(timing, span, threads_per_leg)):
+        at = span_step(timing, span, k * threads_per_leg + thread)
         sums.weight = at.weight
         i = at.entry
         base = get_base(record, i, world)
         law = get_law(record, i, world, leg)
-        held = base_factors(record, world, i, dt, base, get_base_weights(record, i, world))
+        base_held = base_factors(record, world, i, dt, base, get_base_weights(record, i, world))
         weights = get_leg_weights(record, i, world, leg)
-        found = leg_gradient(
-            model, own, dt, world, leg, trajectory, cotangent, at.step, i, record, base, law, held, weights
+        gradient = leg_gradient(
+            model, params, dt, world, leg, trajectory, cotangent, at.step, i, record, base, law, base_held, weights
         )
-        add_leg_constants(sums, leg, law, found)
+        add_leg_constants(sums, leg, law, gradient)
 
 
 @wp.kernel
 def motor_constants_kernel(
     # in
-    turns: int,
+    threads_per_leg: int,
     settings: StepSettings,
     timing: Timing,
     actuation: Actuation,
@@ -100,18 +100,18 @@ def motor_constants_kernel(
 
     With those of the legs in one kernel, a GPU's threads would keep more at a time than its first cache holds.
     """
-    place, turn, leg = wp.tid()
-    world = settings.first + place
+    index, thread, leg = wp.tid()
+    world = settings.first + index
     motors = wp.zeros(shape=(3,), dtype=MotorParams)
     for j in range(motors.shape[0]):
         motors[j] = load_world_motor(actuation, 3 * leg + j, world)
     delay = actuation.latency[world] / settings.dt
-    of_leg = thread_sums(gradients, world, turn == 0, True, False)
-    of_legs = thread_sums(gradients, world, turn == 0 and leg == 0, True, True)
-    for number in range(turns_of(timing, span, turns)):
-        at = turn_at(timing, span, number * turns + turn)
-        of_leg.weight = at.weight
-        of_legs.weight = at.weight
+    leg_sums = thread_sums(gradients, world, thread == 0, True, False)
+    shared_sums = thread_sums(gradients, world, thread == 0 and leg == 0, True, True)
+    for k in range(steps_per_thread(timing, span, threads_per_leg)):
+        at = span_step(timing, span, k * threads_per_leg + thread)
+        leg_sums.weight = at.weight
+        shared_sums.weight = at.weight
         angles = get_vec(record, at.entry, ANGLES, world, leg)
         rates = get_vec(record, at.entry, RATES, world, leg)
         torque = settings.dt * get_leg_weights(record, at.entry, world, leg).rates
@@ -131,11 +131,11 @@ def motor_constants_kernel(
                 angles[c],
                 rates[c],
             )
-            add_motor_constants(of_leg, of_legs, 3 * leg + c, torque[c], by_motor)
+            add_motor_constants(leg_sums, shared_sums, 3 * leg + c, torque[c], by_motor)
         by_filter = vec3(real(0.0))
         if actuation.filtered != 0 and at.step - (at.step / timing.substeps) * timing.substeps == 0:
             by_filter = get_vec(record, at.entry, FILTER, world, leg)
-        add_offsets(of_leg, leg, by_filter)
+        add_offsets(leg_sums, leg, by_filter)
 
 
 ADJOINTS = generate_adjoints(__name__)

@@ -10,7 +10,7 @@ from ...actuation.motors import MotorParams
 from ...actuation.springs import LegSpring
 from ...actuation.stops import StopParams
 from ...kinematics.geometry import LegGeometry
-from ...lanes import sum_legs, sum_turns
+from ...lanes import sum_legs, sum_step_threads
 from ...layout import (
     ARMATURE,
     BASE,
@@ -72,21 +72,21 @@ class ThreadSums:
     parameters: wp.array2d(dtype=real)  # (GRADIENT_ROWS, num_worlds)
     world: int
     weight: real  # of what this thread found
-    adds: bool  # whether it adds the sum of what all of them found
-    turns: bool  # over those that have other steps of the same leg
-    legs: bool  # over those that have other legs
+    writes: bool  # whether it adds the sum of what all of them found
+    over_steps: bool  # over those that have other steps of the same leg
+    over_legs: bool  # over those that have other legs
 
 
 @wp.func
-def thread_sums(gradients: Gradients, world: int, adds: bool, turns: bool, legs: bool) -> ThreadSums:
+def thread_sums(gradients: Gradients, world: int, writes: bool, over_steps: bool, over_legs: bool) -> ThreadSums:
     """Return where a thread adds, all that it finds counted; see `ThreadSums`."""
     sums = ThreadSums()
     sums.parameters = gradients.parameters
     sums.world = world
     sums.weight = real(1.0)
-    sums.adds = adds
-    sums.turns = turns
-    sums.legs = legs
+    sums.writes = writes
+    sums.over_steps = over_steps
+    sums.over_legs = over_legs
     return sums
 
 
@@ -100,11 +100,11 @@ def add_entry(sums: wp.array(dtype=real), row: int, x: real):
 def add_entry(sums: ThreadSums, row: int, x: real):  # noqa: F811
     """Add what some threads found to a row of their world. Only one of them adds, and does not wait for it."""
     total = sums.weight * x
-    if sums.turns:
-        total = sum_turns(total)
-    if sums.legs:
+    if sums.over_steps:
+        total = sum_step_threads(total)
+    if sums.over_legs:
         total = sum_legs(total)
-    if sums.adds:
+    if sums.writes:
         wp.atomic_add(sums.parameters, row, sums.world, total)
 
 

@@ -16,7 +16,7 @@ from ...layout import BASE, GRAVITY, LEG_ROWS, MU_DYNAMIC, MU_STATIC
 from ...scalar import mat33, quat, real, vec3
 from ...state import BaseState, base_com
 from ..base_dynamics import BaseSystem, add_leg, invert, motor_acceleration, solve_ang, solve_lin, sum_systems
-from ..base_motion import moved_base
+from ..base_motion import integrate_base
 from ..contact import SEPARATE, PawContact
 from ..contact_laws import PawLaw, contact_at, contact_point, paw_law
 from ..inertia import MassMoments
@@ -94,7 +94,7 @@ def leg_law(c: PawContact, law: PawLaw, impulse: vec3, point: vec3) -> LegLaw:
 
 @wp.func
 def replay_leg(
-    model: RobotModel, own: LegParams, dt: real, world: int, leg: int, force: vec3, moment: vec3,
+    model: RobotModel, params: LegParams, dt: real, world: int, leg: int, force: vec3, moment: vec3,
     first_impulse: wp.array2d(dtype=vec3), trajectory: TrajectoryArrays, step: int, i: int, record: LegRecord,
 ):  # fmt: skip
     """Make a step again from entry i of the record; see `replay_step`. All threads write the base, the same bits."""
@@ -106,7 +106,7 @@ def replay_leg(
     stops = stop_rates(load_stops(model.table, leg, world), angles, dt)
     spring = load_spring(model.table, leg, world)
     terms = leg_terms(
-        own, spring, angles, rates, torque, stops, int(trajectory.pressed[step, leg, world]), base.ang, g, dt
+        params, spring, angles, rates, torque, stops, int(trajectory.pressed[step, leg, world]), base.ang, g, dt
     )
     share = add_leg(BaseSystem(), terms.dynamics, terms.solve)
     system = sum_systems(base_system(model, world, base, g, force, moment), share)
@@ -136,7 +136,7 @@ def replay_leg(
     put_vec(record, i + 1, RATES, world, leg, ahead)
     put_vec(record, i + 1, ANGLES, world, leg, angles + dt * ahead)
     old_lin = wp.quat_rotate_inv(base.quat, base.lin)
-    put_base(record, i + 1, world, moved_base(base, old_lin + lin, base.ang + ang, dt))
+    put_base(record, i + 1, world, integrate_base(base, old_lin + lin, base.ang + ang, dt))
     law = PawLaw()
     if touches:
         old_velocity = old_lin + wp.cross(base.ang, point) + c.jacobian * rates
@@ -221,14 +221,14 @@ def multiplier(row: LawRow, impulse_cotangent: vec3) -> vec3:
 def base_factors(record: LegRecord, world: int, i: int, dt: real, base: BaseState, weights: BaseWeights) -> BaseFactors:
     """Return what is held of the base in a step."""
     ahead = get_base(record, i + 1, world)
-    held = BaseFactors()
-    held.virtual_lin = weights.lin
-    held.virtual_ang = weights.ang
-    held.lin = wp.quat_rotate_inv(base.quat, ahead.lin)
-    held.ang = ahead.ang
-    held.lin_acc = (held.lin - wp.quat_rotate_inv(base.quat, base.lin)) / dt
-    held.ang_acc = (held.ang - base.ang) / dt
-    return held
+    base_held = BaseFactors()
+    base_held.virtual_lin = weights.lin
+    base_held.virtual_ang = weights.ang
+    base_held.lin = wp.quat_rotate_inv(base.quat, ahead.lin)
+    base_held.ang = ahead.ang
+    base_held.lin_acc = (base_held.lin - wp.quat_rotate_inv(base.quat, base.lin)) / dt
+    base_held.ang_acc = (base_held.ang - base.ang) / dt
+    return base_held
 
 
 @wp.func
@@ -237,18 +237,18 @@ def leg_factors(
     leg: int, dt: real, law: LegLaw, weights: LegWeights,
 ) -> LegFactors:  # fmt: skip
     """Return what is held of a leg in a step."""
-    held = LegFactors()
-    held.virtual_rates = weights.rates
-    held.rates = get_vec(record, i + 1, RATES, world, leg)
-    held.acc = (held.rates - get_vec(record, i, RATES, world, leg)) / dt
-    held.mode = law.mode
-    held.pressed = int(trajectory.pressed[step, leg, world])
+    base_held = LegFactors()
+    base_held.virtual_rates = weights.rates
+    base_held.rates = get_vec(record, i + 1, RATES, world, leg)
+    base_held.acc = (base_held.rates - get_vec(record, i, RATES, world, leg)) / dt
+    base_held.mode = law.mode
+    base_held.pressed = int(trajectory.pressed[step, leg, world])
     if law.mode != SEPARATE:
-        held.impulse = law.impulse
-        held.law = weights.law
+        base_held.impulse = law.impulse
+        base_held.law = weights.law
         if cotangent.impulse.shape[0] > 0:
-            held.push = cotangent.impulse[step, leg, world]
-    return held
+            base_held.push = cotangent.impulse[step, leg, world]
+    return base_held
 
 
 @wp.struct
@@ -262,7 +262,7 @@ class LegGradient:
     stops: StopParams
     mu: real
     pos: vec3  # by the base's state
-    turn: quat
+    quat: quat
     omega: vec3
     gravity: vec3  # body axes
     angles: vec3
@@ -271,21 +271,21 @@ class LegGradient:
 
 @wp.func
 def leg_gradient(
-    model: RobotModel, own: LegParams, dt: real, world: int, leg: int, trajectory: TrajectoryArrays,
-    cotangent: TrajectoryArrays, step: int, i: int, record: LegRecord, base: BaseState, law: LegLaw, held: BaseFactors,
-    weights: LegWeights,
+    model: RobotModel, params: LegParams, dt: real, world: int, leg: int, trajectory: TrajectoryArrays,
+    cotangent: TrajectoryArrays, step: int, i: int, record: LegRecord, base: BaseState, law: LegLaw,
+    base_held: BaseFactors, weights: LegWeights,
 ) -> LegGradient:  # fmt: skip
     """Return the gradient of `leg_action` in a step."""
-    factors = leg_factors(record, trajectory, cotangent, world, step, i, leg, dt, law, weights)
+    leg_held = leg_factors(record, trajectory, cotangent, world, step, i, leg, dt, law, weights)
     g = wp.quat_rotate_inv(base.quat, load_vec3(model.table, GRAVITY, world))
     angles = get_vec(record, i, ANGLES, world, leg)
     rates = get_vec(record, i, RATES, world, leg)
-    (geo, masses, joints, spring, stops, _ground, mu, pos, turn, omega, g_adj, angle_adj, rate_adj, _held, _leg,
+    (geo, masses, joints, spring, stops, _ground, mu, pos, quat, omega, g_adj, angle_adj, rate_adj, _held, _leg,
      _step) = (
         wp.grad(leg_action)(
-            own.geometry, own.masses, own.joints, load_spring(model.table, leg, world),
+            params.geometry, params.masses, params.joints, load_spring(model.table, leg, world),
             load_stops(model.table, leg, world), model.ground, law.mu, base.pos, base.quat, base.ang, g, angles, rates,
-            held, factors, dt,
+            base_held, leg_held, dt,
         )
     )  # fmt: skip
     found = LegGradient()
@@ -296,7 +296,7 @@ def leg_gradient(
     found.stops = stops
     found.mu = mu
     found.pos = pos
-    found.turn = turn
+    found.quat = quat
     found.omega = omega
     found.gravity = g_adj
     found.angles = angle_adj
@@ -344,20 +344,20 @@ def find_weights(
         if touches:
             y = wp.transpose(law.by_velocity) * found.leg.law
         joint = wp.transpose(law.jacobian) * y
-        more_lin = sum_vec(law.to_lin * y)
-        more_ang = sum_vec(law.to_ang * y)
+        law_lin = sum_vec(law.to_lin * y)
+        law_ang = sum_vec(law.to_ang * y)
         found.lin += sum_vec(y)
         found.ang += sum_vec(wp.cross(law.point, y))
         found.rates += joint
-        found.leg.rates += solve.inverse * joint - solve.to_lin * more_lin - solve.to_ang * more_ang
-        found.base.lin += more_lin
-        found.base.ang += more_ang
+        found.leg.rates += solve.inverse * joint - solve.to_lin * law_lin - solve.to_ang * law_ang
+        found.base.lin += law_lin
+        found.base.ang += law_ang
     return found
 
 
 @wp.func
 def reverse_leg(
-    model: RobotModel, own: LegParams, dt: real, world: int, leg: int, force: vec3, moment: vec3,
+    model: RobotModel, params: LegParams, dt: real, world: int, leg: int, force: vec3, moment: vec3,
     trajectory: TrajectoryArrays, cotangent: TrajectoryArrays, step: int, i: int, record: LegRecord, adj: LegAdjoint,
     keeps: bool,
 ) -> LegAdjoint:  # fmt: skip
@@ -372,26 +372,26 @@ def reverse_leg(
         record, world, leg, cotangent, step, i, base, law, wp.quat_rotate_inv(base.quat, new_velocity),
         ang_cotangent + adj.base.ang, adj.rates + dt * adj.angles,
     )  # fmt: skip
-    by_base = weights.base
+    base_weights = weights.base
     # the equations of motion
-    held = base_factors(record, world, i, dt, base, by_base)
+    base_held = base_factors(record, world, i, dt, base, base_weights)
     found = leg_gradient(
-        model, own, dt, world, leg, trajectory, cotangent, step, i, record, base, law, held, weights.leg
+        model, params, dt, world, leg, trajectory, cotangent, step, i, record, base, law, base_held, weights.leg
     )
-    by_base.cotangent.velocity = weights.lin
-    by_base.cotangent.new_velocity = new_velocity
-    by_base.cotangent.gravity = sum_vec(found.gravity)
+    base_weights.cotangent.velocity = weights.lin
+    base_weights.cotangent.new_velocity = new_velocity
+    base_weights.cotangent.gravity = sum_vec(found.gravity)
     gravity = load_vec3(model.table, GRAVITY, world)
-    body, com, weight, force_adj, moment_adj, base_turn, lin_adj, base_omega, _base, _cotangent, _base_step = wp.grad(
+    body, com, weight, force_adj, moment_adj, base_quat, lin_adj, base_omega, _base, _cotangent, _base_step = wp.grad(
         base_action
     )(load_moments(model.table, BASE, world), base_com(model.table, world), gravity, force, moment, base.quat,
-      base.lin, base.ang, held, by_base.cotangent, dt)  # fmt: skip
+      base.lin, base.ang, base_held, base_weights.cotangent, dt)  # fmt: skip
     if keeps:
-        put_base_weights(record, i, world, by_base)
+        put_base_weights(record, i, world, base_weights)
         put_leg_weights(record, i, world, leg, weights.leg)
     out = LegAdjoint()
     out.base.pos = adj.base.pos + sum_vec(found.pos)
-    out.base.quat = quat_adj + base_turn + sum_quat(found.turn)
+    out.base.quat = quat_adj + base_quat + sum_quat(found.quat)
     out.base.lin = lin_adj
     out.base.ang = weights.ang + base_omega + sum_vec(found.omega)
     out.angles = adj.angles + found.angles

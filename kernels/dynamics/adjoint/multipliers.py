@@ -7,7 +7,7 @@ from ...layout import GRAVITY
 from ...scalar import real, vec3
 from ...state import BaseState
 from ..base_dynamics import BaseInverse, LegSolve, add_leg, invert, motor_acceleration, solve_ang, solve_lin
-from ..base_motion import moved_base
+from ..base_motion import integrate_base
 from ..contact import SEPARATE, PawContact
 from ..contact_laws import PawLaw, contact_at, contact_point, paw_law
 from ..leg_dynamics import PawKinematics
@@ -32,7 +32,7 @@ class StepRecord:
 
 
 @wp.struct
-class StepPlace:
+class ReplayedStep:
     """A step that is made again and run backwards, and what acts on the base in it."""
 
     dt: real  # [s]
@@ -67,7 +67,7 @@ class Multipliers:
 
 @wp.func
 def solve_system(
-    record: StepRecord, at: StepPlace, lin_cotangent: vec3, ang_cotangent: vec3, legs: wp.array(dtype=LegReverse)
+    record: StepRecord, at: ReplayedStep, lin_cotangent: vec3, ang_cotangent: vec3, legs: wp.array(dtype=LegReverse)
 ) -> Multipliers:
     """Solve M m = seeds, for the motors those by their rates; their m is written to `virtual_rates`."""
     m = Multipliers()
@@ -90,7 +90,7 @@ def solve_system(
 
 @wp.func
 def replay_step(
-    model: RobotModel, params: wp.array(dtype=LegParams), at: StepPlace, trajectory: TrajectoryArrays,
+    model: RobotModel, params: wp.array(dtype=LegParams), at: ReplayedStep, trajectory: TrajectoryArrays,
     record: StepRecord,
 ):  # fmt: skip
     """Make a step again from its entry of the record, with known torques and impulses; writes the record."""
@@ -132,7 +132,7 @@ def replay_step(
         rates = record.rates[world, i, k] + dt * motor_acceleration(record.legs[world, i, k], lin / dt, ang / dt)
         record.rates[world, i + 1, k] = rates
         record.angles[world, i + 1, k] = record.angles[world, i, k] + dt * rates
-    record.base[world, i + 1] = moved_base(base, wp.quat_rotate_inv(base.quat, base.lin) + lin, base.ang + ang, dt)
+    record.base[world, i + 1] = integrate_base(base, wp.quat_rotate_inv(base.quat, base.lin) + lin, base.ang + ang, dt)
 
 
 @wp.func
@@ -204,8 +204,8 @@ def solve_laws(
 
 
 @wp.func
-def load_laws(
-    model: RobotModel, at: StepPlace, first_impulse: wp.array2d(dtype=vec3), trajectory: TrajectoryArrays,
+def write_laws(
+    model: RobotModel, at: ReplayedStep, first_impulse: wp.array2d(dtype=vec3), trajectory: TrajectoryArrays,
     record: StepRecord, m: Multipliers, cotangent: TrajectoryArrays, legs: wp.array(dtype=LegReverse),
     contacts: wp.array(dtype=PawContact),
 ) -> bool:  # fmt: skip
@@ -243,35 +243,35 @@ def load_laws(
 
 @wp.func
 def add_laws(
-    model: RobotModel, at: StepPlace, record: StepRecord, multipliers: Multipliers, legs: wp.array(dtype=LegReverse),
+    model: RobotModel, at: ReplayedStep, record: StepRecord, multipliers: Multipliers, legs: wp.array(dtype=LegReverse),
     contacts: wp.array(dtype=PawContact),
 ) -> Multipliers:  # fmt: skip
     """Return the multipliers with the share of the contact laws, whose own are known; the legs' are replaced."""
     m = multipliers
-    more_lin = vec3(real(0.0))
-    more_ang = vec3(real(0.0))
+    law_lin = vec3(real(0.0))
+    law_ang = vec3(real(0.0))
     for k in range(legs.shape[0]):
         if legs[k].law.mode != SEPARATE:
             c = contacts[k]
             y = wp.transpose(legs[k].law.by_velocity) * legs[k].multiplier
             joint = wp.transpose(c.jacobian) * y
-            more_lin += c.to_lin * y
-            more_ang += c.to_ang * y
+            law_lin += c.to_lin * y
+            law_ang += c.to_ang * y
             m.lin_cotangent += y
             m.ang_cotangent += wp.cross(contact_point(model, k, record.paws[at.world, at.entry, k], c), y)
             legs[k].rates = legs[k].rates + joint
             legs[k].virtual_rates = legs[k].virtual_rates + record.legs[at.world, at.entry, k].inverse * joint
-    m.lin += more_lin
-    m.ang += more_ang
+    m.lin += law_lin
+    m.ang += law_ang
     for k in range(legs.shape[0]):
         solve = record.legs[at.world, at.entry, k]
-        legs[k].virtual_rates = legs[k].virtual_rates - solve.to_lin * more_lin - solve.to_ang * more_ang
+        legs[k].virtual_rates = legs[k].virtual_rates - solve.to_lin * law_lin - solve.to_ang * law_ang
     return m
 
 
 @wp.func
 def find_multipliers(
-    model: RobotModel, at: StepPlace, first_impulse: wp.array2d(dtype=vec3), trajectory: TrajectoryArrays,
+    model: RobotModel, at: ReplayedStep, first_impulse: wp.array2d(dtype=vec3), trajectory: TrajectoryArrays,
     cotangent: TrajectoryArrays, record: StepRecord, lin_cotangent: vec3, ang_cotangent: vec3,
     legs: wp.array(dtype=LegReverse), contacts: wp.array(dtype=PawContact), matrix: wp.array2d(dtype=real),
     vector: wp.array(dtype=real),
@@ -281,42 +281,42 @@ def find_multipliers(
     legs: `rates` are those of the motors; to them the share of the contact laws is added.
     """
     m = solve_system(record, at, lin_cotangent, ang_cotangent, legs)
-    if load_laws(model, at, first_impulse, trajectory, record, m, cotangent, legs, contacts):
+    if write_laws(model, at, first_impulse, trajectory, record, m, cotangent, legs, contacts):
         solve_laws(contacts, legs, matrix, vector)
         m = add_laws(model, at, record, m, legs, contacts)
     return m
 
 
 @wp.func
-def base_factors(at: StepPlace, record: StepRecord, m: Multipliers) -> BaseFactors:
+def base_factors(at: ReplayedStep, record: StepRecord, m: Multipliers) -> BaseFactors:
     """Return what is held of the base."""
     base = record.base[at.world, at.entry]
     ahead = record.base[at.world, at.entry + 1]
-    held = BaseFactors()
-    held.virtual_lin = m.lin
-    held.virtual_ang = m.ang
-    held.lin = wp.quat_rotate_inv(base.quat, ahead.lin)
-    held.ang = ahead.ang
-    held.lin_acc = (held.lin - wp.quat_rotate_inv(base.quat, base.lin)) / at.dt
-    held.ang_acc = (held.ang - base.ang) / at.dt
-    return held
+    factors = BaseFactors()
+    factors.virtual_lin = m.lin
+    factors.virtual_ang = m.ang
+    factors.lin = wp.quat_rotate_inv(base.quat, ahead.lin)
+    factors.ang = ahead.ang
+    factors.lin_acc = (factors.lin - wp.quat_rotate_inv(base.quat, base.lin)) / at.dt
+    factors.ang_acc = (factors.ang - base.ang) / at.dt
+    return factors
 
 
 @wp.func
 def leg_factors(
-    at: StepPlace, k: int, trajectory: TrajectoryArrays, cotangent: TrajectoryArrays, record: StepRecord,
+    at: ReplayedStep, k: int, trajectory: TrajectoryArrays, cotangent: TrajectoryArrays, record: StepRecord,
     legs: wp.array(dtype=LegReverse), contacts: wp.array(dtype=PawContact),
 ) -> LegFactors:  # fmt: skip
     """Return what is held of a leg."""
-    held = LegFactors()
-    held.virtual_rates = legs[k].virtual_rates
-    held.rates = record.rates[at.world, at.entry + 1, k]
-    held.acc = (held.rates - record.rates[at.world, at.entry, k]) / at.dt
-    held.mode = legs[k].law.mode
-    held.pressed = int(trajectory.pressed[at.step, k, at.world])
-    if held.mode != SEPARATE:
-        held.impulse = contacts[k].impulse
-        held.law = legs[k].multiplier
+    factors = LegFactors()
+    factors.virtual_rates = legs[k].virtual_rates
+    factors.rates = record.rates[at.world, at.entry + 1, k]
+    factors.acc = (factors.rates - record.rates[at.world, at.entry, k]) / at.dt
+    factors.mode = legs[k].law.mode
+    factors.pressed = int(trajectory.pressed[at.step, k, at.world])
+    if factors.mode != SEPARATE:
+        factors.impulse = contacts[k].impulse
+        factors.law = legs[k].multiplier
         if cotangent.impulse.shape[0] > 0:
-            held.push = cotangent.impulse[at.step, k, at.world]
-    return held
+            factors.push = cotangent.impulse[at.step, k, at.world]
+    return factors

@@ -39,7 +39,7 @@ from .command_adjoint import (
     motor_gradient,
 )
 from .gradients import GRADIENT_ROWS, Gradients, add_com, add_filter
-from .multipliers import LegReverse, StepPlace, StepRecord, replay_step
+from .multipliers import LegReverse, ReplayedStep, StepRecord, replay_step
 from .step_adjoint import reverse_step
 from .virtual_power import BaseCotangent, BaseFactors, LegFactors, base_action, leg_action, rotation_adjoint_scalar
 
@@ -160,9 +160,9 @@ def load_parts(
 
 
 @wp.func
-def place_in(commands: Commands, t: int, dt: real, world: int) -> StepPlace:
+def replayed_step(commands: Commands, t: int, dt: real, world: int) -> ReplayedStep:
     """Return the place of the steps in a policy step, with the wrench on the base."""
-    at = StepPlace()
+    at = ReplayedStep()
     at.dt = dt
     at.world = world
     at.force = row_vec3(commands.wrench, t, 0, world)
@@ -172,11 +172,11 @@ def place_in(commands: Commands, t: int, dt: real, world: int) -> StepPlace:
 
 @wp.func
 def replay_row(
-    model: RobotModel, params: wp.array(dtype=LegParams), place: StepPlace, trajectory: TrajectoryArrays, row: int,
-    every: int, com: vec3, record: StepRecord,
+    model: RobotModel, params: wp.array(dtype=LegParams), policy_step: ReplayedStep, trajectory: TrajectoryArrays,
+    row: int, every: int, com: vec3, record: StepRecord,
 ):  # fmt: skip
     """Make the steps from a row to the next one again."""
-    at = place
+    at = policy_step
     record.base[at.world, 0] = load_row_base(trajectory, row, at.world, com)
     for k in range(record.angles.shape[2]):
         record.angles[at.world, 0, k] = row_vec3(trajectory.q, row, 7 + 3 * k, at.world)
@@ -196,8 +196,8 @@ def add_wrench(gradients: Gradients, t: int, world: int, force: vec3, moment: ve
 
 @wp.func
 def add_motor_adjoint(
-    found: MotorAdjoint, arrived: Arrival, at: StepPlace, motor: int, cotangent: TrajectoryArrays, gradients: Gradients,
-    legs: wp.array(dtype=LegReverse), sums: wp.array(dtype=real),
+    found: MotorAdjoint, arrived: Arrival, at: ReplayedStep, motor: int, cotangent: TrajectoryArrays,
+    gradients: Gradients, legs: wp.array(dtype=LegReverse), sums: wp.array(dtype=real),
 ):  # fmt: skip
     """Add the gradients by what a motor's torque in a step depends on."""
     k = motor / 3
@@ -286,7 +286,7 @@ def reverse_kernel(
     for back in range(last):
         row = last - 1 - back
         t = row * timing.every / timing.substeps
-        at = place_in(commands, t, settings.dt, world)
+        at = replayed_step(commands, t, settings.dt, world)
         replay_row(model, params, at, trajectory, row, timing.every, com, record)
         end = store_row_base_adjoint(model, world, record.base[world, timing.every], entries)
         adj = end.base

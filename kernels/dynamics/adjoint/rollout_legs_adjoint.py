@@ -85,18 +85,18 @@ def replay_legs_kernel(
 
     Threads beyond the last world repeat it, and write the same bits.
     """
-    offset, place, leg = wp.tid()
-    world = settings.first + wp.min(place, count - 1)
+    offset, index, leg = wp.tid()
+    world = settings.first + wp.min(index, count - 1)
     row = span.begin + offset
-    at = first_entry(timing, span, row)
+    start_entry = first_entry(timing, span, row)
     first = row * timing.every
     t = first / timing.substeps
-    own = load_leg(model, world, leg)
+    params = load_leg(model, world, leg)
     force = row_vec3(commands.wrench, t, 0, world)
     moment = row_vec3(commands.wrench, t, 3, world)
-    put_base(record, at, world, load_row_base(trajectory, row, world, base_com(model.table, world)))
-    put_vec(record, at, ANGLES, world, leg, row_vec3(trajectory.q, row, 7 + 3 * leg, world))
-    put_vec(record, at, RATES, world, leg, row_vec3(trajectory.qd, row, 6 + 3 * leg, world))
+    put_base(record, start_entry, world, load_row_base(trajectory, row, world, base_com(model.table, world)))
+    put_vec(record, start_entry, ANGLES, world, leg, row_vec3(trajectory.q, row, 7 + 3 * leg, world))
+    put_vec(record, start_entry, RATES, world, leg, row_vec3(trajectory.qd, row, 6 + 3 * leg, world))
     sync_lanes()
     motors = wp.zeros(shape=(3,), dtype=MotorParams)
     for c in range(motors.shape[0]):
@@ -105,11 +105,22 @@ def replay_legs_kernel(
     for i in range(timing.every):
         step = first + i
         replay_leg(
-            model, own, settings.dt, world, leg, force, moment, commands.impulse, trajectory, step, at + i, record
+            model,
+            params,
+            settings.dt,
+            world,
+            leg,
+            force,
+            moment,
+            commands.impulse,
+            trajectory,
+            step,
+            start_entry + i,
+            record,
         )
         sync_lanes()
-        angles = get_vec(record, at + i, ANGLES, world, leg)
-        rates = get_vec(record, at + i, RATES, world, leg)
+        angles = get_vec(record, start_entry + i, ANGLES, world, leg)
+        rates = get_vec(record, start_entry + i, RATES, world, leg)
         slopes = MotorSlopes()
         for c in range(motors.shape[0]):
             by_motor = motor_gradient(
@@ -128,7 +139,7 @@ def replay_legs_kernel(
             slopes.target[c] = by_motor.target
             slopes.angle[c] = by_motor.angle
             slopes.rate[c] = by_motor.rate
-        put_slopes(record, at + i, world, leg, slopes)
+        put_slopes(record, start_entry + i, world, leg, slopes)
 
 
 @wp.func
@@ -208,23 +219,23 @@ def reverse_legs_kernel(
     gradients.q and qd hold the gradient by the row after the span, and then that by its first row. Of those by
     parameters the base's and the filter's are added. Threads beyond the last world repeat it, and write nothing.
     """
-    place, leg = wp.tid()
-    world = settings.first + wp.min(place, count - 1)
+    index, leg = wp.tid()
+    world = settings.first + wp.min(index, count - 1)
     dt = settings.dt
-    own = load_leg(model, world, leg)
+    params = load_leg(model, world, leg)
     delay = actuation.latency[world] / dt
     entries = load_entries(gradients, world)
     adj = load_motor_entries(gradients, world, leg)
-    of_leg = thread_sums(gradients, world, place < count, False, False)
-    of_legs = thread_sums(gradients, world, place < count and leg == 0, False, True)
+    leg_sums = thread_sums(gradients, world, index < count, False, False)
+    shared_sums = thread_sums(gradients, world, index < count and leg == 0, False, True)
     for back in range(span.end - span.begin):
         row = span.end - 1 - back
-        at = first_entry(timing, span, row)
+        start_entry = first_entry(timing, span, row)
         first = row * timing.every
         t = first / timing.substeps
         force = row_vec3(commands.wrench, t, 0, world)
         moment = row_vec3(commands.wrench, t, 3, world)
-        end = store_row_base_adjoint(model, world, get_base(record, at + timing.every, world), entries)
+        end = store_row_base_adjoint(model, world, get_base(record, start_entry + timing.every, world), entries)
         adj.base = end.base
         adj.force = vec3(real(0.0))
         adj.moment = vec3(real(0.0))
@@ -233,7 +244,7 @@ def reverse_legs_kernel(
             step = first + i
             adj = reverse_leg(
                 model,
-                own,
+                params,
                 dt,
                 world,
                 leg,
@@ -242,28 +253,28 @@ def reverse_legs_kernel(
                 trajectory,
                 cotangent,
                 step,
-                at + i,
+                start_entry + i,
                 record,
                 adj,
-                place < count,
+                index < count,
             )
             arrived = arrival(step, timing.substeps, delay)
-            slopes = get_slopes(record, at + i, world, leg)
-            adj = reverse_motors(adj, slopes, arrived, cotangent, step, leg, world, gradients, place < count)
+            slopes = get_slopes(record, start_entry + i, world, leg)
+            adj = reverse_motors(adj, slopes, arrived, cotangent, step, leg, world, gradients, index < count)
         entries = add_row_cotangent(
             load_row_base_adjoint(trajectory, model, row, world, adj.base, end.com), cotangent, row, world
         )
-        if place < count:
+        if index < count:
             if leg == 0:
                 add_wrench(gradients, t, world, adj.force, adj.moment)
         if first == t * timing.substeps:
             by_filter = filter_gradient(
-                commands, actuation, t, leg, world, get_vec(record, at, ANGLES, world, leg),
-                get_vec(record, at, RATES, world, leg), gradients,
+                commands, actuation, t, leg, world, get_vec(record, start_entry, ANGLES, world, leg),
+                get_vec(record, start_entry, RATES, world, leg), gradients,
             )  # fmt: skip
-            add_filter(of_legs, by_filter.constants)
-            if place < count:
-                put_vec(record, at, FILTER, world, leg, by_filter.angles)
+            add_filter(shared_sums, by_filter.constants)
+            if index < count:
+                put_vec(record, start_entry, FILTER, world, leg, by_filter.angles)
                 store_row_vec3(gradients.target, t, 3 * leg, world, by_filter.target)
             adj.angles += by_filter.angles
             adj.rates += by_filter.rates
@@ -271,12 +282,12 @@ def reverse_legs_kernel(
             adj.angles += row_vec3(cotangent.q, row, 7 + 3 * leg, world)
         if cotangent.qd.shape[0] > 0:
             adj.rates += row_vec3(cotangent.qd, row, 6 + 3 * leg, world)
-    if place < count:
+    if index < count:
         store_entries(gradients, world, leg, entries, adj)
         if leg == 0:
-            add_moments(of_leg, BASE, adj.body)
-            add_com(of_leg, model.table[BASE, world], base_com(model.table, world), adj.com + entries.com)
-            add_vec3(of_leg, GRAVITY, adj.gravity)
+            add_moments(leg_sums, BASE, adj.body)
+            add_com(leg_sums, model.table[BASE, world], base_com(model.table, world), adj.com + entries.com)
+            add_vec3(leg_sums, GRAVITY, adj.gravity)
 
 
 ADJOINTS = generate_adjoints(__name__)

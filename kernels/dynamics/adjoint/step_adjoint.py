@@ -31,27 +31,27 @@ from .gradients import (
     add_stops,
     add_vec3,
 )
-from .multipliers import LegReverse, StepPlace, StepRecord, base_factors, find_multipliers, leg_factors
+from .multipliers import LegReverse, ReplayedStep, StepRecord, base_factors, find_multipliers, leg_factors
 from .virtual_power import BaseCotangent, BaseFactors, LegFactors, base_action, leg_action, rotation_adjoint_scalar
 
 wp.set_module_options({"enable_backward": False})
 
 
 @wp.struct
-class BasePart:
+class BaseGradient:
     """A leg's part of the gradient by the base's state at the start of a step, and by gravity in body axes."""
 
     pos: vec3
-    turn: quat
+    quat: quat
     omega: vec3
     gravity: vec3
 
 
 @wp.func
-def reverse_leg_part(
-    model: RobotModel, params: LegParams, at: StepPlace, k: int, record: StepRecord, g: vec3, base: BaseFactors,
-    held: LegFactors, legs: wp.array(dtype=LegReverse), sums: wp.array(dtype=real),
-) -> BasePart:  # fmt: skip
+def reverse_leg_equations(
+    model: RobotModel, params: LegParams, at: ReplayedStep, k: int, record: StepRecord, g: vec3, base: BaseFactors,
+    leg_held: LegFactors, legs: wp.array(dtype=LegReverse), sums: wp.array(dtype=real),
+) -> BaseGradient:  # fmt: skip
     """Add the gradients of a leg's weighed equations to those by its motors and its parameters."""
     world, i = at.world, at.entry
     start = record.base[world, i]
@@ -59,12 +59,12 @@ def reverse_leg_part(
     mu = real(0.0)
     if law.mode != SEPARATE:
         mu = law.mu
-    (geo, masses, joints, spring, stops, _ground, mu_adj, pos, turn, omega, g_part, angles, rates, _held, _leg,
+    (geo, masses, joints, spring, stops, _ground, mu_adj, pos, quat_adj, omega, g_part, angles, rates, _held, _leg,
      _step) = (
         wp.grad(leg_action)(
             params.geometry, params.masses, params.joints, load_spring(model.table, k, world),
             load_stops(model.table, k, world), model.ground, mu, start.pos, start.quat, start.ang, g,
-            record.angles[world, i, k], record.rates[world, i, k], base, held, at.dt,
+            record.angles[world, i, k], record.rates[world, i, k], base, leg_held, at.dt,
         )
     )  # fmt: skip
     add_geometry(sums, k, geo)
@@ -77,12 +77,12 @@ def reverse_leg_part(
     legs[k].angles = legs[k].angles + angles
     legs[k].rates = legs[k].rates + rates
     legs[k].torque = at.dt * legs[k].virtual_rates
-    part = BasePart()
-    part.pos = pos
-    part.turn = turn
-    part.omega = omega
-    part.gravity = g_part
-    return part
+    gradient = BaseGradient()
+    gradient.pos = pos
+    gradient.quat = quat_adj
+    gradient.omega = omega
+    gradient.gravity = g_part
+    return gradient
 
 
 @wp.struct
@@ -96,7 +96,7 @@ class StepAdjoint:
 
 @wp.func
 def reverse_step(
-    model: RobotModel, params: wp.array(dtype=LegParams), at: StepPlace, first_impulse: wp.array2d(dtype=vec3),
+    model: RobotModel, params: wp.array(dtype=LegParams), at: ReplayedStep, first_impulse: wp.array2d(dtype=vec3),
     trajectory: TrajectoryArrays, cotangent: TrajectoryArrays, record: StepRecord, adj: BaseState,
     legs: wp.array(dtype=LegReverse), contacts: wp.array(dtype=PawContact), matrix: wp.array2d(dtype=real),
     vector: wp.array(dtype=real), sums: wp.array(dtype=real),
@@ -118,7 +118,7 @@ def reverse_step(
         ang_cotangent + adj.ang, legs, contacts, matrix, vector,
     )  # fmt: skip
     # the equations of motion
-    held = base_factors(at, record, m)
+    base_held = base_factors(at, record, m)
     gravity = load_vec3(model.table, GRAVITY, world)
     g = wp.quat_rotate_inv(base.quat, gravity)
     out = StepAdjoint()
@@ -127,27 +127,27 @@ def reverse_step(
     out.base.ang = m.ang_cotangent
     g_adj = vec3(real(0.0))
     for k in range(legs.shape[0]):
-        leg = leg_factors(at, k, trajectory, cotangent, record, legs, contacts)
-        part = reverse_leg_part(model, params[k], at, k, record, g, held, leg, legs, sums)
-        out.base.pos += part.pos
-        out.base.quat += part.turn
-        out.base.ang += part.omega
-        g_adj += part.gravity
+        leg_held = leg_factors(at, k, trajectory, cotangent, record, legs, contacts)
+        gradient = reverse_leg_equations(model, params[k], at, k, record, g, base_held, leg_held, legs, sums)
+        out.base.pos += gradient.pos
+        out.base.quat += gradient.quat
+        out.base.ang += gradient.omega
+        g_adj += gradient.gravity
     weights = BaseCotangent()
     weights.velocity = m.lin_cotangent
     weights.new_velocity = new_velocity
     weights.gravity = g_adj
-    body, com, weight, force_adj, moment_adj, turn, lin_adj, omega, _base, _cotangent, _dt_base = wp.grad(
+    body, com, weight, force_adj, moment_adj, quat_adj, lin_adj, omega, _base, _cotangent, _dt_base = wp.grad(
         base_action
     )(load_moments(model.table, BASE, world), base_com(model.table, world), gravity, at.force, at.moment, base.quat,
-        base.lin, base.ang, held, weights, dt,
+        base.lin, base.ang, base_held, weights, dt,
     )  # fmt: skip
     add_moments(sums, BASE, body)
     add_com(sums, model.table[BASE, world], base_com(model.table, world), com)
     add_vec3(sums, GRAVITY, weight)
     out.force = force_adj
     out.moment = moment_adj
-    out.base.quat += turn
+    out.base.quat += quat_adj
     out.base.lin = lin_adj
     out.base.ang += omega
     return out

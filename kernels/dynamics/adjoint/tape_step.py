@@ -12,14 +12,14 @@ import warp as wp
 from ...layout import BASE, GRAVITY
 from ...scalar import mat43, real, vec3
 from ...state import base_com, leg_coord, leg_dof, load_base, load_motors, store_base, store_motors
-from ..base_motion import moved_base
+from ..base_motion import integrate_base
 from ..contact import BlockLaw, PawContact
 from ..drive import Drive, Workspace, base_wrench
 from ..parameters import load_joint_params, load_masses, load_moments, load_spring, load_stops, load_vec3
 from ..step import LegParams, RobotModel, StepSettings, load_leg
 from ..trajectory import TrajectoryArrays, store_row_vec3
 from ..world.world_step import LegStep, solve_step
-from .multipliers import LegReverse, StepPlace, StepRecord, base_factors, find_multipliers, leg_factors, replay_step
+from .multipliers import LegReverse, ReplayedStep, StepRecord, base_factors, find_multipliers, leg_factors, replay_step
 from .virtual_power import BaseCotangent, BaseFactors, LegFactors, base_action, leg_action
 
 
@@ -99,14 +99,14 @@ def power_kernel(
     base = load_base(joint_q, joint_qd, com, world)
     gravity = load_vec3(model.table, GRAVITY, world)
     g = wp.quat_rotate_inv(base.quat, gravity)
-    held = solved.base[world]
+    base_held = solved.base[world]
     leg = solved.legs[k, world]
     rates = load_motors(joint_qd, leg_dof(world, k))
     total = leg_action(
         model.geometry[k], load_masses(model.table, k, world), load_joint_params(model.table, k, world),
         load_spring(model.table, k, world), load_stops(model.table, k, world), model.ground,
         model.table[solved.mu_row[k, world], world], base.pos, base.quat, base.ang, g,
-        load_motors(joint_q, leg_coord(world, k)), rates, held, leg, dt,
+        load_motors(joint_q, leg_coord(world, k)), rates, base_held, leg, dt,
     )  # fmt: skip
     total += wp.dot(solved.rate_cotangent[k, world], rates)
     total += dt * wp.dot(leg.virtual_rates, load_motors(joint_f, leg_dof(world, k)))
@@ -115,8 +115,8 @@ def power_kernel(
         force = vec3(wrench[0], wrench[1], wrench[2])
         moment = vec3(wrench[3], wrench[4], wrench[5])
         total += base_action(
-            load_moments(model.table, BASE, world), com, gravity, force, moment, base.quat, base.lin, base.ang, held,
-            solved.cotangent[world], dt,
+            load_moments(model.table, BASE, world), com, gravity, force, moment, base.quat, base.lin, base.ang,
+            base_held, solved.cotangent[world], dt,
         )  # fmt: skip
         total += wp.dot(solved.ang_cotangent[world], base.ang)
     power[k, world] = total
@@ -159,7 +159,7 @@ def adj_end_velocities(
     matrix = wp.zeros(shape=(12, 12), dtype=real)
     vector = wp.zeros(shape=(12,), dtype=real)
     wrench = base_wrench(joint_f, body_f, world)
-    at = StepPlace()
+    at = ReplayedStep()
     at.dt = dt
     at.world = world
     at.force = vec3(wrench[0], wrench[1], wrench[2])
@@ -218,7 +218,7 @@ def integrate_kernel(
     com = base_com(model.table, world)
     base = load_base(joint_q, joint_qd, com, world)
     end = end_velocities(model, dt, joint_q, joint_qd, joint_f, body_f, solved, record, power, world)
-    store_base(joint_q_out, joint_qd_out, com, world, moved_base(base, end.lin, end.ang, dt))
+    store_base(joint_q_out, joint_qd_out, com, world, integrate_base(base, end.lin, end.ang, dt))
     for k in range(4):
         rates = vec3(end.rates[k, 0], end.rates[k, 1], end.rates[k, 2])
         angles = load_motors(joint_q, leg_coord(world, k)) + dt * rates

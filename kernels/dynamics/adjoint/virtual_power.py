@@ -303,11 +303,12 @@ def leg_action(
     still = vec2(zero)
     outer_thigh = link_motion(
         housing, vec3(geo.outer_x, geo.plane_y, zero), still, still, still,
-        vec3(bias.outer_thigh_rate, -f * outer_acc, -f * outer_virtual), loop.outer_turn[1], -f * loop.outer_turn[0],
+        vec3(bias.outer_thigh_rate, -f * outer_acc, -f * outer_virtual), loop.outer_sin_cos[1],
+        -f * loop.outer_sin_cos[0],
     )  # fmt: skip
     inner_thigh = link_motion(
         housing, vec3(geo.inner_x, geo.plane_y, zero), still, still, still,
-        vec3(bias.inner_thigh_rate, f * inner_acc, f * inner_virtual), loop.inner_turn[1], f * loop.inner_turn[0],
+        vec3(bias.inner_thigh_rate, f * inner_acc, f * inner_virtual), loop.inner_sin_cos[1], f * loop.inner_sin_cos[0],
     )  # fmt: skip
     knee_y = geo.plane_y + geo.knee_y
     outer_shank = link_motion(

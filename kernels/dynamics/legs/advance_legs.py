@@ -26,7 +26,7 @@ from ...scalar import real, vec3
 from ...state import BaseState, base_com, leg_coord, leg_dof, load_base, load_motors, store_base, store_motors
 from ...terrain.ground import move_block
 from ..base_dynamics import BaseSystem, add_leg, invert, motor_acceleration, solve_ang, solve_lin, sum_systems
-from ..base_motion import moved_base
+from ..base_motion import integrate_base
 from ..contact import BlockLaw, PawContact, block_velocity, local_impulse
 from ..drive import Drive, LegDrive, Workspace, applied_torque, base_wrench, freeze_diverged_world, load_leg_drive
 from ..parameters import load_spring, load_stops, load_vec3
@@ -92,7 +92,7 @@ def solve_paws(c: PawContact, blocks: bool, block: BlockLaw, leg: int, max_round
     working, together = bool(True), bool(True)
     previous_change = real(ANY_CHANGE)
     while any_world(working):
-        velocity = c.free + c.from_lin * s.lin + c.from_ang * s.ang + c.own * s.impulse
+        velocity = c.free + c.from_lin * s.lin + c.from_ang * s.ang + c.leg_response * s.impulse
         if blocks:
             push = sum_vec(wp.where(c.on_block != 0, -s.impulse, vec3(real(0.0))))
             if c.on_block != 0:
@@ -105,13 +105,13 @@ def solve_paws(c: PawContact, blocks: bool, block: BlockLaw, leg: int, max_round
         if not change > real(0.0):  # NaN too
             change, step = real(0.0), vec3(real(0.0))
         most = max_legs(change)
-        chosen = first_leg(change == most)
+        chosen_leg = first_leg(change == most)
         if working:
             s.residual = wp.sqrt(most)
         working = working and s.residual > tolerance and s.rounds < max_rounds
         together = together and most <= SHRINKING * SHRINKING * previous_change
         previous_change = most
-        if leg != chosen and not together:
+        if leg != chosen_leg and not together:
             step = vec3(real(0.0))
         lin = sum_vec(c.to_lin * step)
         ang = sum_vec(c.to_ang * step)
@@ -124,7 +124,7 @@ def solve_paws(c: PawContact, blocks: bool, block: BlockLaw, leg: int, max_round
 
 
 @wp.struct
-class StopTry:
+class StopAttempt:
     """The set of pressed stops that a leg tries in a step."""
 
     stop_rates: StopRates
@@ -132,34 +132,34 @@ class StopTry:
 
 
 @wp.func
-def next_try(model: RobotModel, world: int, leg: int, old: LegState, dt: real) -> StopTry:
+def stop_attempt(model: RobotModel, world: int, leg: int, old: LegState, dt: real) -> StopAttempt:
     """Return the leg's stops for the present try."""
-    found = StopTry()
-    found.pressed = old.pressed
-    if found.pressed != 0 or old.sets == 0:
+    attempt = StopAttempt()
+    attempt.pressed = old.pressed
+    if attempt.pressed != 0 or old.sets == 0:
         stops = load_stops(model.table, leg, world)
-        if found.pressed != 0 or beyond_stops(stops, old.angles + dt * old.rates):
-            found.stop_rates = stop_rates(stops, old.angles, dt)
+        if attempt.pressed != 0 or beyond_stops(stops, old.angles + dt * old.rates):
+            attempt.stop_rates = stop_rates(stops, old.angles, dt)
             if old.sets == 0:
-                found.pressed = pressed_stops(found.stop_rates, old.rates, real(0.0), 0)
-    return found
+                attempt.pressed = pressed_stops(attempt.stop_rates, old.rates, real(0.0), 0)
+    return attempt
 
 
 @wp.func
-def wanted_stops(
+def required_stops(
     model: RobotModel, settings: StepSettings, world: int, leg: int, angles: vec3, rates: vec3, pressed: int, sets: int
 ) -> int:
     """Return the set that the rates at the end of the step ask for; loads limits again, which would fill registers."""
     limits = load_stops(model.table, leg, world)
-    wanted = int(0)
+    required = int(0)
     if pressed != 0 or beyond_stops(limits, angles + settings.dt * rates):
         bounds = stop_rates(limits, angles, settings.dt)
-        wanted = revised_stops(bounds, rates, SLACK * settings.tolerance, pressed, sets)
-    return wanted
+        required = revised_stops(bounds, rates, SLACK * settings.tolerance, pressed, sets)
+    return required
 
 
 @wp.func
-def stepped(
+def completed_step(
     old: LegState, base: BaseState, angles: vec3, rates: vec3, torque: vec3, solved: PawSolution, total: vec3,
     pressed: int,
 ) -> LegState:  # fmt: skip
@@ -182,21 +182,21 @@ def stepped(
 
 
 @wp.func
-def tried(old: LegState, pressed: int, wanted: int, chosen: bool) -> LegState:
+def next_attempt(old: LegState, pressed: int, required: int, changes: bool) -> LegState:
     """Return the state with the next set to try for the same step; chosen: this leg's changes where only one may."""
     new = old
     new.sets = old.sets + 1
     new.pressed = pressed
     if not one_by_one(new.sets):
-        new.pressed = wanted
-    elif chosen:
-        new.pressed = change_one(pressed, wanted)
+        new.pressed = required
+    elif changes:
+        new.pressed = change_one(pressed, required)
     return new
 
 
 @wp.func
 def advance_leg(
-    model: RobotModel, settings: StepSettings, drive: Drive, own: LegParams, motors: LegDrive, world: int, leg: int,
+    model: RobotModel, settings: StepSettings, drive: Drive, params: LegParams, motors: LegDrive, world: int, leg: int,
     old: LegState, writes: bool,
 ) -> LegState:  # fmt: skip
     """Return the thread's state after a step, or the old one with another set of stops to try for the same step.
@@ -208,15 +208,15 @@ def advance_leg(
     base = old.base
     g = wp.quat_rotate_inv(base.quat, load_vec3(model.table, GRAVITY, world))
     torque = applied_torque(motors, old.step, old.angles, old.rates)
-    stops = next_try(model, world, leg, old, dt)
+    stops = stop_attempt(model, world, leg, old, dt)
     pressed = stops.pressed
     spring = load_spring(model.table, leg, world)
-    terms = leg_terms(own, spring, old.angles, old.rates, torque, stops.stop_rates, pressed, base.ang, g, dt)
+    terms = leg_terms(params, spring, old.angles, old.rates, torque, stops.stop_rates, pressed, base.ang, g, dt)
     wrench = base_wrench(drive.joint_f, drive.body_f, world)
     force = vec3(wrench[0], wrench[1], wrench[2])
     moment = vec3(wrench[3], wrench[4], wrench[5])
-    share = add_leg(BaseSystem(), terms.dynamics, terms.solve)
-    system = sum_systems(base_system(model, world, base, g, force, moment), share)
+    leg_system = add_leg(BaseSystem(), terms.dynamics, terms.solve)
+    system = sum_systems(base_system(model, world, base, g, force, moment), leg_system)
     inverse = hold_base(model, world, invert(system))
     lin_acc = solve_lin(inverse, system.force, system.moment)
     ang_acc = solve_ang(inverse, system.force, system.moment)
@@ -234,9 +234,9 @@ def advance_leg(
     rates -= solve.to_lin * solved.lin + solve.to_ang * solved.ang
     total = sum_vec(solved.impulse)
     sets = old.sets + 1
-    wanted = wanted_stops(model, settings, world, leg, old.angles, rates, pressed, sets)
-    first = first_leg(wanted != pressed)
-    agreed = from_leg(wp.where(wanted != pressed, real(1.0), real(0.0)), first) == real(0.0)
+    required = required_stops(model, settings, world, leg, old.angles, rates, pressed, sets)
+    first = first_leg(required != pressed)
+    agreed = from_leg(wp.where(required != pressed, real(1.0), real(0.0)), first) == real(0.0)
     done = old.step < settings.substeps and (agreed or sets >= MAX_SETS)
     if blocks:
         push = sum_vec(wp.where(contact.on_block != 0, -solved.impulse, vec3(real(0.0))))
@@ -244,9 +244,9 @@ def advance_leg(
             move_block(model.ground, world, wp.quat_rotate(base.quat, block_velocity(block, push)), dt)
         sync_lanes()
     if done:
-        moved = moved_base(base, lin + solved.lin, ang + solved.ang, dt)
-        return stepped(old, moved, old.angles + dt * rates, rates, torque, solved, total, pressed)
-    return tried(old, pressed, wanted, leg == first)
+        moved = integrate_base(base, lin + solved.lin, ang + solved.ang, dt)
+        return completed_step(old, moved, old.angles + dt * rates, rates, torque, solved, total, pressed)
+    return next_attempt(old, pressed, required, leg == first)
 
 
 @wp.kernel
@@ -270,21 +270,21 @@ def advance_legs_kernel(
 
     Does what `advance_kernel` does, to the contact tolerance.
     """
-    place, leg = wp.tid()
-    world = settings.first + wp.min(place, count - 1)  # threads beyond the last world repeat it, and write nothing
+    index, leg = wp.tid()
+    world = settings.first + wp.min(index, count - 1)  # threads beyond the last world repeat it, and write nothing
     com = base_com(model.table, world)
     s = LegState()
     s.base = load_base(joint_q, joint_qd, com, world)
     s.angles = load_motors(joint_q, leg_coord(world, leg))
     s.rates = load_motors(joint_qd, leg_dof(world, leg))
     s.impulse = work.impulse[leg, world]
-    own = load_leg(model, world, leg)
+    params = load_leg(model, world, leg)
     motors = load_leg_drive(drive, world, leg)
     while any_world(s.step < settings.substeps):
-        s = advance_leg(model, settings, drive, own, motors, world, leg, s, leg == 0 and place < count)
+        s = advance_leg(model, settings, drive, params, motors, world, leg, s, leg == 0 and index < count)
     total = sum_legs(wp.dot(s.angles, s.angles) + wp.dot(s.rates, s.rates))
     broken = work.diverged[world] != 0 or not (finite_base(s.base) and wp.isfinite(total))
-    if place >= count:
+    if index >= count:
         return
     if broken:
         if leg == 0:

@@ -44,11 +44,11 @@ def rollout_legs_kernel(
 
     count: worlds, from `settings.first` on.
     """
-    place, leg = wp.tid()
-    world = settings.first + wp.min(place, count - 1)  # threads beyond the last world repeat it
+    index, leg = wp.tid()
+    world = settings.first + wp.min(index, count - 1)  # threads beyond the last world repeat it
     com = base_com(model.table, world)
     delay = actuation.latency[world] / settings.dt
-    own = load_leg(model, world, leg)
+    params = load_leg(model, world, leg)
     s = LegState()
     s.impulse = commands.impulse[leg, world]
     for step in range(timing.steps * timing.substeps):
@@ -71,7 +71,7 @@ def rollout_legs_kernel(
         s.step = 0
         s.sets = 0
         while any_world(s.step == 0):
-            s = advance_leg(model, settings, drive, own, motors, world, leg, s, False)
+            s = advance_leg(model, settings, drive, params, motors, world, leg, s, False)
         store_row_vec3(trajectory.torque, step, 3 * leg, world, torque)
         trajectory.impulse[step, leg, world] = s.impulse
         trajectory.pressed[step, leg, world] = wp.uint8(s.used)

@@ -9,7 +9,7 @@ import warp as wp
 from ...scalar import real, vec3
 from ...state import BaseState, base_com, leg_coord, leg_dof, load_base, load_motors, store_base, store_motors
 from ...terrain.ground import has_block, move_block
-from ..base_motion import moved_base
+from ..base_motion import integrate_base
 from ..contact import ContactState, PawContact, block_velocity, push_on_block
 from ..drive import Drive, Workspace, applied_torque, base_wrench, freeze_diverged_world, load_leg_drive
 from ..step import RobotModel, StepSettings, block_law, finite_base
@@ -48,7 +48,7 @@ def advance_once(
         end = legs[k].new_rates
         legs[k].rates = end
         legs[k].angles = legs[k].angles + dt * end
-    return moved_base(base, solved.lin, solved.ang, dt)
+    return integrate_base(base, solved.lin, solved.ang, dt)
 
 
 @wp.func

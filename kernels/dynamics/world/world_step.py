@@ -58,10 +58,10 @@ def solve_with_stops(
     g = wp.quat_rotate_inv(base.quat, load_vec3(model.table, GRAVITY, world))
     system = base_system(model, world, base, g, force, moment)
     for k in range(legs.shape[0]):
-        own = load_leg(model, world, k)
+        params = load_leg(model, world, k)
         spring = load_spring(model.table, k, world)
         terms = leg_terms(
-            own,
+            params,
             spring,
             legs[k].angles,
             legs[k].rates,
@@ -105,11 +105,11 @@ def revise_stops(legs: wp.array(dtype=LegStep), slack: real, sets: int) -> bool:
     changed = bool(False)
     for k in range(legs.shape[0]):
         pressed = legs[k].pressed
-        wanted = revised_stops(legs[k].stop_rates, legs[k].new_rates, slack, pressed, sets)
-        if wanted != pressed and not (changed and one_by_one(sets)):
+        required = revised_stops(legs[k].stop_rates, legs[k].new_rates, slack, pressed, sets)
+        if required != pressed and not (changed and one_by_one(sets)):
             if one_by_one(sets):
-                wanted = change_one(pressed, wanted)
-            legs[k].pressed = wanted
+                required = change_one(pressed, required)
+            legs[k].pressed = required
             changed = True
     return changed
 
