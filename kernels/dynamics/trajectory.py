@@ -178,7 +178,7 @@ def arrival(step: int, substeps: int, delay: real) -> Arrival:
 
 
 @wp.func
-def commanded(
+def policy_target(
     filtered_target: wp.array3d(dtype=real), initial_target: wp.array2d(dtype=real), step: int, motor: int, world: int
 ) -> real:
     """Return a motor's target [rad] of a policy step, before the first one what it followed until then."""
@@ -192,10 +192,10 @@ def arrived_target(
     commands: Commands, filtered_target: wp.array3d(dtype=real), arrived: Arrival, motor: int, world: int
 ) -> real:
     """Return the target [rad] that a motor follows in a physics step."""
-    newer = commanded(filtered_target, commands.initial_target, arrived.newer, motor, world)
+    newer = policy_target(filtered_target, commands.initial_target, arrived.newer, motor, world)
     if arrived.weight == real(1.0):
         return newer
-    older = commanded(filtered_target, commands.initial_target, arrived.older, motor, world)
+    older = policy_target(filtered_target, commands.initial_target, arrived.older, motor, world)
     return older + arrived.weight * (newer - older)
 
 
@@ -223,6 +223,6 @@ def filter_commands(
     target = row_vec3(commands.target, step, m, world)
     if actuation.filtered != 0:
         offset = actuation.motors.offset
-        read = angles + vec3(offset[m, world], offset[m + 1, world], offset[m + 2, world])
-        target = filter_leg(target, read, rates, load_filter(actuation.limits, world))
+        measured = angles + vec3(offset[m, world], offset[m + 1, world], offset[m + 2, world])
+        target = filter_leg(target, measured, rates, load_filter(actuation.limits, world))
     store_row_vec3(filtered_target, step, m, world, target)

@@ -7,7 +7,7 @@ import warp as wp
 from ...actuation.command_filter import FilterParams, filter_leg
 from ...actuation.motors import MotorParams, motor_torque
 from ...scalar import real, vec3
-from ..trajectory import Actuation, Arrival, Commands, Timing, arrival, commanded, load_filter, row_vec3
+from ..trajectory import Actuation, Arrival, Commands, Timing, arrival, load_filter, policy_target, row_vec3
 from .gradients import LATENCY_GRADIENT, MOTOR_GRADIENT, Gradients, add_entry, add_motor, add_vec3
 
 wp.set_module_options({"enable_backward": False})
@@ -35,14 +35,14 @@ class FilterAdjoint:
 
 
 @wp.func
-def add_target(gradients: Gradients, step: int, motor: int, world: int, x: real):
+def add_target(gradients: Gradients, step: int, motor: int, world: int, gradient: real):
     """Add to the gradient by a motor's filtered target of a policy step, or by what it followed before the first."""
     if step < 0:
         wp.atomic_add(
-            gradients.initial_target, motor, world, x
+            gradients.initial_target, motor, world, gradient
         )  # no other thread does; so none waits for what was there
     else:
-        wp.atomic_add(gradients.filtered_target, step, motor, world, x)
+        wp.atomic_add(gradients.filtered_target, step, motor, world, gradient)
 
 
 @wp.func
@@ -51,37 +51,37 @@ def motor_gradient(
     dt: real, step: int, motor: int, world: int, angle: real, rate: real,
 ) -> MotorAdjoint:  # fmt: skip
     """Return the derivatives of a motor's torque in a step."""
-    found = MotorAdjoint()
+    adjoint = MotorAdjoint()
     arrived = arrival(step, timing.substeps, delay)
-    newer = commanded(filtered_target, commands.initial_target, arrived.newer, motor, world)
+    newer = policy_target(filtered_target, commands.initial_target, arrived.newer, motor, world)
     older = newer
     target = newer
     if arrived.newer > arrived.older:
-        older = commanded(filtered_target, commands.initial_target, arrived.older, motor, world)
+        older = policy_target(filtered_target, commands.initial_target, arrived.older, motor, world)
         if arrived.weight != real(1.0):
             target = older + arrived.weight * (newer - older)
     by_target, by_angle, by_rate, by_motor = wp.grad(motor_torque)(target, angle, rate, params)
-    found.target = by_target
-    found.angle = by_angle
-    found.rate = by_rate
-    found.constants = by_motor
-    found.latency = -by_target * (newer - older) / dt
-    return found
+    adjoint.target = by_target
+    adjoint.angle = by_angle
+    adjoint.rate = by_rate
+    adjoint.constants = by_motor
+    adjoint.latency = -by_target * (newer - older) / dt
+    return adjoint
 
 
 @wp.func
-def add_targets(gradients: Gradients, arrived: Arrival, motor: int, world: int, x: real):
+def add_targets(gradients: Gradients, arrived: Arrival, motor: int, world: int, gradient: real):
     """Add a gradient by the target that a motor follows to those by the filtered targets it comes from."""
-    add_target(gradients, arrived.newer, motor, world, arrived.weight * x)
+    add_target(gradients, arrived.newer, motor, world, arrived.weight * gradient)
     if arrived.newer > arrived.older:
-        add_target(gradients, arrived.older, motor, world, (real(1.0) - arrived.weight) * x)
+        add_target(gradients, arrived.older, motor, world, (real(1.0) - arrived.weight) * gradient)
 
 
 @wp.func
-def add_motor_constants(sums: Any, shared: Any, motor: int, cotangent: real, found: MotorAdjoint):
+def add_motor_constants(sums: Any, shared: Any, motor: int, cotangent: real, adjoint: MotorAdjoint):
     """Add to the gradients by a motor's constants, and to `shared` by the latency; seed: gradient by its torque."""
-    add_motor(sums, shared, motor, cotangent, found.constants)
-    add_entry(shared, LATENCY_GRADIENT, cotangent * found.latency)
+    add_motor(sums, shared, motor, cotangent, adjoint.constants)
+    add_entry(shared, LATENCY_GRADIENT, cotangent * adjoint.latency)
 
 
 @wp.func
@@ -97,21 +97,21 @@ def filter_gradient(
 ) -> FilterAdjoint:  # fmt: skip
     """Return a leg's gradients for those by its filtered targets of a policy step."""
     m = 3 * leg
-    found = FilterAdjoint()
+    adjoint = FilterAdjoint()
     cotangent = row_vec3(gradients.filtered_target, step, m, world)
-    found.target = cotangent
+    adjoint.target = cotangent
     if actuation.filtered != 0:
         offset = actuation.motors.offset
-        read = angles + vec3(offset[m, world], offset[m + 1, world], offset[m + 2, world])
+        measured = angles + vec3(offset[m, world], offset[m + 1, world], offset[m + 2, world])
         target = row_vec3(commands.target, step, m, world)
         by_target, by_angles, by_rates, by_params, _cotangent = wp.grad(filter_adjoint_scalar)(
-            target, read, rates, load_filter(actuation.limits, world), cotangent
+            target, measured, rates, load_filter(actuation.limits, world), cotangent
         )
-        found.target = by_target
-        found.angles = by_angles
-        found.rates = by_rates
-        found.constants = by_params
-    return found
+        adjoint.target = by_target
+        adjoint.angles = by_angles
+        adjoint.rates = by_rates
+        adjoint.constants = by_params
+    return adjoint
 
 
 @wp.func

@@ -37,6 +37,7 @@ from ...scalar import real, vec3
 from ..inertia import MassMoments
 from ..leg_dynamics import LegMasses
 from ..trajectory import FILTER_HORIZON, FILTER_ROWS, FILTER_SPEED
+from .action_gradients import LegGradient
 
 wp.set_module_options({"enable_backward": False})
 
@@ -180,6 +181,16 @@ def add_geometry(sums: Any, leg: int, geo: LegGeometry):
     add_entry(sums, row + 7, geo.thigh)
     add_entry(sums, row + 8, geo.shank)
     add_entry(sums, row + 9, geo.paw_radius)
+
+
+@wp.func
+def add_leg_parameters(sums: Any, leg: int, gradient: LegGradient):
+    """Add the gradient by a leg's parameters, its friction coefficients aside."""
+    add_geometry(sums, leg, gradient.geometry)
+    add_masses(sums, leg, gradient.masses)
+    add_joints(sums, leg, gradient.joints)
+    add_spring(sums, leg, gradient.spring)
+    add_stops(sums, leg, gradient.stops)
 
 
 @wp.func

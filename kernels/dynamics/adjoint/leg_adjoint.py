@@ -7,31 +7,30 @@ multipliers, from which the gradients by parameters follow, again for many steps
 
 import warp as wp
 
-from ...actuation.joint_forces import JointParams
-from ...actuation.springs import LegSpring
-from ...actuation.stops import StopParams, stop_rates
-from ...kinematics.geometry import LegGeometry
+from ...actuation.stops import stop_rates
 from ...lanes import any_world, mat_from_leg, sum_legs, sum_quat, sum_vec, vec_from_leg
-from ...layout import BASE, GRAVITY, LEG_ROWS, MU_DYNAMIC, MU_STATIC
-from ...scalar import mat33, quat, real, vec3
-from ...state import BaseState, base_com
+from ...layout import GRAVITY, LEG_ROWS, MU_DYNAMIC, MU_STATIC
+from ...scalar import mat33, real, vec3
+from ...state import BaseState
 from ..base_dynamics import BaseSystem, add_leg, invert, motor_acceleration, solve_ang, solve_lin, sum_systems
 from ..base_motion import integrate_base
 from ..contact import SEPARATE, PawContact
 from ..contact_laws import PawLaw, contact_at, contact_point, paw_law
 from ..inertia import MassMoments
-from ..leg_dynamics import LegMasses
-from ..parameters import load_moments, load_spring, load_stops, load_vec3
+from ..parameters import load_spring, load_stops, load_vec3
 from ..step import LegParams, RobotModel, base_system, hold_base, leg_terms
 from ..trajectory import TrajectoryArrays, row_vec3
+from .action_gradients import (
+    LegGradient,
+    base_action_gradient,
+    leg_action_gradient,
+    make_base_factors,
+    make_leg_factors,
+)
 from .gradients import (
     ThreadSums,
     add_entry,
-    add_geometry,
-    add_joints,
-    add_masses,
-    add_spring,
-    add_stops,
+    add_leg_parameters,
 )
 from .leg_record import (
     ANGLES,
@@ -56,7 +55,7 @@ from .leg_record import (
     put_solve,
     put_vec,
 )
-from .virtual_power import BaseFactors, LegFactors, add, base_action, leg_action, rotation_adjoint_scalar
+from .virtual_power import BaseFactors, add, rotation_adjoint_scalar
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
 
@@ -79,17 +78,17 @@ class LegAdjoint:
 @wp.func
 def leg_law(c: PawContact, law: PawLaw, impulse: vec3, point: vec3) -> LegLaw:
     """Return what is recorded of a paw's law; impulse [N s], point [m]: body axes."""
-    found = LegLaw()
-    found.mode = law.mode
-    found.mu_row = law.mu_row
-    found.mu = law.mu
-    found.impulse = impulse
-    found.point = point
-    found.jacobian = c.jacobian
-    found.to_lin = c.to_lin
-    found.to_ang = c.to_ang
-    found.by_velocity = law.by_velocity
-    return found
+    recorded = LegLaw()
+    recorded.mode = law.mode
+    recorded.mu_row = law.mu_row
+    recorded.mu = law.mu
+    recorded.impulse = impulse
+    recorded.point = point
+    recorded.jacobian = c.jacobian
+    recorded.to_lin = c.to_lin
+    recorded.to_ang = c.to_ang
+    recorded.by_velocity = law.by_velocity
+    return recorded
 
 
 @wp.func
@@ -132,15 +131,15 @@ def replay_leg(
     twist = dt * system.moment + sum_vec(twist)
     lin = solve_lin(inverse, push, twist)
     ang = solve_ang(inverse, push, twist)
-    ahead = rates + dt * motor_acceleration(solve, lin / dt, ang / dt)
-    put_vec(record, i + 1, RATES, world, leg, ahead)
-    put_vec(record, i + 1, ANGLES, world, leg, angles + dt * ahead)
+    new_rates = rates + dt * motor_acceleration(solve, lin / dt, ang / dt)
+    put_vec(record, i + 1, RATES, world, leg, new_rates)
+    put_vec(record, i + 1, ANGLES, world, leg, angles + dt * new_rates)
     old_lin = wp.quat_rotate_inv(base.quat, base.lin)
     put_base(record, i + 1, world, integrate_base(base, old_lin + lin, base.ang + ang, dt))
     law = PawLaw()
     if touches:
         old_velocity = old_lin + wp.cross(base.ang, point) + c.jacobian * rates
-        velocity = old_lin + lin + wp.cross(base.ang + ang, point) + c.jacobian * ahead
+        velocity = old_lin + lin + wp.cross(base.ang + ang, point) + c.jacobian * new_rates
         old_impulse = first_impulse[leg, world]
         if step > 0:
             old_impulse = trajectory.impulse[step - 1, leg, world]
@@ -202,71 +201,27 @@ def inverted_laws(c: PawContact, law: PawLaw, leg: int) -> LawRow:
     a3 = reduce_block(a3, a2, scale * a3, 2, leg)
     a2 = reduce_block(none, a2, scale, 2, leg)
     scale = wp.inverse(wp.where(leg == 3, a3, eye))
-    found = LawRow()
-    found.a = reduce_block(a0, a3, scale * a0, 3, leg)
-    found.b = reduce_block(a1, a3, scale * a1, 3, leg)
-    found.c = reduce_block(a2, a3, scale * a2, 3, leg)
-    found.d = reduce_block(none, a3, scale, 3, leg)
-    return found
+    row = LawRow()
+    row.a = reduce_block(a0, a3, scale * a0, 3, leg)
+    row.b = reduce_block(a1, a3, scale * a1, 3, leg)
+    row.c = reduce_block(a2, a3, scale * a2, 3, leg)
+    row.d = reduce_block(none, a3, scale, 3, leg)
+    return row
 
 
 @wp.func
 def multiplier(row: LawRow, impulse_cotangent: vec3) -> vec3:
     """Return the multiplier of a paw's law for the gradients by all paws' impulses; seed: 0 where separated."""
-    found = row.a * vec_from_leg(impulse_cotangent, 0) + row.b * vec_from_leg(impulse_cotangent, 1)
-    return -(found + row.c * vec_from_leg(impulse_cotangent, 2) + row.d * vec_from_leg(impulse_cotangent, 3))
+    total = row.a * vec_from_leg(impulse_cotangent, 0) + row.b * vec_from_leg(impulse_cotangent, 1)
+    return -(total + row.c * vec_from_leg(impulse_cotangent, 2) + row.d * vec_from_leg(impulse_cotangent, 3))
 
 
 @wp.func
-def base_factors(record: LegRecord, world: int, i: int, dt: real, base: BaseState, weights: BaseWeights) -> BaseFactors:
-    """Return what is held of the base in a step."""
-    ahead = get_base(record, i + 1, world)
-    base_held = BaseFactors()
-    base_held.virtual_lin = weights.lin
-    base_held.virtual_ang = weights.ang
-    base_held.lin = wp.quat_rotate_inv(base.quat, ahead.lin)
-    base_held.ang = ahead.ang
-    base_held.lin_acc = (base_held.lin - wp.quat_rotate_inv(base.quat, base.lin)) / dt
-    base_held.ang_acc = (base_held.ang - base.ang) / dt
-    return base_held
-
-
-@wp.func
-def leg_factors(
-    record: LegRecord, trajectory: TrajectoryArrays, cotangent: TrajectoryArrays, world: int, step: int, i: int,
-    leg: int, dt: real, law: LegLaw, weights: LegWeights,
-) -> LegFactors:  # fmt: skip
-    """Return what is held of a leg in a step."""
-    base_held = LegFactors()
-    base_held.virtual_rates = weights.rates
-    base_held.rates = get_vec(record, i + 1, RATES, world, leg)
-    base_held.acc = (base_held.rates - get_vec(record, i, RATES, world, leg)) / dt
-    base_held.mode = law.mode
-    base_held.pressed = int(trajectory.pressed[step, leg, world])
-    if law.mode != SEPARATE:
-        base_held.impulse = law.impulse
-        base_held.law = weights.law
-        if cotangent.impulse.shape[0] > 0:
-            base_held.push = cotangent.impulse[step, leg, world]
-    return base_held
-
-
-@wp.struct
-class LegGradient:
-    """Gradient of a leg's part of the weighed equations."""
-
-    geometry: LegGeometry
-    masses: LegMasses
-    joints: JointParams
-    spring: LegSpring
-    stops: StopParams
-    mu: real
-    pos: vec3  # by the base's state
-    quat: quat
-    omega: vec3
-    gravity: vec3  # body axes
-    angles: vec3
-    rates: vec3
+def base_factors(
+    record: LegRecord, world: int, i: int, dt: real, base: BaseState, weights: BaseWeights
+) -> BaseFactors:  # fmt: skip
+    """Return the base's constants in the step at entry i."""
+    return make_base_factors(base, get_base(record, i + 1, world), weights.lin, weights.ang, dt)
 
 
 @wp.func
@@ -275,33 +230,17 @@ def leg_gradient(
     cotangent: TrajectoryArrays, step: int, i: int, record: LegRecord, base: BaseState, law: LegLaw,
     base_held: BaseFactors, weights: LegWeights,
 ) -> LegGradient:  # fmt: skip
-    """Return the gradient of `leg_action` in a step."""
-    leg_held = leg_factors(record, trajectory, cotangent, world, step, i, leg, dt, law, weights)
-    g = wp.quat_rotate_inv(base.quat, load_vec3(model.table, GRAVITY, world))
-    angles = get_vec(record, i, ANGLES, world, leg)
+    """Return the gradient of `leg_action` in the step of the rollout whose entry in the record is i."""
     rates = get_vec(record, i, RATES, world, leg)
-    (geo, masses, joints, spring, stops, _ground, mu, pos, quat, omega, g_adj, angle_adj, rate_adj, _held, _leg,
-     _step) = (
-        wp.grad(leg_action)(
-            params.geometry, params.masses, params.joints, load_spring(model.table, leg, world),
-            load_stops(model.table, leg, world), model.ground, law.mu, base.pos, base.quat, base.ang, g, angles, rates,
-            base_held, leg_held, dt,
-        )
+    push = vec3(real(0.0))
+    if cotangent.impulse.shape[0] > 0:
+        push = cotangent.impulse[step, leg, world]
+    leg_held = make_leg_factors(
+        rates, get_vec(record, i + 1, RATES, world, leg), weights.rates, law.mode,
+        int(trajectory.pressed[step, leg, world]), law.impulse, weights.law, push, dt,
     )  # fmt: skip
-    found = LegGradient()
-    found.geometry = geo
-    found.masses = masses
-    found.joints = joints
-    found.spring = spring
-    found.stops = stops
-    found.mu = mu
-    found.pos = pos
-    found.quat = quat
-    found.omega = omega
-    found.gravity = g_adj
-    found.angles = angle_adj
-    found.rates = rate_adj
-    return found
+    angles = get_vec(record, i, ANGLES, world, leg)
+    return leg_action_gradient(model, params, world, leg, law.mu, base, angles, rates, base_held, leg_held, dt)
 
 
 @wp.struct
@@ -323,45 +262,51 @@ def find_weights(
     """Return the multipliers of a step for the gradients by the velocities at its end; see `find_multipliers`."""
     inverse = get_inverse(record, i, world)
     solve = get_solve(record, i, world, leg)
-    found = StepWeights()
-    found.lin = lin_cotangent
-    found.ang = ang_cotangent
-    found.rates = rate_cotangent
+    weights = StepWeights()
+    weights.lin = lin_cotangent
+    weights.ang = ang_cotangent
+    weights.rates = rate_cotangent
     push = lin_cotangent - sum_vec(wp.transpose(solve.to_lin) * rate_cotangent)
     twist = ang_cotangent - sum_vec(wp.transpose(solve.to_ang) * rate_cotangent)
-    found.base.lin = solve_lin(inverse, push, twist)
-    found.base.ang = solve_ang(inverse, push, twist)
-    found.leg.rates = solve.inverse * rate_cotangent - solve.to_lin * found.base.lin - solve.to_ang * found.base.ang
+    weights.base.lin = solve_lin(inverse, push, twist)
+    weights.base.ang = solve_ang(inverse, push, twist)
+    weights.leg.rates = (
+        solve.inverse * rate_cotangent - solve.to_lin * weights.base.lin - solve.to_ang * weights.base.ang
+    )
     touches = law.mode != SEPARATE
     impulse_cotangent = vec3(real(0.0))
     if touches:
-        impulse_cotangent = found.base.lin + wp.cross(found.base.ang, law.point) + law.jacobian * found.leg.rates
+        impulse_cotangent = weights.base.lin + wp.cross(weights.base.ang, law.point) + law.jacobian * weights.leg.rates
         if cotangent.impulse.shape[0] > 0:
             impulse_cotangent += wp.quat_rotate_inv(base.quat, cotangent.impulse[step, leg, world])
     if any_world(any_leg(touches)):
         y = vec3(real(0.0))
-        found.leg.law = multiplier(get_law_row(record, i, world, leg), impulse_cotangent)
+        weights.leg.law = multiplier(get_law_row(record, i, world, leg), impulse_cotangent)
         if touches:
-            y = wp.transpose(law.by_velocity) * found.leg.law
+            y = wp.transpose(law.by_velocity) * weights.leg.law
         joint = wp.transpose(law.jacobian) * y
         law_lin = sum_vec(law.to_lin * y)
         law_ang = sum_vec(law.to_ang * y)
-        found.lin += sum_vec(y)
-        found.ang += sum_vec(wp.cross(law.point, y))
-        found.rates += joint
-        found.leg.rates += solve.inverse * joint - solve.to_lin * law_lin - solve.to_ang * law_ang
-        found.base.lin += law_lin
-        found.base.ang += law_ang
-    return found
+        weights.lin += sum_vec(y)
+        weights.ang += sum_vec(wp.cross(law.point, y))
+        weights.rates += joint
+        weights.leg.rates += solve.inverse * joint - solve.to_lin * law_lin - solve.to_ang * law_ang
+        weights.base.lin += law_lin
+        weights.base.ang += law_ang
+    return weights
 
 
 @wp.func
 def reverse_leg(
     model: RobotModel, params: LegParams, dt: real, world: int, leg: int, force: vec3, moment: vec3,
     trajectory: TrajectoryArrays, cotangent: TrajectoryArrays, step: int, i: int, record: LegRecord, adj: LegAdjoint,
-    keeps: bool,
+    writes_record: bool,
 ) -> LegAdjoint:  # fmt: skip
-    """Run a step backwards, see `reverse_step`; if it `keeps`, it records what its equations are weighed with."""
+    """Return the gradient by the state at the start of a step for `adj`, that by the state at its end; see `reverse_step`.
+
+    i: the step's entry in the record, `step`: its number in the rollout. force [N], moment [N m]: on the base at its
+    com, world axes. writes_record: whether this thread writes the step's multipliers to the record.
+    """
     base = get_base(record, i, world)
     law = get_law(record, i, world, leg)
     new_velocity = adj.base.lin + dt * adj.base.pos
@@ -375,44 +320,36 @@ def reverse_leg(
     base_weights = weights.base
     # the equations of motion
     base_held = base_factors(record, world, i, dt, base, base_weights)
-    found = leg_gradient(
+    gradient = leg_gradient(
         model, params, dt, world, leg, trajectory, cotangent, step, i, record, base, law, base_held, weights.leg
     )
     base_weights.cotangent.velocity = weights.lin
     base_weights.cotangent.new_velocity = new_velocity
-    base_weights.cotangent.gravity = sum_vec(found.gravity)
-    gravity = load_vec3(model.table, GRAVITY, world)
-    body, com, weight, force_adj, moment_adj, base_quat, lin_adj, base_omega, _base, _cotangent, _base_step = wp.grad(
-        base_action
-    )(load_moments(model.table, BASE, world), base_com(model.table, world), gravity, force, moment, base.quat,
-      base.lin, base.ang, base_held, base_weights.cotangent, dt)  # fmt: skip
-    if keeps:
+    base_weights.cotangent.gravity = sum_vec(gradient.gravity)
+    by_base = base_action_gradient(model, world, force, moment, base, base_held, base_weights.cotangent, dt)
+    if writes_record:
         put_base_weights(record, i, world, base_weights)
         put_leg_weights(record, i, world, leg, weights.leg)
     out = LegAdjoint()
-    out.base.pos = adj.base.pos + sum_vec(found.pos)
-    out.base.quat = quat_adj + base_quat + sum_quat(found.quat)
-    out.base.lin = lin_adj
-    out.base.ang = weights.ang + base_omega + sum_vec(found.omega)
-    out.angles = adj.angles + found.angles
-    out.rates = weights.rates + found.rates
+    out.base.pos = adj.base.pos + sum_vec(gradient.pos)
+    out.base.quat = quat_adj + by_base.quat + sum_quat(gradient.quat)
+    out.base.lin = by_base.lin
+    out.base.ang = weights.ang + by_base.omega + sum_vec(gradient.omega)
+    out.angles = adj.angles + gradient.angles
+    out.rates = weights.rates + gradient.rates
     out.torque = dt * weights.leg.rates
-    out.force = adj.force + force_adj
-    out.moment = adj.moment + moment_adj
-    out.body = add(adj.body, body)
-    out.com = adj.com + com
-    out.gravity = adj.gravity + weight
+    out.force = adj.force + by_base.force
+    out.moment = adj.moment + by_base.moment
+    out.body = add(adj.body, by_base.body)
+    out.com = adj.com + by_base.com
+    out.gravity = adj.gravity + by_base.gravity
     return out
 
 
 @wp.func
-def add_leg_constants(sums: ThreadSums, leg: int, law: LegLaw, found: LegGradient):
+def add_leg_constants(sums: ThreadSums, leg: int, law: LegLaw, gradient: LegGradient):
     """Add a step's gradients by the parameters of a leg."""
-    add_geometry(sums, leg, found.geometry)
-    add_masses(sums, leg, found.masses)
-    add_joints(sums, leg, found.joints)
-    add_spring(sums, leg, found.spring)
-    add_stops(sums, leg, found.stops)
+    add_leg_parameters(sums, leg, gradient)
     for row in range(2):  # one of the two coefficients
         mu_row = leg * LEG_ROWS + wp.where(row == 0, int(MU_STATIC), int(MU_DYNAMIC))
-        add_entry(sums, mu_row, wp.where(law.mode != SEPARATE and law.mu_row == mu_row, found.mu, real(0.0)))
+        add_entry(sums, mu_row, wp.where(law.mode != SEPARATE and law.mu_row == mu_row, gradient.mu, real(0.0)))

@@ -14,6 +14,7 @@ from ..leg_dynamics import PawKinematics
 from ..parameters import load_spring, load_stops, load_vec3
 from ..step import LegParams, RobotModel, base_system, hold_base, leg_terms
 from ..trajectory import TrajectoryArrays, row_vec3
+from .action_gradients import make_base_factors, make_leg_factors
 from .virtual_power import BaseFactors, LegFactors
 
 wp.set_module_options({"enable_backward": False})
@@ -51,8 +52,9 @@ class LegReverse:
     rates: vec3
     torque: vec3  # by the torques
     virtual_rates: vec3  # multipliers of the motors' equations
+    contact: PawContact  # of its paw at the solution
     law: PawLaw
-    multiplier: vec3  # by the paw's impulse, then the multiplier of its law
+    multiplier: vec3  # of the paw's law; until `solve_laws` the gradient by its impulse
 
 
 @wp.struct
@@ -167,23 +169,22 @@ def solve_linear(a: wp.array2d(dtype=real), b: wp.array(dtype=real), n: int):
 
 
 @wp.func
-def solve_laws(
-    contacts: wp.array(dtype=PawContact), legs: wp.array(dtype=LegReverse), matrix: wp.array2d(dtype=real),
-    vector: wp.array(dtype=real),
-):  # fmt: skip
-    """Replace the gradients of the paws' impulses in `multiplier` by the multipliers of their laws.
-
-    matrix, vector: of shape (12, 12) and (12,), overwritten.
-    """
+def solve_laws(legs: wp.array(dtype=LegReverse)):
+    """Replace the gradients by the paws' impulses in `multiplier` by the multipliers of their laws."""
+    matrix = wp.zeros(shape=(12, 12), dtype=real)
+    vector = wp.zeros(shape=(12,), dtype=real)
     row = int(0)
     for k in range(legs.shape[0]):
         if legs[k].law.mode != SEPARATE:
             col = int(0)
             for j in range(legs.shape[0]):
                 if legs[j].law.mode != SEPARATE:
-                    block = contacts[k].from_lin * contacts[j].to_lin + contacts[k].from_ang * contacts[j].to_ang
+                    block = (
+                        legs[k].contact.from_lin * legs[j].contact.to_lin
+                        + legs[k].contact.from_ang * legs[j].contact.to_ang
+                    )
                     if k == j:
-                        block = contacts[k].total
+                        block = legs[k].contact.total
                     block = block * wp.transpose(legs[j].law.by_velocity)
                     if k == j:
                         block = block + wp.transpose(legs[k].law.by_impulse)
@@ -207,14 +208,13 @@ def solve_laws(
 def write_laws(
     model: RobotModel, at: ReplayedStep, first_impulse: wp.array2d(dtype=vec3), trajectory: TrajectoryArrays,
     record: StepRecord, m: Multipliers, cotangent: TrajectoryArrays, legs: wp.array(dtype=LegReverse),
-    contacts: wp.array(dtype=PawContact),
 ) -> bool:  # fmt: skip
     """Write the paws' laws at the solution, and the gradients by their impulses; returns whether any touches."""
     world, i = at.world, at.entry
     base = record.base[world, i]
-    ahead = record.base[world, i + 1]
-    lin = wp.quat_rotate_inv(base.quat, ahead.lin)
-    ang = ahead.ang
+    end = record.base[world, i + 1]
+    lin = wp.quat_rotate_inv(base.quat, end.lin)
+    ang = end.ang
     old_lin = wp.quat_rotate_inv(base.quat, base.lin)
     touching = bool(False)
     for k in range(legs.shape[0]):
@@ -234,7 +234,7 @@ def write_laws(
             impulse_cotangent = m.lin + wp.cross(m.ang, point) + c.jacobian * legs[k].virtual_rates
             if cotangent.impulse.shape[0] > 0:
                 impulse_cotangent += wp.quat_rotate_inv(base.quat, cotangent.impulse[at.step, k, world])
-            contacts[k] = c
+            legs[k].contact = c
             legs[k].law = law
             legs[k].multiplier = impulse_cotangent
             touching = touching or law.mode != SEPARATE
@@ -244,7 +244,6 @@ def write_laws(
 @wp.func
 def add_laws(
     model: RobotModel, at: ReplayedStep, record: StepRecord, multipliers: Multipliers, legs: wp.array(dtype=LegReverse),
-    contacts: wp.array(dtype=PawContact),
 ) -> Multipliers:  # fmt: skip
     """Return the multipliers with the share of the contact laws, whose own are known; the legs' are replaced."""
     m = multipliers
@@ -252,7 +251,7 @@ def add_laws(
     law_ang = vec3(real(0.0))
     for k in range(legs.shape[0]):
         if legs[k].law.mode != SEPARATE:
-            c = contacts[k]
+            c = legs[k].contact
             y = wp.transpose(legs[k].law.by_velocity) * legs[k].multiplier
             joint = wp.transpose(c.jacobian) * y
             law_lin += c.to_lin * y
@@ -273,50 +272,37 @@ def add_laws(
 def find_multipliers(
     model: RobotModel, at: ReplayedStep, first_impulse: wp.array2d(dtype=vec3), trajectory: TrajectoryArrays,
     cotangent: TrajectoryArrays, record: StepRecord, lin_cotangent: vec3, ang_cotangent: vec3,
-    legs: wp.array(dtype=LegReverse), contacts: wp.array(dtype=PawContact), matrix: wp.array2d(dtype=real),
-    vector: wp.array(dtype=real),
+    legs: wp.array(dtype=LegReverse),
 ) -> Multipliers:  # fmt: skip
     """Return the multipliers of a step's equations for the gradients by the velocities at its end, body axes.
 
     legs: `rates` are those of the motors; to them the share of the contact laws is added.
     """
     m = solve_system(record, at, lin_cotangent, ang_cotangent, legs)
-    if write_laws(model, at, first_impulse, trajectory, record, m, cotangent, legs, contacts):
-        solve_laws(contacts, legs, matrix, vector)
-        m = add_laws(model, at, record, m, legs, contacts)
+    if write_laws(model, at, first_impulse, trajectory, record, m, cotangent, legs):
+        solve_laws(legs)
+        m = add_laws(model, at, record, m, legs)
     return m
 
 
 @wp.func
 def base_factors(at: ReplayedStep, record: StepRecord, m: Multipliers) -> BaseFactors:
-    """Return what is held of the base."""
+    """Return the base's constants in a step."""
     base = record.base[at.world, at.entry]
-    ahead = record.base[at.world, at.entry + 1]
-    factors = BaseFactors()
-    factors.virtual_lin = m.lin
-    factors.virtual_ang = m.ang
-    factors.lin = wp.quat_rotate_inv(base.quat, ahead.lin)
-    factors.ang = ahead.ang
-    factors.lin_acc = (factors.lin - wp.quat_rotate_inv(base.quat, base.lin)) / at.dt
-    factors.ang_acc = (factors.ang - base.ang) / at.dt
-    return factors
+    return make_base_factors(base, record.base[at.world, at.entry + 1], m.lin, m.ang, at.dt)
 
 
 @wp.func
 def leg_factors(
     at: ReplayedStep, k: int, trajectory: TrajectoryArrays, cotangent: TrajectoryArrays, record: StepRecord,
-    legs: wp.array(dtype=LegReverse), contacts: wp.array(dtype=PawContact),
+    legs: wp.array(dtype=LegReverse),
 ) -> LegFactors:  # fmt: skip
-    """Return what is held of a leg."""
-    factors = LegFactors()
-    factors.virtual_rates = legs[k].virtual_rates
-    factors.rates = record.rates[at.world, at.entry + 1, k]
-    factors.acc = (factors.rates - record.rates[at.world, at.entry, k]) / at.dt
-    factors.mode = legs[k].law.mode
-    factors.pressed = int(trajectory.pressed[at.step, k, at.world])
-    if factors.mode != SEPARATE:
-        factors.impulse = contacts[k].impulse
-        factors.law = legs[k].multiplier
-        if cotangent.impulse.shape[0] > 0:
-            factors.push = cotangent.impulse[at.step, k, at.world]
-    return factors
+    """Return the constants of leg k in a step."""
+    push = vec3(real(0.0))
+    if cotangent.impulse.shape[0] > 0:
+        push = cotangent.impulse[at.step, k, at.world]
+    return make_leg_factors(
+        record.rates[at.world, at.entry, k], record.rates[at.world, at.entry + 1, k], legs[k].virtual_rates,
+        legs[k].law.mode, int(trajectory.pressed[at.step, k, at.world]), legs[k].contact.impulse, legs[k].multiplier,
+        push, at.dt,
+    )  # fmt: skip

@@ -10,7 +10,6 @@ from ...actuation.motors import MotorParams, motor_torque
 from ...layout import BASE
 from ...scalar import quat, real, vec3
 from ...state import BaseState, base_com
-from ..contact import PawContact
 from ..parameters import load_moments, load_spring, load_stops
 from ..step import LegParams, RobotModel, StepSettings, load_leg
 from ..trajectory import (
@@ -196,7 +195,7 @@ def add_wrench(gradients: Gradients, t: int, world: int, force: vec3, moment: ve
 
 @wp.func
 def add_motor_adjoint(
-    found: MotorAdjoint, arrived: Arrival, at: ReplayedStep, motor: int, cotangent: TrajectoryArrays,
+    by_motor: MotorAdjoint, arrived: Arrival, at: ReplayedStep, motor: int, cotangent: TrajectoryArrays,
     gradients: Gradients, legs: wp.array(dtype=LegReverse), sums: wp.array(dtype=real),
 ):  # fmt: skip
     """Add the gradients by what a motor's torque in a step depends on."""
@@ -205,27 +204,27 @@ def add_motor_adjoint(
     torque_cotangent = legs[k].torque[c]
     if cotangent.torque.shape[0] > 0:
         torque_cotangent += cotangent.torque[at.step, motor, at.world]
-    add_targets(gradients, arrived, motor, at.world, torque_cotangent * found.target)
-    add_motor_constants(sums, sums, motor, torque_cotangent, found)
+    add_targets(gradients, arrived, motor, at.world, torque_cotangent * by_motor.target)
+    add_motor_constants(sums, sums, motor, torque_cotangent, by_motor)
     angles = legs[k].angles
     rates = legs[k].rates
-    angles[c] += torque_cotangent * found.angle
-    rates[c] += torque_cotangent * found.rate
+    angles[c] += torque_cotangent * by_motor.angle
+    rates[c] += torque_cotangent * by_motor.rate
     legs[k].angles = angles
     legs[k].rates = rates
 
 
 @wp.func
 def add_filter_adjoint(
-    found: FilterAdjoint, t: int, k: int, world: int, gradients: Gradients, legs: wp.array(dtype=LegReverse),
+    by_motor: FilterAdjoint, t: int, k: int, world: int, gradients: Gradients, legs: wp.array(dtype=LegReverse),
     sums: wp.array(dtype=real),
 ):  # fmt: skip
     """Add the gradients by what a leg's filtered targets of a policy step depend on."""
-    store_row_vec3(gradients.target, t, 3 * k, world, found.target)
-    add_offsets(sums, k, found.angles)
-    add_filter(sums, found.constants)
-    legs[k].angles = legs[k].angles + found.angles
-    legs[k].rates = legs[k].rates + found.rates
+    store_row_vec3(gradients.target, t, 3 * k, world, by_motor.target)
+    add_offsets(sums, k, by_motor.angles)
+    add_filter(sums, by_motor.constants)
+    legs[k].angles = legs[k].angles + by_motor.angles
+    legs[k].rates = legs[k].rates + by_motor.rates
 
 
 @wp.func
@@ -271,9 +270,6 @@ def reverse_kernel(
     """Add the gradient of a scalar to `gradients`, given its gradient by the trajectory; one thread per world."""
     world = settings.first + wp.tid()
     legs = wp.zeros(shape=(4,), dtype=LegReverse)
-    contacts = wp.zeros(shape=(4,), dtype=PawContact)
-    matrix = wp.zeros(shape=(12, 12), dtype=real)
-    vector = wp.zeros(shape=(12,), dtype=real)
     sums = wp.zeros(shape=(GRADIENT_ROWS,), dtype=real)
     params = wp.zeros(shape=(4,), dtype=LegParams)
     motors = wp.zeros(shape=(12,), dtype=MotorParams)
@@ -303,9 +299,6 @@ def reverse_kernel(
                 record,
                 adj,
                 legs,
-                contacts,
-                matrix,
-                vector,
                 sums,
             )
             adj = by_step.base
@@ -314,10 +307,10 @@ def reverse_kernel(
             for i in range(motors.shape[0]):
                 angle = record.angles[world, at.entry, i / 3][i % 3]
                 rate = record.rates[world, at.entry, i / 3][i % 3]
-                found = motor_gradient(
+                by_motor = motor_gradient(
                     motors[i], delay, commands, filtered_target, timing, at.dt, at.step, i, world, angle, rate
                 )
-                add_motor_adjoint(found, arrived, at, i, cotangent, gradients, legs, sums)
+                add_motor_adjoint(by_motor, arrived, at, i, cotangent, gradients, legs, sums)
         entries = add_row_cotangent(
             load_row_base_adjoint(trajectory, model, row, world, adj, end.com), cotangent, row, world
         )

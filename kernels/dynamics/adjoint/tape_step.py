@@ -68,9 +68,9 @@ def solve_kernel(
     wrench = base_wrench(drive.joint_f, drive.body_f, world)
     force = vec3(wrench[0], wrench[1], wrench[2])
     moment = vec3(wrench[3], wrench[4], wrench[5])
-    found = solve_step(model, settings, world, base, force, moment, BlockLaw(), work.impulse, legs, contacts)
-    solved.lin[world] = found.lin
-    solved.ang[world] = found.ang
+    solution = solve_step(model, settings, world, base, force, moment, BlockLaw(), work.impulse, legs, contacts)
+    solved.lin[world] = solution.lin
+    solved.ang[world] = solution.ang
     for k in range(legs.shape[0]):
         impulse = wp.quat_rotate(base.quat, contacts[k].impulse)
         solved.rates[k, world] = legs[k].new_rates
@@ -155,9 +155,6 @@ def adj_end_velocities(
     """Write what `power_kernel` weighs the equations of motion with, and set its gradient to 1."""
     params = wp.zeros(shape=(4,), dtype=LegParams)
     legs = wp.zeros(shape=(4,), dtype=LegReverse)
-    contacts = wp.zeros(shape=(4,), dtype=PawContact)
-    matrix = wp.zeros(shape=(12, 12), dtype=real)
-    vector = wp.zeros(shape=(12,), dtype=real)
     wrench = base_wrench(joint_f, body_f, world)
     at = ReplayedStep()
     at.dt = dt
@@ -181,9 +178,6 @@ def adj_end_velocities(
         adj_ret.lin,
         adj_ret.ang,
         legs,
-        contacts,
-        matrix,
-        vector,
     )
     cotangent = BaseCotangent()
     cotangent.velocity = m.lin_cotangent
@@ -191,7 +185,7 @@ def adj_end_velocities(
     solved.cotangent[world] = cotangent
     solved.ang_cotangent[world] = m.ang_cotangent
     for k in range(legs.shape[0]):
-        solved.legs[k, world] = leg_factors(at, k, solved.trajectory, TrajectoryArrays(), record, legs, contacts)
+        solved.legs[k, world] = leg_factors(at, k, solved.trajectory, TrajectoryArrays(), record, legs)
         solved.rate_cotangent[k, world] = legs[k].rates
         solved.mu_row[k, world] = legs[k].law.mu_row
         wp.adjoint[power][k, world] += real(1.0)

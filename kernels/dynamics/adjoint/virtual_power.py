@@ -42,7 +42,7 @@ from ..leg_dynamics import LegMasses, PawKinematics, leg_pose, paw_kinematics
 
 @wp.struct
 class BaseFactors:
-    """Constants of the base in the scalar: multipliers, accelerations, new velocities; body axes of the step's start."""
+    """Constants of the base in the scalar: multipliers, accelerations, new velocities; body axes of its start."""
 
     virtual_lin: vec3  # multipliers of the base's equations
     virtual_ang: vec3
@@ -176,8 +176,8 @@ def link_motion(
     """Return the motion of a link's frame in the housing, in the link's axes.
 
     origin [m], vel [m/s], acc [m/s^2], virtual: of the link frame's origin, in housing axes; the last three in the
-    five-bar's plane (x, z). about_y: rate [rad/s], acceleration [rad/s^2] and virtual rate about y. cosine, sine: of the
-    link's angle about y.
+    five-bar's plane (x, z). about_y: rate [rad/s], acceleration [rad/s^2] and virtual rate about y. cosine, sine: of
+    the link's angle about y.
     """
     w = housing.ang
     link = FrameMotion()

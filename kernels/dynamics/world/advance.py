@@ -21,11 +21,13 @@ wp.set_module_options({"enable_backward": False})
 @wp.func
 def advance_once(
     model: RobotModel, settings: StepSettings, drive: Drive, work: Workspace, world: int, step: int, base: BaseState,
-    legs: wp.array(dtype=LegStep), contacts: wp.array(dtype=PawContact), peaks: wp.array(dtype=real),
+    legs: wp.array(dtype=LegStep), contacts: wp.array(dtype=PawContact),
 ) -> BaseState:  # fmt: skip
-    """Advance one world by one step; the angles and rates of the legs' motors are updated in place.
+    """Advance one world by `settings.dt`; overwrites `legs` and `contacts`, returns the new base state.
 
-    legs, contacts: as in `solve_step`. peaks [N^2 s^2]: largest impulse on each paw, squared, (4,).
+    step: of the launch, counted from 0; the last one writes torques and paw forces to `work`. legs, contacts: scratch
+    of the thread, shape (4,), see `solve_step`; of the legs the motors' angles and rates are input, and then those at
+    the end of the step. A block moves in `model.ground`; `work` gets the paws' impulses and the largest values.
     """
     dt = settings.dt
     last = step == settings.substeps - 1
@@ -43,7 +45,7 @@ def advance_once(
     if has_block(model.ground, world):
         push = push_on_block(contacts)
         move_block(model.ground, world, wp.quat_rotate(base.quat, block_velocity(block, push)), dt)
-    record_contacts(work, world, base, contacts, solved.contact, dt, last, peaks)
+    record_contacts(work, world, base, contacts, solved.contact, dt, last, legs)
     for k in range(legs.shape[0]):
         end = legs[k].new_rates
         legs[k].rates = end
@@ -54,9 +56,9 @@ def advance_once(
 @wp.func
 def record_contacts(
     work: Workspace, world: int, base: BaseState, contacts: wp.array(dtype=PawContact), solved: ContactState, dt: real,
-    last: bool, peaks: wp.array(dtype=real),
+    last: bool, legs: wp.array(dtype=LegStep),
 ):  # fmt: skip
-    """Write the paws' impulses, forces in the last step, and keep the largest; peaks: as in `advance_once`."""
+    """Write the paws' impulses [N s] and, if `last`, forces [N] to `work`, world axes, and keep the largest values."""
     total = vec3(real(0.0))
     for k in range(contacts.shape[0]):
         impulse = wp.quat_rotate(base.quat, contacts[k].impulse)
@@ -64,7 +66,7 @@ def record_contacts(
         force = impulse / dt
         if last:
             work.contact_force[k, world] = force
-        peaks[k] = wp.max(peaks[k], wp.dot(contacts[k].impulse, contacts[k].impulse))
+        legs[k].peak_sq = wp.max(legs[k].peak_sq, wp.dot(contacts[k].impulse, contacts[k].impulse))
         total += force
     work.peak_force[world] = wp.max(work.peak_force[world], wp.length(total))
     work.sweeps[world] = wp.max(work.sweeps[world], solved.sweeps)
@@ -97,7 +99,6 @@ def advance_kernel(
     base = load_base(joint_q, joint_qd, com, world)
     legs = wp.zeros(shape=(4,), dtype=LegStep)
     contacts = wp.zeros(shape=(4,), dtype=PawContact)
-    peaks = wp.zeros(shape=(4,), dtype=real)
     for k in range(legs.shape[0]):
         legs[k].angles = load_motors(joint_q, leg_coord(world, k))
         legs[k].rates = load_motors(joint_qd, leg_dof(world, k))
@@ -105,12 +106,12 @@ def advance_kernel(
     work.sweeps[world] = 0
     work.peak_force[world] = real(0.0)
     for step in range(settings.substeps):
-        base = advance_once(model, settings, drive, work, world, step, base, legs, contacts, peaks)
+        base = advance_once(model, settings, drive, work, world, step, base, legs, contacts)
     total = real(0.0)
     for k in range(legs.shape[0]):
         angles = legs[k].angles
         rates = legs[k].rates
-        work.peak_paw_force[k, world] = wp.sqrt(peaks[k]) / settings.dt
+        work.peak_paw_force[k, world] = wp.sqrt(legs[k].peak_sq) / settings.dt
         store_motors(joint_q_out, leg_coord(world, k), angles)
         store_motors(joint_qd_out, leg_dof(world, k), rates)
         total += wp.dot(angles, angles) + wp.dot(rates, rates)

@@ -55,7 +55,6 @@ def rollout_kernel(
     com = base_com(model.table, world)
     legs = wp.zeros(shape=(4,), dtype=LegStep)
     contacts = wp.zeros(shape=(4,), dtype=PawContact)
-    peaks = wp.zeros(shape=(4,), dtype=real)
     delay = actuation.latency[world] / settings.dt
     for k in range(legs.shape[0]):
         work.impulse[k, world] = commands.impulse[k, world]
@@ -78,7 +77,7 @@ def rollout_kernel(
             torque = leg_torque(commands, actuation, filtered_target, arrived, k, world, legs[k].angles, legs[k].rates)
             store_row_vec3(trajectory.torque, step, 3 * k, world, torque)
             store_motors(drive.joint_f, leg_dof(world, k), torque)
-        base = advance_once(model, settings, drive, work, world, 0, base, legs, contacts, peaks)
+        base = advance_once(model, settings, drive, work, world, 0, base, legs, contacts)
         for k in range(legs.shape[0]):
             trajectory.impulse[step, k, world] = work.impulse[k, world]
             trajectory.pressed[step, k, world] = wp.uint8(legs[k].pressed)

@@ -26,16 +26,17 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.struct
 class LegStep:
-    """A leg's motors (lateral, outer, inner), and what a step writes of the leg."""
+    """A leg in a step: input (angles, rates, torque), scratch and results; vectors are lateral, outer, inner."""
 
     angles: vec3  # [rad] at the start of the step
-    rates: vec3  # [rad/s]
-    torque: vec3  # [N m]
+    rates: vec3  # [rad/s] at the start of the step
+    torque: vec3  # [N m] of the motors
     new_rates: vec3  # [rad/s] at the end of the step
     stop_rates: StopRates
-    pressed: int  # set of hard stops
+    pressed: int  # set of pressed hard stops, see `stops`
     solve: LegSolve
     paw: PawKinematics
+    peak_sq: real  # [N^2 s^2] square of the largest impulse on the paw, over the steps of a launch
 
 
 @wp.struct
