@@ -1,4 +1,4 @@
-"""The motor command filter (paper, Section III): position targets give way to the limits as these come near.
+"""The motor command filter (paper, Section III): position targets are limited near the joint limits.
 
 A quantity x (a motor angle, or the sum of a leg's two transversal angles) has limits [lower, upper]. With margins
 m_u = upper - x and m_l = x - lower, and the speed floor v_0, the time to violation is
@@ -66,14 +66,14 @@ def limit_weight(command: real, pos: real, vel: real, limits: Limits, horizon: r
 
 @wp.func
 def limit_command(command: real, pos: real, vel: real, limits: Limits, horizon: real, speed_floor: real) -> real:
-    """Return the safe command [rad] for a quantity at `pos` [rad] that moves at `vel` [rad/s]."""
+    """Return the filtered command [rad] for a quantity at `pos` [rad] that moves at `vel` [rad/s]."""
     weight = limit_weight(command, pos, vel, limits, horizon, speed_floor)
     return command + weight * (wp.clamp(command, limits.lower, limits.upper) - command)
 
 
 @wp.func
 def filter_leg(target: vec3, pos: vec3, vel: vec3, params: FilterParams) -> vec3:
-    """Return the safe targets [rad] of one leg. All vectors: (lateral, outer, inner), [rad] and [rad/s].
+    """Return the filtered targets [rad] of one leg. All vectors: (lateral, outer, inner), [rad] and [rad/s].
 
     The single motors' limits come first. The limits of the transversal sum then act on the sum of what is left, and
     both transversal commands give way by half of what they must.

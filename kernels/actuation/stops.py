@@ -26,8 +26,8 @@ UPPER_STOP = wp.constant(2)
 ROW_BITS = wp.constant(2)
 ROW_MASK = wp.constant(3)
 ROWS = wp.constant(4)
-# after so many sets of a step only one stop changes at a time, which alone cannot cycle without friction; after so many
-# none is released; and after so many the last set stands
+# after this many sets of a step only one stop changes at a time, which cannot cycle without friction; then none is
+# released; and after the last number the set stands
 ONE_BY_ONE = wp.constant(3)
 PRESS_ONLY = wp.constant(8)
 MAX_SETS = wp.constant(12)
@@ -49,7 +49,7 @@ class StopParams:
 
 @wp.struct
 class StopRates:
-    """The stops of one leg in a step; rows are lateral, outer, inner, outer + inner."""
+    """Rates at which the stops of one leg press in a step; rows are lateral, outer, inner, outer + inner."""
 
     lower: vec4  # [rad/s] rate at the end of the step above which the lower stop is free
     upper: vec4  # [rad/s] rate below which the upper stop is free
@@ -66,7 +66,7 @@ class StopForces:
 
 @wp.func
 def stop_rates(p: StopParams, angles: vec3, dt: real) -> StopRates:
-    """Return the stops in a step dt [s] from motor angles [rad]."""
+    """Return the rates at which the stops press in a step dt [s] from motor angles [rad]: lateral, outer, inner."""
     damping = wp.max(dt * p.ke + p.kd, real(1.0e-9))
     inside = p.ke / damping
     outside = real(1.0) / dt

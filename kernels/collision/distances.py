@@ -71,7 +71,7 @@ def segment_box_bound_sq(start: vec3, end: vec3, half: vec3) -> real:
 
 @wp.func
 def inflated_distance(distance_sq: real, radius: real, bound: real) -> real:
-    """Return the distance [m] of shapes swollen by `radius` in total, or `bound` (>= 0) if it is not below that."""
+    """Return the distance [m] of shapes inflated by `radius` [m] in total, or `bound` (>= 0) if it is not smaller."""
     reach = bound + radius
     if distance_sq >= reach * reach:
         return bound

@@ -64,10 +64,10 @@ class LegCapsules:
 
 @wp.struct
 class Collisions:
-    """Result for one robot."""
+    """Forbidden contacts of one robot."""
 
     flags: int  # bitmask of the contacts that exist
-    clearance: real  # [m] smallest distance found, negative in contact
+    clearance: real  # [m] smallest distance, negative in contact
 
 
 @wp.func
@@ -245,7 +245,7 @@ def load_leg(
 
 @wp.func
 def next_leg(order: int) -> int:
-    """Return the leg at a place of the way around the body: FL, FR, BR, BL."""
+    """Return the leg at a position around the body, modulo 4: FL, FR, BR, BL are legs 0, 1, 3, 2."""
     return (order % 4) ^ ((order % 4) >> 1)
 
 
@@ -306,7 +306,9 @@ def leg_collisions(
     geometry: wp.array(dtype=LegGeometry), ground: Ground, joint_q: wp.array(dtype=wp.float32), start: int, order: int,
     min_distance: real,
 ) -> int:  # fmt: skip
-    """Return the flags of one leg, counted around the body; together the four give those of `world_collisions`.
+    """Return the flags of the leg at position `order` around the body, see `next_leg`.
+
+    Those of all four are those of `world_collisions`.
 
     apart: links closer to one another than this [m] count as touching; `world_collisions` has 0.
     """

@@ -38,7 +38,7 @@ def exp_rotation(rotation_vector: vec3) -> quat:
 
 @wp.func
 def integrate_base(base: BaseState, lin: vec3, ang: vec3, dt: real) -> BaseState:
-    """Return the base moved for dt [s]; lin, ang: its new twist in the present body axes [m/s], [rad/s]."""
+    """Return the base state after dt [s] (semi-implicit Euler); lin [m/s], ang [rad/s]: new twist, old body axes."""
     moved = BaseState()
     moved.lin = wp.quat_rotate(base.quat, lin)
     moved.ang = ang

@@ -47,16 +47,16 @@ class PawContact:
 
     active: int  # 0: too far from the ground to touch within the step
     on_block: int  # 1: the ground is the sliding block there
-    normal: vec3
-    mu: real
+    normal: vec3  # unit, out of the ground
+    mu: real  # friction coefficient
     mu_row: int  # row of mu in the parameter table
     goal: real  # smallest admissible normal velocity at the end of the step [m/s]
     free: vec3  # contact point velocity without any impulse [m/s]
     jacobian: mat33  # contact velocity per motor rate [m/rad]
-    from_lin: mat33  # G: contact velocity per base twist
-    from_ang: mat33
-    to_lin: mat33  # S^-1 G^T: base twist per impulse
-    to_ang: mat33
+    from_lin: mat33  # G: contact velocity per base velocity [1]
+    from_ang: mat33  # and per base angular velocity [m]
+    to_lin: mat33  # S^-1 G^T: base velocity per impulse [1/kg]
+    to_ang: mat33  # base angular velocity per impulse [1/(kg m)]
     leg_response: mat33  # A: contact velocity per impulse through the leg alone [1/kg]
     total_inv: mat33  # inverse of `total` [kg]
     total: mat33  # A + G S^-1 G^T, plus 1/mass of the block along the floor: relative velocity per impulse [1/kg]

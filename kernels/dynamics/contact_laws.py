@@ -15,13 +15,13 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.struct
 class PawLaw:
-    """A paw's contact law at the solution: its derivatives by velocity and impulse, 0 where separated."""
+    """A paw's contact law R(impulse, velocity) = 0 at the solution, see `contact_residual`; body axes."""
 
     mode: int  # SEPARATE, STICK or SLIDE
     mu_row: int  # row of the friction coefficient in the parameter table
-    mu: real
-    by_velocity: mat33
-    by_impulse: mat33  # at fixed velocity
+    mu: real  # friction coefficient
+    by_velocity: mat33  # dR/dv^T, 0 where separated
+    by_impulse: mat33  # dR/dp at fixed velocity, 0 where separated
 
 
 @wp.func

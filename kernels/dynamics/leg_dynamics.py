@@ -40,10 +40,10 @@ class LegMasses:
 
 @wp.struct
 class LegPose:
-    """Where a leg is: the five-bar in the housing, and the housing's rotation about body x."""
+    """Configuration of a leg: the five-bar in the housing, and the housing's rotation about body x."""
 
     loop: FiveBar
-    cosine: real
+    cosine: real  # of the lateral angle times `side`
     sine: real
 
 
@@ -88,7 +88,7 @@ def columns(a: vec3, b: vec3, c: vec3) -> mat33:
 
 @wp.func
 def paw_kinematics(geo: LegGeometry, pose: LegPose) -> PawKinematics:
-    """Return the paw's position and maps."""
+    """Return the position and Jacobians of a leg's paw centre in body axes."""
     loop, cosine, sine = pose.loop, pose.cosine, pose.sine
     zero = real(0.0)
     y = geo.plane_y + geo.knee_y

@@ -19,25 +19,25 @@ from .inertia import MassMoments, rotate_y, rotate_y_second, sym_outer
 class LinkSums:
     """Integrals over link mass; subscripts o and i mean derivatives by the outer and inner motor angle.
 
-    Of a link or of a side of the leg, o is the motor of its own side and i the other; `leg_sums` tells them apart.
+    Of a link or a side of the leg, o is the motor of the same side and i the other; `leg_sums` sorts them.
     """
 
-    mass: real  # of 1
-    first: vec3  # of r
-    second: vec6  # of r r^T
+    mass: real  # [kg]
+    first: vec3  # [kg m] of r
+    second: vec6  # [kg m^2] of r r^T: xx yy zz xy xz yz
     second_o: vec5  # of r_o r^T + r r_o^T: xx zz xy xz yz
     second_i: vec5
-    lin_o: vec2  # of r_o: linear momentum per motor rate
+    lin_o: vec2  # [kg m] of r_o: linear momentum per motor rate
     lin_i: vec2
-    ang_o: vec3  # of r x r_o: angular momentum about the hip per motor rate
+    ang_o: vec3  # [kg m^2] of r x r_o: angular momentum about the hip per motor rate
     ang_i: vec3
-    inertia_oo: real  # of r_o . r_o
+    inertia_oo: real  # [kg m^2] of r_o . r_o
     inertia_oi: real
     inertia_ii: real
-    coriolis: real  # y component of 2 r_i x r_o
-    lin_acc: vec2  # of the acceleration while motor accelerations are zero
-    ang_acc: vec3  # of r x that acceleration
-    bias_o: real  # of r_o . that acceleration
+    coriolis: real  # [kg m^2] y component of 2 r_i x r_o
+    lin_acc: vec2  # [N] of the acceleration while motor accelerations are zero
+    ang_acc: vec3  # [N m] of r x that acceleration
+    bias_o: real  # [N m] of r_o . that acceleration
     bias_i: real
 
 
@@ -85,7 +85,12 @@ def shank_sums(
     knee_acc: vec2,
     rotation_acc: real,
 ) -> LinkSums:
-    """Return the sums of a shank whose frame sits at the knee of its own side and turns about y."""
+    """Return the sums of a shank, whose frame has its origin at the knee of its side and rotates about y.
+
+    link: about that frame. knee [m], direction (unit, knee to ankle): in the housing frame. knee_do [m/rad]: derivative
+    by the motor of its side. rotation_do, _di [1]: of the shank's angle about y by that motor and the other. rate
+    [rad/s], knee_acc [m/s^2], rotation_acc [rad/s^2]: at zero motor accelerations, see `FiveBarBias`.
+    """
     # a shank hanging along -z has direction (0, -1): its rotation has sine -x and cosine -z
     u = rotate_y(link.first, -direction[1], -direction[0])
     s = rotate_y_second(link.second, -direction[1], -direction[0])
@@ -130,8 +135,8 @@ def add_thigh(
 ) -> LinkSums:
     """Return a shank's sums with those of the thigh above it.
 
-    The thigh turns about its transversal axis, at x and y `axis` [m], z = 0, by `sign` (-1 or +1) per angle of its own
-    motor.
+    The thigh turns about its transversal axis, at x and y `axis` [m], z = 0, by `sign` (-1 or +1) per its motor's angle,
+    at `rate` [rad/s]; cosine, sine: of that angle about y.
     """
     u = rotate_y(link.first, cosine, sine)
     s = rotate_y_second(link.second, cosine, sine)

@@ -1,8 +1,9 @@
-"""Momentum of a robot in free flight, and its correction to what it was before some steps.
+"""Momentum of a robot in free flight, and its correction to the conserved value.
 
 The step is semi-implicit Euler, whose momentum drifts by an error of first order while legs move. In free flight, with
-no paw down and no wrench from outside, the right momentum is known: the angular one about the centre of mass stays, the
-linear one grows by m g t. The correction changes the base's twist alone, as an impulse on a robot with locked joints.
+no paw down and no wrench from outside, the right momentum is known: the angular one about the centre of mass is
+constant, the linear one grows by m g t. The correction changes the base's twist alone, as an impulse on a robot with
+locked joints.
 """
 
 import warp as wp
@@ -39,7 +40,7 @@ class Momenta:
 def robot_momentum(
     model: RobotModel, world: int, base: BaseState, joint_q: wp.array(dtype=real), joint_qd: wp.array(dtype=real)
 ) -> RobotMomentum:  # fmt: skip
-    """Return a robot's mass moments and momentum."""
+    """Return a robot's mass moments and momentum; joint_q, joint_qd: in Newton's layout, of all worlds."""
     momentum = RobotMomentum()
     body = load_moments(model.table, BASE, world)
     for k in range(model.geometry.shape[0]):
@@ -87,7 +88,7 @@ def momentum_kernel(
     # out
     momenta: Momenta,
 ):
-    """Write the momentum of every robot; one thread per world."""
+    """Write the momentum of every robot; one thread per world, from world `first` on."""
     world = first + wp.tid()
     base = load_base(joint_q, joint_qd, base_com(model.table, world), world)
     momentum = robot_momentum(model, world, base, joint_q, joint_qd)
@@ -109,9 +110,10 @@ def project_momentum_kernel(
     joint_q: wp.array(dtype=real),
     joint_qd: wp.array(dtype=real),
 ):
-    """Give robots that flew freely for a time [s] the momentum that theirs of before has become; one thread per world.
+    """Project the base twist of robots in free flight onto conserved momentum; one thread per world.
 
-    body_f: wrenches of that time. peak_force [N]: largest on the paws in it.
+    momenta: at the start of an interval of `time` [s]. body_f: wrenches in it. peak_force [N]: largest total paw force
+    in it, 0 in flight. diverged: worlds left alone.
     """
     world = first + wp.tid()
     if diverged[world] != 0 or peak_force[world] > real(0.0) or wp.length_sq(body_f[world * BODIES]) > 0.0:

@@ -39,12 +39,12 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.struct
 class RobotModel:
-    """What the step reads of the robot and the ground, besides its state."""
+    """Parameters of the robots and their ground in every world; constant during a launch, blocks aside."""
 
-    geometry: wp.array(dtype=LegGeometry)  # (4,)
-    table: wp.array2d(dtype=real)  # parameters, see `parameters`
+    geometry: wp.array(dtype=LegGeometry)  # (4,): FL, FR, BL, BR, the same in all worlds
+    table: wp.array2d(dtype=real)  # (PARAMETER_ROWS, num_worlds), rows as in `layout`
     ground: Ground
-    held: wp.array(dtype=int)  # (num_worlds,), not 0: the base stays as it is, hung up; empty: none
+    held: wp.array(dtype=int)  # (num_worlds,), not 0: the base keeps its twist (hung up); empty: none
 
 
 @wp.struct
@@ -52,15 +52,15 @@ class StepSettings:
     """Numerical settings of the step."""
 
     dt: real  # [s]
-    substeps: int
-    max_sweeps: int
+    substeps: int  # steps of a launch
+    max_sweeps: int  # of the contact iteration
     tolerance: real  # [m/s], of the contact iteration
     first: int  # world of the first thread of a launch
 
 
 @wp.struct
 class LegParams:
-    """One leg of one world: what does not change as it moves."""
+    """Constants of one leg of one world."""
 
     geometry: LegGeometry
     masses: LegMasses
@@ -91,7 +91,11 @@ def leg_terms(
     params: LegParams, spring: LegSpring, angles: vec3, rates: vec3, torque: vec3, stop_rates: StopRates, pressed: int,
     omega: vec3, g: vec3, dt: real,
 ) -> LegTerms:  # fmt: skip
-    """Return a leg's dynamics, its elimination with the pressed stops, and its paw."""
+    """Return a leg's dynamics, its elimination with the pressed stops, and its paw, in body axes.
+
+    angles [rad], rates [rad/s], torque [N m] of the motors: lateral, outer, inner, at the start of the step dt [s].
+    omega [rad/s], g [m/s^2]: of the base, body axes. stop_rates, pressed: see `stops`.
+    """
     geo = params.geometry
     joints = params.joints
     pose = leg_pose(geo, angles)
@@ -209,7 +213,7 @@ def base_system(model: RobotModel, world: int, base: BaseState, g: vec3, force: 
 
 @wp.func
 def hold_base(model: RobotModel, world: int, inverse: BaseInverse) -> BaseInverse:
-    """Return the inverse of a world's base system, zero where the base is held: nothing accelerates it."""
+    """Return the inverse of a world's base system, or zero (no acceleration) where the base is held."""
     if model.held.shape[0] > 0:
         if model.held[world] != 0:
             return BaseInverse()

@@ -1,4 +1,4 @@
-"""What the kernels of rollouts share: their commands, rows of the state, and the targets that motors follow."""
+"""Data of rollouts shared by their kernels: commands, trajectory rows, latency and command filter."""
 
 import warp as wp
 
@@ -31,18 +31,18 @@ class Timing:
 
 @wp.struct
 class Actuation:
-    """What lies between targets and torques, per world."""
+    """Motors, latency and command filter of every world: from targets to torques."""
 
-    motors: MotorArrays  # fades aside
+    motors: MotorArrays  # without its fades, see `fade`
     fade: wp.array2d(dtype=real)  # [rad/s], (2, num_worlds): start and end of the over-speed protection
     latency: wp.array(dtype=real)  # [s], (num_worlds,)
-    filtered: int  # 0: the targets pass as they are
+    filtered: int  # 0: targets are not filtered
     limits: wp.array2d(dtype=real)  # constants of the filter, (FILTER_ROWS, num_worlds)
 
 
 @wp.struct
 class Commands:
-    """What a rollout is told; K = T S / every."""
+    """Inputs of a rollout of T policy steps."""
 
     target: wp.array3d(dtype=real)  # [rad], (T, 12, num_worlds)
     initial_target: wp.array2d(
@@ -54,7 +54,7 @@ class Commands:
 
 @wp.struct
 class TrajectoryArrays:
-    """A trajectory, or the gradient of a number by it; an empty array is one of zeros."""
+    """A trajectory, or a gradient by one, where an empty array means zeros; K = T S / every, see `Timing`."""
 
     q: wp.array3d(dtype=real)  # [m], [rad], (K + 1, ROW_COORDS, num_worlds)
     qd: wp.array3d(dtype=real)  # [m/s], [rad/s], (K + 1, ROW_RATES, num_worlds)
@@ -76,24 +76,22 @@ def row_base(pos: vec3, orientation: quat, com_lin: vec3, ang: vec3, com: vec3) 
 
 @wp.func
 def row_vec3(values: wp.array3d(dtype=real), row: int, first: int, world: int) -> vec3:
-    """Return three entries of a row."""
+    """Return three entries of a row, from index `first`; values: (rows, entries, num_worlds)."""
     return vec3(values[row, first, world], values[row, first + 1, world], values[row, first + 2, world])
 
 
 @wp.func
 def row_quat(values: wp.array3d(dtype=real), row: int, first: int, world: int) -> quat:
-    """Return four entries of a row."""
+    """Return four entries of a row, from index `first`."""
     return quat(
-        values[row, first, world],
-        values[row, first + 1, world],
-        values[row, first + 2, world],
+        values[row, first, world], values[row, first + 1, world], values[row, first + 2, world],
         values[row, first + 3, world],
-    )
+    )  # fmt: skip
 
 
 @wp.func
 def store_row_vec3(values: wp.array3d(dtype=real), row: int, first: int, world: int, v: vec3):
-    """Write three entries of a row."""
+    """Write three entries of a row, from index `first`."""
     for i in range(3):
         values[row, first + i, world] = v[i]
 
@@ -152,7 +150,7 @@ def load_world_motor(actuation: Actuation, motor: int, world: int) -> MotorParam
 
 @wp.struct
 class Arrival:
-    """Which targets a motor follows in a physics step, late by the latency: the mean over the step of what arrived."""
+    """Interpolation of the targets that a motor follows in a physics step, delayed by the latency: its mean target."""
 
     older: int  # policy step of the target at the start of the physics step; -1: `Commands.initial_target`
     newer: int  # and at its end
@@ -161,7 +159,7 @@ class Arrival:
 
 @wp.func
 def arrival(step: int, substeps: int, delay: real) -> Arrival:
-    """Return what arrives during a physics step; delay: latency in physics steps, any fraction.
+    """Return the targets that arrive during a physics step; delay: latency in physics steps, any fraction.
 
     Where a target arrives just as the step begins it has weight 1, whose derivative is that of more latency. No target
     arrives before it is sent, whatever the latency.
@@ -181,7 +179,7 @@ def arrival(step: int, substeps: int, delay: real) -> Arrival:
 def policy_target(
     filtered_target: wp.array3d(dtype=real), initial_target: wp.array2d(dtype=real), step: int, motor: int, world: int
 ) -> real:
-    """Return a motor's target [rad] of a policy step, before the first one what it followed until then."""
+    """Return a motor's filtered target [rad] of a policy step; step -1: its initial target."""
     if step < 0:
         return initial_target[motor, world]
     return filtered_target[step, motor, world]
@@ -191,7 +189,7 @@ def policy_target(
 def arrived_target(
     commands: Commands, filtered_target: wp.array3d(dtype=real), arrived: Arrival, motor: int, world: int
 ) -> real:
-    """Return the target [rad] that a motor follows in a physics step."""
+    """Return the target [rad] that a motor follows in a physics step; filtered_target [rad]: (T, 12, num_worlds)."""
     newer = policy_target(filtered_target, commands.initial_target, arrived.newer, motor, world)
     if arrived.weight == real(1.0):
         return newer
@@ -204,7 +202,7 @@ def leg_torque(
     commands: Commands, actuation: Actuation, filtered_target: wp.array3d(dtype=real), arrived: Arrival, leg: int,
     world: int, angles: vec3, rates: vec3,
 ) -> vec3:  # fmt: skip
-    """Return the torques [N m] of a leg's motors in a physics step."""
+    """Return a leg's motor torques [N m] in a physics step; angles [rad], rates [rad/s]: of its motors."""
     torque = vec3(real(0.0))
     for j in range(3):
         motor = 3 * leg + j
@@ -218,7 +216,7 @@ def filter_commands(
     commands: Commands, actuation: Actuation, step: int, leg: int, world: int, angles: vec3, rates: vec3,
     filtered_target: wp.array3d(dtype=real),
 ):  # fmt: skip
-    """Write what the filter lets through of a leg's targets at the start of a policy step."""
+    """Write a leg's filtered targets [rad] of a policy step, for angles [rad] and rates [rad/s] at its start."""
     m = 3 * leg
     target = row_vec3(commands.target, step, m, world)
     if actuation.filtered != 0:

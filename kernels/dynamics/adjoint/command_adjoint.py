@@ -17,21 +17,21 @@ wp.set_module_options({"enable_backward": False})
 class MotorAdjoint:
     """Derivatives of a motor's torque."""
 
-    target: real  # by the target that it follows
-    angle: real
-    rate: real
-    constants: MotorParams
-    latency: real
+    target: real  # [N m/rad] by the target that it follows
+    angle: real  # [N m/rad]
+    rate: real  # [N m s/rad]
+    constants: MotorParams  # by each of them
+    latency: real  # [N m/s]
 
 
 @wp.struct
 class FilterAdjoint:
-    """Gradient by what a leg's filtered targets depend on."""
+    """Gradient by the inputs of a leg's command filter; vectors are lateral, outer, inner."""
 
-    target: vec3
-    angles: vec3
+    target: vec3  # by the raw targets
+    angles: vec3  # by the measured angles
     rates: vec3
-    constants: FilterParams
+    constants: FilterParams  # by each of them
 
 
 @wp.func
@@ -50,7 +50,7 @@ def motor_gradient(
     params: MotorParams, delay: real, commands: Commands, filtered_target: wp.array3d(dtype=real), timing: Timing,
     dt: real, step: int, motor: int, world: int, angle: real, rate: real,
 ) -> MotorAdjoint:  # fmt: skip
-    """Return the derivatives of a motor's torque in a step."""
+    """Return the derivatives of a motor's torque in a physics step of dt [s]; delay: latency in physics steps."""
     adjoint = MotorAdjoint()
     arrived = arrival(step, timing.substeps, delay)
     newer = policy_target(filtered_target, commands.initial_target, arrived.newer, motor, world)
@@ -86,7 +86,7 @@ def add_motor_constants(sums: Any, shared: Any, motor: int, cotangent: real, adj
 
 @wp.func
 def filter_adjoint_scalar(target: vec3, angles: vec3, rates: vec3, params: FilterParams, cotangent: vec3) -> real:
-    """Return the weighed sum of a leg's filtered targets."""
+    """Return cotangent . (filtered targets of a leg [rad])."""
     return wp.dot(cotangent, filter_leg(target, angles, rates, params))
 
 
@@ -95,7 +95,10 @@ def filter_gradient(
     commands: Commands, actuation: Actuation, step: int, leg: int, world: int, angles: vec3, rates: vec3,
     gradients: Gradients,
 ) -> FilterAdjoint:  # fmt: skip
-    """Return a leg's gradients for those by its filtered targets of a policy step."""
+    """Return the gradients by the filter's inputs, given those by a leg's filtered targets of a policy step.
+
+    angles [rad], rates [rad/s]: of the leg's motors at the start of the policy step.
+    """
     m = 3 * leg
     adjoint = FilterAdjoint()
     cotangent = row_vec3(gradients.filtered_target, step, m, world)

@@ -1,4 +1,4 @@
-"""Gradients of a rollout by constants of legs and motors, for GPUs: steps side by side, once run backwards."""
+"""Gradients of a rollout by constants of legs and motors, for GPUs: all steps in parallel, from the multipliers."""
 
 import warp as wp
 
@@ -6,9 +6,10 @@ from ...actuation.motors import MotorParams
 from ...scalar import real, vec3
 from ..step import RobotModel, StepSettings, load_leg
 from ..trajectory import Actuation, Commands, Timing, TrajectoryArrays, load_world_motor, row_vec3
+from .action_gradients import leg_action_gradient
 from .command_adjoint import add_motor_constants, add_offsets, motor_gradient
 from .gradients import Gradients, thread_sums
-from .leg_adjoint import add_leg_constants, base_factors, leg_gradient
+from .leg_adjoint import add_leg_constants, base_factors, leg_factors
 from .leg_record import ANGLES, FILTER, RATES, LegRecord, get_base, get_base_weights, get_law, get_leg_weights, get_vec
 from .rollout_adjoint import generate_adjoints
 from .rollout_legs_adjoint import Span, first_entry
@@ -18,11 +19,11 @@ wp.set_module_options({"enable_backward": False, "fast_math": True})
 
 @wp.struct
 class SpanStep:
-    """A step of a span that one of the threads of a leg takes."""
+    """A step of a span, as one of the threads of a leg takes it."""
 
-    step: int
+    step: int  # of the rollout
     entry: int  # of the record
-    weight: real  # 0 where a thread repeats the last step, as there are none left
+    weight: real  # 0 where there are no steps left and the thread repeats the last one
 
 
 @wp.func
@@ -33,7 +34,7 @@ def steps_per_thread(timing: Timing, span: Span, threads_per_leg: int) -> int:
 
 @wp.func
 def span_step(timing: Timing, span: Span, k: int) -> SpanStep:
-    """Return step `k` of a span."""
+    """Return the k-th step of a span."""
     step = SpanStep()
     end = span.end * timing.every
     step.step = span.begin * timing.every + k
@@ -75,9 +76,11 @@ def leg_constants_kernel(
         law = get_law(record, i, world, leg)
         base_held = base_factors(record, world, i, dt, base, get_base_weights(record, i, world))
         weights = get_leg_weights(record, i, world, leg)
-        gradient = leg_gradient(
-            model, params, dt, world, leg, trajectory, cotangent, at.step, i, record, base, law, base_held, weights
-        )
+        leg_held = leg_factors(record, trajectory, cotangent, world, at.step, i, leg, dt, law, weights)
+        gradient = leg_action_gradient(
+            model, params, world, leg, law.mu, base, get_vec(record, i, ANGLES, world, leg),
+            get_vec(record, i, RATES, world, leg), base_held, leg_held, dt,
+        )  # fmt: skip
         add_leg_constants(sums, leg, law, gradient)
 
 
@@ -96,9 +99,9 @@ def motor_constants_kernel(
     # in, out
     gradients: Gradients,
 ):
-    """Add those by constants of motors, launched likewise.
+    """Add the gradients by constants of motors of the steps of a span; launched as `leg_constants_kernel`.
 
-    With those of the legs in one kernel, a GPU's threads would keep more at a time than its first cache holds.
+    Two kernels, since one would need more memory per thread than a GPU's L1 cache holds.
     """
     index, thread, leg = wp.tid()
     world = settings.first + index
@@ -119,18 +122,9 @@ def motor_constants_kernel(
             torque += row_vec3(cotangent.torque, at.step, 3 * leg, world)
         for c in range(motors.shape[0]):
             by_motor = motor_gradient(
-                motors[c],
-                delay,
-                commands,
-                filtered_target,
-                timing,
-                settings.dt,
-                at.step,
-                3 * leg + c,
-                world,
-                angles[c],
-                rates[c],
-            )
+                motors[c], delay, commands, filtered_target, timing, settings.dt, at.step, 3 * leg + c, world,
+                angles[c], rates[c],
+            )  # fmt: skip
             add_motor_constants(leg_sums, shared_sums, 3 * leg + c, torque[c], by_motor)
         by_filter = vec3(real(0.0))
         if actuation.filtered != 0 and at.step - (at.step / timing.substeps) * timing.substeps == 0:

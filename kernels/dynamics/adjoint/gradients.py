@@ -55,7 +55,7 @@ GRADIENT_ROWS = wp.constant(GEOMETRY_GRADIENT + 40)
 
 @wp.struct
 class Gradients:
-    """Gradients of one number by everything that a rollout read, per world."""
+    """Gradient of one number per world by all inputs of a rollout; units: the number's per the input's."""
 
     q: wp.array2d(dtype=real)  # of row 0, (ROW_COORDS, num_worlds)
     qd: wp.array2d(dtype=real)  # (ROW_RATES, num_worlds)
@@ -68,19 +68,19 @@ class Gradients:
 
 @wp.struct
 class ThreadSums:
-    """Where the threads of a warp add what each of them found."""
+    """Destination of a thread's gradients by parameters, and over which threads of its warp they are summed first."""
 
     parameters: wp.array2d(dtype=real)  # (GRADIENT_ROWS, num_worlds)
     world: int
-    weight: real  # of what this thread found
-    writes: bool  # whether it adds the sum of what all of them found
-    over_steps: bool  # over those that have other steps of the same leg
-    over_legs: bool  # over those that have other legs
+    weight: real  # of this thread's contribution: 1, or 0 for a repeated step
+    writes: bool  # whether this thread adds the sum to `parameters`
+    over_steps: bool  # whether to sum over threads with other steps of the same leg
+    over_legs: bool  # whether to sum over threads with other legs
 
 
 @wp.func
 def thread_sums(gradients: Gradients, world: int, writes: bool, over_steps: bool, over_legs: bool) -> ThreadSums:
-    """Return where a thread adds, all that it finds counted; see `ThreadSums`."""
+    """Return `ThreadSums` of weight 1 that add to `gradients.parameters`."""
     sums = ThreadSums()
     sums.parameters = gradients.parameters
     sums.world = world
@@ -99,7 +99,7 @@ def add_entry(sums: wp.array(dtype=real), row: int, x: real):
 
 @wp.func
 def add_entry(sums: ThreadSums, row: int, x: real):  # noqa: F811
-    """Add what some threads found to a row of their world. Only one of them adds, and does not wait for it."""
+    """Add x, weighted and summed over threads as `sums` says, to a row of their world; one atomic addition."""
     total = sums.weight * x
     if sums.over_steps:
         total = sum_step_threads(total)

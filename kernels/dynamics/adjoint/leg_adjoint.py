@@ -1,4 +1,4 @@
-"""`step_adjoint` for GPUs: a thread a leg, the base's part made by each of the four, in three parts.
+"""`step_adjoint` for GPUs, with a thread per leg; each of a world's four computes the base's part. In three parts.
 
 What depends on the motion alone is made for many steps side by side (`replay_leg`), the inverse of the system of
 the contact laws' multipliers too. Only what must go from step to step backwards does so (`reverse_leg`). It leaves the
@@ -55,29 +55,29 @@ from .leg_record import (
     put_solve,
     put_vec,
 )
-from .virtual_power import BaseFactors, add, rotation_adjoint_scalar
+from .virtual_power import BaseFactors, LegFactors, add, rotation_adjoint_scalar
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
 
 
 @wp.struct
 class LegAdjoint:
-    """Gradient by the state of a world as a leg's thread holds it, and what a step adds for its motors and the base."""
+    """Gradient by a world's state and inputs as a leg's thread holds it; axes and order as those of the value."""
 
-    base: BaseState
-    angles: vec3
+    base: BaseState  # by the base's state at the start of the step, as the next two
+    angles: vec3  # by the motors' angles: lateral, outer, inner
     rates: vec3
     torque: vec3  # by the motors' torques in the step
-    force: vec3  # by the wrench on the base, summed over steps as what follows
+    force: vec3  # by the wrench on the base at its com, world axes; summed over steps as are the next four
     moment: vec3
-    body: MassMoments  # by the base link's
+    body: MassMoments  # by the base link's mass moments
     com: vec3  # by the base's centre of mass
-    gravity: vec3
+    gravity: vec3  # by gravity, world axes
 
 
 @wp.func
 def leg_law(c: PawContact, law: PawLaw, impulse: vec3, point: vec3) -> LegLaw:
-    """Return what is recorded of a paw's law; impulse [N s], point [m]: body axes."""
+    """Return the part of a paw's law that is recorded; impulse [N s], point [m] of contact: body axes."""
     recorded = LegLaw()
     recorded.mode = law.mode
     recorded.mu_row = law.mu_row
@@ -96,7 +96,11 @@ def replay_leg(
     model: RobotModel, params: LegParams, dt: real, world: int, leg: int, force: vec3, moment: vec3,
     first_impulse: wp.array2d(dtype=vec3), trajectory: TrajectoryArrays, step: int, i: int, record: LegRecord,
 ):  # fmt: skip
-    """Make a step again from entry i of the record; see `replay_step`. All threads write the base, the same bits."""
+    """Recompute a step of the rollout from entry i of the record, and write the state at its end to entry i + 1.
+
+    To entry i go the inverse of the base's system, the leg's elimination, and its paw's law. force [N], moment [N m]:
+    on the base at its com, world axes. Every thread of a world writes the base, with the same bits; see `replay_step`.
+    """
     base = get_base(record, i, world)
     rates = get_vec(record, i, RATES, world, leg)
     angles = get_vec(record, i, ANGLES, world, leg)
@@ -157,7 +161,7 @@ def any_leg(flag: bool) -> bool:
 
 @wp.func
 def law_block(c: PawContact, law: PawLaw, of: PawContact, of_law: PawLaw, leg: int, j: int) -> mat33:
-    """Return block (leg, j) of the system of the laws' multipliers; `of`, `of_law`: paw j, sent by its thread."""
+    """Return block (leg, j) of the system of the laws' multipliers; `of`, `of_law`: own paw, which thread j sends."""
     to_lin = mat_from_leg(of.to_lin * wp.transpose(of_law.by_velocity), j)
     to_ang = mat_from_leg(of.to_ang * wp.transpose(of_law.by_velocity), j)
     if law.mode == SEPARATE:
@@ -211,7 +215,7 @@ def inverted_laws(c: PawContact, law: PawLaw, leg: int) -> LawRow:
 
 @wp.func
 def multiplier(row: LawRow, impulse_cotangent: vec3) -> vec3:
-    """Return the multiplier of a paw's law for the gradients by all paws' impulses; seed: 0 where separated."""
+    """Return the multiplier of a paw's law, given each paw's gradient by its impulse, 0 where it is separated."""
     total = row.a * vec_from_leg(impulse_cotangent, 0) + row.b * vec_from_leg(impulse_cotangent, 1)
     return -(total + row.c * vec_from_leg(impulse_cotangent, 2) + row.d * vec_from_leg(impulse_cotangent, 3))
 
@@ -225,33 +229,29 @@ def base_factors(
 
 
 @wp.func
-def leg_gradient(
-    model: RobotModel, params: LegParams, dt: real, world: int, leg: int, trajectory: TrajectoryArrays,
-    cotangent: TrajectoryArrays, step: int, i: int, record: LegRecord, base: BaseState, law: LegLaw,
-    base_held: BaseFactors, weights: LegWeights,
-) -> LegGradient:  # fmt: skip
-    """Return the gradient of `leg_action` in the step of the rollout whose entry in the record is i."""
-    rates = get_vec(record, i, RATES, world, leg)
+def leg_factors(
+    record: LegRecord, trajectory: TrajectoryArrays, cotangent: TrajectoryArrays, world: int, step: int, i: int,
+    leg: int, dt: real, law: LegLaw, weights: LegWeights,
+) -> LegFactors:  # fmt: skip
+    """Return a leg's constants in the step of the rollout whose entry in the record is i."""
     push = vec3(real(0.0))
     if cotangent.impulse.shape[0] > 0:
         push = cotangent.impulse[step, leg, world]
-    leg_held = make_leg_factors(
-        rates, get_vec(record, i + 1, RATES, world, leg), weights.rates, law.mode,
+    return make_leg_factors(
+        get_vec(record, i, RATES, world, leg), get_vec(record, i + 1, RATES, world, leg), weights.rates, law.mode,
         int(trajectory.pressed[step, leg, world]), law.impulse, weights.law, push, dt,
     )  # fmt: skip
-    angles = get_vec(record, i, ANGLES, world, leg)
-    return leg_action_gradient(model, params, world, leg, law.mu, base, angles, rates, base_held, leg_held, dt)
 
 
 @wp.struct
 class StepWeights:
-    """What a step's equations are weighed with, and the gradients by the velocities at its start that this leaves."""
+    """Multipliers of a step's equations, and the gradients by the velocities at its start that they leave."""
 
     base: BaseWeights
     leg: LegWeights
-    lin: vec3
-    ang: vec3
-    rates: vec3
+    lin: vec3  # by the base's linear velocity, body axes
+    ang: vec3  # by its angular velocity
+    rates: vec3  # by the motors' rates
 
 
 @wp.func
@@ -259,7 +259,10 @@ def find_weights(
     record: LegRecord, world: int, leg: int, cotangent: TrajectoryArrays, step: int, i: int, base: BaseState,
     law: LegLaw, lin_cotangent: vec3, ang_cotangent: vec3, rate_cotangent: vec3,
 ) -> StepWeights:  # fmt: skip
-    """Return the multipliers of a step for the gradients by the velocities at its end; see `find_multipliers`."""
+    """Return the multipliers of a step, given the gradients by the velocities at its end; see `find_multipliers`.
+
+    lin_, ang_, rate_cotangent: by the base's velocities in the body axes of the step's start, and the motors' rates.
+    """
     inverse = get_inverse(record, i, world)
     solve = get_solve(record, i, world, leg)
     weights = StepWeights()
@@ -302,7 +305,7 @@ def reverse_leg(
     trajectory: TrajectoryArrays, cotangent: TrajectoryArrays, step: int, i: int, record: LegRecord, adj: LegAdjoint,
     writes_record: bool,
 ) -> LegAdjoint:  # fmt: skip
-    """Return the gradient by the state at the start of a step for `adj`, that by the state at its end; see `reverse_step`.
+    """Return the gradient by the state at the start of a step from `adj`, that at its end; see `reverse_step`.
 
     i: the step's entry in the record, `step`: its number in the rollout. force [N], moment [N m]: on the base at its
     com, world axes. writes_record: whether this thread writes the step's multipliers to the record.
@@ -320,9 +323,11 @@ def reverse_leg(
     base_weights = weights.base
     # the equations of motion
     base_held = base_factors(record, world, i, dt, base, base_weights)
-    gradient = leg_gradient(
-        model, params, dt, world, leg, trajectory, cotangent, step, i, record, base, law, base_held, weights.leg
-    )
+    leg_held = leg_factors(record, trajectory, cotangent, world, step, i, leg, dt, law, weights.leg)
+    gradient = leg_action_gradient(
+        model, params, world, leg, law.mu, base, get_vec(record, i, ANGLES, world, leg),
+        get_vec(record, i, RATES, world, leg), base_held, leg_held, dt,
+    )  # fmt: skip
     base_weights.cotangent.velocity = weights.lin
     base_weights.cotangent.new_velocity = new_velocity
     base_weights.cotangent.gravity = sum_vec(gradient.gravity)

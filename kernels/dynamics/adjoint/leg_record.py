@@ -1,4 +1,4 @@
-"""What the reverse pass keeps of some steps where a thread has a leg: by fields, so that a warp reads neighbours."""
+"""Record of a few steps for the reverse pass with a thread per leg, world and leg last for coalesced access."""
 
 import warp as wp
 
@@ -42,27 +42,27 @@ class LegRecord:
 
 @wp.struct
 class BaseWeights:
-    """What the base's equations of motion in a step are weighed with, body axes."""
+    """Multipliers of the base's equations of motion in a step, body axes."""
 
-    lin: vec3  # virtual velocity
-    ang: vec3
+    lin: vec3  # virtual velocity, see `virtual_power`
+    ang: vec3  # virtual angular velocity
     cotangent: BaseCotangent
 
 
 @wp.struct
 class LegWeights:
-    """What a leg's equations of motion and its paw's law are weighed with."""
+    """Multipliers of a leg's equations of motion and of its paw's contact law."""
 
     rates: vec3  # virtual rates of the motors
-    law: vec3
+    law: vec3  # multiplier of the contact law, body axes
 
 
 @wp.struct
 class MotorSlopes:
-    """Derivatives of the torques of a leg's motors, one by one."""
+    """Derivatives of the torque of each of a leg's motors (lateral, outer, inner), no cross terms."""
 
     target: vec3  # [N m/rad]
-    angle: vec3
+    angle: vec3  # [N m/rad]
     rate: vec3  # [N m s/rad]
 
 
@@ -72,18 +72,18 @@ class LegLaw:
 
     mode: int  # SEPARATE, STICK or SLIDE
     mu_row: int  # row of the friction coefficient in the parameter table
-    mu: real
+    mu: real  # friction coefficient
     impulse: vec3  # [N s], body axes
     point: vec3  # [m] where the paw touches, body axes, from the base's origin
     jacobian: mat33  # contact velocity per motor rate [m/rad]
-    to_lin: mat33  # base twist per impulse
-    to_ang: mat33
-    by_velocity: mat33  # the law's derivative
+    to_lin: mat33  # change of the base's linear velocity per impulse [1/kg]
+    to_ang: mat33  # change of its angular velocity per impulse [1/(kg m)]
+    by_velocity: mat33  # derivative of the law by the contact velocity, see `contact_laws.PawLaw`
 
 
 @wp.struct
 class LawRow:
-    """A paw's row of the inverse of the system of the laws' multipliers, a block for each paw."""
+    """A paw's row of the inverse of the system of the laws' multipliers, one 3x3 block per paw, in order of legs."""
 
     a: mat33
     b: mat33

@@ -1,4 +1,4 @@
-"""A step made again, and the multipliers of its equations of motion and contact laws; see `step_adjoint`."""
+"""A step recomputed, and the multipliers of its equations of motion and contact laws; see `step_adjoint`."""
 
 import warp as wp
 
@@ -22,48 +22,48 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.struct
 class StepRecord:
-    """What the reverse pass needs of the steps between two rows of a rollout, by world, step and leg."""
+    """Steps between two rows of a rollout, recomputed for the reverse pass; indices: world, step, leg."""
 
     base: wp.array2d(dtype=BaseState)  # (num_worlds, steps + 1)
     angles: wp.array3d(dtype=vec3)  # [rad], (num_worlds, steps + 1, 4)
     rates: wp.array3d(dtype=vec3)  # [rad/s], likewise
-    inverse: wp.array2d(dtype=BaseInverse)  # (num_worlds, steps)
-    legs: wp.array3d(dtype=LegSolve)  # (num_worlds, steps, 4)
-    paws: wp.array3d(dtype=PawKinematics)  # likewise
+    inverse: wp.array2d(dtype=BaseInverse)  # of the base's system, (num_worlds, steps)
+    legs: wp.array3d(dtype=LegSolve)  # `free` includes the paw's impulse, (num_worlds, steps, 4)
+    paws: wp.array3d(dtype=PawKinematics)  # (num_worlds, steps, 4)
 
 
 @wp.struct
 class ReplayedStep:
-    """A step that is made again and run backwards, and what acts on the base in it."""
+    """Indices of a step that is recomputed and run backwards, and the wrench on the base in it."""
 
     dt: real  # [s]
     world: int
     step: int  # of the rollout
     entry: int  # of the record
     force: vec3  # [N] at the base's com, world axes
-    moment: vec3  # [N m]
+    moment: vec3  # [N m], world axes
 
 
 @wp.struct
 class LegReverse:
-    """Gradients by a leg's motors in a step, and its multipliers."""
+    """Scratch of a leg in the reverse pass: gradients by its motors (lateral, outer, inner), multipliers, contact."""
 
     angles: vec3  # by the angles at the end of the step, then at its start
-    rates: vec3
-    torque: vec3  # by the torques
+    rates: vec3  # by the rates, likewise
+    torque: vec3  # by the torques in the step
     virtual_rates: vec3  # multipliers of the motors' equations
     contact: PawContact  # of its paw at the solution
-    law: PawLaw
+    law: PawLaw  # of its paw's contact
     multiplier: vec3  # of the paw's law; until `solve_laws` the gradient by its impulse
 
 
 @wp.struct
 class Multipliers:
-    """Gradients of the base's velocities at the end of a step, and what solving M for them gives; body axes."""
+    """Multipliers m of the base's equations in a step, and the gradients y in M m = y; body axes."""
 
-    lin_cotangent: vec3
-    ang_cotangent: vec3
-    lin: vec3
+    lin_cotangent: vec3  # y: by the base's linear velocity at the end of the step, contact laws included
+    ang_cotangent: vec3  # by its angular velocity
+    lin: vec3  # m
     ang: vec3
 
 
@@ -71,7 +71,7 @@ class Multipliers:
 def solve_system(
     record: StepRecord, at: ReplayedStep, lin_cotangent: vec3, ang_cotangent: vec3, legs: wp.array(dtype=LegReverse)
 ) -> Multipliers:
-    """Solve M m = seeds, for the motors those by their rates; their m is written to `virtual_rates`."""
+    """Solve M m = y; y: lin_cotangent, ang_cotangent, and each leg's `rates`. The motors' m goes to `virtual_rates`."""
     m = Multipliers()
     m.lin_cotangent = lin_cotangent
     m.ang_cotangent = ang_cotangent
@@ -95,7 +95,10 @@ def replay_step(
     model: RobotModel, params: wp.array(dtype=LegParams), at: ReplayedStep, trajectory: TrajectoryArrays,
     record: StepRecord,
 ):  # fmt: skip
-    """Make a step again from its entry of the record, with known torques and impulses; writes the record."""
+    """Recompute a step from its entry of the record, with the torques, impulses and pressed stops of the trajectory.
+
+    Writes to `record` the leg and base terms of the step (entry `at.entry`) and the state at its end (the next entry).
+    """
     dt, world, step, i = at.dt, at.world, at.step, at.entry
     base = record.base[world, i]
     g = wp.quat_rotate_inv(base.quat, load_vec3(model.table, GRAVITY, world))
@@ -209,7 +212,10 @@ def write_laws(
     model: RobotModel, at: ReplayedStep, first_impulse: wp.array2d(dtype=vec3), trajectory: TrajectoryArrays,
     record: StepRecord, m: Multipliers, cotangent: TrajectoryArrays, legs: wp.array(dtype=LegReverse),
 ) -> bool:  # fmt: skip
-    """Write the paws' laws at the solution, and the gradients by their impulses; returns whether any touches."""
+    """Write the paws' contacts and laws at the solution, and the gradients by their impulses, to `legs`.
+
+    Returns whether any paw touches. first_impulse: as `Commands.impulse`; cotangent: gradient by the trajectory.
+    """
     world, i = at.world, at.entry
     base = record.base[world, i]
     end = record.base[world, i + 1]
@@ -245,7 +251,7 @@ def write_laws(
 def add_laws(
     model: RobotModel, at: ReplayedStep, record: StepRecord, multipliers: Multipliers, legs: wp.array(dtype=LegReverse),
 ) -> Multipliers:  # fmt: skip
-    """Return the multipliers with the share of the contact laws, whose own are known; the legs' are replaced."""
+    """Return the multipliers with the contact laws' part added, from the laws' own in `legs`; updates the legs' too."""
     m = multipliers
     law_lin = vec3(real(0.0))
     law_ang = vec3(real(0.0))
@@ -274,9 +280,12 @@ def find_multipliers(
     cotangent: TrajectoryArrays, record: StepRecord, lin_cotangent: vec3, ang_cotangent: vec3,
     legs: wp.array(dtype=LegReverse),
 ) -> Multipliers:  # fmt: skip
-    """Return the multipliers of a step's equations for the gradients by the velocities at its end, body axes.
+    """Return the multipliers of a step's equations, given the gradients by the velocities at its end.
 
-    legs: `rates` are those of the motors; to them the share of the contact laws is added.
+    See `step_adjoint`.
+
+    lin_cotangent, ang_cotangent: by the base's, body axes. legs: `rates` are those by the motors' rates, to which the
+    contact laws' part is added; multipliers, contacts and laws are written.
     """
     m = solve_system(record, at, lin_cotangent, ang_cotangent, legs)
     if write_laws(model, at, first_impulse, trajectory, record, m, cotangent, legs):

@@ -1,7 +1,7 @@
-"""The reverse pass of a rollout, all its steps in a launch, a thread a world.
+"""The reverse pass of a rollout: all its steps in one launch, with one thread per world.
 
-From row to row, backwards: the steps between two rows are made again, with the impulses that the rollout found, and
-then run backwards one by one (`step_adjoint`, `virtual_power`).
+The rows are visited backwards: the steps between two rows are recomputed with the impulses of the rollout, then run
+backwards one by one (`step_adjoint`, `virtual_power`).
 """
 
 import warp as wp
@@ -47,7 +47,7 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.func
 def row_adjoint_scalar(pos: vec3, orientation: quat, com_lin: vec3, ang: vec3, com: vec3, cotangent: BaseState) -> real:
-    """Return the weighed state of the base that a row holds."""
+    """Return cotangent . (the base's state that a row holds, see `row_base`)."""
     base = row_base(pos, orientation, com_lin, ang, com)
     return (
         wp.dot(cotangent.pos, base.pos)
@@ -61,27 +61,30 @@ def row_adjoint_scalar(pos: vec3, orientation: quat, com_lin: vec3, ang: vec3, c
 def store_adjoint_scalar(
     orientation: quat, lin: vec3, omega: vec3, com: vec3, lin_cotangent: vec3, ang_cotangent: vec3
 ) -> real:
-    """Return the weighed velocities that a row holds of a state of the base."""
+    """Return the cotangents . (the velocities that a row stores of a base state, see `store_row_base`)."""
     ang = wp.quat_rotate(orientation, omega)
     return wp.dot(ang_cotangent, ang) + wp.dot(lin_cotangent, lin + wp.cross(ang, wp.quat_rotate(orientation, com)))
 
 
 @wp.struct
 class RowCotangent:
-    """Gradient by the base's entries of a row."""
+    """Gradient by the base's entries of a row, in their order and axes, see `TrajectoryArrays`."""
 
     pos: vec3
     quat: quat
-    lin: vec3
-    ang: vec3
-    com: vec3  # by the base's centre of mass, of all rows that were passed
+    lin: vec3  # by the com's velocity, world axes
+    ang: vec3  # by the angular velocity, world axes
+    com: vec3  # by the base's centre of mass, summed over rows
 
 
 @wp.func
 def load_row_base_adjoint(
     trajectory: TrajectoryArrays, model: RobotModel, row: int, world: int, adj: BaseState, later_com: vec3
 ) -> RowCotangent:
-    """Return the gradient by a row's entries for that by the base's state which is read from it."""
+    """Return the gradient by a row's entries from `adj`, that by the base's state read from it.
+
+    later_com: gradient by the base's centre of mass of the rows after it.
+    """
     com = base_com(model.table, world)
     pos, orientation, lin, ang, com_adj, _cotangent = wp.grad(row_adjoint_scalar)(
         row_vec3(trajectory.q, row, 0, world), row_quat(trajectory.q, row, 3, world),
@@ -98,7 +101,7 @@ def load_row_base_adjoint(
 
 @wp.func
 def add_row_cotangent(into: RowCotangent, cotangent: TrajectoryArrays, row: int, world: int) -> RowCotangent:
-    """Return the gradient by a row's entries with that of the number itself added."""
+    """Return the gradient by a row's base entries, `into` plus the direct one in `cotangent`."""
     s = into
     if cotangent.q.shape[0] > 0:
         s.pos += row_vec3(cotangent.q, row, 0, world)
@@ -111,15 +114,15 @@ def add_row_cotangent(into: RowCotangent, cotangent: TrajectoryArrays, row: int,
 
 @wp.struct
 class RowBaseAdjoint:
-    """Gradient by the base's state which a row was written from."""
+    """Gradient by the base's state that a row was written from."""
 
     base: BaseState
-    com: vec3  # by the base's centre of mass, of all rows that were passed
+    com: vec3  # by the base's centre of mass, summed over rows
 
 
 @wp.func
 def store_row_base_adjoint(model: RobotModel, world: int, base: BaseState, cotangent: RowCotangent) -> RowBaseAdjoint:
-    """Return the gradient by the base's state which a row was written from, for that by the row's entries."""
+    """Return the gradient by the base's state that a row was written from, given that by the row's entries."""
     com = base_com(model.table, world)
     orientation, lin, ang, com_adj, _lin, _ang = wp.grad(store_adjoint_scalar)(
         base.quat, base.lin, base.ang, com, cotangent.lin, cotangent.ang
@@ -135,7 +138,7 @@ def store_row_base_adjoint(model: RobotModel, world: int, base: BaseState, cotan
 
 @wp.func
 def add_motor_rows(legs: wp.array(dtype=LegReverse), cotangent: TrajectoryArrays, row: int, world: int):
-    """Add the gradient of the number itself by a row's angles and rates."""
+    """Add the direct gradient by a row's angles and rates, in `cotangent`, to `legs`."""
     for k in range(legs.shape[0]):
         if cotangent.q.shape[0] > 0:
             legs[k].angles = legs[k].angles + row_vec3(cotangent.q, row, 7 + 3 * k, world)
@@ -160,7 +163,7 @@ def load_parts(
 
 @wp.func
 def replayed_step(commands: Commands, t: int, dt: real, world: int) -> ReplayedStep:
-    """Return the place of the steps in a policy step, with the wrench on the base."""
+    """Return the constants of the steps of policy step t; `step` and `entry` are to be set."""
     at = ReplayedStep()
     at.dt = dt
     at.world = world
@@ -174,7 +177,7 @@ def replay_row(
     model: RobotModel, params: wp.array(dtype=LegParams), policy_step: ReplayedStep, trajectory: TrajectoryArrays,
     row: int, every: int, com: vec3, record: StepRecord,
 ):  # fmt: skip
-    """Make the steps from a row to the next one again."""
+    """Recompute the `every` steps after a row into the record."""
     at = policy_step
     record.base[at.world, 0] = load_row_base(trajectory, row, at.world, com)
     for k in range(record.angles.shape[2]):
@@ -198,7 +201,7 @@ def add_motor_adjoint(
     by_motor: MotorAdjoint, arrived: Arrival, at: ReplayedStep, motor: int, cotangent: TrajectoryArrays,
     gradients: Gradients, legs: wp.array(dtype=LegReverse), sums: wp.array(dtype=real),
 ):  # fmt: skip
-    """Add the gradients by what a motor's torque in a step depends on."""
+    """Add the gradients by the inputs of a motor's torque in a step: targets, constants, angle and rate."""
     k = motor / 3
     c = motor - 3 * k
     torque_cotangent = legs[k].torque[c]
@@ -219,7 +222,7 @@ def add_filter_adjoint(
     by_motor: FilterAdjoint, t: int, k: int, world: int, gradients: Gradients, legs: wp.array(dtype=LegReverse),
     sums: wp.array(dtype=real),
 ):  # fmt: skip
-    """Add the gradients by what a leg's filtered targets of a policy step depend on."""
+    """Add the gradients by the inputs of a leg's filter in policy step t: raw targets, constants, angles and rates."""
     store_row_vec3(gradients.target, t, 3 * k, world, by_motor.target)
     add_offsets(sums, k, by_motor.angles)
     add_filter(sums, by_motor.constants)
@@ -290,17 +293,8 @@ def reverse_kernel(
             at.entry = timing.every - 1 - j
             at.step = row * timing.every + at.entry
             by_step = reverse_step(
-                model,
-                params,
-                at,
-                commands.impulse,
-                trajectory,
-                cotangent,
-                record,
-                adj,
-                legs,
-                sums,
-            )
+                model, params, at, commands.impulse, trajectory, cotangent, record, adj, legs, sums,
+            )  # fmt: skip
             adj = by_step.base
             add_wrench(gradients, t, world, by_step.force, by_step.moment)
             arrived = arrival(at.step, timing.substeps, delay)
@@ -330,7 +324,7 @@ def adjoint_roots(
     factors: LegFactors, base: BaseFactors, base_cotangent: BaseCotangent, model: RobotModel, actuation: Actuation,
     trajectory: TrajectoryArrays, state: BaseState, world: int,
 ) -> real:  # fmt: skip
-    """Return the sum of all functions whose gradients the reverse pass takes; see `generate_adjoints`."""
+    """Return the sum of all functions that the reverse pass differentiates; see `generate_adjoints`."""
     params = load_leg(model, world, 0)
     v = row_vec3(trajectory.q, 0, 0, world)
     q = row_quat(trajectory.q, 0, 3, world)

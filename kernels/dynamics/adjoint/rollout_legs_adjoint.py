@@ -1,7 +1,7 @@
-"""`rollout_adjoint` for GPUs: four threads a world, a thread a leg; a few rows at a time, from the last to the first.
+"""`rollout_adjoint` for GPUs, with four threads per world, one per leg; a span of rows at a time, last to first.
 
-Four launches take the steps between these rows: they are made again, each row by threads of its own, run backwards one
-by one, and then twice more side by side for the gradients by parameters (`constants_adjoint`).
+Each span takes four launches: its steps are recomputed, all rows in parallel; run backwards one by one; and then twice
+visited in parallel for the gradients by parameters (`constants_adjoint`).
 """
 
 import warp as wp
@@ -54,15 +54,15 @@ wp.set_module_options({"enable_backward": False, "fast_math": True})
 
 @wp.struct
 class Span:
-    """The rows whose steps a launch takes."""
+    """Range of rows whose steps a launch takes."""
 
-    begin: int
+    begin: int  # first row
     end: int  # excluded
 
 
 @wp.func
 def first_entry(timing: Timing, span: Span, row: int) -> int:
-    """Return the record's entry of the first step after a row; that of its end follows the last one."""
+    """Return the record's entry of the first step after a row; each row has `every` + 1, the last for its end."""
     return (row - span.begin) * (timing.every + 1)
 
 
@@ -81,7 +81,7 @@ def replay_legs_kernel(
     # out
     record: LegRecord,
 ):
-    """Make the steps after each row again; launch over (rows of the span, count rounded up to a multiple of 8, 4).
+    """Recompute the steps after each row; launch over (rows of the span, count rounded up to a multiple of 8, 4).
 
     Threads beyond the last world repeat it, and write the same bits.
     """
@@ -105,37 +105,18 @@ def replay_legs_kernel(
     for i in range(timing.every):
         step = first + i
         replay_leg(
-            model,
-            params,
-            settings.dt,
-            world,
-            leg,
-            force,
-            moment,
-            commands.impulse,
-            trajectory,
-            step,
-            start_entry + i,
+            model, params, settings.dt, world, leg, force, moment, commands.impulse, trajectory, step, start_entry + i,
             record,
-        )
+        )  # fmt: skip
         sync_lanes()
         angles = get_vec(record, start_entry + i, ANGLES, world, leg)
         rates = get_vec(record, start_entry + i, RATES, world, leg)
         slopes = MotorSlopes()
         for c in range(motors.shape[0]):
             by_motor = motor_gradient(
-                motors[c],
-                delay,
-                commands,
-                filtered_target,
-                timing,
-                settings.dt,
-                step,
-                3 * leg + c,
-                world,
-                angles[c],
+                motors[c], delay, commands, filtered_target, timing, settings.dt, step, 3 * leg + c, world, angles[c],
                 rates[c],
-            )
+            )  # fmt: skip
             slopes.target[c] = by_motor.target
             slopes.angle[c] = by_motor.angle
             slopes.rate[c] = by_motor.rate
@@ -183,7 +164,7 @@ def reverse_motors(
     old: LegAdjoint, slopes: MotorSlopes, arrived: Arrival, cotangent: TrajectoryArrays, step: int, leg: int,
     world: int, gradients: Gradients, writes: bool,
 ) -> LegAdjoint:  # fmt: skip
-    """Return the gradient with that by the motors' angles and rates; if it `writes`, add those by their targets."""
+    """Return the gradient with that by the motors' angles and rates; if it `writes`, add that by their targets."""
     adj = old
     torque_cotangent = adj.torque
     if cotangent.torque.shape[0] > 0:
@@ -243,21 +224,9 @@ def reverse_legs_kernel(
             i = timing.every - 1 - j
             step = first + i
             adj = reverse_leg(
-                model,
-                params,
-                dt,
-                world,
-                leg,
-                force,
-                moment,
-                trajectory,
-                cotangent,
-                step,
-                start_entry + i,
-                record,
-                adj,
+                model, params, dt, world, leg, force, moment, trajectory, cotangent, step, start_entry + i, record, adj,
                 index < count,
-            )
+            )  # fmt: skip
             arrived = arrival(step, timing.substeps, delay)
             slopes = get_slopes(record, start_entry + i, world, leg)
             adj = reverse_motors(adj, slopes, arrived, cotangent, step, leg, world, gradients, index < count)

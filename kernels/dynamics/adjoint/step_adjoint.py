@@ -28,7 +28,7 @@ from .gradients import (
     add_vec3,
 )
 from .multipliers import LegReverse, ReplayedStep, StepRecord, base_factors, find_multipliers, leg_factors
-from .virtual_power import BaseCotangent, BaseFactors, LegFactors, rotation_adjoint_scalar
+from .virtual_power import BaseCotangent, rotation_adjoint_scalar
 
 wp.set_module_options({"enable_backward": False})
 
@@ -37,33 +37,22 @@ wp.set_module_options({"enable_backward": False})
 class StepAdjoint:
     """Gradient by the base's state at the start of a step, and by the wrench on it."""
 
-    base: BaseState
-    force: vec3
+    base: BaseState  # axes as those of the state
+    force: vec3  # by the force at the com, world axes
     moment: vec3
 
 
 @wp.func
-def reverse_leg_equations(
-    model: RobotModel, params: LegParams, at: ReplayedStep, k: int, record: StepRecord, base_held: BaseFactors,
-    leg_held: LegFactors, legs: wp.array(dtype=LegReverse), sums: wp.array(dtype=real),
-) -> LegGradient:  # fmt: skip
-    """Return the gradient of a leg's equations; adds that by its motors to `legs`, that by its parameters to `sums`."""
-    world, i = at.world, at.entry
-    law = legs[k].law
-    mu = real(0.0)
-    if law.mode != SEPARATE:
-        mu = law.mu
-    gradient = leg_action_gradient(
-        model, params, world, k, mu, record.base[world, i], record.angles[world, i, k], record.rates[world, i, k],
-        base_held, leg_held, at.dt,
-    )  # fmt: skip
+def add_leg_gradient(
+    gradient: LegGradient, k: int, dt: real, legs: wp.array(dtype=LegReverse), sums: wp.array(dtype=real)
+):
+    """Add a leg's gradient by its motors to `legs`, by its parameters to `sums`, and write that by its torques."""
     add_leg_parameters(sums, k, gradient)
-    if law.mode != SEPARATE:
-        add_entry(sums, law.mu_row, gradient.mu)
+    if legs[k].law.mode != SEPARATE:
+        add_entry(sums, legs[k].law.mu_row, gradient.mu)
     legs[k].angles = legs[k].angles + gradient.angles
     legs[k].rates = legs[k].rates + gradient.rates
-    legs[k].torque = at.dt * legs[k].virtual_rates
-    return gradient
+    legs[k].torque = dt * legs[k].virtual_rates
 
 
 @wp.func
@@ -100,7 +89,12 @@ def reverse_step(
     g_adj = vec3(real(0.0))
     for k in range(legs.shape[0]):
         leg_held = leg_factors(at, k, trajectory, cotangent, record, legs)
-        gradient = reverse_leg_equations(model, params[k], at, k, record, base_held, leg_held, legs, sums)
+        mu = wp.where(legs[k].law.mode != SEPARATE, legs[k].law.mu, real(0.0))
+        gradient = leg_action_gradient(
+            model, params[k], world, k, mu, base, record.angles[world, at.entry, k], record.rates[world, at.entry, k],
+            base_held, leg_held, dt,
+        )  # fmt: skip
+        add_leg_gradient(gradient, k, dt, legs, sums)
         out.base.pos += gradient.pos
         out.base.quat += gradient.quat
         out.base.ang += gradient.omega

@@ -93,7 +93,7 @@ def power_kernel(
     # out
     power: wp.array2d(dtype=real),
 ):
-    """Weigh the equations of motion, (4, num_worlds), those of the base with leg 0's; one thread per (leg, world)."""
+    """Write the virtual power of each leg (4, num_worlds), the base's with leg 0's; one thread per (leg, world)."""
     k, world = wp.tid()
     com = base_com(model.table, world)
     base = load_base(joint_q, joint_qd, com, world)
@@ -152,7 +152,7 @@ def adj_end_velocities(
     joint_f: wp.array(dtype=real), body_f: wp.array(dtype=wp.spatial_vector), solved: SolvedStep, record: StepRecord,
     power: wp.array2d(dtype=real), world: int, adj_ret: EndVelocities,
 ):  # fmt: skip
-    """Write what `power_kernel` weighs the equations of motion with, and set its gradient to 1."""
+    """Write the multipliers that `power_kernel` reads to `solved`, and set the gradient by its `power` to 1."""
     params = wp.zeros(shape=(4,), dtype=LegParams)
     legs = wp.zeros(shape=(4,), dtype=LegReverse)
     wrench = base_wrench(joint_f, body_f, world)
@@ -169,16 +169,8 @@ def adj_end_velocities(
         legs[k].rates = vec3(adj_ret.rates[k, 0], adj_ret.rates[k, 1], adj_ret.rates[k, 2])
     replay_step(model, params, at, solved.trajectory, record)
     m = find_multipliers(
-        model,
-        at,
-        solved.old_impulse,
-        solved.trajectory,
-        TrajectoryArrays(),
-        record,
-        adj_ret.lin,
-        adj_ret.ang,
-        legs,
-    )
+        model, at, solved.old_impulse, solved.trajectory, TrajectoryArrays(), record, adj_ret.lin, adj_ret.ang, legs,
+    )  # fmt: skip
     cotangent = BaseCotangent()
     cotangent.velocity = m.lin_cotangent
     solved.base[world] = base_factors(at, record, m)

@@ -1,4 +1,4 @@
-"""`advance` for GPUs: four threads a world, a thread a leg, which exchange what the base and the contacts need.
+"""`advance` for GPUs: four threads per world, one per leg, which exchange sums for the base and the contacts.
 
 A thread holds one leg and a copy of the base; the base's equations are sums over the four threads. The contact law is
 that of `contact`; here all paws propose their next impulse at once, until none would change its contact velocity by
@@ -54,7 +54,7 @@ wp.set_module_options({"enable_backward": False, "fast_math": True})
 
 @wp.struct
 class LegState:
-    """What a thread carries from step to step."""
+    """State of a thread between steps: a leg, and a copy of the base."""
 
     base: BaseState
     angles: vec3  # [rad] of its leg's motors
@@ -67,24 +67,27 @@ class LegState:
     rounds: int  # of the contact iteration, most of a step
     step: int  # steps made in this launch
     sets: int  # sets of pressed stops tried for the present step without agreement
-    pressed: int  # the leg's next one
+    pressed: int  # the leg's set in the next attempt
     used: int  # the leg's set of pressed stops in the last step
 
 
 @wp.struct
 class PawSolution:
-    """The contact problem's solution as one paw sees it."""
+    """The contact problem's solution: one paw's impulse, and the base's change of velocity."""
 
     impulse: vec3  # [N s] on the paw, body axes
     lin: vec3  # change of the base's linear velocity [m/s]
     ang: vec3  # change of its angular velocity [rad/s]
-    residual: real  # [m/s]
-    rounds: int
+    residual: real  # [m/s] largest change of a contact velocity in the last round
+    rounds: int  # of the iteration
 
 
 @wp.func
 def solve_paws(c: PawContact, blocks: bool, block: BlockLaw, leg: int, max_rounds: int, tolerance: real) -> PawSolution:
-    """Solve the contact problem; `blocks`: whether any world has a block."""
+    """Solve the contact problem by simultaneous proposals of all paws, see the module; body axes.
+
+    blocks: whether any world has a block. leg: this thread's. tolerance [m/s].
+    """
     s = PawSolution()
     s.impulse = c.impulse
     s.lin = sum_vec(c.to_lin * c.impulse)
@@ -125,15 +128,15 @@ def solve_paws(c: PawContact, blocks: bool, block: BlockLaw, leg: int, max_round
 
 @wp.struct
 class StopAttempt:
-    """The set of pressed stops that a leg tries in a step."""
+    """The set of pressed stops that a leg tries in a step, see `stops`."""
 
-    stop_rates: StopRates
+    stop_rates: StopRates  # zero where no stop is near
     pressed: int
 
 
 @wp.func
 def stop_attempt(model: RobotModel, world: int, leg: int, old: LegState, dt: real) -> StopAttempt:
-    """Return the leg's stops for the present try."""
+    """Return the leg's stops for the present attempt at a step of dt [s]."""
     attempt = StopAttempt()
     attempt.pressed = old.pressed
     if attempt.pressed != 0 or old.sets == 0:
@@ -149,7 +152,7 @@ def stop_attempt(model: RobotModel, world: int, leg: int, old: LegState, dt: rea
 def required_stops(
     model: RobotModel, settings: StepSettings, world: int, leg: int, angles: vec3, rates: vec3, pressed: int, sets: int
 ) -> int:
-    """Return the set that the rates at the end of the step ask for; loads limits again, which would fill registers."""
+    """Return the set required by `rates` [rad/s] at the end of the step; reloads the limits, to save registers."""
     limits = load_stops(model.table, leg, world)
     required = int(0)
     if pressed != 0 or beyond_stops(limits, angles + settings.dt * rates):
@@ -183,7 +186,7 @@ def completed_step(
 
 @wp.func
 def next_attempt(old: LegState, pressed: int, required: int, changes: bool) -> LegState:
-    """Return the state with the next set to try for the same step; chosen: this leg's changes where only one may."""
+    """Return the state with the next set to try for the same step; changes: this leg changes, if only one may."""
     new = old
     new.sets = old.sets + 1
     new.pressed = pressed
@@ -201,7 +204,8 @@ def advance_leg(
 ) -> LegState:  # fmt: skip
     """Return the thread's state after a step, or the old one with another set of stops to try for the same step.
 
-    writes: whether the thread is the one that moves its world's block. A world that has made its steps stays.
+    A world that has made all its steps keeps its state. params, motors: of this thread's leg. writes: whether this
+    thread moves its world's block.
     """
     dt = settings.dt
     blocks = model.ground.blocks.shape[0] > 0

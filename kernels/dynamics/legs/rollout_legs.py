@@ -1,4 +1,4 @@
-"""`rollout` for GPUs: four threads a world, a thread a leg."""
+"""`rollout` for GPUs: four threads per world, one per leg."""
 
 import warp as wp
 

@@ -1,6 +1,6 @@
-"""Rollouts: policy steps of command filter, latency, motors and physics, several in a launch, a thread a world.
+"""Rollouts: policy steps of command filter, latency, motors and physics in one launch, with one thread per world.
 
-A rollout has T policy steps of S physics steps. It keeps what the reverse pass starts from: a row of the state every
+A rollout has T policy steps of S physics steps. It records what the reverse pass needs: a row of the state every
 `every` physics steps, and each paw's impulse in each of them.
 """
 
@@ -48,8 +48,8 @@ def rollout_kernel(
 ):
     """Run a rollout from the state in row 0; one thread per world.
 
-    settings.substeps is 1; drive.joint_f and drive.wrench are overwritten. safe [rad], (T, 12, num_worlds): filtered
-    targets.
+    settings.substeps is 1; drive.joint_f and drive.wrench are overwritten. filtered_target [rad]: (T, 12,
+    num_worlds).
     """
     world = settings.first + wp.tid()
     com = base_com(model.table, world)

@@ -1,4 +1,4 @@
-"""The velocities at the end of a step of one world: legs eliminated, contacts and hard stops settled together."""
+"""The velocities at the end of a step of one world: legs eliminated, contacts and hard stops solved together."""
 
 import warp as wp
 
@@ -41,11 +41,11 @@ class LegStep:
 
 @wp.struct
 class StepSolution:
-    """Velocities of the base at the end of a step, in the body axes of its start, and how contact came to them."""
+    """Velocities of the base at the end of a step, in the body axes of its start, and statistics."""
 
     lin: vec3  # [m/s]
     ang: vec3  # [rad/s]
-    contact: ContactState
+    contact: ContactState  # of the last solution
     sets: int  # of pressed stops that were tried
 
 
@@ -62,17 +62,9 @@ def solve_with_stops(
         params = load_leg(model, world, k)
         spring = load_spring(model.table, k, world)
         terms = leg_terms(
-            params,
-            spring,
-            legs[k].angles,
-            legs[k].rates,
-            legs[k].torque,
-            legs[k].stop_rates,
-            legs[k].pressed,
-            base.ang,
-            g,
-            dt,
-        )
+            params, spring, legs[k].angles, legs[k].rates, legs[k].torque, legs[k].stop_rates, legs[k].pressed,
+            base.ang, g, dt,
+        )  # fmt: skip
         legs[k].solve = terms.solve
         legs[k].paw = terms.paw
         system = add_leg(system, terms.dynamics, terms.solve)
@@ -102,7 +94,7 @@ def solve_with_stops(
 
 @wp.func
 def revise_stops(legs: wp.array(dtype=LegStep), slack: real, sets: int) -> bool:
-    """Change the sets of pressed stops to what the rates that they led to ask for; returns whether they changed."""
+    """Replace each leg's set of pressed stops by the one its new rates require; returns whether any changed."""
     changed = bool(False)
     for k in range(legs.shape[0]):
         pressed = legs[k].pressed
