@@ -135,8 +135,8 @@ def add_thigh(
 ) -> LinkSums:
     """Return a shank's sums with those of the thigh above it.
 
-    The thigh turns about its transversal axis, at x and y `axis` [m], z = 0, by `sign` (-1 or +1) per its motor's angle,
-    at `rate` [rad/s]; cosine, sine: of that angle about y.
+    The thigh turns about its transversal axis, at x and y `axis` [m], z = 0, by `sign` (-1 or +1) times its motor's
+    angle, at `rate` [rad/s]; cosine, sine: of that angle about y.
     """
     u = rotate_y(link.first, cosine, sine)
     s = rotate_y_second(link.second, cosine, sine)

@@ -231,28 +231,22 @@ def add_filter_adjoint(
 
 
 @wp.func
-def store_start(
-    gradients: Gradients,
-    world: int,
-    entries: RowCotangent,
-    legs: wp.array(dtype=LegReverse),
-    sums: wp.array(dtype=real),
-):
-    """Write the gradients by the first row and by the parameters."""
-    for i in range(sums.shape[0]):
-        gradients.parameters[i, world] = sums[i]
+def store_base_entries(gradients: Gradients, world: int, entries: RowCotangent):
+    """Write the gradient by a row's base entries."""
     for i in range(3):
         gradients.q[i, world] = entries.pos[i]
         gradients.qd[i, world] = entries.lin[i]
         gradients.qd[3 + i, world] = entries.ang[i]
     for i in range(4):
         gradients.q[3 + i, world] = entries.quat[i]
-    for k in range(legs.shape[0]):
-        angles = legs[k].angles
-        rates = legs[k].rates
-        for i in range(3):
-            gradients.q[7 + 3 * k + i, world] = angles[i]
-            gradients.qd[6 + 3 * k + i, world] = rates[i]
+
+
+@wp.func
+def store_motor_entries(gradients: Gradients, world: int, leg: int, angles: vec3, rates: vec3):
+    """Write the gradient by a row's entries of one leg: angles and rates of its motors."""
+    for i in range(3):
+        gradients.q[7 + 3 * leg + i, world] = angles[i]
+        gradients.qd[6 + 3 * leg + i, world] = rates[i]
 
 
 @wp.kernel
@@ -316,7 +310,11 @@ def reverse_kernel(
                 add_filter_adjoint(by_filter, t, k, world, gradients, legs, sums)
         add_motor_rows(legs, cotangent, row, world)
     add_com(sums, model.table[BASE, world], com, entries.com)
-    store_start(gradients, world, entries, legs, sums)
+    for i in range(sums.shape[0]):
+        gradients.parameters[i, world] = sums[i]
+    store_base_entries(gradients, world, entries)
+    for k in range(legs.shape[0]):
+        store_motor_entries(gradients, world, k, legs[k].angles, legs[k].rates)
 
 
 @wp.func

@@ -46,6 +46,8 @@ from .rollout_adjoint import (
     add_wrench,
     generate_adjoints,
     load_row_base_adjoint,
+    store_base_entries,
+    store_motor_entries,
     store_row_base_adjoint,
 )
 
@@ -132,21 +134,6 @@ def load_entries(gradients: Gradients, world: int) -> RowCotangent:
     entries.lin = vec3(gradients.qd[0, world], gradients.qd[1, world], gradients.qd[2, world])
     entries.ang = vec3(gradients.qd[3, world], gradients.qd[4, world], gradients.qd[5, world])
     return entries
-
-
-@wp.func
-def store_entries(gradients: Gradients, world: int, leg: int, entries: RowCotangent, adj: LegAdjoint):
-    """Write the gradient by a span's first row; leg 0 writes the base's."""
-    for i in range(3):
-        gradients.q[7 + 3 * leg + i, world] = adj.angles[i]
-        gradients.qd[6 + 3 * leg + i, world] = adj.rates[i]
-        if leg == 0:
-            gradients.q[i, world] = entries.pos[i]
-            gradients.qd[i, world] = entries.lin[i]
-            gradients.qd[3 + i, world] = entries.ang[i]
-    if leg == 0:
-        for i in range(4):
-            gradients.q[3 + i, world] = entries.quat[i]
 
 
 @wp.func
@@ -252,8 +239,9 @@ def reverse_legs_kernel(
         if cotangent.qd.shape[0] > 0:
             adj.rates += row_vec3(cotangent.qd, row, 6 + 3 * leg, world)
     if index < count:
-        store_entries(gradients, world, leg, entries, adj)
+        store_motor_entries(gradients, world, leg, adj.angles, adj.rates)
         if leg == 0:
+            store_base_entries(gradients, world, entries)
             add_moments(leg_sums, BASE, adj.body)
             add_com(leg_sums, model.table[BASE, world], base_com(model.table, world), adj.com + entries.com)
             add_vec3(leg_sums, GRAVITY, adj.gravity)
