@@ -120,7 +120,7 @@ class Flights(EvaluationLog):
         forces = np.linalg.norm(env.sim.paw_force.numpy(), axis=2)
         return {"base_pos": q[:, :3].copy(), "tilt": np.arccos(np.clip(up, -1.0, 1.0)), "turn": np.abs(yaw_of(quat)),
                 "rise": qd[:, 2].copy(), "spin": np.linalg.norm(qd[:, 3:6], axis=1), "down": (forces > 0.1).any(axis=0),
-                "ending": env.worlds.ending.numpy().copy(), "momentum": momentum(env.sim)[1]}  # fmt: skip
+                "termination": env.episodes.termination.numpy().copy(), "momentum": momentum(env.sim)[1]}  # fmt: skip
 
     def follow(self, env: Any) -> bool:
         """Look at the environment after a policy step, and ask for a turn where a flight has begun."""
@@ -156,8 +156,8 @@ class Flights(EvaluationLog):
         self.height[running] = np.maximum(self.height, arrays["base_pos"][:, 2])[running]
         for kept, now in ((self.tilts, arrays["tilt"]), (self.heights, arrays["base_pos"][:, 2])):
             kept.append(np.where(running, now, kept[-1]) if kept else now)
-        fell = running & (arrays["ending"] >= 0)
-        self.end[fell] = arrays["ending"][fell]
+        fell = running & (arrays["termination"] >= 0)
+        self.end[fell] = arrays["termination"][fell]
         over = running & ~fell & (self._down >= 0) & (step - self._down >= round(AFTER / step_dt))
         good = np.degrees(arrays["tilt"]) < UPRIGHT
         self.end[over] = np.where(good[over], OUTCOMES.index("landed"), OUTCOMES.index("tilted"))

@@ -80,8 +80,8 @@ def learning_curve(
         wp.synchronize_device(device)
         start = time.perf_counter()
         until = min(trained + every, seconds)
-        while (spent := trained + time.perf_counter() - start) < until:
-            ppo.set_progress(spent / seconds)
+        while (steps_per_mode := trained + time.perf_counter() - start) < until:
+            ppo.set_progress(steps_per_mode / seconds)
             ppo.iterate()
             curve.iterations += 1
             wp.synchronize_device(device)

@@ -110,8 +110,8 @@ class Course(EvaluationLog):
         q, qd = env.sim.joint_q(), env.sim.joint_qd()
         seen = {
             "base_pos": q[:, :3].copy(), "base_quat": q[:, 3:7].copy(), "base_ang_vel": qd[:, 3:6].copy(),
-            "base_vel": env.sim.base_velocity(), "skill": env.worlds.skill.numpy().copy(),
-            "ending": env.worlds.ending.numpy().copy(),
+            "base_vel": env.sim.base_velocity(), "skill": env.episodes.skill.numpy().copy(),
+            "termination": env.episodes.termination.numpy().copy(),
             "force": np.linalg.norm(env.sim.paw_force.numpy(), axis=2).T,
         }  # fmt: skip
         rows = np.arange(len(q))
@@ -166,8 +166,8 @@ class Course(EvaluationLog):
         skill, was, step = arrays["skill"], self._skill, len(self.skills) + 1
         running = self.end < 0
         self._keep(arrays, running, was, step)
-        fell = running & (arrays["ending"] >= 0)
-        self.end[fell] = arrays["ending"][fell]
+        fell = running & (arrays["termination"] >= 0)
+        self.end[fell] = arrays["termination"][fell]
         row = np.flatnonzero(running & ~fell)
         at = (row, self.current[row])
         kind, since = self.target[at], step - self.began[at]

@@ -44,14 +44,14 @@ class Descent:
         """Decrease of the cost that the last steps promised when they ended, but did not bring."""
         self._begun = (time.perf_counter(), time.process_time(), replay.world_steps)
 
-    def spent(self) -> tuple[float, float, int]:
+    def steps_per_mode(self) -> tuple[float, float, int]:
         """Return wall time [s], CPU time [s] and physics steps of all worlds."""
         seconds, cpu, steps = self._begun
         return time.perf_counter() - seconds, time.process_time() - cpu, self.replay.world_steps - steps
 
     def note(self, problem: LeastSquares, trial: Trial) -> None:
         """Record a step."""
-        seconds, _, count = self.spent()
+        seconds, _, count = self.steps_per_mode()
         self.steps.append(Step(self.stage, trial.cost / problem.count, trial.damping, count, seconds))
 
     def steps_down(

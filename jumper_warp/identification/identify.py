@@ -122,13 +122,13 @@ def identify_by_evolution(
     search = cma.CMAEvolutionStrategy(point.z, FIRST_DEVIATION, options)
     starts = [np.repeat(start[None], population, axis=0) for start in point.starts]
     best, cost = point.z, np.inf
-    while descent.spent()[0] < max_seconds and not search.stop():
+    while descent.steps_per_mode()[0] < max_seconds and not search.stop():
         candidates = np.array(search.ask())
         costs = problem.costs(candidates, starts)
         search.tell(list(candidates), list(np.where(np.isfinite(costs), costs, 1.0e12)))
         if costs.min() < cost:
             best, cost = candidates[int(np.argmin(costs))], float(costs.min())
-        seconds, _, count = descent.spent()
+        seconds, _, count = descent.steps_per_mode()
         descent.steps.append(Step(0, cost / problem.count, 0.0, count, seconds))
     point = Point(np.clip(best, low, high), point.starts)
     return result(problem, point, problem.normal(point), descent)
@@ -165,7 +165,7 @@ def result(problem: LeastSquares, point: Point, normal: Normal, descent: Descent
     mismatch = mismatch_factor(tables)
     columns = [np.nonzero(motion.valid)[1] for motion in problem.motions]
     systematic = systematic_deviations(normal, columns, covariance) if mismatch > 1.0 else np.zeros(len(point.z))
-    seconds, cpu_seconds, world_steps = descent.spent()
+    seconds, cpu_seconds, world_steps = descent.steps_per_mode()
     return Identification(
         parameters=problem.parameters,
         z=point.z,

@@ -26,7 +26,7 @@ from jumper_warp.robot.description import RobotDescription
 from jumper_warp.robot.grounds import BlockCfg
 from jumper_warp.robot.model import other_colliders
 from jumper_warp.sim.dynamics import JumperDynamics
-from jumper_warp.sim.slices import Worlds
+from jumper_warp.sim.slices import WorldRange
 from jumper_warp.sim.tape import DifferentiableStep
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.newton_types import Control, Model, State
@@ -177,7 +177,7 @@ class SolverJumper(SolverBase):
         delay: wp.array | None = None,
         bodies: bool = True,
         observables: SolverBase.Observables | None = None,
-        worlds: Worlds | None = None,
+        worlds: WorldRange | None = None,
     ) -> None:
         """Advance every world by `substeps` steps of dt [s], the motors following targets, in one launch.
 
@@ -207,7 +207,7 @@ class SolverJumper(SolverBase):
         substeps: int,
         observables: SolverBase.Observables | None,
         bodies: bool,
-        worlds: Worlds | None = None,
+        worlds: WorldRange | None = None,
     ) -> None:
         check_step(dt, substeps)
         qdd = None
@@ -292,7 +292,7 @@ class SolverJumper(SolverBase):
             self.dynamics.pack_gravity()
 
     def reset(self, state: State, world_mask: wp.array | None = None, flags: StateFlags | int | None = None) -> None:
-        """Forget contact history and the invalid flag of the masked worlds, and put them in the reference pose.
+        """Zero contact history and the flag `diverged` of the masked worlds, and put them in the reference pose.
 
         Blocks return to their starts.
         With `flags=StateFlags.NONE` the state is left alone, for callers that write their own.

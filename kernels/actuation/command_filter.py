@@ -103,7 +103,7 @@ def command_filter_kernel(
 ):
     """Filter the motor targets of every leg. Launch over (4, worlds from `first` on).
 
-    raw_target, safe_target [rad]: (12, num_worlds). joint_q, joint_qd: flat over worlds, laid out as Newton's.
+    raw_target, filtered_target [rad]: (12, num_worlds). joint_q, joint_qd: flat over worlds, laid out as Newton's.
     offset [rad]: what each position sensor reads above the true angle, (12, num_worlds); the filter sees what it reads.
     """
     leg, world = wp.tid()

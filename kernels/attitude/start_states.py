@@ -1,4 +1,4 @@
-"""Start states of turning: afloat in any attitude, legs anywhere or in the default pose."""
+"""Start states of the attitude task: weightless, with a sampled spin, legs sampled or in the default pose."""
 
 import warp as wp
 
@@ -45,16 +45,16 @@ class AttitudeStart:
 
 
 @wp.func
-def sample_base(start: AttitudeStart, arrays: RobotArrays, draw: RngStream, attempt: int) -> AttitudeStart:
-    """Return the base, the same in every attempt; in the last one the legs are in the default pose."""
+def sample_base(start: AttitudeStart, arrays: RobotArrays, rng: RngStream, attempt: int) -> AttitudeStart:
+    """Return the base, the same in every attempt; in the last attempt the legs are in the default pose."""
     base = start
     base.default_legs = start.default_legs or attempt == ATTEMPTS - 1
     return base
 
 
 @wp.func
-def sample_leg(start: AttitudeStart, base: AttitudeStart, geo: LegGeometry, draw: RngStream, leg: int) -> LegSample:
-    """Return a leg at rest; reachable if the sum of its transversal angles keeps its limits."""
+def sample_leg(start: AttitudeStart, base: AttitudeStart, geo: LegGeometry, rng: RngStream, leg: int) -> LegSample:
+    """Return a sampled leg at rest; reachable if the sum of its transversal angles is within limits."""
     found = LegSample()
     if base.default_legs:
         for j in range(3):
@@ -62,9 +62,9 @@ def sample_leg(start: AttitudeStart, base: AttitudeStart, geo: LegGeometry, draw
         found.reachable = True
         return found
     found.angles = wp.vec3(
-        uniform_range(draw, streams.LATERAL + leg, start.settings.lateral),
-        uniform_range(draw, streams.OUTER + leg, start.settings.transversal),
-        uniform_range(draw, streams.INNER + leg, start.settings.transversal),
+        uniform_range(rng, streams.LATERAL + leg, start.settings.lateral),
+        uniform_range(rng, streams.OUTER + leg, start.settings.transversal),
+        uniform_range(rng, streams.INNER + leg, start.settings.transversal),
     )
     total = found.angles[1] + found.angles[2]
     found.reachable = total > start.limits.sum_lower and total < start.limits.sum_upper
@@ -73,22 +73,22 @@ def sample_leg(start: AttitudeStart, base: AttitudeStart, geo: LegGeometry, draw
 
 @wp.func
 def write_start(
-    arrays: RobotArrays, scene: Scene, skill: SkillSettings, settings: AttitudeSettings, quat: wp.quat, draw: RngStream
+    arrays: RobotArrays, scene: Scene, skill: SkillSettings, settings: AttitudeSettings, quat: wp.quat, rng: RngStream
 ):
-    """Write a start state with an orientation (xyzw) to a world."""
+    """Write a sampled start state with orientation `quat` (xyzw) to a world."""
     w = settings.spin
     start = AttitudeStart()
-    start.ground = world_ground(scene.ground, draw.world)
+    start.ground = world_ground(scene.ground, rng.world)
     start.pos = wp.vec3(0.0, 0.0, surface(start.ground, 0.0, 0.0)[0] + settings.height)
     start.quat = quat
     start.ang_vel = wp.vec3(
-        uniform(draw, streams.SPIN, -w, w),
-        uniform(draw, streams.SPIN + 1, -w, w),
-        uniform(draw, streams.SPIN + 2, -w, w),
+        uniform(rng, streams.SPIN, -w, w),
+        uniform(rng, streams.SPIN + 1, -w, w),
+        uniform(rng, streams.SPIN + 2, -w, w),
     )
-    start.com_vel = wp.cross(start.ang_vel, wp.quat_rotate(quat, arrays.body_com[draw.world * BODIES]))
-    start.default_legs = uniform(draw, streams.DEFAULT_LEGS, 0.0, 1.0) < settings.default_share
+    start.com_vel = wp.cross(start.ang_vel, wp.quat_rotate(quat, arrays.body_com[rng.world * BODIES]))
+    start.default_legs = uniform(rng, streams.DEFAULT_LEGS, 0.0, 1.0) < settings.default_share
     start.default_angle = arrays.default_angle
     start.settings = settings
     start.limits = leg_limits(skill.command_filter)
-    sample_valid_state(sample_base, sample_leg, start, arrays, scene, draw)
+    sample_valid_state(sample_base, sample_leg, start, arrays, scene, rng)

@@ -1,4 +1,4 @@
-"""Draws of the ground that an episode begins on: level, off a platform, or onto a block that may slide."""
+"""Sampled ground of an episode: level, a platform to jump off, or a block to jump onto, which may slide."""
 
 import warp as wp
 
@@ -53,21 +53,21 @@ def fixed_block(center: wp.vec2, half: wp.vec2, height: float) -> Block:
 
 
 @wp.func
-def draw_platform(draw: RngStream, ranges: GroundRanges, foot: wp.vec2, goal: wp.vec3) -> Block:
-    """Return a platform under a robot at the origin; none if its paws could not land beside it."""
+def sample_platform(rng: RngStream, ranges: GroundRanges, foot: wp.vec2, goal: wp.vec3) -> Block:
+    """Return a sampled platform under a robot at the origin; none if its paws could not land beside it."""
     half = foot + wp.vec2(
-        uniform(draw, streams.PLATFORM_ROOM_X, EVERY_SIDE, ranges.room),
-        uniform(draw, streams.PLATFORM_ROOM_Y, EVERY_SIDE, ranges.room),
+        uniform(rng, streams.PLATFORM_ROOM_X, EVERY_SIDE, ranges.room),
+        uniform(rng, streams.PLATFORM_ROOM_Y, EVERY_SIDE, ranges.room),
     )
     beyond = wp.vec2(wp.abs(goal[0]), wp.abs(goal[1])) - half - foot
     if wp.max(beyond) < ranges.clearance:
         return Block()
-    return fixed_block(wp.vec2(0.0), half, uniform_range(draw, streams.BLOCK_HEIGHT, ranges.drop))
+    return fixed_block(wp.vec2(0.0), half, uniform_range(rng, streams.BLOCK_HEIGHT, ranges.drop))
 
 
 @wp.func
-def draw_block(draw: RngStream, ranges: GroundRanges, foot: wp.vec2, goal: wp.vec3) -> Block:
-    """Return a block under the goal; none without room for its near side between the paws before and after the jump.
+def sample_block(rng: RngStream, ranges: GroundRanges, foot: wp.vec2, goal: wp.vec3) -> Block:
+    """Return a sampled block under the goal; none without room for its near side between the paws of start and goal.
 
     The near side is anywhere there, more often near than far (a third within a ninth of the room), across the axis
     along which the goal is farther.
@@ -78,25 +78,25 @@ def draw_block(draw: RngStream, ranges: GroundRanges, foot: wp.vec2, goal: wp.ve
     farthest = way - foot[along] - ranges.clearance
     if nearest > farthest:
         return Block()
-    u = uniform(draw, streams.BLOCK_NEAR_SIDE, 0.0, 1.0)
+    u = uniform(rng, streams.BLOCK_NEAR_SIDE, 0.0, 1.0)
     near = nearest + u * u * (farthest - nearest)
-    far = way + foot[along] + uniform(draw, streams.BLOCK_FAR_ROOM, EVERY_SIDE, ranges.room)
+    far = way + foot[along] + uniform(rng, streams.BLOCK_FAR_ROOM, EVERY_SIDE, ranges.room)
     center = wp.vec2(goal[0], goal[1])
     center[along] = wp.sign(goal[along]) * 0.5 * (near + far)
-    half = foot + wp.vec2(uniform(draw, streams.BLOCK_SIDE_ROOM, EVERY_SIDE, ranges.room))
+    half = foot + wp.vec2(uniform(rng, streams.BLOCK_SIDE_ROOM, EVERY_SIDE, ranges.room))
     half[along] = 0.5 * (far - near)
-    block = fixed_block(center, half, uniform_range(draw, streams.BLOCK_HEIGHT, ranges.rise))
-    block.mass = real(uniform_range(draw, streams.BLOCK_MASS, ranges.mass))
-    block.friction = real(uniform_range(draw, streams.BLOCK_FRICTION, ranges.friction))
+    block = fixed_block(center, half, uniform_range(rng, streams.BLOCK_HEIGHT, ranges.rise))
+    block.mass = real(uniform_range(rng, streams.BLOCK_MASS, ranges.mass))
+    block.friction = real(uniform_range(rng, streams.BLOCK_FRICTION, ranges.friction))
     return block
 
 
 @wp.func
-def draw_ground(draw: RngStream, ranges: GroundRanges, foot: wp.vec2, goal: wp.vec3) -> Block:
-    """Return the block of a standing start at the origin with a goal [m], world axes; mostly there is none."""
-    u = uniform(draw, streams.GROUND, 0.0, 1.0)
+def sample_ground(rng: RngStream, ranges: GroundRanges, foot: wp.vec2, goal: wp.vec3) -> Block:
+    """Return a sampled platform, block or level ground (no block) of a standing start; goal [m]: world axes."""
+    u = uniform(rng, streams.GROUND, 0.0, 1.0)
     if u < ranges.platform:
-        return draw_platform(draw, ranges, foot, goal)
+        return sample_platform(rng, ranges, foot, goal)
     if u < ranges.platform + ranges.block:
-        return draw_block(draw, ranges, foot, goal)
+        return sample_block(rng, ranges, foot, goal)
     return Block()

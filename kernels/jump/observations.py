@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from ..mdp.view import RobotArrays, RobotView, base_pos, base_quat, turned, yaw_of
+from ..mdp.view import RobotArrays, RobotView, base_pos, base_quat, rotate_yaw, yaw_of
 from ..terrain.ground import Block, Ground, floor_surface, world_ground
 from .phase import estimated_apex, estimated_landing
 from .state import JumpState, commanded, goal_offset
@@ -29,7 +29,7 @@ def goal(robot: RobotView, state: JumpState) -> wp.vec2:
     """Way to the goal [m] ahead and to the left, 0 before the command."""
     way = wp.vec3(0.0)
     if state.steps >= state.command_step:
-        way = turned(goal_offset(robot, state), -yaw_of(robot.quat))
+        way = rotate_yaw(goal_offset(robot, state), -yaw_of(robot.quat))
     return wp.vec2(way[0], way[1])
 
 
@@ -61,14 +61,14 @@ def height_errors(robot: RobotView, state: JumpState) -> wp.vec2:
 def landing_miss(robot: RobotView, state: JumpState) -> wp.vec2:
     """Way from the ballistic landing to the goal [m], ahead and to the left."""
     landing = estimated_landing(robot.pos, robot.lin_vel, LANDING_HEIGHT + state.goal_ground, robot.gravity_magnitude)
-    miss = turned(wp.vec3(state.goal[0] - landing[0], state.goal[1] - landing[1], 0.0), -yaw_of(robot.quat))
+    miss = rotate_yaw(wp.vec3(state.goal[0] - landing[0], state.goal[1] - landing[1], 0.0), -yaw_of(robot.quat))
     return wp.vec2(miss[0], miss[1])
 
 
 @wp.func
 def way(robot: RobotView, state: JumpState) -> wp.vec2:
     """Way to the goal [m] ahead and to the left, before the command too."""
-    offset = turned(goal_offset(robot, state), -yaw_of(robot.quat))
+    offset = rotate_yaw(goal_offset(robot, state), -yaw_of(robot.quat))
     return wp.vec2(offset[0], offset[1])
 
 
@@ -105,7 +105,7 @@ def block_ahead(arrays: RobotArrays, ground: Ground, world: int) -> vec7:
     heading = yaw_of(base_quat(arrays, world))
     seen = vec7()
     for i in range(3):
-        aside = turned(wp.vec3(0.0, 0.2 * float(1 - i), 0.0), heading)
+        aside = rotate_yaw(wp.vec3(0.0, 0.2 * float(1 - i), 0.0), heading)
         edges = edges_of_block(block, pos[0] + aside[0], pos[1] + aside[1], heading)
         seen[2 * i] = edges[0]
         seen[2 * i + 1] = edges[1]

@@ -6,7 +6,7 @@ Times are counted in policy steps of 1/60 s.
 import warp as wp
 
 from ..mdp.rewards import phi, posture_offset, psi, square_sum
-from ..mdp.view import RobotView, braking, rotation_from
+from ..mdp.view import RobotView, angle_from_level, base_deceleration
 from .phase import estimated_apex, landing_error_estimate
 from .state import FLIGHT, LANDED, STANCE, JumpState, commanded, goal_offset, waiting
 
@@ -157,7 +157,7 @@ def flight_orientation(robot: RobotView, state: JumpState, width: float) -> floa
     """Orientation error: phi_width of the rotation from level and heading, in flight while moving toward the goal."""
     if state.phase != FLIGHT or wp.dot(robot.lin_vel, goal_offset(robot, state)) <= 0.0:
         return 0.0
-    return phi(rotation_from(robot.quat, state.heading), width)
+    return phi(angle_from_level(robot.quat, state.heading), width)
 
 
 @wp.func
@@ -195,7 +195,7 @@ def soft_impact(robot: RobotView, state: JumpState, limit: float) -> float:
     """Soft impact: max(0, 1 - deceleration / limit), first 0.3 s after touchdown."""
     if not just_landed(state):
         return 0.0
-    return wp.max(0.0, 1.0 + braking(robot) / limit)
+    return wp.max(0.0, 1.0 + base_deceleration(robot) / limit)
 
 
 @wp.func
@@ -203,7 +203,7 @@ def stance_impact(robot: RobotView, state: JumpState, limit: float) -> float:
     """Stance impact: deceleration / limit in stance, in -1..0."""
     if state.phase != STANCE:
         return 0.0
-    return wp.clamp(braking(robot) / limit, -1.0, 0.0)
+    return wp.clamp(base_deceleration(robot) / limit, -1.0, 0.0)
 
 
 @wp.func

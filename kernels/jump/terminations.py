@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from ..mdp.view import RobotView, braking, rotation_from, yaw_of
+from ..mdp.view import RobotView, angle_from_level, base_deceleration, yaw_of
 from .phase import landing_error_estimate
 from .state import FLIGHT, LANDED, STANCE, JumpState, goal_offset, waiting
 
@@ -38,7 +38,7 @@ def turned_touchdown(robot: RobotView, state: JumpState, rotation: float, yaw: f
     """At touchdown rotated by more than `rotation` [rad] from level and heading, or by `yaw` [rad] about z."""
     turn = yaw_of(robot.quat) - state.heading
     off = wp.abs(wp.atan2(wp.sin(turn), wp.cos(turn)))
-    return state.touched_down == 1 and (rotation_from(robot.quat, state.heading) > rotation or off > yaw)
+    return state.touched_down == 1 and (angle_from_level(robot.quat, state.heading) > rotation or off > yaw)
 
 
 @wp.func
@@ -75,7 +75,7 @@ def slanted_takeoff(robot: RobotView, state: JumpState, speed: float) -> bool:
 def hard_impact(robot: RobotView, state: JumpState, stance: float, flight: float) -> bool:
     """Deceleration above `stance` [m/s^2] in stance, above `flight` in flight and after touchdown."""
     limit = wp.where(state.phase == STANCE, stance, flight)
-    return braking(robot) < -limit
+    return base_deceleration(robot) < -limit
 
 
 @wp.func

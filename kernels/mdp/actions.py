@@ -1,18 +1,18 @@
-"""From the policy's action to motor targets, and the push that acts during a policy step."""
+"""Motor targets from the policy's action, and the external push of a policy step."""
 
 import warp as wp
 
 from ..actuation.command_filter import filter_leg
 from ..layout import BODIES, COORDS, DOFS
-from .env import RING, Delays, EnvArrays, SkillSettings
+from .env import RING, Delays, EpisodeArrays, SkillSettings
 from .view import RobotArrays, base_quat, base_velocity
 
 wp.set_module_options({"enable_backward": False})
 
 
 @wp.func
-def remember(arrays: RobotArrays, push: wp.array(dtype=wp.spatial_vector), push_in_flight: int, world: int):
-    """Begin a world's policy step: keep the base's velocity, apply its push."""
+def begin_policy_step(arrays: RobotArrays, push: wp.array(dtype=wp.spatial_vector), push_in_flight: int, world: int):
+    """Store the base's velocity as the previous one, and write the push wrench; in flight only if `push_in_flight`."""
     arrays.prev_lin_vel[world] = base_velocity(arrays, world, base_quat(arrays, world))
     pushed = push_in_flight
     for k in range(4):
@@ -25,13 +25,13 @@ def remember(arrays: RobotArrays, push: wp.array(dtype=wp.spatial_vector), push_
 
 
 @wp.func
-def delayed(delays: Delays, clock: int, world: int, m: int):
-    """Choose what a motor follows: the target of as many physics steps ago as the latency asks for."""
+def select_delayed_target(delays: Delays, step_count: int, world: int, m: int):
+    """Write the two targets [rad] that motor m follows in this policy step, and when it switches, from the latency."""
     whole = delays.steps[world] // delays.substeps
-    delays.late_target[m, world] = delays.past_target[(clock - whole) % RING, m, world]
-    delays.earlier_target[m, world] = delays.past_target[(clock - whole - 1) % RING, m, world]
+    delays.current_target[m, world] = delays.target_history[(step_count - whole) % RING, m, world]
+    delays.prev_target[m, world] = delays.target_history[(step_count - whole - 1) % RING, m, world]
     if m == 0:
-        delays.late_steps[world] = delays.steps[world] - whole * delays.substeps
+        delays.switch_step[world] = delays.steps[world] - whole * delays.substeps
 
 
 @wp.kernel
@@ -42,16 +42,16 @@ def action_kernel(
     push: wp.array(dtype=wp.spatial_vector),
     # in, out
     arrays: RobotArrays,
-    env: EnvArrays,
+    episode: EpisodeArrays,
     delays: Delays,
 ):
     """Clamp, scale and filter the action (skills, num_worlds, 12) of each world's skill; one thread per (leg, world).
 
-    An action that is not finite counts as 0, and its world as broken.
+    An action that is not finite counts as 0, and its world as diverged.
     """
     leg, world = wp.tid()
-    world += env.first
-    skill = skills[env.skill[world]]
+    world += episode.first
+    skill = skills[episode.skill[world]]
     q = world * COORDS + 7 + 5 * leg
     d = world * DOFS + 6 + 5 * leg
     angles = wp.vec3(arrays.joint_q[q], arrays.joint_q[q + 1], arrays.joint_q[q + 3])
@@ -59,10 +59,10 @@ def action_kernel(
     target = wp.vec3(0.0)
     for j in range(3):
         m = 3 * leg + j
-        asked = policy_action[env.skill[world], world, m]
+        asked = policy_action[episode.skill[world], world, m]
         if not wp.isfinite(asked):
             asked = 0.0
-            env.bad_action[world] = 1
+            episode.bad_action[world] = 1
         action = wp.clamp(asked, -1.0, 1.0)
         arrays.prev_prev_action[m, world] = arrays.prev_action[m, world]
         arrays.prev_action[m, world] = arrays.action[m, world]
@@ -72,12 +72,12 @@ def action_kernel(
         angles[j] = angles[j] + arrays.joint_offset[m, world]
         target[j] = action * skill.action_scale[m] + arrays.default_angle[m]
     safe = filter_leg(target, angles, rates, skill.command_filter)
-    clock = env.clock[world]
+    step_count = episode.step_count[world]
     for j in range(3):
         m = 3 * leg + j
         arrays.target[m, world] = target[j]
-        arrays.safe_target[m, world] = safe[j]
-        delays.past_target[clock % RING, m, world] = safe[j]
-        delayed(delays, clock, world, m)
+        arrays.filtered_target[m, world] = safe[j]
+        delays.target_history[step_count % RING, m, world] = safe[j]
+        select_delayed_target(delays, step_count, world, m)
     if leg == 0:
-        remember(arrays, push, skill.push_in_flight, world)
+        begin_policy_step(arrays, push, skill.push_in_flight, world)

@@ -1,10 +1,10 @@
-"""Handing a world over from one skill to another; the robot is left as it is."""
+"""Handover of a world from one skill to another; the robot's state does not change."""
 
 from typing import Any
 
 import warp as wp
 
-from .env import BEGUN, EnvArrays, Scene, SkillSettings
+from .env import BEGUN, EpisodeArrays, Scene, SkillSettings
 from .parameters import RobotParameters, set_motor
 from .view import RobotArrays, load_view, yaw_of
 
@@ -15,16 +15,16 @@ NONE = wp.constant(-1)
 
 @wp.func
 def hand_over(
-    arrays: RobotArrays, parameters: RobotParameters, env: EnvArrays, skills: wp.array(dtype=SkillSettings),
+    arrays: RobotArrays, parameters: RobotParameters, episode: EpisodeArrays, skills: wp.array(dtype=SkillSettings),
     world: int, target: int,
 ):  # fmt: skip
-    """Make another skill the active one: its motors from now on, and as last action the one that holds the targets."""
-    env.skill[world] = target
-    env.requested_task[world] = NONE
-    env.has_command[world] = 0
-    env.history_reset[world] = BEGUN
+    """Make `target` the active skill: its motor constants, and as previous actions the one that holds the targets."""
+    episode.skill[world] = target
+    episode.requested_task[world] = NONE
+    episode.has_command[world] = 0
+    episode.history_reset[world] = BEGUN
     for m in range(12):
-        off = arrays.safe_target[m, world] - arrays.default_angle[m]
+        off = arrays.filtered_target[m, world] - arrays.default_angle[m]
         action = wp.clamp(off / skills[target].action_scale[m], -1.0, 1.0)
         arrays.action[m, world] = action
         arrays.prev_action[m, world] = action
@@ -39,15 +39,15 @@ def restore_task_kernel(
     home: wp.array(dtype=int),
     # in, out
     parameters: RobotParameters,
-    env: EnvArrays,
+    episode: EpisodeArrays,
 ):
-    """Put worlds into their first skill where mask is not 0, with its motors, and asked for none; one thread each."""
-    world = env.first + wp.tid()
+    """Reset worlds with mask != 0 to their first skill, its motors, and no request; one thread per world."""
+    world = episode.first + wp.tid()
     if mask[world] == 0.0:
         return
-    env.skill[world] = home[world]
-    env.requested_task[world] = NONE
-    env.has_command[world] = 0
+    episode.skill[world] = home[world]
+    episode.requested_task[world] = NONE
+    episode.has_command[world] = 0
     for m in range(12):
         set_motor(parameters, world, m)
 
@@ -67,25 +67,27 @@ def make_handover_kernel(handover: Any) -> wp.Kernel:
         # in, out
         arrays: RobotArrays,
         parameters: RobotParameters,
-        env: EnvArrays,
+        episode: EpisodeArrays,
         sources: wp.array(dtype=handover.source.state),
         targets: wp.array(dtype=handover.target.state),
     ):
-        """Hand worlds over whose time has come, and give them the command that they were asked with.
+        """Hand over worlds of `source` for which `when` holds, and set their pending command; one thread per world.
 
-        moved: 1 where that happened in this step; one thread per world.
+        moved: 1 where a world was handed over in this step.
         """
-        world = env.first + wp.tid()
-        if env.skill[world] != source or env.done[world] != 0.0 or moved[world] != 0:
+        world = episode.first + wp.tid()
+        if episode.skill[world] != source or episode.done[world] != 0.0 or moved[world] != 0:
             return
         robot = load_view(arrays, scene.ground, world)
-        if wp.static(when)(robot, sources[world], env.requested_task[world] == target):
+        if wp.static(when)(robot, sources[world], episode.requested_task[world] == target):
             begun = wp.static(begin)(robot, sources[world])
-            if env.requested_task[world] == target and env.has_command[world] != 0:
-                targets[world] = wp.static(give)(robot, scene, begun, env.pending_command[world], yaw_of(robot.quat))
+            if episode.requested_task[world] == target and episode.has_command[world] != 0:
+                targets[world] = wp.static(give)(
+                    robot, scene, begun, episode.pending_command[world], yaw_of(robot.quat)
+                )
             else:
                 targets[world] = begun
-            hand_over(arrays, parameters, env, skills, world, target)
+            hand_over(arrays, parameters, episode, skills, world, target)
             moved[world] = 1
 
     return handover_kernel

@@ -1,11 +1,11 @@
-"""The stage that observes: terms of all groups, then latency, noise, clipping, scale and history."""
+"""Observations: evaluate the terms of all groups, then apply latency, noise, clipping, scale and history."""
 
 from typing import Any
 
 import warp as wp
 
 from ..terrain.ground import Ground
-from .env import BEGUN, COMMANDED, RING, EnvArrays
+from .env import BEGUN, COMMANDED, RING, EpisodeArrays
 from .options import FAST
 from .parameters import RobotParameters
 from .random import OBSERVATION, clamped_normal, step_key, stream_at
@@ -20,8 +20,8 @@ LANES = wp.constant(32)
 
 
 @wp.struct
-class Column:
-    """Where a component of an observation term comes from and stands in the rows of its group."""
+class ObservationColumn:
+    """Index table of one component of an observation term: its source, and its columns in its group."""
 
     raw: int  # its row among the raw values
     group: int
@@ -33,7 +33,7 @@ class Column:
     oldest: int  # column of its oldest frame
     width: int  # columns of a frame
     history: int  # number of frames
-    delayed: int  # 1: comes as late as the world's sensors do
+    delayed: int  # 1: subject to the observation latency of the world
     past: int  # column in the ring of past values
 
 
@@ -41,18 +41,18 @@ class Column:
 class ObservationArrays:
     """Observations of all worlds, one row a world, one group after the other."""
 
-    raw: wp.array2d(dtype=float)  # (components, num_worlds) what the terms gave
-    now: wp.array(dtype=float)  # of the next step; an ended episode has begun anew
-    final: wp.array(dtype=float)  # the same before that new beginning
-    past: wp.array3d(dtype=float)  # (RING, num_worlds, columns) what sensors gave, a ring over policy steps
+    raw: wp.array2d(dtype=float)  # (components, num_worlds) values of the terms
+    now: wp.array(dtype=float)  # of the next step; ended episodes are already reset
+    final: wp.array(dtype=float)  # the same before resets
+    past: wp.array3d(dtype=float)  # (RING, num_worlds, columns) delayed components, ring buffer over policy steps
     latency: wp.array(dtype=int)  # [physics steps] (num_worlds,)
     substeps: int
 
 
 @wp.func
-def load_column(columns: wp.array2d(dtype=int), component: int) -> Column:
+def load_column(columns: wp.array2d(dtype=int), component: int) -> ObservationColumn:
     """Return a component's row; columns: (fields of `Column`, components), so that neighbours read neighbours."""
-    column = Column()
+    column = ObservationColumn()
     column.raw = columns[0, component]
     column.group = columns[1, component]
     column.start = columns[2, component]
@@ -84,10 +84,10 @@ def store(value: Any, row: int, world: int, out: wp.array2d(dtype=float)):  # no
 def make_observe_kernel(task: Any) -> wp.Kernel:
     """Return the kernel that evaluates all observation terms of a task."""
     slots = [slot for group in task.groups for slot in task.params.slots[group]]
-    first = [next(iter(slot.func.input_types.values())) for slot in slots]
-    of_parameters = [kind is RobotParameters for kind in first]
-    of_ground = [kind is RobotArrays for kind in first]
-    places = [sum(slot.term.width for slot in slots[:i]) for i in range(len(slots))]
+    input_types = [next(iter(slot.func.input_types.values())) for slot in slots]
+    reads_parameters = [kind is RobotParameters for kind in input_types]
+    reads_ground = [kind is RobotArrays for kind in input_types]
+    rows = [sum(slot.term.width for slot in slots[:i]) for i in range(len(slots))]
 
     @wp.kernel(module="unique", module_options=FAST)
     def observe_kernel(
@@ -96,37 +96,37 @@ def make_observe_kernel(task: Any) -> wp.Kernel:
         arrays: RobotArrays,
         parameters: RobotParameters,
         ground: Ground,
-        env: EnvArrays,
+        episode: EpisodeArrays,
         states: wp.array(dtype=task.state),
         p: wp.array(dtype=float),
-        beginning: int,
+        after_reset: int,
         # out
         raw: wp.array2d(dtype=float),
     ):
-        """Write what the terms give; one thread per (chunk of terms, world).
+        """Write the values of the terms; one thread per (chunk of terms, world).
 
-        beginning 1: only where an episode or the skill has just begun, or another command came.
+        after_reset 1: only where an episode or the skill has just begun, or another command came.
         """
         chunk, world = wp.tid()
-        world += env.first
-        if env.skill[world] != skill or (beginning != 0 and env.history_reset[world] == 0):
+        world += episode.first
+        if episode.skill[world] != skill or (after_reset != 0 and episode.history_reset[world] == 0):
             return
         for c in range(wp.static((len(slots) + CHUNK - 1) // CHUNK)):
             if chunk == c:
                 robot = load_view(arrays, ground, world)
                 for i in range(wp.static(c * CHUNK), wp.static(min((c + 1) * CHUNK, len(slots)))):
-                    if wp.static(of_parameters[i]):
-                        store(wp.static(slots[i].func)(parameters, world), wp.static(places[i]), world, raw)
-                    elif wp.static(of_ground[i]):
-                        store(wp.static(slots[i].func)(arrays, ground, world), wp.static(places[i]), world, raw)
-                    elif wp.static(slots[i].plain):
-                        store(wp.static(slots[i].func)(robot, states[world]), wp.static(places[i]), world, raw)
+                    if wp.static(reads_parameters[i]):
+                        store(wp.static(slots[i].func)(parameters, world), wp.static(rows[i]), world, raw)
+                    elif wp.static(reads_ground[i]):
+                        store(wp.static(slots[i].func)(arrays, ground, world), wp.static(rows[i]), world, raw)
+                    elif wp.static(slots[i].parameterless):
+                        store(wp.static(slots[i].func)(robot, states[world]), wp.static(rows[i]), world, raw)
                     else:
                         store(
                             wp.static(slots[i].func)(
-                                robot, states[world], *p[wp.static(slots[i].lo) : wp.static(slots[i].hi)]
+                                robot, states[world], *p[wp.static(slots[i].start) : wp.static(slots[i].stop)]
                             ),
-                            wp.static(places[i]),
+                            wp.static(rows[i]),
                             world,
                             raw,
                         )
@@ -135,79 +135,81 @@ def make_observe_kernel(task: Any) -> wp.Kernel:
 
 
 @wp.func
-def or_zero(value: float, broken: bool) -> float:
-    """Return 0 instead of the value of a world that came apart, or of one that is not finite."""
-    if broken or not wp.isfinite(value):
+def finite_or_zero(value: float, diverged: bool) -> float:
+    """Return a value, or 0 if its world diverged or it is not finite."""
+    if diverged or not wp.isfinite(value):
         return 0.0
     return value
 
 
 @wp.struct
-class Moment:
-    """What all components of a world have in common in a step."""
+class StepContext:
+    """What all observation components of a world share in a policy step."""
 
     world: int
-    draws: wp.uint32  # see `step_key`
-    fresh: int  # as in `EnvArrays`
-    broken: bool
-    now: int  # place in the rings of past values
-    newer: int  # place of the value that a sensor's latency has passed
-    older: int  # place of the one before
-    share: float  # [1] way from the newer to the older one
+    step_key: wp.uint32  # see `mdp.random`
+    history_reset: int  # as in `EpisodeArrays`
+    diverged: bool
+    slot: int  # present one of the ring buffers
+    newer: int  # slot of the latest value that is as old as the latency
+    older: int  # slot before it
+    fraction: float  # [1] interpolation from newer to older
 
 
 @wp.func
-def moment(env: EnvArrays, arrays: ObservationArrays, world: int) -> Moment:
-    """Return what a world's components have in common."""
-    clock = env.clock[world]
-    whole = arrays.latency[world] // arrays.substeps
-    m = Moment()
+def step_context(episode: EpisodeArrays, arrays: ObservationArrays, world: int) -> StepContext:
+    """Return what a world's observation components share in this policy step."""
+    step_count = episode.step_count[world]
+    steps = arrays.latency[world] // arrays.substeps
+    m = StepContext()
     m.world = world
-    m.draws = step_key(env.seed, world, clock)
-    m.fresh = env.history_reset[world]
-    m.broken = env.broken[world] != 0
-    m.now = clock % RING
-    m.newer = (clock - whole) % RING
-    m.older = (clock - whole - 1) % RING
-    m.share = float(arrays.latency[world] - whole * arrays.substeps) / float(arrays.substeps)
+    m.step_key = step_key(episode.seed, world, step_count)
+    m.history_reset = episode.history_reset[world]
+    m.diverged = episode.diverged[world] != 0
+    m.slot = step_count % RING
+    m.newer = (step_count - steps) % RING
+    m.older = (step_count - steps - 1) % RING
+    m.fraction = float(arrays.latency[world] - steps * arrays.substeps) / float(arrays.substeps)
     return m
 
 
 @wp.func
-def late(arrays: ObservationArrays, m: Moment, column: int, value: float) -> float:
-    """Return what a sensor gave as long ago as its latency says, between policy steps a straight line."""
-    if m.fresh == BEGUN:
+def delay_value(arrays: ObservationArrays, m: StepContext, column: int, value: float) -> float:
+    """Store a component's value, and return it delayed by the observation latency, linear between policy steps."""
+    if m.history_reset == BEGUN:
         for i in range(RING):
             arrays.past[i, m.world, column] = value
-    arrays.past[m.now, m.world, column] = value
+    arrays.past[m.slot, m.world, column] = value
     newer = arrays.past[m.newer, m.world, column]
-    if m.share == 0.0:
+    if m.fraction == 0.0:
         return newer
-    return newer + m.share * (arrays.past[m.older, m.world, column] - newer)
+    return newer + m.fraction * (arrays.past[m.older, m.world, column] - newer)
 
 
 @wp.func
-def condition(arrays: ObservationArrays, column: Column, p: wp.array(dtype=float), m: Moment, beginning: int):
-    """Turn a component's raw value into an observation, behind the frames before."""
-    value = or_zero(arrays.raw[column.raw, m.world], m.broken)
+def postprocess(
+    arrays: ObservationArrays, column: ObservationColumn, p: wp.array(dtype=float), m: StepContext, after_reset: int
+):
+    """Write a component's observation: delayed, with noise, clipped, scaled, behind the older frames of its history."""
+    value = finite_or_zero(arrays.raw[column.raw, m.world], m.diverged)
     if column.delayed != 0:
-        value = late(arrays, m, column.past, value)
+        value = delay_value(arrays, m, column.past, value)
     noise = p[column.noise]
     if noise > 0.0:
-        value += noise * clamped_normal(stream_at(m.draws, m.world, OBSERVATION + column.group), column.oldest)
-    value = or_zero(p[column.scale] * wp.clamp(value, -p[column.clip], p[column.clip]), m.broken)
+        value += noise * clamped_normal(stream_at(m.step_key, m.world, OBSERVATION + column.group), column.oldest)
+    value = finite_or_zero(p[column.scale] * wp.clamp(value, -p[column.clip], p[column.clip]), m.diverged)
     i = column.start + m.world * column.stride + column.oldest
-    again = beginning != 0 and m.fresh == COMMANDED
+    keep_frames = after_reset != 0 and m.history_reset == COMMANDED
     for _ in range(column.history - 1):
-        frame = arrays.now[i + wp.where(again, 0, column.width)]
-        if m.broken or m.fresh == BEGUN:
+        frame = arrays.now[i + wp.where(keep_frames, 0, column.width)]
+        if m.diverged or m.history_reset == BEGUN:
             frame = value
         arrays.now[i] = frame
-        if beginning == 0:
+        if after_reset == 0:
             arrays.final[i] = frame
         i += column.width
     arrays.now[i] = value
-    if beginning == 0:
+    if after_reset == 0:
         arrays.final[i] = value
 
 
@@ -215,23 +217,23 @@ def condition(arrays: ObservationArrays, column: Column, p: wp.array(dtype=float
 def postprocess_obs_kernel(
     # in
     skill: int,
-    env: EnvArrays,
+    episode: EpisodeArrays,
     columns: wp.array2d(dtype=int),
     p: wp.array(dtype=float),
-    beginning: int,
+    after_reset: int,
     # in, out
     arrays: ObservationArrays,
 ):
     """Turn raw values into observations; launch over (num_worlds, LANES).
 
-    Rows of worlds that came apart are 0, history and all, and so is what else is not finite.
-    beginning 1: only where an episode or the skill has just begun, or another command came; then frames of before
+    Rows of diverged worlds are 0, with their history; so are other values that are not finite.
+    after_reset 1: only where an episode or skill has just begun, or another command came; then older frames
     stay, and so does `final`.
     """
     world, lane = wp.tid()
-    world += env.first
-    if env.skill[world] != skill or (beginning != 0 and env.history_reset[world] == 0):
+    world += episode.first
+    if episode.skill[world] != skill or (after_reset != 0 and episode.history_reset[world] == 0):
         return
-    m = moment(env, arrays, world)
+    m = step_context(episode, arrays, world)
     for component in range(lane, columns.shape[1], LANES):
-        condition(arrays, load_column(columns, component), p, m, beginning)
+        postprocess(arrays, load_column(columns, component), p, m, after_reset)

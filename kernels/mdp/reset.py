@@ -1,4 +1,4 @@
-"""The stage that begins: new episodes where they ended, and new commands where they are due."""
+"""Resets: new episodes, and new commands within an episode where they are due."""
 
 from typing import Any
 
@@ -10,18 +10,18 @@ from ..kinematics.inverse import LegLimits
 from ..layout import COORDS, DOFS, motor_slot
 from ..terrain.ground import rest_block, surface, world_ground
 from .attempts import sync_attempts
-from .env import BEGUN, COMMANDED, RING, Delays, EnvArrays, Scene, SkillSettings
+from .env import BEGUN, COMMANDED, RING, Delays, EpisodeArrays, Scene, SkillSettings
 from .options import FAST
 from .random import ANY_LEVEL, COMMAND, RESET, make_stream, uniform
-from .track import follow_paw
+from .track import update_paw_kinematics
 from .view import RobotArrays, base_quat, base_velocity, load_view, yaw_of
 
 wp.set_module_options({"enable_backward": False})
 
 
 @wp.func
-def before_reset(old: Any, done: float):
-    """Return the state that a new episode follows; one that was cut off from outside counts as not begun."""
+def previous_state(old: Any, done: float):
+    """Return the state of the previous episode; with 0 steps if it was cut off from outside (done = 0)."""
     state = old
     if done == 0.0:
         state.steps = 0
@@ -29,7 +29,7 @@ def before_reset(old: Any, done: float):
 
 
 def make_reset_kernel(task: Any) -> wp.Kernel:
-    """Return the kernel that begins a task's episodes; task: see `jumper_warp.tasks.cfg.TaskCfg`."""
+    """Return the kernel that resets a task's worlds; task: see `jumper_warp.tasks.cfg.TaskCfg`."""
     reset, due, command = task.reset.func, task.command.due, task.command.draw
     settings_type, level_type = task.settings_type, task.level_type
 
@@ -44,17 +44,17 @@ def make_reset_kernel(task: Any) -> wp.Kernel:
         settings: wp.array(dtype=settings_type),
         levels: wp.array(dtype=level_type),
         # in, out
-        env: EnvArrays,
+        episode: EpisodeArrays,
         states: wp.array(dtype=task.state),
         arrays: RobotArrays,
     ):
-        """Begin a new episode where mask is not 0, else a new command where it is due; launch over (worlds, lanes).
+        """Begin a new episode where mask != 0, else sample a command where one is due; launch over (worlds, lanes).
 
         The lanes, neighbours in a warp, do the same but for what they share by `draw.lane`.
         """
         world, lane = wp.tid()
-        world += env.first
-        if env.skill[world] != skill:
+        world += episode.first
+        if episode.skill[world] != skill:
             return
         begins = mask[world] != 0.0
         commanded = bool(False)
@@ -62,32 +62,32 @@ def make_reset_kernel(task: Any) -> wp.Kernel:
             commanded = wp.static(due)(states[world])
         if not (begins or commanded):
             return
-        draw = make_stream(env.seed, world, env.clock[world], RESET)
-        draw.lane = lane
-        draw.lanes = lanes
-        level = env.level[world]
+        rng = make_stream(episode.seed, world, episode.step_count[world], RESET)
+        rng.lane = lane
+        rng.lanes = lanes
+        level = episode.level[world]
         if level >= levels.shape[0]:
-            level = wp.min(int(uniform(draw, ANY_LEVEL, 0.0, float(levels.shape[0]))), levels.shape[0] - 1)
+            level = wp.min(int(uniform(rng, ANY_LEVEL, 0.0, float(levels.shape[0]))), levels.shape[0] - 1)
         if begins:
-            old = before_reset(states[world], env.done[world])
-            state = wp.static(reset)(arrays, scene, skills[skill], old, settings[0], levels[level], draw)
-            sync_attempts(draw)
+            old = previous_state(states[world], episode.done[world])
+            state = wp.static(reset)(arrays, scene, skills[skill], old, settings[0], levels[level], rng)
+            sync_attempts(rng)
             if lane == 0:
                 states[world] = state
-                env.history_reset[world] = BEGUN
-                env.broken[world] = 0
+                episode.history_reset[world] = BEGUN
+                episode.diverged[world] = 0
         elif wp.static(command is not None):
             if lane == 0:
                 robot = load_view(arrays, scene.ground, world)
-                fresh = make_stream(env.seed, world, env.clock[world], COMMAND)
+                fresh = make_stream(episode.seed, world, episode.step_count[world], COMMAND)
                 states[world] = wp.static(command)(robot, scene, states[world], levels[level], fresh)
-                env.history_reset[world] = COMMANDED
+                episode.history_reset[world] = COMMANDED
 
     return reset_kernel
 
 
 def make_set_command_kernel(task: Any) -> wp.Kernel:
-    """Return the kernel that gives worlds a command from outside."""
+    """Return the kernel that sets commands from the host; task: see `jumper_warp.tasks.cfg.TaskCfg`."""
     give = task.command.give
 
     @wp.kernel(module="unique", enable_backward=False)
@@ -101,33 +101,33 @@ def make_set_command_kernel(task: Any) -> wp.Kernel:
         scene: Scene,
         arrays: RobotArrays,
         # in, out
-        env: EnvArrays,
+        episode: EpisodeArrays,
         states: wp.array(dtype=task.state),
     ):
-        """Give a command where mask is not 0; one thread per world.
+        """Set a command where mask != 0; one thread per world.
 
-        begins 1: to a new episode, with its heading [rad]; 0: to the one under way, in the heading that the robot has.
+        begins 1: of a new episode, with its heading [rad]; 0: within the episode, relative to the robot's yaw.
         """
         world = wp.tid()
-        if env.skill[world] != skill or mask[world] == 0.0:
+        if episode.skill[world] != skill or mask[world] == 0.0:
             return
         robot = load_view(arrays, scene.ground, world)
         if begins != 0:
             fresh = task.state()
             states[world] = wp.static(give)(robot, scene, fresh, values[world], headings[world])
-            env.history_reset[world] = BEGUN
-            env.broken[world] = 0
+            episode.history_reset[world] = BEGUN
+            episode.diverged[world] = 0
         else:
             states[world] = wp.static(give)(robot, scene, states[world], values[world], yaw_of(robot.quat))
-            if env.history_reset[world] != BEGUN:
-                env.history_reset[world] = COMMANDED
+            if episode.history_reset[world] != BEGUN:
+                episode.history_reset[world] = COMMANDED
 
     return set_command_kernel
 
 
 @wp.func
 def leg_limits(params: FilterParams) -> LegLimits:
-    """Return the limits of a command filter as those of the inverse kinematics."""
+    """Return a command filter's angle limits [rad] as limits of the inverse kinematics."""
     limits = LegLimits()
     limits.lateral_lower = params.lateral.lower
     limits.lateral_upper = params.lateral.upper
@@ -139,8 +139,8 @@ def leg_limits(params: FilterParams) -> LegLimits:
 
 
 @wp.func
-def store_pose(arrays: RobotArrays, scene: Scene, world: int, heading: float, lift: float):
-    """Write the model's reference pose at rest, turned to a heading [rad] and lifted [m]."""
+def write_default_pose(arrays: RobotArrays, scene: Scene, world: int, heading: float, ground_height: float):
+    """Write the default pose at rest, with a yaw `heading` [rad], on ground of height `ground_height` [m]."""
     q = world * COORDS
     for j in range(int(COORDS)):
         arrays.joint_q[q + j] = scene.reference_q[q + j]
@@ -149,11 +149,11 @@ def store_pose(arrays: RobotArrays, scene: Scene, world: int, heading: float, li
     turn = wp.quat_from_axis_angle(wp.vec3(0.0, 0.0, 1.0), heading)
     for j in range(4):
         arrays.joint_q[q + 3 + j] = turn[j]
-    arrays.joint_q[q + 2] = scene.reference_q[q + 2] + lift
+    arrays.joint_q[q + 2] = scene.reference_q[q + 2] + ground_height
 
 
 @wp.kernel
-def stand_kernel(
+def default_pose_kernel(
     # in
     mask: wp.array(dtype=float),
     headings: wp.array(dtype=float),
@@ -163,15 +163,15 @@ def stand_kernel(
     # in, out
     arrays: RobotArrays,
 ):
-    """Stand robots in the default pose with a heading [rad] where mask is not 0, blocks at their starts.
+    """Put robots with mask != 0 into the default pose with a heading [rad], and blocks to their starts.
 
-    They are lifted off the ground as the skill says that each world is in.
+    The base is above the ground by the `lift` of the world's skill; one thread per world.
     """
     world = wp.tid()
     if mask[world] != 0.0:
         rest_block(scene.ground, world)
-        lift = surface(world_ground(scene.ground, world), 0.0, 0.0)[0] + skills[skill[world]].lift
-        store_pose(arrays, scene, world, headings[world], lift)
+        ground_height = surface(world_ground(scene.ground, world), 0.0, 0.0)[0] + skills[skill[world]].lift
+        write_default_pose(arrays, scene, world, headings[world], ground_height)
 
 
 @wp.kernel
@@ -179,12 +179,12 @@ def advance_rng_kernel(
     # in
     mask: wp.array(dtype=float),
     # in, out
-    env: EnvArrays,
+    episode: EpisodeArrays,
 ):
-    """Move the clock on where mask is not 0, so that what follows draws anew; one thread per world."""
+    """Advance the step count where mask != 0, so that the next samples are new ones; one thread per world."""
     world = wp.tid()
     if mask[world] != 0.0:
-        env.clock[world] = env.clock[world] + 1
+        episode.step_count[world] = episode.step_count[world] + 1
 
 
 @wp.kernel
@@ -197,9 +197,9 @@ def clear_history_kernel(
     arrays: RobotArrays,
     delays: Delays,
 ):
-    """Forget the past where mask is not 0: actions, torques, contacts; one thread per (motor, world).
+    """Clear actions, torques, contacts and delays where mask != 0; one thread per (motor, world).
 
-    Paws are taken to be where they are now. first: world of the first thread.
+    Paw positions and velocities are those of the present state. first: world of the first thread.
     """
     m, world = wp.tid()
     world += first
@@ -213,10 +213,10 @@ def clear_history_kernel(
     arrays.prev_action[m, world] = 0.0
     arrays.prev_prev_action[m, world] = 0.0
     arrays.target[m, world] = angle
-    arrays.safe_target[m, world] = angle
+    arrays.filtered_target[m, world] = angle
     arrays.prev_rate[m, world] = arrays.joint_qd[world * DOFS + 6 + slot]
     for i in range(RING):
-        delays.past_target[i, m, world] = angle
+        delays.target_history[i, m, world] = angle
     if m < 4:
         arrays.impulse[m, world] = wp.vec3(0.0)
         arrays.paw_force[m, world] = wp.vec3(0.0)
@@ -226,7 +226,7 @@ def clear_history_kernel(
         arrays.touchdown_speed[m, world] = 0.0
         arrays.paw_height[m, world] = 0.0
         arrays.collisions[m, world] = 0
-        follow_paw(arrays, geometry[m], world, m)
+        update_paw_kinematics(arrays, geometry[m], world, m)
     if m == 0:
         arrays.diverged[world] = 0
         arrays.prev_lin_vel[world] = base_velocity(arrays, world, base_quat(arrays, world))

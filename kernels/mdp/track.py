@@ -1,4 +1,4 @@
-"""Following the paws over a policy step: where they are, how long they have been down or up, and what touches what."""
+"""Paw kinematics, contact timers and collisions at the end of a policy step."""
 
 import warp as wp
 
@@ -8,15 +8,15 @@ from ..kinematics.geometry import LegGeometry
 from ..layout import COORDS
 from ..state import leg_coord, leg_dof, load_motors
 from ..terrain.ground import Ground, grown_block, surface, world_ground
-from .env import EnvArrays, SkillSettings
+from .env import EpisodeArrays, SkillSettings
 from .view import RobotArrays, base_pos, base_quat, base_velocity
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
 
 
 @wp.func
-def follow_paw(arrays: RobotArrays, geo: LegGeometry, world: int, leg: int):
-    """Write place and velocity of a paw."""
+def update_paw_kinematics(arrays: RobotArrays, geo: LegGeometry, world: int, leg: int):
+    """Write position [m] and velocity [m/s] of a paw's centre, world axes."""
     quat = base_quat(arrays, world)
     angles = load_motors(arrays.joint_q, leg_coord(world, leg))
     rates = load_motors(arrays.joint_qd, leg_dof(world, leg))
@@ -30,15 +30,15 @@ def follow_paw(arrays: RobotArrays, geo: LegGeometry, world: int, leg: int):
 
 
 @wp.func
-def height_of_paw(arrays: RobotArrays, geo: LegGeometry, ground: Ground, world: int, leg: int) -> float:
+def paw_clearance(arrays: RobotArrays, geo: LegGeometry, ground: Ground, world: int, leg: int) -> float:
     """Return the height of a paw's lowest point above the ground below its centre [m]."""
     pos = arrays.paw_pos[leg, world]
     return pos[2] - surface(world_ground(ground, world), pos[0], pos[1])[0] - geo.paw_radius
 
 
 @wp.func
-def time_contact(arrays: RobotArrays, world: int, leg: int, down: bool):
-    """Count how long a paw has been down or up; `air_time` stays through the step of its first contact."""
+def update_contact_timers(arrays: RobotArrays, world: int, leg: int, down: bool):
+    """Update contact and air time [s] of a paw; `air_time` stays through the step of its first contact."""
     was_down = arrays.contact_time[leg, world] > 0.0
     if down:
         if was_down:
@@ -59,18 +59,18 @@ def track_kernel(
     geometry: wp.array(dtype=LegGeometry),
     ground: Ground,
     skills: wp.array(dtype=SkillSettings),
-    env: EnvArrays,
+    episode: EpisodeArrays,
     # in, out
     arrays: RobotArrays,
 ):
-    """Follow every paw, and find what must not touch; one thread per (leg, world)."""
+    """Update every paw's kinematics and contact, and each leg's collision flags; one thread per (leg, world)."""
     leg, world = wp.tid()
-    world += env.first
-    skill = skills[env.skill[world]]
+    world += episode.first
+    skill = skills[episode.skill[world]]
     down = wp.length(arrays.paw_force[leg, world]) > skill.contact_force
-    time_contact(arrays, world, leg, down)  # before the velocity of the step before is written over
-    follow_paw(arrays, geometry[leg], world, leg)
-    arrays.paw_height[leg, world] = height_of_paw(arrays, geometry[leg], ground, world, leg)
+    update_contact_timers(arrays, world, leg, down)  # before the velocity of the step before is written over
+    update_paw_kinematics(arrays, geometry[leg], world, leg)
+    arrays.paw_height[leg, world] = paw_clearance(arrays, geometry[leg], ground, world, leg)
     here = grown_block(world_ground(ground, world), skill.block_margin)
     arrays.collisions[leg, world] = leg_collisions(
         geometry, here, arrays.joint_q, world * COORDS, leg, skill.link_margin

@@ -3,7 +3,7 @@
 import warp as wp
 
 from ..layout import BODIES
-from ..mdp.view import RobotArrays, RobotView, base_pos, base_quat, turned, yaw_of
+from ..mdp.view import RobotArrays, RobotView, base_pos, base_quat, rotate_yaw, yaw_of
 from ..terrain.ground import Ground, surface, world_ground
 from .state import POLICY_RATE, VelocityState
 
@@ -18,7 +18,7 @@ def command(robot: RobotView, state: VelocityState) -> wp.vec3:
 
 
 @wp.func
-def clock(robot: RobotView, state: VelocityState) -> wp.vec2:
+def step_count(robot: RobotView, state: VelocityState) -> wp.vec2:
     """Sine and cosine of the gait's phase."""
     angle = 2.0 * wp.pi * state.phase
     return wp.vec2(wp.sin(angle), wp.cos(angle))
@@ -66,6 +66,6 @@ def ground_heights(arrays: RobotArrays, ground: Ground, world: int) -> vec15:
     heading = yaw_of(base_quat(arrays, world))
     found = vec15()
     for i in range(15):
-        way = turned(wp.vec3(0.25 * float(i / 3 - 2), 0.2 * float(i % 3 - 1), 0.0), heading)
+        way = rotate_yaw(wp.vec3(0.25 * float(i / 3 - 2), 0.2 * float(i % 3 - 1), 0.0), heading)
         found[i] = pos[2] - surface(here, pos[0] + way[0], pos[1] + way[1])[0] - 0.35
     return found

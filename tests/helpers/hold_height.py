@@ -86,12 +86,12 @@ def advance_hold(robot: mdp.RobotView, state: HoldState, tolerance: float) -> Ho
 @wp.func
 def reset_hold(
     robot: mdp.RobotArrays, scene: mdp.Scene, skill: mdp.SkillSettings, old: HoldState, settings: HoldSettings,
-    level: HoldLevel, draw: mdp.RngStream,
+    level: HoldLevel, rng: mdp.RngStream,
 ) -> HoldState:  # fmt: skip
     """Stand in the default pose with any heading."""
-    mdp.store_pose(robot, scene, draw.world, mdp.uniform(draw, 0, -settings.heading, settings.heading), 0.0)
+    mdp.write_default_pose(robot, scene, rng.world, mdp.uniform(rng, 0, -settings.heading, settings.heading), 0.0)
     new = HoldState()
-    new.goal = mdp.uniform_range(draw, 1, level.goal)
+    new.goal = mdp.uniform_range(rng, 1, level.goal)
     new.lasts = settings.lasts
     return new
 
@@ -113,12 +113,12 @@ def another_goal_due(state: HoldState) -> bool:
 
 
 @wp.func
-def draw_goal(
-    robot: mdp.RobotView, scene: mdp.Scene, state: HoldState, level: HoldLevel, draw: mdp.RngStream
+def sample_goal(
+    robot: mdp.RobotView, scene: mdp.Scene, state: HoldState, level: HoldLevel, rng: mdp.RngStream
 ) -> HoldState:
     """Command another height."""
     new = state
-    new.goal = mdp.uniform_range(draw, 1, level.goal)
+    new.goal = mdp.uniform_range(rng, 1, level.goal)
     new.age = 0
     return new
 
@@ -154,11 +154,11 @@ def wanted_height(robot: mdp.RobotView, state: HoldState) -> float:
 
 
 @wp.func
-def weak_motors(robot: mdp.RobotParameters, draw: mdp.RngStream, lower: float, upper: float):
+def weak_motors(robot: mdp.RobotParameters, rng: mdp.RngStream, lower: float, upper: float):
     """Scale the torque limit of each motor."""
     for m in range(12):
-        robot.torque_ratio[m, draw.world] = mdp.uniform(draw, m, lower, upper)
-        mdp.events.set_torque_limit(robot, draw.world, m)
+        robot.torque_ratio[m, rng.world] = mdp.uniform(rng, m, lower, upper)
+        mdp.events.set_torque_limit(robot, rng.world, m)
 
 
 def hold_height() -> mdp.TaskCfg:
@@ -175,7 +175,7 @@ def hold_height() -> mdp.TaskCfg:
         state=HoldState,
         advance=mdp.Advance(advance_hold, tolerance=0.02),
         reset=mdp.Reset(reset_hold, HoldResetCfg()),
-        command=mdp.Command(give_hold, another_goal_due, draw_goal),
+        command=mdp.Command(give_hold, another_goal_due, sample_goal),
         curriculum=mdp.Curriculum(height_error, tolerance=0.03, promote_after=2, counts=every_episode),
         rewards=(
             mdp.RewardTerm(near_goal, 60.0, width=0.05),

@@ -35,7 +35,7 @@ def robot_of(env) -> dict[str, np.ndarray]:
         "peak": views.peak_force.numpy().astype(float),
         "paws": views.paw_pos.numpy().astype(float),
         "air_time": views.air_time.numpy().astype(float),
-        "clipped": np.sum((views.target.numpy().astype(float) - views.safe_target.numpy()) ** 2, axis=0),
+        "clipped": np.sum((views.target.numpy().astype(float) - views.filtered_target.numpy()) ** 2, axis=0),
     }
     return robot | {name: tasks[name].copy() for name in EPISODE}
 

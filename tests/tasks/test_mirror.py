@@ -24,8 +24,8 @@ QUAT = np.array([-1.0, 1.0, -1.0, 1.0])
 
 def task():
     """The task on rough ground with a clock, so that every term of all velocity tasks is there."""
-    rough, clock = make_task("velocity-rough"), ObservationTerm(velocity.clock)
-    return dataclasses.replace(rough, policy=(*rough.policy, clock), critic=(*rough.critic, clock))
+    rough, step_count = make_task("velocity-rough"), ObservationTerm(velocity.step_count)
+    return dataclasses.replace(rough, policy=(*rough.policy, step_count), critic=(*rough.critic, step_count))
 
 
 def reflected(values, change):
@@ -90,8 +90,8 @@ def reflection():
         command_steps=state["command_steps"][:HALF],
     )
     parameters.observation_latency.zero_()
-    env.worlds.broken.zero_()
-    env.worlds.history_reset.fill_(1)
+    env.episodes.diverged.zero_()
+    env.episodes.history_reset.fill_(1)
     env.stages()["observe"]()
     return env.task, {"policy": env.obs.numpy().copy(), "critic": env.critic_obs.numpy().copy()}
 

@@ -8,7 +8,7 @@ import pytest
 from jump_helpers import (
     DEFAULT_ANGLE,
     DEG,
-    SCHEMES,
+    NUM_START_MODES,
     begin_by,
     edit_episodes,
     episodes_of,
@@ -76,23 +76,23 @@ def euler(quat):
     return np.stack([roll, pitch, np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))], axis=1)
 
 
-def some(episodes, scheme, count=60):
-    return np.flatnonzero(episodes["scheme"] == SCHEMES.index(scheme))[:count]
+def some(episodes, start_mode, count=60):
+    return np.flatnonzero(episodes["start_mode"] == NUM_START_MODES.index(start_mode))[:count]
 
 
 def test_schemes_have_their_shares(drawn):
     _, episodes, _, _ = drawn
-    shares = np.bincount(episodes["scheme"], minlength=5) / N
+    shares = np.bincount(episodes["start_mode"], minlength=5) / N
     assert np.abs(shares - SHARES).max() < 4.0 * np.sqrt(0.25 / N)
 
 
 def test_phase_and_counters_fit_the_scheme(drawn):
     _, episodes, _, qd = drawn
-    phases = np.array([STANCE, STANCE, FLIGHT, FLIGHT, LANDED])[episodes["scheme"]]
+    phases = np.array([STANCE, STANCE, FLIGHT, FLIGHT, LANDED])[episodes["start_mode"]]
     np.testing.assert_array_equal(episodes["phase"], phases)
     for name in ("steps", "idle_steps", "took_off", "touched_down", "at_apex", "streak"):
         assert not episodes[name].any(), name
-    on_feet = episodes["scheme"] < 2
+    on_feet = episodes["start_mode"] < 2
     assert uniform_range(episodes["command_step"][on_feet], 0, 30) and not episodes["command_step"][~on_feet].any()
     landed = episodes["phase"] == LANDED
     assert uniform_range(episodes["phase_steps"][landed], 0, 17) and not episodes["phase_steps"][~landed].any()
@@ -113,10 +113,10 @@ def test_goals_and_starts_are_within_the_level(drawn):
     np.testing.assert_array_equal(default, np.broadcast_to(DEFAULT_ANGLE.astype(np.float32), default.shape))
 
 
-@pytest.mark.parametrize("scheme", ["standing", "in_flight", "touchdown", "landed"])
-def test_base_place_and_attitude_cover_their_ranges(drawn, scheme):
+@pytest.mark.parametrize("start_mode", ["standing", "in_flight", "touchdown", "landed"])
+def test_base_place_and_attitude_cover_their_ranges(drawn, start_mode):
     _, episodes, q, qd = drawn
-    worlds = some(episodes, scheme, N)
+    worlds = some(episodes, start_mode, N)
     for axis in (0, 1):
         assert uniform_range(q[worlds, axis], -0.05, 0.05)
         assert uniform_range(euler(q[worlds, 3:7])[:, axis], -5.0 * DEG, 5.0 * DEG)
@@ -136,14 +136,14 @@ def test_a_share_of_the_commands_comes_after_a_long_wait(begun, share):
     assert np.abs(np.cumsum(counts) / N - np.cumsum(expected)).max() < 1.95 / np.sqrt(N)  # Kolmogorov, 1 in 1000
 
 
-@pytest.mark.parametrize("scheme", ["standing", "default", "landed"])
-def test_robots_on_their_feet_have_their_paws_at_rest_on_the_ground(drawn, scheme):
+@pytest.mark.parametrize("start_mode", ["standing", "default", "landed"])
+def test_robots_on_their_feet_have_their_paws_at_rest_on_the_ground(drawn, start_mode):
     env, episodes, _, _ = drawn
-    worlds = some(episodes, scheme)
+    worlds = some(episodes, start_mode)
     position, velocity = paws_and_velocities(env, worlds)
     np.testing.assert_allclose(position[..., 2], PAW_RADIUS, atol=2e-4)
     np.testing.assert_allclose(velocity, 0.0, atol=2e-3)
-    if scheme != "default":
+    if start_mode != "default":
         spots = position * np.array([[1, 1, 1], [1, -1, 1], [-1, 1, 1], [-1, -1, 1]])
         assert uniform_range(spots[..., 0], 0.20, 0.22, 0.1)
         assert uniform_range(spots[:, :2, 1], 0.15, 0.17, 0.1) and uniform_range(spots[:, 2:, 1], 0.20, 0.22, 0.1)
@@ -156,10 +156,10 @@ def test_landed_robots_still_fall(drawn):
     assert np.abs(qd[worlds][:, MOTOR_V]).max() > 1.0
 
 
-@pytest.mark.parametrize("scheme", ["in_flight", "touchdown"])
-def test_flights_are_on_a_projectile_to_the_goal(drawn, scheme):
+@pytest.mark.parametrize("start_mode", ["in_flight", "touchdown"])
+def test_flights_are_on_a_projectile_to_the_goal(drawn, start_mode):
     _, episodes, q, qd = drawn
-    worlds = some(episodes, scheme, N)
+    worlds = some(episodes, start_mode, N)
     apex = q[worlds, 2] + qd[worlds, 2] ** 2 / (2.0 * G)
     # from a takeoff height of 0.40 to 0.45 m; a goal below it is the takeoff itself
     goal = episodes["goal"][worlds, 2]
@@ -170,7 +170,7 @@ def test_flights_are_on_a_projectile_to_the_goal(drawn, scheme):
     assert not qd[worlds][:, MOTOR_V].any()
     # touchdowns begin at most 0.15 s before landing: after the apex of a jump of more than 0.3 s
     rising = np.mean(qd[worlds[goal > 0.6], 2] > 0.0)
-    assert rising == 0.0 if scheme == "touchdown" else 0.3 < rising < 0.7
+    assert rising == 0.0 if start_mode == "touchdown" else 0.3 < rising < 0.7
 
 
 def test_flights_cover_the_leg_ranges_and_touchdowns_reach_for_the_ground(drawn):
@@ -202,12 +202,12 @@ def test_draws_that_collide_are_drawn_again(begun):
     for reset in (only("standing"), only("in_flight", flight_transversal=(-30.0, 60.0))):
         env = begun(reset, level)
         assert not collision_flags(env).any()
-        assert np.mean(env.task_arrays()["scheme"] == SCHEMES.index("default")) < 0.5
+        assert np.mean(env.task_arrays()["start_mode"] == NUM_START_MODES.index("default")) < 0.5
 
 
 def test_the_same_draw_is_taken_once(drawn):
     _, episodes, q, _ = drawn
-    moving = episodes["scheme"] != SCHEMES.index("default")
+    moving = episodes["start_mode"] != NUM_START_MODES.index("default")
     assert len(np.unique(q[moving, :3], axis=0)) == moving.sum()
 
 
@@ -219,17 +219,17 @@ def test_loops_are_closed():
     assert env.sim.loop_gap().max() < 1e-5
 
 
-@pytest.mark.parametrize("scheme", ["standing", "in_flight", "touchdown", "landed"])
-def test_the_default_pose_rarely_stands_in(begun, scheme):
-    env = begun(only(scheme), Level((0.0, 0.0, 0.45), (0.0, 0.0, 1.2), (0.22, 0.45)))
-    assert np.mean(env.task_arrays()["scheme"] == SCHEMES.index("default")) < 0.005
+@pytest.mark.parametrize("start_mode", ["standing", "in_flight", "touchdown", "landed"])
+def test_the_default_pose_rarely_stands_in(begun, start_mode):
+    env = begun(only(start_mode), Level((0.0, 0.0, 0.45), (0.0, 0.0, 1.2), (0.22, 0.45)))
+    assert np.mean(env.task_arrays()["start_mode"] == NUM_START_MODES.index("default")) < 0.005
 
 
 def test_a_state_that_cannot_be_reached_becomes_the_default_pose():
     # a base 0.7 m above paws on the ground: beyond the legs' length
     level = Level((0.0, 0.0, 0.5), (0.0, 0.0, 0.6), (0.7, 0.8))
     env = make_env(16, reset=only("standing"), task=dataclasses.replace(TASK, levels=(level,)))
-    assert env.task_arrays()["scheme"].tolist() == [SCHEMES.index("default")] * 16
+    assert env.task_arrays()["start_mode"].tolist() == [NUM_START_MODES.index("default")] * 16
     np.testing.assert_array_equal(env.sim.joint_q(), env.sim.model.joint_q.numpy().reshape(16, -1))
 
 

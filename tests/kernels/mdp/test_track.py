@@ -4,7 +4,7 @@ import pytest
 import warp as wp
 
 from jump_starts import ANKLE
-from jumper_warp.envs.skill import Skill
+from jumper_warp.envs.skill import TaskRuntime
 from jumper_warp.kernels.collision.robot import collision_kernel
 from jumper_warp.kernels.mdp.env import SkillSettings
 from jumper_warp.kernels.mdp.track import track_kernel
@@ -24,7 +24,7 @@ def contact_force(force, link_margin=0.0, block_margin=0.0):
     """Return the settings of skills with a least contact force [N] each."""
     settings = []
     for least in np.atleast_1d(force):
-        found = Skill(make_task("vertical-jump"), 0, 1, STEP_DT, 8, "cpu").settings_of_skill()
+        found = TaskRuntime(make_task("vertical-jump"), 0, 1, STEP_DT, 8, "cpu").settings_of_skill()
         found.contact_force, found.link_margin, found.block_margin = float(least), link_margin, block_margin
         settings.append(found)
     return wp.array(settings, dtype=SkillSettings, device="cpu")
@@ -240,7 +240,7 @@ def test_blocks_are_larger_by_their_margin_for_links_but_not_for_paws(sim, poses
         ground.blocks, robot.joint_q = blocks(n, drawn), poses
         track(robot, sim, ground=ground, settings=contact_force(0.1, block_margin=settings))
         found.append((robot.collisions.numpy().copy(), robot.paw_height.numpy().copy()))
-    (flags, heights), (grown, _), (plain, level) = found
+    (flags, heights), (grown, _), (parameterless, level) = found
     np.testing.assert_array_equal(flags, grown)
-    assert (flags & plain == plain).all() and (flags != plain).any(axis=0).sum() > 20
+    assert (flags & parameterless == parameterless).all() and (flags != parameterless).any(axis=0).sum() > 20
     np.testing.assert_array_equal(heights, level)
