@@ -282,8 +282,8 @@ def find_multipliers(
 ) -> Multipliers:  # fmt: skip
     """Return the multipliers of a step's equations, given the gradients by the velocities at its end.
 
-    See `step_adjoint` for the equations. lin_cotangent, ang_cotangent: by the base's, body axes. legs: `rates` are those
-    by the motors' rates, to which the contact laws' part is added; multipliers, contacts and laws are written.
+    See `step_adjoint` for the equations. lin_cotangent, ang_cotangent: by the base's, body axes. legs: `rates` are
+    those by the motors' rates, to which the contact laws' part is added; multipliers, contacts and laws are written.
     """
     m = solve_system(record, at, lin_cotangent, ang_cotangent, legs)
     if write_laws(model, at, first_impulse, trajectory, record, m, cotangent, legs):
