@@ -1,7 +1,7 @@
-"""Exchange between the threads of a GPU's warp that share a world: four, a thread a leg, or 32, eight attempts of four.
+"""Exchange between the threads of a GPU's warp that share a world: four, one per leg, or 32, eight attempts of four.
 
 Legs are neighbours, leg fastest, and all threads of a warp must reach every call together: none may stand behind an
-`and` or `or`, which leave out what no longer matters, or in a branch that not all take. On the CPU, where these
+`and` or `or`, which may skip them, or in a branch that not all take. On the CPU, where these
 functions serve tests, a block is the threads of one world (launch with `block_dim=4`, or 32).
 """
 
@@ -130,7 +130,7 @@ def any_world(flag: bool) -> bool:
 
 @wp.func_native(_MEET)
 def sync_lanes():
-    """Wait until the threads of a world got here; each then sees what the others wrote to memory."""
+    """Synchronise the threads of a world; memory writes before it are visible to all of them after it."""
     ...
 
 

@@ -76,7 +76,7 @@ def filter_leg(target: vec3, pos: vec3, vel: vec3, params: FilterParams) -> vec3
     """Return the filtered targets [rad] of one leg. All vectors: (lateral, outer, inner), [rad] and [rad/s].
 
     The single motors' limits come first. The limits of the transversal sum then act on the sum of what is left, and
-    both transversal commands give way by half of what they must.
+    each transversal command takes half of the correction.
     """
     t, h, v = params.transversal, params.horizon, params.speed_floor
     lateral = limit_command(wp.clamp(target[0], -COMMAND_BOUND, COMMAND_BOUND), pos[0], vel[0], params.lateral, h, v)
@@ -104,7 +104,7 @@ def command_filter_kernel(
     """Filter the motor targets of every leg. Launch over (4, worlds from `first` on).
 
     raw_target, filtered_target [rad]: (12, num_worlds). joint_q, joint_qd: flat over worlds, laid out as Newton's.
-    offset [rad]: what each position sensor reads above the true angle, (12, num_worlds); the filter sees what it reads.
+    offset [rad]: added by each position sensor to the true angle, (12, num_worlds); the filter uses the reading.
     """
     leg, world = wp.tid()
     world += first

@@ -11,8 +11,8 @@ It gives back no more than the spring took. With s the speed away from the stop 
 where goal = -gap / dt outside the stop (the gap closes exactly) and -gap ke / c inside. Where a stop is pressed,
 torque = c (goal - s) is linear in the rates, so that it joins the leg's inertia as damping does (`joint_forces`).
 
-Which stops are pressed is settled together with contact: a step is solved with a set of pressed stops, and again with
-another one until the set is the one that the resulting rates ask for (`pressed_stops`). Most steps need one set, few
+The pressed stops are found together with contact: a step is solved with a set of pressed stops, and again with
+another one until the set is the one that the resulting rates require (`pressed_stops`). Most steps need one set, few
 three. Friction can make sets cycle, in a violent impact on jammed legs: stops are then pressed and no more released.
 """
 

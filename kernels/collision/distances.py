@@ -1,4 +1,4 @@
-"""Distances between the simple shapes that stand for links: capsules and boxes.
+"""Distances between the simple shapes that model links: capsules and boxes.
 
 A sphere is a capsule of zero length. Distances are signed as far as the radii go: two overlapping capsules report
 minus their overlap, but never less than minus the sum of their radii.

@@ -84,8 +84,8 @@ def contact_jacobian(paw: PawKinematics, arm: vec3) -> mat33:
 def target_normal_velocity(gap: real, pressed: int, dt: real) -> real:
     """Return the smallest admissible normal velocity [m/s] for a gap [m]: close it exactly, push penetration out.
 
-    pressed: the leg's pressed hard stops. On stops the legs carry the body as those of a table, and what rounding adds
-    to a gap would shift load between them: then gaps within `STIFF_BAND` stay, and close gently at first beyond it.
+    pressed: the leg's pressed hard stops. On stops the legs are stiff like those of a table, and the rounding error
+    of a gap would shift load between them: then gaps within `STIFF_BAND` stay, and close gently at first beyond it.
     """
     beyond = gap
     if pressed != 0:

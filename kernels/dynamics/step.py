@@ -1,4 +1,4 @@
-"""The parts of a time step that `advance` and `advance_legs` put together: a leg's terms, a paw's contact, the base.
+"""The parts of a time step shared by `advance` and `advance_legs`: a leg's terms, a paw's contact, the base.
 
 Semi-implicit Euler: forces and Jacobians at the start of the step, positions moved with the velocities at its end.
 """

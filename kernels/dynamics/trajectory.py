@@ -45,9 +45,7 @@ class Commands:
     """Inputs of a rollout of T policy steps."""
 
     target: wp.array3d(dtype=real)  # [rad], (T, 12, num_worlds)
-    initial_target: wp.array2d(
-        dtype=real
-    )  # [rad], (12, num_worlds): what the motors follow until the first target arrives
+    initial_target: wp.array2d(dtype=real)  # [rad], (12, num_worlds), followed until the first target arrives
     wrench: wp.array3d(dtype=real)  # [N], [N m] at the base's com, world axes, (T, 6, num_worlds)
     impulse: wp.array2d(dtype=vec3)  # [N s] of each paw in the step before the first, world axes, (4, num_worlds)
 

@@ -1,4 +1,4 @@
-"""The ground that the paws stand on: a plane z = 0 or a heightfield, and in each world a block that slides on it.
+"""The ground under the paws: a plane z = 0 or a heightfield, and in each world a block that slides on it.
 
 Functions of a point take the ground of one world, whose block `world_ground` has copied to `Ground.block`.
 """

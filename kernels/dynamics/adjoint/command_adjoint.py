@@ -36,11 +36,10 @@ class FilterAdjoint:
 
 @wp.func
 def add_target(gradients: Gradients, step: int, motor: int, world: int, gradient: real):
-    """Add to the gradient by a motor's filtered target of a policy step, or by what it followed before the first."""
+    """Add to the gradient by a motor's filtered target of a policy step, or, for step -1, by its initial target."""
     if step < 0:
-        wp.atomic_add(
-            gradients.initial_target, motor, world, gradient
-        )  # no other thread does; so none waits for what was there
+        # atomic to avoid a load: no other thread writes here
+        wp.atomic_add(gradients.initial_target, motor, world, gradient)
     else:
         wp.atomic_add(gradients.filtered_target, step, motor, world, gradient)
 

@@ -44,7 +44,7 @@ wp.set_module_options({"enable_backward": False})
 # rows of a leg's geometry: hip (3), then the lengths in the order of `LegGeometry`, its signs left out
 GEOMETRY_ROWS = wp.constant(10)
 
-# rows of the gradient by what a world has throughout: the parameter table, then 12 a motor constant, then
+# rows of the gradient by a world's parameters: the parameter table, then 12 per motor constant, then
 MOTOR_GRADIENT = wp.constant(PARAMETER_ROWS)  # kp, kd, saturation, peak, cutoff_speed, no_load_speed, offset
 FADE_GRADIENT = wp.constant(MOTOR_GRADIENT + 84)  # 2: start and end
 LATENCY_GRADIENT = wp.constant(FADE_GRADIENT + 2)
@@ -202,7 +202,7 @@ def add_com(sums: Any, mass: real, com: vec3, gradient: vec3):
 
 @wp.func
 def add_motor(sums: Any, shared: Any, motor: int, scale: real, p: MotorParams):
-    """Add `scale` times a gradient by a motor's constants, to `shared` what all motors have in common."""
+    """Add `scale` times a gradient by a motor's constants, to `shared` the constants that all motors share."""
     row = MOTOR_GRADIENT + motor
     add_entry(sums, row, scale * p.kp)
     add_entry(sums, row + 12, scale * p.kd)

@@ -1,8 +1,8 @@
 """`step_adjoint` for GPUs, with a thread per leg; each of a world's four computes the base's part. In three parts.
 
-What depends on the motion alone is made for many steps side by side (`replay_leg`), the inverse of the system of
-the contact laws' multipliers too. Only what must go from step to step backwards does so (`reverse_leg`). It leaves the
-multipliers, from which the gradients by parameters follow, again for many steps side by side (`add_leg_constants`).
+`replay_leg` recomputes the motion and inverts the system of the contact laws' multipliers, for many steps in parallel.
+`reverse_leg` goes backwards from step to step and records multipliers. The gradients by parameters follow from these,
+again for many steps in parallel (`add_leg_constants`).
 """
 
 import warp as wp

@@ -4,7 +4,7 @@
 
 Backwards, `integrate_kernel` hands the gradient by the velocities at the end of the step to `find_multipliers`, and
 `power_kernel` is the scalar whose derivatives by all that the step read are those of the step: the virtual power of its
-equations of motion, weighed with these multipliers (see `step_adjoint`).
+equations of motion, weighted with these multipliers (see `step_adjoint`).
 """
 
 import warp as wp
@@ -25,7 +25,7 @@ from .virtual_power import BaseCotangent, BaseFactors, LegFactors, base_action, 
 
 @wp.struct
 class SolvedStep:
-    """A step on the tape, arrays by world or by (leg, world): its solution, and what the reverse pass finds of it."""
+    """A step on the tape, arrays by world or by (leg, world): its solution, and multipliers of the reverse pass."""
 
     trajectory: TrajectoryArrays  # torques, impulses and pressed stops, shape (1, ..., num_worlds)
     old_impulse: wp.array2d(dtype=vec3)  # [N s] on each paw in the step before, world axes
@@ -34,9 +34,9 @@ class SolvedStep:
     rates: wp.array2d(dtype=vec3)  # [rad/s] of the motors
     base: wp.array(dtype=BaseFactors)
     cotangent: wp.array(dtype=BaseCotangent)
-    ang_cotangent: wp.array(dtype=vec3)  # weight of the base's angular velocity at the start
+    ang_cotangent: wp.array(dtype=vec3)  # gradient by the base's angular velocity at the start
     legs: wp.array2d(dtype=LegFactors)
-    rate_cotangent: wp.array2d(dtype=vec3)  # weight of the motors' rates at the start
+    rate_cotangent: wp.array2d(dtype=vec3)  # gradient by the motors' rates at the start
     mu_row: wp.array2d(dtype=int)  # row of the friction coefficient in the parameter table
 
 

@@ -375,7 +375,7 @@ def leg_action(
 
 @wp.struct
 class BaseCotangent:
-    """Cotangents of what else depends on the base's orientation and velocity."""
+    """Cotangents of further quantities that depend on the base's orientation and velocity."""
 
     velocity: vec3  # of its linear velocity at the start of the step, body axes
     new_velocity: vec3  # of its linear velocity at the end of the step, world axes
@@ -387,7 +387,7 @@ def base_action(
     body: MassMoments, com: vec3, gravity: vec3, force: vec3, moment: vec3, orientation: quat, lin: vec3, omega: vec3,
     base: BaseFactors, cotangent: BaseCotangent, dt: real,
 ) -> real:  # fmt: skip
-    """Return the base link's part of the scalar, and cotangents . what else depends on its orientation and velocity.
+    """Return the base link's part of the scalar, plus `cotangent` . (gravity in body axes and the base's velocities).
 
     gravity [m/s^2], external force [N] and moment [N m] at the com, lin [m/s]: world axes; com [m], omega [rad/s]: body
     axes; orientation: xyzw.

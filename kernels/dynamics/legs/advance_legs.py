@@ -3,8 +3,8 @@
 A thread holds one leg and a copy of the base; the base's equations are sums over the four threads. The contact law is
 that of `contact`; here all paws propose their next impulse at once, until none would change its contact velocity by
 more than the tolerance. All take it, since paws are coupled through the heavy base only; should the largest change not
-shrink so, the paw that would change most takes its own alone from then on. A step whose stops turn out wrong (see
-`world_step`) is made again by its world, while the others of a warp go on.
+shrink so, the paw that would change most takes its own alone from then on. A step whose set of stops turns out
+wrong (see `world_step`) is repeated by its world, while the others of a warp continue.
 """
 
 import warp as wp

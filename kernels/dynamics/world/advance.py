@@ -1,7 +1,7 @@
-"""The kernel that advances every world by several steps in one launch, a thread a world: the CPU's.
+"""The kernel that advances every world by several steps in one launch, with one thread per world: the CPU's.
 
-On one CPU thread `advance_legs`, with a thread a leg, takes 4.1 to 4.8 times as long a policy step (64 and 512 worlds,
-standing and jumping).
+On one CPU thread `advance_legs`, with a thread per leg, takes 4.1 to 4.8 times as long per policy step (64 and 512
+worlds, standing and jumping).
 """
 
 import warp as wp
