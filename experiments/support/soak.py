@@ -67,7 +67,7 @@ def simulation_steps(sim: Simulation, args: SoakArgs) -> Iterator[torch.Tensor]:
     if sim.device.is_cuda:
         torch.cuda.set_stream(wp.stream_to_torch(wp.get_stream(sim.device)))
     randomize(sim, np.random.default_rng(args.seed))
-    target, invalid = wp.to_torch(sim.target), wp.to_torch(sim.physics.invalid)
+    target, diverged = wp.to_torch(sim.target), wp.to_torch(sim.physics.diverged)
     lateral, low, high = (np.radians(value) for value in (args.lateral, *args.transversal))
     lower, upper = (
         target.new_tensor([row] * 4).reshape(12, 1) for row in ([-lateral, low, low], [lateral, high, high])
@@ -77,7 +77,7 @@ def simulation_steps(sim: Simulation, args: SoakArgs) -> Iterator[torch.Tensor]:
             target.copy_(lower + (upper - lower) * torch.rand_like(target))
         sim.step()
         last = (step + 1) % args.episode == 0 or step + 1 == args.steps
-        yield (invalid != 0) & last
+        yield (diverged != 0) & last
         if last:  # flagged worlds are counted once
             sim.reset()
 

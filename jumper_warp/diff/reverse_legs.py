@@ -28,7 +28,7 @@ class LegReverse:
     def run(self, settings: Any, motion: list[Any], seeds: Any, gradients: Any) -> None:
         """Add to `gradients`, whose q and qd hold the seeds of the last row.
 
-        settings: `StepSettings`. motion: `Timing`, `Actuation`, `Commands`, filtered targets, `Rows` of the rollout.
+        settings: `StepSettings`. motion: `Timing`, `Actuation`, `Commands`, filtered targets, `TrajectoryArrays`.
         seeds: gradient by these rows.
         """
         robot, record, num = self._dynamics.robot, self._record, self._num

@@ -217,7 +217,7 @@ class Rollout:
         commands = self.dynamics.modules.trajectory.Commands()
         commands.target = self._input("targets", targets, (count, 12))
         q, qd = self._input("q", q, (19,)), self._input("qd", qd, (18,))
-        commands.before = q[7:] if before is None else self._input("before", before, (12,))
+        commands.initial_target = q[7:] if before is None else self._input("before", before, (12,))
         commands.wrench = self._zeros(count, 6, self.num_worlds) if wrench is None else (
             self._input("wrench", wrench, (count, 6)),
         )  # fmt: skip
@@ -267,16 +267,16 @@ class Rollout:
         if trajectory.q.shape != rows_of or trajectory.q.dtype != self.real:
             raise InputError(f"this rollout makes trajectories {rows_of}, got {trajectory.q.shape}")
         seeds = self._seeds(trajectory, {"q": q, "qd": qd, "torque": torque, "impulse": impulse, "safe": safe})
-        rows = modules.trajectory.Rows()
+        rows = modules.trajectory.TrajectoryArrays()
         for name in ("q", "qd", "torque", "impulse", "pressed"):
             setattr(rows, name, getattr(trajectory, name))
         gradients = modules.gradients.Gradients()
-        shapes = {"q": (19,), "qd": (18,), "target": (count, 12), "before": (12,), "wrench": (count, 6),
-                  "safe": (count, 12), "parameters": (int(modules.gradients.GRADIENT_ROWS),)}  # fmt: skip
+        shapes = {"q": (19,), "qd": (18,), "target": (count, 12), "initial_target": (12,), "wrench": (count, 6),
+                  "filtered_target": (count, 12), "parameters": (int(modules.gradients.GRADIENT_ROWS),)}  # fmt: skip
         for name, shape in shapes.items():
             setattr(gradients, name, self._zeros(*shape, n))
         if safe is not None:
-            wp.copy(gradients.safe, safe)  # which the reverse pass adds to
+            wp.copy(gradients.filtered_target, safe)  # which the reverse pass adds to
         motion = [self._timing(count), self._actuation, commands, trajectory.safe, rows]
         if self.by_legs:
             last: Any
@@ -291,13 +291,13 @@ class Rollout:
                 self._record = self.dynamics.step_record(self.every)
             self._launch(modules.rollout_adjoint.reverse_kernel, [*motion, seeds], [self._record, gradients])
         if trajectory.from_start:
-            wp.map(wp.add, gradients.q[7:], gradients.before, out=gradients.q[7:])
-        found = {"targets": gradients.target, "q": gradients.q, "qd": gradients.qd, "before": gradients.before}
+            wp.map(wp.add, gradients.q[7:], gradients.initial_target, out=gradients.q[7:])
+        found = {"targets": gradients.target, "q": gradients.q, "qd": gradients.qd, "before": gradients.initial_target}
         return found | {"wrench": gradients.wrench} | self._named(gradients.parameters)
 
     def _seeds(self, trajectory: Trajectory, given: dict[str, wp.array | None]) -> Any:
-        """Return the kernels' `Rows` of a gradient by a trajectory. Raises InputError: an array unlike it."""
-        seeds = self.dynamics.modules.trajectory.Rows()
+        """Return the gradient by a trajectory as `TrajectoryArrays`. Raises InputError: an array unlike it."""
+        seeds = self.dynamics.modules.trajectory.TrajectoryArrays()
         for name, array in given.items():
             like = getattr(trajectory, name)
             alike = isinstance(array, wp.array) and array.shape == like.shape and array.dtype == like.dtype
@@ -329,7 +329,7 @@ class Rollout:
     def _rows(self, count: int) -> Any:
         """Return an empty trajectory."""
         steps, n = count * self.substeps, self.num_worlds
-        rows = self.dynamics.modules.trajectory.Rows()
+        rows = self.dynamics.modules.trajectory.TrajectoryArrays()
         rows.q, rows.qd = (self._empty(steps // self.every + 1, size, n) for size in (19, 18))
         rows.torque = self._empty(steps, 12, n)
         rows.impulse = self._empty(steps, 4, n, dtype=self.dynamics.modules.scalar.vec3)

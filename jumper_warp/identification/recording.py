@@ -162,7 +162,7 @@ def simulate_plan(
             if held:
                 _put_back(sim, begin)
     table = np.array(found)[:, :, None]
-    valid = np.array([bool(np.isfinite(table).all()) and sim.physics.invalid.numpy()[0] == 0])
+    valid = np.array([bool(np.isfinite(table).all()) and sim.physics.diverged.numpy()[0] == 0])
     return Record(table[:, :12], table[:, 12:24], table[:, 24:36], table[:, 36:39], table[:, 39:43], valid)
 
 

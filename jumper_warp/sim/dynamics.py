@@ -178,7 +178,7 @@ class JumperDynamics:
         """Stiffness [N/m], 0: none, and rest length [m] of the springs between the knees, shape (num_worlds,); call
         `pack_springs` after a change."""
 
-        self.robot = self.modules.step.Robot()
+        self.robot = self.modules.step.RobotModel()
         self.robot.geometry = leg_geometry_array(self.description, self.modules.geometry, self.device)
         self.robot.table = wp.zeros(
             (self.modules.layout.PARAMETER_ROWS, self.num_worlds),
@@ -201,7 +201,7 @@ class JumperDynamics:
             (("peak_force", "residual"), n, scalar.real),
             (("peak_paw_force",), (4, n), scalar.real),
             (("torque",), (12, n), scalar.real),
-            (("sweeps", "invalid"), n, int),
+            (("sweeps", "diverged"), n, int),
         ):
             for name in names:
                 setattr(work, name, wp.zeros(shape, dtype=dtype, device=self.device))
@@ -345,7 +345,7 @@ class JumperDynamics:
         momenta: of before it. body_f: the wrenches in it. worlds: which are corrected, by default all.
         """
         first, count = worlds or (0, self.num_worlds)
-        inputs = [first, self.robot, momenta, body_f, self.work.peak_force, self.work.invalid, time, q, qd]
+        inputs = [first, self.robot, momenta, body_f, self.work.peak_force, self.work.diverged, time, q, qd]
         wp.launch(self.modules.momentum.project_momentum_kernel, count, inputs, device=self.device, block_dim=32)
 
     def full_state(

@@ -42,7 +42,7 @@ class Physics(ABC):
     solver: newton.solvers.SolverBase
     dynamics: JumperDynamics
     """Geometry, ground and friction ratio; on other solvers for kinematics only."""
-    invalid: wp.array
+    diverged: wp.array
     """(num_worlds,) int, 1: the solver gave the world up."""
     impulse: wp.array
     """(4, num_worlds) vec3 [N s], what the contact solver carries over."""
@@ -117,7 +117,7 @@ class JumperPhysics(Physics):
         self.solver = SolverJumper(sim.model, block=block, tolerance=tolerance)
         self.dynamics = self.solver.dynamics
         work = self.dynamics.work
-        self.invalid, self.impulse, self.torque = work.invalid, work.impulse, work.torque
+        self.diverged, self.impulse, self.torque = work.diverged, work.impulse, work.torque
         self.paw_force, self.peak_force, self.peak_paw_force = work.contact_force, work.peak_force, work.peak_paw_force
         self._momenta = self.dynamics.momenta() if keep_momentum else None
 
@@ -186,7 +186,7 @@ class MujocoPhysics(Physics):
         robot = load_description()
         self._passive = [knee_damping, robot.knee_damping_limit, *robot.transversal_sum, *EXPLICIT_STOP,
                          self.dynamics.robot.geometry, self.dynamics.leg_springs]  # fmt: skip
-        self.invalid = wp.zeros(n, dtype=int, device=device)
+        self.diverged = wp.zeros(n, dtype=int, device=device)
         self.impulse = wp.zeros((4, n), dtype=wp.vec3, device=device)
         self.torque = wp.zeros((12, n), dtype=float, device=device)
         self.paw_force = wp.zeros((4, n), dtype=wp.vec3, device=device)

@@ -57,13 +57,13 @@ class DifferentiableStep:
     def _solved(self) -> Any:
         """Return an empty `SolvedStep`."""
         dynamics, n = self._dynamics, self._dynamics.num_worlds
-        solved, rows = dynamics.modules.tape_step.SolvedStep(), dynamics.modules.trajectory.Rows()
+        solved, trajectory = dynamics.modules.tape_step.SolvedStep(), dynamics.modules.trajectory.TrajectoryArrays()
         for name, shape in {"torque": (1, 12, n), "impulse": (1, 4, n), "pressed": (1, 4, n)}.items():
-            setattr(rows, name, wp.zeros(shape, rows._cls.vars[name].type.dtype, dynamics.device))
-        rows.q = rows.qd = wp.zeros((0, 0, 0), dynamics.real, dynamics.device)
-        solved.rows = rows
+            setattr(trajectory, name, wp.zeros(shape, trajectory._cls.vars[name].type.dtype, dynamics.device))
+        trajectory.q = trajectory.qd = wp.zeros((0, 0, 0), dynamics.real, dynamics.device)
+        solved.trajectory = trajectory
         for name, var in solved._cls.vars.items():
-            if name != "rows":
+            if name != "trajectory":
                 shape = n if var.type.ndim == 1 else (4, n)
                 setattr(solved, name, wp.zeros(shape, var.type.dtype, dynamics.device))
         return solved

@@ -99,7 +99,7 @@ def test_an_evaluation_stands_robots_on_the_block_below_them():
     np.testing.assert_allclose(env.obs[:, 2], env.sim.model.joint_q.numpy()[2], atol=1e-5)
     for _ in range(20):
         env.step(REST)
-        assert not env.done.any() and not env.robot.invalid.numpy().any()
+        assert not env.done.any() and not env.robot.diverged.numpy().any()
     env.sim.physics.write_bodies()
     np.testing.assert_allclose(paw_centres(env.sim)[..., 2], tops[:, None] + PAW_RADIUS + np.zeros(4), atol=2e-3)
 

@@ -33,7 +33,7 @@ def standing_robots(n: int):
     robot.body_com = array(np.zeros((n * int(BODIES), 3)), wp.vec3)
     robot.body_f = array(np.zeros((n * int(BODIES), 6)), wp.spatial_vector)
     robot.gravity = array(np.tile([0.0, 0.0, -9.81], (n + 1, 1)), wp.vec3)
-    robot.invalid = array(np.zeros(n), int)
+    robot.diverged = array(np.zeros(n), int)
     for names, rows in ((PAWS, 4), (MOTORS, 12)):
         for name in names:
             setattr(robot, name, wp.zeros((rows, n), dtype=RobotArrays.vars[name].type.dtype, device="cpu"))

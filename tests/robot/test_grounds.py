@@ -111,7 +111,7 @@ def test_robots_thrown_across_an_edge_stay_finite_and_above_ground():
     for _ in range(90):
         sim.step()
         assert np.abs(sim.base_velocity()).max() < 8.0
-    assert not sim.solver.invalid.numpy().any()
+    assert not sim.solver.diverged.numpy().any()
     paws = paw_centres(sim)
     upper = paws[..., 0] < 0.3 - PAW_RADIUS
     assert paws[upper][:, 2].min() > PAW_RADIUS - 5e-3

@@ -183,7 +183,7 @@ def test_sites_and_visual_shapes_change_no_motion_and_nothing_is_warned_of():
     [(ball, "body 'world_0/ball'"), (arm, "body 'world_0/forearm'"), (leash, "joint 'world_0/leash'"),
      (grain, "2 particles"), (coupling, "2 mimic joints")],
 )  # fmt: skip
-def test_what_moves_by_itself_is_refused_by_the_solver(extras, what):
+def test_solver_refuses_additional_bodies(extras, what):
     model = build_model(2, visuals=False, device="cpu", extras=extras)
     with pytest.raises(NotThisRobotError, match=f"{what}.*this robot alone") as refusal:
         SolverJumper(model)
@@ -197,7 +197,7 @@ def test_simulation_refuses_another_body_on_either_solver(solver):
 
 
 @pytest.mark.parametrize(("extras", "name"), [(wall, "wall"), (bumper, "bumper")])
-def test_collisions_that_are_not_simulated_are_said_once(extras, name):
+def test_warns_once_about_ignored_collisions(extras, name):
     model = build_model(2, visuals=False, device="cpu", extras=extras)
     with pytest.warns(UserWarning, match=f"ignores the collisions of 2 shapes, such as 'world_0/{name}'") as said:
         solver = SolverJumper(model)

@@ -210,7 +210,7 @@ def test_robots_thrown_on_light_blocks_converge_and_stay_finite():
         sim.step()
         assert sim.solver.residual.numpy().max() <= TOLERANCE
         assert np.linalg.norm(sim.solver.block_velocity(), axis=1).max() < 10.0
-    assert not sim.solver.invalid.numpy().any()
+    assert not sim.solver.diverged.numpy().any()
 
 
 def test_paws_push_the_side_of_a_block():
@@ -293,7 +293,7 @@ def test_blocks_return_to_their_starts():
     assert np.array_equal(sim.solver.block_position(), starts)
 
 
-def test_block_of_a_broken_world_returns_to_its_start():
+def test_block_of_a_diverged_world_returns_to_its_start():
     sim = on_block(2, settle=2, mass=5.0, friction=0.0)
     set_block_velocity(sim, [[1.0, 0.0], [1.0, 0.0]])
     sim.step()
@@ -303,7 +303,7 @@ def test_block_of_a_broken_world_returns_to_its_start():
     sim.state.joint_qd.assign(rates.ravel())
     sim.step()
     sim.step()
-    assert sim.solver.invalid.numpy().tolist() == [1, 0]
+    assert sim.solver.diverged.numpy().tolist() == [1, 0]
     assert np.array_equal(sim.solver.block_position()[0], [0.0, 0.0])
     assert np.isfinite(sim.solver.block_velocity()).all()
 
@@ -330,7 +330,7 @@ def test_double_precision_moves_the_block_alike():
     assert blocks["center"] == pytest.approx(sim.solver.block_position(), abs=1e-4)
 
 
-def test_what_does_not_know_blocks_says_so():
+def test_refuses_blocks_where_unsupported():
     block = BlockCfg(center=(1.0, 0.0))
     with pytest.raises(ValueError, match="needs solver='jumper'"):
         simulation(1, solver="mujoco", block=block)
@@ -353,7 +353,7 @@ def test_what_does_not_know_blocks_says_so():
         ({"center": (np.inf, 0.0)}, "center must be finite"),
     ],
 )
-def test_impossible_blocks_are_refused(values, message):
+def test_refuses_invalid_blocks(values, message):
     with pytest.raises(ValueError, match=message):
         BlockCfg(**({"center": (0.0, 0.0)} | values))
 

@@ -83,7 +83,7 @@ def test_reset_leaves_other_worlds_alone(solver, kind):
 
 
 @pytest.mark.parametrize("solver", SOLVERS)
-def test_broken_world_recovers_by_a_reset(solver):
+def test_reset_recovers_diverged_world(solver):
     sim = simulation(2, solver)
     first = jump(sim)
     sim.reset()
@@ -93,7 +93,7 @@ def test_broken_world_recovers_by_a_reset(solver):
     if solver == "mujoco":
         assert np.isnan(sim.joint_q()[1]).any()
     else:
-        assert sim.solver.invalid.numpy()[1] == 1
+        assert sim.solver.diverged.numpy()[1] == 1
     sim.reset(np.array([False, True]))
     again = jump(sim)
     assert np.array_equal(again[:, 1], first[:, 1])
@@ -168,7 +168,7 @@ def test_reset_puts_blocks_back():
     [[True], [[True, False]], [0, 1], np.array([1.0, 0.0]), torch.tensor([0, 1]), "ab", [True, None], [[True], []]],
     ids=repr,
 )
-def test_reset_refuses_what_is_no_mask(mask):
+def test_reset_refuses_invalid_mask(mask):
     sim = simulation(2, "jumper")
     with pytest.raises(ValueError, match=r"mask must be bool of shape \(2,\)") as refusal:
         sim.reset(mask)
@@ -185,7 +185,7 @@ def spinning(solver):
 
 
 @pytest.mark.parametrize("solver", SOLVERS)
-def test_base_velocity_is_the_way_that_the_base_goes(solver):
+def test_base_velocity_is_the_derivative_of_base_position(solver):
     sim = spinning(solver)
     for _ in range(5):
         before = sim.joint_q()[:, :3].astype(float)
@@ -215,7 +215,7 @@ def test_base_velocity_in_a_captured_graph():
     assert np.abs(np.diff(seen, axis=0)).min(axis=(1, 2)).max() > 0.0
 
 
-def test_targets_are_checked_and_may_be_alike_for_all_worlds():
+def test_targets_are_checked_and_broadcast_over_worlds():
     sim, angles = Simulation(3, visuals=False, device="cpu"), np.arange(36.0).reshape(12, 3) / 36.0
     for given in (angles, torch.tensor(angles), angles.tolist()):
         sim.set_targets(given)

@@ -66,7 +66,7 @@ def test_robot_without_a_paw_is_refused():
 
 
 @pytest.mark.parametrize(("argument", "value"), [("max_sweeps", 0), ("tolerance", 0.0), ("tolerance", float("nan"))])
-def test_bad_settings_are_refused(argument, value):
+def test_refuses_invalid_settings(argument, value):
     with pytest.raises(ValueError, match=argument):
         SolverJumper(build_model(1, visuals=False, device="cpu"), **{argument: value})
 
@@ -172,7 +172,7 @@ def test_reset_of_the_solver_alone_leaves_the_state():
     assert not sim.paw_force.numpy().any()
 
 
-def test_world_with_nan_is_parked_and_disturbs_no_other():
+def test_diverged_world_is_frozen_and_disturbs_no_other():
     sims = [simulation(3), simulation(3)]
     for sim in sims:
         launch(sim)
@@ -186,7 +186,7 @@ def test_world_with_nan_is_parked_and_disturbs_no_other():
     for _ in range(20):
         broken.step()
         intact.step()
-    assert broken.solver.invalid.numpy().tolist() == [0, 1, 0]
+    assert broken.solver.diverged.numpy().tolist() == [0, 1, 0]
     assert broken.joint_q()[1] == pytest.approx(broken.model.joint_q.numpy().reshape(3, COORDS)[1], abs=1e-6)
     assert not broken.joint_qd()[1].any()
     for world in (0, 2):
@@ -197,7 +197,7 @@ def test_world_with_nan_is_parked_and_disturbs_no_other():
         sim.solver.reset(sim.state, mask)
         sim.step()
         sim.step()
-    assert not broken.solver.invalid.numpy().any()
+    assert not broken.solver.diverged.numpy().any()
     assert np.array_equal(broken.joint_q(), intact.joint_q())
 
 

@@ -281,7 +281,7 @@ def test_forgetting_touches_the_masked_worlds_only(stage):
 
 
 ZERO = ("torque", "prev_torque", "action", "prev_action", "prev_prev_action", "impulse", "paw_force", "peak_force",
-        "contact_time", "air_time", "touchdown_speed", "paw_height", "invalid", "collisions")  # fmt: skip
+        "contact_time", "air_time", "touchdown_speed", "paw_height", "diverged", "collisions")  # fmt: skip
 FORGOTTEN = (*ZERO, "target", "filtered_target", "prev_rate", "prev_lin_vel", "paw_pos", "paw_vel")
 
 
