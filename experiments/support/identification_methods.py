@@ -12,12 +12,12 @@ from jumper_warp.identification.identify import identify_by_evolution
 from jumper_warp.identification.least_squares import LeastSquares, Point
 from jumper_warp.identification.motions import NoiseLevels
 from jumper_warp.identification.parameters import ParameterSet
-from jumper_warp.identification.replay import Replay
+from jumper_warp.identification.replay import MotionReplay
 from jumper_warp.identification.residuals import MotionResiduals
 from support.known_robots import Carry, Case, prediction_errors
 
 
-def problem_of(parameters: ParameterSet, case: Case, replay: Replay) -> LeastSquares:
+def problem_of(parameters: ParameterSet, case: Case, replay: MotionReplay) -> LeastSquares:
     """Return the problem whose motions start as their first rows say."""
     whole = [MotionResiduals(motion, parameters, NoiseLevels(), replay.description) for motion in case.motions]
     return LeastSquares(parameters, whole, replay, [case.mass])
@@ -30,7 +30,7 @@ def chi2_at(problem: LeastSquares, point: Point) -> float:
 
 def scipy_fit(problem: LeastSquares, seconds: float) -> Point:
     """Return where SciPy's trust region comes in `seconds`, by differences over the same parallel worlds."""
-    begin, size, ends = problem.expected(), len(problem.parameters), time.perf_counter() + seconds
+    begin, size, ends = problem.nominal_point(), len(problem.parameters), time.perf_counter() + seconds
     edges = np.cumsum([size, *(len(start) for start in begin.starts)])
     best = (np.inf, begin)
 
@@ -44,7 +44,7 @@ def scipy_fit(problem: LeastSquares, seconds: float) -> Point:
     def residuals(x: np.ndarray) -> np.ndarray:
         nonlocal best
         point = point_of(x)
-        found = np.concatenate([*problem.residuals(point), [problem.known(point.z)[0][0]], x])
+        found = np.concatenate([*problem.residuals(point), [problem.prior_residuals(point.z)[0][0]], x])
         cost = float(found @ found)
         if cost < best[0]:
             best = (cost, point)
@@ -61,7 +61,7 @@ def scipy_fit(problem: LeastSquares, seconds: float) -> Point:
             rows = table[row : row + len(found)]
             rows[:, :size], rows[:, first : first + len(start)] = found[:, :size], found[:, size:]
             row += len(found)
-        table[row, :size] = problem.known(point.z)[0][1]
+        table[row, :size] = problem.prior_residuals(point.z)[0][1]
         table[row + 1 :] = np.eye(len(x))
         return table
 
@@ -78,12 +78,12 @@ def scipy_fit(problem: LeastSquares, seconds: float) -> Point:
     return best[1]
 
 
-def compare_methods(parameters: ParameterSet, case: Case, replay: Replay, ours: Carry, seconds: float) -> dict:
+def compare_methods(parameters: ParameterSet, case: Case, replay: MotionReplay, ours: Carry, seconds: float) -> dict:
     """Return χ² and held-out errors of CMA-ES and SciPy in the time that this project took."""
     problem = problem_of(parameters, case, replay)
-    evolved = identify_by_evolution(case.motions, parameters, knowledge=[case.mass], max_seconds=seconds)
+    evolved = identify_by_evolution(case.motions, parameters, prior_measurements=[case.mass], max_seconds=seconds)
     points = {"cma": Point(evolved.z, list(evolved.starts)), "scipy": scipy_fit(problem, seconds)}
-    metrics = {"methods_wall_s": seconds, "cma_million_world_steps": evolved.world_steps / 1.0e6}
+    metrics = {"methods_wall_s": seconds, "cma_million_world_steps": evolved.effort.world_steps / 1.0e6}
     for name, point in points.items():
         angle, height = prediction_errors(case, parameters.robots(point.z[None]), ours)
         metrics |= {

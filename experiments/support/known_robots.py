@@ -10,14 +10,14 @@ import numpy as np
 
 from jumper_warp.evaluation.heights import run_jumps
 from jumper_warp.evaluation.plots import drawn
-from jumper_warp.identification.excitation import unsafe
-from jumper_warp.identification.findings import Identification
-from jumper_warp.identification.identify import identify, total_mass, weighed
-from jumper_warp.identification.least_squares import Knowledge
-from jumper_warp.identification.motions import Motion
-from jumper_warp.identification.parameters import ParameterSet
-from jumper_warp.identification.recording import KINDS, Plan, draw_plan, measured, replay_plan
-from jumper_warp.identification.replay import Record, Replay
+from jumper_warp.identification.excitation import unsafe_reason
+from jumper_warp.identification.identify import identify
+from jumper_warp.identification.motions import RecordedMotion
+from jumper_warp.identification.parameters import ParameterSet, PriorMeasurement, total_mass, weighed_mass
+from jumper_warp.identification.recording import KINDS, Plan, measure, replay_plan, sample_plan
+from jumper_warp.identification.replay import MotionReplay, Record
+from jumper_warp.identification.report import identified_overlay
+from jumper_warp.identification.results import Identification
 from jumper_warp.policies.conditions import Conditions, env_of_policy
 from jumper_warp.policies.runs import open_policy
 from jumper_warp.robot.overlay import overlay_of
@@ -38,8 +38,8 @@ class Case:
     truth: np.ndarray
     """(P,) normalised."""
     robots: RobotValues
-    motions: list[Motion]
-    mass: Knowledge
+    motions: list[RecordedMotion]
+    mass: PriorMeasurement
     held_out: Plan
     record: Record
     """Of the held-out jump."""
@@ -48,7 +48,7 @@ class Case:
 Carry = Callable[[Plan, RobotValues], Record]
 
 
-def make_case(parameters: ParameterSet, seed: int, carry: Carry, replay: Replay) -> Case:
+def make_case(parameters: ParameterSet, seed: int, carry: Carry, replay: MotionReplay) -> Case:
     """Return a robot and what it did; carry: carries a plan out."""
     rng = np.random.default_rng(seed)
     z = np.clip(SPREAD * rng.normal(size=len(parameters)), -MOST, MOST)
@@ -58,12 +58,12 @@ def make_case(parameters: ParameterSet, seed: int, carry: Carry, replay: Replay)
     nominal = parameters.robots(np.zeros((1, len(z))))
     plans: list[Plan] = []
     while len(plans) < len(KINDS):
-        plan = draw_plan(KINDS[len(plans)], rng)
-        if not unsafe(plan, replay_plan(replay, plan, nominal)):
+        plan = sample_plan(KINDS[len(plans)], rng)
+        if not unsafe_reason(plan, replay_plan(replay, plan, nominal)):
             plans.append(plan)
-    motions = [measured(p, f"{i} {p.kind}", carry(p, robots), robots, rng) for i, p in enumerate(plans)]
-    held_out = draw_plan("small jump", rng, torque_limit=HELD_OUT_TORQUE)
-    mass = weighed(float(total_mass(robots)[0] + SCALE * rng.normal()), SCALE)
+    motions = [measure(p, f"{i} {p.kind}", carry(p, robots), robots, rng) for i, p in enumerate(plans)]
+    held_out = sample_plan("small jump", rng, torque_limit=HELD_OUT_TORQUE)
+    mass = weighed_mass(float(total_mass(robots)[0] + SCALE * rng.normal()), SCALE)
     return Case(z, robots, motions, mass, held_out, carry(held_out, robots))
 
 
@@ -84,7 +84,7 @@ def accuracy(parameters: ParameterSet, case: Case, found: Identification) -> dic
         error = np.abs(values[chosen] - true[chosen])
         return float((error / np.abs(true[chosen]) if relative else error).max())
 
-    error = np.abs(found.z - case.truth) / np.maximum(found.deviations, 1.0e-9)
+    error = np.abs(found.z - case.truth) / np.maximum(found.std, 1.0e-9)
     return {
         "kp_worst_percent": 100.0 * worst("kp", True),
         "kd_worst_percent": 100.0 * worst("kd", True),
@@ -99,17 +99,18 @@ def accuracy(parameters: ParameterSet, case: Case, found: Identification) -> dic
 
 
 def run_case(
-    parameters: ParameterSet, case: Case, replay: Replay, ours: Carry, dt: float | None = None
+    parameters: ParameterSet, case: Case, replay: MotionReplay, ours: Carry, dt: float | None = None
 ) -> tuple[dict[str, float], Identification]:
     """Identify one robot and return its metrics; ours: carries a plan out as the model does."""
-    found = identify(case.motions, parameters, knowledge=[case.mass], replay=replay, dt=dt)
+    found = identify(case.motions, parameters, prior_measurements=[case.mass], replay=replay, dt=dt)
     (nominal_deg, nominal_mm), (deg, mm) = (
         prediction_errors(case, robots, ours)
         for robots in (parameters.robots(np.zeros((1, len(parameters)))), found.robots())
     )
     metrics = accuracy(parameters, case, found) | {
         "chi2": found.chi2, "nominal_chi2": found.nominal_chi2, "identified": float(found.identified.sum()),
-        "wall_s": found.seconds, "cpu_s": found.cpu_seconds, "million_world_steps": found.world_steps / 1.0e6,
+        "wall_s": found.effort.seconds, "cpu_s": found.effort.cpu_seconds,
+        "million_world_steps": found.effort.world_steps / 1.0e6,
         "held_out_nominal_deg": nominal_deg, "held_out_deg": deg, "held_out_ratio": nominal_deg / deg,
         "held_out_nominal_mm": nominal_mm, "held_out_mm": mm, "held_out_height_ratio": nominal_mm / mm,
     }  # fmt: skip
@@ -119,7 +120,10 @@ def run_case(
 def policy_errors(name: str, jumps: int, case: Case, found: Identification, folder: Path) -> dict[str, float]:
     """Return how well the described and the identified robot predict a policy's jumps on the true one."""
     quantities = tuple(dict.fromkeys(parameter.quantity for parameter in found.parameters))
-    overlays = {"true": overlay_of(case.robots, quantities, source="truth"), "identified": found.overlay("identified")}
+    overlays = {
+        "true": overlay_of(case.robots, quantities, source="truth"),
+        "identified": identified_overlay(found, "identified"),
+    }
     apex, success = {}, {}
     for robot in ("true", "identified", "described"):
         if robot in overlays:

@@ -5,7 +5,7 @@ import pytest
 
 from jumper_warp.identification.parameters import jumper_parameters
 from jumper_warp.identification.recording import replay_plan
-from jumper_warp.identification.replay import Replay
+from jumper_warp.identification.replay import MotionReplay
 from support.identification_methods import chi2_at, problem_of
 from support.known_robots import MOST, make_case, prediction_errors
 
@@ -13,8 +13,8 @@ from support.known_robots import MOST, make_case, prediction_errors
 @pytest.fixture(scope="module")
 def drawn():
     """Parameters, one known robot, what replays, and what carries a plan out."""
-    parameters, one = jumper_parameters(), Replay(device="cpu", threads=1)
-    many = Replay(device="cpu", threads=1)
+    parameters, one = jumper_parameters(), MotionReplay(device="cpu", threads=1)
+    many = MotionReplay(device="cpu", threads=1)
 
     def carry(plan, robots):
         return replay_plan(one, plan, robots)
