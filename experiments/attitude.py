@@ -20,7 +20,7 @@ import numpy as np
 import tyro
 
 from jumper_warp.cli.main import run_command
-from jumper_warp.evaluation.plots import drawn
+from jumper_warp.evaluation.plots import figure
 from jumper_warp.evaluation.run import EvaluationArgs, EvaluationRun
 from jumper_warp.evaluation.turns import DIRECTIONS, TurnFlags, Turns, axis_metrics, turn_metrics, turns_about_any
 from support.momentum import MomentumWatch, rotational_inertia
@@ -51,7 +51,7 @@ def plot(run: EvaluationRun, turns: Turns, title: str) -> None:
     """Draw the errors of turns about the body's axes over time."""
     errors = np.degrees(np.array(turns.errors))
     time = (np.arange(len(errors)) + 1) * turns.step_dt
-    with drawn(run.folder / "turns.png", 1, 2, figsize=(11, 4.2)) as axes:
+    with figure(run.folder / "turns.png", 1, 2, figsize=(11, 4.2)) as axes:
         for i, name in enumerate(DIRECTIONS):
             style = {"color": COLORS[i // 2], "linestyle": "-" if i % 2 == 0 else "--"}
             axes[0].plot(time, errors[:, i::6], alpha=0.15 if errors.shape[1] > 6 else 0.0, linewidth=0.6, **style)

@@ -17,7 +17,7 @@ import numpy as np
 import tyro
 
 from jumper_warp.cli.main import run_command
-from jumper_warp.evaluation.plots import drawn
+from jumper_warp.evaluation.plots import figure
 from support.gradients import INNER, OUTER, TICKS, GradientJump, apex, check, schedule
 from support.scripts import DeviceArgs, prepare, report
 
@@ -51,7 +51,7 @@ def ascend(device: str | None) -> Ascent:
 
 def plot(rollout: Any, actions: tuple[np.ndarray, np.ndarray], ascent: Ascent, path: Path) -> None:
     """Draw the gradient along the jump with the differences on it, the jump, and the ascent."""
-    with drawn(path, 4, 1, figsize=(8, 11)) as axes:
+    with figure(path, 4, 1, figsize=(8, 11)) as axes:
         ticks = np.arange(TICKS) / 60.0
         found, differenced = (values.reshape(2, TICKS) for values in actions)
         for i, name in enumerate(("outer", "inner")):

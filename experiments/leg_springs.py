@@ -21,7 +21,7 @@ from rich.console import Console
 from rich.table import Table
 
 from jumper_warp.cli.main import run_command
-from jumper_warp.evaluation.plots import drawn
+from jumper_warp.evaluation.plots import figure
 from jumper_warp.robot.gravity import EARTH, MARS
 from jumper_warp.robot.motors import jumping_motors
 from jumper_warp.robot.overlay import with_springs
@@ -74,7 +74,7 @@ def main(args: Args) -> dict:
         "stiffness [N/m]", title=f"open-loop apex in m, {place}, {args.torque:g} N m, springs {args.length:g} m"
     )
     rows = [[f"{stiffness:g}"] for stiffness in args.stiffness]
-    with drawn(folder / "springs.png", figsize=(7, 4.5)) as axis:
+    with figure(folder / "springs.png", figsize=(7, 4.5)) as axis:
         for name in FILTERS if args.filter == "both" else (args.filter,):
             jumps = args.jumps(name)
             found = jumps.apexes(args.stiffness, args.squats)

@@ -16,7 +16,7 @@ import numpy as np
 import tyro
 
 from jumper_warp.cli.main import run_command
-from jumper_warp.evaluation.plots import drawn
+from jumper_warp.evaluation.plots import figure
 from jumper_warp.evaluation.run import HEIGHTS, PLACES, EvaluationArgs, EvaluationRun
 from jumper_warp.utils.errors import InputError
 from support.holds import Holds, hold_goals, hold_metrics
@@ -51,7 +51,7 @@ def plot(run: EvaluationRun, holds: Holds) -> None:
     """Draw forces and torques of the robot whose forces vary most, and the ranges of all."""
     time = (np.arange(len(holds.forces)) + 1) * holds.step_dt
     robot = np.flatnonzero(~holds.over)[holds.force_range.argmax()]
-    with drawn(run.folder / "hold.png", 1, 3, figsize=(14, 4)) as axes:
+    with figure(run.folder / "hold.png", 1, 3, figsize=(14, 4)) as axes:
         axes[0].plot(time, np.array(holds.forces)[:, robot], linewidth=0.8)
         axes[0].set(xlabel="time [s]", ylabel="force on each paw [N]", title="the robot whose forces vary most")
         axes[1].plot(time, np.array(holds.torques)[:, robot], linewidth=0.8)

@@ -19,7 +19,7 @@ import numpy as np
 import tyro
 
 from jumper_warp.cli.main import run_command
-from jumper_warp.evaluation.courses import Course, course_metrics, draw_course
+from jumper_warp.evaluation.courses import Course, course_metrics, plot_course
 from jumper_warp.evaluation.places import random_headings
 from jumper_warp.evaluation.run import EvaluationArgs, SkillRun
 from jumper_warp.evaluation.scripts import ScriptStep
@@ -107,7 +107,7 @@ def main(args: Args) -> dict:
     course = Course(scripts(args), random_headings(args.robots, args.seed))
     run.follow(run.env(args.robots, block=course.block), course, film=name)
     title = f"walk, jump, walk: robot 0 of {course.count}, {run.title}"
-    draw_course(run.folder / "course.png", course, 0, title)
+    plot_course(run.folder / "course.png", course, 0, title)
     return run.report(course_metrics(course), {} if args.course else PAPER)
 
 

@@ -17,7 +17,7 @@ import tyro
 
 from jumper_warp.cli.main import run_command
 from jumper_warp.evaluation.places import random_headings
-from jumper_warp.evaluation.plots import drawn
+from jumper_warp.evaluation.plots import figure
 from jumper_warp.evaluation.run import EvaluationArgs, EvaluationRun
 from jumper_warp.evaluation.velocities import Walks, check_walks
 from jumper_warp.robot.terrain import KINDS, TerrainCfg, single_tile
@@ -64,11 +64,11 @@ def main(args: Args) -> dict:
         ground = single_tile(terrain, kind)
         env = run.env(args.robots, ground=ground)
         asked = Walks(commands, env.task, SECONDS, headings=random_headings(args.robots, args.seed))
-        walks = run.follow(env, asked, film=kind, drawn={"ground": ground})
+        walks = run.follow(env, asked, film=kind, figure={"ground": ground})
         shares[kind] = walked(walks)
         figures[f"success_rate_{kind}"] = float(shares[kind].mean())
         figures[f"fall_rate_{kind}"] = float(walks.fallen.mean())
-    with drawn(run.folder / "terrain.png", figsize=(7, 4)) as axis:
+    with figure(run.folder / "terrain.png", figsize=(7, 4)) as axis:
         axis.boxplot([shares[kind] for kind in args.terrains], tick_labels=list(args.terrains), whis=(5, 95))
         axis.set(ylabel="share of the way", title=f"{args.robots} robots each, {run.title}", ylim=(0.0, 1.05))
     return run.report({"robots": args.robots, "speed_m_s": args.speed} | figures, {})

@@ -19,7 +19,7 @@ import numpy as np
 import tyro
 
 from jumper_warp.cli.main import run_command
-from jumper_warp.evaluation.plots import drawn
+from jumper_warp.evaluation.plots import figure
 from jumper_warp.evaluation.run import EvaluationArgs, EvaluationRun
 from jumper_warp.evaluation.velocities import AXES, Walks, check_walks, grid, tracking_metrics
 from jumper_warp.utils.errors import InputError
@@ -50,7 +50,7 @@ class Args(EvaluationArgs):
 def plot(run: EvaluationRun, walks: Walks, settling: np.ndarray) -> None:
     """Draw mean velocities over commands, and how soon robots settle."""
     history = walks.history()[round(1.0 / walks.step_dt) :]
-    with drawn(run.folder / "tracking.png", 2, 2, figsize=(9, 8)) as axes:
+    with figure(run.folder / "tracking.png", 2, 2, figsize=(9, 8)) as axes:
         for i, (axis, name) in enumerate(zip(axes.flat, AXES, strict=False)):
             wanted = walks.commands[:, 0, i]
             axis.plot([-REACH, REACH], [-REACH, REACH], color="tab:green", linewidth=1.0, label="commanded")

@@ -5,8 +5,8 @@
     from jumper_warp import make_task, mdp
 
     @wp.func
-    def level(view: mdp.RobotView, task: mdp.JumpState, scale: float) -> float:
-        return wp.where(task.phase == mdp.FLIGHT, mdp.rewards.psi(mdp.tilt(view), scale), 0.0)
+    def level(robot: mdp.RobotView, state: mdp.JumpState, scale: float) -> float:
+        return wp.where(state.phase == mdp.FLIGHT, mdp.rewards.psi(mdp.tilt(view), scale), 0.0)
 
     jump = make_task("vertical-jump")
     jump = replace(jump, rewards=(*jump.rewards, mdp.RewardTerm(level, weight=2.0, scale=0.1)))
@@ -21,8 +21,7 @@ from jumper_warp.kernels.mdp import observations, rewards, terminations
 from jumper_warp.kernels.mdp import parameters as events
 from jumper_warp.kernels.mdp.env import Scene, SkillSettings
 from jumper_warp.kernels.mdp.parameters import RobotParameters
-from jumper_warp.kernels.mdp.random import Draw, between, branch, cut_gaussian, within
-from jumper_warp.kernels.mdp.reset import store_pose
+from jumper_warp.kernels.mdp.random import RngStream, clamped_normal, fold_in, uniform, uniform_range
 from jumper_warp.kernels.mdp.view import RobotArrays, RobotView, tilt, vec12, yaw_of
 from jumper_warp.kernels.terrain.ground import Ground, surface, world_ground
 from jumper_warp.kernels.velocity.state import VelocityState
@@ -46,7 +45,6 @@ __all__ = [
     "AttitudeState",
     "Command",
     "Curriculum",
-    "Draw",
     "EventTerm",
     "Ground",
     "Handover",
@@ -55,6 +53,7 @@ __all__ = [
     "RandomizationCfg",
     "Reset",
     "RewardTerm",
+    "RngStream",
     "RobotArrays",
     "RobotParameters",
     "RobotView",
@@ -64,20 +63,20 @@ __all__ = [
     "TaskCfg",
     "TerminationTerm",
     "VelocityState",
-    "between",
-    "branch",
+    "clamped_normal",
     "commanded",
-    "cut_gaussian",
     "events",
+    "fold_in",
     "observations",
     "rewards",
-    "store_pose",
     "surface",
     "terminations",
     "tilt",
+    "uniform",
+    "uniform_range",
     "vec12",
     "waiting",
-    "within",
     "world_ground",
+    "write_default_pose",
     "yaw_of",
 ]

@@ -129,7 +129,7 @@ def any_world(flag: bool) -> bool:
 
 
 @wp.func_native(_MEET)
-def meet():
+def sync_lanes():
     """Wait until the threads of a world got here; each then sees what the others wrote to memory."""
     ...
 

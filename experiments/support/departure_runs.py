@@ -14,7 +14,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from jumper_warp.cli.train import env_maker, parse_train
-from jumper_warp.evaluation.plots import drawn
+from jumper_warp.evaluation.plots import figure
 from jumper_warp.evaluation.run import HEIGHTS, EvaluationRun
 from jumper_warp.policies.conditions import Conditions
 from jumper_warp.policies.warm_start import start_from
@@ -138,7 +138,7 @@ def cell(tests: dict[str, dict[str, Any]], name: str, scale: float) -> str:
 def plot(found: Found, path: Path) -> None:
     """Draw success and error of each training, the task with all departures as lines."""
     rows = [*found]
-    with drawn(path, 1, 2, figsize=(11, 1.0 + 0.25 * len(rows)), sharey=True) as axes:
+    with figure(path, 1, 2, figsize=(11, 1.0 + 0.25 * len(rows)), sharey=True) as axes:
         for axis, name, scale in zip(axes, ("success_rate", "error_m"), (100.0, 1000.0), strict=True):
             for test, marker in zip(TESTS, "ox", strict=True):
                 x = [np.nan if (v := found[row][test][name]) is None else scale * v for row in rows]

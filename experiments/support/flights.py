@@ -18,7 +18,7 @@ import torch
 from jumper_warp.envs.env import Env
 from jumper_warp.evaluation.jumps import DELAY, jump_commands, yaw_of
 from jumper_warp.evaluation.log import NO_END, EvaluationLog, Metrics, failures, finite, largest, mean, mean_and_max
-from jumper_warp.evaluation.plots import drawn
+from jumper_warp.evaluation.plots import figure
 from jumper_warp.evaluation.run import HEIGHTS, EvaluationArgs, Run, conditions_of
 from jumper_warp.policies.policy import Policy
 from jumper_warp.policies.restore import restored_task
@@ -120,7 +120,7 @@ class Flights(EvaluationLog):
         forces = np.linalg.norm(env.sim.paw_force.numpy(), axis=2)
         return {"base_pos": q[:, :3].copy(), "tilt": np.arccos(np.clip(up, -1.0, 1.0)), "turn": np.abs(yaw_of(quat)),
                 "rise": qd[:, 2].copy(), "spin": np.linalg.norm(qd[:, 3:6], axis=1), "down": (forces > 0.1).any(axis=0),
-                "ending": env.worlds.ending.numpy().copy(), "momentum": momentum(env.sim)[1]}  # fmt: skip
+                "termination": env.episodes.termination.numpy().copy(), "momentum": momentum(env.sim)[1]}  # fmt: skip
 
     def follow(self, env: Any) -> bool:
         """Look at the environment after a policy step, and ask for a turn where a flight has begun."""
@@ -128,7 +128,7 @@ class Flights(EvaluationLog):
         ended = super().follow(env)
         fresh = (self._left >= 0) & (before < 0)
         if self.turns and fresh.any():
-            env.request(TURN, fresh)
+            env.requested_task(TURN, fresh)
         return ended
 
     def update(self, arrays: dict[str, np.ndarray], step_dt: float) -> bool:
@@ -156,8 +156,8 @@ class Flights(EvaluationLog):
         self.height[running] = np.maximum(self.height, arrays["base_pos"][:, 2])[running]
         for kept, now in ((self.tilts, arrays["tilt"]), (self.heights, arrays["base_pos"][:, 2])):
             kept.append(np.where(running, now, kept[-1]) if kept else now)
-        fell = running & (arrays["ending"] >= 0)
-        self.end[fell] = arrays["ending"][fell]
+        fell = running & (arrays["termination"] >= 0)
+        self.end[fell] = arrays["termination"][fell]
         over = running & ~fell & (self._down >= 0) & (step - self._down >= round(AFTER / step_dt))
         good = np.degrees(arrays["tilt"]) < UPRIGHT
         self.end[over] = np.where(good[over], OUTCOMES.index("landed"), OUTCOMES.index("tilted"))
@@ -226,7 +226,7 @@ def delays(count: int, most: float, seed: int) -> np.ndarray:
 
 def draw_flights(path: Path, found: Mapping[str, Flights]) -> None:
     """Draw tilt and height of all flights over time, a column for each name."""
-    with drawn(path, 2, len(found), figsize=(11, 6), sharex=True, sharey="row") as axes:
+    with figure(path, 2, len(found), figsize=(11, 6), sharex=True, sharey="row") as axes:
         for column, (name, flights) in zip(axes.T, found.items(), strict=True):
             time = np.arange(len(flights.tilts)) * flights.step_dt
             column[0].plot(time, np.degrees(np.array(flights.tilts)), linewidth=0.6, alpha=0.5, color="tab:red")

@@ -14,7 +14,7 @@ from rich.table import Table
 
 from jumper_warp.diff.differentiable_env import DifferentiableEnv
 from jumper_warp.envs.env import Env
-from jumper_warp.evaluation.plots import drawn
+from jumper_warp.evaluation.plots import figure
 from jumper_warp.policies.policy import Policy
 from jumper_warp.policies.runs import open_policy
 from jumper_warp.rl.networks import ActorCritic, weights_of
@@ -97,7 +97,7 @@ def variances(make_env: Callable[[], Env], horizons: tuple[int, ...], path: Path
     """Measure spreads over horizons, draw them, and return them."""
     values: dict[str, Any] = {"horizons": list(horizons)}
     table = Table("policy", "steps", *(f"{name}: {what}" for name in ESTIMATORS for what in ("deviation", "worlds")))
-    with drawn(path, 1, 2, figsize=(11, 4.5)) as axes:
+    with figure(path, 1, 2, figsize=(11, 4.5)) as axes:
         for i, (who, policy) in enumerate(policies().items()):
             found = spreads_of(policy, DifferentiableEnv(make_env(), world_norm=math.inf), horizons)
             for horizon, *pair in zip(horizons, *found.values(), strict=True):

@@ -52,12 +52,12 @@ class Holds(EvaluationLog):
         return {
             "peak": env.sim.physics.peak_paw_force.numpy().T.copy(),
             "force": np.linalg.norm(env.sim.paw_force.numpy(), axis=2).T.copy(),
-            "torque": env.sim.torque.numpy().T.copy(), "ending": env.worlds.ending.numpy().copy(),
+            "torque": env.sim.torque.numpy().T.copy(), "termination": env.episodes.termination.numpy().copy(),
         }  # fmt: skip
 
     def update(self, arrays: dict[str, np.ndarray], step_dt: float) -> bool:
         """Take in a policy step; return whether all have ended."""
-        self.over |= arrays["ending"] >= 0
+        self.over |= arrays["termination"] >= 0
         for kept, name in ((self.peaks, "peak"), (self.forces, "force"), (self.torques, "torque")):
             kept.append(arrays[name])
         return bool(self.over.all())

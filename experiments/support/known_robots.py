@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from jumper_warp.evaluation.heights import run_jumps
-from jumper_warp.evaluation.plots import drawn
+from jumper_warp.evaluation.plots import figure
 from jumper_warp.identification.excitation import unsafe_reason
 from jumper_warp.identification.identify import identify
 from jumper_warp.identification.motions import RecordedMotion
@@ -150,7 +150,7 @@ def plot_cases(rows: list[dict[str, float]], path: Path) -> None:
          {"yscale": "log"}),
         ("time [s]", {"wall": "wall_s", "CPU": "cpu_s"}, {"ylim": (0.0, None)}),
     )  # fmt: skip
-    with drawn(path, 1, len(panels), figsize=(14, 3.2)) as axes:
+    with figure(path, 1, len(panels), figsize=(14, 3.2)) as axes:
         for axis, (title, series, settings) in zip(axes, panels, strict=True):
             for label, name in series.items():
                 axis.plot([row[name] for row in rows], "o", label=label)

@@ -15,7 +15,7 @@ import warp as wp
 from jumper_warp.envs.env import Env
 from jumper_warp.envs.vec_env import VecEnv
 from jumper_warp.evaluation.heights import run_jumps
-from jumper_warp.evaluation.plots import drawn
+from jumper_warp.evaluation.plots import figure
 from jumper_warp.rl.cfg import PpoCfg
 from jumper_warp.rl.ppo import Ppo
 from jumper_warp.rl.shac import Shac
@@ -80,8 +80,8 @@ def learning_curve(
         wp.synchronize_device(device)
         start = time.perf_counter()
         until = min(trained + every, seconds)
-        while (spent := trained + time.perf_counter() - start) < until:
-            ppo.set_progress(spent / seconds)
+        while (steps_per_mode := trained + time.perf_counter() - start) < until:
+            ppo.set_progress(steps_per_mode / seconds)
             ppo.iterate()
             curve.iterations += 1
             wp.synchronize_device(device)
@@ -124,7 +124,7 @@ def curve_metrics(curve: Curve, name: str) -> dict[str, Any]:
 
 def draw_curves(curves: Mapping[str, Sequence[Curve]], path: Path) -> None:
     """Draw success over time and steps, a color for each name."""
-    with drawn(path, 1, 2, figsize=(11, 4.5), sharey=True) as axes:
+    with figure(path, 1, 2, figsize=(11, 4.5), sharey=True) as axes:
         for i, (name, runs) in enumerate(curves.items()):
             for number, curve in enumerate(runs):
                 for axis, x in zip(axes, (curve.seconds, np.array(curve.steps) / 1e6), strict=True):

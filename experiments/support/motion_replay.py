@@ -14,7 +14,7 @@ import warp as wp
 from jumper_warp.diff.rollout import compact
 from jumper_warp.diff.torch_rollout import TorchTrajectory
 from jumper_warp.evaluation.film import ankles
-from jumper_warp.evaluation.plots import drawn
+from jumper_warp.evaluation.plots import figure
 from jumper_warp.kernels.collision.robot import collision_kernel
 from jumper_warp.kernels.layout import COORDS
 from jumper_warp.robot.description import MOTOR_JOINTS
@@ -160,7 +160,7 @@ class Replay:
 
 def plot(replays: dict[str, Replay], path: Path) -> None:
     """Draw height, angles of two legs, torques and paw forces over time, a column for each label."""
-    with drawn(path, 4, len(replays), figsize=(4.2 * len(replays), 10), sharex="col", squeeze=False) as axes:
+    with figure(path, 4, len(replays), figsize=(4.2 * len(replays), 10), sharex="col", squeeze=False) as axes:
         for column, (label, replay) in zip(axes.T, replays.items(), strict=True):
             column[0].plot(replay.time, replay.height)
             column[0].axvline(replay.takeoff / 60.0, color="0.7", linestyle="--")

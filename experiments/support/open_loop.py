@@ -11,7 +11,7 @@ import numpy as np
 
 from jumper_warp.evaluation.film import ankles
 from jumper_warp.evaluation.limits import EXTEND, HOLD, RAMP
-from jumper_warp.evaluation.plots import drawn
+from jumper_warp.evaluation.plots import figure
 from jumper_warp.robot.description import LEGS, MOTOR_JOINTS
 from jumper_warp.sim.simulation import Simulation, motor_values
 
@@ -120,7 +120,7 @@ def jump_metrics(trace: Trace) -> dict[str, float]:
 
 def draw_trace(path: Path, trace: Trace, title: str, hardware: float) -> None:
     """Draw height, vertical speed, angles, torques and paw forces over time; hardware [m]: apex of the robot."""
-    with drawn(path, 5, 1, figsize=(9, 12), sharex=True) as axes:
+    with figure(path, 5, 1, figsize=(9, 12), sharex=True) as axes:
         axes[0].plot(trace.time, trace.height)
         axes[0].axhline(hardware, color="0.6", linestyle="--", label="hardware, 18 N m")
         axes[1].plot(trace.time, trace.speed)

@@ -136,13 +136,13 @@ def soak_env(env: Env, args: SoakArgs) -> dict:
     """
     env.reset()
     apart = [term.name for term in env.task.terminations].index("came_apart")
-    ending, totals, action = wp.to_torch(env.worlds.ending), Totals(env.sim), torch.zeros_like(env.action)
+    termination, totals, action = wp.to_torch(env.episodes.termination), Totals(env.sim), torch.zeros_like(env.action)
 
     def some() -> None:
         action.uniform_(-1.0, 1.0)
         for _ in range(args.hold):
             env.step(action)
-            totals.take(ending == apart, env.obs, env.critic_obs, env.reward)
+            totals.take(termination == apart, env.obs, env.critic_obs, env.reward)
 
     run, rounds = Captured(some, env.device.type == "cuda"), -(-args.steps // args.hold)
     looks = max(args.episode // args.hold, 1)

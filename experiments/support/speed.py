@@ -18,7 +18,7 @@ from jumper_warp.rl.logger import Stopwatch
 from jumper_warp.rl.ppo import Ppo
 from jumper_warp.robot.model import build_model
 from jumper_warp.sim.simulation import Simulation, SolverName
-from jumper_warp.sim.slices import SlicedGraph, Worlds
+from jumper_warp.sim.slices import SlicedGraph, WorldRange
 from support.timing import device_memory, median_time, wall_time
 
 SQUAT, DEFAULT, EXTEND = 110.0, 45.0, -10.0
@@ -101,7 +101,7 @@ def standing_solver(envs: int, device: str | None) -> Callable[[], None]:
         sim.step()
     check_standing(sim, 0.40)
 
-    def advance(worlds: Worlds) -> None:
+    def advance(worlds: WorldRange) -> None:
         sim.physics.advance(sim.substeps, sim.target, bodies=False, worlds=worlds)
 
     kept = (sim, SlicedGraph(advance, sim.slices, sim.device))  # the graph works on the simulation's arrays

@@ -23,7 +23,7 @@ from jumper_warp.robot.model import PHYSICS_DT
 from jumper_warp.robot.motors import FilterCfg, MotorCfg, jumping_motors, motor_arrays
 from jumper_warp.sim.dynamics import JumperDynamics
 from jumper_warp.sim.simulation import SUBSTEPS, motor_values
-from jumper_warp.sim.slices import Worlds, slices_of
+from jumper_warp.sim.slices import WorldRange, slices_of
 from jumper_warp.sim.solver import check_step
 from jumper_warp.utils.checks import check_within
 from jumper_warp.utils.errors import InputError
@@ -348,7 +348,7 @@ class Rollout:
     def _launch(self, kernel: wp.Kernel, inputs: list, outputs: list) -> None:
         """Launch a kernel over all worlds, on a CPU in slices side by side."""
 
-        def launch(worlds: Worlds) -> None:
+        def launch(worlds: WorldRange) -> None:
             settings = self._new_settings()  # a copy of a Warp struct shares its memory, and slices run side by side
             settings.first = worlds.first
             wp.launch(

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 import warp as wp
 
-from jumper_warp.kernels.mdp.env import RING, Delays, EnvArrays, Scene
+from jumper_warp.kernels.mdp.env import RING, Delays, EpisodeArrays, Scene
 from jumper_warp.kernels.mdp.view import RobotArrays
 from jumper_warp.robot.description import load_description
 from jumper_warp.sim.simulation import Simulation
@@ -17,7 +17,7 @@ from jumper_warp.tasks.cfg import Handover, TaskCfg
 from jumper_warp.tasks.commands import check_commands
 from jumper_warp.utils.errors import InputError
 
-FIRST_CLOCK = 2 * RING
+FIRST_STEP_COUNT = 2 * RING
 """Of every world, so that rings can look back from the first step on."""
 
 
@@ -35,37 +35,46 @@ def robot_arrays(sim: Simulation, step_dt: float) -> Any:
     robot.invalid, robot.impulse = sim.physics.invalid, sim.physics.impulse
     robot.paw_force, robot.peak_force = sim.paw_force, sim.physics.peak_paw_force
     robot.torque, robot.joint_offset = sim.torque, sim.motors.offset
-    motors = ("old_torque", "action", "old_action", "older_action", "target", "safe_target", "old_rate")
+    motors = ("prev_torque", "action", "prev_action", "prev_prev_action", "target", "filtered_target", "prev_rate")
     fill(robot, ("paw_pos", "paw_vel"), (4, n), wp.vec3, device)
     fill(robot, ("contact_time", "air_time", "touchdown_speed", "paw_height"), (4, n), float, device)
     fill(robot, ("collisions",), (4, n), int, device)
     fill(robot, motors, (12, n), float, device)
-    fill(robot, ("old_lin_vel",), n, wp.vec3, device)
+    fill(robot, ("prev_lin_vel",), n, wp.vec3, device)
     robot.default_angle = wp.array(load_description().pose("default"), dtype=float, device=device)
     robot.step_dt = step_dt
     return robot
 
 
-def env_arrays(num_envs: int, seed: int, skill: wp.array, device: Any) -> Any:
-    """Return the kernels' `EnvArrays`."""
-    env = EnvArrays()
-    env.seed, env.skill = seed, skill
-    counts = ("request", "told", "fresh", "ending", "broken", "bad_action", "level", "streak")
-    fill(env, ("wanted",), num_envs, wp.vec4, device)
-    fill(env, counts, num_envs, int, device)
-    fill(env, ("reward", "done", "timeout"), num_envs, float, device)
-    fill(env, ("terminated", "truncated"), num_envs, wp.bool, device)
-    env.clock = wp.full(num_envs, FIRST_CLOCK, dtype=int, device=device)
-    env.request.fill_(-1)
-    return env
+def episode_arrays(num_envs: int, seed: int, skill: wp.array, device: Any) -> Any:
+    """Return the kernels' `EpisodeArrays`."""
+    episode = EpisodeArrays()
+    episode.seed, episode.skill = seed, skill
+    counts = (
+        "requested_task",
+        "has_command",
+        "history_reset",
+        "termination",
+        "diverged",
+        "bad_action",
+        "level",
+        "streak",
+    )
+    fill(episode, ("pending_command",), num_envs, wp.vec4, device)
+    fill(episode, counts, num_envs, int, device)
+    fill(episode, ("reward", "done", "timeout"), num_envs, float, device)
+    fill(episode, ("terminated", "truncated"), num_envs, wp.bool, device)
+    episode.step_count = wp.full(num_envs, FIRST_STEP_COUNT, dtype=int, device=device)
+    episode.requested_task.fill_(-1)
+    return episode
 
 
 def delay_arrays(num_envs: int, latency: wp.array, substeps: int, device: Any) -> Any:
     """Return the kernels' `Delays`; latency [physics steps]: (num_envs,)."""
     delays = Delays()
-    fill(delays, ("past_target",), (RING, 12, num_envs), float, device)
-    fill(delays, ("late_target", "earlier_target"), (12, num_envs), float, device)
-    fill(delays, ("late_steps",), num_envs, int, device)
+    fill(delays, ("target_history",), (RING, 12, num_envs), float, device)
+    fill(delays, ("current_target", "prev_target"), (12, num_envs), float, device)
+    fill(delays, ("switch_step",), num_envs, int, device)
     delays.steps, delays.substeps = latency, substeps
     return delays
 

@@ -12,7 +12,7 @@ import warp as wp
 from jumper_warp.diff.actuation import MOTOR_CONSTANTS
 from jumper_warp.diff.snapshot import Snapshot, compact_columns
 from jumper_warp.envs.arrays import (
-    FIRST_CLOCK,
+    FIRST_STEP_COUNT,
     checked_action,
     checked_commands,
     checked_mask,
@@ -23,7 +23,7 @@ from jumper_warp.envs.arrays import (
 )
 from jumper_warp.envs.stages import Stages
 from jumper_warp.envs.state import load_state, save_state
-from jumper_warp.kernels.mdp.reset import stand_kernel
+from jumper_warp.kernels.mdp.reset import default_pose_kernel
 from jumper_warp.robot.grounds import BlockCfg
 from jumper_warp.robot.model import PHYSICS_DT
 from jumper_warp.robot.overlay import RobotOverlay
@@ -133,7 +133,7 @@ class Env(Stages):
         terms = wp.to_torch(first.term_value)
         self.reward_terms = {term.name: terms[i] for i, term in enumerate(first.task.rewards)}
         names = ("reward", "done", "timeout", "terminated", "truncated")
-        self.reward, self.done, self.timeout, ended, cut = (wp.to_torch(getattr(self.worlds, name)) for name in names)
+        self.reward, self.done, self.timeout, ended, cut = (wp.to_torch(getattr(self.episodes, name)) for name in names)
         self._step = Step(first.obs, self.reward, ended, cut, {"final_obs": first.final_obs, "time_outs": self.timeout})
 
     # ------------------------------------------------------------------ stepping
@@ -156,9 +156,9 @@ class Env(Stages):
             self._start_over(seed)
         self._ends_episodes = self._ends_episodes or worlds is None
         self.compile()  # an evaluation compiles no draws
-        self._tick(chosen)
-        self._begin(self._part(), chosen)
-        self._observe(self._part(), beginning=int(worlds is not None))
+        self._advance_rng(chosen)
+        self._reset_worlds(self._part(), chosen)
+        self._observe(self._part(), after_reset=int(worlds is not None))
         return self._step.obs, {}
 
     def compile(self) -> None:
@@ -168,13 +168,14 @@ class Env(Stages):
             self._compiled = True
 
     def _start_over(self, seed: int) -> None:
-        self.seed = self.worlds.seed = seed
+        self.seed = self.episodes.seed = seed
         self._started = False
         self._graphs.clear()  # they hold the old seed
-        for array, value in ((self.worlds.clock, FIRST_CLOCK), (self.worlds.request, -1), (self.worlds.told, 0),
-                             (self.worlds.level, 0), (self.worlds.streak, 0)):  # fmt: skip
+        for array, value in ((self.episodes.step_count, FIRST_STEP_COUNT), (self.episodes.requested_task, -1),
+                             (self.episodes.has_command, 0), (self.episodes.level, 0),
+                             (self.episodes.streak, 0)):  # fmt: skip
             array.fill_(value)
-        self.worlds.skill.assign(self._first_skill)
+        self.episodes.skill.assign(self._first_skill)
         for skill in self.skills:
             skill.states.zero_()
 
@@ -233,15 +234,15 @@ class Env(Stages):
             load_kernels(self.kernels(draws=False), self.wp_device)
         if self._draws_ground:
             self._scene.ground.blocks.zero_()
-        self._tick(mask)
-        self._go_home(self._part(), mask)
-        self._draw(self._part(), mask)
-        inputs = [mask, headings, self._scene, self._settings, self.worlds.skill, self.robot]
-        self._launch(stand_kernel, n, inputs)
-        self._forget(self._part(), mask)
-        self._give(mask, 1, values, headings)
-        self.worlds.done.zero_()
-        self._observe(self._part(), beginning=1)
+        self._advance_rng(mask)
+        self._restore_first_task(self._part(), mask)
+        self._randomize(self._part(), mask)
+        inputs = [mask, headings, self._scene, self._settings, self.episodes.skill, self.robot]
+        self._launch(default_pose_kernel, n, inputs)
+        self._clear_history(self._part(), mask)
+        self._set_commands(mask, 1, values, headings)
+        self.episodes.done.zero_()
+        self._observe(self._part(), after_reset=1)
 
     def command(self, commands: Any, worlds: Any = None) -> None:
         """Give worlds a command within their episode; `obs` shows it at once.
@@ -251,8 +252,8 @@ class Env(Stages):
         Raises ValueError: values of another shape, out of bounds or not finite.
         """
         chosen = checked_mask(worlds, self.num_envs)
-        self._give(self._array(chosen), 0, checked_commands(commands, chosen, self.tasks), self._all)
-        self._observe(self._part(), beginning=1)
+        self._set_commands(self._array(chosen), 0, checked_commands(commands, chosen, self.tasks), self._all)
+        self._observe(self._part(), after_reset=1)
 
     def request(self, skill: int, worlds: Any = None, commands: Any = None) -> None:
         """Ask worlds to hand over to another skill as soon as a handover allows it.
@@ -266,8 +267,8 @@ class Env(Stages):
         if commands is not None:
             values = checked_commands(commands, mask, [self.tasks[skill]])
         mask = mask > 0.0
-        for array, new in ((self.worlds.request, skill), (self.worlds.told, int(commands is not None)),
-                           (self.worlds.wanted, values[mask])):  # fmt: skip
+        for array, new in ((self.episodes.requested_task, skill), (self.episodes.has_command, int(commands is not None)),
+                           (self.episodes.pending_command, values[mask])):  # fmt: skip
             kept = array.numpy()
             kept[mask] = new
             array.assign(kept)
@@ -286,12 +287,12 @@ class Env(Stages):
         arrays = {name: np.array(state[name]) for name in state.dtype.names or ()}
         q, qd = self.sim.joint_q(), self.sim.joint_qd()
         arrays |= {"base_pos": q[:, :3].copy(), "base_quat": q[:, 3:7].copy(), "base_vel": qd[:, :3].copy()}
-        return arrays | {name: getattr(self.worlds, name).numpy().copy() for name in ("done", "ending", "level")}
+        return arrays | {name: getattr(self.episodes, name).numpy().copy() for name in ("done", "termination", "level")}
 
     def snapshot(self) -> Snapshot:
         """Return the robots, their parameters and their state, as gradients need them; waits for nothing."""
         sim, n = self.sim, self.num_envs
-        past, clock = wp.to_torch(self.delays.past_target), wp.to_torch(self.worlds.clock).long()
+        past, step_count = wp.to_torch(self.delays.target_history), wp.to_torch(self.episodes.step_count).long()
         parameters = {name: wp.to_torch(getattr(sim.motors, name)) for name in MOTOR_CONSTANTS}
         dynamics = sim.physics.dynamics
         return Snapshot(
@@ -307,7 +308,7 @@ class Env(Stages):
             | {"table": wp.to_torch(dynamics.robot.table), "latency": wp.to_torch(self.parameters.latency) * sim.dt},
             q=compact_columns(wp.to_torch(self.robot.joint_q).view(n, -1), 7),
             qd=compact_columns(wp.to_torch(self.robot.joint_qd).view(n, -1), 6),
-            before=past[(clock - 1) % len(past), :, torch.arange(n, device=self.device)].T,
+            before=past[(step_count - 1) % len(past), :, torch.arange(n, device=self.device)].T,
             impulse=wp.to_torch(self.robot.impulse),
             action=wp.to_torch(self.robot.action),
             torque=wp.to_torch(self.robot.torque),
@@ -322,7 +323,7 @@ class Env(Stages):
         figures = self.skills[0].metrics()
         for skill in self.skills[1:]:
             figures |= {f"{skill.task.name}/{name}": value for name, value in skill.metrics().items()}
-        levels = np.bincount(self.worlds.level.numpy(), minlength=len(self.task.levels) + 1)
+        levels = np.bincount(self.episodes.level.numpy(), minlength=len(self.task.levels) + 1)
         return figures | {f"Curriculum/level_{i}": float(count) / self.num_envs for i, count in enumerate(levels)}
 
     def mirror(self, what: str) -> Mirror:

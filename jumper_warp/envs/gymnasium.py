@@ -48,7 +48,7 @@ class GymVectorEnv(gymnasium.vector.VectorEnv):
         self.env, self.num_envs = env, env.num_envs
         self.endings = tuple(term.name for term in env.task.terminations)
         self._all_groups, self._tensors, self._began = all_groups, tensors, False
-        self._ending = wp.to_torch(env.worlds.ending)
+        self._ending = wp.to_torch(env.episodes.termination)
         widths = {"policy": env.num_obs, "critic": env.num_critic_obs}
         boxes = {group: Box(-RAW_LIMIT, RAW_LIMIT, (width,)) for group, width in widths.items()}
         self.single_observation_space = Dict([*boxes.items()]) if all_groups else boxes["policy"]
@@ -86,9 +86,9 @@ class GymVectorEnv(gymnasium.vector.VectorEnv):
         terminated, truncated = (self._given(flag.clone()) for flag in (step.terminated, step.truncated))
         ended, infos = terminated | truncated, {}
         if self._tensors or ended.any():
-            final, ending = self._shown(step.extras["final_obs"]), self._given(self._ending.clone())
+            final, termination = self._shown(step.extras["final_obs"]), self._given(self._ending.clone())
             infos["final_obs"], infos["_final_obs"] = final if self._tensors else self._rows(final, ended), ended
-            infos["final_info"] = {"ending": ending, "_ending": _copy(ended)}
+            infos["final_info"] = {"termination": termination, "_ending": _copy(ended)}
             infos["_final_info"] = _copy(ended)
         return self._shown(step.obs), self._given(reward), terminated, truncated, infos
 

@@ -11,10 +11,10 @@ import torch
 import warp as wp
 
 from jumper_warp.envs.arrays import fill
-from jumper_warp.kernels.mdp.env import RING, Counters, Nothing, SkillSettings
+from jumper_warp.kernels.mdp.env import RING, Counters, NoSettings, SkillSettings
 from jumper_warp.kernels.mdp.events import make_event_kernel
 from jumper_warp.kernels.mdp.observe import CHUNK, ObservationArrays, make_observe_kernel
-from jumper_warp.kernels.mdp.reset import make_give_kernel, make_reset_kernel
+from jumper_warp.kernels.mdp.reset import make_reset_kernel, make_set_command_kernel
 from jumper_warp.kernels.mdp.step import make_step_kernel
 from jumper_warp.kernels.mdp.view import vec12
 from jumper_warp.robot.motors import filter_params
@@ -25,7 +25,7 @@ from jumper_warp.utils.kernels import Kernel, records
 _KERNELS: dict[tuple, Kernel] = {}
 
 
-class Skill:
+class TaskRuntime:
     """The side of an environment that belongs to one task. Struct and array attributes are the kernels' arguments."""
 
     def __init__(self, task: TaskCfg, index: int, num_envs: int, step_dt: float, substeps: int, device: Any) -> None:
@@ -45,14 +45,14 @@ class Skill:
     def _counters(self) -> Any:
         n, task, counters = self.num_envs, self.task, Counters()
         fill(counters, ("term_sum",), (max(len(task.rewards), 1), n), wp.float64, self.device)
-        fill(counters, ("ending_count",), (len(task.terminations), n), int, self.device)
-        fill(counters, ("counted", "succeeded", "bad_actions"), n, int, self.device)
+        fill(counters, ("termination_count",), (len(task.terminations), n), int, self.device)
+        fill(counters, ("curriculum_episodes", "curriculum_successes", "bad_actions"), n, int, self.device)
         fill(counters, ("error_sum",), n, wp.float64, self.device)
         return counters
 
     def _structs(self, values: list, kind: Any = None) -> wp.array:
         """Return structs as an array; an unused one where there are none."""
-        values = values or [Nothing()]
+        values = values or [NoSettings()]
         return wp.array(values, dtype=kind or values[0]._cls, device=self.device)
 
     def _allocate_observations(self, substeps: int) -> None:
@@ -107,13 +107,16 @@ class Skill:
     def metrics(self) -> dict[str, float]:
         """Return means since the last call, and clear the counters (waits for the device)."""
         task, counters, figures = self.task, self.counters, {}
-        endings = counters.ending_count.numpy().sum(axis=1)
+        endings = counters.termination_count.numpy().sum(axis=1)
         ended = max(int(endings.sum()), 1)
         for term, total in zip(task.rewards, counters.term_sum.numpy().sum(axis=1), strict=False):
             figures[f"Episode_Reward/{term.name}"] = float(total) / ended
         for term, count in zip(task.terminations, endings, strict=True):
             figures[f"Episode_Termination/{term.name}"] = float(count) / ended
-        counted, succeeded = int(counters.counted.numpy().sum()), int(counters.succeeded.numpy().sum())
+        counted, succeeded = (
+            int(counters.curriculum_episodes.numpy().sum()),
+            int(counters.curriculum_successes.numpy().sum()),
+        )
         figures["Metrics/success"] = succeeded / max(counted, 1)
         error = float(counters.error_sum.numpy().sum())
         figures[f"Metrics/error_{task.curriculum.options['unit']}"] = error / max(succeeded, 1)
@@ -149,7 +152,7 @@ def kernels_of(task: TaskCfg) -> dict[str, Kernel]:
     return {
         "step": _kernel(make_step_kernel, task, task.state, ends, task.reward_floor),
         "reset": _kernel(make_reset_kernel, task, task.state, begins),
-        "give": _kernel(make_give_kernel, task, task.state, task.command.give),
+        "give": _kernel(make_set_command_kernel, task, task.state, task.command.give),
         "observe": _kernel(make_observe_kernel, task, task.state, tuple(compiled[group] for group in task.groups)),
         "event": _kernel(make_event_kernel, slots["events"], compiled["events"]),
     }

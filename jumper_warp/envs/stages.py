@@ -8,20 +8,27 @@ from typing import Any, NamedTuple
 import numpy as np
 import warp as wp
 
-from jumper_warp.envs.arrays import FIRST_CLOCK, checked_skill, delay_arrays, env_arrays, robot_arrays, scene_of
+from jumper_warp.envs.arrays import (
+    FIRST_STEP_COUNT,
+    checked_skill,
+    delay_arrays,
+    episode_arrays,
+    robot_arrays,
+    scene_of,
+)
 from jumper_warp.envs.parameters import robot_parameters
-from jumper_warp.envs.skill import Skill
+from jumper_warp.envs.skill import TaskRuntime
 from jumper_warp.kernels.mdp import attempts, events
 from jumper_warp.kernels.mdp.actions import action_kernel
-from jumper_warp.kernels.mdp.env import EnvArrays, SkillSettings
+from jumper_warp.kernels.mdp.env import EpisodeArrays, SkillSettings
 from jumper_warp.kernels.mdp.events import AT_RESET, AT_STEP, STARTUP
-from jumper_warp.kernels.mdp.handover import home_kernel, make_handover_kernel
-from jumper_warp.kernels.mdp.observe import LANES, condition_kernel
+from jumper_warp.kernels.mdp.handover import make_handover_kernel, restore_task_kernel
+from jumper_warp.kernels.mdp.observe import LANES, postprocess_obs_kernel
 from jumper_warp.kernels.mdp.parameters import motors_kernel
-from jumper_warp.kernels.mdp.reset import forget_kernel, tick_kernel
+from jumper_warp.kernels.mdp.reset import advance_rng_kernel, clear_history_kernel
 from jumper_warp.kernels.mdp.track import track_kernel
 from jumper_warp.sim.simulation import Simulation
-from jumper_warp.sim.slices import Worlds
+from jumper_warp.sim.slices import WorldRange
 from jumper_warp.tasks.cfg import Handover, TaskCfg
 from jumper_warp.utils.kernels import Kernel
 
@@ -29,18 +36,18 @@ BLOCK = 32
 """Threads of a block: small ones spread a few thousand heavy threads over all multiprocessors."""
 BLOCKS = {"reset": 128, "event": 256}
 """Of kernels of a task that are not launched so, by name."""
-CONDITION_BLOCK = 256
+POSTPROCESS_BLOCK = 256
 EVENT_BLOCKS = 264
 """Most blocks of events: of their many threads few have something to do, and a new block costs more than a turn."""
 
 
-class Part(NamedTuple):
+class WorldSlice(NamedTuple):
     """The worlds that a stage is launched for."""
 
     first: int
     count: int
-    env: Any
-    """The kernels' `EnvArrays` that begin at `first`."""
+    episode: Any
+    """The kernels' `EpisodeArrays` that begin at `first`."""
 
 
 class Stages:
@@ -63,10 +70,10 @@ class Stages:
         n, device, sim = self.num_envs, self.wp_device, self.sim
         self._first_skill = checked_skill(skill, n, len(tasks))
         active, self._home = (wp.array(self._first_skill, dtype=int, device=device) for _ in range(2))
-        self.skills = [Skill(task, i, n, self.step_dt, sim.substeps, device) for i, task in enumerate(tasks)]
+        self.skills = [TaskRuntime(task, i, n, self.step_dt, sim.substeps, device) for i, task in enumerate(tasks)]
         self.parameters = robot_parameters(sim, tuple(tasks), active)
         self.robot, self._scene = robot_arrays(sim, self.step_dt), scene_of(sim)
-        self.worlds = env_arrays(n, self.seed, active, device)
+        self.episodes = episode_arrays(n, self.seed, active, device)
         self.delays = delay_arrays(n, self.parameters.latency, sim.substeps, device)
         for each in self.skills:
             each.observations.latency = self.parameters.observation_latency
@@ -81,104 +88,105 @@ class Stages:
 
     def restored(self) -> None:
         """Let the solver and the terms read what was put back."""
-        self._started = bool((self.worlds.clock.numpy() > FIRST_CLOCK).all())
+        self._started = bool((self.episodes.step_count.numpy() > FIRST_STEP_COUNT).all())
         for skill in self.skills:
             skill.params.restore()
         self.sim.physics.parameters_changed()
 
     def kernels(self, draws: bool = True) -> list[tuple[Kernel, int]]:
         """Return what `reset` and `step` launch, each with its block size; draws: the draw of starts too."""
-        shared = [action_kernel, motors_kernel, forget_kernel, tick_kernel, track_kernel]
-        shared += [home_kernel] if len(self.skills) > 1 else []
+        shared = [action_kernel, motors_kernel, clear_history_kernel, advance_rng_kernel, track_kernel]
+        shared += [restore_task_kernel] if len(self.skills) > 1 else []
         shared += [kernel for kernel, _, _ in self._handovers]
         names = [name for name in self.skills[0].kernels if draws or name != "reset"]
         found = [(skill.kernels[name], BLOCKS.get(name, BLOCK)) for skill in self.skills for name in names]
-        found += [(condition_kernel, CONDITION_BLOCK), *((kernel, BLOCK) for kernel in shared)]
+        found += [(postprocess_obs_kernel, POSTPROCESS_BLOCK), *((kernel, BLOCK) for kernel in shared)]
         return found + self.sim.physics.kernels()
 
-    def _part(self, worlds: Worlds | None = None) -> Part:
+    def _part(self, worlds: WorldRange | None = None) -> WorldSlice:
         """Return some of the worlds as stages are launched for them, by default all."""
         if worlds is None or worlds.count == self.num_envs:
-            return Part(0, self.num_envs, self.worlds)
-        env = EnvArrays()
-        for name in EnvArrays.vars:
-            setattr(env, name, getattr(self.worlds, name))
+            return WorldSlice(0, self.num_envs, self.episodes)
+        env = EpisodeArrays()
+        for name in EpisodeArrays.vars:
+            setattr(env, name, getattr(self.episodes, name))
         env.first = worlds.first
-        return Part(*worlds, env)
+        return WorldSlice(*worlds, env)
 
-    def _launch_step(self, worlds: Worlds | None = None) -> None:
+    def _launch_step(self, worlds: WorldRange | None = None) -> None:
         for stage in self.stages(worlds).values():
             stage()
 
-    def stages(self, worlds: Worlds | None = None) -> dict[str, Callable[[], None]]:
+    def stages(self, worlds: WorldRange | None = None) -> dict[str, Callable[[], None]]:
         """Return the parts of a step by name, in order: each launches its kernels and does not wait for them.
 
         worlds: for which they are launched, by default all; no stage of some reads or writes what is of others.
         """
         part = self._part(worlds)
-        return {"action": lambda: self._act(part), "physics": lambda: self._advance(part),
-                "episode": lambda: self._judge(part), "observe": lambda: self._observe(part, beginning=0),
-                "reset": lambda: self._renew(part)}  # fmt: skip
+        return {"action": lambda: self._apply_actions(part), "physics": lambda: self._advance(part),
+                "episode": lambda: self._compute_rewards_and_dones(part),
+                "observe": lambda: self._observe(part, after_reset=0),
+                "reset": lambda: self._reset_done(part)}  # fmt: skip
 
-    def _act(self, part: Part) -> None:
-        inputs = [self._action, self._settings, self.parameters.push, self.robot, part.env, self.delays]
+    def _apply_actions(self, part: WorldSlice) -> None:
+        inputs = [self._action, self._settings, self.parameters.push, self.robot, part.episode, self.delays]
         self._launch(action_kernel, (4, part.count), inputs)
         self._events(part, AT_STEP, self._all)
 
-    def _advance(self, part: Part) -> None:
+    def _advance(self, part: WorldSlice) -> None:
         delays, scene = self.delays, self._scene
         self.sim.physics.advance(
-            self.sim.substeps, delays.late_target, delays.earlier_target, delays.late_steps, bodies=False,
-            worlds=Worlds(part.first, part.count),
+            self.sim.substeps, delays.current_target, delays.prev_target, delays.switch_step, bodies=False,
+            worlds=WorldRange(part.first, part.count),
         )  # fmt: skip
-        inputs = [scene.geometry, scene.ground, self._settings, part.env, self.robot]
+        inputs = [scene.geometry, scene.ground, self._settings, part.episode, self.robot]
         self._launch(track_kernel, (4, part.count), inputs)
 
-    def _judge(self, part: Part) -> None:
+    def _compute_rewards_and_dones(self, part: WorldSlice) -> None:
         for skill in self.skills:
             self._launch(
                 skill.kernels["step"], part.count,
-                [skill.index, self.robot, self._scene.ground, len(skill.task.levels), skill.params.values, part.env,
+                [skill.index, self.robot, self._scene.ground, len(skill.task.levels), skill.params.values, part.episode,
                  skill.states, skill.term_value, skill.counters],
             )  # fmt: skip
 
-    def _renew(self, part: Part) -> None:
+    def _reset_done(self, part: WorldSlice) -> None:
         self._hand_over(part)
         begins = self.auto_reset and self._ends_episodes
         if begins:
-            self._begin(part, self.worlds.done)
+            self._reset_worlds(part, self.episodes.done)
         if self._handovers or begins:
-            self._observe(part, beginning=1)
+            self._observe(part, after_reset=1)
 
-    def _hand_over(self, part: Part) -> None:
+    def _hand_over(self, part: WorldSlice) -> None:
         if self._handovers:
             self._moved[part.first : part.first + part.count].zero_()
         for kernel, source, target in self._handovers:
             self._launch(
                 kernel, part.count,
                 [source, target, self._scene, self._settings, self._moved, self.robot, self.parameters,
-                 part.env, self.skills[source].states, self.skills[target].states],
+                 part.episode, self.skills[source].states, self.skills[target].states],
             )  # fmt: skip
 
-    def _begin(self, part: Part, mask: wp.array) -> None:
+    def _reset_worlds(self, part: WorldSlice, mask: wp.array) -> None:
         """Begin new episodes where mask is not 0, in the first skill, and commands where they are due."""
-        self._go_home(part, mask)
-        self._draw(part, mask)
+        self._restore_first_task(part, mask)
+        self._randomize(part, mask)
         for skill in self.skills:
             lanes = attempts.LANES if self.wp_device.is_cuda and skill.task.reset.side_by_side else 1
             self._launch(
                 skill.kernels["reset"], (part.count, lanes),
-                [skill.index, lanes, mask, self._scene, self._settings, skill.settings, skill.levels, part.env,
+                [skill.index, lanes, mask, self._scene, self._settings, skill.settings, skill.levels, part.episode,
                  skill.states, self.robot], BLOCKS["reset"],
             )  # fmt: skip
-        self._forget(part, mask)
+        self._clear_history(part, mask)
 
-    def _go_home(self, part: Part, mask: wp.array) -> None:
+    def _restore_first_task(self, part: WorldSlice, mask: wp.array) -> None:
         """Put worlds back into their first skill where mask is not 0, and forget what they were asked for."""
         if len(self.skills) > 1:
-            self._launch(home_kernel, part.count, [mask, self._home, self.parameters, part.env])
+            self._launch(restore_task_kernel, part.count, [mask, self._home, self.parameters, part.episode])
 
-    def _draw(self, part: Part, mask: wp.array) -> None:
+    def _randomize(self, part: WorldSlice, mask: wp.array) -> None:
         """Draw parameters of episodes that begin where mask is not 0."""
         if not self._started:  # all worlds begin
             self._launch(motors_kernel, (12, self.num_envs), [self.parameters])
@@ -186,7 +194,7 @@ class Stages:
             self._started = True
         self._events(part, AT_RESET, mask)
 
-    def _events(self, part: Part, stage: int, mask: wp.array) -> None:
+    def _events(self, part: WorldSlice, stage: int, mask: wp.array) -> None:
         """Run the events of a stage, and let the solver read what they changed."""
         for skill in self.skills:
             slots = enumerate(skill.task.params.slots["events"])
@@ -196,30 +204,30 @@ class Stages:
                 first, lanes = min(due), events.LANES if spread else 1
                 self._launch(
                     skill.kernels["event"], (max(due) - first + 1, lanes, part.count),
-                    [skill.index, stage, first, lanes, mask, self.step_dt, part.env, skill.params.values, skill.timer,
-                     self.parameters], BLOCKS["event"], EVENT_BLOCKS,
+                    [skill.index, stage, first, lanes, mask, self.step_dt, part.episode, skill.params.values,
+                     skill.timer, self.parameters], BLOCKS["event"], EVENT_BLOCKS,
                 )  # fmt: skip
             if any(slot.repack for slot in due.values()):
-                self.sim.physics.parameters_changed(mask, Worlds(part.first, part.count))
+                self.sim.physics.parameters_changed(mask, WorldRange(part.first, part.count))
 
-    def _forget(self, part: Part, mask: wp.array) -> None:
+    def _clear_history(self, part: WorldSlice, mask: wp.array) -> None:
         inputs = [part.first, mask, self._scene.geometry, self.robot, self.delays]
-        self._launch(forget_kernel, (12, part.count), inputs)
+        self._launch(clear_history_kernel, (12, part.count), inputs)
         self.sim.physics.after_reset(mask)
 
-    def _tick(self, mask: wp.array) -> None:
-        self._launch(tick_kernel, self.num_envs, [mask, self.worlds])
+    def _advance_rng(self, mask: wp.array) -> None:
+        self._launch(advance_rng_kernel, self.num_envs, [mask, self.episodes])
 
-    def _observe(self, part: Part, beginning: int) -> None:
+    def _observe(self, part: WorldSlice, after_reset: int) -> None:
         for skill in self.skills:
             arrays = skill.observations
             self._launch(
                 skill.kernels["observe"], (skill.num_chunks, part.count),
-                [skill.index, self.robot, self.parameters, self._scene.ground, part.env, skill.states,
-                 skill.params.values, beginning, arrays.raw],
+                [skill.index, self.robot, self.parameters, self._scene.ground, part.episode, skill.states,
+                 skill.params.values, after_reset, arrays.raw],
             )  # fmt: skip
-            inputs = [skill.index, part.env, skill.columns, skill.params.values, beginning, arrays]
-            self._launch(condition_kernel, (part.count, int(LANES)), inputs, CONDITION_BLOCK)
+            inputs = [skill.index, part.episode, skill.columns, skill.params.values, after_reset, arrays]
+            self._launch(postprocess_obs_kernel, (part.count, int(LANES)), inputs, POSTPROCESS_BLOCK)
 
     def _launch(
         self, kernel: Kernel, dim: int | tuple[int, ...], inputs: list, block: int = BLOCK, blocks: int = 0
@@ -227,10 +235,10 @@ class Stages:
         """Launch; blocks: most blocks of a GPU, whose threads take turns (0: as many as there are threads)."""
         wp.launch(kernel, dim=dim, inputs=inputs, device=self.wp_device, block_dim=block, max_blocks=blocks)
 
-    def _give(self, mask: wp.array, begins: int, values: np.ndarray, headings: wp.array) -> None:
+    def _set_commands(self, mask: wp.array, begins: int, values: np.ndarray, headings: wp.array) -> None:
         commands = wp.array(values, dtype=wp.vec4, device=self.wp_device)
         for skill in self.skills:
             self._launch(
                 skill.kernels["give"], self.num_envs,
-                [skill.index, mask, begins, commands, headings, self._scene, self.robot, self.worlds, skill.states],
+                [skill.index, mask, begins, commands, headings, self._scene, self.robot, self.episodes, skill.states],
             )  # fmt: skip

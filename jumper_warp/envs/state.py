@@ -10,8 +10,8 @@ import numpy as np
 import torch
 import warp as wp
 
-from jumper_warp.envs.arrays import FIRST_CLOCK
-from jumper_warp.kernels.mdp.env import RING, Delays, EnvArrays
+from jumper_warp.envs.arrays import FIRST_STEP_COUNT
+from jumper_warp.kernels.mdp.env import RING, Delays, EpisodeArrays
 from jumper_warp.kernels.mdp.parameters import RobotParameters
 from jumper_warp.kernels.mdp.view import RobotArrays
 from jumper_warp.utils.errors import InputError
@@ -96,7 +96,7 @@ def _check_indices(env: Stages, state: dict[str, torch.Tensor]) -> None:
     bounds = {
         "env.level": (0, max(len(skill.task.levels) for skill in env.skills)),
         "env.skill": (0, len(env.skills) - 1),
-        "env.clock": (FIRST_CLOCK, math.inf),
+        "env.step_count": (FIRST_STEP_COUNT, math.inf),
         "parameters.latency": (0, longest),
         "parameters.observation_latency": (0, longest),
     }
@@ -125,7 +125,7 @@ def _records(env: Stages) -> dict[str, wp.array]:
 def _tensors(env: Stages) -> dict[str, torch.Tensor]:
     """Return views of the environment's own memory by name."""
     found: dict[str, Any] = {}
-    structs = (("robot", RobotArrays, env.robot), ("env", EnvArrays, env.worlds), ("delays", Delays, env.delays),
+    structs = (("robot", RobotArrays, env.robot), ("env", EpisodeArrays, env.episodes), ("delays", Delays, env.delays),
                ("parameters", RobotParameters, env.parameters))  # fmt: skip
     for prefix, kind, struct in structs:
         for name in kind.vars:

@@ -13,7 +13,7 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
-from jumper_warp.evaluation.courses import Course, course_metrics, draw_course
+from jumper_warp.evaluation.courses import Course, course_metrics, plot_course
 from jumper_warp.evaluation.film import Film
 from jumper_warp.evaluation.log import EvaluationLog, run_evaluation
 from jumper_warp.evaluation.run import EvaluationRun, SkillRun
@@ -160,7 +160,7 @@ def play_script(cfg: ScriptCfg) -> Path:
     film = Film(env, course.series, [0], notes={**course.notes([0]), "solver": cfg.conditions.solver})
     run_evaluation(run.actor(env), env, course, watch=film)
     path = film.save_rrd(run.folder / "course.rrd")
-    draw_course(run.folder / "course.png", course, 0)
+    plot_course(run.folder / "course.png", course, 0)
     figures = {"outcome": str(course.outcomes[0]), **course_metrics(course)}
     write_metrics(run.folder, figures)
     print_figures(figures)

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from jumper_warp.evaluation.log import EvaluationLog, Metrics, failures, finite, largest, mean
-from jumper_warp.evaluation.plots import drawn
+from jumper_warp.evaluation.plots import figure
 from jumper_warp.evaluation.scripts import ScriptStep
 from jumper_warp.evaluation.velocities import SKIP, body_velocity, rmse_metrics, velocity_series
 from jumper_warp.policies.skills import JUMP_TO, JUMP_UP, WALK
@@ -110,8 +110,8 @@ class Course(EvaluationLog):
         q, qd = env.sim.joint_q(), env.sim.joint_qd()
         seen = {
             "base_pos": q[:, :3].copy(), "base_quat": q[:, 3:7].copy(), "base_ang_vel": qd[:, 3:6].copy(),
-            "base_vel": env.sim.base_velocity(), "skill": env.worlds.skill.numpy().copy(),
-            "ending": env.worlds.ending.numpy().copy(),
+            "base_vel": env.sim.base_velocity(), "skill": env.episodes.skill.numpy().copy(),
+            "termination": env.episodes.termination.numpy().copy(),
             "force": np.linalg.norm(env.sim.paw_force.numpy(), axis=2).T,
         }  # fmt: skip
         rows = np.arange(len(q))
@@ -158,7 +158,7 @@ class Course(EvaluationLog):
             asked = worlds & (self.target[rows, at] == skill)
             if asked.any():
                 delay = np.full((len(rows), 1), round(SQUAT / self.step_dt))
-                env.request(skill, asked, np.concatenate([self.goal[rows, at], delay], axis=1))
+                env.requested_task(skill, asked, np.concatenate([self.goal[rows, at], delay], axis=1))
 
     def update(self, arrays: dict[str, np.ndarray], step_dt: float) -> bool:
         """Take in a policy step; return whether all courses have ended."""
@@ -166,8 +166,8 @@ class Course(EvaluationLog):
         skill, was, step = arrays["skill"], self._skill, len(self.skills) + 1
         running = self.end < 0
         self._keep(arrays, running, was, step)
-        fell = running & (arrays["ending"] >= 0)
-        self.end[fell] = arrays["ending"][fell]
+        fell = running & (arrays["termination"] >= 0)
+        self.end[fell] = arrays["termination"][fell]
         row = np.flatnonzero(running & ~fell)
         at = (row, self.current[row])
         kind, since = self.target[at], step - self.began[at]
@@ -331,9 +331,9 @@ def active_spans(course: Course, world: int) -> list[tuple[int, float, float]]:
     return [(int(skills[a]), a * course.step_dt, b * course.step_dt) for a, b in pairwise(edges)]
 
 
-def draw_course(path: Path, course: Course, world: int, title: str = "") -> None:
+def plot_course(path: Path, course: Course, world: int, title: str = "") -> None:
     """Draw velocities and commands, height and active skill of a robot over time."""
-    with drawn(path, 5, 1, figsize=(10, 9), sharex=True) as axes:
+    with figure(path, 5, 1, figsize=(10, 9), sharex=True) as axes:
         time = course.step_dt * np.arange(1, len(course.skills) + 1)
         velocity, wanted = (np.array(values)[:, world] for values in (course.velocity, course.wanted))
         labels = ("vx [m/s]", "vy [m/s]", "yaw rate [rad/s]")

@@ -60,8 +60,8 @@ class Episodes(EvaluationLog):
         self._height_sum[running] += arrays["base_pos"][running, 2]
         self._steps[running] += 1
         self.length[running] += step_dt
-        ended = running & (arrays["ending"] >= 0)
-        self.end[ended] = arrays["ending"][ended]
+        ended = running & (arrays["termination"] >= 0)
+        self.end[ended] = arrays["termination"][ended]
         return bool((self.end >= 0).all())
 
     @property

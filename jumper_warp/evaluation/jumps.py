@@ -144,9 +144,9 @@ class JumpLog(EvaluationLog):
         self.apex[at], self.tilt[at] = now["max_height"], now["peak_tilt"]
         landed = now["phase"] == LANDED
         self._follow_landing(now, at, landed, step_dt)
-        failed = (now["ending"] >= 0) & (now["ending"] != self._success)
+        failed = (now["termination"] >= 0) & (now["termination"] != self._success)
         rested = ~failed & landed & (now["phase_steps"] >= round(self.rest / step_dt))
-        self.end[at] = np.where(failed, now["ending"], np.where(rested, self._success, -1))
+        self.end[at] = np.where(failed, now["termination"], np.where(rested, self._success, -1))
         self.current[row[rested]] += 1
         self.current[row[failed]] = count
         return bool((self.current >= count).all())

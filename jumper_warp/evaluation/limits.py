@@ -49,17 +49,17 @@ def open_loop_limits(env: Env, fresh: dict[str, Any]) -> np.ndarray:
     for name in pushes:
         env.set(name, 0.0)
     env.evaluation_reset(jump_commands(np.zeros((env.num_envs, 3)), 0.0, env.step_dt))
-    highest, broken = np.zeros(env.num_envs), np.zeros(env.num_envs, dtype=bool)
+    highest, diverged = np.zeros(env.num_envs), np.zeros(env.num_envs, dtype=bool)
     for step in range(STAND + RAMP + HOLD + EXTEND + MORE):
         level = open_loop_action(step)
         env.step(torch.tensor([0.0, level, level] * 4, device=env.device).repeat(env.num_envs, 1))
         arrays = env.task_arrays()
-        broken |= env.worlds.broken.numpy() != 0
+        diverged |= env.episodes.diverged.numpy() != 0
         if step >= STAND + RAMP + HOLD:
             highest = np.fmax(highest, arrays["base_pos"][:, 2])
     for name, value in pushes.items():
         env.set(name, value)
-    return np.where(broken, np.nan, highest)
+    return np.where(diverged, np.nan, highest)
 
 
 def limit_metrics(jumps: HeightLog, limit: np.ndarray) -> Metrics:

@@ -18,7 +18,7 @@ import matplotlib.pyplot as plt
 
 
 @contextmanager
-def drawn(path: Path, *shape: int, **settings: Any) -> Iterator[Any]:
+def figure(path: Path, *shape: int, **settings: Any) -> Iterator[Any]:
     """Give the axes of a figure, which is written to a file afterwards; shape, settings: as of `subplots`."""
     fig, axes = plt.subplots(*shape, constrained_layout=True, **settings)
     yield axes
@@ -26,7 +26,7 @@ def drawn(path: Path, *shape: int, **settings: Any) -> Iterator[Any]:
     plt.close(fig)
 
 
-def draw_sweep(
+def plot_sweep(
     axis: Any, commanded: np.ndarray, reached: np.ndarray, good: np.ndarray, tolerance: float, names: tuple[str, str]
 ) -> None:
     """Draw reached over commanded values [m], and what counts as reached; names: of the good ones and the others."""
@@ -40,9 +40,9 @@ def draw_sweep(
     axis.legend(loc="upper left")
 
 
-def draw_landings(path: Path, tests: dict[str, PlaceLog], size: tuple[float, float]) -> None:
+def plot_landings(path: Path, tests: dict[str, PlaceLog], size: tuple[float, float]) -> None:
     """Draw goals and landings of first jumps from above, the start at the origin, a panel a test (title to jumps)."""
-    with drawn(path, 1, len(tests), figsize=size, squeeze=False) as axes:
+    with figure(path, 1, len(tests), figsize=size, squeeze=False) as axes:
         for axis, (title, landings) in zip(axes[0], tests.items(), strict=True):
             good, goals, landing = landings.success[:, 0], landings.places[:, 0], landings.landing[:, 0]
             axis.plot(*np.stack([goals, landing]).transpose(2, 0, 1), color="0.7", linewidth=0.8)
@@ -71,12 +71,12 @@ class Track:
         return np.stack([cos * x + sin * y, cos * y - sin * x], axis=-1)
 
 
-def draw_paths(path: Path, paths: dict[str, np.ndarray], goals: Mapping[str, Sequence], title: str) -> None:
+def plot_paths(path: Path, paths: dict[str, np.ndarray], goals: Mapping[str, Sequence], title: str) -> None:
     """Draw ways of bases from above, a panel a test; where a test has a row of goals, these if no jump has an error.
 
     paths [m]: by test, of `Track.in_start_frame`; goals [m]: by test, each relative to the one before.
     """
-    with drawn(path, 1, len(paths), figsize=(5.0 * len(paths), 4.5)) as axes:
+    with figure(path, 1, len(paths), figsize=(5.0 * len(paths), 4.5)) as axes:
         for axis, (name, places) in zip(axes, paths.items(), strict=True):
             for way in places:
                 axis.plot(way[:, 0], way[:, 1], linewidth=0.8, alpha=0.5, color="tab:blue")

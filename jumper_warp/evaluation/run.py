@@ -128,7 +128,7 @@ class Run(ABC):
         log: Log,
         *,
         film: str = "",
-        drawn: Mapping[str, Any] | None = None,
+        figure: Mapping[str, Any] | None = None,
         watch: Callable[[Log], None] | None = None,
     ) -> Log:
         """Run one episode a world as a log commands, and return the log.
@@ -136,7 +136,7 @@ class Run(ABC):
         film: name of the recording and filmstrip of some of the worlds; no film without. drawn: the environment's
         `ground` and `block`, if the film shows them. watch: called with the log after every policy step.
         """
-        pictures = self._film(env, log, drawn or {}) if film and self.record else None
+        pictures = self._film(env, log, figure or {}) if film and self.record else None
 
         def look() -> None:
             if watch is not None:
@@ -151,12 +151,12 @@ class Run(ABC):
             self._develop(pictures, log, film)
         return log
 
-    def _film(self, env: Env, log: EvaluationLog, drawn: Mapping[str, Any]) -> Film:
+    def _film(self, env: Env, log: EvaluationLog, figure: Mapping[str, Any]) -> Film:
         """Return the film of some worlds, evenly chosen."""
-        ground = drawn.get("ground", "plane")
+        ground = figure.get("ground", "plane")
         worlds = np.linspace(0, env.num_envs - 1, min(self.record, env.num_envs)).round().astype(int).tolist()
         spacing = log.spacing if isinstance(ground, str) else 0.0
-        block, notes = drawn.get("block"), log.notes(worlds)
+        block, notes = figure.get("block"), log.notes(worlds)
         return Film(env, log.series, worlds, spacing=spacing, ground=ground, block=block, notes=notes)
 
     def _develop(self, film: Film, log: EvaluationLog, name: str) -> None:

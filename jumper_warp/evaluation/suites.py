@@ -16,7 +16,7 @@ import numpy as np
 from jumper_warp.evaluation.film import block_places
 from jumper_warp.evaluation.log import largest, mean, within
 from jumper_warp.evaluation.places import AT_END, FALLS, MISSED, PlaceLog, landing_metrics, trained_range
-from jumper_warp.evaluation.plots import Track, draw_landings, draw_paths, drawn
+from jumper_warp.evaluation.plots import Track, figure, plot_landings, plot_paths
 from jumper_warp.evaluation.run import EvaluationRun
 from jumper_warp.evaluation.sweeps import DistanceSweep, HeightSweep, Suite, check
 from jumper_warp.robot.grounds import BlockCfg, platform, uneven
@@ -91,7 +91,7 @@ class Grid(Suite):
     def measure(self, run: EvaluationRun) -> dict[str, Any]:
         """Follow jumps, draw them, and return the metrics."""
         landings = self.jump(run, self.places, film="jumps")
-        draw_landings(run.folder / "grid.png", {f"{len(landings.end)} jumps, {run.title}": landings}, (8.0, 5.0))
+        plot_landings(run.folder / "grid.png", {f"{len(landings.end)} jumps, {run.title}": landings}, (8.0, 5.0))
         inside = landings.places[..., 0] < AHEAD[1] - 1.0e-6
         return {"goals": self.columns * self.rows, **landing_metrics(landings, inside)}
 
@@ -117,7 +117,7 @@ class Ring(Suite):
         places = self.radius * np.stack([np.cos(angle), np.sin(angle)], axis=-1)[:, None]
         landings = self.jump(run, places, film="jumps")
         title = f"{self.jumps} jumps over {self.radius:g} m, {run.title}"
-        draw_landings(run.folder / "landings.png", {title: landings}, (6.0, 6.5))
+        plot_landings(run.folder / "landings.png", {title: landings}, (6.0, 6.5))
         sector = np.round(np.arctan2(places[..., 1], places[..., 0]) / (0.5 * np.pi)).astype(int) % len(SECTORS)
         fell, missed = np.isin(landings.ends, FALLS), landings.outcomes == MISSED
         values = landing_metrics(landings)
@@ -163,7 +163,7 @@ class Consecutive(Suite):
             logs.append(self.jump(run, places, delay=delay, film=name, watch=track))
             paths.append(track.in_start_frame(logs[-1].headings))
         parts = dict(zip((*PAIRS, f"{self.row} in a row"), (*np.split(paths[0], 2), paths[1]), strict=True))
-        draw_paths(run.folder / "paths.png", parts, PAIRS, run.title)
+        plot_paths(run.folder / "paths.png", parts, PAIRS, run.title)
         return {"rest_s": self.rest} | consecutive_metrics(*logs)
 
 
@@ -230,13 +230,13 @@ class Platform(Suite):
         done: dict[str, PlaceLog] = {}
         for name, special, headings in self.scenes(goals, rng):
             env = run.env(self.jumps, **special)
-            done[name] = self.jump(run, goals[:, None], env, headings=headings, film=name, drawn=special)
+            done[name] = self.jump(run, goals[:, None], env, headings=headings, film=name, figure=special)
             values |= {f"{name}_{metric}": value for metric, value in landing_metrics(done[name]).items()}
             if "block" in special:
                 slide = np.linalg.norm(block_places(env.sim) - special["block"].center, axis=1)
                 values |= {"block_mean_slide_m": float(slide.mean()), "block_max_slide_m": float(slide.max())}
         titles = {f"{name}, {run.title}": landings for name, landings in done.items()}
-        draw_landings(run.folder / "landings.png", titles, (5.0 * len(done), 4.0))
+        plot_landings(run.folder / "landings.png", titles, (5.0 * len(done), 4.0))
         names = ("mean_error_m", "success_rate", "fall_rate", "miss_rate", "still_landing_rate")
         summary = {name: mean([values[f"{scene}_{name}"] for scene in done]) for name in names}
         tilts = [values[f"{scene}_max_landing_tilt_deg"] for scene in done]
@@ -297,7 +297,7 @@ class Farthest(Suite):
 
 def draw_distances(run: EvaluationRun, values: dict[str, Any]) -> None:
     """Draw success and error over the distance."""
-    with drawn(run.folder / "max_jump.png", 2, 1, figsize=(7, 6), sharex=True) as (top, bottom):
+    with figure(run.folder / "max_jump.png", 2, 1, figsize=(7, 6), sharex=True) as (top, bottom):
         for kind, rate in KINDS.items():
             label = f"success{kind.replace('_', ' ')}"
             top.plot(values["bin_m"], [100.0 * share for share in values[f"bin_{rate}"]], marker="o", label=label)

@@ -22,7 +22,7 @@ from jumper_warp.evaluation.places import (
     random_headings,
     trained_range,
 )
-from jumper_warp.evaluation.plots import draw_sweep, drawn
+from jumper_warp.evaluation.plots import figure, plot_sweep
 from jumper_warp.evaluation.run import HEIGHTS, PLACES, EvaluationArgs, EvaluationRun
 from jumper_warp.policies.conditions import Conditions
 from jumper_warp.utils.errors import InputError
@@ -136,9 +136,9 @@ class HeightSweep(Suite):
         fresh = env.state_dict()
         jumps = self.follow(run, env, "jumps")
         limit = open_loop_limits(env, fresh)
-        with drawn(run.folder / "sweep.png", figsize=(6, 5.5)) as axis:
+        with figure(run.folder / "sweep.png", figsize=(6, 5.5)) as axis:
             axis.scatter(jumps.commanded, limit, s=5, color="0.6", label="open-loop jump of the same robot")
-            draw_sweep(axis, jumps.commanded, jumps.apex, jumps.reached, SUCCESS_TOLERANCE, ("reached", "missed"))
+            plot_sweep(axis, jumps.commanded, jumps.apex, jumps.reached, SUCCESS_TOLERANCE, ("reached", "missed"))
             axis.legend(loc="lower right")
             axis.set(xlabel="commanded base height [m]", ylabel="highest base height [m]")
             axis.set_title(f"{self.jumps} jumps, {run.title}", wrap=True)
@@ -197,11 +197,11 @@ class DistanceSweep(Suite):
     def measure(self, run: EvaluationRun) -> dict[str, Any]:
         """Follow jumps, draw them, and return the metrics."""
         landings, trained = self.follow(run, run.conditions, "jumps"), trained_range(run.task)
-        with drawn(run.folder / "sweep.png", figsize=(6, 5.5)) as axis:
+        with figure(run.folder / "sweep.png", figsize=(6, 5.5)) as axis:
             axis.axvspan(*TRAINED, color="0.5", alpha=0.08, label="training of the paper")
             axis.axvspan(*trained.values(), color="tab:orange", alpha=0.06, label="training of this policy")
             commanded, reached = landings.places[..., 0], landings.landing[..., 0]
-            draw_sweep(axis, commanded, reached, landings.success, SUCCESS_TOLERANCE, ("landed there", "failed"))
+            plot_sweep(axis, commanded, reached, landings.success, SUCCESS_TOLERANCE, ("landed there", "failed"))
             axis.set(xlabel="commanded distance [m]", ylabel="distance of the base at the end [m]")
             axis.set(xlim=(self.distances[0] - 0.05, self.distances[1] + 0.05))
             axis.set_title(f"{self.jumps} jumps, {run.title}", wrap=True)

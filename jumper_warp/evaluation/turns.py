@@ -90,7 +90,7 @@ class Turns(EvaluationLog):
 
     def update(self, arrays: dict[str, np.ndarray], step_dt: float) -> bool:
         """Take in a policy step; return whether all have come apart."""
-        self.apart |= arrays["ending"] >= 0
+        self.apart |= arrays["termination"] >= 0
         self.errors.append(np.where(self.apart, np.nan, arrays["error"]))
         self.spins.append(np.where(self.apart, np.nan, np.linalg.norm(arrays["base_ang_vel"], axis=1)))
         self.collided |= (arrays["collisions"] > 0) & ~self.apart

@@ -74,7 +74,7 @@ class Walks(EvaluationLog):
         sim = env.sim
         q, qd = sim.joint_q(), sim.joint_qd()
         seen = {"base_quat": q[:, 3:7].copy(), "base_vel": sim.base_velocity(), "base_ang_vel": qd[:, 3:6].copy(),
-                "ending": env.task_arrays()["ending"]}  # fmt: skip
+                "termination": env.task_arrays()["termination"]}  # fmt: skip
         step = len(self.velocity) + 1
         due = np.flatnonzero(np.round(self.times / env.step_dt).astype(int) == step)
         if len(due) and due[-1] > 0:
@@ -92,8 +92,8 @@ class Walks(EvaluationLog):
         self.step_dt = step_dt
         standing = self.end < 0
         self.velocity.append(body_velocity(arrays).astype(np.float32))
-        fell = standing & self._is_fall[arrays["ending"]]
-        self.end[fell] = arrays["ending"][fell]
+        fell = standing & self._is_fall[arrays["termination"]]
+        self.end[fell] = arrays["termination"][fell]
         self.fall_step[self.end < 0] = len(self.velocity)
         return bool((self.end >= 0).all())
 

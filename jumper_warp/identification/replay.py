@@ -17,7 +17,7 @@ from jumper_warp.robot.description import RobotDescription, load_description
 from jumper_warp.robot.model import build_model
 from jumper_warp.robot.motors import MotorCfg
 from jumper_warp.robot.values import LINK_KINDS, RobotValues
-from jumper_warp.sim.slices import Worlds
+from jumper_warp.sim.slices import WorldRange
 from jumper_warp.utils.rotations import rotate
 from jumper_warp.utils.threads import checked_threads
 
@@ -105,7 +105,7 @@ class MotionReplay:
             )  # fmt: skip
             parts = max(1, min(self._threads, count // 4))  # slices smaller than a simulation's pay off here
             edges = [round(count * i / parts) for i in range(parts + 1)]
-            rollout.slices = [Worlds(a, b - a) for a, b in itertools.pairwise(edges)]
+            rollout.slices = [WorldRange(a, b - a) for a, b in itertools.pairwise(edges)]
             self._rollouts[count, dt] = rollout, rollout.parameters["table"].numpy()[:, :1].copy()
         return self._rollouts[count, dt]
 

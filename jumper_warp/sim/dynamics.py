@@ -14,7 +14,7 @@ from jumper_warp.robot.description import LEGS, RobotDescription, load_descripti
 from jumper_warp.robot.grounds import BlockCfg
 from jumper_warp.robot.model import leg_geometry_array
 from jumper_warp.sim.precision import float64_kernels
-from jumper_warp.sim.slices import Worlds
+from jumper_warp.sim.slices import WorldRange
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.newton_types import Model
 
@@ -250,7 +250,7 @@ class JumperDynamics:
             [self._paws, self._ground_shape, self.model.shape_material_mu, self.static_friction_ratio],
         )
 
-    def repack(self, mask: wp.array, worlds: Worlds | None = None) -> None:
+    def repack(self, mask: wp.array, worlds: WorldRange | None = None) -> None:
         """Read masses, armature, motor friction and friction of paws, where mask (num_worlds,) float is not 0.
 
         worlds: which are looked at, by default all.
@@ -310,7 +310,7 @@ class JumperDynamics:
 
     def advance(
         self, settings: Any, drive: Any, q: wp.array, qd: wp.array, q_out: wp.array, qd_out: wp.array,
-        worlds: Worlds | None = None, by_legs: bool | None = None,
+        worlds: WorldRange | None = None, by_legs: bool | None = None,
     ) -> None:  # fmt: skip
         """Advance base and motor coordinates by `settings.substeps` steps, in place if out is in.
 
@@ -331,14 +331,14 @@ class JumperDynamics:
             setattr(found, name, wp.zeros(self.num_worlds, dtype=self.modules.scalar.vec3, device=self.device))
         return found
 
-    def read_momenta(self, q: wp.array, qd: wp.array, momenta: Any, worlds: Worlds | None = None) -> None:
+    def read_momenta(self, q: wp.array, qd: wp.array, momenta: Any, worlds: WorldRange | None = None) -> None:
         """Write the momenta of robots, world axes; worlds: whose, by default all."""
         first, count = worlds or (0, self.num_worlds)
         inputs = [first, self.robot, q, qd, momenta]
         wp.launch(self.modules.momentum.momentum_kernel, count, inputs, device=self.device, block_dim=32)
 
-    def keep_momenta(
-        self, q: wp.array, qd: wp.array, momenta: Any, body_f: wp.array, time: float, worlds: Worlds | None = None
+    def project_momentum(
+        self, q: wp.array, qd: wp.array, momenta: Any, body_f: wp.array, time: float, worlds: WorldRange | None = None
     ) -> None:
         """Correct the base's velocities where a robot flew freely in the last call of `advance`, which took a time [s].
 
@@ -346,10 +346,10 @@ class JumperDynamics:
         """
         first, count = worlds or (0, self.num_worlds)
         inputs = [first, self.robot, momenta, body_f, self.work.peak_force, self.work.invalid, time, q, qd]
-        wp.launch(self.modules.momentum.keep_momentum_kernel, count, inputs, device=self.device, block_dim=32)
+        wp.launch(self.modules.momentum.project_momentum_kernel, count, inputs, device=self.device, block_dim=32)
 
     def full_state(
-        self, q: wp.array, qd: wp.array, body_q: wp.array, body_qd: wp.array, worlds: Worlds | None = None
+        self, q: wp.array, qd: wp.array, body_q: wp.array, body_qd: wp.array, worlds: WorldRange | None = None
     ) -> None:
         """Write passive and loop joints (into q, qd) and all bodies from the base and motor coordinates.
 

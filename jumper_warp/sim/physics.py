@@ -20,7 +20,7 @@ from jumper_warp.robot.grounds import BlockCfg
 from jumper_warp.robot.model import KNEE_DOFS
 from jumper_warp.sim.dynamics import JumperDynamics
 from jumper_warp.sim.mujoco import mujoco_solver
-from jumper_warp.sim.slices import Worlds
+from jumper_warp.sim.slices import WorldRange
 from jumper_warp.sim.solver import SolverJumper
 
 EXPLICIT_STOP = (1000.0, 2.0)
@@ -67,7 +67,7 @@ class Physics(ABC):
         previous: wp.array | None = None,
         delay: wp.array | None = None,
         bodies: bool = True,
-        worlds: Worlds | None = None,
+        worlds: WorldRange | None = None,
     ) -> None:
         """Launch physics steps towards motor targets [rad], shape (12, num_worlds).
 
@@ -77,7 +77,7 @@ class Physics(ABC):
         """
 
     @abstractmethod
-    def parameters_changed(self, mask: wp.array | None = None, worlds: Worlds | None = None) -> None:
+    def parameters_changed(self, mask: wp.array | None = None, worlds: WorldRange | None = None) -> None:
         """Read the model's masses, joints and friction again, where mask (num_worlds,) is not 0; None: everywhere.
 
         worlds: at which the mask is looked at, by default all.
@@ -128,7 +128,7 @@ class JumperPhysics(Physics):
         previous: wp.array | None = None,
         delay: wp.array | None = None,
         bodies: bool = True,
-        worlds: Worlds | None = None,
+        worlds: WorldRange | None = None,
     ) -> None:
         """See `Physics.advance`."""
         state, sim = self._sim.state, self._sim
@@ -140,11 +140,11 @@ class JumperPhysics(Physics):
             bodies=bodies and momenta is None, worlds=worlds,
         )  # fmt: skip
         if momenta is not None:
-            self.dynamics.keep_momenta(q, qd, momenta, state.body_f, sim.dt * substeps, worlds)
+            self.dynamics.project_momentum(q, qd, momenta, state.body_f, sim.dt * substeps, worlds)
             if bodies:
                 self.dynamics.full_state(q, qd, state.body_q, state.body_qd, worlds)
 
-    def parameters_changed(self, mask: wp.array | None = None, worlds: Worlds | None = None) -> None:
+    def parameters_changed(self, mask: wp.array | None = None, worlds: WorldRange | None = None) -> None:
         """See `Physics.parameters_changed`."""
         if mask is None:
             self.dynamics.pack()
@@ -163,7 +163,7 @@ class JumperPhysics(Physics):
     def kernels(self) -> list[tuple[wp.Kernel, int]]:
         """See `Physics.kernels`."""
         momentum = self.dynamics.modules.momentum
-        kept = [(momentum.momentum_kernel, 32), (momentum.keep_momentum_kernel, 32)]
+        kept = [(momentum.momentum_kernel, 32), (momentum.project_momentum_kernel, 32)]
         return [self.dynamics.advance_kernel(), *(kept if self._momenta is not None else [])]
 
 
@@ -210,7 +210,7 @@ class MujocoPhysics(Physics):
         previous: wp.array | None = None,
         delay: wp.array | None = None,
         bodies: bool = True,
-        worlds: Worlds | None = None,
+        worlds: WorldRange | None = None,
     ) -> None:
         """See `Physics.advance`; all worlds are, and bodies are always written."""
         for i in range(substeps):
@@ -234,7 +234,7 @@ class MujocoPhysics(Physics):
                 paw_force_kernel, sim.num_worlds, inputs, [self.paw_force, self.peak_force, self.peak_paw_force]
             )
 
-    def parameters_changed(self, mask: wp.array | None = None, worlds: Worlds | None = None) -> None:
+    def parameters_changed(self, mask: wp.array | None = None, worlds: WorldRange | None = None) -> None:
         """See `Physics.parameters_changed`; MuJoCo reads all worlds."""
         self.solver.notify_model_changed(DRAWN_FLAGS)
 

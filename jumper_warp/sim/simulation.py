@@ -21,7 +21,7 @@ from jumper_warp.robot.overlay import RobotOverlay
 from jumper_warp.robot.values import RobotValues
 from jumper_warp.sim.overlay import write_model, write_motors, write_springs
 from jumper_warp.sim.physics import JumperPhysics, MujocoPhysics, Physics
-from jumper_warp.sim.slices import SlicedGraph, Worlds, slices_of
+from jumper_warp.sim.slices import SlicedGraph, WorldRange, slices_of
 from jumper_warp.sim.solver import TOLERANCE, check_step, check_tolerance, state_arrays
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.threads import checked_threads
@@ -209,17 +209,17 @@ class Simulation:
         """Advance one physics step towards the filtered targets."""
         self._captured("physics", lambda worlds: self._physics(1, worlds))
 
-    def _step(self, worlds: Worlds) -> None:
+    def _step(self, worlds: WorldRange) -> None:
         self._filter_targets(worlds)
         self._physics(self.substeps, worlds)
 
-    def _captured(self, name: str, body: Callable[[Worlds], None]) -> None:
+    def _captured(self, name: str, body: Callable[[WorldRange], None]) -> None:
         """Run a body eagerly the first time, then as a captured graph; within a capture it becomes part of that."""
         if self.device.is_capturing:
-            body(Worlds(0, self.num_worlds))
+            body(WorldRange(0, self.num_worlds))
             return
         if name not in self._graphs:
-            body(Worlds(0, self.num_worlds))
+            body(WorldRange(0, self.num_worlds))
             self._graphs[name] = None
             return
         graph = self._graphs[name]
@@ -227,7 +227,7 @@ class Simulation:
             graph = self._graphs[name] = SlicedGraph(body, self.slices, self.device)
         graph.replay()
 
-    def _filter_targets(self, worlds: Worlds) -> None:
+    def _filter_targets(self, worlds: WorldRange) -> None:
         if self._filter is None:
             if worlds.count == self.num_worlds:
                 wp.copy(self._safe_target, self.target)
@@ -244,7 +244,7 @@ class Simulation:
             [self._safe_target],
         )  # fmt: skip
 
-    def _physics(self, substeps: int, worlds: Worlds) -> None:
+    def _physics(self, substeps: int, worlds: WorldRange) -> None:
         self.physics.advance(substeps, self._safe_target, worlds=worlds)
 
     def _launch(self, kernel: Any, dim: int | tuple[int, ...], inputs: list, outputs: list) -> None:

@@ -20,24 +20,24 @@ LEAST = 16
 """Worlds of the smallest slice: fewer are not worth a thread, and two slices share no cache line of an array's row."""
 
 
-class Worlds(NamedTuple):
+class WorldRange(NamedTuple):
     """Worlds from `first` on, `count` of them."""
 
     first: int
     count: int
 
 
-def slices_of(num_worlds: int, threads: int) -> list[Worlds]:
+def slices_of(num_worlds: int, threads: int) -> list[WorldRange]:
     """Return the worlds in at most so many slices of about the same size; one slice of a few worlds."""
     count = max(1, min(threads, num_worlds // LEAST))
     begins = [LEAST * (num_worlds // LEAST * i // count) for i in range(count)]
-    return [Worlds(a, b - a) for a, b in itertools.pairwise([*begins, num_worlds])]
+    return [WorldRange(a, b - a) for a, b in itertools.pairwise([*begins, num_worlds])]
 
 
 class SlicedGraph:
     """What is launched for each slice, captured; `replay` launches all."""
 
-    def __init__(self, launch: Callable[[Worlds], None], slices: list[Worlds], device: wp.Device) -> None:
+    def __init__(self, launch: Callable[[WorldRange], None], slices: list[WorldRange], device: wp.Device) -> None:
         """Capture; launch: launches everything for some worlds, whose kernels are loaded."""
         self._device, self._graphs = device, []
         for worlds in slices:

@@ -26,7 +26,7 @@ from jumper_warp.robot.description import RobotDescription
 from jumper_warp.robot.grounds import BlockCfg
 from jumper_warp.robot.model import other_colliders
 from jumper_warp.sim.dynamics import JumperDynamics
-from jumper_warp.sim.slices import Worlds
+from jumper_warp.sim.slices import WorldRange
 from jumper_warp.sim.tape import DifferentiableStep
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.newton_types import Control, Model, State
@@ -177,7 +177,7 @@ class SolverJumper(SolverBase):
         delay: wp.array | None = None,
         bodies: bool = True,
         observables: SolverBase.Observables | None = None,
-        worlds: Worlds | None = None,
+        worlds: WorldRange | None = None,
     ) -> None:
         """Advance every world by `substeps` steps of dt [s], the motors following targets, in one launch.
 
@@ -207,7 +207,7 @@ class SolverJumper(SolverBase):
         substeps: int,
         observables: SolverBase.Observables | None,
         bodies: bool,
-        worlds: Worlds | None = None,
+        worlds: WorldRange | None = None,
     ) -> None:
         check_step(dt, substeps)
         qdd = None

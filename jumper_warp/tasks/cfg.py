@@ -7,8 +7,8 @@ import math
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from jumper_warp.kernels.mdp.env import Nothing
-from jumper_warp.kernels.mdp.starts import APART
+from jumper_warp.kernels.mdp.env import NoSettings
+from jumper_warp.kernels.mdp.starts import MIN_LINK_DISTANCE
 from jumper_warp.kernels.mdp.terminations import came_apart
 from jumper_warp.robot.gravity import EARTH, check_gravity
 from jumper_warp.robot.motors import FilterCfg, MotorCfg
@@ -49,11 +49,11 @@ class Command:
     """How a robot is told what to do."""
 
     give: Function
-    """(view, scene: Scene, task, values: wp.vec4, heading: float) -> task with a command from outside."""
+    """(robot, scene: Scene, state, values: wp.vec4, heading: float) -> task with a command from outside."""
     due: Function | None = None
-    """(task) -> bool, whether a new command is drawn within the episode."""
+    """(state) -> bool, whether a new command is drawn within the episode."""
     draw: Function | None = None
-    """(view, scene: Scene, task, level, draw: Draw) -> task with a new command."""
+    """(robot, scene: Scene, state, level, draw: Draw) -> task with a new command."""
 
     def __post_init__(self) -> None:
         """Raises ValueError: one of due and draw is missing."""
@@ -132,8 +132,8 @@ class TaskCfg:
         check_gravity(self.gravity)
         for name in ("lift", "contact_force", "block_margin"):
             check_not_negative(f"{self.name}: {name}", getattr(self, name))
-        if not 0.0 <= self.link_margin <= APART:
-            raise InputError(f"{self.name}: link_margin must be in [0, {APART:g}], got {self.link_margin}")
+        if not 0.0 <= self.link_margin <= MIN_LINK_DISTANCE:
+            raise InputError(f"{self.name}: link_margin must be in [0, {MIN_LINK_DISTANCE:g}], got {self.link_margin}")
         if self.reward_floor is not None and not math.isfinite(self.reward_floor):
             raise InputError(f"{self.name}: reward_floor must be finite or None, got {self.reward_floor}")
 
@@ -187,12 +187,12 @@ class TaskCfg:
     @property
     def settings_type(self) -> Any:
         """The struct of the reset's settings."""
-        return Nothing if self.reset.settings is None else self.reset.settings.struct
+        return NoSettings if self.reset.settings is None else self.reset.settings.struct
 
     @property
     def level_type(self) -> Any:
         """The struct of a level."""
-        return self.levels[0].struct if self.levels else Nothing
+        return self.levels[0].struct if self.levels else NoSettings
 
     def with_terms(self, section: str, **changes: dict[str, Any]) -> TaskCfg:
         """Return the task with other numbers or options in terms of a section, by name.
@@ -239,6 +239,6 @@ class Handover:
     source: TaskCfg
     target: TaskCfg
     when: Function
-    """(view, task of the source, requested: bool) -> bool"""
+    """(robot, task of the source, requested: bool) -> bool"""
     begin: Function
-    """(view, task of the source) -> task of the target; then the target's `Command.give`, if the request has one."""
+    """(robot, task of the source) -> task of the target; then the target's `Command.give`, if the request has one."""

@@ -41,7 +41,7 @@ VECTOR, AXIAL = (1, -1, 1), (-1, 1, -1)
 
 _PLAIN: dict[Any, tuple[int, ...]] = {
     obs.lin_vel: VECTOR, obs.ang_vel: AXIAL, obs.gravity: VECTOR, velocity.command: (1, -1, -1),
-    velocity.clock: (-1, -1), velocity.command_age: (1,), velocity.push: VECTOR + AXIAL, obs.height: (1,),
+    velocity.step_count: (-1, -1), velocity.command_age: (1,), velocity.push: VECTOR + AXIAL, obs.height: (1,),
     attitude.turn_left: (*AXIAL, 1), attitude.time_left: (1,), attitude.in_collision: (1,),
     jump.wanted_height: (1,), jump.jump_command: (1,), jump.goal: (1, -1), jump.phase: (1, 1, 1),
     jump.phase_times: (1, 1), jump.height_errors: (1, 1), jump.landing_miss: (1, -1), jump.way: (1, -1),

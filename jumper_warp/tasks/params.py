@@ -26,11 +26,11 @@ class TermSlot(SimpleNamespace):
     def __init__(self, term: Any, start: int) -> None:
         """start: index of the term's first number."""
         super().__init__(**term.options, **{name: start + i for i, name in enumerate(term.settings)})
-        self.term, self.func, self.plain = term, term.func, not term.num_params
+        self.term, self.func, self.parameterless = term, term.func, not term.num_params
         """plain: no parameters; Warp refuses an empty `*p[lo:lo]`."""
-        self.lo, self.hi = start + len(term.settings), start + len(term.numbers)
+        self.params_start, self.params_stop = start + len(term.settings), start + len(term.numbers)
         """Range of the function's parameters."""
-        self.compiled = (term.func, start, self.lo, self.hi, *term.options.items())
+        self.compiled = (term.func, start, self.params_start, self.params_stop, *term.options.items())
         """What a kernel holds of the term; tasks with the same share the kernel, whatever their numbers."""
 
 

@@ -19,7 +19,7 @@ from typing import Any, Union, get_args, get_origin, get_type_hints
 import warp as wp
 
 import jumper_warp.tasks
-from jumper_warp.kernels.mdp.env import Nothing
+from jumper_warp.kernels.mdp.env import NoSettings
 from jumper_warp.tasks.cfg import Handover, TaskCfg
 from jumper_warp.tasks.terms import RewardTerm, Term
 from jumper_warp.utils.checks import NAME, version_refusal
@@ -33,7 +33,7 @@ OPTIONAL = ("rewards", "critic", "events")
 """Sections that a policy needs for training only."""
 MAX_ENTRIES = 1000
 """Longest list; a kernel of more terms would not be compiled in a day."""
-Struct = type(Nothing)
+Struct = type(NoSettings)
 
 
 class TaskError(InputError):
@@ -59,19 +59,19 @@ def name_of(thing: Any) -> str:
     return f"{module}:{name}"
 
 
-def plain(value: Any) -> Any:
+def parameterless(value: Any) -> Any:
     """Return a configuration as JSON can hold it. Raises TaskError: a part of it could not be read back."""
     if isinstance(value, Term):
-        options = {key: plain(option) for key, option in value.options.items()}
+        options = {key: parameterless(option) for key, option in value.options.items()}
         named = {"type": name_of(type(value)), "func": name_of(value.func), "name": value.name}
         return {**named, **value.numbers, **options}
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        fields = {spec.name: plain(getattr(value, spec.name)) for spec in dataclasses.fields(value)}
+        fields = {spec.name: parameterless(getattr(value, spec.name)) for spec in dataclasses.fields(value)}
         return {"type": name_of(type(value)), **fields}
     if isinstance(value, wp.Function | Struct):
         return name_of(value)
     if isinstance(value, tuple):
-        return [plain(v) for v in value]
+        return [parameterless(v) for v in value]
     if not (value is None or isinstance(value, bool | int | float | str)):
         raise TaskError(f"{shown(value)} cannot be saved: settings are numbers, strings, tuples and dataclasses")
     if isinstance(value, float) and not math.isfinite(value):
@@ -81,7 +81,7 @@ def plain(value: Any) -> Any:
 
 def task_to_json(task: TaskCfg) -> dict[str, Any]:
     """Return a task as JSON can hold it. Raises TaskError: a function of it cannot be found again."""
-    return {"version": VERSION, **plain(task)}
+    return {"version": VERSION, **parameterless(task)}
 
 
 def handover_to_json(handover: Handover) -> dict[str, Any]:

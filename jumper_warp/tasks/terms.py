@@ -91,7 +91,7 @@ class Term:
     @property
     def of_state(self) -> Any:
         """The struct of the task's state that the function reads, or Any."""
-        return self.func.input_types.get("task", Any)
+        return self.func.input_types.get("state", Any)
 
     def __eq__(self, other: object) -> bool:
         return type(self) is type(other) and all(
@@ -107,7 +107,7 @@ class Term:
 
 
 class RewardTerm(Term):
-    """(view: RobotView, task, ...) -> float; times the weight, and times the policy step [s] unless paid `once`."""
+    """(robot: RobotView, state, ...) -> float; times the weight, and times the policy step [s] unless paid `once`."""
 
     settings: ClassVar = {"weight": REQUIRED}
     options: Mapping[str, Any] = {"once": False}
@@ -123,7 +123,7 @@ class RewardTerm(Term):
 
 
 class TerminationTerm(Term):
-    """(view: RobotView, task, ...) -> bool.
+    """(robot: RobotView, state, ...) -> bool.
 
     time_out: an end that says nothing against the state, so that what would follow counts. success: what the success
     rate and the curriculum count.
@@ -134,8 +134,8 @@ class TerminationTerm(Term):
 
 
 class ObservationTerm(Term):
-    """(view: RobotView, task, ...) -> float or vector; or likewise (parameters: RobotParameters, world: int), or of the
-    ground around the robot (robot: RobotArrays, ground: Ground, world: int).
+    """(robot: RobotView, state, ...) -> float or vector; or likewise (parameters: RobotParameters, world: int), or of
+    the ground around the robot (arrays: RobotArrays, ground: Ground, world: int).
 
     noise: standard deviation, cut at one. Then clipped to plus and minus `clip`, and scaled. history: frames, the
     oldest first. delayed: whether it comes as late as the world's sensors do.
@@ -203,14 +203,14 @@ class EventTerm(Term):
 
 
 class Advance(Term):
-    """(view: RobotView, task, ...) -> task, one policy step later: the task's phase machine."""
+    """(robot: RobotView, state, ...) -> state, one policy step later: the task's phase machine."""
 
 
 class Curriculum(Term):
-    """(view: RobotView, task) -> error of an ended episode.
+    """(robot: RobotView, state) -> error of an ended episode.
 
     An episode that ends with success and an error up to `tolerance` is one; `promote_after` of them in a row raise the
-    world's level. counts: (task) -> bool, whether an episode counts at all. unit: of the error, as it is logged.
+    world's level. counts: (state) -> bool, whether an episode counts at all. unit: of the error, as it is logged.
     """
 
     settings: ClassVar = {"tolerance": REQUIRED, "promote_after": 5}
@@ -220,7 +220,7 @@ class Curriculum(Term):
     def __init__(self, func: Function, **given: Any) -> None:
         super().__init__(func, **given)
         if not isinstance(self.options["counts"], wp.Function):
-            raise InputError(f"Curriculum {self.name}: counts must be a @wp.func (task) -> bool")
+            raise InputError(f"Curriculum {self.name}: counts must be a @wp.func (state) -> bool")
         if self.numbers["tolerance"] < 0.0 or self.numbers["promote_after"] < 1:
             raise InputError(f"Curriculum {self.name}: tolerance must not be negative, promote_after at least 1")
 

@@ -99,7 +99,7 @@ def command_filter_kernel(
     offset: wp.array2d(dtype=real),
     params: FilterParams,
     # out
-    safe_target: wp.array2d(dtype=real),
+    filtered_target: wp.array2d(dtype=real),
 ):
     """Filter the motor targets of every leg. Launch over (4, worlds from `first` on).
 
@@ -118,6 +118,6 @@ def command_filter_kernel(
         vec3(joint_qd[dof], joint_qd[dof + 1], joint_qd[dof + 3]),
         params,
     )
-    safe_target[lateral, world] = safe[0]
-    safe_target[outer, world] = safe[1]
-    safe_target[inner, world] = safe[2]
+    filtered_target[lateral, world] = safe[0]
+    filtered_target[outer, world] = safe[1]
+    filtered_target[inner, world] = safe[2]

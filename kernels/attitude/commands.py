@@ -3,7 +3,7 @@
 import warp as wp
 
 from ..mdp.env import Scene
-from ..mdp.random import Draw, between, branch, within
+from ..mdp.random import RngStream, fold_in, uniform, uniform_range
 from ..mdp.view import RobotView
 from . import streams
 from .state import AttitudeState, with_goal
@@ -20,41 +20,41 @@ class TurnRanges:
 
 
 @wp.func
-def draw_unit_quat(draw: Draw) -> wp.quat:
+def sample_unit_quat(rng: RngStream) -> wp.quat:
     """Return a random orientation (xyzw), uniform over all (Shoemake 1992)."""
-    a = between(draw, streams.QUAT, 0.0, 1.0)
-    b = between(draw, streams.QUAT + 1, 0.0, 2.0 * wp.pi)
-    c = between(draw, streams.QUAT + 2, 0.0, 2.0 * wp.pi)
+    a = uniform(rng, streams.QUAT, 0.0, 1.0)
+    b = uniform(rng, streams.QUAT + 1, 0.0, 2.0 * wp.pi)
+    c = uniform(rng, streams.QUAT + 2, 0.0, 2.0 * wp.pi)
     s = wp.sqrt(1.0 - a)
     r = wp.sqrt(a)
     return wp.quat(s * wp.sin(b), s * wp.cos(b), r * wp.sin(c), r * wp.cos(c))
 
 
 @wp.func
-def draw_axis(draw: Draw, axis_share: float) -> wp.vec3:
+def sample_axis(rng: RngStream, axis_share: float) -> wp.vec3:
     """Return a unit vector: one of the body's axes in a share of draws, else any, uniform over the sphere."""
-    sign = wp.where(between(draw, streams.SIGN, 0.0, 1.0) < 0.5, -1.0, 1.0)
-    if between(draw, streams.ALONG_BODY, 0.0, 1.0) < axis_share:
+    sign = wp.where(uniform(rng, streams.SIGN, 0.0, 1.0) < 0.5, -1.0, 1.0)
+    if uniform(rng, streams.ALONG_BODY, 0.0, 1.0) < axis_share:
         axis = wp.vec3(0.0)
-        axis[wp.min(int(between(draw, streams.BODY_AXIS, 0.0, 3.0)), 2)] = sign
+        axis[wp.min(int(uniform(rng, streams.BODY_AXIS, 0.0, 3.0)), 2)] = sign
         return axis
-    z = between(draw, streams.AXIS_Z, -1.0, 1.0)
-    around = between(draw, streams.AXIS_AROUND, 0.0, 2.0 * wp.pi)
+    z = uniform(rng, streams.AXIS_Z, -1.0, 1.0)
+    around = uniform(rng, streams.AXIS_AROUND, 0.0, 2.0 * wp.pi)
     r = wp.sqrt(1.0 - z * z)
     return wp.vec3(r * wp.cos(around), r * wp.sin(around), z)
 
 
 @wp.func
-def draw_turn(draw: Draw, ranges: TurnRanges) -> wp.quat:
+def sample_rotation(rng: RngStream, ranges: TurnRanges) -> wp.quat:
     """Return a drawn turn (xyzw), body axes."""
-    axis = draw_axis(branch(draw, streams.AXIS_BRANCH), ranges.axis_share)
-    return wp.quat_from_axis_angle(axis, within(draw, streams.ANGLE, ranges.angle))
+    axis = sample_axis(fold_in(rng, streams.AXIS_BRANCH), ranges.axis_share)
+    return wp.quat_from_axis_angle(axis, uniform_range(rng, streams.ANGLE, ranges.angle))
 
 
 @wp.func
-def give_turn(view: RobotView, scene: Scene, task: AttitudeState, values: wp.vec4, heading: float) -> AttitudeState:
+def give_turn(robot: RobotView, scene: Scene, state: AttitudeState, values: wp.vec4, heading: float) -> AttitudeState:
     """Command a turn (quaternion xyzw, of any length but 0) from the orientation that the robot has; 0: none."""
     turn = wp.quat(values[0], values[1], values[2], values[3])
     if wp.length(values) == 0.0:
         turn = wp.quat(0.0, 0.0, 0.0, 1.0)
-    return with_goal(task, view.quat, view.quat * wp.normalize(turn))
+    return with_goal(state, robot.quat, robot.quat * wp.normalize(turn))

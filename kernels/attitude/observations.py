@@ -7,19 +7,19 @@ from .state import POLICY_RATE, AttitudeState, rotation_between
 
 
 @wp.func
-def turn_left(view: RobotView, task: AttitudeState) -> wp.vec4:
+def turn_left(robot: RobotView, state: AttitudeState) -> wp.vec4:
     """Rotation from the robot's orientation to the goal, quaternion xyzw with w >= 0, body axes."""
-    turn = rotation_between(view.quat, task.goal)
+    turn = rotation_between(robot.quat, state.goal)
     return wp.vec4(turn[0], turn[1], turn[2], turn[3])
 
 
 @wp.func
-def time_left(view: RobotView, task: AttitudeState) -> float:
+def time_left(robot: RobotView, state: AttitudeState) -> float:
     """Time until the end of the episode [s]; 0 if it has none."""
-    return float(wp.max(task.episode_steps - task.steps, 0)) / POLICY_RATE
+    return float(wp.max(state.episode_steps - state.steps, 0)) / POLICY_RATE
 
 
 @wp.func
-def in_collision(view: RobotView, task: AttitudeState) -> float:
+def in_collision(robot: RobotView, state: AttitudeState) -> float:
     """Whether links touch each other, or anything but a paw the ground [1]."""
-    return wp.where(view.collisions != 0, 1.0, 0.0)
+    return wp.where(robot.collisions != 0, 1.0, 0.0)

@@ -2,13 +2,13 @@
 
 import warp as wp
 
-from ..mdp.attempts import meet_attempts
+from ..mdp.attempts import sync_attempts
 from ..mdp.env import Scene, SkillSettings
-from ..mdp.random import Draw, branch, within
+from ..mdp.random import RngStream, fold_in, uniform_range
 from ..mdp.view import RobotArrays
 from ..terrain.ground import rest_block
 from . import streams
-from .commands import TurnRanges, draw_turn, draw_unit_quat
+from .commands import TurnRanges, sample_rotation, sample_unit_quat
 from .start_states import AttitudeSettings, write_start
 from .state import AttitudeState, carried_over, with_goal
 
@@ -17,14 +17,14 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.func
 def reset_attitude(
-    robot: RobotArrays, scene: Scene, skill: SkillSettings, old: AttitudeState, settings: AttitudeSettings,
-    level: TurnRanges, draw: Draw,
+    arrays: RobotArrays, scene: Scene, skill: SkillSettings, old: AttitudeState, settings: AttitudeSettings,
+    level: TurnRanges, rng: RngStream,
 ) -> AttitudeState:  # fmt: skip
     """Begin an episode with a drawn turn, and return its state."""
     new = carried_over(old)
-    rest_block(scene.ground, draw.world)
-    quat = draw_unit_quat(branch(draw, streams.ORIENTATION_BRANCH))
-    meet_attempts(draw)
-    write_start(robot, scene, skill, settings, quat, draw)
-    new.episode_steps = wp.max(int(within(draw, streams.EPISODE_STEPS, settings.episode_steps) + 0.5), 1)
-    return with_goal(new, quat, quat * draw_turn(branch(draw, streams.TURN_BRANCH), level))
+    rest_block(scene.ground, rng.world)
+    quat = sample_unit_quat(fold_in(rng, streams.ORIENTATION_BRANCH))
+    sync_attempts(rng)
+    write_start(arrays, scene, skill, settings, quat, rng)
+    new.episode_steps = wp.max(int(uniform_range(rng, streams.EPISODE_STEPS, settings.episode_steps) + 0.5), 1)
+    return with_goal(new, quat, quat * sample_rotation(fold_in(rng, streams.TURN_BRANCH), level))

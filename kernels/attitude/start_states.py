@@ -7,7 +7,7 @@ from ..kinematics.inverse import LegLimits
 from ..layout import BODIES
 from ..mdp.attempts import ATTEMPTS, sample_valid_state
 from ..mdp.env import Scene, SkillSettings
-from ..mdp.random import Draw, between, within
+from ..mdp.random import RngStream, uniform, uniform_range
 from ..mdp.reset import leg_limits
 from ..mdp.starts import LegSample
 from ..mdp.view import RobotArrays
@@ -45,7 +45,7 @@ class AttitudeStart:
 
 
 @wp.func
-def sample_base(start: AttitudeStart, robot: RobotArrays, draw: Draw, attempt: int) -> AttitudeStart:
+def sample_base(start: AttitudeStart, arrays: RobotArrays, rng: RngStream, attempt: int) -> AttitudeStart:
     """Return the base, the same in every attempt; in the last one the legs are in the default pose."""
     base = start
     base.default_legs = start.default_legs or attempt == ATTEMPTS - 1
@@ -53,7 +53,7 @@ def sample_base(start: AttitudeStart, robot: RobotArrays, draw: Draw, attempt: i
 
 
 @wp.func
-def sample_leg(start: AttitudeStart, base: AttitudeStart, geo: LegGeometry, draw: Draw, leg: int) -> LegSample:
+def sample_leg(start: AttitudeStart, base: AttitudeStart, geo: LegGeometry, rng: RngStream, leg: int) -> LegSample:
     """Return a leg at rest; reachable if the sum of its transversal angles keeps its limits."""
     found = LegSample()
     if base.default_legs:
@@ -62,9 +62,9 @@ def sample_leg(start: AttitudeStart, base: AttitudeStart, geo: LegGeometry, draw
         found.reachable = True
         return found
     found.angles = wp.vec3(
-        within(draw, streams.LATERAL + leg, start.settings.lateral),
-        within(draw, streams.OUTER + leg, start.settings.transversal),
-        within(draw, streams.INNER + leg, start.settings.transversal),
+        uniform_range(rng, streams.LATERAL + leg, start.settings.lateral),
+        uniform_range(rng, streams.OUTER + leg, start.settings.transversal),
+        uniform_range(rng, streams.INNER + leg, start.settings.transversal),
     )
     total = found.angles[1] + found.angles[2]
     found.reachable = total > start.limits.sum_lower and total < start.limits.sum_upper
@@ -73,22 +73,22 @@ def sample_leg(start: AttitudeStart, base: AttitudeStart, geo: LegGeometry, draw
 
 @wp.func
 def write_start(
-    robot: RobotArrays, scene: Scene, skill: SkillSettings, settings: AttitudeSettings, quat: wp.quat, draw: Draw
+    arrays: RobotArrays, scene: Scene, skill: SkillSettings, settings: AttitudeSettings, quat: wp.quat, rng: RngStream
 ):
     """Write a start state with an orientation (xyzw) to a world."""
     w = settings.spin
     start = AttitudeStart()
-    start.ground = world_ground(scene.ground, draw.world)
+    start.ground = world_ground(scene.ground, rng.world)
     start.pos = wp.vec3(0.0, 0.0, surface(start.ground, 0.0, 0.0)[0] + settings.height)
     start.quat = quat
     start.ang_vel = wp.vec3(
-        between(draw, streams.SPIN, -w, w),
-        between(draw, streams.SPIN + 1, -w, w),
-        between(draw, streams.SPIN + 2, -w, w),
+        uniform(rng, streams.SPIN, -w, w),
+        uniform(rng, streams.SPIN + 1, -w, w),
+        uniform(rng, streams.SPIN + 2, -w, w),
     )
-    start.com_vel = wp.cross(start.ang_vel, wp.quat_rotate(quat, robot.body_com[draw.world * BODIES]))
-    start.default_legs = between(draw, streams.DEFAULT_LEGS, 0.0, 1.0) < settings.default_share
-    start.default_angle = robot.default_angle
+    start.com_vel = wp.cross(start.ang_vel, wp.quat_rotate(quat, arrays.body_com[rng.world * BODIES]))
+    start.default_legs = uniform(rng, streams.DEFAULT_LEGS, 0.0, 1.0) < settings.default_share
+    start.default_angle = arrays.default_angle
     start.settings = settings
     start.limits = leg_limits(skill.command_filter)
-    sample_valid_state(sample_base, sample_leg, start, robot, scene, draw)
+    sample_valid_state(sample_base, sample_leg, start, arrays, scene, rng)

@@ -44,9 +44,9 @@ def angle_between(quat: wp.quat, goal: wp.quat) -> float:
 
 
 @wp.func
-def with_goal(task: AttitudeState, quat: wp.quat, goal: wp.quat) -> AttitudeState:
+def with_goal(state: AttitudeState, quat: wp.quat, goal: wp.quat) -> AttitudeState:
     """Return the state with a goal that has just come; quat, goal: orientations (xyzw), body to world."""
-    new = task
+    new = state
     new.goal = goal
     new.error = angle_between(quat, goal)
     new.old_error = new.error
@@ -55,16 +55,16 @@ def with_goal(task: AttitudeState, quat: wp.quat, goal: wp.quat) -> AttitudeStat
 
 
 @wp.func
-def advance_attitude(view: RobotView, task: AttitudeState, tolerance: float) -> AttitudeState:
+def advance_attitude(robot: RobotView, state: AttitudeState, tolerance: float) -> AttitudeState:
     """Return the state one policy step later; tolerance [rad]: error up to which the robot is at its goal."""
-    t = task
-    t.steps = task.steps + 1
-    t.old_error = task.error
-    t.error = angle_between(view.quat, task.goal)
-    t.inside = wp.where(t.error <= tolerance, task.inside + 1, 0)
-    t.max_height = wp.max(task.max_height, view.pos[2])
-    if view.collisions != 0:
-        t.collisions = task.collisions + 1
+    t = state
+    t.steps = state.steps + 1
+    t.old_error = state.error
+    t.error = angle_between(robot.quat, state.goal)
+    t.inside = wp.where(t.error <= tolerance, state.inside + 1, 0)
+    t.max_height = wp.max(state.max_height, robot.pos[2])
+    if robot.collisions != 0:
+        t.collisions = state.collisions + 1
     return t
 
 
@@ -88,12 +88,12 @@ def carried_over(old: AttitudeState) -> AttitudeState:
 
 
 @wp.func
-def attitude_error(view: RobotView, task: AttitudeState) -> float:
+def attitude_error(robot: RobotView, state: AttitudeState) -> float:
     """Angle of the rotation to the goal [rad]."""
-    return task.error
+    return state.error
 
 
 @wp.func
-def every_episode(task: AttitudeState) -> bool:
+def every_episode(state: AttitudeState) -> bool:
     """Return true: all episodes count."""
     return True

@@ -7,12 +7,12 @@ from .state import AttitudeState
 
 
 @wp.func
-def ended_clear(view: RobotView, task: AttitudeState) -> bool:
+def ended_clear(robot: RobotView, state: AttitudeState) -> bool:
     """The episode has lasted as long as it should, and nothing has touched anything."""
-    return task.episode_steps > 0 and task.steps >= task.episode_steps and task.collisions == 0
+    return state.episode_steps > 0 and state.steps >= state.episode_steps and state.collisions == 0
 
 
 @wp.func
-def ended(view: RobotView, task: AttitudeState) -> bool:
+def ended(robot: RobotView, state: AttitudeState) -> bool:
     """The episode has lasted as long as it should."""
-    return task.episode_steps > 0 and task.steps >= task.episode_steps
+    return state.episode_steps > 0 and state.steps >= state.episode_steps

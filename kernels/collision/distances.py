@@ -14,18 +14,18 @@ def segment_segment_sq(start_a: vec3, end_a: vec3, start_b: vec3, end_b: vec3) -
     """Return the squared distance [m^2] between two segments, either of which may be a point."""
     a = end_a - start_a
     b = end_b - start_b
-    between = start_a - start_b
+    uniform = start_a - start_b
     aa = wp.max(wp.dot(a, a), real(1.0e-12))
     bb = wp.max(wp.dot(b, b), real(1.0e-12))
     ab = wp.dot(a, b)
-    a_between = wp.dot(a, between)
-    b_between = wp.dot(b, between)
+    a_between = wp.dot(a, uniform)
+    b_between = wp.dot(b, uniform)
     # for (nearly) parallel segments the floor on the determinant turns the division into a step downhill
     det = wp.max(aa * bb - ab * ab, real(1.0e-7) * aa * bb)
     along_a = wp.clamp((ab * b_between - a_between * bb) / det, real(0.0), real(1.0))
     along_b = wp.clamp((ab * along_a + b_between) / bb, real(0.0), real(1.0))
     nearest_a = wp.clamp((ab * along_b - a_between) / aa, real(0.0), real(1.0))
-    gap = between + nearest_a * a - along_b * b
+    gap = uniform + nearest_a * a - along_b * b
     return wp.dot(gap, gap)
 
 

@@ -55,7 +55,9 @@ class Workspace:
 
 
 @wp.func
-def park(robot: Robot, work: Workspace, world: int, joint_q: wp.array(dtype=real), joint_qd: wp.array(dtype=real)):
+def freeze_diverged_world(
+    robot: Robot, work: Workspace, world: int, joint_q: wp.array(dtype=real), joint_qd: wp.array(dtype=real)
+):
     """Put a world at rest in its reference pose, its block at rest at its start."""
     rest_block(robot.ground, world)
     for i in range(int(COORDS)):

@@ -96,7 +96,7 @@ def momentum_kernel(
 
 
 @wp.kernel
-def keep_momentum_kernel(
+def project_momentum_kernel(
     # in
     first: int,
     robot: Robot,

@@ -48,7 +48,7 @@ def restore_motors_kernel(
     standing: wp.array2d(dtype=float),
     # out
     target: wp.array2d(dtype=float),
-    safe_target: wp.array2d(dtype=float),
+    filtered_target: wp.array2d(dtype=float),
     torque: wp.array2d(dtype=float),
     paw_force: wp.array2d(dtype=wp.vec3),
     peak_force: wp.array(dtype=float),
@@ -59,7 +59,7 @@ def restore_motors_kernel(
         return
     for motor in range(12):
         target[motor, world] = standing[motor, world]
-        safe_target[motor, world] = standing[motor, world]
+        filtered_target[motor, world] = standing[motor, world]
         torque[motor, world] = 0.0
     for k in range(4):
         paw_force[k, world] = wp.vec3(0.0)

@@ -7,12 +7,12 @@ from .state import JumpState, goal_offset
 
 
 @wp.func
-def height_error(view: RobotView, task: JumpState) -> float:
+def height_error(robot: RobotView, state: JumpState) -> float:
     """Return the distance [m] of the highest base height from the wanted one."""
-    return wp.abs(task.max_height - task.goal[2])
+    return wp.abs(state.max_height - state.goal[2])
 
 
 @wp.func
-def landing_error(view: RobotView, task: JumpState) -> float:
+def landing_error(robot: RobotView, state: JumpState) -> float:
     """Return the horizontal distance [m] of the base from the goal."""
-    return wp.length(goal_offset(view, task))
+    return wp.length(goal_offset(robot, state))

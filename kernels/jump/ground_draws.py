@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from ..mdp.random import Draw, between, within
+from ..mdp.random import RngStream, uniform, uniform_range
 from ..scalar import real, vec2
 from ..terrain.ground import Block
 from . import streams
@@ -53,20 +53,20 @@ def fixed_block(center: wp.vec2, half: wp.vec2, height: float) -> Block:
 
 
 @wp.func
-def draw_platform(draw: Draw, ranges: GroundRanges, foot: wp.vec2, goal: wp.vec3) -> Block:
+def sample_platform(rng: RngStream, ranges: GroundRanges, foot: wp.vec2, goal: wp.vec3) -> Block:
     """Return a platform under a robot at the origin; none if its paws could not land beside it."""
     half = foot + wp.vec2(
-        between(draw, streams.PLATFORM_ROOM_X, EVERY_SIDE, ranges.room),
-        between(draw, streams.PLATFORM_ROOM_Y, EVERY_SIDE, ranges.room),
+        uniform(rng, streams.PLATFORM_ROOM_X, EVERY_SIDE, ranges.room),
+        uniform(rng, streams.PLATFORM_ROOM_Y, EVERY_SIDE, ranges.room),
     )
     beyond = wp.vec2(wp.abs(goal[0]), wp.abs(goal[1])) - half - foot
     if wp.max(beyond) < ranges.clearance:
         return Block()
-    return fixed_block(wp.vec2(0.0), half, within(draw, streams.BLOCK_HEIGHT, ranges.drop))
+    return fixed_block(wp.vec2(0.0), half, uniform_range(rng, streams.BLOCK_HEIGHT, ranges.drop))
 
 
 @wp.func
-def draw_block(draw: Draw, ranges: GroundRanges, foot: wp.vec2, goal: wp.vec3) -> Block:
+def sample_block(rng: RngStream, ranges: GroundRanges, foot: wp.vec2, goal: wp.vec3) -> Block:
     """Return a block under the goal; none without room for its near side between the paws before and after the jump.
 
     The near side is anywhere there, more often near than far (a third within a ninth of the room), across the axis
@@ -78,25 +78,25 @@ def draw_block(draw: Draw, ranges: GroundRanges, foot: wp.vec2, goal: wp.vec3) -
     farthest = way - foot[along] - ranges.clearance
     if nearest > farthest:
         return Block()
-    u = between(draw, streams.BLOCK_NEAR_SIDE, 0.0, 1.0)
+    u = uniform(rng, streams.BLOCK_NEAR_SIDE, 0.0, 1.0)
     near = nearest + u * u * (farthest - nearest)
-    far = way + foot[along] + between(draw, streams.BLOCK_FAR_ROOM, EVERY_SIDE, ranges.room)
+    far = way + foot[along] + uniform(rng, streams.BLOCK_FAR_ROOM, EVERY_SIDE, ranges.room)
     center = wp.vec2(goal[0], goal[1])
     center[along] = wp.sign(goal[along]) * 0.5 * (near + far)
-    half = foot + wp.vec2(between(draw, streams.BLOCK_SIDE_ROOM, EVERY_SIDE, ranges.room))
+    half = foot + wp.vec2(uniform(rng, streams.BLOCK_SIDE_ROOM, EVERY_SIDE, ranges.room))
     half[along] = 0.5 * (far - near)
-    block = fixed_block(center, half, within(draw, streams.BLOCK_HEIGHT, ranges.rise))
-    block.mass = real(within(draw, streams.BLOCK_MASS, ranges.mass))
-    block.friction = real(within(draw, streams.BLOCK_FRICTION, ranges.friction))
+    block = fixed_block(center, half, uniform_range(rng, streams.BLOCK_HEIGHT, ranges.rise))
+    block.mass = real(uniform_range(rng, streams.BLOCK_MASS, ranges.mass))
+    block.friction = real(uniform_range(rng, streams.BLOCK_FRICTION, ranges.friction))
     return block
 
 
 @wp.func
-def draw_ground(draw: Draw, ranges: GroundRanges, foot: wp.vec2, goal: wp.vec3) -> Block:
+def sample_ground(rng: RngStream, ranges: GroundRanges, foot: wp.vec2, goal: wp.vec3) -> Block:
     """Return the block of a standing start at the origin with a goal [m], world axes; mostly there is none."""
-    u = between(draw, streams.GROUND, 0.0, 1.0)
+    u = uniform(rng, streams.GROUND, 0.0, 1.0)
     if u < ranges.platform:
-        return draw_platform(draw, ranges, foot, goal)
+        return sample_platform(rng, ranges, foot, goal)
     if u < ranges.platform + ranges.block:
-        return draw_block(draw, ranges, foot, goal)
+        return sample_block(rng, ranges, foot, goal)
     return Block()

@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from ..mdp.view import RobotArrays, RobotView, base_pos, base_quat, turned, yaw_of
+from ..mdp.view import RobotArrays, RobotView, base_pos, base_quat, rotate_yaw, yaw_of
 from ..terrain.ground import Block, Ground, floor_surface, world_ground
 from .phase import estimated_apex, estimated_landing
 from .state import JumpState, commanded, goal_offset
@@ -13,62 +13,62 @@ LANDING_HEIGHT = wp.constant(0.3)  # [m] of the base above the ground at the goa
 
 
 @wp.func
-def wanted_height(view: RobotView, task: JumpState) -> float:
+def wanted_height(robot: RobotView, state: JumpState) -> float:
     """Commanded height of the base at the apex [m]."""
-    return task.goal[2]
+    return state.goal[2]
 
 
 @wp.func
-def jump_command(view: RobotView, task: JumpState) -> float:
+def jump_command(robot: RobotView, state: JumpState) -> float:
     """Whether a jump is asked for and not yet landed (the paper's c)."""
-    return wp.where(commanded(task), 1.0, 0.0)
+    return wp.where(commanded(state), 1.0, 0.0)
 
 
 @wp.func
-def goal(view: RobotView, task: JumpState) -> wp.vec2:
+def goal(robot: RobotView, state: JumpState) -> wp.vec2:
     """Way to the goal [m] ahead and to the left, 0 before the command."""
     way = wp.vec3(0.0)
-    if task.steps >= task.command_step:
-        way = turned(goal_offset(view, task), -yaw_of(view.quat))
+    if state.steps >= state.command_step:
+        way = rotate_yaw(goal_offset(robot, state), -yaw_of(robot.quat))
     return wp.vec2(way[0], way[1])
 
 
 @wp.func
-def phase(view: RobotView, task: JumpState) -> wp.vec3:
+def phase(robot: RobotView, state: JumpState) -> wp.vec3:
     """Which of stance, flight and landed it is [1]."""
     return wp.vec3(
-        wp.where(task.phase == 0, 1.0, 0.0), wp.where(task.phase == 1, 1.0, 0.0), wp.where(task.phase == 2, 1.0, 0.0)
+        wp.where(state.phase == 0, 1.0, 0.0), wp.where(state.phase == 1, 1.0, 0.0), wp.where(state.phase == 2, 1.0, 0.0)
     )
 
 
 @wp.func
-def phase_times(view: RobotView, task: JumpState) -> wp.vec2:
+def phase_times(robot: RobotView, state: JumpState) -> wp.vec2:
     """Time in the phase, at most 2 s, and since the command, from -1 to 3 s."""
     return wp.vec2(
-        wp.min(float(task.phase_steps), 120.0) / 60.0,
-        wp.clamp(float(task.steps - task.command_step), -60.0, 180.0) / 60.0,
+        wp.min(float(state.phase_steps), 120.0) / 60.0,
+        wp.clamp(float(state.steps - state.command_step), -60.0, 180.0) / 60.0,
     )
 
 
 @wp.func
-def height_errors(view: RobotView, task: JumpState) -> wp.vec2:
+def height_errors(robot: RobotView, state: JumpState) -> wp.vec2:
     """Highest base height so far, and its ballistic estimate, less the wanted one [m]."""
-    apex = estimated_apex(view.pos, view.lin_vel, view.fall_acc)
-    return wp.vec2(task.max_height - task.goal[2], apex - task.goal[2])
+    apex = estimated_apex(robot.pos, robot.lin_vel, robot.gravity_magnitude)
+    return wp.vec2(state.max_height - state.goal[2], apex - state.goal[2])
 
 
 @wp.func
-def landing_miss(view: RobotView, task: JumpState) -> wp.vec2:
+def landing_miss(robot: RobotView, state: JumpState) -> wp.vec2:
     """Way from the ballistic landing to the goal [m], ahead and to the left."""
-    landing = estimated_landing(view.pos, view.lin_vel, LANDING_HEIGHT + task.goal_ground, view.fall_acc)
-    miss = turned(wp.vec3(task.goal[0] - landing[0], task.goal[1] - landing[1], 0.0), -yaw_of(view.quat))
+    landing = estimated_landing(robot.pos, robot.lin_vel, LANDING_HEIGHT + state.goal_ground, robot.gravity_magnitude)
+    miss = rotate_yaw(wp.vec3(state.goal[0] - landing[0], state.goal[1] - landing[1], 0.0), -yaw_of(robot.quat))
     return wp.vec2(miss[0], miss[1])
 
 
 @wp.func
-def way(view: RobotView, task: JumpState) -> wp.vec2:
+def way(robot: RobotView, state: JumpState) -> wp.vec2:
     """Way to the goal [m] ahead and to the left, before the command too."""
-    offset = turned(goal_offset(view, task), -yaw_of(view.quat))
+    offset = rotate_yaw(goal_offset(robot, state), -yaw_of(robot.quat))
     return wp.vec2(offset[0], offset[1])
 
 
@@ -95,17 +95,17 @@ def edges_of_block(block: Block, from_x: float, from_y: float, heading: float) -
 
 
 @wp.func
-def block_ahead(robot: RobotArrays, ground: Ground, world: int) -> vec7:
+def block_ahead(arrays: RobotArrays, ground: Ground, world: int) -> vec7:
     """What the block ahead is like: where it begins and ends [m] ahead of the base, and its height above the floor [m].
 
     Along three rays in the base's heading, 0.2 m to its left, through it and to its right; 2 m where there is none.
     """
     block = world_ground(ground, world).block
-    pos = base_pos(robot, world)
-    heading = yaw_of(base_quat(robot, world))
+    pos = base_pos(arrays, world)
+    heading = yaw_of(base_quat(arrays, world))
     seen = vec7()
     for i in range(3):
-        aside = turned(wp.vec3(0.0, 0.2 * float(1 - i), 0.0), heading)
+        aside = rotate_yaw(wp.vec3(0.0, 0.2 * float(1 - i), 0.0), heading)
         edges = edges_of_block(block, pos[0] + aside[0], pos[1] + aside[1], heading)
         seen[2 * i] = edges[0]
         seen[2 * i + 1] = edges[1]

@@ -28,51 +28,51 @@ def estimated_landing(pos: wp.vec3, lin_vel: wp.vec3, height: float, g: float) -
 
 
 @wp.func
-def landing_error_estimate(view: RobotView, task: JumpState, height: float) -> float:
+def landing_error_estimate(robot: RobotView, state: JumpState, height: float) -> float:
     """Return how far from the goal [m] the base's projectile falls through a height [m] above the ground there."""
-    landing = estimated_landing(view.pos, view.lin_vel, height + task.goal_ground, view.fall_acc)
-    return wp.length(wp.vec2(task.goal[0] - landing[0], task.goal[1] - landing[1]))
+    landing = estimated_landing(robot.pos, robot.lin_vel, height + state.goal_ground, robot.gravity_magnitude)
+    return wp.length(wp.vec2(state.goal[0] - landing[0], state.goal[1] - landing[1]))
 
 
 @wp.func
-def next_phase(task: JumpState, view: RobotView, takeoff_speed: float) -> int:
+def next_phase(state: JumpState, robot: RobotView, takeoff_speed: float) -> int:
     """Return the phase after this policy step; a takeoff needs free paws and an upward speed [m/s]."""
-    if task.phase == STANCE and view.contacts == 0 and view.lin_vel[2] > takeoff_speed:
+    if state.phase == STANCE and robot.contacts == 0 and robot.lin_vel[2] > takeoff_speed:
         return FLIGHT
-    if task.phase == FLIGHT and view.contacts > 0:
+    if state.phase == FLIGHT and robot.contacts > 0:
         return LANDED
-    return task.phase
+    return state.phase
 
 
 @wp.func
-def advance_jump(view: RobotView, task: JumpState, takeoff_speed: float) -> JumpState:
+def advance_jump(robot: RobotView, state: JumpState, takeoff_speed: float) -> JumpState:
     """Return the jump's state one policy step later; takeoff_speed [m/s]: upward, that begins a flight."""
-    t = task
-    t.steps = task.steps + 1
-    phase = next_phase(task, view, takeoff_speed)
-    t.took_off = wp.where(task.phase == STANCE and phase == FLIGHT, 1, 0)
-    t.touched_down = wp.where(task.phase == FLIGHT and phase == LANDED, 1, 0)
-    t.phase_steps = wp.where(phase == task.phase, task.phase_steps + 1, 0)
+    t = state
+    t.steps = state.steps + 1
+    phase = next_phase(state, robot, takeoff_speed)
+    t.took_off = wp.where(state.phase == STANCE and phase == FLIGHT, 1, 0)
+    t.touched_down = wp.where(state.phase == FLIGHT and phase == LANDED, 1, 0)
+    t.phase_steps = wp.where(phase == state.phase, state.phase_steps + 1, 0)
     t.phase = phase
     if t.took_off == 1:
-        t.max_height = view.pos[2]
+        t.max_height = robot.pos[2]
         t.apex_passed = 0
     t.at_apex = 0
-    if phase != STANCE and task.apex_passed == 0:
-        t.max_height = wp.max(t.max_height, view.pos[2])
-        if view.lin_vel[2] <= 0.0 or t.touched_down == 1:
+    if phase != STANCE and state.apex_passed == 0:
+        t.max_height = wp.max(t.max_height, robot.pos[2])
+        if robot.lin_vel[2] <= 0.0 or t.touched_down == 1:
             t.apex_passed = 1
             t.at_apex = 1
     if t.touched_down == 1:
-        t.touchdown_vel = view.old_lin_vel
+        t.touchdown_vel = robot.prev_lin_vel
         t.peak_tilt = 0.0
         t.paws_landed = 0
     if phase == LANDED:
-        t.peak_tilt = wp.max(t.peak_tilt, tilt(view))
+        t.peak_tilt = wp.max(t.peak_tilt, tilt(robot))
         for k in range(4):
-            if view.contact[k] > 0.0:
+            if robot.contact[k] > 0.0:
                 t.paws_landed = t.paws_landed | (1 << k)
     t.idle_steps = 0
-    if phase == STANCE and t.steps >= t.command_step and wp.length(view.lin_vel) < 0.1:
-        t.idle_steps = task.idle_steps + 1
+    if phase == STANCE and t.steps >= t.command_step and wp.length(robot.lin_vel) < 0.1:
+        t.idle_steps = state.idle_steps + 1
     return t

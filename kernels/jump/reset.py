@@ -4,12 +4,12 @@ import warp as wp
 
 from ..layout import DOFS
 from ..mdp.env import Scene, SkillSettings
-from ..mdp.random import Draw, between, within
+from ..mdp.random import RngStream, uniform, uniform_range
 from ..mdp.reset import leg_limits
-from ..mdp.view import RobotArrays, RobotView, base_pos, turned, yaw_of
+from ..mdp.view import RobotArrays, RobotView, base_pos, rotate_yaw, yaw_of
 from ..terrain.ground import Block, Ground, rest_block, surface, world_ground
 from . import streams
-from .ground_draws import GroundRanges, draw_ground, footprint
+from .ground_draws import GroundRanges, footprint, sample_ground
 from .start_states import (
     AFTER_LANDING,
     DEFAULT,
@@ -19,7 +19,7 @@ from .start_states import (
     TOUCHDOWN,
     JumpStart,
     ResetRanges,
-    draw_scheme,
+    sample_start_mode,
     write_start,
 )
 from .state import FLIGHT, LANDED, STANCE, JumpState
@@ -47,7 +47,7 @@ class JumpLevel:
 
 
 @wp.func
-def rounded(goal: wp.vec3, lower: wp.vec3, upper: wp.vec3) -> wp.vec3:
+def project_to_ellipse(goal: wp.vec3, lower: wp.vec3, upper: wp.vec3) -> wp.vec3:
     """Return a goal of a box around the start moved into the ellipse that touches the box's sides, its height kept.
 
     Each quarter has its own half axes, so that reaches ahead, back and to either side can differ.
@@ -59,34 +59,34 @@ def rounded(goal: wp.vec3, lower: wp.vec3, upper: wp.vec3) -> wp.vec3:
 
 
 @wp.func
-def draw_goal(draw: Draw, level: JumpLevel) -> wp.vec3:
+def sample_goal(rng: RngStream, level: JumpLevel) -> wp.vec3:
     """Return a goal of a level relative to start and heading."""
     lower = level.goal_lower
     upper = level.goal_upper
     goal = wp.vec3(
-        between(draw, streams.GOAL, lower[0], upper[0]),
-        between(draw, streams.GOAL + 1, lower[1], upper[1]),
-        between(draw, streams.GOAL + 2, lower[2], upper[2]),
+        uniform(rng, streams.GOAL, lower[0], upper[0]),
+        uniform(rng, streams.GOAL + 1, lower[1], upper[1]),
+        uniform(rng, streams.GOAL + 2, lower[2], upper[2]),
     )
     if level.round != 0:
-        goal = rounded(goal, lower, upper)
+        goal = project_to_ellipse(goal, lower, upper)
     return goal
 
 
 @wp.func
-def draw_again(draw: Draw, delay: wp.vec2, share: float) -> int:
+def sample_next_jump_step(rng: RngStream, delay: wp.vec2, share: float) -> int:
     """Return how many policy steps after touchdown another goal comes; 0: none, in all but a share of draws.
 
     delay: range in policy steps.
     """
-    steps = int(within(draw, streams.AGAIN_STEP, delay))
-    return wp.where(between(draw, streams.AGAIN, 0.0, 1.0) < share, wp.max(steps, 1), 0)
+    steps = int(uniform_range(rng, streams.AGAIN_STEP, delay))
+    return wp.where(uniform(rng, streams.AGAIN, 0.0, 1.0) < share, wp.max(steps, 1), 0)
 
 
 @wp.func
-def draw_command(draw: Draw, ranges: ResetRanges) -> int:
+def sample_command_step(rng: RngStream, ranges: ResetRanges) -> int:
     """Return at which policy step the jump is commanded: uniform, a share of the draws in the longer of two ranges."""
-    u = between(draw, streams.COMMAND_STEP, 0.0, 1.0)
+    u = uniform(rng, streams.COMMAND_STEP, 0.0, 1.0)
     share = ranges.long_wait_share
     soon = (u - share) / wp.max(1.0 - share, 1.0e-6) * (float(ranges.command_delay) + 0.999)
     later = u / wp.max(share, 1.0e-6) * (float(ranges.long_wait) + 0.999)
@@ -94,137 +94,137 @@ def draw_command(draw: Draw, ranges: ResetRanges) -> int:
 
 
 @wp.func
-def begin_task(
-    draw: Draw, ranges: ResetRanges, scheme: int, goal: wp.vec3, pos: wp.vec3, vz: float, jump_again: float
+def begin_jump(
+    rng: RngStream, ranges: ResetRanges, start_mode: int, goal: wp.vec3, pos: wp.vec3, vz: float, jump_again: float
 ) -> JumpState:
     """Return the state of a new episode that begins with a scheme at a base position [m] and upward speed [m/s]."""
-    task = JumpState()
-    task.scheme = scheme
-    task.goal = goal
-    task.start = pos
-    task.max_height = pos[2]
-    task.command_step = draw_command(draw, ranges)
-    task.again_delay = ranges.again_delay
-    task.again_step = draw_again(draw, ranges.again_delay, jump_again)
-    if scheme == PUSHING or (scheme == STANDING and ranges.lean > 0.0):
-        task.start = wp.vec3(0.0, 0.0, pos[2])
-    if scheme == PUSHING:
-        task.command_step = 0
-    if scheme == IN_FLIGHT or scheme == TOUCHDOWN:
-        task.phase = FLIGHT
-        task.command_step = 0
+    state = JumpState()
+    state.start_mode = start_mode
+    state.goal = goal
+    state.start = pos
+    state.max_height = pos[2]
+    state.command_step = sample_command_step(rng, ranges)
+    state.again_delay = ranges.again_delay
+    state.next_jump_step = sample_next_jump_step(rng, ranges.again_delay, jump_again)
+    if start_mode == PUSHING or (start_mode == STANDING and ranges.lean > 0.0):
+        state.start = wp.vec3(0.0, 0.0, pos[2])
+    if start_mode == PUSHING:
+        state.command_step = 0
+    if start_mode == IN_FLIGHT or start_mode == TOUCHDOWN:
+        state.phase = FLIGHT
+        state.command_step = 0
         if vz <= 0.0:
-            task.apex_passed = 1
-            task.max_height = wp.max(goal[2], pos[2])
-    if scheme == AFTER_LANDING:
-        task.phase = LANDED
-        task.command_step = 0
-        task.apex_passed = 1
-        task.max_height = wp.max(goal[2], pos[2])
-        task.phase_steps = int(between(draw, streams.LANDED_STEPS, 0.0, 17.999))
-    return task
+            state.apex_passed = 1
+            state.max_height = wp.max(goal[2], pos[2])
+    if start_mode == AFTER_LANDING:
+        state.phase = LANDED
+        state.command_step = 0
+        state.apex_passed = 1
+        state.max_height = wp.max(goal[2], pos[2])
+        state.phase_steps = int(uniform(rng, streams.LANDED_STEPS, 0.0, 17.999))
+    return state
 
 
 @wp.func
 def begin_next_jump(old: JumpState, ground: Ground, goal: wp.vec3, pos: wp.vec3, heading: float) -> JumpState:
     """Return the state of an episode that goes on with another jump at once; goal relative to base and heading."""
-    task = old
-    task.heading = heading
-    task.goal = turned(goal, heading) + wp.vec3(pos[0], pos[1], 0.0)
-    task.goal_ground = surface(ground, task.goal[0], task.goal[1])[0]
-    task.start = pos
-    task.phase = STANCE
-    task.phase_steps = 0
-    task.command_step = old.steps
-    task.apex_passed = 0
-    task.idle_steps = 0
-    task.max_height = pos[2]
-    task.peak_tilt = 0.0
-    task.paws_landed = 0
-    task.again_step = 0
-    task.jumps = old.jumps + 1
-    return task
+    state = old
+    state.heading = heading
+    state.goal = rotate_yaw(goal, heading) + wp.vec3(pos[0], pos[1], 0.0)
+    state.goal_ground = surface(ground, state.goal[0], state.goal[1])[0]
+    state.start = pos
+    state.phase = STANCE
+    state.phase_steps = 0
+    state.command_step = old.steps
+    state.apex_passed = 0
+    state.idle_steps = 0
+    state.max_height = pos[2]
+    state.peak_tilt = 0.0
+    state.paws_landed = 0
+    state.next_jump_step = 0
+    state.jumps = old.jumps + 1
+    return state
 
 
 @wp.func
-def place_ground(ground: Ground, start: JumpStart, grounds: GroundRanges, draw: Draw) -> Ground:
+def place_ground(ground: Ground, start: JumpStart, grounds: GroundRanges, rng: RngStream) -> Ground:
     """Put the block of a world to its start, or draw another if blocks are drawn; returns the ground as it is there."""
     if grounds.platform + grounds.block > 0.0:
         block = Block()
-        if start.scheme == STANDING or start.scheme == DEFAULT:
-            block = draw_ground(draw, grounds, footprint(start.ranges, start.heading), start.goal)
-        ground.blocks[draw.world] = block
+        if start.start_mode == STANDING or start.start_mode == DEFAULT:
+            block = sample_ground(rng, grounds, footprint(start.ranges, start.heading), start.goal)
+        ground.blocks[rng.world] = block
     else:
-        rest_block(ground, draw.world)
-    return world_ground(ground, draw.world)
+        rest_block(ground, rng.world)
+    return world_ground(ground, rng.world)
 
 
 @wp.func
 def reset_jump(
-    robot: RobotArrays, scene: Scene, skill: SkillSettings, old: JumpState, settings: JumpSettings, level: JumpLevel,
-    draw: Draw,
+    arrays: RobotArrays, scene: Scene, skill: SkillSettings, old: JumpState, settings: JumpSettings, level: JumpLevel,
+    rng: RngStream,
 ) -> JumpState:  # fmt: skip
     """Begin an episode at a stage of a jump, and return its state."""
-    world = draw.world
+    world = rng.world
     ranges = settings.states
-    spent = old.spent
-    spent[old.scheme] += float(old.steps)
+    steps_per_mode = old.steps_per_mode
+    steps_per_mode[old.start_mode] += float(old.steps)
     start = JumpStart()
-    start.scheme = draw_scheme(draw, ranges, spent)
-    start.heading = between(draw, streams.HEADING, -ranges.heading, ranges.heading)
-    start.goal = turned(draw_goal(draw, level), start.heading)
+    start.start_mode = sample_start_mode(rng, ranges, steps_per_mode)
+    start.heading = uniform(rng, streams.HEADING, -ranges.heading, ranges.heading)
+    start.goal = rotate_yaw(sample_goal(rng, level), start.heading)
     start.base_height = level.base_height
     start.ranges = ranges
     start.limits = leg_limits(skill.command_filter)
-    start.ground = place_ground(scene.ground, start, settings.grounds, draw)
-    scheme = write_start(robot, scene, start, draw)
-    vz = robot.joint_qd[world * DOFS + 2]
-    task = begin_task(draw, ranges, scheme, start.goal, base_pos(robot, world), vz, level.jump_again)
-    task.heading = start.heading
-    task.spent = spent
-    task.goal_ground = surface(start.ground, start.goal[0], start.goal[1])[0]
-    return task
+    start.ground = place_ground(scene.ground, start, settings.grounds, rng)
+    start_mode = write_start(arrays, scene, start, rng)
+    vz = arrays.joint_qd[world * DOFS + 2]
+    state = begin_jump(rng, ranges, start_mode, start.goal, base_pos(arrays, world), vz, level.jump_again)
+    state.heading = start.heading
+    state.steps_per_mode = steps_per_mode
+    state.goal_ground = surface(start.ground, start.goal[0], start.goal[1])[0]
+    return state
 
 
 @wp.func
-def another_jump_due(task: JumpState) -> bool:
+def another_jump_due(state: JumpState) -> bool:
     """Return whether a landed robot gets another goal now."""
-    return task.phase == LANDED and task.again_step > 0 and task.phase_steps >= task.again_step
+    return state.phase == LANDED and state.next_jump_step > 0 and state.phase_steps >= state.next_jump_step
 
 
 @wp.func
-def draw_next_jump(view: RobotView, scene: Scene, task: JumpState, level: JumpLevel, draw: Draw) -> JumpState:
+def draw_next_jump(robot: RobotView, scene: Scene, state: JumpState, level: JumpLevel, rng: RngStream) -> JumpState:
     """Return the state of an episode that goes on with another jump, to a drawn goal."""
-    goal = draw_goal(draw, level)
-    new = begin_next_jump(task, world_ground(scene.ground, view.world), goal, view.pos, yaw_of(view.quat))
-    new.again_step = draw_again(draw, task.again_delay, level.jump_again)
+    goal = sample_goal(rng, level)
+    new = begin_next_jump(state, world_ground(scene.ground, robot.world), goal, robot.pos, yaw_of(robot.quat))
+    new.next_jump_step = sample_next_jump_step(rng, state.again_delay, level.jump_again)
     return new
 
 
 @wp.func
-def give_jump(view: RobotView, scene: Scene, task: JumpState, values: wp.vec4, heading: float) -> JumpState:
+def give_jump(robot: RobotView, scene: Scene, state: JumpState, values: wp.vec4, heading: float) -> JumpState:
     """Ask a robot that stands at its start, or has landed, for a jump.
 
     values: goal x, y [m] relative to base and heading, base height at the apex [m], and at a start the policy step of
     the command.
     """
-    here = world_ground(scene.ground, view.world)
+    here = world_ground(scene.ground, robot.world)
     goal = wp.vec3(values[0], values[1], values[2])
-    if task.phase == LANDED:
-        return begin_next_jump(task, here, goal, view.pos, heading)
-    if task.phase != STANCE or task.steps > 0:
-        return task
+    if state.phase == LANDED:
+        return begin_next_jump(state, here, goal, robot.pos, heading)
+    if state.phase != STANCE or state.steps > 0:
+        return state
     new = JumpState()
     new.heading = heading
-    new.start = view.pos
-    new.goal = turned(goal, heading) + wp.vec3(view.pos[0], view.pos[1], 0.0)
+    new.start = robot.pos
+    new.goal = rotate_yaw(goal, heading) + wp.vec3(robot.pos[0], robot.pos[1], 0.0)
     new.goal_ground = surface(here, new.goal[0], new.goal[1])[0]
-    new.max_height = view.pos[2]
+    new.max_height = robot.pos[2]
     new.command_step = int(values[3])
     return new
 
 
 @wp.func
-def from_standing(task: JumpState) -> bool:
+def from_standing(state: JumpState) -> bool:
     """Return whether an episode began standing, and so counts for the curriculum."""
-    return task.scheme <= DEFAULT
+    return state.start_mode <= DEFAULT

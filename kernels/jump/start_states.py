@@ -15,14 +15,14 @@ from ..kinematics.leg import leg_forward_kinematics
 from ..layout import BODIES
 from ..mdp.attempts import sample_valid_state
 from ..mdp.env import Scene
-from ..mdp.random import Draw, between, within
-from ..mdp.reset import store_pose
-from ..mdp.starts import LegSample, leg_over_ground, leg_to, place_beside, turn_of
-from ..mdp.view import RobotArrays, turned
+from ..mdp.random import RngStream, uniform, uniform_range
+from ..mdp.reset import write_default_pose
+from ..mdp.starts import LegSample, leg_ik, quat_from_ypr, sample_foot_offset, with_foot_velocity
+from ..mdp.view import RobotArrays, rotate_yaw
 from ..terrain.ground import Ground, surface
 from . import streams
 from .phase import time_to_height
-from .state import SCHEMES, vec_schemes
+from .state import NUM_START_MODES, vec_start_modes
 
 wp.set_module_options({"enable_backward": False})
 
@@ -38,7 +38,7 @@ PUSHING = wp.constant(5)
 class ResetRanges:
     """Ranges of the drawn states; pairs are (lower, upper), angles [rad], lengths [m]."""
 
-    shares: vec_schemes  # of standing, default, in flight, touchdown, just landed, pushing off
+    shares: vec_start_modes  # of standing, default, in flight, touchdown, just landed, pushing off
     of_time: int  # 1: shares are of the time that a world spends in episodes, 0: of its resets
     base_xy: float  # half width
     tilt: float  # half width of roll, pitch; of yaw too around the heading
@@ -76,7 +76,7 @@ class ResetRanges:
 class JumpStart:
     """What all attempts at a start state share."""
 
-    scheme: int
+    start_mode: int
     heading: float  # [rad] yaw
     goal: wp.vec3  # [m] from the origin, world axes
     base_height: wp.vec2  # [m] range of standing starts
@@ -100,55 +100,55 @@ class JumpBase:
 
 
 @wp.func
-def scheme_of_shares(shares: vec_schemes, u: float) -> int:
+def start_mode_at(shares: vec_start_modes, u: float) -> int:
     """Return the scheme at u in [0, 1) of the shares one after the other."""
-    scheme = int(0)
+    start_mode = int(0)
     rest = u
-    for i in range(SCHEMES):
+    for i in range(NUM_START_MODES):
         if rest >= 0.0 and shares[i] > 0.0:
-            scheme = i
+            start_mode = i
         rest -= shares[i]
-    return scheme
+    return start_mode
 
 
 @wp.func
-def most_lacking(shares: vec_schemes, spent: vec_schemes) -> int:
+def least_sampled_mode(shares: vec_start_modes, steps_per_mode: vec_start_modes) -> int:
     """Return the scheme that is farthest behind its share of what was spent, in policy steps."""
     total = float(0.0)
-    for i in range(SCHEMES):
-        total += spent[i]
-    scheme = int(0)
+    for i in range(NUM_START_MODES):
+        total += steps_per_mode[i]
+    start_mode = int(0)
     most = float(-3.0e38)
-    for i in range(SCHEMES):
-        lack = shares[i] * total - spent[i]
+    for i in range(NUM_START_MODES):
+        lack = shares[i] * total - steps_per_mode[i]
         if shares[i] > 0.0 and lack > most:
-            scheme = i
+            start_mode = i
             most = lack
-    return scheme
+    return start_mode
 
 
 @wp.func
-def draw_scheme(draw: Draw, ranges: ResetRanges, spent: vec_schemes) -> int:
+def sample_start_mode(rng: RngStream, ranges: ResetRanges, steps_per_mode: vec_start_modes) -> int:
     """Return the scheme of a new episode; shares of time are drawn once, and then what lacks most comes next."""
-    if ranges.of_time != 0 and wp.length_sq(spent) > 0.0:
-        return most_lacking(ranges.shares, spent)
-    return scheme_of_shares(ranges.shares, between(draw, streams.SCHEME, 0.0, 1.0))
+    if ranges.of_time != 0 and wp.length_sq(steps_per_mode) > 0.0:
+        return least_sampled_mode(ranges.shares, steps_per_mode)
+    return start_mode_at(ranges.shares, uniform(rng, streams.START_MODE, 0.0, 1.0))
 
 
 @wp.func
-def sample_quat(draw: Draw, ranges: ResetRanges, heading: float, pitch: float) -> wp.quat:
+def sample_quat(rng: RngStream, ranges: ResetRanges, heading: float, pitch: float) -> wp.quat:
     """Return an orientation (xyzw) around a heading and a pitch [rad]."""
-    yaw = heading + between(draw, streams.YAW, -ranges.tilt, ranges.tilt)
-    tip = pitch + between(draw, streams.PITCH, -ranges.tilt, ranges.tilt)
-    roll = between(draw, streams.ROLL, -ranges.tilt, ranges.tilt)
-    return turn_of(yaw, tip, roll)
+    yaw = heading + uniform(rng, streams.YAW, -ranges.tilt, ranges.tilt)
+    tip = pitch + uniform(rng, streams.PITCH, -ranges.tilt, ranges.tilt)
+    roll = uniform(rng, streams.ROLL, -ranges.tilt, ranges.tilt)
+    return quat_from_ypr(yaw, tip, roll)
 
 
 @wp.func
-def sample_offset(draw: Draw, ranges: ResetRanges) -> wp.vec3:
+def sample_offset(rng: RngStream, ranges: ResetRanges) -> wp.vec3:
     """Return a horizontal offset [m] of the base."""
-    x = between(draw, streams.OFFSET_X, -ranges.base_xy, ranges.base_xy)
-    return wp.vec3(x, between(draw, streams.OFFSET_Y, -ranges.base_xy, ranges.base_xy), 0.0)
+    x = uniform(rng, streams.OFFSET_X, -ranges.base_xy, ranges.base_xy)
+    return wp.vec3(x, uniform(rng, streams.OFFSET_Y, -ranges.base_xy, ranges.base_xy), 0.0)
 
 
 @wp.func
@@ -157,91 +157,93 @@ def direction(start: JumpStart) -> wp.vec3:
     to_goal = wp.vec3(start.goal[0], start.goal[1], 0.0)
     if wp.length(to_goal) > 1.0e-3:
         return wp.normalize(to_goal)
-    return turned(wp.vec3(1.0, 0.0, 0.0), start.heading)
+    return rotate_yaw(wp.vec3(1.0, 0.0, 0.0), start.heading)
 
 
 @wp.func
-def standing(start: JumpStart, draw: Draw) -> JumpBase:
+def standing(start: JumpStart, rng: RngStream) -> JumpBase:
     """Return a base at rest over paws around the origin; the deeper a squat, the farther it may lean back."""
     ranges = start.ranges
     lower = start.base_height[0]
     upper = start.base_height[1]
-    height = within(draw, streams.HEIGHT, start.base_height)
-    tip = between(draw, streams.FORWARD_PITCH, 0.0, ranges.forward_pitch)
-    lean = (upper - height) / wp.max(upper - lower, 1.0e-6) * between(draw, streams.LEAN, 0.0, ranges.lean)
+    height = uniform_range(rng, streams.HEIGHT, start.base_height)
+    tip = uniform(rng, streams.FORWARD_PITCH, 0.0, ranges.forward_pitch)
+    lean = (upper - height) / wp.max(upper - lower, 1.0e-6) * uniform(rng, streams.LEAN, 0.0, ranges.lean)
     base = JumpBase()
-    base.quat = sample_quat(draw, ranges, start.heading, tip)
-    base.pos = sample_offset(draw, ranges) + wp.vec3(0.0, 0.0, height) - lean * direction(start)
+    base.quat = sample_quat(rng, ranges, start.heading, tip)
+    base.pos = sample_offset(rng, ranges) + wp.vec3(0.0, 0.0, height) - lean * direction(start)
     return base
 
 
 @wp.func
-def just_landed(start: JumpStart, draw: Draw) -> JumpBase:
+def just_landed(start: JumpStart, rng: RngStream) -> JumpBase:
     """Return a base that sinks over paws around the goal."""
     ranges = start.ranges
     base = JumpBase()
-    base.quat = sample_quat(draw, ranges, start.heading, 0.0)
+    base.quat = sample_quat(rng, ranges, start.heading, 0.0)
     base.spot = wp.vec3(start.goal[0], start.goal[1], 0.0)
-    ahead = within(draw, streams.LANDED_AHEAD, ranges.landed_ahead)
-    base.pos = sample_offset(draw, ranges) + base.spot + ahead * direction(start)
-    base.pos[2] = within(draw, streams.LANDED_HEIGHT, ranges.landed_height)
-    base.lin_vel = wp.vec3(0.0, 0.0, -within(draw, streams.LANDED_SPEED, ranges.landed_speed))
+    ahead = uniform_range(rng, streams.LANDED_AHEAD, ranges.landed_ahead)
+    base.pos = sample_offset(rng, ranges) + base.spot + ahead * direction(start)
+    base.pos[2] = uniform_range(rng, streams.LANDED_HEIGHT, ranges.landed_height)
+    base.lin_vel = wp.vec3(0.0, 0.0, -uniform_range(rng, streams.LANDED_SPEED, ranges.landed_speed))
     return base
 
 
 @wp.func
-def takeoff_speed(draw: Draw, ranges: ResetRanges, height: float, distance: float, apex: float, g: float) -> float:
+def takeoff_speed(rng: RngStream, ranges: ResetRanges, height: float, distance: float, apex: float, g: float) -> float:
     """Return the upward speed [m/s] with which a jump over a distance [m] leaves a height [m]."""
     if apex > 0.0:
         return wp.sqrt(wp.max(2.0 * g * (apex - height), 0.0))
     # height + v_z t - g t^2 / 2 = landing_height, where v_z t = distance tan(angle)
-    climb = distance * wp.tan(within(draw, streams.TAKEOFF_ANGLE, ranges.takeoff_angle))
+    climb = distance * wp.tan(uniform_range(rng, streams.TAKEOFF_ANGLE, ranges.takeoff_angle))
     t = wp.sqrt(wp.max(2.0 * (height - ranges.landing_height + climb) / g, 1.0e-6))
     limit = wp.sqrt(wp.max(2.0 * g * (ranges.highest_apex - height), 0.0))
     return wp.min(climb / t, limit)
 
 
 @wp.func
-def in_flight(start: JumpStart, draw: Draw, g: float) -> JumpBase:
+def in_flight(start: JumpStart, rng: RngStream, g: float) -> JumpBase:
     """Return a base on the projectile to the goal: anywhere, shortly before touchdown, or for a push at the takeoff."""
     ranges = start.ranges
     along = direction(start)
-    height = within(draw, streams.TAKEOFF_HEIGHT, ranges.takeoff_height)
+    height = uniform_range(rng, streams.TAKEOFF_HEIGHT, ranges.takeoff_height)
     way = wp.length(wp.vec3(start.goal[0], start.goal[1], 0.0))
-    ahead = wp.min(within(draw, streams.TAKEOFF_AHEAD, ranges.takeoff_ahead), way)
+    ahead = wp.min(uniform_range(rng, streams.TAKEOFF_AHEAD, ranges.takeoff_ahead), way)
     distance = way - ahead
-    up = takeoff_speed(draw, ranges, height, distance, start.goal[2], g)
+    up = takeoff_speed(rng, ranges, height, distance, start.goal[2], g)
     duration = wp.max(time_to_height(height, up, ranges.landing_height, g), 1.0e-3)
     forward = distance / duration
-    t = duration * within(draw, streams.FLIGHT_TIME, ranges.flight_time)
-    if start.scheme == TOUCHDOWN:
-        t = wp.max(duration - within(draw, streams.TOUCHDOWN_TIME, ranges.touchdown_time), 0.0)
-    if start.scheme == PUSHING:
+    t = duration * uniform_range(rng, streams.FLIGHT_TIME, ranges.flight_time)
+    if start.start_mode == TOUCHDOWN:
+        t = wp.max(duration - uniform_range(rng, streams.TOUCHDOWN_TIME, ranges.touchdown_time), 0.0)
+    if start.start_mode == PUSHING:
         t = float(0.0)
     rise = wp.vec3(0.0, 0.0, height + up * t - 0.5 * g * t * t)
     base = JumpBase()
-    base.quat = sample_quat(draw, ranges, start.heading, within(draw, streams.TAKEOFF_PITCH, ranges.takeoff_pitch))
-    base.pos = sample_offset(draw, ranges) + (ahead + forward * t) * along + rise
+    base.quat = sample_quat(rng, ranges, start.heading, uniform_range(rng, streams.TAKEOFF_PITCH, ranges.takeoff_pitch))
+    base.pos = sample_offset(rng, ranges) + (ahead + forward * t) * along + rise
     base.lin_vel = forward * along + wp.vec3(0.0, 0.0, up - g * t)
     return base
 
 
 @wp.func
-def before_touchdown(start: JumpStart, flight: JumpBase, draw: Draw) -> JumpBase:
+def before_touchdown(start: JumpStart, flight: JumpBase, rng: RngStream) -> JumpBase:
     """Return a base in flight moved behind the spot that its paws surround."""
     base = flight
     base.spot = wp.vec3(flight.pos[0], flight.pos[1], 0.0)
-    base.pos = flight.pos - within(draw, streams.TOUCHDOWN_BEHIND, start.ranges.touchdown_behind) * direction(start)
+    base.pos = flight.pos - uniform_range(rng, streams.TOUCHDOWN_BEHIND, start.ranges.touchdown_behind) * direction(
+        start
+    )
     return base
 
 
 @wp.func
-def pushing_off(start: JumpStart, takeoff: JumpBase, draw: Draw) -> JumpBase:
+def pushing_off(start: JumpStart, takeoff: JumpBase, rng: RngStream) -> JumpBase:
     """Return a base before its takeoff, over paws around the start: on a straight line, evenly accelerated."""
     base = takeoff
-    back = within(draw, streams.PUSH_LENGTH, start.ranges.push_length)
+    back = uniform_range(rng, streams.PUSH_LENGTH, start.ranges.push_length)
     speed = wp.length(takeoff.lin_vel)
-    before = speed * speed - 2.0 * back * within(draw, streams.PUSH_ACCELERATION, start.ranges.push_acceleration)
+    before = speed * speed - 2.0 * back * uniform_range(rng, streams.PUSH_ACCELERATION, start.ranges.push_acceleration)
     way = wp.normalize(takeoff.lin_vel)
     base.pos = takeoff.pos - back * way
     base.lin_vel = wp.sqrt(wp.max(before, 0.0)) * way
@@ -249,20 +251,20 @@ def pushing_off(start: JumpStart, takeoff: JumpBase, draw: Draw) -> JumpBase:
 
 
 @wp.func
-def sample_base(start: JumpStart, robot: RobotArrays, draw: Draw, attempt: int) -> JumpBase:
+def sample_base(start: JumpStart, arrays: RobotArrays, rng: RngStream, attempt: int) -> JumpBase:
     """Return the base of the start's scheme in an attempt."""
     base = JumpBase()
-    if start.scheme == STANDING:
-        base = standing(start, draw)
-    elif start.scheme == AFTER_LANDING:
-        base = just_landed(start, draw)
+    if start.start_mode == STANDING:
+        base = standing(start, rng)
+    elif start.start_mode == AFTER_LANDING:
+        base = just_landed(start, rng)
     else:
-        base = in_flight(start, draw, -robot.gravity[draw.world][2])
-        if start.scheme == TOUCHDOWN:
-            base = before_touchdown(start, base, draw)
-        if start.scheme == PUSHING:
-            base = pushing_off(start, base, draw)
-    base.com_vel = base.lin_vel + wp.cross(base.ang_vel, wp.quat_rotate(base.quat, robot.body_com[draw.world * BODIES]))
+        base = in_flight(start, rng, -arrays.gravity[rng.world][2])
+        if start.start_mode == TOUCHDOWN:
+            base = before_touchdown(start, base, rng)
+        if start.start_mode == PUSHING:
+            base = pushing_off(start, base, rng)
+    base.com_vel = base.lin_vel + wp.cross(base.ang_vel, wp.quat_rotate(base.quat, arrays.body_com[rng.world * BODIES]))
     base.height = base.pos[2]
     base.ground_height = surface(start.ground, 0.0, 0.0)[0]
     base.pos = base.pos + wp.vec3(0.0, 0.0, base.ground_height)
@@ -270,16 +272,16 @@ def sample_base(start: JumpStart, robot: RobotArrays, draw: Draw, attempt: int) 
 
 
 @wp.func
-def leg_in_flight(ranges: ResetRanges, base: JumpBase, geo: LegGeometry, draw: Draw, leg: int) -> LegSample:
+def leg_in_flight(ranges: ResetRanges, base: JumpBase, geo: LegGeometry, rng: RngStream, leg: int) -> LegSample:
     """Return a leg in flight, its paw above the ground: both thighs about alike, all legs about alike."""
     lower = ranges.flight_transversal[0]
     upper = ranges.flight_transversal[1]
-    middle = within(draw, streams.FLIGHT_TRANSVERSAL, ranges.flight_transversal)
-    lateral = between(draw, streams.FLIGHT_LATERAL, -ranges.flight_lateral, ranges.flight_lateral)
+    middle = uniform_range(rng, streams.FLIGHT_TRANSVERSAL, ranges.flight_transversal)
+    lateral = uniform(rng, streams.FLIGHT_LATERAL, -ranges.flight_lateral, ranges.flight_lateral)
     angles = wp.vec3(
-        lateral + between(draw, streams.LEG_LATERAL + leg, -0.03, 0.03),
-        wp.clamp(middle + between(draw, streams.LEG_OUTER + leg, -0.1, 0.1), lower, upper),
-        wp.clamp(middle + between(draw, streams.LEG_INNER + leg, -0.1, 0.1), lower, upper),
+        lateral + uniform(rng, streams.LEG_LATERAL + leg, -0.03, 0.03),
+        wp.clamp(middle + uniform(rng, streams.LEG_OUTER + leg, -0.1, 0.1), lower, upper),
+        wp.clamp(middle + uniform(rng, streams.LEG_INNER + leg, -0.1, 0.1), lower, upper),
     )
     found = LegSample()
     found.angles = angles
@@ -289,34 +291,34 @@ def leg_in_flight(ranges: ResetRanges, base: JumpBase, geo: LegGeometry, draw: D
 
 
 @wp.func
-def sample_leg(start: JumpStart, base: JumpBase, geo: LegGeometry, draw: Draw, leg: int) -> LegSample:
+def sample_leg(start: JumpStart, base: JumpBase, geo: LegGeometry, rng: RngStream, leg: int) -> LegSample:
     """Return a leg of an attempt: in flight, or by its paw's place on the ground, above it before touchdown."""
     ranges = start.ranges
-    if start.scheme == IN_FLIGHT:
-        return leg_in_flight(ranges, base, geo, draw, leg)
-    beside = place_beside(draw, leg, ranges.front_x, ranges.front_y, ranges.back_x, ranges.back_y)
-    spot = base.spot + turned(beside, start.heading)
+    if start.start_mode == IN_FLIGHT:
+        return leg_in_flight(ranges, base, geo, rng, leg)
+    beside = sample_foot_offset(rng, leg, ranges.front_x, ranges.front_y, ranges.back_x, ranges.back_y)
+    spot = base.spot + rotate_yaw(beside, start.heading)
     paw = spot - base.pos
-    if start.scheme == TOUCHDOWN:
+    if start.start_mode == TOUCHDOWN:
         # paws hang below the base, a little above the ground at least
-        depth = within(draw, streams.PAW_DEPTH, ranges.paw_depth)
+        depth = uniform_range(rng, streams.PAW_DEPTH, ranges.paw_depth)
         paw[2] = -wp.min(depth, base.height - geo.paw_radius - 0.025)
     else:
         below = surface(start.ground, spot[0], spot[1])[0]
         paw[2] = below + geo.paw_radius - base.height - base.ground_height
-    found = leg_to(geo, start.limits, wp.quat_rotate_inv(base.quat, paw))
-    if start.scheme == AFTER_LANDING or start.scheme == PUSHING:
+    found = leg_ik(geo, start.limits, wp.quat_rotate_inv(base.quat, paw))
+    if start.start_mode == AFTER_LANDING or start.start_mode == PUSHING:
         # the paw rests on the ground while the base moves, so the joints move too
         moving = base.lin_vel + wp.cross(base.ang_vel, paw)
-        found = leg_over_ground(geo, found, -wp.quat_rotate_inv(base.quat, moving))
+        found = with_foot_velocity(geo, found, -wp.quat_rotate_inv(base.quat, moving))
     return found
 
 
 @wp.func
-def write_start(robot: RobotArrays, scene: Scene, start: JumpStart, draw: Draw) -> int:
+def write_start(arrays: RobotArrays, scene: Scene, start: JumpStart, rng: RngStream) -> int:
     """Write a start state to a world, and return its scheme: `DEFAULT` where no attempt was valid too."""
-    if start.scheme != DEFAULT:
-        if sample_valid_state(sample_base, sample_leg, start, robot, scene, draw):
-            return start.scheme
-    store_pose(robot, scene, draw.world, start.heading, surface(start.ground, 0.0, 0.0)[0])
+    if start.start_mode != DEFAULT:
+        if sample_valid_state(sample_base, sample_leg, start, arrays, scene, rng):
+            return start.start_mode
+    write_default_pose(arrays, scene, rng.world, start.heading, surface(start.ground, 0.0, 0.0)[0])
     return DEFAULT

@@ -9,8 +9,8 @@ FLIGHT = wp.constant(1)
 LANDED = wp.constant(2)
 
 
-SCHEMES = wp.constant(6)  # ways in which an episode begins, see `start_states`
-vec_schemes = wp.types.vector(length=6, dtype=wp.float32)
+NUM_START_MODES = wp.constant(6)  # ways in which an episode begins, see `start_states`
+vec_start_modes = wp.types.vector(length=6, dtype=wp.float32)
 
 
 @wp.struct
@@ -33,27 +33,27 @@ class JumpState:
     max_height: float  # [m] of the base since takeoff
     touchdown_vel: wp.vec3  # [m/s] of the base, step before touchdown
     peak_tilt: float  # [rad] largest between body and world z since touchdown
-    scheme: int  # reset scheme that began the episode
-    again_step: int  # policy steps after touchdown at which another goal comes, 0: never
+    start_mode: int  # reset scheme that began the episode
+    next_jump_step: int  # policy steps after touchdown at which another goal comes, 0: never
     again_delay: wp.vec2  # policy steps between which that of yet another goal is drawn
     jumps: int  # jumps that were followed by another in this episode
     paws_landed: int  # bits of the paws that have come down since touchdown
-    spent: vec_schemes  # policy steps that the world has spent in episodes of each scheme, before this one
+    steps_per_mode: vec_start_modes  # policy steps that the world has spent in episodes of each scheme, before this one
 
 
 @wp.func
-def goal_offset(view: RobotView, task: JumpState) -> wp.vec3:
+def goal_offset(robot: RobotView, state: JumpState) -> wp.vec3:
     """Return the horizontal way from the base to the goal [m], world axes."""
-    return wp.vec3(task.goal[0] - view.pos[0], task.goal[1] - view.pos[1], 0.0)
+    return wp.vec3(state.goal[0] - robot.pos[0], state.goal[1] - robot.pos[1], 0.0)
 
 
 @wp.func
-def commanded(task: JumpState) -> bool:
+def commanded(state: JumpState) -> bool:
     """Return whether a jump is asked for and not yet landed (the paper's c)."""
-    return task.steps >= task.command_step and task.phase != LANDED
+    return state.steps >= state.command_step and state.phase != LANDED
 
 
 @wp.func
-def waiting(task: JumpState) -> bool:
+def waiting(state: JumpState) -> bool:
     """Return whether a jump is asked for but the robot still stands."""
-    return task.phase == STANCE and task.steps >= task.command_step
+    return state.phase == STANCE and state.steps >= state.command_step

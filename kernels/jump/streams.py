@@ -4,7 +4,7 @@ Alternatives share numbers: a start draws only those of its scheme, an episode o
 """
 
 # of an episode (stream `RESET`), goal and AGAIN also of the next jump in it (stream `COMMAND`)
-SCHEME, HEADING = 1, 13
+START_MODE, HEADING = 1, 13
 GOAL = 50  # to 52
 COMMAND_STEP, LANDED_STEPS = 9, 9  # policy steps until the command; since touchdown, of those just landed
 AGAIN, AGAIN_STEP = 18, 19  # whether, and when, another goal comes

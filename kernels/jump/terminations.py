@@ -2,89 +2,89 @@
 
 import warp as wp
 
-from ..mdp.view import RobotView, braking, rotation_from, yaw_of
+from ..mdp.view import RobotView, angle_from_level, base_deceleration, yaw_of
 from .phase import landing_error_estimate
 from .state import FLIGHT, LANDED, STANCE, JumpState, goal_offset, waiting
 
 
 @wp.func
-def success(view: RobotView, task: JumpState, steps: float) -> bool:
+def success(robot: RobotView, state: JumpState, steps: float) -> bool:
     """So many policy steps after touchdown: the jump is over."""
-    return task.phase == LANDED and task.phase_steps >= int(steps)
+    return state.phase == LANDED and state.phase_steps >= int(steps)
 
 
 @wp.func
-def wrong_height(view: RobotView, task: JumpState, tolerance: float) -> bool:
+def wrong_height(robot: RobotView, state: JumpState, tolerance: float) -> bool:
     """At touchdown the jump missed its height by more than a tolerance [m]."""
-    return task.touched_down == 1 and wp.abs(task.max_height - task.goal[2]) > tolerance
+    return state.touched_down == 1 and wp.abs(state.max_height - state.goal[2]) > tolerance
 
 
 @wp.func
-def missed_goal(view: RobotView, task: JumpState, tolerance: float) -> bool:
+def missed_goal(robot: RobotView, state: JumpState, tolerance: float) -> bool:
     """Base more than a tolerance [m] beside the goal at touchdown."""
-    return task.touched_down == 1 and wp.length(goal_offset(view, task)) > tolerance
+    return state.touched_down == 1 and wp.length(goal_offset(robot, state)) > tolerance
 
 
 @wp.func
-def predicted_miss(view: RobotView, task: JumpState, tolerance: float, steps: float, height: float) -> bool:
+def predicted_miss(robot: RobotView, state: JumpState, tolerance: float, steps: float, height: float) -> bool:
     """After so many policy steps in flight the ballistic landing at a height [m] misses the goal by more [m]."""
-    if task.phase != FLIGHT or task.phase_steps != int(steps):
+    if state.phase != FLIGHT or state.phase_steps != int(steps):
         return False
-    return landing_error_estimate(view, task, height) > tolerance
+    return landing_error_estimate(robot, state, height) > tolerance
 
 
 @wp.func
-def turned_touchdown(view: RobotView, task: JumpState, rotation: float, yaw: float) -> bool:
+def turned_touchdown(robot: RobotView, state: JumpState, rotation: float, yaw: float) -> bool:
     """At touchdown rotated by more than `rotation` [rad] from level and heading, or by `yaw` [rad] about z."""
-    turn = yaw_of(view.quat) - task.heading
+    turn = yaw_of(robot.quat) - state.heading
     off = wp.abs(wp.atan2(wp.sin(turn), wp.cos(turn)))
-    return task.touched_down == 1 and (rotation_from(view.quat, task.heading) > rotation or off > yaw)
+    return state.touched_down == 1 and (angle_from_level(robot.quat, state.heading) > rotation or off > yaw)
 
 
 @wp.func
-def second_takeoff(view: RobotView, task: JumpState, speed: float) -> bool:
+def second_takeoff(robot: RobotView, state: JumpState, speed: float) -> bool:
     """Off the ground again after touchdown, with no paw down, and upward faster than a speed [m/s]."""
-    return task.phase == LANDED and view.contacts == 0 and view.lin_vel[2] > speed
+    return state.phase == LANDED and robot.contacts == 0 and robot.lin_vel[2] > speed
 
 
 @wp.func
-def low_touchdown(view: RobotView, task: JumpState, height: float) -> bool:
+def low_touchdown(robot: RobotView, state: JumpState, height: float) -> bool:
     """Base less than a height [m] above the ground at touchdown."""
-    return task.touched_down == 1 and view.height < height
+    return state.touched_down == 1 and robot.height < height
 
 
 @wp.func
-def moved_away(view: RobotView, task: JumpState, distance: float) -> bool:
+def moved_away(robot: RobotView, state: JumpState, distance: float) -> bool:
     """Base more than a distance [m] from where it started, at any time."""
-    return wp.length(wp.vec2(view.pos[0] - task.start[0], view.pos[1] - task.start[1])) > distance
+    return wp.length(wp.vec2(robot.pos[0] - state.start[0], robot.pos[1] - state.start[1])) > distance
 
 
 @wp.func
-def left_stance(view: RobotView, task: JumpState, distance: float) -> bool:
+def left_stance(robot: RobotView, state: JumpState, distance: float) -> bool:
     """Base more than a distance [m] from where the jump began, still standing."""
-    return task.phase == STANCE and moved_away(view, task, distance)
+    return state.phase == STANCE and moved_away(robot, state, distance)
 
 
 @wp.func
-def slanted_takeoff(view: RobotView, task: JumpState, speed: float) -> bool:
+def slanted_takeoff(robot: RobotView, state: JumpState, speed: float) -> bool:
     """Horizontal speed above a limit [m/s] at takeoff."""
-    return task.took_off == 1 and wp.length(wp.vec2(view.lin_vel[0], view.lin_vel[1])) > speed
+    return state.took_off == 1 and wp.length(wp.vec2(robot.lin_vel[0], robot.lin_vel[1])) > speed
 
 
 @wp.func
-def hard_impact(view: RobotView, task: JumpState, stance: float, flight: float) -> bool:
+def hard_impact(robot: RobotView, state: JumpState, stance: float, flight: float) -> bool:
     """Deceleration above `stance` [m/s^2] in stance, above `flight` in flight and after touchdown."""
-    limit = wp.where(task.phase == STANCE, stance, flight)
-    return braking(view) < -limit
+    limit = wp.where(state.phase == STANCE, stance, flight)
+    return base_deceleration(robot) < -limit
 
 
 @wp.func
-def no_jump(view: RobotView, task: JumpState, steps: float, idle_steps: float) -> bool:
+def no_jump(robot: RobotView, state: JumpState, steps: float, idle_steps: float) -> bool:
     """A commanded jump did not begin within `steps` policy steps, or the base rested for `idle_steps`."""
-    return waiting(task) and (task.steps - task.command_step > int(steps) or task.idle_steps > int(idle_steps))
+    return waiting(state) and (state.steps - state.command_step > int(steps) or state.idle_steps > int(idle_steps))
 
 
 @wp.func
-def early_takeoff(view: RobotView, task: JumpState) -> bool:
+def early_takeoff(robot: RobotView, state: JumpState) -> bool:
     """Jumped before the jump was commanded."""
-    return task.took_off == 1 and task.steps < task.command_step
+    return state.took_off == 1 and state.steps < state.command_step

@@ -2,7 +2,7 @@
 
 Joint angles come from the closed-form inverse kinematics and joint rates from the leg's Jacobian, so that every state
 satisfies the loops. A sample whose paws cannot be reached within limits, or whose links touch what they must not, is
-rejected. On a GPU the 32 threads of a world differ in `Draw.lane` alone, and reach every exchange together (see
+rejected. On a GPU the 32 threads of a world differ in `RngStream.lane` alone, and reach every exchange together (see
 `lanes`); each writes to coordinates of its own until one is accepted.
 """
 
@@ -12,14 +12,14 @@ import warp as wp
 
 from ..collision.robot import leg_collisions
 from ..kinematics.geometry import LegGeometry
-from ..lanes import all_of_attempt, from_leg_of_attempt, least_of_attempts, meet
+from ..lanes import all_of_attempt, from_leg_of_attempt, least_of_attempts, sync_lanes
 from ..layout import COORDS, DOFS
 from ..scalar import vec3
 from ..state import leg_coord, leg_dof, load_motors, store_motors
 from ..terrain.ground import Ground
 from .env import Scene
-from .random import Draw, branch
-from .starts import APART, LegSample
+from .random import RngStream, fold_in
+from .starts import MIN_LINK_DISTANCE, LegSample
 from .view import RobotArrays
 
 wp.set_module_options({"enable_backward": False})
@@ -30,21 +30,21 @@ LANES = 32
 
 
 @wp.func
-def first_leg(draw: Draw) -> int:
+def first_leg(rng: RngStream) -> int:
     """Return the first leg that a thread samples."""
-    return draw.lane % 4
+    return rng.lane % 4
 
 
 @wp.func
-def leg_step(draw: Draw) -> int:
+def leg_step(rng: RngStream) -> int:
     """Return how many legs further a thread samples its next one."""
-    return wp.min(draw.lanes, 4)
+    return wp.min(rng.lanes, 4)
 
 
 @wp.func
-def all_legs(draw: Draw, flag: bool) -> bool:
+def all_legs(rng: RngStream, flag: bool) -> bool:
     """Return whether a flag, which each thread has for its legs, is set for all legs of an attempt."""
-    if draw.lanes > 1:
+    if rng.lanes > 1:
         return all_of_attempt(flag)
     return flag
 
@@ -56,10 +56,10 @@ def vec_from_leg(v: vec3, leg: int) -> vec3:
 
 
 @wp.func
-def meet_attempts(draw: Draw):
+def sync_attempts(rng: RngStream):
     """Wait for the threads of a world; each then sees what the others wrote."""
-    if draw.lanes > 1:
-        meet()
+    if rng.lanes > 1:
+        sync_lanes()
 
 
 @wp.func
@@ -71,35 +71,35 @@ def store_leg(leg: int, sample: LegSample, joint_q: wp.array(dtype=float), joint
 
 @wp.func
 def pose_is_valid(
-    geometry: wp.array(dtype=LegGeometry), ground: Ground, draw: Draw, own: LegSample, reachable: bool,
+    geometry: wp.array(dtype=LegGeometry), ground: Ground, rng: RngStream, own: LegSample, reachable: bool,
     joint_q: wp.array(dtype=float), joint_qd: wp.array(dtype=float),
 ) -> bool:  # fmt: skip
     """Return whether legs are reachable and touch nothing; completes the coordinates by the legs of other threads.
 
     own: the leg that a thread has sampled, if it is one of several; reachable: whether its legs are.
     """
-    all_reachable = all_legs(draw, reachable)
-    if draw.lanes == 1 and not all_reachable:
+    all_reachable = all_legs(rng, reachable)
+    if rng.lanes == 1 and not all_reachable:
         return False  # several threads go on together
-    if draw.lanes > 1:
+    if rng.lanes > 1:
         other = LegSample()
         for leg in range(geometry.shape[0]):
             other.angles = vec_from_leg(own.angles, leg)
             other.rates = vec_from_leg(own.rates, leg)
             store_leg(leg, other, joint_q, joint_qd)
     flags = int(0)
-    for turn in range(first_leg(draw), geometry.shape[0], leg_step(draw)):
-        flags = flags | leg_collisions(geometry, ground, joint_q, 0, turn, APART)
-    return all_legs(draw, all_reachable and flags == 0)
+    for turn in range(first_leg(rng), geometry.shape[0], leg_step(rng)):
+        flags = flags | leg_collisions(geometry, ground, joint_q, 0, turn, MIN_LINK_DISTANCE)
+    return all_legs(rng, all_reachable and flags == 0)
 
 
 @wp.func
 def write_sample_and_check(
-    sample_base: wp.Function, sample_leg: wp.Function, start: Any, robot: RobotArrays, scene: Scene, draw: Draw,
+    sample_base: wp.Function, sample_leg: wp.Function, start: Any, arrays: RobotArrays, scene: Scene, rng: RngStream,
     attempt: int, joint_q: wp.array(dtype=float), joint_qd: wp.array(dtype=float),
 ) -> bool:  # fmt: skip
     """Write the sample of an attempt to coordinates of one world, and return whether it is valid."""
-    base = sample_base(start, robot, draw, attempt)
+    base = sample_base(start, arrays, rng, attempt)
     for j in range(3):
         joint_q[j] = base.pos[j]
         joint_qd[j] = base.com_vel[j]
@@ -108,16 +108,16 @@ def write_sample_and_check(
         joint_q[3 + j] = base.quat[j]
     reachable = bool(True)
     own = LegSample()
-    for leg in range(first_leg(draw), scene.geometry.shape[0], leg_step(draw)):
-        own = sample_leg(start, base, scene.geometry[leg], draw, leg)
+    for leg in range(first_leg(rng), scene.geometry.shape[0], leg_step(rng)):
+        own = sample_leg(start, base, scene.geometry[leg], rng, leg)
         reachable = reachable and own.reachable
         store_leg(leg, own, joint_q, joint_qd)
-    return pose_is_valid(scene.geometry, start.ground, draw, own, reachable, joint_q, joint_qd)
+    return pose_is_valid(scene.geometry, start.ground, rng, own, reachable, joint_q, joint_qd)
 
 
 @wp.func
 def write_first_valid(
-    geometry: wp.array(dtype=LegGeometry), draw: Draw, accepted: int, own_q: wp.array(dtype=float),
+    geometry: wp.array(dtype=LegGeometry), rng: RngStream, accepted: int, own_q: wp.array(dtype=float),
     own_qd: wp.array(dtype=float), joint_q: wp.array(dtype=float), joint_qd: wp.array(dtype=float),
 ) -> bool:  # fmt: skip
     """Write the first valid attempt to the coordinates of all worlds; returns whether there is one.
@@ -125,23 +125,23 @@ def write_first_valid(
     accepted: attempt of this thread that was valid, `ATTEMPTS` if none was.
     """
     first = accepted
-    if draw.lanes > 1:
+    if rng.lanes > 1:
         first = least_of_attempts(accepted)
-    if accepted == first and first < ATTEMPTS and first_leg(draw) == 0:
+    if accepted == first and first < ATTEMPTS and first_leg(rng) == 0:
         for i in range(7):
-            joint_q[draw.world * COORDS + i] = own_q[i]
+            joint_q[rng.world * COORDS + i] = own_q[i]
         for i in range(6):
-            joint_qd[draw.world * DOFS + i] = own_qd[i]
+            joint_qd[rng.world * DOFS + i] = own_qd[i]
         for leg in range(geometry.shape[0]):
-            store_motors(joint_q, leg_coord(draw.world, leg), load_motors(own_q, leg_coord(0, leg)))
-            store_motors(joint_qd, leg_dof(draw.world, leg), load_motors(own_qd, leg_dof(0, leg)))
-    meet_attempts(draw)
+            store_motors(joint_q, leg_coord(rng.world, leg), load_motors(own_q, leg_coord(0, leg)))
+            store_motors(joint_qd, leg_dof(rng.world, leg), load_motors(own_qd, leg_dof(0, leg)))
+    sync_attempts(rng)
     return first < ATTEMPTS
 
 
 @wp.func
 def sample_valid_state(
-    sample_base: wp.Function, sample_leg: wp.Function, start: Any, robot: RobotArrays, scene: Scene, draw: Draw
+    sample_base: wp.Function, sample_leg: wp.Function, start: Any, arrays: RobotArrays, scene: Scene, rng: RngStream
 ) -> bool:
     """Sample states of a world until one is valid, and write it; returns whether one of the attempts was.
 
@@ -152,9 +152,9 @@ def sample_valid_state(
     own_q = wp.zeros(shape=(COORDS,), dtype=float)
     own_qd = wp.zeros(shape=(DOFS,), dtype=float)
     accepted = int(ATTEMPTS)
-    for attempt in range(draw.lane // 4, ATTEMPTS, wp.max(draw.lanes // 4, 1)):
+    for attempt in range(rng.lane // 4, ATTEMPTS, wp.max(rng.lanes // 4, 1)):
         if accepted == ATTEMPTS:
-            fresh = branch(draw, attempt)
-            if write_sample_and_check(sample_base, sample_leg, start, robot, scene, fresh, attempt, own_q, own_qd):
+            fresh = fold_in(rng, attempt)
+            if write_sample_and_check(sample_base, sample_leg, start, arrays, scene, fresh, attempt, own_q, own_qd):
                 accepted = attempt
-    return write_first_valid(scene.geometry, draw, accepted, own_q, own_qd, robot.joint_q, robot.joint_qd)
+    return write_first_valid(scene.geometry, rng, accepted, own_q, own_qd, arrays.joint_q, arrays.joint_qd)

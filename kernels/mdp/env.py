@@ -23,31 +23,33 @@ class Scene:
 
 
 @wp.struct
-class Nothing:
+class NoSettings:
     """Stands for the settings of a reset, or a level, that has none."""
 
     unused: float
 
 
 @wp.struct
-class EnvArrays:
+class EpisodeArrays:
     """Bookkeeping of all worlds, arrays of shape (num_worlds,)."""
 
     seed: int
     first: int  # world of the first thread of a launch
-    clock: wp.array(dtype=int)  # policy steps made; with the seed, all state of the random numbers
+    step_count: wp.array(dtype=int)  # policy steps made; with the seed, all state of the random numbers
     skill: wp.array(dtype=int)  # index of the task that a world is in
-    request: wp.array(dtype=int)  # skill that is asked for, -1: none
-    wanted: wp.array(dtype=wp.vec4)  # command that the skill is given when it takes over
-    told: wp.array(dtype=int)  # 1: there is one
-    fresh: wp.array(dtype=int)  # BEGUN: an episode or a skill, observations have no past; COMMANDED: within an episode
+    requested_task: wp.array(dtype=int)  # skill that is asked for, -1: none
+    pending_command: wp.array(dtype=wp.vec4)  # command that the skill is given when it takes over
+    has_command: wp.array(dtype=int)  # 1: there is one
+    history_reset: wp.array(
+        dtype=int
+    )  # BEGUN: an episode or a skill, observations have no past; COMMANDED: within an episode
     reward: wp.array(dtype=float)
     done: wp.array(dtype=float)  # 1: the episode ended
     timeout: wp.array(dtype=float)  # 1: it ended without failure
     terminated: wp.array(dtype=wp.bool)  # it ended with failure
     truncated: wp.array(dtype=wp.bool)  # it ended without
-    ending: wp.array(dtype=int)  # index of the termination, -1: none
-    broken: wp.array(dtype=int)  # 1: the state is not one of a robot; observations are 0
+    termination: wp.array(dtype=int)  # index of the termination, -1: none
+    diverged: wp.array(dtype=int)  # 1: the state is not one of a robot; observations are 0
     bad_action: wp.array(dtype=int)  # 1: the action was not finite; the world is broken at the end of the step
     level: wp.array(dtype=int)  # curriculum; the number of levels means that all were passed
     streak: wp.array(dtype=int)  # successes in a row
@@ -58,9 +60,9 @@ class Counters:
     """Results that grow until the host clears them."""
 
     term_sum: wp.array2d(dtype=wp.float64)  # (rewards, num_worlds)
-    ending_count: wp.array2d(dtype=int)  # (terminations, num_worlds)
-    counted: wp.array(dtype=int)  # (num_worlds,) ended episodes that count for the curriculum
-    succeeded: wp.array(dtype=int)  # of these, successful
+    termination_count: wp.array2d(dtype=int)  # (terminations, num_worlds)
+    curriculum_episodes: wp.array(dtype=int)  # (num_worlds,) ended episodes that count for the curriculum
+    curriculum_successes: wp.array(dtype=int)  # of these, successful
     error_sum: wp.array(dtype=wp.float64)  # of the successful ones
     bad_actions: wp.array(dtype=int)  # actions that were not finite
 
@@ -82,9 +84,9 @@ class SkillSettings:
 class Delays:
     """Latency: what was commanded lately, and which of it the motors follow."""
 
-    past_target: wp.array3d(dtype=float)  # [rad] (RING, 12, num_worlds) filtered targets, a ring over policy steps
+    target_history: wp.array3d(dtype=float)  # [rad] (RING, 12, num_worlds) filtered targets, a ring over policy steps
     steps: wp.array(dtype=int)  # [physics steps] (num_worlds,) from action to motor
     substeps: int  # physics steps in a policy step
-    late_steps: wp.array(dtype=int)  # [physics steps] (num_worlds,) what is left of the latency in a policy step
-    late_target: wp.array2d(dtype=float)  # [rad] (12, num_worlds) what the motors follow after `late_steps`
-    earlier_target: wp.array2d(dtype=float)  # [rad] (12, num_worlds) what they follow before
+    switch_step: wp.array(dtype=int)  # [physics steps] (num_worlds,) what is left of the latency in a policy step
+    current_target: wp.array2d(dtype=float)  # [rad] (12, num_worlds) what the motors follow after `late_steps`
+    prev_target: wp.array2d(dtype=float)  # [rad] (12, num_worlds) what they follow before

@@ -2,10 +2,10 @@
 
 import warp as wp
 
-from .env import EnvArrays
+from .env import EpisodeArrays
 from .options import FAST
 from .parameters import RobotParameters
-from .random import EVENT, INTERVAL, Draw, between, make_draw
+from .random import EVENT, INTERVAL, RngStream, make_stream, uniform
 
 STARTUP, AT_RESET, AT_STEP = 0, 1, 2
 LANES = 8
@@ -14,9 +14,9 @@ MODES = {"startup": STARTUP, "reset": AT_RESET, "interval": AT_STEP}
 
 
 @wp.func
-def steps_until(draw: Draw, least: float, most: float, step_dt: float) -> int:
+def steps_until(rng: RngStream, least: float, most: float, step_dt: float) -> int:
     """Return a drawn number of policy steps between two times [s], at least one."""
-    return wp.max(int(wp.round(between(draw, INTERVAL, least, most) / step_dt)), 1)
+    return wp.max(int(wp.round(uniform(rng, INTERVAL, least, most) / step_dt)), 1)
 
 
 def make_event_kernel(slots: list) -> wp.Kernel:
@@ -32,7 +32,7 @@ def make_event_kernel(slots: list) -> wp.Kernel:
         lanes: int,
         mask: wp.array(dtype=float),
         step_dt: float,
-        env: EnvArrays,
+        episode: EpisodeArrays,
         p: wp.array(dtype=float),
         # in, out
         timer: wp.array2d(dtype=int),
@@ -47,27 +47,29 @@ def make_event_kernel(slots: list) -> wp.Kernel:
         """
         row, lane, world = wp.tid()
         row += first
-        world += env.first
-        if env.skill[world] != skill or mask[world] == 0.0:
+        world += episode.first
+        if episode.skill[world] != skill or mask[world] == 0.0:
             return
         for i in range(wp.static(len(slots))):
             if row == i and (wp.static(bool(slots[i].spread)) or lane == 0):
-                draw = make_draw(env.seed, world, env.clock[world], EVENT + 100 * stage + i)
+                rng = make_stream(episode.seed, world, episode.step_count[world], EVENT + 100 * stage + i)
                 if wp.static(bool(slots[i].spread)):
-                    draw.lane = lane
-                    draw.lanes = lanes
+                    rng.lane = lane
+                    rng.lanes = lanes
                 due = stage == wp.static(modes[i])
                 if wp.static(modes[i] == AT_STEP):
                     left = timer[i, world] - 1
                     due = stage == wp.static(AT_RESET) or (stage == wp.static(AT_STEP) and left == 0)
                     if due or left < 0:
-                        left = steps_until(draw, p[wp.static(slots[i].least)], p[wp.static(slots[i].most)], step_dt)
+                        left = steps_until(rng, p[wp.static(slots[i].least)], p[wp.static(slots[i].most)], step_dt)
                     if stage != wp.static(STARTUP):
                         timer[i, world] = left
                 if due:
-                    if wp.static(slots[i].plain):
-                        wp.static(slots[i].func)(robot, draw)
+                    if wp.static(slots[i].parameterless):
+                        wp.static(slots[i].func)(robot, rng)
                     else:
-                        wp.static(slots[i].func)(robot, draw, *p[wp.static(slots[i].lo) : wp.static(slots[i].hi)])
+                        wp.static(slots[i].func)(
+                            robot, rng, *p[wp.static(slots[i].params_start) : wp.static(slots[i].params_stop)]
+                        )
 
     return event_kernel

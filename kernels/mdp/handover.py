@@ -4,7 +4,7 @@ from typing import Any
 
 import warp as wp
 
-from .env import BEGUN, EnvArrays, Scene, SkillSettings
+from .env import BEGUN, EpisodeArrays, Scene, SkillSettings
 from .parameters import RobotParameters, set_motor
 from .view import RobotArrays, load_view, yaw_of
 
@@ -15,39 +15,39 @@ NONE = wp.constant(-1)
 
 @wp.func
 def hand_over(
-    robot: RobotArrays, parameters: RobotParameters, env: EnvArrays, skills: wp.array(dtype=SkillSettings),
+    arrays: RobotArrays, parameters: RobotParameters, episode: EpisodeArrays, skills: wp.array(dtype=SkillSettings),
     world: int, target: int,
 ):  # fmt: skip
     """Make another skill the active one: its motors from now on, and as last action the one that holds the targets."""
-    env.skill[world] = target
-    env.request[world] = NONE
-    env.told[world] = 0
-    env.fresh[world] = BEGUN
+    episode.skill[world] = target
+    episode.requested_task[world] = NONE
+    episode.has_command[world] = 0
+    episode.history_reset[world] = BEGUN
     for m in range(12):
-        off = robot.safe_target[m, world] - robot.default_angle[m]
+        off = arrays.filtered_target[m, world] - arrays.default_angle[m]
         action = wp.clamp(off / skills[target].action_scale[m], -1.0, 1.0)
-        robot.action[m, world] = action
-        robot.old_action[m, world] = action
-        robot.older_action[m, world] = action
+        arrays.action[m, world] = action
+        arrays.prev_action[m, world] = action
+        arrays.prev_prev_action[m, world] = action
         set_motor(parameters, world, m)
 
 
 @wp.kernel
-def home_kernel(
+def restore_task_kernel(
     # in
     mask: wp.array(dtype=float),
     home: wp.array(dtype=int),
     # in, out
     parameters: RobotParameters,
-    env: EnvArrays,
+    episode: EpisodeArrays,
 ):
     """Put worlds into their first skill where mask is not 0, with its motors, and asked for none; one thread each."""
-    world = env.first + wp.tid()
+    world = episode.first + wp.tid()
     if mask[world] == 0.0:
         return
-    env.skill[world] = home[world]
-    env.request[world] = NONE
-    env.told[world] = 0
+    episode.skill[world] = home[world]
+    episode.requested_task[world] = NONE
+    episode.has_command[world] = 0
     for m in range(12):
         set_motor(parameters, world, m)
 
@@ -65,9 +65,9 @@ def make_handover_kernel(handover: Any) -> wp.Kernel:
         skills: wp.array(dtype=SkillSettings),
         moved: wp.array(dtype=int),
         # in, out
-        robot: RobotArrays,
+        arrays: RobotArrays,
         parameters: RobotParameters,
-        env: EnvArrays,
+        episode: EpisodeArrays,
         sources: wp.array(dtype=handover.source.state),
         targets: wp.array(dtype=handover.target.state),
     ):
@@ -75,17 +75,19 @@ def make_handover_kernel(handover: Any) -> wp.Kernel:
 
         moved: 1 where that happened in this step; one thread per world.
         """
-        world = env.first + wp.tid()
-        if env.skill[world] != source or env.done[world] != 0.0 or moved[world] != 0:
+        world = episode.first + wp.tid()
+        if episode.skill[world] != source or episode.done[world] != 0.0 or moved[world] != 0:
             return
-        view = load_view(robot, scene.ground, world)
-        if wp.static(when)(view, sources[world], env.request[world] == target):
-            begun = wp.static(begin)(view, sources[world])
-            if env.request[world] == target and env.told[world] != 0:
-                targets[world] = wp.static(give)(view, scene, begun, env.wanted[world], yaw_of(view.quat))
+        robot = load_view(arrays, scene.ground, world)
+        if wp.static(when)(robot, sources[world], episode.requested_task[world] == target):
+            begun = wp.static(begin)(robot, sources[world])
+            if episode.requested_task[world] == target and episode.has_command[world] != 0:
+                targets[world] = wp.static(give)(
+                    robot, scene, begun, episode.pending_command[world], yaw_of(robot.quat)
+                )
             else:
                 targets[world] = begun
-            hand_over(robot, parameters, env, skills, world, target)
+            hand_over(arrays, parameters, episode, skills, world, target)
             moved[world] = 1
 
     return handover_kernel

@@ -11,66 +11,66 @@ vec6 = wp.types.vector(length=6, dtype=wp.float32)
 
 
 @wp.func
-def lin_vel(view: RobotView, task: Any) -> wp.vec3:
+def lin_vel(robot: RobotView, state: Any) -> wp.vec3:
     """Velocity of the base [m/s], body axes."""
-    return wp.quat_rotate_inv(view.quat, view.lin_vel)
+    return wp.quat_rotate_inv(robot.quat, robot.lin_vel)
 
 
 @wp.func
-def ang_vel(view: RobotView, task: Any) -> wp.vec3:
+def ang_vel(robot: RobotView, state: Any) -> wp.vec3:
     """Angular velocity of the base [rad/s], body axes."""
-    return view.ang_vel
+    return robot.ang_vel
 
 
 @wp.func
-def gravity(view: RobotView, task: Any) -> wp.vec3:
+def gravity(robot: RobotView, state: Any) -> wp.vec3:
     """Direction of gravity, body axes [1]."""
-    return view.gravity
+    return robot.projected_gravity
 
 
 @wp.func
-def height(view: RobotView, task: Any) -> float:
+def height(robot: RobotView, state: Any) -> float:
     """Height of the base above the ground below it [m]."""
-    return view.height
+    return robot.height
 
 
 @wp.func
-def angle(view: RobotView, task: Any) -> vec12:
+def angle(robot: RobotView, state: Any) -> vec12:
     """Motor angles as the sensors read them, relative to the default pose [rad]."""
-    return view.sensed_angle - view.default_angle
+    return robot.sensed_angle - robot.default_angle
 
 
 @wp.func
-def rate(view: RobotView, task: Any) -> vec12:
+def rate(robot: RobotView, state: Any) -> vec12:
     """Motor rates [rad/s]."""
-    return view.rate
+    return robot.rate
 
 
 @wp.func
-def last_action(view: RobotView, task: Any) -> vec12:
+def last_action(robot: RobotView, state: Any) -> vec12:
     """The action before [1]."""
-    return view.action
+    return robot.action
 
 
 @wp.func
-def paw_forces(view: RobotView, task: Any) -> wp.vec4:
+def paw_forces(robot: RobotView, state: Any) -> wp.vec4:
     """Forces on the paws over the robot's weight, at most 5 [1]."""
     force = wp.vec4(0.0)
     for k in range(4):
-        force[k] = wp.min(view.paw_force[k] / 140.0, 5.0)
+        force[k] = wp.min(robot.paw_force[k] / 140.0, 5.0)
     return force
 
 
 @wp.func
-def air_times(view: RobotView, task: Any) -> wp.vec4:
+def air_times(robot: RobotView, state: Any) -> wp.vec4:
     """Time that each paw has been in the air [s]."""
-    return view.air_time
+    return robot.air_time
 
 
 @wp.func
-def contacts(view: RobotView, task: Any) -> wp.vec4:
+def contacts(robot: RobotView, state: Any) -> wp.vec4:
     """Which paws are on the ground [1]."""
-    return view.contact
+    return robot.contact
 
 
 # ---------------------------------------------------------------- drawn parameters, of order 1, 0 if nominal

@@ -5,10 +5,10 @@ from typing import Any
 import warp as wp
 
 from ..terrain.ground import Ground
-from .env import BEGUN, COMMANDED, RING, EnvArrays
+from .env import BEGUN, COMMANDED, RING, EpisodeArrays
 from .options import FAST
 from .parameters import RobotParameters
-from .random import OBSERVATION, cut_gaussian, draw_at, moment_of
+from .random import OBSERVATION, clamped_normal, step_key, stream_at
 from .view import RobotArrays, load_view
 
 wp.set_module_options(FAST)
@@ -20,7 +20,7 @@ LANES = wp.constant(32)
 
 
 @wp.struct
-class Column:
+class ObservationColumn:
     """Where a component of an observation term comes from and stands in the rows of its group."""
 
     raw: int  # its row among the raw values
@@ -50,9 +50,9 @@ class ObservationArrays:
 
 
 @wp.func
-def load_column(columns: wp.array2d(dtype=int), component: int) -> Column:
+def load_column(columns: wp.array2d(dtype=int), component: int) -> ObservationColumn:
     """Return a component's row; columns: (fields of `Column`, components), so that neighbours read neighbours."""
-    column = Column()
+    column = ObservationColumn()
     column.raw = columns[0, component]
     column.group = columns[1, component]
     column.start = columns[2, component]
@@ -93,13 +93,13 @@ def make_observe_kernel(task: Any) -> wp.Kernel:
     def observe_kernel(
         # in
         skill: int,
-        robot: RobotArrays,
+        arrays: RobotArrays,
         parameters: RobotParameters,
         ground: Ground,
-        env: EnvArrays,
+        episode: EpisodeArrays,
         states: wp.array(dtype=task.state),
         p: wp.array(dtype=float),
-        beginning: int,
+        after_reset: int,
         # out
         raw: wp.array2d(dtype=float),
     ):
@@ -108,23 +108,25 @@ def make_observe_kernel(task: Any) -> wp.Kernel:
         beginning 1: only where an episode or the skill has just begun, or another command came.
         """
         chunk, world = wp.tid()
-        world += env.first
-        if env.skill[world] != skill or (beginning != 0 and env.fresh[world] == 0):
+        world += episode.first
+        if episode.skill[world] != skill or (after_reset != 0 and episode.history_reset[world] == 0):
             return
         for c in range(wp.static((len(slots) + CHUNK - 1) // CHUNK)):
             if chunk == c:
-                view = load_view(robot, ground, world)
+                robot = load_view(arrays, ground, world)
                 for i in range(wp.static(c * CHUNK), wp.static(min((c + 1) * CHUNK, len(slots)))):
                     if wp.static(of_parameters[i]):
                         store(wp.static(slots[i].func)(parameters, world), wp.static(places[i]), world, raw)
                     elif wp.static(of_ground[i]):
-                        store(wp.static(slots[i].func)(robot, ground, world), wp.static(places[i]), world, raw)
-                    elif wp.static(slots[i].plain):
-                        store(wp.static(slots[i].func)(view, states[world]), wp.static(places[i]), world, raw)
+                        store(wp.static(slots[i].func)(arrays, ground, world), wp.static(places[i]), world, raw)
+                    elif wp.static(slots[i].parameterless):
+                        store(wp.static(slots[i].func)(robot, states[world]), wp.static(places[i]), world, raw)
                     else:
                         store(
                             wp.static(slots[i].func)(
-                                view, states[world], *p[wp.static(slots[i].lo) : wp.static(slots[i].hi)]
+                                robot,
+                                states[world],
+                                *p[wp.static(slots[i].params_start) : wp.static(slots[i].params_stop)],
                             ),
                             wp.static(places[i]),
                             world,
@@ -135,21 +137,21 @@ def make_observe_kernel(task: Any) -> wp.Kernel:
 
 
 @wp.func
-def or_zero(value: float, broken: bool) -> float:
+def finite_or_zero(value: float, diverged: bool) -> float:
     """Return 0 instead of the value of a world that came apart, or of one that is not finite."""
-    if broken or not wp.isfinite(value):
+    if diverged or not wp.isfinite(value):
         return 0.0
     return value
 
 
 @wp.struct
-class Moment:
+class StepContext:
     """What all components of a world have in common in a step."""
 
     world: int
-    draws: wp.uint32  # see `moment_of`
-    fresh: int  # as in `EnvArrays`
-    broken: bool
+    draws: wp.uint32  # see `step_key`
+    fresh: int  # as in `EpisodeArrays`
+    diverged: bool
     now: int  # place in the rings of past values
     newer: int  # place of the value that a sensor's latency has passed
     older: int  # place of the one before
@@ -157,24 +159,24 @@ class Moment:
 
 
 @wp.func
-def moment(env: EnvArrays, arrays: ObservationArrays, world: int) -> Moment:
+def step_context(episode: EpisodeArrays, arrays: ObservationArrays, world: int) -> StepContext:
     """Return what a world's components have in common."""
-    clock = env.clock[world]
+    step_count = episode.step_count[world]
     whole = arrays.latency[world] // arrays.substeps
-    m = Moment()
+    m = StepContext()
     m.world = world
-    m.draws = moment_of(env.seed, world, clock)
-    m.fresh = env.fresh[world]
-    m.broken = env.broken[world] != 0
-    m.now = clock % RING
-    m.newer = (clock - whole) % RING
-    m.older = (clock - whole - 1) % RING
+    m.draws = step_key(episode.seed, world, step_count)
+    m.fresh = episode.history_reset[world]
+    m.diverged = episode.diverged[world] != 0
+    m.now = step_count % RING
+    m.newer = (step_count - whole) % RING
+    m.older = (step_count - whole - 1) % RING
     m.share = float(arrays.latency[world] - whole * arrays.substeps) / float(arrays.substeps)
     return m
 
 
 @wp.func
-def late(arrays: ObservationArrays, m: Moment, column: int, value: float) -> float:
+def delay_value(arrays: ObservationArrays, m: StepContext, column: int, value: float) -> float:
     """Return what a sensor gave as long ago as its latency says, between policy steps a straight line."""
     if m.fresh == BEGUN:
         for i in range(RING):
@@ -187,38 +189,40 @@ def late(arrays: ObservationArrays, m: Moment, column: int, value: float) -> flo
 
 
 @wp.func
-def condition(arrays: ObservationArrays, column: Column, p: wp.array(dtype=float), m: Moment, beginning: int):
+def postprocess(
+    arrays: ObservationArrays, column: ObservationColumn, p: wp.array(dtype=float), m: StepContext, after_reset: int
+):
     """Turn a component's raw value into an observation, behind the frames before."""
-    value = or_zero(arrays.raw[column.raw, m.world], m.broken)
+    value = finite_or_zero(arrays.raw[column.raw, m.world], m.diverged)
     if column.delayed != 0:
-        value = late(arrays, m, column.past, value)
+        value = delay_value(arrays, m, column.past, value)
     noise = p[column.noise]
     if noise > 0.0:
-        value += noise * cut_gaussian(draw_at(m.draws, m.world, OBSERVATION + column.group), column.oldest)
-    value = or_zero(p[column.scale] * wp.clamp(value, -p[column.clip], p[column.clip]), m.broken)
+        value += noise * clamped_normal(stream_at(m.draws, m.world, OBSERVATION + column.group), column.oldest)
+    value = finite_or_zero(p[column.scale] * wp.clamp(value, -p[column.clip], p[column.clip]), m.diverged)
     i = column.start + m.world * column.stride + column.oldest
-    again = beginning != 0 and m.fresh == COMMANDED
+    again = after_reset != 0 and m.fresh == COMMANDED
     for _ in range(column.history - 1):
         frame = arrays.now[i + wp.where(again, 0, column.width)]
-        if m.broken or m.fresh == BEGUN:
+        if m.diverged or m.fresh == BEGUN:
             frame = value
         arrays.now[i] = frame
-        if beginning == 0:
+        if after_reset == 0:
             arrays.final[i] = frame
         i += column.width
     arrays.now[i] = value
-    if beginning == 0:
+    if after_reset == 0:
         arrays.final[i] = value
 
 
 @wp.kernel
-def condition_kernel(
+def postprocess_obs_kernel(
     # in
     skill: int,
-    env: EnvArrays,
+    episode: EpisodeArrays,
     columns: wp.array2d(dtype=int),
     p: wp.array(dtype=float),
-    beginning: int,
+    after_reset: int,
     # in, out
     arrays: ObservationArrays,
 ):
@@ -229,9 +233,9 @@ def condition_kernel(
     stay, and so does `final`.
     """
     world, lane = wp.tid()
-    world += env.first
-    if env.skill[world] != skill or (beginning != 0 and env.fresh[world] == 0):
+    world += episode.first
+    if episode.skill[world] != skill or (after_reset != 0 and episode.history_reset[world] == 0):
         return
-    m = moment(env, arrays, world)
+    m = step_context(episode, arrays, world)
     for component in range(lane, columns.shape[1], LANES):
-        condition(arrays, load_column(columns, component), p, m, beginning)
+        postprocess(arrays, load_column(columns, component), p, m, after_reset)

@@ -9,7 +9,7 @@ import warp as wp
 
 from ..actuation.motors import MotorArrays
 from ..layout import BODIES, DOFS, motor_slot
-from .random import Draw, between
+from .random import RngStream, uniform
 
 wp.set_module_options({"enable_backward": False, "max_unroll": 1})  # long loops in short code
 
@@ -63,38 +63,38 @@ def write_mass(robot: RobotParameters, world: int, body: int, scale: float):
 
 
 @wp.func
-def base_mass(robot: RobotParameters, draw: Draw, lower: float, upper: float):
+def base_mass(robot: RobotParameters, rng: RngStream, lower: float, upper: float):
     """Add a mass [kg] to the base, its inertia in proportion."""
-    write_mass(robot, draw.world, 0, 1.0 + between(draw, 0, lower, upper) / robot.nominal_mass[0])
+    write_mass(robot, rng.world, 0, 1.0 + uniform(rng, 0, lower, upper) / robot.nominal_mass[0])
 
 
 @wp.func
-def link_mass(robot: RobotParameters, draw: Draw, lower: float, upper: float):
+def link_mass(robot: RobotParameters, rng: RngStream, lower: float, upper: float):
     """Scale mass and inertia of each link of the legs."""
-    for body in range(1 + draw.lane, BODIES, draw.lanes):
-        write_mass(robot, draw.world, body, between(draw, body, lower, upper))
+    for body in range(1 + rng.lane, BODIES, rng.lanes):
+        write_mass(robot, rng.world, body, uniform(rng, body, lower, upper))
 
 
 @wp.func
-def com_shift(robot: RobotParameters, draw: Draw, lower: float, upper: float):
+def com_shift(robot: RobotParameters, rng: RngStream, lower: float, upper: float):
     """Shift the base's centre of mass [m] along each axis."""
-    shift = wp.vec3(between(draw, 0, lower, upper), between(draw, 1, lower, upper), between(draw, 2, lower, upper))
-    robot.body_com[draw.world * BODIES] = robot.nominal_com[0] + shift
+    shift = wp.vec3(uniform(rng, 0, lower, upper), uniform(rng, 1, lower, upper), uniform(rng, 2, lower, upper))
+    robot.body_com[rng.world * BODIES] = robot.nominal_com[0] + shift
 
 
 @wp.func
-def armature(robot: RobotParameters, draw: Draw, lower: float, upper: float):
+def armature(robot: RobotParameters, rng: RngStream, lower: float, upper: float):
     """Scale each motor's armature."""
-    for m in range(draw.lane, 12, draw.lanes):
+    for m in range(rng.lane, 12, rng.lanes):
         dof = 6 + motor_slot(m)
-        robot.joint_armature[draw.world * DOFS + dof] = robot.nominal_armature[dof] * between(draw, m, lower, upper)
+        robot.joint_armature[rng.world * DOFS + dof] = robot.nominal_armature[dof] * uniform(rng, m, lower, upper)
 
 
 @wp.func
-def motor_friction(robot: RobotParameters, draw: Draw, lower: float, upper: float):
+def motor_friction(robot: RobotParameters, rng: RngStream, lower: float, upper: float):
     """Give each motor a Coulomb friction [N m]."""
-    for m in range(draw.lane, 12, draw.lanes):
-        robot.joint_friction[draw.world * DOFS + 6 + motor_slot(m)] = between(draw, m, lower, upper)
+    for m in range(rng.lane, 12, rng.lanes):
+        robot.joint_friction[rng.world * DOFS + 6 + motor_slot(m)] = uniform(rng, m, lower, upper)
 
 
 @wp.func
@@ -143,48 +143,46 @@ def motors_kernel(
 
 @wp.func
 def gains(
-    robot: RobotParameters, draw: Draw, kp_lower: float, kp_upper: float, kd_lower: float, kd_upper: float
+    robot: RobotParameters, rng: RngStream, kp_lower: float, kp_upper: float, kd_lower: float, kd_upper: float
 ):  # fmt: skip
     """Scale kp and kd of each motor."""
-    for m in range(draw.lane, 12, draw.lanes):
-        ratio = wp.vec2(between(draw, m, kp_lower, kp_upper), between(draw, 12 + m, kd_lower, kd_upper))
-        robot.gain_ratio[m, draw.world] = ratio
-        set_gains(robot, draw.world, m, ratio)
+    for m in range(rng.lane, 12, rng.lanes):
+        ratio = wp.vec2(uniform(rng, m, kp_lower, kp_upper), uniform(rng, 12 + m, kd_lower, kd_upper))
+        robot.gain_ratio[m, rng.world] = ratio
+        set_gains(robot, rng.world, m, ratio)
 
 
 @wp.func
 def speed_limits(
-    robot: RobotParameters, draw: Draw, no_load_lower: float, no_load_upper: float, cutoff_lower: float,
+    robot: RobotParameters, rng: RngStream, no_load_lower: float, no_load_upper: float, cutoff_lower: float,
     cutoff_upper: float,
 ):  # fmt: skip
     """Scale no-load and cutoff speed of each motor; the cutoff stays below the no-load speed."""
-    for m in range(draw.lane, 12, draw.lanes):
-        ratio = wp.vec2(
-            between(draw, m, no_load_lower, no_load_upper), between(draw, 12 + m, cutoff_lower, cutoff_upper)
-        )
-        robot.speed_ratio[m, draw.world] = ratio
-        set_speed_limits(robot, draw.world, m, ratio)
+    for m in range(rng.lane, 12, rng.lanes):
+        ratio = wp.vec2(uniform(rng, m, no_load_lower, no_load_upper), uniform(rng, 12 + m, cutoff_lower, cutoff_upper))
+        robot.speed_ratio[m, rng.world] = ratio
+        set_speed_limits(robot, rng.world, m, ratio)
 
 
 @wp.func
-def joint_offset(robot: RobotParameters, draw: Draw, lower: float, upper: float):
+def joint_offset(robot: RobotParameters, rng: RngStream, lower: float, upper: float):
     """Give each motor's position sensor a constant error [rad] besides its nominal one."""
-    for m in range(draw.lane, 12, draw.lanes):
-        robot.motors.offset[m, draw.world] = robot.nominal_offset[m] + between(draw, m, lower, upper)
+    for m in range(rng.lane, 12, rng.lanes):
+        robot.motors.offset[m, rng.world] = robot.nominal_offset[m] + uniform(rng, m, lower, upper)
 
 
 @wp.func
 def friction(
-    robot: RobotParameters, draw: Draw, dynamic_lower: float, dynamic_upper: float, static_lower: float,
+    robot: RobotParameters, rng: RngStream, dynamic_lower: float, dynamic_upper: float, static_lower: float,
     static_upper: float,
 ):  # fmt: skip
     """Draw the paws' dynamic coefficient, and a static one that is not below it."""
-    dynamic = between(draw, 0, dynamic_lower, dynamic_upper)
-    static = wp.max(between(draw, 1, static_lower, static_upper), dynamic)
+    dynamic = uniform(rng, 0, dynamic_lower, dynamic_upper)
+    static = wp.max(uniform(rng, 1, static_lower, static_upper), dynamic)
     for k in range(4):
-        robot.shape_mu[robot.paw_shapes[4 * draw.world + k]] = dynamic
+        robot.shape_mu[robot.paw_shapes[4 * rng.world + k]] = dynamic
     # without dynamic friction there is no static one either
-    robot.static_ratio[draw.world] = wp.where(dynamic > 0.0, static / wp.max(dynamic, 1.0e-9), 1.0)
+    robot.static_ratio[rng.world] = wp.where(dynamic > 0.0, static / wp.max(dynamic, 1.0e-9), 1.0)
 
 
 @wp.func
@@ -194,34 +192,34 @@ def physics_steps(robot: RobotParameters, seconds: float) -> int:
 
 
 @wp.func
-def drawn_delay(robot: RobotParameters, draw: Draw, lower: float, upper: float, none: float) -> int:
+def drawn_delay(robot: RobotParameters, rng: RngStream, lower: float, upper: float, none: float) -> int:
     """Return a drawn delay [physics steps], none in a share of draws."""
-    if between(draw, 1, 0.0, 1.0) < none:
+    if uniform(rng, 1, 0.0, 1.0) < none:
         return 0
-    return physics_steps(robot, between(draw, 0, lower, upper))
+    return physics_steps(robot, uniform(rng, 0, lower, upper))
 
 
 @wp.func
-def action_latency(robot: RobotParameters, draw: Draw, lower: float, upper: float, none: float = 0.0):
+def action_latency(robot: RobotParameters, rng: RngStream, lower: float, upper: float, none: float = 0.0):
     """Delay actions [s], but not in a share of worlds."""
-    robot.latency[draw.world] = drawn_delay(robot, draw, lower, upper, none)
+    robot.latency[rng.world] = drawn_delay(robot, rng, lower, upper, none)
 
 
 @wp.func
-def observation_latency(robot: RobotParameters, draw: Draw, lower: float, upper: float, none: float = 0.0):
+def observation_latency(robot: RobotParameters, rng: RngStream, lower: float, upper: float, none: float = 0.0):
     """Delay what the policy reads of its sensors [s], but not in a share of worlds."""
-    robot.observation_latency[draw.world] = drawn_delay(robot, draw, lower, upper, none)
+    robot.observation_latency[rng.world] = drawn_delay(robot, rng, lower, upper, none)
 
 
 @wp.func
 def push(
-    robot: RobotParameters, draw: Draw, share: float, force_lower: float, force_upper: float, torque_lower: float,
+    robot: RobotParameters, rng: RngStream, share: float, force_lower: float, force_upper: float, torque_lower: float,
     torque_upper: float,
 ):  # fmt: skip
     """Push the base with a force [N] along and a torque [N m] about each world axis in a share of draws, else not."""
     wrench = wp.spatial_vector()
-    if between(draw, 6, 0.0, 1.0) < share:
+    if uniform(rng, 6, 0.0, 1.0) < share:
         for i in range(3):
-            wrench[i] = between(draw, i, force_lower, force_upper)
-            wrench[3 + i] = between(draw, 3 + i, torque_lower, torque_upper)
-    robot.push[draw.world] = wrench
+            wrench[i] = uniform(rng, i, force_lower, force_upper)
+            wrench[3 + i] = uniform(rng, 3 + i, torque_lower, torque_upper)
+    robot.push[rng.world] = wrench

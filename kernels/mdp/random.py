@@ -14,7 +14,7 @@ ANY_LEVEL = wp.constant(-2)  # of the curriculum, of a world past the last
 
 
 @wp.struct
-class Draw:
+class RngStream:
     """Independent random numbers of one world."""
 
     world: int
@@ -24,48 +24,48 @@ class Draw:
 
 
 @wp.func
-def moment_of(seed: int, world: int, clock: int) -> wp.uint32:
+def step_key(seed: int, world: int, step_count: int) -> wp.uint32:
     """Return what the numbers of all streams at one moment begin with; clock: policy steps that the world has made."""
-    return wp.rand_init(int(wp.rand_init(seed, world)), clock)
+    return wp.rand_init(int(wp.rand_init(seed, world)), step_count)
 
 
 @wp.func
-def draw_at(moment: wp.uint32, world: int, stream: int) -> Draw:
+def stream_at(moment: wp.uint32, world: int, stream: int) -> RngStream:
     """Return the numbers of a stream at a moment."""
-    draw = Draw()
-    draw.world = world
-    draw.lanes = 1
-    draw.seed = wp.rand_init(int(moment), stream)
-    return draw
+    rng = RngStream()
+    rng.world = world
+    rng.lanes = 1
+    rng.seed = wp.rand_init(int(moment), stream)
+    return rng
 
 
 @wp.func
-def make_draw(seed: int, world: int, clock: int, stream: int) -> Draw:
+def make_stream(seed: int, world: int, step_count: int, stream: int) -> RngStream:
     """Return the numbers of a stream; clock: policy steps that the world has made."""
-    return draw_at(moment_of(seed, world, clock), world, stream)
+    return stream_at(step_key(seed, world, step_count), world, stream)
 
 
 @wp.func
-def branch(draw: Draw, i: int) -> Draw:
+def fold_in(rng: RngStream, i: int) -> RngStream:
     """Return other numbers, independent for every i."""
-    other = draw
-    other.seed = wp.rand_init(int(draw.seed), 7919 + i)
+    other = rng
+    other.seed = wp.rand_init(int(rng.seed), 7919 + i)
     return other
 
 
 @wp.func
-def between(draw: Draw, i: int, lower: float, upper: float) -> float:
+def uniform(rng: RngStream, i: int, lower: float, upper: float) -> float:
     """Return the i-th number, uniform in [lower, upper)."""
-    return lower + (upper - lower) * wp.randf(wp.rand_init(int(draw.seed), i))
+    return lower + (upper - lower) * wp.randf(wp.rand_init(int(rng.seed), i))
 
 
 @wp.func
-def within(draw: Draw, i: int, pair: wp.vec2) -> float:
+def uniform_range(rng: RngStream, i: int, pair: wp.vec2) -> float:
     """Return the i-th number, uniform in a pair (lower, upper)."""
-    return between(draw, i, pair[0], pair[1])
+    return uniform(rng, i, pair[0], pair[1])
 
 
 @wp.func
-def cut_gaussian(draw: Draw, i: int) -> float:
+def clamped_normal(rng: RngStream, i: int) -> float:
     """Return the i-th number, standard normal, cut at one standard deviation."""
-    return wp.clamp(wp.randn(wp.rand_init(int(draw.seed), i)), -1.0, 1.0)
+    return wp.clamp(wp.randn(wp.rand_init(int(rng.seed), i)), -1.0, 1.0)

@@ -9,18 +9,18 @@ from ..kinematics.geometry import LegGeometry
 from ..kinematics.inverse import LegLimits
 from ..layout import COORDS, DOFS, motor_slot
 from ..terrain.ground import rest_block, surface, world_ground
-from .attempts import meet_attempts
-from .env import BEGUN, COMMANDED, RING, Delays, EnvArrays, Scene, SkillSettings
+from .attempts import sync_attempts
+from .env import BEGUN, COMMANDED, RING, Delays, EpisodeArrays, Scene, SkillSettings
 from .options import FAST
-from .random import ANY_LEVEL, COMMAND, RESET, between, make_draw
-from .track import follow_paw
+from .random import ANY_LEVEL, COMMAND, RESET, make_stream, uniform
+from .track import update_paw_kinematics
 from .view import RobotArrays, base_quat, base_velocity, load_view, yaw_of
 
 wp.set_module_options({"enable_backward": False})
 
 
 @wp.func
-def before_reset(old: Any, done: float):
+def previous_state(old: Any, done: float):
     """Return the state that a new episode follows; one that was cut off from outside counts as not begun."""
     state = old
     if done == 0.0:
@@ -44,17 +44,17 @@ def make_reset_kernel(task: Any) -> wp.Kernel:
         settings: wp.array(dtype=settings_type),
         levels: wp.array(dtype=level_type),
         # in, out
-        env: EnvArrays,
+        episode: EpisodeArrays,
         states: wp.array(dtype=task.state),
-        robot: RobotArrays,
+        arrays: RobotArrays,
     ):
         """Begin a new episode where mask is not 0, else a new command where it is due; launch over (worlds, lanes).
 
         The lanes, neighbours in a warp, do the same but for what they share by `draw.lane`.
         """
         world, lane = wp.tid()
-        world += env.first
-        if env.skill[world] != skill:
+        world += episode.first
+        if episode.skill[world] != skill:
             return
         begins = mask[world] != 0.0
         commanded = bool(False)
@@ -62,36 +62,36 @@ def make_reset_kernel(task: Any) -> wp.Kernel:
             commanded = wp.static(due)(states[world])
         if not (begins or commanded):
             return
-        draw = make_draw(env.seed, world, env.clock[world], RESET)
-        draw.lane = lane
-        draw.lanes = lanes
-        level = env.level[world]
+        rng = make_stream(episode.seed, world, episode.step_count[world], RESET)
+        rng.lane = lane
+        rng.lanes = lanes
+        level = episode.level[world]
         if level >= levels.shape[0]:
-            level = wp.min(int(between(draw, ANY_LEVEL, 0.0, float(levels.shape[0]))), levels.shape[0] - 1)
+            level = wp.min(int(uniform(rng, ANY_LEVEL, 0.0, float(levels.shape[0]))), levels.shape[0] - 1)
         if begins:
-            old = before_reset(states[world], env.done[world])
-            state = wp.static(reset)(robot, scene, skills[skill], old, settings[0], levels[level], draw)
-            meet_attempts(draw)
+            old = previous_state(states[world], episode.done[world])
+            state = wp.static(reset)(arrays, scene, skills[skill], old, settings[0], levels[level], rng)
+            sync_attempts(rng)
             if lane == 0:
                 states[world] = state
-                env.fresh[world] = BEGUN
-                env.broken[world] = 0
+                episode.history_reset[world] = BEGUN
+                episode.diverged[world] = 0
         elif wp.static(command is not None):
             if lane == 0:
-                view = load_view(robot, scene.ground, world)
-                fresh = make_draw(env.seed, world, env.clock[world], COMMAND)
-                states[world] = wp.static(command)(view, scene, states[world], levels[level], fresh)
-                env.fresh[world] = COMMANDED
+                robot = load_view(arrays, scene.ground, world)
+                fresh = make_stream(episode.seed, world, episode.step_count[world], COMMAND)
+                states[world] = wp.static(command)(robot, scene, states[world], levels[level], fresh)
+                episode.history_reset[world] = COMMANDED
 
     return reset_kernel
 
 
-def make_give_kernel(task: Any) -> wp.Kernel:
+def make_set_command_kernel(task: Any) -> wp.Kernel:
     """Return the kernel that gives worlds a command from outside."""
     give = task.command.give
 
     @wp.kernel(module="unique", enable_backward=False)
-    def give_kernel(
+    def set_command_kernel(
         # in
         skill: int,
         mask: wp.array(dtype=float),
@@ -99,9 +99,9 @@ def make_give_kernel(task: Any) -> wp.Kernel:
         values: wp.array(dtype=wp.vec4),
         headings: wp.array(dtype=float),
         scene: Scene,
-        robot: RobotArrays,
+        arrays: RobotArrays,
         # in, out
-        env: EnvArrays,
+        episode: EpisodeArrays,
         states: wp.array(dtype=task.state),
     ):
         """Give a command where mask is not 0; one thread per world.
@@ -109,20 +109,20 @@ def make_give_kernel(task: Any) -> wp.Kernel:
         begins 1: to a new episode, with its heading [rad]; 0: to the one under way, in the heading that the robot has.
         """
         world = wp.tid()
-        if env.skill[world] != skill or mask[world] == 0.0:
+        if episode.skill[world] != skill or mask[world] == 0.0:
             return
-        view = load_view(robot, scene.ground, world)
+        robot = load_view(arrays, scene.ground, world)
         if begins != 0:
             fresh = task.state()
-            states[world] = wp.static(give)(view, scene, fresh, values[world], headings[world])
-            env.fresh[world] = BEGUN
-            env.broken[world] = 0
+            states[world] = wp.static(give)(robot, scene, fresh, values[world], headings[world])
+            episode.history_reset[world] = BEGUN
+            episode.diverged[world] = 0
         else:
-            states[world] = wp.static(give)(view, scene, states[world], values[world], yaw_of(view.quat))
-            if env.fresh[world] != BEGUN:
-                env.fresh[world] = COMMANDED
+            states[world] = wp.static(give)(robot, scene, states[world], values[world], yaw_of(robot.quat))
+            if episode.history_reset[world] != BEGUN:
+                episode.history_reset[world] = COMMANDED
 
-    return give_kernel
+    return set_command_kernel
 
 
 @wp.func
@@ -139,21 +139,21 @@ def leg_limits(params: FilterParams) -> LegLimits:
 
 
 @wp.func
-def store_pose(robot: RobotArrays, scene: Scene, world: int, heading: float, lift: float):
+def write_default_pose(arrays: RobotArrays, scene: Scene, world: int, heading: float, ground_height: float):
     """Write the model's reference pose at rest, turned to a heading [rad] and lifted [m]."""
     q = world * COORDS
     for j in range(int(COORDS)):
-        robot.joint_q[q + j] = scene.reference_q[q + j]
+        arrays.joint_q[q + j] = scene.reference_q[q + j]
     for j in range(int(DOFS)):
-        robot.joint_qd[world * DOFS + j] = 0.0
+        arrays.joint_qd[world * DOFS + j] = 0.0
     turn = wp.quat_from_axis_angle(wp.vec3(0.0, 0.0, 1.0), heading)
     for j in range(4):
-        robot.joint_q[q + 3 + j] = turn[j]
-    robot.joint_q[q + 2] = scene.reference_q[q + 2] + lift
+        arrays.joint_q[q + 3 + j] = turn[j]
+    arrays.joint_q[q + 2] = scene.reference_q[q + 2] + ground_height
 
 
 @wp.kernel
-def stand_kernel(
+def default_pose_kernel(
     # in
     mask: wp.array(dtype=float),
     headings: wp.array(dtype=float),
@@ -161,7 +161,7 @@ def stand_kernel(
     skills: wp.array(dtype=SkillSettings),
     skill: wp.array(dtype=int),
     # in, out
-    robot: RobotArrays,
+    arrays: RobotArrays,
 ):
     """Stand robots in the default pose with a heading [rad] where mask is not 0, blocks at their starts.
 
@@ -170,31 +170,31 @@ def stand_kernel(
     world = wp.tid()
     if mask[world] != 0.0:
         rest_block(scene.ground, world)
-        lift = surface(world_ground(scene.ground, world), 0.0, 0.0)[0] + skills[skill[world]].lift
-        store_pose(robot, scene, world, headings[world], lift)
+        ground_height = surface(world_ground(scene.ground, world), 0.0, 0.0)[0] + skills[skill[world]].lift
+        write_default_pose(arrays, scene, world, headings[world], ground_height)
 
 
 @wp.kernel
-def tick_kernel(
+def advance_rng_kernel(
     # in
     mask: wp.array(dtype=float),
     # in, out
-    env: EnvArrays,
+    episode: EpisodeArrays,
 ):
     """Move the clock on where mask is not 0, so that what follows draws anew; one thread per world."""
     world = wp.tid()
     if mask[world] != 0.0:
-        env.clock[world] = env.clock[world] + 1
+        episode.step_count[world] = episode.step_count[world] + 1
 
 
 @wp.kernel
-def forget_kernel(
+def clear_history_kernel(
     # in
     first: int,
     mask: wp.array(dtype=float),
     geometry: wp.array(dtype=LegGeometry),
     # in, out
-    robot: RobotArrays,
+    arrays: RobotArrays,
     delays: Delays,
 ):
     """Forget the past where mask is not 0: actions, torques, contacts; one thread per (motor, world).
@@ -206,27 +206,27 @@ def forget_kernel(
     if mask[world] == 0.0:
         return
     slot = motor_slot(m)
-    angle = robot.joint_q[world * COORDS + 7 + slot]
-    robot.torque[m, world] = 0.0
-    robot.old_torque[m, world] = 0.0
-    robot.action[m, world] = 0.0
-    robot.old_action[m, world] = 0.0
-    robot.older_action[m, world] = 0.0
-    robot.target[m, world] = angle
-    robot.safe_target[m, world] = angle
-    robot.old_rate[m, world] = robot.joint_qd[world * DOFS + 6 + slot]
+    angle = arrays.joint_q[world * COORDS + 7 + slot]
+    arrays.torque[m, world] = 0.0
+    arrays.prev_torque[m, world] = 0.0
+    arrays.action[m, world] = 0.0
+    arrays.prev_action[m, world] = 0.0
+    arrays.prev_prev_action[m, world] = 0.0
+    arrays.target[m, world] = angle
+    arrays.filtered_target[m, world] = angle
+    arrays.prev_rate[m, world] = arrays.joint_qd[world * DOFS + 6 + slot]
     for i in range(RING):
-        delays.past_target[i, m, world] = angle
+        delays.target_history[i, m, world] = angle
     if m < 4:
-        robot.impulse[m, world] = wp.vec3(0.0)
-        robot.paw_force[m, world] = wp.vec3(0.0)
-        robot.peak_force[m, world] = 0.0
-        robot.contact_time[m, world] = 0.0
-        robot.air_time[m, world] = 0.0
-        robot.touchdown_speed[m, world] = 0.0
-        robot.paw_height[m, world] = 0.0
-        robot.collisions[m, world] = 0
-        follow_paw(robot, geometry[m], world, m)
+        arrays.impulse[m, world] = wp.vec3(0.0)
+        arrays.paw_force[m, world] = wp.vec3(0.0)
+        arrays.peak_force[m, world] = 0.0
+        arrays.contact_time[m, world] = 0.0
+        arrays.air_time[m, world] = 0.0
+        arrays.touchdown_speed[m, world] = 0.0
+        arrays.paw_height[m, world] = 0.0
+        arrays.collisions[m, world] = 0
+        update_paw_kinematics(arrays, geometry[m], world, m)
     if m == 0:
-        robot.invalid[world] = 0
-        robot.old_lin_vel[world] = base_velocity(robot, world, base_quat(robot, world))
+        arrays.invalid[world] = 0
+        arrays.prev_lin_vel[world] = base_velocity(arrays, world, base_quat(arrays, world))

@@ -29,11 +29,11 @@ def square_sum(v: vec12) -> float:
 
 
 @wp.func
-def posture_offset(view: RobotView, shift: float) -> float:
+def posture_offset(robot: RobotView, shift: float) -> float:
     """Return the rms offset [rad] of all motors from the default pose, the transversal ones shifted by `shift`."""
     total = float(0.0)
     for m in range(12):
-        off = view.angle[m] - view.default_angle[m]
+        off = robot.angle[m] - robot.default_angle[m]
         if m % 3 != 0:
             off = off - shift
         total += off * off
@@ -41,42 +41,42 @@ def posture_offset(view: RobotView, shift: float) -> float:
 
 
 @wp.func
-def ground_force(view: RobotView, task: Any, weight_force: float) -> float:
+def ground_force(robot: RobotView, state: Any, weight_force: float) -> float:
     """Ground force L2: sum of squared paw forces over that of the robot's weight [N]."""
-    return wp.dot(view.paw_force, view.paw_force) / (weight_force * weight_force)
+    return wp.dot(robot.paw_force, robot.paw_force) / (weight_force * weight_force)
 
 
 @wp.func
-def action_clip(view: RobotView, task: Any) -> float:
+def action_clip(robot: RobotView, state: Any) -> float:
     """Action clip: squared distance that the command filter moved the targets [rad^2]."""
-    return view.clipped
+    return robot.clipped
 
 
 @wp.func
-def motor_torque_sq(view: RobotView, task: Any) -> float:
+def motor_torque_sq(robot: RobotView, state: Any) -> float:
     """Motor torque: sum of squares [N^2 m^2]."""
-    return square_sum(view.torque)
+    return square_sum(robot.torque)
 
 
 @wp.func
-def joint_acceleration(view: RobotView, task: Any) -> float:
+def joint_acceleration(robot: RobotView, state: Any) -> float:
     """Joint acceleration: sum of squares [rad^2/s^4]."""
-    return square_sum(view.rate_change)
+    return square_sum(robot.joint_acc)
 
 
 @wp.func
-def action_rate(view: RobotView, task: Any) -> float:
+def action_rate(robot: RobotView, state: Any) -> float:
     """Action rate: sum of squared changes of the action."""
-    return square_sum(view.action - view.old_action)
+    return square_sum(robot.action - robot.prev_action)
 
 
 @wp.func
-def action_acceleration(view: RobotView, task: Any) -> float:
+def action_acceleration(robot: RobotView, state: Any) -> float:
     """Action acceleration: sum of squared second differences of the action."""
-    return square_sum(view.action - 2.0 * view.old_action + view.older_action)
+    return square_sum(robot.action - 2.0 * robot.prev_action + robot.prev_prev_action)
 
 
 @wp.func
-def collision(view: RobotView, task: Any) -> float:
+def collision(robot: RobotView, state: Any) -> float:
     """Collision: 1 if anything but a paw touched the ground, or links touched each other."""
-    return wp.where(view.collisions != 0, 1.0, 0.0)
+    return wp.where(robot.collisions != 0, 1.0, 0.0)

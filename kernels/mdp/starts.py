@@ -5,13 +5,13 @@ import warp as wp
 from ..kinematics.geometry import LegGeometry
 from ..kinematics.inverse import LegLimits, clamped_closed_form
 from ..kinematics.leg import leg_forward_kinematics, leg_inverse_velocity
-from .random import Draw, within
+from .random import RngStream, uniform_range
 
 wp.set_module_options({"enable_backward": False})
 
-MISS = wp.constant(1.0e-4)  # [m] by which a paw may miss its place
-FASTEST = wp.constant(30.0)  # [rad/s] norm of a leg's motor rates
-APART = wp.constant(0.005)  # [m] least between links
+MAX_FOOT_ERROR = wp.constant(1.0e-4)  # [m] by which a paw may miss its place
+MAX_LEG_SPEED = wp.constant(30.0)  # [rad/s] norm of a leg's motor rates
+MIN_LINK_DISTANCE = wp.constant(0.005)  # [m] least between links
 
 PAW_X, PAW_Y = 20, 24
 """Numbers of a stream, the first of four: one a leg."""
@@ -27,41 +27,41 @@ class LegSample:
 
 
 @wp.func
-def leg_to(geo: LegGeometry, limits: LegLimits, ankle: wp.vec3) -> LegSample:
+def leg_ik(geo: LegGeometry, limits: LegLimits, ankle: wp.vec3) -> LegSample:
     """Return the leg at rest with its ankle in a place [m], body axes."""
     found = LegSample()
     angles = clamped_closed_form(geo, limits, ankle - geo.hip)
     found.angles = angles
-    found.reachable = wp.length(leg_forward_kinematics(geo, angles[0], angles[1], angles[2]) - ankle) <= MISS
+    found.reachable = wp.length(leg_forward_kinematics(geo, angles[0], angles[1], angles[2]) - ankle) <= MAX_FOOT_ERROR
     return found
 
 
 @wp.func
-def leg_over_ground(geo: LegGeometry, leg: LegSample, ankle_vel: wp.vec3) -> LegSample:
+def with_foot_velocity(geo: LegGeometry, leg: LegSample, ankle_vel: wp.vec3) -> LegSample:
     """Return a leg whose ankle moves relative to the base [m/s], body axes."""
     found = leg
     found.rates = leg_inverse_velocity(geo, leg.angles, ankle_vel)
-    found.reachable = leg.reachable and wp.length(found.rates) <= FASTEST
+    found.reachable = leg.reachable and wp.length(found.rates) <= MAX_LEG_SPEED
     return found
 
 
 @wp.func
-def place_beside(
-    draw: Draw, leg: int, front_x: wp.vec2, front_y: wp.vec2, back_x: wp.vec2, back_y: wp.vec2
+def sample_foot_offset(
+    rng: RngStream, leg: int, front_x: wp.vec2, front_y: wp.vec2, back_x: wp.vec2, back_y: wp.vec2
 ) -> wp.vec3:  # fmt: skip
     """Return a paw's place [m] relative to the spot that the paws surround, z = 0; ranges of absolute values."""
-    x = within(draw, PAW_X + leg, front_x)
-    y = within(draw, PAW_Y + leg, front_y)
+    x = uniform_range(rng, PAW_X + leg, front_x)
+    y = uniform_range(rng, PAW_Y + leg, front_y)
     if leg >= 2:
-        x = -within(draw, PAW_X + leg, back_x)
-        y = within(draw, PAW_Y + leg, back_y)
+        x = -uniform_range(rng, PAW_X + leg, back_x)
+        y = uniform_range(rng, PAW_Y + leg, back_y)
     if leg % 2 == 1:
         y = -y
     return wp.vec3(x, y, 0.0)
 
 
 @wp.func
-def turn_of(yaw: float, pitch: float, roll: float) -> wp.quat:
+def quat_from_ypr(yaw: float, pitch: float, roll: float) -> wp.quat:
     """Return an orientation (xyzw), body to world: roll first, yaw last [rad]."""
     return (
         wp.quat_from_axis_angle(wp.vec3(0.0, 0.0, 1.0), yaw)

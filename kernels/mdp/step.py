@@ -5,46 +5,58 @@ from typing import Any
 import warp as wp
 
 from ..terrain.ground import Ground
-from .env import Counters, EnvArrays
+from .env import Counters, EpisodeArrays
 from .options import FAST
 from .terminations import came_apart
-from .view import RobotArrays, load_view, speed_limit_broken
+from .view import RobotArrays, has_diverged, load_view
 
-NOT_ENDED = wp.constant(-1)
+NOT_TERMINATED = wp.constant(-1)
 
 
 @wp.func
-def count_episode(
-    env: EnvArrays, counters: Counters, world: int, success: bool, error: float, promote_after: float, num_levels: int
+def update_curriculum(
+    episode: EpisodeArrays,
+    counters: Counters,
+    world: int,
+    success: bool,
+    error: float,
+    promote_after: float,
+    num_levels: int,
 ):
     """Take an ended episode into the curriculum: successes in a row raise the world's level."""
-    streak = wp.where(success, env.streak[world] + 1, 0)
+    streak = wp.where(success, episode.streak[world] + 1, 0)
     if streak >= int(promote_after):
         streak = int(0)
-        env.level[world] = wp.min(env.level[world] + 1, num_levels)
-    env.streak[world] = streak
-    counters.counted[world] = counters.counted[world] + 1
+        episode.level[world] = wp.min(episode.level[world] + 1, num_levels)
+    episode.streak[world] = streak
+    counters.curriculum_episodes[world] = counters.curriculum_episodes[world] + 1
     if success:
-        counters.succeeded[world] = counters.succeeded[world] + 1
+        counters.curriculum_successes[world] = counters.curriculum_successes[world] + 1
         counters.error_sum[world] = counters.error_sum[world] + wp.float64(error)
 
 
 @wp.func
-def write_outcome(
-    env: EnvArrays, counters: Counters, world: int, total: float, ending: int, timeout: float, broken: bool
+def write_step_result(
+    episode: EpisodeArrays,
+    counters: Counters,
+    world: int,
+    total: float,
+    termination: int,
+    timeout: float,
+    diverged: bool,
 ):
     """Write how a policy step of a world ended."""
-    env.reward[world] = total
-    env.ending[world] = ending
-    env.done[world] = wp.where(ending == NOT_ENDED, 0.0, 1.0)
-    env.timeout[world] = timeout
-    env.terminated[world] = ending != NOT_ENDED and timeout == 0.0
-    env.truncated[world] = timeout != 0.0
-    env.broken[world] = wp.where(broken, 1, 0)
-    counters.bad_actions[world] = counters.bad_actions[world] + env.bad_action[world]
-    env.bad_action[world] = 0
-    env.clock[world] = env.clock[world] + 1
-    env.fresh[world] = 0
+    episode.reward[world] = total
+    episode.termination[world] = termination
+    episode.done[world] = wp.where(termination == NOT_TERMINATED, 0.0, 1.0)
+    episode.timeout[world] = timeout
+    episode.terminated[world] = termination != NOT_TERMINATED and timeout == 0.0
+    episode.truncated[world] = timeout != 0.0
+    episode.diverged[world] = wp.where(diverged, 1, 0)
+    counters.bad_actions[world] = counters.bad_actions[world] + episode.bad_action[world]
+    episode.bad_action[world] = 0
+    episode.step_count[world] = episode.step_count[world] + 1
+    episode.history_reset[world] = 0
 
 
 def make_step_kernel(task: Any) -> wp.Kernel:
@@ -58,12 +70,12 @@ def make_step_kernel(task: Any) -> wp.Kernel:
     def step_kernel(
         # in
         skill: int,
-        robot: RobotArrays,
+        arrays: RobotArrays,
         ground: Ground,
         num_levels: int,
         p: wp.array(dtype=float),
         # in, out
-        env: EnvArrays,
+        episode: EpisodeArrays,
         states: wp.array(dtype=task.state),
         # out
         term_value: wp.array2d(dtype=float),
@@ -73,44 +85,48 @@ def make_step_kernel(task: Any) -> wp.Kernel:
 
         term_value: rewards of this step, weights applied, (rewards, num_worlds). Those that are not finite count 0.
         """
-        world = env.first + wp.tid()
-        if env.skill[world] != skill:
+        world = episode.first + wp.tid()
+        if episode.skill[world] != skill:
             return
-        view = load_view(robot, ground, world)
-        if wp.static(advance.plain):
-            state = wp.static(advance.func)(view, states[world])
+        robot = load_view(arrays, ground, world)
+        if wp.static(advance.parameterless):
+            state = wp.static(advance.func)(robot, states[world])
         else:
-            state = wp.static(advance.func)(view, states[world], *p[wp.static(advance.lo) : wp.static(advance.hi)])
+            state = wp.static(advance.func)(
+                robot, states[world], *p[wp.static(advance.params_start) : wp.static(advance.params_stop)]
+            )
 
-        ending = int(NOT_ENDED)
+        termination = int(NOT_TERMINATED)
         timeout = float(0.0)
         success = bool(False)
-        broken = robot.invalid[world] != 0 or env.bad_action[world] != 0 or speed_limit_broken(view)
-        if broken:
-            ending = wp.static(broken_ending)
+        diverged = arrays.invalid[world] != 0 or episode.bad_action[world] != 0 or has_diverged(robot)
+        if diverged:
+            termination = wp.static(broken_ending)
         for i in range(wp.static(len(endings))):
-            if ending == NOT_ENDED:
-                if wp.static(endings[i].plain):
-                    holds = wp.static(endings[i].func)(view, state)
+            if termination == NOT_TERMINATED:
+                if wp.static(endings[i].parameterless):
+                    holds = wp.static(endings[i].func)(robot, state)
                 else:
                     holds = wp.static(endings[i].func)(
-                        view, state, *p[wp.static(endings[i].lo) : wp.static(endings[i].hi)]
+                        robot, state, *p[wp.static(endings[i].params_start) : wp.static(endings[i].params_stop)]
                     )
                 if holds:
-                    ending = i
+                    termination = i
                     timeout = wp.where(wp.static(bool(endings[i].time_out)), 1.0, 0.0)
                     success = wp.static(bool(endings[i].success))
 
         total = float(0.0)
         for i in range(wp.static(len(rewards))):
-            if wp.static(rewards[i].plain):
-                raw = wp.static(rewards[i].func)(view, state)
+            if wp.static(rewards[i].parameterless):
+                raw = wp.static(rewards[i].func)(robot, state)
             else:
-                raw = wp.static(rewards[i].func)(view, state, *p[wp.static(rewards[i].lo) : wp.static(rewards[i].hi)])
+                raw = wp.static(rewards[i].func)(
+                    robot, state, *p[wp.static(rewards[i].params_start) : wp.static(rewards[i].params_stop)]
+                )
             value = p[wp.static(rewards[i].weight)] * raw
             if wp.static(not rewards[i].once):
-                value = value * robot.step_dt
-            if broken:
+                value = value * arrays.step_dt
+            if diverged:
                 value = float(0.0)
             term_value[i, world] = value
             counters.term_sum[i, world] = counters.term_sum[i, world] + wp.float64(value)
@@ -120,13 +136,15 @@ def make_step_kernel(task: Any) -> wp.Kernel:
             total = float(0.0)
         if wp.static(floor is not None):
             total = wp.max(total, wp.static(0.0 if floor is None else float(floor)))
-        write_outcome(env, counters, world, total, ending, timeout, broken)
+        write_step_result(episode, counters, world, total, termination, timeout, diverged)
         states[world] = state
-        if ending != NOT_ENDED:
-            counters.ending_count[ending, world] = counters.ending_count[ending, world] + 1
+        if termination != NOT_TERMINATED:
+            counters.termination_count[termination, world] = counters.termination_count[termination, world] + 1
             if wp.static(curriculum.counts)(state):
-                error = wp.static(curriculum.func)(view, state)
+                error = wp.static(curriculum.func)(robot, state)
                 success = success and error <= p[wp.static(curriculum.tolerance)]
-                count_episode(env, counters, world, success, error, p[wp.static(curriculum.promote_after)], num_levels)
+                update_curriculum(
+                    episode, counters, world, success, error, p[wp.static(curriculum.promote_after)], num_levels
+                )
 
     return step_kernel

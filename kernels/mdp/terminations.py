@@ -7,40 +7,40 @@ from typing import Any
 
 import warp as wp
 
-from .view import RobotView, speed_limit_broken, tilt
+from .view import RobotView, has_diverged, tilt
 
 
 @wp.func
-def too_long(view: RobotView, task: Any, steps: float) -> bool:
+def too_long(robot: RobotView, state: Any, steps: float) -> bool:
     """Episode of so many policy steps."""
-    return task.steps >= int(steps)
+    return state.steps >= int(steps)
 
 
 @wp.func
-def came_apart(view: RobotView, task: Any) -> bool:
+def came_apart(robot: RobotView, state: Any) -> bool:
     """State non-finite or absurdly fast."""
-    return speed_limit_broken(view)
+    return has_diverged(robot)
 
 
 @wp.func
-def low_base(view: RobotView, task: Any, height: float) -> bool:
+def low_base(robot: RobotView, state: Any, height: float) -> bool:
     """Base less than a height [m] above the ground."""
-    return view.height < height
+    return robot.height < height
 
 
 @wp.func
-def tilted(view: RobotView, task: Any, angle: float) -> bool:
+def tilted(robot: RobotView, state: Any, angle: float) -> bool:
     """Body z more than an angle [rad] from vertical."""
-    return tilt(view) > angle
+    return tilt(robot) > angle
 
 
 @wp.func
-def fallen(view: RobotView, task: Any, angle: float) -> bool:
+def fallen(robot: RobotView, state: Any, angle: float) -> bool:
     """Body z more than an angle [rad] from vertical while a paw is on the ground."""
-    return view.contacts > 0 and tilt(view) > angle
+    return robot.contacts > 0 and tilt(robot) > angle
 
 
 @wp.func
-def collided(view: RobotView, task: Any) -> bool:
+def collided(robot: RobotView, state: Any) -> bool:
     """Anything but a paw touched the ground, or links touched each other."""
-    return view.collisions != 0
+    return robot.collisions != 0

@@ -8,49 +8,49 @@ from ..kinematics.geometry import LegGeometry
 from ..layout import COORDS
 from ..state import leg_coord, leg_dof, load_motors
 from ..terrain.ground import Ground, grown_block, surface, world_ground
-from .env import EnvArrays, SkillSettings
+from .env import EpisodeArrays, SkillSettings
 from .view import RobotArrays, base_pos, base_quat, base_velocity
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
 
 
 @wp.func
-def follow_paw(robot: RobotArrays, geo: LegGeometry, world: int, leg: int):
+def update_paw_kinematics(arrays: RobotArrays, geo: LegGeometry, world: int, leg: int):
     """Write place and velocity of a paw."""
-    quat = base_quat(robot, world)
-    angles = load_motors(robot.joint_q, leg_coord(world, leg))
-    rates = load_motors(robot.joint_qd, leg_dof(world, leg))
+    quat = base_quat(arrays, world)
+    angles = load_motors(arrays.joint_q, leg_coord(world, leg))
+    rates = load_motors(arrays.joint_qd, leg_dof(world, leg))
     paw = paw_kinematics(geo, leg_pose(geo, angles))
     arm = wp.quat_rotate(quat, paw.position)
     i = leg_dof(world, 0) - 3
-    ang = wp.vec3(robot.joint_qd[i], robot.joint_qd[i + 1], robot.joint_qd[i + 2])
+    ang = wp.vec3(arrays.joint_qd[i], arrays.joint_qd[i + 1], arrays.joint_qd[i + 2])
     along = wp.quat_rotate(quat, paw.jacobian * rates)
-    robot.paw_pos[leg, world] = base_pos(robot, world) + arm
-    robot.paw_vel[leg, world] = base_velocity(robot, world, quat) + wp.cross(ang, arm) + along
+    arrays.paw_pos[leg, world] = base_pos(arrays, world) + arm
+    arrays.paw_vel[leg, world] = base_velocity(arrays, world, quat) + wp.cross(ang, arm) + along
 
 
 @wp.func
-def height_of_paw(robot: RobotArrays, geo: LegGeometry, ground: Ground, world: int, leg: int) -> float:
+def paw_clearance(arrays: RobotArrays, geo: LegGeometry, ground: Ground, world: int, leg: int) -> float:
     """Return the height of a paw's lowest point above the ground below its centre [m]."""
-    pos = robot.paw_pos[leg, world]
+    pos = arrays.paw_pos[leg, world]
     return pos[2] - surface(world_ground(ground, world), pos[0], pos[1])[0] - geo.paw_radius
 
 
 @wp.func
-def time_contact(robot: RobotArrays, world: int, leg: int, down: bool):
+def update_contact_timers(arrays: RobotArrays, world: int, leg: int, down: bool):
     """Count how long a paw has been down or up; `air_time` stays through the step of its first contact."""
-    was_down = robot.contact_time[leg, world] > 0.0
+    was_down = arrays.contact_time[leg, world] > 0.0
     if down:
         if was_down:
-            robot.air_time[leg, world] = 0.0
-        elif robot.air_time[leg, world] > 0.0:
-            robot.touchdown_speed[leg, world] = wp.max(-robot.paw_vel[leg, world][2], 0.0)
-        robot.contact_time[leg, world] = robot.contact_time[leg, world] + robot.step_dt
+            arrays.air_time[leg, world] = 0.0
+        elif arrays.air_time[leg, world] > 0.0:
+            arrays.touchdown_speed[leg, world] = wp.max(-arrays.paw_vel[leg, world][2], 0.0)
+        arrays.contact_time[leg, world] = arrays.contact_time[leg, world] + arrays.step_dt
     else:
         if was_down:
-            robot.air_time[leg, world] = 0.0
-        robot.air_time[leg, world] = robot.air_time[leg, world] + robot.step_dt
-        robot.contact_time[leg, world] = 0.0
+            arrays.air_time[leg, world] = 0.0
+        arrays.air_time[leg, world] = arrays.air_time[leg, world] + arrays.step_dt
+        arrays.contact_time[leg, world] = 0.0
 
 
 @wp.kernel
@@ -59,17 +59,19 @@ def track_kernel(
     geometry: wp.array(dtype=LegGeometry),
     ground: Ground,
     skills: wp.array(dtype=SkillSettings),
-    env: EnvArrays,
+    episode: EpisodeArrays,
     # in, out
-    robot: RobotArrays,
+    arrays: RobotArrays,
 ):
     """Follow every paw, and find what must not touch; one thread per (leg, world)."""
     leg, world = wp.tid()
-    world += env.first
-    skill = skills[env.skill[world]]
-    down = wp.length(robot.paw_force[leg, world]) > skill.contact_force
-    time_contact(robot, world, leg, down)  # before the velocity of the step before is written over
-    follow_paw(robot, geometry[leg], world, leg)
-    robot.paw_height[leg, world] = height_of_paw(robot, geometry[leg], ground, world, leg)
+    world += episode.first
+    skill = skills[episode.skill[world]]
+    down = wp.length(arrays.paw_force[leg, world]) > skill.contact_force
+    update_contact_timers(arrays, world, leg, down)  # before the velocity of the step before is written over
+    update_paw_kinematics(arrays, geometry[leg], world, leg)
+    arrays.paw_height[leg, world] = paw_clearance(arrays, geometry[leg], ground, world, leg)
     here = grown_block(world_ground(ground, world), skill.block_margin)
-    robot.collisions[leg, world] = leg_collisions(geometry, here, robot.joint_q, world * COORDS, leg, skill.link_margin)
+    arrays.collisions[leg, world] = leg_collisions(
+        geometry, here, arrays.joint_q, world * COORDS, leg, skill.link_margin
+    )

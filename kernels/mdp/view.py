@@ -18,20 +18,20 @@ class RobotView:
     height: float  # [m] of the base origin above the ground below it
     quat: wp.quat  # xyzw, body to world
     lin_vel: wp.vec3  # [m/s] base origin, world
-    old_lin_vel: wp.vec3  # [m/s] the same one policy step before
+    prev_lin_vel: wp.vec3  # [m/s] the same one policy step before
     lin_acc: wp.vec3  # [m/s^2] base origin, world, mean of the policy step
     ang_vel: wp.vec3  # [rad/s] body axes
-    gravity: wp.vec3  # [1] direction of gravity in body axes
-    fall_acc: float  # [m/s^2] of gravity, downward
+    projected_gravity: wp.vec3  # [1] direction of gravity in body axes
+    gravity_magnitude: float  # [m/s^2] of gravity, downward
     angle: vec12  # [rad]
     sensed_angle: vec12  # [rad] as the motors' position sensors read it
     rate: vec12  # [rad/s]
-    rate_change: vec12  # [rad/s^2] mean of the policy step
+    joint_acc: vec12  # [rad/s^2] mean of the policy step
     torque: vec12  # [N m] last physics step
-    old_torque: vec12  # [N m] last physics step of the policy step before
+    prev_torque: vec12  # [N m] last physics step of the policy step before
     action: vec12  # [1] within -1..1
-    old_action: vec12
-    older_action: vec12  # two policy steps before
+    prev_action: vec12
+    prev_prev_action: vec12  # two policy steps before
     clipped: float  # [rad^2] squared distance that the command filter moved the targets
     default_angle: vec12  # [rad]
     contacts: int  # number of paws on the ground
@@ -68,120 +68,120 @@ class RobotArrays:
     touchdown_speed: wp.array2d(dtype=float)
     collisions: wp.array2d(dtype=int)
     torque: wp.array2d(dtype=float)  # (12, num_worlds), like all below
-    old_torque: wp.array2d(dtype=float)
+    prev_torque: wp.array2d(dtype=float)
     action: wp.array2d(dtype=float)
-    old_action: wp.array2d(dtype=float)
-    older_action: wp.array2d(dtype=float)
+    prev_action: wp.array2d(dtype=float)
+    prev_prev_action: wp.array2d(dtype=float)
     target: wp.array2d(dtype=float)  # [rad] before the filter
-    safe_target: wp.array2d(dtype=float)  # [rad] after it
-    old_rate: wp.array2d(dtype=float)
+    filtered_target: wp.array2d(dtype=float)  # [rad] after it
+    prev_rate: wp.array2d(dtype=float)
     joint_offset: wp.array2d(dtype=float)  # [rad] constant error of each motor's position sensor
-    old_lin_vel: wp.array(dtype=wp.vec3)  # (num_worlds,)
+    prev_lin_vel: wp.array(dtype=wp.vec3)  # (num_worlds,)
     default_angle: wp.array(dtype=float)  # (12,)
     step_dt: float  # [s] policy step
     paw_height: wp.array2d(dtype=float)  # [m] (4, num_worlds) above the ground
 
 
 @wp.func
-def base_velocity(robot: RobotArrays, world: int, quat: wp.quat) -> wp.vec3:
+def base_velocity(arrays: RobotArrays, world: int, quat: wp.quat) -> wp.vec3:
     """Return the velocity of the base origin [m/s], world frame."""
     i = world * DOFS
-    com_vel = wp.vec3(robot.joint_qd[i], robot.joint_qd[i + 1], robot.joint_qd[i + 2])
-    ang = wp.vec3(robot.joint_qd[i + 3], robot.joint_qd[i + 4], robot.joint_qd[i + 5])
-    return com_vel - wp.cross(ang, wp.quat_rotate(quat, robot.body_com[world * BODIES]))
+    com_vel = wp.vec3(arrays.joint_qd[i], arrays.joint_qd[i + 1], arrays.joint_qd[i + 2])
+    ang = wp.vec3(arrays.joint_qd[i + 3], arrays.joint_qd[i + 4], arrays.joint_qd[i + 5])
+    return com_vel - wp.cross(ang, wp.quat_rotate(quat, arrays.body_com[world * BODIES]))
 
 
 @wp.func
-def base_pos(robot: RobotArrays, world: int) -> wp.vec3:
+def base_pos(arrays: RobotArrays, world: int) -> wp.vec3:
     """Return the base origin [m], world frame."""
     i = world * COORDS
-    return wp.vec3(robot.joint_q[i], robot.joint_q[i + 1], robot.joint_q[i + 2])
+    return wp.vec3(arrays.joint_q[i], arrays.joint_q[i + 1], arrays.joint_q[i + 2])
 
 
 @wp.func
-def base_quat(robot: RobotArrays, world: int) -> wp.quat:
+def base_quat(arrays: RobotArrays, world: int) -> wp.quat:
     """Return the base's orientation, xyzw, body to world."""
     i = world * COORDS + 3
-    return wp.quat(robot.joint_q[i], robot.joint_q[i + 1], robot.joint_q[i + 2], robot.joint_q[i + 3])
+    return wp.quat(arrays.joint_q[i], arrays.joint_q[i + 1], arrays.joint_q[i + 2], arrays.joint_q[i + 3])
 
 
 @wp.func
-def load_base_view(robot: RobotArrays, ground: Ground, world: int) -> RobotView:
+def load_base_view(arrays: RobotArrays, ground: Ground, world: int) -> RobotView:
     """Return the view with the base's entries filled in."""
     j = world * DOFS
-    view = RobotView()
-    view.world = world
-    view.pos = base_pos(robot, world)
-    quat = base_quat(robot, world)
-    view.quat = quat
-    view.lin_vel = base_velocity(robot, world, quat)
-    view.old_lin_vel = robot.old_lin_vel[world]
-    view.lin_acc = (view.lin_vel - view.old_lin_vel) / robot.step_dt
-    ang = wp.vec3(robot.joint_qd[j + 3], robot.joint_qd[j + 4], robot.joint_qd[j + 5])
-    view.ang_vel = wp.quat_rotate_inv(quat, ang)
-    view.gravity = wp.quat_rotate_inv(quat, wp.vec3(0.0, 0.0, -1.0))
-    view.fall_acc = -robot.gravity[world][2]
-    below = surface(world_ground(ground, world), view.pos[0], view.pos[1])
-    view.height = view.pos[2] - below[0]
-    return view
+    robot = RobotView()
+    robot.world = world
+    robot.pos = base_pos(arrays, world)
+    quat = base_quat(arrays, world)
+    robot.quat = quat
+    robot.lin_vel = base_velocity(arrays, world, quat)
+    robot.prev_lin_vel = arrays.prev_lin_vel[world]
+    robot.lin_acc = (robot.lin_vel - robot.prev_lin_vel) / arrays.step_dt
+    ang = wp.vec3(arrays.joint_qd[j + 3], arrays.joint_qd[j + 4], arrays.joint_qd[j + 5])
+    robot.ang_vel = wp.quat_rotate_inv(quat, ang)
+    robot.projected_gravity = wp.quat_rotate_inv(quat, wp.vec3(0.0, 0.0, -1.0))
+    robot.gravity_magnitude = -arrays.gravity[world][2]
+    below = surface(world_ground(ground, world), robot.pos[0], robot.pos[1])
+    robot.height = robot.pos[2] - below[0]
+    return robot
 
 
 @wp.func
-def load_view(robot: RobotArrays, ground: Ground, world: int) -> RobotView:
+def load_view(arrays: RobotArrays, ground: Ground, world: int) -> RobotView:
     """Return the robot of a world."""
-    view = load_base_view(robot, ground, world)
+    robot = load_base_view(arrays, ground, world)
     contacts = int(0)
     collisions = int(0)
     for k in range(4):
-        time = robot.contact_time[k, world]
+        time = arrays.contact_time[k, world]
         down = time > 0.0
         contacts += wp.where(down, 1, 0)
-        collisions = collisions | robot.collisions[k, world]
-        view.contact[k] = wp.where(down, 1.0, 0.0)
-        view.first_contact[k] = wp.where(down and robot.air_time[k, world] > 0.0, 1.0, 0.0)
-        view.contact_time[k] = time
-        view.air_time[k] = robot.air_time[k, world]
-        view.touchdown_speed[k] = robot.touchdown_speed[k, world]
-        view.paw_force[k] = wp.length(robot.paw_force[k, world])
-        view.peak_force[k] = robot.peak_force[k, world]
-        view.paw_height[k] = robot.paw_height[k, world]
+        collisions = collisions | arrays.collisions[k, world]
+        robot.contact[k] = wp.where(down, 1.0, 0.0)
+        robot.first_contact[k] = wp.where(down and arrays.air_time[k, world] > 0.0, 1.0, 0.0)
+        robot.contact_time[k] = time
+        robot.air_time[k] = arrays.air_time[k, world]
+        robot.touchdown_speed[k] = arrays.touchdown_speed[k, world]
+        robot.paw_force[k] = wp.length(arrays.paw_force[k, world])
+        robot.peak_force[k] = arrays.peak_force[k, world]
+        robot.paw_height[k] = arrays.paw_height[k, world]
         for j in range(3):
-            view.paw_pos[k, j] = robot.paw_pos[k, world][j]
-            view.paw_vel[k, j] = robot.paw_vel[k, world][j]
-    view.contacts = contacts
-    view.collisions = collisions
+            robot.paw_pos[k, j] = arrays.paw_pos[k, world][j]
+            robot.paw_vel[k, j] = arrays.paw_vel[k, world][j]
+    robot.contacts = contacts
+    robot.collisions = collisions
     clipped = float(0.0)
     for m in range(12):
         slot = motor_slot(m)
-        rate = robot.joint_qd[world * DOFS + 6 + slot]
-        angle = robot.joint_q[world * COORDS + 7 + slot]
-        view.angle[m] = angle
-        view.sensed_angle[m] = angle + robot.joint_offset[m, world]
-        view.rate[m] = rate
-        view.rate_change[m] = (rate - robot.old_rate[m, world]) / robot.step_dt
-        view.torque[m] = robot.torque[m, world]
-        view.old_torque[m] = robot.old_torque[m, world]
-        view.action[m] = robot.action[m, world]
-        view.old_action[m] = robot.old_action[m, world]
-        view.older_action[m] = robot.older_action[m, world]
-        view.default_angle[m] = robot.default_angle[m]
-        off = robot.target[m, world] - robot.safe_target[m, world]
+        rate = arrays.joint_qd[world * DOFS + 6 + slot]
+        angle = arrays.joint_q[world * COORDS + 7 + slot]
+        robot.angle[m] = angle
+        robot.sensed_angle[m] = angle + arrays.joint_offset[m, world]
+        robot.rate[m] = rate
+        robot.joint_acc[m] = (rate - arrays.prev_rate[m, world]) / arrays.step_dt
+        robot.torque[m] = arrays.torque[m, world]
+        robot.prev_torque[m] = arrays.prev_torque[m, world]
+        robot.action[m] = arrays.action[m, world]
+        robot.prev_action[m] = arrays.prev_action[m, world]
+        robot.prev_prev_action[m] = arrays.prev_prev_action[m, world]
+        robot.default_angle[m] = arrays.default_angle[m]
+        off = arrays.target[m, world] - arrays.filtered_target[m, world]
         clipped += off * off
-    view.clipped = clipped
-    return view
+    robot.clipped = clipped
+    return robot
 
 
 @wp.func
-def speed_limit_broken(view: RobotView) -> bool:
+def has_diverged(robot: RobotView) -> bool:
     """Return whether a state is non-finite or faster than the robot can ever be: the world has come apart."""
     fastest = float(0.0)
-    total = wp.length_sq(view.pos) + wp.length_sq(view.lin_vel) + wp.length_sq(view.ang_vel)
+    total = wp.length_sq(robot.pos) + wp.length_sq(robot.lin_vel) + wp.length_sq(robot.ang_vel)
     for m in range(12):
-        fastest = wp.max(fastest, wp.abs(view.rate[m]))
-        total += view.rate[m] * view.rate[m] + view.angle[m] * view.angle[m]  # max() would pass over a NaN
+        fastest = wp.max(fastest, wp.abs(robot.rate[m]))
+        total += robot.rate[m] * robot.rate[m] + robot.angle[m] * robot.angle[m]  # max() would pass over a NaN
     if not wp.isfinite(total):
         return True
-    return wp.length(view.lin_vel) > 15.0 or wp.length(view.ang_vel) > 40.0 or fastest > 120.0
+    return wp.length(robot.lin_vel) > 15.0 or wp.length(robot.ang_vel) > 40.0 or fastest > 120.0
 
 
 @wp.func
@@ -192,13 +192,13 @@ def yaw_of(quat: wp.quat) -> float:
 
 
 @wp.func
-def turned(v: wp.vec3, heading: float) -> wp.vec3:
+def rotate_yaw(v: wp.vec3, heading: float) -> wp.vec3:
     """Return a vector turned about z by a heading [rad]."""
     return wp.quat_rotate(wp.quat_from_axis_angle(wp.vec3(0.0, 0.0, 1.0), heading), v)
 
 
 @wp.func
-def rotation_from(quat: wp.quat, heading: float) -> float:
+def angle_from_level(quat: wp.quat, heading: float) -> float:
     """Return the angle [rad] between an orientation (xyzw) and the level one with a heading [rad]."""
     half = 0.5 * heading
     level = wp.quat(0.0, 0.0, wp.sin(half), wp.cos(half))
@@ -207,23 +207,23 @@ def rotation_from(quat: wp.quat, heading: float) -> float:
 
 
 @wp.func
-def tilt(view: RobotView) -> float:
+def tilt(robot: RobotView) -> float:
     """Return the angle [rad] between body z and world z."""
-    return wp.acos(wp.clamp(-view.gravity[2], -1.0, 1.0))
+    return wp.acos(wp.clamp(-robot.projected_gravity[2], -1.0, 1.0))
 
 
 @wp.func
-def braking(view: RobotView) -> float:
+def base_deceleration(robot: RobotView) -> float:
     """Return what the base lost of its speed of the step before, over the step [m/s^2], <= 0.
 
     Speed that it gained against that motion, as in a rebound, does not count: a fall that ends within the step has lost
     all of its speed.
     """
-    speed = wp.length(view.old_lin_vel)
+    speed = wp.length(robot.prev_lin_vel)
     if speed < 1.0e-6:
         return 0.0
-    kept = wp.dot(view.lin_vel, view.old_lin_vel) / speed
-    rate = wp.dot(view.lin_acc, view.old_lin_vel) / speed
+    kept = wp.dot(robot.lin_vel, robot.prev_lin_vel) / speed
+    rate = wp.dot(robot.lin_acc, robot.prev_lin_vel) / speed
     if kept < 0.0:
         rate = rate * speed / (speed - kept)
     return wp.min(rate, 0.0)

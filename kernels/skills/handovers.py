@@ -26,43 +26,43 @@ NEVER = wp.constant(1_000_000)  # policy step of a command that has not come
 
 
 @wp.func
-def at_rest(view: RobotView) -> bool:
+def at_rest(robot: RobotView) -> bool:
     """Return whether a robot stands: on four paws for a while, the base level, slow and not turning."""
     return (
-        view.contacts == 4
-        and wp.min(view.contact_time) > PLANTED
-        and wp.length(view.lin_vel) < REST_SPEED
-        and wp.length(view.ang_vel) < REST_SPIN
-        and tilt(view) < LEVEL
+        robot.contacts == 4
+        and wp.min(robot.contact_time) > PLANTED
+        and wp.length(robot.lin_vel) < REST_SPEED
+        and wp.length(robot.ang_vel) < REST_SPIN
+        and tilt(robot) < LEVEL
     )
 
 
 @wp.func
-def near_default(view: RobotView) -> bool:
+def near_default(robot: RobotView) -> bool:
     """Return whether all motors are near the default pose."""
     most = float(0.0)
     for m in range(12):
-        most = wp.max(most, wp.abs(view.angle[m] - view.default_angle[m]))
+        most = wp.max(most, wp.abs(robot.angle[m] - robot.default_angle[m]))
     return most < NEAR
 
 
 @wp.func
-def come_to_a_stop(view: RobotView, task: VelocityState, requested: bool) -> bool:
+def come_to_a_stop(robot: RobotView, state: VelocityState, requested: bool) -> bool:
     """Walking to a jump: asked for, commanded to stand, at rest, and near the default pose."""
-    return requested and task.standing == 1 and at_rest(view) and near_default(view)
+    return requested and state.standing == 1 and at_rest(robot) and near_default(robot)
 
 
 @wp.func
-def landed_or_lost(view: RobotView, task: JumpState, requested: bool) -> bool:
+def landed_or_lost(robot: RobotView, state: JumpState, requested: bool) -> bool:
     """A jump to walking: landed and at rest; or as recovery, landed badly, not at rest in time or not taken off."""
-    if task.phase == LANDED:
-        over = at_rest(view) or tilt(view) > FALLING or task.phase_steps >= RECOVER_STEPS
-        return task.phase_steps >= LANDED_STEPS and over
-    return task.phase == STANCE and task.steps >= NO_JUMP_STEPS
+    if state.phase == LANDED:
+        over = at_rest(robot) or tilt(robot) > FALLING or state.phase_steps >= RECOVER_STEPS
+        return state.phase_steps >= LANDED_STEPS and over
+    return state.phase == STANCE and state.steps >= NO_JUMP_STEPS
 
 
 @wp.func
-def begin_walk(view: RobotView, task: JumpState) -> VelocityState:
+def begin_walk(robot: RobotView, state: JumpState) -> VelocityState:
     """Return the state of walking, commanded to stand."""
     new = VelocityState()
     new.standing = 1
@@ -70,56 +70,56 @@ def begin_walk(view: RobotView, task: JumpState) -> VelocityState:
 
 
 @wp.func
-def begin_jump(view: RobotView, task: VelocityState) -> JumpState:
+def begin_jump(robot: RobotView, state: VelocityState) -> JumpState:
     """Return the state of a jump whose command has not come; that of the request is given at once."""
     new = JumpState()
-    new.heading = yaw_of(view.quat)
-    new.start = view.pos
-    new.goal = view.pos
-    new.goal_ground = view.pos[2] - view.height
-    new.max_height = view.pos[2]
+    new.heading = yaw_of(robot.quat)
+    new.start = robot.pos
+    new.goal = robot.pos
+    new.goal_ground = robot.pos[2] - robot.height
+    new.max_height = robot.pos[2]
     new.command_step = NEVER
     return new
 
 
 @wp.func
-def in_flight(view: RobotView, task: JumpState, requested: bool) -> bool:
+def in_flight(robot: RobotView, state: JumpState, requested: bool) -> bool:
     """A jump to turning: asked for, and in flight."""
-    return requested and task.phase == FLIGHT and task.phase_steps >= FREE_STEPS
+    return requested and state.phase == FLIGHT and state.phase_steps >= FREE_STEPS
 
 
 @wp.func
-def about_to_land(view: RobotView, task: AttitudeState, requested: bool) -> bool:
+def about_to_land(robot: RobotView, state: AttitudeState, requested: bool) -> bool:
     """Turning to the jump: down soon, or down."""
-    if view.contacts > 0:
+    if robot.contacts > 0:
         return True
-    if view.fall_acc <= 0.0 or view.lin_vel[2] > 0.0:
+    if robot.gravity_magnitude <= 0.0 or robot.lin_vel[2] > 0.0:
         return False
-    left = time_to_height(view.height, view.lin_vel[2], LANDING_HEIGHT, view.fall_acc)
-    return left < LANDING_TIME or view.height < LANDING_HEIGHT
+    left = time_to_height(robot.height, robot.lin_vel[2], LANDING_HEIGHT, robot.gravity_magnitude)
+    return left < LANDING_TIME or robot.height < LANDING_HEIGHT
 
 
 @wp.func
-def begin_turn(view: RobotView, task: JumpState) -> AttitudeState:
+def begin_turn(robot: RobotView, state: JumpState) -> AttitudeState:
     """Return the state of a turn that brings the robot level, in the heading of its jump."""
     new = AttitudeState()
-    new.jump_start = task.start
-    new.jump_goal = task.goal
-    new.goal_ground = task.goal_ground
-    new.max_height = task.max_height
-    return with_goal(new, view.quat, wp.quat_from_axis_angle(wp.vec3(0.0, 0.0, 1.0), task.heading))
+    new.jump_start = state.start
+    new.jump_goal = state.goal
+    new.goal_ground = state.goal_ground
+    new.max_height = state.max_height
+    return with_goal(new, robot.quat, wp.quat_from_axis_angle(wp.vec3(0.0, 0.0, 1.0), state.heading))
 
 
 @wp.func
-def begin_landing(view: RobotView, task: AttitudeState) -> JumpState:
+def begin_landing(robot: RobotView, state: AttitudeState) -> JumpState:
     """Return the state of the jump that turning was part of, in flight past its apex."""
     new = JumpState()
     new.phase = FLIGHT
-    new.start = task.jump_start
-    new.goal = task.jump_goal
-    new.goal_ground = task.goal_ground
-    new.heading = yaw_of(task.goal)
-    new.max_height = task.max_height
+    new.start = state.jump_start
+    new.goal = state.jump_goal
+    new.goal_ground = state.goal_ground
+    new.heading = yaw_of(state.goal)
+    new.max_height = state.max_height
     new.apex_passed = 1
     new.steps = 1
     return new

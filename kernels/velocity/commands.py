@@ -3,7 +3,7 @@
 import warp as wp
 
 from ..mdp.env import Scene
-from ..mdp.random import Draw, between, within
+from ..mdp.random import RngStream, uniform, uniform_range
 from ..mdp.view import RobotView
 from . import streams
 from .state import POLICY_RATE, VelocityState
@@ -36,24 +36,24 @@ def reach_of(ranges: CommandRanges, level: int) -> wp.vec4:
 
 
 @wp.func
-def draw_velocity(draw: Draw, ranges: CommandRanges, level: int) -> wp.vec3:
+def sample_velocity_command(rng: RngStream, ranges: CommandRanges, level: int) -> wp.vec3:
     """Return a command of a level.
 
     Beyond the first level, the faster it goes along x, the less far it reaches across and in turning: an ellipse
     between the largest reach along x and those of the level across it.
     """
-    kind = between(draw, streams.KIND, 0.0, 1.0)
+    kind = uniform(rng, streams.KIND, 0.0, 1.0)
     if kind < ranges.stand:
         return wp.vec3(0.0)
     reach = reach_of(ranges, level)
-    easy = level == 0 or between(draw, streams.NARROW, 0.0, 1.0) < ranges.narrow_share
+    easy = level == 0 or uniform(rng, streams.NARROW, 0.0, 1.0) < ranges.narrow_share
     if easy:
         reach = ranges.narrow
-    spin = between(draw, streams.TURN, -reach[3], reach[3])
+    spin = uniform(rng, streams.TURN, -reach[3], reach[3])
     if kind < ranges.stand + ranges.turn:
         return wp.vec3(0.0, 0.0, spin)
-    ahead = between(draw, streams.AHEAD, -reach[1], reach[0])
-    side = between(draw, streams.SIDE, -reach[2], reach[2])
+    ahead = uniform(rng, streams.AHEAD, -reach[1], reach[0])
+    side = uniform(rng, streams.SIDE, -reach[2], reach[2])
     if easy:
         return wp.vec3(ahead, side, spin)
     share = ahead / wp.where(ahead > 0.0, ranges.wide[0], ranges.wide[1])
@@ -62,9 +62,9 @@ def draw_velocity(draw: Draw, ranges: CommandRanges, level: int) -> wp.vec3:
 
 
 @wp.func
-def with_command(task: VelocityState, command: wp.vec3) -> VelocityState:
+def with_command(state: VelocityState, command: wp.vec3) -> VelocityState:
     """Return the state with a command that has just come."""
-    new = task
+    new = state
     new.command = command
     new.command_steps = 0
     new.standing = wp.where(wp.max(wp.abs(command)) < LEAST, 1, 0)
@@ -74,26 +74,30 @@ def with_command(task: VelocityState, command: wp.vec3) -> VelocityState:
 
 
 @wp.func
-def command_due(task: VelocityState) -> bool:
+def command_due(state: VelocityState) -> bool:
     """Return whether the command has lasted long enough."""
-    return task.command_lasts > 0 and task.command_steps >= task.command_lasts
+    return state.command_lasts > 0 and state.command_steps >= state.command_lasts
 
 
 @wp.func
-def draw_command(view: RobotView, scene: Scene, task: VelocityState, level: CommandRanges, draw: Draw) -> VelocityState:
+def draw_command(
+    robot: RobotView, scene: Scene, state: VelocityState, level: CommandRanges, rng: RngStream
+) -> VelocityState:
     """Return the state of an episode that goes on with a drawn command."""
-    new = with_command(task, draw_velocity(draw, level, task.command_level))
-    new.command_lasts = wp.max(int(within(draw, streams.LASTS, level.lasts)), 1)
+    new = with_command(state, sample_velocity_command(rng, level, state.command_level))
+    new.command_lasts = wp.max(int(uniform_range(rng, streams.LASTS, level.lasts)), 1)
     return new
 
 
 @wp.func
-def give_velocity(view: RobotView, scene: Scene, task: VelocityState, values: wp.vec4, heading: float) -> VelocityState:
+def give_velocity(
+    robot: RobotView, scene: Scene, state: VelocityState, values: wp.vec4, heading: float
+) -> VelocityState:
     """Command a velocity until another comes: ahead, to the left [m/s] and about z [rad/s], body axes.
 
     The fourth value is the gait's frequency [Hz], 0: as it was.
     """
-    new = with_command(task, wp.vec3(values[0], values[1], values[2]))
+    new = with_command(state, wp.vec3(values[0], values[1], values[2]))
     if values[3] > 0.0:
         new.pace = values[3] / POLICY_RATE
     new.command_lasts = 0

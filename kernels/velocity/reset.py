@@ -2,13 +2,13 @@
 
 import warp as wp
 
-from ..mdp.attempts import meet_attempts
+from ..mdp.attempts import sync_attempts
 from ..mdp.env import Scene, SkillSettings
-from ..mdp.random import Draw, between, within
+from ..mdp.random import RngStream, uniform, uniform_range
 from ..mdp.view import RobotArrays, base_pos
 from ..terrain.ground import rest_block
 from . import streams
-from .commands import CommandRanges, draw_velocity, with_command
+from .commands import CommandRanges, sample_velocity_command, with_command
 from .start_states import Map, VelocitySettings, write_start
 from .state import VelocityState, mean_error
 from .terminations import off_map
@@ -58,19 +58,19 @@ def carried_over(
 
 @wp.func
 def reset_velocity(
-    robot: RobotArrays, scene: Scene, skill: SkillSettings, old: VelocityState, settings: VelocitySettings,
-    level: CommandRanges, draw: Draw,
+    arrays: RobotArrays, scene: Scene, skill: SkillSettings, old: VelocityState, settings: VelocitySettings,
+    level: CommandRanges, rng: RngStream,
 ) -> VelocityState:  # fmt: skip
     """Begin an episode with a drawn command, and return its state."""
-    world = draw.world
-    new = carried_over(old, base_pos(robot, world), settings.tolerance, level.levels, settings.map.rows)
+    world = rng.world
+    new = carried_over(old, base_pos(arrays, world), settings.tolerance, level.levels, settings.map.rows)
     rest_block(scene.ground, world)
-    meet_attempts(draw)  # all have read where the base was
-    write_start(robot, scene, skill, settings, new.terrain_level, draw)
+    sync_attempts(rng)  # all have read where the base was
+    write_start(arrays, scene, skill, settings, new.terrain_level, rng)
     new.episode_steps = settings.episode_steps
     new.pace = settings.pace
-    new.phase = between(draw, streams.GAIT_PHASE, 0.0, 1.0)
+    new.phase = uniform(rng, streams.GAIT_PHASE, 0.0, 1.0)
     new.limit = map_limit(settings.map)
-    new = with_command(new, draw_velocity(draw, level, new.command_level))
-    new.command_lasts = wp.max(int(within(draw, streams.LASTS, level.lasts)), 1)
+    new = with_command(new, sample_velocity_command(rng, level, new.command_level))
+    new.command_lasts = wp.max(int(uniform_range(rng, streams.LASTS, level.lasts)), 1)
     return new

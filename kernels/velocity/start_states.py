@@ -10,10 +10,10 @@ from ..kinematics.inverse import LegLimits
 from ..layout import BODIES, COORDS
 from ..mdp.attempts import sample_valid_state
 from ..mdp.env import Scene, SkillSettings
-from ..mdp.random import Draw, between, within
-from ..mdp.reset import leg_limits, store_pose
-from ..mdp.starts import LegSample, leg_over_ground, leg_to, place_beside, turn_of
-from ..mdp.view import RobotArrays, turned
+from ..mdp.random import RngStream, uniform, uniform_range
+from ..mdp.reset import leg_limits, write_default_pose
+from ..mdp.starts import LegSample, leg_ik, quat_from_ypr, sample_foot_offset, with_foot_velocity
+from ..mdp.view import RobotArrays, rotate_yaw
 from ..terrain.ground import Ground, surface, world_ground
 from . import streams
 
@@ -76,80 +76,87 @@ class VelocityBase:
 
 
 @wp.func
-def draw_spot(draw: Draw, map: Map, level: int) -> wp.vec2:
+def sample_tile(rng: RngStream, map: Map, level: int) -> wp.vec2:
     """Return the middle of a tile [m] of a level, of any level past the last; the origin without a map."""
     if map.rows == 0:
         return wp.vec2(0.0)
     row = level
     if row >= map.rows:
-        row = wp.min(int(between(draw, streams.ROW, 0.0, float(map.rows))), map.rows - 1)
-    col = wp.min(int(between(draw, streams.COL, 0.0, float(map.cols))), map.cols - 1)
+        row = wp.min(int(uniform(rng, streams.ROW, 0.0, float(map.rows))), map.rows - 1)
+    col = wp.min(int(uniform(rng, streams.COL, 0.0, float(map.cols))), map.cols - 1)
     return wp.vec2(
         map.tile * (float(row) + 0.5 - 0.5 * float(map.rows)), map.tile * (float(col) + 0.5 - 0.5 * float(map.cols))
     )
 
 
 @wp.func
-def sample_base(start: VelocityStart, robot: RobotArrays, draw: Draw, attempt: int) -> VelocityBase:
+def sample_base(start: VelocityStart, arrays: RobotArrays, rng: RngStream, attempt: int) -> VelocityBase:
     """Return a base in motion around the start's spot."""
     settings = start.settings
     v = settings.lin_vel
     w = settings.ang_vel
-    roll = between(draw, streams.ROLL, -settings.tilt, settings.tilt)
-    pitch = between(draw, streams.PITCH, -settings.tilt, settings.tilt)
-    x = start.spot[0] + between(draw, streams.OFFSET_X, -settings.base_xy, settings.base_xy)
-    y = start.spot[1] + between(draw, streams.OFFSET_Y, -settings.base_xy, settings.base_xy)
+    roll = uniform(rng, streams.ROLL, -settings.tilt, settings.tilt)
+    pitch = uniform(rng, streams.PITCH, -settings.tilt, settings.tilt)
+    x = start.spot[0] + uniform(rng, streams.OFFSET_X, -settings.base_xy, settings.base_xy)
+    y = start.spot[1] + uniform(rng, streams.OFFSET_Y, -settings.base_xy, settings.base_xy)
     base = VelocityBase()
-    base.quat = turn_of(start.heading, pitch, roll)
-    base.pos = wp.vec3(x, y, surface(start.ground, x, y)[0] + within(draw, streams.HEIGHT, settings.height))
+    base.quat = quat_from_ypr(start.heading, pitch, roll)
+    base.pos = wp.vec3(x, y, surface(start.ground, x, y)[0] + uniform_range(rng, streams.HEIGHT, settings.height))
     base.lin_vel = wp.vec3(
-        between(draw, streams.LIN_VEL, -v, v),
-        between(draw, streams.LIN_VEL + 1, -v, v),
-        0.3 * between(draw, streams.LIN_VEL + 2, -v, v),
+        uniform(rng, streams.LIN_VEL, -v, v),
+        uniform(rng, streams.LIN_VEL + 1, -v, v),
+        0.3 * uniform(rng, streams.LIN_VEL + 2, -v, v),
     )
     base.body_rate = wp.vec3(
-        between(draw, streams.ANG_VEL, -w, w),
-        between(draw, streams.ANG_VEL + 1, -w, w),
-        between(draw, streams.ANG_VEL + 2, -w, w),
+        uniform(rng, streams.ANG_VEL, -w, w),
+        uniform(rng, streams.ANG_VEL + 1, -w, w),
+        uniform(rng, streams.ANG_VEL + 2, -w, w),
     )
     base.ang_vel = wp.quat_rotate(base.quat, base.body_rate)
-    base.com_vel = base.lin_vel + wp.cross(base.ang_vel, wp.quat_rotate(base.quat, robot.body_com[draw.world * BODIES]))
+    base.com_vel = base.lin_vel + wp.cross(base.ang_vel, wp.quat_rotate(base.quat, arrays.body_com[rng.world * BODIES]))
     return base
 
 
 @wp.func
-def sample_leg(start: VelocityStart, base: VelocityBase, geo: LegGeometry, draw: Draw, leg: int) -> LegSample:
+def sample_leg(start: VelocityStart, base: VelocityBase, geo: LegGeometry, rng: RngStream, leg: int) -> LegSample:
     """Return a leg; its paw rests on the ground, or is in the air in a share of draws."""
     settings = start.settings
-    beside = place_beside(draw, leg, settings.front_x, settings.front_y, settings.back_x, settings.back_y)
-    paw = base.pos + turned(beside, start.heading)
-    lifted = between(draw, streams.LIFTED + leg, 0.0, 1.0) < settings.lifted_share
+    beside = sample_foot_offset(rng, leg, settings.front_x, settings.front_y, settings.back_x, settings.back_y)
+    paw = base.pos + rotate_yaw(beside, start.heading)
+    lifted = uniform(rng, streams.LIFTED + leg, 0.0, 1.0) < settings.lifted_share
     up = float(0.0)
     if lifted:
-        up = between(draw, streams.LIFT + leg, 0.01, settings.lift)
+        up = uniform(rng, streams.LIFT + leg, 0.01, settings.lift)
     paw[2] = surface(start.ground, paw[0], paw[1])[0] + geo.paw_radius + up
     ankle = wp.quat_rotate_inv(base.quat, paw - base.pos)
-    found = leg_to(geo, start.limits, ankle)
+    found = leg_ik(geo, start.limits, ankle)
     if lifted:
         return found
-    return leg_over_ground(geo, found, -wp.quat_rotate_inv(base.quat, base.lin_vel) - wp.cross(base.body_rate, ankle))
+    return with_foot_velocity(
+        geo, found, -wp.quat_rotate_inv(base.quat, base.lin_vel) - wp.cross(base.body_rate, ankle)
+    )
 
 
 @wp.func
 def write_start(
-    robot: RobotArrays, scene: Scene, skill: SkillSettings, settings: VelocitySettings, terrain_level: int, draw: Draw
+    arrays: RobotArrays,
+    scene: Scene,
+    skill: SkillSettings,
+    settings: VelocitySettings,
+    terrain_level: int,
+    rng: RngStream,
 ):
     """Write a start state to a world: a sampled one, or in a share of draws the default pose."""
-    world = draw.world
+    world = rng.world
     start = VelocityStart()
-    start.spot = draw_spot(draw, settings.map, terrain_level)
-    start.heading = between(draw, streams.HEADING, -settings.heading, settings.heading)
+    start.spot = sample_tile(rng, settings.map, terrain_level)
+    start.heading = uniform(rng, streams.HEADING, -settings.heading, settings.heading)
     start.settings = settings
     start.limits = leg_limits(skill.command_filter)
     start.ground = world_ground(scene.ground, world)
-    if between(draw, streams.DEFAULT_POSE, 0.0, 1.0) >= settings.default_share:
-        if sample_valid_state(sample_base, sample_leg, start, robot, scene, draw):
+    if uniform(rng, streams.DEFAULT_POSE, 0.0, 1.0) >= settings.default_share:
+        if sample_valid_state(sample_base, sample_leg, start, arrays, scene, rng):
             return
-    store_pose(robot, scene, world, start.heading, surface(start.ground, start.spot[0], start.spot[1])[0])
-    robot.joint_q[world * COORDS] = start.spot[0]
-    robot.joint_q[world * COORDS + 1] = start.spot[1]
+    write_default_pose(arrays, scene, world, start.heading, surface(start.ground, start.spot[0], start.spot[1])[0])
+    arrays.joint_q[world * COORDS] = start.spot[0]
+    arrays.joint_q[world * COORDS + 1] = start.spot[1]

@@ -43,69 +43,69 @@ class VelocityState:
 
 
 @wp.func
-def velocity_error(view: RobotView, task: VelocityState) -> wp.vec3:
+def velocity_error(robot: RobotView, state: VelocityState) -> wp.vec3:
     """Return velocity less command: ahead [m/s], to the left [m/s], about z [rad/s], body axes."""
-    vel = wp.quat_rotate_inv(view.quat, view.lin_vel)
-    return wp.vec3(vel[0] - task.command[0], vel[1] - task.command[1], view.ang_vel[2] - task.command[2])
+    vel = wp.quat_rotate_inv(robot.quat, robot.lin_vel)
+    return wp.vec3(vel[0] - state.command[0], vel[1] - state.command[1], robot.ang_vel[2] - state.command[2])
 
 
 @wp.func
-def follow_steps(view: RobotView, task: VelocityState) -> VelocityState:
+def follow_steps(robot: RobotView, state: VelocityState) -> VelocityState:
     """Return the state with the paws' steps taken in: how many there were lately, and how high the paws went."""
-    t = task
+    t = state
     for k in range(4):
-        came_down = view.first_contact[k]
-        oldest = (task.recent[k] >> wp.int64(44)) & wp.int64(1)
-        kept = (task.recent[k] << wp.int64(1)) & wp.int64(35184372088831)  # 2^45 - 1
+        came_down = robot.first_contact[k]
+        oldest = (state.recent[k] >> wp.int64(44)) & wp.int64(1)
+        kept = (state.recent[k] << wp.int64(1)) & wp.int64(35184372088831)  # 2^45 - 1
         t.recent[k] = kept | wp.int64(came_down)
-        t.recent_steps[k] = task.recent_steps[k] + came_down - float(oldest)
-        if came_down > 0.0 and task.standing == 0:
+        t.recent_steps[k] = state.recent_steps[k] + came_down - float(oldest)
+        if came_down > 0.0 and state.standing == 0:
             t.touchdowns = t.touchdowns + 0.25
-            t.apexes = t.apexes + 0.25 * task.swing_height[k]
-        t.swing_height[k] = wp.where(view.contact[k] > 0.0, 0.0, wp.max(task.swing_height[k], view.paw_height[k]))
+            t.apexes = t.apexes + 0.25 * state.swing_height[k]
+        t.swing_height[k] = wp.where(robot.contact[k] > 0.0, 0.0, wp.max(state.swing_height[k], robot.paw_height[k]))
     return t
 
 
 @wp.func
-def advance_velocity(view: RobotView, task: VelocityState, settle: float) -> VelocityState:
+def advance_velocity(robot: RobotView, state: VelocityState, settle: float) -> VelocityState:
     """Return the state one policy step later; errors count from `settle` policy steps after a command on."""
-    t = follow_steps(view, task)
-    t.steps = task.steps + 1
-    t.command_steps = task.command_steps + 1
-    phase = task.phase + task.pace
+    t = follow_steps(robot, state)
+    t.steps = state.steps + 1
+    t.command_steps = state.command_steps + 1
+    phase = state.phase + state.pace
     t.phase = phase - wp.floor(phase)
-    t.all_steps = task.all_steps + 1.0
-    t.minutes = task.minutes + 1.0 / (60.0 * POLICY_RATE)
-    if task.standing == 0:
-        t.seconds_walking = task.seconds_walking + 1.0 / POLICY_RATE
-    error = velocity_error(view, task)
+    t.all_steps = state.all_steps + 1.0
+    t.minutes = state.minutes + 1.0 / (60.0 * POLICY_RATE)
+    if state.standing == 0:
+        t.seconds_walking = state.seconds_walking + 1.0 / POLICY_RATE
+    error = velocity_error(robot, state)
     xy = wp.length(wp.vec2(error[0], error[1]))
     yaw = wp.abs(error[2])
     if t.command_steps > int(settle) and xy < ABSURD and yaw < ABSURD:  # both false if not a number
-        speed = wp.length(wp.vec2(task.command[0], task.command[1])) + 0.3 * wp.abs(task.command[2])
-        t.error_xy = task.error_xy + xy
-        t.error_yaw = task.error_yaw + yaw
-        t.settled = task.settled + 1.0
-        t.sum_xy = task.sum_xy + xy
-        t.sum_yaw = task.sum_yaw + yaw
-        t.sum_settled = task.sum_settled + 1.0
-        t.score = task.score + (speed - 2.0 * (xy + 0.3 * yaw)) * (1.0 + 0.1 * float(task.terrain_level))
+        speed = wp.length(wp.vec2(state.command[0], state.command[1])) + 0.3 * wp.abs(state.command[2])
+        t.error_xy = state.error_xy + xy
+        t.error_yaw = state.error_yaw + yaw
+        t.settled = state.settled + 1.0
+        t.sum_xy = state.sum_xy + xy
+        t.sum_yaw = state.sum_yaw + yaw
+        t.sum_settled = state.sum_settled + 1.0
+        t.score = state.score + (speed - 2.0 * (xy + 0.3 * yaw)) * (1.0 + 0.1 * float(state.terrain_level))
     return t
 
 
 @wp.func
-def mean_error(task: VelocityState) -> float:
+def mean_error(state: VelocityState) -> float:
     """Return the episode's mean error [m/s]: of the velocity in the plane, and 0.3 m of that of the yaw rate."""
-    return (task.error_xy + 0.3 * task.error_yaw) / wp.max(task.settled, 1.0)
+    return (state.error_xy + 0.3 * state.error_yaw) / wp.max(state.settled, 1.0)
 
 
 @wp.func
-def tracking_error(view: RobotView, task: VelocityState) -> float:
+def tracking_error(robot: RobotView, state: VelocityState) -> float:
     """Mean error of the episode [m/s]."""
-    return mean_error(task)
+    return mean_error(state)
 
 
 @wp.func
-def every_episode(task: VelocityState) -> bool:
+def every_episode(state: VelocityState) -> bool:
     """Return true: all episodes count."""
     return True

@@ -7,9 +7,9 @@ from .state import VelocityState
 
 
 @wp.func
-def finished(view: RobotView, task: VelocityState) -> bool:
+def finished(robot: RobotView, state: VelocityState) -> bool:
     """The episode has lasted as long as it should."""
-    return task.episode_steps > 0 and task.steps >= task.episode_steps
+    return state.episode_steps > 0 and state.steps >= state.episode_steps
 
 
 @wp.func
@@ -19,6 +19,6 @@ def off_map(pos: wp.vec3, limit: wp.vec2) -> bool:
 
 
 @wp.func
-def left_map(view: RobotView, task: VelocityState) -> bool:
+def left_map(robot: RobotView, state: VelocityState) -> bool:
     """The base comes near the edge of the map."""
-    return off_map(view.pos, task.limit)
+    return off_map(robot.pos, state.limit)

@@ -40,13 +40,13 @@ from jumper_warp.kernels.mdp.view import RobotView
 
 
 @wp.func
-def rest(view: RobotView, task: Any, height: float) -> float:
+def rest(robot: RobotView, state: Any, height: float) -> float:
     """Base height over a height [m]."""
     return view.height / height
 
 
 @wp.func
-def strange(view: RobotView, task: Any) -> float:
+def strange(robot: RobotView, state: Any) -> float:
     """What the critic sees: one."""
     return 1.0
 
@@ -59,7 +59,7 @@ def slow(robot: RobotParameters, draw: Draw, lower: float, upper: float):
 
 
 @wp.func
-def too_high(view: RobotView, task: Any, height: float) -> bool:
+def too_high(robot: RobotView, state: Any, height: float) -> bool:
     """The base is above a height [m]."""
     return view.height > height
 

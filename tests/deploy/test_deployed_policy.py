@@ -89,7 +89,7 @@ def test_observations_actions_and_targets_are_those_of_the_environment(page, nam
         env.step(expected)
         assert deployed.action is action  # what it will see as its last
         deployed.action = expected[0].numpy()  # in flight a policy may make more of what its last actions were off by
-        theirs = env.robot.safe_target.numpy()[:, 0]
+        theirs = env.robot.filtered_target.numpy()[:, 0]
         pairs = ((seen, own), (action, expected[0].numpy()), (safe, theirs))
         off = np.maximum(off, [np.abs(a - b).max() for a, b in pairs])
     assert env.task_arrays()["phase"][0] == 2 and (command.wanted, command.in_flight) == (False, False)

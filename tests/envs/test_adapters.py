@@ -111,7 +111,12 @@ def test_gymnasium_gets_copies(tensors):
         *values, step_infos = envs.step(action)
         given += values
         infos = step_infos or infos
-    given += [infos["_final_obs"], infos["_final_info"], infos["final_info"]["ending"], infos["final_info"]["_ending"]]
+    given += [
+        infos["_final_obs"],
+        infos["_final_info"],
+        infos["final_info"]["termination"],
+        infos["final_info"]["_ending"],
+    ]
     given += [infos["final_obs"]] if tensors else [row for row in infos["final_obs"] if row is not None]
     shown = [value.clone() if tensors else value.copy() for value in given]
     played(envs, actions[13:])
@@ -174,7 +179,7 @@ def test_final_infos_tell_why_an_episode_ended():
     for _, _, terminated, truncated, infos in played(envs):
         for world in np.flatnonzero(terminated | truncated):
             assert infos["_final_info"][world] and infos["final_info"]["_ending"][world]
-            name = envs.endings[infos["final_info"]["ending"][world]]
+            name = envs.endings[infos["final_info"]["termination"][world]]
             assert (name in ("too_long", "success")) == truncated[world]
             seen.add(name)
     assert {"too_long", "tilted"} <= seen
@@ -196,17 +201,17 @@ def test_tensors_are_what_arrays_are():
             for group in ("policy", "critic"):
                 np.testing.assert_array_equal(infos["final_obs"][world][group], other_infos["final_obs"][group][world])
         if "final_info" in infos:
-            np.testing.assert_array_equal(infos["final_info"]["ending"], other_infos["final_info"]["ending"])
+            np.testing.assert_array_equal(infos["final_info"]["termination"], other_infos["final_info"]["termination"])
 
 
 def test_statistics_of_a_wrapper_are_those_counted_by_hand():
-    plain, envs = GymVectorEnv(jumper(seed=4)), RecordEpisodeStatistics(GymVectorEnv(jumper(seed=4)))
-    plain.reset()
+    parameterless, envs = GymVectorEnv(jumper(seed=4)), RecordEpisodeStatistics(GymVectorEnv(jumper(seed=4)))
+    parameterless.reset()
     envs.reset()
     returns, lengths = np.zeros(N), np.zeros(N, dtype=int)
     expected = []
     for action in ACTIONS:
-        _, reward, terminated, truncated, _ = plain.step(action)
+        _, reward, terminated, truncated, _ = parameterless.step(action)
         *_, infos = envs.step(action)
         returns += reward
         lengths += 1
@@ -237,7 +242,7 @@ def test_a_seed_makes_what_a_new_environment_of_it_makes(redraw):
     envs, new = (GymVectorEnv(jumper(task=task, seed=seed)) for seed in (1, 5))
     envs.reset()
     played(envs)
-    envs.env.worlds.level.fill_(2)  # as if the curriculum had gone on
+    envs.env.episodes.level.fill_(2)  # as if the curriculum had gone on
     np.testing.assert_array_equal(envs.reset(seed=5)[0], new.reset()[0])
     assert_same(played(envs), played(new))
     np.testing.assert_array_equal(envs.reset()[0], new.reset()[0])
@@ -246,11 +251,11 @@ def test_a_seed_makes_what_a_new_environment_of_it_makes(redraw):
 def test_a_seed_brings_every_world_back_to_its_first_task():
     env = jumper(2, task=[TASK, dataclasses.replace(TASK, name="other")], skill=np.array([1, 0]))
     env.reset()
-    env.worlds.skill.zero_()
-    env.request(1)
+    env.episodes.skill.zero_()
+    env.requested_task(1)
     env.reset(seed=5)
-    assert env.worlds.skill.numpy().tolist() == [1, 0]
-    assert env.worlds.request.numpy().tolist() == [-1, -1]
+    assert env.episodes.skill.numpy().tolist() == [1, 0]
+    assert env.episodes.requested_task.numpy().tolist() == [-1, -1]
 
 
 def test_seeds_reproduce_and_differ():
@@ -345,14 +350,14 @@ def test_rsl_rl_trains_on_the_environment(one_thread):
     env = jumper()
     adapter = RslRlVecEnv(env, metrics_every=SMALL.num_steps)
     adapter.reset()
-    before = env.worlds.clock.numpy().copy()
+    before = env.episodes.step_count.numpy().copy()
     runner = OnPolicyRunner(adapter, rsl_rl_config(SMALL, 100, 0), log_dir=None, device="cpu")
     old = [p.detach().clone() for p in runner.alg.actor.parameters()]
     runner.learn(2, init_at_random_ep_len=True)
     new = list(runner.alg.actor.parameters())
     assert all(p.isfinite().all() for p in new)
     assert any(not torch.equal(a, b) for a, b in zip(old, new, strict=True))
-    assert (env.worlds.clock.numpy() - before == 2 * SMALL.num_steps).all()
+    assert (env.episodes.step_count.numpy() - before == 2 * SMALL.num_steps).all()
 
 
 def test_rsl_rl_bootstraps_time_outs_but_not_failures(one_thread):

@@ -37,7 +37,7 @@ def env():
     return Env(task, N, seed=3, device="cpu", randomize=False, noise=False)
 
 
-def turned(quat, goal):
+def rotate_yaw(quat, goal):
     """Return the rotations from orientations to goals, body axes."""
     return Rotation.from_quat(quat).inv() * Rotation.from_quat(goal)
 
@@ -45,7 +45,7 @@ def turned(quat, goal):
 def test_episodes_begin_afloat_at_rest_in_any_attitude_with_a_turn_of_the_level(env):
     env.reset()
     arrays, q = env.task_arrays(), env.sim.joint_q()
-    angle = turned(arrays["base_quat"], arrays["goal"]).magnitude() / DEG
+    angle = rotate_yaw(arrays["base_quat"], arrays["goal"]).magnitude() / DEG
     assert angle.min() > 20.0 - 1e-3 and angle.max() < 90.0 + 1e-3 and angle.std() > 10.0
     np.testing.assert_allclose(arrays["error"], angle * DEG, atol=1e-5)
     up = Rotation.from_quat(arrays["base_quat"]).apply([0.0, 0.0, 1.0])
@@ -64,7 +64,7 @@ def test_the_policy_sees_the_rotation_that_is_left(env):
     obs = env.reset()[0]["policy"].numpy()
     arrays = env.task_arrays()
     first, end = env.task.layout("policy")["turn_left"]
-    expected = turned(arrays["base_quat"], arrays["goal"]).as_quat(canonical=True)
+    expected = rotate_yaw(arrays["base_quat"], arrays["goal"]).as_quat(canonical=True)
     np.testing.assert_allclose(obs[:, first:end], expected, atol=1e-5)
     mirror = mirror_of(env.task, "policy")
     flip = np.diag([1.0, -1.0, 1.0])
@@ -87,7 +87,7 @@ def test_an_episode_succeeds_within_tolerance_and_without_touching(env):
         step = env.step(action)
     assert step.truncated.all() and not step.terminated.any()
     names = [term.name for term in env.task.terminations]
-    ends = [names[i] for i in env.worlds.ending.numpy()]
+    ends = [names[i] for i in env.episodes.termination.numpy()]
     assert ends[2] == "ended" and ends.count("ended_clear") == N - 1
     metrics = env.metrics()
     assert metrics["Metrics/success"] == pytest.approx((N - 2) / N)
@@ -132,7 +132,7 @@ def test_leg_motions_turn_the_robot_but_give_it_no_momentum(env):
         action = np.array([stroke(i / 60.0 * sign) for sign in backward])
         env.step(torch.tensor(action, dtype=torch.float32))
         drift.append(np.linalg.norm(momentum(env.sim)[1], axis=1))
-    angle = turned(start, env.task_arrays()["base_quat"]).as_euler("YXZ", degrees=True)[:, 0]
+    angle = rotate_yaw(start, env.task_arrays()["base_quat"]).as_euler("YXZ", degrees=True)[:, 0]
     assert (angle * backward).max() < -15.0
     assert np.max(drift) < 1.0e-5  # 0.010 kg m^2/s without the correction
 

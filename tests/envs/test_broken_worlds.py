@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from jump_helpers import edit_coordinates, edit_episodes, ending_names, make_env, only
-from jumper_warp.envs.arrays import FIRST_CLOCK
+from jumper_warp.envs.arrays import FIRST_STEP_COUNT
 from jumper_warp.kernels.jump.state import LANDED
 from jumper_warp.registry import make_task
 
@@ -48,11 +48,11 @@ SUCCEEDING = {"phase": LANDED, "phase_steps": 100}
 )
 def test_a_world_that_came_apart_ends_at_once_and_touches_no_other(env, case, episode):
     outcomes = []
-    for broken in (False, True):
-        env.worlds.clock.fill_(FIRST_CLOCK)  # the same draws
+    for diverged in (False, True):
+        env.episodes.step_count.fill_(FIRST_STEP_COUNT)  # the same draws
         env.reset()
         edit_episodes(env, command_step=1000)
-        if broken:
+        if diverged:
             edit_coordinates(env, 9, **BROKEN[case])
             edit_episodes(env, 9, **episode)
         env.step(REST)
@@ -72,7 +72,7 @@ def test_a_world_that_came_apart_ends_at_once_and_touches_no_other(env, case, ep
 def test_an_action_that_is_not_finite_is_counted_and_ends_its_world_only(env, value):
     outcomes = []
     for wrong in (0.0, value):
-        env.worlds.clock.fill_(FIRST_CLOCK)
+        env.episodes.step_count.fill_(FIRST_STEP_COUNT)
         env.reset()
         edit_episodes(env, command_step=1000)
         env.metrics()

@@ -143,8 +143,8 @@ def test_the_next_jump_of_an_evaluation_knows_the_ground_at_its_goal(landed):
 
 
 def test_another_jump_of_an_episode_knows_the_ground_at_its_goal(landed):
-    edit_episodes(landed, again_step=5, level=4)
-    landed._begin(landed._part(), landed.worlds.done)
+    edit_episodes(landed, next_jump_step=5, level=4)
+    landed._begin(landed._part(), landed.episodes.done)
     found = landed.task_arrays()
     assert (found["phase"] == STANCE).all() and (found["jumps"] == 1).all() and not landed.done.any()
     np.testing.assert_allclose(found["goal_ground"], on_block(found["goal"]), atol=1e-6)

@@ -33,9 +33,9 @@ STRETCH = torch.tensor([0.0, -1.0, -1.0] * 4).repeat(N, 1)
 
 
 @wp.func
-def my_own_term(view: RobotView, task: JumpState, scale: float) -> float:
+def my_own_term(robot: RobotView, state: JumpState, scale: float) -> float:
     """Height of the base times a scale."""
-    return scale * view.pos[2]
+    return scale * robot.pos[2]
 
 
 def stand(env: Env, **fields) -> None:
@@ -69,7 +69,7 @@ def rollout():
         expected.append(expected_terms(TASK, before, after, action.clamp(-1.0, 1.0).numpy().T))
         rewarded.append(env.reward.clone().numpy())
         phases.append(after["phase"])
-        env._begin(env._part(), wp.clone(env.worlds.done))
+        env._begin(env._part(), wp.clone(env.episodes.done))
     return np.array(logged), np.array(expected), np.array(rewarded), np.array(phases)
 
 
@@ -96,16 +96,16 @@ ENDING_CASES = {
 }
 
 
-@pytest.mark.parametrize("ending", ENDING_CASES)
-def test_a_termination_ends_the_episode(env, ending):
+@pytest.mark.parametrize("termination", ENDING_CASES)
+def test_a_termination_ends_the_episode(env, termination):
     stand(env, command_step=1000)
-    edit_episodes(env, 3, **ENDING_CASES[ending])
-    if ending == "low_base":
+    edit_episodes(env, 3, **ENDING_CASES[termination])
+    if termination == "low_base":
         edit_coordinates(env, 3, q={2: 0.05})
     env.step(REST)
-    assert ending_names(env) == ["" if world != 3 else ending for world in range(N)]
+    assert ending_names(env) == ["" if world != 3 else termination for world in range(N)]
     assert env.done.tolist() == [float(world == 3) for world in range(N)]
-    without_failure = ending in ("success", "too_long")
+    without_failure = termination in ("success", "too_long")
     assert env.timeout.tolist() == [float(world == 3 and without_failure) for world in range(N)]
 
 
@@ -114,7 +114,7 @@ def test_counters_are_means_of_the_episodes_that_ended(env):
     env.metrics()
     edit_episodes(env, slice(0, 3), phase=LANDED, phase_steps=59, max_height=0.8, goal=(0.0, 0.0, 0.77))
     edit_episodes(env, slice(3, 7), steps=200, command_step=0)
-    edit_episodes(env, slice(7, 9), phase=LANDED, phase_steps=59, scheme=4)  # begun just landed: not counted
+    edit_episodes(env, slice(7, 9), phase=LANDED, phase_steps=59, start_mode=4)  # begun just landed: not counted
     env.step(REST)
     total = env.skills[0].term_value.numpy().sum(axis=1)
     figures = env.metrics()
@@ -140,11 +140,11 @@ def finish(env, worlds, success: bool) -> None:
     assert env.done[worlds].all()
 
 
-@pytest.mark.parametrize("scheme", [2, 3, 4])
+@pytest.mark.parametrize("start_mode", [2, 3, 4])
 @pytest.mark.parametrize("success", [True, False])
-def test_other_starts_do_not_count_for_the_curriculum(env, scheme, success):
+def test_other_starts_do_not_count_for_the_curriculum(env, start_mode, success):
     stand(env, level=1, streak=3, command_step=1000)
-    edit_episodes(env, [0], scheme=scheme)
+    edit_episodes(env, [0], start_mode=start_mode)
     finish(env, [0], success)
     assert (episodes_of(env)["level"][0], episodes_of(env)["streak"][0]) == (1, 3)
 
@@ -182,7 +182,7 @@ def test_a_new_episode_leaves_other_worlds_alone():
         assert torch.equal(getattr(one, name)[rest], getattr(other, name)[rest]), name
     np.testing.assert_array_equal(one.sim.joint_q()[rest], other.sim.joint_q()[rest])
     np.testing.assert_array_equal(one.sim.joint_qd()[rest], other.sim.joint_qd()[rest])
-    np.testing.assert_array_equal(one.worlds.clock.numpy()[rest], other.worlds.clock.numpy()[rest])
+    np.testing.assert_array_equal(one.episodes.step_count.numpy()[rest], other.episodes.step_count.numpy()[rest])
     for name, values in drawn_of(one).items():
         np.testing.assert_array_equal(values[..., rest], drawn_of(other)[name][..., rest], err_msg=name)
     assert (one.skills[0].states.numpy()[rest] == other.skills[0].states.numpy()[rest]).all()
@@ -213,13 +213,13 @@ def test_a_new_episode_forgets_the_old_one():
     arrays, robot = env.task_arrays(), env.robot
     for name in ("steps", "phase", "phase_steps", "idle_steps", "took_off", "touched_down", "at_apex", "apex_passed"):
         assert not arrays[name].any(), name
-    for name in ("action", "old_action", "older_action", "old_rate", "torque", "old_torque", "paw_force", "impulse",
-                 "contact_time", "air_time", "touchdown_speed", "peak_force", "old_lin_vel"):  # fmt: skip
+    for name in ("action", "prev_action", "prev_prev_action", "prev_rate", "torque", "prev_torque", "paw_force",
+                 "impulse", "contact_time", "air_time", "touchdown_speed", "peak_force", "prev_lin_vel"):  # fmt: skip
         assert not getattr(robot, name).numpy().any(), name
     assert not env.obs[:, -12:].any() and env.final_obs[:, -12:].any()
     angles = env.sim.joint_q()[:, 7:27].reshape(N, 4, 5)[:, :, [0, 1, 3]].reshape(N, 12)
-    np.testing.assert_array_equal(robot.safe_target.numpy().T, angles)
-    np.testing.assert_array_equal(env.delays.past_target.numpy(), np.broadcast_to(angles.T, (8, 12, N)))
+    np.testing.assert_array_equal(robot.filtered_target.numpy().T, angles)
+    np.testing.assert_array_equal(env.delays.target_history.numpy(), np.broadcast_to(angles.T, (8, 12, N)))
 
 
 def test_commands_of_a_measurement_may_come_one_by_one(env):

@@ -182,7 +182,7 @@ def test_a_state_that_does_not_fit_is_refused_and_nothing_changes(change, messag
         ("env.level", 2**31 - 1, "saved env.level must be at most [1-9], got 2147483647"),
         ("env.skill", 1, "saved env.skill must be at most 0, got 1"),
         ("env.skill", -1, "saved env.skill must not be below 0, got -1"),
-        ("env.clock", 0, "saved env.clock must not be below 16, got 0"),
+        ("env.step_count", 0, "saved env.clock must not be below 16, got 0"),
         ("parameters.latency", 49, "saved parameters.latency must be at most 48, got 49"),
         ("parameters.observation_latency", -1, "saved parameters.observation_latency must not be below 0, got -1"),
     ],

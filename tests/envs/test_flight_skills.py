@@ -28,7 +28,7 @@ def flown():
         env.step(torch.stack([action, torch.zeros(N, 12)]))
         turn, jump = (env.skills[skill].states.numpy().copy() for skill in (TURN, JUMP))
         height, rise = env.sim.joint_q()[:, 2].copy(), env.sim.joint_qd()[:, 2].copy()
-        seen.append((env.worlds.skill.numpy().copy(), turn, jump, height, rise))
+        seen.append((env.episodes.skill.numpy().copy(), turn, jump, height, rise))
         if flights.follow(env):
             break
     return env, flights, seen

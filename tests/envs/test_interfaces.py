@@ -165,7 +165,7 @@ def test_worlds_that_are_none_are_refused(env, worlds, message):
     commands = np.zeros((N, 3))
     refused(env, message, env.evaluation_reset, commands, 0.0, worlds)
     refused(env, message, env.command, commands, worlds)
-    refused(env, message, env.request, 0, worlds)
+    refused(env, message, env.requested_task, 0, worlds)
 
 
 @pytest.mark.parametrize(("headings", "message"), WRONG_HEADINGS)
@@ -317,7 +317,7 @@ def test_a_number_of_a_term_may_change_in_captured_steps():
     np.testing.assert_allclose(env.skills[0].term_value.numpy()[index], 2.0 * before[index], rtol=1e-3)
     env.skills[0].set("terminations", "low_base", height=10.0)
     env.step(REST)
-    assert env.done.all() and [TASK.terminations[i].name for i in env.worlds.ending.numpy()] == ["low_base"] * N
+    assert env.done.all() and [TASK.terminations[i].name for i in env.episodes.termination.numpy()] == ["low_base"] * N
 
 
 @pytest.mark.parametrize(
@@ -346,7 +346,7 @@ def test_a_number_that_is_none_is_refused(env, name, value, message):
 def test_some_worlds_may_begin_anew(worlds):
     env, chosen = make_env(N, noise=True, randomize=True, seed=3), np.isin(np.arange(N), (1, 5))
     env.reset()
-    env.worlds.level.fill_(2)
+    env.episodes.level.fill_(2)
     for action in 0.1 * random_actions(N, 4):
         env.step(action)
     before, motions, kept = env.task_arrays(), env.sim.joint_q().copy(), env.obs.clone()

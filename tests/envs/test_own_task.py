@@ -84,7 +84,7 @@ def test_its_state_settings_and_levels_are_its_own():
     going_on = env.done.numpy() == 0.0
     assert going_on.sum() > 32 and (found["steps"][going_on] == 30).all()
     assert not found["age"][going_on].any() and (found["goal"] != states["goal"])[going_on].all()  # commanded anew
-    env.worlds.level.fill_(1)
+    env.episodes.level.fill_(1)
     env.reset()
     assert states_of(env)["goal"].min() < 0.22
 
@@ -112,13 +112,15 @@ def test_its_terminations_and_curriculum_are_its_own():
     height = env.sim.joint_q()[0, 2]
     edit(env, 0, near=99, goal=height)
     edit(env, 1, steps=119, goal=height + 0.2)
-    env.worlds.streak.fill_(1)
+    env.episodes.streak.fill_(1)
     env.step(torch.zeros((N, 12)))
     names = [term.name for term in env.task.terminations]
-    assert [names[i] if i >= 0 else "" for i in env.worlds.ending.numpy()] == ["held", "too_long"] + [""] * (N - 2)
+    assert [names[i] if i >= 0 else "" for i in env.episodes.termination.numpy()] == ["held", "too_long"] + [""] * (
+        N - 2
+    )
     assert env.timeout.tolist() == [1.0, 1.0] + [0.0] * (N - 2)
-    assert env.worlds.level.numpy().tolist() == [1] + [0] * (N - 1)
-    assert env.worlds.streak.numpy().tolist() == [0, 0] + [1] * (N - 2)
+    assert env.episodes.level.numpy().tolist() == [1] + [0] * (N - 1)
+    assert env.episodes.streak.numpy().tolist() == [0, 0] + [1] * (N - 2)
     assert (states_of(env)["goal"][2:] == goal[2:]).all()
     assert env.metrics()["Metrics/success"] == 0.5
 

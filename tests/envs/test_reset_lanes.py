@@ -17,7 +17,7 @@ def reset_by(env, lanes):
     skill = env.skills[0]
     env.sim.state.joint_q.assign(np.tile(env.sim.model.joint_q.numpy()[:43], N))
     skill.states.zero_()
-    inputs = [skill.index, lanes, env._all, env._scene, env._settings, skill.settings, skill.levels, env.worlds,
+    inputs = [skill.index, lanes, env._all, env._scene, env._settings, skill.settings, skill.levels, env.episodes,
               skill.states, env.robot]  # fmt: skip
     wp.launch(skill.kernels["reset"], (N, lanes), inputs, device="cpu", block_dim=max(lanes, 1))
     return env.sim.joint_q(), env.sim.joint_qd(), skill.states.numpy().copy()

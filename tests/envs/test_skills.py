@@ -27,13 +27,13 @@ SKILL = np.arange(N) % 3 == 1
 
 
 @wp.func
-def always(view: RobotView, task: HoldState, requested: bool) -> bool:
+def always(robot: RobotView, state: HoldState, requested: bool) -> bool:
     return True
 
 
 @wp.func
-def go_on_holding(view: RobotView, task: HoldState) -> HoldState:
-    return task
+def go_on_holding(robot: RobotView, state: HoldState) -> HoldState:
+    return state
 
 
 TO_JUMP = Handover(HOLD, JUMP, when_asked_to_jump, begin_jump)
@@ -91,7 +91,7 @@ def test_worlds_of_a_skill_are_those_of_an_environment_with_that_skill_alone(ind
             np.testing.assert_array_equal(values[..., mine], parameters_of(alone)[name][..., mine], err_msg=name)
         ended += both.done.numpy()
     assert (ended[mine] > 0).all() and not skill.metrics()["Metrics/bad_actions"]
-    np.testing.assert_array_equal(both.worlds.skill.numpy(), SKILL)
+    np.testing.assert_array_equal(both.episodes.skill.numpy(), SKILL)
 
 
 def test_every_skill_counts_its_own():
@@ -101,7 +101,7 @@ def test_every_skill_counts_its_own():
         env.step(action.repeat(2, 1, 1))
         ended += env.done.numpy()
     for index, skill in enumerate(env.skills):
-        counted = skill.counters.ending_count.numpy().sum(axis=0)
+        counted = skill.counters.termination_count.numpy().sum(axis=0)
         np.testing.assert_array_equal(counted, np.where(index == SKILL, ended, 0.0))
 
 
@@ -115,10 +115,10 @@ def followed(env, actions, request_at=None, skill=0, worlds=ASKED):
     trace, skills = [], []
     for step, action in enumerate(actions):
         if step == request_at:
-            env.request(skill, worlds)
+            env.requested_task(skill, worlds)
         env.step(action.repeat(len(env.skills), 1, 1))
         trace.append(coordinates(env).copy())
-        skills.append(env.worlds.skill.numpy().copy())
+        skills.append(env.episodes.skill.numpy().copy())
     return np.array(trace), np.array(skills)
 
 
@@ -126,7 +126,7 @@ def test_worlds_that_are_asked_for_switch_once_and_others_never():
     env = make(JUMP, HOLD, skill=1, handovers=(TO_JUMP, TO_HOLD))
     trace, skills = followed(env, 0.2 * random_actions(N, 12), request_at=5)
     assert (skills[:5] == 1).all() and (skills[5:] == ~ASKED).all()
-    assert (env.worlds.request.numpy() == -1).all() and not env.done.any()
+    assert (env.episodes.requested_task.numpy() == -1).all() and not env.done.any()
     states = env.skills[0].states.numpy()
     assert (states["steps"][ASKED] == 6).all() and not states["steps"][~ASKED].any()
     np.testing.assert_allclose(states["start"][ASKED], trace[5, ASKED, :3])
@@ -178,11 +178,11 @@ def test_motors_filter_and_scales_become_those_of_the_new_skill_and_drawn_ratios
     before, action = parameters_of(env), torch.zeros((2, N, 12))
     action[:, :, ::3] = 1.0  # lateral
     env.step(action)
-    np.testing.assert_allclose(env.robot.safe_target.numpy()[::3], 40.0 * DEG, rtol=1e-6)
-    env.request(0, ASKED)
+    np.testing.assert_allclose(env.robot.filtered_target.numpy()[::3], 40.0 * DEG, rtol=1e-6)
+    env.requested_task(0, ASKED)
     env.step(action)
     assert not env.done.any()
-    held = env.robot.safe_target.numpy() - env.robot.default_angle.numpy()[:, None]
+    held = env.robot.filtered_target.numpy() - env.robot.default_angle.numpy()[:, None]
     scale = np.tile([40.0, 90.0, 90.0], 4)[:, None] * DEG
     np.testing.assert_allclose(env.robot.action.numpy()[:, ASKED], (held / scale)[:, ASKED], atol=1e-6)
     after = parameters_of(env)
@@ -199,7 +199,7 @@ def test_motors_filter_and_scales_become_those_of_the_new_skill_and_drawn_ratios
         np.testing.assert_allclose(after[name][:, ASKED] / new, before[name][:, ASKED] / old, rtol=1e-5, err_msg=name)
     assert (after["cutoff_speed"] <= 0.95 * after["no_load_speed"] + 1e-5).all()
     env.step(action)
-    lateral = env.robot.safe_target.numpy()[::3] / DEG
+    lateral = env.robot.filtered_target.numpy()[::3] / DEG
     np.testing.assert_allclose(env.robot.target.numpy()[::3], 40.0 * DEG, rtol=1e-6)
     near = lateral[:, ASKED] < 15.0 + 1e-4  # the filter binds where the limit is near
     assert near.mean() > 0.3 and (np.abs(lateral[:, ASKED][~near] - 40.0) < 1e-4).all()
@@ -214,7 +214,7 @@ def test_a_new_skill_sees_nothing_of_before_its_beginning():
     followed(env, actions[:8], request_at=5)  # to jumping
     kept = env.skills[1].obs["policy"].clone()
     followed(env, actions[8:15], request_at=6, skill=1)  # and back
-    assert (env.worlds.skill.numpy() == 1).all() and not env.done.any()
+    assert (env.episodes.skill.numpy() == 1).all() and not env.done.any()
     seen = env.skills[1].obs["policy"][ASKED, first:end].numpy()
     height = env.sim.joint_q()[ASKED, 2]
     np.testing.assert_allclose(seen, np.repeat(5.0 * height[:, None], 3, axis=1), rtol=1e-5)
@@ -246,15 +246,15 @@ def test_an_environment_with_handovers_goes_on_from_a_saved_state():
     fresh.load_state_dict(saved.state_dict())
     for found, expected in zip(followed(fresh, actions[12:]), followed(saved, actions[12:]), strict=True):
         np.testing.assert_array_equal(found, expected)
-    assert torch.equal(fresh.reward, saved.reward) and (saved.worlds.skill.numpy() == 1).all()
+    assert torch.equal(fresh.reward, saved.reward) and (saved.episodes.skill.numpy() == 1).all()
 
 
 def test_beginning_with_a_seed_puts_the_skills_and_their_motors_back():
     env, fresh = (make(JUMP, HOLD, skill=1, handovers=(TO_JUMP,), randomize=False) for _ in range(2))
     followed(env, torch.zeros((3, N, 12)), request_at=1)
-    assert set(env.worlds.skill.numpy()) == {0, 1}
+    assert set(env.episodes.skill.numpy()) == {0, 1}
     env.reset(seed=5)
-    assert (env.worlds.skill.numpy() == 1).all()
+    assert (env.episodes.skill.numpy() == 1).all()
     for name, values in parameters_of(fresh).items():
         np.testing.assert_array_equal(parameters_of(env)[name], values, err_msg=name)
 
@@ -264,17 +264,17 @@ def test_a_command_that_came_with_the_request_is_given_as_the_skill_takes_over()
     followed(env, torch.zeros((3, N, 12)))
     commands = np.zeros((N, 3))
     commands[:, 2] = np.linspace(0.6, 0.9, N)
-    env.request(0, ASKED, commands)
-    env.request(0, np.arange(N) == 7)
+    env.requested_task(0, ASKED, commands)
+    env.requested_task(0, np.arange(N) == 7)
     followed(env, torch.zeros((1, N, 12)))
     states = env.skills[0].states.numpy()
     np.testing.assert_allclose(states["goal"][ASKED, 2], commands[ASKED, 2], rtol=1e-6)
     assert (states["command_step"][ASKED] == 0).all() and states["command_step"][7] == 1000
     first, _ = JUMP.layout("policy")["wanted_height"]
     np.testing.assert_allclose(env.skills[0].obs["policy"][ASKED, first], commands[ASKED, 2], rtol=1e-6)
-    assert not env.worlds.told.numpy()[ASKED].any() and (env.worlds.skill.numpy()[8:] == 1).all()
+    assert not env.episodes.has_command.numpy()[ASKED].any() and (env.episodes.skill.numpy()[8:] == 1).all()
     with pytest.raises(ValueError, match=r"16 rows or one for all, got shape \(3, 2\)"):
-        env.request(0, ASKED, np.zeros((3, 2)))
+        env.requested_task(0, ASKED, np.zeros((3, 2)))
 
 
 @pytest.mark.parametrize("begin", ["reset", "evaluation_reset", "ended"])
@@ -282,7 +282,7 @@ def test_new_episodes_begin_in_the_first_skill_and_forget_requests(begin):
     """Worlds of the last case end by themselves; its others stay as they are."""
     env, fresh = (make(JUMP, HOLD, skill=1, handovers=(TO_JUMP, TO_HOLD), randomize=False) for _ in range(2))
     followed(env, torch.zeros((3, N, 12)), request_at=1)
-    env.request(1, np.arange(N) == 4, np.ones((N, 1)))
+    env.requested_task(1, np.arange(N) == 4, np.ones((N, 1)))
     new = np.full(N, True)
     if begin == "reset":
         env.reset()
@@ -293,12 +293,12 @@ def test_new_episodes_begin_in_the_first_skill_and_forget_requests(begin):
         records = env.skills[0].states.numpy().copy()
         records["steps"][3] = 10_000  # too long
         env.skills[0].states.assign(records)
-        env.request(1, new)
+        env.requested_task(1, new)
         followed(env, torch.zeros((1, N, 12)))
         assert env.done[3]
-    assert (env.worlds.skill.numpy()[new] == 1).all() and (env.worlds.request.numpy()[new] == -1).all()
-    assert not env.worlds.told.numpy()[new].any()
-    assert (env.worlds.skill.numpy()[(~new) & ASKED & (np.arange(N) != 4)] == 0).all()
+    assert (env.episodes.skill.numpy()[new] == 1).all() and (env.episodes.requested_task.numpy()[new] == -1).all()
+    assert not env.episodes.has_command.numpy()[new].any()
+    assert (env.episodes.skill.numpy()[(~new) & ASKED & (np.arange(N) != 4)] == 0).all()
     for name, values in parameters_of(fresh).items():
         np.testing.assert_array_equal(parameters_of(env)[name][..., new], values[..., new], err_msg=name)
 

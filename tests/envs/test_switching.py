@@ -33,7 +33,7 @@ class Switch:
     """What there was of a world at a switch."""
 
     def __init__(self, env: Env, world: int) -> None:
-        self.world, self.target = world, int(env.worlds.skill.numpy()[world])
+        self.world, self.target = world, int(env.episodes.skill.numpy()[world])
         self.after, self.action = coordinates(env)[world], env.robot.action.numpy()[:, world].copy()
         self.obs = env.skills[self.target].obs["policy"][world].clone()
         self.state = env.skills[self.target].states.numpy()[world].copy()
@@ -51,13 +51,13 @@ def followed():
         env.actions.copy_(policies.act(env))
         for name, stage in env.stages().items():
             if name == "reset":
-                was = env.worlds.skill.numpy().copy()
+                was = env.episodes.skill.numpy().copy()
             stage()
             if name == "action":
                 for each in fresh:
                     each.next_action = env.robot.action.numpy()[:, each.world].copy()
-                    each.next_safe = env.robot.safe_target.numpy()[:, each.world].copy()
-        fresh = [Switch(env, w) for w in np.flatnonzero(env.worlds.skill.numpy() != was)]
+                    each.next_safe = env.robot.filtered_target.numpy()[:, each.world].copy()
+        fresh = [Switch(env, w) for w in np.flatnonzero(env.episodes.skill.numpy() != was)]
         switches += fresh
         if course.follow(env):
             break
@@ -93,12 +93,12 @@ def test_after_a_switch_observation_and_filter_are_those_of_a_fresh_environment_
             states = alone.skills[0].states.numpy().copy()
             states[0] = s.state
             alone.skills[0].states.assign(wp.array(states, dtype=alone.task.state, device="cpu"))
-            alone.worlds.fresh.fill_(1)
-            alone._observe(alone._part(), beginning=1)
+            alone.episodes.history_reset.fill_(1)
+            alone._observe(alone._part(), after_reset=1)
             assert torch.equal(alone.obs[0], s.obs), (target, alone.obs[0] - s.obs)
             alone.action[0] = torch.from_numpy(s.next_action)
             alone.stages()["action"]()
-            np.testing.assert_array_equal(alone.robot.safe_target.numpy()[:, 0], s.next_safe)
+            np.testing.assert_array_equal(alone.robot.filtered_target.numpy()[:, 0], s.next_safe)
 
 
 def test_jumps_are_commanded_from_the_squat_after_they_took_over_and_walking_stands_first(followed):

@@ -23,7 +23,7 @@ from jumper_warp.rl.checkpoint import load_checkpoint
 from jumper_warp.rl.runner import CHECKPOINTS, train
 from jumper_warp.robot.motors import vertical_jump_filter
 from jumper_warp.sim.simulation import Simulation
-from jumper_warp.sim.slices import LEAST, Worlds, slices_of
+from jumper_warp.sim.slices import LEAST, WorldRange, slices_of
 from jumper_warp.tasks.cfg import Handover
 from jumper_warp.tasks.randomization import RandomizationCfg
 from jumper_warp.utils import threads as pool
@@ -38,8 +38,8 @@ HOLD = hold_height.hold_height()
 
 
 @wp.func
-def in_the_air(view: RobotView, task: JumpState, requested: bool) -> bool:
-    return view.contacts == 0
+def in_the_air(robot: RobotView, state: JumpState, requested: bool) -> bool:
+    return robot.contacts == 0
 
 
 @pytest.fixture(autouse=True)
@@ -58,7 +58,7 @@ def story(threads, steps=240, task=JUMP, **arguments):
     found = []
     for step, action in enumerate(random_actions(N, steps)):
         if len(env.tasks) > 1 and step % 40 == 10:
-            env.request(0)
+            env.requested_task(0)
         env.step(action.repeat(len(env.tasks), 1, 1) if len(env.tasks) > 1 else action)
         rows = [*env._step.obs.values(), *env.skills[0].final_obs.values(), env.reward, env.done, env.timeout]
         found.append(torch.cat([row.reshape(N, -1) for row in rows], dim=1))
@@ -84,7 +84,7 @@ def test_an_environment_has_the_same_bits_on_any_number_of_threads(alone, thread
     rows, env = alone[0], alone[-1]
     assert (rows[..., -2].sum(0) > 1).all() and rows[..., -2].sum(0).unique().numel() > 1
     assert len(np.unique(env.parameters.push.numpy(), axis=0)) > N // 4
-    assert env.worlds.level.numpy().max() > 0
+    assert env.episodes.level.numpy().max() > 0
     assert_same(story(threads), alone)
 
 
@@ -163,7 +163,7 @@ def test_slices_hold_each_world_once_and_are_about_equal(worlds, threads):
     assert all(each.first % LEAST == 0 for each in slices)
     counts = [each.count for each in slices]
     assert max(counts) - min(counts) < 2 * LEAST
-    assert worlds >= 2 * LEAST or slices == [Worlds(0, worlds)]
+    assert worlds >= 2 * LEAST or slices == [WorldRange(0, worlds)]
 
 
 def test_mujoco_has_one_slice():

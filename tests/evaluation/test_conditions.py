@@ -63,12 +63,12 @@ def test_second_takeoff_ends_the_jump_where_that_is_asked_for():
 
 
 def test_pushes_of_a_test_come_and_go_however_they_were_trained_with():
-    drawn = Conditions(randomize=True).applied(HELD).randomization
-    assert (drawn.push_interval, drawn.push_share, drawn.redraw) == (PUSH_INTERVAL, PUSH_SHARE, "reset")
-    assert (drawn.push_in_flight, drawn.force) == (False, (-7.0, 7.0))
+    figure = Conditions(randomize=True).applied(HELD).randomization
+    assert (figure.push_interval, figure.push_share, figure.redraw) == (PUSH_INTERVAL, PUSH_SHARE, "reset")
+    assert (figure.push_in_flight, figure.force) == (False, (-7.0, 7.0))
     own = dataclasses.replace(HELD, randomization=RandomizationCfg(push_interval=(1.0, 2.0), push_share=0.5))
-    drawn = Conditions(randomize=True).applied(own).randomization
-    assert (drawn.push_interval, drawn.push_share) == ((1.0, 2.0), 0.5)
+    figure = Conditions(randomize=True).applied(own).randomization
+    assert (figure.push_interval, figure.push_share) == ((1.0, 2.0), 0.5)
 
 
 @pytest.mark.parametrize("in_flight", [False, True])
@@ -130,9 +130,9 @@ def test_a_fixed_parameter_that_is_nominal_changes_no_bit():
 
 
 def test_randomised_conditions_draw_the_rest():
-    drawn = Conditions(randomize=True, gains=(0.6, 1.0), latency=50.0).applied(JUMP).randomization
-    assert (drawn.gains, drawn.damping_gains, drawn.latency) == ((0.6, 0.6), (1.0, 1.0), (50.0, 50.0))
-    assert drawn.base_mass == RandomizationCfg().base_mass
+    figure = Conditions(randomize=True, gains=(0.6, 1.0), latency=50.0).applied(JUMP).randomization
+    assert (figure.gains, figure.damping_gains, figure.latency) == ((0.6, 0.6), (1.0, 1.0), (50.0, 50.0))
+    assert figure.base_mass == RandomizationCfg().base_mass
 
 
 @pytest.mark.parametrize(

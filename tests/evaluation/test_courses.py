@@ -56,12 +56,12 @@ class MadeUp:
                 self.skill[w], self.wanted[w], self.since[w] = self.wanted[w], -1, 0
             elif self.skill[w] >= JUMP_UP and self.since[w] >= 65:
                 self.skill[w], self.since[w] = WALK, 0
-        ending = np.where(self.falls_at == self.steps, 1, -1) * np.ones(self.n, int)
+        termination = np.where(self.falls_at == self.steps, 1, -1) * np.ones(self.n, int)
         return {
             "base_pos": np.tile([0.05, 0.0, 0.4], (self.n, 1)), "base_quat": np.tile([0.0, 0.0, 0.0, 1.0], (self.n, 1)),
             "base_vel": self.velocity * [1, 1, 0] + self.error * [1, 1, 0],
             "base_ang_vel": (self.velocity + self.error)[:, 2:] * [0.0, 0.0, 1.0],
-            "skill": self.skill.copy(), "ending": ending,
+            "skill": self.skill.copy(), "termination": termination,
             "force": np.tile([30.0, 31.0, 32.0, 33.0], (self.n, 1)) + (self.steps % 2),
             "jump_max_height": np.full(self.n, 0.78), "jump_goal": np.zeros((self.n, 3)),
             "jump_took_off": took_off.astype(int), "jump_phase": np.zeros(self.n, int),

@@ -23,7 +23,7 @@ class Stub:
     num_envs, step_dt = 4, DT
 
     def __init__(self):
-        self.arrays = {"base_pos": np.tile([1.0, 0.0, 0.3], (4, 1)), "ending": np.full(4, -1)}
+        self.arrays = {"base_pos": np.tile([1.0, 0.0, 0.3], (4, 1)), "termination": np.full(4, -1)}
 
     def evaluation_reset(self, commands):
         self.commands = commands
@@ -42,10 +42,10 @@ def episodes():
     log, env = EpisodeFlags(4, command=(0.5, 0.1)).log(TASK, 0), Stub()
     log.begin(env)
     assert env.commands.tolist() == [[0.5, 0.1, 0.0, 0.0]] * 4
-    env.now(ending=[0, -1, -1, ENDS.index("came_apart")])
+    env.now(termination=[0, -1, -1, ENDS.index("came_apart")])
     env.now(base_pos=[[1.5, 0.0, 0.4], [1.0, 0.1, 0.2], [1.0, 0.0, 0.3], [np.nan, 0.0, 9.0]])
     assert not log.follow(env)
-    env.now(ending=[ENDS.index("tilted"), ENDS.index("low_base"), -1, -1])
+    env.now(termination=[ENDS.index("tilted"), ENDS.index("low_base"), -1, -1])
     env.now(base_pos=[[9.0, 9.0, 9.0], [1.0, 0.4, 0.0], [1.0, 0.0, 0.3], [9.0, 9.0, 9.0]])
     assert not log.follow(env)
     return log
@@ -82,7 +82,7 @@ def test_columns_have_a_row_an_episode_and_none_where_there_is_no_number(episode
 
 def test_all_ended_is_told():
     log = Episodes(np.zeros((1, 4)), TASK)
-    assert log.update({"base_pos": np.zeros((1, 3)), "ending": np.array([3])}, DT)
+    assert log.update({"base_pos": np.zeros((1, 3)), "termination": np.array([3])}, DT)
 
 
 @pytest.mark.parametrize(

@@ -10,8 +10,8 @@ from jumper_warp.viz.snapshot import FIELD_OF_VIEW
 def step_of(jumps, **changes):
     count = len(jumps.goals)
     arrays = {
-        "phase": np.zeros(count, dtype=int), "phase_steps": np.zeros(count, dtype=int), "ending": np.full(count, -1),
-        "max_height": np.zeros(count), "peak_tilt": np.zeros(count), "base_vel": np.zeros((count, 3)),
+        "phase": np.zeros(count, dtype=int), "phase_steps": np.zeros(count, dtype=int),
+        "termination": np.full(count, -1), "max_height": np.zeros(count), "peak_tilt": np.zeros(count), "base_vel": np.zeros((count, 3)),
         "steps": np.full(count, 40), "command_step": np.full(count, 30), "base_pos": np.zeros((count, 3)),
         "base_quat": np.tile([0.0, 0.0, 0.0, 1.0], (count, 1)), "start": np.zeros((count, 3)),
         "heading": np.zeros(count), "goal": np.zeros((count, 3)), "touched_down": np.zeros(count, dtype=int),
@@ -30,9 +30,11 @@ def test_metrics_by_hand():
         "base_quat": [[0.0, 0.0, math.sin(angle), math.cos(angle)] for angle in half],
     }
     speeds = {"base_vel": [[0.0, 0.03, 0.04], [9.0] * 3, [0.0, 0.0, -0.2], [0.0] * 3]}
-    assert not jumps.update(step_of(jumps, ending=[0, 1, 0, -1], **landed, **heights, **speeds, **places), 1.0 / 60.0)
+    assert not jumps.update(
+        step_of(jumps, termination=[0, 1, 0, -1], **landed, **heights, **speeds, **places), 1.0 / 60.0
+    )
     later = {"max_height": [9.0, 9.0, 9.0, 0.9], "peak_tilt": [3.0] * 4}
-    assert jumps.update(step_of(jumps, ending=[2, 2, 2, 2], **later), 1.0 / 60.0)
+    assert jumps.update(step_of(jumps, termination=[2, 2, 2, 2], **later), 1.0 / 60.0)
     metrics = jump_metrics(jumps, (0.5, 1.1))
     expected = {
         "jumps": 4,
@@ -72,7 +74,7 @@ def test_jump_that_never_ends_is_a_failure():
 def test_columns_have_a_row_a_jump_and_none_where_there_is_no_number():
     jumps = HeightLog(np.array([0.5, 0.8]), ("success", "came_apart"))
     landed = {"phase": [2, 0], "phase_steps": [60, 0]}
-    jumps.update(step_of(jumps, ending=[0, 1], max_height=[0.52, np.nan], **landed), 1.0 / 60.0)
+    jumps.update(step_of(jumps, termination=[0, 1], max_height=[0.52, np.nan], **landed), 1.0 / 60.0)
     assert jumps.columns() == {
         "target_m": [0.5, 0.8], "apex_m": [pytest.approx(0.52), None], "error_m": [pytest.approx(0.02), None],
         "end": ["success", "came_apart"],
@@ -88,7 +90,7 @@ def test_jump_is_early_if_it_has_begun_when_the_command_comes():
 
 def test_a_jump_to_another_height_is_a_miss_and_no_fall():
     jumps = HeightLog(np.array([0.5, 0.6, 0.7]), ("wrong_height", "collided", "success"))
-    jumps.update(step_of(jumps, ending=[0, 1, -1], phase=[2, 2, 2], phase_steps=[0, 3, 60]), 1.0 / 60.0)
+    jumps.update(step_of(jumps, termination=[0, 1, -1], phase=[2, 2, 2], phase_steps=[0, 3, 60]), 1.0 / 60.0)
     metrics = jump_metrics(jumps, (0.5, 1.1))
     assert [metrics[name] for name in ("success_rate", "fall_rate", "miss_rate")] == pytest.approx([1 / 3] * 3)
 

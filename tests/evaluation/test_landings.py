@@ -32,7 +32,7 @@ class Stub:
             "base_pos": np.zeros((count, 3)),
             "base_vel": np.zeros((count, 3)), "goal": np.zeros((count, 3)), "heading": np.zeros(count),
             "max_height": np.zeros(count), "peak_tilt": np.zeros(count), "took_off": np.zeros(count, dtype=int),
-            "steps": np.full(count, 40), "command_step": np.full(count, 30), "ending": np.full(count, -1),
+            "steps": np.full(count, 40), "command_step": np.full(count, 30), "termination": np.full(count, -1),
             "touched_down": np.zeros(count, dtype=int),
             "phase": np.zeros(count, dtype=int), "phase_steps": np.zeros(count, dtype=int),
         }  # fmt: skip
@@ -81,7 +81,7 @@ def five_jumps():
         base_pos=[[0.03, 0.96, 0.3], [-0.2, 0.8, 0.3], [1e9, 0.0, 0.0], [0.0, 0.9, 0.1], [0.0, 0.0, 0.3]],
         base_quat=[about_z(QUARTER + 0.1), about_z(QUARTER - 0.3), *([[0.0, 0.0, 0.0, 1.0]] * 3)],
         base_vel=[[0.0, 0.06, 0.0], [0.2, 0.0, 0.0], *([[0.0] * 3] * 3)],
-        phase=[2, 2, 1, 2, 0], phase_steps=[60, 60, 3, 20, 9], ending=[0, -1, 1, COLLIDED, NO_JUMP],
+        phase=[2, 2, 1, 2, 0], phase_steps=[60, 60, 3, 20, 9], termination=[0, -1, 1, COLLIDED, NO_JUMP],
         peak_tilt=[0.1, 0.2, 3.0, 1.0, 0.0], max_height=[0.6, 0.5, 9.0, 0.7, 0.3],
     )  # fmt: skip
     assert landings.follow(env)
@@ -141,7 +141,7 @@ def test_nothing_changes_after_the_end():
     landings = five_jumps()
     before = landings.landing.copy()
     later = Stub(5)
-    later.now(ending=COLLIDED, base_pos=7.0)
+    later.now(termination=COLLIDED, base_pos=7.0)
     assert landings.follow(later)
     assert np.array_equal(landings.landing, before) and landings.success.sum() == 1
 
@@ -237,11 +237,11 @@ def test_second_takeoffs_are_upward_with_no_paw_down(moments, takeoffs):
 def test_fall_after_the_first_second_counts_where_the_jump_is_followed_for_longer():
     landings, env = PlaceLog(np.zeros((2, 1, 2)), TERMINATIONS, rest=3.0), Stub(2)
     landings.begin(env)
-    env.now(phase=2, phase_steps=60, ending=0)
+    env.now(phase=2, phase_steps=60, termination=0)
     assert not landings.follow(env)
-    env.now(phase_steps=120, ending=[0, 2])
+    env.now(phase_steps=120, termination=[0, 2])
     assert not landings.follow(env)
-    env.now(phase_steps=180, ending=0)
+    env.now(phase_steps=180, termination=0)
     assert landings.follow(env)
     assert landings.outcomes[:, 0].tolist() == ["success", "low_base"]
     metrics = landing_metrics(landings)
@@ -275,7 +275,7 @@ def two_in_a_row():
     """A row that goes through, and one whose first jump collides."""
     landings, env = PlaceLog(np.array([[[0.8, 0.2], [0.7, 0.0]]] * 2), TERMINATIONS, rest=0.5), Stub(2)
     landings.begin(env)
-    env.now(base_pos=[0.8, 0.15, 0.3], phase=2, phase_steps=[29, 10], ending=[-1, COLLIDED])
+    env.now(base_pos=[0.8, 0.15, 0.3], phase=2, phase_steps=[29, 10], termination=[-1, COLLIDED])
     assert not landings.follow(env) and not env.commanded
     env.now(phase_steps=30)
     assert not landings.follow(env)
@@ -291,7 +291,7 @@ def test_next_jump_is_commanded_after_the_rest_and_only_after_a_landing():
 
 def test_next_jump_is_measured_from_its_own_goal():
     landings, env = two_in_a_row()
-    env.now(base_pos=[[1.48, 0.15, 0.3], [0.0, 0.0, 0.0]], phase=2, phase_steps=30, ending=0)
+    env.now(base_pos=[[1.48, 0.15, 0.3], [0.0, 0.0, 0.0]], phase=2, phase_steps=30, termination=0)
     assert landings.follow(env)
     assert landings.error[0] == pytest.approx([0.05, 0.02])
     assert landings.outcomes.tolist() == [["success", "success"], ["collided", "not_begun"]]

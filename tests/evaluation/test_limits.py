@@ -55,17 +55,17 @@ def test_limits_are_of_the_very_robots_that_jumped_before():
     env, fresh = begun(Conditions(randomize=True), 8)
     command = jump_commands(np.tile([0.0, 0.0, 0.8], (8, 1)), 0.5, env.step_dt)
     env.evaluation_reset(command)
-    drawn, skill = read(env), env.skills[0]
+    figure, skill = read(env), env.skills[0]
     for _ in range(30):
         env.step(torch.zeros((8, 12)))
     numbers = skill.params.values.numpy().copy()
     limits = open_loop_limits(env, fresh)
     found = read(env)
-    for name in drawn:
+    for name in figure:
         if name in ("force", "torque"):
             assert not found[name].any()
         else:
-            np.testing.assert_array_equal(found[name], drawn[name], err_msg=name)
+            np.testing.assert_array_equal(found[name], figure[name], err_msg=name)
     np.testing.assert_array_equal(skill.params.values.numpy(), numbers)
     assert 0.75 < limits.min() < limits.max() - 0.05 < 1.3
     np.testing.assert_array_equal(open_loop_limits(env, fresh), limits)

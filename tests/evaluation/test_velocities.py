@@ -28,11 +28,11 @@ def followed(velocity_of, *, seconds=2.0, falls=None, task=TASK, commands=None, 
         wanted = velocity_of(step * DT)
         vel, ang = np.zeros((ROBOTS, 3)), np.zeros((ROBOTS, 3))
         vel[:, :2], vel[:, 2], ang[:, 2], ang[:, 0] = wanted[:, :2], 0.7, wanted[:, 2], 0.3
-        ending = np.full(ROBOTS, -1)
+        termination = np.full(ROBOTS, -1)
         for robot, fall in (falls or {}).items():
-            ending[robot] = NAMES.index("collided") if step >= fall else -1
+            termination[robot] = NAMES.index("collided") if step >= fall else -1
         arrays = {"base_quat": turn.as_quat(), "base_vel": turn.apply(vel), "base_ang_vel": turn.apply(ang),
-                  "ending": ending}  # fmt: skip
+                  "termination": termination}  # fmt: skip
         walks.update(arrays, DT)
     return walks
 
@@ -61,7 +61,7 @@ def test_nothing_counts_after_a_fall():
 def test_end_of_the_time_is_no_fall():
     walks = Walks(np.zeros((1, 1, 3)), TASK, 1.0)
     arrays = {"base_quat": np.array([[0.0, 0.0, 0.0, 1.0]]), "base_vel": np.zeros((1, 3)),
-              "base_ang_vel": np.zeros((1, 3)), "ending": np.array([NAMES.index("finished")])}  # fmt: skip
+              "base_ang_vel": np.zeros((1, 3)), "termination": np.array([NAMES.index("finished")])}  # fmt: skip
     walks.update(arrays, DT)
     assert not walks.fallen.any() and walks.outcomes[0] == "walked"
 

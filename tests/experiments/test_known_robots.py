@@ -11,7 +11,7 @@ from support.known_robots import MOST, make_case, prediction_errors
 
 
 @pytest.fixture(scope="module")
-def drawn():
+def figure():
     """Parameters, one known robot, what replays, and what carries a plan out."""
     parameters, one = jumper_parameters(), MotionReplay(device="cpu", threads=1)
     many = MotionReplay(device="cpu", threads=1)
@@ -22,23 +22,23 @@ def drawn():
     return parameters, make_case(parameters, 3, carry, many), many, carry
 
 
-def test_a_robot_is_drawn_from_the_priors_and_always_late(drawn):
-    parameters, case, _, _ = drawn
+def test_a_robot_is_drawn_from_the_priors_and_always_late(figure):
+    parameters, case, _, _ = figure
     assert np.abs(case.truth).max() <= 0.2 + MOST and case.truth.std() > 0.4
     assert case.truth[parameters.names.index("latency")] >= 0.2
     assert len(case.motions) == 4 and case.held_out.torque_limit == 16.0
 
 
-def test_a_robot_predicts_itself_exactly_and_another_one_does_not(drawn):
-    parameters, case, _, carry = drawn
+def test_a_robot_predicts_itself_exactly_and_another_one_does_not(figure):
+    parameters, case, _, carry = figure
     assert max(prediction_errors(case, case.robots, carry)) < 1.0e-12
     angle, height = prediction_errors(case, parameters.robots(np.zeros((1, len(parameters)))), carry)
     assert angle > 0.5 and height > 1.0
 
 
-def test_the_truth_explains_what_was_measured_to_its_noise(drawn):
+def test_the_truth_explains_what_was_measured_to_its_noise(figure):
     """But for where the motions started, which is expected and not known here."""
-    parameters, case, many, _ = drawn
+    parameters, case, many, _ = figure
     problem = problem_of(parameters, case, many)
     point = problem.expected()
     described = chi2_at(problem, point)

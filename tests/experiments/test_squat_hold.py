@@ -18,7 +18,7 @@ def held(steps, **changes):
     for step, force in enumerate(steps):
         arrays = {
             "force": np.tile(force, (3, 1)), "peak": np.tile(force, (3, 1)) + [[1.0], [2.0], [900.0]],
-            "torque": np.full((3, 12), 2.0 * (step % 2)), "ending": np.array([-1, -1, step - 2]),
+            "torque": np.full((3, 12), 2.0 * (step % 2)), "termination": np.array([-1, -1, step - 2]),
         }  # fmt: skip
         holds.update(arrays | changes, 1.0 / 60.0)
     return holds
@@ -36,7 +36,7 @@ def test_figures_against_hand_numbers():
 
 
 def test_robots_that_do_not_hold_have_no_forces():
-    metrics = hold_metrics(held([np.ones(4)] * 2, ending=np.zeros(3)))
+    metrics = hold_metrics(held([np.ones(4)] * 2, termination=np.zeros(3)))
     assert metrics["holding_rate"] == 0.0
     assert all(value is None for name, value in metrics.items() if name not in ("squats", "holding_rate"))
 

@@ -74,32 +74,32 @@ class HoldLevelCfg:
 
 
 @wp.func
-def advance_hold(view: mdp.RobotView, task: HoldState, tolerance: float) -> HoldState:
+def advance_hold(robot: mdp.RobotView, state: HoldState, tolerance: float) -> HoldState:
     """Count steps, and those near the goal up to a tolerance [m]."""
-    new = task
-    new.steps = task.steps + 1
-    new.age = task.age + 1
-    new.near = wp.where(wp.abs(view.height - task.goal) < tolerance, task.near + 1, 0)
+    new = state
+    new.steps = state.steps + 1
+    new.age = state.age + 1
+    new.near = wp.where(wp.abs(robot.height - state.goal) < tolerance, state.near + 1, 0)
     return new
 
 
 @wp.func
 def reset_hold(
     robot: mdp.RobotArrays, scene: mdp.Scene, skill: mdp.SkillSettings, old: HoldState, settings: HoldSettings,
-    level: HoldLevel, draw: mdp.Draw,
+    level: HoldLevel, rng: mdp.RngStream,
 ) -> HoldState:  # fmt: skip
     """Stand in the default pose with any heading."""
-    mdp.store_pose(robot, scene, draw.world, mdp.between(draw, 0, -settings.heading, settings.heading), 0.0)
+    mdp.write_default_pose(robot, scene, rng.world, mdp.uniform(rng, 0, -settings.heading, settings.heading), 0.0)
     new = HoldState()
-    new.goal = mdp.within(draw, 1, level.goal)
+    new.goal = mdp.uniform_range(rng, 1, level.goal)
     new.lasts = settings.lasts
     return new
 
 
 @wp.func
-def give_hold(view: mdp.RobotView, scene: mdp.Scene, task: HoldState, values: wp.vec4, heading: float) -> HoldState:
+def give_hold(robot: mdp.RobotView, scene: mdp.Scene, state: HoldState, values: wp.vec4, heading: float) -> HoldState:
     """Command a height [m], the first of the values, until another comes."""
-    new = task
+    new = state
     new.goal = values[0]
     new.age = 0
     new.lasts = 0
@@ -107,56 +107,58 @@ def give_hold(view: mdp.RobotView, scene: mdp.Scene, task: HoldState, values: wp
 
 
 @wp.func
-def another_goal_due(task: HoldState) -> bool:
+def another_goal_due(state: HoldState) -> bool:
     """Whether the command has lasted long enough."""
-    return task.lasts > 0 and task.age >= task.lasts
+    return state.lasts > 0 and state.age >= state.lasts
 
 
 @wp.func
-def draw_goal(view: mdp.RobotView, scene: mdp.Scene, task: HoldState, level: HoldLevel, draw: mdp.Draw) -> HoldState:
+def sample_goal(
+    robot: mdp.RobotView, scene: mdp.Scene, state: HoldState, level: HoldLevel, rng: mdp.RngStream
+) -> HoldState:
     """Command another height."""
-    new = task
-    new.goal = mdp.within(draw, 1, level.goal)
+    new = state
+    new.goal = mdp.uniform_range(rng, 1, level.goal)
     new.age = 0
     return new
 
 
 @wp.func
-def height_error(view: mdp.RobotView, task: HoldState) -> float:
+def height_error(robot: mdp.RobotView, state: HoldState) -> float:
     """Distance from the commanded height [m]."""
-    return wp.abs(view.height - task.goal)
+    return wp.abs(robot.height - state.goal)
 
 
 @wp.func
-def every_episode(task: HoldState) -> bool:
+def every_episode(state: HoldState) -> bool:
     """All episodes count."""
     return True
 
 
 @wp.func
-def near_goal(view: mdp.RobotView, task: HoldState, width: float) -> float:
+def near_goal(robot: mdp.RobotView, state: HoldState, width: float) -> float:
     """Closeness to the commanded height; width [m]: of the kernel."""
-    return mdp.rewards.psi(view.height - task.goal, width)
+    return mdp.rewards.psi(robot.height - state.goal, width)
 
 
 @wp.func
-def held(view: mdp.RobotView, task: HoldState, steps: float) -> bool:
+def held(robot: mdp.RobotView, state: HoldState, steps: float) -> bool:
     """Near the goal for so many policy steps in a row."""
-    return task.near >= int(steps)
+    return state.near >= int(steps)
 
 
 @wp.func
-def wanted_height(view: mdp.RobotView, task: HoldState) -> float:
+def wanted_height(robot: mdp.RobotView, state: HoldState) -> float:
     """The commanded height [m]."""
-    return task.goal
+    return state.goal
 
 
 @wp.func
-def weak_motors(robot: mdp.RobotParameters, draw: mdp.Draw, lower: float, upper: float):
+def weak_motors(robot: mdp.RobotParameters, rng: mdp.RngStream, lower: float, upper: float):
     """Scale the torque limit of each motor."""
     for m in range(12):
-        robot.torque_ratio[m, draw.world] = mdp.between(draw, m, lower, upper)
-        mdp.events.set_torque_limit(robot, draw.world, m)
+        robot.torque_ratio[m, rng.world] = mdp.uniform(rng, m, lower, upper)
+        mdp.events.set_torque_limit(robot, rng.world, m)
 
 
 def hold_height() -> mdp.TaskCfg:
@@ -173,7 +175,7 @@ def hold_height() -> mdp.TaskCfg:
         state=HoldState,
         advance=mdp.Advance(advance_hold, tolerance=0.02),
         reset=mdp.Reset(reset_hold, HoldResetCfg()),
-        command=mdp.Command(give_hold, another_goal_due, draw_goal),
+        command=mdp.Command(give_hold, another_goal_due, sample_goal),
         curriculum=mdp.Curriculum(height_error, tolerance=0.03, promote_after=2, counts=every_episode),
         rewards=(
             mdp.RewardTerm(near_goal, 60.0, width=0.05),

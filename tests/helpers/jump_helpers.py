@@ -8,7 +8,7 @@ import torch
 import warp as wp
 
 from jumper_warp.envs.env import Env
-from jumper_warp.envs.skill import Skill
+from jumper_warp.envs.skill import TaskRuntime
 from jumper_warp.kernels.jump.reset import JumpLevel, JumpSettings
 from jumper_warp.kernels.jump.state import JumpState
 from jumper_warp.kernels.mdp.parameters import RobotParameters
@@ -22,7 +22,7 @@ from jumper_warp.tasks.observations import exact
 from mdp_helpers import DEFAULT_ANGLE, MOTOR_SLOTS, STEP_DT, SUBSTEPS, array, new_worlds, observe, standing_robots
 
 DEG = np.pi / 180.0
-SCHEMES = ("standing", "default", "in_flight", "touchdown", "landed", "pushing")
+NUM_START_MODES = ("standing", "default", "in_flight", "touchdown", "landed", "pushing")
 OF_WORLD = ("level", "streak")
 """What a world keeps from episode to episode."""
 
@@ -53,9 +53,9 @@ class Table:
 
         self._kernel = table_kernel
 
-    def __call__(self, name: str, view: RobotView, task: JumpState, **numbers: float) -> float | bool:
+    def __call__(self, name: str, robot: RobotView, task: JumpState, **numbers: float) -> float | bool:
         """Return the value of one function."""
-        return self._returns(self.all(name, [view], [task], **numbers)[0])
+        return self._returns(self.all(name, [robot], [task], **numbers)[0])
 
     def all(self, name: str, views: list, tasks: list, **numbers: float) -> np.ndarray:
         """Return the values of one function, one a robot and its episode; numbers: all of its own, by name."""
@@ -80,7 +80,7 @@ def make_view(**fields) -> RobotView:
     view = RobotView()
     view.pos, view.quat, view.gravity = wp.vec3(0.0, 0.0, 0.4), wp.quat_identity(), wp.vec3(0.0, 0.0, -1.0)
     view.angle = view.default_angle = vec12(*DEFAULT_ANGLE)
-    view.fall_acc = 9.81
+    view.gravity_magnitude = 9.81
     for name, value in fields.items():
         kind = type(getattr(view, name))
         setattr(view, name, kind(*value) if np.ndim(value) else value)
@@ -108,14 +108,14 @@ class Robots:
     def __init__(self, task: TaskCfg, n: int = 1):
         """task: of jumping; what is drawn for a world is left out."""
         task = without_draws(task)
-        self.skill, self.n = Skill(task, 0, n, STEP_DT, SUBSTEPS, "cpu"), n
+        self.skill, self.n = TaskRuntime(task, 0, n, STEP_DT, SUBSTEPS, "cpu"), n
         self.numbers = {True: array(task.params.values), False: array(task.without_noise().params.values)}
         self.q, self.qd = np.zeros((n, 43)), np.zeros((n, 38))
         self.q[:, 2], self.q[:, 6], self.q[:, 7 + MOTOR_SLOTS] = 0.35, 1.0, DEFAULT_ANGLE
         self.com, self.action, self.offset = np.zeros(3), np.zeros((12, n)), np.zeros((12, n))
         self.force, self.heights = np.zeros((4, n, 3)), np.zeros((1, 1))
         self.tasks = [make_episode(goal=(0.0, 0.0, 0.8), command_step=5)] * n
-        self.worlds = new_worlds(n, seed=7919)
+        self.episodes = new_worlds(n, seed=7919)
 
     def observe(self, noise: bool = False) -> np.ndarray:
         """Return the actor's observations, (n, 48); draws go on from call to call."""
@@ -133,8 +133,8 @@ class Robots:
         ground.heights = array(self.heights)
         ground.rows, ground.cols = self.heights.shape if self.heights.size > 1 else (0, 0)
         ground.half_x = ground.half_y = 2.0
-        observe(skill, robot, RobotParameters(), ground, self.worlds, tasks, self.numbers[noise])
-        self.worlds.clock.assign(self.worlds.clock.numpy() + 1)
+        observe(skill, robot, RobotParameters(), ground, self.episodes, tasks, self.numbers[noise])
+        self.episodes.step_count.assign(self.episodes.step_count.numpy() + 1)
         return skill.obs["policy"].double().numpy().copy(), skill.obs["critic"].double().numpy().copy()
 
 
@@ -144,9 +144,9 @@ def tilted_by(angle: float, axis=(1.0, 0.0, 0.0)) -> dict:
     return {"quat": tuple(quat), "gravity": tuple(wp.quat_rotate_inv(quat, wp.vec3(0.0, 0.0, -1.0)))}
 
 
-def only(scheme: str, reset: ResetCfg | None = None, **ranges) -> ResetCfg:
+def only(start_mode: str, reset: ResetCfg | None = None, **ranges) -> ResetCfg:
     """Return resets that all follow one scheme, otherwise as `reset`."""
-    shares = dict.fromkeys(SHARES, 0.0) | ({} if scheme == "landed" else {scheme: 1.0})
+    shares = dict.fromkeys(SHARES, 0.0) | ({} if start_mode == "landed" else {start_mode: 1.0})
     return dataclasses.replace(ResetCfg() if reset is None else reset, **shares, **ranges)
 
 
@@ -187,7 +187,7 @@ def edit_episodes(env: Env, worlds=slice(None), **fields) -> None:
     records = states.numpy().copy()
     for name, value in fields.items():
         if name in OF_WORLD:
-            kept = getattr(env.worlds, name)
+            kept = getattr(env.episodes, name)
             values = kept.numpy().copy()
             values[worlds] = value
             kept.assign(values)
@@ -200,7 +200,7 @@ def episodes_of(env: Env) -> dict[str, np.ndarray]:
     """Return copies of all fields of worlds' episodes, and their level and streak."""
     records = env.skills[0].states.numpy()
     fields = {name: records[name].copy() for name in records.dtype.names}
-    return fields | {name: getattr(env.worlds, name).numpy().copy() for name in OF_WORLD}
+    return fields | {name: getattr(env.episodes, name).numpy().copy() for name in OF_WORLD}
 
 
 def edit_coordinates(env: Env, world: int, *, q: dict | None = None, qd: dict | None = None) -> None:
@@ -220,4 +220,4 @@ def random_actions(num_envs: int, steps: int, seed: int = 0) -> torch.Tensor:
 def ending_names(env: Env) -> list[str]:
     """Return the termination that ended each world's episode in the last step, "" where none did."""
     names = [term.name for term in env.task.terminations]
-    return [names[i] if i >= 0 else "" for i in env.task_arrays()["ending"]]
+    return [names[i] if i >= 0 else "" for i in env.task_arrays()["termination"]]

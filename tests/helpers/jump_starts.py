@@ -7,7 +7,7 @@ import pinocchio as pin
 import warp as wp
 from scipy.spatial.transform import Rotation
 
-from jump_helpers import SCHEMES, begin_by, edit_episodes, episodes_of, only, resets_of
+from jump_helpers import NUM_START_MODES, begin_by, edit_episodes, episodes_of, only, resets_of
 from jumper_warp.envs.env import Env
 from jumper_warp.kernels.collision.robot import collision_kernel
 from solver_helpers import Reference, States, paw_joint
@@ -22,15 +22,15 @@ ANKLE = np.array([0.0, 0.0, -0.3])
 class Starts:
     """Beginnings of one scheme, every world at its own level; exact: the jump starts at the origin."""
 
-    def __init__(self, env: Env, scheme: str, exact: bool = False, **settings):
+    def __init__(self, env: Env, start_mode: str, exact: bool = False, **settings):
         """settings: of the reset, besides the scheme."""
         settings |= {"base_xy": 0.0} if exact else {}
-        begin_by(env, only(scheme, resets_of(env), **settings))
+        begin_by(env, only(start_mode, resets_of(env), **settings))
         self.level = np.arange(env.num_envs) % len(env.task.levels)
         edit_episodes(env, level=self.level)
         env.reset()
         episodes = episodes_of(env)
-        drawn = episodes["scheme"] == SCHEMES.index(scheme)
+        drawn = episodes["start_mode"] == NUM_START_MODES.index(start_mode)
         self.drawn, self.fallbacks = drawn, 1.0 - drawn.mean()
         self.flags = collision_flags(env)
         self.episodes = {name: values[drawn].astype(float) for name, values in episodes.items()}
@@ -56,8 +56,8 @@ class Starts:
     def paws_around(self, spot: np.ndarray) -> np.ndarray:
         """Return the paws relative to places (worlds, 3), in the jump's heading, all as if they were front left."""
         relative = self.paws - spot[:, None]
-        turned = np.stack([self.heading.inv().apply(relative[:, leg]) for leg in range(4)], axis=1)
-        return turned * np.array([[1, 1, 1], [1, -1, 1], [-1, 1, 1], [-1, -1, 1]])
+        rotate_yaw = np.stack([self.heading.inv().apply(relative[:, leg]) for leg in range(4)], axis=1)
+        return rotate_yaw * np.array([[1, 1, 1], [1, -1, 1], [-1, 1, 1], [-1, -1, 1]])
 
 
 def paws_of(model, q: np.ndarray, qd: np.ndarray) -> np.ndarray:

@@ -5,9 +5,9 @@ from types import SimpleNamespace
 import numpy as np
 import warp as wp
 
-from jumper_warp.envs.arrays import delay_arrays, env_arrays
+from jumper_warp.envs.arrays import delay_arrays, episode_arrays
 from jumper_warp.kernels.layout import BODIES, COORDS, DOFS
-from jumper_warp.kernels.mdp.observe import LANES, condition_kernel
+from jumper_warp.kernels.mdp.observe import LANES, postprocess_obs_kernel
 from jumper_warp.kernels.mdp.view import RobotArrays
 
 STEP_DT = 1.0 / 60.0  # [s]
@@ -16,8 +16,8 @@ DEFAULT_ANGLE = np.tile([0.0, np.pi / 4.0, np.pi / 4.0], 4)  # [rad]
 MOTOR_SLOTS = np.array([5 * leg + joint for leg in range(4) for joint in (0, 1, 3)])
 PAWS = ("impulse", "paw_force", "peak_force", "paw_pos", "paw_vel", "contact_time", "air_time", "touchdown_speed",
         "collisions", "paw_height")  # fmt: skip
-MOTORS = ("torque", "old_torque", "action", "old_action", "older_action", "target", "safe_target", "old_rate",
-          "joint_offset")  # fmt: skip
+MOTORS = ("torque", "prev_torque", "action", "prev_action", "prev_prev_action", "target", "filtered_target",
+          "prev_rate", "joint_offset")  # fmt: skip
 
 
 def array(values, dtype=float) -> wp.array:
@@ -37,14 +37,14 @@ def standing_robots(n: int):
     for names, rows in ((PAWS, 4), (MOTORS, 12)):
         for name in names:
             setattr(robot, name, wp.zeros((rows, n), dtype=RobotArrays.vars[name].type.dtype, device="cpu"))
-    robot.old_lin_vel = array(np.zeros((n, 3)), wp.vec3)
+    robot.prev_lin_vel = array(np.zeros((n, 3)), wp.vec3)
     robot.default_angle, robot.step_dt = array(DEFAULT_ANGLE), STEP_DT
     return robot
 
 
 def new_worlds(n: int, seed: int = 0, skill=0):
-    """Return `EnvArrays` of worlds that have made no step."""
-    return env_arrays(n, seed, array(np.broadcast_to(skill, n), int), "cpu")
+    """Return `EpisodeArrays` of worlds that have made no step."""
+    return episode_arrays(n, seed, array(np.broadcast_to(skill, n), int), "cpu")
 
 
 def no_delays(n: int, steps=0):
@@ -65,10 +65,10 @@ def values_of(struct, kind) -> SimpleNamespace:
     return SimpleNamespace(**{name: v.numpy().copy() for name, v in found.items() if isinstance(v, wp.array)})
 
 
-def observe(skill, robot, parameters, ground, worlds, states, numbers, beginning: int = 0) -> None:
+def observe(skill, robot, parameters, ground, worlds, states, numbers, after_reset: int = 0) -> None:
     """Launch the stage that observes on a skill's arrays; beginning 1: only where something has just begun."""
     arrays = skill.observations
-    inputs = [skill.index, robot, parameters, ground, worlds, states, numbers, beginning, arrays.raw]
+    inputs = [skill.index, robot, parameters, ground, worlds, states, numbers, after_reset, arrays.raw]
     wp.launch(skill.kernels["observe"], (skill.num_chunks, skill.num_envs), inputs, device="cpu")
-    inputs = [skill.index, worlds, skill.columns, numbers, beginning, arrays]
-    wp.launch(condition_kernel, (skill.num_envs, int(LANES)), inputs, device="cpu")
+    inputs = [skill.index, worlds, skill.columns, numbers, after_reset, arrays]
+    wp.launch(postprocess_obs_kernel, (skill.num_envs, int(LANES)), inputs, device="cpu")

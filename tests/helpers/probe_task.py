@@ -6,12 +6,12 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from jumper_warp.envs.skill import Skill
+from jumper_warp.envs.skill import TaskRuntime
 from jumper_warp.kernels.mdp import terminations
 from jumper_warp.kernels.mdp.env import Scene, SkillSettings
 from jumper_warp.kernels.mdp.parameters import RobotParameters
-from jumper_warp.kernels.mdp.random import Draw, between
-from jumper_warp.kernels.mdp.reset import store_pose
+from jumper_warp.kernels.mdp.random import RngStream, uniform
+from jumper_warp.kernels.mdp.reset import write_default_pose
 from jumper_warp.kernels.mdp.view import RobotArrays, RobotView
 from jumper_warp.kernels.terrain.ground import Ground
 from jumper_warp.robot.motors import jumping_motors, vertical_jump_filter
@@ -76,92 +76,92 @@ class ProbeLevelCfg:
 
 
 @wp.func
-def advance_probe(view: RobotView, task: ProbeState, growth: float) -> ProbeState:
+def advance_probe(robot: RobotView, state: ProbeState, growth: float) -> ProbeState:
     """Let the value grow."""
-    new = task
-    new.steps = task.steps + 1
-    new.value = task.value + growth
+    new = state
+    new.steps = state.steps + 1
+    new.value = state.value + growth
     return new
 
 
 @wp.func
 def reset_probe(
-    robot: RobotArrays, scene: Scene, skill: SkillSettings, old: ProbeState, settings: ProbeSettings, level: ProbeLevel,
-    draw: Draw,
+    arrays: RobotArrays, scene: Scene, skill: SkillSettings, old: ProbeState, settings: ProbeSettings,
+    level: ProbeLevel, rng: RngStream,
 ) -> ProbeState:  # fmt: skip
     """Stand; keep a draw in `other` and the level in `counts`."""
-    store_pose(robot, scene, draw.world, 0.5, 0.25)
+    write_default_pose(arrays, scene, rng.world, 0.5, 0.25)
     new = ProbeState()
     new.value = settings.value
-    new.other = between(draw, 0, 0.0, 1.0)
+    new.other = uniform(rng, 0, 0.0, 1.0)
     new.counts = level.number
     return new
 
 
 @wp.func
-def give_probe(view: RobotView, scene: Scene, task: ProbeState, values: wp.vec4, heading: float) -> ProbeState:
+def give_probe(robot: RobotView, scene: Scene, state: ProbeState, values: wp.vec4, heading: float) -> ProbeState:
     """Take over the first value and the heading."""
-    new = task
+    new = state
     new.value = values[0]
     new.other = heading
     return new
 
 
 @wp.func
-def command_due(task: ProbeState) -> bool:
+def command_due(state: ProbeState) -> bool:
     """Due at a value of 7."""
-    return task.value == 7.0
+    return state.value == 7.0
 
 
 @wp.func
-def draw_command(view: RobotView, scene: Scene, task: ProbeState, level: ProbeLevel, draw: Draw) -> ProbeState:
+def draw_command(robot: RobotView, scene: Scene, state: ProbeState, level: ProbeLevel, rng: RngStream) -> ProbeState:
     """Keep a draw in `other` and the level in `counts`."""
-    new = task
-    new.other = between(draw, 0, 0.0, 1.0)
+    new = state
+    new.other = uniform(rng, 0, 0.0, 1.0)
     new.counts = level.number
     return new
 
 
 @wp.func
-def value(view: RobotView, task: ProbeState) -> float:
+def value(robot: RobotView, state: ProbeState) -> float:
     """The value."""
-    return task.value
+    return state.value
 
 
 @wp.func
-def offset_square(view: RobotView, task: ProbeState, offset: float, scale: float) -> float:
+def offset_square(robot: RobotView, state: ProbeState, offset: float, scale: float) -> float:
     """Squared distance of the value from an offset, times a scale."""
-    return scale * (task.value - offset) * (task.value - offset)
+    return scale * (state.value - offset) * (state.value - offset)
 
 
 @wp.func
-def other(view: RobotView, task: ProbeState) -> float:
+def other(robot: RobotView, state: ProbeState) -> float:
     """The other number."""
-    return task.other
+    return state.other
 
 
 @wp.func
-def base_height(view: RobotView, task: Any) -> float:
+def base_height(robot: RobotView, state: Any) -> float:
     """Height of the base [m]."""
-    return view.height
+    return robot.height
 
 
 @wp.func
-def other_above(view: RobotView, task: ProbeState, limit: float) -> bool:
+def other_above(robot: RobotView, state: ProbeState, limit: float) -> bool:
     """Whether the other number is above a limit."""
-    return task.other > limit
+    return state.other > limit
 
 
 @wp.func
-def counts(task: ProbeState) -> bool:
+def counts(state: ProbeState) -> bool:
     """Whether the episode counts for the curriculum."""
-    return task.counts != 0
+    return state.counts != 0
 
 
 @wp.func
-def both(view: RobotView, task: ProbeState) -> wp.vec2:
+def both(robot: RobotView, state: ProbeState) -> wp.vec2:
     """Both numbers."""
-    return wp.vec2(task.value, task.other)
+    return wp.vec2(state.value, state.other)
 
 
 @wp.func
@@ -218,12 +218,12 @@ class Probe:
     def __init__(self, n: int, task: TaskCfg | None = None, index: int = 0, seed: int = 0):
         """index: of the skill."""
         self.n, self.task = n, probe_task() if task is None else task
-        self.skill = Skill(self.task, index, n, STEP_DT, SUBSTEPS, "cpu")
-        self.robot, self.worlds, self.delays = standing_robots(n), new_worlds(n, seed), no_delays(n)
+        self.skill = TaskRuntime(self.task, index, n, STEP_DT, SUBSTEPS, "cpu")
+        self.robot, self.episodes, self.delays = standing_robots(n), new_worlds(n, seed), no_delays(n)
         self.parameters, self.ground = RobotParameters(), Ground()
         self.ground.heights = array(np.zeros((1, 1)))
         self.parameters.latency = array(np.zeros(n), int)
-        self.parameters.skill = self.worlds.skill
+        self.parameters.skill = self.episodes.skill
         self.latency = array(np.zeros(n), int)
         self.skill.observations.latency = self.latency
 
@@ -239,25 +239,25 @@ class Probe:
         return self.skill.states.numpy()[name].copy()
 
     def world(self, name: str) -> np.ndarray:
-        """Return an array of `EnvArrays`."""
-        return getattr(self.worlds, name).numpy().copy()
+        """Return an array of `EpisodeArrays`."""
+        return getattr(self.episodes, name).numpy().copy()
 
     def step(self) -> None:
         """Launch the end of a step."""
         skill = self.skill
-        inputs = [skill.index, self.robot, self.ground, len(self.task.levels), skill.params.values, self.worlds,
+        inputs = [skill.index, self.robot, self.ground, len(self.task.levels), skill.params.values, self.episodes,
                   skill.states, skill.term_value, skill.counters]  # fmt: skip
         wp.launch(skill.kernels["step"], self.n, inputs, device="cpu")
 
-    def observe(self, beginning: int = 0) -> None:
+    def observe(self, after_reset: int = 0) -> None:
         """Launch the observation."""
         states, numbers = self.skill.states, self.skill.params.values
-        observe(self.skill, self.robot, self.parameters, self.ground, self.worlds, states, numbers, beginning)
+        observe(self.skill, self.robot, self.parameters, self.ground, self.episodes, states, numbers, after_reset)
 
     def next_clock(self) -> None:
         """Let all worlds be one policy step further on, and no longer new."""
-        self.worlds.clock.assign(self.worlds.clock.numpy() + 1)
-        self.worlds.fresh.zero_()
+        self.episodes.step_count.assign(self.episodes.step_count.numpy() + 1)
+        self.episodes.history_reset.zero_()
 
     def obs(self, group: str, final: bool = False) -> np.ndarray:
         """Return an observation group, (n, columns)."""

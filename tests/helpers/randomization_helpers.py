@@ -91,7 +91,7 @@ def seen(env):
     return {name: values for name, values in read(env).items() if name not in left_out}
 
 
-def within(values, lower, upper):
+def uniform_range(values, lower, upper):
     """Whether values stay in a range, but for rounding."""
     width = upper - lower
     return values.min() >= lower - 1e-5 * width and values.max() <= upper + 1e-5 * width
@@ -101,7 +101,7 @@ def fills(values, lower, upper):
     """Whether values stay in a range, reach its ends and lie about its middle."""
     width = upper - lower
     wide = values.min() < lower + 0.03 * width and values.max() > upper - 0.03 * width
-    return within(values, lower, upper) and wide and abs(values.mean() - 0.5 * (lower + upper)) < 0.1 * width
+    return uniform_range(values, lower, upper) and wide and abs(values.mean() - 0.5 * (lower + upper)) < 0.1 * width
 
 
 ROWS = {

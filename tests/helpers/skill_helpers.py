@@ -8,27 +8,27 @@ from jumper_warp.kernels.mdp.view import RobotView
 
 
 @wp.func
-def when_asked_to_jump(view: RobotView, task: HoldState, requested: bool) -> bool:
+def when_asked_to_jump(robot: RobotView, state: HoldState, requested: bool) -> bool:
     return requested
 
 
 @wp.func
-def when_asked_to_hold(view: RobotView, task: JumpState, requested: bool) -> bool:
+def when_asked_to_hold(robot: RobotView, state: JumpState, requested: bool) -> bool:
     return requested
 
 
 @wp.func
-def begin_jump(view: RobotView, task: HoldState) -> JumpState:
+def begin_jump(robot: RobotView, state: HoldState) -> JumpState:
     new = JumpState()
-    new.start = view.pos
-    new.max_height = view.pos[2]
-    new.goal = wp.vec3(view.pos[0], view.pos[1], 0.6 + task.goal)
+    new.start = robot.pos
+    new.max_height = robot.pos[2]
+    new.goal = wp.vec3(robot.pos[0], robot.pos[1], 0.6 + state.goal)
     new.command_step = 1000
     return new
 
 
 @wp.func
-def begin_hold(view: RobotView, task: JumpState) -> HoldState:
+def begin_hold(robot: RobotView, state: JumpState) -> HoldState:
     new = HoldState()
     new.goal = 0.3
     return new

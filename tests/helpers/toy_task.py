@@ -153,11 +153,11 @@ def train_rank(rank: int, port: int, cfg: TrainCfg, path: str) -> None:
     networks = []
     original = Ppo.__init__
 
-    def remember(self: Ppo, env: PushTask, ppo_cfg: PpoCfg) -> None:
+    def begin_policy_step(self: Ppo, env: PushTask, ppo_cfg: PpoCfg) -> None:
         original(self, env, ppo_cfg)
         networks.append(self.model)
 
-    Ppo.__init__ = remember
+    Ppo.__init__ = begin_policy_step
     result = train(cfg, make_env)
     outcome = {"model": networks[0].state_dict(), "seed": made[0].seed, "num_envs": made[0].num_envs}
     torch.save({**outcome, "iteration": result.iteration}, path + str(rank))

@@ -31,11 +31,11 @@ def robot_of(env) -> dict[str, np.ndarray]:
         "torque": views.torque.numpy().astype(float),
         "action": views.action.numpy().astype(float),
         "force": np.linalg.norm(views.paw_force.numpy().astype(float), axis=2),
-        "old_torque": views.old_torque.numpy().astype(float),
+        "prev_torque": views.prev_torque.numpy().astype(float),
         "peak": views.peak_force.numpy().astype(float),
         "paws": views.paw_pos.numpy().astype(float),
         "air_time": views.air_time.numpy().astype(float),
-        "clipped": np.sum((views.target.numpy().astype(float) - views.safe_target.numpy()) ** 2, axis=0),
+        "clipped": np.sum((views.target.numpy().astype(float) - views.filtered_target.numpy()) ** 2, axis=0),
     }
     return robot | {name: tasks[name].copy() for name in EPISODE}
 
@@ -44,9 +44,9 @@ def between(before: dict, after: dict, action: np.ndarray) -> dict[str, np.ndarr
     """Return the robot after a step, with what follows from the step; action: (12, worlds)."""
     return after | {
         "acc": (after["vel"] - before["vel"]) / DT,
-        "rate_change": (after["rate"] - before["rate"]) / DT,
+        "joint_acc": (after["rate"] - before["rate"]) / DT,
         "action": action,
-        "old_action": before["action"],
+        "prev_action": before["action"],
     }
 
 
@@ -189,8 +189,8 @@ TERMS = {
     ),
     "paws_down": lambda r, p: (r["phase"] == LANDED) * np.count_nonzero(r["force"] > CONTACT_FORCE, axis=0),
     "capture_point": lambda r, p: (r["phase"] == LANDED) * phi(norm(capture_offset(r)), p["width"]),
-    "resting_action_rate": lambda r, p: at_ease(r) * np.sum((r["action"] - r["old_action"]) ** 2, axis=0),
-    "torque_ripple": lambda r, p: at_ease(r) * np.sum((r["torque"] - r["old_torque"]) ** 2, axis=0),
+    "resting_action_rate": lambda r, p: at_ease(r) * np.sum((r["action"] - r["prev_action"]) ** 2, axis=0),
+    "torque_ripple": lambda r, p: at_ease(r) * np.sum((r["torque"] - r["prev_torque"]) ** 2, axis=0),
     "force_ripple": lambda r, p: at_ease(r) * np.sum(((r["peak"] - r["force"]) / p["weight_force"]) ** 2, axis=0),
     "soft_impact": lambda r, p: soon(r) * np.maximum(1.0 - deceleration(r) / p["limit"], 0.0),
     "stance_impact": lambda r, p: -1.0 * (r["phase"] == STANCE) * np.minimum(deceleration(r) / p["limit"], 1.0),
@@ -199,8 +199,8 @@ TERMS = {
     "ground_force": lambda r, p: np.sum(r["force"] ** 2, axis=0) / p["weight_force"] ** 2,
     "action_clip": lambda r, p: r["clipped"],
     "motor_torque_sq": lambda r, p: np.sum(r["torque"] ** 2, axis=0),
-    "joint_acceleration": lambda r, p: np.sum(r["rate_change"] ** 2, axis=0),
-    "action_rate": lambda r, p: np.sum((r["action"] - r["old_action"]) ** 2, axis=0),
+    "joint_acceleration": lambda r, p: np.sum(r["joint_acc"] ** 2, axis=0),
+    "action_rate": lambda r, p: np.sum((r["action"] - r["prev_action"]) ** 2, axis=0),
 }
 """(robot, numbers) -> value of every world, before weight and step."""
 

@@ -24,8 +24,8 @@ QUAT = np.array([-1.0, 1.0, -1.0, 1.0])
 
 def task():
     """The task on rough ground with a clock, so that every term of all velocity tasks is there."""
-    rough, clock = make_task("velocity-rough"), ObservationTerm(velocity.clock)
-    return dataclasses.replace(rough, policy=(*rough.policy, clock), critic=(*rough.critic, clock))
+    rough, step_count = make_task("velocity-rough"), ObservationTerm(velocity.step_count)
+    return dataclasses.replace(rough, policy=(*rough.policy, step_count), critic=(*rough.critic, step_count))
 
 
 def reflected(values, change):
@@ -69,7 +69,7 @@ def reflection():
     change(robot.body_com, (n, BODIES, 3), lambda c: c * FLIP)
     for name in ("contact_time", "air_time", "touchdown_speed", "peak_force", "paw_height", "paw_force"):
         change(getattr(robot, name), None, lambda x: x[:, LEGS], worlds_last=True)
-    for name in ("action", "old_action", "older_action", "torque", "joint_offset"):
+    for name in ("action", "prev_action", "prev_prev_action", "torque", "joint_offset"):
         change(getattr(robot, name), None, lambda x: x[:, MOTORS], worlds_last=True)
     for array in (parameters.gain_ratio, parameters.motors.no_load_speed):
         change(array, None, lambda x: x[:, MOTORS], worlds_last=True)
@@ -90,8 +90,8 @@ def reflection():
         command_steps=state["command_steps"][:HALF],
     )
     parameters.observation_latency.zero_()
-    env.worlds.broken.zero_()
-    env.worlds.fresh.fill_(1)
+    env.episodes.diverged.zero_()
+    env.episodes.history_reset.fill_(1)
     env.stages()["observe"]()
     return env.task, {"policy": env.obs.numpy().copy(), "critic": env.critic_obs.numpy().copy()}
 

@@ -16,14 +16,22 @@ from jumper_warp.kernels.jump.state import JumpState
 from jumper_warp.kernels.mdp.view import RobotView
 from jumper_warp.registry import TASKS, make_task
 from jumper_warp.tasks.cfg import TaskCfg
-from jumper_warp.tasks.saving import MAX_ENTRIES, OPTIONAL, TaskError, name_of, plain, task_from_json, task_to_json
+from jumper_warp.tasks.saving import (
+    MAX_ENTRIES,
+    OPTIONAL,
+    TaskError,
+    name_of,
+    parameterless,
+    task_from_json,
+    task_to_json,
+)
 from jumper_warp.tasks.terms import RewardTerm
 
 JUMP = "jumper_warp.kernels.jump"
 
 
 @wp.func
-def rest(view: RobotView, task: Any, speed: float, spin: float) -> float:
+def rest(robot: RobotView, state: Any, speed: float, spin: float) -> float:
     """Another rest than the project's, with the same numbers."""
     return speed + spin
 
@@ -91,7 +99,7 @@ def test_sections_of_a_training_can_be_left_out_with_their_functions():
 
 def local_func():
     @wp.func
-    def inner(view: RobotView, task: Any) -> float:
+    def inner(robot: RobotView, state: Any) -> float:
         return 1.0
 
     return inner
@@ -124,7 +132,7 @@ class Settings:
 @pytest.mark.parametrize("value", [math.nan, math.inf, {"a": 1.0}, [1.0], b"x", object()])
 def test_setting_that_would_not_come_back_is_not_saved(value):
     with pytest.raises(TaskError):
-        plain(Settings(value))
+        parameterless(Settings(value))
 
 
 @pytest.mark.parametrize(

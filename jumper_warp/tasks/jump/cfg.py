@@ -13,7 +13,7 @@ import warp as wp
 from jumper_warp.kernels.jump.ground_draws import EVERY_SIDE, GroundRanges
 from jumper_warp.kernels.jump.reset import JumpLevel, JumpSettings
 from jumper_warp.kernels.jump.start_states import ResetRanges
-from jumper_warp.kernels.jump.state import vec_schemes
+from jumper_warp.kernels.jump.state import vec_start_modes
 from jumper_warp.tasks.ranges import Pair, check_ranges, filled
 from jumper_warp.utils.checks import check_positive, check_shares
 from jumper_warp.utils.errors import InputError
@@ -226,7 +226,7 @@ class ResetCfg:
         ranges = filled(ResetRanges(), self, apart, degrees)
         *others, pushing = self._shares()
         landed = 1.0 - sum(self._shares())
-        ranges.shares = vec_schemes(*others, landed if landed > 1.0e-6 else 0.0, pushing)
+        ranges.shares = vec_start_modes(*others, landed if landed > 1.0e-6 else 0.0, pushing)
         ranges.of_time = int(self.shares_of == "time")
         ranges.command_delay = round(self.command_delay / step_dt)
         ranges.long_wait = round(self.long_wait / step_dt)

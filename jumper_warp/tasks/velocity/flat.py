@@ -125,12 +125,12 @@ def velocity_flat() -> TaskCfg:
 def velocity_trot() -> TaskCfg:
     """Return the task with a clock that is seen and whose trot is paid for, at 2 Hz."""
     flat = velocity_flat()
-    clock = ObservationTerm(velocity.clock)
+    step_count = ObservationTerm(velocity.step_count)
     return replace(
         flat,
         name="velocity-trot",
         reset=replace(flat.reset, settings=replace(flat.reset.settings, gait=2.0)),
         rewards=(*flat.rewards, RewardTerm(rewards.trot_schedule, 2.0, duty=0.55)),
-        policy=(*flat.policy, clock),
-        critic=(*flat.critic, clock),
+        policy=(*flat.policy, step_count),
+        critic=(*flat.critic, step_count),
     )

@@ -7,7 +7,7 @@ by one, and then twice more side by side for the gradients by parameters (`const
 import warp as wp
 
 from ...actuation.motors import MotorParams
-from ...lanes import meet
+from ...lanes import sync_lanes
 from ...layout import BASE, GRAVITY
 from ...scalar import quat, real, vec3
 from ...state import base_com
@@ -90,7 +90,7 @@ def replay_legs_kernel(
     put_base(record, at, world, load_row_base(rows, row, world, base_com(robot.table, world)))
     put_vec(record, at, ANGLES, world, leg, row_vec3(rows.q, row, 7 + 3 * leg, world))
     put_vec(record, at, RATES, world, leg, row_vec3(rows.qd, row, 6 + 3 * leg, world))
-    meet()
+    sync_lanes()
     motors = wp.zeros(shape=(3,), dtype=MotorParams)
     for c in range(motors.shape[0]):
         motors[c] = load_world_motor(actuation, 3 * leg + c, world)
@@ -98,7 +98,7 @@ def replay_legs_kernel(
     for i in range(timing.every):
         step = first + i
         replay_leg(robot, own, settings.dt, world, leg, force, moment, commands.impulse, rows, step, at + i, record)
-        meet()
+        sync_lanes()
         angles = get_vec(record, at + i, ANGLES, world, leg)
         rates = get_vec(record, at + i, RATES, world, leg)
         slopes = MotorSlopes()

@@ -20,7 +20,7 @@ from ...actuation.stops import (
     revised_stops,
     stop_rows,
 )
-from ...lanes import any_world, first_leg, from_leg, max_legs, meet, sum_legs, sum_vec
+from ...lanes import any_world, first_leg, from_leg, max_legs, sum_legs, sum_vec, sync_lanes
 from ...layout import GRAVITY
 from ...scalar import real, vec3
 from ...state import BaseState, base_com, leg_coord, leg_dof, load_base, load_motors, store_base, store_motors
@@ -28,7 +28,7 @@ from ...terrain.ground import move_block
 from ..base_dynamics import BaseSystem, add_leg, invert, motor_acceleration, solve_ang, solve_lin, sum_systems
 from ..base_motion import moved_base
 from ..contact import BlockLaw, PawContact, block_velocity, local_impulse
-from ..drive import Drive, LegDrive, Workspace, applied_torque, base_wrench, load_leg_drive, park
+from ..drive import Drive, LegDrive, Workspace, applied_torque, base_wrench, freeze_diverged_world, load_leg_drive
 from ..parameters import load_spring, load_stops, load_vec3
 from ..step import (
     LegParams,
@@ -242,7 +242,7 @@ def advance_leg(
         push = sum_vec(wp.where(contact.on_block != 0, -solved.impulse, vec3(real(0.0))))
         if writes and done and robot.ground.blocks[world].exists != 0:
             move_block(robot.ground, world, wp.quat_rotate(base.quat, block_velocity(block, push)), dt)
-        meet()
+        sync_lanes()
     if done:
         moved = moved_base(base, lin + solved.lin, ang + solved.ang, dt)
         return stepped(old, moved, old.angles + dt * rates, rates, torque, solved, total, pressed)
@@ -289,7 +289,7 @@ def advance_legs_kernel(
     if broken:
         if leg == 0:
             work.invalid[world] = 1
-            park(robot, work, world, joint_q_out, joint_qd_out)
+            freeze_diverged_world(robot, work, world, joint_q_out, joint_qd_out)
         return
     for j in range(3):
         work.torque[3 * leg + j, world] = s.torque[j]

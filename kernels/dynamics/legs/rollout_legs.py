@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from ...lanes import any_world, meet
+from ...lanes import any_world, sync_lanes
 from ...layout import DOFS
 from ...scalar import real
 from ...state import base_com
@@ -63,7 +63,7 @@ def rollout_legs_kernel(
             if leg == 0:
                 for i in range(6):
                     drive.joint_f[world * DOFS + i] = commands.wrench[t, i, world]
-            meet()
+            sync_lanes()
         arrived = arrival(step, timing.substeps, late)
         motors = LegDrive()
         torque = leg_torque(commands, actuation, safe, arrived, leg, world, s.angles, s.rates)
@@ -80,4 +80,4 @@ def rollout_legs_kernel(
                 store_row_base(rows, row + 1, world, com, s.base)
             store_row_vec3(rows.q, row + 1, 7 + 3 * leg, world, s.angles)
             store_row_vec3(rows.qd, row + 1, 6 + 3 * leg, world, s.rates)
-            meet()
+            sync_lanes()

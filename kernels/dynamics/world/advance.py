@@ -11,7 +11,7 @@ from ...state import BaseState, base_com, leg_coord, leg_dof, load_base, load_mo
 from ...terrain.ground import has_block, move_block
 from ..base_motion import moved_base
 from ..contact import ContactState, PawContact, block_velocity, push_on_block
-from ..drive import Drive, Workspace, applied_torque, base_wrench, load_leg_drive, park
+from ..drive import Drive, Workspace, applied_torque, base_wrench, freeze_diverged_world, load_leg_drive
 from ..step import Robot, StepSettings, block_law, finite_base
 from .world_step import LegStep, solve_step
 
@@ -91,7 +91,7 @@ def advance_kernel(
     """
     world = settings.first + wp.tid()
     if work.invalid[world] != 0:
-        park(robot, work, world, joint_q_out, joint_qd_out)
+        freeze_diverged_world(robot, work, world, joint_q_out, joint_qd_out)
         return
     com = base_com(robot.table, world)
     base = load_base(joint_q, joint_qd, com, world)
@@ -117,4 +117,4 @@ def advance_kernel(
     store_base(joint_q_out, joint_qd_out, com, world, base)
     if not (finite_base(base) and wp.isfinite(total)):
         work.invalid[world] = 1
-        park(robot, work, world, joint_q_out, joint_qd_out)
+        freeze_diverged_world(robot, work, world, joint_q_out, joint_qd_out)

@@ -210,11 +210,11 @@ def oracle_distances():
     for i in range(len(pos)):
         points = np.array([leg_points(leg, *motors[i, 3 * leg : 3 * leg + 3]) for leg in range(4)])
         bars = [links(p) for p in points]
-        between = min(coal_distance(a, b) for one, two in PAIRS for a in bars[one] for b in bars[two])
+        uniform = min(coal_distance(a, b) for one, two in PAIRS for a in bars[one] for b in bars[two])
         shells = [[box(*NOSE), box(*TRUNK), box(*(REAR_DRUMS if f > 0 else FRONT_DRUMS))] for f, _ in LEGS]
         shell = min(coal_distance(a, b) for leg in range(4) for a in bars[leg] for b in shells[leg])
         own = min(self_distance(p) for p in points)
-        out.append((*ground_oracle(pos[i], quat_xyzw[i], points), between, own, shell))
+        out.append((*ground_oracle(pos[i], quat_xyzw[i], points), uniform, own, shell))
     return np.array(out)
 
 

@@ -51,8 +51,8 @@ def drawn_blocks(env):
 class Scenes(Starts):
     """Thousands of starts on one kind of ground; the attributes of `Starts`, and of those `taken` the block's too."""
 
-    def __init__(self, env, kind, scheme):
-        super().__init__(env, scheme, ground=KINDS[kind])
+    def __init__(self, env, kind, start_mode):
+        super().__init__(env, start_mode, ground=KINDS[kind])
         self.block = {name: values[self.drawn] for name, values in drawn_blocks(env).items()}
         self.foot = extents(self.episodes["heading"])
         self.taken = self.block["exists"] == 1
@@ -80,7 +80,9 @@ def env(request):
 @pytest.fixture(scope="module")
 def scenes(env):
     """(kind, scheme) -> Scenes"""
-    return {(kind, scheme): Scenes(env, kind, scheme) for kind in KINDS for scheme in ("standing", "default")}
+    return {
+        (kind, start_mode): Scenes(env, kind, start_mode) for kind in KINDS for start_mode in ("standing", "default")
+    }
 
 
 @pytest.fixture(params=["standing", "default"])
@@ -194,9 +196,9 @@ def test_blocks_have_uniform_heights_masses_and_frictions(to_block):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("scheme", ["standing", "default"])
-def test_no_start_collides(scenes, kind, scheme):
-    found = scenes[kind, scheme]
+@pytest.mark.parametrize("start_mode", ["standing", "default"])
+def test_no_start_collides(scenes, kind, start_mode):
+    found = scenes[kind, start_mode]
     assert not found.flags.any() and found.fallbacks < 0.005
 
 
@@ -208,9 +210,9 @@ def test_an_episode_knows_the_ground_at_its_goal(scenes, kind):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("scheme", ["in_flight", "touchdown", "landed"])
-def test_the_ground_is_level_where_a_jump_has_begun(env, kind, scheme):
-    for start in ("default", scheme):
+@pytest.mark.parametrize("start_mode", ["in_flight", "touchdown", "landed"])
+def test_the_ground_is_level_where_a_jump_has_begun(env, kind, start_mode):
+    for start in ("default", start_mode):
         begin_by(env, only(start, resets_of(env), ground=KINDS[kind]))
         edit_episodes(env, level=len(env.task.levels) - 1)
         env.reset()
@@ -266,9 +268,9 @@ def hold(env, steps=20):
     env.sim.physics.write_bodies()
 
 
-@pytest.mark.parametrize("scheme", ["standing", "default"])
-def test_robots_stand_still_on_platforms_which_do_not_move(scheme):
-    env = drawing_env("horizontal-jump", 64, KINDS["platform"], levels=FAR, reset=only(scheme, heading=180.0))
+@pytest.mark.parametrize("start_mode", ["standing", "default"])
+def test_robots_stand_still_on_platforms_which_do_not_move(start_mode):
+    env = drawing_env("horizontal-jump", 64, KINDS["platform"], levels=FAR, reset=only(start_mode, heading=180.0))
     edit_episodes(env, command_step=1000)
     block, before = drawn_blocks(env), env.sim.joint_q()
     assert block["exists"].all()

@@ -43,7 +43,7 @@ def stand(env, **fields):
     """Begin episodes in the default pose, and overwrite fields of all of them."""
     env.auto_reset = True
     env.reset()
-    edit_episodes(env, **({"command_step": 1000, "again_step": 0} | fields))
+    edit_episodes(env, **({"command_step": 1000, "next_jump_step": 0} | fields))
 
 
 def yaw_of(arrays):
@@ -100,7 +100,7 @@ def test_an_evaluation_starts_with_its_heading_and_goal(turn):
     np.testing.assert_allclose(arrays["heading"], turn * DEG, atol=1e-6)
     assert angle_between(yaw_of(arrays), turn * DEG).max() < 1e-5
     assert not env.obs[:, :2].any()  # the jump is commanded later
-    assert (arrays["again_step"] == 0).all()
+    assert (arrays["next_jump_step"] == 0).all()
 
 
 # ---------------------------------------------------------------- another jump
@@ -125,7 +125,7 @@ def every_array(env):
 def second(env):
     """Episodes before and after the step in which some worlds got another goal."""
     land(env)
-    edit_episodes(env, AGAIN, again_step=13, level=np.arange(10) % 4 + 1)
+    edit_episodes(env, AGAIN, next_jump_step=13, level=np.arange(10) % 4 + 1)
     before = env.task_arrays()
     env.step(REST)
     return before, env.task_arrays()
@@ -156,7 +156,7 @@ def shown(arrays):
 
 def test_the_second_goal_is_seen_at_once(env):
     land(env)
-    edit_episodes(env, AGAIN, again_step=13)
+    edit_episodes(env, AGAIN, next_jump_step=13)
     env.step(REST)
     after = env.task_arrays()
     assert (after["jumps"][AGAIN] == np.arange(N)[AGAIN] % 3 + 1).all()
@@ -176,7 +176,7 @@ def test_a_goal_from_outside_is_seen_at_once(env):
 def test_the_second_goal_is_in_the_levels_box_before_the_robot(env):
     ahead, level = [], []
     for _ in range(8):
-        land(env, again_step=13, level=1 + np.arange(N) % 4)
+        land(env, next_jump_step=13, level=1 + np.arange(N) % 4)
         env.step(REST)
         after = env.task_arrays()
         assert (after["phase"] == STANCE).all()
@@ -194,7 +194,7 @@ def test_the_second_goal_is_in_the_levels_box_before_the_robot(env):
 def test_others_keep_their_episode(second):
     before, after = second
     others = np.setdiff1d(np.arange(N), AGAIN)
-    for name in ("goal", "start", "heading", "command_step", "jumps", "again_step"):
+    for name in ("goal", "start", "heading", "command_step", "jumps", "next_jump_step"):
         np.testing.assert_array_equal(after[name][others], before[name][others])
     np.testing.assert_array_equal(after["phase_steps"][others], 13)
 
@@ -202,7 +202,7 @@ def test_others_keep_their_episode(second):
 def test_another_goal_moves_nothing_but_the_episode():
     pair = [make_env(N, task=again_and_again(1.0), reset=only("default"), seed=4) for _ in range(2)]
     for env, when in zip(pair, (13, 0), strict=True):
-        edit_episodes(env, level=1, phase=LANDED, phase_steps=12, again_step=when)
+        edit_episodes(env, level=1, phase=LANDED, phase_steps=12, next_jump_step=when)
         for action in 0.3 * random_actions(N, 5):
             env.step(action)
     one, other = pair
@@ -213,19 +213,19 @@ def test_another_goal_moves_nothing_but_the_episode():
 
 
 def test_jumps_follow_each_other_as_often_as_planned(env):
-    land(env, again_step=13)
+    land(env, next_jump_step=13)
     env.step(REST)
-    planned = env.task_arrays()["again_step"]  # jump_again = 1: after every second jump a third
+    planned = env.task_arrays()["next_jump_step"]  # jump_again = 1: after every second jump a third
     assert planned.min() >= 12 and planned.max() <= 42 and len(set(planned)) > 20
     never = make_env(N, task=again_and_again(0.0), reset=only("default"))
-    land(never, again_step=13)
+    land(never, next_jump_step=13)
     never.step(REST)
     arrays = never.task_arrays()
-    assert (arrays["phase"] == STANCE).all() and not arrays["again_step"].any()
+    assert (arrays["phase"] == STANCE).all() and not arrays["next_jump_step"].any()
 
 
 def test_an_ended_episode_begins_anew_instead(env):
-    land(env, again_step=60, phase_steps=59)
+    land(env, next_jump_step=60, phase_steps=59)
     env.step(REST)
     after = env.task_arrays()
     assert env.done.all() and not after["jumps"].any() and not after["steps"].any()
@@ -233,14 +233,14 @@ def test_an_ended_episode_begins_anew_instead(env):
 
 @pytest.mark.parametrize("wait", [{"phase_steps": 11}, {"phase": STANCE}, {"phase": FLIGHT}])
 def test_another_jump_waits_for_its_time_after_touchdown(env, wait):
-    land(env, **({"again_step": 13} | wait))
+    land(env, **({"next_jump_step": 13} | wait))
     env.step(REST)
     going = env.done.numpy() == 0.0
     np.testing.assert_array_equal(env.task_arrays()["jumps"][going], (np.arange(N) % 3)[going])
 
 
 def test_another_jump_that_is_overdue_begins(env):
-    land(env, again_step=13, phase_steps=20)
+    land(env, next_jump_step=13, phase_steps=20)
     env.step(REST)
     going = env.done.numpy() == 0.0
     assert going.any()

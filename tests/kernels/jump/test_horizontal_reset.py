@@ -4,7 +4,17 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from jump_helpers import DEG, SCHEMES, begin_by, edit_episodes, episodes_of, make_env, only, resets_of, set_levels
+from jump_helpers import (
+    DEG,
+    NUM_START_MODES,
+    begin_by,
+    edit_episodes,
+    episodes_of,
+    make_env,
+    only,
+    resets_of,
+    set_levels,
+)
 from jump_starts import PAW_RADIUS, PLACES, Starts, covers, paws_and_velocities
 from jumper_warp.kernels.jump.state import FLIGHT, LANDED, STANCE
 from jumper_warp.registry import make_task
@@ -38,9 +48,10 @@ def env(request):
 @pytest.fixture(scope="module")
 def starts(env):
     """Beginnings of every scheme, (scheme) -> Starts, and those of jumps from the very origin, (exact scheme)."""
-    found = {scheme: Starts(env, scheme) for scheme in SCHEMES}
+    found = {start_mode: Starts(env, start_mode) for start_mode in NUM_START_MODES}
     return found | {
-        f"exact {scheme}": Starts(env, scheme, exact=True) for scheme in ("in_flight", "touchdown", "landed")
+        f"exact {start_mode}": Starts(env, start_mode, exact=True)
+        for start_mode in ("in_flight", "touchdown", "landed")
     }
 
 
@@ -48,40 +59,40 @@ def test_schemes_have_the_tasks_shares(env):
     begin_by(env, dataclasses.replace(resets_of(env), shares_of="resets"))
     edit_episodes(env, level=np.arange(N) % len(env.task.levels))
     env.reset()
-    shares = np.bincount(episodes_of(env)["scheme"], minlength=6) / N
+    shares = np.bincount(episodes_of(env)["start_mode"], minlength=6) / N
     # 0.02: default poses that stand in for what cannot be drawn
     assert np.abs(shares - [0.40, 0.15, 0.15, 0.15, 0.05, 0.10]).max() < 4.0 * np.sqrt(0.25 / N) + 0.02
 
 
-@pytest.mark.parametrize("scheme", SCHEMES)
-def test_no_state_collides_or_crosses_the_motor_limits(starts, scheme):
-    assert not starts[scheme].flags.any()
-    angles = starts[scheme].q[:, MOTOR_Q].reshape(-1, 4, 3)
+@pytest.mark.parametrize("start_mode", NUM_START_MODES)
+def test_no_state_collides_or_crosses_the_motor_limits(starts, start_mode):
+    assert not starts[start_mode].flags.any()
+    angles = starts[start_mode].q[:, MOTOR_Q].reshape(-1, 4, 3)
     assert np.abs(angles[..., 0]).max() <= 15.0 * DEG + 1e-4
     sums = angles[..., 1:].sum(axis=2)
     assert sums.min() >= -1e-4 and sums.max() <= 220.0 * DEG + 1e-4
 
 
-@pytest.mark.parametrize("scheme", [name for name in SCHEMES if name != "default"])
-def test_the_default_pose_rarely_stands_in(starts, scheme):
-    assert starts[scheme].fallbacks < 0.02
+@pytest.mark.parametrize("start_mode", [name for name in NUM_START_MODES if name != "default"])
+def test_the_default_pose_rarely_stands_in(starts, start_mode):
+    assert starts[start_mode].fallbacks < 0.02
 
 
-@pytest.mark.parametrize("scheme", SCHEMES)
-def test_headings_cover_the_circle(env, starts, scheme):
-    found = starts[scheme]
+@pytest.mark.parametrize("start_mode", NUM_START_MODES)
+def test_headings_cover_the_circle(env, starts, start_mode):
+    found = starts[start_mode]
     heading = found.episodes["heading"]
     assert covers(heading, -np.pi, np.pi, 0.01)
     shares = np.histogram(heading, np.linspace(-np.pi, np.pi, 9))[0] / len(heading)
     assert np.abs(shares - 0.125).max() < 5.0 * np.sqrt(0.125 * 0.875 / len(heading))
     body = (found.heading.inv() * Rotation.from_quat(found.q[:, 3:7])).as_euler("ZYX")
-    if scheme in ("in_flight", "touchdown", "pushing"):  # nose down in the mean
+    if start_mode in ("in_flight", "touchdown", "pushing"):  # nose down in the mean
         down = env.task.reset.settings.takeoff_pitch[1] * DEG
         assert covers(body[:, 1], -5.0 * DEG, down + 5.0 * DEG, 0.1)
         body[:, 1] = body[:, 0]
-    half = 0.0 if scheme == "default" else 5.0 * DEG
+    half = 0.0 if start_mode == "default" else 5.0 * DEG
     assert np.abs(body[:, [0, 2]]).max() <= half + 1e-4
-    if scheme not in ("standing", "default"):
+    if start_mode not in ("standing", "default"):
         assert covers(body[:, 0], -half, half) and covers(body[:, 1], -half, half) and covers(body[:, 2], -half, half)
 
 
@@ -93,9 +104,9 @@ def test_only_forward_jumps_begin_pitched_forward(env, starts):
     assert body[:, 1].mean() == pytest.approx(0.5 * mean, abs=0.15 * mean + 4.0 * 5.0 * DEG / np.sqrt(len(body)))
 
 
-@pytest.mark.parametrize("scheme", SCHEMES)
-def test_goals_lie_in_the_levels_box_or_ellipse_turned_by_the_heading(env, starts, scheme):
-    found = starts[scheme]
+@pytest.mark.parametrize("start_mode", NUM_START_MODES)
+def test_goals_lie_in_the_levels_box_or_ellipse_turned_by_the_heading(env, starts, start_mode):
+    found = starts[start_mode]
     ahead = found.heading.inv().apply(found.goal)
     for number, level in enumerate(env.task.levels):
         here = ahead[found.level == number]
@@ -109,10 +120,10 @@ def test_goals_lie_in_the_levels_box_or_ellipse_turned_by_the_heading(env, start
 
 
 def test_phases_and_the_command_fit_the_scheme(starts):
-    for scheme, phase in zip(SCHEMES, (STANCE, STANCE, FLIGHT, FLIGHT, LANDED, STANCE), strict=True):
-        episodes = starts[scheme].episodes
+    for start_mode, phase in zip(NUM_START_MODES, (STANCE, STANCE, FLIGHT, FLIGHT, LANDED, STANCE), strict=True):
+        episodes = starts[start_mode].episodes
         assert (episodes["phase"] == int(phase)).all()
-        if scheme in ("standing", "default"):
+        if start_mode in ("standing", "default"):
             assert set(episodes["command_step"]) == set(range(31))
         else:
             assert not episodes["command_step"].any()
@@ -189,7 +200,7 @@ def test_paws_of_a_push_rest_on_the_ground_around_the_start(starts):
 def test_joints_of_a_push_move_so_that_the_paws_do_not(env):
     begin_by(env, only("pushing", resets_of(env)))
     env.reset()
-    worlds = np.flatnonzero(episodes_of(env)["scheme"] == SCHEMES.index("pushing"))[:40]
+    worlds = np.flatnonzero(episodes_of(env)["start_mode"] == NUM_START_MODES.index("pushing"))[:40]
     _, velocities = paws_and_velocities(env, worlds)
     assert np.abs(velocities).max() < 1e-3 and np.abs(env.sim.joint_qd()[worlds, :3]).max() > 1.0
 
@@ -204,10 +215,10 @@ def test_shares_of_time_are_met_however_long_episodes_are():
     env = make_env(64, task=task, seed=3)
     resets, schemes = np.zeros(6), []
     for _ in range(120):
-        schemes.append(episodes_of(env)["scheme"])
+        schemes.append(episodes_of(env)["start_mode"])
         resets += np.bincount(schemes[-1], minlength=6)
         edit_episodes(env, steps=length[schemes[-1]])
-        env.worlds.done.fill_(1.0)
+        env.episodes.done.fill_(1.0)
         env.reset()
     wanted = np.array([0.40, 0.15, 0.15, 0.15, 0.05, 0.10])
     time = resets * length
@@ -215,7 +226,7 @@ def test_shares_of_time_are_met_however_long_episodes_are():
     assert resets[4] / resets.sum() > 1.3 * wanted[4]
     own = np.array([np.bincount(column, minlength=6) for column in np.array(schemes).T]) * length
     assert np.abs(own / own.sum(axis=1, keepdims=True) - wanted).max() < 0.08  # of every single world
-    counted = episodes_of(env)["spent"]
+    counted = episodes_of(env)["steps_per_mode"]
     assert np.abs(counted.sum() - time.sum()) < 1.0
 
 
@@ -306,8 +317,8 @@ def test_touchdowns_fall(starts):
 
 
 def test_another_goal_is_planned_past_the_first_level_only(env, starts):
-    planned = np.concatenate([starts[scheme].episodes["again_step"] for scheme in SCHEMES])
-    level = np.concatenate([starts[scheme].level for scheme in SCHEMES])
+    planned = np.concatenate([starts[start_mode].episodes["next_jump_step"] for start_mode in NUM_START_MODES])
+    level = np.concatenate([starts[start_mode].level for start_mode in NUM_START_MODES])
     assert not planned[level == 0].any()
     share = (planned[level > 1] > 0).mean()  # the first goals have two levels of starts
     assert not planned[level == 1].any()
@@ -315,4 +326,4 @@ def test_another_goal_is_planned_past_the_first_level_only(env, starts):
     assert covers(planned[planned > 0], 12.0, 42.0, 0.05)  # 0.2 to 0.7 s
     set_levels(env, *(dataclasses.replace(level, jump_again=0.0) for level in env.task.levels))
     env.reset()
-    assert not episodes_of(env)["again_step"].any()
+    assert not episodes_of(env)["next_jump_step"].any()

@@ -180,7 +180,7 @@ def rollout():
         after = robot_of(env)
         logged.append(env.skills[0].term_value.numpy().copy())
         expected.append(expected_terms(TASK, before, after, action.clamp(-1.0, 1.0).numpy().T))
-        env._begin(env._part(), env.worlds.done)
+        env._begin(env._part(), env.episodes.done)
     return np.array(logged), np.array(expected)
 
 
@@ -206,15 +206,15 @@ def test_bracing_is_paid_where_a_pendulum_stops_over_the_paws():
     view = make_view(pos=(0.0, 0.0, 0.24525), lin_vel=(2.0, 0.0, -3.0), paw_pos=paws.ravel())
     landed = make_episode(phase=LANDED)
     assert paid("capture_point", view, landed, width=0.1) == pytest.approx(1.0, abs=1e-4)
-    view.fall_acc = 9.81 / 4.0  # twice as far
+    view.gravity_magnitude = 9.81 / 4.0  # twice as far
     assert paid("capture_point", view, landed, width=0.3162) == pytest.approx(E(-1.0), rel=1e-3)
     assert paid("capture_point", view, make_episode(phase=FLIGHT), width=0.1) == 0.0
 
 
 def test_ripple_costs_while_the_robot_should_rest_only():
     view = make_view(
-        torque=np.arange(12.0), old_torque=np.arange(12.0) - 0.5, paw_force=(30.0, 30.0, 30.0, 30.0),
-        peak_force=(30.0, 40.0, 30.0, 30.0), action=np.full(12, 0.1), old_action=np.zeros(12),
+        torque=np.arange(12.0), prev_torque=np.arange(12.0) - 0.5, paw_force=(30.0, 30.0, 30.0, 30.0),
+        peak_force=(30.0, 40.0, 30.0, 30.0), action=np.full(12, 0.1), prev_action=np.zeros(12),
     )  # fmt: skip
     resting = (make_episode(steps=3, command_step=9), make_episode(phase=LANDED, phase_steps=30))
     moving = (make_episode(steps=9, command_step=9), make_episode(phase=FLIGHT), make_episode(phase=LANDED))

@@ -40,7 +40,7 @@ def advance(views, start=None):
     start = make_episode() if start is None else start
     tasks = wp.array([start] + [JumpState()] * count, dtype=JumpState, device="cpu")
     for before, view in itertools.pairwise(views):
-        view.old_lin_vel = before.lin_vel
+        view.prev_lin_vel = before.lin_vel
     paid, estimate = (wp.zeros(count, dtype=float, device="cpu") for _ in range(2))
     inputs = [wp.array(views, dtype=RobotView, device="cpu"), wp.array(HEIGHT, dtype=float, device="cpu")]
     wp.launch(advance_kernel, 1, inputs, [tasks, paid, estimate], device="cpu")

@@ -8,7 +8,7 @@ import pytest
 from jump_helpers import (
     DEFAULT_ANGLE,
     DEG,
-    SCHEMES,
+    NUM_START_MODES,
     begin_by,
     edit_episodes,
     episodes_of,
@@ -61,7 +61,7 @@ def begun(other_env):
     return begin
 
 
-def within(values, lower, upper, reach=0.02):
+def uniform_range(values, lower, upper, reach=0.02):
     """Whether values stay in a range and come near both of its ends."""
     width = upper - lower
     inside = values.min() >= lower - 1e-5 and values.max() <= upper + 1e-5
@@ -76,26 +76,26 @@ def euler(quat):
     return np.stack([roll, pitch, np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))], axis=1)
 
 
-def some(episodes, scheme, count=60):
-    return np.flatnonzero(episodes["scheme"] == SCHEMES.index(scheme))[:count]
+def some(episodes, start_mode, count=60):
+    return np.flatnonzero(episodes["start_mode"] == NUM_START_MODES.index(start_mode))[:count]
 
 
 def test_schemes_have_their_shares(drawn):
     _, episodes, _, _ = drawn
-    shares = np.bincount(episodes["scheme"], minlength=5) / N
+    shares = np.bincount(episodes["start_mode"], minlength=5) / N
     assert np.abs(shares - SHARES).max() < 4.0 * np.sqrt(0.25 / N)
 
 
 def test_phase_and_counters_fit_the_scheme(drawn):
     _, episodes, _, qd = drawn
-    phases = np.array([STANCE, STANCE, FLIGHT, FLIGHT, LANDED])[episodes["scheme"]]
+    phases = np.array([STANCE, STANCE, FLIGHT, FLIGHT, LANDED])[episodes["start_mode"]]
     np.testing.assert_array_equal(episodes["phase"], phases)
     for name in ("steps", "idle_steps", "took_off", "touched_down", "at_apex", "streak"):
         assert not episodes[name].any(), name
-    on_feet = episodes["scheme"] < 2
-    assert within(episodes["command_step"][on_feet], 0, 30) and not episodes["command_step"][~on_feet].any()
+    on_feet = episodes["start_mode"] < 2
+    assert uniform_range(episodes["command_step"][on_feet], 0, 30) and not episodes["command_step"][~on_feet].any()
     landed = episodes["phase"] == LANDED
-    assert within(episodes["phase_steps"][landed], 0, 17) and not episodes["phase_steps"][~landed].any()
+    assert uniform_range(episodes["phase_steps"][landed], 0, 17) and not episodes["phase_steps"][~landed].any()
     # a flight on its way down, and a landed robot, have reached the goal
     passed = landed | ((episodes["phase"] == FLIGHT) & (qd[:, 2] <= 0.0))
     np.testing.assert_array_equal(episodes["apex_passed"], passed)
@@ -105,22 +105,22 @@ def test_phase_and_counters_fit_the_scheme(drawn):
 def test_goals_and_starts_are_within_the_level(drawn):
     env, episodes, q, _ = drawn
     level = env.task.levels[episodes["level"][0]]
-    assert within(episodes["goal"][:, 2], level.goal_lower[2], level.goal_upper[2])
+    assert uniform_range(episodes["goal"][:, 2], level.goal_lower[2], level.goal_upper[2])
     standing = some(episodes, "standing", N)
-    assert within(q[standing, 2], *level.base_height)
+    assert uniform_range(q[standing, 2], *level.base_height)
     np.testing.assert_array_equal(episodes["start"], q[:, :3].astype(np.float32))
     default = q[some(episodes, "default", N)][:, MOTOR_Q]
     np.testing.assert_array_equal(default, np.broadcast_to(DEFAULT_ANGLE.astype(np.float32), default.shape))
 
 
-@pytest.mark.parametrize("scheme", ["standing", "in_flight", "touchdown", "landed"])
-def test_base_place_and_attitude_cover_their_ranges(drawn, scheme):
+@pytest.mark.parametrize("start_mode", ["standing", "in_flight", "touchdown", "landed"])
+def test_base_place_and_attitude_cover_their_ranges(drawn, start_mode):
     _, episodes, q, qd = drawn
-    worlds = some(episodes, scheme, N)
+    worlds = some(episodes, start_mode, N)
     for axis in (0, 1):
-        assert within(q[worlds, axis], -0.05, 0.05)
-        assert within(euler(q[worlds, 3:7])[:, axis], -5.0 * DEG, 5.0 * DEG)
-    assert within(euler(q[worlds, 3:7])[:, 2], -5.0 * DEG, 5.0 * DEG)
+        assert uniform_range(q[worlds, axis], -0.05, 0.05)
+        assert uniform_range(euler(q[worlds, 3:7])[:, axis], -5.0 * DEG, 5.0 * DEG)
+    assert uniform_range(euler(q[worlds, 3:7])[:, 2], -5.0 * DEG, 5.0 * DEG)
     np.testing.assert_allclose(np.linalg.norm(q[worlds, 3:7], axis=1), 1.0, atol=1e-6)
     assert not qd[worlds, :2].any() and not qd[worlds, 3:6].any()
 
@@ -136,30 +136,30 @@ def test_a_share_of_the_commands_comes_after_a_long_wait(begun, share):
     assert np.abs(np.cumsum(counts) / N - np.cumsum(expected)).max() < 1.95 / np.sqrt(N)  # Kolmogorov, 1 in 1000
 
 
-@pytest.mark.parametrize("scheme", ["standing", "default", "landed"])
-def test_robots_on_their_feet_have_their_paws_at_rest_on_the_ground(drawn, scheme):
+@pytest.mark.parametrize("start_mode", ["standing", "default", "landed"])
+def test_robots_on_their_feet_have_their_paws_at_rest_on_the_ground(drawn, start_mode):
     env, episodes, _, _ = drawn
-    worlds = some(episodes, scheme)
+    worlds = some(episodes, start_mode)
     position, velocity = paws_and_velocities(env, worlds)
     np.testing.assert_allclose(position[..., 2], PAW_RADIUS, atol=2e-4)
     np.testing.assert_allclose(velocity, 0.0, atol=2e-3)
-    if scheme != "default":
+    if start_mode != "default":
         spots = position * np.array([[1, 1, 1], [1, -1, 1], [-1, 1, 1], [-1, -1, 1]])
-        assert within(spots[..., 0], 0.20, 0.22, 0.1)
-        assert within(spots[:, :2, 1], 0.15, 0.17, 0.1) and within(spots[:, 2:, 1], 0.20, 0.22, 0.1)
+        assert uniform_range(spots[..., 0], 0.20, 0.22, 0.1)
+        assert uniform_range(spots[:, :2, 1], 0.15, 0.17, 0.1) and uniform_range(spots[:, 2:, 1], 0.20, 0.22, 0.1)
 
 
 def test_landed_robots_still_fall(drawn):
     _, episodes, q, qd = drawn
     worlds = some(episodes, "landed", N)
-    assert within(-qd[worlds, 2], 0.0, 1.0) and within(q[worlds, 2], 0.30, 0.42)
+    assert uniform_range(-qd[worlds, 2], 0.0, 1.0) and uniform_range(q[worlds, 2], 0.30, 0.42)
     assert np.abs(qd[worlds][:, MOTOR_V]).max() > 1.0
 
 
-@pytest.mark.parametrize("scheme", ["in_flight", "touchdown"])
-def test_flights_are_on_a_projectile_to_the_goal(drawn, scheme):
+@pytest.mark.parametrize("start_mode", ["in_flight", "touchdown"])
+def test_flights_are_on_a_projectile_to_the_goal(drawn, start_mode):
     _, episodes, q, qd = drawn
-    worlds = some(episodes, scheme, N)
+    worlds = some(episodes, start_mode, N)
     apex = q[worlds, 2] + qd[worlds, 2] ** 2 / (2.0 * G)
     # from a takeoff height of 0.40 to 0.45 m; a goal below it is the takeoff itself
     goal = episodes["goal"][worlds, 2]
@@ -170,14 +170,14 @@ def test_flights_are_on_a_projectile_to_the_goal(drawn, scheme):
     assert not qd[worlds][:, MOTOR_V].any()
     # touchdowns begin at most 0.15 s before landing: after the apex of a jump of more than 0.3 s
     rising = np.mean(qd[worlds[goal > 0.6], 2] > 0.0)
-    assert rising == 0.0 if scheme == "touchdown" else 0.3 < rising < 0.7
+    assert rising == 0.0 if start_mode == "touchdown" else 0.3 < rising < 0.7
 
 
 def test_flights_cover_the_leg_ranges_and_touchdowns_reach_for_the_ground(drawn):
     env, episodes, q, _ = drawn
     angles = q[some(episodes, "in_flight", N)][:, MOTOR_Q].reshape(-1, 4, 3)
     assert np.abs(angles[..., 0]).max() <= 10.0 * DEG + 0.03 + 1e-5
-    assert within(angles[..., 1:], 0.0, 90.0 * DEG)
+    assert uniform_range(angles[..., 1:], 0.0, 90.0 * DEG)
     worlds = some(episodes, "touchdown")
     height = paws_and_velocities(env, worlds)[0][..., 2]
     depth = q[worlds, 2][:, None] - height
@@ -202,12 +202,12 @@ def test_draws_that_collide_are_drawn_again(begun):
     for reset in (only("standing"), only("in_flight", flight_transversal=(-30.0, 60.0))):
         env = begun(reset, level)
         assert not collision_flags(env).any()
-        assert np.mean(env.task_arrays()["scheme"] == SCHEMES.index("default")) < 0.5
+        assert np.mean(env.task_arrays()["start_mode"] == NUM_START_MODES.index("default")) < 0.5
 
 
 def test_the_same_draw_is_taken_once(drawn):
     _, episodes, q, _ = drawn
-    moving = episodes["scheme"] != SCHEMES.index("default")
+    moving = episodes["start_mode"] != NUM_START_MODES.index("default")
     assert len(np.unique(q[moving, :3], axis=0)) == moving.sum()
 
 
@@ -219,17 +219,17 @@ def test_loops_are_closed():
     assert env.sim.loop_gap().max() < 1e-5
 
 
-@pytest.mark.parametrize("scheme", ["standing", "in_flight", "touchdown", "landed"])
-def test_the_default_pose_rarely_stands_in(begun, scheme):
-    env = begun(only(scheme), Level((0.0, 0.0, 0.45), (0.0, 0.0, 1.2), (0.22, 0.45)))
-    assert np.mean(env.task_arrays()["scheme"] == SCHEMES.index("default")) < 0.005
+@pytest.mark.parametrize("start_mode", ["standing", "in_flight", "touchdown", "landed"])
+def test_the_default_pose_rarely_stands_in(begun, start_mode):
+    env = begun(only(start_mode), Level((0.0, 0.0, 0.45), (0.0, 0.0, 1.2), (0.22, 0.45)))
+    assert np.mean(env.task_arrays()["start_mode"] == NUM_START_MODES.index("default")) < 0.005
 
 
 def test_a_state_that_cannot_be_reached_becomes_the_default_pose():
     # a base 0.7 m above paws on the ground: beyond the legs' length
     level = Level((0.0, 0.0, 0.5), (0.0, 0.0, 0.6), (0.7, 0.8))
     env = make_env(16, reset=only("standing"), task=dataclasses.replace(TASK, levels=(level,)))
-    assert env.task_arrays()["scheme"].tolist() == [SCHEMES.index("default")] * 16
+    assert env.task_arrays()["start_mode"].tolist() == [NUM_START_MODES.index("default")] * 16
     np.testing.assert_array_equal(env.sim.joint_q(), env.sim.model.joint_q.numpy().reshape(16, -1))
 
 
@@ -237,7 +237,7 @@ def test_heading_and_forward_pitch(begun):
     env = begun(only("standing", heading=180.0, forward_pitch=10.0))
     angles = euler(env.sim.joint_q()[:, 3:7].astype(float))
     # a mean from 0 to 10 degrees, and 5 degrees to either side of it
-    assert within(angles[:, 1], -5.0 * DEG, 15.0 * DEG, 0.05)
+    assert uniform_range(angles[:, 1], -5.0 * DEG, 15.0 * DEG, 0.05)
     spread = math.sqrt(2.0 * 10.0**2 / 12.0) * DEG
     assert angles[:, 1].mean() == pytest.approx(5.0 * DEG, abs=4.0 * spread / math.sqrt(N))
     assert angles[:, 1].std() == pytest.approx(spread, rel=4.0 / math.sqrt(2.0 * N))

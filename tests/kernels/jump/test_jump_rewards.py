@@ -138,7 +138,7 @@ IMPACTS = [
 
 @pytest.mark.parametrize(("vel", "acc", "soft", "stance"), IMPACTS)
 def test_impacts_count_what_was_lost_of_the_speed_before(vel, acc, soft, stance):
-    view = make_view(old_lin_vel=vel, lin_acc=acc, lin_vel=np.array(vel) + np.array(acc) / 60.0)
+    view = make_view(prev_lin_vel=vel, lin_acc=acc, lin_vel=np.array(vel) + np.array(acc) / 60.0)
     assert paid("soft_impact", view, make_episode(phase=LANDED), limit=50.0) == pytest.approx(soft)
     assert paid("stance_impact", view, make_episode(phase=STANCE), limit=25.0) == pytest.approx(stance)
     for phase in (FLIGHT, LANDED):

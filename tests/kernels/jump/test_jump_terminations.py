@@ -53,14 +53,14 @@ def test_hard_impact_has_a_limit_for_stance_and_one_for_the_rest(phase, limit):
     task = make_episode(phase=phase)
     for acc, hard in ((limit - 0.1, False), (limit + 0.1, True), (-limit - 0.1, False)):
         falling = make_view(
-            old_lin_vel=(0.0, 0.0, -1.0), lin_acc=(0.0, 0.0, acc), lin_vel=(0.0, 0.0, -1.0 + acc / 60.0)
+            prev_lin_vel=(0.0, 0.0, -1.0), lin_acc=(0.0, 0.0, acc), lin_vel=(0.0, 0.0, -1.0 + acc / 60.0)
         )
         assert holds("hard_impact", falling, task, stance=25.0, flight=50.0) is hard
 
 
 def test_a_landing_that_stops_within_a_step_is_a_hard_impact():
     # 3 m/s lost in 1/60 s: 180 m/s^2
-    stopped = make_view(old_lin_vel=(0.0, 0.0, -3.0), lin_acc=(0.0, 0.0, 180.0))
+    stopped = make_view(prev_lin_vel=(0.0, 0.0, -3.0), lin_acc=(0.0, 0.0, 180.0))
     assert holds("hard_impact", stopped, make_episode(phase=LANDED, touched_down=1), stance=25.0, flight=50.0)
 
 

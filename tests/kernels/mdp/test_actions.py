@@ -6,11 +6,11 @@ import torch
 import warp as wp
 
 from jump_helpers import make_env, only, random_actions
-from jumper_warp.envs.skill import Skill
+from jumper_warp.envs.skill import TaskRuntime
 from jumper_warp.kernels.mdp.actions import action_kernel
 from jumper_warp.kernels.mdp.env import SkillSettings
 from jumper_warp.kernels.mdp.parameters import action_latency
-from jumper_warp.kernels.mdp.reset import tick_kernel
+from jumper_warp.kernels.mdp.reset import advance_rng_kernel
 from jumper_warp.registry import make_task
 from jumper_warp.robot.motors import LimitsCfg, vertical_jump_filter
 from jumper_warp.tasks.randomization import RandomizationCfg
@@ -29,19 +29,19 @@ class Commands:
 
     def __init__(self, n, tasks=(), delay=0):
         """tasks: of the skills, (by default one); delay [physics steps]: of each world."""
-        skills = [Skill(task, i, n, STEP_DT, SUBSTEPS, "cpu") for i, task in enumerate(tasks or [probe_task()])]
-        self.n, self.robot, self.worlds = n, standing_robots(n), new_worlds(n)
+        skills = [TaskRuntime(task, i, n, STEP_DT, SUBSTEPS, "cpu") for i, task in enumerate(tasks or [probe_task()])]
+        self.n, self.robot, self.episodes = n, standing_robots(n), new_worlds(n)
         self.delays = no_delays(n, delay)
         self.settings = wp.array([s.settings_of_skill() for s in skills], dtype=SkillSettings, device="cpu")
         self.push = wp.zeros(n, dtype=wp.spatial_vector, device="cpu")
-        self.delays.past_target.assign(np.tile(DEFAULT_ANGLE[None, :, None], (8, 1, n)))
+        self.delays.target_history.assign(np.tile(DEFAULT_ANGLE[None, :, None], (8, 1, n)))
 
     def act(self, action):
         """Begin a step with an action, (n, 12) or (skills, n, 12)."""
         action = array(np.reshape(action, (-1, self.n, 12)))
-        inputs = [action, self.settings, self.push, self.robot, self.worlds, self.delays]
+        inputs = [action, self.settings, self.push, self.robot, self.episodes, self.delays]
         wp.launch(action_kernel, (4, self.n), inputs, device="cpu")
-        wp.launch(tick_kernel, self.n, [array(np.ones(self.n)), self.worlds], device="cpu")
+        wp.launch(advance_rng_kernel, self.n, [array(np.ones(self.n)), self.episodes], device="cpu")
 
     def motors(self, name):
         """Return an array of the motors, (n, 12)."""
@@ -61,18 +61,18 @@ def test_an_action_is_clamped_and_scaled_about_the_default_pose():
     clamped = np.clip(action, -1.0, 1.0)
     np.testing.assert_array_equal(commands.motors("action"), clamped)
     np.testing.assert_allclose(commands.motors("target"), DEFAULT_ANGLE + SCALE * clamped, atol=1e-6)
-    assert not commands.motors("old_action").any()
+    assert not commands.motors("prev_action").any()
     commands.act(0.5 * action)
-    np.testing.assert_array_equal(commands.motors("old_action"), clamped)
-    assert not commands.motors("older_action").any()
+    np.testing.assert_array_equal(commands.motors("prev_action"), clamped)
+    assert not commands.motors("prev_prev_action").any()
     commands.act(0.2 * action)
-    np.testing.assert_array_equal(commands.motors("older_action"), clamped)
+    np.testing.assert_array_equal(commands.motors("prev_prev_action"), clamped)
 
 
 def test_a_world_takes_the_action_and_the_scale_of_its_own_skill():
     other = dataclasses.replace(probe_task(), name="other", action_scale=(30.0, 45.0))
     commands = Commands(32, [probe_task(), other])
-    commands.worlds.skill.assign(np.arange(32) % 2)
+    commands.episodes.skill.assign(np.arange(32) % 2)
     actions = np.stack([random_action(32, seed=1), random_action(32, seed=2)])
     commands.act(actions)
     odd = (np.arange(32) % 2 == 1)[:, None]
@@ -90,9 +90,9 @@ def test_what_happened_before_the_step_is_kept():
     commands.robot.joint_qd.assign(qd.ravel())
     commands.robot.torque.assign(torque.T)
     commands.act(np.zeros((32, 12)))
-    np.testing.assert_array_equal(commands.motors("old_rate"), rates)
-    np.testing.assert_array_equal(commands.motors("old_torque"), torque)
-    np.testing.assert_array_equal(commands.robot.old_lin_vel.numpy(), np.tile([1.0, 2.0, 3.0], (32, 1)))
+    np.testing.assert_array_equal(commands.motors("prev_rate"), rates)
+    np.testing.assert_array_equal(commands.motors("prev_torque"), torque)
+    np.testing.assert_array_equal(commands.robot.prev_lin_vel.numpy(), np.tile([1.0, 2.0, 3.0], (32, 1)))
 
 
 @pytest.mark.parametrize(("offset", "safe"), [(0.0, 24.375), (4.0, 16.875), (-10.0, 30.0)])
@@ -109,8 +109,8 @@ def test_targets_are_filtered_by_what_the_sensors_read(offset, safe):
     commands.robot.joint_offset.assign(np.full((12, 1), offset * DEG))
     commands.act(np.eye(1, 12))
     assert commands.motors("target")[0, 0] == pytest.approx(30.0 * DEG)
-    assert commands.motors("safe_target")[0, 0] == pytest.approx(safe * DEG, abs=1e-5)
-    np.testing.assert_array_equal(commands.motors("target")[0, 1:], commands.motors("safe_target")[0, 1:])
+    assert commands.motors("filtered_target")[0, 0] == pytest.approx(safe * DEG, abs=1e-5)
+    np.testing.assert_array_equal(commands.motors("target")[0, 1:], commands.motors("filtered_target")[0, 1:])
 
 
 # ---------------------------------------------------------------- actions that are no numbers
@@ -123,7 +123,7 @@ def test_an_action_that_is_not_finite_counts_as_0_and_is_told(bad):
     commands.act(action)
     expected = np.where(np.isfinite(action), action, 0.0)
     np.testing.assert_array_equal(commands.motors("action"), expected)
-    assert commands.worlds.bad_action.numpy().tolist() == [0, 0, 0, 1, 0, 1, 0, 0]
+    assert commands.episodes.bad_action.numpy().tolist() == [0, 0, 0, 1, 0, 1, 0, 0]
 
 
 # ---------------------------------------------------------------- latency
@@ -138,9 +138,9 @@ def test_motors_follow_the_target_of_as_many_physics_steps_ago_as_the_latency():
     followed = []
     for action in asked:
         commands.act(np.tile(action, (len(DELAYS), 1)))
-        np.testing.assert_array_equal(commands.motors("safe_target"), commands.motors("target"))
-        late, earlier = commands.delays.late_target.numpy().T, commands.delays.earlier_target.numpy().T
-        when = commands.delays.late_steps.numpy()
+        np.testing.assert_array_equal(commands.motors("filtered_target"), commands.motors("target"))
+        late, earlier = commands.delays.current_target.numpy().T, commands.delays.prev_target.numpy().T
+        when = commands.delays.switch_step.numpy()
         assert (when >= 0).all() and (when < SUBSTEPS).all()
         followed += [np.where((substep < when)[:, None], earlier, late) for substep in range(SUBSTEPS)]
     followed = np.array(followed)
@@ -152,12 +152,12 @@ def test_motors_follow_the_target_of_as_many_physics_steps_ago_as_the_latency():
 
 def test_the_ring_goes_on_over_thousands_of_steps():
     commands = Commands(len(DELAYS), delay=DELAYS)
-    commands.worlds.clock.fill_(2**20 - 3)
+    commands.episodes.clock.fill_(2**20 - 3)
     past = [np.tile(DEFAULT_ANGLE, (len(DELAYS), 1)).astype(np.float32)] * 8
     for step in range(40):
         commands.act(0.2 * random_action(len(DELAYS), seed=step))
-        past.append(commands.motors("safe_target"))
-        late, earlier = commands.delays.late_target.numpy().T, commands.delays.earlier_target.numpy().T
+        past.append(commands.motors("filtered_target"))
+        late, earlier = commands.delays.current_target.numpy().T, commands.delays.prev_target.numpy().T
         for world, delay in enumerate(DELAYS):
             np.testing.assert_array_equal(late[world], past[-1 - delay // 8][world])
             np.testing.assert_array_equal(earlier[world], past[-2 - delay // 8][world])
@@ -175,7 +175,7 @@ def test_the_solvers_motors_follow_it_too():
     now = wp.zeros((12, len(delays)), dtype=float, device="cpu")
     for action in 0.3 * random_actions(len(delays), 12, seed=1):
         env.step(action)
-        past += SUBSTEPS * [env.robot.safe_target.numpy().T.copy()]
+        past += SUBSTEPS * [env.robot.filtered_target.numpy().T.copy()]
         for substep in range(SUBSTEPS):
             when = len(past) - SUBSTEPS + substep - delays
             targets = [past[at][world] if at >= 0 else still[world] for world, at in enumerate(when)]
@@ -206,7 +206,7 @@ def test_a_drawn_latency_is_the_one_that_acts():
 def test_a_push_acts_on_the_base_while_a_paw_is_down_or_in_the_air_too_where_the_skill_says_so():
     flying = probe_task(name="flying", randomization=dataclasses.replace(RandomizationCfg.off(), push_in_flight=True))
     commands = Commands(8, [probe_task(), flying])
-    commands.worlds.skill.assign([0, 0, 0, 0, 1, 1, 1, 1])
+    commands.episodes.skill.assign([0, 0, 0, 0, 1, 1, 1, 1])
     wrench = np.arange(48.0).reshape(8, 6) + 1.0
     commands.push.assign(wrench)
     time = np.zeros((4, 8))
@@ -221,8 +221,8 @@ def test_a_push_acts_on_the_base_while_a_paw_is_down_or_in_the_air_too_where_the
 
 def test_a_step_moves_the_clock_on_and_nothing_is_new_any_more():
     env = make_env(4)
-    env.worlds.fresh.fill_(1)
-    clock = env.worlds.clock.numpy().copy()
+    env.episodes.history_reset.fill_(1)
+    clock = env.episodes.clock.numpy().copy()
     env.step(torch.zeros(4, 12))
-    np.testing.assert_array_equal(env.worlds.clock.numpy(), clock + 1)
-    assert not env.worlds.fresh.numpy().any()
+    np.testing.assert_array_equal(env.episodes.clock.numpy(), clock + 1)
+    assert not env.episodes.history_reset.numpy().any()

@@ -8,7 +8,7 @@ import warp as wp
 from jump_helpers import edit_episodes, make_env, random_actions
 from jumper_warp.kernels.mdp.events import AT_RESET, AT_STEP, STARTUP
 from jumper_warp.kernels.mdp.parameters import RobotParameters
-from jumper_warp.kernels.mdp.random import Draw, between
+from jumper_warp.kernels.mdp.random import RngStream, uniform
 from jumper_warp.registry import make_task
 from jumper_warp.tasks.randomization import RandomizationCfg
 from jumper_warp.tasks.terms import EventTerm
@@ -19,21 +19,21 @@ N = 256
 
 
 @wp.func
-def count(robot: RobotParameters, draw: Draw, times: float):
+def count(robot: RobotParameters, rng: RngStream, times: float):
     """Count in the latency how often the event ran."""
-    robot.latency[draw.world] = robot.latency[draw.world] + int(times)
+    robot.latency[rng.world] = robot.latency[rng.world] + int(times)
 
 
 @wp.func
-def mark(robot: RobotParameters, draw: Draw):
+def mark(robot: RobotParameters, rng: RngStream):
     """Count in the latency of observations."""
-    robot.observation_latency[draw.world] = robot.observation_latency[draw.world] + 1
+    robot.observation_latency[rng.world] = robot.observation_latency[rng.world] + 1
 
 
 @wp.func
-def drawn_force(robot: RobotParameters, draw: Draw, lower: float, upper: float):
+def drawn_force(robot: RobotParameters, rng: RngStream, lower: float, upper: float):
     """Draw a force."""
-    robot.push[draw.world] = wp.spatial_vector(between(draw, 0, lower, upper), 0.0, 0.0, 0.0, 0.0, 0.0)
+    robot.push[rng.world] = wp.spatial_vector(uniform(rng, 0, lower, upper), 0.0, 0.0, 0.0, 0.0, 0.0)
 
 
 EVENTS = (
@@ -59,7 +59,7 @@ class Events(Probe):
     def run(self, stage, mask=1.0):
         """Launch the events of a stage where mask is not 0."""
         skill, mask = self.skill, array(np.broadcast_to(np.asarray(mask, dtype=float), N))
-        inputs = [skill.index, stage, 0, LANES, mask, STEP_DT, self.worlds, skill.params.values, skill.timer,
+        inputs = [skill.index, stage, 0, LANES, mask, STEP_DT, self.episodes, skill.params.values, skill.timer,
                   self.parameters]  # fmt: skip
         wp.launch(skill.kernels["event"], (skill.num_events, LANES, N), inputs, device="cpu")
 
@@ -98,7 +98,7 @@ def test_a_reset_runs_in_the_masked_worlds_only(counting):
 
 def test_worlds_of_another_skill_are_passed_over(counting):
     away = np.arange(N) % 3 == 0
-    counting.worlds.skill.assign(away.astype(int))
+    counting.episodes.skill.assign(away.astype(int))
     for stage in (STARTUP, AT_RESET, AT_STEP):
         counting.run(stage)
     started, begun = counting.counted()

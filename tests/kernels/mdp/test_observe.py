@@ -18,7 +18,7 @@ def probe():
     """Worlds whose first observation has no past; exact."""
     probe = Probe(N)
     probe.skill.set("policy", "value", noise=0.0)
-    probe.worlds.fresh.fill_(1)
+    probe.episodes.history_reset.fill_(1)
     return probe
 
 
@@ -79,7 +79,7 @@ def test_noise_is_another_in_every_step_and_the_same_again_at_the_same_clock(pro
     probe.next_clock()
     second = noise_of(probe)
     assert np.abs(np.corrcoef(first, second)[0, 1]) < 0.6 and (first != second).mean() > 0.5
-    probe.worlds.clock.assign(probe.worlds.clock.numpy() - 1)
+    probe.episodes.clock.assign(probe.episodes.clock.numpy() - 1)
     np.testing.assert_array_equal(noise_of(probe), first)
 
 
@@ -109,7 +109,7 @@ def test_history_shifts_by_a_frame_a_step_and_begins_with_the_first_frame_everyw
 
 def begin_some(probe, worlds, value, other):
     """Begin an episode in some worlds after a step, as an environment does."""
-    probe.worlds.fresh.assign(np.isin(np.arange(N), worlds).astype(int))
+    probe.episodes.history_reset.assign(np.isin(np.arange(N), worlds).astype(int))
     states = probe.skill.states.numpy().copy()
     states["value"][worlds], states["other"][worlds] = value, other
     probe.write(value=states["value"], other=states["other"])
@@ -179,9 +179,9 @@ def test_a_command_within_an_episode_renews_the_newest_frame_and_keeps_those_bef
     probe.latency.fill_(0)
     values, others = sequence(5)
     policy, critic = play(probe, values, others)
-    probe.worlds.clock.assign(probe.worlds.clock.numpy() - 1)  # as after the last step
+    probe.episodes.clock.assign(probe.episodes.clock.numpy() - 1)  # as after the last step
     some, rest = np.arange(0, N, 4), np.setdiff1d(np.arange(N), np.arange(0, N, 4))
-    probe.worlds.fresh.assign(np.isin(np.arange(N), some) * int(COMMANDED))
+    probe.episodes.history_reset.assign(np.isin(np.arange(N), some) * int(COMMANDED))
     probe.write(value=7.5, other=-7.5)
     for _ in range(2):  # a second time changes nothing
         probe.observe(beginning=1)
@@ -192,7 +192,7 @@ def test_a_command_within_an_episode_renews_the_newest_frame_and_keeps_those_bef
         np.testing.assert_array_equal(now[some][:, [5, 6, 7, 8]], np.tile([7.5, -7.5], (len(some), 2)))
         np.testing.assert_array_equal(probe.obs("critic")[some][:, 2], critic[-1, some][:, 2])
     probe.next_clock()
-    probe.worlds.fresh.zero_()
+    probe.episodes.history_reset.zero_()
     probe.latency.fill_(8)
     again, _ = play(probe, values[:1], others[:1])
     np.testing.assert_array_equal(again[0][some][:, [3, 4, 7, 8]], np.tile([7.5, -7.5], (len(some), 2)))
@@ -207,7 +207,7 @@ def test_broken_worlds_read_0_in_all_frames_and_go_on_without_a_trace(probe):
     probe.latency.fill_(12)
     play(probe, *sequence(4))
     broken = np.arange(N) % 5 == 0
-    probe.worlds.broken.assign(broken.astype(int))
+    probe.episodes.broken.assign(broken.astype(int))
     write(probe.robot.joint_q, slice(0, 43), np.nan)
     probe.write(value=np.where(broken, np.nan, 1.0), other=np.where(broken, np.inf, 1.0))
     probe.observe()
@@ -215,7 +215,7 @@ def test_broken_worlds_read_0_in_all_frames_and_go_on_without_a_trace(probe):
         for final in (False, True):
             seen = probe.obs(group, final)
             assert np.isfinite(seen).all() and not seen[broken].any() and (np.abs(seen[~broken, 1:]) > 0).any()
-    probe.worlds.broken.zero_()
+    probe.episodes.broken.zero_()
     begin_some(probe, np.flatnonzero(broken), 0.5, 0.25)
     found = probe.obs("policy")[broken][:, 1:]
     np.testing.assert_array_equal(found, np.tile([0.5, 0.25], (broken.sum(), 4)))
@@ -237,7 +237,7 @@ def test_worlds_of_another_skill_are_passed_over(probe):
     play(probe, *sequence(3))
     before = {group: probe.obs(group) for group in ("policy", "critic")}
     past = probe.skill.observations.past.numpy().copy()
-    probe.worlds.skill.assign(away.astype(int))
+    probe.episodes.skill.assign(away.astype(int))
     play(probe, *sequence(1, seed=1))
     for group, seen in before.items():
         np.testing.assert_array_equal(probe.obs(group)[away], seen[away])

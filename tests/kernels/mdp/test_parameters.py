@@ -9,7 +9,7 @@ from scipy.stats import kstest
 from jumper_warp.envs.parameters import robot_parameters
 from jumper_warp.kernels.mdp import parameters
 from jumper_warp.kernels.mdp.parameters import RobotParameters
-from jumper_warp.kernels.mdp.random import make_draw
+from jumper_warp.kernels.mdp.random import make_stream
 from jumper_warp.registry import make_task
 from jumper_warp.robot.motors import jumping_motors
 from jumper_warp.sim.simulation import Simulation
@@ -29,7 +29,7 @@ DRAWN = [name for name in RobotParameters.vars if not name.startswith("nominal_"
 def event_kernel(which: int, p: wp.array(dtype=float), robot: RobotParameters):
     """Run one of the events in every world, two threads a world."""
     world, lane = wp.tid()
-    draw = make_draw(11, world, 16, 100 + which)
+    draw = make_stream(11, world, 16, 100 + which)
     draw.lane = lane
     draw.lanes = 2
     for i in range(wp.static(len(FUNCS))):

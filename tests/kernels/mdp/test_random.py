@@ -5,7 +5,7 @@ import pytest
 import warp as wp
 from scipy.stats import kstest
 
-from jumper_warp.kernels.mdp.random import between, branch, cut_gaussian, make_draw, within
+from jumper_warp.kernels.mdp.random import clamped_normal, fold_in, make_stream, uniform_range
 from mdp_helpers import array
 
 WORLDS, COLUMNS = 4096, 8
@@ -28,14 +28,14 @@ def draw_kernel(
 ):
     """Draw columns from `first` on; branch_of < 0: from the stream itself."""
     i = wp.tid()
-    draw = make_draw(seed, worlds[i], clock, stream)
+    draw = make_stream(seed, worlds[i], clock, stream)
     if branch_of >= 0:
-        draw = branch(draw, branch_of)
+        draw = fold_in(draw, branch_of)
     seeds[i] = draw.seed
     for j in range(uniform.shape[1]):
-        uniform[i, j] = between(draw, first + j, -2.0, 3.0)
-        pairs[i, j] = within(draw, first + j, wp.vec2(-2.0, 3.0))
-        normal[i, j] = cut_gaussian(draw, first + j)
+        uniform[i, j] = uniform(draw, first + j, -2.0, 3.0)
+        pairs[i, j] = uniform_range(draw, first + j, wp.vec2(-2.0, 3.0))
+        normal[i, j] = clamped_normal(draw, first + j)
 
 
 def draws(worlds=None, seed=7, clock=16, stream=1, branch_of=-1, first=0, columns=COLUMNS):
@@ -101,7 +101,7 @@ OTHERS = {
     "far clock": {"clock": 16 + 60 * 3600},
     "stream": {"stream": 2},
     "observation": {"stream": 200},
-    "branch": {"branch_of": 0},
+    "fold_in": {"branch_of": 0},
     "columns": {"first": COLUMNS},
 }
 
@@ -172,5 +172,5 @@ def truncated(x):
 
 
 def test_a_draw_belongs_to_its_world():
-    draw = make_draw(3, 12, 40, 1)
-    assert draw.world == 12 and branch(draw, 5).world == 12
+    draw = make_stream(3, 12, 40, 1)
+    assert draw.world == 12 and fold_in(draw, 5).world == 12

@@ -6,8 +6,8 @@ import warp as wp
 from scipy.spatial.transform import Rotation
 from scipy.stats import kstest
 
-from jumper_warp.kernels.mdp.env import BEGUN, COMMANDED, Delays, EnvArrays, Scene, SkillSettings
-from jumper_warp.kernels.mdp.reset import forget_kernel, stand_kernel, tick_kernel
+from jumper_warp.kernels.mdp.env import BEGUN, COMMANDED, Delays, EpisodeArrays, Scene, SkillSettings
+from jumper_warp.kernels.mdp.reset import advance_rng_kernel, clear_history_kernel, default_pose_kernel
 from jumper_warp.kernels.mdp.track import track_kernel
 from jumper_warp.kernels.mdp.view import RobotArrays
 from jumper_warp.robot.grounds import BlockCfg
@@ -36,25 +36,25 @@ class Stage(Probe):
         """Launch the beginning of episodes."""
         skill = self.skill
         inputs = [skill.index, 1, self.mask(chosen), self.scene, self.settings, skill.settings, skill.levels,
-                  self.worlds, skill.states, self.robot]  # fmt: skip
+                  self.episodes, skill.states, self.robot]  # fmt: skip
         wp.launch(skill.kernels["reset"], (self.n, 1), inputs, device="cpu")
 
     def give(self, chosen, begins, values, headings):
         """Launch commands from outside."""
         skill = self.skill
         inputs = [skill.index, self.mask(chosen), begins, array(values, wp.vec4), array(headings), self.scene,
-                  self.robot, self.worlds, skill.states]  # fmt: skip
+                  self.robot, self.episodes, skill.states]  # fmt: skip
         wp.launch(skill.kernels["give"], self.n, inputs, device="cpu")
 
     def forget(self, chosen):
         """Launch what forgets the past."""
         inputs = [0, self.mask(chosen), self.scene.geometry, self.robot, self.delays]
-        wp.launch(forget_kernel, (12, self.n), inputs, device="cpu")
+        wp.launch(clear_history_kernel, (12, self.n), inputs, device="cpu")
 
     def stand(self, chosen, headings):
         """Launch what stands robots up."""
-        inputs = [self.mask(chosen), array(headings), self.scene, self.settings, self.worlds.skill, self.robot]
-        wp.launch(stand_kernel, self.n, inputs, device="cpu")
+        inputs = [self.mask(chosen), array(headings), self.scene, self.settings, self.episodes.skill, self.robot]
+        wp.launch(default_pose_kernel, self.n, inputs, device="cpu")
 
     def scramble(self, seed=0):
         """Give the robots random states and pasts."""
@@ -104,12 +104,12 @@ def unchanged(before, after, worlds, but=()):
 def test_a_reset_begins_episodes_in_the_masked_worlds_and_touches_no_other(stage):
     stage.scramble()
     stage.write(value=1.5, other=-1.0, steps=9)
-    before, worlds = values_of(stage.robot, RobotArrays), values_of(stage.worlds, EnvArrays)
-    stage.worlds.broken.fill_(1)
+    before, worlds = values_of(stage.robot, RobotArrays), values_of(stage.episodes, EpisodeArrays)
+    stage.episodes.broken.fill_(1)
     stage.reset(SOME)
     after = values_of(stage.robot, RobotArrays)
     unchanged(before, after, ~SOME)
-    unchanged(worlds, values_of(stage.worlds, EnvArrays), ~SOME, but=("broken",))
+    unchanged(worlds, values_of(stage.episodes, EpisodeArrays), ~SOME, but=("broken",))
     np.testing.assert_array_equal(stage.world("fresh"), SOME)
     np.testing.assert_array_equal(stage.world("broken"), ~SOME)
     np.testing.assert_array_equal(stage.read("value"), np.where(SOME, 2.5, 1.5))
@@ -125,7 +125,7 @@ def test_a_reset_begins_episodes_in_the_masked_worlds_and_touches_no_other(stage
 
 
 def test_worlds_of_another_skill_are_passed_over(stage):
-    stage.worlds.skill.assign(SOME.astype(int))
+    stage.episodes.skill.assign(SOME.astype(int))
     stage.write(value=7.0)
     before = values_of(stage.robot, RobotArrays)
     stage.reset(1.0)
@@ -138,7 +138,7 @@ def test_worlds_of_another_skill_are_passed_over(stage):
 def test_draws_of_a_beginning_follow_seed_and_clock():
     def draws(seed=0, later=0):
         stage = Stage(seed=seed)
-        stage.worlds.clock.assign(stage.worlds.clock.numpy() + later)
+        stage.episodes.clock.assign(stage.episodes.clock.numpy() + later)
         stage.reset(1.0)
         return stage.read("other")
 
@@ -151,14 +151,14 @@ def test_draws_of_a_beginning_follow_seed_and_clock():
 
 @pytest.mark.parametrize("level", [0, 1])
 def test_an_episode_is_of_its_worlds_level(stage, level):
-    stage.worlds.level.fill_(level)
+    stage.episodes.level.fill_(level)
     stage.reset(1.0)
     assert set(stage.read("counts")) == {11 + level}
 
 
 def test_past_the_last_level_every_episode_draws_one():
     stage = Stage(2048)
-    stage.worlds.level.fill_(2)
+    stage.episodes.level.fill_(2)
     stage.reset(1.0)
     assert set(stage.read("counts")) == {11, 12}
     assert np.mean(stage.read("counts") == 11) == pytest.approx(0.5, abs=4.0 * 0.5 / np.sqrt(2048))
@@ -174,7 +174,7 @@ def test_a_command_that_is_due_is_drawn_and_moves_nothing(stage):
     stage.scramble()
     due = np.arange(N) % 4 == 1
     stage.write(value=np.where(due, 7.0, 6.0), other=-1.0, steps=30)
-    stage.worlds.level.fill_(1)
+    stage.episodes.level.fill_(1)
     before = values_of(stage.robot, RobotArrays)
     stage.reset(0.0)
     unchanged(before, values_of(stage.robot, RobotArrays), np.ones(N, dtype=bool))
@@ -205,7 +205,7 @@ def test_a_task_without_drawn_commands_begins_alike():
 
 def test_a_command_from_outside_begins_an_episode_with_its_heading(stage):
     stage.write(value=1.5, steps=9, other=3.0)
-    stage.worlds.broken.fill_(1)
+    stage.episodes.broken.fill_(1)
     values, headings = np.arange(4.0 * N).reshape(N, 4), np.linspace(-3.0, 3.0, N).astype(np.float32)
     stage.give(SOME, 1, values, headings)
     np.testing.assert_array_equal(stage.read("value"), np.where(SOME, values[:, 0], 1.5))
@@ -228,7 +228,7 @@ def test_a_command_from_outside_within_an_episode_comes_in_the_robots_heading(st
 
 
 def test_a_command_before_the_first_step_leaves_a_beginning_one(stage):
-    stage.worlds.fresh.fill_(BEGUN)
+    stage.episodes.history_reset.fill_(BEGUN)
     stage.give(SOME, 0, np.zeros((N, 4)), np.zeros(N))
     assert (stage.world("fresh") == BEGUN).all()
 
@@ -263,7 +263,7 @@ def test_robots_stand_up_with_their_headings_on_the_block_below_them_at_its_star
 
 def test_the_clock_goes_on_in_the_masked_worlds(stage):
     clock = stage.world("clock")
-    wp.launch(tick_kernel, N, [stage.mask(SOME), stage.worlds], device="cpu")
+    wp.launch(advance_rng_kernel, N, [stage.mask(SOME), stage.episodes], device="cpu")
     np.testing.assert_array_equal(stage.world("clock"), clock + SOME)
 
 
@@ -280,9 +280,9 @@ def test_forgetting_touches_the_masked_worlds_only(stage):
     unchanged(before[0], after[0], SOME, but=FORGOTTEN)
 
 
-ZERO = ("torque", "old_torque", "action", "old_action", "older_action", "impulse", "paw_force", "peak_force",
+ZERO = ("torque", "prev_torque", "action", "prev_action", "prev_prev_action", "impulse", "paw_force", "peak_force",
         "contact_time", "air_time", "touchdown_speed", "paw_height", "invalid", "collisions")  # fmt: skip
-FORGOTTEN = (*ZERO, "target", "safe_target", "old_rate", "old_lin_vel", "paw_pos", "paw_vel")
+FORGOTTEN = (*ZERO, "target", "filtered_target", "prev_rate", "prev_lin_vel", "paw_pos", "paw_vel")
 
 
 def test_nothing_has_been_done_felt_or_touched_before_a_beginning(stage):
@@ -294,13 +294,13 @@ def test_nothing_has_been_done_felt_or_touched_before_a_beginning(stage):
         assert rows(getattr(found, name))[~SOME].all(), name
     q, qd = found.joint_q.reshape(N, 43), found.joint_qd.reshape(N, 38)
     angles = q[:, 7 + MOTOR_SLOTS][SOME]
-    for name in ("target", "safe_target"):
+    for name in ("target", "filtered_target"):
         np.testing.assert_array_equal(rows(getattr(found, name))[SOME], angles, name)
-    np.testing.assert_array_equal(rows(found.old_rate)[SOME], qd[:, 6 + MOTOR_SLOTS][SOME])
-    past = stage.delays.past_target.numpy()
+    np.testing.assert_array_equal(rows(found.prev_rate)[SOME], qd[:, 6 + MOTOR_SLOTS][SOME])
+    past = stage.delays.target_history.numpy()
     np.testing.assert_array_equal(past[:, :, SOME], np.tile(angles.T, (8, 1, 1)))
     origin = qd[:, :3] - np.cross(qd[:, 3:6], Rotation.from_quat(q[:, 3:7]).apply([0.01, -0.02, 0.03]))
-    np.testing.assert_allclose(found.old_lin_vel[SOME], origin[SOME], atol=1e-5)
+    np.testing.assert_allclose(found.prev_lin_vel[SOME], origin[SOME], atol=1e-5)
 
 
 def test_paws_are_known_where_they_are_at_a_beginning():
@@ -309,7 +309,7 @@ def test_paws_are_known_where_they_are_at_a_beginning():
     stage.scramble()
     stage.forget(SOME)
     place, speed = (getattr(stage.robot, name).numpy().copy() for name in ("paw_pos", "paw_vel"))
-    inputs = [stage.scene.geometry, stage.scene.ground, stage.settings, stage.worlds, stage.robot]
+    inputs = [stage.scene.geometry, stage.scene.ground, stage.settings, stage.episodes, stage.robot]
     wp.launch(track_kernel, (4, N), inputs, device="cpu")
     for before, after in ((place, stage.robot.paw_pos.numpy()), (speed, stage.robot.paw_vel.numpy())):
         np.testing.assert_array_equal(before[:, SOME], after[:, SOME])
@@ -317,7 +317,7 @@ def test_paws_are_known_where_they_are_at_a_beginning():
 
 
 def test_motors_hold_still_after_a_beginning_however_late_they_are(stage):
-    write(stage.delays.past_target, slice(None), 9.0)
+    write(stage.delays.target_history, slice(None), 9.0)
     stage.forget(1.0)
     angles = stage.robot.joint_q.numpy().reshape(N, 43)[:, 7 + MOTOR_SLOTS]
-    assert (stage.delays.past_target.numpy() == angles.T).all()
+    assert (stage.delays.target_history.numpy() == angles.T).all()

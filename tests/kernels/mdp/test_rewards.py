@@ -24,10 +24,10 @@ def test_regularization_is_a_sum_of_squares_in_every_phase(phase):
         paw_force=(10.0, 20.0, 0.0, 20.0),
         clipped=0.7,
         torque=np.arange(12.0),
-        rate_change=2.0 * np.arange(12.0),
+        joint_acc=2.0 * np.arange(12.0),
         action=np.full(12, 0.5),
-        old_action=np.full(12, -0.5),
-        older_action=np.full(12, 0.25),
+        prev_action=np.full(12, -0.5),
+        prev_prev_action=np.full(12, 0.25),
         collisions=int(phase == 1) * 16,
     )
     assert paid("ground_force", view, task, weight_force=30.0) == pytest.approx(1.0)

@@ -120,10 +120,10 @@ def test_the_state_moves_on_before_it_is_judged(probe):
 def test_worlds_of_another_skill_are_passed_over(probe):
     random_state(probe)
     away = np.arange(N) % 3 == 0
-    probe.worlds.skill.assign(np.where(away, 1, 0))
+    probe.episodes.skill.assign(np.where(away, 1, 0))
     probe.write(other=2.0e3)
     for name in ("reward", "done", "timeout", "ending", "broken"):
-        write(getattr(probe.worlds, name), slice(None), 5)
+        write(getattr(probe.episodes, name), slice(None), 5)
     before = probe.skill.states.numpy().copy()
     probe.step()
     np.testing.assert_array_equal(probe.skill.states.numpy()[away], before[away])
@@ -131,7 +131,7 @@ def test_worlds_of_another_skill_are_passed_over(probe):
     for name in ("reward", "done", "timeout", "ending", "broken"):
         values = probe.world(name)
         assert (values[away] == 5).all() and (values[~away] != 5).all(), name
-    assert not probe.skill.counters.ending_count.numpy()[:, away].any()
+    assert not probe.skill.counters.termination_count.numpy()[:, away].any()
 
 
 # ---------------------------------------------------------------- ends
@@ -148,7 +148,7 @@ def test_the_first_termination_that_holds_ends_the_episode(probe, other, ending,
     assert (probe.world("ending") == ending).all() and (probe.world("done") == float(done)).all()
     assert (probe.world("timeout") == float(time_out)).all() and (probe.world("truncated") == time_out).all()
     assert (probe.world("terminated") == (done and not time_out)).all()
-    counted = probe.skill.counters.ending_count.numpy()
+    counted = probe.skill.counters.termination_count.numpy()
     expected = np.zeros((5, N))
     if done:
         expected[ending] = 1
@@ -160,7 +160,7 @@ def break_world(probe, how, world):
     if how == "invalid":
         write(probe.robot.invalid, world, 1)
     elif how == "action":
-        write(probe.worlds.bad_action, world, 1)
+        write(probe.episodes.bad_action, world, 1)
     elif how == "fast":
         write(probe.robot.joint_qd, 38 * world + 2, 15.1)
     else:
@@ -218,7 +218,7 @@ def test_anything_else_breaks_the_row(probe, failure):
 
 
 def test_a_broken_world_is_no_success(probe):
-    write(probe.worlds.streak, slice(None), 2)
+    write(probe.episodes.streak, slice(None), 2)
     break_world(probe, "invalid", 0)
     end(probe)
     assert probe.world("level").tolist() == [0] + [1] * (N - 1)
@@ -229,7 +229,7 @@ def test_episodes_that_do_not_count_change_neither_level_nor_row(probe):
     end(probe, counts=0)
     end(probe, counts=0, other=1001.0)
     assert (probe.world("streak") == 1).all() and (probe.skill.counters.counted.numpy() == 1).all()
-    assert (probe.skill.counters.ending_count.numpy().sum(axis=0) == 3).all()
+    assert (probe.skill.counters.termination_count.numpy().sum(axis=0) == 3).all()
 
 
 def test_the_errors_of_successes_add_up_in_double_precision(probe):

@@ -4,7 +4,7 @@ import pytest
 import warp as wp
 
 from jump_starts import ANKLE
-from jumper_warp.envs.skill import Skill
+from jumper_warp.envs.skill import TaskRuntime
 from jumper_warp.kernels.collision.robot import collision_kernel
 from jumper_warp.kernels.mdp.env import SkillSettings
 from jumper_warp.kernels.mdp.track import track_kernel
@@ -24,7 +24,7 @@ def contact_force(force, link_margin=0.0, block_margin=0.0):
     """Return the settings of skills with a least contact force [N] each."""
     settings = []
     for least in np.atleast_1d(force):
-        found = Skill(make_task("vertical-jump"), 0, 1, STEP_DT, 8, "cpu").settings_of_skill()
+        found = TaskRuntime(make_task("vertical-jump"), 0, 1, STEP_DT, 8, "cpu").settings_of_skill()
         found.contact_force, found.link_margin, found.block_margin = float(least), link_margin, block_margin
         settings.append(found)
     return wp.array(settings, dtype=SkillSettings, device="cpu")
@@ -76,12 +76,12 @@ def test_paws_are_where_pinocchio_puts_them_and_move_alike(sim, robots):
 
 @wp.kernel(enable_backward=False)
 def seen_kernel(
-    robot: RobotArrays, ground: Ground, contact: wp.array(dtype=wp.vec4), first: wp.array(dtype=wp.vec4),
+    arrays: RobotArrays, ground: Ground, contact: wp.array(dtype=wp.vec4), first: wp.array(dtype=wp.vec4),
     contacts: wp.array(dtype=int), collisions: wp.array(dtype=int),
 ):  # fmt: skip
     """Read what rewards see of the paws."""
     world = wp.tid()
-    view = load_view(robot, ground, world)
+    view = load_view(arrays, ground, world)
     contact[world] = view.contact
     first[world] = view.first_contact
     contacts[world] = view.contacts

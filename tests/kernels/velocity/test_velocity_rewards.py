@@ -39,7 +39,7 @@ def robots(seed: int = 3):
             "quat": tuple(quat), "lin_vel": rng.normal(size=3), "ang_vel": rng.normal(size=3),
             "gravity": np.array(wp.quat_rotate_inv(quat, wp.vec3(0.0, 0.0, -1.0))),
             "angle": DEFAULT_ANGLE + rng.normal(size=12) * 0.4, "torque": rng.normal(size=12),
-            "old_torque": rng.normal(size=12), "contact": contact, "contacts": int(contact.sum()),
+            "prev_torque": rng.normal(size=12), "contact": contact, "contacts": int(contact.sum()),
             "first_contact": contact * rng.integers(0, 2, 4), "air_time": rng.uniform(0.0, 0.6, 4),
             "paw_height": rng.uniform(0.0, 0.15, 4), "touchdown_speed": rng.uniform(0.0, 2.0, 4),
         }  # fmt: skip
@@ -78,8 +78,8 @@ def shank_lean(r, free, hip, thigh, shank):
                  for side, a in ((1.0, outer), (-1.0, inner))]  # fmt: skip
         links = []
         for turn in (1.0, -1.0):  # by the law of cosines, at the first knee
-            between = knees[1] - knees[0]
-            angle = np.arctan2(between[1], between[0]) + turn * np.arccos(np.linalg.norm(between) / (2.0 * shank))
+            uniform = knees[1] - knees[0]
+            angle = np.arctan2(uniform[1], uniform[0]) + turn * np.arccos(np.linalg.norm(uniform) / (2.0 * shank))
             links.append(knees[0] + shank * np.array([np.cos(angle), np.sin(angle)]))
         ankle = min(links, key=lambda p: p[1])
         leans = [np.arccos(np.dot(ankle - knee, down) / shank) for knee in knees]
@@ -116,7 +116,7 @@ EXPECTED = {
     "foot_clearance": ({"height": 0.07}, lambda r: clearance(r, 0.07)),
     "slip": ({}, lambda r: np.sum(r["contact"] * np.sum(r["paw_vel"][:, :2] ** 2, axis=1))),
     "touchdown": ({}, lambda r: np.sum(r["first_contact"] * r["touchdown_speed"] ** 2)),
-    "jerk": ({}, lambda r: np.sum(np.sign(r["torque"]) != np.sign(r["old_torque"]))),
+    "jerk": ({}, lambda r: np.sum(np.sign(r["torque"]) != np.sign(r["prev_torque"]))),
     "shank_lean": (LEG, lambda r: shank_lean(r, **LEG)),
     "trot_schedule": ({"duty": 0.55}, lambda r: trot(r, 0.55)),
 }  # fmt: skip
