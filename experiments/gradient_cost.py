@@ -60,7 +60,14 @@ def main(args: Args) -> dict:
         for key in ("targets", "q", "qd", "table", "saturation")
     }
     trajectory = mine.forward()
-    kept = (trajectory.q, trajectory.qd, trajectory.torque, trajectory.impulse, trajectory.pressed, trajectory.safe)
+    kept = (
+        trajectory.q,
+        trajectory.qd,
+        trajectory.torque,
+        trajectory.impulse,
+        trajectory.pressed,
+        trajectory.filtered_target,
+    )
     times = {"plain": [], "forward": [], "gradient": []}
     for _ in range(args.repeats):
         for kind, run in (("plain", plain.run), ("forward", mine.forward), ("gradient", mine.run)):

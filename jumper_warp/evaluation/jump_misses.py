@@ -99,7 +99,7 @@ def follow(group: Group, network: Network, *, derivatives: bool) -> Misses:
     arrays: dict[str, np.ndarray] = {}
     for _ in range(begin, last):
         if derivatives:
-            state, _ = loop.step(state, network.act(loop.seen(state), tape=tape))
+            state, _ = loop.step(state, network.act(loop.observation(state), tape=tape))
         else:
             env.step(network.act(env.obs))
             state = loop.state()

@@ -47,7 +47,13 @@ def test_drawn_robots_move_and_see_as_in_the_environment(name, acting):
         state, made = loop.step(state, network.act(env.obs))
         goes_on = env.done == 0.0
         assert goes_on.any()
-        for part, atol in (("q", 1.0e-4), ("before", 1.0e-6), ("action", 0.0), ("qd", 2.0e-2), ("torque", 5.0e-2)):
+        for part, atol in (
+            ("q", 1.0e-4),
+            ("initial_target", 1.0e-6),
+            ("action", 0.0),
+            ("qd", 2.0e-2),
+            ("torque", 5.0e-2),
+        ):
             torch.testing.assert_close(
                 getattr(made, part)[:, goes_on], getattr(state, part)[:, goes_on], rtol=0.0, atol=atol, msg=part
             )

@@ -81,7 +81,7 @@ def test_what_is_kept_of_a_policy_step_is_below_two_kilobytes():
     trajectory = rollout().run(push_off(8), *squat())
     usual = Rollout(rollout().dynamics.model, double=True).run(push_off(8), *squat())
     for made, steps in ((trajectory, 8), (usual, 8)):
-        arrays = (made.q, made.qd, made.torque, made.impulse, made.pressed, made.safe)
+        arrays = (made.q, made.qd, made.torque, made.impulse, made.pressed, made.filtered_target)
         per_step = sum(array.size * wp.types.type_size_in_bytes(array.dtype) for array in arrays) / (steps + 1)
         assert per_step <= 2000.0
 
@@ -154,9 +154,9 @@ def test_what_is_late_at_first_makes_the_start_matter_twice():
 
     for before in (False, True):
         start = q.clone().requires_grad_()
-        height(start, **({"before": start[7:]} if before else {})).backward()
+        height(start, **({"initial_target": start[7:]} if before else {})).backward()
         found.append(start.grad)
-    runs = [of.run(targets.numpy(), q.numpy(), qd.numpy(), before=start) for start in (None, q[7:].numpy())]
+    runs = [of.run(targets.numpy(), q.numpy(), qd.numpy(), initial_target=start) for start in (None, q[7:].numpy())]
     seed = np.zeros(runs[0].q.shape)
     seed[-1, 2] = 1.0
     with_start, without = (of.backward(made, q=of.array(seed))["q"].numpy() for made in runs)

@@ -84,7 +84,7 @@ CASES = {
     "targets": (jump, "targets", [(0, 1), (3, 0), (4, 4), (8, 7), (20, 8)], 2.0e-6),
     "position": (jump, "q", [0, 2, 3, 4, 5, 7, 8, 12, 18], 1.0e-7),
     "velocity": (jump, "qd", [0, 2, 3, 5, 6, 7, 14], 2.0e-6),
-    "before": (jump, "before", [1, 5], 1.0e-5),
+    "initial_target": (jump, "initial_target", [1, 5], 1.0e-5),
     "wrench": (jump, "wrench", [(0, 2), (6, 0), (6, 5), (30, 1)], 1.0e-4),
     "masses": (jump, "table", MASSES, 1.0e-6),
     "joints": (jump, "table", JOINTS, 1.0e-6),

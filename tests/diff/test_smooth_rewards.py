@@ -5,8 +5,8 @@ import pytest
 import torch
 
 from jumper_warp.diff.closed_loop import ClosedLoop
-from jumper_warp.diff.differentiable_env import DifferentiableEnv, limited
-from jumper_warp.diff.smooth_rewards import SMOOTH, make_moment
+from jumper_warp.diff.differentiable_env import DifferentiableEnv, clip_norm
+from jumper_warp.diff.smooth_rewards import SMOOTH, make_context
 from jumper_warp.envs.env import Env
 from jumper_warp.policies.runs import open_policy
 from jumper_warp.registry import make_task
@@ -31,24 +31,24 @@ def test_smooth_rewards_have_the_values_of_the_environments_terms():
     for _ in range(30):
         env.step(network.act(env.obs) + 0.1 * torch.sin(torch.arange(12.0) + env.obs[:, :1]))
         state, goes_on, arrays = loop.state(), env.done == 0.0, env.task_arrays()
-        moment = make_moment(loop, state, old, arrays)
+        context = make_context(loop, state, old, arrays)
         for term, values in zip(TASK.rewards, env.skills[0].term_value.numpy(), strict=True):
             if term.func.key not in SMOOTH:
                 continue
             time = 1.0 if term.options["once"] else env.step_dt
-            found = term.numbers["weight"] * time * SMOOTH[term.func.key](moment, term.numbers)
+            found = term.numbers["weight"] * time * SMOOTH[term.func.key](context, term.numbers)
             if term.name == "jump_height":
                 at_apex = (goes_on.numpy() == 1) & (arrays["at_apex"] == 1)
-                base, goal = moment.motion, arrays["goal"][:, 2]
+                base, goal = context.motion, arrays["goal"][:, 2]
                 ballistic = (base.pos[:, 2] + base.lin_vel[:, 2] ** 2 / (2.0 * TASK.gravity)).numpy()
                 for mine, height in ((found.numpy(), ballistic), (values, arrays["max_height"])):
                     np.testing.assert_allclose(mine[at_apex], height_reward(term, height - goal)[at_apex], rtol=2e-4)
                 assert not found.numpy()[~at_apex & (goes_on.numpy() == 1)].any()
                 # the highest of the policy steps is that before the apex or that after it
-                highest = torch.maximum(moment.before.pos[:, 2], base.pos[:, 2]).numpy()
+                highest = torch.maximum(context.prev_motion.pos[:, 2], base.pos[:, 2]).numpy()
                 np.testing.assert_allclose(arrays["max_height"][at_apex], highest[at_apex], rtol=0.0, atol=1.0e-6)
                 # legs move, so that a base loses other than g; what it lost in this step holds the apex
-                lost = (moment.before.lin_vel - base.lin_vel)[:, 2].numpy()
+                lost = (context.prev_motion.lin_vel - base.lin_vel)[:, 2].numpy()
                 assert (np.abs(ballistic - highest) < lost**2 / (2.0 * TASK.gravity))[at_apex].all()
                 paid |= {term.name} if at_apex.sum() else set()
                 continue
@@ -119,4 +119,4 @@ def vars_of(task):
 def test_long_gradients_are_shortened_world_by_world_and_broken_ones_dropped():
     grad = torch.tensor([[3.0, 0.3, np.nan], [4.0, 0.4, 1.0]])
     expected = torch.tensor([[0.6, 0.3, 0.0], [0.8, 0.4, 0.0]])
-    torch.testing.assert_close(limited(1.0)(grad), expected)
+    torch.testing.assert_close(clip_norm(1.0)(grad), expected)

@@ -56,7 +56,7 @@ def nominal() -> dict[str, np.ndarray]:
 def defaults() -> dict[str, np.ndarray]:
     """Return what a jump reads, by name, without worlds."""
     q, qd = squat()
-    values = {"targets": push_off(), "q": q, "qd": qd, "before": q[7:], "wrench": np.zeros((TICKS, 6))}
+    values = {"targets": push_off(), "q": q, "qd": qd, "initial_target": q[7:], "wrench": np.zeros((TICKS, 6))}
     return values | {name: value.copy() for name, value in nominal().items()}
 
 
@@ -65,7 +65,7 @@ def run(of: Rollout, values: dict[str, np.ndarray]):
     for name, array in of.parameters.items():
         value = np.asarray(values[name])
         array.assign(np.broadcast_to(value[..., None], array.shape) if value.ndim < array.ndim else value)
-    commands = {name: values[name] for name in ("targets", "q", "qd", "before", "wrench")}
+    commands = {name: values[name] for name in ("targets", "q", "qd", "initial_target", "wrench")}
     return of.run(**commands)
 
 
