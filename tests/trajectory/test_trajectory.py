@@ -203,7 +203,7 @@ def test_descent_stays_in_the_box():
 
 def test_smoothed_descent_comes_near_from_afar():
     begin = np.random.default_rng(0).uniform(-1.0, 1.0, (64, 2))
-    stages = (Stage(8, 60, 0.05, 0.05, least=1.0), Stage(2, 100, 0.03, 0.03, penalty=100.0))
+    stages = (Stage(8, 60, 0.05, 0.05, final_fraction=1.0), Stage(2, 100, 0.03, 0.03, penalty=100.0))
     found = smoothed(Bowl(), begin, stages=stages)
     assert found.shape == (2, 2) and found == pytest.approx(np.tile(NEAREST, (2, 1)), abs=0.03)
 
@@ -237,7 +237,7 @@ def test_starts_that_fell_off_an_edge_go_back():
     begin = torch.tensor([[0.3, 0.4], [-0.5, 0.3]], dtype=torch.float64)
     ends = {}
     for slack in (math.inf, 0.1):
-        stage = Stage(2, 120, 0.05, 0.01, least=1.0, slack=slack)
+        stage = Stage(2, 120, 0.05, 0.01, final_fraction=1.0, slack=slack)
         ends[slack] = Edge().evaluate(descend(Edge(), begin, stage, np.random.default_rng(0))).objective
     assert (ends[math.inf] == 5.0).any()
     first = Edge().evaluate(begin).objective
@@ -246,9 +246,9 @@ def test_starts_that_fell_off_an_edge_go_back():
 
 def test_starts_that_go_back_go_on_with_smaller_steps():
     begin, merit = torch.tensor([[0.2, 0.3]], dtype=torch.float64), {}
-    for calmer in (1.0, 0.5):
-        stage = Stage(1, 100, 0.3, 0.01, least=1.0, slack=0.001, look=2, calmer=calmer)
-        merit[calmer] = float(Edge().evaluate(descend(Edge(), begin, stage, np.random.default_rng(0))).objective)
+    for scale in (1.0, 0.5):
+        stage = Stage(1, 100, 0.3, 0.01, final_fraction=1.0, slack=0.001, check_every=2, return_scale=scale)
+        merit[scale] = float(Edge().evaluate(descend(Edge(), begin, stage, np.random.default_rng(0))).objective)
     assert merit[0.5] < 0.0226 < 0.1 < merit[1.0]  # (0.6 - 0.45)^2
 
 
