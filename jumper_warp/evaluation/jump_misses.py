@@ -16,7 +16,7 @@ import torch
 from jumper_warp.diff.closed_loop import ClosedLoop, LoopState
 from jumper_warp.envs.env import Env
 from jumper_warp.evaluation.jumps import LANDED, REST_TIME
-from jumper_warp.trajectory.gauss_newton import Network, Tape, world_rows
+from jumper_warp.trajectory.gauss_newton import Network, Tape, per_world_gradients
 
 LANDING_HEIGHT = 0.30
 """[m] Of the base, where its projectile comes down."""
@@ -117,7 +117,7 @@ def follow(group: Group, network: Network, *, derivatives: bool) -> Misses:
     rows = value.new_zeros(0)
     if derivatives:
         numbers = (apex_of if to_height else place_of)(loop, states, arrays)
-        rows = torch.cat([world_rows(number.sum(), tape) for number in numbers]).nan_to_num(0.0, 0.0, 0.0)
+        rows = torch.cat([per_world_gradients(number.sum(), tape) for number in numbers]).nan_to_num(0.0, 0.0, 0.0)
     return Misses(torch.where(valid, value, 0.0), rows, valid)
 
 
