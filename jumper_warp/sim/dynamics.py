@@ -290,7 +290,7 @@ class JumperDynamics:
         previous: wp.array | None = None,
         delay: wp.array | None = None,
     ) -> Any:
-        """Return the kernels' `Drive`; with `motors` (MotorArrays) and `target` [rad] (12, num_worlds) it is closed-loop.
+        """Return the kernels' `Drive`; closed-loop with `motors` (MotorArrays) and `target` [rad] (12, num_worlds).
 
         With `delay` [physics steps], (num_worlds,), the motors follow `previous` until the target arrives.
         """

@@ -113,8 +113,8 @@ def at_the_stops(n, seed, joint_rate=8.0):
     return states
 
 
-class Steps:
-    """Single steps in double precision, with the stops or with none."""
+class StopSteps:
+    """Single steps in double precision, with or without stops."""
 
     def __init__(self, num_worlds, *, stops):
         self.n, self.model = num_worlds, build_model(num_worlds, visuals=False, device="cpu")
@@ -165,10 +165,10 @@ def test_stops_solve_a_quadratic_program():
     n = 40
     states = at_the_stops(n, 21)
     states.pos[:, 2] = 3.0
-    stopping = Steps(n, stops=True)
+    stopping = StopSteps(n, stops=True)
     found, (lower, upper) = stopping.run(states).rates, stopping.bounds()
     units = np.tile(np.vstack([np.zeros(12), np.eye(12)]), (n, 1))
-    free = Steps(13 * n, stops=False).run(repeated(states, 13), units).rates.reshape(n, 13, 12)
+    free = StopSteps(13 * n, stops=False).run(repeated(states, 13), units).rates.reshape(n, 13, 12)
     toward = np.vstack([BOUNDED, -BOUNDED])
     several = surprised = 0
     for i in range(n):
@@ -198,10 +198,10 @@ def test_stops_return_no_more_energy_than_they_store(falling):
         sim = simulation(n)
         write_state(sim, states.joint_q().reshape(n, -1))
         states.pos[:, 2] += PAW_RADIUS + 1.0e-4 - paw_centres(sim)[..., 2].min(axis=1)
-    stopping = Steps(n, stops=True)
+    stopping = StopSteps(n, stops=True)
     ended = stopping.run(states)
     states.pos[:, 2] += 3.0
-    freely = Steps(n, stops=False).run(states)
+    freely = StopSteps(n, stops=False).run(states)
     freely.pos[:] = ended.pos
     reference = Reference(stopping.model)
 

@@ -18,8 +18,8 @@ SLOTS = [*range(7), *(7 + 5 * leg + j for leg in range(4) for j in (0, 1, 3))]
 DOFS = [*range(6), *(6 + 5 * leg + j for leg in range(4) for j in (0, 1, 3))]
 
 
-class Steps:
-    """The inputs of some steps in double precision, and the gradient of a random sum over the last state."""
+class TapeSteps:
+    """Inputs of some steps in double precision, and the gradient of a random weighted sum of the last state."""
 
     def __init__(self):
         self.dynamics = JumperDynamics(build_model(N, visuals=False, requires_grad=True, device="cpu"), double=True)
@@ -69,7 +69,7 @@ class Steps:
 
 @pytest.fixture(scope="module")
 def steps():
-    return Steps()
+    return TapeSteps()
 
 
 def gradient(arrays, name):
