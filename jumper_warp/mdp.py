@@ -6,7 +6,7 @@
 
     @wp.func
     def level(robot: mdp.RobotView, state: mdp.JumpState, scale: float) -> float:
-        return wp.where(state.phase == mdp.FLIGHT, mdp.rewards.psi(mdp.tilt(view), scale), 0.0)
+        return wp.where(state.phase == mdp.FLIGHT, mdp.rewards.psi(mdp.tilt(robot), scale), 0.0)
 
     jump = make_task("vertical-jump")
     jump = replace(jump, rewards=(*jump.rewards, mdp.RewardTerm(level, weight=2.0, scale=0.1)))
@@ -22,6 +22,7 @@ from jumper_warp.kernels.mdp import parameters as events
 from jumper_warp.kernels.mdp.env import Scene, SkillSettings
 from jumper_warp.kernels.mdp.parameters import RobotParameters
 from jumper_warp.kernels.mdp.random import RngStream, clamped_normal, fold_in, uniform, uniform_range
+from jumper_warp.kernels.mdp.reset import write_default_pose
 from jumper_warp.kernels.mdp.view import RobotArrays, RobotView, tilt, vec12, yaw_of
 from jumper_warp.kernels.terrain.ground import Ground, surface, world_ground
 from jumper_warp.kernels.velocity.state import VelocityState

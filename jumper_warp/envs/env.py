@@ -267,7 +267,8 @@ class Env(Stages):
         if commands is not None:
             values = checked_commands(commands, mask, [self.tasks[skill]])
         mask = mask > 0.0
-        for array, new in ((self.episodes.requested_task, skill), (self.episodes.has_command, int(commands is not None)),
+        for array, new in ((self.episodes.requested_task, skill),
+                           (self.episodes.has_command, int(commands is not None)),
                            (self.episodes.pending_command, values[mask])):  # fmt: skip
             kept = array.numpy()
             kept[mask] = new

@@ -35,13 +35,13 @@ class Reset:
     """How an episode begins."""
 
     func: Function
-    """(robot: RobotArrays, scene: Scene, skill: SkillSettings, task, settings, level, draw: Draw) -> task of the new
-    episode; writes coordinates and rates of `draw.world`."""
+    """(arrays: RobotArrays, scene: Scene, skill: SkillSettings, old, settings, level, rng: RngStream) -> state of
+    the new episode; writes coordinates and rates of `rng.world`."""
     settings: Any = None
     """Frozen dataclass with `struct`, the type of the kernels' settings, and `values(step_dt)`, which makes them."""
     side_by_side: bool = False
-    """Whether `func` makes attempts `range(draw.lane, number, draw.lanes)`, which threads of a GPU share: they run it
-    with the same arguments but for `draw.lane`, and all that they write otherwise must be the same."""
+    """Whether `func` makes attempts `range(rng.lane, number, rng.lanes)`, which threads of a GPU share: they run it
+    with the same arguments but for `rng.lane`, and all that they write otherwise must be the same."""
 
 
 @dataclass(frozen=True)
@@ -49,11 +49,11 @@ class Command:
     """How a robot is told what to do."""
 
     give: Function
-    """(robot, scene: Scene, state, values: wp.vec4, heading: float) -> task with a command from outside."""
+    """(robot, scene: Scene, state, values: wp.vec4, heading: float) -> state with a command from outside."""
     due: Function | None = None
     """(state) -> bool, whether a new command is drawn within the episode."""
     draw: Function | None = None
-    """(robot, scene: Scene, state, level, draw: Draw) -> task with a new command."""
+    """(robot, scene: Scene, state, level, rng: RngStream) -> state with a new command."""
 
     def __post_init__(self) -> None:
         """Raises ValueError: one of due and draw is missing."""

@@ -23,14 +23,14 @@ class TermSlot(SimpleNamespace):
     Each of its `settings` is an attribute, the index of its value: `p[slot.weight]`. So are its options, as values.
     """
 
-    def __init__(self, term: Any, start: int) -> None:
-        """start: index of the term's first number."""
-        super().__init__(**term.options, **{name: start + i for i, name in enumerate(term.settings)})
+    def __init__(self, term: Any, offset: int) -> None:
+        """offset: index of the term's first number."""
+        super().__init__(**term.options, **{name: offset + i for i, name in enumerate(term.settings)})
         self.term, self.func, self.parameterless = term, term.func, not term.num_params
-        """plain: no parameters; Warp refuses an empty `*p[lo:lo]`."""
-        self.params_start, self.params_stop = start + len(term.settings), start + len(term.numbers)
+        """parameterless: Warp refuses an empty `*p[start:start]`."""
+        self.start, self.stop = offset + len(term.settings), offset + len(term.numbers)
         """Range of the function's parameters."""
-        self.compiled = (term.func, start, self.params_start, self.params_stop, *term.options.items())
+        self.compiled = (term.func, offset, self.start, self.stop, *term.options.items())
         """What a kernel holds of the term; tasks with the same share the kernel, whatever their numbers."""
 
 

@@ -175,7 +175,7 @@ class ObservationTerm(Term):
 
 
 class EventTerm(Term):
-    """(parameters: RobotParameters, draw: Draw, ...), writes the parameters of `draw.world`.
+    """(parameters: RobotParameters, rng: RngStream, ...), writes the parameters of `rng.world`.
 
     mode: once at the start ("startup"), at every "reset", or also at "interval"s of `least` to `most` seconds.
     repack: whether the solver must read the model again, as after any but pushes and latencies.

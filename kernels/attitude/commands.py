@@ -1,4 +1,4 @@
-"""Commands to turn: how they are drawn and given from outside."""
+"""Attitude commands: sampled, or set from outside."""
 
 import warp as wp
 
@@ -13,7 +13,7 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.struct
 class TurnRanges:
-    """Ranges of drawn turns."""
+    """Ranges of sampled rotations."""
 
     angle: wp.vec2  # [rad] smallest and largest
     axis_share: float  # share of turns about x, y or z of the body; the others are about any axis
@@ -32,7 +32,7 @@ def sample_unit_quat(rng: RngStream) -> wp.quat:
 
 @wp.func
 def sample_axis(rng: RngStream, axis_share: float) -> wp.vec3:
-    """Return a unit vector: one of the body's axes in a share of draws, else any, uniform over the sphere."""
+    """Return a sampled unit vector: one of the body's axes with a probability, else uniform over the sphere."""
     sign = wp.where(uniform(rng, streams.SIGN, 0.0, 1.0) < 0.5, -1.0, 1.0)
     if uniform(rng, streams.ALONG_BODY, 0.0, 1.0) < axis_share:
         axis = wp.vec3(0.0)
@@ -46,14 +46,14 @@ def sample_axis(rng: RngStream, axis_share: float) -> wp.vec3:
 
 @wp.func
 def sample_rotation(rng: RngStream, ranges: TurnRanges) -> wp.quat:
-    """Return a drawn turn (xyzw), body axes."""
+    """Return a sampled rotation (xyzw), body axes."""
     axis = sample_axis(fold_in(rng, streams.AXIS_BRANCH), ranges.axis_share)
     return wp.quat_from_axis_angle(axis, uniform_range(rng, streams.ANGLE, ranges.angle))
 
 
 @wp.func
 def give_turn(robot: RobotView, scene: Scene, state: AttitudeState, values: wp.vec4, heading: float) -> AttitudeState:
-    """Command a turn (quaternion xyzw, of any length but 0) from the orientation that the robot has; 0: none."""
+    """Return the state with a commanded rotation (xyzw, any length) from the present orientation; 0: none."""
     turn = wp.quat(values[0], values[1], values[2], values[3])
     if wp.length(values) == 0.0:
         turn = wp.quat(0.0, 0.0, 0.0, 1.0)

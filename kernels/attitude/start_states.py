@@ -1,4 +1,4 @@
-"""Start states of turning: afloat in any attitude, legs anywhere or in the default pose."""
+"""Start states of the attitude task: weightless, with a sampled spin, legs sampled or in the default pose."""
 
 import warp as wp
 
@@ -46,7 +46,7 @@ class AttitudeStart:
 
 @wp.func
 def sample_base(start: AttitudeStart, arrays: RobotArrays, rng: RngStream, attempt: int) -> AttitudeStart:
-    """Return the base, the same in every attempt; in the last one the legs are in the default pose."""
+    """Return the base, the same in every attempt; in the last attempt the legs are in the default pose."""
     base = start
     base.default_legs = start.default_legs or attempt == ATTEMPTS - 1
     return base
@@ -54,7 +54,7 @@ def sample_base(start: AttitudeStart, arrays: RobotArrays, rng: RngStream, attem
 
 @wp.func
 def sample_leg(start: AttitudeStart, base: AttitudeStart, geo: LegGeometry, rng: RngStream, leg: int) -> LegSample:
-    """Return a leg at rest; reachable if the sum of its transversal angles keeps its limits."""
+    """Return a sampled leg at rest; reachable if the sum of its transversal angles is within limits."""
     found = LegSample()
     if base.default_legs:
         for j in range(3):
@@ -75,7 +75,7 @@ def sample_leg(start: AttitudeStart, base: AttitudeStart, geo: LegGeometry, rng:
 def write_start(
     arrays: RobotArrays, scene: Scene, skill: SkillSettings, settings: AttitudeSettings, quat: wp.quat, rng: RngStream
 ):
-    """Write a start state with an orientation (xyzw) to a world."""
+    """Write a sampled start state with orientation `quat` (xyzw) to a world."""
     w = settings.spin
     start = AttitudeStart()
     start.ground = world_ground(scene.ground, rng.world)

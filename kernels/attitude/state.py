@@ -1,4 +1,4 @@
-"""The state of turning in free flight, and how it moves on by a policy step."""
+"""State of the attitude task (`AttitudeState`), and its update in a policy step."""
 
 import warp as wp
 
@@ -9,7 +9,7 @@ POLICY_RATE = wp.constant(60.0)  # policy steps in a second
 
 @wp.struct
 class AttitudeState:
-    """State of one world's episode. What is counted goes on over episodes until it is read."""
+    """Task state of one world; statistics accumulate over episodes until the host reads them."""
 
     goal: wp.quat  # xyzw, body to world: wanted orientation
     steps: int  # policy steps since the episode began
@@ -45,7 +45,7 @@ def angle_between(quat: wp.quat, goal: wp.quat) -> float:
 
 @wp.func
 def with_goal(state: AttitudeState, quat: wp.quat, goal: wp.quat) -> AttitudeState:
-    """Return the state with a goal that has just come; quat, goal: orientations (xyzw), body to world."""
+    """Return the state with a new goal; quat, goal: present and wanted orientation (xyzw), body to world."""
     new = state
     new.goal = goal
     new.error = angle_between(quat, goal)
@@ -70,7 +70,7 @@ def advance_attitude(robot: RobotView, state: AttitudeState, tolerance: float) -
 
 @wp.func
 def carried_over(old: AttitudeState) -> AttitudeState:
-    """Return the state of a new episode with what was counted, an old one that came to its end included."""
+    """Return the initial state of the next episode, statistics kept; an old one that came to its end is counted."""
     new = AttitudeState()
     new.episodes = old.episodes
     new.sum_error = old.sum_error
@@ -95,5 +95,5 @@ def attitude_error(robot: RobotView, state: AttitudeState) -> float:
 
 @wp.func
 def every_episode(state: AttitudeState) -> bool:
-    """Return true: all episodes count."""
+    """Return True: the curriculum counts every episode."""
     return True

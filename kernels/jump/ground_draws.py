@@ -1,4 +1,4 @@
-"""Draws of the ground that an episode begins on: level, off a platform, or onto a block that may slide."""
+"""Sampled ground of an episode: level, a platform to jump off, or a block to jump onto, which may slide."""
 
 import warp as wp
 
@@ -54,7 +54,7 @@ def fixed_block(center: wp.vec2, half: wp.vec2, height: float) -> Block:
 
 @wp.func
 def sample_platform(rng: RngStream, ranges: GroundRanges, foot: wp.vec2, goal: wp.vec3) -> Block:
-    """Return a platform under a robot at the origin; none if its paws could not land beside it."""
+    """Return a sampled platform under a robot at the origin; none if its paws could not land beside it."""
     half = foot + wp.vec2(
         uniform(rng, streams.PLATFORM_ROOM_X, EVERY_SIDE, ranges.room),
         uniform(rng, streams.PLATFORM_ROOM_Y, EVERY_SIDE, ranges.room),
@@ -67,7 +67,7 @@ def sample_platform(rng: RngStream, ranges: GroundRanges, foot: wp.vec2, goal: w
 
 @wp.func
 def sample_block(rng: RngStream, ranges: GroundRanges, foot: wp.vec2, goal: wp.vec3) -> Block:
-    """Return a block under the goal; none without room for its near side between the paws before and after the jump.
+    """Return a sampled block under the goal; none without room for its near side between the paws of start and goal.
 
     The near side is anywhere there, more often near than far (a third within a ninth of the room), across the axis
     along which the goal is farther.
@@ -93,7 +93,7 @@ def sample_block(rng: RngStream, ranges: GroundRanges, foot: wp.vec2, goal: wp.v
 
 @wp.func
 def sample_ground(rng: RngStream, ranges: GroundRanges, foot: wp.vec2, goal: wp.vec3) -> Block:
-    """Return the block of a standing start at the origin with a goal [m], world axes; mostly there is none."""
+    """Return a sampled platform, block or level ground (no block) of a standing start; goal [m]: world axes."""
     u = uniform(rng, streams.GROUND, 0.0, 1.0)
     if u < ranges.platform:
         return sample_platform(rng, ranges, foot, goal)

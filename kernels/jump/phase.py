@@ -1,4 +1,4 @@
-"""The jump's phases (stance, in flight, landed), and where its projectile will go."""
+"""Phase machine of a jump (stance, flight, landed), and ballistic estimates of its apex and landing."""
 
 import warp as wp
 

@@ -1,4 +1,4 @@
-"""How episodes of a jump begin and go on: scheme, goal, ground and command; `start_states` has the robot's state."""
+"""Reset of a jump and the next jump in an episode: start mode, goal, ground, command; robot: see `start_states`."""
 
 import warp as wp
 
@@ -48,9 +48,9 @@ class JumpLevel:
 
 @wp.func
 def project_to_ellipse(goal: wp.vec3, lower: wp.vec3, upper: wp.vec3) -> wp.vec3:
-    """Return a goal of a box around the start moved into the ellipse that touches the box's sides, its height kept.
+    """Return a goal [m] of a box around the start, scaled into the ellipse inscribed in the box; its height is kept.
 
-    Each quarter has its own half axes, so that reaches ahead, back and to either side can differ.
+    Each quadrant has its own half axes, since the box need not be centred on the start.
     """
     x = goal[0] / wp.max(wp.where(goal[0] < 0.0, -lower[0], upper[0]), 1.0e-6)
     y = goal[1] / wp.max(wp.where(goal[1] < 0.0, -lower[1], upper[1]), 1.0e-6)
@@ -60,7 +60,7 @@ def project_to_ellipse(goal: wp.vec3, lower: wp.vec3, upper: wp.vec3) -> wp.vec3
 
 @wp.func
 def sample_goal(rng: RngStream, level: JumpLevel) -> wp.vec3:
-    """Return a goal of a level relative to start and heading."""
+    """Return a sampled goal [m] of a level, relative to start and heading: x, y and apex height."""
     lower = level.goal_lower
     upper = level.goal_upper
     goal = wp.vec3(
@@ -75,7 +75,7 @@ def sample_goal(rng: RngStream, level: JumpLevel) -> wp.vec3:
 
 @wp.func
 def sample_next_jump_step(rng: RngStream, delay: wp.vec2, share: float) -> int:
-    """Return how many policy steps after touchdown another goal comes; 0: none, in all but a share of draws.
+    """Return how many policy steps after touchdown another goal comes; 0: none.
 
     delay: range in policy steps.
     """
@@ -85,7 +85,7 @@ def sample_next_jump_step(rng: RngStream, delay: wp.vec2, share: float) -> int:
 
 @wp.func
 def sample_command_step(rng: RngStream, ranges: ResetRanges) -> int:
-    """Return at which policy step the jump is commanded: uniform, a share of the draws in the longer of two ranges."""
+    """Return the policy step of the jump command: uniform in one of two ranges, the longer one with a probability."""
     u = uniform(rng, streams.COMMAND_STEP, 0.0, 1.0)
     share = ranges.long_wait_share
     soon = (u - share) / wp.max(1.0 - share, 1.0e-6) * (float(ranges.command_delay) + 0.999)
@@ -97,7 +97,7 @@ def sample_command_step(rng: RngStream, ranges: ResetRanges) -> int:
 def begin_jump(
     rng: RngStream, ranges: ResetRanges, start_mode: int, goal: wp.vec3, pos: wp.vec3, vz: float, jump_again: float
 ) -> JumpState:
-    """Return the state of a new episode that begins with a scheme at a base position [m] and upward speed [m/s]."""
+    """Return the state of a new episode; pos [m]: base position, vz [m/s]: its vertical velocity."""
     state = JumpState()
     state.start_mode = start_mode
     state.goal = goal
@@ -127,7 +127,7 @@ def begin_jump(
 
 @wp.func
 def begin_next_jump(old: JumpState, ground: Ground, goal: wp.vec3, pos: wp.vec3, heading: float) -> JumpState:
-    """Return the state of an episode that goes on with another jump at once; goal relative to base and heading."""
+    """Return the state of the next jump of an episode, commanded at once; goal relative to base and heading."""
     state = old
     state.heading = heading
     state.goal = rotate_yaw(goal, heading) + wp.vec3(pos[0], pos[1], 0.0)
@@ -148,7 +148,7 @@ def begin_next_jump(old: JumpState, ground: Ground, goal: wp.vec3, pos: wp.vec3,
 
 @wp.func
 def place_ground(ground: Ground, start: JumpStart, grounds: GroundRanges, rng: RngStream) -> Ground:
-    """Put the block of a world to its start, or draw another if blocks are drawn; returns the ground as it is there."""
+    """Reset or sample the block of a world, and return the world's ground."""
     if grounds.platform + grounds.block > 0.0:
         block = Block()
         if start.start_mode == STANDING or start.start_mode == DEFAULT:
@@ -164,7 +164,7 @@ def reset_jump(
     arrays: RobotArrays, scene: Scene, skill: SkillSettings, old: JumpState, settings: JumpSettings, level: JumpLevel,
     rng: RngStream,
 ) -> JumpState:  # fmt: skip
-    """Begin an episode at a stage of a jump, and return its state."""
+    """Reset a world to a sampled start state of a jump, and return the task's state."""
     world = rng.world
     ranges = settings.states
     steps_per_mode = old.steps_per_mode
@@ -188,13 +188,13 @@ def reset_jump(
 
 @wp.func
 def another_jump_due(state: JumpState) -> bool:
-    """Return whether a landed robot gets another goal now."""
+    """Return whether a landed robot gets its next goal in this policy step."""
     return state.phase == LANDED and state.next_jump_step > 0 and state.phase_steps >= state.next_jump_step
 
 
 @wp.func
 def draw_next_jump(robot: RobotView, scene: Scene, state: JumpState, level: JumpLevel, rng: RngStream) -> JumpState:
-    """Return the state of an episode that goes on with another jump, to a drawn goal."""
+    """Return the state of the next jump of an episode, to a sampled goal."""
     goal = sample_goal(rng, level)
     new = begin_next_jump(state, world_ground(scene.ground, robot.world), goal, robot.pos, yaw_of(robot.quat))
     new.next_jump_step = sample_next_jump_step(rng, state.again_delay, level.jump_again)
@@ -203,7 +203,7 @@ def draw_next_jump(robot: RobotView, scene: Scene, state: JumpState, level: Jump
 
 @wp.func
 def give_jump(robot: RobotView, scene: Scene, state: JumpState, values: wp.vec4, heading: float) -> JumpState:
-    """Ask a robot that stands at its start, or has landed, for a jump.
+    """Return the state with a commanded jump, of a robot that stands at its start or has landed; else unchanged.
 
     values: goal x, y [m] relative to base and heading, base height at the apex [m], and at a start the policy step of
     the command.
@@ -226,5 +226,5 @@ def give_jump(robot: RobotView, scene: Scene, state: JumpState, values: wp.vec4,
 
 @wp.func
 def from_standing(state: JumpState) -> bool:
-    """Return whether an episode began standing, and so counts for the curriculum."""
+    """Return whether an episode began standing or in the default pose; only these count for the curriculum."""
     return state.start_mode <= DEFAULT

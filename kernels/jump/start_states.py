@@ -1,7 +1,7 @@
-"""Start states of a jump (paper, Section V-D: reference state initialisation), one function a scheme.
+"""Start states of a jump (paper, Section V-D: reference state initialisation), one function a start mode.
 
 Standing or squatting on given paw positions, the default pose, pushing off, in flight on a projectile to the goal, just
-before touchdown, and just landed. The default pose stands in after the last attempt.
+before touchdown, and just landed. If no attempt is valid, the episode begins in the default pose.
 
 A jump goes from above the origin to `goal`: x, y [m] of the landing and, for a vertical jump, the base height [m]
 wanted at the apex; where none is wanted, the takeoff angle is drawn.
@@ -101,7 +101,7 @@ class JumpBase:
 
 @wp.func
 def start_mode_at(shares: vec_start_modes, u: float) -> int:
-    """Return the scheme at u in [0, 1) of the shares one after the other."""
+    """Return the start mode in whose share u in [0, 1) falls, shares laid end to end."""
     start_mode = int(0)
     rest = u
     for i in range(NUM_START_MODES):
@@ -113,7 +113,7 @@ def start_mode_at(shares: vec_start_modes, u: float) -> int:
 
 @wp.func
 def least_sampled_mode(shares: vec_start_modes, steps_per_mode: vec_start_modes) -> int:
-    """Return the scheme that is farthest behind its share of what was spent, in policy steps."""
+    """Return the start mode whose policy steps so far are farthest below its share of all."""
     total = float(0.0)
     for i in range(NUM_START_MODES):
         total += steps_per_mode[i]
@@ -129,7 +129,7 @@ def least_sampled_mode(shares: vec_start_modes, steps_per_mode: vec_start_modes)
 
 @wp.func
 def sample_start_mode(rng: RngStream, ranges: ResetRanges, steps_per_mode: vec_start_modes) -> int:
-    """Return the scheme of a new episode; shares of time are drawn once, and then what lacks most comes next."""
+    """Return the start mode of a new episode: sampled, or with shares of steps the one that lacks most."""
     if ranges.of_time != 0 and wp.length_sq(steps_per_mode) > 0.0:
         return least_sampled_mode(ranges.shares, steps_per_mode)
     return start_mode_at(ranges.shares, uniform(rng, streams.START_MODE, 0.0, 1.0))
@@ -137,7 +137,7 @@ def sample_start_mode(rng: RngStream, ranges: ResetRanges, steps_per_mode: vec_s
 
 @wp.func
 def sample_quat(rng: RngStream, ranges: ResetRanges, heading: float, pitch: float) -> wp.quat:
-    """Return an orientation (xyzw) around a heading and a pitch [rad]."""
+    """Return a sampled orientation (xyzw): heading and pitch [rad] plus uniform noise, and a sampled roll."""
     yaw = heading + uniform(rng, streams.YAW, -ranges.tilt, ranges.tilt)
     tip = pitch + uniform(rng, streams.PITCH, -ranges.tilt, ranges.tilt)
     roll = uniform(rng, streams.ROLL, -ranges.tilt, ranges.tilt)
@@ -146,7 +146,7 @@ def sample_quat(rng: RngStream, ranges: ResetRanges, heading: float, pitch: floa
 
 @wp.func
 def sample_offset(rng: RngStream, ranges: ResetRanges) -> wp.vec3:
-    """Return a horizontal offset [m] of the base."""
+    """Return a sampled horizontal offset [m] of the base."""
     x = uniform(rng, streams.OFFSET_X, -ranges.base_xy, ranges.base_xy)
     return wp.vec3(x, uniform(rng, streams.OFFSET_Y, -ranges.base_xy, ranges.base_xy), 0.0)
 
@@ -162,7 +162,7 @@ def direction(start: JumpStart) -> wp.vec3:
 
 @wp.func
 def standing(start: JumpStart, rng: RngStream) -> JumpBase:
-    """Return a base at rest over paws around the origin; the deeper a squat, the farther it may lean back."""
+    """Return a base at rest over paws around the origin; in a deeper squat it may be farther behind their middle."""
     ranges = start.ranges
     lower = start.base_height[0]
     upper = start.base_height[1]
@@ -177,7 +177,7 @@ def standing(start: JumpStart, rng: RngStream) -> JumpBase:
 
 @wp.func
 def just_landed(start: JumpStart, rng: RngStream) -> JumpBase:
-    """Return a base that sinks over paws around the goal."""
+    """Return a base just after landing: over paws around the goal, moving down."""
     ranges = start.ranges
     base = JumpBase()
     base.quat = sample_quat(rng, ranges, start.heading, 0.0)
@@ -191,7 +191,7 @@ def just_landed(start: JumpStart, rng: RngStream) -> JumpBase:
 
 @wp.func
 def takeoff_speed(rng: RngStream, ranges: ResetRanges, height: float, distance: float, apex: float, g: float) -> float:
-    """Return the upward speed [m/s] with which a jump over a distance [m] leaves a height [m]."""
+    """Return the vertical takeoff speed [m/s] at `height` [m] of a jump over `distance` [m]; apex [m], 0: any."""
     if apex > 0.0:
         return wp.sqrt(wp.max(2.0 * g * (apex - height), 0.0))
     # height + v_z t - g t^2 / 2 = landing_height, where v_z t = distance tan(angle)
@@ -203,7 +203,7 @@ def takeoff_speed(rng: RngStream, ranges: ResetRanges, height: float, distance: 
 
 @wp.func
 def in_flight(start: JumpStart, rng: RngStream, g: float) -> JumpBase:
-    """Return a base on the projectile to the goal: anywhere, shortly before touchdown, or for a push at the takeoff."""
+    """Return a base on the ballistic flight to the goal: anywhere on it, before touchdown, or at takeoff (PUSHING)."""
     ranges = start.ranges
     along = direction(start)
     height = uniform_range(rng, streams.TAKEOFF_HEIGHT, ranges.takeoff_height)
@@ -228,7 +228,7 @@ def in_flight(start: JumpStart, rng: RngStream, g: float) -> JumpBase:
 
 @wp.func
 def before_touchdown(start: JumpStart, flight: JumpBase, rng: RngStream) -> JumpBase:
-    """Return a base in flight moved behind the spot that its paws surround."""
+    """Return a base in flight, moved back [m] relative to its paws, which stay below the projectile."""
     base = flight
     base.spot = wp.vec3(flight.pos[0], flight.pos[1], 0.0)
     base.pos = flight.pos - uniform_range(rng, streams.TOUCHDOWN_BEHIND, start.ranges.touchdown_behind) * direction(
@@ -239,7 +239,7 @@ def before_touchdown(start: JumpStart, flight: JumpBase, rng: RngStream) -> Jump
 
 @wp.func
 def pushing_off(start: JumpStart, takeoff: JumpBase, rng: RngStream) -> JumpBase:
-    """Return a base before its takeoff, over paws around the start: on a straight line, evenly accelerated."""
+    """Return a base on a straight line to its takeoff state, with constant acceleration, over paws around the start."""
     base = takeoff
     back = uniform_range(rng, streams.PUSH_LENGTH, start.ranges.push_length)
     speed = wp.length(takeoff.lin_vel)
@@ -252,7 +252,7 @@ def pushing_off(start: JumpStart, takeoff: JumpBase, rng: RngStream) -> JumpBase
 
 @wp.func
 def sample_base(start: JumpStart, arrays: RobotArrays, rng: RngStream, attempt: int) -> JumpBase:
-    """Return the base of the start's scheme in an attempt."""
+    """Return the base's sampled state of an attempt, for the start's mode."""
     base = JumpBase()
     if start.start_mode == STANDING:
         base = standing(start, rng)
@@ -273,7 +273,7 @@ def sample_base(start: JumpStart, arrays: RobotArrays, rng: RngStream, attempt: 
 
 @wp.func
 def leg_in_flight(ranges: ResetRanges, base: JumpBase, geo: LegGeometry, rng: RngStream, leg: int) -> LegSample:
-    """Return a leg in flight, its paw above the ground: both thighs about alike, all legs about alike."""
+    """Return a leg in flight: angles near one sampled value for all legs; reachable if its paw is above the ground."""
     lower = ranges.flight_transversal[0]
     upper = ranges.flight_transversal[1]
     middle = uniform_range(rng, streams.FLIGHT_TRANSVERSAL, ranges.flight_transversal)
@@ -292,7 +292,7 @@ def leg_in_flight(ranges: ResetRanges, base: JumpBase, geo: LegGeometry, rng: Rn
 
 @wp.func
 def sample_leg(start: JumpStart, base: JumpBase, geo: LegGeometry, rng: RngStream, leg: int) -> LegSample:
-    """Return a leg of an attempt: in flight, or by its paw's place on the ground, above it before touchdown."""
+    """Return a leg of an attempt: in flight, or from its paw's position on the ground (TOUCHDOWN: above it)."""
     ranges = start.ranges
     if start.start_mode == IN_FLIGHT:
         return leg_in_flight(ranges, base, geo, rng, leg)
@@ -316,7 +316,7 @@ def sample_leg(start: JumpStart, base: JumpBase, geo: LegGeometry, rng: RngStrea
 
 @wp.func
 def write_start(arrays: RobotArrays, scene: Scene, start: JumpStart, rng: RngStream) -> int:
-    """Write a start state to a world, and return its scheme: `DEFAULT` where no attempt was valid too."""
+    """Write a start state to a world, and return its mode; `DEFAULT` also where no attempt was valid."""
     if start.start_mode != DEFAULT:
         if sample_valid_state(sample_base, sample_leg, start, arrays, scene, rng):
             return start.start_mode

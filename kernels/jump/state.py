@@ -1,4 +1,4 @@
-"""The state of a jump, and what follows from it."""
+"""State of one jump (`JumpState`), and quantities derived from it."""
 
 import warp as wp
 
@@ -9,13 +9,13 @@ FLIGHT = wp.constant(1)
 LANDED = wp.constant(2)
 
 
-NUM_START_MODES = wp.constant(6)  # ways in which an episode begins, see `start_states`
+NUM_START_MODES = wp.constant(6)  # see `start_states`
 vec_start_modes = wp.types.vector(length=6, dtype=wp.float32)
 
 
 @wp.struct
 class JumpState:
-    """State of one world's episode."""
+    """Task state of one world in a jump episode."""
 
     goal: wp.vec3  # [m] where to land: base x, y; and its wanted height at the apex, 0 if any will do
     start: wp.vec3  # [m] base origin where the jump began
@@ -43,17 +43,17 @@ class JumpState:
 
 @wp.func
 def goal_offset(robot: RobotView, state: JumpState) -> wp.vec3:
-    """Return the horizontal way from the base to the goal [m], world axes."""
+    """Return the horizontal vector from the base to the goal [m], world axes."""
     return wp.vec3(state.goal[0] - robot.pos[0], state.goal[1] - robot.pos[1], 0.0)
 
 
 @wp.func
 def commanded(state: JumpState) -> bool:
-    """Return whether a jump is asked for and not yet landed (the paper's c)."""
+    """Return whether a jump is commanded and not yet landed (the paper's c)."""
     return state.steps >= state.command_step and state.phase != LANDED
 
 
 @wp.func
 def waiting(state: JumpState) -> bool:
-    """Return whether a jump is asked for but the robot still stands."""
+    """Return whether a jump is commanded but the robot is still in stance."""
     return state.phase == STANCE and state.steps >= state.command_step

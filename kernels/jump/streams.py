@@ -1,6 +1,6 @@
-"""Numbers of the random streams of a jump: which are taken, and by what.
+"""Indices in the random streams of a jump, one name for each sampled quantity.
 
-Alternatives share numbers: a start draws only those of its scheme, an episode only those of its ground.
+Alternatives share indices: a start samples only those of its mode, an episode only those of its ground.
 """
 
 # of an episode (stream `RESET`), goal and AGAIN also of the next jump in it (stream `COMMAND`)

@@ -1,4 +1,4 @@
-"""From the policy's action to motor targets, and the push that acts during a policy step."""
+"""Motor targets from the policy's action, and the external push of a policy step."""
 
 import warp as wp
 
@@ -12,7 +12,7 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.func
 def begin_policy_step(arrays: RobotArrays, push: wp.array(dtype=wp.spatial_vector), push_in_flight: int, world: int):
-    """Begin a world's policy step: keep the base's velocity, apply its push."""
+    """Store the base's velocity as the previous one, and write the push wrench; in flight only if `push_in_flight`."""
     arrays.prev_lin_vel[world] = base_velocity(arrays, world, base_quat(arrays, world))
     pushed = push_in_flight
     for k in range(4):
@@ -26,7 +26,7 @@ def begin_policy_step(arrays: RobotArrays, push: wp.array(dtype=wp.spatial_vecto
 
 @wp.func
 def select_delayed_target(delays: Delays, step_count: int, world: int, m: int):
-    """Choose what a motor follows: the target of as many physics steps ago as the latency asks for."""
+    """Write the two targets [rad] that motor m follows in this policy step, and when it switches, from the latency."""
     whole = delays.steps[world] // delays.substeps
     delays.current_target[m, world] = delays.target_history[(step_count - whole) % RING, m, world]
     delays.prev_target[m, world] = delays.target_history[(step_count - whole - 1) % RING, m, world]
@@ -47,7 +47,7 @@ def action_kernel(
 ):
     """Clamp, scale and filter the action (skills, num_worlds, 12) of each world's skill; one thread per (leg, world).
 
-    An action that is not finite counts as 0, and its world as broken.
+    An action that is not finite counts as 0, and its world as diverged.
     """
     leg, world = wp.tid()
     world += episode.first

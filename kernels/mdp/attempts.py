@@ -37,13 +37,13 @@ def first_leg(rng: RngStream) -> int:
 
 @wp.func
 def leg_step(rng: RngStream) -> int:
-    """Return how many legs further a thread samples its next one."""
+    """Return the stride over legs of a thread."""
     return wp.min(rng.lanes, 4)
 
 
 @wp.func
 def all_legs(rng: RngStream, flag: bool) -> bool:
-    """Return whether a flag, which each thread has for its legs, is set for all legs of an attempt."""
+    """Return whether a per-thread flag holds for all legs of an attempt."""
     if rng.lanes > 1:
         return all_of_attempt(flag)
     return flag
@@ -51,32 +51,32 @@ def all_legs(rng: RngStream, flag: bool) -> bool:
 
 @wp.func
 def vec_from_leg(v: vec3, leg: int) -> vec3:
-    """Return the vector of one leg of the attempt, in each of its four threads."""
+    """Return leg `leg`'s vector of the attempt in each of its four threads."""
     return vec3(from_leg_of_attempt(v[0], leg), from_leg_of_attempt(v[1], leg), from_leg_of_attempt(v[2], leg))
 
 
 @wp.func
 def sync_attempts(rng: RngStream):
-    """Wait for the threads of a world; each then sees what the others wrote."""
+    """Synchronise the threads of a world, so that each sees the others' writes."""
     if rng.lanes > 1:
         sync_lanes()
 
 
 @wp.func
 def store_leg(leg: int, sample: LegSample, joint_q: wp.array(dtype=float), joint_qd: wp.array(dtype=float)):
-    """Write a leg."""
+    """Write motor angles [rad] and rates [rad/s] of a leg to one world's coordinates."""
     store_motors(joint_q, leg_coord(0, leg), sample.angles)
     store_motors(joint_qd, leg_dof(0, leg), sample.rates)
 
 
 @wp.func
 def pose_is_valid(
-    geometry: wp.array(dtype=LegGeometry), ground: Ground, rng: RngStream, own: LegSample, reachable: bool,
+    geometry: wp.array(dtype=LegGeometry), ground: Ground, rng: RngStream, sample: LegSample, reachable: bool,
     joint_q: wp.array(dtype=float), joint_qd: wp.array(dtype=float),
 ) -> bool:  # fmt: skip
-    """Return whether legs are reachable and touch nothing; completes the coordinates by the legs of other threads.
+    """Return whether all legs are reachable and free of collisions; first gathers the legs of other threads.
 
-    own: the leg that a thread has sampled, if it is one of several; reachable: whether its legs are.
+    sample: the leg that this thread has sampled, if it is one of several; reachable: whether its legs are.
     """
     all_reachable = all_legs(rng, reachable)
     if rng.lanes == 1 and not all_reachable:
@@ -84,12 +84,12 @@ def pose_is_valid(
     if rng.lanes > 1:
         other = LegSample()
         for leg in range(geometry.shape[0]):
-            other.angles = vec_from_leg(own.angles, leg)
-            other.rates = vec_from_leg(own.rates, leg)
+            other.angles = vec_from_leg(sample.angles, leg)
+            other.rates = vec_from_leg(sample.rates, leg)
             store_leg(leg, other, joint_q, joint_qd)
     flags = int(0)
-    for turn in range(first_leg(rng), geometry.shape[0], leg_step(rng)):
-        flags = flags | leg_collisions(geometry, ground, joint_q, 0, turn, MIN_LINK_DISTANCE)
+    for leg in range(first_leg(rng), geometry.shape[0], leg_step(rng)):
+        flags = flags | leg_collisions(geometry, ground, joint_q, 0, leg, MIN_LINK_DISTANCE)
     return all_legs(rng, all_reachable and flags == 0)
 
 
@@ -98,7 +98,7 @@ def write_sample_and_check(
     sample_base: wp.Function, sample_leg: wp.Function, start: Any, arrays: RobotArrays, scene: Scene, rng: RngStream,
     attempt: int, joint_q: wp.array(dtype=float), joint_qd: wp.array(dtype=float),
 ) -> bool:  # fmt: skip
-    """Write the sample of an attempt to coordinates of one world, and return whether it is valid."""
+    """Write an attempt's sample to coordinates of one world, and return whether it is valid."""
     base = sample_base(start, arrays, rng, attempt)
     for j in range(3):
         joint_q[j] = base.pos[j]
@@ -107,20 +107,20 @@ def write_sample_and_check(
     for j in range(4):
         joint_q[3 + j] = base.quat[j]
     reachable = bool(True)
-    own = LegSample()
+    sample = LegSample()
     for leg in range(first_leg(rng), scene.geometry.shape[0], leg_step(rng)):
-        own = sample_leg(start, base, scene.geometry[leg], rng, leg)
-        reachable = reachable and own.reachable
-        store_leg(leg, own, joint_q, joint_qd)
-    return pose_is_valid(scene.geometry, start.ground, rng, own, reachable, joint_q, joint_qd)
+        sample = sample_leg(start, base, scene.geometry[leg], rng, leg)
+        reachable = reachable and sample.reachable
+        store_leg(leg, sample, joint_q, joint_qd)
+    return pose_is_valid(scene.geometry, start.ground, rng, sample, reachable, joint_q, joint_qd)
 
 
 @wp.func
 def write_first_valid(
-    geometry: wp.array(dtype=LegGeometry), rng: RngStream, accepted: int, own_q: wp.array(dtype=float),
-    own_qd: wp.array(dtype=float), joint_q: wp.array(dtype=float), joint_qd: wp.array(dtype=float),
+    geometry: wp.array(dtype=LegGeometry), rng: RngStream, accepted: int, attempt_q: wp.array(dtype=float),
+    attempt_qd: wp.array(dtype=float), joint_q: wp.array(dtype=float), joint_qd: wp.array(dtype=float),
 ) -> bool:  # fmt: skip
-    """Write the first valid attempt to the coordinates of all worlds; returns whether there is one.
+    """Write the first valid attempt to the world's coordinates in `joint_q`, `joint_qd`; returns whether there is one.
 
     accepted: attempt of this thread that was valid, `ATTEMPTS` if none was.
     """
@@ -129,12 +129,12 @@ def write_first_valid(
         first = least_of_attempts(accepted)
     if accepted == first and first < ATTEMPTS and first_leg(rng) == 0:
         for i in range(7):
-            joint_q[rng.world * COORDS + i] = own_q[i]
+            joint_q[rng.world * COORDS + i] = attempt_q[i]
         for i in range(6):
-            joint_qd[rng.world * DOFS + i] = own_qd[i]
+            joint_qd[rng.world * DOFS + i] = attempt_qd[i]
         for leg in range(geometry.shape[0]):
-            store_motors(joint_q, leg_coord(rng.world, leg), load_motors(own_q, leg_coord(0, leg)))
-            store_motors(joint_qd, leg_dof(rng.world, leg), load_motors(own_qd, leg_dof(0, leg)))
+            store_motors(joint_q, leg_coord(rng.world, leg), load_motors(attempt_q, leg_coord(0, leg)))
+            store_motors(joint_qd, leg_dof(rng.world, leg), load_motors(attempt_qd, leg_dof(0, leg)))
     sync_attempts(rng)
     return first < ATTEMPTS
 
@@ -149,12 +149,14 @@ def sample_valid_state(
     sample_base: (start, robot, draw, attempt) -> struct with pos [m], quat (xyzw), com_vel [m/s] and ang_vel [rad/s] of
     the base, world axes. sample_leg: (start, base, geometry, draw, leg) -> `LegSample`.
     """
-    own_q = wp.zeros(shape=(COORDS,), dtype=float)
-    own_qd = wp.zeros(shape=(DOFS,), dtype=float)
+    attempt_q = wp.zeros(shape=(COORDS,), dtype=float)
+    attempt_qd = wp.zeros(shape=(DOFS,), dtype=float)
     accepted = int(ATTEMPTS)
     for attempt in range(rng.lane // 4, ATTEMPTS, wp.max(rng.lanes // 4, 1)):
         if accepted == ATTEMPTS:
-            fresh = fold_in(rng, attempt)
-            if write_sample_and_check(sample_base, sample_leg, start, arrays, scene, fresh, attempt, own_q, own_qd):
+            branch = fold_in(rng, attempt)
+            if write_sample_and_check(
+                sample_base, sample_leg, start, arrays, scene, branch, attempt, attempt_q, attempt_qd
+            ):
                 accepted = attempt
-    return write_first_valid(scene.geometry, rng, accepted, own_q, own_qd, arrays.joint_q, arrays.joint_qd)
+    return write_first_valid(scene.geometry, rng, accepted, attempt_q, attempt_qd, arrays.joint_q, arrays.joint_qd)

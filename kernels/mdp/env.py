@@ -1,4 +1,4 @@
-"""What an environment keeps of every world besides the robot, and the settings of each skill."""
+"""Episode bookkeeping of all worlds, and the settings of each skill."""
 
 import warp as wp
 
@@ -10,12 +10,12 @@ from .view import vec12
 BEGUN = wp.constant(1)
 COMMANDED = wp.constant(2)
 RING = wp.constant(8)
-"""Policy steps that the rings of past targets and observations hold; known to the compiler, which divides by it."""
+"""Length [policy steps] of the ring buffers of targets and observations; a constant, since kernels divide by it."""
 
 
 @wp.struct
 class Scene:
-    """What all worlds have in common."""
+    """Geometry and ground that all worlds share."""
 
     geometry: wp.array(dtype=LegGeometry)  # (4,)
     ground: Ground
@@ -24,69 +24,69 @@ class Scene:
 
 @wp.struct
 class NoSettings:
-    """Stands for the settings of a reset, or a level, that has none."""
+    """Placeholder struct for a reset without settings, or a task without levels."""
 
     unused: float
 
 
 @wp.struct
 class EpisodeArrays:
-    """Bookkeeping of all worlds, arrays of shape (num_worlds,)."""
+    """Episode state of all worlds, arrays of shape (num_worlds,)."""
 
     seed: int
     first: int  # world of the first thread of a launch
-    step_count: wp.array(dtype=int)  # policy steps made; with the seed, all state of the random numbers
+    step_count: wp.array(dtype=int)  # policy steps made; with the seed, the whole state of the random streams
     skill: wp.array(dtype=int)  # index of the task that a world is in
-    requested_task: wp.array(dtype=int)  # skill that is asked for, -1: none
-    pending_command: wp.array(dtype=wp.vec4)  # command that the skill is given when it takes over
-    has_command: wp.array(dtype=int)  # 1: there is one
+    requested_task: wp.array(dtype=int)  # skill that a world is to hand over to, -1: none
+    pending_command: wp.array(dtype=wp.vec4)  # command of the requested skill, set when it takes over
+    has_command: wp.array(dtype=int)  # 1: `pending_command` is set
     history_reset: wp.array(
         dtype=int
-    )  # BEGUN: an episode or a skill, observations have no past; COMMANDED: within an episode
+    )  # BEGUN: an episode or skill began, so observations have no history; COMMANDED: a command came within an episode
     reward: wp.array(dtype=float)
     done: wp.array(dtype=float)  # 1: the episode ended
-    timeout: wp.array(dtype=float)  # 1: it ended without failure
+    timeout: wp.array(dtype=float)  # 1: it ended without failure (truncated)
     terminated: wp.array(dtype=wp.bool)  # it ended with failure
-    truncated: wp.array(dtype=wp.bool)  # it ended without
-    termination: wp.array(dtype=int)  # index of the termination, -1: none
-    diverged: wp.array(dtype=int)  # 1: the state is not one of a robot; observations are 0
-    bad_action: wp.array(dtype=int)  # 1: the action was not finite; the world is broken at the end of the step
-    level: wp.array(dtype=int)  # curriculum; the number of levels means that all were passed
-    streak: wp.array(dtype=int)  # successes in a row
+    truncated: wp.array(dtype=wp.bool)  # it ended without failure
+    termination: wp.array(dtype=int)  # index of the termination term that ended it, -1: none
+    diverged: wp.array(dtype=int)  # 1: the state is not finite or too fast; observations are 0
+    bad_action: wp.array(dtype=int)  # 1: the action was not finite; the world counts as diverged at the end of the step
+    level: wp.array(dtype=int)  # curriculum level; num_levels: all were passed
+    streak: wp.array(dtype=int)  # consecutive successes
 
 
 @wp.struct
 class Counters:
-    """Results that grow until the host clears them."""
+    """Statistics that accumulate until the host reads and clears them."""
 
     term_sum: wp.array2d(dtype=wp.float64)  # (rewards, num_worlds)
     termination_count: wp.array2d(dtype=int)  # (terminations, num_worlds)
     curriculum_episodes: wp.array(dtype=int)  # (num_worlds,) ended episodes that count for the curriculum
     curriculum_successes: wp.array(dtype=int)  # of these, successful
-    error_sum: wp.array(dtype=wp.float64)  # of the successful ones
-    bad_actions: wp.array(dtype=int)  # actions that were not finite
+    error_sum: wp.array(dtype=wp.float64)  # (num_worlds,) sum of the errors of the successful ones
+    bad_actions: wp.array(dtype=int)  # (num_worlds,) actions that were not finite
 
 
 @wp.struct
 class SkillSettings:
-    """How a skill drives the robot."""
+    """Constants of a skill: action scale, command filter, thresholds and margins."""
 
     action_scale: vec12  # [rad]
     command_filter: FilterParams
-    contact_force: float  # [N] above it a paw is in contact
+    contact_force: float  # [N] a paw with more is in contact
     push_in_flight: int  # 1: pushes act in the air too
-    lift: float  # [m] above standing, at which robots begin whose policy is measured
+    lift: float  # [m] height above standing at which evaluations begin
     link_margin: float  # [m] links closer to one another than this count as touching
-    block_margin: float  # [m] by which blocks are wider and higher for what must not touch them
+    block_margin: float  # [m] blocks count as wider and higher by this in collision checks
 
 
 @wp.struct
 class Delays:
-    """Latency: what was commanded lately, and which of it the motors follow."""
+    """Actuation latency: the last motor targets, and the two that motors follow within a policy step."""
 
-    target_history: wp.array3d(dtype=float)  # [rad] (RING, 12, num_worlds) filtered targets, a ring over policy steps
+    target_history: wp.array3d(dtype=float)  # [rad] (RING, 12, num_worlds) filtered targets, a ring buffer
     steps: wp.array(dtype=int)  # [physics steps] (num_worlds,) from action to motor
     substeps: int  # physics steps in a policy step
-    switch_step: wp.array(dtype=int)  # [physics steps] (num_worlds,) what is left of the latency in a policy step
-    current_target: wp.array2d(dtype=float)  # [rad] (12, num_worlds) what the motors follow after `late_steps`
-    prev_target: wp.array2d(dtype=float)  # [rad] (12, num_worlds) what they follow before
+    switch_step: wp.array(dtype=int)  # [physics steps] (num_worlds,) at which `current_target` follows `prev_target`
+    current_target: wp.array2d(dtype=float)  # [rad] (12, num_worlds) target from `switch_step` on
+    prev_target: wp.array2d(dtype=float)  # [rad] (12, num_worlds) target before `switch_step`

@@ -68,8 +68,6 @@ def make_event_kernel(slots: list) -> wp.Kernel:
                     if wp.static(slots[i].parameterless):
                         wp.static(slots[i].func)(robot, rng)
                     else:
-                        wp.static(slots[i].func)(
-                            robot, rng, *p[wp.static(slots[i].params_start) : wp.static(slots[i].params_stop)]
-                        )
+                        wp.static(slots[i].func)(robot, rng, *p[wp.static(slots[i].start) : wp.static(slots[i].stop)])
 
     return event_kernel

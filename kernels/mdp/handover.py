@@ -1,4 +1,4 @@
-"""Handing a world over from one skill to another; the robot is left as it is."""
+"""Handover of a world from one skill to another; the robot's state does not change."""
 
 from typing import Any
 
@@ -18,7 +18,7 @@ def hand_over(
     arrays: RobotArrays, parameters: RobotParameters, episode: EpisodeArrays, skills: wp.array(dtype=SkillSettings),
     world: int, target: int,
 ):  # fmt: skip
-    """Make another skill the active one: its motors from now on, and as last action the one that holds the targets."""
+    """Make `target` the active skill: its motor constants, and as previous actions the one that holds the targets."""
     episode.skill[world] = target
     episode.requested_task[world] = NONE
     episode.has_command[world] = 0
@@ -41,7 +41,7 @@ def restore_task_kernel(
     parameters: RobotParameters,
     episode: EpisodeArrays,
 ):
-    """Put worlds into their first skill where mask is not 0, with its motors, and asked for none; one thread each."""
+    """Reset worlds with mask != 0 to their first skill, its motors, and no request; one thread per world."""
     world = episode.first + wp.tid()
     if mask[world] == 0.0:
         return
@@ -71,9 +71,9 @@ def make_handover_kernel(handover: Any) -> wp.Kernel:
         sources: wp.array(dtype=handover.source.state),
         targets: wp.array(dtype=handover.target.state),
     ):
-        """Hand worlds over whose time has come, and give them the command that they were asked with.
+        """Hand over worlds of `source` for which `when` holds, and set their pending command; one thread per world.
 
-        moved: 1 where that happened in this step; one thread per world.
+        moved: 1 where a world was handed over in this step.
         """
         world = episode.first + wp.tid()
         if episode.skill[world] != source or episode.done[world] != 0.0 or moved[world] != 0:

@@ -1,4 +1,4 @@
-"""The stage that observes: terms of all groups, then latency, noise, clipping, scale and history."""
+"""Observations: evaluate the terms of all groups, then apply latency, noise, clipping, scale and history."""
 
 from typing import Any
 
@@ -21,7 +21,7 @@ LANES = wp.constant(32)
 
 @wp.struct
 class ObservationColumn:
-    """Where a component of an observation term comes from and stands in the rows of its group."""
+    """Index table of one component of an observation term: its source, and its columns in its group."""
 
     raw: int  # its row among the raw values
     group: int
@@ -33,7 +33,7 @@ class ObservationColumn:
     oldest: int  # column of its oldest frame
     width: int  # columns of a frame
     history: int  # number of frames
-    delayed: int  # 1: comes as late as the world's sensors do
+    delayed: int  # 1: subject to the observation latency of the world
     past: int  # column in the ring of past values
 
 
@@ -41,10 +41,10 @@ class ObservationColumn:
 class ObservationArrays:
     """Observations of all worlds, one row a world, one group after the other."""
 
-    raw: wp.array2d(dtype=float)  # (components, num_worlds) what the terms gave
-    now: wp.array(dtype=float)  # of the next step; an ended episode has begun anew
-    final: wp.array(dtype=float)  # the same before that new beginning
-    past: wp.array3d(dtype=float)  # (RING, num_worlds, columns) what sensors gave, a ring over policy steps
+    raw: wp.array2d(dtype=float)  # (components, num_worlds) values of the terms
+    now: wp.array(dtype=float)  # of the next step; ended episodes are already reset
+    final: wp.array(dtype=float)  # the same before resets
+    past: wp.array3d(dtype=float)  # (RING, num_worlds, columns) delayed components, ring buffer over policy steps
     latency: wp.array(dtype=int)  # [physics steps] (num_worlds,)
     substeps: int
 
@@ -84,10 +84,10 @@ def store(value: Any, row: int, world: int, out: wp.array2d(dtype=float)):  # no
 def make_observe_kernel(task: Any) -> wp.Kernel:
     """Return the kernel that evaluates all observation terms of a task."""
     slots = [slot for group in task.groups for slot in task.params.slots[group]]
-    first = [next(iter(slot.func.input_types.values())) for slot in slots]
-    of_parameters = [kind is RobotParameters for kind in first]
-    of_ground = [kind is RobotArrays for kind in first]
-    places = [sum(slot.term.width for slot in slots[:i]) for i in range(len(slots))]
+    input_types = [next(iter(slot.func.input_types.values())) for slot in slots]
+    reads_parameters = [kind is RobotParameters for kind in input_types]
+    reads_ground = [kind is RobotArrays for kind in input_types]
+    rows = [sum(slot.term.width for slot in slots[:i]) for i in range(len(slots))]
 
     @wp.kernel(module="unique", module_options=FAST)
     def observe_kernel(
@@ -103,9 +103,9 @@ def make_observe_kernel(task: Any) -> wp.Kernel:
         # out
         raw: wp.array2d(dtype=float),
     ):
-        """Write what the terms give; one thread per (chunk of terms, world).
+        """Write the values of the terms; one thread per (chunk of terms, world).
 
-        beginning 1: only where an episode or the skill has just begun, or another command came.
+        after_reset 1: only where an episode or the skill has just begun, or another command came.
         """
         chunk, world = wp.tid()
         world += episode.first
@@ -115,20 +115,18 @@ def make_observe_kernel(task: Any) -> wp.Kernel:
             if chunk == c:
                 robot = load_view(arrays, ground, world)
                 for i in range(wp.static(c * CHUNK), wp.static(min((c + 1) * CHUNK, len(slots)))):
-                    if wp.static(of_parameters[i]):
-                        store(wp.static(slots[i].func)(parameters, world), wp.static(places[i]), world, raw)
-                    elif wp.static(of_ground[i]):
-                        store(wp.static(slots[i].func)(arrays, ground, world), wp.static(places[i]), world, raw)
+                    if wp.static(reads_parameters[i]):
+                        store(wp.static(slots[i].func)(parameters, world), wp.static(rows[i]), world, raw)
+                    elif wp.static(reads_ground[i]):
+                        store(wp.static(slots[i].func)(arrays, ground, world), wp.static(rows[i]), world, raw)
                     elif wp.static(slots[i].parameterless):
-                        store(wp.static(slots[i].func)(robot, states[world]), wp.static(places[i]), world, raw)
+                        store(wp.static(slots[i].func)(robot, states[world]), wp.static(rows[i]), world, raw)
                     else:
                         store(
                             wp.static(slots[i].func)(
-                                robot,
-                                states[world],
-                                *p[wp.static(slots[i].params_start) : wp.static(slots[i].params_stop)],
+                                robot, states[world], *p[wp.static(slots[i].start) : wp.static(slots[i].stop)]
                             ),
-                            wp.static(places[i]),
+                            wp.static(rows[i]),
                             world,
                             raw,
                         )
@@ -138,7 +136,7 @@ def make_observe_kernel(task: Any) -> wp.Kernel:
 
 @wp.func
 def finite_or_zero(value: float, diverged: bool) -> float:
-    """Return 0 instead of the value of a world that came apart, or of one that is not finite."""
+    """Return a value, or 0 if its world diverged or it is not finite."""
     if diverged or not wp.isfinite(value):
         return 0.0
     return value
@@ -146,65 +144,65 @@ def finite_or_zero(value: float, diverged: bool) -> float:
 
 @wp.struct
 class StepContext:
-    """What all components of a world have in common in a step."""
+    """What all observation components of a world share in a policy step."""
 
     world: int
-    draws: wp.uint32  # see `step_key`
-    fresh: int  # as in `EpisodeArrays`
+    step_key: wp.uint32  # see `mdp.random`
+    history_reset: int  # as in `EpisodeArrays`
     diverged: bool
-    now: int  # place in the rings of past values
-    newer: int  # place of the value that a sensor's latency has passed
-    older: int  # place of the one before
-    share: float  # [1] way from the newer to the older one
+    slot: int  # present one of the ring buffers
+    newer: int  # slot of the latest value that is as old as the latency
+    older: int  # slot before it
+    fraction: float  # [1] interpolation from newer to older
 
 
 @wp.func
 def step_context(episode: EpisodeArrays, arrays: ObservationArrays, world: int) -> StepContext:
-    """Return what a world's components have in common."""
+    """Return what a world's observation components share in this policy step."""
     step_count = episode.step_count[world]
-    whole = arrays.latency[world] // arrays.substeps
+    steps = arrays.latency[world] // arrays.substeps
     m = StepContext()
     m.world = world
-    m.draws = step_key(episode.seed, world, step_count)
-    m.fresh = episode.history_reset[world]
+    m.step_key = step_key(episode.seed, world, step_count)
+    m.history_reset = episode.history_reset[world]
     m.diverged = episode.diverged[world] != 0
-    m.now = step_count % RING
-    m.newer = (step_count - whole) % RING
-    m.older = (step_count - whole - 1) % RING
-    m.share = float(arrays.latency[world] - whole * arrays.substeps) / float(arrays.substeps)
+    m.slot = step_count % RING
+    m.newer = (step_count - steps) % RING
+    m.older = (step_count - steps - 1) % RING
+    m.fraction = float(arrays.latency[world] - steps * arrays.substeps) / float(arrays.substeps)
     return m
 
 
 @wp.func
 def delay_value(arrays: ObservationArrays, m: StepContext, column: int, value: float) -> float:
-    """Return what a sensor gave as long ago as its latency says, between policy steps a straight line."""
-    if m.fresh == BEGUN:
+    """Store a component's value, and return it delayed by the observation latency, linear between policy steps."""
+    if m.history_reset == BEGUN:
         for i in range(RING):
             arrays.past[i, m.world, column] = value
-    arrays.past[m.now, m.world, column] = value
+    arrays.past[m.slot, m.world, column] = value
     newer = arrays.past[m.newer, m.world, column]
-    if m.share == 0.0:
+    if m.fraction == 0.0:
         return newer
-    return newer + m.share * (arrays.past[m.older, m.world, column] - newer)
+    return newer + m.fraction * (arrays.past[m.older, m.world, column] - newer)
 
 
 @wp.func
 def postprocess(
     arrays: ObservationArrays, column: ObservationColumn, p: wp.array(dtype=float), m: StepContext, after_reset: int
 ):
-    """Turn a component's raw value into an observation, behind the frames before."""
+    """Write a component's observation: delayed, with noise, clipped, scaled, behind the older frames of its history."""
     value = finite_or_zero(arrays.raw[column.raw, m.world], m.diverged)
     if column.delayed != 0:
         value = delay_value(arrays, m, column.past, value)
     noise = p[column.noise]
     if noise > 0.0:
-        value += noise * clamped_normal(stream_at(m.draws, m.world, OBSERVATION + column.group), column.oldest)
+        value += noise * clamped_normal(stream_at(m.step_key, m.world, OBSERVATION + column.group), column.oldest)
     value = finite_or_zero(p[column.scale] * wp.clamp(value, -p[column.clip], p[column.clip]), m.diverged)
     i = column.start + m.world * column.stride + column.oldest
-    again = after_reset != 0 and m.fresh == COMMANDED
+    keep_frames = after_reset != 0 and m.history_reset == COMMANDED
     for _ in range(column.history - 1):
-        frame = arrays.now[i + wp.where(again, 0, column.width)]
-        if m.diverged or m.fresh == BEGUN:
+        frame = arrays.now[i + wp.where(keep_frames, 0, column.width)]
+        if m.diverged or m.history_reset == BEGUN:
             frame = value
         arrays.now[i] = frame
         if after_reset == 0:
@@ -228,8 +226,8 @@ def postprocess_obs_kernel(
 ):
     """Turn raw values into observations; launch over (num_worlds, LANES).
 
-    Rows of worlds that came apart are 0, history and all, and so is what else is not finite.
-    beginning 1: only where an episode or the skill has just begun, or another command came; then frames of before
+    Rows of diverged worlds are 0, with their history; so are other values that are not finite.
+    after_reset 1: only where an episode or skill has just begun, or another command came; then older frames
     stay, and so does `final`.
     """
     world, lane = wp.tid()

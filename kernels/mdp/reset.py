@@ -1,4 +1,4 @@
-"""The stage that begins: new episodes where they ended, and new commands where they are due."""
+"""Resets: new episodes, and new commands within an episode where they are due."""
 
 from typing import Any
 
@@ -21,7 +21,7 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.func
 def previous_state(old: Any, done: float):
-    """Return the state that a new episode follows; one that was cut off from outside counts as not begun."""
+    """Return the state of the previous episode; with 0 steps if it was cut off from outside (done = 0)."""
     state = old
     if done == 0.0:
         state.steps = 0
@@ -29,7 +29,7 @@ def previous_state(old: Any, done: float):
 
 
 def make_reset_kernel(task: Any) -> wp.Kernel:
-    """Return the kernel that begins a task's episodes; task: see `jumper_warp.tasks.cfg.TaskCfg`."""
+    """Return the kernel that resets a task's worlds; task: see `jumper_warp.tasks.cfg.TaskCfg`."""
     reset, due, command = task.reset.func, task.command.due, task.command.draw
     settings_type, level_type = task.settings_type, task.level_type
 
@@ -48,7 +48,7 @@ def make_reset_kernel(task: Any) -> wp.Kernel:
         states: wp.array(dtype=task.state),
         arrays: RobotArrays,
     ):
-        """Begin a new episode where mask is not 0, else a new command where it is due; launch over (worlds, lanes).
+        """Begin a new episode where mask != 0, else sample a command where one is due; launch over (worlds, lanes).
 
         The lanes, neighbours in a warp, do the same but for what they share by `draw.lane`.
         """
@@ -87,7 +87,7 @@ def make_reset_kernel(task: Any) -> wp.Kernel:
 
 
 def make_set_command_kernel(task: Any) -> wp.Kernel:
-    """Return the kernel that gives worlds a command from outside."""
+    """Return the kernel that sets commands from the host; task: see `jumper_warp.tasks.cfg.TaskCfg`."""
     give = task.command.give
 
     @wp.kernel(module="unique", enable_backward=False)
@@ -104,9 +104,9 @@ def make_set_command_kernel(task: Any) -> wp.Kernel:
         episode: EpisodeArrays,
         states: wp.array(dtype=task.state),
     ):
-        """Give a command where mask is not 0; one thread per world.
+        """Set a command where mask != 0; one thread per world.
 
-        begins 1: to a new episode, with its heading [rad]; 0: to the one under way, in the heading that the robot has.
+        begins 1: of a new episode, with its heading [rad]; 0: within the episode, relative to the robot's yaw.
         """
         world = wp.tid()
         if episode.skill[world] != skill or mask[world] == 0.0:
@@ -127,7 +127,7 @@ def make_set_command_kernel(task: Any) -> wp.Kernel:
 
 @wp.func
 def leg_limits(params: FilterParams) -> LegLimits:
-    """Return the limits of a command filter as those of the inverse kinematics."""
+    """Return a command filter's angle limits [rad] as limits of the inverse kinematics."""
     limits = LegLimits()
     limits.lateral_lower = params.lateral.lower
     limits.lateral_upper = params.lateral.upper
@@ -140,7 +140,7 @@ def leg_limits(params: FilterParams) -> LegLimits:
 
 @wp.func
 def write_default_pose(arrays: RobotArrays, scene: Scene, world: int, heading: float, ground_height: float):
-    """Write the model's reference pose at rest, turned to a heading [rad] and lifted [m]."""
+    """Write the default pose at rest, with a yaw `heading` [rad], on ground of height `ground_height` [m]."""
     q = world * COORDS
     for j in range(int(COORDS)):
         arrays.joint_q[q + j] = scene.reference_q[q + j]
@@ -163,9 +163,9 @@ def default_pose_kernel(
     # in, out
     arrays: RobotArrays,
 ):
-    """Stand robots in the default pose with a heading [rad] where mask is not 0, blocks at their starts.
+    """Put robots with mask != 0 into the default pose with a heading [rad], and blocks to their starts.
 
-    They are lifted off the ground as the skill says that each world is in.
+    The base is above the ground by the `lift` of the world's skill; one thread per world.
     """
     world = wp.tid()
     if mask[world] != 0.0:
@@ -181,7 +181,7 @@ def advance_rng_kernel(
     # in, out
     episode: EpisodeArrays,
 ):
-    """Move the clock on where mask is not 0, so that what follows draws anew; one thread per world."""
+    """Advance the step count where mask != 0, so that the next samples are new ones; one thread per world."""
     world = wp.tid()
     if mask[world] != 0.0:
         episode.step_count[world] = episode.step_count[world] + 1
@@ -197,9 +197,9 @@ def clear_history_kernel(
     arrays: RobotArrays,
     delays: Delays,
 ):
-    """Forget the past where mask is not 0: actions, torques, contacts; one thread per (motor, world).
+    """Clear actions, torques, contacts and delays where mask != 0; one thread per (motor, world).
 
-    Paws are taken to be where they are now. first: world of the first thread.
+    Paw positions and velocities are those of the present state. first: world of the first thread.
     """
     m, world = wp.tid()
     world += first

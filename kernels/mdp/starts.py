@@ -1,4 +1,4 @@
-"""Parts of start states that tasks share: legs at or over a place, places of the paws, orientations."""
+"""Parts of start states that tasks share: legs from foot positions, sampled foot positions, orientations."""
 
 import warp as wp
 
@@ -9,17 +9,17 @@ from .random import RngStream, uniform_range
 
 wp.set_module_options({"enable_backward": False})
 
-MAX_FOOT_ERROR = wp.constant(1.0e-4)  # [m] by which a paw may miss its place
+MAX_FOOT_ERROR = wp.constant(1.0e-4)  # [m] distance of a foot from its wanted position
 MAX_LEG_SPEED = wp.constant(30.0)  # [rad/s] norm of a leg's motor rates
 MIN_LINK_DISTANCE = wp.constant(0.005)  # [m] least between links
 
 PAW_X, PAW_Y = 20, 24
-"""Numbers of a stream, the first of four: one a leg."""
+"""Indices in a stream, each the first of four: one a leg."""
 
 
 @wp.struct
 class LegSample:
-    """A sampled leg."""
+    """Sampled motor state of one leg."""
 
     angles: wp.vec3  # [rad] of the motors
     rates: wp.vec3  # [rad/s]
@@ -28,7 +28,7 @@ class LegSample:
 
 @wp.func
 def leg_ik(geo: LegGeometry, limits: LegLimits, ankle: wp.vec3) -> LegSample:
-    """Return the leg at rest with its ankle in a place [m], body axes."""
+    """Return the leg at rest with its ankle at a position [m] from the base origin, body axes (inverse kinematics)."""
     found = LegSample()
     angles = clamped_closed_form(geo, limits, ankle - geo.hip)
     found.angles = angles
@@ -38,7 +38,7 @@ def leg_ik(geo: LegGeometry, limits: LegLimits, ankle: wp.vec3) -> LegSample:
 
 @wp.func
 def with_foot_velocity(geo: LegGeometry, leg: LegSample, ankle_vel: wp.vec3) -> LegSample:
-    """Return a leg whose ankle moves relative to the base [m/s], body axes."""
+    """Return a leg with the motor rates that move its ankle with `ankle_vel` [m/s] relative to the base, body axes."""
     found = leg
     found.rates = leg_inverse_velocity(geo, leg.angles, ankle_vel)
     found.reachable = leg.reachable and wp.length(found.rates) <= MAX_LEG_SPEED
@@ -49,7 +49,7 @@ def with_foot_velocity(geo: LegGeometry, leg: LegSample, ankle_vel: wp.vec3) -> 
 def sample_foot_offset(
     rng: RngStream, leg: int, front_x: wp.vec2, front_y: wp.vec2, back_x: wp.vec2, back_y: wp.vec2
 ) -> wp.vec3:  # fmt: skip
-    """Return a paw's place [m] relative to the spot that the paws surround, z = 0; ranges of absolute values."""
+    """Return a sampled foot position [m] relative to the stance's centre, z = 0; ranges (lower, upper) of |x|, |y|."""
     x = uniform_range(rng, PAW_X + leg, front_x)
     y = uniform_range(rng, PAW_Y + leg, front_y)
     if leg >= 2:
@@ -62,7 +62,7 @@ def sample_foot_offset(
 
 @wp.func
 def quat_from_ypr(yaw: float, pitch: float, roll: float) -> wp.quat:
-    """Return an orientation (xyzw), body to world: roll first, yaw last [rad]."""
+    """Return the orientation (xyzw), body to world, Rz(yaw) Ry(pitch) Rx(roll); angles [rad]."""
     return (
         wp.quat_from_axis_angle(wp.vec3(0.0, 0.0, 1.0), yaw)
         * wp.quat_from_axis_angle(wp.vec3(0.0, 1.0, 0.0), pitch)

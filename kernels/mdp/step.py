@@ -1,4 +1,4 @@
-"""The end of a policy step: the task moves on, its terminations and rewards, and the curriculum."""
+"""End of a policy step: advance the task's state, then terminations, rewards and the curriculum."""
 
 from typing import Any
 
@@ -15,15 +15,10 @@ NOT_TERMINATED = wp.constant(-1)
 
 @wp.func
 def update_curriculum(
-    episode: EpisodeArrays,
-    counters: Counters,
-    world: int,
-    success: bool,
-    error: float,
-    promote_after: float,
+    episode: EpisodeArrays, counters: Counters, world: int, success: bool, error: float, promote_after: float,
     num_levels: int,
-):
-    """Take an ended episode into the curriculum: successes in a row raise the world's level."""
+):  # fmt: skip
+    """Count an ended episode for the curriculum: `promote_after` successes in a row raise the world's level."""
     streak = wp.where(success, episode.streak[world] + 1, 0)
     if streak >= int(promote_after):
         streak = int(0)
@@ -37,15 +32,10 @@ def update_curriculum(
 
 @wp.func
 def write_step_result(
-    episode: EpisodeArrays,
-    counters: Counters,
-    world: int,
-    total: float,
-    termination: int,
-    timeout: float,
+    episode: EpisodeArrays, counters: Counters, world: int, total: float, termination: int, timeout: float,
     diverged: bool,
-):
-    """Write how a policy step of a world ended."""
+):  # fmt: skip
+    """Write reward, done flags and termination of a world's policy step, and advance its step count."""
     episode.reward[world] = total
     episode.termination[world] = termination
     episode.done[world] = wp.where(termination == NOT_TERMINATED, 0.0, 1.0)
@@ -81,7 +71,7 @@ def make_step_kernel(task: Any) -> wp.Kernel:
         term_value: wp.array2d(dtype=float),
         counters: Counters,
     ):
-        """Move every world of the skill on by one policy step; one thread per world.
+        """Advance the task state of every world of a skill by one policy step; one thread per world.
 
         term_value: rewards of this step, weights applied, (rewards, num_worlds). Those that are not finite count 0.
         """
@@ -93,7 +83,7 @@ def make_step_kernel(task: Any) -> wp.Kernel:
             state = wp.static(advance.func)(robot, states[world])
         else:
             state = wp.static(advance.func)(
-                robot, states[world], *p[wp.static(advance.params_start) : wp.static(advance.params_stop)]
+                robot, states[world], *p[wp.static(advance.start) : wp.static(advance.stop)]
             )
 
         termination = int(NOT_TERMINATED)
@@ -108,7 +98,7 @@ def make_step_kernel(task: Any) -> wp.Kernel:
                     holds = wp.static(endings[i].func)(robot, state)
                 else:
                     holds = wp.static(endings[i].func)(
-                        robot, state, *p[wp.static(endings[i].params_start) : wp.static(endings[i].params_stop)]
+                        robot, state, *p[wp.static(endings[i].start) : wp.static(endings[i].stop)]
                     )
                 if holds:
                     termination = i
@@ -121,7 +111,7 @@ def make_step_kernel(task: Any) -> wp.Kernel:
                 raw = wp.static(rewards[i].func)(robot, state)
             else:
                 raw = wp.static(rewards[i].func)(
-                    robot, state, *p[wp.static(rewards[i].params_start) : wp.static(rewards[i].params_stop)]
+                    robot, state, *p[wp.static(rewards[i].start) : wp.static(rewards[i].stop)]
                 )
             value = p[wp.static(rewards[i].weight)] * raw
             if wp.static(not rewards[i].once):

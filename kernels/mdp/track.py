@@ -1,4 +1,4 @@
-"""Following the paws over a policy step: where they are, how long they have been down or up, and what touches what."""
+"""Paw kinematics, contact timers and collisions at the end of a policy step."""
 
 import warp as wp
 
@@ -16,7 +16,7 @@ wp.set_module_options({"enable_backward": False, "fast_math": True})
 
 @wp.func
 def update_paw_kinematics(arrays: RobotArrays, geo: LegGeometry, world: int, leg: int):
-    """Write place and velocity of a paw."""
+    """Write position [m] and velocity [m/s] of a paw's centre, world axes."""
     quat = base_quat(arrays, world)
     angles = load_motors(arrays.joint_q, leg_coord(world, leg))
     rates = load_motors(arrays.joint_qd, leg_dof(world, leg))
@@ -38,7 +38,7 @@ def paw_clearance(arrays: RobotArrays, geo: LegGeometry, ground: Ground, world: 
 
 @wp.func
 def update_contact_timers(arrays: RobotArrays, world: int, leg: int, down: bool):
-    """Count how long a paw has been down or up; `air_time` stays through the step of its first contact."""
+    """Update contact and air time [s] of a paw; `air_time` stays through the step of its first contact."""
     was_down = arrays.contact_time[leg, world] > 0.0
     if down:
         if was_down:
@@ -63,7 +63,7 @@ def track_kernel(
     # in, out
     arrays: RobotArrays,
 ):
-    """Follow every paw, and find what must not touch; one thread per (leg, world)."""
+    """Update every paw's kinematics and contact, and each leg's collision flags; one thread per (leg, world)."""
     leg, world = wp.tid()
     world += episode.first
     skill = skills[episode.skill[world]]

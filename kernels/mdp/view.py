@@ -1,4 +1,4 @@
-"""What rewards, terminations and observations of every task may read of a robot, and where it is stored."""
+"""State of a robot that rewards, terminations and observations read (`RobotView`), and its arrays (`RobotArrays`)."""
 
 import warp as wp
 
@@ -11,7 +11,7 @@ mat43 = wp.types.matrix(shape=(4, 3), dtype=wp.float32)
 
 @wp.struct
 class RobotView:
-    """One robot at the end of a policy step; motors in the order FL, FR, BL, BR by lateral, outer, inner."""
+    """State of one robot at the end of a policy step; legs FL, FR, BL, BR, motors of each lateral, outer, inner."""
 
     world: int  # index of the world
     pos: wp.vec3  # [m] base origin, world
@@ -37,10 +37,10 @@ class RobotView:
     contacts: int  # number of paws on the ground
     collisions: int  # bits of `jumper_warp.kernels.collision.robot`
     contact: wp.vec4  # [1] 1: the paw is on the ground
-    first_contact: wp.vec4  # [1] 1: it came down in this step
-    air_time: wp.vec4  # [s] since the paw left the ground; at its first contact how long it was off it, later 0
-    contact_time: wp.vec4  # [s] since the paw came down; 0 in the air
-    touchdown_speed: wp.vec4  # [m/s] downward, of the paw in the step before it came down
+    first_contact: wp.vec4  # [1] 1: it touched down in this step
+    air_time: wp.vec4  # [s] since the paw left the ground; at its first contact the length of its swing, later 0
+    contact_time: wp.vec4  # [s] since the paw touched down; 0 in the air
+    touchdown_speed: wp.vec4  # [m/s] downward, of the paw in the step before touchdown
     paw_force: wp.vec4  # [N] on each paw, last physics step
     peak_force: wp.vec4  # [N] on each paw, largest of the policy step
     paw_pos: mat43  # [m] centres, world
@@ -50,14 +50,14 @@ class RobotView:
 
 @wp.struct
 class RobotArrays:
-    """Where the robots' state is; the old_ arrays hold the values of the policy step before."""
+    """State of all robots; the `prev_` arrays hold the values of the policy step before."""
 
     joint_q: wp.array(dtype=float)
     joint_qd: wp.array(dtype=float)
     body_com: wp.array(dtype=wp.vec3)
     body_f: wp.array(dtype=wp.spatial_vector)  # [N], [N m] wrench on each body at its com, world axes
     gravity: wp.array(dtype=wp.vec3)  # [m/s^2] (num_worlds + 1,), world axes
-    invalid: wp.array(dtype=int)  # (num_worlds,) 1: the solver gave the world up
+    invalid: wp.array(dtype=int)  # (num_worlds,) 1: the solver froze the world because its state diverged
     impulse: wp.array2d(dtype=wp.vec3)  # [N s] (4, num_worlds) first guess of the next contact
     paw_force: wp.array2d(dtype=wp.vec3)  # [N] (4, num_worlds), like all of paws
     peak_force: wp.array2d(dtype=float)  # [N]
@@ -107,7 +107,7 @@ def base_quat(arrays: RobotArrays, world: int) -> wp.quat:
 
 @wp.func
 def load_base_view(arrays: RobotArrays, ground: Ground, world: int) -> RobotView:
-    """Return the view with the base's entries filled in."""
+    """Return the `RobotView` of a world with the entries of the base alone."""
     j = world * DOFS
     robot = RobotView()
     robot.world = world
@@ -128,7 +128,7 @@ def load_base_view(arrays: RobotArrays, ground: Ground, world: int) -> RobotView
 
 @wp.func
 def load_view(arrays: RobotArrays, ground: Ground, world: int) -> RobotView:
-    """Return the robot of a world."""
+    """Return the `RobotView` of a world."""
     robot = load_base_view(arrays, ground, world)
     contacts = int(0)
     collisions = int(0)
@@ -173,7 +173,7 @@ def load_view(arrays: RobotArrays, ground: Ground, world: int) -> RobotView:
 
 @wp.func
 def has_diverged(robot: RobotView) -> bool:
-    """Return whether a state is non-finite or faster than the robot can ever be: the world has come apart."""
+    """Return whether a state is not finite or faster than 15 m/s, 40 rad/s (base) or 120 rad/s (joints)."""
     fastest = float(0.0)
     total = wp.length_sq(robot.pos) + wp.length_sq(robot.lin_vel) + wp.length_sq(robot.ang_vel)
     for m in range(12):
@@ -193,13 +193,13 @@ def yaw_of(quat: wp.quat) -> float:
 
 @wp.func
 def rotate_yaw(v: wp.vec3, heading: float) -> wp.vec3:
-    """Return a vector turned about z by a heading [rad]."""
+    """Return a vector rotated about z by a heading [rad]."""
     return wp.quat_rotate(wp.quat_from_axis_angle(wp.vec3(0.0, 0.0, 1.0), heading), v)
 
 
 @wp.func
 def angle_from_level(quat: wp.quat, heading: float) -> float:
-    """Return the angle [rad] between an orientation (xyzw) and the level one with a heading [rad]."""
+    """Return the rotation angle [rad] between an orientation (xyzw) and the level one with a yaw `heading` [rad]."""
     half = 0.5 * heading
     level = wp.quat(0.0, 0.0, wp.sin(half), wp.cos(half))
     off = wp.quat_inverse(level) * quat
@@ -214,10 +214,9 @@ def tilt(robot: RobotView) -> float:
 
 @wp.func
 def base_deceleration(robot: RobotView) -> float:
-    """Return what the base lost of its speed of the step before, over the step [m/s^2], <= 0.
+    """Return the base's acceleration against its previous velocity [m/s^2], <= 0, mean of the policy step.
 
-    Speed that it gained against that motion, as in a rebound, does not count: a fall that ends within the step has lost
-    all of its speed.
+    A rebound does not count: a fall that ends within the step loses all of its speed, and no more.
     """
     speed = wp.length(robot.prev_lin_vel)
     if speed < 1.0e-6:

@@ -1,4 +1,4 @@
-"""Commands of velocity tracking: how they are drawn, within an episode too, and given from outside."""
+"""Velocity commands: sampled at resets and within episodes, or set from outside."""
 
 import warp as wp
 
@@ -10,7 +10,7 @@ from .state import POLICY_RATE, VelocityState
 
 wp.set_module_options({"enable_backward": False})
 
-LEAST = wp.constant(0.05)  # [m/s], [rad/s] a command that is smaller in all three means to stand
+LEAST = wp.constant(0.05)  # [m/s], [rad/s] a command smaller in all three components means to stand
 
 
 @wp.struct
@@ -28,7 +28,7 @@ class CommandRanges:
 
 @wp.func
 def reach_of(ranges: CommandRanges, level: int) -> wp.vec4:
-    """Return the reach at a level."""
+    """Return the command limits at a level, linear between those of the first and the last one."""
     if ranges.levels == 0:
         return ranges.narrow
     share = float(wp.min(level, ranges.levels)) / float(ranges.levels)
@@ -37,10 +37,9 @@ def reach_of(ranges: CommandRanges, level: int) -> wp.vec4:
 
 @wp.func
 def sample_velocity_command(rng: RngStream, ranges: CommandRanges, level: int) -> wp.vec3:
-    """Return a command of a level.
+    """Return a sampled command of a level: velocity ahead, to the left [m/s], yaw rate [rad/s].
 
-    Beyond the first level, the faster it goes along x, the less far it reaches across and in turning: an ellipse
-    between the largest reach along x and those of the level across it.
+    Beyond the first level, y and yaw shrink with the speed along x, as on an ellipse.
     """
     kind = uniform(rng, streams.KIND, 0.0, 1.0)
     if kind < ranges.stand:
@@ -63,7 +62,7 @@ def sample_velocity_command(rng: RngStream, ranges: CommandRanges, level: int) -
 
 @wp.func
 def with_command(state: VelocityState, command: wp.vec3) -> VelocityState:
-    """Return the state with a command that has just come."""
+    """Return the state with a new command."""
     new = state
     new.command = command
     new.command_steps = 0
@@ -75,7 +74,7 @@ def with_command(state: VelocityState, command: wp.vec3) -> VelocityState:
 
 @wp.func
 def command_due(state: VelocityState) -> bool:
-    """Return whether the command has lasted long enough."""
+    """Return whether another command is to be sampled in this policy step."""
     return state.command_lasts > 0 and state.command_steps >= state.command_lasts
 
 
@@ -83,7 +82,7 @@ def command_due(state: VelocityState) -> bool:
 def draw_command(
     robot: RobotView, scene: Scene, state: VelocityState, level: CommandRanges, rng: RngStream
 ) -> VelocityState:
-    """Return the state of an episode that goes on with a drawn command."""
+    """Return the state with a newly sampled command."""
     new = with_command(state, sample_velocity_command(rng, level, state.command_level))
     new.command_lasts = wp.max(int(uniform_range(rng, streams.LASTS, level.lasts)), 1)
     return new
@@ -93,9 +92,9 @@ def draw_command(
 def give_velocity(
     robot: RobotView, scene: Scene, state: VelocityState, values: wp.vec4, heading: float
 ) -> VelocityState:
-    """Command a velocity until another comes: ahead, to the left [m/s] and about z [rad/s], body axes.
+    """Return the state with a commanded velocity: ahead, to the left [m/s], yaw rate [rad/s], body axes.
 
-    The fourth value is the gait's frequency [Hz], 0: as it was.
+    It holds until the next command. values[3]: gait frequency [Hz], 0: unchanged.
     """
     new = with_command(state, wp.vec3(values[0], values[1], values[2]))
     if values[3] > 0.0:

@@ -1,4 +1,4 @@
-"""How episodes of velocity tracking begin: levels and a command; `start_states` has the robot's state."""
+"""Reset of velocity tracking: curriculum levels and a command; robot: see `start_states`."""
 
 import warp as wp
 
@@ -15,12 +15,12 @@ from .terminations import off_map
 
 wp.set_module_options({"enable_backward": False})
 
-FALL = wp.constant(60.0)  # [m/s] what a fall takes from the score, as much as a second at 1 m/s gives
+FALL = wp.constant(60.0)  # [m/s] penalty of a fall in the score, as much as a second at 1 m/s adds
 
 
 @wp.func
 def map_limit(map: Map) -> wp.vec2:
-    """Return where the base has left the tiles [m] along x and y, 0 without a map."""
+    """Return the half extents [m] of the map along x and y, 0 without a map."""
     return 0.5 * map.tile * wp.vec2(float(map.rows), float(map.cols))
 
 
@@ -28,9 +28,10 @@ def map_limit(map: Map) -> wp.vec2:
 def carried_over(
     old: VelocityState, pos: wp.vec3, tolerance: float, command_levels: int, terrain_levels: int
 ) -> VelocityState:  # fmt: skip
-    """Return the state of a new episode, with what was counted, and both levels after the old one, ended at `pos` [m].
+    """Return the initial state of the next episode: statistics kept, both curriculum levels updated.
 
-    An episode to the end with a mean error up to a tolerance [m/s] raises the levels, a fall lowers them.
+    pos [m]: base at the end of the old one. A full episode with a mean error up to `tolerance` [m/s] raises the levels,
+    a fall lowers them.
     """
     new = VelocityState()
     new.sum_xy = old.sum_xy
@@ -61,7 +62,7 @@ def reset_velocity(
     arrays: RobotArrays, scene: Scene, skill: SkillSettings, old: VelocityState, settings: VelocitySettings,
     level: CommandRanges, rng: RngStream,
 ) -> VelocityState:  # fmt: skip
-    """Begin an episode with a drawn command, and return its state."""
+    """Reset a world to a sampled start state with a sampled command, and return the task's state."""
     world = rng.world
     new = carried_over(old, base_pos(arrays, world), settings.tolerance, level.levels, settings.map.rows)
     rest_block(scene.ground, world)

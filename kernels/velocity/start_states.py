@@ -1,6 +1,6 @@
-"""Start states of velocity tracking: any pose of the base, any places of the paws, in motion, on any ground.
+"""Start states of velocity tracking: base pose and velocity, and foot positions, sampled on any ground.
 
-The default pose stands in after the last attempt.
+If no attempt is valid, the episode begins in the default pose.
 """
 
 import warp as wp
@@ -77,7 +77,7 @@ class VelocityBase:
 
 @wp.func
 def sample_tile(rng: RngStream, map: Map, level: int) -> wp.vec2:
-    """Return the middle of a tile [m] of a level, of any level past the last; the origin without a map."""
+    """Return the centre [m] of a sampled tile of a terrain level (any past the last); the origin without a map."""
     if map.rows == 0:
         return wp.vec2(0.0)
     row = level
@@ -91,7 +91,7 @@ def sample_tile(rng: RngStream, map: Map, level: int) -> wp.vec2:
 
 @wp.func
 def sample_base(start: VelocityStart, arrays: RobotArrays, rng: RngStream, attempt: int) -> VelocityBase:
-    """Return a base in motion around the start's spot."""
+    """Return the base's sampled pose and velocity, around the start's position."""
     settings = start.settings
     v = settings.lin_vel
     w = settings.ang_vel
@@ -119,7 +119,7 @@ def sample_base(start: VelocityStart, arrays: RobotArrays, rng: RngStream, attem
 
 @wp.func
 def sample_leg(start: VelocityStart, base: VelocityBase, geo: LegGeometry, rng: RngStream, leg: int) -> LegSample:
-    """Return a leg; its paw rests on the ground, or is in the air in a share of draws."""
+    """Return a sampled leg; its paw rests on the ground, or is in the air with a probability."""
     settings = start.settings
     beside = sample_foot_offset(rng, leg, settings.front_x, settings.front_y, settings.back_x, settings.back_y)
     paw = base.pos + rotate_yaw(beside, start.heading)
@@ -139,14 +139,10 @@ def sample_leg(start: VelocityStart, base: VelocityBase, geo: LegGeometry, rng: 
 
 @wp.func
 def write_start(
-    arrays: RobotArrays,
-    scene: Scene,
-    skill: SkillSettings,
-    settings: VelocitySettings,
-    terrain_level: int,
+    arrays: RobotArrays, scene: Scene, skill: SkillSettings, settings: VelocitySettings, terrain_level: int,
     rng: RngStream,
-):
-    """Write a start state to a world: a sampled one, or in a share of draws the default pose."""
+):  # fmt: skip
+    """Write a start state to a world: a sampled one, or with a probability the default pose."""
     world = rng.world
     start = VelocityStart()
     start.spot = sample_tile(rng, settings.map, terrain_level)

@@ -44,14 +44,14 @@ class VelocityState:
 
 @wp.func
 def velocity_error(robot: RobotView, state: VelocityState) -> wp.vec3:
-    """Return velocity less command: ahead [m/s], to the left [m/s], about z [rad/s], body axes."""
+    """Return velocity minus command: ahead [m/s], to the left [m/s], yaw rate [rad/s], body axes."""
     vel = wp.quat_rotate_inv(robot.quat, robot.lin_vel)
     return wp.vec3(vel[0] - state.command[0], vel[1] - state.command[1], robot.ang_vel[2] - state.command[2])
 
 
 @wp.func
 def follow_steps(robot: RobotView, state: VelocityState) -> VelocityState:
-    """Return the state with the paws' steps taken in: how many there were lately, and how high the paws went."""
+    """Return the state with updated step counts and swing heights of the paws."""
     t = state
     for k in range(4):
         came_down = robot.first_contact[k]
@@ -107,5 +107,5 @@ def tracking_error(robot: RobotView, state: VelocityState) -> float:
 
 @wp.func
 def every_episode(state: VelocityState) -> bool:
-    """Return true: all episodes count."""
+    """Return True: the curriculum counts every episode."""
     return True

@@ -35,14 +35,14 @@ from jumper_warp.rl.cfg import PpoCfg
 from jumper_warp.tasks.jump.vertical import vertical_jump
 from jumper_warp.tasks.terms import EventTerm, ObservationTerm, RewardTerm, TerminationTerm
 from jumper_warp.kernels.mdp.parameters import RobotParameters
-from jumper_warp.kernels.mdp.random import Draw, between
+from jumper_warp.kernels.mdp.random import RngStream, uniform
 from jumper_warp.kernels.mdp.view import RobotView
 
 
 @wp.func
 def rest(robot: RobotView, state: Any, height: float) -> float:
     """Base height over a height [m]."""
-    return view.height / height
+    return robot.height / height
 
 
 @wp.func
@@ -52,16 +52,16 @@ def strange(robot: RobotView, state: Any) -> float:
 
 
 @wp.func
-def slow(robot: RobotParameters, draw: Draw, lower: float, upper: float):
+def slow(robot: RobotParameters, rng: RngStream, lower: float, upper: float):
     """Scale the proportional gain of every motor."""
     for m in range(12):
-        robot.motors.kp[m, draw.world] = 17.0 * between(draw, m, lower, upper)
+        robot.motors.kp[m, rng.world] = 17.0 * uniform(rng, m, lower, upper)
 
 
 @wp.func
 def too_high(robot: RobotView, state: Any, height: float) -> bool:
     """The base is above a height [m]."""
-    return view.height > height
+    return robot.height > height
 
 
 def tame_jump():
@@ -225,7 +225,7 @@ def test_a_changed_file_is_told_and_settings_stay_those_of_the_run(capsys, runs,
     folder, edited = tmp_path / "tame-jump" / "run", tmp_path / "edited" / "my_jumps.py"
     shutil.copytree(runs["tame-jump"], folder)
     edited.parent.mkdir()
-    edited.write_text(TASK.replace("view.height / height", "view.height / (2.0 * height)"))
+    edited.write_text(TASK.replace("robot.height / height", "robot.height / (2.0 * height)"))
     args = ["--device", "cpu", "--iterations", "2", "--resume", str(folder)]
     code, _, err = run(capsys, "train", "tame-jump", "--task-module", str(edited), *args)
     assert code == 0, err
@@ -270,7 +270,7 @@ def test_run_of_an_older_version_is_refused_with_the_commit_that_reads_it(capsys
     [
         ("import warp as wp\n", "import warp as wp\nimport not_there\n", "own_faults.py:6: ModuleNotFoundError"),
         ("weight=2.0, ", "", "own_faults.py:{line}: TypeError: RewardTerm.__init__() missing"),
-        ("tilt(view)", "tilt(view.quad)", "own_faults.py, function level: `quad` is not an attribute of 'view'"),
+        ("tilt(robot)", "tilt(robot.quad)", "own_faults.py, function level: `quad` is not an attribute of 'robot'"),
     ],
 )
 def test_a_mistake_in_a_users_file_is_told_in_one_line(right, wrong, told, tmp_path, monkeypatch, capsys):

@@ -11,8 +11,9 @@ def step_of(jumps, **changes):
     count = len(jumps.goals)
     arrays = {
         "phase": np.zeros(count, dtype=int), "phase_steps": np.zeros(count, dtype=int),
-        "termination": np.full(count, -1), "max_height": np.zeros(count), "peak_tilt": np.zeros(count), "base_vel": np.zeros((count, 3)),
-        "steps": np.full(count, 40), "command_step": np.full(count, 30), "base_pos": np.zeros((count, 3)),
+        "termination": np.full(count, -1), "max_height": np.zeros(count), "peak_tilt": np.zeros(count),
+        "base_vel": np.zeros((count, 3)), "steps": np.full(count, 40), "command_step": np.full(count, 30),
+        "base_pos": np.zeros((count, 3)),
         "base_quat": np.tile([0.0, 0.0, 0.0, 1.0], (count, 1)), "start": np.zeros((count, 3)),
         "heading": np.zeros(count), "goal": np.zeros((count, 3)), "touched_down": np.zeros(count, dtype=int),
         "up": np.zeros(count), "paws_down": np.ones((count, 4), dtype=bool),

@@ -28,7 +28,7 @@ OF_WORLD = ("level", "streak")
 
 
 class Table:
-    """Functions of (view, task, ...), compiled into one kernel as a task's are, to be called one at a time."""
+    """Functions of (robot, state, ...), compiled into one kernel as a task's are, to be called one at a time."""
 
     def __init__(self, funcs, returns: type, state=JumpState):
         """funcs: of terms of the state's task or of any; returns: float or bool."""
@@ -78,7 +78,7 @@ def functions(module, names: str) -> list[wp.Function]:
 def make_view(**fields) -> RobotView:
     """Return a robot at rest in the default pose, 0.4 m high; vectors of 12 may be any sequence."""
     view = RobotView()
-    view.pos, view.quat, view.gravity = wp.vec3(0.0, 0.0, 0.4), wp.quat_identity(), wp.vec3(0.0, 0.0, -1.0)
+    view.pos, view.quat, view.projected_gravity = wp.vec3(0.0, 0.0, 0.4), wp.quat_identity(), wp.vec3(0.0, 0.0, -1.0)
     view.angle = view.default_angle = vec12(*DEFAULT_ANGLE)
     view.gravity_magnitude = 9.81
     for name, value in fields.items():
@@ -141,7 +141,7 @@ class Robots:
 def tilted_by(angle: float, axis=(1.0, 0.0, 0.0)) -> dict:
     """Return orientation and gravity of a robot tilted by an angle [rad] about a horizontal axis."""
     quat = wp.quat_from_axis_angle(wp.vec3(*axis), float(angle))
-    return {"quat": tuple(quat), "gravity": tuple(wp.quat_rotate_inv(quat, wp.vec3(0.0, 0.0, -1.0)))}
+    return {"quat": tuple(quat), "projected_gravity": tuple(wp.quat_rotate_inv(quat, wp.vec3(0.0, 0.0, -1.0)))}
 
 
 def only(start_mode: str, reset: ResetCfg | None = None, **ranges) -> ResetCfg:

@@ -80,7 +80,7 @@ def test_a_turned_world_runs_alike():
         assert env.reward[1].item() == pytest.approx(env.reward[0].item(), abs=2e-3, rel=2e-3)
         assert env.done[0] == env.done[1]
         arrays = env.task_arrays()
-        assert arrays["phase"][0] == arrays["phase"][1] and arrays["ending"][0] == arrays["ending"][1]
+        assert arrays["phase"][0] == arrays["phase"][1] and arrays["termination"][0] == arrays["termination"][1]
         phases.add(int(arrays["phase"][0]))
     assert phases == {int(STANCE), int(FLIGHT)}
     expected = Rotation.from_euler("z", turn).apply(arrays["base_pos"][0])
@@ -311,15 +311,15 @@ def test_a_jump_counts_where_it_ended_near_its_goal(env, miss, near):
 
 
 @pytest.mark.parametrize(
-    ("ending", "episode"),
+    ("termination", "episode"),
     [("too_long", {"steps": 1199, "phase_steps": 10}), ("no_jump", {"phase": STANCE, "steps": 500, "command_step": 0})],
 )
-def test_any_other_end_at_the_goal_is_no_success(env, ending, episode):
+def test_any_other_end_at_the_goal_is_no_success(env, termination, episode):
     stand(env, level=1, streak=2)
     edit_episodes(env, goal=env.task_arrays()["base_pos"], **({"phase": LANDED} | episode))
     env.metrics()
     env.step(REST)
-    assert ending_names(env) == [ending] * N
+    assert ending_names(env) == [termination] * N
     assert not episodes_of(env)["streak"].any() and env.metrics()["Metrics/success"] == 0.0
 
 

@@ -63,7 +63,7 @@ def test_predicted_miss_of_the_task_is_decided_at_a_whole_step():
 
 @pytest.mark.parametrize("heading", HEADINGS)
 @pytest.mark.parametrize(
-    ("yaw", "pitch", "turned"),
+    ("yaw", "pitch", "is_turned"),
     [
         (0.0, 0.0, False),
         (9.5, 0.0, False),
@@ -77,13 +77,13 @@ def test_predicted_miss_of_the_task_is_decided_at_a_whole_step():
         (180.0, 0.0, True),
     ],
 )
-def test_turned_touchdown_measures_from_the_heading_across_180_degrees(heading, yaw, pitch, turned):
+def test_turned_touchdown_measures_from_the_heading_across_180_degrees(heading, yaw, pitch, is_turned):
     quat = Rotation.from_euler("ZYX", [heading + yaw, pitch, 0.0], degrees=True).as_quat()
     limits = {"rotation": 30.0 * DEG, "yaw": 10.0 * DEG}
     for sign in (1.0, -1.0):
         view = make_view(quat=sign * quat)
         touching = make_episode(phase=LANDED, touched_down=1, heading=heading * DEG)
-        assert holds("turned_touchdown", view, touching, **limits) is turned
+        assert holds("turned_touchdown", view, touching, **limits) is is_turned
         assert not holds("turned_touchdown", view, make_episode(phase=LANDED, heading=heading * DEG), **limits)
 
 

@@ -50,7 +50,7 @@ def test_estimated_jump_height_is_ballistic_and_paid_in_flight_before_the_apex()
 
 ALWAYS_PAID = [
     ("horizontal_velocity", {"lin_vel": (0.03, -0.04, 7.0)}, {"width": 0.05, "share": 0.25}, [E(-1.0), 2.0 * E(-1.0)]),
-    ("orientation", {"gravity": (0.06, -0.08, -0.995)}, {"width": 0.1, "share": 0.25}, [E(-1.0), E(-1.0)]),
+    ("orientation", {"projected_gravity": (0.06, -0.08, -0.995)}, {"width": 0.1, "share": 0.25}, [E(-1.0), E(-1.0)]),
     ("angular_velocity", {"ang_vel": (2.0, -1.0, 2.0)}, {"width": 3.0, "share": 0.25}, [E(-1.0), E(-1.0)]),
     # transversal angles 0.5 and 0.9 in equal number: variance 0.04; |lateral| = sqrt(4) * 0.1
     (

@@ -152,7 +152,7 @@ def test_motors_follow_the_target_of_as_many_physics_steps_ago_as_the_latency():
 
 def test_the_ring_goes_on_over_thousands_of_steps():
     commands = Commands(len(DELAYS), delay=DELAYS)
-    commands.episodes.clock.fill_(2**20 - 3)
+    commands.episodes.step_count.fill_(2**20 - 3)
     past = [np.tile(DEFAULT_ANGLE, (len(DELAYS), 1)).astype(np.float32)] * 8
     for step in range(40):
         commands.act(0.2 * random_action(len(DELAYS), seed=step))
@@ -222,7 +222,7 @@ def test_a_push_acts_on_the_base_while_a_paw_is_down_or_in_the_air_too_where_the
 def test_a_step_moves_the_clock_on_and_nothing_is_new_any_more():
     env = make_env(4)
     env.episodes.history_reset.fill_(1)
-    clock = env.episodes.clock.numpy().copy()
+    step_count = env.episodes.step_count.numpy().copy()
     env.step(torch.zeros(4, 12))
-    np.testing.assert_array_equal(env.episodes.clock.numpy(), clock + 1)
+    np.testing.assert_array_equal(env.episodes.step_count.numpy(), step_count + 1)
     assert not env.episodes.history_reset.numpy().any()

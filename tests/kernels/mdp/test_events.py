@@ -63,7 +63,7 @@ class Events(Probe):
                   self.parameters]  # fmt: skip
         wp.launch(skill.kernels["event"], (skill.num_events, LANES, N), inputs, device="cpu")
 
-    def counted(self):
+    def curriculum_episodes(self):
         """Return how often the counting events ran at the start, and at resets."""
         found = self.parameters.latency.numpy()
         return found % 1000, found // 1000

@@ -79,7 +79,7 @@ def test_noise_is_another_in_every_step_and_the_same_again_at_the_same_clock(pro
     probe.next_clock()
     second = noise_of(probe)
     assert np.abs(np.corrcoef(first, second)[0, 1]) < 0.6 and (first != second).mean() > 0.5
-    probe.episodes.clock.assign(probe.episodes.clock.numpy() - 1)
+    probe.episodes.step_count.assign(probe.episodes.step_count.numpy() - 1)
     np.testing.assert_array_equal(noise_of(probe), first)
 
 
@@ -113,7 +113,7 @@ def begin_some(probe, worlds, value, other):
     states = probe.skill.states.numpy().copy()
     states["value"][worlds], states["other"][worlds] = value, other
     probe.write(value=states["value"], other=states["other"])
-    probe.observe(beginning=1)
+    probe.observe(after_reset=1)
 
 
 def test_a_new_episode_has_no_past_and_the_last_observation_keeps_that_of_the_old_one(probe):
@@ -179,12 +179,12 @@ def test_a_command_within_an_episode_renews_the_newest_frame_and_keeps_those_bef
     probe.latency.fill_(0)
     values, others = sequence(5)
     policy, critic = play(probe, values, others)
-    probe.episodes.clock.assign(probe.episodes.clock.numpy() - 1)  # as after the last step
+    probe.episodes.step_count.assign(probe.episodes.step_count.numpy() - 1)  # as after the last step
     some, rest = np.arange(0, N, 4), np.setdiff1d(np.arange(N), np.arange(0, N, 4))
     probe.episodes.history_reset.assign(np.isin(np.arange(N), some) * int(COMMANDED))
     probe.write(value=7.5, other=-7.5)
     for _ in range(2):  # a second time changes nothing
-        probe.observe(beginning=1)
+        probe.observe(after_reset=1)
         now, final = probe.obs("policy"), probe.obs("policy", final=True)
         np.testing.assert_array_equal(final, policy[-1])
         np.testing.assert_array_equal(now[rest], policy[-1, rest])
@@ -206,19 +206,19 @@ def test_broken_worlds_read_0_in_all_frames_and_go_on_without_a_trace(probe):
     probe.skill.set("policy", "value", noise=1.0)
     probe.latency.fill_(12)
     play(probe, *sequence(4))
-    broken = np.arange(N) % 5 == 0
-    probe.episodes.broken.assign(broken.astype(int))
+    diverged = np.arange(N) % 5 == 0
+    probe.episodes.diverged.assign(diverged.astype(int))
     write(probe.robot.joint_q, slice(0, 43), np.nan)
-    probe.write(value=np.where(broken, np.nan, 1.0), other=np.where(broken, np.inf, 1.0))
+    probe.write(value=np.where(diverged, np.nan, 1.0), other=np.where(diverged, np.inf, 1.0))
     probe.observe()
     for group in ("policy", "critic"):
         for final in (False, True):
             seen = probe.obs(group, final)
-            assert np.isfinite(seen).all() and not seen[broken].any() and (np.abs(seen[~broken, 1:]) > 0).any()
-    probe.episodes.broken.zero_()
-    begin_some(probe, np.flatnonzero(broken), 0.5, 0.25)
-    found = probe.obs("policy")[broken][:, 1:]
-    np.testing.assert_array_equal(found, np.tile([0.5, 0.25], (broken.sum(), 4)))
+            assert np.isfinite(seen).all() and not seen[diverged].any() and (np.abs(seen[~diverged, 1:]) > 0).any()
+    probe.episodes.diverged.zero_()
+    begin_some(probe, np.flatnonzero(diverged), 0.5, 0.25)
+    found = probe.obs("policy")[diverged][:, 1:]
+    np.testing.assert_array_equal(found, np.tile([0.5, 0.25], (diverged.sum(), 4)))
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])

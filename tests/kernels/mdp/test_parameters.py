@@ -29,12 +29,12 @@ DRAWN = [name for name in RobotParameters.vars if not name.startswith("nominal_"
 def event_kernel(which: int, p: wp.array(dtype=float), robot: RobotParameters):
     """Run one of the events in every world, two threads a world."""
     world, lane = wp.tid()
-    draw = make_stream(11, world, 16, 100 + which)
-    draw.lane = lane
-    draw.lanes = 2
+    rng = make_stream(11, world, 16, 100 + which)
+    rng.lane = lane
+    rng.lanes = 2
     for i in range(wp.static(len(FUNCS))):
         if which == i:
-            wp.static(FUNCS[i])(robot, draw, *p[0 : wp.static(COUNTS[i])])
+            wp.static(FUNCS[i])(robot, rng, *p[0 : wp.static(COUNTS[i])])
 
 
 def other_motors():

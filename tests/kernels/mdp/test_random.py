@@ -5,7 +5,7 @@ import pytest
 import warp as wp
 from scipy.stats import kstest
 
-from jumper_warp.kernels.mdp.random import clamped_normal, fold_in, make_stream, uniform_range
+from jumper_warp.kernels.mdp.random import clamped_normal, fold_in, make_stream, uniform, uniform_range
 from mdp_helpers import array
 
 WORLDS, COLUMNS = 4096, 8
@@ -17,39 +17,39 @@ SIGMA_OF_CUT = math.sqrt(0.5161)
 def draw_kernel(
     seed: int,
     worlds: wp.array(dtype=int),
-    clock: int,
+    step_count: int,
     stream: int,
     branch_of: int,
     first: int,
     seeds: wp.array(dtype=wp.uint32),
-    uniform: wp.array2d(dtype=float),
+    uniforms: wp.array2d(dtype=float),
     pairs: wp.array2d(dtype=float),
     normal: wp.array2d(dtype=float),
 ):
     """Draw columns from `first` on; branch_of < 0: from the stream itself."""
     i = wp.tid()
-    draw = make_stream(seed, worlds[i], clock, stream)
+    rng = make_stream(seed, worlds[i], step_count, stream)
     if branch_of >= 0:
-        draw = fold_in(draw, branch_of)
-    seeds[i] = draw.seed
-    for j in range(uniform.shape[1]):
-        uniform[i, j] = uniform(draw, first + j, -2.0, 3.0)
-        pairs[i, j] = uniform_range(draw, first + j, wp.vec2(-2.0, 3.0))
-        normal[i, j] = clamped_normal(draw, first + j)
+        rng = fold_in(rng, branch_of)
+    seeds[i] = rng.seed
+    for j in range(uniforms.shape[1]):
+        uniforms[i, j] = uniform(rng, first + j, -2.0, 3.0)
+        pairs[i, j] = uniform_range(rng, first + j, wp.vec2(-2.0, 3.0))
+        normal[i, j] = clamped_normal(rng, first + j)
 
 
-def draws(worlds=None, seed=7, clock=16, stream=1, branch_of=-1, first=0, columns=COLUMNS):
+def draws(worlds=None, seed=7, step_count=16, stream=1, branch_of=-1, first=0, columns=COLUMNS):
     """Return the state of each world's stream, uniform numbers of [-2, 3), and cut normal ones, (worlds, columns)."""
     worlds = np.arange(WORLDS) if worlds is None else np.asarray(worlds)
     n = len(worlds)
     seeds = wp.zeros(n, dtype=wp.uint32, device="cpu")
     found = [wp.zeros((n, columns), dtype=float, device="cpu") for _ in range(3)]
     wp.launch(
-        draw_kernel, n, [seed, array(worlds, int), clock, stream, branch_of, first], [seeds, *found], device="cpu"
+        draw_kernel, n, [seed, array(worlds, int), step_count, stream, branch_of, first], [seeds, *found], device="cpu"
     )
-    uniform, pairs, normal = (values.numpy() for values in found)
-    np.testing.assert_array_equal(pairs, uniform)
-    return seeds.numpy(), uniform, normal
+    uniforms, pairs, normal = (values.numpy() for values in found)
+    np.testing.assert_array_equal(pairs, uniforms)
+    return seeds.numpy(), uniforms, normal
 
 
 def pcg(state):
@@ -75,7 +75,7 @@ def hashed(*keys):
 @pytest.mark.parametrize("seed", [0, 7, 2**31 - 1, -5])
 def test_numbers_are_a_hash_of_seed_world_clock_stream_and_column(seed):
     worlds = np.arange(WORLDS)
-    states, uniform, _ = draws(seed=seed, clock=123456, stream=205)
+    states, uniform, _ = draws(seed=seed, step_count=123456, stream=205)
     expected = hashed(np.uint32(seed % 2**32), worlds, 123456, 205)
     np.testing.assert_array_equal(states, expected)
     columns = hashed(expected[:, None], np.arange(COLUMNS))
@@ -97,8 +97,8 @@ def test_a_number_is_the_same_whatever_else_is_drawn():
 
 OTHERS = {
     "seed": {"seed": 8},
-    "clock": {"clock": 17},
-    "far clock": {"clock": 16 + 60 * 3600},
+    "step_count": {"step_count": 17},
+    "far clock": {"step_count": 16 + 60 * 3600},
     "stream": {"stream": 2},
     "observation": {"stream": 200},
     "fold_in": {"branch_of": 0},
@@ -138,7 +138,7 @@ def test_neighbouring_worlds_and_columns_are_independent():
 
 def test_streams_rarely_meet():
     """Of 4096 worlds at 64 clocks: n^2 / 2^33 = 8 pairs by chance."""
-    states = np.concatenate([draws(clock=clock, columns=1)[0] for clock in range(16, 80)])
+    states = np.concatenate([draws(step_count=step_count, columns=1)[0] for step_count in range(16, 80)])
     meetings = len(states) - len(np.unique(states))
     assert meetings < 8 + 5 * math.sqrt(8)
 

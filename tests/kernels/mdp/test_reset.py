@@ -105,13 +105,13 @@ def test_a_reset_begins_episodes_in_the_masked_worlds_and_touches_no_other(stage
     stage.scramble()
     stage.write(value=1.5, other=-1.0, steps=9)
     before, worlds = values_of(stage.robot, RobotArrays), values_of(stage.episodes, EpisodeArrays)
-    stage.episodes.broken.fill_(1)
+    stage.episodes.diverged.fill_(1)
     stage.reset(SOME)
     after = values_of(stage.robot, RobotArrays)
     unchanged(before, after, ~SOME)
-    unchanged(worlds, values_of(stage.episodes, EpisodeArrays), ~SOME, but=("broken",))
+    unchanged(worlds, values_of(stage.episodes, EpisodeArrays), ~SOME, but=("diverged",))
     np.testing.assert_array_equal(stage.world("fresh"), SOME)
-    np.testing.assert_array_equal(stage.world("broken"), ~SOME)
+    np.testing.assert_array_equal(stage.world("diverged"), ~SOME)
     np.testing.assert_array_equal(stage.read("value"), np.where(SOME, 2.5, 1.5))
     np.testing.assert_array_equal(stage.read("steps"), np.where(SOME, 0, 9))
     np.testing.assert_array_equal(stage.read("counts"), np.where(SOME, 11, 0))
@@ -138,7 +138,7 @@ def test_worlds_of_another_skill_are_passed_over(stage):
 def test_draws_of_a_beginning_follow_seed_and_clock():
     def draws(seed=0, later=0):
         stage = Stage(seed=seed)
-        stage.episodes.clock.assign(stage.episodes.clock.numpy() + later)
+        stage.episodes.step_count.assign(stage.episodes.step_count.numpy() + later)
         stage.reset(1.0)
         return stage.read("other")
 
@@ -205,14 +205,14 @@ def test_a_task_without_drawn_commands_begins_alike():
 
 def test_a_command_from_outside_begins_an_episode_with_its_heading(stage):
     stage.write(value=1.5, steps=9, other=3.0)
-    stage.episodes.broken.fill_(1)
+    stage.episodes.diverged.fill_(1)
     values, headings = np.arange(4.0 * N).reshape(N, 4), np.linspace(-3.0, 3.0, N).astype(np.float32)
     stage.give(SOME, 1, values, headings)
     np.testing.assert_array_equal(stage.read("value"), np.where(SOME, values[:, 0], 1.5))
     np.testing.assert_array_equal(stage.read("other"), np.where(SOME, headings, 3.0))
     np.testing.assert_array_equal(stage.read("steps"), np.where(SOME, 0, 9))
     np.testing.assert_array_equal(stage.world("fresh"), SOME)
-    np.testing.assert_array_equal(stage.world("broken"), ~SOME)
+    np.testing.assert_array_equal(stage.world("diverged"), ~SOME)
 
 
 def test_a_command_from_outside_within_an_episode_comes_in_the_robots_heading(stage):
@@ -262,9 +262,9 @@ def test_robots_stand_up_with_their_headings_on_the_block_below_them_at_its_star
 
 
 def test_the_clock_goes_on_in_the_masked_worlds(stage):
-    clock = stage.world("clock")
+    step_count = stage.world("step_count")
     wp.launch(advance_rng_kernel, N, [stage.mask(SOME), stage.episodes], device="cpu")
-    np.testing.assert_array_equal(stage.world("clock"), clock + SOME)
+    np.testing.assert_array_equal(stage.world("step_count"), step_count + SOME)
 
 
 # ---------------------------------------------------------------- forgetting

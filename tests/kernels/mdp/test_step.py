@@ -6,7 +6,7 @@ from probe_task import Probe, probe_task
 
 N = 64
 NAMES = ["first", "second", "third", "came_apart", "too_long"]
-FIRST, SECOND, THIRD, APART, LONG = range(5)
+FIRST, SECOND, THIRD, DIVERGED, LONG = range(5)
 NONE = -1
 GROWTH = 0.25
 
@@ -33,7 +33,7 @@ def weighted(value, other, height):
 
 
 def endings(probe):
-    return [NAMES[i] if i >= 0 else "" for i in probe.world("ending")]
+    return [NAMES[i] if i >= 0 else "" for i in probe.world("termination")]
 
 
 # ---------------------------------------------------------------- rewards
@@ -122,13 +122,13 @@ def test_worlds_of_another_skill_are_passed_over(probe):
     away = np.arange(N) % 3 == 0
     probe.episodes.skill.assign(np.where(away, 1, 0))
     probe.write(other=2.0e3)
-    for name in ("reward", "done", "timeout", "ending", "broken"):
+    for name in ("reward", "done", "timeout", "termination", "diverged"):
         write(getattr(probe.episodes, name), slice(None), 5)
     before = probe.skill.states.numpy().copy()
     probe.step()
     np.testing.assert_array_equal(probe.skill.states.numpy()[away], before[away])
     assert (probe.read("steps")[~away] == 1).all()
-    for name in ("reward", "done", "timeout", "ending", "broken"):
+    for name in ("reward", "done", "timeout", "termination", "diverged"):
         values = probe.world(name)
         assert (values[away] == 5).all() and (values[~away] != 5).all(), name
     assert not probe.skill.counters.termination_count.numpy()[:, away].any()
@@ -138,20 +138,20 @@ def test_worlds_of_another_skill_are_passed_over(probe):
 
 
 @pytest.mark.parametrize(
-    ("other", "ending", "time_out"),
+    ("other", "termination", "time_out"),
     [(5.0, NONE, False), (11.0, THIRD, True), (101.0, SECOND, True), (1001.0, FIRST, False)],
 )
-def test_the_first_termination_that_holds_ends_the_episode(probe, other, ending, time_out):
+def test_the_first_termination_that_holds_ends_the_episode(probe, other, termination, time_out):
     probe.write(other=other)
     probe.step()
-    done = ending != NONE
-    assert (probe.world("ending") == ending).all() and (probe.world("done") == float(done)).all()
+    done = termination != NONE
+    assert (probe.world("termination") == termination).all() and (probe.world("done") == float(done)).all()
     assert (probe.world("timeout") == float(time_out)).all() and (probe.world("truncated") == time_out).all()
     assert (probe.world("terminated") == (done and not time_out)).all()
     counted = probe.skill.counters.termination_count.numpy()
     expected = np.zeros((5, N))
     if done:
-        expected[ending] = 1
+        expected[termination] = 1
     np.testing.assert_array_equal(counted, expected)
 
 
@@ -174,11 +174,14 @@ def test_a_broken_world_ends_as_one_that_came_apart_and_pays_nothing(probe, how,
     break_world(probe, how, 3)
     probe.step()
     others = np.delete(np.arange(N), 3)
-    assert probe.world("ending")[3] == APART and (probe.world("ending")[others] == (FIRST if other else NONE)).all()
+    assert (
+        probe.world("termination")[3] == DIVERGED
+        and (probe.world("termination")[others] == (FIRST if other else NONE)).all()
+    )
     assert probe.world("terminated")[3] and not probe.world("truncated")[3]
     assert probe.world("reward")[3] == 0.0 and (probe.world("reward")[others] != 0.0).all()
     assert not probe.skill.term_value.numpy()[:, 3].any() and not probe.skill.counters.term_sum.numpy()[:, 3].any()
-    assert probe.world("broken").tolist() == (np.arange(N) == 3).astype(int).tolist()
+    assert probe.world("diverged").tolist() == (np.arange(N) == 3).astype(int).tolist()
     assert not probe.world("bad_action").any()
     np.testing.assert_array_equal(probe.skill.counters.bad_actions.numpy(), (np.arange(N) == 3) * (how == "action"))
 
@@ -197,8 +200,8 @@ def test_successes_in_a_row_raise_the_level_up_to_past_the_last(probe):
         end(probe)
         assert (probe.world("level") == min(number // 3, 2)).all()
         assert (probe.world("streak") == number % 3).all()
-    np.testing.assert_array_equal(probe.skill.counters.counted.numpy(), 9)
-    np.testing.assert_array_equal(probe.skill.counters.succeeded.numpy(), 9)
+    np.testing.assert_array_equal(probe.skill.counters.curriculum_episodes.numpy(), 9)
+    np.testing.assert_array_equal(probe.skill.counters.curriculum_successes.numpy(), 9)
 
 
 @pytest.mark.parametrize(
@@ -211,7 +214,9 @@ def test_anything_else_breaks_the_row(probe, failure):
     end(probe)
     end(probe, **failure)
     assert not probe.world("level").any() and not probe.world("streak").any()
-    assert (probe.skill.counters.counted.numpy() == 3).all() and (probe.skill.counters.succeeded.numpy() == 2).all()
+    assert (probe.skill.counters.curriculum_episodes.numpy() == 3).all() and (
+        probe.skill.counters.curriculum_successes.numpy() == 2
+    ).all()
     for _ in range(3):
         end(probe)
     assert (probe.world("level") == 1).all()
@@ -228,7 +233,7 @@ def test_episodes_that_do_not_count_change_neither_level_nor_row(probe):
     end(probe)
     end(probe, counts=0)
     end(probe, counts=0, other=1001.0)
-    assert (probe.world("streak") == 1).all() and (probe.skill.counters.counted.numpy() == 1).all()
+    assert (probe.world("streak") == 1).all() and (probe.skill.counters.curriculum_episodes.numpy() == 1).all()
     assert (probe.skill.counters.termination_count.numpy().sum(axis=0) == 3).all()
 
 

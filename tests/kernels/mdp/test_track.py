@@ -240,7 +240,7 @@ def test_blocks_are_larger_by_their_margin_for_links_but_not_for_paws(sim, poses
         ground.blocks, robot.joint_q = blocks(n, drawn), poses
         track(robot, sim, ground=ground, settings=contact_force(0.1, block_margin=settings))
         found.append((robot.collisions.numpy().copy(), robot.paw_height.numpy().copy()))
-    (flags, heights), (grown, _), (plain, level) = found
+    (flags, heights), (grown, _), (parameterless, level) = found
     np.testing.assert_array_equal(flags, grown)
-    assert (flags & plain == plain).all() and (flags != plain).any(axis=0).sum() > 20
+    assert (flags & parameterless == parameterless).all() and (flags != parameterless).any(axis=0).sum() > 20
     np.testing.assert_array_equal(heights, level)

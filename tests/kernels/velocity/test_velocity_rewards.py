@@ -37,7 +37,7 @@ def robots(seed: int = 3):
         contact = rng.integers(0, 2, 4).astype(float)
         view = {
             "quat": tuple(quat), "lin_vel": rng.normal(size=3), "ang_vel": rng.normal(size=3),
-            "gravity": np.array(wp.quat_rotate_inv(quat, wp.vec3(0.0, 0.0, -1.0))),
+            "projected_gravity": np.array(wp.quat_rotate_inv(quat, wp.vec3(0.0, 0.0, -1.0))),
             "angle": DEFAULT_ANGLE + rng.normal(size=12) * 0.4, "torque": rng.normal(size=12),
             "prev_torque": rng.normal(size=12), "contact": contact, "contacts": int(contact.sum()),
             "first_contact": contact * rng.integers(0, 2, 4), "air_time": rng.uniform(0.0, 0.6, 4),
@@ -70,7 +70,7 @@ def clearance(r, height):
 
 def shank_lean(r, free, hip, thigh, shank):
     """Knees by the thighs' angles, ankles where circles about them meet below, angles between links and gravity."""
-    down, total = r["gravity"][[0, 2]] / np.linalg.norm(r["gravity"][[0, 2]]), 0.0
+    down, total = r["projected_gravity"][[0, 2]] / np.linalg.norm(r["projected_gravity"][[0, 2]]), 0.0
     for leg, contact in enumerate(r["contact"]):
         front = 1.0 if leg < 2 else -1.0
         outer, inner = r["angle"][3 * leg + 1 : 3 * leg + 3]
@@ -94,7 +94,7 @@ EXPECTED = {
     "yaw_rate": ({"width": 0.5}, lambda r: np.exp(-((r["ang_vel"][2] - r["command"][2]) ** 2) / 0.25)),
     "vertical_velocity": ({}, lambda r: r["vel"][2] ** 2),
     "lateral_stability": ({}, lambda r: np.sum(r["ang_vel"][:2] ** 2)),
-    "flat": ({}, lambda r: np.sum(r["gravity"][:2] ** 2)),
+    "flat": ({}, lambda r: np.sum(r["projected_gravity"][:2] ** 2)),
     "stand": (
         {"width": 0.5},
         lambda r: np.exp(-np.mean(OFF["angle"](r)[TRANSVERSAL] ** 2) / 0.25) * r["standing"],
@@ -139,7 +139,7 @@ def test_every_reward_of_the_task_is_compared():
 
 def test_shanks_lean_as_inverse_kinematics_has_them():
     """In the default pose a shank is off vertical by asin of (0.045 + 0.175 sin 45 deg) / 0.3: 34.3 degrees."""
-    view = make_view(contact=np.ones(4), gravity=(0.0, 0.0, -1.0))
+    view = make_view(contact=np.ones(4), projected_gravity=(0.0, 0.0, -1.0))
     lean = np.arcsin((0.045 + 0.175 * np.sin(np.pi / 4.0)) / 0.3)
     assert paid("shank_lean", view, make_state(), **(LEG | {"free": 0.0})) == pytest.approx(8.0 * lean**2, rel=1e-5)
     assert paid("shank_lean", view, make_state(), **(LEG | {"free": lean + 0.01})) == 0.0
