@@ -12,12 +12,7 @@ import numpy as np
 from jumper_warp.identification.least_squares import LeastSquares, NormalEquations, Point
 from jumper_warp.identification.parameters import ParameterSet, PriorMeasurement
 from jumper_warp.identification.residuals import MotionResiduals
-from jumper_warp.identification.uncertainty import (
-    Direction,
-    mismatch_factor,
-    systematic_std,
-    weak_directions,
-)
+from jumper_warp.identification.uncertainty import Direction, mismatch_factor, systematic_std, weak_directions
 from jumper_warp.robot.values import RobotValues
 
 CONFIDENCE = 1.959964

@@ -11,13 +11,7 @@ from jumper_warp.identification.identify import identify
 from jumper_warp.identification.initial_states import paw_positions, stance, unevenness
 from jumper_warp.identification.least_squares import gram
 from jumper_warp.identification.motions import NoiseLevels
-from jumper_warp.identification.parameters import (
-    Parameter,
-    ParameterSet,
-    jumper_parameters,
-    total_mass,
-    weighed_mass,
-)
+from jumper_warp.identification.parameters import Parameter, ParameterSet, jumper_parameters, total_mass, weighed_mass
 from jumper_warp.identification.recording import KINDS, measure, replay_plan, sample_plan, simulate_plan
 from jumper_warp.identification.replay import MotionReplay
 from jumper_warp.identification.residuals import MotionResiduals
