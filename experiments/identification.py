@@ -20,7 +20,7 @@ import tyro
 from jumper_warp.cli.main import run_command
 from jumper_warp.identification.parameters import jumper_parameters
 from jumper_warp.identification.recording import KINDS, replay_plan, simulate_plan
-from jumper_warp.identification.replay import Replay
+from jumper_warp.identification.replay import MotionReplay
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.output import output_dir
 from jumper_warp.utils.runtime import configure_device
@@ -92,7 +92,7 @@ def main(args: Args) -> dict[str, Any]:
             values |= {f"{part}_{name}": value for name, value in results[0].items()}
             values |= {f"{part}_{name}_of_seeds": [row[name] for row in results] for name in ("coverage", "identified")}
     if "methods" in args.parts:
-        values |= compare_methods(parameters, cases[0][0], replay, ours, cases[0][2].seconds)
+        values |= compare_methods(parameters, cases[0][0], replay, ours, cases[0][2].effort.seconds)
     if "policy" in args.parts:
         values |= policy_errors(args.policy, args.jumps, cases[0][0], cases[0][2], folder)
     if rows:

@@ -12,7 +12,7 @@ from jumper_warp.identification.identify import identify_by_evolution
 from jumper_warp.identification.least_squares import LeastSquares, Point
 from jumper_warp.identification.motions import NoiseLevels
 from jumper_warp.identification.parameters import ParameterSet
-from jumper_warp.identification.replay import Replay
+from jumper_warp.identification.replay import MotionReplay
 from jumper_warp.identification.residuals import MotionResiduals
 from support.known_robots import Case, Simulate, prediction_errors
 
@@ -83,7 +83,7 @@ def compare_methods(parameters: ParameterSet, case: Case, replay: Replay, ours: 
     problem = make_problem(parameters, case, replay)
     evolved = identify_by_evolution(case.motions, parameters, knowledge=[case.mass], max_seconds=seconds)
     points = {"cma": Point(evolved.z, list(evolved.starts)), "scipy": scipy_fit(problem, seconds)}
-    metrics = {"methods_wall_s": seconds, "cma_million_world_steps": evolved.world_steps / 1.0e6}
+    metrics = {"methods_wall_s": seconds, "cma_million_world_steps": evolved.effort.world_steps / 1.0e6}
     for name, point in points.items():
         angle, height = prediction_errors(case, parameters.robots(point.z[None]), ours)
         metrics |= {

@@ -10,14 +10,14 @@ import numpy as np
 
 from jumper_warp.evaluation.heights import run_jumps
 from jumper_warp.evaluation.plots import figure
-from jumper_warp.identification.excitation import unsafe
-from jumper_warp.identification.findings import Identification
-from jumper_warp.identification.identify import identify, total_mass, weighed
-from jumper_warp.identification.least_squares import Knowledge
-from jumper_warp.identification.motions import Motion
-from jumper_warp.identification.parameters import ParameterSet
-from jumper_warp.identification.recording import KINDS, Plan, measured, plot_plan, replay_plan
-from jumper_warp.identification.replay import Record, Replay
+from jumper_warp.identification.excitation import unsafe_reason
+from jumper_warp.identification.identify import identify
+from jumper_warp.identification.motions import RecordedMotion
+from jumper_warp.identification.parameters import ParameterSet, PriorMeasurement, total_mass, weighed_mass
+from jumper_warp.identification.recording import KINDS, Plan, measure, replay_plan, sample_plan
+from jumper_warp.identification.replay import MotionReplay, Record
+from jumper_warp.identification.report import identified_overlay
+from jumper_warp.identification.results import Identification
 from jumper_warp.policies.conditions import Conditions, env_of_policy
 from jumper_warp.policies.runs import open_policy
 from jumper_warp.robot.overlay import overlay_of
@@ -34,8 +34,8 @@ class Case:
 
     truth: np.ndarray  # (parameters,) True parameters, normalised by the priors
     robots: RobotValues
-    motions: list[Motion]
-    mass: Knowledge
+    motions: list[RecordedMotion]
+    mass: PriorMeasurement
     held_out: Plan
     record: Record  # Measured trajectory of the held-out jump
 
@@ -53,8 +53,8 @@ def make_case(parameters: ParameterSet, seed: int, simulate: Simulate, replay: R
     nominal = parameters.robots(np.zeros((1, len(z))))
     plans: list[Plan] = []
     while len(plans) < len(KINDS):
-        plan = plot_plan(KINDS[len(plans)], rng)
-        if not unsafe(plan, replay_plan(replay, plan, nominal)):
+        plan = sample_plan(KINDS[len(plans)], rng)
+        if not unsafe_reason(plan, replay_plan(replay, plan, nominal)):
             plans.append(plan)
     motions = [measured(p, f"{i} {p.kind}", simulate(p, robots), robots, rng) for i, p in enumerate(plans)]
     held_out = plot_plan("small jump", rng, torque_limit=HELD_OUT_TORQUE)

@@ -21,7 +21,7 @@ from jumper_warp.robot.description import MOTOR_JOINTS
 from jumper_warp.robot.gravity import EARTH
 from jumper_warp.robot.model import build_model
 from jumper_warp.sim.simulation import Simulation, motor_values
-from jumper_warp.trajectory.problem import Motion, Problem
+from jumper_warp.trajectory.problem import Problem, SimulatedMotion
 
 CONTACT_FORCE = 0.1  # [N] Force above which a paw is in contact
 TAKEOFF_SPEED = 0.25  # [m/s] Smallest upward speed of the base at takeoff
@@ -128,7 +128,7 @@ class MotionReplay:
         q, qd = (np.stack(column) for column in zip(*self.states, strict=True))
         parts = q, qd, self.torque[..., None], np.stack(self.impulses), self.targets[..., None]
         device = str(self.problem.rollout(1).device)
-        return self.problem.recorded(TorchTrajectory(*(torch.as_tensor(x, dtype=torch.float64, device=device)
+        return self.problem.motion_of(TorchTrajectory(*(torch.as_tensor(x, dtype=torch.float64, device=device)
                                                        for x in parts)))  # fmt: skip
 
     @property

@@ -148,7 +148,7 @@ FINE: dict[str, Any] = {"substeps": SUBSTEPS}
 COARSE = FINE | {"substeps": 4}  # Fewer physics steps per policy step, for the first stages of a search
 QUICK = FINE | {"double": False, "tolerance": None}  # Single precision, and its tolerance of the contact iteration
 UPWARD = (
-    (COARSE, Stage(32, 40, rate=0.05, noise=0.05, least=1.0)),
+    (COARSE, Stage(32, 40, rate=0.05, noise=0.05, final_fraction=1.0)),
     (COARSE, Stage(12, 100, rate=0.04, noise=0.04)),
     (FINE, Stage(4, 100, rate=0.02, noise=0.02, penalty=100.0)),
 )
@@ -156,14 +156,14 @@ CALM: dict[str, Any] = {"slack": 0.03, "look": 5, "calmer": 0.7}
 """Settings of stages that often return to the best motion and continue with smaller steps."""
 CALMEST: dict[str, Any] = CALM | {"slack": 0.02}
 FORWARD = (
-    (QUICK | {"lean": LEAN}, Stage(40, 40, rate=0.05, noise=0.05, least=1.0, slack=0.1)),
-    (QUICK | {"lean": LEAN}, Stage(16, 40, rate=0.05, noise=0.05, least=1.0, slack=0.1)),
-    (QUICK, Stage(10, 60, rate=0.04, noise=0.03, least=0.5, slack=0.1)),
-    (QUICK, Stage(10, 80, rate=0.02, noise=0.015, least=0.2, penalty=40.0, dual=2.0, crossings=40, **CALM)),
-    (QUICK, Stage(8, 80, rate=0.02, noise=0.015, least=0.2, penalty=40.0, dual=2.0, crossings=40, **CALM)),
-    (QUICK, Stage(6, 80, rate=0.02, noise=0.01, least=0.2, penalty=40.0, dual=2.0, crossings=40, **CALM)),
-    (QUICK, Stage(4, 100, rate=0.015, noise=0.006, least=0.1, penalty=40.0, dual=2.0, crossings=40, **CALM)),
-    (QUICK, Stage(3, 150, rate=0.01, noise=0.003, least=0.1, penalty=100.0, dual=4.0, **CALMEST)),
+    (QUICK | {"lean": LEAN}, Stage(40, 40, rate=0.05, noise=0.05, final_fraction=1.0, slack=0.1)),
+    (QUICK | {"lean": LEAN}, Stage(16, 40, rate=0.05, noise=0.05, final_fraction=1.0, slack=0.1)),
+    (QUICK, Stage(10, 60, rate=0.04, noise=0.03, final_fraction=0.5, slack=0.1)),
+    (QUICK, Stage(10, 80, rate=0.02, noise=0.015, final_fraction=0.2, penalty=40.0, dual=2.0, crossings=40, **CALM)),
+    (QUICK, Stage(8, 80, rate=0.02, noise=0.015, final_fraction=0.2, penalty=40.0, dual=2.0, crossings=40, **CALM)),
+    (QUICK, Stage(6, 80, rate=0.02, noise=0.01, final_fraction=0.2, penalty=40.0, dual=2.0, crossings=40, **CALM)),
+    (QUICK, Stage(4, 100, rate=0.015, noise=0.006, final_fraction=0.1, penalty=40.0, dual=2.0, crossings=40, **CALM)),
+    (QUICK, Stage(3, 150, rate=0.01, noise=0.003, final_fraction=0.1, penalty=100.0, dual=4.0, **CALMEST)),
 )
 JUMPS = {
     "farthest": Jump(
@@ -188,7 +188,7 @@ JUMPS = {
         f"still landing from {STILL_HEIGHT:g} m", "s",
         lambda **s: _vertical(jumps.still(), jumps.reaches(STILL_HEIGHT), jumps.soft(SOFT), knots=LANDING, **s),
         (
-            (FINE, Stage(16, 60, rate=0.05, noise=0.05, least=1.0)),
+            (FINE, Stage(16, 60, rate=0.05, noise=0.05, final_fraction=1.0)),
             (FINE, Stage(6, 100, rate=0.03, noise=0.03)),
         ),
         lambda replay: replay.longest_lift, draw=partial(squats, push=30), samples=1024, after="least_work",

@@ -11,10 +11,10 @@ from jumper_warp.utils.errors import InputError
 
 
 class DifferentiableStep:
-    """Launches the step so that `wp.Tape` can run it backwards; each call makes its own buffers.
+    """One time step that `wp.Tape` can reverse; each call allocates its buffers.
 
-    Gradients flow to the state, the joint forces, the external wrench and the parameter table. At given contact modes
-    and pressed stops they are exact; see `kernels.dynamics.adjoint.tape_step`.
+    Gradients reach the state, the joint forces, the external wrench and the parameter table. They are exact at the
+    contact modes and pressed stops of the step; see `kernels.dynamics.adjoint.tape_step`.
     """
 
     def __init__(self, dynamics: JumperDynamics, max_sweeps: int, tolerance: float):
@@ -36,7 +36,7 @@ class DifferentiableStep:
     ) -> None:
         """Advance base and motor coordinates by dt [s]; arrays as in `JumperDynamics.advance`, none shared.
 
-        Raises ValueError if the result would overwrite what the step read, or if there are blocks.
+        Raises InputError: an output is an input, or there are moving blocks.
         """
         if q.ptr == q_out.ptr or qd.ptr == qd_out.ptr:
             raise InputError("a differentiable step needs its own output state: state_out must not be state_in")
@@ -55,7 +55,7 @@ class DifferentiableStep:
         wp.launch(kernels.integrate_kernel, n, [*inputs, self._record, power], [q_out, qd_out], device=device)
 
     def _solved(self) -> Any:
-        """Return an empty `SolvedStep`."""
+        """Return the kernels' `SolvedStep`, zeroed."""
         dynamics, n = self._dynamics, self._dynamics.num_worlds
         solved, trajectory = dynamics.modules.tape_step.SolvedStep(), dynamics.modules.trajectory.TrajectoryArrays()
         for name, shape in {"torque": (1, 12, n), "impulse": (1, 4, n), "pressed": (1, 4, n)}.items():

@@ -1,4 +1,4 @@
-"""A thread per leg (GPUs) computes what a thread per world does; on the CPU blocks of four take turns."""
+"""Physics with a thread per leg (for GPUs) against a thread per world; on the CPU threads of a block take turns."""
 
 import numpy as np
 import pytest
@@ -71,7 +71,7 @@ GROUNDS = {
 
 
 @pytest.mark.parametrize("kind", GROUNDS)
-def test_thread_per_leg_equals_thread_per_world(kind):
+def test_thread_per_leg_matches_thread_per_world(kind):
     model = build_model(N, ground=GROUNDS[kind]["ground"], friction=0.5)
     q, qd, force = states(model, 0.34)
     legs, world = (JumperDynamics(model, double=True, block=GROUNDS[kind].get("block")) for _ in range(2))
@@ -94,7 +94,7 @@ def test_thread_per_leg_equals_thread_per_world(kind):
         np.testing.assert_allclose(*moved, atol=1.0e-9)
 
 
-def test_stops_of_thread_per_leg_equal_thread_per_world():
+def test_stops_match_thread_per_world():
     model = build_model(N, friction=0.5)
     q, qd, force = squatting(model)
     legs, world = (JumperDynamics(model, double=True) for _ in range(2))
@@ -110,7 +110,7 @@ def test_stops_of_thread_per_leg_equal_thread_per_world():
     assert (~pressed & paws).any()
 
 
-def test_freezes_diverged_world():
+def test_diverged_world_is_frozen():
     model = build_model(N)
     dynamics = JumperDynamics(model, double=True)
     q, qd, force = states(model, 0.34)
@@ -127,7 +127,7 @@ def test_freezes_diverged_world():
         np.testing.assert_array_equal(a.reshape(N, -1)[others], b.reshape(N, -1)[others])
 
 
-def test_contact_iteration_stops_at_the_tolerance_and_reports_it():
+def test_contact_iteration_ends_at_tolerance_and_reports_residual():
     model = build_model(N)
     dynamics = JumperDynamics(model, double=True)
     q, qd, force = states(model, 0.34)

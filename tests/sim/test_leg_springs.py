@@ -1,4 +1,4 @@
-"""Springs between the knees: their forces do the work that their energy says, in both solvers, and lose none of it."""
+"""Springs between the knees: torques against energy, conservation of energy, and agreement of both solvers."""
 
 import numpy as np
 import pinocchio as pin
@@ -41,7 +41,7 @@ def flight(n: int, springs: bool = True, double: bool = True) -> Flight:
     return found
 
 
-def test_spring_torque_is_the_gradient_of_its_energy():
+def test_spring_torques_are_the_gradient_of_energy():
     # the change of generalized momentum over a short step, with springs less without, is their torque: power matches
     n, dt, h = 40, 1.0e-6, 1.0e-5
     states = random_states(n, 3)
@@ -85,7 +85,7 @@ def test_springs_conserve_energy():
 
 
 @pytest.mark.parametrize("stiffness", [0.0, STIFFNESS])
-def test_springs_agree_between_solvers(stiffness):
+def test_springs_move_alike_on_both_solvers(stiffness):
     # a robot that hangs in the air with weak motors: the springs stretch its legs
     angles = {}
     for solver in ("jumper", "mujoco"):
@@ -100,7 +100,7 @@ def test_springs_agree_between_solvers(stiffness):
     np.testing.assert_allclose(angles["mujoco"], angles["jumper"], atol=0.02)
 
 
-def test_refuses_invalid_spring():
+def test_refuses_bad_springs():
     with pytest.raises(InputError, match="spring_stiffness must be in 0 to 10000 N/m"):
         with_springs(-1.0, 0.17)
     with pytest.raises(InputError, match="spring_length must be in 0 to 1 m"):

@@ -44,7 +44,7 @@ def test_standing_robot_creeps_less_than_a_millimetre_in_ten_seconds(standing):
     assert np.abs(paw_centres(standing)[0] - paws).max() < 1e-3
 
 
-def test_contacts_of_thrown_robots_never_pull_and_stay_in_the_cone():
+def test_contacts_never_pull_and_stay_in_the_friction_cone():
     sim = simulation(64, friction=0.6)
     thrown(sim, 11)
     touched = np.zeros(64, dtype=bool)
@@ -73,7 +73,7 @@ def test_contact_iteration_reaches_its_tolerance(standing):
     assert missed <= 1e-3 * steps
 
 
-def test_friction_never_pushes_a_sliding_paw_along():
+def test_friction_never_accelerates_a_sliding_paw():
     sim = simulation(64)
     thrown(sim, 11, height=(0.3, 0.6), speed=2.0)
     rng = np.random.default_rng(18)
